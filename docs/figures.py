@@ -15,7 +15,7 @@ from matplotlib.colors import PowerNorm
 from matplotlib.figure import Figure
 
 from hilctl import api
-from hilctl.analysis.canvas import COMMAND, DISPLACEMENT, ERROR, MARK, QUIET, REFERENCE, STYLE
+from hilctl.analysis.plot_style import COMMAND, DISPLACEMENT, ERROR, MARK, QUIET, REFERENCE, STYLE
 from hilctl.base.types import F64
 from hilctl.kernels.hysteresis import stop_step
 from hilctl.models.base import HysteresisModel
@@ -23,15 +23,15 @@ from hilctl.models.bouc_wen import BoucWenModel
 from hilctl.models.butterfly import ButterflyModel
 from hilctl.models.deadband import DeadbandFunction
 from hilctl.models.duhem import DuhemModel
-from hilctl.models.field import FieldLosses, FieldModel, OutputCurve
-from hilctl.models.files import load_model
-from hilctl.models.generalised import Envelope, GeneralisedModel
+from hilctl.models.effective_field import FieldLosses, FieldModel, OutputCurve
 from hilctl.models.generalised_duhem import GeneralisedDuhemModel
+from hilctl.models.generalised_pi import GeneralisedModel, PlayEnvelope
 from hilctl.models.integrated import IntegratedModel
 from hilctl.models.kp import KrasnoselskiiPokrovskiiModel
+from hilctl.models.model_file import load_model
 from hilctl.models.plays import PpiModel, RdpiModel
 from hilctl.models.preisach import PreisachModel
-from hilctl.models.staged import FieldLag, StagedModel, Structure
+from hilctl.models.staged import FieldLag, FirstMode, StagedModel
 
 ROOT = Path(__file__).parents[1]
 MODELS = ROOT / "configs" / "models"
@@ -221,7 +221,7 @@ def stages() -> Figure:
     named(left, "field lag, τ = 0.2 ms", "time, ms", "field")
     f_hz = np.geomspace(10.0, 10_000.0, 300)
     for damping, colour in ((0.1, DISPLACEMENT), (0.4, COMMAND)):
-        structure = Structure(natural_hz=2250.0, damping_ratio=damping)
+        structure = FirstMode(natural_hz=2250.0, damping_ratio=damping)
         s = 1j * f_hz / structure.natural_hz
         right.loglog(f_hz, np.abs(1.0 / (s**2 + 2.0 * damping * s + 1.0)), color=colour,
                      label=f"ζ = {damping:g}")  # fmt: skip
@@ -287,7 +287,7 @@ def other_operators() -> Figure:
         "Duhem": DuhemModel(a=2.5, b=1.0, c=0.7, command_span=(-1.2, 1.2)),
         "generalised PI": GeneralisedModel(
             direct=0.5, weights=(0.4, 0.2), thresholds=(0.1, 0.3), command_span=(-1.2, 1.2),
-            rising=Envelope(slope=1.2, shift=-0.4), falling=Envelope(slope=1.2, shift=0.1),
+            rising=PlayEnvelope(slope=1.2, shift=-0.4), falling=PlayEnvelope(slope=1.2, shift=0.1),
         ),
     }  # fmt: skip
     for i, (name, model) in enumerate(shapes.items()):

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from hilctl.base.private import memory_folder
+from hilctl.base.private_dirs import memory_folder
 from hilctl.base.yaml import io
 from hilctl.experiment import device as registry
 from hilctl.kernels.jit import ensure_compiled

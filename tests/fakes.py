@@ -18,19 +18,19 @@ import numpy as np
 from hilctl.base.device import Device
 from hilctl.base.errors import DeviceError, InputError
 from hilctl.base.events import Event
-from hilctl.base.samples import Batch, Head
+from hilctl.base.samples import BlockBatch, BlockHeader
 from hilctl.loop.block import Block
 from hilctl.loop.host import Tuning
 from hilctl.loop.interlocks import InterlockContext, Interlocks, InterlockSettings
+from hilctl_drivers.emulator.factory import Emulator, build
 from hilctl_drivers.emulator.labjack_stream import attach_stream
 from hilctl_drivers.emulator.modbus_device import EmulatedModbus
 from hilctl_drivers.emulator.modbus_wire import ModbusWire
 from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.emulator.rig import Rig, WriteLog
-from hilctl_drivers.emulator.setup import Emulator, build
-from hilctl_drivers.modbus.profile import ModbusProfile
+from hilctl_drivers.modbus.modbus_profile import ModbusProfile
 from hilctl_drivers.profile import load_profile
-from hilctl_drivers.wire.links import LostError, Missing, NoAnswerError
+from hilctl_drivers.transport.links import LostError, Missing, NoAnswerError
 
 
 @dataclass
@@ -176,7 +176,7 @@ class FakeHost:
         tunings: Changes of the reference by the sample at which they come.
 
     Attributes:
-        heads: Numbers of each recorded block, by :class:`Head`.
+        heads: Numbers of each recorded block, by :class:`BlockHeader`.
         sent: First sample and commands of each block that was on its way, as they were then.
     """
 
@@ -205,10 +205,10 @@ class FakeHost:
         return made
 
     def sending(self, block):
-        self.sent.append((block.head[Head.FIRST_SAMPLE], block.command.tolist()))
+        self.sent.append((block.head[BlockHeader.FIRST_SAMPLE], block.command.tolist()))
 
     def answered(self, block):
-        if block.head[Head.FIRST_SAMPLE] in self.full:
+        if block.head[BlockHeader.FIRST_SAMPLE] in self.full:
             return False
         self.heads.append(list(block.head))
         self.columns.append(block.columns.copy())
@@ -238,7 +238,7 @@ class FakeHost:
 
 def made_block(block=1, state_size=1, fill=np.nan):
     """Return a block in memory of its own."""
-    area = Batch.empty(1, block, state_size)
+    area = BlockBatch.empty(1, block, state_size)
     area.columns[:] = fill
     return Block(area.heads[0].data.cast("B").cast("q"), area, 0)
 
@@ -297,7 +297,7 @@ class VirtualTime:
 
 
 class InProcessLink:
-    """A :class:`~hilctl_drivers.wire.links.Link` that hands each request to a wire.
+    """A :class:`~hilctl_drivers.transport.links.Link` that hands each request to a wire.
 
     Args:
         wire: Emulated devices and their framing.
@@ -319,11 +319,11 @@ class InProcessLink:
         return "in process"
 
     def open(self) -> None:
-        """See :meth:`~hilctl_drivers.wire.links.Link.open`."""
+        """See :meth:`~hilctl_drivers.transport.links.Link.open`."""
         self.is_open = True
 
     def transact(self, request: bytes | bytearray, missing: Missing, usual: int = 0) -> bytes:
-        """Exchange, see :meth:`~hilctl_drivers.wire.links.Link.transact`."""
+        """Exchange, see :meth:`~hilctl_drivers.transport.links.Link.transact`."""
         del usual
         if not self.is_open:
             raise LostError("not connected")
@@ -344,7 +344,7 @@ class InProcessLink:
         return reply
 
     def close(self) -> None:
-        """See :meth:`~hilctl_drivers.wire.links.Link.close`."""
+        """See :meth:`~hilctl_drivers.transport.links.Link.close`."""
         self.is_open = False
 
 

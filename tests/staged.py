@@ -7,9 +7,9 @@ import numpy as np
 from hilctl.identify.data.records import SteadyLoop
 from hilctl.identify.fit_model import FittedModel, fit_model
 from hilctl.identify.settings import FitSettings
-from hilctl.identify.staged.convex import convex_start
+from hilctl.identify.staged.convex_start import convex_start
 from hilctl.identify.staged.fit_data import StagedFitData
-from hilctl.identify.staged.layered import Layers, Point
+from hilctl.identify.staged.objective import Layers, Point
 from hilctl.models.integrated import exponential_integrated
 from hilctl.models.staged import StagedModel
 

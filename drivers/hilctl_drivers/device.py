@@ -13,7 +13,7 @@ import numpy as np
 from hilctl.base.device import DeviceInfo, DeviceOptions
 from hilctl.base.errors import DeviceError, UnconfirmedError
 from hilctl.base.types import F64
-from hilctl_drivers.wire.timing import RateLimit
+from hilctl_drivers.transport.wire_time import RateLimit
 
 _SHORT = 64
 

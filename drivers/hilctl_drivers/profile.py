@@ -16,10 +16,10 @@ from pydantic import PlainSerializer, PlainValidator, ValidationError, Validatio
 from pydantic.json_schema import models_json_schema
 from pydantic_core import PydanticKnownError
 
-from hilctl.base.errors import ConfigError, InputError, Problem
+from hilctl.base.errors import ConfigError, ConfigProblem, InputError
 from hilctl.base.files import TextFiles
 from hilctl.base.yaml import Document, broken_rules, did_you_mean, loc_of
-from hilctl_drivers.profile_parts import BaseProfile
+from hilctl_drivers.profile_base import BaseProfile
 
 FOLDER = Path(__file__).parent / "profiles"
 _Profile = TypeVar("_Profile", bound=BaseProfile)
@@ -152,10 +152,10 @@ def parse_profile(text: str, where: str) -> BaseProfile:
         rule = f"must be one of {', '.join(link_kinds())}"
         value = "nothing" if kind is None else repr(kind)
         place = document.where(("link", "kind"))
-        raise ConfigError([Problem(place, "link.kind", rule, value)])
+        raise ConfigError([ConfigProblem(place, "link.kind", rule, value)])
     profile = document.validate(profile_class(kind))
     problems = [
-        Problem(
+        ConfigProblem(
             document.where(("unverified", index)),
             "unverified",
             "must name keys that are in this file",

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.formatting import printable
-from hilctl.recording.facts import END_FIGURES, LABELS_FACT
+from hilctl.recording.metadata_keys import END_FIGURES, LABELS_FACT
 
 if TYPE_CHECKING:
     from hilctl.base.segments import Segment
@@ -63,7 +63,7 @@ COLUMNS: dict[str, type] = {
 """Names and types of what is known of a recording.
 
 ``path`` is relative to the folder that was listed, ``state`` that of
-:class:`hilctl.recording.ends.RecordingEnds`, or ``unreadable``, ``waveform`` what ran, for people,
+:class:`hilctl.recording.run_summary.RunSummary`, or ``unreadable``, ``waveform`` what ran, for people,
 ``frequency_hz`` the highest of all segments that repeat. All other names, except ``options``, are
 those of facts in a recording.
 """
@@ -184,7 +184,7 @@ def _from_sql(kind: type, value: Any) -> Any:
     return bool(value) if kind is bool and value is not None else value
 
 
-class Found(NamedTuple):
+class CatalogueHit(NamedTuple):
     """A file as it lies in a folder.
 
     Attributes:
@@ -271,13 +271,13 @@ def _write_cache(path: Path | None, entries: Sequence[Entry]) -> None:
         _log.warning("cannot write the cache, recordings are read again next time: %s", error)
 
 
-def _entry(found: Found) -> Entry:
+def _entry(found: CatalogueHit) -> Entry:
     if found.problem:
         return unreadable(found.path, found.size_bytes, found.mtime_ns, found.problem)
     return entry_of(Path(found.file), found.path, found.size_bytes, found.mtime_ns)
 
 
-def _scan(folder: str, below: str) -> Iterator[Found]:
+def _scan(folder: str, below: str) -> Iterator[CatalogueHit]:
     """Yield every recording below a folder; links to folders are not followed, they may lead round.
 
     Args:
@@ -288,7 +288,7 @@ def _scan(folder: str, below: str) -> Iterator[Found]:
         with os.scandir(folder) as listed:
             entries = list(listed)
     except OSError as error:
-        yield Found(folder, below, 0, 0, f"can't be listed: {error.strerror}")
+        yield CatalogueHit(folder, below, 0, 0, f"can't be listed: {error.strerror}")
         return
     for entry in entries:
         path = below + os.fsencode(entry.name).decode("utf-8", "backslashreplace")
@@ -298,13 +298,13 @@ def _scan(folder: str, below: str) -> Iterator[Found]:
             yield _found(entry, path)
 
 
-def _found(entry: "os.DirEntry[str]", path: str) -> Found:
+def _found(entry: "os.DirEntry[str]", path: str) -> CatalogueHit:
     try:
         status = entry.stat()
     except OSError as error:
-        return Found(entry.path, path, 0, 0, f"can't be read: {error.strerror}")
+        return CatalogueHit(entry.path, path, 0, 0, f"can't be read: {error.strerror}")
     problem = "" if stat.S_ISREG(status.st_mode) else "is not a file"
-    return Found(entry.path, path, status.st_size, status.st_mtime_ns, problem)
+    return CatalogueHit(entry.path, path, status.st_size, status.st_mtime_ns, problem)
 
 
 def unreadable(path: str, size_bytes: int, mtime_ns: int, problem: str) -> Entry:
@@ -324,7 +324,7 @@ def entry_of(file: Path, path: str, size_bytes: int, mtime_ns: int) -> Entry:
         mtime_ns: Its time of modification then, in ns.
     """
     # What reads recordings takes a second to import: a catalogue that is known needs none of it.
-    from hilctl.recording.ends import read_ends
+    from hilctl.recording.run_summary import read_ends
     from hilctl.recording.segments import segments_of
     from hilctl.recording.validation import labels_of
 

@@ -16,7 +16,7 @@ from hilctl.analysis.export_files import FORMATS, ColumnFile, Columns, Facts, Pa
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.files import check_writable, write_file
 from hilctl.base.samples import COLUMNS
-from hilctl.recording.data import Recording
+from hilctl.recording.recording import Recording
 
 _MOST_WAITING = 4  # pieces: as many as fill a row group
 
@@ -32,7 +32,7 @@ def export(
     files also hold the facts of the run and the experiment and model as YAML.
 
     Args:
-        recording: The run, or its pieces in order (:class:`hilctl.recording.reader.Pieces`): then
+        recording: The run, or its pieces in order (:class:`hilctl.recording.reader.RecordingStream`): then
             memory does not grow with its length.
         path: File to write: ``.csv``, ``.npz``, ``.parquet`` or ``.mat``.
         overwrite: Replace a file of that name.

@@ -20,8 +20,8 @@ from hilctl.analysis.export_files import Columns, ParquetFile, arrow
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.files import write_file
 from hilctl.base.samples import RECORDED_FIELDS
-from hilctl.recording.data import Recording
-from hilctl.recording.reader import Pieces
+from hilctl.recording.reader import RecordingStream
+from hilctl.recording.recording import Recording
 
 _UNKNOWN = "__HIVE_DEFAULT_PARTITION__"
 _DATE = re.compile(r"\d{4}-\d\d-\d\d")
@@ -91,7 +91,7 @@ def _export_one(source: Path, target: Path, path: str, done: ExportedAll) -> Non
     try:
         write_file(
             target,
-            lambda stream: write_pieces(Pieces(source), ParquetFile(stream), _uniform),
+            lambda stream: write_pieces(RecordingStream(source), ParquetFile(stream), _uniform),
             overwrite=False,
         )
     except DataError as error:

@@ -11,8 +11,8 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from hilctl.analysis.sheet import Sheet, drawn
-from hilctl.analysis.vector import svg
+from hilctl.analysis.figure_export import svg
+from hilctl.analysis.figure_layout import FigureSpec, drawn
 from hilctl.base.files import write_text
 from hilctl.base.formatting import printable
 
@@ -100,7 +100,7 @@ def grid(headings: Iterable[str], cells: Iterable[Iterable[str]], css: str = "")
     return f'<div class="wide"><table class="{css}"><tr>{head}</tr>\n{body}</table></div>'
 
 
-def figures(sheets: Iterable[Sheet]) -> str:
+def figures(sheets: Iterable[FigureSpec]) -> str:
     """Return figures with their captions, as many abreast as have room."""
     blocks = "\n".join(
         f'<figure role="img" aria-label="{text(sheet.caption)}">{svg(drawn(sheet))}'

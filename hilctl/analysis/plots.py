@@ -10,8 +10,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import NullFormatter
 
-from hilctl.analysis import timing
-from hilctl.analysis.canvas import (
+from hilctl.analysis import tick_lateness
+from hilctl.analysis.figure_layout import FigureSpec, Panel
+from hilctl.analysis.plot_style import (
     COMMAND,
     DISPLACEMENT,
     ERROR,
@@ -21,14 +22,13 @@ from hilctl.analysis.canvas import (
     draw_line,
     draw_over_time,
 )
-from hilctl.analysis.sheet import Panel, Sheet
-from hilctl.analysis.steady import SteadyPart, steady_part, steady_samples
+from hilctl.analysis.steady_state import SteadyPart, steady_part, steady_samples
 from hilctl.base.formatting import quantity, short_name
-from hilctl.base.metrics import MAX_BINS, fold
 from hilctl.base.samples import Samples
 from hilctl.base.segments import Segment
 from hilctl.base.types import F64, I64
-from hilctl.recording.data import Recording
+from hilctl.recording.recording import Recording
+from hilctl.signals.cycle_metrics import MAX_BINS, fold
 
 MOST_HARMONICS = 20
 _MOST_SAMPLES = 2**20
@@ -118,7 +118,7 @@ _DECADES = 5.0  # of amplitude that a spectrum shows
 _LOW = 0.5
 
 
-def time_history(recording: Recording) -> Sheet | None:
+def time_history(recording: Recording) -> FigureSpec | None:
     """Return reference, displacement and command over the whole run; None without samples."""
     if recording.samples.index.size == 0:
         return None
@@ -127,7 +127,7 @@ def time_history(recording: Recording) -> Sheet | None:
         Panel(partial(_draw_command, recording=recording), height=_LOW),
     )
     caption = "Whole run: displacement, reference and command; grey: the part that is judged."
-    return Sheet("history", caption, panels, stacked=True)
+    return FigureSpec("history", caption, panels, stacked=True)
 
 
 def _draw_history(axes: Axes, recording: Recording) -> None:
@@ -144,7 +144,7 @@ def _draw_command(axes: Axes, recording: Recording) -> None:
     _mark_judged(axes, recording)
 
 
-def steady_cycles(recording: Recording, focus: int = 0) -> Sheet | None:
+def steady_cycles(recording: Recording, focus: int = 0) -> FigureSpec | None:
     """Return the same over the last two steady cycles of a segment; None where there is none."""
     zoom = _zoom(recording, focus)
     if zoom is None:
@@ -165,7 +165,7 @@ def steady_cycles(recording: Recording, focus: int = 0) -> Sheet | None:
     label = short_name(recording.segments[focus].label)
     caption = f"End of the steady part: {label}."
     panels = (Panel(moved), Panel(commanded, height=_LOW))
-    return Sheet("steady_cycles", caption, panels, stacked=True)
+    return FigureSpec("steady_cycles", caption, panels, stacked=True)
 
 
 def _zoom(recording: Recording, focus: int) -> Samples | None:
@@ -191,7 +191,7 @@ def _mark_judged(axes: Axes, recording: Recording) -> None:
             label = "_again"
 
 
-def error(recording: Recording, focus: int = 0) -> Sheet | None:
+def error(recording: Recording, focus: int = 0) -> FigureSpec | None:
     """Return displacement less reference, over the run and over one cycle.
 
     Returns:
@@ -213,7 +213,7 @@ def error(recording: Recording, focus: int = 0) -> Sheet | None:
         if part.cycle is not None:
             panels.append(Panel(partial(_draw_phase, part=part, segment=segment), "over one cycle"))
     caption = "Error: displacement less reference, over the run and over one cycle."
-    return Sheet("error", caption, tuple(panels))
+    return FigureSpec("error", caption, tuple(panels))
 
 
 def _draw_phase(axes: Axes, part: SteadyPart, segment: Segment) -> None:
@@ -244,7 +244,7 @@ def _spread(part: SteadyPart, segment: Segment) -> tuple[F64, F64, F64]:
     return ((np.arange(bins) + 0.5) / bins)[filled], low[filled], high[filled]
 
 
-def spectrum(recording: Recording, focus: int = 0) -> Sheet | None:
+def spectrum(recording: Recording, focus: int = 0) -> FigureSpec | None:
     """Return spectrum and harmonics of the error; None where there is none, or no steady part."""
     if not recording.compensated or focus >= len(recording.segments):
         return None
@@ -259,7 +259,7 @@ def spectrum(recording: Recording, focus: int = 0) -> Sheet | None:
     if found.harmonics_um.size:
         caption = "Spectrum of the error, and its harmonics in the average cycle."
         panels.append(Panel(partial(_draw_harmonics, found=found), "harmonics", 0.5))
-    return Sheet("error_spectrum", caption, tuple(panels))
+    return FigureSpec("error_spectrum", caption, tuple(panels))
 
 
 def _draw_spectrum(axes: Axes, found: ErrorSpectrum) -> None:
@@ -279,7 +279,7 @@ def _draw_harmonics(axes: Axes, found: ErrorSpectrum) -> None:
     axes.set_xticks([1, *range(5, int(order[-1]) + 1, 5)])
 
 
-def lateness(recording: Recording) -> Sheet | None:
+def lateness(recording: Recording) -> FigureSpec | None:
     """Return how late ticks woke and how long exchanges took, as histograms with log counts.
 
     Returns:
@@ -288,7 +288,7 @@ def lateness(recording: Recording) -> Sheet | None:
     if recording.ticks.late_ns.size == 0 or recording.run.get("paced") == "false":
         return None
     caption = "How late ticks woke up, and how long exchanges with the device took."
-    return Sheet("lateness", caption, (Panel(partial(_draw_lateness, recording=recording)),))
+    return FigureSpec("lateness", caption, (Panel(partial(_draw_lateness, recording=recording)),))
 
 
 def _draw_lateness(axes: Axes, recording: Recording) -> None:
@@ -299,10 +299,10 @@ def _draw_lateness(axes: Axes, recording: Recording) -> None:
     bins = np.geomspace(float(everything.min()), highest, _BINS).tolist()
     axes.hist(late_us, bins, color=DISPLACEMENT, alpha=0.6, label="lateness")
     axes.hist(exchange_us, bins, histtype="step", color=COMMAND, label="exchange")
-    marks = timing.percentiles_us(ticks.late_ns)
+    marks = tick_lateness.percentiles_us(ticks.late_ns)
     for name in ("p50", "p99", "max"):
         _mark(axes, max(marks[name], 1.0), f"{name} {quantity(marks[name], 'us')}")
-    period_ns = timing.tick_period_ns(ticks)
+    period_ns = tick_lateness.tick_period_ns(ticks)
     if period_ns is not None and period_ns * 0.5e-3 < bins[-1]:
         axes.axvline(period_ns * 0.5e-3, color=MARK, linewidth=1.4, label="half a tick period")
     axes.set(xscale="log", yscale="log", xlabel="time, µs (below 1 µs counts as 1)", ylabel="ticks")

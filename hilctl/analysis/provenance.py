@@ -7,9 +7,9 @@ from datetime import datetime
 from hilctl.base.errors import ConfigError
 from hilctl.base.formatting import printable, quantity, significant
 from hilctl.models.base import HysteresisModel
-from hilctl.models.files import parse_model
-from hilctl.recording.data import Recording
-from hilctl.recording.facts import OVERRIDES_FACT
+from hilctl.models.model_file import parse_model
+from hilctl.recording.metadata_keys import OVERRIDES_FACT
+from hilctl.recording.recording import Recording
 
 FAULT = "fault"
 _WAVEFORM = "waveform."

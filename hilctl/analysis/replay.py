@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from hilctl.analysis.predicted import ErrorPrediction, PredictedError
+from hilctl.analysis.predicted_error import ErrorPrediction, PredictedError
 from hilctl.base.errors import DataError, ModelError
 from hilctl.base.events import INVERSE, Event
 from hilctl.base.samples import NO_WAVEFORM, Flag, Samples
@@ -18,12 +18,12 @@ from hilctl.base.types import F64, U32
 from hilctl.base.yaml import Document
 from hilctl.experiment.file import Experiment
 from hilctl.loop.compensator import Compensator
-from hilctl.loop.host import StraightLine
+from hilctl.loop.host import LinearBypass
 from hilctl.loop.limiter import Limiter
 from hilctl.loop.tuning import fade, on_the_way
 from hilctl.models.base import HysteresisModel
-from hilctl.models.files import parse_model
-from hilctl.recording.data import Recording, ReplayStart
+from hilctl.models.model_file import parse_model
+from hilctl.recording.recording import Recording, ReplayStart
 
 _LIMIT_BITS = int(
     Flag.RANGE_LIMITED | Flag.SLEW_LIMITED | Flag.INVALID | Flag.INVERSE_OUT | NO_WAVEFORM
@@ -75,7 +75,7 @@ def replay(
 
     Args:
         recording: What was recorded, or its pieces in order
-            (:class:`hilctl.recording.reader.Pieces`): then memory does not grow with its length.
+            (:class:`hilctl.recording.reader.RecordingStream`): then memory does not grow with its length.
             They are walked over twice where the inverse went out: what says so may stand behind
             its samples.
         model: Another model to invert instead of the recorded one; it starts from rest, its
@@ -132,7 +132,7 @@ class _Running:
         self._any_start = False
         self._known = self._unbegun = False
         self._before: tuple[int, int] | None = None
-        self._faded: tuple[F64, StraightLine] | None = None
+        self._faded: tuple[F64, LinearBypass] | None = None
         self._comparison = _Comparison(first.command_unit)
 
     def add(self, piece: Recording) -> None:
@@ -240,7 +240,7 @@ class _Running:
                 fade(shares[rows], line, samples.reference_um[rows], wanted, flags)
         self._limiter.limit(wanted, command, flags)
 
-    def _inverse_shares(self, samples: Samples) -> tuple[F64, StraightLine] | None:
+    def _inverse_shares(self, samples: Samples) -> tuple[F64, LinearBypass] | None:
         """Return the inverse's share in each sample, float64[n], and what else is in it.
 
         None where it never went out.
@@ -250,7 +250,7 @@ class _Running:
         """
         if self._fades is None:
             return None
-        line, index, shares = StraightLine(), samples.index, np.ones(samples.index.size)
+        line, index, shares = LinearBypass(), samples.index, np.ones(samples.index.size)
         before, after, begins, lasts = 1.0, 1.0, 0, 1
         for event in self._fades:
             values = event.values
@@ -260,7 +260,7 @@ class _Running:
             rows = slice(int(np.searchsorted(index, begins)), None)
             part = np.minimum(index[rows] - begins + 1, lasts) / lasts
             shares[rows] = on_the_way(before, after, part)
-            line = StraightLine(values["slope"], values["at_zero"])
+            line = LinearBypass(values["slope"], values["at_zero"])
         waveform = (samples.flags & NO_WAVEFORM.value) == 0
         if not (_out(samples) == ((shares < 1.0) & waveform)).all():
             raise DataError(f"{self._path}: /events: when the inverse went out or in is not there")

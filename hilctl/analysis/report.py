@@ -6,18 +6,18 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from hilctl.analysis import timing
-from hilctl.analysis.figures import RunReport, SegmentReport
-from hilctl.analysis.processes import processes_of
-from hilctl.analysis.segment_figures import SegmentGathering
-from hilctl.analysis.steady import judged, waveform_end
+from hilctl.analysis import tick_lateness
+from hilctl.analysis.process_table import processes_of
+from hilctl.analysis.run_metrics import RunReport, SegmentReport
+from hilctl.analysis.segment_metrics import SegmentReportBuilder
+from hilctl.analysis.steady_state import judged, waveform_end
 from hilctl.base.errors import DataError
 from hilctl.base.events import ADAPTED, CHANGES, MARK, Event
-from hilctl.base.metrics import Fold
 from hilctl.base.samples import LAST_SAMPLE, NO_WAVEFORM, Flag, Samples
 from hilctl.base.segments import Segment
 from hilctl.base.types import F64
-from hilctl.recording.data import Recording
+from hilctl.recording.recording import Recording
+from hilctl.signals.cycle_metrics import MeanCycle
 
 _LIMITED = Flag.RANGE_LIMITED | Flag.SLEW_LIMITED | Flag.INVALID
 
@@ -41,7 +41,7 @@ def summarize(recording: Recording | Iterable[Recording]) -> RunReport:
 
     Args:
         recording: The run, or its pieces in order, which can be gone through again
-            (:class:`hilctl.recording.reader.Pieces`): then memory does not grow with its length,
+            (:class:`hilctl.recording.reader.RecordingStream`): then memory does not grow with its length,
             and a run that ended early or was tuned is read twice.
 
     Raises:
@@ -59,10 +59,10 @@ def summarize(recording: Recording | Iterable[Recording]) -> RunReport:
     return gathering.report()
 
 
-def _gathered(pieces: Iterable[Recording], windows: Windows | None) -> "RunGathering":
-    gathering: RunGathering | None = None
+def _gathered(pieces: Iterable[Recording], windows: Windows | None) -> "RunReportBuilder":
+    gathering: RunReportBuilder | None = None
     for piece in pieces:
-        gathering = gathering or RunGathering(piece, windows)
+        gathering = gathering or RunReportBuilder(piece, windows)
         gathering.add(piece)
     if gathering is None:
         raise DataError("there is no recording to judge")
@@ -78,7 +78,7 @@ def _windows(recording: Recording, events: Iterable[Event], end: int) -> Windows
 def judge(recording: Recording, segment: Segment) -> SegmentReport:
     """Work out the figures of one segment; None where it has not been reached."""
     window = judged(segment, recording.events, waveform_end(recording.samples))
-    gathering = SegmentGathering(recording, segment, window)
+    gathering = SegmentReportBuilder(recording, segment, window)
     with np.errstate(over="ignore", invalid="ignore"):
         gathering.add(recording.samples)
     return gathering.report()
@@ -88,7 +88,7 @@ _KEPT = {*CHANGES, ADAPTED, MARK}
 """Codes of events that figures go by, or that are shown among them."""
 
 
-class RunGathering:
+class RunReportBuilder:
     """Gathers the figures of a run, piece by piece.
 
     Args:
@@ -99,9 +99,9 @@ class RunGathering:
     def __init__(self, first: Recording, windows: Windows | None) -> None:
         self.windows = windows if windows is not None else _windows(first, (), LAST_SAMPLE)
         self._last = first
-        self._segments = [SegmentGathering(first, *window) for window in self.windows]
+        self._segments = [SegmentReportBuilder(first, *window) for window in self.windows]
         longest = max((segment.stop for segment in first.segments), default=0)
-        self._ticks = timing.TickGathering(longest / first.sample_rate_hz / 60.0)
+        self._ticks = tick_lateness.LatenessBuilder(longest / first.sample_rate_hz / 60.0)
         self._events: list[Event] = []
         self._counts: Counter[str] = Counter()
         self._waveform: tuple[int, int] | None = None
@@ -138,7 +138,7 @@ class RunGathering:
         """Return what is to be judged by how far the run got and how it was tuned: at the end."""
         return _windows(self._last, self._events, self._waveform[1] if self._waveform else 0)
 
-    def cycles(self) -> list[Fold | None]:
+    def cycles(self) -> list[MeanCycle | None]:
         """Return the average cycle of each segment, at the end; None where it has no period."""
         return [segment.cycle() for segment in self._segments]
 
@@ -184,9 +184,9 @@ class RunGathering:
     def _timing(self) -> dict[str, Any]:
         ticks, last = self._ticks, self._last
         return {
-            "deadline_misses": timing.misses(last, ticks.ticks),
-            "skipped_ticks": timing.counter(last, "skipped_ticks", None),
-            "late_ticks": timing.counter(last, "late_ticks", ticks.late_ticks()),
+            "deadline_misses": tick_lateness.misses(last, ticks.ticks),
+            "skipped_ticks": tick_lateness.counter(last, "skipped_ticks", None),
+            "late_ticks": tick_lateness.counter(last, "late_ticks", ticks.late_ticks()),
             "lateness_us": ticks.late_us(),
             "lateness_by_minute": ticks.by_minute(),
             "exchange_us": ticks.exchange_us(),

@@ -5,15 +5,15 @@ from pathlib import Path
 
 import numpy as np
 
-from hilctl.analysis import html, loops, plots, table
-from hilctl.analysis.figures import RunReport
+from hilctl.analysis import html, loop_plot, plots, report_table
+from hilctl.analysis.figure_layout import FigureSpec
 from hilctl.analysis.html import definitions_of
 from hilctl.analysis.provenance import FAULT, provenance_rows
 from hilctl.analysis.report import worst_segment
-from hilctl.analysis.sheet import Sheet
+from hilctl.analysis.run_metrics import RunReport
 from hilctl.base.events import Event
 from hilctl.base.formatting import quantity
-from hilctl.recording.data import Recording
+from hilctl.recording.recording import Recording
 
 _MOST_EVENTS = 200
 _MOST_FAULTS = 3
@@ -46,12 +46,14 @@ def page(recording: Recording, report: RunReport, before: Recording | None = Non
         html.paragraph(report.path, "file"),
         *_fault(recording, report),
         html.paragraph(headline(report), "headline"),
-        html.paragraph(f"The device is {table.SIMULATED}.", "note") if report.simulated else "",
+        html.paragraph(f"The device is {report_table.SIMULATED}.", "note")
+        if report.simulated
+        else "",
         *_figures(recording, report, before),
         '<div class="side">',
-        html.rows("Figures", table.quality_rows(report)),
+        html.rows("Figures", report_table.quality_rows(report)),
         html.rows("Run", provenance_rows(recording)),
-        html.rows("Samples and timing", table.run_rows(report)),
+        html.rows("Samples and timing", report_table.run_rows(report)),
         "</div>",
         *_segments(report),
         *_events(recording.events),
@@ -107,7 +109,7 @@ def _figures(recording: Recording, report: RunReport, before: Recording | None) 
             yield html.paragraph(otherwise)
 
 
-def run_sheets(recording: Recording, report: RunReport) -> list[Sheet]:
+def run_sheets(recording: Recording, report: RunReport) -> list[FigureSpec]:
     """Return the figures of a run's page, those that apply.
 
     Args:
@@ -121,13 +123,13 @@ def run_sheets(recording: Recording, report: RunReport) -> list[Sheet]:
 
 def _sheets(
     recording: Recording, report: RunReport, before: Recording | None
-) -> list[tuple[Sheet | None, str]]:
+) -> list[tuple[FigureSpec | None, str]]:
     """Return each figure, or what is said in its place."""
     focus = worst_segment(report.segments)
     no_error = "No error is drawn: no sample has a reference displacement."
     return [
-        (loops.before_and_after(before, recording) if before else None, ""),
-        (loops.hysteresis_loop(recording, focus), "No steady samples were recorded."),
+        (loop_plot.before_and_after(before, recording) if before else None, ""),
+        (loop_plot.hysteresis_loop(recording, focus), "No steady samples were recorded."),
         (plots.steady_cycles(recording, focus), ""),
         (plots.error(recording, focus), no_error),
         (plots.spectrum(recording, focus), ""),
@@ -147,7 +149,7 @@ def _segments(report: RunReport) -> list[str]:
     if len(report.segments) < 2:
         return []
     note = html.paragraph("The figures above are the worst of these.")
-    headings, rows = table.segment_table(report)
+    headings, rows = report_table.segment_table(report)
     return ["<h2>By segment</h2>", note, html.grid(headings, rows, "numbers")]
 
 

@@ -28,6 +28,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from hilctl.api.campaigns import campaign, characterise, learn
     from hilctl.api.connection import RunConnection, connect
+    from hilctl.api.init import WrittenExperiment, init
     from hilctl.api.models import compare, identify, refine
     from hilctl.api.recordings import (
         RecordedRun,
@@ -40,8 +41,7 @@ if TYPE_CHECKING:
         report_runs,
         summarize,
     )
-    from hilctl.api.running import check, load, run
-    from hilctl.api.starting import WrittenExperiment, init
+    from hilctl.api.runs import check, load, run
     from hilctl.api.table import SampleTable
 
 __all__ = [

@@ -8,28 +8,32 @@ from pathlib import Path
 from hilctl.api.given import PathLike, Settings, path_or_none, runs_folder, texts_of
 from hilctl.base.errors import InputError
 from hilctl.base.files import check_no_input, check_writable
-from hilctl.campaign.fast import planned_fast, run_fast
-from hilctl.campaign.folder import campaign_folder
-from hilctl.campaign.plan import SeriesPlan
-from hilctl.campaign.session import (
-    SeriesHost,
-    SeriesResult,
+from hilctl.experiment.correction import write_correction
+from hilctl.experiment.load import inputs_of
+from hilctl.ilc.ilc_session import IlcSession
+from hilctl.ilc.results import IlcResult, IlcRow
+from hilctl.recording.run_summary import recordings_in
+from hilctl.run.dead_runs import finish_dead_runs
+from hilctl.run.start import paced, unpaced
+from hilctl.studies.campaign.campaign_runner import (
+    CampaignHost,
+    CampaignResult,
     planned_in_real_time,
     prepared,
     run_series,
 )
-from hilctl.campaign.steps import CampaignSteps, SeriesStep, load_campaign
-from hilctl.campaign.table import SeriesRow
-from hilctl.characterise.page import write_characterisation
-from hilctl.characterise.results import Characterisation, StepRow
-from hilctl.characterise.session import Campaign, CampaignHost, CampaignPlan
-from hilctl.experiment.correction import write_correction
-from hilctl.experiment.load import inputs_of
-from hilctl.learning.results import Learned, Row
-from hilctl.learning.session import Session
-from hilctl.recording.ends import recordings_in
-from hilctl.run.dead_runs import finish_dead_runs
-from hilctl.run.start import paced, unpaced
+from hilctl.studies.campaign.parallel_simulation import planned_fast, run_fast
+from hilctl.studies.campaign.plan import CampaignPlan
+from hilctl.studies.campaign.steps import CampaignStep, CampaignSteps, load_campaign
+from hilctl.studies.campaign.store import campaign_folder
+from hilctl.studies.campaign.table import CampaignRow
+from hilctl.studies.characterise.characterisation_runner import (
+    CharacterisationHost,
+    CharacterisationPlan,
+    CharacterisationRunner,
+)
+from hilctl.studies.characterise.results import Characterisation, StepRow
+from hilctl.studies.characterise.rig_page import write_characterisation
 
 
 def _nothing(*_ignored: object) -> None:
@@ -47,7 +51,7 @@ def characterise(
     overwrite: bool = False,
     dry_run: bool = False,
     on_progress: Callable[[float, str], None] = _nothing,
-    on_plan: "Callable[[CampaignPlan], None]" = _nothing,
+    on_plan: "Callable[[CharacterisationPlan], None]" = _nothing,
     on_step: "Callable[[StepRow], None]" = _nothing,
 ) -> "Characterisation | None":
     """Find a model of a wired actuator: measure within its limits, identify, judge.
@@ -78,8 +82,12 @@ def characterise(
     page = file.with_suffix(".html")
     if page == file:
         raise InputError(f"{file}: is the name of the page: give the model another one, .yaml")
-    host = CampaignHost(run=unpaced if fast else paced, on_progress=on_progress, on_step=on_step)
-    measured = Campaign(Path(experiment), texts_of(settings), chosen, highest_hz, host)
+    host = CharacterisationHost(
+        run=unpaced if fast else paced, on_progress=on_progress, on_step=on_step
+    )
+    measured = CharacterisationRunner(
+        Path(experiment), texts_of(settings), chosen, highest_hz, host
+    )
     if not dry_run:
         inputs = inputs_of(Path(experiment), texts_of(settings))
         check_writable(file, overwrite=overwrite, inputs=inputs)
@@ -108,10 +116,10 @@ def campaign(
     scheduler: str = "none",
     dry_run: bool = False,
     on_progress: Callable[[float, str], None] = _nothing,
-    on_plan: "Callable[[SeriesPlan], None]" = _nothing,
-    on_row: "Callable[[SeriesStep, SeriesRow], None]" = _nothing,
+    on_plan: "Callable[[CampaignPlan], None]" = _nothing,
+    on_row: "Callable[[CampaignStep, CampaignRow], None]" = _nothing,
     on_note: Callable[[str], None] = _nothing,
-) -> "SeriesResult | None":
+) -> "CampaignResult | None":
     """Run an experiment again and again with other values of its keys; goes on where it was.
 
     Args:
@@ -133,7 +141,7 @@ def campaign(
         InputError: Something can't be used; nothing has moved.
         RunError: A danger to device or rig ended it; what stands is kept.
     """
-    host = replace(SeriesHost(), on_progress=on_progress, on_row=on_row, on_note=on_note)
+    host = replace(CampaignHost(), on_progress=on_progress, on_row=on_row, on_note=on_note)
     steps = load_campaign(Path(file), texts_of(settings))
     return run_steps(
         steps, path_or_none(folder), host,
@@ -150,8 +158,8 @@ def learn(
     settings: Settings = (),
     fast: bool = False,
     overwrite: bool = False,
-    on_rows: "Callable[[Sequence[Row]], None]" = lambda rows: None,
-) -> "Learned":
+    on_rows: "Callable[[Sequence[IlcRow]], None]" = lambda rows: None,
+) -> "IlcResult":
     """Learn a correction for a reference that repeats: run, correct, and run again.
 
     Args:
@@ -174,7 +182,7 @@ def learn(
         check_no_input(path, inputs)
     if not overwrite and any(chosen.glob("run-*.mcap")):
         raise InputError(f"{chosen}: holds runs already: give another --folder, or --overwrite")
-    session = Session(Path(experiment), texts_of(settings), chosen, unpaced if fast else paced)
+    session = IlcSession(Path(experiment), texts_of(settings), chosen, unpaced if fast else paced)
     learned = session.learn(cycles, on_rows)
     write_correction(file, learned.correction, overwrite=overwrite)
     return learned
@@ -183,13 +191,13 @@ def learn(
 def run_steps(
     steps: "CampaignSteps",
     folder: Path | None,
-    host: "SeriesHost",
+    host: "CampaignHost",
     *,
     fast: bool,
     scheduler: str,
     dry_run: bool,
-    on_plan: "Callable[[SeriesPlan], None]",
-) -> "SeriesResult | None":
+    on_plan: "Callable[[CampaignPlan], None]",
+) -> "CampaignResult | None":
     """Run the steps of a campaign, wherever they come from; see :func:`campaign`."""
     if scheduler != "none" and not fast:
         rule = "for fast runs only; those that keep real time follow each other"
@@ -206,7 +214,9 @@ def run_steps(
         return run_fast(plan, host, scheduler) if fast else run_series(plan, host)
 
 
-def _plan(steps: "CampaignSteps", folder: Path, host: "SeriesHost", *, fast: bool) -> "SeriesPlan":
+def _plan(
+    steps: "CampaignSteps", folder: Path, host: "CampaignHost", *, fast: bool
+) -> "CampaignPlan":
 
     host.on_progress(0.0, "check every step")
     if fast:

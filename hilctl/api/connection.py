@@ -14,7 +14,7 @@ from hilctl.run.protocol import InverseState
 from hilctl.run.run_folder import RunFolder
 
 if TYPE_CHECKING:
-    from hilctl.desk.frames import RunFrame
+    from hilctl.live.frame_codec import RunFrame
 
 
 def connect(run: str | None = None) -> "RunConnection":
@@ -106,10 +106,10 @@ class RunConnection:
         for name, value, least in (("every_s", every_s, 0.0), ("window_s", window_s, 1e-3)):
             if not least <= value <= 1e5:
                 raise InputError(f"{name}: must be from {least:g} to 100000 s: got {value:g}")
-        from hilctl.desk.feed import RunFeed
-        from hilctl.desk.frames import frames_of
+        from hilctl.live.frame_codec import frames_of
+        from hilctl.live.run_reader import RunReader
 
-        return frames_of(RunFeed(self._folder), every_s, window_s, time.monotonic, time.sleep)
+        return frames_of(RunReader(self._folder), every_s, window_s, time.monotonic, time.sleep)
 
     def stop(self, wait_s: float = 60.0) -> None:
         """End it by its safe ramp, and wait until its recording is closed.

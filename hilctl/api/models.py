@@ -9,10 +9,10 @@ from hilctl.api.given import PathLike, Paths, Settings, path_or_none, paths_of, 
 from hilctl.base.files import check_writable
 from hilctl.comparison import compare as library
 from hilctl.comparison.compare import Comparison
-from hilctl.comparison.page import write_comparison
+from hilctl.comparison.comparison_page import write_comparison
 from hilctl.experiment.load import inputs_of
 from hilctl.identify.command import Identification, identify_files, settings_from
-from hilctl.identify.refine.command import Refinement, refine_files
+from hilctl.identify.refine.refinement import Refinement, refine_files
 from hilctl.run.dead_runs import finish_dead_runs
 
 

@@ -9,24 +9,24 @@ from typing import TYPE_CHECKING, Any, Literal
 from hilctl.analysis.catalogue import read_catalogue, select
 from hilctl.analysis.export import columns, units
 from hilctl.analysis.export import export as write
-from hilctl.analysis.figures import RunReport
 from hilctl.analysis.report import summarize as judge
+from hilctl.analysis.run_metrics import RunReport
 from hilctl.api.given import PathLike, Paths, paths_of
 from hilctl.api.table import SampleTable
 from hilctl.base.errors import InputError
 from hilctl.base.files import check_writable
-from hilctl.recording.data import Recording
-from hilctl.recording.reader import Pieces
+from hilctl.recording.reader import RecordingStream
 from hilctl.recording.reader import read as read_file
-from hilctl.recording.stretch import Stretch
+from hilctl.recording.recording import Recording
+from hilctl.recording.time_range import TimeRange
 from hilctl.run.dead_runs import finish_dead_runs
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+    from hilctl.analysis.figure_layout import FigureSpec
     from hilctl.analysis.replay import ReplayResult
-    from hilctl.analysis.sheet import Sheet
-    from hilctl.series.collect import RunSeries
+    from hilctl.studies.multi_run.collect import RunSeries
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class RecordedRun:
     """A recording, read.
 
     Attributes:
-        recording: All that it holds, see :class:`hilctl.recording.data.Recording`: samples,
+        recording: All that it holds, see :class:`hilctl.recording.recording.Recording`: samples,
             segments, ticks, events, and the facts of the run.
     """
 
@@ -78,9 +78,9 @@ def read(path: PathLike, *, from_s: float | None = None, to_s: float | None = No
     return RecordedRun(read_file(Path(path), _stretch(from_s, to_s)))
 
 
-def _stretch(from_s: float | None, to_s: float | None) -> "Stretch | None":
+def _stretch(from_s: float | None, to_s: float | None) -> "TimeRange | None":
 
-    return None if from_s is None and to_s is None else Stretch(from_s, to_s)
+    return None if from_s is None and to_s is None else TimeRange(from_s, to_s)
 
 
 def summarize(
@@ -123,7 +123,7 @@ def report_page(
         InputError: There is no such file, or the page can't be written.
         DataError: It is no recording.
     """
-    from hilctl.analysis.overview import overview
+    from hilctl.analysis.decimation import overview
     from hilctl.analysis.run_page import write_html
 
     page = Path(html)
@@ -160,7 +160,7 @@ def report_runs(
         check_writable(Path(html), overwrite=overwrite, inputs=inputs)
     series = _series(runs, model, on_progress)
     if html is not None:
-        from hilctl.series.page import write_series
+        from hilctl.studies.multi_run.multi_run_page import write_series
 
         write_series(series, Path(html))
     return series
@@ -169,18 +169,20 @@ def report_runs(
 def _series(
     runs: Paths, model: PathLike | None, on_progress: Callable[[float, str], None]
 ) -> "RunSeries":
-    from hilctl.models.files import load_model
-    from hilctl.series.collect import collect
+    from hilctl.models.model_file import load_model
+    from hilctl.studies.multi_run.collect import collect
 
     finish_dead_runs()
     known = None if model is None else load_model(Path(model))
     return collect(paths_of(runs), known, on_progress)
 
 
-def _pieces(run: PathLike, from_s: float | None = None, to_s: float | None = None) -> "Pieces":
+def _pieces(
+    run: PathLike, from_s: float | None = None, to_s: float | None = None
+) -> "RecordingStream":
 
     finish_dead_runs()
-    return Pieces(Path(run), _stretch(from_s, to_s))
+    return RecordingStream(Path(run), _stretch(from_s, to_s))
 
 
 def replay(run: RecordedRun | PathLike, model: PathLike | None = None) -> "ReplayResult":
@@ -195,7 +197,7 @@ def replay(run: RecordedRun | PathLike, model: PathLike | None = None) -> "Repla
         DataError: It is no recording, or can't be replayed.
     """
     from hilctl.analysis.replay import replay as recompute
-    from hilctl.models.files import load_model
+    from hilctl.models.model_file import load_model
 
     other = None if model is None else load_model(Path(model))
     recorded = run.recording if isinstance(run, RecordedRun) else _pieces(run)
@@ -279,8 +281,8 @@ def figures(
         InputError: A run can't be read, no figure applies, or a file can't be written.
         DataError: A recording that was named can't be read.
     """
-    from hilctl.analysis.vector import formats_of
-    from hilctl.series.sheets import draw_sheets, write_sheets
+    from hilctl.analysis.figure_export import formats_of
+    from hilctl.studies.multi_run.plots import draw_sheets, write_sheets
 
     chosen = formats_of(formats)
     sheets = _sheets(paths_of(runs), model, on_progress)
@@ -299,12 +301,12 @@ def figures(
 
 def _sheets(
     runs: list[Path], model: PathLike | None, on_progress: Callable[[float, str], None]
-) -> "list[Sheet]":
-    from hilctl.series.sheets import applying_sheets
+) -> "list[FigureSpec]":
+    from hilctl.studies.multi_run.plots import applying_sheets
 
     if len(runs) > 1 or runs[0].is_dir() or model is not None:
         return applying_sheets(_series(runs, model, on_progress))
-    from hilctl.analysis.overview import overview
+    from hilctl.analysis.decimation import overview
     from hilctl.analysis.run_page import run_sheets
 
     summary, shown = overview(_pieces(runs[0]))

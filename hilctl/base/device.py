@@ -9,11 +9,11 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
 from hilctl.base.errors import InputError
-from hilctl.base.strict import Strict
+from hilctl.base.strict import StrictModel
 from hilctl.base.types import F64, CommandUnit
 
 
-class DeviceOptions(Strict):
+class DeviceOptions(StrictModel):
     """Base of a device's own options in the experiment file: frozen, strict, no unknown keys."""
 
 

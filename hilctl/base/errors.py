@@ -27,7 +27,7 @@ class InputError(HilctlError):
 
 
 @dataclass(frozen=True, slots=True)
-class Problem:
+class ConfigProblem:
     """One broken rule in a user's file.
 
     Attributes:
@@ -62,11 +62,11 @@ class ConfigError(InputError):
     compensator with a reference in amperes, a reference outside the model's range.
     """
 
-    def __init__(self, problems: Iterable[Problem]) -> None:
+    def __init__(self, problems: Iterable[ConfigProblem]) -> None:
         self.problems = tuple(problems)
         super().__init__("\n".join(str(problem) for problem in self.problems))
 
-    def __reduce__(self) -> tuple[type["ConfigError"], tuple[tuple[Problem, ...]]]:
+    def __reduce__(self) -> tuple[type["ConfigError"], tuple[tuple[ConfigProblem, ...]]]:
         return ConfigError, (self.problems,)
 
 

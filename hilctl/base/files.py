@@ -10,7 +10,7 @@ from types import TracebackType
 from typing import BinaryIO, Self
 
 from hilctl.base.errors import InputError
-from hilctl.base.remedy import no_such_file, reason
+from hilctl.base.os_errors import no_such_file, reason
 
 
 class TextFiles:

@@ -199,7 +199,7 @@ ANSWERS = [row for row, each in enumerate(COLUMNS.values()) if each.answered]
 _ALL = slice(None)
 
 
-class Head(IntEnum):
+class BlockHeader(IntEnum):
     """Numbers at the head of each block, int64 each."""
 
     SEQUENCE = 0
@@ -212,7 +212,7 @@ class Head(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Batch:
+class BlockBatch:
     """k blocks with B samples each.
 
     Attributes:
@@ -229,18 +229,18 @@ class Batch:
     flags: U32
 
     @classmethod
-    def empty(cls, blocks: int, block: int, state_size: int) -> "Batch":
+    def empty(cls, blocks: int, block: int, state_size: int) -> "BlockBatch":
         """Return room for blocks, in this process's own memory."""
         return cls(
-            np.zeros((blocks, len(Head)), dtype=np.int64),
+            np.zeros((blocks, len(BlockHeader)), dtype=np.int64),
             np.zeros((blocks, state_size)),
             np.full((blocks, len(COLUMNS), block), np.nan),
             np.zeros((blocks, block), dtype=np.uint32),
         )
 
-    def rows(self, chosen: slice | I64) -> "Batch":
+    def rows(self, chosen: slice | I64) -> "BlockBatch":
         """Return a copy of some blocks."""
-        return Batch(
+        return BlockBatch(
             self.heads[chosen].copy(),
             self.states[chosen].copy(),
             self.columns[chosen].copy(),
@@ -254,7 +254,7 @@ class Batch:
 
     def index(self, blocks: slice = _ALL) -> I64:
         """Return the sample indices of some blocks, one after the other."""
-        firsts = self.heads[blocks, Head.FIRST_SAMPLE]
+        firsts = self.heads[blocks, BlockHeader.FIRST_SAMPLE]
         index: I64 = (firsts[:, None] + np.arange(self.flags.shape[1])).ravel()
         return index
 

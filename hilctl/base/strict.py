@@ -18,7 +18,7 @@ __all__ = [
     "AfterValidator",
     "BeforeValidator",
     "Field",
-    "Strict",
+    "StrictModel",
     "StringConstraints",
     "ValidationError",
     "ValidationInfo",
@@ -28,7 +28,7 @@ __all__ = [
 ]
 
 
-class Strict(BaseModel):
+class StrictModel(BaseModel):
     """A frozen model that takes no unknown key, no other type, no NaN, no infinity."""
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)

@@ -16,12 +16,8 @@ from rich.text import Text
 from hilctl import api
 from hilctl.api.campaigns import run_steps
 from hilctl.api.given import runs_folder
-from hilctl.base.errors import ConfigError, InputError, Problem
+from hilctl.base.errors import ConfigError, ConfigProblem, InputError
 from hilctl.base.yaml import Document
-from hilctl.campaign.plan import SeriesPlan
-from hilctl.campaign.session import SeriesHost, SeriesResult
-from hilctl.campaign.steps import CampaignSteps, SeriesStep, campaign_of, cell, load_campaign
-from hilctl.campaign.table import SeriesRow
 from hilctl.cli.console import console, progress_bar
 from hilctl.cli.options import (
     AsJson,
@@ -33,11 +29,21 @@ from hilctl.cli.options import (
     Settings,
 )
 from hilctl.cli.safe_streams import print_json
-from hilctl.experiment.labels import label_settings
-from hilctl.learning.results import Learned, Row
-from hilctl.learning.session import correction_setting
+from hilctl.experiment.run_labels import label_settings
+from hilctl.ilc.ilc_session import correction_setting
+from hilctl.ilc.results import IlcResult, IlcRow
 from hilctl.run.dead_runs import finish_dead_runs
-from hilctl.series.columns import COMPLETED
+from hilctl.studies.campaign.campaign_runner import CampaignHost, CampaignResult
+from hilctl.studies.campaign.plan import CampaignPlan
+from hilctl.studies.campaign.steps import (
+    CampaignStep,
+    CampaignSteps,
+    campaign_of,
+    cell,
+    load_campaign,
+)
+from hilctl.studies.campaign.table import CampaignRow
+from hilctl.studies.multi_run.columns import COMPLETED
 
 _RESUMES = "the same command resumes from there"
 Folder = Annotated[
@@ -105,7 +111,7 @@ def sweep_document(experiment: Path, vary: Sequence[str], repeat: int) -> Docume
         key, equals, values = (part.strip() for part in text.partition("="))
         if not (key and equals and values):
             rule = "must be KEY=1,2,5 or KEY=first:last:count"
-            problems.append(Problem(f"--vary {text}", "", rule))
+            problems.append(ConfigProblem(f"--vary {text}", "", rule))
         listed = values if ":" in values and "{" not in values else f"[{values}]"
         lines.append(f"  {json.dumps(key)}: {listed}")
     if problems:
@@ -126,14 +132,14 @@ def _run_campaign(
     if scheduler != "none" and not fast:
         raise InputError("--scheduler needs --fast: runs in real time are sequential")
 
-    def on_plan(plan: SeriesPlan) -> None:
+    def on_plan(plan: CampaignPlan) -> None:
         if not as_json:
             print_plan(plan, fast=fast, every_step=dry_run)
         elif dry_run:
             print_json(plan_mapping(plan))
 
     with progress_bar("campaign", quiet=as_json) as on_progress:
-        host = SeriesHost(on_progress=on_progress, on_note=_note)
+        host = CampaignHost(on_progress=on_progress, on_note=_note)
         host = host if as_json else replace(host, on_row=print_row)
         try:
             result = run_steps(
@@ -151,7 +157,7 @@ def _note(text: str) -> None:
     print(f"hilctl: {text}", file=sys.stderr)
 
 
-def _finish(result: SeriesResult, *, as_json: bool) -> None:
+def _finish(result: CampaignResult, *, as_json: bool) -> None:
     if as_json:
         print_json(result_mapping(result))
     else:
@@ -165,7 +171,7 @@ def _finish(result: SeriesResult, *, as_json: bool) -> None:
         raise typer.Exit(3)
 
 
-def plan_mapping(plan: SeriesPlan) -> dict[str, Any]:
+def plan_mapping(plan: CampaignPlan) -> dict[str, Any]:
     """Return a plan as plain values."""
     return {
         "campaign": plan.campaign.config.name,
@@ -191,7 +197,7 @@ def plan_mapping(plan: SeriesPlan) -> dict[str, Any]:
     }
 
 
-def print_plan(plan: SeriesPlan, *, fast: bool, every_step: bool) -> None:
+def print_plan(plan: CampaignPlan, *, fast: bool, every_step: bool) -> None:
     """Print the plan of a campaign.
 
     Args:
@@ -212,7 +218,7 @@ def print_plan(plan: SeriesPlan, *, fast: bool, every_step: bool) -> None:
     terminal.print(f"{count}; {time}{pauses}{how}; {disk}", soft_wrap=True)
 
 
-def _steps(plan: SeriesPlan) -> Table:
+def _steps(plan: CampaignPlan) -> Table:
     table = Table(title=Text(f"{plan.campaign.config.name}: steps"), title_justify="left")
     for name in ("step", *plan.campaign.keys, "s", "pause s", "coil A rms", ""):
         table.add_column(name, justify="right")
@@ -243,7 +249,7 @@ def _duration(seconds: float) -> str:
     return f"{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d}"
 
 
-def print_row(step: SeriesStep, row: SeriesRow) -> None:
+def print_row(step: CampaignStep, row: CampaignRow) -> None:
     """Print a completed step."""
     values = "  ".join(f"{key}={_shown(value)}" for key, value in step.point.items())
     figures = row.figures
@@ -259,7 +265,7 @@ def print_row(step: SeriesStep, row: SeriesRow) -> None:
     print(f"{step.number:4d}  {values or 'reference run'}  {kept}{text}", flush=True)
 
 
-def result_mapping(result: SeriesResult) -> dict[str, Any]:
+def result_mapping(result: CampaignResult) -> dict[str, Any]:
     """Return the result of a campaign as plain values."""
     codes = [row.code for _, row in result.ordered]
     return {
@@ -274,7 +280,7 @@ def result_mapping(result: SeriesResult) -> dict[str, Any]:
     }
 
 
-def print_result(result: SeriesResult) -> None:
+def print_result(result: CampaignResult) -> None:
     """Print the result of a campaign, its drift and its files."""
     terminal = console()
     counts = result_mapping(result)["results"]
@@ -326,7 +332,7 @@ def learn(
         raise typer.Exit(3)
 
 
-def _print_iteration(rows: Sequence[Row]) -> None:
+def _print_iteration(rows: Sequence[IlcRow]) -> None:
     for row in rows:
         name = f"  {row.label}" if len(rows) > 1 else ""
         reach = f"learning bandwidth {row.reach_hz:.0f} Hz" if row.run else "start"
@@ -334,7 +340,7 @@ def _print_iteration(rows: Sequence[Row]) -> None:
         print(f"run {row.run:2d}  {error}  {reach}{name}", flush=True)
 
 
-def _print_learned(learned: Learned, output: Path, folder: Path) -> None:
+def _print_learned(learned: IlcResult, output: Path, folder: Path) -> None:
     checks = {row.label: row for row in learned.check}
     last = {row.label: row for row in learned.rows}
     table = Table(title=Text(f"learned: {learned.reason}"), title_justify="left")

@@ -12,9 +12,6 @@ from rich.text import Text
 from hilctl import api
 from hilctl.api.given import runs_folder
 from hilctl.base.errors import RunError
-from hilctl.characterise.page import HELD_OUT_HEADINGS, figure_rows, held_out_rows
-from hilctl.characterise.results import Characterisation, StepRow
-from hilctl.characterise.session import CampaignPlan
 from hilctl.cli.console import console, progress_bar
 from hilctl.cli.options import (
     AsJson,
@@ -26,8 +23,11 @@ from hilctl.cli.options import (
     Settings,
 )
 from hilctl.cli.safe_streams import print_json
-from hilctl.experiment.labels import label_settings
+from hilctl.experiment.run_labels import label_settings
 from hilctl.run.start import StepStoppedError
+from hilctl.studies.characterise.characterisation_runner import CharacterisationPlan
+from hilctl.studies.characterise.results import Characterisation, StepRow
+from hilctl.studies.characterise.rig_page import HELD_OUT_HEADINGS, figure_rows, held_out_rows
 
 _RESUMES = "the same command resumes from this step"
 
@@ -52,7 +52,7 @@ def characterise(
     """Measure a connected actuator within its limits, then identify and validate a model."""
     chosen = runs_folder(output, folder)
 
-    def on_plan(plan: CampaignPlan) -> None:
+    def on_plan(plan: CharacterisationPlan) -> None:
         if not as_json:
             print_plan(plan, chosen)
         elif dry_run:
@@ -107,7 +107,7 @@ def _finish(
         raise typer.Exit(1)
 
 
-def plan_mapping(plan: CampaignPlan) -> dict[str, Any]:
+def plan_mapping(plan: CharacterisationPlan) -> dict[str, Any]:
     """Return a plan as plain values."""
     limits = plan.limits
     return {
@@ -127,7 +127,7 @@ def plan_mapping(plan: CampaignPlan) -> dict[str, Any]:
     }
 
 
-def print_plan(plan: CampaignPlan, folder: Path) -> None:
+def print_plan(plan: CharacterisationPlan, folder: Path) -> None:
     """Print the steps of a characterisation and their largest extent."""
     limits = plan.limits
     table = Table(title=Text(f"{limits.loaded.device.info.name}: steps"), title_justify="left")

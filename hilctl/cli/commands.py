@@ -138,7 +138,7 @@ COMMANDS: dict[str, CommandEntry] = {
         "List devices, shipped profiles and serial ports (opens none).",
     ),
     "emulate": CommandEntry(
-        "hilctl_drivers.emulator.command:emulate",
+        "hilctl_drivers.emulator.emulate_command:emulate",
         "Emulate a device with the simulated rig, until Ctrl-C.",
     ),
     "schema": CommandEntry(

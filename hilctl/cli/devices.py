@@ -16,11 +16,11 @@ from hilctl import api
 from hilctl.cli.console import console, print_rich
 from hilctl.cli.options import AsJson, ExperimentFile, Settings
 from hilctl.cli.safe_streams import print_json
-from hilctl.experiment.inventory import Described, Inventory, describe, inventory
+from hilctl.experiment.inventory import DeviceDescription, Inventory, describe, inventory
 from hilctl.machine.diagnosis import DEFAULT_RATE_HZ, Diagnosis, diagnose, lateness_counts
-from hilctl.machine.latency import Latency
-from hilctl.machine.realtime import SetUpStep
+from hilctl.machine.rt_setup import SetUpStep
 from hilctl.machine.settings import Realtime
+from hilctl.machine.timer_latency import Latency
 from hilctl.run.architecture import require_linux
 
 if TYPE_CHECKING:
@@ -195,7 +195,7 @@ def print_inventory(listed: Inventory) -> None:
     terminal.print(ports if listed.serial_ports else "no serial port found", soft_wrap=True)
 
 
-def print_described(described: Described) -> None:
+def print_described(described: DeviceDescription) -> None:
     """Print the options of a device, or the content of a profile."""
     terminal = console()
     terminal.print(f"{described.name}: {described.place}", soft_wrap=True, markup=False)
@@ -214,7 +214,7 @@ def print_described(described: Described) -> None:
             terminal.print(f"{key}: {_plain(text)}", markup=False, soft_wrap=True)
 
 
-def _options(described: Described) -> Table:
+def _options(described: DeviceDescription) -> Table:
     table = Table(box=None)
     for heading in ("key", "default", "meaning"):
         table.add_column(heading, no_wrap=heading == "key")

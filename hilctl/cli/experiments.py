@@ -10,7 +10,7 @@ import typer
 from rich.table import Table
 
 from hilctl import api
-from hilctl.api.starting import default_path, is_set, refuse_existing
+from hilctl.api.init import default_path, is_set, refuse_existing
 from hilctl.base.errors import InputError
 from hilctl.base.files import read_text, write_text
 from hilctl.cli.console import print_rich
@@ -20,7 +20,7 @@ from hilctl.cli.safe_streams import print_json
 from hilctl.experiment.device import known_devices
 from hilctl.experiment.examples import copy_example, examples_folder, shipped_examples
 from hilctl.experiment.inventory import schema_text, shipped_profiles
-from hilctl.experiment.starting import LIMITS_ASKED, starting_device
+from hilctl.experiment.template import LIMITS_ASKED, starting_device
 from hilctl.run.architecture import require_linux
 from hilctl.run.dead_runs import finish_dead_runs
 

@@ -6,7 +6,7 @@ import typer
 
 from hilctl.cli.options import AsJson
 from hilctl.cli.safe_streams import print_json
-from hilctl.desk.live import ShowsRuns, UntilEnded, serve_foxglove, serve_runs
+from hilctl.live.server_process import RunSelector, SingleRun, serve_foxglove, serve_runs
 from hilctl.run.architecture import require_linux
 from hilctl.run.client import find_run
 from hilctl.run.run_folder import RunFolder
@@ -45,9 +45,9 @@ def live(
             return first
         return runs[0] if runs else None
 
-    ended = UntilEnded()
+    ended = SingleRun()
 
-    def over(server: ShowsRuns) -> bool:
+    def over(server: RunSelector) -> bool:
         if first is None:
             return False
         # A run that ended before the server could read it has no feed.

@@ -18,14 +18,14 @@ from hilctl.cli.options import AsJson, Overwrite, Settings
 from hilctl.cli.safe_streams import print_json
 from hilctl.comparison.compare import Comparison
 from hilctl.comparison.summary import headings, notes, table_rows, titles
-from hilctl.identify.catalogue import CATALOGUE
 from hilctl.identify.command import Identification
-from hilctl.identify.judge import LoopError
-from hilctl.identify.model_size import OrderError
-from hilctl.identify.page import write_identification
-from hilctl.identify.refine.command import Refinement
-from hilctl.identify.refine.page import HEADINGS as REFINEMENT_HEADINGS
-from hilctl.identify.refine.page import refinement_rows, write_refinement
+from hilctl.identify.evaluation import LoopScore
+from hilctl.identify.model_page import write_identification
+from hilctl.identify.order_selection import OrderScore
+from hilctl.identify.refine.refined_page import HEADINGS as REFINEMENT_HEADINGS
+from hilctl.identify.refine.refined_page import refinement_rows, write_refinement
+from hilctl.identify.refine.refinement import Refinement
+from hilctl.identify.registry import CATALOGUE
 from hilctl.identify.settings import setting_rows
 from hilctl.identify.summary import HEADINGS, error_rows, parameter_texts, summary
 from hilctl.run.dead_runs import finish_dead_runs
@@ -277,7 +277,7 @@ def print_identification(result: Identification, output: Path | None) -> None:
         terminal.print(f"{output}: not written", soft_wrap=True)
 
 
-def _errors_table(title: str, errors: Sequence[LoopError]) -> Table:
+def _errors_table(title: str, errors: Sequence[LoopScore]) -> Table:
     table = Table(title=title)
     for name in HEADINGS:
         table.add_column(name, justify="left" if name == "loop" else "right")
@@ -286,7 +286,7 @@ def _errors_table(title: str, errors: Sequence[LoopError]) -> Table:
     return table
 
 
-def _orders_table(orders: Sequence[OrderError]) -> Table:
+def _orders_table(orders: Sequence[OrderScore]) -> Table:
     table = Table(title="errors on validation loops")
     for name in ("plays", "deadbands per side", "rms %", "peak %"):
         table.add_column(name, justify="right")

@@ -10,7 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from hilctl import api
-from hilctl.analysis.table import quality_rows, run_rows, segment_table
+from hilctl.analysis.report_table import quality_rows, run_rows, segment_table
 from hilctl.base.errors import InputError
 from hilctl.base.formatting import printable, quantity
 from hilctl.cli.console import console, print_rich, progress_bar
@@ -19,9 +19,9 @@ from hilctl.cli.safe_streams import print_json
 from hilctl.run.dead_runs import finish_dead_runs
 
 if TYPE_CHECKING:
-    from hilctl.analysis.figures import RunReport
     from hilctl.analysis.replay import ReplayResult
-    from hilctl.series.collect import RunSeries
+    from hilctl.analysis.run_metrics import RunReport
+    from hilctl.studies.multi_run.collect import RunSeries
 
 RunsInput = Annotated[
     list[Path], typer.Argument(help="Recordings (MCAP), or a campaign folder.", metavar="RUN")
@@ -137,7 +137,7 @@ def report_series(
     as_json: bool,
 ) -> None:
     """Report several runs, and write their page if requested."""
-    from hilctl.series.page import series_mapping  # imports matplotlib
+    from hilctl.studies.multi_run.multi_run_page import series_mapping  # imports matplotlib
 
     with progress_bar("read", quiet=as_json) as on_progress:
         series = api.report_runs(
@@ -201,8 +201,8 @@ def _minutes(report: "RunReport") -> Table:
 
 def render_series(series: "RunSeries") -> Group:
     """Return the summary of several runs and a table of them."""
-    from hilctl.series.headline import headline
-    from hilctl.series.page import MOST_ROWS, run_table  # imports matplotlib
+    from hilctl.studies.multi_run.multi_run_page import MOST_ROWS, run_table  # imports matplotlib
+    from hilctl.studies.multi_run.summary_text import headline
 
     headings, rows = run_table(series, MOST_ROWS, short=True)
     table = Table(title=Text(printable(series.name)), title_justify="left")

@@ -28,17 +28,17 @@ from hilctl.cli.console import console
 from hilctl.cli.options import AsJson, ExperimentFile, LabelTexts, Overwrite, Settings
 from hilctl.cli.reports import render_report
 from hilctl.cli.safe_streams import print_json
-from hilctl.experiment.labels import label_settings
+from hilctl.experiment.run_labels import label_settings
 from hilctl.loop.safe_output import describe
-from hilctl.machine.files import Machine
 from hilctl.machine.logind import log_out
+from hilctl.machine.procfs import Machine
 from hilctl.run.architecture import require_linux
 from hilctl.run.dead_runs import finish_dead_runs
 from hilctl.run.run_folder import facts_of
 
 if TYPE_CHECKING:
-    from hilctl.analysis.figures import RunReport
-    from hilctl.experiment.check import Checked
+    from hilctl.analysis.run_metrics import RunReport
+    from hilctl.experiment.preflight import CheckedExperiment
     from hilctl.run.result import Progress as RunProgress
     from hilctl.run.result import RunResult
 
@@ -144,7 +144,7 @@ def _served(*, requested: bool) -> Iterator[list[str]]:
     if not requested:
         yield []
         return
-    from hilctl.desk.live import served_beside
+    from hilctl.live.server_process import served_beside
 
     with served_beside() as url:
         yield [url]
@@ -304,7 +304,7 @@ def print_run(result: "RunResult", report: "RunReport | None") -> None:
     terminal.print(f"  hilctl report {path} --html run.html", soft_wrap=True)
 
 
-def print_forecast(checked: "Checked") -> None:
+def print_forecast(checked: "CheckedExperiment") -> None:
     """Print the forecast of a run and its warnings."""
     forecast, config = checked.forecast, checked.loaded.config
     unit, reference_unit = forecast.command_unit, checked.reference.unit

@@ -24,9 +24,9 @@ from hilctl.base.events import Event
 from hilctl.base.formatting import printable
 from hilctl.cli.console import console
 from hilctl.cli.safe_streams import safe_streams
-from hilctl.desk.feed import RunFeed
-from hilctl.desk.scope import WINDOWS_S
-from hilctl.desk.signals import ROW
+from hilctl.live.run_reader import RunReader
+from hilctl.live.scope import WINDOWS_S
+from hilctl.live.signals import ROW
 from hilctl.run.client import find_run, mark_run, request_stop, set_run
 from hilctl.run.protocol import JOB_CONTROL, MAX_MARK
 from hilctl.run.run_folder import RunFolder, runs
@@ -74,7 +74,7 @@ def main() -> None:
 
 def _watch(run: RunFolder) -> None:
     """Show a run, then print how it ended, or that it is still active."""
-    feed = RunFeed(run)
+    feed = RunReader(run)
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))  # by way of finally
     with suppress(KeyboardInterrupt):  # ends the view only
         View(feed).show() if _has_keys() else print_lines(feed)
@@ -94,7 +94,7 @@ def _has_keys() -> bool:
     return True  # a terminal without job control
 
 
-def print_lines(feed: RunFeed) -> None:
+def print_lines(feed: RunReader) -> None:
     """Print each event, and the state about once per second, until the run ends."""
     seen = frames = 0
     while not feed.ended:
@@ -111,7 +111,7 @@ def print_lines(feed: RunFeed) -> None:
 class View:
     """A run on the alternate screen of the terminal, with keys to stop and change it."""
 
-    def __init__(self, feed: RunFeed) -> None:
+    def __init__(self, feed: RunReader) -> None:
         self.feed, self.message, self.left = feed, "", False
         self._mark: str | None = None  # while it is typed
         self._window, self._triggered = 1, True
@@ -229,7 +229,7 @@ def _facts(status: dict[str, Any]) -> tuple[str, str]:
     return "  ".join(figures), f"late ticks {status['late_ticks']}{wakes}"
 
 
-def _event(event: Event, feed: RunFeed) -> str:
+def _event(event: Event, feed: RunReader) -> str:
     t_s = event.sample / feed.description.sample_rate_hz
     return f"{t_s:.3f} s  {event.code}: {printable(event.text)}"
 

@@ -8,7 +8,7 @@ from typing import Any
 from hilctl.base.errors import InputError
 from hilctl.base.files import already_there, check_no_input, write_text
 from hilctl.base.yaml import Document
-from hilctl.comparison.trials import (
+from hilctl.comparison.simulated_trials import (
     InverseTrial,
     TrialDevice,
     full_stroke,
@@ -16,18 +16,18 @@ from hilctl.comparison.trials import (
     waveforms_of,
 )
 from hilctl.experiment.load import LoadedExperiment, load_experiment, resolve
-from hilctl.identify.catalogue import entry
 from hilctl.identify.data.cycles import loops_from_recording
 from hilctl.identify.data.records import SteadyLoop
+from hilctl.identify.evaluation import Evaluation, judge
+from hilctl.identify.fit_api import OnProgress
 from hilctl.identify.fit_data import FitData
 from hilctl.identify.fit_model import FittedModel, fit_model
-from hilctl.identify.job import OnProgress
-from hilctl.identify.judge import Judgement, judge
+from hilctl.identify.registry import entry
 from hilctl.identify.settings import FitKind, FitSettings
 from hilctl.models.base import HysteresisModel
-from hilctl.models.files import dump_model, load_model
-from hilctl.recording.data import Recording
+from hilctl.models.model_file import dump_model, load_model
 from hilctl.recording.reader import read
+from hilctl.recording.recording import Recording
 
 FREQUENCIES_HZ = (10.0, 100.0, 200.0)
 POINTS = 300
@@ -100,7 +100,7 @@ class ComparedModel:
     model: HysteresisModel
     numbers: int | None
     identify_s: float | None
-    error: Judgement
+    error: Evaluation
     inverse_ns: float
     trials: tuple[InverseTrial, ...]
 

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 
 from hilctl.comparison.compare import ComparedModel, Comparison
-from hilctl.comparison.trials import InverseTrial
+from hilctl.comparison.simulated_trials import InverseTrial
 
 
 def headings(comparison: Comparison) -> list[str]:

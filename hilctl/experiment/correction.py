@@ -16,11 +16,11 @@ import numpy.typing as npt
 from hilctl.base.errors import InputError
 from hilctl.base.files import TextFiles, write_text
 from hilctl.base.segments import Segment
-from hilctl.base.strict import Field, Strict, model_validator
+from hilctl.base.strict import Field, StrictModel, model_validator
 from hilctl.base.types import C128, CHUNK, F64, I64
 from hilctl.base.yaml import dump, load_document
 from hilctl.models.base import HysteresisModel
-from hilctl.models.files import dump_model
+from hilctl.models.model_file import dump_model
 from hilctl.waveforms.build import Reference
 
 PHASES = 64
@@ -31,7 +31,7 @@ _TOLERANCE = 1e-3
 _SAME_PERIOD = 1e-6
 
 
-class LearnedCycle(Strict):
+class LearnedCycle(StrictModel):
     """One period of a correction: ``sum cosine_k cos(k phi) + sine_k sin(k phi)``.
 
     Attributes:
@@ -92,7 +92,7 @@ class LearnedCycle(Strict):
         return values
 
 
-class Correction(Strict):
+class Correction(StrictModel):
     """Learned cycles, and what they were learned with.
 
     Attributes:
@@ -142,7 +142,7 @@ class Correction(Strict):
         return correction
 
 
-class CorrectionFile(Strict):
+class CorrectionFile(StrictModel):
     """A correction file: one correction under the key ``correction``."""
 
     correction: Correction

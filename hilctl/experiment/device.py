@@ -13,16 +13,16 @@ from importlib.metadata import entry_points
 from pathlib import Path
 
 from hilctl.base.device import Device, complete
-from hilctl.base.errors import ConfigError, InputError, Problem
+from hilctl.base.errors import ConfigError, ConfigProblem, InputError
 from hilctl.base.files import TextFiles
 from hilctl.base.yaml import Document, did_you_mean
 
 BUILTIN: dict[str, str] = {
-    "simulated_terfenol": "hilctl_drivers.simulated.rigs:SimulatedTerfenol",
-    "simulated_piezo": "hilctl_drivers.simulated.rigs:SimulatedPiezo",
-    "modbus_dac": "hilctl_drivers.modbus.device:ModbusDac",
-    "modbus_stream": "hilctl_drivers.labjack.device:ModbusStream",
-    "serial_dac": "hilctl_drivers.serial.device:SerialDac",
+    "simulated_terfenol": "hilctl_drivers.simulated.devices:SimulatedTerfenol",
+    "simulated_piezo": "hilctl_drivers.simulated.devices:SimulatedPiezo",
+    "modbus_dac": "hilctl_drivers.modbus.modbus_dac:ModbusDac",
+    "modbus_stream": "hilctl_drivers.labjack.modbus_stream:ModbusStream",
+    "serial_dac": "hilctl_drivers.serial.serial_dac:SerialDac",
 }
 
 GROUP = "hilctl.devices"
@@ -72,11 +72,11 @@ def made_device(document: Document, folder: Path, files: TextFiles) -> Device | 
     if not isinstance(kind, str):
         rule, value = ("must be text", repr(kind)) if "kind" in given else ("is required", "")
         hint = f"known: {', '.join(sorted(known_devices()))}"
-        raise ConfigError([Problem(where, "device.kind", rule, value, hint)])
+        raise ConfigError([ConfigProblem(where, "device.kind", rule, value, hint)])
     try:
         chosen = device_class(kind)
     except InputError as error:
-        raise ConfigError([Problem(where, "device.kind", str(error))]) from None
+        raise ConfigError([ConfigProblem(where, "device.kind", str(error))]) from None
     context = {"folder": folder, "files": files}
     options = document.validate(chosen.Options, at=("device",), without=("kind",), context=context)
     try:
@@ -84,4 +84,6 @@ def made_device(document: Document, folder: Path, files: TextFiles) -> Device | 
     except ConfigError:
         raise
     except InputError as error:
-        raise ConfigError([Problem(document.where(("device",)), "device", str(error))]) from None
+        raise ConfigError(
+            [ConfigProblem(document.where(("device",)), "device", str(error))]
+        ) from None

@@ -18,12 +18,12 @@ from typing import Annotated
 
 from hilctl.base.errors import InputError
 from hilctl.base.files import read_text, write_text
-from hilctl.base.strict import Field, Strict, ValidationError
+from hilctl.base.strict import Field, StrictModel, ValidationError
 
 _log = logging.getLogger(__name__)
 
 
-class CoilState(Strict):
+class CoilState(StrictModel):
     """How a run left the coil.
 
     Attributes:
@@ -39,7 +39,7 @@ class CoilState(Strict):
     thermal_time_constant_s: float | None
 
 
-class DeviceState(Strict):
+class DeviceState(StrictModel):
     """The last run of a device.
 
     Attributes:

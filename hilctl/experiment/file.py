@@ -2,9 +2,9 @@
 
 from typing import Annotated, Any, Literal, TypeVar
 
-from hilctl.base.strict import BeforeValidator, Field, Strict
-from hilctl.experiment.labels import Labels
-from hilctl.experiment.parts import (
+from hilctl.base.strict import BeforeValidator, Field, StrictModel
+from hilctl.experiment.run_labels import Labels
+from hilctl.experiment.sections import (
     AdaptationConfig,
     Condition,
     FeedbackConfig,
@@ -29,7 +29,7 @@ def _none_or_mapping(value: Any) -> Any:
     return value
 
 
-class Safe(Strict):
+class Safe(StrictModel):
     """The safe value, and the safe ramp to it with which every run ends.
 
     Attributes:
@@ -45,7 +45,7 @@ class Safe(Strict):
     at_start: float | None = None
 
 
-class CompensatorConfig(Strict):
+class CompensatorConfig(StrictModel):
     """The model whose inverse stands before the actuator.
 
     Attributes:
@@ -68,7 +68,7 @@ class CompensatorConfig(Strict):
     offset: Literal["identified", "measured"] = "identified"
 
 
-class Experiment(Strict):
+class Experiment(StrictModel):
     """One experiment: everything that a run needs to know.
 
     Attributes:

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 
 from hilctl.base.types import F64
+from hilctl.experiment.coil_heat import CoilHeat, RunHeat
+from hilctl.experiment.command_simulation import CommandSimulation
 from hilctl.experiment.file import Experiment
-from hilctl.experiment.heat import CoilHeat, RunHeat
-from hilctl.experiment.initial_state import Begun
+from hilctl.experiment.initial_state import CompensatorStart
+from hilctl.experiment.linear_bypass import LineEnds
 from hilctl.experiment.load import LoadedExperiment
-from hilctl.experiment.straight import LineEnds
-from hilctl.experiment.whole_run import WholeRun
 from hilctl.loop.compensator import Compensator
-from hilctl.loop.host import StraightLine
+from hilctl.loop.host import LinearBypass
 from hilctl.waveforms.build import Reference
 
 _BYTES_A_SAMPLE = 45.0
@@ -66,7 +66,7 @@ class Forecast:
     recording_mb: float
     highest_rate_hz: float
     rate_note: str
-    line: StraightLine | None
+    line: LinearBypass | None
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the fields as plain values."""
@@ -79,7 +79,7 @@ class Forecast:
 def forecast_of(
     loaded: LoadedExperiment,
     reference: Reference,
-    begun: Begun,
+    begun: CompensatorStart,
     conditioned: F64,
     heat_a2: float = 0.0,
     input_um: Callable[[int, int], F64] | None = None,
@@ -106,7 +106,7 @@ def forecast_of(
     if conditioned.size:
         figures.add_before(conditioned)
     values = reference.values
-    run = WholeRun(
+    run = CommandSimulation(
         compensator,
         input_um or (lambda start, stop: begun.input_um[start:stop]),
         lambda start, stop: values[start:stop],

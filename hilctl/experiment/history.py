@@ -12,13 +12,13 @@ from datetime import datetime
 from pathlib import Path
 
 from hilctl.base.errors import DataError
+from hilctl.experiment.coil_heat import CoilHeat, cooled
 from hilctl.experiment.device_state import DeviceState, read_device_state
 from hilctl.experiment.file import Experiment
-from hilctl.experiment.heat import CoilHeat, cooled
 from hilctl.experiment.initial_state import InitialState, initial_state_after
 from hilctl.experiment.load import LoadedExperiment
-from hilctl.recording.ends import read_ends
-from hilctl.recording.facts import HEAT_FACT
+from hilctl.recording.metadata_keys import HEAT_FACT
+from hilctl.recording.run_summary import read_ends
 
 _LARGEST_BYTES = 256 << 20  # some minutes at 50 kHz: more would keep the start waiting
 

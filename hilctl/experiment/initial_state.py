@@ -17,13 +17,13 @@ from hilctl.loop.compensator import Compensator
 from hilctl.models.base import HysteresisModel
 
 if TYPE_CHECKING:
-    from hilctl.recording.data import Recording
+    from hilctl.recording.recording import Recording
 
 _STILL_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
-class Begun:
+class CompensatorStart:
     """What the compensator of a run is given, and what it begins with.
 
     Attributes:
@@ -80,7 +80,7 @@ def begin(
     values: F64,
     before: InitialState | None = None,
     begins: str = "at rest",
-) -> Begun:
+) -> CompensatorStart:
     """Return what the compensator is fed, and its memory once it has begun.
 
     Args:
@@ -98,7 +98,7 @@ def begin(
         compensator.restore(before.state)
     compensator.begin(values)
     state = compensator.state()
-    return Begun(
+    return CompensatorStart(
         input_um=compensator.ahead(values),
         preview=compensator.preview,
         state_size=state.size,
@@ -190,11 +190,11 @@ class _Followed:
 
     def commands(self) -> Iterator[F64]:
         """Yield them, from the first sample to the last."""
-        from hilctl.recording.reader import Pieces  # most runs begin at rest
+        from hilctl.recording.reader import RecordingStream  # most runs begin at rest
 
         samples = 0
         unanswered = False
-        for piece in Pieces(self._path):
+        for piece in RecordingStream(self._path):
             self._check(piece)
             index, flags = piece.samples.index, piece.samples.flags
             unanswered |= bool(np.any(flags & Flag.UNANSWERED.value))

@@ -1,10 +1,10 @@
 """Interlocks from an experiment: what they are set to, and what is known of them before a run."""
 
 from hilctl.base.device import DeviceInfo
-from hilctl.base.errors import Problem
+from hilctl.base.errors import ConfigProblem
 from hilctl.experiment.file import Experiment
 from hilctl.experiment.load import LoadedExperiment
-from hilctl.loop.interlocks import InterlockContext, InterlockSettings, Needs
+from hilctl.loop.interlocks import InterlockContext, InterlockRequirement, InterlockSettings
 
 _TRAVEL = 0.02  # of the command's range: far beyond noise, and far less than any run worth watching
 
@@ -26,21 +26,21 @@ def interlock_context(config: Experiment, info: DeviceInfo) -> InterlockContext:
     )
 
 
-def interlock_problems(loaded: LoadedExperiment) -> list[Problem]:
+def interlock_problems(loaded: LoadedExperiment) -> list[ConfigProblem]:
     """Return interlocks that could not do what they say, each by its key."""
     limits = loaded.config.limits
     found = []
     for key, field in InterlockSettings.model_fields.items():
         for needs in field.metadata:
-            if isinstance(needs, Needs) and getattr(limits, key) is not None:
+            if isinstance(needs, InterlockRequirement) and getattr(limits, key) is not None:
                 found += [(key, rule) for rule in _unmet(needs, loaded)]
     return [
-        Problem(loaded.document.where(("limits", key)), f"limits.{key}", rule)
+        ConfigProblem(loaded.document.where(("limits", key)), f"limits.{key}", rule)
         for key, rule in found
     ]
 
 
-def _unmet(needs: Needs, loaded: LoadedExperiment) -> list[str]:
+def _unmet(needs: InterlockRequirement, loaded: LoadedExperiment) -> list[str]:
     """Return what a key needs and does not have, in words."""
     limits, info = loaded.config.limits, loaded.device.info
     rules = []

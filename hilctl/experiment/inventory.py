@@ -69,7 +69,7 @@ class DeviceOption:
 
 
 @dataclass(frozen=True, slots=True)
-class Described:
+class DeviceDescription:
     """What is to be known of a device or a profile before an experiment names it.
 
     Attributes:
@@ -89,7 +89,7 @@ class Described:
         return asdict(self)
 
 
-def describe(name: str) -> Described:
+def describe(name: str) -> DeviceDescription:
     """Return what is known of a device or a shipped profile; nothing is opened.
 
     Raises:
@@ -98,7 +98,7 @@ def describe(name: str) -> Described:
     kinds, profiles = known_devices(), shipped_profiles()
     if name in profiles:
         path = Path(profiles[name])
-        return Described(name, str(path), (), load_document(path).data)
+        return DeviceDescription(name, str(path), (), load_document(path).data)
     if name not in kinds:
         hint = did_you_mean(name, [*kinds, *profiles])
         raise InputError(f"there is no device or profile '{name}' ({hint})")
@@ -112,7 +112,7 @@ def describe(name: str) -> Described:
         )
         for key, each in schema.get("properties", {}).items()
     )
-    return Described(name, kinds[name], options, {})
+    return DeviceDescription(name, kinds[name], options, {})
 
 
 def shipped_profiles() -> dict[str, str]:

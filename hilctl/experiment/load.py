@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import TypeVar
 
 from hilctl.base.device import Device
-from hilctl.base.errors import ConfigError, InputError, Problem
+from hilctl.base.errors import ConfigError, ConfigProblem, InputError
 from hilctl.base.files import TextFiles
 from hilctl.base.yaml import Document, dump, load_document
 from hilctl.experiment.correction import Correction, load_correction
 from hilctl.experiment.device import made_device
 from hilctl.experiment.file import Experiment
 from hilctl.models.base import HysteresisModel
-from hilctl.models.files import load_model
+from hilctl.models.model_file import load_model
 
 T = TypeVar("T")
 FILE_KEYS = {"compensator.model", "compensator.correction", "compensator.initial_state",
@@ -124,7 +124,7 @@ def resolve(
     files = TextFiles() if files is None else files
     for setting in settings:
         document.set(setting)
-    problems: list[Problem] = []
+    problems: list[ConfigProblem] = []
     config = _collect(problems, lambda: document.validate(Experiment))
     device = _collect(problems, lambda: made_device(document, folder, files))
     named = _NamedFiles(document, folder, files)
@@ -138,12 +138,12 @@ def resolve(
     return LoadedExperiment(config, device, model, folder, yaml_text, document, correction, files)
 
 
-def _joint_problems(config: Experiment, document: Document) -> list[Problem]:
+def _joint_problems(config: Experiment, document: Document) -> list[ConfigProblem]:
     """Return broken rules that tie one part of the experiment to another."""
-    found: list[Problem] = []
+    found: list[ConfigProblem] = []
 
     def add(loc: tuple[str, str], rule: str, value: object = "", hint: str = "") -> None:
-        found.append(Problem(document.where(loc), ".".join(loc), rule, str(value), hint))
+        found.append(ConfigProblem(document.where(loc), ".".join(loc), rule, str(value), hint))
 
     unit, limits = config.waveform.unit, config.limits
     if unit is None:
@@ -160,7 +160,7 @@ def _joint_problems(config: Experiment, document: Document) -> list[Problem]:
     return found
 
 
-def _collect(problems: list[Problem], load: Callable[[], T]) -> T | None:
+def _collect(problems: list[ConfigProblem], load: Callable[[], T]) -> T | None:
     try:
         return load()
     except ConfigError as error:
@@ -188,4 +188,4 @@ class _NamedFiles:
             raise
         except InputError as error:
             where = self.document.where(("compensator", key))
-            raise ConfigError([Problem(where, f"compensator.{key}", str(error))]) from None
+            raise ConfigError([ConfigProblem(where, f"compensator.{key}", str(error))]) from None

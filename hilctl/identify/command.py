@@ -11,22 +11,22 @@ from hilctl.base.errors import InputError
 from hilctl.base.files import check_writable, write_text
 from hilctl.base.types import CommandUnit
 from hilctl.base.yaml import Document
-from hilctl.identify.candidates import CandidateError, Choice, choose_kind
-from hilctl.identify.catalogue import entry
-from hilctl.identify.data.files import load_records
+from hilctl.identify.cross_validation import HeldOut, held_out_error
+from hilctl.identify.data.data_files import load_records
 from hilctl.identify.data.records import History, Record
+from hilctl.identify.evaluation import Evaluation, judge
+from hilctl.identify.fit_api import OnProgress, ignore_progress
 from hilctl.identify.fit_model import FittedModel, error_table, fit_model
-from hilctl.identify.held_out import HeldOut, held_out_error
-from hilctl.identify.job import OnProgress, ignore_progress
-from hilctl.identify.judge import Judgement, judge
-from hilctl.identify.model_size import OrderError, choose_lag, choose_order
-from hilctl.identify.modes import WORTH, further_modes
+from hilctl.identify.model_quality import Verdict, verdict_of
+from hilctl.identify.model_selection import CandidateScore, SelectedModel, choose_kind
+from hilctl.identify.order_selection import OrderScore, choose_lag, choose_order
+from hilctl.identify.parallel import MapFunction, serial_map, workers
+from hilctl.identify.registry import entry
+from hilctl.identify.resonances import WORTH, further_modes
 from hilctl.identify.settings import FitSettings, IdentifySettings
-from hilctl.identify.verdict import Verdict, verdict_of
-from hilctl.identify.workers import Map, one_by_one, workers
 from hilctl.models.base import HysteresisModel
-from hilctl.models.files import dump_model
-from hilctl.models.structure import Mode, Structure
+from hilctl.models.mechanics import FirstMode, FurtherMode
+from hilctl.models.model_file import dump_model
 
 TURNS = 4  # each finds a model anew
 
@@ -50,7 +50,9 @@ class Judged(Protocol):
 _Judged = TypeVar("_Judged", bound=Judged)
 
 
-def with_modes(records: Sequence[Record], identify: Callable[[Sequence[Mode]], _Judged]) -> _Judged:
+def with_modes(
+    records: Sequence[Record], identify: Callable[[Sequence[FurtherMode]], _Judged]
+) -> _Judged:
     """Return a model with the further modes that its records show.
 
     A mode that was left out bends all the rest, so the model is found anew without it each time,
@@ -67,7 +69,7 @@ def with_modes(records: Sequence[Record], identify: Callable[[Sequence[Mode]], _
     for _ in range(TURNS):
         model = best.fit.model
         structure, known = getattr(model, "structure", None), getattr(model, "modes", ())
-        first_hz = structure.natural_hz if isinstance(structure, Structure) else None
+        first_hz = structure.natural_hz if isinstance(structure, FirstMode) else None
         better = further_modes(histories, best.fit.modelled_um, known, first_hz)
         if better is None:
             break
@@ -103,9 +105,9 @@ class Identification:
     data: Sequence[Record]
     verdict: Verdict
     held_out: HeldOut | None
-    orders: tuple[OrderError, ...]
+    orders: tuple[OrderScore, ...]
     lag_samples: int
-    candidates: tuple[CandidateError, ...] = ()
+    candidates: tuple[CandidateScore, ...] = ()
 
     def to_mapping(self) -> dict[str, Any]:
         """Return all figures as plain mappings, lists and numbers, for JSON."""
@@ -158,7 +160,7 @@ def identify_files(
         settings: The choices.
         output: Model file to write; None for none.
         validate: Files to judge the model on; where there are none, parts of the others.
-        scheduler: Where independent fits run, see :func:`hilctl.identify.workers.workers`.
+        scheduler: Where independent fits run, see :func:`hilctl.identify.parallel.workers`.
         overwrite: Whether a model file of that name may be replaced.
         progress: Called with what is being done.
 
@@ -188,7 +190,7 @@ def identify_records(
     unit: CommandUnit,
     validate: Sequence[Record] = (),
     source: Sequence[str] = (),
-    run: Map = one_by_one,
+    run: MapFunction = serial_map,
     progress: OnProgress = ignore_progress,
 ) -> Identification:
     """Fit a model to records, and judge it on data that the fit did not see.
@@ -208,12 +210,12 @@ def identify_records(
     """
     created = datetime.now(UTC).isoformat(timespec="seconds")
 
-    def found(modes: Sequence[Mode]) -> _Found:
-        chosen, orders = settings, tuple[OrderError, ...]()
-        candidates = tuple[CandidateError, ...]()
+    def found(modes: Sequence[FurtherMode]) -> _Found:
+        chosen, orders = settings, tuple[OrderScore, ...]()
+        candidates = tuple[CandidateScore, ...]()
         held_out: HeldOut | None = None
         if isinstance(settings, IdentifySettings) and settings.auto:
-            data = Choice(tuple(records), settings, unit, tuple(modes))
+            data = SelectedModel(tuple(records), settings, unit, tuple(modes))
             chosen, held_out, candidates = choose_kind(data, run, progress)
         elif settings.size == "auto":
             chosen, orders = choose_order(records, settings, run, progress)
@@ -245,11 +247,11 @@ class _Found:
     fit: FittedModel
     held_out: HeldOut | None
     settings: FitSettings
-    orders: tuple[OrderError, ...]
-    candidates: tuple[CandidateError, ...]
+    orders: tuple[OrderScore, ...]
+    candidates: tuple[CandidateScore, ...]
 
 
-def _with_held_out(model: HysteresisModel, judgement: Judgement) -> HysteresisModel:
+def _with_held_out(model: HysteresisModel, judgement: Evaluation) -> HysteresisModel:
     """Return a model whose provenance says how it does on data that its fit did not see."""
     figures = {f"held_out_{name}": value for name, value in error_table(judgement).items()}
     errors = {**model.provenance.errors_percent, **figures}
@@ -257,7 +259,9 @@ def _with_held_out(model: HysteresisModel, judgement: Judgement) -> HysteresisMo
     return model.model_copy(update={"provenance": provenance})
 
 
-def _lag(paths: Sequence[Path], settings: IdentifySettings, run: Map, progress: OnProgress) -> int:
+def _lag(
+    paths: Sequence[Path], settings: IdentifySettings, run: MapFunction, progress: OnProgress
+) -> int:
     if not settings.table.find_lag:
         return settings.table.lag_samples
 

@@ -5,15 +5,15 @@ from dataclasses import replace
 from typing import Any
 
 from hilctl.base.types import CommandUnit
-from hilctl.identify.catalogue import CATALOGUE
-from hilctl.identify.creep import creep_of, without_creep
+from hilctl.identify.creep_fit import creep_of, without_creep
 from hilctl.identify.data.records import Records
+from hilctl.identify.fit_api import FitJob, FoundModel, OnProgress, ignore_progress
 from hilctl.identify.fit_data import FitData, search_data
-from hilctl.identify.job import FitJob, FoundModel, OnProgress, ignore_progress
-from hilctl.identify.modes import without_modes
+from hilctl.identify.parallel import MapFunction, serial_map
+from hilctl.identify.registry import CATALOGUE
+from hilctl.identify.resonances import without_modes
 from hilctl.identify.settings import FitSettings
-from hilctl.identify.workers import Map, one_by_one
-from hilctl.models.structure import Mode
+from hilctl.models.mechanics import FurtherMode
 
 
 def fit_kind(
@@ -21,10 +21,10 @@ def fit_kind(
     settings: FitSettings,
     unit: CommandUnit,
     *,
-    run: Map = one_by_one,
+    run: MapFunction = serial_map,
     progress: OnProgress = ignore_progress,
     start: object | None = None,
-    modes: Sequence[Mode] = (),
+    modes: Sequence[FurtherMode] = (),
 ) -> FoundModel:
     """Fit a kind of model.
 
@@ -37,7 +37,7 @@ def fit_kind(
         unit: Unit of the command.
         run: Follows starts that do not depend on each other.
         progress: Called with what is being done.
-        start: Where the search begins, see :class:`~hilctl.identify.job.FitJob`.
+        start: Where the search begins, see :class:`~hilctl.identify.fit_api.FitJob`.
         modes: Further modes of the structure.
 
     Raises:

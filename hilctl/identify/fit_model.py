@@ -9,23 +9,23 @@ import scipy
 
 import hilctl
 from hilctl.base.types import CommandUnit
-from hilctl.identify.catalogue import CATALOGUE
 from hilctl.identify.data.records import Record, Records, SteadyLoop
+from hilctl.identify.evaluation import Evaluation, judge
+from hilctl.identify.fit_api import OnProgress, StartOutcome, ignore_progress
 from hilctl.identify.fit_data import FitData
 from hilctl.identify.fit_kind import fit_kind
-from hilctl.identify.found_range import identified_range
-from hilctl.identify.job import OnProgress, StartOutcome, ignore_progress
-from hilctl.identify.judge import Judgement, judge
+from hilctl.identify.identified_range import identified_range
+from hilctl.identify.parallel import MapFunction, serial_map
+from hilctl.identify.registry import CATALOGUE
 from hilctl.identify.settings import FitSettings
-from hilctl.identify.workers import Map, one_by_one
 from hilctl.models.base import HysteresisModel, Provenance
-from hilctl.models.structure import Mode
+from hilctl.models.mechanics import FurtherMode
 
 VERSIONS = {"hilctl": hilctl.__version__, "numpy": np.__version__, "scipy": scipy.__version__}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FittedModel(Judgement):
+class FittedModel(Evaluation):
     """An identified model, and how far it is from what it was fitted to.
 
     Attributes:
@@ -50,7 +50,7 @@ class FittedModel(Judgement):
         """Return all of it as plain mappings, lists and numbers, for JSON."""
         return {
             "model": {"kind": getattr(self.model, "kind"), **self.model.to_mapping()},  # noqa: B009
-            **Judgement.to_mapping(self),
+            **Evaluation.to_mapping(self),
             "starts": [asdict(start) for start in self.starts],
             "numbers": self.numbers,
             "parameters": dict(self.parameters),
@@ -69,9 +69,9 @@ def fit_model(
     source: Sequence[str] = (),
     created: str = "",
     progress: OnProgress = ignore_progress,
-    run: Map = one_by_one,
+    run: MapFunction = serial_map,
     start: object | None = None,
-    modes: Sequence[Mode] = (),
+    modes: Sequence[FurtherMode] = (),
 ) -> FittedModel:
     """Fit a model's parameters to steady loops and time histories.
 
@@ -90,7 +90,7 @@ def fit_model(
         created: Date and time in ISO 8601, UTC, for the provenance.
         progress: Called with what is being done.
         run: Follows starts that do not depend on each other.
-        start: Where the search begins, see :class:`~hilctl.identify.job.FitJob`.
+        start: Where the search begins, see :class:`~hilctl.identify.fit_api.FitJob`.
         modes: Further modes of the structure, for kinds that have them.
 
     Raises:
@@ -146,7 +146,7 @@ def _grid_line(record: Record) -> str:
     return f"{record.label}: {low:.4g} to {high:.4g}, {points}"
 
 
-def error_table(judged: Judgement) -> dict[str, float]:
+def error_table(judged: Evaluation) -> dict[str, float]:
     """Return the errors by name."""
     areas = [error.area_error_percent for error in judged.errors]
     table = {

@@ -10,7 +10,7 @@ from typing import Any, Literal, Self, TypeAlias, get_args, get_origin
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 from pydantic.fields import FieldInfo
 
-from hilctl.base.strict import Strict
+from hilctl.base.strict import StrictModel
 from hilctl.base.types import CommandUnit
 
 FitKind: TypeAlias = Literal[
@@ -47,7 +47,7 @@ def _of(*kinds: str, default: Any, description: str, **limits: Any) -> Any:
     )
 
 
-class FitSettings(Strict):
+class FitSettings(StrictModel):
     """Choices of a fit; what is not given is as published for the kind of model."""
 
     kind: FitKind = Field("integrated", description="Kind of model.")
@@ -231,7 +231,7 @@ class FitSettings(Strict):
         )
 
 
-class TableSettings(Strict):
+class TableSettings(StrictModel):
     """How text tables are read; recordings need none of it."""
 
     unit: CommandUnit | None = Field(None, description="Unit of the command.")

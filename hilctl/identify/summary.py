@@ -3,13 +3,13 @@
 from collections.abc import Sequence
 
 from hilctl.identify.command import Identification
+from hilctl.identify.evaluation import Evaluation, LoopScore
 from hilctl.identify.fit_model import FittedModel
-from hilctl.identify.judge import Judgement, LoopError
 
 HEADINGS = ("loop", "p-p µm", "peak %", "rms %", "area %")
 
 
-def error_rows(errors: Sequence[LoopError]) -> list[tuple[str, ...]]:
+def error_rows(errors: Sequence[LoopScore]) -> list[tuple[str, ...]]:
     """Return one row a loop under :data:`HEADINGS`."""
     rows = []
     for error in errors:
@@ -60,7 +60,7 @@ def summary(found: Identification) -> list[str]:
     return lines
 
 
-def _errors(judged: Judgement) -> str:
+def _errors(judged: Evaluation) -> str:
     return (
         f"peak error {judged.peak_percent:.2f} %, rms {judged.rms_percent:.2f} % of the largest "
         f"peak-to-peak; {judged.own_peak_percent:.2f} % of a record's own"

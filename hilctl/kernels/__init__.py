@@ -21,7 +21,7 @@ import os
 from contextlib import suppress
 from pathlib import Path
 
-from hilctl.base.private import private_folder, user_folders
+from hilctl.base.private_dirs import private_folder, user_folders
 
 
 def _set_cache_folder() -> None:

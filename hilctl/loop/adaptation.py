@@ -23,7 +23,7 @@ import numpy as np
 from hilctl.base.errors import InputError
 from hilctl.base.events import ADAPTED, Event, adapted_text
 from hilctl.base.types import F64, chunks
-from hilctl.kernels import adaptation as kernel
+from hilctl.kernels import gradient as kernel
 from hilctl.kernels.jit import ensure_compiled
 from hilctl.loop.block import Block
 
@@ -68,7 +68,7 @@ class DisplacementOperator:
 
     Args:
         bounds: float64[m], how far the parameters may go.
-        settings: float64[SETTINGS], see :mod:`hilctl.kernels.adaptation`.
+        settings: float64[SETTINGS], see :mod:`hilctl.kernels.gradient`.
         table: float64[3, m], see there.
         shape: float64[m, m], see there.
     """

@@ -1,6 +1,6 @@
 """One block of samples, in the slot where it is born and stays until it is recorded."""
 
-from hilctl.base.samples import COLUMNS, Batch
+from hilctl.base.samples import COLUMNS, BlockBatch
 
 COMMAND = [*COLUMNS].index("command")
 
@@ -9,7 +9,7 @@ class Block:
     """One slot of an area, with B samples.
 
     Args:
-        head: Numbers of :class:`hilctl.base.samples.Head`, int64 each.
+        head: Numbers of :class:`hilctl.base.samples.BlockHeader`, int64 each.
         area: Room for many blocks.
         slot: Which of them it is.
 
@@ -50,7 +50,7 @@ class Block:
         "wanted",
     )
 
-    def __init__(self, head: "memoryview[int]", area: Batch, slot: int) -> None:
+    def __init__(self, head: "memoryview[int]", area: BlockBatch, slot: int) -> None:
         self.head = head
         self.due = self.guarded = True
         self.number = self.skipped = 0

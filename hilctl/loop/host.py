@@ -9,7 +9,7 @@ from hilctl.loop.block import Block
 
 
 @dataclass(frozen=True, slots=True)
-class StraightLine:
+class LinearBypass:
     """What is put out in the place of the inverse: a command that is linear in the reference.
 
     Attributes:
@@ -39,7 +39,7 @@ class Tuning:
     samples: int
     begins_at: int = 0
     inverse_share: float = 1.0
-    line: StraightLine = StraightLine()
+    line: LinearBypass = LinearBypass()
 
 
 class Host(Protocol):

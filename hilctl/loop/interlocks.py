@@ -11,8 +11,8 @@ from typing import Annotated, Literal, TypeAlias
 import numpy as np
 
 from hilctl.base.errors import InputError
-from hilctl.base.samples import Flag, Head
-from hilctl.base.strict import Field, Strict
+from hilctl.base.samples import BlockHeader, Flag
+from hilctl.base.strict import Field, StrictModel
 from hilctl.base.types import F64, U32, CommandUnit
 from hilctl.kernels import interlock as kernels
 from hilctl.kernels.interlock import InterlockFlag
@@ -23,7 +23,7 @@ TripCode: TypeAlias = Literal[
     "stroke", "sensor_range", "sensor_frozen", "deviation", "thermal", "tracking_error"
 ]
 
-_FIRST_SAMPLE = int(Head.FIRST_SAMPLE)
+_FIRST_SAMPLE = int(BlockHeader.FIRST_SAMPLE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +42,7 @@ class Trip:
 
 
 @dataclass(frozen=True, slots=True)
-class Needs:
+class InterlockRequirement:
     """What a key needs beside it, to mean anything.
 
     Attributes:
@@ -63,43 +63,49 @@ _Positive: TypeAlias = Annotated[float, Field(gt=0.0)]
 _NotNegative: TypeAlias = Annotated[float, Field(ge=0.0)]
 
 
-class InterlockSettings(Strict):
+class InterlockSettings(StrictModel):
     """What the interlocks are set to: keys of an experiment's ``limits``; None switches one off.
 
     A condition with a time trips once it has held for longer than that without a break.
     """
 
-    rms_current_a: Annotated[_Positive | None, Needs("A", "thermal_time_constant_s")] = Field(
+    rms_current_a: Annotated[
+        _Positive | None, InterlockRequirement("A", "thermal_time_constant_s")
+    ] = Field(
         default=None,
         description="largest running rms of the coil current, commanded or measured, A; a run"
         " begins with what the last run of its device has left of the coil's heat",
     )
-    thermal_time_constant_s: Annotated[_Positive | None, Needs("A", "rms_current_a")] = Field(
-        default=None, description="time constant of the coil's heating, s"
-    )
-    tracking_error_um: Annotated[_Positive | None, Needs(reference_um=True)] = Field(
+    thermal_time_constant_s: Annotated[
+        _Positive | None, InterlockRequirement("A", "rms_current_a")
+    ] = Field(default=None, description="time constant of the coil's heating, s")
+    tracking_error_um: Annotated[_Positive | None, InterlockRequirement(reference_um=True)] = Field(
         default=None, description="largest |reference - displacement| of a compensated run, um"
     )
-    tracking_s: Annotated[_NotNegative | None, Needs(key="tracking_error_um")] = Field(
-        default=None, description="time for which it may be larger, s; 0 where not given"
+    tracking_s: Annotated[_NotNegative | None, InterlockRequirement(key="tracking_error_um")] = (
+        Field(default=None, description="time for which it may be larger, s; 0 where not given")
     )
     frozen_s: _Positive | None = Field(
         default=None,
         description="time for which the displacement may stay the same after the command has moved"
         " by 2 % of its range, s",
     )
-    frozen_um: Annotated[_NotNegative | None, Needs(key="frozen_s")] = Field(
+    frozen_um: Annotated[_NotNegative | None, InterlockRequirement(key="frozen_s")] = Field(
         default=None,
         description="largest change of the displacement that counts as none, um; 0 where not given",
     )
-    measured_deviation_a: Annotated[_Positive | None, Needs("A", measured=True)] = Field(
-        default=None, description="largest distance of the measured current from the command, A"
+    measured_deviation_a: Annotated[_Positive | None, InterlockRequirement("A", measured=True)] = (
+        Field(
+            default=None, description="largest distance of the measured current from the command, A"
+        )
     )
-    measured_deviation_v: Annotated[_Positive | None, Needs("V", measured=True)] = Field(
-        default=None, description="largest distance of the measured drive from the command, V"
+    measured_deviation_v: Annotated[_Positive | None, InterlockRequirement("V", measured=True)] = (
+        Field(
+            default=None, description="largest distance of the measured drive from the command, V"
+        )
     )
-    deviation_s: Annotated[_NotNegative | None, Needs(key="measured_deviation")] = Field(
-        default=None, description="time for which it may be larger, s; 0 where not given"
+    deviation_s: Annotated[_NotNegative | None, InterlockRequirement(key="measured_deviation")] = (
+        Field(default=None, description="time for which it may be larger, s; 0 where not given")
     )
 
     @property

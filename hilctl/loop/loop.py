@@ -20,23 +20,23 @@ import numpy as np
 from hilctl.base.device import Device, WatchdogDevice
 from hilctl.base.errors import DeviceError
 from hilctl.base.events import OFFSET, Event
-from hilctl.base.samples import Flag, Head
+from hilctl.base.samples import BlockHeader, Flag
 from hilctl.base.types import F64, U32
-from hilctl.loop.beginning import Beginning
 from hilctl.loop.block import Block
-from hilctl.loop.feed import feed, pass_over
 from hilctl.loop.host import Host, Tuning
+from hilctl.loop.input_stage import feed, pass_over
 from hilctl.loop.interlocks import Interlocks, Trip
+from hilctl.loop.lead_in import LeadIn
 from hilctl.loop.limiter import Limiter
 from hilctl.loop.pacer import Lateness, Pacer
-from hilctl.loop.plan import Code, Outcome, Plan
+from hilctl.loop.plan import Code, LoopOutcome, LoopPlan
 from hilctl.loop.safe_output import OutputState, SafeGoal, describe, drive_to_safe
-from hilctl.loop.tuning import Tuner
+from hilctl.loop.tuning import ReferenceTuner
 
 # Plain numbers: looking up an enumeration's member takes longer than writing it.
-_FIRST_SAMPLE, _SAMPLES = int(Head.FIRST_SAMPLE), int(Head.SAMPLES)
-_DROPPED_BEFORE, _DEADLINE_NS = int(Head.DROPPED_BEFORE), int(Head.DEADLINE_NS)
-_LATE_NS, _EXCHANGE_NS = int(Head.LATE_NS), int(Head.EXCHANGE_NS)
+_FIRST_SAMPLE, _SAMPLES = int(BlockHeader.FIRST_SAMPLE), int(BlockHeader.SAMPLES)
+_DROPPED_BEFORE, _DEADLINE_NS = int(BlockHeader.DROPPED_BEFORE), int(BlockHeader.DEADLINE_NS)
+_LATE_NS, _EXCHANGE_NS = int(BlockHeader.LATE_NS), int(BlockHeader.EXCHANGE_NS)
 _SKIPPED, _CONDITION = int(Flag.AFTER_SKIPPED), int(Flag.CONDITION)
 
 
@@ -63,7 +63,7 @@ class Loop:
         host: Time, room for blocks, and supervision.
     """
 
-    def __init__(self, plan: Plan, device: Device, host: Host) -> None:
+    def __init__(self, plan: LoopPlan, device: Device, host: Host) -> None:
         period_ns = plan.block / plan.sample_rate_hz * 1e9
         self._plan = plan
         self._device = device
@@ -73,7 +73,7 @@ class Loop:
         self._limiter = Limiter(plan.limits, 1.0 / plan.sample_rate_hz)
         self._interlocks = Interlocks(plan.interlocks, plan.interlock_settings, plan.sample_rate_hz)
         self._pacer = Pacer(host.clock, period_ns, plan.late_policy, plan.late_rules)
-        self._tuner = Tuner()
+        self._tuner = ReferenceTuner()
         # What works out part of the input, and learns from the answers, block by block.
         learners = plan.feedback, plan.adaptation, plan.conditioning
         self._learns = any(each is not None for each in learners)
@@ -81,7 +81,7 @@ class Loop:
         self._start_ns = 0
         self._next_sample = 0
         self._ended_at = 0
-        self._before = Beginning(None, 0)
+        self._before = LeadIn(None, 0)
         self._end = plan.samples
         self._on_ramp = False
         self._missing = 0
@@ -110,14 +110,14 @@ class Loop:
         self._interlocks.begin_at(output)
         block, conditioning = self._plan.block, self._plan.conditioning
         ramp_samples = -(-self._limiter.ramp_samples // block) * block
-        self._before = before = Beginning(conditioning, ramp_samples)
+        self._before = before = LeadIn(conditioning, ramp_samples)
         self._end = before.waveform_at + self._plan.samples
         if before.waveform_at:
             self._phase = _STARTING if ramp_samples else _CONDITIONING
             self._pacer.policy = self._plan.start_policy
         return before.waveform_at
 
-    def run(self, start_ns: int) -> Outcome:
+    def run(self, start_ns: int) -> LoopOutcome:
         """Run until the end, ramp to the safe value, and say how it went.
 
         Args:
@@ -140,7 +140,7 @@ class Loop:
             return self._lost_device(error)
         self._record_adapted(ended=True)
         output: OutputState = "confirmed" if self._device.info.confirms else "sent"
-        return Outcome(self._code, self._reason, self._ended_at, output, self._dropped)
+        return LoopOutcome(self._code, self._reason, self._ended_at, output, self._dropped)
 
     def _armed(self, start_ns: int) -> int:
         """Arm the device's watchdog just before the first tick; return when that is due."""
@@ -399,7 +399,7 @@ class Loop:
             reason = f"no room for sample {sample}: the recorder does not keep up"
             self._leave("fault", "dropped", reason)
 
-    def _lost_device(self, error: DeviceError) -> Outcome:
+    def _lost_device(self, error: DeviceError) -> LoopOutcome:
         text = str(error) if self._code == "completed" else f"{self._reason}; then {error}"
         event = Event(self._next_sample, "error", "device_lost", str(error))
         self._host.record_event(event)
@@ -420,7 +420,7 @@ class Loop:
                 block.flags |= (Flag.SENSOR_INVALID | Flag.UNANSWERED).value
                 self._record(block)
         self._record_adapted(ended=True)
-        return Outcome("fault", text, self._ended_at, output.state, self._dropped)
+        return LoopOutcome("fault", text, self._ended_at, output.state, self._dropped)
 
     def _seconds(self) -> float:
         return self._clock.now_ns() * 1e-9

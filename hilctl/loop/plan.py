@@ -17,7 +17,7 @@ Code: TypeAlias = Literal["completed", "stopped", "fault"]
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class LoopOutcome:
     """How a run ended.
 
     Attributes:
@@ -41,7 +41,7 @@ class Outcome:
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class LoopPlan:
     """What a run does.
 
     Attributes:

@@ -15,14 +15,14 @@ import numpy as np
 from hilctl.base.events import INVERSE, TUNED, Event
 from hilctl.base.samples import Flag
 from hilctl.base.types import F64, U32
-from hilctl.loop.host import StraightLine, Tuning
+from hilctl.loop.host import LinearBypass, Tuning
 
 T = TypeVar("T", float, F64)
 _OUT = np.uint32(Flag.INVERSE_OUT)
 _AS_IT_IS = (1.0, 0.0, 1.0)
 
 
-class Factors(NamedTuple):
+class TuningFactors(NamedTuple):
     """What a block is tuned by: numbers, or float64[n] each while a change is under way.
 
     Attributes:
@@ -45,7 +45,7 @@ def on_the_way(before: float, after: float, part: T) -> T:
     return before * (1.0 - part) + after * part
 
 
-class Tuner:
+class ReferenceTuner:
     """Gain, offset and share of the inverse in each block; changes are spread over a ramp."""
 
     def __init__(self) -> None:
@@ -95,18 +95,18 @@ class Tuner:
         self.gain, self.offset, self.inverse_share = values
         self.idle = not self.moving and values == _AS_IT_IS
 
-    def advance(self, samples: int) -> Factors | None:
+    def advance(self, samples: int) -> TuningFactors | None:
         """Return what the next samples are tuned by; None where they pass as they are."""
         if self.idle:
             return None
         if not self.moving:
-            return Factors(self.gain, self.offset, self.inverse_share)
+            return TuningFactors(self.gain, self.offset, self.inverse_share)
         steps = np.minimum(self._done + np.arange(1, samples + 1), self._to.samples)
         factors = self._way(steps / self._to.samples)
         self.pass_over(samples)
-        return Factors(*factors)
+        return TuningFactors(*factors)
 
-    def fade(self, factors: Factors, reference: F64, wanted: F64, flags: U32) -> None:
+    def fade(self, factors: TuningFactors, reference: F64, wanted: F64, flags: U32) -> None:
         """Bring the straight line's part into the commands of the inverse.
 
         Args:
@@ -128,13 +128,13 @@ class Tuner:
         )
 
 
-def tune(factors: Factors, values: F64, out: F64) -> None:
+def tune(factors: TuningFactors, values: F64, out: F64) -> None:
     """Fill ``out`` (float64[n]) with gain * values + offset."""
     np.multiply(values, factors.gain, out=out)
     out += factors.offset
 
 
-def fade(share: float | F64, line: StraightLine, reference: F64, wanted: F64, flags: U32) -> None:
+def fade(share: float | F64, line: LinearBypass, reference: F64, wanted: F64, flags: U32) -> None:
     """Cross-fade commands of the inverse (float64[n]) with those of a straight line, in place.
 
     Args:

@@ -9,10 +9,10 @@ import numpy as np
 
 from hilctl.base.types import I64
 from hilctl.machine import findings, hardware
-from hilctl.machine.files import Finding, Machine
-from hilctl.machine.latency import Latency, measure
 from hilctl.machine.logind import log_out
+from hilctl.machine.procfs import Finding, Machine
 from hilctl.machine.settings import Realtime
+from hilctl.machine.timer_latency import Latency, measure
 
 DEFAULT_RATE_HZ = 1000.0
 _EDGES_US = np.concatenate([[0], 2 ** np.arange(17)])
@@ -129,7 +129,7 @@ def diagnose(
         settings: What the loop would ask for.
         folder: Where recordings go.
         seconds: Length of the measurement.
-        on_progress: See :func:`hilctl.machine.latency.measure`.
+        on_progress: See :func:`hilctl.machine.timer_latency.measure`.
 
     Raises:
         InputError: The rate is beyond what is measured.

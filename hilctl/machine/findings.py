@@ -2,9 +2,8 @@
 
 import re
 
-from hilctl.machine.files import Finding, Machine
-from hilctl.machine.linux import DMA_LATENCY
-from hilctl.machine.realtime import (
+from hilctl.machine.procfs import Finding, Machine
+from hilctl.machine.rt_setup import (
     ISOLATED,
     LIMITS_FILE,
     PRIORITY_REMEDY,
@@ -14,6 +13,7 @@ from hilctl.machine.realtime import (
     rt_group_runtime_us,
 )
 from hilctl.machine.settings import Realtime
+from hilctl.machine.syscalls import DMA_LATENCY
 
 _CAP_IPC_LOCK, _CAP_SYS_NICE = 14, 23
 _ENOUGH_LOCKED_BYTES = 1 << 30

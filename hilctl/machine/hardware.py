@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from hilctl.machine.files import Finding, Machine
+from hilctl.machine.procfs import Finding, Machine
 
 _CPU = "/sys/devices/system/cpu"
 _SERIAL = ("/dev/ttyUSB*", "/dev/ttyACM*")

@@ -2,7 +2,7 @@
 
 import os
 
-from hilctl.machine.files import Finding, Machine
+from hilctl.machine.procfs import Finding, Machine
 
 _FOLDERS = ("/usr/lib/systemd", "/usr/local/lib/systemd", "/run/systemd", "/etc/systemd")
 """Folders of settings, the one that counts most last."""

@@ -2,14 +2,14 @@
 
 from typing import Annotated, Any, Literal
 
-from hilctl.base.strict import BeforeValidator, Field, Strict
+from hilctl.base.strict import BeforeValidator, Field, StrictModel
 
 
 def _none_or_number(value: Any) -> Any:
     return None if value == "none" else value
 
 
-class Realtime(Strict):
+class Realtime(StrictModel):
     """How the loop's process asks for real time.
 
     Attributes:

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Self, TypeAlias
 import numpy as np
 
 from hilctl.base.errors import ModelError
-from hilctl.base.strict import Field, Strict, field_validator, model_validator
+from hilctl.base.strict import Field, StrictModel, field_validator, model_validator
 from hilctl.base.types import F64, CommandUnit
 from hilctl.kernels.hysteresis import rest_memory
 
@@ -135,7 +135,7 @@ class Operator:
             self.process(np.array([first_input]))
 
 
-class IdentifiedRange(Strict):
+class IdentifiedRange(StrictModel):
     """The motions that a model was identified on; beyond them its error is not known.
 
     Attributes:
@@ -156,7 +156,7 @@ class IdentifiedRange(Strict):
         return limits
 
 
-class Provenance(Strict):
+class Provenance(StrictModel):
     """Where a model's parameters come from.
 
     Attributes:
@@ -180,7 +180,7 @@ class Provenance(Strict):
     created: str = ""
 
 
-class HysteresisModel(Strict, ABC):
+class HysteresisModel(StrictModel, ABC):
     """Parameters of a model from command to displacement, and of its inverse.
 
     Attributes:

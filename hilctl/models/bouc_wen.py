@@ -6,9 +6,9 @@ from typing import Literal, Self
 import numpy as np
 
 from hilctl.base.strict import model_validator
-from hilctl.kernels.implicit import BOUC_WEN
+from hilctl.kernels.implicit_models import BOUC_WEN
 from hilctl.models.base import refuse
-from hilctl.models.numeric_inverse import NOTHING, ImplicitModel, Packed
+from hilctl.models.implicit_base import NOTHING, ImplicitModel, PackedParameters
 
 
 def bouc_wen_problems(direct: float, hysteretic: float, beta: float, gamma: float) -> Iterator[str]:
@@ -57,9 +57,9 @@ class BoucWenModel(ImplicitModel):
         """Number of states: z."""
         return 1
 
-    def packed(self) -> Packed:
+    def packed(self) -> PackedParameters:
         """Return the parameters as the kernels take them."""
         first = np.array(
             [self.direct, self.hysteretic, self.beta, self.gamma, float(self.exponent)]
         )
-        return Packed(BOUC_WEN, (first, NOTHING, NOTHING))
+        return PackedParameters(BOUC_WEN, (first, NOTHING, NOTHING))

@@ -4,7 +4,7 @@ from typing import Annotated, Self
 
 import numpy as np
 
-from hilctl.base.strict import Field, Strict, model_validator
+from hilctl.base.strict import Field, StrictModel, model_validator
 from hilctl.base.types import F64
 from hilctl.kernels.dynamics import creep_stage, uncreep_stage
 from hilctl.models.base import Operator, StageKernel, refuse, threshold_problems
@@ -13,7 +13,7 @@ TimeConstant = Annotated[float, Field(ge=1e-3, le=1e6)]
 Share = Annotated[float, Field(gt=0.0, le=1.0)]
 
 
-class Creep(Strict):
+class CreepModel(StrictModel):
     """y = x + c_1 + c_2 + ..., T_i c_i' = s_i x - c_i: springs and dampers in series with it all.
 
     As K. Kuhnen and H. Janocha, "Inverse feedforward controller for complex hysteretic
@@ -64,7 +64,7 @@ class _CreepOperator(Operator):
     """
 
     def __init__(
-        self, creep: Creep, stage: StageKernel, sample_rate_hz: float, rest_um: float
+        self, creep: CreepModel, stage: StageKernel, sample_rate_hz: float, rest_um: float
     ) -> None:
         parameters = np.concatenate(creep.over(1.0 / sample_rate_hz))
 

@@ -6,13 +6,13 @@ from typing import Self
 import numpy as np
 
 from hilctl.base.errors import ModelError
-from hilctl.base.strict import Strict, ValidationError, model_validator
+from hilctl.base.strict import StrictModel, ValidationError, model_validator
 from hilctl.base.types import F64
 from hilctl.kernels.hysteresis import deadband_block
 from hilctl.models.base import Thresholds, Weights, length_problems, refuse, threshold_problems
 
 
-class DeadbandFunction(Strict):
+class DeadbandFunction(StrictModel):
     """Lambda(x) = g_0 x + sum g_j J_j(x): piecewise linear, for asymmetry and saturation.
 
     It can be inverted while each cumulative slope, g_0 plus the weights from 0 outwards on one

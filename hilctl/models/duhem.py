@@ -6,9 +6,9 @@ from typing import Literal, Self
 import numpy as np
 
 from hilctl.base.strict import model_validator
-from hilctl.kernels.implicit import BOUC_WEN
+from hilctl.kernels.implicit_models import BOUC_WEN
 from hilctl.models.base import refuse
-from hilctl.models.numeric_inverse import NOTHING, ImplicitModel, Packed
+from hilctl.models.implicit_base import NOTHING, ImplicitModel, PackedParameters
 
 
 class DuhemModel(ImplicitModel):
@@ -48,7 +48,7 @@ class DuhemModel(ImplicitModel):
         """Number of states: z."""
         return 1
 
-    def packed(self) -> Packed:
+    def packed(self) -> PackedParameters:
         """Return the parameters as the kernels take them."""
         first = np.array([self.b, self.b - self.c, self.a, 0.0, 1.0])
-        return Packed(BOUC_WEN, (first, NOTHING, NOTHING))
+        return PackedParameters(BOUC_WEN, (first, NOTHING, NOTHING))

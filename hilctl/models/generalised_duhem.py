@@ -9,7 +9,7 @@ from hilctl.base.strict import model_validator
 from hilctl.base.types import F64
 from hilctl.kernels.generalised_duhem import Band, Losses, duhem_forward, duhem_inverse
 from hilctl.models.base import HysteresisModel, Operator, Weights, refuse
-from hilctl.models.field import FieldLosses
+from hilctl.models.effective_field import FieldLosses
 
 Slopes: TypeAlias = tuple[Weights, ...]
 _LEAST_STEPS = 2.0  # steps of y from node to node, at least

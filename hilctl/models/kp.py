@@ -6,9 +6,9 @@ from typing import Literal, Self
 import numpy as np
 
 from hilctl.base.strict import model_validator
-from hilctl.kernels.implicit import KRASNOSELSKII_POKROVSKII
+from hilctl.kernels.implicit_models import KRASNOSELSKII_POKROVSKII
 from hilctl.models.base import Weights, refuse
-from hilctl.models.numeric_inverse import ImplicitModel, Packed
+from hilctl.models.implicit_base import ImplicitModel, PackedParameters
 
 
 class KrasnoselskiiPokrovskiiModel(ImplicitModel):
@@ -53,10 +53,10 @@ class KrasnoselskiiPokrovskiiModel(ImplicitModel):
         """Number of operators."""
         return len(self.weights) * (len(self.weights) + 1) // 2
 
-    def packed(self) -> Packed:
+    def packed(self) -> PackedParameters:
         """Return the parameters as the kernels take them."""
         row, column = np.tril_indices(len(self.weights))
         levels = self.lowest + self.spacing * np.arange(len(self.weights), dtype=np.float64)
         weights = np.array([weight for row in self.weights for weight in row])
         third = np.append(weights, self.spacing).astype(np.float64)
-        return Packed(KRASNOSELSKII_POKROVSKII, (levels[row], levels[column], third))
+        return PackedParameters(KRASNOSELSKII_POKROVSKII, (levels[row], levels[column], third))

@@ -6,9 +6,9 @@ from typing import Literal, Self
 import numpy as np
 
 from hilctl.base.strict import model_validator
-from hilctl.kernels.implicit import PREISACH
+from hilctl.kernels.implicit_models import PREISACH
 from hilctl.models.base import Thresholds, Weights, refuse
-from hilctl.models.numeric_inverse import ImplicitModel, Packed
+from hilctl.models.implicit_base import ImplicitModel, PackedParameters
 
 
 class PreisachModel(ImplicitModel):
@@ -46,7 +46,7 @@ class PreisachModel(ImplicitModel):
         """Number of lines, which is all that the memory needs."""
         return len(self.thresholds)
 
-    def packed(self) -> Packed:
+    def packed(self) -> PackedParameters:
         """Return the parameters as the kernels take them."""
         slopes = np.array(self.slopes)
         lines, cells = slopes.shape
@@ -57,7 +57,7 @@ class PreisachModel(ImplicitModel):
         of_rest = int(min(max(np.floor(place), 0.0), cells - 1.0))
         values -= values[:, [of_rest]] + slopes[:, [of_rest]] * self.cell * (place - of_rest)
         third = np.array([self.lowest, self.cell, float(cells)])
-        return Packed(PREISACH, (np.array(self.thresholds), values.ravel(), third))
+        return PackedParameters(PREISACH, (np.array(self.thresholds), values.ravel(), third))
 
 
 def _line_problems(thresholds: Thresholds, slopes: tuple[Weights, ...]) -> Iterator[str]:

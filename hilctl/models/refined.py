@@ -7,9 +7,9 @@ from typing import Annotated, Any, Literal, Self, TypeAlias
 
 import numpy as np
 
-from hilctl.base.strict import Field, Strict, model_validator
+from hilctl.base.strict import Field, StrictModel, model_validator
 from hilctl.base.types import F64
-from hilctl.kernels.residual import Tables, residual_forward, residual_inverse
+from hilctl.kernels.residual_operator import Tables, residual_forward, residual_inverse
 from hilctl.models.base import (
     HysteresisModel,
     Operator,
@@ -21,15 +21,15 @@ from hilctl.models.base import (
 )
 from hilctl.models.bouc_wen import BoucWenModel
 from hilctl.models.butterfly import ButterflyModel
-from hilctl.models.chain import Chain
+from hilctl.models.cascade import Chain
 from hilctl.models.duhem import DuhemModel
-from hilctl.models.generalised import GeneralisedModel
+from hilctl.models.generalised_pi import GeneralisedModel
 from hilctl.models.integrated import IntegratedModel
 from hilctl.models.kp import KrasnoselskiiPokrovskiiModel
+from hilctl.models.mechanics import FirstMode
 from hilctl.models.plays import PpiModel, RdpiModel, SpiModel
 from hilctl.models.preisach import PreisachModel
 from hilctl.models.staged import StagedModel
-from hilctl.models.structure import Structure
 
 Refinable: TypeAlias = (
     PpiModel
@@ -52,8 +52,8 @@ _POSITIONS = 60  # of x that the slope is worked out at, each way
 _TURNS = (0.02, 2.0, 8)  # of the longest drag: nearest and furthest turn that is tried, how many
 
 
-class ResidualOperator(Strict):
-    """R of the displacement x that a model gives, see :mod:`hilctl.kernels.residual`.
+class ResidualOperator(StrictModel):
+    """R of the displacement x that a model gives, see :mod:`hilctl.kernels.residual_operator`.
 
     Attributes:
         lowest_um: Lower end of the first cell of x.
@@ -256,7 +256,7 @@ class RefinedModel(HysteresisModel):
         return self.base.operators + self.residual.operators
 
     @property
-    def structure(self) -> Structure | None:
+    def structure(self) -> FirstMode | None:
         """What the displacement goes through, where the base has it."""
         return self.base.structure if isinstance(self.base, StagedModel) else None
 

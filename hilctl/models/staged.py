@@ -19,18 +19,18 @@ from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 
-from hilctl.base.strict import Field, Strict, model_validator
+from hilctl.base.strict import Field, StrictModel, model_validator
 from hilctl.base.types import F64
 from hilctl.kernels.dynamics import lag_block, lead_stage, weigh_block
 from hilctl.models.base import HysteresisModel, Operator, Provenance, refuse
-from hilctl.models.chain import Chain, between, delayed, smoothing_weights
-from hilctl.models.creep import Creep
-from hilctl.models.field import FieldModel
+from hilctl.models.cascade import Chain, between, delayed, smoothing_weights
+from hilctl.models.creep import CreepModel
+from hilctl.models.effective_field import FieldModel
 from hilctl.models.generalised_duhem import GeneralisedDuhemModel
 from hilctl.models.integrated import IntegratedModel
+from hilctl.models.mechanics import FirstMode, FurtherMode
 from hilctl.models.plays import PpiModel, RdpiModel
 from hilctl.models.preisach import PreisachModel
-from hilctl.models.structure import Mode, Structure
 
 AnyHysteresis = Annotated[
     PpiModel | RdpiModel | IntegratedModel | PreisachModel | FieldModel | GeneralisedDuhemModel,
@@ -39,7 +39,7 @@ AnyHysteresis = Annotated[
 _WHOLE = 1e-6
 
 
-class FieldLag(Strict):
+class FieldLag(StrictModel):
     """tau (1 + b |v - x|) dx/dt = v - x: the field x follows the command v.
 
     Attributes:
@@ -86,11 +86,11 @@ class StagedModel(HysteresisModel):
     kind: Literal["staged"] = "staged"
     hysteresis: AnyHysteresis
     lag: FieldLag | None = None
-    structure: Structure | None = None
-    modes: tuple[Mode, ...] = Field(default=(), max_length=8)
+    structure: FirstMode | None = None
+    modes: tuple[FurtherMode, ...] = Field(default=(), max_length=8)
     delay_s: float = Field(default=0.0, ge=0.0, le=1.0)
     smoothing_s: float = Field(default=0.0, ge=0.0, le=0.1)
-    creep: Creep | None = None
+    creep: CreepModel | None = None
 
     @classmethod
     def around(
@@ -98,11 +98,11 @@ class StagedModel(HysteresisModel):
         hysteresis: AnyHysteresis,
         *,
         lag: FieldLag | None = None,
-        structure: Structure | None = None,
-        modes: tuple[Mode, ...] = (),
+        structure: FirstMode | None = None,
+        modes: tuple[FurtherMode, ...] = (),
         delay_s: float = 0.0,
         smoothing_s: float = 0.0,
-        creep: Creep | None = None,
+        creep: CreepModel | None = None,
     ) -> Self:
         """Put stages around a model, whose unit, ranges and provenance become theirs."""
         shared = {name: getattr(hysteresis, name) for name in _SHARED}

@@ -12,11 +12,11 @@ from hilctl.base.events import Event
 from hilctl.base.samples import COLUMNS, LAST_SAMPLE, Samples
 from hilctl.base.types import F64, I64, U32, CommandUnit
 from hilctl.recording.codec import BlockArrays
-from hilctl.recording.data import TICK_COLUMNS, Recording, ReplayStart, Ticks
-from hilctl.recording.facts import unsealed
+from hilctl.recording.metadata_keys import unsealed
+from hilctl.recording.recording import TICK_COLUMNS, Recording, ReplayStart, Ticks
 from hilctl.recording.recovery_scan import RecoveryScan
 from hilctl.recording.segments import segments_of
-from hilctl.recording.stretch import Stretch
+from hilctl.recording.time_range import TimeRange
 from hilctl.recording.validation import (
     RATES_HZ,
     MessageValidator,
@@ -68,7 +68,7 @@ class RecordingBuilder:
         waiting: Samples taken since the last piece.
     """
 
-    def __init__(self, scan: RecoveryScan, stretch: Stretch | None) -> None:
+    def __init__(self, scan: RecoveryScan, stretch: TimeRange | None) -> None:
         self._scan = scan
         self._budget = scan.budget
         self._stretch = stretch

@@ -13,7 +13,7 @@ import numpy as np
 from hilctl.base.samples import RECORDED_FIELDS
 from hilctl.base.types import F64, I64, U8, U32
 from hilctl.recording import schema
-from hilctl.recording.data import TICK_COLUMNS, Ticks
+from hilctl.recording.recording import TICK_COLUMNS, Ticks
 
 _COLUMNS = tuple(field.name for field in RECORDED_FIELDS)
 _BLOCK = schema.message_class("SampleBlock")
@@ -109,7 +109,7 @@ def _unpacked_flags(packed: bytes) -> U32:
 
 
 def encode_ticks(columns: Mapping[str, I64]) -> bytes:
-    """Return a ``TickBlock`` of columns by the names of :class:`~hilctl.recording.data.Ticks`."""
+    """Return a ``TickBlock`` of columns by the names of :class:`~hilctl.recording.recording.Ticks`."""
     message = _TICKS(**{name: values.tolist() for name, values in columns.items()})
     data: bytes = message.SerializeToString()
     return data

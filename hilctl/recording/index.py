@@ -20,9 +20,9 @@ from mcap.records import (
 from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
-from hilctl.recording.facts import unsealed
 from hilctl.recording.mcap_records import FRAME, LARGEST_BYTES, parse, records_from
-from hilctl.recording.stretch import Stretch
+from hilctl.recording.metadata_keys import unsealed
+from hilctl.recording.time_range import TimeRange
 from hilctl.recording.validation import RATES_HZ, number_of
 
 _FOOTER_BYTES = FRAME.size + 20
@@ -31,7 +31,7 @@ _NS = 10**9
 _MOST_DIGITS = 20
 
 
-def places_of(stream: BinaryIO, stretch: Stretch) -> list[int] | None:
+def places_of(stream: BinaryIO, stretch: TimeRange) -> list[int] | None:
     """Return the places of all records that a stretch needs, in order.
 
     These are chunks with its samples and ticks, those with events, metadata and attachments.

@@ -4,7 +4,7 @@ import errno
 from io import FileIO
 from typing import BinaryIO
 
-from hilctl.base.private import is_locked, take_lock
+from hilctl.base.private_dirs import is_locked, take_lock
 
 
 def lock(stream: BinaryIO, *, shared: bool = False) -> None:

@@ -7,13 +7,13 @@ from contextlib import closing
 from pathlib import Path
 
 from hilctl.base.errors import DataError
-from hilctl.base.remedy import no_such_file, reason
+from hilctl.base.os_errors import no_such_file, reason
 from hilctl.recording.builder import RecordingBuilder
-from hilctl.recording.data import Recording
 from hilctl.recording.index import places_of
 from hilctl.recording.locks import is_being_recorded
+from hilctl.recording.recording import Recording
 from hilctl.recording.recovery_scan import RecoveryScan
-from hilctl.recording.stretch import Stretch
+from hilctl.recording.time_range import TimeRange
 
 _log = logging.getLogger(__name__)
 
@@ -21,7 +21,7 @@ PIECE_SAMPLES = 2**18
 """Fewest samples per piece."""
 
 
-def read(path: Path, stretch: Stretch | None = None) -> Recording:
+def read(path: Path, stretch: TimeRange | None = None) -> Recording:
     """Read a recording; if it was truncated or damaged, everything that is whole.
 
     Nothing is written. Missing data is logged as a warning, in one line. All arrays have one shape
@@ -40,10 +40,10 @@ def read(path: Path, stretch: Stretch | None = None) -> Recording:
     return stretch.cut(whole) if stretch else whole
 
 
-class Pieces:
+class RecordingStream:
     """A recording of any length, a piece at a time; each iteration reads the file anew.
 
-    Every piece is a :class:`~hilctl.recording.data.Recording` of the samples, ticks, events and
+    Every piece is a :class:`~hilctl.recording.recording.Recording` of the samples, ticks, events and
     replay starts that come next. The last one, which may hold no sample, has the end, the number of
     missing samples and, of a stretch, the segments as they are cut. Together they are what
     :func:`read` returns.
@@ -53,7 +53,7 @@ class Pieces:
         stretch: What to read of it; everything if None.
     """
 
-    def __init__(self, path: Path, stretch: Stretch | None = None) -> None:
+    def __init__(self, path: Path, stretch: TimeRange | None = None) -> None:
         self.path = path
         self.stretch = stretch
 
@@ -77,7 +77,7 @@ def _prefetched(pieces: Generator[Recording, None, None]) -> Iterator[Recording]
 
 
 def _read(
-    path: Path, stretch: Stretch | None, piece_samples: int | None
+    path: Path, stretch: TimeRange | None, piece_samples: int | None
 ) -> Generator[Recording, None, None]:
     """Yield pieces of that many samples, uncut; all in one if None."""
     try:

@@ -15,10 +15,10 @@ import numpy as np
 
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.events import Event
-from hilctl.base.private import HAS_LOCKS
-from hilctl.base.samples import LAST_SAMPLE, Batch, Head
+from hilctl.base.private_dirs import HAS_LOCKS
+from hilctl.base.samples import LAST_SAMPLE, BlockBatch, BlockHeader
+from hilctl.recording.encoder import RecordingLayout
 from hilctl.recording.locks import lock
-from hilctl.recording.messages import RecordingLayout
 from hilctl.recording.recovery_scan import Damage, RecoveryScan
 from hilctl.recording.rewrite import Rewritten, Survey
 from hilctl.recording.safe_replace import Replacement
@@ -69,7 +69,7 @@ class Recovered:
 
 def recover_recording(
     path: Path,
-    extra: Iterable[Batch] = (),
+    extra: Iterable[BlockBatch] = (),
     end: Mapping[str, str] | None = None,
     *,
     events: Sequence[Event] = (),
@@ -154,7 +154,7 @@ def _left_alone(path: Path, survey: Survey) -> Recovered:
     return Recovered(path, None, text, survey.samples, 0, missing, damages)
 
 
-def _check(path: Path, survey: Survey, more: list[Batch]) -> RecordingLayout | None:
+def _check(path: Path, survey: Survey, more: list[BlockBatch]) -> RecordingLayout | None:
     """Refuse what nothing can be made of; return how to add what is to be added."""
     if not survey.records:
         raise DataError(f"{path}: holds no whole record: there is nothing to recover")
@@ -166,13 +166,13 @@ def _check(path: Path, survey: Survey, more: list[Batch]) -> RecordingLayout | N
         raise DataError(f"{path}: samples can't be added: {error}") from None
 
 
-def _not_in_file(extra: Iterable[Batch], next_sample: int) -> Iterator[Batch]:
+def _not_in_file(extra: Iterable[BlockBatch], next_sample: int) -> Iterator[BlockBatch]:
     """Yield the blocks from ``next_sample`` on, with the gaps before them counted anew.
 
     They come from memory that a dying process has left: what no loop can have written is left out.
     """
     for batch in extra:
-        firsts = batch.heads[:, Head.FIRST_SAMPLE].tolist()
+        firsts = batch.heads[:, BlockHeader.FIRST_SAMPLE].tolist()
         sound = sound_blocks(batch)
         rows: list[int] = []
         gaps: list[int] = []
@@ -183,5 +183,5 @@ def _not_in_file(extra: Iterable[Batch], next_sample: int) -> Iterator[Batch]:
                 next_sample = first + batch.flags.shape[1]
         if rows:
             chosen = batch.rows(np.array(rows, dtype=np.int64))
-            chosen.heads[:, Head.DROPPED_BEFORE] = gaps
+            chosen.heads[:, BlockHeader.DROPPED_BEFORE] = gaps
             yield chosen

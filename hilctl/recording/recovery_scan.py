@@ -27,8 +27,8 @@ from mcap.records import (
 )
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
-from hilctl.recording.facts import unsealed
 from hilctl.recording.mcap_records import FRAME, LARGEST_BYTES, Contents, contents, parse
+from hilctl.recording.metadata_keys import unsealed
 from hilctl.recording.read_budget import ReadBudget
 from hilctl.recording.truncated_chunks import next_likely, own_channels, tail_kind, take_chunk
 from hilctl.recording.validation import MessageValidator

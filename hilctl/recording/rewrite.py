@@ -7,9 +7,9 @@ from mcap.records import Attachment, Channel, McapRecord, Message, Metadata, Sch
 
 from hilctl import __version__
 from hilctl.base.events import Event
-from hilctl.base.samples import Batch
-from hilctl.recording.facts import CHECKSUM_FACT, sealed, unsealed
-from hilctl.recording.messages import MessageMaker, RecordingLayout, Topics, event_message
+from hilctl.base.samples import BlockBatch
+from hilctl.recording.encoder import MessageMaker, RecordingLayout, Topics, event_message
+from hilctl.recording.metadata_keys import CHECKSUM_FACT, sealed, unsealed
 from hilctl.recording.recovery_scan import RecoveryScan
 from hilctl.recording.validation import MessageValidator, count_of
 from hilctl.recording.writer import mcap_writer
@@ -145,7 +145,7 @@ class Rewritten:
         )
 
     def add(
-        self, batches: Iterable[Batch], events: Iterable[Event], layout: RecordingLayout
+        self, batches: Iterable[BlockBatch], events: Iterable[Event], layout: RecordingLayout
     ) -> None:
         """Add batches and events that the old file does not hold, in order."""
         maker = MessageMaker(layout)

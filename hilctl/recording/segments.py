@@ -7,13 +7,13 @@ from pydantic import Field, TypeAdapter, ValidationError
 
 from hilctl.base.samples import LAST_SAMPLE
 from hilctl.base.segments import SHORTEST_PERIOD, Segment
-from hilctl.base.strict import Strict
+from hilctl.base.strict import StrictModel
 
 _MOST_TEXT = 2**24
 _Index = Annotated[int, Field(ge=0, lt=LAST_SAMPLE)]
 
 
-class _RecordedSegment(Strict):
+class _RecordedSegment(StrictModel):
     """The fields of a :class:`~hilctl.base.segments.Segment` as a recording has them."""
 
     label: str

@@ -16,12 +16,19 @@ from google.protobuf.message import DecodeError
 from mcap.records import Channel, McapRecord, Message, Schema
 
 from hilctl.base.events import CHANGES, INVERSE
-from hilctl.base.samples import COLUMNS, LAST_SAMPLE, LONGEST_NS, RECORDED_FIELDS, Batch, Head
+from hilctl.base.samples import (
+    COLUMNS,
+    LAST_SAMPLE,
+    LONGEST_NS,
+    RECORDED_FIELDS,
+    BlockBatch,
+    BlockHeader,
+)
 from hilctl.base.types import CommandUnit
 from hilctl.recording import schema
 from hilctl.recording.codec import BlockArrays, decode_block, decode_ticks
-from hilctl.recording.data import TICK_COLUMNS, Ticks
-from hilctl.recording.facts import LABELS_FACT, LabelValue
+from hilctl.recording.metadata_keys import LABELS_FACT, LabelValue
+from hilctl.recording.recording import TICK_COLUMNS, Ticks
 
 MAX_UNIX_NS = 2**63 - 1
 """Latest time that 64 bits hold with a sign, as NumPy and Parquet have it: in the year 2262."""
@@ -47,7 +54,7 @@ def decode(topic: str, data: bytes) -> tuple[Any, str]:
 
     Returns:
         For ``/samples`` a :class:`~hilctl.recording.codec.BlockArrays`, for ``/ticks``
-        :class:`~hilctl.recording.data.Ticks`, otherwise a message of the protobuf library.
+        :class:`~hilctl.recording.recording.Ticks`, otherwise a message of the protobuf library.
     """
     try:
         return _DECODERS[topic](data), ""
@@ -145,10 +152,10 @@ def _is_fade(event: Any) -> bool:
     return whole and 0.0 <= values["share"] <= 1.0 and values["samples"] >= 1.0
 
 
-def sound_blocks(batch: Batch) -> npt.NDArray[np.bool_]:
+def sound_blocks(batch: BlockBatch) -> npt.NDArray[np.bool_]:
     """Return which blocks of a batch a loop can have written: bool[k]."""
-    first = batch.heads[:, Head.FIRST_SAMPLE]
-    times = batch.heads[:, [Head.DEADLINE_NS, Head.LATE_NS, Head.EXCHANGE_NS]]
+    first = batch.heads[:, BlockHeader.FIRST_SAMPLE]
+    times = batch.heads[:, [BlockHeader.DEADLINE_NS, BlockHeader.LATE_NS, BlockHeader.EXCHANGE_NS]]
     in_time = ((times >= -LONGEST_NS) & (times <= LONGEST_NS)).all(axis=1)
     in_run = (first >= 0) & (first < LAST_SAMPLE - batch.flags.shape[1])
     begun = np.isfinite(batch.states[:, -1])

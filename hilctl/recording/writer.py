@@ -20,11 +20,11 @@ from mcap.writer import Writer
 from hilctl import __version__
 from hilctl.base.events import Event
 from hilctl.base.files import begins_as_recording
-from hilctl.base.samples import Batch
+from hilctl.base.samples import BlockBatch
 from hilctl.base.segments import Segment
-from hilctl.recording.facts import sealed
+from hilctl.recording.encoder import MessageMaker, RecordingLayout, Topics
 from hilctl.recording.locks import lock
-from hilctl.recording.messages import MessageMaker, RecordingLayout, Topics
+from hilctl.recording.metadata_keys import sealed
 
 _CHUNK_BYTES = 5 << 20
 """Size at which a chunk is closed: about 2 s of samples at 50 kHz, the default flush interval."""
@@ -120,7 +120,7 @@ class RecordingWriter:
         """Write one event."""
         self._topics.add(self._maker.event(event))
 
-    def batch(self, batch: Batch) -> None:
+    def batch(self, batch: BlockBatch) -> None:
         """Write all samples and ticks of a batch."""
         for message in self._maker.batch(batch):
             self._topics.add(message)

@@ -6,8 +6,8 @@ from dataclasses import replace
 from hilctl.base.device import Device, DeviceInfo
 from hilctl.base.errors import InputError
 from hilctl.base.types import F64
-from hilctl.experiment.adaptation import make_adaptation
-from hilctl.experiment.feedback import make_feedback
+from hilctl.experiment.adaptation_bounds import make_adaptation
+from hilctl.experiment.feedback_checks import make_feedback
 from hilctl.experiment.file import Experiment
 from hilctl.experiment.interlocks import interlock_context
 from hilctl.experiment.load import LoadedExperiment
@@ -15,7 +15,7 @@ from hilctl.loop.adaptation import DisplacementOperator
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.conditioning import Conditioning
 from hilctl.loop.pacer import LatePolicy, LateRules
-from hilctl.loop.plan import Plan
+from hilctl.loop.plan import LoopPlan
 
 _ALWAYS_LATE_S = 2.0
 _MISSED_WINDOW_S = 10.0
@@ -65,7 +65,7 @@ def assemble(
     operator: DisplacementOperator | None = None,
     paced: bool = True,
     heat_a2: float = 0.0,
-) -> Plan:
+) -> LoopPlan:
     """Return what a run does; its compensator is warmed up.
 
     Args:
@@ -86,7 +86,7 @@ def assemble(
     compensator.warm_up()
     if state is not None:
         compensator.restore(state)
-    return Plan(
+    return LoopPlan(
         reference=reference,
         input_um=input_um,
         block=config.block,

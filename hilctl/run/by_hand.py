@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hilctl.base.errors import ConfigError, Problem, RunError
+from hilctl.base.errors import ConfigError, ConfigProblem, RunError
 from hilctl.base.files import TextFiles
 from hilctl.base.yaml import load_document
 from hilctl.experiment.device import made_device
@@ -87,7 +87,7 @@ def put_safe(
     safe = document.validate(Safe, at=("safe",)) if given else Safe()
     device = made_device(document, path.parent, TextFiles())
     if device is None:
-        raise ConfigError([Problem(str(path), "device", "is required, with a key kind")])
+        raise ConfigError([ConfigProblem(str(path), "device", "is required, with a key kind")])
     info = device.info
     died, relief = _earlier_run(info.holds)
     goal = SafeGoal(safe.value, 1.0, None, pending=died)

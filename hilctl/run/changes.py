@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 
 from hilctl.base.errors import InputError
-from hilctl.experiment.check import Checked, command_problems, reference_problems
-from hilctl.experiment.straight import fade_refusal
+from hilctl.experiment.linear_bypass import fade_refusal
+from hilctl.experiment.preflight import CheckedExperiment, command_problems, reference_problems
 from hilctl.loop.compensator import Compensator
 from hilctl.run.protocol import InverseState
-from hilctl.run.shared_page import Field, SharedPage
+from hilctl.run.shared_page import PageField, SharedPage
 
 _SHARES: dict[str | None, float] = {"in": 1.0, "out": 0.0}
 _MOST_WAITING = 16
@@ -47,7 +47,7 @@ class Changes:
 
     def __init__(
         self,
-        checked: Checked,
+        checked: CheckedExperiment,
         page: SharedPage,
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
@@ -99,7 +99,7 @@ class Changes:
                         raise InputError(f"set: {why}")
                     # The loop must have taken the change before, which is overwritten.
                     page = self._page
-                    if page.get(Field.TUNE_WANTED) == page.observe(Field.TUNE_TAKEN):
+                    if page.get(PageField.TUNE_WANTED) == page.observe(PageField.TUNE_TAKEN):
                         return self._make(gain, offset, over_s, inverse)
                 if self._clock() >= until:
                     raise InputError("set: the loop has not taken the change before: try again")
@@ -109,9 +109,9 @@ class Changes:
 
     def _too_late(self) -> str:
         """Return why no change can be made any more, or an empty text."""
-        if self._page.get(Field.STOP):
+        if self._page.get(PageField.STOP):
             return "the run is on its way to the safe value"
-        if self._page.get(Field.NEXT_SAMPLE) >= self._checked.forecast.samples:
+        if self._page.get(PageField.NEXT_SAMPLE) >= self._checked.forecast.samples:
             return "the waveform is over; the run is on its way to the safe value"
         return ""
 
@@ -135,20 +135,20 @@ class Changes:
             raise InputError(f"set: {why}")
         page, config = self._page, self._checked.loaded.config
         lead = max(1, round(_LEAD_S * config.sample_rate_hz))
-        blocks = math.ceil((page.get(Field.NEXT_SAMPLE) + lead) / config.block) + 1
+        blocks = math.ceil((page.get(PageField.NEXT_SAMPLE) + lead) / config.block) + 1
         begins_at = blocks * config.block
         if begins_at >= self._checked.forecast.samples:
             raise InputError("set: the waveform is over before the change could begin")
-        page.put_float(Field.TUNE_GAIN, gain)
-        page.put_float(Field.TUNE_OFFSET, offset)
-        page.put_float(Field.TUNE_INVERSE_SHARE, share)
+        page.put_float(PageField.TUNE_GAIN, gain)
+        page.put_float(PageField.TUNE_OFFSET, offset)
+        page.put_float(PageField.TUNE_INVERSE_SHARE, share)
         if line := self._checked.forecast.line:
-            page.put_float(Field.TUNE_LINE_SLOPE, line.slope)
-            page.put_float(Field.TUNE_LINE_AT_ZERO, line.at_zero)
-        page.put(Field.TUNE_SAMPLES, max(1, round(over_s * config.sample_rate_hz)))
-        page.put(Field.TUNE_BEGINS_AT, begins_at)
+            page.put_float(PageField.TUNE_LINE_SLOPE, line.slope)
+            page.put_float(PageField.TUNE_LINE_AT_ZERO, line.at_zero)
+        page.put(PageField.TUNE_SAMPLES, max(1, round(over_s * config.sample_rate_hz)))
+        page.put(PageField.TUNE_BEGINS_AT, begins_at)
         # Last: the loop reads the numbers above as soon as it sees a new count.
-        page.publish(Field.TUNE_WANTED, page.get(Field.TUNE_WANTED) + 1)
+        page.publish(PageField.TUNE_WANTED, page.get(PageField.TUNE_WANTED) + 1)
         self.gain, self.offset, self._inverse_share = gain, offset, share
         return {
             "gain": gain,
@@ -159,7 +159,7 @@ class Changes:
         }
 
 
-def bound_refusal(checked: Checked, gain: float, offset: float, *, bypassed: bool) -> str:
+def bound_refusal(checked: CheckedExperiment, gain: float, offset: float, *, bypassed: bool) -> str:
     """Return why a reference of this gain and offset would leave the limits, or an empty text.
 
     The whole range of the reference counts, also what has passed. Its command range is bounded; its
@@ -187,7 +187,9 @@ def bound_refusal(checked: Checked, gain: float, offset: float, *, bypassed: boo
     return "; ".join(f"{problem.rule}, got {problem.value}" for problem in problems)
 
 
-def command_range(checked: Checked, low: float, high: float, gain: float) -> tuple[float, float]:
+def command_range(
+    checked: CheckedExperiment, low: float, high: float, gain: float
+) -> tuple[float, float]:
     """Return the lowest and highest command for a reference from ``low`` to ``high``.
 
     It is the range of a sine between them. The checked run differs from a sine over its own range,
@@ -206,7 +208,7 @@ def command_range(checked: Checked, low: float, high: float, gain: float) -> tup
     return found[0] + more[0], found[1] + more[1]
 
 
-def _sine_commands(checked: Checked, low: float, high: float) -> tuple[float, float]:
+def _sine_commands(checked: CheckedExperiment, low: float, high: float) -> tuple[float, float]:
     """Return the lowest and highest command in the second cycle of a sine from rest."""
     phase = np.arange(2 * _CYCLE) * (2.0 * np.pi / _CYCLE)
     values = 0.5 * (low + high) + 0.5 * (high - low) * np.sin(phase)

@@ -9,7 +9,7 @@ from contextlib import suppress
 from hilctl.base.errors import InputError, RunError
 from hilctl.run.job import start_process
 from hilctl.run.run_folder import RunFolder
-from hilctl.run.shared_page import Field, PageText, Phase, SharedPage
+from hilctl.run.shared_page import PageField, PageSlot, Phase, SharedPage
 
 _READY_TIMEOUT_S = 120.0
 _DEATH_S = 0.1
@@ -78,23 +78,23 @@ class LoopProcess(ChildProcess):
         """
         page = self._page
         deadline = time.monotonic() + _READY_TIMEOUT_S
-        while page.observe(Field.PHASE) == Phase.STARTING and not self.ended:
+        while page.observe(PageField.PHASE) == Phase.STARTING and not self.ended:
             if stopped():
                 raise RunError("stopped before the start; nothing has moved")
             if time.monotonic() > deadline:
                 raise RunError(f"the loop was not ready within {_READY_TIMEOUT_S:g} s")
             time.sleep(0.005)
-        if page.observe(Field.PHASE) == Phase.REFUSED:
-            raise InputError(page.read_text(PageText.ERROR))
-        if page.observe(Field.PHASE) == Phase.FAILED:
-            raise RunError(page.read_text(PageText.ERROR))
-        if page.observe(Field.PHASE) != Phase.READY:
+        if page.observe(PageField.PHASE) == Phase.REFUSED:
+            raise InputError(page.read_text(PageSlot.ERROR))
+        if page.observe(PageField.PHASE) == Phase.FAILED:
+            raise RunError(page.read_text(PageSlot.ERROR))
+        if page.observe(PageField.PHASE) != Phase.READY:
             raise RunError(f"the loop process died before the start: {self._death()}")
 
     def death(self) -> str:
         """Return why it could not say how it ended."""
-        if self._page.observe(Field.PHASE) == Phase.FAILED:
-            return self._page.read_text(PageText.ERROR)
+        if self._page.observe(PageField.PHASE) == Phase.FAILED:
+            return self._page.read_text(PageSlot.ERROR)
         return f"the loop process died: {self._death()}"
 
     def _death(self) -> str:

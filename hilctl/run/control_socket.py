@@ -17,7 +17,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from hilctl.base.errors import InputError, RunError
-from hilctl.base.private import private_folder
+from hilctl.base.private_dirs import private_folder
 from hilctl.run.protocol import MAX_BYTES, VERSION, VERSION_KEY, is_same_user, short_path
 
 _log = logging.getLogger(__name__)

@@ -27,15 +27,15 @@ from types import FrameType
 from hilctl.base.device import Device
 from hilctl.base.errors import HilctlError
 from hilctl.loop.safe_output import LocalError, SafeGoal, SafeOutput
-from hilctl.machine.linux import LinuxProcess
-from hilctl.machine.realtime import be_quick
+from hilctl.machine.rt_setup import be_quick
+from hilctl.machine.syscalls import LinuxProcess
 from hilctl.run.job import Job, SilenceLimits
 from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import keep_removed
 from hilctl.run.shared_page import (
-    Field,
     GuardianPhase,
-    PageText,
+    PageField,
+    PageSlot,
     Phase,
     SafeActionResult,
     SharedPage,
@@ -78,7 +78,7 @@ class HangWatch:
             now_ns: Monotonic time.
         """
         page = self._page
-        heartbeat_ns, phase = page.get(Field.LOOP_HEARTBEAT_NS), page.get(Field.PHASE)
+        heartbeat_ns, phase = page.get(PageField.LOOP_HEARTBEAT_NS), page.get(PageField.PHASE)
         watched = phase in {Phase.RUNNING, Phase.CLOSING}
         if heartbeat_ns != self._heartbeat_ns or not watched:
             self._heartbeat_ns, self._seen_ns, self._polls = heartbeat_ns, now_ns, 0
@@ -88,7 +88,7 @@ class HangWatch:
         if self._polls <= _POLLS:
             return False
         limits = self._limits
-        loop_s = limits.real_time_s if page.get(Field.REAL_TIME) else limits.ordinary_s
+        loop_s = limits.real_time_s if page.get(PageField.REAL_TIME) else limits.ordinary_s
         if silent_s > loop_s + self._wait_s(phase):
             return True
         # Last, since it asks the kernel.
@@ -97,9 +97,9 @@ class HangWatch:
     def _wait_s(self, phase: int) -> float:
         """Return how long the loop may be waiting for its device."""
         # A lost device may use up its timeouts; before the first tick nothing moves.
-        if phase == Phase.CLOSING or not self._page.get(Field.LOOP_HEARTBEAT_NS):
+        if phase == Phase.CLOSING or not self._page.get(PageField.LOOP_HEARTBEAT_NS):
             return _CLOSING_S
-        return self._limits.exchange_s if self._page.get(Field.EXCHANGING) else 0.0
+        return self._limits.exchange_s if self._page.get(PageField.EXCHANGING) else 0.0
 
 
 def is_stopped(process: int) -> bool:
@@ -210,15 +210,15 @@ class Guardian:
             False if this process cannot drive the device, and another one has to.
         """
         page = self._page
-        page.put(Field.GUARDIAN_HEARTBEAT_NS, time.monotonic_ns())
+        page.put(PageField.GUARDIAN_HEARTBEAT_NS, time.monotonic_ns())
         # After the heartbeat: an old one would pass for silence.
-        page.put(Field.GUARDIAN_PHASE, GuardianPhase.WATCHING)
+        page.put(PageField.GUARDIAN_PHASE, GuardianPhase.WATCHING)
         while True:
             now_ns = time.monotonic_ns()
-            page.put(Field.GUARDIAN_HEARTBEAT_NS, now_ns)
+            page.put(PageField.GUARDIAN_HEARTBEAT_NS, now_ns)
             if self._death.poll(_POLL_MS):
                 # Without the start signal nothing was sent: the output is as it was before.
-                if not page.get(Field.GO) or page.ended_safely():
+                if not page.get(PageField.GO) or page.ended_safely():
                     return True
                 return act(page, self._device, self._goal(), hung=False, prepare=self._prepare)
             if self._watch.hangs(now_ns):
@@ -243,7 +243,7 @@ def safe_goal(ring: SampleRing, device: Device, value: float, ramp_per_s: float)
     if start is None:
         start = ring.last_command()
     # A loop that has ended without a confirmed output lost its device in an exchange.
-    unanswered = page.get(Field.EXCHANGING) or page.get(Field.PHASE) == Phase.ENDED
+    unanswered = page.get(PageField.EXCHANGING) or page.get(PageField.PHASE) == Phase.ENDED
     if info.simulated:  # another process has a simulation of its own
         return SafeGoal(value, ramp_per_s, None, pending=False)
     return SafeGoal(value, ramp_per_s, start, bool(unanswered))
@@ -276,11 +276,11 @@ def act(
         ended_by_user = True
 
     page.leave_safe_result(SafeActionResult(hung, "unknown", "", final=False))
-    page.put(Field.GUARDIAN_PHASE, GuardianPhase.ACTING)
+    page.put(PageField.GUARDIAN_PHASE, GuardianPhase.ACTING)
     signal.signal(signal.SIGTERM, end)
     action = SafeAction(page, device, goal, hung=hung, prepare=prepare)
     while not (result := action.result(_POLL_MS * 1e-3)).final and not ended_by_user:
-        page.put(Field.GUARDIAN_HEARTBEAT_NS, time.monotonic_ns())
+        page.put(PageField.GUARDIAN_HEARTBEAT_NS, time.monotonic_ns())
         page.leave_safe_result(result)
         if action.failed:
             _fail(page, action.failed)
@@ -290,9 +290,9 @@ def act(
 
 
 def _fail(page: SharedPage, text: str) -> None:
-    page.write_text(PageText.GUARDIAN, text)
+    page.write_text(PageSlot.GUARDIAN, text)
     # The text first: the phase says that it is there.
-    page.put(Field.GUARDIAN_PHASE, GuardianPhase.FAILED)
+    page.put(PageField.GUARDIAN_PHASE, GuardianPhase.FAILED)
 
 
 def main(words: list[str]) -> int:
@@ -302,7 +302,7 @@ def main(words: list[str]) -> int:
     job = Job.read(Path(words[0]))
     ring = SampleRing(Path(job.ring))
     page = ring.page
-    page.put(Field.GUARDIAN_PID, os.getpid())
+    page.put(PageField.GUARDIAN_PID, os.getpid())
     try:
         device = job.device()
     except (HilctlError, MemoryError) as error:
@@ -325,7 +325,7 @@ def main(words: list[str]) -> int:
 
 def _leave_folder(folder: Path, page: SharedPage) -> None:
     """Remove the run's folder if nothing is left to do, or see that it can be recovered."""
-    if page.get(Field.RECORDED) and page.get(Field.GUARDIAN_PHASE) == GuardianPhase.DONE:
+    if page.get(PageField.RECORDED) and page.get(PageField.GUARDIAN_PHASE) == GuardianPhase.DONE:
         shutil.rmtree(folder, ignore_errors=True)
     else:
         keep_removed()

@@ -15,7 +15,7 @@ from hilctl.run.child import ChildProcess
 from hilctl.run.job import start_process
 from hilctl.run.ring import SampleRing, safe_result_of
 from hilctl.run.run_folder import RunFolder, locked_run, runs
-from hilctl.run.shared_page import Field, GuardianPhase, PageText, SharedPage
+from hilctl.run.shared_page import GuardianPhase, PageField, PageSlot, SharedPage
 
 _log = logging.getLogger(__name__)
 
@@ -39,8 +39,8 @@ class GuardianProcess(ChildProcess):
         self, folder: RunFolder, page: SharedPage, inherits: Sequence[int], loop: int | None
     ) -> None:
         self._page = page
-        page.put(Field.GUARDIAN_PHASE, GuardianPhase.STARTING)
-        page.put(Field.GUARDIAN_HEARTBEAT_NS, 0)
+        page.put(PageField.GUARDIAN_PHASE, GuardianPhase.STARTING)
+        page.put(PageField.GUARDIAN_HEARTBEAT_NS, 0)
         self._log = folder.guardian_log
         with ExitStack() as stack:
             watched = []
@@ -59,18 +59,18 @@ class GuardianProcess(ChildProcess):
     @property
     def phase(self) -> GuardianPhase:
         """How far it has come."""
-        return GuardianPhase(self._page.get(Field.GUARDIAN_PHASE))
+        return GuardianPhase(self._page.get(PageField.GUARDIAN_PHASE))
 
     @property
     def heartbeat_ns(self) -> int:
         """Time of its last heartbeat, monotonic; 0 before the first."""
-        return self._page.get(Field.GUARDIAN_HEARTBEAT_NS)
+        return self._page.get(PageField.GUARDIAN_HEARTBEAT_NS)
 
     @property
     def error(self) -> str:
         """Why it could not start or go on."""
         if self.phase == GuardianPhase.FAILED:
-            return self._page.read_text(PageText.GUARDIAN)
+            return self._page.read_text(PageSlot.GUARDIAN)
         with suppress(OSError):
             *_, last = self._log.read_text(encoding="utf-8", errors="replace").splitlines() or [""]
             return f"it died: {last}" if last else "it died"
@@ -120,7 +120,7 @@ class GuardianRelief:
         """Remove their folders: another process drives the devices."""
         for run in self.runs:
             with suppress(OSError, ValueError):
-                if SampleRing(run.ring, look_only=True).page.get(Field.RECORDED):
+                if SampleRing(run.ring, look_only=True).page.get(PageField.RECORDED):
                     run.remove()
 
 
@@ -133,7 +133,9 @@ def signal_guardian(run: RunFolder, number: int, wait_s: float = 0.0) -> bool:
         wait_s: Longest wait for its end.
     """
     try:
-        guardian = os.pidfd_open(SampleRing(run.ring, look_only=True).page.get(Field.GUARDIAN_PID))
+        guardian = os.pidfd_open(
+            SampleRing(run.ring, look_only=True).page.get(PageField.GUARDIAN_PID)
+        )
     except (OSError, ValueError):
         return False  # it has just ended
     try:

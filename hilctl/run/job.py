@@ -25,7 +25,7 @@ from hilctl.base.yaml import Document
 from hilctl.experiment.device import made_device
 
 if TYPE_CHECKING:
-    from hilctl.experiment.check import Checked
+    from hilctl.experiment.preflight import CheckedExperiment
     from hilctl.run.run_folder import RunFolder
 
 _SIMULATED_MARGIN_S = 0.5
@@ -94,7 +94,7 @@ class Job:
 
     @classmethod
     def of(
-        cls, checked: "Checked", folder: "RunFolder", *, supervisor: int, silence_s: float
+        cls, checked: "CheckedExperiment", folder: "RunFolder", *, supervisor: int, silence_s: float
     ) -> Self:
         """Return the job of a checked experiment, and write its arrays into the run's folder.
 
@@ -169,7 +169,7 @@ class Job:
         return reference, reference if same else _mapped(self.input_um)
 
 
-def silence_limits(checked: "Checked") -> SilenceLimits:
+def silence_limits(checked: "CheckedExperiment") -> SilenceLimits:
     """Return how long the loop of an experiment may be silent."""
     config = checked.loaded.config
     timing = config.timing
@@ -190,7 +190,7 @@ def silence_limits(checked: "Checked") -> SilenceLimits:
     )
 
 
-def safe_priority(checked: "Checked") -> int:
+def safe_priority(checked: "CheckedExperiment") -> int:
     """Return the SCHED_FIFO priority of the process that sets the safe value.
 
     It is above the loop's, so that a loop in an endless cycle cannot delay that process.

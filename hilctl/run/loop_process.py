@@ -16,28 +16,28 @@ import numpy as np
 from hilctl.base.device import Clock
 from hilctl.base.errors import HilctlError, InputError, RunError
 from hilctl.base.files import TextFiles
-from hilctl.experiment.condition import conditioning_of
+from hilctl.experiment.conditioning import conditioning_of
 from hilctl.experiment.load import LoadedExperiment, resolve
 from hilctl.loop.adaptation import DisplacementOperator
-from hilctl.loop.host import StraightLine, Tuning
+from hilctl.loop.host import LinearBypass, Tuning
 from hilctl.loop.loop import Loop
 from hilctl.loop.pacer import SystemClock
-from hilctl.loop.plan import Outcome, Plan
+from hilctl.loop.plan import LoopOutcome, LoopPlan
 from hilctl.loop.safe_output import SafeGoal, describe, drive_to_safe
-from hilctl.machine.realtime import be_ordinary, prepare, refusals, require, step_facts
-from hilctl.machine.usage import ProcessUsage
+from hilctl.machine.process_usage import ProcessUsage
+from hilctl.machine.rt_setup import be_ordinary, prepare, refusals, require, step_facts
 from hilctl.run.assemble import assemble, starting_output
 from hilctl.run.job import Job
 from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import keep_removed
-from hilctl.run.shared_page import Field, PageText, Phase, SharedPage, Stop
+from hilctl.run.shared_page import PageField, PageSlot, Phase, SharedPage, Stop
 
 # Plain numbers: looking up an enumeration's member takes longer than writing it.
-_HEARTBEAT_NS, _NEXT_SAMPLE = int(Field.LOOP_HEARTBEAT_NS), int(Field.NEXT_SAMPLE)
-_LATE_TICKS, _STOP = int(Field.LATE_TICKS), int(Field.STOP)
-_SUPERVISOR_HEARTBEAT_NS = int(Field.SUPERVISOR_HEARTBEAT_NS)
-_TUNE_WANTED, _TUNE_TAKEN = int(Field.TUNE_WANTED), int(Field.TUNE_TAKEN)
-_TUNE_BEGINS_AT = int(Field.TUNE_BEGINS_AT)
+_HEARTBEAT_NS, _NEXT_SAMPLE = int(PageField.LOOP_HEARTBEAT_NS), int(PageField.NEXT_SAMPLE)
+_LATE_TICKS, _STOP = int(PageField.LATE_TICKS), int(PageField.STOP)
+_SUPERVISOR_HEARTBEAT_NS = int(PageField.SUPERVISOR_HEARTBEAT_NS)
+_TUNE_WANTED, _TUNE_TAKEN = int(PageField.TUNE_WANTED), int(PageField.TUNE_TAKEN)
+_TUNE_BEGINS_AT = int(PageField.TUNE_BEGINS_AT)
 
 
 class RingHost:
@@ -79,26 +79,28 @@ class RingHost:
     def closing(self) -> None:
         """Say that the loop is over, and that the device may take its time."""
         self._numbers[_HEARTBEAT_NS] = self.clock.now_ns()
-        self._page.publish(Field.PHASE, Phase.CLOSING)
+        self._page.publish(PageField.PHASE, Phase.CLOSING)
 
     def tuning(self) -> Tuning | None:
         """Return a change of the reference that is wanted, new, and due to begin."""
         numbers, page = self._numbers, self._page
         if numbers[_TUNE_WANTED] == numbers[_TUNE_TAKEN]:
             return None
-        wanted = page.observe(Field.TUNE_WANTED)
+        wanted = page.observe(PageField.TUNE_WANTED)
         if numbers[_NEXT_SAMPLE] < numbers[_TUNE_BEGINS_AT]:
             return None
         tuning = Tuning(
-            page.get_float(Field.TUNE_GAIN),
-            page.get_float(Field.TUNE_OFFSET),
-            page.get(Field.TUNE_SAMPLES),
-            page.get(Field.TUNE_BEGINS_AT),
-            page.get_float(Field.TUNE_INVERSE_SHARE),
-            StraightLine(*map(page.get_float, (Field.TUNE_LINE_SLOPE, Field.TUNE_LINE_AT_ZERO))),
+            page.get_float(PageField.TUNE_GAIN),
+            page.get_float(PageField.TUNE_OFFSET),
+            page.get(PageField.TUNE_SAMPLES),
+            page.get(PageField.TUNE_BEGINS_AT),
+            page.get_float(PageField.TUNE_INVERSE_SHARE),
+            LinearBypass(
+                *map(page.get_float, (PageField.TUNE_LINE_SLOPE, PageField.TUNE_LINE_AT_ZERO))
+            ),
         )
         # Taken only once it has been read: the supervisor may write the next one from here on.
-        page.publish(Field.TUNE_TAKEN, wanted)
+        page.publish(PageField.TUNE_TAKEN, wanted)
         return tuning
 
     def supervised(self) -> bool:
@@ -111,7 +113,7 @@ def loaded_of(job: Job) -> LoadedExperiment:
     return resolve(job.document(), Path(job.folder), files=TextFiles(job.files))
 
 
-def plan_of(job: Job, loaded: LoadedExperiment) -> Plan:
+def plan_of(job: Job, loaded: LoadedExperiment) -> LoopPlan:
     """Return what the loop of a job does."""
     reference, input_um = job.arrays()
     return assemble(
@@ -125,7 +127,7 @@ def plan_of(job: Job, loaded: LoadedExperiment) -> Plan:
     )
 
 
-def run_job(job: Job, ring: SampleRing) -> Outcome:
+def run_job(job: Job, ring: SampleRing) -> LoopOutcome:
     """Run a job, from set-up to the closed device.
 
     Raises:
@@ -144,25 +146,27 @@ def run_job(job: Job, ring: SampleRing) -> Outcome:
     try:
         output = starting_output(device, config.safe.at_start)
         waveform_at = loop.begin_at(output)
-        page.put_float(Field.OUTPUT_AT_START, output)
-        page.put(Field.REAL_TIME, int(any(s.name == "fifo" and s.outcome == "done" for s in steps)))
-        page.put(Field.WAVEFORM_AT, waveform_at)
-        page.write_text(PageText.SET_UP, json.dumps([step_facts(steps), refusals(steps)]))
+        page.put_float(PageField.OUTPUT_AT_START, output)
+        page.put(
+            PageField.REAL_TIME, int(any(s.name == "fifo" and s.outcome == "done" for s in steps))
+        )
+        page.put(PageField.WAVEFORM_AT, waveform_at)
+        page.write_text(PageSlot.SET_UP, json.dumps([step_facts(steps), refusals(steps)]))
         # After the text, which the supervisor reads then.
-        page.publish(Field.PHASE, Phase.READY)
+        page.publish(PageField.PHASE, Phase.READY)
         start_ns = _await_go(page, host)
     except BaseException:
         device.close()  # and no safe value: nothing has moved, and the output is not to step there
         raise
     try:
-        page.publish(Field.PHASE, Phase.RUNNING)
+        page.publish(PageField.PHASE, Phase.RUNNING)
         before = ProcessUsage.now()
         outcome = loop.run(start_ns)
         page.leave_usage(ProcessUsage.now().since(before))
         # Before the device is closed: that may take its time-outs, and is no hang.
         host.closing()
     except BaseException as error:
-        pending = bool(page.get(Field.EXCHANGING)) and not device.info.simulated
+        pending = bool(page.get(PageField.EXCHANGING)) and not device.info.simulated
         goal = SafeGoal(job.safe_value, job.ramp_per_s, ring.last_command(), pending)
         found = drive_to_safe(device, goal, on_write=page.note_safe_write)
         if found.state != "confirmed":
@@ -182,11 +186,11 @@ def _await_go(page: SharedPage, host: RingHost) -> int:
     Raises:
         RunError: The supervisor has died; nothing has moved.
     """
-    while not page.observe(Field.GO):
+    while not page.observe(PageField.GO):
         if not host.supervised():
             raise RunError("the supervisor died before the start; nothing has moved")
         time.sleep(0.001)
-    return page.get(Field.START_NS)
+    return page.get(PageField.START_NS)
 
 
 def main(words: list[str]) -> int:
@@ -212,8 +216,8 @@ def main(words: list[str]) -> int:
 
 def _failed(page: SharedPage, text: str, phase: Phase = Phase.FAILED) -> int:
     # The text first: the phase says that it is there.
-    page.write_text(PageText.ERROR, text)
-    page.publish(Field.PHASE, phase)
+    page.write_text(PageSlot.ERROR, text)
+    page.publish(PageField.PHASE, phase)
     return 1
 
 

@@ -20,24 +20,15 @@ import numpy as np
 from hilctl import __version__
 from hilctl.base.errors import RunError
 from hilctl.base.events import CHANGES, Event
-from hilctl.base.metrics import (
-    Folding,
-    loop_area,
-    peak,
-    peak_hysteresis_percent,
-    peak_to_peak,
-    percent,
-    rms,
-)
 from hilctl.base.samples import COLUMNS, NO_WAVEFORM, Flag, Samples
 from hilctl.base.segments import Segment
-from hilctl.base.strict import Strict
+from hilctl.base.strict import StrictModel
 from hilctl.base.yaml import dump
 from hilctl.loop.pacer import Lateness
-from hilctl.loop.plan import Outcome
+from hilctl.loop.plan import LoopOutcome
 from hilctl.machine.diagnosis import machine_facts
-from hilctl.machine.usage import ProcessUsage
-from hilctl.recording.facts import (
+from hilctl.machine.process_usage import ProcessUsage
+from hilctl.recording.metadata_keys import (
     END_FIGURES,
     HEAT_FACT,
     HOLDS_FACT,
@@ -45,17 +36,26 @@ from hilctl.recording.facts import (
     OVERRIDES_FACT,
     USAGE_FACT,
 )
+from hilctl.signals.cycle_metrics import (
+    CycleAverager,
+    loop_area,
+    peak,
+    peak_hysteresis_percent,
+    peak_to_peak,
+    percent,
+    rms,
+)
 
 if TYPE_CHECKING:
-    from hilctl.experiment.check import Checked
     from hilctl.experiment.load import LoadedExperiment
+    from hilctl.experiment.preflight import CheckedExperiment
     from hilctl.waveforms.spec import AnyWaveform
 
 _LEFT_OUT = NO_WAVEFORM | Flag.SENSOR_INVALID
 
 
 def run_facts(
-    checked: "Checked", started: str, model_yaml: str, correction_yaml: str = ""
+    checked: "CheckedExperiment", started: str, model_yaml: str, correction_yaml: str = ""
 ) -> dict[str, str]:
     """Return identity, versions, device and units, as text; the layout says the rates.
 
@@ -127,7 +127,7 @@ def sha256_of(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest() if text else ""
 
 
-def end_facts(outcome: Outcome, counters: Lateness, lost_events: int = 0) -> dict[str, str]:
+def end_facts(outcome: LoopOutcome, counters: Lateness, lost_events: int = 0) -> dict[str, str]:
     """Return the loop's own account of a run's end and the exact counters, as text.
 
     Args:
@@ -161,7 +161,7 @@ def usage_facts(loop: ProcessUsage | None, supervisor: ProcessUsage) -> dict[str
     return {USAGE_FACT: json.dumps({name: asdict(each) for name, each in known.items() if each})}
 
 
-class SettingRow(Strict):
+class SettingRow(StrictModel):
     """One key of the experiment as it runs.
 
     Attributes:
@@ -175,7 +175,7 @@ class SettingRow(Strict):
     settable: bool
 
 
-class LimitBounds(Strict):
+class LimitBounds(StrictModel):
     """What limiter and interlocks hold the run to; None where there is none.
 
     Attributes:
@@ -201,7 +201,7 @@ class LimitBounds(Strict):
     late_s: float
 
 
-class RunDescription(Strict):
+class RunDescription(StrictModel):
     """One run.
 
     Attributes:
@@ -238,7 +238,7 @@ class RunDescription(Strict):
     settings: list[SettingRow]
 
     @classmethod
-    def of(cls, checked: "Checked") -> Self:
+    def of(cls, checked: "CheckedExperiment") -> Self:
         """Return what a checked experiment says of itself."""
         loaded, reference = checked.loaded, checked.reference
         config, info = loaded.config, loaded.device.info
@@ -289,7 +289,7 @@ class RunDescription(Strict):
         return cls.model_validate_json(path.read_bytes())
 
 
-def _limits(checked: "Checked") -> LimitBounds:
+def _limits(checked: "CheckedExperiment") -> LimitBounds:
     config = checked.loaded.config
     limits = config.limits
     return LimitBounds(
@@ -373,7 +373,7 @@ class _SegmentFigures:
     def __init__(self, segment: Segment, *, compensated: bool) -> None:
         self._segment, self._compensated = segment, compensated
         self._start, self._stop, cycles = segment.steady_cycles()
-        self._folding = Folding(segment.period, 2) if cycles else None
+        self._folding = CycleAverager(segment.period, 2) if cycles else None
         self._lowest_um, self._highest_um = math.inf, -math.inf
         self._peak_um = self._squares_um2 = 0.0
         self._samples = 0

@@ -9,19 +9,19 @@ from pathlib import Path
 
 from hilctl.base.errors import HilctlError
 from hilctl.base.events import Event
-from hilctl.base.samples import Batch, Head
-from hilctl.loop.plan import Outcome
+from hilctl.base.samples import BlockBatch, BlockHeader
+from hilctl.loop.plan import LoopOutcome
 from hilctl.loop.safe_output import describe
 from hilctl.recording.locks import is_being_recorded
 from hilctl.recording.recover import recover_recording
 from hilctl.run.metadata import end_facts
 from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import RunFolder, runs, taken_over
-from hilctl.run.shared_page import Field, PageText, Phase
+from hilctl.run.shared_page import PageField, PageSlot, Phase
 
 
 @dataclass(frozen=True, slots=True)
-class Orphan:
+class RecoveredRun:
     """A run that somebody else had to finish.
 
     Attributes:
@@ -41,7 +41,7 @@ class Orphan:
     started: bool = True
 
 
-def recover_orphans() -> list[Orphan]:
+def recover_orphans() -> list[RecoveredRun]:
     """Finish the recordings of all dead runs of this user, and clear their folders away."""
     found = []
     for run in runs():
@@ -55,28 +55,28 @@ def recover_orphans() -> list[Orphan]:
     return found
 
 
-def _recover(run: RunFolder) -> Orphan:
+def _recover(run: RunFolder) -> RecoveredRun:
     path = Path(run.card.recording)
     if not _has_started(run, path):
         _remove_claimed(path)
-        return Orphan(run.card.name, path, True, "nothing has moved", started=False)
+        return RecoveredRun(run.card.name, path, True, "nothing has moved", started=False)
     outcome, batches, events, end = _left_behind(run)
     where = "at its safe value" if outcome.safe else "NOT confirmed to be safe: check it"
     if _is_recorded(run):
-        return Orphan(run.card.name, path, outcome.safe, f"{outcome.reason}; output {where}")
+        return RecoveredRun(run.card.name, path, outcome.safe, f"{outcome.reason}; output {where}")
     try:
         recovered = recover_recording(path, batches, end, events=events, ended_at=outcome.ended_at)
         text = f"{outcome.reason}; output {where}; {recovered.samples} samples: {recovered.reason}"
     except (HilctlError, OSError) as error:
         text = f"{outcome.reason}; output {where}; its recording could not be recovered: {error}"
-        return Orphan(run.card.name, path, outcome.safe, text, run.path)
-    return Orphan(run.card.name, path, outcome.safe, text)
+        return RecoveredRun(run.card.name, path, outcome.safe, text, run.path)
+    return RecoveredRun(run.card.name, path, outcome.safe, text)
 
 
 def _is_recorded(run: RunFolder) -> bool:
     """Return whether the supervisor closed the recording, and only the output was still to do."""
     try:
-        return bool(SampleRing(run.ring).page.get(Field.RECORDED))
+        return bool(SampleRing(run.ring).page.get(PageField.RECORDED))
     except (OSError, ValueError):
         return False
 
@@ -86,7 +86,7 @@ def _has_started(run: RunFolder, recording: Path) -> bool:
         page = SampleRing(run.ring).page
     except (OSError, ValueError):  # it is made before anything is written to the recording
         return not (recording.is_file() and recording.stat().st_size == 0)
-    return bool(page.get(Field.GO) or page.get(Field.SENT))
+    return bool(page.get(PageField.GO) or page.get(PageField.SENT))
 
 
 def _remove_claimed(recording: Path) -> None:
@@ -98,9 +98,9 @@ def _remove_claimed(recording: Path) -> None:
 
 def _left_behind(
     run: RunFolder,
-) -> tuple[Outcome, list[Batch], list[Event], dict[str, str]]:
+) -> tuple[LoopOutcome, list[BlockBatch], list[Event], dict[str, str]]:
     """Return how the loop ended, blocks and events that are not safe yet, facts of the end."""
-    died = Outcome("fault", "supervisor and loop died", 0, "unknown", 0)
+    died = LoopOutcome("fault", "supervisor and loop died", 0, "unknown", 0)
     try:
         ring = SampleRing(run.ring)
     except (OSError, ValueError):
@@ -123,21 +123,21 @@ def _left_behind(
             break
     page = ring.page
     outcome = page.outcome() or died
-    if page.observe(Field.PHASE) == Phase.FAILED:
-        outcome = replace(died, reason=page.read_text(PageText.ERROR))
+    if page.observe(PageField.PHASE) == Phase.FAILED:
+        outcome = replace(died, reason=page.read_text(PageSlot.ERROR))
     if not page.ended_safely() and (result := page.safe_result()) is not None:
         did = f"guardian: {describe(result.output, result.error)}"
         outcome = replace(outcome, reason=f"{outcome.reason}; {did}", output=result.output)
-    if page.observe(Field.PHASE) != Phase.ENDED:
+    if page.observe(PageField.PHASE) != Phase.ENDED:
         last = batches[-1].heads[-1] if batches else None
-        next_sample = 0 if last is None else int(last[Head.FIRST_SAMPLE]) + ring.block
+        next_sample = 0 if last is None else int(last[BlockHeader.FIRST_SAMPLE]) + ring.block
         if (unanswered := ring.unanswered(next_sample)) is not None:
             batches.append(unanswered)
     return (
         outcome,
         batches,
         page.pop_events(),
-        end_facts(outcome, page.lateness(), page.get(Field.EVENTS_LOST)),
+        end_facts(outcome, page.lateness(), page.get(PageField.EVENTS_LOST)),
     )
 
 

@@ -20,21 +20,21 @@ import numpy as np
 from hilctl.base.errors import InputError
 from hilctl.base.events import ADAPTED, Event
 from hilctl.base.files import already_there, sync_folder
-from hilctl.base.remedy import reason
-from hilctl.base.samples import Batch, Head, Samples
-from hilctl.experiment.check import Checked
+from hilctl.base.os_errors import reason
+from hilctl.base.samples import BlockBatch, BlockHeader, Samples
+from hilctl.experiment.coil_heat import CoilHeat
 from hilctl.experiment.correction import dump_correction
 from hilctl.experiment.device_state import CoilState, DeviceState, write_device_state
-from hilctl.experiment.heat import CoilHeat
-from hilctl.loop.plan import Outcome
-from hilctl.machine.usage import ProcessUsage
-from hilctl.models.files import dump_model
-from hilctl.recording.facts import HEAT_FACT
-from hilctl.recording.messages import RecordingLayout
+from hilctl.experiment.preflight import CheckedExperiment
+from hilctl.loop.plan import LoopOutcome
+from hilctl.machine.process_usage import ProcessUsage
+from hilctl.models.model_file import dump_model
+from hilctl.recording.encoder import RecordingLayout
+from hilctl.recording.metadata_keys import HEAT_FACT
 from hilctl.recording.writer import OutputFile, RecordingWriter, RunFacts
 from hilctl.run.metadata import EndFigures, end_facts, run_facts, usage_facts
 from hilctl.run.ring import SampleRing
-from hilctl.run.shared_page import Field
+from hilctl.run.shared_page import PageField
 
 _SAMPLES_BEFORE = 50
 _SPARE = 20
@@ -60,7 +60,7 @@ class Recorder:
         InputError: The file exists or can't be written.
     """
 
-    def __init__(self, checked: Checked, path: Path, *, overwrite: bool) -> None:
+    def __init__(self, checked: CheckedExperiment, path: Path, *, overwrite: bool) -> None:
         self.path = path
         self.adapted: Mapping[str, float] = {}
         """Values of the newest event of adaptation."""
@@ -70,7 +70,7 @@ class Recorder:
         self._checked = checked
         self._writer: RecordingWriter | None = None
         self._unix_ns = steady_unix_ns()
-        self._tail = Tail(_SAMPLES_BEFORE)
+        self._tail = RecentSamples(_SAMPLES_BEFORE)
         config = checked.loaded.config
         self._heat = CoilHeat(config.limits, config.sample_rate_hz, checked.heat_a2)
         self._run: RunFacts | None = None
@@ -91,7 +91,7 @@ class Recorder:
         Args:
             start_unix_ns: When it is due.
             set_up: How the loop's process was set up, see
-                :func:`hilctl.machine.realtime.step_facts`.
+                :func:`hilctl.machine.rt_setup.step_facts`.
             waveform_at: Index of the first sample of the waveform; a ramp comes before it.
 
         Raises:
@@ -135,14 +135,14 @@ class Recorder:
             )
             write_device_state(state)
 
-    def batch(self, batch: Batch) -> None:
+    def batch(self, batch: BlockBatch) -> None:
         """Write a batch."""
-        self._next_sample = int(batch.heads[-1, Head.FIRST_SAMPLE]) + batch.flags.shape[1]
+        self._next_sample = int(batch.heads[-1, BlockHeader.FIRST_SAMPLE]) + batch.flags.shape[1]
         self._tail.add(batch)
         self._heat.follow(batch.samples())
         if self._begun.samples == 0:
             # The file says itself what is missing before its first sample.
-            batch.heads[0, Head.DROPPED_BEFORE] = batch.heads[0, Head.FIRST_SAMPLE]
+            batch.heads[0, BlockHeader.DROPPED_BEFORE] = batch.heads[0, BlockHeader.FIRST_SAMPLE]
         self._write(partial(self._begun.batch, batch))
         self._gathered.add(batch.samples())
 
@@ -305,7 +305,7 @@ class Recorder:
         )
 
 
-class Tail:
+class RecentSamples:
     """Keeps at least the last samples, however they came.
 
     Args:
@@ -316,7 +316,7 @@ class Tail:
         self._samples = samples
         self._newest: Samples | None = None
 
-    def add(self, batch: Batch) -> None:
+    def add(self, batch: BlockBatch) -> None:
         """Take the newest samples of a batch; more of them than are asked for, for late events."""
         kept = _SPARE * self._samples
         blocks = -(-kept // batch.flags.shape[1])
@@ -355,12 +355,12 @@ class RingRecorder:
 
     def __init__(self, ring: SampleRing, recorder: Recorder, flush_s: float) -> None:
         self.recorder = recorder
-        self.newest: Batch | None = None
+        self.newest: BlockBatch | None = None
         """A copy of the newest block."""
         self._ring, self._flush_s = ring, flush_s
         self._events: deque[Event] = deque()
         self._of_loop: deque[Event] = deque()
-        self._outcome: Outcome | None = None
+        self._outcome: LoopOutcome | None = None
         self._lost_loop = False
         self._ending = threading.Event()
         self._released_s = time.monotonic()
@@ -377,7 +377,7 @@ class RingRecorder:
         """Record an event of the supervisor; returns at once."""
         self._events.append(event)
 
-    def end(self, outcome: Outcome, *, lost_loop: bool) -> None:
+    def end(self, outcome: LoopOutcome, *, lost_loop: bool) -> None:
         """Let it take what is left, and close the recording; returns at once.
 
         Args:
@@ -457,8 +457,8 @@ class RingRecorder:
         if self._lost_loop:
             if (batch := self._ring.unanswered(recorder.next_sample)) is not None:
                 recorder.batch(batch)
-            ended_at = max(recorder.next_sample, page.get(Field.ENDED_AT))
+            ended_at = max(recorder.next_sample, page.get(PageField.ENDED_AT))
             outcome = replace(outcome, ended_at=ended_at)
-        facts = end_facts(outcome, page.lateness(), page.get(Field.EVENTS_LOST))
+        facts = end_facts(outcome, page.lateness(), page.get(PageField.EVENTS_LOST))
         facts |= usage_facts(page.usage(), ProcessUsage.now().since(self._before))
         recorder.finish(facts, outcome.ended_at)

@@ -8,23 +8,23 @@ from pydantic import AfterValidator, Field, TypeAdapter, ValidationError
 
 from hilctl.base.errors import InputError
 from hilctl.base.events import MARK, Event
-from hilctl.base.strict import Strict
-from hilctl.experiment.check import Checked
+from hilctl.base.strict import StrictModel
+from hilctl.experiment.preflight import CheckedExperiment
 from hilctl.run.changes import Changes
 from hilctl.run.protocol import MAX_MARK
 from hilctl.run.recorder import RingRecorder
 from hilctl.run.run_folder import RunFolder, facts_of
-from hilctl.run.shared_page import Field as Number
+from hilctl.run.shared_page import PageField as Number
 from hilctl.run.shared_page import Phase, SharedPage
 
 
-class StatusRequest(Strict):
+class StatusRequest(StrictModel):
     """Where does the run stand?"""
 
     command: Literal["status"]
 
 
-class SetRequest(Strict):
+class SetRequest(StrictModel):
     """Move the reference's gain or offset over a ramp, or fade the inverse out or in.
 
     Attributes:
@@ -48,7 +48,7 @@ def _one_line(text: str) -> str:
     return text
 
 
-class MarkRequest(Strict):
+class MarkRequest(StrictModel):
     """Set a mark at the present sample.
 
     Attributes:
@@ -77,7 +77,7 @@ class Requests:
 
     def __init__(
         self,
-        checked: Checked,
+        checked: CheckedExperiment,
         folder: RunFolder,
         page: SharedPage,
         recording: RingRecorder,

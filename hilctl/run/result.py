@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from hilctl.base.samples import Batch
+from hilctl.base.samples import BlockBatch
 from hilctl.loop.safe_output import OutputState
 
 
@@ -77,4 +77,4 @@ class Progress:
     total: int
     late_ticks: int
     compensated: bool
-    batch: Batch
+    batch: BlockBatch

@@ -25,19 +25,27 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from hilctl.base.samples import ANSWERS, COLUMNS, LAST_SAMPLE, LONGEST_NS, Batch, Flag, Head
+from hilctl.base.samples import (
+    ANSWERS,
+    COLUMNS,
+    LAST_SAMPLE,
+    LONGEST_NS,
+    BlockBatch,
+    BlockHeader,
+    Flag,
+)
 from hilctl.base.types import I64
 from hilctl.loop.block import COMMAND, Block
 from hilctl.run.run_folder import RunFolder
 from hilctl.run.shared_page import SIZE as _PAGE_SIZE
-from hilctl.run.shared_page import Field, SafeActionResult, SharedPage
+from hilctl.run.shared_page import PageField, SafeActionResult, SharedPage
 
 _LINE = 64
 # Plain numbers: looking up an enumeration's member takes longer than writing it.
-_SENT, _HEAD, _TAIL = int(Field.SENT), int(Field.HEAD), int(Field.TAIL)
-_ENDED_AT, _EXCHANGING = int(Field.ENDED_AT), int(Field.EXCHANGING)
-_SEQUENCE, _FIRST_SAMPLE = int(Head.SEQUENCE), int(Head.FIRST_SAMPLE)
-_HEAD_NUMBERS = len(Head)
+_SENT, _HEAD, _TAIL = int(PageField.SENT), int(PageField.HEAD), int(PageField.TAIL)
+_ENDED_AT, _EXCHANGING = int(PageField.ENDED_AT), int(PageField.EXCHANGING)
+_SEQUENCE, _FIRST_SAMPLE = int(BlockHeader.SEQUENCE), int(BlockHeader.FIRST_SAMPLE)
+_HEAD_NUMBERS = len(BlockHeader)
 _MAGIC = 0x48494C43_52494E48
 _MOST_BLOCKS = 50_000
 """Most blocks that are made before the first tick: each takes 1.3 kB."""
@@ -78,20 +86,20 @@ class SampleRing:
         if len(self._map) < _PAGE_SIZE:
             raise ValueError(f"{path}: is not a hilctl ring")
         self.page = SharedPage(self._map)
-        if self.page.get(Field.MAGIC) != _MAGIC:
+        if self.page.get(PageField.MAGIC) != _MAGIC:
             raise ValueError(f"{path}: is not a hilctl ring")
         self._numbers, self._integers = self.page.numbers, self.page.integers
         self._publish, self._observe = self.page.publishes, self.page.observes
-        self.slots, self.block = self.page.get(Field.SLOTS), self.page.get(Field.BLOCK)
-        self._spare = self.page.get(Field.SPARE)
-        state_size = self.page.get(Field.STATE_SIZE)
+        self.slots, self.block = self.page.get(PageField.SLOTS), self.page.get(PageField.BLOCK)
+        self._spare = self.page.get(PageField.SPARE)
+        state_size = self.page.get(PageField.STATE_SIZE)
         if min(self.slots, self.block, self._spare, state_size) < 1:
             raise ValueError(f"{path}: is damaged")
         self._area = self._views(state_size)
         self._heads = memoryview(self._area.heads.data.cast("B")).cast("q")
         self._spares_used = 0
         self._blocks: list[Block] = []
-        self._tail = self._released = self.page.get(Field.TAIL)
+        self._tail = self._released = self.page.get(PageField.TAIL)
 
     @classmethod
     def create(
@@ -117,10 +125,10 @@ class SampleRing:
             os.posix_fallocate(descriptor, 0, _PAGE_SIZE + size)
             with mmap.mmap(descriptor, _PAGE_SIZE) as memory:
                 numbers = memoryview(memory).cast("q")
-                numbers[Field.SLOTS], numbers[Field.BLOCK] = slots, block
-                numbers[Field.STATE_SIZE], numbers[Field.SPARE] = state_size, spare
+                numbers[PageField.SLOTS], numbers[PageField.BLOCK] = slots, block
+                numbers[PageField.STATE_SIZE], numbers[PageField.SPARE] = state_size, spare
                 # Last: a ring whose maker died meanwhile is not taken for one.
-                numbers[Field.MAGIC] = _MAGIC
+                numbers[PageField.MAGIC] = _MAGIC
                 numbers.release()
         finally:
             os.close(descriptor)
@@ -128,7 +136,7 @@ class SampleRing:
         made._clean(slice(None))
         return made
 
-    def _views(self, state_size: int) -> Batch:
+    def _views(self, state_size: int) -> BlockBatch:
         count, block = self.slots + self._spare, self.block
         shapes = _shapes(count, block, state_size)
         sizes = _sizes(count, block, state_size)
@@ -140,7 +148,7 @@ class SampleRing:
             count = math.prod(shape)
             parts.append(np.frombuffer(self._map, dtype, count, offset).reshape(shape))
             offset += _padded(size)
-        return Batch(*parts)
+        return BlockBatch(*parts)
 
     def prepare_blocks(self) -> None:
         """Make the blocks of the slots before the first tick, for the producer."""
@@ -176,14 +184,14 @@ class SampleRing:
         Returns:
             Command in the device's unit; None if the block was not in a slot of its own.
         """
-        sent, head = self.page.get(Field.SENT), self.page.get(Field.HEAD)
-        if self.page.get(Field.ENDED_AT) == 0:
-            return self.page.get_float(Field.OUTPUT_AT_START)
+        sent, head = self.page.get(PageField.SENT), self.page.get(PageField.HEAD)
+        if self.page.get(PageField.ENDED_AT) == 0:
+            return self.page.get_float(PageField.OUTPUT_AT_START)
         number = min(head, sent - 1)
         slot = number % self.slots
-        first = int(self._area.heads[slot, Head.FIRST_SAMPLE])
+        first = int(self._area.heads[slot, BlockHeader.FIRST_SAMPLE])
         if number < 0 or (
-            number == sent - 1 and first + self.block != self.page.get(Field.ENDED_AT)
+            number == sent - 1 and first + self.block != self.page.get(PageField.ENDED_AT)
         ):
             return None
         return float(self._area.columns[slot, COMMAND, -1])
@@ -207,15 +215,15 @@ class SampleRing:
         self._publish(self._integers, _HEAD, block.number + 1)
         return True
 
-    def batches(self) -> Iterator[Batch]:
+    def batches(self) -> Iterator[BlockBatch]:
         """Take out the blocks that are there now, some at a time; see :meth:`pop`."""
         # As many as there are now: on a busy machine there always is another one by then.
-        waiting = min(max(self.page.observe(Field.HEAD) - self._tail, 0), self.slots)
+        waiting = min(max(self.page.observe(PageField.HEAD) - self._tail, 0), self.slots)
         until = self._tail + waiting
         while (left := until - self._tail) > 0 and (batch := self.pop(left)) is not None:
             yield batch
 
-    def pop(self, most: int | None = None) -> Batch | None:
+    def pop(self, most: int | None = None) -> BlockBatch | None:
         """Take out blocks, up to the end of the ring and not too many; None where there are none.
 
         They keep their room until :meth:`release`.
@@ -223,7 +231,7 @@ class SampleRing:
         Args:
             most: How many at most.
         """
-        there = min(max(self.page.observe(Field.HEAD) - self._tail, 0), self.slots)
+        there = min(max(self.page.observe(PageField.HEAD) - self._tail, 0), self.slots)
         if there == 0:
             return None
         first = self._tail % self.slots
@@ -245,7 +253,7 @@ class SampleRing:
         Returns:
             How many there were.
         """
-        there = min(max(self.page.observe(Field.HEAD) - self._tail, 0), self.slots)
+        there = min(max(self.page.observe(PageField.HEAD) - self._tail, 0), self.slots)
         passed = 0
         while passed < there:
             slot = (self._tail + passed) % self.slots
@@ -255,19 +263,21 @@ class SampleRing:
         self._tail += passed
         return passed
 
-    def look(self, since: int) -> tuple[Batch, int]:
+    def look(self, since: int) -> tuple[BlockBatch, int]:
         """Copy the blocks from number ``since`` on; takes nothing out, any process may call it.
 
         Returns:
             Those that still stand there whole, perhaps none, and the number after the last of all;
             what is missing between was overwritten, or damaged.
         """
-        head = self.page.observe(Field.HEAD)
-        numbers = _numbers(max(since, self.page.observe(Field.CLEANED), head - self.slots), head)
+        head = self.page.observe(PageField.HEAD)
+        numbers = _numbers(
+            max(since, self.page.observe(PageField.CLEANED), head - self.slots), head
+        )
         batch = self._area.rows(numbers % self.slots)
         # Looked at again: of what is given back meanwhile, a part may be clean already.
-        whole = numbers >= self.page.observe(Field.CLEANED)
-        whole &= batch.heads[:, Head.SEQUENCE] == numbers + 1
+        whole = numbers >= self.page.observe(PageField.CLEANED)
+        whole &= batch.heads[:, BlockHeader.SEQUENCE] == numbers + 1
         return batch if whole.all() else batch.rows(np.flatnonzero(whole)), max(head, since)
 
     def release(self, keep: int = 0) -> None:
@@ -279,20 +289,20 @@ class SampleRing:
         self.page.release_events()
         until = max(self._released, self._tail - keep)
         # Said first: who looks on must not take a block that is cleaned under its copy for whole.
-        self.page.publish(Field.CLEANED, until)
+        self.page.publish(PageField.CLEANED, until)
         # Cleaned here and not in the tick; before the room is given, or the loop would be in it.
         first, count = self._released % self.slots, until - self._released
         self._clean(slice(first, min(first + count, self.slots)))
         self._clean(slice(0, max(0, first + count - self.slots)))
         self._released = until
-        self.page.publish(Field.TAIL, until)
+        self.page.publish(PageField.TAIL, until)
 
     def _clean(self, slots: slice) -> None:
         """Let slots hold no flag and no answer."""
         self._area.flags[slots] = 0
         self._area.columns[slots, ANSWERS] = np.nan
 
-    def unanswered(self, next_sample: int) -> Batch | None:
+    def unanswered(self, next_sample: int) -> BlockBatch | None:
         """Return the blocks that were sent and never answered; for when the producer has died.
 
         Args:
@@ -303,18 +313,20 @@ class SampleRing:
             The blocks in order, every sample with :attr:`~hilctl.base.samples.Flag.UNANSWERED`, or
             None. The last may not have reached the device.
         """
-        sent = self.page.observe(Field.SENT)
-        numbers = _numbers(max(self.page.observe(Field.HEAD), sent - self.slots), sent)
+        sent = self.page.observe(PageField.SENT)
+        numbers = _numbers(max(self.page.observe(PageField.HEAD), sent - self.slots), sent)
         slots: I64 = numbers % self.slots
         heads = self._area.heads[slots]
-        under_way = heads[:, Head.SEQUENCE] == -numbers - 1
-        batch = self._area.rows(slots[under_way & (heads[:, Head.FIRST_SAMPLE] >= next_sample)])
+        under_way = heads[:, BlockHeader.SEQUENCE] == -numbers - 1
+        batch = self._area.rows(
+            slots[under_way & (heads[:, BlockHeader.FIRST_SAMPLE] >= next_sample)]
+        )
         if not batch.heads.shape[0]:
             return None
         batch.columns[:, ANSWERS] = np.nan
         batch.flags[:] |= np.uint32((Flag.SENSOR_INVALID | Flag.UNANSWERED).value)
-        ends = [next_sample, *(batch.heads[:-1, Head.FIRST_SAMPLE] + self.block).tolist()]
-        batch.heads[:, Head.DROPPED_BEFORE] = batch.heads[:, Head.FIRST_SAMPLE] - ends
+        ends = [next_sample, *(batch.heads[:-1, BlockHeader.FIRST_SAMPLE] + self.block).tolist()]
+        batch.heads[:, BlockHeader.DROPPED_BEFORE] = batch.heads[:, BlockHeader.FIRST_SAMPLE] - ends
         return batch
 
 
@@ -329,18 +341,18 @@ def _whole(heads: I64, number: int) -> npt.NDArray[np.bool_]:
     A recording that holds what no run can have is not read again.
     """
     expected = np.arange(number + 1, number + 1 + heads.shape[0])
-    first = heads[:, Head.FIRST_SAMPLE]
-    dropped = heads[:, Head.DROPPED_BEFORE]
+    first = heads[:, BlockHeader.FIRST_SAMPLE]
+    dropped = heads[:, BlockHeader.DROPPED_BEFORE]
     possible = (first < LAST_SAMPLE) & (dropped >= 0) & (dropped <= first)
     furthest = (heads >= -LONGEST_NS) & (heads <= LONGEST_NS)
-    whole: npt.NDArray[np.bool_] = (heads[:, Head.SEQUENCE] == expected) & possible
+    whole: npt.NDArray[np.bool_] = (heads[:, BlockHeader.SEQUENCE] == expected) & possible
     return whole & furthest.all(axis=1)
 
 
 def _shapes(slots: int, block: int, state_size: int) -> tuple[tuple[int, ...], ...]:
     """Return the shapes of heads, states, columns and flags."""
     width = len(COLUMNS)
-    return (slots, len(Head)), (slots, state_size), (slots, width, block), (slots, block)
+    return (slots, len(BlockHeader)), (slots, state_size), (slots, width, block), (slots, block)
 
 
 def _sizes(slots: int, block: int, state_size: int) -> Sequence[int]:

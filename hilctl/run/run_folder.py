@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from hilctl.base.errors import InputError, RunError
-from hilctl.base.private import is_locked, private_folder, take_lock, user_folders
+from hilctl.base.private_dirs import is_locked, private_folder, take_lock, user_folders
 
 _log = logging.getLogger(__name__)
 

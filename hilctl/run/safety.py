@@ -13,15 +13,15 @@ from functools import partial
 
 from hilctl.base.errors import RunError
 from hilctl.base.events import Event
-from hilctl.experiment.check import Checked
+from hilctl.experiment.preflight import CheckedExperiment
 from hilctl.loop.safe_output import PATIENCE_S
-from hilctl.machine.realtime import be_ordinary, be_quick
+from hilctl.machine.rt_setup import be_ordinary, be_quick
 from hilctl.run.child import LoopProcess
 from hilctl.run.guardian import LAST_CALL_MS, HangWatch, SafeAction, is_stopped, safe_goal
 from hilctl.run.guardian_process import GuardianProcess
 from hilctl.run.job import safe_priority, silence_limits
 from hilctl.run.ring import SampleRing
-from hilctl.run.shared_page import Field, GuardianPhase, SafeActionResult
+from hilctl.run.shared_page import GuardianPhase, PageField, SafeActionResult
 
 _AWAKE_NS = 50_000_000
 _LOST_NS = 1_000_000_000
@@ -47,7 +47,7 @@ class Safety:
 
     def __init__(
         self,
-        checked: Checked,
+        checked: CheckedExperiment,
         ring: SampleRing,
         child: LoopProcess,
         start_guardian: Callable[[int | None], GuardianProcess] | None,
@@ -189,7 +189,7 @@ class Safety:
         return "gives no sign any more" if lost else ""
 
     def _say(self, text: str) -> None:
-        sample = self._page.get(Field.NEXT_SAMPLE)
+        sample = self._page.get(PageField.NEXT_SAMPLE)
         self._record_event(Event(sample, "warning", "guardian_lost", text))
 
     def close(self, stopped: Callable[[], bool] = lambda: False) -> bool:

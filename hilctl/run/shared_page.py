@@ -26,8 +26,8 @@ from hilctl.loop.safe_output import OutputState
 
 if TYPE_CHECKING:
     from hilctl.loop.pacer import Lateness
-    from hilctl.loop.plan import Outcome
-    from hilctl.machine.usage import ProcessUsage
+    from hilctl.loop.plan import LoopOutcome
+    from hilctl.machine.process_usage import ProcessUsage
 
 _PAGE = 4096
 _TEXT_BYTES = 4096
@@ -35,28 +35,28 @@ _EVENT_BYTES = 1024
 _EVENT_SLOTS = 32
 
 
-class PageText(IntEnum):
+class PageSlot(IntEnum):
     """Texts that loop and guardian leave for the supervisor, each in a place of its own."""
 
     SET_UP = 0
     """How its process was set up: JSON of names and what became of each, and of what was refused
     that real time needs."""
     OUTCOME = 1
-    """How the run ended: JSON of :class:`hilctl.loop.plan.Outcome`."""
+    """How the run ended: JSON of :class:`hilctl.loop.plan.LoopOutcome`."""
     ERROR = 2
     """Why it could not start or go on, for people."""
     GUARDIAN = 3
     """What the guardian did: JSON of :class:`SafeActionResult`, or why it failed, for people."""
 
 
-_EVENTS_AT = _PAGE + len(PageText) * _TEXT_BYTES
+_EVENTS_AT = _PAGE + len(PageSlot) * _TEXT_BYTES
 _NOTES_AT = _EVENTS_AT + _EVENT_SLOTS * _EVENT_BYTES
 _NOTE_SLOTS = 32
 SIZE = _NOTES_AT + _NOTE_SLOTS * _EVENT_BYTES
 """Bytes that the numbers, the texts and the events take."""
 
 
-class Field(IntEnum):
+class PageField(IntEnum):
     """Numbers of the page, int64 each; what a change leads to, but its samples, is float64."""
 
     MAGIC = 0
@@ -184,22 +184,22 @@ _REASONS = {
 
 
 _LATENESS = (
-    Field.LATE_TICKS,
-    Field.SKIPPED_TICKS,
-    Field.WORST_LATE_NS,
-    Field.WORST_LATE_TICK,
-    Field.LONGEST_LATE_RUN,
+    PageField.LATE_TICKS,
+    PageField.SKIPPED_TICKS,
+    PageField.WORST_LATE_NS,
+    PageField.WORST_LATE_TICK,
+    PageField.LONGEST_LATE_RUN,
 )
 """Where each field of :class:`~hilctl.loop.pacer.Lateness` stands, in its order."""
 
 _USAGE = (
-    Field.RESIDENT_BYTES,
-    Field.CPU_NS,
-    Field.MINOR_FAULTS,
-    Field.MAJOR_FAULTS,
-    Field.INVOLUNTARY_SWITCHES,
+    PageField.RESIDENT_BYTES,
+    PageField.CPU_NS,
+    PageField.MINOR_FAULTS,
+    PageField.MAJOR_FAULTS,
+    PageField.INVOLUNTARY_SWITCHES,
 )
-"""Where each field of :class:`~hilctl.machine.usage.ProcessUsage` stands, in its order."""
+"""Where each field of :class:`~hilctl.machine.process_usage.ProcessUsage` stands, in its order."""
 
 
 class SharedPage:
@@ -216,13 +216,13 @@ class SharedPage:
         self.numbers = memoryview(memory)[:_PAGE].cast("q")
         """The same numbers as Python's own: three times as fast to read and write singly."""
         self._floats: F64 = np.frombuffer(memory, dtype=np.float64, count=_PAGE // 8)
-        self._event_tail = self.get(Field.EVENT_TAIL)
+        self._event_tail = self.get(PageField.EVENT_TAIL)
 
-    def get(self, field: Field) -> int:
+    def get(self, field: PageField) -> int:
         """Return a number."""
         return int(self.integers[field])
 
-    def put(self, field: Field, value: int) -> None:
+    def put(self, field: PageField, value: int) -> None:
         """Set a number."""
         self.integers[field] = value
 
@@ -240,27 +240,27 @@ class SharedPage:
 
         return observe
 
-    def publish(self, field: Field, value: int) -> None:
+    def publish(self, field: PageField, value: int) -> None:
         """Set a number that says of others that they are there, after them."""
         self.publishes(self.integers, field, value)
 
-    def observe(self, field: Field) -> int:
+    def observe(self, field: PageField) -> int:
         """Return a number that says of others that they are there, before they are read."""
         return self.observes(self.integers, field)
 
-    def get_float(self, field: Field) -> float:
+    def get_float(self, field: PageField) -> float:
         """Return a number that is no whole one."""
         return float(self._floats[field])
 
-    def put_float(self, field: Field, value: float) -> None:
+    def put_float(self, field: PageField, value: float) -> None:
         """Set a number that is no whole one."""
         self._floats[field] = value
 
-    def write_text(self, place: PageText, text: str) -> None:
+    def write_text(self, place: PageSlot, text: str) -> None:
         """Leave a text for the other side, cut to what fits."""
         self._write(_PAGE + place * _TEXT_BYTES, _TEXT_BYTES, text)
 
-    def read_text(self, place: PageText) -> str:
+    def read_text(self, place: PageSlot) -> str:
         """Return the text that the other side left."""
         return self._read(_PAGE + place * _TEXT_BYTES, _TEXT_BYTES)
 
@@ -277,7 +277,7 @@ class SharedPage:
 
     def usage(self) -> "ProcessUsage | None":
         """Return what the loop's process said that its run took; None where it said nothing."""
-        from hilctl.machine.usage import ProcessUsage
+        from hilctl.machine.process_usage import ProcessUsage
 
         found = ProcessUsage(*map(self.get, _USAGE))
         return found if found.resident_bytes else None
@@ -287,65 +287,67 @@ class SharedPage:
         for field, value in zip(_USAGE, astuple(usage), strict=True):
             self.put(field, value)
 
-    def leave_outcome(self, outcome: "Outcome") -> None:
+    def leave_outcome(self, outcome: "LoopOutcome") -> None:
         """Leave how the run ended for the supervisor."""
-        self.write_text(PageText.OUTCOME, json.dumps(asdict(outcome)))
+        self.write_text(PageSlot.OUTCOME, json.dumps(asdict(outcome)))
         # The text first: the phase says that it is there.
-        self.publish(Field.PHASE, Phase.ENDED)
+        self.publish(PageField.PHASE, Phase.ENDED)
 
-    def outcome(self) -> "Outcome | None":
+    def outcome(self) -> "LoopOutcome | None":
         """Return how the loop said that the run ended; None where it said nothing."""
-        from hilctl.loop.plan import Outcome
+        from hilctl.loop.plan import LoopOutcome
 
-        if self.observe(Field.PHASE) != Phase.ENDED:
+        if self.observe(PageField.PHASE) != Phase.ENDED:
             return None
         with suppress(ValueError, TypeError):  # damaged
-            return Outcome(**json.loads(self.read_text(PageText.OUTCOME)))
+            return LoopOutcome(**json.loads(self.read_text(PageSlot.OUTCOME)))
         return None
 
     def note_safe_write(self, value: float) -> None:
         """Note a write on the way to the safe value, so that another process can go on from it."""
-        self.put_float(Field.LAST_SAFE_WRITE, value)
+        self.put_float(PageField.LAST_SAFE_WRITE, value)
         # The value first: the count says that it is there.
-        self.put(Field.SAFE_WRITES, self.get(Field.SAFE_WRITES) + 1)
+        self.put(PageField.SAFE_WRITES, self.get(PageField.SAFE_WRITES) + 1)
 
     def last_safe_write(self) -> float | None:
         """Return the last value written on the way to the safe value; None before the first."""
-        return self.get_float(Field.LAST_SAFE_WRITE) if self.get(Field.SAFE_WRITES) else None
+        return (
+            self.get_float(PageField.LAST_SAFE_WRITE) if self.get(PageField.SAFE_WRITES) else None
+        )
 
     def ended_safely(self) -> bool:
         """Return whether the loop said how it ended, and no further write is needed."""
-        if self.get(Field.PHASE) != Phase.ENDED:
+        if self.get(PageField.PHASE) != Phase.ENDED:
             return False
         with suppress(ValueError, TypeError):  # damaged
             # Not by outcome(), which imports numba: the guardian calls this.
-            return json.loads(self.read_text(PageText.OUTCOME))["output"] in {"confirmed", "sent"}
+            return json.loads(self.read_text(PageSlot.OUTCOME))["output"] in {"confirmed", "sent"}
         return False
 
     def leave_safe_result(self, result: SafeActionResult) -> None:
         """Leave what the guardian has reached so far, for the supervisor and later commands."""
-        self.write_text(PageText.GUARDIAN, json.dumps(asdict(result)))
+        self.write_text(PageSlot.GUARDIAN, json.dumps(asdict(result)))
         # The text first: the phase says that it is there.
         if result.final:
-            self.put(Field.GUARDIAN_PHASE, GuardianPhase.DONE)
+            self.put(PageField.GUARDIAN_PHASE, GuardianPhase.DONE)
 
     def safe_result(self) -> SafeActionResult | None:
         """Return what the guardian has reached so far; None if it has not acted."""
-        if self.get(Field.GUARDIAN_PHASE) not in {GuardianPhase.ACTING, GuardianPhase.DONE}:
+        if self.get(PageField.GUARDIAN_PHASE) not in {GuardianPhase.ACTING, GuardianPhase.DONE}:
             return None
         with suppress(ValueError, TypeError):  # damaged, or just being written
-            return SafeActionResult(**json.loads(self.read_text(PageText.GUARDIAN)))
+            return SafeActionResult(**json.loads(self.read_text(PageSlot.GUARDIAN)))
         return None
 
     def push_event(self, event: Event) -> None:
         """Leave an event; where there is no room it is counted as lost."""
-        head = self.get(Field.EVENT_HEAD)
-        if head - self.observe(Field.EVENT_TAIL) >= _EVENT_SLOTS:
-            self.integers[Field.EVENTS_LOST] += 1
+        head = self.get(PageField.EVENT_HEAD)
+        if head - self.observe(PageField.EVENT_TAIL) >= _EVENT_SLOTS:
+            self.integers[PageField.EVENTS_LOST] += 1
             return
         self._write(_EVENTS_AT + head % _EVENT_SLOTS * _EVENT_BYTES, _EVENT_BYTES, _packed(event))
         # Last: an event that is counted is whole.
-        self.publish(Field.EVENT_HEAD, head + 1)
+        self.publish(PageField.EVENT_HEAD, head + 1)
 
     def look_at_events(self, since: int) -> tuple[list[Event], int]:
         """Return the events from number ``since`` on that still stand there; takes nothing out.
@@ -353,12 +355,12 @@ class SharedPage:
         Returns:
             The events, and the number after the last of all.
         """
-        head, found = self.observe(Field.EVENT_HEAD), []
+        head, found = self.observe(PageField.EVENT_HEAD), []
         for number in range(max(since, head - _EVENT_SLOTS), head):
             raw = self._read(_EVENTS_AT + number % _EVENT_SLOTS * _EVENT_BYTES, _EVENT_BYTES)
             # Looked at again: the loop may have begun a new one in a slot that was released.
-            kept = self.observe(Field.EVENT_TAIL) <= number
-            if kept or self.observe(Field.EVENT_HEAD) < number + _EVENT_SLOTS:
+            kept = self.observe(PageField.EVENT_TAIL) <= number
+            if kept or self.observe(PageField.EVENT_HEAD) < number + _EVENT_SLOTS:
                 with suppress(ValueError, TypeError):  # damaged: the recorder counts it
                     found.append(Event(**json.loads(raw)))
         return found, max(head, since)
@@ -368,38 +370,38 @@ class SharedPage:
 
         The oldest gives way: nobody takes it out.
         """
-        head = self.get(Field.NOTE_HEAD)
+        head = self.get(PageField.NOTE_HEAD)
         self._write(_NOTES_AT + head % _NOTE_SLOTS * _EVENT_BYTES, _EVENT_BYTES, _packed(event))
         # Last: a note that is counted is whole.
-        self.publish(Field.NOTE_HEAD, head + 1)
+        self.publish(PageField.NOTE_HEAD, head + 1)
 
     def look_at_notes(self, since: int) -> tuple[list[Event], int]:
         """Return the notes from number ``since`` on that still stand there, and the next number."""
-        head, found = self.observe(Field.NOTE_HEAD), []
+        head, found = self.observe(PageField.NOTE_HEAD), []
         for number in range(max(since, head - _NOTE_SLOTS), head):
             raw = self._read(_NOTES_AT + number % _NOTE_SLOTS * _EVENT_BYTES, _EVENT_BYTES)
             # Looked at again: a new one may have been begun in its slot.
-            if self.observe(Field.NOTE_HEAD) < number + _NOTE_SLOTS:
+            if self.observe(PageField.NOTE_HEAD) < number + _NOTE_SLOTS:
                 with suppress(ValueError, TypeError):
                     found.append(Event(**json.loads(raw)))
         return found, max(head, since)
 
     def pop_events(self) -> list[Event]:
         """Take the events that came since; they keep their room until they are released."""
-        head, found = self.observe(Field.EVENT_HEAD), []
+        head, found = self.observe(PageField.EVENT_HEAD), []
         first = max(self._event_tail, head - _EVENT_SLOTS)
         for number in range(first, head):
             raw = self._read(_EVENTS_AT + number % _EVENT_SLOTS * _EVENT_BYTES, _EVENT_BYTES)
             try:
                 found.append(Event(**json.loads(raw)))
             except (ValueError, TypeError):
-                self.integers[Field.EVENTS_LOST] += 1  # damaged
+                self.integers[PageField.EVENTS_LOST] += 1  # damaged
         self._event_tail = head
         return found
 
     def release_events(self) -> None:
         """Give the room of all events that were taken back to the loop: they are safe elsewhere."""
-        self.publish(Field.EVENT_TAIL, self._event_tail)
+        self.publish(PageField.EVENT_TAIL, self._event_tail)
 
     def _write(self, at: int, size: int, text: str) -> None:
         raw = text.encode()[: size - 8].decode(errors="ignore").encode()

@@ -13,12 +13,12 @@ from typing import Self, TypeAlias
 
 from hilctl.base.errors import DataError, InputError, RunError
 from hilctl.base.files import check_no_input
-from hilctl.base.remedy import reason
-from hilctl.experiment.check import Checked, check
+from hilctl.base.os_errors import reason
 from hilctl.experiment.correction import dump_correction
 from hilctl.experiment.load import LoadedExperiment, input_files, load_experiment
-from hilctl.models.files import dump_model
-from hilctl.recording.ends import read_ends
+from hilctl.experiment.preflight import CheckedExperiment, check
+from hilctl.models.model_file import dump_model
+from hilctl.recording.run_summary import read_ends
 from hilctl.run.architecture import require_linux
 from hilctl.run.metadata import experiment_sha256, sha256_of
 from hilctl.run.own_process import has_threads, run_in_own_process
@@ -31,7 +31,9 @@ OnPart: TypeAlias = Callable[[float], None]
 """Called with how much of a run is done, from 0 to 1."""
 
 
-def checked_experiment(path: Path, settings: Sequence[str], heat_a2: float = 0.0) -> Checked:
+def checked_experiment(
+    path: Path, settings: Sequence[str], heat_a2: float = 0.0
+) -> CheckedExperiment:
     """Load an experiment and check it against device, model and limits.
 
     Args:
@@ -45,7 +47,7 @@ def checked_experiment(path: Path, settings: Sequence[str], heat_a2: float = 0.0
     return check(load_experiment(path, settings), heat_a2)
 
 
-def output_of(checked: Checked, output: Path | None) -> Path:
+def output_of(checked: CheckedExperiment, output: Path | None) -> Path:
     """Return the recording to write: the one given, or a new name in the experiment's folder.
 
     Raises:

@@ -20,11 +20,11 @@ from types import FrameType
 
 from hilctl.base.errors import RunError
 from hilctl.base.events import Event
-from hilctl.experiment.check import Checked
+from hilctl.experiment.preflight import CheckedExperiment
 from hilctl.loop.pacer import deadline_misses
-from hilctl.loop.plan import Outcome
+from hilctl.loop.plan import LoopOutcome
 from hilctl.loop.safe_output import describe
-from hilctl.machine.realtime import be_ordinary, favoured
+from hilctl.machine.rt_setup import be_ordinary, favoured
 from hilctl.run.child import LoopProcess
 from hilctl.run.control_socket import ControlServer
 from hilctl.run.guardian_process import GuardianProcess, GuardianRelief
@@ -37,7 +37,7 @@ from hilctl.run.result import Progress, RunResult
 from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import RunFolder, held_devices, run_folder
 from hilctl.run.safety import Safety
-from hilctl.run.shared_page import Field, PageText, SharedPage, Stop
+from hilctl.run.shared_page import PageField, PageSlot, SharedPage, Stop
 
 _log = logging.getLogger(__name__)
 
@@ -149,7 +149,7 @@ class RunMonitor:
 
     def __init__(
         self,
-        checked: Checked,
+        checked: CheckedExperiment,
         ring: SampleRing,
         child: LoopProcess,
         safety: Safety,
@@ -158,7 +158,7 @@ class RunMonitor:
         self._config, self._forecast = checked.loaded.config, checked.forecast
         self._page, self._child = ring.page, child
         self._safety, self._recording = safety, recording
-        self.outcome: Outcome | None = None
+        self.outcome: LoopOutcome | None = None
         """How the run ended; None until the output is safe or nothing more can be done."""
         self.broke = ""
         """Error of the supervisor itself; empty if there was none."""
@@ -172,7 +172,7 @@ class RunMonitor:
         # Asked first: of a loop that has ended, nothing can come after that.
         ended = self._child.ended
         now_ns = time.monotonic_ns()
-        self._page.put(Field.SUPERVISOR_HEARTBEAT_NS, now_ns)
+        self._page.put(PageField.SUPERVISOR_HEARTBEAT_NS, now_ns)
         self._pass_stop_on(stop_signal)
         if self.outcome is None:
             self._safety.update(now_ns, ended=ended)
@@ -184,7 +184,7 @@ class RunMonitor:
         """Stop the loop by its safe ramp because the supervisor failed."""
         self.broke = self.broke or f"{type(error).__name__}: {error}"
         text = f"the supervisor broke: {self.broke}"
-        sample = self._page.get(Field.NEXT_SAMPLE)
+        sample = self._page.get(PageField.NEXT_SAMPLE)
         self._recording.record_event(Event(sample, "error", "supervisor_broke", text))
 
     def progress(self) -> Progress | None:
@@ -194,14 +194,14 @@ class RunMonitor:
         return Progress(
             samples=self._recording.recorder.samples,
             total=self._forecast.samples,
-            late_ticks=self._page.get(Field.LATE_TICKS),
+            late_ticks=self._page.get(PageField.LATE_TICKS),
             compensated=self._config.compensator is not None,
             batch=newest,
         )
 
     def progress_failed(self, text: str) -> None:
         """Record that progress is not reported any more."""
-        sample = self._page.get(Field.NEXT_SAMPLE)
+        sample = self._page.get(PageField.NEXT_SAMPLE)
         self._recording.record_event(Event(sample, "warning", "progress_failed", text))
 
     def _conclude(self, *, ended: bool) -> None:
@@ -216,7 +216,7 @@ class RunMonitor:
                 reason += "; the guardian set the output to its safe value"
             if not result.confirmed:
                 reason += f"; {describe(result.output, result.error)}"
-            last = said or Outcome("fault", "", 0, "unknown", 0)
+            last = said or LoopOutcome("fault", "", 0, "unknown", 0)
             self.outcome = replace(last, code="fault", reason=reason, output=result.output)
         if self.outcome is not None:
             self._recording.end(self.outcome, lost_loop=result is not None and said is None)
@@ -225,13 +225,13 @@ class RunMonitor:
         page = self._page
         must_record = self._config.recording.on_failure == "stop"
         if stop_signal:
-            page.put(Field.STOP, STOPS[signal.Signals(stop_signal)])
+            page.put(PageField.STOP, STOPS[signal.Signals(stop_signal)])
         elif self.broke:
-            page.put(Field.STOP, Stop.SUPERVISOR_BROKE)
+            page.put(PageField.STOP, Stop.SUPERVISOR_BROKE)
         elif must_record and self._recording.stalled_s() > self._config.recording.ring_s / 2.0:
             # Not at the first error: while the ring is less than half full, a retry loses nothing.
             failed = bool(self._recording.recorder.error)
-            page.put(Field.STOP, Stop.RECORDER_FAILED if failed else Stop.RECORDER_STALLED)
+            page.put(PageField.STOP, Stop.RECORDER_FAILED if failed else Stop.RECORDER_STALLED)
 
 
 def _stay(number: int, frame: FrameType | None) -> None:
@@ -252,7 +252,7 @@ class Supervisor:
 
     def __init__(
         self,
-        checked: Checked,
+        checked: CheckedExperiment,
         output: Path,
         *,
         overwrite: bool,
@@ -311,7 +311,7 @@ class Supervisor:
             relief.discard()
             _go(ring.page, start_ns)
             self._attend(started, server)
-            ring.page.put(Field.RECORDED, int(not recorder.error))
+            ring.page.put(PageField.RECORDED, int(not recorder.error))
             stops = self._stops
             guarded = safety.close(lambda: self._stops > stops)
             if guarded or recorder.error:
@@ -369,7 +369,7 @@ class Supervisor:
         The file says when that is. On a disk so slow that the time has come before the file says
         so, it is written anew with a later one: the first tick would be late by as much.
         """
-        set_up, refused = json.loads(page.read_text(PageText.SET_UP))
+        set_up, refused = json.loads(page.read_text(PageSlot.SET_UP))
         self._warn(refused)
         # Arming the device's watchdog comes before sample 0, and after the start signal.
         least_ns = _START_DELAY_NS + round(self._checked.loaded.device.info.arm_s * 1e9)
@@ -377,7 +377,7 @@ class Supervisor:
         for _ in range(_START_TRIES):
             began_ns = time.monotonic_ns()
             start_ns = began_ns + delay_ns
-            recorder.begin(time.time_ns() + delay_ns, set_up, page.get(Field.WAVEFORM_AT))
+            recorder.begin(time.time_ns() + delay_ns, set_up, page.get(PageField.WAVEFORM_AT))
             took_ns = time.monotonic_ns() - began_ns
             if took_ns < delay_ns // 2:
                 return start_ns
@@ -499,7 +499,7 @@ class Supervisor:
             stop_signal=stop_signal if code == "stopped" else 0,
             samples=recorder.samples,
             missing=recorder.missing,
-            late_ticks=ring.page.get(Field.LATE_TICKS),
+            late_ticks=ring.page.get(PageField.LATE_TICKS),
             deadline_misses=deadline_misses(skipped, due, self._config.timing.max_missed_share),
             adapted=recorder.adapted,
         )
@@ -507,7 +507,7 @@ class Supervisor:
 
 def _go(page: SharedPage, start_ns: int) -> None:
     """Give the loop the start signal."""
-    page.put(Field.SUPERVISOR_HEARTBEAT_NS, time.monotonic_ns())
-    page.put(Field.START_NS, start_ns)
+    page.put(PageField.SUPERVISOR_HEARTBEAT_NS, time.monotonic_ns())
+    page.put(PageField.START_NS, start_ns)
     # Last: the loop then reads its start time, and would take an old heartbeat for silence.
-    page.publish(Field.GO, 1)
+    page.publish(PageField.GO, 1)

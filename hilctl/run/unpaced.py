@@ -13,13 +13,13 @@ import numpy as np
 from hilctl.base.device import Clock, Device
 from hilctl.base.errors import HilctlError, InputError
 from hilctl.base.events import Event
-from hilctl.base.samples import ANSWERS, Batch, Samples
-from hilctl.experiment.check import Checked
+from hilctl.base.samples import ANSWERS, BlockBatch, Samples
+from hilctl.experiment.preflight import CheckedExperiment
 from hilctl.loop.block import Block
 from hilctl.loop.host import Tuning
 from hilctl.loop.loop import Loop
 from hilctl.loop.pacer import Lateness
-from hilctl.loop.plan import Outcome, Plan
+from hilctl.loop.plan import LoopOutcome, LoopPlan
 from hilctl.run.assemble import assemble, starting_output
 from hilctl.run.metadata import end_facts
 from hilctl.run.recorder import Recorder
@@ -28,7 +28,7 @@ from hilctl.run.result import RunResult
 _BLOCKS_A_BATCH = 256
 
 
-class SampleClock:
+class VirtualClock:
     """Time that passes only in sleeps, and takes none."""
 
     def __init__(self) -> None:
@@ -43,7 +43,7 @@ class SampleClock:
         self._now_ns = max(self._now_ns, deadline_ns)
 
 
-class BatchHost:
+class OfflineHost:
     """A host that gathers blocks in this process's own memory; supervises nothing.
 
     Args:
@@ -55,16 +55,16 @@ class BatchHost:
 
     def __init__(
         self,
-        plan: Plan,
+        plan: LoopPlan,
         *,
-        on_batch: Callable[[Batch], None],
+        on_batch: Callable[[BlockBatch], None],
         on_event: Callable[[Event], None] = lambda event: None,
         stop: Callable[[], str] = lambda: "",
     ) -> None:
-        self.clock: Clock = SampleClock()
+        self.clock: Clock = VirtualClock()
         # No slot is used again before the batch that its block is in has been taken.
         slots = _BLOCKS_A_BATCH + 2 * (plan.latency_blocks + 1)
-        self._room = Batch.empty(slots, plan.block, plan.compensator.state_size + 1)
+        self._room = BlockBatch.empty(slots, plan.block, plan.compensator.state_size + 1)
         heads = [head.data.cast("B").cast("q") for head in self._room.heads]
         self._blocks = [Block(head, self._room, slot) for slot, head in enumerate(heads)]
         self._claimed = self._first = self._answered = 0
@@ -118,7 +118,7 @@ class BatchHost:
         self._on_event(event)
 
 
-def run_unpaced(checked: Checked, output: Path, *, overwrite: bool = False) -> RunResult:
+def run_unpaced(checked: CheckedExperiment, output: Path, *, overwrite: bool = False) -> RunResult:
     """Run a checked experiment on its simulated device.
 
     Args:
@@ -149,7 +149,7 @@ def run_unpaced(checked: Checked, output: Path, *, overwrite: bool = False) -> R
     )
 
 
-def _run(checked: Checked, recorder: Recorder) -> tuple[Outcome, Lateness]:
+def _run(checked: CheckedExperiment, recorder: Recorder) -> tuple[LoopOutcome, Lateness]:
     loaded, begun = checked.loaded, checked.begun
     plan = assemble(
         loaded,
@@ -166,7 +166,7 @@ def _run(checked: Checked, recorder: Recorder) -> tuple[Outcome, Lateness]:
         """Return why the file cannot be written, retried once, or an empty text."""
         return recorder.error if recorder.error and not recorder.flush() else ""
 
-    host = BatchHost(plan, on_batch=recorder.batch, on_event=recorder.event, stop=refused)
+    host = OfflineHost(plan, on_batch=recorder.batch, on_event=recorder.event, stop=refused)
     try:
         loop, waveform_at = _opened(plan, loaded.device, host, loaded.config.safe.at_start)
         recorder.begin(time.time_ns(), {"paced": "false"}, waveform_at)
@@ -177,7 +177,7 @@ def _run(checked: Checked, recorder: Recorder) -> tuple[Outcome, Lateness]:
     return _drive(loop, loaded.device, host)
 
 
-def run_in_memory(plan: Plan, device: Device) -> tuple[Outcome, Samples]:
+def run_in_memory(plan: LoopPlan, device: Device) -> tuple[LoopOutcome, Samples]:
     """Run a plan on a simulated device, and keep its samples.
 
     Args:
@@ -188,7 +188,7 @@ def run_in_memory(plan: Plan, device: Device) -> tuple[Outcome, Samples]:
         DeviceError: It can't be opened, or can't keep this rate or block.
     """
     parts: list[Samples] = []
-    host = BatchHost(plan, on_batch=lambda batch: parts.append(batch.samples(slice(None))))
+    host = OfflineHost(plan, on_batch=lambda batch: parts.append(batch.samples(slice(None))))
     loop, _ = _opened(plan, device, host, None)
     outcome, _ = _drive(loop, device, host)
     values = np.concatenate([[*part.columns().values()] for part in parts], axis=1)
@@ -197,7 +197,7 @@ def run_in_memory(plan: Plan, device: Device) -> tuple[Outcome, Samples]:
 
 
 def _opened(
-    plan: Plan, device: Device, host: BatchHost, at_start: float | None
+    plan: LoopPlan, device: Device, host: OfflineHost, at_start: float | None
 ) -> tuple[Loop, int]:
     """Open the device; return the loop, and the samples that come before the waveform."""
     loop = Loop(plan, device, host)
@@ -209,7 +209,7 @@ def _opened(
         raise
 
 
-def _drive(loop: Loop, device: Device, host: BatchHost) -> tuple[Outcome, Lateness]:
+def _drive(loop: Loop, device: Device, host: OfflineHost) -> tuple[LoopOutcome, Lateness]:
     try:
         outcome = loop.run(0)
     finally:

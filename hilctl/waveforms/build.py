@@ -11,11 +11,11 @@ from hilctl.base.errors import InputError
 from hilctl.base.segments import Segment
 from hilctl.base.types import CHUNK, F64, chunks
 from hilctl.waveforms import shapes, spec
-from hilctl.waveforms.table import read_samples
+from hilctl.waveforms.waveform_file import read_samples
 
 
 @dataclass(frozen=True, slots=True)
-class Repeat:
+class RepeatedPart:
     """What repeats within a reference, to the last bit or to a sample's part.
 
     Attributes:
@@ -47,7 +47,7 @@ class Reference:
     sample_rate_hz: float
     segments: tuple[Segment, ...]
     span: tuple[float, float]
-    repeats: tuple[Repeat, ...] = ()
+    repeats: tuple[RepeatedPart, ...] = ()
 
     @property
     def telling(self) -> tuple[slice, ...]:
@@ -97,16 +97,16 @@ def build(waveform: spec.AnyWaveform, sample_rate_hz: float, folder: Path) -> Re
     return Reference(values, waveform.unit, sample_rate_hz, tuple(segments), span, repeats)
 
 
-def _repeats(parts: list[_Part], repeat: int) -> tuple[Repeat, ...]:
+def _repeats(parts: list[_Part], repeat: int) -> tuple[RepeatedPart, ...]:
     """Return what repeats in a long reference: all of it, or the steady parts of its waveforms."""
     once = sum(part.values.size for part in parts)
     if repeat > 1:
-        return (Repeat(0, repeat * once, float(once)),)
+        return (RepeatedPart(0, repeat * once, float(once)),)
     found, start = [], 0
     for part in parts:
         if part.repeats:
             segment = part.segment.shifted(start)
-            found.append(Repeat(segment.steady_start, segment.steady_stop, segment.period))
+            found.append(RepeatedPart(segment.steady_start, segment.steady_stop, segment.period))
         start += part.values.size
     return tuple(found)
 
@@ -180,7 +180,7 @@ def _raised_cosine(n: int) -> F64:
     return values
 
 
-def telling(size: int, repeats: Sequence[Repeat]) -> tuple[slice, ...]:
+def telling(size: int, repeats: Sequence[RepeatedPart]) -> tuple[slice, ...]:
     """Return the parts of a reference that show all there is to see in it.
 
     Args:

@@ -7,7 +7,7 @@ reference into a command, A or V where none stands between.
 import math
 from typing import Annotated, Any, Literal, TypeAlias
 
-from hilctl.base.strict import AfterValidator, Field, Strict, ValidationInfo, field_validator
+from hilctl.base.strict import AfterValidator, Field, StrictModel, ValidationInfo, field_validator
 
 WaveformUnit: TypeAlias = Literal["um", "A", "V"]
 Positive: TypeAlias = Annotated[float, Field(gt=0.0)]
@@ -34,7 +34,7 @@ NotEmpty = AfterValidator(_not_empty)
 AtLeastOne = Field(json_schema_extra={"minItems": 1})
 
 
-class _Shape(Strict):
+class _Shape(StrictModel):
     """What all kinds have.
 
     Attributes:
@@ -71,7 +71,7 @@ class Triangle(_Shape):
     duration_s: Positive
 
 
-class Harmonic(Strict):
+class Harmonic(StrictModel):
     """One component of a complex harmonic."""
 
     amplitude: Positive
@@ -258,7 +258,7 @@ _Single: TypeAlias = Shape | FileWaveform
 SinglePart: TypeAlias = Annotated[_Single, Field(discriminator="kind")]
 
 
-class Sequence(Strict):
+class Sequence(StrictModel):
     """Waveforms one after the other; the unit stands here, not in the parts."""
 
     kind: Literal["sequence"]

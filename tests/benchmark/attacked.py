@@ -20,7 +20,7 @@ import yaml
 
 from hilctl.base.samples import Flag
 from hilctl.base.types import F64, I64
-from hilctl.recording.data import Samples
+from hilctl.recording.recording import Samples
 from hilctl.run.ring import SampleRing
 from hilctl.run.shared_page import SharedPage
 from hilctl_drivers.profile import shipped_profiles

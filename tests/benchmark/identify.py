@@ -17,9 +17,9 @@ from scipy.optimize import least_squares
 
 from hilctl.identify.data.cycles import average_cycle
 from hilctl.identify.data.records import SteadyLoop
+from hilctl.identify.evaluation import Evaluation, judge
 from hilctl.identify.fit_data import FitData
 from hilctl.identify.fit_model import fit_model
-from hilctl.identify.judge import Judgement, judge
 from hilctl.identify.settings import FitSettings
 from hilctl.kernels.hysteresis import deadband_block
 from hilctl.models.integrated import IntegratedModel, exponential_integrated
@@ -96,7 +96,7 @@ def fast(data: list[SteadyLoop], repeats: int = 10) -> tuple[IntegratedModel, fl
     return found.model, (time.perf_counter() - begin) / repeats
 
 
-def line(name: str, judged: Judgement, held_out: Judgement, seconds: float) -> str:
+def line(name: str, judged: Evaluation, held_out: Evaluation, seconds: float) -> str:
     """Return one row of the table."""
     return (
         f"{name:<10} {seconds:8.3f} s   peak {judged.peak_percent:5.2f} %  rms "

@@ -20,7 +20,7 @@ from pathlib import Path
 from hilctl.base.errors import HilctlError
 from hilctl.loop.safe_output import HOLD_S
 from hilctl.recording.reader import read
-from hilctl.run.shared_page import Field, Phase, SharedPage
+from hilctl.run.shared_page import PageField, Phase, SharedPage
 from tests.benchmark.attacked import (
     LONGEST_S,
     RAMP_A_PER_S,
@@ -84,19 +84,19 @@ def _children(supervisor: int) -> dict[str, int]:
 
 
 def _begun(page: SharedPage) -> bool:
-    return page.get(Field.ENDED_AT) > 0
+    return page.get(PageField.ENDED_AT) > 0
 
 
 def _in_waveform(page: SharedPage) -> bool:
-    return page.get(Field.ENDED_AT) > page.get(Field.WAVEFORM_AT) > 0
+    return page.get(PageField.ENDED_AT) > page.get(PageField.WAVEFORM_AT) > 0
 
 
 def _leaving(page: SharedPage) -> bool:
-    return page.get(Field.STOP) != 0
+    return page.get(PageField.STOP) != 0
 
 
 def _closing(page: SharedPage) -> bool:
-    return page.get(Field.PHASE) in {Phase.CLOSING, Phase.ENDED}
+    return page.get(PageField.PHASE) in {Phase.CLOSING, Phase.ENDED}
 
 
 def _await(run: AttackedRun, phase: str, chance: random.Random) -> tuple[SharedPage, float]:
@@ -156,7 +156,7 @@ def attack(
     ends = "loop" in plan or plan.get("supervisor") == "kill" or phase in {"ramp out", "close"}
     due_ns = hit_ns if ends else stop_ns
     # Without the start signal the loop has sent nothing, and the output stays as it was.
-    moved = page.get(Field.GO) != 0
+    moved = page.get(PageField.GO) != 0
     return said, hit_ns, due_ns if moved else None, hit_ns if "loop" in plan else 1e30
 
 

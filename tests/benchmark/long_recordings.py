@@ -20,14 +20,14 @@ from pathlib import Path
 
 import numpy as np
 
-from hilctl.base.samples import COLUMNS, Batch, Head
+from hilctl.base.samples import COLUMNS, BlockBatch, BlockHeader
 from hilctl.base.segments import Segment
 from hilctl.base.types import F64, U32
-from hilctl.experiment.check import Checked
+from hilctl.experiment.preflight import CheckedExperiment
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.limiter import Limiter
-from hilctl.models.files import dump_model
-from hilctl.recording.messages import RecordingLayout
+from hilctl.models.model_file import dump_model
+from hilctl.recording.encoder import RecordingLayout
 from hilctl.recording.writer import RecordingWriter, RunFacts
 from hilctl.run.metadata import run_facts
 from hilctl.run.start import checked_experiment
@@ -53,7 +53,7 @@ class Content:
         checked: The experiment whose model and limits they are made by.
     """
 
-    def __init__(self, checked: Checked) -> None:
+    def __init__(self, checked: CheckedExperiment) -> None:
         config, model = checked.loaded.config, checked.loaded.model
         compensator = Compensator(model, RATE_HZ)
         self.state = compensator.state()
@@ -88,7 +88,7 @@ class Content:
         absent = np.full_like(reference, np.nan)
         return np.array([known.get(name, absent) for name in COLUMNS]), flags
 
-    def batches(self, seconds: int) -> Iterator[Batch]:
+    def batches(self, seconds: int) -> Iterator[BlockBatch]:
         """Yield a run of that many seconds after its soft start."""
         for at in range(0, SOFT + seconds * SPAN, BATCH):
             values, flags, start = self.begin, self.begin_flags, at
@@ -96,17 +96,17 @@ class Content:
                 values, flags = self.span, self.span_flags
                 start = (at - self.begin_flags.size) % SPAN
             blocks = BATCH // BLOCK
-            batch = Batch.empty(blocks, BLOCK, self.state.size + 1)
+            batch = BlockBatch.empty(blocks, BLOCK, self.state.size + 1)
             shaped = values[:, start : start + BATCH].reshape(len(COLUMNS), blocks, BLOCK)
             batch.columns[:] = shaped.transpose(1, 0, 2)
             batch.flags[:] = flags[start : start + BATCH].reshape(blocks, BLOCK)
             batch.states[:, :-1], batch.states[:, -1] = self.state, self.previous
             first = at + BLOCK * np.arange(blocks)
-            batch.heads[:, Head.FIRST_SAMPLE] = first
-            batch.heads[:, Head.SAMPLES] = BLOCK
-            batch.heads[:, Head.DEADLINE_NS] = first * (10**9 // RATE_HZ)
-            batch.heads[:, Head.LATE_NS] = 40_000 + first % 7919 * 11
-            batch.heads[:, Head.EXCHANGE_NS] = 30_000 + first % 6547 * 3
+            batch.heads[:, BlockHeader.FIRST_SAMPLE] = first
+            batch.heads[:, BlockHeader.SAMPLES] = BLOCK
+            batch.heads[:, BlockHeader.DEADLINE_NS] = first * (10**9 // RATE_HZ)
+            batch.heads[:, BlockHeader.LATE_NS] = 40_000 + first % 7919 * 11
+            batch.heads[:, BlockHeader.EXCHANGE_NS] = 30_000 + first % 6547 * 3
             yield batch
 
 

@@ -23,7 +23,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 
 from hilctl.base.types import F64
-from hilctl.experiment.condition import conditioning_of
+from hilctl.experiment.conditioning import conditioning_of
 from hilctl.experiment.initial_state import InitialState, begin, left_by
 from hilctl.experiment.load import LoadedExperiment, load_experiment
 from hilctl.identify.command import identify_records, settings_from
@@ -31,9 +31,9 @@ from hilctl.identify.data.records import History
 from hilctl.identify.fit_model import FittedModel
 from hilctl.loop.compensator import Compensator
 from hilctl.models.base import HysteresisModel
-from hilctl.models.files import load_model
+from hilctl.models.model_file import load_model
 from hilctl.waveforms.build import build
-from hilctl_drivers.simulated.rigs import PHYSICS, Physics, TerfenolOptions
+from hilctl_drivers.simulated.devices import PHYSICS, Physics, TerfenolOptions
 from hilctl_drivers.simulated.terfenol import TerfenolActuator
 from tests.benchmark.references import RATE_HZ, Row, Stroke, random, references
 

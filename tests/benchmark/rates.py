@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hilctl.machine.linux import DMA_LATENCY
+from hilctl.machine.syscalls import DMA_LATENCY
 from tests.benchmark.wakeup import SOURCE
 
 EXPERIMENT = Path(__file__).parents[2] / "configs" / "terfenol_sine_6a.yaml"

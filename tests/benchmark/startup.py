@@ -13,7 +13,7 @@ import time
 from datetime import datetime
 from pathlib import Path
 
-from hilctl.recording.ends import read_ends
+from hilctl.recording.run_summary import read_ends
 
 CONFIG = Path(__file__).parents[2] / "configs" / "terfenol_sine_6a.yaml"
 

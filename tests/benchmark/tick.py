@@ -15,18 +15,18 @@ from typing import ClassVar
 
 import numpy as np
 
-from hilctl.base.private import memory_folder
-from hilctl.base.samples import Head
-from hilctl.experiment.check import Checked, check
+from hilctl.base.private_dirs import memory_folder
+from hilctl.base.samples import BlockHeader
 from hilctl.experiment.load import LoadedExperiment, load_experiment
+from hilctl.experiment.preflight import CheckedExperiment, check
 from hilctl.loop.pacer import SystemClock
-from hilctl.machine.realtime import prepare
+from hilctl.machine.rt_setup import prepare
 from hilctl.machine.settings import Realtime
 from hilctl.run import loop_process
 from hilctl.run.job import Job
 from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import RunCard, RunFolder
-from hilctl.run.shared_page import Field, Phase, SharedPage
+from hilctl.run.shared_page import PageField, Phase, SharedPage
 
 EXPERIMENT = Path(__file__).parents[2] / "configs" / "terfenol_sine_6a.yaml"
 MODELS = EXPERIMENT.parent / "models"
@@ -58,17 +58,17 @@ def experiment(options: argparse.Namespace, model: Path) -> LoadedExperiment:
     return load_experiment(EXPERIMENT, [f"{key}={value}" for key, value in settings.items()])
 
 
-def job(folder: RunFolder, checked: Checked) -> Job:
+def job(folder: RunFolder, checked: CheckedExperiment) -> Job:
     """Return what the supervisor hands to the loop process, without a heartbeat timeout."""
     return Job.of(checked, folder, supervisor=os.getppid(), silence_s=1e9)
 
 
 def start(page: SharedPage) -> None:
     """Give the start signal once all is compiled, as the supervisor does."""
-    while page.get(Field.PHASE) != Phase.READY:
+    while page.get(PageField.PHASE) != Phase.READY:
         time.sleep(0.01)
-    page.put(Field.START_NS, time.monotonic_ns() + 50_000_000)
-    page.put(Field.GO, 1)
+    page.put(PageField.START_NS, time.monotonic_ns() + 50_000_000)
+    page.put(PageField.GO, 1)
 
 
 def ticks_us(options: argparse.Namespace, model: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -88,7 +88,7 @@ def ticks_us(options: argparse.Namespace, model: Path) -> tuple[np.ndarray, np.n
         heads = [batch.heads for batch in ring.batches()]
     if outcome.code != "completed" or not heads:
         sys.exit(f"the run ended as {outcome.code}: {outcome.reason}")
-    exchange_ns = np.concatenate(heads)[:, Head.EXCHANGE_NS]
+    exchange_ns = np.concatenate(heads)[:, BlockHeader.EXCHANGE_NS]
     slept, woke = np.array([TimedClock.slept, TimedClock.woke])
     busy_ns = slept[1:] - woke[:-1] - exchange_ns[: slept.size - 1]
     return busy_ns[: options.ticks] * 1e-3, exchange_ns[: options.ticks] * 1e-3

@@ -16,8 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hilctl.machine.latency import Latency, measure
 from hilctl.machine.settings import Realtime
+from hilctl.machine.timer_latency import Latency, measure
 
 SOURCE = Path(__file__).with_suffix(".c")
 LONGEST_US = 60_000

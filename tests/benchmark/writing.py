@@ -12,9 +12,9 @@ import time
 from pathlib import Path
 from unittest.mock import patch
 
-from hilctl.base.samples import Batch
-from hilctl.experiment.parts import RecordingConfig
-from hilctl.recording.messages import RecordingLayout
+from hilctl.base.samples import BlockBatch
+from hilctl.experiment.sections import RecordingConfig
+from hilctl.recording.encoder import RecordingLayout
 from hilctl.recording.writer import RecordingWriter, RunFacts
 from hilctl.run.recorder import Recorder
 from hilctl.run.start import checked_experiment
@@ -30,12 +30,12 @@ LAYOUT = RecordingLayout(RATE_HZ, "A", False, 1000.0, 1_800_000_000 * 10**9)
 RUN = RunFacts({}, (), "name: writing\n", "", LAYOUT)
 
 
-def batches(seconds: int, folder: Path) -> list[Batch]:
+def batches(seconds: int, folder: Path) -> list[BlockBatch]:
     """Return a run of the simulated rig as the recorder takes it out of the ring."""
     checked = checked_experiment(EXPERIMENT, [f"waveform.duration_s={seconds}"])
-    found: list[Batch] = []
+    found: list[BlockBatch] = []
 
-    def keep(_recorder: Recorder, batch: Batch) -> None:
+    def keep(_recorder: Recorder, batch: BlockBatch) -> None:
         firsts = range(0, batch.flags.shape[0], BLOCKS)
         found.extend(batch.rows(slice(first, first + BLOCKS)) for first in firsts)
 
@@ -44,7 +44,7 @@ def batches(seconds: int, folder: Path) -> list[Batch]:
     return found
 
 
-def written_s(run: list[Batch], path: Path) -> float:
+def written_s(run: list[BlockBatch], path: Path) -> float:
     """Record a run; return the processor time in s."""
     began_s = time.process_time()
     with path.open("wb") as stream:

@@ -16,9 +16,9 @@ from hilctl.base.device import Device
 from hilctl.experiment.device import BUILTIN, device_class, known_devices
 from hilctl_drivers.contract import *  # noqa: F403  the checks, and the fixture driven
 from hilctl_drivers.contract import RATE_HZ, SAMPLES, DrivenDevice, driven_device
+from hilctl_drivers.emulator.factory import build
 from hilctl_drivers.emulator.options import EmulatorOptions
-from hilctl_drivers.emulator.setup import build
-from hilctl_drivers.modbus.profile import ModbusProfile
+from hilctl_drivers.modbus.modbus_profile import ModbusProfile
 from hilctl_drivers.profile import load_profile, shipped_profiles
 from tests.fakes import ManualClock
 

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from hilctl_drivers.emulator.factory import Emulator, build
 from hilctl_drivers.emulator.faults import parse_fault
 from hilctl_drivers.emulator.options import EmulatorOptions
-from hilctl_drivers.emulator.setup import Emulator, build
 
 ROOT = Path(__file__).parents[2]
 GIVE_UP_S = 120.0

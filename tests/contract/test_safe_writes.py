@@ -16,13 +16,13 @@ import numpy as np
 import pytest
 
 from hilctl.base.errors import DeviceError, UnconfirmedError
-from hilctl_drivers.modbus.device import ModbusDac
+from hilctl_drivers.modbus.config import ModbusOptions
+from hilctl_drivers.modbus.modbus_dac import ModbusDac
 from hilctl_drivers.modbus.pdu import rtu_adu
-from hilctl_drivers.modbus.setup import ModbusOptions
 from hilctl_drivers.profile import shipped_profiles
-from hilctl_drivers.serial.device import SerialDac
-from hilctl_drivers.serial.setup import SerialOptions
-from hilctl_drivers.wire.framing import binary_framing
+from hilctl_drivers.serial.serial_dac import SerialDac
+from hilctl_drivers.serial.serial_setup import SerialOptions
+from hilctl_drivers.transport.framing import binary_framing
 
 TIMEOUT_S = 0.15
 RATE_HZ = 10.0

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from hilctl.experiment.check import check
 from hilctl.experiment.load import load_experiment
-from hilctl.models.files import load_model
+from hilctl.experiment.preflight import check
+from hilctl.models.model_file import load_model
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 EXPERIMENTS = sorted(path.name for path in CONFIGS.glob("*.yaml"))

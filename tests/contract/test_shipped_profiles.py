@@ -3,10 +3,11 @@
 import pytest
 
 from hilctl.base.yaml import load_document, loc_of
-from hilctl_drivers.board.profile import FrameProfile
-from hilctl_drivers.modbus.channels import EnsureStep, RegisterStep
+from hilctl_drivers.ascii.ascii_profile import AsciiProfile, SendStep, fields_of
+from hilctl_drivers.board.board_profile import FrameProfile
+from hilctl_drivers.modbus.modbus_profile import ModbusProfile
 from hilctl_drivers.modbus.pdu import read_pdu, rtu_adu, write_single_pdu
-from hilctl_drivers.modbus.profile import ModbusProfile
+from hilctl_drivers.modbus.register_map import EnsureStep, RegisterStep
 from hilctl_drivers.profile import (
     FOLDER,
     link_kinds,
@@ -14,7 +15,6 @@ from hilctl_drivers.profile import (
     profile_class,
     shipped_profiles,
 )
-from hilctl_drivers.text.profile import AsciiProfile, SendStep, fields_of
 
 NAMES = (
     "adam_4024", "adam_4024_ascii", "adam_4117", "adam_6024", "adam_6217", "adam_6224",

@@ -13,8 +13,8 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
+from hilctl_drivers.emulator.factory import Emulator, build
 from hilctl_drivers.emulator.options import EmulatorOptions
-from hilctl_drivers.emulator.setup import Emulator, build
 from tests.fakes import ManualClock
 
 BAUD = 115_200

@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 
 from hilctl.base.errors import DeviceError
-from hilctl_drivers.modbus.device import ModbusDac
-from hilctl_drivers.modbus.setup import ModbusOptions
+from hilctl_drivers.modbus.config import ModbusOptions
+from hilctl_drivers.modbus.modbus_dac import ModbusDac
 
 HERE = Path(__file__).parent
 BAUD = 115_200

@@ -8,13 +8,13 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from hilctl.base.samples import Flag
-from hilctl.kernels import adaptation as kernel
+from hilctl.kernels import gradient as kernel
 from hilctl.loop.adaptation import Adaptation, AdaptationBounds, DisplacementOperator
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.interlocks import InterlockContext
 from hilctl.loop.limiter import CommandLimits
 from hilctl.loop.loop import Loop
-from hilctl.loop.plan import Plan
+from hilctl.loop.plan import LoopPlan
 from hilctl.models.plays import PpiModel
 from tests.fakes import FakeClock, FakeFifoDevice, FakeHost, made_block
 
@@ -92,7 +92,7 @@ def test_any_broken_rig(how, at, size, bounds, way):
     compensator = Compensator(MODEL, RATE_HZ)
     device = Broken(latency, how, at, size)
     host = FakeHost(FakeClock(), block, compensator.state_size + 1)
-    plan = Plan(
+    plan = LoopPlan(
         reference=REFERENCE,
         input_um=REFERENCE,
         block=block,

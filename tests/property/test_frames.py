@@ -19,6 +19,7 @@ from pymodbus.pdu.register_message import (
     WriteMultipleRegistersResponse,
 )
 
+from hilctl_drivers.ascii.lines import LineFormat, parse_number
 from hilctl_drivers.modbus.pdu import (
     feedback_pdu,
     read_pdu,
@@ -31,15 +32,11 @@ from hilctl_drivers.modbus.pdu import (
     write_read_pdu,
     write_single_pdu,
 )
+from hilctl_drivers.modbus.prepared_requests import RtuTransaction, TcpTransaction
 from hilctl_drivers.modbus.registers import RegisterFormat
-from hilctl_drivers.modbus.transactions import RtuTransaction, TcpTransaction
-from hilctl_drivers.text.lines import (
-    LineFormat,
-    parse_number,
-)
-from hilctl_drivers.wire.crc import CRCS
-from hilctl_drivers.wire.framing import binary_framing
-from hilctl_drivers.wire.links import Corrupt, FrameError
+from hilctl_drivers.transport.crc import CRCS
+from hilctl_drivers.transport.framing import binary_framing
+from hilctl_drivers.transport.links import CorruptError, FrameError
 
 BINARY = [(kind, crc) for kind in ("cobs", "length") for crc in CRCS if crc != "none"]
 NUMPY = {
@@ -456,7 +453,7 @@ def test_streams_lose_no_more_than_was_damaged(name):
         splitter = framing.splitter()
         step = rng.randint(1, 60)
         out = [x for k in range(0, len(stream), step) for x in splitter.feed(stream[k : k + step])]
-        good = [each for each in out if not isinstance(each, Corrupt)]
+        good = [each for each in out if not isinstance(each, CorruptError)]
         made_up += any(each not in payloads for each in good)
         surely = payloads[:at] + payloads[at + 2 :]
         assert [each for each in good if each in surely] == surely
@@ -473,7 +470,7 @@ def test_xmodem_does_not_see_zeros_at_the_beginning():
     for framing, seen in ((xmodem, False), (ccitt, True)):
         more = plain.encode(b"\0" + plain.decode(framing.encode(b"\1\2")))
         if seen:
-            with pytest.raises(Corrupt):
+            with pytest.raises(CorruptError):
                 framing.decode(more)
         else:
             assert framing.decode(more) == b"\0\1\2"

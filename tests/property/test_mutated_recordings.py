@@ -28,8 +28,8 @@ from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.writer import CompressionType, Writer
 
 from hilctl.analysis.catalogue import entry_of
+from hilctl.analysis.decimation import overview
 from hilctl.analysis.export import export
-from hilctl.analysis.overview import overview
 from hilctl.analysis.replay import replay
 from hilctl.analysis.report import summarize
 from hilctl.analysis.run_page import page
@@ -38,23 +38,23 @@ from hilctl.base.segments import Segment
 from hilctl.cli.reports import render_report
 from hilctl.experiment.initial_state import initial_state_after
 from hilctl.identify.data.cycles import loops_from_recording
-from hilctl.identify.data.files import history_from_recording
+from hilctl.identify.data.data_files import history_from_recording
 from hilctl.kernels.hysteresis import play_sum
 from hilctl.models.base import HysteresisModel
 from hilctl.models.bouc_wen import BoucWenModel
-from hilctl.models.files import dump_model
-from hilctl.models.generalised import Envelope, GeneralisedModel
+from hilctl.models.generalised_pi import GeneralisedModel, PlayEnvelope
 from hilctl.models.kp import KrasnoselskiiPokrovskiiModel
+from hilctl.models.mechanics import FirstMode, FurtherMode
+from hilctl.models.model_file import dump_model
 from hilctl.models.plays import PpiModel
 from hilctl.models.preisach import PreisachModel
 from hilctl.models.staged import FieldLag, StagedModel
-from hilctl.models.structure import Mode, Structure
 from hilctl.recording import reader, schema
-from hilctl.recording.data import Recording
 from hilctl.recording.reader import read
+from hilctl.recording.recording import Recording
 from hilctl.recording.recover import recover_recording
 from hilctl.recording.recovery_scan import RecoveryScan
-from hilctl.recording.stretch import Stretch
+from hilctl.recording.time_range import TimeRange
 from tests.published import terfenol_rdpi
 
 ROOT = Path(__file__).parents[2]
@@ -74,7 +74,7 @@ PREISACH = PreisachModel(
     thresholds=(0.0, 0.5), lowest=-5.0, cell=2.5, slopes=((2.0, 3.0, 2.0), (0.5, 0.1, 0.0)),
     command_span=SPAN,
 )  # fmt: skip
-MODE = Mode(
+MODE = FurtherMode(
     natural_hz=600.0, damping_ratio=0.03, antiresonance_hz=630.0, antiresonance_damping_ratio=0.03
 )
 MODELS: tuple[HysteresisModel, ...] = (
@@ -85,12 +85,12 @@ MODELS: tuple[HysteresisModel, ...] = (
     ),
     BoucWenModel(direct=5.0, hysteretic=1.0, beta=0.6, gamma=0.1, command_span=SPAN),
     GeneralisedModel(
-        direct=20.0, weights=(3.0,), thresholds=(0.1,), rising=Envelope(slope=0.2),
-        falling=Envelope(slope=0.2, shift=0.1), command_span=SPAN,
+        direct=20.0, weights=(3.0,), thresholds=(0.1,), rising=PlayEnvelope(slope=0.2),
+        falling=PlayEnvelope(slope=0.2, shift=0.1), command_span=SPAN,
     ),
     StagedModel.around(
         PREISACH, lag=FieldLag(tau_s=1e-4, growth_per_unit=0.3),
-        structure=Structure(natural_hz=2200.0, damping_ratio=0.12), modes=(MODE,), delay_s=3e-5,
+        structure=FirstMode(natural_hz=2200.0, damping_ratio=0.12), modes=(MODE,), delay_s=3e-5,
     ),
 )  # fmt: skip
 
@@ -341,8 +341,8 @@ def _pieces(_recording: Recording, path: Path) -> None:
     """Read it in pieces, as the commands do: refused where the whole is not, never otherwise."""
     usual, reader.PIECE_SAMPLES = reader.PIECE_SAMPLES, 300
     try:
-        for stretch in (None, Stretch(0.01, 0.05)):
-            pieces = reader.Pieces(path, stretch)
+        for stretch in (None, TimeRange(0.01, 0.05)):
+            pieces = reader.RecordingStream(path, stretch)
             summary, _ = overview(pieces)
             json.dumps(summary.to_mapping())
             with suppress(HilctlError):

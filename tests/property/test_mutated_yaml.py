@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from hilctl.base.errors import ConfigError, InputError, Problem
+from hilctl.base.errors import ConfigError, ConfigProblem, InputError
 from hilctl.base.yaml import Document
-from hilctl.experiment.check import check
 from hilctl.experiment.load import resolve
+from hilctl.experiment.preflight import check
 from hilctl_drivers.profile import FOLDER, parse_profile
 
 FILES = 10_000
@@ -123,7 +123,7 @@ def test_damaged_profiles_are_refused_in_words(name: str, files: int) -> None:
     """No crash and no hang; every refusal has a line, a rule, and no word of pydantic's types."""
     good = (FOLDER / f"{name}.yaml").read_text(encoding="utf-8")
     chance = random.Random(name)
-    problems: list[Problem] = []
+    problems: list[ConfigProblem] = []
     for _ in range(files):
         try:
             parse_profile(mutated(good, chance), "profile.yaml")

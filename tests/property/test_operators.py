@@ -10,8 +10,8 @@ from hypothesis.extra import numpy as hnp
 
 from hilctl.kernels.hysteresis import play_sum_shared, rest_memory
 from hilctl.models.deadband import DeadbandFunction
-from hilctl.models.files import dump_model, parse_model
 from hilctl.models.integrated import IntegratedModel
+from hilctl.models.model_file import dump_model, parse_model
 from hilctl.models.plays import PpiModel, RdpiModel, SpiModel
 
 SAMPLE_RATE_HZ = 20_000.0

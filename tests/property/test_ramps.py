@@ -9,13 +9,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hilctl.analysis.replay import replay
-from hilctl.base.samples import COLUMNS, Flag, Head, Samples
+from hilctl.base.samples import COLUMNS, BlockHeader, Flag, Samples
 from hilctl.base.yaml import Document
 from hilctl.experiment.file import Experiment
 from hilctl.loop.conditioning import Conditioning
 from hilctl.loop.host import Tuning
-from hilctl.recording.data import ReplayStart
 from hilctl.recording.reader import read
+from hilctl.recording.recording import ReplayStart
 from tests.fakes import FakeClock, FakeDevice, FakeFifoDevice
 from tests.published import terfenol_rdpi
 from tests.unit.loop.test_loop import LIMITS, RATE_HZ, Rig, sine
@@ -158,7 +158,7 @@ class TestStart:
         assert rig.run().code == "completed"
         assert rig.waveform_at == plain.waveform_at == 30
         assert rig.device.commands == plain.device.commands
-        due_ns = [head[Head.DEADLINE_NS] for head in rig.host.heads]
+        due_ns = [head[BlockHeader.DEADLINE_NS] for head in rig.host.heads]
         assert due_ns[stalled + 1] == 1_000_000 * (stalled + 1) + 12_000_000
 
     @given(data=st.data())
@@ -243,7 +243,10 @@ class TestByTime:
         """They shift on the ramp in only, by each exchange."""
         rig = slow_rig(lambda number: 0.01, sine(100), output=4.0)
         rig.run()
-        waited = [h[Head.DEADLINE_NS] - 1_000_000 * h[Head.FIRST_SAMPLE] for h in rig.host.heads]
+        waited = [
+            h[BlockHeader.DEADLINE_NS] - 1_000_000 * h[BlockHeader.FIRST_SAMPLE]
+            for h in rig.host.heads
+        ]
         assert waited[:41] == [10_000_000 * k for k in range(41)]
         assert set(waited[40:]) == {400_000_000}
 
@@ -259,7 +262,11 @@ class TestByTime:
             np.full(200, 4.0), clock=clock, device=device, limits=limits, stroke_um=(-99.0, 99.0)
         )
         assert rig.run().code == "completed"
-        gaps = [head[Head.FIRST_SAMPLE] for head in rig.host.heads if head[Head.DROPPED_BEFORE]]
+        gaps = [
+            head[BlockHeader.FIRST_SAMPLE]
+            for head in rig.host.heads
+            if head[BlockHeader.DROPPED_BEFORE]
+        ]
         assert len(gaps) == 2
         values = np.array([rig.host.column(row) for row in range(len(COLUMNS))])
         flags = np.concatenate(rig.host.flags)

@@ -2,16 +2,16 @@
 
 import numpy as np
 import pytest
+from tests.unit.models.test_numeric_inverse import BOUC_WEN, DUHEM, KP, PREISACH
 
 from hilctl.base.samples import Flag
 from hilctl.loop.limiter import CommandLimits
-from hilctl.models.files import load_model
+from hilctl.models.model_file import load_model
 from hilctl.models.staged import StagedModel
 from tests.fakes import FakeClock
 from tests.unit.loop.test_loop import CONFIGS, RATE_HZ, Rig
 from tests.unit.models.test_base import MODELS as PLAYS
 from tests.unit.models.test_generalised_duhem import duhem_model
-from tests.unit.models.test_numeric_inverse import BOUC_WEN, DUHEM, KP, PREISACH
 
 COMPARED = {"preisach": PREISACH, "kp": KP, "bouc_wen": BOUC_WEN, "duhem": DUHEM}
 SHIPPED = {path.stem: load_model(path) for path in sorted(CONFIGS.glob("*.yaml"))}

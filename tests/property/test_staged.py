@@ -5,12 +5,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from hilctl.models.chain import smoothing_weights
-from hilctl.models.files import dump_model, parse_model
+from hilctl.models.cascade import smoothing_weights
 from hilctl.models.integrated import IntegratedModel
+from hilctl.models.mechanics import FirstMode
+from hilctl.models.model_file import dump_model, parse_model
 from hilctl.models.plays import PpiModel, RdpiModel
 from hilctl.models.staged import FieldLag, StagedModel
-from hilctl.models.structure import Structure
 
 LEVEL = st.floats(-100.0, 100.0)
 RATES_HZ = st.sampled_from((100.0, 5e3, 50e3, 1e6))
@@ -42,7 +42,7 @@ LAGS = st.builds(
     growth_per_unit=st.one_of(st.just(0.0), st.floats(0.0, 100.0), st.floats(1e-12, 1e-6)),
 )
 STRUCTURES = st.builds(
-    Structure, natural_hz=st.floats(0.1, 1e6), damping_ratio=st.floats(1e-3, 10.0)
+    FirstMode, natural_hz=st.floats(0.1, 1e6), damping_ratio=st.floats(1e-3, 10.0)
 )
 MAYBE_STRUCTURES = st.none() | STRUCTURES
 SMOOTHINGS_S = st.just(0.0) | st.floats(0.0, 0.1)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from hilctl.base.errors import ConfigError
 from hilctl.base.yaml import Document, dump, io
 from hilctl.experiment.load import resolve
-from hilctl.models.files import load_model, parse_model
+from hilctl.models.model_file import load_model, parse_model
 from hilctl_drivers.profile import FOLDER, load_profile, parse_profile
 
 INF, NAN = math.inf, math.nan

@@ -17,11 +17,11 @@ from hilctl.base.samples import Flag
 from hilctl.experiment.initial_state import initial_state_after
 from hilctl.loop.compensator import Compensator
 from hilctl.models.base import HysteresisModel
-from hilctl.models.files import dump_model
+from hilctl.models.mechanics import FirstMode
+from hilctl.models.model_file import dump_model
 from hilctl.models.staged import FieldLag, StagedModel
-from hilctl.models.structure import Structure
-from hilctl.recording.data import Recording
 from hilctl.recording.reader import read
+from hilctl.recording.recording import Recording
 from hilctl.run.result import RunResult
 from hilctl.run.start import checked_experiment, start_run
 from hilctl.run.unpaced import run_unpaced
@@ -34,7 +34,7 @@ GOLDEN = sorted((Path(__file__).parents[2] / "recordings" / "golden").glob("*.mc
 STAGED = StagedModel.around(
     terfenol_rdpi(),
     lag=FieldLag(tau_s=1e-4, growth_per_unit=0.3),
-    structure=Structure(natural_hz=2200.0, damping_ratio=0.12),
+    structure=FirstMode(natural_hz=2200.0, damping_ratio=0.12),
     delay_s=3e-5,
 )
 

@@ -13,10 +13,10 @@ from hilctl.analysis.report import summarize
 from hilctl.cli.commands import app
 from hilctl.identify.data.cycles import average_cycle
 from hilctl.identify.data.records import SteadyLoop
+from hilctl.identify.evaluation import judge
 from hilctl.identify.fit_model import fit_model
-from hilctl.identify.judge import judge
 from hilctl.identify.settings import FitSettings
-from hilctl.models.files import dump_model, load_model
+from hilctl.models.model_file import dump_model, load_model
 from hilctl.recording.reader import read
 from hilctl.run.start import checked_experiment, start_run
 from hilctl.run.unpaced import run_unpaced

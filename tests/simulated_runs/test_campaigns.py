@@ -16,14 +16,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilctl.campaign.fast import planned_fast, run_fast
-from hilctl.campaign.session import SeriesHost
-from hilctl.campaign.steps import load_campaign
 from hilctl.recording.reader import read
-from hilctl.series.collect import collect
-from hilctl.series.headline import headline
-from hilctl.series.sheets import sheets_of
-from hilctl.series.trend import AREA, ASYMMETRY, DAMPING, HYSTERESIS, NATURAL, STROKE, trends
+from hilctl.studies.campaign.campaign_runner import CampaignHost
+from hilctl.studies.campaign.parallel_simulation import planned_fast, run_fast
+from hilctl.studies.campaign.steps import load_campaign
+from hilctl.studies.multi_run.collect import collect
+from hilctl.studies.multi_run.plots import sheets_of
+from hilctl.studies.multi_run.summary_text import headline
+from hilctl.studies.multi_run.trend import (
+    AREA,
+    ASYMMETRY,
+    DAMPING,
+    HYSTERESIS,
+    NATURAL,
+    STROKE,
+    trends,
+)
 
 CAMPAIGNS = Path(__file__).parents[2] / "configs" / "campaigns"
 
@@ -63,7 +71,7 @@ def ran(tmp_path_factory):
         if name not in tables:
             folder = tmp_path_factory.mktemp(name)
             plan = planned_fast(load_campaign(CAMPAIGNS / f"{name}.yaml"), folder)
-            result = run_fast(plan, SeriesHost(), "processes")
+            result = run_fast(plan, CampaignHost(), "processes")
             assert result.count("completed") == len(plan.steps), result.reason
             tables[name] = (Table(result.tables[0]), result)
         return tables[name]

@@ -11,17 +11,22 @@ from pathlib import Path
 import pytest
 
 from hilctl.analysis.report import summarize
-from hilctl.characterise.session import Campaign, CampaignHost
 from hilctl.recording.reader import read
 from hilctl.run.start import checked_experiment, unpaced
 from hilctl.run.unpaced import run_unpaced
+from hilctl.studies.characterise.characterisation_runner import (
+    CharacterisationHost,
+    CharacterisationRunner,
+)
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 RIG = CONFIGS / "terfenol_sine_6a.yaml"
 
 
 def characterised(path, settings, folder, output):
-    campaign = Campaign(path, settings, folder, None, CampaignHost(run=unpaced))
+    campaign = CharacterisationRunner(
+        path, settings, folder, None, CharacterisationHost(run=unpaced)
+    )
     assert campaign.plan.seconds < 300.0
     return campaign.characterise(output)
 
@@ -78,9 +83,13 @@ def test_a_piezo_that_begins_at_0_v_gets_a_model(tmp_path):
 def test_what_is_wrong_with_a_rig_is_named(tmp_path, setting, code):
     """Before anything large is tried."""
     quick = ["sample_rate_hz=20000", "block=20"]
-    campaign = Campaign(RIG, [*quick, setting], tmp_path, None, CampaignHost(run=unpaced))
+    campaign = CharacterisationRunner(
+        RIG, [*quick, setting], tmp_path, None, CharacterisationHost(run=unpaced)
+    )
     if not code:  # a weak one, but nothing is wrong with it
-        campaign = Campaign(RIG, [*quick, setting], tmp_path, 40.0, CampaignHost(run=unpaced))
+        campaign = CharacterisationRunner(
+            RIG, [*quick, setting], tmp_path, 40.0, CharacterisationHost(run=unpaced)
+        )
     found = campaign.characterise(tmp_path / "model.yaml")
     assert found.problem_code == code
     assert (tmp_path / "model.yaml").exists() is (code == "")

@@ -9,7 +9,7 @@ import pytest
 
 from hilctl.analysis.replay import replay
 from hilctl.analysis.report import summarize
-from hilctl.comparison.trials import TrialDevice
+from hilctl.comparison.simulated_trials import TrialDevice
 from hilctl.experiment.load import load_experiment
 from hilctl.recording.reader import read
 from hilctl.run.start import start_run

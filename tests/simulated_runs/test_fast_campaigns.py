@@ -1,17 +1,20 @@
 """Campaigns without real time over several processes: the same as in one."""
 
-from hilctl.campaign.fast import planned_fast, run_fast
-from hilctl.campaign.session import SeriesHost
-from hilctl.campaign.steps import load_campaign
-from hilctl.recording.reader import read
 from tests.unit.campaign.conftest import CAMPAIGN, EXPERIMENT
+
+from hilctl.recording.reader import read
+from hilctl.studies.campaign.campaign_runner import CampaignHost
+from hilctl.studies.campaign.parallel_simulation import planned_fast, run_fast
+from hilctl.studies.campaign.steps import load_campaign
 
 BUDGET = "set: {limits.rms_current_a: 1.3, limits.thermal_time_constant_s: 2.0}\n"
 
 
 def test_processes_give_the_table_of_one(tmp_path, monkeypatch):
     """To the last bit, with the heat that goes from run to run and the noise of each."""
-    monkeypatch.setattr("hilctl.series.page.write_series", lambda _series, path: path.touch())
+    monkeypatch.setattr(
+        "hilctl.studies.multi_run.multi_run_page.write_series", lambda _series, path: path.touch()
+    )
     (tmp_path / "rig.yaml").write_text(EXPERIMENT, encoding="utf-8")
     (tmp_path / "few.yaml").write_text(CAMPAIGN + BUDGET, encoding="utf-8")
     few = load_campaign(tmp_path / "few.yaml", ())
@@ -19,7 +22,7 @@ def test_processes_give_the_table_of_one(tmp_path, monkeypatch):
     for scheduler in ("none", "processes"):
         folder = tmp_path / scheduler
         folder.mkdir()
-        result = run_fast(planned_fast(few, folder), SeriesHost(), scheduler)
+        result = run_fast(planned_fast(few, folder), CampaignHost(), scheduler)
         assert result.count("completed") == 4
         samples = [read(path).samples for path in sorted(folder.glob("*.mcap"))]
         measured = [each.displacement_um.tobytes() for each in samples]

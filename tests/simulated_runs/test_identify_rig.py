@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hilctl.base.metrics import fold, peak_hysteresis_percent
 from hilctl.base.types import F64
 from hilctl.identify.data.cycles import average_cycle
 from hilctl.identify.data.records import SteadyLoop
+from hilctl.identify.evaluation import judge
 from hilctl.identify.fit_model import FittedModel, fit_model
-from hilctl.identify.judge import judge
 from hilctl.identify.settings import FitKind, FitSettings
+from hilctl.signals.cycle_metrics import fold, peak_hysteresis_percent
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 
 RATE_HZ = 50_000.0

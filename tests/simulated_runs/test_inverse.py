@@ -8,19 +8,19 @@ import pytest
 
 from hilctl.analysis.replay import replay
 from hilctl.base.errors import DataError
-from hilctl.base.metrics import fold, peak_hysteresis_percent
 from hilctl.loop.host import Tuning
 from hilctl.recording import reader
-from hilctl.recording.reader import Pieces, read
+from hilctl.recording.reader import RecordingStream, read
 from hilctl.run import unpaced
 from hilctl.run.start import checked_experiment
+from hilctl.signals.cycle_metrics import fold, peak_hysteresis_percent
 
 DEMO = Path(__file__).parents[2] / "configs" / "demo.yaml"
 RATE_HZ = 50_000
 OUT_S, IN_S, FADE_S = 1.0, 2.0, 0.25
 
 
-class _Switched(unpaced.BatchHost):
+class _Switched(unpaced.OfflineHost):
     """Takes the inverse out and in where a run stands at these times."""
 
     changes: tuple[Tuning, ...] = ()
@@ -85,8 +85,8 @@ def test_it_replays_in_pieces(switched, monkeypatch):
     """A fade may begin in one piece and end in another, and its event stand behind its samples."""
     recording, _ = switched
     monkeypatch.setattr(reader, "PIECE_SAMPLES", 3000)
-    assert len(list(Pieces(recording.path))) > 20
-    assert replay(Pieces(recording.path)) == replay(recording)
+    assert len(list(RecordingStream(recording.path))) > 20
+    assert replay(RecordingStream(recording.path)) == replay(recording)
 
 
 def test_without_its_events_it_is_not_replayed(switched):

@@ -13,10 +13,10 @@ from hilctl.analysis.report import summarize
 from hilctl.cli.commands import app
 from hilctl.experiment.correction import load_correction
 from hilctl.experiment.load import load_experiment
-from hilctl.learning.session import Session
-from hilctl.models.files import dump_model, load_model
+from hilctl.ilc.ilc_session import IlcSession
+from hilctl.models.mechanics import FirstMode
+from hilctl.models.model_file import dump_model, load_model
 from hilctl.models.staged import FieldLag, StagedModel
-from hilctl.models.structure import Structure
 from hilctl.recording.reader import read
 from hilctl.run.start import checked_experiment, paced, start_run, unpaced
 from hilctl.run.unpaced import run_unpaced
@@ -32,7 +32,7 @@ def at(frequency_hz, *more):
 
 
 def learn(folder, settings, run=unpaced, cycles=20):
-    return Session(SINE, settings, folder, run).learn(cycles, lambda rows: None)
+    return IlcSession(SINE, settings, folder, run).learn(cycles, lambda rows: None)
 
 
 def errors(learned):
@@ -107,7 +107,7 @@ def test_the_delay_of_a_link_is_found(tmp_path):
 
 def test_what_is_too_fast_is_learned_more_slowly(tmp_path):
     """A correction that would break a limit is not run; smaller steps are."""
-    slow = Session(SINE, at(250.0, "limits.slew_a_per_s=14700.0"), tmp_path, unpaced)
+    slow = IlcSession(SINE, at(250.0, "limits.slew_a_per_s=14700.0"), tmp_path, unpaced)
     learned = slow.learn(8, lambda rows: None)
     assert "corrections were refused" in learned.reason
     assert "must change no faster than 14700 A/s" in learned.reason
@@ -118,7 +118,7 @@ def test_what_is_too_fast_is_learned_more_slowly(tmp_path):
 def staged(tmp_path):
     """A model whose inverse looks ahead: the shipped one with a lag and a structure around it."""
     omega = load_model(CONFIGS / "models" / "terfenol_omega.yaml")
-    structure = Structure(natural_hz=2300.0, damping_ratio=0.12)
+    structure = FirstMode(natural_hz=2300.0, damping_ratio=0.12)
     model = StagedModel.around(omega, lag=FieldLag(tau_s=4e-5), structure=structure)
     path = tmp_path / "staged.yaml"
     path.write_text(dump_model(model))
@@ -192,11 +192,11 @@ def test_a_fault_later_on_keeps_what_was_learned(tmp_path):
 
 def test_learning_goes_on_from_a_correction(tmp_path):
     """An experiment that has one starts where that left off, also through its own file."""
-    first = Session(SINE, at(100.0), tmp_path / "a", unpaced).learn(4, lambda rows: None)
+    first = IlcSession(SINE, at(100.0), tmp_path / "a", unpaced).learn(4, lambda rows: None)
     file = tmp_path / "a" / "run-04.yaml"
     settings = at(100.0, f"compensator.correction={file}")
     assert load_experiment(SINE, settings).correction is not None
-    second = Session(SINE, settings, tmp_path / "b", unpaced).learn(1, lambda rows: None)
+    second = IlcSession(SINE, settings, tmp_path / "b", unpaced).learn(1, lambda rows: None)
     assert errors(second)[0] == pytest.approx(errors(first)[4], rel=0.3)
 
 

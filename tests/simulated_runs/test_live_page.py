@@ -54,7 +54,7 @@ class LiveRun:
         return next(
             int(each)
             for each in children.split()
-            if b"hilctl.desk.live" in Path(f"/proc/{each}/cmdline").read_bytes()
+            if b"hilctl.live.server_process" in Path(f"/proc/{each}/cmdline").read_bytes()
         )
 
 

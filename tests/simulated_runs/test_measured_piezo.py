@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from hilctl.models.files import load_model
+from hilctl.models.model_file import load_model
 from hilctl.models.plays import PpiModel
 
 DATA = Path(__file__).parents[3] / "shared" / "data" / "yan9a_DBO"

@@ -12,7 +12,7 @@ import pytest
 
 from hilctl.analysis.replay import replay
 from hilctl.analysis.report import summarize
-from hilctl.models.files import dump_model
+from hilctl.models.model_file import dump_model
 from hilctl.models.plays import SpiModel
 from hilctl.recording.reader import read
 from hilctl.run.start import checked_experiment

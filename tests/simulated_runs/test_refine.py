@@ -4,7 +4,7 @@ from pathlib import Path
 
 from hilctl.analysis.replay import replay
 from hilctl.analysis.report import summarize
-from hilctl.identify.refine.command import refine_files
+from hilctl.identify.refine.refinement import refine_files
 from hilctl.recording.reader import read
 from hilctl.run.start import checked_experiment
 from hilctl.run.unpaced import run_unpaced

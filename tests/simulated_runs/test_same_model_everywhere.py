@@ -17,10 +17,10 @@ import pytest
 import scipy
 
 from hilctl.base.types import F64
-from hilctl.identify.catalogue import CATALOGUE, HISTORIES
 from hilctl.identify.data.cycles import average_cycle
 from hilctl.identify.data.records import History, SteadyLoop
 from hilctl.identify.fit_model import fit_model
+from hilctl.identify.registry import CATALOGUE, HISTORIES
 from hilctl.identify.settings import FitSettings
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 

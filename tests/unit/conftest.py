@@ -11,7 +11,7 @@ from hilctl.base.events import Event
 from hilctl.base.samples import Flag, Samples
 from hilctl.base.segments import Segment
 from hilctl.base.types import F64, I64, U32
-from hilctl.recording.data import Recording, Ticks
+from hilctl.recording.recording import Recording, Ticks
 
 MakeRecording = Callable[..., Recording]
 

@@ -16,9 +16,9 @@ WITHOUT = {
     "drivers/emulator/wire": "a contract and a record; drivers/emulator/test_server.py uses both",
     "loop/host": "a contract and a record; loop/test_loop.py runs the loop on a double of it",
     "loop/plan": "two records of plain values; loop/test_loop.py fills and reads all of them",
-    "recording/facts": "names; analysis/test_catalogue.py reads all of them",
+    "recording/metadata_keys": "names; analysis/test_catalogue.py reads all of them",
     "run/protocol": "constants and small functions; run/test_requests.py and test_client.py use it",
-    "recording/data": "records of plain values; recording/test_reader.py fills them",
+    "recording/recording": "records of plain values; recording/test_reader.py fills them",
 }
 """Modules without a file of their own, and where they are tested instead."""
 

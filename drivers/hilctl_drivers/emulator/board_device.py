@@ -7,11 +7,11 @@ import numpy as np
 
 from hilctl.base.types import F64
 from hilctl_drivers.board import frames as board
+from hilctl_drivers.board.board_profile import FrameProfile, FrameStreaming
+from hilctl_drivers.board.board_session import BoardValues
 from hilctl_drivers.board.frames import Status
-from hilctl_drivers.board.profile import FrameProfile, FrameStreaming
-from hilctl_drivers.board.session import Values
 from hilctl_drivers.emulator.fifo import SampleFifo
-from hilctl_drivers.emulator.rig import Rig, Wiring, WriteLog
+from hilctl_drivers.emulator.rig import Rig, SimulatedWiring, WriteLog
 from hilctl_drivers.emulator.wire import EmulatedReply
 
 
@@ -33,16 +33,22 @@ class EmulatedBoard:
     """
 
     def __init__(
-        self, profile: FrameProfile, rig: Rig, log: WriteLog, wiring: Wiring, *, noise: bool
+        self,
+        profile: FrameProfile,
+        rig: Rig,
+        log: WriteLog,
+        wiring: SimulatedWiring,
+        *,
+        noise: bool,
     ) -> None:
         self._profile = profile
         self._rig = rig
         self._log = log
         self._wiring = wiring
         self._output_name, self._output = next(iter(profile.outputs.items()))
-        self._outputs = Values(self._output)
+        self._outputs = BoardValues(self._output)
         self._sensor = next(iter(profile.inputs.values()))
-        self._inputs = Values(self._sensor)
+        self._inputs = BoardValues(self._sensor)
         streaming = profile.streaming
         self._streaming = streaming if isinstance(streaming, FrameStreaming) else None
         self.fifo = SampleFifo(noise=noise, repeats=False, on_played=self._played)

@@ -12,12 +12,12 @@ import numpy as np
 
 from hilctl.base.types import F64
 from hilctl_drivers.emulator.fifo import SampleFifo
-from hilctl_drivers.emulator.modbus_device import Declined, EmulatedModbus
+from hilctl_drivers.emulator.modbus_device import EmulatedModbus, RejectedRequest
 from hilctl_drivers.emulator.rig import Rig, WriteLog
 from hilctl_drivers.labjack import stream
-from hilctl_drivers.labjack.profile import BYTES_A_SAMPLE, LabJackStreaming
-from hilctl_drivers.modbus.channels import RegisterStep
-from hilctl_drivers.modbus.profile import ModbusProfile
+from hilctl_drivers.labjack.labjack_profile import BYTES_A_SAMPLE, LabJackStreaming
+from hilctl_drivers.modbus.modbus_profile import ModbusProfile
+from hilctl_drivers.modbus.register_map import RegisterStep
 
 _DROPPING, _DROPPED = 2940, 2941
 _LIMIT = 0xFFFF
@@ -181,9 +181,9 @@ class LabJackStream:
         elif address in self._words:
             data = struct.pack(">2H", *self._words[address])
         else:
-            raise Declined(_FAILURE_EXCEPTION)
+            raise RejectedRequest(_FAILURE_EXCEPTION)
         if len(data) != 2 * count:
-            raise Declined(_VALUE_EXCEPTION)
+            raise RejectedRequest(_VALUE_EXCEPTION)
         return list(struct.unpack(f">{count}H", data))
 
     def write(self, address: int, values: Sequence[int]) -> None:
@@ -198,7 +198,7 @@ class LabJackStream:
             return
         for start in range(0, len(values), 2):
             if address + start not in self._words:
-                raise Declined(_VALUE_EXCEPTION)
+                raise RejectedRequest(_VALUE_EXCEPTION)
         for start in range(0, len(values), 2):
             self._words[address + start] = list(values[start : start + 2])
 
@@ -218,7 +218,7 @@ class LabJackStream:
         """Keep the rate that the clock can make (description of STREAM_SCANRATE_HZ)."""
         (rate_hz,) = struct.unpack(">f", data)
         if not 0.0 < rate_hz <= self._streaming.samples_per_s_max:
-            raise Declined(_VALUE_EXCEPTION)
+            raise RejectedRequest(_VALUE_EXCEPTION)
         unit_ns = _PERIOD_NS
         while round(1e9 / rate_hz / unit_ns) > _PERIODS_MAX:
             unit_ns *= 10
@@ -232,7 +232,7 @@ class LabJackStream:
         if self._number(stream.OUT_ENABLE) and (
             not allowed or self._number(stream.OUT_TARGET) != self._target
         ):
-            raise Declined(_FAILURE_EXCEPTION)
+            raise RejectedRequest(_FAILURE_EXCEPTION)
         self.fifo.clear()
         self._pending.clear()
 
@@ -241,15 +241,15 @@ class LabJackStream:
         low, high = self._limits
         slack = 1e-6 * (high - low)
         if not ((values >= low - slack) & (values <= high + slack)).all():
-            raise Declined(_VALUE_EXCEPTION)
+            raise RejectedRequest(_VALUE_EXCEPTION)
         enabled = self._number(stream.OUT_ENABLE)
         if not enabled or self._held + values.size > self._capacity:
-            raise Declined(_FAILURE_EXCEPTION)
+            raise RejectedRequest(_FAILURE_EXCEPTION)
         self._pending.append(values)
 
     def _use_values(self, data: bytes) -> None:
         if data != stream.u32(stream.USE_AT_ONCE):
-            raise Declined(_VALUE_EXCEPTION)
+            raise RejectedRequest(_VALUE_EXCEPTION)
         for values in self._pending:
             self.fifo.queue(self._current_a(values))
         self._pending.clear()
@@ -257,7 +257,7 @@ class LabJackStream:
     def _enable(self, data: bytes) -> None:
         if data == stream.u32(0):
             if not self.running:
-                raise Declined(_FAILURE_EXCEPTION)
+                raise RejectedRequest(_FAILURE_EXCEPTION)
             self.fifo.stop()
             return
         addresses = [self._number(stream.SCANLIST_ADDRESS + 2 * k) for k in range(2)]
@@ -271,7 +271,7 @@ class LabJackStream:
             or settings != wanted
             or not 0.0 < rate_hz <= self._streaming.rate_max_hz
         ):
-            raise Declined(_FAILURE_EXCEPTION)
+            raise RejectedRequest(_FAILURE_EXCEPTION)
         self.input.start(self._number(stream.BUFFER_SIZE_BYTES))
         self.fifo.current_a = self._standing_a()
         self.fifo.set_rate(rate_hz)
@@ -284,13 +284,13 @@ class LabJackStream:
 
     def _data(self, count: int) -> bytes:
         if not self.running:
-            raise Declined(_FAILURE_EXCEPTION)
+            raise RejectedRequest(_FAILURE_EXCEPTION)
         return self.input.fetch(count)
 
     def _read_flash(self, count: int) -> bytes:
         start = self._number(stream.FLASH_READ_POINTER) - self._streaming.calibration_address
         if start < 0:
-            raise Declined(_VALUE_EXCEPTION)
+            raise RejectedRequest(_VALUE_EXCEPTION)
         return self.input.flash[start : start + 2 * count]
 
 

@@ -5,9 +5,9 @@ from typing import Protocol
 
 from hilctl.base.errors import InputError
 from hilctl_drivers.emulator.registers import NoSuchRegister, RegisterMap, Words
-from hilctl_drivers.emulator.rig import Rig, Wiring, WriteLog
-from hilctl_drivers.modbus.channels import EnsureStep, ModbusStep, RegisterStep, WriteStep
-from hilctl_drivers.modbus.profile import ModbusProfile, ModbusWatchdog
+from hilctl_drivers.emulator.rig import Rig, SimulatedWiring, WriteLog
+from hilctl_drivers.modbus.modbus_profile import ModbusProfile, ModbusWatchdog
+from hilctl_drivers.modbus.register_map import EnsureStep, ModbusStep, RegisterStep, WriteStep
 
 Target = tuple[Words, list[int] | None]
 """A value and the words that trigger something; None stands for any words but zeros."""
@@ -94,7 +94,7 @@ def _hit(trigger: Target | None, target: Words) -> bool:
     return any(target.words) if trigger[1] is None else target.words == trigger[1]
 
 
-class Declined(Exception):  # noqa: N818  a reply, not a mistake
+class RejectedRequest(Exception):  # noqa: N818  a reply, not a mistake
     """The device refuses a request.
 
     Attributes:
@@ -114,11 +114,11 @@ class Overlay(Protocol):
         ...
 
     def read(self, address: int, count: int) -> list[int]:
-        """Return register words; raise ``Declined`` where they can't be read."""
+        """Return register words; raise ``RejectedRequest`` where they can't be read."""
         ...
 
     def write(self, address: int, values: Sequence[int]) -> None:
-        """Write register words; raise ``Declined`` where they can't be written."""
+        """Write register words; raise ``RejectedRequest`` where they can't be written."""
         ...
 
     def tick(self, now_ns: int) -> None:
@@ -165,7 +165,7 @@ class EmulatedModbus:
         log: WriteLog,
         output: str | None,
         sensor: str | None,
-        wiring: Wiring | None = None,
+        wiring: SimulatedWiring | None = None,
         current_a: float | None = None,
     ) -> None:
         self.profile = profile
@@ -180,7 +180,7 @@ class EmulatedModbus:
         if wiring is None:
             assert output is not None, "a device that only reads needs its wiring"
             assert sensor is not None, "a device that only drives needs its wiring"
-            wiring = Wiring.spread(profile.outputs[output], profile.inputs[sensor])
+            wiring = SimulatedWiring.spread(profile.outputs[output], profile.inputs[sensor])
         self.wiring = wiring
         watchdog = profile.watchdog
         self._watchdog = None if watchdog == "none" else EmulatedWatchdog(watchdog, self._steps)
@@ -228,7 +228,7 @@ class EmulatedModbus:
         try:
             return self.memory.read(areas, address, count)
         except NoSuchRegister:
-            raise Declined(2) from None
+            raise RejectedRequest(2) from None
 
     def write(self, area: str, address: int, values: Sequence[int]) -> None:
         """Write register words; all of them or none.
@@ -243,14 +243,14 @@ class EmulatedModbus:
         try:
             targets = self.memory.targets(area, address, values)
         except NoSuchRegister:
-            raise Declined(2) from None
+            raise RejectedRequest(2) from None
         before = [list(words.words) for words, _ in targets]
         for words, wanted in targets:
             words.words[:] = wanted
         try:
             for words, _ in targets:
                 self._check(words)
-        except Declined:
+        except RejectedRequest:
             for (words, _), old in zip(targets, before, strict=True):
                 words.words[:] = old
             raise
@@ -267,10 +267,10 @@ class EmulatedModbus:
                 low, high = channel.limits
                 margin = 0.5 * channel.step + 1e-6 * (high - low)
                 if not low - margin <= words.value <= high + margin:
-                    raise Declined(3)
+                    raise RejectedRequest(3)
                 watchdog = self.profile.watchdog
                 if self.tripped and watchdog != "none" and watchdog.refuses_while_tripped:
-                    raise Declined(4)
+                    raise RejectedRequest(4)
 
     def _act(self, words: Words) -> None:
         if self._watchdog is not None:

@@ -15,7 +15,7 @@ from pymodbus.exceptions import ModbusException
 from pymodbus.framer import FramerRTU, FramerSocket
 from pymodbus.pdu import DecodePDU, ExceptionResponse, ModbusPDU
 
-from hilctl_drivers.emulator.modbus_device import Declined, EmulatedModbus
+from hilctl_drivers.emulator.modbus_device import EmulatedModbus, RejectedRequest
 from hilctl_drivers.emulator.wire import EmulatedReply
 
 LinkKind: TypeAlias = Literal["tcp", "rtu"]
@@ -87,7 +87,7 @@ class _Context:
                     "coil" if function == 5 else "holding", address, count
                 )
             return self._device.read(_AREAS[function], address, count)
-        except Declined as declined:
+        except RejectedRequest as declined:
             return ExcCodes(declined.code)
 
     async def async_setValues(  # noqa: N802  pymodbus calls it by this name
@@ -96,7 +96,7 @@ class _Context:
         area = "coil" if function in {5, 15} else "holding"
         try:
             self._device.write(area, address, [int(value) for value in values])
-        except Declined as declined:
+        except RejectedRequest as declined:
             return ExcCodes(declined.code)
         return None
 

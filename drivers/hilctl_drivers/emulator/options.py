@@ -7,7 +7,7 @@ from typing import Literal, TypeAlias, get_args
 from hilctl.base.errors import InputError
 from hilctl_drivers.emulator.faults import WireFault
 from hilctl_drivers.emulator.modbus_wire import LinkKind
-from hilctl_drivers.emulator.rig import Wiring
+from hilctl_drivers.emulator.rig import SimulatedWiring
 
 ReaderLine: TypeAlias = Literal["same", "own"]
 
@@ -56,7 +56,7 @@ class EmulatorOptions:
     reader_port: int = 0
     lacking: frozenset[int] = frozenset()
     mute: frozenset[int] = frozenset()
-    wiring: Wiring | None = None
+    wiring: SimulatedWiring | None = None
     noise: bool = True
     current_a: float | None = None
 

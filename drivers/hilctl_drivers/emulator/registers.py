@@ -3,8 +3,8 @@
 import struct
 from collections.abc import Sequence
 
-from hilctl_drivers.modbus.channels import ExpectStep, ModbusStep, Register, RegisterStep
-from hilctl_drivers.modbus.profile import ModbusOutput, ModbusProfile
+from hilctl_drivers.modbus.modbus_profile import ModbusOutput, ModbusProfile
+from hilctl_drivers.modbus.register_map import ExpectStep, ModbusStep, Register, RegisterStep
 from hilctl_drivers.modbus.registers import RegisterFormat
 
 Key = tuple[str, int]

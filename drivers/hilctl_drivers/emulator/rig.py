@@ -8,8 +8,8 @@ from typing import IO, Any
 import numpy as np
 
 from hilctl.base.errors import InputError
-from hilctl.base.remedy import reason
-from hilctl_drivers.profile_parts import Range
+from hilctl.base.os_errors import reason
+from hilctl_drivers.profile_base import Range
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 
 RATE_HZ = 10_000.0
@@ -69,7 +69,7 @@ class Rig:
 
 
 @dataclass(frozen=True, slots=True)
-class Wiring:
+class SimulatedWiring:
     """What stands between the device's terminals and the rig.
 
     Attributes:
@@ -85,7 +85,7 @@ class Wiring:
     offset_um: float
 
     @classmethod
-    def spread(cls, output: Range, sensor: Range) -> "Wiring":
+    def spread(cls, output: Range, sensor: Range) -> "SimulatedWiring":
         """Return a wiring that spreads the rig's ranges over those of the two channels.
 
         An output in A drives the coil itself.

@@ -4,12 +4,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Protocol
 
-from hilctl_drivers.board.profile import FrameProfile
+from hilctl_drivers.ascii.ascii_profile import AsciiProfile
+from hilctl_drivers.ascii.lines import LineFormat
+from hilctl_drivers.board.board_profile import FrameProfile
 from hilctl_drivers.emulator.wire import EmulatedReply
-from hilctl_drivers.text.lines import LineFormat
-from hilctl_drivers.text.profile import AsciiProfile
-from hilctl_drivers.wire.framing import Framing, binary_framing
-from hilctl_drivers.wire.links import Corrupt
+from hilctl_drivers.transport.framing import Framing, binary_framing
+from hilctl_drivers.transport.links import CorruptError
 
 
 class LineFraming(Protocol):
@@ -43,7 +43,7 @@ class TextFraming:
     def feed(self, data: bytes) -> list[bytes]:
         """See :meth:`LineFraming.feed`."""
         found = self._splitter.feed(data)
-        return [each.encode() for each in found if not isinstance(each, Corrupt) and each]
+        return [each.encode() for each in found if not isinstance(each, CorruptError) and each]
 
     def encode(self, message: bytes) -> bytes:
         """See :meth:`LineFraming.encode`."""
@@ -68,7 +68,7 @@ class FrameFraming:
 
     def feed(self, data: bytes) -> list[bytes]:
         """See :meth:`LineFraming.feed`."""
-        return [each for each in self._splitter.feed(data) if not isinstance(each, Corrupt)]
+        return [each for each in self._splitter.feed(data) if not isinstance(each, CorruptError)]
 
     def encode(self, message: bytes) -> bytes:
         """See :meth:`LineFraming.encode`."""

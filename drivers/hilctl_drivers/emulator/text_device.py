@@ -3,9 +3,7 @@
 import re
 from string import Formatter
 
-from hilctl_drivers.emulator.rig import Rig, Wiring, WriteLog
-from hilctl_drivers.emulator.wire import EmulatedReply
-from hilctl_drivers.text.profile import (
+from hilctl_drivers.ascii.ascii_profile import (
     AsciiInput,
     AsciiProfile,
     AsciiStep,
@@ -14,6 +12,8 @@ from hilctl_drivers.text.profile import (
     Reply,
     SendStep,
 )
+from hilctl_drivers.emulator.rig import Rig, SimulatedWiring, WriteLog
+from hilctl_drivers.emulator.wire import EmulatedReply
 
 _NUMBER = r"[-+]?[0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?"
 _OUT_OF_RANGE = '-222,"Data out of range"'
@@ -88,7 +88,7 @@ class EmulatedText:
         profile: AsciiProfile,
         rig: Rig,
         log: WriteLog,
-        wiring: Wiring,
+        wiring: SimulatedWiring,
         *,
         output: str | None,
         sensor: str | None,

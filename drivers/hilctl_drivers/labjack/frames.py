@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Final, TypeAlias
 
 from hilctl_drivers.modbus.pdu import EXCEPTIONS, FEEDBACK, PDU_MAX, TCP_HEAD, tcp_adu, tcp_pdu
-from hilctl_drivers.wire.links import BadRequest, Link, Mismatch, Refused
+from hilctl_drivers.transport.links import BadRequestError, Link, MismatchError, RefusedError
 
 FRAME_HEAD: Final = 4
 """Bytes of a frame before its data."""
@@ -48,7 +48,7 @@ class WriteFrame:
         """Return the frame's bytes."""
         words, odd = divmod(len(self.data), 2)
         if odd:
-            raise BadRequest(f"registers have 2 bytes each, got {len(self.data)} bytes")
+            raise BadRequestError(f"registers have 2 bytes each, got {len(self.data)} bytes")
         return _HEAD.pack(1, self.address, _counted(words)) + self.data
 
     @property
@@ -62,7 +62,7 @@ FeedbackFrame: TypeAlias = ReadFrame | WriteFrame
 
 def _counted(words: int) -> int:
     if not 1 <= words <= _WORDS_MAX:
-        raise BadRequest(f"a frame has 1 to {_WORDS_MAX} registers, got {words}")
+        raise BadRequestError(f"a frame has 1 to {_WORDS_MAX} registers, got {words}")
     return words
 
 
@@ -75,7 +75,7 @@ def frames_pdu(frames: Sequence[FeedbackFrame]) -> bytes:
     pdu = bytes((FEEDBACK,)) + b"".join(frame.encode() for frame in frames)
     longest = max(len(pdu), 1 + sum(frame.reply_size for frame in frames))
     if longest > PDU_MAX:
-        raise BadRequest(f"a PDU has at most {PDU_MAX} bytes, got {longest}")
+        raise BadRequestError(f"a PDU has at most {PDU_MAX} bytes, got {longest}")
     return pdu
 
 
@@ -134,9 +134,9 @@ def _checked(pdu: bytes, size: int) -> bytes:
     if len(pdu) == 2 and pdu[0] == FEEDBACK | 0x80:
         code = pdu[1]
         name = EXCEPTIONS.get(code, "unknown")
-        raise Refused(f"function {FEEDBACK} refused with exception {code} ({name})", code)
+        raise RefusedError(f"function {FEEDBACK} refused with exception {code} ({name})", code)
     if pdu[0] != FEEDBACK:
-        raise Mismatch(f"asked with function {FEEDBACK}, answered with {pdu[0]}")
+        raise MismatchError(f"asked with function {FEEDBACK}, answered with {pdu[0]}")
     if len(pdu) != 1 + size:
-        raise Mismatch(f"reply must have {1 + size} bytes, got {len(pdu)}")
+        raise MismatchError(f"reply must have {1 + size} bytes, got {len(pdu)}")
     return pdu[1:]

@@ -20,9 +20,9 @@ import numpy.typing as npt
 from hilctl.base.errors import DeviceError
 from hilctl.base.types import F64
 from hilctl_drivers.labjack.frames import FRAME_HEAD, FeedbackFrame, ReadFrame, WriteFrame
-from hilctl_drivers.labjack.profile import BYTES_A_SAMPLE
+from hilctl_drivers.labjack.labjack_profile import BYTES_A_SAMPLE
 from hilctl_drivers.modbus.pdu import PDU_MAX
-from hilctl_drivers.wire.links import Mismatch
+from hilctl_drivers.transport.links import MismatchError
 
 SCANRATE_HZ: Final = 4002
 NUM_ADDRESSES: Final = 4004
@@ -123,7 +123,7 @@ def stream_data(data: bytes, free: bytes) -> StreamData:
         text = STATUS.get(status, "stream status {}")
         raise DeviceError(text.format(more if status in STATUS else status))
     if count > SAMPLES_MAX:
-        raise Mismatch(f"{count} samples in an answer that holds {SAMPLES_MAX}")
+        raise MismatchError(f"{count} samples in an answer that holds {SAMPLES_MAX}")
     raw = np.frombuffer(data, ">u2", count, DATA_HEAD.size).astype(np.uint16)
     if (raw == MISSING).any():
         raise DeviceError("scans are missing from the stream")

@@ -8,8 +8,14 @@ Modbus TCP]". Addresses are PDU addresses: counted from 0.
 
 import struct
 
-from hilctl_drivers.wire.crc import Bytes, crc16_modbus
-from hilctl_drivers.wire.links import BadRequest, Corrupt, Incomplete, Mismatch, Refused
+from hilctl_drivers.transport.crc import Bytes, crc16_modbus
+from hilctl_drivers.transport.links import (
+    BadRequestError,
+    CorruptError,
+    IncompleteError,
+    MismatchError,
+    RefusedError,
+)
 
 READ_COILS, READ_DISCRETE, READ_HOLDING, READ_INPUT = 1, 2, 3, 4
 WRITE_COIL, WRITE_REGISTER, WRITE_REGISTERS, WRITE_READ = 5, 6, 16, 23
@@ -31,15 +37,15 @@ EXCEPTIONS = {
 def _check_span(what: str, address: int, count: int, count_max: int) -> None:
     """Raise BadRequest unless ``count`` things from ``address`` on exist and fit a message."""
     if not 1 <= count <= count_max:
-        raise BadRequest(f"{what} count must be 1 to {count_max} in one message, got {count}")
+        raise BadRequestError(f"{what} count must be 1 to {count_max} in one message, got {count}")
     if not 0 <= address <= 0x10000 - count:
-        raise BadRequest(f"{what} address must be 0 to {0x10000 - count}, got {address}")
+        raise BadRequestError(f"{what} address must be 0 to {0x10000 - count}, got {address}")
 
 
 def _written(address: int, data: bytes, count_max: int) -> int:
     """Return how many registers ``data`` is; raise BadRequest where they can't be written."""
     if len(data) % 2:
-        raise BadRequest(f"registers have 2 bytes each, got {len(data)} bytes")
+        raise BadRequestError(f"registers have 2 bytes each, got {len(data)} bytes")
     _check_span("written register", address, len(data) // 2, count_max)
     return len(data) // 2
 
@@ -56,7 +62,7 @@ def read_pdu(function: int, address: int, count: int) -> bytes:
     elif function in {READ_HOLDING, READ_INPUT}:
         _check_span("register", address, count, READ_MAX)
     else:
-        raise BadRequest(f"functions that read are 1, 2, 3 and 4, got {function}")
+        raise BadRequestError(f"functions that read are 1, 2, 3 and 4, got {function}")
     return struct.pack(">BHH", function, address, count)
 
 
@@ -142,7 +148,7 @@ def reply_layout(pdu: bytes) -> tuple[bytes, int]:
     elif function == FEEDBACK:
         return pdu[:1], 2 * pdu[4]
     else:
-        raise BadRequest(f"function {function} is not one of those known here")
+        raise BadRequestError(f"function {function} is not one of those known here")
     return bytes((function, size)), size
 
 
@@ -167,15 +173,15 @@ def reply_data(request_pdu: bytes, reply_pdu: bytes) -> bytes:
     if len(reply_pdu) == 2 and reply_pdu[0] == function | 0x80:
         code = reply_pdu[1]
         name = EXCEPTIONS.get(code, "unknown")
-        raise Refused(f"function {function} refused with exception {code} ({name})", code)
+        raise RefusedError(f"function {function} refused with exception {code} ({name})", code)
     if not reply_pdu or reply_pdu[0] != function:
         got = reply_pdu[0] if reply_pdu else "nothing"
-        raise Mismatch(f"asked with function {function}, answered with {got}")
+        raise MismatchError(f"asked with function {function}, answered with {got}")
     if len(reply_pdu) != len(head) + size:
-        raise Mismatch(f"reply must have {len(head) + size} bytes, got {len(reply_pdu)}")
+        raise MismatchError(f"reply must have {len(head) + size} bytes, got {len(reply_pdu)}")
     if reply_pdu[: len(head)] != head:
         got_head = reply_pdu[: len(head)].hex(" ")
-        raise Mismatch(f"reply must begin with {head.hex(' ')}, got {got_head}")
+        raise MismatchError(f"reply must begin with {head.hex(' ')}, got {got_head}")
     return bytes(reply_pdu[len(head) :])
 
 
@@ -187,7 +193,7 @@ def tcp_adu(transaction: int, unit: int, pdu: bytes) -> bytes:
     """
     _check_envelope(unit, 0, pdu)
     if not 0 <= transaction <= 0xFFFF:
-        raise BadRequest(f"transaction must be 0 to 65535, got {transaction}")
+        raise BadRequestError(f"transaction must be 0 to 65535, got {transaction}")
     return struct.pack(">HHHB", transaction, 0, len(pdu) + 1, unit) + pdu
 
 
@@ -200,18 +206,18 @@ def tcp_pdu(adu: Bytes, transaction: int, unit: int) -> bytes:
         Mismatch: Another transaction or unit.
     """
     if len(adu) < TCP_HEAD:
-        raise Incomplete(f"{len(adu)} of at least {TCP_HEAD + 1} bytes")
+        raise IncompleteError(f"{len(adu)} of at least {TCP_HEAD + 1} bytes")
     got_transaction, protocol, length, got_unit = struct.unpack_from(">HHHB", adu)
     if protocol or not 2 <= length <= PDU_MAX + 1:
-        raise Corrupt(f"not a Modbus TCP header: {bytes(adu[:TCP_HEAD]).hex(' ')}")
+        raise CorruptError(f"not a Modbus TCP header: {bytes(adu[:TCP_HEAD]).hex(' ')}")
     if len(adu) < length + 6:
-        raise Incomplete(f"{len(adu)} of {length + 6} bytes")
+        raise IncompleteError(f"{len(adu)} of {length + 6} bytes")
     if len(adu) > length + 6:
-        raise Corrupt(f"{len(adu) - length - 6} bytes behind the end of the reply")
+        raise CorruptError(f"{len(adu) - length - 6} bytes behind the end of the reply")
     if got_transaction != transaction:
-        raise Mismatch(f"transaction must be {transaction}, got {got_transaction}")
+        raise MismatchError(f"transaction must be {transaction}, got {got_transaction}")
     if got_unit != unit:
-        raise Mismatch(f"unit must be {unit}, got {got_unit}")
+        raise MismatchError(f"unit must be {unit}, got {got_unit}")
     return bytes(adu[TCP_HEAD:])
 
 
@@ -236,16 +242,16 @@ def rtu_pdu(adu: Bytes, unit: int) -> bytes:
         Mismatch: Another unit.
     """
     if len(adu) < 5:
-        raise Incomplete(f"{len(adu)} of at least 5 bytes")
+        raise IncompleteError(f"{len(adu)} of at least 5 bytes")
     if crc16_modbus(adu):
-        raise Corrupt(f"CRC of {len(adu)} bytes is wrong: {bytes(adu[:16]).hex(' ')}")
+        raise CorruptError(f"CRC of {len(adu)} bytes is wrong: {bytes(adu[:16]).hex(' ')}")
     if adu[0] != unit:
-        raise Mismatch(f"unit must be {unit}, got {adu[0]}")
+        raise MismatchError(f"unit must be {unit}, got {adu[0]}")
     return bytes(adu[1:-2])
 
 
 def _check_envelope(unit: int, unit_min: int, pdu: bytes) -> None:
     if not unit_min <= unit <= 255:
-        raise BadRequest(f"unit must be {unit_min} to 255, got {unit}")
+        raise BadRequestError(f"unit must be {unit_min} to 255, got {unit}")
     if not 1 <= len(pdu) <= PDU_MAX:
-        raise BadRequest(f"a PDU has 1 to {PDU_MAX} bytes, got {len(pdu)}")
+        raise BadRequestError(f"a PDU has 1 to {PDU_MAX} bytes, got {len(pdu)}")

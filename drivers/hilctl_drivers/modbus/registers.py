@@ -12,8 +12,8 @@ from math import inf, isfinite
 from operator import itemgetter
 from typing import Literal, TypeAlias
 
-from hilctl_drivers.wire.crc import Bytes
-from hilctl_drivers.wire.links import BadRequest, Mismatch
+from hilctl_drivers.transport.crc import Bytes
+from hilctl_drivers.transport.links import BadRequestError, MismatchError
 
 RegisterType: TypeAlias = Literal["int16", "uint16", "int32", "uint32", "float32", "float64"]
 
@@ -53,16 +53,20 @@ class RegisterFormat:
 
     def __post_init__(self) -> None:
         if self.type not in _CODES:
-            raise BadRequest(f"unknown register type {self.type!r}; known are {', '.join(_CODES)}")
+            raise BadRequestError(
+                f"unknown register type {self.type!r}; known are {', '.join(_CODES)}"
+            )
         if not (isfinite(self.scale) and isfinite(self.offset) and self.scale):
-            raise BadRequest(
+            raise BadRequestError(
                 f"scale must be finite and not 0 and offset finite, got {self.scale}, {self.offset}"
             )
         size = struct.calcsize(">" + _CODES[self.type])
         natural = _LETTERS[:size]
         order = self.order or natural
         if sorted(order) != list(natural):
-            raise BadRequest(f"order of {self.type} must name each of {natural} once, got {order}")
+            raise BadRequestError(
+                f"order of {self.type} must name each of {natural} once, got {order}"
+            )
         little = order == natural[::-1]
         plain = little or order == natural
         to_wire = tuple(natural.index(letter) for letter in order)
@@ -112,11 +116,11 @@ class RegisterFormat:
         """
         raw = (value - self.offset) / self.scale
         if not isfinite(raw):
-            raise BadRequest(f"{self.type} register can't hold {value}")
+            raise BadRequestError(f"{self.type} register can't hold {value}")
         try:
             data = self._pack(round(raw) if self._whole else raw)
         except (struct.error, OverflowError):
-            raise BadRequest(
+            raise BadRequestError(
                 f"{self.type} register holds {self.limits[0]:g} to {self.limits[1]:g}, got {value}"
             ) from None
         return data if self._to_wire is None else bytes(self._to_wire(data))
@@ -131,7 +135,7 @@ class RegisterFormat:
             Mismatch: Too many or too few bytes.
         """
         if len(data) != self.size:
-            raise Mismatch(f"{self.type} register has {self.size} bytes, got {len(data)}")
+            raise MismatchError(f"{self.type} register has {self.size} bytes, got {len(data)}")
         if self._from_wire is not None:
             data = bytes(self._from_wire(data))
         return self._unpack(data)[0] * self.scale + self.offset

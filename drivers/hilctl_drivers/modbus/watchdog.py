@@ -4,15 +4,15 @@ from collections.abc import Callable
 from contextlib import suppress
 
 from hilctl.base.errors import DeviceError
-from hilctl_drivers.modbus.channels import ModbusStep, RegisterStep
-from hilctl_drivers.modbus.profile import ModbusWatchdog
-from hilctl_drivers.modbus.session import ModbusSession
-from hilctl_drivers.modbus.setup import ModbusSetup
-from hilctl_drivers.wire.links import Refused
-from hilctl_drivers.wire.timing import check_feeds
+from hilctl_drivers.modbus.config import ModbusSetup
+from hilctl_drivers.modbus.modbus_profile import ModbusWatchdog
+from hilctl_drivers.modbus.modbus_session import ModbusSession
+from hilctl_drivers.modbus.register_map import ModbusStep, RegisterStep
+from hilctl_drivers.transport.links import RefusedError
+from hilctl_drivers.transport.wire_time import check_feeds
 
 
-class ModbusGuard:
+class ModbusWatchdogDriver:
     """The watchdog, as the experiment wants it.
 
     Args:
@@ -44,7 +44,7 @@ class ModbusGuard:
         if has == "none" or not has.clear:
             put()
             return
-        with suppress(Refused):
+        with suppress(RefusedError):
             put()
             if has.tripped == "none" or not session.is_set(has.tripped):
                 return
@@ -80,7 +80,7 @@ class ModbusGuard:
             return False
         try:  # what it holds already moves nothing
             session.put_out(self._setup.output, session.read_bytes(readback))
-        except Refused:
+        except RefusedError:
             return True
         return False
 

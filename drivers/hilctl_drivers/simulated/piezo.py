@@ -13,7 +13,7 @@ import numpy as np
 
 from hilctl.base.types import F64
 from hilctl.kernels.jit import kernel
-from hilctl_drivers.simulated.plant import Plant
+from hilctl_drivers.simulated.actuator_base import Plant
 
 _INDEX = tuple(range(1, 11))
 

@@ -15,10 +15,10 @@ import numpy as np
 from hilctl.base.types import F64
 from hilctl.kernels.dynamics import exponential
 from hilctl.kernels.jit import ensure_compiled
-from hilctl_drivers.simulated.extras import Creep, SecondMode, Thermal, VoltageLimit
+from hilctl_drivers.simulated.actuator_base import CHUNK, Plant
+from hilctl_drivers.simulated.optional_effects import CreepEffect, SecondMode, Thermal, VoltageLimit
 from hilctl_drivers.simulated.pinned_cells import PinnedCellsParameters
-from hilctl_drivers.simulated.plant import CHUNK, Plant
-from hilctl_drivers.simulated.rods import Coil, RodParameters
+from hilctl_drivers.simulated.rod_model import Coil, RodParameters
 from hilctl_drivers.simulated.terfenol_kernel import Amplification, amplify, creep, respond, warm
 
 
@@ -69,7 +69,7 @@ class TerfenolParameters:
     drift_s: float = 1.0
     step_max_s: float = 10e-6
     rods: RodParameters = field(default_factory=PinnedCellsParameters)
-    creep: Creep | None = None
+    creep: CreepEffect | None = None
     thermal: Thermal | None = None
     second_mode: SecondMode | None = None
     amplifier: VoltageLimit | None = None
@@ -123,7 +123,7 @@ def _amplifier(parameters: TerfenolParameters, step_s: float) -> Amplification:
     )
 
 
-def _creep(option: Creep | None, step_s: float) -> F64:
+def _creep(option: CreepEffect | None, step_s: float) -> F64:
     """Return float64[3, m], the elements of ``creep``."""
     if option is None:
         return np.zeros((3, 0))

@@ -15,7 +15,7 @@ from typing import Annotated, Any, NamedTuple, TypeAlias
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from hilctl.base.errors import ConfigError, Problem
+from hilctl.base.errors import ConfigError, ConfigProblem
 
 Loc: TypeAlias = tuple[str | int, ...]
 """Keys and list indices that lead to a value."""
@@ -95,7 +95,7 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
 
 def broken_rules(
     error: ValidationError, model: type[BaseModel], where: Callable[[Loc], str], at: Loc = ()
-) -> list[Problem]:
+) -> list[ConfigProblem]:
     """Return all that pydantic says of a file, one problem a value.
 
     Args:
@@ -104,7 +104,7 @@ def broken_rules(
         where: Gives the ``file:line`` of a location, or of the nearest thing around it.
         at: Where in the file the model's data stand.
     """
-    problems: list[Problem] = []
+    problems: list[ConfigProblem] = []
     broken: list[_Broken] = []
     for detail in error.errors(include_url=False):
         cause = detail.get("ctx", {}).get("error")
@@ -167,7 +167,7 @@ def _decimal(text: str) -> float | None:
     return float(f"{whole}.{part}{power}")
 
 
-def _problem(group: list[_Broken], where: Callable[[Loc], str], at: Loc) -> Problem:
+def _problem(group: list[_Broken], where: Callable[[Loc], str], at: Loc) -> ConfigProblem:
     first = group[0]
     place = loc = (*at, *first.loc)
     rule, *others = (_rule(each.detail) for each in group)
@@ -176,7 +176,7 @@ def _problem(group: list[_Broken], where: Callable[[Loc], str], at: Loc) -> Prob
         place = (*loc, *loc_of(rule.split(" ", 1)[0]))
     known = first.parent.model_fields if first.parent else ()
     hint = next(filter(None, (_hint(each.detail, known) for each in group)), "")
-    return Problem(where(place), dotted(loc), rule, _value(first.detail), hint)
+    return ConfigProblem(where(place), dotted(loc), rule, _value(first.detail), hint)
 
 
 def _rule(detail: ErrorDetails) -> str:

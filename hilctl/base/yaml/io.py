@@ -24,7 +24,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 from yaml.composer import ComposerError
 
-from hilctl.base.errors import ConfigError, Problem
+from hilctl.base.errors import ConfigError, ConfigProblem
 from hilctl.base.files import TextFiles
 from hilctl.base.yaml.errors import NUMBERS, Loc, broken_rules, dotted, readings
 
@@ -198,7 +198,7 @@ class Document:
         self.name = name
         self.assignments: list[str] = []
         self._places: dict[Loc, str] = {}
-        self._duplicates: list[Problem] = []
+        self._duplicates: list[ConfigProblem] = []
 
         def place(mark: yaml.Mark) -> str:
             named = lines[mark.line] if mark.line < len(lines) else ""
@@ -208,10 +208,12 @@ class Document:
             node = compose(text)
         except yaml.MarkedYAMLError as error:
             where = place(error.problem_mark) if error.problem_mark else f"{name}:1"
-            raise ConfigError([Problem(where, "", _UNREADABLE, hint=str(error.problem))]) from None
+            raise ConfigError(
+                [ConfigProblem(where, "", _UNREADABLE, hint=str(error.problem))]
+            ) from None
         if not isinstance(node, yaml.MappingNode):
             rule = "must hold a mapping of keys to values"
-            raise ConfigError([Problem(f"{name}:1", "", rule)])
+            raise ConfigError([ConfigProblem(f"{name}:1", "", rule)])
         self.data: dict[str, Any] = self._build(node, (), place)
         if self._duplicates:
             raise ConfigError(self._duplicates)
@@ -227,7 +229,7 @@ class Document:
             inner, where = (*loc, key.value), place(key.start_mark)
             if key.value in mapping:
                 rule = f"stands already at {self._places[inner]}"
-                self._duplicates.append(Problem(where, dotted(inner), rule))
+                self._duplicates.append(ConfigProblem(where, dotted(inner), rule))
             self._places[inner] = where
             mapping[key.value] = self._build(value, inner, place)
         return mapping
@@ -243,11 +245,11 @@ class Document:
         key, equals, text = assignment.partition("=")
         parts = key.strip().split(".")
         if not equals or not all(parts) or len(parts) > MAX_DEPTH:
-            raise ConfigError([Problem(where, "", "must be dotted.key=value")])
+            raise ConfigError([ConfigProblem(where, "", "must be dotted.key=value")])
         try:
             node = compose(text)
         except yaml.MarkedYAMLError as error:
-            problem = Problem(where, key, _UNREADABLE, repr(text), str(error.problem))
+            problem = ConfigProblem(where, key, _UNREADABLE, repr(text), str(error.problem))
             raise ConfigError([problem]) from None
         loc: Loc = ()
         data: Any = self.data
@@ -258,7 +260,7 @@ class Document:
                 loc, data = (*loc, part), data.get(part, {})
             else:
                 rule = "there is no such key to set"
-                raise ConfigError([Problem(where, dotted((*loc, part)), rule)])
+                raise ConfigError([ConfigProblem(where, dotted((*loc, part)), rule)])
         self._places = {at: old for at, old in self._places.items() if at[: len(loc)] != loc}
         for end in range(1, len(loc) + 1):
             self._places.setdefault(loc[:end], where)
@@ -266,7 +268,9 @@ class Document:
         self.data = _replaced(self.data, loc, value)
         self.assignments.append(assignment)
         if self._duplicates:
-            raise ConfigError([Problem(where, p.key, "stands twice") for p in self._duplicates])
+            raise ConfigError(
+                [ConfigProblem(where, p.key, "stands twice") for p in self._duplicates]
+            )
 
     def holds(self, loc: Loc) -> bool:
         """Return whether something stands at a location."""
@@ -325,7 +329,7 @@ class Document:
         new, mapping = (*loc[:-1], name), _at(self.data, loc[:-1])
         if name in mapping:
             rule = f"stands already at {self.where(new)}"
-            raise ConfigError([Problem(self.where(loc), dotted(loc), rule)])
+            raise ConfigError([ConfigProblem(self.where(loc), dotted(loc), rule)])
         renamed = {(name if key == loc[-1] else key): value for key, value in mapping.items()}
         self.data = _replaced(self.data, loc[:-1], renamed)
         self._places = {

@@ -10,7 +10,7 @@ from hilctl.base.segments import Segment
 from hilctl.base.types import F64
 from hilctl.identify.data.period import find_period
 from hilctl.identify.data.records import FEWEST_POINTS, History, SteadyLoop
-from hilctl.recording.data import Recording
+from hilctl.recording.recording import Recording
 
 _LARGEST = 1e100  # no reading is; the spline's differences and products stay finite below it
 
@@ -120,7 +120,7 @@ def loops_from_pieces(
 
     Args:
         pieces: A run with at least one repeating segment, see
-            :class:`hilctl.recording.reader.Pieces`.
+            :class:`hilctl.recording.reader.RecordingStream`.
         points: Points a loop; published are 200, 300 and 400.
         labels: Segments to take, by label; all where empty.
 

@@ -7,9 +7,9 @@ from scipy.fft import irfft, next_fast_len, rfft
 from scipy.optimize import minimize_scalar
 
 from hilctl.base.errors import DataError
-from hilctl.base.metrics import MAD_TO_SIGMA
 from hilctl.base.types import F64, I64
 from hilctl.identify.data.records import FEWEST_POINTS
+from hilctl.signals.cycle_metrics import MAD_TO_SIGMA
 
 LIKELY = 0.3  # least similarity worth a closer look; a decay lowers it
 PROMINENT = 0.02  # how far a top stands out: noise has many that do not

@@ -6,10 +6,10 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from hilctl.base.types import F64
-from hilctl.identify.field.prepared import Prepared, Run
-from hilctl.identify.field.weights import Curve
+from hilctl.identify.field.densities import Curve
+from hilctl.identify.field.preprocess import Prepared, Run
 from hilctl.kernels.field import field_left
-from hilctl.models.field import FieldLosses, even_excess
+from hilctl.models.effective_field import FieldLosses, even_excess
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,13 +6,13 @@ import numpy as np
 
 from hilctl.base.errors import DataError
 from hilctl.identify.data.records import History, SteadyLoop
-from hilctl.identify.field.prepared import OFF, Prepared
+from hilctl.identify.field.preprocess import OFF, Prepared
+from hilctl.identify.fit_api import FitJob, FoundModel
 from hilctl.identify.generalised_duhem.search import DuhemEnd, DuhemSearch
 from hilctl.identify.generalised_duhem.signals import NAMES
-from hilctl.identify.job import FitJob, FoundModel
 from hilctl.models.generalised_duhem import GeneralisedDuhemModel
+from hilctl.models.mechanics import FirstMode
 from hilctl.models.staged import StagedModel
-from hilctl.models.structure import Structure
 
 POINTS = 45  # samples that are left of the fastest cycle; a table has no thresholds to turn on
 
@@ -57,7 +57,7 @@ def _model(job: FitJob, found: DuhemEnd) -> StagedModel:
         losses=known.losses,
         **job.data.common(found.offset_um),
     )
-    structure = Structure(
+    structure = FirstMode(
         natural_hz=0.5 / (math.pi * known.radian_s), damping_ratio=known.damping_ratio
     )
     return StagedModel.around(hysteresis, structure=structure, delay_s=known.delay_s)

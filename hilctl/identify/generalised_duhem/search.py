@@ -12,10 +12,11 @@ import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from hilctl.base.types import F64, I64
-from hilctl.identify.field.prepared import Prepared
-from hilctl.identify.field.rows import chosen
+from hilctl.identify.field.densities import Curve
+from hilctl.identify.field.preprocess import Prepared
+from hilctl.identify.field.sampling import chosen
 from hilctl.identify.field.stages import Physical
-from hilctl.identify.field.weights import Curve
+from hilctl.identify.fit_api import OnProgress
 from hilctl.identify.generalised_duhem.signals import (
     FIRST,
     HIGHEST,
@@ -26,8 +27,7 @@ from hilctl.identify.generalised_duhem.signals import (
     Signals,
 )
 from hilctl.identify.generalised_duhem.tables import STEEPEST, Layout, laid_over, prior
-from hilctl.identify.job import OnProgress
-from hilctl.identify.workers import beside_each_other
+from hilctl.identify.parallel import parallel_map
 from hilctl.kernels.generalised_duhem import duhem_columns
 
 COARSE_WAY, FINE_WAY = 0.03, 0.02  # of the span: furthest way between two points of a path
@@ -225,7 +225,7 @@ class DuhemSearch:
         samples = self._rows.samples
         firsts = np.cumsum([0, *(rows.size for rows in samples[:-1])]).tolist()
         parts = zip(self._signals.paths(x), samples, firsts, strict=True)
-        beside_each_other(lambda part: fill(*part), parts)
+        parallel_map(lambda part: fill(*part), parts)
         return errors
 
 

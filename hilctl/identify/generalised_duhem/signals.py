@@ -5,9 +5,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hilctl.base.types import F64, I64
-from hilctl.identify.field.columns import turning_points
-from hilctl.identify.field.prepared import Latest, Prepared
-from hilctl.identify.field.rows import Motion
+from hilctl.identify.field.densities import Curve
+from hilctl.identify.field.design_matrix import turning_points
+from hilctl.identify.field.preprocess import Latest, Prepared
+from hilctl.identify.field.sampling import Motion
 from hilctl.identify.field.stages import (
     HIGH,
     LOW,
@@ -18,8 +19,7 @@ from hilctl.identify.field.stages import (
     signals,
     stages_of,
 )
-from hilctl.identify.field.weights import Curve
-from hilctl.identify.workers import beside_each_other
+from hilctl.identify.parallel import parallel_map
 
 STAGES = ("field", "output", "decay", "growth", "bend", "excess", "radian", "damping", "delay")
 POWERS = np.arange(1.0, 5.0)
@@ -129,4 +129,4 @@ class Signals:
     def _whole(self, x: F64) -> list[tuple[F64, F64]]:
         known, flux = self.known(x), self.flux(x)
         span = 2.0 * self._data.reach
-        return beside_each_other(lambda run: signals(run, known, flux, span), self._data.runs)
+        return parallel_map(lambda run: signals(run, known, flux, span), self._data.runs)

@@ -9,9 +9,9 @@ import numpy as np
 from scipy.optimize import nnls
 
 from hilctl.base.types import F64
-from hilctl.identify.job import FitJob, FoundModel
+from hilctl.identify.fit_api import FitJob, FoundModel
 from hilctl.identify.searched.search import converged, first_least
-from hilctl.identify.staged.layered import segments
+from hilctl.identify.staged.objective import segments
 from hilctl.models.deadband import DeadbandFunction
 from hilctl.models.integrated import IntegratedModel
 

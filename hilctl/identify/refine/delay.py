@@ -11,7 +11,7 @@ import numpy as np
 
 from hilctl.base.types import F64
 from hilctl.identify.data.records import History
-from hilctl.kernels.residual import residual_columns
+from hilctl.kernels.residual_operator import residual_columns
 from hilctl.models.base import HysteresisModel
 from hilctl.models.refined import ResidualOperator, rest_um
 from hilctl.models.staged import AnyHysteresis, StagedModel

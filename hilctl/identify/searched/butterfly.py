@@ -11,7 +11,7 @@ from scipy.optimize import lsq_linear, minimize
 from hilctl.base.errors import DataError
 from hilctl.base.types import F64
 from hilctl.identify.data.records import SteadyLoop
-from hilctl.identify.job import FitJob, FoundModel
+from hilctl.identify.fit_api import FitJob, FoundModel
 from hilctl.identify.searched.search import first_least
 from hilctl.models.butterfly import ButterflyModel
 from hilctl.models.deadband import DeadbandFunction

@@ -7,7 +7,7 @@ from scipy.linalg import qr
 
 from hilctl.base.types import F64
 from hilctl.identify.fit_data import FitData
-from hilctl.identify.linear import bounded_and_free
+from hilctl.identify.nnls import bounded_and_free
 from hilctl.identify.searched.search import SearchSpace
 from hilctl.identify.settings import FitSettings
 from hilctl.models.plays import PlayModel, PpiModel, RdpiModel, SpiModel

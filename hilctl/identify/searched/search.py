@@ -8,8 +8,8 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from hilctl.base.types import F64
-from hilctl.identify.job import OnProgress, StartOutcome
-from hilctl.identify.linear import Mask
+from hilctl.identify.fit_api import OnProgress, StartOutcome
+from hilctl.identify.nnls import Mask
 from hilctl.models.plays import PlayModel
 
 DRAWS_A_START = 12  # random points looked at for each start that is followed

@@ -5,9 +5,9 @@ import math
 import numpy as np
 
 from hilctl.base.types import F64
-from hilctl.identify.staged.layered import DYNAMIC, Layers
-from hilctl.identify.staged.search import StagedEnd
+from hilctl.identify.staged.objective import DYNAMIC, Layers
 from hilctl.identify.staged.sensitivity import GAMMA_S, GROWTH, LAG_S, SPACING
+from hilctl.identify.staged.staged_search import StagedEnd
 
 DELAY, C_S, Q_S2 = range(SPACING + 2, DYNAMIC)
 RIDGE = 1e-9

@@ -6,12 +6,12 @@ import numpy as np
 
 from hilctl.base.types import F64, CommandUnit
 from hilctl.identify.staged.fit_data import Linear, StagedFitData
-from hilctl.identify.staged.layered import Layers, Point, loop_delay_s
+from hilctl.identify.staged.objective import Layers, Point, loop_delay_s
 from hilctl.models.deadband import DeadbandFunction
 from hilctl.models.integrated import IntegratedModel
+from hilctl.models.mechanics import FirstMode
 from hilctl.models.plays import PlayModel
 from hilctl.models.staged import FieldLag, StagedModel
-from hilctl.models.structure import Structure
 
 HIGHEST_DAMPING = 10.0  # that a Structure takes
 STAGE_PARAMETERS = ("tau_s", "growth_per_unit", "natural_hz", "damping_ratio", "delay_s")
@@ -53,7 +53,7 @@ def staged_model(
     structure = None
     if layers.structure:
         natural_hz, damping = structure_of(point.linear)
-        structure = Structure(natural_hz=natural_hz, damping_ratio=damping)
+        structure = FirstMode(natural_hz=natural_hz, damping_ratio=damping)
     return StagedModel.around(
         integrated_model(data, layers, point, unit),
         lag=lag,

@@ -21,7 +21,7 @@ from hilctl.analysis.catalogue import (
 )
 from hilctl.analysis.report import summarize
 from hilctl.base.errors import InputError
-from hilctl.recording.facts import END_FIGURES, HOLDS_FACT, LABELS_FACT, RECORDINGS
+from hilctl.recording.metadata_keys import END_FIGURES, HOLDS_FACT, LABELS_FACT, RECORDINGS
 from hilctl.recording.reader import read
 
 GOLDEN = Path(__file__).parents[3] / "recordings" / "golden"

@@ -18,7 +18,7 @@ from hilctl.analysis.export_files import NpzFile
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.samples import Samples
 from hilctl.base.segments import Segment
-from hilctl.recording.data import Recording, Ticks
+from hilctl.recording.recording import Recording, Ticks
 
 NAMES = {
     "A": ("wanted_a", "current_a", "measured_a"),

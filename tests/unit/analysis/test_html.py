@@ -3,8 +3,8 @@
 import pytest
 
 from hilctl.analysis import html
+from hilctl.analysis.figure_layout import FigureSpec, Panel
 from hilctl.analysis.html import DEFINITIONS, definitions_of
-from hilctl.analysis.sheet import Panel, Sheet
 
 NASTY = "<b onclick='x'>&\x1b"
 
@@ -25,7 +25,7 @@ def test_no_part_takes_a_text_for_markup():
 
 @pytest.mark.usefixtures("undrawn")
 def test_figures_stand_with_their_captions():
-    text = html.figures([Sheet("a", "what it <shows>", (Panel(lambda axes: None),))])
+    text = html.figures([FigureSpec("a", "what it <shows>", (Panel(lambda axes: None),))])
     assert text.count("<figure") == text.count("</figure>") == 1
     assert 'aria-label="what it &lt;shows&gt;"' in text
     assert "<figcaption>what it &lt;shows&gt;</figcaption>" in text

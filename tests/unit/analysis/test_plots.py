@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from matplotlib.collections import FillBetweenPolyCollection
 
-from hilctl.analysis import canvas, loops, plots
+from hilctl.analysis import loop_plot, plot_style, plots
+from hilctl.analysis.figure_export import svg
+from hilctl.analysis.figure_layout import drawn
 from hilctl.analysis.plots import ErrorSpectrum, error_spectrum, thinned
-from hilctl.analysis.sheet import drawn
-from hilctl.analysis.vector import svg
 from hilctl.base.segments import Segment
-from hilctl.recording.data import Recording, Ticks
+from hilctl.recording.recording import Recording, Ticks
 
 PERIOD = 1000.0
 
@@ -66,7 +66,7 @@ class TestTimeHistory:
         for sheet in (plots.time_history(recording), plots.error(recording)):
             for axes in drawn(sheet).axes:
                 for line in axes.get_lines():
-                    assert line.get_xdata().size <= canvas.MAX_POINTS
+                    assert line.get_xdata().size <= plot_style.MAX_POINTS
 
     def test_spike_stays_visible(self, run) -> None:
         """One odd reading in half a million is drawn."""
@@ -92,7 +92,7 @@ class TestHysteresisLoop:
     @pytest.mark.parametrize("compensated", [True, False])
     def test_peak_hysteresis_is_marked_at_its_height(self, run, compensated: bool) -> None:
         """The mark is 2 B sin(lag) high in both panels, and says its percentage."""
-        figure = drawn(loops.hysteresis_loop(run(compensated=compensated)))
+        figure = drawn(loop_plot.hysteresis_loop(run(compensated=compensated)))
         for axes in figure.axes:
             label = next(name for name in lines(axes) if name.startswith("peak hysteresis"))
             assert label.startswith(f"peak hysteresis {100.0 * np.sin(0.1):.3g} %")
@@ -101,7 +101,7 @@ class TestHysteresisLoop:
 
     def test_compensated_run_is_held_against_its_reference(self, run) -> None:
         """What is left beside is the error over the reference, the loop closed."""
-        right = drawn(loops.hysteresis_loop(run())).axes[1]
+        right = drawn(loop_plot.hysteresis_loop(run())).axes[1]
         x, y = right.get_lines()[0].get_data()
         assert right.get_xlabel() == "reference, µm"
         assert (x[0], y[0]) == (x[-1], y[-1])
@@ -109,7 +109,7 @@ class TestHysteresisLoop:
 
     def test_uncompensated_run_is_held_against_its_command(self, run) -> None:
         """The axis says command and its unit."""
-        axes = drawn(loops.hysteresis_loop(run(compensated=False))).axes[0]
+        axes = drawn(loop_plot.hysteresis_loop(run(compensated=False))).axes[0]
         assert axes.get_xlabel() == "command, A"
 
     def test_each_segment_has_its_loop(self, run) -> None:
@@ -117,7 +117,7 @@ class TestHysteresisLoop:
         recording = run(cycles=9)
         ends = [(3000 * k, 3000 * k + 3000) for k in range(4)]
         parts = [Segment(f"part {k}", *ends[k], *ends[k], PERIOD) for k in range(4)]
-        figure = drawn(loops.hysteresis_loop(replace(recording, segments=tuple(parts))))
+        figure = drawn(loop_plot.hysteresis_loop(replace(recording, segments=tuple(parts))))
         axes = figure.axes[0]
         shown = {text.get_text() for text in figure.legends[0].get_texts()}
         assert {"part 0", "part 1", "part 2"} <= shown
@@ -128,7 +128,7 @@ class TestHysteresisLoop:
         """Without a period there is a path and no mark."""
         recording = run()
         once = replace(recording.segments[0], period=0.0)
-        axes = drawn(loops.hysteresis_loop(replace(recording, segments=(once,)))).axes[0]
+        axes = drawn(loop_plot.hysteresis_loop(replace(recording, segments=(once,)))).axes[0]
         assert axes.get_lines()[0].get_xdata().size == 4000
         assert not any(name.startswith("peak") for name in lines(axes))
         assert "not averaged" in axes.get_title("left")
@@ -136,9 +136,9 @@ class TestHysteresisLoop:
     def test_nothing_steady_draws_nothing(self, run) -> None:
         """A run cut short before its first whole cycle has no loop."""
         recording = run()
-        assert loops.hysteresis_loop(replace(recording, segments=())) is None
+        assert loop_plot.hysteresis_loop(replace(recording, segments=())) is None
         short = replace(recording, samples=recording.samples.part(0, 700))
-        assert loops.hysteresis_loop(short) is None
+        assert loop_plot.hysteresis_loop(short) is None
 
 
 class TestError:
@@ -195,7 +195,7 @@ def test_every_figure_can_be_drawn(run) -> None:
     sheets = [
         plots.time_history(recording),
         plots.steady_cycles(recording),
-        loops.hysteresis_loop(recording),
+        loop_plot.hysteresis_loop(recording),
         plots.error(recording),
         plots.spectrum(recording),
         plots.lateness(recording),
@@ -225,7 +225,7 @@ def test_a_run_out_of_real_time_has_no_lateness(run) -> None:
 def test_pieces_cover_a_run_without_overlap(run) -> None:
     """Segments, what lies between them and the safe ramp: every sample in one piece."""
     parts = (Segment("b", 2000, 3000, 2000, 3000, 10.0), Segment("a", 500, 1500, 500, 1500, 20.0))
-    found = canvas.pieces(replace(run(), segments=parts))
+    found = plot_style.pieces(replace(run(), segments=parts))
     assert found == [
         (0, 500, 0.0),
         (500, 1500, 20.0),

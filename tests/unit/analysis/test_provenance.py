@@ -8,8 +8,8 @@ import pytest
 
 from hilctl.analysis.provenance import model_error, provenance_rows
 from hilctl.base.segments import Segment
-from hilctl.models.files import load_model
-from hilctl.recording.facts import OVERRIDES_FACT
+from hilctl.models.model_file import load_model
+from hilctl.recording.metadata_keys import OVERRIDES_FACT
 
 MODEL = Path(__file__).parents[3] / "configs" / "models" / "terfenol_omega.yaml"
 RUN = {

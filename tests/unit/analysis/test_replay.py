@@ -11,9 +11,9 @@ from hilctl.analysis.replay import replay
 from hilctl.base.errors import DataError
 from hilctl.base.samples import Flag
 from hilctl.loop.compensator import Compensator
-from hilctl.models.files import load_model
+from hilctl.models.model_file import load_model
 from hilctl.recording import reader
-from hilctl.recording.reader import Pieces, read
+from hilctl.recording.reader import RecordingStream, read
 from hilctl.recording.recover import recover_recording
 
 ROOT = Path(__file__).parents[3]
@@ -158,8 +158,8 @@ def test_a_damaged_file_in_pieces(tmp_path, monkeypatch):
     path.write_bytes(data)
     whole = replay(read(path))
     monkeypatch.setattr(reader, "PIECE_SAMPLES", 1)
-    assert len(list(Pieces(path))) > 3
-    assert replay(Pieces(path)) == whole
+    assert len(list(RecordingStream(path))) > 3
+    assert replay(RecordingStream(path)) == whole
 
 
 def test_samples_without_the_inverse_need_the_event_that_says_so():

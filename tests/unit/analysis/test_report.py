@@ -8,18 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilctl.analysis.figures import RunReport
 from hilctl.analysis.report import summarize, worst_segment
-from hilctl.analysis.table import run_rows
+from hilctl.analysis.report_table import run_rows
+from hilctl.analysis.run_metrics import RunReport
 from hilctl.base.errors import DataError
 from hilctl.base.events import ADAPTED, MARK, TUNED, Event
 from hilctl.base.samples import Flag
 from hilctl.base.segments import Segment
 from hilctl.base.types import F64
 from hilctl.recording import reader
-from hilctl.recording.data import Recording, Ticks
-from hilctl.recording.reader import Pieces, read
-from hilctl.recording.stretch import Stretch
+from hilctl.recording.reader import RecordingStream, read
+from hilctl.recording.recording import Recording, Ticks
+from hilctl.recording.time_range import TimeRange
 
 RATE_HZ = 50_000.0
 LAG = 0.05
@@ -385,15 +385,15 @@ def _others(mapping: dict) -> dict:
 
 @pytest.mark.parametrize("path", GOLDEN, ids=lambda path: path.stem)
 @pytest.mark.parametrize("size", [1, 1500, None])
-@pytest.mark.parametrize("stretch", [None, Stretch(0.02, 0.06), Stretch(0.03, None)])
+@pytest.mark.parametrize("stretch", [None, TimeRange(0.02, 0.06), TimeRange(0.03, None)])
 def test_a_report_in_pieces_is_that_of_the_whole(monkeypatch, path, size, stretch):
     """Of one piece to the last bit; of many to the rounding of sums."""
     expected = summarize(read(path, stretch))
     if size is None:
-        assert summarize(Pieces(path, stretch)) == expected
+        assert summarize(RecordingStream(path, stretch)) == expected
         return
     monkeypatch.setattr(reader, "PIECE_SAMPLES", size)
-    near(summarize(Pieces(path, stretch)), expected)
+    near(summarize(RecordingStream(path, stretch)), expected)
 
 
 class Counted:

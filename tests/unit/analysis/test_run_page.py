@@ -13,7 +13,7 @@ from hilctl.analysis.run_page import headline, page, write_html
 from hilctl.base.errors import InputError
 from hilctl.base.events import Event
 from hilctl.base.segments import Segment
-from hilctl.recording.data import Recording
+from hilctl.recording.recording import Recording
 
 NASTY = """<script>alert("x")</script>&amp;<img src=x onerror='y'>"""
 

@@ -56,8 +56,8 @@ def test_frames_of_no_time_are_refused(run, times):
 
 def test_frames_are_those_of_the_run(run, monkeypatch):
     """Subscribed with what is asked for, on this machine's time."""
-    monkeypatch.setattr("hilctl.desk.feed.RunFeed", lambda folder: folder.card.name)
-    monkeypatch.setattr("hilctl.desk.frames.frames_of", lambda *given: iter([given]))
+    monkeypatch.setattr("hilctl.live.run_reader.RunReader", lambda folder: folder.card.name)
+    monkeypatch.setattr("hilctl.live.frame_codec.frames_of", lambda *given: iter([given]))
     ((feed, every_s, window_s, clock, sleep),) = run.frames(0.2, 2.0)
     assert (feed, every_s, window_s) == ("sine-7", 0.2, 2.0)
     assert (clock, sleep) == (time.monotonic, time.sleep)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hilctl import api
-from hilctl.models.files import load_model
+from hilctl.models.model_file import load_model
 from hilctl.models.plays import PpiModel
 
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from tests.unit.api.test_running import SHORT, SINE
 
 from hilctl import api
 from hilctl.base.errors import DataError, InputError
-from tests.unit.api.test_running import SHORT, SINE
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +77,7 @@ def test_what_is_no_recording_is_refused(tmp_path):
 def test_figures_of_one_recording_are_those_of_its_page(file, tmp_path, monkeypatch):
     pages, seen = [], {}
     monkeypatch.setattr("hilctl.analysis.html.figures", lambda sheets: pages.extend(sheets) or "")
-    monkeypatch.setattr("hilctl.series.sheets.drawn", lambda sheet, width: Figure())
+    monkeypatch.setattr("hilctl.studies.multi_run.plots.drawn", lambda sheet, width: Figure())
     page = tmp_path / "page.html"
     assert api.report_page(file, page) == api.summarize(file)
     figures = api.figures(file, tmp_path / "one", formats="svg", on_written=seen.__setitem__)

@@ -3,16 +3,19 @@
 import pytest
 
 from hilctl.base import errors
-from hilctl.base.errors import ConfigError, DeviceError, HilctlError, InputError, Problem
+from hilctl.base.errors import ConfigError, ConfigProblem, DeviceError, HilctlError, InputError
 
 
 @pytest.mark.parametrize(
     ("problem", "text"),
     [
-        (Problem("a.yaml:3", "limits.slew", "must be > 0"), "a.yaml:3: limits.slew: must be > 0"),
-        (Problem("a.yaml", "", "is empty"), "a.yaml: is empty"),
         (
-            Problem("a.yaml:3", "x", "must be > 0", "-1", "in A"),
+            ConfigProblem("a.yaml:3", "limits.slew", "must be > 0"),
+            "a.yaml:3: limits.slew: must be > 0",
+        ),
+        (ConfigProblem("a.yaml", "", "is empty"), "a.yaml: is empty"),
+        (
+            ConfigProblem("a.yaml:3", "x", "must be > 0", "-1", "in A"),
             "a.yaml:3: x: must be > 0, got -1 (in A)",
         ),
     ],
@@ -23,7 +26,7 @@ def test_a_problem_has_place_key_rule_value_and_hint(problem, text):
 
 def test_all_problems_of_a_file_are_one_error():
     """One line each, in order, from any iterable, and still there for programs."""
-    problems = [Problem("a", "x", "one"), Problem("b", "y", "two")]
+    problems = [ConfigProblem("a", "x", "one"), ConfigProblem("b", "y", "two")]
     error = ConfigError(iter(problems))
     assert str(error) == "a: x: one\nb: y: two"
     assert error.problems == tuple(problems)

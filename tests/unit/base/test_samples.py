@@ -4,16 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from hilctl.base.samples import ANSWERS, COLUMNS, RECORDED_FIELDS, Batch, Head, Samples
+from hilctl.base.samples import ANSWERS, COLUMNS, RECORDED_FIELDS, BlockBatch, BlockHeader, Samples
 
 BLOCK = 5
 
 
-def batch(blocks: int) -> Batch:
+def batch(blocks: int) -> BlockBatch:
     """Return blocks of random numbers that follow one another."""
-    made = Batch.empty(blocks, BLOCK, 1)
+    made = BlockBatch.empty(blocks, BLOCK, 1)
     rng = np.random.default_rng(1)
-    made.heads[:, Head.FIRST_SAMPLE] = 100 + BLOCK * np.arange(blocks)
+    made.heads[:, BlockHeader.FIRST_SAMPLE] = 100 + BLOCK * np.arange(blocks)
     made.columns[:] = rng.normal(size=made.columns.shape)
     made.flags[:] = rng.integers(0, 1000, made.flags.shape)
     return made

@@ -3,10 +3,10 @@
 import pytest
 from pydantic import ValidationError
 
-from hilctl.base.strict import Strict
+from hilctl.base.strict import StrictModel
 
 
-class Gain(Strict):
+class Gain(StrictModel):
     gain: float
     plays: int = 1
 

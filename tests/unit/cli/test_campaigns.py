@@ -5,13 +5,9 @@ import json
 import numpy as np
 import pytest
 import typer
+from tests.unit.campaign.conftest import CAMPAIGN, EXPERIMENT
 
 from hilctl.base.errors import ConfigError, InputError
-from hilctl.campaign import session
-from hilctl.campaign.plan import planned
-from hilctl.campaign.session import SeriesResult
-from hilctl.campaign.steps import SeriesStep, load_campaign
-from hilctl.campaign.table import SeriesRow
 from hilctl.cli import campaigns
 from hilctl.cli.campaigns import (
     campaign,
@@ -24,9 +20,13 @@ from hilctl.cli.campaigns import (
     sweep_document,
 )
 from hilctl.experiment.correction import Correction, LearnedCycle
-from hilctl.learning.results import Learned, Row
-from hilctl.series.run_figures import RunFigures
-from tests.unit.campaign.conftest import CAMPAIGN, EXPERIMENT
+from hilctl.ilc.results import IlcResult, IlcRow
+from hilctl.studies.campaign import campaign_runner
+from hilctl.studies.campaign.campaign_runner import CampaignResult
+from hilctl.studies.campaign.plan import planned
+from hilctl.studies.campaign.steps import CampaignStep, load_campaign
+from hilctl.studies.campaign.table import CampaignRow
+from hilctl.studies.multi_run.run_figures import RunFigures
 
 pytestmark = pytest.mark.usefixtures("undrawn")
 
@@ -85,7 +85,7 @@ def test_fault_has_exit_code_3(file, capsys):
 
 def test_stop_has_the_exit_code_of_its_signal(file, capsys, monkeypatch):
     def stopped(plan, host):
-        return session.SeriesResult(plan, {}, (), "step 1: Ctrl-C", 2)
+        return campaign_runner.CampaignResult(plan, {}, (), "step 1: Ctrl-C", 2)
 
     monkeypatch.setattr("hilctl.api.campaigns.run_series", stopped)
     with pytest.raises(typer.Exit) as ended:
@@ -161,10 +161,10 @@ def test_plan_lists_each_step(tmp_path, capsys):
 
 
 def test_row_prints_metrics_or_fault(capsys):
-    step = SeriesStep(7, {"waveform.amplitude": 2.5}, 1, False, ())
+    step = CampaignStep(7, {"waveform.amplitude": 2.5}, 1, False, ())
     figures = RunFigures(peak_to_peak_um=12.345, natural_hz=300.0)
-    print_row(step, SeriesRow("completed", figures, "a.mcap", "completed", kept=True))
-    print_row(step, SeriesRow("fault: late", code="fault"))
+    print_row(step, CampaignRow("completed", figures, "a.mcap", "completed", kept=True))
+    print_row(step, CampaignRow("fault: late", code="fault"))
     first, second = capsys.readouterr().out.splitlines()
     assert first == "   7  waveform.amplitude=2.5  done earlier  12.35 µm  resonance 300 Hz"
     assert second == "   7  waveform.amplitude=2.5  fault: late"
@@ -173,14 +173,14 @@ def test_row_prints_metrics_or_fault(capsys):
 def test_result_prints_the_drift(tmp_path, capsys):
     found = plan(tmp_path)
     figures = RunFigures(peak_to_peak_um=10.0)
-    row = SeriesRow("completed", figures, "a.mcap", "completed")
-    print_result(SeriesResult(found, {1: row, 6: row}, (tmp_path / "few.csv",)))
+    row = CampaignRow("completed", figures, "a.mcap", "completed")
+    print_result(CampaignResult(found, {1: row, 6: row}, (tmp_path / "few.csv",)))
     shown = capsys.readouterr().out
     assert "few: 2 completed, 4 planned" in shown
     assert "drift over 2 reference runs: +0 % in peak-to-peak" in shown
 
 
-ROW = Row(
+ROW = IlcRow(
     run=1, label="sine", error_percent=0.5, rms_percent=0.2, floor_percent=0.05, cycles=16,
     reach_hz=800.0, delay_samples=2.5, natural_hz=None, recording="run-01.mcap",
 )  # fmt: skip
@@ -210,9 +210,9 @@ def taught(monkeypatch, tmp_path):
 
             def learn(self, cycles, on_rows):
                 on_rows([ROW])
-                return Learned(CORRECTION, (ROW,), (), "the noise floor is reached", **how)
+                return IlcResult(CORRECTION, (ROW,), (), "the noise floor is reached", **how)
 
-        monkeypatch.setattr("hilctl.api.campaigns.Session", Done)
+        monkeypatch.setattr("hilctl.api.campaigns.IlcSession", Done)
 
     return ends
 

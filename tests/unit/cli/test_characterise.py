@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 import typer
+from tests.unit.characterise.conftest import experiment, limits, limits_with
+from tests.unit.characterise.test_results import FOUND, identification
 
 from hilctl.base.errors import InputError, RunError
-from hilctl.characterise.results import Characterisation, StepRow
-from hilctl.characterise.session import CampaignPlan
 from hilctl.cli.characterise import (
     characterise,
     plan_mapping,
@@ -18,8 +18,8 @@ from hilctl.cli.characterise import (
     print_step,
 )
 from hilctl.run.start import StepStoppedError, paced, unpaced
-from tests.unit.characterise.conftest import experiment, limits, limits_with
-from tests.unit.characterise.test_results import FOUND, identification
+from hilctl.studies.characterise.characterisation_runner import CharacterisationPlan
+from hilctl.studies.characterise.results import Characterisation, StepRow
 
 __all__ = ["experiment", "limits", "limits_with"]
 
@@ -34,7 +34,7 @@ def ends(monkeypatch, limits):
     asked["is_model"] = True
 
     class Done:
-        plan = CampaignPlan(limits, FOUND.steps, 3.0, 5000.0)
+        plan = CharacterisationPlan(limits, FOUND.steps, 3.0, 5000.0)
 
         def __init__(self, experiment, settings, folder, highest_hz, host):
             asked.update(folder=folder, highest_hz=highest_hz, run=host.run)
@@ -48,7 +48,7 @@ def ends(monkeypatch, limits):
                 raise asked["error"]
             return asked["found"]
 
-    monkeypatch.setattr("hilctl.api.campaigns.Campaign", Done)
+    monkeypatch.setattr("hilctl.api.campaigns.CharacterisationRunner", Done)
     return asked
 
 
@@ -154,12 +154,12 @@ def test_model_must_not_have_the_name_of_its_page(ends, tmp_path):
 def test_plan_prints_cooling_with_a_thermal_limit(limits_with, capsys):
     budget = limits_with("limits.rms_current_a=1.0", "limits.thermal_time_constant_s=9.0")
     for kept_to, text in ((limits_with(), "no thermal limit"), (budget, "7 s for the coil")):
-        print_plan(CampaignPlan(kept_to, FOUND.steps, 7.0, 5000.0), Path("runs"))
+        print_plan(CharacterisationPlan(kept_to, FOUND.steps, 7.0, 5000.0), Path("runs"))
         assert text in capsys.readouterr().out
 
 
 def test_plan_mapping(limits):
-    mapping = plan_mapping(CampaignPlan(limits, FOUND.steps, 7.0, 5000.0))
+    mapping = plan_mapping(CharacterisationPlan(limits, FOUND.steps, 7.0, 5000.0))
     assert mapping["band_hz"] == [0.5, 80.0]
     assert mapping["steps"] == [{"name": "rest", "purpose": "noise", "seconds": 2.0}]
 

@@ -17,14 +17,9 @@ from hilctl.cli.devices import (
     print_probed,
     render_diagnosis,
 )
-from hilctl.experiment.inventory import (
-    Described,
-    DeviceOption,
-    Inventory,
-    SerialPort,
-)
+from hilctl.experiment.inventory import DeviceDescription, DeviceOption, Inventory, SerialPort
 from hilctl.machine.diagnosis import Diagnosis
-from hilctl.machine.latency import Latency
+from hilctl.machine.timer_latency import Latency
 from hilctl.run.probe import Probed
 
 DEMO = Path(__file__).parents[3] / "configs" / "demo.yaml"
@@ -96,7 +91,7 @@ def test_serial_ports_are_listed(capsys):
 def test_profile_is_printed_without_markup(capsys):
     channel = {"min": 0.0, "max": 5.0, "unit": "V"}
     profile = {"model": "[T7]", "outputs": {"DAC0": channel}, "notes": ("one\nnote", "another")}
-    print_described(Described("t7", "t7.yaml", (), profile))
+    print_described(DeviceDescription("t7", "t7.yaml", (), profile))
     shown = capsys.readouterr().out
     for text in ("t7: t7.yaml", "model: [T7]", "0.0 to 5.0 V", "notes: one note", "notes: another"):
         assert text in shown
@@ -104,7 +99,7 @@ def test_profile_is_printed_without_markup(capsys):
 
 def test_required_options_are_marked(capsys):
     options = (DeviceOption("host", None, "where it is"), DeviceOption("port", "502", "its port"))
-    print_described(Described("dac", "a:B", options, {}))
+    print_described(DeviceDescription("dac", "a:B", options, {}))
     shown = capsys.readouterr().out
     assert "host  required" in shown
     assert "502" in shown

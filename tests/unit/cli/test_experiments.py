@@ -48,7 +48,7 @@ def runs(tmp_path, monkeypatch):
         seen.append((experiment.name, settings))
         return RunResult(path, ends["code"], "because", "confirmed", ends["stop_signal"], 0, 0, 0)
 
-    monkeypatch.setattr("hilctl.api.running.start_run", start_run)
+    monkeypatch.setattr("hilctl.api.runs.start_run", start_run)
 
     def write(contents, summary, page, before):
         page.write_text(f"{summary.name}{' beside the one before' if before else ''}")

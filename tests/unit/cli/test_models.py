@@ -19,7 +19,7 @@ from hilctl.cli.models import (
 )
 from hilctl.comparison.compare import ComparisonRequest, compare
 from hilctl.identify.settings import IdentifySettings
-from hilctl.models.files import dump_model, load_model
+from hilctl.models.model_file import dump_model, load_model
 from tests.fakes import SteppingClock
 from tests.unit.identify.refine.conftest import OLD, actuator, history
 
@@ -34,7 +34,7 @@ def test_every_setting_is_listed(capsys: pytest.CaptureFixture[str]) -> None:
 def given(monkeypatch, tmp_path, truth):
     """Replace the runs to load; return model file, paths and output."""
     runs = [history(truth, i, noise_um=0.05) for i in range(4)]
-    monkeypatch.setattr("hilctl.identify.refine.command.load_runs", lambda paths, model: runs)
+    monkeypatch.setattr("hilctl.identify.refine.refinement.load_runs", lambda paths, model: runs)
     (tmp_path / "old.yaml").write_text(dump_model(OLD))
     return tmp_path / "old.yaml", [Path(f"{i}.mcap") for i in range(4)], tmp_path / "better.yaml"
 

@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 import typer
 from rich.console import Console
+from tests.unit.series.conftest import grown
 
 from hilctl.analysis import html
 from hilctl.analysis import replay as replaying
-from hilctl.analysis.figures import RunReport
 from hilctl.analysis.replay import ReplayResult
 from hilctl.analysis.report import summarize
+from hilctl.analysis.run_metrics import RunReport
 from hilctl.base.errors import InputError
 from hilctl.base.segments import Segment
 from hilctl.base.types import F64
@@ -23,8 +24,7 @@ from hilctl.cli.commands import load
 from hilctl.cli.console import print_rich
 from hilctl.cli.recordings import export, recover
 from hilctl.cli.reports import figures, print_replay, render_report, render_series, replay, report
-from hilctl.series.collect import RunSeries
-from tests.unit.series.conftest import grown
+from hilctl.studies.multi_run.collect import RunSeries
 
 UNCOMPENSATED = Path(__file__).parents[3] / "recordings" / "golden" / "terfenol_uncompensated.mcap"
 

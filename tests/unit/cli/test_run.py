@@ -29,7 +29,7 @@ def ended(monkeypatch):
             started.append((experiment, settings, output, overwrite))
             return RunResult(Path("no.mcap"), code, "because", "confirmed", stop_signal, 0, 0, 0)
 
-        monkeypatch.setattr("hilctl.api.running.start_run", start_run)
+        monkeypatch.setattr("hilctl.api.runs.start_run", start_run)
         monkeypatch.setattr("hilctl.cli.run.report_of", lambda result, *, every: None)
         return started
 

@@ -17,8 +17,8 @@ from hilctl.base.events import Event
 from hilctl.cli import watch as module
 from hilctl.cli.console import print_rich
 from hilctl.cli.watch import View, print_lines
-from hilctl.desk.scope import WINDOWS_S, Buckets, Window
-from hilctl.desk.signals import SIGNALS
+from hilctl.live.scope import WINDOWS_S, Buckets, ScopeWindow
+from hilctl.live.signals import SIGNALS
 
 
 class FakeFeed:
@@ -36,7 +36,7 @@ class FakeFeed:
         self.events = [Event(1000 * k, "info", "mark", f"tap {k}") for k in range(5)]
         t_s = np.linspace(0.0, 0.02, 300)
         values = np.tile(40.0 * np.sin(628.0 * t_s), (len(SIGNALS), 1))
-        window = Window(t_s, Buckets(values, values, values))
+        window = ScopeWindow(t_s, Buckets(values, values, values))
         self.scope = SimpleNamespace(
             triggered=lambda: window, rolling=lambda s: window, loops=lambda: values[:2]
         )
@@ -200,7 +200,7 @@ def test_the_screen_has_state_limits_figures_and_the_newest_events(capsys):
 def test_empty_signal_has_no_curve(capsys):
     feed = FakeFeed()
     nothing = np.full((len(SIGNALS), 3), np.nan)
-    empty = Window(np.arange(3.0), Buckets(nothing, nothing, nothing))
+    empty = ScopeWindow(np.arange(3.0), Buckets(nothing, nothing, nothing))
     feed.scope.triggered, feed.scope.loops = lambda: empty, lambda: np.empty((2, 0))
     assert not any(0x2800 < ord(each) < 0x2900 for each in shown(View(feed), capsys))
 
@@ -209,7 +209,7 @@ def test_a_missing_reference_does_not_change_the_scale(capsys):
     feed = FakeFeed()
     values = np.full((len(SIGNALS), 3), np.nan)
     values[1] = 100.0, 110.0, 120.0
-    window = Window(np.arange(3.0), Buckets(values, values, values))
+    window = ScopeWindow(np.arange(3.0), Buckets(values, values, values))
     feed.scope.triggered, feed.scope.loops = lambda: window, lambda: np.empty((2, 0))
     text = shown(View(feed), capsys)
     assert "120┤" in text

@@ -9,9 +9,9 @@ import pytest
 from hilctl.base.errors import InputError
 from hilctl.cli.models import notes
 from hilctl.comparison.compare import COMPARED, ComparisonRequest, compare, save_models
-from hilctl.comparison.page import comparison_page
-from hilctl.identify.catalogue import CATALOGUE, entry
-from hilctl.models.files import load_model
+from hilctl.comparison.comparison_page import comparison_page
+from hilctl.identify.registry import CATALOGUE, entry
+from hilctl.models.model_file import load_model
 from hilctl.recording.reader import read
 from tests.fakes import SteppingClock
 

@@ -10,9 +10,10 @@ import yaml
 
 from hilctl.base.errors import ConfigError, InputError
 from hilctl.base.yaml import dump
-from hilctl_drivers.board.profile import FrameProfile
-from hilctl_drivers.modbus.channels import EnsureStep, RegisterStep
-from hilctl_drivers.modbus.profile import ModbusProfile
+from hilctl_drivers.ascii.ascii_profile import AsciiProfile
+from hilctl_drivers.board.board_profile import FrameProfile
+from hilctl_drivers.modbus.modbus_profile import ModbusProfile
+from hilctl_drivers.modbus.register_map import EnsureStep, RegisterStep
 from hilctl_drivers.profile import (
     FOLDER,
     load_profile,
@@ -21,7 +22,6 @@ from hilctl_drivers.profile import (
     shipped_profiles,
     with_link,
 )
-from hilctl_drivers.text.profile import AsciiProfile
 
 MODBUS = """\
 vendor: Acme

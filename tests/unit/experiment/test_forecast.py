@@ -11,8 +11,8 @@ from hilctl.base.device import DeviceInfo, DeviceOptions
 from hilctl.base.errors import ConfigError
 from hilctl.base.types import F64
 from hilctl.base.yaml import Document
-from hilctl.experiment.check import Checked, check
 from hilctl.experiment.load import LoadedExperiment, resolve
+from hilctl.experiment.preflight import CheckedExperiment, check
 from hilctl.models.base import HysteresisModel
 from hilctl.models.staged import FieldLag, StagedModel
 from tests.published import terfenol_rdpi
@@ -99,7 +99,7 @@ def loaded(
     return replace(made, config=config, device=device, model=model)
 
 
-def checked(text: str, *settings: str, **given: Any) -> Checked:
+def checked(text: str, *settings: str, **given: Any) -> CheckedExperiment:
     return check(loaded(text, *settings, **given))
 
 
@@ -151,7 +151,7 @@ class TestForecast:
         """However the reference is cut, the forecast is the same, bit for bit."""
         model = terfenol_rdpi()
         whole = checked(DISPLACEMENT, model=model).forecast
-        monkeypatch.setattr("hilctl.experiment.whole_run.CHUNK", chunk)
+        monkeypatch.setattr("hilctl.experiment.command_simulation.CHUNK", chunk)
         assert checked(DISPLACEMENT, model=model).forecast == whole
 
     def test_longer_than_a_chunk(self, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -159,7 +159,7 @@ class TestForecast:
         settings = ("waveform.duration_s=120.0", "waveform.frequency_hz=0.37")
         forecast = checked(DISPLACEMENT, *settings, model=terfenol_rdpi()).forecast
         assert forecast.samples == 1_200_000
-        monkeypatch.setattr("hilctl.experiment.whole_run.CHUNK", 2_000_000)
+        monkeypatch.setattr("hilctl.experiment.command_simulation.CHUNK", 2_000_000)
         assert checked(DISPLACEMENT, *settings, model=terfenol_rdpi()).forecast == forecast
 
     def test_what_is_fed_ahead_is_what_is_forecast(self) -> None:

@@ -10,13 +10,13 @@ import pytest
 
 from hilctl.base.errors import ConfigError
 from hilctl.base.yaml import Document
-from hilctl.experiment.check import check
+from hilctl.experiment.coil_heat import CoilHeat
 from hilctl.experiment.device_state import CoilState, DeviceState, write_device_state
-from hilctl.experiment.heat import CoilHeat
 from hilctl.experiment.history import heat_after, heat_before, left_by_last_run
 from hilctl.experiment.load import resolve
-from hilctl.models.files import dump_model
-from hilctl.recording.facts import HEAT_FACT
+from hilctl.experiment.preflight import check
+from hilctl.models.model_file import dump_model
+from hilctl.recording.metadata_keys import HEAT_FACT
 from tests.unit.experiment.test_initial_state import COMMAND, OMEGA, record
 
 HOLDS = ("tcp:10.0.0.5:502",)

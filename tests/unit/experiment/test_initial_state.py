@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from hilctl.base.errors import DataError
-from hilctl.base.samples import COLUMNS, Batch, Flag, Head
+from hilctl.base.samples import COLUMNS, BlockBatch, BlockHeader, Flag
 from hilctl.experiment.initial_state import InitialState, initial_state_after, left_by
-from hilctl.models.creep import Creep
+from hilctl.models.creep import CreepModel
 from hilctl.models.integrated import exponential_integrated
 from hilctl.models.staged import FieldLag, StagedModel
-from hilctl.recording.messages import RecordingLayout
+from hilctl.recording.encoder import RecordingLayout
 from hilctl.recording.writer import RecordingWriter, RunFacts
 from tests.published import piezo_ppi
 
@@ -26,7 +26,7 @@ STAGED = StagedModel.around(
     OMEGA, lag=FieldLag(tau_s=2e-4, growth_per_unit=0.2), delay_s=2.0 / RATE_HZ
 )
 CREEPING = STAGED.model_copy(
-    update={"creep": Creep(time_constants_s=(0.3, 20.0), shares=(0.03, 0.05))}
+    update={"creep": CreepModel(time_constants_s=(0.3, 20.0), shares=(0.03, 0.05))}
 )
 NOW_S = datetime.fromisoformat("2026-01-01T00:01:00+00:00").timestamp()
 COMMAND = 4.0 * np.sin(np.pi * np.arange(1000) / 999.0)
@@ -35,10 +35,10 @@ COMMAND = 4.0 * np.sin(np.pi * np.arange(1000) / 999.0)
 def record(path: Path, command, *, first=0, whole=True, flags=0, facts=None, end=None) -> Path:
     """Write a run of these commands, of which the compensator knew nothing."""
     blocks = command.size // BLOCK
-    batch = Batch.empty(blocks, BLOCK, 1)
-    batch.heads[:, Head.FIRST_SAMPLE] = first + BLOCK * np.arange(blocks)
-    batch.heads[:, Head.SAMPLES] = BLOCK
-    batch.heads[0, Head.DROPPED_BEFORE] = first
+    batch = BlockBatch.empty(blocks, BLOCK, 1)
+    batch.heads[:, BlockHeader.FIRST_SAMPLE] = first + BLOCK * np.arange(blocks)
+    batch.heads[:, BlockHeader.SAMPLES] = BLOCK
+    batch.heads[0, BlockHeader.DROPPED_BEFORE] = first
     batch.columns[:, list(COLUMNS).index("command")] = command.reshape(blocks, BLOCK)
     batch.flags[-1, -1] = flags
     run = RunFacts(

@@ -9,9 +9,9 @@ import pytest
 
 from hilctl.base.errors import ConfigError
 from hilctl.base.yaml import Document
-from hilctl.experiment.check import check
 from hilctl.experiment.interlocks import interlock_context
 from hilctl.experiment.load import resolve
+from hilctl.experiment.preflight import check
 from hilctl.loop.interlocks import Interlocks, InterlockSettings
 from tests.published import terfenol_rdpi
 
@@ -214,7 +214,7 @@ class TestHeatForecast:
     @pytest.mark.parametrize("chunk", [1, 700, 4000, 1_000_000])
     def test_refused_with_when_and_by_how_much(self, monkeypatch, chunk):
         """A waveform whose budget would trip is refused, however it is cut into chunks."""
-        monkeypatch.setattr("hilctl.experiment.whole_run.CHUNK", chunk)
+        monkeypatch.setattr("hilctl.experiment.command_simulation.CHUNK", chunk)
         assert refusals(CURRENT, *BUDGET) == [
             "x.yaml: limits.rms_current_a: the coil must stay within 4 A rms over 1.5 s, got "
             "4.105 A (0.105 A too much, and the budget is used up after 3.23 s: lower the "

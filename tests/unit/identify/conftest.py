@@ -14,7 +14,7 @@ from hilctl.identify.data.records import SteadyLoop
 from hilctl.identify.fit_data import FitData
 from hilctl.models.base import HysteresisModel
 from hilctl.models.plays import PlayModel
-from hilctl.recording.data import Recording, Ticks
+from hilctl.recording.recording import Recording, Ticks
 
 RATE_HZ = 50_000.0
 

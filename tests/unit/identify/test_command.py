@@ -15,12 +15,12 @@ from hilctl.cli.models import print_identification
 from hilctl.identify import command as subject
 from hilctl.identify.command import TURNS, identify_files, settings_from, with_modes
 from hilctl.identify.data.records import History, SteadyLoop
-from hilctl.identify.modes import WORTH
-from hilctl.identify.page import write_identification
+from hilctl.identify.model_page import write_identification
+from hilctl.identify.resonances import WORTH
 from hilctl.identify.settings import FitSettings, IdentifySettings
-from hilctl.models.files import load_model
+from hilctl.models.mechanics import FirstMode, FurtherMode
+from hilctl.models.model_file import load_model
 from hilctl.models.plays import PpiModel
-from hilctl.models.structure import Mode, Structure
 
 STAGE = PpiModel(input_unit="V", direct=1.0, weights=(0.6, 0.3, 0.2), thresholds=(0.3, 0.7, 1.2))
 
@@ -119,10 +119,10 @@ def test_histories_import_neither_plots_nor_statistics(tables: list[Path]) -> No
 
 
 FIELD = FitSettings(kind="field")
-MODE = Mode(
+MODE = FurtherMode(
     natural_hz=600.0, damping_ratio=0.03, antiresonance_hz=630.0, antiresonance_damping_ratio=0.03
 )
-FIRST = Structure(natural_hz=2000.0, damping_ratio=0.1)
+FIRST = FirstMode(natural_hz=2000.0, damping_ratio=0.1)
 TIME = np.arange(200) / 200
 RECORD = History("h", np.sin(6.3 * TIME), np.sin(6.3 * TIME), 1000.0)
 
@@ -134,7 +134,7 @@ class Found:
     rms_percent: float
     held_out_percent: float | None = None
     modes: tuple = ()
-    first: Structure | None = FIRST
+    first: FirstMode | None = FIRST
     settings: FitSettings = FIELD
 
     @property
@@ -170,7 +170,7 @@ def asked(monkeypatch):
 
 
 def test_modes_are_kept_for_as_long_as_data_held_out_are_the_better(asked):
-    stiffer = Structure(natural_hz=2200.0, damping_ratio=0.1)
+    stiffer = FirstMode(natural_hz=2200.0, damping_ratio=0.1)
     found = with_modes(
         [RECORD],
         identifying(Found(1.0, 1.0), Found(0.9, 0.5, first=stiffer), Found(0.1, 0.46)),

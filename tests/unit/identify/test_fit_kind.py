@@ -9,10 +9,10 @@ from hilctl.base.errors import DataError
 from hilctl.identify.data.records import History
 from hilctl.identify.fit_kind import fit_kind
 from hilctl.identify.settings import FitSettings
-from hilctl.models.creep import Creep
+from hilctl.models.creep import CreepModel
 from hilctl.models.integrated import exponential_integrated
+from hilctl.models.mechanics import FurtherMode
 from hilctl.models.staged import FieldLag, StagedModel
-from hilctl.models.structure import Mode
 
 RATE_HZ = 2000.0
 FIELD = FitSettings(kind="field", plays=8, drags=0, cells=8, knots=8)
@@ -23,7 +23,7 @@ OMEGA = exponential_integrated(
 TRUTH = StagedModel.around(
     OMEGA,
     lag=FieldLag(tau_s=1e-3),
-    creep=Creep(time_constants_s=(0.11, 1.3, 14.0), shares=(0.015, 0.02, 0.02)),
+    creep=CreepModel(time_constants_s=(0.11, 1.3, 14.0), shares=(0.015, 0.02, 0.02)),
 )
 
 
@@ -68,7 +68,7 @@ def test_the_range_is_that_of_the_displacement_with_creep(records):
 
 
 def test_known_modes_are_taken_off_the_records_and_put_into_the_model(records):
-    mode = Mode(
+    mode = FurtherMode(
         natural_hz=150.0, damping_ratio=0.1, antiresonance_hz=140.0, antiresonance_damping_ratio=0.1
     )
     (record,) = records

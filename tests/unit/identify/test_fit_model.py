@@ -11,11 +11,11 @@ import pytest
 from hilctl.base.errors import DataError
 from hilctl.base.types import CommandUnit
 from hilctl.identify.data.records import History, Records, SteadyLoop
+from hilctl.identify.evaluation import judge
 from hilctl.identify.fit_model import FittedModel, fit_model
-from hilctl.identify.judge import judge
 from hilctl.identify.settings import FitKind, FitSettings
-from hilctl.models.files import dump_model, parse_model
 from hilctl.models.integrated import IntegratedModel, even_thresholds, exponential_integrated
+from hilctl.models.model_file import dump_model, parse_model
 from hilctl.models.plays import PpiModel, RdpiModel
 from tests.published import piezo_ppi, terfenol_rdpi
 

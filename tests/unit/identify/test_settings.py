@@ -5,7 +5,7 @@ from typing import Any, get_args
 import pytest
 from pydantic import ValidationError
 
-from hilctl.identify.catalogue import CATALOGUE
+from hilctl.identify.registry import CATALOGUE
 from hilctl.identify.settings import (
     PUBLISHED,
     FitKind,

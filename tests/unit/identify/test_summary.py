@@ -4,9 +4,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from hilctl.identify.judge import LoopError
+from hilctl.identify.evaluation import LoopScore
+from hilctl.identify.model_quality import Verdict
 from hilctl.identify.summary import HEADINGS, error_rows, parameter_texts, summary
-from hilctl.identify.verdict import Verdict
 from hilctl.models.base import IdentifiedRange, Provenance
 
 
@@ -25,7 +25,7 @@ def found(held_out=None, lag_samples=0, starts=(), at_bound=(), known=None):
 
 @pytest.mark.parametrize(("area", "text"), [(None, "-"), (1.5, "+1.50"), (-0.25, "-0.25")])
 def test_the_area_s_error_has_a_sign_and_a_history_has_none(area, text):
-    (row,) = error_rows([LoopError("sine", 1.25, 0.5, area, 80.0)])
+    (row,) = error_rows([LoopScore("sine", 1.25, 0.5, area, 80.0)])
     assert row == ("sine", "80", "1.25", "0.5", text)
     assert len(row) == len(HEADINGS)
 

@@ -17,13 +17,13 @@ from hilctl.kernels.dynamics import (
     unmode_stage,
 )
 from hilctl.kernels.hysteresis import rest_memory
-from hilctl.models.chain import smoothing_weights
+from hilctl.models.cascade import smoothing_weights
+from hilctl.models.mechanics import FirstMode, FurtherMode
 from hilctl.models.staged import FieldLag
-from hilctl.models.structure import Mode, Structure
 
 RATE_HZ = 20_000.0
 SIGNAL = 2.0 * np.sin(np.arange(400) / 9.0) + 0.6 * np.cos(np.arange(400) / 2.3)
-MOTION = Structure(natural_hz=1500.0, damping_ratio=0.1).motion(RATE_HZ)
+MOTION = FirstMode(natural_hz=1500.0, damping_ratio=0.1).motion(RATE_HZ)
 STREAMING = {
     "lag": (dynamics.lag_block, (0.3, 0.4), 1),
     "linear lag": (dynamics.lag_block, (0.3, 0.0), 1),
@@ -245,7 +245,7 @@ def test_what_is_no_displacement_creeps_nowhere(walk, kernel, bad):
     assert np.isfinite(np.delete(out, 100)).all()
 
 
-PAIR = Mode(
+PAIR = FurtherMode(
     natural_hz=900.0, damping_ratio=0.04, antiresonance_hz=760.0, antiresonance_damping_ratio=0.02
 )
 MODE_PARAMETERS = PAIR._parameters(RATE_HZ)

@@ -8,13 +8,13 @@ import pytest
 from hilctl.base.errors import InputError
 from hilctl.base.events import ADAPTED
 from hilctl.base.samples import Flag
-from hilctl.kernels import adaptation as kernel
+from hilctl.kernels import gradient as kernel
 from hilctl.loop.adaptation import THRESHOLDS, Adaptation, AdaptationBounds, DisplacementOperator
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.interlocks import InterlockContext
 from hilctl.loop.limiter import CommandLimits
 from hilctl.loop.loop import Loop
-from hilctl.loop.plan import Plan
+from hilctl.loop.plan import LoopPlan
 from hilctl.models.plays import PpiModel
 from tests.fakes import FakeClock, FakeFifoDevice, FakeHost, made_block
 
@@ -220,7 +220,7 @@ class TestLoop:
         adapting, _ = adaptation(1, 1, bounds=AdaptationBounds(6.0, 0.1, 0.02))
         compensator = Compensator(self.MODEL, RATE_HZ)
         host = FakeHost(FakeClock(), block, compensator.state_size + 1, **options)
-        plan = Plan(
+        plan = LoopPlan(
             reference=reference,
             input_um=reference,
             block=block,

@@ -1,6 +1,6 @@
 """A block is views of one slot: what is written in it stands in the slot's own arrays."""
 
-from hilctl.base.samples import COLUMNS, Batch
+from hilctl.base.samples import COLUMNS, BlockBatch
 from hilctl.loop.block import Block
 
 BLOCK_NAMES = {"reference_um": "reference"}  # in the command's unit where nothing compensates
@@ -8,7 +8,7 @@ BLOCK_NAMES = {"reference_um": "reference"}  # in the command's unit where nothi
 
 def test_each_name_is_the_column_of_that_name():
     """In the order of the recorded columns, without a copy."""
-    area = Batch.empty(3, 5, 4)
+    area = BlockBatch.empty(3, 5, 4)
     block, columns = Block(area.heads[1].data, area, 1), area.columns[1]
     for number, name in enumerate(COLUMNS, start=1):
         getattr(block, BLOCK_NAMES.get(name, name))[:] = number
@@ -17,7 +17,7 @@ def test_each_name_is_the_column_of_that_name():
 
 def test_memory_is_the_state_without_the_command_before():
     """The compensator writes there, and the limiter's last command stands behind it."""
-    area = Batch.empty(3, 1, 4)
+    area = BlockBatch.empty(3, 1, 4)
     block = Block(area.heads[1].data, area, 1)
     block.memory[:] = 1.0
     assert area.states[1].tolist() == [1.0, 1.0, 1.0, 0.0]

@@ -10,21 +10,18 @@ from hypothesis import strategies as st
 from hilctl.base.errors import InputError
 from hilctl.base.samples import Flag
 from hilctl.base.yaml import Document
-from hilctl.experiment.feedback import (
-    gains_for,
-    make_feedback,
-)
+from hilctl.experiment.feedback_checks import gains_for, make_feedback
 from hilctl.experiment.file import Experiment
-from hilctl.experiment.parts import PiFeedbackConfig
+from hilctl.experiment.sections import PiFeedbackConfig
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.feedback import Feedback, Gains, IntegralFeedback
 from hilctl.loop.interlocks import InterlockContext
 from hilctl.loop.limiter import CommandLimits
 from hilctl.loop.loop import Loop
-from hilctl.loop.plan import Plan
+from hilctl.loop.plan import LoopPlan
+from hilctl.models.mechanics import FirstMode
 from hilctl.models.plays import PpiModel
 from hilctl.models.staged import FieldLag, StagedModel
-from hilctl.models.structure import Structure
 from tests.fakes import FakeClock, FakeFifoDevice, FakeHost, made_block
 
 RATE_HZ = 5000.0
@@ -239,7 +236,7 @@ class TestFollow:
 PLAYS = PpiModel(direct=5.0, weights=(1.0, 0.5), thresholds=(0.3, 0.6))
 LAGGING = StagedModel.around(PLAYS, lag=FieldLag(tau_s=5e-4))
 LATE = StagedModel.around(
-    PLAYS, structure=Structure(natural_hz=500.0, damping_ratio=0.3), delay_s=4e-4
+    PLAYS, structure=FirstMode(natural_hz=500.0, damping_ratio=0.3), delay_s=4e-4
 )
 
 
@@ -470,7 +467,7 @@ def test_in_the_loop_of_a_fifo_device(latency, block):
     compensator = Compensator(MODEL, INTEGRAL_RATE_HZ)
     device = FakeFifoDevice(latency)
     host = FakeHost(FakeClock(), block, compensator.state_size + 1)
-    plan = Plan(
+    plan = LoopPlan(
         reference=reference,
         input_um=reference + 2.0,  # what the actuator is wrong by
         block=block,

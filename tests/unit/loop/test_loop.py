@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 
 from hilctl.base.errors import DeviceError
-from hilctl.base.samples import Flag, Head
+from hilctl.base.samples import BlockHeader, Flag
 from hilctl.loop.compensator import Compensator
-from hilctl.loop.host import StraightLine, Tuning
+from hilctl.loop.host import LinearBypass, Tuning
 from hilctl.loop.interlocks import InterlockContext
 from hilctl.loop.limiter import CommandLimits
 from hilctl.loop.loop import Loop
 from hilctl.loop.pacer import LateRules
-from hilctl.loop.plan import Plan
-from hilctl.models.files import load_model
+from hilctl.loop.plan import LoopPlan
+from hilctl.models.model_file import load_model
 from tests.fakes import FakeClock, FakeDevice, FakeFifoDevice, FakeHost, FakeInfo
 from tests.published import terfenol_rdpi
 
@@ -35,7 +35,7 @@ class Rig:
             clock or FakeClock(), block, compensator.state_size + 1, **host_options
         )
         late = {"late_after_ns": 0.5e9 * block / RATE_HZ, "max_late_ns": 1e9}
-        plan = Plan(
+        plan = LoopPlan(
             reference=reference,
             input_um=options.get("input_um", reference),
             block=block,
@@ -58,7 +58,7 @@ class Rig:
     @property
     def firsts(self):
         """First sample of each recorded block."""
-        return [head[Head.FIRST_SAMPLE] for head in self.host.heads]
+        return [head[BlockHeader.FIRST_SAMPLE] for head in self.host.heads]
 
 
 def sine(n=200, amplitude=3.0):
@@ -92,7 +92,7 @@ def test_each_sample_is_recorded_with_what_belongs_to_it():
     """Blocks in the sink are contiguous and hold reference, command and displacement."""
     rig = Rig(10.0 * sine(100), block=10, model=terfenol_rdpi())
     rig.run()
-    firsts = [head[Head.FIRST_SAMPLE] for head in rig.host.heads]
+    firsts = [head[BlockHeader.FIRST_SAMPLE] for head in rig.host.heads]
     assert firsts == list(range(0, 10 * len(firsts), 10))
     assert rig.host.column(0)[:100].tolist() == (10.0 * sine(100)).tolist()
     assert np.isnan(rig.host.column(0)[100:]).all()
@@ -329,16 +329,16 @@ def test_skipped_ticks_are_a_counted_gap():
     rig = Rig(sine(200), clock=clock)
     outcome = rig.run()
     gaps = {
-        head[Head.FIRST_SAMPLE]: head[Head.DROPPED_BEFORE]
+        head[BlockHeader.FIRST_SAMPLE]: head[BlockHeader.DROPPED_BEFORE]
         for head in rig.host.heads
-        if head[Head.DROPPED_BEFORE]
+        if head[BlockHeader.DROPPED_BEFORE]
     }
     assert gaps == {35: 5}
     assert outcome.code == "completed"
-    at = [head[Head.FIRST_SAMPLE] for head in rig.host.heads].index(35)
+    at = [head[BlockHeader.FIRST_SAMPLE] for head in rig.host.heads].index(35)
     assert rig.host.columns[at][1][0] == sine(200)[35]
-    due_ns = [1_000_000 * head[Head.FIRST_SAMPLE] for head in rig.host.heads]
-    assert [head[Head.DEADLINE_NS] for head in rig.host.heads] == due_ns
+    due_ns = [1_000_000 * head[BlockHeader.FIRST_SAMPLE] for head in rig.host.heads]
+    assert [head[BlockHeader.DEADLINE_NS] for head in rig.host.heads] == due_ns
 
 
 def test_full_ring_is_a_counted_gap():
@@ -346,9 +346,9 @@ def test_full_ring_is_a_counted_gap():
     rig = Rig(sine(200), block=10, full=range(50, 80))
     outcome = rig.run()
     gaps = {
-        head[Head.FIRST_SAMPLE]: head[Head.DROPPED_BEFORE]
+        head[BlockHeader.FIRST_SAMPLE]: head[BlockHeader.DROPPED_BEFORE]
         for head in rig.host.heads
-        if head[Head.DROPPED_BEFORE]
+        if head[BlockHeader.DROPPED_BEFORE]
     }
     assert gaps == {80: 30}
     assert outcome.dropped == 30
@@ -360,14 +360,14 @@ def test_ticks_record_deadline_lateness_and_exchange():
     clock = FakeClock(stall_ns={3: 120_000})
     rig = Rig(sine(20), clock=clock)
     rig.run()
-    assert [head[Head.DEADLINE_NS] for head in rig.host.heads[:5]] == [
+    assert [head[BlockHeader.DEADLINE_NS] for head in rig.host.heads[:5]] == [
         0,
         10**6,
         2 * 10**6,
         3 * 10**6,
         4 * 10**6,
     ]
-    assert [head[Head.LATE_NS] for head in rig.host.heads[:5]] == [0, 0, 0, 120_000, 0]
+    assert [head[BlockHeader.LATE_NS] for head in rig.host.heads[:5]] == [0, 0, 0, 120_000, 0]
 
 
 LATENCIES = [1, 3, 8]
@@ -455,9 +455,9 @@ def test_full_ring_behind_a_fifo_is_a_counted_gap():
     rig = Rig(sine(200), block=10, device=device, full=range(50, 80))
     outcome = rig.run()
     assert {
-        head[Head.FIRST_SAMPLE]: head[Head.DROPPED_BEFORE]
+        head[BlockHeader.FIRST_SAMPLE]: head[BlockHeader.DROPPED_BEFORE]
         for head in rig.host.heads
-        if head[Head.DROPPED_BEFORE]
+        if head[BlockHeader.DROPPED_BEFORE]
     } == {80: 30}
     assert outcome.dropped == 30
 
@@ -568,7 +568,7 @@ def test_command_after_skipped_ticks_is_the_one_that_was_due(name, frequency_hz,
     plain.run()
     rig = Rig(reference, model=model, clock=FakeClock(stall_ns={60: late * 1_000_000}))
     rig.run()
-    firsts = [head[Head.FIRST_SAMPLE] for head in rig.host.heads]
+    firsts = [head[BlockHeader.FIRST_SAMPLE] for head in rig.host.heads]
     at = firsts.index(60 + late)
     assert rig.host.columns[at][1][0] == plain.host.columns[60 + late][1][0]
     assert (
@@ -587,14 +587,14 @@ def test_skipped_ticks_move_a_tuning_on():
         clock=FakeClock(stall_ns={50: 10_000_000}),
     )
     rig.run()
-    at = [head[Head.FIRST_SAMPLE] for head in rig.host.heads].index(60)
+    at = [head[BlockHeader.FIRST_SAMPLE] for head in rig.host.heads].index(60)
     assert rig.host.columns[at][0][0] == pytest.approx(2.0 * (1.0 - 0.5 * 21 / 40))
 
 
 def test_inverse_that_comes_back_in_has_the_memory_of_one_that_was_never_out():
     """It is fed while it is out: the commands after its way back are the same to the bit."""
     reference = 10.0 * sine(400)
-    line = StraightLine(0.1, 0.25)
+    line = LinearBypass(0.1, 0.25)
     out, back = Tuning(1.0, 0.0, 20, 0, 0.0, line), Tuning(1.0, 0.0, 30, 0, 1.0, line)
     rig = Rig(reference, block=10, model=terfenol_rdpi(), tunings={50: out, 200: back})
     plain = Rig(reference, block=10, model=terfenol_rdpi())
@@ -614,7 +614,7 @@ def test_inverse_that_comes_back_in_has_the_memory_of_one_that_was_never_out():
 def test_skipped_ticks_move_a_fade_on():
     """The inverse is fed what was skipped, and its share is that of the sample."""
     reference = np.linspace(0.0, 20.0, 200)
-    out = Tuning(1.0, 0.0, 40, 0, 0.0, StraightLine(0.1, 0.0))
+    out = Tuning(1.0, 0.0, 40, 0, 0.0, LinearBypass(0.1, 0.0))
     rig = Rig(
         reference,
         model=terfenol_rdpi(),
@@ -622,7 +622,7 @@ def test_skipped_ticks_move_a_fade_on():
         clock=FakeClock(stall_ns={50: 10_000_000}),
     )
     rig.run()
-    at = [head[Head.FIRST_SAMPLE] for head in rig.host.heads].index(60)
+    at = [head[BlockHeader.FIRST_SAMPLE] for head in rig.host.heads].index(60)
     compensator, inverse = Compensator(terfenol_rdpi(), RATE_HZ), np.empty(61)
     compensator.process(reference[:61].copy(), inverse)
     share = 1.0 - 21 / 40

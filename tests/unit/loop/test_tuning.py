@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from hilctl.base.events import INVERSE, TUNED
 from hilctl.base.samples import Flag
-from hilctl.loop.host import StraightLine, Tuning
-from hilctl.loop.tuning import Tuner, tune
+from hilctl.loop.host import LinearBypass, Tuning
+from hilctl.loop.tuning import ReferenceTuner, tune
 
 
 def tuned(tuner, values, out):
@@ -36,12 +36,12 @@ def run(tuner, reference, block, moves):
 def test_untouched_reference_passes_bit_for_bit():
     """Nothing is multiplied or added before somebody asks for it."""
     reference = np.random.default_rng(1).normal(size=100)
-    assert run(Tuner(), reference, 7, {}).tobytes() == reference.tobytes()
+    assert run(ReferenceTuner(), reference, 7, {}).tobytes() == reference.tobytes()
 
 
 def test_change_is_a_straight_ramp_to_exactly_what_is_wanted():
     """Every step is the same, and the end is the wanted value, not one near it."""
-    out = run(Tuner(), np.ones(100), 10, {20: Tuning(0.3, 0.4, 30)})
+    out = run(ReferenceTuner(), np.ones(100), 10, {20: Tuning(0.3, 0.4, 30)})
     assert (out[:20] == 1.0).all()
     assert np.diff(out[19:50]) == pytest.approx(np.full(30, -0.3 / 30))
     assert (out[50:] == 0.3 * 1.0 + 0.4).all()
@@ -49,7 +49,9 @@ def test_change_is_a_straight_ramp_to_exactly_what_is_wanted():
 
 def test_second_change_begins_where_the_first_stands():
     """A change that overtakes another makes no jump."""
-    out = run(Tuner(), np.ones(100), 5, {10: Tuning(0.0, 0.0, 50), 30: Tuning(1.0, 0.0, 20)})
+    out = run(
+        ReferenceTuner(), np.ones(100), 5, {10: Tuning(0.0, 0.0, 50), 30: Tuning(1.0, 0.0, 20)}
+    )
     assert np.abs(np.diff(out)).max() == pytest.approx(0.4 / 20)
     assert (out[50:] == 1.0).all()
 
@@ -59,7 +61,7 @@ def test_block_cuts_make_no_difference(block, start, samples):
     """A change comes out the same however the samples are cut into blocks."""
     reference = np.sin(np.arange(240) / 5.0)
     begin = start * 40
-    whole, cut = Tuner(), Tuner()
+    whole, cut = ReferenceTuner(), ReferenceTuner()
     expected = run(whole, reference, 40, {begin: Tuning(0.5, 1.0, samples)})
     out = np.empty_like(reference)
     at = 0
@@ -74,7 +76,7 @@ def test_block_cuts_make_no_difference(block, start, samples):
 
 def test_two_arrays_are_moved_alike():
     """Reference and input get the same gain and offset, sample by sample."""
-    tuner, a, b = Tuner(), np.empty(10), np.empty(10)
+    tuner, a, b = ReferenceTuner(), np.empty(10), np.empty(10)
     tuner.move(Tuning(2.0, 1.0, 10))
     factors = tuner.advance(10)
     tune(factors, np.ones(10), a)
@@ -86,7 +88,7 @@ def test_two_arrays_are_moved_alike():
 @given(st.integers(0, 80), st.integers(1, 60))
 def test_samples_that_go_by_count(passed, samples):
     """Gain and offset are then as if each sample had been looked at, to the bit."""
-    looked, gone_by = Tuner(), Tuner()
+    looked, gone_by = ReferenceTuner(), ReferenceTuner()
     for tuner in (looked, gone_by):
         tuner.move(Tuning(0.3, -2.0, samples))
     if passed:
@@ -104,7 +106,7 @@ def test_samples_that_go_by_count(passed, samples):
         assert offsets[0] <= offset
 
 
-FADE = Tuning(1.0, 0.0, 30, 0, 0.0, StraightLine(0.5, -1.0))
+FADE = Tuning(1.0, 0.0, 30, 0, 0.0, LinearBypass(0.5, -1.0))
 BACK = replace(FADE, samples=20, inverse_share=1.0)
 
 
@@ -124,7 +126,7 @@ def test_inverse_goes_over_to_the_line_and_back_to_the_bit():
     """In a line from sample to sample; before and after, the inverse's commands are untouched."""
     reference, wanted = np.random.default_rng(1).normal(size=(2, 200))
     wanted[150] = -0.0
-    out, flagged = faded(Tuner(), reference, wanted, 10, {40: FADE, 100: BACK})
+    out, flagged = faded(ReferenceTuner(), reference, wanted, 10, {40: FADE, 100: BACK})
     straight = 0.5 * reference - 1.0
     share = np.interp(np.arange(200), [39, 69, 99, 119], [1.0, 0.0, 0.0, 1.0])
     assert out == pytest.approx(share * wanted + (1.0 - share) * straight)
@@ -138,14 +140,14 @@ def test_block_cuts_give_the_same_bits_of_a_fade(block, overtaken):
     """Also of one that the next overtakes in its midst."""
     reference, wanted = np.random.default_rng(2).normal(size=(2, 200))
     moves = {40: FADE, 40 + 20 * overtaken: BACK} if overtaken else {40: FADE}
-    whole, _ = faded(Tuner(), reference, wanted, 20, moves)
-    cut, _ = faded(Tuner(), reference, wanted, block, moves)
+    whole, _ = faded(ReferenceTuner(), reference, wanted, 20, moves)
+    cut, _ = faded(ReferenceTuner(), reference, wanted, block, moves)
     assert cut.tobytes() == whole.tobytes()
 
 
 def test_events_name_what_moves_and_no_more():
     """A fade alone is no change of the reference; both together are one event each."""
-    tuner = Tuner()
+    tuner = ReferenceTuner()
     (event,) = tuner.events(FADE, 40)
     assert (event.sample, event.code, event.text) == (40, INVERSE, "inverse out, over 30 samples")
     assert event.values == {"share": 0.0, "samples": 30.0, "slope": 0.5, "at_zero": -1.0}
@@ -154,4 +156,4 @@ def test_events_name_what_moves_and_no_more():
     both = Tuning(0.5, 0.0, 20)
     assert [each.code for each in tuner.events(both, 90)] == [TUNED, INVERSE]
     assert [each.code for each in tuner.events(replace(FADE, gain=0.5), 90)] == [TUNED]
-    assert [each.code for each in Tuner().events(BACK, 0)] == [TUNED]
+    assert [each.code for each in ReferenceTuner().events(BACK, 0)] == [TUNED]

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from hilctl.machine.files import Machine
+from hilctl.machine.procfs import Machine
 
 GOOD = {
     "/proc/version": "Linux version 6.12.9-rt #1 SMP PREEMPT_RT Debian",

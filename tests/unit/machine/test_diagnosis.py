@@ -8,10 +8,10 @@ from rich.console import Console
 
 from hilctl.cli.devices import render_diagnosis
 from hilctl.machine.diagnosis import Diagnosis, examine, machine_facts
-from hilctl.machine.files import Finding
-from hilctl.machine.latency import Latency
-from hilctl.machine.realtime import SetUpStep
+from hilctl.machine.procfs import Finding
+from hilctl.machine.rt_setup import SetUpStep
 from hilctl.machine.settings import Realtime
+from hilctl.machine.timer_latency import Latency
 
 MS = 1_000_000
 STEPS = (SetUpStep("fifo", "refused", "SCHED_FIFO 80: Operation not permitted", "rtprio"),)
@@ -55,7 +55,7 @@ def test_mapping_is_plain():
 
 def test_an_empty_machine_is_no_error(make_machine, tmp_path):
     """Where no file can be read, every check still says something."""
-    from hilctl.machine.files import Machine
+    from hilctl.machine.procfs import Machine
 
     found = examine(Machine(tmp_path / "nothing"), Realtime(), tmp_path)
     assert all(each.text for each in found)

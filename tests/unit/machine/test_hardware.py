@@ -25,7 +25,7 @@ def test_idle_states(make_machine):
 
 def test_no_file_for_idle_states(tmp_path):
     """Where the kernel has no such file, there is nothing to hold."""
-    from hilctl.machine.files import Machine
+    from hilctl.machine.procfs import Machine
 
     found = check(findings.dma_latency, Machine(tmp_path))
     assert (found[0], "manages none" in found[1]) == ("ok", True)

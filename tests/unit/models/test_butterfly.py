@@ -9,7 +9,7 @@ from pydantic import ValidationError
 from hilctl.base.errors import ModelError
 from hilctl.models.butterfly import ButterflyModel
 from hilctl.models.deadband import DeadbandFunction
-from hilctl.models.files import dump_model, parse_model
+from hilctl.models.model_file import dump_model, parse_model
 
 RATE_HZ = 10_000.0
 SHAPE = DeadbandFunction(slope=0.3, up_thresholds=(2.0, 4.0, 9.0), up_weights=(0.7, 1.2, -1.5))

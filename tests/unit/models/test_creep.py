@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from hilctl.models.creep import Creep
+from hilctl.models.creep import CreepModel
 
 RATE_HZ = 1000.0
-CREEP = Creep(time_constants_s=(0.05, 2.0), shares=(0.02, 0.04))
+CREEP = CreepModel(time_constants_s=(0.05, 2.0), shares=(0.02, 0.04))
 
 
 def signal(n=4000):
@@ -62,4 +62,4 @@ def test_a_value_that_is_none_is_not_gone_on_from():
 ])  # fmt: skip
 def test_conditions_are_named(times_s, shares, message):
     with pytest.raises(ValidationError, match=message):
-        Creep(time_constants_s=times_s, shares=shares)
+        CreepModel(time_constants_s=times_s, shares=shares)

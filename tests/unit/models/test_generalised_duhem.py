@@ -7,11 +7,11 @@ import pytest
 from pydantic import ValidationError
 
 from hilctl.base.types import F64
-from hilctl.models.field import FieldLosses
-from hilctl.models.files import dump_model, parse_model
+from hilctl.models.effective_field import FieldLosses
 from hilctl.models.generalised_duhem import GeneralisedDuhemModel
+from hilctl.models.mechanics import FirstMode
+from hilctl.models.model_file import dump_model, parse_model
 from hilctl.models.staged import StagedModel
-from hilctl.models.structure import Structure
 
 RATE_HZ = 50_000.0
 LOSSES = FieldLosses(field_s=1e-4, output_s=2e-6, decay_s=3e-5, growth=0.1, bend=0.02, excess=0.05)
@@ -105,7 +105,7 @@ def test_every_finite_reference_gives_a_finite_command() -> None:
 
 
 def test_between_stages_and_through_a_file() -> None:
-    structure = Structure(natural_hz=2300.0, damping_ratio=0.12)
+    structure = FirstMode(natural_hz=2300.0, damping_ratio=0.12)
     staged = StagedModel.around(duhem_model(), structure=structure, delay_s=3e-5)
     back = parse_model("model", dump_model(staged))
     assert back == staged

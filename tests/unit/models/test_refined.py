@@ -5,17 +5,17 @@ import pytest
 from pydantic import ValidationError
 
 from hilctl.models.base import Provenance
-from hilctl.models.files import dump_model, parse_model
+from hilctl.models.mechanics import FirstMode
+from hilctl.models.model_file import dump_model, parse_model
 from hilctl.models.refined import RefinedModel, ResidualOperator, rest_um
 from hilctl.models.staged import FieldLag, StagedModel
-from hilctl.models.structure import Structure
 from tests.published import piezo_ppi, terfenol_rdpi
 
 RATE_HZ = 50_000.0
 STAGED = StagedModel.around(
     terfenol_rdpi(),
     lag=FieldLag(tau_s=1e-4),
-    structure=Structure(natural_hz=2200.0, damping_ratio=0.12),
+    structure=FirstMode(natural_hz=2200.0, damping_ratio=0.12),
     delay_s=2.7e-5,
 )
 BASES = {

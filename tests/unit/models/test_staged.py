@@ -6,25 +6,25 @@ from pydantic import ValidationError
 
 from hilctl.base.errors import ModelError
 from hilctl.models.base import Provenance
-from hilctl.models.chain import smoothing_weights
-from hilctl.models.creep import Creep
-from hilctl.models.files import dump_model, parse_model
+from hilctl.models.cascade import smoothing_weights
+from hilctl.models.creep import CreepModel
 from hilctl.models.integrated import exponential_integrated
+from hilctl.models.mechanics import FirstMode, FurtherMode
+from hilctl.models.model_file import dump_model, parse_model
 from hilctl.models.staged import FieldLag, StagedModel
-from hilctl.models.structure import Mode, Structure
 from tests.published import piezo_ppi, terfenol_rdpi
 
 RATE_HZ = 50_000.0
 LAG = FieldLag(tau_s=1e-4, growth_per_unit=0.28)
-STRUCTURE = Structure(natural_hz=2200.0, damping_ratio=0.12)
+STRUCTURE = FirstMode(natural_hz=2200.0, damping_ratio=0.12)
 OMEGA = exponential_integrated(
     alpha=0.3, gamma_s=0.0, a_0=1.0, alpha_0=0.2, beta_0=0.3, g_0=6.0, alpha_1=0.3, beta_1=0.1,
     d_p=0.8, alpha_2=0.4, beta_2=0.1, d_n=0.8, plays=6, deadbands_a_side=2,
 )  # fmt: skip
-MODE = Mode(
+MODE = FurtherMode(
     natural_hz=600.0, damping_ratio=0.03, antiresonance_hz=630.0, antiresonance_damping_ratio=0.03
 )
-CREEP = Creep(time_constants_s=(0.02, 0.3), shares=(0.03, 0.02))
+CREEP = CreepModel(time_constants_s=(0.02, 0.3), shares=(0.03, 0.02))
 STAGES = {
     "bare": {},
     "lag": {"lag": LAG},

@@ -9,9 +9,9 @@ from mcap.data_stream import RecordBuilder
 from mcap.records import Chunk, Message
 
 from hilctl.base.events import Event
-from hilctl.base.samples import COLUMNS, Batch, Head, Samples
+from hilctl.base.samples import COLUMNS, BlockBatch, BlockHeader, Samples
 from hilctl.base.segments import Segment
-from hilctl.recording.messages import RecordingLayout
+from hilctl.recording.encoder import RecordingLayout
 from hilctl.recording.writer import RecordingWriter, RunFacts
 
 RATE_HZ = 50_000.0
@@ -24,14 +24,14 @@ ENDED = Event(17, "info", "run_ended", "waveform completed", time_ns=START_NS + 
 def batch(first, blocks, *, dropped=0, seed=0):
     """Random blocks that follow one another, the first after a gap."""
     rng = np.random.default_rng(seed)
-    heads = np.zeros((blocks, len(Head)), dtype=np.int64)
-    heads[:, Head.FIRST_SAMPLE] = first + BLOCK * np.arange(blocks)
-    heads[:, Head.SAMPLES] = BLOCK
-    heads[0, Head.DROPPED_BEFORE] = dropped
-    heads[:, Head.DEADLINE_NS] = heads[:, Head.FIRST_SAMPLE] * 20_000
-    heads[:, Head.LATE_NS] = rng.integers(0, 90_000, blocks)
-    heads[:, Head.EXCHANGE_NS] = rng.integers(0, 50_000, blocks)
-    return Batch(
+    heads = np.zeros((blocks, len(BlockHeader)), dtype=np.int64)
+    heads[:, BlockHeader.FIRST_SAMPLE] = first + BLOCK * np.arange(blocks)
+    heads[:, BlockHeader.SAMPLES] = BLOCK
+    heads[0, BlockHeader.DROPPED_BEFORE] = dropped
+    heads[:, BlockHeader.DEADLINE_NS] = heads[:, BlockHeader.FIRST_SAMPLE] * 20_000
+    heads[:, BlockHeader.LATE_NS] = rng.integers(0, 90_000, blocks)
+    heads[:, BlockHeader.EXCHANGE_NS] = rng.integers(0, 50_000, blocks)
+    return BlockBatch(
         heads,
         rng.normal(size=(blocks, 4)),
         rng.normal(size=(blocks, len(COLUMNS), BLOCK)),

@@ -11,9 +11,9 @@ from hilctl.base.errors import DataError
 from hilctl.base.samples import COLUMNS
 from hilctl.recording import reader
 from hilctl.recording.builder import ColumnTable
-from hilctl.recording.data import TICK_COLUMNS
-from hilctl.recording.reader import Pieces, read
-from hilctl.recording.stretch import Stretch
+from hilctl.recording.reader import RecordingStream, read
+from hilctl.recording.recording import TICK_COLUMNS
+from hilctl.recording.time_range import TimeRange
 
 
 @pytest.fixture
@@ -27,11 +27,11 @@ def recorded(tmp_path, make):
 
 
 @pytest.mark.parametrize("size", [1, 700, 10**9])
-@pytest.mark.parametrize("stretch", [None, Stretch(0.011, 0.05)])
+@pytest.mark.parametrize("stretch", [None, TimeRange(0.011, 0.05)])
 def test_pieces_are_the_whole(monkeypatch, recorded, size, stretch):
     """Samples, ticks, starts, events, end and segments, bit for bit."""
     monkeypatch.setattr(reader, "PIECE_SAMPLES", size)
-    whole, pieces = read(recorded, stretch), list(Pieces(recorded, stretch))
+    whole, pieces = read(recorded, stretch), list(RecordingStream(recorded, stretch))
     assert len(pieces) >= 2 or size == 10**9
     for name in ("index", *COLUMNS, "flags"):
         joined = np.concatenate([getattr(piece.samples, name) for piece in pieces])
@@ -51,8 +51,8 @@ def test_pieces_are_the_whole(monkeypatch, recorded, size, stretch):
 
 def test_pieces_of_a_stretch_are_cut_from_the_whole(monkeypatch, recorded):
     monkeypatch.setattr(reader, "PIECE_SAMPLES", 500)
-    stretch = Stretch(0.0123, 0.05)
-    cut, pieces = stretch.cut(read(recorded)), list(Pieces(recorded, stretch))
+    stretch = TimeRange(0.0123, 0.05)
+    cut, pieces = stretch.cut(read(recorded)), list(RecordingStream(recorded, stretch))
     assert cut.samples.index.size > 1000
     for name in ("index", *COLUMNS, "flags"):
         joined = np.concatenate([getattr(piece.samples, name) for piece in pieces])
@@ -74,7 +74,7 @@ def test_a_walk_that_is_left_leaves_nothing_behind(monkeypatch, recorded):
         return streams[-1]
 
     monkeypatch.setattr(Path, "open", noted)
-    walk = iter(Pieces(recorded))
+    walk = iter(RecordingStream(recorded))
     next(walk)
     assert threading.active_count() == before + 1
     walk.close()
@@ -95,7 +95,7 @@ def test_many_small_blocks_take_no_array_each():
 
 
 def test_a_walk_can_be_repeated(recorded):
-    pieces = Pieces(recorded)
+    pieces = RecordingStream(recorded)
     assert [p.samples.index.size for p in pieces] == [p.samples.index.size for p in pieces]
 
 
@@ -109,7 +109,7 @@ def test_what_samples_are_can_not_be_said_behind_them(tmp_path, monkeypatch, mak
         writer.finish({}, 0)
     monkeypatch.setattr(reader, "PIECE_SAMPLES", 1)
     with pytest.raises(DataError, match=r"hilctl\.run stands behind the first samples"):
-        list(Pieces(path))
+        list(RecordingStream(path))
 
 
 def test_a_column_in_some_blocks_only_is_refused(tmp_path, monkeypatch, make):
@@ -123,6 +123,6 @@ def test_a_column_in_some_blocks_only_is_refused(tmp_path, monkeypatch, make):
         writer.finish({}, 0)
     monkeypatch.setattr(reader, "PIECE_SAMPLES", 1)
     with pytest.raises(DataError, match="not in all blocks: measured"):
-        list(Pieces(path))
+        list(RecordingStream(path))
     with pytest.raises(DataError, match="200 values of measured_a for 400 samples"):
         read(path)

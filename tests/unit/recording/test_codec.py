@@ -8,7 +8,7 @@ from hypothesis.strategies import binary, floats, integers, lists, sampled_from,
 
 from hilctl.base.samples import RECORDED_FIELDS
 from hilctl.recording import codec, schema
-from hilctl.recording.data import TICK_COLUMNS
+from hilctl.recording.recording import TICK_COLUMNS
 
 VALUES = floats(width=64) | sampled_from([0.0, -0.0, 5e-324])
 SCOPE = ["t_rel", *(each.name for each in RECORDED_FIELDS if each.scope)]

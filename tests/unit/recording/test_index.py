@@ -9,10 +9,10 @@ import pytest
 from hilctl.base.errors import DataError
 from hilctl.base.samples import COLUMNS
 from hilctl.recording import reader
-from hilctl.recording.data import TICK_COLUMNS
 from hilctl.recording.index import places_of
 from hilctl.recording.reader import read
-from hilctl.recording.stretch import Stretch
+from hilctl.recording.recording import TICK_COLUMNS
+from hilctl.recording.time_range import TimeRange
 
 
 @pytest.fixture
@@ -29,8 +29,8 @@ def recorded(tmp_path, make):
 
 
 STRETCHES = [
-    Stretch(0.0, 0.004), Stretch(0.00399, 0.00401), Stretch(0.0301, 0.0302), Stretch(None, 0.02),
-    Stretch(0.1, None), Stretch(0.07, 0.11), Stretch(0.016, 0.02),
+    TimeRange(0.0, 0.004), TimeRange(0.00399, 0.00401), TimeRange(0.0301, 0.0302), TimeRange(None, 0.02),
+    TimeRange(0.1, None), TimeRange(0.07, 0.11), TimeRange(0.016, 0.02),
 ]  # fmt: skip
 
 
@@ -52,8 +52,8 @@ def test_the_index_gives_what_a_walk_gives(monkeypatch, recorded, stretch):
 def test_the_rest_is_not_read(recorded):
     """Of forty chunks, those with the samples, their neighbours, and those with events."""
     with recorded.open("rb") as stream:
-        everything = places_of(stream, Stretch(None, None))
-        few = places_of(stream, Stretch(0.05, 0.0501))
+        everything = places_of(stream, TimeRange(None, None))
+        few = places_of(stream, TimeRange(0.05, 0.0501))
     assert len(everything) > 40
     assert len(few) < 12
     assert set(few) < set(everything)
@@ -62,16 +62,16 @@ def test_the_rest_is_not_read(recorded):
 def test_damage_elsewhere_is_not_seen_and_damage_within_is_told(recorded, caplog):
     data = bytearray(recorded.read_bytes())
     with recorded.open("rb") as stream:
-        at = places_of(stream, Stretch(None, None))
-        within = places_of(stream, Stretch(0.05, 0.0501))
+        at = places_of(stream, TimeRange(None, None))
+        within = places_of(stream, TimeRange(0.05, 0.0501))
     elsewhere = next(place for place in at[5:] if place not in within)
     data[elsewhere + 300] ^= 1
     recorded.write_bytes(data)
-    assert read(recorded, Stretch(0.05, 0.0501)).samples.index.tolist() == list(range(2500, 2505))
+    assert read(recorded, TimeRange(0.05, 0.0501)).samples.index.tolist() == list(range(2500, 2505))
     assert not caplog.records
     data[within[5] + 300] ^= 1
     recorded.write_bytes(data)
-    read(recorded, Stretch(0.04, 0.07))
+    read(recorded, TimeRange(0.04, 0.07))
     assert "damaged record at byte" in caplog.text
 
 
@@ -88,13 +88,13 @@ def test_without_a_sound_index_the_file_is_walked_through(recorded, change):
         data[-28:-20] = struct.pack("<Q", 2**62)
     else:
         data[-37] = 0x77
-    assert places_of(io.BytesIO(bytes(data)), Stretch(0.05, 0.06)) is None
-    assert places_of(io.BytesIO(bytes(data[:20])), Stretch(0.05, 0.06)) is None
-    expected = read(recorded, Stretch(0.05, 0.06)).samples.index
+    assert places_of(io.BytesIO(bytes(data)), TimeRange(0.05, 0.06)) is None
+    assert places_of(io.BytesIO(bytes(data[:20])), TimeRange(0.05, 0.06)) is None
+    expected = read(recorded, TimeRange(0.05, 0.06)).samples.index
     recorded.write_bytes(data)
-    assert np.array_equal(read(recorded, Stretch(0.05, 0.06)).samples.index, expected)
+    assert np.array_equal(read(recorded, TimeRange(0.05, 0.06)).samples.index, expected)
 
 
 def test_a_stretch_without_samples_is_refused(recorded):
     with pytest.raises(DataError, match="holds no sample from 5 s to its end"):
-        read(recorded, Stretch(5.0, None))
+        read(recorded, TimeRange(5.0, None))

@@ -4,7 +4,7 @@ import errno
 
 import pytest
 
-from hilctl.base import private as locks
+from hilctl.base import private_dirs as locks
 from hilctl.recording.locks import is_being_recorded, lock
 
 

@@ -13,7 +13,7 @@ from hypothesis.strategies import floats
 
 from hilctl.base.errors import DataError
 from hilctl.base.events import Event
-from hilctl.base.samples import COLUMNS, Head
+from hilctl.base.samples import COLUMNS, BlockHeader
 from hilctl.recording.reader import read
 
 
@@ -46,7 +46,7 @@ def test_everything_comes_back(recorded, make):
     assert back.samples.index.tolist() == [*range(1700), *range(1900, 2050)]
     assert back.dropped == 200
     for name in ("first_sample", "deadline_ns", "late_ns", "exchange_ns"):
-        heads = np.concatenate([b.heads[:, Head[name.upper()]] for b in batches])
+        heads = np.concatenate([b.heads[:, BlockHeader[name.upper()]] for b in batches])
         assert np.array_equal(getattr(back.ticks, name), heads), name
     assert back.events == (make.ended,)
     assert back.segments == (make.segment,)

@@ -17,10 +17,10 @@ from mcap.reader import NonSeekingReader, SeekingReader
 from mcap.writer import CompressionType, IndexType, Writer
 
 from hilctl.base.errors import DataError, HilctlError
-from hilctl.recording.ends import read_ends
 from hilctl.recording.reader import read
 from hilctl.recording.recover import recover_recording
 from hilctl.recording.rewrite import Survey
+from hilctl.recording.run_summary import read_ends
 
 PEERS = Path(__file__).parents[2] / "peers"
 CHUNK, CHUNK_INDEX, STATISTICS, METADATA, DATA_END = 0x06, 0x08, 0x0B, 0x0C, 0x0F

@@ -11,7 +11,7 @@ from mcap.reader import make_reader
 
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.events import Event
-from hilctl.base.samples import COLUMNS, Head
+from hilctl.base.samples import COLUMNS, BlockHeader
 from hilctl.recording.reader import read
 from hilctl.recording.recover import recover_recording
 from hilctl.recording.writer import OutputFile
@@ -192,7 +192,7 @@ def test_ring_batches_fill_the_end(torn, batches, make):
     for name, values in make.samples(batches).columns().items():
         assert np.array_equal(back.samples.columns()[name], values), name
     assert np.array_equal(back.samples.flags, make.samples(batches).flags)
-    late_ns = np.concatenate([b.heads[:, Head.LATE_NS] for b in batches])
+    late_ns = np.concatenate([b.heads[:, BlockHeader.LATE_NS] for b in batches])
     assert back.ticks.late_ns.tolist() == late_ns.tolist()
     assert (back.end["code"], back.end["reason"]) == ("fault", "killed")
     assert [start.sample for start in back.starts] == [0]

@@ -10,10 +10,10 @@ from mcap.writer import Writer
 
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.events import INVERSE, TUNED, Event
-from hilctl.base.samples import Head
+from hilctl.base.samples import BlockHeader
 from hilctl.recording import schema
-from hilctl.recording.facts import sealed, unsealed
-from hilctl.recording.messages import RecordingLayout
+from hilctl.recording.encoder import RecordingLayout
+from hilctl.recording.metadata_keys import sealed, unsealed
 from hilctl.recording.reader import read
 from hilctl.recording.recover import recover_recording
 from hilctl.recording.recovery_scan import RecoveryScan
@@ -215,9 +215,9 @@ def test_what_a_dying_process_left_is_looked_at(tmp_path, make):
     with path.open("wb") as stream:
         make.write(stream, [make.batch(0, 4)], finish=False)
     left = make.batch(200, 4)
-    left.heads[0, Head.FIRST_SAMPLE] = -5
-    left.heads[2, Head.FIRST_SAMPLE] = 2**62
-    left.heads[3, Head.LATE_NS] = -(2**63)
+    left.heads[0, BlockHeader.FIRST_SAMPLE] = -5
+    left.heads[2, BlockHeader.FIRST_SAMPLE] = 2**62
+    left.heads[3, BlockHeader.LATE_NS] = -(2**63)
     assert sound_blocks(left).tolist() == [False, True, False, False]
     events = [Event(-1, "info", "x", "y"), Event(3, "info", "x", "y", time_ns=-9), make.ended]
     recovered = recover_recording(path, [left], events=events, ended_at=LAST_SAMPLE + 5)

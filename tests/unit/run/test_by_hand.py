@@ -8,7 +8,7 @@ import yaml
 from hilctl.base.errors import ConfigError, DeviceError, InputError, UnconfirmedError
 from hilctl.run.by_hand import put_safe
 from hilctl.run.run_folder import held_devices
-from hilctl_drivers.simulated.rigs import SimulatedTerfenol
+from hilctl_drivers.simulated.devices import SimulatedTerfenol
 
 
 class Amplifier(SimulatedTerfenol):

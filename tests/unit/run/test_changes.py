@@ -9,12 +9,12 @@ import pytest
 from hilctl.base.device import DeviceInfo
 from hilctl.base.errors import InputError
 from hilctl.base.yaml import Document
-from hilctl.experiment.check import check
 from hilctl.experiment.load import resolve
+from hilctl.experiment.preflight import check
 from hilctl.models.staged import FieldLag, StagedModel
 from hilctl.run import client
 from hilctl.run.changes import Changes, bound_refusal, command_range
-from hilctl.run.shared_page import SIZE, Field, SharedPage, Stop
+from hilctl.run.shared_page import SIZE, PageField, SharedPage, Stop
 from tests.fakes import SteppingClock
 from tests.published import terfenol_rdpi
 
@@ -69,7 +69,7 @@ def experiment():
 @pytest.fixture
 def page():
     made = SharedPage(mmap(-1, SIZE))
-    made.put(Field.NEXT_SAMPLE, 500)
+    made.put(PageField.NEXT_SAMPLE, 500)
     return made
 
 
@@ -100,8 +100,8 @@ def change(changes, gain=None, offset=None, over_s=0.2, inverse=None):
 
 def take(page, at):
     """Let the loop take the change on the page, at a sample."""
-    page.put(Field.NEXT_SAMPLE, at)
-    page.put(Field.TUNE_TAKEN, page.get(Field.TUNE_WANTED))
+    page.put(PageField.NEXT_SAMPLE, at)
+    page.put(PageField.TUNE_TAKEN, page.get(PageField.TUNE_WANTED))
 
 
 def test_a_change_reaches_the_loop_whole(changes, page):
@@ -112,8 +112,11 @@ def test_a_change_reaches_the_loop_whole(changes, page):
         "over_s": 0.2,
         "begins_at_sample": 500 + LEAD,
     }
-    assert (page.get_float(Field.TUNE_GAIN), page.get_float(Field.TUNE_OFFSET)) == (0.5, 0.0)
-    numbers = (Field.TUNE_SAMPLES, Field.TUNE_BEGINS_AT, Field.TUNE_WANTED)
+    assert (page.get_float(PageField.TUNE_GAIN), page.get_float(PageField.TUNE_OFFSET)) == (
+        0.5,
+        0.0,
+    )
+    numbers = (PageField.TUNE_SAMPLES, PageField.TUNE_BEGINS_AT, PageField.TUNE_WANTED)
     assert [page.get(each) for each in numbers] == [2000, 500 + LEAD, 1]
     assert (changes.gain, changes.offset) == (0.5, 0.0)
 
@@ -123,7 +126,7 @@ def test_the_second_of_two_follows_the_first(changes, page, waits):
     wanted = []
 
     def meanwhile():
-        wanted.append(page.get(Field.TUNE_WANTED))
+        wanted.append(page.get(PageField.TUNE_WANTED))
         if len(wanted) == 3:
             take(page, 1013)
 
@@ -133,7 +136,7 @@ def test_the_second_of_two_follows_the_first(changes, page, waits):
     assert wanted == [1, 1, 1]
     assert (answer["gain"], answer["offset"]) == (0.5, 3.0)
     assert answer["begins_at_sample"] == 1020 + LEAD
-    assert page.get(Field.TUNE_WANTED) == 2
+    assert page.get(PageField.TUNE_WANTED) == 2
 
 
 def test_a_refusal_changes_nothing_and_the_next_has_its_turn(changes, page):
@@ -147,8 +150,8 @@ def test_a_refusal_changes_nothing_and_the_next_has_its_turn(changes, page):
 @pytest.mark.parametrize(
     ("number", "value", "said"),
     [
-        (Field.STOP, Stop.CTRL_C, "on its way to the safe value"),
-        (Field.NEXT_SAMPLE, SAMPLES, "the waveform is over"),
+        (PageField.STOP, Stop.CTRL_C, "on its way to the safe value"),
+        (PageField.NEXT_SAMPLE, SAMPLES, "the waveform is over"),
     ],
 )
 def test_the_end_of_the_run_refuses_a_change_that_waits(changes, page, waits, number, value, said):
@@ -158,7 +161,7 @@ def test_the_end_of_the_run_refuses_a_change_that_waits(changes, page, waits, nu
     for gain in (0.2, 0.3):
         with pytest.raises(InputError, match=said):
             change(changes, gain=gain)
-    assert page.get(Field.TUNE_WANTED) == 1
+    assert page.get(PageField.TUNE_WANTED) == 1
 
 
 def test_a_loop_that_takes_no_change_is_not_waited_for_without_end(changes, waits):
@@ -170,10 +173,10 @@ def test_a_loop_that_takes_no_change_is_not_waited_for_without_end(changes, wait
 
 
 def test_a_change_that_could_not_begin_is_refused(changes, page):
-    page.put(Field.NEXT_SAMPLE, SAMPLES - LEAD)
+    page.put(PageField.NEXT_SAMPLE, SAMPLES - LEAD)
     with pytest.raises(InputError, match="before the change could begin"):
         change(changes, gain=0.5)
-    assert page.get(Field.TUNE_WANTED) == 0
+    assert page.get(PageField.TUNE_WANTED) == 0
 
 
 def test_a_queue_that_is_full_takes_no_more(changes, page, waits):
@@ -182,7 +185,7 @@ def test_a_queue_that_is_full_takes_no_more(changes, page, waits):
 
     def meanwhile():
         if refused:
-            take(page, page.get(Field.NEXT_SAMPLE))
+            take(page, page.get(PageField.NEXT_SAMPLE))
             return
         try:
             made.append(change(changes, gain=1.0))
@@ -204,7 +207,7 @@ def test_a_change_of_nothing_is_refused(changes):
 def test_the_inverse_goes_out_and_stays_there_until_it_is_wanted_in(changes, page, experiment):
     """A change of the gain in between leaves it where it is."""
     line = experiment.forecast.line
-    numbers = [Field.TUNE_INVERSE_SHARE, Field.TUNE_LINE_SLOPE, Field.TUNE_LINE_AT_ZERO]
+    numbers = [PageField.TUNE_INVERSE_SHARE, PageField.TUNE_LINE_SLOPE, PageField.TUNE_LINE_AT_ZERO]
     for at, wanted, share in (
         (2000, {"inverse": "out"}, 0.0),
         (4000, {"gain": 0.5}, 0.0),
@@ -220,7 +223,7 @@ def test_an_inverse_that_is_not_there_can_not_go_out(page):
     with pytest.raises(InputError, match="set: inverse: the experiment has no compensator"):
         change(changes, inverse="out")
     assert changes.inverse is None
-    assert page.get(Field.TUNE_WANTED) == 0
+    assert page.get(PageField.TUNE_WANTED) == 0
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from hilctl.base.errors import InputError, RunError
 from hilctl.run import child as module
 from hilctl.run.child import LoopProcess
 from hilctl.run.ring import SampleRing
-from hilctl.run.shared_page import Field, PageText, Phase
+from hilctl.run.shared_page import PageField, PageSlot, Phase
 
 
 class FakeProcess:
@@ -64,8 +64,8 @@ def test_a_loop_process_that_cannot_be_started_is_an_error_of_the_run(tmp_path, 
 def test_a_loop_that_can_not_start_says_why(started, phase, error):
     """What the user gave is told from what a device did."""
     child, page = started
-    page.write_text(PageText.ERROR, "no port")
-    page.put(Field.PHASE, phase)
+    page.write_text(PageSlot.ERROR, "no port")
+    page.put(PageField.PHASE, phase)
     with pytest.raises(error, match="no port"):
         child.await_ready(never)
 
@@ -81,7 +81,7 @@ def test_a_stop_comes_before_the_start(started):
     child, page = started
     with pytest.raises(RunError, match="stopped before the start; nothing has moved"):
         child.await_ready(lambda: True)
-    page.put(Field.PHASE, Phase.READY)
+    page.put(PageField.PHASE, Phase.READY)
     child.await_ready(lambda: True)
 
 
@@ -92,8 +92,8 @@ def test_a_loop_that_died_or_broke_says_what_it_can(started):
     assert child.death() == "the loop process died: exit code 7"
     child._process.code = -signal.SIGSEGV
     assert child.death() == "the loop process died: killed by SIGSEGV"
-    page.write_text(PageText.ERROR, "the loop broke: ZeroDivisionError")
-    page.put(Field.PHASE, Phase.FAILED)
+    page.write_text(PageSlot.ERROR, "the loop broke: ZeroDivisionError")
+    page.put(PageField.PHASE, Phase.FAILED)
     assert child.death() == "the loop broke: ZeroDivisionError"
 
 

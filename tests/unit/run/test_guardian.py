@@ -14,16 +14,16 @@ from types import SimpleNamespace
 import pytest
 
 from hilctl.base.errors import DeviceError
-from hilctl.loop.plan import Outcome
+from hilctl.loop.plan import LoopOutcome
 from hilctl.loop.safe_output import SafeGoal
 from hilctl.run import guardian
 from hilctl.run.guardian import LAST_CALL_MS, Guardian, HangWatch, SafeAction, is_stopped, main
 from hilctl.run.job import Job, SilenceLimits
 from hilctl.run.ring import SampleRing
 from hilctl.run.shared_page import (
-    Field,
     GuardianPhase,
-    PageText,
+    PageField,
+    PageSlot,
     Phase,
     SafeActionResult,
     SharedPage,
@@ -68,10 +68,10 @@ def guarded(tmp_path, monkeypatch):
     loop = subprocess.Popen(SLEEP)
     ring = SampleRing.create(tmp_path / "ring", slots=4, block=1, state_size=1)
     page = ring.page
-    page.put(Field.GO, 1)
-    page.put(Field.PHASE, Phase.RUNNING)
-    page.put(Field.REAL_TIME, 1)
-    page.put_float(Field.OUTPUT_AT_START, 0.25)
+    page.put(PageField.GO, 1)
+    page.put(PageField.PHASE, Phase.RUNNING)
+    page.put(PageField.REAL_TIME, 1)
+    page.put_float(PageField.OUTPUT_AT_START, 0.25)
     pidfd = os.pidfd_open(loop.pid)
     before = signal.getsignal(signal.SIGTERM)
     made = SimpleNamespace(loop=loop, page=page, ring=ring, device=Device(loop), pidfd=pidfd)
@@ -101,9 +101,9 @@ def test_a_loop_that_died_is_followed_by_the_safe_value(guarded):
 @pytest.mark.parametrize("how", ["stopped", "silent"])
 def test_a_loop_that_hangs_is_killed_before_the_device_is_touched(guarded, how):
     """A stopped one in the midst of an exchange too: nothing of it may come after."""
-    guarded.page.put(Field.LOOP_HEARTBEAT_NS, 1)
+    guarded.page.put(PageField.LOOP_HEARTBEAT_NS, 1)
     if how == "stopped":
-        guarded.page.put(Field.EXCHANGING, 1)
+        guarded.page.put(PageField.EXCHANGING, 1)
         guarded.loop.send_signal(signal.SIGSTOP)
         os.waitid(os.P_PID, guarded.loop.pid, os.WSTOPPED | os.WNOWAIT)
     guarded.guard(hang_s=0.03)
@@ -126,9 +126,9 @@ def test_a_loop_that_goes_on_is_left_alone(guarded, monkeypatch):
 
     monkeypatch.setattr(SharedPage, "put", noted)
     guarded.guard()
-    assert page[1] == (Field.GUARDIAN_PHASE, GuardianPhase.WATCHING)
-    heartbeats_ns = [value for field, value in page if field == Field.GUARDIAN_HEARTBEAT_NS]
-    assert [field for field, _ in page[:6]].count(Field.GUARDIAN_HEARTBEAT_NS) == 5
+    assert page[1] == (PageField.GUARDIAN_PHASE, GuardianPhase.WATCHING)
+    heartbeats_ns = [value for field, value in page if field == PageField.GUARDIAN_HEARTBEAT_NS]
+    assert [field for field, _ in page[:6]].count(PageField.GUARDIAN_HEARTBEAT_NS) == 5
     assert heartbeats_ns == sorted(set(heartbeats_ns))
     assert guarded.page.safe_result().confirmed
     assert not guarded.page.safe_result().hung
@@ -160,13 +160,13 @@ def test_a_loop_that_hangs_may_end_a_call_before_the_device_is_touched(guarded, 
             pidfd_send_signal=send,
         ),
     )
-    guarded.page.put(Field.LOOP_HEARTBEAT_NS, 1)
+    guarded.page.put(PageField.LOOP_HEARTBEAT_NS, 1)
     guarded.guard(hang_s=0.0)
     assert done[-2:] == [signal.SIGKILL, LAST_CALL_MS]
 
 
 def test_a_loop_that_ended_by_itself_is_left_to_what_it_said(guarded):
-    guarded.page.leave_outcome(Outcome("completed", "waveform completed", 7, "confirmed", 0))
+    guarded.page.leave_outcome(LoopOutcome("completed", "waveform completed", 7, "confirmed", 0))
     guarded.loop.kill()
     guarded.guard()
     assert guarded.device.asked == []
@@ -174,8 +174,8 @@ def test_a_loop_that_ended_by_itself_is_left_to_what_it_said(guarded):
 
 
 def test_a_loop_that_died_before_the_start_has_moved_nothing(guarded):
-    guarded.page.put(Field.GO, 0)
-    guarded.page.put(Field.PHASE, Phase.READY)
+    guarded.page.put(PageField.GO, 0)
+    guarded.page.put(PageField.PHASE, Phase.READY)
     guarded.loop.kill()
     guarded.guard()
     assert guarded.device.asked == []
@@ -183,14 +183,14 @@ def test_a_loop_that_died_before_the_start_has_moved_nothing(guarded):
 
 def test_a_loop_that_broke_is_followed_by_the_safe_value(guarded):
     """What it tried itself may not have been confirmed."""
-    guarded.page.put(Field.PHASE, Phase.FAILED)
+    guarded.page.put(PageField.PHASE, Phase.FAILED)
     guarded.loop.kill()
     guarded.guard()
     assert len(guarded.device.asked) == 1
 
 
 def test_the_way_is_a_ramp_from_the_last_command(guarded):
-    guarded.page.put_float(Field.OUTPUT_AT_START, 1.25)
+    guarded.page.put_float(PageField.OUTPUT_AT_START, 1.25)
     guarded.loop.kill()
     assert guarded.guard()
     values = [value for value, _ in guarded.device.asked]
@@ -201,7 +201,7 @@ def test_the_way_is_a_ramp_from_the_last_command(guarded):
 
 def test_a_ramp_that_another_process_began_is_gone_on_with(guarded):
     """It would step back to the last command otherwise."""
-    guarded.page.put_float(Field.OUTPUT_AT_START, 4.0)
+    guarded.page.put_float(PageField.OUTPUT_AT_START, 4.0)
     guarded.page.note_safe_write(0.3)
     guarded.loop.kill()
     guarded.guard()
@@ -211,7 +211,7 @@ def test_a_ramp_that_another_process_began_is_gone_on_with(guarded):
 @pytest.mark.parametrize("output", ["unknown", "set"])
 def test_a_loop_that_gave_up_is_followed(guarded, output):
     """It has its outcome, but the device did not confirm it."""
-    guarded.page.leave_outcome(Outcome("fault", "no answer", 7, output, 0))
+    guarded.page.leave_outcome(LoopOutcome("fault", "no answer", 7, output, 0))
     guarded.loop.kill()
     assert guarded.guard()
     assert guarded.page.safe_result().confirmed
@@ -241,9 +241,9 @@ def test_a_guardian_that_cannot_drive_the_device_says_so_and_ends(guarded, error
     guarded.device.error = error
     guarded.loop.kill()
     assert not guarded.guard()
-    assert guarded.page.get(Field.GUARDIAN_PHASE) == GuardianPhase.FAILED
+    assert guarded.page.get(PageField.GUARDIAN_PHASE) == GuardianPhase.FAILED
     assert guarded.page.safe_result() is None
-    assert type(error).__name__ in guarded.page.read_text(PageText.GUARDIAN)
+    assert type(error).__name__ in guarded.page.read_text(PageSlot.GUARDIAN)
 
 
 def test_it_gives_signs_of_life_while_the_device_keeps_it(guarded, monkeypatch):
@@ -259,8 +259,8 @@ def test_it_gives_signs_of_life_while_the_device_keeps_it(guarded, monkeypatch):
 
     def make_safe(value):
         while len(seen) < 3:
-            seen.add(guarded.page.get(Field.GUARDIAN_HEARTBEAT_NS))
-            assert guarded.page.get(Field.GUARDIAN_PHASE) == GuardianPhase.ACTING
+            seen.add(guarded.page.get(PageField.GUARDIAN_HEARTBEAT_NS))
+            assert guarded.page.get(PageField.GUARDIAN_PHASE) == GuardianPhase.ACTING
             time.sleep(0.0)
         go_on.set()
 
@@ -296,8 +296,8 @@ def written(tmp_path):
 )
 def test_a_device_that_can_not_be_made_is_said_before_the_start(written, experiment, said):
     assert written.call(experiment) == 1
-    assert written.page.get(Field.GUARDIAN_PHASE) == GuardianPhase.FAILED
-    assert said in written.page.read_text(PageText.GUARDIAN)
+    assert written.page.get(PageField.GUARDIAN_PHASE) == GuardianPhase.FAILED
+    assert said in written.page.read_text(PageSlot.GUARDIAN)
 
 
 def test_a_device_that_has_no_memory_is_said_before_the_start(written, monkeypatch):
@@ -306,8 +306,8 @@ def test_a_device_that_has_no_memory_is_said_before_the_start(written, monkeypat
 
     monkeypatch.setattr(Job, "device", device)
     assert written.call("device: {kind: simulated_terfenol}") == 1
-    assert written.page.get(Field.GUARDIAN_PHASE) == GuardianPhase.FAILED
-    assert written.page.read_text(PageText.GUARDIAN) == "not enough memory"
+    assert written.page.get(PageField.GUARDIAN_PHASE) == GuardianPhase.FAILED
+    assert written.page.read_text(PageSlot.GUARDIAN) == "not enough memory"
 
 
 def test_the_device_is_made_of_the_experiment_alone():
@@ -326,9 +326,9 @@ def test_it_prepares_for_a_machine_that_does_nothing_else(written, guarded, monk
     )
     monkeypatch.setattr(guardian, "LinuxProcess", lambda: process)
     monkeypatch.setattr(Job, "device", lambda job: guarded.device)
-    written.page.put(Field.GO, 1)
-    written.page.put_float(Field.OUTPUT_AT_START, 0.25)
-    written.page.put(Field.PHASE, Phase.RUNNING)
+    written.page.put(PageField.GO, 1)
+    written.page.put_float(PageField.OUTPUT_AT_START, 0.25)
+    written.page.put(PageField.PHASE, Phase.RUNNING)
     guarded.loop.kill()
     assert written.call("", guarded.pidfd) == 0
     assert guarded.device.asked == [(0.25, False)]
@@ -349,13 +349,13 @@ def test_refused_real_time_is_no_reason_to_leave_the_coil(written, guarded, monk
     monkeypatch.setattr(guardian, "LinuxProcess", lambda: process)
     guarded.loop.kill()
     assert written.call("device: {kind: simulated_terfenol}", guarded.pidfd) == 0
-    assert written.page.get(Field.GUARDIAN_PHASE) == GuardianPhase.WATCHING
+    assert written.page.get(PageField.GUARDIAN_PHASE) == GuardianPhase.WATCHING
 
 
 def test_it_brings_no_numba_along():
     """It is to be small, and ready at once."""
     code = (
-        "import sys, hilctl.run.guardian, hilctl_drivers.modbus.device\n"
+        "import sys, hilctl.run.guardian, hilctl_drivers.modbus.modbus_dac\n"
         "sys.exit(any(name in sys.modules for name in ('numba', 'scipy', 'mcap')))"
     )
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
@@ -369,9 +369,9 @@ class Watched:
 
     def __init__(self, folder):
         self.page = SampleRing.create(folder / "ring", slots=4, block=1, state_size=1).page
-        self.page.put(Field.PHASE, Phase.RUNNING)
-        self.page.put(Field.LOOP_HEARTBEAT_NS, 1)
-        self.page.put(Field.REAL_TIME, 1)
+        self.page.put(PageField.PHASE, Phase.RUNNING)
+        self.page.put(PageField.LOOP_HEARTBEAT_NS, 1)
+        self.page.put(PageField.REAL_TIME, 1)
         self.stopped = False
         self.watch = HangWatch(self.page, LIMITS, lambda: self.stopped)
 
@@ -394,14 +394,14 @@ def test_silence_beyond_the_limit_is_a_hang(watched):
 
 
 def test_without_real_time_priority_a_busy_machine_may_keep_the_loop_waiting(watched):
-    watched.page.put(Field.REAL_TIME, 0)
+    watched.page.put(PageField.REAL_TIME, 0)
     assert watched.hangs_after_s() == 1.7
 
 
 def test_heartbeat_starts_the_time_again(watched):
     """Any new sign of life will do."""
     assert not any(watched.looks(*[0.1 * k for k in range(10)]))
-    watched.page.put(Field.LOOP_HEARTBEAT_NS, 2)
+    watched.page.put(PageField.LOOP_HEARTBEAT_NS, 2)
     assert not any(watched.looks(*[0.9 + 0.1 * k for k in range(10)]))
 
 
@@ -413,13 +413,13 @@ def test_machine_that_stood_still_is_no_hang(watched):
 def test_loop_that_does_not_run_yet_or_any_more_does_not_hang(watched):
     """Opening and closing a device may take its time."""
     for phase in (Phase.STARTING, Phase.READY, Phase.ENDED, Phase.FAILED):
-        watched.page.put(Field.PHASE, phase)
+        watched.page.put(PageField.PHASE, phase)
         assert not any(watched.looks(*[0.5 * k for k in range(20)]))
 
 
 def test_a_device_that_keeps_the_loop_waiting_is_no_hang_at_once(watched):
     """An exchange may use up the device's time-out; for that long the loop is silent."""
-    watched.page.put(Field.EXCHANGING, 1)
+    watched.page.put(PageField.EXCHANGING, 1)
     assert watched.hangs_after_s() == 3.1
 
 
@@ -427,8 +427,8 @@ def test_a_device_that_keeps_the_loop_waiting_is_no_hang_at_once(watched):
 @pytest.mark.parametrize("exchanging", [0, 1])
 def test_a_loop_that_is_stopped_waits_for_no_device(watched, phase, exchanging):
     """SIGSTOP hits most loops in an exchange: its time-out is no excuse then, nor is the load."""
-    watched.page.put(Field.EXCHANGING, exchanging)
-    watched.page.put(Field.PHASE, phase)
+    watched.page.put(PageField.EXCHANGING, exchanging)
+    watched.page.put(PageField.PHASE, phase)
     watched.stopped = True
     assert watched.hangs_after_s() == 0.5
 
@@ -441,13 +441,13 @@ def test_a_stop_is_looked_at_several_times(watched):
 
 def test_closing_a_device_has_more_time(watched):
     """A device that is lost may use up its time-outs, but not for ever."""
-    watched.page.put(Field.PHASE, Phase.CLOSING)
+    watched.page.put(PageField.PHASE, Phase.CLOSING)
     assert watched.hangs_after_s() == pytest.approx(31.0, abs=0.11)
 
 
 def test_a_loop_that_never_comes_to_its_first_tick_is_found(watched):
     """Nothing has moved until then, so that it gets more time: from the first look on."""
-    watched.page.put(Field.LOOP_HEARTBEAT_NS, 0)
+    watched.page.put(PageField.LOOP_HEARTBEAT_NS, 0)
     assert not any(watched.looks(*[9e5 + 0.1 * k for k in range(310)]))
     assert watched.looks(9e5 + 31.2) == [True]
 

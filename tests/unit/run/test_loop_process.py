@@ -15,23 +15,23 @@ import numpy as np
 import pytest
 
 from hilctl.base.errors import DeviceError, InputError, RunError
-from hilctl.base.samples import Flag, Head
+from hilctl.base.samples import BlockHeader, Flag
 from hilctl.loop.compensator import Compensator
-from hilctl.loop.host import StraightLine, Tuning
+from hilctl.loop.host import LinearBypass, Tuning
 from hilctl.loop.interlocks import InterlockContext
 from hilctl.loop.limiter import CommandLimits
 from hilctl.loop.loop import Loop
 from hilctl.loop.pacer import Lateness, LateRules
-from hilctl.loop.plan import Outcome, Plan
-from hilctl.machine.realtime import SetUpStep
-from hilctl.machine.usage import ProcessUsage
+from hilctl.loop.plan import LoopOutcome, LoopPlan
+from hilctl.machine.process_usage import ProcessUsage
+from hilctl.machine.rt_setup import SetUpStep
 from hilctl.run import loop_process
 from hilctl.run import ring as ring_module
 from hilctl.run.job import Job
 from hilctl.run.loop_process import RingHost
 from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import RunCard, RunFolder
-from hilctl.run.shared_page import Field, PageText, Phase, Stop
+from hilctl.run.shared_page import PageField, PageSlot, Phase, Stop
 from hilctl.run.start import checked_experiment
 from tests.fakes import FakeClock, FakeDevice
 from tests.published import terfenol_rdpi
@@ -70,7 +70,7 @@ class Prepared:
             folder.ring, slots=16, block=50, state_size=checked.state_size
         )
         self.page = self.ring.page
-        self.page.put(Field.GO, 1)
+        self.page.put(PageField.GO, 1)
         self.job = Job.of(checked, folder, supervisor=os.getppid(), silence_s=1.0)
         self.device = Closing(checked.loaded.device.info, **device_is)
         self.loaded = replace(checked.loaded, device=self.device)
@@ -116,7 +116,7 @@ def test_a_loop_that_breaks_makes_the_output_safe_and_closes(broken):
     device, error, page = broken(reachable=True)
     assert device.events == ["prepare", "open", "make_safe", "close"]
     assert isinstance(error, ZeroDivisionError)
-    assert page.get(Field.PHASE) == Phase.RUNNING
+    assert page.get(PageField.PHASE) == Phase.RUNNING
 
 
 def test_the_cause_is_not_lost_behind_a_device_that_can_not_be_reached(broken):
@@ -134,39 +134,39 @@ def test_a_start_that_is_refused_moves_nothing(broken, output):
     assert device.events == ["prepare", "open", "close"]
     assert isinstance(error, InputError)
     assert str(error).endswith("nothing has moved")
-    assert page.get(Field.PHASE) == Phase.STARTING
+    assert page.get(PageField.PHASE) == Phase.STARTING
 
 
 @pytest.mark.parametrize(("output", "ramps"), [(0.0, False), (5.0, True)])
 def test_the_waveform_begins_after_the_ramp(broken, output, ramps):
     """The recorder needs to know before the first sample: the page says it."""
     _, _, page = broken(output=output)
-    assert (page.get(Field.WAVEFORM_AT) > 0) == ramps
+    assert (page.get(PageField.WAVEFORM_AT) > 0) == ramps
 
 
-OUTCOME = Outcome("completed", "waveform completed", 7, "confirmed", 0)
+OUTCOME = LoopOutcome("completed", "waveform completed", 7, "confirmed", 0)
 REFUSED = (SetUpStep("fifo", "failed", "not permitted", "raise rtprio"),)
 
 
 def test_the_loop_is_started_at_the_time_that_the_supervisor_says(prepared):
     """It is ready with all that it set up, says so, and leaves how late it was."""
     made = prepared()
-    made.page.put(Field.START_NS, 12345)
+    made.page.put(PageField.START_NS, 12345)
     made.steps = REFUSED
     seen = []
 
     def run(loop, start_ns):
-        seen.append((start_ns, made.page.get(Field.PHASE)))
+        seen.append((start_ns, made.page.get(PageField.PHASE)))
         loop.lateness.late_ticks, loop.lateness.worst_ns = 3, 70
         return OUTCOME
 
     made.loop_does(run)
     assert made.run() == OUTCOME
     assert seen == [(12345, Phase.RUNNING)]
-    assert made.page.get(Field.PHASE) == Phase.CLOSING
+    assert made.page.get(PageField.PHASE) == Phase.CLOSING
     assert made.device.events == ["prepare", "open", "close"]
     assert made.page.lateness() == Lateness(late_ticks=3, worst_ns=70)
-    facts, refused = json.loads(made.page.read_text(PageText.SET_UP))
+    facts, refused = json.loads(made.page.read_text(PageSlot.SET_UP))
     assert facts == {"rt.fifo": "failed: not permitted"}
     assert refused == ["fifo: not permitted: raise rtprio"]
 
@@ -194,10 +194,10 @@ class Waiting:
         self.made, self.supervised, self.slept_s = made, supervised, []
 
     def sleep(self, seconds):
-        assert self.made.page.get(Field.PHASE) == Phase.READY
+        assert self.made.page.get(PageField.PHASE) == Phase.READY
         self.slept_s.append(seconds)
         if len(self.slept_s) == 3:
-            self.made.page.put(Field.GO, 1)
+            self.made.page.put(PageField.GO, 1)
 
     def __getattr__(self, name):
         return getattr(time, name)
@@ -206,7 +206,7 @@ class Waiting:
 def test_it_waits_for_the_start_signal(prepared, monkeypatch):
     """Ready, and looking often: what it sleeps is missing between the signal and sample 0."""
     made = prepared()
-    made.page.put(Field.GO, 0)
+    made.page.put(PageField.GO, 0)
     made.loop_does(lambda loop, start_ns: OUTCOME)
     waiting = Waiting(made)
     monkeypatch.setattr(loop_process, "time", waiting)
@@ -218,7 +218,7 @@ def test_it_waits_for_the_start_signal(prepared, monkeypatch):
 def test_if_the_supervisor_dies_before_the_start_nothing_moves(prepared, monkeypatch):
     """There is no recording that could say so; the output stays where it was found."""
     made = prepared()
-    made.page.put(Field.GO, 0)
+    made.page.put(PageField.GO, 0)
     monkeypatch.setattr("hilctl.run.loop_process.RingHost.supervised", lambda host: False)
     with pytest.raises(RunError, match="nothing has moved"):
         made.run()
@@ -265,8 +265,8 @@ def test_all_that_it_has_to_say_is_in_the_page(prepared, monkeypatch, raised, co
     made.job.write(made.folder.job)
     assert loop_process.main([str(made.folder.job)]) == code
     assert signals == dict.fromkeys((signal.SIGINT, signal.SIGTERM, signal.SIGHUP), signal.SIG_IGN)
-    assert made.page.get(Field.PHASE) == phase
-    assert made.page.read_text(PageText.ERROR) == text
+    assert made.page.get(PageField.PHASE) == phase
+    assert made.page.read_text(PageSlot.ERROR) == text
     assert made.page.outcome() == (OUTCOME if code == 0 else None)
 
 
@@ -278,8 +278,8 @@ OF_OTHERS = ("scipy.special", "mcap", "google.protobuf", "rich", "typer")
 @pytest.mark.parametrize(
     ("modules", "left_out"),
     [
-        ("hilctl.run.loop_process, hilctl_drivers.modbus.device", BULKY + OF_OTHERS),
-        ("hilctl.run.loop_process, hilctl_drivers.simulated.rigs", BULKY + OF_OTHERS[1:]),
+        ("hilctl.run.loop_process, hilctl_drivers.modbus.modbus_dac", BULKY + OF_OTHERS),
+        ("hilctl.run.loop_process, hilctl_drivers.simulated.devices", BULKY + OF_OTHERS[1:]),
         ("hilctl.cli.run", BULKY),
         ("hilctl.run.client", (*BULKY, *OF_OTHERS, "numpy", "pydantic")),
     ],
@@ -312,15 +312,15 @@ def clock():
 def host(ring, clock, monkeypatch):
     """A host whose supervisor is process 77 and shows life at once."""
     monkeypatch.setattr("os.getppid", lambda: 77)
-    ring.page.put(Field.SUPERVISOR_HEARTBEAT_NS, clock.now)
+    ring.page.put(PageField.SUPERVISOR_HEARTBEAT_NS, clock.now)
     return RingHost(ring, clock, 77, SILENCE_S)
 
 
 def test_a_heartbeat_shows_time_sample_and_late_ticks(host, ring, clock):
     assert host.heartbeat(50, 3) == ""
     page = ring.page
-    assert page.get(Field.LOOP_HEARTBEAT_NS) == clock.now
-    assert (page.get(Field.NEXT_SAMPLE), page.get(Field.LATE_TICKS)) == (50, 3)
+    assert page.get(PageField.LOOP_HEARTBEAT_NS) == clock.now
+    assert (page.get(PageField.NEXT_SAMPLE), page.get(PageField.LATE_TICKS)) == (50, 3)
 
 
 def test_each_reason_to_end_is_said(host, ring, clock, monkeypatch):
@@ -331,7 +331,7 @@ def test_each_reason_to_end_is_said(host, ring, clock, monkeypatch):
     assert host.heartbeat(0, 0) == "stopped because the supervisor was silent for 2 s"
     monkeypatch.setattr("os.getppid", lambda: 1)
     assert host.heartbeat(0, 0) == "stopped because the supervisor died"
-    ring.page.put(Field.STOP, Stop.CTRL_C)
+    ring.page.put(PageField.STOP, Stop.CTRL_C)
     assert host.heartbeat(0, 0) == Stop.CTRL_C.reason
 
 
@@ -340,38 +340,38 @@ def test_a_tuning_is_taken_once(host, ring):
     page = ring.page
     assert host.tuning() is None
     for number, gain in enumerate((0.5, 0.75), start=1):
-        page.put_float(Field.TUNE_GAIN, gain)
-        page.put_float(Field.TUNE_OFFSET, -1.0)
-        page.put(Field.TUNE_SAMPLES, 40)
-        page.put_float(Field.TUNE_INVERSE_SHARE, 0.25)
-        page.put_float(Field.TUNE_LINE_SLOPE, 0.1)
-        page.put_float(Field.TUNE_LINE_AT_ZERO, -2.0)
-        page.put(Field.TUNE_WANTED, number)
-        assert host.tuning() == Tuning(gain, -1.0, 40, 0, 0.25, StraightLine(0.1, -2.0))
+        page.put_float(PageField.TUNE_GAIN, gain)
+        page.put_float(PageField.TUNE_OFFSET, -1.0)
+        page.put(PageField.TUNE_SAMPLES, 40)
+        page.put_float(PageField.TUNE_INVERSE_SHARE, 0.25)
+        page.put_float(PageField.TUNE_LINE_SLOPE, 0.1)
+        page.put_float(PageField.TUNE_LINE_AT_ZERO, -2.0)
+        page.put(PageField.TUNE_WANTED, number)
+        assert host.tuning() == Tuning(gain, -1.0, 40, 0, 0.25, LinearBypass(0.1, -2.0))
         assert host.tuning() is None
-        assert page.get(Field.TUNE_TAKEN) == number
+        assert page.get(PageField.TUNE_TAKEN) == number
 
 
 def test_a_tuning_waits_for_its_sample(host, ring):
     """It was worked out from there on; where a tick was skipped it begins at the next one."""
     page = ring.page
-    page.put_float(Field.TUNE_GAIN, 0.5)
-    page.put_float(Field.TUNE_INVERSE_SHARE, 1.0)
-    page.put(Field.TUNE_SAMPLES, 40)
-    page.put(Field.TUNE_BEGINS_AT, 60)
-    page.put(Field.TUNE_WANTED, 1)
+    page.put_float(PageField.TUNE_GAIN, 0.5)
+    page.put_float(PageField.TUNE_INVERSE_SHARE, 1.0)
+    page.put(PageField.TUNE_SAMPLES, 40)
+    page.put(PageField.TUNE_BEGINS_AT, 60)
+    page.put(PageField.TUNE_WANTED, 1)
     host.heartbeat(59, 0)
     assert host.tuning() is None
-    assert page.get(Field.TUNE_TAKEN) == 0
+    assert page.get(PageField.TUNE_TAKEN) == 0
     host.heartbeat(61, 0)
     assert host.tuning() == Tuning(0.5, 0.0, 40, 60)
-    assert page.get(Field.TUNE_TAKEN) == 1
+    assert page.get(PageField.TUNE_TAKEN) == 1
 
 
 def test_closing_is_shown_before_the_device_takes_its_time(host, ring, clock):
     host.closing()
-    assert ring.page.get(Field.PHASE) == Phase.CLOSING
-    assert ring.page.get(Field.LOOP_HEARTBEAT_NS) == clock.now
+    assert ring.page.get(PageField.PHASE) == Phase.CLOSING
+    assert ring.page.get(PageField.LOOP_HEARTBEAT_NS) == clock.now
 
 
 def test_a_supervisor_may_be_silent_for_ever(ring, clock, monkeypatch):
@@ -403,7 +403,7 @@ class Rig:
         compensator = Compensator(terfenol_rdpi(), 1000.0)
         compensator.warm_up()
         reference = 14.0 * np.sin(2 * np.pi * 25.0 * np.arange(self.SAMPLES) / 1000.0)
-        plan = Plan(
+        plan = LoopPlan(
             reference=reference,
             input_um=reference,
             block=block,
@@ -416,7 +416,7 @@ class Rig:
         )
         size = compensator.state_size + 1
         self.ring = SampleRing.create(folder, slots=self.SLOTS, block=block, state_size=size)
-        self.ring.page.put(Field.SUPERVISOR_HEARTBEAT_NS, 1)
+        self.ring.page.put(PageField.SUPERVISOR_HEARTBEAT_NS, 1)
         self.host = RingHost(self.ring, FakeClock(stall_ns=stalls or {}), os.getppid(), 5.0)
         self.batches, self.answered = [], self.host.answered
         self.host.answered = self.take
@@ -460,9 +460,9 @@ def test_a_slot_that_is_used_again_has_nothing_of_its_last_block(tmp_path, monke
 @pytest.mark.parametrize(
     ("field", "number", "reason"),
     [
-        (Field.STOP, Stop.REQUEST, Stop.REQUEST.reason),
+        (PageField.STOP, Stop.REQUEST, Stop.REQUEST.reason),
         (
-            Field.SUPERVISOR_HEARTBEAT_NS,
+            PageField.SUPERVISOR_HEARTBEAT_NS,
             -(10**10),
             "stopped because the supervisor was silent for 5 s",
         ),
@@ -483,8 +483,14 @@ def test_a_block_on_its_way_can_be_seen_as_such(tmp_path):
 
     def look(command):
         batch, page = rig.ring.unanswered(20), rig.ring.page
-        sent = batch.heads[0, Head.FIRST_SAMPLE], batch.columns[0, 2, 0]
-        fields = (Field.SENT, Field.HEAD, Field.ENDED_AT, Field.EXCHANGING, Field.NEXT_SAMPLE)
+        sent = batch.heads[0, BlockHeader.FIRST_SAMPLE], batch.columns[0, 2, 0]
+        fields = (
+            PageField.SENT,
+            PageField.HEAD,
+            PageField.ENDED_AT,
+            PageField.EXCHANGING,
+            PageField.NEXT_SAMPLE,
+        )
         seen.append((*sent, [page.get(field) for field in fields]))
         assert sent[1] == command
 
@@ -496,7 +502,7 @@ def test_a_block_on_its_way_can_be_seen_as_such(tmp_path):
 
 def test_a_tick_shows_how_many_were_late(tmp_path):
     page = []
-    fields = (Field.LATE_TICKS, Field.NEXT_SAMPLE, Field.LOOP_HEARTBEAT_NS)
+    fields = (PageField.LATE_TICKS, PageField.NEXT_SAMPLE, PageField.LOOP_HEARTBEAT_NS)
     rig = Rig(
         tmp_path / "ring",
         at=20,

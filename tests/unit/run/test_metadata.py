@@ -8,16 +8,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hilctl.recording.validation import labels_of
 
 from hilctl.analysis.report import summarize
 from hilctl.base.events import TUNED, Event
 from hilctl.base.samples import COLUMNS, Flag
 from hilctl.base.segments import Segment
 from hilctl.loop.pacer import Lateness
-from hilctl.loop.plan import Outcome
-from hilctl.recording.facts import END_FIGURES
+from hilctl.loop.plan import LoopOutcome
+from hilctl.recording.metadata_keys import END_FIGURES
 from hilctl.recording.reader import read
+from hilctl.recording.validation import labels_of
 from hilctl.run.metadata import (
     EndFigures,
     RunDescription,
@@ -31,7 +31,7 @@ from hilctl.run.shared_page import SIZE, SharedPage
 from hilctl.run.start import checked_experiment
 
 EXPERIMENT = Path(__file__).parents[3] / "configs" / "demo.yaml"
-OUTCOME = Outcome("stopped", "asked to", 400, "confirmed", 50)
+OUTCOME = LoopOutcome("stopped", "asked to", 400, "confirmed", 50)
 COUNTERS = Lateness(late_ticks=1, skipped_ticks=2, worst_ns=3, worst_tick=4, longest_run=5)
 FACTS = {
     "code": "stopped",

@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 
 from hilctl.base.errors import InputError
-from hilctl.loop.plan import Outcome
+from hilctl.loop.plan import LoopOutcome
 from hilctl.recording.reader import read
 from hilctl.run.orphans import recover_orphans
 from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import dismiss, run_folder, runs
-from hilctl.run.shared_page import Field, PageText, Phase, SafeActionResult
+from hilctl.run.shared_page import PageField, PageSlot, Phase, SafeActionResult
 
 GOLDEN = Path(__file__).parents[3] / "recordings" / "golden" / "terfenol_uncompensated.mcap"
 
@@ -52,10 +52,10 @@ def test_a_loop_that_ended_by_its_ramp_is_believed(dead):
 
     def fill(folder):
         page = SampleRing.create(folder.ring, slots=4, block=1, state_size=1).page
-        ended = Outcome("stopped", "stopped because the supervisor died", 0, "confirmed", 0)
-        page.write_text(PageText.OUTCOME, json.dumps(asdict(ended)))
-        page.put(Field.PHASE, Phase.ENDED)
-        page.put(Field.GO, 1)
+        ended = LoopOutcome("stopped", "stopped because the supervisor died", 0, "confirmed", 0)
+        page.write_text(PageSlot.OUTCOME, json.dumps(asdict(ended)))
+        page.put(PageField.PHASE, Phase.ENDED)
+        page.put(PageField.GO, 1)
 
     dead(fill)
     (orphan,) = recover_orphans()
@@ -71,8 +71,8 @@ def test_what_the_guardian_did_is_said(dead, error, words):
 
     def fill(folder):
         page = SampleRing.create(folder.ring, slots=4, block=1, state_size=1).page
-        page.put(Field.PHASE, Phase.RUNNING)
-        page.put(Field.GO, 1)
+        page.put(PageField.PHASE, Phase.RUNNING)
+        page.put(PageField.GO, 1)
         output = "unknown" if error else "confirmed"
         page.leave_safe_result(SafeActionResult(hung=False, output=output, error=error))
 
@@ -109,7 +109,7 @@ def test_what_can_not_be_recovered_is_kept(dead):
 
 def ready(folder):
     page = SampleRing.create(folder.ring, slots=4, block=1, state_size=1).page
-    page.put(Field.PHASE, Phase.READY)
+    page.put(PageField.PHASE, Phase.READY)
 
 
 @pytest.mark.parametrize("fill", [lambda folder: None, ready])

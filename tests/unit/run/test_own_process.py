@@ -5,7 +5,7 @@ import threading
 
 import pytest
 
-from hilctl.base.errors import ConfigError, InputError, Problem, RunError
+from hilctl.base.errors import ConfigError, ConfigProblem, InputError, RunError
 from hilctl.run import own_process
 from hilctl.run.own_process import has_threads, run_in_own_process
 
@@ -43,7 +43,7 @@ def test_errors_come_back_as_they_are(answering):
     )
     with pytest.raises(ConfigError) as refused:
         run_in_own_process(GIVEN, print)
-    assert refused.value.problems == (Problem("x.yaml:1", "name", "is required"),)
+    assert refused.value.problems == (ConfigProblem("x.yaml:1", "name", "is required"),)
 
 
 @pytest.mark.parametrize("code", ["", "answers.write(b'cut')", "os._exit(7)"])

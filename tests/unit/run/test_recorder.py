@@ -15,16 +15,16 @@ from mcap.writer import MCAP0_MAGIC
 
 from hilctl.base.errors import InputError
 from hilctl.base.events import Event
-from hilctl.base.samples import Batch, Head
+from hilctl.base.samples import BlockBatch, BlockHeader
 from hilctl.experiment.device_state import read_device_state
-from hilctl.loop.plan import Outcome
-from hilctl.recording.ends import read_ends
+from hilctl.loop.plan import LoopOutcome
 from hilctl.recording.reader import read
+from hilctl.recording.run_summary import read_ends
 from hilctl.recording.writer import OutputFile, PendingFile
 from hilctl.run import recorder
-from hilctl.run.recorder import Recorder, RingRecorder, Tail, steady_unix_ns
+from hilctl.run.recorder import RecentSamples, Recorder, RingRecorder, steady_unix_ns
 from hilctl.run.ring import SampleRing
-from hilctl.run.shared_page import Field
+from hilctl.run.shared_page import PageField
 from hilctl.run.start import checked_experiment
 from tests.fakes import FailingFile
 
@@ -33,12 +33,12 @@ BLOCK = 10
 END = {"code": "completed", "reason": "waveform completed"}
 
 
-def batch(first: int, blocks: int, dropped: int = 0) -> Batch:
+def batch(first: int, blocks: int, dropped: int = 0) -> BlockBatch:
     """Return blocks that follow one another, the first behind a gap of ``dropped`` samples."""
-    made = Batch.empty(blocks, BLOCK, 3)
-    made.heads[:, Head.FIRST_SAMPLE] = first + BLOCK * np.arange(blocks)
-    made.heads[:, Head.SAMPLES] = BLOCK
-    made.heads[0, Head.DROPPED_BEFORE] = dropped
+    made = BlockBatch.empty(blocks, BLOCK, 3)
+    made.heads[:, BlockHeader.FIRST_SAMPLE] = first + BLOCK * np.arange(blocks)
+    made.heads[:, BlockHeader.SAMPLES] = BLOCK
+    made.heads[0, BlockHeader.DROPPED_BEFORE] = dropped
     made.columns[:] = np.random.default_rng(first).normal(size=made.columns.shape)
     return made
 
@@ -216,8 +216,8 @@ def test_times_go_on_when_the_wall_clock_is_set(monkeypatch):
 
 def numbered(first, blocks, block):
     """Return blocks in which every value of a sample is its index."""
-    made = Batch.empty(blocks, block, 1)
-    made.heads[:, Head.FIRST_SAMPLE] = first + block * np.arange(blocks)
+    made = BlockBatch.empty(blocks, block, 1)
+    made.heads[:, BlockHeader.FIRST_SAMPLE] = first + block * np.arange(blocks)
     numbers = first + np.arange(blocks * block).reshape(blocks, block)
     made.columns[:] = numbers[:, None, :]
     made.flags[:] = numbers
@@ -227,7 +227,7 @@ def numbered(first, blocks, block):
 @pytest.mark.parametrize("block", [1, 7, 4000])
 def test_last_samples_come_up_to_the_one_asked_for(block):
     """However they came, the samples before an event are told in order, and no later ones."""
-    tail = Tail(50)
+    tail = RecentSamples(50)
     for start in range(0, 40 * block, 4 * block):
         tail.add(numbered(start, 4, block))
     last = 40 * block - 1
@@ -241,7 +241,7 @@ def test_last_samples_come_up_to_the_one_asked_for(block):
 
 def test_nothing_comes_before_the_first_sample():
     """An event before any sample has none to tell."""
-    tail = Tail(50)
+    tail = RecentSamples(50)
     assert tail.up_to(10) is None
     tail.add(numbered(100, 1, 5))
     assert tail.up_to(99) is None
@@ -306,7 +306,7 @@ def test_a_recording_that_is_deleted_before_the_start_is_refused(on_a_disk):
     on_a_disk.give_back()
 
 
-ENDED = Outcome("completed", "waveform completed", 8, "confirmed", 0)
+ENDED = LoopOutcome("completed", "waveform completed", 8, "confirmed", 0)
 
 
 class RecorderDouble:
@@ -325,7 +325,7 @@ class RecorderDouble:
     def batch(self, batch):
         if self.broken:
             raise ZeroDivisionError("a bug")
-        self.firsts += batch.heads[:, Head.FIRST_SAMPLE].tolist()
+        self.firsts += batch.heads[:, BlockHeader.FIRST_SAMPLE].tolist()
 
     def event(self, event):
         self.events.append(event.code)
@@ -358,7 +358,7 @@ def recording(ring):
 def exchange(ring, count, *, answered=True):
     for _ in range(count):
         block = ring.claim()
-        block.head[Head.FIRST_SAMPLE] = block.number
+        block.head[BlockHeader.FIRST_SAMPLE] = block.number
         ring.sending(block)
         if answered:
             ring.answered(block)
@@ -368,8 +368,8 @@ def test_room_is_given_back_once_the_file_has_what_stood_there(ring, recording):
     exchange(ring, 3)
     recording._work()
     assert recording.recorder.firsts == [0, 1, 2]
-    assert ring.page.get(Field.TAIL) == 2  # an eighth of the ring stays for those who look on
-    assert recording.newest.heads[-1, Head.FIRST_SAMPLE] == 2
+    assert ring.page.get(PageField.TAIL) == 2  # an eighth of the ring stays for those who look on
+    assert recording.newest.heads[-1, BlockHeader.FIRST_SAMPLE] == 2
 
 
 def test_a_loop_that_is_never_waited_for_keeps_no_sample_from_the_file(ring, recording):
@@ -408,13 +408,13 @@ def test_what_the_disk_refuses_stays_in_the_ring(ring, recording, monkeypatch):
     now_s = 103.0
     exchange(ring, 2)
     recording._work()
-    assert ring.page.get(Field.TAIL) == ring.page.get(Field.EVENT_TAIL) == 0
+    assert ring.page.get(PageField.TAIL) == ring.page.get(PageField.EVENT_TAIL) == 0
     assert recording.stalled_s() == 3.0
     recording.recorder.refused = False
     recording._work()
     assert recording.recorder.firsts == [0, 1, 2, 3, 4]
     assert recording.recorder.events == ["of_the_loop"]
-    assert (ring.page.get(Field.TAIL), ring.page.get(Field.EVENT_TAIL)) == (4, 1)
+    assert (ring.page.get(PageField.TAIL), ring.page.get(PageField.EVENT_TAIL)) == (4, 1)
     assert recording.stalled_s() == 0.0
 
 
@@ -448,8 +448,8 @@ def test_what_a_dead_loop_had_sent_is_recorded_as_not_answered(ring, recording):
     """And the samples behind a damaged block come out too."""
     exchange(ring, 4)
     exchange(ring, 2, answered=False)
-    ring._area.heads[1, Head.SEQUENCE] = 77
-    recording.end(Outcome("fault", "it died", 0, "confirmed", 0), lost_loop=True)
+    ring._area.heads[1, BlockHeader.SEQUENCE] = 77
+    recording.end(LoopOutcome("fault", "it died", 0, "confirmed", 0), lost_loop=True)
     recording._finish()
     assert recording.recorder.firsts == [0, 2, 3, 4, 5]
     assert recording.recorder.finished == ("it died", 6)
@@ -496,7 +496,7 @@ def test_nobody_waits_for_a_disk_that_stands_still(ring, recording, monkeypatch)
     assert not recording.finished
     now_s = 107.0
     assert recording.stalled_s() == 7.0
-    assert ring.page.get(Field.TAIL) == 0
+    assert ring.page.get(PageField.TAIL) == 0
     recording.recorder.disk.set()
     recording._thread.join(30.0)
     assert recording.recorder.finished == ("waveform completed", 8)

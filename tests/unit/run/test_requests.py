@@ -13,7 +13,7 @@ from hilctl.base.events import MARK
 from hilctl.run import protocol
 from hilctl.run.requests import REQUESTS, Requests
 from hilctl.run.run_folder import run_folder
-from hilctl.run.shared_page import SIZE, Field, Phase, SharedPage, Stop
+from hilctl.run.shared_page import SIZE, PageField, Phase, SharedPage, Stop
 from hilctl.run.start import checked_experiment
 
 DEMO = Path(__file__).parents[3] / "configs" / "demo.yaml"
@@ -27,8 +27,8 @@ def checked():
 @pytest.fixture
 def page():
     made = SharedPage(mmap(-1, SIZE))
-    made.put(Field.PHASE, Phase.RUNNING)
-    made.put(Field.NEXT_SAMPLE, 500)
+    made.put(PageField.PHASE, Phase.RUNNING)
+    made.put(PageField.NEXT_SAMPLE, 500)
     return made
 
 
@@ -53,14 +53,14 @@ def asked(requests, **message):
 def test_status_says_where_the_run_stands(requests, page):
     found = asked(requests, command="status")
     assert (found["state"], found["sample"], found["gain"]) == ("running", 500, 1.0)
-    page.put(Field.STOP, Stop.CTRL_C)
+    page.put(PageField.STOP, Stop.CTRL_C)
     assert asked(requests, command="status")["state"] == "stopping"
 
 
 def test_a_change_is_passed_to_the_loop(requests, page):
     answer = asked(requests, command="set", gain=0.5, over_s=2.0)
     assert (answer["gain"], answer["offset"], answer["over_s"]) == (0.5, 0.0, 2.0)
-    assert (page.get_float(Field.TUNE_GAIN), page.get(Field.TUNE_WANTED)) == (0.5, 1)
+    assert (page.get_float(PageField.TUNE_GAIN), page.get(PageField.TUNE_WANTED)) == (0.5, 1)
 
 
 def test_nobody_stops_a_run_by_its_socket(requests):
@@ -102,17 +102,17 @@ def test_bad_requests_change_nothing(requests, page, line, said):
 
 
 def test_nothing_is_moved_on_the_way_out(requests, page, checked):
-    page.put(Field.NEXT_SAMPLE, checked.forecast.samples)
+    page.put(PageField.NEXT_SAMPLE, checked.forecast.samples)
     with pytest.raises(InputError, match="the waveform is over"):
         asked(requests, command="set", gain=0.5)
-    page.put(Field.STOP, Stop.REQUEST)
+    page.put(PageField.STOP, Stop.REQUEST)
     with pytest.raises(InputError, match="on its way to the safe value"):
         asked(requests, command="set", gain=0.5)
 
 
 def test_a_mark_is_an_event_at_the_present_sample(requests, page, recording):
     """Counted from the start of the run, as every event is."""
-    page.put(Field.WAVEFORM_AT, 100)
+    page.put(PageField.WAVEFORM_AT, 100)
     answer = asked(requests, command="mark", text="tapped the stage")
     assert answer == {"sample": 600, "text": "tapped the stage"}
     (event,) = recording.events

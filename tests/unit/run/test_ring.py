@@ -7,10 +7,10 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from hilctl.base.samples import LAST_SAMPLE, LONGEST_NS, Flag, Head
+from hilctl.base.samples import LAST_SAMPLE, LONGEST_NS, BlockHeader, Flag
 from hilctl.run import ring as module
 from hilctl.run.ring import SampleRing
-from hilctl.run.shared_page import Field, PageText
+from hilctl.run.shared_page import PageField, PageSlot
 
 BLOCK, STATE = 3, 2
 
@@ -22,8 +22,8 @@ def make(tmp_path, slots=4):
 def born(ring, number, *, due=True):
     """Fill a block in its slot and send it."""
     block = ring.claim(due=due)
-    block.head[Head.FIRST_SAMPLE], block.head[Head.SAMPLES] = number * BLOCK, BLOCK
-    block.head[Head.DEADLINE_NS] = number
+    block.head[BlockHeader.FIRST_SAMPLE], block.head[BlockHeader.SAMPLES] = number * BLOCK, BLOCK
+    block.head[BlockHeader.DEADLINE_NS] = number
     block.state[:] = -number
     for row in (block.reference, block.wanted, block.command, block.input_um):
         row[:] = number
@@ -45,7 +45,7 @@ def test_blocks_come_out_as_they_went_in(tmp_path):
     assert push(ring, 1)
     assert push(ring, 2)
     batch = other.pop()
-    assert batch.heads[:, Head.FIRST_SAMPLE].tolist() == [3, 6]
+    assert batch.heads[:, BlockHeader.FIRST_SAMPLE].tolist() == [3, 6]
     assert batch.columns[1].tolist() == [[2.0] * BLOCK] * 6
     assert batch.states.tolist() == [[-1.0, -1.0], [-2.0, -2.0]]
     assert batch.flags.tolist() == [[1] * BLOCK, [2] * BLOCK]
@@ -57,7 +57,7 @@ def test_full_ring_refuses_and_keeps_what_it_has(tmp_path):
     ring = make(tmp_path)
     other = SampleRing(ring.path)
     assert [push(ring, n) for n in range(6)] == [True] * 4 + [False] * 2
-    assert other.pop().heads[:, Head.FIRST_SAMPLE].tolist() == [0, 3, 6, 9]
+    assert other.pop().heads[:, BlockHeader.FIRST_SAMPLE].tolist() == [0, 3, 6, 9]
     assert not push(ring, 9)
     other.release()
     assert push(ring, 9)
@@ -97,7 +97,7 @@ def test_many_come_out_some_at_a_time(tmp_path, monkeypatch):
     sizes, taken = [], []
     for batch in other.batches():
         sizes.append(batch.heads.shape[0])
-        taken += (batch.heads[:, Head.FIRST_SAMPLE] // BLOCK).tolist()
+        taken += (batch.heads[:, BlockHeader.FIRST_SAMPLE] // BLOCK).tolist()
         if len(sizes) == 1:
             push(ring, 9)
     assert (sizes, taken) == ([2, 2, 2], [*range(3, 9)])
@@ -125,10 +125,10 @@ def test_any_order_of_pushes_and_pops(tmp_path_factory, steps):
             if push(ring, number):
                 accepted.append(number)
         elif (batch := other.pop()) is not None:
-            taken += batch.heads[:, Head.DEADLINE_NS].tolist()
+            taken += batch.heads[:, BlockHeader.DEADLINE_NS].tolist()
             other.release()
     while (batch := other.pop()) is not None:
-        taken += batch.heads[:, Head.DEADLINE_NS].tolist()
+        taken += batch.heads[:, BlockHeader.DEADLINE_NS].tolist()
     assert taken == accepted
 
 
@@ -138,23 +138,23 @@ def test_damaged_slot_is_not_taken(tmp_path):
     other = SampleRing(ring.path)
     for number in range(3):
         push(ring, number)
-    ring._area.heads[1, Head.SEQUENCE] = 77
+    ring._area.heads[1, BlockHeader.SEQUENCE] = 77
     assert other.pop().heads.shape[0] == 1
     assert other.pop() is None
     assert other.skip_damaged() == 1
-    assert other.pop().heads[:, Head.FIRST_SAMPLE].tolist() == [6]
+    assert other.pop().heads[:, BlockHeader.FIRST_SAMPLE].tolist() == [6]
     assert other.skip_damaged() == 0
 
 
 @pytest.mark.parametrize(
     ("field", "value"),
     [
-        (Head.FIRST_SAMPLE, LAST_SAMPLE),
-        (Head.FIRST_SAMPLE, -1),
-        (Head.DROPPED_BEFORE, -1),
-        (Head.DROPPED_BEFORE, 4),
-        (Head.DEADLINE_NS, LONGEST_NS + 1),
-        (Head.LATE_NS, -LONGEST_NS - 1),
+        (BlockHeader.FIRST_SAMPLE, LAST_SAMPLE),
+        (BlockHeader.FIRST_SAMPLE, -1),
+        (BlockHeader.DROPPED_BEFORE, -1),
+        (BlockHeader.DROPPED_BEFORE, 4),
+        (BlockHeader.DEADLINE_NS, LONGEST_NS + 1),
+        (BlockHeader.LATE_NS, -LONGEST_NS - 1),
     ],
 )
 def test_slot_that_no_recording_may_hold_is_not_taken(tmp_path, field, value):
@@ -165,7 +165,7 @@ def test_slot_that_no_recording_may_hold_is_not_taken(tmp_path, field, value):
     ring._area.heads[1, field] = value
     assert ring.pop().heads.shape[0] == 1
     assert ring.skip_damaged() == 1
-    assert ring.pop().heads[:, Head.FIRST_SAMPLE].tolist() == [6]
+    assert ring.pop().heads[:, BlockHeader.FIRST_SAMPLE].tolist() == [6]
 
 
 def test_what_was_not_released_is_there_for_the_next_consumer(tmp_path):
@@ -179,7 +179,7 @@ def test_what_was_not_released_is_there_for_the_next_consumer(tmp_path):
     first.pop()
     push(ring, 2)
     second = SampleRing(ring.path)
-    assert second.pop().heads[:, Head.FIRST_SAMPLE].tolist() == [3, 6]
+    assert second.pop().heads[:, BlockHeader.FIRST_SAMPLE].tolist() == [3, 6]
 
 
 def test_blocks_that_were_sent_outlive_their_loop(tmp_path):
@@ -192,10 +192,10 @@ def test_blocks_that_were_sent_outlive_their_loop(tmp_path):
     assert push(ring, 0)
     for number in (1, 2, 3):
         born(ring, number).flags[:] = Flag.SLEW_LIMITED
-    assert other.pop().heads[:, Head.FIRST_SAMPLE].tolist() == [0]
+    assert other.pop().heads[:, BlockHeader.FIRST_SAMPLE].tolist() == [0]
     batch = other.unanswered(5)
-    assert batch.heads[:, Head.FIRST_SAMPLE].tolist() == [6, 9]
-    assert batch.heads[:, Head.DROPPED_BEFORE].tolist() == [1, 0]
+    assert batch.heads[:, BlockHeader.FIRST_SAMPLE].tolist() == [6, 9]
+    assert batch.heads[:, BlockHeader.DROPPED_BEFORE].tolist() == [1, 0]
     assert np.isnan(batch.columns[:, 3:5]).all()
     assert (batch.columns[:, 5] == batch.columns[:, 2]).all()
     assert (batch.columns[:, 2] == [[2.0] * BLOCK, [3.0] * BLOCK]).all()
@@ -215,7 +215,7 @@ def test_block_without_room_lives_in_a_spare_slot(tmp_path):
     assert [block.command[0] for block in (*kept, *spare)] == [1.0, 2.0, 3.0, 4.0]
     assert [ring.answered(block) for block in (*kept, *spare)] == [True, True, False, False]
     assert other.pop().columns[:, 2, 0].tolist() == [1.0, 2.0]
-    assert other.page.get(Field.ENDED_AT) == 5 * BLOCK
+    assert other.page.get(PageField.ENDED_AT) == 5 * BLOCK
     assert other.unanswered(0) is None
 
 
@@ -225,7 +225,7 @@ def test_block_that_is_not_due_is_never_seen(tmp_path):
     other = SampleRing(ring.path)
     assert not ring.answered(born(ring, 7, due=False))
     assert push(ring, 1)
-    assert other.pop().heads[:, Head.FIRST_SAMPLE].tolist() == [3]
+    assert other.pop().heads[:, BlockHeader.FIRST_SAMPLE].tolist() == [3]
 
 
 @settings(max_examples=60)
@@ -247,7 +247,7 @@ def test_damaged_ring_is_survived(tmp_path_factory, garbage, at):
         other.release()
     other.unanswered(0)
     other.look(0)
-    other.page.read_text(PageText.ERROR)
+    other.page.read_text(PageSlot.ERROR)
     other.page.outcome()
 
 
@@ -259,7 +259,9 @@ def test_other_files_are_refused(tmp_path):
         SampleRing(path)
 
 
-@pytest.mark.parametrize("field", [Field.SLOTS, Field.BLOCK, Field.STATE_SIZE, Field.SPARE])
+@pytest.mark.parametrize(
+    "field", [PageField.SLOTS, PageField.BLOCK, PageField.STATE_SIZE, PageField.SPARE]
+)
 @pytest.mark.parametrize("value", [-1, 0, 2**40])
 def test_sizes_that_can_not_be_are_refused(tmp_path, field, value):
     """A ring that says it is larger than its file, or smaller than anything, is damaged."""
@@ -291,17 +293,17 @@ def test_who_looks_on_sees_what_stands_there_and_takes_nothing(tmp_path):
     for number in range(3):
         push(ring, number)
     batch, after = seen.look(1)
-    assert (batch.heads[:, Head.FIRST_SAMPLE].tolist(), after) == ([3, 6], 3)
+    assert (batch.heads[:, BlockHeader.FIRST_SAMPLE].tolist(), after) == ([3, 6], 3)
     consumer.pop()
     consumer.release(keep=1)
     batch, after = seen.look(0)
     assert (batch.columns[:, 0, 0].tolist(), after) == ([2.0], 3)
     assert np.isfinite(batch.columns).all()
     push(ring, 3)
-    assert consumer.pop().heads[:, Head.FIRST_SAMPLE].tolist() == [9]
+    assert consumer.pop().heads[:, BlockHeader.FIRST_SAMPLE].tolist() == [9]
     assert seen.look(7)[1] == 7
     with pytest.raises(ValueError, match="read-only"):
-        seen.page.put(Field.STOP, 1)
+        seen.page.put(PageField.STOP, 1)
 
 
 def test_a_block_that_is_cleaned_or_damaged_under_the_copy_is_left_out(tmp_path):
@@ -313,13 +315,13 @@ def test_a_block_that_is_cleaned_or_damaged_under_the_copy_is_left_out(tmp_path)
 
     class Area:
         def rows(self, chosen):
-            ring.page.put(Field.CLEANED, 2)
+            ring.page.put(PageField.CLEANED, 2)
             return rows(chosen)
 
     seen._area = Area()
-    ring._area.heads[3, Head.SEQUENCE] = 77
+    ring._area.heads[3, BlockHeader.SEQUENCE] = 77
     batch, after = seen.look(0)
-    assert (batch.heads[:, Head.FIRST_SAMPLE].tolist(), after) == ([6], 4)
+    assert (batch.heads[:, BlockHeader.FIRST_SAMPLE].tolist(), after) == ([6], 4)
 
 
 def test_cursors_are_published_after_what_they_say(tmp_path, monkeypatch):
@@ -330,8 +332,10 @@ def test_cursors_are_published_after_what_they_say(tmp_path, monkeypatch):
         publish = page.publishes
 
         def spied(numbers, field, value):
-            heads, flags = ring._area.heads[:, Head.SEQUENCE], ring._area.flags[:, 0]
-            seen.append((Field(field), value, heads.max().item(), heads.min().item(), flags.max()))
+            heads, flags = ring._area.heads[:, BlockHeader.SEQUENCE], ring._area.flags[:, 0]
+            seen.append(
+                (PageField(field), value, heads.max().item(), heads.min().item(), flags.max())
+            )
             publish(numbers, field, value)
 
         return spied
@@ -342,9 +346,9 @@ def test_cursors_are_published_after_what_they_say(tmp_path, monkeypatch):
     assert ring.pop() is not None
     ring.release()
     assert seen == [
-        (Field.SENT, 1, 0, -1, 3),
-        (Field.HEAD, 1, 1, 0, 3),
-        (Field.EVENT_TAIL, 0, 1, 0, 3),
-        (Field.CLEANED, 1, 1, 0, 3),
-        (Field.TAIL, 1, 1, 0, 0),
+        (PageField.SENT, 1, 0, -1, 3),
+        (PageField.HEAD, 1, 1, 0, 3),
+        (PageField.EVENT_TAIL, 0, 1, 0, 3),
+        (PageField.CLEANED, 1, 1, 0, 3),
+        (PageField.TAIL, 1, 1, 0, 0),
     ]

@@ -6,12 +6,12 @@ import pytest
 
 from hilctl.base.errors import DeviceError, RunError
 from hilctl.loop.limiter import CommandLimits
-from hilctl.loop.plan import Outcome
+from hilctl.loop.plan import LoopOutcome
 from hilctl.run import safety as module
 from hilctl.run.guardian import LAST_CALL_MS
 from hilctl.run.ring import SampleRing
 from hilctl.run.safety import Safety
-from hilctl.run.shared_page import Field, GuardianPhase, Phase, SafeActionResult
+from hilctl.run.shared_page import GuardianPhase, PageField, Phase, SafeActionResult
 
 MS = 1_000_000
 
@@ -83,7 +83,7 @@ class Run:
 
     def look_alive(self, page, passed_ms):
         """Look at a loop that has just given a sign of life; the guardian gives none."""
-        page.put(Field.LOOP_HEARTBEAT_NS, self.now_ns + round(passed_ms * MS))
+        page.put(PageField.LOOP_HEARTBEAT_NS, self.now_ns + round(passed_ms * MS))
         self.look(passed_ms=passed_ms, awake=False)
 
     def settle(self):
@@ -96,10 +96,10 @@ class Run:
 @pytest.fixture
 def ring(tmp_path):
     ring = SampleRing.create(tmp_path / "ring", slots=4, block=1, state_size=1)
-    ring.page.put(Field.PHASE, Phase.RUNNING)
-    ring.page.put(Field.LOOP_HEARTBEAT_NS, 1)
-    ring.page.put(Field.REAL_TIME, 1)
-    ring.page.put_float(Field.OUTPUT_AT_START, 0.25)
+    ring.page.put(PageField.PHASE, Phase.RUNNING)
+    ring.page.put(PageField.LOOP_HEARTBEAT_NS, 1)
+    ring.page.put(PageField.REAL_TIME, 1)
+    ring.page.put_float(PageField.OUTPUT_AT_START, 0.25)
     return ring
 
 
@@ -155,7 +155,7 @@ def test_a_guardian_that_was_just_done_when_it_was_killed_is_believed(run, page)
 def acting(run, page, **result):
     """Let the guardian act, and leave what it has reached so far."""
     run.guardians[0].phase = GuardianPhase.ACTING
-    page.put(Field.GUARDIAN_PHASE, GuardianPhase.ACTING)
+    page.put(PageField.GUARDIAN_PHASE, GuardianPhase.ACTING)
     page.leave_safe_result(SafeActionResult(hung=False, final=False, **result))
 
 
@@ -230,7 +230,7 @@ def test_a_simulated_device_has_no_guardian(ring, monkeypatch):
 
 
 def test_a_loop_that_said_how_it_ended_is_left_alone(run, page):
-    page.leave_outcome(Outcome("completed", "waveform completed", 7, "confirmed", 0))
+    page.leave_outcome(LoopOutcome("completed", "waveform completed", 7, "confirmed", 0))
     run.guardians[0].ended = True  # as it does by itself
     for _ in range(5):
         run.look(ended=True, awake=False, passed_ms=100)

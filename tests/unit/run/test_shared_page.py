@@ -8,9 +8,9 @@ import pytest
 
 from hilctl.base.events import Event
 from hilctl.loop.pacer import Lateness
-from hilctl.loop.plan import Outcome
-from hilctl.machine.usage import ProcessUsage
-from hilctl.run.shared_page import SIZE, Field, PageText, Phase, SharedPage, Stop
+from hilctl.loop.plan import LoopOutcome
+from hilctl.machine.process_usage import ProcessUsage
+from hilctl.run.shared_page import SIZE, PageField, PageSlot, Phase, SharedPage, Stop
 
 
 @pytest.fixture
@@ -23,20 +23,20 @@ def sides():
 def test_numbers_are_shared(sides):
     """What one side sets the other reads, whole numbers and others."""
     one, other = sides
-    one.put(Field.STOP, 3)
-    one.put_float(Field.TUNE_GAIN, -0.125)
-    assert (other.get(Field.STOP), other.get_float(Field.TUNE_GAIN)) == (3, -0.125)
+    one.put(PageField.STOP, 3)
+    one.put_float(PageField.TUNE_GAIN, -0.125)
+    assert (other.get(PageField.STOP), other.get_float(PageField.TUNE_GAIN)) == (3, -0.125)
 
 
 def test_each_text_has_a_place_of_its_own(sides):
     """No text is read in the place of another; one that is too long is cut at a character."""
     one, other = sides
-    for place in PageText:
+    for place in PageSlot:
         one.write_text(place, f"{place.name}: öffnen")
-    assert [other.read_text(place) for place in PageText] == [f"{p.name}: öffnen" for p in PageText]
-    one.write_text(PageText.SET_UP, "µ" * 10_000)
-    assert set(other.read_text(PageText.SET_UP)) == {"µ"}
-    assert other.read_text(PageText.OUTCOME) == "OUTCOME: öffnen"
+    assert [other.read_text(place) for place in PageSlot] == [f"{p.name}: öffnen" for p in PageSlot]
+    one.write_text(PageSlot.SET_UP, "µ" * 10_000)
+    assert set(other.read_text(PageSlot.SET_UP)) == {"µ"}
+    assert other.read_text(PageSlot.OUTCOME) == "OUTCOME: öffnen"
 
 
 def test_events_come_once_and_are_cut_to_what_fits(sides):
@@ -48,7 +48,7 @@ def test_events_come_once_and_are_cut_to_what_fits(sides):
     assert [event.sample for event in events] == list(range(32))
     assert set(events[0].text) == {"ü"}
     assert events[0].values == {"number": 0.5}
-    assert one.get(Field.EVENTS_LOST) == 8
+    assert one.get(PageField.EVENTS_LOST) == 8
     one.push_event(Event(41, "info", "test", "no room yet"))
     other.release_events()
     one.push_event(Event(42, "info", "test", "room"))
@@ -58,12 +58,12 @@ def test_events_come_once_and_are_cut_to_what_fits(sides):
 def test_outcome_counts_only_at_the_end(sides):
     """A text that is not there yet, or damaged, is no outcome."""
     one, other = sides
-    outcome = Outcome("stopped", "stopped by a test", 7, "confirmed", 2)
-    one.write_text(PageText.OUTCOME, json.dumps(asdict(outcome)))
+    outcome = LoopOutcome("stopped", "stopped by a test", 7, "confirmed", 2)
+    one.write_text(PageSlot.OUTCOME, json.dumps(asdict(outcome)))
     assert other.outcome() is None
-    one.put(Field.PHASE, Phase.ENDED)
+    one.put(PageField.PHASE, Phase.ENDED)
     assert other.outcome() == outcome
-    one.write_text(PageText.OUTCOME, '{"code": "sto')
+    one.write_text(PageSlot.OUTCOME, '{"code": "sto')
     assert other.outcome() is None
 
 

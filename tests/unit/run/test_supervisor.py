@@ -16,11 +16,11 @@ import pytest
 
 from hilctl.base.errors import InputError, RunError
 from hilctl.loop.pacer import Lateness
-from hilctl.loop.plan import Outcome
+from hilctl.loop.plan import LoopOutcome
 from hilctl.run import supervisor as module
 from hilctl.run.protocol import STOP_SIGNAL
 from hilctl.run.ring import SampleRing
-from hilctl.run.shared_page import Field, PageText, SafeActionResult, Stop
+from hilctl.run.shared_page import PageField, PageSlot, SafeActionResult, Stop
 from hilctl.run.supervisor import ProgressThread, RunMonitor, Supervisor, SystemdNotifier
 from tests.fakes import SteppingClock
 
@@ -82,7 +82,7 @@ class Neighbours:
             begin=self.begin, give_back=lambda: self.note("given back"),
         )  # fmt: skip
         self.outcome, self.broke = (
-            Outcome("completed", "waveform completed", 100, "confirmed", 0),
+            LoopOutcome("completed", "waveform completed", 100, "confirmed", 0),
             "",
         )
         self.folder = SimpleNamespace(
@@ -158,8 +158,8 @@ class Neighbours:
     def child(self, folder, page, inherits):
         assert inherits == ["tcp:here", "lock"]
         set_up = json.dumps([{"rt.fifo": "done: 50"}, self.refused])
-        page.write_text(PageText.SET_UP, set_up)
-        page.put(Field.WAVEFORM_AT, 40)
+        page.write_text(PageSlot.SET_UP, set_up)
+        page.put(PageField.WAVEFORM_AT, 40)
         self.note("child")
         return SimpleNamespace(
             pid=1, await_ready=self.await_ready, kill=lambda: self.note("child killed")
@@ -183,7 +183,7 @@ class Neighbours:
         return SimpleNamespace(recorder=recorder, start=self.start, record_event=None)
 
     def start(self):
-        assert self.ring.page.get(Field.GO) == 0
+        assert self.ring.page.get(PageField.GO) == 0
         self.note("recording")
 
     def safety(self, checked, ring, child, guardian, record_event):
@@ -207,7 +207,7 @@ class Neighbours:
         )
 
     def attend(self, stop_signal):
-        assert self.ring.page.get(Field.GO) == 1
+        assert self.ring.page.get(PageField.GO) == 1
         self.attended.append(stop_signal)
         self.on_attend.get(len(self.attended), lambda: None)()
         return len(self.attended) < 4
@@ -231,13 +231,13 @@ def test_a_run_is_begun_in_one_order_and_undone_in_the_other(stage):
     result = stage.run()
     assert stage.log == [*READY, "serving", "progress ended", "safety closed", *UNDONE]
     page = stage.ring.page
-    assert page.get(Field.GO) == 1
+    assert page.get(PageField.GO) == 1
     assert stage.guardian_looks == -1  # it was waited for, and not a moment longer
     ((unix_ns, at_ns),) = stage.begun
     assert 10**12 < at_ns <= 10**12 + 20 * MS
-    assert page.get(Field.START_NS) == at_ns + 50 * MS
-    assert unix_ns - 10**18 == page.get(Field.START_NS)
-    assert page.get(Field.SUPERVISOR_HEARTBEAT_NS) == at_ns
+    assert page.get(PageField.START_NS) == at_ns + 50 * MS
+    assert unix_ns - 10**18 == page.get(PageField.START_NS)
+    assert page.get(PageField.SUPERVISOR_HEARTBEAT_NS) == at_ns
     assert stage.guardian == ["tcp:here", "lock"]
     assert (result.path, result.code, result.reason) == (
         stage.output, "completed", "waveform completed",
@@ -270,7 +270,7 @@ def test_a_guardian_that_does_not_get_ready_is_not_waited_for(stage):
     stage.guardian_looks = 10**9
     with pytest.raises(RunError, match="guardian was not ready"):
         stage.run()
-    assert stage.ring.page.get(Field.GO) == 0
+    assert stage.ring.page.get(PageField.GO) == 0
 
 
 def test_a_supervisor_that_breaks_again_and_again_still_sees_to_the_run(stage):
@@ -326,7 +326,7 @@ def test_whatever_fails_before_the_start_signal_leaves_nothing(stage, number):
     expected += [undone for begun, undone in undo.items() if READY.index(begun) < number]
     assert stage.log[number + 1 :] == expected
     if stage.ring is not None:
-        assert stage.ring.page.get(Field.GO) == 0
+        assert stage.ring.page.get(PageField.GO) == 0
 
 
 def test_what_the_system_refuses_at_the_start_is_a_message(stage):
@@ -351,7 +351,7 @@ def test_a_slow_disk_has_the_start_put_off(stage, takes_ms, delays_ms):
     stage.begin_takes_ns = [each * MS for each in takes_ms]
     stage.run()
     assert [(unix - 10**18 - at) // MS for unix, at in stage.begun] == delays_ms
-    assert stage.ring.page.get(Field.START_NS) == stage.begun[-1][1] + delays_ms[-1] * MS
+    assert stage.ring.page.get(PageField.START_NS) == stage.begun[-1][1] + delays_ms[-1] * MS
 
 
 def test_the_first_sample_waits_for_the_watchdog_to_be_armed(stage):
@@ -386,7 +386,7 @@ def test_what_breaks_afterwards_costs_neither_coil_nor_recording(stage):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, STOP_SIGNAL])
 def test_the_first_signal_is_the_one_that_stops_it(stage, number):
     """One that comes later changes nothing; afterwards signals are as they were."""
-    stage.outcome = Outcome("stopped", "stopped by someone", 100, "confirmed", 0)
+    stage.outcome = LoopOutcome("stopped", "stopped by someone", 100, "confirmed", 0)
     stage.on_attend[1] = lambda: os.kill(os.getpid(), number)
     stage.on_attend[2] = lambda: os.kill(os.getpid(), signal.SIGTERM)
     before = signal.getsignal(signal.SIGINT)
@@ -435,8 +435,8 @@ def test_handlers_of_the_program_come_back(stage):
     ("changes", "code", "reason"),
     [
         ({"broke": "a bug"}, "fault", "waveform completed; the supervisor broke: a bug"),
-        ({"outcome": Outcome("stopped", "gone", 1, "confirmed", 0)}, "fault", "gone"),
-        ({"outcome": Outcome("fault", "late", 1, "unknown", 0)}, "fault", "late"),
+        ({"outcome": LoopOutcome("stopped", "gone", 1, "confirmed", 0)}, "fault", "gone"),
+        ({"outcome": LoopOutcome("fault", "late", 1, "unknown", 0)}, "fault", "late"),
     ],
 )
 def test_how_it_ended(stage, changes, code, reason):
@@ -471,7 +471,7 @@ def test_deadline_misses_are_counted_in_ticks(stage, skipped, said):
     stage.on_attend[1] = lambda: stage.ring.page.leave_lateness(lateness)
     result = stage.run()
     assert (result.late_ticks, result.deadline_misses) == (
-        stage.ring.page.get(Field.LATE_TICKS),
+        stage.ring.page.get(PageField.LATE_TICKS),
         said,
     )
 
@@ -546,9 +546,9 @@ def run(tmp_path):
 def test_the_heartbeat_is_written_and_the_loop_looked_at(run, monkeypatch):
     monkeypatch.setattr(module.time, "monotonic_ns", lambda: 77)
     assert run.started.attend(0)
-    assert run.page.get(Field.SUPERVISOR_HEARTBEAT_NS) == 77
+    assert run.page.get(PageField.SUPERVISOR_HEARTBEAT_NS) == 77
     assert run.looks == [False]
-    assert run.page.get(Field.STOP) == 0
+    assert run.page.get(PageField.STOP) == 0
     assert run.started.outcome is None
 
 
@@ -570,16 +570,16 @@ def break_off(run):
 )
 def test_a_stop_is_passed_on(run, cause, stop):
     run.started.attend(0)
-    assert run.page.get(Field.STOP) == 0
+    assert run.page.get(PageField.STOP) == 0
     cause(run)
     run.started.attend(0)
-    assert run.page.get(Field.STOP) == stop
+    assert run.page.get(PageField.STOP) == stop
 
 
 def test_a_write_that_is_refused_stops_nothing_while_the_ring_has_room(run):
     run.recording.recorder.error, run.stalled = "full", 4.9
     run.started.attend(0)
-    assert run.page.get(Field.STOP) == 0
+    assert run.page.get(PageField.STOP) == 0
 
 
 @pytest.mark.parametrize(
@@ -594,25 +594,25 @@ def test_a_write_that_is_refused_stops_nothing_while_the_ring_has_room(run):
 def test_a_signal_goes_before_all_else(run, number, stop):
     break_off(run)
     run.started.attend(number)
-    assert run.page.get(Field.STOP) == stop
+    assert run.page.get(PageField.STOP) == stop
 
 
 def test_a_run_that_is_to_go_on_goes_on_without_its_recording(run):
     run.config.recording.on_failure = "go_on"
     run.recording.recorder.error, run.stalled = "full", 60.0
     run.started.attend(0)
-    assert run.page.get(Field.STOP) == 0
+    assert run.page.get(PageField.STOP) == 0
 
 
 def test_half_a_ring_is_no_reason_to_stop(run):
     run.stalled = 4.9
     run.started.attend(0)
-    assert run.page.get(Field.STOP) == 0
+    assert run.page.get(PageField.STOP) == 0
 
 
 def test_a_loop_that_ended_by_itself_is_believed_once_it_is_gone(run):
     """Until then it may still be closing its device."""
-    outcome = Outcome("completed", "waveform completed", 7, "confirmed", 0)
+    outcome = LoopOutcome("completed", "waveform completed", 7, "confirmed", 0)
     run.page.leave_outcome(outcome)
     run.started.attend(0)
     assert run.ended == []
@@ -654,7 +654,7 @@ def test_who_acted_is_said_and_only_what_was_confirmed(run, result, by, words):
 
 def test_a_loop_that_lost_its_device_keeps_its_account_of_the_end(run):
     """The guardian went on where it gave up; what the loop recorded is whole."""
-    run.page.leave_outcome(Outcome("fault", "no answer", 7, "unknown", 3))
+    run.page.leave_outcome(LoopOutcome("fault", "no answer", 7, "unknown", 3))
     run.child.ended = True
     run.started.attend(0)
     assert run.ended == []

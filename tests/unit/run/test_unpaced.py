@@ -12,14 +12,14 @@ from hilctl.analysis.replay import replay
 from hilctl.analysis.report import summarize
 from hilctl.base.errors import InputError
 from hilctl.base.events import Event
-from hilctl.base.samples import Flag, Head
+from hilctl.base.samples import BlockHeader, Flag
 from hilctl.recording import writer
-from hilctl.recording.facts import END_FIGURES
+from hilctl.recording.metadata_keys import END_FIGURES
 from hilctl.recording.reader import read
 from hilctl.recording.writer import PendingFile
 from hilctl.run.assemble import assemble
 from hilctl.run.start import checked_experiment
-from hilctl.run.unpaced import BatchHost, SampleClock, run_in_memory, run_unpaced
+from hilctl.run.unpaced import OfflineHost, VirtualClock, run_in_memory, run_unpaced
 from tests.fakes import FailingFile
 
 UNCOMPENSATED = Path(__file__).parents[3] / "configs" / "terfenol_sine_6a_uncompensated.yaml"
@@ -33,7 +33,7 @@ def plan(block, latency_blocks):
 
 
 def test_time_passes_in_sleeps_only():
-    clock = SampleClock()
+    clock = VirtualClock()
     clock.sleep_until_ns(500)
     clock.sleep_until_ns(200)
     assert clock.now_ns() == 500
@@ -68,14 +68,14 @@ def test_every_block_comes_once_and_in_order(latency):
     firsts, seen = [], []
 
     def take(batch):
-        firsts.extend(batch.heads[:, Head.FIRST_SAMPLE].tolist())
+        firsts.extend(batch.heads[:, BlockHeader.FIRST_SAMPLE].tolist())
         seen.extend(batch.columns[:, 0, 0].tolist())
 
-    host = BatchHost(plan(2, latency), on_batch=take)
+    host = OfflineHost(plan(2, latency), on_batch=take)
     waiting = []
     for number in range(1000):
         block = host.claim()
-        block.head[Head.FIRST_SAMPLE] = 2 * number
+        block.head[BlockHeader.FIRST_SAMPLE] = 2 * number
         block.reference[:] = number
         waiting.append(block)
         if len(waiting) > latency:
@@ -89,7 +89,7 @@ def test_every_block_comes_once_and_in_order(latency):
 
 def test_an_event_comes_after_the_blocks_before_it():
     order = []
-    host = BatchHost(
+    host = OfflineHost(
         plan(1, 0), on_batch=lambda batch: order.append(len(batch.heads)),
         on_event=lambda event: order.append(event.code),
     )  # fmt: skip

@@ -7,11 +7,11 @@ import pytest
 from pydantic import Field, model_validator
 
 from hilctl.base.errors import ConfigError
-from hilctl.base.strict import Strict
+from hilctl.base.strict import StrictModel
 from hilctl.base.yaml import Document, did_you_mean, dotted, loc_of
 
 
-class Guard(Strict):
+class Guard(StrictModel):
     timeout_s: float
     kick: Literal["any", "write"] = "any"
 
@@ -22,7 +22,7 @@ class Guard(Strict):
         return self
 
 
-class Several(Strict):
+class Several(StrictModel):
     guard: Guard | Literal["none"] = "none"
     base: Literal[0, 1, "modicon"] | None = None
     level: float | Literal["safe"] = 0.0
@@ -75,7 +75,7 @@ def test_keys_and_suggestions() -> None:
     assert did_you_mean("zzz", []) == ""
 
 
-class Wave(Strict):
+class Wave(StrictModel):
     unit: Literal["um", "A"] = "um"
     height_um: float = 0.0
     cycles: int = 1
@@ -84,7 +84,7 @@ class Wave(Strict):
     name: str = ""
 
 
-class Whole(Strict):
+class Whole(StrictModel):
     wave: Wave = Wave()
 
 

@@ -5,8 +5,8 @@ from contextlib import ExitStack
 
 import pytest
 
+from hilctl_drivers.emulator.factory import build
 from hilctl_drivers.emulator.options import EmulatorOptions
-from hilctl_drivers.emulator.setup import build
 from tests.fakes import emulated, logged
 
 MS = 1_000_000

@@ -9,7 +9,7 @@ from hilctl_drivers.emulator.labjack_stream import LabJackInput
 from hilctl_drivers.labjack import stream
 from hilctl_drivers.labjack.frames import ModbusFeedback, ReadFrame, WriteFrame
 from hilctl_drivers.profile import load_profile
-from hilctl_drivers.wire.links import Refused
+from hilctl_drivers.transport.links import RefusedError
 from tests.fakes import InProcess
 
 SETTINGS = {
@@ -140,7 +140,7 @@ def test_a_full_buffer_drops_scans_until_it_is_emptied(device):
 )
 def test_what_it_can_not_do_is_refused(device, what, code):
     """With the exception that says whether the value or the moment is wrong."""
-    with pytest.raises(Refused) as refused:
+    with pytest.raises(RefusedError) as refused:
         what(device)
     assert refused.value.code == code
 

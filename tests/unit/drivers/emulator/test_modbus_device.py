@@ -3,7 +3,7 @@
 import pytest
 
 from hilctl.base.errors import InputError
-from hilctl_drivers.emulator.modbus_device import Declined, EmulatedModbus, EmulatedWatchdog
+from hilctl_drivers.emulator.modbus_device import EmulatedModbus, EmulatedWatchdog, RejectedRequest
 from hilctl_drivers.emulator.registers import RegisterMap
 from hilctl_drivers.emulator.rig import Rig, WriteLog
 from hilctl_drivers.profile import load_profile
@@ -22,7 +22,7 @@ def test_unknown_channels_are_refused():
 def test_decline_carries_the_code():
     """What a device declines becomes that exception reply."""
     device = device_of("labjack_t7", "DAC0", "AIN0")
-    with pytest.raises(Declined) as declined:
+    with pytest.raises(RejectedRequest) as declined:
         device.read(["holding"], 9999, 1)
     assert declined.value.code == 2
 
@@ -52,7 +52,7 @@ def test_trip_that_a_step_clears_keeps_the_command(tmp_path):
     device._trip(0)
     assert device._rig.current_a == 0.0
     assert device._outputs["AO0"].words == [16384]
-    with pytest.raises(Declined):
+    with pytest.raises(RejectedRequest):
         device.write("holding", 0, [100])
     device.write("holding", 0x1007, [1])
     assert not device.tripped

@@ -4,7 +4,7 @@ import pytest
 
 from hilctl_drivers.emulator.modbus_device import EmulatedModbus
 from hilctl_drivers.emulator.modbus_wire import ModbusWire
-from hilctl_drivers.emulator.rig import Rig, Wiring, WriteLog
+from hilctl_drivers.emulator.rig import Rig, SimulatedWiring, WriteLog
 from hilctl_drivers.modbus.pdu import (
     feedback_pdu,
     read_pdu,
@@ -19,7 +19,7 @@ from hilctl_drivers.modbus.pdu import (
 )
 from hilctl_drivers.modbus.registers import RegisterFormat
 from hilctl_drivers.profile import load_profile
-from hilctl_drivers.wire.links import Refused
+from hilctl_drivers.transport.links import RefusedError
 
 FLOAT32 = RegisterFormat("float32")
 MS = 1_000_000
@@ -90,7 +90,7 @@ def test_coupler_reads_elsewhere_than_it_writes():
 def test_refusals_change_nothing(t7, pdu, code):
     """Wrong addresses, parts of values, values out of range, unknown functions."""
     ask(t7, write_pdu(1000, FLOAT32.encode(2.0)))
-    with pytest.raises(Refused) as refusal:
+    with pytest.raises(RefusedError) as refusal:
         ask(t7, pdu)
     assert refusal.value.code == code
     assert FLOAT32.decode(ask(t7, read_pdu(3, 1000, 2))) == 2.0
@@ -119,7 +119,7 @@ def test_rtu_ignores_others_and_rubbish():
 
 def test_units_share_a_line_and_a_rig():
     """One unit drives, the other shows; neither has the other's registers."""
-    rig, log, wiring = Rig(0), WriteLog(None, 0), Wiring(1.0, 0.0, 12.5, 0.0)
+    rig, log, wiring = Rig(0), WriteLog(None, 0), SimulatedWiring(1.0, 0.0, 12.5, 0.0)
     drives = EmulatedModbus(load_profile("adam_4024"), rig, log, "AO0", None, wiring)
     reads = EmulatedModbus(load_profile("adam_4117"), rig, log, None, "AI2", wiring)
     wire = ModbusWire("rtu", {1: drives, 2: reads})
@@ -132,7 +132,7 @@ def test_units_share_a_line_and_a_rig():
     raw = int.from_bytes(transact(2, read_pdu(3, 2, 1), 10 * MS), "big")
     assert 12.5 * (raw * 20.0 / 65535.0 - 10.0) == pytest.approx(rig.displacement_um, abs=0.01)
     assert rig.displacement_um > 40.0
-    with pytest.raises(Refused):
+    with pytest.raises(RefusedError):
         transact(2, write_single_pdu(0, bytes(2)), 10 * MS)
     assert requests(wire, rtu_adu(3, read_pdu(3, 0, 1))) == []
 
@@ -143,7 +143,7 @@ def test_gateway_says_that_a_unit_is_not_there():
     pdu = read_pdu(3, 1000, 2)
     wire = ModbusWire("tcp", {1: device, 2: device_of("labjack_t7", "DAC0", "AIN0")})
     (request,) = requests(wire, tcp_adu(7, 3, pdu))
-    with pytest.raises(Refused) as refusal:
+    with pytest.raises(RefusedError) as refusal:
         reply_data(pdu, tcp_pdu(wire.answer(request, 0).data, 7, 3))
     assert refusal.value.code == 11
     alone = ModbusWire("tcp", device)

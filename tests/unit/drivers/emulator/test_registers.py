@@ -3,7 +3,7 @@
 import pytest
 
 from hilctl_drivers.emulator.registers import NoSuchRegister, RegisterBank, RegisterMap, Words
-from hilctl_drivers.modbus.channels import Register
+from hilctl_drivers.modbus.register_map import Register
 from hilctl_drivers.profile import load_profile
 
 FLOAT = Register(address=10, type="float32", order="CDAB")

@@ -8,7 +8,7 @@ from pathlib import Path
 from cobs import cobs
 
 from hilctl_drivers.emulator.options import EmulatorOptions
-from hilctl_drivers.wire.framing import binary_framing
+from hilctl_drivers.transport.framing import binary_framing
 from tests.fakes import emulated
 
 

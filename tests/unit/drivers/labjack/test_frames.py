@@ -3,7 +3,12 @@
 import pytest
 
 from hilctl_drivers.labjack.frames import ModbusFeedback, ReadFrame, WriteFrame, frames_pdu
-from hilctl_drivers.wire.links import BadRequest, Corrupt, Mismatch, Refused
+from hilctl_drivers.transport.links import (
+    BadRequestError,
+    CorruptError,
+    MismatchError,
+    RefusedError,
+)
 
 
 class Link:
@@ -70,7 +75,7 @@ def test_each_read_frame_gets_its_words():
 def test_what_no_message_holds_is_refused(frames, text):
     """Neither request nor reply may be longer than a PDU, and nothing is sent then."""
     link = answered(b"")
-    with pytest.raises(BadRequest, match=text):
+    with pytest.raises(BadRequestError, match=text):
         ModbusFeedback(link, 1).call(frames)
     assert link.request == b""
 
@@ -78,11 +83,15 @@ def test_what_no_message_holds_is_refused(frames, text):
 @pytest.mark.parametrize(
     ("link", "error", "text"),
     [
-        (answered(bytes.fromhex("cc 02")), Refused, "exception 2 .illegal data address"),
-        (answered(bytes.fromhex("03 02 0000")), Mismatch, "answered with 3"),
-        (answered(bytes.fromhex("4c 0000")), Mismatch, "must have 5 bytes, got 3"),
-        (answered(bytes.fromhex("4c 00000000"), transaction=9), Mismatch, "transaction must be 1"),
-        (answered(bytes.fromhex("4c 00000000"), unit=2), Mismatch, "unit must be 1, got 2"),
+        (answered(bytes.fromhex("cc 02")), RefusedError, "exception 2 .illegal data address"),
+        (answered(bytes.fromhex("03 02 0000")), MismatchError, "answered with 3"),
+        (answered(bytes.fromhex("4c 0000")), MismatchError, "must have 5 bytes, got 3"),
+        (
+            answered(bytes.fromhex("4c 00000000"), transaction=9),
+            MismatchError,
+            "transaction must be 1",
+        ),
+        (answered(bytes.fromhex("4c 00000000"), unit=2), MismatchError, "unit must be 1, got 2"),
     ],
 )
 def test_an_answer_to_something_else_is_an_error(link, error, text):
@@ -94,7 +103,7 @@ def test_an_answer_to_something_else_is_an_error(link, error, text):
 def test_nonsense_is_not_waited_for():
     """Bytes that are not Modbus are refused at once."""
     link = Link(lambda request: bytes.fromhex("0001 0700 0006 01 4c00"))
-    with pytest.raises(Corrupt, match="not a Modbus TCP header"):
+    with pytest.raises(CorruptError, match="not a Modbus TCP header"):
         ModbusFeedback(link, 1).read(0, 2)
 
 

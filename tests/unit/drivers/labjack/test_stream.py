@@ -8,7 +8,7 @@ import pytest
 from hilctl.base.errors import DeviceError
 from hilctl_drivers.labjack import stream
 from hilctl_drivers.labjack.frames import WriteFrame, frames_pdu
-from hilctl_drivers.wire.links import Mismatch
+from hilctl_drivers.transport.links import MismatchError
 
 DOCUMENTED = {
     "SCANRATE_HZ": 4002, "NUM_ADDRESSES": 4004, "SETTLING_US": 4008, "RESOLUTION_INDEX": 4010,
@@ -74,7 +74,7 @@ def test_a_stream_that_lost_something_is_an_error_in_words(head, text):
 
 def test_more_samples_than_asked_for_are_no_answer():
     """A count that the message can't hold is not believed."""
-    with pytest.raises(Mismatch, match="121 samples in an answer that holds 120"):
+    with pytest.raises(MismatchError, match="121 samples in an answer that holds 120"):
         stream.stream_data(words(121, 0, 0, 0) + bytes(240), stream.u32(0))
 
 

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hilctl_drivers.emulator.factory import Emulator, build
 from hilctl_drivers.emulator.options import EmulatorOptions
-from hilctl_drivers.emulator.setup import Emulator, build
-from hilctl_drivers.modbus.device import ModbusDac
-from hilctl_drivers.modbus.setup import ModbusOptions
+from hilctl_drivers.modbus.config import ModbusOptions
+from hilctl_drivers.modbus.modbus_dac import ModbusDac
 from hilctl_drivers.profile import shipped_profiles
 from tests.fakes import FaultyLink, InProcess, ManualClock, logged
 

@@ -38,7 +38,13 @@ from hilctl_drivers.modbus.pdu import (
     write_read_pdu,
     write_single_pdu,
 )
-from hilctl_drivers.wire.links import BadRequest, Corrupt, Incomplete, Mismatch, Refused
+from hilctl_drivers.transport.links import (
+    BadRequestError,
+    CorruptError,
+    IncompleteError,
+    MismatchError,
+    RefusedError,
+)
 
 H = bytes.fromhex
 FOUR = H("01020304")
@@ -180,7 +186,7 @@ def test_exceptions_are_refusals_with_their_code(code, name):
     theirs.dev_id, theirs.transaction_id = 1, 5
     adu = FramerSocket(DecodePDU(False)).buildFrame(theirs)
     with pytest.raises(
-        Refused, match=f"function 23 refused with exception {code} .*{name}"
+        RefusedError, match=f"function 23 refused with exception {code} .*{name}"
     ) as caught:
         reply_data(SAME[6][0], tcp_pdu(adu, 5, 1))
     assert caught.value.code == code
@@ -230,7 +236,7 @@ def test_exceptions_are_refusals_with_their_code(code, name):
 )
 def test_what_the_specification_does_not_allow_is_not_built(build, arguments):
     """Counts, addresses past 65535, odd data, units and transactions."""
-    with pytest.raises(BadRequest):
+    with pytest.raises(BadRequestError):
         build(*arguments)
 
 
@@ -279,15 +285,15 @@ def test_the_largest_of_each_fits(pdu):
 )
 def test_answers_to_something_else_are_mismatches(pdu, reply):
     """Function, byte count, length, and everything that a write echoes."""
-    with pytest.raises(Mismatch):
+    with pytest.raises(MismatchError):
         reply_data(pdu, H(reply))
 
 
 def test_another_function_is_named():
     """The message says what was asked and what came."""
-    with pytest.raises(Mismatch, match="asked with function 3, answered with 4"):
+    with pytest.raises(MismatchError, match="asked with function 3, answered with 4"):
         reply_data(read_pdu(3, 0, 2), H("04 04 00000000"))
-    with pytest.raises(Mismatch, match="answered with nothing"):
+    with pytest.raises(MismatchError, match="answered with nothing"):
         reply_data(read_pdu(3, 0, 2), b"")
 
 
@@ -297,14 +303,14 @@ GOOD = H("0102 0000 0005 11 03 02 0005")
 @pytest.mark.parametrize(
     ("adu", "error", "rule"),
     [
-        (H("0103 0000 0005 11 03 02 0005"), Mismatch, "transaction must be 258, got 259"),
-        (H("0102 0000 0005 12 03 02 0005"), Mismatch, "unit must be 17, got 18"),
-        (H("0102 0001 0005 11 03 02 0005"), Corrupt, "not a Modbus TCP header"),
-        (H("0102 0000 0001 11 03 02 0005"), Corrupt, "not a Modbus TCP header"),
-        (H("0102 0000 00FF 11 03 02 0005"), Corrupt, "not a Modbus TCP header"),
-        (H("0102 0000 0006 11 03 02 0005"), Incomplete, "11 of 12"),
-        (H("0102 0000 0004 11 03 02 0005"), Corrupt, "1 bytes behind"),
-        (GOOD * 2, Corrupt, "11 bytes behind"),
+        (H("0103 0000 0005 11 03 02 0005"), MismatchError, "transaction must be 258, got 259"),
+        (H("0102 0000 0005 12 03 02 0005"), MismatchError, "unit must be 17, got 18"),
+        (H("0102 0001 0005 11 03 02 0005"), CorruptError, "not a Modbus TCP header"),
+        (H("0102 0000 0001 11 03 02 0005"), CorruptError, "not a Modbus TCP header"),
+        (H("0102 0000 00FF 11 03 02 0005"), CorruptError, "not a Modbus TCP header"),
+        (H("0102 0000 0006 11 03 02 0005"), IncompleteError, "11 of 12"),
+        (H("0102 0000 0004 11 03 02 0005"), CorruptError, "1 bytes behind"),
+        (GOOD * 2, CorruptError, "11 bytes behind"),
     ],
 )
 def test_tcp_headers_of_something_else(adu, error, rule):
@@ -317,18 +323,18 @@ def test_beginnings_of_frames_are_incomplete():
     """As far as the envelope can tell."""
     assert tcp_pdu(GOOD, 258, 17) == H("03 02 0005")
     for cut in range(len(GOOD)):
-        with pytest.raises(Incomplete):
+        with pytest.raises(IncompleteError):
             tcp_pdu(GOOD[:cut], 258, 17)
     frame = rtu_adu(1, read_pdu(3, 0, 1))
     for cut in range(5):
-        with pytest.raises(Incomplete):
+        with pytest.raises(IncompleteError):
             rtu_pdu(frame[:cut], 1)
 
 
 def test_rtu_checks_crc_before_unit():
     """A flipped unit is corruption; a good frame of another unit is a mismatch."""
     frame = rtu_adu(2, H("03 02 0005"))
-    with pytest.raises(Mismatch, match="unit must be 1, got 2"):
+    with pytest.raises(MismatchError, match="unit must be 1, got 2"):
         rtu_pdu(frame, 1)
-    with pytest.raises(Corrupt, match="CRC"):
+    with pytest.raises(CorruptError, match="CRC"):
         rtu_pdu(b"\x01" + frame[1:], 1)

@@ -7,7 +7,7 @@ import struct
 import pytest
 
 from hilctl_drivers.modbus.registers import RegisterFormat
-from hilctl_drivers.wire.links import BadRequest, FrameError, Mismatch
+from hilctl_drivers.transport.links import BadRequestError, FrameError, MismatchError
 
 CODES = {"int16": "h", "uint16": "H", "int32": "i", "uint32": "I", "float32": "f", "float64": "d"}
 
@@ -93,7 +93,7 @@ def test_integers_reach_their_ends_and_no_further(kind, low, high):
     assert channel.limits == (low, high)
     assert [channel.decode(channel.encode(v)) for v in (low, high)] == [low, high]
     for value in (low - 1, high + 1, 1e300, -1e300):
-        with pytest.raises(BadRequest, match=f"{kind} register holds"):
+        with pytest.raises(BadRequestError, match=f"{kind} register holds"):
             channel.encode(value)
 
 
@@ -102,7 +102,7 @@ def test_integers_round_half_to_even():
     channel = RegisterFormat("int16")
     assert [channel.decode(channel.encode(v)) for v in (2.5, 3.5, -2.5, 0.4999)] == [2, 4, -2, 0]
     assert channel.encode(32767.4) == b"\x7f\xff"
-    with pytest.raises(BadRequest):
+    with pytest.raises(BadRequestError):
         channel.encode(32767.5)
 
 
@@ -112,7 +112,7 @@ def test_float32_refuses_what_only_a_double_holds():
     channel = RegisterFormat("float32")
     assert channel.decode(channel.encode(largest)) == largest
     assert channel.limits == (-largest, largest)
-    with pytest.raises(BadRequest, match=r"float32 register holds .* got 3\.5e\+38"):
+    with pytest.raises(BadRequestError, match=r"float32 register holds .* got 3\.5e\+38"):
         channel.encode(3.5e38)
 
 
@@ -120,13 +120,13 @@ def test_float32_refuses_what_only_a_double_holds():
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_nothing_that_is_not_a_number_is_sent(kind, value):
     """Infinities and not a number are refused for every type."""
-    with pytest.raises(BadRequest, match="can't hold"):
+    with pytest.raises(BadRequestError, match="can't hold"):
         RegisterFormat(kind).encode(value)
 
 
 def test_scaling_past_the_doubles_is_refused():
     """A finite value whose raw value overflows is refused as well."""
-    with pytest.raises(BadRequest, match="can't hold"):
+    with pytest.raises(BadRequestError, match="can't hold"):
         RegisterFormat("float64", scale=1e-300).encode(1e300)
 
 
@@ -144,7 +144,7 @@ def test_a_device_that_sends_not_a_number_is_not_hidden():
 def test_decoding_wants_exactly_its_bytes(size):
     """Too few or too many bytes are an error, with and without a byte order."""
     for order in ("", "CDAB", "DCBA"):
-        with pytest.raises(Mismatch, match="float32 register has 4 bytes"):
+        with pytest.raises(MismatchError, match="float32 register has 4 bytes"):
             RegisterFormat("float32", order).decode(bytes(size))
 
 
@@ -163,7 +163,7 @@ def test_decoding_wants_exactly_its_bytes(size):
 )
 def test_formats_that_make_no_sense_are_refused(arguments, rule):
     """The message names the rule; it is a ValueError too, for a profile's validation."""
-    with pytest.raises(BadRequest, match=rule) as caught:
+    with pytest.raises(BadRequestError, match=rule) as caught:
         RegisterFormat(*arguments)
     assert isinstance(caught.value, FrameError)
     assert isinstance(caught.value, ValueError)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hilctl.base.errors import DeviceError
-from hilctl_drivers.modbus.device import ModbusDac
+from hilctl_drivers.modbus.modbus_dac import ModbusDac
 
 TIMEOUT_S = 0.5
 TRIPPED = {"timeout_s": TIMEOUT_S}

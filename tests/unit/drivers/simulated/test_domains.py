@@ -17,7 +17,7 @@ from hilctl_drivers.simulated.domains import (
     equilibrium,
     magnetise,
 )
-from hilctl_drivers.simulated.rods import ROD_LENGTH_M, VACUUM_PERMEABILITY, Coil
+from hilctl_drivers.simulated.rod_model import ROD_LENGTH_M, VACUUM_PERMEABILITY, Coil
 
 RATED = DomainsParameters()
 # Next to no eddy currents: what is left does not know how fast the field goes.

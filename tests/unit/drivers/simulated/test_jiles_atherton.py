@@ -15,7 +15,7 @@ from hilctl_drivers.simulated.jiles_atherton import (
     langevin,
     susceptibility,
 )
-from hilctl_drivers.simulated.rods import VACUUM_PERMEABILITY, Coil
+from hilctl_drivers.simulated.rod_model import VACUUM_PERMEABILITY, Coil
 
 RATED = JilesAthertonParameters()
 # Next to no loss: what is left does not know how fast the field goes.

@@ -5,11 +5,8 @@ import pytest
 
 from hilctl.base.device import Device
 from hilctl.base.types import F64
-from hilctl_drivers.simulated.device import SimulatedDevice
-from hilctl_drivers.simulated.rigs import (
-    PiezoOptions,
-    SimulatedPiezo,
-)
+from hilctl_drivers.simulated.devices import PiezoOptions, SimulatedPiezo
+from hilctl_drivers.simulated.simulated_device import SimulatedDevice
 
 RATE_HZ = 50e3
 BLOCK = 50

@@ -15,7 +15,7 @@ from hilctl.identify.data.cycles import (
     loops_from_recording,
 )
 from hilctl.identify.data.records import History
-from hilctl.recording.data import Recording
+from hilctl.recording.recording import Recording
 
 RATE_HZ = 50_000.0
 

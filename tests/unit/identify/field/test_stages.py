@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from hilctl.identify.data.records import History
-from hilctl.identify.field.prepared import Prepared, Run
+from hilctl.identify.field.densities import Curve
+from hilctl.identify.field.preprocess import Prepared, Run
 from hilctl.identify.field.stages import (
     HIGH,
     LOW,
@@ -21,8 +22,7 @@ from hilctl.identify.field.stages import (
     stages_in,
     stages_of,
 )
-from hilctl.identify.field.weights import Curve
-from hilctl.models.field import FieldLosses, FieldModel, OutputCurve
+from hilctl.models.effective_field import FieldLosses, FieldModel, OutputCurve
 
 RATE_HZ = 20_000.0
 STAGES = Stages(0.3, 0.2, 0.1, 0.4, 0.5, 0.06, 0.08, 0.9, 0.11)

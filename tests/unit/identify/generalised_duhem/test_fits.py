@@ -8,13 +8,13 @@ import pytest
 from hilctl.base.errors import DataError
 from hilctl.base.types import F64
 from hilctl.identify.data.records import History, SteadyLoop
+from hilctl.identify.evaluation import judge
 from hilctl.identify.fit_model import FittedModel, fit_model
-from hilctl.identify.judge import judge
 from hilctl.identify.settings import FitSettings
-from hilctl.models.field import FieldLosses
+from hilctl.models.effective_field import FieldLosses
 from hilctl.models.generalised_duhem import GeneralisedDuhemModel
+from hilctl.models.mechanics import FirstMode
 from hilctl.models.staged import StagedModel
-from hilctl.models.structure import Structure
 from tests.unit.models.test_generalised_duhem import duhem_model
 
 RATE_HZ = 20_000.0
@@ -33,7 +33,7 @@ def command(seed: int) -> F64:
 def truth() -> StagedModel:
     """Return what the data come from."""
     hysteresis = duhem_model(losses=FieldLosses(field_s=1e-4, output_s=5e-6))
-    structure = Structure(natural_hz=1500.0, damping_ratio=0.2)
+    structure = FirstMode(natural_hz=1500.0, damping_ratio=0.2)
     return StagedModel.around(hysteresis, structure=structure, delay_s=5e-5)
 
 

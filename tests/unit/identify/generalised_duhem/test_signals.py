@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hilctl.identify.data.records import History
-from hilctl.identify.field.prepared import OFF, Prepared
+from hilctl.identify.field.preprocess import OFF, Prepared
 from hilctl.identify.field.stages import HIGH, LOW, STEP
 from hilctl.identify.generalised_duhem.fits import POINTS
 from hilctl.identify.generalised_duhem.signals import (

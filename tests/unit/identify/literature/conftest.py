@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from hilctl.identify.data.records import SteadyLoop
+from hilctl.identify.evaluation import judge
+from hilctl.identify.fit_api import FitJob
 from hilctl.identify.fit_data import FitData
-from hilctl.identify.job import FitJob
-from hilctl.identify.judge import judge
 from hilctl.identify.settings import FitSettings
 from tests.published import piezo_ppi
 

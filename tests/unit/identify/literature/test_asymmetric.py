@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hilctl.identify.job import FitJob
+from hilctl.identify.fit_api import FitJob
 from hilctl.identify.literature.asymmetric import _Problem, fit_asymmetric
 from hilctl.identify.settings import FitSettings
 from hilctl.models.deadband import DeadbandFunction

@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import lsq_linear
 
 from hilctl.base.types import F64
-from hilctl.identify.linear import bounded_weights
+from hilctl.identify.nnls import bounded_weights
 from hilctl.identify.searched.search import SearchSpace, first_least, refine_peak, search
 from hilctl.models.plays import PlayModel
 

@@ -5,9 +5,9 @@ import pytest
 
 from hilctl.identify.staged.confidence import at_bound, standard_errors
 from hilctl.identify.staged.fit_data import Linear
-from hilctl.identify.staged.layered import DYNAMIC, Layers, Point
-from hilctl.identify.staged.search import StagedEnd
+from hilctl.identify.staged.objective import DYNAMIC, Layers, Point
 from hilctl.identify.staged.sensitivity import SPACING
+from hilctl.identify.staged.staged_search import StagedEnd
 
 LAYERS = Layers(plays=1, deadbands=0, lag=False, structure=False, delay=False)
 SIZE, RECORDS, EACH = DYNAMIC + 2 + 3, 40, 30

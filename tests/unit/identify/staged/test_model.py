@@ -7,7 +7,6 @@ import pytest
 
 from hilctl.identify.fit_data import FitData
 from hilctl.identify.staged.fit_data import Linear, StagedFitData
-from hilctl.identify.staged.layered import Layers, Point, loop_delay_s
 from hilctl.identify.staged.model import (
     parameters,
     response_um,
@@ -15,8 +14,9 @@ from hilctl.identify.staged.model import (
     stages_of,
     structure_of,
 )
+from hilctl.identify.staged.objective import Layers, Point, loop_delay_s
 from hilctl.models.integrated import exponential_integrated
-from hilctl.models.structure import Structure
+from hilctl.models.mechanics import FirstMode
 
 HALF_S = 1e-5
 LAYERS = Layers(plays=2, deadbands=1, half_period_s=HALF_S)
@@ -46,7 +46,7 @@ def test_a_low_pass_keeps_its_time_constant_and_is_a_structure():
     """A sensor of 1 kHz has no mass: whatever the search found for one is too small to matter."""
     low_pass = Linear(0.0, 1.6e-4, 1e-14)
     natural_hz, damping = structure_of(low_pass)
-    Structure(natural_hz=natural_hz, damping_ratio=damping)
+    FirstMode(natural_hz=natural_hz, damping_ratio=damping)
     assert damping / (np.pi * natural_hz) == pytest.approx(1.6e-4)
     s = 2j * np.pi * 250.0
     kept = 1.0 / (1.0 + s * 1.6e-4 + (s / (2.0 * np.pi * natural_hz)) ** 2)

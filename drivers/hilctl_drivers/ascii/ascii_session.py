@@ -1,0 +1,225 @@
+"""Asking a device that speaks lines of text: templates out, patterns back."""
+
+import re
+import time
+from collections.abc import Callable, Sequence
+
+from hilctl.base.errors import DeviceError
+from hilctl_drivers.ascii.ascii_profile import (
+    AsciiProfile,
+    AsciiStep,
+    AskStep,
+    NumberStep,
+    Query,
+    Reply,
+    SendStep,
+)
+from hilctl_drivers.ascii.lines import LineFormat, parse_number
+from hilctl_drivers.profile_base import WaitStep
+from hilctl_drivers.transport.links import (
+    CorruptError,
+    Link,
+    MismatchError,
+    NoAnswerError,
+    RefusedError,
+    WatchdogTrippedError,
+)
+
+_ADDRESSED = re.compile(r"[!?]([0-9A-F]{2})")
+
+
+class AsciiSession:
+    """A link to one device, asked one thing at a time.
+
+    Args:
+        profile: What the device is.
+        link: Not yet open; several devices may share it.
+        address: The device's address, for ``{address}``.
+        sleep: Waits that many s.
+    """
+
+    def __init__(
+        self,
+        profile: AsciiProfile,
+        link: Link,
+        address: int,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        line = profile.link
+        size = line.max_line_chars or 255
+        self._profile = profile
+        self._lines = LineFormat(line.terminator.encode(), line.checksum, size)
+        self._replies = LineFormat(line.reply_terminator.encode(), line.checksum)
+        self._expected_lines = 2 if line.echo else 1
+        self._address = address
+        self._sleep = sleep
+        self._watch = (
+            None
+            if profile.watchdog == "none" or profile.watchdog.refusal == "none"
+            else re.compile(profile.watchdog.refusal.pattern, re.ASCII)
+        )
+        self._errors = [(re.compile(e.pattern, re.ASCII), e.meaning) for e in profile.errors]
+        self.link = link
+
+    def text(self, template: str, **values: float) -> str:
+        """Return a template with its fields filled in."""
+        return template.format(address=self._address, **values)
+
+    def line(self, text: str) -> bytes:
+        """Return a line as it stands on the wire."""
+        return self._lines.encode(text)
+
+    def send(self, text: str) -> None:
+        """Send a line that is not answered."""
+        if self._expected_lines == 2:
+            self._check_echo(text, self.link.transact(self._lines.encode(text), self._missing(1)))
+        else:
+            self.link.transact(self._lines.encode(text), lambda got: 0)
+
+    def ask(self, text: str, pattern: str) -> re.Match[str]:
+        """Send a line and return its reply, matched whole.
+
+        Raises:
+            WatchdogTripped: The command was ignored because of a trip.
+            Refused: The reply is one of the profile's errors.
+            Mismatch: It is no answer to this.
+            DeviceError: No answer, or a damaged one.
+        """
+        request = self._lines.encode(text)
+        try:
+            data: bytes | bytearray = self.link.transact(
+                request, self._missing(self._expected_lines)
+            )
+        except NoAnswerError as error:
+            raise NoAnswerError(f"{text}: {error}") from None
+        if self._expected_lines == 2:
+            data = self._check_echo(text, data)
+        reply = self._replies.decode(data)
+        self._check_trouble(text, reply)
+        found = re.fullmatch(pattern, reply, re.ASCII)
+        if found is None:
+            raise MismatchError(f"{text}: not an answer to this: {reply!r}")
+        return found
+
+    def query(self, text: str, pattern: str) -> re.Match[str]:
+        """Ask a question, see :meth:`ask`; a reply that repeats it is no answer.
+
+        Raises:
+            Mismatch: The line echoes, and perhaps nothing is connected.
+            DeviceError: As for :meth:`ask`.
+        """
+        found = self.ask(text, pattern)
+        if found.string == text:
+            raise MismatchError(
+                f"{text}: came back unchanged: the line echoes what is sent; set link.echo in the "
+                "profile if the device answers after that"
+            )
+        return found
+
+    def number(self, query: Query) -> float:
+        """Ask for a number."""
+        return parse_number(self.query(self.text(query.ask), query.pattern)[1])
+
+    def command(self, text: str, reply: Reply | str) -> None:
+        """Send a line that is answered as ``reply`` says, or not at all."""
+        if isinstance(reply, Reply):
+            self.ask(text, reply.pattern)
+        else:
+            self.send(text)
+
+    def run(self, steps: Sequence[AsciiStep], **values: float) -> None:
+        """Carry out a profile's steps.
+
+        Args:
+            steps: The steps.
+            values: What ``timeout`` and ``safe`` stand for.
+
+        Raises:
+            DeviceError: One of them failed; the text says which.
+        """
+        for step in steps:
+            try:
+                self._step(step, values)
+            except DeviceError as error:
+                note = getattr(step, "note", "")
+                raise DeviceError(f"{error}{f' ({note})' if note else ''}") from None
+
+    def check_errors(self) -> None:
+        """Ask for errors that commands without an answer have left behind.
+
+        Raises:
+            Refused: There is one.
+        """
+        query = self._profile.error_query
+        if query == "none":
+            return
+        text = self.text(query.ask)
+        reply = self.query(text, ".*")[0]
+        if not re.fullmatch(query.pattern, reply, re.ASCII):
+            raise RefusedError(f"{text} says {reply}", reply)
+
+    def check_selftest(self) -> None:
+        """Ask the device what it is.
+
+        Raises:
+            DeviceError: It is another one.
+        """
+        test = self._profile.selftest
+        if test == "none":
+            return
+        text = self.text(test.ask)
+        reply = self.query(text, ".*")[0]
+        if not re.fullmatch(test.pattern, reply, re.ASCII):
+            raise DeviceError(f"{text} must be answered like {test.example!r}, got {reply!r}")
+
+    def tripped(self) -> bool:
+        """Return whether the host watchdog says that it has tripped; no where it can't say."""
+        watchdog = self._profile.watchdog
+        if watchdog == "none" or watchdog.tripped == "none":
+            return False
+        reply = self.query(self.text(watchdog.tripped.ask), ".*")[0]
+        return re.fullmatch(watchdog.tripped.pattern, reply, re.ASCII) is not None
+
+    def _step(self, step: AsciiStep, values: dict[str, float]) -> None:
+        if isinstance(step, WaitStep):
+            self._sleep(step.seconds)
+        elif isinstance(step, SendStep):
+            self.command(self.text(step.text, **values), step.reply)
+        elif isinstance(step, AskStep):
+            self.ask(self.text(step.ask, **values), step.pattern)
+        else:
+            self._check_number(step, values)
+
+    def _check_number(self, step: NumberStep, values: dict[str, float]) -> None:
+        wanted = values["safe"] if step.value == "safe" else step.value
+        found = self.number(step)
+        if not abs(found - wanted) <= step.tolerance:
+            rule = f"{self.text(step.ask)} must say {wanted:g} within {step.tolerance:g}"
+            raise DeviceError(f"{rule}, got {found:g}")
+
+    def _check_trouble(self, text: str, reply: str) -> None:
+        if self._watch is not None and self._watch.fullmatch(reply):
+            said = "ignored, the host watchdog has tripped: output is at its safe value"
+            raise WatchdogTrippedError(f"{text}: {said}", reply)
+        for pattern, meaning in self._errors:
+            if pattern.fullmatch(reply):
+                raise RefusedError(f"{text}: {meaning} ({reply})", reply)
+        who = _ADDRESSED.match(reply)
+        if who and text[1:3] == f"{self._address:02X}" and who[1] != text[1:3]:
+            raise MismatchError(f"{text}: answered by address {who[1]}: {reply!r}")
+
+    def _missing(self, lines: int) -> Callable[[bytearray], int]:
+        end = self._replies.terminator
+
+        def missing(got: bytearray) -> int:
+            if len(got) > 2 * self._replies.size_max:
+                raise CorruptError(f"no end of line within {len(got)} bytes")
+            return max(0, lines - got.count(end))
+
+        return missing
+
+    def _check_echo(self, text: str, data: bytes | bytearray) -> bytes | bytearray:
+        echo, end, rest = data.partition(self._replies.terminator)
+        if bytes(echo + end).rstrip(b"\r\n") != self._lines.encode(text).rstrip(b"\r\n"):
+            raise CorruptError(f"{text}: came back as {bytes(echo)!r}")
+        return rest

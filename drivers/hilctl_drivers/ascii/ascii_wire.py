@@ -1,0 +1,338 @@
+"""A device that speaks lines of text, sample by sample; its sensor may stand behind another one."""
+
+import re
+from string import Formatter
+
+from hilctl.base.errors import DeviceError, InputError, UnconfirmedError
+from hilctl.base.types import F64
+from hilctl_drivers.ascii.ascii_profile import AsciiInput, AsciiOutput, AsciiProfile
+from hilctl_drivers.ascii.ascii_session import AsciiSession
+from hilctl_drivers.ascii.ascii_timing import arm_s, exchange_time, feed_time, query_time
+from hilctl_drivers.ascii.lines import parse_number
+from hilctl_drivers.profile_base import Range
+from hilctl_drivers.serial.serial_setup import SerialSetup
+from hilctl_drivers.serial.serial_wire import SerialWire, check_stands
+from hilctl_drivers.transport.links import WatchdogTrippedError, naming
+from hilctl_drivers.transport.wire_time import RateLimit, WireTime, check_feeds
+
+_NO_EVIDENCE = (
+    "the device cannot confirm it: it does not answer, or repeats what it is sent, and its profile "
+    "has neither readback nor error_query"
+)
+
+
+class AsciiWire(SerialWire):
+    """A :class:`~hilctl_drivers.serial.serial_wire.SerialWire` of lines."""
+
+    def __init__(self, setup: SerialSetup) -> None:
+        super().__init__(setup)
+        assert isinstance(setup.profile, AsciiProfile)
+        assert isinstance(setup.output, AsciiOutput)
+        self._profile = setup.profile
+        self._reader_profile = _reader_profile(setup, setup.profile)
+        assert isinstance(setup.input, AsciiInput)
+        self._output, self._input = setup.output, setup.input
+        self._measure = _measuring_input(setup.profile, setup.options.measure, setup.output)
+        self.measures = self._measure is not None
+        self._address = _address(setup.options.unit_id, self._profile)
+        reader = setup.options.reader
+        self._reader_address = _address(reader.unit_id if reader else None, self._reader_profile)
+        self._writer = AsciiSession(self._profile, self._link, self._address)
+        self._reader_link = setup.reader_link(self._link)
+        self._reader, self._reader_name = self._writer, ""
+        if reader is not None:
+            where = reader.serial_port or f"unit {self._reader_address}"
+            self._reader_name = f"reader {self._reader_profile.title} at {where}"
+        if setup.reads_elsewhere:
+            self._reader = AsciiSession(
+                self._reader_profile, self._reader_link, self._reader_address
+            )
+        self._feed_every = 0
+        self._ticks = 0
+        # Half duplex: what was asked last is answered before the safe value can go out.
+        write = exchange_time(self._profile, setup.options.output, None)
+        self.longest_message_s = self._sample_time().answered_s + write.answered_s
+        self.unconfirmed = self._unconfirmed()
+        self.arm_s = arm_s(self._profile, setup.options.output)
+
+    def rates(self, block: int) -> RateLimit:
+        """See :meth:`~hilctl_drivers.serial.serial_wire.SerialWire.rates`."""
+        del block
+        slowest = min((self._profile, self._reader_profile), key=lambda each: each.max_rate_hz)
+        whose = f"the profile of {slowest.title}"
+        return RateLimit.of(self._sample_time(), slowest.max_rate_hz, whose)
+
+    def _sample_time(self) -> WireTime:
+        """Return what a sample costs on the wire."""
+        options, profile, reader = self._setup.options, self._profile, self._reader_profile
+        if self._setup.reads_elsewhere:
+            wire = exchange_time(profile, options.output, None)
+            wire = wire.then(
+                query_time(reader, self._input, self._reader_address, f"to {reader.title}")
+            )
+        else:
+            wire = exchange_time(profile, options.output, options.input)
+        if self._measure is not None:
+            what = f"to measure {options.measure}"
+            wire = wire.then(query_time(profile, self._measure, self._address, what))
+        if options.watchdog != "none":
+            wire = wire.then(feed_time(profile))
+        return wire
+
+    def open(self, sample_rate_hz: float, block: int) -> None:
+        """See :meth:`~hilctl_drivers.serial.serial_wire.SerialWire.open`."""
+        del block
+        feed_every = check_feeds(self._setup.options.watchdog_timeout_s, sample_rate_hz)
+        self._open_links()
+        writer, watchdog = self._writer, self._profile.watchdog
+        writer.check_selftest()
+        # A device that has tripped refuses the steps that follow.
+        self._clear_trip()
+        writer.run(self._profile.init)
+        if self._setup.reads_elsewhere:
+            with naming(self._reader_name):
+                self._reader.check_selftest()
+                self._reader.run(self._reader_profile.init)
+        self._try_out_safe_value()
+        strict = watchdog != "none" and watchdog.kick == "strict"
+        self._feed_every = feed_every if strict else 0
+        writer.check_errors()  # after all steps: commands without a reply leave theirs there
+        self._ticks = 0
+
+    def arm(self) -> None:
+        """See :meth:`~hilctl_drivers.serial.serial_wire.SerialWire.arm`."""
+        if self._profile.watchdog != "none" and self._setup.options.watchdog != "none":
+            # The safe value before the time-out: once it counts, it must know where to go.
+            self._run("safe")
+            self._run("arm")
+            self._writer.check_errors()  # commands without a reply leave theirs there
+
+    def exchange(self, first_sample: int, output: F64, reading: F64, measured: F64) -> None:
+        """See :meth:`~hilctl_drivers.serial.serial_wire.SerialWire.exchange`."""
+        del first_sample
+        value = output.item() + 0.0  # makes 0.0 of -0.0
+        combined = self._profile.exchange
+        if combined != "none" and self._is_combined:
+            text = self._writer.text(combined.write, value=value)
+            found = parse_number(self._writer.ask(text, combined.pattern)[1])
+        else:
+            # First the reading, which must not show yet what the command does.
+            found = self._read()
+            self._write(value)
+        reading[0] = _value(self._input, found)
+        if self._measure is not None:
+            measured[0] = _value(self._measure, self._writer.number(self._measure))
+        self._feed()
+
+    def output(self) -> float | None:
+        """See :meth:`~hilctl_drivers.serial.serial_wire.SerialWire.output`."""
+        readback, watchdog = self._output.readback, self._profile.watchdog
+        if readback == "none":
+            return None
+        # A trip that nobody can ask about has perhaps put out something else than the last command.
+        if readback.of == "command" and watchdog != "none" and watchdog.tripped == "none":
+            return None
+        return self._writer.number(readback)
+
+    def look(self) -> tuple[float, float | None]:
+        """See :meth:`~hilctl_drivers.serial.serial_wire.SerialWire.look`."""
+        self._open_links()
+        self._writer.check_selftest()
+        if self._setup.reads_elsewhere:
+            with naming(self._reader_name):
+                self._reader.check_selftest()
+        return _value(self._input, self._read()), self._measured_output()
+
+    def close(self) -> None:
+        """See :meth:`~hilctl_drivers.serial.serial_wire.SerialWire.close`."""
+        if self._profile.watchdog != "none" and self._setup.options.watchdog != "none":
+            # First: nothing feeds it any more, and it would trip while the close steps run.
+            self._run("disarm")
+        self._writer.run(self._profile.close)
+        self._writer.check_errors()
+
+    def release(self) -> None:
+        """See :meth:`~hilctl_drivers.serial.serial_wire.SerialWire.release`."""
+        self._link.close()
+        self._reader_link.close()
+
+    @property
+    def _is_combined(self) -> bool:
+        combined, options = self._profile.exchange, self._setup.options
+        if combined == "none" or self._setup.reads_elsewhere:
+            return False
+        return (combined.output, combined.input) == (options.output, options.input)
+
+    def _open_links(self) -> None:
+        self._link.open()
+        if self._reader_link is not self._link:
+            with naming(self._reader_name):
+                self._reader_link.open()
+
+    def _read(self) -> float:
+        with naming(self._reader_name):
+            return self._reader.number(self._input)
+
+    def _write(self, value: float) -> bool:
+        """Write the output; return whether the answer shows that a device has received it."""
+        text, reply = self._command(value), self._output.reply
+        if reply == "none":
+            self._writer.send(text)
+            return False
+        # A line that echoes gives an answer that equals what was sent.
+        return self._writer.ask(text, reply.pattern).string != text
+
+    def _command(self, value: float) -> str:
+        return self._writer.text(self._output.write, value=value)
+
+    def _measured_output(self) -> float | None:
+        """Return the output as the device measures it, or as it says that it is, tripped or not."""
+        unit = self._output.unit
+        for source in self._profile.inputs.values():
+            if source.measures == "output" and source.unit == unit:
+                return _value(source, self._writer.number(source))
+        readback = self._output.readback
+        if readback != "none" and readback.of == "command" and self._writer.tripped():
+            return None
+        return self.output()
+
+    def _send(self, value: float) -> None:
+        self._link.send_now(self._writer.line(self._command(value)))
+
+    def _put_out(self, value: float) -> None:
+        try:
+            answered = self._write(value)
+        except WatchdogTrippedError:
+            self._run("clear")
+            answered = self._write(value)
+        # A command without a reply may have been ignored.
+        readback = self._output.readback
+        if readback != "none":
+            check_stands(self._output, value, self._writer.number(readback))
+        elif self._profile.error_query != "none":
+            self._writer.check_errors()
+        elif not answered:
+            raise UnconfirmedError(f"the value was sent, but {_NO_EVIDENCE}")
+
+    def _try_out_safe_value(self) -> None:
+        """Set the output to what it holds, with the command of the safe value; nothing moves.
+
+        An output that cannot be read is left alone, as is a value that the command would round.
+        """
+        value = self.output()
+        low, high = self._output.limits
+        if value is None or not low <= value <= high:
+            return
+        fields = Formatter().parse(self._output.write)
+        spec = next(spec for _, field, spec, _ in fields if field == "value")
+        if float(format(value + 0.0, spec or "")) != value:
+            return
+        text = self._command(value + 0.0)
+        try:
+            self._write(value + 0.0)
+            self._writer.check_errors()
+        except DeviceError as error:
+            raise DeviceError(f"the safe value cannot be set with {text}: {error}") from None
+
+    def _unconfirmed(self) -> str:
+        """Return why a value cannot be confirmed; empty if it can."""
+        reply = self._output.reply
+        if self._output.readback != "none" or self._profile.error_query != "none":
+            return ""
+        if reply == "none" or _without_numbers(reply.example) == _without_numbers(
+            self._command(0.0)
+        ):
+            return _NO_EVIDENCE
+        return ""
+
+    def _clear_trip(self) -> None:
+        """End a trip of an earlier run, at the safe value."""
+        watchdog = self._profile.watchdog
+        if watchdog == "none" or not self._writer.tripped():
+            return
+        safe = self._setup.chain.output(self._setup.options.safe_command)
+        # Before where it is taken, and after in any case: a device that goes back to its last
+        # command when the trip ends must not put that out, or not for longer than one line takes.
+        if not watchdog.refuses_while_tripped:
+            self._write(safe)
+        self._run("clear")
+        self._put_out(safe)
+
+    def _run(self, name: str) -> None:
+        """Run the watchdog's steps of that name."""
+        watchdog = self._profile.watchdog
+        if watchdog == "none":
+            return
+        steps = getattr(watchdog, name)
+        if name == "safe":
+            steps = steps.get(self._setup.options.output, ())
+        options = self._setup.options
+        timeout_s = options.watchdog_timeout_s
+        counts = watchdog.counts(watchdog.min_s if timeout_s is None else timeout_s)
+        safe = self._setup.chain.output(options.safe_command)
+        self._writer.run(steps, timeout=counts, safe=safe)
+
+    def _feed(self) -> None:
+        """Feed a watchdog that exchanges don't feed; three times in its timeout."""
+        if not self._feed_every:
+            return
+        self._ticks += 1
+        if self._ticks % self._feed_every == 0:
+            self._run("feed")
+
+
+def _without_numbers(text: str) -> str:
+    return re.sub(r"[-+.\d]+", "#", text)
+
+
+def _value(source: AsciiInput, number: float) -> float:
+    return number * source.scale + source.offset
+
+
+def _address(wanted: int | None, profile: AsciiProfile) -> int:
+    """Return a device's address on a shared line; 0 where there is none."""
+    if wanted is not None:
+        return wanted
+    return 0 if profile.address == "none" else profile.address
+
+
+def _reader_profile(setup: SerialSetup, profile: AsciiProfile) -> AsciiProfile:
+    """Return the profile of the device that has the input, often the same.
+
+    Raises:
+        InputError: It speaks no lines of text, or can't share the other's line.
+    """
+    reader, options = setup.reader, setup.options.reader
+    if not isinstance(reader, AsciiProfile):
+        raise InputError("reader is for devices that speak lines of text, both of them")
+    if options is None or options.serial_port is not None:
+        return reader
+    kept = ("terminator", "reply_terminator", "checksum", "bytesize", "echo")
+    if any(getattr(profile.link, name) != getattr(reader.link, name) for name in kept):
+        rule = f"{reader.title} can't share the line of {profile.title}: {', '.join(kept)} differ"
+        raise InputError(f"{rule}; give reader.serial_port")
+    return reader
+
+
+def _measuring_input(profile: AsciiProfile, name: str | None, output: Range) -> AsciiInput | None:
+    """Return the input that measures the output itself; None where none is wanted.
+
+    Args:
+        profile: The device's profile.
+        name: Name of the input, or None.
+        output: The output in use.
+
+    Raises:
+        InputError: There is no such input, or it measures something else.
+    """
+    if name is None:
+        return None
+    measuring = {key: each for key, each in profile.inputs.items() if each.measures == "output"}
+    if name not in measuring:
+        known = ", ".join(measuring) or "none"
+        rule = f"measure must be an input of {profile.title} that measures its own output"
+        raise InputError(f"{rule}, got {name!r} (it has {known})")
+    if measuring[name].unit != output.unit:
+        rule = f"measure must be in {output.unit}, as the output is"
+        raise InputError(f"{rule}: {name} is in {measuring[name].unit}")
+    return measuring[name]

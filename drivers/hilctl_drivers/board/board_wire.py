@@ -1,0 +1,322 @@
+"""A microcontroller board: asked sample by sample, or fed block by block through its FIFO.
+
+A board with a FIFO answers a block when all but ``prefill`` of the samples queued so far have been
+put out, and gives back the readings of those. So its clock is the pace; a block's readings come
+``fifo_blocks`` exchanges after it; and between two exchanges the FIFO holds that many blocks, which
+is how long this machine may stall. The first sample is put out once that many are there.
+"""
+
+import numpy as np
+
+from hilctl.base.errors import DeviceError
+from hilctl.base.types import F64
+from hilctl_drivers.board import frames as board
+from hilctl_drivers.board.board_profile import FrameProfile, FramesLink, FrameStreaming
+from hilctl_drivers.board.board_session import BoardFacts, BoardSession, Readings
+from hilctl_drivers.board.frames import WATCHDOG_REPLY, WATCHDOG_REQUEST, exchange_sizes
+from hilctl_drivers.serial.serial_setup import SerialSetup
+from hilctl_drivers.serial.serial_wire import SerialWire, check_stands, refuse
+from hilctl_drivers.transport.framing import binary_framing
+from hilctl_drivers.transport.links import WatchdogTrippedError
+from hilctl_drivers.transport.serial_port import SerialLink
+from hilctl_drivers.transport.wire_time import RateLimit, WireTime, check_feeds
+
+_USB_BITS_PER_S = {True: 19 * 64 * 8e3, False: 13 * 512 * 8 * 8e3}
+"""Bulk payload of full-speed (1 ms) and high-speed (125 us) frames (USB 2.0, tables 5-9, 5-10)."""
+
+
+def exchange_time(profile: FrameProfile, block: int = 1) -> WireTime:
+    """Return what a block costs.
+
+    Args:
+        profile: The board; see :func:`hilctl_drivers.profile.with_link` for another line.
+        block: Samples in an exchange; more than one only for boards that stream. Those settle while
+            the next messages pass, so a sample period is no shorter than :func:`settle_s`.
+    """
+    link = profile.link
+    stream = profile.exchange == "stream"
+    size = next(iter(profile.outputs.values())).format.size
+    request, reply = exchange_sizes(block, size, stream=stream)
+    framing = binary_framing(link.framing, link.crc, link.payload_max)
+    what = f"{block} {'sample' if block == 1 else 'samples'} in {link.framing} frames"
+    byte_s, gaps, gaps_s, line = _line(link)
+    return WireTime(
+        f"{what} {line}",
+        framing.wire_size(request) * byte_s,
+        framing.wire_size(reply) * byte_s,
+        gaps,
+        gaps_s,
+        profile.turnaround_s,
+        block,
+        0.0 if stream else settle_s(profile),
+    )
+
+
+def arm_s(profile: FrameProfile) -> float:
+    """Return how long a WATCHDOG message and its reply take, s."""
+    link = profile.link
+    size = next(iter(profile.outputs.values())).format.size
+    framing = binary_framing(link.framing, link.crc, link.payload_max)
+    sent = framing.wire_size(WATCHDOG_REQUEST.size + size)
+    received = framing.wire_size(WATCHDOG_REPLY.size)
+    byte_s, _, gaps_s, _ = _line(link)
+    return (sent + received) * byte_s + gaps_s + profile.turnaround_s
+
+
+def settle_s(profile: FrameProfile) -> float:
+    """Return how long output and input take to settle, s."""
+    channels = (*profile.outputs.values(), *profile.inputs.values())
+    return sum(channel.settle_s for channel in channels)
+
+
+def _line(link: FramesLink) -> tuple[float, int, float, str]:
+    """Return time of a byte, number and time of gaps, and the line in words."""
+    if not link.usb:
+        return link.char_s, 0, 0.0, f"at {link.format}"
+    full_speed = link.usb_frame_s >= 1e-3
+    byte_s = 8.0 / _USB_BITS_PER_S[full_speed]
+    speed = "full" if full_speed else "high"
+    return byte_s, 1, link.usb_frame_s, f"over {speed}-speed USB"
+
+
+_FIRST_MAX = 2**32
+
+
+def board_wire(setup: SerialSetup) -> SerialWire:
+    """Return how a board is talked to, as its profile says.
+
+    Args:
+        setup: What the experiment says of it.
+
+    Raises:
+        InputError: Options that a board has no use for.
+    """
+    profile = setup.profile
+    assert isinstance(profile, FrameProfile)
+    if profile.streaming == "none":
+        return BoardSingle(setup, profile)
+    return BoardStream(setup, profile, profile.streaming)
+
+
+class BoardWire(SerialWire):
+    """What both forms of a board share.
+
+    Args:
+        setup: What the experiment says of it.
+        profile: What the board is.
+    """
+
+    def __init__(self, setup: SerialSetup, profile: FrameProfile) -> None:
+        super().__init__(setup)
+        refuse(setup, "reader", "measure", "unit_id")
+        self._profile = profile
+        self._session = BoardSession(profile, self._link)
+        self._safe = setup.chain.output(setup.options.safe_command)
+        self.arm_s = arm_s(profile)
+
+    def rates(self, block: int) -> RateLimit:
+        """See :meth:`~hilctl_drivers.serial.serial_wire.SerialWire.rates`."""
+        most_hz, whose = self._profile.max_rate_hz, f"the profile of {self._profile.title}"
+        if settle_s(self._profile) * most_hz > 1.0:
+            most_hz = 1.0 / settle_s(self._profile)
+            whose = f"settling {1e3 / most_hz:.2f} ms: {whose}"
+        streaming = self._profile.streaming
+        lowest_hz = 0.0 if streaming == "none" else streaming.rate_min_hz
+        return RateLimit.of(exchange_time(self._profile, block), most_hz, whose, lowest_hz)
+
+    def output(self) -> float | None:
+        """See :meth:`~hilctl_drivers.serial.serial_wire.SerialWire.output`."""
+        state = self._session.state()
+        return None if state is None else state.output
+
+    def look(self) -> tuple[float, float | None]:
+        """See :meth:`~hilctl_drivers.serial.serial_wire.SerialWire.look`."""
+        facts = self._connect(self._setup.link())
+        state = self._session.state()
+        if state is None:
+            who = facts.name or "the board"
+            raise DeviceError(f"{who} speaks version 1 of the protocol: no message only reads")
+        return state.reading, state.output
+
+    def release(self) -> None:
+        """See :meth:`~hilctl_drivers.serial.serial_wire.SerialWire.release`."""
+        self._link.close()
+
+    def _send(self, value: float) -> None:
+        self._link.send_now(self._session.safe_frame(value))
+
+    def _put_out(self, value: float) -> None:
+        try:
+            self._session.put_out(value)
+        except WatchdogTrippedError:
+            self._set_watchdog()
+            self._session.put_out(value)
+        state = self._session.state()
+        if state is not None:
+            check_stands(self._setup.output, value, state.output)
+
+    def _connect(self, link: SerialLink) -> BoardFacts:
+        """Connect and check that it is a board that this profile describes."""
+        self._link, self._session = link, BoardSession(self._profile, link)
+        link.open()
+        facts = self._session.facts()
+        if facts.version not in board.VERSIONS:
+            known = " or ".join(str(each) for each in board.VERSIONS)
+            raise DeviceError(
+                f"{facts.name or 'the board'} speaks version {facts.version} of the protocol, "
+                f"not {known}"
+            )
+        low, high = self._setup.output.limits
+        slack = 1e-6 * (high - low)
+        if low < facts.low - slack or high > facts.high + slack:
+            raise DeviceError(
+                f"{facts.name or 'the board'} puts out {facts.low:g} to {facts.high:g}, the "
+                f"profile says {low:g} to {high:g}"
+            )
+        return facts
+
+    def arm(self) -> None:
+        """See :meth:`~hilctl_drivers.serial.serial_wire.SerialWire.arm`."""
+        if self._setup.options.watchdog != "none":
+            self._set_watchdog()
+
+    def _try_out_safe_value(self) -> None:
+        """Set the output to what it holds by SAFE, or to the safe value after a trip."""
+        state = self._session.state()
+        self._disarm()  # which ends a trip of an earlier run
+        if state is None:
+            return
+        # At once: a board that comes back to a command from before must not keep it.
+        value = self._safe if state.tripped else state.output
+        low, high = self._setup.output.limits
+        if low <= value <= high:
+            try:  # the message of the safe value, with what the output holds
+                self._session.put_out(value)
+            except DeviceError as error:
+                raise DeviceError(f"the safe value cannot be written by SAFE: {error}") from None
+
+    def _set_watchdog(self) -> None:
+        """Set the watchdog as the experiment wants it, which clears a trip."""
+        if self._profile.watchdog != "none":
+            timeout_s = self._setup.options.watchdog_timeout_s or 0.0
+            self._session.set_watchdog(timeout_s, self._safe)
+
+    def _disarm(self) -> None:
+        if self._profile.watchdog != "none":
+            self._session.set_watchdog(0.0, self._safe)
+
+
+class BoardSingle(BoardWire):
+    """A board that takes one sample a message, paced by this machine."""
+
+    def open(self, sample_rate_hz: float, block: int) -> None:
+        """See :meth:`~hilctl_drivers.serial.serial_wire.SerialWire.open`."""
+        del block
+        check_feeds(self._setup.options.watchdog_timeout_s, sample_rate_hz)
+        self._connect(self._setup.link())
+        self._try_out_safe_value()
+
+    def exchange(self, first_sample: int, output: F64, reading: F64, measured: F64) -> None:
+        """See :meth:`~hilctl_drivers.serial.serial_wire.SerialWire.exchange`."""
+        del first_sample, measured
+        found = self._session.exchange(output)
+        if found.values.size != 1:
+            raise DeviceError(f"{found.values.size} readings came for one sample")
+        reading[:] = found.values
+
+    def close(self) -> None:
+        """See :meth:`~hilctl_drivers.serial.serial_wire.SerialWire.close`."""
+        self._disarm()
+
+
+class BoardStream(BoardWire):
+    """A board that plays blocks from its FIFO.
+
+    Args:
+        setup: What the experiment says of it.
+        profile: What the board is.
+        streaming: What its FIFO is.
+    """
+
+    def __init__(
+        self, setup: SerialSetup, profile: FrameProfile, streaming: FrameStreaming
+    ) -> None:
+        super().__init__(setup, profile)
+        self.block_max, self.fifo_depth = streaming.block_max, streaming.fifo_depth
+        self._latency_blocks = setup.options.fifo_blocks
+        self._block = 0
+        self._next_sample = 0
+        self.fifo_level_min = 0
+        """Lowest level that an answer has reported since the output began to move."""
+
+    def open(self, sample_rate_hz: float, block: int) -> None:
+        """See :meth:`~hilctl_drivers.serial.serial_wire.SerialWire.open`; starts no clock yet."""
+        self._check_block(block, self.fifo_depth, self.block_max)
+        check_feeds(self._setup.options.watchdog_timeout_s, sample_rate_hz / block)
+        facts = self._connect(self._setup.link(extra_s=block / sample_rate_hz))
+        self._check_board(facts, sample_rate_hz, block)
+        self._try_out_safe_value()  # before the clock, which SAFE stops
+        prefill = self._latency_blocks * block
+        self._session.set_clock(sample_rate_hz, prefill)
+        self._block = block
+        self._next_sample = 0
+        self.fifo_level_min = prefill
+
+    def exchange(self, first_sample: int, output: F64, reading: F64, measured: F64) -> None:
+        """Queue a block and wait for the readings of the one that it pushes out.
+
+        Raises:
+            DeviceError: No good answer in time; samples that don't follow the last ones; the board
+                ran out of samples.
+        """
+        del measured
+        if first_sample != self._next_sample:
+            rule = f"samples must follow one another, {self._next_sample} is next"
+            raise DeviceError(f"{rule}, got {first_sample}: open again to start at 0")
+        found = self._session.stream(first_sample, output)
+        self._check_answer(found, first_sample)
+        self._next_sample += output.size
+        if found.values.size:
+            reading[:] = found.values
+            self.fifo_level_min = min(self.fifo_level_min, found.fifo_level)
+
+    def close(self) -> None:
+        """Stop the clock and disarm; the output holds its last value."""
+        # The clock first: an output that moves must not be without its watchdog.
+        self._session.set_clock(0.0, 0)
+        self._disarm()
+
+    def _check_block(self, block: int, depth: int, block_max: int) -> None:
+        if not 1 <= block <= block_max:
+            raise DeviceError(f"block must be 1 to {block_max} samples, got {block}")
+        need = (self._latency_blocks + 1) * block
+        if need > depth:
+            most = depth // block - 1
+            rule = f"fifo_blocks + 1 blocks must fit into the FIFO, {depth} samples"
+            hint = f"at most {most} with this block" if most else "take smaller blocks"
+            raise DeviceError(f"{rule}, got {need} ({hint})")
+
+    def _check_board(self, facts: BoardFacts, sample_rate_hz: float, block: int) -> None:
+        """Hold what is wanted against what the board itself says, which may be less."""
+        if sample_rate_hz > facts.rate_max_hz * (1.0 + 1e-6):
+            rule = f"sample rate must be <= {facts.rate_max_hz:g} Hz, says {facts.name}"
+            raise DeviceError(f"{rule}, got {sample_rate_hz:g}")
+        self._check_block(block, facts.fifo_depth, facts.block_max)
+
+    def _check_answer(self, found: Readings, first_sample: int) -> None:
+        if found.underruns:
+            played = first_sample - self._latency_blocks * self._block
+            raise DeviceError(
+                f"underrun: the board had nothing to put out for {found.underruns} sample periods, "
+                f"about sample {max(0, played)}; its FIFO kept {self._latency_blocks} blocks of "
+                f"{self._block}: this machine or the line was slower than that"
+            )
+        answered = first_sample - self._latency_blocks * self._block
+        want = self._block if answered >= 0 else 0
+        if found.values.size != want or (want and found.first != answered % _FIRST_MAX):
+            raise DeviceError(
+                f"readings must be {want} from sample {max(0, answered)} on, got "
+                f"{found.values.size} from {found.first}"
+            )
+        if not np.isfinite(found.values).all():
+            raise DeviceError("the board sent readings that are not numbers")

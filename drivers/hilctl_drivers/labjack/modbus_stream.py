@@ -1,0 +1,206 @@
+"""A DAC that plays blocks from the device's own buffer, over Modbus TCP: ``modbus_stream``.
+
+LabJack's T4 and T7 put out one value in each scan of their own clock and read the input just before
+(stream-out and stream-in in one scan list). So that clock is the pace, a block's displacements come
+``fifo_blocks`` exchanges after it, and between two exchanges the buffer holds that many blocks,
+which is how long this machine may stall. The first sample is put out once that many are there.
+"""
+
+import time
+from collections.abc import Callable
+from typing import ClassVar
+
+import numpy as np
+
+from hilctl.base.device import DeviceOptions
+from hilctl.base.errors import DeviceError
+from hilctl.base.types import F64
+from hilctl_drivers.device import DacDevice
+from hilctl_drivers.labjack.frames import ModbusFeedback, ReadFrame, WriteFrame
+from hilctl_drivers.labjack.stream import ENABLE, InputCalibration, u32
+from hilctl_drivers.labjack.stream_session import StreamSession
+from hilctl_drivers.labjack.stream_setup import ModbusStreamOptions, StreamSetup
+from hilctl_drivers.modbus.config import ModbusEndpoint
+from hilctl_drivers.modbus.modbus_safe_write import Connect, ModbusSafeWrite
+from hilctl_drivers.modbus.modbus_session import ModbusSession
+from hilctl_drivers.modbus.probe import look
+from hilctl_drivers.modbus.watchdog import ModbusWatchdogDriver
+from hilctl_drivers.transport.links import RefusedError
+from hilctl_drivers.transport.wire_time import RateLimit
+
+
+class StreamSafeWrite(ModbusSafeWrite):
+    """Stops the stream and writes the output in one message; what is queued is dropped."""
+
+    def _put(self, session: ModbusSession, data: bytes) -> None:
+        feedback = ModbusFeedback(session.link, self._setup.writer.unit)
+        write = WriteFrame(self._setup.writer.address(self._setup.output), data)
+        # The stream first: it would write over the safe value with its next scan.
+        try:
+            feedback.call([WriteFrame(ENABLE, u32(0)), write])
+        except RefusedError:  # a stream that does not run can't be stopped
+            feedback.call([write])
+
+    def _check_held(self, session: ModbusSession, value: float) -> None:
+        output = self._setup.output
+        feedback = ModbusFeedback(session.link, self._setup.writer.unit)
+        target = ReadFrame(self._setup.writer.address(output), output.words)
+        running, held = feedback.call([ReadFrame(ENABLE, 2), target])
+        if running != u32(0):
+            raise DeviceError("the stream was stopped, but still runs")
+        self._check(output.format.decode(held), value)
+
+
+class ModbusStream(DacDevice):
+    """A :class:`~hilctl.base.device.Device` that streams over Modbus TCP."""
+
+    Options: ClassVar[type[DeviceOptions]] = ModbusStreamOptions
+
+    def __init__(
+        self,
+        options: ModbusStreamOptions,
+        connect: Connect = ModbusEndpoint.session,
+        sleep: Callable[[float], None] = time.sleep,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Describe the device; nothing is sent before :meth:`open`.
+
+        Args:
+            options: What the experiment says of it.
+            connect: Makes a session on a new link.
+            sleep: Waits that many s.
+            clock: Monotonic time in s.
+
+        Raises:
+            InputError: The profile can't be used, or options don't go with it.
+        """
+        setup = StreamSetup.of(options)
+        writer = setup.base.writer
+        super().__init__(
+            setup.info(),
+            f"modbus_stream {writer.name} at {writer.place}",
+            f"stream {options.output} and {options.input}",
+            options.output,
+        )
+        self._setup = setup
+        self._connect, self._sleep, self._clock = connect, sleep, clock
+        self._factors = setup.base.chain.factors
+        self._guard = ModbusWatchdogDriver(setup.base)
+        self._session: ModbusSession | None = None
+        self._stream: StreamSession | None = None
+        self._calibration: InputCalibration | None = None
+        self._next_sample = 0
+        self._peer = writer
+        self._safe_write = StreamSafeWrite(setup.base, connect)
+
+    @property
+    def stream(self) -> StreamSession | None:
+        """The stream while it is open, for tests and diagnosis."""
+        return self._stream
+
+    def _longest_block(self) -> tuple[int, str]:
+        depth = self._setup.streaming.fifo_depth
+        why = f": fifo_blocks + 1 of them must fit into the FIFO, {depth} samples"
+        return self._setup.block_max, why
+
+    def _rates(self, block: int) -> RateLimit:
+        return self._setup.rates(block)
+
+    def _open(self, sample_rate_hz: float, block: int) -> None:
+        """Self-test, init steps, calibration, buffers and clock; see :class:`DacDevice`.
+
+        The output does not move before enough blocks have come.
+        """
+        setup, base = self._setup, self._setup.base
+        self._guard.plan(sample_rate_hz / block)
+        self._session = session = self._connect(base.writer)
+        session.link.open()
+        self._peer = base.writer.reached(session.link)
+        session.check_selftest()
+        self._guard.end_trip(session)
+        stream = self._stream_on(session)
+        stream.stop()  # whoever started it: no other setting is taken while it runs
+        session.run(base.writer.profile.init)
+        session.run(setup.streaming.setup)
+        self._calibration = stream.calibration(setup.channel)
+        addresses = base.writer.address(base.output), base.writer.address(base.input)
+        stream.prepare(sample_rate_hz, *addresses)
+        setup.check_capacity(block, stream.capacity)
+        self._safe_write.try_out(session)
+        self._stream = stream
+        self._next_sample = 0
+
+    def _arm(self) -> None:
+        assert self._session is not None
+        self._guard.arm(self._session)
+
+    def _output(self) -> float | None:
+        assert self._session is not None
+        held = self._session.held(self._setup.base.output)
+        return None if held is None else self._setup.base.chain.command(held)
+
+    def _stream_on(self, session: ModbusSession) -> StreamSession:
+        base = self._setup.base
+        return StreamSession(
+            ModbusFeedback(session.link, base.writer.unit),
+            self._setup.streaming,
+            base.options.timeout_s,
+            base.writer.profile.turnaround_s,
+            self._sleep,
+            self._clock,
+        )
+
+    def _exchange(
+        self, first_sample: int, command: F64, displacement_um: F64, measured: F64
+    ) -> None:
+        """Queue a block and wait for the readings of the one that it pushes out."""
+        del measured
+        stream = self._stream
+        if stream is None:
+            raise DeviceError("not open")
+        if first_sample != self._next_sample:
+            rule = f"samples must follow one another, {self._next_sample} is next"
+            raise DeviceError(f"{rule}, got {first_sample}: open again to start at 0")
+        gain, offset, um_per_unit, offset_um = self._factors
+        # Queued before the readings are waited for: meanwhile the device must not run dry.
+        stream.feed((command - offset) / gain)
+        self._next_sample += command.size
+        readings = self._readings(stream, command.size)
+        if self._guard.feed_every and self._session is not None:
+            self._guard.feed(self._session)
+        if readings is not None:
+            np.multiply(readings, um_per_unit, out=displacement_um)
+            displacement_um += offset_um
+
+    def _readings(self, stream: StreamSession, block: int) -> F64 | None:
+        """Return a block's volts, float64[B]; None before the first one is due."""
+        kept = self._setup.fifo_blocks * block
+        if self._next_sample < kept:
+            return None
+        if self._next_sample == kept:
+            stream.start()
+            return None
+        assert self._calibration is not None
+        return self._calibration.volts(stream.take(block))
+
+    def _put_out(self, command: float) -> None:
+        """Stop the stream and put the output at ``command``; what is queued is dropped."""
+        self._release()
+        value = self._setup.base.chain.output(command)
+        self._safe_write.attempt(self._peer, value)
+
+    def _look(self) -> tuple[float, float | None]:
+        return look(self._setup.base)
+
+    def _close(self) -> None:
+        session, stream = self._session, self._stream
+        if session is not None and stream is not None:
+            # The stream first: an output that moves must not be without its watchdog.
+            stream.stop()
+            self._guard.disarm(session)
+            session.run(self._setup.base.writer.profile.close)
+
+    def _release(self) -> None:
+        session, self._session, self._stream = self._session, None, None
+        if session is not None:
+            session.link.close()

@@ -1,0 +1,243 @@
+"""Profiles of devices that speak Modbus, TCP or RTU."""
+
+from collections.abc import Iterator
+from typing import Annotated, ClassVar, Literal, Self
+
+from pydantic import Field, model_validator
+
+from hilctl_drivers.labjack.labjack_profile import LabJackStreaming
+from hilctl_drivers.modbus.register_map import (
+    AddressBase,
+    Channel,
+    ModbusSelftest,
+    ModbusStep,
+    Register,
+    RegisterStep,
+    TripFlag,
+    wire_address,
+)
+from hilctl_drivers.profile_base import BaseProfile, Name, Watchdog
+from hilctl_drivers.transport.link_config import BinaryLineSettings, LinkSettings
+
+GAP_CHARS = 3.5
+FAST_BAUD = 19200
+FAST_GAP_S = 1.75e-3
+"""Silence between RTU frames above 19200 baud (Modbus over serial line 1.02, section 2.5.1.1)."""
+
+
+class ModbusTcpLink(LinkSettings):
+    """Modbus TCP."""
+
+    kind: Literal["tcp"]
+    port: int = Field(default=502, ge=1, le=65535)
+
+
+class ModbusRtuLink(BinaryLineSettings):
+    """Modbus RTU."""
+
+    kind: Literal["rtu"]
+    gap_s: float | None = Field(
+        default=None,
+        ge=0.0,
+        description="silence before each frame, s; left out: 3.5 characters, 1.75 ms above 19200",
+    )
+
+    @property
+    def silence_s(self) -> float:
+        """Silence before each frame, s."""
+        if self.gap_s is not None:
+            return self.gap_s
+        return FAST_GAP_S if self.baud > FAST_BAUD else GAP_CHARS * self.char_s
+
+
+class ModbusOutput(Channel):
+    """An analogue output."""
+
+    function: Literal[6, 16] = Field(default=16, description="Modbus function that writes it")
+    readback: Register | Literal["same", "none"] = Field(
+        default="same",
+        description="where the value can be read again: another register, same, or none where"
+        " reading is refused; scale and offset are the output's",
+    )
+    power_up: float | None = Field(
+        default=None, description="what it puts out after power-up, in unit; left out: not known"
+    )
+
+    @model_validator(mode="after")
+    def _writable(self) -> Self:
+        if self.area != "holding":
+            raise ValueError(f"area of an output must be holding, got {self.area}")
+        if self.power_up is not None and not self.min <= self.power_up <= self.max:
+            raise ValueError(f"power_up must be min to max, got {self.power_up:g}")
+        if self.function == 6 and self.words != 1:
+            raise ValueError(f"function 6 writes one register, {self.type} takes {self.words}")
+        return self
+
+    @property
+    def readback_register(self) -> Register | None:
+        """Where the value can be read again with the output's scale; None where it can't be."""
+        if self.readback == "none":
+            return None
+        if self.readback == "same":
+            return self
+        return self.readback.model_copy(update={"scale": self.scale, "offset": self.offset})
+
+
+class ModbusInput(Channel):
+    """An analogue input."""
+
+    measures: Literal["terminal", "output"] = Field(
+        default="terminal",
+        description="terminal: what is wired to it, such as a sensor; output: the device's own"
+        " output measured",
+    )
+
+    @model_validator(mode="after")
+    def _readable(self) -> Self:
+        if self.area not in {"holding", "input"}:
+            raise ValueError(f"area of an input must be holding or input, got {self.area}")
+        return self
+
+
+class ModbusWatchdog(Watchdog):
+    """A host watchdog set and read through registers."""
+
+    arm: tuple[ModbusStep, ...] = Field(min_length=1, description="steps that set and start it")
+    unlock: tuple[ModbusStep, ...] = Field(
+        default=(),
+        description="steps that come before safe and arm, but only where an ensure step of theirs"
+        " finds something to change",
+    )
+    disarm: tuple[ModbusStep, ...] = Field(default=(), description="steps that stop it")
+    feed: tuple[ModbusStep, ...] = Field(default=(), description="steps that feed a strict one")
+    clear: tuple[ModbusStep, ...] = Field(default=(), description="steps that clear a trip")
+    safe: dict[Name, tuple[ModbusStep, ...]] = Field(
+        default={}, description="steps that set an output's safe value, by output"
+    )
+    tripped: TripFlag | Literal["none"] = Field(default="none", description="where a trip shows")
+
+    @model_validator(mode="after")
+    def _can_be_fed(self) -> Self:
+        if (self.kick == "strict") != bool(self.feed):
+            raise ValueError("feed steps and kick: strict go together")
+        return self
+
+    def protects(self, output: str) -> bool:
+        """Return whether a trip makes an output safe; some devices do so for some outputs only."""
+        return self.on_trip != "safe" or not self.safe or output in self.safe
+
+    def steps(self) -> dict[str, tuple[ModbusStep, ...]]:
+        """Return all steps by dotted key in the profile."""
+        named = {name: getattr(self, name) for name in ("unlock", "arm", "disarm", "feed", "clear")}
+        named |= {f"safe.{output}": steps for output, steps in self.safe.items()}
+        return {f"watchdog.{name}": steps for name, steps in named.items()}
+
+    def bound(
+        self,
+        steps: tuple[ModbusStep, ...],
+        output: ModbusOutput,
+        timeout_s: float,
+        safe: float,
+    ) -> tuple[ModbusStep, ...]:
+        """Return steps with numbers for ``timeout`` and ``safe``, scaled to the device's units.
+
+        Args:
+            steps: Any of the watchdog's steps.
+            output: The output in use; its scale and offset go with ``safe``.
+            timeout_s: Timeout in s.
+            safe: Safe value in the output's unit.
+
+        Raises:
+            InputError: The timeout is out of range, see :meth:`Watchdog.counts`.
+        """
+        self.counts(timeout_s)
+        changes: dict[str, dict[str, float]] = {
+            "timeout": {"value": timeout_s, "scale": self.unit_s, "offset": 0.0},
+            "safe": {"value": safe, "scale": output.scale, "offset": output.offset},
+        }
+        return tuple(
+            step.model_copy(update=changes[step.value])
+            if isinstance(step, RegisterStep) and isinstance(step.value, str)
+            else step
+            for step in steps
+        )
+
+
+class ModbusProfile(BaseProfile):
+    """A device that speaks Modbus."""
+
+    DEVICE: ClassVar[str] = "modbus_dac"
+
+    link: Annotated[ModbusTcpLink | ModbusRtuLink, Field(discriminator="kind")]
+    unit_id: int = Field(default=1, ge=0, le=255, description="as shipped")
+    address_base: AddressBase = Field(description="see a register's address_base")
+    exchange: Literal[23, 76, "none"] = Field(
+        description="function that writes the output and reads the input in one transaction"
+    )
+    outputs: dict[Name, ModbusOutput]
+    inputs: dict[Name, ModbusInput]
+    init: tuple[ModbusStep, ...] = Field(default=(), description="steps after connecting")
+    close: tuple[ModbusStep, ...] = Field(default=(), description="steps before disconnecting")
+    watchdog: ModbusWatchdog | Literal["none"]
+    selftest: ModbusSelftest | Literal["none"] = "none"
+    streaming: LabJackStreaming | Literal["none"] = "none"
+
+    @model_validator(mode="after")
+    def _channels(self) -> Self:
+        if self.exchange != "none" and not (self.outputs and self.inputs):
+            raise ValueError("exchange must be none where there are no outputs or no inputs")
+        if self.streaming != "none":
+            self.streaming.check_names(self.outputs, self.inputs)
+        return self
+
+    @model_validator(mode="after")
+    def _addresses(self) -> Self:
+        for where, register in self.registers():
+            address = self.wire_address(register)
+            if not 0 <= address <= 65_536 - register.words:
+                base = self.address_base if register.address_base is None else register.address_base
+                raise ValueError(
+                    f"{where}.address must be in area {register.area} with address_base {base},"
+                    f" got {register.address}"
+                )
+        for name, channel in self.inputs.items():
+            if self.exchange == 23 and channel.area != "holding":
+                raise ValueError(f"inputs.{name}.area must be holding: exchange 23 reads holding")
+        return self
+
+    @model_validator(mode="after")
+    def _placeholders(self) -> Self:
+        for name in ("init", "close"):
+            values = [getattr(step, "value", 0.0) for step in getattr(self, name)]
+            if {"timeout", "safe"} & set(values):
+                raise ValueError(f"{name}: timeout and safe are for watchdog steps")
+        if self.watchdog != "none":
+            unknown = set(self.watchdog.safe) - set(self.outputs)
+            if unknown:
+                raise ValueError(f"watchdog.safe.{min(unknown)} must be one of the outputs")
+        return self
+
+    def registers(self) -> Iterator[tuple[str, Register]]:
+        """Yield every register with its dotted key."""
+        for group, channels in (("outputs", self.outputs), ("inputs", self.inputs)):
+            for name, channel in channels.items():
+                yield f"{group}.{name}", channel
+                readback = getattr(channel, "readback", None)
+                if isinstance(readback, Register):
+                    yield f"{group}.{name}.readback", readback
+        groups = {"init": self.init, "close": self.close}
+        if self.watchdog != "none":
+            groups |= self.watchdog.steps()
+            if self.watchdog.tripped != "none":
+                yield "watchdog.tripped", self.watchdog.tripped
+        for key, steps in groups.items():
+            for index, step in enumerate(steps):
+                if isinstance(step, Register):
+                    yield f"{key}.{index}", step
+        if self.selftest != "none":
+            yield "selftest", self.selftest
+
+    def wire_address(self, register: Register) -> int:
+        """Return the address that goes into the frame, 0 to 65535."""
+        base = self.address_base if register.address_base is None else register.address_base
+        return wire_address(register, base)

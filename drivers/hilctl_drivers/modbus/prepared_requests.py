@@ -1,0 +1,238 @@
+"""Modbus requests built once and sent many times: the loop's hot path.
+
+A transaction keeps what never changes of its request and of its good reply. A tick puts transaction
+id, data and CRC to it, and compares. Only a reply that differs goes the long way through
+:mod:`hilctl_drivers.modbus.pdu`, which says what is wrong with it.
+"""
+
+import struct
+from typing import Protocol, cast
+
+from hilctl_drivers.modbus.pdu import (
+    FEEDBACK,
+    PDU_MAX,
+    TCP_HEAD,
+    WRITE_READ,
+    WRITE_REGISTER,
+    WRITE_REGISTERS,
+    reply_data,
+    reply_layout,
+    rtu_adu,
+    rtu_pdu,
+    tcp_adu,
+    tcp_pdu,
+)
+from hilctl_drivers.transport.crc import MODBUS_WORDS, Bytes, crc16_modbus
+from hilctl_drivers.transport.links import BadRequestError, IncompleteError
+
+_TCP_SHORTEST = TCP_HEAD + 2
+_RTU_SHORTEST = 5
+_tcp_start = struct.Struct(">HHH").unpack_from
+
+
+class Transaction(Protocol):
+    """A prepared request and the check of its reply."""
+
+    @property
+    def size(self) -> int:
+        """Bytes of the request."""
+        ...
+
+    @property
+    def reply_size(self) -> int:
+        """Bytes of a good reply."""
+        ...
+
+    def request(self, data: bytes = b"") -> bytes:
+        """Return the next request.
+
+        Args:
+            data: Register bytes to write, as many as the PDU was prepared with; empty for those
+                of the last call.
+
+        Raises:
+            BadRequest: Another length.
+        """
+        ...
+
+    def reply(self, adu: Bytes) -> bytes:
+        """Check the reply to the last request and return the register bytes read.
+
+        Raises:
+            Incomplete: More bytes belong to it; see :meth:`missing`.
+            Corrupt: A check or the structure is wrong.
+            Mismatch: Not the answer to the last request.
+            Refused: An exception reply.
+        """
+        ...
+
+    def missing(self, received: Bytes) -> int:
+        """Return how many more bytes to wait for; 0 where the reply is ready to be checked.
+
+        The first bytes tell a good reply from an exception reply, which is shorter.
+        """
+        ...
+
+
+def _data_span(pdu: bytes) -> tuple[int, int]:
+    """Return where the data to write stands in a request PDU: first and past the last byte."""
+    function = pdu[0]
+    if function == WRITE_REGISTER:
+        return 3, 5
+    if function == WRITE_REGISTERS:
+        return 6, len(pdu)
+    if function == WRITE_READ:
+        return 10, len(pdu)
+    if function == FEEDBACK:
+        return 9, len(pdu)
+    return len(pdu), len(pdu)
+
+
+class _Prepared:
+    """What stays the same in all requests and good replies of one PDU."""
+
+    def __init__(self, adu: bytes, pdu: bytes, start: int) -> None:
+        """Take the first request, its PDU, and where in the request the PDU begins."""
+        first, last = _data_span(pdu)
+        head, read_size = reply_layout(pdu)
+        self._last = adu
+        self._data = pdu[first:last]
+        self._data_size = last - first
+        self._before = adu[: start + first]
+        self._after = pdu[last:]
+        # The reply to a single write echoes all of the request.
+        self._echo = pdu[0] == WRITE_REGISTER
+        self._head = adu[:start] + head
+        self._read_size = read_size
+        self._reply_size = len(self._head) + read_size
+
+    @property
+    def size(self) -> int:
+        """Bytes of the request."""
+        return len(self._last)
+
+    @property
+    def reply_size(self) -> int:
+        """Bytes of a good reply."""
+        return self._reply_size
+
+    def _bad_size(self, data: bytes) -> BadRequestError:
+        return BadRequestError(f"request was prepared for {self._data_size} bytes, got {len(data)}")
+
+
+class TcpTransaction(_Prepared):
+    """A prepared Modbus TCP :class:`Transaction`; each request has the next transaction id."""
+
+    def __init__(self, unit: int, pdu: bytes, transaction: int = 0) -> None:
+        """Prepare ``pdu`` for ``unit``; the first request's id is ``transaction`` + 1.
+
+        Raises:
+            BadRequest: Unit outside 0 to 255, transaction outside 0 to 65535, or an unknown PDU.
+        """
+        super().__init__(tcp_adu(transaction, unit, pdu), pdu, TCP_HEAD)
+        self._unit = unit
+        self._transaction = transaction
+        self._before = self._before[2:]
+        length = (self._reply_size - 6).to_bytes(2, "big")
+        self._head = self._head[2:4] + length + self._head[6:]
+        sizes = (len(self._before), self._data_size, len(self._after))
+        self._join = struct.Struct(">H{}s{}s{}s".format(*sizes)).pack
+        self._split = struct.Struct(f">H{len(self._head)}s{self._read_size}s").unpack
+
+    def request(self, data: bytes = b"") -> bytes:
+        """See :meth:`Transaction.request`."""
+        if data:
+            if len(data) != self._data_size:
+                raise self._bad_size(data)
+            self._data = data
+            if self._echo:
+                self._head = self._head[:-2] + data
+        self._transaction = transaction = (self._transaction + 1) & 0xFFFF
+        self._last = made = self._join(transaction, self._before, self._data, self._after)
+        return made
+
+    def reply(self, adu: Bytes) -> bytes:
+        """See :meth:`Transaction.reply`."""
+        if len(adu) == self._reply_size:
+            transaction, head, read = self._split(adu)
+            if transaction == self._transaction and head == self._head:
+                return cast(bytes, read)
+        pdu = tcp_pdu(adu, self._transaction, self._unit)
+        return reply_data(self._last[TCP_HEAD:], pdu)
+
+    def missing(self, received: Bytes) -> int:
+        """See :meth:`Transaction.missing`."""
+        count = len(received)
+        if count < _TCP_SHORTEST:
+            return _TCP_SHORTEST - count
+        _, protocol, length = _tcp_start(received)
+        # Nonsense is ready to be refused; its length is not worth waiting for.
+        if protocol or length > PDU_MAX + 1:
+            return 0
+        return max(0, int(length) + 6 - count)
+
+
+class RtuTransaction(_Prepared):
+    """A prepared Modbus RTU :class:`Transaction`; there is no id to tell a late reply by.
+
+    CRCs of what never changes are worked out once; the rest is taken two bytes at a time.
+    """
+
+    def __init__(self, unit: int, pdu: bytes) -> None:
+        """Prepare ``pdu`` for ``unit``.
+
+        Raises:
+            BadRequest: Unit outside 1 to 255, or an unknown PDU.
+        """
+        super().__init__(rtu_adu(unit, pdu), pdu, 1)
+        self._unit = unit
+        self._reply_size += 2
+        self._before_crc = crc16_modbus(self._before)
+        self._head_crc = crc16_modbus(self._head)
+        sizes = (len(self._before), self._data_size, len(self._after))
+        self._join = struct.Struct("<{}s{}s{}sH".format(*sizes)).pack
+        self._split = struct.Struct(f"<{len(self._head)}s{self._read_size}sH").unpack
+        # What is written, and what LabJack's function has after it, is always whole registers.
+        self._written_words = struct.Struct(f"<{self._data_size // 2}H").unpack
+        self._after_words = struct.unpack(f"<{len(self._after) // 2}H", self._after)
+        self._read_words = struct.Struct(f"<{self._read_size // 2}H").unpack
+        self._in_words = self._read_size % 2 == 0  # bits may not be
+
+    def request(self, data: bytes = b"") -> bytes:
+        """See :meth:`Transaction.request`."""
+        if not data:
+            return self._last
+        if len(data) != self._data_size:
+            raise self._bad_size(data)
+        table, crc = MODBUS_WORDS, self._before_crc
+        for word in self._written_words(data):
+            crc = table[crc ^ word]
+        for word in self._after_words:
+            crc = table[crc ^ word]
+        if self._echo:
+            self._head = self._head[:-2] + data
+            self._head_crc = crc16_modbus(self._head)
+        self._last = made = self._join(self._before, data, self._after, crc)
+        return made
+
+    def reply(self, adu: Bytes) -> bytes:
+        """See :meth:`Transaction.reply`."""
+        if len(adu) == self._reply_size and self._in_words:
+            head, read, sent = self._split(adu)
+            if head == self._head:
+                table, crc = MODBUS_WORDS, self._head_crc
+                for word in self._read_words(read):
+                    crc = table[crc ^ word]
+                if crc == sent:
+                    return cast(bytes, read)
+        missing = self.missing(adu)
+        if missing:
+            raise IncompleteError(f"{missing} more bytes belong to the reply")
+        return reply_data(self._last[1:-2], rtu_pdu(adu, self._unit))
+
+    def missing(self, received: Bytes) -> int:
+        """See :meth:`Transaction.missing`."""
+        count = len(received)
+        if count < _RTU_SHORTEST:
+            return _RTU_SHORTEST - count
+        return 0 if received[1] & 0x80 else max(0, self._reply_size - count)

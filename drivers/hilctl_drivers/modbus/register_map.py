@@ -1,0 +1,216 @@
+"""Registers in a profile: channels, the steps that set a device up, and the flag of a trip."""
+
+from typing import Annotated, Literal, Self, TypeAlias
+
+from pydantic import Field, model_validator
+
+from hilctl.base.strict import StrictModel
+from hilctl_drivers.modbus.registers import RegisterFormat, RegisterType
+from hilctl_drivers.profile_base import Range, WaitStep
+from hilctl_drivers.transport.links import BadRequestError
+
+Area: TypeAlias = Literal["coil", "discrete", "input", "holding"]
+AddressBase: TypeAlias = Literal[0, 1, "modicon"]
+StepValue: TypeAlias = float | Literal["timeout", "safe"]
+
+_READ_FUNCTION: dict[str, int] = {"coil": 1, "discrete": 2, "holding": 3, "input": 4}
+_MODICON: dict[Area, int] = {"coil": 0, "discrete": 1, "input": 3, "holding": 4}
+
+
+class Register(StrictModel):
+    """A value in a Modbus device: where it stands and how it is written in bytes.
+
+    Value = raw * scale + offset.
+    """
+
+    area: Area = Field(default="holding", description="what is read or written")
+    address: int = Field(ge=0, description="as the vendor's document has it, see address_base")
+    address_base: AddressBase | None = Field(
+        default=None,
+        description="0 or 1: number of the first register; modicon: 40001, 30001, 10001 or 1 by"
+        " area; left out: the profile's",
+    )
+    type: Literal["bit", RegisterType] = Field(description="how the raw value is stored")
+    order: str = Field(
+        default="",
+        description="bytes on the wire, A the most significant: ABCD, CDAB, BADC, DCBA; left out:"
+        " most significant first",
+    )
+    scale: float = Field(default=1.0, description="value = raw * scale + offset")
+    offset: float = Field(default=0.0, description="value = raw * scale + offset")
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        bits = self.area in {"coil", "discrete"}
+        if bits != (self.type == "bit"):
+            rule = "must be bit" if bits else "must not be bit"
+            raise ValueError(f"type {rule} in area {self.area}")
+        if bits and (self.order, self.scale, self.offset) != ("", 1.0, 0.0):
+            raise ValueError("a bit has no order, scale or offset")
+        if not bits:
+            _ = self.format
+        return self
+
+    @property
+    def format(self) -> RegisterFormat:
+        """How the value becomes bytes.
+
+        Raises:
+            BadRequest: It is a bit, or order or scale is wrong.
+        """
+        if self.type == "bit":
+            raise BadRequestError("a bit has no register format")
+        return RegisterFormat(self.type, self.order, self.scale, self.offset)
+
+    @property
+    def words(self) -> int:
+        """Registers (or bits) that it takes up."""
+        return 1 if self.type == "bit" else self.format.count
+
+    @property
+    def read_function(self) -> int:
+        """Modbus function that reads it: 1, 2, 3 or 4."""
+        return _READ_FUNCTION[self.area]
+
+    @property
+    def representable(self) -> tuple[float, float]:
+        """Lowest and highest value that its type can hold, scaled."""
+        return (0.0, 1.0) if self.type == "bit" else self.format.limits
+
+
+class Channel(Register, Range):
+    """A register that stands for a terminal."""
+
+    raw_min: int | None = Field(default=None, description="lowest raw value in use")
+    raw_max: int | None = Field(default=None, description="highest raw value in use")
+    ignored_low_bits: int = Field(
+        default=0, ge=0, le=15, description="low bits of the raw value that the device drops"
+    )
+
+    @model_validator(mode="after")
+    def _range_fits_register(self) -> Self:
+        if self.type == "bit":
+            raise ValueError(f"an analogue channel can't be in area {self.area}")
+        if self.type.startswith("float") and (self.raw_min, self.raw_max) != (None, None):
+            raise ValueError("raw_min and raw_max are for whole-number types")
+        low, high = RegisterFormat(self.format.type).limits
+        if not low <= self.raw_limits[0] < self.raw_limits[1] <= high:
+            raise ValueError(f"raw_min and raw_max must be ordered and fit into {self.type}")
+        low, high = self.representable
+        half = 0.5 * abs(self.scale)
+        if self.min < low - half or self.max > high + half:
+            raise ValueError(
+                f"min and max must be inside what the register holds, {low:g} to {high:g}"
+                f" {self.unit}, got {self.min:g} to {self.max:g}"
+            )
+        return self
+
+    @property
+    def raw_limits(self) -> tuple[float, float]:
+        """Lowest and highest raw value in use."""
+        low, high = RegisterFormat(self.format.type).limits
+        return (
+            low if self.raw_min is None else float(self.raw_min),
+            high if self.raw_max is None else float(self.raw_max),
+        )
+
+    @property
+    def representable(self) -> tuple[float, float]:
+        """Lowest and highest value that the register can hold, in ``unit``."""
+        ends = sorted(raw * self.scale + self.offset for raw in self.raw_limits)
+        return ends[0], ends[1]
+
+    @property
+    def step(self) -> float:
+        """Smallest step in ``unit``; 0 where the profile doesn't say and the type is a float."""
+        if self.resolution is not None:
+            return self.resolution
+        whole = not self.type.startswith("float")
+        return abs(self.scale) * 2.0**self.ignored_low_bits if whole else 0.0
+
+
+class ModbusSelftest(Register):
+    """A register of known content: finds a wrong address base, word order or device."""
+
+    expect: float = Field(description="what it must hold")
+
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        low, high = self.representable
+        if not low <= self.expect <= high:
+            raise ValueError(f"expect must fit into {self.type}, got {self.expect:g}")
+        return self
+
+
+class RegisterStep(Register):
+    """A step on one register.
+
+    ``timeout`` and ``safe`` stand for what the experiment says of the watchdog.
+    """
+
+    value: StepValue = Field(description="a number, or timeout or safe in watchdog steps")
+    note: str = ""
+
+    @model_validator(mode="after")
+    def _value_fits(self) -> Self:
+        low, high = self.representable
+        if isinstance(self.value, float) and not low <= self.value <= high:
+            raise ValueError(f"value must fit into {self.type}, got {self.value:g}")
+        return self
+
+
+class WriteStep(RegisterStep):
+    """Write a register, and read it again where ``verify`` is set."""
+
+    kind: Literal["write"]
+    verify: bool = False
+
+
+class EnsureStep(RegisterStep):
+    """Read a register; write it only where it differs, then read it again.
+
+    For settings in flash that must not be rewritten at each run.
+    """
+
+    kind: Literal["ensure"]
+
+
+class ExpectStep(RegisterStep):
+    """Read a register and refuse to go on where it differs; writes nothing."""
+
+    kind: Literal["expect"]
+
+
+ModbusStep: TypeAlias = Annotated[
+    WriteStep | EnsureStep | ExpectStep | WaitStep, Field(discriminator="kind")
+]
+
+
+class TripFlag(Register):
+    """A register that says yes where any bit of ``mask`` is set."""
+
+    mask: int = Field(ge=1, le=0xFFFFFFFF, description="bits of the raw value that say yes")
+
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        if self.type.startswith("float") or self.mask > self.representable[1]:
+            raise ValueError(f"mask must fit into {self.type}, got {self.mask:#x}")
+        return self
+
+
+def wire_address(register: Register, base: AddressBase) -> int:
+    """Return the address that goes into the frame; out of 0..65535 where there is none.
+
+    With base ``modicon``, holding register 1 is 40001 or 400001, input register 1 is 30001 or
+    300001, discrete input 1 is 10001 or 100001 and coil 1 is 1.
+    """
+    if base != "modicon":
+        return register.address - base
+    digit = _MODICON[register.area]
+    if digit == 0:
+        return register.address - 1
+    for decade, size in ((10_000, 9_999), (100_000, 65_536)):
+        index = register.address - digit * decade - 1
+        if 0 <= index < size:
+            return index
+    return -1

@@ -1,0 +1,152 @@
+"""The parts of a device profile that all protocols share: ranges, watchdog, provenance."""
+
+import math
+from collections.abc import Mapping
+from typing import Annotated, ClassVar, Literal, Self, TypeAlias
+
+from pydantic import Field, StringConstraints, model_validator
+
+from hilctl.base.errors import InputError
+from hilctl.base.strict import StrictModel
+from hilctl_drivers.transport.link_config import LinkSettings
+
+Text: TypeAlias = Annotated[str, StringConstraints(min_length=1)]
+Name: TypeAlias = Annotated[str, StringConstraints(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
+
+
+class Range(StrictModel):
+    """What a channel means at the terminals.
+
+    ``min`` and ``max`` are what the device puts out or takes in, not what its register could hold.
+    """
+
+    unit: Literal["V", "A", "mA"] = Field(description="unit of min, max and of the value")
+    min: float = Field(description="lowest value that the device puts out or reads, in unit")
+    max: float = Field(description="highest value that the device puts out or reads, in unit")
+    resolution: float | None = Field(default=None, gt=0.0, description="smallest step, in unit")
+    settle_s: float = Field(
+        default=0.0,
+        ge=0.0,
+        description="time it takes to settle, s; a sample period is longer by that",
+    )
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if self.min >= self.max:
+            raise ValueError(f"min must be < max, got {self.min:g} and {self.max:g}")
+        return self
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Lowest and highest value, in ``unit``."""
+        return self.min, self.max
+
+
+class Watchdog(StrictModel):
+    """The device's own host watchdog: what it does when this machine falls silent."""
+
+    unit_s: float = Field(gt=0.0, description="one count of the device's timeout, s")
+    min_s: float = Field(gt=0.0, description="shortest timeout it takes, s")
+    max_s: float = Field(gt=0.0, description="longest timeout it takes, s")
+    kick: Literal["any", "write", "strict"] = Field(
+        description="what feeds it: any request, a write, or only the feed steps"
+    )
+    on_trip: Literal["safe", "zero", "hold", "reset", "unknown"] = Field(
+        description="what the outputs do: go to the safe value, to 0, stay, or the device restarts"
+    )
+    refuses_while_tripped: bool = Field(description="whether it refuses commands until cleared")
+
+    @model_validator(mode="after")
+    def _span(self) -> Self:
+        if self.min_s > self.max_s:
+            raise ValueError(f"min_s must be <= max_s, got {self.min_s:g} and {self.max_s:g}")
+        return self
+
+    def counts(self, timeout_s: float) -> int:
+        """Return a timeout in the device's own counts.
+
+        Raises:
+            InputError: It is out of range, or no whole number of counts.
+        """
+        if not self.min_s <= timeout_s <= self.max_s:
+            raise InputError(
+                f"watchdog timeout_s must be {self.min_s:g} to {self.max_s:g}, got {timeout_s:g}"
+            )
+        counts = round(timeout_s / self.unit_s)
+        if not math.isclose(counts * self.unit_s, timeout_s, rel_tol=1e-9):
+            raise InputError(
+                f"watchdog timeout_s must be a multiple of {self.unit_s:g}, got {timeout_s:g}"
+            )
+        return counts
+
+
+class WaitStep(StrictModel):
+    """Let the device settle."""
+
+    kind: Literal["wait"]
+    seconds: float = Field(gt=0.0, le=60.0, description="how long, s")
+    note: str = ""
+
+
+class BaseProfile(StrictModel):
+    """What every profile says of a device, whatever it speaks.
+
+    Subclasses narrow ``link``, ``outputs``, ``inputs`` and ``watchdog`` to their protocol's.
+
+    Attributes:
+        DEVICE: The kind of device in an experiment that such profiles are for.
+        WIRE: What makes a :class:`~hilctl_drivers.serial.serial_wire.SerialWire` from a
+            :class:`~hilctl_drivers.serial.serial_setup.SerialSetup`, as ``module:name``; empty where the
+            protocol has a device of its own.
+    """
+
+    DEVICE: ClassVar[str]
+    WIRE: ClassVar[str] = ""
+
+    vendor: Text
+    model: Text = Field(description="model, as ordered")
+    source: tuple[Text, ...] = Field(min_length=1, description="documents this was taken from")
+    verified: Literal["yes", "partly", "no"] = Field(
+        description="whether the source was seen to say all, some or none of this"
+    )
+    unverified: tuple[Text, ...] = Field(
+        default=(), description="dotted keys of this file that no document was seen for"
+    )
+    notes: tuple[Text, ...] = Field(default=(), description="what a user must know before wiring")
+    turnaround_s: float = Field(ge=0.0, le=1.0, description="request received to reply begun, s")
+    max_rate_hz: float = Field(gt=0.0, description="highest sample rate that makes sense, Hz")
+    link: LinkSettings
+    outputs: Mapping[Name, Range]
+    inputs: Mapping[Name, Range]
+    watchdog: Watchdog | Literal["none"]
+
+    @model_validator(mode="after")
+    def _says_what_is_unverified(self) -> Self:
+        if (self.verified == "partly") != bool(self.unverified) and self.verified != "no":
+            raise ValueError(
+                "verified must be 'partly' when keys are unverified, and name them then"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _has_channels(self) -> Self:
+        # A device with inputs only can be another one's reader.
+        if not self.outputs and not self.inputs:
+            raise ValueError("must have outputs or inputs, or both")
+        if self.watchdog != "none" and not self.outputs:
+            raise ValueError("watchdog must be none where there are no outputs to make safe")
+        return self
+
+    @property
+    def title(self) -> str:
+        """Vendor and model."""
+        return f"{self.vendor} {self.model}"
+
+    def provenance(self, prefix: str = "") -> dict[str, str]:
+        """Return what the profile is of, and where it was taken from, to keep with a recording."""
+        return {
+            f"{prefix}vendor": self.vendor,
+            f"{prefix}model": self.model,
+            f"{prefix}source": "; ".join(self.source),
+            f"{prefix}verified": self.verified,
+        }

@@ -1,0 +1,349 @@
+"""What an experiment says of a DAC with a profile: where it is and what its terminals are wired to.
+
+The device's profile says what its terminals do; these options say which of them are used, what
+stands between them and the actuator, and which device reads the sensor where it is another one.
+command = gain * output + offset, displacement = sensitivity * input + offset.
+"""
+
+from collections.abc import Mapping
+from typing import Annotated, Literal, Self, TypeAlias, TypeVar
+
+from pydantic import Field, model_validator
+
+from hilctl.base.device import DeviceOptions
+from hilctl.base.errors import InputError
+from hilctl.base.strict import StrictModel
+from hilctl.base.types import CommandUnit
+from hilctl_drivers.profile import ProfileName
+from hilctl_drivers.profile_base import Range, Watchdog
+
+PROFILE = "name of a shipped profile, or path of your own, from the experiment's folder"
+
+_Channel = TypeVar("_Channel", bound=Range)
+
+
+class Amplifier(StrictModel):
+    """The power amplifier after the output; one of the gains."""
+
+    gain_a_per_v: float | None = Field(default=None, description="coil current of one volt")
+    gain_a_per_ma: float | None = Field(default=None, description="coil current of one milliampere")
+    gain_v_per_v: float | None = Field(default=None, description="drive voltage of one volt")
+    gain_v_per_ma: float | None = Field(default=None, description="drive voltage of one mA")
+    offset_a: float = Field(default=0.0, description="coil current at 0 of the output")
+    offset_v: float = Field(default=0.0, description="drive voltage at 0 of the output")
+
+    @model_validator(mode="after")
+    def _one_gain(self) -> Self:
+        given = [gain for gain in self._gains.values() if gain is not None]
+        if len(given) != 1 or given[0] == 0.0:
+            raise ValueError(f"must have one of {', '.join(self._gains)}, and not 0")
+        wrong = self.offset_v if self.command_unit == "A" else self.offset_a
+        if wrong:
+            raise ValueError("offset must be in the unit that the gain leads to")
+        return self
+
+    @property
+    def _gains(self) -> dict[str, float | None]:
+        return {
+            "gain_a_per_v": self.gain_a_per_v,
+            "gain_a_per_ma": self.gain_a_per_ma,
+            "gain_v_per_v": self.gain_v_per_v,
+            "gain_v_per_ma": self.gain_v_per_ma,
+        }
+
+    @property
+    def command_unit(self) -> CommandUnit:
+        """Unit of what drives the actuator."""
+        current = (self.gain_a_per_v, self.gain_a_per_ma)
+        return "V" if current == (None, None) else "A"
+
+    @property
+    def output_unit(self) -> str:
+        """Unit of the output that it is wired to."""
+        volts = (self.gain_a_per_v, self.gain_v_per_v)
+        return "mA" if volts == (None, None) else "V"
+
+    @property
+    def gain(self) -> float:
+        """Command for one unit of the output."""
+        return next(gain for gain in self._gains.values() if gain is not None)
+
+    @property
+    def offset(self) -> float:
+        """Command at 0 of the output."""
+        return self.offset_a + self.offset_v
+
+
+class Sensor(StrictModel):
+    """The displacement sensor before the input; one of the sensitivities."""
+
+    um_per_v: float | None = Field(default=None, description="displacement of one volt, um")
+    um_per_ma: float | None = Field(default=None, description="displacement of one mA, um")
+    offset_um: float = Field(default=0.0, description="displacement at 0 of the input, um")
+
+    @model_validator(mode="after")
+    def _one_sensitivity(self) -> Self:
+        given = [each for each in (self.um_per_v, self.um_per_ma) if each is not None]
+        if len(given) != 1 or given[0] == 0.0:
+            raise ValueError("must have one of um_per_v and um_per_ma, and not 0")
+        return self
+
+    @property
+    def input_unit(self) -> str:
+        """Unit of the input that it is wired to."""
+        return "mA" if self.um_per_v is None else "V"
+
+    @property
+    def um_per_unit(self) -> float:
+        """Displacement for one unit of the input, um."""
+        return self.um_per_v or self.um_per_ma or 0.0
+
+
+class Calibration(StrictModel):
+    """When and by whom gain and sensitivity were found; kept with each recording."""
+
+    date: str = Field(description="day of the calibration")
+    by: str = Field(description="who did it")
+    reference: str = Field(description="against what, or where it is written down")
+
+
+class WatchdogOptions(StrictModel):
+    """What the device does by itself when this machine falls silent."""
+
+    timeout_s: float = Field(gt=0.0, description="silence after which it acts, s")
+    safe_command: float = Field(
+        default=0.0, description="where it puts the output, in the command's unit"
+    )
+    reason: str = Field(
+        default="",
+        description="why safe_command is not the experiment's safe value, where it isn't",
+    )
+
+
+class ReaderOptions(StrictModel):
+    """The device that has the input, where it is another one."""
+
+    profile: ProfileName = Field(description=PROFILE)
+    serial_port: str | None = Field(
+        default=None, description="its device file; left out where it is on the same line"
+    )
+    unit_id: int | None = Field(
+        default=None, ge=0, le=255, description="its address on a shared line; else its profile's"
+    )
+    baud: int | None = Field(
+        default=None, ge=300, description="of its own line; else its profile's"
+    )
+
+    @model_validator(mode="after")
+    def _own_line(self) -> Self:
+        if self.serial_port is None and self.baud is not None:
+            raise ValueError("baud goes with serial_port")
+        return self
+
+
+FifoBlocks: TypeAlias = Annotated[
+    int,
+    Field(
+        ge=1,
+        le=1024,
+        description="blocks kept in the FIFO of a device that streams: what a stall of this machine"
+        " may last, and by how much displacements come later",
+    ),
+]
+
+
+class DacOptions(DeviceOptions):
+    """Options of every DAC that has a profile."""
+
+    profile: ProfileName = Field(description=PROFILE)
+    serial_port: str | None = Field(
+        default=None, description="device file; best under /dev/serial/by-id"
+    )
+    baud: int | None = Field(default=None, ge=300, description="else the profile's")
+    parity: Literal["N", "E", "O"] | None = Field(default=None, description="else the profile's")
+    stopbits: Literal[1, 2] | None = Field(default=None, description="else the profile's")
+    unit_id: int | None = Field(
+        default=None, ge=0, le=255, description="address on a shared line; else the profile's"
+    )
+    output: str = Field(description="output that drives the actuator")
+    input: str = Field(description="input that the displacement sensor is wired to")
+    reader: ReaderOptions | None = Field(
+        default=None, description="the device that has the input, where it is another one"
+    )
+    timeout_s: float = Field(
+        default=0.1, gt=0.0, le=60.0, description="longest wait for one answer, s"
+    )
+    amplifier: Amplifier | None = Field(
+        default=None, description="left out only where the output is in A and drives the coil"
+    )
+    sensor: Sensor
+    calibration: Calibration | None = None
+    watchdog: WatchdogOptions | Literal["none"] = Field(
+        description="the device's own; none says that you know it would hold its last output"
+    )
+
+    @property
+    def watchdog_timeout_s(self) -> float | None:
+        """The timeout that is wanted, s; None without a watchdog."""
+        return None if self.watchdog == "none" else self.watchdog.timeout_s
+
+    @property
+    def safe_command(self) -> float:
+        """Where a watchdog is to put the output; 0 without one."""
+        return 0.0 if self.watchdog == "none" else self.watchdog.safe_command
+
+    @property
+    def watchdog_command(self) -> float | None:
+        """Where the watchdog is to put the output; None without one."""
+        return None if self.watchdog == "none" else self.watchdog.safe_command
+
+    @property
+    def watchdog_reason(self) -> str:
+        """Why that is not the experiment's safe value; empty where nothing was said."""
+        return "" if self.watchdog == "none" else self.watchdog.reason
+
+    def details(self) -> dict[str, str]:
+        """Return the options as text, to keep with a recording."""
+        return {name: str(value) for name, value in self.model_dump(exclude_none=True).items()}
+
+
+class SignalChain:
+    """Commands to output values and input values to displacements.
+
+    Args:
+        output: The output's range.
+        sensor_input: The input's range.
+        amplifier: Between output and actuator; None where an output in A drives the coil itself.
+        sensor: Between actuator and input.
+
+    Raises:
+        InputError: Units that don't go together.
+    """
+
+    def __init__(
+        self, output: Range, sensor_input: Range, amplifier: Amplifier | None, sensor: Sensor
+    ) -> None:
+        if amplifier is None and output.unit != "A":
+            raise InputError(f"amplifier is required: the output is in {output.unit}")
+        if amplifier is not None and amplifier.output_unit != output.unit:
+            raise InputError(
+                f"amplifier takes {amplifier.output_unit}, but the output is in {output.unit}"
+            )
+        if sensor.input_unit != sensor_input.unit:
+            raise InputError(
+                f"sensor gives {sensor.input_unit}, but the input is in {sensor_input.unit}"
+            )
+        self.command_unit: CommandUnit = "A" if amplifier is None else amplifier.command_unit
+        self._gain = 1.0 if amplifier is None else amplifier.gain
+        self._offset = 0.0 if amplifier is None else amplifier.offset
+        self._um_per_unit = sensor.um_per_unit
+        self._offset_um = sensor.offset_um
+
+    @property
+    def factors(self) -> tuple[float, float, float, float]:
+        """Gain and offset of the command, sensitivity and offset of the displacement."""
+        return self._gain, self._offset, self._um_per_unit, self._offset_um
+
+    def output(self, command: float) -> float:
+        """Return the output value of a command."""
+        return (command - self._offset) / self._gain
+
+    def command(self, output: float) -> float:
+        """Return the command of an output value."""
+        return output * self._gain + self._offset
+
+    def displacement_um(self, value: float) -> float:
+        """Return the displacement of an input value, um."""
+        return value * self._um_per_unit + self._offset_um
+
+    def command_range(self, low: float, high: float) -> tuple[float, float]:
+        """Return lowest and highest command of an output's range."""
+        ends = sorted((self.command(low), self.command(high)))
+        return ends[0], ends[1]
+
+    def displacement_range(self, low: float, high: float) -> tuple[float, float]:
+        """Return lowest and highest displacement of an input's range, um."""
+        ends = sorted((self.displacement_um(low), self.displacement_um(high)))
+        return ends[0], ends[1]
+
+
+def channel(what: str, name: str, channels: Mapping[str, _Channel], title: str) -> _Channel:
+    """Return an output or input by its name.
+
+    Args:
+        what: The option that names it.
+        name: Its name.
+        channels: What the device has.
+        title: The device.
+
+    Raises:
+        InputError: There is none of this name; or it is an input that no sensor can be wired to,
+            because it measures the device's own output.
+    """
+    if name not in channels:
+        known = ", ".join(channels) or "none"
+        raise InputError(f"{what} must be one that {title} has, got {name!r} (it has {known})")
+    found = channels[name]
+    if getattr(found, "measures", "terminal") != "terminal":
+        raise InputError(
+            f"input {name} of {title} measures the device's own output: name the device that reads "
+            "the sensor as reader"
+        )
+    return found
+
+
+def check_watchdog(
+    title: str,
+    options: DacOptions,
+    output: Range,
+    chain: SignalChain,
+    has: Watchdog | Literal["none"],
+) -> None:
+    """Refuse a watchdog that the device hasn't got, or that can't do what is asked of it.
+
+    Args:
+        title: The device.
+        options: What the experiment asks for.
+        output: The output in use.
+        chain: What that is wired to.
+        has: What the device has.
+
+    Raises:
+        InputError: It has none, can't take the time-out, or would not go to the safe command.
+    """
+    wanted, name = options.watchdog, options.output
+    if wanted == "none":
+        return
+    if has == "none":
+        raise InputError(
+            f"{title} has no host watchdog: it holds its last output when this "
+            "machine dies; say watchdog: none if you accept that"
+        )
+    has.counts(wanted.timeout_s)
+    low, high = chain.command_range(*output.limits)
+    if not low <= wanted.safe_command <= high:
+        raise InputError(
+            f"watchdog.safe_command must be {low:g} to {high:g}, got {wanted.safe_command:g}"
+        )
+    _check_protects(title, name, has)
+    at_zero, unit = chain.command(0.0), chain.command_unit
+    if has.on_trip in {"zero", "reset"} and abs(at_zero - wanted.safe_command) > 1e-9:
+        raise InputError(
+            f"the watchdog of {title} puts {name} at 0 {output.unit}, which is {at_zero:g} "
+            f"{unit} here: watchdog.safe_command must be that, got {wanted.safe_command:g}"
+        )
+
+
+def _check_protects(title: str, name: str, has: Watchdog) -> None:
+    """Refuse a watchdog whose trip leaves the output where it is."""
+    safe = getattr(has, "safe", {})
+    if has.on_trip == "hold":
+        raise InputError(
+            f"the watchdog of {title} holds {name} where it is when it trips: say watchdog: none "
+            "if you accept that"
+        )
+    if has.on_trip == "safe" and safe and name not in safe:
+        raise InputError(
+            f"the watchdog of {title} does nothing for {name}, only for "
+            f"{', '.join(safe)}: take one of these, or say watchdog: none"
+        )

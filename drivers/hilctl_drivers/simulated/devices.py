@@ -1,0 +1,241 @@
+"""The simulated rigs as devices: ``simulated_terfenol`` and ``simulated_piezo``."""
+
+from dataclasses import asdict, replace
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeAlias
+
+from hilctl.base.device import DeviceInfo, DeviceOptions
+from hilctl.base.strict import Field, model_validator
+from hilctl_drivers.simulated.actuator_base import Plant
+from hilctl_drivers.simulated.diffusion import DiffusionParameters
+from hilctl_drivers.simulated.domains import DomainsParameters
+from hilctl_drivers.simulated.jiles_atherton import JilesAthertonParameters
+from hilctl_drivers.simulated.optional_effects import CreepEffect, SecondMode, Thermal, VoltageLimit
+from hilctl_drivers.simulated.piezo import PiezoActuator, PiezoParameters
+from hilctl_drivers.simulated.pinned_cells import PinnedCellsParameters
+from hilctl_drivers.simulated.rod_model import RodParameters
+from hilctl_drivers.simulated.simulated_device import (
+    FIFO_DEPTH,
+    MAX_RATE_HZ,
+    SimulatedDevice,
+    SimulatedOptions,
+)
+from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
+
+Physics: TypeAlias = Literal["pinned_cells", "domains", "diffusion", "jiles_atherton"]
+PHYSICS: dict[Physics, type[RodParameters]] = {
+    "pinned_cells": PinnedCellsParameters,
+    "domains": DomainsParameters,
+    "diffusion": DiffusionParameters,
+    "jiles_atherton": JilesAthertonParameters,
+}
+Factor: TypeAlias = Annotated[float, Field(ge=0.5, le=2.0)]
+
+
+class Variation(DeviceOptions):
+    """Factors on the rated actuator, to try what a model of another one is still good for."""
+
+    lag: Factor = Field(default=1.0, description="time constant of the field")
+    pinning: Factor = Field(default=1.0, description="pinning fields, the width of the loops")
+    strain: Factor = Field(default=1.0, description="displacement, the gain of the rig")
+    resonance: Factor = Field(default=1.0, description="natural frequency, by the stiffness")
+    damping: Factor = Field(default=1.0, description="damping ratio")
+
+    def of(self, rated: TerfenolParameters) -> TerfenolParameters:
+        """Return an actuator that differs from ``rated`` by these factors."""
+        return replace(
+            rated,
+            rods=rated.rods.varied(self.lag, self.pinning, self.strain),
+            stiffness_n_per_m=rated.stiffness_n_per_m * self.resonance**2,
+            damping_ratio=rated.damping_ratio * self.damping,
+        )
+
+
+class Drift(DeviceOptions):
+    """Slow growth of the displacement, as of rods that warm up: ``um * (1 - exp(-t / tau_s))``."""
+
+    um: float = Field(ge=-50.0, le=50.0, description="displacement that it comes to, um")
+    tau_s: float = Field(gt=0.0, description="its time constant, s")
+
+
+class TerfenolOptions(SimulatedOptions):
+    """Options of ``simulated_terfenol``."""
+
+    physics: Physics = Field(
+        default="pinned_cells",
+        description="what goes on in the rods; pinned_cells: cells with dry friction behind one lag"
+        " of the field; domains: domains of eight orientations, averaged over their energies;"
+        " diffusion: the field diffuses into conducting rods, shell by shell;"
+        " jiles_atherton: Jiles and Atherton's equations with eddy and excess loss",
+    )
+    load_kg: float = Field(default=0.0, ge=0.0, le=100.0, description="mass on the actuator, kg")
+    magnet: bool = Field(
+        default=True,
+        description="whether permanent magnets bias the rods; without them and without bias_a the"
+        " displacement is even in the current, and its loops are butterflies",
+    )
+    bias_a: float = Field(
+        default=0.0,
+        ge=-8.0,
+        le=8.0,
+        description="constant current beside the command, A; displacement is zero there",
+    )
+    current_max_a: float = Field(
+        default=10.0,
+        gt=0.0,
+        le=10.0,
+        description="largest current accepted either way, bias and command together, A",
+    )
+    vary: Variation = Field(
+        default=Variation(), description="factors on the rated actuator, for tests of robustness"
+    )
+    drift: Drift | None = Field(default=None, description="slow growth of the displacement")
+    creep: CreepEffect | None = Field(default=None, description="creep of the displacement")
+    thermal: Thermal | None = Field(
+        default=None, description="growth of the displacement with the rods' temperature"
+    )
+    second_mode: SecondMode | None = Field(
+        default=None, description="a mode of the structure beside the first"
+    )
+    amplifier: VoltageLimit | None = Field(
+        default=None, description="limit of the amplifier's voltage"
+    )
+
+    @model_validator(mode="after")
+    def _room(self) -> Self:
+        if not abs(self.bias_a) < self.current_max_a:
+            raise ValueError(
+                f"bias_a must leave room for a command within current_max_a, "
+                f"{self.current_max_a:g} A: {self.bias_a:g}"
+            )
+        return self
+
+    @property
+    def command_range_a(self) -> tuple[float, float]:
+        """Lowest and highest command: with the bias it must stay within ``current_max_a``."""
+        dac_a = TerfenolParameters().dac_range_a
+        low, high = -self.current_max_a - self.bias_a, self.current_max_a - self.bias_a
+        return max(-dac_a, low), min(dac_a, high)
+
+    def parameters(self) -> TerfenolParameters:
+        """Return the actuator that the options describe."""
+        rated = TerfenolParameters(
+            rods=PHYSICS[self.physics](),
+            creep=self.creep,
+            thermal=self.thermal,
+            second_mode=self.second_mode,
+            amplifier=self.amplifier,
+        )
+        parameters = self.vary.of(rated)
+        if not self.noise:
+            parameters = replace(parameters, sensor_noise_um=0.0)
+        if not self.magnet:
+            parameters = replace(parameters, magnet_field_a_per_m=0.0)
+        if self.drift is not None:
+            parameters = replace(parameters, drift_um=self.drift.um, drift_s=self.drift.tau_s)
+        return parameters
+
+
+class PiezoStage(DeviceOptions):
+    """A stage of your own: a sum of play operators, for example one identified from your data."""
+
+    drive_max_v: float = Field(gt=0.0, description="top of the drive, V; its bottom is 0 V")
+    slope_um_per_v: float = Field(gt=0.0, description="weight p_0 of the drive itself")
+    thresholds_v: tuple[float, ...] = Field(description="thresholds r_i of the play operators, V")
+    weights_um_per_v: tuple[float, ...] = Field(description="weights p_i of the play operators")
+    offset_um: float = Field(default=0.0, description="position at rest, um")
+    sensor_range_um: float = Field(gt=0.0, description="reading at either end of the range, um")
+
+    @model_validator(mode="after")
+    def _same_length(self) -> Self:
+        weights, thresholds = len(self.weights_um_per_v), len(self.thresholds_v)
+        if weights != thresholds:
+            raise ValueError(
+                f"weights_um_per_v must have one value a threshold: {weights} for {thresholds}"
+            )
+        return self
+
+
+class PiezoOptions(SimulatedOptions):
+    """Options of ``simulated_piezo``."""
+
+    stage: PiezoStage | None = Field(
+        default=None, description="a stage of your own instead of the published P-753.31C"
+    )
+    sensor_noise_um: float = Field(
+        default=1e-3, ge=0.0, le=1.0, description="rms noise of each reading, um"
+    )
+
+
+def _details(parameters: dict[str, Any], options: SimulatedOptions) -> dict[str, str]:
+    """Return physical parameters and options as text, to be kept with a recording."""
+    everything = parameters | parameters.pop("rods", {}) | options.model_dump()
+    return {name: str(value) for name, value in everything.items()}
+
+
+_COMMON: dict[str, Any] = {
+    "max_rate_hz": MAX_RATE_HZ,
+    "buffered": True,
+    "fifo_depth": FIFO_DEPTH,
+    "measures_command": True,
+    "simulated": True,
+}
+
+
+class SimulatedTerfenol(SimulatedDevice):
+    """The Terfenol-D actuator of :mod:`hilctl_drivers.simulated.terfenol`; commands in A."""
+
+    Options: ClassVar[type[DeviceOptions]] = TerfenolOptions
+
+    def __init__(self, options: TerfenolOptions) -> None:
+        """Describe the device; nothing is simulated before :meth:`open`."""
+        self._options = options
+        self._parameters = options.parameters()
+        range_um = self._parameters.sensor_range_um
+        command_min, command_max = options.command_range_a
+        info = DeviceInfo(
+            name="simulated_terfenol",
+            description="simulated Terfenol-D actuator, linear amplifier and capacitive sensor",
+            command_unit="A",
+            command_min=command_min,
+            command_max=command_max,
+            sensor_min_um=-range_um,
+            sensor_max_um=range_um,
+            details=_details(asdict(self._parameters), options),
+            **_COMMON,
+        )
+        super().__init__(info, options)
+
+    def _build(self, sample_rate_hz: float) -> Plant:
+        options = self._options
+        return TerfenolActuator(
+            self._parameters, sample_rate_hz, options.load_kg, options.bias_a, options.seed
+        )
+
+
+class SimulatedPiezo(SimulatedDevice):
+    """The piezo stage of :mod:`hilctl_drivers.simulated.piezo`; commands in V of drive."""
+
+    Options: ClassVar[type[DeviceOptions]] = PiezoOptions
+
+    def __init__(self, options: PiezoOptions) -> None:
+        """Describe the device; nothing is simulated before :meth:`open`."""
+        self._seed = options.seed
+        noise_um = options.sensor_noise_um if options.noise else 0.0
+        stage = options.stage.model_dump() if options.stage else {}
+        self._parameters = PiezoParameters(sensor_noise_um=noise_um, **stage)
+        info = DeviceInfo(
+            name="simulated_piezo",
+            description=f"simulated piezo stage, 0..{self._parameters.drive_max_v:g} V drive and "
+            "capacitive sensor",
+            command_unit="V",
+            command_min=0.0,
+            command_max=self._parameters.drive_max_v,
+            sensor_min_um=-self._parameters.sensor_range_um,
+            sensor_max_um=self._parameters.sensor_range_um,
+            details=_details(asdict(self._parameters), options),
+            **_COMMON,
+        )
+        super().__init__(info, options)
+
+    def _build(self, sample_rate_hz: float) -> Plant:
+        return PiezoActuator(self._parameters, sample_rate_hz, self._seed)

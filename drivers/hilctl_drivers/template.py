@@ -1,0 +1,168 @@
+"""The device section of a first experiment with a profile; the values in it are nobody's yet.
+
+It is what every DAC with a profile needs to be named, in an order for people. What only the owner
+of a rig can know stands there as a value that is easy to see through, and in ``asked``.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+from hilctl.base.errors import InputError
+from hilctl.base.files import TextFiles
+from hilctl.base.types import CommandUnit
+from hilctl_drivers.profile import load_profile
+from hilctl_drivers.profile_base import BaseProfile, Range, Watchdog
+
+_HERE = "127.0.0.1"
+_PORT = "/dev/serial/by-id/set-me"
+_SUFFIX = {"V": "v", "mA": "ma"}
+_UM_PER_UNIT = 10.0
+_SILENCE_S = 2.0
+
+_Channel = TypeVar("_Channel", bound=Range)
+
+
+@dataclass(slots=True)
+class StartingSection:
+    """A device section to begin with.
+
+    Attributes:
+        title: The device.
+        values: The section, ``kind`` first.
+        remarks: What stands behind a value, by dotted key of the section.
+        asked: Keys that only the owner of the rig can know, each with the question.
+        notes: What the profile says must be known before anything is wired.
+    """
+
+    title: str
+    values: dict[str, Any]
+    remarks: dict[str, str] = field(default_factory=dict)
+    asked: dict[str, str] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+
+def starting_section(
+    name_or_path: str, unit: CommandUnit, reader_name: str | None, files: TextFiles | None = None
+) -> StartingSection:
+    """Return the device section of a first experiment with a profile.
+
+    Args:
+        name_or_path: Name of a shipped profile, or path of one.
+        unit: What the actuator is driven with; an output in A drives it itself.
+        reader_name: Profile of the device that has the sensor, where it is another one.
+        files: Where profiles are read from; the disk where None.
+
+    Raises:
+        InputError: There is no such profile, or it has no output, or there is no input that a
+            sensor can be wired to.
+    """
+    profile = load_profile(name_or_path, files)
+    reader = profile if reader_name is None else load_profile(reader_name, files)
+    output_name, output = _first("output", profile.outputs, profile)
+    inputs = {
+        key: each
+        for key, each in reader.inputs.items()
+        if getattr(each, "measures", "terminal") == "terminal"
+    }
+    input_name, sensor_input = _first("input", inputs, reader)
+    made = StartingSection(profile.title, {"kind": profile.DEVICE}, notes=profile.notes)
+    _add(made, "profile", name_or_path)
+    _place(made, "", profile)
+    _add(made, "output", output_name, f"{_span(output)}; it has {', '.join(profile.outputs)}")
+    if reader_name is not None:
+        made.values["reader"] = _reader(made, reader_name, profile, reader)
+    of = "of the reader, " if reader_name is not None else ""
+    _add(made, "input", input_name, f"{of}{_span(sensor_input)}; it has {', '.join(inputs)}")
+    _amplifier(made, output, unit)
+    _sensor(made, sensor_input)
+    _watchdog(made, profile.watchdog)
+    return made
+
+
+def _first(
+    what: str, channels: Mapping[str, _Channel], profile: BaseProfile
+) -> tuple[str, _Channel]:
+    if not channels and what == "output":
+        raise InputError(
+            f"{profile.title} has no output: it reads the sensor for another device; name that, "
+            "and this with --reader"
+        )
+    if not channels:
+        raise InputError(
+            f"{profile.title} has no input for a displacement sensor: name the profile of what "
+            "reads it with --reader"
+        )
+    return next(iter(channels.items()))
+
+
+def _span(channel: Range) -> str:
+    return f"{channel.min:g} to {channel.max:g} {channel.unit}"
+
+
+def _add(made: StartingSection, key: str, value: object, remark: str = "") -> None:
+    made.values[key] = value
+    if remark:
+        made.remarks[key] = remark
+
+
+def _place(made: StartingSection, prefix: str, profile: BaseProfile) -> dict[str, Any]:
+    """Say where a device is; return that for a reader, whose keys begin with ``prefix``."""
+    where = {} if prefix else made.values
+    if profile.link.kind == "tcp":
+        where["host"] = _HERE
+        # Two devices can't have one place: at addresses of their own both have the usual port.
+        where["tcp_port"] = getattr(profile.link, "port", 502) + bool(prefix)
+        made.remarks[f"{prefix}host"] = "set: name or address; this machine is hilctl emulate's"
+        made.asked[f"{prefix}host"] = f"name or address of the {profile.title}"
+    else:
+        where["serial_port"] = _PORT
+        made.remarks[f"{prefix}serial_port"] = "set: hilctl devices lists the ports of this machine"
+        made.asked[f"{prefix}serial_port"] = f"serial port of the {profile.title}"
+    return where
+
+
+def _reader(
+    made: StartingSection, name: str, profile: BaseProfile, reader: BaseProfile
+) -> dict[str, Any]:
+    kinds = profile.link.kind, reader.link.kind
+    if kinds == ("rtu", "rtu"):  # on the same line, where no two may have one address
+        mine = getattr(profile, "unit_id", 1)
+        other = getattr(reader, "unit_id", 1)
+        made.remarks["reader.unit_id"] = f"its address on the same line; the output's is {mine}"
+        return {"profile": name, "unit_id": other + (other == mine)}
+    return {"profile": name, **_place(made, "reader.", reader)}
+
+
+def _amplifier(made: StartingSection, output: Range, unit: CommandUnit) -> None:
+    if output.unit == "A":
+        return
+    key = f"gain_{unit.lower()}_per_{_SUFFIX[output.unit]}"
+    middle = 0.5 * (output.min + output.max) if unit == "A" else 0.0
+    made.values["amplifier"] = {key: 1.0, f"offset_{unit.lower()}": 0.0 - middle}
+    of = {"A": "coil current", "V": "drive voltage"}[unit]
+    made.remarks[f"amplifier.{key}"] = f"set: {of} of one {output.unit} of the output"
+    made.remarks[f"amplifier.offset_{unit.lower()}"] = f"set: {of} at 0 {output.unit}"
+    made.asked[f"amplifier.{key}"] = f"{of} of one {output.unit} of {made.values['output']}"
+    made.asked[f"amplifier.offset_{unit.lower()}"] = f"{of} at 0 {output.unit}"
+
+
+def _sensor(made: StartingSection, sensor_input: Range) -> None:
+    if sensor_input.unit == "A":
+        raise InputError(f"{made.values['input']} is in A: no displacement sensor gives that")
+    key = f"um_per_{_SUFFIX[sensor_input.unit]}"
+    middle = 0.5 * (sensor_input.min + sensor_input.max)
+    made.values["sensor"] = {key: _UM_PER_UNIT, "offset_um": 0.0 - _UM_PER_UNIT * middle}
+    made.remarks[f"sensor.{key}"] = f"set: displacement of one {sensor_input.unit} of the input, um"
+    made.remarks["sensor.offset_um"] = f"set: displacement at 0 {sensor_input.unit}, um"
+    made.asked[f"sensor.{key}"] = f"displacement of one {sensor_input.unit} of the sensor, um"
+    made.asked["sensor.offset_um"] = f"displacement at 0 {sensor_input.unit}, um"
+
+
+def _watchdog(made: StartingSection, has: Watchdog | str) -> None:
+    if not isinstance(has, Watchdog):
+        _add(made, "watchdog", "none", "it has none: if this machine dies, the output stays")
+        return
+    silence_s = min(max(_SILENCE_S, has.min_s), has.max_s)
+    made.values["watchdog"] = {"timeout_s": silence_s, "safe_command": 0.0}
+    made.remarks["watchdog"] = "the device's own: what it does when this machine falls silent"

@@ -1,0 +1,161 @@
+"""Bytes there and back: one request, one reply, never longer than the time-out.
+
+Nothing is pipelined and nothing is sent twice. A reply ends where its own bytes say so, which the
+caller works out from what has come so far; pauses between bytes mean nothing. Texts of errors leave
+out who was asked for what: the device that owns the link adds it.
+
+This is what all links have in common; :mod:`hilctl_drivers.transport.tcp` and
+:mod:`hilctl_drivers.transport.serial_port` are the links.
+
+Errors of one message:
+
+DeviceError
+|-- NoAnswerError     nothing, or not all of a reply, in time
+|-- LostError         the connection is gone
+`-- FrameError        any of the below
+    |-- BadRequest    the request is not possible on this wire; nothing was sent
+    |-- Incomplete    a good beginning, but more bytes are needed
+    |-- Corrupt       a check or the structure is wrong
+    |-- Mismatch      well formed, but not the answer to the request
+    `-- Refused       the device understood and refused
+        `-- WatchdogTripped   its host watchdog has set the output to its safe value
+
+The texts describe the bytes; devices put their own name and the request in front.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from types import MappingProxyType
+from typing import Protocol, TypeAlias
+
+from hilctl.base.errors import DeviceError
+from hilctl.base.os_errors import reason
+
+Missing: TypeAlias = Callable[[bytearray], int]
+"""How many more bytes to wait for, at least, after those that have come; 0 where the reply is
+there. It may raise where they can't be the beginning of one."""
+
+
+class NoAnswerError(DeviceError):
+    """Nothing, or not all of a reply, came in time."""
+
+
+class LostError(DeviceError):
+    """The connection is gone: refused, reset, closed by the peer, or unplugged."""
+
+
+class Link(Protocol):
+    """A way to send a request and get its reply."""
+
+    @property
+    def name(self) -> str:
+        """Where it leads, for messages: ``host:port`` or the serial port."""
+        ...
+
+    def open(self) -> None:
+        """Connect.
+
+        Raises:
+            LostError: There is nobody, or the port is in use.
+        """
+        ...
+
+    def transact(
+        self, request: bytes | bytearray, missing: Missing, usual: int = 0
+    ) -> bytes | bytearray:
+        """Send ``request`` and return the whole reply.
+
+        Args:
+            request: What to send.
+            missing: Says how much of the reply is still to come.
+            usual: Size of a good reply, where it is known: ``missing`` is not asked then when just
+                that much has come.
+
+        Raises:
+            NoAnswerError: The reply was not complete in time.
+            LostError: The link is not open, or broke.
+            DeviceError: Bytes came that are no reply.
+        """
+        ...
+
+    def close(self) -> None:
+        """Let go of it; closing twice is fine."""
+        ...
+
+
+@contextmanager
+def naming(who: str) -> Iterator[None]:
+    """Let errors of a device say which one it is; an empty name leaves them as they are."""
+    try:
+        yield
+    except DeviceError as error:
+        if who:
+            raise DeviceError(f"{who}: {error}") from None
+        raise
+
+
+def why(error: OSError, remedies: Mapping[int, str] = MappingProxyType({})) -> str:
+    """Return the system's own words for an error, to stand in a sentence, and what to do about it.
+
+    Args:
+        error: What was raised.
+        remedies: What to do, by ``errno``.
+    """
+    text = reason(error, remedies)
+    return text[:1].lower() + text[1:]
+
+
+def cut(got: int, wanted: int, timeout_s: float) -> str:
+    """Return what is wrong with a reply that was not complete in time.
+
+    Args:
+        got: Bytes that have come.
+        wanted: Bytes that were still waited for.
+        timeout_s: Time-out of the exchange, s.
+    """
+    what = f"only {got} bytes, {wanted} short," if got else "no answer"
+    return f"{what} within {timeout_s:g} s"
+
+
+class FrameError(DeviceError):
+    """A message can't be built, or what came back is not a good answer to it."""
+
+
+class BadRequestError(FrameError, ValueError):
+    """What is asked can't be put on this wire; nothing was sent.
+
+    Example scenarios: more registers than a frame holds, a value that the register's type or the
+    number's field can't hold. Also a ``ValueError``, so that a profile's validation can collect it.
+    """
+
+
+class IncompleteError(FrameError):
+    """The bytes so far are the beginning of a message: read on until the deadline."""
+
+
+class CorruptError(FrameError):
+    """The bytes are not a message: a check or the structure is wrong."""
+
+
+class MismatchError(FrameError):
+    """A well-formed message, but not the answer to what was asked.
+
+    Example scenarios: another transaction, unit, function, address or length; a late answer to an
+    earlier request.
+    """
+
+
+class RefusedError(FrameError):
+    """The device understood the request and refused it.
+
+    Attributes:
+        code: Modbus exception code, SCPI error number or the device's own mark, such as ``E01``.
+    """
+
+    def __init__(self, text: str, code: int | str = "") -> None:
+        super().__init__(text)
+        self.code = code
+
+
+class WatchdogTrippedError(RefusedError):
+    """The host watchdog has tripped: the output is at its safe value, commands are ignored."""

@@ -1,0 +1,63 @@
+"""One attempt to put a safe value on a serial line.
+
+It follows a failure, so the line may be full of late answers or never fall silent, and the device
+may be deaf or booting. The value is sent before any of this is examined; only the device's own
+answer to it counts.
+"""
+
+from collections.abc import Callable
+
+from hilctl.base.errors import DeviceError, UnconfirmedError
+from hilctl_drivers.transport.serial_port import SerialLink
+
+_QUIET_S = 0.05
+"""Silence that is taken as the end of late answers in the first attempt: adapters hold bytes back
+for 16 ms, and some devices think as long."""
+
+
+class SafeExchange:
+    """Attempts that send a value first, and then have it confirmed.
+
+    Serial protocols do not number their replies, or repeat the numbers: after a failure the answer
+    to an older message would pass for the next one's, and so on. The silence that is required grows
+    with each failed attempt, up to the time-out.
+    """
+
+    def __init__(self) -> None:
+        self._quiet_s = _QUIET_S
+
+    def attempt(
+        self, link: SerialLink, send: Callable[[], None], confirm: Callable[[], None]
+    ) -> None:
+        """Send the value and have it confirmed, once.
+
+        Args:
+            link: To the device, open or not; a board that opening resets is not waited for.
+            send: Send the value and await no answer.
+            confirm: Send it, and raise unless the device confirms it.
+
+        Raises:
+            UnconfirmedError: It was sent; the device has no way to confirm it.
+            DeviceError: It was not confirmed.
+        """
+        try:
+            if not link.is_open:
+                link.open(boot=False)
+            if link.is_in_step:
+                confirm()
+            else:
+                send()
+                quiet_s = min(self._quiet_s, link.timeout_s)
+                link.await_silence(quiet_s, answer_s=link.timeout_s)
+                confirm()
+                # That answer may have been a late one. Another follows only if this device answers
+                # now: it answers in order, and silence came in between.
+                link.await_silence(quiet_s)
+                confirm()
+        except UnconfirmedError:
+            raise
+        except DeviceError:
+            link.doubt()
+            self._quiet_s = 2.0 * min(self._quiet_s, link.timeout_s)
+            raise
+        self._quiet_s = _QUIET_S

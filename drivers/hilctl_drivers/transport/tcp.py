@@ -1,0 +1,134 @@
+"""Bytes over TCP."""
+
+import math
+import select
+import socket
+import struct
+import time
+from collections.abc import Callable
+
+from hilctl.base.errors import DeviceError
+from hilctl.base.os_errors import CONNECT_REMEDIES
+from hilctl_drivers.transport.links import LostError, Missing, NoAnswerError, cut, why
+
+_FIRST = 256
+"""Most replies are shorter; buffers up to 512 bytes come from Python's own pool, which is faster
+than the system's."""
+_CHUNK = 4096
+
+
+class TcpLink:
+    """A TCP connection without Nagle's delay.
+
+    Args:
+        host: Name or address.
+        port: TCP port.
+        timeout_s: Longest that connecting, or one exchange, may take.
+        clock: Monotonic time in s.
+    """
+
+    def __init__(
+        self, host: str, port: int, timeout_s: float, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._address = (host, port)
+        self._timeout_s = timeout_s
+        self._clock = clock
+        self._socket: socket.socket | None = None
+        self.peer_host = host
+        """Numeric address of the peer, once it was reached; the host as given before."""
+
+    @property
+    def name(self) -> str:
+        """``host:port``."""
+        return f"{self._address[0]}:{self._address[1]}"
+
+    def open(self) -> None:
+        """Connect, see :meth:`~hilctl_drivers.transport.links.Link.open`."""
+        self.close()
+        try:
+            made = socket.create_connection(self._address, self._timeout_s)
+        except TimeoutError:
+            raise LostError(f"no connection within {self._timeout_s:g} s") from None
+        except OSError as error:
+            raise LostError(f"can't connect: {why(error, CONNECT_REMEDIES)}") from None
+        try:
+            self._set_up(made)
+        except OSError as error:  # reset since
+            made.close()
+            raise LostError(f"can't connect: {why(error)}") from None
+        self._socket = made
+
+    def _set_up(self, made: socket.socket) -> None:
+        made.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        made.settimeout(None)
+        # The kernel's own time-outs spare the poll() before each call that Python's would cost.
+        seconds, fraction = divmod(self._timeout_s, 1.0)
+        limit = struct.pack("ll", int(seconds), max(1, int(fraction * 1e6)))
+        made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, limit)
+        made.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, limit)
+        # What is not acknowledged by then is given up, also where this process dies: else the
+        # kernel sends an old command again when the cable is back.
+        unacknowledged_ms = math.ceil(self._timeout_s * 1e3)
+        made.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, unacknowledged_ms)
+        self.peer_host = made.getpeername()[0]
+
+    def transact(
+        self, request: bytes | bytearray, missing: Missing, usual: int = 0
+    ) -> bytes | bytearray:
+        """Exchange, see :meth:`~hilctl_drivers.transport.links.Link.transact`.
+
+        After a failure the connection is reset: a late reply could only be taken for that of the
+        next request, and a request that is not delivered yet must not be any more.
+        """
+        connection = self._socket
+        if connection is None:
+            raise LostError("not connected")
+        deadline = self._clock() + self._timeout_s
+        try:
+            connection.sendall(request)
+            if not usual and not missing(bytearray()):
+                return b""
+            reply = connection.recv(_FIRST)
+            if len(reply) == usual > 0:
+                return reply
+            return self._rest(connection, bytearray(reply), missing, deadline)
+        except BlockingIOError:
+            self._reset()
+            raise NoAnswerError(f"no answer within {self._timeout_s:g} s") from None
+        except OSError as error:
+            self._reset()
+            raise LostError(f"connection lost: {why(error)}") from None
+        except DeviceError:
+            self._reset()
+            raise
+
+    def _rest(
+        self, connection: socket.socket, reply: bytearray, missing: Missing, deadline: float
+    ) -> bytearray:
+        if not reply:
+            raise LostError("connection closed by the device")
+        while wanted := missing(reply):
+            reply += self._more(connection, len(reply), wanted, deadline)
+        return reply
+
+    def _more(self, connection: socket.socket, got: int, wanted: int, deadline: float) -> bytes:
+        left_s = deadline - self._clock()
+        poll = select.poll()
+        poll.register(connection, select.POLLIN)
+        if left_s <= 0.0 or not poll.poll(math.ceil(left_s * 1e3)):
+            raise NoAnswerError(cut(got, wanted, self._timeout_s))
+        data = connection.recv(_CHUNK)
+        if not data:
+            raise LostError(f"connection closed by the device, {wanted} bytes before the end")
+        return data
+
+    def _reset(self) -> None:
+        if self._socket is not None:
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        self.close()
+
+    def close(self) -> None:
+        """Close the connection."""
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None

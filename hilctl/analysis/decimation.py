@@ -1,0 +1,275 @@
+"""What plots need of a recording of any length, in bounded memory.
+
+A recording that is short enough is taken as it is. Of a longer one every spike stays: of each even
+stretch the samples with the lowest and the highest displacement, reference, command and error are
+kept, and all of the last samples that are judged of each segment.
+"""
+
+from collections import deque
+from collections.abc import Iterable, Sequence
+from dataclasses import fields, replace
+
+import numpy as np
+
+from hilctl.analysis.report import RunReportBuilder, Windows
+from hilctl.analysis.run_metrics import RunReport
+from hilctl.analysis.steady_state import Overview, SteadyPart, trusted
+from hilctl.base.errors import DataError
+from hilctl.base.events import Event
+from hilctl.base.samples import Samples
+from hilctl.base.types import F64, I64
+from hilctl.recording.recording import Recording, Ticks
+from hilctl.signals.cycle_metrics import MeanCycle
+
+MOST_SAMPLES = 2**22
+"""Most samples of a recording that is taken as it is."""
+
+_STRETCHES = 2**16  # a plot has 4000 points
+_LAST_SAMPLES = 2**18  # all segments together
+_MOST_TICKS = 2**20
+
+
+def overview(pieces: Iterable[Recording]) -> tuple[RunReport, Recording]:
+    """Return the figures of a recording, and one whose plots are those of the whole.
+
+    Of its ticks, where they are many, every so manieth is there, and the latest.
+
+    Args:
+        pieces: The run in order, which can be gone through again: one that ended early or was tuned
+            is read twice.
+
+    Raises:
+        DataError: As :func:`hilctl.analysis.report.summarize` does.
+    """
+    planned: Windows | None = None
+    for _ in range(2):
+        gathering, shown = _gathered(pieces, planned)
+        planned = gathering.right_windows()
+        if planned == gathering.windows:
+            break
+    return gathering.report(), shown.recording(gathering.cycles())
+
+
+def _gathered(
+    pieces: Iterable[Recording], windows: Windows | None
+) -> tuple[RunReportBuilder, "_Shown"]:
+    gathering: RunReportBuilder | None = None
+    for piece in pieces:
+        if gathering is None:
+            gathering = RunReportBuilder(piece, windows)
+            shown = _Shown(gathering.windows)
+        gathering.add(piece)
+        shown.add(piece)
+    if gathering is None:
+        raise DataError("there is no recording to show")
+    return gathering, shown
+
+
+class _Shown:
+    """Gathers what plots need of a recording.
+
+    Args:
+        windows: What is judged of it.
+    """
+
+    def __init__(self, windows: Windows) -> None:
+        self._windows = windows
+        self._held: list[Recording] = []
+        self._thinned: _Thinned | None = None
+
+    def add(self, piece: Recording) -> None:
+        """Take the next piece."""
+        if self._thinned:
+            self._thinned.add(piece)
+            return
+        self._held.append(piece)
+        if sum(each.samples.index.size for each in self._held) > MOST_SAMPLES:
+            self._thinned = _Thinned(self._windows)
+            while self._held:
+                self._thinned.add(self._held.pop(0))
+
+    def recording(self, cycles: Sequence[MeanCycle | None]) -> Recording:
+        """Return it, at the end, when the average cycle of each segment is known."""
+        return self._thinned.recording(cycles) if self._thinned else _joined(self._held)
+
+
+def _joined(pieces: list[Recording]) -> Recording:
+    """Return one recording of all pieces."""
+    if len(pieces) == 1:
+        return pieces[0]
+    return replace(
+        pieces[-1],
+        samples=_samples_of([piece.samples for piece in pieces]),
+        ticks=_ticks_of([piece.ticks for piece in pieces]),
+        events=tuple(event for piece in pieces for event in piece.events),
+        starts=tuple(start for piece in pieces for start in piece.starts),
+    )
+
+
+def _samples_of(parts: list[Samples]) -> Samples:
+    filled = [part for part in parts if part.index.size] or parts[:1]
+    names = [each.name for each in fields(Samples)]
+    return Samples(**{name: np.concatenate([getattr(p, name) for p in filled]) for name in names})
+
+
+def _ticks_of(parts: list[Ticks]) -> Ticks:
+    names = [each.name for each in fields(Ticks)]
+    return Ticks(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in names})
+
+
+class _Thinned:
+    """Thins out what plots do not show."""
+
+    def __init__(self, windows: Windows) -> None:
+        self._windows = windows
+        self._last: Recording | None = None
+        self._shown: list[Samples] = []
+        self._size = 0
+        self._ticks = _SampledTicks()
+        most = _LAST_SAMPLES // max(1, len(windows))
+        self._parts = [_Part(window, most) for _, window in windows]
+        self._per_stretch = 0
+        self._events: list[Event] = []
+
+    def add(self, piece: Recording) -> None:
+        self._last = piece
+        self._events += piece.events
+        if not self._per_stretch:
+            longest = max((segment.stop for segment in piece.segments), default=0)
+            self._per_stretch = max(16, longest // _STRETCHES)
+        self._ticks.add(piece.ticks)
+        for part in self._parts:
+            part.add(piece)
+        rows = _extreme_rows(piece.samples, self._per_stretch)
+        self._shown.append(_rows_of(piece.samples, rows))
+        self._size += rows.size
+        if self._size > MOST_SAMPLES:  # longer than was planned
+            self._per_stretch *= 4
+            together = _samples_of(self._shown)
+            rows = _extreme_rows(together, 32)
+            self._shown, self._size = [_rows_of(together, rows)], rows.size
+
+    def recording(self, cycles: Sequence[MeanCycle | None]) -> Overview:
+        assert self._last is not None
+        parts = {
+            segment: part.steady_part(cycle)
+            for (segment, _), part, cycle in zip(self._windows, self._parts, cycles, strict=True)
+        }
+        samples = _with(_samples_of(self._shown), [part.last_samples() for part in self._parts])
+        named = {each.name: getattr(self._last, each.name) for each in fields(Recording)}
+        named |= {"samples": samples, "ticks": self._ticks.ticks()}
+        named |= {"events": tuple(self._events), "starts": ()}
+        return Overview(**named, windows=dict(self._windows), parts=parts)
+
+
+def _extreme_rows(samples: Samples, per_stretch: int) -> I64:
+    """Return the rows of each stretch in which a signal is lowest or highest, and its first."""
+    whole = samples.index.size // per_stretch * per_stretch
+    places = np.arange(0, whole, per_stretch)
+    rows = [places, np.arange(whole, samples.index.size)]
+    error_um = samples.displacement_um - samples.reference_um
+    for values in (samples.displacement_um, samples.reference_um, samples.command, error_um):
+        shaped = values[:whole].reshape(-1, per_stretch)
+        finite = np.isfinite(shaped)
+        low = high = shaped
+        if not finite.all():
+            low, high = np.where(finite, shaped, np.inf), np.where(finite, shaped, -np.inf)
+        rows += places + low.argmin(axis=1), places + high.argmax(axis=1)
+    return np.unique(np.concatenate(rows))
+
+
+def _with(samples: Samples, more: list[Samples]) -> Samples:
+    """Return samples and others, in order and each once."""
+    together = _samples_of([samples, *more])
+    _, rows = np.unique(together.index, return_index=True)
+    return _rows_of(together, rows)
+
+
+def _rows_of(samples: Samples, rows: I64) -> Samples:
+    values = {each.name: getattr(samples, each.name) for each in fields(Samples)}
+    return Samples(**{name: each[rows] if each.size else each for name, each in values.items()})
+
+
+class _Part:
+    """Gathers the last steady samples of a segment.
+
+    Args:
+        window: Its judged samples: first, after the last, whole cycles.
+        most: Most samples to keep.
+    """
+
+    def __init__(self, window: tuple[int, int, int], most: int) -> None:
+        self._start, self._stop, self._cycles = window
+        self._most = most
+        self._kept: deque[Samples] = deque()
+        self._size = 0
+        self._compensated = False
+
+    def add(self, piece: Recording) -> None:
+        index = piece.samples.index
+        elsewhere = index.size == 0 or index[-1] < self._start or index[0] >= self._stop
+        if elsewhere and self._kept:
+            return
+        part = trusted(piece.samples.part(self._start, self._stop))
+        self._compensated = piece.compensated
+        self._kept.append(part)
+        self._size += part.index.size
+        while self._size - self._kept[0].index.size >= self._most > 0:
+            self._size -= self._kept.popleft().index.size
+
+    def _loop(self, samples: Samples) -> F64:
+        loop_input = samples.reference_um if self._compensated else samples.command
+        return np.array((loop_input, samples.displacement_um))
+
+    def last_samples(self) -> Samples:
+        return _samples_of(list(self._kept)).rows(slice(-self._most, None))
+
+    def steady_part(self, cycle: MeanCycle | None) -> SteadyPart:
+        """Return it with the average cycle of all of its samples; None where it has no cycle."""
+        samples = self.last_samples()
+        if cycle is None:
+            loop = self._loop(samples)
+            return SteadyPart(samples, 0, None, loop[:, np.isfinite(loop).all(axis=0)])
+        if not cycle.whole:
+            return SteadyPart(samples, self._cycles, None, np.empty((2, 0)))
+        return SteadyPart(samples, self._cycles, cycle, cycle.signals)
+
+
+class _SampledTicks:
+    """Keeps every so manieth tick, and the latest."""
+
+    def __init__(self) -> None:
+        self._every = 1
+        self._seen = 0
+        self._kept: list[Ticks] = []
+        self._latest: Ticks | None = None
+
+    def add(self, ticks: Ticks) -> None:
+        size = ticks.late_ns.size
+        if size == 0:
+            return
+        self._kept.append(_rows(ticks, np.arange(-self._seen % self._every, size, self._every)))
+        self._seen += size
+        latest = _rows(ticks, np.array([int(np.argmax(ticks.late_ns))]))
+        if self._latest is None or latest.late_ns[0] > self._latest.late_ns[0]:
+            self._latest = latest
+        if sum(each.late_ns.size for each in self._kept) > _MOST_TICKS:
+            self._every *= 2
+            together = _ticks_of(self._kept)
+            self._kept = [_rows(together, np.arange(0, together.late_ns.size, 2))]
+
+    def ticks(self) -> Ticks:
+        if self._latest is None:
+            return Ticks(*(np.empty(0, dtype=np.int64),) * 4)
+        together = _ticks_of(self._kept)
+        if self._latest.first_sample[0] in together.first_sample:
+            return together
+        place = int(np.searchsorted(together.first_sample, self._latest.first_sample[0]))
+        return _ticks_of([
+            _rows(together, np.arange(place)), self._latest,
+            _rows(together, np.arange(place, together.late_ns.size)),
+        ])  # fmt: skip
+
+
+def _rows(ticks: Ticks, rows: I64) -> Ticks:
+    return Ticks(**{each.name: getattr(ticks, each.name)[rows] for each in fields(Ticks)})

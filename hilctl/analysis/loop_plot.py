@@ -1,0 +1,171 @@
+"""The hysteresis loop as a figure, with the peak hysteresis marked in it."""
+
+from collections.abc import Sequence
+from functools import partial
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+
+from hilctl.analysis.figure_layout import FigureSpec, Panel
+from hilctl.analysis.plot_style import DISPLACEMENT, MARK, REFERENCE, WITH, WITHOUT
+from hilctl.analysis.steady_state import SteadyPart, steady_part
+from hilctl.base.formatting import quantity, short_name
+from hilctl.base.types import F64
+from hilctl.recording.recording import Recording
+from hilctl.signals import cycle_metrics
+
+_LONGEST_PATH = 5_000
+_MOST_LABELS = 12
+_SQUARE = 0.85
+_DISPLACEMENT_AXIS = "displacement, µm"
+
+
+def hysteresis_loop(recording: Recording, focus: int = 0) -> FigureSpec | None:
+    """Return displacement against the loop's input, one average cycle a segment.
+
+    Below it stands what is left when a straight line is taken off: the line that a compensated run
+    should follow, otherwise the closest one. What does not repeat is drawn as it was measured.
+
+    Args:
+        recording: The run.
+        focus: Number of the segment whose peak hysteresis is marked.
+
+    Returns:
+        None where no segment has steady samples.
+    """
+    parts = [steady_part(recording, segment) for segment in recording.segments]
+    everything = np.concatenate([np.empty((2, 0)), *map(_loop, parts)], axis=1)
+    if everything.size == 0:
+        return None
+    line = np.array([1.0, 0.0]) if recording.compensated else _closest_line(everything)
+    averaged = any(part.cycle is not None for part in parts)
+    title = "average steady cycle" if averaged else "as measured, not averaged"
+    draw = partial(_draw, recording=recording, parts=parts, focus=focus, line=line)
+    panels = (
+        Panel(partial(draw, taken_off=np.zeros(2)), title, _SQUARE),
+        Panel(partial(draw, taken_off=line), "off the straight line"),
+    )
+    caption = f"Displacement against {_input_name(recording)}, and what is off a straight line."
+    return FigureSpec("hysteresis", caption, panels)
+
+
+def _input_name(recording: Recording) -> str:
+    return "reference" if recording.compensated else "command"
+
+
+def _loop(part: SteadyPart) -> F64:
+    """Return one loop, float64[2, m]: input and displacement, closed where it is an average."""
+    if part.cycle is not None:
+        return np.concatenate((part.loop, part.loop[:, :1]), axis=1)
+    return part.loop[:, :: max(1, part.loop.shape[1] // _LONGEST_PATH)]
+
+
+def _closest_line(everything: F64) -> F64:
+    """Return slope and offset of the least-squares line; a level one where the input stands."""
+    x, y = everything
+    if np.ptp(x) == 0.0:
+        return np.array([0.0, float(y.mean())])
+    return np.asarray(np.polyfit(x, y, 1), dtype=np.float64)
+
+
+def _draw(
+    axes: Axes,
+    recording: Recording,
+    parts: Sequence[SteadyPart],
+    focus: int,
+    line: F64,
+    taken_off: F64,
+) -> None:
+    loops = [_loop(part) for part in parts]
+    reached = [k for k, loop in enumerate(loops) if loop[0].size]
+    for k, colour in zip(reached, _colours(len(reached)), strict=True):
+        named = len(reached) <= _MOST_LABELS or k in (reached[0], reached[-1], focus)
+        label = short_name(recording.segments[k].label) if named else "_unnamed"
+        off = loops[k][1] - np.polyval(taken_off, loops[k][0])
+        axes.plot(loops[k][0], off, color=colour, linewidth=0.9, label=label)
+    everything = np.concatenate(loops, axis=1)
+    ends = np.array([everything[0].min(), everything[0].max()])
+    straight = np.polyval(line - taken_off, ends)
+    axes.plot(ends, straight, color=REFERENCE, linestyle=":", linewidth=0.8)
+    if focus < len(parts):
+        _mark_gap(axes, parts[focus], taken_off)
+    unit = "µm" if recording.compensated else recording.command_unit
+    left = "less line" if taken_off.any() else ""
+    axes.set(
+        xlabel=f"{_input_name(recording)}, {unit}",
+        ylabel=f"displacement {left}, µm" if left else _DISPLACEMENT_AXIS,
+    )
+
+
+def _colours(loops: int) -> list[object]:
+    """Return a colour a loop; many of them in viridis, which keeps its order in grey too."""
+    if loops == 1:
+        return [DISPLACEMENT]
+    return list(mpl.colormaps["viridis"](np.linspace(0.0, 0.78, loops)))
+
+
+def _mark_gap(axes: Axes, part: SteadyPart, taken_off: F64) -> None:
+    """Mark the widest place, which taking a function of the input off does not change."""
+    if part.cycle is None:
+        return
+    loop_input, displacement_um = part.cycle.signals
+    gap = cycle_metrics.widest_gap(loop_input, displacement_um)
+    hysteresis = cycle_metrics.peak_hysteresis_percent(loop_input, displacement_um)
+    if gap is None or hysteresis is None:
+        return
+    shift = float(np.polyval(taken_off, gap.at_input))
+    text = f"peak hysteresis {quantity(hysteresis, '%')} ({quantity(gap.height, 'um')})"
+    ends = (gap.low - shift, gap.high - shift)
+    axes.plot((gap.at_input,) * 2, ends, "_-", color=MARK, linewidth=2.0, label=text, zorder=5)
+
+
+def before_and_after(before: Recording, after: Recording) -> FigureSpec | None:
+    """Return the loops of one motion without and with a compensator, and the errors of both.
+
+    Each is shown over its own range, as command and reference have different units: a straight line
+    from corner to corner is what a compensator is for.
+
+    Args:
+        before: The run without one.
+        after: The run with one.
+
+    Returns:
+        None where one of them has no average cycle.
+    """
+    loops = [_worst_loop(before), _worst_loop(after)]
+    if any(loop is None for loop in loops):
+        return None
+    shown = [_of_range(loop) for loop in loops if loop is not None]
+
+    def draw(axes: Axes, off_line: float) -> None:
+        for (x, y), colour, label in zip(
+            shown, (WITHOUT, WITH), ("without compensator", "with it"), strict=True
+        ):
+            axes.plot(x, y - off_line * x, color=colour, linewidth=1.0, label=label)
+        straight = [0.0, 100.0 * (1.0 - off_line)]
+        axes.plot([0.0, 100.0], straight, color=REFERENCE, linestyle=":", linewidth=0.8)
+        left = " less line" if off_line else ""
+        axes.set(xlabel="input, % of its range", ylabel=f"displacement{left}, % of its range")
+
+    panels = (
+        Panel(partial(draw, off_line=0.0), "loops", _SQUARE),
+        Panel(partial(draw, off_line=1.0), "off the straight line"),
+    )
+    caption = "Before and after compensation, each over its own range; dotted: no hysteresis."
+    return FigureSpec("before_and_after", caption, panels)
+
+
+def _worst_loop(recording: Recording) -> F64 | None:
+    """Return the closed loop of a run that has the widest gap; None without any."""
+    parts = [steady_part(recording, segment) for segment in recording.segments]
+    loops = [_loop(part) for part in parts if part.cycle is not None]
+    return max(
+        loops, key=lambda loop: cycle_metrics.peak_hysteresis_percent(*loop) or 0.0, default=None
+    )
+
+
+def _of_range(loop: F64) -> F64:
+    low, whole = loop.min(axis=1, keepdims=True), np.ptp(loop, axis=1)[:, None]
+    percent: F64 = 100.0 * (loop - low) / np.where(whole > 0.0, whole, 1.0)
+    return percent

@@ -1,0 +1,194 @@
+"""What all plots share: style, colours, signals over time.
+
+Long signals are reduced to what a plot can show, without hiding spikes or inventing beats.
+Colours are those of Okabe and Ito, which colour-blind people can tell apart.
+"""
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from hilctl.base.types import F64, I64
+from hilctl.recording.recording import Recording
+
+REFERENCE = "#000000"
+DISPLACEMENT = "#0072B2"
+COMMAND = "#D55E00"
+ERROR = "#009E73"
+MARK = "#CC79A7"
+QUIET = "#666666"
+WITHOUT, WITH = COMMAND, DISPLACEMENT
+"""Colours of a motion without a compensator and with one, wherever both are drawn."""
+
+MAX_POINTS = 4000
+"""Most points of one line."""
+
+_NARROWEST_CYCLE = 1.0 / 150.0
+_MAX_BUCKETS = 600
+
+STYLE: dict[Any, Any] = {
+    "font.family": "DejaVu Sans",
+    "font.size": 8.0,  # on paper: figures have the width of a journal's column
+    "axes.titlesize": 8.0,
+    "axes.titlelocation": "left",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#e4e4e4",
+    "grid.linewidth": 0.5,
+    "axes.linewidth": 0.6,
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "lines.linewidth": 1.0,
+    "lines.markersize": 3.5,
+    "legend.frameon": False,
+    "legend.fontsize": 7.0,
+    "legend.handlelength": 1.6,
+    "legend.columnspacing": 1.2,
+    "figure.constrained_layout.use": True,
+    "agg.path.chunksize": 20000,
+    "text.parse_math": False,  # names and labels are not formulas
+    "svg.hashsalt": "hilctl",  # the same run gives the same bytes
+    "pdf.fonttype": 42,  # journals refuse outlines of bitmaps
+}
+
+
+def pieces(recording: Recording) -> list[tuple[int, int, float]]:
+    """Cut a run where its waveform changes: start, stop and period of each piece, in samples.
+
+    What lies outside all segments, such as the safe ramp, has period 0.
+    """
+    index = recording.samples.index
+    if index.size == 0:
+        return []
+    first, end = int(index[0]), int(index[-1]) + 1
+    cut: list[tuple[int, int, float]] = []
+    at = first
+    for segment in sorted(recording.segments, key=lambda each: each.start):
+        start, stop = max(segment.start, at), min(segment.stop, end)
+        if start < stop:
+            cut += [(at, start, 0.0), (start, stop, segment.period)]
+            at = stop
+    return [piece for piece in [*cut, (at, end, 0.0)] if piece[0] < piece[1]]
+
+
+def draw_over_time(
+    axes: Axes, recording: Recording, values: F64, colour: str, label: str, *, outline: bool = False
+) -> None:
+    """Draw a signal over a whole run: as a line, or where cycles crowd as the band they fill.
+
+    Args:
+        axes: Where to draw, time in s.
+        recording: The run.
+        values: float64[n], one a sample.
+        colour: Colour of line and band.
+        label: For the legend.
+        outline: Draw only a band's edges, so that another one can be seen in it.
+    """
+    index = recording.samples.index
+    rate_hz = recording.sample_rate_hz
+    for start, stop, period in pieces(recording):
+        low, high = np.searchsorted(index, (start, stop))
+        part = slice(int(low), int(high))
+        if part.start == part.stop or not np.isfinite(values[part]).any():
+            continue
+        if shown_as_band(stop - start, period, int(index[-1] - index[0]) + 1):
+            middle, lowest, highest = band(index[part], values[part], period)
+            _band(axes, middle / rate_hz, lowest, highest, colour, label, outline)
+        else:
+            share = MAX_POINTS * (part.stop - part.start) // index.size
+            line = min_max(index[part] / rate_hz, values[part], max(share, 2))
+            width, style = (0.9, "--") if outline else (1.5, "-")
+            axes.plot(*line, color=colour, linestyle=style, label=label, linewidth=width)
+        label = "_again"  # matplotlib leaves labels with an underscore out of legends
+
+
+def _band(axes: Axes, t: F64, low: F64, high: F64, colour: str, label: str, outline: bool) -> None:
+    if outline:
+        axes.plot(t, low, color=colour, linewidth=0.8, linestyle="--", label=label)
+        axes.plot(t, high, color=colour, linewidth=0.8, linestyle="--", label="_again")
+    else:
+        axes.fill_between(t, low, high, color=colour, alpha=0.45, linewidth=0.8, label=label)
+
+
+def draw_line(
+    axes: Axes, t: F64, values: F64, colour: str, label: str = "", *, dashed: bool = False
+) -> None:
+    """Draw a signal as a line of at most :data:`MAX_POINTS` points."""
+    width, style = (0.9, "--") if dashed else (1.5, "-")
+    name = label or "_unnamed"  # matplotlib leaves labels with an underscore out of legends
+    axes.plot(*min_max(t, values), color=colour, linestyle=style, linewidth=width, label=name)
+
+
+def legend(axes: Axes) -> None:
+    """Put a legend above the axes, at the right, out of the way of what is drawn."""
+    handles, labels = axes.get_legend_handles_labels()
+    if labels:
+        corner = (1.0, 1.0)
+        axes.legend(loc="lower right", bbox_to_anchor=corner, borderaxespad=0.2, ncols=len(handles))
+
+
+def min_max(t: F64, values: F64, points: int = MAX_POINTS) -> tuple[F64, F64]:
+    """Reduce a signal to the lowest and highest value of each of even stretches.
+
+    Every spike stays. Values that are not finite are left out; where a stretch has no other, the
+    line is broken by NaN.
+
+    Args:
+        t: float64[n].
+        values: float64[n].
+        points: Most points to return, >= 2.
+
+    Returns:
+        t and values, float64[m] each, m <= max(points, 2).
+    """
+    if values.size <= points:
+        return t, values
+    edges = _edges(values.size, max(1, points // 2))
+    low, high = _extremes(values, edges)
+    middle = t[(edges + np.append(edges[1:], values.size)) // 2]
+    return np.repeat(middle, 2), np.column_stack((low, high)).ravel()
+
+
+def band(index: I64, values: F64, period: float) -> tuple[F64, F64, F64]:
+    """Reduce a periodic signal to the band it fills, on stretches of at least one period.
+
+    Shorter stretches would beat with the period and draw waves that are not there.
+
+    Args:
+        index: int64[n], n > 0, sample index, rising.
+        values: float64[n].
+        period: Samples in one period, > 0.
+
+    Returns:
+        Sample index of each stretch's middle, lowest and highest value in it: float64[m] each.
+    """
+    span = int(index[-1] - index[0]) + 1
+    stretches = max(1, min(_MAX_BUCKETS, int(span / period)))
+    of = (index - index[0]) * stretches // span
+    edges = np.flatnonzero(np.diff(of, prepend=-1))
+    low, high = _extremes(values, edges)
+    middle = index[0] + (of[edges] + 0.5) * span / stretches
+    return middle, low, high
+
+
+def shown_as_band(samples: int, period: float, shown: int) -> bool:
+    """Return whether cycles would be too narrow for a line.
+
+    Args:
+        samples: Length of the stretch with this period.
+        period: Samples in one period; 0.0 where it does not repeat.
+        shown: Samples on the whole time axis.
+    """
+    return 0.0 < period < shown * _NARROWEST_CYCLE and samples > 4.0 * period
+
+
+def _edges(size: int, stretches: int) -> I64:
+    return np.arange(stretches, dtype=np.int64) * size // stretches
+
+
+def _extremes(values: F64, edges: I64) -> tuple[F64, F64]:
+    finite = np.where(np.isfinite(values), values, np.nan)
+    return np.fmin.reduceat(finite, edges), np.fmax.reduceat(finite, edges)

@@ -1,0 +1,121 @@
+"""A report for people, as rows of text."""
+
+from hilctl.analysis.process_table import usage_text
+from hilctl.analysis.run_metrics import RunReport, SegmentReport
+from hilctl.base.events import adapted_text
+from hilctl.base.formatting import MISSING, printable, quantity
+
+SIMULATED = "simulated: no hardware was driven"
+
+_SEGMENT_HEADINGS = (
+    "segment",
+    "start s",
+    "freq. Hz",
+    "cycles",
+    "p-p µm",
+    "peak hyst. %",
+    "floor %",
+    "peak err. %",
+    "rms err. %",
+    "loop area",
+)
+
+
+def number(value: float | None, unit: str = "") -> str:
+    """Return a number with four significant digits and its unit; a dash for None."""
+    return quantity(value, unit, 4)
+
+
+def run_rows(report: RunReport) -> list[tuple[str, str]]:
+    """Return name and value of what the run was and how it ended."""
+    simulated = f" ({SIMULATED})" if report.simulated else ""
+    held_against = "reference" if report.compensated else "command: nothing compensated"
+    reason = printable(report.reason) or MISSING
+    labels = ", ".join(f"{key} {value}" for key, value in report.labels.items())
+    return [
+        *([("labels", printable(labels))] if labels else []),
+        ("device", f"{printable(report.device) or MISSING}{simulated}"),
+        ("ended", f"{reason}{'' if report.complete else ' (NOT complete)'}"),
+        (
+            "samples",
+            f"{report.samples:,} of the waveform, {report.ramp_samples:,} of ramps",
+        ),
+        ("missing samples", f"{report.dropped:,}"),
+        ("rate, length", f"{report.sample_rate_hz:g} Hz, {quantity(report.duration_s, 's', 4)}"),
+        ("loop", f"displacement against {held_against}"),
+        ("command", _range(report.command_min, report.command_max, report.command_unit)),
+        ("displacement", _range(report.displacement_min_um, report.displacement_max_um, "um")),
+        ("limited samples", f"{report.limited_samples:,}"),
+        ("invalid readings", f"{report.sensor_invalid_samples:,}"),
+        ("ticks", f"{_count(report.late_ticks)} late, {_count(report.skipped_ticks)} skipped"),
+        *([("timing", report.deadline_misses)] if report.deadline_misses else []),
+        *([("adapted", adapted_text(report.adapted))] if report.adapted else []),
+        *(("mark", f"{at_s:.6g} s: {printable(text)}") for at_s, text in report.marks),
+        ("lateness", _percentiles(report.lateness_us)),
+        ("exchange", _percentiles(report.exchange_us)),
+        *((f"{name} took", usage_text(each)) for name, each in report.processes.items()),
+    ]
+
+
+def quality_rows(report: RunReport) -> list[tuple[str, str]]:
+    """Return name and value of the figures of quality; the noise floor beside the hysteresis."""
+    floor = number(report.noise_floor_percent, "%")
+    raw = f"{number(report.peak_error_raw_percent, '%')} peak, "
+    raw += f"{number(report.rms_error_raw_percent, '%')} rms"
+    rows = [
+        ("peak hysteresis", f"{number(report.peak_hysteresis_percent, '%')} (noise floor {floor})"),
+        ("loop area", number(report.loop_area, report.loop_area_unit)),
+        ("peak-to-peak", number(report.peak_to_peak_um, "um")),
+        ("peak error", number(report.peak_error_percent, "%")),
+        ("rms error", number(report.rms_error_percent, "%")),
+        ("error, not averaged", raw),
+        ("sensor noise", _nanometres(report.sensor_noise_um)),
+        ("steady cycles", f"{report.steady_cycles:,}"),
+        ("steady samples", f"{report.steady_samples:,}"),
+    ]
+    return rows if report.compensated else [row for row in rows if "error" not in row[0]]
+
+
+def segment_table(report: RunReport) -> tuple[list[str], list[list[str]]]:
+    """Return headings and rows of all segments, without columns that are empty in all of them."""
+    columns = zip(*(_segment_cells(segment) for segment in report.segments), strict=True)
+    filled = [
+        (heading, column)
+        for heading, column in zip(_SEGMENT_HEADINGS, columns, strict=False)
+        if set(column) != {MISSING}
+    ]
+    rows = zip(*(column for _, column in filled), strict=True)
+    return [heading for heading, _ in filled], [list(row) for row in rows]
+
+
+def _segment_cells(segment: SegmentReport) -> list[str]:
+    return [
+        printable(segment.label),
+        f"{segment.start_s:g}",
+        MISSING if segment.frequency_hz is None else f"{segment.frequency_hz:g}",
+        str(segment.steady_cycles),
+        number(segment.peak_to_peak_um),
+        number(segment.peak_hysteresis_percent),
+        number(segment.noise_floor_percent),
+        number(segment.peak_error_percent),
+        number(segment.rms_error_percent),
+        number(segment.loop_area),
+    ]
+
+
+def _range(low: float | None, high: float | None, unit: str) -> str:
+    return MISSING if low is None else f"{number(low, unit)} to {number(high, unit)}"
+
+
+def _count(value: int | None) -> str:
+    return MISSING if value is None else f"{value:,}"
+
+
+def _nanometres(noise_um: float | None) -> str:
+    return MISSING if noise_um is None else f"{number(noise_um, 'um')} rms"
+
+
+def _percentiles(figures: dict[str, float]) -> str:
+    if not figures:
+        return MISSING
+    return ", ".join(f"{name} {quantity(value, 'us')}" for name, value in figures.items())

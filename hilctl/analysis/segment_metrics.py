@@ -1,0 +1,173 @@
+"""Figures of one segment, gathered as its samples come: one pass, whatever its length."""
+
+import math
+
+import numpy as np
+
+from hilctl.analysis.quantiles import Quantiles
+from hilctl.analysis.run_metrics import SegmentReport
+from hilctl.analysis.steady_state import trusted
+from hilctl.base.samples import Samples
+from hilctl.base.segments import Segment
+from hilctl.base.types import F64, I64
+from hilctl.recording.recording import Recording
+from hilctl.signals import cycle_metrics
+
+
+class SegmentReportBuilder:
+    """Gathers the figures of a segment.
+
+    Sums of a run in several pieces differ from those of the whole in their last digits; sensor
+    noise of more than :data:`~hilctl.analysis.quantiles.MOST_EXACT` samples is right to 6e-5 of it.
+
+    Args:
+        recording: What the run was; its samples are not looked at.
+        segment: The segment.
+        window: Its judged samples: first, after the last, whole cycles.
+    """
+
+    def __init__(
+        self, recording: Recording, segment: Segment, window: tuple[int, int, int]
+    ) -> None:
+        self._rate_hz = recording.sample_rate_hz
+        self._compensated = recording.compensated
+        self._segment = segment
+        self._start, self._stop, self._cycles = window
+        self._folding = cycle_metrics.CycleAverager(segment.period, 2) if self._cycles else None
+        self._samples = self._steady = 0
+        self._lowest_um, self._highest_um = math.inf, -math.inf
+        self._averaged, self._raw = _Errors(), _Errors()
+        self._noise = _Noise()
+
+    def add(self, samples: Samples) -> None:
+        """Take the next samples of the run; at least one."""
+        segment = self._segment
+        if samples.index[-1] < segment.start or samples.index[0] >= segment.stop:
+            return  # a run may have a thousand segments, and each piece is of one or two
+        first, end = np.searchsorted(samples.index, (segment.start, segment.stop)).tolist()
+        self._samples += end - first
+        part = trusted(samples.part(self._start, self._stop))
+        if part.index.size == 0:
+            return
+        self._steady += part.index.size
+        output = part.displacement_um
+        loop_input = part.reference_um if self._compensated else part.command
+        if self._folding:
+            self._folding.add(part.index - segment.start, np.array((loop_input, output)))
+        else:
+            self._loop(loop_input, output)
+        if self._compensated:
+            self._raw.add(output - loop_input)
+        if self._has_noise:
+            self._noise.add(part.index, output)
+
+    def cycle(self) -> cycle_metrics.MeanCycle | None:
+        """Return the average cycle of the loop's input and output; None where it has no period."""
+        return self._folding.fold() if self._folding else None
+
+    @property
+    def _has_noise(self) -> bool:
+        period = self._segment.period
+        return period <= 0.0 or period >= cycle_metrics.SHORTEST_PERIOD
+
+    def _loop(self, loop_input: F64, output: F64) -> None:
+        """Take a loop that has no cycle to average."""
+        finite = np.isfinite(loop_input) & np.isfinite(output)
+        if not finite.any():
+            return
+        known = output[finite]
+        self._lowest_um = min(self._lowest_um, float(known.min()))
+        self._highest_um = max(self._highest_um, float(known.max()))
+        self._averaged.add(known - loop_input[finite])
+
+    @np.errstate(over="ignore", invalid="ignore")  # of readings near the end of all numbers
+    def report(self) -> SegmentReport:
+        """Return the figures; None where they have no meaning or the segment was not reached."""
+        cycle = self.cycle()
+        stroke_um = noise_um = hysteresis = area = floor = None
+        peak_rms: tuple[float | None, float | None] = (None, None)
+        raw = peak_rms
+        if cycle is not None and cycle.whole:
+            loop_input, output = cycle.signals
+            stroke_um = cycle_metrics.peak_to_peak(output)
+            peak_rms = cycle_metrics.peak_and_rms_percent(output - loop_input, stroke_um)
+            hysteresis = cycle_metrics.peak_hysteresis_percent(loop_input, output)
+            area = cycle_metrics.loop_area(loop_input, output)
+        elif cycle is None and self._averaged.count:
+            stroke_um = self._highest_um - self._lowest_um
+            peak_rms = self._averaged.percent(stroke_um)
+        if stroke_um is not None:
+            raw = self._raw.percent(stroke_um)
+        noise_um = self._noise.rms_um()
+        if hysteresis is not None or area is not None:
+            assert cycle is not None
+            if noise_um is not None and stroke_um is not None:
+                floor = cycle_metrics.noise_floor_percent(noise_um, cycle.counts, stroke_um)
+        period = self._segment.period
+        return SegmentReport(
+            label=self._segment.label,
+            start_s=self._segment.start / self._rate_hz,
+            frequency_hz=self._rate_hz / period if period > 0.0 else None,
+            samples=self._samples,
+            steady_cycles=self._cycles,
+            steady_samples=self._steady,
+            peak_to_peak_um=stroke_um,
+            peak_error_percent=peak_rms[0] if self._compensated else None,
+            rms_error_percent=peak_rms[1] if self._compensated else None,
+            peak_error_raw_percent=raw[0] if self._compensated else None,
+            rms_error_raw_percent=raw[1] if self._compensated else None,
+            peak_hysteresis_percent=hysteresis,
+            loop_area=area,
+            sensor_noise_um=noise_um,
+            noise_floor_percent=floor,
+        )
+
+
+class _Errors:
+    """Peak and root mean square of errors, in um; those that are not finite are left out."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._peak_um = self._squares_um2 = 0.0
+
+    def add(self, error_um: F64) -> None:
+        finite = np.isfinite(error_um)
+        known = error_um if finite.all() else error_um[finite]
+        if known.size:
+            self.count += known.size
+            self._peak_um = max(self._peak_um, cycle_metrics.peak(known))
+            self._squares_um2 += float(np.sum(np.square(known)))
+
+    def percent(self, whole_um: float) -> tuple[float | None, float | None]:
+        """Return peak and root mean square in percent; None where there is none."""
+        if not self.count:
+            return None, None
+        rms_um = math.sqrt(self._squares_um2 / self.count)
+        return cycle_metrics.percent(self._peak_um, whole_um), cycle_metrics.percent(
+            rms_um, whole_um
+        )
+
+
+class _Noise:
+    """Sensor noise over the borders of pieces, see :func:`hilctl.signals.cycle_metrics.sensor_noise_um`."""
+
+    def __init__(self) -> None:
+        self._windows = Quantiles()
+        self._index = np.empty(0, dtype=np.int64)
+        self._displacement_um = np.empty(0)
+
+    def add(self, index: I64, displacement_um: F64) -> None:
+        finite = np.isfinite(displacement_um)
+        if not finite.all():
+            index, displacement_um = index[finite], displacement_um[finite]
+        index = np.concatenate((self._index, index))
+        displacement_um = np.concatenate((self._displacement_um, displacement_um))
+        if index.size > cycle_metrics.NOISE_OVERLAP:
+            self._windows.add(cycle_metrics.noise_windows_um(index, displacement_um))
+        self._index = index[-cycle_metrics.NOISE_OVERLAP :]
+        self._displacement_um = displacement_um[-cycle_metrics.NOISE_OVERLAP :]
+
+    def rms_um(self) -> float | None:
+        if not self._windows.size:
+            return None
+        return cycle_metrics.noise_of(self._windows.median(), self._windows.size)

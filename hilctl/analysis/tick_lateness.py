@@ -1,0 +1,164 @@
+"""How well the loop kept its time."""
+
+import numpy as np
+
+from hilctl.analysis.quantiles import MOST_EXACT, Quantiles
+from hilctl.base.errors import DataError
+from hilctl.base.types import I64
+from hilctl.loop.pacer import USUAL_MISSED_SHARE, deadline_misses
+from hilctl.recording.recording import Recording, Ticks
+
+MOST_ROWS = 1440
+"""Most stretches that lateness is given for: a day has as many minutes."""
+
+_MINUTE_NS = 60_000_000_000
+_PERCENTILES = {"p50": 50.0, "p90": 90.0, "p99": 99.0, "p99.9": 99.9}
+
+
+class LatenessBuilder:
+    """Gathers how well the loop kept its time, as its ticks come.
+
+    Args:
+        minutes: How long the run is to be; beyond a day several minutes share a row.
+    """
+
+    def __init__(self, minutes: float) -> None:
+        self._together = 1 + int(minutes) // MOST_ROWS
+        self._late, self._exchange, self._steps = Quantiles(), Quantiles(), Quantiles()
+        self._before: int | None = None
+        self._rows: list[dict[str, float]] = []
+        self._minute, self._of_minute = 0, Quantiles()
+
+    @property
+    def ticks(self) -> int:
+        """Ticks so far."""
+        return self._late.size
+
+    def add(self, ticks: Ticks) -> None:
+        """Take the next ticks."""
+        if ticks.late_ns.size == 0:
+            return
+        self._late.add(ticks.late_ns)
+        self._exchange.add(ticks.exchange_ns)
+        if self._steps.size < MOST_EXACT:  # more of them say nothing new of what is usual
+            before = np.array([] if self._before is None else [self._before], dtype=np.int64)
+            due_ns = np.concatenate((before, ticks.deadline_ns))
+            self._steps.add(due_ns[1:] - due_ns[:-1])
+        self._before = int(ticks.deadline_ns[-1])
+        minutes = ticks.deadline_ns // _MINUTE_NS // self._together * self._together
+        cuts = np.flatnonzero(np.diff(minutes)) + 1
+        parts = np.split(ticks.late_ns, cuts)
+        for number, part in zip(minutes[[0, *cuts]].tolist(), parts, strict=True):
+            if number != self._minute and len(self._rows) < MOST_ROWS:
+                self._end_row()
+                self._minute = number
+            self._of_minute.add(part)
+
+    def _end_row(self) -> None:
+        if self._of_minute.size:
+            counted = {"minute": self._minute, "ticks": self._of_minute.size}
+            self._rows.append({**counted, **_percentiles_us(self._of_minute)})
+        self._of_minute = Quantiles()
+
+    def late_us(self) -> dict[str, float]:
+        """Return the percentiles of lateness, see :func:`percentiles_us`."""
+        return _percentiles_us(self._late)
+
+    def exchange_us(self) -> dict[str, float]:
+        """Return those of the time that exchanges took."""
+        return _percentiles_us(self._exchange)
+
+    def by_minute(self) -> list[dict[str, float]]:
+        """Return the lateness of each minute so far, see :func:`by_minute`; nothing is added then.
+
+        ``minute`` is the first where several share a row.
+        """
+        self._end_row()
+        return self._rows
+
+    def late_ticks(self) -> int | None:
+        """Count ticks that woke more than half a tick period late; None with fewer than two."""
+        return self._late.above(0.5 * self._steps.median()) if self._steps.size else None
+
+
+def percentiles_us(times_ns: I64) -> dict[str, float]:
+    """Return ``p50``, ``p90``, ``p99``, ``p99.9`` and ``max`` in us of int64[m] in ns.
+
+    Empty where there is none.
+    """
+    quantiles = Quantiles()
+    quantiles.add(times_ns)
+    return _percentiles_us(quantiles)
+
+
+def _percentiles_us(times_ns: Quantiles) -> dict[str, float]:
+    if times_ns.size == 0:
+        return {}
+    values = [each * 1e-3 for each in times_ns.percentiles(list(_PERCENTILES.values()))]
+    return {**dict(zip(_PERCENTILES, values, strict=True)), "max": times_ns.largest * 1e-3}
+
+
+def by_minute(ticks: Ticks) -> list[dict[str, float]]:
+    """Return the lateness of each minute of a run, in order.
+
+    Returns:
+        For each minute with ticks: ``minute`` from 0, its ``ticks``, and the figures of
+        :func:`percentiles_us`. Of a run longer than a day, for stretches of several minutes, with
+        the first of them.
+    """
+    return gathered(ticks).by_minute()
+
+
+def gathered(ticks: Ticks) -> LatenessBuilder:
+    """Return all ticks of a run, gathered."""
+    span_ns = int(np.ptp(ticks.deadline_ns)) if ticks.deadline_ns.size else 0
+    found = LatenessBuilder(span_ns / _MINUTE_NS)
+    found.add(ticks)
+    return found
+
+
+def tick_period_ns(ticks: Ticks) -> float | None:
+    """Return the usual time from one tick's deadline to the next; None with fewer than two."""
+    if ticks.deadline_ns.size < 2:
+        return None
+    return float(np.median(np.diff(ticks.deadline_ns)))
+
+
+def misses(recording: Recording, ticks: int) -> str:
+    """Return how many ticks a run has skipped, for people; empty where none or not known.
+
+    Args:
+        recording: What is known of the run.
+        ticks: Ticks that were not skipped.
+
+    Raises:
+        DataError: A number that the recording says of it is none.
+    """
+    skipped = counter(recording, "skipped_ticks", None) or 0
+    text = recording.run.get("max_missed_share", repr(USUAL_MISSED_SHARE))
+    try:
+        max_share = float(text)
+    except ValueError:
+        rule = "hilctl.run: max_missed_share must be a number"
+        raise DataError(f"{recording.path}: {rule}, got {text!r}") from None
+    return deadline_misses(skipped, ticks + skipped, max_share)
+
+
+def counter(recording: Recording, name: str, otherwise: int | None) -> int | None:
+    """Return a counter from the record of the end, or what was counted otherwise.
+
+    Raises:
+        DataError: It is not a whole number.
+    """
+    if name not in recording.end:
+        return otherwise
+    try:
+        return int(recording.end[name])
+    except ValueError:
+        text = f"{recording.path}: hilctl.end: {name} must be a whole number"
+        raise DataError(f"{text}, got {recording.end[name]!r}") from None
+
+
+def late_ticks(ticks: Ticks) -> int | None:
+    """Count ticks that woke more than half a tick period late; None with fewer than two ticks."""
+    return gathered(ticks).late_ticks()

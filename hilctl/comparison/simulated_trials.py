@@ -1,0 +1,216 @@
+"""Each inverse before a simulated device, in this process: what a run would come to, and how fast.
+
+A trial is a run that keeps no pace and records nothing, without interlocks and feedback. That is
+for devices whose time is the sample count: any other is refused.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from hilctl.base.errors import DeviceError, InputError
+from hilctl.base.samples import Flag
+from hilctl.base.types import F64, U32
+from hilctl.experiment.initial_state import begin
+from hilctl.experiment.load import LoadedExperiment
+from hilctl.identify.data.records import SteadyLoop
+from hilctl.loop.interlocks import InterlockContext, InterlockSettings
+from hilctl.models.base import HysteresisModel
+from hilctl.run.assemble import assemble
+from hilctl.run.unpaced import run_in_memory
+from hilctl.signals import cycle_metrics
+from hilctl.waveforms.build import Reference, build
+from hilctl.waveforms.spec import AnyWaveform, Sine, Triangle
+
+CYCLES = 4
+"""Cycles of each trial at full amplitude; the first is not judged."""
+
+STROKE = 0.98
+"""Part of the measured stroke that a trial covers where no experiment says otherwise."""
+
+TIMED_SAMPLES = 20_000
+_ROUNDS = 5
+_SOFT_S = 0.2
+_LIMITED = int(Flag.RANGE_LIMITED | Flag.SLEW_LIMITED | Flag.INVALID)
+
+
+@dataclass(frozen=True, slots=True)
+class InverseTrial:
+    """What came of one model's inverse before the device, on the average steady cycle.
+
+    Attributes:
+        label: The waveform.
+        frequency_hz: Of its cycle.
+        peak_hysteresis_percent: See :class:`hilctl.analysis.run_metrics.RunMetrics`.
+        peak_error_percent: The same.
+        rms_error_percent: The same.
+        limited_samples: Judged samples whose command the limiter changed.
+    """
+
+    label: str
+    frequency_hz: float
+    peak_hysteresis_percent: float | None
+    peak_error_percent: float | None
+    rms_error_percent: float | None
+    limited_samples: int
+
+
+def waveforms_of(
+    waveform: AnyWaveform, frequencies_hz: Sequence[float] | None
+) -> list[AnyWaveform]:
+    """Return an experiment's waveform at each frequency, no longer than it takes.
+
+    Args:
+        waveform: A sine or a triangle; anything else is run as it is.
+        frequencies_hz: Frequencies wanted; None for the waveform as it is.
+
+    Raises:
+        InputError: Frequencies are wanted of another waveform, or one is not > 0.
+    """
+    if frequencies_hz is None:
+        return [waveform]
+    if not isinstance(waveform, Sine | Triangle):
+        raise InputError(
+            f"--frequencies must be left out for a waveform of the kind {waveform.kind}"
+        )
+    if not all(0.0 < f < float("inf") for f in frequencies_hz):
+        raise InputError(f"--frequencies must be > 0: {list(frequencies_hz)}")
+    soft_s = waveform.soft_start_s + waveform.soft_end_s
+    return [
+        waveform.model_copy(update={"frequency_hz": f, "duration_s": soft_s + CYCLES / f})
+        for f in frequencies_hz
+    ]
+
+
+def full_stroke(loops: Sequence[SteadyLoop]) -> Sine:
+    """Return a sine in um that covers nearly the stroke of the widest loop."""
+    widest = max(loops, key=lambda loop: float(np.ptp(loop.displacement_um)))
+    low, high = float(widest.displacement_um.min()), float(widest.displacement_um.max())
+    return Sine(
+        kind="sine",
+        unit="um",
+        amplitude=STROKE * 0.5 * (high - low),
+        offset=0.5 * (high + low),
+        frequency_hz=widest.frequency_hz,
+        duration_s=2.0 * _SOFT_S + CYCLES / widest.frequency_hz,
+        soft_start_s=_SOFT_S,
+        soft_end_s=_SOFT_S,
+    )
+
+
+class TrialDevice:
+    """A simulated device and the limits of its experiment, for one trial after another.
+
+    Args:
+        loaded: Gives device, limits, sample rate and block.
+        waveforms: What each model is tried on.
+        folder: Folder that file names in them are relative to.
+
+    Raises:
+        InputError: The device is not simulated, or a waveform can't be built or doesn't repeat.
+    """
+
+    def __init__(
+        self, loaded: LoadedExperiment, waveforms: Sequence[AnyWaveform], folder: Path
+    ) -> None:
+        info = loaded.device.info
+        if not info.simulated:
+            raise InputError(
+                f"inverses are tried on simulated devices only, not on {info.name}: run each with "
+                "'hilctl run'"
+            )
+        self._loaded = loaded
+        rate_hz = loaded.config.sample_rate_hz
+        self.references = tuple(build(waveform, rate_hz, folder) for waveform in waveforms)
+        for reference in self.references:
+            if reference.unit != "um" or reference.segments[0].period <= 0.0:
+                label = reference.segments[0].label
+                raise InputError(f"a trial needs a waveform in um that repeats: {label}")
+
+    @property
+    def description(self) -> str:
+        """The device, for people."""
+        return self._loaded.device.info.description
+
+    @property
+    def sample_rate_hz(self) -> float:
+        """Samples a second."""
+        return self._loaded.config.sample_rate_hz
+
+    def run(self, model: HysteresisModel, reference: Reference) -> list[InverseTrial]:
+        """Run one model's inverse before the device from rest, and judge each segment.
+
+        Raises:
+            ModelError: The model can't be inverted.
+            DeviceError: The device refuses something.
+        """
+        loaded = replace(self._loaded, model=model)
+        begun = begin(model, self.sample_rate_hz, reference.values)
+        values = (reference.values, begun.input_um[:], begun.state)
+        plan = replace(
+            assemble(loaded, *values, paced=False),
+            # A model that is far off is to be judged, and not to be stopped.
+            interlocks=InterlockContext(stroke_um=(-math.inf, math.inf)),
+            interlock_settings=InterlockSettings(),
+            feedback=None,
+        )
+        outcome, samples = run_in_memory(plan, loaded.device)
+        if outcome.code == "fault":
+            raise DeviceError(outcome.reason)
+        return _judged(reference, samples.displacement_um, samples.flags)
+
+
+def _judged(reference: Reference, displacement_um: F64, flags: U32) -> list[InverseTrial]:
+    trials = []
+    for segment in reference.segments:
+        start, stop, cycles = segment.steady_cycles()
+        if cycles == 0:
+            raise InputError(f"{segment.label}: no steady cycle: give the waveform more time")
+        signals = (reference.values[start:stop], displacement_um[start:stop])
+        cycle = cycle_metrics.fold(np.arange(start, stop) - segment.start, segment.period, signals)
+        wanted, moved = cycle.signals
+        peak, rms = cycle_metrics.peak_and_rms_percent(
+            moved - wanted, cycle_metrics.peak_to_peak(moved)
+        )
+        trials.append(
+            InverseTrial(
+                label=segment.label,
+                frequency_hz=reference.sample_rate_hz / segment.period,
+                peak_hysteresis_percent=cycle_metrics.peak_hysteresis_percent(wanted, moved),
+                peak_error_percent=peak,
+                rms_error_percent=rms,
+                limited_samples=int(np.count_nonzero(flags[start:stop] & _LIMITED)),
+            )
+        )
+    return trials
+
+
+def inverse_ns(
+    model: HysteresisModel, loop: SteadyLoop, sample_rate_hz: float, clock: Callable[[], float]
+) -> float:
+    """Measure what one sample of a model's inverse takes, in ns.
+
+    The reference is a sine of the loop's stroke and frequency; the shortest of some rounds counts,
+    because whatever else the machine does only adds to it.
+
+    Args:
+        model: Any model.
+        loop: Gives stroke and frequency.
+        sample_rate_hz: Samples a second.
+        clock: Time in s.
+    """
+    low, high = float(loop.displacement_um.min()), float(loop.displacement_um.max())
+    angle = 2.0 * np.pi * loop.frequency_hz / sample_rate_hz * np.arange(TIMED_SAMPLES)
+    reference_um = 0.5 * (low + high) + 0.5 * (high - low) * np.sin(angle)
+    operator = model.inverse(sample_rate_hz)
+    out = np.empty_like(reference_um)
+    operator.process(reference_um, out)
+    times = []
+    for _ in range(_ROUNDS):
+        begin = clock()
+        operator.process(reference_um, out)
+        times.append(clock() - begin)
+    return 1e9 * min(times) / TIMED_SAMPLES

@@ -1,0 +1,209 @@
+"""The heat of a coil, the running mean square of its current in A^2, from run to run.
+
+It follows ``d(heat)/dt = (current^2 - heat) / tau``, as the thermal interlock counts it, so heat is
+linear in what there was before: a run needs to be worked out only once.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilctl.base.samples import Flag, Samples
+from hilctl.base.types import F64
+from hilctl.experiment.file import Experiment
+from hilctl.experiment.sections import Limits
+from hilctl.kernels.interlock import heat_block
+from hilctl.loop.interlocks import warming
+
+_ROOM = 0.9  # of the budget, for measured currents: late by a sample, they add to the commands
+_LEAST_DIFFERENCE = 1e-3
+
+
+class CoilHeat:
+    """Follows the thermal budget of the coil through the commands of a run.
+
+    Args:
+        limits: The budget; without a time constant nothing is followed.
+        sample_rate_hz: Samples a second.
+        heat_a2: Running mean square of the current before them, in A^2.
+
+    Attributes:
+        heat_a2: Running mean square after the last of them, in A^2.
+        highest_a2: Highest running mean square so far, in A^2.
+        used_s: Time of the commands after which the budget is overdrawn; None where it is kept.
+    """
+
+    def __init__(self, limits: Limits, sample_rate_hz: float, heat_a2: float) -> None:
+        self._rate_hz = sample_rate_hz
+        self._budget_a2 = (limits.rms_current_a or math.inf) ** 2
+        self._tau_s = limits.thermal_time_constant_s
+        self.heat_a2 = self.highest_a2 = heat_a2
+        self._samples = 0
+        self._last = 0.0
+        self.used_s: float | None = None
+
+    def add(self, command: F64) -> None:
+        """Go on with the next commands: float64[n], in A."""
+        if self._tau_s is None:
+            return
+        heat = np.empty(command.size)
+        self.heat_a2 = heat_block(command, warming(self._tau_s, self._rate_hz), self.heat_a2, heat)
+        over = np.flatnonzero(heat > self._budget_a2)
+        if self.used_s is None and over.size:
+            self.used_s = (self._samples + int(over[0])) / self._rate_hz
+        self.highest_a2 = max(self.highest_a2, float(heat.max()))
+        self._samples += command.size
+
+    def follow(self, samples: Samples) -> None:
+        """Go on with samples as they were exchanged; those in between held the output."""
+        if self._tau_s is None or not samples.index.size:
+            return
+        current = np.abs(samples.command)
+        if samples.measured.size:
+            current = np.fmax(current, np.where(np.isinf(samples.measured), 0.0, samples.measured))
+        ends = np.flatnonzero(np.diff(samples.index) > 1) + 1
+        for part in np.split(np.arange(current.size), ends):
+            first = int(samples.index[part[0]])
+            if first == 0 and samples.flags[part[0]] & Flag.RAMP:
+                # The ramp begins where the output was found: the coil is as hot as that keeps it.
+                self.heat_a2 = max(self.heat_a2, float(current[0]) ** 2)
+            held_s = (first - self._samples) / self._rate_hz
+            self.heat_a2 = cooled(self.heat_a2, self._last, self._tau_s, held_s)
+            self._samples = first
+            self.add(np.ascontiguousarray(current[part]))
+            self._last = float(samples.command[part[-1]])
+
+    def pass_over(self, before_a2: float, samples: int, times: int) -> None:
+        """Take a cycle that was added for added that many times more, but for the highest in it.
+
+        Args:
+            before_a2: Heat before it, in A^2.
+            samples: How many it has.
+            times: How often.
+        """
+        if self._tau_s is None:
+            return
+        self.heat_a2 = _repeated(
+            before_a2, self.heat_a2, samples / self._rate_hz, self._tau_s, times
+        )
+        self._samples += times * samples
+
+    @property
+    def rms_a(self) -> float | None:
+        """Highest running rms of the current so far, in A; None without a thermal budget."""
+        return None if self._tau_s is None else math.sqrt(self.highest_a2)
+
+
+@dataclass(frozen=True, slots=True)
+class RunHeat:
+    """What the commands of a run do to the heat of the coil, whatever that is before them.
+
+    Attributes:
+        seconds: Time that they take.
+        alone_a2: Heat after them of a coil without any before, in A^2.
+        hottest_a2: Hottest before them that keeps the budget, in A^2; infinite without a budget.
+    """
+
+    seconds: float = 0.0
+    alone_a2: float = 0.0
+    hottest_a2: float = math.inf
+
+    def then(self, command: F64, limits: Limits, sample_rate_hz: float) -> "RunHeat":
+        """Return it with the next commands: float64[n], in A."""
+        before = round(self.seconds * sample_rate_hz)
+        seconds = (before + command.size) / sample_rate_hz
+        tau_s = limits.thermal_time_constant_s
+        if tau_s is None or not command.size:
+            return RunHeat(seconds)
+        alone = np.empty(command.size)
+        last = heat_block(command, warming(tau_s, sample_rate_hz), self.alone_a2, alone)
+        times_s = np.arange(before + 1, before + command.size + 1) / sample_rate_hz
+        # What is so long after the start that nothing is left of it limits nothing.
+        left = np.maximum(np.exp(-times_s / tau_s), 1e-300)
+        budget_a2 = _ROOM * (limits.rms_current_a or math.inf) ** 2
+        hottest = float(np.min((budget_a2 - alone) / left))
+        return RunHeat(seconds, last, min(self.hottest_a2, hottest))
+
+    def pass_over(
+        self, alone_a2: float, samples: int, times: int, limits: Limits, sample_rate_hz: float
+    ) -> "RunHeat":
+        """Return it with a cycle that it has already, that many times more, and one to come.
+
+        The hottest before them is decided by the first cycle or by the last, which is still to be
+        added: from one to the next, the room that is left grows or shrinks.
+
+        Args:
+            alone_a2: :attr:`alone_a2` before that cycle.
+            samples: How many it has.
+            times: How often.
+            limits: The budget.
+            sample_rate_hz: Samples a second.
+        """
+        seconds, tau_s = (
+            self.seconds + times * samples / sample_rate_hz,
+            limits.thermal_time_constant_s,
+        )
+        if tau_s is None:
+            return RunHeat(seconds)
+        last = _repeated(alone_a2, self.alone_a2, samples / sample_rate_hz, tau_s, times)
+        return RunHeat(seconds, last, self.hottest_a2)
+
+
+class CoolingCoil:
+    """Follows the heat of a coil through runs and pauses.
+
+    Where the experiment has no thermal budget, nothing is ever waited for.
+
+    Args:
+        config: The experiment.
+        heat_a2: Heat at ``now_s``, in A^2; at least that of the safe value.
+        now_s: Time in s, by any clock.
+    """
+
+    def __init__(self, config: Experiment, heat_a2: float, now_s: float) -> None:
+        self._tau_s = config.limits.thermal_time_constant_s
+        self._rest = config.safe.value
+        self._heat_a2 = max(heat_a2, self._rest**2)
+        self._at_s = now_s
+
+    def heat_a2(self, now_s: float) -> float:
+        """Return the heat at a time, in A^2; times before the last run count as its end."""
+        return cooled(self._heat_a2, self._rest, self._tau_s, now_s - self._at_s)
+
+    def ran(self, run: RunHeat, ended_s: float) -> None:
+        """Take a run that has ended."""
+        if self._tau_s is not None:
+            before_a2 = self.heat_a2(ended_s - run.seconds)
+            self._heat_a2 = run.alone_a2 + before_a2 * math.exp(-run.seconds / self._tau_s)
+        self._at_s = max(self._at_s, ended_s)
+
+    def pause_s(self, run: RunHeat, now_s: float, to_rms_a: float = math.inf) -> float:
+        """Return how long the coil must cool before a run.
+
+        Args:
+            run: What is to be run.
+            now_s: Present time in s.
+            to_rms_a: Running rms that it must have cooled to in any case, in A.
+        """
+        hottest_a2, heat_a2 = min(run.hottest_a2, to_rms_a**2), self.heat_a2(now_s)
+        over_a2 = heat_a2 - self._rest**2
+        if self._tau_s is None or heat_a2 <= hottest_a2 or over_a2 <= 0.0:
+            return 0.0
+        allowed_a2 = max(hottest_a2 - self._rest**2, _LEAST_DIFFERENCE * over_a2)
+        return max(0.0, self._tau_s * math.log(over_a2 / allowed_a2))
+
+
+def _repeated(before_a2: float, after_a2: float, seconds: float, tau_s: float, times: int) -> float:
+    """Return the heat after a cycle that took it from one to another has come that often more."""
+    # A cycle maps the heat before it to kept * heat + a constant: the rest is a geometric row.
+    kept = math.exp(-seconds / tau_s)
+    final_a2 = before_a2 + (after_a2 - before_a2) / (1.0 - kept)
+    return final_a2 + (before_a2 - final_a2) * kept ** (times + 1)
+
+
+def cooled(heat_a2: float, held_a: float, tau_s: float | None, seconds: float) -> float:
+    """Return the heat in A^2 after a time in s at a constant current in A."""
+    if tau_s is None or seconds <= 0.0:
+        return heat_a2
+    return held_a**2 + (heat_a2 - held_a**2) * math.exp(-seconds / tau_s)

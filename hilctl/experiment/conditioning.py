@@ -1,0 +1,124 @@
+"""What an experiment asks for before its waveform: a decaying cycle, and a rest to measure at.
+
+Hysteresis forgets what it went through once it has been further than ever before, and then back in
+ever smaller loops: so a run that begins with such a cycle does not depend on what came before it,
+and the compensator begins with what the cycle leaves.
+"""
+
+import math
+
+import numpy as np
+
+from hilctl.base.errors import ConfigProblem
+from hilctl.base.types import F64
+from hilctl.experiment.file import Experiment
+from hilctl.experiment.load import LoadedExperiment
+from hilctl.experiment.sections import REST_S
+from hilctl.loop.conditioning import Conditioning
+
+OFFSET_SHARE = 0.25
+"""Largest offset that is taken out, as a share of the limits of the stroke."""
+_HIGHEST_HZ = 10.0  # slow enough for fields to go through the whole of a rod
+_FEWEST_SAMPLES = 20  # a cycle of fewer misses its own peaks
+_SLEW_SHARE = 0.5  # of the slew limit, for a cycle for which no frequency is given
+
+
+def measures_offset(config: Experiment) -> bool:
+    """Return whether a run measures its resting offset before the waveform."""
+    return config.compensator is not None and config.compensator.offset == "measured"
+
+
+def conditioning_of(
+    loaded: LoadedExperiment, stands_um: float | None = None
+) -> Conditioning | None:
+    """Return what comes before the waveform; None where nothing does.
+
+    Args:
+        loaded: The experiment.
+        stands_um: Displacement at its end by the model; None where no offset is measured.
+    """
+    config, condition = loaded.config, loaded.config.condition
+    if condition is None and not measures_offset(config):
+        return None
+    rate_hz, block, safe = config.sample_rate_hz, config.block, config.safe.value
+    cycle = np.empty(0) if condition is None else _cycle(config)
+    rest_s = REST_S if condition is None else condition.rest_s
+    stop = cycle.size + max(block, round(rest_s * rate_hz))
+    blocks = math.ceil(stop / block) + loaded.device.info.latency_blocks
+    command = np.full(blocks * block, safe)
+    command[: cycle.size] = cycle
+    low_um, high_um = config.limits.stroke_um
+    return Conditioning(
+        command=command,
+        rest=((cycle.size + stop) // 2, stop),
+        cycle_samples=cycle.size,
+        stands_um=stands_um,
+        largest_um=OFFSET_SHARE * (high_um - low_um),
+        lead_in=config.lead_in_samples,
+    )
+
+
+def condition_problems(loaded: LoadedExperiment) -> list[ConfigProblem]:
+    """Return why an experiment can't have the condition that it asks for."""
+    config, condition = loaded.config, loaded.config.condition
+    if condition is None:
+        return []
+    found: list[tuple[str, str, str]] = []
+    unit = config.limits.unit
+    key = f"condition.amplitude_{unit.lower()}"
+    given = {"A": condition.amplitude_a, "V": condition.amplitude_v}
+    if any(value is not None for other, value in given.items() if other != unit):
+        found.append(("condition", f"must have amplitude_{unit.lower()}: limits are in {unit}", ""))
+    furthest = max(_room(config))
+    amplitude = given[unit]
+    if amplitude is not None and amplitude > furthest:
+        rule = f"must be <= {furthest:g}, the way from safe.value to the limits, in {unit}"
+        found.append((key, rule, f"{amplitude:g}"))
+    hz, highest_hz = _frequency_hz(config), _highest_hz(config)
+    if hz > highest_hz:
+        rule = (
+            f"must be <= {highest_hz:.4g} Hz: {_FEWEST_SAMPLES} samples a cycle, and the slew limit"
+        )
+        found.append(("condition.frequency_hz", rule, f"{hz:g}"))
+    return [
+        ConfigProblem(loaded.document.where(tuple(key.split("."))), key, rule, value)
+        for key, rule, value in found
+    ]
+
+
+def _room(config: Experiment) -> tuple[float, float]:
+    """Return how far a cycle goes below and above the safe value, in the command's unit."""
+    condition, limits = config.condition, config.command_limits()
+    assert condition is not None
+    given = condition.amplitude_a or condition.amplitude_v or math.inf
+    return min(given, limits.safe - limits.low), min(given, limits.high - limits.safe)
+
+
+def _highest_hz(config: Experiment) -> float:
+    slew_hz = config.limits.slew_per_s / (2.0 * math.pi * max(_room(config)))
+    return min(slew_hz, config.sample_rate_hz / _FEWEST_SAMPLES)
+
+
+def _frequency_hz(config: Experiment) -> float:
+    assert config.condition is not None
+    given = config.condition.frequency_hz
+    return given or min(_HIGHEST_HZ, _SLEW_SHARE * _highest_hz(config))
+
+
+def _cycle(config: Experiment) -> F64:
+    """Return the commands of the cycle, float64[n]; the first period has the whole amplitude."""
+    condition, safe = config.condition, config.safe.value
+    assert condition is not None
+    below, above = _room(config)
+    turns_a_sample = _frequency_hz(config) / config.sample_rate_hz
+    turn = turns_a_sample * np.arange(1, round(condition.cycles / turns_a_sample) + 1)
+    wave = np.sin(2.0 * np.pi * turn)
+    falling, span, decay = np.maximum(turn - 1.0, 0.0), condition.cycles - 1.0, condition.decay
+    if decay == 1.0:
+        envelope = 1.0 - falling / span
+    else:  # shifted so that it ends at 0; plain differences of powers near 1 are steps
+        log = math.log(decay)
+        envelope = decay**falling * np.expm1((span - falling) * log) / math.expm1(span * log)
+    command: F64 = safe + envelope * np.where(wave > 0.0, above, below) * wave
+    command[-1] = safe
+    return command

@@ -1,0 +1,234 @@
+"""A first experiment for a device: small, slow, and with every value explained.
+
+It moves a fifth of what the device can put out, without a compensator: whoever has wired a rig sees
+by it whether signs, gains and ranges are as they thought, before a model is identified.
+"""
+
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from hilctl.base.device import DeviceInfo
+from hilctl.base.errors import ConfigError, ConfigProblem, InputError
+from hilctl.base.files import TextFiles
+from hilctl.base.types import CommandUnit
+from hilctl.base.yaml import Document, commented, did_you_mean, dump
+from hilctl.experiment.device import known_devices, made_device
+from hilctl.experiment.inventory import describe, shipped_profiles
+from hilctl.experiment.load import resolve
+from hilctl.experiment.preflight import check
+
+STARTING_SECTION = "hilctl_drivers.template:starting_section"
+_SCHEMA_LINE = "# yaml-language-server: $schema=schema.json"
+_SHARE = 0.2
+_RATES_HZ = tuple(digit * 10.0**power for power in range(-2, 5) for digit in (1, 2, 5))
+_PACED_HZ, _BUFFERED_HZ = 1e3, 1e4
+_BLOCK_S = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class TemplateDevice:
+    """What an experiment is written for.
+
+    Attributes:
+        name: What it was asked for by, without folder and ending.
+        title: The device, for people.
+        section: Its section of the experiment, ``kind`` first.
+        remarks: What stands behind a value, by dotted key of the experiment.
+        asked: Dotted keys that only the owner of the rig can know, each with the question.
+        notes: What must be known before anything is wired.
+    """
+
+    name: str
+    title: str
+    section: Mapping[str, Any]
+    remarks: Mapping[str, str]
+    asked: Mapping[str, str]
+    notes: Sequence[str]
+
+
+LIMITS_ASKED = {
+    "A": {"limits.peak_current_a": "largest current of the first runs, A"},
+    "V": {"limits.drive_v": "lowest and highest voltage of the first runs, [low, high]"},
+}
+"""What is asked about limits, by the unit of the command."""
+
+
+def starting_device(
+    name: str, folder: Path, unit: CommandUnit = "A", reader: str | None = None
+) -> TemplateDevice:
+    """Return what an experiment for a device begins with.
+
+    Args:
+        name: Device, shipped profile, or path of a profile.
+        folder: Where the experiment will stand: a profile is named from there.
+        unit: What the actuator is driven with, where an amplifier stands behind an output.
+        reader: Profile of the device that reads the sensor, where it is another one.
+
+    Raises:
+        InputError: There is none of this name, or it can't drive an actuator by itself.
+    """
+    kinds, profiles = known_devices(), shipped_profiles()
+    if name in kinds and not any(option.name == "profile" for option in describe(name).options):
+        if reader is not None:
+            raise InputError(f"--reader is for profiles: {name} reads its own sensor")
+        needed = {o.name: o.description for o in describe(name).options if o.default is None}
+        asked = {f"device.{key}": text or key for key, text in needed.items()}
+        return TemplateDevice(name, name, {"kind": name}, {}, asked, ())
+    if name in kinds:
+        raise InputError(f"{name} takes a profile: hilctl init PROFILE ({', '.join(profiles)})")
+    own = Path(name).suffix != "" or os.sep in name
+    if name not in profiles and not own:
+        hint = did_you_mean(name, [*kinds, *profiles])
+        raise InputError(f"there is no device or profile '{name}' ({hint})")
+    module, _, function = STARTING_SECTION.partition(":")
+    made = getattr(import_module(module), function)(name, unit, reader)
+    section = dict(made.values)
+    if own:  # a path in an experiment is from its own folder
+        section["profile"] = os.path.relpath(name, folder)
+    prefixed = ({f"device.{key}": text for key, text in each.items()}
+                for each in (made.remarks, made.asked))  # fmt: skip
+    remarks, asked = prefixed
+    return TemplateDevice(Path(name).stem, made.title, section, remarks, asked, made.notes)
+
+
+def starting_experiment(
+    device: TemplateDevice, path: Path, settings: Sequence[str] = ()
+) -> tuple[str, DeviceInfo]:
+    """Return the text of a first experiment, which has been checked, and what its device says.
+
+    Args:
+        device: What it is for.
+        path: File that it will stand in; nothing is written.
+        settings: ``key=value`` texts over it.
+
+    Raises:
+        InputError: With these settings it may not start; all reasons are listed.
+    """
+    files = TextFiles()
+    named = {"name": path.stem, "device": dict(device.section)}
+    document = Document(str(path), dump(named))
+    of_device = [each for each in settings if each.lstrip().startswith("device.")]
+    _set(document, of_device)
+    made = made_device(document, path.parent, files)
+    assert made is not None
+    data, remarks = _first_values(made.info)
+    whole = Document(str(path), dump({**document.data, **data}))
+    _set(whole, settings)
+    head = _head(device, path)
+    text = head + commented(whole.data, {**remarks, **device.remarks})
+    check(resolve(Document(str(path), text), path.parent, (), files))
+    return text, made.info
+
+
+def _set(document: Document, settings: Sequence[str]) -> None:
+    problems: list[ConfigProblem] = []
+    for each in settings:
+        try:
+            document.set(each)
+        except ConfigError as error:
+            problems += error.problems
+    if problems:
+        raise ConfigError(problems)
+
+
+def _head(device: TemplateDevice, path: Path) -> str:
+    lines = [_SCHEMA_LINE, "#", f"# A first experiment for {device.title}, by hilctl init."]
+    if any(text.startswith("set:") for text in device.remarks.values()):
+        lines.append(
+            "# Put your own values where it says 'set:'; those that stand there are nobody's."
+        )
+    if device.notes:
+        profile = device.section.get("profile")
+        lines.append(f"# Before anything is wired, read the notes: hilctl devices show {profile}")
+    commands = {
+        f"hilctl check {path.name}": "what would it do? nothing moves",
+        f"hilctl run {path.name}": "it moves, and is recorded",
+        f"hilctl characterise {path.name} --output model.yaml": "finds a model within the limits",
+    }
+    width = max(map(len, commands))
+    lines += [f"#     {command:{width}}   {what}" for command, what in commands.items()]
+    lines.append(
+        "# Then 'compensator: {model: model.yaml}' and a waveform in um run through its inverse."
+    )
+    return "\n".join(lines) + "\n"
+
+
+def _first_values(info: DeviceInfo) -> tuple[dict[str, Any], dict[str, str]]:
+    """Return all keys but those of the device, and what stands behind them."""
+    rate_hz = _below(min(info.max_rate_hz, _BUFFERED_HZ if info.buffered else _PACED_HZ))
+    frequency_hz = _below(min(rate_hz / 100.0, 1.0))
+    low, high = (_rounded(_SHARE * each, 2) for each in (info.command_min, info.command_max))
+    data: dict[str, Any] = {"sample_rate_hz": rate_hz}
+    remarks = {"sample_rate_hz": f"at most {info.max_rate_hz:g}"}
+    if info.buffered:
+        most = info.fifo_depth // max(2, info.latency_blocks + 1)
+        data["block"] = max(1, min(int(_BLOCK_S * rate_hz), most))
+        remarks["block"] = "samples exchanged in one tick; the device has a FIFO"
+    data["waveform"] = _sine(info.command_unit, low, high, frequency_hz)
+    remarks["waveform.amplitude"] = f"{info.command_unit}: half of the limits below"
+    remarks["waveform.soft_start_s"] = "the first cycle grows, the last one fades"
+    data["compensator"] = "none"
+    remarks["compensator"] = "or {model: model.yaml}, once there is one"
+    slew = _rounded(math.pi * frequency_hz * (high - low), 2)
+    data["limits"], of_limits = _limits(info, low, high, slew)
+    data["safe"] = {
+        "value": 0.0 if low <= 0.0 <= high else low,
+        "ramp_s": _rounded((high - low) / slew, 1),
+    }
+    remarks["safe.value"] = f"{info.command_unit} at which nothing can happen; every run ends there"
+    remarks["safe.ramp_s"] = "from the limit to there"
+    return data, {**remarks, **of_limits}
+
+
+def _sine(unit: CommandUnit, low: float, high: float, frequency_hz: float) -> dict[str, Any]:
+    """Return a sine of half of the way between limits, around 0 where it can be."""
+    cycle_s = 1.0 / frequency_hz
+    offset = 0.0 if low < 0.0 < high else 0.5 * (low + high)
+    return {
+        "kind": "sine",
+        "unit": unit,
+        "amplitude": _rounded(0.5 * min(high - offset, offset - low), 2),
+        "offset": _rounded(offset, 2),
+        "frequency_hz": frequency_hz,
+        "duration_s": 4.0 * cycle_s,
+        "soft_start_s": cycle_s,
+        "soft_end_s": cycle_s,
+    }
+
+
+def _limits(
+    info: DeviceInfo, low: float, high: float, slew: float
+) -> tuple[dict[str, Any], dict[str, str]]:
+    unit, ends = info.command_unit, f"{info.command_min:g} to {info.command_max:g}"
+    peak, slew_key = ("peak_current_a", "slew_a_per_s")
+    value: Any = min(high, -low)
+    if unit == "A" and value <= 0.0:
+        raise InputError(
+            f"{info.name}: takes {ends} A, and limits.peak_current_a holds both ways, so that "
+            "0 A must lie inside: give the offset of its amplifier, device.amplifier.offset_a"
+        )
+    if unit == "V":
+        peak, slew_key, value = "drive_v", "slew_v_per_s", [low, high]
+    stroke = [_rounded(0.9 * each, 3) for each in (info.sensor_min_um, info.sensor_max_um)]
+    return {peak: value, slew_key: slew, "stroke_um": stroke}, {
+        f"limits.{peak}": f"set: what your actuator bears; the device takes {ends} {unit}",
+        f"limits.{slew_key}": f"fastest change of the command, {unit}/s",
+        "limits.stroke_um": "set: displacements beyond end the run by its safe ramp",
+    }
+
+
+def _below(limit: float) -> float:
+    return max((each for each in _RATES_HZ if each <= limit), default=limit)
+
+
+def _rounded(value: float, digits: int) -> float:
+    """Return a value with so many significant digits, towards zero: a limit must not grow."""
+    if value == 0.0:
+        return 0.0
+    step = 10.0 ** (math.floor(math.log10(abs(value))) - digits + 1)
+    return float(f"{math.trunc(value / step + math.copysign(1e-9, value)) * step:.12g}")

@@ -1,0 +1,304 @@
+"""Densities of plays and drags, and the curve after them, by one non-negative least squares.
+
+With the effective field known, the operators' output is linear in what each rises by in each cell,
+and so is the curve's inverse in its slopes. Its mean slope is set to 1, since a common factor of
+both sides makes no difference. What data leave open, smoothness decides, so there is one solution.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg import cholesky, solve_triangular
+from scipy.optimize import nnls
+
+from hilctl.base.types import F64, I64
+from hilctl.identify.field.design_matrix import needed_points, play_columns, plays_given
+from hilctl.identify.field.gauss_newton import SearchPoint
+from hilctl.identify.nnls import RIDGE
+from hilctl.kernels.field import drag_columns
+
+STEEPEST = 6.0  # slope of the curve, of its mean
+SMOOTH = 0.01  # weight of a difference of neighbours, relative to the longest column
+SMOOTH_PLAYS = 10  # lines beyond which it falls with their number, as their densities do
+CURVE_SMOOTH = 0.02  # the same for the curve's slopes
+EDGE = 0.1  # of half a turn: how much closer they lie
+MOVED = 1e-3  # of the furthest: a column that moves less is left out
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """What operators there are, in units of the command.
+
+    Attributes:
+        thresholds: float64[p], of the plays, rising from 0.
+        lengths: float64[d], of the drags.
+        lowest: Lower end of the first cell of the effective field.
+        width: Of a cell.
+        cells: Number of cells of the drags, and of splines of the plays over the same range, >= 3.
+        knots: Corners of the curve.
+    """
+
+    thresholds: F64
+    lengths: F64
+    lowest: float
+    width: float
+    cells: int
+    knots: int
+
+    @property
+    def lines(self) -> int:
+        """Plays and drags."""
+        return int(self.thresholds.size + self.lengths.size)
+
+    @property
+    def piece(self) -> float:
+        """Width of a piece of the splines."""
+        return self.width * self.cells / (self.cells - 2)
+
+
+@dataclass(frozen=True, slots=True)
+class Curve:
+    """The curve after the operators: points, float64[K + 1] each, the operators' 0 among them."""
+
+    operators: F64
+    displacement_um: F64
+
+    def operators_of(self, y: F64) -> F64:
+        """Return the operators' output for displacements; the ends go on straight."""
+        inside = np.interp(y, self.displacement_um, self.operators)
+        first, last = self.displacement_um[0], self.displacement_um[-1]
+        slopes = np.diff(self.operators) / np.diff(self.displacement_um)
+        below = slopes[0] * np.minimum(y - first, 0.0)
+        return np.asarray(inside + below + slopes[-1] * np.maximum(y - last, 0.0))
+
+
+@dataclass(frozen=True, slots=True)
+class Weights:
+    """What was found.
+
+    Attributes:
+        slopes: float64[lines, cells], um per command unit; of plays those of their splines.
+        curve: From the operators' output to displacement, without the offset.
+        offset_um: Displacement at rest.
+        errors_um: float64[N], modelled less measured displacement of the rows.
+        squares: Sum of the weighted squares of the operators' errors, and of the prior's.
+    """
+
+    slopes: F64
+    curve: Curve
+    offset_um: float
+    errors_um: F64
+    squares: float = 0.0
+
+    def errors_of(self, given: F64, y: F64) -> F64:
+        """Return errors of what operators give at rows that may be others: float64[N]."""
+        curve = Curve(self.curve.operators, self.curve.displacement_um + self.offset_um)
+        return np.asarray(given - curve.operators_of(y))
+
+
+def table(paths: Sequence[F64], kept: Sequence[I64], grid: Grid) -> F64:
+    """Return what each operator gives for each cell: float64[N, lines cells].
+
+    Args:
+        paths: For each record, float64[n], its effective field from rest.
+        kept: For each record, int64[N_i], which of these are rows.
+        grid: The operators.
+    """
+    plays, cells = grid.thresholds.size, grid.cells
+    parts: list[F64] = []
+    for path, samples in zip(paths, kept, strict=True):
+        points, rows = np.empty(path.size, dtype=np.int64), np.empty_like(samples)
+        u = path[points[: needed_points(path, samples, points, rows)]]
+        out = np.empty((rows.size, grid.lines * cells))
+        play_columns(u, rows, grid.thresholds, grid.lowest, grid.piece, cells, out)
+        for i, length in enumerate(grid.lengths):
+            first = (plays + i) * cells
+            drag_columns(u, rows, length, grid.lowest, grid.width, cells, first, out)
+        parts.append(out)
+    return np.concatenate(parts)
+
+
+def outputs(paths: Sequence[F64], kept: Sequence[I64], grid: Grid, slopes: F64) -> tuple[F64, F64]:
+    """Return what operators of known weights give, and its derivatives by the thresholds.
+
+    Args:
+        paths: See :func:`table`.
+        kept: See :func:`table`.
+        grid: The operators.
+        slopes: float64[lines, cells].
+
+    Returns:
+        float64[N], and float64[N, p - 1] for all thresholds but the first.
+    """
+    plays = grid.thresholds.size
+    drags = replace(grid, thresholds=np.empty(0))
+    given: list[F64] = []
+    changes: list[F64] = []
+    for path, samples in zip(paths, kept, strict=True):
+        points, rows = np.empty(path.size, dtype=np.int64), np.empty_like(samples)
+        u = path[points[: needed_points(path, samples, points, rows)]]
+        total, by = np.empty(rows.size), np.empty((rows.size, plays))
+        weights = np.ascontiguousarray(slopes[:plays])
+        plays_given(u, rows, grid.thresholds, grid.lowest, grid.piece, weights, total, by)
+        if grid.lengths.size:
+            total += table([u], [rows], drags) @ slopes[plays:].ravel()
+        given.append(total)
+        changes.append(by[:, 1:])
+    return np.concatenate(given), np.concatenate(changes)
+
+
+class Equations:
+    """Linear equations of all weights, of which the operators' output and the curve's differ least.
+
+    Args:
+        columns: What :func:`table` returned.
+        y: float64[N], displacement without structure and delay, in um.
+        grid: The operators.
+        least: Smallest slope of the first line, um per command unit.
+        scale: float64[N], square root of each row's weight.
+    """
+
+    def __init__(self, columns: F64, y: F64, grid: Grid, least: float, scale: F64) -> None:
+        """Leave out what does not move, and lay the curve's corners."""
+        self._y, self._grid, self._scale = y, grid, scale
+        moved = np.ptp(columns, axis=0)
+        self._used = moved > MOVED * float(moved.max())
+        self._used[: grid.cells] = True
+        # Magnetostriction begins and ends flat: there its inverse bends most, corners lie closer.
+        even = 0.5 - 0.5 * np.cos(np.pi * np.linspace(EDGE, 1.0 - EDGE, grid.knots + 1))
+        self._knots = float(y.min()) + float(np.ptp(y)) * (even - even[0]) / (even[-1] - even[0])
+        parts = _segments(y, self._knots)
+        anchor = int(np.clip(np.searchsorted(self._knots, 0.0) - 1, 0, grid.knots - 1))
+        self._anchor, self._others = anchor, np.delete(np.arange(grid.knots), anchor)
+        self._share = np.diff(self._knots) / np.diff(self._knots)[anchor]
+        bends = parts[:, [anchor]] * self._share[self._others] - parts[:, self._others]
+        self._left = np.hstack([columns[:, self._used], bends])
+        self._target = float(self._share.sum()) * parts[:, anchor]
+        self._lows = np.zeros(self._left.shape[1])
+        self._lows[: grid.cells] = least
+        self._lows[self._left.shape[1] - self._others.size :] = 1.0 / STEEPEST
+        longest = float(np.linalg.norm(columns * scale[:, None], axis=0).max())
+        held = CURVE_SMOOTH * float(np.ptp(y)) / grid.knots * float(np.linalg.norm(scale))
+        curve = self._others, anchor, self._share, held
+        self._prior, self._wanted = _prior(self._used, grid, longest, curve)
+
+    def solve(self) -> Weights:
+        """Find all weights; once, however often it is asked for."""
+        found, constant = self._found
+        grid, others = self._grid, self._others
+        curve_slopes = np.empty(grid.knots)
+        curve_slopes[others] = found[found.size - others.size :]
+        rest = float(self._share.sum() - self._share[others] @ curve_slopes[others])
+        curve_slopes[self._anchor] = max(rest, 1.0 / STEEPEST)
+        slopes = np.zeros(self._used.size)
+        slopes[self._used] = found[: found.size - others.size]
+        errors = (self._left @ found + constant - self._target) / (
+            curve_slopes[np.clip(np.searchsorted(self._knots, self._y) - 1, 0, grid.knots - 1)]
+        )
+        values = np.concatenate(([0.0], np.cumsum(curve_slopes * np.diff(self._knots))))
+        operators = values - constant  # these give 0 at rest
+        offset_um = float(Curve(self._knots, operators).operators_of(np.zeros(1))[0])
+        curve = Curve(operators, self._knots - offset_um)
+        residual = (self._left @ found + constant - self._target) * self._scale
+        held = self._prior @ found - self._wanted
+        squares = float(residual @ residual + held @ held)
+        lines = slopes.reshape(grid.lines, grid.cells)
+        return Weights(lines, curve, offset_um, errors, squares)
+
+    def place(self, errors: F64, changes: F64) -> SearchPoint:
+        """Return the sum of squares where changes of the rows lead, the weights following.
+
+        The weights that are free take up what they can of each change (Kaufman's variable
+        projection), so a step down from here needs no other solution.
+
+        Args:
+            errors: float64[N], of the operators' output with the weights of :meth:`solve`.
+            changes: float64[N, p], of these errors.
+        """
+        found, _ = self._found
+        free = found > self._lows
+        means = self._means(self._left[:, free])
+        left = (self._left[:, free] - means) * self._scale[:, None]
+        rows = self._prior[:, free]
+        normal = left.T @ left + rows.T @ rows
+        corner = cholesky(normal + 1e-12 * float(normal.diagonal().max()) * np.eye(len(normal)))
+        here = errors * self._scale
+        moved = (changes - self._means(changes)) * self._scale[:, None]
+        taken = solve_triangular(corner, left.T @ moved, trans=1)
+        held = self._prior @ found - self._wanted
+        squares = float(here @ here + held @ held)
+        return SearchPoint(squares, moved.T @ here, moved.T @ moved - taken.T @ taken)
+
+    @cached_property
+    def _found(self) -> tuple[F64, float]:
+        """Minimise |scale (left w + c - target)|^2 + |prior w - wanted|^2 over w >= lows, and c.
+
+        On normal equations: the prior keeps them well conditioned, and a search solves many of
+        them.
+        """
+        means, mean = self._means(self._left), float(self._means(self._target))
+        left = (self._left - means) * self._scale[:, None]
+        right = (self._target - mean - (self._left - means) @ self._lows) * self._scale
+        rows = self._prior
+        normal = left.T @ left + rows.T @ rows
+        normal[np.diag_indices_from(normal)] += 1e-12 * float(normal.diagonal().max())
+        corner = cholesky(normal)
+        downhill = left.T @ right + rows.T @ (self._wanted - rows @ self._lows)
+        more, _ = nnls(corner, solve_triangular(corner, downhill, trans=1))
+        found = self._lows + more
+        return found, mean - float(means @ found)
+
+    def _means(self, rows: F64) -> F64:
+        weight = self._scale**2 / float(np.sum(self._scale**2))
+        return np.asarray(weight @ rows)
+
+
+def solve(columns: F64, y: F64, grid: Grid, least: float, scale: F64) -> Weights:
+    """Find all weights; see :class:`Equations` for the arguments."""
+    return Equations(columns, y, grid, least, scale).solve()
+
+
+def _segments(y: F64, knots: F64) -> F64:
+    """Return how far y has gone between each two knots; the ends go on: float64[N, K]."""
+    width = np.diff(knots)
+    out = np.clip(y[:, None] - knots[:-1], 0.0, width)
+    out[:, 0] += np.minimum(y - knots[0], 0.0)
+    out[:, -1] += np.maximum(y - knots[-1], 0.0)
+    return np.asarray(out)
+
+
+def _prior(
+    used: F64, grid: Grid, longest: float, curve: tuple[I64, int, F64, float]
+) -> tuple[F64, F64]:
+    """Return rows that hold neighbours alike and densities small, and what they are to give."""
+    others, anchor, share, held = curve
+    count = int(used.sum())
+    number = np.where(used, np.cumsum(used) - 1, -1).reshape(grid.lines, grid.cells)
+    smooth = SMOOTH * min(1.0, SMOOTH_PLAYS / grid.thresholds.size)
+    pairs = [(number[:, :-1], number[:, 1:], smooth)]
+    plays = number[1 : grid.thresholds.size]
+    pairs.append((plays[:-1], plays[1:], 0.5 * smooth))
+    width = count + others.size
+    out: list[F64] = []
+    for first, second, weight in pairs:
+        a, b = first.ravel(), second.ravel()
+        both = (a >= 0) & (b >= 0)
+        rows_of = np.zeros((int(both.sum()), width))
+        index = np.arange(len(rows_of))
+        rows_of[index, a[both]], rows_of[index, b[both]] = -weight * longest, weight * longest
+        out.append(rows_of)
+    ridge = np.zeros((count, width))
+    ridge[:, :count] = RIDGE * longest * np.eye(count)
+    out.append(ridge)
+    # Slopes of the curve, of which the anchor's follows from the mean; their second differences.
+    full, constant = np.zeros((grid.knots, width)), np.zeros(grid.knots)
+    full[others, count + np.arange(others.size)] = 1.0
+    full[anchor, count:], constant[anchor] = -share[others], float(share.sum())
+    bends = held * np.diff(np.eye(grid.knots), 2, axis=0)
+    out.append(bends @ full)
+    prior = np.vstack(out)
+    wanted = np.zeros(len(prior))
+    wanted[len(prior) - len(bends) :] = -bends @ constant
+    return prior, wanted

@@ -1,0 +1,347 @@
+"""From a few starts to the stages; the weights follow from them, round by round."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hilctl.base.types import F64, I64
+from hilctl.identify.field.densities import Curve, Equations, Grid, Weights, outputs, solve, table
+from hilctl.identify.field.gauss_newton import SearchPoint, settle
+from hilctl.identify.field.preprocess import Prepared
+from hilctl.identify.field.sampling import Rows, chosen
+from hilctl.identify.field.stages import (
+    HIGH,
+    LOW,
+    NAMES,
+    STEP,
+    Physical,
+    Stages,
+    physical,
+    row,
+    signals,
+    stages_in,
+    stages_of,
+)
+from hilctl.identify.fit_api import OnProgress
+from hilctl.identify.parallel import parallel_map
+
+TRIED = 0.2  # of a unit: change that slopes are taken by; kinks of single rows are smoothed
+MOVES = 0.1  # of the way to the next: change of a threshold that makes about as much difference
+ROOM = 0.45  # the same: how far one may go from where the search has laid it
+STAGES = len(NAMES)
+
+
+@dataclass(frozen=True, slots=True)
+class BareSignal:
+    """What stages make of the records.
+
+    Attributes:
+        fields: For each record, float64[n], its effective field.
+        y: float64[N], displacement of the rows without structure and delay, in um.
+        scale: float64[N], square root of each row's weight.
+    """
+
+    fields: Sequence[F64]
+    y: F64
+    scale: F64
+
+
+class JointRefinement:
+    """A sum of squares over the stages and thresholds of the whole model; its weights follow.
+
+    A search on fewer operators ends at their optimum, which is not that of all of them: small loops
+    need a slightly different lag, and thresholds beside those at which the rods yield.
+
+    Args:
+        rows_of: From stages, float64[9], to the rows.
+        paths: For each record int64[N_i], the samples that are rows.
+        grid: The operators; their thresholds are where to start.
+        least: Smallest slope of the first line, um per command unit.
+    """
+
+    def __init__(
+        self, rows_of: Callable[[F64], BareSignal], paths: Sequence[I64], grid: Grid, least: float
+    ) -> None:
+        self._rows_of, self._paths, self._grid, self._least = rows_of, paths, grid, least
+        self._tried: tuple[F64, Equations, BareSignal] | None = None
+
+    def follow(self, stages: F64) -> tuple[F64, Grid]:
+        """Return the stages and the operators where the sum is least."""
+        first = self._grid.thresholds[1:]
+        below = np.diff(self._grid.thresholds)
+        above = np.append(below[1:], below[-1:])
+        unit = np.concatenate((row(STEP), MOVES * below))
+        # Each goes less than halfway to its neighbours, so that they stay in order.
+        low = np.concatenate((row(LOW), first - ROOM * below))
+        high = np.concatenate((row(HIGH), first + ROOM * above))
+        x = settle(
+            lambda point: self._equations(point)[0].solve().squares,
+            lambda point: self._place(point, unit, high),
+            np.concatenate((stages, first)),
+            (low, high),
+            unit,
+        )
+        return x[:STAGES], self._laid(x)
+
+    def _laid(self, x: F64) -> Grid:
+        return replace(self._grid, thresholds=np.append(0.0, x[STAGES:]))
+
+    def _equations(self, x: F64) -> tuple[Equations, BareSignal]:
+        """Return the equations of a point: a step is tried first, and taken from there."""
+        if self._tried is None or not np.array_equal(self._tried[0], x):
+            rows, grid = self._rows_of(x[:STAGES]), self._laid(x)
+            columns = table(rows.fields, self._paths, grid)
+            equations = Equations(columns, rows.y, grid, self._least, rows.scale)
+            self._tried = x.copy(), equations, rows
+        return self._tried[1:]
+
+    def _place(self, x: F64, unit: F64, high: F64) -> SearchPoint:
+        equations, rows = self._equations(x)
+        grid, found = self._laid(x), equations.solve()
+        changes = np.empty((rows.y.size, x.size))
+        given, changes[:, STAGES:] = outputs(rows.fields, self._paths, grid, found.slopes)
+        here = found.errors_of(given, rows.y)
+        for i in range(STAGES):
+            there = x.copy()
+            there[i] += TRIED * unit[i] if x[i] + TRIED * unit[i] <= high[i] else -TRIED * unit[i]
+            moved = self._rows_of(there[:STAGES])
+            given, _ = outputs(moved.fields, self._paths, grid, found.slopes)
+            errors = found.errors_of(given, moved.y)
+            changes[:, i] = (errors * moved.scale / rows.scale - here) / (there[i] - x[i])
+        return equations.place(here, changes)
+
+
+MARGIN = 0.1  # of the span: room of the tables beyond what the data reach
+LENGTHS = (0.05, 0.4)  # of half the span: shortest and longest drag
+SEARCH_ROWS, POLISH_ROWS, FINAL_ROWS = 2500, 4000, 12_000
+ROUNDS = 2
+FIRST_LAGS = (0.02, 0.1, 0.4)  # starts: lag of the field
+NEAR_BOUND = 0.95
+STIFFER = (0.02, 0.05)  # radians of other starts, where the first leads to a bound
+LEAST_WIDEST = 0.1  # of half the span
+TAIL = 0.02  # of all weights: those of thresholds beyond the widest that is worth its place
+
+
+@dataclass(frozen=True, slots=True)
+class Size:
+    """How many operators."""
+
+    plays: int
+    drags: int
+    cells: int
+    knots: int
+
+    @property
+    def coarse(self) -> "Size":
+        """Fewer of them, for the search."""
+        return Size(min(self.plays, 8), self.drags, min(self.cells, 12), min(self.knots, 16))
+
+
+@dataclass(frozen=True, slots=True)
+class FieldEnd:
+    """What was found, and what another search goes on from.
+
+    Attributes:
+        known: The stages.
+        grid: The operators.
+        weights: Of the operators, and the curve.
+        met: The curve by which errors were judged, by displacement with its offset.
+        widest: Largest threshold that is worth its place, of half the span.
+    """
+
+    known: Physical
+    grid: Grid
+    weights: Weights
+    met: Curve | None
+    widest: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Descent:
+    """Where a descent has led, and what was learned of curve and cells on the way."""
+
+    error: float
+    stages: Stages
+    curve: Curve | None
+    grid: Grid | None
+    widest: float
+
+
+class FieldSearch:
+    """Weights and stages of one size of model.
+
+    Args:
+        data: The records.
+        size: The operators.
+        least: Smallest slope of the first line, um per command unit.
+    """
+
+    def __init__(self, data: Prepared, size: Size, least: float) -> None:
+        self._data = data
+        self._size = size
+        self._least = least
+        self._curve: Curve | None = None
+        self._grid: Grid | None = None
+        self._widest = 1.0
+
+    def find(self, first: Stages, progress: OnProgress) -> FieldEnd:
+        """Follow the best of some starts down, and work out all weights there."""
+        found = self._descended(first, progress, 0.0)
+        if _at_bound(found.stages):
+            # A slow record says little of the structure: a soft one can bend what the hysteresis
+            # should.
+            for k, radian in enumerate(STIFFER, start=1):
+                start = replace(first, radian=radian, delay=0.3 * radian)
+                other = self._descended(start, progress, 1.0 - 0.5**k)
+                found = min(found, other, key=lambda each: each.error)
+        self._curve, self._grid, self._widest = found.curve, found.grid, found.widest
+        return self._end(row(found.stages), None)
+
+    def go_on(self, end: FieldEnd) -> FieldEnd:
+        """Return where a search leads that begins where one of other operators or data ended."""
+        self._curve, self._grid, self._widest = end.met, end.grid, end.widest
+        return self._end(row(stages_of(end.known, self._data)), end.grid)
+
+    def _descended(self, first: Stages, progress: OnProgress, done: float) -> "_Descent":
+        """Return where the best of some starts leads."""
+        coarse = self._size.coarse
+        tried = [self._tried(replace(first, field=lag), coarse) for lag in FIRST_LAGS]
+        first = min(tried, key=_error)[1]
+        x = row(first)
+        self._forget()
+        for turn in range(ROUNDS):
+            part = (turn + 0.2) / (ROUNDS + 1)
+            progress(done + (1.0 - done) * part, f"round {turn + 1} of {ROUNDS}")
+            self._lay(stages_in(x), coarse)
+            self._learn(x, self._chosen())
+            self._lay(stages_in(x), coarse)
+            self._learn(x, self._chosen())
+            x, _ = self._polish(x, self._chosen())
+            self._learn(x, self._chosen())
+        error = float(np.sqrt(np.mean(self._errors(x, self._chosen()) ** 2)))
+        return _Descent(error, stages_in(x), self._curve, self._grid, self._widest)
+
+    def _forget(self) -> None:
+        self._curve = self._grid = None
+        self._widest = 1.0
+
+    def _tried(self, stages: Stages, size: Size) -> tuple[float, Stages]:
+        """Return the error of a start whose weights have been learned twice."""
+        self._forget()
+        for _ in range(2):
+            self._lay(stages, size)
+            self._learn(row(stages), self._chosen())
+        self._lay(stages, size)
+        errors = self._errors(row(stages), self._chosen())
+        return float(np.sqrt(np.mean(errors**2))), stages
+
+    def _polish(self, x: F64, rows: Rows) -> tuple[F64, Grid]:
+        """Return better stages and thresholds."""
+
+        def bare(stages: F64) -> BareSignal:
+            fields, y = self._bare(stages, rows)
+            return BareSignal(fields, y, self._scale(y, rows))
+
+        return JointRefinement(bare, rows.samples, self._laid(), self._least).follow(x)
+
+    def _errors(self, x: F64, rows: Rows) -> F64:
+        """Return weighted errors of the displacement at rows: float64[N], in um."""
+        return self._solved(x, rows).errors_um * rows.scale
+
+    def _solved(self, x: F64, rows: Rows) -> Weights:
+        fields, y = self._bare(x, rows)
+        grid = self._laid()
+        return solve(table(fields, rows.samples, grid), y, grid, self._least, self._scale(y, rows))
+
+    def _bare(self, x: F64, rows: Rows) -> tuple[list[F64], F64]:
+        """Return fields, and displacements of the rows."""
+        fields, bare = self._signals(x)
+        y = [b[samples] for b, samples in zip(bare, rows.samples, strict=True)]
+        return fields, np.concatenate(y)
+
+    def _signals(self, x: F64) -> tuple[list[F64], list[F64]]:
+        known = physical(stages_in(x), self._data)
+        span = self._grid.width * self._grid.cells if self._grid else 2.0 * self._data.reach
+        curve, runs = self._curve, self._data.runs
+        both = parallel_map(lambda run: signals(run, known, curve, span), runs)
+        return [u for u, _ in both], [y for _, y in both]
+
+    def _scale(self, y: F64, rows: Rows) -> F64:
+        """Return what makes errors of the operators' weighted ones of the displacement."""
+        if self._curve is None:
+            return rows.scale
+        step = 0.01 * self._data.stroke_um
+        rise = self._curve.operators_of(y + step) - self._curve.operators_of(y - step)
+        return np.asarray(rows.scale * 2.0 * step / np.maximum(rise, 0.5 * step))
+
+    def _laid(self) -> Grid:
+        assert self._grid is not None
+        return self._grid
+
+    def _learn(self, x: F64, rows: Rows) -> Weights:
+        """Work out weights; what drags and curve do follows from them the next time."""
+        found = self._solved(x, rows)
+        grid = self._laid()
+        plays = grid.thresholds.size
+        self._curve = self._between(found)
+        weights = found.slopes.sum(axis=1)
+        tail = np.cumsum(weights[:plays][::-1])[::-1]
+        beyond = int(np.argmax(np.append(tail, 0.0) < TAIL * float(weights.sum())))
+        widest = 1.2 * float(grid.thresholds[min(beyond, plays - 1)])
+        half = 0.5 * grid.width * grid.cells / (1.0 + 2.0 * MARGIN)
+        self._widest = min(1.0, max(widest / half, LEAST_WIDEST))
+        return found
+
+    def _between(self, found: Weights) -> Curve:
+        """Return the new curve, halfway from the one before: whole steps would swing round it."""
+        y = found.curve.displacement_um + found.offset_um
+        if self._curve is None:
+            return Curve(found.curve.operators, y)
+        return Curve(0.5 * (found.curve.operators + self._curve.operators_of(y)), y)
+
+    def _lay(self, stages: Stages, size: Size) -> None:
+        """Lay the cells over the field that the stages give."""
+        fields, _ = self._signals(row(stages))
+        low = min(float(u.min()) for u in fields)
+        high = max(float(u.max()) for u in fields)
+        span = high - low
+        lowest, width = low - MARGIN * span, (1.0 + 2.0 * MARGIN) * span / size.cells
+        spread = np.arange(size.plays) / size.plays
+        lengths = 0.5 * span * np.array(_lengths(size.drags))
+        self._grid = Grid(
+            0.5 * span * self._widest * spread, lengths, lowest, width, size.cells, size.knots
+        )
+
+    def _chosen(self, most: int = SEARCH_ROWS) -> Rows:
+        return chosen([run.motion for run in self._data.runs], most)
+
+    def _end(self, x: F64, before: Grid | None) -> FieldEnd:
+        rows = self._chosen(POLISH_ROWS)
+        kept = before is not None and before.thresholds.size == self._size.plays
+        for _ in range(1 if kept else 2):
+            self._lay(stages_in(x), self._size)
+            if kept and before is not None:
+                self._grid = replace(self._laid(), thresholds=before.thresholds)
+            self._learn(x, rows)
+        x, self._grid = self._polish(x, rows)
+        self._learn(x, rows)
+        found = self._solved(x, self._chosen(FINAL_ROWS))
+        known = physical(stages_in(x), self._data)
+        return FieldEnd(known, self._laid(), found, self._curve, self._widest)
+
+
+def _at_bound(stages: Stages) -> bool:
+    """Return whether the structure has become about as soft as it may."""
+    return stages.radian > NEAR_BOUND * HIGH.radian
+
+
+def _error(tried: tuple[float, Stages]) -> float:
+    return tried[0]
+
+
+def _lengths(count: int) -> tuple[float, ...]:
+    if count <= 1:
+        return (0.15,)[:count]
+    first, last = np.log(LENGTHS[0]), np.log(LENGTHS[-1])
+    return tuple(np.exp(np.linspace(first, last, count)).tolist())

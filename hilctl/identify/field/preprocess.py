@@ -1,0 +1,200 @@
+"""Records as the fit needs them: thinned in time, the displacement ready to lose its structure."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Generic, TypeVar
+
+import numpy as np
+from scipy.ndimage import uniform_filter1d
+
+from hilctl.base.types import F64, I64
+from hilctl.identify.data.records import History
+from hilctl.identify.field.design_matrix import bare_displacement, corners
+from hilctl.identify.field.sampling import Motion
+from hilctl.identify.parallel import parallel_map
+from hilctl.models.cascade import smoothing_weights
+
+WIDER = 4.0  # of the first width: the second
+MEDIAN_SQUARE = 0.4549  # of numbers whose mean square is 1, with Gauss's distribution
+LEAST = 0.01  # part of the noise that a smoothing has to take away to say how much there is
+
+
+def smoothed(displacement_um: F64, width: float, rate_hz: float) -> F64:
+    """Return the displacement and its first two derivatives by time: float64[3, n].
+
+    A window that is narrow enough for the fastest loop leaves most of the sensor noise. In small
+    and slow loops noise reverses the path where the actuator did not, which would bend a model.
+    Of what a wider smoothing takes away more, that part is kept by which it is more than noise (J.
+    S. Lee, IEEE Trans. Pattern Anal. Mach. Intell. 2 (1980) 165). How much noise would be is known
+    from what the first smoothing takes away.
+
+    Args:
+        displacement_um: float64[n].
+        width: Of the first smoothing, in samples.
+        rate_hz: Samples a second.
+    """
+    plain, wide = smoothing_weights(width)[0], smoothing_weights(WIDER * width)[0]
+    found = _derivatives(displacement_um, width, rate_hz)
+    own = 1.0 - 2.0 * plain[plain.size // 2] + float(np.sum(plain**2))
+    if own < LEAST or wide.size > displacement_um.size:
+        return np.ascontiguousarray(found)
+    noise = float(np.median((displacement_um - found[0]) ** 2)) / (MEDIAN_SQUARE * own)
+    calm = _derivatives(displacement_um, WIDER * width, rate_hz)
+    apart = wide.copy()
+    apart[(wide.size - plain.size) // 2 :][: plain.size] -= plain
+    off = uniform_filter1d((found[0] - calm[0]) ** 2, 2 * wide.size, mode="nearest")
+    kept = 1.0 - noise * float(np.sum(apart**2)) / np.maximum(off, np.finfo(np.float64).tiny)
+    return np.ascontiguousarray(calm + np.maximum(kept, 0.0) * (found - calm))
+
+
+def _derivatives(y: F64, width: float, rate_hz: float) -> F64:
+    plain = smoothing_weights(width)[0]
+    by_slope = smoothing_weights(width, slope_gain=rate_hz)[0] - plain
+    by_bend = smoothing_weights(width, bend_gain=rate_hz**2)[0] - plain
+    return np.stack([_convolved(y, weights) for weights in (plain, by_slope, by_bend)])
+
+
+def _convolved(y: F64, weights: F64) -> F64:
+    """Return y under odd weights of which the middle one is its own, its ends going on as are."""
+    padded = np.pad(y, weights.size // 2, mode="edge")
+    return np.convolve(padded, weights[::-1], "valid")
+
+
+POINTS = 90  # samples that are left of the fastest cycle
+SMOOTHED = 0.09  # of a radian of the fastest cycle: how far the displacement is smoothed at least
+OFF = 5e-4  # of the displacement's peak-to-peak: how far straight lines may be from it
+COMMAND_OFF = 1e-4  # the same for commands, on which the operators turn
+LONGEST = 0.3  # cycles of the fastest: longest step
+
+
+_Found = TypeVar("_Found")
+
+
+class Latest(Generic[_Found]):
+    """What was found last: a search changes one stage at a time, and most depends on few."""
+
+    def __init__(self) -> None:
+        self._known: tuple[object, _Found] | None = None
+
+    def of(self, key: object, work: Callable[[], _Found]) -> _Found:
+        """Return what ``work`` gives for a key; the same again where the key is the same.
+
+        Args:
+            key: All that the result depends on; compared by ``==``.
+            work: Works it out.
+        """
+        known = self._known
+        if known is None or known[0] != key:
+            self._known = known = key, work()
+        return known[1]
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """One record; what its methods return is not to be changed, as it may be returned again.
+
+    Attributes:
+        rate_hz: Of the record.
+        kept: int64[n], the samples that are left.
+        step_s: float64[n], time since the one before.
+        command: float64[n], at the end of each step.
+        mean: float64[n], the command's mean over each step.
+        derivatives: float64[3, N], displacement of all samples in um and its derivatives by time.
+        motion: How it moves, at the samples that are left.
+    """
+
+    rate_hz: float
+    kept: I64
+    step_s: F64
+    command: F64
+    mean: F64
+    derivatives: F64
+    motion: Motion
+    _late: Latest[tuple[F64, F64]] = field(default_factory=Latest, init=False, repr=False)
+    _bare: Latest[F64] = field(default_factory=Latest, init=False, repr=False)
+
+    @property
+    def time_s(self) -> F64:
+        """Time of each sample that is left."""
+        return self.kept / self.rate_hz
+
+    def late_command(self, lag_s: float) -> tuple[F64, F64]:
+        """Return when in each step to take its command, and the command there: float64[n] each.
+
+        A lag's steps are exact for commands that go straight if their ends are weighed as its
+        answer to a constant asks: the middle of a short step, the end of one that it has settled
+        in. Steps are of all lengths, so no one rule does.
+
+        Args:
+            lag_s: Time constant, > 0.
+        """
+        return self._late.of(lag_s, lambda: self._late_command(lag_s))
+
+    def _late_command(self, lag_s: float) -> tuple[F64, F64]:
+        lags = np.maximum(self.step_s / lag_s, 1e-3)
+        late = -1.0 / np.expm1(-lags) - 1.0 / lags
+        return late, self.mean + (2.0 * late - 1.0) * (self.command - self.mean)
+
+    def bare_um(self, delay_s: float, slope_s: float, bend_s2: float) -> F64:
+        """Return the displacement before delay and structure: float64[n]."""
+        key = delay_s, slope_s, bend_s2
+        return self._bare.of(key, lambda: self._bare_um(*key))
+
+    def _bare_um(self, delay_s: float, slope_s: float, bend_s2: float) -> F64:
+        out = np.empty(self.kept.size)
+        late = delay_s * self.rate_hz
+        bare_displacement(self.derivatives, self.kept, late, slope_s, bend_s2, out)
+        return out
+
+
+class Prepared:
+    """All records.
+
+    Args:
+        records: The records.
+        points: Samples that are left of the fastest cycle.
+        command_off: Of the peak-to-peak command: how far straight lines may be from it.
+
+    Attributes:
+        runs: The records.
+        reach: Half the largest peak-to-peak command.
+        stroke_um: Largest peak-to-peak displacement.
+        top_hz: Frequency of a sine that is as fast as the fastest record.
+    """
+
+    def __init__(
+        self, records: Sequence[History], points: int = POINTS, command_off: float = COMMAND_OFF
+    ) -> None:
+        """Smooth and thin records."""
+        self._points, self._command_off = points, command_off
+        self.reach = max(0.5 * float(np.ptp(record.command)) for record in records)
+        self.stroke_um = max(float(np.ptp(record.displacement_um)) for record in records)
+        self.top_hz = max(_speed(record) for record in records) / (2.0 * math.pi * self.reach)
+        self.runs: Sequence[Run] = parallel_map(self._run, records)
+
+    def _run(self, record: History) -> Run:
+        rate_hz, command = record.sample_rate_hz, record.command
+        width = min(SMOOTHED / (2.0 * math.pi * self.top_hz), 1.0) * rate_hz
+        derivatives = smoothed(record.displacement_um, width, rate_hz)
+        thin = max(1, math.floor(rate_hz / (self._points * self.top_hz)))
+        furthest = max(thin, math.floor(LONGEST * rate_hz / self.top_hz))
+        kept = np.empty(command.size, dtype=np.int64)
+        off = 2.0 * self._command_off * self.reach, OFF * self.stroke_um
+        count = corners(np.ascontiguousarray(command), derivatives[0], *off, thin, furthest, kept)
+        kept = kept[:count].copy()
+        steps = np.diff(kept, prepend=kept[0])
+        at_end = 0.5 * (command[kept] + command[np.maximum(kept - 1, 0)])
+        held = np.cumsum(np.concatenate(([command[0]], command)))
+        mean = np.full(kept.size, command[0])
+        mean[1:] = np.diff(held[kept]) / np.diff(kept)
+        step_s, both = steps / rate_hz, (at_end, derivatives[0, kept])
+        judged = int(np.searchsorted(kept, record.ignore))
+        motion = Motion.of(both, step_s, judged, self.reach, self.stroke_um)
+        return Run(rate_hz, kept, step_s, at_end, mean, derivatives, motion)
+
+
+def _speed(record: History) -> float:
+    """Return the largest rate of a command; noise on a measured one is told from it."""
+    _, rate, _ = record.run()
+    return float(np.quantile(np.abs(rate), 0.999))

@@ -1,0 +1,94 @@
+"""An identified model as one self-contained page: model against data."""
+
+import html
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.figure import Figure
+
+from hilctl.analysis.html import document, grid, wide_figure, write_page
+from hilctl.analysis.plot_style import DISPLACEMENT, ERROR, REFERENCE, STYLE
+from hilctl.base.types import F64
+from hilctl.identify.command import Identification
+from hilctl.identify.data.records import Record, SteadyLoop
+from hilctl.identify.evaluation import Evaluation
+from hilctl.identify.summary import HEADINGS, error_rows, parameter_texts, summary
+from hilctl.models.model_file import dump_model
+
+COLUMNS = 3
+MOST_RECORDS = 36
+MOST_DRAWN = 20_000  # samples of a history: more have no place on a page
+
+
+def write_identification(found: Identification, path: Path) -> None:
+    """Write the page; one of that name is replaced.
+
+    Raises:
+        InputError: It can't be written.
+    """
+    write_page(identification_page(found), path)
+
+
+def identification_page(found: Identification) -> str:
+    """Return the page as HTML."""
+    fit = found.fit
+    unit = fit.model.input_unit
+    title = f"Identified from {', '.join(fit.model.provenance.source)}"
+    body = [
+        f"<h1>{html.escape(title)}</h1>",
+        f"<p>{html.escape(fit.model.provenance.method)}</p>",
+        *(f"<p>{html.escape(line)}</p>" for line in summary(found)),
+    ]
+    if (held_out := found.held_out) is not None:
+        body += ["<h2>Errors on data not fitted</h2>"]
+        body += [grid(HEADINGS, error_rows(held_out.judgement.errors), "numbers")]
+        body += _drawn("Model and data not fitted", held_out.judgement, held_out.records, unit)
+    body += ["<h2>Errors on data fitted</h2>", grid(HEADINGS, error_rows(fit.errors), "numbers")]
+    body += _drawn("Model and data", fit, found.data, unit)
+    body += ["<h2>Parameters</h2>", grid(("name", "value"), parameter_texts(fit), "numbers")]
+    body += [f"<details><summary>Model</summary><pre>{html.escape(dump_model(fit.model))}</pre>"]
+    return document(html.escape(title), [*body, "</details>"])
+
+
+def _drawn(heading: str, judged: Evaluation, data: Sequence[Record], unit: str) -> list[str]:
+    shown = data[:MOST_RECORDS]
+    left_out = [f"<p>The first {len(shown)} of {len(data)}.</p>"] if len(shown) < len(data) else []
+    figure = loops_figure(judged.modelled_um, shown, unit)
+    return [f"<h2>{heading}</h2>", *left_out, wide_figure(heading, figure)]
+
+
+@mpl.rc_context(STYLE)
+def loops_figure(modelled_um: Sequence[F64], data: Sequence[Record], unit: str) -> Figure:
+    """Draw displacement against command, measured and modelled, and the error below each.
+
+    Args:
+        modelled_um: The model's displacement of each record's judged samples.
+        data: Loops and histories.
+        unit: Unit of the command.
+    """
+    columns = min(COLUMNS, len(data))
+    rows = -(-len(data) // columns)
+    figure = Figure(figsize=(3.6 * columns, 3.8 * rows))
+    axes = figure.subplots(2 * rows, columns, squeeze=False, height_ratios=[3.0, 1.0] * rows)
+    for each in axes.flat[:]:
+        each.set_visible(False)
+    for i, (record, modelled) in enumerate(zip(data, modelled_um, strict=False)):
+        row, column = divmod(i, columns)
+        upper, lower = axes[2 * row, column], axes[2 * row + 1, column]
+        command, measured = (
+            signal[-modelled.size :] for signal in (record.command, record.displacement_um)
+        )
+        steady = isinstance(record, SteadyLoop)
+        step = 1 + command.size // MOST_DRAWN
+        x = (command if steady else np.arange(command.size))[::step]
+        upper.plot(x, measured[::step], color=REFERENCE, label="measured", linewidth=1.6)
+        upper.plot(x, modelled[::step], color=DISPLACEMENT, label="model", linewidth=0.9)
+        lower.plot(x, (modelled - measured)[::step], color=ERROR)
+        upper.set(title=record.label, ylabel="µm")
+        lower.set(xlabel=f"command, {unit}" if steady else "sample", ylabel="error, µm")
+        upper.set_visible(True)
+        lower.set_visible(True)
+    axes[0, 0].legend(loc="upper left")
+    return figure

@@ -1,0 +1,153 @@
+"""Independent fits at the same time: here, over threads or processes, or on a Dask cluster."""
+
+import os
+import threading
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
+from contextlib import contextmanager
+from functools import cache
+from multiprocessing import get_context
+from typing import Any, Protocol, TypeVar
+
+from hilctl.base.errors import InputError
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+SCHEDULERS = ("none", "threads", "processes")
+
+
+class MapFunction(Protocol):
+    """Runs a function on each task and returns the results in the tasks' order."""
+
+    def __call__(
+        self, function: Callable[[Task], Result], tasks: Sequence[Task], /
+    ) -> list[Result]:
+        """Return ``[function(task) for task in tasks]``; the first error is raised."""
+        ...
+
+
+class StreamFunction(Protocol):
+    """Runs a function on each task and yields the results in the tasks' order, as they come."""
+
+    def __call__(
+        self, function: Callable[[Task], Result], tasks: Sequence[Task], /
+    ) -> Iterator[Result]:
+        """Yield ``function(task) for task in tasks``; the first error is raised."""
+        ...
+
+
+def serial_map(function: Callable[[Task], Result], tasks: Sequence[Task], /) -> list[Result]:
+    """Run tasks one after the other."""
+    return [function(task) for task in tasks]
+
+
+def parallel_map(function: Callable[[Task], Result], tasks: Iterable[Task], /) -> list[Result]:
+    """Return ``[function(task) for task in tasks]``, worked out on all cores; the order is kept.
+
+    For the short parts of one fit, most of whose time goes to kernels that leave the interpreter to
+    others (``nogil``) and to BLAS; a part must not come here itself.
+    """
+    if _worker.unwanted.is_set():
+        raise _UnwantedError
+    return list(_threads().map(function, tasks))
+
+
+class _UnwantedError(Exception):
+    """Ends a fit whose result nobody waits for any more."""
+
+
+class _Worker(threading.local):
+    """Whether what a thread of :func:`streams` works out is still wanted."""
+
+    def __init__(self) -> None:
+        self.unwanted = threading.Event()
+
+
+_worker = _Worker()
+
+
+@cache
+def _threads() -> ThreadPoolExecutor:
+    usable = (
+        os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1)
+    )
+    return ThreadPoolExecutor(len(usable), "hilctl-fit")
+
+
+@contextmanager
+def workers(scheduler: str = "none") -> Iterator[MapFunction]:
+    """Give a :class:`MapFunction`; see :func:`streams`."""
+    if scheduler == "none":
+        yield serial_map
+        return
+    with streams(scheduler) as stream:
+
+        def run(function: Callable[[Any], Any], tasks: Sequence[Any], /) -> list[Any]:
+            return list(stream(function, tasks))
+
+        yield run
+
+
+@contextmanager
+def streams(scheduler: str = "none") -> Iterator[StreamFunction]:
+    """Give a :class:`StreamFunction`; results do not depend on which.
+
+    Args:
+        scheduler: ``none`` for one after the other, ``threads`` or ``processes`` on this machine,
+            or the address of a Dask scheduler, such as ``tcp://host:8786``. Its workers need the
+            same hilctl.
+
+    Raises:
+        InputError: The scheduler is unknown, can't be reached, or Dask is not installed.
+    """
+    if scheduler == "none":
+        yield map
+    elif scheduler in SCHEDULERS:
+        with _local(scheduler) as executor:
+            yield executor.map
+    elif "://" in scheduler:
+        with _dask(scheduler) as distributed:
+            yield distributed
+    else:
+        known = ", ".join(SCHEDULERS)
+        raise InputError(f"scheduler must be {known} or an address such as tcp://host:8786: "
+                         f"{scheduler!r}")  # fmt: skip
+
+
+@contextmanager
+def _local(scheduler: str) -> Iterator[Executor]:
+    if scheduler == "processes":  # spawned: a fork would copy BLAS's threads
+        with ProcessPoolExecutor(mp_context=get_context("spawn")) as processes:
+            yield processes
+        return
+    unwanted = threading.Event()
+
+    def begin() -> None:
+        _worker.unwanted = unwanted
+
+    with ThreadPoolExecutor(initializer=begin) as threads:
+        try:
+            yield threads
+        except BaseException:
+            unwanted.set()  # a Ctrl-C is not to wait seconds for fits to end
+            raise
+
+
+@contextmanager
+def _dask(address: str) -> Iterator[StreamFunction]:
+    try:
+        from distributed import Client
+    except ImportError:
+        raise InputError(
+            f"--scheduler {address} needs Dask: install it with pip install 'hilctl[scale]'"
+        ) from None
+    try:
+        client = Client(address, timeout="10s")
+    except (OSError, ValueError) as error:
+        raise InputError(f"no Dask scheduler answers at {address}: {error}") from None
+    with client:
+
+        def run(function: Callable[[Any], Any], tasks: Sequence[Any], /) -> Iterator[Any]:
+            return (each.result() for each in client.map(function, list(tasks), pure=False))
+
+        yield run

@@ -1,0 +1,233 @@
+"""Refine from files: a model and recordings in, a better model out, or why there is none."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hilctl.base.errors import DataError, InputError
+from hilctl.base.files import check_writable, write_text
+from hilctl.base.samples import Flag
+from hilctl.identify.data.data_files import history_from_recording
+from hilctl.identify.data.records import History
+from hilctl.identify.fit_api import OnProgress, ignore_progress
+from hilctl.identify.fit_data import FitData
+from hilctl.identify.fit_model import VERSIONS, error_table
+from hilctl.identify.identified_range import identified_range
+from hilctl.identify.model_quality import data_reasons
+from hilctl.identify.refine.regularisation import (
+    WORTH,
+    Regularisation,
+    SelectedRegularisation,
+    parts_of,
+)
+from hilctl.models.base import HysteresisModel, IdentifiedRange, Provenance
+from hilctl.models.model_file import dump_model, load_model
+from hilctl.models.refined import RefinedModel
+from hilctl.recording.reader import read
+from hilctl.recording.recording import Recording
+
+STILL_S = 1.0  # between a run and the one that began where it ended
+
+
+def load_runs(paths: Sequence[Path], model: HysteresisModel) -> list[History]:
+    """Read runs, with a compensator or without one, each from rest.
+
+    What moves the actuator is the command that was put out, so it makes no difference which model
+    the run had, or what it had learned. A run that began where another one had left the actuator
+    has that one's samples before its own, not judged.
+
+    Args:
+        paths: Recordings.
+        model: The model; its command has the unit of theirs.
+
+    Raises:
+        InputError: A file is named twice, or there is none.
+        DataError: A recording can't be read or followed from rest, or is of another unit.
+    """
+    if not paths:
+        raise InputError("nothing to refine a model from: name recordings")
+    twice = {path for path in paths if list(paths).count(path) > 1}
+    if twice:
+        raise InputError(f"named twice: {', '.join(map(str, sorted(twice)))}")
+    recordings = [read(path) for path in paths]
+    for recording in recordings:
+        if recording.command_unit != model.input_unit:
+            raise DataError(
+                f"{recording.path}: was recorded in {recording.command_unit}, the model takes "
+                f"{model.input_unit}"
+            )
+    known = {recording.run.get("run_id", ""): recording for recording in recordings}
+    return [_history(recording, known) for recording in recordings]
+
+
+def _history(recording: Recording, known: Mapping[str, Recording]) -> History:
+    history = history_from_recording(recording)
+    before = recording.run.get("initial_state_run_id", "")
+    conditioned = (recording.samples.flags & Flag.CONDITION.value).any()
+    if not before or conditioned:
+        return history
+    if before not in known:
+        raise DataError(
+            f"{recording.path}: began {recording.run.get('initial_state', 'where a run ended')}: "
+            "give that recording too, so that it can be followed from rest"
+        )
+    first = known[before].samples
+    last = float(first.command[-1])
+    still = round(STILL_S * recording.sample_rate_hz)
+    command = np.concatenate((first.command, np.full(still, last), history.command))
+    ahead = np.zeros(command.size - history.command.size)  # not judged, and need not be known
+    return History(
+        history.label,
+        command,
+        np.concatenate((ahead, history.displacement_um)),
+        history.sample_rate_hz,
+        ahead.size + history.ignore,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Refinement:
+    """A refined model, and what it is worth.
+
+    Attributes:
+        model: The refined model; to be used where it is better.
+        choice: How it was refined, with the errors before and after on what was held out.
+        reasons: Why it is no better than the old model; empty where it is.
+    """
+
+    model: RefinedModel
+    choice: SelectedRegularisation
+    reasons: tuple[str, ...]
+
+    @property
+    def better(self) -> bool:
+        """Whether it is better than the old model on what was held out, and on no run worse."""
+        return not self.reasons
+
+    def __str__(self) -> str:
+        was, now = self.choice.before.judgement, self.choice.after.judgement
+        what = f"{now.own_peak_percent:.2f} % at most where it was {was.own_peak_percent:.2f} %"
+        if self.better:
+            return f"better: {self.choice.ratio:.2f} times the old error on runs not fitted; {what}"
+        return f"no better than the old model, because {'; '.join(self.reasons)}"
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return all figures as plain mappings, lists and numbers, for JSON."""
+        return {
+            "better": self.better,
+            "text": str(self),
+            "reasons": list(self.reasons),
+            "ratio": self.choice.ratio,
+            "strength": self.choice.strength,
+            "anchor": self.choice.anchor,
+            "own_drift": self.choice.own,
+            "before": self.choice.before.to_mapping(),
+            "after": self.choice.after.to_mapping(),
+        }
+
+
+def refine_files(
+    model: Path,
+    paths: Sequence[Path],
+    output: Path | None,
+    validate: Sequence[Path] = (),
+    *,
+    overwrite: bool = False,
+    progress: OnProgress = ignore_progress,
+) -> Refinement:
+    """Refine a model from recordings, and write it where it is better than it was.
+
+    Args:
+        model: Model file.
+        paths: Recordings of runs, compensated by this model, another or none, learned or not.
+        output: Model file to write; None for none.
+        validate: Recordings to judge by; where there are none, those of ``paths`` in turn.
+        overwrite: Whether a model file of that name may be replaced.
+        progress: Called with what is being done.
+
+    Raises:
+        InputError: A file can't be used; nothing is written.
+    """
+    if output is not None:
+        check_writable(output, overwrite=overwrite, inputs=[model, *paths, *validate])
+    old = load_model(model)
+    progress(0.0, "reading")
+    both = load_runs([*paths, *validate], old)
+    found = refine_runs(old, both[: len(paths)], both[len(paths) :], model.name, progress)
+    if output is not None and found.better:
+        write_text(output, dump_model(found.model), overwrite=overwrite)
+    return found
+
+
+def refine_runs(
+    old: HysteresisModel,
+    runs: Sequence[History],
+    validate: Sequence[History] = (),
+    source: str = "",
+    progress: OnProgress = ignore_progress,
+) -> Refinement:
+    """Refine a model from runs, and judge it on runs that it was not refined on.
+
+    Args:
+        old: The model.
+        runs: What it is refined on.
+        validate: What it is judged on; ``runs`` in turn where there is none.
+        source: Name of the model, for the provenance.
+        progress: Called with what is being done.
+
+    Raises:
+        InputError: These are no runs of an actuator, or too few, or nothing found has an inverse.
+    """
+    if reasons := tuple(data_reasons([*runs, *validate])):
+        raise InputError("\n".join(reasons))
+    parts, splits = parts_of(runs, validate)
+    choice, refined = Regularisation(old, parts, splits, old.input_unit).best(progress)
+    progress(1.0, "done")
+    named = refined.model_copy(update={"provenance": _provenance(old, runs, choice, source)})
+    return Refinement(named, choice, tuple(_reasons(choice)))
+
+
+def _reasons(choice: SelectedRegularisation) -> list[str]:
+    if choice.better:
+        return []
+    if choice.ratio <= WORTH:
+        return [f"'{label}', which was not fitted, would become worse" for label in choice.worse]
+    return [
+        f"runs that were not fitted would have {choice.ratio:.2f} times the old error: what is "
+        "left of it is noise, or drifts, or is beyond what such a model can say"
+    ]
+
+
+def _provenance(
+    old: HysteresisModel, runs: Sequence[History], choice: SelectedRegularisation, source: str
+) -> Provenance:
+    was = old.provenance
+    data = FitData(runs, old.input_unit)
+    figures = {f"held_out_{k}": v for k, v in error_table(choice.after.judgement).items()}
+    labels = tuple(run.label for run in runs)
+    return was.model_copy(
+        update={
+            "source": (*was.source, *([source] if source else []), *labels),
+            "method": f"{was.method}; refined on {len(runs)} runs, strength {choice.strength:g}",
+            "errors_percent": figures,
+            "identified_range": _wider(was.identified_range, identified_range(data)),
+            "versions": VERSIONS,
+            "created": datetime.now(UTC).isoformat(timespec="seconds"),
+        }
+    )
+
+
+def _wider(old: IdentifiedRange | None, new: IdentifiedRange) -> IdentifiedRange:
+    """Return a range that has both: where runs say nothing, the old model still holds."""
+    if old is None:
+        return new
+    moves, turns = (old.peak_to_peak_um, new.peak_to_peak_um), (old.frequency_hz, new.frequency_hz)
+    return IdentifiedRange(
+        peak_to_peak_um=(min(a for a, _ in moves), max(b for _, b in moves)),
+        frequency_hz=(min(a for a, _ in turns), max(b for _, b in turns)),
+        speed_um_per_s=max(old.speed_um_per_s, new.speed_um_per_s),
+    )

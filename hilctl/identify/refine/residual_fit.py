@@ -1,0 +1,262 @@
+"""What a model leaves of the displacement, as one linear problem in the numbers of an operator."""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilctl.base.types import F64, I64
+from hilctl.identify.data.records import History
+from hilctl.identify.refine.delay import delayed_model, fastest_um_per_s
+from hilctl.kernels.residual_operator import residual_columns
+from hilctl.models.base import HysteresisModel
+from hilctl.models.refined import LEAST_SLOPE, RefinedModel, ResidualOperator, rest_um
+
+PLAYS, DRAGS, CELLS = 8, 5, 12
+LENGTHS = (0.03, 0.6)  # of the span: shortest and longest drag
+SPREAD = 1.6  # exponent: thresholds are closer together near 0
+WINDOW = 0.05  # of a cycle of the fastest sine: over which a change is its rate
+ROWS = 6000  # samples of a run that are looked at
+SEED = 1
+DRAGGED, FREE, SMOOTH, BENT = 0.3, 0.1, 3.0, 1.0
+"""How firm: drags, the constant, differences of plays and of drags beside each other."""
+SMALL = 0.05  # of the span, by which errors of runs that move little are no heavier than that
+ANCHOR = 0.005  # weight of each run's worth of the old model on motions of its whole range
+CREEP_S = 0.1
+GOLDEN = 1.618  # ratio of frequencies that never meet again
+ROOM = 1.1  # times the least slope that a model may have
+OWN = 1e-4  # ridge of what a run may have of its own, of its weight
+
+
+@dataclass(frozen=True, slots=True)
+class NormalEquations:
+    """Sums that a least-squares problem is made of.
+
+    Attributes:
+        normal: float64[m, m], of products of columns.
+        right: float64[m], of columns and the target.
+    """
+
+    normal: F64
+    right: F64
+
+    def __add__(self, other: "NormalEquations") -> "NormalEquations":
+        return NormalEquations(self.normal + other.normal, self.right + other.right)
+
+    def scaled(self, factor: float) -> "NormalEquations":
+        """Return them with as many times their weight."""
+        return NormalEquations(factor * self.normal, factor * self.right)
+
+    def __sub__(self, other: "NormalEquations") -> "NormalEquations":
+        return NormalEquations(self.normal - other.normal, self.right - other.right)
+
+
+class ResidualFit:
+    """The remainders of all runs, and the operator that is to give them.
+
+    Attributes:
+        base: What stays as it is: the model, or that which has been refined before.
+        x_um: For each run, float64[n], what the base gives, less that at rest.
+    """
+
+    def __init__(
+        self, model: HysteresisModel, runs: Sequence[History], fitted: Sequence[History]
+    ) -> None:
+        """Run the base on what was put out, and lay the operator's cells over what comes of it.
+
+        Args:
+            model: The old model.
+            runs: All that is fitted or judged.
+            fitted: Those of them that a delay is taken from.
+        """
+        self._old = model
+        bare: HysteresisModel = model.base if isinstance(model, RefinedModel) else model
+        self.base = delayed_model(bare, fitted)
+        self._runs = tuple(runs)
+        self._rest_um = rest_um(self.base)
+        self.x_um = tuple(self._base_um(self.base, run) for run in self._runs)
+        low, high = model.output_range_um or (np.inf, -np.inf)
+        low = min(low - self._rest_um, *(float(x.min()) for x in self.x_um), 0.0)
+        high = max(high - self._rest_um, *(float(x.max()) for x in self.x_um), 0.0)
+        self._low, self._span = low, high - low
+        self.fastest_um_per_s = fastest_um_per_s(self.x_um, self._runs)
+        if isinstance(model, RefinedModel):  # what is held to at its speeds must be known there
+            self.fastest_um_per_s = max(self.fastest_um_per_s, model.residual.fastest_um_per_s)
+        self._window_s = WINDOW * math.pi * self._span / self.fastest_um_per_s
+        self._grid = self._operator(np.zeros(self.size - 1))
+
+    @property
+    def size(self) -> int:
+        """Numbers that are looked for; the last is a constant displacement."""
+        return PLAYS * CELLS + (2 * DRAGS + 1) * (CELLS + 1) + 1
+
+    def moments(self, *, own: bool) -> list[NormalEquations]:
+        """Return the sums of each run.
+
+        Args:
+            own: Whether each run may have a constant, creep and drift of its own; they are taken
+                out, so that they are not learned as hysteresis.
+        """
+        return [self._of(x, run, own=own) for x, run in zip(self.x_um, self._runs, strict=True)]
+
+    def anchor(self) -> NormalEquations:
+        """Return the sums by which the old model is held to where runs say nothing.
+
+        Small motions must not spoil large ones: on motions of the model's whole range, slow and
+        fast, it is to stay what it was, but for what runs say with more weight.
+        """
+        total = NormalEquations(np.zeros((self.size, self.size)), np.zeros(self.size))
+        rate_hz = 1.0 / self._window_s  # one window is one sample here: rates are those of runs
+        for x in self._motions():
+            rows = np.unique(np.linspace(0, x.size - 1, ROWS).astype(np.int64))
+            columns, was = self._columns(x, rows, rate_hz), self._was(x, rate_hz)[rows]
+            total += _sums(columns, was, self._weight(x, rows))
+        return total.scaled(ANCHOR * len(self._runs))
+
+    def _motions(self) -> Iterator[F64]:
+        """Give motions of the whole range: growing sines, slow and fast, and small in large."""
+        half, middle = 0.5 * self._span, self._low + 0.5 * self._span
+        for speed in (0.05, 0.9):
+            points = round(2.0 * math.pi * half / (speed * self.fastest_um_per_s * self._window_s))
+            turns = np.arange(6 * points) / points
+            path = np.minimum(turns / 4.0, 1.0) * half * np.sin(2.0 * np.pi * turns)
+            yield np.minimum(turns, 1.0) * middle + path
+        turns = np.arange(ROWS) / 400.0
+        sines = [np.sin(2.0 * np.pi * turns * golden) for golden in GOLDEN ** np.arange(5.0)]
+        mixed = np.sum(sines, axis=0)
+        yield np.minimum(turns, 1.0) * (middle + half * mixed / np.max(np.abs(mixed)))
+
+    def firm(self, strength: float, moments: NormalEquations) -> F64:
+        """Return what holds all numbers small and neighbours alike: float64[m, m]."""
+        plays = PLAYS * CELLS
+        longest = math.sqrt(float(moments.normal.diagonal()[:plays].max()))
+        # A slope of 1 over all cells is as much as a span of displacement.
+        weights = np.full(self.size, 1.0 / self._span)
+        weights[:plays] = 1.0
+        weights[plays : plays + DRAGS * (CELLS + 1)] *= DRAGGED
+        weights[-1] *= FREE
+        firm = np.diag((strength * longest * weights) ** 2)
+        alike = SMOOTH * strength * longest * _alike()
+        firm[:plays, :plays] += alike.T @ alike
+        bent = np.diff(np.eye(CELLS + 1), axis=0) * BENT * strength * longest / self._span
+        for first in range(plays, self.size - 1, CELLS + 1):
+            line = slice(first, first + CELLS + 1)
+            firm[line, line] += bent.T @ bent
+        return firm
+
+    def model(self, numbers: F64) -> RefinedModel:
+        """Return the model with these numbers, all of them less where it would have no inverse."""
+        ranges = {name: getattr(self._old, name) for name in _RANGES}
+        ranges |= {"provenance": self._old.provenance}
+        base = self.base.model_copy(update=ranges)
+        steep = 1.0 - self._operator(numbers[:-1], checked=False).least_slope
+        part = min(1.0, (1.0 - ROOM * LEAST_SLOPE) / steep) if steep > 0.0 else 1.0
+        return RefinedModel.of(base, self._operator(part * numbers[:-1]), float(numbers[-1]))
+
+    def modelled_um(self, model: HysteresisModel, number: int) -> F64:
+        """Return the displacement of a run by the old model or one with other numbers."""
+        run, x = self._runs[number], self.x_um[number]
+        if not isinstance(model, RefinedModel):
+            return self._base_um(model, run) + rest_um(model)
+        if model is self._old:
+            return model.forward(run.sample_rate_hz).process(run.command)
+        return self._through(model, x, run.sample_rate_hz)
+
+    def _base_um(self, base: HysteresisModel, run: History) -> F64:
+        return base.forward(run.sample_rate_hz).process(run.command) - rest_um(base)
+
+    def _through(self, model: RefinedModel, x: F64, rate_hz: float) -> F64:
+        operator = model.residual.forward(rate_hz, self._rest_um)
+        return operator.process(x + self._rest_um) + model.output_offset_um
+
+    def _was(self, x: F64, rate_hz: float) -> F64:
+        """Return the remainder as the old model has it: float64[n]."""
+        if not isinstance(self._old, RefinedModel):
+            return np.zeros(x.size)
+        return self._through(self._old, x, rate_hz) - self._rest_um - x
+
+    def _of(self, x: F64, run: History, *, own: bool) -> NormalEquations:
+        rows = _rows(run)
+        missed = run.displacement_um - self._rest_um - x
+        wide = max(1, round(0.5 * self._window_s * run.sample_rate_hz))
+        target = np.convolve(np.pad(missed, wide // 2, mode="edge"), np.full(wide, 1.0 / wide),
+                             "same")[wide // 2 : wide // 2 + x.size][rows]  # fmt: skip
+        columns = self._columns(x, rows, run.sample_rate_hz)
+        weight = self._weight(x, rows)
+        if not own:
+            return _sums(columns, target, weight)
+        time_s = (rows - rows[0]) / run.sample_rate_hz
+        mine = np.column_stack(
+            [np.ones(rows.size), np.log1p(time_s / CREEP_S), time_s / time_s[-1]]
+        )
+        return _without(columns, target, weight, mine)
+
+    def _columns(self, x: F64, rows: I64, rate_hz: float) -> F64:
+        tables, window = self._grid.tables(rate_hz)
+        inner = np.zeros((rows.size, self.size - 1))
+        residual_columns(np.ascontiguousarray(x), rows, window, tables, inner)
+        return np.column_stack([inner, np.ones(rows.size)])
+
+    def _weight(self, x: F64, rows: I64) -> float:
+        moves = float(np.ptp(x[rows]))
+        return 1.0 / ((moves + SMALL * self._span) * math.sqrt(rows.size))
+
+    def _operator(self, numbers: F64, *, checked: bool = True) -> ResidualOperator:
+        plays = PLAYS * CELLS
+        lines = numbers[plays:].reshape(2 * DRAGS + 1, CELLS + 1).tolist()
+        lengths = self._span * np.geomspace(*LENGTHS, DRAGS)
+        make = ResidualOperator if checked else ResidualOperator.model_construct
+        return make(
+            lowest_um=self._low,
+            cell_um=self._span / CELLS,
+            thresholds_um=tuple((0.5 * self._span * (np.arange(PLAYS) / PLAYS) ** SPREAD).tolist()),
+            slopes=tuple(map(tuple, numbers[:plays].reshape(PLAYS, CELLS).tolist())),
+            lengths_um=tuple(lengths.tolist()),
+            drags_um=tuple(map(tuple, lines[:-1])),
+            rate_um=tuple(lines[-1]),
+            window_s=self._window_s,
+            fastest_um_per_s=self.fastest_um_per_s,
+        )
+
+
+def _sums(columns: F64, target: F64, weight: float) -> NormalEquations:
+    left = columns * weight
+    return NormalEquations(left.T @ left, left.T @ (target * weight))
+
+
+def _without(columns: F64, target: F64, weight: float, mine: F64) -> NormalEquations:
+    """Return the sums of what is left when a run has taken out what it may have of its own."""
+    whole = _sums(np.column_stack([columns, mine]), target, weight)
+    kept = columns.shape[1]
+    inner = whole.normal[kept:, kept:].copy()
+    inner[np.diag_indices_from(inner)] *= 1.0 + OWN
+    across = whole.normal[:kept, kept:]
+    taken = np.linalg.solve(inner, np.column_stack([across.T, whole.right[kept:]]))
+    return NormalEquations(
+        whole.normal[:kept, :kept] - across @ taken[:, :-1],
+        whole.right[:kept] - across @ taken[:, -1],
+    )
+
+
+def _rows(run: History) -> I64:
+    """Return samples that are looked at, one of each of many stretches: int64[N]."""
+    judged = run.command.size - run.ignore
+    edges = np.linspace(run.ignore, run.command.size, min(ROWS, judged) + 1).astype(np.int64)
+    return np.asarray(np.random.default_rng(SEED).integers(edges[:-1], edges[1:]), dtype=np.int64)
+
+
+def _alike() -> F64:
+    """Return what takes differences of the plays' slopes beside each other: float64[k, p c]."""
+    number = np.arange(PLAYS * CELLS).reshape(PLAYS, CELLS)
+    pairs = ((number[:, :-1], number[:, 1:], 1.0), (number[1:-1], number[2:], 0.5))
+    parts = []
+    for first, second, weight in pairs:
+        part = np.zeros((first.size, number.size))
+        rows = np.arange(first.size)
+        part[rows, first.ravel()], part[rows, second.ravel()] = -weight, weight
+        parts.append(part)
+    return np.vstack(parts)
+
+
+_RANGES = ("input_range", "output_range_um")

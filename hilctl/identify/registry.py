@@ -1,0 +1,132 @@
+"""Every kind of model that can be identified: its name, how, and what data that takes."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilctl.base.errors import InputError
+from hilctl.base.yaml import did_you_mean
+from hilctl.identify.evaluation import weight_roots
+from hilctl.identify.field.field_fits import fit_field
+from hilctl.identify.fit_api import FitJob, FoundModel
+from hilctl.identify.generalised_duhem.fits import fit_generalised_duhem
+from hilctl.identify.literature.asymmetric import fit_asymmetric
+from hilctl.identify.literature.generalised_pi import fit_generalised
+from hilctl.identify.literature.linear_weights import fit_kp, fit_preisach, fit_straight
+from hilctl.identify.literature.ode_models import fit_bouc_wen, fit_duhem
+from hilctl.identify.searched.butterfly import fit_butterfly
+from hilctl.identify.searched.integrated import ExponentialProblem
+from hilctl.identify.searched.plays import PlaysProblem
+from hilctl.identify.searched.search import SearchProblem, refine_peak, search
+from hilctl.identify.settings import FitKind
+from hilctl.identify.staged.staged_fits import fit_free, fit_staged
+
+
+def fit_plays(job: FitJob) -> FoundModel:
+    """Fit a PPI or an RDPI; its weights follow from its thresholds."""
+    return _searched(PlaysProblem(job.data, job.settings), job)
+
+
+def fit_exponential(job: FitJob) -> FoundModel:
+    """Fit the integrated model with exponential weights."""
+    return _searched(ExponentialProblem(job.data, job.settings), job)
+
+
+def _searched(problem: SearchProblem, job: FitJob) -> FoundModel:
+    data, settings = job.data, job.settings
+    rng = np.random.default_rng(settings.seed)
+    roots = weight_roots(data.records, settings.weight_by)
+    scale = np.append(roots, np.ones(problem.held))
+    found = search(problem, scale, data.stroke_um, settings.starts, rng, job.progress)
+    if settings.peak_goal_percent is not None:
+        goal_um = settings.peak_goal_percent / 100.0 * data.stroke_um
+        found = refine_peak(problem, found, goal_um, job.progress)
+    known = problem.parameters(found.x, found.scale)
+    numbers = len(known.keys() - {"g_0"})  # which is 1 by definition
+    at_bound = problem.space.at_bound(found.x)
+    held = tuple(name for name, bound in zip(problem.searched, at_bound, strict=True) if bound)
+    model = problem.build(found.x, found.scale)
+    return FoundModel(model, numbers, known, found.starts, at_bound=held)
+
+
+ANY = "steady loops, or whole histories"
+HISTORIES = "whole histories"
+LOOPS = "steady loops"
+STAGES = "steady loops at one sample rate; whole histories without lag, structure and delay"
+
+
+@dataclass(frozen=True, slots=True)
+class CatalogueEntry:
+    """A kind of model.
+
+    Attributes:
+        title: What it is, for people.
+        found_by: How it is identified, for people.
+        data: What that takes, for people.
+        fit: Identifies it.
+    """
+
+    title: str
+    found_by: str
+    data: str
+    fit: Callable[[FitJob], FoundModel]
+
+
+def _fit_integrated(job: FitJob) -> FoundModel:
+    return fit_free(job) if job.settings.weights == "free" else fit_exponential(job)
+
+
+_SEARCH = "least squares from several starts"
+_NNLS = "non-negative least squares, held smooth"
+_WEIGHTS_FOLLOW = "least squares on the shape, the weights follow"
+
+CATALOGUE: Mapping[FitKind, CatalogueEntry] = {
+    "integrated": CatalogueEntry(
+        "integrated, Omega: rate, asymmetry (6.18-6.24)", _SEARCH, ANY, _fit_integrated
+    ),
+    "staged": CatalogueEntry(
+        "Omega between field lag, structure and delay", "identified together", STAGES, fit_staged
+    ),
+    "rdpi": CatalogueEntry("rate-dependent PI: no deadbands (5.11, 5.14)", _SEARCH, ANY, fit_plays),
+    "asymmetric": CatalogueEntry(
+        "Omega with gamma = 0: no rate (1.14-1.16)", _WEIGHTS_FOLLOW, ANY, fit_asymmetric
+    ),
+    "ppi": CatalogueEntry("PI: no rate, no deadbands (3.25-3.27)", _SEARCH, ANY, fit_plays),
+    "spi": CatalogueEntry("PI, undone by stop operators (3.11-3.24)", _SEARCH, ANY, fit_plays),
+    "generalised": CatalogueEntry(
+        "generalised PI, tanh envelopes (1.17-1.20)", _WEIGHTS_FOLLOW, ANY, fit_generalised
+    ),
+    "preisach": CatalogueEntry("Preisach (1.1-1.2)", _NNLS, ANY, fit_preisach),
+    "kp": CatalogueEntry("Krasnosel'skii-Pokrovskii (1.3-1.5)", _NNLS, ANY, fit_kp),
+    "bouc_wen": CatalogueEntry("Bouc-Wen (1.21)", _WEIGHTS_FOLLOW, ANY, fit_bouc_wen),
+    "duhem": CatalogueEntry("Duhem, Coleman-Hodgdon (1.22)", _WEIGHTS_FOLLOW, ANY, fit_duhem),
+    "butterfly": CatalogueEntry(
+        "plays, then an even function: rods without bias", _WEIGHTS_FOLLOW, LOOPS, fit_butterfly
+    ),
+    "field": CatalogueEntry(
+        "plays and drags of an effective field, with its losses",
+        "densities by non-negative least squares, the stages searched",
+        HISTORIES,
+        fit_field,
+    ),
+    "generalised_duhem": CatalogueEntry(
+        "generalised Duhem: slopes by place and direction, with losses",
+        "slopes and stages together, held smooth",
+        HISTORIES,
+        fit_generalised_duhem,
+    ),
+    "straight": CatalogueEntry("straight line: no hysteresis", "least squares", ANY, fit_straight),
+}
+
+
+def entry(name: str) -> tuple[FitKind, CatalogueEntry]:
+    """Return a kind of model and what is known of it.
+
+    Raises:
+        InputError: There is none of that name.
+    """
+    for kind, known in CATALOGUE.items():
+        if kind == name:
+            return kind, known
+    raise InputError(f"unknown kind of model '{name}' ({did_you_mean(name, list(CATALOGUE))})")

@@ -1,0 +1,316 @@
+"""Further modes of the structure, from what a model with one mode leaves of the displacement.
+
+A linear part that was left out shows as a transfer function from what the model gives to what was
+measured, whatever the hysteresis before it. Cross-spectra of the records tell it from what is not
+linear; where a resonance with its antiresonance has its shape, both are taken off the records, and
+the model is fitted to the rest.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from hilctl.base.errors import ModelError
+from hilctl.base.types import C128, F64
+from hilctl.identify.data.records import History, Record
+from hilctl.models.mechanics import FurtherMode
+
+SEGMENT_S = 0.3  # long beside the time that what rings takes to die away, short beside a record
+FASTEST_HZ = 20e3  # sample rate: no structure of an actuator is looked for beyond a quarter of it
+FEWEST_SEGMENTS = 12
+FEWEST_BINS = 40
+AT_ONCE = 64  # segments, of which a long record has many
+LOWEST_BIN = 2  # those below have the trend of each segment in them
+WORTH = 0.9  # of a model's rms error: what better modes must bring it to
+ROUNDING = 1e-20  # of the power of a displacement: less than that is left by no model
+TRIES = 24, (0.01, 0.03, 0.1, 0.3)  # natural frequencies and damping ratios that are tried first
+FOLLOWED = 3  # of the best of them
+APART = 1.4  # from the first mode, either way: what is nearer is that mode, found not quite right
+DISTINCT = 1.15  # of two further modes' frequencies: nearer ones are one, cut in two
+LEAST_DAMPING, MOST_DAMPING = 2e-3, 0.3  # what is damped more does not ring
+NEAR = math.log(2.0)  # of antiresonance over resonance
+SMOOTH = 3  # numbers of what is smooth
+PAIR = 4
+MOST = 3
+
+
+@dataclass(frozen=True, slots=True)
+class _Spectra:
+    """From what is modelled to what was measured, by frequency.
+
+    Attributes:
+        frequency_hz: float64[k].
+        transfer: complex128[k], the part of the measured that follows the modelled linearly.
+        power: float64[k], of the modelled.
+        left: Power of what the model leaves of the measured, linear or not, at all frequencies.
+    """
+
+    frequency_hz: F64
+    transfer: C128
+    power: F64
+    left: float
+
+
+def further_modes(
+    records: Sequence[History],
+    modelled_um: Sequence[F64],
+    known: Sequence[FurtherMode],
+    first_hz: float | None,
+) -> tuple[FurtherMode, ...] | None:
+    """Return better modes than those that are known, or one more; None where it is not worth it.
+
+    Args:
+        records: What was measured.
+        modelled_um: float64[n] each, what the model gives for their judged samples.
+        known: Further modes that the model has.
+        first_hz: Natural frequency of its first mode; None where it has none.
+    """
+    bare_um = [
+        _undone(model_um, known, record.sample_rate_hz)
+        for model_um, record in zip(modelled_um, records, strict=True)
+    ]
+    spectra = _spectra(records, modelled_um, bare_um)
+    if spectra is None:
+        return None
+    before = _Pairs(_packed(known), _smooth_misfit(spectra, known))
+    better = _followed(spectra, before.x, first_hz) if known else before
+    more = _one_more(spectra, better.x, first_hz) if len(known) < MOST else None
+    rate_hz, chosen = min(record.sample_rate_hz for record in records), better
+    if more is not None and _stands(_modes(more.x), first_hz, rate_hz):
+        left = _left(spectra, before, better)
+        chosen = more if _left(spectra, before, more) < WORTH**2 * left else better
+    modes = _modes(chosen.x)
+    worth = _left(spectra, before, chosen) < WORTH**2
+    return modes if worth and _stands(modes, first_hz, rate_hz) else None
+
+
+def without_modes(records: Sequence[Record], modes: Sequence[FurtherMode]) -> tuple[Record, ...]:
+    """Return records as they were without modes: that is, histories; steady loops as they are."""
+    return tuple(
+        replace(record, displacement_um=_bare_um(record, modes))
+        if isinstance(record, History)
+        else record
+        for record in records
+    )
+
+
+def _bare_um(history: History, modes: Sequence[FurtherMode]) -> F64:
+    return _undone(history.displacement_um, modes, history.sample_rate_hz)
+
+
+def _undone(y_um: F64, modes: Sequence[FurtherMode], rate_hz: float) -> F64:
+    for mode in modes:
+        y_um = mode.inverse(rate_hz).process(y_um)
+    return y_um
+
+
+def _spectra(
+    records: Sequence[History], modelled_um: Sequence[F64], bare_um: Sequence[F64]
+) -> _Spectra | None:
+    """Return the transfer function of all records together; None where they are too few."""
+    top = min(FASTEST_HZ, *(record.sample_rate_hz for record in records))
+    count = int(0.25 * top * SEGMENT_S)
+    own, cross, left, segments = np.zeros(count), np.zeros(count, np.complex128), 0.0, 0
+    for record, model_um, um in zip(records, modelled_um, bare_um, strict=True):
+        measured_um = record.displacement_um[record.ignore :]
+        signals = np.stack((measured_um - model_um, um, measured_um))
+        for error, x, y in _pieces(signals, record.sample_rate_hz):
+            left += float(np.sum(np.abs(error) ** 2))
+            own += np.sum(np.abs(x[:, :count]) ** 2, axis=0)
+            cross += np.sum(np.conj(x[:, :count]) * y[:, :count], axis=0)
+            segments += len(x)
+    if segments < FEWEST_SEGMENTS or count < FEWEST_BINS:
+        return None
+    bins = slice(LOWEST_BIN, None)
+    return _Spectra(
+        frequency_hz=(np.arange(count) / SEGMENT_S)[bins],
+        transfer=np.asarray(cross / np.maximum(own, 1e-300), dtype=np.complex128)[bins],
+        power=own[bins],
+        # Of a model that leaves nothing, whatever makes rounding a little less would be worth all.
+        left=max(left, ROUNDING * float(own.sum()), 1e-300),
+    )
+
+
+def _pieces(signals: F64, rate_hz: float) -> Iterator[C128]:
+    """Give the spectra of stretches of signals, each under a window: complex128[s, m, k].
+
+    Args:
+        signals: float64[s, n].
+        rate_hz: Their sample rate.
+    """
+    together = max(1, int(rate_hz / FASTEST_HZ))
+    size = round(SEGMENT_S * rate_hz / together)
+    whole = signals[:, : signals.shape[1] // together * together]
+    coarse = whole.reshape(len(signals), -1, together).mean(axis=2)
+    if coarse.shape[1] < size:
+        return
+    views = np.lib.stride_tricks.sliding_window_view(coarse, size, axis=1)[:, :: size // 2]
+    window = np.hanning(size)
+    for first in range(0, views.shape[1], AT_ONCE):
+        part = views[:, first : first + AT_ONCE]
+        yield np.fft.rfft((part - part.mean(axis=2, keepdims=True)) * window)
+
+
+@dataclass(frozen=True, slots=True)
+class _Pairs:
+    """Pairs, and what is smooth beside them.
+
+    Attributes:
+        x: float64[4 m + 3]: of each pair natural frequency and damping ratio, then the
+            antiresonance's frequency over it and damping ratio, logarithms all; gain, slope, bend.
+        misfit: What they leave of the transfer function, in power.
+    """
+
+    x: F64
+    misfit: float
+
+
+def _left(spectra: _Spectra, before: _Pairs, now: _Pairs) -> float:
+    """Return the part of a model's error that is left, in power.
+
+    What is smooth is no gain of the pairs: the next fit finds it without them.
+    """
+    return 1.0 - (before.misfit - now.misfit) / spectra.left
+
+
+def _one_more(spectra: _Spectra, x: F64, first_hz: float | None) -> _Pairs | None:
+    """Return the best pairs with one more; None where none can be tried."""
+    known = _response(x, spectra.frequency_hz)
+    rest = replace(
+        spectra, transfer=spectra.transfer / known, power=spectra.power * np.abs(known) ** 2
+    )
+    tried = [_tried(rest, natural_hz, damping) for natural_hz, damping in _grid(spectra, first_hz)]
+    starts = [
+        np.concatenate((x[:-SMOOTH], each.x)) for each in sorted(tried, key=_misfit)[:FOLLOWED]
+    ]
+    ends = [_followed(spectra, start, first_hz) for start in starts]
+    return min(ends, key=_misfit, default=None)
+
+
+def _misfit(pairs: _Pairs) -> float:
+    return pairs.misfit
+
+
+def _grid(spectra: _Spectra, first_hz: float | None) -> list[tuple[float, float]]:
+    """Return natural frequencies and damping ratios of pairs to try."""
+    count, dampings = TRIES
+    low, high = 4.0 * spectra.frequency_hz[0], 0.8 * spectra.frequency_hz[-1]
+    frequencies = np.geomspace(low, high, count).tolist()
+    return [(hz, damping) for hz in frequencies if _apart(hz, first_hz) for damping in dampings]
+
+
+def _apart(natural_hz: float, first_hz: float | None) -> bool:
+    return first_hz is None or not 1.0 / APART < natural_hz / first_hz < APART
+
+
+def _tried(spectra: _Spectra, natural_hz: float, damping: float) -> _Pairs:
+    """Return the best pair with a given resonance."""
+    s = 1j * spectra.frequency_hz / natural_hz
+    columns = [*_smooth(spectra), s**2 / (1.0 + 2.0 * damping * s + s**2)]
+    found, misfit = _least_squares(spectra, np.stack(columns, axis=1))
+    bend = min(max(1.0 + float(found[3]), 0.3), 3.0)  # one over the antiresonance squared
+    pair = math.log(natural_hz), math.log(damping), -0.5 * math.log(bend), math.log(damping)
+    return _Pairs(np.array([*pair, *found[:3]]), misfit)
+
+
+def _smooth(spectra: _Spectra) -> tuple[C128, C128, C128]:
+    """Return what a gain, a slope and a bend change: complex128[k] each."""
+    s = 1j * spectra.frequency_hz / spectra.frequency_hz[-1]
+    return np.ones_like(s), s, s**2
+
+
+def _smooth_misfit(spectra: _Spectra, known: Sequence[FurtherMode]) -> float:
+    """Return what known modes leave with a gain, a slope and a bend beside them."""
+    answer = _response(_packed(known), spectra.frequency_hz)
+    columns = np.stack(_smooth(spectra), axis=1) * answer[:, None]
+    return _least_squares(replace(spectra, transfer=spectra.transfer - answer + 1.0), columns)[1]
+
+
+def _least_squares(spectra: _Spectra, columns: C128) -> tuple[F64, float]:
+    """Return real weights of columns, as near to the transfer function less 1, and the misfit."""
+    scale = np.sqrt(spectra.power)
+    rows, target = columns * scale[:, None], (spectra.transfer - 1.0) * scale
+    both = np.concatenate((rows.real, rows.imag)), np.concatenate((target.real, target.imag))
+    found = np.linalg.lstsq(*both, rcond=None)[0]
+    return np.asarray(found, dtype=np.float64), float(np.sum((both[0] @ found - both[1]) ** 2))
+
+
+def _followed(spectra: _Spectra, start: F64, first_hz: float | None) -> _Pairs:
+    """Return the pairs that a start leads to; each stays on its side of the first mode."""
+    low, high = _bounds(spectra, start, first_hz)
+    scale, smooth = np.sqrt(spectra.power), np.stack(_smooth(spectra), axis=1)
+
+    def residuals(x: F64) -> F64:
+        answer = _response(x, spectra.frequency_hz) * (1.0 + smooth @ x[-SMOOTH:])
+        off = (answer - spectra.transfer) * scale
+        return np.concatenate((off.real, off.imag))
+
+    begin = np.clip(start, low, high)
+    end = least_squares(residuals, begin, bounds=(low, high), x_scale="jac", max_nfev=60)
+    return _Pairs(end.x, 2.0 * float(end.cost))
+
+
+def _bounds(spectra: _Spectra, x: F64, first_hz: float | None) -> tuple[F64, F64]:
+    low, high = np.full(x.size, -9.0), np.full(x.size, 9.0)
+    bottom, top = math.log(spectra.frequency_hz[0]), math.log(spectra.frequency_hz[-1])
+    dampings = math.log(LEAST_DAMPING), math.log(MOST_DAMPING)
+    for k in range(0, x.size - SMOOTH, PAIR):
+        ends = bottom, top
+        if first_hz is not None:
+            first = math.log(first_hz)
+            below = x[k] < first
+            ends = (bottom, first - math.log(APART)) if below else (first + math.log(APART), top)
+        low[k : k + PAIR] = ends[0], dampings[0], -NEAR, dampings[0]
+        high[k : k + PAIR] = ends[1], dampings[1], NEAR, dampings[1]
+    return low, high
+
+
+def _packed(modes: Sequence[FurtherMode]) -> F64:
+    """Return modes as :class:`_Pairs` has them, with nothing smooth beside them."""
+    numbers: list[float] = []
+    for each in modes:
+        ratio = each.antiresonance_hz / each.natural_hz
+        both = each.natural_hz, each.damping_ratio, ratio, each.antiresonance_damping_ratio
+        numbers += [math.log(number) for number in both]
+    return np.array([*numbers, *[0.0] * SMOOTH])
+
+
+def _modes(x: F64) -> tuple[FurtherMode, ...]:
+    """Undo :func:`_packed`."""
+    numbers = np.exp(x[:-SMOOTH]).reshape(-1, PAIR).tolist()
+    return tuple(
+        FurtherMode(
+            natural_hz=natural_hz,
+            damping_ratio=damping_ratio,
+            antiresonance_hz=ratio * natural_hz,
+            antiresonance_damping_ratio=antiresonance_damping_ratio,
+        )
+        for natural_hz, damping_ratio, ratio, antiresonance_damping_ratio in numbers
+    )
+
+
+def _response(x: F64, frequency_hz: F64) -> C128:
+    answer = np.ones(frequency_hz.size, complex)
+    for mode in _modes(x):
+        answer *= mode.response(frequency_hz)
+    return answer
+
+
+def _stands(modes: Sequence[FurtherMode], first_hz: float | None, rate_hz: float) -> bool:
+    """Return whether modes are modes of their own, and can be undone."""
+    ends = [hz for mode in modes for hz in (mode.natural_hz, mode.antiresonance_hz)]
+    ladder = sorted(mode.natural_hz for mode in modes)
+    if not all(_apart(hz, first_hz) for hz in ends):
+        return False
+    if any(after < DISTINCT * before for before, after in pairwise(ladder)):
+        return False
+    try:
+        for mode in modes:
+            mode.inverse(rate_hz)
+    except ModelError:
+        return False
+    return True

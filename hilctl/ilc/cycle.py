@@ -1,0 +1,167 @@
+"""The error of a recording's steady cycles, harmonic by harmonic: pure functions of arrays."""
+
+import cmath
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilctl.analysis.steady_state import SteadyPart, steady_part
+from hilctl.base.errors import DataError
+from hilctl.base.segments import Segment
+from hilctl.base.types import C128, F64, I64
+from hilctl.recording.recording import Recording
+from hilctl.signals import cycle_metrics
+
+MAX_HARMONICS = 2000
+"""Most harmonics that are looked at; a bin of the fold is then a quarter of the shortest."""
+
+_BINS = 8192
+_FEWEST_CYCLES = 2
+_STRONGEST_WITHIN = 16  # harmonics
+
+
+@dataclass(frozen=True, slots=True)
+class CycleScore:
+    """How far the steady cycles of one segment were from what was wanted.
+
+    Attributes:
+        harmonics_um: complex128[K + 1], coefficients c_k of displacement less reference.
+        noise_um: float64[K + 1], standard deviation of each, from the scatter of the cycles.
+        step_hz: Frequency of the first harmonic.
+        cycles: Cycles averaged.
+        peak_um: Largest magnitude of the average cycle's error, as reports have it.
+        rms_um: Its root mean square.
+        peak_to_peak_um: Peak-to-peak displacement of the average cycle.
+        floor_um: Peak that sensor noise alone would make of an average cycle without error.
+        strongest_hz: Frequency of the reference's strongest harmonic.
+        answer: Displacement over reference there.
+    """
+
+    harmonics_um: C128
+    noise_um: F64
+    step_hz: float
+    cycles: int
+    peak_um: float
+    rms_um: float
+    peak_to_peak_um: float
+    floor_um: float
+    strongest_hz: float
+    answer: complex
+
+    @property
+    def delay_s(self) -> float:
+        """Delay of displacement against reference, by the phase of the strongest harmonic."""
+        return -cmath.phase(self.answer) / (2.0 * math.pi * self.strongest_hz)
+
+    @property
+    def percent(self) -> float:
+        """Peak error in percent of the peak-to-peak displacement."""
+        return 100.0 * self.peak_um / self.peak_to_peak_um
+
+    @property
+    def floor_percent(self) -> float:
+        """Noise floor of :attr:`percent`."""
+        return 100.0 * self.floor_um / self.peak_to_peak_um
+
+
+def cycle_error(recording: Recording, segment: Segment, highest_hz: float) -> CycleScore:
+    """Judge the steady cycles of a segment.
+
+    Args:
+        recording: What was recorded.
+        segment: A segment with a period.
+        highest_hz: Highest frequency to look at.
+
+    Raises:
+        DataError: It has fewer than two whole steady cycles, or nothing was wanted or moved.
+    """
+    part = steady_part(recording, segment)
+    if part.cycle is None or part.cycles < _FEWEST_CYCLES:
+        rule = f"{segment.label}: needs at least {_FEWEST_CYCLES} whole steady cycles"
+        raise DataError(f"{recording.path}: {rule}, got {part.cycles}")
+    reference, displacement = part.cycle.signals
+    whole = cycle_metrics.peak_to_peak(displacement)
+    if not (whole > 0.0 and np.ptp(reference) > 0.0):
+        raise DataError(f"{recording.path}: {segment.label}: nothing moved")
+    step_hz = recording.sample_rate_hz / segment.period
+    count = harmonic_count(segment.period, step_hz, highest_hz)
+    each = _each_cycle(part, segment, count)
+    scatter = np.sqrt(np.mean(np.abs(each - each.mean(axis=0)) ** 2, axis=0) / (len(each) - 1))
+    strongest_hz, answer = _answer(part, segment, step_hz)
+    return CycleScore(
+        harmonics_um=each.mean(axis=0),
+        noise_um=scatter,
+        step_hz=step_hz,
+        cycles=part.cycles,
+        peak_um=cycle_metrics.peak(displacement - reference),
+        rms_um=cycle_metrics.rms(displacement - reference),
+        peak_to_peak_um=whole,
+        floor_um=_floor_um(part, segment.period),
+        strongest_hz=strongest_hz,
+        answer=answer,
+    )
+
+
+def harmonic_count(period: float, step_hz: float, highest_hz: float) -> int:
+    """Return how many harmonics of a period, in samples, are looked at."""
+    return max(1, min(int(period / 4.0), int(highest_hz / step_hz), MAX_HARMONICS))
+
+
+def coefficients(index: I64, period: float, signal: F64, count: int) -> C128:
+    """Return Fourier coefficients c_0 to c_count of whole cycles of a signal.
+
+    Args:
+        index: int64[n], sample index; phase 0 is where it is a multiple of ``period``.
+        period: Samples in one period.
+        signal: float64[n]; values that are not finite are left out.
+        count: Highest harmonic.
+
+    Returns:
+        complex128[count + 1], in the signal's unit: a cosine of amplitude 1 has c_k = 0.5.
+    """
+    folded = cycle_metrics.fold(index, period, (signal,), _BINS)
+    phase = folded.phase
+    around = np.concatenate(([phase[-1] - 1.0], phase, [phase[0] + 1.0]))
+    weighted = folded.signals[0] * (around[2:] - around[:-2]) * 0.5
+    turns = np.exp(-2j * np.pi * phase)
+    rotated = np.ones_like(turns)
+    found = np.empty(count + 1, dtype=np.complex128)
+    for k in range(count + 1):
+        found[k] = np.dot(weighted, rotated)
+        rotated *= turns
+    return found
+
+
+def _each_cycle(part: SteadyPart, segment: Segment, count: int) -> C128:
+    """Return the error's coefficients in each cycle: complex128[cycles, count + 1], in um."""
+    samples = part.samples
+    since = samples.index - segment.start
+    error = samples.displacement_um - samples.reference_um
+    number = np.floor((since - since[-1] - 0.5) / segment.period).astype(np.int64) + part.cycles
+    rows = [number == k for k in range(part.cycles)]
+    whole = [row for row in rows if np.count_nonzero(row) > 0.95 * segment.period]
+    if len(whole) < _FEWEST_CYCLES:
+        raise DataError(f"{segment.label}: samples are missing in nearly every cycle")
+    return np.array([coefficients(since[r], segment.period, error[r], count) for r in whole])
+
+
+def _answer(part: SteadyPart, segment: Segment, step_hz: float) -> tuple[float, complex]:
+    """Return frequency of the reference's strongest harmonic, and displacement over reference."""
+    samples = part.samples
+    count = harmonic_count(segment.period, step_hz, _STRONGEST_WITHIN * step_hz)
+    since = samples.index - segment.start
+    wanted = coefficients(since, segment.period, samples.reference_um, count)
+    moved = coefficients(since, segment.period, samples.displacement_um, count)
+    k = int(np.argmax(np.abs(wanted[1:]))) + 1
+    return k * step_hz, complex(moved[k] / wanted[k])
+
+
+def _floor_um(part: SteadyPart, period: float) -> float:
+    assert part.cycle is not None
+    samples, counts = part.samples, part.cycle.counts
+    if period < cycle_metrics.SHORTEST_PERIOD:
+        return 0.0
+    noise_um = cycle_metrics.sensor_noise_um(samples.index, samples.displacement_um) or 0.0
+    average_um = noise_um * float(np.sqrt(np.mean(1.0 / counts)))
+    return average_um * cycle_metrics.expected_maximum(counts.size)

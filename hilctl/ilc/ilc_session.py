@@ -1,0 +1,257 @@
+"""Learning, run by run: the same experiment over and over, each time with the next correction."""
+
+import json
+import signal
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+
+from hilctl import __version__
+from hilctl.base.errors import ConfigError, ConfigProblem, HilctlError, InputError, RunError
+from hilctl.base.segments import Segment
+from hilctl.base.types import C128
+from hilctl.experiment.correction import (
+    Correction,
+    LearnedCycle,
+    fits,
+    model_sha256,
+    signature,
+    write_correction,
+)
+from hilctl.experiment.preflight import CheckedExperiment
+from hilctl.ilc.cycle import cycle_error, harmonic_count
+from hilctl.ilc.results import IlcResult, IlcRow, row_of
+from hilctl.ilc.update import IlcState, begin, learn, refused
+from hilctl.recording.reader import read
+from hilctl.run.result import RunResult
+from hilctl.run.start import StepStoppedError, checked_experiment, paced
+
+HIGHEST_PART = 0.125
+"""Highest frequency that a correction reaches, as a part of the sample rate."""
+
+_FEWEST_CYCLES = 2
+
+
+def repeating(checked: CheckedExperiment) -> list[Segment]:
+    """Return the segments to learn, the first of those that are alike.
+
+    Raises:
+        ConfigError: There is none, or one is too short; or no compensator stands there.
+    """
+    loaded = checked.loaded
+
+    def refuse(key: str, rule: str, hint: str) -> ConfigError:
+        return ConfigError([ConfigProblem(loaded.document.where((key,)), key, rule, hint=hint)])
+
+    if loaded.model is None:
+        raise refuse("compensator", "is needed to learn: its input is corrected", "set a model")
+    found: list[Segment] = []
+    known: list[LearnedCycle] = []
+    for segment in checked.reference.segments:
+        wanted = signature(checked.reference.values, segment)
+        if wanted is None or segment.steady_cycles()[2] < _FEWEST_CYCLES:
+            continue
+        if any(fits(cycle, checked.reference.values, segment) for cycle in known):
+            continue
+        found.append(segment)
+        nothing = np.zeros(1, dtype=np.complex128)
+        known.append(LearnedCycle.from_coefficients(segment.label, segment.period, wanted, nothing))
+    if not found:
+        rule = f"must repeat for at least {_FEWEST_CYCLES} whole cycles after its soft start"
+        raise refuse("waveform", rule, "16 or more average the noise well")
+    return found
+
+
+def beginning(checked: CheckedExperiment, segment: Segment) -> IlcState:
+    """Return where learning begins: with nothing, or with the correction the experiment has."""
+    rate_hz = checked.reference.sample_rate_hz
+    highest_hz = HIGHEST_PART * rate_hz
+    count = harmonic_count(segment.period, rate_hz / segment.period, highest_hz)
+    first: C128 = np.zeros(count + 1, dtype=np.complex128)
+    known = checked.loaded.correction
+    for cycle in known.cycles if known else ():
+        if fits(cycle, checked.reference.values, segment):
+            size = min(first.size, cycle.coefficients.size)
+            first[:size] = cycle.coefficients[:size]
+    return begin(rate_hz, first, highest_hz)
+
+
+Runner: TypeAlias = Callable[[Path, Sequence[str], Path], RunResult]
+"""Runs an experiment file with settings into a recording."""
+
+
+def correction_setting(file: Path) -> str:
+    """Return the ``key=value`` text that has an experiment use a correction, whatever its name."""
+    # Quoted: "lab #3" would end at the space, and "a: b" be a mapping.
+    return f"compensator.correction={json.dumps(str(file.resolve()), ensure_ascii=False)}"
+
+
+class IlcSession:
+    """Learns the correction of every waveform of an experiment that repeats.
+
+    Args:
+        experiment: Experiment file; where it has a correction already, learning goes on from it.
+        settings: ``key=value`` texts over it.
+        folder: Where each run's recording and correction go.
+        run: How an experiment is run.
+
+    Raises:
+        InputError: It has no compensator, or no waveform with enough whole steady cycles.
+    """
+
+    def __init__(
+        self, experiment: Path, settings: Sequence[str], folder: Path, run: Runner = paced
+    ) -> None:
+        self._experiment = experiment
+        self._settings = list(settings)
+        self._folder = folder
+        self._run = run
+        self._checked = checked_experiment(experiment, settings)
+        self._segments = repeating(self._checked)
+        self._learning = [beginning(self._checked, each) for each in self._segments]
+        self._rows: list[IlcRow] = []
+        self._refusals: list[str] = []
+
+    def learn(self, cycles: int, on_rows: Callable[[Sequence[IlcRow]], None]) -> IlcResult:
+        """Run, learn, and run again, until nothing is left to learn.
+
+        Args:
+            cycles: Most runs after the first.
+            on_rows: Called after each run.
+
+        Raises:
+            InputError: The first run is refused; nothing has moved.
+            RunError: The first run ended by a fault.
+        """
+        self._make_folder()
+        reason, stop_signal, fault = "", 0, False
+        check: tuple[IlcRow, ...] = ()
+        try:
+            reason = self._runs_until_done(cycles, on_rows)
+            check = self._check()
+        except (KeyboardInterrupt, HilctlError) as error:
+            if not self._rows:
+                raise
+            stopped = isinstance(error, StepStoppedError | KeyboardInterrupt)
+            fault = not stopped
+            stop_signal = 0 if fault else getattr(error, "signal", signal.SIGINT)
+            reason = "; ".join(filter(None, (reason, str(error) or "stopped by Ctrl-C")))
+        if self._refusals:
+            reason += f"; {len(self._refusals)} corrections were refused: {self._refusals[-1]}"
+        return IlcResult(self._best(), tuple(self._rows), check, reason, stop_signal, fault)
+
+    def _runs_until_done(self, cycles: int, on_rows: Callable[[Sequence[IlcRow]], None]) -> str:
+        """Run and learn; return why that ended."""
+        for number in range(cycles + 1):
+            try:
+                path = self._next_run(number, [each.next_um for each in self._learning])
+            except ConfigError as error:
+                if not self._rows:
+                    raise
+                self._refusals.append(str(error))
+                self._learning = [refused(each) for each in self._learning]
+                continue
+            on_rows(self._take(number, path))
+            if all(each.done for each in self._learning):
+                return "; ".join(sorted({each.done for each in self._learning}))
+        return f"{cycles} learning cycles are done"
+
+    def _make_folder(self) -> None:
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"{self._folder}: can't be made: {error.strerror}") from None
+
+    def _next_run(self, number: int, coefficients: Sequence[C128]) -> Path:
+        """Run with a correction, which is kept beside the recording; return that."""
+        name = f"run-{number:02d}"
+        file = self._folder / f"{name}.yaml"
+        cycles = [
+            self._cycle(segment, each)
+            for segment, each in zip(self._segments, coefficients, strict=True)
+        ]
+        write_correction(file, self._whole(cycles), overwrite=True)
+        settings = [*self._settings, correction_setting(file)]
+        settings += self._other_noise(number)
+        result = self._run(self._experiment, settings, self._folder / f"{name}.mcap")
+        if result.stop_signal and self._rows:
+            raise StepStoppedError(f"run {number}: {result.reason}", result.stop_signal)
+        if result.code != "completed":
+            raise RunError(f"run {number}: {result.reason}")
+        return result.path
+
+    def _other_noise(self, number: int) -> list[str]:
+        """Give each run of a simulated device noise of its own: it must not be learned."""
+        device = self._checked.loaded.device
+        field = device.Options.model_fields.get("seed")
+        if field is None:
+            return []
+        first = self._checked.loaded.config.device.get("seed", field.default)
+        return [f"device.seed={first + number}"]
+
+    def _take(self, number: int, path: Path) -> list[IlcRow]:
+        rows = self._judge(number, path, learning=True)
+        self._rows += rows
+        return rows
+
+    def _judge(self, number: int, path: Path, *, learning: bool) -> list[IlcRow]:
+        recording = read(path)
+        rows = []
+        for i, segment in enumerate(self._segments):
+            state = self._learning[i]
+            error = cycle_error(recording, segment, state.highest_hz)
+            reach_hz = state.reach_hz
+            if learning and not state.done:
+                state = learn(state, error)
+                if state.done:  # it stays as it is while others go on
+                    state = replace(state, next_um=state.best.correction_um)
+                self._learning[i] = state
+            rows.append(row_of(number, segment, error, state, reach_hz, path))
+        return rows
+
+    def _check(self) -> tuple[IlcRow, ...]:
+        """Run once more with the best corrections, under noise that they have not seen."""
+        number = self._rows[-1].run + 1
+        path = self._next_run(number, [each.best.correction_um for each in self._learning])
+        return tuple(self._judge(number, path, learning=False))
+
+    def _best(self) -> Correction:
+        cycles = []
+        for segment, state in zip(self._segments, self._learning, strict=True):
+            figures = {
+                "start_percent": state.trials[0].error.percent,
+                "error_percent": state.best.error.percent,
+            }
+            cycles.append(self._cycle(segment, state.best.correction_um, **figures))
+        return self._whole(cycles)
+
+    def _cycle(self, segment: Segment, coefficients: C128, **figures: float) -> LearnedCycle:
+        wanted = signature(self._checked.reference.values, segment)
+        assert wanted is not None
+        return LearnedCycle.from_coefficients(
+            segment.label, segment.period, wanted, coefficients, **figures
+        )
+
+    def _whole(self, cycles: Sequence[LearnedCycle]) -> Correction:
+        rate_hz = self._checked.reference.sample_rate_hz
+        provenance = {
+            "experiment": self._checked.loaded.config.name,
+            "device": self._checked.loaded.device.info.name,
+            "hilctl": __version__,
+            "created": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+            "runs": str(len(self._rows) // len(self._segments)),
+        }
+        for segment, state in zip(self._segments, self._learning, strict=True):
+            if state.trials:
+                delay = state.response.delay_s * rate_hz
+                provenance[f"delay_samples: {segment.label}"] = f"{delay:.2f}"
+        return Correction(
+            sample_rate_hz=rate_hz,
+            model_sha256=model_sha256(self._checked.loaded.model),
+            cycles=tuple(cycles),
+            provenance=provenance,
+        )

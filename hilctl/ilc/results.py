@@ -1,0 +1,103 @@
+"""What learning says of itself: every run, and what came of all of them."""
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from hilctl.base.segments import Segment
+from hilctl.experiment.correction import Correction
+from hilctl.ilc.cycle import CycleScore
+from hilctl.ilc.update import IlcState
+
+
+@dataclass(frozen=True, slots=True)
+class IlcRow:
+    """What one run said of one waveform.
+
+    Attributes:
+        run: Number of the run; 0 is the start, without what is learned here.
+        label: The waveform.
+        error_percent: Peak error of the average cycle, in percent of the peak-to-peak.
+        rms_percent: Its root mean square.
+        floor_percent: Peak error that sensor noise alone would make.
+        cycles: Cycles averaged.
+        reach_hz: Up to which frequency the correction had been moved.
+        delay_samples: Delay that the runs so far show between correction and displacement.
+        natural_hz: Resonance that they show; None where there is none.
+        recording: The run's recording.
+    """
+
+    run: int
+    label: str
+    error_percent: float
+    rms_percent: float
+    floor_percent: float
+    cycles: int
+    reach_hz: float
+    delay_samples: float
+    natural_hz: float | None
+    recording: str
+
+
+@dataclass(frozen=True, slots=True)
+class IlcResult:
+    """What came of learning.
+
+    Attributes:
+        correction: The best correction.
+        rows: Every run, for each waveform.
+        check: One more run with the best correction, for each waveform; none where it was stopped.
+        reason: Why it ended.
+        stop_signal: Number of the signal that stopped it, or 0.
+        fault: Whether a run ended by a fault, or could not be run or judged.
+    """
+
+    correction: Correction
+    rows: tuple[IlcRow, ...]
+    check: tuple[IlcRow, ...]
+    reason: str
+    stop_signal: int = 0
+    fault: bool = False
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return plain values, without the coefficients."""
+        return {
+            "reason": self.reason,
+            "waveforms": [
+                {
+                    "label": cycle.label,
+                    "start_percent": cycle.start_percent,
+                    "error_percent": cycle.error_percent,
+                }
+                for cycle in self.correction.cycles
+            ],
+            "check": [asdict(row) for row in self.check],
+            "runs": [asdict(row) for row in self.rows],
+        }
+
+
+def row_of(
+    number: int, segment: Segment, error: CycleScore, state: IlcState, reach_hz: float, path: Path
+) -> IlcRow:
+    """Return what a run said of one waveform.
+
+    Args:
+        number: Number of the run.
+        segment: The waveform.
+        error: What came of it.
+        state: Where learning stands with it.
+        reach_hz: Up to which frequency the run's correction had been moved.
+        path: The run's recording.
+    """
+    return IlcRow(
+        run=number,
+        label=segment.label,
+        error_percent=error.percent,
+        rms_percent=100.0 * error.rms_um / error.peak_to_peak_um,
+        floor_percent=error.floor_percent,
+        cycles=error.cycles,
+        reach_hz=reach_hz,
+        delay_samples=state.response.delay_s * state.sample_rate_hz,
+        natural_hz=state.response.natural_hz,
+        recording=str(path),
+    )

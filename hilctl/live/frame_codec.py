@@ -1,0 +1,108 @@
+"""Encode frames for a page: a JSON header and float32 values.
+
+uint32 little endian   size of the JSON in bytes, with spaces up to a multiple of 4
+JSON                   ``mode`` of the window, its ``n`` buckets, ``loop`` points of the loops
+                       and ``cycle`` points per cycle
+float32 little endian  t_s[n], low[signals, n], high[signals, n], input[loop], output[loop]
+"""
+
+import json
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+
+from hilctl.base.events import Event
+from hilctl.base.types import F64
+from hilctl.live.run_reader import RunReader
+from hilctl.live.scope import WINDOWS_S, Scope
+from hilctl.live.signals import SIGNALS
+
+ScopeMode: TypeAlias = Literal["roll", "cycle"]
+
+
+def nearest_window_s(wanted_s: float) -> float:
+    """Return the value of :data:`hilctl.live.scope.WINDOWS_S` with the nearest ratio."""
+    return min(WINDOWS_S, key=lambda each: max(each / wanted_s, wanted_s / each))
+
+
+def frame_of(scope: Scope, mode: ScopeMode, window_s: float) -> bytes:
+    """Return the current frame of a page.
+
+    Args:
+        scope: The windows of a run.
+        mode: ``cycle`` is triggered by the waveform's cycle; without a cycle it rolls.
+        window_s: Length of a rolling window, one of :data:`hilctl.live.scope.WINDOWS_S`.
+    """
+    window = scope.triggered() if mode == "cycle" else None
+    shown: ScopeMode = "roll" if window is None else "cycle"
+    if window is None:
+        window = scope.rolling(window_s)
+    loops = scope.loops()
+    header = json.dumps(
+        {
+            "mode": shown,
+            "n": window.t_s.size,
+            "signals": len(SIGNALS),
+            "loop": loops.shape[1],
+            "cycle": scope.points_a_cycle(),
+        }
+    ).encode()
+    header += b" " * (-len(header) % 4)
+    parts = (window.t_s, window.buckets.low, window.buckets.high, loops)
+    values = np.concatenate([np.ravel(part) for part in parts]).astype("<f4")
+    return struct.pack("<I", len(header)) + header + values.tobytes()
+
+
+@dataclass(frozen=True, slots=True)
+class RunFrame:
+    """A run at one time.
+
+    Attributes:
+        status: Where it stands: figures, limits, lateness; see :meth:`RunReader.status`.
+        events: Those since the frame before.
+        t_s: float64[n], beginning of each bucket of samples, up to 0 for the newest.
+        low: Lowest value in each bucket by signal, float64[n]; NaN where there is none.
+        high: Highest value, likewise: no spike is lost.
+    """
+
+    status: dict[str, Any]
+    events: list[Event]
+    t_s: F64
+    low: dict[str, F64]
+    high: dict[str, F64]
+
+
+def frames_of(
+    feed: RunReader,
+    every_s: float,
+    window_s: float,
+    clock: Callable[[], float],
+    sleep: Callable[[float], None],
+) -> Iterator[RunFrame]:
+    """Give frames of a run until it is over, the last of them after its end.
+
+    Args:
+        feed: The run.
+        every_s: Time from one frame to the next; one that is taken late does not hurry the next.
+        window_s: Time that each shows; the nearest that is kept.
+        clock: Monotonic time in s.
+        sleep: Lets that many s pass.
+    """
+    window_s, seen = nearest_window_s(window_s), 0
+    while True:
+        began_s = clock()
+        feed.poll(began_s)
+        ended = feed.ended
+        events, seen = feed.events_since(seen)
+        window = feed.scope.rolling(window_s)
+        low, high = (
+            {signal.name: values[row] for row, signal in enumerate(SIGNALS)}
+            for values in (window.buckets.low, window.buckets.high)
+        )
+        yield RunFrame(feed.status(), events, window.t_s, low, high)
+        if ended:
+            return
+        sleep(max(0.0, began_s + every_s - clock()))

@@ -1,0 +1,151 @@
+"""Session of one page: its requests and the newest frame for it.
+
+Frames are not queued: a frame is made when the previous one has been sent, so that a slow page gets
+fewer frames, always the newest. A page that reads nothing for seconds is disconnected.
+"""
+
+import asyncio
+import time
+from collections.abc import Awaitable, Callable
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, ValidationError
+from websockets.asyncio.server import ServerConnection
+from websockets.exceptions import ConnectionClosed
+
+from hilctl.base.formatting import finite_json
+from hilctl.base.strict import StrictModel
+from hilctl.live.frame_codec import ScopeMode
+
+MAX_MESSAGE_BYTES = 4096
+"""Longest message of a page."""
+SLOW_S = 5.0
+"""A page that takes nothing for so long is cut."""
+_RATE_HZ, _BURST = 20.0, 40.0
+
+
+class PageView(StrictModel):
+    """Selection of a page.
+
+    Attributes:
+        run: Name of the run; None for the default run of the server.
+        mode: Mode of its scope.
+        window_s: Length of a rolling window.
+    """
+
+    run: str | None = None
+    mode: ScopeMode = "cycle"
+    window_s: Annotated[float, Field(ge=1e-3, le=1e5)] = 2.0
+
+
+class PageMessage(StrictModel):
+    """Message of a page.
+
+    Attributes:
+        id: Number that is returned with the answer.
+        ask: ``view`` changes the selection, ``stop`` stops the run, ``run`` sends a request to the
+            run's control socket.
+        view: New selection, a :class:`PageView`.
+        request: Request to the run.
+    """
+
+    id: int
+    ask: Literal["view", "stop", "run"]
+    view: dict[str, Any] = Field(default_factory=dict)
+    request: dict[str, Any] = Field(default_factory=dict)
+
+
+def answer_text(message: PageMessage, **said: Any) -> str:
+    """Return the answer to a message as JSON."""
+    return finite_json({"kind": "answer", "id": message.id, "ask": message.ask, **said})
+
+
+class RateLimiter:
+    """Rate limiter with a burst.
+
+    Args:
+        rate_hz: Number per second in the long run.
+        burst: Number at once.
+        clock: Monotonic time in s.
+    """
+
+    def __init__(self, rate_hz: float, burst: float, clock: Callable[[], float]) -> None:
+        self._rate_hz, self._burst, self._clock = rate_hz, burst, clock
+        self._left, self._at = burst, clock()
+
+    def take(self) -> bool:
+        """Take one; return False if none is left."""
+        now = self._clock()
+        self._left = min(self._burst, self._left + (now - self._at) * self._rate_hz)
+        self._at = now
+        if self._left < 1.0:
+            return False
+        self._left -= 1.0
+        return True
+
+
+class PageSession:
+    """Session of an authenticated page.
+
+    Args:
+        connection: Connection to the page.
+        answer: Executes a request and returns the answer to send.
+        clock: Monotonic time in s.
+
+    Attributes:
+        view: Current selection.
+    """
+
+    def __init__(
+        self,
+        connection: ServerConnection,
+        answer: "Callable[[PageSession, PageMessage], Awaitable[str]]",
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.view = PageView()
+        self._connection, self._answer, self._clock = connection, answer, clock
+        self._allowance = RateLimiter(_RATE_HZ, _BURST, clock)
+        self._sending: asyncio.Task[None] | None = None
+        self._began_s = 0.0
+
+    @property
+    def ready(self) -> bool:
+        """Whether all earlier messages were sent; a page that is too slow is disconnected."""
+        if self._sending is None or self._sending.done():
+            return True
+        if self._clock() - self._began_s > SLOW_S:
+            self._connection.transport.abort()
+        return False
+
+    def offer(self, *messages: str | bytes) -> None:
+        """Send messages in order; call it only if the session is :attr:`ready`."""
+        self._began_s = self._clock()
+        self._sending = asyncio.create_task(self._send(messages))
+
+    async def _send(self, messages: tuple[str | bytes, ...]) -> None:
+        try:
+            for message in messages:
+                await self._connection.send(message)
+        except ConnectionClosed:
+            return
+
+    async def attend(self) -> None:
+        """Execute the requests of the page until it disconnects."""
+        async for raw in self._connection:
+            if not self._allowance.take():
+                await self._connection.close(1008, "too many messages")
+                return
+            try:
+                message = PageMessage.model_validate_json(raw)
+            except ValidationError:
+                await self._connection.close(1008, "not a message of the page")
+                return
+            if message.ask == "view":
+                try:
+                    self.view = PageView.model_validate(message.view)
+                except ValidationError as error:
+                    first = error.errors(include_url=False, include_input=False)[0]
+                    text = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+                    await self._connection.send(answer_text(message, ok=False, error=text))
+                    continue
+            await self._connection.send(await self._answer(self, message))

@@ -1,0 +1,289 @@
+"""Read a live run from outside: its newest signals, metrics, limits and events.
+
+The ring is mapped read-only and copied data are validated, so that the loop and the recorder are
+not affected. Time is an argument.
+"""
+
+import math
+import os
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hilctl.base.errors import RunError
+from hilctl.base.events import Event
+from hilctl.base.samples import BlockBatch, BlockHeader
+from hilctl.base.types import F64, I64
+from hilctl.live.limit_usage import Gauge, Headroom
+from hilctl.live.live_metrics import FigureValues, RunningFigures
+from hilctl.live.scope import Scope
+from hilctl.live.signals import ROW, Traces, traces_of
+from hilctl.run.metadata import RunDescription
+from hilctl.run.ring import SampleRing
+from hilctl.run.run_folder import RunFolder
+from hilctl.run.shared_page import PageField, Phase
+
+_SAMPLES = 16384
+_POINTS = 240
+
+
+class LiveErrorSpectrum:
+    """Amplitudes of what the newest samples of the error are made of.
+
+    Args:
+        sample_rate_hz: Samples a second.
+    """
+
+    def __init__(self, sample_rate_hz: float) -> None:
+        self._rate_hz = sample_rate_hz
+        self._newest = np.empty(0)
+
+    def add(self, traces: Traces) -> None:
+        """Take the next samples; what has no error, or comes after a gap, begins anew."""
+        error_um = traces.values[ROW["error"]]
+        broken = ~np.isfinite(error_um)
+        if broken.any():
+            last = int(np.flatnonzero(broken)[-1])
+            self._newest, error_um = np.empty(0), error_um[last + 1 :]
+        self._newest = np.concatenate((self._newest, error_um))[-_SAMPLES:]
+
+    def points(self) -> tuple[F64, F64]:
+        """Return frequencies in Hz and amplitudes in um, each the largest of its neighbours.
+
+        Both float64[k]; empty before there are 256 samples. A line of a sine of 1 um is 1 um high.
+        """
+        size = 1 << (self._newest.size.bit_length() - 1) if self._newest.size else 0
+        if size < 256:
+            return np.empty(0), np.empty(0)
+        window = np.hanning(size)
+        error_um = self._newest[-size:]
+        lines_um = np.abs(np.fft.rfft((error_um - error_um.mean()) * window))
+        lines_um *= 2.0 / window.sum()
+        # By the largest: a line must not vanish among its neighbours.
+        edges = np.unique(np.geomspace(1, lines_um.size, _POINTS).astype(np.int64))[:-1]
+        largest_um: F64 = np.maximum.reduceat(lines_um, edges)
+        return edges.astype(np.float64) * np.float64(self._rate_hz / size), largest_um
+
+
+EDGES_US: F64 = np.concatenate(([0.0], np.geomspace(1.0, 1e6, 31)))
+"""Edges of the histogram's bins; what is later is in the last one."""
+_TICKS = 20_000
+
+
+class LatenessCounts:
+    """Histogram of the whole run, as far as it was seen, and percentiles of its newest ticks."""
+
+    def __init__(self) -> None:
+        self.counts: I64 = np.zeros(EDGES_US.size - 1, dtype=np.int64)
+        self._newest_us: F64 = np.empty(0)
+
+    def add(self, batch: BlockBatch) -> None:
+        """Take the next blocks."""
+        late_us = np.maximum(batch.heads[:, BlockHeader.LATE_NS] * 1e-3, 0.0)
+        self.counts += np.histogram(np.minimum(late_us, EDGES_US[-1]), EDGES_US)[0]
+        self._newest_us = np.concatenate((self._newest_us, late_us))[-_TICKS:]
+
+    def percentiles_us(self) -> dict[str, float]:
+        """Return ``p50``, ``p99`` and ``max`` of the newest ticks; nothing before the first."""
+        if not self._newest_us.size:
+            return {}
+        p50, p99, most = np.percentile(self._newest_us, (50.0, 99.0, 100.0))
+        return {"p50": float(p50), "p99": float(p99), "max": float(most)}
+
+
+_EVENTS = 60
+_LOOK_S = 0.5  # interval of checks of the run's locks and the disk
+
+
+@dataclass(frozen=True, slots=True)
+class DiskRoom:
+    """Free space on the disk of the recording.
+
+    Attributes:
+        free_bytes: Free space.
+        recorded_bytes: Size of the recording.
+    """
+
+    free_bytes: int
+    recorded_bytes: int
+
+
+class RunReader:
+    """Reader of one active run.
+
+    Args:
+        folder: Folder of the run.
+
+    Attributes:
+        description: Description of the run.
+        scope: Its windows and loops.
+        spectrum: Spectrum of its error.
+        events: Its newest events, the oldest first.
+        missed: Number of samples not read: dropped by the run, or overwritten too early.
+        ended: Whether the run has ended and no data can follow.
+
+    Raises:
+        RunError: The run has ended, or cannot be read.
+    """
+
+    def __init__(self, folder: RunFolder) -> None:
+        self.folder = folder
+        try:
+            self.description = RunDescription.read(folder.description)
+            self._ring = SampleRing(folder.ring, look_only=True)
+        except (OSError, ValueError) as error:
+            raise RunError(f"{folder.card.name}: cannot read the run: {error}") from None
+        self._page = self._ring.page
+        self.scope = Scope(self.description.sample_rate_hz, [], self.loop_input)
+        self._waveform_at = -1
+        self._figures = RunningFigures(self.description.sample_rate_hz, self.loop_input)
+        self.spectrum = LiveErrorSpectrum(self.description.sample_rate_hz)
+        self._lateness, self._headroom = LatenessCounts(), Headroom(self.description)
+        self.events: list[Event] = []
+        self._events_seen = 0
+        self.missed = 0
+        self.ended = False
+        self._disk: DiskRoom | None = None
+        self._next_block, self._next_event = max(0, self._page.observe(PageField.HEAD) - 1), 0
+        self._next_sample, self._next_note = -1, 0
+        self._looked_s = -math.inf
+
+    @property
+    def loop_input(self) -> str:
+        """Signal on the abscissa of the loop: the reference if there is one in um."""
+        return "reference" if self.description.waveform_unit == "um" else "command"
+
+    def poll(self, now_s: float) -> bool:
+        """Read new data.
+
+        Args:
+            now_s: Monotonic time.
+
+        Returns:
+            Whether there were samples.
+        """
+        if now_s - self._looked_s >= _LOOK_S:
+            self._looked_s = now_s
+            # Checked first: an ended run writes no more data after this.
+            self.ended = not self.folder.alive
+            self._disk = _disk_room(Path(self.folder.card.recording))
+        if self._page.observe(PageField.PHASE) < Phase.RUNNING:
+            return False
+        self._begin()
+        batch, self._next_block = self._ring.look(self._next_block)
+        events, self._next_event = self._page.look_at_events(self._next_event)
+        notes, self._next_note = self._page.look_at_notes(self._next_note)
+        self.events = (self.events + events + notes)[-_EVENTS:]
+        self._events_seen += len(events) + len(notes)
+        if not batch.heads.shape[0]:
+            return False
+        self._lateness.add(batch)
+        self._take(traces_of(batch, self.description.waveform_unit))
+        return True
+
+    def _begin(self) -> None:
+        """Read the first sample of the waveform, which is known once the loop runs."""
+        if self._waveform_at < 0:
+            self._waveform_at = self._page.get(PageField.WAVEFORM_AT)
+            segments = self.description.segments_at(self._waveform_at)
+            self.scope = Scope(self.description.sample_rate_hz, segments, self.loop_input)
+
+    def _take(self, traces: Traces) -> None:
+        if self._next_sample >= 0:
+            self.missed += int(traces.index[-1]) + 1 - self._next_sample - traces.index.size
+        self._next_sample = int(traces.index[-1]) + 1
+        self.scope.add(traces)
+        self._figures.add(traces, self.scope.segment)
+        self.spectrum.add(traces)
+        self._headroom.add(traces)
+
+    def events_since(self, seen: int) -> tuple[list[Event], int]:
+        """Return the events after the first ``seen``, and the number of all events."""
+        new = min(self._events_seen - seen, len(self.events))
+        return self.events[len(self.events) - new :], self._events_seen
+
+    @property
+    def start_ns(self) -> int:
+        """Monotonic time of sample 0 in ns; 0 while unknown."""
+        return self._page.get(PageField.START_NS)
+
+    @property
+    def state(self) -> str:
+        """State of the run in one word."""
+        outcome = self._page.outcome()
+        if outcome is not None:
+            return outcome.code
+        if self.ended:
+            return "ended"
+        if self._page.get(PageField.STOP):
+            return "stopping"
+        return Phase(self._page.get(PageField.PHASE)).name.lower()
+
+    @property
+    def figures(self) -> FigureValues:
+        """Running metrics by name with unit; empty before the first complete cycle."""
+        return self._figures.newest
+
+    @property
+    def inverse(self) -> str | None:
+        """State of the inverse after the last change, ``in`` or ``out``; None without one."""
+        if not self.description.compensator:
+            return None
+        changed = self._page.get(PageField.TUNE_WANTED)
+        return "out" if changed and not self._page.get_float(PageField.TUNE_INVERSE_SHARE) else "in"
+
+    def status(self) -> dict[str, Any]:
+        """Return everything except the traces, as plain values for JSON."""
+        page, rate_hz = self._page, self.description.sample_rate_hz
+        outcome = page.outcome()
+        late = self._lateness.percentiles_us()
+        ring_used = (page.get(PageField.HEAD) - page.get(PageField.TAIL)) / self._ring.slots
+        gauges = self._headroom.gauges(late.get("max", 0.0) * 1e-6)
+        gauges.append(Gauge("ring", ring_used, 100.0 * ring_used, 100.0, "%"))
+        return {
+            "run": self.folder.card.name,
+            "recording": self.folder.card.recording,
+            "state": self.state,
+            "reason": outcome.reason if outcome else "",
+            "safe": outcome.safe if outcome else None,
+            "ended": self.ended,
+            "t_s": max(self._next_sample, 0) / rate_hz,
+            "total_s": (self.description.samples + max(self._waveform_at, 0)) / rate_hz,
+            "segment": self.scope.segment.label if self.scope.segment else "",
+            "figures": self.figures,
+            "gain": page.get_float(PageField.TUNE_GAIN) if page.get(PageField.TUNE_WANTED) else 1.0,
+            "offset": page.get_float(PageField.TUNE_OFFSET)
+            if page.get(PageField.TUNE_WANTED)
+            else 0.0,
+            "inverse": self.inverse,
+            "missed_samples": self.missed,
+            "late_ticks": page.get(PageField.LATE_TICKS),
+            "lateness_us": late,
+            "lateness_edges_us": EDGES_US.tolist(),
+            "lateness_counts": self._lateness.counts.tolist(),
+            "gauges": [{**asdict(each), "level": each.level} for each in gauges],
+            "ring_used": ring_used,
+            "disk": asdict(self._disk) if self._disk else None,
+            "events": [_plain_event(each, rate_hz) for each in self.events],
+        }
+
+
+def _plain_event(event: Event, rate_hz: float) -> dict[str, Any]:
+    return {
+        "t_s": event.sample / rate_hz,
+        "level": event.level,
+        "code": event.code,
+        "text": event.text,
+        "values": dict(event.values),
+    }
+
+
+def _disk_room(recording: Path) -> DiskRoom | None:
+    """Return the disk space for a recording; None if it is unknown."""
+    try:
+        disk = os.statvfs(recording.parent)
+        return DiskRoom(disk.f_bavail * disk.f_frsize, recording.stat().st_size)
+    except OSError:
+        return None

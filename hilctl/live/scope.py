@@ -1,0 +1,224 @@
+"""Provide the windows of an oscilloscope (rolling or triggered) and hysteresis loops."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilctl.base.samples import NO_WAVEFORM
+from hilctl.base.segments import Segment
+from hilctl.base.types import F64, I64
+from hilctl.live.signals import ROW, SIGNALS, Traces
+
+
+@dataclass(frozen=True, slots=True)
+class Buckets:
+    """Some buckets after one another.
+
+    Attributes:
+        low: float64[len(SIGNALS), n]; NaN where a bucket has no sample.
+        high: The same shape.
+        first: The same shape: values of one sample, so that they belong together.
+    """
+
+    low: F64
+    high: F64
+    first: F64
+
+
+class MinMaxTrace:
+    """The newest buckets of a run, with the lowest, highest and first value of each signal.
+
+    The range of each bucket is drawn, so an outlier is visible in an hour as well as in a second.
+
+    Args:
+        origin: Sample with which bucket 0 begins.
+        width: Samples in a bucket, >= 1, not necessarily whole.
+        keep: Number of buckets that are kept.
+    """
+
+    def __init__(self, origin: float, width: float, keep: int) -> None:
+        self.origin, self.width, self.keep = origin, width, keep
+        self.newest = -1
+        """Number of the newest bucket that has a sample; negative before the first."""
+        shape = (len(SIGNALS), keep)
+        self._low, self._high = np.full(shape, np.nan), np.full(shape, np.nan)
+        self._first = np.full(shape, np.nan)
+
+    def add(self, traces: Traces) -> None:
+        """Take the next samples; those before the origin, or older than the newest, are left."""
+        numbers = np.floor((traces.index - self.origin) / self.width).astype(np.int64)
+        begin = int(np.searchsorted(numbers, max(self.newest, 0)))
+        if begin == numbers.size:
+            return
+        numbers, values = numbers[begin:], traces.values[:, begin:]
+        starts = np.flatnonzero(np.diff(numbers, prepend=numbers[0] - 1))
+        numbers, first = numbers[starts], values[:, starts]
+        low = np.fmin.reduceat(values, starts, axis=1)
+        high = np.fmax.reduceat(values, starts, axis=1)
+        self._clear(int(numbers[-1]))
+        if numbers[0] == self.newest:  # it has samples from before
+            slot = self.newest % self.keep
+            low[:, 0] = np.fmin(low[:, 0], self._low[:, slot])
+            high[:, 0] = np.fmax(high[:, 0], self._high[:, slot])
+            first[:, 0] = self._first[:, slot]
+        slots = numbers[-self.keep :] % self.keep
+        self._low[:, slots] = low[:, -self.keep :]
+        self._high[:, slots] = high[:, -self.keep :]
+        self._first[:, slots] = first[:, -self.keep :]
+        self.newest = int(numbers[-1])
+
+    def _clear(self, newest: int) -> None:
+        """Empty the buckets that come after the newest, up to the one that will be it."""
+        numbers = np.arange(max(self.newest + 1, newest - self.keep + 1), newest + 1)
+        slots = numbers % self.keep
+        for values in (self._low, self._high, self._first):
+            values[:, slots] = np.nan
+
+    def window(self, begin: int, count: int) -> Buckets:
+        """Return the buckets from number ``begin`` on, empty ones where there is none."""
+        numbers: I64 = np.arange(begin, begin + count)
+        there = (numbers >= 0) & (numbers <= self.newest) & (numbers > self.newest - self.keep)
+        slots = numbers % self.keep
+        return Buckets(
+            *(
+                np.where(there, values[:, slots], np.nan)
+                for values in (self._low, self._high, self._first)
+            )
+        )
+
+
+WINDOWS_S = (0.02, 0.1, 0.5, 2.0, 10.0, 60.0, 600.0)
+"""Lengths of a rolling window, in s."""
+BUCKETS = 600
+"""Buckets in a window."""
+CYCLES = 6
+"""Cycles of the loop that are kept."""
+_CYCLE_BUCKETS = 300
+_LONG_S = 1.0
+_LOOP_S = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class ScopeWindow:
+    """Content of a scope.
+
+    Attributes:
+        t_s: float64[n], start of each bucket: relative to now if rolling, to the start of the cycle
+            if triggered.
+        buckets: The signals.
+    """
+
+    t_s: F64
+    buckets: Buckets
+
+
+class Scope:
+    """The windows of one run.
+
+    Args:
+        sample_rate_hz: Samples per second.
+        segments: Segments of the run, in order.
+        loop_input: Signal on the abscissa of the loop.
+    """
+
+    def __init__(self, sample_rate_hz: float, segments: list[Segment], loop_input: str) -> None:
+        self._rate_hz = sample_rate_hz
+        self._segments, self._input = segments, ROW[loop_input]
+        self._rolling = {
+            window_s: MinMaxTrace(
+                0, max(1, math.ceil(window_s * sample_rate_hz / BUCKETS)), BUCKETS
+            )
+            for window_s in WINDOWS_S
+        }
+        self._cycles: MinMaxTrace | None = None
+        self.segment: Segment | None = None
+        """The stretch that the newest sample of the waveform is in."""
+
+    def add(self, traces: Traces) -> None:
+        """Add the next samples."""
+        for envelope in self._rolling.values():
+            envelope.add(traces)
+        running = traces.index[(traces.flags & NO_WAVEFORM) == 0]
+        if running.size:
+            self._follow(int(running[-1]))
+        if self._cycles is not None and running.size:
+            self._cycles.add(traces.part(running[0], running[-1] + 1))
+
+    def _follow(self, sample: int) -> None:
+        here = next((each for each in self._segments if each.start <= sample < each.stop), None)
+        if here is None or here is self.segment:
+            return
+        self.segment = here
+        if here.period > 0.0:
+            width = max(1.0, here.period / _CYCLE_BUCKETS)
+        else:
+            width = max(1.0, _LOOP_S * self._rate_hz / _CYCLE_BUCKETS)
+        cycle = here.period / width if here.period > 0.0 else _CYCLE_BUCKETS
+        self._cycles = MinMaxTrace(here.start, width, math.ceil((CYCLES + 2) * cycle))
+
+    def rolling(self, window_s: float) -> ScopeWindow:
+        """Return the newest ``window_s``, one of :data:`WINDOWS_S`."""
+        envelope = self._rolling[window_s]
+        count = min(BUCKETS, max(2, math.ceil(window_s * self._rate_hz / envelope.width)))
+        t_s = np.arange(1 - count, 1) * (envelope.width / self._rate_hz)
+        return ScopeWindow(
+            t_s.astype(np.float64), envelope.window(envelope.newest - count + 1, count)
+        )
+
+    def whole_buckets(self, window_s: float, since: int) -> tuple[int, Buckets]:
+        """Return the completed buckets of a rolling window.
+
+        Args:
+            window_s: One of :data:`WINDOWS_S`; a bucket is one of its :data:`BUCKETS` parts.
+            since: Number of the first requested bucket.
+
+        Returns:
+            Number of the first bucket that is still stored, and the buckets from there on.
+        """
+        envelope = self._rolling[window_s]
+        first = max(since, envelope.newest - envelope.keep + 1, 0)
+        return first, envelope.window(first, max(0, envelope.newest - first))
+
+    def bucket_samples(self, window_s: float) -> int:
+        """Return the number of samples per bucket of a rolling window."""
+        return int(self._rolling[window_s].width)
+
+    def triggered(self, cycles: int = 2) -> ScopeWindow | None:
+        """Return the newest complete cycles of the waveform; None before the first.
+
+        A long cycle is shown while it is recorded.
+        """
+        envelope, segment = self._cycles, self.segment
+        if envelope is None or segment is None or segment.period <= 0.0:
+            return None
+        cycle = segment.period / envelope.width
+        done = (envelope.newest + 1) / cycle
+        live = segment.period > _LONG_S * self._rate_hz
+        begin = math.floor(done) - (cycles - 1 if live else cycles)
+        if begin < 0:
+            return None
+        first = math.ceil(begin * cycle - 1e-9)
+        count = math.ceil(cycles * cycle)
+        t_s = (np.arange(first, first + count) - begin * cycle) * (envelope.width / self._rate_hz)
+        return ScopeWindow(t_s.astype(np.float64), envelope.window(first, count))
+
+    def loops(self) -> F64:
+        """Return the newest loops: float64[2, n], oldest first.
+
+        Input and displacement of the same sample.
+        """
+        envelope, segment = self._cycles, self.segment
+        if envelope is None or segment is None:
+            return np.empty((2, 0))
+        cycle = segment.period / envelope.width if segment.period > 0.0 else _CYCLE_BUCKETS
+        count = min(math.ceil(CYCLES * cycle), envelope.newest + 1)
+        first = envelope.window(envelope.newest - count + 1, count).first
+        return first[[self._input, ROW["displacement"]]]
+
+    def points_a_cycle(self) -> int:
+        """Return the number of points of :meth:`loops` per cycle."""
+        segment = self.segment
+        if segment is None or segment.period <= 0.0 or self._cycles is None:
+            return _CYCLE_BUCKETS
+        return max(1, round(segment.period / self._cycles.width))

@@ -1,0 +1,266 @@
+"""Serve the page: files, and one live connection per page, on loopback only.
+
+The server is a separate, read-only process. Requests are sent to the run like those of ``hilctl
+set`` and ``hilctl stop``, so that a run does not depend on a server.
+"""
+
+import asyncio
+import logging
+import secrets
+import socket
+import time
+from collections.abc import Callable, Sequence
+from contextlib import AsyncExitStack, ExitStack, suppress
+from functools import cache
+from http import HTTPStatus
+from importlib.resources import files
+from typing import Any
+
+from websockets.asyncio.server import ServerConnection, serve
+from websockets.datastructures import Headers
+from websockets.http11 import Request, Response
+from websockets.typing import Subprotocol
+
+from hilctl.base.errors import HilctlError, InputError, RunError
+from hilctl.base.formatting import finite_json
+from hilctl.base.os_errors import ADDRESS_REMEDIES, reason
+from hilctl.live.auth import PROTOCOL, Admission, PendingConnections, bounded
+from hilctl.live.frame_codec import frame_of, nearest_window_s
+from hilctl.live.page_session import MAX_MESSAGE_BYTES, PageMessage, PageSession, answer_text
+from hilctl.live.run_list import RunList
+from hilctl.live.run_reader import RunReader
+from hilctl.live.signals import SIGNALS
+from hilctl.run.client import ask, request_stop
+from hilctl.run.run_folder import RunFolder
+
+FILES = {
+    "/": ("index.html", "text/html; charset=utf-8"),
+    "/live.js": ("live.js", "text/javascript; charset=utf-8"),
+    "/icon.svg": ("icon.svg", "image/svg+xml"),
+    "/live.css": ("live.css", "text/css; charset=utf-8"),
+    "/uplot.js": ("uplot/uPlot.iife.min.js", "text/javascript; charset=utf-8"),
+    "/uplot.css": ("uplot/uPlot.min.css", "text/css; charset=utf-8"),
+}
+"""Path of each, its file and its type."""
+_HEADERS = {
+    "Content-Security-Policy": "default-src 'self'; base-uri 'none'; form-action 'none'; "
+    "frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cache-Control": "no-store",
+    "Connection": "close",
+}
+
+
+@cache
+def _content(name: str) -> bytes:
+    return files("hilctl.live").joinpath("page", name).read_bytes()
+
+
+def file_response(path: str) -> Response:
+    """Return the file at a path; 404 where there is none."""
+    if path not in FILES:
+        return plain_response(HTTPStatus.NOT_FOUND, "no such file")
+    name, kind = FILES[path]
+    return _response(HTTPStatus.OK, kind, _content(name))
+
+
+def plain_response(status: HTTPStatus, text: str) -> Response:
+    """Return a line of text."""
+    return _response(status, "text/plain; charset=utf-8", f"{text}\n".encode())
+
+
+def _response(status: HTTPStatus, kind: str, body: bytes) -> Response:
+    more = {"Content-Type": kind, "Content-Length": str(len(body))}
+    return Response(status.value, status.phrase, Headers({**_HEADERS, **more}), body)
+
+
+_log = logging.getLogger(__name__)
+
+FRAME_S = 1.0 / 30.0
+_STATUS_FRAMES = 6  # values that change more often are unreadable
+_MOST_VIEWERS = 16
+_LIVE = "/live"
+_REQUEST_S = 30.0
+
+
+class LiveServer:
+    """Serves the page of all runs of this user.
+
+    Args:
+        chosen: Returns the run that a page shows by default; None if there is none.
+        port: Port to listen on; 0 for any.
+        clock: Monotonic time in s.
+
+    Attributes:
+        port: Port that it listens on.
+
+    Raises:
+        RunError: The port is not available.
+    """
+
+    def __init__(
+        self,
+        chosen: Callable[[list[RunFolder]], RunFolder | None],
+        port: int = 0,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._clock = clock
+        self._sockets = _listeners(port)
+        self.port = int(self._sockets[0].getsockname()[1])
+        self._token = secrets.token_hex(16)
+        self._admission = Admission(self.port, self._token)
+        self._pending = PendingConnections()
+        self._viewers: set[PageSession] = set()
+        self._feeds = RunList(chosen)
+
+    @property
+    def url(self) -> str:
+        """Address of the page; the token is in the fragment, which browsers never send."""
+        return f"http://127.0.0.1:{self.port}/#{self._token}"
+
+    async def run(self, over: Callable[["LiveServer"], bool]) -> None:
+        """Serve until ``over`` returns true."""
+        settings: dict[str, Any] = {
+            "process_request": self._let_in,
+            "select_subprotocol": _our_protocol,
+            "compression": None,  # slower than loopback
+            "server_header": None,
+            "open_timeout": 3.0,
+            "close_timeout": 1.0,
+            "max_size": MAX_MESSAGE_BYTES,
+            "max_queue": 4,
+            "create_connection": bounded(self._pending),
+            "logger": _quiet(),
+        }
+        async with AsyncExitStack() as stack:
+            for listener in self._sockets:
+                await stack.enter_async_context(serve(self._attend, sock=listener, **settings))
+            await self._tick(over)
+
+    def feed(self, name: str | None) -> RunReader | None:
+        """Return the reader of a run, see :meth:`hilctl.live.run_list.RunList.feed`."""
+        return self._feeds.feed(name)
+
+    def _let_in(self, connection: ServerConnection, request: Request) -> Response | None:
+        upgrade = request.path == _LIVE
+        refused = self._admission.refusal(request.headers, upgrade=upgrade)
+        if refused is None and upgrade and len(self._viewers) >= _MOST_VIEWERS:
+            refused = (HTTPStatus.SERVICE_UNAVAILABLE, "too many pages look on")
+        if request.method != "GET":
+            refused = (HTTPStatus.METHOD_NOT_ALLOWED, "only GET is served")
+        if refused is not None:
+            return plain_response(*refused)
+        if not upgrade:
+            return file_response(request.path.partition("?")[0])
+        self._pending.remove(connection)
+        return None
+
+    async def _attend(self, connection: ServerConnection) -> None:
+        viewer = PageSession(connection, self._answer, self._clock)
+        self._viewers.add(viewer)
+        try:
+            await viewer.attend()
+        finally:
+            self._viewers.discard(viewer)
+
+    async def _answer(self, viewer: PageSession, message: PageMessage) -> str:
+        try:
+            answer = await self._followed(viewer, message)
+        except HilctlError as error:
+            answer = {"ok": False, "error": str(error)}
+        return answer_text(message, **answer)
+
+    async def _followed(self, viewer: PageSession, message: PageMessage) -> dict[str, Any]:
+        feed = self.feed(viewer.view.run)
+        if message.ask == "view":
+            return {"ok": True}
+        if feed is None:
+            raise InputError("no such active run")
+        if message.ask == "stop":
+            # Without a supervisor its loop ramps down by itself.
+            requested = request_stop(feed.folder)
+            return {"ok": requested or not feed.folder.alive, "requested": requested}
+        place = feed.folder.socket
+        answer = await asyncio.to_thread(ask, place, message.request, _REQUEST_S)
+        return {"ok": True, **answer}
+
+    async def _tick(self, over: Callable[["LiveServer"], bool]) -> None:
+        number, due_s = 0, self._clock()
+        while not over(self):
+            self._show(number)
+            number, due_s = number + 1, due_s + FRAME_S
+            now_s = self._clock()
+            # Skip frames if there was no time.
+            due_s = max(due_s, now_s + FRAME_S / 4.0)
+            await asyncio.sleep(due_s - now_s)
+
+    def _show(self, number: int) -> None:
+        now_s = self._clock()
+        self._feeds.look(now_s, [each.view.run for each in self._viewers])
+        self.feed(None)  # read from the first sample, even without a page
+        for feed in self._feeds:
+            feed.poll(now_s)
+        frames: dict[tuple[str, str, float], bytes] = {}
+        for viewer in [each for each in self._viewers if each.ready]:
+            shown, view = self.feed(viewer.view.run), viewer.view
+            status = [] if number % _STATUS_FRAMES else [self._status(shown)]
+            if shown is None:
+                viewer.offer(*status)
+                continue
+            key = (shown.folder.card.name, view.mode, nearest_window_s(view.window_s))
+            if key not in frames:
+                frames[key] = frame_of(shown.scope, view.mode, key[2])
+            viewer.offer(*status, frames[key])
+
+    def _status(self, feed: RunReader | None) -> str:
+        runs = [
+            {"name": run.card.name, "experiment": run.card.experiment} for run in self._feeds.runs
+        ]
+        state: dict[str, Any] = {"kind": "status", "runs": runs}
+        if feed is not None:
+            hz, um = feed.spectrum.points()
+            state |= feed.status()
+            state["spectrum"] = {"hz": hz.tolist(), "um": um.tolist()}
+            state["description"] = feed.description.model_dump()
+            state["signals"] = [[each.name, each.label, each.unit] for each in SIGNALS]
+        return finite_json(state)
+
+
+def _our_protocol(
+    connection: ServerConnection, offered: Sequence[Subprotocol]
+) -> Subprotocol | None:
+    """Select the protocol of the page; the token is offered too, and never selected."""
+    del connection
+    return PROTOCOL if PROTOCOL in offered else None
+
+
+def _quiet() -> logging.Logger:
+    """Return a log that discards messages on invalid requests."""
+    log = _log.getChild("strangers")
+    log.propagate = False
+    log.addHandler(logging.NullHandler())
+    return log
+
+
+def _listeners(port: int) -> list[socket.socket]:
+    """Return sockets on one port of 127.0.0.1 and, if IPv6 is available, of ::1.
+
+    Raises:
+        RunError: The port is not available.
+    """
+    with ExitStack() as stack:
+        try:
+            first = stack.enter_context(socket.create_server(("127.0.0.1", port)))
+            found = [first]
+            if socket.has_ipv6:
+                with suppress(OSError):  # IPv6 is disabled
+                    address = ("::1", first.getsockname()[1])
+                    found.append(socket.create_server(address, family=socket.AF_INET6))
+        except OSError as error:
+            raise RunError(f"port {port} of 127.0.0.1: {reason(error, ADDRESS_REMEDIES)}") from None
+        stack.pop_all()
+        return found

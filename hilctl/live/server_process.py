@@ -1,0 +1,186 @@
+"""Run the servers as processes: beside a run that requested one, or alone.
+
+Beside a run it is started as ``python -m hilctl.live.server_process`` with the supervisor's process number on
+standard input; its first line of output is the address. It ends with its run.
+"""
+
+import asyncio
+import os
+import select
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from typing import Protocol
+
+from hilctl.base.errors import RunError
+from hilctl.live.run_reader import RunReader
+from hilctl.live.server import LiveServer
+from hilctl.machine.rt_setup import be_ordinary
+from hilctl.run.run_folder import RunFolder
+
+_NICE = 5
+_LAST_S = 1.5
+_START_S = 30.0
+
+
+class RunSelector(Protocol):
+    """A server whose end depends on its runs."""
+
+    def feed(self, name: str | None) -> RunReader | None:
+        """Return the reader of a run; None for the default run."""
+        ...
+
+
+class SingleRun:
+    """Returns whether a server has ended: some time after its run, so that pages show the end.
+
+    Args:
+        clock: Monotonic time in s.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._ended_s: float | None = None
+
+    def __call__(self, server: RunSelector) -> bool:
+        """Return whether the server has ended."""
+        feed = server.feed(None)
+        if feed is None or not feed.ended:
+            self._ended_s = None
+        elif self._ended_s is None:
+            self._ended_s = self._clock()
+        return self._ended_s is not None and self._clock() - self._ended_s > _LAST_S
+
+
+def serve_runs(
+    chosen: Callable[[list[RunFolder]], RunFolder | None],
+    over: Callable[[RunSelector], bool],
+    on_url: Callable[[str], None],
+    port: int = 0,
+) -> None:
+    """Serve the page until it is over.
+
+    Args:
+        chosen: See :class:`hilctl.live.server.LiveServer`.
+        over: Returns whether to end the server.
+        on_url: Called with the address of the page, including its token.
+        port: Port to listen on; 0 for any.
+
+    Raises:
+        RunError: The port is not available.
+    """
+    _come_last()
+    server = LiveServer(chosen, port)
+    on_url(server.url)
+    asyncio.run(server.run(over))
+
+
+def serve_foxglove(
+    chosen: Callable[[list[RunFolder]], RunFolder | None],
+    over: Callable[[RunSelector], bool],
+    on_url: Callable[[str], None],
+    port: int | None = None,
+) -> None:
+    """Serve runs to Foxglove and compatible applications until it is over.
+
+    Args:
+        chosen: See :class:`hilctl.live.run_list.RunList`.
+        over: Returns whether to end the server.
+        on_url: Called with the address of the server.
+        port: Port to listen on; 0 for any, None for the default port of the applications.
+
+    Raises:
+        InputError: The library is not installed.
+        RunError: The port is not available.
+    """
+    from hilctl.live.foxglove_server import PORT, FoxgloveServer
+
+    _come_last()  # before the library starts threads, which inherit the priority
+    server = FoxgloveServer(chosen, PORT if port is None else port)
+    on_url(server.url)
+    server.run(over)
+
+
+def _come_last() -> None:
+    """Lower the priority of this process below that of loop, recorder and guardian."""
+    be_ordinary()
+    os.nice(_NICE)
+
+
+@contextmanager
+def served_beside() -> Iterator[str]:
+    """Serve the page of the run that this process is about to supervise.
+
+    Yields:
+        Address of the page, including its token.
+
+    Raises:
+        RunError: The server cannot be started.
+    """
+    process = subprocess.Popen(
+        # -P: never import from the working folder.
+        [sys.executable, "-P", "-m", "hilctl.live.server_process"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        start_new_session=True,  # a Ctrl-C in the terminal is the supervisor's to handle
+        text=True,
+    )
+    try:
+        yield _url_of(process)
+        with suppress(subprocess.TimeoutExpired):  # it first sends the end to its pages
+            process.wait(2.0 * _LAST_S)
+    finally:
+        _end(process)
+
+
+def _url_of(process: "subprocess.Popen[str]") -> str:
+    """Send the supervisor's process number to the server and return its address."""
+    assert process.stdin is not None
+    assert process.stdout is not None
+    with suppress(BrokenPipeError):  # detected by the missing address
+        process.stdin.write(f"{os.getpid()}\n")
+        process.stdin.flush()
+    ready, _, _ = select.select([process.stdout], [], [], _START_S)
+    url = process.stdout.readline().strip() if ready else ""
+    if not url:
+        raise RunError("cannot start the server of the live page")
+    return url
+
+
+def _end(process: "subprocess.Popen[str]") -> None:
+    """Stop the server, even if it is suspended or hangs."""
+    process.terminate()
+    with suppress(subprocess.TimeoutExpired):
+        process.wait(_LAST_S)
+    process.kill()
+    for stream in (process.stdin, process.stdout):
+        if stream is not None:
+            with suppress(OSError):
+                stream.close()
+
+
+def main() -> None:
+    """Serve the run of a supervisor until the run or the supervisor has ended."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    supervisor, ended = int(sys.stdin.readline()), SingleRun()
+
+    def its_run(runs: list[RunFolder]) -> RunFolder | None:
+        return next((run for run in runs if run.card.supervisor == supervisor), None)
+
+    def over(server: RunSelector) -> bool:
+        orphaned = os.getppid() != supervisor and server.feed(None) is None
+        return orphaned or ended(server)
+
+    serve_runs(its_run, over, _say)
+
+
+def _say(url: str) -> None:
+    sys.stdout.write(f"{url}\n")
+    sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,154 @@
+"""What real-time processes ask of Linux and the standard library has no call for.
+
+Everything here concerns the calling process, or where Linux has it so (policy, CPU, timer slack),
+its calling thread. A refusal is an :class:`OSError`.
+"""
+
+import ctypes
+import errno
+import gc
+import os
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+DMA_LATENCY = "/dev/cpu_dma_latency"
+
+_STACK_DEPTH = 250
+_CAP_IPC_LOCK = 14
+_PR_SET_TIMERSLACK = 29
+_MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
+_M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4
+
+
+def _go_down(depth: int) -> None:
+    if depth:
+        _descend(depth - 1)
+
+
+_descend = ctypes.CFUNCTYPE(None, ctypes.c_int)(_go_down)
+"""Uses up stack of C, 2 kB at each depth; Python alone would not."""
+
+
+class LinuxProcess:
+    """This process, on Linux with glibc; see :class:`hilctl.machine.rt_setup.System`."""
+
+    def __init__(self) -> None:
+        self._latency_file: int | None = None
+        self._cpus_before: set[int] | None = None
+
+    @cached_property
+    def _libc(self) -> ctypes.CDLL:
+        return ctypes.CDLL(None, use_errno=True)
+
+    def _call(self, name: str, *arguments: int) -> None:
+        function: Any = getattr(self._libc, name)
+        if function(*map(ctypes.c_long, arguments)) < 0:
+            code = ctypes.get_errno()
+            raise OSError(code, os.strerror(code))
+
+    def read(self, path: str) -> str:
+        """Return the text of a file."""
+        return Path(path).read_text(encoding="utf-8")
+
+    def lockable_bytes(self) -> int | None:
+        """Return how much memory may be locked; None where any amount."""
+        import resource
+
+        limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
+        capable = int(self._status("CapEff"), 16) >> _CAP_IPC_LOCK & 1
+        return None if capable or limit == resource.RLIM_INFINITY else limit
+
+    def mapped_bytes(self) -> int:
+        """Return the size of all that is mapped now."""
+        return int(self._status("VmSize").removesuffix(" kB")) << 10
+
+    def _status(self, name: str) -> str:
+        for line in self.read("/proc/self/status").splitlines():
+            key, _, value = line.partition(":")
+            if key == name:
+                return value.strip()
+        raise OSError(errno.ENODATA, f"/proc/self/status has no {name}")
+
+    def freeze_gc(self) -> None:
+        """Collect once, then never again."""
+        gc.collect()
+        gc.freeze()
+        gc.disable()
+
+    def prefault(self, heap_bytes: int) -> None:
+        """Claim heap and stack now, and keep them."""
+        mallopt: Any = getattr(self._libc, "mallopt", None)
+        if mallopt is None:
+            raise OSError(errno.ENOSYS, "this C library is not glibc")
+        mallopt(_M_TRIM_THRESHOLD, -1)  # freed memory stays with the process,
+        mallopt(_M_MMAP_MAX, 0)  # and large arrays come from it
+        touched = b"\x01" * heap_bytes
+        del touched
+        _descend(_STACK_DEPTH)
+
+    def lock_memory(self, *, untouched: bool = False) -> None:
+        """Keep in RAM every page that is there now, and every page that is touched later.
+
+        Args:
+            untouched: Also read and lock now what is mapped and was never touched. In the loop
+                process that would be 160 MB of LLVM and OpenBLAS.
+        """
+        on_fault = 0 if untouched else _MCL_ONFAULT
+        self._call("mlockall", _MCL_CURRENT | _MCL_FUTURE | on_fault)
+
+    def set_timer_slack(self, slack_ns: int) -> None:
+        """Let timers fire this much late; 0 for the system's own value."""
+        self._call("prctl", _PR_SET_TIMERSLACK, slack_ns, 0, 0, 0)
+
+    def hold_dma_latency(self, latency_us: int) -> None:
+        """Keep CPUs out of idle states that take longer to leave."""
+        descriptor = os.open(DMA_LATENCY, os.O_WRONLY)  # the wish lasts as long as it is open
+        try:
+            os.write(descriptor, latency_us.to_bytes(4, "little", signed=True))
+        except OSError:
+            os.close(descriptor)
+            raise
+        self._latency_file = descriptor
+
+    def pin(self, cpu: int) -> None:
+        """Run on this CPU only."""
+        before = os.sched_getaffinity(0)
+        os.sched_setaffinity(0, {cpu})
+        self._cpus_before = before
+
+    def set_fifo(self, priority: int) -> None:
+        """Run before all that is not real-time; children and new threads start without it."""
+        policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
+        os.sched_setscheduler(0, policy, os.sched_param(priority))
+
+    def set_ordinary(self) -> None:
+        """Share the CPU with everybody else."""
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+
+    def policy(self, process: int = 0) -> int:
+        """Return a scheduling policy, such as ``os.SCHED_OTHER``: of a process, or of this one."""
+        return os.sched_getscheduler(process) & ~os.SCHED_RESET_ON_FORK
+
+    def nice(self) -> int:
+        """Return how far this thread stands back behind others; below 0, before them."""
+        return os.getpriority(os.PRIO_PROCESS, 0)
+
+    def set_nice(self, nice: int) -> None:
+        """Set it, for the threads and processes too that this one starts from now on."""
+        os.setpriority(os.PRIO_PROCESS, 0, nice)
+
+    def undo(self) -> None:
+        """Go back to an ordinary process, as far as each step was taken."""
+        # First: the rest takes as long as it takes, and must not keep others from a CPU.
+        self.set_ordinary()
+        if self._cpus_before is not None:
+            os.sched_setaffinity(0, self._cpus_before)
+            self._cpus_before = None
+        if self._latency_file is not None:
+            os.close(self._latency_file)
+            self._latency_file = None
+        self.set_timer_slack(0)
+        self._call("munlockall")
+        gc.unfreeze()
+        gc.enable()

@@ -1,0 +1,171 @@
+"""Wake-up lateness, measured as the loop has it: same pacer, same set-up, a process of its own.
+
+Run as ``python -m hilctl.machine.timer_latency`` with a JSON job on standard input, it measures and
+answers with the steps of the set-up as JSON on standard output.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hilctl.base.device import Clock
+from hilctl.base.errors import InputError, RunError
+from hilctl.base.types import I64
+from hilctl.loop.pacer import LatePolicy, LateRules, Pacer, SystemClock
+from hilctl.machine.rt_setup import SetUpStep, prepare
+from hilctl.machine.settings import Realtime
+
+MAX_RATE_HZ = 20e3
+"""Highest rate that is measured, in ticks a second."""
+
+_POLL_S = 0.1
+_PATIENCE_S = 30.0
+_START_DELAY_NS = 50_000_000
+_HOPELESS_NS = 500_000_000
+_QUANTILES = (50.0, 90.0, 99.0, 99.9)
+
+
+@dataclass(frozen=True, slots=True)
+class Latency:
+    """How late a process woke.
+
+    Attributes:
+        rate_hz: Ticks a second.
+        late_ns: int64[m], time from each tick's deadline to its wake-up.
+        steps: How the process was set up.
+    """
+
+    rate_hz: float
+    late_ns: I64
+    steps: tuple[SetUpStep, ...]
+
+    @property
+    def longest_period_ns(self) -> float:
+        """Longest time from one wake-up to the next."""
+        return 1e9 / self.rate_hz + float(np.diff(self.late_ns).max(initial=0))
+
+    @property
+    def kept_rate_hz(self) -> float:
+        """Highest rate at which these delays would not have doubled any period."""
+        return 1e9 / max(1.0, float(np.diff(self.late_ns).max(initial=0)))
+
+    @property
+    def kept(self) -> bool:
+        """Whether no period was over twice the nominal one, RTXI's rule for real time."""
+        return self.longest_period_ns <= 2e9 / self.rate_hz
+
+    def percentiles_us(self) -> dict[str, float]:
+        """Return p50, p90, p99, p99.9 and max of the lateness."""
+        values = np.percentile(self.late_ns, _QUANTILES) * 1e-3
+        named = {f"p{q:g}": float(v) for q, v in zip(_QUANTILES, values, strict=True)}
+        return {**named, "max": float(self.late_ns.max()) * 1e-3}
+
+
+def measure(
+    rate_hz: float,
+    seconds: float,
+    settings: Realtime,
+    on_progress: Callable[[float], None] = lambda _: None,
+    policy: LatePolicy = "catch_up",
+) -> Latency:
+    """Measure wake-up lateness in a new process.
+
+    Args:
+        rate_hz: Ticks a second.
+        seconds: How long.
+        settings: How that process is set up.
+        on_progress: Called a few times a second with the time since the start, in s.
+        policy: What follows a tick that woke a period late: the others at once, each of them late,
+            or with ``skip`` the next that is not due yet, so that a stall counts once.
+
+    Raises:
+        InputError: The rate is beyond what is measured.
+        RunError: The process failed, or took far longer than asked.
+    """
+    if not 0.0 < rate_hz <= MAX_RATE_HZ:
+        raise InputError(f"rate must be in (0, {MAX_RATE_HZ:g}] Hz to be measured: {rate_hz:g}")
+    with tempfile.TemporaryDirectory(prefix="hilctl-") as folder:
+        output = Path(folder) / "late_ns.npy"
+        job = {
+            "output": str(output),
+            "rate_hz": rate_hz,
+            "ticks": max(2, round(rate_hz * seconds)),
+            "settings": settings.model_dump(),
+            "parent": os.getpid(),
+            "policy": policy,
+        }
+        answer = _ask(json.dumps(job), seconds, on_progress)
+        steps = tuple(SetUpStep(**step) for step in json.loads(answer))
+        return Latency(rate_hz, np.load(output), steps)
+
+
+def _ask(job: str, seconds: float, on_progress: Callable[[float], None]) -> str:
+    started = time.monotonic()
+    with subprocess.Popen(
+        [sys.executable, "-P", "-m", "hilctl.machine.timer_latency"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        start_new_session=True,  # a Ctrl-C in the terminal comes to the parent alone
+    ) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        try:
+            with suppress(BrokenPipeError):  # it died at once, which its exit code tells
+                process.stdin.write(job)
+                process.stdin.close()
+            while process.poll() is None:
+                elapsed_s = time.monotonic() - started
+                if elapsed_s > seconds + _PATIENCE_S:
+                    raise RunError(f"the measurement did not end in {elapsed_s:.0f} s")
+                on_progress(elapsed_s)
+                time.sleep(_POLL_S)
+            answer = process.stdout.read()
+        finally:
+            process.kill()
+    if process.returncode:
+        raise RunError(f"the measurement ended with exit code {process.returncode}")
+    return answer
+
+
+def watch(pacer: Pacer, late_ns: I64, clock: Clock, supervised: Callable[[], bool]) -> int:
+    """Fill ``late_ns`` (int64[m]) tick by tick, until it is full or nobody waits for it.
+
+    Also until the ticks are far behind: a real-time process must not run without a pause.
+
+    Returns:
+        Ticks measured.
+    """
+    pacer.begin(clock.now_ns() + _START_DELAY_NS)
+    for k in range(late_ns.size):
+        pacer.wait()
+        late_ns[k] = pacer.late_ns
+        if pacer.late_ns > _HOPELESS_NS or not supervised():
+            return k + 1
+    return late_ns.size
+
+
+def _run(job: dict[str, Any]) -> tuple[SetUpStep, ...]:
+    clock = SystemClock()
+    period_ns = 1e9 / job["rate_hz"]
+    pacer = Pacer(clock, period_ns, job["policy"], LateRules(period_ns))
+    late_ns = np.zeros(job["ticks"], dtype=np.int64)
+    # After the array: memory that is claimed later would be faulted in while lateness is measured.
+    steps = prepare(Realtime(**job["settings"]))
+    ticks = watch(pacer, late_ns, clock, lambda: os.getppid() == job["parent"])
+    np.save(job["output"], late_ns[:ticks])
+    return steps
+
+
+if __name__ == "__main__":
+    json.dump([asdict(step) for step in _run(json.load(sys.stdin))], sys.stdout)

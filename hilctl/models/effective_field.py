@@ -1,0 +1,205 @@
+"""Hysteresis of an effective field, with the losses that follow the permeability."""
+
+import math
+from collections.abc import Iterator
+from typing import Annotated, Literal, Self
+
+import numpy as np
+
+from hilctl.base.strict import Field, StrictModel, model_validator
+from hilctl.base.types import F64
+from hilctl.kernels.field import Bank, Losses, field_forward, field_inverse
+from hilctl.models.base import HysteresisModel, Operator, Thresholds, Weights, refuse
+from hilctl.models.preisach import cell_problems, table_problems
+
+_TOLERANCE_UM = 1e-6
+_EVEN = 1e-3
+
+Time = Annotated[float, Field(ge=0.0, le=1.0)]
+NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+
+
+def even_excess(span: float) -> float:
+    """Return e_0, below which the excess loss is even, for a span of effective fields."""
+    return _EVEN * span
+
+
+class FieldLosses(StrictModel):
+    """What a command is ahead of the field by: v = w + z, z + decay_s z' = h(e).
+
+    e = field_s w' + output_s m', h(e) = e (1 + growth |e| + bend e^2 + excess / sqrt(|e| + e_0)).
+
+    Attributes:
+        field_s: In s; a lag of the field that is always the same.
+        output_s: In command units s a um; eddy currents, which follow the slope of the hysteresis.
+        decay_s: In s; the field inside a rod comes later than that at its surface.
+        growth: One over the command's unit.
+        bend: One over the command's unit squared.
+        excess: Square root of the command's unit; losses of domain walls in motion.
+    """
+
+    field_s: Time = 0.0
+    output_s: NotNegative = 0.0
+    decay_s: Time = 0.0
+    growth: NotNegative = 0.0
+    bend: NotNegative = 0.0
+    excess: NotNegative = 0.0
+
+    def sampled(self, sample_rate_hz: float, span: float) -> Losses:
+        """Return them as kernels take them, for a span of effective fields.
+
+        Commands are means over a sample, and so must what is lost of them be: that at its end
+        would be later the shorter the samples are.
+        """
+        lags = self.decay_s * sample_rate_hz
+        left = math.exp(-1.0 / lags) if lags > 0.0 else 0.0
+        return (
+            self.field_s * sample_rate_hz,
+            self.output_s * sample_rate_hz,
+            left,
+            self.growth,
+            self.bend,
+            self.excess,
+            even_excess(span),
+            (1.0 - left) * lags,
+        )
+
+
+class OutputCurve(StrictModel):
+    """A line through points, from what the operators give to displacement, both rising.
+
+    Attributes:
+        operators_um: What the operators give, of which 0 is at rest.
+        displacement_um: Displacement, without the model's offset. The ends go on straight.
+    """
+
+    operators_um: Weights
+    displacement_um: Weights
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        refuse(self._problems())
+        return self
+
+    def _problems(self) -> Iterator[str]:
+        if len(self.operators_um) != len(self.displacement_um) or len(self.operators_um) < 2:
+            yield "the curve needs as many displacement_um as operators_um, and two at least"
+        for name in ("operators_um", "displacement_um"):
+            if any(np.diff(getattr(self, name)) <= 0.0):
+                yield f"{name} must rise for the inverse to exist: {list(getattr(self, name))}"
+
+
+class FieldModel(HysteresisModel):
+    """Plays and drags of an effective field u = w + coupling m, a curve after them, losses before.
+
+    Small loops inside a large one are what sums of plays of the command get wrong: theirs look
+    alike wherever they lie. Here they change with the output (the curve, the coupling), and, by
+    the drags, with how often they have run. See :mod:`hilctl.kernels.field` for the equations.
+
+    Outputs come a sample after the commands of a run, as those of a lag do: put it into a
+    :class:`~hilctl.models.staged.StagedModel`.
+
+    Attributes:
+        thresholds: r of each line of plays, rising from 0; the first is 0.
+        lengths: k of each drag, > 0.
+        lowest: Lower end of the first cell of u, in the input unit.
+        cell: Width of a cell of the plays, > 0.
+        slopes: For each line of plays, then for each drag, what it rises by in each cell, um per
+            input unit, >= 0; > 0 throughout the first line, which is what makes the inverse exist.
+            All plays have the same cells, and all drags have: over the same range as the plays'.
+        coupling: Effective field for each um of the operators', in input units a um.
+        curve: From the operators' output to displacement.
+        losses: What the command is ahead by.
+    """
+
+    kind: Literal["field"] = "field"
+    thresholds: Thresholds
+    lengths: Thresholds = ()
+    lowest: float
+    cell: float
+    slopes: tuple[Weights, ...]
+    coupling: float = 0.0
+    curve: OutputCurve
+    losses: FieldLosses = FieldLosses()
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        plays, drags = self._lines()
+        refuse(
+            (
+                *self._operator_problems(),
+                *cell_problems(self.cell, plays),
+                *table_problems(drags),
+            )
+        )
+        return self
+
+    def _operator_problems(self) -> Iterator[str]:
+        if not self.thresholds or self.thresholds[0] != 0.0:
+            yield f"the first threshold must be 0: {list(self.thresholds[:1])}"
+        if any(np.diff(self.thresholds) <= 0.0):
+            yield f"thresholds must rise: {list(self.thresholds)}"
+        if any(not length > 0.0 for length in self.lengths):
+            yield f"lengths must be > 0: {list(self.lengths)}"
+        if len(self.slopes) != len(self.thresholds) + len(self.lengths):
+            yield (
+                f"slopes must have one line a threshold and one a length: {len(self.slopes)} for "
+                f"{len(self.thresholds)} and {len(self.lengths)}"
+            )
+
+    def _lines(self) -> tuple[tuple[Weights, ...], tuple[Weights, ...]]:
+        """Return the slopes of the plays, and those of the drags."""
+        plays = len(self.thresholds)
+        return self.slopes[:plays], self.slopes[plays:]
+
+    @property
+    def operators(self) -> int:
+        """Number of plays, and of cells of drags, each of which remembers something."""
+        return len(self.thresholds) + sum(map(len, self._lines()[1]))
+
+    def _numbers(self) -> int:
+        """Return how many numbers the memory has before the previous input."""
+        return self.operators + 3 * len(self.lengths) + 5
+
+    def _bank(self) -> Bank:
+        slopes, drags = map(np.array, self._lines())
+        lines, cells = slopes.shape
+        wide = drags.shape[1] if drags.size else cells
+        values = np.zeros((lines, cells + 1))
+        np.cumsum(slopes * self.cell, axis=1, out=values[:, 1:])
+        place = -self.lowest / self.cell
+        of_rest = int(min(max(np.floor(place), 0.0), cells - 1.0))
+        values -= values[:, [of_rest]] + slopes[:, [of_rest]] * self.cell * (place - of_rest)
+        grid = np.array([self.lowest, self.cell, cells, self.cell * (cells / wide), wide])
+        lengths = np.array(self.lengths, dtype=np.float64)
+        return np.array(self.thresholds), lengths, values.ravel(), drags.ravel(), grid
+
+    def _span(self) -> tuple[float, float, float]:
+        """Return the lowest and the highest u that is tried, and the tolerance."""
+        width = self.cell * len(self.slopes[0])
+        return self.lowest - width, self.lowest + 2.0 * width, _TOLERANCE_UM
+
+    def _curve(self) -> tuple[F64, F64]:
+        return np.array(self.curve.operators_um), np.array(self.curve.displacement_um)
+
+    def forward(self, sample_rate_hz: float) -> Operator:
+        """Return the operator from command to um, at rest."""
+        span, bank = self._span(), self._bank()
+        losses = self.losses.sampled(sample_rate_hz, self.cell * len(self.slopes[0]))
+        coupling, curve = self.coupling, self._curve()
+
+        def run(v: F64, memory: F64, out: F64) -> None:
+            field_forward(v, span, bank, coupling, losses, curve, memory, out)
+
+        return Operator(run, self._numbers(), output_offset=self.output_offset_um)
+
+    def inverse(self, sample_rate_hz: float) -> Operator:
+        """Return the operator from um to command, at rest."""
+        span, bank = self._span(), self._bank()
+        losses = self.losses.sampled(sample_rate_hz, self.cell * len(self.slopes[0]))
+        coupling, curve = self.coupling, self._curve()
+
+        def run(y: F64, memory: F64, out: F64) -> None:
+            field_inverse(y, span, bank, coupling, losses, curve, memory, out)
+
+        return Operator(run, self._numbers(), input_offset=-self.output_offset_um)

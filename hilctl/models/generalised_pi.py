@@ -1,0 +1,115 @@
+"""The generalised Prandtl-Ishlinskii model: plays between envelope functions (1.17-1.20)."""
+
+from collections.abc import Iterator
+from typing import Literal, Self
+
+import numpy as np
+
+from hilctl.base.strict import StrictModel, model_validator
+from hilctl.base.types import F64
+from hilctl.kernels.generalised_play import envelope_forward, envelope_inverse
+from hilctl.models.base import (
+    Operator,
+    Thresholds,
+    Weights,
+    length_problems,
+    play_weight_problems,
+    refuse,
+    threshold_problems,
+)
+from hilctl.models.implicit_base import BoundedInputModel
+from hilctl.models.plays import inverse_plays
+
+
+class PlayEnvelope(StrictModel):
+    """``height tanh(slope v + shift) + level``, as in Al Janaideh's generalised plays.
+
+    Attributes:
+        height: Half the difference of both saturated ends, > 0.
+        slope: Per command unit, > 0.
+        shift: Where it is steepest, times -slope.
+        level: Middle between both saturated ends.
+    """
+
+    height: float = 1.0
+    slope: float
+    shift: float = 0.0
+    level: float = 0.0
+
+    def array(self) -> F64:
+        """Return float64[4], as the kernels take it."""
+        return np.array([self.height, self.slope, self.shift, self.level])
+
+
+def _envelope_problems(name: str, envelope: PlayEnvelope) -> Iterator[str]:
+    for key in ("height", "slope"):
+        value = getattr(envelope, key)
+        if not value > 0.0:
+            yield f"{name}.{key} must be > 0 for the envelope to rise: {value!r}"
+
+
+class GeneralisedModel(BoundedInputModel):
+    """p_0 S_0[v] + sum p_i S_i[v], asymmetric and saturating, rate-independent (1.20).
+
+    Between a falling envelope that lies above the rising one the model holds still, and its inverse
+    jumps where it turns. Where the falling one would lie below, it follows the rising one.
+
+    Attributes:
+        direct: p_0, um, > 0.
+        weights: p_1 to p_n, um, >= 0.
+        thresholds: r_1 to r_n, in the unit of the envelopes, rising from 0.
+        rising: gamma_l, which the command climbs along.
+        falling: gamma_r, which it comes down along.
+    """
+
+    kind: Literal["generalised"] = "generalised"
+    direct: float
+    weights: Weights
+    thresholds: Thresholds
+    rising: PlayEnvelope
+    falling: PlayEnvelope
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        refuse(
+            (
+                *length_problems("weights", self.weights, self.thresholds),
+                *play_weight_problems(self.direct, self.weights),
+                *threshold_problems("r", self.thresholds),
+                *_envelope_problems("rising", self.rising),
+                *_envelope_problems("falling", self.falling),
+            )
+        )
+        return self
+
+    @property
+    def operators(self) -> int:
+        """Number of operators with memory: the plays, and the one of threshold 0."""
+        return len(self.weights) + 1
+
+    def forward(self, sample_rate_hz: float) -> Operator:
+        """Return the operator from command to um, at rest; no rate makes a difference."""
+        del sample_rate_hz
+        rising, falling, direct = self.rising.array(), self.falling.array(), self.direct
+        thresholds, weights = np.array(self.thresholds), np.array(self.weights)
+
+        def run(v: F64, memory: F64, out: F64) -> None:
+            envelope_forward(v, rising, falling, direct, thresholds, weights, memory, out)
+
+        return Operator(run, self.operators, output_offset=self.output_offset_um)
+
+    def inverse(self, sample_rate_hz: float) -> Operator:
+        """Return the operator from um to command, at rest: inverse plays, inverse envelopes."""
+        del sample_rate_hz
+        rising, falling = self.rising.array(), self.falling.array()
+        low, high = self.command_span
+        direct, weights, thresholds = inverse_plays(
+            self.direct, np.array(self.weights), np.array(self.thresholds)
+        )
+
+        def run(y: F64, memory: F64, out: F64) -> None:
+            envelope_inverse(
+                y, rising, falling, low, high, direct, thresholds, weights, memory, out
+            )
+
+        return Operator(run, self.operators, input_offset=-self.output_offset_um)

@@ -1,0 +1,47 @@
+"""Model files: YAML in and out."""
+
+from pathlib import Path
+from typing import Annotated, TypeAlias
+
+from hilctl.base.files import TextFiles
+from hilctl.base.strict import Field, StrictModel
+from hilctl.base.yaml import Document, dump, load_document
+from hilctl.models.base import HysteresisModel
+from hilctl.models.refined import Refinable, RefinedModel
+
+AnyModel: TypeAlias = Annotated[Refinable | RefinedModel, Field(discriminator="kind")]
+
+
+class ModelFile(StrictModel):
+    """A model file: one model under the key ``model``."""
+
+    model: AnyModel
+
+
+def load_model(path: Path, files: TextFiles | None = None) -> HysteresisModel:
+    """Read a model file.
+
+    Args:
+        path: The file.
+        files: Where it is read from; the disk where None.
+
+    Raises:
+        InputError: The file can't be read.
+        ConfigError: It breaks a rule, or the model can't be inverted; all problems are listed.
+    """
+    return load_document(path, files).validate(ModelFile).model
+
+
+def parse_model(name: str, text: str) -> HysteresisModel:
+    """Read a model from a YAML text, for example a recording's attachment.
+
+    Raises:
+        ConfigError: See :func:`load_model`.
+    """
+    return Document(name, text).validate(ModelFile).model
+
+
+def dump_model(model: HysteresisModel) -> str:
+    """Return a model as YAML; reading it back gives the same model, bit for bit."""
+    mapping = {"model": {"kind": getattr(model, "kind"), **model.to_mapping()}}  # noqa: B009
+    return dump(mapping)

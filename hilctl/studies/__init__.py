@@ -1,0 +1,6 @@
+"""Experiments of several runs.
+
+campaign/      runs of one experiment over a grid of parameters
+characterise/  measure a connected actuator, then identify and validate a model
+multi_run/     reports of many runs
+"""

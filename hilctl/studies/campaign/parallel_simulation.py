@@ -1,0 +1,144 @@
+"""A campaign of simulated runs that need no real time: at once, over processes or a Dask cluster.
+
+Each run is made of the texts that were checked, and gives back its recording as bytes: no worker
+needs to see the campaign's folder, and a file appears in it whole or not at all. The coil begins
+each run with the heat that it would have if the steps and their pauses followed each other.
+"""
+
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from hilctl.base.errors import HilctlError, InputError
+from hilctl.base.files import TextFiles, write_file
+from hilctl.base.yaml import Document
+from hilctl.experiment.load import resolve
+from hilctl.experiment.preflight import check
+from hilctl.identify.parallel import streams
+from hilctl.recording.reader import read
+from hilctl.run.unpaced import run_unpaced
+from hilctl.studies.campaign.campaign_runner import (
+    Campaign,
+    CampaignHost,
+    CampaignResult,
+    is_harmless,
+)
+from hilctl.studies.campaign.plan import CampaignPlan, PlannedStep, planned
+from hilctl.studies.campaign.steps import CampaignSteps
+from hilctl.studies.campaign.store import new_recording, standing_runs
+from hilctl.studies.campaign.table import CampaignRow
+from hilctl.studies.multi_run.columns import COMPLETED
+from hilctl.studies.multi_run.digest import RunDigest, digest_of
+from hilctl.studies.multi_run.run_figures import RunFigures
+
+
+@dataclass(frozen=True, slots=True)
+class FastTask:
+    """One run, as text.
+
+    Attributes:
+        experiment: The experiment as YAML.
+        files: Texts of the files that it refers to, by absolute path.
+        folder: Folder that file names in it are relative to.
+        heat_a2: Heat of the coil before it, in A^2.
+    """
+
+    experiment: str
+    files: Mapping[str, str]
+    folder: str
+    heat_a2: float
+
+
+@dataclass(frozen=True, slots=True)
+class FastRun:
+    """What became of a run.
+
+    Attributes:
+        recording: Its recording, as bytes; empty where it was refused.
+        code: ``completed``, ``fault`` or ``refused``.
+        reason: One line for people.
+        harmless: Whether it says nothing against running the next one.
+        digest: What its recording says; None where it was not completed.
+    """
+
+    recording: bytes
+    code: str
+    reason: str
+    harmless: bool
+    digest: RunDigest | None = None
+
+
+def run_task(task: FastTask) -> FastRun:
+    """Run one step, on whatever machine this is called."""
+    document = Document("experiment", task.experiment)
+    loaded = resolve(document, Path(task.folder), files=TextFiles(task.files))
+    with tempfile.TemporaryDirectory(prefix="hilctl-campaign-") as folder:
+        output = Path(folder) / "run.mcap"
+        try:
+            result = run_unpaced(check(loaded, task.heat_a2), output)
+        except HilctlError as error:
+            return FastRun(b"", "refused", str(error), harmless=True)
+        content, recording = output.read_bytes(), read(output)
+        harmless = result.code == COMPLETED or is_harmless(result)
+        digest = digest_of(recording) if result.code == COMPLETED else None
+        return FastRun(content, result.code, result.reason, harmless, digest)
+
+
+def planned_fast(campaign: CampaignSteps, folder: Path) -> CampaignPlan:
+    """Return the plan of a campaign whose runs need no real time.
+
+    Raises:
+        ConfigError: One or more steps must not be run.
+        InputError: A device is not a simulated one.
+    """
+    plan = planned(campaign, folder, standing_runs(folder) if folder.is_dir() else {})
+    for each in plan.steps:
+        info = each.loaded.device.info
+        if not info.simulated:
+            rule = "only a simulated device can do without real time"
+            raise InputError(f"--fast: {each.step.text}: {info.name}: {rule}")
+    return plan
+
+
+def run_fast(plan: CampaignPlan, host: CampaignHost, scheduler: str = "none") -> CampaignResult:
+    """Run what is left of a campaign as fast as it goes.
+
+    Args:
+        plan: Its plan.
+        host: Who watches.
+        scheduler: Where runs go, see :func:`hilctl.identify.parallel.streams`.
+
+    Raises:
+        InputError: There is no room, the table can't be written, or the scheduler can't be reached.
+    """
+    plan.require_room()
+    left = plan.left
+    with streams(scheduler) as stream:
+        series = Campaign(plan, host)
+        series.keep()
+        runs = stream(run_task, [_task(each) for each in left])
+        for number, (each, run) in enumerate(zip(left, runs, strict=True), 1):
+            _take(series, each, run)
+            host.on_progress(number / len(left), f"{len(left) - number} of {len(left)} runs left")
+            if not run.harmless:
+                return series.result(f"{each.step.text}: {run.reason}")
+    return series.result()
+
+
+def _task(each: PlannedStep) -> FastTask:
+    loaded = each.loaded
+    folder = str(loaded.folder.resolve())
+    return FastTask(loaded.yaml_text, dict(loaded.files.texts), folder, each.heat_a2)
+
+
+def _take(series: Campaign, each: PlannedStep, run: FastRun) -> None:
+    name = series.plan.campaign.config.name
+    if not run.recording:
+        series.add(each, CampaignRow(f"refused: {run.reason}", code="refused"))
+        return
+    path = new_recording(series.plan.folder, name, each.step.number)
+    write_file(path, lambda stream: stream.write(run.recording), overwrite=False)
+    result = COMPLETED if run.code == COMPLETED else f"{run.code}: {run.reason}"
+    figures = run.digest.figures if run.digest else RunFigures()
+    series.add(each, CampaignRow(result, figures, path.name, run.code, digest=run.digest))

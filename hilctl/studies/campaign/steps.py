@@ -1,0 +1,214 @@
+"""A campaign's steps, in the order in which they are run: each is settings over one experiment."""
+
+import json
+import math
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hilctl.base.errors import ConfigError, ConfigProblem, InputError
+from hilctl.base.files import TextFiles
+from hilctl.base.yaml import Document, Loc, dotted, load_document
+from hilctl.experiment.device import device_class, known_devices
+from hilctl.experiment.load import LoadedExperiment, named_from, resolve
+from hilctl.studies.campaign.file import CampaignFile
+from hilctl.studies.campaign.parameter_grid import MOST_STEPS, Point, groups_of, points
+
+_SEEDS = 1_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class CampaignStep:
+    """One step of a campaign: one run.
+
+    Attributes:
+        number: Its place in the order, from 1.
+        point: A value for each varied key; empty for a reference run.
+        repeat: Which repeat of the point it is, or which reference run, from 1.
+        is_reference: Whether it is a reference run.
+        settings: ``key=value`` texts over the base experiment.
+    """
+
+    number: int
+    point: Point
+    repeat: int
+    is_reference: bool
+    settings: tuple[str, ...]
+
+    @property
+    def text(self) -> str:
+        """The step in words: its number and its values."""
+        values = ", ".join(f"{key}={cell(value)}" for key, value in self.point.items())
+        return f"step {self.number} ({values or f'reference run {self.repeat}'})"
+
+
+@dataclass(frozen=True, slots=True)
+class CampaignSteps:
+    """A campaign file with its steps, none of them checked.
+
+    Attributes:
+        config: The file.
+        document: Where each of its values stands.
+        experiment: File of the base experiment.
+        settings: ``key=value`` texts over it that came from outside of the campaign file.
+        keys: The varied keys.
+        steps: The steps in order.
+    """
+
+    config: CampaignFile
+    document: Document
+    experiment: Path
+    settings: tuple[str, ...]
+    keys: tuple[str, ...]
+    steps: tuple[CampaignStep, ...]
+
+    def load(self, step: CampaignStep, files: TextFiles) -> LoadedExperiment:
+        """Return the experiment of a step.
+
+        Raises:
+            InputError: It, or what it names, can't be read.
+            ConfigError: It breaks rules.
+        """
+        document = load_document(self.experiment, files)
+        return resolve(document, self.experiment.parent, self.settings_for(step, files), files)
+
+    def settings_for(self, step: CampaignStep, files: TextFiles) -> list[str]:
+        """Return all ``key=value`` texts of a step, outermost last.
+
+        Each run of a simulated device gets noise of its own, the same whenever it is run.
+
+        Raises:
+            InputError: The base experiment can't be read.
+            ConfigError: A setting is none.
+        """
+        settings = [*self.settings, *step.settings]
+        document = load_document(self.experiment, files)
+        for text in settings:
+            document.set(text)
+        device = document.data.get("device")
+        kind = device.get("kind") if isinstance(device, dict) else None
+        if "device.seed" in self.keys or kind not in known_devices():
+            return settings
+        field = device_class(str(kind)).Options.model_fields.get("seed")
+        first = device.get("seed", field.default) if field and isinstance(device, dict) else None
+        if isinstance(first, int):
+            own = json.dumps([step.settings, step.repeat, step.is_reference])
+            settings.append(f"device.seed={first + zlib.crc32(own.encode()) % _SEEDS}")
+        return settings
+
+
+def load_campaign(path: Path, settings: Sequence[str] = ()) -> CampaignSteps:
+    """Read a campaign file.
+
+    Args:
+        path: The file.
+        settings: ``key=value`` texts over its base experiment.
+
+    Raises:
+        InputError: It can't be read.
+        ConfigError: Rules are broken; all of them are listed.
+    """
+    return campaign_of(load_document(path), path.parent, settings)
+
+
+def campaign_of(document: Document, folder: Path, settings: Sequence[str]) -> CampaignSteps:
+    """Return a campaign and its steps.
+
+    Args:
+        document: The campaign.
+        folder: What the experiment's file name is relative to.
+        settings: ``key=value`` texts over its base experiment.
+
+    Raises:
+        ConfigError: Rules are broken; all of them are listed.
+    """
+    config = document.validate(CampaignFile)
+    groups, broken = groups_of(config.vary)
+    keys = tuple(dict.fromkeys(key for group in groups for key in group[0]))
+    count = config.repeat * math.prod(map(len, groups))
+    if count > MOST_STEPS:
+        broken.append(((), f"must make at most {MOST_STEPS} steps", f"{count}", ""))
+    problems = [
+        ConfigProblem(document.where(("vary", *loc)), dotted(("vary", *loc)), rule, value, hint)
+        for loc, rule, value, hint in broken
+    ]
+    fixed = [*config.set, *(key_of(text) for text in settings)]
+    problems += [
+        ConfigProblem(
+            document.where(_loc_of(config, key)), f"vary.{key}", f"is set to one value by {by}"
+        )
+        for key in keys
+        if (by := next((each for each in fixed if _clash(each, key)), None))
+    ]
+    if config.condition is not None and "condition" in {key.split(".")[0] for key in keys}:
+        where = document.where(("condition",))
+        problems.append(ConfigProblem(where, "condition", "must not stand here where it is varied"))
+    if problems:
+        raise ConfigError(problems)
+    steps = tuple(_steps(config, points(groups, config.order, config.seed, config.repeat)))
+    experiment = folder / config.experiment
+    from_here = tuple(named_from(experiment.parent, text) for text in settings)
+    return CampaignSteps(config, document, experiment, from_here, keys, steps)
+
+
+def _clash(one: str, other: str) -> bool:
+    return one == other or one.startswith(f"{other}.")
+
+
+def _loc_of(config: CampaignFile, key: str) -> Loc:
+    if isinstance(config.vary, Mapping):
+        return ("vary", key)
+    return ("vary", next(n for n, group in enumerate(config.vary) if key in group), key)
+
+
+def _steps(config: CampaignFile, found: Sequence[tuple[Point, int]]) -> Iterator[CampaignStep]:
+    common = [f"name={json.dumps(config.name)}", *settings_of(config.set)]
+    if config.condition is not None:
+        given = config.condition.model_dump(exclude_unset=True)
+        common.append(setting("condition", given))
+    reference = config.reference_run
+    number = again = 0
+    for place, (point, repeat) in enumerate(found):
+        if reference is not None and place % reference.every == 0:
+            number, again = number + 1, again + 1
+            yield _reference(number, again, common, reference.set)
+        number += 1
+        yield CampaignStep(number, point, repeat, False, (*common, *settings_of(point)))
+    if reference is not None:
+        yield _reference(number + 1, again + 1, common, reference.set)
+
+
+def _reference(
+    number: int, again: int, common: list[str], given: Mapping[str, Any]
+) -> CampaignStep:
+    return CampaignStep(number, {}, again, True, (*common, *settings_of(given)))
+
+
+def settings_of(given: Mapping[str, Any]) -> list[str]:
+    """Return keys and values as ``key=value`` texts."""
+    return [setting(key, value) for key, value in given.items()]
+
+
+def setting(key: str, value: Any) -> str:
+    """Return the ``key=value`` text that sets a key to any plain value."""
+    return f"{key}={json.dumps(value, ensure_ascii=False)}"
+
+
+def key_of(text: str) -> str:
+    """Return the key of a ``key=value`` text."""
+    return text.partition("=")[0].strip()
+
+
+def cell(value: Any) -> Any:
+    """Return a value as it stands in a table: a number or a text."""
+    if value is None or isinstance(value, str | int | float):
+        return value
+    return json.dumps(value, ensure_ascii=False)
+
+
+def base_problem(campaign: CampaignSteps, error: InputError) -> ConfigError:
+    """Return the problem of a base experiment that can't be read."""
+    where = campaign.document.where(("experiment",))
+    return ConfigError([ConfigProblem(where, "experiment", str(error))])

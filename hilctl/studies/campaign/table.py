@@ -1,0 +1,130 @@
+"""The table of a campaign: a row a step, what varied, what came out, and where it is recorded."""
+
+import csv
+import io
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from hilctl.analysis.export import write_parquet
+from hilctl.base.files import write_file, write_text
+from hilctl.studies.campaign.plan import CampaignPlan
+from hilctl.studies.campaign.steps import CampaignStep, cell
+from hilctl.studies.multi_run.columns import (
+    PLANNED,
+    RECORDING,
+    REFERENCE,
+    REPEAT,
+    RESULT,
+    STEP,
+    SeriesEntry,
+)
+from hilctl.studies.multi_run.digest import RunDigest
+from hilctl.studies.multi_run.run_figures import FIGURES, RunFigures
+
+
+@dataclass(frozen=True, slots=True)
+class CampaignRow:
+    """What became of a step.
+
+    Attributes:
+        result: ``planned``, ``completed``, or what went wrong.
+        figures: What its recording says.
+        recording: Name of its recording in the campaign's folder; empty where there is none.
+        code: ``planned``, ``completed``, ``refused``, ``fault`` or ``stopped``.
+        kept: Whether it stood already.
+        digest: What its recording gives to figures; None where there is none.
+    """
+
+    result: str = PLANNED
+    figures: RunFigures = RunFigures()  # noqa: RUF009  frozen
+    recording: str = ""
+    code: str = PLANNED
+    kept: bool = False
+    digest: RunDigest | None = field(default=None, compare=False, repr=False)
+
+
+def columns_of(
+    keys: Sequence[str], rows: Sequence[tuple[CampaignStep, CampaignRow]]
+) -> dict[str, list[Any]]:
+    """Return the columns of the table, each a list with a value a step; None where there is none.
+
+    Args:
+        keys: The varied keys.
+        rows: The steps in order, each with what became of it.
+    """
+    columns: dict[str, list[Any]] = {
+        STEP: [step.number for step, _ in rows],
+        REPEAT: [step.repeat for step, _ in rows],
+        REFERENCE: [step.is_reference for step, _ in rows],
+    }
+    for key in keys:
+        columns[key] = _one_type([cell(step.point.get(key)) for step, _ in rows])
+    for name in FIGURES:
+        columns[name] = [getattr(row.figures, name) for _, row in rows]
+    columns[RESULT] = [row.result for _, row in rows]
+    columns[RECORDING] = [row.recording for _, row in rows]
+    return columns
+
+
+def _one_type(values: list[Any]) -> list[Any]:
+    """Return a column of numbers, or one of texts: no other program takes both in one."""
+    given = [value for value in values if value is not None]
+    if all(isinstance(value, bool) for value in given):
+        return values
+    if all(isinstance(value, int | float) and not isinstance(value, bool) for value in given):
+        return [None if value is None else float(value) for value in values]
+    return [
+        value if value is None or isinstance(value, str) else json.dumps(value) for value in values
+    ]
+
+
+def write_table(
+    plan: CampaignPlan, rows: Mapping[int, CampaignRow], facts: Mapping[str, str]
+) -> list[Path]:
+    """Write the table as CSV and, where pyarrow is installed, as Parquet; each whole or not at all.
+
+    Args:
+        plan: The campaign's plan.
+        rows: What became of steps, by their number.
+        facts: What is kept beside the columns of a Parquet file.
+
+    Returns:
+        The files.
+
+    Raises:
+        InputError: One can't be written.
+    """
+    known = [(each.step, rows.get(each.step.number, CampaignRow())) for each in plan.steps]
+    table = columns_of(plan.campaign.keys, known)
+    path = plan.folder / f"{plan.campaign.config.name}.csv"
+    write_text(path, csv_text(table), overwrite=True)
+    written = [path]
+    if find_spec("pyarrow") is not None:
+
+        def write(stream: BinaryIO) -> None:
+            write_parquet(stream, table, facts)
+
+        written.append(path.with_suffix(".parquet"))
+        write_file(written[-1], write, overwrite=True)
+    return written
+
+
+def csv_text(table: Mapping[str, Sequence[Any]]) -> str:
+    """Return columns as CSV; numbers read back as the same bits, what there is not is empty."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(table)
+    writer.writerows(zip(*table.values(), strict=True))
+    return stream.getvalue()
+
+
+def entry_of(step: CampaignStep, row: CampaignRow) -> SeriesEntry:
+    """Return a step and what became of it, as it is read back from the table."""
+    return SeriesEntry(
+        step.number, step.repeat, step.is_reference, step.point, row.figures, row.result,
+        row.recording,
+    )  # fmt: skip

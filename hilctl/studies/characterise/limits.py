@@ -1,0 +1,145 @@
+"""What an experiment allows its actuator, and the band of frequencies that follows from it."""
+
+import math
+from dataclasses import dataclass
+
+from hilctl.base.errors import InputError
+from hilctl.base.types import F64, CommandUnit
+from hilctl.experiment.forecast import CommandFigures
+from hilctl.experiment.load import LoadedExperiment
+
+_SAMPLES_A_CYCLE = 125.0  # in the shortest cycle of loops
+_FEWER = 40.0  # with slow devices, so that a campaign takes minutes
+_SLOW_TOP_HZ = 80.0
+_DECADES = 400.0  # highest over lowest frequency
+_SLOWEST_HZ = 0.5  # what is slower takes minutes, and shows creep rather than rate
+_NARROWEST = 4.0
+_FEWEST_SAMPLES = 25.0
+_OF_RANGE = 0.95
+_OF_SLEW = 0.85
+_OF_SLEW_TO_START = 0.13
+_NEARLY = 0.99
+_OF_HEAT = 0.9
+
+
+@dataclass(frozen=True, slots=True)
+class CharacterisationLimits:
+    """What a campaign keeps to.
+
+    Attributes:
+        loaded: The experiment.
+        unit: Unit of commands.
+        low: Lowest command.
+        high: Highest command.
+        rest: Safe value, at which each run begins and ends.
+        stroke_um: Displacements that the sensor may show.
+        sample_rate_hz: Samples a second.
+        lowest_hz: Lowest frequency of loops.
+        highest_hz: Highest frequency of loops.
+    """
+
+    loaded: LoadedExperiment
+    unit: CommandUnit
+    low: float
+    high: float
+    rest: float
+    stroke_um: tuple[float, float]
+    sample_rate_hz: float
+    lowest_hz: float
+    highest_hz: float
+
+    @property
+    def centre(self) -> float:
+        """Middle of the range, round which loops go."""
+        return 0.5 * (self.low + self.high)
+
+    @property
+    def reach(self) -> float:
+        """Largest amplitude round the middle."""
+        return _OF_RANGE * 0.5 * (self.high - self.low)
+
+    @property
+    def middle_hz(self) -> float:
+        """Frequency of loops that are neither slow nor fast."""
+        return round_hz(math.sqrt(self.lowest_hz * self.highest_hz))
+
+    @property
+    def stroke_span_um(self) -> float:
+        """Width of the allowed stroke."""
+        return self.stroke_um[1] - self.stroke_um[0]
+
+    @property
+    def slew_per_s(self) -> float:
+        """Fastest change of a command, with some room to the limit."""
+        return _OF_SLEW * self.loaded.config.limits.slew_per_s
+
+    def beside_rest(self, amplitude: float) -> float:
+        """Return the command nearest to rest with room for an amplitude either way."""
+        room = min(1.02 * amplitude, 0.5 * (self.high - self.low))
+        return min(max(self.rest, self.low + room), self.high - room)
+
+    def by_slew(self, amplitude: float, frequency_hz: float) -> float:
+        """Return an amplitude, or the largest that a sine of a frequency may have."""
+        return min(amplitude, self.slew_per_s / (2.0 * math.pi * frequency_hz))
+
+    def soft_s(self, amplitude: float, offset: float) -> float:
+        """Return the shortest soft start that leaves a sine the slew that it may have."""
+        travel = amplitude + abs(offset - self.rest)
+        return math.pi * travel / (2.0 * _OF_SLEW_TO_START * self.loaded.config.limits.slew_per_s)
+
+    def scale(self, values: F64) -> float:
+        """Return what a command must be multiplied by to keep slew and heat with some room.
+
+        Args:
+            values: float64[n], every command of a run.
+
+        Returns:
+            At most 1.
+        """
+        config = self.loaded.config
+        figures = CommandFigures(config, self.rest, self.rest**2)
+        figures.add(values)
+        scale = 1.0
+        if figures.slew_per_s > 0.0:
+            scale = min(scale, _NEARLY * config.limits.slew_per_s / figures.slew_per_s)
+        budget_a, rms_a = config.limits.rms_current_a, figures.heat.rms_a
+        if budget_a is not None and rms_a:
+            scale = min(scale, _OF_HEAT * budget_a / rms_a)
+        return scale
+
+
+def limits_of(loaded: LoadedExperiment, highest_hz: float | None = None) -> CharacterisationLimits:
+    """Return what a campaign keeps to.
+
+    Args:
+        loaded: The experiment.
+        highest_hz: Highest frequency of loops; one that follows from the sample rate where None.
+
+    Raises:
+        InputError: That frequency has too few samples a cycle.
+    """
+    config = loaded.config
+    rate_hz = config.sample_rate_hz
+    most_hz = rate_hz / _FEWEST_SAMPLES
+    if highest_hz is not None and not 0.0 < highest_hz <= most_hz:
+        rule = f"must be above 0 and at most {most_hz:g} Hz, {_FEWEST_SAMPLES:g} samples a cycle"
+        raise InputError(f"--highest-hz {rule}: {highest_hz:g}")
+    slow_hz = min(rate_hz / _FEWER, _SLOW_TOP_HZ)
+    top_hz = highest_hz or round_hz(max(rate_hz / _SAMPLES_A_CYCLE, slow_hz))
+    low, high = config.limits.command_range
+    return CharacterisationLimits(
+        loaded=loaded,
+        unit=config.limits.unit,
+        low=low,
+        high=high,
+        rest=config.safe.value,
+        stroke_um=config.limits.stroke_um,
+        sample_rate_hz=rate_hz,
+        lowest_hz=min(max(round_hz(top_hz / _DECADES), _SLOWEST_HZ), top_hz / _NARROWEST),
+        highest_hz=top_hz,
+    )
+
+
+def round_hz(value: float) -> float:
+    """Return a frequency with two digits, as people write it."""
+    return float(f"{value:.2g}")

@@ -1,0 +1,229 @@
+"""Loops and reversal curves: their figures, what repeats, and how far amplitudes may grow."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilctl.analysis.steady_state import steady_part
+from hilctl.base.errors import DataError
+from hilctl.base.segments import Segment
+from hilctl.base.types import F64
+from hilctl.recording.recording import Recording
+from hilctl.signals import cycle_metrics
+from hilctl.studies.characterise.rig_problem import RigProblemError
+
+_FEWEST_STEPS = 500  # of the sensor in a motion, so that equal readings mean something
+_AT_END = 0.06  # of a sine's cycle at one and the same extreme reading
+_OF_STROKE = 0.94
+_FIRST_GROWTH = 1.5  # exponent of displacement over amplitude where it isn't known yet
+_MORE_GROWTH = 0.2
+_LEAST_RATIO = 0.01
+_WORTHWHILE = 1.03
+_NEAR_TOP = 0.004
+_POINTS = 400
+_SHAPE_HARMONICS = 12
+
+
+@dataclass(frozen=True, slots=True)
+class LoopFigures:
+    """One steady loop.
+
+    Attributes:
+        label: What ran.
+        amplitude: Half the peak-to-peak command.
+        bias: Its middle.
+        frequency_hz: Cycles a second.
+        low_um: Lowest displacement of the average cycle.
+        high_um: Highest.
+        hysteresis_percent: Peak hysteresis; None where the loop has no two branches.
+        scatter_percent: rms by which cycles differ beyond noise, of the peak-to-peak.
+        command: float64[m], the average cycle's command.
+        displacement_um: float64[m], its displacement.
+    """
+
+    label: str
+    amplitude: float
+    bias: float
+    frequency_hz: float
+    low_um: float
+    high_um: float
+    hysteresis_percent: float | None
+    scatter_percent: float
+    command: F64
+    displacement_um: F64
+
+    @property
+    def peak_to_peak_um(self) -> float:
+        """Peak-to-peak displacement."""
+        return self.high_um - self.low_um
+
+    @property
+    def gain_um(self) -> float:
+        """Peak-to-peak displacement over peak-to-peak command, um a command unit."""
+        return 0.5 * self.peak_to_peak_um / self.amplitude
+
+
+def loop_figures(recording: Recording, segment: Segment) -> LoopFigures:
+    """Judge the steady cycles of a segment.
+
+    Raises:
+        RigProblemError: The sensor stands at one reading while the command moves on.
+        DataError: It has no whole steady cycle.
+    """
+    part = steady_part(recording, segment)
+    if part.cycle is None:
+        raise DataError(f"{recording.path}: {segment.label}: no whole steady cycle")
+    _refuse_saturated(part.samples.displacement_um, segment.label)
+    command, displacement_um = part.cycle.signals
+    low_um, high_um = float(displacement_um.min()), float(displacement_um.max())
+    average = np.interp(
+        np.mod(part.samples.index - segment.start, segment.period) / segment.period,
+        part.cycle.phase,
+        displacement_um,
+        period=1.0,
+    )
+    count = max(part.cycles, 1)
+    cycle_of = (np.arange(average.size) * count) // average.size
+    off = part.samples.displacement_um - average
+    means = np.bincount(cycle_of, off) / np.bincount(cycle_of)
+    return LoopFigures(
+        label=segment.label,
+        amplitude=0.5 * float(np.ptp(command)),
+        bias=0.5 * float(command.max() + command.min()),
+        frequency_hz=recording.sample_rate_hz / segment.period,
+        low_um=low_um,
+        high_um=high_um,
+        hysteresis_percent=cycle_metrics.peak_hysteresis_percent(command, displacement_um),
+        scatter_percent=100.0 * float(np.std(means)) / max(high_um - low_um, 1e-12),
+        command=command,
+        displacement_um=displacement_um,
+    )
+
+
+def all_loops(recording: Recording) -> tuple[LoopFigures, ...]:
+    """Judge every segment that repeats."""
+    return tuple(loop_figures(recording, each) for each in recording.segments if each.period > 0.0)
+
+
+def _refuse_saturated(displacement_um: F64, label: str) -> None:
+    values = displacement_um[np.isfinite(displacement_um)]
+    if np.unique(values).size < _FEWEST_STEPS:
+        return
+    for end in (values.min(), values.max()):
+        share = float(np.mean(values == end))
+        if share > _AT_END:
+            raise RigProblemError(
+                "saturated_sensor",
+                f"{label}: the sensor stands at {end:.4g} µm for {100.0 * share:.0f} % of the time",
+                "move the sensor, give it a wider range, or narrow limits.stroke_um to less than "
+                "that",
+            )
+
+
+def next_amplitude(
+    loops: Sequence[LoopFigures], wanted: float, stroke_um: tuple[float, float]
+) -> float | None:
+    """Return the amplitude of the next of a row of growing loops.
+
+    Displacement grows faster than the command in most actuators; by how much is taken from the
+    last two loops.
+
+    Args:
+        loops: The loops so far, each larger than the one before.
+        wanted: Amplitude that it is to have.
+        stroke_um: Displacements that are allowed.
+
+    Returns:
+        The wanted one, or as much of it as the stroke allows; None where that isn't worth a run.
+    """
+    if not loops:
+        return wanted
+    last = loops[-1]
+    exponent = _FIRST_GROWTH
+    ratio = math.log(last.amplitude / loops[-2].amplitude) if len(loops) > 1 else 0.0
+    if ratio > _LEAST_RATIO:
+        before = loops[-2]
+        grown = math.log(max(last.peak_to_peak_um / max(before.peak_to_peak_um, 1e-12), 1e-6))
+        exponent = min(max(grown / ratio, 0.5), 3.0) + _MORE_GROWTH
+    middle_um = 0.5 * (last.high_um + last.low_um)
+    half_um = max(0.5 * last.peak_to_peak_um, 1e-12)
+    centre_um, room_um = 0.5 * sum(stroke_um), 0.5 * _OF_STROKE * (stroke_um[1] - stroke_um[0])
+    free_um = room_um - abs(middle_um - centre_um)
+    if free_um <= half_um:
+        return None
+    allowed = last.amplitude * float((free_um / half_um) ** (1.0 / exponent))
+    chosen = min(wanted, allowed)
+    return chosen if chosen > _WORTHWHILE * last.amplitude else None
+
+
+@dataclass(frozen=True, slots=True)
+class Repeatability:
+    """One and the same loop, once more at the end.
+
+    Attributes:
+        shape_percent: Largest difference with the means taken out, of the peak-to-peak.
+        shift_um: By how much the mean has moved.
+        shift_percent: The same, of the peak-to-peak.
+    """
+
+    shape_percent: float
+    shift_um: float
+    shift_percent: float
+
+
+def repeatability(first: LoopFigures, again: LoopFigures) -> Repeatability:
+    """Compare a loop with itself at another time."""
+    phase = np.linspace(0.0, 1.0, _POINTS, endpoint=False)
+    one, two = (
+        np.interp(phase, np.arange(y.size) / y.size, y, period=1.0)
+        for y in (first.displacement_um, again.displacement_um)
+    )
+    shift_um = float(two.mean() - one.mean())
+    whole = max(first.peak_to_peak_um, 1e-12)
+    # Sensor noise is spread over all harmonics; what a loop has changed by, over the lowest.
+    harmonics = np.fft.rfft(two - one - shift_um)
+    harmonics[_SHAPE_HARMONICS + 1 :] = 0.0
+    shape = float(np.max(np.abs(np.fft.irfft(harmonics, _POINTS))))
+    return Repeatability(100.0 * shape / whole, shift_um, 100.0 * abs(shift_um) / whole)
+
+
+@dataclass(frozen=True, slots=True)
+class ReversalCurves:
+    """First-order reversal curves.
+
+    Attributes:
+        turns: Commands at which the curves turn, the highest first.
+        curves: Command and displacement of each, float64[2, n], from its turn up to the top.
+        return_um: rms by which the displacement at the top differs from curve to curve: what
+            return-point memory says is nothing.
+        return_percent: The same, of the span of the curves.
+    """
+
+    turns: tuple[float, ...]
+    curves: tuple[F64, ...]
+    return_um: float
+    return_percent: float
+
+
+def reversal_curves(recording: Recording) -> ReversalCurves:
+    """Cut a path of reversal curves where it turns."""
+    segment = recording.segments[-1]
+    samples = recording.samples.part(segment.start, segment.stop)
+    command, displacement_um = samples.command, samples.displacement_um
+    moving = np.flatnonzero(np.diff(command))  # a corner may be two samples wide
+    edges = moving[1:][np.diff(np.sign(command[moving + 1] - command[moving])) != 0.0]
+    # The first turn is the top; then the bottom, and the top again: the outer loop.
+    pairs = list(zip(edges[1::2].tolist(), edges[2::2].tolist(), strict=False))
+    curves = [np.array((command[a : b + 1], displacement_um[a : b + 1])) for a, b in pairs]
+    top, span = float(command.max()), float(np.ptp(command))
+    ends = [float(np.nanmean(c[1][c[0] > top - _NEAR_TOP * span])) for c in curves]
+    span_um = max(float(np.nanmax(displacement_um) - np.nanmin(displacement_um)), 1e-12)
+    spread_um = float(np.std(ends))
+    return ReversalCurves(
+        turns=tuple(float(c[0][0]) for c in curves),
+        curves=tuple(curves),
+        return_um=spread_um,
+        return_percent=100.0 * spread_um / span_um,
+    )

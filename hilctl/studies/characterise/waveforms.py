@@ -1,0 +1,269 @@
+"""The waveform of each step, as keys of an experiment: pure functions of what is allowed.
+
+Every part begins and ends at rest, so that parts may stand in any order.
+"""
+
+import json
+import math
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from pydantic import TypeAdapter
+
+from hilctl.base.types import F64
+from hilctl.studies.characterise.limits import CharacterisationLimits, round_hz
+from hilctl.waveforms.build import Reference, build
+from hilctl.waveforms.spec import AnyWaveform
+
+Keys: TypeAlias = dict[str, Any]
+
+REST_S = 2.0
+CREEP_S = 4.0
+RANDOM_S = 3.0
+HELD_OUT_SEED = 7
+TRAINING_SEED = 100
+
+_ADAPTER: TypeAdapter[AnyWaveform] = TypeAdapter(AnyWaveform)
+_LINES_BELOW_TOP = 8.0  # lines of the small multisine within the band of loops
+_TOP = 0.2  # of the sample rate: its highest line
+_RESPONSE_S = 2.0
+_PERIODS = (6, 100)
+_CONDITIONING_CYCLES = 12
+_RANDOM_CYCLES = 8.0
+_REVERSALS = 9
+_BIASES = (0.7, 0.35, 0.0, -0.35, -0.7)
+_TRIES = 5
+_OF_BIAS = 0.15
+_OF_REST = 0.8
+_SMALL = ((0.6, 0.35), (-0.6, 0.35), (0.0, 0.35), (0.87, 0.11), (-0.87, 0.11), (0.0, 0.11))
+_RANDOM_BAND = (5.0, 0.5)  # of the lowest and of the highest frequency of loops
+
+
+def reference_of(limits: CharacterisationLimits, keys: Keys) -> Reference:
+    """Return every command of a waveform, and its segments."""
+    return build(_ADAPTER.validate_json(json.dumps(keys)), limits.sample_rate_hz, Path())
+
+
+def within(limits: CharacterisationLimits, keys: Keys) -> tuple[Keys, F64]:
+    """Shrink a waveform towards rest until slew and heat are kept, where that is what it takes.
+
+    Returns:
+        Its keys, and every command: float64[n].
+    """
+    for _ in range(_TRIES):
+        command = reference_of(limits, keys).values.copy()  # kernels take no read-only one
+        scale = limits.scale(command)
+        if scale >= 1.0:
+            break
+        keys = _scaled(limits, keys, 0.99 * scale)
+    return keys, command
+
+
+def _scaled(limits: CharacterisationLimits, keys: Keys, scale: float) -> Keys:
+    """Shrink a waveform towards rest: within the range it stays."""
+    changed = {
+        key: scale * value if key in {"amplitude", "rate_per_s"} else value
+        for key, value in keys.items()
+    }
+    if "parts" in keys:
+        changed["parts"] = [_scaled(limits, part, scale) for part in keys["parts"]]
+    if "levels" in keys:
+        changed["levels"] = [scale * level for level in keys["levels"]]
+    if "offset" in keys:
+        changed["offset"] = limits.rest + scale * (keys["offset"] - limits.rest)
+    return changed
+
+
+def at_rest(limits: CharacterisationLimits) -> Keys:
+    """Hold the safe value."""
+    return {"kind": "hold", "unit": limits.unit, "level": limits.rest, "duration_s": REST_S}
+
+
+def sine(
+    limits: CharacterisationLimits,
+    amplitude: float,
+    frequency_hz: float,
+    cycles: float,
+    *,
+    offset: float | None = None,
+    soft: float = 2.0,
+) -> Keys:
+    """Return a sine with soft ends.
+
+    Args:
+        limits: What is allowed.
+        amplitude: Its amplitude, lowered to what the slew limit leaves.
+        frequency_hz: Its frequency.
+        cycles: Cycles at full amplitude.
+        offset: What it goes round; the middle of the range where None.
+        soft: Cycles of the soft start; the soft end has half as many.
+    """
+    keys = {
+        "kind": "sine",
+        "unit": limits.unit,
+        "amplitude": _rounded(limits.by_slew(amplitude, frequency_hz)),
+        "frequency_hz": frequency_hz,
+        "offset": limits.centre if offset is None else offset,
+    }
+    return _softened(limits, keys, cycles / frequency_hz, soft / frequency_hz)
+
+
+def _softened(limits: CharacterisationLimits, keys: Keys, whole_s: float, soft_s: float) -> Keys:
+    """Return keys with a soft start and an end of half its length, about a time at full size."""
+    least_s = limits.soft_s(keys["amplitude"], keys["offset"])
+    start_s, end_s = max(soft_s, least_s), max(0.5 * soft_s, least_s)
+    return {
+        **keys,
+        "rest": limits.rest,
+        "duration_s": start_s + whole_s + end_s,
+        "soft_start_s": start_s,
+        "soft_end_s": end_s,
+    }
+
+
+def small_multisine(limits: CharacterisationLimits, amplitude: float) -> Keys:
+    """Return equal sines far beyond the band of loops, whose period is whole samples."""
+    wanted_hz = limits.highest_hz / _LINES_BELOW_TOP
+    step_hz = limits.sample_rate_hz / round(limits.sample_rate_hz / wanted_hz)
+    periods = min(max(round(_RESPONSE_S * step_hz), _PERIODS[0]), _PERIODS[1])
+    keys = {
+        "kind": "multisine",
+        "unit": limits.unit,
+        "amplitude": amplitude,
+        "first_hz": step_hz,
+        "last_hz": _TOP * limits.sample_rate_hz,
+        "step_hz": step_hz,
+        "offset": limits.beside_rest(amplitude),
+    }
+    return _softened(limits, keys, periods / step_hz, 2.0 / step_hz)
+
+
+def conditioning(limits: CharacterisationLimits, amplitude: float) -> Keys:
+    """Return the decaying cycle that leads every run to the same state."""
+    return {
+        **sine(limits, amplitude, limits.middle_hz, _CONDITIONING_CYCLES, soft=1.0),
+        "kind": "decaying",
+    }
+
+
+def slow_loops(limits: CharacterisationLimits, amplitude: float) -> Keys:
+    """Return loops at the lowest frequency, the largest first: it makes the others repeatable."""
+    parts = [
+        sine(limits, part * amplitude, limits.lowest_hz, 3.0, soft=1.0)
+        for part in (1.0, 0.75, 0.5, 0.25)
+    ]
+    return _sequence(limits, parts)
+
+
+def frequencies_hz(limits: CharacterisationLimits) -> list[float]:
+    """Return the frequencies of fast loops, the highest last."""
+    growth = (limits.highest_hz / limits.lowest_hz) ** 0.2
+    return [round_hz(limits.lowest_hz * growth**k) for k in range(1, 5)] + [limits.highest_hz]
+
+
+def fast_loops(limits: CharacterisationLimits, amplitudes: dict[float, float]) -> Keys:
+    """Return loops at several frequencies.
+
+    Args:
+        limits: What is allowed.
+        amplitudes: Largest amplitude at each frequency.
+    """
+    parts = [
+        sine(limits, part * amplitude, frequency_hz, max(4.0, math.ceil(0.2 * frequency_hz)))
+        for part in (1.0, 0.5, 0.2)
+        for frequency_hz, amplitude in amplitudes.items()
+        if part > 0.2 or frequency_hz > limits.middle_hz
+    ]
+    return _sequence(limits, parts)
+
+
+def reversal_curves(limits: CharacterisationLimits, amplitude: float) -> Keys:
+    """Return first-order reversal curves: from the top down to ever lower turns, and up again.
+
+    They follow a conditioning cycle.
+    """
+    turns = [1.0 - 2.0 * k / _REVERSALS for k in range(1, _REVERSALS + 1)]
+    levels = [1.0, -1.0, 1.0]
+    for turn in turns:
+        levels += [turn, 1.0]
+    scaled = [level * amplitude for level in levels]
+    path = {
+        "kind": "path",
+        "levels": [*scaled, limits.rest - limits.centre],
+        "rate_per_s": min(8.0 * amplitude * limits.lowest_hz, limits.slew_per_s),
+        "offset": limits.centre,
+        "rest": limits.rest,
+    }
+    return _sequence(limits, [conditioning(limits, amplitude), path])
+
+
+def biased_loops(limits: CharacterisationLimits, amplitude: float) -> Keys:
+    """Return small loops at places all over the range, after a conditioning cycle."""
+    small = _OF_BIAS * amplitude
+    parts = [
+        sine(limits, small, limits.middle_hz, 4.0, offset=limits.centre + part * amplitude)
+        for part in _BIASES
+    ]
+    return _sequence(limits, [conditioning(limits, amplitude), *parts])
+
+
+def random_reference(limits: CharacterisationLimits, amplitude: float, seed: int) -> Keys:
+    """Return a reference that never repeats, after a conditioning cycle."""
+    part = _random_part(limits, amplitude, seed, RANDOM_S, limits.centre)
+    return _sequence(limits, [conditioning(limits, amplitude), part])
+
+
+def rests(limits: CharacterisationLimits, amplitude: float) -> Keys:
+    """Return rests on either side and at rest, after a conditioning cycle: they tell creep."""
+    level = _OF_REST * amplitude
+    rate_per_s = min(8.0 * amplitude * limits.lowest_hz, limits.slew_per_s)
+    rise_s = min(2.0 * level / rate_per_s, 0.5 * CREEP_S)
+    steps = {
+        "kind": "step",
+        "levels": [level, -level, limits.rest - limits.centre],
+        "dwell_s": CREEP_S,
+        "rise_s": rise_s,
+        "offset": limits.centre,
+        "rest": limits.rest,
+        "soft_start_s": rise_s,
+    }
+    return _sequence(limits, [conditioning(limits, amplitude), steps])
+
+
+def _random_part(
+    limits: CharacterisationLimits, amplitude: float, seed: int, least_s: float, offset: float
+) -> Keys:
+    first_hz, last_hz = _RANDOM_BAND[0] * limits.lowest_hz, _RANDOM_BAND[1] * limits.highest_hz
+    part = {
+        "kind": "random",
+        "unit": limits.unit,
+        "amplitude": _rounded(amplitude),
+        "first_hz": min(first_hz, 0.5 * last_hz),
+        "last_hz": last_hz,
+        "seed": seed,
+        "offset": offset,
+    }
+    seconds = max(least_s, _RANDOM_CYCLES / limits.middle_hz)
+    part, _ = within(limits, _softened(limits, part, seconds, 1.0 / limits.middle_hz))
+    return part
+
+
+def small_motions(limits: CharacterisationLimits, amplitude: float) -> Keys:
+    """Return small aperiodic motions of two sizes all over the range, after a conditioning cycle.
+
+    Loops of a tenth of the stroke depend on what larger ones say nothing of, most at the ends.
+    """
+    parts = [
+        _random_part(limits, size * amplitude, seed, 0.5 * RANDOM_S, limits.centre + at * amplitude)
+        for seed, (at, size) in enumerate(_SMALL, TRAINING_SEED + 1)
+    ]
+    return _sequence(limits, [conditioning(limits, amplitude), *parts])
+
+
+def _rounded(amplitude: float) -> float:
+    """Return an amplitude as people write it; it is far enough from the limits."""
+    return float(f"{amplitude:.4g}")
+
+
+def _sequence(limits: CharacterisationLimits, parts: list[Keys]) -> Keys:
+    return {"kind": "sequence", "unit": limits.unit, "parts": parts}

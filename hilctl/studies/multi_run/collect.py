@@ -1,0 +1,236 @@
+"""Runs to be seen side by side: of a campaign's folder, or of files; each is read once."""
+
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from hilctl.base.errors import DataError, InputError
+from hilctl.models.base import HysteresisModel
+from hilctl.recording.reader import read
+from hilctl.recording.run_summary import recordings_in
+from hilctl.studies.multi_run.columns import (
+    COMPLETED,
+    PLANNED,
+    SeriesEntry,
+    find_table,
+    read_entries,
+)
+from hilctl.studies.multi_run.digest import RunDigest, digest_of
+from hilctl.studies.multi_run.run_figures import RunFigures, SeriesDrift, drift_of
+from hilctl.studies.multi_run.varied_parameter import (
+    VariedParameter,
+    dimensions,
+    keys_of,
+    short_value,
+    value_at,
+)
+
+OnRead = Callable[[float, str], None]
+"""Called with what is done, from 0 to 1, and what is being read."""
+
+MOST_BYTES = 512 << 20
+"""Largest recording that is read into memory, where it takes some eight times as much."""
+
+
+@dataclass(frozen=True, slots=True)
+class SeriesRun:
+    """One run of several.
+
+    Attributes:
+        number: Its place, from 1.
+        is_reference: Whether it is a reference run of a campaign.
+        values: Value of each key that varied, as number or short text.
+        figures: Its figures.
+        result: ``completed``, ``planned``, or what went wrong.
+        recording: Name of its recording; empty where there is none.
+        digest: What its recording gives to figures; None where there is none.
+    """
+
+    number: int
+    is_reference: bool
+    values: Mapping[str, Hashable]
+    figures: RunFigures
+    result: str
+    recording: str
+    digest: RunDigest | None = None
+
+    @property
+    def completed(self) -> bool:
+        """Whether it was run to its end."""
+        return self.result == COMPLETED
+
+
+@dataclass(frozen=True)
+class RunSeries:
+    """Runs side by side.
+
+    Attributes:
+        name: Name of the campaign, or of the runs.
+        runs: The runs in order.
+        keys: Keys that were varied.
+        missing: Recordings that can't be read, each with why.
+        is_campaign: Whether they are of a campaign.
+    """
+
+    name: str
+    runs: tuple[SeriesRun, ...]
+    keys: tuple[str, ...]
+    missing: tuple[str, ...] = ()
+    is_campaign: bool = False
+
+    @cached_property
+    def done(self) -> tuple[SeriesRun, ...]:
+        """Completed runs that are no reference runs: what trends and figures are of."""
+        return tuple(run for run in self.runs if run.completed and not run.is_reference)
+
+    @cached_property
+    def dimensions(self) -> tuple[VariedParameter, ...]:
+        """What varied among those that were run."""
+        units = {
+            str(value_at(run.digest.values, "waveform.unit")) for run in self.done if run.digest
+        }
+        unit = units.pop() if len(units) == 1 else ""
+        return dimensions(self.keys, [run.values for run in self.done], unit)
+
+    @property
+    def drift(self) -> SeriesDrift | None:
+        """What reference runs say of drift."""
+        return drift_of([run.figures for run in self.runs if run.is_reference and run.completed])
+
+    @property
+    def failed(self) -> tuple[SeriesRun, ...]:
+        """Runs that did not come to their end."""
+        return tuple(run for run in self.runs if not run.completed and run.result != PLANNED)
+
+    @property
+    def planned(self) -> int:
+        """How many runs are still to come."""
+        return sum(run.result == PLANNED for run in self.runs)
+
+    def text(self, run: SeriesRun) -> str:
+        """Return what a run is known by among the others."""
+        values = [each.text(run.values[each.key]) for each in self.dimensions
+                  if run.values.get(each.key) is not None]  # fmt: skip
+        return ", ".join(values) or ("reference run" if run.is_reference else f"run {run.number}")
+
+
+def collect(
+    paths: Sequence[Path],
+    model: HysteresisModel | None = None,
+    on_read: OnRead = lambda done, text: None,
+) -> RunSeries:
+    """Read runs.
+
+    Args:
+        paths: Recordings, or one folder: of a campaign, or with recordings in it.
+        model: Model to hold against what was measured; the recorded ones where None.
+        on_read: Told of progress.
+
+    Raises:
+        InputError: A folder holds no recordings, or stands among others.
+        DataError: A recording that was named, or a table, can't be read.
+    """
+    folders = [path for path in paths if path.is_dir()]
+    if folders and len(paths) > 1:
+        raise InputError(f"{folders[0]}: is a folder: name one folder, or recordings only")
+    if not folders:
+        return _of_files(paths, "runs", model, on_read, missing=None)
+    table = find_table(folders[0])
+    if table is not None:
+        return _of_campaign(table, model, on_read)
+    found = recordings_in(folders[0])
+    if not found:
+        raise InputError(f"{folders[0]}: holds no recordings (*.mcap)")
+    return _of_files(found, folders[0].resolve().name, model, on_read, missing=[])
+
+
+def series_of(
+    name: str, entries: Sequence[SeriesEntry], digests: Mapping[str, RunDigest],
+    missing: Sequence[str] = (),
+) -> RunSeries:  # fmt: skip
+    """Return the runs of a campaign's table.
+
+    Args:
+        name: Name of the campaign.
+        entries: Rows of its table.
+        digests: What recordings give to figures, by their names.
+        missing: Recordings that can't be read, each with why.
+    """
+    keys = tuple(dict.fromkeys(key for entry in entries for key in entry.values))
+    runs = tuple(
+        SeriesRun(
+            entry.step,
+            entry.is_reference,
+            {key: short_value(value) for key, value in entry.values.items()},
+            entry.figures,
+            entry.result,
+            entry.recording,
+            digests.get(entry.recording),
+        )
+        for entry in entries
+    )
+    return RunSeries(name, runs, keys, tuple(missing), is_campaign=True)
+
+
+def _digest(path: Path, model: HysteresisModel | None) -> RunDigest:
+    if path.is_file() and path.stat().st_size > MOST_BYTES:
+        raise DataError(
+            f"{path}: is larger than {MOST_BYTES >> 20} MB, too long for a page of many runs: "
+            f"'hilctl report {path}' makes one of its own, in little memory"
+        )
+    return digest_of(read(path), model)
+
+
+def _of_campaign(table: Path, model: HysteresisModel | None, on_read: OnRead) -> RunSeries:
+    entries = read_entries(table)
+    named = [entry for entry in entries if entry.recording and entry.result == COMPLETED]
+    digests, missing = {}, []
+    for number, entry in enumerate(named):
+        on_read(number / len(named), f"read {entry.recording}")
+        # A name in the table must not lead elsewhere.
+        path = table.parent / Path(entry.recording).name
+        try:
+            digests[entry.recording] = _digest(path, model)
+        except DataError as error:
+            missing.append(str(error))
+    return series_of(table.stem, entries, digests, missing)
+
+
+def _of_files(
+    paths: Sequence[Path],
+    name: str,
+    model: HysteresisModel | None,
+    on_read: OnRead,
+    missing: list[str] | None,
+) -> RunSeries:
+    """Read files; one that can't be read is left out where ``missing`` is a list."""
+    digests = []
+    for number, path in enumerate(paths):
+        on_read(number / len(paths), f"read {path.name}")
+        try:
+            digests.append((path, _digest(path, model)))
+        except DataError as error:
+            if missing is None:
+                raise
+            missing.append(str(error))
+    keys = keys_of([digest.values for _, digest in digests])
+    runs = tuple(
+        SeriesRun(
+            number,
+            False,
+            {key: value_at(digest.values, key) for key in keys},
+            digest.figures,
+            _result(digest),
+            path.name,
+            digest,
+        )
+        for number, (path, digest) in enumerate(digests, 1)
+    )
+    return RunSeries(name, runs, tuple(keys), tuple(missing or ()))
+
+
+def _result(digest: RunDigest) -> str:
+    if digest.code in {"", COMPLETED}:
+        return COMPLETED if digest.code else "cut short: its end was not recorded"
+    return f"{digest.code}: {digest.reason}"

@@ -1,0 +1,234 @@
+"""Write the page of many runs, and their result for programs."""
+
+import math
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from hilctl.analysis import html
+from hilctl.analysis.html import definitions_of
+from hilctl.base.formatting import quantity, unit_text
+from hilctl.studies.multi_run.collect import RunSeries, SeriesRun
+from hilctl.studies.multi_run.plots import sheets_of
+from hilctl.studies.multi_run.summary_text import headline
+from hilctl.studies.multi_run.trend import (
+    AREA,
+    ASYMMETRY,
+    DAMPING,
+    HYSTERESIS,
+    MODEL_ERROR,
+    NATURAL,
+    PEAK_ERROR,
+    RMS_ERROR,
+    STROKE,
+    RunFigure,
+    Trend,
+    trends,
+)
+
+MOST_ROWS = 1000
+"""Rows of the table on a page: more are in the campaign's table."""
+
+_COLUMNS = (STROKE, HYSTERESIS, AREA, PEAK_ERROR, RMS_ERROR, MODEL_ERROR, NATURAL, DAMPING)
+
+
+def write_series(series: RunSeries, path: Path) -> None:
+    """Write the page; one of that name is replaced, as a whole or not at all.
+
+    Raises:
+        InputError: It can't be written.
+    """
+    html.write_page(series_page(series), path)
+
+
+def series_page(series: RunSeries) -> str:
+    """Return the page as HTML."""
+    first, *more = headline(series)
+    sheets = sheets_of(series)
+    body = [
+        f"<h1>{html.text(series.name)}</h1>",
+        html.paragraph(" ".join((first, *more[:2])), "headline"),
+        html.paragraph(" ".join(more[2:])) if more[2:] else "",
+        *(html.paragraph(f"Not read: {problem}", "bad") for problem in series.missing),
+        *(html.paragraph(f"{series.text(run)}: {run.result}", "bad") for run in series.failed),
+        *_simulated(series),
+        html.figures(sheets) if sheets else html.paragraph("No completed run holds a figure."),
+        *_trends(series),
+        "<h2>Runs</h2>",
+        html.grid(*run_table(series, MOST_ROWS), "numbers"),
+        *_left_out(series),
+        *_made_of(series),
+        html.definitions("What the figures mean", _terms(series)),
+    ]
+    return html.document(html.text(series.name), filter(None, body))
+
+
+def _simulated(series: RunSeries) -> Iterator[str]:
+    count = sum(run.digest is not None and run.digest.simulated for run in series.runs)
+    if count:
+        which = "All" if count == len(series.runs) else f"{count} of the"
+        yield html.paragraph(f"{which} runs were simulated: no hardware was driven.", "note")
+
+
+def run_table(
+    series: RunSeries, most: int, *, short: bool = False
+) -> tuple[list[str], list[list[str]]]:
+    """Return headings and rows of a table of runs, without columns that are empty.
+
+    Args:
+        series: The runs.
+        most: Most rows.
+        short: For a terminal: short headings, and no names of files.
+    """
+    figures = [each for each in _COLUMNS if each.of(series.runs)]
+    headings = ["run", *(each.axis for each in series.dimensions)]
+    headings += [each.short if short else _heading(series, each) for each in figures]
+    last = _last(series, short=short)
+    rows = [
+        [
+            f"{run.number}{' (reference)' if run.is_reference else ''}",
+            *(_shown(run, each.key) for each in series.dimensions),
+            *(quantity(each.value(run)) for each in figures),
+            *(value(run) for value in last.values()),
+        ]
+        for run in series.runs[:most]
+    ]
+    return [*headings, *last], rows
+
+
+def _heading(series: RunSeries, figure: RunFigure) -> str:
+    unit = unit_text(figure.unit)
+    if figure is AREA:
+        units = {run.digest.command_unit for run in series.runs if run.digest is not None}
+        unit = f"µm·{units.pop()}" if len(units) == 1 else ""
+    return f"{figure.text}, {unit}" if unit else figure.text
+
+
+def _last(series: RunSeries, *, short: bool) -> dict[str, Callable[[SeriesRun], str]]:
+    """Return the last columns, by their headings."""
+    found: dict[str, Callable[[SeriesRun], str]] = {}
+    if not short or series.failed or series.planned:
+        found["result"] = lambda run: run.result
+    if not series.is_campaign and not short:
+        found["name"] = lambda run: run.digest.name if run.digest else ""
+        found["waveform"] = lambda run: run.digest.waveform if run.digest else ""
+        found["started (UTC)"] = _started
+    if not short:
+        found["recording"] = lambda run: run.recording
+    return found
+
+
+def _started(run: SeriesRun) -> str:
+    return run.digest.started[:19].replace("T", " ") if run.digest else ""
+
+
+def _shown(run: SeriesRun, key: str) -> str:
+    value = run.values.get(key)
+    return "" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _left_out(series: RunSeries) -> Iterator[str]:
+    if len(series.runs) > MOST_ROWS:
+        yield html.paragraph(f"{len(series.runs) - MOST_ROWS} more are in the campaign's table.")
+
+
+def _trends(series: RunSeries) -> Iterator[str]:
+    found = list(fitted_trends(series))
+    if found:
+        rows = [
+            (
+                trend.figure.text,
+                trend.along.axis,
+                held_text(series, trend),
+                quantity(trend.slope),
+                quantity(trend.offset),
+                "-" if trend.r2 is None else f"{trend.r2:.4f}",
+                trend.direction,
+            )
+            for trend in found
+        ]
+        names = ("figure", "against", "at", "slope", "offset", "r²", "direction")
+        yield "<h2>Linear fits</h2>"
+        yield html.grid(names, rows, "numbers")
+
+
+def fitted_trends(series: RunSeries) -> Iterator[Trend]:
+    """Yield the trends of loops along frequencies, as far as nothing compensated them."""
+    plain = [run for run in series.done if run.digest is None or run.digest.is_plain_loop]
+    for along in series.dimensions:
+        if along.is_frequency:
+            for figure in (AREA, HYSTERESIS):
+                yield from trends(series, figure, along, plain)
+
+
+def held_text(series: RunSeries, trend: Trend) -> str:
+    """Return what was held along a trend, for people."""
+    known = [each for each in series.dimensions if trend.held.get(each.key) is not None]
+    return ", ".join(each.text(trend.held[each.key]) for each in known)
+
+
+def _made_of(series: RunSeries) -> Iterator[str]:
+    """Yield what all runs have in common: device, dates, labels."""
+    digests = [run.digest for run in series.runs if run.digest is not None]
+    if not digests:
+        return
+    started = sorted(_started(run) for run in series.runs if run.digest is not None)
+    rows = [
+        ("recorded (UTC)", f"{started[0]} to {started[-1]}"),
+        ("devices", _several(digest.device for digest in digests)),
+        *(
+            (key, _several(str(d.labels[key]) for d in digests if key in d.labels))
+            for key in dict.fromkeys(key for digest in digests for key in digest.labels)
+        ),
+    ]
+    yield html.rows("Made with", rows)
+
+
+def _several(texts: Iterable[str]) -> str:
+    return ", ".join(dict.fromkeys(texts))
+
+
+def _terms(series: RunSeries) -> list[tuple[str, str]]:
+    terms = ["average cycle", "peak hysteresis", "loop area"]
+    if PEAK_ERROR.of(series.done):
+        terms.append("peak and rms error")
+    if MODEL_ERROR.of(series.done):
+        terms.append("model error")
+    if ASYMMETRY.of(series.done) and any(each.name == "amplitude" for each in series.dimensions):
+        terms.append("asymmetry")
+    return definitions_of(*terms, "r²")
+
+
+def series_mapping(series: RunSeries) -> dict[str, Any]:
+    """Return plain values for JSON; a number that is not finite becomes None."""
+    return {
+        "name": series.name,
+        "headline": " ".join(headline(series)),
+        "varied": [
+            {"key": each.key, "name": each.name, "unit": each.unit, "values": list(each.values)}
+            for each in series.dimensions
+        ],
+        "runs": [_run(run) for run in series.runs],
+        "failed": [run.number for run in series.failed],
+        "not_read": list(series.missing),
+        "trends": [trend.to_mapping() for trend in fitted_trends(series)],
+        "drift": series.drift.to_mapping() if series.drift else None,
+    }
+
+
+def _run(run: SeriesRun) -> dict[str, Any]:
+    figures = {
+        name: None if isinstance(value, float) and not math.isfinite(value) else value
+        for name, value in asdict(run.figures).items()
+    }
+    return {
+        "run": run.number,
+        "reference_run": run.is_reference,
+        "values": dict(run.values),
+        "result": run.result,
+        "recording": run.recording,
+        "started": run.digest.started if run.digest else None,
+        "model_error_percent": run.digest.model_error_percent if run.digest else None,
+        **figures,
+    }

@@ -1,0 +1,252 @@
+"""Figures of loops: by what varied, minor ones, the model's, before and after, and their error."""
+
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from functools import partial
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from hilctl.analysis.figure_layout import FigureSpec, Panel
+from hilctl.analysis.plot_style import DISPLACEMENT, MARK, QUIET, REFERENCE
+from hilctl.base.formatting import quantity
+from hilctl.base.types import F64
+from hilctl.studies.multi_run.collect import RunSeries, SeriesRun
+from hilctl.studies.multi_run.digest import RunDigest
+from hilctl.studies.multi_run.minor_loops import minor_parts
+from hilctl.studies.multi_run.series_style import line_of, looks, spread
+from hilctl.studies.multi_run.varied_parameter import WITHOUT_COMPENSATOR, VariedParameter
+
+_MOST_PANELS = 6
+_SQUARE = 0.9
+_DISPLACEMENT_AXIS = "displacement, µm"
+
+
+def loop_sheets(series: RunSeries) -> Iterator[FigureSpec]:
+    """Yield the loops by each dimension of numbers, one panel for values of the others."""
+    for along in series.dimensions:
+        groups = _groups(series, along)
+        if along.numeric and groups:
+            panels = [
+                Panel(partial(_draw_loops, along=along, runs=runs), title, _SQUARE)
+                for title, runs in spread(groups, _MOST_PANELS)
+            ]
+            more = f", {len(panels)} of {len(groups)} shown" if len(panels) < len(groups) else ""
+            caption = f"Average steady loops by {along.name}{more}."
+            name = f"loops_by_{along.name.replace(' ', '_')}"
+            yield FigureSpec(name, caption, tuple(panels), alike=_alike(groups))
+
+
+def _alike(groups: Sequence[tuple[str, Sequence[SeriesRun]]]) -> bool:
+    """Return whether loops are of one input: then they have one axis."""
+    digests = [run.digest for _, runs in groups for run in runs if run.digest is not None]
+    return len({_input_axis(digest) for digest in digests}) == 1
+
+
+def _groups(series: RunSeries, along: VariedParameter) -> list[tuple[str, list[SeriesRun]]]:
+    """Return the runs with loops that differ by a dimension only, with what they have in common."""
+    others = [each for each in series.dimensions if each is not along]
+    found: dict[tuple[Hashable, ...], dict[Hashable, SeriesRun]] = {}
+    for run in series.done:
+        if run.digest is not None and run.digest.loop.size:
+            held = tuple(run.values.get(each.key) for each in others)
+            found.setdefault(held, {}).setdefault(run.values.get(along.key), run)
+    order = {each.key: {v: n for n, v in enumerate(each.values)} for each in others}
+
+    def place(held: tuple[Hashable, ...]) -> list[int]:
+        return [order[e.key].get(v, -1) for e, v in zip(others, held, strict=True)]
+
+    groups = []
+    for held in sorted(found, key=place):
+        runs = [found[held][value] for value in along.values if value in found[held]]
+        texts = [e.text(v) for e, v in zip(others, held, strict=True) if v is not None]
+        if len(runs) > 1:
+            groups.append((", ".join(texts), runs))
+    return groups
+
+
+def _input_axis(digest: RunDigest) -> str:
+    return "reference, µm" if digest.compensated else f"command, {digest.command_unit}"
+
+
+def _draw_loops(axes: Axes, along: VariedParameter, runs: Sequence[SeriesRun]) -> None:
+    shown = spread(runs)
+    look = looks(along, spread(along.values))
+    own = looks(along, [run.values[along.key] for run in shown])
+    for run in shown:
+        if run.digest is not None:
+            value = run.values[along.key]
+            style = line_of(look.get(value) or own[value])
+            axes.plot(*run.digest.loop, **style, linewidth=0.9, label=along.text(value))
+            axes.set(xlabel=_input_axis(run.digest), ylabel=_DISPLACEMENT_AXIS)
+
+
+def minor_loop_sheet(series: RunSeries) -> FigureSpec | None:
+    """Return loops with the minor loops in them, one panel a run; None where no run has any."""
+    runs = [
+        run
+        for run in series.done
+        if run.digest is not None
+        and run.digest.loop.size
+        and (run.figures.minor_low_um or run.figures.minor_high_um)
+    ]
+    if not runs:
+        return None
+    panels, more = _panels(series, runs, _draw_minor)
+    caption = f"Minor loops, where the input turns back within the cycle{more}."
+    return FigureSpec("minor_loops", caption, panels, alike=True)
+
+
+def _panels(
+    series: RunSeries, runs: Sequence[SeriesRun], draw: Callable[..., None]
+) -> tuple[tuple[Panel, ...], str]:
+    """Return a panel a run, spread over all where they are many, and what to say of that."""
+    panels = tuple(
+        Panel(partial(draw, run=run), series.text(run), _SQUARE)
+        for run in spread(runs, _MOST_PANELS)
+    )
+    return panels, f"; {len(panels)} of {len(runs)} runs" if len(panels) < len(runs) else ""
+
+
+def _draw_minor(axes: Axes, run: SeriesRun) -> None:
+    if run.digest is None:
+        return
+    loop = run.digest.loop
+    axes.plot(*loop, color=QUIET, linewidth=0.8, label="cycle")
+    for part in minor_parts(loop[0, :-1], loop[1, :-1]):
+        axes.plot(*part, color=MARK, linewidth=1.3, label="minor loop")
+    axes.set(xlabel=_input_axis(run.digest), ylabel=_DISPLACEMENT_AXIS)
+
+
+def model_sheet(series: RunSeries) -> FigureSpec | None:
+    """Return measured loops and what models make of their commands; None without models."""
+    runs = [run for run in series.done if run.digest is not None and run.digest.modelled.size]
+    if not runs:
+        return None
+    panels, more = _panels(series, runs, _draw_model)
+    caption = f"Measured loops and the model's, command against displacement{more}."
+    return FigureSpec("model_against_measured", caption, panels, alike=True)
+
+
+def _draw_model(axes: Axes, run: SeriesRun) -> None:
+    if run.digest is None:
+        return
+    command, measured, modelled = run.digest.modelled
+    axes.plot(command, measured, color=QUIET, linewidth=2.2, alpha=0.6, label="measured")
+    axes.plot(command, modelled, color=DISPLACEMENT, linewidth=0.9, label="model")
+    unit = run.digest.command_unit
+    axes.set(xlabel=f"command, {unit}", ylabel=_DISPLACEMENT_AXIS)
+    _note(axes, f"error {quantity(run.digest.model_error_percent, '%')}")
+
+
+def before_after_sheet(series: RunSeries) -> FigureSpec | None:
+    """Return loops without and with each compensator, as parts of their range; None without both.
+
+    Command and reference have different units, so that each is shown over its own range: a straight
+    line from corner to corner is what a compensator is for.
+    """
+    pairs = pairs_of(series)
+    if not pairs:
+        return None
+    panels = tuple(
+        Panel(partial(_draw_pair, before=before, after=after), title, _SQUARE)
+        for title, before, after in spread(pairs, _MOST_PANELS)
+    )
+    caption = "Loops before and after compensation, each over its own range; dotted: no hysteresis."
+    return FigureSpec("before_and_after", caption, panels, alike=True)
+
+
+Pair = tuple[str, SeriesRun, list[tuple[str, SeriesRun]]]
+
+
+def pairs_of(series: RunSeries) -> list[Pair]:
+    """Return each run without a compensator, with those of the same settings that have one."""
+    with_loop = [run for run in series.done if run.digest is not None and run.digest.loop.size]
+    before = [run for run in with_loop if run.digest and not run.digest.compensated]
+    after = [run for run in with_loop if run.digest and run.digest.compensated]
+    others = [each for each in series.dimensions if not each.is_compensator]
+    found = []
+    for run in before:
+        same = [
+            (_compensator(other), other)
+            for other in after
+            if all(run.values.get(e.key) == other.values.get(e.key) for e in others)
+        ]
+        if same:
+            texts = [e.text(run.values[e.key]) for e in others if run.values.get(e.key) is not None]
+            found.append((", ".join(texts), run, same))
+    return found
+
+
+def _compensator(run: SeriesRun) -> str:
+    name = run.values.get("compensator")
+    return str(name) if name not in {None, "none"} else "with compensator"
+
+
+def _draw_pair(axes: Axes, before: SeriesRun, after: Sequence[tuple[str, SeriesRun]]) -> None:
+    lines = [(WITHOUT_COMPENSATOR, before), *after]
+    look = looks(None, [name for name, _ in lines])
+    axes.plot([0, 100], [0, 100], color=REFERENCE, linestyle=":", linewidth=0.8)
+    for name, run in lines:
+        if run.digest is not None:
+            loop_input, moved = (_of_range(each) for each in run.digest.loop)
+            axes.plot(loop_input, moved, **line_of(look[name]), linewidth=0.9, label=name)
+    axes.set(xlabel="input, % of its range", ylabel="displacement, %")
+
+
+def _of_range(values: F64) -> F64:
+    low, whole = float(values.min()), float(np.ptp(values))
+    percent: F64 = 100.0 * (values - low) / whole if whole > 0.0 else values - low
+    return percent
+
+
+def error_sheet(series: RunSeries) -> FigureSpec | None:
+    """Return the error over one cycle of compensated runs; None where no run has any."""
+    runs = [run for run in series.done if run.digest is not None and run.digest.error_um.size]
+    if not runs:
+        return None
+    along = next((each for each in series.dimensions if each.numeric), None)
+    if along is None:
+        groups = [("", runs)]
+    else:
+        kept = {id(run) for run in runs}
+        groups = [
+            (title, [run for run in members if id(run) in kept])
+            for title, members in _groups(series, along)
+        ]
+        groups = [(title, members) for title, members in groups if members] or [("", runs)]
+    panels = tuple(
+        Panel(partial(_draw_error, text=_text_of(series, along), runs=members), title)
+        for title, members in spread(groups, _MOST_PANELS)
+    )
+    caption = "Error over one average cycle: displacement less reference."
+    return FigureSpec("error_history", caption, panels, alike=len(panels) > 1)
+
+
+def _text_of(series: RunSeries, along: VariedParameter | None) -> Callable[[SeriesRun], str]:
+    if along is None:
+        return series.text
+    return lambda run: along.text(run.values[along.key])
+
+
+def _draw_error(axes: Axes, text: Callable[[SeriesRun], str], runs: Sequence[SeriesRun]) -> None:
+    shown = spread(runs)
+    names = [text(run) for run in shown]
+    shades = looks(
+        VariedParameter("", "", "", tuple(map(float, range(len(shown))))), range(len(shown))
+    )
+    for number, (run, name) in enumerate(zip(shown, names, strict=True)):
+        if run.digest is not None:
+            style = line_of(shades[number])
+            axes.plot(*run.digest.error_um, **style, linewidth=0.9, label=name)
+    axes.set(xlabel="phase, cycles", ylabel="error, µm", xlim=(0.0, 1.0))
+
+
+def _note(axes: Axes, text: str) -> None:
+    axes.annotate(
+        text,
+        (0.04, 0.96),
+        xycoords="axes fraction",
+        va="top",
+        fontsize=6.5,
+        color=QUIET,
+    )

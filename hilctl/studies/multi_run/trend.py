@@ -1,0 +1,183 @@
+"""A figure of runs against what varied among them: linear fit, direction, and its extremes."""
+
+from collections import defaultdict
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from hilctl.base.types import F64
+from hilctl.studies.multi_run.collect import RunSeries, SeriesRun
+from hilctl.studies.multi_run.varied_parameter import VariedParameter
+
+_SPREAD = 0.02  # of the mean: less is no change
+_FEWEST = 3
+
+
+@dataclass(frozen=True, slots=True)
+class RunFigure:
+    """A figure that is compared among runs.
+
+    Attributes:
+        name: Its column in the table.
+        text: What it is, for people.
+        unit: Its unit; ``%`` or as in :func:`hilctl.base.formatting.quantity`.
+        short: Heading where there is no room for more.
+        value: Takes it from a run; None where it has none.
+    """
+
+    name: str
+    text: str
+    unit: str
+    short: str
+    value: Callable[[SeriesRun], float | None]
+
+    def of(self, runs: Sequence[SeriesRun]) -> list[tuple[SeriesRun, float]]:
+        """Return the runs that have it, each with its value."""
+        found = [(run, self.value(run)) for run in runs]
+        return [(run, value) for run, value in found if value is not None]
+
+
+def _column(name: str, text: str, unit: str, short: str) -> RunFigure:
+    return RunFigure(name, text, unit, short, lambda run: getattr(run.figures, name))
+
+
+STROKE = _column("peak_to_peak_um", "peak-to-peak", "um", "p-p µm")
+AREA = _column("loop_area", "loop area", "um*A", "area")
+HYSTERESIS = _column("peak_hysteresis_percent", "peak hysteresis", "%", "hyst. %")
+PEAK_ERROR = _column("peak_error_percent", "peak error", "%", "error %")
+RMS_ERROR = _column("rms_error_percent", "rms error", "%", "rms %")
+MINOR_HIGH = _column("minor_high_percent", "hysteresis of upper minor loop", "%", "upper %")
+MINOR_LOW = _column("minor_low_percent", "hysteresis of lower minor loop", "%", "lower %")
+NATURAL = _column("natural_hz", "natural frequency", "Hz", "reson. Hz")
+DAMPING = _column("damping_ratio", "damping ratio", "", "damping")
+MODEL_ERROR = RunFigure(
+    "model_error_percent",
+    "model error",
+    "%",
+    "model %",
+    lambda run: run.digest.model_error_percent if run.digest else None,
+)
+
+
+def _asymmetry(run: SeriesRun) -> float | None:
+    low, high, stroke = run.figures.low_um, run.figures.high_um, run.figures.peak_to_peak_um
+    if low is None or high is None or not stroke:
+        return None
+    return 100.0 * abs(high + low) / stroke
+
+
+ASYMMETRY = RunFigure("asymmetry_percent", "asymmetry", "%", "asym. %", _asymmetry)
+"""Difference of the two peaks, of the peak-to-peak."""
+
+
+@dataclass(frozen=True, slots=True)
+class Trend:
+    """A figure against one dimension, all others held.
+
+    Attributes:
+        figure: The figure.
+        along: What varies along it.
+        held: Value of each other dimension, by its key.
+        x: float64[n], values of ``along``, rising.
+        y: float64[n], the figure, averaged over repeats.
+        slope: Of the closest line; None with fewer than three points.
+        offset: Of the closest line.
+        r2: Share of the variance that the line explains; None as ``slope``.
+    """
+
+    figure: RunFigure
+    along: VariedParameter
+    held: Mapping[str, Hashable]
+    x: F64
+    y: F64
+    slope: float | None = None
+    offset: float | None = None
+    r2: float | None = None
+
+    @property
+    def direction(self) -> str:
+        """``rises``, ``falls``, ``does not change``, or empty where it is neither."""
+        spread = float(np.ptp(self.y))
+        if spread <= _SPREAD * float(np.mean(np.abs(self.y))):
+            return "does not change"
+        steps = np.diff(self.y)
+        if (steps > 0.0).all():
+            return "rises"
+        return "falls" if (steps < 0.0).all() else ""
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return plain values."""
+        return {
+            "figure": self.figure.name,
+            "along": self.along.key,
+            "held": dict(self.held),
+            "x": self.x.tolist(),
+            "y": self.y.tolist(),
+            "slope": self.slope,
+            "offset": self.offset,
+            "r2": self.r2,
+            "direction": self.direction,
+        }
+
+
+def trends(
+    series: RunSeries,
+    figure: RunFigure,
+    along: VariedParameter,
+    runs: Sequence[SeriesRun] | None = None,
+) -> list[Trend]:
+    """Return a figure's trends along a dimension, one for all values of the others.
+
+    Args:
+        series: The runs.
+        figure: The figure.
+        along: The dimension; of numbers.
+        runs: Those of the runs that count; all that were completed where None.
+    """
+    others = [each for each in series.dimensions if each.key != along.key]
+    grouped: dict[tuple[Hashable, ...], dict[float, list[float]]] = defaultdict(
+        lambda: defaultdict(list)
+    )
+    for run, value in figure.of(series.done if runs is None else runs):
+        at = run.values.get(along.key)
+        if isinstance(at, int | float):
+            held = tuple(run.values.get(each.key) for each in others)
+            grouped[held][float(at)].append(value)
+    order = {each.key: {v: n for n, v in enumerate(each.values)} for each in others}
+    rank = [
+        (tuple(order[e.key].get(v, -1) for e, v in zip(others, held, strict=True)), held)
+        for held in grouped
+    ]
+    return [
+        _trend(figure, along, {e.key: v for e, v in zip(others, held, strict=True)}, grouped[held])
+        for _, held in sorted(rank, key=lambda each: each[0])
+        if len(grouped[held]) > 1
+    ]
+
+
+def _trend(
+    figure: RunFigure,
+    along: VariedParameter,
+    held: Mapping[str, Hashable],
+    points: Mapping[float, list[float]],
+) -> Trend:
+    x = np.array(sorted(points))
+    y = np.array([np.mean(points[at]) for at in x.tolist()])
+    if x.size < _FEWEST:
+        return Trend(figure, along, held, x, y)
+    slope, offset = (float(each) for each in np.polyfit(x, y, 1))
+    whole = float(np.sum((y - y.mean()) ** 2))
+    left = float(np.sum((y - slope * x - offset) ** 2))
+    return Trend(figure, along, held, x, y, slope, offset, 1.0 - left / whole if whole else None)
+
+
+def extremes(
+    figure: RunFigure, runs: Sequence[SeriesRun]
+) -> tuple[tuple[SeriesRun, float], tuple[SeriesRun, float]] | None:
+    """Return the runs with the lowest and the highest value of a figure; None without any."""
+    found = figure.of(runs)
+    if not found:
+        return None
+    return min(found, key=lambda each: each[1]), max(found, key=lambda each: each[1])

@@ -1,0 +1,66 @@
+"""Figures for any column's width."""
+
+import pytest
+
+from hilctl.analysis.figure_layout import COLUMN_MM, FigureSpec, Panel, drawn
+
+
+def draw(axes, label="a line"):
+    axes.plot([0.0, 1.0], [0.0, 2.0], label=label)
+    axes.set(xlabel="time, s", ylabel="displacement, µm")
+
+
+def panels(count, **keys):
+    return tuple(Panel(lambda axes, k=k: draw(axes, f"line {k}"), **keys) for k in range(count))
+
+
+@pytest.mark.parametrize("width", ["single", "double"])
+def test_a_figure_has_the_width_of_a_column_and_letters_of_one_size(width):
+    figure = drawn(FigureSpec("a", "", panels(3, title="x")), width)
+    assert figure.get_size_inches()[0] * 25.4 == pytest.approx(COLUMN_MM[width])
+    assert {axes.title.get_fontsize() for axes in figure.axes} == {8.0}
+    assert [axes.get_title("left") for axes in figure.axes] == ["(a) x", "(b) x", "(c) x"]
+
+
+@pytest.mark.slow
+def test_panels_stand_abreast_where_there_is_room():
+    def columns(sheet, width):
+        figure = drawn(sheet, width)
+        return figure.axes[0].get_gridspec().ncols
+
+    assert columns(FigureSpec("a", "", panels(3)), "single") == 1
+    assert columns(FigureSpec("a", "", panels(3)), "double") == 3
+    assert columns(FigureSpec("a", "", panels(4)), "double") == 2
+    assert columns(FigureSpec("a", "", panels(6), alike=True), "single") == 2
+    assert columns(FigureSpec("a", "", panels(2), stacked=True), "double") == 1
+    assert columns(FigureSpec("a", "", panels(2), most_beside=1), "double") == 1
+
+
+def test_panels_alike_are_named_at_the_edge_only():
+    axes = drawn(FigureSpec("a", "", panels(3), alike=True)).axes
+    assert [bool(each.get_xlabel()) for each in axes[:3]] == [False, True, True]
+    assert [bool(each.get_ylabel()) for each in axes[:3]] == [True, False, True]
+    assert axes[0].get_xlim() == axes[2].get_xlim()
+
+
+def test_one_legend_names_everything_once_below_all_panels():
+    figure = drawn(FigureSpec("a", "", (*panels(2), *panels(2))))
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["line 0", "line 1"]
+    assert drawn(FigureSpec("a", "", panels(1))).legends == []
+
+
+def test_no_legend_is_wider_than_its_figure():
+    figure = drawn(FigureSpec("a", "", tuple(
+        Panel(lambda axes, k=k: draw(axes, f"a rather long name of line {k}")) for k in range(9)
+    )))  # fmt: skip
+    figure.draw_without_rendering()
+    box, whole = figure.legends[0].get_window_extent(), figure.bbox
+    assert box.x0 >= 0.0
+    assert box.x1 <= whole.x1
+
+
+def test_long_titles_are_broken():
+    axes = drawn(FigureSpec("a", "", panels(4, title="with compensator, 250 Hz"), alike=True)).axes[
+        0
+    ]
+    assert "\n" in axes.get_title("left")

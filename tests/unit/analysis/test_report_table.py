@@ -1,0 +1,57 @@
+"""The rows of a report: dashes, ranges and columns that say nothing."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from hilctl.analysis.report import summarize
+from hilctl.analysis.report_table import number, quality_rows, run_rows, segment_table
+from hilctl.recording.reader import read
+
+GOLDEN = Path(__file__).parents[3] / "recordings" / "golden"
+
+
+@pytest.fixture
+def report():
+    return summarize(read(GOLDEN / "terfenol_compensated.mcap"))
+
+
+def test_numbers_have_four_digits_and_their_unit():
+    assert number(1234.567, "um") == "1.235 mm"
+    assert number(0.0001234) == "0.0001234"
+    assert number(None, "um") == "-"
+
+
+def test_unknown_figures_are_dashes(report):
+    """A range without a lowest value, counters that the run did not keep, no percentiles."""
+    unknown = replace(
+        report, command_min=None, command_max=None, late_ticks=None, skipped_ticks=None,
+        lateness_us={}, device="", reason="", simulated=False, complete=True,
+    )  # fmt: skip
+    rows = dict(run_rows(unknown))
+    assert rows["command"] == "-"
+    assert rows["ticks"] == "- late, - skipped"
+    assert rows["lateness"] == "-"
+    assert "timing" not in rows
+    assert dict(run_rows(replace(report, deadline_misses="3 of 5")))["timing"] == "3 of 5"
+    assert (rows["device"], rows["ended"]) == ("-", "-")
+    assert dict(run_rows(replace(unknown, complete=False)))["ended"] == "- (NOT complete)"
+
+
+def test_uncompensated_runs_have_no_errors(report):
+    """There is no reference that an error could be held against."""
+    assert any("error" in name for name, _ in quality_rows(report))
+    assert not any("error" in name for name, _ in quality_rows(replace(report, compensated=False)))
+
+
+def test_columns_that_are_empty_everywhere_are_left_out(report):
+    """One segment that has a figure keeps its column."""
+    segment = report.segments[0]
+    blank = replace(segment, frequency_hz=None)
+    headings, rows = segment_table(replace(report, segments=(segment, blank)))
+    assert "freq. Hz" in headings
+    assert rows[1][headings.index("freq. Hz")] == "-"
+    headings, rows = segment_table(replace(report, segments=(blank,)))
+    assert "freq. Hz" not in headings
+    assert len(rows[0]) == len(headings)

@@ -1,0 +1,111 @@
+"""The command: words, places, and its end by a signal."""
+
+import json
+import re
+import signal
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from hilctl.cli.commands import app
+from hilctl_drivers.emulator.emulate_command import ListenAddress, serve
+from hilctl_drivers.emulator.factory import Emulator
+from hilctl_drivers.emulator.faults import parse_fault
+from hilctl_drivers.emulator.options import EmulatorOptions
+from hilctl_drivers.emulator.server import EmulatorServer
+
+CONFIGS = Path(__file__).parents[4] / "configs"
+
+
+@pytest.mark.parametrize(
+    ("profile", "reader", "options", "places"),
+    [
+        ("adam_4024", "adam_4117", {}, r"(/dev/pts/\d+) unit 1 \1 unit 2"),
+        ("adam_4024", "adam_4117", {"reader_unit_id": 7}, r"(/dev/\S+) unit 1 \1 unit 7"),
+        ("adam_6224", "adam_6217", {}, r"127.0.0.1:(\d+) unit 1 127.0.0.1:(?!\1)\d+ unit 1"),
+        ("kepco_bop", "agilent_34970a", {}, r"(/dev/pts/\d+) (?!\1)/dev/pts/\d+"),
+    ],
+)
+def test_it_says_where_both_answer(profile, reader, options, places):
+    """Each with its place, and its unit id where there is one; a signal ends it."""
+    told: list[ListenAddress] = []
+
+    def on_ready(places: Sequence[ListenAddress], emulator: Emulator) -> None:
+        told.extend(places)
+        signal.raise_signal(signal.SIGTERM)
+
+    serve(EmulatorOptions(profile, reader=reader, **options), on_ready)
+    assert [each.profile for each in told] == [profile, reader]
+    said = (f"{each.address}" + f" unit {each.unit_id}" * bool(each.unit_id) for each in told)
+    assert re.fullmatch(places, " ".join(said))
+
+
+@pytest.fixture
+def ended_at_once(monkeypatch):
+    """Let a signal end each emulator as soon as it answers."""
+    run = EmulatorServer.run
+
+    def run_shortly(server: EmulatorServer) -> None:
+        signal.raise_signal(signal.SIGTERM)
+        run(server)
+
+    monkeypatch.setattr(EmulatorServer, "run", run_shortly)
+
+
+def test_a_program_reads_where_and_how(ended_at_once):
+    """One line: places, wiring, and the arguments of a run there; people read the same in words."""
+    path = str(CONFIGS / "serial_scpi_kepco.yaml")
+    (line,) = CliRunner().invoke(app, ["emulate", path, "--json"]).stdout.splitlines()
+    said = json.loads(line)
+    assert [each["profile"] for each in said["devices"]] == ["kepco_bop", "agilent_34970a"]
+    places = [each["address"] for each in said["devices"]]
+    assert all(place.startswith("/dev/pts/") for place in places)
+    assert said["wiring"] == {
+        "output": "current", "input": "AI101",
+        "gain_a": 1.0, "offset_a": 0.0, "sensor_um": 12.5, "offset_um": 0.0,
+    }  # fmt: skip
+    assert said["arguments"] == [
+        "run", path,
+        "--set", f"device.serial_port={places[0]}",
+        "--set", f"device.reader.serial_port={places[1]}",
+    ]  # fmt: skip
+    shown = CliRunner().invoke(app, ["emulate", path]).stdout.splitlines()
+    assert re.fullmatch(r"kepco_bop answers at /dev/pts/\d+", shown[0])
+    assert shown[-1].startswith(f"hilctl run {path} --set device.serial_port=/dev/pts/")
+
+
+def test_a_profile_alone_has_no_wiring_to_tell(ended_at_once):
+    said = json.loads(CliRunner().invoke(app, ["emulate", "labjack_t7", "--json"]).stdout)
+    assert list(said) == ["devices"]
+    assert said["devices"][0]["unit_id"] is None
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["kepco_bop", "--reader", "agilent_34970a", "--sensor", "AI102"],
+        ["kepco_bop", "--sensor", "agilent_34970a:AI102"],
+    ],
+)
+def test_options_become_the_emulator(words, tmp_path, monkeypatch):
+    """What is not given has the default of :class:`EmulatorOptions`; a reader has two spellings."""
+    asked = []
+    monkeypatch.setattr(
+        "hilctl_drivers.emulator.emulate_command.serve", lambda *of: asked.append(of[0])
+    )
+    log = tmp_path / "log.jsonl"
+    more = ["--log", str(log), "--fault", "cut@2", "--fault", "delay:0.3@1s", "--port", "5020"]
+    ended = CliRunner().invoke(app, ["emulate", *words, *more])
+    assert ended.exit_code == 0, ended.output
+    assert asked == [
+        EmulatorOptions(
+            "kepco_bop",
+            port=5020,
+            log=log,
+            faults=(parse_fault("cut@2"), parse_fault("delay:0.3@1s")),
+            reader="agilent_34970a",
+            sensor="AI102",
+        )
+    ]

@@ -1,0 +1,552 @@
+"""``modbus_stream`` against an emulated LabJack in this process, in a time that tests make pass."""
+
+import struct
+from contextlib import nullcontext
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from hilctl.base.errors import DeviceError
+from hilctl_drivers.labjack import stream
+from hilctl_drivers.labjack.modbus_stream import ModbusStream
+from hilctl_drivers.labjack.stream_setup import ModbusStreamOptions
+from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
+from hilctl_drivers.transport.links import NoAnswerError
+from tests.fakes import FaultyLink, InProcess, InProcessLink, logged, made_safe
+
+RATE_HZ = 10_000.0
+BLOCK = 100
+FIFO_BLOCKS = 5
+MESSAGE_S = 0.0003
+LSB_UM = 0.0003158058 * 12.5
+PATTERN = b"\xcc\x04"
+
+
+def options(**changes):
+    made = {
+        "profile": "labjack_t7",
+        "host": "127.0.0.1",
+        "output": "DAC0",
+        "input": "AIN0",
+        "amplifier": {"gain_a_per_v": 4.0, "offset_a": -10.0},
+        "sensor": {"um_per_v": 12.5},
+        "watchdog": "none",
+        "fifo_blocks": FIFO_BLOCKS,
+        **changes,
+    }
+    return ModbusStreamOptions.model_validate(made)
+
+
+class DrivenStream:
+    """A streaming device that is wired to an emulated LabJack."""
+
+    def __init__(self, emulated, log, chosen):
+        self.emulated = emulated
+        self.time = emulated.time
+        self.link = emulated.link
+        self._log = log
+        self.device = ModbusStream(
+            chosen,
+            connect=lambda peer: peer.session(emulated.link),
+            sleep=emulated.time.sleep,
+            clock=emulated.time,
+        )
+        self.sent = 0
+
+    def open(self, rate_hz=RATE_HZ, block=BLOCK):
+        """Open and arm it, as a run does."""
+        self.device.open(rate_hz, block)
+        self.device.arm()
+        self.sent = 0
+
+    def exchange(self, command):
+        """Send one block; return the displacements that came back with it."""
+        displacement_um, measured = np.full(command.size, np.nan), np.full(command.size, np.nan)
+        self.device.exchange(self.sent, command, displacement_um, measured)
+        self.sent += command.size
+        return displacement_um
+
+    def hold(self, command, blocks):
+        return [self.exchange(np.full(BLOCK, float(command))) for _ in range(blocks)]
+
+    def stall(self, seconds):
+        self.time.sleep(seconds)
+
+    def events(self):
+        return logged(self._log)
+
+    @property
+    def clock(self):
+        """The emulated device's scan clock."""
+        return self.emulated.device.overlay.fifo
+
+
+@pytest.fixture
+def driven(tmp_path):
+    """Return a function that wires a streaming device to an emulated LabJack."""
+    made = []
+
+    def of(link=InProcessLink, message_s=MESSAGE_S, current_a=0.0, **changes):
+        chosen = options(**changes)
+        log = tmp_path / f"log{len(made)}.jsonl"
+        emulated = InProcess.of(
+            chosen.profile.name, link=link, log=log, message_s=message_s, current_a=current_a
+        )
+        made.append(DrivenStream(emulated, log, chosen))
+        return made[-1]
+
+    yield of
+    for each in made:
+        each.emulated.log.close()
+
+
+def sine(n, frequency_hz=50.0, rate_hz=RATE_HZ):
+    return 3.0 * np.sin(2 * np.pi * frequency_hz * np.arange(n) / rate_hz)
+
+
+def alone(commands, rate_hz=RATE_HZ):
+    """Return what the same actuator does with float32 volts sample by sample, without noise."""
+    volts = ((commands + 10.0) / 4.0).astype(np.float32).astype(np.float64)
+    actuator = TerfenolActuator(replace(TerfenolParameters(), sensor_noise_um=0.0), rate_hz)
+    found, measured = np.empty(commands.size), np.empty(commands.size)
+    actuator.step(volts * 4.0 - 10.0, found, measured)
+    return found
+
+
+def test_says_that_it_streams(driven):
+    """Its FIFO and the exchanges until an answer are known before it is opened."""
+    info = driven().device.info
+    assert info.name == "modbus_stream"
+    assert info.buffered
+    assert (info.fifo_depth, info.latency_blocks) == (8192, FIFO_BLOCKS)
+    assert info.max_rate_hz == 50_000.0
+    assert info.details["fifo_depth"] == "8192 samples"
+    assert info.details["fifo_level"] == f"{FIFO_BLOCKS} blocks"
+    assert (info.command_min, info.command_max) == (-10.0, 10.0)
+
+
+@pytest.mark.parametrize("profile", ["labjack_t7", "labjack_t4"])
+def test_each_displacement_belongs_to_its_command(driven, profile):
+    """What comes back is what the same actuator does sample by sample, as many blocks later."""
+    made = driven(profile=profile)
+    made.open()
+    commands = sine(20 * BLOCK)
+    back = [made.exchange(part) for part in np.split(commands, 20)]
+    assert np.isnan(np.concatenate(back[:FIFO_BLOCKS])).all()
+    found = np.concatenate(back[FIFO_BLOCKS:])
+    assert found == pytest.approx(alone(commands[: found.size]), abs=0.51 * LSB_UM * 1.03)
+
+
+def test_the_stream_is_set_up_by_the_documented_registers(driven):
+    """Buffer before values, scan list with the input first, command-response data, then enabled."""
+    made = driven()
+    made.open()
+    made.hold(0.0, FIFO_BLOCKS)
+    sent = b"".join(made.link.requests)
+    in_order = [
+        (4090, stream.u32(0)),
+        (4040, stream.u32(1000)),
+        (4050, stream.u32(16384)),
+        (4060, stream.u32(1)),
+        (4090, stream.u32(1)),
+        (4002, stream.f32(RATE_HZ)),
+        (4004, stream.u32(2)),
+        (4008, stream.f32(0.0)),
+        (4010, stream.u32(0)),
+        (4012, stream.u32(16384)),
+        (4016, stream.u32(16)),
+        (4018, stream.u32(0)),
+        (4020, stream.u32(0)),
+        (4100, stream.u32(0) + stream.u32(4800)),
+        (4400, stream.f32(2.5) * 58),
+        (4070, stream.u32(1)),
+        (4990, stream.u32(1)),
+    ]
+    at = 0
+    for address, data in in_order:
+        frame = struct.pack(">BHB", 1, address, len(data) // 2) + data
+        at = sent.index(frame, at) + len(frame)
+
+
+def test_nothing_moves_before_the_fifo_is_filled(driven):
+    """Opening and the first blocks leave the output alone; the clock starts with the last."""
+    made = driven()
+    made.open()
+    made.hold(2.0, FIFO_BLOCKS - 1)
+    made.stall(1.0)
+    assert not made.clock.running
+    assert [each["current_a"] for each in made.events()] == pytest.approx([0.0])
+    made.hold(2.0, 1)
+    assert made.clock.running
+
+
+def test_the_device_keeps_the_pace(driven):
+    """Blocks go out at once until the FIFO is filled, then one for each that was put out."""
+    made = driven()
+    made.open()
+    made.hold(1.0, FIFO_BLOCKS)
+    before = made.time()
+    made.hold(1.0, 50)
+    assert made.time() - before == pytest.approx(50 * BLOCK / RATE_HZ, rel=0.01)
+    assert made.device.stream.level_min > (FIFO_BLOCKS - 1.1) * BLOCK
+    assert made.clock.underruns == 0
+
+
+def test_a_block_costs_no_more_messages_than_values_and_readings_need(driven):
+    """58 values or 120 readings fill a message; the readings that wait come with the values."""
+    made = driven(message_s=0.001)
+    made.open(20_000.0, 580)
+    for _ in range(FIFO_BLOCKS + 3):
+        made.exchange(np.zeros(580))
+    before = len(made.link.requests)
+    for _ in range(10):
+        made.exchange(np.zeros(580))
+    assert len(made.link.requests) - before <= 10 * (10 + 5)
+
+
+@pytest.mark.slow
+def test_the_highest_rate_needs_all_of_the_messages(driven):
+    """At 1 ms a message and nearly the rate that check allows, nothing runs dry."""
+    made = driven(message_s=0.001, fifo_blocks=6)
+    rate_hz = 50_000.0
+    made.open(rate_hz, 1160)
+    commands = sine(40 * 1160, rate_hz=rate_hz)
+    back = [made.exchange(part) for part in np.split(commands, 40)]
+    found = np.concatenate(back[6:])
+    expected = alone(commands[: found.size], rate_hz)
+    assert found == pytest.approx(expected, abs=0.51 * LSB_UM)
+    assert made.clock.underruns == 0
+
+
+def test_a_stall_of_this_machine_costs_fifo_and_no_sample(driven):
+    """After a stall shorter than the FIFO holds, blocks go out in a burst and none is missing."""
+    made = driven()
+    made.open()
+    made.hold(1.0, 10)
+    made.stall(0.035)
+    assert all(np.isfinite(each).all() for each in made.hold(1.0, 20))
+    assert made.clock.underruns == 0
+    made.device.close()
+    assert not made.clock.running
+
+
+def test_an_underrun_is_told_with_its_length(driven):
+    """A stall longer than the FIFO holds ends in an error that says by how many samples."""
+    made = driven()
+    made.open()
+    made.hold(1.0, 10)
+    made.stall(0.080)
+    with pytest.raises(DeviceError, match=r"underrun: .* put out for (\d+) sample periods") as e:
+        made.hold(1.0, 1)
+    told = int(str(e.value).split("put out for ")[1].split()[0])
+    assert told == made.clock.underruns
+    assert 250 <= told <= 350
+    made.device.make_safe(0.0)
+    assert made.events()[-1]["current_a"] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_fifo_that_is_nearly_empty_is_an_underrun(driven):
+    """With fewer values than pass in one message nobody knows whether each came in time."""
+    made = driven()
+    made.open()
+    made.hold(1.0, 10)
+    made.stall(0.0490)
+    with pytest.raises(DeviceError, match=r"underrun: only \d+ values were left"):
+        made.hold(1.0, 1)
+
+
+def test_a_device_that_repeats_values_is_found_out(driven):
+    """Its own count of waiting values must fit the count of its scans."""
+    made = driven()
+    made.open()
+    made.hold(1.0, 10)
+    made.clock.queue(np.zeros(50))
+    with pytest.raises(DeviceError, match=r"the device holds \d+ values, by its scans it must be"):
+        made.hold(1.0, 1)
+
+
+def test_dropped_readings_are_told(driven):
+    """A full buffer of readings is an error with the device's own reason."""
+    made = driven(fifo_blocks=40)
+    made.open()
+    made.hold(1.0, 45)
+    made.emulated.device.overlay.input.start(64)
+    made.stall(0.02)
+    with pytest.raises(DeviceError, match="buffer of readings was full"):
+        made.hold(1.0, 2)
+
+
+class Silent(InProcessLink):
+    """Answers no request once it has been told so."""
+
+    silent = False
+
+    def transact(self, request, missing, usual=0):
+        if self.silent:
+            self.close()
+            raise NoAnswerError("no answer within 0.1 s")
+        return super().transact(request, missing, usual)
+
+    def open(self):
+        super().open()
+        self.silent = False
+
+
+class Spoiled(InProcessLink):
+    """Changes every reply in a way that a test wants."""
+
+    change = staticmethod(lambda reply: reply)
+
+    def spoil(self, reply):
+        return self.change(reply)
+
+    def open(self):
+        super().open()
+        self.change = lambda reply: reply
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (lambda r: r[:-1], "only 259 bytes"),
+        (lambda r: r + b"\0", "1 bytes behind the end"),
+        (lambda r: b"\x55" + r[1:], "transaction must be"),
+        (lambda r: r[:3] + b"\1" + r[4:], "not a Modbus TCP header"),
+        (lambda r: r[:5] + b"\3" + r[6:7] + PATTERN, r"exception 4 \(device failure\)"),
+        (lambda r: r[:12] + b"\x0b\x7c" + r[14:], "it drops scans"),
+    ],
+)
+def test_a_bad_answer_is_an_error_and_the_output_can_still_be_made_safe(driven, change, text):
+    """No wrong reading is taken, and what is queued is dropped for the safe value."""
+    made = driven(link=Spoiled)
+    made.open()
+    made.hold(2.0, 8)
+    made.link.change = change
+    with pytest.raises(DeviceError, match=text):
+        made.hold(2.0, 1)
+    made.device.make_safe(0.0)
+    assert not made.clock.running
+    assert made.events()[-1]["current_a"] == pytest.approx(0.0, abs=1e-9)
+    made.open()
+    made.hold(0.0, 8)
+
+
+def test_a_device_that_falls_silent_is_an_error_that_says_what_was_done(driven):
+    """Its name, its place and the deed are in the text; it must be opened again."""
+    made = driven(link=Silent)
+    made.open()
+    made.hold(2.0, 8)
+    made.link.silent = True
+    text = r"modbus_stream labjack_t7 at 127.0.0.1:502: no answer .*to stream DAC0 and AIN0"
+    with pytest.raises(DeviceError, match=text):
+        made.hold(2.0, 1)
+    with pytest.raises(DeviceError, match="not open"):
+        made.hold(2.0, 1)
+
+
+def test_a_clock_that_stands_is_not_waited_for_for_ever(driven):
+    """Readings that don't come end the run by the time-out."""
+    made = driven(timeout_s=0.2)
+    made.open()
+    made.hold(2.0, 8)
+    made.clock.advance = lambda now_ns: np.empty(0)
+    before = made.time()
+    with pytest.raises(DeviceError, match=r"the device's clock stands: \d+ of 100 readings"):
+        made.hold(2.0, 1)
+    assert made.time() - before < 0.5
+
+
+def test_a_silent_host_is_noticed_by_the_device(driven):
+    """The watchdog puts the safe value out; blocks are refused then, and make_safe still works."""
+    made = driven(watchdog={"timeout_s": 2.0, "safe_command": -1.0})
+    made.open()
+    made.hold(2.0, 10)
+    made.stall(3.0)
+    with pytest.raises(DeviceError, match="function 76 refused"):
+        made.hold(2.0, 1)
+    last = made.events()[-1]
+    assert (last["event"], last["current_a"]) == ("watchdog", pytest.approx(-1.0))
+    made.device.make_safe(0.0)
+    assert made.events()[-1]["current_a"] == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, 10.01, -10.01])
+def test_a_block_with_a_bad_value_is_refused_whole(driven, bad):
+    """Nothing of it is sent, and the run can go on."""
+    made = driven()
+    made.open()
+    made.hold(1.0, 2)
+    before = len(made.link.requests)
+    command = np.full(BLOCK, 1.0)
+    command[40] = bad
+    with pytest.raises(DeviceError, match=r"command\[40\] must be in .*nothing was sent"):
+        made.exchange(command)
+    assert len(made.link.requests) == before
+    made.hold(1.0, 2)
+
+
+def test_samples_follow_one_another(driven):
+    """A jump is refused: the device puts samples out one after the other, whatever their index."""
+    made = driven()
+    made.open()
+    made.hold(1.0, 2)
+    made.sent += BLOCK
+    with pytest.raises(DeviceError, match="samples must follow one another, 200 is next, got 300"):
+        made.hold(1.0, 1)
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "block", "changes", "text"),
+    [
+        (RATE_HZ, 1366, {}, "block must be 1 to 1365.*8192 samples, got 1366"),
+        (RATE_HZ, 0, {}, "block must be 1 to 1365"),
+        (50.0, 10, {}, r"sample rate must be in \[100, .*got 50"),
+        (50_001.0, 580, {}, r"sample rate must be in \[100, 50000\] Hz .*580 samples in"),
+        (40_000.0, 58, {}, r"in \[100, 29000\] Hz .*58 samples in 2 messages.*turnaround 2.00 ms"),
+        (7_000.0, 100, {}, "scan rate was set to 7000 Hz, the device makes 6997.9"),
+        (100.0, 100, {"watchdog": {"timeout_s": 2.0}}, "3 exchanges must come within"),
+    ],
+)
+def test_what_the_device_can_not_do_is_refused_at_open(driven, rate_hz, block, changes, text):
+    """With what would be possible; nothing was put out."""
+    made = driven(**changes)
+    with pytest.raises(DeviceError, match=text):
+        made.device.open(rate_hz, block)
+    assert all(each["current_a"] == pytest.approx(0.0) for each in made.events())
+    assert not made.clock.running
+
+
+def test_a_stream_of_an_earlier_run_is_stopped(driven):
+    """A run that was killed leaves its stream running; the next one starts from its own blocks."""
+    made = driven()
+    made.open()
+    made.hold(2.0, 10)
+    again = DrivenStream(made.emulated, made._log, options())
+    again.open()
+    assert not again.clock.running
+    found = again.hold(2.0, FIFO_BLOCKS + 2)
+    assert np.isfinite(found[-1]).all()
+    assert again.clock.underruns == 0
+
+
+def test_opening_again_starts_at_zero_and_keeps_the_output(driven):
+    """After close the output holds; the next run counts from 0 and starts where it is."""
+    made = driven()
+    made.open()
+    held = made.hold(2.0, 20)[-1]
+    made.device.close()
+    made.device.close()
+    made.open()
+    first = made.hold(2.0, FIFO_BLOCKS + 1)[-1]
+    assert first[0] == pytest.approx(held[-1], abs=0.5)
+
+
+def test_make_safe_needs_no_open_connection(driven):
+    """It makes its own, and lets go of it."""
+    made = driven()
+    made.device.make_safe(1.0)
+    assert made.events()[-1]["current_a"] == pytest.approx(1.0)
+    assert not made.link.is_open
+
+
+def test_says_what_it_puts_out(driven):
+    """Read back after opening: at power-up the end of the range, later where a run has left it."""
+    made = driven(current_a=None)
+    made.open()
+    assert made.device.output() == pytest.approx(-10.0)
+    assert [each["current_a"] for each in made.events()] == pytest.approx([-10.0])
+    made.hold(2.0, 10)
+    made.device.close()
+    made.open()
+    assert made.device.output() == pytest.approx(2.0)
+    made.device.close()
+
+
+def test_stream_starts_where_the_output_stands(driven):
+    """The rig has been there all the time: its first displacement is that of the last command."""
+    made = driven()
+    made.device.make_safe(3.0)
+    made.open()
+    first = made.hold(3.0, FIFO_BLOCKS + 1)[-1]
+    assert first[0] == pytest.approx(first[-1], abs=0.5)
+    assert first[0] > 10.0
+
+
+def test_one_message_stops_the_stream_and_writes_the_safe_value(driven):
+    """The device has it as soon as a message can reach it, whatever waits in the buffer."""
+    made = driven(link=FaultyLink)
+    made.open()
+    made.hold(2.0, 10)
+    before_s, sent = made.time(), len(made.link.requests)
+    made.device.make_safe(-1.0)
+    last = made.events()[-1]
+    assert (last["event"], last["current_a"]) == ("write", pytest.approx(-1.0))
+    assert last["monotonic_ns"] * 1e-9 - before_s == pytest.approx(MESSAGE_S)
+    assert len(made.link.requests) - sent == 2  # the other one reads it back
+    assert not made.clock.running
+
+
+def test_stream_that_is_started_late_is_stopped_by_the_next_attempt(driven):
+    """The message that starts it timed out, and is executed after the safe value."""
+    made = driven(link=FaultyLink)
+    made.open()
+    made.hold(4.0, FIFO_BLOCKS - 1)
+    made.link.late_if = lambda request: struct.pack(">BHB", 1, stream.ENABLE, 2) in request
+    made.link.late_s = 0.4
+    with pytest.raises(DeviceError, match="no answer"):
+        made.hold(4.0, 1)
+    made.device.make_safe(0.0)
+    made.stall(0.5)
+    made.link.deliver()
+    assert made.clock.running
+    made.device.make_safe(0.0)
+    made.stall(60.0)
+    made.emulated.device.tick(made.time.now_ns)
+    assert made.emulated.rig.current_a == pytest.approx(0.0, abs=1e-9)
+    assert not made.clock.running
+
+
+@pytest.mark.parametrize("silence_s", [0.6, 3.0])
+def test_stream_that_was_silent_is_made_safe_when_it_is_back(driven, silence_s):
+    """What waits in the buffer is dropped by the first message that gets there."""
+    made = driven(link=FaultyLink)
+    made.open()
+    made.hold(2.0, 10)
+    back_s = made.time() + silence_s
+    made.link.silent_until_s = back_s
+    with pytest.raises(DeviceError):
+        made.hold(2.0, 1)
+    made_safe(made.device, 0.0)
+    written = [each for each in made.events() if each["event"] == "write"][1:]
+    assert 0.0 <= written[0]["monotonic_ns"] * 1e-9 - back_s < 0.2
+    assert made.emulated.rig.current_a == pytest.approx(0.0, abs=1e-9)
+
+
+def test_the_watchdog_does_not_count_before_it_is_armed(driven):
+    """However long the start signal takes."""
+    made = driven(watchdog={"timeout_s": 2.0})
+    made.device.open(RATE_HZ, BLOCK)
+    made.stall(60.0)
+    assert made.events()[-1]["event"] != "watchdog"
+    made.device.arm()
+    made.hold(1.0, 1)
+    made.stall(2.1)
+    made.hold(1.0, 1)
+    assert made.events()[-1]["event"] == "watchdog"
+
+
+@pytest.mark.parametrize(
+    ("running", "held_v", "holds"), [(0, 1.0, True), (1, 1.0, False), (0, 2.0, False)]
+)
+def test_safe_is_a_stopped_stream_and_an_output_that_holds(
+    driven, monkeypatch, running, held_v, holds
+):
+    """Each alone is not: a running stream writes over the output with its next scan."""
+    safe_write = driven().device._safe_write
+    encoded = safe_write._setup.output.format.encode(held_v)
+    answer = SimpleNamespace(call=lambda frames: [stream.u32(running), encoded])
+    monkeypatch.setattr("hilctl_drivers.labjack.modbus_stream.ModbusFeedback", lambda *_: answer)
+    with nullcontext() if holds else pytest.raises(DeviceError):
+        safe_write._check_held(SimpleNamespace(link=None), 1.0)

@@ -1,0 +1,586 @@
+"""modbus_dac on loopback: what it checks before it opens, how it exchanges, and its watchdog."""
+
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from hilctl.base.errors import DeviceError, InputError
+from hilctl_drivers.emulator.factory import Emulator, build
+from hilctl_drivers.emulator.faults import parse_fault
+from hilctl_drivers.emulator.options import EmulatorOptions
+from hilctl_drivers.modbus.config import ModbusOptions
+from hilctl_drivers.modbus.modbus_dac import ModbusDac
+from hilctl_drivers.profile import load_profile, shipped_profiles
+from tests.fakes import ManualClock, logged
+
+T7 = {
+    "profile": "labjack_t7",
+    "output": "DAC0",
+    "input": "AIN0",
+    "amplifier": {"gain_a_per_v": 4.0, "offset_a": -10.0},
+    "sensor": {"um_per_v": 12.5},
+    "watchdog": "none",
+}
+WAGO = {
+    "profile": "wago_750",
+    "output": "AO0",
+    "input": "AI0",
+    "amplifier": {"gain_a_per_v": 1.0},
+    "sensor": {"um_per_v": 12.5},
+    "watchdog": "none",
+}
+MODULE = """\
+vendor: nobody
+model: an analogue module on a serial line
+source: [this test]
+verified: "yes"
+link: {kind: rtu, baud: 115200}
+address_base: 0
+exchange: 23
+turnaround_s: 0.0
+max_rate_hz: 1000.0
+outputs:
+  OUT: {address: 100, type: float32, unit: V, min: -10.0, max: 10.0}
+inputs:
+  IN: {address: 200, type: float32, unit: V, min: -10.0, max: 10.0}
+watchdog: none
+"""
+READER = {"profile": "adam_6217", "unit_id": 2}
+READS = {"reader": READER, "input": "AI0"}
+RTU = {
+    "output": "OUT",
+    "input": "IN",
+    "amplifier": {"gain_a_per_v": 1.0},
+    "sensor": {"um_per_v": 12.5},
+    "watchdog": "none",
+}
+
+
+@dataclass
+class Served:
+    """An emulator in a thread, with what it logs.
+
+    Attributes:
+        emulator: The emulator.
+        clock: Its time.
+        log: What it put out.
+    """
+
+    emulator: Emulator
+    clock: ManualClock
+    log: Path
+
+    def device(self, options: dict, **changes) -> ModbusDac:
+        host, _, port = self.emulator.address.partition(":")
+        where = {"host": host, "tcp_port": int(port)} if port else {"serial_port": host}
+        given = {**options, "timeout_s": 5.0, **where, **changes}
+        return ModbusDac(ModbusOptions.model_validate(given))
+
+    def events(self) -> list[dict]:
+        return logged(self.log)
+
+
+@pytest.fixture
+def serve(tmp_path) -> Iterator[Callable[..., Served]]:
+    """Return a function that serves an emulated device on a clock that stands still."""
+    started: list[tuple[Served, threading.Thread]] = []
+
+    def start(profile: str, **options) -> Served:
+        clock, log = ManualClock(0), tmp_path / f"writes{len(started)}.jsonl"
+        emulator = build(EmulatorOptions(profile, log=log, **{"current_a": 0.0, **options}), clock)
+        thread = threading.Thread(target=emulator.server.run)
+        thread.start()
+        started.append((Served(emulator, clock, log), thread))
+        return started[-1][0]
+
+    yield start
+    for served, thread in started:
+        served.emulator.server.stop()
+        thread.join()
+        served.emulator.log.close()
+
+
+@pytest.fixture
+def module(tmp_path) -> str:
+    """A profile for Modbus RTU, by path."""
+    path = tmp_path / "module.yaml"
+    path.write_text(MODULE, encoding="utf-8")
+    return str(path)
+
+
+def exchange(device: ModbusDac, value: float) -> float:
+    displacement_um = np.full(1, np.nan)
+    device.exchange(0, np.array([value]), displacement_um, np.full(1, np.nan))
+    return float(displacement_um[0])
+
+
+def made(**changes) -> ModbusDac:
+    options = ModbusOptions.model_validate({**T7, "host": "h", **changes})
+    return ModbusDac(options)
+
+
+class TestOptions:
+    """What is refused before anything is sent."""
+
+    @pytest.mark.parametrize(
+        ("changes", "words"),
+        [
+            ({"serial_port": "/dev/x"}, "either host or serial_port"),
+            ({"host": None}, "either host or serial_port"),
+            ({"host": None, "serial_port": "/dev/x", "tcp_port": 502}, "tcp_port goes with host"),
+            ({"reader": {"unit_id": 2}}, "Field required"),
+            ({"reader": {**READER, "host": "r", "serial_port": "/dev/r"}}, "one of host and"),
+            ({"reader": {**READER, "tcp_port": 502}}, "tcp_port goes with host"),
+            ({"reader": {**READER, "baud": 9600}}, "baud goes with serial_port"),
+            ({"profile": "nothing"}, "no profile 'nothing' is shipped"),
+            ({"reader": {"profile": "nothing"}}, "no profile 'nothing' is shipped"),
+            ({"profile": 7}, "valid string"),
+            ({"amplifier": {"offset_a": 1.0}}, "must have one of gain_a_per_v"),
+            ({"amplifier": {"gain_a_per_v": 1.0, "gain_v_per_v": 1.0}}, "must have one of"),
+            ({"amplifier": {"gain_v_per_v": 1.0, "offset_a": 1.0}}, "offset must be in the unit"),
+            ({"sensor": {"offset_um": 1.0}}, "must have one of um_per_v"),
+        ],
+    )
+    def test_options_that_contradict_themselves(self, changes, words):
+        """Rules inside the options are told as such."""
+        with pytest.raises(ValidationError, match=words):
+            made(**changes)
+
+    def test_watchdog_must_be_decided(self):
+        """Nobody drives without a watchdog by leaving a line out."""
+        with pytest.raises(ValidationError, match="watchdog"):
+            ModbusOptions.model_validate(
+                {"host": "h", **{key: T7[key] for key in T7 if key != "watchdog"}}
+            )
+
+    @pytest.mark.parametrize(
+        ("changes", "words"),
+        [
+            ({"output": "DAC9"}, r"output must be one that LabJack T7 has, got 'DAC9' \(it has"),
+            ({"input": "AIN9"}, "input must be one that LabJack T7 has"),
+            ({"amplifier": None}, "amplifier is required: the output is in V"),
+            ({"amplifier": {"gain_a_per_ma": 1.0}}, "amplifier takes mA, but the output is in V"),
+            ({"sensor": {"um_per_ma": 1.0}}, "sensor gives mA, but the input is in V"),
+            ({"profile": "kepco_bop"}, "is not one of a Modbus device"),
+            ({"host": None, "serial_port": "/dev/x"}, "is for Modbus tcp: give host"),
+            ({"watchdog": {"timeout_s": 0.5}}, "watchdog timeout_s must be"),
+            ({"watchdog": {"timeout_s": 1.0, "safe_command": 20.0}}, "safe_command must be -10 to"),
+            ({"watchdog": {"timeout_s": 1.0}, "output": "TDAC0"}, "does nothing for TDAC0"),
+            ({"timeout_s": 1e-4}, "timeout_s must be > 0.001"),
+            ({"baud": 9600, "parity": "E"}, "baud, parity must be left out: LabJack T7 has no"),
+            ({**READS, "input": "AI9"}, "input must be one that Advantech ADAM-6217 has"),
+            (
+                {"reader": {"profile": "adam_6217"}, "input": "AI0"},
+                "both be unit 1 at h:502: give reader.u",
+            ),
+            (
+                {**READS, "reader": {"profile": "kepco_bop"}},
+                "kepco_bop is not one of a Modbus device",
+            ),
+            ({**READS, "output": "AI0", "profile": "adam_6217"}, "output must be one that"),
+            (
+                {**READS, "reader": {**READER, "serial_port": "/dev/r"}},
+                "is for Modbus tcp: give reader.h",
+            ),
+            (
+                {**WAGO, "watchdog": {"timeout_s": 1.0, "safe_command": 3.0}},
+                "puts AO0 at 0 V, which is 0 A here",
+            ),
+            (
+                {**WAGO, "profile": "adam_6024", "watchdog": {"timeout_s": 1.0}},
+                "has no host watchdog: it holds its last output",
+            ),
+        ],
+    )
+    def test_options_that_do_not_go_with_the_profile(self, changes, words):
+        """Names, units, links and the watchdog are held against the profile."""
+        with pytest.raises(InputError, match=words):
+            made(**changes)
+
+    def test_range_is_that_of_the_terminals_through_the_chain(self):
+        """Commands in A and displacements in um follow from volts, gains and offsets."""
+        info = made().info
+        assert (info.command_min, info.command_max, info.command_unit) == (-10.0, 10.0, "A")
+        assert (info.sensor_min_um, info.sensor_max_um) == (-125.0, 125.0)
+        turned = made(amplifier={"gain_v_per_v": -2.0, "offset_v": 1.0}).info
+        assert (turned.command_min, turned.command_max, turned.command_unit) == (-9.0, 1.0, "V")
+
+    def test_rate_is_what_the_wire_leaves(self, module):
+        """115200 8N1 with standard gaps: 2.26 ms of characters and 3.5 ms of silence."""
+        options = {**RTU, "profile": module, "serial_port": "/dev/x"}
+        info = ModbusDac(ModbusOptions.model_validate(options)).info
+        assert info.max_rate_hz == pytest.approx(174.0, abs=1.0)
+        assert "FC23 at 115200 8N1" in info.rate_note
+        slow = ModbusDac(ModbusOptions.model_validate({**options, "baud": 9600})).info
+        assert slow.max_rate_hz == pytest.approx(29.0, abs=1.0)
+
+    def test_watchdog_is_said_before_it_is_opened(self):
+        """Where it would put the output, and why that is another value than the run's."""
+        wanted = {"timeout_s": 1.0, "safe_command": 1.5, "reason": "holds a load"}
+        info = made(watchdog=wanted).info
+        assert (info.watchdog_command, info.watchdog_reason) == (1.5, "holds a load")
+        assert made().info.watchdog_command is None
+
+    def test_calibration_is_kept(self):
+        """Who calibrated what goes with every recording."""
+        calibration = {"date": "2026-01-01", "by": "N. N.", "reference": "sheet 4"}
+        assert "sheet 4" in made(calibration=calibration).info.details["calibration"]
+
+
+def timeout_s(said: str) -> float:
+    """Return a short timeout where it is what ends the exchange, else longer than any stall."""
+    return 1.0 if "within" in said else 20.0
+
+
+class TestExchange:
+    """One transaction where it can be."""
+
+    @pytest.mark.parametrize(
+        ("options", "without", "one"),
+        [
+            (T7, {}, True),
+            (T7, {"lacking": frozenset({76})}, False),
+            (WAGO, {}, True),
+            (WAGO, {"lacking": frozenset({23})}, False),
+            (WAGO, {"mute": frozenset({23})}, False),
+            ({**WAGO, "profile": "icp_et7000"}, {}, False),
+        ],
+    )
+    def test_one_transaction_is_found_out_without_moving(self, serve, options, without, one):
+        """Refusal and silence both lead to a read and a write; the output stays where it was."""
+        served = serve(options["profile"], **without)
+        device = served.device(options, timeout_s=0.5)
+        device.open(10.0, 1)
+        assert device.one_transaction is one
+        assert {event["current_a"] for event in served.events()} <= {0.0}
+        exchange(device, 3.0)
+        served.clock.pass_s(0.1)
+        assert exchange(device, 3.0) == pytest.approx(16.5, abs=1.0)
+        assert served.events()[-1]["current_a"] == pytest.approx(3.0, abs=1e-3)
+        device.close()
+
+    @pytest.mark.parametrize("without", [{}, {"lacking": frozenset({76})}])
+    def test_input_is_read_before_the_output_is_written(self, serve, without):
+        """In one message or in two: the reading shows nothing yet of the command."""
+        served = serve("labjack_t7", **without)
+        device = served.device(T7)
+        device.open(10.0, 1)
+        emulated, order = served.emulator.device, []
+        read, write = emulated.read, emulated.write
+
+        def reading(areas: tuple[str, ...], address: int, count: int) -> list[int]:
+            order.append(("read", address))
+            return read(areas, address, count)
+
+        def writing(area: str, address: int, values: list[int]) -> None:
+            order.append(("write", address))
+            write(area, address, values)
+
+        emulated.read, emulated.write = reading, writing
+        exchange(device, 1.0)
+        assert order == [("read", 0), ("write", 1000)]
+        device.close()
+
+    @pytest.mark.parametrize("kind", ["23", "none"])
+    def test_wrong_input_is_found_out_at_opening(self, serve, tmp_path, kind):
+        """An address that the device does not have is refused before anything is written."""
+        served = serve("generic_float32")
+        text = shipped_profiles()["generic_float32"].read_text(encoding="utf-8")
+        wrong = tmp_path / "wrong.yaml"
+        text = text.replace("exchange: 23", f"exchange: {kind}")
+        wrong.write_text(text.replace("IN: {address: 2,", "IN: {address: 50,"), encoding="utf-8")
+        device = served.device({**RTU, "profile": str(wrong)})
+        with pytest.raises(DeviceError, match=r"exception 2 .* \(to open\)"):
+            device.open(10.0, 1)
+        assert served.events() == []
+
+    def test_slower_way_may_be_too_slow(self, serve):
+        """A rate that only one transaction could keep is refused where the device lacks it."""
+        served = serve("labjack_t7", lacking=frozenset({76}))
+        device = served.device(T7)
+        device.open(500.0, 1)
+        with pytest.raises(DeviceError, match=r"\(0, 500\] Hz \(a read and a write a sample; "):
+            device.open(501.0, 1)
+
+    def test_output_that_can_not_be_read_is_not_tried(self, serve):
+        """A TDAC can't be read back, so trying function 76 on it would move it."""
+        options = {**T7, "output": "TDAC0", "amplifier": {"gain_a_per_v": 1.0}}
+        served = serve("labjack_t7", output="TDAC0")
+        device = served.device(options)
+        assert device.info.max_rate_hz == pytest.approx(1e3 / 3)  # 1 ms each and 1 ms to settle
+        device.open(333.0, 1)
+        assert not device.one_transaction
+        assert served.events() == []
+        exchange(device, 1.0)
+        device.close()
+
+    def test_over_rtu(self, serve, module):
+        """The same over a pty."""
+        served = serve(module)
+        device = served.device({**RTU, "profile": module})
+        device.open(100.0, 1)
+        assert device.one_transaction
+        assert exchange(device, 2.5) == pytest.approx(0.0, abs=0.3)
+        device.make_safe(-1.0)
+        assert served.events()[-1]["current_a"] == -1.0
+
+    def test_blocks_are_refused(self, serve):
+        """There is no FIFO, so a block is one sample."""
+        served = serve("labjack_t7")
+        device = served.device(T7)
+        with pytest.raises(DeviceError, match="block must be 1 sample, got 2"):
+            device.open(100.0, 2)
+        device.open(100.0, 1)
+        with pytest.raises(DeviceError, match="block must be 1 sample, as at open, got 2"):
+            device.exchange(0, np.zeros(2), np.zeros(2), np.zeros(2))
+        device.close()
+
+    def test_after_an_error_it_must_be_opened_again(self, serve):
+        """What comes next on a link that failed could belong to what went before."""
+        served = serve("labjack_t7", faults=(parse_fault("exception@1s"),))
+        device = served.device(T7)
+        device.open(100.0, 1)
+        exchange(device, 0.0)
+        served.clock.pass_s(2.0)
+        with pytest.raises(DeviceError, match=r"exception 4 .* \(to write DAC0, read AIN0\)"):
+            exchange(device, 0.0)
+        with pytest.raises(DeviceError, match="not open"):
+            exchange(device, 0.0)
+        device.open(100.0, 1)
+        exchange(device, 0.0)
+        device.close()
+
+    @pytest.mark.parametrize(
+        ("fault", "said"),
+        [
+            ("silence", "no answer within 1 s"),
+            ("corrupt", "not a Modbus TCP header"),
+            ("cut", "only 6 bytes, 3 short, within 1 s"),
+            ("duplicate", "bytes behind the end of the reply"),
+            ("wrong_id", "transaction must be"),
+            ("reset", "connection lost: connection reset by peer"),
+        ],
+    )
+    def test_bad_answer_over_tcp_is_told(self, serve, fault, said):
+        """In words, with what was asked; the safe value gets there by a new connection."""
+        served = serve("labjack_t7", faults=(parse_fault(f"{fault}@1s"),))
+        device = served.device(T7, timeout_s=timeout_s(said))
+        self.assert_told(served, device, said)
+
+    @pytest.mark.parametrize(
+        ("fault", "said"),
+        [
+            ("silence", "no answer within 1 s"),
+            ("corrupt", "CRC of 9 bytes is wrong"),
+            ("cut", "short, within 1 s"),
+            ("duplicate", "CRC of 18 bytes is wrong"),
+            ("wrong_id", "unit must be 1, got 2"),
+        ],
+    )
+    def test_bad_answer_over_rtu_is_told(self, serve, module, fault, said):
+        """The same on a serial line."""
+        served = serve(module, faults=(parse_fault(f"{fault}@1s"),))
+        device = served.device({**RTU, "profile": module}, timeout_s=timeout_s(said))
+        self.assert_told(served, device, said)
+
+    @staticmethod
+    def assert_told(served: Served, device: ModbusDac, said: str) -> None:
+        device.open(100.0, 1)
+        exchange(device, 1.0)
+        served.clock.pass_s(2.0)
+        with pytest.raises(DeviceError, match=said):
+            exchange(device, 1.0)
+        device.make_safe(0.0)
+        assert served.events()[-1]["current_a"] == pytest.approx(0.0, abs=1e-5)
+
+    def test_nobody_there(self):
+        """A refused connection names the device, where it should be, and what was tried."""
+        device = made(host="127.0.0.1", tcp_port=1)
+        words = r"modbus_dac labjack_t7 at 127\.0\.0\.1:1: can't connect: .* \(to open\)"
+        with pytest.raises(DeviceError, match=words):
+            device.open(100.0, 1)
+        with pytest.raises(DeviceError, match="make safe, DAC0"):
+            device.make_safe(0.0)
+
+
+class TestSteps:
+    """Self-test and init steps."""
+
+    def test_wrong_device_is_refused(self, serve):
+        """A self-test register with words swapped means another byte order than the profile's."""
+        served = serve("labjack_t7")
+        memory = served.emulator.device.memory
+        words, _ = memory._readable["holding", 55100]
+        words.words.reverse()
+        with pytest.raises(DeviceError, match=r"self-test register 55100 must hold .*byte order"):
+            served.device(T7).open(100.0, 1)
+        assert served.events() == []
+
+    def test_init_is_verified(self, serve):
+        """A setting that does not stick is an error that names the step."""
+        served = serve("labjack_t7")
+        memory = served.emulator.device.memory
+        kept, _ = memory._writable["holding", 43903]
+        memory._writable["holding", 43903] = (type(kept)(kept.register), 0)
+        with pytest.raises(DeviceError, match=r"1.* was written, but 0 stands, at step write"):
+            served.device(T7).open(100.0, 1)
+
+    def test_expectation_is_checked(self, serve):
+        """A device in a mode that the profile does not mean is refused."""
+        served = serve("icp_et7000")
+        words, _ = served.emulator.device.memory._readable["coil", 631]
+        words.words[:] = [1]
+        options = {**WAGO, "profile": "icp_et7000"}
+        with pytest.raises(DeviceError, match="AI data format must be hex"):
+            served.device(options).open(10.0, 1)
+
+
+class TestWatchdog:
+    """The device's own, armed and cleared by the profile's steps."""
+
+    def test_trips_to_the_safe_command(self, serve):
+        """A T7 goes to the volts that stand for the safe command, when the time is up."""
+        served = serve("labjack_t7")
+        device = served.device(T7, watchdog={"timeout_s": 2.0, "safe_command": 1.0})
+        device.open(100.0, 1)
+        device.arm()
+        exchange(device, 3.0)
+        served.clock.pass_s(1.9)
+        exchange(device, 3.0)
+        assert [event["event"] for event in served.events()].count("watchdog") == 0
+        served.clock.pass_s(2.1)
+        exchange(device, 3.0)
+        trips = [event for event in served.events() if event["event"] == "watchdog"]
+        assert [trip["output"] for trip in trips] == ["DAC0"]
+        assert trips[0]["current_a"] == pytest.approx(1.0)
+        assert trips[0]["monotonic_ns"] == pytest.approx(3.9e9)
+        device.close()
+
+    def test_settings_in_flash_are_written_once(self, serve):
+        """What is right already is read and left alone."""
+        served = serve("labjack_t7")
+        emulated = served.emulator.device
+        written: list[int] = []
+        write = emulated.write
+
+        def noting(area: str, address: int, values: list[int]) -> None:
+            written.append(address)
+            write(area, address, values)
+
+        emulated.write = noting
+        for watchdog_writes in ([61600, 61640, 61642, 61604, 61600], []):
+            written.clear()
+            device = served.device(T7, watchdog={"timeout_s": 2.0})
+            device.open(100.0, 1)
+            device.arm()
+            device.close()
+            assert [address for address in written if address > 61000] == watchdog_writes
+
+    def test_trip_is_cleared_at_the_next_start(self, serve):
+        """A tripped WAGO refuses commands until its watchdog is restarted; opening does that."""
+        served = serve("wago_750")
+        device = served.device(WAGO, watchdog={"timeout_s": 0.5})
+        device.open(100.0, 1)
+        device.arm()
+        exchange(device, 3.0)
+        served.clock.pass_s(0.6)
+        with pytest.raises(DeviceError, match="exception 4"):
+            exchange(device, 3.0)
+        assert served.emulator.device.tripped
+        tripped = [event for event in served.events() if event["event"] == "watchdog"]
+        assert [(each["output"], each["value"]) for each in tripped] == [("AO0", 0.0), ("AO1", 0.0)]
+        device.open(100.0, 1)
+        device.arm()
+        exchange(device, 2.0)
+        device.close()
+        served.clock.pass_s(60.0)
+        served_events = [event["event"] for event in served.events()]
+        assert served_events.count("watchdog") == 2  # both outputs, once: closing disarmed it
+
+    def test_make_safe_clears_a_trip_first(self, serve):
+        """The last resort works on a device that refuses commands."""
+        served = serve("wago_750")
+        device = served.device(WAGO, watchdog={"timeout_s": 0.5})
+        device.open(100.0, 1)
+        device.arm()
+        exchange(device, 3.0)
+        served.clock.pass_s(0.6)
+        with pytest.raises(DeviceError):
+            exchange(device, 3.0)
+        device.make_safe(0.0)
+        assert served.events()[-1]["event"] == "write"
+        assert served.events()[-1]["current_a"] == 0.0
+
+    def test_too_slow_a_loop_would_trip_it(self, serve):
+        """Fewer than three samples in its time-out are refused at open."""
+        served = serve("labjack_t7")
+        device = served.device(T7, watchdog={"timeout_s": 1.0})
+        with pytest.raises(
+            DeviceError, match="3 exchanges must come within the watchdog's timeout"
+        ):
+            device.open(2.0, 1)
+
+
+def test_every_profile_with_an_input_can_be_driven():
+    """Nothing in the shipped Modbus profiles keeps an experiment from being made of them."""
+    for name, output, sensor in (("labjack_t4", "DAC0", "AIN0"), ("labjack_t8", "DAC0", "AIN0")):
+        profile = load_profile(name)
+        assert made(profile=name, output=output, input=sensor).info.max_rate_hz <= (
+            profile.max_rate_hz
+        )
+
+
+def test_device_as_it_powers_up(driven):
+    """A LabJack gives 0 V, which the amplifier makes the end of its range; opening leaves it."""
+    made = driven("labjack_t7", current_a=None)
+    made.open()
+    assert made.device.output() == pytest.approx(-10.0)
+    assert {each["current_a"] for each in made.writes()} == {-10.0}
+
+
+@pytest.mark.parametrize("profile", ["labjack_t7", "wago_750", "adam_6024", "generic_float32"])
+def test_output_of_the_run_before(driven, profile):
+    """It stays between connections, and is read from the register that the profile names."""
+    made = driven(profile)
+    made.device.open(5.0, 1)
+    made.exchange(3.0)
+    assert made.device.output() == pytest.approx(3.0, abs=1e-2)
+    made.device.close()
+    made.device.open(5.0, 1)
+    assert made.device.output() == pytest.approx(made.current_a, abs=1e-9)
+    assert made.current_a == pytest.approx(3.0, abs=1e-2)
+
+
+def test_value_out_of_range_is_returned_as_it_is(driven):
+    """It is for the run to refuse it."""
+    made = driven()
+    made.open()
+    made.emulated.device._outputs["OUT"].value = 17.0
+    assert made.device.output() == pytest.approx(17.0)
+
+
+def test_output_that_can_not_be_read_is_not_known(driven, write_only):
+    """Nothing is guessed."""
+    made = driven(write_only)
+    made.open()
+    made.exchange(3.0)
+    assert made.device.output() is None
+
+
+def test_silent_device_must_be_opened_again(driven):
+    """It is asked, or there is no answer."""
+    made = driven()
+    with pytest.raises(DeviceError, match="not open"):
+        made.device.output()
+    made.open()
+    made.link.silent_until_s = 1e9
+    with pytest.raises(DeviceError, match=r"no answer .* \(to read the output back\)"):
+        made.device.output()
+    made.link.silent_until_s = 0.0
+    with pytest.raises(DeviceError, match="not open"):
+        made.exchange(1.0)

@@ -1,0 +1,499 @@
+"""``serial_dac`` on lines of text and on single frames, against emulated devices on a pty."""
+
+import os
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilctl.base.errors import DeviceError, InputError
+from hilctl_drivers.emulator.faults import parse_fault
+from hilctl_drivers.emulator.options import EmulatorOptions
+from hilctl_drivers.profile import shipped_profiles
+from hilctl_drivers.serial.serial_dac import SerialDac
+from hilctl_drivers.serial.serial_setup import SerialOptions
+from tests.fakes import ShiftedClock, emulated, logged, made_safe
+
+DCON = (Path(__file__).parents[3] / "data" / "dcon_module.yaml").read_text()
+KINDS = ["dcon", "scpi", "cobs", "length"]
+PATIENT_S = 20.0  # a busy machine answers within it
+TIMEOUT_S = 2.0  # where it is to run out
+
+
+@pytest.fixture
+def profiles(tmp_path):
+    """Return paths of one profile of each kind, none of which waits for a board to boot."""
+    board = shipped_profiles()["cobs_board"].read_text()
+    board = board.replace("boot_wait_s: 2.0", "boot_wait_s: 0.0")
+    texts = {
+        "dcon": DCON,
+        "cobs": board,
+        "length": board.replace("framing: cobs", "framing: length"),
+    }
+    for name, text in texts.items():
+        (tmp_path / f"{name}.yaml").write_text(text)
+    made = {name: str(tmp_path / f"{name}.yaml") for name in texts}
+    return {**made, "scpi": "agilent_34970a"}
+
+
+class Rig:
+    """A device that is wired to its emulator."""
+
+    def __init__(self, emulator, log, clock, **options):
+        self.emulator = emulator
+        self.log = log
+        self.clock = clock
+        made = {**emulator.options, "timeout_s": PATIENT_S, **options}
+        self.device = SerialDac(SerialOptions.model_validate(made))
+        self.sample = 0
+
+    def open(self):
+        self.device.open(20.0, 1)
+        self.device.arm()
+
+    def pass_s(self, seconds):
+        self.clock.extra_ns += round(seconds * 1e9)
+
+    def exchange(self, command):
+        displacement_um, measured = np.full(1, np.nan), np.full(1, np.nan)
+        self.device.exchange(self.sample, np.array([command]), displacement_um, measured)
+        self.sample += 1
+        return displacement_um[0]
+
+    def events(self):
+        return logged(self.log)
+
+    def current_a(self):
+        """What the coil carries by the emulator's log."""
+        return [event["current_a"] for event in self.events() if "current_a" in event][-1]
+
+    def await_current(self, current_a):
+        """Let the emulator come to a setting that it does not answer; fail where it never does."""
+        deadline = time.monotonic() + 20.0
+        while self.current_a() != pytest.approx(current_a):
+            assert time.monotonic() < deadline, f"still at {self.current_a()} A"
+            os.sched_yield()
+
+
+@pytest.fixture
+def rig(profiles, tmp_path):
+    """Return a function that wires a device of a kind to its emulator."""
+    stack = []
+
+    def of(kind, faults=(), reader=None, own_line=False, **options):
+        log = tmp_path / f"log{len(stack)}.jsonl"
+        wanted = EmulatorOptions(
+            profiles.get(kind, kind),
+            log=log,
+            faults=tuple(parse_fault(text) for text in faults),
+            reader=reader,
+            reader_line="own" if own_line else "same",
+        )
+        clock = ShiftedClock()
+        served = emulated(wanted, clock)
+        made = Rig(served.__enter__(), log, clock, **options)
+        stack.append((made, served))
+        return made
+
+    yield of
+    for made, served in stack:
+        made.device.wire.release()
+        served.__exit__(None, None, None)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_command_arrives_and_a_reading_comes_back(rig, kind):
+    """Through amplifier and sensor, the coil carries what was asked and the rig is seen to move."""
+    bench = rig(kind)
+    bench.open()
+    assert abs(bench.exchange(0.0)) < 1.0
+    bench.exchange(5.0)
+    assert bench.current_a() == pytest.approx(5.0, abs=2e-3)
+    bench.pass_s(0.5)
+    assert 20.0 < bench.exchange(5.0) < 45.0
+    bench.device.close()
+    assert bench.current_a() == pytest.approx(5.0, abs=2e-3)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 10.1, -10.1])
+def test_bad_commands_are_refused_and_nothing_is_sent(rig, kind, bad):
+    """Nothing reaches the device, and the next good command does."""
+    bench = rig(kind)
+    bench.open()
+    with pytest.raises(DeviceError, match=r"serial_dac .*: command must be in .*nothing was"):
+        bench.exchange(bad)
+    with pytest.raises(DeviceError, match="nothing was sent"):
+        bench.device.make_safe(bad)
+    assert {each["current_a"] for each in bench.events()} <= {0.0}  # as opening found it
+    bench.exchange(1.0)
+
+
+FAULTS = {
+    "silence": f"no answer within {TIMEOUT_S:g} s",
+    "delay": f"no answer within {TIMEOUT_S:g} s",
+    "corrupt": "checksum of|not an answer to this|crc16_ccitt_false of .* is wrong",
+    "cut": f"only . bytes, 1 short, within {TIMEOUT_S:g} s",
+    "duplicate": "must be one line|bytes behind",
+    "wrong_id": "not an answer to this|reply 90 to message",
+    "exception": "invalid command|no answer within|refused by the board",
+}
+
+
+def exchange_until_it_fails(bench, command=2.0):
+    for _ in range(40):
+        assert abs(bench.exchange(command)) < 30.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_bad_answer_is_an_error_and_the_output_can_still_be_made_safe(rig, kind, fault):
+    """No wrong reading is taken; the next request is not confused by what is left on the line."""
+    late = f":{1.5 * TIMEOUT_S}" if fault == "delay" else ""
+    bench = rig(kind, faults=[f"{fault}{late}@30"], timeout_s=TIMEOUT_S)
+    bench.open()
+    with pytest.raises(DeviceError, match=FAULTS[fault]) as caught:
+        exchange_until_it_fails(bench)
+    assert str(caught.value).startswith("serial_dac ")
+    with pytest.raises(DeviceError, match="not open"):
+        bench.exchange(2.0)
+    bench.device.make_safe(-1.0)
+    assert bench.current_a() == pytest.approx(-1.0, abs=2e-3)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_unplugged_port_is_an_error_everywhere(rig, kind):
+    """Exchange and make_safe say so within the time-out, and nothing hangs."""
+    bench = rig(kind, faults=["unplug@30"])
+    bench.open()
+    with pytest.raises(DeviceError, match="unplugged"):
+        exchange_until_it_fails(bench)
+    with pytest.raises(DeviceError, match="can't be opened"):
+        bench.device.make_safe(0.0)
+    bench.device.close()
+
+
+@pytest.mark.parametrize("kind", ["dcon", "cobs"])
+def test_a_silent_host_is_noticed_by_the_device(rig, kind):
+    """The device's own watchdog puts the output at the safe value, and then refuses commands."""
+    bench = rig(kind, watchdog={"timeout_s": 20.0, "safe_command": 0.0})
+    bench.open()
+    for _ in range(10):
+        bench.exchange(3.0)
+    bench.pass_s(20.0)
+    with pytest.raises(DeviceError, match="watchdog has tripped"):
+        bench.exchange(3.0)
+    assert (bench.events()[-1]["event"], bench.current_a()) == ("watchdog", 0.0)
+    bench.device.make_safe(0.5)
+    assert bench.current_a() == pytest.approx(0.5)
+
+
+@pytest.mark.slow  # it is fed by this machine's clock, and would trip where that runs ahead
+@pytest.mark.parametrize("kind", ["dcon", "cobs"])
+def test_exchanges_feed_the_watchdog_and_close_disarms_it(rig, kind):
+    """Through several of its timeouts nothing trips, nor after closing."""
+    bench = rig(kind, watchdog={"timeout_s": 2.0, "safe_command": 0.0})
+    bench.open()
+    for _ in range(60):
+        bench.exchange(3.0)
+        bench.pass_s(0.05)
+    bench.device.close()
+    bench.pass_s(3.0)
+    bench.open()
+    assert "watchdog" not in {event["event"] for event in bench.events()}
+
+
+@pytest.mark.parametrize("readback", ["output", "command"])
+def test_a_trip_of_an_earlier_run_ends_at_the_safe_value(rig, profiles, readback):
+    """Before anything else is put out, whatever the module would say of its last command."""
+    path = Path(profiles["dcon"])
+    path.write_text(DCON.replace("of: output", f"of: {readback}"))
+    bench = rig("dcon", watchdog={"timeout_s": 20.0, "safe_command": 0.0})
+    # As where a trip keeps commands back, but does not forget the last one.
+    switch, device = bench.emulator.device._switch, bench.emulator.device
+
+    def restore(name, template, text):
+        switch(name, template, text)
+        if name == "clear":
+            device._put_out("AO0", device._commands["AO0"], "stale", device._now_ns)
+
+    device._switch = restore
+    bench.device.open(60.0, 1)
+    bench.device.arm()
+    bench.exchange(3.0)
+    bench.device.wire.release()
+    with pytest.raises(DeviceError, match="not open"):
+        bench.device.close()
+    bench.pass_s(21.0)
+    bench.device.open(60.0, 1)
+    events = [(event["event"], event["current_a"]) for event in bench.events()]
+    assert events[-4:] == [("watchdog", 0.0), ("stale", 3.0), ("write", 0.0), ("write", 0.0)]
+    assert bench.device.output() == 0.0
+    assert bench.exchange(1.0) < 45.0
+
+
+@pytest.mark.parametrize("own_line", [True, False])
+def test_the_sensor_may_stand_on_another_device(rig, profiles, tmp_path, own_line):
+    """On a line of its own, or on the same one at another address."""
+    path = tmp_path / "reader.yaml"
+    path.write_text(DCON.replace("checksum: dcon", "checksum: none"))
+    bench = rig("icp_m7024_dcon", reader=str(path), own_line=own_line, baud=115200)
+    bench.device.open(50.0, 1)
+    assert abs(bench.exchange(0.0)) < 1.0
+    bench.exchange(5.0)
+    bench.pass_s(0.5)
+    assert 20.0 < bench.exchange(5.0) < 45.0
+    assert bench.device.info.max_rate_hz < 200.0
+
+
+def test_scpi_supply_is_set_up_and_checked(rig):
+    """A Kepco BOP is put in current mode, and an error that it keeps is found on the way out."""
+    bench = rig("kepco_bop", reader="agilent_34970a", own_line=True)
+    bench.open()
+    bench.exchange(2.5)
+    bench.await_current(2.5)
+    bench.emulator.device.refusal(b"")  # leaves an error to be asked for
+    with pytest.raises(DeviceError, match=r"SYST:ERR\? says -200"):
+        bench.device.close()
+
+
+@pytest.mark.parametrize(("profile", "current_a"), [("kepco_bop", 2.5), ("tdk_lambda_gen", 3.0)])
+def test_the_output_is_measured_where_that_is_asked_for(rig, profile, current_a):
+    """What MEAS:CURR? or MC? says stands beside the command, and costs a part of the rate."""
+    quick = rig(profile, reader="agilent_34970a", own_line=True).device.info
+    bench = rig(profile, reader="agilent_34970a", own_line=True, measure="current")
+    info = bench.device.info
+    assert (quick.measures_command, info.measures_command) == (False, True)
+    assert "to measure current" in info.rate_note
+    assert info.max_rate_hz < quick.max_rate_hz
+    bench.device.open(10.0, 1)
+    displacement_um, measured = np.full(1, np.nan), np.full(1, np.nan)
+    bench.device.exchange(0, np.array([current_a]), displacement_um, measured)
+    assert measured[0] == pytest.approx(current_a, abs=1e-3)
+    assert np.isfinite(displacement_um).all()
+
+
+def test_a_reading_does_not_show_yet_what_the_command_does(rig):
+    """The sensor is asked first, however slow the line is."""
+    bench = rig("dcon")
+    bench.open()
+    bench.exchange(0.0)
+    bench.pass_s(0.5)
+    assert abs(bench.exchange(5.0)) < 1.0
+    bench.pass_s(0.5)
+    assert bench.exchange(5.0) > 20.0
+
+
+def test_a_reader_that_fails_is_named(rig):
+    """Which of the two devices did not answer is said."""
+    bench = rig("kepco_bop", reader="agilent_34970a", own_line=True, timeout_s=TIMEOUT_S)
+    bench.open()
+    bench.exchange(0.0)
+    bench.emulator.wires[1].devices = []
+    port = bench.emulator.reader_address
+    with pytest.raises(DeviceError, match=rf"reader Agilent 34970A .* at {port}: "):
+        exchange_until_it_fails(bench, 0.0)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("fault", ["silence", "corrupt", "duplicate", "wrong_id"])
+def test_a_bad_answer_to_the_safe_value_confirms_nothing(rig, kind, fault):
+    """The attempt that got it fails; a later one does not."""
+    message = {"dcon": 15, "scpi": 15, "cobs": 10, "length": 10}[kind]
+    bench = rig(kind, faults=[f"{fault}@{message}"], timeout_s=TIMEOUT_S)
+    bench.open()
+    for _ in range(5):
+        bench.exchange(2.0)
+    made_safe(bench.device, 0.0)
+    assert bench.current_a() == pytest.approx(0.0, abs=2e-3)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_device_that_was_deaf_is_made_safe_when_it_comes_back(rig, kind):
+    """Each message of some time is lost: the safe value is sent until one gets through."""
+    bench = rig(kind, faults=[f"silence@{n}" for n in range(20, 25)], timeout_s=TIMEOUT_S)
+    bench.open()
+    with pytest.raises(DeviceError, match="no answer"):
+        exchange_until_it_fails(bench)
+    made_safe(bench.device, -1.0)
+    assert bench.current_a() == pytest.approx(-1.0, abs=2e-3)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_safe_is_said_only_of_what_was_read_back(rig, kind):
+    """A device that acknowledges and holds another value is not taken for safe."""
+    bench = rig(kind)
+    bench.open()
+    bench.exchange(2.0)
+    device = bench.emulator.device
+    device._set = lambda name, value, reply: reply
+    device._put_out = lambda *args: None
+    with pytest.raises(DeviceError):
+        bench.device.make_safe(0.0)
+
+
+def test_making_safe_waits_for_no_board_to_boot(rig):
+    """The value goes out as soon as the port is open; one that boots gets it again later."""
+    bench = rig("cobs_board")
+    slept = []
+    bench.device.wire._link._sleep = slept.append
+    bench.device.make_safe(1.0)
+    assert bench.current_a() == 1.0
+    assert slept == []
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_line_that_never_falls_silent_gets_the_safe_value(rig, kind):
+    """It is put out; that it stands can't be known as long as the answers drown."""
+    bench = rig(kind, timeout_s=TIMEOUT_S)
+    bench.open()
+    bench.exchange(2.0)
+    link = bench.device.wire._link
+    # As where somebody keeps sending: the line is never found quiet.
+    link._stale = True
+
+    def drain(quiet_s=0.0):
+        raise DeviceError("the line does not get quiet")
+
+    link.drain = drain
+    with pytest.raises(DeviceError, match="the line does not"):
+        bench.device.make_safe(-1.0)
+    bench.await_current(-1.0)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_output_is_read_back(rig, kind):
+    """After power-up, and what was left by another connection."""
+    bench = rig(kind)
+    bench.open()
+    assert bench.device.output() == pytest.approx(0.0, abs=1e-3)
+    bench.exchange(3.0)
+    bench.device.close()
+    bench.open()
+    assert bench.device.output() == pytest.approx(3.0, abs=2e-3)
+
+
+def test_an_output_that_nobody_can_read_back_is_not_known(rig, profiles):
+    """No query for it; a board of version 1; a query for commands, where a trip does not show."""
+    silent = Path(profiles["dcon"])
+    start = DCON.index("    readback:")
+    silent.write_text(DCON[:start] + DCON[DCON.index("    unit: V", start) :])
+    old = Path(profiles["cobs"])
+    old.write_text(old.read_text().replace("hilctl-2", "hilctl-1"))
+    adam = rig("adam_4024_ascii", reader="agilent_34970a", own_line=True)
+    for bench in (rig("dcon"), rig("cobs"), adam):
+        bench.device.open(10.0, 1)
+        assert bench.device.output() is None
+        bench.device.make_safe(1.0)
+        assert bench.current_a() == pytest.approx(1.0, abs=2e-3)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_looking_changes_nothing(rig, kind):
+    """Displacement and output as they are; no write, no step, and a trip stays."""
+    watched = {"watchdog": {"timeout_s": 5.0}} if kind != "scpi" else {}
+    bench = rig(kind, **watched)
+    bench.open()
+    bench.exchange(3.0)
+    bench.device.wire.release()
+    bench.device._block = 0
+    bench.pass_s(6.0)  # each second takes the emulated rig time, too
+    before = bench.events()
+    displacement_um, output = bench.device.look()
+    held = 3.0 if kind == "scpi" else 0.0  # tripped
+    assert output == pytest.approx(held, abs=2e-3)
+    assert displacement_um == pytest.approx(bench.emulator.device._rig.displacement_um, abs=0.5)
+    since = bench.events()[len(before) :]
+    assert {event["event"] for event in since} <= {"watchdog"}
+    if kind != "scpi":
+        assert bench.emulator.device.tripped
+    bench.open()
+    with pytest.raises(DeviceError, match="open"):
+        bench.device.look()
+
+
+def test_another_device_is_noticed_at_open(rig, tmp_path):
+    """A self-test that is answered by something else ends the opening."""
+    path = tmp_path / "other.yaml"
+    path.write_text(DCON.replace("{2}7.*", "{2}9.*").replace("!027024", "!029024"))
+    bench = rig("dcon", profile=str(path))
+    with pytest.raises(DeviceError, match=r"\$02M must be answered like '!029024', got '!027024'"):
+        bench.open()
+
+
+def test_nobody_there_is_said(rig):
+    """A port that does not exist, and one that somebody else holds."""
+    bench = rig("dcon")
+    away = SerialDac(
+        SerialOptions.model_validate({**bench.emulator.options, "serial_port": "/dev/ttyNOWHERE"})
+    )
+    with pytest.raises(DeviceError, match=r"at /dev/ttyNOWHERE: can't be opened"):
+        away.open(20.0, 1)
+    bench.open()
+    second = SerialDac(SerialOptions.model_validate(bench.emulator.options))
+    with pytest.raises(DeviceError, match="lock"):
+        second.open(20.0, 1)
+
+
+def test_impossible_rates_and_blocks_are_refused(rig):
+    """At open, with what would be possible."""
+    bench = rig("dcon")
+    highest = bench.device.info.max_rate_hz
+    assert 250.0 < highest < 400.0
+    with pytest.raises(DeviceError, match=rf"must be in \(0, {highest:.6g}\] Hz"):
+        bench.device.open(1.01 * highest, 1)
+    with pytest.raises(DeviceError, match="block must be 1"):
+        bench.device.open(50.0, 2)
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"output": "AO9"}, "output must be one that nobody DCON"),
+        ({"input": "AI9"}, "input must be one that nobody DCON"),
+        ({"profile": "labjack_t7"}, "one for kind: modbus_dac"),
+        ({"profile": "kepco_bop", "output": "current", "input": "current"}, "as reader"),
+        ({"measure": "AI0"}, "measure must be an input of nobody .* measures its own output"),
+        ({"profile": "cobs_board", "output": "DAC", "input": "ADC", "measure": "ADC"}, "lines of"),
+        ({"watchdog": {"timeout_s": 100.0}}, "timeout_s must be 0.1 to 25.5"),
+        ({"watchdog": {"timeout_s": 1.0, "safe_command": 11.0}}, "safe_command must be -10 to 10"),
+        ({"sensor": {"um_per_ma": 1.0}}, "the input is in V"),
+        ({"reader": {"profile": "agilent_34970a"}, "input": "AI101"}, "can't share the line"),
+    ],
+)
+def test_options_that_do_not_go_together_are_refused(profiles, changes, text):
+    """Before anything is opened."""
+    options = {
+        "profile": profiles["dcon"],
+        "serial_port": "/dev/x",
+        "output": "AO0",
+        "input": "AI0",
+        "amplifier": {"gain_a_per_v": 1.0},
+        "sensor": {"um_per_v": 12.5},
+        "watchdog": "none",
+        **changes,
+    }
+    with pytest.raises(InputError, match=text):
+        SerialDac(SerialOptions.model_validate(options))
+
+
+def test_a_line_too_slow_for_the_safe_value_is_said():
+    """With what stands behind it; not a word on a line that is fast enough."""
+    slow = {"baud": 1200, "watchdog": {"timeout_s": 2.0}}
+    options = {
+        "profile": "icp_m7024_dcon", "serial_port": "/dev/x", "output": "AO0", "input": "AI101",
+        "reader": {"profile": "agilent_34970a", "serial_port": "/dev/y"},
+        "amplifier": {"gain_a_per_v": 1.0}, "sensor": {"um_per_v": 12.5}, "watchdog": "none",
+    }  # fmt: skip
+
+    def note(**changes):
+        device = SerialDac(SerialOptions.model_validate({**options, **changes}))
+        return device.info.safe_note
+
+    assert note() == ""
+    assert note(baud=1200) == (
+        "a message takes up to 0.26 s on this line; no watchdog of the device stands behind it"
+    )
+    assert note(**slow).endswith("the device's watchdog acts after 2 s")

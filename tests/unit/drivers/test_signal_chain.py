@@ -1,0 +1,79 @@
+"""Watchdogs that can't do what is asked of them, and channels that can't be wired so."""
+
+from typing import Any
+
+import pytest
+
+from hilctl.base.errors import InputError
+from hilctl_drivers.ascii.ascii_profile import AsciiWatchdog
+from hilctl_drivers.profile import load_profile
+from hilctl_drivers.profile_base import Range, Watchdog
+from hilctl_drivers.signal_chain import DacOptions, SignalChain, channel, check_watchdog
+
+VOLTS = Range(unit="V", min=-10.0, max=10.0)
+
+
+def asked(has: Watchdog | str, offset_a: float = 0.0, **wanted: float) -> None:
+    """Hold a wanted watchdog against what a device has, on output B."""
+    options = DacOptions.model_validate(
+        {
+            "profile": "generic_float32",
+            "output": "B",
+            "input": "I",
+            "amplifier": {"gain_a_per_v": 2.0, "offset_a": offset_a},
+            "sensor": {"um_per_v": 1.0},
+            "watchdog": {"timeout_s": 1.0, **wanted},
+        }
+    )
+    chain = SignalChain(VOLTS, VOLTS, options.amplifier, options.sensor)
+    check_watchdog("Acme", options, VOLTS, chain, has)
+
+
+def watchdog(**changes: Any) -> AsciiWatchdog:
+    arm = ({"kind": "send", "text": "W{timeout}"},)
+    data = {
+        "unit_s": 0.1, "min_s": 0.1, "max_s": 10.0, "kick": "any", "on_trip": "safe",
+        "refuses_while_tripped": False, "arm": arm, **changes,
+    }  # fmt: skip
+    return AsciiWatchdog.model_validate(data)
+
+
+@pytest.mark.parametrize(
+    ("has", "wanted", "words"),
+    [
+        ("none", {}, "Acme has no host watchdog: it holds its last output"),
+        (watchdog(), {"timeout_s": 20.0}, "timeout_s must be 0.1 to 10"),
+        (watchdog(), {"safe_command": 30.0}, "safe_command must be -20 to 20, got 30"),
+        (watchdog(safe={"A": ()}), {}, "does nothing for B, only for A: take one of these, or"),
+        (watchdog(on_trip="hold"), {}, "holds B where it is when it trips: say watchdog: none"),
+        (watchdog(on_trip="zero"), {"safe_command": 3.0}, "puts B at 0 V, which is 0 A here"),
+        (watchdog(on_trip="reset"), {"offset_a": 1.0}, "which is 1 A here: .* got 0"),
+    ],
+)
+def test_watchdog_that_does_not_do_what_is_asked_is_refused(has, wanted, words):
+    """The same rules for lines of text as for Modbus: it must act, on this output, as wanted."""
+    with pytest.raises(InputError, match=words):
+        asked(has, **wanted)
+
+
+@pytest.mark.parametrize("has", [watchdog(), watchdog(safe={"B": ()}), watchdog(on_trip="zero")])
+def test_watchdog_that_does_is_taken(has):
+    """A safe value, one for this output among others, or 0 where that is asked for."""
+    asked(has)
+
+
+def test_channels_are_found_by_name():
+    """An unknown name lists those that there are; none is said where there are none."""
+    assert channel("input", "A", {"A": VOLTS}, "Acme") is VOLTS
+    two = {"A": VOLTS, "B": VOLTS}
+    with pytest.raises(InputError, match=r"must be one that Acme has, got 'C' \(it has A, B\)"):
+        channel("input", "C", two, "Acme")
+    with pytest.raises(InputError, match=r"\(it has none\)"):
+        channel("input", "C", {}, "Acme")
+
+
+def test_input_of_its_own_output_is_no_sensor():
+    """A supply's own meter can't be the displacement sensor."""
+    supply = load_profile("kepco_bop")
+    with pytest.raises(InputError, match="name the device that reads the sensor as reader"):
+        channel("input", "current", supply.inputs, supply.title)

@@ -1,0 +1,64 @@
+"""Device sections to begin with: every shipped profile gives one, or says what it lacks."""
+
+import pytest
+
+from hilctl.base.errors import InputError
+from hilctl.experiment.device import device_class
+from hilctl_drivers.profile import load_profile, shipped_profiles
+from hilctl_drivers.template import starting_section
+
+ALONE = [
+    name
+    for name in shipped_profiles()
+    if (each := load_profile(name)).outputs
+    and any(getattr(one, "measures", "terminal") == "terminal" for one in each.inputs.values())
+]
+
+
+def made(section):
+    chosen = device_class(section.values["kind"])
+    options = {key: value for key, value in section.values.items() if key != "kind"}
+    return chosen(chosen.Options.model_validate(options)).info
+
+
+@pytest.mark.parametrize("name", ALONE)
+def test_a_device_can_be_made_of_it(name):
+    """Its range is even about 0 A, so that limits can be; and what is asked stands in it."""
+    section = starting_section(name, "A", None)
+    info = made(section)
+    assert info.command_unit == "A"
+    assert info.command_min == pytest.approx(-info.command_max)
+    for key in section.asked:
+        value = section.values
+        for part in key.split("."):
+            value = value[part]
+        assert value is not None
+
+
+@pytest.mark.parametrize(
+    ("name", "reader", "line"),
+    [
+        ("kepco_bop", "agilent_34970a", "own"),
+        ("adam_6224", "adam_6217", "own"),
+        ("icp_m7024", "icp_m7017", "same"),
+    ],
+)
+def test_the_sensor_may_be_on_another_device(name, reader, line):
+    section = starting_section(name, "A", reader)
+    made(section)
+    placed = {"host", "serial_port"} & section.values["reader"].keys()
+    assert bool(placed) == (line == "own")
+
+
+def test_a_voltage_begins_at_zero():
+    section = starting_section("labjack_t7", "V", None)
+    assert (made(section).command_unit, made(section).command_min) == ("V", 0.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "rule"),
+    [("adam_6224", "has no input for a displacement sensor"), ("adam_6217", "has no output")],
+)
+def test_half_a_device_says_what_it_lacks(name, rule):
+    with pytest.raises(InputError, match=rf"{rule}.*--reader"):
+        starting_section(name, "A", None)

@@ -1,0 +1,173 @@
+"""CRCs against their parameters and catalogued check values; byte sums against the manuals."""
+
+import random
+
+import numpy as np
+import pytest
+from pymodbus.framer.rtu import FramerRTU
+
+from hilctl_drivers.transport.crc import (
+    CRCS,
+    MODBUS_WORDS,
+    crc16_modbus,
+    dcon_checksum,
+    gen_checksum,
+    named_crc,
+)
+from hilctl_drivers.transport.links import BadRequestError
+
+# "Catalogue of parametrised CRC algorithms": CRC-16/MODBUS, CRC-16/IBM-3740 (also called
+# CCITT-FALSE), CRC-16/XMODEM, CRC-32/ISO-HDLC.
+CATALOGUE = {
+    "crc16_modbus": (16, 0x8005, 0xFFFF, True, True, 0x0000, 0x4B37),
+    "crc16_ccitt_false": (16, 0x1021, 0xFFFF, False, False, 0x0000, 0x29B1),
+    "crc16_xmodem": (16, 0x1021, 0x0000, False, False, 0x0000, 0x31C3),
+    "crc32": (32, 0x04C11DB7, 0xFFFFFFFF, True, True, 0xFFFFFFFF, 0xCBF43926),
+}
+
+
+def reflected(value, width):
+    """Return ``value`` with its bits in reverse."""
+    return int(f"{value:0{width}b}"[::-1], 2)
+
+
+def by_definition(crc, data):
+    """Divide bit by bit, straight from the parameters."""
+    register = crc.init
+    for byte in data:
+        register ^= (reflected(byte, 8) if crc.refin else byte) << (crc.width - 8)
+        for _ in range(8):
+            register <<= 1
+            if register >> crc.width:
+                register ^= 1 << crc.width | crc.poly
+    return (reflected(register, crc.width) if crc.refout else register) ^ crc.xorout
+
+
+@pytest.mark.parametrize("name", CATALOGUE)
+def test_crc_has_its_catalogued_parameters_and_check_value(name):
+    """Parameters and the CRC of "123456789" are those of the catalogue."""
+    crc = named_crc(name)
+    parameters = (crc.width, crc.poly, crc.init, crc.refin, crc.refout, crc.xorout, crc.check)
+    assert parameters == CATALOGUE[name]
+    assert crc.compute(b"123456789") == crc.check
+
+
+@pytest.mark.parametrize("name", CATALOGUE)
+def test_fast_function_is_the_one_the_parameters_say(name):
+    """Table, zlib and binascii agree with division bit by bit, on any length and buffer."""
+    crc = named_crc(name)
+    rng = random.Random(1)
+    for size in range(70):
+        data = rng.randbytes(size)
+        want = by_definition(crc, data)
+        assert crc.compute(data) == want
+        assert crc.compute(bytearray(data)) == crc.compute(memoryview(data)) == want
+        assert crc.of(data) == want.to_bytes(crc.width // 8, "little")
+
+
+def test_every_named_crc_is_checked_here():
+    """No CRC can be named that these tests leave out; "none" is the empty check."""
+    assert set(CRCS) == {*CATALOGUE, "none"}
+    none = named_crc("none")
+    assert (none.size, none.of(b"123456789")) == (0, b"")
+
+
+def test_unknown_crc_is_refused_with_the_known_ones():
+    """The message names what can be chosen."""
+    known = "crc16_modbus, crc16_ccitt_false, crc16_xmodem, crc32, none"
+    with pytest.raises(BadRequestError, match=f"^unknown CRC 'crc8'; known are {known}$"):
+        named_crc("crc8")
+
+
+def test_no_check_has_no_parameters():
+    """The one that is none says so in every parameter."""
+    none = named_crc("none")
+    numbers = (none.width, none.poly, none.init, none.xorout, none.check)
+    assert numbers == (0, 0, 0, 0, 0)
+    assert (none.refin, none.refout) == (False, False)
+
+
+def test_modbus_crc_of_a_published_frame():
+    """Waveshare's example "01 06 00 00 03 E8 89 74" ends in its CRC, low byte first."""
+    frame = bytes.fromhex("01 06 00 00 03 E8")
+    assert named_crc("crc16_modbus").of(frame) == bytes.fromhex("89 74")
+    assert crc16_modbus(frame + bytes.fromhex("89 74")) == 0
+
+
+def test_modbus_crc_goes_on_from_a_known_beginning():
+    """CRC of a beginning, then of the rest, is the CRC of the whole."""
+    data = random.Random(2).randbytes(40)
+    for cut in range(41):
+        assert crc16_modbus(data[cut:], crc16_modbus(data[:cut])) == crc16_modbus(data)
+
+
+def test_modbus_crc_agrees_with_pymodbus():
+    """pymodbus computes the same on random data; it keeps the bytes swapped."""
+    rng = random.Random(3)
+    for size in range(1, 260):
+        data = rng.randbytes(size)
+        theirs = FramerRTU.compute_CRC(data).to_bytes(2, "big")
+        assert crc16_modbus(data).to_bytes(2, "little") == theirs
+
+
+@pytest.mark.parametrize(("text", "want"), [(b"$012", b"B7"), (b"!01200600", b"AA")])
+def test_dcon_checksum_as_in_the_manual(text, want):
+    """ICP DAS, "Checksum Calculation": $012 gives B7, !01200600 gives AA."""
+    assert dcon_checksum(text) == want
+
+
+@pytest.mark.parametrize(("text", "want"), [(b"STT?", b"$3A"), (b"STAT?", b"$7B")])
+def test_gen_checksum_as_in_the_manual(text, want):
+    """TDK-Lambda Genesys, 4.9.4: STT?$3A and STAT?$7B."""
+    assert gen_checksum(text) == want
+
+
+def syndromes(name, size):
+    """Return what each flipped bit of ``size`` bytes and their CRC does to the check, in the order
+    in which a serial port sends bits: uint32[8 * (size + crc.size)]."""
+    crc = named_crc(name)
+    clean = crc.compute(bytes(size))
+    flips = [(1 << bit).to_bytes(size, "little") for bit in range(8 * size)]
+    own = [1 << bit for bit in range(crc.width)]
+    return np.array([crc.compute(flip) ^ clean for flip in flips] + own, dtype=np.uint32)
+
+
+@pytest.mark.parametrize("name", CATALOGUE)
+def test_up_to_three_flipped_bits_are_always_seen(name):
+    """In a message of 64 bytes no three flips, its CRC's own bits included, cancel out."""
+    flips = syndromes(name, 64)
+    assert np.all(flips)
+    first, second = np.triu_indices(len(flips), 1)
+    pairs = flips[first] ^ flips[second]
+    assert np.all(pairs)
+    assert not np.isin(pairs, flips).any()
+
+
+@pytest.mark.parametrize(
+    ("name", "bits"),
+    [("crc16_modbus", 16), ("crc16_ccitt_false", 14), ("crc16_xmodem", 14), ("crc32", 18)],
+)
+def test_bursts_up_to_this_many_bits_are_always_seen(name, bits):
+    """Wherever the burst begins, across the seam of message and CRC too.
+
+    A CRC that takes its bits in the order of the wire is sure of bursts as long as itself. The
+    CCITT ones take each byte from the other end and are sent low byte first, and lose two bits.
+    (crc32 is sure of 32; more than 18 would take too long to count here.)
+    """
+    flips = syndromes(name, 12)
+    for start in range(len(flips)):
+        effects = flips[start : start + 1]
+        for flip in flips[start + 1 : start + bits]:
+            effects = np.concatenate([effects, effects ^ flip])
+        assert np.all(effects)
+
+
+def test_modbus_crc_two_bytes_at_a_time_is_the_same():
+    """The loop's faster form agrees with the plain one, from any start."""
+    source = random.Random(5)
+    for _ in range(500):
+        data, start = source.randbytes(2 * source.randrange(20)), source.randrange(0x10000)
+        crc = start
+        for word in np.frombuffer(data, dtype="<u2").tolist():
+            crc = MODBUS_WORDS[crc ^ word]
+        assert crc == crc16_modbus(data, start)

@@ -1,0 +1,303 @@
+"""Binary frames: bytes as specified, exact limits, and streams that find their way back."""
+
+import itertools
+import random
+
+import pytest
+
+from hilctl_drivers.transport.crc import CRCS, named_crc
+from hilctl_drivers.transport.framing import CobsFraming, LengthFraming, binary_framing
+from hilctl_drivers.transport.links import (
+    BadRequestError,
+    CorruptError,
+    FrameError,
+    IncompleteError,
+)
+
+KINDS = [
+    (kind, crc) for kind in ("cobs", "length") for crc in CRCS if (kind, crc) != ("length", "none")
+]
+ALL = pytest.mark.parametrize(
+    "framing", [binary_framing(*kind) for kind in KINDS], ids=map("-".join, KINDS)
+)
+WITH_CRC = [kind for kind in KINDS if kind[1] != "none"]
+EACH = pytest.mark.parametrize(
+    "framing", [binary_framing(*kind) for kind in WITH_CRC], ids=map("-".join, WITH_CRC)
+)
+
+
+COBS, LENGTH = CobsFraming(named_crc("crc16_modbus")), LengthFraming(named_crc("crc16_modbus"))
+
+
+def payloads_of(split):
+    """Return what a splitter made of a stream, with lost stretches as None."""
+    return [None if isinstance(each, CorruptError) else each for each in split]
+
+
+@pytest.mark.parametrize(
+    ("payload", "wire"),
+    [
+        ("00", "01 01 00"),
+        ("00 00", "01 01 01 00"),
+        ("11 22 00 33", "03 11 22 02 33 00"),
+        ("11 22 33 44", "05 11 22 33 44 00"),
+        ("11 00 00 00", "02 11 01 01 01 00"),
+    ],
+)
+def test_cobs_of_published_examples(payload, wire):
+    """Known encodings from the literature on COBS, without a CRC."""
+    framing = CobsFraming(named_crc("none"))
+    assert framing.encode(bytes.fromhex(payload)) == bytes.fromhex(wire)
+    assert framing.decode(bytes.fromhex(wire)) == bytes.fromhex(payload)
+
+
+def test_cobs_frame_byte_by_byte():
+    """CRC-16/CCITT-FALSE of "123456789" is 29B1: it follows the payload, low byte first."""
+    frame = CobsFraming(named_crc("crc16_ccitt_false")).encode(b"123456789")
+    assert frame == b"\x0c123456789\xb1\x29\x00"
+
+
+def test_length_frame_byte_by_byte():
+    """Length, payload, then CRC-16/MODBUS over both: worked out by hand with the definition."""
+    frame = LengthFraming(named_crc("crc16_modbus")).encode(b"\x01\x02")
+    assert frame[:4] == b"\x02\x00\x01\x02"
+    assert frame[4:] == named_crc("crc16_modbus").of(b"\x02\x00\x01\x02")
+    assert len(frame) == 6
+
+
+@ALL
+@pytest.mark.parametrize("size", [1, 2, 10, 252, 253, 254, 255, 256, 508, 1000, 4096])
+def test_payloads_of_any_size_come_back(framing, size):
+    """Around COBS's block of 254 too; wire_size bounds the frame."""
+    for payload in (bytes(size), b"\xff" * size, random.Random(size).randbytes(size)):
+        frame = framing.encode(payload)
+        assert framing.decode(frame) == payload
+        assert framing.decode(bytearray(frame)) == payload
+        assert framing.decode(memoryview(frame)) == payload
+        assert len(frame) <= framing.wire_size(size)
+
+
+@ALL
+def test_payloads_that_do_not_fit_are_refused(framing):
+    """Neither an empty payload nor one past the limit is sent."""
+    for size in (0, 4097):
+        with pytest.raises(BadRequestError, match=f"1 to 4096 bytes, got {size}"):
+            framing.encode(bytes(size))
+
+
+@ALL
+def test_a_beginning_is_incomplete_and_a_tail_is_corrupt(framing):
+    """Every proper beginning asks for more; bytes behind the end are not dropped silently."""
+    frame = framing.encode(b"\x01\x00\x02\x03")
+    for cut in range(len(frame)):
+        with pytest.raises(IncompleteError):
+            framing.decode(frame[:cut])
+    for tail in (b"\0", b"\x05", frame):
+        with pytest.raises(CorruptError, match="behind"):
+            framing.decode(frame + tail)
+
+
+def test_an_endless_frame_is_corrupt():
+    """Past the largest frame there is nothing left to wait for."""
+    with pytest.raises(CorruptError, match="no final 00"):
+        CobsFraming(named_crc("crc32"), payload_max=8).decode(b"\x01" * 40)
+    with pytest.raises(CorruptError, match="1 to 8 bytes, got 9"):
+        LengthFraming(named_crc("crc32"), payload_max=8).decode(b"\x09\x00")
+
+
+def test_cobs_size_on_the_wire_is_the_largest_there_is():
+    """A payload without a zero takes all of it; a frame may be awaited up to there, no further."""
+    framing = CobsFraming(named_crc("none"), payload_max=8)
+    assert len(framing.encode(b"\xff" * 8)) == framing.wire_size(8) == 10
+    with pytest.raises(IncompleteError, match=r"^9 bytes without the final 00$"):
+        framing.decode(b"\x01" * 9)
+    with pytest.raises(CorruptError, match=r"^no final 00 within 10 bytes$"):
+        framing.decode(b"\x01" * 10)
+    splitter = framing.splitter()
+    assert splitter.feed(b"\x01" * 10) == []
+    assert [str(each) for each in splitter.feed(b"\x01")] == ["no end within 9 bytes"]
+
+
+@pytest.mark.parametrize(
+    ("framing", "frame", "text"),
+    [
+        (COBS, b"\0", "payload must have 1 to 4096 bytes, got -2"),
+        (COBS, b"\0\5", "1 bytes behind the final 00"),
+        (COBS, b"\2\1\0\0\0", "2 bytes behind the final 00"),
+        (COBS, b"\5\1\0", "not a COBS frame: not enough input bytes for length code"),
+        (COBS, b"\4\1\2\3\0", "crc16_modbus of 1 bytes is wrong: 01"),
+        (COBS, b"\x15" + 20 * b"\7" + b"\0", "crc16_modbus of 18 bytes is wrong:" + 16 * " 07"),
+        (LENGTH, b"\1\0\7\0\0", "crc16_modbus of 3 bytes is wrong: 01 00 07"),
+        (LENGTH, LENGTH.encode(b"\7") + b"\0\0", "2 bytes behind the end of the frame"),
+        (LENGTH, b"\1\x10", "payload must have 1 to 4096 bytes, got 4097"),
+    ],
+)
+def test_corrupt_frames_are_told_in_words(framing, frame, text):
+    """What is wrong with a frame is said, with sizes and at most its first 16 bytes."""
+    with pytest.raises(CorruptError) as caught:
+        framing.decode(frame)
+    assert str(caught.value) == text
+
+
+def test_refusals_and_beginnings_are_told_in_words():
+    """So are payloads and settings that can't be, and how much of a frame has come."""
+    with pytest.raises(BadRequestError, match=r"^payload must have 1 to 4096 bytes, got 0$"):
+        COBS.encode(b"")
+    with pytest.raises(IncompleteError, match=r"^3 bytes of a frame$"):
+        LENGTH.decode(b"\2\0\7")
+    for size in (0, 65536):
+        with pytest.raises(BadRequestError, match=f"^payload_max must be 1 to 65535, got {size}$"):
+            LengthFraming(named_crc("crc32"), size)
+    with pytest.raises(BadRequestError, match=r"^length-prefixed frames need a CRC: name one, or"):
+        LengthFraming(named_crc("none"))
+
+
+@pytest.mark.parametrize("size", [1, 65535])
+def test_length_frames_of_the_extreme_sizes(size):
+    """The limit of a payload may be as small as one byte and as large as two bytes can say."""
+    framing = LengthFraming(named_crc("crc32"), size)
+    assert framing.decode(framing.encode(bytes(size))) == bytes(size)
+
+
+def test_limits_hold_for_what_is_received():
+    """A good frame of a larger payload than agreed is refused, as is one without payload."""
+    for crc in ("crc16_modbus", "crc32"):
+        check = named_crc(crc)
+        large = CobsFraming(check).encode(bytes(9))
+        with pytest.raises(CorruptError, match="1 to 8 bytes, got 9"):
+            CobsFraming(check, payload_max=8).decode(large)
+        for body in (b"\x01", b"\x02\x07", b"\x03\xff\xff"):
+            with pytest.raises(CorruptError):
+                CobsFraming(check).decode(body + b"\0")
+        with pytest.raises(CorruptError, match="got 0"):
+            LengthFraming(check).decode(b"\0\0" + check.of(b"\0\0"))
+
+
+def test_zeros_are_no_frame():
+    """A CRC that starts at 0 would pass a line stuck at zero, if empty payloads were allowed."""
+    framing = LengthFraming(named_crc("crc16_xmodem"))
+    assert payloads_of(framing.splitter().feed(bytes(100))) == [None]
+
+
+def test_length_frames_need_a_check():
+    """Without one nothing would tell a frame's beginning."""
+    with pytest.raises(BadRequestError, match="need a CRC"):
+        binary_framing("length", "none")
+    with pytest.raises(BadRequestError, match="1 to 65535"):
+        binary_framing("length", "crc32", 65536)
+    with pytest.raises(BadRequestError, match="unknown CRC"):
+        binary_framing("cobs", "crc7")
+
+
+@EACH
+def test_each_wrong_crc_bit_is_seen(framing):
+    """Flipping any one bit under the check is refused."""
+    crc, payload = framing.crc, b"\x01\x00\x02\x7f"
+    if isinstance(framing, CobsFraming):
+        good = payload + crc.of(payload)
+        frame = CobsFraming(named_crc("none")).encode
+    else:
+        good = framing.encode(payload)
+        frame = bytes
+    assert framing.decode(frame(good)) == payload
+    for bit in range(8 * len(good)):
+        bad = bytearray(good)
+        bad[bit // 8] ^= 1 << bit % 8
+        with pytest.raises(FrameError):
+            framing.decode(frame(bad))
+
+
+@ALL
+def test_stream_in_any_pieces(framing):
+    """Byte by byte, in odd pieces or at once: the same payloads in the same order."""
+    rng = random.Random(4)
+    payloads = [rng.randbytes(rng.randint(1, 40)) for _ in range(50)]
+    stream = b"".join(map(framing.encode, payloads))
+    for piece in (1, 2, 3, 7, 64, len(stream)):
+        splitter = framing.splitter()
+        out = [
+            each
+            for at in range(0, len(stream), piece)
+            for each in splitter.feed(stream[at : at + piece])
+        ]
+        assert out == payloads
+
+
+@EACH
+@pytest.mark.parametrize(
+    "rubbish", [b"\x55", b"\xff\xff\xff", b"\x00", b"\x07\x00", bytes(range(1, 60))]
+)
+def test_stream_finds_its_way_back_after_rubbish(framing, rubbish):
+    """Rubbish between frames costs at most the frame that follows it, and is reported once."""
+    framing = type(framing)(framing.crc, payload_max=64)
+    payloads = [bytes([k]) * 30 for k in range(1, 12)]
+    frames = [framing.encode(payload) for payload in payloads]
+    stream = b"".join(frames[:4]) + rubbish + b"".join(frames[4:])
+    out = payloads_of(framing.splitter().feed(stream))
+    lost = [payload for payload in payloads if payload not in out]
+    assert lost in ([], [payloads[4]])
+    assert [each for each in out if each is not None] == [p for p in payloads if p not in lost]
+    assert out.count(None) <= 1
+    if lost:
+        assert out[4] is None
+
+
+def test_cobs_stream_drops_what_never_ends():
+    """What never ends is reported once and kept short; after the next 00 all is well."""
+    framing = CobsFraming(named_crc("crc32"), payload_max=16)
+    splitter = framing.splitter()
+    out = list(itertools.chain.from_iterable(splitter.feed(b"\x01" * 10) for _ in range(100)))
+    assert payloads_of(out) == [None]
+    assert "no end within" in str(out[0])
+    assert len(splitter._buffer) < 32
+    good = framing.encode(b"good")
+    assert splitter.feed(b"\x01\x00" + good) == [b"good"]
+
+
+@ALL
+def test_stream_takes_the_largest_frame_byte_by_byte(framing):
+    """The longest frame there can be is not yet too long."""
+    framing = type(framing)(framing.crc, payload_max=40)
+    for payload in (b"\xff" * 40, bytes(40)):
+        splitter = framing.splitter()
+        out = [each for byte in framing.encode(payload) for each in splitter.feed(bytes((byte,)))]
+        assert out == [payload]
+
+
+@EACH
+def test_stream_reports_each_lost_stretch(framing):
+    """Two damaged frames with good ones around them are two reports, in their places."""
+    framing = type(framing)(framing.crc, payload_max=8)
+    good, bad = framing.encode(b"\x01\x02\x03"), bytearray(framing.encode(b"\x01\x02\x03"))
+    bad[3] ^= 0x40
+    out = payloads_of(framing.splitter().feed(good + bad + good + good + bad + good))
+    assert out == [b"\1\2\3", None, b"\1\2\3", b"\1\2\3", None, b"\1\2\3"]
+
+
+def test_cobs_stream_ignores_00_in_a_row():
+    """Senders may put 00 in front of frames to wake a receiver up."""
+    framing = CobsFraming(named_crc("crc16_modbus"))
+    stream = b"\0\0\0" + framing.encode(b"a") + b"\0" + framing.encode(b"b")
+    assert framing.splitter().feed(stream) == [b"a", b"b"]
+
+
+@EACH
+def test_reset_forgets_half_a_frame(framing):
+    """After a time-out the next frame starts afresh."""
+    splitter = framing.splitter()
+    frame = framing.encode(b"\x01\x02\x03\x04")
+    assert splitter.feed(frame[:-2]) == []
+    splitter.reset()
+    assert splitter.feed(frame) == [b"\x01\x02\x03\x04"]
+
+
+@EACH
+def test_reset_forgets_that_the_way_was_lost(framing):
+    """Rubbish before a reset neither hides a later report nor costs a later frame."""
+    framing = type(framing)(framing.crc, payload_max=16)
+    rubbish = b"\xff" * 64
+    splitter = framing.splitter()
+    for _ in range(2):
+        assert payloads_of(splitter.feed(rubbish)) == [None]
+        splitter.reset()
+    assert splitter.feed(framing.encode(b"good")) == [b"good"]

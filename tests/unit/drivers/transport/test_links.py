@@ -1,0 +1,285 @@
+"""Bytes over TCP and ptys: whole replies, deadlines, and clear words about what went wrong."""
+
+import os
+import pty
+import select
+import socket
+import threading
+import tty
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from hilctl.base.errors import DeviceError
+from hilctl_drivers.transport import links as errors
+from hilctl_drivers.transport.links import (
+    BadRequestError,
+    FrameError,
+    LostError,
+    NoAnswerError,
+    RefusedError,
+    WatchdogTrippedError,
+)
+from hilctl_drivers.transport.serial_port import SerialLink, SerialSettings
+from hilctl_drivers.transport.tcp import TcpLink
+from tests.fakes import received
+
+QUICK_S = 0.05
+PATIENT_S = 5.0
+REPLY = b"0123456789"
+
+
+def missing(received: bytearray) -> int:
+    return max(0, len(REPLY) - len(received))
+
+
+class Peer:
+    """A TCP server that does one thing with its first connection, in a thread of its own."""
+
+    def __init__(self, act: Callable[[socket.socket], None]) -> None:
+        self.server = socket.create_server(("127.0.0.1", 0))
+        self.port = self.server.getsockname()[1]
+        self._act = act
+        self.done = threading.Event()
+        self.thread = threading.Thread(target=self._run)
+        self.thread.start()
+
+    def _run(self) -> None:
+        connection, _ = self.server.accept()
+        with connection:
+            self._act(connection)
+            self.done.wait(10.0)
+
+    def stop(self) -> None:
+        self.done.set()
+        self.thread.join()
+        self.server.close()
+
+
+@pytest.fixture
+def serve() -> Iterator[Callable[[Callable[[socket.socket], None]], int]]:
+    """Return a function that starts a peer and returns its port."""
+    peers = []
+
+    def start(act: Callable[[socket.socket], None]) -> int:
+        peers.append(Peer(act))
+        return peers[-1].port
+
+    yield start
+    for peer in peers:
+        peer.stop()
+
+
+def tcp(port, timeout_s=PATIENT_S):
+    link = TcpLink("127.0.0.1", port, timeout_s)
+    link.open()
+    return link
+
+
+def test_no_reply_wanted_is_not_waited_for(serve, line):
+    """A command that is not answered costs no time-out, on either link."""
+    _, name = line
+    wire = SerialLink(name, SerialSettings(), PATIENT_S)
+    wire.open()
+    for link in (tcp(serve(lambda connection: None)), wire):
+        assert link.transact(b"tell", lambda received: 0) == b""
+        link.close()
+
+
+@pytest.mark.parametrize(
+    ("sent", "words"), [(b"", "no answer within 0.3 s"), (b"0123", "only 4 bytes, 6 short")]
+)
+def test_a_known_size_moves_no_deadline(serve, line, sent, words):
+    """Silence and cut replies end in time too where the size of a good reply is known."""
+
+    def act(connection):
+        connection.recv(100)
+        connection.sendall(sent)
+
+    master, name = line
+    wire = SerialLink(name, SerialSettings(), 0.3)
+    wire.open()
+    wire.drain()
+    thread = threading.Thread(target=lambda: os.write(master, os.read(master, 100) and sent))
+    thread.start()
+    for link in (tcp(serve(act), 0.3), wire):
+        with pytest.raises(NoAnswerError, match=words):
+            link.transact(b"ask", missing, len(REPLY))
+        link.close()
+    thread.join()
+
+
+@pytest.mark.parametrize("size", [9, 11, 300])
+def test_a_reply_of_another_size_than_usual_is_asked_about(serve, size):
+    """Shorter, longer, and longer than what is read at once: what comes is what is returned."""
+    sent = bytes(size)
+
+    def act(connection):
+        connection.recv(100)
+        connection.sendall(sent)
+
+    link = tcp(serve(act))
+    assert link.transact(b"ask", lambda got: size - len(got), len(REPLY)) == sent
+    link.close()
+
+
+def test_full_serial_line_times_out(line):
+    """Nobody takes what is sent: an error in time, not a hang."""
+    _, name = line
+    link = SerialLink(name, SerialSettings(), QUICK_S)
+    link.open()
+    with pytest.raises(NoAnswerError, match="could not send within"):
+        link.transact(bytes(1_000_000), missing)
+    with pytest.raises(NoAnswerError, match="could not send within"):
+        link.transact(b"ask", missing)
+    link.close()
+
+
+@pytest.fixture
+def line() -> Iterator[tuple[int, str]]:
+    """Yield the far end of a pty and the device file of the near end."""
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    yield master, os.ttyname(slave)
+    os.close(slave)
+    os.close(master)
+
+
+def test_serial_exchanges(line):
+    """What is written gets there, and a reply that is waiting in pieces is put together."""
+    master, name = line
+    link = SerialLink(name, SerialSettings(115200, 8, "E", 1), PATIENT_S)
+    link.open()
+    link.drain()
+
+    def answer():
+        assert os.read(master, 100) == b"ask"
+        os.write(master, REPLY[:4])
+        os.write(master, REPLY[4:])
+
+    thread = threading.Thread(target=answer)
+    thread.start()
+    assert link.transact(b"ask", missing) == REPLY
+    thread.join()
+    assert link.low_latency is False  # a pty has no such setting
+    link.close()
+    link.close()
+
+
+def test_serial_port_is_ours_alone(line):
+    """A second one can't have the port, and is told so."""
+    _, name = line
+    first, second = (SerialLink(name, SerialSettings(), QUICK_S) for _ in range(2))
+    first.open()
+    with pytest.raises(LostError, match=r"can't be opened: .*lock"):
+        second.open()
+    first.close()
+    second.open()
+    second.close()
+
+
+def test_serial_late_reply_is_thrown_away(line):
+    """After a time-out, what still comes is not taken for the answer to the next request."""
+    master, name = line
+    link = SerialLink(name, SerialSettings(), QUICK_S)
+    link.open()
+    with pytest.raises(NoAnswerError, match=r"no answer within 0\.05 s"):
+        link.transact(b"one", missing)
+    os.write(master, b"late reply")
+    with pytest.raises(NoAnswerError):
+        link.transact(b"two", missing)
+    assert received(master, 6) == b"onetwo"
+    link.close()
+
+
+def test_serial_unasked_bytes_are_refused(line):
+    """A doubled reply is noticed before the next request is sent."""
+    master, name = line
+    link = SerialLink(name, SerialSettings(), PATIENT_S)
+    link.open()
+    link.drain()
+    os.write(master, REPLY)
+    select.select([link._fd], [], [], PATIENT_S)
+    with pytest.raises(DeviceError, match="10 bytes that nobody asked for"):
+        link.transact(b"ask", missing)
+    link.close()
+
+
+def test_serial_gap_is_kept():
+    """The next request waits until the line has been quiet for the gap."""
+    now, slept = [10.0], []
+
+    def sleep(seconds):
+        slept.append(seconds)
+        now[0] += seconds
+
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    settings = SerialSettings(9600, gap_s=0.004, boot_s=2.0)
+    link = SerialLink(os.ttyname(slave), settings, 1.0, clock=lambda: now[0], sleep=sleep)
+    link.open()
+    assert slept == [2.0]
+    link.drain()
+    for _ in range(2):
+        thread = threading.Thread(target=lambda: (os.read(master, 3), os.write(master, REPLY)))
+        thread.start()
+        assert link.transact(b"ask", missing) == REPLY
+        thread.join()
+    assert slept == [2.0, pytest.approx(0.004)]
+    link.close()
+    os.close(slave)
+    os.close(master)
+
+
+def test_serial_unplugged_is_one_line():
+    """A port that goes away in mid-exchange is told so, and is closed."""
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    link = SerialLink(os.ttyname(slave), SerialSettings(), PATIENT_S)
+    link.open()
+    link.drain()
+    os.close(slave)
+    thread = threading.Thread(target=lambda: (os.read(master, 3), os.close(master)))
+    thread.start()
+    with pytest.raises(LostError, match="port lost, unplugged"):
+        link.transact(b"ask", missing)
+    thread.join()
+    with pytest.raises(LostError, match="not open"):
+        link.transact(b"ask", missing)
+
+
+def test_serial_missing_port_is_one_line():
+    """A port that is not there is a device error with the system's own words."""
+    link = SerialLink("/dev/no_such_port", SerialSettings(), QUICK_S)
+    with pytest.raises(LostError, match="No such file"):
+        link.open()
+
+
+def test_serial_chatter_does_not_hang(line):
+    """A line that never gets quiet is an error within bounds."""
+    _, name = line
+    times = iter(range(1000))
+    link = SerialLink(name, SerialSettings(), 1.0, clock=lambda: float(next(times)))
+    link.open()
+    link._read = lambda: b"x"
+    link._poll = type("Always", (), {"poll": lambda self, ms: [1]})()
+    with pytest.raises(DeviceError, match="does not get quiet"):
+        link.transact(b"ask", missing)
+    link.close()
+
+
+def test_every_frame_error_is_a_device_error():
+    """The loop makes safe on any of them."""
+    found = [e for e in vars(errors).values() if isinstance(e, type) and issubclass(e, FrameError)]
+    assert len(found) == 7
+    assert all(issubclass(each, DeviceError) for each in found)
+    assert issubclass(BadRequestError, ValueError)
+
+
+@pytest.mark.parametrize("kind", [RefusedError, WatchdogTrippedError])
+def test_a_refusal_keeps_the_device_s_code(kind):
+    """Callers that can clear a trip catch it as a refusal, too."""
+    error = kind("no", 6)
+    assert (str(error), error.code) == ("no", 6)
+    assert isinstance(error, RefusedError)
+    assert RefusedError("no").code == ""

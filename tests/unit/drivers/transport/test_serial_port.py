@@ -1,0 +1,217 @@
+"""How a serial port is set at opening: modem lines, flow control, and long replies."""
+
+import fcntl
+import os
+import pty
+import struct
+import termios
+import threading
+import tty
+from collections.abc import Iterator
+
+import pytest
+
+from hilctl.base.errors import InputError
+from hilctl_drivers.profile import load_profile, with_link
+from hilctl_drivers.transport import serial_port as serial_link
+from hilctl_drivers.transport.links import NoAnswerError
+from hilctl_drivers.transport.serial_port import SerialLink, SerialSettings
+
+QUICK_S = 0.05
+PATIENT_S = 5.0
+XOFF, XON = b"\x13", b"\x11"
+
+
+@pytest.fixture
+def line() -> Iterator[tuple[int, str]]:
+    """Yield the far end of a pty and the device file of the near end."""
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    yield master, os.ttyname(slave)
+    os.close(slave)
+    os.close(master)
+
+
+@pytest.fixture
+def levels(monkeypatch) -> list[tuple[str, bool]]:
+    """Return a list of what the kernel is asked for: a modem line and its level."""
+    names = {termios.TIOCM_DTR: "dtr", termios.TIOCM_RTS: "rts"}
+    real, asked = fcntl.ioctl, []
+
+    def ioctl(fd, request, *args):
+        if request not in {termios.TIOCMBIS, termios.TIOCMBIC}:
+            return real(fd, request, *args)
+        bits = struct.unpack("I", args[0])[0]
+        asked.append((names[bits], request == termios.TIOCMBIS))
+        return args[0]  # a pty has no modem lines and would refuse
+
+    monkeypatch.setattr(fcntl, "ioctl", ioctl)
+    return asked
+
+
+def opened(name, **settings):
+    link = SerialLink(name, SerialSettings(**settings), QUICK_S)
+    link.open()
+    return link
+
+
+@pytest.mark.parametrize("dtr", [None, True, False])
+@pytest.mark.parametrize("rts", [None, True, False])
+def test_modem_lines_get_their_levels_once(line, levels, dtr, rts):
+    """A level that is asked for is set, never the other one first; else opening raises it."""
+    opened(line[1], dtr=dtr, rts=rts).close()
+    assert levels == [("dtr", dtr is not False), ("rts", rts is not False)]
+
+
+def test_modem_lines_are_set_before_the_board_starts(line, levels):
+    """What resets a board must not come after the wait for it."""
+    seen = []
+    settings = SerialSettings(dtr=False, boot_s=2.0)
+    link = SerialLink(line[1], settings, QUICK_S, sleep=lambda s: seen.append((s, list(levels))))
+    link.open()
+    link.close()
+    assert seen == [(2.0, [("dtr", False), ("rts", True)])]
+
+
+@pytest.mark.parametrize("flow", ["none", "xonxoff"])
+def test_flow_control_is_set_both_ways(line, flow):
+    """XON/XOFF is on where it is asked for, and off where a port was left with it."""
+    _, name = line
+    other = "none" if flow == "xonxoff" else "xonxoff"
+    opened(name, flow=other).close()
+    link = opened(name, flow=flow)
+    wanted = termios.IXON | termios.IXOFF if flow == "xonxoff" else 0
+    assert termios.tcgetattr(link._fd)[0] & (termios.IXON | termios.IXOFF) == wanted
+    link.close()
+
+
+def test_a_device_that_holds_the_line_is_an_error_in_time(line):
+    """After XOFF nothing goes out until XON; closing does not wait for it."""
+    master, name = line
+    link = opened(name, flow="xonxoff")
+    os.write(master, XOFF)
+    link.drain()  # polling is what takes the XOFF in
+    with pytest.raises(NoAnswerError, match="could not send within"):
+        link.transact(b"ask", lambda got: 0)
+    os.write(master, XON)
+    assert link.transact(b"ask", lambda got: 0) == b""
+    assert os.read(master, 100) == b"ask"
+    os.write(master, XOFF)
+    link.drain()
+    with pytest.raises(NoAnswerError, match="could not send within"):
+        link.transact(b"ask", lambda got: 0)
+    link.close()
+
+
+def test_time_spent_on_sending_is_not_there_for_the_answer(line, monkeypatch):
+    """One time-out is for both."""
+    now = [0.0]
+    link = SerialLink(line[1], SerialSettings(), 1.0, clock=lambda: now[0])
+    link.open()
+    link.drain()
+
+    class Never:
+        def poll(self, _ms):
+            raise AssertionError("waited after the deadline")
+
+    monkeypatch.setattr(serial_link, "write", lambda _fd, _data: 0)
+    monkeypatch.setattr(link._port, "write", lambda _data: now.__setitem__(0, 2.0))
+    monkeypatch.setattr(link, "_poll", Never())
+    with pytest.raises(NoAnswerError, match="no answer within 1 s"):
+        link.transact(b"ask", lambda got: 10 - len(got), 10)
+    link.close()
+
+
+def test_without_flow_control_all_bytes_pass(line):
+    """0x11 and 0x13 are data on a binary line."""
+    master, name = line
+    link = SerialLink(name, SerialSettings(), PATIENT_S)
+    link.open()
+    link.drain()
+    reply = bytes(range(256))
+    thread = threading.Thread(target=lambda: os.write(master, os.read(master, 1) and reply))
+    thread.start()
+    assert link.transact(b"?", lambda got: 256 - len(got), 256) == reply
+    thread.join()
+    link.close()
+
+
+def test_long_replies_are_put_together(line):
+    """Of known size or not: a reply may be longer than what is read at once."""
+    master, name = line
+    link = SerialLink(name, SerialSettings(), PATIENT_S)
+    link.open()
+    reply = bytes(3000)
+
+    def answer():
+        for _ in range(2):
+            os.read(master, 1)
+            os.write(master, reply)
+
+    thread = threading.Thread(target=answer)
+    thread.start()
+    for usual in (0, len(reply)):
+        assert link.transact(b"?", lambda got: len(reply) - len(got), usual) == reply
+    thread.join()
+    link.close()
+
+
+def test_profiles_say_how_their_line_is_set():
+    """Levels and flow control get from the profile to the port."""
+    profile = with_link(load_profile("kepco_bop"), flow="xonxoff", dtr=True, rts=False)
+    settings = profile.link.settings
+    assert (settings.flow, settings.dtr, settings.rts) == ("xonxoff", True, False)
+    settings = load_profile("icp_m7024").link.settings
+    assert (settings.flow, settings.dtr, settings.rts) == ("none", None, None)
+    assert load_profile("cobs_board").link.settings.dtr is True
+
+
+@pytest.mark.parametrize("name", ["icp_m7024", "cobs_board"])
+def test_binary_lines_refuse_flow_control(name):
+    """Two byte values would be lost, and the rest of the frame with them."""
+    rule = "flow must be none where bytes 0x11 and 0x13 are data, got xonxoff"
+    with pytest.raises(InputError, match=rule):
+        with_link(load_profile(name), flow="xonxoff")
+
+
+def test_levels_stay_when_the_port_of_a_board_that_boots_is_closed(line):
+    """A board that a falling DTR resets would be deaf when the next one opens its port."""
+
+    def falls(link):
+        return bool(termios.tcgetattr(link._fd)[2] & termios.HUPCL)
+
+    plain = opened(line[1])
+    attributes = termios.tcgetattr(plain._fd)
+    attributes[2] |= termios.HUPCL  # as ports have it, but not ptys
+    termios.tcsetattr(plain._fd, termios.TCSANOW, attributes)
+    plain.timeout_s = 0.2  # sets the port anew
+    assert falls(plain)
+    plain.close()
+    link = SerialLink(line[1], SerialSettings(boot_s=2.0), QUICK_S, sleep=lambda seconds: None)
+    link.open()
+    assert not falls(link)
+    link.timeout_s = 0.2
+    assert not falls(link)
+    link.close()
+
+
+def test_a_value_is_sent_past_a_line_that_never_falls_silent(line):
+    """At once and whole, where an exchange would first wait for silence; that comes later."""
+    master, name = line
+    link = opened(name)
+    os.write(master, b"chatter" * 20)
+    link.send_now(b"safe\r")
+    assert os.read(master, 100) == b"safe\r"
+    assert link.is_open
+    assert not link.is_in_step
+    link.close()
+
+
+def test_opening_waits_for_a_boot_unless_it_must_not(line):
+    slept = []
+    link = SerialLink(line[1], SerialSettings(boot_s=2.0), QUICK_S, sleep=slept.append)
+    link.open(boot=False)
+    assert slept == []
+    link.open()
+    assert slept == [2.0]
+    link.close()

@@ -1,0 +1,195 @@
+"""A TCP link against a peer in a thread: pieces, silence, resets, and one name for each address."""
+
+import socket
+import struct
+import threading
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from hilctl.base.errors import DeviceError
+from hilctl_drivers.transport.links import LostError, NoAnswerError
+from hilctl_drivers.transport.tcp import TcpLink
+
+QUICK_S = 0.05
+PATIENT_S = 5.0
+REPLY = b"0123456789"
+
+
+def missing(received: bytearray) -> int:
+    return max(0, len(REPLY) - len(received))
+
+
+class Peer:
+    """A TCP server that does one thing with its first connection, in a thread of its own."""
+
+    def __init__(self, act: Callable[[socket.socket], None]) -> None:
+        self.server = socket.create_server(("127.0.0.1", 0))
+        self.port = self.server.getsockname()[1]
+        self._act = act
+        self.done = threading.Event()
+        self.thread = threading.Thread(target=self._run)
+        self.thread.start()
+
+    def _run(self) -> None:
+        connection, _ = self.server.accept()
+        with connection:
+            self._act(connection)
+            self.done.wait(10.0)
+
+    def stop(self) -> None:
+        self.done.set()
+        self.thread.join()
+        self.server.close()
+
+
+@pytest.fixture
+def serve() -> Iterator[Callable[[Callable[[socket.socket], None]], int]]:
+    """Return a function that starts a peer and returns its port."""
+    peers = []
+
+    def start(act: Callable[[socket.socket], None]) -> int:
+        peers.append(Peer(act))
+        return peers[-1].port
+
+    yield start
+    for peer in peers:
+        peer.stop()
+
+
+def tcp(port, timeout_s=PATIENT_S):
+    link = TcpLink("127.0.0.1", port, timeout_s)
+    link.open()
+    return link
+
+
+def test_tcp_reply_in_pieces_is_put_together(serve):
+    """A reply may come in any number of segments."""
+
+    def act(connection):
+        connection.recv(100)
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        for k in range(len(REPLY)):
+            connection.sendall(REPLY[k : k + 1])
+
+    link = tcp(serve(act))
+    assert link.transact(b"ask", missing) == REPLY
+    link.close()
+    link.close()
+
+
+def test_tcp_turns_nagle_off(serve):
+    """Small requests leave at once."""
+    link = tcp(serve(lambda connection: None))
+    assert link._socket.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
+    link.close()
+
+
+@pytest.mark.parametrize(
+    ("sent", "words"), [(b"", "no answer within 0.05 s"), (b"0123", "only 4 bytes, 6 short")]
+)
+def test_tcp_silence_ends_at_the_deadline(serve, sent, words):
+    """No reply, or a part of one, is an error in time, and the connection is given up."""
+
+    def act(connection):
+        connection.recv(100)
+        connection.sendall(sent)
+
+    link = tcp(serve(act), QUICK_S)
+    with pytest.raises(NoAnswerError, match=words):
+        link.transact(b"ask", missing)
+    with pytest.raises(LostError, match="not connected"):
+        link.transact(b"ask", missing)
+
+
+def test_tcp_request_that_was_not_answered_is_given_up(serve):
+    """The peer sees a reset: what it has not been given yet must not reach it later."""
+    seen, acted = [], threading.Event()
+
+    def act(connection):
+        connection.recv(100)
+        try:
+            connection.recv(100)
+        except ConnectionResetError as error:
+            seen.append(error)
+        acted.set()
+
+    link = tcp(serve(act), QUICK_S)
+    with pytest.raises(NoAnswerError):
+        link.transact(b"ask", missing)
+    assert acted.wait(PATIENT_S)
+    assert len(seen) == 1
+
+
+def test_tcp_kernel_gives_up_what_is_not_acknowledged(serve):
+    """In one time-out, also where this process dies before."""
+    link = tcp(serve(lambda connection: None), QUICK_S)
+    found = link._socket.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT)
+    assert found == round(QUICK_S * 1e3)
+    link.close()
+
+
+def test_tcp_address_of_the_peer_is_known_once_it_was_reached(serve):
+    """Then nobody need look a name up again."""
+    link = TcpLink("localhost", serve(lambda connection: None), PATIENT_S)
+    assert link.peer_host == "localhost"
+    link.open()
+    assert link.peer_host == "127.0.0.1"
+    link.close()
+
+
+def test_tcp_trickle_does_not_move_the_deadline():
+    """A byte now and then does not keep an exchange alive: time is injected and runs out."""
+    ours, theirs = socket.socketpair()
+    theirs.sendall(b"012")
+    times = iter([0.0, 1.1])
+    link = TcpLink("", 0, 1.0, clock=lambda: next(times))
+    link._socket = ours
+    with pytest.raises(NoAnswerError, match="within 1 s"):
+        link.transact(b"ask", lambda received: 1)
+    theirs.close()
+
+
+def test_tcp_reset_closing_and_refusal_are_told_apart(serve):
+    """Each way to lose a peer has words of its own."""
+
+    def reset(connection):
+        connection.recv(100)
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        connection.close()
+
+    def hang_up(connection):
+        connection.recv(100)
+        connection.shutdown(socket.SHUT_RDWR)
+
+    with pytest.raises(LostError, match="connection reset by peer"):
+        tcp(serve(reset)).transact(b"ask", missing)
+    with pytest.raises(LostError, match="connection closed by the device"):
+        tcp(serve(hang_up)).transact(b"ask", missing)
+    with pytest.raises(LostError, match="can't connect: connection refused"):
+        tcp(1)
+
+
+def test_tcp_unknown_host_is_one_line():
+    """A name that can't be looked up is a device error, not a traceback."""
+    with pytest.raises(LostError, match="can't connect"):
+        TcpLink("host.invalid", 502, QUICK_S).open()
+
+
+def test_tcp_frame_error_closes_the_connection(serve):
+    """When the reply can't be one, what else is on its way must not be taken for the next."""
+
+    def act(connection):
+        connection.recv(100)
+        connection.sendall(REPLY)
+
+    def refuse(received):
+        if received:
+            raise DeviceError("not a reply")
+        return 1
+
+    link = tcp(serve(act))
+    with pytest.raises(DeviceError, match="not a reply"):
+        link.transact(b"ask", refuse)
+    with pytest.raises(LostError):
+        link.transact(b"ask", missing)

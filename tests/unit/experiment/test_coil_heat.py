@@ -1,0 +1,147 @@
+"""The coil's heat through runs and pauses."""
+
+import math
+
+import numpy as np
+import pytest
+
+from hilctl.base.samples import Flag, Samples
+from hilctl.experiment.coil_heat import CoilHeat, CoolingCoil, RunHeat, cooled
+from hilctl.experiment.load import load_experiment
+
+EXPERIMENT = """\
+name: rig
+device: {kind: simulated_terfenol, seed: 3}
+sample_rate_hz: 5000
+waveform: {kind: hold, unit: A, level: 0.0, duration_s: 1.0}
+compensator: none
+limits: {peak_current_a: 4.0, slew_a_per_s: 5000.0, stroke_um: [-50.0, 50.0]}
+"""
+RATE_HZ = 5000.0
+BUDGET = ["limits.rms_current_a=1.0", "limits.thermal_time_constant_s=10.0"]
+
+
+@pytest.fixture
+def experiment(tmp_path):
+    path = tmp_path / "rig.yaml"
+    path.write_text(EXPERIMENT, encoding="utf-8")
+    return path
+
+
+@pytest.fixture
+def config(experiment):
+    return load_experiment(experiment, BUDGET).config
+
+
+@pytest.fixture
+def coil(config):
+    return CoolingCoil(config, 0.0, 100.0)
+
+
+@pytest.fixture
+def held(config):
+    """What a current does that is held for a time."""
+
+    def make(amps, seconds):
+        command = np.full(round(seconds * RATE_HZ), float(amps))
+        return RunHeat().then(command, config.limits, RATE_HZ)
+
+    return make
+
+
+def samples(index, command, measured=None, flags=None):
+    size = len(index)
+    nothing = np.full(size, np.nan)
+    return Samples(
+        index=np.array(index, dtype=np.int64),
+        reference_um=nothing,
+        wanted=np.array(command, dtype=np.float64),
+        command=np.array(command, dtype=np.float64),
+        displacement_um=nothing,
+        input_um=nothing,
+        measured=np.empty(0) if measured is None else np.array(measured),
+        flags=np.zeros(size, dtype=np.uint32) if flags is None else flags,
+    )
+
+
+def test_without_a_budget_nothing_is_waited_for(experiment):
+    config = load_experiment(experiment).config
+    run = RunHeat().then(np.full(25000, 4.0), config.limits, RATE_HZ)
+    cold = CoolingCoil(config, 0.0, 0.0)
+    cold.ran(run, 5.0)
+    assert cold.pause_s(run, 5.0) == 0.0
+
+
+def test_a_cold_coil_runs_at_once(coil, held):
+    assert coil.pause_s(held(2.0, 1.0), 100.0) == 0.0
+
+
+def test_the_pause_is_just_long_enough(coil, held, config):
+    """After it the run keeps the budget, as the interlock counts it; a little less does not do."""
+    run = held(2.5, 1.0)
+    coil.ran(run, 101.0)
+    pause_s = coil.pause_s(run, 101.0)
+    assert pause_s > 1.0
+    for waited_s, kept in ((pause_s, True), (0.8 * pause_s, False)):
+        then = CoilHeat(config.limits, RATE_HZ, coil.heat_a2(101.0 + waited_s))
+        then.add(np.full(5000, 2.5))
+        assert (then.highest_a2 <= 0.901) is kept
+
+
+def test_in_parts_a_run_does_the_same(config):
+    """And the same as sample by sample."""
+    command = np.sin(np.arange(9000) / 50.0) * 2.0
+    whole = RunHeat().then(command, config.limits, RATE_HZ)
+    parts = RunHeat()
+    for part in np.split(command, 3):
+        parts = parts.then(part, config.limits, RATE_HZ)
+    assert parts.seconds == pytest.approx(whole.seconds)
+    assert parts.alone_a2 == pytest.approx(whole.alone_a2, rel=1e-12)
+    assert parts.hottest_a2 == pytest.approx(whole.hottest_a2, rel=1e-9)
+    sure = CoilHeat(config.limits, RATE_HZ, whole.hottest_a2)
+    sure.add(command)
+    assert sure.highest_a2 == pytest.approx(0.9, rel=1e-9)
+
+
+def test_it_cools_to_what_is_asked_for(coil, held):
+    coil.ran(held(2.5, 1.0), 101.0)
+    pause_s = coil.pause_s(held(0.1, 0.1), 101.0, 0.2)
+    assert coil.heat_a2(101.0 + pause_s) == pytest.approx(0.04)
+
+
+def test_time_that_passes_anyway_is_no_pause(coil, held):
+    coil.ran(held(2.5, 1.0), 101.0)
+    assert coil.pause_s(held(2.5, 1.0), 200.0) == 0.0
+
+
+def test_a_run_that_never_fits_is_waited_for_no_longer_than_for_a_cold_coil(coil, held):
+    """The amplitude was lowered before; here it was not."""
+    coil.ran(held(2.5, 1.0), 101.0)
+    assert coil.pause_s(held(4.0, 5.0), 101.0) < 100.0
+
+
+def test_a_clock_that_goes_back_cools_nothing():
+    assert cooled(4.0, 0.0, 10.0, -5.0) == 4.0
+    assert cooled(4.0, 1.0, 10.0, 10.0) == pytest.approx(1.0 + 3.0 / math.e)
+
+
+class TestSamples:
+    """What was exchanged, not what was meant."""
+
+    def test_what_was_measured_counts_where_it_is_more(self, config):
+        heat, sure = (CoilHeat(config.limits, RATE_HZ, 0.5) for _ in range(2))
+        heat.follow(samples(range(4), [1, 1, 1, 1], [np.nan, 3.0, np.inf, 0.5]))
+        sure.add(np.array([1.0, 3.0, 1.0, 1.0]))
+        assert heat.heat_a2 == sure.heat_a2
+
+    def test_in_a_gap_the_output_was_held(self, config):
+        heat, sure = (CoilHeat(config.limits, RATE_HZ, 0.0) for _ in range(2))
+        heat.follow(samples([0, 1], [1, 2]))
+        heat.follow(samples([2, 5000, 5001], [2, 1, 1]))
+        sure.add(np.array([1.0] + [2.0] * 4999 + [1.0, 1.0]))
+        assert heat.heat_a2 == pytest.approx(sure.heat_a2, rel=1e-9)
+
+    def test_a_ramp_at_the_start_says_how_hot_the_output_has_kept_it(self, config):
+        heat = CoilHeat(config.limits, RATE_HZ, 0.0)
+        heat.follow(samples([0], [0.9], flags=np.array([Flag.RAMP], dtype=np.uint32)))
+        assert heat.heat_a2 == pytest.approx(0.81)

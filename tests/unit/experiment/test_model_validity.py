@@ -1,0 +1,70 @@
+"""A reference held against the motions that the model was identified on."""
+
+import numpy as np
+import pytest
+
+from hilctl.base.segments import Segment
+from hilctl.experiment.model_validity import range_findings, spectrum
+from hilctl.models.base import IdentifiedRange
+from hilctl.waveforms.build import Reference
+
+RATE_HZ = 10_000.0
+KNOWN = IdentifiedRange(
+    peak_to_peak_um=(20.0, 80.0), frequency_hz=(10.0, 100.0), speed_um_per_s=25_000.0
+)
+
+
+def findings(values_um, frequency_hz=0.0):
+    period = RATE_HZ / frequency_hz if frequency_hz else 0.0
+    segment = Segment("s", 0, values_um.size, 0, values_um.size, period)
+    span = float(values_um.min()), float(values_um.max())
+    return range_findings(KNOWN, Reference(values_um, "um", RATE_HZ, (segment,), span))
+
+
+def sine(frequency_hz, amplitude=40.0, seconds=1.0):
+    return amplitude * np.sin(2.0 * np.pi * frequency_hz * np.arange(seconds * RATE_HZ) / RATE_HZ)
+
+
+@pytest.mark.parametrize("frequency_hz", [10.0, 37.0, 100.0])
+def test_within_the_range_there_is_nothing_to_say(frequency_hz):
+    found = findings(sine(frequency_hz), frequency_hz)
+    assert (found.refused, found.warnings) == ((), ())
+
+
+def test_somewhat_faster_is_warned_and_much_faster_refused():
+    assert "up to about 15" in findings(sine(150.0, 20.0)).warnings[0]
+    assert "at about 250 Hz" in findings(sine(250.0)).refused[0]
+
+
+def test_a_corner_is_warned_not_refused():
+    """A triangle within the range has harmonics beyond it, but does not live on them."""
+    triangle = 40.0 * (2.0 / np.pi) * np.arcsin(sine(80.0, 1.0))
+    found = findings(triangle, 80.0)
+    assert not found.refused
+    assert "frequencies up to" in found.warnings[0]
+
+
+@pytest.mark.parametrize(
+    ("values", "frequency_hz", "text"),
+    [
+        (sine(50.0, 4.0), 50.0, "moves by 8 µm peak-to-peak"),
+        (sine(2.0, 40.0), 2.0, "repeats at 2 Hz"),
+        (sine(50.0, 40.0) + np.where(np.arange(10_000) > 5003, 8.0, 0.0), 0.0, "µm/s"),
+    ],
+)
+def test_smaller_slower_and_faster_motions_are_warned(values, frequency_hz, text):
+    found = findings(values, frequency_hz)
+    assert any(text in each for each in found.warnings)
+    assert not found.refused
+
+
+def test_what_hardly_moves_has_no_frequency():
+    """A quiver of a hundredth beside a slow motion, and a rest."""
+    rest = np.concatenate((sine(20.0), sine(900.0, 0.5), np.zeros(5000)))
+    assert not findings(rest).refused
+    assert findings(rest).warnings == ()
+    assert spectrum(np.zeros(1000), RATE_HZ).highest_hz == 0.0
+
+
+def test_a_reference_shorter_than_a_window_is_one():
+    assert spectrum(sine(100.0, 1.0, 0.03), RATE_HZ).main_hz == pytest.approx(100.0, abs=40.0)

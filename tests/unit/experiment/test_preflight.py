@@ -1,0 +1,738 @@
+"""What is worked out and refused before anything moves."""
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+from pydantic import ConfigDict
+
+from hilctl.base.device import DeviceInfo, DeviceOptions
+from hilctl.base.errors import ConfigError, DataError
+from hilctl.base.segments import Segment
+from hilctl.base.types import F64
+from hilctl.base.yaml import Document
+from hilctl.experiment import preflight as module
+from hilctl.experiment.coil_heat import RunHeat
+from hilctl.experiment.correction import Correction, LearnedCycle, model_sha256, signature
+from hilctl.experiment.file import CompensatorConfig
+from hilctl.experiment.initial_state import InitialState
+from hilctl.experiment.load import LoadedExperiment, load_experiment, resolve
+from hilctl.experiment.preflight import CheckedExperiment, check, command_problems, pace_warnings
+from hilctl.models.base import HysteresisModel, IdentifiedRange, Operator, Provenance
+from hilctl.models.plays import RdpiModel
+from tests.published import piezo_ppi, terfenol_rdpi
+
+CURRENT = """\
+name: current
+device: {kind: simulated_terfenol}
+sample_rate_hz: 10000
+waveform: {kind: sine, unit: A, amplitude: 6.0, offset: 0.5, frequency_hz: 10.0, duration_s: 1.0}
+compensator: none
+limits: {peak_current_a: 7.0, slew_a_per_s: 20000.0, stroke_um: [-75.0, 60.0]}
+"""
+DISPLACEMENT = """\
+name: displacement
+device: {kind: simulated_terfenol}
+sample_rate_hz: 10000
+waveform:
+  kind: sine
+  unit: um
+  amplitude: 10.0
+  frequency_hz: 10.0
+  duration_s: 1.0
+  soft_start_s: 0.1
+compensator: {model: model.yaml}
+limits: {peak_current_a: 7.0, slew_a_per_s: 20000.0, stroke_um: [-75.0, 60.0]}
+"""
+INFO = DeviceInfo(
+    name="fake",
+    description="a device that does nothing",
+    command_unit="A",
+    command_min=-8.0,
+    command_max=8.0,
+    sensor_min_um=-100.0,
+    sensor_max_um=100.0,
+    max_rate_hz=20e3,
+)
+
+
+class DescribedDevice:
+    """A device that only says what it is."""
+
+    Options: ClassVar[type[DeviceOptions]] = DeviceOptions
+
+    def __init__(self, info: DeviceInfo) -> None:
+        self.info = info
+
+    def open(self, sample_rate_hz: float, block: int) -> None:
+        """Refuse: nothing may be opened before the run."""
+        raise AssertionError("opened")
+
+    def output(self) -> float:
+        """Refuse: nothing may be opened before the run."""
+        raise AssertionError("opened")
+
+    def exchange(
+        self, first_sample: int, command: F64, displacement_um: F64, measured: F64
+    ) -> None:
+        """Refuse: nothing may move before the run."""
+        raise AssertionError("moved")
+
+    def make_safe(self, command: float) -> None:
+        """Refuse: nothing may move before the run."""
+        raise AssertionError("moved")
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+class BrokenModel(HysteresisModel):
+    """A model whose inverse gives 0 A, and something that is not finite at one sample."""
+
+    model_config = ConfigDict(allow_inf_nan=True)
+    bad: float
+    at: int
+
+    @property
+    def operators(self) -> int:
+        """Return 1: the memory counts samples."""
+        return 1
+
+    def forward(self, sample_rate_hz: float) -> Operator:
+        """Refuse: only the inverse is run."""
+        raise AssertionError("forward")
+
+    def inverse(self, sample_rate_hz: float) -> Operator:
+        """Return the operator with the fault."""
+
+        def run(x: F64, memory: F64, out: F64) -> None:
+            out[:] = 0.0
+            first = int(memory[0])
+            if first <= self.at < first + x.size:
+                out[self.at - first] = self.bad
+            memory[0] += x.size
+
+        return Operator(run, self.operators)
+
+
+def loaded(
+    text: str,
+    *settings: str,
+    model: HysteresisModel | None = None,
+    **info: Any,
+) -> LoadedExperiment:
+    """Read an experiment and put a fake device and a model in."""
+    without_model = text.replace("{model: model.yaml}", "none").replace("unit: um", "unit: A")
+    made = resolve(Document("x.yaml", text if model is None else without_model), Path(), settings)
+    device = DescribedDevice(replace(INFO, **info))
+    if model is None:
+        return replace(made, device=device)
+    waveform = made.config.waveform.model_copy(update={"unit": "um"})
+    config = made.config.model_copy(update={"waveform": waveform})
+    return replace(made, config=config, device=device, model=model)
+
+
+def checked(text: str, *settings: str, **given: Any) -> CheckedExperiment:
+    return check(loaded(text, *settings, **given))
+
+
+def refusals(text: str, *settings: str, **given: Any) -> list[str]:
+    with pytest.raises(ConfigError) as caught:
+        checked(text, *settings, **given)
+    lines = text.splitlines()
+    for problem in caught.value.problems:
+        name, _, line = problem.where.partition(":")
+        key = problem.key.rpartition(".")[2]
+        assert name.startswith("--set") or key in lines[int(line) - 1], problem
+    return [str(replace(problem, where="x.yaml")) for problem in caught.value.problems]
+
+
+@pytest.mark.parametrize("at_start", [-8.0, 8.0])
+def test_a_start_within_the_device_s_range_is_taken(at_start: float) -> None:
+    """Outside the limits too: it is ramped in from there."""
+    assert checked(CURRENT, f"safe.at_start={at_start}").loaded.config.safe.at_start == at_start
+
+
+def test_a_start_that_the_device_can_not_hold_is_refused() -> None:
+    found = refusals(CURRENT, "safe.at_start=8.5")
+    assert len(found) == 1
+    assert "safe.at_start: must lie within what " in found[0]
+    assert found[0].endswith("-8 to 8 A, got 8.5")
+
+
+class TestReference:
+    """References that go too far."""
+
+    def test_outside_the_stroke(self) -> None:
+        """A reference outside the stroke limits is refused, by how much included."""
+        found = refusals(
+            DISPLACEMENT,
+            "waveform.soft_start_s=0.0",
+            "limits.stroke_um=[-9.5, 60.0]",
+            model=terfenol_rdpi(),
+        )
+        assert found == [
+            "x.yaml: waveform: reference must stay within limits.stroke_um, -9.5 to 60 µm, got "
+            "-10 to 10 µm (0.5 µm too far: change the waveform's amplitude or offset)"
+        ]
+
+    def test_outside_the_model(self) -> None:
+        """A reference beyond what the model was found on is refused; just within is not."""
+        model = terfenol_rdpi().model_copy(update={"output_range_um": (-12.0, 9.75)})
+        found = refusals(DISPLACEMENT, model=model)
+        assert found == [
+            "x.yaml: waveform: reference must stay within the range that compensator.model was "
+            "found on, -12 to 9.75 µm, got -10 to 10 µm (0.25 µm too far: change the waveform's "
+            "amplitude or offset)"
+        ]
+        checked(DISPLACEMENT, "waveform.amplitude=9.75", model=model)
+
+    def test_outside_both(self) -> None:
+        """Both ranges are told, each with its own distance, and the current that would flow."""
+        model = terfenol_rdpi().model_copy(update={"output_range_um": (-12.0, 12.0)})
+        found = refusals(DISPLACEMENT, "waveform.amplitude=80.0", model=model)
+        assert len(found) == 3
+        assert "limits.stroke_um, -75 to 60 µm" in found[0]
+        assert "(20 µm too far" in found[0]
+        assert "-12 to 12 µm" in found[1]
+        assert "(68 µm too far" in found[1]
+        assert found[2].startswith("x.yaml: limits.peak_current_a: the run must stay within")
+
+    def test_a_current_is_no_displacement(self) -> None:
+        """A waveform in ampere is not held against micrometres."""
+        checked(CURRENT, "limits.stroke_um=[-1.0, 1.0]")
+
+
+class TestCommand:
+    """Commands that the limits do not allow."""
+
+    def test_peak(self) -> None:
+        """A peak over the limit is refused, by how much included."""
+        assert refusals(CURRENT, "limits.peak_current_a=6.25") == [
+            "x.yaml: limits.peak_current_a: the run must stay within -6.25 to 6.25 A, got -5.5 to "
+            "6.5 A (0.25 A too much: lower the waveform's amplitude, or raise the limit)"
+        ]
+        checked(CURRENT, "limits.peak_current_a=6.5")
+
+    def test_lowest(self) -> None:
+        """The lower end counts as much as the upper."""
+        found = refusals(CURRENT, "waveform.offset=-2.0")
+        assert found == [
+            "x.yaml: limits.peak_current_a: the run must stay within -7 to 7 A, got -8 to 4 A "
+            "(1 A too much: lower the waveform's amplitude, or raise the limit)"
+        ]
+
+    def test_slew(self) -> None:
+        """A change faster than the limit is refused, with how many times too fast."""
+        found = refusals(CURRENT, "waveform.soft_start_s=0.1", "limits.slew_a_per_s=150.0")
+        assert found == [
+            "x.yaml: limits.slew_a_per_s: the run must change no faster than 150 A/s, got 377.004 "
+            "(2.51 times the limit: lower the frequency, soften the start, or raise it)"
+        ]
+        checked(CURRENT, "waveform.soft_start_s=0.1", "limits.slew_a_per_s=377.01")
+
+    def test_first_step(self) -> None:
+        """A waveform that does not begin at the safe value jumps there: that is a slew too."""
+        found = refusals(CURRENT, "limits.slew_a_per_s=4000.0")
+        assert len(found) == 1
+        assert "got 5000 (1.25 times the limit" in found[0]
+
+    def test_voltage(self) -> None:
+        """For a device driven in V the keys and units are those of a voltage."""
+        text = (
+            CURRENT.replace("unit: A", "unit: V")
+            .replace("peak_current_a: 7.0", "drive_v: [0.0, 5.0]")
+            .replace("slew_a_per_s: 20000.0", "slew_v_per_s: 100.0")
+        )
+        found = refusals(text, "waveform.soft_start_s=0.2", command_unit="V")
+        assert len(found) == 2
+        assert found[0].startswith(
+            "x.yaml: limits.drive_v: the run must stay within 0 to 5 V, got -5.5 to 6.5 V (5.5 V"
+        )
+        assert found[1].startswith(
+            "x.yaml: limits.slew_v_per_s: the run must change no faster than 100 V/s, got "
+        )
+
+    def test_model_that_can_not_be_inverted(self) -> None:
+        """A model whose inverse leaves the numbers is refused with the rest."""
+        model = RdpiModel(direct=1e-310, weights=(1.0, 1.0), thresholds=(0.3, 0.6))
+        found = refusals(DISPLACEMENT, "block=5", model=model)
+        assert len(found) == 2
+        assert found[0].startswith("x.yaml: block: must be 1")
+        assert found[1].startswith("x.yaml: compensator.model: the weights and thresholds are")
+
+    @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+    @pytest.mark.parametrize("at", [0, 1, 1500])
+    def test_not_a_number(self, monkeypatch: pytest.MonkeyPatch, bad: float, at: int) -> None:
+        """A command that is not finite is refused, wherever and in whichever chunk it stands."""
+        monkeypatch.setattr("hilctl.experiment.command_simulation.CHUNK", 1000)
+        found = refusals(DISPLACEMENT, model=BrokenModel(bad=bad, at=at))
+        assert len(found) == 1
+        assert found[0].startswith(
+            "x.yaml: compensator.model: every command must be a finite number, got "
+        )
+
+    def test_very_large_numbers(self) -> None:
+        """Numbers near the end of the range are refused in words, without a warning."""
+        found = refusals(CURRENT, "waveform.amplitude=1.0e+308", "waveform.offset=0.0")
+        assert len(found) == 2
+        assert "got -1e+308 to 1e+308 A (1e+308 A too much" in found[0]
+        assert "(inf times the limit" in found[1]
+
+
+class TestBudget:
+    """What is said of a coil that would get too hot, and what helps."""
+
+    BUDGET: ClassVar = ("limits.rms_current_a=4.0", "limits.thermal_time_constant_s=20.0")
+
+    def hint(self, begins_rms_a: float | None, hottest_a2: float, safe: float = 0.0) -> str:
+        made = loaded(CURRENT, *self.BUDGET, f"safe.value={safe}")
+        forecast = replace(
+            checked(CURRENT).forecast, heating_rms_a=4.5, budget_used_s=1.5, before_s=1.5,
+            begins_rms_a=begins_rms_a, heat=RunHeat(2.0, 1.0, hottest_a2),
+        )  # fmt: skip
+        (problem,) = command_problems(made, forecast)
+        assert problem.key == "limits.rms_current_a"
+        assert problem.rule == "the coil must stay within 4 A rms over 20 s"
+        assert problem.value == "4.5 A"
+        return problem.hint
+
+    @pytest.mark.parametrize(
+        ("begins_rms_a", "hottest_a2", "safe", "wait_s"),
+        [(3.0, 4.0, 0.0, 16), (2.02, 4.0, 0.0, 0), (3.5, 10.0, 3.0, 24)],
+    )
+    def test_heat_of_the_last_run_is_waited_for(
+        self, begins_rms_a: float, hottest_a2: float, safe: float, wait_s: int
+    ) -> None:
+        """20 s times ln(9 / 4), ln(4.08 / 4), and ln(3.25 / 1) above what the safe value makes."""
+        begins = f"it begins at {begins_rms_a:.3g} A rms, left by the last run: wait {wait_s} s"
+        assert self.hint(begins_rms_a, hottest_a2, safe) == begins
+
+    @pytest.mark.parametrize(
+        ("begins_rms_a", "hottest_a2", "safe"),
+        [(1.0, 4.0, 0.0), (3.0, 4.0, 2.0), (3.5, 8.0, 3.0), (None, 0.5, 0.0)],
+    )
+    def test_no_wait_helps_a_run_that_makes_the_heat_itself(
+        self, begins_rms_a: float | None, hottest_a2: float, safe: float
+    ) -> None:
+        """Or one that must begin colder than the safe value lets the coil become."""
+        assert self.hint(begins_rms_a, hottest_a2, safe) == (
+            "0.5 A too much, and the budget is used up after 1.5 s: lower the waveform's "
+            "amplitude, or shorten the run"
+        )
+
+
+class TestDevice:
+    """What the device can't do."""
+
+    def test_range(self) -> None:
+        """Limits wider than what the device takes are refused."""
+        assert refusals(CURRENT, command_max=6.9) == [
+            "x.yaml: limits: must lie within what fake takes, -8 to 6.9 A, got -7 to 7"
+        ]
+        assert refusals(CURRENT, command_min=-6.9) == [
+            "x.yaml: limits: must lie within what fake takes, -6.9 to 8 A, got -7 to 7"
+        ]
+        checked(CURRENT, command_min=-7.0, command_max=7.0)
+
+    def test_unit(self) -> None:
+        """Limits in A for a device driven in V are refused."""
+        found = refusals(CURRENT, command_unit="V")
+        assert found == ["x.yaml: limits: must be in V, what fake is driven with, got A"]
+
+    def test_rate(self) -> None:
+        """A rate that the device can't keep is refused; the fastest that it can is not."""
+        assert refusals(CURRENT, max_rate_hz=9999.0) == [
+            "x.yaml: sample_rate_hz: must be <= 9999, the fastest that fake can keep, got 10000.0"
+        ]
+        checked(CURRENT, max_rate_hz=10_000.0)
+
+    def test_block(self) -> None:
+        """Blocks are for devices that have a FIFO."""
+        assert refusals(CURRENT, "block=2") == [
+            "x.yaml: block: must be 1: fake has no sample clock and FIFO of its own, got 2"
+        ]
+        checked(CURRENT, "block=2", buffered=True, fifo_depth=4)
+
+    def test_fifo(self) -> None:
+        """Two blocks must fit in the FIFO: one that plays and one that is sent."""
+        assert refusals(CURRENT, "block=33", buffered=True, fifo_depth=64) == [
+            "x.yaml: block: must be <= 32: 2 blocks must fit into the FIFO of fake, 64 samples, "
+            "got 33"
+        ]
+        checked(CURRENT, "block=32", buffered=True, fifo_depth=64)
+
+    def test_blocks_kept_in_the_fifo(self) -> None:
+        """All blocks that the device keeps in its FIFO must fit, and the one being sent."""
+        kept = {"buffered": True, "fifo_depth": 64, "latency_blocks": 7}
+        assert refusals(CURRENT, "block=9", **kept) == [
+            "x.yaml: block: must be <= 8: 8 blocks must fit into the FIFO of fake, 64 samples, "
+            "got 9"
+        ]
+        checked(CURRENT, "block=8", **kept)
+
+    @pytest.mark.parametrize("stroke", ["[-100.5, 60.0]", "[-75.0, 100.5]"])
+    def test_sensor(self, stroke: str) -> None:
+        """A stroke that the sensor can't see can't be watched."""
+        found = refusals(CURRENT, f"limits.stroke_um={stroke}")
+        assert len(found) == 1
+        assert found[0].startswith(
+            "x.yaml: limits.stroke_um: must lie within what the sensor can report, -100 to 100 µm"
+        )
+        checked(CURRENT, "limits.stroke_um=[-100.0, 100.0]")
+
+    def test_model_of_another_device(self) -> None:
+        """A model that gives volts is refused for a device driven with amperes."""
+        found = refusals(DISPLACEMENT, "limits.peak_current_a=8.0", model=piezo_ppi())
+        assert found[0] == (
+            "x.yaml: compensator.model: must give commands in A, what fake is driven with, got V"
+        )
+
+
+class TestAllAtOnce:
+    """Every reason is told in one go."""
+
+    def test_device_reference_and_command(self) -> None:
+        """Problems of the device, the reference and the command come together."""
+        found = refusals(
+            DISPLACEMENT,
+            "block=5",
+            "waveform.amplitude=100.0",
+            "limits.slew_a_per_s=1.0",
+            model=terfenol_rdpi(),
+            max_rate_hz=100.0,
+        )
+        keys = [each.split(": ")[1] for each in found]
+        assert keys == [
+            "sample_rate_hz",
+            "block",
+            "waveform",
+            "limits.peak_current_a",
+            "limits.slew_a_per_s",
+        ]
+
+    def test_device_and_a_waveform_that_can_not_be_built(self) -> None:
+        """Where there is no waveform, what is known of the device is still told."""
+        found = refusals(CURRENT, "block=5", "waveform.frequency_hz=6000.0")
+        assert found == [
+            "x.yaml: block: must be 1: fake has no sample clock and FIFO of its own, got 5",
+            "x.yaml: waveform: sine: every frequency must be below half the sample rate, 5000 Hz: "
+            "6000 Hz",
+        ]
+
+
+class TestWatchdog:
+    """Where the device's own watchdog would put the output."""
+
+    @pytest.mark.parametrize(
+        ("command", "reason", "safe"),
+        [
+            (0.0, "", 0.0),
+            (1e-10, "", 0.0),
+            (1.5, "", 1.5),
+            (1.5, "holds a load", 0.0),
+            (7.0, "at the limit", 0.0),
+            (-7.0, "at the limit", 0.0),
+        ],
+    )
+    def test_safe_value_or_a_reason(self, command: float, reason: str, safe: float) -> None:
+        """It goes where the run itself would go, or somebody says why not."""
+        found = checked(
+            CURRENT, f"safe={{value: {safe}}}", watchdog_command=command, watchdog_reason=reason
+        )
+        assert found.loaded.device.info.watchdog_command == command
+
+    @pytest.mark.parametrize(
+        ("command", "reason", "rule"),
+        [
+            (
+                1.5,
+                "",
+                "must be the safe value, 0 A, got 1.5 (or say in device.watchdog.reason why it is "
+                "not)",
+            ),
+            (
+                1e-6,
+                "",
+                "must be the safe value, 0 A, got 1e-06 (or say in device.watchdog.reason why"
+                " it is not)",
+            ),
+            (7.5, "holds a load", "must lie within the limits, -7 to 7 A, got 7.5"),
+        ],
+    )
+    def test_another_value_is_refused(self, command: float, reason: str, rule: str) -> None:
+        """Without a reason, and outside the limits with any."""
+        with pytest.raises(ConfigError) as caught:
+            checked(CURRENT, watchdog_command=command, watchdog_reason=reason)
+        (problem,) = caught.value.problems
+        assert str(problem).endswith(f"device.watchdog.safe_command: {rule}")
+
+    @pytest.mark.parametrize(
+        ("timeout_s", "arm_s", "refused"),
+        [(0.1, 0.0, False), (0.1, 0.0999, True), (0.00031, 0.0, False), (0.00029, 0.0, True)],
+    )
+    def test_a_time_that_the_start_cannot_keep_is_refused(self, timeout_s, arm_s, refused) -> None:
+        """Three ticks of 0.1 ms, and what arming takes on the line."""
+        watched = {"watchdog_command": 0.0, "watchdog_timeout_s": timeout_s, "arm_s": arm_s}
+        if not refused:
+            checked(CURRENT, **watched)
+            return
+        with pytest.raises(ConfigError) as caught:
+            checked(CURRENT, **watched)
+        assert [each.key for each in caught.value.problems] == ["device.watchdog.timeout_s"]
+
+
+def within(frequency_hz: float) -> HysteresisModel:
+    """Return a model that was identified at that frequency alone."""
+    known = IdentifiedRange(
+        peak_to_peak_um=(20.0, 20.0),
+        frequency_hz=(frequency_hz, frequency_hz),
+        speed_um_per_s=70.0 * frequency_hz,
+    )
+    return terfenol_rdpi().model_copy(update={"provenance": Provenance(identified_range=known)})
+
+
+def test_a_reference_beyond_what_the_model_was_identified_on_is_warned_or_refused() -> None:
+    """Warned where the error is not known, refused where it is known to be large."""
+    assert check(loaded(DISPLACEMENT, model=within(10.0))).warnings == ()
+    assert "repeats at 10 Hz" in check(loaded(DISPLACEMENT, model=within(30.0))).warnings[0]
+    faster = loaded(DISPLACEMENT, "waveform.frequency_hz=60", model=within(10.0))
+    with pytest.raises(ConfigError, match="waveform: the reference moves at about 60 Hz") as caught:
+        check(faster)
+    assert "identify the model on such motions too" in str(caught.value)
+
+
+def test_a_reference_that_begins_beside_the_rest_position_is_moved_not_hurried() -> None:
+    """At 0 A the actuator rests at 24.5 um: from 0 um the first command would be a step."""
+    moved = terfenol_rdpi().model_copy(update={"output_offset_um": 24.5})
+    with pytest.raises(ConfigError) as caught:
+        check(loaded(DISPLACEMENT, "waveform.offset=0", model=moved))
+    (problem,) = caught.value.problems
+    assert problem.key == "waveform"
+    assert "rests at 0 A, by the model 24.5 µm" in problem.rule
+    assert problem.value == "0 µm"
+    assert "slew" not in str(problem)
+    there = ("waveform.offset=24.5", "waveform.soft_start_s=0")
+    assert check(loaded(DISPLACEMENT, *there, model=moved))
+
+
+class Offset(HysteresisModel):
+    """Commands are 3 A above the reference, and rest comes slowly: a um more with each sample."""
+
+    @property
+    def operators(self) -> int:
+        """Return 1: a number that is added to the commands."""
+        return 1
+
+    def forward(self, sample_rate_hz: float) -> Operator:
+        """Return an operator that counts."""
+
+        def run(x: F64, memory: F64, out: F64) -> None:
+            out[:] = np.arange(x.size)
+
+        return Operator(run, self.operators)
+
+    def inverse(self, sample_rate_hz: float) -> Operator:
+        """Return the operator that adds."""
+
+        def run(x: F64, memory: F64, out: F64) -> None:
+            out[:] = x + 3.0 + memory[0]
+
+        return Operator(run, self.operators)
+
+
+FAST = ("limits.slew_a_per_s=400.0", "waveform.frequency_hz=20.0", "waveform.amplitude=3.5")
+
+
+@pytest.mark.parametrize(("rate_hz", "rests_um"), [(10_000.0, 999), (40.0, 3), (2.0, 0)])
+def test_where_it_rests_is_said_once_all_stages_do(rate_hz: float, rests_um: int) -> None:
+    """After a tenth of a second, and a sample at least."""
+    slow = (f"sample_rate_hz={rate_hz}", "limits.slew_a_per_s=1.0", "waveform.frequency_hz=0.01")
+    (found,) = refusals(DISPLACEMENT, *slow, "waveform.amplitude=1.0", model=Offset())
+    assert found.startswith(
+        "x.yaml: waveform: must begin where the actuator rests at 0 A, by the model "
+        f"{rests_um} µm, got 0 µm (its first command would step to 3 A at once"
+    )
+
+
+def test_at_the_safe_value_there_is_no_step() -> None:
+    """What is too fast further on is told then, and where it begins is not."""
+    (found,) = refusals(DISPLACEMENT, *FAST, "safe.value=3.0", model=Offset())
+    assert found.startswith("x.yaml: limits.slew_a_per_s: the run must change no faster than 400")
+
+
+def test_the_first_command_is_that_of_the_state_it_begins_with(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A run that goes on from another one makes no step from rest."""
+    there = InitialState(np.array([-3.0, 0.0]), 0.0, "before")
+    monkeypatch.setattr(module, "left_by_last_run", lambda *_: (there, "as left"))
+    made = loaded(DISPLACEMENT, *FAST, model=Offset())
+    compensator = CompensatorConfig(model="model.yaml", initial_state="last")
+    config = made.config.model_copy(update={"compensator": compensator})
+    with pytest.raises(ConfigError) as caught:
+        check(replace(made, config=config))
+    assert [problem.key for problem in caught.value.problems] == ["limits.slew_a_per_s"]
+
+
+def test_the_input_is_recorded_where_it_may_move() -> None:
+    """By feedback or adaptation alone, too."""
+    plain = checked(DISPLACEMENT, model=terfenol_rdpi())
+    for name in ("feedback", "adaptation"):
+        config = plain.loaded.config.model_copy(update={name: object()})
+        assert replace(plain, loaded=replace(plain.loaded, config=config)).records_input
+
+
+def test_the_coil_is_cold_unless_something_says_otherwise(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The last run by what has cooled since, or whoever asks; the hotter counts."""
+    assert checked(CURRENT).heat_a2 == 0.0
+    monkeypatch.setattr(module, "heat_before", lambda loaded, now_s: now_s)
+    monkeypatch.setattr(module, "time", SimpleNamespace(time=lambda: 7.0))
+    made = loaded(CURRENT)
+    assert check(made).heat_a2 == 7.0
+    assert check(made, now_s=5.0).heat_a2 == 5.0
+    assert check(made, heat_a2=9.0, now_s=5.0).heat_a2 == 9.0
+
+
+def test_a_run_before_that_says_nothing_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(path: Path, *_: object) -> InitialState:
+        raise DataError(f"{path}: nothing there")
+
+    monkeypatch.setattr(module, "initial_state_after", refuse)
+    made = loaded(DISPLACEMENT, model=terfenol_rdpi())
+    compensator = CompensatorConfig(model="model.yaml", initial_state="before.mcap")
+    config = made.config.model_copy(update={"compensator": compensator})
+    with pytest.raises(ConfigError) as caught:
+        check(replace(made, config=config))
+    (problem,) = caught.value.problems
+    assert problem.key == "compensator.initial_state"
+    assert problem.rule == "before.mcap: nothing there"
+
+
+def test_a_faster_change_further_on_is_what_is_told() -> None:
+    """Where to begin is no remedy then."""
+    moved = terfenol_rdpi().model_copy(update={"output_offset_um": 24.5})
+    holds = ", ".join(f"{{kind: hold, level: {um}, duration_s: 0.2}}" for um in (22.0, 18.0))
+    steps = f"waveform={{kind: sequence, unit: A, parts: [{holds}]}}"
+    (found,) = refusals(DISPLACEMENT, steps, "limits.slew_a_per_s=1000.0", model=moved)
+    assert found.startswith("x.yaml: limits.slew_a_per_s: the run must change no faster than")
+    a_third_more = steps.replace("22.0", "0.0").replace("18.0", "3.9")
+    (found,) = refusals(DISPLACEMENT, a_third_more, model=Offset())
+    assert found.startswith("x.yaml: limits.slew_a_per_s: the run must change no faster than")
+
+
+def learned(made: CheckedExperiment, waveform: Segment) -> Correction:
+    """Return a correction for one segment of an experiment that was checked without."""
+    wanted = signature(made.reference.values, waveform)
+    coefficients = np.array([0.0, 0.2 - 0.1j, 0.0, 0.05j])
+    cycle = LearnedCycle.from_coefficients(waveform.label, waveform.period, wanted, coefficients)
+    return Correction(
+        sample_rate_hz=made.reference.sample_rate_hz,
+        model_sha256=model_sha256(made.loaded.model),
+        cycles=(cycle,),
+    )
+
+
+def test_what_was_learned_is_added_to_the_compensator_s_input() -> None:
+    """And to nothing else; it is recorded then, as it is not the reference."""
+    plain = checked(DISPLACEMENT, model=terfenol_rdpi())
+    assert not plain.records_input
+    assert plain.begun.input_um is plain.reference.values
+    correction = learned(plain, plain.reference.segments[0])
+    found = check(replace(plain.loaded, correction=correction))
+    assert found.records_input
+    np.testing.assert_array_equal(found.reference.values, plain.reference.values)
+    added = found.begun.input_um - plain.reference.values
+    with_it = correction.added(plain.reference, plain.loaded.model)
+    np.testing.assert_array_equal(found.begun.input_um, with_it)
+    assert 0.1 < np.abs(added).max() < 1.0
+
+
+def test_what_was_learned_on_another_motion_is_refused() -> None:
+    plain = checked(DISPLACEMENT, model=terfenol_rdpi())
+    faster = checked(DISPLACEMENT, "waveform.frequency_hz=20", model=terfenol_rdpi())
+    correction = learned(plain, plain.reference.segments[0])
+    with pytest.raises(ConfigError) as caught:
+        check(replace(faster.loaded, correction=correction))
+    (problem,) = caught.value.problems
+    assert problem.key == "compensator.correction"
+    assert problem.hint == "learn again with 'hilctl learn', or take it out"
+
+
+def test_each_block_keeps_the_memory_and_the_command_before() -> None:
+    """So that a recording replays from any block on."""
+    model = terfenol_rdpi()
+    kept = model.inverse(10_000.0).state().size
+    assert checked(DISPLACEMENT, model=model).state_size == kept + 1
+    assert checked(CURRENT).state_size == 1
+
+
+def test_work_that_takes_long_is_told(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """By what is worked out of the waveform, not by what repeats."""
+    longer = "waveform.duration_s=300.0"
+    reference = checked(DISPLACEMENT, longer, model=terfenol_rdpi()).reference
+    samples = sum(part.stop - part.start for part in reference.telling)
+    assert any(part.start for part in reference.telling)
+    assert 1000 < samples < reference.values.size
+    monkeypatch.setattr(module, "_MANY", samples)
+    checked(DISPLACEMENT, longer, model=terfenol_rdpi())
+    assert not caplog.records
+    monkeypatch.setattr(module, "_MANY", samples - 1)
+    checked(DISPLACEMENT, longer, model=terfenol_rdpi())
+    assert [record.getMessage() for record in caplog.records] == [
+        f"the waveform does not repeat: {samples * 1e-6:.3g} million samples are worked out before "
+        "it starts"
+    ]
+
+
+def test_a_rest_before_the_waveform_does_not_make_the_last_run_forgotten(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A conditioning cycle does; a rest in which the offset is measured leaves things there."""
+    model = terfenol_rdpi()
+    there = InitialState(model.inverse(10_000.0).state(), 0.0, "before")
+    monkeypatch.setattr(module, "left_by_last_run", lambda *_: (there, "as left"))
+    made = loaded(DISPLACEMENT, model=model)
+    for named, run_id in (("last", "before"), ("rest", "")):
+        compensator = CompensatorConfig(model="model.yaml", initial_state=named, offset="measured")
+        config = made.config.model_copy(update={"compensator": compensator})
+        found = check(replace(made, config=config))
+        assert found.conditioning() is not None
+        assert found.begun.run_id == run_id
+
+
+DEMO = Path(__file__).parents[3] / "configs" / "demo.yaml"
+
+
+def warned(*settings, **info):
+    loaded = load_experiment(DEMO, settings)
+    return pace_warnings(loaded.config, replace(loaded.device.info, **info))
+
+
+@pytest.mark.parametrize(("block", "told"), [(4, True), (5, False)])
+def test_ticks_of_less_than_a_tenth_of_a_millisecond_are_told(block, told):
+    """The demo has 50 kHz."""
+    assert bool(warned(f"block={block}")) == told
+
+
+def test_the_text_says_what_to_do():
+    (text,) = warned("block=1")
+    assert text.startswith("sample_rate_hz: 50000 ticks per second: ")
+    assert "larger block" in text
+    (text,) = warned("block=1", buffered=False)
+    assert "lower rate" in text
+
+
+def test_a_device_that_keeps_the_pace_needs_no_timer():
+    assert warned("block=1", latency_blocks=2) == ()
+
+
+def test_a_check_tells():
+    settings = ["sample_rate_hz=20000", "block=1", "waveform.duration_s=1.0"]
+    checked = check(load_experiment(DEMO, settings))
+    assert any("ticks per second" in each for each in checked.warnings)

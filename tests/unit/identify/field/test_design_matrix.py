@@ -1,0 +1,107 @@
+"""What the fit takes plays and drags for is what the model makes of them."""
+
+import numpy as np
+import pytest
+
+from hilctl.identify.field.densities import Grid, table
+from hilctl.identify.field.design_matrix import (
+    bare_displacement,
+    corners,
+    needed_points,
+    swings,
+    turning_points,
+)
+from hilctl.identify.field.field_fits import FINER, tabled
+from hilctl.models.effective_field import FieldModel, OutputCurve
+
+GRID = Grid(np.array([0.0, 0.7, 2.0]), np.array([0.6, 2.5]), -6.0, 3.0, 4, 2)
+SLOPES = np.array(
+    [[2.0, 2.5, 3.0, 2.0], [0.5, 1.0, 1.0, 0.0], [0.0, 1.0, 2.0, 1.0], [1.0, 2.0, 2.0, 1.0],
+     [0.5, 3.0, 0.0, 1.0]]
+)  # fmt: skip
+
+
+def path() -> np.ndarray:
+    rng = np.random.default_rng(4)
+    t = np.linspace(0.0, 1.0, 600)
+    return 1.6 * sum(np.sin(2 * np.pi * f * t + rng.uniform(0, 6)) for f in (3.0, 7.0, 11.0)) * t
+
+
+def test_columns_times_slopes_are_the_model() -> None:
+    u = np.ascontiguousarray(path())
+    line = OutputCurve(operators_um=(-1.0, 1.0), displacement_um=(-1.0, 1.0))
+    slopes = (*tabled(SLOPES[:3]), *SLOPES[3:].tolist())
+    model = FieldModel(
+        thresholds=tuple(GRID.thresholds), lengths=tuple(GRID.lengths), lowest=GRID.lowest,
+        cell=GRID.piece / FINER, slopes=tuple(map(tuple, slopes)), curve=line,
+    )  # fmt: skip
+    # Without losses the field is the mean of the command over a sample: so feed what gives u.
+    command = np.empty_like(u)
+    before = u[0]
+    for k, now in enumerate(u):
+        command[k] = 0.5 * (now + before)
+        before = now
+    modelled = model.forward(1.0).process(command)
+    rows = np.arange(u.size)
+    columns = table([u], [rows], GRID)
+    given = columns @ SLOPES.ravel()
+    # The model's slopes are even in each of its cells, so that it is a line through the splines.
+    assert given == pytest.approx(modelled, abs=0.02)
+
+
+def test_turning_points_and_rows_are_enough_of_a_path() -> None:
+    u = np.ascontiguousarray(path())
+    kept = np.empty(u.size, dtype=np.int64)
+    kept = kept[: turning_points(u, 1.5, kept)].copy()
+    assert kept.size < u.size / 5
+    whole = table([u], [kept], GRID)
+    few = table([np.ascontiguousarray(u[kept])], [np.arange(kept.size)], GRID)
+    assert few == pytest.approx(whole, abs=0.02)
+
+
+def test_swings_go_from_turn_to_turn_and_small_ones_are_none() -> None:
+    y = np.array([0.0, -0.1, 0.2, 1.0, 0.9, 2.0, 1.9, 0.5, 0.6, -1.0, -0.9, 3.0])
+    out = np.empty(y.size)
+    swings(y, 0.3, out)
+    # From 0 up to 2 at sample 5, down to -1 at sample 9, and up to 3.
+    assert out.tolist() == [2.0] * 5 + [3.0] * 4 + [4.0] * 3
+
+
+def test_points_are_the_rows_and_all_turns() -> None:
+    u = np.array([0.0, 1.0, 2.0, 1.5, 1.0, 3.0, 4.0, 5.0, 6.0])
+    points, places = np.empty(9, dtype=np.int64), np.empty(3, dtype=np.int64)
+    count = needed_points(u, np.array([1, 4, 6]), points, places)
+    assert points[:count].tolist() == [0, 1, 2, 4, 6]
+    assert places.tolist() == [1, 3, 4]
+
+
+def test_straight_lines_between_corners_are_near_both_signals() -> None:
+    x, y = path(), np.cos(np.linspace(0.0, 40.0, 600))
+    kept = np.empty(600, dtype=np.int64)
+    kept = kept[: corners(np.ascontiguousarray(x), y, 0.2, 0.03, 2, 40, kept)].copy()
+    assert kept.size < 200
+    assert (kept % 2 == 0).all()
+    assert (kept[0], kept[-1]) == (0, 598)
+    assert np.diff(kept).min() >= 2
+    assert np.diff(kept).max() <= 40
+    every = np.arange(599)
+    # A line goes through its ends, which are themselves as far off as it is.
+    assert np.abs(np.interp(every, kept, x[kept]) - x[:599]).max() < 2.0 * 0.2
+    assert np.abs(np.interp(every, kept, y[kept]) - y[:599]).max() < 2.0 * 0.03
+
+
+def test_corners_of_one_signal_alone_are_kept() -> None:
+    still, edge = np.zeros(100), np.concatenate([np.zeros(50), np.arange(50.0)])
+    kept = np.empty(100, dtype=np.int64)
+    for x, y in ((still, edge), (edge, still)):
+        count = corners(x, y, 0.1, 0.1, 1, 1000, kept)
+        assert kept[:count].tolist() == [0, 50, 99]
+
+
+def test_what_comes_later_is_taken_between_samples() -> None:
+    derivatives = np.array([[0.0, 1.0, 4.0, 9.0], [0.0, 2.0, 4.0, 6.0], [2.0, 2.0, 2.0, 2.0]])
+    out = np.empty(3)
+    bare_displacement(derivatives, np.array([0, 1, 3]), 1.25, 0.5, 0.1, out)
+    whole = derivatives[0] + 0.5 * derivatives[1] + 0.1 * derivatives[2]
+    expected = [0.75 * whole[1] + 0.25 * whole[2], 0.75 * whole[2] + 0.25 * whole[3], whole[3]]
+    assert out == pytest.approx(expected)

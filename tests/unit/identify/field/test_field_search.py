@@ -1,0 +1,313 @@
+"""The search on a history of a small field model: what it finds, and what makes no difference."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from hilctl.base.types import F64
+from hilctl.identify.data.records import History
+from hilctl.identify.field import field_search
+from hilctl.identify.field.densities import Equations, Grid, outputs, solve, table
+from hilctl.identify.field.field_search import (
+    FINAL_ROWS,
+    LENGTHS,
+    MARGIN,
+    ROOM,
+    ROUNDS,
+    SEARCH_ROWS,
+    STAGES,
+    BareSignal,
+    FieldEnd,
+    FieldSearch,
+    JointRefinement,
+    Size,
+)
+from hilctl.identify.field.preprocess import Prepared
+from hilctl.identify.field.sampling import Rows
+from hilctl.identify.field.stages import HIGH, LOW, STEP, Stages, row
+from hilctl.models.effective_field import FieldLosses, FieldModel, OutputCurve
+from hilctl.models.mechanics import FirstMode
+from hilctl.models.staged import StagedModel
+
+RATE_HZ = 2000.0
+SIZE = Size(4, 1, 6, 5)
+LEAST = 0.05
+
+
+def made(command: F64) -> F64:
+    """Return what the known model does: float64[n], in um."""
+    hysteresis = FieldModel(
+        thresholds=(0.0, 1.0),
+        lengths=(1.5,),
+        lowest=-9.0,
+        cell=6.0,
+        slopes=((4.0, 5.0, 4.0), (1.0, 1.0, 0.5), (2.0, 3.0, 2.0)),
+        curve=OutputCurve(operators_um=(-60.0, 0.0, 60.0), displacement_um=(-50.0, 0.0, 45.0)),
+        losses=FieldLosses(field_s=5e-4),
+    )
+    structure = FirstMode(natural_hz=400.0, damping_ratio=0.2)
+    return StagedModel.around(hysteresis, structure=structure).forward(RATE_HZ).process(command)
+
+
+def data(unit: float = 1.0, um: float = 1.0, ignore: int = 50) -> Prepared:
+    """Return a history of the known model in other units of the command and the displacement."""
+    t, rng = np.arange(700) / RATE_HZ, np.random.default_rng(1)
+    wave = sum(np.sin(2.0 * np.pi * f * t + rng.uniform(0, 6)) for f in (7.0, 17.0, 31.0))
+    command = np.ascontiguousarray(6.0 * np.minimum(t / 0.02, 1.0) * wave / np.abs(wave).max())
+    record = History("random", unit * command, um * made(command), RATE_HZ, ignore)
+    return Prepared([record])
+
+
+@cache
+def found(unit: float = 1.0, um: float = 1.0) -> FieldEnd:
+    """Return what the search ends with."""
+    return FieldSearch(data(unit, um), SIZE, LEAST * um / unit).find(Stages(), lambda *_: None)
+
+
+def laid(size: Size = SIZE) -> FieldSearch:
+    """Return a search whose operators are laid over the data."""
+    out = FieldSearch(data(), size, LEAST)
+    out._lay(Stages(), size)
+    return out
+
+
+@pytest.mark.slow
+def test_the_data_are_met_and_what_is_late_in_all_is_found() -> None:
+    end = found()
+    known = end.known
+    assert np.std(end.weights.errors_um) < 0.005 * data().stroke_um
+    # A record as slow as this one leaves it open which of them it is.
+    late_s = known.lag_s + 2.0 * known.damping_ratio * known.radian_s + known.delay_s
+    assert late_s == pytest.approx(5e-4 + 2.0 * 0.2 / (2.0 * np.pi * 400.0), rel=0.5)
+    assert (end.weights.slopes >= 0.0).all()
+    assert (end.weights.slopes[0] >= LEAST).all()
+
+
+def test_the_size_is_what_was_asked_for() -> None:
+    end = found()
+    assert end.weights.slopes.shape == (SIZE.plays + SIZE.drags, SIZE.cells)
+    assert end.weights.curve.operators.size == SIZE.knots + 1
+    assert end.grid.thresholds.size == SIZE.plays
+    assert end.grid.lengths.size == SIZE.drags
+
+
+def test_units_make_no_difference() -> None:
+    one, other = found(), found(unit=4.0, um=2.0)
+    assert other.known.losses.field_s == pytest.approx(one.known.losses.field_s, rel=1e-3)
+    assert other.grid.thresholds == pytest.approx(4.0 * one.grid.thresholds, rel=1e-3)
+    assert other.grid.width == pytest.approx(4.0 * one.grid.width, rel=1e-3)
+    assert other.weights.slopes == pytest.approx(0.5 * one.weights.slopes, rel=0.01, abs=0.01)
+
+
+def test_progress_rises_below_1_and_names_each_round() -> None:
+    seen: list[tuple[float, str]] = []
+    FieldSearch(data(), Size(2, 0, 3, 3), LEAST).find(
+        Stages(), lambda part, what: seen.append((part, what))
+    )
+    parts = [part for part, _ in seen]
+    assert parts == sorted(set(parts))
+    assert 0.0 < parts[0] <= parts[-1] < 1.0
+    rounds = [f"round {i} of {ROUNDS}" for i in range(1, ROUNDS + 1)]
+    assert [what for _, what in seen] == rounds * (len(seen) // ROUNDS)
+
+
+def test_of_the_starts_the_one_with_the_least_error_is_followed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Whatever the order in which they are tried; none of the others leaves anything behind."""
+    with monkeypatch.context() as patch:
+        patch.setattr(field_search, "FIRST_LAGS", field_search.FIRST_LAGS[::-1])
+        end = found.__wrapped__()
+    assert end.known == found().known
+    assert np.array_equal(end.weights.slopes, found().weights.slopes)
+
+
+def test_a_search_that_goes_on_from_another_of_its_data_ends_no_worse() -> None:
+    """Of the same size at once where that one ended, of another from its stages."""
+    same = FieldSearch(data(), SIZE, LEAST).go_on(found())
+    spread = np.std(found().weights.errors_um)
+    assert np.std(same.weights.errors_um) < 1.1 * spread
+    more = FieldSearch(data(ignore=60), replace(SIZE, plays=6), LEAST).go_on(found())
+    assert more.grid.thresholds.size == 6
+    assert np.std(more.weights.errors_um) < 1.1 * spread
+    known = [end.known.losses.field_s for end in (found(), same, more)]
+    assert known == pytest.approx([known[0]] * 3, rel=0.2)
+
+
+def test_a_search_ends_within_its_bounds_though_it_starts_beyond() -> None:
+    job = laid()
+    x = row(HIGH) + 1.0
+    job._learn(row(Stages()), job._chosen())
+    ended, _ = job._polish(x, job._chosen())
+    assert (ended >= row(LOW)).all()
+    assert (ended <= row(HIGH)).all()
+    assert (ended != x).all()
+
+
+def test_cells_reach_beyond_the_effective_field_by_the_margin() -> None:
+    job = laid()
+    (u,), _ = job._signals(row(Stages()))
+    grid = job._laid()
+    assert grid.lowest == pytest.approx(u.min() - MARGIN * np.ptp(u), rel=1e-3)
+    highest = grid.lowest + grid.cells * grid.width
+    assert highest == pytest.approx(u.max() + MARGIN * np.ptp(u), rel=1e-3)
+    assert grid.lengths == pytest.approx([0.15 * 0.5 * np.ptp(u)], rel=1e-3)
+    assert grid.thresholds[0] == 0.0
+    steps = np.diff(grid.thresholds)
+    assert steps == pytest.approx(steps[0])
+    assert grid.thresholds[-1] < 0.5 * np.ptp(u)
+
+
+@pytest.mark.parametrize(("last", "part"), [(0, 1.2 * 1.0 / 8.0), (3, 1.2 * 4.0 / 8.0), (7, 1.0)])
+def test_thresholds_wider_than_what_has_weight_are_given_up(
+    last: int, part: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    size = Size(8, 1, 6, 5)
+    job = laid(size)
+    before, rows = job._laid().thresholds, job._chosen()
+    weights = job._solved(row(Stages()), rows)
+    slopes = np.where(np.arange(9)[:, None] <= last, np.ones((9, 6)), 0.0)
+    slopes[8] = 1.0
+    monkeypatch.setattr(job, "_solved", lambda *_: replace(weights, slopes=slopes))
+    job._learn(row(Stages()), rows)
+    job._lay(Stages(), size)
+    assert job._laid().thresholds == pytest.approx(part * before, rel=0.02)
+
+
+def test_the_last_fit_sees_more_of_a_path() -> None:
+    job = laid()
+    few, more = (job._chosen(most).scale.size for most in (SEARCH_ROWS, FINAL_ROWS))
+    assert few <= SEARCH_ROWS
+    assert few <= more <= FINAL_ROWS
+
+
+def test_errors_of_the_operators_are_brought_to_um_by_the_curve() -> None:
+    """Where it rises by 2 um an um, an error of the operators' is half of one of the output."""
+    job = laid()
+    two = Rows((np.array([1, 2]),), np.array([1.0, 3.0]))
+    assert job._scale(np.array([1.0, 2.0]), two).tolist() == [1.0, 3.0]
+    found_here = job._learn(row(Stages()), job._chosen())
+    curve = found_here.curve
+    middle = 0.5 * (curve.displacement_um[1:] + curve.displacement_um[:-1]) + found_here.offset_um
+    slopes = np.diff(curve.displacement_um) / np.diff(curve.operators)
+    alike = Rows((), np.ones(middle.size))
+    assert job._scale(middle, alike) == pytest.approx(slopes, rel=1e-6)
+
+
+def test_a_search_is_never_of_more_operators_than_were_asked_for() -> None:
+    assert Size(40, 3, 50, 60).coarse == Size(8, 3, 12, 16)
+    assert Size(4, 0, 6, 5).coarse == Size(4, 0, 6, 5)
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 5])
+def test_lengths_of_drags_rise_by_the_same_factor(count: int) -> None:
+    lengths = field_search._lengths(count)
+    assert len(lengths) == count
+    assert all(LENGTHS[0] - 1e-12 <= length <= LENGTHS[1] + 1e-12 for length in lengths)
+    if count > 1:
+        factors = np.divide(lengths[1:], lengths[:-1])
+        assert factors == pytest.approx((LENGTHS[1] / LENGTHS[0]) ** (1.0 / (count - 1)))
+
+
+def test_the_least_slope_of_the_first_line_holds_throughout_the_search() -> None:
+    job = FieldSearch(data(), SIZE, 20.0)
+    job._lay(Stages(), SIZE)
+    weights = job._solved(row(Stages()), job._chosen())
+    assert weights.slopes[0].min() >= 20.0
+
+
+TRUE_R = 0.85
+GRID = Grid(np.array([0.0, 0.7, 1.4]), np.empty(0), -4.0, 1.6, 5, 4)
+
+
+def path(gain: float = 1.0) -> F64:
+    t = np.linspace(0.0, 1.0, 900)
+    wave = np.sin(2 * np.pi * 5.0 * t) * (0.3 + 0.7 * t) + 0.3 * np.sin(2 * np.pi * 31.0 * t)
+    return np.ascontiguousarray(2.6 * gain * wave)
+
+
+KEPT = [np.arange(900)]
+
+
+def displacement_um() -> F64:
+    """Return what plays of no threshold and of the true one give along the path."""
+    true = Grid(np.array([0.0, TRUE_R]), np.empty(0), -4.0, 1.6, 5, 4)
+    return np.asarray(table([path()], KEPT, true) @ np.repeat([3.0, 2.0], 5))
+
+
+def test_a_threshold_goes_to_where_the_rods_yield() -> None:
+    y = displacement_um()
+    polish = JointRefinement(lambda _: BareSignal([path()], y, np.ones(y.size)), KEPT, GRID, LEAST)
+    x, grid = polish.follow(row(Stages()))
+    assert grid.thresholds[1] == pytest.approx(TRUE_R, abs=0.02)
+    assert x == pytest.approx(row(Stages()))  # nothing follows from them here, so they stay
+    before, after = (
+        np.std(solve(table([path()], KEPT, each), y, each, LEAST, np.ones(y.size)).errors_um)
+        for each in (GRID, grid)
+    )
+    assert after < 0.3 * before
+
+
+def test_thresholds_stay_in_order() -> None:
+    """Whatever would be best: none goes halfway to its neighbour."""
+    y = np.asarray(table([path()], KEPT, GRID)[:, 5:10].sum(axis=1) + 4.0 * np.sign(path()))
+    polish = JointRefinement(lambda _: BareSignal([path()], y, np.ones(y.size)), KEPT, GRID, LEAST)
+    _, grid = polish.follow(row(Stages()))
+    assert grid.thresholds[0] == 0.0
+    assert (np.abs(grid.thresholds - GRID.thresholds) <= ROOM * 0.7 + 1e-9).all()
+
+
+def test_a_stage_is_found_with_the_weights_free() -> None:
+    """The field's path is larger by what one stage is away from where it should be."""
+    y, first = displacement_um(), row(Stages())
+
+    def rows_of(stages: F64) -> BareSignal:
+        bent = path() + 0.4 * (stages[0] - 0.16) / row(STEP)[0] * np.sin(np.arange(900) / 40.0)
+        return BareSignal([np.ascontiguousarray(bent)], y, np.ones(y.size))
+
+    x, _ = JointRefinement(rows_of, KEPT, GRID, LEAST).follow(first)
+    assert x[0] == pytest.approx(0.16, abs=0.002)
+    assert (x >= row(LOW)).all()
+    assert (x <= row(HIGH)).all()
+    assert x.size == STAGES
+
+
+@pytest.mark.parametrize("lengths", [(), (0.6, 1.5)])
+def test_operators_of_known_weights_give_what_their_columns_do(lengths: tuple[float, ...]) -> None:
+    grid = replace(GRID, lengths=np.array(lengths))
+    slopes = np.random.default_rng(3).uniform(0.5, 2.0, (grid.lines, 5))
+    for gain in (1.0, 2.0):  # within the cells, and beyond them
+        given, _ = outputs([path(gain)] * 2, KEPT * 2, grid, slopes)
+        columns = table([path(gain)] * 2, KEPT * 2, grid)
+        assert given == pytest.approx(columns @ slopes.ravel(), abs=1e-9)
+
+
+def test_slopes_by_thresholds_are_differences() -> None:
+    slopes = np.random.default_rng(3).uniform(0.5, 2.0, (3, 5))
+    _, found = outputs([path()], KEPT, GRID, slopes)
+    for i in (1, 2):
+        moved = []
+        for change in (-1e-3, 1e-3):
+            thresholds = GRID.thresholds.copy()
+            thresholds[i] += change
+            grid = replace(GRID, thresholds=thresholds)
+            moved.append(table([path()], KEPT, grid) @ slopes.ravel())
+        rise = (moved[1] - moved[0]) / 2e-3
+        assert np.mean(np.abs(found[:, i - 1] - rise)) < 0.05 * np.mean(np.abs(rise))
+
+
+def test_what_free_weights_take_up_of_a_change_costs_nothing() -> None:
+    """A change along a column of a free weight leaves the sum as it is; another one does not."""
+    y = displacement_um() + np.random.default_rng(1).normal(0.0, 0.05, 900)
+    columns = table([path()], KEPT, GRID)
+    equations = Equations(columns, y, GRID, LEAST, np.ones(900))
+    weights = equations.solve()
+    here = weights.errors_of(columns @ weights.slopes.ravel(), y)
+    changes = np.stack([columns[:, 2], np.sign(path())], axis=1)
+    place = equations.place(here, changes)
+    total = np.sum((changes - changes.mean(axis=0)) ** 2, axis=0)
+    assert place.normal[0, 0] < 1e-2 * total[0]
+    assert place.normal[1, 1] > 0.05 * total[1]
+    assert place.squares == pytest.approx(equations.solve().squares, rel=0.1)

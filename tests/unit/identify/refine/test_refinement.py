@@ -1,0 +1,206 @@
+"""Refined models: better on what they have not seen, or not written."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilctl.base.errors import DataError, InputError
+from hilctl.identify.refine.refinement import (
+    STILL_S,
+    _history,
+    load_runs,
+    refine_files,
+    refine_runs,
+)
+from hilctl.models.model_file import dump_model, load_model
+from hilctl.models.refined import RefinedModel
+from hilctl.recording.reader import read
+from tests.published import piezo_ppi
+from tests.unit.identify.refine.conftest import (
+    OLD,
+    RATE_HZ,
+    actuator,
+    command,
+    five_runs,
+    history,
+)
+
+ROOT = Path(__file__).parents[4]
+GOLDEN = ROOT / "recordings" / "golden"
+OMEGA = ROOT / "configs" / "models" / "terfenol_omega.yaml"
+
+
+def missed_percent(model, truth, v):
+    """Rms error of a model on a command, of the peak-to-peak displacement."""
+    wanted = truth.forward(RATE_HZ).process(v)
+    error = model.forward(RATE_HZ).process(v) - wanted
+    return 100.0 * float(np.sqrt(np.mean(error**2)) / np.ptp(wanted))
+
+
+@pytest.fixture(scope="module")
+def found():
+    """Return what five runs make of the old model."""
+    return refine_runs(OLD, five_runs(), source="old.yaml")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("amplitude", [5.0, 3.0, 1.5])
+def test_error_on_unseen_references_is_far_less_than_half(old, found, amplitude):
+    v = command(77, amplitude)
+    assert found.better
+    assert missed_percent(found.model, actuator(), v) < 0.3 * missed_percent(old, actuator(), v)
+
+
+@pytest.mark.slow
+def test_small_runs_do_not_spoil_the_large_loop(old):
+    """Runs that move a tenth say nothing of what the whole stroke does."""
+    small = [history(OLD, i, amplitude=0.7, noise_um=0.1) for i in range(4)]
+    gain = [replace(run, displacement_um=0.97 * run.displacement_um) for run in small]
+    found = refine_runs(old, gain)
+    large = command(77, 6.5)
+    assert missed_percent(found.model, OLD, large) < 0.5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("drift_um", [0.0, 1.0])
+def test_creep_of_single_runs_is_not_learned_as_hysteresis(old, drift_um):
+    """Each run creeps by another amount; the model found is as good as without."""
+    runs = [
+        history(actuator(), i, drift_um=drift_um * (i - 2), amplitude=a)
+        for i, a in enumerate((6.5, 6.5, 4.0, 2.0, 5.0))
+    ]
+    found = refine_runs(old, runs)
+    v = command(77, 5.0)
+    assert found.choice.own == (drift_um > 0.0)
+    assert missed_percent(found.model, actuator(), v) < 0.4 * missed_percent(old, actuator(), v)
+
+
+@pytest.mark.slow
+def test_an_offset_becomes_the_models_own(old):
+    runs = [history(actuator(offset_um=4.0), i) for i in range(4)]
+    found = refine_runs(old, runs)
+    assert found.model.output_offset_um == pytest.approx(4.0, abs=0.3)
+
+
+@pytest.mark.slow
+def test_a_model_that_was_right_stays_as_it_is(old):
+    """Noise is nothing to learn, and the reason is given."""
+    found = refine_runs(old, [history(OLD, i, noise_um=0.05) for i in range(4)])
+    assert not found.better
+    assert str(found).startswith("no better than the old model, because")
+    assert "noise" in found.reasons[0]
+
+
+@pytest.mark.slow
+def test_refining_what_was_refined_goes_on_from_it(old, runs):
+    """The old operator is what the new one is held to where new runs say nothing."""
+    first = refine_runs(old, runs[:3]).model
+    again = refine_runs(first, [history(actuator(offset_um=1.0), i, amplitude=3.0)
+                                for i in range(20, 24)])  # fmt: skip
+    assert again.better
+    assert isinstance(again.model.base, type(old))
+    v = command(77, 5.0)
+    shifted = actuator(offset_um=1.0)
+    assert missed_percent(again.model, shifted, v) < 0.5 * missed_percent(old, shifted, v)
+
+
+@pytest.mark.slow
+def test_one_run_is_judged_by_its_end(old):
+    found = refine_runs(old, [history(actuator(), 1, seconds=2.0)])
+    assert found.better
+    assert len(found.choice.after.records) == 1
+    assert found.choice.after.records[0].ignore > 10_000
+
+
+@pytest.mark.slow
+def test_validation_runs_are_judged_and_not_fitted(old, runs):
+    found = refine_runs(old, runs[:3], runs[3:])
+    assert [record.label for record in found.choice.after.records] == ["run 3", "run 4"]
+    assert "run 3" not in found.model.provenance.source
+
+
+@pytest.mark.slow
+def test_provenance_says_what_it_was_refined_on(found):
+    found = found.model.provenance
+    assert found.source == ("old.yaml", "run 0", "run 1", "run 2", "run 3", "run 4")
+    assert "refined on 5 runs" in found.method
+    assert {"held_out_peak", "held_out_rms"} <= found.errors_percent.keys()
+    assert found.identified_range is not None
+
+
+def test_swapped_wires_are_refused(old, runs):
+    turned = [replace(run, displacement_um=-run.displacement_um) for run in runs]
+    with pytest.raises(InputError, match="swap the wires"):
+        refine_runs(old, turned)
+
+
+@pytest.mark.slow
+def test_files_in_a_better_model_file_out(tmp_path):
+    """A shipped model and a recording of it; what is written is what was found."""
+    output = tmp_path / "better.yaml"
+    found = refine_files(OMEGA, [GOLDEN / "terfenol_compensated.mcap",
+                                 GOLDEN / "terfenol_uncompensated.mcap"], output)  # fmt: skip
+    assert output.exists() == found.better
+    if found.better:
+        assert load_model(output) == found.model
+        assert isinstance(found.model, RefinedModel)
+
+
+@pytest.mark.slow
+def test_nothing_is_written_where_it_is_no_better(tmp_path, monkeypatch, old):
+    model, output = tmp_path / "old.yaml", tmp_path / "better.yaml"
+    model.write_text(dump_model(old))
+    right = [history(OLD, i, noise_um=0.05) for i in range(4)]
+    monkeypatch.setattr("hilctl.identify.refine.refinement.load_runs", lambda paths, model: right)
+    found = refine_files(model, [Path("a.mcap")] * 4, output)
+    assert not found.better
+    assert not output.exists()
+
+
+def test_a_file_that_exists_is_refused_before_anything_is_read(tmp_path):
+    output = tmp_path / "better.yaml"
+    output.write_text("mine")
+    with pytest.raises(InputError, match=r"better\.yaml"):
+        refine_files(tmp_path / "none.yaml", [], output)
+    assert output.read_text() == "mine"
+
+
+GOLDEN_runs = ROOT / "recordings" / "golden" / "terfenol_compensated.mcap"
+OMEGA_runs = load_model(ROOT / "configs" / "models" / "terfenol_omega.yaml")
+
+
+def test_a_run_from_rest_is_what_was_put_out_and_what_came():
+    (run,), recording = load_runs([GOLDEN_runs], OMEGA_runs), read(GOLDEN_runs)
+    assert run.ignore == 0
+    np.testing.assert_array_equal(run.command, recording.samples.command[: run.command.size])
+
+
+def test_a_run_that_goes_on_has_the_one_before_ahead_of_it():
+    """Not judged; without it, where the actuator stood could not be known."""
+    first = read(GOLDEN_runs)
+    later = replace(first, run={**first.run, "run_id": "b", "initial_state_run_id": "a"})
+    run = _history(later, {"a": first, "b": later})
+    still = round(STILL_S * first.sample_rate_hz)
+    assert run.ignore == first.samples.index.size + still
+    np.testing.assert_array_equal(run.command[: first.samples.index.size], first.samples.command)
+    assert (run.command[run.ignore - still : run.ignore] == first.samples.command[-1]).all()
+
+
+def test_a_run_that_goes_on_from_one_that_is_not_given_is_refused():
+    first = read(GOLDEN_runs)
+    later = replace(first, run={**first.run, "initial_state_run_id": "a"})
+    with pytest.raises(DataError, match="give that recording too"):
+        _history(later, {})
+
+
+def test_what_can_not_be_used_is_said(tmp_path):
+    copy = Path(shutil.copy(GOLDEN_runs, tmp_path / "run.mcap"))
+    with pytest.raises(InputError, match="named twice"):
+        load_runs([copy, copy], OMEGA_runs)
+    with pytest.raises(InputError, match="name recordings"):
+        load_runs([], OMEGA_runs)
+    with pytest.raises(DataError, match="was recorded in A, the model takes V"):
+        load_runs([copy], piezo_ppi())

@@ -1,0 +1,16 @@
+"""What a fit is asked: the least slope in the data's own measure."""
+
+import pytest
+
+from hilctl.identify.fit_api import FitJob
+from hilctl.identify.settings import FitSettings
+from hilctl.models.plays import PpiModel
+
+
+def test_the_least_slope_is_a_part_of_the_data_s_gain(data_of):
+    """Um per command unit: loops of 6 A and a straight line of 4 um/A."""
+    data = data_of(PpiModel(direct=4.0, weights=(), thresholds=()))
+    job = FitJob(data, FitSettings(kind="ppi", least_slope=0.05))
+    assert data.gain == pytest.approx(4.0, rel=1e-3)
+    assert job.least == pytest.approx(0.2, rel=1e-3)
+    assert job.run(abs, [-1, 2]) == [1, 2]

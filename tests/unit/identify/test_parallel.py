@@ -1,0 +1,117 @@
+"""Work shared out over processes or a cluster finds the same."""
+
+import importlib.util
+import os
+import threading
+from collections.abc import Callable
+
+import pytest
+
+from hilctl.base.errors import InputError
+from hilctl.identify.data.records import SteadyLoop
+from hilctl.identify.fit_model import fit_model
+from hilctl.identify.parallel import _threads, parallel_map, workers
+from hilctl.identify.settings import FitSettings
+from hilctl.models.integrated import exponential_integrated
+
+Loops = Callable[..., list[SteadyLoop]]
+GRID = [(a, f) for a in (2.0, 3.0, 6.0) for f in (10.0, 100.0, 250.0)]
+
+
+@pytest.fixture
+def loops(loops_of: Loops) -> list[SteadyLoop]:
+    omega = exponential_integrated(
+        alpha=0.9, gamma_s=2e-4, a_0=3.0, alpha_0=1.4, beta_0=0.3, g_0=1.0, alpha_1=0.08,
+        beta_1=0.15, d_p=8.0, alpha_2=0.1, beta_2=0.4, d_n=8.0, plays=6, deadbands_a_side=4,
+    )  # fmt: skip
+    return loops_of(omega, GRID)
+
+
+def test_threads_need_no_affinity(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only Linux says which CPUs a process may use."""
+    monkeypatch.delattr(os, "sched_getaffinity", raising=False)
+    _threads.cache_clear()
+    assert parallel_map(abs, [-1, -2]) == [1, 2]
+    _threads.cache_clear()
+
+
+def test_short_parts_run_beside_each_other_and_keep_their_order():
+    """All that a machine's cores take are under way at once; the first error is raised."""
+    cores = len(os.sched_getaffinity(0))
+    together = threading.Barrier(cores)
+
+    def met(part: int) -> int:
+        together.wait(timeout=60.0)
+        return 2 * part
+
+    assert parallel_map(met, range(cores)) == [2 * part for part in range(cores)]
+    with pytest.raises(ZeroDivisionError):
+        parallel_map(lambda part: 1 // part, [1, 0])
+
+
+def test_fits_that_nobody_waits_for_end():
+    """A Ctrl-C, or the error of one of them, need not wait until all others are done."""
+    begun, ended = threading.Event(), []
+
+    def fit(number: int) -> None:
+        if number:
+            assert begun.wait(timeout=60.0)
+            raise KeyboardInterrupt
+        begun.set()
+        try:
+            while True:  # the test's time limit ends it where nothing else does
+                parallel_map(abs, [number])
+        finally:
+            ended.append(number)
+
+    def run() -> None:
+        with workers("threads") as each:
+            each(fit, [1, 0])
+
+    with pytest.raises(KeyboardInterrupt):
+        run()
+    assert ended == [0]
+    assert parallel_map(abs, [-2, 3]) == [2, 3]
+
+
+@pytest.mark.parametrize("scheduler", ["threads", "processes"])
+@pytest.mark.slow
+def test_workers_find_the_same(loops: list[SteadyLoop], scheduler: str) -> None:
+    """Starts followed on other workers end at the same bits."""
+    settings = FitSettings(kind="integrated", weights="free", starts=3)
+    alone = fit_model(loops[:4], settings, lambda: 0.0)
+    with workers(scheduler) as run:
+        found = fit_model(loops[:4], settings, lambda: 0.0, run=run)
+    assert found.model == alone.model
+    assert found.starts == alone.starts
+
+
+@pytest.mark.skipif(
+    importlib.util.find_spec("distributed") is None,
+    reason="Dask is not installed: pip install 'hilctl[scale]'",
+)
+@pytest.mark.filterwarnings("ignore")
+def test_dask_cluster_finds_the_same(loops: list[SteadyLoop]) -> None:
+    """The same on a Dask cluster, by its scheduler's address."""
+    from distributed import LocalCluster
+
+    settings = FitSettings(kind="integrated", weights="free", starts=3)
+    alone = fit_model(loops[:4], settings, lambda: 0.0)
+    with (
+        LocalCluster(
+            n_workers=1, threads_per_worker=1, processes=False, protocol="tcp",
+            dashboard_address=None,
+        ) as cluster,
+        workers(cluster.scheduler_address) as run,
+    ):  # fmt: skip
+        found = fit_model(loops[:4], settings, lambda: 0.0, run=run)
+    assert found.model == alone.model
+
+
+def test_unknown_schedulers_are_refused() -> None:
+    """A scheduler that is neither known nor an address is refused with what there is."""
+    with (
+        pytest.raises(InputError, match=r"none, threads, processes or an address .*: 'four'"),
+        workers("four"),
+    ):
+        pass

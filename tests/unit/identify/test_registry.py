@@ -1,0 +1,123 @@
+"""Every kind of model has one way to be found, and that way gives that kind.
+
+A PPI is identified on measured data of a piezo micromanipulator, and tried on other data of it.
+Data: github.com/yan9a/DiscreteBacklashOperator, MIT licence. Drive in V, capacitive sensor, 200 Hz.
+Figures are percent of the output range of the judged rows.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hilctl.base.errors import InputError
+from hilctl.identify.data.cycles import find_cycles
+from hilctl.identify.data.data_files import read_table
+from hilctl.identify.data.records import History
+from hilctl.identify.evaluation import judge
+from hilctl.identify.fit_api import FitJob
+from hilctl.identify.fit_model import FittedModel, fit_model
+from hilctl.identify.registry import CATALOGUE, entry
+from hilctl.identify.settings import FitSettings
+from hilctl.models.plays import PpiModel
+
+QUICK = ["straight", "duhem", "preisach", "krasnoselskii_pokrovskii", "ppi"]
+TRUTH = PpiModel(direct=4.0, weights=(1.0, 2.0), thresholds=(0.5, 1.5))
+
+
+@pytest.mark.parametrize("kind", [kind for kind in CATALOGUE if kind in QUICK])
+def test_what_is_found_is_of_the_kind_that_was_asked_for(data_of, kind):
+    """A straight line is a PPI without plays."""
+    name, known = entry(kind)
+    found = known.fit(FitJob(data_of(TRUTH), FitSettings(kind=name)))
+    assert found.model.kind == ("ppi" if kind == "straight" else kind)
+    assert found.numbers >= 1
+
+
+def test_a_slip_of_the_finger_is_answered_with_the_nearest_kind():
+    with pytest.raises(InputError, match=r"unknown kind of model 'duhm'.*duhem"):
+        entry("duhm")
+
+
+def test_no_two_kinds_have_one_title():
+    assert len({each.title for each in CATALOGUE.values()}) == len(CATALOGUE)
+
+
+FOLDER = Path(__file__).resolve().parents[5] / "shared" / "data" / "yan9a_DBO"
+START_TRANSIENT = 500  # rows of the model file; the test file settles after 600
+RATE_HZ = 200.0
+
+pytestmark = [
+    pytest.mark.data,
+    pytest.mark.skipif(not FOLDER.is_dir(), reason=f"measured piezo data not at {FOLDER}"),
+]
+
+
+@pytest.fixture(scope="module")
+def model_file() -> History:
+    path = FOLDER / "Model_Vi_Do.dat"
+    return read_table(path, 1, 5, rate_hz=RATE_HZ, ignore=START_TRANSIENT)
+
+
+@pytest.fixture(scope="module")
+def test_file() -> History:
+    return read_table(FOLDER / "Test_Vi_Do_Di.dat", 1, 5, rate_hz=RATE_HZ, ignore=600)
+
+
+def piezo_fit(history: History, **choices: Any) -> FittedModel:
+    settings = FitSettings(
+        kind="ppi",
+        plays=25,
+        weights="free",
+        layout="midpoint",
+        offset=True,
+        starts=2,
+        **choices,
+    )
+    return fit_model([history], settings, lambda: 0.0, unit="V")
+
+
+def test_model_and_test_file_within_the_published_baseline(
+    model_file: History, test_file: History
+) -> None:
+    """With the sensor's lag of 2 samples taken out, both files are met within the baselines.
+
+    The drift of the first seconds sets the peak on the model file; the goal of 2 % takes it down.
+    """
+    found = piezo_fit(model_file.without_lag(2), peak_goal_percent=2.0)
+    assert found.peak_percent <= 2.0
+    assert found.rms_percent <= 0.75
+    tried = judge(found.model, [test_file.without_lag(2)])
+    assert tried.peak_percent <= 6.2
+    assert tried.rms_percent <= 1.33
+    assert min(found.model.weights) >= 0.0
+    assert found.model.direct > 0.0
+
+
+@pytest.mark.parametrize(
+    ("lag_samples", "own", "other"), [(0, (2.3, 0.76), (4.6, 1.75)), (1, (2.25, 0.75), (5.1, 1.15))]
+)
+def test_plain_least_squares_at_smaller_lags(
+    model_file: History,
+    test_file: History,
+    lag_samples: int,
+    own: tuple[float, float],
+    other: tuple[float, float],
+) -> None:
+    """Without a goal for the peak, and with less of the lag taken out, errors stay near these."""
+    found = piezo_fit(model_file.without_lag(lag_samples))
+    assert (found.peak_percent, found.rms_percent) <= own
+    assert found.rms_percent <= own[1]
+    tried = judge(found.model, [test_file.without_lag(lag_samples)])
+    assert tried.peak_percent <= other[0]
+    assert tried.rms_percent <= other[1]
+
+
+def test_published_weights_describe_it_too(model_file: History) -> None:
+    """Ten plays with exponential weights (3.25, 3.26) reach 2.8 % peak on the averaged cycle."""
+    loop = find_cycles(model_file.without_lag(1))
+    assert loop.frequency_hz == pytest.approx(1.0, rel=1e-5)
+    settings = FitSettings(kind="ppi", offset=True, starts=3)
+    found = fit_model([loop], settings, lambda: 0.0, unit="V")
+    assert found.peak_percent <= 2.8
+    assert set(found.parameters) == {"sigma", "alpha", "beta", "p_0", "output_offset_um"}

@@ -1,0 +1,173 @@
+"""Learning on plants made of numbers: it converges, stops, and backs off."""
+
+import numpy as np
+import pytest
+
+from hilctl.ilc.cycle import CycleScore
+from hilctl.ilc.response import Response
+from hilctl.ilc.update import FIRST_GAIN, IlcState, begin, learn, refused
+
+RATE_HZ = 50_000.0
+STEP_HZ = 100.0
+HARMONICS = 60
+FREQUENCY = np.arange(HARMONICS + 1) * STEP_HZ
+NOISE_UM = 2e-4
+RESONANT = Response(1.0, 2.0 / RATE_HZ, 1.0 / (2.0 * np.pi * 2300.0) ** 2, 0.12)
+
+
+class Plant:
+    """Answers a correction harmonic by harmonic, with some of it in the neighbours."""
+
+    def __init__(self, response: Response, coupling: float = 0.0, seed: int = 1) -> None:
+        self._random = np.random.default_rng(seed)
+        decay = np.maximum(1.0, np.arange(HARMONICS + 1)) ** -2.0
+        phase = np.exp(2j * np.pi * self._random.random(HARMONICS + 1))
+        self._start = decay * phase
+        self._start[0] = 0.3
+        self._answer = response.at(FREQUENCY)
+        self._coupling = coupling
+        self.corrections: list[np.ndarray] = []
+
+    def run(self, correction: np.ndarray) -> CycleScore:
+        self.corrections.append(correction)
+        beside = self._coupling * (np.roll(correction, 2) + np.roll(correction, -2))
+        answered = self._answer * (correction + beside)
+        normal = self._random.standard_normal((2, HARMONICS + 1)) / np.sqrt(2.0)
+        noise = NOISE_UM * (normal[0] + 1j * normal[1])
+        error = self._start + answered + noise
+        error[0] = error[0].real
+        cycle = np.fft.irfft(np.append(error, np.zeros(1000)) * 2120, 2120)
+        return CycleScore(
+            harmonics_um=error,
+            noise_um=np.full(HARMONICS + 1, NOISE_UM),
+            step_hz=STEP_HZ,
+            cycles=16,
+            peak_um=float(np.abs(cycle).max()),
+            rms_um=float(np.sqrt(np.mean(cycle**2))),
+            peak_to_peak_um=100.0,
+            floor_um=4.0 * NOISE_UM * np.sqrt(2.0 * HARMONICS),
+            strongest_hz=STEP_HZ,
+            answer=complex(self._answer[1]),
+        )
+
+
+def begun() -> IlcState:
+    return begin(RATE_HZ, np.zeros(HARMONICS + 1, dtype=complex), 6000.0)
+
+
+def learned(plant: Plant, cycles: int = 20) -> IlcState:
+    state = begun()
+    for _ in range(cycles + 1):
+        state = learn(state, plant.run(state.next_um))
+        if state.done:
+            break
+    return state
+
+
+def peaks(state: IlcState) -> list[float]:
+    return [trial.error.peak_um for trial in state.trials]
+
+
+@pytest.mark.parametrize(
+    "response",
+    [
+        pytest.param(Response(), id="exact", marks=pytest.mark.slow),
+        pytest.param(Response(0.8, 5.0 / RATE_HZ), id="late", marks=pytest.mark.slow),
+        pytest.param(RESONANT, id="resonant"),
+        pytest.param(
+            Response(1.1, 3.0 / RATE_HZ, 1.0 / (2.0 * np.pi * 480.0) ** 2, 0.12),
+            id="loaded",
+            marks=pytest.mark.slow,
+        ),
+    ],
+)
+@pytest.mark.parametrize(
+    "coupling", [pytest.param(0.0, marks=[pytest.mark.slow, pytest.mark.long]), 0.15]
+)
+def test_the_error_goes_to_the_noise_floor(response, coupling):
+    """Delay, resonance and hysteresis between harmonics leave less than 2 % within 20 runs."""
+    state = learned(Plant(response, coupling))
+    assert min(peaks(state)) < 0.02 * peaks(state)[0]
+    assert max(peaks(state)) == peaks(state)[0]
+
+
+@pytest.mark.slow
+def test_it_stops_at_the_noise_floor():
+    """Once the error is that of the noise, there is nothing to learn."""
+    state = learned(Plant(Response()))
+    assert state.done == "at the noise floor"
+    assert state.best.error.peak_um <= 1.2 * state.best.error.floor_um
+    assert len(state.trials) < 15
+
+
+def test_noise_alone_is_not_learned():
+    """Where the error is noise, the correction stays nearly empty."""
+    plant = Plant(Response())
+    plant._start[:] = 0.0
+    state = learn(begun(), plant.run(begun().next_um))
+    assert np.abs(state.next_um).max() < NOISE_UM
+
+
+def test_the_first_step_reaches_no_further_than_the_phase_is_known():
+    """30 degrees of what the first answer says: 50 samples late is 30 degrees at 83 Hz."""
+    quick, late = begun(), begun()
+    quick = learn(quick, Plant(Response()).run(quick.next_um))
+    late = learn(late, Plant(Response(1.0, 50.0 / RATE_HZ)).run(late.next_um))
+    assert quick.reach_hz == pytest.approx(500.0)
+    assert late.reach_hz == pytest.approx(STEP_HZ)
+
+
+def test_the_reach_grows_while_the_error_falls():
+    """Harmonics beyond the reach are not touched, and the reach moves on."""
+    plant = Plant(Response())
+    state = learn(begun(), plant.run(begun().next_um))
+    beyond = 1.25 * state.reach_hz < FREQUENCY
+    assert not state.next_um[beyond].any()
+    further = learn(state, plant.run(state.next_um))
+    assert further.reach_hz > state.reach_hz
+
+
+@pytest.mark.slow
+def test_it_backs_off_to_the_best_where_the_error_grows():
+    """Half the gain, and the next correction starts from the best one again."""
+    plant = Plant(Response())
+    state = learn(begun(), plant.run(begun().next_um))
+    state = learn(state, plant.run(state.next_um))
+    best = state.best
+    worse = plant.run(state.next_um + 0.5)
+    after = learn(state, worse)
+    assert after.best is best
+    assert after.gain == pytest.approx(0.5 * state.gain)
+    assert abs(after.next_um[0] - best.correction_um[0]) < 0.1
+
+
+@pytest.mark.slow
+def test_a_plant_that_turns_the_wrong_way_does_not_run_away():
+    """Where the answer has the wrong sign above 1 kHz, the error never grows far beyond its start.
+
+    It ends with a correction no worse than none.
+    """
+    plant = Plant(Response())
+    plant._answer = np.where(FREQUENCY > 1000.0, -1.0, 1.0) * plant._answer
+    state = learned(plant)
+    assert max(peaks(state)) < 1.2 * peaks(state)[0]
+    assert state.best.error.peak_um < 0.5 * peaks(state)[0]
+
+
+def test_a_refused_correction_is_tried_again_with_less():
+    """Half the gain, less reach, from the best so far; before the first run nothing changes."""
+    state = learn(begun(), Plant(Response()).run(begun().next_um))
+    smaller = refused(state)
+    assert smaller.gain == pytest.approx(0.5 * FIRST_GAIN)
+    assert smaller.reach_hz < state.reach_hz
+    assert np.abs(smaller.next_um).sum() < np.abs(state.next_um).sum()
+    assert refused(begun()).gain == FIRST_GAIN
+
+
+def test_it_gives_up_where_nothing_helps():
+    """An error that no correction touches ends the learning after some runs."""
+    plant = Plant(Response())
+    plant._answer = 0.0 * plant._answer
+    state = learned(plant)
+    assert state.done == "no better in 5 runs"
+    assert len(state.trials) == 6

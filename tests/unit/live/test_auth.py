@@ -1,0 +1,83 @@
+"""Who is let in."""
+
+import pytest
+from websockets.datastructures import Headers
+
+from hilctl.live.auth import PROTOCOL, Admission, PendingConnections
+
+TOKEN = "0123456789abcdef" * 2
+PORT = 4321
+HOST, ORIGIN = f"127.0.0.1:{PORT}", f"http://127.0.0.1:{PORT}"
+OFFER = f"{PROTOCOL}, token.{TOKEN}"
+
+
+def refusal(upgrade=True, **given):
+    headers = Headers()
+    for name, values in given.items():
+        for value in [values] if isinstance(values, str) else values:
+            headers[name.replace("_", "-")] = value
+    found = Admission(PORT, TOKEN).refusal(headers, upgrade=upgrade)
+    return found and found[0].value
+
+
+@pytest.mark.parametrize("name", ["127.0.0.1", "[::1]", "localhost"])
+def test_a_page_of_this_server_with_the_token_is_let_in(name):
+    host = f"{name}:{PORT}"
+    assert not refusal(Host=host, Origin=f"http://{host}", Sec_WebSocket_Protocol=OFFER)
+    assert not refusal(upgrade=False, Host=host)
+
+
+@pytest.mark.parametrize(
+    "host", ["evil.example", f"evil.example:{PORT}", "127.0.0.1", "127.0.0.1:1", [HOST, HOST], []]
+)
+@pytest.mark.parametrize("upgrade", [True, False])
+def test_a_foreign_host_is_refused(host, upgrade):
+    """A name that somebody else's server has made point here, above all."""
+    assert refusal(upgrade, Host=host, Origin=ORIGIN, Sec_WebSocket_Protocol=OFFER) == 421
+
+
+@pytest.mark.parametrize(
+    "origin",
+    [
+        "http://evil.example",
+        "null",
+        f"https://127.0.0.1:{PORT}",
+        "http://127.0.0.1:1",
+        [],
+        [ORIGIN] * 2,
+    ],
+)
+def test_a_foreign_origin_is_refused(origin):
+    assert refusal(Host=HOST, Origin=origin, Sec_WebSocket_Protocol=OFFER) == 403
+
+
+def test_a_foreign_page_gets_no_file_either():
+    assert refusal(upgrade=False, Host=HOST, Origin="http://evil.example") == 403
+
+
+@pytest.mark.parametrize(
+    "offered",
+    [
+        [],
+        PROTOCOL,
+        f"{PROTOCOL}, token.",
+        f"{PROTOCOL}, token.{TOKEN[:-1]}",
+        f"{PROTOCOL}, token.{TOKEN}0",
+        f"{PROTOCOL}, token.{'0' * 32}, token.{TOKEN}",
+        f"{PROTOCOL}, {TOKEN}",
+        "a b, ;",
+    ],
+)
+def test_without_the_token_nobody_is(offered):
+    assert refusal(Host=HOST, Origin=ORIGIN, Sec_WebSocket_Protocol=offered) == 401
+
+
+def test_the_oldest_that_waits_gives_way():
+    pending, cut = PendingConnections(2), []
+    for name in "abc":
+        pending.add(name, lambda name=name: cut.append(name))
+    assert cut == ["a"]
+    pending.remove("b")
+    pending.remove("x")
+    pending.add("d", lambda: cut.append("d"))
+    assert (cut, len(pending)) == (["a"], 2)

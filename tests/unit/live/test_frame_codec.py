@@ -1,0 +1,102 @@
+"""A frame, taken apart as the page does."""
+
+import json
+import struct
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from hilctl.base.events import Event
+from hilctl.base.segments import Segment
+from hilctl.live.frame_codec import frame_of, frames_of, nearest_window_s
+from hilctl.live.scope import Buckets, Scope, ScopeWindow
+from hilctl.live.signals import ROW, SIGNALS, Traces
+from tests.fakes import SteppingClock
+
+
+@pytest.fixture
+def scope():
+    made = Scope(1000.0, [Segment("sine", 0, 9000, 0, 9000, 50.0)], "reference")
+    values = np.tile(np.arange(600.0), (len(SIGNALS), 1))
+    values[ROW["measured"]] = np.nan
+    made.add(Traces(np.arange(600), values, np.zeros(600, dtype=np.uint32)))
+    return made
+
+
+def taken_apart(frame):
+    (size,) = struct.unpack_from("<I", frame)
+    header = json.loads(frame[4 : 4 + size])
+    values = np.frombuffer(frame, "<f4", offset=4 + size)
+    n, rows = header["n"], header["signals"] * header["n"]
+    low, high = values[n : n + rows], values[n + rows : n + 2 * rows]
+    loops = values[n + 2 * rows :].reshape(2, header["loop"])
+    return header, values[:n], low.reshape(-1, n), high.reshape(-1, n), loops
+
+
+def test_a_frame_holds_the_window_and_the_loops(scope):
+    frame = frame_of(scope, "cycle", 2.0)
+    header, t_s, low, high, loops = taken_apart(frame)
+    assert header == {"mode": "cycle", "n": 100, "signals": 6, "loop": 300, "cycle": 50}
+    assert t_s == pytest.approx(np.arange(100) / 1000.0)
+    assert low[ROW["error"]].tolist() == high[ROW["error"]].tolist() == list(range(500, 600))
+    assert np.isnan(low[ROW["measured"]]).all()
+    assert loops[0].tolist() == list(range(300, 600))
+    assert len(frame) % 4 == 0
+
+
+def test_what_has_no_cycle_rolls(scope):
+    header, t_s, *_ = taken_apart(frame_of(scope, "roll", 0.1))
+    assert (header["mode"], t_s[-1], t_s.size) == ("roll", 0.0, 100)
+    empty = Scope(1000.0, [], "reference")
+    assert taken_apart(frame_of(empty, "cycle", 0.1))[0]["mode"] == "roll"
+
+
+@pytest.mark.parametrize(
+    ("wanted_s", "given_s"), [(2.0, 2.0), (1e9, 600.0), (1e-9, 0.02), (3, 2.0)]
+)
+def test_a_window_is_one_of_those_there_are(wanted_s, given_s):
+    assert nearest_window_s(wanted_s) == given_s
+
+
+@pytest.fixture
+def feed():
+    """A run that is over at its fourth look, with one event at each."""
+    values = np.arange(3.0 * len(SIGNALS)).reshape(len(SIGNALS), 3)
+    looked = []
+    made = SimpleNamespace(ended=False, looked=looked, windows=[])
+
+    def poll(now_s):
+        looked.append(now_s)
+        made.ended = len(looked) == 4
+
+    def rolling(window_s):
+        made.windows.append(window_s)
+        return ScopeWindow(np.array([-2.0, -1.0, 0.0]), Buckets(values, values + 1.0, values))
+
+    made.poll, made.scope = poll, SimpleNamespace(rolling=rolling)
+    made.status = lambda: {"t_s": looked[-1]}
+    made.events_since = lambda seen: (
+        [Event(k, "info", "mark", "") for k in range(seen, len(looked))],
+        len(looked),
+    )
+    return made
+
+
+def test_frames_come_at_their_pace_until_the_run_is_over(feed):
+    clock, slept = SteppingClock(), []
+
+    def sleep(seconds):
+        slept.append(seconds)
+        clock.now += seconds
+
+    frames = []
+    for frame in frames_of(feed, 0.25, 0.4, clock, sleep):
+        frames.append(frame)
+        clock.now += 0.1 if len(frames) != 2 else 1.0
+    assert feed.looked == pytest.approx([0.0, 0.25, 1.25, 1.5])
+    assert slept == pytest.approx([0.15, 0.0, 0.15])
+    assert [[event.sample for event in frame.events] for frame in frames] == [[0], [1], [2], [3]]
+    assert {*feed.windows} == {0.5}
+    assert frames[0].low["displacement"].tolist() == [3.0, 4.0, 5.0]
+    assert frames[0].high["displacement"].tolist() == [4.0, 5.0, 6.0]

@@ -1,0 +1,70 @@
+"""What is left to each limit."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilctl.live.limit_usage import Gauge, Headroom
+from hilctl.live.signals import ROW, SIGNALS, Traces
+from hilctl.run.metadata import RunDescription
+from hilctl.run.start import checked_experiment
+
+DEMO = Path(__file__).parents[3] / "configs" / "demo.yaml"
+
+
+@pytest.fixture(scope="module")
+def description():
+    more = (
+        "limits.rms_current_a=5",
+        "limits.thermal_time_constant_s=10",
+        "limits.tracking_error_um=8",
+    )
+    return RunDescription.of(checked_experiment(DEMO, more))
+
+
+def traces(start, **rows):
+    size = len(next(iter(rows.values())))
+    values = np.full((len(SIGNALS), size), np.nan)
+    for name, row in rows.items():
+        values[ROW[name]] = row
+    return Traces(np.arange(start, start + size), values, np.zeros(size, dtype=np.uint32))
+
+
+def used(headroom, late_s=0.0):
+    return {gauge.name: gauge.used for gauge in headroom.gauges(late_s)}
+
+
+def test_each_limit_has_its_part_used(description):
+    headroom = Headroom(description)
+    headroom.add(traces(0, command=[0.0, 0.1], displacement=[0.0, 26.25], error=[1.0, -4.0]))
+    headroom.add(traces(2, command=[0.3], displacement=[0.0], error=[0.0]))
+    found = used(headroom, 0.25)
+    assert found["command"] == pytest.approx(0.3 / 7.07)
+    assert found["slew"] == pytest.approx(0.2 * 50000 / 20000)  # from one look to the next
+    assert found["displacement"] == pytest.approx((26.25 + 7.5) / 67.5)
+    assert found["tracking error"] == 0.5
+    assert found["late tick"] == 0.25
+    assert "measured - command" not in found
+
+
+def test_the_most_is_held_for_a_second_and_then_forgotten(description):
+    headroom = Headroom(description)
+    headroom.add(traces(0, command=[7.07]))
+    headroom.add(traces(30_000, command=[1.0]))
+    assert used(headroom)["command"] == 1.0
+    headroom.add(traces(60_000, command=[1.0]))
+    assert used(headroom)["command"] == pytest.approx(1.0 / 7.07)
+
+
+def test_the_coil_warms_as_the_interlock_has_it(description):
+    headroom = Headroom(description)
+    for start in range(0, 500_000, 50_000):  # one time constant
+        headroom.add(traces(start, command=np.full(50_000, 5.0)))
+    assert used(headroom)["coil heat"] == pytest.approx(math.sqrt(1 - math.exp(-1)), rel=1e-6)
+
+
+@pytest.mark.parametrize(("part", "level"), [(0.5, "info"), (0.81, "warning"), (0.96, "error")])
+def test_a_gauge_says_how_much_it_should_worry(part, level):
+    assert Gauge("slew", part, part, 1.0, "A/s").level == level

@@ -1,0 +1,69 @@
+"""Running figures, by those of a report."""
+
+import numpy as np
+import pytest
+
+from hilctl.base.samples import Flag
+from hilctl.base.segments import Segment
+from hilctl.live.live_metrics import RunningFigures
+from hilctl.live.signals import ROW, SIGNALS, Traces
+from hilctl.signals.cycle_metrics import peak_hysteresis_percent
+
+RATE, PERIOD = 1000.0, 100.0
+SEGMENT = Segment("sine", 30, 100_000, 30, 100_000, PERIOD)
+
+
+def loop(start, stop, lag=0.2, flags=0):
+    index = np.arange(start, stop)
+    phase = 2 * np.pi * (index - 30) / PERIOD
+    values = np.zeros((len(SIGNALS), index.size))
+    values[ROW["reference"]] = 10.0 * np.sin(phase)
+    values[ROW["displacement"]] = 10.0 * np.sin(phase - lag)
+    values[ROW["error"]] = values[ROW["displacement"]] - values[ROW["reference"]]
+    return Traces(index, values, np.full(index.size, flags, dtype=np.uint32))
+
+
+def added(figures, traces, segment=SEGMENT, part=37):
+    for at in range(0, traces.index.size, part):
+        figures.add(traces.rows(slice(at, at + part)), segment)
+    return figures
+
+
+def test_figures_are_those_of_whole_cycles():
+    figures = added(RunningFigures(RATE, "reference"), loop(30, 1200)).newest
+    cycle = loop(30, 130).values
+    expected = peak_hysteresis_percent(cycle[ROW["reference"]], cycle[ROW["displacement"]])
+    assert figures["peak_hysteresis_percent"] == pytest.approx(expected, rel=1e-6)
+    error_um = cycle[ROW["error"]]
+    assert figures["peak_error_um"] == pytest.approx(np.abs(error_um).max())
+    assert figures["rms_error_um"] == pytest.approx(np.sqrt(np.mean(error_um**2)))
+    assert figures["peak_to_peak_um"] == pytest.approx(20.0, rel=1e-3)
+    assert figures["noise_floor_percent"] < 1e-3
+
+
+def test_the_newest_cycles_count_and_a_start_within_one_is_passed_over():
+    figures = added(RunningFigures(RATE, "reference"), loop(75, 2000, lag=0.4))
+    assert figures.newest["peak_error_um"] == pytest.approx(20 * np.sin(0.2), rel=1e-3)
+    added(figures, loop(2000, 4000, lag=0.1))
+    assert figures.newest["peak_error_um"] == pytest.approx(20 * np.sin(0.05), rel=1e-3)
+
+
+def test_samples_that_are_not_trusted_are_left_out():
+    traces = loop(30, 1200)
+    traces.values[ROW["displacement"], 300] = 1e6
+    traces.values[ROW["error"], 300] = 1e6
+    traces.flags[300] = int(Flag.SENSOR_INVALID)
+    assert added(RunningFigures(RATE, "reference"), traces).newest["peak_error_um"] < 3.0
+
+
+def test_without_a_period_there_are_those_that_need_none():
+    plain = Segment("steps", 0, 100_000, 0, 100_000)
+    figures = added(RunningFigures(RATE, "reference"), loop(0, 1200), plain).newest
+    assert figures["peak_error_um"] == pytest.approx(20 * np.sin(0.1), rel=1e-3)
+    assert "peak_hysteresis_percent" not in figures
+
+
+def test_before_the_first_whole_cycle_there_are_none():
+    figures = RunningFigures(RATE, "reference")
+    assert added(figures, loop(30, 90)).newest == {}
+    assert added(figures, loop(90, 200), None).newest == {}

@@ -1,0 +1,139 @@
+"""One page: what it asks for, and how much it gets."""
+
+import asyncio
+import json
+
+import pytest
+
+from hilctl.live.page_session import SLOW_S, PageSession, PageView, RateLimiter
+
+
+class Transport:
+    aborted = False
+
+    def abort(self):
+        self.aborted = True
+
+
+class Connection:
+    """A connection whose other end says some messages, and takes none while it is held."""
+
+    def __init__(self, *messages):
+        self.messages, self.sent, self.closed = list(messages), [], None
+        self.transport = Transport()
+        self.free = asyncio.Event()
+        self.free.set()
+
+    async def __aiter__(self):
+        for message in self.messages:
+            if self.closed:
+                return
+            yield message
+
+    async def send(self, message):
+        await self.free.wait()
+        self.sent.append(message)
+
+    async def close(self, code, reason):
+        self.closed = (code, reason)
+
+
+async def answer(viewer, message):
+    return f"{message.id} {message.ask}"
+
+
+def message(**fields):
+    return json.dumps({"id": 1, "ask": "view"} | fields)
+
+
+def test_messages_are_answered_and_a_view_is_taken():
+    async def told():
+        view = {"run": "a", "mode": "roll", "window_s": 10.0}
+        connection = Connection(message(view=view), message(id=2, ask="stop"))
+        viewer = PageSession(connection, answer)
+        await viewer.attend()
+        return viewer.view, connection.sent
+
+    assert asyncio.run(told()) == (
+        PageView(run="a", mode="roll", window_s=10.0),
+        ["1 view", "2 stop"],
+    )
+
+
+def test_what_is_no_message_of_the_page_ends_the_connection():
+    async def closed(raw):
+        connection = Connection(raw, message(id=2))
+        await PageSession(connection, answer).attend()
+        return connection.closed[0], connection.sent
+
+    for raw in ("", "{}", b"\xff\x00", message(ask="format"), message(more=1), message(id="1")):
+        assert asyncio.run(closed(raw)) == (1008, [])
+
+
+BAD_TIMES = ("0", "-0.0", "-1", "1e-320", "1e308", "NaN", "Infinity", "1e999", "true", '"2"', "[]")
+
+
+@pytest.mark.parametrize("value", [*BAD_TIMES, "null", "1" + "0" * 400])
+def test_a_window_that_is_no_time_is_refused_and_changes_nothing(value):
+    """The page gets an answer, and goes on."""
+
+    async def told():
+        raw = f'{{"id": 5, "ask": "view", "view": {{"window_s": {value}}}}}'
+        connection = Connection(raw, message(id=6, ask="stop"))
+        viewer = PageSession(connection, answer)
+        await viewer.attend()
+        return viewer.view, connection
+
+    view, connection = asyncio.run(told())
+    assert view == PageView()
+    assert connection.closed is None
+    refused = json.loads(connection.sent[0])
+    assert (refused["kind"], refused["id"], refused["ok"]) == ("answer", 5, False)
+    assert refused["error"].startswith("window_s: ")
+    assert connection.sent[1] == "6 stop"
+
+
+def test_too_many_messages_end_the_connection():
+    async def flooded():
+        connection = Connection(*[message()] * 500)
+        await PageSession(connection, answer, clock=lambda: 0.0).attend()
+        return connection
+
+    connection = asyncio.run(flooded())
+    assert connection.closed == (1008, "too many messages")
+    assert len(connection.sent) == 40
+
+
+def test_an_allowance_comes_back_with_time():
+    now = [0.0]
+    allowance = RateLimiter(2.0, 3.0, lambda: now[0])
+    assert [allowance.take() for _ in range(4)] == [True, True, True, False]
+    now[0] = 1.0
+    assert [allowance.take() for _ in range(3)] == [True, True, False]
+
+
+def test_a_slow_page_gets_the_newest_and_is_cut_in_the_end():
+    async def slow():
+        now = [0.0]
+        connection = Connection()
+        viewer = PageSession(connection, answer, clock=lambda: now[0])
+        connection.free.clear()
+        viewer.offer("status", b"old")
+        await asyncio.sleep(0)
+        assert not viewer.ready
+        connection.free.set()
+        await asyncio.sleep(0.01)
+        assert viewer.ready
+        assert connection.sent == ["status", b"old"]
+        connection.free.clear()
+        viewer.offer(b"new")
+        now[0] = SLOW_S - 0.1
+        assert not viewer.ready
+        assert not connection.transport.aborted
+        now[0] = SLOW_S + 0.1
+        assert not viewer.ready
+        assert connection.transport.aborted
+        connection.free.set()
+        await asyncio.sleep(0.01)
+
+    asyncio.run(slow())

@@ -1,0 +1,144 @@
+"""Windows: rolling, triggered to the cycle, and loops."""
+
+import numpy as np
+import pytest
+
+from hilctl.base.samples import Flag
+from hilctl.base.segments import Segment
+from hilctl.live.scope import BUCKETS, WINDOWS_S, MinMaxTrace, Scope
+from hilctl.live.signals import ROW, SIGNALS, Traces
+
+RATE = 1000.0
+
+
+def waves(start, stop, period, flags=0):
+    index = np.arange(start, stop)
+    values = np.zeros((len(SIGNALS), index.size))
+    values[ROW["reference"]] = np.sin(2 * np.pi * (index - 100) / period)
+    values[ROW["displacement"]] = np.cos(2 * np.pi * (index - 100) / period)
+    return Traces(index, values, np.full(index.size, flags, dtype=np.uint32))
+
+
+def segment(period, stop=100_000):
+    return Segment("sine", 100, stop, 100, stop, period)
+
+
+@pytest.mark.parametrize("period", [50.0, 33.4])
+def test_a_triggered_window_begins_with_the_cycle(period):
+    """However many samples there are, it is the same picture."""
+    scope = Scope(RATE, [segment(period)], "reference")
+    scope.add(waves(0, 100, period, int(Flag.RAMP)))
+    assert scope.triggered() is None
+    for start, stop in ((100, 400), (400, 411), (411, 433)):
+        scope.add(waves(start, stop, period))
+        window = scope.triggered()
+        expected = np.sin(2 * np.pi * window.t_s * RATE / period)
+        assert window.buckets.low[ROW["reference"]] == pytest.approx(expected, abs=1e-9)
+        assert 0.0 <= window.t_s[0] < 1.0 / RATE
+        assert window.t_s[-1] == pytest.approx(2 * period / RATE, abs=1.01 / RATE)
+
+
+def test_a_long_cycle_is_shown_as_it_comes():
+    period = 5000.0
+    scope = Scope(RATE, [segment(period)], "reference")
+    scope.add(waves(100, 100 + 7500, period))
+    shown = scope.triggered().buckets.low[ROW["reference"]]
+    there = np.isfinite(shown)
+    assert there[: int(0.74 * shown.size)].all()
+    assert not there[int(0.76 * shown.size) :].any()
+
+
+@pytest.mark.parametrize("window_s", WINDOWS_S)
+def test_a_rolling_window_ends_now_and_holds_every_spike(window_s):
+    scope = Scope(RATE, [segment(50.0)], "reference")
+    traces = waves(100, 8000, 50.0)
+    traces.values[ROW["error"], -9] = 30.0
+    scope.add(traces)
+    window = scope.rolling(window_s)
+    assert window.t_s[-1] == 0.0
+    assert window.t_s.size <= BUCKETS
+    assert np.nanmax(window.buckets.high[ROW["error"]]) == 30.0
+
+
+def test_loops_pair_one_samples_values():
+    scope = Scope(RATE, [segment(50.0)], "reference")
+    scope.add(waves(100, 1000, 50.0))
+    loops = scope.loops()
+    assert loops.shape == (2, 6 * 50)
+    assert np.hypot(*loops) == pytest.approx(np.ones(300))
+    assert scope.points_a_cycle() == 50
+
+
+def test_each_stretch_has_its_own_cycle_and_one_without_a_period_none():
+    first = Segment("a", 0, 500, 0, 500, 50.0)
+    scope = Scope(RATE, [first, Segment("b", 500, 9000, 500, 9000)], "reference")
+    scope.add(waves(0, 400, 50.0))
+    assert scope.segment.label == "a"
+    scope.add(waves(400, 900, 50.0))
+    assert scope.segment.label == "b"
+    assert scope.triggered() is None
+    assert scope.loops().shape[1] > 30
+
+
+def test_nothing_is_shown_before_the_first_sample():
+    scope = Scope(RATE, [segment(50.0)], "reference")
+    assert scope.loops().shape == (2, 0)
+    assert np.isnan(scope.rolling(0.5).buckets.low).all()
+
+
+def traces(start, values, step=1):
+    values = np.asarray(values, dtype=float)
+    index = np.arange(start, start + step * values.size, step)
+    rows = np.tile(values, (len(SIGNALS), 1))
+    return Traces(index, rows, np.zeros(values.size, dtype=np.uint32))
+
+
+@pytest.mark.parametrize("width", [1, 3, 7.5])
+def test_each_sample_is_within_its_bucket_however_the_samples_come(width):
+    """So one spike of one sample is seen, and the first value is that of a sample."""
+    rng = np.random.default_rng(3)
+    values = rng.standard_normal(400)
+    values[137] = 50.0
+    whole, parts = MinMaxTrace(5, width, 500), MinMaxTrace(5, width, 500)
+    whole.add(traces(5, values))
+    at = 0
+    while at < 400:
+        size = int(rng.integers(1, 40))
+        parts.add(traces(5 + at, values[at : at + size]))
+        at += size
+    count = whole.newest + 1
+    one, other = whole.window(0, count), parts.window(0, count)
+    numbers = np.floor(np.arange(400) / width).astype(int)
+    for bucket in range(count):
+        mine = values[numbers == bucket]
+        found = (one.low[0, bucket], one.high[0, bucket], one.first[0, bucket])
+        assert found == (mine.min(), mine.max(), mine[0])
+    assert one.high.max() == 50.0
+    for name in ("low", "high", "first"):
+        assert np.array_equal(getattr(one, name), getattr(other, name))
+
+
+def test_gaps_and_what_is_gone_are_empty():
+    envelope = MinMaxTrace(0, 2, 4)
+    envelope.add(traces(0, [1.0, 2.0, 3.0, 4.0]))
+    envelope.add(traces(8, [5.0]))
+    found = envelope.window(0, 6).low[0]
+    assert np.isnan(found).tolist() == [True, False, True, True, False, True]
+    envelope.add(traces(1000, [6.0]))
+    assert np.isnan(envelope.window(497, 4).low[0]).tolist() == [True, True, True, False]
+
+
+def test_a_value_that_is_missing_hides_no_other():
+    envelope = MinMaxTrace(0, 3, 4)
+    envelope.add(traces(0, [np.nan, 2.0, 7.0, np.nan, np.nan, np.nan]))
+    found = envelope.window(0, 2)
+    assert (found.low[0, 0], found.high[0, 0]) == (2.0, 7.0)
+    assert np.isnan(found.low[0, 1])
+
+
+def test_what_comes_before_the_origin_is_left():
+    envelope = MinMaxTrace(10, 1, 4)
+    envelope.add(traces(7, [1.0, 2.0]))
+    assert envelope.newest == -1
+    envelope.add(traces(9, [3.0, 4.0]))
+    assert envelope.window(0, 1).low[0].tolist() == [4.0]

@@ -1,0 +1,282 @@
+"""The server on loopback, with a run's folder behind it."""
+
+import asyncio
+import json
+import re
+import socket
+from contextlib import asynccontextmanager, contextmanager, suppress
+from pathlib import Path
+
+import pytest
+from websockets.asyncio.client import connect
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+
+from hilctl.base.errors import RunError
+from hilctl.live import server as module
+from hilctl.live.auth import MOST_PENDING
+from hilctl.live.server import FILES, LiveServer, file_response
+from hilctl.run.metadata import RunDescription
+from hilctl.run.ring import SampleRing
+from hilctl.run.run_folder import run_folder
+from hilctl.run.shared_page import PageField, Phase
+from hilctl.run.start import checked_experiment
+
+DEMO = Path(__file__).parents[3] / "configs" / "demo.yaml"
+
+
+@pytest.fixture(scope="module")
+def description():
+    return RunDescription.of(checked_experiment(DEMO, []))
+
+
+@contextmanager
+def going_on(description, tmp_path):
+    with run_folder("demo", tmp_path / "a.mcap", 12.0) as (folder, _):
+        description.write(folder.description)
+        ring = SampleRing.create(folder.ring, slots=16, block=50, state_size=1)
+        ring.page.put(PageField.PHASE, Phase.RUNNING)
+        yield folder
+
+
+@asynccontextmanager
+async def serving(chosen=lambda runs: runs[0] if runs else None):
+    server, over = LiveServer(chosen), asyncio.Event()
+    task = asyncio.create_task(server.run(lambda _: over.is_set()))
+    await asyncio.sleep(0.05)
+    try:
+        yield server
+    finally:
+        over.set()
+        await task
+
+
+def opened(server, *, token=None, origin=None, host="127.0.0.1"):
+    token = server.url.partition("#")[2] if token is None else token
+    return connect(
+        f"ws://{host}:{server.port}/live",
+        origin=origin or f"http://{host}:{server.port}",
+        subprotocols=["hilctl.live.1", f"token.{token}"],
+        proxy=None,
+    )
+
+
+async def status_of(connection):
+    while True:
+        message = await connection.recv()
+        if isinstance(message, str) and (said := json.loads(message))["kind"] == "status":
+            return said
+
+
+async def answer_to(connection, **message):
+    await connection.send(json.dumps({"id": 7, **message}))
+    while True:
+        said = await connection.recv()
+        if isinstance(said, str) and json.loads(said)["kind"] == "answer":
+            return json.loads(said)
+
+
+async def http(port, request):
+    reader, writer = await asyncio.open_connection("127.0.0.1", port)
+    writer.write(request)
+    answer = await reader.read()
+    writer.close()
+    await writer.wait_closed()
+    return answer
+
+
+def test_a_page_gets_frames_and_where_the_run_stands(description, tmp_path):
+    async def seen():
+        async with serving() as server, opened(server) as connection:
+            assert connection.subprotocol == "hilctl.live.1"
+            status = await status_of(connection)
+            while isinstance(frame := await connection.recv(), str):
+                pass
+            return status, frame
+
+    with going_on(description, tmp_path) as folder:
+        status, frame = asyncio.run(seen())
+        assert (status["run"], status["state"]) == (folder.card.name, "running")
+    assert b'"signals": 6' in frame
+
+
+def test_stop_goes_the_way_of_hilctl_stop_and_is_acknowledged(description, tmp_path, monkeypatch):
+    stopped = []
+    monkeypatch.setattr(module, "request_stop", lambda run: stopped.append(run) or True)
+
+    async def pressed():
+        async with serving() as server, opened(server) as connection:
+            await status_of(connection)
+            return await answer_to(connection, ask="stop")
+
+    with going_on(description, tmp_path) as folder:
+        assert asyncio.run(pressed())["ok"]
+        assert stopped == [folder]
+
+
+def test_requests_go_to_the_control_socket_and_refusals_come_back(
+    description, tmp_path, monkeypatch
+):
+    asked = []
+
+    def ask(path, request, timeout_s):
+        asked.append((path, request))
+        if request["command"] == "set":
+            raise RunError("no room")
+        return {"sample": 5}
+
+    monkeypatch.setattr(module, "ask", ask)
+
+    async def answers():
+        async with serving() as server, opened(server) as connection:
+            await status_of(connection)
+            mark = {"command": "mark", "text": "tap"}
+            yes = await answer_to(connection, ask="run", request=mark)
+            return yes, await answer_to(connection, ask="run", request={"command": "set"})
+
+    with going_on(description, tmp_path) as folder:
+        yes, no = asyncio.run(answers())
+        assert asked[0] == (folder.socket, {"command": "mark", "text": "tap"})
+    assert (yes["ok"], yes["sample"]) == (True, 5)
+    assert (no["ok"], no["error"]) == (False, "no room")
+
+
+def test_a_window_of_no_length_does_not_end_the_server(description, tmp_path):
+    """It did, for every page."""
+
+    async def shown():
+        async with serving() as server, opened(server) as connection:
+            await status_of(connection)
+            refused = await answer_to(connection, ask="view", view={"mode": "roll", "window_s": 0})
+            return refused, await status_of(connection)
+
+    with going_on(description, tmp_path):
+        refused, status = asyncio.run(shown())
+    assert not refused["ok"]
+    assert status["state"] == "running"
+
+
+def test_without_a_run_a_page_says_so_and_a_stop_is_refused():
+    async def seen():
+        async with serving(lambda runs: None) as server, opened(server) as connection:
+            return await status_of(connection), await answer_to(connection, ask="stop")
+
+    status, answer = asyncio.run(seen())
+    assert "run" not in status
+    assert (answer["ok"], answer["error"]) == (False, "no such active run")
+
+
+def test_strangers_are_refused_in_the_upgrade():
+    async def refusals():
+        found = []
+        async with serving(lambda runs: None) as server:
+            for given in ({"token": "0" * 32}, {"token": ""}, {"origin": "http://evil.example"}):
+                with pytest.raises(InvalidStatus) as refused:
+                    await opened(server, **given)
+                found.append(refused.value.response.status_code)
+            foreign = b"GET / HTTP/1.1\r\nHost: evil.example\r\n\r\n"
+            found.append((await http(server.port, foreign)).split()[1])
+            assert server.url.partition("#")[2] not in (await http(server.port, foreign)).decode()
+            async with opened(server) as connection:  # and nobody else is kept out by them
+                await status_of(connection)
+        return found
+
+    assert asyncio.run(refusals()) == [401, 401, 403, b"421"]
+
+
+def test_no_request_but_a_get_of_a_file_is_followed():
+    async def answers():
+        async with serving(lambda runs: None) as server:
+            host = f"Host: 127.0.0.1:{server.port}\r\n".encode()
+            found = []
+            for line in (
+                b"GET /",
+                b"GET /?run=x",
+                b"GET /live",
+                b"POST /",
+                b"PUT /live.js",
+                b"GET /etc",
+            ):
+                answer = await http(server.port, line + b" HTTP/1.1\r\n" + host + b"\r\n")
+                found.append(answer.split()[1] if answer else b"cut")
+            return found
+
+    *files, posted, put, missing = asyncio.run(answers())
+    assert files == [b"200", b"200", b"403"]
+    assert (posted, put, missing) == (b"405", b"405", b"404")
+
+
+def test_a_message_that_is_too_long_ends_its_connection_only():
+    async def sent():
+        async with serving(lambda runs: None) as server, opened(server) as other:
+            async with opened(server) as connection:
+                with suppress(ConnectionClosed):
+                    await connection.send("x" * 1_000_000)
+                await connection.wait_closed()
+            await status_of(other)
+            return connection.close_code
+
+    assert asyncio.run(sent()) == 1009
+
+
+def test_a_crowd_of_silent_connections_is_bounded_and_keeps_nobody_out():
+    async def crowded():
+        async with serving(lambda runs: None) as server:
+            address = ("127.0.0.1", server.port)
+            crowd = [(await asyncio.open_connection(*address))[1] for _ in range(300)]
+            try:
+                await asyncio.sleep(0.2)
+                waiting = len(server._pending)
+                async with asyncio.timeout(5), opened(server) as connection:
+                    await status_of(connection)
+            finally:
+                for each in crowd:
+                    each.close()
+            return waiting
+
+    assert asyncio.run(crowded()) == MOST_PENDING
+
+
+def test_both_addresses_of_loopback_are_served():
+    async def seen():
+        async with serving(lambda runs: None) as server:
+            if len(server._sockets) < 2:
+                pytest.skip("this machine has no IPv6")
+            async with opened(server, host="[::1]") as connection:
+                return await status_of(connection)
+
+    assert asyncio.run(seen())["kind"] == "status"
+
+
+def test_a_port_that_is_taken_is_said():
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(RunError, match=f"port {port} of 127.0.0.1: Address already in use"):
+            LiveServer(lambda runs: None, port)
+
+
+@pytest.mark.parametrize("path", FILES)
+def test_each_file_is_there_and_comes_with_its_headers(path):
+    response = file_response(path)
+    assert response.status_code == 200
+    assert len(response.body) == int(response.headers["Content-Length"]) > 100
+    assert response.headers["Content-Security-Policy"].startswith("default-src 'self';")
+    assert response.headers["X-Content-Type-Options"] == "nosniff"
+
+
+@pytest.mark.parametrize("path", ["/x", "/../live.js", "/page/live.js", "", "//", "/live.js/"])
+def test_nothing_else_is_served(path):
+    assert file_response(path).status_code == 404
+
+
+def test_the_page_names_no_address_outside_and_holds_no_script_of_its_own():
+    """So that it works with the cable out, and a strict policy lets all of it through."""
+    page = file_response("/").body.decode()
+    script = file_response("/live.js").body.decode()
+    assert not re.findall(r"""(?:https?:)?//[a-z0-9]""", page)
+    assert not re.findall(r"""["'`](?:https?:)?//""", script)
+    assert not re.findall(r"<script>|<style|style=|\son\w+=", page)
+    assert "innerHTML" not in script
+    asked = set(re.findall(r'(?:href|src)="([^"]+)"', page))
+    assert {f"/{name}" for name in asked} == FILES.keys() - {"/"}
+    ids = set(re.findall(r'id="([^"]+)"', page))
+    assert set(re.findall(r'\$\("([^"]+)"\)', script)) <= ids

@@ -1,0 +1,77 @@
+"""The server's process."""
+
+import os
+import signal
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import pytest
+
+from hilctl.base.errors import RunError
+from hilctl.live import server_process
+from hilctl.live.server_process import SingleRun, served_beside
+
+
+def server(feed):
+    return SimpleNamespace(feed=lambda name: feed)
+
+
+def test_a_server_goes_on_until_its_pages_have_heard_of_the_end():
+    now = [0.0]
+    over = SingleRun(lambda: now[0])
+    assert not over(server(None))
+    assert not over(server(SimpleNamespace(ended=False)))
+    ended = server(SimpleNamespace(ended=True))
+    assert not over(ended)
+    now[0] = 1.4
+    assert not over(ended)
+    now[0] = 1.6
+    assert over(ended)
+
+
+def test_another_run_makes_it_go_on():
+    now = [0.0]
+    over = SingleRun(lambda: now[0])
+    over(server(SimpleNamespace(ended=True)))
+    over(server(SimpleNamespace(ended=False)))
+    now[0] = 5.0
+    assert not over(server(SimpleNamespace(ended=True)))
+
+
+@pytest.fixture
+def beside(monkeypatch):
+    """Return a function that has a program take the server's place; and the processes."""
+    started, popen = [], subprocess.Popen
+
+    def take_place(code):
+        def start(command, **settings):
+            started.append(popen([sys.executable, "-c", code], **settings))
+            return started[-1]
+
+        names = {name: getattr(subprocess, name) for name in ("PIPE", "TimeoutExpired")}
+        monkeypatch.setattr(server_process, "subprocess", SimpleNamespace(Popen=start, **names))
+        monkeypatch.setattr(server_process, "_LAST_S", 0.05)
+        monkeypatch.setattr(server_process, "_START_S", 0.05)
+        return started
+
+    yield take_place
+    for process in started:
+        process.kill()
+        process.wait()
+
+
+def test_a_server_that_is_stopped_does_not_keep_the_run_from_ending(beside, monkeypatch):
+    started = beside("print('http://here', flush=True); input(); input()")
+    monkeypatch.setattr(server_process, "_START_S", 60.0)
+    with served_beside() as url:
+        assert url == "http://here"
+        os.kill(started[0].pid, signal.SIGSTOP)
+    assert started[0].wait(60) == -signal.SIGKILL
+
+
+def test_a_server_that_gives_no_address_does_not_keep_the_run_from_being_refused(beside):
+    started = beside("input(); input()")
+    with pytest.raises(RunError), served_beside():
+        pass
+    assert started[0].wait(60) < 0

@@ -1,0 +1,61 @@
+"""What is read of a machine's files, and what is said where they are absent or strange."""
+
+import pytest
+
+from hilctl.machine.procfs import Machine
+
+LIMITS = """\
+Limit                     Soft Limit           Hard Limit           Units
+Max locked memory         8388608              unlimited            bytes
+Max realtime priority     unlimited            98
+"""
+
+
+@pytest.fixture
+def written(tmp_path):
+    """Return a function that makes a machine of these files."""
+
+    def make(**files):
+        for name, text in files.items():
+            path = tmp_path / "proc" / name.replace("__", "/")
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text)
+        return Machine(tmp_path)
+
+    return make
+
+
+def test_absent_files_say_nothing_and_raise_nothing(written):
+    machine = written()
+    assert machine.text("/proc/version") is None
+    assert machine.number("/proc/version") is None
+    assert machine.status("CapEff") == ""
+    assert not machine.capable(14)
+    assert machine.limit("Max locked memory") == 0
+    assert machine.glob("/dev/ttyUSB*") == []
+    with pytest.raises(FileNotFoundError):
+        machine.read("/proc/version")
+
+
+@pytest.mark.parametrize(("text", "number"), [("12\n", 12), ("-1", -1), ("max", None), ("", None)])
+def test_a_number_is_a_whole_file(written, text, number):
+    assert written(n=text).number("/proc/n") == number
+
+
+def test_capabilities_are_bits_of_this_process(written):
+    """CAP_IPC_LOCK is 14, CAP_SYS_NICE 23."""
+    machine = written(self__status="Name:\thilctl\nCapEff:\t0000000000004000\n")
+    assert machine.status("Name") == "hilctl"
+    assert machine.capable(14)
+    assert not machine.capable(23)
+
+
+def test_limits_are_soft_ones(written):
+    machine = written(self__limits=LIMITS)
+    assert machine.limit("Max locked memory") == 8388608
+    assert machine.limit("Max realtime priority") is None
+
+
+def test_patterns_give_absolute_paths_in_order(written):
+    machine = written(cpu__1="", cpu__0="")
+    assert machine.glob("/proc/cpu/*") == ["/proc/cpu/0", "/proc/cpu/1"]

@@ -1,0 +1,136 @@
+"""The model of an effective field: conditions, forward and inverse."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from hilctl.base.types import F64
+from hilctl.models.effective_field import FieldLosses, FieldModel, OutputCurve
+from hilctl.models.mechanics import FirstMode
+from hilctl.models.model_file import dump_model, parse_model
+from hilctl.models.staged import StagedModel
+
+RATE_HZ = 50_000.0
+CURVE = OutputCurve(operators_um=(-60.0, 0.0, 60.0), displacement_um=(-50.0, 0.0, 45.0))
+LOSSES = FieldLosses(field_s=1e-4, output_s=2e-6, decay_s=3e-5, growth=0.1, bend=0.02, excess=0.05)
+
+
+def field_model(**changes: Any) -> FieldModel:
+    """Return a small model with everything in it."""
+    slopes = ((4.0, 5.0, 4.0), (1.0, 1.0, 0.0), (2.0, 3.0, 2.0))
+    given: dict[str, Any] = {
+        "thresholds": (0.0, 1.0),
+        "lengths": (1.5,),
+        "lowest": -9.0,
+        "cell": 6.0,
+        "slopes": slopes,
+        "coupling": -0.03,
+        "curve": CURVE,
+        "losses": LOSSES,
+    }
+    return FieldModel(**(given | changes))
+
+
+def reference_um(seed: int) -> F64:
+    """Return a smooth, aperiodic reference from rest: float64[n]."""
+    t = np.arange(4000) / RATE_HZ
+    rng = np.random.default_rng(seed)
+    sines = sum(np.sin(2 * np.pi * f * t + rng.uniform(0, 6)) for f in (11.0, 57.0, 143.0, 231.0))
+    return np.ascontiguousarray(9.0 * np.minimum(t / 0.02, 1.0) * sines)
+
+
+@pytest.mark.parametrize("coupling", [-0.03, 0.0, 0.03])
+def test_inverse_undoes_the_model(coupling: float) -> None:
+    model = field_model(coupling=coupling)
+    wanted_um = reference_um(1)
+    command = model.inverse(RATE_HZ).process(wanted_um)
+    assert model.forward(RATE_HZ).process(command) == pytest.approx(wanted_um, abs=1e-4)
+    assert np.ptp(command) > 5.0
+
+
+def test_any_cut_into_blocks_gives_the_same_bits() -> None:
+    wanted_um = reference_um(2)
+    for operator in (field_model().inverse, field_model().forward):
+        whole = operator(RATE_HZ).process(wanted_um)
+        parts, starts = operator(RATE_HZ), range(0, wanted_um.size, 37)
+        cut = [parts.process(wanted_um[start : start + 37].copy()) for start in starts]
+        assert np.array_equal(np.concatenate(cut), whole)
+
+
+def test_small_biased_loops_creep_by_drags_and_close_by_plays() -> None:
+    """A play's loop comes back to where it began; a drag's has moved on."""
+    loop = [*np.linspace(5.0, 4.0), *np.linspace(4.0, 5.0)]
+    turns = np.concatenate([np.linspace(0.0, 5.0), np.tile(loop, 8)])
+    no_losses = {"losses": FieldLosses(), "coupling": 0.0}
+    moved = []
+    for slopes in (((1.0,) * 3, (3.0,) * 3, (0.0,) * 3), ((1.0,) * 3, (0.0,) * 3, (3.0,) * 3)):
+        out = field_model(slopes=slopes, **no_losses).forward(RATE_HZ).process(turns)
+        moved.append(abs(out[-1] - out[49]))
+    assert moved[0] < 1e-9
+    assert moved[1] > 0.1
+
+
+def test_a_loop_is_the_narrower_the_slower_it_is() -> None:
+    def width_um(frequency_hz: float) -> float:
+        t = np.arange(round(2 * RATE_HZ / frequency_hz)) / RATE_HZ
+        v = 5.0 * np.sin(2 * np.pi * frequency_hz * t)
+        half = v.size // 2
+        y = field_model().forward(RATE_HZ).process(v)[half:]
+        return float(abs(np.interp(0.0, v[half:][: half // 4], y[: half // 4]) - y[half // 2]))
+
+    assert width_um(200.0) > 1.5 * width_um(5.0)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_what_is_no_number_leaves_no_trace(bad: float) -> None:
+    wanted_um = reference_um(3)
+    inverse = field_model().inverse(RATE_HZ)
+    first = inverse.process(wanted_um[:100].copy())
+    assert np.isnan(inverse.process(np.array([bad])))
+    after = inverse.process(wanted_um[100:].copy())
+    whole = field_model().inverse(RATE_HZ).process(wanted_um)
+    assert np.array_equal(np.concatenate([first, after]), whole)
+
+
+def test_every_finite_reference_gives_a_finite_command() -> None:
+    wild_um = np.array([0.0, 1e3, -1e3, 1e9, -1e9, 0.0, 1e-9])
+    command = field_model().inverse(RATE_HZ).process(wild_um)
+    assert np.isfinite(command).all()
+
+
+def test_between_stages_and_through_a_file() -> None:
+    structure = FirstMode(natural_hz=2300.0, damping_ratio=0.12)
+    staged = StagedModel.around(field_model(), structure=structure, delay_s=3e-5)
+    back = parse_model("model", dump_model(staged))
+    assert back == staged
+    inverse, wanted_um = back.inverse(RATE_HZ), reference_um(4)
+    ahead = np.append(wanted_um[inverse.preview :], np.full(inverse.preview, wanted_um[-1]))
+    got_um = back.forward(RATE_HZ).process(inverse.process(ahead))
+    assert np.max(np.abs(got_um - wanted_um)[500:]) < 0.05 * np.ptp(wanted_um) / 10.0
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"thresholds": (1.0, 2.0)}, "first threshold must be 0"),
+        ({"thresholds": (0.0, 0.0)}, "thresholds must rise"),
+        ({"lengths": (0.0,)}, "lengths must be > 0"),
+        ({"lengths": ()}, "one line a threshold and one a length"),
+        ({"cell": 0.0}, "cell must be > 0"),
+        ({"slopes": ((1.0, 0.0), (1.0, 1.0), (1.0, 1.0))}, "first line must be > 0"),
+        ({"slopes": ((1.0, 1.0), (-1.0, 1.0), (1.0, 1.0))}, "slopes must be >= 0"),
+        ({"slopes": ((1.0, 1.0), (1.0,), (1.0, 1.0))}, "the same cells"),
+    ],
+)
+def test_conditions(changes: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValidationError, match=words):
+        field_model(**changes)
+
+
+def test_a_curve_must_rise() -> None:
+    with pytest.raises(ValidationError, match="displacement_um must rise"):
+        OutputCurve(operators_um=(0.0, 1.0), displacement_um=(0.0, 0.0))
+    with pytest.raises(ValidationError, match="two at least"):
+        OutputCurve(operators_um=(0.0,), displacement_um=(0.0,))

@@ -1,0 +1,183 @@
+"""Model files: what comes back, and what a broken one says."""
+
+import random
+from typing import get_args
+
+import pytest
+import yaml
+
+from hilctl.base.errors import ConfigError, InputError
+from hilctl.models.base import Provenance
+from hilctl.models.integrated import IntegratedModel, exponential_integrated
+from hilctl.models.model_file import AnyModel, dump_model, load_model, parse_model
+from hilctl.models.plays import SpiModel
+from tests.published import piezo_ppi, terfenol_rdpi
+
+OMEGA = exponential_integrated(
+    alpha=0.3, gamma_s=2e-4, a_0=1.0, alpha_0=0.2, beta_0=0.3, g_0=6.0, alpha_1=0.3, beta_1=0.1,
+    d_p=0.8, alpha_2=0.4, beta_2=0.1, d_n=0.8, plays=3, deadbands_a_side=2,
+)  # fmt: skip
+SPI = SpiModel(**piezo_ppi().model_dump(exclude={"kind"}))
+MODELS = [piezo_ppi(), SPI, terfenol_rdpi(), OMEGA]
+RDPI = """\
+model:
+  kind: rdpi
+  direct: 2.7
+  weights: [0.5, 0.1]
+  thresholds: [0.3, 0.6]
+  gamma_s: 2.0e-4
+"""
+NASTY = (
+    "!!int ", "!!float ", "!!bool x", "!!binary ", "!!timestamp x", "!!set ", "!!null ", "!",
+    "!foo ", "!<tag:yaml.org,2002:int> ", "!!python/object:os.system ", "&a ", "*a", "<<: ",
+    "<<: *a", "? ", "? [1]\n", "- ", ": ", "[", "]", "{", "}", ",", "'", '"', "#", "|\n", ">\n",
+    "%YAML 1.1\n", "@", "---\n", "...\n", "\t", "\0", "\x85", "\u2028", "\ufeff", "\ud800",
+    '"\\U99999999"', '"\\ud800"', '"\\x00"', "9" * 5000, "0x" + "f" * 5000, "1" + "0" * 400, "-",
+    "1e3", "1e400", ".nan", ".inf", "-.inf", "nan", "2024-01-01", "2024-13-99", "~", "null",
+    "2024-01-01T00:00:00Z", "true", "on", "=", "0o7", "0b_", "0x_", "017", "1:30", "5.0e-324",
+    "1.0e+308", "[" * 3000, "{a: " * 3000, "- " * 500, "model: ", "kind: ppi\n", "kind: [1]\n",
+    "kind: {a: 1}\n", "rdpi: 3\n", "ppi: ", "  integrated: 3\n", "model: &m\n  x: *m\n", "1: 2\n",
+    "null: 2\n", "[a]: 2\n", "{a: b}: 2\n",
+)  # fmt: skip
+
+
+def mutated(rng, text):
+    """Return the text with one to three things wrong with it, most likely."""
+    for _ in range(rng.choice((1, 1, 1, 2, 3))):
+        lines = text.split("\n")
+        line, place = rng.randrange(len(lines)), rng.randrange(len(text) + 1)
+        match rng.randrange(7):
+            case 0:
+                text = text[:place] + rng.choice(NASTY) + text[place:]
+                continue
+            case 1:
+                text = text[:place] + text[place + rng.randrange(1, 20) :]
+                continue
+            case 2:
+                lines.insert(rng.randrange(len(lines) + 1), lines[line])
+            case 3:
+                head, colon, _ = lines[line].partition(":")
+                lines[line] = f"{head}: {rng.choice(NASTY)}" if colon else f"- {rng.choice(NASTY)}"
+            case 4:
+                lines[line] = rng.choice(("", "  ", "    ")) + lines[line].lstrip()
+            case 5:
+                del lines[line]
+            case _:
+                lines[line] = rng.choice(NASTY) + lines[line]
+        text = "\n".join(lines)
+    return text
+
+
+def problems_of(text):
+    with pytest.raises(ConfigError) as caught:
+        parse_model("m.yaml", text)
+    return str(caught.value).split("\n")
+
+
+@pytest.mark.parametrize("model", MODELS, ids=lambda model: model.kind)
+def test_round_trip_gives_the_same_model(model, tmp_path):
+    """Dumped and read back, from a text or a file, a model is equal to itself."""
+    text = dump_model(model)
+    assert parse_model("text", text) == model
+    path = tmp_path / "model.yaml"
+    path.write_text(text, encoding="utf-8")
+    assert load_model(path) == model
+
+
+def test_all_of_a_model_survives():
+    """Units, ranges, offset and provenance come back as well."""
+    provenance = Provenance(
+        source=("run-1.mcap", "ångström: 'quoted' # 5"),
+        method="fit",
+        grid=("6 A 10 Hz",),
+        parameters={"alpha": 0.1 + 0.2},
+        errors_percent={"6 A": 1e-17},
+        versions={"hilctl": "0.1.0"},
+        created="2024-05-01",
+    )
+    model = OMEGA.model_copy(update={
+        "input_unit": "V", "input_range": (-6.0, 6.0), "output_range_um": (-50.0, 1 / 3),
+        "output_offset_um": -0.0, "provenance": provenance,
+    })  # fmt: skip
+    back = parse_model("text", dump_model(model))
+    assert isinstance(back, IntegratedModel)
+    assert back == model
+
+
+def test_dump_is_plain_yaml():
+    """Any YAML reader reads a dumped model, and it says its kind."""
+    for model in MODELS:
+        data = yaml.safe_load(dump_model(model))
+        assert data["model"]["kind"] == model.kind
+        assert type(model) in get_args(get_args(AnyModel)[0])
+
+
+def test_every_problem_is_told_at_once():
+    """Each broken rule of a file has its own line: file:line: key: rule, value, hint."""
+    text = RDPI.replace("2.7", "1_3").replace("0.1]", ".nan]").replace("gamma_s", "gama_s")
+    assert problems_of(text + "  input_unit: mA\n  output_offset_um: .inf\n") == [
+        "m.yaml:7: model.input_unit: must be one of 'A' or 'V', got 'mA'",
+        "m.yaml:8: model.output_offset_um: must be a finite number, got inf",
+        "m.yaml:3: model.direct: must be a number, got '1_3' "
+        "(write a plain number, such as 1000, 0.5 or 1e-3)",
+        "m.yaml:4: model.weights.1: must be a finite number, got nan",
+        "m.yaml:6: model.gama_s: unknown key (did you mean 'gamma_s'?)",
+    ]
+
+
+@pytest.mark.parametrize(("before", "after", "problem"), [
+    ("direct: 2.7", "direct: -1", "m.yaml:1: model: a_0 must be > 0 for the inverse to exist: -1"),
+    ("0.1]", "-0.1]", "m.yaml:1: model: a_2 must be >= 0 for the inverse to exist: -0.1"),
+    ("0.1]", "0.1, 1]", "m.yaml:4: model: weights must have one value a threshold: 3 for 2"),
+    ("2.0e-4", "-1", "m.yaml:6: model.gamma_s: must be >= 0.0, got -1"),
+    ("  direct: 2.7\n", "", "m.yaml:1: model.direct: is required"),
+    ("  kind: rdpi\n", "", "m.yaml:1: model: needs a 'kind'"),
+    ("kind: rdpi", "kind: rpdi",
+     "m.yaml:2: model.kind: must be one of 'ppi', 'spi', 'rdpi', 'integrated', "),
+    ("kind: rdpi", "kind: ppi", "m.yaml:6: model.gamma_s: unknown key"),
+    ("gamma_s", "rdpi", "m.yaml:6: model.rdpi: unknown key"),
+    ("[0.3, 0.6]", "0.3", "m.yaml:5: model.thresholds: must be a list, got 0.3"),
+    ("model:\n", "modell:\n", "m.yaml:1: modell: unknown key (did you mean 'model'?)"),
+])  # fmt: skip
+def test_a_broken_rule_is_placed(before, after, problem):
+    """The line, the dotted key, the rule and the value are those of the mistake."""
+    assert before in RDPI
+    assert any(line.startswith(problem) for line in problems_of(RDPI.replace(before, after)))
+
+
+def test_deadband_problems_are_placed_below_the_model():
+    """A nested part has its own line and dotted key."""
+    text = RDPI.replace("rdpi", "integrated") + "  deadband:\n    slope: on\n    up_weight: []\n"
+    assert problems_of(text) == [
+        "m.yaml:8: model.deadband.slope: must be a number, got 'on'",
+        "m.yaml:9: model.deadband.up_weight: unknown key (did you mean 'up_weights'?)",
+    ]
+
+
+def test_files_that_cannot_be_read_say_so(tmp_path):
+    """Missing, a folder, not text: an InputError with the path."""
+    with pytest.raises(InputError, match=r"none\.yaml: no such file"):
+        load_model(tmp_path / "none.yaml")
+    with pytest.raises(InputError, match="is not a file"):
+        load_model(tmp_path)
+    binary = tmp_path / "binary.yaml"
+    binary.write_bytes(b"model: \xff\xfe")
+    with pytest.raises(InputError, match="is not UTF-8 text"):
+        load_model(binary)
+
+
+@pytest.mark.parametrize("count", [200, pytest.param(2_000, marks=pytest.mark.slow)])
+def test_damaged_files_are_refused_in_words(count):
+    """Damaged model files: each is read or refused, and never anything else."""
+    texts = [RDPI, dump_model(OMEGA)]
+    refusals = []
+    for seed in range(count):
+        rng = random.Random(seed)
+        text = mutated(rng, rng.choice(texts))
+        try:
+            parse_model("m.yaml", text)
+        except InputError as error:
+            refusals.append(str(error))
+    assert len(refusals) > 0.75 * count
+    assert all(text.startswith("m.yaml") for text in refusals)
+    assert "\n".join(refusals).encode("utf-8")

@@ -1,0 +1,263 @@
+"""A campaign's runs: what stands is kept, what fails is marked, what endangers a rig ends it."""
+
+import time
+from dataclasses import replace
+
+import pytest
+from tests.unit.campaign.conftest import CAMPAIGN
+
+from hilctl.base.errors import DeviceError, InputError
+from hilctl.base.events import Event
+from hilctl.recording.reader import read
+from hilctl.run.start import unpaced
+from hilctl.studies.campaign import campaign_runner
+from hilctl.studies.campaign.campaign_runner import (
+    CampaignHost,
+    is_harmless,
+    planned_in_real_time,
+    prepared,
+    run_series,
+)
+
+BUDGET = "set: {limits.rms_current_a: 0.9, limits.thermal_time_constant_s: 3.0}\n"
+
+
+class Rig:
+    """Runs for real, but for one that a test ends otherwise; keeps what was run and waited for."""
+
+    def __init__(self, ends_at=99, error=None, **ends):
+        self.ends_at, self.error, self.ends = ends_at, error, ends
+        self.runs, self.rows, self.texts, self.pauses = [], [], [], []
+        self.time_s = time.time()
+
+    def __call__(self, path, settings, output, on_part, *, overwrite, heat_a2):
+        assert not overwrite
+        self.runs.append((output.name, heat_a2))
+        on_part(0.5)
+        if len(self.runs) == self.ends_at and self.error:
+            raise self.error
+        result = unpaced(path, settings, output, overwrite=False, heat_a2=heat_a2)
+        self.time_s += result.samples / 2000.0
+        return replace(result, **self.ends) if len(self.runs) == self.ends_at else result
+
+    def sleep(self, seconds):
+        self.pauses.append(seconds)
+        self.time_s += seconds
+
+    @property
+    def host(self):
+        return CampaignHost(
+            run=self,
+            now_s=lambda: self.time_s,
+            sleep_s=self.sleep,
+            on_row=lambda step, row: self.rows.append((step.number, row.code, row.kept)),
+            on_progress=lambda done, text: self.texts.append((done, text)),
+        )
+
+
+@pytest.fixture
+def run(campaign, tmp_path):
+    """Run a campaign on a rig."""
+
+    def go(rig, text=CAMPAIGN, host=None):
+        folder = tmp_path / "runs"
+        folder.mkdir(exist_ok=True)
+        plan = planned_in_real_time(campaign(text), folder, rig.time_s)
+        return run_series(plan, host or rig.host)
+
+    return go
+
+
+def codes(result):
+    return [row.code for _, row in result.ordered]
+
+
+def test_every_step_is_run_and_recorded(run, tmp_path):
+    rig = Rig()
+    result = run(rig)
+    assert codes(result) == ["completed"] * 4
+    assert [name for name, _ in rig.runs] == [f"few-000{k}.mcap" for k in range(1, 5)]
+    assert (result.reason, result.stop_signal, result.drift) == ("", 0, None)
+    assert all(each.is_file() for each in result.tables)
+    suffixes = {path.suffix for path in (tmp_path / "runs").iterdir()}
+    assert suffixes == {".mcap", ".csv", ".parquet", ".html"}
+
+
+def test_what_stands_is_kept_and_nothing_is_overwritten(run, tmp_path):
+    """A value more costs its own runs only."""
+    run(Rig())
+    before = {each: each.read_bytes() for each in (tmp_path / "runs").glob("*.mcap")}
+    rig = Rig()
+    result = run(rig, CAMPAIGN.replace("[1.0, 2.0]", "[0.5, 1.0, 2.0]"))
+    assert [name for name, _ in rig.runs] == ["few-0001-2.mcap", "few-0002-2.mcap"]
+    assert rig.rows[:4] == [
+        (3, "completed", True),
+        (4, "completed", True),
+        (5, "completed", True),
+        (6, "completed", True),
+    ]
+    assert result.count("completed") == 6
+    assert all(path.read_bytes() == content for path, content in before.items())
+    again = Rig()
+    assert run(again, CAMPAIGN.replace("[1.0, 2.0]", "[0.5, 1.0, 2.0]")).count("completed") == 6
+    assert again.runs == []
+
+
+def test_a_failed_step_is_marked_and_the_rest_goes_on(run, monkeypatch):
+    """Lateness says nothing of the rig; the same command tries that step again."""
+    monkeypatch.setattr(campaign_runner, "is_harmless", lambda result: True)
+    result = run(Rig(2, code="fault", reason="late"))
+    assert codes(result) == ["completed", "fault", "completed", "completed"]
+    assert result.rows[2].result == "fault: late"
+    rig = Rig()
+    monkeypatch.setattr("hilctl.studies.campaign.store.completed_key", _but("few-0002.mcap"))
+    assert codes(run(rig)) == ["completed"] * 4
+    assert [name for name, _ in rig.runs] == ["few-0002-2.mcap"]
+
+
+def _but(name):
+    from hilctl.run.start import completed_key
+
+    return lambda path: None if path.name == name else completed_key(path)
+
+
+def test_a_fault_of_device_or_rig_ends_the_campaign(run):
+    result = run(Rig(2, code="fault", reason="stroke"))
+    assert codes(result) == ["completed", "fault", "planned", "planned"]
+    assert result.reason.endswith(": stroke")
+    assert "step 2 (waveform.amplitude=1.0, waveform.frequency_hz=20.0)" in result.reason
+
+
+def test_a_device_that_can_t_be_opened_ends_it_too(run):
+    result = run(Rig(3, error=DeviceError("modbus_dac: no answer")))
+    assert codes(result) == ["completed", "completed", "fault", "planned"]
+    assert "no answer" in result.reason
+
+
+def test_ctrl_c_ends_it_and_the_same_command_goes_on(run):
+    result = run(Rig(3, code="stopped", stop_signal=2, reason="Ctrl-C"))
+    assert (result.stop_signal, codes(result)) == (
+        2,
+        ["completed", "completed", "stopped", "planned"],
+    )
+
+
+@pytest.mark.parametrize(
+    ("events", "safe", "harmless"),
+    [
+        (["late"], True, True),
+        (["late"], False, False),
+        (["late", "stroke"], True, False),
+        (["device_lost"], True, False),
+        ([], True, False),
+    ],
+)
+def test_what_says_nothing_of_the_rig(monkeypatch, events, safe, harmless, make_recording):
+    from types import SimpleNamespace
+
+    import numpy as np
+
+    made = make_recording(
+        np.zeros(10), events=tuple(Event(1, "error", code, "") for code in events)
+    )
+    monkeypatch.setattr(campaign_runner, "read", lambda path: made)
+    assert is_harmless(SimpleNamespace(safe=safe, path=None)) is harmless
+
+
+@pytest.mark.slow
+def test_the_coil_cools_and_its_heat_goes_on(run, tmp_path):
+    """Each run begins with what the one before has left, cooled by the time in between."""
+    rig = Rig()
+    result = run(
+        rig,
+        CAMPAIGN.replace("[1.0, 2.0]", "[2.5]").replace("10.0, 20.0", "10.0, 20.0, 30.0")
+        + BUDGET
+        + "repeat: 2\n",
+    )
+    assert set(codes(result)) == {"completed"}, result.reason
+    assert sum(rig.pauses) > 1.0
+    assert any("the coil cools for" in text for _, text in rig.texts)
+    heats = [
+        float(read(path).end["coil_heat_a2"]) for path in sorted((tmp_path / "runs").glob("*.mcap"))
+    ]
+    begins = [heat_a2 for _, heat_a2 in rig.runs]
+    assert begins[0] == 0.0
+    assert all(0.0 < begin <= left for begin, left in zip(begins[1:], heats, strict=False))
+    assert max(heats) <= 0.81
+
+
+def test_it_cools_as_far_as_is_asked_for(run):
+    rig = Rig()
+    run(rig, CAMPAIGN + BUDGET + "cool_down: {to_rms_a: 0.05}\n")
+    assert all(heat_a2 <= 0.05**2 * 1.001 for _, heat_a2 in rig.runs)
+    assert sum(rig.pauses) > 5.0
+
+
+def test_progress_says_the_time_left(run):
+    rig = Rig()
+    run(rig)
+    done = [part for part, _ in rig.texts]
+    assert done == sorted(done)
+    assert 0.0 < done[-1] <= 1.0
+    assert rig.texts[0][1].endswith("0:00:01 left")
+
+
+def test_an_experiment_that_changes_meanwhile_ends_it(run, experiment):
+    class Changing(Rig):
+        def __call__(self, path, settings, output, on_part, **more):
+            experiment.write_text(experiment.read_text() + "description: another\n")
+            return super().__call__(path, settings, output, on_part, **more)
+
+    result = run(Changing())
+    assert "has changed since the campaign began" in result.reason
+    assert set(codes(result)) == {"planned"}
+
+
+def test_a_folder_is_prepared_for_one(tmp_path):
+    notes = []
+    host = replace(Rig().host, on_note=notes.append)
+    with prepared(tmp_path / "runs", host):
+        assert (tmp_path / "runs").is_dir()
+    assert notes == []
+
+
+@pytest.mark.slow
+def test_the_page_follows_as_long_as_it_takes_little_of_the_time(run, drawn_pages):
+    """Within the first minute it is written at the end only; then between steps as well."""
+    rig = Rig()
+    run(rig)
+    assert drawn_pages == [("few.html", 4)]
+    slow = Rig()
+    told = slow.__call__
+
+    def slower(*given, **keys):
+        result = told(*given, **keys)
+        slow.time_s += 50.0
+        return result
+
+    drawn_pages.clear()
+    host = replace(slow.host, run=slower)
+    assert host.run is slower
+    run(slow, CAMPAIGN.replace("name: few", "name: long"), host)
+    assert drawn_pages == [("long.html", 2), ("long.html", 4), ("long.html", 4)]
+
+
+def test_a_page_that_can_t_be_written_ends_nothing(run, monkeypatch):
+    """Recordings and table have all that is on it; it is said."""
+
+    def fail(series, path):
+        raise InputError(f"{path.name}: no space left")
+
+    monkeypatch.setattr("hilctl.studies.multi_run.multi_run_page.write_series", fail)
+    rig, notes = Rig(), []
+    result = run(rig, CAMPAIGN, replace(rig.host, on_note=notes.append))
+    assert codes(result) == ["completed"] * 4
+    assert result.page is None
+    assert notes == ["no page: few.html: no space left"]
+
+
+def test_ctrl_c_between_two_steps_leaves_a_page(run, drawn_pages):
+    rig = Rig(ends_at=3, error=KeyboardInterrupt())
+    with pytest.raises(KeyboardInterrupt):
+        run(rig)
+    assert drawn_pages == [("few.html", 2)]

@@ -1,0 +1,77 @@
+"""Every step is held against its limits before the first one moves."""
+
+import pytest
+from tests.unit.campaign.conftest import CAMPAIGN
+
+from hilctl.base.errors import ConfigError, InputError
+from hilctl.studies.campaign.plan import planned
+
+HOT = "set: {limits.rms_current_a: 0.7, limits.thermal_time_constant_s: 2.0}\n"
+
+
+def test_what_it_takes(campaign, tmp_path):
+    plan = planned(campaign(), tmp_path / "runs", {}, 0.0)
+    assert plan.seconds == pytest.approx(4 * 0.4)
+    assert (plan.pauses_s, len(plan.left)) == (0.0, 4)
+    assert 0.0 < plan.megabytes < 1.0
+    plan.require_room()
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_step_that_breaks_a_limit_is_refused_before_the_first_run(campaign, tmp_path):
+    """With the value's place in the campaign file, the step, and how many others there are."""
+    text = CAMPAIGN.replace("[1.0, 2.0]", "[1.0, -2.0, 5.0]")
+    with pytest.raises(ConfigError) as found:
+        planned(campaign(text), tmp_path / "runs", {}, 0.0)
+    said = str(found.value).splitlines()
+    assert len(said) == 2
+    assert "few.yaml:4: waveform.amplitude: must be > 0" in said[0]
+    assert "in step 3 (waveform.amplitude=-2.0, waveform.frequency_hz=10.0) and 1 more" in said[0]
+    assert "rig.yaml:7: limits.peak_current_a: the run must stay within -4 to 4 A" in said[1]
+    assert "step 5" in said[1]
+
+
+def test_what_is_wrong_with_all_of_them_is_said_once(campaign, tmp_path):
+    with pytest.raises(ConfigError) as found:
+        planned(campaign(CAMPAIGN, "limits.slew_a_per_s=1.0"), tmp_path, {}, 0.0)
+    assert str(found.value).count("\n") == 0
+    assert str(found.value).endswith("in every step)")
+    with pytest.raises(ConfigError) as found:
+        planned(campaign(CAMPAIGN, "blok=1"), tmp_path, {}, 0.0)
+    assert str(found.value).endswith("in every step)")
+
+
+def test_no_experiment(campaign, experiment, tmp_path):
+    few = campaign()
+    experiment.unlink()
+    with pytest.raises(InputError, match=r"few.yaml:2: experiment: .*rig.yaml: no such file"):
+        planned(few, tmp_path, {}, 0.0)
+
+
+def test_the_coil_cools_between_steps(campaign, tmp_path):
+    """As long as each step needs, and what the last run has left counts."""
+    few = campaign(CAMPAIGN + HOT)
+    cold, hot = (planned(few, tmp_path, {}, heat_a2) for heat_a2 in (0.0, 0.48))
+    assert cold.steps[0].pause_s == 0.0
+    assert cold.pauses_s > 0.0
+    assert hot.pauses_s > cold.pauses_s
+    to = planned(campaign(CAMPAIGN + HOT + "cool_down: {to_rms_a: 0.1}\n"), tmp_path, {}, 0.0)
+    assert [each.heat_a2**0.5 <= 0.1 + 1e-9 for each in to.steps] == [True] * 4
+    assert to.pauses_s > cold.pauses_s
+
+
+def test_what_stands_is_not_run(campaign, tmp_path):
+    """As often as it stands; another experiment's does not count."""
+    plan = planned(campaign(CAMPAIGN + "repeat: 2"), tmp_path, {}, 0.0)
+    standing = {plan.steps[0].key: [tmp_path / "a.mcap"]}
+    again = planned(campaign(CAMPAIGN + "repeat: 2"), tmp_path, standing, 0.0)
+    assert [each.kept is not None for each in again.steps] == [True] + [False] * 7
+    other = planned(campaign(CAMPAIGN + "set: {waveform.duration_s: 0.5}"), tmp_path, standing, 0.0)
+    assert len(other.left) == 4
+
+
+def test_no_room(campaign, tmp_path, monkeypatch):
+    plan = planned(campaign(), tmp_path, {}, 0.0)
+    object.__setattr__(plan, "free_mb", 1e-3)
+    with pytest.raises(InputError, match="no room for the recordings"):
+        plan.require_room()

@@ -1,0 +1,81 @@
+"""The steps of a campaign: settings over one experiment."""
+
+import json
+
+import pytest
+from tests.unit.campaign.conftest import CAMPAIGN
+
+from hilctl.base.errors import ConfigError
+from hilctl.base.files import TextFiles
+from hilctl.studies.campaign.steps import setting
+
+
+def test_each_step_is_the_experiment_with_its_values(campaign):
+    few = campaign()
+    assert few.keys == ("waveform.amplitude", "waveform.frequency_hz")
+    loaded = [few.load(step, TextFiles()).config for step in few.steps]
+    found = [(each.waveform.amplitude, each.waveform.frequency_hz) for each in loaded]
+    assert found == [(1.0, 10.0), (1.0, 20.0), (2.0, 10.0), (2.0, 20.0)]
+    assert {each.name for each in loaded} == {"few"}
+
+
+def test_each_run_has_noise_of_its_own_that_depends_on_nothing_but_the_step(campaign):
+    """A value more, or another order, and what stands still counts."""
+    texts = {}
+    for text in (
+        CAMPAIGN,
+        CAMPAIGN.replace("[1.0, 2.0]", "[2.0, 0.5, 1.0]"),
+        CAMPAIGN + "repeat: 2",
+    ):
+        few = campaign(text)
+        loaded = [few.load(step, TextFiles()) for step in few.steps]
+        assert len({each.config.device["seed"] for each in loaded}) == len(loaded)
+        texts[text] = {each.yaml_text for each in loaded}
+    first, *others = texts.values()
+    assert all(first <= other for other in others)
+
+
+def test_seeds_that_are_varied_are_left_alone(campaign):
+    few = campaign(CAMPAIGN + "  device.seed: [7, 8]\n")
+    seeds = [few.load(step, TextFiles()).config.device["seed"] for step in few.steps]
+    assert set(seeds) == {7, 8}
+
+
+def test_reference_runs_come_first_now_and_then_and_last(campaign):
+    few = campaign(CAMPAIGN + "reference_run: {every: 2, set: {waveform.amplitude: 3.0}}\n")
+    assert [step.is_reference for step in few.steps] == [
+        True,
+        False,
+        False,
+        True,
+        False,
+        False,
+        True,
+    ]
+    assert [step.number for step in few.steps] == [*range(1, 8)]
+    references = [step for step in few.steps if step.is_reference]
+    assert [step.repeat for step in references] == [1, 2, 3]
+    amplitudes = {few.load(step, TextFiles()).config.waveform.amplitude for step in references}
+    assert amplitudes == {3.0}
+
+
+def test_whole_sections_and_the_condition(campaign):
+    text = CAMPAIGN.replace("waveform.amplitude: [1.0, 2.0]", "compensator: [none]")
+    few = campaign(text + "condition: {cycles: 4}\nset: {recording: {flush_s: 1.0}}\n", "block=10")
+    config = few.load(few.steps[0], TextFiles()).config
+    assert (config.condition.cycles, config.recording.flush_s, config.block) == (4, 1.0, 10)
+
+
+def test_broken_rules_have_their_place(campaign):
+    text = CAMPAIGN.replace("[10.0, 20.0]", "10:20") + "  name: [x]\nset: {name: y}\n"
+    with pytest.raises(ConfigError) as found:
+        campaign(text, "waveform.amplitude=2")
+    said = str(found.value)
+    assert "few.yaml:5: vary.waveform.frequency_hz: must be a list of values, or a range" in said
+    assert "few.yaml:4: vary.waveform.amplitude: is set to one value by waveform.amplitude" in said
+    assert "few.yaml:6: vary.name: is set to one value by name" in said
+
+
+def test_settings_take_any_plain_value():
+    for value in (1e-7, "a: b #", None, True, [1, {"k": "µ"}]):
+        assert json.loads(setting("key", value).removeprefix("key=")) == value

@@ -1,0 +1,71 @@
+"""The table of a campaign."""
+
+import csv
+import os
+from dataclasses import replace
+
+import pytest
+from tests.unit.campaign.conftest import CAMPAIGN
+
+from hilctl.studies.campaign.plan import planned
+from hilctl.studies.campaign.table import CampaignRow, write_table
+from hilctl.studies.multi_run.run_figures import FIGURES, RunFigures
+
+DONE = CampaignRow("completed", RunFigures(peak_to_peak_um=0.1 + 0.2), "few-0001.mcap", "completed")
+
+
+@pytest.fixture
+def plan(campaign, tmp_path):
+    text = CAMPAIGN.replace("waveform.frequency_hz: [10.0, 20.0]", "compensator: [none]")
+    return planned(campaign(text + "reference_run: {every: 9}"), tmp_path, {}, 0.0)
+
+
+def read_back(path):
+    with path.open(newline="", encoding="utf-8") as stream:
+        return list(csv.DictReader(stream))
+
+
+def test_every_step_is_a_row_whether_it_was_run_or_not(plan):
+    """Numbers read back as the same bits; what there is not is empty."""
+    paths = write_table(plan, {1: DONE}, {"campaign": "few"})
+    rows = read_back(paths[0])
+    assert paths[0].name == "few.csv"
+    assert list(rows[0])[:5] == [
+        "step",
+        "repeat",
+        "reference_run",
+        "waveform.amplitude",
+        "compensator",
+    ]
+    assert [name for name in rows[0] if name in FIGURES] == list(FIGURES)
+    assert float(rows[0]["peak_to_peak_um"]) == 0.1 + 0.2
+    assert rows[0]["loop_area"] == ""
+    assert [row["result"] for row in rows] == ["completed", "planned", "planned", "planned"]
+    assert [row["waveform.amplitude"] for row in rows] == ["", "1.0", "2.0", ""]
+    assert rows[1]["compensator"] == "none"
+
+
+def test_it_is_replaced_whole(plan, monkeypatch):
+    path = write_table(plan, {}, {})[0]
+    before = path.read_bytes()
+
+    def fail(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", fail)
+    with pytest.raises(Exception, match="No space left"):
+        write_table(plan, {1: DONE}, {})
+    assert path.read_bytes() == before
+    assert [each.name for each in path.parent.glob(".few*")] == []
+
+
+def test_parquet_has_the_same_and_its_facts(plan):
+    parquet = pytest.importorskip("pyarrow.parquet")
+    csv_path, path = write_table(
+        plan, {1: DONE, 2: replace(DONE, result="fault: x")}, {"campaign": "few"}
+    )
+    table = parquet.read_table(path)
+    assert table.column("peak_to_peak_um").to_pylist() == [0.1 + 0.2] * 2 + [None] * 2
+    assert table.column("waveform.amplitude").to_pylist() == [None, 1.0, 2.0, None]
+    assert table.schema.metadata[b"hilctl.studies.campaign"] == b"few"
+    assert table.column_names == list(read_back(csv_path)[0])

@@ -1,0 +1,63 @@
+"""Limits of an experiment, and steps played on an actuator that is a formula."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilctl.experiment.load import load_experiment
+from hilctl.studies.characterise.limits import limits_of
+from hilctl.studies.characterise.waveforms import reference_of, within
+
+EXPERIMENT = """\
+name: rig
+device: {kind: simulated_terfenol, seed: 3}
+sample_rate_hz: 5000
+block: 50
+waveform: {kind: hold, unit: A, level: 0.0, duration_s: 1.0}
+compensator: none
+limits: {peak_current_a: 4.0, slew_a_per_s: 5000.0, stroke_um: [-50.0, 50.0]}
+"""
+
+
+@pytest.fixture
+def experiment(tmp_path) -> Path:
+    """Return an experiment file."""
+    path = tmp_path / "rig.yaml"
+    path.write_text(EXPERIMENT, encoding="utf-8")
+    return path
+
+
+@pytest.fixture
+def limits_with(experiment) -> Callable[..., object]:
+    """Return the limits of the experiment with settings over it."""
+
+    def make(*settings, highest_hz=None):
+        return limits_of(load_experiment(experiment, settings), highest_hz)
+
+    return make
+
+
+@pytest.fixture
+def limits(limits_with):
+    return limits_with()
+
+
+@pytest.fixture
+def played(make_recording):
+    """Return a recording of a waveform's keys on an actuator: its displacement of a command."""
+
+    def play(limits, keys, actuator, noise_um=0.0, seed=1):
+        keys, _ = within(limits, keys)
+        reference = reference_of(limits, keys)
+        command = reference.values.copy()
+        noise = noise_um * np.random.default_rng(seed).standard_normal(command.size)
+        return make_recording(
+            actuator(command) + noise,
+            command=command,
+            segments=reference.segments,
+            sample_rate_hz=limits.sample_rate_hz,
+        )
+
+    return play

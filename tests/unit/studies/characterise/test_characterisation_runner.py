@@ -1,0 +1,314 @@
+"""A campaign's runs: which are needed, which stand already, what ends it, what it waits for."""
+
+import json
+import signal
+import time
+from dataclasses import replace
+
+import pytest
+
+from hilctl.base.errors import InputError, RunError
+from hilctl.experiment.load import load_experiment
+from hilctl.run.start import StepStoppedError, unpaced
+from hilctl.studies.characterise import characterisation_runner
+from hilctl.studies.characterise.characterisation_runner import (
+    CharacterisationHost,
+    CharacterisationRunner,
+    unit_of,
+    waveform_setting,
+    without_reference,
+)
+from hilctl.studies.characterise.steps import STEPS
+from hilctl.studies.characterise.waveforms import biased_loops
+
+FEW = ("rest", "polarity", "growing-1", "growing-2")
+SHORT = tuple(step for step in STEPS if step.name.startswith(FEW))
+
+
+RECORDED = {}
+"""What an experiment with settings came to: the same whichever campaign asks for it."""
+
+
+def recorded(path, settings, output, on_part):
+    """Run an experiment, once for all tests of this module."""
+    asked = path.read_text(encoding="utf-8"), tuple(settings)
+    if asked not in RECORDED:
+        RECORDED[asked] = unpaced(path, settings, output, on_part), output.read_bytes()
+    result, recording = RECORDED[asked]
+    output.write_bytes(recording)
+    return replace(result, path=output)
+
+
+class Rig:
+    """Runs for real, but for one that a test ends otherwise; keeps what was run and waited for."""
+
+    def __init__(self, ends_at=99, code="completed", stop_signal=0, error=None):
+        self.ends_at, self.code, self.stop_signal = ends_at, code, stop_signal
+        self.error = error
+        self.runs, self.rows, self.texts, self.pauses, self.time_s = [], [], [], [], 0.0
+
+    def __call__(self, path, settings, output, on_part):
+        self.runs.append((output.name, list(settings)))
+        on_part(0.5)
+        if len(self.runs) == self.ends_at and self.error:
+            raise self.error
+        result = recorded(path, settings, output, on_part)
+        self.time_s += result.samples / 5000.0
+        if len(self.runs) == self.ends_at:
+            result = replace(result, code=self.code, stop_signal=self.stop_signal, reason="a test")
+        return result
+
+    def sleep(self, seconds):
+        self.pauses.append(seconds)
+        self.time_s += seconds
+
+    def host(self):
+        return CharacterisationHost(
+            run=self,
+            now_s=lambda: self.time_s,
+            sleep_s=self.sleep,
+            on_step=self.rows.append,
+            on_progress=lambda done, text: self.texts.append((done, text)),
+        )
+
+
+@pytest.fixture(autouse=True)
+def short(monkeypatch):
+    """Let a campaign have few steps, and no model."""
+    monkeypatch.setattr(characterisation_runner, "STEPS", SHORT)
+    monkeypatch.setattr(characterisation_runner, "identified", lambda *_, **__: None)
+    monkeypatch.setattr(
+        CharacterisationRunner, "_with_model", lambda self, result, *_, **__: self._so_far(result)
+    )
+
+
+def run(experiment, rig, *settings, folder="runs"):
+    campaign = CharacterisationRunner(
+        experiment, list(settings), experiment.parent / folder, None, rig.host()
+    )
+    return campaign.characterise(experiment.parent / "model.yaml")
+
+
+@pytest.mark.slow
+def test_each_step_is_a_run_with_noise_of_its_own(experiment):
+    rig = Rig()
+    found = run(experiment, rig)
+    assert [name for name, _ in rig.runs] == [
+        "01-rest.mcap", "02-polarity-1.mcap", "05-growing-1.mcap",
+        "06-growing-2.mcap",
+    ]  # fmt: skip
+    assert [settings[-1] for _, settings in rig.runs] == [
+        "device.seed=4", "device.seed=5", "device.seed=8", "device.seed=9",
+    ]  # fmt: skip
+    assert [row.name for row in rig.rows] == ["rest", "polarity-1", "growing-1", "growing-2"]
+    assert found.steps == tuple(rig.rows)
+    assert "noise 0.035" in rig.rows[0].text
+    assert found.measured.reaction.gain_um > 3.0
+
+
+def test_what_stands_is_not_run_again(experiment):
+    """And says the same: amplitudes follow from the recordings."""
+    first = run(experiment, Rig())
+    rig = Rig()
+    again = run(experiment, rig)
+    assert rig.runs == []
+    assert [row.kept for row in rig.rows] == [True] * 4
+    assert again.measured.reaction == first.measured.reaction
+
+
+def test_a_step_that_was_cut_short_is_run_again_and_no_other(experiment):
+    run(experiment, Rig())
+    path = experiment.parent / "runs" / "02-polarity-1.mcap"
+    path.write_bytes(path.read_bytes()[:20_000])
+    rig = Rig()
+    run(experiment, rig)
+    assert [name for name, _ in rig.runs] == ["02-polarity-1.mcap"]
+
+
+def test_a_file_that_is_no_recording_is_run_over(experiment):
+    folder = experiment.parent / "runs"
+    folder.mkdir()
+    (folder / "01-rest.mcap").write_text("nothing")
+    rig = Rig()
+    run(experiment, rig)
+    assert len(rig.runs) == 4
+
+
+@pytest.mark.slow
+def test_recordings_of_another_experiment_do_not_count(experiment):
+    run(experiment, Rig())
+    rig = Rig()
+    run(experiment, rig, "limits.peak_current_a=3.0")
+    assert len(rig.runs) == 4
+
+
+def test_discarding_begins_anew(experiment):
+    run(experiment, Rig())
+    rig = Rig()
+    campaign = CharacterisationRunner(experiment, [], experiment.parent / "runs", None, rig.host())
+    campaign.discard()
+    assert not list((experiment.parent / "runs").glob("*.mcap"))
+
+
+def test_a_problem_is_what_was_found_not_an_error(experiment):
+    """What was measured before stands on the page."""
+    fault = "device.fault={kind: sensor_inverted, at_sample: 0}"
+    found = run(experiment, Rig(), fault)
+    assert found.problem_code == "wrong_polarity"
+    assert "swap the wires" in found.problem
+    assert found.measured.rest is not None
+    assert [row.name for row in found.steps] == ["rest", "polarity-1"]
+
+
+def test_a_sensor_at_its_end_is_named(experiment):
+    """The interlock ends the run; the campaign says what that means."""
+    fault = "device.fault={kind: sensor_nan, at_sample: 3000}"
+    with pytest.raises(RunError, match="rest: "):
+        run(experiment, Rig(), fault)
+
+
+def test_somebody_may_stop_it(experiment):
+    rig = Rig(ends_at=2, code="stopped", stop_signal=signal.SIGTERM)
+    with pytest.raises(StepStoppedError, match="polarity-1: a test") as caught:
+        run(experiment, rig)
+    assert caught.value.signal == signal.SIGTERM
+
+
+def test_a_later_step_that_is_refused_is_no_bad_input(experiment):
+    """The first has moved the actuator: exit code 2 would say that nothing had."""
+    with pytest.raises(RunError, match="polarity-1 is refused: too fast"):
+        run(experiment, Rig(ends_at=2, error=InputError("too fast")))
+    with pytest.raises(InputError, match="too fast"):
+        run(experiment, Rig(ends_at=1, error=InputError("too fast")), folder="others")
+
+
+@pytest.mark.slow
+def test_the_coil_is_let_cool(experiment):
+    """The second of the growing loops waits for what the first has left."""
+    budget = ["limits.rms_current_a=0.05", "limits.thermal_time_constant_s=20.0"]
+    rig = Rig()
+    run(experiment, rig, *budget)
+    assert rig.pauses
+    assert sum(rig.pauses) < 100.0
+    assert any("the coil cools for" in text for _, text in rig.texts)
+
+
+def test_a_coil_that_has_cooled_since_is_not_waited_for(experiment):
+    """What was run an hour ago heats no more."""
+    budget = ["limits.rms_current_a=0.05", "limits.thermal_time_constant_s=20.0"]
+    run(experiment, Rig(), *budget)
+    (experiment.parent / "runs" / "06-growing-2.mcap").unlink()
+    rig = Rig()
+    rig.time_s = time.time() + 3600.0
+    run(experiment, rig, *budget)
+    assert [name for name, _ in rig.runs] == ["06-growing-2.mcap"]
+    assert rig.pauses == []
+
+
+@pytest.mark.slow
+def test_where_the_output_is_given_by_hand_it_is_at_rest_after_the_first_step(experiment):
+    rig = Rig()
+    run(experiment, rig, "safe={value: 0.0, at_start: 0.5}", "device.output_at_open=null")
+    given = [[each for each in settings if "at_start=" in each] for _, settings in rig.runs]
+    assert given == [[], *([["safe.at_start=0.0"]] * 3)]
+
+
+def test_progress_says_the_time_left(experiment):
+    rig = Rig()
+    run(experiment, rig)
+    done = [part for part, _ in rig.texts]
+    assert done == sorted(done)
+    assert rig.texts[0][1].startswith("rest: noise and drift at rest; 0:")
+    assert rig.texts[0][1].endswith(" left")
+
+
+def test_the_plan_says_steps_time_and_disk(experiment):
+    rig = Rig()
+    campaign = CharacterisationRunner(experiment, [], experiment.parent / "runs", None, rig.host())
+    plan = campaign.plan
+    assert [step.name for step in plan.steps] == [step.name for step in SHORT]
+    assert plan.seconds == pytest.approx(sum(step.seconds for step in plan.steps))
+    assert plan.megabytes == pytest.approx(plan.seconds * 5000 * 45e-6)
+    assert rig.runs == []
+    assert not (experiment.parent / "runs").exists()
+
+
+def test_a_full_disk_is_said_before_anything_moves(experiment):
+    rig = Rig()
+    campaign = CharacterisationRunner(experiment, [], experiment.parent / "runs", None, rig.host())
+    campaign.__dict__["plan"] = replace(campaign.plan, free_mb=0.1)
+    with pytest.raises(InputError, match="no room for the recordings"):
+        campaign.characterise(experiment.parent / "model.yaml")
+    assert rig.runs == []
+
+
+def test_a_real_device_keeps_real_time(experiment, monkeypatch):
+    from hilctl_drivers.simulated.devices import SimulatedTerfenol
+
+    info = SimulatedTerfenol.info
+    monkeypatch.setattr(
+        SimulatedTerfenol, "info", property(lambda self: replace(info.fget(self), simulated=False))
+    )
+    with pytest.raises(InputError, match="--fast: simulated_terfenol: only a simulated device"):
+        CharacterisationRunner(
+            experiment, [], experiment.parent / "runs", None, CharacterisationHost(run=unpaced)
+        )
+
+
+def test_a_broken_experiment_is_refused_at_once(experiment):
+    with pytest.raises(InputError, match="sample_rate_hz"):
+        CharacterisationRunner(experiment, ["sample_rate_hz=5e5"], experiment.parent / "runs")
+
+
+@pytest.mark.slow
+def test_fast_runs_wait_for_no_coil(experiment):
+    """There is none."""
+    rig = Rig()
+    host = replace(rig.host(), run=unpaced)
+    settings = ["limits.rms_current_a=0.05", "limits.thermal_time_constant_s=20.0"]
+    CharacterisationRunner(experiment, settings, experiment.parent / "r", None, host).characterise(
+        experiment.parent / "model.yaml"
+    )
+    assert rig.pauses == []
+
+
+COMPENSATED = """\
+name: rig
+device: {kind: simulated_terfenol}
+sample_rate_hz: 5000
+waveform: {kind: sine, unit: um, amplitude: 4.0, frequency_hz: 2.0, duration_s: 1.0}
+compensator: {model: nowhere.yaml}
+feedback: {limit_um: 1.0, bandwidth_hz: 10.0}
+adaptation: {noise_um: 0.1}
+limits:
+  {peak_current_a: 4.0, slew_a_per_s: 5000.0, stroke_um: [-50.0, 50.0], tracking_error_um: 5.0,
+   tracking_s: 0.1, frozen_s: 1.0}
+"""
+
+
+def test_what_needs_a_reference_is_taken_out(tmp_path, limits):
+    """Also a model that is not there yet: it is what the campaign is to find."""
+    path = tmp_path / "compensated.yaml"
+    path.write_text(COMPENSATED, encoding="utf-8")
+    settings = without_reference(path, [])
+    keys = biased_loops(limits, 2.0)
+    loaded = load_experiment(path, [*settings, waveform_setting(keys)])
+    assert loaded.model is None
+    assert loaded.config.feedback is None
+    assert loaded.config.adaptation is None
+    assert loaded.config.limits.tracking_error_um is None
+    assert loaded.config.limits.tracking_s is None
+    assert loaded.config.limits.frozen_s == 1.0
+    assert len(loaded.config.waveform.parts) == len(keys["parts"])
+
+
+def test_an_experiment_without_all_that_is_left_as_it_is(experiment):
+    assert without_reference(experiment, []) == ["compensator=none"]
+    assert unit_of(experiment, []) == "A"
+    volts = ["limits={drive_v: [0, 1], slew_v_per_s: 1.0, stroke_um: [0, 1]}"]
+    assert unit_of(experiment, volts) == "V"
+
+
+def test_the_waveform_is_written_as_json(limits):
+    text = waveform_setting({"kind": "hold", "level": 1e-7})
+    assert json.loads(text.partition("=")[2]) == {"kind": "hold", "level": 1e-7}

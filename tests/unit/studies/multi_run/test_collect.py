@@ -1,0 +1,92 @@
+"""Runs of a folder or of files."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from hilctl.base.errors import DataError, InputError
+from hilctl.studies.campaign.steps import CampaignStep
+from hilctl.studies.campaign.table import CampaignRow, columns_of, csv_text
+from hilctl.studies.multi_run import collect as module
+from hilctl.studies.multi_run.collect import collect
+from hilctl.studies.multi_run.run_figures import RunFigures
+
+GOLDEN = Path(__file__).parents[3] / "recordings" / "golden"
+RUNS = (GOLDEN / "terfenol_uncompensated.mcap",)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return Path(shutil.copytree(GOLDEN, tmp_path / "runs"))
+
+
+def test_files_are_told_apart_by_their_experiments():
+    told = []
+    series = collect(
+        sorted(GOLDEN.glob("*uncompensated.mcap")) * 2, None, lambda *a: told.append(a)
+    )
+    assert [run.number for run in series.runs] == [1, 2]
+    assert series.dimensions == ()
+    assert [series.text(run) for run in series.runs] == ["run 1", "run 2"]
+    assert told[1] == (0.5, "read terfenol_uncompensated.mcap")
+
+
+def test_a_folder_without_a_table_gives_all_that_can_be_read(folder):
+    (folder / "zz.mcap").write_text("no recording")
+    (folder / "folder.mcap").mkdir()
+    series = collect([folder])
+    assert len(series.runs) == len(list(GOLDEN.glob("*.mcap")))
+    assert len(series.missing) == 1
+    assert "zz.mcap" in series.missing[0]
+
+
+def test_a_campaign_s_table_says_what_varied_and_what_failed(folder):
+    figures = RunFigures(peak_hysteresis_percent=20.0)
+    steps = [CampaignStep(n, {"waveform.amplitude": float(n)}, 1, False, ()) for n in (1, 2, 3)]
+    name = "terfenol_uncompensated.mcap"
+    rows = [
+        (steps[0], CampaignRow("completed", figures, name, "completed")),
+        (steps[1], CampaignRow("completed", figures, "../lost.mcap", "completed")),
+        (steps[2], CampaignRow("fault: hot", code="fault")),
+    ]
+    (folder / "few.csv").write_text(csv_text(columns_of(("waveform.amplitude",), rows)))
+    series = collect([folder])
+    assert (series.name, series.is_campaign) == ("few", True)
+    assert series.keys == ("waveform.amplitude",)
+    assert series.runs[0].digest.name == "terfenol_sine_6a_uncompensated"
+    # What a table names lies beside it, whatever the table says.
+    assert series.missing == (f"{folder / 'lost.mcap'}: no such file",)
+    assert [run.number for run in series.failed] == [3]
+    assert series.planned == 0
+
+
+def test_what_was_named_must_be_there(folder, tmp_path):
+    with pytest.raises(DataError, match="no such file"):
+        collect([tmp_path / "none.mcap"])
+    with pytest.raises(InputError, match="name one folder, or recordings only"):
+        collect([folder, RUNS[0]])
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    with pytest.raises(InputError, match="holds no recordings"):
+        collect([empty])
+
+
+def test_a_recording_too_long_for_memory_is_left_out_and_named(folder, monkeypatch):
+    monkeypatch.setattr(module, "MOST_BYTES", 180_000)
+    short = [path for path in folder.glob("*.mcap") if path.stat().st_size <= module.MOST_BYTES]
+    series = collect([folder])
+    assert len(series.runs) == len(short) > 0
+    assert all("too long for a page of many runs" in text for text in series.missing)
+    assert len(series.missing) == len(list(folder.glob("*.mcap"))) - len(short) > 0
+
+
+def test_a_recording_without_an_end_is_not_completed(monkeypatch):
+    from hilctl.studies.multi_run import collect as module
+
+    found = module.read
+    monkeypatch.setattr(module, "read", lambda path: replace(found(path), end={}))
+    series = collect([RUNS[0]])
+    assert series.runs[0].result == "cut short: its end was not recorded"
+    assert series.done == ()
