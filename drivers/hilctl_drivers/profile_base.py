@@ -96,8 +96,8 @@ class BaseProfile(StrictModel):
     Attributes:
         DEVICE: The kind of device in an experiment that such profiles are for.
         WIRE: What makes a :class:`~hilctl_drivers.serial.serial_wire.SerialWire` from a
-            :class:`~hilctl_drivers.serial.serial_setup.SerialSetup`, as ``module:name``; empty where the
-            protocol has a device of its own.
+            :class:`~hilctl_drivers.serial.serial_setup.SerialSetup`, as ``module:name``;
+            empty if the protocol has a device of its own.
     """
 
     DEVICE: ClassVar[str]

@@ -63,7 +63,7 @@ COLUMNS: dict[str, type] = {
 """Names and types of what is known of a recording.
 
 ``path`` is relative to the folder that was listed, ``state`` that of
-:class:`hilctl.recording.run_summary.RunSummary`, or ``unreadable``, ``waveform`` what ran, for people,
+:class:`hilctl.recording.run_summary.RunSummary`, or ``unreadable``, ``waveform`` its text,
 ``frequency_hz`` the highest of all segments that repeat. All other names, except ``options``, are
 those of facts in a recording.
 """

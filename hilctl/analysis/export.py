@@ -32,8 +32,8 @@ def export(
     files also hold the facts of the run and the experiment and model as YAML.
 
     Args:
-        recording: The run, or its pieces in order (:class:`hilctl.recording.reader.RecordingStream`): then
-            memory does not grow with its length.
+        recording: The run, or its pieces in order, so that memory does not grow with its length
+            (:class:`hilctl.recording.reader.RecordingStream`).
         path: File to write: ``.csv``, ``.npz``, ``.parquet`` or ``.mat``.
         overwrite: Replace a file of that name.
 

@@ -75,7 +75,7 @@ def replay(
 
     Args:
         recording: What was recorded, or its pieces in order
-            (:class:`hilctl.recording.reader.RecordingStream`): then memory does not grow with its length.
+            (:class:`hilctl.recording.reader.RecordingStream`), so that memory does not grow.
             They are walked over twice where the inverse went out: what says so may stand behind
             its samples.
         model: Another model to invert instead of the recorded one; it starts from rest, its

@@ -41,7 +41,7 @@ def summarize(recording: Recording | Iterable[Recording]) -> RunReport:
 
     Args:
         recording: The run, or its pieces in order, which can be gone through again
-            (:class:`hilctl.recording.reader.RecordingStream`): then memory does not grow with its length,
+            (:class:`hilctl.recording.reader.RecordingStream`), so that memory does not grow,
             and a run that ended early or was tuned is read twice.
 
     Raises:

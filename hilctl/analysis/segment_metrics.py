@@ -149,7 +149,7 @@ class _Errors:
 
 
 class _Noise:
-    """Sensor noise over the borders of pieces, see :func:`hilctl.signals.cycle_metrics.sensor_noise_um`."""
+    """Sensor noise across pieces, see :func:`hilctl.signals.cycle_metrics.sensor_noise_um`."""
 
     def __init__(self) -> None:
         self._windows = Quantiles()

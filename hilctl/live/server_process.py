@@ -1,7 +1,7 @@
 """Run the servers as processes: beside a run that requested one, or alone.
 
-Beside a run it is started as ``python -m hilctl.live.server_process`` with the supervisor's process number on
-standard input; its first line of output is the address. It ends with its run.
+A run starts it as ``python -m hilctl.live.server_process`` with the supervisor's process number
+on standard input; its first line of output is the address. It ends with its run.
 """
 
 import asyncio

@@ -109,7 +109,7 @@ def _unpacked_flags(packed: bytes) -> U32:
 
 
 def encode_ticks(columns: Mapping[str, I64]) -> bytes:
-    """Return a ``TickBlock`` of columns by the names of :class:`~hilctl.recording.recording.Ticks`."""
+    """Return a ``TickBlock`` of the columns of :class:`~hilctl.recording.recording.Ticks`."""
     message = _TICKS(**{name: values.tolist() for name, values in columns.items()})
     data: bytes = message.SerializeToString()
     return data

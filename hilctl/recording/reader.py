@@ -43,8 +43,8 @@ def read(path: Path, stretch: TimeRange | None = None) -> Recording:
 class RecordingStream:
     """A recording of any length, a piece at a time; each iteration reads the file anew.
 
-    Every piece is a :class:`~hilctl.recording.recording.Recording` of the samples, ticks, events and
-    replay starts that come next. The last one, which may hold no sample, has the end, the number of
+    Every piece is a :class:`~hilctl.recording.recording.Recording` of the next samples, ticks,
+    events and replay starts. The last one, which may hold no sample, has the end, the number of
     missing samples and, of a stretch, the segments as they are cut. Together they are what
     :func:`read` returns.
 

@@ -48,7 +48,7 @@ class TimeRange:
         return whole
 
     def cut_pieces(self, pieces: Iterable[Recording]) -> Iterator[Recording]:
-        """Cut a recording that comes in pieces, see :class:`hilctl.recording.reader.RecordingStream`.
+        """Cut the pieces of a :class:`hilctl.recording.reader.RecordingStream`.
 
         What can be said only of all that is there stands in the last one: counters, and segments
         that end with its last sample.

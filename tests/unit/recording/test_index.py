@@ -29,7 +29,8 @@ def recorded(tmp_path, make):
 
 
 STRETCHES = [
-    TimeRange(0.0, 0.004), TimeRange(0.00399, 0.00401), TimeRange(0.0301, 0.0302), TimeRange(None, 0.02),
+    TimeRange(0.0, 0.004), TimeRange(0.00399, 0.00401), TimeRange(0.0301, 0.0302),
+    TimeRange(None, 0.02),
     TimeRange(0.1, None), TimeRange(0.07, 0.11), TimeRange(0.016, 0.02),
 ]  # fmt: skip
 
