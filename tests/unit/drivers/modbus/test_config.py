@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
+from tests.unit.drivers.modbus.test_device import exchange
 
 from hilctl.base.errors import InputError
 from hilctl_drivers.modbus.config import ModbusOptions
@@ -22,12 +22,6 @@ PAIR = {
 READS = PAIR["reader"]
 SETTLE_S = 0.01
 """Of an M-7024's output."""
-
-
-def exchange(device: ModbusDac, value: float) -> float:
-    displacement_um = np.full(1, np.nan)
-    device.exchange(0, np.array([value]), displacement_um, np.full(1, np.nan))
-    return float(displacement_um[0])
 
 
 def made(**changes) -> ModbusDac:
