@@ -272,7 +272,7 @@ def test_a_supervisor_that_breaks_ends_the_run_by_its_ramp(tmp_path, monkeypatch
         if len(calls) == 30:
             raise ZeroDivisionError("a bug")
 
-    monkeypatch.setattr("hilctl.run.supervisor.Notifier.alive", alive)
+    monkeypatch.setattr("hilctl.run.supervisor.SystemdNotifier.alive", alive)
     result, recording = supervised(tmp_path)
     assert result.reason == (
         "stopped because the supervisor broke; the supervisor broke: ZeroDivisionError: a bug"
