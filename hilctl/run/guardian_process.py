@@ -8,7 +8,8 @@ import os
 import select
 import signal
 import subprocess
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 
 from hilctl.run.child import ChildProcess
@@ -20,6 +21,9 @@ from hilctl.run.shared_page import GuardianPhase, PageField, PageSlot, SharedPag
 _log = logging.getLogger(__name__)
 
 _END_S = 1.0
+_POLL_S = 0.01
+START_S = 10.0
+"""Longest wait for a new guardian to drive the device."""
 
 
 class GuardianProcess(ChildProcess):
@@ -68,13 +72,28 @@ class GuardianProcess(ChildProcess):
 
     @property
     def error(self) -> str:
-        """Why it could not start or go on."""
+        """Why it does not act."""
+        if not self.ended and self.phase != GuardianPhase.FAILED:
+            return "it does not start"
         if self.phase == GuardianPhase.FAILED:
             return self._page.read_text(PageSlot.GUARDIAN)
         with suppress(OSError):
             *_, last = self._log.read_text(encoding="utf-8", errors="replace").splitlines() or [""]
             return f"it died: {last}" if last else "it died"
         return "it died"
+
+    def await_acting(self, stopped: Callable[[], bool] = lambda: False) -> bool:
+        """Wait until it drives the device; return False if it does not within 10 s.
+
+        Args:
+            stopped: Whether the user ends the wait.
+        """
+        deadline_s = time.monotonic() + START_S
+        while not self.ended and time.monotonic() < deadline_s and not stopped():
+            if self.phase in {GuardianPhase.ACTING, GuardianPhase.DONE}:
+                return True
+            time.sleep(_POLL_S)
+        return False
 
     def end(self) -> None:
         """Let it end by itself, as it does when the loop has; not for long."""
@@ -104,7 +123,9 @@ class GuardianRelief:
             signal_guardian(run, signal.SIGKILL, _END_S)
 
     def resume(self, inherits: Sequence[int]) -> None:
-        """Start them again: the devices have not been driven to a safe value meanwhile.
+        """Start them again and wait until they act: the outputs are not at their safe values.
+
+        A command that follows finds them in that state, and can stop or relieve them.
 
         Args:
             inherits: Descriptors of the devices' locks.
@@ -112,8 +133,12 @@ class GuardianRelief:
         for run in self.runs:
             try:
                 with locked_run(run) as lock:
-                    GuardianProcess(run, SampleRing(run.ring).page, [*inherits, lock], None)
-            except (OSError, ValueError) as error:
+                    page = SampleRing(run.ring).page
+                    guardian = GuardianProcess(run, page, [*inherits, lock], None)
+                error = "" if guardian.await_acting() else guardian.error
+            except (OSError, ValueError) as failure:
+                error = str(failure)
+            if error:
                 _log.error("the guardian of %s cannot be started again: %s", run.card.name, error)
 
     def discard(self) -> None:

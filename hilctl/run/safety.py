@@ -30,7 +30,6 @@ _START_NS = 60_000_000_000
 _AGAIN_NS = 5_000_000_000
 _HAND_OVER_S = 10.0
 _POLL_S = 0.01
-_ACTING = {GuardianPhase.ACTING, GuardianPhase.DONE}
 
 
 class Safety:
@@ -230,9 +229,4 @@ class Safety:
             guardian = self._guardian = self._start_guardian(None)
         except OSError:
             return False
-        deadline_s = time.monotonic() + _HAND_OVER_S
-        while not guardian.ended and time.monotonic() < deadline_s and not stopped():
-            if guardian.phase in _ACTING:
-                return True
-            time.sleep(_POLL_S)
-        return False
+        return guardian.await_acting(stopped)

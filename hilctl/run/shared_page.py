@@ -33,6 +33,7 @@ _PAGE = 4096
 _TEXT_BYTES = 4096
 _EVENT_BYTES = 1024
 _EVENT_SLOTS = 32
+_READS = 3
 
 
 class PageSlot(IntEnum):
@@ -335,8 +336,9 @@ class SharedPage:
         """Return what the guardian has reached so far; None if it has not acted."""
         if self.get(PageField.GUARDIAN_PHASE) not in {GuardianPhase.ACTING, GuardianPhase.DONE}:
             return None
-        with suppress(ValueError, TypeError):  # damaged, or just being written
-            return SafeActionResult(**json.loads(self.read_text(PageSlot.GUARDIAN)))
+        for _ in range(_READS):  # the guardian may be writing it
+            with suppress(ValueError, TypeError):
+                return SafeActionResult(**json.loads(self.read_text(PageSlot.GUARDIAN)))
         return None
 
     def push_event(self, event: Event) -> None:

@@ -31,6 +31,9 @@ class Guardian:
     def end(self):
         self.log.append("guardian ended")
 
+    def await_acting(self, stopped):
+        return not self.ended and self.phase in {GuardianPhase.ACTING, GuardianPhase.DONE}
+
 
 class Run:
     """A run's safety, with time in the test's hand."""
