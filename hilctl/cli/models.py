@@ -28,7 +28,7 @@ from hilctl.identify.refine.refinement import Refinement
 from hilctl.identify.registry import CATALOGUE
 from hilctl.identify.settings import setting_rows
 from hilctl.identify.summary import HEADINGS, error_rows, parameter_texts, summary
-from hilctl.run.dead_runs import finish_dead_runs
+from hilctl.run.control.client import finish_dead_runs
 
 IdentifyInput = Annotated[
     list[Path], typer.Argument(metavar="FILE", help="Recordings (MCAP) or text tables.")

@@ -13,7 +13,7 @@ from hilctl.experiment.interlocks import interlock_context
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.loop.adaptation import DisplacementOperator
 from hilctl.loop.compensator import Compensator
-from hilctl.loop.conditioning import Conditioning
+from hilctl.loop.lead_in import Conditioning
 from hilctl.loop.pacer import LatePolicy, LateRules
 from hilctl.loop.plan import LoopPlan
 

@@ -9,10 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hilctl.base.errors import HilctlError, InputError, RunError
-from hilctl.run.architecture import require_linux
-from hilctl.run.client import ask
-from hilctl.run.protocol import request
-from hilctl.run.run_folder import RunFolder, runs
+from hilctl.run.control.client import ask, request
+from hilctl.run.run_folder import RunFolder, require_linux, runs
 from hilctl.run.start import checked_experiment, output_of
 
 _POLL_S = 0.05

@@ -8,9 +8,7 @@ The guardian imports this module, so it must not import numba.
 """
 
 import json
-import subprocess
-import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -196,30 +194,6 @@ def safe_priority(checked: "CheckedExperiment") -> int:
     It is above the loop's, so that a loop in an endless cycle cannot delay that process.
     """
     return checked.loaded.config.realtime.priority + 1
-
-
-def start_process(
-    module: str, *words: str, inherits: Sequence[int], stderr: Any = None
-) -> "subprocess.Popen[bytes]":
-    """Start a module as a process of the run.
-
-    Args:
-        module: Its dotted name.
-        words: Its arguments.
-        inherits: Descriptors that it keeps open, such as those of locks.
-        stderr: File of its standard error; the supervisor's if None.
-
-    Raises:
-        OSError: It cannot be started.
-    """
-    return subprocess.Popen(
-        [sys.executable, "-P", "-m", module, *words],  # -P: import nothing from the working folder
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,  # a reader of the supervisor's would wait for this process's end
-        stderr=stderr,
-        start_new_session=True,  # the supervisor handles Ctrl-C in the terminal
-        pass_fds=inherits,
-    )
 
 
 def _save(path: Path, values: F64) -> None:

@@ -19,18 +19,18 @@ from hilctl.base.files import TextFiles
 from hilctl.experiment.conditioning import conditioning_of
 from hilctl.experiment.load import LoadedExperiment, resolve
 from hilctl.loop.adaptation import DisplacementOperator
-from hilctl.loop.host import LinearBypass, Tuning
 from hilctl.loop.loop import Loop
 from hilctl.loop.pacer import SystemClock
-from hilctl.loop.plan import LoopOutcome, LoopPlan
-from hilctl.loop.safe_output import SafeGoal, describe, drive_to_safe
-from hilctl.machine.process_usage import ProcessUsage
+from hilctl.loop.plan import LoopPlan
+from hilctl.loop.safe_output import LoopOutcome, SafeGoal, describe, drive_to_safe
+from hilctl.loop.tuning import LinearBypass, Tuning
+from hilctl.machine.procfs import ProcessUsage
 from hilctl.machine.rt_setup import be_ordinary, prepare, refusals, require, step_facts
 from hilctl.run.assemble import assemble, starting_output
 from hilctl.run.job import Job
-from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import keep_removed
-from hilctl.run.shared_page import PageField, PageSlot, Phase, SharedPage, Stop
+from hilctl.run.shared.ring import SampleRing
+from hilctl.run.shared.shared_page import PageField, PageSlot, Phase, SharedPage, Stop
 
 # Plain numbers: looking up an enumeration's member takes longer than writing it.
 _HEARTBEAT_NS, _NEXT_SAMPLE = int(PageField.LOOP_HEARTBEAT_NS), int(PageField.NEXT_SAMPLE)
@@ -41,7 +41,7 @@ _TUNE_BEGINS_AT = int(PageField.TUNE_BEGINS_AT)
 
 
 class RingHost:
-    """See :class:`hilctl.loop.host.Host`.
+    """See :class:`hilctl.loop.plan.Host`.
 
     Args:
         ring: Shared with the supervisor.

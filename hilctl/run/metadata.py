@@ -25,9 +25,9 @@ from hilctl.base.segments import Segment
 from hilctl.base.strict import StrictModel
 from hilctl.base.yaml import dump
 from hilctl.loop.pacer import Lateness
-from hilctl.loop.plan import LoopOutcome
+from hilctl.loop.safe_output import LoopOutcome
 from hilctl.machine.diagnosis import machine_facts
-from hilctl.machine.process_usage import ProcessUsage
+from hilctl.machine.procfs import ProcessUsage
 from hilctl.recording.metadata_keys import (
     END_FIGURES,
     HEAT_FACT,

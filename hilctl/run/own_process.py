@@ -19,7 +19,7 @@ from types import FrameType
 from typing import Any, BinaryIO
 
 from hilctl.base.errors import HilctlError, RunError
-from hilctl.run.protocol import HANG_UP
+from hilctl.run.control.client import HANG_UP
 from hilctl.run.result import Progress, RunResult
 
 _log = logging.getLogger(__name__)

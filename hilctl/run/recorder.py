@@ -26,15 +26,15 @@ from hilctl.experiment.coil_heat import CoilHeat
 from hilctl.experiment.correction import dump_correction
 from hilctl.experiment.device_state import CoilState, DeviceState, write_device_state
 from hilctl.experiment.preflight import CheckedExperiment
-from hilctl.loop.plan import LoopOutcome
-from hilctl.machine.process_usage import ProcessUsage
+from hilctl.loop.safe_output import LoopOutcome
+from hilctl.machine.procfs import ProcessUsage
 from hilctl.models.model_file import dump_model
 from hilctl.recording.encoder import RecordingLayout
 from hilctl.recording.metadata_keys import HEAT_FACT
 from hilctl.recording.writer import OutputFile, RecordingWriter, RunFacts
 from hilctl.run.metadata import EndFigures, end_facts, run_facts, usage_facts
-from hilctl.run.ring import SampleRing
-from hilctl.run.shared_page import PageField
+from hilctl.run.shared.ring import SampleRing
+from hilctl.run.shared.shared_page import PageField
 
 _SAMPLES_BEFORE = 50
 _SPARE = 20

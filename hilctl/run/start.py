@@ -19,10 +19,10 @@ from hilctl.experiment.load import LoadedExperiment, input_files, load_experimen
 from hilctl.experiment.preflight import CheckedExperiment, check
 from hilctl.models.model_file import dump_model
 from hilctl.recording.run_summary import read_ends
-from hilctl.run.architecture import require_linux
 from hilctl.run.metadata import experiment_sha256, sha256_of
 from hilctl.run.own_process import has_threads, run_in_own_process
 from hilctl.run.result import Progress, RunResult
+from hilctl.run.run_folder import require_linux
 from hilctl.run.unpaced import run_unpaced
 
 _log = logging.getLogger(__name__)

@@ -22,22 +22,20 @@ from hilctl.base.errors import RunError
 from hilctl.base.events import Event
 from hilctl.experiment.preflight import CheckedExperiment
 from hilctl.loop.pacer import deadline_misses
-from hilctl.loop.plan import LoopOutcome
-from hilctl.loop.safe_output import describe
+from hilctl.loop.safe_output import LoopOutcome, describe
 from hilctl.machine.rt_setup import be_ordinary, favoured
-from hilctl.run.child import LoopProcess
-from hilctl.run.control_socket import ControlServer
-from hilctl.run.guardian_process import GuardianProcess, GuardianRelief
+from hilctl.run.control.client import HANG_UP, JOB_CONTROL, STOP_SIGNAL
+from hilctl.run.control.control_socket import ControlServer
+from hilctl.run.control.requests import Requests
 from hilctl.run.job import Job
 from hilctl.run.metadata import RunDescription
-from hilctl.run.protocol import HANG_UP, JOB_CONTROL, STOP_SIGNAL
+from hilctl.run.processes import GuardianProcess, GuardianRelief, LoopProcess
 from hilctl.run.recorder import Recorder, RingRecorder
-from hilctl.run.requests import Requests
 from hilctl.run.result import Progress, RunResult
-from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import RunFolder, held_devices, run_folder
-from hilctl.run.safety import Safety
-from hilctl.run.shared_page import PageField, PageSlot, SharedPage, Stop
+from hilctl.run.safety.safety_monitor import SafetyMonitor
+from hilctl.run.shared.ring import SampleRing
+from hilctl.run.shared.shared_page import PageField, PageSlot, SharedPage, Stop
 
 _log = logging.getLogger(__name__)
 
@@ -152,7 +150,7 @@ class RunMonitor:
         checked: CheckedExperiment,
         ring: SampleRing,
         child: LoopProcess,
-        safety: Safety,
+        safety: SafetyMonitor,
         recording: RingRecorder,
     ) -> None:
         self._config, self._forecast = checked.loaded.config, checked.forecast
@@ -326,7 +324,7 @@ class Supervisor:
         child: LoopProcess,
         recording: RingRecorder,
         locks: list[int],
-    ) -> tuple[Safety, int]:
+    ) -> tuple[SafetyMonitor, int]:
         """Wait for loop and guardian to be ready, and begin the recording.
 
         Returns:
@@ -337,7 +335,7 @@ class Supervisor:
         try:
             simulated = checked.loaded.device.info.simulated  # needs no guardian
             guardian = None if simulated else partial(GuardianProcess, folder, page, locks)
-            safety = Safety(checked, ring, child, guardian, recording.record_event)
+            safety = SafetyMonitor(checked, ring, child, guardian, recording.record_event)
             child.await_ready(lambda: self._stop_signal != 0)
             # It is started after the loop, to watch its process, and ready long before it.
             self._await_guardian(safety)
@@ -354,7 +352,7 @@ class Supervisor:
             raise
         return safety, start_ns
 
-    def _await_guardian(self, safety: Safety) -> None:
+    def _await_guardian(self, safety: SafetyMonitor) -> None:
         deadline_s = time.monotonic() + _GUARDIAN_READY_S
         while not safety.ready():
             if self._stop_signal:

@@ -16,10 +16,11 @@ from hilctl.base.events import Event
 from hilctl.base.samples import ANSWERS, BlockBatch, Samples
 from hilctl.experiment.preflight import CheckedExperiment
 from hilctl.loop.block import Block
-from hilctl.loop.host import Tuning
 from hilctl.loop.loop import Loop
 from hilctl.loop.pacer import Lateness
-from hilctl.loop.plan import LoopOutcome, LoopPlan
+from hilctl.loop.plan import LoopPlan
+from hilctl.loop.safe_output import LoopOutcome
+from hilctl.loop.tuning import Tuning
 from hilctl.run.assemble import assemble, starting_output
 from hilctl.run.metadata import end_facts
 from hilctl.run.recorder import Recorder

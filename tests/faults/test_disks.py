@@ -14,7 +14,7 @@ import yaml
 
 from hilctl.analysis.replay import replay
 from hilctl.recording.reader import read
-from hilctl.run.dead_runs import finish_dead_runs
+from hilctl.run.control.client import finish_dead_runs
 from hilctl.run.run_folder import runs
 
 DEMO = Path(__file__).parents[2] / "configs" / "demo.yaml"

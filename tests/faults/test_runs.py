@@ -16,8 +16,8 @@ import yaml
 from hilctl.analysis.replay import replay
 from hilctl.base.samples import Flag
 from hilctl.recording.reader import read
-from hilctl.run.client import status_of
-from hilctl.run.orphans import recover_orphans
+from hilctl.run.control.client import status_of
+from hilctl.run.recovery import recover_dead_runs
 from hilctl.run.run_folder import base_folder, runs
 from hilctl.run.start import checked_experiment
 from hilctl.run.supervisor import Supervisor
@@ -208,13 +208,13 @@ def test_killed_supervisor_takes_the_loop_along(tmp_path):
     while Path(f"/proc/{loop}").exists():
         assert time.monotonic() < deadline
         time.sleep(0.02)
-    (orphan,) = recover_orphans()
+    (orphan,) = recover_dead_runs()
     assert orphan.safe
     assert orphan.recording == run.output
     recording = assert_good_way_out(run)
     assert recording.samples.index.size > 1000
     assert recording.end["reason"] == "stopped because the supervisor died"
-    assert recover_orphans() == []
+    assert recover_dead_runs() == []
 
 
 def test_nothing_stays_in_memory(tmp_path):
@@ -333,7 +333,7 @@ def test_if_the_recording_is_gone_the_run_is_a_fault(tmp_path, how, on_failure):
     assert str(left.path) in result.reason
     if how == "renamed":
         moved.rename(output)
-    (orphan,) = recover_orphans()
+    (orphan,) = recover_dead_runs()
     assert (orphan.kept is None) == (how == "renamed")
     if how == "renamed" and on_failure == "stop":
         recording = read(output)

@@ -9,12 +9,12 @@ import pytest
 from hilctl.base.errors import DeviceError
 from hilctl.base.samples import BlockHeader, Flag
 from hilctl.loop.compensator import Compensator
-from hilctl.loop.host import LinearBypass, Tuning
 from hilctl.loop.interlocks import InterlockContext
 from hilctl.loop.limiter import CommandLimits
 from hilctl.loop.loop import Loop
 from hilctl.loop.pacer import LateRules
 from hilctl.loop.plan import LoopPlan
+from hilctl.loop.tuning import LinearBypass, Tuning
 from hilctl.models.model_file import load_model
 from tests.fakes import FakeClock, FakeDevice, FakeFifoDevice, FakeHost, FakeInfo
 from tests.published import terfenol_rdpi

@@ -16,11 +16,11 @@ import pytest
 
 from hilctl.base.errors import InputError, RunError
 from hilctl.loop.pacer import Lateness
-from hilctl.loop.plan import LoopOutcome
+from hilctl.loop.safe_output import LoopOutcome
 from hilctl.run import supervisor as module
-from hilctl.run.protocol import STOP_SIGNAL
-from hilctl.run.ring import SampleRing
-from hilctl.run.shared_page import PageField, PageSlot, SafeActionResult, Stop
+from hilctl.run.control.client import STOP_SIGNAL
+from hilctl.run.shared.ring import SampleRing
+from hilctl.run.shared.shared_page import PageField, PageSlot, SafeActionResult, Stop
 from hilctl.run.supervisor import ProgressThread, RunMonitor, Supervisor, SystemdNotifier
 from tests.fakes import SteppingClock
 
@@ -111,7 +111,7 @@ class Neighbours:
             "GuardianRelief": lambda holds: SimpleNamespace(
                 resume=self.resumed.append, discard=lambda: self.resumed.append("discarded")
             ),
-            "Safety": self.safety,
+            "SafetyMonitor": self.safety,
             "RunMonitor": self.started_run,
             "ProgressThread": lambda *a: SimpleNamespace(
                 start=lambda: self.said.append("shown"), end=lambda: self.note("progress ended")
