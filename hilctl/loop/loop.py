@@ -164,7 +164,7 @@ class Loop:
         if first_invalid >= 0:
             at = f"at sample {first_sample + first_invalid}"
             self._begin_safe_ramp(
-                "fault", "invalid_command", f"requested command is not a finite number {at}"
+                "fault", "invalid_command", f"requested command is not finite {at}"
             )
         feedback = self._plan.feedback
         if feedback is not None and feedback.against:

@@ -1,4 +1,4 @@
-"""Runs whose processes have died: what they left in memory goes into their recordings."""
+"""Recovery of dead runs: samples left in memory are added to their recordings."""
 
 import signal
 import threading
@@ -21,15 +21,15 @@ from hilctl.run.shared.shared_page import PageField, PageSlot, Phase
 
 @dataclass(frozen=True, slots=True)
 class RecoveredRun:
-    """A run that somebody else had to finish.
+    """A dead run that another command has finished.
 
     Attributes:
         name: The run's name.
         recording: Its recording.
-        safe: Whether loop or guardian have put the output at its safe value before they left.
-        text: What became of it, for people.
-        kept: Folder that still holds what could not be recovered; None where all of it was.
-        started: Whether its loop had started; otherwise nothing has moved, or is to be recovered.
+        safe: Whether loop or guardian confirmed the safe value.
+        text: Description of the result.
+        kept: Folder of samples that were not recovered; None if all were.
+        started: Whether the loop had started; otherwise nothing has moved.
     """
 
     name: str
@@ -41,15 +41,15 @@ class RecoveredRun:
 
 
 def recover_dead_runs() -> list[RecoveredRun]:
-    """Finish the recordings of all dead runs of this user, and clear their folders away."""
+    """Finish the recordings of all dead runs of this user, and remove their folders."""
     found = []
     for run in runs():
         if run.alive:
             continue
         with taken_over(run) as ours, _undisturbed():
             if ours:
-                found.append(orphan := _recover(run))
-                if orphan.kept is None:  # else its samples are nowhere but there
+                found.append(recovered := _recover(run))
+                if recovered.kept is None:
                     run.remove()
     return found
 
@@ -73,7 +73,7 @@ def _recover(run: RunFolder) -> RecoveredRun:
 
 
 def _is_recorded(run: RunFolder) -> bool:
-    """Return whether the supervisor closed the recording, and only the output was still to do."""
+    """Return whether the supervisor had closed the recording."""
     try:
         return bool(SampleRing(run.ring).page.get(PageField.RECORDED))
     except (OSError, ValueError):
@@ -83,13 +83,13 @@ def _is_recorded(run: RunFolder) -> bool:
 def _has_started(run: RunFolder, recording: Path) -> bool:
     try:
         page = SampleRing(run.ring).page
-    except (OSError, ValueError):  # it is made before anything is written to the recording
+    except (OSError, ValueError):  # the ring is created before the recording is written
         return not (recording.is_file() and recording.stat().st_size == 0)
     return bool(page.get(PageField.GO) or page.get(PageField.SENT))
 
 
 def _remove_claimed(recording: Path) -> None:
-    """Remove the empty file that a run has claimed, unless another has claimed it since."""
+    """Remove the empty file of a run unless another run uses it."""
     with suppress(OSError), recording.open("rb") as stream:
         if not stream.read(1) and not is_being_recorded(stream):
             recording.unlink()
@@ -98,7 +98,7 @@ def _remove_claimed(recording: Path) -> None:
 def _left_behind(
     run: RunFolder,
 ) -> tuple[LoopOutcome, list[BlockBatch], list[Event], dict[str, str]]:
-    """Return how the loop ended, blocks and events that are not safe yet, facts of the end."""
+    """Return the outcome, blocks and events that are only in memory, and metadata of the end."""
     died = LoopOutcome("fault", "supervisor and loop died", 0, "unknown", 0)
     try:
         ring = SampleRing(run.ring)
@@ -142,9 +142,9 @@ def _left_behind(
 
 @contextmanager
 def _undisturbed() -> Iterator[None]:
-    """Let no Ctrl-C come between a recovered recording and the end of its folder."""
+    """Ignore Ctrl-C between a recovered recording and the removal of its folder."""
     if threading.current_thread() is not threading.main_thread():
-        yield  # a Ctrl-C goes to the main thread, and only that may set handlers
+        yield  # only the main thread receives Ctrl-C and may set handlers
         return
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:

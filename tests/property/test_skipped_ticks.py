@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from tests.unit.models.test_numeric_inverse import BOUC_WEN, DUHEM, KP, PREISACH
+from tests.unit.models.test_implicit_base import BOUC_WEN, DUHEM, KP, PREISACH
 
 from hilctl.base.samples import Flag
 from hilctl.loop.limiter import CommandLimits

@@ -1,7 +1,6 @@
-"""Pass changes of gain, offset and inverse to the loop, one after another.
+"""Changes of gain, offset and inverse: checked by a bound on the amplitude, passed to the loop.
 
-Each is checked by a bound on its amplitude when the loop has taken the one before. So the second
-follows the first, and none is overwritten.
+A change waits until the loop has taken the previous one, so none is overwritten.
 """
 
 import math
@@ -23,7 +22,7 @@ from hilctl.run.shared.shared_page import PageField, SharedPage
 _SHARES: dict[str | None, float] = {"in": 1.0, "out": 0.0}
 _MOST_WAITING = 16
 _WAIT_S = 20.0
-"""Longest wait for the change before; a client waits longer for its answer."""
+"""Longest wait for the previous change; a client waits longer for its answer."""
 _POLL_S = 0.005
 _LEAD_S = 0.05
 """Time from the answer to the first sample of a change."""
@@ -32,7 +31,7 @@ _CYCLE = 2000
 
 
 class Changes:
-    """The changes of one run; they may be requested from several threads.
+    """Changes of one run, requested from several threads.
 
     Args:
         checked: The experiment.
@@ -41,8 +40,8 @@ class Changes:
         sleep: Waits for that many s.
 
     Attributes:
-        gain: Factor of the reference that the last change has led to, or leads to.
-        offset: What is added to it, likewise.
+        gain: Final gain of the last change.
+        offset: Final offset of the last change.
     """
 
     def __init__(
@@ -60,7 +59,7 @@ class Changes:
 
     @property
     def inverse(self) -> str | None:
-        """Where the last change leads the inverse, ``in`` or ``out``; None where there is none."""
+        """Final state of the inverse, ``in`` or ``out``; None without an inverse."""
         if self._checked.loaded.model is None:
             return None
         return "in" if self._inverse_share else "out"
@@ -72,16 +71,19 @@ class Changes:
         over_s: float,
         inverse: InverseState | None = None,
     ) -> dict[str, Any]:
-        """Make a change as soon as the loop has taken the one before; return the answer.
+        """Make a change when the loop has taken the previous one; None: unchanged.
 
         Args:
-            gain: Factor of the reference; unchanged if None.
-            offset: Added to the reference; unchanged if None.
-            over_s: Time that the change takes.
-            inverse: Whether the inverse is to be ``in`` or ``out``; unchanged if None.
+            gain: Factor of the reference.
+            offset: Added to the reference.
+            over_s: Duration of the change.
+            inverse: ``in`` or ``out``.
+
+        Returns:
+            The answer to the request.
 
         Raises:
-            InputError: It is refused; nothing has changed.
+            InputError: The change is refused; nothing has changed.
         """
         if gain is None and offset is None and inverse is None:
             raise InputError("set: gain, offset or inverse is required")
@@ -97,22 +99,22 @@ class Changes:
                 with self._lock:
                     if why := self._too_late():
                         raise InputError(f"set: {why}")
-                    # The loop must have taken the change before, which is overwritten.
+                    # The loop must have taken the previous change, which is overwritten.
                     page = self._page
                     if page.get(PageField.TUNE_WANTED) == page.observe(PageField.TUNE_TAKEN):
                         return self._make(gain, offset, over_s, inverse)
                 if self._clock() >= until:
-                    raise InputError("set: the loop has not taken the change before: try again")
+                    raise InputError("set: the loop has not taken the previous change: try again")
                 self._sleep(_POLL_S)
         finally:
             self._places.release()
 
     def _too_late(self) -> str:
-        """Return why no change can be made any more, or an empty text."""
+        """Return why no change is possible, or an empty text."""
         if self._page.get(PageField.STOP):
-            return "the run is on its way to the safe value"
+            return "the run is in its safe ramp"
         if self._page.get(PageField.NEXT_SAMPLE) >= self._checked.forecast.samples:
-            return "the waveform is over; the run is on its way to the safe value"
+            return "the waveform has ended; the run is in its safe ramp"
         return ""
 
     def _make(
@@ -122,10 +124,10 @@ class Changes:
         over_s: float,
         inverse: InverseState | None,
     ) -> dict[str, Any]:
-        """Put a change on the page for the loop; return the answer.
+        """Write a change to the page; return the answer.
 
         Raises:
-            InputError: It is refused; nothing has changed.
+            InputError: The change is refused; nothing has changed.
         """
         gain = self.gain if gain is None else gain
         offset = self.offset if offset is None else offset
@@ -138,7 +140,7 @@ class Changes:
         blocks = math.ceil((page.get(PageField.NEXT_SAMPLE) + lead) / config.block) + 1
         begins_at = blocks * config.block
         if begins_at >= self._checked.forecast.samples:
-            raise InputError("set: the waveform is over before the change could begin")
+            raise InputError("set: the waveform ends before the change could begin")
         page.put_float(PageField.TUNE_GAIN, gain)
         page.put_float(PageField.TUNE_OFFSET, offset)
         page.put_float(PageField.TUNE_INVERSE_SHARE, share)
@@ -147,7 +149,7 @@ class Changes:
             page.put_float(PageField.TUNE_LINE_AT_ZERO, line.at_zero)
         page.put(PageField.TUNE_SAMPLES, max(1, round(over_s * config.sample_rate_hz)))
         page.put(PageField.TUNE_BEGINS_AT, begins_at)
-        # Last: the loop reads the numbers above as soon as it sees a new count.
+        # Last: the loop reads the numbers above when the count changes.
         page.publish(PageField.TUNE_WANTED, page.get(PageField.TUNE_WANTED) + 1)
         self.gain, self.offset, self._inverse_share = gain, offset, share
         return {
@@ -160,16 +162,16 @@ class Changes:
 
 
 def bound_refusal(checked: CheckedExperiment, gain: float, offset: float, *, bypassed: bool) -> str:
-    """Return why a reference of this gain and offset would leave the limits, or an empty text.
+    """Return why a reference with this gain and offset would exceed the limits, or an empty text.
 
-    The whole range of the reference counts, also what has passed. Its command range is bounded; its
-    slew and heat are not: the loop's limiter and interlocks hold those.
+    The whole range of the reference counts, also samples that have passed. Slew and heat are not
+    checked: limiter and interlocks enforce them.
 
     Args:
         checked: The experiment.
         gain: Factor of the reference.
         offset: Added to it.
-        bypassed: Whether the straight line gives commands too.
+        bypassed: Whether the straight line contributes to the command.
     """
     low, high = sorted(gain * end + offset for end in checked.reference.span)
     problems = reference_problems(checked.loaded, checked.reference.unit, low, high)
@@ -192,12 +194,12 @@ def command_range(
 ) -> tuple[float, float]:
     """Return the lowest and highest command for a reference from ``low`` to ``high``.
 
-    It is the range of a sine between them. The checked run differs from a sine over its own range,
-    by its rate and its history; that difference is added, times the gain.
+    They are those of a sine over this range, plus the difference between the checked run and a sine
+    over the run's range, which is due to rate and history, times the gain.
     """
     found = _sine_commands(checked, low, high)
     line = checked.forecast.line
-    if line is None:  # no model, so the commands are the reference; or a constant reference
+    if line is None:  # no model: the commands are the reference; or a constant reference
         return found
     # The ends of the line are the lowest and highest command of the checked waveform.
     known = sorted(line.slope * end + line.at_zero for end in checked.reference.span)
@@ -215,6 +217,6 @@ def _sine_commands(checked: CheckedExperiment, low: float, high: float) -> tuple
     values = np.clip(values, low, high)  # rounding must not leave a limit
     compensator = Compensator(checked.loaded.model, checked.loaded.config.sample_rate_hz)
     commands = np.empty_like(values)
-    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused
+    with np.errstate(over="ignore", invalid="ignore"):  # values that are not finite are refused
         compensator.process(values, commands)
     return float(commands[_CYCLE:].min()), float(commands[_CYCLE:].max())

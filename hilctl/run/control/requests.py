@@ -1,4 +1,4 @@
-"""Requests to a running supervisor: its status, to move the reference, and to set a mark."""
+"""Requests to a running supervisor: status, changes of the reference, marks."""
 
 import time
 from collections.abc import Mapping
@@ -19,20 +19,19 @@ from hilctl.run.shared.shared_page import Phase, SharedPage
 
 
 class StatusRequest(StrictModel):
-    """Where does the run stand?"""
+    """Return the status of the run."""
 
     command: Literal["status"]
 
 
 class SetRequest(StrictModel):
-    """Move the reference's gain or offset over a ramp, or fade the inverse out or in.
+    """Ramp gain or offset of the reference, or bypass or enable the inverse; None: unchanged.
 
     Attributes:
-        gain: Factor of the reference; left as it is where None.
-        offset: Added to the reference, in the waveform's unit; left as it is where None.
-        inverse: ``out`` puts a straight line in the place of the inverse, ``in`` the inverse back;
-            left as it is where None.
-        over_s: Time that the change takes.
+        gain: Factor of the reference.
+        offset: Added to the reference, in the waveform's unit.
+        inverse: ``out`` replaces the inverse by a straight line, ``in`` enables it.
+        over_s: Duration of the change.
     """
 
     command: Literal["set"]
@@ -52,7 +51,7 @@ class MarkRequest(StrictModel):
     """Set a mark at the present sample.
 
     Attributes:
-        text: What happened, for people.
+        text: Text of the mark.
     """
 
     command: Literal["mark"]
@@ -62,17 +61,17 @@ class MarkRequest(StrictModel):
 REQUESTS: TypeAdapter[StatusRequest | SetRequest | MarkRequest] = TypeAdapter(
     Annotated[StatusRequest | SetRequest | MarkRequest, Field(discriminator="command")]
 )
-"""Reads a request; ``command`` says which."""
+"""Validator of requests, selected by ``command``."""
 
 
 class Requests:
-    """Answers the requests to a run.
+    """Answer the requests to a run.
 
     Args:
         checked: The experiment.
         folder: The run's folder.
         page: Shared with the loop.
-        recording: Takes what the loop exchanges.
+        recording: Records events.
     """
 
     def __init__(
@@ -89,12 +88,12 @@ class Requests:
         self._changes = Changes(checked, page)
 
     def answer(self, line: bytes) -> Mapping[str, Any]:
-        """Return the answer to one line of JSON; a change waits for the one before.
+        """Return the answer to one line of JSON; a change waits for the previous one.
 
         Several threads may call it.
 
         Raises:
-            InputError: It is no request, or can't be followed; nothing has changed.
+            InputError: The request is not valid, or refused; nothing has changed.
         """
         try:
             request = REQUESTS.validate_json(line)
@@ -110,7 +109,7 @@ class Requests:
 
     def _mark(self, text: str) -> dict[str, Any]:
         if not self._recording.takes_marks:
-            raise InputError("mark: the recording takes none now, or is over")
+            raise InputError("mark: the recording accepts none now, or has ended")
         page = self._page
         sample = page.get(Number.WAVEFORM_AT) + page.get(Number.NEXT_SAMPLE)
         self._recording.record_event(Event(sample, "info", MARK, text))

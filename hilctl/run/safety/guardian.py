@@ -4,11 +4,11 @@ Started by the supervisor as ``python -m hilctl.run.safety.guardian JOB PIDFD PI
 and the number of the loop process. Once it watches, it reads no file, imports nothing and waits for
 no other process, so neither a disk nor the supervisor can delay the safe value.
 
-It acts if the loop dies without a confirmed safe output, or hangs. It keeps trying until the device
-confirms the safe value, also after the supervisor has ended; SIGTERM ends it then. The supervisor
-drives the device only after the guardian has ended or was killed, so two processes never hold it.
+It acts if the loop hangs or dies without a confirmed safe output. It retries until the device
+confirms the safe value, even after the supervisor has ended; then SIGTERM ends it. The supervisor
+drives the device only after the guardian has ended, so two processes never hold it.
 
-As ``python -m hilctl.run.safety.guardian JOB act`` it has no loop to watch, and acts at once.
+As ``python -m hilctl.run.safety.guardian JOB act`` it acts immediately, without a loop to watch.
 """
 
 import os
@@ -45,19 +45,21 @@ _POLLS = 3
 _CLOSING_S = 30.0
 _POLL_MS = 5
 LAST_CALL_MS = 5
-"""How long a process that was killed may be in a call that it is to end. Then it is dying: giving
-back its memory takes much longer, and only a device that takes one connection waits for that."""
+"""Longest wait for a killed process to leave a system call.
+
+Its memory is released much later, which only matters to a device that accepts one connection.
+"""
 
 
 class HangWatch:
-    """Detect a loop that lives but writes no heartbeat.
+    """Detect a live loop without heartbeat.
 
-    A stall of the whole machine stalls this process too, so silence counts only after several
+    A stall of the whole computer stalls this process too, so silence counts only after several
     polls.
 
     Args:
         page: Shared with the loop.
-        limits: Longest that it may be silent.
+        limits: Longest silence.
         is_stopped: Whether the loop's process is stopped.
     """
 
@@ -91,12 +93,12 @@ class HangWatch:
         loop_s = limits.real_time_s if page.get(PageField.REAL_TIME) else limits.ordinary_s
         if silent_s > loop_s + self._wait_s(phase):
             return True
-        # Last, since it asks the kernel.
+        # Last: it reads /proc.
         return silent_s > limits.stopped_s and self._is_stopped()
 
     def _wait_s(self, phase: int) -> float:
-        """Return how long the loop may be waiting for its device."""
-        # A lost device may use up its timeouts; before the first tick nothing moves.
+        """Return how long the loop may wait for its device."""
+        # Closing a lost device takes its timeouts; before the first tick nothing moves.
         if phase == Phase.CLOSING or not self._page.get(PageField.LOOP_HEARTBEAT_NS):
             return _CLOSING_S
         return self._limits.exchange_s if self._page.get(PageField.EXCHANGING) else 0.0
@@ -113,17 +115,17 @@ def is_stopped(process: int) -> bool:
 
 
 class SafeAction:
-    """Drive a device to its safe value in a thread, until the outcome is final.
+    """Drive a device to its safe value in a thread until the result is final.
 
     Args:
         page: Shared with the other processes of the run.
-        device: Not open; each write opens a connection of its own.
-        goal: Where the output goes.
-        hung: Whether the loop had to be killed.
-        prepare: Called in that thread first.
+        device: Not open; each write opens a connection.
+        goal: The safe value and the ramp to it.
+        hung: Whether the loop was killed.
+        prepare: Called first in that thread.
 
     Attributes:
-        failed: Error of this process, after which another one has to try; empty without one.
+        failed: Error of this process, so that another one must try; may be empty.
 
     Raises:
         RuntimeError: No thread can be started.
@@ -143,7 +145,7 @@ class SafeAction:
         self._result = SafeActionResult(hung, "unknown", self._output.error, final=False)
         self._ending = threading.Event()
         self.failed = ""
-        # A daemon: a device that blocks for ever must not keep the process alive.
+        # A daemon, so that a device that blocks forever does not keep the process alive.
         self._thread = threading.Thread(target=self._run, name="safe action", daemon=True)
         self._thread.start()
 
@@ -160,7 +162,7 @@ class SafeAction:
                     self._ending.wait(output.pause_s)
         except LocalError as error:
             self.failed = str(error)
-        except Exception as error:  # noqa: BLE001  no error may pass for a confirmed output
+        except Exception as error:  # noqa: BLE001  every error leaves the output unconfirmed
             self.failed = f"{type(error).__name__}: {error}"
 
     def result(self, wait_s: float = 0.0) -> SafeActionResult:
@@ -204,20 +206,20 @@ class Guardian:
         self._death.register(pidfd, select.POLLIN)
 
     def watch(self) -> bool:
-        """Watch until the loop is gone, and the output safe if that can be had.
+        """Watch until the loop has ended and the output is safe.
 
         Returns:
-            False if this process cannot drive the device, and another one has to.
+            False if this process cannot drive the device, so that another one must.
         """
         page = self._page
         page.put(PageField.GUARDIAN_HEARTBEAT_NS, time.monotonic_ns())
-        # After the heartbeat: an old one would pass for silence.
+        # After the heartbeat: an old one would count as silence.
         page.put(PageField.GUARDIAN_PHASE, GuardianPhase.WATCHING)
         while True:
             now_ns = time.monotonic_ns()
             page.put(PageField.GUARDIAN_HEARTBEAT_NS, now_ns)
             if self._death.poll(_POLL_MS):
-                # Without the start signal nothing was sent: the output is as it was before.
+                # Without the start signal nothing was sent.
                 if not page.get(PageField.GO) or page.ended_safely():
                     return True
                 return act(page, self._device, self._goal(), hung=False, prepare=self._prepare)
@@ -229,22 +231,22 @@ class Guardian:
         return safe_goal(self._ring, self._device, self._job.safe_value, self._job.ramp_per_s)
 
     def _kill_loop(self) -> None:
-        """End the loop for good: should it go on, it would send commands from before."""
+        """Kill the loop: if it continued, it would send old commands."""
         with suppress(ProcessLookupError):
             signal.pidfd_send_signal(self._pidfd, signal.SIGKILL)
         self._death.poll(LAST_CALL_MS)
 
 
 def safe_goal(ring: SampleRing, device: Device, value: float, ramp_per_s: float) -> SafeGoal:
-    """Return where the output goes after a loop that has died, by what it left in the ring."""
+    """Return the goal after a loop that died, from its data in the ring."""
     page, info = ring.page, device.info
-    # Loop, guardian or supervisor may have been on the way before.
+    # Loop, guardian or supervisor may have started the ramp.
     start = page.last_safe_write()
     if start is None:
         start = ring.last_command()
-    # A loop that has ended without a confirmed output lost its device in an exchange.
+    # A loop that ended without a confirmed output lost its device in an exchange.
     unanswered = page.get(PageField.EXCHANGING) or page.get(PageField.PHASE) == Phase.ENDED
-    if info.simulated:  # another process has a simulation of its own
+    if info.simulated:  # each process has its own simulation
         return SafeGoal(value, ramp_per_s, None, pending=False)
     return SafeGoal(value, ramp_per_s, start, bool(unanswered))
 
@@ -257,17 +259,17 @@ def act(
     hung: bool,
     prepare: Callable[[], object] = lambda: None,
 ) -> bool:
-    """Drive the device until its safe value is confirmed, cannot be, or SIGTERM ends it.
+    """Drive the device until the result is final, or SIGTERM ends it.
 
     Args:
-        page: Shared with the supervisor; shows how far it is.
+        page: Shared with the supervisor.
         device: Not open.
-        goal: Where the output goes.
-        hung: Whether the loop had to be killed.
+        goal: The safe value and the ramp to it.
+        hung: Whether the loop was killed.
         prepare: Called first in the thread that drives the device.
 
     Returns:
-        False if this process cannot drive the device, and another one has to.
+        False if this process cannot drive the device, so that another one must.
     """
     ended_by_user = False
 
@@ -291,14 +293,14 @@ def act(
 
 def _fail(page: SharedPage, text: str) -> None:
     page.write_text(PageSlot.GUARDIAN, text)
-    # The text first: the phase says that it is there.
+    # After the text, which readers expect in this phase.
     page.put(PageField.GUARDIAN_PHASE, GuardianPhase.FAILED)
 
 
 def main(words: list[str]) -> int:
     """Guard one run; the exit code is 0 if the job could be read and the device driven."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.SIG_IGN)  # it ends with the loop, and not before
+        signal.signal(number, signal.SIG_IGN)  # it ends after the loop
     job = Job.read(Path(words[0]))
     ring = SampleRing(Path(job.ring))
     page = ring.page
@@ -308,7 +310,7 @@ def main(words: list[str]) -> int:
     except (HilctlError, MemoryError) as error:
         _fail(page, str(error) or "not enough memory")
         return 1
-    "localhost".encode("idna")  # the codec, which is imported at the first connection otherwise
+    "localhost".encode("idna")  # import the codec now, not at the first connection
     process = LinuxProcess()
     _stay_in_memory(process)
     be_quick(job.safe_priority, process)
@@ -324,7 +326,7 @@ def main(words: list[str]) -> int:
 
 
 def _leave_folder(folder: Path, page: SharedPage) -> None:
-    """Remove the run's folder if nothing is left to do, or see that it can be recovered."""
+    """Remove the run's folder if it is complete; otherwise keep it for recovery."""
     if page.get(PageField.RECORDED) and page.get(PageField.GUARDIAN_PHASE) == GuardianPhase.DONE:
         shutil.rmtree(folder, ignore_errors=True)
     else:
@@ -332,7 +334,7 @@ def _leave_folder(folder: Path, page: SharedPage) -> None:
 
 
 def _stay_in_memory(process: LinuxProcess) -> None:
-    """Keep all that is needed in RAM where that is allowed: to read it back may need a disk."""
+    """Lock all memory if that is allowed: a page fault may need a disk."""
     process.freeze_gc()
     with suppress(OSError):
         if process.lockable_bytes() is None:

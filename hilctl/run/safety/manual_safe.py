@@ -1,4 +1,4 @@
-"""Set a device to its safe value by hand, without a run."""
+"""``hilctl safe``: set a device to its safe value without a run."""
 
 import logging
 import time
@@ -29,15 +29,15 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class SafeResult:
-    """What came of it.
+    """Result of setting the safe value.
 
     Attributes:
-        device: The device, for people.
+        device: Description of the device.
         value: The safe value.
         unit: Its unit, ``A`` or ``V``.
-        output: What is known of the output.
-        error: Why it is not confirmed; empty if no write failed.
-        guardian_active: Whether the guardian of an earlier run keeps trying.
+        output: State of the output.
+        error: Why it is not confirmed; may be empty.
+        guardian_active: Whether the guardian of an earlier run continues.
     """
 
     device: str
@@ -68,17 +68,17 @@ def put_safe(
 ) -> SafeResult:
     """Set the device of an experiment to the experiment's safe value, without a ramp.
 
-    Nothing else of the file is needed, and so nothing else of it is checked. A guardian that still
-    drives the device after an earlier run is relieved, and goes on if the device does not confirm.
+    Only these sections of the file are validated. A guardian of an earlier run that drives the
+    device is stopped, and started again if the device does not confirm.
 
     Args:
         path: Experiment file.
-        settings: ``key=value`` texts over it.
+        settings: ``key=value`` texts that override it.
         clock: Monotonic time in s.
         sleep: Waits that many s.
 
     Raises:
-        InputError: The file can't be used, or a run holds the device; nothing was sent.
+        InputError: The file is not valid, or a run holds the device; nothing was sent.
     """
     document = load_document(path)
     for setting in settings:
@@ -95,7 +95,7 @@ def put_safe(
     with ExitStack() as stack:
         locks: list[int] = []
         try:
-            # Not past a run that holds it: its loop would overwrite the safe value a tick later.
+            # Refused while a run holds the device: its loop would overwrite the safe value.
             locks = _locks(stack, info.holds)
             _drive(output, clock, sleep, watches=not relief.runs)
         finally:
@@ -114,24 +114,24 @@ def put_safe(
 
 
 def _earlier_run(holds: Sequence[str]) -> tuple[bool, GuardianRelief]:
-    """Return whether a run of a device has died, and the relief of its guardian.
+    """Return whether a run of the device has died, and the relief of its guardian.
 
-    Such a run may have left a command without an answer.
+    A dead run may have left an unanswered command.
     """
     try:
         died = any(not run.supervised and set(run.card.holds) & set(holds) for run in runs())
         return died, GuardianRelief(holds)
     except RunError as error:
-        _log.warning("%s: the safe value is written all the same", error)
+        _log.warning("%s: the safe value is written anyway", error)
         return True, GuardianRelief(())
 
 
 def _locks(stack: ExitStack, holds: Sequence[str]) -> list[int]:
-    """Hold a device; return the descriptors of its locks, none if they cannot be made."""
+    """Lock a device; return the descriptors of its locks, none if they cannot be created."""
     try:
         return stack.enter_context(held_devices(holds))
-    except RunError as error:  # any user can fill /dev/shm: no reason to leave current flowing
-        _log.warning("%s: the safe value is written all the same", error)
+    except RunError as error:  # such as a full /dev/shm: the output must become safe nevertheless
+        _log.warning("%s: the safe value is written anyway", error)
         return []
 
 
@@ -142,13 +142,13 @@ def _drive(
     *,
     watches: bool,
 ) -> None:
-    """Write until the outcome is final, or nothing more is gained; Ctrl-C ends it too.
+    """Write until the state is final, a time limit, or Ctrl-C.
 
     Args:
-        output: What is driven.
+        output: The output.
         clock: Monotonic time in s.
         sleep: Waits that many s.
-        watches: Whether to watch a value that is set until no older command can follow.
+        watches: Whether to repeat a value that is set until no older command can follow.
     """
     give_up_s = clock() + PATIENCE_S
     try:

@@ -1,9 +1,9 @@
-"""The supervisor's part in setting the output to its safe value.
+"""The supervisor's monitor of loop and guardian, which replaces a lost guardian.
 
-The guardian acts by itself if the loop dies or hangs. The supervisor restarts a guardian that is
-lost, and acts in its place if there is none: for a simulated device, and if the guardian has died,
-hangs, cannot drive the device, or has not restarted yet. It kills the guardian first, so that only
-one process holds the device. What is not confirmed when the run ends is left to a guardian.
+The guardian acts by itself if the loop dies or hangs. The supervisor restarts a lost guardian, and
+sets the safe value itself if no guardian can: for a simulated device, or if the guardian died,
+hangs, or cannot drive the device. It kills the guardian first, so that only one process holds the
+device. An output that is not confirmed at the end of the run is left to a guardian.
 """
 
 import time
@@ -32,14 +32,14 @@ _POLL_S = 0.01
 
 
 class SafetyMonitor:
-    """Sees to it that a loop which died or hangs leaves a safe output.
+    """Ensure a safe output after a loop that died or hangs.
 
     Args:
         checked: The experiment.
         ring: Shared with loop and guardian.
         child: The loop's process.
-        start_guardian: Starts a guardian, to watch that process or to act at once if None; None if
-            the run needs none.
+        start_guardian: Starts a guardian that watches a process, or acts immediately if None; None
+            if the run needs no guardian.
         record_event: Records an event.
     """
 
@@ -66,7 +66,7 @@ class SafetyMonitor:
         self._hung = False
         self._action: SafeAction | None = None
         self.result: SafeActionResult | None = None
-        """What came of it, once a run may end with it; None if nobody had to act, or still acts."""
+        """Final result; None while no action was necessary or the action continues."""
         self.by = ""
         """Which process acted."""
 
@@ -74,7 +74,7 @@ class SafetyMonitor:
         """Return whether the guardian watches, if the run needs one.
 
         Raises:
-            RunError: It could not be started.
+            RunError: The guardian failed to start.
         """
         guardian = self._guardian
         if guardian is None or guardian.phase == GuardianPhase.WATCHING:
@@ -84,11 +84,11 @@ class SafetyMonitor:
         return False
 
     def update(self, now_ns: int, *, ended: bool) -> None:
-        """Look once, and do what has to be done; never waits for device or guardian.
+        """Check loop and guardian, and act if necessary; never wait for device or guardian.
 
         Args:
             now_ns: Monotonic time.
-            ended: Whether the loop's process was gone before.
+            ended: Whether the loop's process had ended before.
         """
         if self.result is not None:
             return
@@ -105,7 +105,7 @@ class SafetyMonitor:
         return self._trouble_ns != 0
 
     def _follow_up(self, now_ns: int, *, ended: bool) -> None:
-        """Follow whoever drives the device, and drive it here if the guardian does not."""
+        """Follow the process that drives the device; drive it here if the guardian does not."""
         action = self._action
         if action is None and not self._guardian_acts(now_ns):
             be_quick(self._priority)
@@ -114,12 +114,12 @@ class SafetyMonitor:
             finally:
                 be_ordinary()
         elif action is not None and action.failed:
-            self._action = None  # and again at the next look: there is nobody else
+            self._action = None  # retried at the next poll
         by, result = self._reached()
         over = now_ns - self._trouble_ns > self._patience_ns
-        # A loop that was killed in a call takes a while to be gone.
+        # A loop that was killed in a system call ends later.
         gone = ended or self._action is not None
-        # Nothing is gained by waiting until a value that is set has held: a guardian watches it.
+        # A guardian watches a value that is set but not confirmed.
         settled = result is not None and (result.final or result.output == "set")
         if result is not None and ((settled and gone) or over):
             self.result, self.by = result, by
@@ -130,12 +130,12 @@ class SafetyMonitor:
         return "guardian", self._page.safe_result()
 
     def _stand_in(self) -> None:
-        # Both before the device: neither may come back to it.
+        # Both before the device is used: neither may write to it afterwards.
         last_call_s = 1e-3 * LAST_CALL_MS
         if self._guardian is not None:
             self._guardian.kill(last_call_s)
         self._child.kill(last_call_s)
-        # It may have been done in the very last moment.
+        # The guardian may have finished just before.
         result = self._page.safe_result()
         if result is None or not result.final:
             limits = self._limits
@@ -154,7 +154,7 @@ class SafetyMonitor:
         return awake or guardian.phase == GuardianPhase.DONE
 
     def _keep_guardian(self, now_ns: int) -> None:
-        """Start another guardian if this one is lost, and record that."""
+        """Replace the guardian if it is lost, and record that."""
         guardian = self._guardian
         if self._started_ns is None:
             self._started_ns = now_ns
@@ -164,40 +164,40 @@ class SafetyMonitor:
                 return
             guardian.kill(0.0)
             self._guardian = None
-            self._say(f"the guardian {why}; the supervisor watches until there is another one")
+            self._record(f"the guardian {why}; the supervisor watches until another one is ready")
         if now_ns - self._started_ns < _AGAIN_NS and self._heartbeat_ns == 0:
-            return  # it never got as far as to watch: not again and again without a pause
+            return  # it has never watched: pause before the next attempt
         assert self._start_guardian is not None
         self._started_ns, self._heartbeat_ns = now_ns, 0
         try:
             self._guardian = self._start_guardian(self._child.pid)
         except OSError as error:
-            self._say(f"the guardian cannot be started: {error.strerror}")
+            self._record(f"the guardian cannot be started: {error.strerror}")
 
     def _silent(self, guardian: GuardianProcess, now_ns: int) -> str:
-        """Return how a guardian that lives is silent; empty if it is not."""
+        """Return how a live guardian is silent, or an empty text."""
         heartbeat_ns = guardian.heartbeat_ns
         if heartbeat_ns != self._heartbeat_ns or heartbeat_ns == 0:
             self._heartbeat_ns, self._looks = heartbeat_ns, 0
             starting = heartbeat_ns == 0 and now_ns - (self._started_ns or now_ns) > _START_NS
             return "does not start" if starting else ""
-        # If all stood still, this process too, it is given the time to go on.
+        # After a stall of the whole computer the guardian gets time to continue.
         self._looks += 1
         lost = self._looks > _LOST_LOOKS and now_ns - heartbeat_ns > _LOST_NS
-        return "gives no sign any more" if lost else ""
+        return "is silent" if lost else ""
 
-    def _say(self, text: str) -> None:
+    def _record(self, text: str) -> None:
         sample = self._page.get(PageField.NEXT_SAMPLE)
         self._record_event(Event(sample, "warning", "guardian_lost", text))
 
     def close(self, stopped: Callable[[], bool] = lambda: False) -> bool:
-        """End the guardian, or leave an output that is not confirmed to one.
+        """End the guardian, or leave an unconfirmed output to it.
 
         Args:
-            stopped: Whether the user ends what this process still does for the output.
+            stopped: Whether the user ends the attempts of this process.
 
         Returns:
-            Whether a guardian goes on after this process.
+            Whether a guardian stays active.
         """
         if self.result is None or self.result.final or self._start_guardian is None:
             if self._guardian is not None:
@@ -208,12 +208,12 @@ class SafetyMonitor:
         return self._hand_over(stopped)
 
     def _hand_over(self, stopped: Callable[[], bool]) -> bool:
-        """Have a new guardian go on with what is not confirmed yet, or go on here until it is."""
+        """Hand an unconfirmed output over to a new guardian; continue here until that works."""
         while self._action is not None and not stopped():
             self._action.end(_HAND_OVER_S)
             if self._started_to_act(stopped):
                 return True
-            with suppress(RuntimeError):  # no thread can be started: the next try may be luckier
+            with suppress(RuntimeError):  # no thread can be started: retried
                 self._stand_in()
             deadline_s = time.monotonic() + _HAND_OVER_S
             while time.monotonic() < deadline_s and not stopped() and not self._action.failed:

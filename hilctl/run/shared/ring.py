@@ -1,18 +1,16 @@
-"""Shared memory between the loop and the recorder: a ring of sample blocks behind a page.
+"""A ring of sample blocks in shared memory, between loop (producer) and recorder (consumer).
 
-One producer (the loop) and one consumer (the recorder). A block is born in its slot and stays
-there: the loop fills it, sends it to the device, and moves a first cursor over it (sent); when its
-displacements have come, a second one (head); the consumer takes it from there, and gives its room
-back (tail) only once it is safe in the recording. So a loop or a supervisor that dies leaves
-everything behind, blocks on their way to the device included: the ring is a file in memory.
+A block stays in its slot. The loop fills it, advances the cursor ``SENT`` and sends it to the
+device; when the displacements have arrived, it advances ``HEAD``. The recorder advances ``TAIL``
+only after the recording contains the block. The ring is a file in memory, so a loop or supervisor
+that dies leaves all blocks, including those sent and not answered.
 
-The producer never waits: where the ring is full a block lives in one of a few spare slots, is
-counted as dropped, and the next one that fits says how many samples are missing before it.
+The producer never waits. If the ring is full, a block uses a spare slot and is counted as dropped;
+the next block contains the number of samples missing before it.
 
-Each slot carries its own sequence number: negative while the block is on its way, positive, and
-written after everything else in it, when it is whole. The consumer takes a slot only when the
-number is the one it expects. The cursors are published and observed, in order with the blocks; see
-:mod:`hilctl.kernels.atomics`.
+Each slot has a sequence number: negative while the block is under way; positive, and written last,
+when it is complete. The consumer accepts only the number that it expects. Cursors have release and
+acquire order, see :mod:`hilctl.kernels.atomics`.
 """
 
 import math
@@ -41,36 +39,35 @@ from hilctl.run.shared.shared_page import SIZE as _PAGE_SIZE
 from hilctl.run.shared.shared_page import PageField, SafeActionResult, SharedPage
 
 _LINE = 64
-# Plain numbers: looking up an enumeration's member takes longer than writing it.
+# Plain integers: access to an enumeration's member takes longer than the write.
 _SENT, _HEAD, _TAIL = int(PageField.SENT), int(PageField.HEAD), int(PageField.TAIL)
 _ENDED_AT, _EXCHANGING = int(PageField.ENDED_AT), int(PageField.EXCHANGING)
 _SEQUENCE, _FIRST_SAMPLE = int(BlockHeader.SEQUENCE), int(BlockHeader.FIRST_SAMPLE)
 _HEAD_NUMBERS = len(BlockHeader)
 _MAGIC = 0x48494C43_52494E48
 _MOST_BLOCKS = 50_000
-"""Most blocks that are made before the first tick: each takes 1.3 kB."""
+"""Most block objects that are created before the first tick; each takes 1.3 kB."""
 _BATCH_SAMPLES = 8192
-"""About how many samples are taken out together: what becomes of them is ten times their memory."""
+"""Approximate samples per batch; their processing takes ten times their memory."""
 _TYPES = (np.int64, np.float64, np.float64, np.uint32)
 
 
 class SampleRing:
-    """The ring, seen from either side.
+    """The ring, for producer, consumer and watchers.
 
     Args:
-        path: File that holds it; one that :meth:`create` made.
-        look_only: Map it so that nothing can be written: for those who look on.
-        at_once: Map all of it now, and not page by page as it is touched: for the loop, whose
-            memory may not be locked.
+        path: File that :meth:`create` made.
+        look_only: Map it read-only, for watchers.
+        at_once: Map all pages now, for the loop, whose memory may not be locked.
 
     Attributes:
-        page: Numbers, texts and events beside the blocks.
-        slots: Number of blocks it holds.
-        block: Samples in a block.
+        page: Numbers, texts and events before the blocks.
+        slots: Number of slots.
+        block: Samples per block.
 
     Raises:
-        ValueError: It is no ring, or a damaged one.
-        OSError: It can't be opened.
+        ValueError: The file is not a ring, or is damaged.
+        OSError: The file cannot be opened.
     """
 
     def __init__(self, path: Path, *, look_only: bool = False, at_once: bool = False) -> None:
@@ -105,29 +102,29 @@ class SampleRing:
     def create(
         cls, path: Path, *, slots: int, block: int, state_size: int, latency_blocks: int = 0
     ) -> Self:
-        """Make a new ring; its memory is claimed at once.
+        """Create a ring and allocate its memory.
 
         Args:
-            path: File that holds it.
-            slots: Number of blocks it holds.
-            block: Samples in a block.
-            state_size: Numbers of state kept with each block.
+            path: Its file.
+            slots: Number of slots.
+            block: Samples per block.
+            state_size: Size of the state of each block.
             latency_blocks: Exchanges from a block's commands to its displacements.
 
         Raises:
-            OSError: There is no such memory to be had.
+            OSError: The memory is not available.
         """
-        spare = latency_blocks + 1  # so many blocks may be on their way without a slot of their own
+        spare = latency_blocks + 1  # blocks that may be under way in spare slots
         size = sum(_padded(each) for each in _sizes(slots + spare, block, state_size))
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
         try:
-            # Claimed now: memory that is not to be had must fail here, and not in mid-run.
+            # Allocated now: missing memory must fail here, not during the run.
             os.posix_fallocate(descriptor, 0, _PAGE_SIZE + size)
             with mmap.mmap(descriptor, _PAGE_SIZE) as memory:
                 numbers = memoryview(memory).cast("q")
                 numbers[PageField.SLOTS], numbers[PageField.BLOCK] = slots, block
                 numbers[PageField.STATE_SIZE], numbers[PageField.SPARE] = state_size, spare
-                # Last: a ring whose maker died meanwhile is not taken for one.
+                # Last: an incomplete ring is not valid.
                 numbers[PageField.MAGIC] = _MAGIC
                 numbers.release()
         finally:
@@ -151,7 +148,7 @@ class SampleRing:
         return BlockBatch(*parts)
 
     def prepare_blocks(self) -> None:
-        """Make the blocks of the slots before the first tick, for the producer."""
+        """Create the block objects of the producer before the first tick."""
         count = min(self.slots + self._spare, _MOST_BLOCKS)
         self._blocks = [self._block(slot) for slot in range(count)]
 
@@ -160,10 +157,7 @@ class SampleRing:
         return Block(self._heads[at : at + _HEAD_NUMBERS], self._area, slot)
 
     def claim(self, *, due: bool = True) -> Block:
-        """Return the slot that the next block is to be born in, see :class:`hilctl.loop.plan.Host`.
-
-        The same one again until :meth:`sending` has been called with it.
-        """
+        """Return the next block, the same one until :meth:`sending`."""
         number = self._numbers[_SENT]
         if due and number - self._observe(self._integers, _TAIL) < self.slots:
             slot = number % self.slots
@@ -176,13 +170,10 @@ class SampleRing:
         return block
 
     def last_command(self) -> float | None:
-        """Return the command that the device is at, as far as the ring tells; for any process.
+        """Return the last command of the device, or None if its block was in a spare slot.
 
-        Of a device that plays blocks from a FIFO it is the end of the first block that has no
-        answer yet. Before the first block it is where the output was when the loop began.
-
-        Returns:
-            Command in the device's unit; None if the block was not in a slot of its own.
+        With a FIFO it is the end of the first unanswered block. Before the first block it is the
+        output at the start of the loop.
         """
         sent, head = self.page.get(PageField.SENT), self.page.get(PageField.HEAD)
         if self.page.get(PageField.ENDED_AT) == 0:
@@ -197,17 +188,17 @@ class SampleRing:
         return float(self._area.columns[slot, COMMAND, -1])
 
     def sending(self, block: Block) -> None:
-        """Note that a block is on its way to the device, before it is."""
+        """Note that a block is about to be sent."""
         numbers = self._numbers
         if block.number >= 0:
             block.head[_SEQUENCE] = -block.number - 1
             self._publish(self._integers, _SENT, block.number + 1)
         numbers[_ENDED_AT] = block.head[_FIRST_SAMPLE] + self.block
-        # Last: from here on the loop may be silent for as long as the device keeps it waiting.
+        # Last: from now on the loop may be silent while it waits for the device.
         numbers[_EXCHANGING] = 1
 
     def answered(self, block: Block) -> bool:
-        """Hand a block over to the consumer; False where it has no slot of its own."""
+        """Hand a block to the consumer; return False if it is in a spare slot."""
         self._numbers[_EXCHANGING] = 0
         if block.number < 0:
             return False
@@ -216,21 +207,15 @@ class SampleRing:
         return True
 
     def batches(self) -> Iterator[BlockBatch]:
-        """Take out the blocks that are there now, some at a time; see :meth:`pop`."""
-        # As many as there are now: on a busy machine there always is another one by then.
+        """Yield the present blocks in batches; see :meth:`pop`."""
+        # Not those that arrive meanwhile: on a busy computer it would not end.
         waiting = min(max(self.page.observe(PageField.HEAD) - self._tail, 0), self.slots)
         until = self._tail + waiting
         while (left := until - self._tail) > 0 and (batch := self.pop(left)) is not None:
             yield batch
 
     def pop(self, most: int | None = None) -> BlockBatch | None:
-        """Take out blocks, up to the end of the ring and not too many; None where there are none.
-
-        They keep their room until :meth:`release`.
-
-        Args:
-            most: How many at most.
-        """
+        """Return the next blocks, at most ``most``, or None; they stay until :meth:`release`."""
         there = min(max(self.page.observe(PageField.HEAD) - self._tail, 0), self.slots)
         if there == 0:
             return None
@@ -239,7 +224,7 @@ class SampleRing:
         count = min(there, self.slots - first, few, there if most is None else most)
         batch = self._area.rows(slice(first, first + count))
         wrong = np.flatnonzero(~_whole(batch.heads, self._tail))
-        if wrong.size:  # damaged: what stands before it is good
+        if wrong.size:  # damaged: the blocks before it are valid
             count = int(wrong[0])
             if count == 0:
                 return None
@@ -248,11 +233,7 @@ class SampleRing:
         return batch
 
     def skip_damaged(self) -> int:
-        """Pass over blocks that will never come out; for when the producer has ended.
-
-        Returns:
-            How many there were.
-        """
+        """Skip damaged blocks after the producer has ended; return their number."""
         there = min(max(self.page.observe(PageField.HEAD) - self._tail, 0), self.slots)
         passed = 0
         while passed < there:
@@ -264,18 +245,17 @@ class SampleRing:
         return passed
 
     def look(self, since: int) -> tuple[BlockBatch, int]:
-        """Copy the blocks from number ``since`` on; takes nothing out, any process may call it.
+        """Copy the complete blocks from number ``since`` on without consuming them.
 
         Returns:
-            Those that still stand there whole, perhaps none, and the number after the last of all;
-            what is missing between was overwritten, or damaged.
+            The blocks, and the number after the last one; others were overwritten or damaged.
         """
         head = self.page.observe(PageField.HEAD)
         numbers = _numbers(
             max(since, self.page.observe(PageField.CLEANED), head - self.slots), head
         )
         batch = self._area.rows(numbers % self.slots)
-        # Looked at again: of what is given back meanwhile, a part may be clean already.
+        # Checked after the copy: blocks may have been released and cleaned meanwhile.
         whole = numbers >= self.page.observe(PageField.CLEANED)
         whole &= batch.heads[:, BlockHeader.SEQUENCE] == numbers + 1
         return batch if whole.all() else batch.rows(np.flatnonzero(whole)), max(head, since)
@@ -284,13 +264,13 @@ class SampleRing:
         """Release consumed blocks to the producer; they are on disk.
 
         Args:
-            keep: Newest blocks that stay for watchers, until the next call.
+            keep: Newest blocks that stay readable for watchers until the next call.
         """
         self.page.release_events()
         until = max(self._released, self._tail - keep)
-        # Said first: who looks on must not take a block that is cleaned under its copy for whole.
+        # First: watchers must not use a block that is cleaned during their copy.
         self.page.publish(PageField.CLEANED, until)
-        # Cleaned here and not in the tick; before the room is given, or the loop would be in it.
+        # Cleaned here, not in the tick, and before the loop may reuse the slots.
         first, count = self._released % self.slots, until - self._released
         self._clean(slice(first, min(first + count, self.slots)))
         self._clean(slice(0, max(0, first + count - self.slots)))
@@ -298,20 +278,19 @@ class SampleRing:
         self.page.publish(PageField.TAIL, until)
 
     def _clean(self, slots: slice) -> None:
-        """Let slots hold no flag and no answer."""
+        """Reset flags and answers of slots."""
         self._area.flags[slots] = 0
         self._area.columns[slots, ANSWERS] = np.nan
 
     def unanswered(self, next_sample: int) -> BlockBatch | None:
-        """Return the blocks that were sent and never answered; for when the producer has died.
+        """Return the blocks that were sent and not answered, after the producer has died.
 
         Args:
-            next_sample: Index after the last sample that came out of the ring; what was sent
-                before it has come out.
+            next_sample: Index after the last consumed sample.
 
         Returns:
-            The blocks in order, every sample with :attr:`~hilctl.base.samples.Flag.UNANSWERED`, or
-            None. The last may not have reached the device.
+            The blocks in order with :attr:`~hilctl.base.samples.Flag.UNANSWERED`, or None. The last
+            one may not have reached the device.
         """
         sent = self.page.observe(PageField.SENT)
         numbers = _numbers(max(self.page.observe(PageField.HEAD), sent - self.slots), sent)
@@ -331,14 +310,14 @@ class SampleRing:
 
 
 def _numbers(first: int, stop: int) -> I64:
-    """Return the numbers of blocks in between; none where damage has put one far off another."""
+    """Return the numbers from ``first`` to ``stop``; none if a damaged cursor is out of range."""
     return np.arange(max(first, 0), stop) if first < stop and stop > 0 else np.empty(0, np.int64)
 
 
 def _whole(heads: I64, number: int) -> npt.NDArray[np.bool_]:
-    """Return which blocks are those that come from ``number`` on, and may be recorded.
+    """Return which blocks have the numbers from ``number`` on and valid headers.
 
-    A recording that holds what no run can have is not read again.
+    A recording with impossible values could not be read again.
     """
     expected = np.arange(number + 1, number + 1 + heads.shape[0])
     first = heads[:, BlockHeader.FIRST_SAMPLE]
@@ -369,10 +348,10 @@ def _padded(size: int) -> int:
 
 
 def safe_result_of(run: RunFolder) -> SafeActionResult | None:
-    """Return how far the guardian of a run without a supervisor is; None if it does not act."""
+    """Return the result so far of the guardian of a run without supervisor, or None."""
     if run.supervised or not run.alive:
         return None
     try:
         return SampleRing(run.ring, look_only=True).page.safe_result()
-    except (OSError, ValueError):  # just being removed
+    except (OSError, ValueError):  # being removed
         return None

@@ -1,12 +1,10 @@
-"""What loop, supervisor and guardian pass to each other in shared memory: numbers, texts, events.
+"""The shared page of a run: numbers, texts and events of loop, supervisor and guardian.
 
-Each number has one writer, and is written whole. Nobody ever waits for the other. A number that
-says that others, a text, events or blocks are there is published and observed, in order with them;
-see :mod:`hilctl.kernels.atomics`.
+Each number has one writer, and no process waits for another. A number that announces other data is
+published and observed, in order with the data; see :mod:`hilctl.kernels.atomics`.
 
-The guardian imports this: nothing of the loop or of the kernels may be imported here before it is
-needed, as it brings numba along. The guardian itself neither publishes nor observes: it looks at
-single numbers, and the supervisor takes its text only once that is whole JSON.
+The guardian imports this module, so it must not import numba. The guardian only reads single
+numbers, and readers accept its text only as complete JSON.
 """
 
 import json
@@ -16,18 +14,14 @@ from dataclasses import asdict, astuple, dataclass
 from enum import IntEnum
 from functools import cached_property
 from mmap import mmap
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hilctl.base.events import Event
 from hilctl.base.types import F64, I64
-from hilctl.loop.safe_output import OutputState
-
-if TYPE_CHECKING:
-    from hilctl.loop.pacer import Lateness
-    from hilctl.loop.safe_output import LoopOutcome
-    from hilctl.machine.procfs import ProcessUsage
+from hilctl.loop.pacer import Lateness
+from hilctl.loop.safe_output import LoopOutcome, OutputState
+from hilctl.machine.procfs import ProcessUsage
 
 _PAGE = 4096
 _TEXT_BYTES = 4096
@@ -37,28 +31,27 @@ _READS = 3
 
 
 class PageSlot(IntEnum):
-    """Texts that loop and guardian leave for the supervisor, each in a place of its own."""
+    """Texts of loop and guardian for the supervisor."""
 
     SET_UP = 0
-    """How its process was set up: JSON of names and what became of each, and of what was refused
-    that real time needs."""
+    """Real-time set-up of the loop: JSON of all steps, and of refused required steps."""
     OUTCOME = 1
-    """How the run ended: JSON of :class:`hilctl.loop.plan.LoopOutcome`."""
+    """Outcome of the run: JSON of :class:`hilctl.loop.safe_output.LoopOutcome`."""
     ERROR = 2
-    """Why it could not start or go on, for people."""
+    """Why the loop failed."""
     GUARDIAN = 3
-    """What the guardian did: JSON of :class:`SafeActionResult`, or why it failed, for people."""
+    """Result of the guardian: JSON of :class:`SafeActionResult`, or why it failed."""
 
 
 _EVENTS_AT = _PAGE + len(PageSlot) * _TEXT_BYTES
 _NOTES_AT = _EVENTS_AT + _EVENT_SLOTS * _EVENT_BYTES
 _NOTE_SLOTS = 32
 SIZE = _NOTES_AT + _NOTE_SLOTS * _EVENT_BYTES
-"""Bytes that the numbers, the texts and the events take."""
+"""Size of the page in bytes."""
 
 
 class PageField(IntEnum):
-    """Numbers of the page, int64 each; what a change leads to, but its samples, is float64."""
+    """Numbers of the page, int64 each; gains, offsets and outputs are float64."""
 
     MAGIC = 0
     SLOTS = 1
@@ -113,7 +106,7 @@ class PageField(IntEnum):
 
 
 class Phase(IntEnum):
-    """How far the loop process has come."""
+    """Phase of the loop process."""
 
     STARTING = 0
     READY = 1
@@ -125,7 +118,7 @@ class Phase(IntEnum):
 
 
 class GuardianPhase(IntEnum):
-    """How far the guardian has come."""
+    """Phase of the guardian."""
 
     STARTING = 0
     WATCHING = 1
@@ -136,12 +129,12 @@ class GuardianPhase(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class SafeActionResult:
-    """What came of setting the output to its safe value in place of a loop that cannot.
+    """Result of setting the safe value in place of the loop.
 
     Attributes:
-        hung: Whether the loop was alive, but silent, and was killed.
-        output: What is known of the output.
-        error: Why it is not confirmed; empty if no write failed since.
+        hung: Whether the loop hung and was killed.
+        output: State of the output.
+        error: Why it is not confirmed; may be empty.
         final: Whether no further write follows.
     """
 
@@ -157,7 +150,7 @@ class SafeActionResult:
 
 
 class Stop(IntEnum):
-    """Why the supervisor has the loop stop; 0 is for no stop."""
+    """Why the supervisor stops the loop; 0: no stop."""
 
     CTRL_C = 1
     SIGTERM = 2
@@ -169,18 +162,18 @@ class Stop(IntEnum):
 
     @property
     def reason(self) -> str:
-        """In words."""
+        """The reason as text."""
         return _REASONS[self]
 
 
 _REASONS = {
     Stop.CTRL_C: "stopped by Ctrl-C",
     Stop.SIGTERM: "stopped by SIGTERM",
-    Stop.SIGHUP: "stopped by SIGHUP: the terminal went away",
-    Stop.RECORDER_FAILED: "stopped because the recording can't be written",
+    Stop.SIGHUP: "stopped by SIGHUP: the terminal was closed",
+    Stop.RECORDER_FAILED: "stopped because the recording cannot be written",
     Stop.REQUEST: "stopped by hilctl stop",
-    Stop.RECORDER_STALLED: "stopped because the disk keeps the recording waiting",
-    Stop.SUPERVISOR_BROKE: "stopped because the supervisor broke",
+    Stop.RECORDER_STALLED: "stopped because the disk stalls the recording",
+    Stop.SUPERVISOR_BROKE: "stopped because the supervisor failed",
 }
 
 
@@ -191,7 +184,7 @@ _LATENESS = (
     PageField.WORST_LATE_TICK,
     PageField.LONGEST_LATE_RUN,
 )
-"""Where each field of :class:`~hilctl.loop.pacer.Lateness` stands, in its order."""
+"""The fields of :class:`~hilctl.loop.pacer.Lateness`, in its order."""
 
 _USAGE = (
     PageField.RESIDENT_BYTES,
@@ -204,10 +197,10 @@ _USAGE = (
 
 
 class SharedPage:
-    """The page, seen from either side.
+    """The page, for all processes.
 
     Args:
-        memory: Shared memory of at least :data:`SIZE` bytes; the page stands at its start.
+        memory: Shared memory that begins with the page.
     """
 
     def __init__(self, memory: mmap) -> None:
@@ -215,7 +208,7 @@ class SharedPage:
         self.integers: I64 = np.frombuffer(memory, dtype=np.int64, count=_PAGE // 8)
         """All numbers, int64[n]."""
         self.numbers = memoryview(memory)[:_PAGE].cast("q")
-        """The same numbers as Python's own: three times as fast to read and write singly."""
+        """The same numbers as Python integers: three times as fast for single accesses."""
         self._floats: F64 = np.frombuffer(memory, dtype=np.float64, count=_PAGE // 8)
         self._event_tail = self.get(PageField.EVENT_TAIL)
 
@@ -242,62 +235,56 @@ class SharedPage:
         return observe
 
     def publish(self, field: PageField, value: int) -> None:
-        """Set a number that says of others that they are there, after them."""
+        """Set a number that announces other data, after them."""
         self.publishes(self.integers, field, value)
 
     def observe(self, field: PageField) -> int:
-        """Return a number that says of others that they are there, before they are read."""
+        """Return a number that announces other data, before they are read."""
         return self.observes(self.integers, field)
 
     def get_float(self, field: PageField) -> float:
-        """Return a number that is no whole one."""
+        """Return a float64 number."""
         return float(self._floats[field])
 
     def put_float(self, field: PageField, value: float) -> None:
-        """Set a number that is no whole one."""
+        """Set a float64 number."""
         self._floats[field] = value
 
     def write_text(self, place: PageSlot, text: str) -> None:
-        """Leave a text for the other side, cut to what fits."""
+        """Write a text, truncated to its slot."""
         self._write(_PAGE + place * _TEXT_BYTES, _TEXT_BYTES, text)
 
     def read_text(self, place: PageSlot) -> str:
-        """Return the text that the other side left."""
+        """Return a text."""
         return self._read(_PAGE + place * _TEXT_BYTES, _TEXT_BYTES)
 
-    def lateness(self) -> "Lateness":
-        """Return the counters of late ticks that the loop left."""
-        from hilctl.loop.pacer import Lateness
-
+    def lateness(self) -> Lateness:
+        """Return the loop's counters of late ticks."""
         return Lateness(*map(self.get, _LATENESS))
 
-    def leave_lateness(self, lateness: "Lateness") -> None:
-        """Leave the counters of late ticks for the supervisor."""
+    def leave_lateness(self, lateness: Lateness) -> None:
+        """Write the counters of late ticks."""
         for field, count in zip(_LATENESS, astuple(lateness), strict=True):
             self.put(field, count)
 
-    def usage(self) -> "ProcessUsage | None":
-        """Return what the loop's process said that its run took; None where it said nothing."""
-        from hilctl.machine.procfs import ProcessUsage
-
+    def usage(self) -> ProcessUsage | None:
+        """Return the resource usage of the loop process, or None."""
         found = ProcessUsage(*map(self.get, _USAGE))
         return found if found.resident_bytes else None
 
-    def leave_usage(self, usage: "ProcessUsage") -> None:
-        """Leave what the run took of the loop's process for the supervisor."""
+    def leave_usage(self, usage: ProcessUsage) -> None:
+        """Write the resource usage of the loop process."""
         for field, value in zip(_USAGE, astuple(usage), strict=True):
             self.put(field, value)
 
-    def leave_outcome(self, outcome: "LoopOutcome") -> None:
-        """Leave how the run ended for the supervisor."""
+    def leave_outcome(self, outcome: LoopOutcome) -> None:
+        """Write the outcome of the run."""
         self.write_text(PageSlot.OUTCOME, json.dumps(asdict(outcome)))
-        # The text first: the phase says that it is there.
+        # After the text, which the phase announces.
         self.publish(PageField.PHASE, Phase.ENDED)
 
-    def outcome(self) -> "LoopOutcome | None":
-        """Return how the loop said that the run ended; None where it said nothing."""
-        from hilctl.loop.safe_output import LoopOutcome
-
+    def outcome(self) -> LoopOutcome | None:
+        """Return the outcome that the loop wrote, or None."""
         if self.observe(PageField.PHASE) != Phase.ENDED:
             return None
         with suppress(ValueError, TypeError):  # damaged
@@ -305,35 +292,35 @@ class SharedPage:
         return None
 
     def note_safe_write(self, value: float) -> None:
-        """Note a write on the way to the safe value, so that another process can go on from it."""
+        """Note a write of the safe ramp, so that another process can continue it."""
         self.put_float(PageField.LAST_SAFE_WRITE, value)
-        # The value first: the count says that it is there.
+        # After the value, which the count announces.
         self.put(PageField.SAFE_WRITES, self.get(PageField.SAFE_WRITES) + 1)
 
     def last_safe_write(self) -> float | None:
-        """Return the last value written on the way to the safe value; None before the first."""
+        """Return the last value of the safe ramp; None before the first."""
         return (
             self.get_float(PageField.LAST_SAFE_WRITE) if self.get(PageField.SAFE_WRITES) else None
         )
 
     def ended_safely(self) -> bool:
-        """Return whether the loop said how it ended, and no further write is needed."""
+        """Return whether the loop ended with a safe output."""
         if self.get(PageField.PHASE) != Phase.ENDED:
             return False
         with suppress(ValueError, TypeError):  # damaged
-            # Not by outcome(), which imports numba: the guardian calls this.
+            # Without outcome(), which imports numba: the guardian calls this.
             return json.loads(self.read_text(PageSlot.OUTCOME))["output"] in {"confirmed", "sent"}
         return False
 
     def leave_safe_result(self, result: SafeActionResult) -> None:
-        """Leave what the guardian has reached so far, for the supervisor and later commands."""
+        """Write the guardian's result so far, for the supervisor and later commands."""
         self.write_text(PageSlot.GUARDIAN, json.dumps(asdict(result)))
-        # The text first: the phase says that it is there.
+        # After the text, which the phase announces.
         if result.final:
             self.put(PageField.GUARDIAN_PHASE, GuardianPhase.DONE)
 
     def safe_result(self) -> SafeActionResult | None:
-        """Return what the guardian has reached so far; None if it has not acted."""
+        """Return the guardian's result so far; None if it has not acted."""
         if self.get(PageField.GUARDIAN_PHASE) not in {GuardianPhase.ACTING, GuardianPhase.DONE}:
             return None
         for _ in range(_READS):  # the guardian may be writing it
@@ -342,54 +329,49 @@ class SharedPage:
         return None
 
     def push_event(self, event: Event) -> None:
-        """Leave an event; where there is no room it is counted as lost."""
+        """Write an event; without a free slot it is counted as lost."""
         head = self.get(PageField.EVENT_HEAD)
         if head - self.observe(PageField.EVENT_TAIL) >= _EVENT_SLOTS:
             self.integers[PageField.EVENTS_LOST] += 1
             return
         self._write(_EVENTS_AT + head % _EVENT_SLOTS * _EVENT_BYTES, _EVENT_BYTES, _packed(event))
-        # Last: an event that is counted is whole.
+        # Last: a counted event is complete.
         self.publish(PageField.EVENT_HEAD, head + 1)
 
     def look_at_events(self, since: int) -> tuple[list[Event], int]:
-        """Return the events from number ``since`` on that still stand there; takes nothing out.
+        """Return the events from number ``since`` on without consuming them, and the next number.
 
-        Returns:
-            The events, and the number after the last of all.
+        Events that were overwritten meanwhile are missing.
         """
-        head, found = self.observe(PageField.EVENT_HEAD), []
-        for number in range(max(since, head - _EVENT_SLOTS), head):
-            raw = self._read(_EVENTS_AT + number % _EVENT_SLOTS * _EVENT_BYTES, _EVENT_BYTES)
-            # Looked at again: the loop may have begun a new one in a slot that was released.
-            kept = self.observe(PageField.EVENT_TAIL) <= number
-            if kept or self.observe(PageField.EVENT_HEAD) < number + _EVENT_SLOTS:
+        return self._look(PageField.EVENT_HEAD, _EVENTS_AT, _EVENT_SLOTS, since)
+
+    def leave_note(self, event: Event) -> None:
+        """Show an event of the supervisor to watchers; the recorder has it already."""
+        head = self.get(PageField.NOTE_HEAD)
+        self._write(_NOTES_AT + head % _NOTE_SLOTS * _EVENT_BYTES, _EVENT_BYTES, _packed(event))
+        # Last: a counted note is complete.
+        self.publish(PageField.NOTE_HEAD, head + 1)
+
+    def look_at_notes(self, since: int) -> tuple[list[Event], int]:
+        """Return the notes from number ``since`` on, and the next number."""
+        return self._look(PageField.NOTE_HEAD, _NOTES_AT, _NOTE_SLOTS, since)
+
+    def _look(self, cursor: PageField, at: int, slots: int, since: int) -> tuple[list[Event], int]:
+        head, found = self.observe(cursor), []
+        for number in range(max(since, head - slots), head):
+            raw = self._read(at + number % slots * _EVENT_BYTES, _EVENT_BYTES)
+            # Checked after the copy: the slot may have been overwritten meanwhile.
+            if self.observe(cursor) < number + slots or self._is_kept(cursor, number):
                 with suppress(ValueError, TypeError):  # damaged: the recorder counts it
                     found.append(Event(**json.loads(raw)))
         return found, max(head, since)
 
-    def leave_note(self, event: Event) -> None:
-        """Show an event of the supervisor to those who look on; the recorder has it already.
-
-        The oldest gives way: nobody takes it out.
-        """
-        head = self.get(PageField.NOTE_HEAD)
-        self._write(_NOTES_AT + head % _NOTE_SLOTS * _EVENT_BYTES, _EVENT_BYTES, _packed(event))
-        # Last: a note that is counted is whole.
-        self.publish(PageField.NOTE_HEAD, head + 1)
-
-    def look_at_notes(self, since: int) -> tuple[list[Event], int]:
-        """Return the notes from number ``since`` on that still stand there, and the next number."""
-        head, found = self.observe(PageField.NOTE_HEAD), []
-        for number in range(max(since, head - _NOTE_SLOTS), head):
-            raw = self._read(_NOTES_AT + number % _NOTE_SLOTS * _EVENT_BYTES, _EVENT_BYTES)
-            # Looked at again: a new one may have been begun in its slot.
-            if self.observe(PageField.NOTE_HEAD) < number + _NOTE_SLOTS:
-                with suppress(ValueError, TypeError):
-                    found.append(Event(**json.loads(raw)))
-        return found, max(head, since)
+    def _is_kept(self, cursor: PageField, number: int) -> bool:
+        """Return whether the slot of an event has not been released to the loop."""
+        return cursor == PageField.EVENT_HEAD and self.observe(PageField.EVENT_TAIL) <= number
 
     def pop_events(self) -> list[Event]:
-        """Take the events that came since; they keep their room until they are released."""
+        """Consume the new events; their slots stay until :meth:`release_events`."""
         head, found = self.observe(PageField.EVENT_HEAD), []
         first = max(self._event_tail, head - _EVENT_SLOTS)
         for number in range(first, head):
@@ -402,7 +384,7 @@ class SharedPage:
         return found
 
     def release_events(self) -> None:
-        """Give the room of all events that were taken back to the loop: they are safe elsewhere."""
+        """Release the slots of consumed events; the events are on disk."""
         self.publish(PageField.EVENT_TAIL, self._event_tail)
 
     def _write(self, at: int, size: int, text: str) -> None:
@@ -418,8 +400,7 @@ class SharedPage:
 def _packed(event: Event) -> str:
     """Return an event as JSON that fits into a slot.
 
-    A text that is too long is cut. Values that alone are too long are left out: the loop must not
-    look for some that fit.
+    A long text is truncated; values that do not fit are omitted.
     """
     room = _EVENT_BYTES - 8
     facts, text = asdict(event), event.text[:room]

@@ -303,7 +303,7 @@ def test_a_recording_that_is_deleted_before_the_start_is_refused(on_a_disk):
     shutil.rmtree(on_a_disk.path.parent)
     with pytest.raises(InputError, match="the file was deleted or renamed"):
         on_a_disk.begin(10**18, {})
-    on_a_disk.give_back()
+    on_a_disk.discard()
 
 
 ENDED = LoopOutcome("completed", "waveform completed", 8, "confirmed", 0)

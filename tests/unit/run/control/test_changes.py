@@ -150,8 +150,8 @@ def test_a_refusal_changes_nothing_and_the_next_has_its_turn(changes, page):
 @pytest.mark.parametrize(
     ("number", "value", "said"),
     [
-        (PageField.STOP, Stop.CTRL_C, "on its way to the safe value"),
-        (PageField.NEXT_SAMPLE, SAMPLES, "the waveform is over"),
+        (PageField.STOP, Stop.CTRL_C, "safe ramp"),
+        (PageField.NEXT_SAMPLE, SAMPLES, "has ended"),
     ],
 )
 def test_the_end_of_the_run_refuses_a_change_that_waits(changes, page, waits, number, value, said):
@@ -167,7 +167,7 @@ def test_the_end_of_the_run_refuses_a_change_that_waits(changes, page, waits, nu
 def test_a_loop_that_takes_no_change_is_not_waited_for_without_end(changes, waits):
     """The client would have given up."""
     change(changes, gain=0.1)
-    with pytest.raises(InputError, match="has not taken the change before"):
+    with pytest.raises(InputError, match="previous change"):
         change(changes, gain=0.2)
     assert waits.clock.now < client._SET_S
 

@@ -103,10 +103,10 @@ def test_bad_requests_change_nothing(requests, page, line, said):
 
 def test_nothing_is_moved_on_the_way_out(requests, page, checked):
     page.put(PageField.NEXT_SAMPLE, checked.forecast.samples)
-    with pytest.raises(InputError, match="the waveform is over"):
+    with pytest.raises(InputError, match="has ended"):
         asked(requests, command="set", gain=0.5)
     page.put(PageField.STOP, Stop.REQUEST)
-    with pytest.raises(InputError, match="on its way to the safe value"):
+    with pytest.raises(InputError, match="safe ramp"):
         asked(requests, command="set", gain=0.5)
 
 
@@ -129,7 +129,7 @@ def test_a_mark_is_one_printable_line(requests, recording, text):
 
 def test_a_mark_that_would_be_lost_is_refused(requests, recording):
     recording.takes_marks = False
-    with pytest.raises(InputError, match="takes none now, or is over"):
+    with pytest.raises(InputError, match="mark: "):
         asked(requests, command="mark", text="late")
     assert recording.events == []
 

@@ -279,7 +279,7 @@ def heartbeat(run, page):
     run.look_alive(page, passed_ms=10)
 
 
-@pytest.mark.parametrize("how", ["died", "gives no sign"])
+@pytest.mark.parametrize("how", ["died", "is silent"])
 def test_a_lost_guardian_is_said_and_another_one_started(run, page, how):
     run.look()
     if how == "died":
