@@ -20,8 +20,8 @@ from hilctl.base.errors import DeviceError, InputError
 from hilctl.base.events import Event
 from hilctl.base.samples import BlockBatch, BlockHeader
 from hilctl.loop.block import Block
-from hilctl.loop.host import Tuning
 from hilctl.loop.interlocks import InterlockContext, Interlocks, InterlockSettings
+from hilctl.loop.tuning import Tuning
 from hilctl_drivers.emulator.factory import Emulator, build
 from hilctl_drivers.emulator.labjack_stream import attach_stream
 from hilctl_drivers.emulator.modbus_device import EmulatedModbus

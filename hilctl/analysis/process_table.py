@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from hilctl.base.errors import DataError
 from hilctl.base.formatting import quantity
-from hilctl.machine.process_usage import ProcessUsage
+from hilctl.machine.procfs import ProcessUsage
 from hilctl.recording.metadata_keys import USAGE_FACT
 from hilctl.recording.recording import Recording
 

@@ -18,9 +18,8 @@ from hilctl.base.types import F64, U32
 from hilctl.base.yaml import Document
 from hilctl.experiment.file import Experiment
 from hilctl.loop.compensator import Compensator
-from hilctl.loop.host import LinearBypass
 from hilctl.loop.limiter import Limiter
-from hilctl.loop.tuning import fade, on_the_way
+from hilctl.loop.tuning import LinearBypass, crossfade, interpolate
 from hilctl.models.base import HysteresisModel
 from hilctl.models.model_file import parse_model
 from hilctl.recording.recording import Recording, ReplayStart
@@ -237,7 +236,7 @@ class _Running:
             self._compensator.process(self._inputs(samples, part, end)[: wanted.size], wanted)
             if self._faded is not None:
                 shares, line = self._faded
-                fade(shares[rows], line, samples.reference_um[rows], wanted, flags)
+                crossfade(shares[rows], line, samples.reference_um[rows], wanted, flags)
         self._limiter.limit(wanted, command, flags)
 
     def _inverse_shares(self, samples: Samples) -> tuple[F64, LinearBypass] | None:
@@ -255,11 +254,11 @@ class _Running:
         for event in self._fades:
             values = event.values
             # Where it stands then: a change may begin before the one before it is through.
-            before = on_the_way(before, after, min(event.sample - begins, lasts) / lasts)
+            before = interpolate(before, after, min(event.sample - begins, lasts) / lasts)
             after, begins, lasts = values["share"], event.sample, int(values["samples"])
             rows = slice(int(np.searchsorted(index, begins)), None)
             part = np.minimum(index[rows] - begins + 1, lasts) / lasts
-            shares[rows] = on_the_way(before, after, part)
+            shares[rows] = interpolate(before, after, part)
             line = LinearBypass(values["slope"], values["at_zero"])
         waveform = (samples.flags & NO_WAVEFORM.value) == 0
         if not (_out(samples) == ((shares < 1.0) & waveform)).all():

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from hilctl.base.types import CommandUnit
-from hilctl.machine.process_usage import ProcessUsage
+from hilctl.machine.procfs import ProcessUsage
 from hilctl.recording.metadata_keys import LabelValue
 
 

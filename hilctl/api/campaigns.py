@@ -13,7 +13,7 @@ from hilctl.experiment.load import inputs_of
 from hilctl.ilc.ilc_session import IlcSession
 from hilctl.ilc.results import IlcResult, IlcRow
 from hilctl.recording.run_summary import recordings_in
-from hilctl.run.dead_runs import finish_dead_runs
+from hilctl.run.control.client import finish_dead_runs
 from hilctl.run.start import paced, unpaced
 from hilctl.studies.campaign.campaign_runner import (
     CampaignHost,

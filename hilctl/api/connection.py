@@ -9,8 +9,14 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from hilctl.base.errors import InputError, RunError
-from hilctl.run.client import find_run, mark_run, set_run, status_of, stop_runs
-from hilctl.run.protocol import InverseState
+from hilctl.run.control.client import (
+    InverseState,
+    find_run,
+    mark_run,
+    set_run,
+    status_of,
+    stop_runs,
+)
 from hilctl.run.run_folder import RunFolder
 
 if TYPE_CHECKING:

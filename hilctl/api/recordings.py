@@ -19,7 +19,7 @@ from hilctl.recording.reader import RecordingStream
 from hilctl.recording.reader import read as read_file
 from hilctl.recording.recording import Recording
 from hilctl.recording.time_range import TimeRange
-from hilctl.run.dead_runs import finish_dead_runs
+from hilctl.run.control.client import finish_dead_runs
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

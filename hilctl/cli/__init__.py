@@ -34,7 +34,7 @@ from hilctl.base.errors import ConfigError, HilctlError, InputError, RunError
 from hilctl.base.os_errors import reason
 from hilctl.cli.safe_streams import print_json, safe_streams
 from hilctl.cli.verbosity import output_as_requested, print_traceback, take_verbosity
-from hilctl.run.architecture import WORKS_ANYWHERE
+from hilctl.run.run_folder import WORKS_ANYWHERE
 
 ACTING = (
     *("run", "set", "mark", "stop", "safe"),

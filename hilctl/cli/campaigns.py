@@ -32,7 +32,7 @@ from hilctl.cli.safe_streams import print_json
 from hilctl.experiment.run_labels import label_settings
 from hilctl.ilc.ilc_session import correction_setting
 from hilctl.ilc.results import IlcResult, IlcRow
-from hilctl.run.dead_runs import finish_dead_runs
+from hilctl.run.control.client import finish_dead_runs
 from hilctl.studies.campaign.campaign_runner import CampaignHost, CampaignResult
 from hilctl.studies.campaign.plan import CampaignPlan
 from hilctl.studies.campaign.steps import (

@@ -11,16 +11,16 @@ import typer
 from hilctl.base.errors import InputError
 from hilctl.cli.options import AsJson
 from hilctl.cli.safe_streams import print_json
-from hilctl.run.client import (
+from hilctl.run.control.client import (
+    active_runs,
     assigned,
     find_run,
-    going_on,
+    finish_dead_runs,
     mark_run,
     set_run,
     status_of,
     stop_runs,
 )
-from hilctl.run.dead_runs import finish_dead_runs
 from hilctl.run.run_folder import runs
 
 _NOT_ENDED = 3
@@ -86,7 +86,7 @@ def stop(
     """Stop a run: ramp to the safe value, close the device, record the reason."""
     if every and run is not None:
         raise InputError("use either --all or --run")
-    stopped = stop_runs(going_on() if every else [find_run(run)], wait)
+    stopped = stop_runs(active_runs() if every else [find_run(run)], wait)
     if as_json:
         print_json({"runs": stopped} if every else stopped[0])
     else:

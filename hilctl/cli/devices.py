@@ -18,10 +18,9 @@ from hilctl.cli.options import AsJson, ExperimentFile, Settings
 from hilctl.cli.safe_streams import print_json
 from hilctl.experiment.inventory import DeviceDescription, Inventory, describe, inventory
 from hilctl.machine.diagnosis import DEFAULT_RATE_HZ, Diagnosis, diagnose, lateness_counts
-from hilctl.machine.rt_setup import SetUpStep
-from hilctl.machine.settings import Realtime
+from hilctl.machine.rt_setup import Realtime, SetUpStep
 from hilctl.machine.timer_latency import Latency
-from hilctl.run.architecture import require_linux
+from hilctl.run.run_folder import require_linux
 
 if TYPE_CHECKING:
     from hilctl.run.probe import Probed

@@ -21,8 +21,8 @@ from hilctl.experiment.device import known_devices
 from hilctl.experiment.examples import copy_example, examples_folder, shipped_examples
 from hilctl.experiment.inventory import schema_text, shipped_profiles
 from hilctl.experiment.template import LIMITS_ASKED, starting_device
-from hilctl.run.architecture import require_linux
-from hilctl.run.dead_runs import finish_dead_runs
+from hilctl.run.control.client import finish_dead_runs
+from hilctl.run.run_folder import require_linux
 
 _DEMO_S = 3.0
 _DEMO_RUNS = (

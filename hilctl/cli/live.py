@@ -7,9 +7,8 @@ import typer
 from hilctl.cli.options import AsJson
 from hilctl.cli.safe_streams import print_json
 from hilctl.live.server_process import RunSelector, SingleRun, serve_foxglove, serve_runs
-from hilctl.run.architecture import require_linux
-from hilctl.run.client import find_run
-from hilctl.run.run_folder import RunFolder
+from hilctl.run.control.client import find_run
+from hilctl.run.run_folder import RunFolder, require_linux
 
 
 def live(

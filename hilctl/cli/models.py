@@ -32,7 +32,7 @@ from hilctl.identify.summary import (
     refinement_rows,
     summary,
 )
-from hilctl.run.dead_runs import finish_dead_runs
+from hilctl.run.control.client import finish_dead_runs
 
 IdentifyInput = Annotated[
     list[Path], typer.Argument(metavar="FILE", help="Recordings (MCAP) or text tables.")

@@ -20,7 +20,7 @@ from hilctl.cli.options import AsJson, FromTime, Overwrite, ToTime
 from hilctl.cli.safe_streams import print_json
 from hilctl.recording.metadata_keys import LABELS_FACT, RECORDINGS
 from hilctl.recording.recover import recover_recording
-from hilctl.run.dead_runs import finish_dead_runs
+from hilctl.run.control.client import finish_dead_runs
 from hilctl.run.run_folder import dismiss
 
 _MISSING = "-"

@@ -16,7 +16,7 @@ from hilctl.base.formatting import printable, quantity
 from hilctl.cli.console import console, print_rich, progress_bar
 from hilctl.cli.options import AsJson, FromTime, Overwrite, RecordingFile, ToTime
 from hilctl.cli.safe_streams import print_json
-from hilctl.run.dead_runs import finish_dead_runs
+from hilctl.run.control.client import finish_dead_runs
 
 if TYPE_CHECKING:
     from hilctl.analysis.replay import ReplayResult

@@ -30,11 +30,10 @@ from hilctl.cli.reports import render_report
 from hilctl.cli.safe_streams import print_json
 from hilctl.experiment.run_labels import label_settings
 from hilctl.loop.safe_output import describe
-from hilctl.machine.logind import log_out
+from hilctl.machine.checks import log_out
 from hilctl.machine.procfs import Machine
-from hilctl.run.architecture import require_linux
-from hilctl.run.dead_runs import finish_dead_runs
-from hilctl.run.run_folder import facts_of
+from hilctl.run.control.client import finish_dead_runs
+from hilctl.run.run_folder import facts_of, require_linux
 
 if TYPE_CHECKING:
     from hilctl.analysis.run_metrics import RunReport
@@ -183,7 +182,7 @@ def check(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson
 def safe(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson = False) -> None:
     """Set a device to its safe value (refused while a run uses it)."""
     require_linux()
-    from hilctl.run.by_hand import put_safe
+    from hilctl.run.safety.manual_safe import put_safe
 
     put = put_safe(experiment, settings or [])
     where = f"{put.device}: {describe(put.output, put.error)} ({put.value:g} {put.unit})"

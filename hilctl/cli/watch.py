@@ -27,8 +27,14 @@ from hilctl.cli.safe_streams import safe_streams
 from hilctl.live.run_reader import RunReader
 from hilctl.live.scope import WINDOWS_S
 from hilctl.live.signals import ROW
-from hilctl.run.client import find_run, mark_run, request_stop, set_run
-from hilctl.run.protocol import JOB_CONTROL, MAX_MARK
+from hilctl.run.control.client import (
+    JOB_CONTROL,
+    MAX_MARK,
+    find_run,
+    mark_run,
+    request_stop,
+    set_run,
+)
 from hilctl.run.run_folder import RunFolder, runs
 
 _FRAME_S, _SEARCH_S, _OVER_S = 0.15, 0.05, 0.5

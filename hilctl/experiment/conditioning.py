@@ -14,7 +14,7 @@ from hilctl.base.types import F64
 from hilctl.experiment.file import Experiment
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.experiment.sections import REST_S
-from hilctl.loop.conditioning import Conditioning
+from hilctl.loop.lead_in import Conditioning
 
 OFFSET_SHARE = 0.25
 """Largest offset that is taken out, as a share of the limits of the stroke."""

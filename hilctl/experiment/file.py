@@ -14,7 +14,7 @@ from hilctl.experiment.sections import (
     Timing,
 )
 from hilctl.loop.limiter import CommandLimits
-from hilctl.machine.settings import Realtime
+from hilctl.machine.rt_setup import Realtime
 from hilctl.waveforms.spec import AnyWaveform
 
 T = TypeVar("T")

@@ -15,7 +15,7 @@ from hilctl.experiment.initial_state import CompensatorStart
 from hilctl.experiment.linear_bypass import LineEnds
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.loop.compensator import Compensator
-from hilctl.loop.host import LinearBypass
+from hilctl.loop.tuning import LinearBypass
 from hilctl.waveforms.build import Reference
 
 _BYTES_A_SAMPLE = 45.0

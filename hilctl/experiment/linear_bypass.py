@@ -10,7 +10,7 @@ import numpy as np
 
 from hilctl.base.types import F64
 from hilctl.experiment.load import LoadedExperiment
-from hilctl.loop.host import LinearBypass
+from hilctl.loop.tuning import LinearBypass
 
 
 class LineEnds:

@@ -39,7 +39,7 @@ from hilctl.experiment.load import LoadedExperiment
 from hilctl.experiment.model_validity import RangeFindings, range_findings
 from hilctl.loop.adaptation import DisplacementOperator
 from hilctl.loop.compensator import Compensator
-from hilctl.loop.conditioning import Conditioning
+from hilctl.loop.lead_in import Conditioning
 from hilctl.waveforms.build import Reference, build
 
 SHORTEST_TICK_S = 1e-4

@@ -5,7 +5,7 @@ from contextlib import suppress
 
 from hilctl.base.errors import RunError
 from hilctl.live.run_reader import RunReader
-from hilctl.run.client import going_on
+from hilctl.run.control.client import active_runs
 from hilctl.run.run_folder import RunFolder
 
 _LOOK_S = 1.0
@@ -41,7 +41,7 @@ class RunList:
         """
         if now_s - self._looked_s < _LOOK_S:
             return
-        self._looked_s, self.runs = now_s, going_on()
+        self._looked_s, self.runs = now_s, active_runs()
         kept = {self._main} | {
             feed.folder.card.name for name in shown if (feed := self.feed(name)) is not None
         }

@@ -21,9 +21,9 @@ from hilctl.live.live_metrics import FigureValues, RunningFigures
 from hilctl.live.scope import Scope
 from hilctl.live.signals import ROW, Traces, traces_of
 from hilctl.run.metadata import RunDescription
-from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import RunFolder
-from hilctl.run.shared_page import PageField, Phase
+from hilctl.run.shared.ring import SampleRing
+from hilctl.run.shared.shared_page import PageField, Phase
 
 _SAMPLES = 16384
 _POINTS = 240

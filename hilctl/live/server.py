@@ -30,7 +30,7 @@ from hilctl.live.page_session import MAX_MESSAGE_BYTES, PageMessage, PageSession
 from hilctl.live.run_list import RunList
 from hilctl.live.run_reader import RunReader
 from hilctl.live.signals import SIGNALS
-from hilctl.run.client import ask, request_stop
+from hilctl.run.control.client import ask, request_stop
 from hilctl.run.run_folder import RunFolder
 
 FILES = {

@@ -1,16 +1,15 @@
-"""Everything that a tick executes; no file, no log, no other thread.
+"""The fixed-rate loop: everything that a tick executes; no file, no log, no other thread.
 
-loop.py         block after block until the waveform ends, or something goes wrong
-plan.py         what a run does, and how it ended
-beginning.py    what comes before the waveform: ramp, and conditioning.py with the resting offset
-host.py         what the loop needs of its host: time, room for blocks, supervision
-feed.py         what the compensator is fed with
-block.py        one block of samples, in its slot from birth to answer
-pacer.py        absolute deadlines and the policy for late ticks
-tuning.py       gain and offset of a running reference, and the inverse faded out and in
-compensator.py  the inverse of a model, in the loop's terms
-feedback.py     a controller around the compensator, per sample or per block
-adaptation.py   offset, gain and weights of the model, adapted by the tracking error
-limiter.py      range and slew of every command: last before the device
-interlocks.py   what ends a run, checked in every answer
+loop.py         one tick from top to bottom, and the phases of a run
+plan.py         the plan of a run, and the host that a loop runs in
+lead_in.py      initial ramp, conditioning cycle, and the offset at rest
+block.py        a block of samples in its slot
+pacer.py        absolute deadlines, and the policies for late ticks
+tuning.py       smooth changes of gain, offset and the inverse's share
+compensator.py  the inverse of a model
+feedback.py     controllers around the compensator
+adaptation.py   adaptation of the model by the tracking error
+limiter.py      range and slew of every command
+interlocks.py   conditions that end a run, checked in every answer
+safe_output.py  writes of the safe value, and the outcome of a run
 """

@@ -1,17 +1,16 @@
-"""Adaptation of the compensator's model while it runs: offset, gain and the weights of some plays.
+"""Adaptation of the compensator's model during a run: offset, gain and the weights of some plays.
 
-What the actuator does beside its model is an operator of few parameters (kernels/adaptation.py),
-whose inverse stands before the model's: one for every kind of model, and its output is recorded as
-the compensator's input, so that a run replays as any other.
+The difference between actuator and model is an operator of few parameters (kernels/gradient.py).
+Its inverse precedes the model's inverse, for every kind of model. Its output is recorded as the
+compensator's input, so the run replays like any other.
 
-The parameters follow the gradient of the squared tracking error. The regressors are those of the
-input that a displacement shows, as much earlier as compensator, sensor and device take. They are
-made orthogonal over the reference, which is known before, so that all parameters take the same time
-and none of them makes up for another (B. Widrow and S. D. Stearns, "Adaptive Signal Processing",
-1985, chapter 8; B. Widrow and E. Walach, "Adaptive Inverse Control", 1996). Four things keep it
-bounded whatever the displacements are: normalisation, a dead zone, leakage, and projection on the
-bounds (P. A. Ioannou and J. Sun, "Robust Adaptive Control", 1996, chapter 8); and its pace is
-limited.
+The parameters follow the gradient of the squared tracking error. The regressors belong to the input
+that a displacement shows, delayed by compensator, sensor and device. They are orthogonalised over
+the reference, so that all parameters converge equally fast and none replaces another (B. Widrow and
+S. D. Stearns, "Adaptive Signal Processing", 1985, chapter 8; B. Widrow and E. Walach, "Adaptive
+Inverse Control", 1996). Normalisation, a dead zone, leakage and projection onto the bounds keep the
+parameters bounded for any displacement (P. A. Ioannou and J. Sun, "Robust Adaptive Control", 1996,
+chapter 8). Their rate is limited as well.
 """
 
 import math
@@ -29,19 +28,19 @@ from hilctl.loop.block import Block
 
 THRESHOLDS = (0.15, 0.4, 0.7)
 """Thresholds of the plays, as shares of half the reference's span."""
-_SMOOTHED = 0.1  # time constant of the smoothed gradient, as a share of that of the parameters
-_LEAK = 0.01  # pace of leakage, as a share of theirs: 1 % of gain and weights is left out
-_DEAD = 3.0  # standard deviations of the noise's part of the gradient
-_ALIKE = 1e-4  # of a mean square: regressors that differ by less are the same
-_RIDGE = 0.02  # of the mean squares, so that regressors that hardly differ are told apart slowly
+_SMOOTHED = 0.1  # time constant of the smoothed gradient / that of the parameters
+_LEAK = 0.01  # rate of leakage / that of the parameters: costs 1 % of gain and weights
+_DEAD = 3.0  # standard deviations of the gradient's noise
+_ALIKE = 1e-4  # of a mean square: regressors that differ by less count as equal
+_RIDGE = 0.02  # of the mean squares: similar regressors are separated slowly
 _LEAST_SLOPE = 0.3
 _EVENT_S = 1.0
-_WORTH_SAYING = 0.1  # of a bound
+_EVENT_CHANGE = 0.1  # of a bound
 
 
 @dataclass(frozen=True, slots=True)
 class AdaptationBounds:
-    """How far parameters may go from those identified, either way; 0 leaves one as it is.
+    """Largest deviations of the parameters from the identified ones; 0 fixes a parameter.
 
     Attributes:
         offset_um: Offset.
@@ -64,13 +63,13 @@ class AdaptationBounds:
 
 
 class DisplacementOperator:
-    """What the actuator does beside its model, over a reference.
+    """Operator of the difference between actuator and model, for a reference.
 
     Args:
-        bounds: float64[m], how far the parameters may go.
+        bounds: float64[m], largest deviations of the parameters.
         settings: float64[SETTINGS], see :mod:`hilctl.kernels.gradient`.
-        table: float64[3, m], see there.
-        shape: float64[m, m], see there.
+        table: float64[3, m], see :mod:`hilctl.kernels.gradient`.
+        shape: float64[m, m], see :mod:`hilctl.kernels.gradient`.
     """
 
     def __init__(self, bounds: F64, settings: F64, table: F64, shape: F64) -> None:
@@ -81,35 +80,35 @@ class DisplacementOperator:
     def over(
         cls, reference_um: F64, bounds: AdaptationBounds, told: tuple[slice, ...] | None = None
     ) -> Self:
-        """Return that of a reference: the plays and the centre are those of its span.
+        """Return the operator for a reference; plays and centre follow from its span.
 
         Args:
             reference_um: float64[n], n > 0.
-            bounds: How far the parameters may go.
-            told: Parts of the reference that show all there is to see; all of it where None.
+            bounds: Largest deviations of the parameters.
+            told: Representative parts of the reference; all of it if None.
 
         Raises:
-            InputError: With parameters within these bounds the operator might have no inverse.
+            InputError: Within these bounds the operator may have no inverse.
         """
         spans = [(each.min(), each.max()) for each in chunks(reference_um, told)]
         low, high = float(np.min(spans)), float(np.max(spans))
         still = not high > low
         most = bounds.array
-        if still:  # nothing but the offset shows in what stands still
+        if still:  # a constant reference only shows the offset
             most[kernel.GAIN :] = 0.0
         settings = np.zeros(kernel.SETTINGS)
         settings[kernel.MIDDLE_UM] = 0.5 * (low + high)
         settings[kernel.HALF_UM] = 1.0 if still else 0.5 * (high - low)
         table = np.stack([most, np.zeros(most.size), np.full(most.size, math.inf)])
         made = cls(most, settings, table, np.eye(most.size))
-        made._take_apart(reference_um, told)
+        made._orthogonalise(reference_um, told)
         least = made._least_slope()
         if not least >= _LEAST_SLOPE:
             raise InputError(f"the slope must stay above {_LEAST_SLOPE} with all bounds: {least:g}")
         return made
 
     def to_lists(self) -> list[Any]:
-        """Return what :meth:`from_lists` makes it of again, to the last bit."""
+        """Return plain values for :meth:`from_lists`, exact to the last bit."""
         return [each.tolist() for each in (self.bounds, self.settings, self.table, self.shape)]
 
     @classmethod
@@ -118,12 +117,12 @@ class DisplacementOperator:
         return cls(*map(np.array, lists))
 
     def at_rest(self, input_um: float) -> F64:
-        """Return the plays' memory where the input has come to rest: float64[m - 1]."""
+        """Return the state of the plays at rest: float64[m - 1]."""
         u = (input_um - self.settings[kernel.MIDDLE_UM]) / self.settings[kernel.HALF_UM]
         return np.append(np.clip(0.0, u - self.thresholds, u + self.thresholds), u)
 
     def invert(self, input_um: F64, size: int, before: F64, after: F64, memory: F64) -> None:
-        """Turn displacements wanted into the model's input, see ``kernels.adaptation``."""
+        """Convert requested displacements to the model's input, in place."""
         kernel.adapted_input(
             input_um, size, before, after, self.settings, self.table, self.thresholds, memory
         )
@@ -135,12 +134,12 @@ class DisplacementOperator:
 
     @property
     def largest_um(self) -> float:
-        """Largest error that the parameters can make between them, in um."""
+        """Largest error due to all parameters together, in um."""
         offset_um, shares = self.bounds[kernel.OFFSET], self.bounds[kernel.GAIN :].sum()
         return float(offset_um + 2.0 * shares * self.settings[kernel.HALF_UM])
 
-    def _take_apart(self, reference_um: F64, told: tuple[slice, ...] | None) -> None:
-        """Have each regressor without what those before it have: Gram and Schmidt's way."""
+    def _orthogonalise(self, reference_um: F64, told: tuple[slice, ...] | None) -> None:
+        """Orthogonalise the regressors (Gram-Schmidt)."""
         m, n = self.bounds.size, 0
         sums, products, found = np.zeros(m), np.zeros((m, m)), np.zeros(m)
         memory = self.at_rest(float(reference_um[0:1][0]))
@@ -171,22 +170,22 @@ class DisplacementOperator:
             self.table[kernel.POWER, j] = power + _RIDGE * products[j, j]
 
     def _least_slope(self) -> float:
-        """Return the least slope that the operator may have anywhere, by the bounds."""
+        """Return the smallest slope of the operator within the bounds."""
         engaged = np.cumsum(self.shape[:, kernel.GAIN :], axis=1)
         return float(1.0 - (self.bounds @ np.abs(engaged)).max())
 
 
 class Adaptation:
-    """The adaptation of one run; called in every tick, it never waits and never gives a NaN.
+    """Adaptation of one run; called in every tick, it never waits, and its output is finite.
 
     Args:
-        operator: What is adapted.
-        time_constant_s: Of the parameters' way to where the error is least, > 0.
-        rate_hz: Samples a second.
-        due_after: Samples from a reference to the displacement that is to show it.
-        shown_after: Samples from an input to the displacement that shows it.
-        noise_um: Standard deviation of the sensor's noise; None where :meth:`take_noise` says it,
-            before which nothing is adapted.
+        operator: Operator to adapt.
+        time_constant_s: Time constant of the parameters, > 0.
+        rate_hz: Samples per second.
+        due_after: Samples from a reference to its displacement.
+        shown_after: Samples from an input to its displacement.
+        noise_um: Standard deviation of the sensor's noise; None: set by :meth:`take_noise`, and
+            nothing is adapted before.
     """
 
     def __init__(
@@ -223,9 +222,9 @@ class Adaptation:
             self.take_noise(noise_um)
 
     def take_noise(self, noise_um: float) -> None:
-        """Begin, with a dead zone of what noise of that standard deviation makes of the gradient.
+        """Set the dead zone from the noise's standard deviation, and start adapting.
 
-        Nothing changes once it is known; where it is not a number, nothing is adapted.
+        Only the first finite value counts.
         """
         if self._ready or not math.isfinite(noise_um):
             return
@@ -234,7 +233,7 @@ class Adaptation:
 
     @property
     def parameters(self) -> dict[str, float]:
-        """What the actuator does beside its model, by name, see :data:`hilctl.base.events.ADAPTED`.
+        """Parameters of the operator by name, see :data:`hilctl.base.events.ADAPTED`.
 
         With v the model's output and ``offset_um`` less ``middle_um``, the displacement is
         ``middle_um`` + ``constant_um`` + ``direct`` v + sum ``weight_i`` P_i[v], and each play P_i
@@ -253,10 +252,10 @@ class Adaptation:
         return found
 
     def follow(self, input_um: F64, size: int) -> None:
-        """Turn the input of a block of ``size`` samples (float64[n], n <= size) into the model's.
+        """Convert the input, float64[n], of a block of ``size`` samples to the model's input.
 
-        The parameters move in a line over the block: a step of them would come out of a
-        compensator with a lead as a spike of the command.
+        The parameters change linearly over the block: a compensator with a lead would turn a step
+        into a spike of the command.
         """
         if self._fed is None:
             self._fed = self._operator.at_rest(input_um.item(0))
@@ -265,10 +264,10 @@ class Adaptation:
         self._before[:] = self._state[kernel.FORM]
 
     def take(self, block: Block) -> None:
-        """Adapt by a block whose displacements have come, whatever the phase of the run.
+        """Adapt to an answered block, in any phase of the run.
 
-        Nothing moves by a block with any flag: an interlock, the limiter, skipped ticks, a ramp or
-        conditioning; nor by what shows the inputs of one.
+        Blocks with a flag (interlock, limiter, skipped ticks, ramp, conditioning) change nothing,
+        nor do displacements that show the inputs of such a block.
         """
         if block.skipped:
             self._due[:] = self._shown[:] = np.nan
@@ -291,18 +290,18 @@ class Adaptation:
         )
 
     def event(self, sample: int, *, ended: bool = False) -> Event | None:
-        """Return what the parameters have come to, where that is worth an event now.
+        """Return an event with the parameters if they have changed enough.
 
         Args:
             sample: Next sample of the run.
-            ended: Whether the run is over: then it always is.
+            ended: Whether the run has ended: then there is always an event.
         """
         values, bounds = self._state[kernel.VALUE], self._operator.bounds
         if not ended:
             if sample - self._said_at < self._event_after:
                 return None
             self._said_at = sample
-            if not (np.abs(values - self._said) > _WORTH_SAYING * bounds).any():
+            if not (np.abs(values - self._said) > _EVENT_CHANGE * bounds).any():
                 return None
         self._said[:] = values
         at_bound = (bounds > 0.0) & (np.abs(values) >= bounds)

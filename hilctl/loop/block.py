@@ -1,4 +1,4 @@
-"""One block of samples, in the slot where it is born and stays until it is recorded."""
+"""A block of samples in its slot."""
 
 from hilctl.base.samples import COLUMNS, BlockBatch
 
@@ -6,30 +6,29 @@ COMMAND = [*COLUMNS].index("command")
 
 
 class Block:
-    """One slot of an area, with B samples.
+    """A slot with B samples; a block stays in it until it is recorded.
 
     Args:
-        head: Numbers of :class:`hilctl.base.samples.BlockHeader`, int64 each.
-        area: Room for many blocks.
-        slot: Which of them it is.
+        head: Fields of :class:`hilctl.base.samples.BlockHeader`, int64 each.
+        area: Arrays of all slots.
+        slot: Index of the slot.
 
     Attributes:
-        number: The slot's number since the start of the run; -1 where it is a spare one, which is
-            not recorded.
-        due: Whether the block is to be recorded: not while the loop only waits for answers.
-        guarded: Whether an interlock that trips in it ends the run: it begins with samples of the
-            waveform or of the conditioning.
-        skipped: Samples that were skipped just before it.
-        state: The compensator's memory before the block, then the command before it: float64[s].
-        memory: The first of these: float64[s - 1].
+        number: Number of the block in the run; -1 in a spare slot, which is not recorded.
+        due: Whether the block is recorded; False while the loop only waits for answers.
+        guarded: Whether a tripped interlock ends the run: the block starts in the waveform or the
+            conditioning.
+        skipped: Samples skipped before it.
+        state: The compensator's state before the block, then the command before it: float64[s].
+        memory: The compensator's state: float64[s - 1].
         flags: Bits of :class:`hilctl.base.samples.Flag` and the interlocks: uint32[B].
-        columns: All that :data:`hilctl.base.samples.COLUMNS` name, those below too: float64[k, B].
+        columns: All columns of :data:`hilctl.base.samples.COLUMNS`: float64[k, B].
         reference: In the waveform's unit: float64[B].
         wanted: Command before the limiter: float64[B].
-        command: Command that is put out: float64[B].
-        displacement_um: What the device fills: float64[B].
-        measured: What the device fills where it measures its command: float64[B].
-        input_um: The compensator's input: float64[B]; in the waveform's unit where there is none.
+        command: Command sent to the device: float64[B].
+        displacement_um: Filled by the device: float64[B].
+        measured: Measured command, filled by the device if it has one: float64[B].
+        input_um: The compensator's input: float64[B]; in the waveform's unit without a model.
     """
 
     __slots__ = (

@@ -1,4 +1,4 @@
-"""Reference block in, wanted command block out; owns the hysteresis memory."""
+"""The compensator: from a reference block to requested commands; owns the hysteresis state."""
 
 import numpy as np
 
@@ -8,64 +8,55 @@ from hilctl.models.base import HysteresisModel, Operator
 
 
 class Compensator:
-    """The inverse of a model, or nothing at all, as one thing that the loop and the replay run.
+    """The inverse of a model, used by loop and replay; without a model it passes the input on.
 
     Args:
-        model: Model whose inverse turns um into commands; None passes the reference on.
-        sample_rate_hz: Samples a second.
+        model: Model to invert, or None.
+        sample_rate_hz: Samples per second.
     """
 
     def __init__(self, model: HysteresisModel | None, sample_rate_hz: float) -> None:
         self._operator: Operator | None = model.inverse(sample_rate_hz) if model else None
         self.preview = self._operator.preview if self._operator else 0
-        """Samples by which its input must run ahead of the commands."""
+        """Samples by which the input leads the commands."""
 
     def ahead(self, reference: F64) -> F64:
-        """Return what to feed for a reference (float64[n]): itself, ``preview`` samples ahead.
-
-        The last value stands for those that come after it.
-        """
+        """Return a reference, float64[n], shifted by ``preview``; its last value repeats."""
         if not self.preview:
             return reference
         after = np.repeat(reference[-1:], min(self.preview, reference.size))
         return np.concatenate((reference[self.preview :], after))
 
     def begin(self, reference: F64) -> None:
-        """Run through what comes before the first command: ``preview`` samples of the reference.
-
-        So the first command belongs to a reference that has stood at its first value until then.
-        """
+        """Process the first ``preview`` samples, which precede the first command."""
         if self.preview:
             first = reference[: self.preview].copy()
             self.process(first, np.empty_like(first))
 
     def process(self, input_um: F64, wanted: F64) -> None:
-        """Fill ``wanted`` (float64[n], command unit) from ``input_um`` (float64[n]).
-
-        Where there is no model, the input is in the command's unit.
-        """
+        """Fill ``wanted`` (float64[n], command unit) from ``input_um`` (float64[n])."""
         if self._operator is None:
             wanted[:] = input_um
         else:
             self._operator.process(input_um, wanted)
 
     def warm_up(self) -> None:
-        """Run once and forget it, so that nothing is compiled or loaded during a run."""
+        """Compile or load all kernels; the state stays as it is."""
         state = self.state()
         self.process(np.zeros(2), np.zeros(2))
         self.restore(state)
 
     def state(self, out: F64 | None = None) -> F64:
-        """Return a copy of the hysteresis memory: float64[state_size], in ``out`` if given."""
+        """Return a copy of the hysteresis state: float64[state_size], in ``out`` if set."""
         if self._operator is None:
             return np.empty(0) if out is None else out
         return self._operator.state(out)
 
     def restore(self, state: F64) -> None:
-        """Go back to a state that :meth:`state` returned.
+        """Restore a state that :meth:`state` returned.
 
         Raises:
-            ModelError: The state is of another model.
+            ModelError: The state belongs to another model.
         """
         if self._operator is not None:
             self._operator.restore(state)
@@ -74,5 +65,5 @@ class Compensator:
 
     @property
     def state_size(self) -> int:
-        """Numbers in the hysteresis memory."""
+        """Size of the hysteresis state."""
         return self.state().size

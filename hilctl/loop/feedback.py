@@ -1,13 +1,12 @@
-"""Feedback around the compensator: what the model does not know, drift above all, is taken out.
+"""Feedback around the compensator: controllers that remove the model's error, such as drift.
 
-A PI controller adds a correction to the compensator's input. It holds the last displacement that
-has come back against the reference that was due then. With the compensator before it, the actuator
-is a gain of about 1 and a delay, so what limits the bandwidth is the delay, and with it the rate.
+The PI controller compares the last displacement with the reference that was due then, and adds a
+correction to the compensator's input. Compensator and actuator together have a gain of about 1 and
+a delay, so the delay limits the bandwidth.
 
-The integral controller corrects from the mean error of each block, for every device, also if it
-plays blocks from a FIFO. It removes offset, creep and drift, and nothing faster. A mean over a
-block has little noise; and with a bandwidth well below 1 / (2 pi times the delay of the whole loop)
-no delay of a FIFO makes it oscillate.
+The integral controller uses the mean error of each block, and works with every device, also with a
+FIFO. It removes offset, creep and drift, and nothing faster. The mean has little noise, and with a
+bandwidth well below 1 / (2 pi times the loop's delay) no FIFO makes it oscillate.
 """
 
 import math
@@ -26,27 +25,27 @@ _INVERSE_OUT = int(Flag.INVERSE_OUT)
 
 
 class Controller(Protocol):
-    """What corrects the compensator's input; called in every tick, it never waits."""
+    """A controller that corrects the compensator's input; called in every tick, it never waits."""
 
     correction_um: float
-    """Newest correction, in um."""
+    """Last correction, in um."""
 
     @property
     def against(self) -> str:
-        """Why sensor and command can't be of one sign; empty as long as they may be."""
+        """Why the sensor seems to have the opposite sign of the command; empty otherwise."""
         ...
 
     def follow(self, block: Block, input_um: F64) -> None:
-        """Correct the input of a block's samples that follow the reference.
+        """Correct the input of a block's samples in the waveform.
 
         Args:
-            block: The block that is worked out; its reference and its skipped samples stand in it.
-            input_um: float64[n], their input, corrected in place.
+            block: The block, with reference and skipped samples.
+            input_um: float64[n], corrected in place.
         """
         ...
 
     def take(self, block: Block) -> None:
-        """Take a block whose displacements have come, whatever the phase of the run."""
+        """Process an answered block, in any phase of the run."""
         ...
 
 
@@ -68,15 +67,15 @@ class Gains:
 
 
 class Feedback:
-    """The controller of one run; called once a tick, it never waits and never gives a NaN.
+    """PI controller for one sample per tick; its correction is always finite.
 
     Args:
         gains: Its gains.
-        rate_hz: Samples a second.
+        rate_hz: Samples per second.
         limit_um: Largest correction, > 0.
-        due_after: Samples from a reference to the displacement that is to show it: 0 where the
-            compensator looks ahead for it, 1 where it does not, and what link and sensor add.
-        shown_after: Samples from a correction to the displacement that shows all of it.
+        due_after: Samples from a reference to its displacement: 0 if the compensator has a preview
+            for it, otherwise 1, plus the delay of link and sensor.
+        shown_after: Samples from a correction to the displacement that contains it.
     """
 
     def __init__(
@@ -95,13 +94,13 @@ class Feedback:
         self._due: deque[float] = deque([math.nan] * (due_after + 1), due_after + 1)
         self._integral_um = 0.0
         self.correction_um = 0.0
-        """Correction of the tick under way, in um, within the limit."""
+        """Present correction, in um, within the limit."""
         self._seen = math.nan, False
         self._polarity = Polarity(limit_um, shown_after)
 
     @property
     def against(self) -> str:
-        """Why sensor and command can't be of one sign; empty as long as they may be."""
+        """Why the sensor seems to have the opposite sign of the command; empty otherwise."""
         return self._polarity.against
 
     def follow(self, block: Block, input_um: F64) -> None:
@@ -112,23 +111,21 @@ class Feedback:
         input_um[0] += self.correct(block.reference.item(0), displacement_um, limited=limited)
 
     def take(self, block: Block) -> None:
-        """Take what the last exchange brought."""
+        """Store the displacement of the last exchange."""
         limited = block.wanted.item(0) != block.command.item(0)
-        # With the inverse out the error is the actuator's own, and no correction can take it away.
-        stands = block.flags.item(0) & _INVERSE_OUT
-        self._seen = math.nan if stands else block.displacement_um.item(0), limited
+        # With the inverse bypassed, the correction has no effect on the error.
+        bypassed = block.flags.item(0) & _INVERSE_OUT
+        self._seen = math.nan if bypassed else block.displacement_um.item(0), limited
 
     def correct(self, reference_um: float, displacement_um: float, *, limited: bool) -> float:
         """Return the correction of the next sample, in um.
 
-        An error that is not a number, as at the start, after a gap, or of a lost sensor, leaves
-        the correction as it is.
+        Without a finite error (at the start, after a gap, with a lost sensor) the correction stays.
 
         Args:
             reference_um: Reference of this sample, after tuning.
-            displacement_um: Displacement that the last exchange brought.
-            limited: Whether the limiter held the last command back: then the integral may only
-                shrink.
+            displacement_um: Displacement of the last exchange.
+            limited: Whether the last command was limited: then the integral may only shrink.
         """
         due_um = self._due[0]
         error_um = due_um - displacement_um
@@ -146,30 +143,26 @@ class Feedback:
             after = before
         self._integral_um = min(limit, max(-limit, after))
         self.correction_um = min(limit, max(-limit, proportional + after))
-        if not limited:  # a command that is held back says nothing
-            self._polarity.look(self.correction_um, due_um, displacement_um)
+        if not limited:  # a limited command contains no information
+            self._polarity.add(self.correction_um, due_um, displacement_um)
         return self.correction_um
 
     def forget(self) -> None:
-        """Pass over samples that were skipped: no displacement is judged until references are new.
-
-        The correction and the integral stay.
-        """
+        """Discard the references before skipped samples; correction and integral stay."""
         self._due.extend([math.nan] * len(self._due))
 
 
 class Polarity:
-    """Whether the displacement goes the way that its input goes, or the other one.
+    """Detect a reversed sign of sensor or command.
 
-    With the sign of the sensor or of the command reversed, a correction makes the error larger that
-    it is to take away, and grows with it up to its limit. Disturbances drive it there too. What
-    tells them apart is the sum of input and displacement: it stands still where one is the other
-    reversed, and moves twice as far as the input where both go together. It is looked at from half
-    of the limit on, and once the limit is met for as long again: a disturbance goes on or stops.
+    With a reversed sign the correction increases the error, and grows to its limit. Disturbances
+    can drive it there too. The sum of input and displacement separates both: with a reversed sign
+    it is constant, otherwise it moves twice as far as the input. It is observed from half of the
+    limit on, and evaluated after as many samples at the limit.
 
     Args:
         limit_um: Largest correction.
-        shown_after: Samples from a correction to the displacement that shows all of it.
+        shown_after: Samples from a correction to the displacement that contains it.
     """
 
     def __init__(self, limit_um: float, shown_after: int) -> None:
@@ -180,8 +173,8 @@ class Polarity:
         self._samples = self._judged_at = 0
         self.against = ""
 
-    def look(self, correction_um: float, due_um: float, displacement_um: float) -> None:
-        """Take one sample: correction, the reference due and the displacement that shows it."""
+    def add(self, correction_um: float, due_um: float, displacement_um: float) -> None:
+        """Add a sample: correction, reference due, and displacement."""
         shown_um = self._corrections[0]
         self._corrections.append(correction_um)
         if abs(shown_um) <= 0.5 * self._limit_um:
@@ -201,9 +194,9 @@ class Polarity:
         left_um = self._sum_um[1] - self._sum_um[0]
         if left_um <= 0.5 * fed_um:
             self.against = (
-                f"the correction grew to its limit of {self._limit_um:g} µm and the error with it: "
-                f"input and displacement went opposite ways, over {fed_um:.3g} µm: the sign of the "
-                "sensor or of the command is wrong"
+                f"the correction and the error grew to the limit of {self._limit_um:g} µm, and "
+                f"input and displacement moved in opposite directions by {fed_um:.3g} µm: the "
+                "sign of the sensor or of the command is wrong"
             )
 
 
@@ -215,13 +208,13 @@ _LIMITED = int(Flag.RANGE_LIMITED | Flag.SLEW_LIMITED)
 
 
 class IntegralFeedback:
-    """The integrator of one run; it never waits and never gives a NaN.
+    """Integral controller for blocks; its correction is always finite.
 
     Args:
         gain_per_block: um of correction per um of error and block, > 0.
         limit_um: Largest correction, > 0.
-        due_after: Samples from a reference to the displacement that is to show it.
-        shown_after: Blocks from a correction to the displacements that show all of it.
+        due_after: Samples from a reference to its displacement.
+        shown_after: Blocks from a correction to the displacements that contain it.
     """
 
     def __init__(
@@ -235,19 +228,19 @@ class IntegralFeedback:
         self._before_due: F64 = np.full(due_after, math.nan)
         self._integral_um = 0.0
         self.correction_um = 0.0
-        """Correction at the end of the newest block, in um, within the limit."""
+        """Correction at the end of the last block, in um, within the limit."""
         self._polarity = Polarity(limit_um, shown_after)
 
     @property
     def against(self) -> str:
-        """Why sensor and command can't be of one sign; empty as long as they may be."""
+        """Why the sensor seems to have the opposite sign of the command; empty otherwise."""
         return self._polarity.against
 
     def follow(self, block: Block, input_um: F64) -> None:
-        """Correct the input of a block's samples that follow the reference: float64[n].
+        """Correct the input, float64[n], of a block's samples in the waveform.
 
-        The correction moves in a line over the block: a step of it would come out of a compensator
-        with a lead as a spike of the command.
+        The correction changes linearly over the block: a compensator with a lead would turn a step
+        into a spike of the command.
         """
         before, change = self.correction_um, self._integral_um - self.correction_um
         size = block.reference.size
@@ -258,11 +251,10 @@ class IntegralFeedback:
         self.correction_um = before + change * input_um.size / size
 
     def take(self, block: Block) -> None:
-        """Judge a block whose displacements have come.
+        """Integrate the error of an answered block.
 
-        Nothing is integrated of a block on a ramp, after skipped ticks, or in which an interlock
-        has tripped or a reading is missing; where the limiter held a command back, the correction
-        may only shrink.
+        Blocks on a ramp, after skipped ticks, with a tripped interlock or a missing reading are
+        ignored. After a limited command the correction may only shrink.
         """
         error_um, due_um, displacement_um = self._error(block)
         flags = int(np.bitwise_or.reduce(block.flags))
@@ -273,11 +265,11 @@ class IntegralFeedback:
         if flags and abs(after) > abs(before):
             return
         self._integral_um = min(self._limit_um, max(-self._limit_um, after))
-        if not flags:  # a command that is held back says nothing
-            self._polarity.look(self._integral_um, due_um, displacement_um)
+        if not flags:  # a limited command contains no information
+            self._polarity.add(self._integral_um, due_um, displacement_um)
 
     def _error(self, block: Block) -> tuple[float, float, float]:
-        """Return the block's mean error, mean of the references due in it, mean displacement."""
+        """Return mean error, mean of the references due, and mean displacement of a block."""
         if block.skipped:
             self._before_due[:] = math.nan
         size, wait = block.reference.size, self._before_due.size

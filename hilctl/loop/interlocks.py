@@ -1,7 +1,7 @@
-"""Interlocks: what ends a run by its safe ramp, checked in every sample that has come back.
+"""Interlocks: conditions that end a run by its safe ramp, checked in every answered sample.
 
-All of them are one compiled call a block. Each says at which sample it tripped, by a code for
-programs and a reason for people, and marks the samples by its flag.
+One compiled call per block checks all of them. A trip has a sample, a code and a reason, and the
+interlock's flag marks the samples.
 """
 
 import math
@@ -32,8 +32,8 @@ class Trip:
 
     Attributes:
         sample: Sample at which an interlock tripped first.
-        code: Which one.
-        reason: One line for people.
+        code: Code of the interlock.
+        reason: One line of text.
     """
 
     sample: int
@@ -43,13 +43,12 @@ class Trip:
 
 @dataclass(frozen=True, slots=True)
 class InterlockRequirement:
-    """What a key needs beside it, to mean anything.
+    """What a key requires.
 
     Attributes:
-        unit: Unit that the device must be driven in; None for either.
-        key: Another key that must be given; ``measured_deviation`` stands for the one of the
-            device's unit.
-        reference_um: Whether there must be a compensator, and with it a reference in um.
+        unit: Command unit of the device; None for either.
+        key: Another key; ``measured_deviation`` means the one of the device's unit.
+        reference_um: Whether a compensator is required, and thus a reference in um.
         measured: Whether the device must measure its command.
     """
 
@@ -64,9 +63,9 @@ _NotNegative: TypeAlias = Annotated[float, Field(ge=0.0)]
 
 
 class InterlockSettings(StrictModel):
-    """What the interlocks are set to: keys of an experiment's ``limits``; None switches one off.
+    """Settings of the interlocks: keys of an experiment's ``limits``; None disables an interlock.
 
-    A condition with a time trips once it has held for longer than that without a break.
+    A condition with a time trips after it has been true for longer without interruption.
     """
 
     rms_current_a: Annotated[
@@ -110,22 +109,22 @@ class InterlockSettings(StrictModel):
 
     @property
     def measured_deviation(self) -> float | None:
-        """Largest distance of the measured command from the one put out, in the command's unit."""
+        """Largest difference of measured command and command, in the command's unit."""
         return self.measured_deviation_a or self.measured_deviation_v
 
 
 @dataclass(frozen=True, slots=True)
 class InterlockContext:
-    """What the interlocks need to know of the rig.
+    """Properties of the rig that interlocks need.
 
     Attributes:
-        stroke_um: Lowest and highest displacement that may be measured.
-        sensor_um: Ends of what the sensor can report; a reading at an end is no measurement.
+        stroke_um: Lowest and highest permitted displacement.
+        sensor_um: Range of the sensor; a reading at its end is invalid.
         unit: Unit of commands.
-        safe: Command at which the output rests before the run.
-        frozen_travel: Travel of the command after which a reading must have changed, in ``unit``.
-        heat_a2: Heat of the coil before the run, its running mean square of the current in A^2;
-            that of the safe value where it is less.
+        safe: Safe value, the command before the run.
+        frozen_travel: Travel of the command after which a reading must change, in ``unit``.
+        heat_a2: Heat of the coil before the run: running mean square of the current in A^2, at
+            least that of the safe value.
     """
 
     stroke_um: tuple[float, float]
@@ -144,12 +143,12 @@ class InterlockContext:
 
 
 class Interlocks:
-    """Holds samples against the interlocks, and remembers what they need from block to block.
+    """Check blocks of samples against the interlocks.
 
     Args:
         context: The rig.
-        settings: What they are set to.
-        sample_rate_hz: Samples a second.
+        settings: Settings of the interlocks.
+        sample_rate_hz: Samples per second.
     """
 
     def __init__(
@@ -166,13 +165,13 @@ class Interlocks:
         ensure_compiled(kernels.interlock_block)
 
     def begin_at(self, command: float) -> None:
-        """Begin with the output at ``command``; its coil is as hot as that keeps it, at least."""
+        """Set the present output; the coil is at least as hot as this command keeps it."""
         memory = self._memory
         memory[kernels.COMMAND] = command
         memory[kernels.HEAT] = max(memory[kernels.HEAT], command**2)
 
     def judge(self, block: Block) -> Trip | None:
-        """Look at the next block; return the first trip in it, or None."""
+        """Check the next block; return its first trip, or None."""
         sent = block.command, block.reference
         came = block.displacement_um, block.measured
         return self.check(block.head[_FIRST_SAMPLE], *sent, *came, block.flags)
@@ -186,16 +185,16 @@ class Interlocks:
         measured: F64,
         flags: U32,
     ) -> Trip | None:
-        """Look at the next block; all arrays have its length n, at least 1.
+        """Check the next block, of n samples.
 
         Args:
-            first_sample: Its first sample. Samples left out since the last block count as time
-                that has passed with the output held.
-            command: float64[n], what was put out, in A or V.
-            reference: float64[n], in um; NaN where there is none.
+            first_sample: Its first sample. Samples skipped before it count as time with a constant
+                output.
+            command: float64[n], in A or V.
+            reference: float64[n], in um; NaN without one.
             displacement_um: float64[n].
-            measured: float64[n], command as measured; NaN where the device does not measure.
-            flags: uint32[n]; the bit of each interlock is added where it trips.
+            measured: float64[n], measured command; NaN without one.
+            flags: uint32[n]; bits of tripped interlocks are added.
 
         Returns:
             The first trip in this block, or None.
@@ -216,7 +215,7 @@ class Interlocks:
         return self._trip(first_sample + k, flags.item(k), sent, seen)
 
     def _hold(self, samples: int) -> None:
-        """Let samples pass that were never exchanged: the output stays, and so do conditions."""
+        """Account for skipped samples: the output and all conditions stay."""
         memory = self._memory
         rest = memory[kernels.COMMAND] ** 2
         cooling = (1.0 - self._numbers[kernels.WARMING]) ** samples
@@ -232,10 +231,10 @@ class Interlocks:
         sent: tuple[float, float, float],
         seen: tuple[float, float],
     ) -> Trip:
-        """Say what tripped: where several did, a cause before what follows from it.
+        """Return the trip; of several, a cause before its consequence.
 
         Args:
-            sample: Where.
+            sample: Sample of the trip.
             bits: Its flags.
             sent: Command before it, command, measured command.
             seen: Reference, displacement.
@@ -261,10 +260,10 @@ class Interlocks:
         reading = f"displacement {displacement_um:.4g} µm at sample {sample}"
         low, high = self.context.sensor_um
         if math.isfinite(displacement_um) and not low < displacement_um < high:
-            text = f"{reading} is at the end of what the sensor can report, {low:g} to {high:g} µm"
+            text = f"{reading} is at an end of the sensor's range, {low:g} to {high:g} µm"
             return Trip(sample, "sensor_range", text)
         low, high = self.context.stroke_um
-        text = f"{reading} is not within the stroke limits {low:g} to {high:g} µm"
+        text = f"{reading} is outside the stroke limits {low:g} to {high:g} µm"
         return Trip(sample, "stroke", text)
 
     def _frozen(self, sample: int, displacement_um: float) -> Trip:
@@ -283,14 +282,14 @@ class Interlocks:
             sent = f"{before:.4g} to {sent}"
         away = f"more than {settings.measured_deviation:g} {unit} away"
         text = (
-            f"measured {measured:.4g} {unit} at sample {sample}, where {sent} was put out, "
+            f"measured {measured:.4g} {unit} at sample {sample}, with a command of {sent}, "
             f"is {away}{_since(settings.deviation_s)}"
         )
         return Trip(sample, "deviation", text)
 
 
 def warming(time_constant_s: float, sample_rate_hz: float) -> float:
-    """Return how much of the way to its final heat a coil goes in one sample."""
+    """Return the share of the difference to its final heat that a coil gains per sample."""
     return -math.expm1(-1.0 / (time_constant_s * sample_rate_hz))
 
 
@@ -303,15 +302,15 @@ def _or_inf(value: float | None) -> float:
 
 
 def _numbers(context: InterlockContext, given: InterlockSettings, rate_hz: float) -> F64:
-    """Return what the kernel takes: float64[kernels.SETTINGS]."""
+    """Return the settings of the kernel: float64[kernels.SETTINGS]."""
 
     def samples(time_s: float) -> float:
-        """Return the samples after which a time has passed: whole, but for the infinite."""
+        """Return a time in samples, rounded up; infinite if it is infinite."""
         count = time_s * rate_hz
         return float(math.ceil(round(count, 6))) if math.isfinite(count) else math.inf
 
     deviation = _or_inf(given.measured_deviation)
-    # A NaN is beyond any distance, the infinite one too: so its time switches the interlock off.
+    # A NaN exceeds any deviation, even an infinite one: the infinite time disables the interlock.
     deviation_s = given.deviation_s or 0.0 if math.isfinite(deviation) else math.inf
     numbers = np.empty(kernels.SETTINGS)
     numbers[[kernels.STROKE_LOW, kernels.STROKE_HIGH]] = context.stroke_um

@@ -1,31 +1,110 @@
-"""What a run goes through before its waveform: where that begins, and what is recorded of it.
+"""The lead-in of a waveform: initial ramp, conditioning cycle, and the resting offset.
 
-A ramp from where the output was to the safe value, then the conditioning where the plan has one,
-then the waveform, whose input is without the offset that was measured at rest.
+The commands of the conditioning cycle are computed before the run, and pass the limiter. After the
+cycle the output rests at the safe value. The mean displacement at rest is compared with the
+model's, and the offset is subtracted from the compensator's input: a sensor or actuator that has
+moved since identification causes no error.
 """
 
 import math
-from typing import TypeAlias
+from dataclasses import dataclass
+
+import numpy as np
 
 from hilctl.base.events import Event
 from hilctl.base.types import F64
-from hilctl.loop.conditioning import Conditioning, RestingOffset
 
-Finding: TypeAlias = tuple[str, dict[str, float], bool]
-"""What was found, in words, empty for nothing; its numbers; whether the run must end for it."""
+
+@dataclass(frozen=True, slots=True)
+class Conditioning:
+    """Commands before a waveform, and the measurement of the offset at rest.
+
+    Attributes:
+        command: float64[m], requested commands, whole blocks; the last ones rest at the safe value.
+        rest: Start and stop of the samples at rest; those after it cover the device's latency.
+        cycle_samples: Samples of the cycle; 0 if there is only rest.
+        stands_um: The model's displacement at rest; None if no offset is measured.
+        largest_um: Largest offset that is removed.
+        lead_in: Samples of the waveform over which the correction fades in.
+    """
+
+    command: F64
+    rest: tuple[int, int]
+    cycle_samples: int
+    stands_um: float | None = None
+    largest_um: float = math.inf
+    lead_in: int = 1
+
+
+class RestingOffset:
+    """Measure the offset between sensor and model at rest, and subtract it from the input.
+
+    Args:
+        conditioning: The conditioning.
+        begins_at: Its first sample.
+    """
+
+    def __init__(self, conditioning: Conditioning, begins_at: int) -> None:
+        first, stop = conditioning.rest
+        self._first, self._stop = begins_at + first, begins_at + stop
+        self._sum_um, self._count = 0.0, 0
+        self._about_um, self._square_um2 = math.nan, 0.0
+        self._offset_um = 0.0
+        way = np.arange(1, conditioning.lead_in + 1) / conditioning.lead_in
+        self._rise: F64 = 0.5 * (1.0 - np.cos(np.pi * way))
+
+    def take(self, first_sample: int, displacement_um: F64) -> None:
+        """Add the displacements of a block, float64[B]; only samples at rest count."""
+        low, high = self._first - first_sample, self._stop - first_sample
+        if low < displacement_um.size and high > 0:
+            resting = displacement_um[max(low, 0) : high]
+            self._sum_um += float(resting.sum())
+            if not self._count:
+                self._about_um = resting.item(0)
+            # Relative to the first sample: squares of the displacement itself would hide the noise.
+            self._square_um2 += float(np.square(resting - self._about_um).sum())
+            self._count += resting.size
+
+    @property
+    def resting_um(self) -> float:
+        """Mean displacement at rest; NaN without samples."""
+        return self._sum_um / self._count if self._count else math.nan
+
+    @property
+    def noise_um(self) -> float:
+        """Standard deviation of the displacement at rest; NaN without samples."""
+        if not self._count:
+            return math.nan
+        mean_um = self.resting_um - self._about_um
+        return math.sqrt(max(0.0, self._square_um2 / self._count - mean_um**2))
+
+    def remove(self, offset_um: float) -> None:
+        """Subtract an offset from the input from now on."""
+        self._offset_um = offset_um
+
+    def apply(self, input_um: F64, start: int) -> None:
+        """Correct the input (float64[n]) from sample ``start`` of the waveform on, in place.
+
+        The correction fades in, so that the compensator starts with the model's value.
+        """
+        if not self._offset_um:
+            return
+        rising = self._rise[start : start + input_um.size]
+        input_um[: rising.size] -= self._offset_um * rising
+        input_um[rising.size :] -= self._offset_um
 
 
 class LeadIn:
-    """What comes before the waveform of one run.
+    """Samples of a run before its waveform.
 
     Args:
-        conditioning: What comes after the ramp; None for nothing.
+        conditioning: Follows the ramp; may be None.
         ramp_samples: Samples of the ramp to the safe value, whole blocks.
     """
 
     def __init__(self, conditioning: Conditioning | None, ramp_samples: int) -> None:
         self.condition_at = self.waveform_at = ramp_samples
-        """Sample at which the conditioning begins, and the one at which the waveform does."""
+        """First samples of the conditioning and of the waveform."""
         self._conditioning = conditioning
         self._resting: RestingOffset | None = None
         if conditioning is not None:
@@ -33,13 +112,13 @@ class LeadIn:
             self._resting = RestingOffset(conditioning, self.condition_at)
 
     def ramp_event(self, output: float, safe: float) -> Event:
-        """Return the event of a ramp from where the output was to the safe value."""
+        """Return the event of the initial ramp."""
         values = {"output": output, "samples": float(self.condition_at)}
         text = f"output was at {output:g}: ramp to {safe:g} first"
         return Event(0, "info", "start_ramp", text, values)
 
     def condition_event(self) -> Event | None:
-        """Return the event of the conditioning cycle; None where there is none."""
+        """Return the event of the conditioning cycle; None without one."""
         conditioning = self._conditioning
         if conditioning is None or not conditioning.cycle_samples:
             return None
@@ -49,20 +128,22 @@ class LeadIn:
         return Event(self.condition_at, "info", "condition", text, values)
 
     def condition(self, wanted: F64, sample: int) -> None:
-        """Fill wanted commands (float64[n]) of the conditioning, from ``sample`` of the run on."""
+        """Fill requested commands, float64[n], from sample ``sample`` of the run on."""
         assert self._conditioning is not None
         start = sample - self.condition_at
         wanted[:] = self._conditioning.command[start : start + wanted.size]
 
     def take(self, first_sample: int, displacement_um: F64) -> None:
-        """Take the displacements of a block, float64[B], of any part of the run."""
+        """Add the displacements of a block, float64[B], of any part of the run."""
         if self._resting is not None:
             self._resting.take(first_sample, displacement_um)
 
-    def take_offset_out(self) -> Finding:
-        """Hold the resting displacement against the model's, and take the difference out.
+    def remove_offset(self) -> tuple[str, dict[str, float], bool]:
+        """Compare the resting displacement with the model's, and remove the difference.
 
-        Beyond the limit the run must end, and nothing is taken out.
+        Returns:
+            Text, empty if nothing was measured; values; whether the offset exceeds the limit, so
+            that the run must end.
         """
         conditioning, resting = self._conditioning, self._resting
         if conditioning is None or resting is None or conditioning.stands_um is None:
@@ -74,16 +155,16 @@ class LeadIn:
         if not abs(offset_um) <= conditioning.largest_um:
             limit = f"an offset beyond {conditioning.largest_um:.4g} µm"
             return f"{rests}: {limit}: identify the model anew", values, True
-        resting.take_out(offset_um)
-        text = f"{rests}: {offset_um:.4g} µm are taken out of the compensator's input"
+        resting.remove(offset_um)
+        text = f"{rests}: {offset_um:.4g} µm are subtracted from the compensator's input"
         return text, values, False
 
     @property
     def noise_um(self) -> float:
-        """Standard deviation of the displacement at rest; NaN where it has not rested."""
+        """Standard deviation of the displacement at rest; NaN without samples."""
         return math.nan if self._resting is None else self._resting.noise_um
 
     def correct(self, input_um: F64, start: int) -> None:
-        """Take the measured offset out of the input (float64[n]) from ``start`` of the waveform."""
+        """Subtract the measured offset from the input (float64[n]) from sample ``start`` on."""
         if self._resting is not None:
             self._resting.apply(input_um, start)

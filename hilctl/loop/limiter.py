@@ -1,7 +1,4 @@
-"""The last thing before the device: range and slew of every command.
-
-Pure: (wanted, previous, limits, time step) to (command, flags). The loop and the replay share it.
-"""
+"""The limiter: range and slew of every command, last before the device; used by loop and replay."""
 
 import math
 from dataclasses import dataclass
@@ -20,9 +17,9 @@ class CommandLimits:
     Attributes:
         low: Lowest command.
         high: Highest command.
-        slew_per_s: Fastest change, > 0.
+        slew_per_s: Slew rate, > 0.
         safe: Command of the safe state, within [low, high].
-        ramp_per_s: Change on the way to the safe state, > 0 and at most ``slew_per_s``.
+        ramp_per_s: Slew rate of the safe ramp, > 0 and at most ``slew_per_s``.
     """
 
     low: float
@@ -46,19 +43,19 @@ class CommandLimits:
             )
 
 
-_LARGEST_STRIDE = 0.25  # of the way from the far limit to the safe value
+_LARGEST_STRIDE = 0.25  # of the distance from the far limit to the safe value
 _BITS = int(Flag.RANGE_LIMITED), int(Flag.SLEW_LIMITED), int(Flag.INVALID)
 
 
 class Limiter:
-    """Holds commands to their limits and remembers the last one.
+    """Limit commands; keeps the last one.
 
-    The last command may be set, to where the output is. From outside the limits, commands then come
-    in by no more than a step each.
+    The last command may be set to the present output. If that is outside the limits, commands
+    return into the range with limited slew.
 
     Args:
-        limits: What commands are held to.
-        dt_s: Time from one sample to the next.
+        limits: The limits.
+        dt_s: Sample period.
     """
 
     def __init__(self, limits: CommandLimits, dt_s: float) -> None:
@@ -73,37 +70,37 @@ class Limiter:
         ensure_compiled(limit_block)
 
     def limit(self, wanted: F64, command: F64, flags: U32) -> int:
-        """Fill ``command`` (float64[n]) with what may be put out; add to ``flags`` (uint32[n]).
+        """Fill ``command`` (float64[n]) with limited commands; add to ``flags`` (uint32[n]).
 
         Returns:
-            Index of the first wish that was not finite, or -1.
+            Index of the first requested command that is not finite, or -1.
         """
         return self._apply(wanted, self._max_step, command, flags)
 
     @property
     def at_rest(self) -> bool:
-        """Whether the last command is so near to the safe value that a step of the ramp is more."""
+        """Whether the last command is within one step of the safe value."""
         return abs(self.last - self.limits.safe) <= self._ramp_step
 
     @property
     def ramp_samples(self) -> int:
-        """Samples that the ramp takes from the last command; 0 where that is at rest."""
+        """Samples of the ramp from the last command; 0 at rest."""
         steps = abs(self.last - self.limits.safe) / self._ramp_step
         return 0 if self.at_rest else math.ceil(round(steps, 6))
 
     def ramp(self, command: F64, flags: U32, skipped: int = 0) -> bool:
-        """Fill ``command`` with the next stretch of the way to the safe value.
+        """Fill ``command`` with the next part of the safe ramp.
 
-        The way goes by time: where samples of it were skipped, the first step is as many times
-        larger, up to a quarter of the way from the far limit.
+        The ramp is a function of time: after skipped samples the first step is larger, at most a
+        quarter of the distance from the far limit.
 
         Args:
             command: float64[n], filled.
-            flags: uint32[n], added to.
-            skipped: Samples of the ramp that were skipped just before.
+            flags: uint32[n], changed in place.
+            skipped: Samples of the ramp skipped before.
 
         Returns:
-            Whether the safe value is reached at the end of it.
+            Whether the ramp has ended.
         """
         flags |= Flag.RAMP.value
         scratch = flags.copy()

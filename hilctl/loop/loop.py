@@ -1,14 +1,12 @@
-"""The fixed-rate loop, and nothing else.
+"""The fixed-rate loop: one tick after another, from the initial ramp to the safe value.
 
-Where the output is not at its safe value, a ramp takes it there before the waveform begins; where
-the plan has one, a conditioning cycle comes after that, and a rest. Then: reference block,
-compensator, limiter, device, ring: once a tick, until the waveform ends, a stop is asked for, or
-something goes wrong. All of these end by the same safe ramp: to the safe value within the ramp's
-slew, recorded as before.
+A run has up to four parts: a ramp from the present output to the safe value, a conditioning cycle,
+the waveform, and the safe ramp. Each tick fills a block (reference, compensator, limiter),
+exchanges it with the device, and hands it to the host. Every regular end uses the same safe ramp:
+the end of the waveform, a stop, a fault.
 
-A device that plays blocks from a FIFO gives a block's displacements some blocks later. Blocks wait
-in their slots until then, and after the ramp the loop goes on at the safe value until the last of
-them has come.
+A device with a FIFO answers a block some ticks later. Blocks wait in their slots until then; after
+the ramp the loop repeats the safe value until the last answer has arrived.
 """
 
 import math
@@ -23,17 +21,22 @@ from hilctl.base.events import OFFSET, Event
 from hilctl.base.samples import BlockHeader, Flag
 from hilctl.base.types import F64, U32
 from hilctl.loop.block import Block
-from hilctl.loop.host import Host, Tuning
-from hilctl.loop.input_stage import feed, pass_over
 from hilctl.loop.interlocks import Interlocks, Trip
 from hilctl.loop.lead_in import LeadIn
 from hilctl.loop.limiter import Limiter
 from hilctl.loop.pacer import Lateness, Pacer
-from hilctl.loop.plan import Code, LoopOutcome, LoopPlan
-from hilctl.loop.safe_output import OutputState, SafeGoal, describe, drive_to_safe
-from hilctl.loop.tuning import ReferenceTuner
+from hilctl.loop.plan import Host, LoopPlan
+from hilctl.loop.safe_output import (
+    Code,
+    LoopOutcome,
+    OutputState,
+    SafeGoal,
+    describe,
+    drive_to_safe,
+)
+from hilctl.loop.tuning import ReferenceTuner, Tuning, TuningFactors, tune
 
-# Plain numbers: looking up an enumeration's member takes longer than writing it.
+# Plain integers: access to an enumeration's member takes longer than the write.
 _FIRST_SAMPLE, _SAMPLES = int(BlockHeader.FIRST_SAMPLE), int(BlockHeader.SAMPLES)
 _DROPPED_BEFORE, _DEADLINE_NS = int(BlockHeader.DROPPED_BEFORE), int(BlockHeader.DEADLINE_NS)
 _LATE_NS, _EXCHANGE_NS = int(BlockHeader.LATE_NS), int(BlockHeader.EXCHANGE_NS)
@@ -41,26 +44,26 @@ _SKIPPED, _CONDITION = int(Flag.AFTER_SKIPPED), int(Flag.CONDITION)
 
 
 class _Phase(Enum):
-    STARTING = "ramps to the safe value, from where the output was"
-    CONDITIONING = "goes through the conditioning cycle, and rests"
-    FOLLOWING = "follows the reference"
-    LEAVING = "ramps to the safe value"
-    HOLDING = "holds the safe value until the last answer has come"
+    STARTING = "initial ramp to the safe value"
+    CONDITIONING = "conditioning cycle and rest"
+    FOLLOWING = "waveform"
+    LEAVING = "safe ramp"
+    HOLDING = "safe value, until the last answer has arrived"
 
 
-# Looked up once: in Python 3.11 each look is a call.
+# Module names: in Python 3.11 each access to an enumeration's member is a call.
 _STARTING, _CONDITIONING, _FOLLOWING, _LEAVING, _HOLDING = _Phase
 _AFTER = (_LEAVING, _HOLDING)
-_ARM_MARGIN_NS = 1_000_000  # arming that ends too soon costs nothing, and too late a late start
+_ARM_MARGIN_NS = 1_000_000  # arming too early costs nothing; too late, it delays the start
 
 
 class Loop:
-    """Runs one plan on one device.
+    """Run one plan on one device.
 
     Args:
-        plan: What to do.
+        plan: The plan.
         device: Open device.
-        host: Time, room for blocks, and supervision.
+        host: Clock, slots of blocks, and supervision.
     """
 
     def __init__(self, plan: LoopPlan, device: Device, host: Host) -> None:
@@ -74,7 +77,6 @@ class Loop:
         self._interlocks = Interlocks(plan.interlocks, plan.interlock_settings, plan.sample_rate_hz)
         self._pacer = Pacer(host.clock, period_ns, plan.late_policy, plan.late_rules)
         self._tuner = ReferenceTuner()
-        # What works out part of the input, and learns from the answers, block by block.
         learners = plan.feedback, plan.adaptation, plan.conditioning
         self._learns = any(each is not None for each in learners)
         self._in_flight: deque[Block] = deque()
@@ -97,14 +99,14 @@ class Loop:
         return self._pacer.counters
 
     def begin_at(self, output: float) -> int:
-        """Begin where the output is, before :meth:`run`.
+        """Set the present output, before :meth:`run`.
 
         Args:
-            output: Command at which it stands, in the device's unit; may lie outside the limits.
+            output: Command in the device's unit; may be outside the limits.
 
         Returns:
-            Samples that come before the waveform, whole blocks: a ramp from there to the safe
-            value, none where it stands there to within one step of the ramp, and the conditioning.
+            Samples before the waveform, whole blocks: the ramp to the safe value (none if the
+            output is within one step of it), and the conditioning.
         """
         self._limiter.last = output
         self._interlocks.begin_at(output)
@@ -118,10 +120,10 @@ class Loop:
         return before.waveform_at
 
     def run(self, start_ns: int) -> LoopOutcome:
-        """Run until the end, ramp to the safe value, and say how it went.
+        """Run to the end, including the safe ramp; return the outcome.
 
         Args:
-            start_ns: When the first tick is due, by the clock.
+            start_ns: Time of the first tick on the host's clock.
         """
         if self._phase is _STARTING:
             ramp = self._before.ramp_event(self._limiter.last, self._limiter.limits.safe)
@@ -135,7 +137,7 @@ class Loop:
                 pass
             self._phase = _HOLDING
             while self._in_flight and self._in_flight[0].due:
-                self._hold()
+                self._drain()
         except DeviceError as error:
             return self._lost_device(error)
         self._record_adapted(ended=True)
@@ -143,68 +145,67 @@ class Loop:
         return LoopOutcome(self._code, self._reason, self._ended_at, output, self._dropped)
 
     def _armed(self, start_ns: int) -> int:
-        """Arm the device's watchdog just before the first tick; return when that is due."""
+        """Arm the watchdog of the device; return the time of the first tick."""
         device, clock = self._device, self._host.clock
         if not isinstance(device, WatchdogDevice):
             return start_ns
         clock.sleep_until_ns(start_ns - math.ceil(device.info.arm_s * 1e9) - _ARM_MARGIN_NS)
         device.arm()
-        # What takes longer than it should makes the run start later, and no tick late.
         return max(start_ns, clock.now_ns())
 
     def _tick(self) -> bool:
-        """Run one tick; return whether the safe value is reached in it."""
-        block = self._claim(self._wait())
-        # Supervision comes before the commands are worked out: what it asks for holds at once.
+        """Run one tick; return whether the safe ramp has ended."""
+        block = self._reserve(self._wait())
+        # Before the commands are computed, so that a request applies to this block.
         self._supervise()
         done, first_invalid = self._fill(block)
         first_sample = block.head[_FIRST_SAMPLE]
         self._exchange(block)
         if first_invalid >= 0:
             at = f"at sample {first_sample + first_invalid}"
-            self._leave("fault", "invalid_command", f"wanted command is not a finite number {at}")
+            self._begin_safe_ramp(
+                "fault", "invalid_command", f"requested command is not finite {at}"
+            )
         feedback = self._plan.feedback
         if feedback is not None and feedback.against:
-            self._leave("fault", "feedback_sign", feedback.against)
+            self._begin_safe_ramp("fault", "feedback_sign", feedback.against)
         if self._phase is not _FOLLOWING:
-            self._go_on()
+            self._enter_next_phase()
         if self._learns:
             self._record_adapted()
         return done
 
-    def _go_on(self) -> None:
-        """Enter the conditioning, or the waveform, where it begins with the next sample."""
-        if self._phase is _STARTING and self._next_sample >= self._before.condition_at:
-            self._phase = _CONDITIONING
-            self._record_condition()
-        if self._phase is _CONDITIONING and self._next_sample >= self._before.waveform_at:
-            self._follow_from_here()
-            self._take_offset_out()
-            if self._plan.adaptation is not None:
-                self._plan.adaptation.take_noise(self._before.noise_um)
-
-    def _hold(self) -> None:
-        """Hold the safe value for one more block, for the sake of the answer that comes with it."""
-        block = self._claim(self._wait(), due=False)
-        self._host.heartbeat(self._next_sample, self._pacer.counters.late_ticks)
-        block.command[:] = self._limiter.limits.safe
-        self._exchange(block)
-
     def _wait(self) -> int:
-        """Wait for the tick; return the samples that were skipped before it."""
+        """Wait for the tick; return the number of samples skipped before it."""
         skipped = self._pacer.wait() * self._plan.block
         if not skipped:
             return 0
-        # Before the block is claimed: its number and the state kept with it are those after it.
+        # Before the block is reserved: its index and state are those after the gap.
         start = self._next_sample
         self._next_sample += skipped
         if self._phase is _FOLLOWING:
             at, stop = self._before.waveform_at, min(self._next_sample, self._end)
-            pass_over(self._plan, self._before, self._tuner, start - at, stop - at)
+            self._pass_over(start - at, stop - at)
         return skipped
 
-    def _claim(self, skipped: int, *, due: bool = True) -> Block:
-        """Return the tick's block with the head filled in."""
+    def _pass_over(self, start: int, stop: int) -> None:
+        """Feed the compensator the skipped samples ``start`` to ``stop`` of the waveform.
+
+        Without them its input would jump, and the jump would appear in the command.
+        """
+        plan = self._plan
+        passed = plan.input_um[start:stop].copy()
+        if (factors := self._tuner.advance(passed.size)) is not None:
+            tune(factors, passed, passed)
+        self._before.correct(passed, start)
+        if plan.feedback is not None:
+            passed += plan.feedback.correction_um
+        if plan.adaptation is not None:
+            plan.adaptation.follow(passed, passed.size)
+        self._compensator.process(passed, np.empty_like(passed))
+
+    def _reserve(self, skipped: int, *, due: bool = True) -> Block:
+        """Return the block of this tick, with its header."""
         pacer = self._pacer
         block = self._host.claim(due=due)
         block.skipped = skipped
@@ -216,86 +217,31 @@ class Loop:
         return block
 
     def _supervise(self) -> None:
-        """Write the heartbeat, and follow what is requested of the run."""
+        """Write the heartbeat, and act on lateness, stops and requested changes."""
         position = self._next_sample - self._before.waveform_at
         stop = self._host.heartbeat(max(position, 0), self._pacer.counters.late_ticks)
-        # The end of the waveform first: a stop or a late tick after it changes nothing any more.
+        # The end of the waveform first: a stop or a late tick after it has no effect.
         if self._next_sample >= self._end:
-            self._leave("completed", "completed", "waveform completed")
+            self._begin_safe_ramp("completed", "completed", "waveform completed")
         if self._phase is _LEAVING:
             return
         if late := self._pacer.too_late():
-            self._leave("fault", "late", late)
+            self._begin_safe_ramp("fault", "late", late)
         elif stop:
-            self._leave("stopped", "stopped", stop)
+            self._begin_safe_ramp("stopped", "stopped", stop)
         elif self._phase is _FOLLOWING and (tuning := self._host.tuning()):
             self._tune(tuning)
 
-    def _follow_from_here(self) -> None:
-        """Enter the waveform; its first tick still waits for a whole period."""
-        self._phase = _FOLLOWING
-        if self._pacer.policy == "spaced":
-            self._pacer.postpone()
-        self._pacer.policy = self._plan.late_policy
-
-    def _record_condition(self) -> None:
-        event = self._before.condition_event()
-        if event is not None:
-            self._host.record_event(event)
-
-    def _record_adapted(self, *, ended: bool = False) -> None:
-        adaptation = self._plan.adaptation
-        if adaptation is None:
-            return
-        sample = max(0, self._ended_at - 1) if ended else self._next_sample
-        if event := adaptation.event(sample, ended=ended):
-            self._host.record_event(event)
-
-    def _take_offset_out(self) -> None:
-        """Take out how far the sensor stands from the model; beyond the limit the run ends."""
-        text, values, refused = self._before.take_offset_out()
-        if refused:
-            self._leave("fault", OFFSET, text)
-        elif text:
-            self._host.record_event(Event(self._next_sample, "info", OFFSET, text, values))
-
-    def _tune(self, tuning: Tuning) -> None:
-        for event in self._tuner.events(tuning, self._next_sample):
-            self._host.record_event(event)
-        self._tuner.move(tuning)
-
-    def _leave(self, code: Code, event: str, reason: str, sample: int | None = None) -> None:
-        """Ramp to the safe value from the next block on.
-
-        The first reason is that of the run, except that a fault of the waveform that shows after
-        its end replaces it.
-        """
-        if self._phase not in _AFTER:
-            self._phase = _LEAVING
-            self._pacer.policy = self._plan.ramp_policy
-            self._code, self._reason = code, reason
-        elif self._code == "completed" and code == "fault":
-            self._code, self._reason = code, reason
-        if code == "fault":
-            self._record_fault(event, reason, sample)
-
-    def _record_fault(self, event: str, reason: str, sample: int | None) -> None:
-        """Record a fault as an event, the first of each kind only."""
-        if event not in self._faults:
-            self._faults.add(event)
-            at = self._next_sample if sample is None else sample
-            self._host.record_event(Event(at, "error", event, reason))
-
     def _fill(self, block: Block) -> tuple[bool, int]:
-        """Work out one block of commands.
+        """Compute the commands of a block.
 
         Returns:
-            Whether the safe value is reached in it, and the first sample whose wish is not a finite
-            number, or -1.
+            Whether the safe ramp ends in it, and the first sample with a requested command that is
+            not finite, or -1.
         """
         if block.skipped:
             block.flags |= _SKIPPED
-        # The memory before the block, so that a replay can begin at any gap.
+        # The state before the block, so that a replay can start after any gap.
         self._compensator.state(block.memory)
         block.state[-1] = self._limiter.last
         phase = self._phase
@@ -310,7 +256,7 @@ class Loop:
         return False, self._follow(block, *parts)
 
     def _fill_end(self, block: Block, n: int) -> tuple[bool, int]:
-        """Fill the last n samples of the waveform, and the ramp behind them; see :meth:`_fill`."""
+        """Fill the last n samples of the waveform and the ramp after them; see :meth:`_fill`."""
         on_ramp, self._on_ramp = self._on_ramp, True
         first_invalid = -1
         if n > 0:
@@ -323,7 +269,7 @@ class Loop:
         return there and self._phase is _LEAVING, first_invalid
 
     def _condition(self, block: Block) -> int:
-        """Fill a block of the conditioning; return the first wish that is not finite, or -1."""
+        """Fill a block of the conditioning; return the first sample that is not finite, or -1."""
         block.reference[:] = block.input_um[:] = np.nan
         self._before.condition(block.wanted, self._next_sample)
         block.flags |= _CONDITION
@@ -338,27 +284,46 @@ class Loop:
         command: F64,
         flags: U32,
     ) -> int:
-        """Fill what comes of the reference; return the first wish that is not finite, or -1."""
+        """Fill samples of the waveform; return the first one that is not finite, or -1."""
         tuner = self._tuner
         factors = None if tuner.idle else tuner.advance(wanted.size)
         start = self._next_sample - self._before.waveform_at
-        feed(self._plan, self._before, factors, block, (reference, input_um), start)
+        self._fill_input(factors, block, reference, input_um, start)
         self._compensator.process(input_um, wanted)
-        # The compensator's memory first: it goes on as if its command were put out.
+        # After the compensator, whose state evolves as if its command were applied.
         if factors is not None:
             tuner.fade(factors, reference, wanted, flags)
         return self._limiter.limit(wanted, command, flags)
 
+    def _fill_input(
+        self, factors: TuningFactors | None, block: Block, reference: F64, input_um: F64, start: int
+    ) -> None:
+        """Fill reference and input from sample ``start`` of the waveform on."""
+        plan, stop = self._plan, start + reference.size
+        if factors is None:
+            reference[:] = plan.reference[start:stop]
+            own = plan.input_um is not plan.reference
+            input_um[:] = plan.input_um[start:stop] if own else reference
+        else:
+            tune(factors, plan.reference[start:stop], reference)
+            tune(factors, plan.input_um[start:stop], input_um)
+        self._before.correct(input_um, start)
+        if plan.feedback is not None:
+            plan.feedback.follow(block, input_um)
+        # Last: it adds the adapted offset and gain, and learns from the input without them.
+        if plan.adaptation is not None:
+            plan.adaptation.follow(input_um, plan.block)
+
     def _exchange(self, sent: Block) -> None:
-        """Send a block; judge and record the one whose displacements come back."""
+        """Exchange a block with the device, and process the block that is answered."""
         in_flight = self._in_flight
-        # Before the exchange: where it fails, the block is recorded as sent and not answered.
+        # Before the exchange: if it fails, the block is recorded as unanswered.
         in_flight.append(sent)
         early = len(in_flight) <= self._plan.latency_blocks
         answered = sent if early else in_flight[0]
         self._next_sample += self._plan.block
         if sent.due:
-            # Before the exchange: a loop that is killed in it leaves what it has sent.
+            # Before the exchange: the block survives if the loop is killed in it.
             self._host.sending(sent)
             self._ended_at = self._next_sample
         first_sample = sent.head[_FIRST_SAMPLE]
@@ -369,21 +334,21 @@ class Loop:
         sent.head[_EXCHANGE_NS] = self._clock.now_ns() - before_ns
         if not early:
             in_flight.popleft()
-            self._take(answered, self._interlocks.judge(answered))
+            self._process_answer(answered, self._interlocks.judge(answered))
 
-    def _take(self, block: Block, trip: Trip | None) -> None:
-        """Learn from a block whose displacements have come and been judged, and record it."""
+    def _process_answer(self, block: Block, trip: Trip | None) -> None:
+        """Pass an answered block to feedback and adaptation, record it, and act on a trip."""
         if self._learns:
             self._before.take(block.head[_FIRST_SAMPLE], block.displacement_um)
-            # Before it is recorded: from then on its slot may be another block's.
+            # Before it is recorded: then its slot may be reused.
             if self._plan.feedback is not None:
                 self._plan.feedback.take(block)
             if self._plan.adaptation is not None:
                 self._plan.adaptation.take(block)
-        # Recorded before the run leaves for it: the event refers to samples that are there.
+        # Before the fault is recorded: its event refers to recorded samples.
         self._record(block)
         if trip is not None and block.guarded:
-            self._leave("fault", trip.code, trip.reason, trip.sample)
+            self._begin_safe_ramp("fault", trip.code, trip.reason, trip.sample)
         elif trip is not None and self._phase in _AFTER:
             self._record_fault(trip.code, trip.reason, trip.sample)
 
@@ -397,18 +362,93 @@ class Loop:
         if self._plan.keep_all:
             sample = block.head[_FIRST_SAMPLE]
             reason = f"no room for sample {sample}: the recorder does not keep up"
-            self._leave("fault", "dropped", reason)
+            self._begin_safe_ramp("fault", "dropped", reason)
+
+    def _begin_safe_ramp(
+        self, code: Code, event: str, reason: str, sample: int | None = None
+    ) -> None:
+        """Enter the safe ramp with the next block.
+
+        The first reason is the reason of the run. A fault replaces a completed waveform: the answer
+        that shows it may arrive after the end.
+        """
+        if self._phase not in _AFTER:
+            self._phase = _LEAVING
+            self._pacer.policy = self._plan.ramp_policy
+            self._code, self._reason = code, reason
+        elif self._code == "completed" and code == "fault":
+            self._code, self._reason = code, reason
+        if code == "fault":
+            self._record_fault(event, reason, sample)
+
+    def _record_fault(self, event: str, reason: str, sample: int | None) -> None:
+        """Record a fault as an event, only the first one of each kind."""
+        if event not in self._faults:
+            self._faults.add(event)
+            at = self._next_sample if sample is None else sample
+            self._host.record_event(Event(at, "error", event, reason))
+
+    def _enter_next_phase(self) -> None:
+        """Enter the conditioning or the waveform if it begins with the next sample."""
+        if self._phase is _STARTING and self._next_sample >= self._before.condition_at:
+            self._phase = _CONDITIONING
+            self._record_condition()
+        if self._phase is _CONDITIONING and self._next_sample >= self._before.waveform_at:
+            self._enter_waveform()
+            self._remove_offset()
+            if self._plan.adaptation is not None:
+                self._plan.adaptation.take_noise(self._before.noise_um)
+
+    def _enter_waveform(self) -> None:
+        """Enter the waveform one whole period after the previous tick."""
+        self._phase = _FOLLOWING
+        if self._pacer.policy == "spaced":
+            self._pacer.postpone()
+        self._pacer.policy = self._plan.late_policy
+
+    def _remove_offset(self) -> None:
+        """Remove the offset between sensor and model; end the run if it exceeds the limit."""
+        text, values, refused = self._before.remove_offset()
+        if refused:
+            self._begin_safe_ramp("fault", OFFSET, text)
+        elif text:
+            self._host.record_event(Event(self._next_sample, "info", OFFSET, text, values))
+
+    def _tune(self, tuning: Tuning) -> None:
+        for event in self._tuner.events(tuning, self._next_sample):
+            self._host.record_event(event)
+        self._tuner.move(tuning)
+
+    def _record_condition(self) -> None:
+        event = self._before.condition_event()
+        if event is not None:
+            self._host.record_event(event)
+
+    def _record_adapted(self, *, ended: bool = False) -> None:
+        adaptation = self._plan.adaptation
+        if adaptation is None:
+            return
+        sample = max(0, self._ended_at - 1) if ended else self._next_sample
+        if event := adaptation.event(sample, ended=ended):
+            self._host.record_event(event)
+
+    def _drain(self) -> None:
+        """Repeat the safe value for one block to receive an outstanding answer."""
+        block = self._reserve(self._wait(), due=False)
+        self._host.heartbeat(self._next_sample, self._pacer.counters.late_ticks)
+        block.command[:] = self._limiter.limits.safe
+        self._exchange(block)
 
     def _lost_device(self, error: DeviceError) -> LoopOutcome:
         text = str(error) if self._code == "completed" else f"{self._reason}; then {error}"
         event = Event(self._next_sample, "error", "device_lost", str(error))
         self._host.record_event(event)
-        # Before the device: its time-outs would look like a hanging loop to the supervisor.
+        # Before the device is used: its timeouts would look like a hang to the supervisor.
         self._host.closing()
         limits = self._limiter.limits
         pending = not self._device.info.simulated
         goal = SafeGoal(limits.safe, limits.ramp_per_s, self._limiter.last, pending)
-        # The coil first: the samples stand in shared memory, and nothing is lost by waiting.
+        # The output first: the samples are safe in shared memory.
         output = drive_to_safe(
             self._device, goal, self._seconds, self._sleep, self._host.writing_safe
         )

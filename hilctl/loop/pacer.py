@@ -1,4 +1,4 @@
-"""Absolute deadlines, the policy for late ticks, and exact counters of them."""
+"""The pacer: absolute deadlines, policies for late ticks, and exact counters."""
 
 import ctypes
 import errno
@@ -15,10 +15,10 @@ if TYPE_CHECKING:
 LatePolicy: TypeAlias = Literal["skip", "catch_up", "slip", "follow", "spaced"]
 
 USUAL_MISSED_SHARE = 0.01
-"""Share of ticks that may be skipped, where no other is given."""
+"""Default share of ticks that may be skipped."""
 
 _FOLLOW = 1.0 / 64.0
-_FEWEST_STALLS = 5  # one stall, however long, may be an accident; what goes on stalling is none
+_FEWEST_STALLS = 5  # a single stall, however long, does not end the run
 _TIMER_ABSTIME = 1
 
 
@@ -27,12 +27,12 @@ class _Timespec(ctypes.Structure):
 
 
 def deadline_misses(skipped: int, due: int, max_share: float) -> str:
-    """Return ``deadline misses 944 of 3003 (31 %)`` in words; empty without any.
+    """Return text such as ``deadline misses 944 of 3003 (31 %)``; empty without any.
 
     Args:
-        skipped: Ticks that were left out.
-        due: All ticks, with these.
-        max_share: Share of them from which on ``timing not kept`` is said too.
+        skipped: Skipped ticks.
+        due: All ticks, skipped ones included.
+        max_share: Share above which ``timing not kept`` is added.
     """
     if not skipped:
         return ""
@@ -42,20 +42,20 @@ def deadline_misses(skipped: int, due: int, max_share: float) -> str:
 
 
 class SystemClock:
-    """CLOCK_MONOTONIC, with sleeps to an absolute time that don't drift."""
+    """CLOCK_MONOTONIC with sleeps to an absolute time."""
 
     def __init__(self) -> None:
-        self._nanosleep = ctypes.CDLL(None).clock_nanosleep  # returns its error, never sets errno
+        self._nanosleep = ctypes.CDLL(None).clock_nanosleep  # returns its error, not in errno
         self._spec = _Timespec()
         self._pointer = ctypes.byref(self._spec)
 
     now_ns = staticmethod(time.monotonic_ns)
-    """Returns the time in ns."""
+    """Return the time in ns."""
 
     def sleep_until_ns(self, deadline_ns: int) -> None:
-        """Sleep until ``deadline_ns``; return at once where that is past."""
+        """Sleep until ``deadline_ns``; return immediately if it has passed."""
         if deadline_ns <= self.now_ns():
-            return  # the kernel would take as long for it as for any other sleep
+            return  # faster than a call of the kernel
         self._spec.tv_sec, self._spec.tv_nsec = divmod(deadline_ns, 1_000_000_000)
         while True:
             code = self._nanosleep(time.CLOCK_MONOTONIC, _TIMER_ABSTIME, self._pointer, None)
@@ -70,11 +70,11 @@ class Lateness:
     """Exact counters of late ticks.
 
     Attributes:
-        late_ticks: Ticks that woke later than the limit after they were due.
-        skipped_ticks: Ticks left out to keep the phase.
+        late_ticks: Ticks later than the limit.
+        skipped_ticks: Ticks skipped to keep the phase.
         worst_ns: Largest lateness.
-        worst_tick: Tick that had it.
-        longest_run: Most late ticks one after the other.
+        worst_tick: Tick with the largest lateness.
+        longest_run: Most consecutive late ticks.
     """
 
     late_ticks: int = 0
@@ -86,16 +86,16 @@ class Lateness:
 
 @dataclass(frozen=True, slots=True)
 class LateRules:
-    """From when a tick counts as late, and when lateness ends a run.
+    """When a tick counts as late, and when lateness ends a run.
 
     Attributes:
         late_after_ns: Lateness from which a tick counts as late.
         max_late_ns: Lateness that ends the run.
-        max_consecutive_late: Late ticks, one after the other, that end the run; 0 for any number.
-        grace_ticks: Ticks at the start that no lateness ends the run in.
-        missed_window: Last ticks that misses are counted in.
-        max_missed: Skipped ticks in that window that are let pass; more of them end the run once
-            they come from five stalls or more.
+        max_consecutive_late: Consecutive late ticks that end the run; 0: any number is allowed.
+        grace_ticks: Ticks at the start in which lateness does not end the run.
+        missed_window: Number of last ticks in which misses are counted.
+        max_missed: Skipped ticks allowed in that window; more end the run if they are due to at
+            least five stalls.
     """
 
     late_after_ns: float = math.inf
@@ -107,19 +107,18 @@ class LateRules:
 
 
 class Pacer:
-    """Wakes the loop at absolute times.
+    """Wake the loop at absolute times.
 
     Args:
-        clock: Time.
-        period_ns: Time from one tick to the next; it need not be a whole number of ns.
-        policy: What happens when a tick wakes a whole period late or more; may be changed between
-            ticks. ``follow`` is for devices whose exchange waits for their own clock: there is no
-            other wait, and the deadlines follow that clock, so that a late tick is one that came
-            later than usual. ``spaced`` is for the start of a run: each tick waits for a whole
-            period after the tick before it has ended, and the schedule shifts by what that takes.
-            No tick is skipped, and two writes are never less than a period apart, however long an
-            exchange took and whenever in it the device moved its output.
-        rules: What counts as late.
+        clock: The clock.
+        period_ns: Period of the ticks; may be fractional.
+        policy: What follows a tick that is a period or more late; may be changed between ticks.
+            ``skip``: skip ticks to keep the phase. ``catch_up``: run all ticks. ``slip``: shift the
+            schedule. ``follow``: the exchange waits for the device's clock, and the deadlines
+            follow that clock. ``spaced``, for the start of a run: each tick waits a whole period
+            after the end of the previous one, so two writes are never closer, however long an
+            exchange took.
+        rules: Rules for late ticks.
     """
 
     def __init__(
@@ -135,20 +134,20 @@ class Pacer:
         self._not_kept = ""
         self._least_counted_ns = 0.0
         self.late_run = 0
-        """Late ticks one after the other, up to this one."""
+        """Consecutive late ticks up to this one."""
         self.tick = -1
         self.deadline_ns = 0
-        """When the tick under way was due, by the clock."""
+        """Deadline of the present tick."""
         self.late_ns = 0
-        """How late the last wait ended; after a skip, behind the first tick that was missed."""
+        """Lateness of the last wake-up; after a skip, relative to the first missed tick."""
         self.counters = Lateness()
 
     def begin(self, start_ns: int) -> None:
-        """Make the first tick due at ``start_ns``."""
+        """Set the time of the first tick."""
         self._origin_ns = start_ns
 
     def postpone(self) -> None:
-        """Shift the schedule so that the next tick is due a whole period from now, or later."""
+        """Shift the schedule so that the next tick is at least a period away."""
         due_ns = self._origin_ns + round((self.tick + 1) * self._period_ns)
         earliest_ns = self._clock.now_ns() + math.ceil(self._period_ns)
         self._origin_ns += max(0, earliest_ns - due_ns)
@@ -165,7 +164,7 @@ class Pacer:
         self._clock.sleep_until_ns(self.deadline_ns)
         now_ns = self._clock.now_ns()
         self.late_ns = now_ns - self.deadline_ns
-        # Nothing to count, as a rule: late means over a limit, and the worst is soon seen.
+        # Usually there is nothing to count.
         if self.late_ns > self._least_counted_ns or self.late_run:
             self._count()
         if self.late_ns < self._period_ns or self.policy in {"catch_up", "follow", "spaced"}:
@@ -176,13 +175,13 @@ class Pacer:
         skipped = int(self.late_ns / self._period_ns)
         self.tick += skipped
         self.counters.skipped_ticks += skipped
-        # The tick that runs now is a later one than that which was waited for.
+        # The present tick is later than the one that was waited for.
         self.deadline_ns = self._origin_ns + round(self.tick * self._period_ns)
         self._note_stall(skipped)
         return skipped
 
     def too_late(self) -> str:
-        """Return why the ticks come too late to go on, or an empty text."""
+        """Return why lateness ends the run, or an empty text."""
         rules = self._rules
         if self.tick < rules.grace_ticks:
             return ""
@@ -193,7 +192,7 @@ class Pacer:
         return self._not_kept
 
     def _note_stall(self, skipped: int) -> None:
-        """Count skipped ticks, and judge those of the last ticks together."""
+        """Count skipped ticks in the window of the last ticks."""
         rules = self._rules
         if self.tick < rules.grace_ticks:
             return
@@ -207,7 +206,7 @@ class Pacer:
             self._not_kept = f"timing not kept: {share}, {allowed}"
 
     def _follow(self) -> None:
-        """Take this moment as the tick: at once where it is early, slowly where it is late."""
+        """Follow the device's clock: immediately if it is early, slowly if it is late."""
         self.late_ns = self._clock.now_ns() - self.deadline_ns
         if self.late_ns < 0:
             self._origin_ns += self.late_ns

@@ -1,68 +1,45 @@
-"""What a run does, and how it ended."""
+"""The plan of a run, and the host that a loop runs in."""
 
 from dataclasses import dataclass, field
-from typing import Literal, TypeAlias
+from typing import Protocol
 
+from hilctl.base.device import Clock
+from hilctl.base.events import Event
 from hilctl.base.types import F64
 from hilctl.loop.adaptation import Adaptation
+from hilctl.loop.block import Block
 from hilctl.loop.compensator import Compensator
-from hilctl.loop.conditioning import Conditioning
 from hilctl.loop.feedback import Controller
 from hilctl.loop.interlocks import InterlockContext, InterlockSettings
+from hilctl.loop.lead_in import Conditioning
 from hilctl.loop.limiter import CommandLimits
 from hilctl.loop.pacer import LatePolicy, LateRules
-from hilctl.loop.safe_output import OutputState
-
-Code: TypeAlias = Literal["completed", "stopped", "fault"]
-
-
-@dataclass(frozen=True, slots=True)
-class LoopOutcome:
-    """How a run ended.
-
-    Attributes:
-        code: ``completed``, ``stopped`` on request, or ``fault``.
-        reason: One line for people.
-        ended_at: Index after the last sample that was sent.
-        output: What is known of the output.
-        dropped: Samples that were exchanged but found no room in the ring.
-    """
-
-    code: Code
-    reason: str
-    ended_at: int
-    output: OutputState
-    dropped: int
-
-    @property
-    def safe(self) -> bool:
-        """Whether the device confirmed its safe value."""
-        return self.output == "confirmed"
+from hilctl.loop.tuning import Tuning
 
 
 @dataclass(frozen=True, slots=True)
 class LoopPlan:
-    """What a run does.
+    """The plan of a run.
 
     Attributes:
         reference: float64[n], in the waveform's unit.
-        input_um: float64[n], the compensator's input: the reference as far ahead as it previews,
-            and whatever is added to it; the reference itself where nothing compensates.
-        block: Samples in each exchange.
+        input_um: float64[n], the compensator's input: the reference shifted by its preview, with
+            corrections; the reference itself without a compensator.
+        block: Samples per exchange.
         latency_blocks: Exchanges from a block's commands to its displacements.
-        sample_rate_hz: Samples a second.
-        compensator: Warmed up, with the memory that it begins with.
-        limits: What commands are held to.
-        interlocks: What the interlocks need to know of the rig.
-        interlock_settings: What they are set to.
-        late_policy: What happens when a tick wakes late in the waveform.
-        start_policy: The same on the ramp and in the conditioning before it.
-        ramp_policy: The same on the safe ramp after it.
-        late_rules: From when a tick counts as late, and when lateness ends the run.
-        feedback: Corrects the compensator's input; None where nothing does.
-        adaptation: Adapts the compensator's model; None where nothing does.
-        conditioning: What comes before the waveform; None where nothing does.
-        keep_all: Whether a block that finds no room in the ring ends the run.
+        sample_rate_hz: Samples per second.
+        compensator: Warmed up, with its initial state.
+        limits: Limits of the commands.
+        interlocks: Properties of the rig that interlocks need.
+        interlock_settings: Settings of the interlocks.
+        late_policy: Policy for late ticks in the waveform.
+        start_policy: Policy in the initial ramp and the conditioning.
+        ramp_policy: Policy in the safe ramp.
+        late_rules: When a tick counts as late, and when lateness ends the run.
+        feedback: Corrects the compensator's input; may be None.
+        adaptation: Adapts the compensator's model; may be None.
+        conditioning: Precedes the waveform; may be None.
+        keep_all: Whether a block that is dropped because the ring is full ends the run.
     """
 
     reference: F64
@@ -87,3 +64,52 @@ class LoopPlan:
     def samples(self) -> int:
         """Samples of the waveform."""
         return self.reference.size
+
+
+class Host(Protocol):
+    """Clock, slots of blocks, and supervision; no call except the clock's sleep may block."""
+
+    @property
+    def clock(self) -> Clock:
+        """The clock."""
+        ...
+
+    def claim(self, *, due: bool = True) -> Block:
+        """Return the next block; a spare slot if it is not due, or if the ring is full.
+
+        Its flags are 0, its displacements and measured commands NaN.
+        """
+        ...
+
+    def sending(self, block: Block) -> None:
+        """Note that a block is about to be sent, so that it is never lost."""
+        ...
+
+    def answered(self, block: Block) -> bool:
+        """Pass a block on to be recorded; return False if it was in a spare slot."""
+        ...
+
+    def heartbeat(self, next_sample: int, late_ticks: int) -> str:
+        """Write the heartbeat, once per tick; return the reason to stop, or an empty text.
+
+        Args:
+            next_sample: Index of the next sample in the waveform; 0 before it begins.
+            late_ticks: Number of late ticks so far.
+        """
+        ...
+
+    def closing(self) -> None:
+        """Note that the loop has ended; closing the device may take its timeouts."""
+        ...
+
+    def writing_safe(self, value: float) -> None:
+        """Note a write of the safe ramp, so that another process can continue it."""
+        ...
+
+    def tuning(self) -> Tuning | None:
+        """Return a requested change that begins now, each one once."""
+        ...
+
+    def record_event(self, event: Event) -> None:
+        """Record an event."""
+        ...

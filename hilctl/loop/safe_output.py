@@ -1,6 +1,6 @@
-"""Bring an output to its safe value, one write after another, until the device confirms it.
+"""The safe value: repeated writes until the device confirms it, and the outcome of a run.
 
-The loop, the guardian, the supervisor and ``hilctl safe`` all use this; a device does single
+The loop, the guardian, the supervisor and ``hilctl safe`` use this module. A device performs single
 writes (:meth:`hilctl.base.device.Device.make_safe`) and never retries.
 """
 
@@ -14,24 +14,23 @@ from hilctl.base.device import Device
 from hilctl.base.errors import DeviceError, UnconfirmedError
 
 OutputState: TypeAlias = Literal["confirmed", "set", "sent", "unknown"]
-"""What is known of the output at the end of a run.
+"""State of the output at the end of a run.
 
 ``confirmed``: the device confirmed the safe value, and no older command can follow.
-``set``: the device confirmed the safe value, but an older command, which was sent and never
-answered, may still be executed.
-``sent``: the safe value was sent to a device that has no way to confirm it.
+``set``: the device confirmed the safe value, but an older unanswered command may still be executed.
+``sent``: the safe value was sent to a device that cannot confirm it.
 ``unknown``: the safe value is not confirmed.
 """
 
-HOLD_S = 30.0
-"""How long the safe value is repeated if an older command was never answered.
+Code: TypeAlias = Literal["completed", "stopped", "fault"]
 
-A gateway queues requests, and its own time-outs and retries add up; devices and gateways that took
-10 s for one request have been seen.
+HOLD_S = 30.0
+"""How long the safe value is repeated after an unanswered command.
+
+A gateway queues requests, and its timeouts and retries add up: some take 10 s for one request.
 """
 PATIENCE_S = 5.0
-"""How long a command waits for the confirmation before it returns and leaves the rest to the
-guardian."""
+"""How long a command waits for confirmation before the guardian takes over."""
 _RAMP_S = 0.005
 _RETRY_S = 0.05
 _LATER_RETRY_S = 0.5
@@ -50,28 +49,47 @@ _DESCRIPTIONS: dict[OutputState, str] = {
 
 
 def describe(state: OutputState, error: str = "") -> str:
-    """Return what is known of the output, for people.
-
-    Args:
-        state: What is known.
-        error: Why it is not confirmed; may be empty.
-    """
+    """Return a description of the output's state; ``error``: why it is not confirmed."""
     return f"{_DESCRIPTIONS[state]}: {error}" if error else _DESCRIPTIONS[state]
 
 
+@dataclass(frozen=True, slots=True)
+class LoopOutcome:
+    """Outcome of a run.
+
+    Attributes:
+        code: ``completed``, ``stopped`` on request, or ``fault``.
+        reason: One line of text.
+        ended_at: Index after the last sample that was sent.
+        output: State of the output.
+        dropped: Samples that were exchanged but not recorded because the ring was full.
+    """
+
+    code: Code
+    reason: str
+    ended_at: int
+    output: OutputState
+    dropped: int
+
+    @property
+    def safe(self) -> bool:
+        """Whether the device confirmed its safe value."""
+        return self.output == "confirmed"
+
+
 class LocalError(Exception):
-    """This process cannot drive the device, for lack of memory or descriptors; another one may."""
+    """This process lacks memory or descriptors to drive the device; another process may not."""
 
 
 @dataclass(frozen=True, slots=True)
 class SafeGoal:
-    """Where the output goes, and how.
+    """Target of the output, and the ramp to it.
 
     Attributes:
         value: The safe value, in the device's command unit.
-        ramp_per_s: Fastest change on the way, > 0.
-        start: Last command; None if it is not known, then there is no ramp.
-        pending: Whether a command that was sent and never answered may still be executed.
+        ramp_per_s: Slew rate of the ramp, > 0.
+        start: Last command; None if unknown, then there is no ramp.
+        pending: Whether an unanswered command may still be executed.
     """
 
     value: float
@@ -81,21 +99,19 @@ class SafeGoal:
 
 
 class SafeOutput:
-    """Drives one device to its safe value; the caller repeats :meth:`attempt` until it is final.
+    """Drive one device to its safe value; call :meth:`attempt` until :attr:`final`.
 
-    The ramp goes by time: each write is as far on the way as the time since the first one allows,
-    so a device that is too slow for a ramp, or does not answer for a while, gets fewer and larger
-    steps.
+    The ramp is a function of time, so a slow device gets fewer and larger steps.
 
     Args:
         device: Open or not.
-        goal: Where the output goes.
+        goal: The safe value and the ramp to it.
         clock: Monotonic time in s.
         on_write: Called with each value before it is written.
 
     Attributes:
-        state: What is known of the output.
-        error: Why it is not confirmed; empty if no write failed since.
+        state: State of the output.
+        error: Why it is not confirmed; empty if the last write succeeded.
     """
 
     def __init__(
@@ -112,17 +128,17 @@ class SafeOutput:
         self._held_since_s: float | None = None
         self._sends = 0
         self.pause_s = 0.0
-        """How long to wait before the next attempt, s."""
+        """Pause before the next attempt, s."""
         self.state: OutputState = "unknown"
         self.error = "nothing was sent"
 
     @property
     def final(self) -> bool:
-        """Whether no further write can tell more."""
+        """Whether further writes cannot change the state."""
         return self.state == "confirmed" or (self.state == "sent" and self._sends >= _SENDS)
 
     def attempt(self) -> None:
-        """Write once, and update state, error and pause.
+        """Write once; update state, error and pause.
 
         Raises:
             LocalError: This process lacks memory or descriptors.
@@ -143,8 +159,7 @@ class SafeOutput:
             patient = now_s - self._began_s > PATIENCE_S
             self.pause_s = _LATER_RETRY_S if patient else _RETRY_S
             self.state, self.error = "unknown", str(error)
-            # A device that was silent until now may find older commands beside the next one, this
-            # value of the ramp too.
+            # The device may execute this command later, after the next one.
             self._held_since_s = None
             self._pending |= value != self._goal.value
             return
@@ -182,17 +197,14 @@ def drive_to_safe(
     sleep: Callable[[float], None] = time.sleep,
     on_write: Callable[[float], None] = lambda value: None,
 ) -> SafeOutput:
-    """Write until the outcome is final, or no more can be known within :data:`PATIENCE_S`.
+    """Write until the state is final or set, at most :data:`PATIENCE_S` longer than the ramp.
 
     Args:
         device: Open or not.
-        goal: Where the output goes.
+        goal: The safe value and the ramp to it.
         clock: Monotonic time in s.
         sleep: Waits that many s.
         on_write: Called with each value before it is written.
-
-    Returns:
-        What is known of the output.
     """
     output = SafeOutput(device, goal, clock, on_write)
     ramp_s = 0.0 if goal.start is None else abs(goal.start - goal.value) / goal.ramp_per_s
@@ -202,14 +214,14 @@ def drive_to_safe(
             output.attempt()
         except LocalError as error:
             output.error, output.pause_s = str(error), _RETRY_S
-        # Nothing is gained here by watching a value that is set: the guardian does.
+        # The guardian watches a value that is set but not confirmed.
         if output.final or output.state == "set" or clock() >= give_up_s:
             return output
         sleep(output.pause_s)
 
 
 def _is_local(error: BaseException | None) -> bool:
-    """Return whether an error comes from a lack of memory or descriptors in this process."""
+    """Return whether an error is due to a lack of memory or descriptors in this process."""
     while error is not None:
         if isinstance(error, MemoryError):
             return True

@@ -1,13 +1,13 @@
-"""Gain and offset of a running reference, and the inverse's share, moved without a bump.
+"""Smooth changes of a running reference's gain and offset, and of the inverse's share.
 
-The inverse goes out and in by a cross-fade between its command and that of a straight line. The
-compensator is fed all the while: so its memory is right, and its command waits for its way back.
-What learns from the error stands still meanwhile, by :attr:`Flag.INVERSE_OUT`: a feedback would
-drive its correction, which is not put out, to the limit, and fade in with it; adaptation would take
-the straight line for a change of the actuator.
+The inverse is bypassed and enabled by a crossfade between its command and that of a straight line.
+The compensator is fed all the time, so that its state is correct when it is enabled again. Feedback
+and adaptation pause meanwhile (:attr:`Flag.INVERSE_OUT`): feedback would drive its correction,
+which is not applied, to the limit, and adaptation would take the line for a change of the actuator.
 """
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -15,20 +15,53 @@ import numpy as np
 from hilctl.base.events import INVERSE, TUNED, Event
 from hilctl.base.samples import Flag
 from hilctl.base.types import F64, U32
-from hilctl.loop.host import LinearBypass, Tuning
 
 T = TypeVar("T", float, F64)
 _OUT = np.uint32(Flag.INVERSE_OUT)
 _AS_IT_IS = (1.0, 0.0, 1.0)
 
 
+@dataclass(frozen=True, slots=True)
+class LinearBypass:
+    """Replacement for the inverse: a command that is linear in the reference.
+
+    Attributes:
+        slope: Slope in the command's unit per um.
+        at_zero: Command at a reference of 0 um.
+    """
+
+    slope: float = 0.0
+    at_zero: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Tuning:
+    """A requested change of the reference or of the inverse's share.
+
+    Attributes:
+        gain: Factor of the reference.
+        offset: Added to it, in the waveform's unit.
+        samples: Duration of the change.
+        begins_at: First sample of the change; if it has passed, the next block.
+        inverse_share: Share of the inverse in the command, 0 to 1; the rest is the line's.
+        line: The straight line.
+    """
+
+    gain: float
+    offset: float
+    samples: int
+    begins_at: int = 0
+    inverse_share: float = 1.0
+    line: LinearBypass = LinearBypass()
+
+
 class TuningFactors(NamedTuple):
-    """What a block is tuned by: numbers, or float64[n] each while a change is under way.
+    """Factors of a block: numbers, or float64[n] each during a change.
 
     Attributes:
         gain: Factor of the reference.
         offset: Added to it.
-        inverse_share: Part of the inverse in the command.
+        inverse_share: Share of the inverse in the command.
     """
 
     gain: float | F64
@@ -36,17 +69,17 @@ class TuningFactors(NamedTuple):
     inverse_share: float | F64
 
 
-def on_the_way(before: float, after: float, part: T) -> T:
-    """Return what a change has led to where a part of its samples has gone by.
+def interpolate(before: float, after: float, part: T) -> T:
+    """Return the value at a part (0 to 1) of a change.
 
-    By the number of the sample alone, so that any cut into blocks gives the same bits; and exactly
-    at both ends.
+    It depends on the sample's number only, so the result is the same for any block size. It is
+    exact at both ends.
     """
     return before * (1.0 - part) + after * part
 
 
 class ReferenceTuner:
-    """Gain, offset and share of the inverse in each block; changes are spread over a ramp."""
+    """Gain, offset and share of the inverse in each block; changes are ramps."""
 
     def __init__(self) -> None:
         self.gain = 1.0
@@ -56,15 +89,15 @@ class ReferenceTuner:
         self._to = Tuning(1.0, 0.0, 0)
         self._done = 0
         self.idle = True
-        """Whether references and commands pass as they are."""
+        """Whether references and commands pass unchanged."""
 
     @property
     def moving(self) -> bool:
-        """Whether a change is under way."""
+        """Whether a change is in progress."""
         return self._done < self._to.samples
 
     def events(self, wanted: Tuning, sample: int) -> Iterator[Event]:
-        """Give the events of a change that begins with a sample; to be asked before it does."""
+        """Yield the events of a change; call it before :meth:`move`."""
         gain, offset, samples = wanted.gain, wanted.offset, wanted.samples
         fades = wanted.inverse_share != self.inverse_share
         if not fades or (gain, offset) != (self.gain, self.offset):
@@ -80,51 +113,51 @@ class ReferenceTuner:
             yield Event(sample, "info", INVERSE, text, values)
 
     def move(self, wanted: Tuning) -> None:
-        """Begin a change, from wherever it stands now."""
+        """Begin a change from the present values."""
         self._from = (self.gain, self.offset, self.inverse_share)
         self._to, self._done = wanted, 0
         self.pass_over(0)
 
     def pass_over(self, samples: int) -> None:
-        """Let samples go by, whose gain and offset nobody needs."""
+        """Advance by samples whose factors are not needed."""
         self._done += samples
         wanted = self._to
         values = wanted.gain, wanted.offset, wanted.inverse_share
         if self.moving:
-            values = self._way(self._done / wanted.samples)
+            values = self._interpolated(self._done / wanted.samples)
         self.gain, self.offset, self.inverse_share = values
         self.idle = not self.moving and values == _AS_IT_IS
 
     def advance(self, samples: int) -> TuningFactors | None:
-        """Return what the next samples are tuned by; None where they pass as they are."""
+        """Return the factors of the next samples; None if they pass unchanged."""
         if self.idle:
             return None
         if not self.moving:
             return TuningFactors(self.gain, self.offset, self.inverse_share)
         steps = np.minimum(self._done + np.arange(1, samples + 1), self._to.samples)
-        factors = self._way(steps / self._to.samples)
+        factors = self._interpolated(steps / self._to.samples)
         self.pass_over(samples)
         return TuningFactors(*factors)
 
     def fade(self, factors: TuningFactors, reference: F64, wanted: F64, flags: U32) -> None:
-        """Bring the straight line's part into the commands of the inverse.
+        """Mix the straight line into the commands of the inverse.
 
         Args:
-            factors: Of these samples.
-            reference: float64[n], in um, as tuned.
+            factors: Factors of these samples.
+            reference: float64[n], in um, tuned.
             wanted: float64[n], the inverse's commands, changed in place.
-            flags: uint32[n], added to.
+            flags: uint32[n], changed in place.
         """
         share = factors.inverse_share
         if isinstance(share, np.ndarray) or share < 1.0:
-            fade(share, self._to.line, reference, wanted, flags)
+            crossfade(share, self._to.line, reference, wanted, flags)
 
-    def _way(self, part: T) -> tuple[T, T, T]:
+    def _interpolated(self, part: T) -> tuple[T, T, T]:
         (gain, offset, share), wanted = self._from, self._to
         return (
-            on_the_way(gain, wanted.gain, part),
-            on_the_way(offset, wanted.offset, part),
-            on_the_way(share, wanted.inverse_share, part),
+            interpolate(gain, wanted.gain, part),
+            interpolate(offset, wanted.offset, part),
+            interpolate(share, wanted.inverse_share, part),
         )
 
 
@@ -134,15 +167,17 @@ def tune(factors: TuningFactors, values: F64, out: F64) -> None:
     out += factors.offset
 
 
-def fade(share: float | F64, line: LinearBypass, reference: F64, wanted: F64, flags: U32) -> None:
-    """Cross-fade commands of the inverse (float64[n]) with those of a straight line, in place.
+def crossfade(
+    share: float | F64, line: LinearBypass, reference: F64, wanted: F64, flags: U32
+) -> None:
+    """Crossfade commands of the inverse (float64[n]) with those of a straight line, in place.
 
     Args:
-        share: Part of the inverse, a number or float64[n]; where it is 1 no bit changes.
+        share: Share of the inverse, a number or float64[n]; if it is 1, no bit changes.
         line: The straight line.
         reference: float64[n], in um.
         wanted: float64[n], the inverse's commands.
-        flags: uint32[n]; the bit of a sample that is changed is set.
+        flags: uint32[n]; ``INVERSE_OUT`` is set for changed samples.
     """
     out = np.broadcast_to(share < 1.0, wanted.shape)
     straight = line.slope * reference + line.at_zero

@@ -1,4 +1,4 @@
-"""All findings of a machine, and whether it keeps a rate."""
+"""Diagnosis of this computer: all checks, and measured timer latency."""
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 
 from hilctl.base.types import I64
-from hilctl.machine import findings, hardware
-from hilctl.machine.logind import log_out
+from hilctl.machine import checks
 from hilctl.machine.procfs import Finding, Machine
-from hilctl.machine.settings import Realtime
+from hilctl.machine.rt_setup import Realtime
 from hilctl.machine.timer_latency import Latency, measure
 
 DEFAULT_RATE_HZ = 1000.0
@@ -20,11 +19,11 @@ _EDGES_US = np.concatenate([[0], 2 ** np.arange(17)])
 
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
-    """What was found.
+    """Result of a diagnosis.
 
     Attributes:
-        findings: What files say of the machine.
-        latency: What was measured.
+        findings: Results of the checks.
+        latency: Measured timer latency.
     """
 
     findings: tuple[Finding, ...]
@@ -32,7 +31,7 @@ class Diagnosis:
 
     @property
     def verdict(self) -> str:
-        """In words: whether every period was at most twice the nominal one, and the longest."""
+        """Text: whether every period was at most twice the nominal one, and the longest."""
         latency = self.latency
         longest_ms, nominal_ms = latency.longest_period_ns * 1e-6, 1e3 / latency.rate_hz
         said = f"the longest of {latency.late_ns.size} periods of {nominal_ms:g} ms"
@@ -44,7 +43,7 @@ class Diagnosis:
         )
 
     def to_mapping(self) -> dict[str, Any]:
-        """Return all of it as plain values."""
+        """Return the fields as plain values."""
         latency = self.latency
         counts = lateness_counts(latency.late_ns)
         return {
@@ -61,9 +60,9 @@ class Diagnosis:
 
 
 def lateness_counts(late_ns: I64) -> dict[int, int]:
-    """Count wake-ups by lateness: lower edge of each bin in us, a power of two, to their number.
+    """Return a histogram of lateness: lower edge of each bin in us, a power of two, to its count.
 
-    The bins up to the last one that holds any; the last one has no upper edge.
+    Bins above the last occupied one are omitted; the last possible bin has no upper edge.
     """
     late_us = np.clip(late_ns // 1000, 0, int(_EDGES_US[-1]))
     counts, _ = np.histogram(late_us, _EDGES_US)
@@ -72,41 +71,41 @@ def lateness_counts(late_ns: I64) -> dict[int, int]:
 
 
 def examine(machine: Machine, settings: Realtime, folder: Path) -> tuple[Finding, ...]:
-    """Return what files say of a machine; quick, nothing is measured or opened.
+    """Return the results of all checks; nothing is measured, and no device is opened.
 
     Args:
         machine: The machine.
-        settings: What the loop would ask for.
-        folder: Where recordings go.
+        settings: Real-time settings of the loop.
+        folder: Folder of recordings.
     """
     return (
-        findings.preemption(machine),
-        findings.fifo(machine, settings),
-        findings.locked_memory(machine),
-        findings.throttling(machine),
-        findings.dma_latency(machine),
-        findings.isolated_cpus(machine, settings),
-        hardware.governor(machine),
-        hardware.hyperthreads(machine),
-        hardware.virtual_machine(machine),
-        hardware.clock_source(machine),
-        hardware.latency_timers(machine),
-        hardware.serial_ports(machine),
-        hardware.serial_daemons(machine),
-        hardware.disk_space(machine, folder),
-        log_out(machine),
+        checks.preemption(machine),
+        checks.fifo(machine, settings),
+        checks.locked_memory(machine),
+        checks.throttling(machine),
+        checks.dma_latency(machine),
+        checks.isolated_cpus(machine, settings),
+        checks.governor(machine),
+        checks.hyperthreads(machine),
+        checks.virtual_machine(machine),
+        checks.clock_source(machine),
+        checks.latency_timers(machine),
+        checks.serial_ports(machine),
+        checks.serial_daemons(machine),
+        checks.disk_space(machine, folder),
+        checks.log_out(machine),
     )
 
 
 def machine_facts(
     settings: Realtime | None = None, folder: Path | None = None, machine: Machine | None = None
 ) -> dict[str, str]:
-    """Return the findings for a recording's metadata: ``machine.kernel`` and so on, to text.
+    """Return the results of all checks as metadata of a recording, such as ``machine.kernel``.
 
     Args:
-        settings: What the loop asks for; else the defaults.
-        folder: Where the recording goes; else the current folder.
-        machine: The machine; else this one.
+        settings: Real-time settings of the loop; the defaults if None.
+        folder: Folder of the recording; the current one if None.
+        machine: The machine; this one if None.
     """
     found = examine(machine or Machine(), settings or Realtime(), folder or Path())
     return {
@@ -122,17 +121,17 @@ def diagnose(
     seconds: float,
     on_progress: Callable[[float], None],
 ) -> Diagnosis:
-    """Look at this machine, and measure how late a process set up as the loop's wakes.
+    """Check this machine, and measure the timer latency of a process set up like the loop.
 
     Args:
-        rate_hz: Ticks a second.
-        settings: What the loop would ask for.
-        folder: Where recordings go.
+        rate_hz: Ticks per second.
+        settings: Real-time settings of the loop.
+        folder: Folder of recordings.
         seconds: Length of the measurement.
         on_progress: See :func:`hilctl.machine.timer_latency.measure`.
 
     Raises:
-        InputError: The rate is beyond what is measured.
+        InputError: The rate is out of range.
         RunError: The measurement failed.
     """
     found = examine(Machine(), settings, folder)

@@ -1,24 +1,27 @@
-"""What is read of a machine: its /proc, /sys and /dev, or a folder that looks like them."""
+"""Read-only access to /proc, /sys and /dev: the machine, and the usage of this process."""
 
 import os
 import shutil
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, TypeAlias
+from typing import Literal, Self, TypeAlias
+
+_STATM = Path("/proc/self/statm")
 
 Level: TypeAlias = Literal["ok", "warn", "bad"]
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """What one check found.
+    """Result of one check.
 
     Attributes:
-        name: What was looked at.
-        level: ``ok``; ``warn``, worth knowing; ``bad``, no real time or no run this way.
-        text: What is there.
-        remedy: What to do about it; empty where there is nothing to do.
+        name: Name of the check.
+        level: ``ok``; ``warn``: worth knowing; ``bad``: prevents real time or a run.
+        text: State that was found.
+        remedy: What to do about it; may be empty.
     """
 
     name: str
@@ -37,7 +40,7 @@ def _free_bytes(path: Path) -> int:
 
 @dataclass(frozen=True, slots=True)
 class Machine:
-    """A machine seen through its files.
+    """Files of this machine, or of a folder that looks like one.
 
     Attributes:
         root: Folder that holds ``proc``, ``sys``, ``dev`` and ``etc``.
@@ -50,26 +53,26 @@ class Machine:
     free_bytes: Callable[[Path], int] = _free_bytes
 
     def path(self, name: str) -> Path:
-        """Return the place of an absolute path on this machine."""
+        """Return an absolute path below the root."""
         return self.root / name.lstrip("/")
 
     def read(self, name: str) -> str:
         """Return the text of a file, such as ``/proc/version``.
 
         Raises:
-            OSError: It can't be read.
+            OSError: It cannot be read.
         """
         return self.path(name).read_text(encoding="utf-8", errors="replace").strip()
 
     def text(self, name: str) -> str | None:
-        """Return the text of a file; None where it is absent, unreadable or forbidden."""
+        """Return the text of a file; None if it cannot be read."""
         try:
             return self.read(name)
         except OSError:
             return None
 
     def number(self, name: str) -> int | None:
-        """Return the whole number in a file; None where there is none."""
+        """Return the integer in a file; None if there is none."""
         text = self.text(name)
         try:
             return None if text is None else int(text)
@@ -77,12 +80,12 @@ class Machine:
             return None
 
     def glob(self, pattern: str) -> list[str]:
-        """Return the absolute paths that fit a pattern such as ``/dev/ttyUSB*``, in order."""
+        """Return the sorted absolute paths that match a pattern such as ``/dev/ttyUSB*``."""
         found = sorted(self.root.glob(pattern.lstrip("/")))
         return [f"/{path.relative_to(self.root)}" for path in found]
 
     def status(self, name: str) -> str:
-        """Return a line of this process's /proc/self/status; empty where there is none."""
+        """Return a value of /proc/self/status; empty if it is missing."""
         for line in (self.text("/proc/self/status") or "").splitlines():
             key, _, value = line.partition(":")
             if key == name:
@@ -94,12 +97,53 @@ class Machine:
         return bool(int(self.status("CapEff") or "0", 16) >> capability & 1)
 
     def limit(self, name: str) -> int | None:
-        """Return a soft limit of /proc/self/limits; None where unlimited.
-
-        An unknown limit is 0: then nothing is promised.
-        """
+        """Return a soft limit of /proc/self/limits; None if unlimited, 0 if unknown."""
         for line in (self.text("/proc/self/limits") or "").splitlines():
             if line.startswith(name):
                 soft = line[len(name) :].split()[0]
                 return None if soft == "unlimited" else int(soft)
         return 0
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessUsage:
+    """Resources used by this process, since its start or another reading.
+
+    Attributes:
+        resident_bytes: Memory in RAM now, shared memory included.
+        cpu_ns: Processor time.
+        minor_faults: Page faults without disk access.
+        major_faults: Page faults with disk access.
+        involuntary_switches: Involuntary context switches.
+    """
+
+    resident_bytes: int
+    cpu_ns: int
+    minor_faults: int
+    major_faults: int
+    involuntary_switches: int
+
+    @classmethod
+    def now(cls) -> Self:
+        """Return the usage of this process with all its threads; Linux only."""
+        import resource
+
+        pages = int(_STATM.read_text(encoding="ascii").split()[1])
+        taken = resource.getrusage(resource.RUSAGE_SELF)
+        return cls(
+            resident_bytes=pages * os.sysconf("SC_PAGE_SIZE"),
+            cpu_ns=time.process_time_ns(),
+            minor_faults=taken.ru_minflt,
+            major_faults=taken.ru_majflt,
+            involuntary_switches=taken.ru_nivcsw,
+        )
+
+    def since(self, before: "ProcessUsage") -> "ProcessUsage":
+        """Return the difference from an earlier reading; memory is the current value."""
+        return ProcessUsage(
+            self.resident_bytes,
+            self.cpu_ns - before.cpu_ns,
+            self.minor_faults - before.minor_faults,
+            self.major_faults - before.major_faults,
+            self.involuntary_switches - before.involuntary_switches,
+        )

@@ -1,18 +1,17 @@
-"""Real-time set-up of the loop's process, step by step, each with what came of it.
+"""Real-time set-up of the loop process: settings, steps, and the outcome of each step.
 
-The steps are those that LinuxCNC, cyclictest and ros2_control take. None of them needs a real-time
-kernel; what the kernel or the user's limits refuse is said, with the remedy, and kept with the
-recording.
+LinuxCNC, cyclictest and ros2_control take the same steps. None needs a real-time kernel.
+The recording contains the outcome of each step. A refused step has a remedy.
 """
 
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from typing import Literal, Protocol, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 from hilctl.base.errors import InputError
-from hilctl.machine.settings import Realtime
+from hilctl.base.strict import BeforeValidator, Field, StrictModel
 from hilctl.machine.syscalls import DMA_LATENCY, LinuxProcess
 
 StepOutcome: TypeAlias = Literal["done", "refused", "not asked"]
@@ -27,11 +26,35 @@ PRIORITY_REMEDY = (
     f"put '@realtime - rtprio 98' and '@realtime - nice -10' into {LIMITS_FILE}, join that group, "
     "log in anew"
 )
-"""What to do where SCHED_FIFO is refused, or its supervisor may not come before others."""
+"""What to do if SCHED_FIFO or a higher priority of the supervisor is refused."""
 
 _HEAP_BYTES = 2 << 20
 _HEADROOM_BYTES = 256 << 20
 _FAVOURED_NICE = -10
+
+
+def _none_or_number(value: Any) -> Any:
+    return None if value == "none" else value
+
+
+class Realtime(StrictModel):
+    """Real-time settings of the loop process.
+
+    Attributes:
+        priority: Its SCHED_FIFO priority.
+        cpu: CPU that it runs on; ``none``: the first isolated one, otherwise any.
+        require: Whether to refuse a run without SCHED_FIFO and locked memory.
+    """
+
+    priority: Annotated[int, Field(ge=1, le=98)] = 80
+    cpu: Annotated[
+        Annotated[int, Field(ge=0)] | None,
+        BeforeValidator(
+            _none_or_number,
+            json_schema_input_type=Literal["none"] | Annotated[int, Field(ge=0)],
+        ),
+    ] = None
+    require: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,77 +65,13 @@ class SetUpStep:
         name: ``gc``, ``prefault``, ``memory``, ``timer_slack``, ``dma_latency``, ``cpu``, ``fifo``.
         outcome: Whether it was done.
         detail: What was set, or why it was refused.
-        remedy: What to do about it; empty where there is nothing to do.
+        remedy: What to do about a refusal; may be empty.
     """
 
     name: str
     outcome: StepOutcome
     detail: str
     remedy: str = ""
-
-
-class System(Protocol):
-    """What the set-up asks of the operating system. A refusal is an :class:`OSError`."""
-
-    def read(self, path: str) -> str:
-        """Return the text of a file."""
-        ...
-
-    def lockable_bytes(self) -> int | None:
-        """Return how much memory may be locked; None where any amount."""
-        ...
-
-    def mapped_bytes(self) -> int:
-        """Return the size of all that is mapped now."""
-        ...
-
-    def freeze_gc(self) -> None:
-        """Collect once, then never again."""
-        ...
-
-    def prefault(self, heap_bytes: int) -> None:
-        """Claim heap and stack now, and keep them."""
-        ...
-
-    def lock_memory(self) -> None:
-        """Keep in RAM every page that is there now, and every page that is touched later."""
-        ...
-
-    def set_timer_slack(self, slack_ns: int) -> None:
-        """Let timers fire this much late; 0 for the system's own value."""
-        ...
-
-    def hold_dma_latency(self, latency_us: int) -> None:
-        """Keep CPUs out of idle states that take longer to leave."""
-        ...
-
-    def pin(self, cpu: int) -> None:
-        """Run on this CPU only."""
-        ...
-
-    def set_fifo(self, priority: int) -> None:
-        """Run before all that is not real-time; children start without it."""
-        ...
-
-    def set_ordinary(self) -> None:
-        """Share the CPU with everybody else."""
-        ...
-
-    def policy(self, process: int = 0) -> int:
-        """Return a scheduling policy, such as ``os.SCHED_OTHER``: of a process, or of this one."""
-        ...
-
-    def nice(self) -> int:
-        """Return how far this thread stands back behind others; below 0, before them."""
-        ...
-
-    def set_nice(self, nice: int) -> None:
-        """Set it, for the threads and processes too that this one starts from now on."""
-        ...
-
-    def undo(self) -> None:
-        """Go back to an ordinary process, as far as each step was taken."""
-        ...
 
 
 def _step(name: str, detail: str, take: Callable[[], object], remedy: str = "") -> SetUpStep:
@@ -123,8 +82,8 @@ def _step(name: str, detail: str, take: Callable[[], object], remedy: str = "") 
     return SetUpStep(name, "done", detail)
 
 
-def _lock_memory(system: System) -> SetUpStep:
-    """Lock all memory, unless what is claimed later would hit a limit in the middle of a run."""
+def _lock_memory(system: LinuxProcess) -> SetUpStep:
+    """Lock all memory, unless a later allocation would exceed the limit."""
     remedy = f"put '@realtime - memlock unlimited' into {LIMITS_FILE}, join that group, log in anew"
     limit = system.lockable_bytes()
     needed = system.mapped_bytes() + _HEADROOM_BYTES
@@ -136,7 +95,7 @@ def _lock_memory(system: System) -> SetUpStep:
     )
 
 
-def _pin(settings: Realtime, system: System) -> SetUpStep:
+def _pin(settings: Realtime, system: LinuxProcess) -> SetUpStep:
     cpu = settings.cpu
     if cpu is None:
         with suppress(OSError):
@@ -147,7 +106,7 @@ def _pin(settings: Realtime, system: System) -> SetUpStep:
     return _step("cpu", f"CPU {cpu}", lambda: system.pin(cpu), remedy)
 
 
-def _set_fifo(settings: Realtime, system: System) -> SetUpStep:
+def _set_fifo(settings: Realtime, system: LinuxProcess) -> SetUpStep:
     priority = settings.priority
     throttling = _throttling(system)
     try:
@@ -163,8 +122,8 @@ def _set_fifo(settings: Realtime, system: System) -> SetUpStep:
     return SetUpStep("fifo", "done", f"SCHED_FIFO {priority}{throttling and ', '}{throttling}")
 
 
-def _throttling(system: System) -> str:
-    """Return what the kernel leaves to real-time work, in words; empty where it does not say."""
+def _throttling(system: LinuxProcess) -> str:
+    """Describe the CPU share of real-time tasks; empty if the kernel does not tell."""
     with suppress(OSError, ValueError):
         runtime_us = int(system.read(RT_RUNTIME))
         period_us = int(system.read(RT_PERIOD))
@@ -175,18 +134,18 @@ def _throttling(system: System) -> str:
 _THIS_PROCESS = LinuxProcess()
 
 
-def prepare(settings: Realtime, system: System = _THIS_PROCESS) -> tuple[SetUpStep, ...]:
-    """Take every step that is allowed; call it last, when all memory is mapped and warm.
+def prepare(settings: Realtime, system: LinuxProcess = _THIS_PROCESS) -> tuple[SetUpStep, ...]:
+    """Take every step that is allowed. Call it last, when all memory is mapped and warm.
 
     Args:
-        settings: What the experiment asks for.
+        settings: The experiment's.
         system: The operating system.
 
     Returns:
-        The steps in the order in which they were tried.
+        The steps in order.
     """
-    # The heap after the lock: its pages then stay in RAM. The CPU before the policy, so that none
-    # is taken from other processes; SCHED_FIFO last, as the steps before it take milliseconds.
+    # The heap after the lock, so that its pages stay in RAM. The CPU before the policy, so that
+    # other processes keep theirs. SCHED_FIFO last: the other steps take milliseconds.
     return (
         _step("gc", "collected once, then off", system.freeze_gc),
         _lock_memory(system),
@@ -207,33 +166,32 @@ def prepare(settings: Realtime, system: System = _THIS_PROCESS) -> tuple[SetUpSt
     )
 
 
-def undo(system: System = _THIS_PROCESS) -> None:
+def undo(system: LinuxProcess = _THIS_PROCESS) -> None:
     """Make this an ordinary process again."""
     system.undo()
 
 
 def require(steps: Sequence[SetUpStep]) -> None:
-    """Refuse a run that has to be real-time and would not be.
+    """Raise an error if SCHED_FIFO or locked memory was refused.
 
-    SCHED_FIFO and locked memory are required. The idle states of the CPU are not: virtual machines
-    have none, and firmware may ignore the wish; ``hilctl doctor`` shows what they cost.
+    Idle states are not required: virtual machines have none, and firmware may ignore the setting.
 
     Raises:
-        InputError: A required step was refused; the text has the remedies.
+        InputError: A required step was refused; the text contains the remedies.
     """
     if lines := refusals(steps):
         raise InputError(
-            "real time is required and can't be had; nothing has moved\n" + "\n".join(lines)
+            "real time is required and not available; nothing has moved\n" + "\n".join(lines)
         )
 
 
 def step_facts(steps: Sequence[SetUpStep]) -> dict[str, str]:
-    """Return the steps for a recording's metadata: ``rt.fifo`` and so on, to text."""
+    """Return the steps as metadata of a recording, such as ``rt.fifo``."""
     return {f"rt.{step.name}": f"{step.outcome}: {step.detail}" for step in steps}
 
 
 def refusals(steps: Sequence[SetUpStep]) -> list[str]:
-    """Return which steps that real time needs were refused, each with what to do about it."""
+    """Return the required steps that were refused, each with its remedy."""
     return [
         f"{step.name}: {step.detail}: {step.remedy}"
         for step in steps
@@ -241,19 +199,16 @@ def refusals(steps: Sequence[SetUpStep]) -> list[str]:
     ]
 
 
-def be_quick(priority: int, system: System = _THIS_PROCESS) -> None:
-    """Put the calling thread before all that is not real-time, where that is allowed."""
+def be_quick(priority: int, system: LinuxProcess = _THIS_PROCESS) -> None:
+    """Give the calling thread a real-time priority if that is allowed."""
     with suppress(OSError):
         system.set_fifo(priority)
 
 
-def be_ordinary(system: System = _THIS_PROCESS) -> bool:
-    """Give up a real-time policy inherited from whoever started this process.
+def be_ordinary(system: LinuxProcess = _THIS_PROCESS) -> bool:
+    """Drop an inherited real-time policy; return whether there was one.
 
-    A supervisor at the loop's own priority could keep it waiting.
-
-    Returns:
-        Whether there was one.
+    A supervisor at the loop's own priority could delay the loop.
     """
     if system.policy() == os.SCHED_OTHER:
         return False
@@ -262,18 +217,18 @@ def be_ordinary(system: System = _THIS_PROCESS) -> bool:
 
 
 @contextmanager
-def favoured(loop: int, system: System = _THIS_PROCESS) -> Iterator[None]:
-    """Put the calling thread, and those that it starts, before ordinary ones, where that may be.
+def favoured(loop: int, system: LinuxProcess = _THIS_PROCESS) -> Iterator[None]:
+    """Lower the nice value of the calling thread and its new threads, if that is allowed.
 
-    A supervisor that waits for its turn on a busy machine can't make the output safe in time. Only
-    beside a loop that is real-time: another would have to wait for it.
+    On a busy machine the supervisor must be scheduled in time to set the safe value. Without a
+    real-time loop nothing changes: the loop would have to wait for the supervisor.
 
     Args:
         loop: Process number of the loop.
         system: The operating system.
     """
     nice = system.nice()
-    with suppress(OSError):  # of the loop too: it may be gone
+    with suppress(OSError):  # not allowed, or the loop has ended
         if system.policy(loop) != os.SCHED_OTHER:
             system.set_nice(min(nice, _FAVOURED_NICE))
     try:
@@ -284,9 +239,9 @@ def favoured(loop: int, system: System = _THIS_PROCESS) -> Iterator[None]:
 
 
 def rt_group_runtime_us(read: Callable[[str], str]) -> int | None:
-    """Return the real-time share of this process's control group, in us a period.
+    """Return the real-time share of this process's control group, in us per period.
 
-    None where the kernel has no such thing; 0 refuses SCHED_FIFO even to root.
+    None if the kernel has no such share. 0 refuses SCHED_FIFO even to root.
     """
     with suppress(OSError, ValueError):
         for line in read("/proc/self/cgroup").splitlines():

@@ -1,7 +1,7 @@
-"""What real-time processes ask of Linux and the standard library has no call for.
+"""Linux system calls for real-time processes.
 
-Everything here concerns the calling process, or where Linux has it so (policy, CPU, timer slack),
-its calling thread. A refusal is an :class:`OSError`.
+They act on the calling process; policy, CPU and timer slack on the calling thread. A refusal is an
+:class:`OSError`.
 """
 
 import ctypes
@@ -27,11 +27,11 @@ def _go_down(depth: int) -> None:
 
 
 _descend = ctypes.CFUNCTYPE(None, ctypes.c_int)(_go_down)
-"""Uses up stack of C, 2 kB at each depth; Python alone would not."""
+"""Uses 2 kB of the C stack per depth; pure Python would use none."""
 
 
 class LinuxProcess:
-    """This process, on Linux with glibc; see :class:`hilctl.machine.rt_setup.System`."""
+    """This process, on Linux with glibc."""
 
     def __init__(self) -> None:
         self._latency_file: int | None = None
@@ -52,7 +52,7 @@ class LinuxProcess:
         return Path(path).read_text(encoding="utf-8")
 
     def lockable_bytes(self) -> int | None:
-        """Return how much memory may be locked; None where any amount."""
+        """Return how much memory may be locked; None if any amount."""
         import resource
 
         limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
@@ -60,7 +60,7 @@ class LinuxProcess:
         return None if capable or limit == resource.RLIM_INFINITY else limit
 
     def mapped_bytes(self) -> int:
-        """Return the size of all that is mapped now."""
+        """Return the size of all mapped memory."""
         return int(self._status("VmSize").removesuffix(" kB")) << 10
 
     def _status(self, name: str) -> str:
@@ -71,13 +71,13 @@ class LinuxProcess:
         raise OSError(errno.ENODATA, f"/proc/self/status has no {name}")
 
     def freeze_gc(self) -> None:
-        """Collect once, then never again."""
+        """Collect garbage once, then disable collection."""
         gc.collect()
         gc.freeze()
         gc.disable()
 
     def prefault(self, heap_bytes: int) -> None:
-        """Claim heap and stack now, and keep them."""
+        """Allocate and touch heap and stack; freed memory stays with the process."""
         mallopt: Any = getattr(self._libc, "mallopt", None)
         if mallopt is None:
             raise OSError(errno.ENOSYS, "this C library is not glibc")
@@ -88,22 +88,22 @@ class LinuxProcess:
         _descend(_STACK_DEPTH)
 
     def lock_memory(self, *, untouched: bool = False) -> None:
-        """Keep in RAM every page that is there now, and every page that is touched later.
+        """Lock the pages in RAM now, and every page that is touched later.
 
         Args:
-            untouched: Also read and lock now what is mapped and was never touched. In the loop
-                process that would be 160 MB of LLVM and OpenBLAS.
+            untouched: Also read and lock pages that were never touched. In the loop process they
+                would be 160 MB of LLVM and OpenBLAS.
         """
         on_fault = 0 if untouched else _MCL_ONFAULT
         self._call("mlockall", _MCL_CURRENT | _MCL_FUTURE | on_fault)
 
     def set_timer_slack(self, slack_ns: int) -> None:
-        """Let timers fire this much late; 0 for the system's own value."""
+        """Set the timer slack; 0 restores the system's value."""
         self._call("prctl", _PR_SET_TIMERSLACK, slack_ns, 0, 0, 0)
 
     def hold_dma_latency(self, latency_us: int) -> None:
-        """Keep CPUs out of idle states that take longer to leave."""
-        descriptor = os.open(DMA_LATENCY, os.O_WRONLY)  # the wish lasts as long as it is open
+        """Disable idle states with a longer exit latency."""
+        descriptor = os.open(DMA_LATENCY, os.O_WRONLY)  # in force while the file is open
         try:
             os.write(descriptor, latency_us.to_bytes(4, "little", signed=True))
         except OSError:
@@ -118,29 +118,29 @@ class LinuxProcess:
         self._cpus_before = before
 
     def set_fifo(self, priority: int) -> None:
-        """Run before all that is not real-time; children and new threads start without it."""
+        """Use SCHED_FIFO; children and new threads start without it."""
         policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
         os.sched_setscheduler(0, policy, os.sched_param(priority))
 
     def set_ordinary(self) -> None:
-        """Share the CPU with everybody else."""
+        """Use SCHED_OTHER."""
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
     def policy(self, process: int = 0) -> int:
-        """Return a scheduling policy, such as ``os.SCHED_OTHER``: of a process, or of this one."""
+        """Return the scheduling policy of a process, by default this one."""
         return os.sched_getscheduler(process) & ~os.SCHED_RESET_ON_FORK
 
     def nice(self) -> int:
-        """Return how far this thread stands back behind others; below 0, before them."""
+        """Return the nice value of this thread."""
         return os.getpriority(os.PRIO_PROCESS, 0)
 
     def set_nice(self, nice: int) -> None:
-        """Set it, for the threads and processes too that this one starts from now on."""
+        """Set the nice value of this thread; new threads and processes inherit it."""
         os.setpriority(os.PRIO_PROCESS, 0, nice)
 
     def undo(self) -> None:
-        """Go back to an ordinary process, as far as each step was taken."""
-        # First: the rest takes as long as it takes, and must not keep others from a CPU.
+        """Undo every step that was taken."""
+        # First: the rest takes time, and other processes need the CPU.
         self.set_ordinary()
         if self._cpus_before is not None:
             os.sched_setaffinity(0, self._cpus_before)

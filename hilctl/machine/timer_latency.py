@@ -1,7 +1,7 @@
-"""Wake-up lateness, measured as the loop has it: same pacer, same set-up, a process of its own.
+"""Timer latency, measured in a separate process with the pacer and set-up of the loop.
 
-Run as ``python -m hilctl.machine.timer_latency`` with a JSON job on standard input, it measures and
-answers with the steps of the set-up as JSON on standard output.
+``python -m hilctl.machine.timer_latency`` reads a JSON job from standard input, measures, and
+writes the steps of the set-up as JSON to standard output.
 """
 
 import json
@@ -22,11 +22,10 @@ from hilctl.base.device import Clock
 from hilctl.base.errors import InputError, RunError
 from hilctl.base.types import I64
 from hilctl.loop.pacer import LatePolicy, LateRules, Pacer, SystemClock
-from hilctl.machine.rt_setup import SetUpStep, prepare
-from hilctl.machine.settings import Realtime
+from hilctl.machine.rt_setup import Realtime, SetUpStep, prepare
 
 MAX_RATE_HZ = 20e3
-"""Highest rate that is measured, in ticks a second."""
+"""Highest measurable rate, in ticks per second."""
 
 _POLL_S = 0.1
 _PATIENCE_S = 30.0
@@ -37,12 +36,12 @@ _QUANTILES = (50.0, 90.0, 99.0, 99.9)
 
 @dataclass(frozen=True, slots=True)
 class Latency:
-    """How late a process woke.
+    """Measured timer latency.
 
     Attributes:
-        rate_hz: Ticks a second.
+        rate_hz: Ticks per second.
         late_ns: int64[m], time from each tick's deadline to its wake-up.
-        steps: How the process was set up.
+        steps: Real-time set-up of the process.
     """
 
     rate_hz: float
@@ -51,17 +50,17 @@ class Latency:
 
     @property
     def longest_period_ns(self) -> float:
-        """Longest time from one wake-up to the next."""
+        """Longest time between two wake-ups."""
         return 1e9 / self.rate_hz + float(np.diff(self.late_ns).max(initial=0))
 
     @property
     def kept_rate_hz(self) -> float:
-        """Highest rate at which these delays would not have doubled any period."""
+        """Highest rate at which no period would have doubled."""
         return 1e9 / max(1.0, float(np.diff(self.late_ns).max(initial=0)))
 
     @property
     def kept(self) -> bool:
-        """Whether no period was over twice the nominal one, RTXI's rule for real time."""
+        """Whether no period was over twice the nominal one (RTXI's criterion)."""
         return self.longest_period_ns <= 2e9 / self.rate_hz
 
     def percentiles_us(self) -> dict[str, float]:
@@ -81,16 +80,15 @@ def measure(
     """Measure wake-up lateness in a new process.
 
     Args:
-        rate_hz: Ticks a second.
-        seconds: How long.
-        settings: How that process is set up.
-        on_progress: Called a few times a second with the time since the start, in s.
-        policy: What follows a tick that woke a period late: the others at once, each of them late,
-            or with ``skip`` the next that is not due yet, so that a stall counts once.
+        rate_hz: Ticks per second.
+        seconds: Duration.
+        settings: Real-time settings of that process.
+        on_progress: Called a few times per second with the time since the start, in s.
+        policy: Late policy of the pacer; with ``skip`` a stall counts once.
 
     Raises:
-        InputError: The rate is beyond what is measured.
-        RunError: The process failed, or took far longer than asked.
+        InputError: The rate is out of range.
+        RunError: The process failed, or took too long.
     """
     if not 0.0 < rate_hz <= MAX_RATE_HZ:
         raise InputError(f"rate must be in (0, {MAX_RATE_HZ:g}] Hz to be measured: {rate_hz:g}")
@@ -116,12 +114,12 @@ def _ask(job: str, seconds: float, on_progress: Callable[[float], None]) -> str:
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
-        start_new_session=True,  # a Ctrl-C in the terminal comes to the parent alone
+        start_new_session=True,  # the parent handles Ctrl-C
     ) as process:
         assert process.stdin is not None
         assert process.stdout is not None
         try:
-            with suppress(BrokenPipeError):  # it died at once, which its exit code tells
+            with suppress(BrokenPipeError):  # it has ended, see its exit code
                 process.stdin.write(job)
                 process.stdin.close()
             while process.poll() is None:
@@ -139,12 +137,9 @@ def _ask(job: str, seconds: float, on_progress: Callable[[float], None]) -> str:
 
 
 def watch(pacer: Pacer, late_ns: I64, clock: Clock, supervised: Callable[[], bool]) -> int:
-    """Fill ``late_ns`` (int64[m]) tick by tick, until it is full or nobody waits for it.
+    """Fill ``late_ns`` (int64[m]) tick by tick; return the number of ticks measured.
 
-    Also until the ticks are far behind: a real-time process must not run without a pause.
-
-    Returns:
-        Ticks measured.
+    It stops early if the parent has ended, or if ticks are so late that the process never sleeps.
     """
     pacer.begin(clock.now_ns() + _START_DELAY_NS)
     for k in range(late_ns.size):
@@ -160,7 +155,7 @@ def _run(job: dict[str, Any]) -> tuple[SetUpStep, ...]:
     period_ns = 1e9 / job["rate_hz"]
     pacer = Pacer(clock, period_ns, job["policy"], LateRules(period_ns))
     late_ns = np.zeros(job["ticks"], dtype=np.int64)
-    # After the array: memory that is claimed later would be faulted in while lateness is measured.
+    # After the array: later allocations would cause page faults during the measurement.
     steps = prepare(Realtime(**job["settings"]))
     ticks = watch(pacer, late_ns, clock, lambda: os.getppid() == job["parent"])
     np.save(job["output"], late_ns[:ticks])

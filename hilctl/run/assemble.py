@@ -1,4 +1,4 @@
-"""From a checked experiment and an open device to the plan of the loop, for every host."""
+"""The plan of the loop, from a checked experiment."""
 
 import math
 from dataclasses import replace
@@ -13,24 +13,24 @@ from hilctl.experiment.interlocks import interlock_context
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.loop.adaptation import DisplacementOperator
 from hilctl.loop.compensator import Compensator
-from hilctl.loop.conditioning import Conditioning
+from hilctl.loop.lead_in import Conditioning
 from hilctl.loop.pacer import LatePolicy, LateRules
 from hilctl.loop.plan import LoopPlan
 
 _ALWAYS_LATE_S = 2.0
 _MISSED_WINDOW_S = 10.0
-_ROUNDING = 1e-6  # of the device's range: error of reading back an end of it
+_ROUNDING = 1e-6  # of the device's range: rounding error of a read-back
 
 
 def starting_output(device: Device, at_start: float | None) -> float:
-    """Return the command that an open device puts out before the run; nothing moves.
+    """Return the output of an open device before the run; nothing moves.
 
     Args:
-        device: Open; its answer is used before ``at_start``.
-        at_start: ``safe.at_start`` of the experiment, for devices that cannot read it.
+        device: Open; its read-back takes precedence.
+        at_start: ``safe.at_start`` of the experiment, for devices without read-back.
 
     Raises:
-        InputError: Both are missing, or the output is outside of the device's range.
+        InputError: Both are missing, or the output is outside the device's range.
         DeviceError: The device did not answer.
     """
     info = device.info
@@ -39,9 +39,8 @@ def starting_output(device: Device, at_start: float | None) -> float:
         output = at_start
     if output is None:
         raise InputError(
-            f"safe.at_start: is required: {info.name} can't tell what it puts out, and a run ramps "
-            f"from there to safe.value: measure it, and give it in {info.command_unit}; "
-            "nothing has moved"
+            f"safe.at_start is required: {info.name} cannot read its output, where the initial "
+            f"ramp begins. Measure it, and set the key in {info.command_unit}; nothing has moved"
         )
     slack = _ROUNDING * (info.command_max - info.command_min)
     low, high = info.command_min - slack, info.command_max + slack
@@ -49,8 +48,8 @@ def starting_output(device: Device, at_start: float | None) -> float:
         unit = info.command_unit
         span = f"{info.command_min:g} to {info.command_max:g} {unit}"
         raise InputError(
-            f"{info.name}: puts out {output:g} {unit}, which is not within what it takes, {span}: "
-            "no ramp can begin there: bring it to its safe value by hand; nothing has moved"
+            f"{info.name}: the output is {output:g} {unit}, outside the device's range {span}, so "
+            "no ramp can begin there. Set it to its safe value by hand; nothing has moved"
         )
     return min(info.command_max, max(info.command_min, output))
 
@@ -66,16 +65,16 @@ def assemble(
     paced: bool = True,
     heat_a2: float = 0.0,
 ) -> LoopPlan:
-    """Return what a run does; its compensator is warmed up.
+    """Return the plan of a run, with a warmed-up compensator.
 
     Args:
         loaded: The experiment.
         reference: float64[n], in the waveform's unit.
         input_um: float64[n], the compensator's input.
-        state: The compensator's memory before the first sample; at rest where None.
-        conditioning: What comes before the waveform; None for nothing.
-        operator: What its adaptation adapts; None where nothing is adapted.
-        paced: Whether the run keeps real time; else no tick is late.
+        state: The compensator's state before the first sample; at rest if None.
+        conditioning: Precedes the waveform; may be None.
+        operator: Operator to adapt; may be None.
+        paced: Whether the run keeps real time; otherwise no tick is late.
         heat_a2: Heat of the coil before it, in A^2.
     """
     config, info = loaded.config, loaded.device.info
@@ -98,7 +97,7 @@ def assemble(
         interlock_settings=config.limits,
         late_policy=policy,
         start_policy="spaced" if host_paced else policy,
-        # By time, not by ticks: a device that takes its time for each would be at it for long.
+        # By time, not by ticks: otherwise the ramp would take long on a slow device.
         ramp_policy="skip" if host_paced else policy,
         late_rules=_late_rules(config, reference.size) if paced else LateRules(),
         feedback=make_feedback(config, compensator, info.latency_blocks),

@@ -1,4 +1,4 @@
-"""Runs in the background: start one, and come back once it runs."""
+"""Start a run in the background."""
 
 import os
 import subprocess
@@ -9,10 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hilctl.base.errors import HilctlError, InputError, RunError
-from hilctl.run.architecture import require_linux
-from hilctl.run.client import ask
-from hilctl.run.protocol import request
-from hilctl.run.run_folder import RunFolder, runs
+from hilctl.run.control.client import ask, request
+from hilctl.run.run_folder import RunFolder, require_linux, runs
 from hilctl.run.start import checked_experiment, output_of
 
 _POLL_S = 0.05
@@ -42,13 +40,13 @@ def start_detached(
 
     Args:
         experiment: Experiment file.
-        settings: ``key=value`` texts over it.
-        output: Recording to write; a name in the experiment's folder where None.
+        settings: ``key=value`` texts that override it.
+        output: Recording to write; a new name in the folder of recordings if None.
         flags: Further arguments of ``hilctl run``.
 
     Raises:
-        InputError: It can't be used; nothing has moved.
-        RunError: It did not start, or has failed; the text is its own error.
+        InputError: The experiment is not valid; nothing has moved.
+        RunError: The run did not start, or failed.
     """
     require_linux()
     checked = checked_experiment(experiment, settings)
@@ -64,17 +62,17 @@ def start_detached(
                 stdin=subprocess.DEVNULL,
                 stdout=stream,
                 stderr=stream,
-                start_new_session=True,  # neither Ctrl-C nor the terminal's end are meant for it
+                start_new_session=True,  # unaffected by Ctrl-C and the end of the terminal
             )
     except OSError as error:
-        raise InputError(f"{log}: can't be written: {error.strerror}") from None
+        raise InputError(f"{log}: cannot write: {error.strerror}") from None
     return Detached(_await_running(process, log), output, log)
 
 
 def free_log(output: Path) -> Path:
-    """Return the log of a run into ``output``: beside it, and no file that is there already."""
+    """Return the log file of a run into ``output``: beside it, and not an existing file."""
     log, number = output.with_suffix(".log"), 2
-    while os.path.lexists(log):  # a link that leads nowhere is there too
+    while os.path.lexists(log):  # also true of a broken link
         log = output.with_suffix(f".{number}.log")
         number += 1
     return log
@@ -99,7 +97,7 @@ def _await_running(process: "subprocess.Popen[bytes]", log: Path) -> RunFolder |
 
 def _has_started(run: RunFolder) -> bool:
     try:
-        # The socket is there before the device is open; its answer only comes once the loop has.
+        # The socket exists before the device is open, but answers only after the start.
         state = ask(run.socket, request("status"), timeout_s=_ANSWER_S)["state"]
     except HilctlError:
         return False

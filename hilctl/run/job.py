@@ -1,16 +1,14 @@
-"""The job of a run: what the supervisor hands to the loop process and to the guardian.
+"""The job of a run, which the supervisor passes to the loop process and the guardian.
 
-The job is JSON text in the run's folder. It holds the experiment and the files that the experiment
-names as the texts that were checked, so a file that changes after the check does not matter. Arrays
-are ``.npy`` files in the same folder.
+The job is JSON text in the run's folder. It contains the experiment and its files as the texts that
+were checked, so later changes of the files have no effect. Arrays are ``.npy`` files in the same
+folder.
 
 The guardian imports this module, so it must not import numba.
 """
 
 import json
-import subprocess
-import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -35,14 +33,13 @@ _STOPPED_S = 0.02
 
 @dataclass(frozen=True, slots=True)
 class SilenceLimits:
-    """How long the loop may be silent.
+    """Longest silence of the loop before it counts as hung.
 
     Attributes:
-        real_time_s: While it runs with real-time priority.
-        ordinary_s: While it runs without: a busy machine may keep it waiting for so long.
-        exchange_s: What is added while it waits for the device.
-        stopped_s: While its process is stopped, as by SIGSTOP: it waits for nothing that could
-            come, and it is no busy machine that keeps it.
+        real_time_s: With real-time priority.
+        ordinary_s: Without real-time priority, on a busy computer.
+        exchange_s: Added while it waits for the device.
+        stopped_s: While its process is stopped, such as by SIGSTOP.
     """
 
     real_time_s: float
@@ -57,21 +54,21 @@ class Job:
 
     Attributes:
         experiment: The experiment as YAML, command-line settings included.
-        files: Texts of the files that it refers to, by absolute path.
-        folder: Folder that file names in it are relative to.
+        files: Texts of its files, by absolute path.
+        folder: Folder of relative file names.
         ring: File of the ring.
         reference: File of the reference samples.
         input_um: File of the compensator's input.
-        state: The compensator's memory before the first sample; None at rest.
+        state: The compensator's state before the first sample; None at rest.
         heat_a2: Heat of the coil before the run, in A^2.
-        stands_um: Displacement before the first sample by the model; None if no offset is measured.
-        adapted: Operator that the run adapts, see
+        stands_um: The model's displacement before the first sample; None if no offset is measured.
+        adapted: Operator to adapt, see
             :meth:`hilctl.loop.adaptation.DisplacementOperator.to_lists`; None without adaptation.
         safe_value: The safe value, in the device's command unit.
-        ramp_per_s: Fastest change on the way there.
-        limits: How long the loop may be silent.
+        ramp_per_s: Slew rate of the safe ramp.
+        limits: Longest silence of the loop.
         supervisor: Process number of the supervisor.
-        silence_s: How long the supervisor may be silent.
+        silence_s: Longest silence of the supervisor.
         safe_priority: SCHED_FIFO priority of the process that sets the safe value.
     """
 
@@ -99,7 +96,7 @@ class Job:
         """Return the job of a checked experiment, and write its arrays into the run's folder.
 
         Raises:
-            RunError: There is no room for them.
+            RunError: There is no memory for them.
         """
         loaded, begun = checked.loaded, checked.begun
         reference = input_um = folder.reference
@@ -131,7 +128,7 @@ class Job:
         """Write the job as JSON.
 
         Raises:
-            RunError: There is no room for it.
+            RunError: There is no memory for it.
         """
         try:
             path.write_text(json.dumps(asdict(self)), encoding="utf-8")
@@ -149,10 +146,10 @@ class Job:
         return Document("experiment", self.experiment)
 
     def device(self) -> Device:
-        """Return the device, made but not opened; nothing is read from disk.
+        """Return the device, not opened; nothing is read from disk.
 
         Raises:
-            InputError: It can't be made.
+            InputError: The device cannot be created.
         """
         made = made_device(self.document(), Path(self.folder), TextFiles(self.files))
         if made is None:
@@ -160,23 +157,20 @@ class Job:
         return made
 
     def arrays(self) -> tuple[F64, F64]:
-        """Return reference and compensator's input, each float64[n]: one array if they are equal.
-
-        They are mapped from their files.
-        """
+        """Return reference and compensator's input, float64[n] each, mapped from their files."""
         reference = _mapped(self.reference)
         same = self.input_um == self.reference
         return reference, reference if same else _mapped(self.input_um)
 
 
 def silence_limits(checked: "CheckedExperiment") -> SilenceLimits:
-    """Return how long the loop of an experiment may be silent."""
+    """Return the longest silence of the loop of an experiment."""
     config = checked.loaded.config
     timing = config.timing
     simulated = checked.loaded.device.info.simulated
     hang_s = ordinary_s = timing.hang_s
     if hang_s is None or ordinary_s is None:
-        # Without real-time priority a loop may be as late as its own limit tolerates.
+        # Without real-time priority the loop may be as late as its own limit allows.
         ordinary_s = timing.max_late_s + (_SIMULATED_MARGIN_S if simulated else 0.0)
         hang_s = ordinary_s if simulated else min(_HANG_S, ordinary_s)
     periods_s = 2.0 * config.tick_s
@@ -185,7 +179,7 @@ def silence_limits(checked: "CheckedExperiment") -> SilenceLimits:
         ordinary_s=periods_s + ordinary_s,
         # A device that takes longer makes the next tick too late, which ends the run as well.
         exchange_s=timing.max_late_s,
-        # A stopped simulated loop may be under a debugger, and there is no coil to protect.
+        # A stopped simulated loop may be under a debugger; no device needs protection.
         stopped_s=periods_s + (hang_s if simulated else min(hang_s, _STOPPED_S)),
     )
 
@@ -193,33 +187,9 @@ def silence_limits(checked: "CheckedExperiment") -> SilenceLimits:
 def safe_priority(checked: "CheckedExperiment") -> int:
     """Return the SCHED_FIFO priority of the process that sets the safe value.
 
-    It is above the loop's, so that a loop in an endless cycle cannot delay that process.
+    It is above the loop's, so that a busy loop cannot delay that process.
     """
     return checked.loaded.config.realtime.priority + 1
-
-
-def start_process(
-    module: str, *words: str, inherits: Sequence[int], stderr: Any = None
-) -> "subprocess.Popen[bytes]":
-    """Start a module as a process of the run.
-
-    Args:
-        module: Its dotted name.
-        words: Its arguments.
-        inherits: Descriptors that it keeps open, such as those of locks.
-        stderr: File of its standard error; the supervisor's if None.
-
-    Raises:
-        OSError: It cannot be started.
-    """
-    return subprocess.Popen(
-        [sys.executable, "-P", "-m", module, *words],  # -P: import nothing from the working folder
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,  # a reader of the supervisor's would wait for this process's end
-        stderr=stderr,
-        start_new_session=True,  # the supervisor handles Ctrl-C in the terminal
-        pass_fds=inherits,
-    )
 
 
 def _save(path: Path, values: F64) -> None:
@@ -227,7 +197,7 @@ def _save(path: Path, values: F64) -> None:
     try:
         np.save(path, values)
     except OSError as error:  # numpy's own has no errno: "8000 requested and 512 written"
-        hint = "less recording.ring_s, or a shorter waveform, needs less of it"
+        hint = "reduce recording.ring_s or the length of the waveform"
         raise RunError(f"{path}: no memory: {error.strerror or error}; {hint}") from None
 
 

@@ -1,6 +1,6 @@
-"""The loop process: prepare everything, run the loop, and leave the outcome in the ring's page.
+"""The loop process: prepares everything, runs the loop, and writes the outcome to the shared page.
 
-Started by the supervisor as ``python -m hilctl.run.loop_process JOB``. It prints nothing and writes
+The supervisor starts it as ``python -m hilctl.run.loop_process JOB``. It prints nothing and writes
 no file.
 """
 
@@ -19,20 +19,20 @@ from hilctl.base.files import TextFiles
 from hilctl.experiment.conditioning import conditioning_of
 from hilctl.experiment.load import LoadedExperiment, resolve
 from hilctl.loop.adaptation import DisplacementOperator
-from hilctl.loop.host import LinearBypass, Tuning
 from hilctl.loop.loop import Loop
 from hilctl.loop.pacer import SystemClock
-from hilctl.loop.plan import LoopOutcome, LoopPlan
-from hilctl.loop.safe_output import SafeGoal, describe, drive_to_safe
-from hilctl.machine.process_usage import ProcessUsage
+from hilctl.loop.plan import LoopPlan
+from hilctl.loop.safe_output import LoopOutcome, SafeGoal, describe, drive_to_safe
+from hilctl.loop.tuning import LinearBypass, Tuning
+from hilctl.machine.procfs import ProcessUsage
 from hilctl.machine.rt_setup import be_ordinary, prepare, refusals, require, step_facts
 from hilctl.run.assemble import assemble, starting_output
 from hilctl.run.job import Job
-from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import keep_removed
-from hilctl.run.shared_page import PageField, PageSlot, Phase, SharedPage, Stop
+from hilctl.run.shared.ring import SampleRing
+from hilctl.run.shared.shared_page import PageField, PageSlot, Phase, SharedPage, Stop
 
-# Plain numbers: looking up an enumeration's member takes longer than writing it.
+# Plain integers: access to an enumeration's member takes longer than the write.
 _HEARTBEAT_NS, _NEXT_SAMPLE = int(PageField.LOOP_HEARTBEAT_NS), int(PageField.NEXT_SAMPLE)
 _LATE_TICKS, _STOP = int(PageField.LATE_TICKS), int(PageField.STOP)
 _SUPERVISOR_HEARTBEAT_NS = int(PageField.SUPERVISOR_HEARTBEAT_NS)
@@ -41,13 +41,13 @@ _TUNE_BEGINS_AT = int(PageField.TUNE_BEGINS_AT)
 
 
 class RingHost:
-    """See :class:`hilctl.loop.host.Host`.
+    """See :class:`hilctl.loop.plan.Host`.
 
     Args:
         ring: Shared with the supervisor.
         clock: Time.
         supervisor: The supervisor's process number.
-        silence_s: Longest that it may be silent.
+        silence_s: Longest silence of the supervisor.
     """
 
     def __init__(self, ring: SampleRing, clock: Clock, supervisor: int, silence_s: float) -> None:
@@ -62,7 +62,7 @@ class RingHost:
         self._silence_ns = silence_s * 1e9
 
     def heartbeat(self, next_sample: int, late_ticks: int) -> str:
-        """Write the loop's heartbeat; return why the run should end, or an empty text."""
+        """Write the heartbeat; return the reason to stop, or an empty text."""
         numbers = self._numbers
         now_ns = self.clock.now_ns()
         numbers[_HEARTBEAT_NS] = now_ns
@@ -77,12 +77,12 @@ class RingHost:
         return ""
 
     def closing(self) -> None:
-        """Say that the loop is over, and that the device may take its time."""
+        """Write the phase after the loop, in which the device may take its timeouts."""
         self._numbers[_HEARTBEAT_NS] = self.clock.now_ns()
         self._page.publish(PageField.PHASE, Phase.CLOSING)
 
     def tuning(self) -> Tuning | None:
-        """Return a change of the reference that is wanted, new, and due to begin."""
+        """Return a new requested change that is due, or None."""
         numbers, page = self._numbers, self._page
         if numbers[_TUNE_WANTED] == numbers[_TUNE_TAKEN]:
             return None
@@ -99,12 +99,12 @@ class RingHost:
                 *map(page.get_float, (PageField.TUNE_LINE_SLOPE, PageField.TUNE_LINE_AT_ZERO))
             ),
         )
-        # Taken only once it has been read: the supervisor may write the next one from here on.
+        # After reading it: from now on the supervisor may write the next one.
         page.publish(PageField.TUNE_TAKEN, wanted)
         return tuning
 
     def supervised(self) -> bool:
-        """Return whether the supervisor is still there."""
+        """Return whether the supervisor is alive."""
         return os.getppid() == self._supervisor
 
 
@@ -114,7 +114,7 @@ def loaded_of(job: Job) -> LoadedExperiment:
 
 
 def plan_of(job: Job, loaded: LoadedExperiment) -> LoopPlan:
-    """Return what the loop of a job does."""
+    """Return the plan of a job."""
     reference, input_um = job.arrays()
     return assemble(
         loaded,
@@ -131,14 +131,14 @@ def run_job(job: Job, ring: SampleRing) -> LoopOutcome:
     """Run a job, from set-up to the closed device.
 
     Raises:
-        HilctlError: It could not start, or broke; the output was put at its safe value.
+        HilctlError: It failed; the output was set to its safe value if anything had moved.
     """
     loaded = loaded_of(job)
     config, device, page = loaded.config, loaded.device, ring.page
     host = RingHost(ring, SystemClock(), job.supervisor, job.silence_s)
     loop = Loop(plan_of(job, loaded), device, host)
-    # After the warm-up, so that all it has mapped gets locked; before the device is opened, so that
-    # a refusal moves nothing.
+    # After the warm-up, so that all its memory is locked; before the device is opened, so that a
+    # refusal moves nothing.
     steps = prepare(config.realtime)
     if config.realtime.require:
         require(steps)
@@ -152,25 +152,25 @@ def run_job(job: Job, ring: SampleRing) -> LoopOutcome:
         )
         page.put(PageField.WAVEFORM_AT, waveform_at)
         page.write_text(PageSlot.SET_UP, json.dumps([step_facts(steps), refusals(steps)]))
-        # After the text, which the supervisor reads then.
+        # After the text, which the phase announces.
         page.publish(PageField.PHASE, Phase.READY)
         start_ns = _await_go(page, host)
     except BaseException:
-        device.close()  # and no safe value: nothing has moved, and the output is not to step there
+        device.close()  # without a safe value: nothing has moved, and the output must not jump
         raise
     try:
         page.publish(PageField.PHASE, Phase.RUNNING)
         before = ProcessUsage.now()
         outcome = loop.run(start_ns)
         page.leave_usage(ProcessUsage.now().since(before))
-        # Before the device is closed: that may take its time-outs, and is no hang.
+        # Before the device is closed, which may take its timeouts and is no hang.
         host.closing()
     except BaseException as error:
         pending = bool(page.get(PageField.EXCHANGING)) and not device.info.simulated
         goal = SafeGoal(job.safe_value, job.ramp_per_s, ring.last_command(), pending)
         found = drive_to_safe(device, goal, on_write=page.note_safe_write)
         if found.state != "confirmed":
-            # The cause first: a device that can't be reached is often only what follows from it.
+            # The cause first: an unreachable device is often its consequence.
             cause = str(error) if isinstance(error, HilctlError) else f"the loop broke: {error!r}"
             raise RunError(f"{cause}; {describe(found.state, found.error)}") from error
         raise
@@ -181,7 +181,7 @@ def run_job(job: Job, ring: SampleRing) -> LoopOutcome:
 
 
 def _await_go(page: SharedPage, host: RingHost) -> int:
-    """Return when the first tick is due.
+    """Wait for the start signal; return the time of the first tick.
 
     Raises:
         RunError: The supervisor has died; nothing has moved.
@@ -196,17 +196,17 @@ def _await_go(page: SharedPage, host: RingHost) -> int:
 def main(words: list[str]) -> int:
     """Run one job; the exit code is 0 if the loop ended by its safe ramp."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.SIG_IGN)  # the supervisor decides, and the loop ramps down
+        signal.signal(number, signal.SIG_IGN)  # the supervisor stops the loop
     be_ordinary()
     job = Job.read(Path(words[0]))
     ring = SampleRing(Path(job.ring), at_once=True)
     try:
         ring.page.leave_outcome(run_job(job, ring))
-    except InputError as error:  # before anything has moved
+    except InputError as error:  # nothing has moved
         return _failed(ring.page, str(error), Phase.REFUSED)
     except HilctlError as error:
         return _failed(ring.page, str(error))
-    except Exception as error:  # noqa: BLE001  the supervisor sets the rig to its safe value
+    except Exception as error:  # noqa: BLE001  the supervisor sets the safe value
         return _failed(ring.page, f"the loop broke: {type(error).__name__}: {error}")
     finally:
         if os.getppid() != job.supervisor:

@@ -1,7 +1,4 @@
-"""The descriptions of a run: facts for its recording, figures of its end, and what watchers read.
-
-Commands that only recover a dead run, and watchers, import this module: it must not import numba.
-"""
+"""Metadata of a run: for its recording, metrics of its end, and its description for watchers."""
 
 import hashlib
 import json
@@ -25,9 +22,9 @@ from hilctl.base.segments import Segment
 from hilctl.base.strict import StrictModel
 from hilctl.base.yaml import dump
 from hilctl.loop.pacer import Lateness
-from hilctl.loop.plan import LoopOutcome
+from hilctl.loop.safe_output import LoopOutcome
 from hilctl.machine.diagnosis import machine_facts
-from hilctl.machine.process_usage import ProcessUsage
+from hilctl.machine.procfs import ProcessUsage
 from hilctl.recording.metadata_keys import (
     END_FIGURES,
     HEAT_FACT,
@@ -57,13 +54,13 @@ _LEFT_OUT = NO_WAVEFORM | Flag.SENSOR_INVALID
 def run_facts(
     checked: "CheckedExperiment", started: str, model_yaml: str, correction_yaml: str = ""
 ) -> dict[str, str]:
-    """Return identity, versions, device and units, as text; the layout says the rates.
+    """Return identity, versions, device and units as text; rates are in the layout.
 
     Args:
-        checked: The experiment that runs.
-        started: Scheduled time of sample 0, ISO 8601.
+        checked: The experiment.
+        started: Time of sample 0, ISO 8601.
         model_yaml: The compensator's model, or empty.
-        correction_yaml: What has been learned and is added to the reference, or empty.
+        correction_yaml: The learned correction, or empty.
     """
     loaded = checked.loaded
     config, info = loaded.config, loaded.device.info
@@ -107,33 +104,30 @@ def run_facts(
 
 
 def _scalars(waveform: "AnyWaveform") -> Iterator[tuple[str, str]]:
-    """Yield the keys of a waveform that hold one text or number, and those as text."""
+    """Yield the keys of a waveform with a single text or number, and the values as text."""
     for key, value in waveform:
         if isinstance(value, str | int | float):
             yield key, str(value)
 
 
 def experiment_sha256(loaded: "LoadedExperiment") -> str:
-    """Return the SHA-256 of an experiment as it runs, by which a run of it is known as done.
-
-    Without its labels: who stands beside the rig does not change what it does.
-    """
+    """Return the SHA-256 of an experiment without its labels; it identifies completed runs."""
     data = {key: value for key, value in loaded.document.data.items() if key != LABELS_FACT}
     return sha256_of(dump(data))
 
 
 def sha256_of(text: str) -> str:
-    """Return the SHA-256 of a text that a run is made of; empty where it has none."""
+    """Return the SHA-256 of a text; empty for an empty text."""
     return hashlib.sha256(text.encode()).hexdigest() if text else ""
 
 
 def end_facts(outcome: LoopOutcome, counters: Lateness, lost_events: int = 0) -> dict[str, str]:
-    """Return the loop's own account of a run's end and the exact counters, as text.
+    """Return the outcome of a run and its counters as text.
 
     Args:
-        outcome: How the run ended.
-        counters: Its late ticks.
-        lost_events: Events that found no room on their way to the recorder.
+        outcome: The outcome.
+        counters: Counters of late ticks.
+        lost_events: Events without a free slot.
     """
     return {
         "code": outcome.code,
@@ -151,23 +145,23 @@ def end_facts(outcome: LoopOutcome, counters: Lateness, lost_events: int = 0) ->
 
 
 def usage_facts(loop: ProcessUsage | None, supervisor: ProcessUsage) -> dict[str, str]:
-    """Return what a run took of the machine, as text.
+    """Return the resource usage of a run as text.
 
     Args:
-        loop: In the loop's process, from its start signal on; None where it could not say it.
-        supervisor: In the supervisor's.
+        loop: Usage of the loop process since the start signal, or None.
+        supervisor: Usage of the supervisor.
     """
     known = {"loop": loop, "supervisor": supervisor}
     return {USAGE_FACT: json.dumps({name: asdict(each) for name, each in known.items() if each})}
 
 
 class SettingRow(StrictModel):
-    """One key of the experiment as it runs.
+    """A key of the experiment.
 
     Attributes:
-        key: Dotted.
-        value: As text.
-        settable: Whether ``--set`` can give another one; else it is changed in the file.
+        key: Dotted key.
+        value: Value as text.
+        settable: Whether ``--set`` can change it.
     """
 
     key: str
@@ -176,18 +170,18 @@ class SettingRow(StrictModel):
 
 
 class LimitBounds(StrictModel):
-    """What limiter and interlocks hold the run to; None where there is none.
+    """Limits of limiter and interlocks; None: no limit.
 
     Attributes:
         command: Lowest and highest command, in its unit.
-        slew_per_s: Fastest change of the command.
+        slew_per_s: Slew rate of the command.
         stroke_um: Lowest and highest displacement.
-        rms_current_a: Largest running rms of the coil current.
+        rms_current_a: Running rms of the coil current.
         thermal_time_constant_s: Its time constant.
         heat_a2: Heat of the coil before the run, in A^2.
-        tracking_error_um: Largest distance of displacement and reference.
-        measured_deviation: Largest distance of command and measured command.
-        late_s: A tick later than this ends the run.
+        tracking_error_um: Difference of displacement and reference.
+        measured_deviation: Difference of command and measured command.
+        late_s: Lateness of a tick.
     """
 
     command: list[float]
@@ -202,24 +196,24 @@ class LimitBounds(StrictModel):
 
 
 class RunDescription(StrictModel):
-    """One run.
+    """Description of a run for watchers.
 
     Attributes:
-        name: Of the experiment.
+        name: Name of the experiment.
         text: The experiment's description.
-        device: What its device is.
-        simulated: Whether that is a simulation.
-        sample_rate_hz: Samples a second.
-        block: Samples in a tick.
+        device: Description of the device.
+        simulated: Whether the device is simulated.
+        sample_rate_hz: Samples per second.
+        block: Samples per tick.
         command_unit: ``A`` or ``V``.
         measures_command: Whether the device measures its command.
         waveform_unit: Unit of the reference.
-        compensator: Kind of its model; empty without one.
+        compensator: Kind of the model; empty without one.
         samples: Samples of the waveform.
-        segments: Its stretches as :meth:`hilctl.base.segments.Segment.to_mapping`, counted from
-            the waveform's first sample.
-        limits: What it is held to.
-        settings: Every key of its experiment.
+        segments: Segments as :meth:`hilctl.base.segments.Segment.to_mapping`, relative to the
+            waveform's first sample.
+        limits: Limits of the run.
+        settings: All keys of the experiment.
     """
 
     name: str
@@ -239,7 +233,7 @@ class RunDescription(StrictModel):
 
     @classmethod
     def of(cls, checked: "CheckedExperiment") -> Self:
-        """Return what a checked experiment says of itself."""
+        """Return the description of a checked experiment."""
         loaded, reference = checked.loaded, checked.reference
         config, info = loaded.config, loaded.device.info
         return cls(
@@ -260,18 +254,14 @@ class RunDescription(StrictModel):
         )
 
     def segments_at(self, waveform_at: int) -> list[Segment]:
-        """Return the stretches, counted from the run's first sample.
-
-        Args:
-            waveform_at: Index of the waveform's first sample.
-        """
+        """Return the segments of a run whose waveform begins at sample ``waveform_at``."""
         return [Segment.from_mapping(each).shifted(waveform_at) for each in self.segments]
 
     def write(self, path: Path) -> None:
-        """Leave it for those who look on.
+        """Write the description as JSON.
 
         Raises:
-            RunError: There is no room for it.
+            RunError: There is no memory for it.
         """
         try:
             path.write_text(self.model_dump_json(), encoding="utf-8")
@@ -280,11 +270,11 @@ class RunDescription(StrictModel):
 
     @classmethod
     def read(cls, path: Path) -> Self:
-        """Return what a run has left.
+        """Return the description that :meth:`write` wrote.
 
         Raises:
-            OSError: There is none.
-            ValueError: It is damaged, or another version's.
+            OSError: The file cannot be read.
+            ValueError: It is damaged, or of another version.
         """
         return cls.model_validate_json(path.read_bytes())
 
@@ -306,7 +296,7 @@ def _limits(checked: "CheckedExperiment") -> LimitBounds:
 
 
 def setting_rows(value: Any, key: str = "") -> list[SettingRow]:
-    """Return the keys of an experiment's data, in order; a sequence is one value of its own."""
+    """Return the keys of an experiment in order; a sequence counts as one value."""
     if isinstance(value, dict):
         inner = (setting_rows(each, f"{key}.{name}".strip(".")) for name, each in value.items())
         return [row for rows in inner for row in rows]
@@ -320,11 +310,11 @@ def _is_sequence(value: Any) -> bool:
 
 
 class EndFigures:
-    """Gathers the figures of a run.
+    """Collect the metrics of a run.
 
     Args:
-        segments: Its stretches, in order.
-        compensated: Whether a compensator stands between reference and command.
+        segments: Its segments in order.
+        compensated: Whether the run has a compensator.
     """
 
     def __init__(self, segments: Sequence[Segment], *, compensated: bool) -> None:
@@ -335,7 +325,7 @@ class EndFigures:
         self._current: _SegmentFigures | None = None
 
     def add(self, samples: Samples) -> None:
-        """Take the next samples of the run."""
+        """Add the next samples of the run."""
         index = samples.index[(samples.flags & NO_WAVEFORM) == 0]
         while self._segments and index.size and self._segments[0].steady_start <= index[-1]:
             segment = self._segments[0]
@@ -349,18 +339,18 @@ class EndFigures:
             del self._segments[0]
 
     def event(self, event: Event) -> None:
-        """Take an event of the run."""
+        """Add an event of the run."""
         if event.code in CHANGES:
             self._changes.append(event)
 
     def facts(self) -> dict[str, str]:
-        """Return the largest of each figure that any segment has, as text."""
+        """Return the maximum of each metric over all segments, as text."""
         judged = [figures for segment, figures in self._done if not self._tuned(segment)]
         known = {name: [each[name] for each in judged if name in each] for name in END_FIGURES}
         return {name: repr(max(values)) for name, values in known.items() if values}
 
     def _tuned(self, segment: Segment) -> bool:
-        """Return whether a change of the reference reaches the steady part of a segment."""
+        """Return whether a change of the reference affects the steady part of a segment."""
         changes = [each for each in self._changes if each.sample < segment.steady_stop]
         return bool(changes) and (
             changes[-1].sample + changes[-1].values["samples"] > segment.steady_start
@@ -368,7 +358,7 @@ class EndFigures:
 
 
 class _SegmentFigures:
-    """Figures of one segment, as its samples come."""
+    """Metrics of one segment."""
 
     def __init__(self, segment: Segment, *, compensated: bool) -> None:
         self._segment, self._compensated = segment, compensated
@@ -378,9 +368,9 @@ class _SegmentFigures:
         self._peak_um = self._squares_um2 = 0.0
         self._samples = 0
 
-    @np.errstate(over="ignore", invalid="ignore")  # of readings near the end of all numbers
+    @np.errstate(over="ignore", invalid="ignore")  # of extreme readings
     def add(self, samples: Samples) -> None:
-        """Take those of some samples that are of its steady part."""
+        """Add samples; only those in the steady part count."""
         part = samples.part(self._start, self._stop)
         part = part.rows((part.flags & _LEFT_OUT) == 0)
         loop_input = part.reference_um if self._compensated else part.command
@@ -399,7 +389,7 @@ class _SegmentFigures:
 
     @np.errstate(over="ignore", invalid="ignore")
     def figures(self) -> dict[str, float]:
-        """Return those that it has, by name."""
+        """Return the metrics by name."""
         found: dict[str, float | None] = {}
         if self._folding:
             cycle = self._folding.fold()

@@ -1,8 +1,7 @@
-"""A run in a process of its own, started by a program that has threads.
+"""A run in a separate process, for programs with threads, such as notebooks.
 
-The supervisor forks, and a fork of such a program may wait for ever for a lock that one of the
-threads held. It also handles signals, which only a main thread may. Here it has a process without
-threads, whose main thread is its own; progress and result come back through a pipe.
+The supervisor handles signals, which only a main thread may do, and starts processes, whose
+priority other threads must not affect. Progress and result come back through a pipe.
 """
 
 import logging
@@ -19,7 +18,7 @@ from types import FrameType
 from typing import Any, BinaryIO
 
 from hilctl.base.errors import HilctlError, RunError
-from hilctl.run.protocol import HANG_UP
+from hilctl.run.control.client import HANG_UP
 from hilctl.run.result import Progress, RunResult
 
 _log = logging.getLogger(__name__)
@@ -28,7 +27,7 @@ Given = tuple[Path, Sequence[str], Path | None, bool, float]
 """Experiment file, settings, recording, whether it may be replaced, and heat of the coil."""
 
 _START = (
-    # Until the supervisor handles it: nothing has moved, and there is nothing to say.
+    # Until the supervisor handles signals: nothing has moved.
     "import signal, sys; signal.signal(signal.SIGINT, signal.SIG_DFL)\n"
     "from hilctl.run.own_process import main; main(int(sys.argv[1]))"
 )
@@ -42,16 +41,14 @@ def has_threads() -> bool:
 
 
 def run_in_own_process(given: Given, on_progress: Callable[[Progress], None]) -> RunResult:
-    """Run an experiment in a process of its own; return the result.
-
-    The run stops if this process ends.
+    """Run an experiment in a separate process; return the result. The run stops with this process.
 
     Args:
         given: See :data:`Given`.
         on_progress: Called with each batch of samples.
 
     Raises:
-        HilctlError: What the run raises.
+        HilctlError: Error of the run.
         RunError: Its process ended without a result.
         KeyboardInterrupt: It was interrupted before anything moved.
     """
@@ -59,17 +56,17 @@ def run_in_own_process(given: Given, on_progress: Callable[[Progress], None]) ->
     with os.fdopen(read_end, "rb") as answers:
         try:
             process = subprocess.Popen(
-                # -P: what lies in the working folder is not to be imported.
+                # -P: import nothing from the working folder.
                 [sys.executable, "-P", "-c", _START, str(write_end)],
                 stdin=subprocess.PIPE,
                 pass_fds=(write_end,),
-                start_new_session=True,  # a Ctrl-C in the terminal is passed on, once
+                start_new_session=True,  # Ctrl-C is forwarded once
             )
         finally:
             os.close(write_end)
         with process, _forwarded(process):
             assert process.stdin is not None
-            with suppress(BrokenPipeError), process.stdin:  # it has ended already
+            with suppress(BrokenPipeError), process.stdin:  # it has ended
                 pickle.dump(given, process.stdin)
             answer = _answer(answers, on_progress)
     if isinstance(answer, HilctlError):
@@ -79,7 +76,7 @@ def run_in_own_process(given: Given, on_progress: Callable[[Progress], None]) ->
     if answer is None:
         raise RunError(
             f"the process of the run ended with code {process.returncode} and without a result: "
-            "look at the output, and at the recording with hilctl list"
+            "check the output, and the recording with hilctl list"
         )
     return answer
 
@@ -87,7 +84,7 @@ def run_in_own_process(given: Given, on_progress: Callable[[Progress], None]) ->
 def _answer(
     answers: BinaryIO, on_progress: Callable[[Progress], None]
 ) -> RunResult | HilctlError | None:
-    """Pass progress on until the result comes; return it, or None where none comes."""
+    """Pass progress on until the result arrives; return it, or None without one."""
     while True:
         try:
             answer: Progress | RunResult | HilctlError = pickle.load(answers)  # noqa: S301  our own
@@ -97,8 +94,8 @@ def _answer(
             return answer
         try:
             on_progress(answer)
-        except Exception:  # noqa: BLE001  whoever shows a run must not end it
-            _log.exception("progress is not shown any more")
+        except Exception:  # noqa: BLE001  an error of the display must not end the run
+            _log.exception("progress is no longer reported")
             on_progress = _ignore
 
 
@@ -108,7 +105,7 @@ def _ignore(_progress: Progress) -> None:
 
 @contextmanager
 def _forwarded(process: "subprocess.Popen[bytes]") -> Iterator[None]:
-    """Pass signals that stop a run on to its process, where this thread may handle them."""
+    """Forward stop signals to the process if this is the main thread."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -121,13 +118,13 @@ def _forwarded(process: "subprocess.Popen[bytes]") -> Iterator[None]:
         yield
     finally:
         for number, handler in before.items():
-            if handler is not None:  # one that is not Python's can't be set again
+            if handler is not None:  # None: not set by Python
                 signal.signal(number, handler)
 
 
 def main(descriptor: int) -> None:
-    """Run what standard input gives; write progress and result to a descriptor."""
-    given: Given = pickle.load(sys.stdin.buffer)  # noqa: S301  from who started this
+    """Run the job from standard input; write progress and result to a descriptor."""
+    given: Given = pickle.load(sys.stdin.buffer)  # noqa: S301  from the parent process
     from hilctl.run.start import start_run
 
     lock = threading.Lock()
@@ -141,7 +138,7 @@ def main(descriptor: int) -> None:
         def show(progress: Progress) -> None:
             try:
                 send(progress)
-            except OSError:  # the program that wanted the run is gone
+            except OSError:  # the parent process has ended
                 os.kill(os.getpid(), signal.SIGTERM)
 
         file, settings, output, overwrite, heat_a2 = given

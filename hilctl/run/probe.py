@@ -1,4 +1,4 @@
-"""Whether an experiment's device answers, and whether what it says can be true; nothing moves."""
+"""Probe: read an experiment's device and check its values for plausibility; nothing moves."""
 
 import math
 from dataclasses import asdict, dataclass
@@ -10,26 +10,26 @@ from hilctl.experiment.load import LoadedExperiment, load_experiment
 from hilctl.run.run_folder import held_devices
 
 _ABSURD = 100.0
-"""So many times beyond its range a value is no signal: its bytes were put together wrongly."""
+"""A value this many ranges outside is not a signal: its bytes are decoded wrongly."""
 _TINY = 1e-18
-"""So close to 0, as a share of the range, is no rounding and no signal: likewise."""
+"""A value this close to 0, relative to the range, is decoded wrongly as well."""
 
 
 @dataclass(frozen=True, slots=True)
 class Probed:
-    """What a device says.
+    """Values read from a device.
 
     Attributes:
         name: Its registry name.
-        description: What it is.
-        max_rate_hz: Highest sample rate it can keep.
-        rate_note: Why that is so.
-        safe_note: How late the safe value may get there, where that is worth a word.
-        details: What it says of itself.
-        displacement_um: What its sensor reads; None where that can't be had without a run.
-        output: What it puts out, in ``command_unit``; None where nobody can know.
-        command_unit: Unit of its output.
-        faults: What can't be true of these, and what it may come from.
+        description: Its description.
+        max_rate_hz: Highest sample rate.
+        rate_note: Reason for that rate.
+        safe_note: Delay of the safe value; may be empty.
+        details: Properties of the device.
+        displacement_um: Reading of the sensor; None if it is not available without a run.
+        output: Output in ``command_unit``; None if unknown.
+        command_unit: Unit of the output.
+        faults: Implausible values, each with a possible cause.
     """
 
     name: str
@@ -49,14 +49,14 @@ class Probed:
 
 
 def probe(path: Path, settings: list[str]) -> Probed:
-    """Read an experiment's device while nobody else uses it.
+    """Read an experiment's device under its lock.
 
-    A device is only read, where it can be: no step of its profile is sent, and a watchdog that has
-    tripped stays so. Others, and simulated ones, are opened and closed.
+    A device that supports it is only read: no set-up steps are sent, and a tripped watchdog stays
+    tripped. Others, and simulated ones, are opened and closed.
 
     Raises:
-        InputError: The experiment can't be used, or a run holds the device.
-        DeviceError: The device can't be reached, or is not what it should be.
+        InputError: The experiment is not valid, or a run holds the device.
+        DeviceError: The device cannot be reached, or is another one.
     """
     loaded = load_experiment(path, settings)
     info = loaded.device.info
@@ -87,12 +87,12 @@ def _read(loaded: LoadedExperiment, device: Device) -> tuple[float | None, float
 
 
 def judge(info: DeviceInfo, displacement_um: float | None, output: float | None) -> tuple[str, ...]:
-    """Return what can't be true of a reading and an output, in sentences; nothing if all can.
+    """Return descriptions of implausible values.
 
     Args:
-        info: What the device can read and put out.
-        displacement_um: What it reads, um.
-        output: What it puts out, in the command's unit.
+        info: Properties of the device.
+        displacement_um: Reading of the sensor, um.
+        output: Output in the command's unit.
     """
     found = []
     if displacement_um is not None:
@@ -107,17 +107,17 @@ def judge(info: DeviceInfo, displacement_um: float | None, output: float | None)
 def _fault(what: str, value: float, span: tuple[float, float], unit: str, whose: str) -> str:
     low, high = span
     size = high - low
-    slack = 1e-3 * size  # an end of the range, by a converter's last steps
+    slack = 1e-3 * size  # resolution of a converter
     tiny = 0.0 < abs(value) < _TINY * size
     if low - slack <= value <= high + slack and not tiny:
         return ""
     absurd = tiny or not math.isfinite(value) or max(low - value, value - high) > _ABSURD * size
     cause = (
-        "its bytes are put together wrongly: compare order (ABCD, CDAB, ...), type and address in "
+        "its bytes are decoded wrongly: compare order (ABCD, CDAB, ...), type and address in "
         "the profile with the device's manual"
         if absurd
         else "compare scale, offset and range in the profile, and gain and sensitivity in the "
-        "experiment, with what is wired"
+        "experiment, with the wiring"
     )
     rule = f"{what} must be {low:g} to {high:g} {unit}, which is what {whose}"
     if tiny:

@@ -1,7 +1,7 @@
-"""The recording side of a run: claim the file, write batches, retry refused writes.
+"""The recorder: from the ring into the recording, with retries of refused writes.
 
-A thread takes samples out of the ring. They stay there until the file has them, so a disk that
-stalls or refuses a write loses nothing while the ring has room, and delays no other thread.
+A thread consumes the ring. Samples stay there until the file contains them, so a disk that stalls
+or refuses writes loses nothing while the ring has room, and delays no other thread.
 """
 
 import errno
@@ -26,15 +26,15 @@ from hilctl.experiment.coil_heat import CoilHeat
 from hilctl.experiment.correction import dump_correction
 from hilctl.experiment.device_state import CoilState, DeviceState, write_device_state
 from hilctl.experiment.preflight import CheckedExperiment
-from hilctl.loop.plan import LoopOutcome
-from hilctl.machine.process_usage import ProcessUsage
+from hilctl.loop.safe_output import LoopOutcome
+from hilctl.machine.procfs import ProcessUsage
 from hilctl.models.model_file import dump_model
 from hilctl.recording.encoder import RecordingLayout
 from hilctl.recording.metadata_keys import HEAT_FACT
 from hilctl.recording.writer import OutputFile, RecordingWriter, RunFacts
 from hilctl.run.metadata import EndFigures, end_facts, run_facts, usage_facts
-from hilctl.run.ring import SampleRing
-from hilctl.run.shared_page import PageField
+from hilctl.run.shared.ring import SampleRing
+from hilctl.run.shared.shared_page import PageField
 
 _SAMPLES_BEFORE = 50
 _SPARE = 20
@@ -43,13 +43,13 @@ _RETRY_S = 0.05
 _POLL_S = 0.05
 _MOST_WAITING = 64
 _KEPT = 8
-"""One part in so many of the ring stays for watchers."""
+"""1/8 of the ring stays readable for watchers."""
 
 
 class Recorder:
-    """Records one run into one file.
+    """Record one run into one file.
 
-    Nothing is lost by a write that fails: it stays in memory, and the next flush tries again.
+    A failed write stays in memory and is repeated by the next flush.
 
     Args:
         checked: The experiment.
@@ -57,13 +57,13 @@ class Recorder:
         overwrite: Whether an existing file may be replaced.
 
     Raises:
-        InputError: The file exists or can't be written.
+        InputError: The file exists or cannot be written.
     """
 
     def __init__(self, checked: CheckedExperiment, path: Path, *, overwrite: bool) -> None:
         self.path = path
         self.adapted: Mapping[str, float] = {}
-        """Values of the newest event of adaptation."""
+        """Values of the last event of adaptation."""
         self._failed = self._problem = ""
         self._next_sample = 0
         self._flushed = 0
@@ -86,44 +86,44 @@ class Recorder:
         return InputError(f"{self.path}: can't be written: {reason(error)}")
 
     def begin(self, start_unix_ns: int, set_up: Mapping[str, str], waveform_at: int = 0) -> None:
-        """Write what is known before the first sample.
+        """Write the metadata that precedes the first sample.
 
         Args:
-            start_unix_ns: When it is due.
-            set_up: How the loop's process was set up, see
+            start_unix_ns: Unix time of the first sample.
+            set_up: Real-time set-up of the loop process, see
                 :func:`hilctl.machine.rt_setup.step_facts`.
-            waveform_at: Index of the first sample of the waveform; a ramp comes before it.
+            waveform_at: Index of the first sample of the waveform, after the lead-in.
 
         Raises:
-            InputError: The file can't be written.
+            InputError: The file cannot be written.
         """
         self._unix_ns = steady_unix_ns()
         try:
-            # Before the file is opened for writing: that empties one which stood there.
+            # Before the file is opened for writing, which truncates an existing one.
             self._run = self._facts(start_unix_ns, set_up, waveform_at)
             self._writer = RecordingWriter(self._file.begin(), self._run)
         except OSError as error:
             raise self._unwritable(error) from None
         compensated = self._checked.loaded.model is not None
         self._figures = EndFigures(self._run.segments, compensated=compensated)
-        # Before anything moves: the file may have been deleted since it was claimed.
+        # Before anything moves: the file may have been deleted.
         if not self.flush():
             raise InputError(self.error)
 
-    def give_back(self) -> None:
-        """Leave no file behind where there was none: the run does not start."""
+    def discard(self) -> None:
+        """Remove the file if the run does not start; an existing one stays as it was."""
         self._file.give_back()
 
     def note_device(self, coil: CoilState | None = None) -> None:
-        """Note that this run is the last one of its device.
+        """Write the device state: this run is the device's last one.
 
         Args:
-            coil: How it left the coil; None while it is running.
+            coil: Final state of the coil; None during the run.
         """
         assert self._run is not None
         facts, info = self._run.facts, self._checked.loaded.device.info
         path = self.path
-        with suppress(OSError):  # the working folder is gone
+        with suppress(OSError):  # the working folder was removed
             path = path.absolute()
         if info.holds:
             state = DeviceState(
@@ -141,13 +141,13 @@ class Recorder:
         self._tail.add(batch)
         self._heat.follow(batch.samples())
         if self._begun.samples == 0:
-            # The file says itself what is missing before its first sample.
+            # The file counts samples that are missing before its first one.
             batch.heads[0, BlockHeader.DROPPED_BEFORE] = batch.heads[0, BlockHeader.FIRST_SAMPLE]
         self._write(partial(self._begun.batch, batch))
         self._gathered.add(batch.samples())
 
     def event(self, event: Event) -> None:
-        """Write an event of the loop, with the samples that led to it."""
+        """Write an event with the samples before it."""
         if event.code == ADAPTED:
             self.adapted = event.values
         self._gathered.event(event)
@@ -156,34 +156,34 @@ class Recorder:
 
     @property
     def error(self) -> str:
-        """Why the file cannot be written at present; empty if it can."""
+        """Why the file cannot be written now; may be empty."""
         refused = self._file.stream.problem
         return self._failed or self._problem or (self._cannot(refused) if refused else "")
 
     def fail(self, why: str) -> None:
-        """End the recording for good; the file stays as the last flush left it."""
+        """End the recording; the file stays as of the last flush."""
         self._failed = self._failed or self._cannot(why)
 
     def _cannot(self, why: str | None) -> str:
         return f"{self.path}: can't be written: {why}"
 
     def flush(self) -> bool:
-        """Hand all that was written to the kernel.
+        """Pass all pending data to the kernel.
 
         Returns:
-            Whether all of it is in the file. Otherwise it is kept for the next flush.
+            Whether the file contains all of it; otherwise the next flush repeats it.
         """
         if self._failed:
             return False
         try:
             self._begun.flush()
-            # Should a later write fail, no more than this is sure to be there.
+            # If a later write fails, only these are certain.
             self._flushed = self._begun.samples
         except OSError as error:
             self._note_problem(error)
             return False
         if self._problem:
-            text = f"written again, nothing is lost: {self._problem}"
+            text = f"write repeated, nothing is lost: {self._problem}"
             sample = max(0, self._next_sample - 1)
             event = Event(sample, "warning", "recording_retried", text, time_ns=self._unix_ns())
             self._write(partial(self._begun.event, event))
@@ -192,22 +192,22 @@ class Recorder:
 
     def _note_problem(self, error: OSError) -> None:
         if error.errno == errno.ESTALE:
-            self._flushed = 0  # under its name nobody can read what is in it
+            self._flushed = 0  # the file is not readable by its name
         self._problem = self._problem or self._cannot(error.strerror)
 
     def finish(
         self, end: Mapping[str, str], ended_at: int, patience_s: float = _PATIENCE_S
     ) -> bool:
-        """Write how the run ended, bring the file to the disk, and close it.
+        """Write the end of the run, sync the file, and close it.
 
         Args:
-            end: Facts of the end, with ``code`` and ``reason``.
+            end: Metadata of the end, with ``code`` and ``reason``.
             ended_at: Index after the last sample.
-            patience_s: How long to retry while the disk refuses it.
+            patience_s: How long to retry.
 
         Returns:
-            Whether the recording is complete and on the disk. Otherwise the file is as the last
-            flush left it.
+            Whether the recording is complete and on the disk; otherwise the file is as of the last
+            flush.
         """
         self._next_sample = max(self._next_sample, ended_at)
         self.flush()
@@ -237,7 +237,7 @@ class Recorder:
         self.note_device(coil)
 
     def _closed(self) -> bool:
-        """Close the finished file; return whether all of it is there."""
+        """Close the finished file; return whether it is complete."""
         if self._failed:
             return False
         try:
@@ -246,14 +246,14 @@ class Recorder:
         except OSError as error:
             self._note_problem(error)
             return False
-        with suppress(OSError):  # all of it is on the disk
+        with suppress(OSError):  # already on the disk
             self._file.stream.close()
         self._problem = ""
         return True
 
     @property
     def samples(self) -> int:
-        """Samples written; while the file cannot be written, those flushed before."""
+        """Samples written; after an error, samples flushed before it."""
         return self._flushed if self.error else self._begun.samples
 
     @property
@@ -263,7 +263,7 @@ class Recorder:
 
     @property
     def missing(self) -> int:
-        """Samples known to be missing: counted in the recording, or not written to it yet."""
+        """Missing samples: counted in the recording, or not written yet."""
         return self._next_sample - self._flushed if self.error else self._begun.missing
 
     @property
@@ -306,10 +306,10 @@ class Recorder:
 
 
 class RecentSamples:
-    """Keeps at least the last samples, however they came.
+    """The last samples of a run.
 
     Args:
-        samples: How many to record with an event.
+        samples: Number of samples to record with an event.
     """
 
     def __init__(self, samples: int) -> None:
@@ -317,7 +317,7 @@ class RecentSamples:
         self._newest: Samples | None = None
 
     def add(self, batch: BlockBatch) -> None:
-        """Take the newest samples of a batch; more of them than are asked for, for late events."""
+        """Add a batch; some more samples are kept, for late events."""
         kept = _SPARE * self._samples
         blocks = -(-kept // batch.flags.shape[1])
         newest = batch.samples(slice(-blocks, None))
@@ -326,7 +326,7 @@ class RecentSamples:
         self._newest = newest.rows(slice(-kept, None))
 
     def up_to(self, sample: int) -> Samples | None:
-        """Return the last samples up to and with ``sample``; None where none is left."""
+        """Return the last samples up to and including ``sample``; None if none is left."""
         if self._newest is None:
             return None
         stop = int(np.searchsorted(self._newest.index, sample, side="right"))
@@ -334,7 +334,7 @@ class RecentSamples:
 
 
 def steady_unix_ns() -> Callable[[], int]:
-    """Return a clock of Unix time in ns that goes on from now, whatever the machine's is set to."""
+    """Return a clock of Unix time in ns that ignores later changes of the system time."""
     offset_ns = time.time_ns() - time.monotonic_ns()
     return lambda: time.monotonic_ns() + offset_ns
 
@@ -345,12 +345,12 @@ def iso_time(unix_ns: int) -> str:
 
 
 class RingRecorder:
-    """Takes samples and events out of the ring, from the start signal to the end of the recording.
+    """Thread that consumes the ring until the end of the recording; its only consumer.
 
     Args:
-        ring: Shared with the loop; nobody else takes anything out of it.
-        recorder: Begun; nobody else writes to it.
-        flush_s: Longest time that a sample stays out of the file.
+        ring: Shared with the loop.
+        recorder: Begun; no other thread writes to it.
+        flush_s: Longest time from a sample to the file.
     """
 
     def __init__(self, ring: SampleRing, recorder: Recorder, flush_s: float) -> None:
@@ -368,29 +368,28 @@ class RingRecorder:
         self._thread = threading.Thread(target=self._run, name="recorder")
 
     def start(self) -> None:
-        """Begin to record."""
+        """Start the thread."""
         self._before = ProcessUsage.now()
         self._released_s = time.monotonic()
         self._thread.start()
 
     def record_event(self, event: Event) -> None:
-        """Record an event of the supervisor; returns at once."""
+        """Queue an event of the supervisor."""
         self._events.append(event)
 
     def end(self, outcome: LoopOutcome, *, lost_loop: bool) -> None:
-        """Let it take what is left, and close the recording; returns at once.
+        """Let the thread drain the ring and close the recording.
 
         Args:
-            outcome: How the run ended; the output is safe as far as that can be had.
-            lost_loop: Whether the loop could not say so itself: then nobody knows what became of
-                the blocks that it had sent.
+            outcome: Outcome of the run.
+            lost_loop: Whether the loop left no outcome, so that sent blocks may be unanswered.
         """
         self._outcome, self._lost_loop = outcome, lost_loop
         self._ending.set()
 
     @property
     def takes_marks(self) -> bool:
-        """Whether a mark will be in the file; no crowd of them waits for a disk that stands."""
+        """Whether marks are accepted: few events are waiting, and the file is writable."""
         waiting = len(self._events) >= _MOST_WAITING
         return not (waiting or self._ending.is_set() or self.recorder.error)
 
@@ -400,7 +399,7 @@ class RingRecorder:
         return not self._thread.is_alive()
 
     def stalled_s(self) -> float:
-        """Return for how long nothing in the ring has come to be safe in the file."""
+        """Return the time since the ring was last released."""
         return time.monotonic() - self._released_s
 
     def _run(self) -> None:
@@ -410,32 +409,32 @@ class RingRecorder:
         self._guarded(self._finish)
 
     def _guarded(self, work: Callable[[], None]) -> None:
-        """Do something; whatever goes wrong is an error of the recording, and not its silence."""
+        """Call a function; its error becomes an error of the recording."""
         try:
             work()
-        except Exception as error:  # noqa: BLE001  what comes after is counted as lost
+        except Exception as error:  # noqa: BLE001  later samples are counted as missing
             self.recorder.fail(f"{type(error).__name__}: {error}")
 
     def _work(self) -> None:
         self._drain()
         if self.stalled_s() < self._flush_s:
             return
-        # Room is given back only once the file has what stood there.
+        # Released only after the file contains the samples.
         if self.recorder.flush():
             self._ring.release(keep=self._ring.slots // _KEPT)
             self._released_s = time.monotonic()
 
     def _drain(self) -> bool:
-        """Record what is there now; return whether there were samples."""
+        """Record all new samples and events; return whether there were samples."""
         page, recorder = self._ring.page, self.recorder
         took = False
-        # Before the samples: whatever an event refers to stands in the ring by the time it is seen.
+        # Before the samples: the ring then contains the samples that an event refers to.
         self._of_loop.extend(page.pop_events())
         for batch in self._ring.batches():
             self.newest = batch.rows(slice(-1, None))
             recorder.batch(batch)
             took = True
-        # After the samples: an event is recorded with those that led to it.
+        # After the samples: an event is recorded with the samples before it.
         while self._of_loop:
             recorder.event(self._of_loop.popleft())
         while self._events:
@@ -452,7 +451,7 @@ class RingRecorder:
         outcome, page, recorder = self._outcome, self._ring.page, self.recorder
         assert outcome is not None
         self._drain_all()
-        while self._ring.skip_damaged():  # no more will come: take what stands behind them
+        while self._ring.skip_damaged():
             self._drain_all()
         if self._lost_loop:
             if (batch := self._ring.unanswered(recorder.next_sample)) is not None:

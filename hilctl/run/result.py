@@ -1,4 +1,4 @@
-"""Where a run stands, and how it ended, for those who show it."""
+"""Progress and result of a run."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -11,20 +11,20 @@ from hilctl.loop.safe_output import OutputState
 
 @dataclass(frozen=True, slots=True)
 class RunResult:
-    """How a run ended.
+    """Result of a run.
 
     Attributes:
         path: The recording.
         code: ``completed``, ``stopped`` or ``fault``.
-        reason: One line for people.
-        output_state: What is known of the output.
-        stop_signal: Number of the signal that stopped it, SIGTERM for a requested stop, or 0.
-        samples: Samples recorded.
-        missing: Samples counted as dropped, skipped or lost.
-        late_ticks: Ticks that woke late.
-        deadline_misses: How many were skipped of all, for people; empty where none was.
-        adapted: What adaptation made of the model by the end, by name, see
-            :data:`hilctl.base.events.ADAPTED`; empty without it.
+        reason: One line of text.
+        output_state: State of the output.
+        stop_signal: Signal that stopped the run, SIGTERM for a requested stop, or 0.
+        samples: Recorded samples.
+        missing: Samples that were dropped, skipped or lost.
+        late_ticks: Late ticks.
+        deadline_misses: Text of skipped ticks; empty without any.
+        adapted: Final values of the adaptation by name, see
+            :data:`hilctl.base.events.ADAPTED`; empty without one.
         guardian_active: Whether a guardian still drives the output to its safe value.
     """
 
@@ -46,10 +46,10 @@ class RunResult:
         return self.output_state == "confirmed"
 
     def to_mapping(self) -> dict[str, Any]:
-        """Return what a program reads of it, as plain values."""
+        """Return the fields for programs as plain values."""
         return {
             "recorded_samples": self.samples,
-            "dropped": self.missing,  # a recording that was cut short can't say it
+            "dropped": self.missing,
             "output": str(self.path),
             "code": self.code,
             "reason": self.reason,
@@ -63,13 +63,13 @@ class RunResult:
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """Where a run stands.
+    """Progress of a run.
 
     Attributes:
-        samples: Samples recorded so far.
+        samples: Recorded samples.
         total: Samples of the waveform.
-        late_ticks: Ticks that woke late so far.
-        compensated: Whether the reference is a displacement, with a compensator behind it.
+        late_ticks: Late ticks so far.
+        compensated: Whether the run has a compensator, so that the reference is a displacement.
         batch: The newest samples.
     """
 

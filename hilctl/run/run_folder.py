@@ -1,16 +1,15 @@
-"""Runs on this machine: the folder of each, who holds which device, and which runs are dead.
+"""Runs on this computer: their folders in memory, and locks of runs and devices.
 
-Each run has a folder in memory that only its user can use. A lock on the run's card, not a process
-number, says whether the run is alive: the kernel releases it with the last process that holds it.
-The loop and the guardian inherit it and the device's lock, so that both stay held until the output
-is safe, even if the supervisor dies.
+A lock on the run's card, not a process number, decides whether a run is alive: the kernel releases
+it with the last process that holds it. Loop and guardian inherit the locks of run and device, so
+both are held until the output is safe, even if the supervisor dies.
 
-The folder may be removed in mid-run: systemd-logind does so when a user logs out (RemoveIPC). Its
-files stay open in the run's processes, and are found there.
+systemd-logind removes the folder of an active run when its user logs out (RemoveIPC). The files
+stay open in the processes of the run, and are found through ``/proc``.
 
-A device's lock is a file of the user's own, which no other user can lock. Beside it a name of an
-abstract Unix socket tells other users: anybody can bind it, so it only counts when this user or
-root has.
+The lock of a device is a file that only this user can lock. A bound name of an abstract Unix socket
+warns other users. Any user can bind it, so it excludes a run only if this user or root has bound
+it.
 """
 
 import hashlib
@@ -20,6 +19,7 @@ import os
 import shutil
 import socket
 import struct
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, fields
@@ -32,6 +32,8 @@ from hilctl.base.private_dirs import is_locked, private_folder, take_lock, user_
 
 _log = logging.getLogger(__name__)
 
+WORKS_ANYWHERE = "report, replay, export, identify, compare, check and learn --fast work here"
+
 _CARD = "run.json"
 _KEPT = "kept"
 _SUPERVISOR = "supervisor.lock"
@@ -39,20 +41,20 @@ _DEVICES = "devices"
 _REMOVED = " (deleted)"
 _PEER = struct.Struct("3i")  # process, user and group, as in unix(7)
 _LATEST_S = 1e12
-_BACKLOG = 1000  # connections that ask who holds a device; they are never accepted
+_BACKLOG = 1000  # connections that query the holder of a device; never accepted
 
 
 @dataclass(frozen=True, slots=True)
 class RunCard:
-    """What other commands read of a run.
+    """Identity of a run, for other commands.
 
     Attributes:
-        name: Its folder's name, unique among runs of a user.
+        name: Name of its folder, unique among the runs of a user.
         experiment: Name of the experiment.
         recording: Absolute path of the recording.
         supervisor: Process number of the supervisor.
         started: Unix time in s.
-        holds: What its device holds alone, as :attr:`hilctl.base.device.DeviceInfo.holds`.
+        holds: Resources of its device, as :attr:`hilctl.base.device.DeviceInfo.holds`.
     """
 
     name: str
@@ -67,7 +69,7 @@ class RunCard:
         """Return a card.
 
         Raises:
-            ValueError: It is not one.
+            ValueError: The text is not a card.
         """
         values = json.loads(text)
         if not isinstance(values, dict):
@@ -88,11 +90,11 @@ class RunCard:
 
 @dataclass(frozen=True, slots=True)
 class RunFolder:
-    """A run's folder.
+    """The folder of a run.
 
     Attributes:
         path: The folder.
-        card: What stands in it of the run.
+        card: Its card.
     """
 
     path: Path
@@ -110,12 +112,12 @@ class RunFolder:
 
     @property
     def input_um(self) -> Path:
-        """File of the compensator's input, where it is not the reference."""
+        """File of the compensator's input if it differs from the reference."""
         return self.path / "input_um.npy"
 
     @property
     def description(self) -> Path:
-        """File that describes the run to watchers."""
+        """File of the run's description for watchers."""
         return self._file("description.json")
 
     @property
@@ -125,44 +127,44 @@ class RunFolder:
 
     @property
     def guardian_log(self) -> Path:
-        """File of what the guardian writes to its standard error."""
+        """File of the guardian's standard error."""
         return self.path / "guardian.log"
 
     @property
     def socket(self) -> Path:
-        """Socket that the supervisor answers at."""
+        """Control socket of the supervisor."""
         return self.path / "socket"
 
     @property
     def supervised(self) -> bool:
-        """Whether the supervisor lives."""
+        """Whether the supervisor is alive."""
         return _is_locked(self._file(_SUPERVISOR))
 
     @property
     def alive(self) -> bool:
-        """Whether supervisor or loop lives."""
+        """Whether a process of the run is alive."""
         return _is_locked(self._file(_CARD))
 
     def keep(self) -> None:
-        """Let the folder outlive its supervisor: for a guardian, or samples in the ring."""
+        """Keep the folder after the supervisor, for a guardian or for samples in the ring."""
         (self.path / _KEPT).touch()
 
     @property
     def kept(self) -> bool:
-        """Whether the folder is to outlive its supervisor."""
+        """Whether the folder stays after the supervisor."""
         return (self.path / _KEPT).exists()
 
     def remove(self) -> None:
-        """Remove it and all that is in it."""
-        # The card first: what is left must not be taken for a dead run. Emptied, it is not taken
-        # for the card of a run whose folder was removed by somebody else either.
+        """Remove the folder."""
+        # The card first, so that a partly removed folder is not a dead run; emptied, because
+        # processes of the run may still have it open.
         with suppress(FileNotFoundError):
             os.truncate(self.path / _CARD, 0)
         (self.path / _CARD).unlink(missing_ok=True)
         shutil.rmtree(self.path, ignore_errors=True)
 
     def _file(self, name: str) -> Path:
-        """Return a file of the folder; if that was removed, a process of the run has it open."""
+        """Return a file of the folder, or of ``/proc`` if the folder was removed."""
         path = self.path / name
         if path.exists() or (self.path / _CARD).exists():
             return path
@@ -170,21 +172,16 @@ class RunFolder:
 
 
 def base_folder() -> Path:
-    """Return the folder that this user's runs have their folders in.
-
-    ``HILCTL_RUNS`` names another one.
+    """Return the parent of this user's run folders; ``HILCTL_RUNS`` overrides it.
 
     Raises:
-        RunError: There is none that can be used and is this user's alone.
+        RunError: No folder is usable and private to this user.
     """
     return _base_folders(make=True)[0]
 
 
 def _places() -> list[Path]:
-    """Return where runs of this user may be.
-
-    All of them: if another user takes the first place, or leaves it, active runs are found still.
-    """
+    """Return all possible parents of this user's run folders."""
     given = os.environ.get("HILCTL_RUNS")
     try:
         return [Path(given)] if given else user_folders()
@@ -193,7 +190,7 @@ def _places() -> list[Path]:
 
 
 def _base_folders(*, make: bool) -> list[Path]:
-    """Return those places that exist; the first one is made if it is missing."""
+    """Return the existing parents; create the first one if ``make``."""
     found: list[Path] = []
     problems: list[str] = []
     for place in _places():
@@ -203,7 +200,7 @@ def _base_folders(*, make: bool) -> list[Path]:
             if make or _is_own(place):  # a folder of another user holds no run of this one
                 problems.append(f"{place}: {error.strerror}")
     if problems and not found:
-        hint = "remove it, or name another one by HILCTL_RUNS"
+        hint = "remove it, or set HILCTL_RUNS to another one"
         raise RunError(f"no folder for runs: {'; '.join(problems)} ({hint})")
     return found
 
@@ -215,10 +212,10 @@ def _is_own(path: Path) -> bool:
 
 
 def runs() -> list[RunFolder]:
-    """Return all runs of this user, the oldest first, dead ones included.
+    """Return all runs of this user, oldest first, dead ones included.
 
     Raises:
-        RunError: The folder of this user's runs can't be trusted.
+        RunError: The parent of the run folders is not private to this user.
     """
     cards: dict[Path, Path] = {}
     for base in _base_folders(make=False):
@@ -229,10 +226,10 @@ def runs() -> list[RunFolder]:
             cards[card] = opened
     found = []
     for path, readable in cards.items():
-        with suppress(OSError):  # being made or removed at this moment, or no run's folder
+        with suppress(OSError):  # being created or removed, or not a run's folder
             text = readable.read_text(encoding="utf-8", errors="replace")
             try:
-                if text:  # a run that is over has emptied it
+                if text:  # empty after the end of a run
                     found.append(RunFolder(path.parent, RunCard.from_json(text)))
             except (ValueError, RecursionError) as error:
                 _warn_once(path.parent.name, f"{path}: {error}")
@@ -241,23 +238,23 @@ def runs() -> list[RunFolder]:
 
 @cache
 def _warn_once(name: str, text: str) -> None:
-    _log.warning("%s; it is passed over: hilctl recover --dismiss %s removes it", text, name)
+    _log.warning("%s: ignored; hilctl recover --dismiss %s removes it", text, name)
 
 
 def _removed_files(process: str = "[0-9]*") -> dict[Path, Path]:
-    """Return files of this user that were removed and that processes have open still.
+    """Return removed files of this user that processes still have open.
 
     Args:
-        process: Pattern of the processes' folders below ``/proc``.
+        process: Pattern of the processes in ``/proc``.
 
     Returns:
-        The name that each file had, and where it can be opened now.
+        The former path of each file, and its path in ``/proc``.
     """
     found: dict[Path, Path] = {}
     if not hasattr(os, "geteuid"):  # Windows has no runs
         return found
     for opened in Path("/proc").glob(f"{process}/fd"):
-        with suppress(OSError):  # it has ended, or is not this user's
+        with suppress(OSError):  # it has ended, or belongs to another user
             own = opened.stat().st_uid == os.geteuid()
             for link in opened.iterdir() if own else ():
                 with suppress(OSError):
@@ -265,24 +262,23 @@ def _removed_files(process: str = "[0-9]*") -> dict[Path, Path]:
                     if not name.endswith(_REMOVED):
                         continue
                     path, file = Path(name.removesuffix(_REMOVED)), link.stat()
-                    # Another user's process can have opened files of any name. A card that its
-                    # run has emptied is of a run that is over.
+                    # Another user can open files of any name. An empty card belongs to a
+                    # run that has ended.
                     if file.st_uid == os.geteuid() and (file.st_size or path.name != _CARD):
                         found.setdefault(path, link)
     return found
 
 
 def keep_removed() -> None:
-    """Leave the ring and card that this process has open in a new folder if theirs was removed.
+    """Restore the folder of a run from the files that this process has open, if it was removed.
 
-    For a process that outlives its supervisor: what it has is all that is left of the last samples,
-    and the next command recovers them from there.
+    A process that outlives its supervisor calls this: the next command recovers the samples.
     """
     own = _removed_files("self")
     for card, opened in own.items():
         folder = card.parent
         if card.name == _CARD and folder / "ring" in own and not card.exists():
-            with suppress(OSError):  # there is no one left to report it to
+            with suppress(OSError):  # no process is left to report it to
                 private_folder(private_folder(folder.parent) / folder.name)
                 shutil.copyfile(own[folder / "ring"], folder / "ring")
                 shutil.copyfile(opened, folder / f"{_CARD}.new")
@@ -294,16 +290,16 @@ def keep_removed() -> None:
 def run_folder(
     experiment: str, recording: Path, started: float, holds: Sequence[str] = ()
 ) -> Iterator[tuple[RunFolder, list[int]]]:
-    """Make a run's folder and hold its locks; remove it in the end unless it is to be kept.
+    """Create a run's folder and hold its locks; remove it at the end unless it is kept.
 
     Yields:
-        The folder, and descriptors of the locks that the loop is to inherit.
+        The folder, and descriptors of the locks for loop and guardian.
 
     Raises:
-        RunError: It can't be made.
+        RunError: The folder cannot be created.
     """
     base, number = base_folder(), os.getpid()
-    recorded = str(recording.resolve())  # it fails where the working folder is gone
+    recorded = str(recording.resolve())  # fails if the working folder was removed
     with ExitStack() as stack:
         try:
             path = _new_folder(base / f"{experiment}-{number}")
@@ -318,7 +314,7 @@ def run_folder(
             # Under the locks: a card without locks is a dead run to others.
             unnamed.rename(path / _CARD)
         except OSError as error:
-            raise RunError(f"{base}: no run's folder can be made: {error.strerror}") from None
+            raise RunError(f"{base}: cannot create the folder of a run: {error.strerror}") from None
         yield folder, [shared]
 
 
@@ -328,7 +324,7 @@ def _clear_away(folder: RunFolder) -> None:
 
 
 def _new_folder(path: Path) -> Path:
-    """Make a folder; one of that name may hold the samples of a process of the same number."""
+    """Create a folder; a kept one of the same name may exist."""
     number, made = 1, path
     while True:
         try:
@@ -341,22 +337,22 @@ def _new_folder(path: Path) -> Path:
 
 @contextmanager
 def held_devices(holds: Sequence[str]) -> Iterator[list[int]]:
-    """Hold what a device holds alone, against every other run of this user and of root.
+    """Lock a device's resources against other runs of this user and of root.
 
-    A run of any other user is only warned of: whatever can be read of it could be made up.
+    A run of another user causes only a warning, because its lock could be forged.
 
     Args:
         holds: Names, as :attr:`hilctl.base.device.DeviceInfo.holds`.
 
     Yields:
-        Descriptors of the locks, for the loop to inherit.
+        Descriptors of the locks for loop and guardian.
 
     Raises:
-        InputError: Another run holds one of them; the message names it.
-        RunError: A lock's file can't be made.
+        InputError: Another run holds one of them.
+        RunError: The file of a lock cannot be created.
     """
     with ExitStack() as stack:
-        # In one order for all: else two runs might each get one of two, and both be refused.
+        # In the same order for all runs, so that one of two runs gets all of them.
         names = sorted(set(holds))
         yield [lock for name in names for lock in stack.enter_context(_held(name))]
 
@@ -393,13 +389,13 @@ def _held(name: str) -> Iterator[list[int]]:
 
 
 def _holder(address: bytes) -> tuple[int, int] | None:
-    """Return process and user that have bound an address; None if the kernel doesn't tell."""
+    """Return process and user that have bound an address; None if unknown."""
     with socket.socket(socket.AF_UNIX) as asking:
-        asking.setblocking(False)  # it never answers; the kernel does
+        asking.setblocking(False)  # the kernel answers
         try:
             asking.connect(address)
             raw = asking.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size)
-        except OSError:  # released at this moment, not listening, or asked by too many
+        except OSError:  # released, not listening, or its queue is full
             return None
     process, user, _ = _PEER.unpack(raw)
     return process, user
@@ -440,10 +436,10 @@ def _locked(path: Path) -> Iterator[int]:
 
 @contextmanager
 def locked_run(run: RunFolder) -> Iterator[int]:
-    """Hold the lock of a run whose processes have ended; yield its descriptor.
+    """Lock a run whose processes have ended; yield the descriptor.
 
     Raises:
-        BlockingIOError: One of them lives.
+        BlockingIOError: One of them is alive.
     """
     with _locked(run.path / _CARD) as descriptor:
         yield descriptor
@@ -451,10 +447,10 @@ def locked_run(run: RunFolder) -> Iterator[int]:
 
 @contextmanager
 def taken_over(run: RunFolder) -> Iterator[bool]:
-    """Hold the lock of a run whose processes are dead.
+    """Try to lock a dead run.
 
     Yields:
-        Whether it is held: False where one of them lives, or somebody else was first.
+        Whether it is locked: not if a process is alive, or another command was first.
     """
     try:
         descriptor = os.open(run.path / _CARD, os.O_RDWR)
@@ -463,7 +459,7 @@ def taken_over(run: RunFolder) -> Iterator[bool]:
         return
     try:
         take_lock(descriptor)
-        # Under the lock: who had it before may have removed what there was.
+        # Under the lock: another command may have removed the folder before.
         held = (run.path / _CARD).exists()
     except BlockingIOError:
         held = False
@@ -474,26 +470,20 @@ def taken_over(run: RunFolder) -> Iterator[bool]:
 
 
 def dismiss(name: str) -> Path:
-    """Remove the folder of a dead run; what was not recovered from it is lost.
-
-    Args:
-        name: Name of the run, which its folder has.
-
-    Returns:
-        The folder that was removed.
+    """Remove the folder of a dead run with its samples; return the folder.
 
     Raises:
-        InputError: There is none of that name, or the run is alive.
+        InputError: No run has that name, or the run is alive.
     """
     found = [each for base in _base_folders(make=False) for each in base.iterdir()]
     for folder in found:
         if folder.name == name and folder.name != _DEVICES:
             if _is_locked(folder / _CARD):
-                raise InputError(f"{name}: is active: end it by hilctl stop --run {name}")
+                raise InputError(f"{name} is active: stop it with hilctl stop --run {name}")
             shutil.rmtree(folder, ignore_errors=True)
             return folder
     known = ", ".join(sorted(each.name for each in found if each.name != _DEVICES))
-    raise InputError(f"{name}: there is no such run ({known or 'there is none'})")
+    raise InputError(f"no run is named {name!r} ({known or 'there is none'})")
 
 
 def _is_locked(path: Path) -> bool:
@@ -510,3 +500,14 @@ def _is_locked(path: Path) -> bool:
 def facts_of(run: RunFolder) -> dict[str, Any]:
     """Return a run's card as plain values."""
     return asdict(run.card)
+
+
+def require_linux() -> None:
+    """Refuse systems other than Linux.
+
+    Raises:
+        InputError: This is another system.
+    """
+    system = sys.platform
+    if system != "linux":
+        raise InputError(f"a run needs Linux, this is {system}: {WORKS_ANYWHERE}")

@@ -1,7 +1,4 @@
-"""From an experiment file to a finished run: load, check, run.
-
-Campaigns and learning run the same steps, in real time or not.
-"""
+"""From an experiment file to a finished run, in real time or not; identity of a run."""
 
 import logging
 import os
@@ -19,16 +16,16 @@ from hilctl.experiment.load import LoadedExperiment, input_files, load_experimen
 from hilctl.experiment.preflight import CheckedExperiment, check
 from hilctl.models.model_file import dump_model
 from hilctl.recording.run_summary import read_ends
-from hilctl.run.architecture import require_linux
 from hilctl.run.metadata import experiment_sha256, sha256_of
 from hilctl.run.own_process import has_threads, run_in_own_process
 from hilctl.run.result import Progress, RunResult
+from hilctl.run.run_folder import require_linux
 from hilctl.run.unpaced import run_unpaced
 
 _log = logging.getLogger(__name__)
 
 OnPart: TypeAlias = Callable[[float], None]
-"""Called with how much of a run is done, from 0 to 1."""
+"""Called with the completed part of a run, 0 to 1."""
 
 
 def checked_experiment(
@@ -38,31 +35,31 @@ def checked_experiment(
 
     Args:
         path: Experiment file.
-        settings: ``key=value`` texts over it.
-        heat_a2: Heat that its coil has at least, in A^2.
+        settings: ``key=value`` texts that override it.
+        heat_a2: Minimum heat of the coil, in A^2.
 
     Raises:
-        InputError: It cannot be used; all problems are listed.
+        InputError: The experiment is not valid; all problems are listed.
     """
     return check(load_experiment(path, settings), heat_a2)
 
 
 def output_of(checked: CheckedExperiment, output: Path | None) -> Path:
-    """Return the recording to write: the one given, or a new name in the experiment's folder.
+    """Return the recording to write: ``output``, or a new name in the folder of recordings.
 
     Raises:
-        InputError: The folder can't be made, or the run reads that file.
+        InputError: The folder cannot be created, or ``output`` is an input of the run.
     """
     if output is not None:
         loaded = checked.loaded
-        # A recording may be one of them: of a waveform, or of where the actuator stands.
+        # A recording may be an input: of a waveform, or of the initial state.
         check_no_input(output, input_files(loaded.document, loaded.folder / "experiment"))
         return output
     folder = Path(checked.loaded.config.recording.folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{folder}: can't be made: {reason(error)}") from None
+        raise InputError(f"cannot create {folder}: {reason(error)}") from None
     return default_output(checked.loaded.config.name, folder, time.localtime())
 
 
@@ -76,28 +73,27 @@ def start_run(
 ) -> RunResult:
     """Run an experiment file to its end.
 
-    A program with threads, such as a notebook, runs it in a process of its own.
+    In a program with threads, such as a notebook, it runs in a separate process.
 
     Args:
         path: Experiment file.
-        settings: ``key=value`` texts over it.
-        output: Recording to write; a name in the experiment's folder if None.
+        settings: ``key=value`` texts that override it.
+        output: Recording to write; a new name in the folder of recordings if None.
         overwrite: Whether an existing recording may be replaced.
         on_progress: Called with each batch of samples.
-        heat_a2: Heat that the coil has at least, in A^2, whatever the last run of it says.
+        heat_a2: Minimum heat of the coil, in A^2.
 
     Raises:
         InputError: Nothing has moved, and no file is left.
-        RunError: The device could not be opened; nothing has moved, and no file is left.
+        RunError: The run failed to start; nothing has moved, and no file is left.
     """
     require_linux()
     if has_threads():
         return run_in_own_process((path, settings, output, overwrite, heat_a2), on_progress)
-    # Here: check and unpaced runs work on systems that have no supervisor.
-    from hilctl.run.supervisor import Supervisor
+    from hilctl.run.supervisor import Supervisor  # Linux only
 
     checked = checked_experiment(path, settings, heat_a2)
-    # A real device remembers earlier runs: tell the user which memory is assumed.
+    # A real device has hysteresis memory: log the assumed initial state.
     if checked.begun.begins and checked.loaded.device.info.holds:
         _log.warning("the compensator begins %s", checked.begun.begins)
     output = output_of(checked, output)
@@ -105,7 +101,7 @@ def start_run(
 
 
 def default_output(name: str, folder: Path, now: time.struct_time) -> Path:
-    """Return the file for a run that was given none: ``folder/name-date-time.mcap``."""
+    """Return the default file name of a recording: ``folder/name-date-time.mcap``."""
     stamp = time.strftime("%Y%m%d-%H%M%S", now)
     candidate = folder / f"{name}-{stamp}.mcap"
     number = 2
@@ -128,7 +124,7 @@ def paced(
     overwrite: bool = True,
     heat_a2: float = 0.0,
 ) -> RunResult:
-    """Run as ``hilctl run`` does, into a file of this name; see :func:`start_run`."""
+    """Run in real time into a file; see :func:`start_run`."""
 
     def show(progress: Progress) -> None:
         on_part(progress.samples / max(progress.total, 1))
@@ -145,14 +141,14 @@ def unpaced(
     overwrite: bool = True,
     heat_a2: float = 0.0,
 ) -> RunResult:
-    """Run a simulated device as fast as it goes."""
+    """Run a simulated device without real time into a file."""
     del on_part
     checked = checked_experiment(path, settings, heat_a2=heat_a2)
     return run_unpaced(checked, output, overwrite=overwrite)
 
 
 class StepStoppedError(RunError):
-    """A run of several was stopped by a signal; the recordings before it are kept.
+    """A run of a study was stopped by a signal; earlier recordings are kept.
 
     Attributes:
         signal: Number of the signal.
@@ -168,7 +164,7 @@ class RunKey:
     """Identity of a run: two runs with one key have the same experiment, model and correction.
 
     Attributes:
-        experiment: SHA-256 of the experiment as it runs.
+        experiment: SHA-256 of the experiment.
         model: SHA-256 of the compensator's model; empty without one.
         correction: SHA-256 of the learned correction; empty without one.
     """

@@ -1,7 +1,7 @@
-"""The supervisor: start loop, guardian and recorder, and end the run whatever happens to them.
+"""The supervisor: starts loop, guardian and recorder, and monitors the run to its end.
 
-Everything that can fail happens before the start signal. From then on the supervisor serves the
-recording, the ring and the safe value, whatever else fails in it.
+Everything that can fail happens before the start signal. Afterwards recording, ring and safe value
+are served even if another part of the supervisor fails.
 """
 
 import json
@@ -22,22 +22,20 @@ from hilctl.base.errors import RunError
 from hilctl.base.events import Event
 from hilctl.experiment.preflight import CheckedExperiment
 from hilctl.loop.pacer import deadline_misses
-from hilctl.loop.plan import LoopOutcome
-from hilctl.loop.safe_output import describe
+from hilctl.loop.safe_output import LoopOutcome, describe
 from hilctl.machine.rt_setup import be_ordinary, favoured
-from hilctl.run.child import LoopProcess
-from hilctl.run.control_socket import ControlServer
-from hilctl.run.guardian_process import GuardianProcess, GuardianRelief
+from hilctl.run.control.client import HANG_UP, JOB_CONTROL, STOP_SIGNAL
+from hilctl.run.control.control_socket import ControlServer
+from hilctl.run.control.requests import Requests
 from hilctl.run.job import Job
 from hilctl.run.metadata import RunDescription
-from hilctl.run.protocol import HANG_UP, JOB_CONTROL, STOP_SIGNAL
+from hilctl.run.processes import GuardianProcess, GuardianRelief, LoopProcess
 from hilctl.run.recorder import Recorder, RingRecorder
-from hilctl.run.requests import Requests
 from hilctl.run.result import Progress, RunResult
-from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import RunFolder, held_devices, run_folder
-from hilctl.run.safety import Safety
-from hilctl.run.shared_page import PageField, PageSlot, SharedPage, Stop
+from hilctl.run.safety.safety_monitor import SafetyMonitor
+from hilctl.run.shared.ring import SampleRing
+from hilctl.run.shared.shared_page import PageField, PageSlot, SharedPage, Stop
 
 _log = logging.getLogger(__name__)
 
@@ -56,10 +54,10 @@ STOPS = {
 
 
 class SystemdNotifier:
-    """Notify systemd of readiness, watchdog and stop, by sd_notify(3).
+    """Notify systemd of readiness, watchdog and stop with sd_notify(3).
 
     Args:
-        environment: ``NOTIFY_SOCKET`` and ``WATCHDOG_USEC`` are looked up here.
+        environment: Contains ``NOTIFY_SOCKET`` and ``WATCHDOG_USEC``.
         clock: Monotonic time in s.
     """
 
@@ -86,19 +84,19 @@ class SystemdNotifier:
             out.sendto("\n".join(lines).encode(), self._address)
 
     def alive(self) -> None:
-        """Feed the watchdog three times per interval; call it more often than that."""
+        """Feed the watchdog three times per interval; call this more often."""
         if self._every_s and self._clock() >= self._next_s:
             self._next_s = self._clock() + self._every_s
             self.say("WATCHDOG=1")
 
 
 class ProgressThread:
-    """Report progress from a thread of its own, so that a blocked terminal does not delay a run.
+    """Report progress in a thread, so that a blocked terminal does not delay the run.
 
     Args:
         current: Returns the progress; None before the first sample.
         on_progress: Called with it; may block.
-        on_error: Called once with the error of ``on_progress``, which is not called any more.
+        on_error: Called with an error of ``on_progress``, which is not called again.
     """
 
     def __init__(
@@ -116,7 +114,7 @@ class ProgressThread:
         self._thread.start()
 
     def end(self) -> None:
-        """Report once more; wait only briefly for a blocked terminal."""
+        """Report a last time; wait only briefly for a blocked terminal."""
         self._ending.set()
         self._thread.join(_LAST_SHOWN_S)
 
@@ -125,8 +123,8 @@ class ProgressThread:
             while not self._ending.wait(_SHOWN_EVERY_S):
                 self._show()
             self._show()
-        except Exception as error:  # noqa: BLE001  whoever shows a run must not end it
-            self._on_error(f"progress is not shown any more: {type(error).__name__}: {error}")
+        except Exception as error:  # noqa: BLE001  an error of the display must not end the run
+            self._on_error(f"progress is no longer reported: {type(error).__name__}: {error}")
 
     def _show(self) -> None:
         if (progress := self._current()) is not None:
@@ -136,14 +134,14 @@ class ProgressThread:
 class RunMonitor:
     """Watch a run from the supervisor's main thread: heartbeat, stop requests, outcome.
 
-    It covers the time from the start signal to the closed recording. It does no file input or
-    output, and never waits for a thread that does.
+    It covers the time from the start signal to the closed recording, performs no file access, and
+    never waits for a thread that does.
 
     Args:
         checked: The experiment.
         ring: Its ring.
         child: Its loop.
-        safety: Watches guardian and loop.
+        safety: Monitors guardian and loop.
         recording: Records from the ring.
     """
 
@@ -152,31 +150,31 @@ class RunMonitor:
         checked: CheckedExperiment,
         ring: SampleRing,
         child: LoopProcess,
-        safety: Safety,
+        safety: SafetyMonitor,
         recording: RingRecorder,
     ) -> None:
         self._config, self._forecast = checked.loaded.config, checked.forecast
         self._page, self._child = ring.page, child
         self._safety, self._recording = safety, recording
         self.outcome: LoopOutcome | None = None
-        """How the run ended; None until the output is safe or nothing more can be done."""
+        """Outcome of the run; None until the output is safe or nothing more can be done."""
         self.broke = ""
-        """Error of the supervisor itself; empty if there was none."""
+        """Error of the supervisor itself; may be empty."""
 
-    def attend(self, stop_signal: int) -> bool:
+    def poll(self, stop_signal: int) -> bool:
         """Write the heartbeat, pass stops on, update safety; return whether the run is active.
 
         Args:
             stop_signal: Number of the signal that stops the run, or 0.
         """
-        # Asked first: of a loop that has ended, nothing can come after that.
+        # First: after its end a loop writes nothing more to the page.
         ended = self._child.ended
         now_ns = time.monotonic_ns()
         self._page.put(PageField.SUPERVISOR_HEARTBEAT_NS, now_ns)
         self._pass_stop_on(stop_signal)
         if self.outcome is None:
             self._safety.update(now_ns, ended=ended)
-            # The safe value comes before the samples, which wait in memory.
+            # The safe value before the samples, which are safe in memory.
             self._conclude(ended=ended)
         return not self._recording.finished
 
@@ -200,14 +198,14 @@ class RunMonitor:
         )
 
     def progress_failed(self, text: str) -> None:
-        """Record that progress is not reported any more."""
+        """Record that progress is no longer reported."""
         sample = self._page.get(PageField.NEXT_SAMPLE)
         self._recording.record_event(Event(sample, "warning", "progress_failed", text))
 
     def _conclude(self, *, ended: bool) -> None:
         result, said = self._safety.result, self._page.outcome() if ended else None
         if result is None:
-            # Without a safe end, guardian or supervisor still has to act.
+            # Without a safe end, guardian or supervisor must act.
             self.outcome = said if self._page.ended_safely() else None
         else:
             hung = "the loop process hung, and was killed"
@@ -229,14 +227,14 @@ class RunMonitor:
         elif self.broke:
             page.put(PageField.STOP, Stop.SUPERVISOR_BROKE)
         elif must_record and self._recording.stalled_s() > self._config.recording.ring_s / 2.0:
-            # Not at the first error: while the ring is less than half full, a retry loses nothing.
+            # Not at the first error: a retry loses nothing while the ring is less than half full.
             failed = bool(self._recording.recorder.error)
             page.put(PageField.STOP, Stop.RECORDER_FAILED if failed else Stop.RECORDER_STALLED)
 
 
-def _stay(number: int, frame: FrameType | None) -> None:
-    """Say why Ctrl-Z does nothing, from another thread: the terminal may not take the text."""
-    text = "Ctrl-Z can't suspend a run: end it by Ctrl-C; run --detach leaves the terminal free"
+def _refuse_suspend(number: int, frame: FrameType | None) -> None:
+    """Explain in a thread why Ctrl-Z has no effect; the terminal may be blocked."""
+    text = "Ctrl-Z cannot suspend a run: stop it with Ctrl-C; run --detach frees the terminal"
     threading.Thread(target=_log.warning, args=(text,), daemon=True).start()
 
 
@@ -247,7 +245,7 @@ class Supervisor:
         checked: The experiment.
         output: File to record to.
         overwrite: Whether an existing file may be replaced.
-        on_progress: Called a few times a second, in a thread of its own.
+        on_progress: Called in a thread, several times per second.
     """
 
     def __init__(
@@ -270,23 +268,22 @@ class Supervisor:
         """Run to the end.
 
         Raises:
-            InputError: The recording can't be written, or another run holds the device; nothing has
-                moved, and no file is left.
-            RunError: The loop could not be started; nothing has moved, and no file is left.
+            InputError: The recording cannot be written, or another run holds the device; nothing
+                has moved, and no file is left.
+            RunError: The loop failed to start; nothing has moved, and no file is left.
         """
         be_ordinary()
         config = self._config
         with ExitStack() as stack:
-            # Before there is a loop: a signal must stop it, not just end this process. And to the
-            # last: whoever finds the run's folder may send one, and impatience while processes are
-            # ended would cost the result of a run that has ended.
+            # From before the loop starts to the very end: a signal must stop the loop, and a
+            # second one must not discard the result of a run that has ended.
             stack.enter_context(self._signals())
             holds = self._checked.loaded.device.info.holds
             relief = GuardianRelief(holds)
             locks: list[int] = []
             recorder = None
             try:
-                # The device before the recording: a run that is refused must not touch a file.
+                # The device before the recording: a refused run must not touch a file.
                 locks = stack.enter_context(held_devices(holds))
                 recorder = Recorder(self._checked, self._output, overwrite=self._overwrite)
                 folder, own = stack.enter_context(
@@ -297,7 +294,7 @@ class Supervisor:
                 requests = Requests(self._checked, folder, ring.page, recording)
                 server = stack.enter_context(ControlServer(folder.socket, requests.answer))
                 self._write_job(folder)
-                # Open to the end: watchers find it even if the folder is removed.
+                # Kept open: watchers find it even if the folder is removed.
                 stack.enter_context(folder.description.open("rb"))
                 child = LoopProcess(folder, ring.page, locks + own)
                 run = folder, ring, child, recording
@@ -305,17 +302,17 @@ class Supervisor:
                 started = RunMonitor(self._checked, ring, child, safety, recording)
             except BaseException:
                 if recorder is not None:
-                    recorder.give_back()
+                    recorder.discard()
                 relief.resume(locks)
                 raise
             relief.discard()
             _go(ring.page, start_ns)
-            self._attend(started, server)
+            self._monitor(started, server)
             ring.page.put(PageField.RECORDED, int(not recorder.error))
             stops = self._stops
             guarded = safety.close(lambda: self._stops > stops)
             if guarded or recorder.error:
-                folder.keep()  # its guardian is active, or recovery takes the rest from its ring
+                folder.keep()  # for its guardian, or for samples that are only in the ring
             return self._result(started, recorder, ring, folder, guarded=guarded)
 
     def _start(
@@ -326,35 +323,35 @@ class Supervisor:
         child: LoopProcess,
         recording: RingRecorder,
         locks: list[int],
-    ) -> tuple[Safety, int]:
-        """Wait for loop and guardian to be ready, and begin the recording.
+    ) -> tuple[SafetyMonitor, int]:
+        """Wait until loop and guardian are ready, and begin the recording.
 
         Returns:
-            What sees to a safe output, and when sample 0 is due, monotonic time in ns.
+            Monitor of the safe output, and the monotonic time of sample 0 in ns.
         """
         page, checked = ring.page, self._checked
         safety = None
         try:
             simulated = checked.loaded.device.info.simulated  # needs no guardian
             guardian = None if simulated else partial(GuardianProcess, folder, page, locks)
-            safety = Safety(checked, ring, child, guardian, recording.record_event)
+            safety = SafetyMonitor(checked, ring, child, guardian, recording.record_event)
             child.await_ready(lambda: self._stop_signal != 0)
-            # It is started after the loop, to watch its process, and ready long before it.
+            # Started after the loop, because it watches the loop's process.
             self._await_guardian(safety)
             start_ns = self._begin(recording.recorder, page)
-            # Before there are threads: all that share the interpreter with this one come along.
+            # Before threads are started, so that they inherit it.
             stack.enter_context(favoured(child.pid))
             recording.start()
         except BaseException as error:
-            child.kill()  # it waits for the start signal, so nothing has moved
+            child.kill()  # it waits for the start signal: nothing has moved
             if safety is not None:
                 safety.close()
             if isinstance(error, OSError):
-                raise RunError(f"the run can't be started: {error}; nothing has moved") from error
+                raise RunError(f"the run cannot be started: {error}; nothing has moved") from error
             raise
         return safety, start_ns
 
-    def _await_guardian(self, safety: Safety) -> None:
+    def _await_guardian(self, safety: SafetyMonitor) -> None:
         deadline_s = time.monotonic() + _GUARDIAN_READY_S
         while not safety.ready():
             if self._stop_signal:
@@ -364,14 +361,14 @@ class Supervisor:
             time.sleep(_POLL_S)
 
     def _begin(self, recorder: Recorder, page: SharedPage) -> int:
-        """Write what the recording begins with; return when sample 0 is due, monotonic time in ns.
+        """Write the start of the recording; return the monotonic time of sample 0 in ns.
 
-        The file says when that is. On a disk so slow that the time has come before the file says
-        so, it is written anew with a later one: the first tick would be late by as much.
+        The file contains that time. If the disk is so slow that the time has passed, the start is
+        written again with a later time; otherwise the first tick would be late.
         """
         set_up, refused = json.loads(page.read_text(PageSlot.SET_UP))
         self._warn(refused)
-        # Arming the device's watchdog comes before sample 0, and after the start signal.
+        # The watchdog is armed between the start signal and sample 0.
         least_ns = _START_DELAY_NS + round(self._checked.loaded.device.info.arm_s * 1e9)
         delay_ns = least_ns
         for _ in range(_START_TRIES):
@@ -387,43 +384,43 @@ class Supervisor:
             "nothing has moved"
         )
 
-    def _attend(self, started: RunMonitor, server: ControlServer) -> None:
-        """See to a run until its recording is closed, whatever goes wrong meanwhile."""
+    def _monitor(self, started: RunMonitor, server: ControlServer) -> None:
+        """Monitor a run until its recording is closed, also after an error in this process."""
         shown: ProgressThread | None = None
         try:
             shown = ProgressThread(started.progress, self._on_progress, started.progress_failed)
             shown.start()
             server.start()
             self._notifier.say("READY=1", f"STATUS=recording to {self._output}")
-            while started.attend(self._stop_signal):
+            while started.poll(self._stop_signal):
                 self._notifier.alive()
                 time.sleep(_POLL_S)
             self._notifier.say("STOPPING=1")
-        except Exception as error:  # noqa: BLE001  it must not cost coil, ring or recording
+        except Exception as error:  # noqa: BLE001  output and recording must survive it
             started.break_off(error)
-            self._attend_only(started)
+            self._monitor_only(started)
         if shown is not None:
             shown.end()
 
-    def _attend_only(self, started: RunMonitor) -> None:
-        """See to a run without what may have broken: no requests, display or service manager."""
+    def _monitor_only(self, started: RunMonitor) -> None:
+        """Monitor a run without requests, progress and systemd."""
         while True:
             try:
-                if not started.attend(self._stop_signal):
+                if not started.poll(self._stop_signal):
                     return
-            except Exception as error:  # noqa: BLE001  the loop must not go on without a recorder
+            except Exception as error:  # noqa: BLE001  the loop must not run without a supervisor
                 started.break_off(error)
             time.sleep(_POLL_S)
 
     def _warn(self, refused: list[str]) -> None:
-        """Say what real time was refused, where a late tick would be one of a real device."""
+        """Warn of refused real-time steps if the device is real."""
         if not self._checked.loaded.device.info.simulated:
             for line in refused:
-                _log.warning("real time refused, timing may not be kept: %s", line)
+                _log.warning("real time refused, ticks may be late: %s", line)
 
     @property
     def _silence_s(self) -> float:
-        """Longest that this side may be silent: then half of the ring is full."""
+        """Longest silence of the supervisor: until half of the ring is full."""
         recording = self._config.recording
         return recording.ring_s / 2.0 if recording.on_failure == "stop" else float("inf")
 
@@ -434,20 +431,20 @@ class Supervisor:
             self._stops += 1
 
         handlers = dict.fromkeys(JOB_CONTROL, signal.SIG_IGN) | dict.fromkeys(STOPS, note)
-        handlers[signal.SIGTSTP] = _stay
+        handlers[signal.SIGTSTP] = _refuse_suspend
         before = {number: signal.signal(number, each) for number, each in handlers.items()}
-        # Never the default, which would end a process that is asked to stop a moment too late.
+        # Never the default: a late stop request would kill the process.
         if before[STOP_SIGNAL] == signal.SIG_DFL:
             before[STOP_SIGNAL] = signal.SIG_IGN
         try:
             yield
         finally:
             for number, handler in before.items():
-                if handler is not None:  # one that is not Python's can't be set again
+                if handler is not None:  # None: not set by Python
                     signal.signal(number, handler)
 
     def _write_job(self, folder: RunFolder) -> None:
-        """Write what the loop process, the guardian and watchers read."""
+        """Write the job for loop and guardian, and the description for watchers."""
         job = Job.of(self._checked, folder, supervisor=os.getpid(), silence_s=self._silence_s)
         job.write(folder.job)
         RunDescription.of(self._checked).write(folder.description)
@@ -463,8 +460,10 @@ class Supervisor:
                 latency_blocks=info.latency_blocks,
             )
         except OSError as error:
-            hint = "less recording.ring_s needs less of it"
-            raise RunError(f"{folder.ring}: no memory: {error.strerror}; {hint}") from None
+            raise RunError(
+                f"{folder.ring}: cannot allocate the sample ring ({error.strerror}): reduce "
+                "recording.ring_s"
+            ) from None
 
     def _result(
         self,
@@ -482,8 +481,8 @@ class Supervisor:
         cut = ""
         if recorder.error:
             cut = f"; {recorder.missing} samples are not in the recording: {recorder.error}; "
-            cut += f"what memory holds of them is kept in {folder.path}: any hilctl command adds "
-            cut += "it once the file can be written"
+            cut += f"those in memory are kept in {folder.path}: any hilctl command adds them when "
+            cut += "the file can be written"
         broke = f"; the supervisor broke: {started.broke}" if started.broke else ""
         unasked = outcome.code == "stopped" and not stop_signal
         fault = recorder.error or started.broke or unasked
@@ -509,5 +508,5 @@ def _go(page: SharedPage, start_ns: int) -> None:
     """Give the loop the start signal."""
     page.put(PageField.SUPERVISOR_HEARTBEAT_NS, time.monotonic_ns())
     page.put(PageField.START_NS, start_ns)
-    # Last: the loop then reads its start time, and would take an old heartbeat for silence.
+    # Last: then the loop reads its start time, and checks the heartbeat.
     page.publish(PageField.GO, 1)

@@ -1,7 +1,6 @@
-"""A run on a simulated device, in this process, as fast as it goes.
+"""A run on a simulated device without real time, in this process.
 
-The simulated devices step on sample count, so that a run of them needs no real time. All else is
-as in a paced run: check, loop, compensator, limiter, interlocks, recorder.
+Check, loop, compensator, limiter, interlocks and recorder are those of a paced run.
 """
 
 import time
@@ -16,10 +15,11 @@ from hilctl.base.events import Event
 from hilctl.base.samples import ANSWERS, BlockBatch, Samples
 from hilctl.experiment.preflight import CheckedExperiment
 from hilctl.loop.block import Block
-from hilctl.loop.host import Tuning
 from hilctl.loop.loop import Loop
 from hilctl.loop.pacer import Lateness
-from hilctl.loop.plan import LoopOutcome, LoopPlan
+from hilctl.loop.plan import LoopPlan
+from hilctl.loop.safe_output import LoopOutcome
+from hilctl.loop.tuning import Tuning
 from hilctl.run.assemble import assemble, starting_output
 from hilctl.run.metadata import end_facts
 from hilctl.run.recorder import Recorder
@@ -29,7 +29,7 @@ _BLOCKS_A_BATCH = 256
 
 
 class VirtualClock:
-    """Time that passes only in sleeps, and takes none."""
+    """A clock that advances only in sleeps, which return immediately."""
 
     def __init__(self) -> None:
         self._now_ns = 0
@@ -39,18 +39,18 @@ class VirtualClock:
         return self._now_ns
 
     def sleep_until_ns(self, deadline_ns: int) -> None:
-        """Let the time be ``deadline_ns``."""
+        """Advance the time to ``deadline_ns``."""
         self._now_ns = max(self._now_ns, deadline_ns)
 
 
 class OfflineHost:
-    """A host that gathers blocks in this process's own memory; supervises nothing.
+    """A host that collects blocks in the memory of this process; see :class:`~.plan.Host`.
 
     Args:
-        plan: The run.
-        on_batch: Takes blocks, some at a time; they are valid until it returns.
-        on_event: Takes events.
-        stop: Why the run should end, or an empty text.
+        plan: The plan.
+        on_batch: Called with batches of blocks, which are valid until it returns.
+        on_event: Called with events.
+        stop: Returns the reason to stop, or an empty text.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class OfflineHost:
         stop: Callable[[], str] = lambda: "",
     ) -> None:
         self.clock: Clock = VirtualClock()
-        # No slot is used again before the batch that its block is in has been taken.
+        # No slot is reused before its batch was passed on.
         slots = _BLOCKS_A_BATCH + 2 * (plan.latency_blocks + 1)
         self._room = BlockBatch.empty(slots, plan.block, plan.compensator.state_size + 1)
         heads = [head.data.cast("B").cast("q") for head in self._room.heads]
@@ -71,24 +71,24 @@ class OfflineHost:
         self._on_batch, self._on_event, self._stop = on_batch, on_event, stop
 
     def claim(self, *, due: bool = True) -> Block:
-        """Return room for the next block."""
+        """Return the next block."""
         block = self._blocks[self._claimed % len(self._blocks)]
         block.number, block.due = self._claimed if due else -1, due
         self._claimed += 1
         return block
 
     def sending(self, block: Block) -> None:
-        """Do nothing: this process outlives no block."""
+        """Do nothing: blocks do not survive this process."""
 
     def answered(self, block: Block) -> bool:
-        """Gather a block."""
+        """Collect a block."""
         self._answered = block.number + 1
         if self._answered - self._first == _BLOCKS_A_BATCH:
             self.flush()
         return True
 
     def flush(self) -> None:
-        """Pass on what has been gathered."""
+        """Pass the collected blocks on."""
         if self._answered > self._first:
             size = self._room.heads.shape[0]
             taken = np.arange(self._first, self._answered) % size
@@ -98,22 +98,21 @@ class OfflineHost:
             self._first = self._answered
 
     def heartbeat(self, next_sample: int, late_ticks: int) -> str:
-        """Return why the run should end, or an empty text."""
+        """Return the reason to stop, or an empty text."""
         return self._stop()
 
     def closing(self) -> None:
-        """Do nothing: no supervisor watches."""
+        """Do nothing: there is no supervisor."""
 
     def tuning(self) -> Tuning | None:
-        """Return no change: nobody requests one."""
+        """Return None: no change is requested."""
         return None
 
     def writing_safe(self, value: float) -> None:
-        """Do nothing: no other process could go on from it."""
+        """Do nothing: no other process continues the ramp."""
 
     def record_event(self, event: Event) -> None:
         """Pass an event on, after the blocks before it."""
-        # An event is recorded with the samples that led to it.
         self.flush()
         self._on_event(event)
 
@@ -127,7 +126,7 @@ def run_unpaced(checked: CheckedExperiment, output: Path, *, overwrite: bool = F
         overwrite: Whether an existing file may be replaced.
 
     Raises:
-        InputError: The device is not a simulated one, or the recording can't be written.
+        InputError: The device is not simulated, or the recording cannot be written.
     """
     info = checked.loaded.device.info
     if not info.simulated:
@@ -135,7 +134,7 @@ def run_unpaced(checked: CheckedExperiment, output: Path, *, overwrite: bool = F
     recorder = Recorder(checked, output, overwrite=overwrite)
     outcome, lateness = _run(checked, recorder)
     recorder.finish(end_facts(outcome, lateness), outcome.ended_at)
-    cut = f"; the recording is cut short: {recorder.error}" if recorder.error else ""
+    cut = f"; the recording is truncated: {recorder.error}" if recorder.error else ""
     return RunResult(
         path=output,
         code="fault" if recorder.error else outcome.code,
@@ -163,7 +162,7 @@ def _run(checked: CheckedExperiment, recorder: Recorder) -> tuple[LoopOutcome, L
     )
 
     def refused() -> str:
-        """Return why the file cannot be written, retried once, or an empty text."""
+        """Return why the file cannot be written after a retry, or an empty text."""
         return recorder.error if recorder.error and not recorder.flush() else ""
 
     host = OfflineHost(plan, on_batch=recorder.batch, on_event=recorder.event, stop=refused)
@@ -172,20 +171,20 @@ def _run(checked: CheckedExperiment, recorder: Recorder) -> tuple[LoopOutcome, L
         recorder.begin(time.time_ns(), {"paced": "false"}, waveform_at)
     except HilctlError:
         loaded.device.close()
-        recorder.give_back()
+        recorder.discard()
         raise
     return _drive(loop, loaded.device, host)
 
 
 def run_in_memory(plan: LoopPlan, device: Device) -> tuple[LoopOutcome, Samples]:
-    """Run a plan on a simulated device, and keep its samples.
+    """Run a plan on a simulated device; return the outcome and the samples.
 
     Args:
-        plan: What to do, without a pace.
-        device: Not yet open.
+        plan: The plan, not paced.
+        device: Not open.
 
     Raises:
-        DeviceError: It can't be opened, or can't keep this rate or block.
+        DeviceError: The device cannot be opened, or does not support the rate or block.
     """
     parts: list[Samples] = []
     host = OfflineHost(plan, on_batch=lambda batch: parts.append(batch.samples(slice(None))))
@@ -199,7 +198,7 @@ def run_in_memory(plan: LoopPlan, device: Device) -> tuple[LoopOutcome, Samples]
 def _opened(
     plan: LoopPlan, device: Device, host: OfflineHost, at_start: float | None
 ) -> tuple[Loop, int]:
-    """Open the device; return the loop, and the samples that come before the waveform."""
+    """Open the device; return the loop, and the number of samples before the waveform."""
     loop = Loop(plan, device, host)
     device.open(plan.sample_rate_hz, plan.block)
     try:

@@ -21,8 +21,8 @@ import yaml
 from hilctl.base.samples import Flag
 from hilctl.base.types import F64, I64
 from hilctl.recording.recording import Samples
-from hilctl.run.ring import SampleRing
-from hilctl.run.shared_page import SharedPage
+from hilctl.run.shared.ring import SampleRing
+from hilctl.run.shared.shared_page import SharedPage
 from hilctl_drivers.profile import shipped_profiles
 
 PRIORITY = 50

@@ -20,7 +20,7 @@ from pathlib import Path
 from hilctl.base.errors import HilctlError
 from hilctl.loop.safe_output import HOLD_S
 from hilctl.recording.reader import read
-from hilctl.run.shared_page import PageField, Phase, SharedPage
+from hilctl.run.shared.shared_page import PageField, Phase, SharedPage
 from tests.benchmark.attacked import (
     LONGEST_S,
     RAMP_A_PER_S,
@@ -36,7 +36,7 @@ SLOW_WRITE = Path(__file__).with_name("slow_write.c")
 OBSERVED_S = 1.0
 END_S = HOLD_S + 30.0
 STAYS = ", does not end"
-MODULES = {"loop": b"hilctl.run.loop_process", "guardian": b"hilctl.run.guardian"}
+MODULES = {"loop": b"hilctl.run.loop_process", "guardian": b"hilctl.run.safety.guardian"}
 PHASES = ("start", "ramp in", "condition", "run", "set", "ramp out", "close", "recovery")
 TARGETS = (
     *("loop", "guardian", "supervisor"),

@@ -20,13 +20,12 @@ from hilctl.base.samples import BlockHeader
 from hilctl.experiment.load import LoadedExperiment, load_experiment
 from hilctl.experiment.preflight import CheckedExperiment, check
 from hilctl.loop.pacer import SystemClock
-from hilctl.machine.rt_setup import prepare
-from hilctl.machine.settings import Realtime
+from hilctl.machine.rt_setup import Realtime, prepare
 from hilctl.run import loop_process
 from hilctl.run.job import Job
-from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import RunCard, RunFolder
-from hilctl.run.shared_page import PageField, Phase, SharedPage
+from hilctl.run.shared.ring import SampleRing
+from hilctl.run.shared.shared_page import PageField, Phase, SharedPage
 
 EXPERIMENT = Path(__file__).parents[2] / "configs" / "terfenol_sine_6a.yaml"
 MODELS = EXPERIMENT.parent / "models"

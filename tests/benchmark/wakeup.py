@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hilctl.machine.settings import Realtime
+from hilctl.machine.rt_setup import Realtime
 from hilctl.machine.timer_latency import Latency, measure
 
 SOURCE = Path(__file__).with_suffix(".c")

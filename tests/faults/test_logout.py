@@ -10,7 +10,7 @@ import time
 import pytest
 
 from hilctl.recording.reader import read
-from hilctl.run.orphans import recover_orphans
+from hilctl.run.recovery import recover_dead_runs
 from hilctl.run.run_folder import base_folder, runs
 from tests.faults.test_daemon import await_state, hilctl, start, stop_all
 
@@ -47,7 +47,7 @@ def test_a_supervisor_that_crashes_afterwards_loses_no_sample(logged_out):
     while run.alive or not any(base_folder().glob("*/run.json")):
         assert time.monotonic() < deadline
         time.sleep(0.01)
-    (orphan,) = recover_orphans()
+    (orphan,) = recover_dead_runs()
     assert orphan.safe
     recording = read(logged_out)
     assert recording.end["reason"] == "stopped because the supervisor died"

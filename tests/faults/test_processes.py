@@ -15,9 +15,9 @@ import yaml
 
 from hilctl.analysis.replay import replay
 from hilctl.recording.reader import read
-from hilctl.run.orphans import recover_orphans
+from hilctl.run.recovery import recover_dead_runs
 from hilctl.run.run_folder import runs
-from hilctl.run.shared_page import SIZE
+from hilctl.run.shared.shared_page import SIZE
 from tests.benchmark.other_reader import is_installed
 from tests.fakes import loop_of
 
@@ -190,7 +190,7 @@ def test_both_processes_dead_is_told_and_recovered(tmp_path):
     os.kill(run.loop, signal.SIGKILL)
     run.process.kill()
     run.process.communicate()
-    (orphan,) = recover_orphans()
+    (orphan,) = recover_dead_runs()
     assert not orphan.safe
     assert "NOT confirmed to be safe" in orphan.text
     recording = read(run.output)

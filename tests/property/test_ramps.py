@@ -12,8 +12,8 @@ from hilctl.analysis.replay import replay
 from hilctl.base.samples import COLUMNS, BlockHeader, Flag, Samples
 from hilctl.base.yaml import Document
 from hilctl.experiment.file import Experiment
-from hilctl.loop.conditioning import Conditioning
-from hilctl.loop.host import Tuning
+from hilctl.loop.lead_in import Conditioning
+from hilctl.loop.tuning import Tuning
 from hilctl.recording.reader import read
 from hilctl.recording.recording import ReplayStart
 from tests.fakes import FakeClock, FakeDevice, FakeFifoDevice

@@ -8,7 +8,7 @@ import pytest
 
 from hilctl.analysis.replay import replay
 from hilctl.base.errors import DataError
-from hilctl.loop.host import Tuning
+from hilctl.loop.tuning import Tuning
 from hilctl.recording import reader
 from hilctl.recording.reader import RecordingStream, read
 from hilctl.run import unpaced

@@ -12,7 +12,7 @@ from hilctl.experiment.coil_heat import CoolingCoil
 from hilctl.experiment.history import heat_after, heat_before
 from hilctl.recording.reader import read
 from hilctl.recording.recording import Recording
-from hilctl.run.orphans import recover_orphans
+from hilctl.run.recovery import recover_dead_runs
 from hilctl.run.result import RunResult
 from hilctl.run.start import OnPart, RunKey, StepStoppedError, paced
 from hilctl.studies.campaign.plan import CampaignPlan, PlannedStep, planned
@@ -201,7 +201,7 @@ def prepared(folder: Path, host: CampaignHost) -> Iterator[None]:
     """
     with held_folder(folder, host.sleep_s):
         await_runs(folder, host.sleep_s)
-        for orphan in recover_orphans():
+        for orphan in recover_dead_runs():
             host.on_note(f"{orphan.name} was not recorded to its end: {orphan.text}")
         for text in make_whole(folder):
             host.on_note(text)

@@ -7,7 +7,7 @@ import pytest
 
 from hilctl.analysis.process_table import processes_of, usage_text
 from hilctl.base.errors import DataError
-from hilctl.machine.process_usage import ProcessUsage
+from hilctl.machine.procfs import ProcessUsage
 from hilctl.recording.metadata_keys import USAGE_FACT
 from hilctl.run.metadata import usage_facts
 

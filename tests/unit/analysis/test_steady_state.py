@@ -9,8 +9,7 @@ from hilctl.analysis.report import summarize
 from hilctl.analysis.steady_state import steady_part
 from hilctl.base.events import TUNED, Event
 from hilctl.base.segments import Segment
-from hilctl.loop.host import Tuning
-from hilctl.loop.tuning import ReferenceTuner
+from hilctl.loop.tuning import ReferenceTuner, Tuning
 
 PERIOD = 100
 CYCLES = 20

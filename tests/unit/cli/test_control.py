@@ -51,10 +51,10 @@ def test_stop_all_reports_each_run(answering, capsys):
         return [stopped(ended=name == "a", name=name) for name in runs]
 
     answering.setattr("hilctl.cli.control.stop_runs", stop_runs)
-    answering.setattr("hilctl.cli.control.going_on", lambda: ["a", "b"])
+    answering.setattr("hilctl.cli.control.active_runs", lambda: ["a", "b"])
     assert call("stop", ["--all", "--json"]) == 3
     assert [each["ended"] for each in json.loads(capsys.readouterr().out)["runs"]] == [True, False]
-    answering.setattr("hilctl.cli.control.going_on", list)
+    answering.setattr("hilctl.cli.control.active_runs", list)
     assert call("stop", ["--all"]) == 0
     assert chosen == [(["a", "b"], 60.0), ([], 60.0)]
     with pytest.raises(InputError, match="--all or --run"):

@@ -13,8 +13,8 @@ import typer
 from hilctl.base.errors import InputError
 from hilctl.cli import run as module
 from hilctl.cli.run import LiveView, check, print_run, report_of, run, run_mapping, safe
-from hilctl.run.by_hand import SafeResult
 from hilctl.run.result import RunResult
+from hilctl.run.safety.manual_safe import SafeResult
 
 DEMO = Path(__file__).parents[3] / "configs" / "demo.yaml"
 
@@ -67,7 +67,7 @@ def test_check_prints_the_forecast(capsys):
 @pytest.mark.parametrize("as_json", [True, False])
 def test_unconfirmed_safe_value_has_exit_code_3(monkeypatch, capsys, as_json):
     put = SafeResult("a device", 0.0, "A", "unknown", "no answer")
-    monkeypatch.setattr("hilctl.run.by_hand.put_safe", lambda path, settings: put)
+    monkeypatch.setattr("hilctl.run.safety.manual_safe.put_safe", lambda path, settings: put)
     with pytest.raises(typer.Exit) as left:
         safe(DEMO, as_json=as_json)
     assert left.value.exit_code == 3
@@ -78,7 +78,7 @@ def test_unconfirmed_safe_value_has_exit_code_3(monkeypatch, capsys, as_json):
 
 def test_confirmed_safe_value_is_printed(monkeypatch, capsys):
     put = SafeResult("a device", 0.25, "A", "confirmed", "")
-    monkeypatch.setattr("hilctl.run.by_hand.put_safe", lambda path, settings: put)
+    monkeypatch.setattr("hilctl.run.safety.manual_safe.put_safe", lambda path, settings: put)
     safe(DEMO)
     assert "0.25 A" in capsys.readouterr().out
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hilctl.experiment.linear_bypass import LineEnds, fade_refusal
-from hilctl.loop.host import LinearBypass
+from hilctl.loop.tuning import LinearBypass
 
 REFERENCE = 10.0 + 5.0 * np.sin(np.arange(1000) / 50.0)
 

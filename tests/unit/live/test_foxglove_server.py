@@ -21,9 +21,9 @@ from hilctl.base.errors import InputError, RunError
 from hilctl.base.samples import BlockHeader
 from hilctl.live.foxglove_server import FoxgloveServer
 from hilctl.run.metadata import RunDescription
-from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import run_folder
-from hilctl.run.shared_page import PageField, Phase
+from hilctl.run.shared.ring import SampleRing
+from hilctl.run.shared.shared_page import PageField, Phase
 from hilctl.run.start import checked_experiment
 
 DEMO = Path(__file__).parents[3] / "configs" / "demo.yaml"

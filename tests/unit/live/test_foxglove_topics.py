@@ -14,9 +14,9 @@ from hilctl.live.foxglove_topics import DIAGNOSTICS, DIAGNOSTICS_SCHEMA, MESSAGE
 from hilctl.live.run_reader import RunReader
 from hilctl.recording.schema import TOPICS, message_class
 from hilctl.run.metadata import RunDescription
-from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import run_folder
-from hilctl.run.shared_page import PageField, Phase
+from hilctl.run.shared.ring import SampleRing
+from hilctl.run.shared.shared_page import PageField, Phase
 from hilctl.run.start import checked_experiment
 
 CONFIGS = Path(__file__).parents[3] / "configs"

@@ -6,8 +6,8 @@ import pytest
 
 from hilctl.live.run_list import RunList
 from hilctl.run.metadata import RunDescription
-from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import run_folder
+from hilctl.run.shared.ring import SampleRing
 from hilctl.run.start import checked_experiment
 
 DEMO = Path(__file__).parents[3] / "configs" / "demo.yaml"

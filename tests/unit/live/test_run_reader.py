@@ -11,11 +11,11 @@ from hilctl.base.events import Event
 from hilctl.base.samples import BlockBatch, BlockHeader
 from hilctl.live.run_reader import EDGES_US, LatenessCounts, LiveErrorSpectrum, RunReader
 from hilctl.live.signals import ROW, SIGNALS, Traces
-from hilctl.loop.plan import LoopOutcome
+from hilctl.loop.safe_output import LoopOutcome
 from hilctl.run.metadata import RunDescription
-from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import run_folder
-from hilctl.run.shared_page import PageField, Phase, Stop
+from hilctl.run.shared.ring import SampleRing
+from hilctl.run.shared.shared_page import PageField, Phase, Stop
 from hilctl.run.start import checked_experiment
 
 DEMO = Path(__file__).parents[3] / "configs" / "demo.yaml"

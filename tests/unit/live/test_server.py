@@ -16,9 +16,9 @@ from hilctl.live import server as module
 from hilctl.live.auth import MOST_PENDING
 from hilctl.live.server import FILES, LiveServer, file_response
 from hilctl.run.metadata import RunDescription
-from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import run_folder
-from hilctl.run.shared_page import PageField, Phase
+from hilctl.run.shared.ring import SampleRing
+from hilctl.run.shared.shared_page import PageField, Phase
 from hilctl.run.start import checked_experiment
 
 DEMO = Path(__file__).parents[3] / "configs" / "demo.yaml"
@@ -30,7 +30,7 @@ def description():
 
 
 @contextmanager
-def going_on(description, tmp_path):
+def active_runs(description, tmp_path):
     with run_folder("demo", tmp_path / "a.mcap", 12.0) as (folder, _):
         description.write(folder.description)
         ring = SampleRing.create(folder.ring, slots=16, block=50, state_size=1)
@@ -93,7 +93,7 @@ def test_a_page_gets_frames_and_where_the_run_stands(description, tmp_path):
                 pass
             return status, frame
 
-    with going_on(description, tmp_path) as folder:
+    with active_runs(description, tmp_path) as folder:
         status, frame = asyncio.run(seen())
         assert (status["run"], status["state"]) == (folder.card.name, "running")
     assert b'"signals": 6' in frame
@@ -108,7 +108,7 @@ def test_stop_goes_the_way_of_hilctl_stop_and_is_acknowledged(description, tmp_p
             await status_of(connection)
             return await answer_to(connection, ask="stop")
 
-    with going_on(description, tmp_path) as folder:
+    with active_runs(description, tmp_path) as folder:
         assert asyncio.run(pressed())["ok"]
         assert stopped == [folder]
 
@@ -133,7 +133,7 @@ def test_requests_go_to_the_control_socket_and_refusals_come_back(
             yes = await answer_to(connection, ask="run", request=mark)
             return yes, await answer_to(connection, ask="run", request={"command": "set"})
 
-    with going_on(description, tmp_path) as folder:
+    with active_runs(description, tmp_path) as folder:
         yes, no = asyncio.run(answers())
         assert asked[0] == (folder.socket, {"command": "mark", "text": "tap"})
     assert (yes["ok"], yes["sample"]) == (True, 5)
@@ -149,7 +149,7 @@ def test_a_window_of_no_length_does_not_end_the_server(description, tmp_path):
             refused = await answer_to(connection, ask="view", view={"mode": "roll", "window_s": 0})
             return refused, await status_of(connection)
 
-    with going_on(description, tmp_path):
+    with active_runs(description, tmp_path):
         refused, status = asyncio.run(shown())
     assert not refused["ok"]
     assert status["state"] == "running"

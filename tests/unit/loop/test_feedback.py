@@ -160,7 +160,7 @@ class TestPolarity:
         feedback = loop(bandwidth_hz, limit_um)
         plant(feedback, gain=-1.0, reference=self.STILL)
         assert abs(feedback.correction_um) == limit_um
-        assert feedback.against.startswith(f"the correction grew to its limit of {limit_um:g} µm")
+        assert f"limit of {limit_um:g} µm" in feedback.against
 
     @pytest.mark.parametrize("frequency_hz", [1.0, 5.0, 50.0])
     @pytest.mark.parametrize("bandwidth_hz", [2.0, 20.0, 200.0])

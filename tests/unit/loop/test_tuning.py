@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 
 from hilctl.base.events import INVERSE, TUNED
 from hilctl.base.samples import Flag
-from hilctl.loop.host import LinearBypass, Tuning
-from hilctl.loop.tuning import ReferenceTuner, tune
+from hilctl.loop.tuning import LinearBypass, ReferenceTuner, Tuning, tune
 
 
 def tuned(tuner, values, out):

@@ -9,8 +9,7 @@ from rich.console import Console
 from hilctl.cli.devices import render_diagnosis
 from hilctl.machine.diagnosis import Diagnosis, examine, machine_facts
 from hilctl.machine.procfs import Finding
-from hilctl.machine.rt_setup import SetUpStep
-from hilctl.machine.settings import Realtime
+from hilctl.machine.rt_setup import Realtime, SetUpStep
 from hilctl.machine.timer_latency import Latency
 
 MS = 1_000_000

@@ -1,8 +1,10 @@
 """What is read of a machine's files, and what is said where they are absent or strange."""
 
+import mmap
+
 import pytest
 
-from hilctl.machine.procfs import Machine
+from hilctl.machine.procfs import Machine, ProcessUsage
 
 LIMITS = """\
 Limit                     Soft Limit           Hard Limit           Units
@@ -59,3 +61,26 @@ def test_limits_are_soft_ones(written):
 def test_patterns_give_absolute_paths_in_order(written):
     machine = written(cpu__1="", cpu__0="")
     assert machine.glob("/proc/cpu/*") == ["/proc/cpu/0", "/proc/cpu/1"]
+
+
+PAGES = 64
+
+
+def test_pages_and_time_are_counted():
+    """Touching a page for the first time is a fault, and keeps it resident."""
+    before = ProcessUsage.now()
+    with mmap.mmap(-1, PAGES * mmap.PAGESIZE) as memory:
+        memory.madvise(mmap.MADV_NOHUGEPAGE)
+        for page in range(PAGES):
+            memory[page * mmap.PAGESIZE] = 1
+        after = ProcessUsage.now()
+    taken = after.since(before)
+    assert taken.minor_faults >= PAGES
+    assert taken.cpu_ns > 0
+    assert taken.resident_bytes == after.resident_bytes
+    assert after.resident_bytes - before.resident_bytes >= PAGES * mmap.PAGESIZE // 2
+
+
+def test_the_difference_is_of_all_that_adds_up():
+    before, after = ProcessUsage(9, 10, 20, 30, 40), ProcessUsage(7, 11, 22, 33, 44)
+    assert after.since(before) == ProcessUsage(7, 1, 2, 3, 4)

@@ -10,8 +10,7 @@ from hilctl.base.errors import InputError, RunError
 from hilctl.loop.pacer import LateRules, Pacer
 from hilctl.machine import timer_latency as module
 from hilctl.machine.diagnosis import lateness_counts
-from hilctl.machine.rt_setup import SetUpStep
-from hilctl.machine.settings import Realtime
+from hilctl.machine.rt_setup import Realtime, SetUpStep
 from hilctl.machine.timer_latency import Latency, measure, watch
 from tests.fakes import FakeClock
 

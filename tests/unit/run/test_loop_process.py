@@ -17,21 +17,22 @@ import pytest
 from hilctl.base.errors import DeviceError, InputError, RunError
 from hilctl.base.samples import BlockHeader, Flag
 from hilctl.loop.compensator import Compensator
-from hilctl.loop.host import LinearBypass, Tuning
 from hilctl.loop.interlocks import InterlockContext
 from hilctl.loop.limiter import CommandLimits
 from hilctl.loop.loop import Loop
 from hilctl.loop.pacer import Lateness, LateRules
-from hilctl.loop.plan import LoopOutcome, LoopPlan
-from hilctl.machine.process_usage import ProcessUsage
+from hilctl.loop.plan import LoopPlan
+from hilctl.loop.safe_output import LoopOutcome
+from hilctl.loop.tuning import LinearBypass, Tuning
+from hilctl.machine.procfs import ProcessUsage
 from hilctl.machine.rt_setup import SetUpStep
 from hilctl.run import loop_process
-from hilctl.run import ring as ring_module
 from hilctl.run.job import Job
 from hilctl.run.loop_process import RingHost
-from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import RunCard, RunFolder
-from hilctl.run.shared_page import PageField, PageSlot, Phase, Stop
+from hilctl.run.shared import ring as ring_module
+from hilctl.run.shared.ring import SampleRing
+from hilctl.run.shared.shared_page import PageField, PageSlot, Phase, Stop
 from hilctl.run.start import checked_experiment
 from tests.fakes import FakeClock, FakeDevice
 from tests.published import terfenol_rdpi
@@ -182,7 +183,7 @@ def test_real_time_that_is_required_is_refused_before_the_device_is_opened(prepa
     if not required:
         assert made.run() == OUTCOME
         return
-    with pytest.raises(InputError, match="real time is required and can't be had"):
+    with pytest.raises(InputError, match="real time is required"):
         made.run()
     assert made.device.events == ["prepare"]
 
@@ -281,7 +282,7 @@ OF_OTHERS = ("scipy.special", "mcap", "google.protobuf", "rich", "typer")
         ("hilctl.run.loop_process, hilctl_drivers.modbus.modbus_dac", BULKY + OF_OTHERS),
         ("hilctl.run.loop_process, hilctl_drivers.simulated.devices", BULKY + OF_OTHERS[1:]),
         ("hilctl.cli.run", BULKY),
-        ("hilctl.run.client", (*BULKY, *OF_OTHERS, "numpy", "pydantic")),
+        ("hilctl.run.control.client", (*BULKY, *OF_OTHERS, "numpy", "pydantic")),
     ],
     ids=["loop", "simulated loop", "supervisor", "client"],
 )

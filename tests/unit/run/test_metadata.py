@@ -14,7 +14,7 @@ from hilctl.base.events import TUNED, Event
 from hilctl.base.samples import COLUMNS, Flag
 from hilctl.base.segments import Segment
 from hilctl.loop.pacer import Lateness
-from hilctl.loop.plan import LoopOutcome
+from hilctl.loop.safe_output import LoopOutcome
 from hilctl.recording.metadata_keys import END_FIGURES
 from hilctl.recording.reader import read
 from hilctl.recording.validation import labels_of
@@ -27,7 +27,7 @@ from hilctl.run.metadata import (
     run_facts,
     setting_rows,
 )
-from hilctl.run.shared_page import SIZE, SharedPage
+from hilctl.run.shared.shared_page import SIZE, SharedPage
 from hilctl.run.start import checked_experiment
 
 EXPERIMENT = Path(__file__).parents[3] / "configs" / "demo.yaml"

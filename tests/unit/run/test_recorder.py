@@ -17,14 +17,14 @@ from hilctl.base.errors import InputError
 from hilctl.base.events import Event
 from hilctl.base.samples import BlockBatch, BlockHeader
 from hilctl.experiment.device_state import read_device_state
-from hilctl.loop.plan import LoopOutcome
+from hilctl.loop.safe_output import LoopOutcome
 from hilctl.recording.reader import read
 from hilctl.recording.run_summary import read_ends
 from hilctl.recording.writer import OutputFile, PendingFile
 from hilctl.run import recorder
 from hilctl.run.recorder import RecentSamples, Recorder, RingRecorder, steady_unix_ns
-from hilctl.run.ring import SampleRing
-from hilctl.run.shared_page import PageField
+from hilctl.run.shared.ring import SampleRing
+from hilctl.run.shared.shared_page import PageField
 from hilctl.run.start import checked_experiment
 from tests.fakes import FailingFile
 
@@ -303,7 +303,7 @@ def test_a_recording_that_is_deleted_before_the_start_is_refused(on_a_disk):
     shutil.rmtree(on_a_disk.path.parent)
     with pytest.raises(InputError, match="the file was deleted or renamed"):
         on_a_disk.begin(10**18, {})
-    on_a_disk.give_back()
+    on_a_disk.discard()
 
 
 ENDED = LoopOutcome("completed", "waveform completed", 8, "confirmed", 0)

@@ -8,19 +8,23 @@ import shutil
 import socket
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 
 from hilctl.base.errors import InputError, RunError
 from hilctl.run import run_folder as run_folder_module
+from hilctl.run.detached import start_detached
 from hilctl.run.run_folder import (
     base_folder,
     held_devices,
     keep_removed,
+    require_linux,
     run_folder,
     runs,
     taken_over,
 )
+from hilctl.run.start import checked_experiment, start_run
 
 
 @pytest.fixture(autouse=True)
@@ -205,7 +209,7 @@ def test_folder_that_can_not_be_made_is_one_message(tmp_path, monkeypatch):
 
     monkeypatch.setattr("pathlib.Path.write_text", full)
     with (
-        pytest.raises(RunError, match="no run's folder can be made: No space left"),
+        pytest.raises(RunError, match="No space left"),
         made(tmp_path),
     ):
         pass
@@ -345,3 +349,28 @@ def test_lock_lives_as_long_as_a_process_that_inherited_it():
     child.communicate(b"\n", timeout=30)
     with held_devices((name,)):
         pass
+
+
+@pytest.mark.parametrize("machine", ["x86_64", "aarch64", "riscv64"])
+def test_linux_may_run_on_any_processor(monkeypatch, machine):
+    monkeypatch.setattr("platform.machine", lambda: machine)
+    require_linux()
+
+
+@pytest.mark.parametrize("system", ["darwin", "win32"])
+def test_another_system_is_refused_in_one_line(monkeypatch, system):
+    monkeypatch.setattr(run_folder_module, "sys", SimpleNamespace(platform=system))
+    with pytest.raises(InputError, match=f"needs Linux, this is {system}: report, replay") as no:
+        require_linux()
+    assert "\n" not in str(no.value)
+
+
+def test_runs_are_refused_before_the_file_is_read(monkeypatch, tmp_path):
+    monkeypatch.setattr(run_folder_module, "sys", SimpleNamespace(platform="darwin"))
+    absent = tmp_path / "absent.yaml"
+    with pytest.raises(InputError, match="needs Linux"):
+        start_run(absent, [], None, overwrite=False, on_progress=print)
+    with pytest.raises(InputError, match="needs Linux"):
+        start_detached(absent, [], None, [])
+    with pytest.raises(InputError, match=r"absent\.yaml"):  # an experiment can be checked
+        checked_experiment(absent, [])

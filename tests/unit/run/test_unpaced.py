@@ -135,8 +135,8 @@ def test_a_run_from_elsewhere_ramps_in_and_is_replayed(tmp_path, output):
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        (["device.output_at_open=null"], "safe.at_start: is required"),
-        (["device.output_at_open=30.0"], "puts out 30 A"),
+        (["device.output_at_open=null"], "safe.at_start is required"),
+        (["device.output_at_open=30.0"], "output is 30 A"),
     ],
 )
 def test_a_start_that_is_not_known_or_can_not_be_is_refused(tmp_path, settings, words):

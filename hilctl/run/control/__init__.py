@@ -1,0 +1,1 @@
+"""Requests to a running supervisor: socket, validation and client."""

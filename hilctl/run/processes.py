@@ -1,0 +1,288 @@
+"""The child processes of a supervisor: loop and guardian; guardians of earlier runs."""
+
+import logging
+import os
+import select
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, suppress
+from typing import Any
+
+from hilctl.base.errors import InputError, RunError
+from hilctl.run.run_folder import RunFolder, locked_run, runs
+from hilctl.run.shared.ring import SampleRing, safe_result_of
+from hilctl.run.shared.shared_page import GuardianPhase, PageField, PageSlot, Phase, SharedPage
+
+_log = logging.getLogger(__name__)
+
+_READY_TIMEOUT_S = 120.0
+_DEATH_S = 0.1
+_END_S = 1.0
+_ACT_S = 10.0
+_POLL_S = 0.01
+
+
+def start_process(
+    module: str, *words: str, inherits: Sequence[int], stderr: Any = None
+) -> "subprocess.Popen[bytes]":
+    """Start a module as a process of the run.
+
+    Args:
+        module: Its dotted name.
+        words: Its arguments.
+        inherits: Descriptors that it keeps open, such as those of locks.
+        stderr: File of its standard error; the supervisor's if None.
+
+    Raises:
+        OSError: It cannot be started.
+    """
+    return subprocess.Popen(
+        [sys.executable, "-P", "-m", module, *words],  # -P: import nothing from the working folder
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,  # otherwise a reader of the supervisor's waits for this process
+        stderr=stderr,
+        start_new_session=True,  # the supervisor handles Ctrl-C in the terminal
+        pass_fds=inherits,
+    )
+
+
+class ChildProcess:
+    """A started process of a run.
+
+    Args:
+        process: The process.
+    """
+
+    def __init__(self, process: "subprocess.Popen[bytes]") -> None:
+        self._process = process
+
+    @property
+    def pid(self) -> int:
+        """Its process number."""
+        return self._process.pid
+
+    @property
+    def ended(self) -> bool:
+        """Whether the process has ended."""
+        return self._process.poll() is not None
+
+    def kill(self, wait_s: float = _DEATH_S) -> None:
+        """Kill it; do not wait for a process that is blocked in the kernel.
+
+        Args:
+            wait_s: Longest wait for its end.
+        """
+        self._process.kill()
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(wait_s)
+
+
+class LoopProcess(ChildProcess):
+    """The loop process of one run; see :mod:`hilctl.run.loop_process`.
+
+    Args:
+        folder: The run's folder, with its job.
+        page: Shared with it.
+        inherits: Descriptors of the locks that it holds.
+
+    Raises:
+        RunError: It cannot be started.
+    """
+
+    def __init__(self, folder: RunFolder, page: SharedPage, inherits: Sequence[int]) -> None:
+        self._page = page
+        try:
+            process = start_process("hilctl.run.loop_process", str(folder.job), inherits=inherits)
+        except OSError as error:
+            raise RunError(f"cannot start the loop process: {error.strerror}") from None
+        super().__init__(process)
+
+    def await_ready(self, stopped: Callable[[], bool]) -> None:
+        """Wait until it is ready for the start signal.
+
+        Args:
+            stopped: Whether a stop has been requested.
+
+        Raises:
+            InputError: It refuses the job; nothing has moved.
+            RunError: It failed; nothing has moved.
+        """
+        page = self._page
+        deadline = time.monotonic() + _READY_TIMEOUT_S
+        while page.observe(PageField.PHASE) == Phase.STARTING and not self.ended:
+            if stopped():
+                raise RunError("stopped before the start; nothing has moved")
+            if time.monotonic() > deadline:
+                raise RunError(f"the loop was not ready within {_READY_TIMEOUT_S:g} s")
+            time.sleep(_POLL_S)
+        if page.observe(PageField.PHASE) == Phase.REFUSED:
+            raise InputError(page.read_text(PageSlot.ERROR))
+        if page.observe(PageField.PHASE) == Phase.FAILED:
+            raise RunError(page.read_text(PageSlot.ERROR))
+        if page.observe(PageField.PHASE) != Phase.READY:
+            raise RunError(f"the loop process died before the start: {self._death()}")
+
+    def death(self) -> str:
+        """Return why it left no outcome."""
+        if self._page.observe(PageField.PHASE) == Phase.FAILED:
+            return self._page.read_text(PageSlot.ERROR)
+        return f"the loop process died: {self._death()}"
+
+    def _death(self) -> str:
+        code = self._process.poll()
+        if code is None:
+            return "it cannot be killed: it is blocked in the kernel"
+        return f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+
+
+class GuardianProcess(ChildProcess):
+    """The guardian of one run; see :mod:`hilctl.run.safety.guardian`.
+
+    Args:
+        folder: The run's folder, with its job and ring.
+        page: Shared with it.
+        inherits: Descriptors of the locks that it holds.
+        loop: Process number of the loop to watch; None to act immediately.
+
+    Raises:
+        OSError: It cannot be started.
+    """
+
+    def __init__(
+        self, folder: RunFolder, page: SharedPage, inherits: Sequence[int], loop: int | None
+    ) -> None:
+        self._page = page
+        page.put(PageField.GUARDIAN_PHASE, GuardianPhase.STARTING)
+        page.put(PageField.GUARDIAN_HEARTBEAT_NS, 0)
+        self._log = folder.guardian_log
+        with ExitStack() as stack:
+            watched = []
+            if loop is not None:
+                watched.append(os.pidfd_open(loop))
+                stack.callback(os.close, watched[0])
+            process = start_process(
+                "hilctl.run.safety.guardian",
+                str(folder.job),
+                *(["act"] if loop is None else [str(watched[0]), str(loop)]),
+                inherits=(*inherits, *watched),
+                stderr=stack.enter_context(self._log.open("wb")),
+            )
+        super().__init__(process)
+
+    @property
+    def phase(self) -> GuardianPhase:
+        """Its phase."""
+        return GuardianPhase(self._page.get(PageField.GUARDIAN_PHASE))
+
+    @property
+    def heartbeat_ns(self) -> int:
+        """Time of its last heartbeat, monotonic; 0 before the first."""
+        return self._page.get(PageField.GUARDIAN_HEARTBEAT_NS)
+
+    @property
+    def error(self) -> str:
+        """Why it does not act."""
+        if not self.ended and self.phase != GuardianPhase.FAILED:
+            return "it does not start"
+        if self.phase == GuardianPhase.FAILED:
+            return self._page.read_text(PageSlot.GUARDIAN)
+        with suppress(OSError):
+            *_, last = self._log.read_text(encoding="utf-8", errors="replace").splitlines() or [""]
+            return f"it died: {last}" if last else "it died"
+        return "it died"
+
+    def await_acting(self, stopped: Callable[[], bool] = lambda: False) -> bool:
+        """Wait until it drives the device; return False if it does not within 10 s.
+
+        Args:
+            stopped: Whether the user ends the wait.
+        """
+        deadline_s = time.monotonic() + _ACT_S
+        while not self.ended and time.monotonic() < deadline_s and not stopped():
+            if self.phase in {GuardianPhase.ACTING, GuardianPhase.DONE}:
+                return True
+            time.sleep(_POLL_S)
+        return False
+
+    def end(self) -> None:
+        """Wait briefly for its end, which follows the loop's; otherwise kill it."""
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(_END_S)
+            return
+        self.kill()
+
+
+class GuardianRelief:
+    """Stop guardians of earlier runs that still drive a device.
+
+    Args:
+        holds: Resources of the device, as :attr:`hilctl.base.device.DeviceInfo.holds`.
+
+    Attributes:
+        runs: The runs whose guardians were stopped.
+    """
+
+    def __init__(self, holds: Sequence[str]) -> None:
+        self.runs = [
+            run
+            for run in (runs() if holds else [])
+            if set(holds) & set(run.card.holds) and safe_result_of(run)
+        ]
+        for run in self.runs:
+            signal_guardian(run, signal.SIGKILL, _END_S)
+
+    def resume(self, inherits: Sequence[int]) -> None:
+        """Start them again, and wait until they act: their outputs are not safe yet.
+
+        Commands that follow can then find, stop or relieve them.
+
+        Args:
+            inherits: Descriptors of the devices' locks.
+        """
+        for run in self.runs:
+            try:
+                with locked_run(run) as lock:
+                    page = SampleRing(run.ring).page
+                    guardian = GuardianProcess(run, page, [*inherits, lock], None)
+                error = "" if guardian.await_acting() else guardian.error
+            except (OSError, ValueError) as failure:
+                error = str(failure)
+            if error:
+                _log.error("the guardian of %s cannot be started again: %s", run.card.name, error)
+
+    def discard(self) -> None:
+        """Remove their folders: another process drives the device."""
+        for run in self.runs:
+            with suppress(OSError, ValueError):
+                if SampleRing(run.ring, look_only=True).page.get(PageField.RECORDED):
+                    run.remove()
+
+
+def signal_guardian(run: RunFolder, number: int, wait_s: float = 0.0) -> bool:
+    """Send a signal to the guardian of a run; return whether there was one.
+
+    Args:
+        run: The run.
+        number: The signal.
+        wait_s: Longest wait for its end.
+    """
+    try:
+        guardian = os.pidfd_open(
+            SampleRing(run.ring, look_only=True).page.get(PageField.GUARDIAN_PID)
+        )
+    except (OSError, ValueError):
+        return False  # it has just ended
+    try:
+        # Checked after opening it: while the lock is held, the number is not reused.
+        if not run.alive:
+            return False
+        signal.pidfd_send_signal(guardian, number)
+        select.select([guardian], [], [], wait_s)
+    except ProcessLookupError:
+        return False
+    finally:
+        os.close(guardian)
+    return True

@@ -1,0 +1,153 @@
+"""Recovery of dead runs: samples left in memory are added to their recordings."""
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from hilctl.base.errors import HilctlError
+from hilctl.base.events import Event
+from hilctl.base.samples import BlockBatch, BlockHeader
+from hilctl.loop.safe_output import LoopOutcome, describe
+from hilctl.recording.locks import is_being_recorded
+from hilctl.recording.recover import recover_recording
+from hilctl.run.metadata import end_facts
+from hilctl.run.run_folder import RunFolder, runs, taken_over
+from hilctl.run.shared.ring import SampleRing
+from hilctl.run.shared.shared_page import PageField, PageSlot, Phase
+
+
+@dataclass(frozen=True, slots=True)
+class RecoveredRun:
+    """A dead run that another command has finished.
+
+    Attributes:
+        name: The run's name.
+        recording: Its recording.
+        safe: Whether loop or guardian confirmed the safe value.
+        text: Description of the result.
+        kept: Folder of samples that were not recovered; None if all were.
+        started: Whether the loop had started; otherwise nothing has moved.
+    """
+
+    name: str
+    recording: Path
+    safe: bool
+    text: str
+    kept: Path | None = None
+    started: bool = True
+
+
+def recover_dead_runs() -> list[RecoveredRun]:
+    """Finish the recordings of all dead runs of this user, and remove their folders."""
+    found = []
+    for run in runs():
+        if run.alive:
+            continue
+        with taken_over(run) as ours, _undisturbed():
+            if ours:
+                found.append(recovered := _recover(run))
+                if recovered.kept is None:
+                    run.remove()
+    return found
+
+
+def _recover(run: RunFolder) -> RecoveredRun:
+    path = Path(run.card.recording)
+    if not _has_started(run, path):
+        _remove_claimed(path)
+        return RecoveredRun(run.card.name, path, True, "nothing has moved", started=False)
+    outcome, batches, events, end = _left_behind(run)
+    where = "at its safe value" if outcome.safe else "NOT confirmed to be safe: check it"
+    if _is_recorded(run):
+        return RecoveredRun(run.card.name, path, outcome.safe, f"{outcome.reason}; output {where}")
+    try:
+        recovered = recover_recording(path, batches, end, events=events, ended_at=outcome.ended_at)
+        text = f"{outcome.reason}; output {where}; {recovered.samples} samples: {recovered.reason}"
+    except (HilctlError, OSError) as error:
+        text = f"{outcome.reason}; output {where}; its recording could not be recovered: {error}"
+        return RecoveredRun(run.card.name, path, outcome.safe, text, run.path)
+    return RecoveredRun(run.card.name, path, outcome.safe, text)
+
+
+def _is_recorded(run: RunFolder) -> bool:
+    """Return whether the supervisor had closed the recording."""
+    try:
+        return bool(SampleRing(run.ring).page.get(PageField.RECORDED))
+    except (OSError, ValueError):
+        return False
+
+
+def _has_started(run: RunFolder, recording: Path) -> bool:
+    try:
+        page = SampleRing(run.ring).page
+    except (OSError, ValueError):  # the ring is created before the recording is written
+        return not (recording.is_file() and recording.stat().st_size == 0)
+    return bool(page.get(PageField.GO) or page.get(PageField.SENT))
+
+
+def _remove_claimed(recording: Path) -> None:
+    """Remove the empty file of a run unless another run uses it."""
+    with suppress(OSError), recording.open("rb") as stream:
+        if not stream.read(1) and not is_being_recorded(stream):
+            recording.unlink()
+
+
+def _left_behind(
+    run: RunFolder,
+) -> tuple[LoopOutcome, list[BlockBatch], list[Event], dict[str, str]]:
+    """Return the outcome, blocks and events that are only in memory, and metadata of the end."""
+    died = LoopOutcome("fault", "supervisor and loop died", 0, "unknown", 0)
+    try:
+        ring = SampleRing(run.ring)
+    except (OSError, ValueError):
+        return (
+            died,
+            [],
+            [],
+            {
+                "code": died.code,
+                "reason": died.reason,
+                "output_safe": "false",
+                "output_state": died.output,
+            },
+        )
+    batches = []
+    while True:
+        while (batch := ring.pop()) is not None:
+            batches.append(batch)
+        if not ring.skip_damaged():
+            break
+    page = ring.page
+    outcome = page.outcome() or died
+    if page.observe(PageField.PHASE) == Phase.FAILED:
+        outcome = replace(died, reason=page.read_text(PageSlot.ERROR))
+    if not page.ended_safely() and (result := page.safe_result()) is not None:
+        did = f"guardian: {describe(result.output, result.error)}"
+        outcome = replace(outcome, reason=f"{outcome.reason}; {did}", output=result.output)
+    if page.observe(PageField.PHASE) != Phase.ENDED:
+        last = batches[-1].heads[-1] if batches else None
+        next_sample = 0 if last is None else int(last[BlockHeader.FIRST_SAMPLE]) + ring.block
+        if (unanswered := ring.unanswered(next_sample)) is not None:
+            batches.append(unanswered)
+    return (
+        outcome,
+        batches,
+        page.pop_events(),
+        end_facts(outcome, page.lateness(), page.get(PageField.EVENTS_LOST)),
+    )
+
+
+@contextmanager
+def _undisturbed() -> Iterator[None]:
+    """Ignore Ctrl-C between a recovered recording and the removal of its folder."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # only the main thread receives Ctrl-C and may set handlers
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -1,0 +1,167 @@
+"""``hilctl safe``: set a device to its safe value without a run."""
+
+import logging
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hilctl.base.errors import ConfigError, ConfigProblem, RunError
+from hilctl.base.files import TextFiles
+from hilctl.base.yaml import load_document
+from hilctl.experiment.device import made_device
+from hilctl.experiment.file import Safe
+from hilctl.loop.safe_output import (
+    HOLD_S,
+    PATIENCE_S,
+    LocalError,
+    OutputState,
+    SafeGoal,
+    SafeOutput,
+)
+from hilctl.run.processes import GuardianRelief
+from hilctl.run.run_folder import held_devices, runs
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class SafeResult:
+    """Result of setting the safe value.
+
+    Attributes:
+        device: Description of the device.
+        value: The safe value.
+        unit: Its unit, ``A`` or ``V``.
+        output: State of the output.
+        error: Why it is not confirmed; may be empty.
+        guardian_active: Whether the guardian of an earlier run continues.
+    """
+
+    device: str
+    value: float
+    unit: str
+    output: OutputState
+    error: str
+    guardian_active: bool = False
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return the fields as plain values."""
+        return {
+            "device": self.device,
+            "safe_value": self.value,
+            "unit": self.unit,
+            "output_safe": self.output == "confirmed",
+            "output_state": self.output,
+            "error": self.error,
+            "guardian_active": self.guardian_active,
+        }
+
+
+def put_safe(
+    path: Path,
+    settings: Sequence[str],
+    clock: Callable[[], float] = time.monotonic,
+    sleep: Callable[[float], None] = time.sleep,
+) -> SafeResult:
+    """Set the device of an experiment to the experiment's safe value, without a ramp.
+
+    Only these sections of the file are validated. A guardian of an earlier run that drives the
+    device is stopped, and started again if the device does not confirm.
+
+    Args:
+        path: Experiment file.
+        settings: ``key=value`` texts that override it.
+        clock: Monotonic time in s.
+        sleep: Waits that many s.
+
+    Raises:
+        InputError: The file is not valid, or a run holds the device; nothing was sent.
+    """
+    document = load_document(path)
+    for setting in settings:
+        document.set(setting)
+    given = "safe" in document.data
+    safe = document.validate(Safe, at=("safe",)) if given else Safe()
+    device = made_device(document, path.parent, TextFiles())
+    if device is None:
+        raise ConfigError([ConfigProblem(str(path), "device", "is required, with a key kind")])
+    info = device.info
+    died, relief = _earlier_run(info.holds)
+    goal = SafeGoal(safe.value, 1.0, None, pending=died)
+    output = SafeOutput(device, goal, clock)
+    with ExitStack() as stack:
+        locks: list[int] = []
+        try:
+            # Refused while a run holds the device: its loop would overwrite the safe value.
+            locks = _locks(stack, info.holds)
+            _drive(output, clock, sleep, watches=not relief.runs)
+        finally:
+            if output.final:
+                relief.discard()
+            else:
+                relief.resume(locks)
+    return SafeResult(
+        device=info.description,
+        value=safe.value,
+        unit=info.command_unit,
+        output=output.state,
+        error=output.error,
+        guardian_active=bool(relief.runs) and not output.final,
+    )
+
+
+def _earlier_run(holds: Sequence[str]) -> tuple[bool, GuardianRelief]:
+    """Return whether a run of the device has died, and the relief of its guardian.
+
+    A dead run may have left an unanswered command.
+    """
+    try:
+        died = any(not run.supervised and set(run.card.holds) & set(holds) for run in runs())
+        return died, GuardianRelief(holds)
+    except RunError as error:
+        _log.warning("%s: the safe value is written anyway", error)
+        return True, GuardianRelief(())
+
+
+def _locks(stack: ExitStack, holds: Sequence[str]) -> list[int]:
+    """Lock a device; return the descriptors of its locks, none if they cannot be created."""
+    try:
+        return stack.enter_context(held_devices(holds))
+    except RunError as error:  # such as a full /dev/shm: the output must become safe nevertheless
+        _log.warning("%s: the safe value is written anyway", error)
+        return []
+
+
+def _drive(
+    output: SafeOutput,
+    clock: Callable[[], float],
+    sleep: Callable[[float], None],
+    *,
+    watches: bool,
+) -> None:
+    """Write until the state is final, a time limit, or Ctrl-C.
+
+    Args:
+        output: The output.
+        clock: Monotonic time in s.
+        sleep: Waits that many s.
+        watches: Whether to repeat a value that is set until no older command can follow.
+    """
+    give_up_s = clock() + PATIENCE_S
+    try:
+        while True:
+            try:
+                output.attempt()
+            except LocalError as error:
+                output.error = str(error)
+            now_s = clock()
+            if output.final or (output.state == "set" and not watches):
+                return
+            if now_s >= give_up_s + (HOLD_S if output.state == "set" else 0.0):
+                return
+            sleep(output.pause_s)
+    except KeyboardInterrupt:
+        return

@@ -1,0 +1,231 @@
+"""The supervisor's monitor of loop and guardian, which replaces a lost guardian.
+
+The guardian acts by itself if the loop dies or hangs. The supervisor restarts a lost guardian, and
+sets the safe value itself if no guardian can: for a simulated device, or if the guardian died,
+hangs, or cannot drive the device. It kills the guardian first, so that only one process holds the
+device. An output that is not confirmed at the end of the run is left to a guardian.
+"""
+
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
+
+from hilctl.base.errors import RunError
+from hilctl.base.events import Event
+from hilctl.experiment.preflight import CheckedExperiment
+from hilctl.loop.safe_output import PATIENCE_S
+from hilctl.machine.rt_setup import be_ordinary, be_quick
+from hilctl.run.job import safe_priority, silence_limits
+from hilctl.run.processes import GuardianProcess, LoopProcess
+from hilctl.run.safety.guardian import LAST_CALL_MS, HangWatch, SafeAction, is_stopped, safe_goal
+from hilctl.run.shared.ring import SampleRing
+from hilctl.run.shared.shared_page import GuardianPhase, PageField, SafeActionResult
+
+_AWAKE_NS = 50_000_000
+_LOST_NS = 1_000_000_000
+_LOST_LOOKS = 3
+_START_NS = 60_000_000_000
+_AGAIN_NS = 5_000_000_000
+_HAND_OVER_S = 10.0
+_POLL_S = 0.01
+
+
+class SafetyMonitor:
+    """Ensure a safe output after a loop that died or hangs.
+
+    Args:
+        checked: The experiment.
+        ring: Shared with loop and guardian.
+        child: The loop's process.
+        start_guardian: Starts a guardian that watches a process, or acts immediately if None; None
+            if the run needs no guardian.
+        record_event: Records an event.
+    """
+
+    def __init__(
+        self,
+        checked: CheckedExperiment,
+        ring: SampleRing,
+        child: LoopProcess,
+        start_guardian: Callable[[int | None], GuardianProcess] | None,
+        record_event: Callable[[Event], None],
+    ) -> None:
+        self._ring, self._page, self._child = ring, ring.page, child
+        self._device = checked.loaded.device
+        self._limits = limits = checked.loaded.config.command_limits()
+        way = max(limits.high - limits.safe, limits.safe - limits.low)
+        self._patience_ns = round(1e9 * (PATIENCE_S + way / limits.ramp_per_s))
+        self._priority = safe_priority(checked)
+        self._watch = HangWatch(ring.page, silence_limits(checked), lambda: is_stopped(child.pid))
+        self._start_guardian, self._record_event = start_guardian, record_event
+        self._guardian = start_guardian(child.pid) if start_guardian else None
+        self._started_ns: int | None = None
+        self._heartbeat_ns, self._looks = 0, 0
+        self._trouble_ns = 0
+        self._hung = False
+        self._action: SafeAction | None = None
+        self.result: SafeActionResult | None = None
+        """Final result; None while no action was necessary or the action continues."""
+        self.by = ""
+        """Which process acted."""
+
+    def ready(self) -> bool:
+        """Return whether the guardian watches, if the run needs one.
+
+        Raises:
+            RunError: The guardian failed to start.
+        """
+        guardian = self._guardian
+        if guardian is None or guardian.phase == GuardianPhase.WATCHING:
+            return True
+        if guardian.ended:
+            raise RunError(f"the guardian could not be started: {guardian.error}")
+        return False
+
+    def update(self, now_ns: int, *, ended: bool) -> None:
+        """Check loop and guardian, and act if necessary; never wait for device or guardian.
+
+        Args:
+            now_ns: Monotonic time.
+            ended: Whether the loop's process had ended before.
+        """
+        if self.result is not None:
+            return
+        if self._in_trouble(now_ns, ended=ended):
+            self._follow_up(now_ns, ended=ended)
+        elif not ended and self._start_guardian is not None:
+            self._keep_guardian(now_ns)
+
+    def _in_trouble(self, now_ns: int, *, ended: bool) -> bool:
+        if not self._trouble_ns:
+            hung = not ended and self._watch.hangs(now_ns)
+            if hung or (ended and not self._page.ended_safely()):
+                self._trouble_ns, self._hung = now_ns, hung
+        return self._trouble_ns != 0
+
+    def _follow_up(self, now_ns: int, *, ended: bool) -> None:
+        """Follow the process that drives the device; drive it here if the guardian does not."""
+        action = self._action
+        if action is None and not self._guardian_acts(now_ns):
+            be_quick(self._priority)
+            try:
+                self._stand_in()
+            finally:
+                be_ordinary()
+        elif action is not None and action.failed:
+            self._action = None  # retried at the next poll
+        by, result = self._reached()
+        over = now_ns - self._trouble_ns > self._patience_ns
+        # A loop that was killed in a system call ends later.
+        gone = ended or self._action is not None
+        # A guardian watches a value that is set but not confirmed.
+        settled = result is not None and (result.final or result.output == "set")
+        if result is not None and ((settled and gone) or over):
+            self.result, self.by = result, by
+
+    def _reached(self) -> tuple[str, SafeActionResult | None]:
+        if self._action is not None:
+            return "supervisor", self._action.result()
+        return "guardian", self._page.safe_result()
+
+    def _stand_in(self) -> None:
+        # Both before the device is used: neither may write to it afterwards.
+        last_call_s = 1e-3 * LAST_CALL_MS
+        if self._guardian is not None:
+            self._guardian.kill(last_call_s)
+        self._child.kill(last_call_s)
+        # The guardian may have finished just before.
+        result = self._page.safe_result()
+        if result is None or not result.final:
+            limits = self._limits
+            goal = safe_goal(self._ring, self._device, limits.safe, limits.ramp_per_s)
+            prepare = partial(be_quick, self._priority)
+            self._action = SafeAction(
+                self._page, self._device, goal, hung=self._hung, prepare=prepare
+            )
+
+    def _guardian_acts(self, now_ns: int) -> bool:
+        guardian = self._guardian
+        if guardian is None or guardian.ended:
+            return guardian is not None and guardian.phase == GuardianPhase.DONE
+        at_it = guardian.phase in {GuardianPhase.WATCHING, GuardianPhase.ACTING}
+        awake = at_it and now_ns - guardian.heartbeat_ns < _AWAKE_NS
+        return awake or guardian.phase == GuardianPhase.DONE
+
+    def _keep_guardian(self, now_ns: int) -> None:
+        """Replace the guardian if it is lost, and record that."""
+        guardian = self._guardian
+        if self._started_ns is None:
+            self._started_ns = now_ns
+        if guardian is not None:
+            why = "died" if guardian.ended else self._silent(guardian, now_ns)
+            if not why:
+                return
+            guardian.kill(0.0)
+            self._guardian = None
+            self._record(f"the guardian {why}; the supervisor watches until another one is ready")
+        if now_ns - self._started_ns < _AGAIN_NS and self._heartbeat_ns == 0:
+            return  # it has never watched: pause before the next attempt
+        assert self._start_guardian is not None
+        self._started_ns, self._heartbeat_ns = now_ns, 0
+        try:
+            self._guardian = self._start_guardian(self._child.pid)
+        except OSError as error:
+            self._record(f"the guardian cannot be started: {error.strerror}")
+
+    def _silent(self, guardian: GuardianProcess, now_ns: int) -> str:
+        """Return how a live guardian is silent, or an empty text."""
+        heartbeat_ns = guardian.heartbeat_ns
+        if heartbeat_ns != self._heartbeat_ns or heartbeat_ns == 0:
+            self._heartbeat_ns, self._looks = heartbeat_ns, 0
+            starting = heartbeat_ns == 0 and now_ns - (self._started_ns or now_ns) > _START_NS
+            return "does not start" if starting else ""
+        # After a stall of the whole computer the guardian gets time to continue.
+        self._looks += 1
+        lost = self._looks > _LOST_LOOKS and now_ns - heartbeat_ns > _LOST_NS
+        return "is silent" if lost else ""
+
+    def _record(self, text: str) -> None:
+        sample = self._page.get(PageField.NEXT_SAMPLE)
+        self._record_event(Event(sample, "warning", "guardian_lost", text))
+
+    def close(self, stopped: Callable[[], bool] = lambda: False) -> bool:
+        """End the guardian, or leave an unconfirmed output to it.
+
+        Args:
+            stopped: Whether the user ends the attempts of this process.
+
+        Returns:
+            Whether a guardian stays active.
+        """
+        if self.result is None or self.result.final or self._start_guardian is None:
+            if self._guardian is not None:
+                self._guardian.end()
+            return False
+        if self._action is None:
+            return self._guardian is not None and not self._guardian.ended
+        return self._hand_over(stopped)
+
+    def _hand_over(self, stopped: Callable[[], bool]) -> bool:
+        """Hand an unconfirmed output over to a new guardian; continue here until that works."""
+        while self._action is not None and not stopped():
+            self._action.end(_HAND_OVER_S)
+            if self._started_to_act(stopped):
+                return True
+            with suppress(RuntimeError):  # no thread can be started: retried
+                self._stand_in()
+            deadline_s = time.monotonic() + _HAND_OVER_S
+            while time.monotonic() < deadline_s and not stopped() and not self._action.failed:
+                self.result = self._action.result(_POLL_S)
+                if self.result.final:
+                    return False
+        return False
+
+    def _started_to_act(self, stopped: Callable[[], bool]) -> bool:
+        assert self._start_guardian is not None
+        try:
+            guardian = self._guardian = self._start_guardian(None)
+        except OSError:
+            return False
+        return guardian.await_acting(stopped)

@@ -1,0 +1,280 @@
+"""Runs from outside: selection of a run, requests to it, and the signal that stops it."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from hilctl.base.errors import InputError, RunError
+from hilctl.run.control import client
+from hilctl.run.control.client import (
+    STOP_SIGNAL,
+    active_runs,
+    ask,
+    assigned,
+    find_run,
+    finish_dead_runs,
+    mark_run,
+    request_stop,
+    set_run,
+    status_of,
+    stop_runs,
+)
+from hilctl.run.recovery import RecoveredRun
+from tests.fakes import SteppingClock
+
+
+def run(name, *, supervised=True, alive=True):
+    card = SimpleNamespace(name=name, recording="a.mcap", supervisor=1, started=0.0)
+    return SimpleNamespace(
+        card=card, supervised=supervised, alive=alive, socket=f"{name}.sock", ring=Path("none")
+    )
+
+
+@pytest.fixture
+def going(monkeypatch):
+    """Let these runs be active."""
+    return lambda *names: monkeypatch.setattr(client, "runs", lambda: [run(n) for n in names])
+
+
+@pytest.fixture
+def answers(monkeypatch):
+    """Answer every question with a copy of it; return the questions."""
+    sent = []
+
+    def ask(socket, message, **more):
+        sent.append((socket, message))
+        return dict(message)
+
+    monkeypatch.setattr(client, "ask", ask)
+    monkeypatch.setattr(client, "facts_of", lambda run: {"name": run.card.name})
+    return sent
+
+
+@pytest.mark.parametrize(
+    ("name", "found"), [("sine", "sine"), ("sine-", "sine-2"), ("tri", "triangle")]
+)
+def test_a_run_is_found_by_its_name_or_the_beginning_of_it(going, name, found):
+    """A whole name goes before the beginning of another."""
+    going("sine", "sine-2", "triangle")
+    assert find_run(name).card.name == found
+
+
+def test_what_is_not_one_run_is_refused_with_those_there_are(going):
+    going("sine-1", "sine-2")
+    with pytest.raises(InputError, match="sine-1, sine-2"):
+        find_run(None)
+    with pytest.raises(InputError, match="sine-1, sine-2"):
+        find_run("x")
+    going()
+    with pytest.raises(InputError, match="no run is active"):
+        find_run(None)
+
+
+def test_status_is_given_of_runs_that_do_not_answer(answers, monkeypatch):
+    """A supervisor that hangs, one that died before its loop, and a run that is dead."""
+    assert status_of(run("a"))["command"] == "status"
+    dead, left = run("a", supervised=False, alive=False), run("a", supervised=False)
+    assert status_of(dead) == {"name": "a", "state": "dead"}
+    assert status_of(left)["state"] == "ramping down without its supervisor"
+
+    def silent(socket, message):
+        raise RunError("no answer")
+
+    monkeypatch.setattr(client, "ask", silent)
+    assert status_of(run("a")) == {"name": "a", "state": "not answering", "error": "no answer"}
+
+
+def test_all_runs_are_requested_to_stop_before_one_is_waited_for(answers, monkeypatch):
+    """Each says whether it has ended within the time for all, and what kept it from being asked."""
+    done, clock = [], SteppingClock()
+    chosen = [run("a"), run("b"), run("c"), run("d", alive=False)]
+
+    def request(each):
+        done.append(each.card.name)
+        if each.card.name == "c":
+            raise RunError("c: can't be stopped: no right")
+        return each.card.name != "b"
+
+    def sleep(seconds):
+        done.append("sleep")
+        clock.now += seconds
+        chosen[0].alive = False
+
+    monkeypatch.setattr(client, "request_stop", request)
+    stopped = stop_runs(chosen, 0.05, clock, sleep)
+    assert done[:5] == ["a", "b", "c", "d", "sleep"]
+    assert 2 <= done.count("sleep") <= 3
+    assert [(each["name"], each["ended"], each["error"]) for each in stopped] == [
+        ("a", True, ""),
+        ("b", False, "its supervisor is gone"),
+        ("c", False, "c: can't be stopped: no right"),
+        ("d", True, ""),
+    ]
+    assert answers == []
+
+
+def test_only_runs_with_a_supervisor_are_going_on(monkeypatch):
+    found = [run("a"), run("b", supervised=False)]
+    monkeypatch.setattr(client, "runs", lambda: found)
+    assert active_runs() == found[:1]
+
+
+def test_set_sends_what_is_to_change(answers):
+    set_run(run("a"), **assigned(["gain=0.5", "offset=-2"]), over_s=1.5)
+    set_run(run("a"), **assigned(["inverse=out"]))
+    first, second = answers
+    assert first == ("a.sock", {"command": "set", "gain": 0.5, "offset": -2.0, "over_s": 1.5})
+    assert second == ("a.sock", {"command": "set", "inverse": "out", "over_s": 1.0})
+
+
+def test_mark_sends_its_text(answers):
+    mark_run(run("a"), "tapped the stage")
+    assert answers == [("a.sock", {"command": "mark", "text": "tapped the stage"})]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("gain", "must be gain=NUMBER, offset=NUMBER or inverse=in.out: 'gain'"),
+        ("rate=1", "must be gain=NUMBER"),
+        ("gain=high", "gain must be a number: 'high'"),
+        ("inverse=0", "inverse must be in or out: '0'"),
+    ],
+)
+def test_what_is_no_setting_is_refused(text, said):
+    with pytest.raises(InputError, match=said):
+        assigned(["offset=1", text])
+
+
+def test_a_dropped_request_is_sent_again(tmp_path):
+    """Until the timeout; a request without an answer has had no effect."""
+    path = tmp_path / "socket"
+    seen = []
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
+        listener.bind(str(path))
+        listener.listen(20)
+
+        def serve(connections, last):
+            for number in range(1, connections + 1):
+                client, _ = listener.accept()
+                with client:
+                    if number % 2 == 0:
+                        seen.append(client.recv(1000))
+                    if number == connections:
+                        client.sendall(last)
+
+        def serving(connections, last=b""):
+            # A daemon: one that waits in vain must not keep the tests from ending.
+            thread = threading.Thread(target=serve, args=(connections, last), daemon=True)
+            thread.start()
+            return thread
+
+        thread = serving(6, b'{"protocol": 1, "ok": true, "n": 1}\n')
+        assert ask(path, {"say": "hello"}) == {"n": 1}
+        thread.join(10)
+        assert seen == [b'{"say": "hello"}\n'] * 3
+        thread = serving(2, b'{"protocol": 9, "ok": false, "error": "set: ..."}\n')
+        with pytest.raises(RunError, match="speaks protocol 9, this hilctl 1"):
+            ask(path, {"say": "hello"})
+        thread.join(10)
+        serving(2)
+        with pytest.raises(RunError, match="among other clients"):
+            ask(path, {"say": "hello"}, 5.0, SteppingClock(2.0))
+        thread.join(10)
+        assert not thread.is_alive()
+
+
+@pytest.fixture
+def process():
+    """A process that ends by the first signal that comes."""
+    # What this process ignores, its children do too, until they say otherwise.
+    code = (
+        f"import signal; signal.signal({STOP_SIGNAL}, signal.SIG_DFL); print(flush=True); input()"
+    )
+    started = subprocess.Popen(
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    )
+    assert started.stdout is not None
+    started.stdout.readline()
+    yield started
+    started.kill()
+    started.communicate()
+
+
+def run_of(number, *, supervised=True):
+    card = SimpleNamespace(name="a", supervisor=number)
+    return SimpleNamespace(card=card, supervised=supervised, alive=False)
+
+
+def test_the_supervisor_gets_the_signal(process):
+    assert request_stop(run_of(process.pid))
+    assert process.wait(timeout=60) == -STOP_SIGNAL
+
+
+def test_a_process_that_holds_no_lock_is_left_alone(process):
+    """Its number may be another program's by now."""
+    assert not request_stop(run_of(process.pid, supervised=False))
+    assert process.poll() is None
+
+
+def test_the_lock_is_looked_at_once_the_process_is_held(process, monkeypatch):
+    """The other way round, the number could become another's in between."""
+    order = []
+    opened = os.pidfd_open
+
+    class Going:
+        card = SimpleNamespace(name="a", supervisor=process.pid)
+        alive = False
+
+        @property
+        def supervised(self):
+            order.append("lock")
+            return True
+
+    monkeypatch.setattr(os, "pidfd_open", lambda pid: order.append("process") or opened(pid))
+    request_stop(Going())
+    assert order == ["process", "lock"]
+
+
+def test_a_supervisor_that_is_gone_is_no_error(process):
+    process.kill()
+    process.wait()
+    assert not request_stop(run_of(process.pid))
+
+
+def test_what_the_kernel_refuses_is_told(process, monkeypatch):
+    def refuse(*_):
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(signal, "pidfd_send_signal", refuse)
+    with pytest.raises(RunError, match="a: can't be stopped: Operation not permitted"):
+        request_stop(run_of(process.pid))
+
+
+def test_what_was_done_is_logged(monkeypatch, caplog):
+    found = [RecoveredRun("sine-7", Path("a.mcap"), safe=False, text="supervisor and loop died")]
+    monkeypatch.setattr("hilctl.run.recovery.recover_dead_runs", lambda: found)
+    monkeypatch.setattr("hilctl.run.run_folder.runs", lambda: [SimpleNamespace(alive=True)])
+    finish_dead_runs()
+    assert caplog.messages == []
+    monkeypatch.setattr("hilctl.run.control.client.runs", lambda: [SimpleNamespace(alive=False)])
+    finish_dead_runs()
+    assert caplog.messages == [
+        "sine-7 was not recorded to its end: supervisor and loop died",
+        "recovered into a.mcap",
+    ]
+
+
+def test_a_run_that_never_started_is_one_line(monkeypatch, caplog):
+    found = [RecoveredRun("sine-7", Path("a.mcap"), True, "nothing has moved", started=False)]
+    monkeypatch.setattr("hilctl.run.recovery.recover_dead_runs", lambda: found)
+    monkeypatch.setattr("hilctl.run.control.client.runs", lambda: [SimpleNamespace(alive=False)])
+    finish_dead_runs()
+    assert len(caplog.messages) == 1

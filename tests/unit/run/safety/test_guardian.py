@@ -1,0 +1,531 @@
+"""The guardian: what it takes for a dead or hanging loop, and what it does then."""
+
+import os
+import select
+import signal
+import subprocess
+import sys
+import threading
+import time
+from contextlib import suppress
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from hilctl.base.errors import DeviceError
+from hilctl.loop.safe_output import LoopOutcome, SafeGoal
+from hilctl.run.job import Job, SilenceLimits
+from hilctl.run.safety import guardian
+from hilctl.run.safety.guardian import (
+    LAST_CALL_MS,
+    Guardian,
+    HangWatch,
+    SafeAction,
+    is_stopped,
+    main,
+)
+from hilctl.run.shared.ring import SampleRing
+from hilctl.run.shared.shared_page import (
+    GuardianPhase,
+    PageField,
+    PageSlot,
+    Phase,
+    SafeActionResult,
+    SharedPage,
+)
+
+SLEEP = [sys.executable, "-c", "import time; time.sleep(600)"]
+DESCRIPTORS = Path("/proc/self/fd")
+IGNORED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+JOB_LIMITS = SilenceLimits(1.0, 1.0, 1.0, 1.0)
+
+
+def job_of(experiment, *, ring="", limits=JOB_LIMITS):
+    """Return a job with what a guardian needs of it."""
+    return Job(
+        experiment=experiment, files={}, folder="", ring=ring, reference="", input_um="",
+        state=None, heat_a2=0.0, stands_um=None, adapted=None, safe_value=0.25, ramp_per_s=50.0,
+        limits=limits, supervisor=2, silence_s=1.0, safe_priority=7,
+    )  # fmt: skip
+
+
+class Device:
+    """Notes what it is asked for, and whether the loop was left to live then."""
+
+    def __init__(self, loop, error=None):
+        self.loop, self.error, self.asked = loop, error, []
+
+    info = SimpleNamespace(simulated=False)
+
+    def make_safe(self, value):
+        with suppress(subprocess.TimeoutExpired):  # one that was killed may still be dying
+            self.loop.wait(5.0)
+        self.asked.append((value, self.loop.poll() is None))
+        if self.error:
+            raise self.error
+
+
+@pytest.fixture
+def guarded(tmp_path, monkeypatch):
+    """A process that stands for the loop, and a function that guards it until it is gone."""
+    loop = subprocess.Popen(SLEEP)
+    ring = SampleRing.create(tmp_path / "ring", slots=4, block=1, state_size=1)
+    page = ring.page
+    page.put(PageField.GO, 1)
+    page.put(PageField.PHASE, Phase.RUNNING)
+    page.put(PageField.REAL_TIME, 1)
+    page.put_float(PageField.OUTPUT_AT_START, 0.25)
+    pidfd = os.pidfd_open(loop.pid)
+    before = signal.getsignal(signal.SIGTERM)
+    made = SimpleNamespace(loop=loop, page=page, ring=ring, device=Device(loop), pidfd=pidfd)
+
+    monkeypatch.setattr("hilctl.loop.safe_output.HOLD_S", 0.0)
+
+    def guard(hang_s=60.0):
+        limits = SilenceLimits(hang_s, hang_s, 60.0, hang_s)
+        return Guardian(ring, made.device, job_of("", limits=limits), pidfd, loop.pid).watch()
+
+    made.guard = guard
+    yield made
+    signal.signal(signal.SIGTERM, before)
+    loop.kill()
+    loop.wait()
+    os.close(pidfd)
+
+
+def test_a_loop_that_died_is_followed_by_the_safe_value(guarded):
+    guarded.loop.kill()
+    guarded.guard()
+    assert [value for value, _ in guarded.device.asked] == [0.25]
+    assert guarded.page.safe_result().confirmed
+    assert not guarded.page.safe_result().hung
+
+
+@pytest.mark.parametrize("how", ["stopped", "silent"])
+def test_a_loop_that_hangs_is_killed_before_the_device_is_touched(guarded, how):
+    """A stopped one in the midst of an exchange too: nothing of it may come after."""
+    guarded.page.put(PageField.LOOP_HEARTBEAT_NS, 1)
+    if how == "stopped":
+        guarded.page.put(PageField.EXCHANGING, 1)
+        guarded.loop.send_signal(signal.SIGSTOP)
+        os.waitid(os.P_PID, guarded.loop.pid, os.WSTOPPED | os.WNOWAIT)
+    guarded.guard(hang_s=0.03)
+    assert guarded.device.asked == [(0.25, False)]
+    assert guarded.loop.wait() == -signal.SIGKILL
+    assert guarded.page.safe_result().hung
+
+
+def test_a_loop_that_goes_on_is_left_alone(guarded, monkeypatch):
+    """Until it dies. The supervisor sees by the heartbeat that it is watched, from the first on."""
+    page, put = [], SharedPage.put
+
+    def noted(self, field, value):
+        put(self, field, value)
+        if self is not guarded.page:  # a thread of an earlier test may still be driving its device
+            return
+        page.append((field, value))
+        if len(page) == 6:
+            guarded.loop.kill()
+
+    monkeypatch.setattr(SharedPage, "put", noted)
+    guarded.guard()
+    assert page[1] == (PageField.GUARDIAN_PHASE, GuardianPhase.WATCHING)
+    heartbeats_ns = [value for field, value in page if field == PageField.GUARDIAN_HEARTBEAT_NS]
+    assert [field for field, _ in page[:6]].count(PageField.GUARDIAN_HEARTBEAT_NS) == 5
+    assert heartbeats_ns == sorted(set(heartbeats_ns))
+    assert guarded.page.safe_result().confirmed
+    assert not guarded.page.safe_result().hung
+
+
+def test_a_loop_that_hangs_may_end_a_call_before_the_device_is_touched(guarded, monkeypatch):
+    """The kernel ends it, where it is not held up: a device may take one connection only."""
+    done = []
+
+    class Death:
+        def register(self, loop, events):
+            assert events == select.POLLIN
+
+        def poll(self, wait_ms):
+            done.append(wait_ms)
+
+    def send(loop, number):
+        done.append(number)
+        signal.pidfd_send_signal(loop, number)
+
+    monkeypatch.setattr(guardian, "select", SimpleNamespace(poll=Death, POLLIN=select.POLLIN))
+    monkeypatch.setattr(
+        guardian,
+        "signal",
+        SimpleNamespace(
+            SIGKILL=signal.SIGKILL,
+            SIGTERM=signal.SIGTERM,
+            signal=lambda number, handler: None,
+            pidfd_send_signal=send,
+        ),
+    )
+    guarded.page.put(PageField.LOOP_HEARTBEAT_NS, 1)
+    guarded.guard(hang_s=0.0)
+    assert done[-2:] == [signal.SIGKILL, LAST_CALL_MS]
+
+
+def test_a_loop_that_ended_by_itself_is_left_to_what_it_said(guarded):
+    guarded.page.leave_outcome(LoopOutcome("completed", "waveform completed", 7, "confirmed", 0))
+    guarded.loop.kill()
+    guarded.guard()
+    assert guarded.device.asked == []
+    assert guarded.page.safe_result() is None
+
+
+def test_a_loop_that_died_before_the_start_has_moved_nothing(guarded):
+    guarded.page.put(PageField.GO, 0)
+    guarded.page.put(PageField.PHASE, Phase.READY)
+    guarded.loop.kill()
+    guarded.guard()
+    assert guarded.device.asked == []
+
+
+def test_a_loop_that_broke_is_followed_by_the_safe_value(guarded):
+    """What it tried itself may not have been confirmed."""
+    guarded.page.put(PageField.PHASE, Phase.FAILED)
+    guarded.loop.kill()
+    guarded.guard()
+    assert len(guarded.device.asked) == 1
+
+
+def test_the_way_is_a_ramp_from_the_last_command(guarded):
+    guarded.page.put_float(PageField.OUTPUT_AT_START, 1.25)
+    guarded.loop.kill()
+    assert guarded.guard()
+    values = [value for value, _ in guarded.device.asked]
+    assert values[0] == pytest.approx(1.0)
+    assert values == sorted(values, reverse=True)
+    assert values[-1] == 0.25
+
+
+def test_a_ramp_that_another_process_began_is_gone_on_with(guarded):
+    """It would step back to the last command otherwise."""
+    guarded.page.put_float(PageField.OUTPUT_AT_START, 4.0)
+    guarded.page.note_safe_write(0.3)
+    guarded.loop.kill()
+    guarded.guard()
+    assert max(value for value, _ in guarded.device.asked) <= 0.3
+
+
+@pytest.mark.parametrize("output", ["unknown", "set"])
+def test_a_loop_that_gave_up_is_followed(guarded, output):
+    """It has its outcome, but the device did not confirm it."""
+    guarded.page.leave_outcome(LoopOutcome("fault", "no answer", 7, output, 0))
+    guarded.loop.kill()
+    assert guarded.guard()
+    assert guarded.page.safe_result().confirmed
+
+
+def test_it_keeps_trying_until_the_user_ends_it(guarded):
+    """What is not confirmed is not called safe."""
+    tries = []
+
+    def make_safe(value):
+        tries.append(value)
+        if len(tries) == 3:
+            os.kill(os.getpid(), signal.SIGTERM)
+        raise DeviceError("no answer")
+
+    guarded.device.make_safe = make_safe
+    guarded.loop.kill()
+    assert guarded.guard()
+    assert len(tries) >= 3
+    assert "no answer" in guarded.page.safe_result().error
+    assert not guarded.page.safe_result().final
+
+
+@pytest.mark.parametrize("error", [MemoryError(), ZeroDivisionError("a bug")])
+def test_a_guardian_that_cannot_drive_the_device_says_so_and_ends(guarded, error):
+    """The supervisor tries then, which may be able to."""
+    guarded.device.error = error
+    guarded.loop.kill()
+    assert not guarded.guard()
+    assert guarded.page.get(PageField.GUARDIAN_PHASE) == GuardianPhase.FAILED
+    assert guarded.page.safe_result() is None
+    assert type(error).__name__ in guarded.page.read_text(PageSlot.GUARDIAN)
+
+
+def test_it_gives_signs_of_life_while_the_device_keeps_it(guarded, monkeypatch):
+    """The supervisor would take it for dead otherwise, and reach for the device as well."""
+    go_on, seen = threading.Event(), set()
+
+    class Prompt(SafeAction):
+        def result(self, wait_s):
+            assert 0.0 < wait_s <= 0.01
+            return super().result(wait_s)
+
+    monkeypatch.setattr(guardian, "SafeAction", Prompt)
+
+    def make_safe(value):
+        while len(seen) < 3:
+            seen.add(guarded.page.get(PageField.GUARDIAN_HEARTBEAT_NS))
+            assert guarded.page.get(PageField.GUARDIAN_PHASE) == GuardianPhase.ACTING
+            time.sleep(0.0)
+        go_on.set()
+
+    guarded.device.make_safe = make_safe
+    guarded.loop.kill()
+    guarded.guard()
+    assert go_on.is_set()
+    assert guarded.page.safe_result().confirmed
+
+
+@pytest.fixture
+def written(tmp_path):
+    """A function that writes a job and calls the program; and the page."""
+    ring = tmp_path / "ring of a job"
+    page = SampleRing.create(ring, slots=4, block=1, state_size=1).page
+    before = {number: signal.getsignal(number) for number in IGNORED}
+
+    def call(experiment, loop=0):
+        job_of(experiment, ring=str(ring)).write(tmp_path / "job")
+        return main([str(tmp_path / "job"), str(loop), "1"])
+
+    yield SimpleNamespace(call=call, page=page)
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.parametrize(
+    ("experiment", "said"),
+    [
+        ("device: {kind: gone}", "unknown device 'gone'"),
+        ("name: x", "the experiment has no device"),
+    ],
+)
+def test_a_device_that_can_not_be_made_is_said_before_the_start(written, experiment, said):
+    assert written.call(experiment) == 1
+    assert written.page.get(PageField.GUARDIAN_PHASE) == GuardianPhase.FAILED
+    assert said in written.page.read_text(PageSlot.GUARDIAN)
+
+
+def test_a_device_that_has_no_memory_is_said_before_the_start(written, monkeypatch):
+    def device(_job):
+        raise MemoryError
+
+    monkeypatch.setattr(Job, "device", device)
+    assert written.call("device: {kind: simulated_terfenol}") == 1
+    assert written.page.get(PageField.GUARDIAN_PHASE) == GuardianPhase.FAILED
+    assert written.page.read_text(PageSlot.GUARDIAN) == "not enough memory"
+
+
+def test_the_device_is_made_of_the_experiment_alone():
+    assert job_of("device: {kind: simulated_terfenol}").device().info.simulated
+
+
+@pytest.mark.parametrize("limit", [None, 65536])
+def test_it_prepares_for_a_machine_that_does_nothing_else(written, guarded, monkeypatch, limit):
+    """No signal ends it, it stays in memory where it may, and both threads are quick."""
+    done, descriptors = [], set(DESCRIPTORS.iterdir())
+    process = SimpleNamespace(
+        freeze_gc=lambda: done.append("frozen"),
+        lockable_bytes=lambda: limit,
+        lock_memory=lambda *, untouched: done.append(f"locked {untouched}"),
+        set_fifo=lambda priority: done.append((priority, threading.current_thread().name)),
+    )
+    monkeypatch.setattr(guardian, "LinuxProcess", lambda: process)
+    monkeypatch.setattr(Job, "device", lambda job: guarded.device)
+    written.page.put(PageField.GO, 1)
+    written.page.put_float(PageField.OUTPUT_AT_START, 0.25)
+    written.page.put(PageField.PHASE, Phase.RUNNING)
+    guarded.loop.kill()
+    assert written.call("", guarded.pidfd) == 0
+    assert guarded.device.asked == [(0.25, False)]
+    locked = ["locked True"] if limit is None else []
+    assert done == ["frozen", *locked, (7, "MainThread"), (7, "safe action")]
+    for number in (signal.SIGINT, signal.SIGHUP):  # SIGTERM ends an action that goes on
+        assert signal.getsignal(number) == signal.SIG_IGN
+    assert set(DESCRIPTORS.iterdir()) <= descriptors
+
+
+def test_refused_real_time_is_no_reason_to_leave_the_coil(written, guarded, monkeypatch):
+    def refuse(*_, **_named):
+        raise OSError(1, "Operation not permitted")
+
+    process = SimpleNamespace(
+        freeze_gc=lambda: None, lockable_bytes=lambda: None, lock_memory=refuse, set_fifo=refuse
+    )
+    monkeypatch.setattr(guardian, "LinuxProcess", lambda: process)
+    guarded.loop.kill()
+    assert written.call("device: {kind: simulated_terfenol}", guarded.pidfd) == 0
+    assert written.page.get(PageField.GUARDIAN_PHASE) == GuardianPhase.WATCHING
+
+
+def test_it_brings_no_numba_along():
+    """It is to be small, and ready at once."""
+    code = (
+        "import sys, hilctl.run.safety.guardian, hilctl_drivers.modbus.modbus_dac\n"
+        "sys.exit(any(name in sys.modules for name in ('numba', 'scipy', 'mcap')))"
+    )
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
+LIMITS = SilenceLimits(real_time_s=1.0, ordinary_s=1.6, exchange_s=2.0, stopped_s=0.4)
+
+
+class Watched:
+    """A page with a heartbeat, and who watches it."""
+
+    def __init__(self, folder):
+        self.page = SampleRing.create(folder / "ring", slots=4, block=1, state_size=1).page
+        self.page.put(PageField.PHASE, Phase.RUNNING)
+        self.page.put(PageField.LOOP_HEARTBEAT_NS, 1)
+        self.page.put(PageField.REAL_TIME, 1)
+        self.stopped = False
+        self.watch = HangWatch(self.page, LIMITS, lambda: self.stopped)
+
+    def looks(self, *times_s):
+        return [self.watch.hangs(round(time_s * 1e9)) for time_s in times_s]
+
+    def hangs_after_s(self):
+        """Look every 0.1 s; return the time of the first look that finds a hang."""
+        return next(k / 10 for k in range(1000) if self.watch.hangs(round(k * 1e8)))
+
+
+@pytest.fixture
+def watched(tmp_path):
+    return Watched(tmp_path)
+
+
+def test_silence_beyond_the_limit_is_a_hang(watched):
+    """A heartbeat that stands still for longer than the limit is found, and not before."""
+    assert watched.looks(*[0.1 * k for k in range(13)]) == [False] * 11 + [True] * 2
+
+
+def test_without_real_time_priority_a_busy_machine_may_keep_the_loop_waiting(watched):
+    watched.page.put(PageField.REAL_TIME, 0)
+    assert watched.hangs_after_s() == 1.7
+
+
+def test_heartbeat_starts_the_time_again(watched):
+    """Any new sign of life will do."""
+    assert not any(watched.looks(*[0.1 * k for k in range(10)]))
+    watched.page.put(PageField.LOOP_HEARTBEAT_NS, 2)
+    assert not any(watched.looks(*[0.9 + 0.1 * k for k in range(10)]))
+
+
+def test_machine_that_stood_still_is_no_hang(watched):
+    """A long pause of both processes is not held against the loop."""
+    assert not any(watched.looks(0.0, 0.1, 30.0, 30.02))
+
+
+def test_loop_that_does_not_run_yet_or_any_more_does_not_hang(watched):
+    """Opening and closing a device may take its time."""
+    for phase in (Phase.STARTING, Phase.READY, Phase.ENDED, Phase.FAILED):
+        watched.page.put(PageField.PHASE, phase)
+        assert not any(watched.looks(*[0.5 * k for k in range(20)]))
+
+
+def test_a_device_that_keeps_the_loop_waiting_is_no_hang_at_once(watched):
+    """An exchange may use up the device's time-out; for that long the loop is silent."""
+    watched.page.put(PageField.EXCHANGING, 1)
+    assert watched.hangs_after_s() == 3.1
+
+
+@pytest.mark.parametrize("phase", [Phase.RUNNING, Phase.CLOSING])
+@pytest.mark.parametrize("exchanging", [0, 1])
+def test_a_loop_that_is_stopped_waits_for_no_device(watched, phase, exchanging):
+    """SIGSTOP hits most loops in an exchange: its time-out is no excuse then, nor is the load."""
+    watched.page.put(PageField.EXCHANGING, exchanging)
+    watched.page.put(PageField.PHASE, phase)
+    watched.stopped = True
+    assert watched.hangs_after_s() == 0.5
+
+
+def test_a_stop_is_looked_at_several_times(watched):
+    """Where all processes were stopped and go on, this one may be the first of them."""
+    watched.stopped = True
+    assert watched.looks(0.0, 5.0, 5.1, 5.2, 5.3) == [False, False, False, False, True]
+
+
+def test_closing_a_device_has_more_time(watched):
+    """A device that is lost may use up its time-outs, but not for ever."""
+    watched.page.put(PageField.PHASE, Phase.CLOSING)
+    assert watched.hangs_after_s() == pytest.approx(31.0, abs=0.11)
+
+
+def test_a_loop_that_never_comes_to_its_first_tick_is_found(watched):
+    """Nothing has moved until then, so that it gets more time: from the first look on."""
+    watched.page.put(PageField.LOOP_HEARTBEAT_NS, 0)
+    assert not any(watched.looks(*[9e5 + 0.1 * k for k in range(310)]))
+    assert watched.looks(9e5 + 31.2) == [True]
+
+
+def test_the_kernel_says_whether_a_process_is_stopped():
+    """Whatever its program is called; one that is gone is not stopped."""
+    code = (
+        "import ctypes, os, signal; ctypes.CDLL(None).prctl(15, b') T ('); "
+        "os.kill(os.getpid(), signal.SIGSTOP)"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code])
+    os.waitid(os.P_PID, process.pid, os.WSTOPPED)
+    assert is_stopped(process.pid)
+    assert not is_stopped(os.getpid())
+    process.kill()
+    process.wait()
+    assert is_stopped(process.pid) is False
+
+
+GOAL = SafeGoal(0.5, 1.0, None, pending=False)
+
+
+@pytest.fixture
+def act(tmp_path):
+    """Return a function that starts a safe action."""
+    page = SampleRing.create(tmp_path / "ring", slots=4, block=1, state_size=1).page
+
+    def start(make_safe, **changes):
+        device = SimpleNamespace(make_safe=make_safe)
+        action = SafeAction(page, device, GOAL, **{"hung": False, **changes})
+        action.page = page
+        return action
+
+    return start
+
+
+def test_the_caller_is_not_blocked(act):
+    go_on, asked = threading.Event(), []
+
+    def make_safe(value):
+        go_on.wait(30.0)
+        asked.append(value)
+
+    action = act(make_safe, hung=True, prepare=lambda: asked.append("prepared"))
+    assert not action.result().final
+    assert action._thread.daemon  # nor does it keep the process from ending
+    go_on.set()
+    assert action.result(30.0) == SafeActionResult(hung=True, output="confirmed")
+    assert asked == ["prepared", 0.5]
+    assert action.page.last_safe_write() == 0.5
+
+
+def test_an_action_goes_on_until_it_is_ended(act):
+    asked = threading.Event()
+
+    def make_safe(value):
+        asked.set()
+        raise DeviceError("no answer")
+
+    action = act(make_safe)
+    assert asked.wait(30.0)
+    assert action.end(30.0)
+    assert (action.result().output, action.result().error) == ("unknown", "no answer")
+    assert not action.result().final
+
+
+@pytest.mark.parametrize("error", [KeyError("x"), MemoryError()])
+def test_a_failure_of_this_process_is_no_answer_of_the_device(act, error):
+    def make_safe(value):
+        raise error
+
+    action = act(make_safe)
+    action.result(30.0)
+    assert type(error).__name__ in action.failed
+    assert not action.result().final

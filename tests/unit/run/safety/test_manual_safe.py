@@ -1,0 +1,108 @@
+"""A device put at its safe value by hand: confirmed, not confirmed, or refused."""
+
+from dataclasses import replace
+
+import pytest
+import yaml
+
+from hilctl.base.errors import ConfigError, DeviceError, InputError, UnconfirmedError
+from hilctl.run.run_folder import held_devices
+from hilctl.run.safety.manual_safe import put_safe
+from hilctl_drivers.simulated.devices import SimulatedTerfenol
+
+
+class Amplifier(SimulatedTerfenol):
+    """A device that notes what it is asked for, and has a port that one may hold."""
+
+    asked: list
+    error = ""
+    now_s = 0.0
+
+    @classmethod
+    def clock(cls):
+        return cls.now_s
+
+    @classmethod
+    def sleep(cls, wait_s):
+        cls.now_s += wait_s
+
+    @property
+    def info(self):
+        return replace(super().info, holds=("tcp:10.9.8.7:502",))
+
+    def make_safe(self, command):
+        self.asked.append(command)
+        type(self).now_s += 0.1
+        if self.error:
+            raise DeviceError(self.error)
+
+
+@pytest.fixture
+def amplifier(monkeypatch):
+    """The class of every device."""
+    monkeypatch.setattr("hilctl.experiment.device.device_class", lambda kind: Amplifier)
+    Amplifier.asked, Amplifier.error = [], ""
+    return Amplifier
+
+
+@pytest.fixture
+def experiment(tmp_path):
+    """A file whose model is gone, which is no reason to leave a coil as it is."""
+    path = tmp_path / "experiment.yaml"
+    section = {"kind": "simulated_terfenol"}
+    given = {"device": section, "safe": {"value": 0.5}, "compensator": {"model": "gone.yaml"}}
+    path.write_text(yaml.safe_dump(given), encoding="utf-8")
+    return path
+
+
+def test_the_experiment_s_safe_value_is_put_out_and_confirmed(amplifier, experiment):
+    assert put_safe(experiment, []).to_mapping()["output_safe"] is True
+    assert put_safe(experiment, ["safe.value=-1.5"]).value == -1.5
+    assert amplifier.asked == [0.5, -1.5]
+
+
+def test_an_output_that_is_not_confirmed_is_not_called_safe(amplifier, experiment):
+    amplifier.error = "no answer"
+    found = put_safe(experiment, [], amplifier.clock, amplifier.sleep).to_mapping()
+    assert (found["output_safe"], found["error"]) == (False, "no answer")
+    assert (found["output_state"], found["guardian_active"]) == ("unknown", False)
+    assert len(amplifier.asked) > 10  # it is tried again and again
+
+
+def test_a_device_without_confirmation_is_sent_the_value(amplifier, experiment, monkeypatch):
+    def make_safe(self, command):
+        raise UnconfirmedError("it does not answer")
+
+    monkeypatch.setattr(Amplifier, "make_safe", make_safe)
+    found = put_safe(experiment, [], amplifier.clock, amplifier.sleep).to_mapping()
+    assert (found["output_safe"], found["output_state"]) == (False, "sent")
+
+
+def test_a_device_that_a_run_holds_is_left_to_it(amplifier, experiment):
+    with (
+        held_devices(("tcp:10.9.8.7:502",)),
+        pytest.raises(InputError, match=r"in use by .*: wait for its end, or stop it first"),
+    ):
+        put_safe(experiment, [])
+    assert amplifier.asked == []
+
+
+def test_no_room_for_a_lock_is_no_reason_to_leave_current_flowing(
+    amplifier, experiment, monkeypatch, tmp_path, caplog
+):
+    """Any user can fill the place where locks go, or take it."""
+    (tmp_path / "runs").write_text("")
+    monkeypatch.setenv("HILCTL_RUNS", str(tmp_path / "runs"))
+    found = put_safe(experiment, [], amplifier.clock, amplifier.sleep).to_mapping()
+    assert (found["output_safe"], set(amplifier.asked)) == (True, {0.5})
+    assert caplog.messages
+
+
+@pytest.mark.parametrize(
+    ("text", "words"), [("name: x", "device"), ("device: {}\nsafe: {value: high}", "safe.value")]
+)
+def test_a_file_without_what_is_needed_is_refused(tmp_path, text, words):
+    path = tmp_path / "x.yaml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(ConfigError, match=words):
+        put_safe(path, [])

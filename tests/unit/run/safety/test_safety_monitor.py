@@ -1,0 +1,373 @@
+"""Who makes the output safe: the guardian where it can, the supervisor where it can't."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from hilctl.base.errors import DeviceError, RunError
+from hilctl.loop.limiter import CommandLimits
+from hilctl.loop.safe_output import LoopOutcome
+from hilctl.run.safety import safety_monitor as module
+from hilctl.run.safety.guardian import LAST_CALL_MS
+from hilctl.run.safety.safety_monitor import SafetyMonitor
+from hilctl.run.shared.ring import SampleRing
+from hilctl.run.shared.shared_page import GuardianPhase, PageField, Phase, SafeActionResult
+
+MS = 1_000_000
+
+
+class Guardian:
+    """A guardian whose process and signs of life the test has in its hand."""
+
+    def __init__(self, page, log):
+        self.page, self.log, self.ended, self.error = page, log, False, "no device"
+        self.phase = GuardianPhase.WATCHING
+        self.heartbeat_ns = 0
+
+    def kill(self, wait_s=None):
+        self.log.append("guardian killed")
+        self.ended, self.waited_s = True, wait_s
+
+    def end(self):
+        self.log.append("guardian ended")
+
+    def await_acting(self, stopped):
+        return not self.ended and self.phase in {GuardianPhase.ACTING, GuardianPhase.DONE}
+
+
+class Run:
+    """A run's safety, with time in the test's hand."""
+
+    def __init__(self, ring, monkeypatch, *, guarded=True, simulated=False):
+        page = ring.page
+        self.page, self.log, self.events, self.guardians = page, [], [], []
+        self.now_ns, self.fail_start, self.error = 10**9, None, None
+        self.watched = []
+        device = SimpleNamespace(
+            info=SimpleNamespace(simulated=simulated), make_safe=self.make_safe
+        )
+        timing = SimpleNamespace(hang_s=None, max_late_s=1.0)
+        config = SimpleNamespace(
+            timing=timing,
+            tick_s=0.01,
+            command_limits=lambda: CommandLimits(-5.0, 5.0, 50.0, 0.25, 50.0),
+            realtime=SimpleNamespace(priority=80),
+        )
+        self.checked = SimpleNamespace(loaded=SimpleNamespace(config=config, device=device))
+        child = SimpleNamespace(pid=1, kill=self.kill_loop)
+        monkeypatch.setattr(module, "is_stopped", lambda pid: False)
+        self.priorities = []
+        monkeypatch.setattr(module, "be_quick", self.priorities.append)
+        monkeypatch.setattr(module, "be_ordinary", lambda: self.priorities.append(0))
+        start = self.start if guarded else None
+        self.safety = SafetyMonitor(self.checked, ring, child, start, self.events.append)
+
+    def make_safe(self, value):
+        self.log.append(f"safe {value}")
+        if self.error:
+            raise self.error
+
+    def start(self, watched):
+        self.watched.append(watched)
+        if self.fail_start:
+            raise self.fail_start
+        self.guardians.append(Guardian(self.page, self.log))
+        return self.guardians[-1]
+
+    def kill_loop(self, wait_s):
+        self.log.append("loop killed")
+        self.waited_s = wait_s
+
+    def look(self, *, ended=False, passed_ms=10, awake=True):
+        self.now_ns += round(passed_ms * MS)
+        if awake and self.guardians:
+            self.guardians[-1].heartbeat_ns = self.now_ns
+        self.safety.update(self.now_ns, ended=ended)
+
+    def look_alive(self, page, passed_ms):
+        """Look at a loop that has just given a sign of life; the guardian gives none."""
+        page.put(PageField.LOOP_HEARTBEAT_NS, self.now_ns + round(passed_ms * MS))
+        self.look(passed_ms=passed_ms, awake=False)
+
+    def settle(self):
+        """Look until what has been begun is over."""
+        while self.safety.result is None:
+            self.look(ended=True, awake=False)
+        return self.safety.result
+
+
+@pytest.fixture
+def ring(tmp_path):
+    ring = SampleRing.create(tmp_path / "ring", slots=4, block=1, state_size=1)
+    ring.page.put(PageField.PHASE, Phase.RUNNING)
+    ring.page.put(PageField.LOOP_HEARTBEAT_NS, 1)
+    ring.page.put(PageField.REAL_TIME, 1)
+    ring.page.put_float(PageField.OUTPUT_AT_START, 0.25)
+    return ring
+
+
+@pytest.fixture
+def page(ring):
+    return ring.page
+
+
+@pytest.fixture
+def run(ring, monkeypatch):
+    return Run(ring, monkeypatch)
+
+
+def test_a_guardian_that_is_awake_does_it(run, page):
+    """The supervisor only waits for it, and touches neither loop nor device."""
+    for _ in range(5):
+        run.look(ended=True)
+    assert (run.log, run.safety.result) == ([], None)
+    page.leave_safe_result(SafeActionResult(hung=True, output="confirmed"))
+    run.look(ended=True)
+    assert run.safety.result == SafeActionResult(hung=True, output="confirmed")
+    assert run.safety.by == "guardian"
+
+
+@pytest.mark.parametrize("what", ["dead", "silent", "starting"])
+def test_where_the_guardian_can_not_the_supervisor_does(run, what):
+    """It kills the other one first: no two of them may hold the device."""
+    guardian = run.guardians[0]
+    run.look()
+    guardian.ended = what == "dead"
+    if what == "starting":
+        guardian.phase = GuardianPhase.STARTING
+    run.look(ended=True, passed_ms=60, awake=what != "silent")
+    assert run.settle() == SafeActionResult(hung=False, output="confirmed")
+    assert run.log == ["guardian killed", "loop killed", "safe 0.25"]
+    assert run.safety.by == "supervisor"
+    assert guardian.waited_s == run.waited_s == pytest.approx(1e-3 * LAST_CALL_MS, rel=1e-6)
+    # Both threads that do it stand before the loop, and one of them goes back.
+    assert sorted(run.priorities) == [0, 81, 81]
+
+
+def test_a_guardian_that_was_just_done_when_it_was_killed_is_believed(run, page):
+    """Nothing is sent twice."""
+    guardian = run.guardians[0]
+    guardian.kill = lambda wait_s: page.leave_safe_result(
+        SafeActionResult(hung=False, output="confirmed")
+    )
+    run.look(ended=True, passed_ms=60, awake=False)
+    assert run.safety.by == "guardian"
+    assert "safe 0.25" not in run.log
+
+
+def acting(run, page, **result):
+    """Let the guardian act, and leave what it has reached so far."""
+    run.guardians[0].phase = GuardianPhase.ACTING
+    page.put(PageField.GUARDIAN_PHASE, GuardianPhase.ACTING)
+    page.leave_safe_result(SafeActionResult(hung=False, final=False, **result))
+
+
+def test_a_guardian_that_keeps_trying_is_left_to_it(run, page):
+    """The run ends without it, and says what is not confirmed; nobody else takes the device."""
+    acting(run, page, output="unknown", error="no answer")
+    run.look(ended=True)
+    run.look(ended=True, passed_ms=5_000)
+    assert run.safety.result is None
+    run.look(ended=True, passed_ms=200)
+    assert (run.safety.result.output, run.safety.by) == ("unknown", "guardian")
+    assert run.safety.close()
+    assert run.log == []
+
+
+@pytest.mark.parametrize("phase", [GuardianPhase.FAILED, GuardianPhase.ACTING])
+def test_if_the_guardian_fails_the_supervisor_drives_the_device(run, page, phase):
+    """It may lack memory or descriptors, which is no answer of the device."""
+    acting(run, page, output="unknown", error="no answer")
+    run.look(ended=True)
+    run.guardians[0].phase, run.guardians[0].ended = phase, True
+    run.look(ended=True)
+    assert run.settle().confirmed
+    assert run.safety.by == "supervisor"
+
+
+def test_what_the_supervisor_cannot_confirm_is_left_to_a_new_guardian(run):
+    run.guardians[0].ended, run.error = True, DeviceError("no answer")
+    run.look(ended=True)
+    run.look(ended=True, passed_ms=5_200)
+    assert (run.safety.result.output, run.safety.by) == ("unknown", "supervisor")
+    monkeypatched = run.start
+
+    def start(watched):
+        guardian = monkeypatched(watched)
+        guardian.phase = GuardianPhase.ACTING
+        return guardian
+
+    run.safety._start_guardian = start
+    assert run.safety.close()
+    assert run.watched == [1, None]
+    sent = len(run.log)
+    assert not run.safety._action._thread.is_alive()
+    assert len(run.log) == sent
+
+
+def test_if_no_guardian_can_be_started_the_supervisor_goes_on_until_it_is_confirmed(run):
+    run.guardians[0].ended, run.error = True, DeviceError("no answer")
+    run.look(ended=True)
+    run.look(ended=True, passed_ms=5_200)
+    run.fail_start, run.error = OSError(24, "Too many open files"), None
+    assert not run.safety.close()
+    assert run.safety.result.confirmed
+
+
+def test_the_user_can_end_that(run):
+    run.guardians[0].ended, run.error = True, DeviceError("no answer")
+    run.look(ended=True)
+    run.look(ended=True, passed_ms=5_200)
+    run.fail_start = OSError(24, "Too many open files")
+    assert not run.safety.close(lambda: True)
+    assert run.safety.result.output == "unknown"
+
+
+def test_a_simulated_device_has_no_guardian(ring, monkeypatch):
+    run = Run(ring, monkeypatch, guarded=False, simulated=True)
+    assert run.safety.ready()
+    run.look()
+    run.look(ended=True)
+    assert run.settle().confirmed
+    assert run.log == ["loop killed", "safe 0.25"]
+
+
+def test_a_loop_that_said_how_it_ended_is_left_alone(run, page):
+    page.leave_outcome(LoopOutcome("completed", "waveform completed", 7, "confirmed", 0))
+    run.guardians[0].ended = True  # as it does by itself
+    for _ in range(5):
+        run.look(ended=True, awake=False, passed_ms=100)
+    assert (run.log, run.events, run.safety.result) == ([], [], None)
+
+
+def test_a_hanging_loop_is_found_here_too(run):
+    """Where the guardian is stopped with it, nobody else does."""
+    run.look()
+    looks = 0
+    while not run.log:
+        run.look(awake=False)
+        looks += 1
+    assert run.settle() == SafeActionResult(hung=True, output="confirmed")
+    assert looks * 10 == pytest.approx(100, abs=11)  # two periods of 10 ms, and 80 ms
+    assert run.log == ["guardian killed", "loop killed", "safe 0.25"]
+
+
+def test_a_guardian_is_awake_for_50_ms_after_its_heartbeat(run):
+    run.look(ended=True)
+    run.look(ended=True, passed_ms=50 - 1e-6, awake=False)
+    assert run.log == []
+    run.look(ended=True, passed_ms=1e-6, awake=False)
+    assert run.log[:2] == ["guardian killed", "loop killed"]
+
+
+def test_a_guardian_that_is_done_is_believed_until_the_process_is_gone(run, page):
+    """A loop that it has killed takes a while to be gone."""
+    run.look()
+    run.guardians[0].phase = GuardianPhase.DONE
+    page.leave_safe_result(SafeActionResult(hung=True, output="confirmed"))
+    for _ in range(50):
+        run.look(awake=False)
+    assert (run.log, run.safety.result) == ([], None)
+    run.look(ended=True, awake=False)
+    assert (run.safety.result, run.safety.by) == (
+        SafeActionResult(hung=True, output="confirmed"),
+        "guardian",
+    )
+
+
+def heartbeat(run, page):
+    run.look_alive(page, passed_ms=10)
+
+
+@pytest.mark.parametrize("how", ["died", "is silent"])
+def test_a_lost_guardian_is_said_and_another_one_started(run, page, how):
+    run.look()
+    if how == "died":
+        run.guardians[0].ended = True
+    looks = 0
+    while len(run.guardians) == 1:
+        heartbeat(run, page)
+        looks += 1
+    assert looks == 1 if how == "died" else looks > 90
+    assert [event.code for event in run.events] == ["guardian_lost"]
+    assert how in run.events[0].text
+    assert run.log == ["guardian killed"]
+    run.look(ended=True)
+    assert run.safety.result is None
+
+
+def test_a_guardian_is_lost_after_four_looks_and_more_than_a_second(run, page):
+    """Both: after a standstill of the whole machine the first look finds old heartbeats only."""
+    run.look()
+    for _ in range(3):
+        run.look_alive(page, passed_ms=3_000)
+    assert (run.log, run.events) == ([], [])
+    run.look_alive(page, passed_ms=1)
+    assert run.log == ["guardian killed"]
+
+
+def test_a_guardian_is_not_lost_within_a_second(run, page):
+    run.look()
+    for _ in range(10):
+        run.look_alive(page, passed_ms=100)
+    assert run.log == []
+    run.look_alive(page, passed_ms=1e-6)
+    assert run.log == ["guardian killed"]
+
+
+def test_a_guardian_has_a_minute_to_start(run, page):
+    run.guardians[0].phase = GuardianPhase.STARTING
+    for passed_ms in (0, *[1_000] * 60):
+        run.look_alive(page, passed_ms)
+    assert run.log == []
+    run.look_alive(page, passed_ms=1e-6)
+    assert run.log == ["guardian killed"]
+    assert "does not start" in run.events[0].text
+    assert len(run.guardians) == 2, "a minute was pause enough"
+
+
+def test_one_that_never_comes_to_watch_is_not_started_without_a_pause(run, page):
+    run.look()
+    run.guardians[0].ended = True
+    for _ in range(100):
+        heartbeat(run, page)
+        for guardian in run.guardians:
+            guardian.ended = True
+    assert len(run.guardians) == 2
+    for _ in range(500):
+        heartbeat(run, page)
+    assert len(run.guardians) == 3
+    assert len(run.events) == 2, "each loss is said once"
+
+
+def test_one_that_dies_at_once_is_started_again_after_the_pause(run, page):
+    run.guardians[0].ended = True
+    heartbeat(run, page)
+    run.look_alive(page, passed_ms=5_000 - 1e-6)
+    assert len(run.guardians) == 1
+    run.look_alive(page, passed_ms=1e-6)
+    assert len(run.guardians) == 2
+
+
+def test_one_that_can_not_be_started_again_is_said(run, page):
+    run.look()
+    run.guardians[0].ended = True
+    run.fail_start = OSError(11, "Resource temporarily unavailable")
+    heartbeat(run, page)
+    assert "cannot be started: Resource temporarily unavailable" in run.events[-1].text
+    run.look(ended=True, awake=False)
+    assert run.settle().confirmed
+
+
+def test_nothing_starts_before_the_guardian_watches(run):
+    guardian = run.guardians[0]
+    guardian.phase = GuardianPhase.STARTING
+    assert run.safety.ready() is False
+    assert run.safety.by == ""
+    guardian.ended = True
+    with pytest.raises(RunError, match="the guardian could not be started: no device"):
+        run.safety.ready()
+    guardian.phase = GuardianPhase.WATCHING
+    assert run.safety.ready() is True
+    run.safety.close()
+    assert run.log == ["guardian ended"]

@@ -1,0 +1,354 @@
+"""The ring between loop and recorder."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from hilctl.base.samples import LAST_SAMPLE, LONGEST_NS, BlockHeader, Flag
+from hilctl.run.shared import ring as module
+from hilctl.run.shared.ring import SampleRing
+from hilctl.run.shared.shared_page import PageField, PageSlot
+
+BLOCK, STATE = 3, 2
+
+
+def make(tmp_path, slots=4):
+    return SampleRing.create(tmp_path / "ring", slots=slots, block=BLOCK, state_size=STATE)
+
+
+def born(ring, number, *, due=True):
+    """Fill a block in its slot and send it."""
+    block = ring.claim(due=due)
+    block.head[BlockHeader.FIRST_SAMPLE], block.head[BlockHeader.SAMPLES] = number * BLOCK, BLOCK
+    block.head[BlockHeader.DEADLINE_NS] = number
+    block.state[:] = -number
+    for row in (block.reference, block.wanted, block.command, block.input_um):
+        row[:] = number
+    block.displacement_um[:] = block.measured[:] = number
+    block.flags[:] = number
+    ring.sending(block)
+    return block
+
+
+def push(ring, number):
+    """Let a block be born, sent and answered at once; return whether it has a slot."""
+    return ring.answered(born(ring, number))
+
+
+def test_blocks_come_out_as_they_went_in(tmp_path):
+    """Heads, states, columns and flags arrive whole and in order in the other process's view."""
+    ring = make(tmp_path)
+    other = SampleRing(ring.path)
+    assert push(ring, 1)
+    assert push(ring, 2)
+    batch = other.pop()
+    assert batch.heads[:, BlockHeader.FIRST_SAMPLE].tolist() == [3, 6]
+    assert batch.columns[1].tolist() == [[2.0] * BLOCK] * 6
+    assert batch.states.tolist() == [[-1.0, -1.0], [-2.0, -2.0]]
+    assert batch.flags.tolist() == [[1] * BLOCK, [2] * BLOCK]
+    assert other.pop() is None
+
+
+def test_full_ring_refuses_and_keeps_what_it_has(tmp_path):
+    """A push into a full ring changes nothing and says so; a release makes room again."""
+    ring = make(tmp_path)
+    other = SampleRing(ring.path)
+    assert [push(ring, n) for n in range(6)] == [True] * 4 + [False] * 2
+    assert other.pop().heads[:, BlockHeader.FIRST_SAMPLE].tolist() == [0, 3, 6, 9]
+    assert not push(ring, 9)
+    other.release()
+    assert push(ring, 9)
+
+
+def mapped(ring):
+    """Return the bytes of a ring's file that this process has mapped, in all of its mappings."""
+    resident, ours = 0, False
+    for line in Path("/proc/self/smaps").read_text(encoding="utf-8").splitlines():
+        words = line.split(maxsplit=5)
+        if not words[0].endswith(":"):
+            ours = words[-1] == str(ring.path)
+        elif ours and words[0] == "Rss:":
+            resident += int(words[1]) << 10
+    return resident
+
+
+def test_a_loop_has_all_of_it_mapped_before_its_first_tick(tmp_path):
+    """Where memory can't be locked, a block would be the first to touch its pages."""
+    size = make(tmp_path, slots=1000).path.stat().st_size
+    assert mapped(SampleRing(tmp_path / "ring")) < size
+    whole = SampleRing(tmp_path / "ring", at_once=True)
+    assert mapped(whole) >= size
+
+
+def test_many_come_out_some_at_a_time(tmp_path, monkeypatch):
+    """In order, round the end of the ring, and no more than there were when it was asked."""
+    monkeypatch.setattr(module, "_BATCH_SAMPLES", 2 * BLOCK)
+    ring = make(tmp_path, slots=7)
+    other = SampleRing(ring.path)
+    for number in range(3):
+        push(ring, number)
+    assert [batch.heads.shape[0] for batch in other.batches()] == [2, 1]
+    other.release()
+    for number in range(3, 9):
+        push(ring, number)
+    sizes, taken = [], []
+    for batch in other.batches():
+        sizes.append(batch.heads.shape[0])
+        taken += (batch.heads[:, BlockHeader.FIRST_SAMPLE] // BLOCK).tolist()
+        if len(sizes) == 1:
+            push(ring, 9)
+    assert (sizes, taken) == ([2, 2, 2], [*range(3, 9)])
+    assert [batch.heads.shape[0] for batch in other.batches()] == [1]
+    assert not [*other.batches()]
+
+
+def test_a_block_comes_out_however_large_it_is(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "_BATCH_SAMPLES", 1)
+    ring = make(tmp_path)
+    push(ring, 0)
+    push(ring, 1)
+    assert ring.pop().heads.shape[0] == 1
+
+
+@settings(max_examples=50)
+@given(st.lists(st.booleans(), max_size=200))
+def test_any_order_of_pushes_and_pops(tmp_path_factory, steps):
+    """Whatever the order, blocks come out once each, in order, or were refused."""
+    ring = make(tmp_path_factory.mktemp("ring"), slots=3)
+    other = SampleRing(ring.path)
+    accepted, taken = [], []
+    for number, is_push in enumerate(steps):
+        if is_push:
+            if push(ring, number):
+                accepted.append(number)
+        elif (batch := other.pop()) is not None:
+            taken += batch.heads[:, BlockHeader.DEADLINE_NS].tolist()
+            other.release()
+    while (batch := other.pop()) is not None:
+        taken += batch.heads[:, BlockHeader.DEADLINE_NS].tolist()
+    assert taken == accepted
+
+
+def test_damaged_slot_is_not_taken(tmp_path):
+    """A slot whose number is not the expected one stops the consumer before it."""
+    ring = make(tmp_path)
+    other = SampleRing(ring.path)
+    for number in range(3):
+        push(ring, number)
+    ring._area.heads[1, BlockHeader.SEQUENCE] = 77
+    assert other.pop().heads.shape[0] == 1
+    assert other.pop() is None
+    assert other.skip_damaged() == 1
+    assert other.pop().heads[:, BlockHeader.FIRST_SAMPLE].tolist() == [6]
+    assert other.skip_damaged() == 0
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        (BlockHeader.FIRST_SAMPLE, LAST_SAMPLE),
+        (BlockHeader.FIRST_SAMPLE, -1),
+        (BlockHeader.DROPPED_BEFORE, -1),
+        (BlockHeader.DROPPED_BEFORE, 4),
+        (BlockHeader.DEADLINE_NS, LONGEST_NS + 1),
+        (BlockHeader.LATE_NS, -LONGEST_NS - 1),
+    ],
+)
+def test_slot_that_no_recording_may_hold_is_not_taken(tmp_path, field, value):
+    """Recorded, it would keep all the rest from being read."""
+    ring = make(tmp_path)
+    for number in range(3):
+        push(ring, number)
+    ring._area.heads[1, field] = value
+    assert ring.pop().heads.shape[0] == 1
+    assert ring.skip_damaged() == 1
+    assert ring.pop().heads[:, BlockHeader.FIRST_SAMPLE].tolist() == [6]
+
+
+def test_what_was_not_released_is_there_for_the_next_consumer(tmp_path):
+    """A consumer that dies with blocks in its hands leaves them in the ring."""
+    ring = make(tmp_path)
+    first = SampleRing(ring.path)
+    push(ring, 0)
+    first.pop()
+    first.release()
+    push(ring, 1)
+    first.pop()
+    push(ring, 2)
+    second = SampleRing(ring.path)
+    assert second.pop().heads[:, BlockHeader.FIRST_SAMPLE].tolist() == [3, 6]
+
+
+def test_blocks_that_were_sent_outlive_their_loop(tmp_path):
+    """They come in order, without those already taken, flagged, with the gap before them."""
+    ring = SampleRing.create(
+        tmp_path / "ring", slots=4, block=BLOCK, state_size=STATE, latency_blocks=2
+    )
+    other = SampleRing(ring.path)
+    assert other.unanswered(0) is None
+    assert push(ring, 0)
+    for number in (1, 2, 3):
+        born(ring, number).flags[:] = Flag.SLEW_LIMITED
+    assert other.pop().heads[:, BlockHeader.FIRST_SAMPLE].tolist() == [0]
+    batch = other.unanswered(5)
+    assert batch.heads[:, BlockHeader.FIRST_SAMPLE].tolist() == [6, 9]
+    assert batch.heads[:, BlockHeader.DROPPED_BEFORE].tolist() == [1, 0]
+    assert np.isnan(batch.columns[:, 3:5]).all()
+    assert (batch.columns[:, 5] == batch.columns[:, 2]).all()
+    assert (batch.columns[:, 2] == [[2.0] * BLOCK, [3.0] * BLOCK]).all()
+    assert (batch.flags & Flag.UNANSWERED).all()
+    assert (batch.flags & Flag.SLEW_LIMITED).all()
+    assert other.unanswered(12) is None
+
+
+def test_block_without_room_lives_in_a_spare_slot(tmp_path):
+    """It touches no block that is kept, nor another one on its way; what was sent is known."""
+    ring = SampleRing.create(
+        tmp_path / "ring", slots=2, block=BLOCK, state_size=STATE, latency_blocks=1
+    )
+    other = SampleRing(ring.path)
+    kept = [born(ring, 1), born(ring, 2)]
+    spare = [born(ring, 3), born(ring, 4)]
+    assert [block.command[0] for block in (*kept, *spare)] == [1.0, 2.0, 3.0, 4.0]
+    assert [ring.answered(block) for block in (*kept, *spare)] == [True, True, False, False]
+    assert other.pop().columns[:, 2, 0].tolist() == [1.0, 2.0]
+    assert other.page.get(PageField.ENDED_AT) == 5 * BLOCK
+    assert other.unanswered(0) is None
+
+
+def test_block_that_is_not_due_is_never_seen(tmp_path):
+    """Blocks that only wait for answers take no slot of those that are recorded."""
+    ring = make(tmp_path)
+    other = SampleRing(ring.path)
+    assert not ring.answered(born(ring, 7, due=False))
+    assert push(ring, 1)
+    assert other.pop().heads[:, BlockHeader.FIRST_SAMPLE].tolist() == [3]
+
+
+@settings(max_examples=60)
+@given(st.binary(min_size=1, max_size=64), st.integers(0, 60_000))
+@example(b"\x00\x00\x00\x00\x00\x00\x80\x00\x00\x01", 57)  # numbers 2**63 from each other
+@example(b"\xff" * 7 + b"\x7f", 56)
+def test_damaged_ring_is_survived(tmp_path_factory, garbage, at):
+    """Whatever stands in the memory, the consumer comes to an end, and raises nothing."""
+    ring = make(tmp_path_factory.mktemp("ring"), slots=3)
+    other = SampleRing(ring.path)
+    for number in range(3):
+        push(ring, number)
+    at = min(at, len(ring._map) - len(garbage))
+    ring._map[at : at + len(garbage)] = garbage
+    for _ in range(10):
+        other.pop()
+        other.page.pop_events()
+        other.skip_damaged()
+        other.release()
+    other.unanswered(0)
+    other.look(0)
+    other.page.read_text(PageSlot.ERROR)
+    other.page.outcome()
+
+
+def test_other_files_are_refused(tmp_path):
+    """A file that is not a ring is not taken for one."""
+    path = tmp_path / "zeros"
+    path.write_bytes(bytes(100_000))
+    with pytest.raises(ValueError, match="is not a hilctl ring"):
+        SampleRing(path)
+
+
+@pytest.mark.parametrize(
+    "field", [PageField.SLOTS, PageField.BLOCK, PageField.STATE_SIZE, PageField.SPARE]
+)
+@pytest.mark.parametrize("value", [-1, 0, 2**40])
+def test_sizes_that_can_not_be_are_refused(tmp_path, field, value):
+    """A ring that says it is larger than its file, or smaller than anything, is damaged."""
+    ring = make(tmp_path)
+    ring.page.put(field, value)
+    with pytest.raises(ValueError, match=r"is damaged|is shorter than it says"):
+        SampleRing(ring.path)
+
+
+def test_slots_are_handed_out_clean(tmp_path):
+    """Nothing of an earlier lap stays in a slot: no flag, no answer that a device did not give."""
+    ring = make(tmp_path, slots=3)
+    other = SampleRing(ring.path)
+    for number in range(20):
+        block = ring.claim()
+        assert not block.flags.any()
+        assert np.isnan(block.displacement_um).all()
+        assert np.isnan(block.measured).all()
+        assert push(ring, number + 1)
+        if number % 3 != 1:
+            other.pop()
+            other.release()
+
+
+def test_who_looks_on_sees_what_stands_there_and_takes_nothing(tmp_path):
+    """Also what was taken and kept; of what was cleaned for the loop, nothing."""
+    ring = make(tmp_path, slots=4)
+    consumer, seen = SampleRing(ring.path), SampleRing(ring.path, look_only=True)
+    for number in range(3):
+        push(ring, number)
+    batch, after = seen.look(1)
+    assert (batch.heads[:, BlockHeader.FIRST_SAMPLE].tolist(), after) == ([3, 6], 3)
+    consumer.pop()
+    consumer.release(keep=1)
+    batch, after = seen.look(0)
+    assert (batch.columns[:, 0, 0].tolist(), after) == ([2.0], 3)
+    assert np.isfinite(batch.columns).all()
+    push(ring, 3)
+    assert consumer.pop().heads[:, BlockHeader.FIRST_SAMPLE].tolist() == [9]
+    assert seen.look(7)[1] == 7
+    with pytest.raises(ValueError, match="read-only"):
+        seen.page.put(PageField.STOP, 1)
+
+
+def test_a_block_that_is_cleaned_or_damaged_under_the_copy_is_left_out(tmp_path):
+    ring = make(tmp_path, slots=4)
+    for number in range(4):
+        push(ring, number)
+    seen = SampleRing(ring.path, look_only=True)
+    rows = seen._area.rows
+
+    class Area:
+        def rows(self, chosen):
+            ring.page.put(PageField.CLEANED, 2)
+            return rows(chosen)
+
+    seen._area = Area()
+    ring._area.heads[3, BlockHeader.SEQUENCE] = 77
+    batch, after = seen.look(0)
+    assert (batch.heads[:, BlockHeader.FIRST_SAMPLE].tolist(), after) == ([6], 4)
+
+
+def test_cursors_are_published_after_what_they_say(tmp_path, monkeypatch):
+    """Whoever observes them reads whole blocks, and writes into clean slots."""
+    ring, seen = make(tmp_path), []
+
+    def publishing(page):
+        publish = page.publishes
+
+        def spied(numbers, field, value):
+            heads, flags = ring._area.heads[:, BlockHeader.SEQUENCE], ring._area.flags[:, 0]
+            seen.append(
+                (PageField(field), value, heads.max().item(), heads.min().item(), flags.max())
+            )
+            publish(numbers, field, value)
+
+        return spied
+
+    monkeypatch.setattr(ring, "_publish", publishing(ring.page))
+    monkeypatch.setattr(ring.page, "publishes", publishing(ring.page))
+    assert push(ring, 3)
+    assert ring.pop() is not None
+    ring.release()
+    assert seen == [
+        (PageField.SENT, 1, 0, -1, 3),
+        (PageField.HEAD, 1, 1, 0, 3),
+        (PageField.EVENT_TAIL, 0, 1, 0, 3),
+        (PageField.CLEANED, 1, 1, 0, 3),
+        (PageField.TAIL, 1, 1, 0, 0),
+    ]

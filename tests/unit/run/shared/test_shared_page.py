@@ -1,0 +1,120 @@
+"""Numbers, texts and events between loop and supervisor."""
+
+import json
+from dataclasses import asdict
+from mmap import mmap
+
+import pytest
+
+from hilctl.base.events import Event
+from hilctl.loop.pacer import Lateness
+from hilctl.loop.safe_output import LoopOutcome
+from hilctl.machine.procfs import ProcessUsage
+from hilctl.run.shared.shared_page import SIZE, PageField, PageSlot, Phase, SharedPage, Stop
+
+
+@pytest.fixture
+def sides():
+    """The page, seen from both sides."""
+    memory = mmap(-1, SIZE)
+    return SharedPage(memory), SharedPage(memory)
+
+
+def test_numbers_are_shared(sides):
+    """What one side sets the other reads, whole numbers and others."""
+    one, other = sides
+    one.put(PageField.STOP, 3)
+    one.put_float(PageField.TUNE_GAIN, -0.125)
+    assert (other.get(PageField.STOP), other.get_float(PageField.TUNE_GAIN)) == (3, -0.125)
+
+
+def test_each_text_has_a_place_of_its_own(sides):
+    """No text is read in the place of another; one that is too long is cut at a character."""
+    one, other = sides
+    for place in PageSlot:
+        one.write_text(place, f"{place.name}: öffnen")
+    assert [other.read_text(place) for place in PageSlot] == [f"{p.name}: öffnen" for p in PageSlot]
+    one.write_text(PageSlot.SET_UP, "µ" * 10_000)
+    assert set(other.read_text(PageSlot.SET_UP)) == {"µ"}
+    assert other.read_text(PageSlot.OUTCOME) == "OUTCOME: öffnen"
+
+
+def test_events_come_once_and_are_cut_to_what_fits(sides):
+    """Events keep their order; too many are counted as lost, and long ones are shortened."""
+    one, other = sides
+    for sample in range(40):
+        one.push_event(Event(sample, "error", "test", "ü" * 1000, {"number": 0.5}))
+    events = other.pop_events()
+    assert [event.sample for event in events] == list(range(32))
+    assert set(events[0].text) == {"ü"}
+    assert events[0].values == {"number": 0.5}
+    assert one.get(PageField.EVENTS_LOST) == 8
+    one.push_event(Event(41, "info", "test", "no room yet"))
+    other.release_events()
+    one.push_event(Event(42, "info", "test", "room"))
+    assert [event.sample for event in other.pop_events()] == [42]
+
+
+def test_outcome_counts_only_at_the_end(sides):
+    """A text that is not there yet, or damaged, is no outcome."""
+    one, other = sides
+    outcome = LoopOutcome("stopped", "stopped by a test", 7, "confirmed", 2)
+    one.write_text(PageSlot.OUTCOME, json.dumps(asdict(outcome)))
+    assert other.outcome() is None
+    one.put(PageField.PHASE, Phase.ENDED)
+    assert other.outcome() == outcome
+    one.write_text(PageSlot.OUTCOME, '{"code": "sto')
+    assert other.outcome() is None
+
+
+def test_counters_arrive(sides):
+    """Each one in its place."""
+    one, other = sides
+    one.leave_lateness(Lateness(1, 2, 3, 4, 5))
+    assert other.lateness() == Lateness(1, 2, 3, 4, 5)
+
+
+def test_every_stop_has_its_words():
+    """What the loop says of a stop."""
+    assert all(stop.reason.startswith("stopped b") for stop in Stop)
+    assert len({stop.reason for stop in Stop}) == len(Stop)
+
+
+def test_values_that_do_not_fit_are_left_out(sides):
+    """The loop does not look for some that do."""
+    one, other = sides
+    values = {f"weight_{number}": 1.0 / 3.0 for number in range(500)}
+    one.push_event(Event(1, "info", "test", "text", values))
+    (event,) = other.pop_events()
+    assert (event.code, event.text, event.values) == ("test", "text", {})
+
+
+def test_who_looks_on_sees_the_newest_events_and_takes_none(sides):
+    one, other = sides
+    for number in range(3):
+        one.push_event(Event(number, "info", f"e{number}", ""))
+    events, after = other.look_at_events(1)
+    assert ([event.code for event in events], after) == (["e1", "e2"], 3)
+    assert other.look_at_events(after) == ([], 3)
+    assert len(one.pop_events()) == 3
+
+
+def test_notes_are_seen_by_all_and_the_oldest_give_way(sides):
+    """Whatever their texts; nobody has to take them out."""
+    one, other = sides
+    for number in range(40):
+        one.leave_note(Event(number, "info", "mark", f"{number} " + "x" * 2000))
+    notes, after = other.look_at_notes(0)
+    assert [note.sample for note in notes] == list(range(9, 40))
+    assert (after, other.look_at_notes(after)) == (40, ([], 40))
+    one.leave_note(Event(40, "info", "mark", "more"))
+    assert [note.text for note in other.look_at_notes(after)[0]] == ["more"]
+
+
+def test_what_a_run_took_passes_to_the_other_side(sides):
+    """Nothing is known of a loop that died before it could say it."""
+    one, other = sides
+    assert other.usage() is None
+    usage = ProcessUsage(98_000_000, 1_500, 12, 3, 4)
+    one.leave_usage(usage)
+    assert other.usage() == usage

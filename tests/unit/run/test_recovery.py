@@ -1,0 +1,149 @@
+"""Runs whose processes died: what the ring holds goes into the recording, and the folder goes."""
+
+import json
+import shutil
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+
+from hilctl.base.errors import InputError
+from hilctl.loop.safe_output import LoopOutcome
+from hilctl.recording.reader import read
+from hilctl.run.recovery import recover_dead_runs
+from hilctl.run.run_folder import dismiss, run_folder, runs
+from hilctl.run.shared.ring import SampleRing
+from hilctl.run.shared.shared_page import PageField, PageSlot, Phase, SafeActionResult
+
+GOLDEN = Path(__file__).parents[3] / "recordings" / "golden" / "terfenol_uncompensated.mcap"
+
+
+@pytest.fixture
+def dead(tmp_path):
+    """Leave the folder of a dead run behind; yield a function that does, given its ring."""
+
+    def leave(fill=lambda folder: None):
+        recording = tmp_path / "a.mcap"
+        recording.write_bytes(GOLDEN.read_bytes()[:-100])
+        kept = tmp_path / "kept"
+        with run_folder("sine", recording, 12.0) as (folder, _):
+            fill(folder)
+            shutil.copytree(folder.path, kept)
+        shutil.move(kept, folder.path)
+        return recording
+
+    return leave
+
+
+def test_a_run_that_left_no_ring_is_not_known_to_be_safe(dead):
+    """Its recording is made whole all the same, and the next look finds nothing."""
+    recording = dead()
+    (orphan,) = recover_dead_runs()
+    assert orphan.recording == recording
+    assert not orphan.safe
+    assert "NOT confirmed to be safe: check it" in orphan.text
+    assert read(recording).samples.index.size > 0
+    assert runs() == []
+    assert recover_dead_runs() == []
+
+
+def test_a_loop_that_ended_by_its_ramp_is_believed(dead):
+    """The page says so, although nobody was left to read it."""
+
+    def fill(folder):
+        page = SampleRing.create(folder.ring, slots=4, block=1, state_size=1).page
+        ended = LoopOutcome("stopped", "stopped because the supervisor died", 0, "confirmed", 0)
+        page.write_text(PageSlot.OUTCOME, json.dumps(asdict(ended)))
+        page.put(PageField.PHASE, Phase.ENDED)
+        page.put(PageField.GO, 1)
+
+    dead(fill)
+    (orphan,) = recover_dead_runs()
+    assert orphan.safe
+    assert orphan.text.startswith("stopped because the supervisor died; output at its safe value")
+
+
+@pytest.mark.parametrize(
+    ("error", "words"), [("", "confirmed by the device"), ("no answer", "no answer")]
+)
+def test_what_the_guardian_did_is_said(dead, error, words):
+    """Both others were dead; what it could not confirm is not called safe."""
+
+    def fill(folder):
+        page = SampleRing.create(folder.ring, slots=4, block=1, state_size=1).page
+        page.put(PageField.PHASE, Phase.RUNNING)
+        page.put(PageField.GO, 1)
+        output = "unknown" if error else "confirmed"
+        page.leave_safe_result(SafeActionResult(hung=False, output=output, error=error))
+
+    recording = dead(fill)
+    (orphan,) = recover_dead_runs()
+    assert orphan.safe == (not error)
+    assert "supervisor and loop died; guardian: " in orphan.text
+    assert words in orphan.text
+    assert ("NOT confirmed to be safe" in orphan.text) == bool(error)
+    assert read(recording).samples.index.size > 0
+
+
+def test_a_living_run_is_left_alone(tmp_path):
+    with run_folder("sine", tmp_path / "a.mcap", 12.0) as (folder, _):
+        assert recover_dead_runs() == []
+        assert folder.path.is_dir()
+
+
+def test_what_can_not_be_recovered_is_kept(dead):
+    """The samples are nowhere else; once the recording can be had again, they go into it."""
+    recording = dead()
+    cut = recording.read_bytes()
+    recording.unlink()
+    (orphan,) = recover_dead_runs()
+    assert orphan.kept is not None
+    assert orphan.kept.is_dir()
+    assert "could not be recovered" in orphan.text
+    recording.write_bytes(cut)
+    (orphan,) = recover_dead_runs()
+    assert orphan.kept is None
+    assert read(recording).samples.index.size > 0
+    assert runs() == []
+
+
+def ready(folder):
+    page = SampleRing.create(folder.ring, slots=4, block=1, state_size=1).page
+    page.put(PageField.PHASE, Phase.READY)
+
+
+@pytest.mark.parametrize("fill", [lambda folder: None, ready])
+def test_a_run_that_never_started_is_cleared_away(dead, fill):
+    """Killed while it starts, it leaves a recording that was claimed, or that has a head only."""
+    recording = dead(fill)
+    recording.write_bytes(b"")
+    (orphan,) = recover_dead_runs()
+    assert (orphan.started, orphan.kept) == (False, None)
+    assert not recording.exists()
+    assert runs() == []
+
+
+def test_what_stood_under_the_name_of_a_run_that_never_started_stays(dead):
+    recording = dead(ready)
+    before = recording.read_bytes()
+    (orphan,) = recover_dead_runs()
+    assert not orphan.started
+    assert recording.read_bytes() == before
+    assert runs() == []
+
+
+def test_what_can_not_be_recovered_can_be_dismissed(dead, tmp_path):
+    """By the run's name; an active run can't."""
+    dead().unlink()
+    (orphan,) = recover_dead_runs()
+    dismiss(orphan.name)
+    assert runs() == []
+    with pytest.raises(InputError, match="no run is named"):
+        dismiss(orphan.name)
+    for name in ("..", ".", "devices"):
+        with pytest.raises(InputError, match="no run is named"):
+            dismiss(name)
+    with run_folder("sine", tmp_path / "a.mcap", 12.0) as (folder, _):
+        with pytest.raises(InputError, match="is active"):
+            dismiss(folder.card.name)
+        assert runs() == [folder]
