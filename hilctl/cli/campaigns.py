@@ -14,9 +14,9 @@ from rich.table import Table
 from rich.text import Text
 
 from hilctl import api
+from hilctl.api._types import runs_folder
 from hilctl.api.campaigns import run_steps
-from hilctl.api.given import runs_folder
-from hilctl.base.errors import ConfigError, ConfigProblem, InputError
+from hilctl.base.errors import ConfigError, ConfigProblem
 from hilctl.base.yaml import Document
 from hilctl.cli.console import console, progress_bar
 from hilctl.cli.options import (
@@ -129,9 +129,6 @@ def _run_campaign(
     dry_run: bool,
     as_json: bool,
 ) -> None:
-    if scheduler != "none" and not fast:
-        raise InputError("--scheduler needs --fast: runs in real time are sequential")
-
     def on_plan(plan: CampaignPlan) -> None:
         if not as_json:
             print_plan(plan, fast=fast, every_step=dry_run)

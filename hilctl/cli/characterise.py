@@ -10,7 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from hilctl import api
-from hilctl.api.given import runs_folder
+from hilctl.api._types import runs_folder
 from hilctl.base.errors import RunError
 from hilctl.cli.console import console, progress_bar
 from hilctl.cli.options import (
