@@ -26,7 +26,7 @@ from hilctl.cli.console import console
 from hilctl.cli.safe_streams import safe_streams
 from hilctl.live.run_reader import RunReader
 from hilctl.live.scope import WINDOWS_S
-from hilctl.live.signals import ROW
+from hilctl.live.traces import ROW
 from hilctl.run.client import find_run, mark_run, request_stop, set_run
 from hilctl.run.protocol import JOB_CONTROL, MAX_MARK
 from hilctl.run.run_folder import RunFolder, runs

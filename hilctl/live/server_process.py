@@ -87,7 +87,7 @@ def serve_foxglove(
     """Serve runs to Foxglove and compatible applications until it is over.
 
     Args:
-        chosen: See :class:`hilctl.live.run_list.RunList`.
+        chosen: See :class:`hilctl.live.run_reader.RunList`.
         over: Returns whether to end the server.
         on_url: Called with the address of the server.
         port: Port to listen on; 0 for any, None for the default port of the applications.
@@ -96,7 +96,7 @@ def serve_foxglove(
         InputError: The library is not installed.
         RunError: The port is not available.
     """
-    from hilctl.live.foxglove_server import PORT, FoxgloveServer
+    from hilctl.live.foxglove import PORT, FoxgloveServer
 
     _come_last()  # before the library starts threads, which inherit the priority
     server = FoxgloveServer(chosen, PORT if port is None else port)

@@ -18,7 +18,7 @@ from hilctl.cli import watch as module
 from hilctl.cli.console import print_rich
 from hilctl.cli.watch import View, print_lines
 from hilctl.live.scope import WINDOWS_S, Buckets, ScopeWindow
-from hilctl.live.signals import SIGNALS
+from hilctl.live.traces import SIGNALS
 
 
 class FakeFeed:
