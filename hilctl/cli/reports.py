@@ -11,16 +11,16 @@ from rich.text import Text
 
 from hilctl import api
 from hilctl.analysis.report_table import quality_rows, run_rows, segment_table
+from hilctl.analysis.run_metrics import RunReport
 from hilctl.base.errors import InputError
 from hilctl.base.formatting import printable, quantity
-from hilctl.cli.console import console, print_rich, progress_bar
+from hilctl.cli.console import console, print_rich, progress_bar, table
 from hilctl.cli.options import AsJson, FromTime, Overwrite, RecordingFile, ToTime
-from hilctl.cli.safe_streams import print_json
+from hilctl.cli.output import print_json
 from hilctl.run.dead_runs import finish_dead_runs
 
 if TYPE_CHECKING:
     from hilctl.analysis.replay import ReplayResult
-    from hilctl.analysis.run_metrics import RunReport
     from hilctl.studies.multi_run.collect import RunSeries
 
 RunsInput = Annotated[
@@ -55,7 +55,7 @@ def report(
     overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
-    """Evaluate a recording (hysteresis, error, noise, lateness), several, or a campaign."""
+    """Evaluate recordings or a campaign: hysteresis, error, noise, lateness."""
     if len(runs) > 1 or runs[0].is_dir():
         if from_s is not None or to_s is not None or before is not None:
             raise InputError("--from, --to and --before apply to the report of one recording only")
@@ -85,7 +85,7 @@ def replay(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Recompute the commands from the recorded reference and compare them bit for bit."""
+    """Recompute commands from the recorded reference and compare them bit for bit."""
     finish_dead_runs()
     result = api.replay(recording, model)
     if as_json:
@@ -149,7 +149,7 @@ def report_series(
         print_rich(render_series(series))
 
 
-def render_report(report: "RunReport") -> Group:
+def render_report(report: RunReport) -> Group:
     """Return the tables of a report; the segments have their own if there are several."""
     title = printable(report.name) or "run"
     quality = _two_columns(title, quality_rows(report))
@@ -162,27 +162,19 @@ def render_report(report: "RunReport") -> Group:
 
 
 def _two_columns(title: str, rows: Sequence[tuple[str, str]]) -> Table:
-    # Text, not str: names and labels come from files and must not be read as markup.
-    table = Table(title=Text(title) if title else None, show_header=False, title_justify="left")
-    table.add_column(style="bold", no_wrap=True)
-    table.add_column(overflow="fold")
-    for name, value in rows:
-        table.add_row(Text(name), Text(value))
-    return table
+    made = table(title, ("", ""), rows, left={""}, wrap=True)
+    made.show_header, made.columns[0].style, made.columns[0].no_wrap = False, "bold", True
+    return made
 
 
-def _segments(report: "RunReport") -> Table:
-    table = Table(title="segments, worst first", title_justify="left")
+def _segments(report: RunReport) -> Table:
     headings, rows = segment_table(report)
     shown = [i for i, heading in enumerate(headings) if heading not in _PAGE_ONLY]
-    for i in shown:
-        table.add_column(headings[i], justify="right" if i else "left", no_wrap=True)
-    for cells in rows:
-        table.add_row(*(Text(cells[i]) for i in shown))
-    return table
+    cells = [[row[i] for i in shown] for row in rows]
+    return table("segments, worst first", [headings[i] for i in shown], cells)
 
 
-def _minutes(report: "RunReport") -> Table:
+def _minutes(report: RunReport) -> Table:
     minutes = report.lateness_by_minute
     title = "lateness per minute, µs"
     if len(minutes) > _MOST_MINUTES:
@@ -190,13 +182,11 @@ def _minutes(report: "RunReport") -> Table:
         title += f": worst {_MOST_MINUTES} of {len(minutes)}"
         worst = sorted(minutes, key=lambda each: -each["max"])[:_MOST_MINUTES]
         minutes = sorted(worst, key=lambda each: each["minute"])
-    table = Table(title=title, title_justify="left")
-    for heading in minutes[0]:
-        table.add_column(heading, justify="right", no_wrap=True)
-    for minute in minutes:
-        cells = (f"{v:,}" if name in _COUNTS else f"{v:.4g}" for name, v in minute.items())
-        table.add_row(*cells)
-    return table
+    rows = [
+        [f"{v:,}" if name in _COUNTS else f"{v:.4g}" for name, v in minute.items()]
+        for minute in minutes
+    ]
+    return table(title, [*minutes[0]], rows)
 
 
 def render_series(series: "RunSeries") -> Group:
@@ -205,16 +195,12 @@ def render_series(series: "RunSeries") -> Group:
     from hilctl.studies.multi_run.summary_text import headline
 
     headings, rows = run_table(series, MOST_ROWS, short=True)
-    table = Table(title=Text(printable(series.name)), title_justify="left")
-    for number, heading in enumerate(headings):
-        left = number == 0 or heading == "result"
-        table.add_column(heading, justify="left" if left else "right", overflow="fold")
-    for cells in rows:
-        table.add_row(*(Text(printable(cell)) for cell in cells))
+    cells = [[printable(cell) for cell in row] for row in rows]
+    runs = table(printable(series.name), headings, cells, left={"result"}, wrap=True)
     problems = [Text(f"not read: {printable(each)}", "red") for each in series.missing]
     named = [] if series.is_campaign else [(run.number, run.recording) for run in series.runs]
     files = [Text(f"{number}: {printable(name)}") for number, name in named]
-    return Group(Text(printable(" ".join(headline(series)))), *problems, table, *files)
+    return Group(Text(printable(" ".join(headline(series)))), *problems, runs, *files)
 
 
 def print_replay(result: "ReplayResult", *, other: Path | None) -> None:

@@ -11,36 +11,35 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Annotated, Any, Self
+from typing import Annotated, Any, Self
 
 import numpy as np
 import typer
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
-from rich.table import Table
 from rich.text import Text
 
 from hilctl import api
+from hilctl.analysis.run_metrics import RunReport
 from hilctl.base.errors import HilctlError, InputError
 from hilctl.base.events import adapted_text
 from hilctl.base.formatting import unit_text
-from hilctl.cli.compile_progress import compile_progress
-from hilctl.cli.console import console
+from hilctl.cli.console import compile_progress, console, listing
 from hilctl.cli.options import AsJson, ExperimentFile, LabelTexts, Overwrite, Settings
+from hilctl.cli.output import print_json
 from hilctl.cli.reports import render_report
-from hilctl.cli.safe_streams import print_json
+from hilctl.experiment.preflight import CheckedExperiment
 from hilctl.experiment.run_labels import label_settings
+from hilctl.live.server_process import served_beside
 from hilctl.loop.safe_output import describe
 from hilctl.machine.logind import log_out
 from hilctl.machine.procfs import Machine
 from hilctl.run.architecture import require_linux
+from hilctl.run.by_hand import put_safe
 from hilctl.run.dead_runs import finish_dead_runs
+from hilctl.run.detached import start_detached
+from hilctl.run.result import Progress as RunProgress
+from hilctl.run.result import RunResult
 from hilctl.run.run_folder import facts_of
-
-if TYPE_CHECKING:
-    from hilctl.analysis.run_metrics import RunReport
-    from hilctl.experiment.preflight import CheckedExperiment
-    from hilctl.run.result import Progress as RunProgress
-    from hilctl.run.result import RunResult
 
 _log = logging.getLogger(__name__)
 
@@ -128,7 +127,7 @@ def _watched(*, requested: bool) -> Iterator[None]:
     if not requested:
         yield
         return
-    with subprocess.Popen([sys.executable, "-Pm", "hilctl.cli.watch", str(os.getpid())]) as process:
+    with subprocess.Popen([sys.executable, "-Pm", "hilctl.cli.live", str(os.getpid())]) as process:
         try:
             yield
         finally:
@@ -144,8 +143,6 @@ def _served(*, requested: bool) -> Iterator[list[str]]:
     if not requested:
         yield []
         return
-    from hilctl.live.server_process import served_beside
-
     with served_beside() as url:
         yield [url]
 
@@ -153,8 +150,6 @@ def _served(*, requested: bool) -> Iterator[list[str]]:
 def _detach(
     experiment: Path, output: Path | None, settings: list[str], *, overwrite: bool, as_json: bool
 ) -> None:
-    from hilctl.run.detached import start_detached
-
     finding = log_out(Machine())
     if finding.level != "ok":
         _log.warning("a log-out %s: %s", finding.text, finding.remedy)
@@ -183,8 +178,6 @@ def check(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson
 def safe(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson = False) -> None:
     """Set a device to its safe value (refused while a run uses it)."""
     require_linux()
-    from hilctl.run.by_hand import put_safe
-
     put = put_safe(experiment, settings or [])
     where = f"{put.device}: {describe(put.output, put.error)} ({put.value:g} {put.unit})"
     if as_json:
@@ -237,7 +230,7 @@ class LiveView:
     ) -> None:
         self._progress.stop()
 
-    def update(self, progress: "RunProgress") -> None:
+    def update(self, progress: RunProgress) -> None:
         """Show the newest samples, a few times per second."""
         while self._addresses:
             print(f"live page: {self._addresses.pop()}", file=sys.stderr)
@@ -254,7 +247,7 @@ class LiveView:
         self._progress.update(self._task, completed=done, live=_live_text(progress))
 
 
-def _live_text(progress: "RunProgress") -> str:
+def _live_text(progress: RunProgress) -> str:
     newest = progress.batch.samples(slice(-1, None))
     command, displacement_um = newest.command, newest.displacement_um
     error_um = displacement_um - newest.reference_um
@@ -266,7 +259,7 @@ def _live_text(progress: "RunProgress") -> str:
     )
 
 
-def report_of(result: "RunResult", *, every: bool) -> "RunReport | None":
+def report_of(result: RunResult, *, every: bool) -> RunReport | None:
     """Return the report of a finished run.
 
     Args:
@@ -277,12 +270,12 @@ def report_of(result: "RunResult", *, every: bool) -> "RunReport | None":
     return api.summarize(result.path) if wanted else None
 
 
-def run_mapping(result: "RunResult", report: "RunReport | None") -> dict[str, Any]:
+def run_mapping(result: RunResult, report: RunReport | None) -> dict[str, Any]:
     """Return the result and report of a run as plain values."""
     return {**(report.to_mapping() if report else {}), **result.to_mapping()}
 
 
-def print_run(result: "RunResult", report: "RunReport | None") -> None:
+def print_run(result: RunResult, report: RunReport | None) -> None:
     """Print the result of a run and its report, if there is one."""
     terminal = console()
     colour = {"completed": "green", "stopped": "yellow"}.get(result.code, "red")
@@ -304,13 +297,12 @@ def print_run(result: "RunResult", report: "RunReport | None") -> None:
     terminal.print(f"  hilctl report {path} --html run.html", soft_wrap=True)
 
 
-def print_forecast(checked: "CheckedExperiment") -> None:
+def print_forecast(checked: CheckedExperiment) -> None:
     """Print the forecast of a run and its warnings."""
     forecast, config = checked.forecast, checked.loaded.config
     unit, reference_unit = forecast.command_unit, checked.reference.unit
     limits = config.limits
     low, high = limits.command_range
-    table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
     rows = {
         "experiment": config.name,
         "device": checked.loaded.device.info.description,
@@ -336,10 +328,8 @@ def print_forecast(checked: "CheckedExperiment") -> None:
         initial = f"initially {forecast.begins_rms_a or 0.0:.3g} A rms"
         maximum = f"{forecast.heating_rms_a:.4g} A rms (limit {limits.rms_current_a:g})"
         rows["heating"] = f"{maximum}, {initial}"
-    for name, text in rows.items():
-        table.add_row(name, text)
     terminal = console()
-    terminal.print(table)
+    terminal.print(listing("", rows.items()))
     for warning in checked.warnings:
         terminal.print(f"warning: {warning}", style="yellow")
     terminal.print("ready to run", style="green")

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import typer
 from rich.console import Console
-from tests.unit.series.conftest import grown
 
 from hilctl.analysis import html
 from hilctl.analysis import replay as replaying
@@ -25,6 +24,7 @@ from hilctl.cli.console import print_rich
 from hilctl.cli.recordings import export, recover
 from hilctl.cli.reports import figures, print_replay, render_report, render_series, replay, report
 from hilctl.studies.multi_run.collect import RunSeries
+from tests.unit.studies.multi_run.conftest import grown
 
 UNCOMPENSATED = Path(__file__).parents[3] / "recordings" / "golden" / "terfenol_uncompensated.mcap"
 
@@ -89,7 +89,7 @@ def test_options_and_arguments_in_any_order(recording, tmp_path, capsys):
     out = tmp_path / "run.csv"
     assert read_recording("export", [str(recording), *stretch, str(out)]) == 0
     assert capsys.readouterr().out == f"{out}: {samples} samples\n"
-    with pytest.raises(InputError, match="exists already"):
+    with pytest.raises(InputError, match="exists"):
         read_recording("export", [str(recording), str(out)])
     assert read_recording("export", [str(recording), str(out), "--overwrite", "--json"]) == 0
 
@@ -131,7 +131,7 @@ def test_folder_is_one_page(tmp_path, monkeypatch, capsys):
     report([GOLDEN], html=page)
     assert "runs, all completed" in page.read_text(encoding="utf-8")
     assert "all completed" in capsys.readouterr().out
-    with pytest.raises(InputError, match="exists already"):
+    with pytest.raises(InputError, match="exists"):
         report([GOLDEN], html=page)
 
 

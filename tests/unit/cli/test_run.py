@@ -67,7 +67,7 @@ def test_check_prints_the_forecast(capsys):
 @pytest.mark.parametrize("as_json", [True, False])
 def test_unconfirmed_safe_value_has_exit_code_3(monkeypatch, capsys, as_json):
     put = SafeResult("a device", 0.0, "A", "unknown", "no answer")
-    monkeypatch.setattr("hilctl.run.by_hand.put_safe", lambda path, settings: put)
+    monkeypatch.setattr("hilctl.cli.run.put_safe", lambda path, settings: put)
     with pytest.raises(typer.Exit) as left:
         safe(DEMO, as_json=as_json)
     assert left.value.exit_code == 3
@@ -78,7 +78,7 @@ def test_unconfirmed_safe_value_has_exit_code_3(monkeypatch, capsys, as_json):
 
 def test_confirmed_safe_value_is_printed(monkeypatch, capsys):
     put = SafeResult("a device", 0.25, "A", "confirmed", "")
-    monkeypatch.setattr("hilctl.run.by_hand.put_safe", lambda path, settings: put)
+    monkeypatch.setattr("hilctl.cli.run.put_safe", lambda path, settings: put)
     safe(DEMO)
     assert "0.25 A" in capsys.readouterr().out
 
@@ -155,5 +155,5 @@ def test_subprocess_of_the_view_ends_with_the_run(monkeypatch, ignores):
     with module._watched(requested=True):
         assert started[0][1].poll() is None
     ((command, process),) = started
-    assert command[-2:] == ["hilctl.cli.watch", str(os.getpid())]
+    assert command[-2:] == ["hilctl.cli.live", str(os.getpid())]
     assert process.returncode == -(signal.SIGKILL if ignores else signal.SIGTERM)
