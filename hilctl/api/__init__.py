@@ -24,14 +24,11 @@ if TYPE_CHECKING:
         RecordedRun,
         SampleTable,
         export,
-        figures,
         list_runs,
         read,
-        replay,
-        report_page,
-        report_runs,
         summarize,
     )
+    from hilctl.api.reports import figures, replay, report_page, report_runs
     from hilctl.api.runs import WrittenExperiment, check, init, load, run
 
 __all__ = [
@@ -65,6 +62,7 @@ if not TYPE_CHECKING:
         "campaigns": {"campaign", "characterise", "learn"},
         "connection": {"RunConnection", "connect"},
         "models": {"compare", "identify", "refine"},
+        "reports": {"figures", "replay", "report_page", "report_runs"},
         "runs": {"WrittenExperiment", "check", "init", "load", "run"},
     }
 

@@ -15,18 +15,20 @@ from typing import Annotated, Any, Self
 
 import numpy as np
 import typer
+from rich.console import Group
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.table import Table
 from rich.text import Text
 
 from hilctl import api
+from hilctl.analysis.report_table import quality_rows, run_rows, segment_table
 from hilctl.analysis.run_metrics import RunReport
 from hilctl.base.errors import HilctlError, InputError
 from hilctl.base.events import adapted_text
-from hilctl.base.formatting import unit_text
-from hilctl.cli.console import compile_progress, console, listing
+from hilctl.base.formatting import printable, unit_text
+from hilctl.cli.console import compile_progress, console, listing, table
 from hilctl.cli.options import AsJson, ExperimentFile, LabelTexts, Overwrite, Settings
 from hilctl.cli.output import print_json
-from hilctl.cli.reports import render_report
 from hilctl.experiment.preflight import CheckedExperiment
 from hilctl.experiment.run_labels import label_settings
 from hilctl.live.server_process import served_beside
@@ -46,6 +48,9 @@ _log = logging.getLogger(__name__)
 _REFRESH_S = 0.1
 _LARGEST_REPORTED = 5_000_000
 _VIEW_END_S = 2.0
+_MOST_MINUTES = 20
+_COUNTS = {"minute", "ticks"}
+_PAGE_ONLY = {"cycles", "start s", "freq. Hz", "floor %", "loop area"}  # a terminal has 80 columns
 
 
 def run(
@@ -295,6 +300,46 @@ def print_run(result: RunResult, report: RunReport | None) -> None:
     terminal.print(f"recorded: {result.path}", soft_wrap=True)
     path = shlex.quote(str(result.path))
     terminal.print(f"  hilctl report {path} --html run.html", soft_wrap=True)
+
+
+def render_report(report: RunReport) -> Group:
+    """Return the tables of a report; the segments have their own if there are several."""
+    title = printable(report.name) or "run"
+    quality = _two_columns(title, quality_rows(report))
+    parts = [quality, _two_columns("", run_rows(report))]
+    if len(report.segments) > 1:
+        parts.append(_segments(report))
+    if len(report.lateness_by_minute) > 1:
+        parts.append(_minutes(report))
+    return Group(*parts)
+
+
+def _two_columns(title: str, rows: Sequence[tuple[str, str]]) -> Table:
+    made = table(title, ("", ""), rows, left={""}, wrap=True)
+    made.show_header, made.columns[0].style, made.columns[0].no_wrap = False, "bold", True
+    return made
+
+
+def _segments(report: RunReport) -> Table:
+    headings, rows = segment_table(report)
+    shown = [i for i, heading in enumerate(headings) if heading not in _PAGE_ONLY]
+    cells = [[row[i] for i in shown] for row in rows]
+    return table("segments, worst first", [headings[i] for i in shown], cells)
+
+
+def _minutes(report: RunReport) -> Table:
+    minutes = report.lateness_by_minute
+    title = "lateness per minute, µs"
+    if len(minutes) > _MOST_MINUTES:
+        # --json contains all of them.
+        title += f": worst {_MOST_MINUTES} of {len(minutes)}"
+        worst = sorted(minutes, key=lambda each: -each["max"])[:_MOST_MINUTES]
+        minutes = sorted(worst, key=lambda each: each["minute"])
+    rows = [
+        [f"{v:,}" if name in _COUNTS else f"{v:.4g}" for name, v in minute.items()]
+        for minute in minutes
+    ]
+    return table(title, [*minutes[0]], rows)
 
 
 def print_forecast(checked: CheckedExperiment) -> None:

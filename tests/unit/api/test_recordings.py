@@ -5,8 +5,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from hilctl import api
 from hilctl.api.recordings import SampleTable
@@ -59,16 +57,6 @@ def test_a_file_and_its_recording_in_memory_give_the_same(file, tmp_path):
     assert (tmp_path / "a.csv").read_bytes() == (tmp_path / "b.csv").read_bytes()
 
 
-@pytest.mark.slow
-def test_figures_are_axes_and_files(file, tmp_path):
-    settings = SHORT | {"waveform": SHORT["waveform"] | {"amplitude": 2.0}}
-    other = api.run(SINE, tmp_path / "b.mcap", settings=settings, fast=True).path
-    figures = api.figures([file, other], tmp_path / "figures", formats="svg")
-    assert figures
-    assert all(isinstance(each, Axes) for axes in figures.values() for each in axes)
-    assert {path.stem for path in (tmp_path / "figures").iterdir()} == set(figures)
-
-
 def test_the_catalogue_is_a_list(file):
     (found,) = api.list_runs(file.parent, where='label.sample == "A7"')
     assert found["labels"] == {"sample": "A7"}
@@ -81,19 +69,6 @@ def test_other_files_are_refused(tmp_path):
         api.read(tmp_path / "x.mcap")
     with pytest.raises(InputError):
         api.summarize(tmp_path / "y.mcap")
-
-
-def test_figures_of_one_recording_are_those_of_its_page(file, tmp_path, monkeypatch):
-    pages, seen = [], {}
-    monkeypatch.setattr("hilctl.analysis.html.figures", lambda sheets: pages.extend(sheets) or "")
-    monkeypatch.setattr("hilctl.studies.multi_run.plots.drawn", lambda sheet, width: Figure())
-    page = tmp_path / "page.html"
-    assert api.report_page(file, page) == api.summarize(file)
-    figures = api.figures(file, tmp_path / "one", formats="svg", on_written=seen.__setitem__)
-    assert [sheet.name for sheet in pages] == list(figures) == [path.stem for path in seen]
-    assert [sheet.caption for sheet in pages] == list(seen.values())
-    with pytest.raises(InputError, match="exists"):
-        api.report_page(file, page)
 
 
 def test_a_time_range_is_evaluated(file):

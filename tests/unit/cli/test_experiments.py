@@ -53,7 +53,7 @@ def runs(tmp_path, monkeypatch):
     def write(contents, summary, page, before):
         page.write_text(f"{summary.name}{' beside the one before' if before else ''}")
 
-    monkeypatch.setattr("hilctl.analysis.run_page.write_html", write)
+    monkeypatch.setattr("hilctl.api.reports.write_html", write)
     return seen, ends
 
 
