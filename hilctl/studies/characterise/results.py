@@ -8,8 +8,8 @@ from typing import Any, Self
 import numpy as np
 
 from hilctl.base.types import F64
-from hilctl.identify.command import Identification
 from hilctl.identify.model_quality import GOOD_PERCENT, MOST_PERCENT, Grade, Verdict
+from hilctl.identify.pipeline import Identification
 from hilctl.studies.characterise.loops import LoopFigures, Repeatability, ReversalCurves
 from hilctl.studies.characterise.noise import RestNoise, StepResponseCheck
 from hilctl.studies.characterise.response import SmallSignal

@@ -81,16 +81,17 @@ def test_the_kind_is_chosen_on_whole_histories_of_what_may_be_fitted(run, monkey
     """Named by their files; to the end of the last waveform at full size, gaps filled in."""
     asked = []
 
-    def identify(records, settings, unit, **more):
-        asked.append((records, settings, unit, more["source"]))
+    def identify(request):
+        asked.append(request)
         return "found"
 
     monkeypatch.setattr(modelling, "identify_records", identify)
     monkeypatch.setattr(modelling, "read", lambda path: run())
     paths = {name: Path(f"{name}.mcap") for name in [*FITTED, *JUDGED, "growing-1"]}
     assert modelling.identified(paths) == "found"
-    ((records, settings, unit, source),) = asked
-    assert len(records) == len(source) == len(FITTED)
+    (request,) = asked
+    records, settings, unit = request.records, request.settings, request.unit
+    assert len(records) == len(request.source) == len(FITTED)
     assert (settings.auto, settings.whole, unit) == (True, True, "A")
     assert all(isinstance(record, History) for record in records)
     assert all(record.command.size == 1900 for record in records)

@@ -6,9 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilctl.identify.command import identify_records
 from hilctl.identify.data.records import SteadyLoop
+from hilctl.identify.fit_api import FitRequest
 from hilctl.identify.model_quality import Verdict
+from hilctl.identify.pipeline import identify_records
 from hilctl.identify.settings import FitSettings
 from hilctl.studies.characterise.loops import LoopFigures, ReversalCurves
 from hilctl.studies.characterise.noise import RestNoise
@@ -38,7 +39,7 @@ def identification(grade="usable"):
     """Return a straight line through two loops, with a verdict of its own."""
     turns = np.linspace(0.0, 2.0 * np.pi, 60, endpoint=False)
     loops = [SteadyLoop(f"{a} A", a * np.sin(turns), 4.0 * a * np.sin(turns), 1.0) for a in (1, 2)]
-    found = identify_records(loops, FitSettings(kind="straight"), "A")
+    found = identify_records(FitRequest(loops, FitSettings(kind="straight"), "A"))
     reasons = ("units are others",) if grade == "not a model" else ()
     return replace(found, verdict=Verdict(grade, 9.0, False, reasons, ("a note",)))
 
