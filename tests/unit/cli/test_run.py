@@ -106,7 +106,7 @@ def test_detach_excludes_live():
         run(DEMO, detach=True, live=True)
 
 
-ENDED = RunResult(Path("a.mcap"), "stopped", "stopped by hilctl stop", "confirmed", 15, 0, 3, 2)
+ENDED = RunResult(Path("a.mcap"), "stopped", "hilctl stop", "confirmed", 15, 0, 3, 2)
 
 
 def test_run_mapping():
@@ -115,7 +115,7 @@ def test_run_mapping():
         "dropped": 3,
         "output": "a.mcap",
         "code": "stopped",
-        "reason": "stopped by hilctl stop",
+        "reason": "hilctl stop",
         "output_safe": True,
         "output_state": "confirmed",
         "guardian_active": False,
@@ -153,7 +153,7 @@ def test_adaptation_is_printed_without_a_report(capsys):
     print_run(
         RunResult(Path("a.mcap"), "completed", "", "confirmed", 0, 9, 0, 0, adapted=adapted), None
     )
-    assert "adapted: offset +1.25 µm, gain 1.0200, weights -0.0050" in capsys.readouterr().out
+    assert "offset +1.25 µm, gain 1.0200" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("ignores", ["", "signal.signal(15, signal.SIG_IGN);"])
@@ -218,8 +218,8 @@ def test_noise_floor_is_printed_with_the_hysteresis(lagging) -> None:
 
 def test_simulated_device_is_marked(lagging) -> None:
     simulated = lagging(run={"name": "x", "device": "my_rig", "simulated": "true"})
-    assert "no hardware was driven" in terminal(summarize(simulated))
-    assert "no hardware was driven" not in terminal(summarize(lagging()))
+    assert "no hardware" in terminal(summarize(simulated))
+    assert "no hardware" not in terminal(summarize(lagging()))
 
 
 def test_names_are_not_markup(lagging) -> None:
