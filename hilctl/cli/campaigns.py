@@ -64,7 +64,7 @@ def campaign(
     dry_run: DryRun = False,
     as_json: AsJson = False,
 ) -> None:
-    """Run an experiment with each combination of varied keys (resumes where it stopped)."""
+    """Run an experiment with each combination of varied keys (a stopped campaign resumes)."""
     steps = load_campaign(file, settings or [])
     _run_campaign(steps, folder, fast=fast, scheduler=scheduler, dry_run=dry_run, as_json=as_json)
 

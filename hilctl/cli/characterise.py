@@ -32,7 +32,7 @@ _RESUMES = "the same command resumes from this step"
 
 def characterise(
     experiment: ExperimentFile,
-    output: Annotated[Path, typer.Option(help="Model file to write; its HTML page is beside it.")],
+    output: Annotated[Path, typer.Option(help="Model file to write, with an HTML page.")],
     folder: Annotated[
         Path | None, typer.Option(help="Folder for the recordings; default: OUTPUT-runs.")
     ] = None,

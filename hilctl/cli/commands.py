@@ -71,7 +71,7 @@ _MODULES = {
     },
     "hilctl.cli.campaigns": {
         "campaign": "Run an experiment with each combination of varied keys "
-        "(resumes where it stopped).",
+        "(a stopped campaign resumes).",
         "sweep": "Run an experiment with several values of one or more keys "
         "(a campaign in one line).",
         "learn": "Learn a correction for a periodic reference: run, correct, and run again.",

@@ -15,7 +15,7 @@ from hilctl.base.files import read_text, write_text
 from hilctl.cli.console import listing, print_rich
 from hilctl.cli.options import AsJson, Settings
 from hilctl.cli.output import print_json
-from hilctl.cli.run import LiveView
+from hilctl.cli.run import run_progress
 from hilctl.experiment.device import known_devices
 from hilctl.experiment.examples import copy_example, examples_folder, shipped_examples
 from hilctl.experiment.inventory import schema_text, shipped_profiles
@@ -68,8 +68,8 @@ def demo(
     before: Path | None = None
     for (which, _, settings), experiment in zip(_DEMO_RUNS, files, strict=True):
         over = [f"waveform.duration_s={_DEMO_S:g}", f"recording.folder={folder}", *settings]
-        with LiveView(quiet=as_json) as view:
-            result = api.run(experiment, settings=over, on_progress=view.update)
+        with run_progress(quiet=as_json) as on_progress:
+            result = api.run(experiment, settings=over, on_progress=on_progress)
         if result.stop_signal:
             raise typer.Exit(128 + result.stop_signal)
         page = result.path.with_suffix(".html")

@@ -7,16 +7,14 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from types import TracebackType
-from typing import Annotated, Any, Self
+from typing import Annotated, Any
 
 import numpy as np
 import typer
 from rich.console import Group
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
@@ -26,7 +24,7 @@ from hilctl.analysis.run_metrics import RunReport
 from hilctl.base.errors import HilctlError, InputError
 from hilctl.base.events import adapted_text
 from hilctl.base.formatting import printable, unit_text
-from hilctl.cli.console import compile_progress, console, listing, table
+from hilctl.cli.console import compile_progress, console, listing, progress_bar, table
 from hilctl.cli.options import AsJson, ExperimentFile, LabelTexts, Overwrite, Settings
 from hilctl.cli.output import print_json
 from hilctl.experiment.preflight import CheckedExperiment
@@ -103,10 +101,10 @@ def _run(
     with (
         _served(requested=live) as addresses,
         _watched(requested=watch),
-        LiveView(quiet=quiet, addresses=addresses) as view,
+        run_progress(quiet=quiet, addresses=addresses) as on_progress,
     ):
         result = api.run(
-            experiment, output, settings=settings, overwrite=overwrite, on_progress=view.update
+            experiment, output, settings=settings, overwrite=overwrite, on_progress=on_progress
         )
         if result.stop_signal:  # a second Ctrl-C must not suppress the result
             signal.signal(result.stop_signal, signal.SIG_IGN)
@@ -200,56 +198,32 @@ def safe(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson 
         raise typer.Exit(3)
 
 
-class LiveView:
-    """A progress line on standard error: samples, error, command, late ticks.
+@contextmanager
+def run_progress(
+    *, quiet: bool, addresses: Sequence[str] = ()
+) -> Iterator[Callable[[RunProgress], None]]:
+    """Show a progress line on standard error: samples, error, command, late ticks.
 
     Args:
         quiet: Show nothing.
         addresses: Addresses of live pages; printed with the first samples.
+
+    Yields:
+        Function that shows the newest samples, a few times per second.
     """
+    pages, shown_s = list(addresses), 0.0
 
-    def __init__(self, *, quiet: bool, addresses: Sequence[str] = ()) -> None:
-        self._addresses = list(addresses)
-        terminal = console(stderr=True)
-        self._progress = Progress(
-            TextColumn("[bold]run"),
-            BarColumn(bar_width=24),
-            TextColumn("{task.percentage:>3.0f} %"),
-            TextColumn("{task.fields[live]}"),
-            TimeRemainingColumn(),
-            console=terminal,
-            disable=quiet or not terminal.is_terminal,
-            refresh_per_second=8,
-        )
-        self._task: TaskID | None = None
-        self._shown = 0.0
+    def update(progress: RunProgress) -> None:
+        nonlocal shown_s
+        while pages:
+            print(f"live page: {pages.pop()}", file=sys.stderr)
+        now_s = time.monotonic()
+        if not quiet and (now_s - shown_s >= _REFRESH_S or progress.samples >= progress.total):
+            shown_s = now_s
+            show(min(progress.samples / max(progress.total, 1), 1.0), _live_text(progress))
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self._progress.stop()
-
-    def update(self, progress: RunProgress) -> None:
-        """Show the newest samples, a few times per second."""
-        while self._addresses:
-            print(f"live page: {self._addresses.pop()}", file=sys.stderr)
-        if self._progress.disable:
-            return
-        now = time.monotonic()
-        if now - self._shown < _REFRESH_S and progress.samples < progress.total:
-            return
-        self._shown = now
-        if self._task is None:
-            self._progress.start()
-            self._task = self._progress.add_task("run", total=progress.total, live="")
-        done = min(progress.samples, progress.total)
-        self._progress.update(self._task, completed=done, live=_live_text(progress))
+    with progress_bar("run", quiet=quiet) as show:
+        yield update
 
 
 def _live_text(progress: RunProgress) -> str:

@@ -21,13 +21,13 @@ from hilctl.base.segments import Segment
 from hilctl.base.types import F64
 from hilctl.cli import run as module
 from hilctl.cli.run import (
-    LiveView,
     check,
     print_run,
     render_report,
     report_of,
     run,
     run_mapping,
+    run_progress,
     safe,
 )
 from hilctl.run.by_hand import SafeResult
@@ -125,10 +125,10 @@ def test_run_mapping():
 
 
 def test_address_of_the_page_is_printed_with_the_first_samples(capsys):
-    with LiveView(quiet=True, addresses=["http://127.0.0.1:5/#x"]) as view:
+    with run_progress(quiet=True, addresses=["http://127.0.0.1:5/#x"]) as update:
         assert capsys.readouterr().err == ""
-        view.update(None)
-        view.update(None)
+        update(None)
+        update(None)
         assert capsys.readouterr().err == "live page: http://127.0.0.1:5/#x\n"
 
 
