@@ -5,7 +5,7 @@ from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
-from hilctl.api.given import PathLike, Settings, path_or_none, runs_folder, texts_of
+from hilctl.api._types import PathLike, Settings, path_or_none, runs_folder, texts_of
 from hilctl.base.errors import InputError
 from hilctl.base.files import check_no_input, check_writable
 from hilctl.experiment.correction import write_correction
@@ -51,37 +51,37 @@ def characterise(
     overwrite: bool = False,
     dry_run: bool = False,
     on_progress: Callable[[float, str], None] = _nothing,
-    on_plan: "Callable[[CharacterisationPlan], None]" = _nothing,
-    on_step: "Callable[[StepRow], None]" = _nothing,
-) -> "Characterisation | None":
-    """Find a model of a wired actuator: measure within its limits, identify, judge.
+    on_plan: Callable[[CharacterisationPlan], None] = _nothing,
+    on_step: Callable[[StepRow], None] = _nothing,
+) -> Characterisation | None:
+    """Measure a connected actuator within its limits, then identify and validate a model.
 
-    It goes on where it was stopped.
+    A stopped characterisation resumes at the step where it stopped.
 
     Args:
-        experiment: Experiment file that gives device and limits.
-        output: Model file to write; a page of the same name, .html, is written beside it.
-        folder: Where each run is kept; ``OUTPUT-runs`` where None.
-        settings: Over the experiment.
-        highest_hz: Highest frequency of loops; from the sample rate where None.
-        fast: Do not wait for real time; simulated devices only.
-        overwrite: Whether to begin anew where runs stand.
-        dry_run: Only work out what it would do: nothing moves, and nothing is written.
-        on_progress: Called with how much is done, from 0 to 1, and what is being done.
-        on_plan: Called with what it will do, before anything moves.
-        on_step: Called with each step that is done.
+        experiment: Experiment file with device and limits.
+        output: Model file to write; its HTML page has the same name.
+        folder: Folder for the recordings; default: ``OUTPUT-runs``.
+        settings: Overrides of the experiment.
+        highest_hz: Highest frequency of loops; default: from the sample rate.
+        fast: Simulate without waiting; simulated devices only.
+        overwrite: Discard earlier runs and start again.
+        dry_run: Plan only; nothing moves, and nothing is written.
+        on_progress: Called with the fraction done (0 to 1) and the current step.
+        on_plan: Called with the plan before anything moves.
+        on_step: Called with each completed step.
 
     Returns:
-        What was found; None of a dry run.
+        The result; None for a dry run.
 
     Raises:
-        InputError: Something can't be used or written; nothing has moved.
-        RunError: A step ended by a fault; those before it stand.
+        InputError: An input is invalid, or a file cannot be written; nothing has moved.
+        RunError: A step ended by a fault; earlier steps are kept.
     """
     file, chosen = Path(output), runs_folder(output, folder)
     page = file.with_suffix(".html")
     if page == file:
-        raise InputError(f"{file}: is the name of the page: give the model another one, .yaml")
+        raise InputError(f"{file}: is the name of the page: choose another --output, such as .yaml")
     host = CharacterisationHost(
         run=unpaced if fast else paced, on_progress=on_progress, on_step=on_step
     )
@@ -102,7 +102,6 @@ def characterise(
     if overwrite:
         measured.discard()
     found = measured.characterise(file, overwrite=overwrite)
-
     write_characterisation(found, page)
     return found
 
@@ -116,30 +115,30 @@ def campaign(
     scheduler: str = "none",
     dry_run: bool = False,
     on_progress: Callable[[float, str], None] = _nothing,
-    on_plan: "Callable[[CampaignPlan], None]" = _nothing,
-    on_row: "Callable[[CampaignStep, CampaignRow], None]" = _nothing,
+    on_plan: Callable[[CampaignPlan], None] = _nothing,
+    on_row: Callable[[CampaignStep, CampaignRow], None] = _nothing,
     on_note: Callable[[str], None] = _nothing,
-) -> "CampaignResult | None":
-    """Run an experiment again and again with other values of its keys; goes on where it was.
+) -> CampaignResult | None:
+    """Run an experiment with each combination of varied keys; a stopped campaign resumes.
 
     Args:
         file: Campaign file (YAML).
-        folder: Where recordings, table and page go; one named after the campaign where None.
-        settings: Over the experiment of every step.
-        fast: Do not wait for real time; simulated devices only.
-        scheduler: With ``fast``, where steps run: ``none``, ``processes``, or a Dask address.
-        dry_run: Only work out what it would do: nothing moves, and nothing is written.
-        on_progress: Called with how much is done, from 0 to 1, and what is being done.
-        on_plan: Called with what it will do, before anything moves.
-        on_row: Called with each step that is done, and what became of it.
-        on_note: Called with what was done for runs that were cut short.
+        folder: Folder for recordings, table and page; default: named after the campaign.
+        settings: Overrides of the experiment of every step.
+        fast: Simulate without waiting; simulated devices only.
+        scheduler: With ``fast``: ``none``, ``processes``, or a Dask scheduler address.
+        dry_run: Plan only; nothing moves, and nothing is written.
+        on_progress: Called with the fraction done (0 to 1) and the current step.
+        on_plan: Called with the plan before anything moves.
+        on_row: Called with each completed step and its result.
+        on_note: Called with a note on each repaired recording.
 
     Returns:
-        What came of it; None of a dry run.
+        The result; None for a dry run.
 
     Raises:
-        InputError: Something can't be used; nothing has moved.
-        RunError: A danger to device or rig ended it; what stands is kept.
+        InputError: An input is invalid; nothing has moved.
+        RunError: A hazard to device or rig ended the campaign; completed steps are kept.
     """
     host = replace(CampaignHost(), on_progress=on_progress, on_row=on_row, on_note=on_note)
     steps = load_campaign(Path(file), texts_of(settings))
@@ -158,22 +157,22 @@ def learn(
     settings: Settings = (),
     fast: bool = False,
     overwrite: bool = False,
-    on_rows: "Callable[[Sequence[IlcRow]], None]" = lambda rows: None,
-) -> "IlcResult":
-    """Learn a correction for a reference that repeats: run, correct, and run again.
+    on_rows: Callable[[Sequence[IlcRow]], None] = lambda rows: None,
+) -> IlcResult:
+    """Learn a correction for a periodic reference: run, correct, and run again.
 
     Args:
         experiment: Experiment file (YAML).
         output: Correction file to write.
-        cycles: Most runs after the first.
-        folder: Where each run is kept; ``OUTPUT-runs`` where None.
-        settings: Over the experiment.
-        fast: Do not wait for real time; simulated devices only.
-        overwrite: Whether files of these names may be replaced.
-        on_rows: Called with the figures of each run.
+        cycles: Largest number of runs after the first.
+        folder: Folder for the recordings; default: ``OUTPUT-runs``.
+        settings: Overrides of the experiment.
+        fast: Simulate without waiting; simulated devices only.
+        overwrite: Replace existing files.
+        on_rows: Called with the metrics of each run.
 
     Raises:
-        InputError: Something can't be used or written; nothing has moved.
+        InputError: An input is invalid, or a file cannot be written; nothing has moved.
     """
     file, chosen = Path(output), runs_folder(output, folder)
     inputs = inputs_of(Path(experiment), texts_of(settings))
@@ -181,7 +180,7 @@ def learn(
     for path in chosen.glob("run-*.*"):
         check_no_input(path, inputs)
     if not overwrite and any(chosen.glob("run-*.mcap")):
-        raise InputError(f"{chosen}: holds runs already: give another --folder, or --overwrite")
+        raise InputError(f"{chosen}: contains runs: choose another --folder, or use --overwrite")
     session = IlcSession(Path(experiment), texts_of(settings), chosen, unpaced if fast else paced)
     learned = session.learn(cycles, on_rows)
     write_correction(file, learned.correction, overwrite=overwrite)
@@ -189,22 +188,25 @@ def learn(
 
 
 def run_steps(
-    steps: "CampaignSteps",
+    steps: CampaignSteps,
     folder: Path | None,
-    host: "CampaignHost",
+    host: CampaignHost,
     *,
     fast: bool,
     scheduler: str,
     dry_run: bool,
-    on_plan: "Callable[[CampaignPlan], None]",
-) -> "CampaignResult | None":
-    """Run the steps of a campaign, wherever they come from; see :func:`campaign`."""
+    on_plan: Callable[[CampaignPlan], None],
+) -> CampaignResult | None:
+    """Run the steps of a campaign file or a sweep; see :func:`campaign`."""
     if scheduler != "none" and not fast:
-        rule = "for fast runs only; those that keep real time follow each other"
-        raise InputError(f"scheduler: {rule}")
+        raise InputError("scheduler needs fast: runs in real time are sequential")
     chosen = folder or campaign_folder(steps)
     with nullcontext() if dry_run else prepared(chosen, host):
-        plan = _plan(steps, chosen, host, fast=fast)
+        host.on_progress(0.0, "check every step")
+        if fast:
+            plan = planned_fast(steps, chosen)
+        else:
+            plan = planned_in_real_time(steps, chosen, host.now_s())
         inputs = inputs_of(steps.experiment, steps.settings)
         for suffix in (".csv", ".parquet", ".html"):
             check_no_input(chosen / f"{steps.config.name}{suffix}", inputs)
@@ -212,13 +214,3 @@ def run_steps(
         if dry_run:
             return None
         return run_fast(plan, host, scheduler) if fast else run_series(plan, host)
-
-
-def _plan(
-    steps: "CampaignSteps", folder: Path, host: "CampaignHost", *, fast: bool
-) -> "CampaignPlan":
-
-    host.on_progress(0.0, "check every step")
-    if fast:
-        return planned_fast(steps, folder)
-    return planned_in_real_time(steps, folder, host.now_s())

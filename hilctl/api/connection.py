@@ -1,7 +1,6 @@
-"""A run that is going on, to look at, to change, to mark, to stop.
+"""Connect to an active run: status, changes, marks, frames, stop.
 
-It speaks the protocol of ``docs/reference/protocol.md``, and imports nothing heavy until it is
-needed.
+The protocol is described in ``docs/reference/protocol.md``.
 """
 
 import time
@@ -24,22 +23,22 @@ if TYPE_CHECKING:
 
 
 def connect(run: str | None = None) -> "RunConnection":
-    """Return a run that is going on.
+    """Return an active run.
 
     Args:
-        run: Its name, or the beginning of it; may be left out where there is one run only.
+        run: Its name, or the beginning of it; required if several runs are active.
 
     Raises:
-        InputError: There is none, or more than one.
+        InputError: No run matches, or several do.
     """
     return RunConnection(find_run(run))
 
 
 class RunConnection:
-    """A run that is going on. Each call is a request of its own: nothing is kept open.
+    """An active run. Each call is a separate request; no connection stays open.
 
     Args:
-        folder: Its folder.
+        folder: Folder of the run.
     """
 
     def __init__(self, folder: RunFolder) -> None:
@@ -47,16 +46,16 @@ class RunConnection:
 
     @property
     def name(self) -> str:
-        """Its name."""
+        """Name of the run."""
         return self._folder.card.name
 
     @property
     def recording(self) -> str:
-        """File that it is recorded to."""
+        """File of the recording."""
         return self._folder.card.recording
 
     def status(self) -> dict[str, Any]:
-        """Return where it stands; ``state`` says so too where nobody answers for it any more."""
+        """Return the status; ``state`` tells if the run no longer answers."""
         return status_of(self._folder)
 
     def set(
@@ -67,66 +66,67 @@ class RunConnection:
         inverse: InverseState | None = None,
         over_s: float = 1.0,
     ) -> dict[str, Any]:
-        """Change the reference or the inverse over a ramp; what is None stays as it is.
+        """Change the reference or the inverse by a ramp; values of None are kept.
 
-        It returns once the change is accepted; ``begins_at_sample`` is its first sample.
+        Return when the change is accepted; ``begins_at_sample`` is its first sample.
 
         Args:
             gain: Factor of the reference.
-            offset: Added to the reference, in the waveform's unit.
-            inverse: ``out`` puts a straight line of the same stroke in its place, ``in`` it back.
-            over_s: Time that the change takes.
+            offset: Offset of the reference, in the waveform's unit.
+            inverse: ``out`` replaces the inverse by a linear gain of the same stroke, ``in``
+                enables it again.
+            over_s: Duration of the change.
 
         Raises:
-            InputError: It is refused; the text says why, and nothing has changed.
+            InputError: The change is rejected; nothing has changed.
             RunError: The run does not answer.
         """
         return set_run(self._folder, gain=gain, offset=offset, inverse=inverse, over_s=over_s)
 
     def mark(self, text: str) -> dict[str, Any]:
-        """Set a mark at the present sample; return that sample.
+        """Add a mark at the current sample and return that sample.
 
         Args:
             text: One printable line.
 
         Raises:
-            InputError: It is refused.
+            InputError: The text is invalid.
             RunError: The run does not answer.
         """
         return mark_run(self._folder, text)
 
     def frames(self, every_s: float = 0.1, window_s: float = 0.5) -> Iterator["RunFrame"]:
-        """Subscribe to the run: give frames of its signals, figures and events until it is over.
+        """Yield frames of the run's signals, metrics and events until the run ends.
 
-        It reads the run's shared memory, writes nothing there, and costs the run nothing. A caller
-        that is slow gets fewer frames; no spike is lost in those it gets.
+        Frames are read from the run's shared memory, so the run is not affected. A slow caller gets
+        fewer frames; each contains the minimum and maximum of all its samples.
 
         Args:
-            every_s: Time from one frame to the next.
-            window_s: Time that each frame shows.
+            every_s: Interval of the frames.
+            window_s: Duration that each frame shows.
 
         Raises:
-            InputError: One of them is no time.
+            InputError: An argument is out of range.
             RunError: The run has ended.
         """
         for name, value, least in (("every_s", every_s, 0.0), ("window_s", window_s, 1e-3)):
             if not least <= value <= 1e5:
-                raise InputError(f"{name}: must be from {least:g} to 100000 s: got {value:g}")
+                raise InputError(f"{name} must be from {least:g} to 100000 s (got {value:g})")
         from hilctl.live.frame_codec import frames_of
         from hilctl.live.run_reader import RunReader
 
         return frames_of(RunReader(self._folder), every_s, window_s, time.monotonic, time.sleep)
 
     def stop(self, wait_s: float = 60.0) -> None:
-        """End it by its safe ramp, and wait until its recording is closed.
+        """Stop the run: ramp to the safe value, and wait until the recording is closed.
 
         Args:
-            wait_s: Longest wait.
+            wait_s: Timeout.
 
         Raises:
-            RunError: It is still going.
+            RunError: The run is still active.
         """
         (stopped,) = stop_runs([self._folder], wait_s)
         if not stopped["ended"]:
-            why = stopped["error"] or "it was requested to stop"
-            raise RunError(f"{self.name} is still going after {wait_s:g} s: {why}")
+            why = stopped["error"] or "stop requested"
+            raise RunError(f"{self.name} is still active after {wait_s:g} s: {why}")

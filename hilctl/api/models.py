@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
-from hilctl.api.given import PathLike, Paths, Settings, path_or_none, paths_of, texts_of
+from hilctl.api._types import PathLike, Paths, Settings, path_or_none, paths_of, texts_of
 from hilctl.base.files import check_writable
 from hilctl.comparison import compare as library
 from hilctl.comparison.compare import Comparison
@@ -26,26 +26,25 @@ def identify(
     scheduler: str | None = None,
     overwrite: bool = False,
     on_progress: Callable[[float, str], None] = lambda done, text: None,
-) -> "Identification":
+) -> Identification:
     """Identify a model's parameters from recordings or measured tables.
 
     Args:
         files: Recordings (MCAP) and text tables.
-        output: Model file to write; what is no model of these data is not written.
-        model: Its kind, or ``auto``: what is best on data that no fit saw.
-        settings: Of the fit, see ``hilctl identify --settings``.
-        validate: Files to judge the model on; parts of the others where there are none.
-        scheduler: Where independent fits run: ``none``, ``threads``, ``processes``, or a Dask
-            address. Left out, the candidates of ``auto`` over threads, as their kernels leave the
-            interpreter to each other, and others one after the other.
-        overwrite: Whether a model file of that name may be replaced.
-        on_progress: Called with how much is done, from 0 to 1, and what is being done.
+        output: Model file to write; not written if the verdict is "not a model".
+        model: Kind of model, or ``auto`` for the kind with the smallest validation error.
+        settings: Settings of the fit, see ``hilctl identify --settings``.
+        validate: Files to validate the model with; default: parts of the other files.
+        scheduler: ``none``, ``threads``, ``processes``, or a Dask scheduler address for independent
+            fits; default: ``threads`` for ``auto``, otherwise ``none``.
+        overwrite: Replace an existing model file.
+        on_progress: Called with the fraction done (0 to 1) and the current step.
 
     Returns:
-        The model, its errors (held out first) and its verdict: good, usable, or not a model.
+        The model, its errors (validation first) and its verdict: good, usable, or not a model.
 
     Raises:
-        InputError: A file or a setting can't be used; nothing is written.
+        InputError: A file or a setting is invalid; nothing is written.
     """
     return identify_files(
         paths_of(files),
@@ -66,19 +65,19 @@ def refine(
     validate: Paths = (),
     overwrite: bool = False,
     on_progress: Callable[[float, str], None] = lambda done, text: None,
-) -> "Refinement":
-    """Improve a model from recordings of runs; it is written only where it has become better.
+) -> Refinement:
+    """Improve a model from recordings of runs; the file is written only if the model is better.
 
     Args:
         model: Model file.
         runs: Recordings of compensated, learned or plain runs.
-        output: Model file to write; None for none.
-        validate: Recordings to judge it on; each run in turn where there are none.
-        overwrite: Whether a model file of that name may be replaced.
-        on_progress: Called with how much is done, from 0 to 1, and what is being done.
+        output: Model file to write, if any.
+        validate: Recordings to validate the model with; default: each run in turn.
+        overwrite: Replace an existing model file.
+        on_progress: Called with the fraction done (0 to 1) and the current step.
 
     Raises:
-        InputError: A file can't be used; nothing is written.
+        InputError: A file is invalid; nothing is written.
     """
     return refine_files(
         Path(model),
@@ -102,24 +101,24 @@ def compare(
     save: PathLike | None = None,
     overwrite: bool = False,
     on_progress: Callable[[float, str], None] = lambda done, text: None,
-) -> "Comparison":
-    """Identify models of the literature on the same loops, and try their inverses.
+) -> Comparison:
+    """Identify models of the literature on the same loops, and test their inverses.
 
     Args:
         recordings: Recordings of steady loops.
-        models: Kinds of model, or model files; those of ``hilctl compare`` where empty.
-        experiment: Experiment that gives device, limits and waveform of the trials; from the first
-            recording where None.
-        settings: Over that experiment.
-        frequencies_hz: Of the trials; 10, 100 and 200 Hz for sines where None.
-        points: Points a loop; 300 where None.
-        html: Page with table and figure to write; None for none.
-        save: Folder for a model file of each that was identified; None for none.
-        overwrite: Whether files of these names may be replaced.
-        on_progress: Called with how much is done, from 0 to 1, and what is being done.
+        models: Kinds of model, or model files; default: those of ``hilctl compare``.
+        experiment: Experiment with device, limits and waveform of the tests; default: from the
+            first recording.
+        settings: Overrides of that experiment.
+        frequencies_hz: Frequencies of the tests; default: 10, 100 and 200 Hz for sines.
+        points: Points per loop; default: 300.
+        html: Page with table and plot to write, if any.
+        save: Folder for the identified model files, if any.
+        overwrite: Replace existing files.
+        on_progress: Called with the fraction done (0 to 1) and the current step.
 
     Raises:
-        InputError: A file or a model can't be used, or a file can't be written.
+        InputError: A file or a model is invalid, or a file cannot be written.
     """
     inputs = [*paths_of(recordings), *map(Path, models)]
     if experiment is not None:
@@ -130,7 +129,6 @@ def compare(
         kinds = models or list(library.COMPARED)
         library.check_free(kinds, Path(save), overwrite=overwrite, inputs=inputs)
     finish_dead_runs()
-
     request = library.ComparisonRequest(
         recordings=paths_of(recordings),
         models=models,

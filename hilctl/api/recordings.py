@@ -1,20 +1,20 @@
-"""Read and evaluate recordings."""
+"""Read, evaluate, list and export recordings."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
 from hilctl.analysis.catalogue import read_catalogue, select
 from hilctl.analysis.export import columns, units
 from hilctl.analysis.export import export as write
 from hilctl.analysis.report import summarize as judge
 from hilctl.analysis.run_metrics import RunReport
-from hilctl.api.given import PathLike, Paths, paths_of
-from hilctl.api.table import SampleTable
+from hilctl.api._types import PathLike
 from hilctl.base.errors import InputError
-from hilctl.base.files import check_writable
 from hilctl.recording.reader import RecordingStream
 from hilctl.recording.reader import read as read_file
 from hilctl.recording.recording import Recording
@@ -22,42 +22,109 @@ from hilctl.recording.time_range import TimeRange
 from hilctl.run.control.client import finish_dead_runs
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+    import numpy.typing as npt
+    import pyarrow as pa
 
-    from hilctl.analysis.figure_layout import FigureSpec
-    from hilctl.analysis.replay import ReplayResult
-    from hilctl.studies.multi_run.collect import RunSeries
+
+class SampleTable(Mapping[str, "npt.NDArray[Any]"]):
+    """Samples as named columns of equal length; ``table["displacement_um"]`` is an array.
+
+    Args:
+        columns: The columns.
+        units: Units by column name.
+    """
+
+    def __init__(self, columns: Mapping[str, "npt.NDArray[Any]"], units: Mapping[str, str]) -> None:
+        self._columns = dict(columns)
+        self.units = dict(units)
+
+    def __getitem__(self, name: str) -> "npt.NDArray[Any]":
+        return self._columns[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._columns)
+
+    def __len__(self) -> int:
+        return len(self._columns)
+
+    def __repr__(self) -> str:
+        named = (f"{name} [{self.units[name]}]" if name in self.units else name for name in self)
+        return f"<{self.rows} samples: {', '.join(named)}>"
+
+    @property
+    def rows(self) -> int:
+        """Number of samples."""
+        return len(next(iter(self._columns.values()), ()))
+
+    def to_pandas(self) -> Any:
+        """Return a ``pandas.DataFrame``; units are in its ``attrs``.
+
+        Raises:
+            InputError: pandas is not installed.
+        """
+        frame = _library("pandas").DataFrame(self._columns)
+        frame.attrs["units"] = dict(self.units)
+        return frame
+
+    def to_polars(self) -> Any:
+        """Return a ``polars.DataFrame``.
+
+        Raises:
+            InputError: polars is not installed.
+        """
+        return _library("polars").DataFrame(self._columns)
+
+    def to_arrow(self) -> "pa.Table":
+        """Return a ``pyarrow.Table``; the unit of a column is in its field's metadata.
+
+        Raises:
+            InputError: pyarrow is not installed.
+        """
+        arrow = _library("pyarrow")
+        arrays = [arrow.array(each) for each in self._columns.values()]
+        fields = [
+            arrow.field(name, array.type, metadata={"unit": self.units.get(name, "")})
+            for name, array in zip(self._columns, arrays, strict=True)
+        ]
+        return arrow.Table.from_arrays(arrays, schema=arrow.schema(fields))
+
+
+def _library(name: str) -> ModuleType:
+    try:
+        return import_module(name)
+    except ImportError:
+        raise InputError(f"{name} is not installed: pip install {name}") from None
 
 
 @dataclass(frozen=True)
 class RecordedRun:
-    """A recording, read.
+    """A recording in memory.
 
     Attributes:
-        recording: All that it holds, see :class:`hilctl.recording.recording.Recording`: samples,
-            segments, ticks, events, and the facts of the run.
+        recording: Its complete content, see :class:`hilctl.recording.recording.Recording`: samples,
+            segments, ticks, events, and metadata of the run.
     """
 
-    recording: "Recording"
+    recording: Recording
 
     @property
     def path(self) -> Path:
-        """File that it was read from."""
+        """File of the recording."""
         return self.recording.path
 
     @property
     def facts(self) -> dict[str, str]:
-        """What the recording says of the run, from its start and its end."""
+        """Metadata from the start and the end of the run."""
         return {**self.recording.run, **self.recording.end}
 
     @property
     def labels(self) -> Mapping[str, Any]:
-        """What the run is found by."""
+        """Labels of the run."""
         return self.recording.labels
 
     @cached_property
     def table(self) -> SampleTable:
-        """The samples as named columns: ``sample``, ``t_s``, those recorded, ``flags``."""
+        """Samples as named columns: ``sample``, ``t_s``, the recorded signals, ``flags``."""
         return SampleTable(columns(self.recording), units(self.recording))
 
 
@@ -65,143 +132,46 @@ def read(path: PathLike, *, from_s: float | None = None, to_s: float | None = No
     """Read a recording into memory.
 
     Args:
-        path: MCAP file; one that was cut short gives what it holds, with a warning in the log. What
-            a run whose processes died has left in memory is put into its recording first.
-        from_s: Read what comes from then on, in s since the start of the run.
-        to_s: Read what comes before then.
+        path: MCAP file. Of a truncated file the intact part is read, with a warning in the log.
+            Samples that a crashed run has left in memory are written to its recording first.
+        from_s: Start of the time range, s since the start of the run.
+        to_s: End of the time range.
 
     Raises:
-        InputError: There is no such file.
-        DataError: It is no recording, or holds no sample of that stretch.
+        InputError: The file does not exist.
+        DataError: The file is not a recording, or contains no sample of the time range.
     """
     finish_dead_runs()
-    return RecordedRun(read_file(Path(path), _stretch(from_s, to_s)))
+    return RecordedRun(read_file(Path(path), _time_range(from_s, to_s)))
 
 
-def _stretch(from_s: float | None, to_s: float | None) -> "TimeRange | None":
-
+def _time_range(from_s: float | None, to_s: float | None) -> TimeRange | None:
     return None if from_s is None and to_s is None else TimeRange(from_s, to_s)
+
+
+def stream_of(
+    run: PathLike, from_s: float | None = None, to_s: float | None = None
+) -> RecordingStream:
+    """Return a recording to be read in pieces, after dead runs are finished."""
+    finish_dead_runs()
+    return RecordingStream(Path(run), _time_range(from_s, to_s))
 
 
 def summarize(
     run: RecordedRun | PathLike, *, from_s: float | None = None, to_s: float | None = None
-) -> "RunReport":
-    """Return the figures of a run: hysteresis, errors, noise, lateness, by segment.
+) -> RunReport:
+    """Return the metrics of a run: hysteresis, errors, noise, lateness, by segment.
 
     Args:
-        run: What was read, or a file: that is read in pieces, and may be larger than memory.
-        from_s: Judge what comes from then on; of a file.
-        to_s: Judge what comes before then; of a file.
+        run: Recording in memory, or a file, which is read in pieces and may be larger than memory.
+        from_s: Start of the time range to evaluate; files only.
+        to_s: End of the time range; files only.
 
     Raises:
-        InputError: There is no such file.
-        DataError: It is no recording.
+        InputError: The file does not exist.
+        DataError: The file is not a recording.
     """
-    return judge(run.recording if isinstance(run, RecordedRun) else _pieces(run, from_s, to_s))
-
-
-def report_page(
-    run: PathLike,
-    html: PathLike,
-    *,
-    before: PathLike | None = None,
-    from_s: float | None = None,
-    to_s: float | None = None,
-    overwrite: bool = False,
-) -> "RunReport":
-    """Write a run's self-contained page with figures, and return the figures of the run.
-
-    Args:
-        run: Recording; it is read in pieces, and may be larger than memory.
-        html: Page to write.
-        before: The same motion without a compensator, to be drawn beside it.
-        from_s: Judge what comes from then on.
-        to_s: Judge what comes before then.
-        overwrite: Whether a page of that name may be replaced.
-
-    Raises:
-        InputError: There is no such file, or the page can't be written.
-        DataError: It is no recording.
-    """
-    from hilctl.analysis.decimation import overview
-    from hilctl.analysis.run_page import write_html
-
-    page = Path(html)
-    check_writable(page, overwrite=overwrite)
-    earlier = overview(_pieces(before))[1] if before is not None else None
-    summary, shown = overview(_pieces(run, from_s, to_s))
-    write_html(shown, summary, page, earlier)
-    return summary
-
-
-def report_runs(
-    runs: Paths,
-    html: PathLike | None = None,
-    *,
-    model: PathLike | None = None,
-    overwrite: bool = False,
-    on_progress: Callable[[float, str], None] = lambda done, text: None,
-) -> "RunSeries":
-    """Return what came out of several runs, and write the page of all of them.
-
-    Args:
-        runs: Recordings, or a folder of them, or of a campaign.
-        html: Page to write; None for none.
-        model: Model file to hold against measured loops; the recorded ones where None.
-        overwrite: Whether a page of that name may be replaced.
-        on_progress: Called with how much is done, from 0 to 1, and what is being done.
-
-    Raises:
-        InputError: A run or the model can't be read, or the page can't be written.
-        DataError: A recording that was named can't be read.
-    """
-    if html is not None:
-        inputs = [] if model is None else [Path(model)]
-        check_writable(Path(html), overwrite=overwrite, inputs=inputs)
-    series = _series(runs, model, on_progress)
-    if html is not None:
-        from hilctl.studies.multi_run.multi_run_page import write_series
-
-        write_series(series, Path(html))
-    return series
-
-
-def _series(
-    runs: Paths, model: PathLike | None, on_progress: Callable[[float, str], None]
-) -> "RunSeries":
-    from hilctl.models.model_file import load_model
-    from hilctl.studies.multi_run.collect import collect
-
-    finish_dead_runs()
-    known = None if model is None else load_model(Path(model))
-    return collect(paths_of(runs), known, on_progress)
-
-
-def _pieces(
-    run: PathLike, from_s: float | None = None, to_s: float | None = None
-) -> "RecordingStream":
-
-    finish_dead_runs()
-    return RecordingStream(Path(run), _stretch(from_s, to_s))
-
-
-def replay(run: RecordedRun | PathLike, model: PathLike | None = None) -> "ReplayResult":
-    """Recompute the commands of a run from its reference, and hold them against the recorded ones.
-
-    Args:
-        run: What was read, or a file: that is read in pieces.
-        model: Model file of another compensator: what it would have done.
-
-    Raises:
-        InputError: There is no such file.
-        DataError: It is no recording, or can't be replayed.
-    """
-    from hilctl.analysis.replay import replay as recompute
-    from hilctl.models.model_file import load_model
-
-    other = None if model is None else load_model(Path(model))
-    recorded = run.recording if isinstance(run, RecordedRun) else _pieces(run)
-    return recompute(recorded, other)
+    return judge(run.recording if isinstance(run, RecordedRun) else stream_of(run, from_s, to_s))
 
 
 def export(
@@ -212,104 +182,39 @@ def export(
     to_s: float | None = None,
     overwrite: bool = False,
 ) -> int:
-    """Write samples as ``.csv``, ``.npz``, ``.parquet`` or ``.mat``; return how many.
+    """Write samples as ``.csv``, ``.npz``, ``.parquet`` or ``.mat``; return their number.
 
     Args:
-        run: What was read, or a file: that is read in pieces.
-        output: File to write; its suffix says the format.
-        from_s: Of a file: write what comes from then on, in s since the start of the run.
-        to_s: Of a file: write what comes before then.
-        overwrite: Whether a file of that name may be replaced.
+        run: Recording in memory, or a file, which is read in pieces.
+        output: File to write; the suffix selects the format.
+        from_s: Start of the time range, s since the start of the run; files only.
+        to_s: End of the time range; files only.
+        overwrite: Replace an existing file.
 
     Raises:
-        InputError: A file can't be read or written, or the format is unknown; nothing is written.
+        InputError: A file cannot be read or written, or the format is unknown; nothing is written.
         DataError: There is no sample.
     """
-    stretch = _stretch(from_s, to_s)
+    time_range = _time_range(from_s, to_s)
     if isinstance(run, RecordedRun):
-        if stretch is not None:
-            raise InputError("from_s and to_s are for a file: give them to read() instead")
+        if time_range is not None:
+            raise InputError("from_s and to_s apply to a file only: use them in read() instead")
         return write(run.recording, Path(output), overwrite=overwrite)
-    return write(_pieces(run, from_s, to_s), Path(output), overwrite=overwrite)
+    return write(stream_of(run, from_s, to_s), Path(output), overwrite=overwrite)
 
 
 def list_runs(
     folder: PathLike = ".", where: str = "", sort: str = "started", *, reverse: bool = False
 ) -> list[dict[str, Any]]:
-    """Return what is known of all recordings below a folder, from their first and last bytes.
+    """Return the metadata of all recordings in a folder and its subfolders.
 
     Args:
         folder: The folder.
-        where: A condition in SQL, ``frequency_hz > 100 and label.sample == "A7"``; empty for all.
+        where: SQL condition, ``frequency_hz > 100 and label.sample == "A7"``; empty for all.
         sort: Key to sort by.
-        reverse: The other way round.
+        reverse: Sort in descending order.
 
     Raises:
-        InputError: The folder can't be listed, the condition is not valid, or a key is unknown.
+        InputError: The folder cannot be read, the condition is invalid, or a key is unknown.
     """
     return select(read_catalogue(Path(folder)), where, sort, reverse=reverse)
-
-
-def figures(
-    runs: Paths,
-    output: PathLike | None = None,
-    *,
-    formats: str = "svg,pdf,png",
-    width: Literal["single", "double"] = "double",
-    model: PathLike | None = None,
-    overwrite: bool = False,
-    on_progress: Callable[[float, str], None] = lambda done, text: None,
-    on_written: Callable[[Path, str], None] = lambda path, caption: None,
-) -> dict[str, tuple["Axes", ...]]:
-    """Draw the figures that apply to runs, by what varied among them.
-
-    Args:
-        runs: One recording, then the figures are those of its page; or several, or a folder of
-            them, or of a campaign.
-        output: Folder for a file of each in each format; None for none.
-        formats: ``svg``, ``pdf`` or ``png``, several with commas between.
-        width: Of one column of a journal, 85 mm, or of two, 175 mm.
-        model: Model file to hold against measured loops; the recorded ones where None.
-        overwrite: Whether files may be replaced.
-        on_progress: Called with how much is done, from 0 to 1, and what is being done.
-        on_written: Called with each file, and the caption of its figure.
-
-    Returns:
-        The axes of each figure, by its short name; ``axes[0].figure`` is the whole one.
-
-    Raises:
-        InputError: A run can't be read, no figure applies, or a file can't be written.
-        DataError: A recording that was named can't be read.
-    """
-    from hilctl.analysis.figure_export import formats_of
-    from hilctl.studies.multi_run.plots import draw_sheets, write_sheets
-
-    chosen = formats_of(formats)
-    sheets = _sheets(paths_of(runs), model, on_progress)
-    if output is None:
-        drawn = draw_sheets(sheets, width, on_progress)
-    else:
-        drawn = {}
-        written = write_sheets(
-            sheets, Path(output), chosen, width,
-            overwrite=overwrite, on_done=on_progress, on_drawn=drawn.__setitem__,
-        )  # fmt: skip
-        for path, caption in written.items():
-            on_written(path, caption)
-    return {name: tuple(figure.axes) for name, figure in drawn.items()}
-
-
-def _sheets(
-    runs: list[Path], model: PathLike | None, on_progress: Callable[[float, str], None]
-) -> "list[FigureSpec]":
-    from hilctl.studies.multi_run.plots import applying_sheets
-
-    if len(runs) > 1 or runs[0].is_dir() or model is not None:
-        return applying_sheets(_series(runs, model, on_progress))
-    from hilctl.analysis.decimation import overview
-    from hilctl.analysis.run_page import run_sheets
-
-    summary, shown = overview(_pieces(runs[0]))
-    if not (found := run_sheets(shown, summary)):
-        raise InputError(f"{runs[0]}: holds nothing that a figure could be drawn of")
-    return found

@@ -2,14 +2,12 @@
 
 commands.py       application and table of commands; imports a command's module when it is called
 options.py        options that several commands share
-console.py        console, tables and progress bars
-verbosity.py      --quiet and --verbose
-safe_streams.py   standard output and error with escaped control characters; JSON output
-compiling.py      progress of the compiler
+output.py         standard streams: verbosity, escaped control characters, JSON
+console.py        tables, styled text and progress
 experiments.py    demo, examples, init, schema
 run.py            run, check, safe
 control.py        status, set, mark, stop
-watch.py, live.py live views in the terminal and on a page
+live.py           watch, live
 recordings.py     list, export, recover
 reports.py        report, figures, replay
 models.py         identify, refine, compare
@@ -25,15 +23,17 @@ signal n.
 
 import signal
 import sys
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import NoReturn
 
 from hilctl.base.errors import ConfigError, HilctlError, InputError, RunError
 from hilctl.base.os_errors import reason
-from hilctl.cli.safe_streams import print_json, safe_streams
-from hilctl.cli.verbosity import output_as_requested, print_traceback, take_verbosity
+from hilctl.cli.output import (
+    output_as_requested,
+    print_json,
+    print_traceback,
+    safe_streams,
+    take_verbosity,
+)
 from hilctl.run.run_folder import WORKS_ANYWHERE
 
 ACTING = (
@@ -50,11 +50,7 @@ def main() -> None:
     """Run the command line and turn every expected error into a message and an exit code."""
     take_verbosity(sys.argv)
     acts = any(name in ACTING for name in sys.argv[1:2])
-    with (
-        safe_streams(acts=acts),
-        _memory_errors_once(),
-        output_as_requested(as_json="--json" in sys.argv),
-    ):
+    with safe_streams(acts=acts), output_as_requested(as_json="--json" in sys.argv):
         try:
             _run_app()
         except HilctlError as error:
@@ -62,46 +58,9 @@ def main() -> None:
             _refuse(error)
         except KeyboardInterrupt:
             raise SystemExit(128 + signal.SIGINT) from None
-        except OverflowError:
-            if _clock_can_be_read():
-                raise
-            _refuse(
-                InputError(
-                    "the clock of this computer is after the year 2262: set it, e.g. by timedatectl"
-                )
-            )
         except (OSError, EOFError, MemoryError, ImportError, SystemError) as error:
             print_traceback()
             _refuse(RunError(system_error_text(error)))
-
-
-def _clock_can_be_read() -> bool:
-    """Return whether the time fits into 64 bits of ns, the limit of Python."""
-    try:
-        time.time_ns()
-    except OverflowError:
-        return False
-    return True
-
-
-@contextmanager
-def _memory_errors_once() -> Iterator[None]:
-    """Suppress Python's messages on memory errors that cannot be caught.
-
-    The error that ends the command is printed once; an import that runs out of memory may cause
-    further messages.
-    """
-    before = sys.unraisablehook
-
-    def hook(unraisable: "sys.UnraisableHookArgs") -> None:
-        if not isinstance(unraisable.exc_value, MemoryError):
-            before(unraisable)
-
-    sys.unraisablehook = hook
-    try:
-        yield
-    finally:
-        sys.unraisablehook = before
 
 
 def _run_app() -> None:

@@ -11,14 +11,13 @@ from typing import Annotated, Any
 
 import typer
 from rich.table import Table
-from rich.text import Text
 
 from hilctl import api
+from hilctl.api._types import runs_folder
 from hilctl.api.campaigns import run_steps
-from hilctl.api.given import runs_folder
-from hilctl.base.errors import ConfigError, ConfigProblem, InputError
+from hilctl.base.errors import ConfigError, ConfigProblem
 from hilctl.base.yaml import Document
-from hilctl.cli.console import console, progress_bar
+from hilctl.cli.console import print_rich, progress_bar, table
 from hilctl.cli.options import (
     AsJson,
     DryRun,
@@ -28,7 +27,7 @@ from hilctl.cli.options import (
     Overwrite,
     Settings,
 )
-from hilctl.cli.safe_streams import print_json
+from hilctl.cli.output import print_json
 from hilctl.experiment.run_labels import label_settings
 from hilctl.ilc.ilc_session import correction_setting
 from hilctl.ilc.results import IlcResult, IlcRow
@@ -65,7 +64,7 @@ def campaign(
     dry_run: DryRun = False,
     as_json: AsJson = False,
 ) -> None:
-    """Run an experiment with each combination of varied keys (resumes where it stopped)."""
+    """Run an experiment with each combination of varied keys (a stopped campaign resumes)."""
     steps = load_campaign(file, settings or [])
     _run_campaign(steps, folder, fast=fast, scheduler=scheduler, dry_run=dry_run, as_json=as_json)
 
@@ -129,9 +128,6 @@ def _run_campaign(
     dry_run: bool,
     as_json: bool,
 ) -> None:
-    if scheduler != "none" and not fast:
-        raise InputError("--scheduler needs --fast: runs in real time are sequential")
-
     def on_plan(plan: CampaignPlan) -> None:
         if not as_json:
             print_plan(plan, fast=fast, every_step=dry_run)
@@ -205,9 +201,8 @@ def print_plan(plan: CampaignPlan, *, fast: bool, every_step: bool) -> None:
         fast: Whether the runs are simulated without waiting.
         every_step: Whether to list each step.
     """
-    terminal = console()
     if every_step:
-        terminal.print(_steps(plan))
+        print_rich(_steps(plan))
     kept = len(plan.steps) - len(plan.left)
     done = f", {kept} done earlier" if kept else ""
     time = f"{_duration(plan.seconds)} of rig time"
@@ -215,25 +210,23 @@ def print_plan(plan: CampaignPlan, *, fast: bool, every_step: bool) -> None:
     how = ", without waiting" if fast else ""
     disk = f"{plan.megabytes:.0f} MB of {plan.free_mb:.0f} MB free in {plan.folder}"
     count = f"{plan.campaign.config.name}: {len(plan.steps)} steps{done}"
-    terminal.print(f"{count}; {time}{pauses}{how}; {disk}", soft_wrap=True)
+    print(f"{count}; {time}{pauses}{how}; {disk}")
 
 
 def _steps(plan: CampaignPlan) -> Table:
-    table = Table(title=Text(f"{plan.campaign.config.name}: steps"), title_justify="left")
-    for name in ("step", *plan.campaign.keys, "s", "pause s", "coil A rms", ""):
-        table.add_column(name, justify="right")
-    for each in plan.steps:
-        values = [_shown(each.step.point.get(key)) for key in plan.campaign.keys]
-        kind = "reference run" if each.step.is_reference else ""
-        table.add_row(
+    rows = [
+        (
             str(each.step.number),
-            *map(Text, values),
+            *(_shown(each.step.point.get(key)) for key in plan.campaign.keys),
             f"{each.seconds:.1f}" if each.kept is None else "",
             f"{each.pause_s:.0f}" if each.pause_s else "",
             f"{each.heat_a2**0.5:.2f}" if each.kept is None else "",
-            "done earlier" if each.kept else kind,
+            "done earlier" if each.kept else "reference run" if each.step.is_reference else "",
         )
-    return table
+        for each in plan.steps
+    ]
+    headings = ("step", *plan.campaign.keys, "s", "pause s", "coil A rms", "")
+    return table(f"{plan.campaign.config.name}: steps", headings, rows)
 
 
 def _shown(value: Any) -> str:
@@ -282,16 +275,15 @@ def result_mapping(result: CampaignResult) -> dict[str, Any]:
 
 def print_result(result: CampaignResult) -> None:
     """Print the result of a campaign, its drift and its files."""
-    terminal = console()
     counts = result_mapping(result)["results"]
     done = ", ".join(f"{count} {code}" for code, count in counts.items())
-    terminal.print(f"{result.plan.campaign.config.name}: {done}", soft_wrap=True)
+    print(f"{result.plan.campaign.config.name}: {done}")
     if result.drift is not None:
-        terminal.print(str(result.drift), soft_wrap=True)
+        print(result.drift)
     for path in result.tables:
-        terminal.print(f"table: {path}", soft_wrap=True)
+        print(f"table: {path}")
     if result.page is not None:
-        terminal.print(f"page: {result.page}", soft_wrap=True)
+        print(f"page: {result.page}")
 
 
 def learn(
@@ -343,32 +335,24 @@ def _print_iteration(rows: Sequence[IlcRow]) -> None:
 def _print_learned(learned: IlcResult, output: Path, folder: Path) -> None:
     checks = {row.label: row for row in learned.check}
     last = {row.label: row for row in learned.rows}
-    table = Table(title=Text(f"learned: {learned.reason}"), title_justify="left")
-    for name in (
-        "waveform",
-        "start %",
-        "best %",
-        "verified %",
-        "noise floor %",
-        "delay",
-        "resonance",
-    ):
-        table.add_column(name, justify="left" if name == "waveform" else "right")
+    headings = (
+        "waveform", "start %", "best %", "verified %", "noise floor %", "delay", "resonance",
+    )  # fmt: skip
+    rows = []
     for cycle in learned.correction.cycles:
-        row = last[cycle.label]
-        check = checks.get(cycle.label)
-        natural = f"{row.natural_hz:.0f} Hz" if row.natural_hz else "-"
-        table.add_row(
-            Text(cycle.label),
-            f"{cycle.start_percent:.4f}",
-            f"{cycle.error_percent:.4f}",
-            f"{check.error_percent:.4f}" if check else "-",
-            f"{row.floor_percent:.4f}",
-            f"{row.delay_samples:.2f} samples",
-            natural,
+        row, check = last[cycle.label], checks.get(cycle.label)
+        rows.append(
+            (
+                cycle.label,
+                f"{cycle.start_percent:.4f}",
+                f"{cycle.error_percent:.4f}",
+                f"{check.error_percent:.4f}" if check else "-",
+                f"{row.floor_percent:.4f}",
+                f"{row.delay_samples:.2f} samples",
+                f"{row.natural_hz:.0f} Hz" if row.natural_hz else "-",
+            )
         )
-    terminal = console()
-    terminal.print(table)
-    terminal.print(f"correction: {output}; runs: {folder}", soft_wrap=True)
+    print_rich(table(f"learned: {learned.reason}", headings, rows))
+    print(f"correction: {output}; runs: {folder}")
     setting = shlex.quote(correction_setting(output))
-    terminal.print(f"  --set {setting}", soft_wrap=True)
+    print(f"  --set {setting}")

@@ -6,13 +6,11 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.table import Table
-from rich.text import Text
 
 from hilctl import api
-from hilctl.api.given import runs_folder
+from hilctl.api._types import runs_folder
 from hilctl.base.errors import RunError
-from hilctl.cli.console import console, progress_bar
+from hilctl.cli.console import print_rich, progress_bar, table
 from hilctl.cli.options import (
     AsJson,
     DryRun,
@@ -22,7 +20,7 @@ from hilctl.cli.options import (
     Overwrite,
     Settings,
 )
-from hilctl.cli.safe_streams import print_json
+from hilctl.cli.output import print_json
 from hilctl.experiment.run_labels import label_settings
 from hilctl.run.start import StepStoppedError
 from hilctl.studies.characterise.characterisation_runner import CharacterisationPlan
@@ -34,7 +32,7 @@ _RESUMES = "the same command resumes from this step"
 
 def characterise(
     experiment: ExperimentFile,
-    output: Annotated[Path, typer.Option(help="Model file to write; its HTML page is beside it.")],
+    output: Annotated[Path, typer.Option(help="Model file to write, with an HTML page.")],
     folder: Annotated[
         Path | None, typer.Option(help="Folder for the recordings; default: OUTPUT-runs.")
     ] = None,
@@ -130,21 +128,17 @@ def plan_mapping(plan: CharacterisationPlan) -> dict[str, Any]:
 def print_plan(plan: CharacterisationPlan, folder: Path) -> None:
     """Print the steps of a characterisation and their largest extent."""
     limits = plan.limits
-    table = Table(title=Text(f"{limits.loaded.device.info.name}: steps"), title_justify="left")
-    for name in ("step", "purpose", "s"):
-        table.add_column(name, justify="right" if name == "s" else "left")
-    for step in plan.steps:
-        table.add_row(step.name, step.purpose, f"{step.seconds:.1f}")
-    terminal = console()
-    terminal.print(table)
+    rows = [(step.name, step.purpose, f"{step.seconds:.1f}") for step in plan.steps]
+    title = f"{limits.loaded.device.info.name}: steps"
+    print_rich(table(title, ("step", "purpose", "s"), rows, left={"purpose"}))
     low_um, high_um = limits.stroke_um
     within = f"{limits.low:g} to {limits.high:g} {limits.unit}, {low_um:g} to {high_um:g} µm"
-    terminal.print(f"within {within}; loops at {limits.lowest_hz:g} to {limits.highest_hz:g} Hz")
+    print(f"within {within}; loops at {limits.lowest_hz:g} to {limits.highest_hz:g} Hz")
     heat = "no thermal limit is set"
     if limits.loaded.config.limits.rms_current_a is not None:
         heat = f"{plan.pauses_s:.0f} s for the coil to cool"
     disk = f"{plan.megabytes:.0f} MB of {plan.free_mb:.0f} MB free in {folder}"
-    terminal.print(f"at most {plan.seconds:.0f} s of rig time; {heat}; {disk}", soft_wrap=True)
+    print(f"at most {plan.seconds:.0f} s of rig time; {heat}; {disk}")
 
 
 def print_step(row: StepRow) -> None:
@@ -155,25 +149,14 @@ def print_step(row: StepRow) -> None:
 
 def print_characterisation(result: Characterisation, model: Path | None, page: Path) -> None:
     """Print the validation error, the measured values and the files."""
-    terminal = console()
     if result.held_out:
-        title = Text("validation errors (references that were not fitted)")
-        terminal.print(_table(title, HELD_OUT_HEADINGS, held_out_rows(result)))
-        terminal.print(f"verdict: {result.verdict}", soft_wrap=True)
+        title = "validation errors (references that were not fitted)"
+        print_rich(table(title, HELD_OUT_HEADINGS, held_out_rows(result)))
+        print(f"verdict: {result.verdict}")
         for note in result.verdict.notes if result.verdict else ():
-            terminal.print(note, soft_wrap=True)
-    figures = list(figure_rows(result))
-    if figures:
-        terminal.print(_table(Text("measured"), ("quantity", "value"), figures))
+            print(note)
+    if figures := list(figure_rows(result)):
+        print_rich(table("measured", ("quantity", "value"), figures, left={"value"}))
     if model is not None:
-        terminal.print(f"model: {model}", soft_wrap=True)
-    terminal.print(f"page: {page}", soft_wrap=True)
-
-
-def _table(title: Text, headings: tuple[str, ...], rows: list[Any]) -> Table:
-    table = Table(title=title, title_justify="left")
-    for i, name in enumerate(headings):
-        table.add_column(name, justify="left" if i == 0 or len(headings) == 2 else "right")
-    for row in rows:
-        table.add_row(*map(Text, row))
-    return table
+        print(f"model: {model}")
+    print(f"page: {page}")

@@ -1,7 +1,6 @@
 """The typer application: a table of commands, each imported when it is called.
 
-This is the only place of lazy imports on the command line; the commands' modules import what they
-need at the top. The table allows a command of ``hilctl_drivers``, which ``hilctl`` never imports.
+The table allows a command of ``hilctl_drivers``, which ``hilctl`` never imports.
 """
 
 from importlib import import_module
@@ -13,145 +12,90 @@ from typer.core import TyperCommand, TyperGroup
 from hilctl import __version__
 from hilctl.base.errors import InputError, RunError
 from hilctl.cli import LINUX_MODULES, system_error_text
-from hilctl.cli.verbosity import QUIET, VERBOSE
+from hilctl.cli.output import QUIET, VERBOSE
 
 
 class CommandEntry(NamedTuple):
-    """Location and help of a command.
+    """Module and help of a command.
 
     Attributes:
-        place: ``module:function``, or ``module:app`` for a group of commands.
+        module: Module with a function, or a typer application, of the command's name; ``NAME_`` if
+            the name has another meaning in Python.
         help: First line of the function's docstring.
     """
 
-    place: str
+    module: str
     help: str
 
 
-COMMANDS: dict[str, CommandEntry] = {
-    "demo": CommandEntry(
-        "hilctl.cli.experiments:demo",
-        "Run the simulated rig without and with the inverse and compare the results.",
-    ),
-    "examples": CommandEntry(
-        "hilctl.cli.experiments:examples",
-        "List the examples, or copy one with the files it refers to.",
-    ),
-    "init": CommandEntry(
-        "hilctl.cli.experiments:init",
-        "Write a first experiment for a device (asks questions in a terminal).",
-    ),
-    "run": CommandEntry(
-        "hilctl.cli.run:run",
-        "Run an experiment and record it (Ctrl-C ramps to the safe value first).",
-    ),
-    "check": CommandEntry(
-        "hilctl.cli.run:check",
-        "Check an experiment and show what it would do (nothing moves).",
-    ),
-    "status": CommandEntry(
-        "hilctl.cli.control:status",
-        "List active runs and their progress.",
-    ),
-    "set": CommandEntry(
-        "hilctl.cli.control:set_",
-        "Change the gain or offset of a running reference smoothly, or bypass the inverse.",
-    ),
-    "mark": CommandEntry(
-        "hilctl.cli.control:mark",
-        "Add a mark to a run's recording at the current sample.",
-    ),
-    "stop": CommandEntry(
-        "hilctl.cli.control:stop",
-        "Stop a run: ramp to the safe value, close the device, record the reason.",
-    ),
-    "watch": CommandEntry(
-        "hilctl.cli.watch:watch",
-        "Show a run in the terminal, with keys to stop and change it.",
-    ),
-    "live": CommandEntry(
-        "hilctl.cli.live:live",
-        "Serve a live page of active runs, until Ctrl-C or the end of RUN.",
-    ),
-    "safe": CommandEntry(
-        "hilctl.cli.run:safe",
-        "Set a device to its safe value (refused while a run uses it).",
-    ),
-    "list": CommandEntry(
-        "hilctl.cli.recordings:list_recordings",
-        "List the recordings in a folder (reads metadata only).",
-    ),
-    "report": CommandEntry(
-        "hilctl.cli.reports:report",
-        "Evaluate a recording (hysteresis, error, noise, lateness), several, or a campaign.",
-    ),
-    "figures": CommandEntry(
-        "hilctl.cli.reports:figures",
-        "Plot the results of runs by what was varied: loops, trends, errors.",
-    ),
-    "replay": CommandEntry(
-        "hilctl.cli.reports:replay",
-        "Recompute the commands from the recorded reference and compare them bit for bit.",
-    ),
-    "export": CommandEntry(
-        "hilctl.cli.recordings:export",
-        "Export a recording's samples to CSV, NumPy, Parquet or MATLAB.",
-    ),
-    "recover": CommandEntry(
-        "hilctl.cli.recordings:recover",
-        "Repair a truncated recording; the original is kept as RUN.torn.",
-    ),
-    "identify": CommandEntry(
-        "hilctl.cli.models:identify",
-        "Identify a model's parameters from recordings or measured tables.",
-    ),
-    "refine": CommandEntry(
-        "hilctl.cli.models:refine",
-        "Improve a model from recordings of runs (written only if it is better).",
-    ),
-    "compare": CommandEntry(
-        "hilctl.cli.models:compare",
-        "Identify models of the literature on the same loops and compare them.",
-    ),
-    "characterise": CommandEntry(
-        "hilctl.cli.characterise:characterise",
-        "Measure a connected actuator within its limits, then identify and validate a model.",
-    ),
-    "campaign": CommandEntry(
-        "hilctl.cli.campaigns:campaign",
-        "Run an experiment with each combination of varied keys (resumes where it stopped).",
-    ),
-    "sweep": CommandEntry(
-        "hilctl.cli.campaigns:sweep",
-        "Run an experiment with several values of one or more keys (a campaign in one line).",
-    ),
-    "learn": CommandEntry(
-        "hilctl.cli.campaigns:learn",
-        "Learn a correction for a periodic reference: run, correct, and run again.",
-    ),
-    "doctor": CommandEntry(
-        "hilctl.cli.devices:doctor",
-        "Check this computer for real-time problems and measure whether it keeps a rate.",
-    ),
-    "devices": CommandEntry(
-        "hilctl.cli.devices:devices_app",
-        "List devices, shipped profiles and serial ports (opens none).",
-    ),
-    "emulate": CommandEntry(
-        "hilctl_drivers.emulator.emulate_command:emulate",
-        "Emulate a device with the simulated rig, until Ctrl-C.",
-    ),
-    "schema": CommandEntry(
-        "hilctl.cli.experiments:schema",
-        "Print the JSON schema of experiment files, for editors.",
-    ),
+_MODULES = {
+    "hilctl.cli.experiments": {
+        "demo": "Run the simulated rig without and with the inverse and compare the results.",
+        "examples": "List the examples, or copy one with the files it refers to.",
+        "init": "Write a first experiment for a device (asks questions in a terminal).",
+        "schema": "Print the JSON schema of experiment files, for editors.",
+    },
+    "hilctl.cli.run": {
+        "run": "Run an experiment and record it (Ctrl-C ramps to the safe value first).",
+        "check": "Check an experiment and show what it would do (nothing moves).",
+        "safe": "Set a device to its safe value (refused while a run uses it).",
+    },
+    "hilctl.cli.control": {
+        "status": "List active runs and their progress.",
+        "set": "Change the gain or offset of a running reference smoothly, or bypass the inverse.",
+        "mark": "Add a mark to a run's recording at the current sample.",
+        "stop": "Stop a run: ramp to the safe value, close the device, record the reason.",
+    },
+    "hilctl.cli.live": {
+        "watch": "Show a run in the terminal, with keys to stop and change it.",
+        "live": "Serve a live page of active runs, until Ctrl-C or the end of RUN.",
+    },
+    "hilctl.cli.recordings": {
+        "list": "List the recordings in a folder (reads metadata only).",
+        "export": "Export a recording's samples to CSV, NumPy, Parquet or MATLAB.",
+        "recover": "Repair a truncated recording; the original is kept as RUN.torn.",
+    },
+    "hilctl.cli.reports": {
+        "report": "Evaluate recordings or a campaign: hysteresis, error, noise, lateness.",
+        "figures": "Plot the results of runs by what was varied: loops, trends, errors.",
+        "replay": "Recompute commands from the recorded reference and compare them bit for bit.",
+    },
+    "hilctl.cli.models": {
+        "identify": "Identify a model's parameters from recordings or measured tables.",
+        "refine": "Improve a model from recordings of runs (written only if it is better).",
+        "compare": "Identify models of the literature on the same loops and compare them.",
+    },
+    "hilctl.cli.characterise": {
+        "characterise": "Measure a connected actuator within its limits, "
+        "then identify and validate a model.",
+    },
+    "hilctl.cli.campaigns": {
+        "campaign": "Run an experiment with each combination of varied keys "
+        "(a stopped campaign resumes).",
+        "sweep": "Run an experiment with several values of one or more keys "
+        "(a campaign in one line).",
+        "learn": "Learn a correction for a periodic reference: run, correct, and run again.",
+    },
+    "hilctl.cli.devices": {
+        "doctor": "Check this computer for real-time problems and measure whether it keeps a rate.",
+        "devices": "List devices, shipped profiles and serial ports (opens none).",
+    },
+    "hilctl_drivers.emulator.emulate_command": {
+        "emulate": "Emulate a device with the simulated rig, until Ctrl-C.",
+    },
 }
+COMMANDS = {
+    name: CommandEntry(module, text)
+    for module, lines in _MODULES.items()
+    for name, text in lines.items()
+}
+"""All commands by name, in the order of the help."""
 
 HELP_NAMES = {"help_option_names": ["-h", "--help"]}
 
 
 class CommandTable(TyperGroup):
-    """The commands of :data:`COMMANDS`; help and suggestions do not import them."""
+    """The group of all commands; help and suggestions do not import their modules."""
 
     def __init__(self, **settings: Any) -> None:
         lines = {name: TyperCommand(name, help=entry.help) for name, entry in COMMANDS.items()}
@@ -187,9 +131,10 @@ def load(name: str) -> Any:
     Raises:
         InputError: It cannot be imported because a part of the installation is missing.
     """
-    module_name, _, attribute = COMMANDS[name].place.partition(":")
+    module = COMMANDS[name].module
     try:
-        command = getattr(import_module(module_name), attribute)
+        found = import_module(module)
+        command = getattr(found, f"{name}_", None) or getattr(found, name)
     except (ImportError, AttributeError) as error:
         if error.name in LINUX_MODULES:
             raise

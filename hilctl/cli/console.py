@@ -1,17 +1,20 @@
-"""Print tables, styled text and progress bars to a terminal."""
+"""Tables, styled text and progress for a terminal."""
 
 import io
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 
-from rich.console import Console, ConsoleOptions, RenderableType
+from rich.console import Console, ConsoleOptions, JustifyMethod, RenderableType
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.segment import Segment
+from rich.table import Table
+from rich.text import Text
 
 from hilctl.base.formatting import printable
-from hilctl.cli.safe_streams import SafeStream
-from hilctl.cli.verbosity import Verbosity
+from hilctl.cli.output import SafeStream, Verbosity
+
+_ONCE = "hilctl: compiling for this machine, about 10 s in all, and only this once:"
 
 
 class SafeConsole(Console):
@@ -43,9 +46,52 @@ def console(*, stderr: bool = False) -> Console:
     )
 
 
-def print_rich(renderable: RenderableType) -> None:
-    """Print a table or text."""
-    console().print(renderable)
+def print_rich(*renderables: RenderableType) -> None:
+    """Print tables or texts."""
+    console().print(*renderables)
+
+
+def table(
+    title: str,
+    headings: Sequence[str],
+    rows: Iterable[Sequence[str]],
+    left: Collection[str] = (),
+    *,
+    wrap: bool = False,
+) -> Table:
+    """Return a table; cells are plain text, never markup.
+
+    Args:
+        title: Title; may be empty.
+        headings: Headings of the columns.
+        rows: Cells.
+        left: Headings of left-aligned columns, in addition to the first.
+        wrap: Wrap long cells.
+    """
+    made = Table(title=Text(title) if title else None, title_justify="left")
+    for number, heading in enumerate(headings):
+        justify: JustifyMethod = "left" if number == 0 or heading in left else "right"
+        made.add_column(Text(heading), justify=justify, no_wrap=not wrap, overflow="fold")
+    for row in rows:
+        made.add_row(*map(Text, row))
+    return made
+
+
+def listing(title: str, rows: Iterable[Sequence[str | Text]], wrap_from: int = 1) -> Table:
+    """Return rows in aligned columns without lines or headings.
+
+    Args:
+        title: Title; may be empty.
+        rows: Cells; plain text or styled.
+        wrap_from: Number of the first column whose long cells wrap.
+    """
+    made = Table(title=Text(title) if title else None, title_justify="left", box=None)
+    made.show_header, made.padding = False, (0, 2, 0, 0)
+    for row in rows:
+        while len(made.columns) < len(row):
+            made.add_column(no_wrap=len(made.columns) < wrap_from, overflow="fold")
+        made.add_row(*(Text(cell) if isinstance(cell, str) else cell for cell in row))
+    return made
 
 
 @contextmanager
@@ -64,3 +110,29 @@ def progress_bar(name: str, *, quiet: bool) -> Iterator[Callable[[float, str], N
     ) as bar:
         task = bar.add_task(name, total=1.0)
         yield lambda done, text: bar.update(task, completed=done, description=text, refresh=True)
+
+
+@contextmanager
+def compile_progress() -> Iterator[None]:
+    """Print the name of each kernel that is compiled meanwhile; only to a terminal."""
+    if Verbosity.quiet or not sys.stderr.isatty():
+        yield
+        return
+    from numba.core.event import Event, Listener, install_listener
+
+    class Progress(Listener):
+        depth = 0
+        lines: tuple[str, ...] = (_ONCE,)
+
+        def on_start(self, event: Event) -> None:
+            if not self.depth:  # a kernel is compiled during the compilation of its caller
+                name = event.data["dispatcher"].py_func.__name__
+                print(*self.lines, f"  {name}", sep="\n", file=sys.stderr)
+                self.lines = ()
+            self.depth += 1
+
+        def on_end(self, event: Event) -> None:
+            self.depth -= 1
+
+    with install_listener("numba:compile", Progress()):
+        yield

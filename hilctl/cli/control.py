@@ -10,7 +10,7 @@ import typer
 
 from hilctl.base.errors import InputError
 from hilctl.cli.options import AsJson
-from hilctl.cli.safe_streams import print_json
+from hilctl.cli.output import print_json
 from hilctl.run.control.client import (
     active_runs,
     assigned,
@@ -79,7 +79,7 @@ def stop(
     run: RunName = None,
     every: Annotated[bool, typer.Option("--all", help="Stop all of your runs.")] = False,
     wait: Annotated[
-        float, typer.Option(metavar="S", help="Longest wait for the end of the runs, s.")
+        float, typer.Option(metavar="S", help="Timeout for the end of the runs, s.")
     ] = 60.0,
     as_json: AsJson = False,
 ) -> None:

@@ -1,31 +1,27 @@
 """Commands on this computer and its devices: doctor, devices."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 from rich.console import Group, RenderableType
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-from rich.table import Table
 from rich.text import Text
 
 from hilctl import api
-from hilctl.cli.console import console, print_rich
+from hilctl.cli.console import listing, print_rich, progress_bar
 from hilctl.cli.options import AsJson, ExperimentFile, Settings
-from hilctl.cli.safe_streams import print_json
+from hilctl.cli.output import print_json
 from hilctl.experiment.inventory import DeviceDescription, Inventory, describe, inventory
 from hilctl.machine.diagnosis import DEFAULT_RATE_HZ, Diagnosis, diagnose, lateness_counts
-from hilctl.machine.rt_setup import Realtime, SetUpStep
+from hilctl.machine.rt_setup import Realtime
 from hilctl.machine.timer_latency import Latency
+from hilctl.run.probe import Probed
+from hilctl.run.probe import probe as read_device
 from hilctl.run.run_folder import require_linux
 
-if TYPE_CHECKING:
-    from hilctl.run.probe import Probed
-
-devices_app = typer.Typer(rich_markup_mode=None)
+devices_ = typer.Typer(rich_markup_mode=None)
 
 _COLOURS = {
     "ok": "green",
@@ -58,8 +54,11 @@ def doctor(
         config = api.load(experiment).config
         settings, folder = config.realtime, Path(config.recording.folder)
         rate_hz = 1.0 / config.tick_s
-    with measurement_progress(seconds, quiet=as_json) as on_progress:
-        diagnosis = diagnose(rate or rate_hz, settings, folder, seconds, on_progress)
+    with progress_bar("measuring", quiet=as_json) as show:
+        diagnosis = diagnose(
+            rate or rate_hz, settings, folder, seconds,
+            lambda elapsed_s: show(elapsed_s / seconds, "measuring"),
+        )  # fmt: skip
     if as_json:
         print_json(diagnosis.to_mapping())
     else:
@@ -68,7 +67,7 @@ def doctor(
         raise typer.Exit(1)
 
 
-@devices_app.callback(invoke_without_command=True)
+@devices_.callback(invoke_without_command=True)
 def devices(context: typer.Context, as_json: AsJson = False) -> None:
     """List devices, shipped profiles and serial ports (opens none)."""
     if context.invoked_subcommand is not None:
@@ -80,7 +79,7 @@ def devices(context: typer.Context, as_json: AsJson = False) -> None:
         print_inventory(listed)
 
 
-@devices_app.command()
+@devices_.command()
 def show(
     name: Annotated[str, typer.Argument(metavar="NAME", help="Device or shipped profile.")],
     as_json: AsJson = False,
@@ -93,12 +92,10 @@ def show(
         print_described(described)
 
 
-@devices_app.command()
+@devices_.command()
 def probe(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson = False) -> None:
     """Read an experiment's device and check its answers (nothing moves)."""
     require_linux()
-    from hilctl.run.probe import probe as read_device  # imports numba
-
     probed = read_device(experiment, settings or [])
     if as_json:
         print_json(probed.to_mapping())
@@ -111,124 +108,74 @@ def probe(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson
 def render_diagnosis(diagnosis: Diagnosis) -> RenderableType:
     """Return findings, set-up, lateness and verdict."""
     latency = diagnosis.latency
-    findings = _table("this computer")
-    for each in diagnosis.findings:
-        _add(findings, each.name, each.level, each.text, each.remedy)
+    findings = [_row(each.name, each.level, each.text, each.remedy) for each in diagnosis.findings]
+    steps = [_row(each.name, each.outcome, each.detail, each.remedy) for each in latency.steps]
     colour = "green" if latency.kept else "red"
     return Group(
-        findings,
-        _steps(latency.steps),
+        listing("this computer", findings, 2),
+        listing("real-time set-up of the loop process", steps, 2),
         _lateness(latency),
         Text(diagnosis.verdict, style=f"bold {colour}"),
     )
 
 
-def _table(title: str) -> Table:
-    table = Table(title=title, title_justify="left", show_header=False, box=None)
-    for no_wrap in (True, True, False):
-        table.add_column(no_wrap=no_wrap)
-    return table
-
-
-def _add(table: Table, name: str, level: str, text: str, remedy: str) -> None:
+def _row(name: str, level: str, text: str, remedy: str) -> tuple[str, Text, Text]:
     cell = Text(text)
     if remedy:
         cell.append(f"\n-> {remedy}", style="dim")
-    table.add_row(name, Text(level, style=_COLOURS[level]), cell)
-
-
-def _steps(steps: tuple[SetUpStep, ...]) -> Table:
-    table = _table("real-time set-up of the loop process")
-    for step in steps:
-        _add(table, step.name, step.outcome, step.detail, step.remedy)
-    return table
+    return name, Text(level, style=_COLOURS[level]), cell
 
 
 def _lateness(latency: Latency) -> RenderableType:
     counts = lateness_counts(latency.late_ns)
     longest = math.log1p(max(counts.values(), default=1))
     seconds = latency.late_ns.size / latency.rate_hz
-    table = Table(
-        title=f"wake-up lateness, {latency.rate_hz:g} Hz, {seconds:.3g} s",
-        title_justify="left",
-        show_header=False,
-        box=None,
-    )
-    for edge_us, count in counts.items():
-        bar = "#" * round(_BAR * math.log1p(count) / longest)
-        table.add_row(Text(f"from {edge_us} us", justify="right"), str(count), bar)
+    rows = [
+        (f"from {edge_us} us", str(count), "#" * round(_BAR * math.log1p(count) / longest))
+        for edge_us, count in counts.items()
+    ]
     figures = latency.percentiles_us()
     line = ", ".join(f"{name} {value:.1f}" for name, value in figures.items())
-    return Group(table, Text(f"{line} us"))
-
-
-@contextmanager
-def measurement_progress(seconds: float, *, quiet: bool) -> Iterator[Callable[[float], None]]:
-    """Show a progress bar on standard error; yield its update function (elapsed time, s)."""
-    terminal = console(stderr=True)
-    with Progress(
-        TextColumn("[bold]measuring"),
-        BarColumn(bar_width=24),
-        TimeRemainingColumn(),
-        console=terminal,
-        disable=quiet or not terminal.is_terminal,
-        transient=True,
-    ) as progress:
-        task = progress.add_task("measuring", total=seconds)
-        yield lambda elapsed_s: progress.update(task, completed=min(elapsed_s, seconds))
+    title = f"wake-up lateness, {latency.rate_hz:g} Hz, {seconds:.3g} s"
+    return Group(listing(title, rows), Text(f"{line} us"))
 
 
 def print_inventory(listed: Inventory) -> None:
     """Print devices, profiles and serial ports."""
-    table = Table(title="devices", title_justify="left", show_header=False, box=None)
-    for kind, place in sorted(listed.devices.items()):
-        table.add_row(kind, place)
-    profiles = Table(title="profiles", title_justify="left", show_header=False, box=None)
-    for name in listed.profiles:
-        profiles.add_row(name)
-    ports = Table(title="serial ports", title_justify="left", show_header=False, box=None)
-    for port in listed.serial_ports:
-        ports.add_row(port.path, port.description)
-    terminal = console()
-    terminal.print(table, profiles)
-    terminal.print(ports if listed.serial_ports else "no serial port found", soft_wrap=True)
+    ports = [(port.path, port.description) for port in listed.serial_ports]
+    print_rich(
+        listing("devices", sorted(listed.devices.items())),
+        listing("profiles", [(name,) for name in listed.profiles]),
+        listing("serial ports", ports) if ports else Text("no serial port found"),
+    )
 
 
 def print_described(described: DeviceDescription) -> None:
     """Print the options of a device, or the content of a profile."""
-    terminal = console()
-    terminal.print(f"{described.name}: {described.place}", soft_wrap=True, markup=False)
+    print(f"{described.name}: {described.place}")
     if described.options:
-        terminal.print(_options(described))
+        rows = [
+            (each.name, "required" if each.default is None else each.default, each.description)
+            for each in described.options
+        ]
+        print_rich(listing("", [("key", "default", "meaning"), *rows]))
     profile = described.profile
     for key in ("vendor", "model", "verified", "unverified", "max_rate_hz"):
         if key in profile:
-            terminal.print(f"{key}: {_plain(profile[key])}", markup=False)
+            print(f"{key}: {_plain(profile[key])}")
     for key in ("outputs", "inputs"):
         if profile.get(key):
-            terminal.print(_channels(key, profile[key]))
+            print_rich(listing(key, map(_channel, profile[key].items())))
     for key in ("source", "notes"):
         texts = profile.get(key, [])
         for text in [texts] if isinstance(texts, str) else texts:
-            terminal.print(f"{key}: {_plain(text)}", markup=False, soft_wrap=True)
+            print(f"{key}: {_plain(text)}")
 
 
-def _options(described: DeviceDescription) -> Table:
-    table = Table(box=None)
-    for heading in ("key", "default", "meaning"):
-        table.add_column(heading, no_wrap=heading == "key")
-    for option in described.options:
-        default = "required" if option.default is None else option.default
-        table.add_row(option.name, Text(default), Text(option.description))
-    return table
-
-
-def _channels(title: str, channels: Mapping[str, Mapping[str, object]]) -> Table:
-    table = Table(title=title, title_justify="left", show_header=False, box=None)
-    for name, channel in channels.items():
-        low, high, unit = (channel.get(key, "?") for key in ("min", "max", "unit"))
-        table.add_row(Text(name), f"{low} to {high} {unit}")
-    return table
+def _channel(item: tuple[str, Mapping[str, object]]) -> tuple[str, str]:
+    name, channel = item
+    low, high, unit = (channel.get(key, "?") for key in ("min", "max", "unit"))
+    return name, f"{low} to {high} {unit}"
 
 
 def _plain(value: object) -> str:
@@ -240,7 +187,7 @@ def _plain(value: object) -> str:
     )
 
 
-def print_probed(probed: "Probed") -> None:
+def print_probed(probed: Probed) -> None:
     """Print a device's description, reading and output, and the faults found."""
     print(f"{probed.name} answers: {probed.description}")
     note = f": {probed.rate_note}" if probed.rate_note else ""

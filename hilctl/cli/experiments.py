@@ -7,16 +7,15 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
-from rich.table import Table
 
 from hilctl import api
-from hilctl.api.first_experiment import default_path, is_set, refuse_existing
+from hilctl.api.runs import default_path, is_set, refuse_existing
 from hilctl.base.errors import InputError
 from hilctl.base.files import read_text, write_text
-from hilctl.cli.console import print_rich
+from hilctl.cli.console import listing, print_rich
 from hilctl.cli.options import AsJson, Settings
-from hilctl.cli.run import LiveView
-from hilctl.cli.safe_streams import print_json
+from hilctl.cli.output import print_json
+from hilctl.cli.run import run_progress
 from hilctl.experiment.device import known_devices
 from hilctl.experiment.examples import copy_example, examples_folder, shipped_examples
 from hilctl.experiment.inventory import schema_text, shipped_profiles
@@ -51,11 +50,7 @@ def examples(
     if as_json:
         print_json({"examples": [example.to_mapping() for example in listed]})
         return
-    table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
-    table.add_column(no_wrap=True)
-    for example in listed:
-        table.add_row(example.name, example.description)
-    print_rich(table)
+    print_rich(listing("", [(example.name, example.description) for example in listed]))
     print("\nhilctl examples NAME copies an example and its files into this folder")
 
 
@@ -73,8 +68,8 @@ def demo(
     before: Path | None = None
     for (which, _, settings), experiment in zip(_DEMO_RUNS, files, strict=True):
         over = [f"waveform.duration_s={_DEMO_S:g}", f"recording.folder={folder}", *settings]
-        with LiveView(quiet=as_json) as view:
-            result = api.run(experiment, settings=over, on_progress=view.update)
+        with run_progress(quiet=as_json) as on_progress:
+            result = api.run(experiment, settings=over, on_progress=on_progress)
         if result.stop_signal:
             raise typer.Exit(128 + result.stop_signal)
         page = result.path.with_suffix(".html")
@@ -154,7 +149,7 @@ def _chosen_device(*, asks: bool) -> str:
     names += shipped_profiles()
     if not asks:
         raise InputError(
-            f"DEVICE is missing: specify a device or a profile, for example {', '.join(names)}"
+            f"DEVICE is missing: specify a device or a profile, such as {', '.join(names)}"
         )
     print("\n".join(f"  {name}" for name in names))
     return str(typer.prompt("device, profile, or path of a profile"))
@@ -195,5 +190,5 @@ def schema(
         print(schema_text(), end="")
         return
     if output.is_file() and read_text(output).strip()[:1] not in {"", "{"}:
-        raise InputError(f"{output}: not a JSON file, so not replaced: specify another --output")
+        raise InputError(f"{output} is not JSON and is not replaced: choose another --output")
     write_text(output, schema_text(), overwrite=True)

@@ -1,14 +1,246 @@
-"""The command ``hilctl live``: serve a live page of active runs."""
+"""Live views of active runs: in the terminal (``hilctl watch``), on a page (``hilctl live``)."""
 
-from typing import Annotated
+import os
+import re
+import select
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Annotated, Any
 
+import numpy as np
 import typer
+from rich.console import Group, RenderableType
+from rich.live import Live
+from rich.text import Text
 
+from hilctl.base.errors import HilctlError, RunError
+from hilctl.base.events import Event
+from hilctl.base.formatting import printable
+from hilctl.cli.console import console
 from hilctl.cli.options import AsJson
-from hilctl.cli.safe_streams import print_json
+from hilctl.cli.output import print_json, safe_streams
+from hilctl.live.run_reader import RunReader
+from hilctl.live.scope import WINDOWS_S
 from hilctl.live.server_process import RunSelector, SingleRun, serve_foxglove, serve_runs
-from hilctl.run.control.client import find_run
-from hilctl.run.run_folder import RunFolder, require_linux
+from hilctl.live.traces import ROW
+from hilctl.run.control.client import (
+    JOB_CONTROL,
+    MAX_MARK,
+    find_run,
+    mark_run,
+    request_stop,
+    set_run,
+)
+from hilctl.run.run_folder import RunFolder, require_linux, runs
+
+_FRAME_S, _SEARCH_S, _OVER_S = 0.15, 0.05, 0.5
+_LINE_FRAMES, _EVENTS, _MIN_WIDTH, _MIN_HEIGHT = 7, 3, 40, 14
+_FIGURES = (
+    ("hyst.", "peak_hysteresis_percent", "%"),
+    ("peak", "peak_error_percent", "%"),
+    ("rms", "rms_error_percent", "%"),
+    ("stroke", "peak_to_peak_um", "um"),
+    ("floor", "noise_floor_percent", "%"),
+)
+
+
+def watch(
+    name: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="RUN",
+            help="Run (or the beginning of its name); required if several are active.",
+        ),
+    ] = None,
+) -> None:
+    """Show a run in the terminal, with keys to stop and change it."""
+    _watch(find_run(name))
+
+
+def main() -> None:
+    """Show the run of the supervisor whose PID is the first argument, until the run ends."""
+    for number in (signal.SIGINT, *JOB_CONTROL):  # Ctrl-C and Ctrl-Z are meant for the run
+        signal.signal(number, signal.SIG_IGN)
+    supervisor, run = int(sys.argv[1]), None
+    with safe_streams():
+        while not run and os.getppid() == supervisor:
+            time.sleep(_SEARCH_S)
+            own = (each for each in runs() if each.card.supervisor == supervisor)
+            run = next((each for each in own if each.description.exists()), None)
+        if run:
+            try:
+                _watch(run)
+            except RunError as error:
+                print(f"hilctl: {error}", file=sys.stderr)
+
+
+def _watch(run: RunFolder) -> None:
+    """Show a run, then print how it ended, or that it is still active."""
+    feed = RunReader(run)
+    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))  # restores the terminal
+    with suppress(KeyboardInterrupt):  # ends the view only
+        View(feed).show() if _has_keys() else print_lines(feed)
+    reason = feed.status()["reason"] or "unknown reason"
+    ended = (
+        f": {feed.state}: {reason}" if feed.ended else " is still active: hilctl watch, hilctl stop"
+    )
+    print(run.card.name + ended)
+
+
+def _has_keys() -> bool:
+    """Return whether this process is in the foreground of a terminal."""
+    if not sys.stdin.isatty() or not sys.stdout.isatty() or os.environ.get("TERM") == "dumb":
+        return False
+    with suppress(OSError):
+        return os.tcgetpgrp(sys.stdin.fileno()) == os.getpgrp()
+    return True  # a terminal without job control
+
+
+def print_lines(feed: RunReader) -> None:
+    """Print each event, and the state about once per second, until the run ends."""
+    seen = frames = 0
+    while not feed.ended:
+        feed.poll(time.monotonic())
+        events, seen = feed.events_since(seen)
+        for event in events:
+            print(_event(event, feed), flush=True)
+        if (frames := frames + 1) % _LINE_FRAMES == 0:
+            facts = (f"{feed.status()['t_s']:.1f} s", feed.state, *_facts(feed.status()))
+            print("  ".join(filter(None, facts)), flush=True)
+        time.sleep(_FRAME_S)
+
+
+class View:
+    """A run on the alternate screen of the terminal, with keys to stop and change it."""
+
+    def __init__(self, feed: RunReader) -> None:
+        self.feed, self.message, self.left = feed, "", False
+        self._mark: str | None = None  # while it is typed
+        self._window, self._triggered = 1, True
+
+    def show(self) -> None:
+        """Show the run until it ends or ``q`` is pressed, then restore the terminal."""
+        import termios  # not on Windows, where the command live refuses to run
+        import tty
+
+        terminal, keyboard = console(), sys.stdin.fileno()
+        before = termios.tcgetattr(keyboard)
+        try:
+            tty.setcbreak(keyboard)
+            with Live(console=terminal, screen=True, auto_refresh=False) as live:
+                while not (self.left or self.feed.ended):
+                    self.feed.poll(time.monotonic())
+                    live.update(self.screen(*terminal.size), refresh=True)
+                    if select.select([keyboard], [], [], _FRAME_S)[0]:
+                        self.press(os.read(keyboard, 256) or b"q")  # end of input
+        finally:
+            termios.tcsetattr(keyboard, termios.TCSADRAIN, before)
+
+    def press(self, raw: bytes) -> None:
+        """Act on pressed keys; ignore escape sequences such as arrows."""
+        for key in re.sub(r"\x1b[\[O][0-9;]*.", "", raw.decode("utf-8", "ignore")):
+            self._act(key) if self._mark is None else self._type(key, self._mark)
+
+    def _act(self, key: str) -> None:
+        if key == "q":
+            self.left = True
+        elif key == "s":
+            self._ask("stop", request_stop)
+        elif key == "m":
+            self._mark = ""
+        elif key == "t":
+            self._triggered = not self._triggered
+        elif key in "[]":
+            wanted = self._window + (1 if key == "]" else -1)
+            self._window, self._triggered = min(len(WINDOWS_S) - 1, max(0, wanted)), False
+        elif key in "+-":
+            gain = round(self.feed.status()["gain"] + float(key + "0.1"), 6)
+            self._ask(f"gain {gain:g}", set_run, gain=gain, over_s=_OVER_S)
+        elif key == "i":
+            inverse = "in" if self.feed.inverse == "out" else "out"
+            self._ask(f"inverse {inverse}", set_run, inverse=inverse, over_s=_OVER_S)
+
+    def _type(self, key: str, text: str) -> None:
+        if key in "\r\n\x1b":
+            self._mark = None
+            if key != "\x1b" and text.strip():
+                self._ask("mark", mark_run, text=text)
+        elif key in "\x7f\b":
+            self._mark = text[:-1]
+        elif key.isprintable():
+            self._mark = (text + key)[:MAX_MARK]
+
+    def _ask(self, what: str, request: Callable[..., object], **values: object) -> None:
+        def ask() -> None:
+            try:
+                done = request(self.feed.folder, **values)
+                self.message = f"{what}: {'done' if done else 'the run has ended'}"
+            except HilctlError as error:
+                self.message = f"{what}: refused: {error}"
+
+        self.message = f"{what}: requested"
+        threading.Thread(target=ask, daemon=True).start()  # a stop must not wait for a change
+
+    def screen(self, width: int, height: int) -> Group:
+        """Return the screen of the run, without plots if the terminal is small."""
+        status, mark = self.feed.status(), self._mark
+        events = [_event(each, self.feed) for each in self.feed.events[-_EVENTS:]]
+        lines = [
+            f"{printable(status['run'])}  {status['state']}  {status['t_s']:.1f}/"
+            f"{status['total_s']:.1f} s  inverse {status['inverse'] or 'none'}  "
+            f"gain {status['gain']:g}  offset {status['offset']:g}",
+            *_facts(status),
+            "limits: "
+            + "  ".join(f"{g['name']} {g['used'] * 100:.0f} %" for g in status["gauges"]),
+            *events + [""] * (_EVENTS - len(events)),
+            self.message if mark is None else f"mark: {mark}_   (Enter sets it, Esc cancels)",
+            "s stop  i inverse  +- gain  m mark  t trigger  [] time  q leave",
+        ]
+        shown: list[RenderableType] = [Text(e, no_wrap=True, overflow="ellipsis") for e in lines]
+        if width >= _MIN_WIDTH and height >= _MIN_HEIGHT:
+            shown.insert(1, self._plots(width, height - len(lines)))
+        return Group(*shown)
+
+    def _plots(self, width: int, height: int) -> Text:
+        from plotext import figure, marker  # import takes 0.25 s
+
+        scope, window_s = self.feed.scope, WINDOWS_S[self._window]
+        cycles = scope.triggered() if self._triggered else None
+        window = cycles or scope.rolling(window_s)
+        scale, second = (1e3, "ms") if window.t_s[-1] - window.t_s[0] < 1.0 else (1.0, "s")
+        unit = "um" if self.feed.loop_input == "reference" else self.feed.description.command_unit
+        figure.clear().subplots(1, 2).plot_size(width, height).theme("colorless")
+        shown = "newest cycles" if cycles else f"last {window_s:g} s"
+        figure.subplot(1, 1).title(f"{shown}, axis in {second}")
+        figure.subplot(1, 2).title(f"against {self.feed.loop_input}, {unit}")
+        curves = [(2, *scope.loops(), "orange")]
+        for name, colour in (("reference", "blue"), ("displacement", "orange")):
+            ends = np.stack((window.buckets.low[ROW[name]], window.buckets.high[ROW[name]]))
+            curves.append((1, np.repeat(window.t_s * scale, 2), ends.T.ravel(), colour))
+        for column, x, y, colour in curves:
+            finite = np.isfinite(x) & np.isfinite(y)
+            if finite.any():
+                plot = figure.subplot(1, column)
+                curve = plot.signal(x[finite], y[finite], marker=marker("braille", colour))
+                plot.draw(curve.lines())
+        return Text.from_ansi(str(figure.build().string()).rstrip("\n"), no_wrap=True)
+
+
+def _facts(status: dict[str, Any]) -> tuple[str, str]:
+    known = {key: value for key, value in status["figures"].items() if value is not None}
+    late = status["lateness_us"]
+    figures = (f"{name} {known[key]:5.2f} {unit}" for name, key, unit in _FIGURES if key in known)
+    wakes = f"  p99 {late['p99']:.0f} us  latest {late['max']:.0f} us" if late else ""
+    return "  ".join(figures), f"late ticks {status['late_ticks']}{wakes}"
+
+
+def _event(event: Event, feed: RunReader) -> str:
+    t_s = event.sample / feed.description.sample_rate_hz
+    return f"{t_s:.3f} s  {event.code}: {printable(event.text)}"
 
 
 def live(
@@ -60,3 +292,7 @@ def live(
         serve_foxglove(chosen, over, on_url, port)
     else:
         serve_runs(chosen, over, on_url, port or 0)
+
+
+if __name__ == "__main__":
+    main()

@@ -6,18 +6,16 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich import box
 from rich.console import Group, RenderableType
 from rich.table import Table
 
 from hilctl import api
 from hilctl.base.errors import InputError
 from hilctl.base.files import check_writable
-from hilctl.cli.console import console, print_rich, progress_bar
+from hilctl.cli.console import listing, print_rich, progress_bar, table
 from hilctl.cli.options import AsJson, Overwrite, Settings
-from hilctl.cli.safe_streams import print_json
+from hilctl.cli.output import print_json
 from hilctl.comparison.compare import Comparison, headings, notes, table_rows, titles
-from hilctl.identify.evaluation import LoopScore
 from hilctl.identify.model_page import write_identification, write_refinement
 from hilctl.identify.model_selection import OrderScore
 from hilctl.identify.pipeline import Identification
@@ -40,7 +38,9 @@ IdentifyInput = Annotated[
 TableUnit = Annotated[str | None, typer.Option(help="Unit of the command in a table, A or V.")]
 TableColumn = Annotated[str | None, typer.Option(help="Column of a table: name, or number from 1.")]
 RateHz = Annotated[float | None, typer.Option(help="Sample rate of a table without a time column.")]
-Whole = Annotated[bool, typer.Option(help="Evaluate complete histories instead of steady cycles.")]
+Whole = Annotated[
+    bool, typer.Option("--whole", help="Evaluate complete histories instead of steady cycles.")
+]
 LeaveOut = Annotated[
     list[str] | None,
     typer.Option(
@@ -197,19 +197,13 @@ def refine(
 
 def print_refinement(result: Refinement, output: Path | None) -> None:
     """Print the validation errors of the old and the new model."""
-    terminal = console()
-    terminal.print(str(result))
-    table = Table(title=f"validation: {result.choice.after.how}")
-    for name in REFINEMENT_HEADINGS:
-        table.add_column(name, justify="left" if name == REFINEMENT_HEADINGS[0] else "right")
-    for row in refinement_rows(result):
-        table.add_row(*row)
-    terminal.print(table)
+    print(result)
+    title = f"validation: {result.choice.after.how}"
+    print_rich(table(title, REFINEMENT_HEADINGS, refinement_rows(result)))
     if result.choice.own:
-        terminal.print("offset, creep and drift of single runs were not learned")
+        print("offset, creep and drift of single runs were not learned")
     if output is not None:
-        written = f"model: {output}" if result.better else f"{output}: not written"
-        terminal.print(written, soft_wrap=True)
+        print(f"model: {output}" if result.better else f"{output}: not written")
 
 
 def compare(
@@ -263,68 +257,47 @@ def _numbers(text: str | None) -> list[float] | None:
 
 def print_identification(result: Identification, output: Path | None) -> None:
     """Print the quality of a model, its errors per loop, its parameters and its file."""
-    terminal = console()
     fit, held_out = result.fit, result.held_out
     for line in summary(result):
-        terminal.print(line)
+        print(line)
     if result.orders:
-        terminal.print(_orders_table(result.orders))
+        print_rich(_orders_table(result.orders))
     if held_out is not None:
-        terminal.print(_errors_table(f"validation: {held_out.how}", held_out.judgement.errors))
-    terminal.print(_errors_table(f"fit: {fit.model.provenance.method}", fit.errors))
-    rows = ", ".join(f"{name} {text}" for name, text in parameter_texts(fit))
-    if rows:
-        terminal.print(f"parameters: {rows}")
-    if output is not None and result.verdict.grade != "not a model":
-        terminal.print(f"model: {output}", soft_wrap=True)
-    elif output is not None:
-        terminal.print(f"{output}: not written", soft_wrap=True)
-
-
-def _errors_table(title: str, errors: Sequence[LoopScore]) -> Table:
-    table = Table(title=title)
-    for name in HEADINGS:
-        table.add_column(name, justify="left" if name == "loop" else "right")
-    for row in error_rows(errors):
-        table.add_row(*row)
-    return table
+        rows = error_rows(held_out.judgement.errors)
+        print_rich(table(f"validation: {held_out.how}", HEADINGS, rows, left={"loop"}))
+    title = f"fit: {fit.model.provenance.method}"
+    print_rich(table(title, HEADINGS, error_rows(fit.errors), left={"loop"}))
+    if parameters := ", ".join(f"{name} {text}" for name, text in parameter_texts(fit)):
+        print(f"parameters: {parameters}")
+    if output is not None:
+        written = result.verdict.grade != "not a model"
+        print(f"model: {output}" if written else f"{output}: not written")
 
 
 def _orders_table(orders: Sequence[OrderScore]) -> Table:
-    table = Table(title="errors on validation loops")
-    for name in ("plays", "deadbands per side", "rms %", "peak %"):
-        table.add_column(name, justify="right")
-    for order in orders:
-        figures = (f"{order.rms_percent:.3f}", f"{order.peak_percent:.2f}")
-        table.add_row(str(order.plays), str(order.deadbands_a_side), *figures)
-    return table
+    rows = [
+        (
+            str(order.plays),
+            str(order.deadbands_a_side),
+            f"{order.rms_percent:.3f}",
+            f"{order.peak_percent:.2f}",
+        )
+        for order in orders
+    ]
+    headings = ("plays", "deadbands per side", "rms %", "peak %")
+    return table("errors on validation loops", headings, rows)
 
 
 def print_settings() -> None:
     """Print all kinds of model and all settings of a fit."""
-    kinds = Table("--model", "description", "identified by", "from", box=None)
-    kinds.columns[0].no_wrap = True
-    for kind, known in CATALOGUE.items():
-        kinds.add_row(kind, known.title, known.found_by, known.data)
-    settings = Table("--set", "default", "limits", "of", "description", box=None)
-    settings.columns[0].no_wrap = True
-    for row in setting_rows():
-        settings.add_row(*row)
-    terminal = console()
-    terminal.print(kinds)
-    terminal.print()
-    terminal.print(settings)
+    kinds = [(kind, each.title, each.found_by, each.data) for kind, each in CATALOGUE.items()]
+    print_rich(listing("", [("--model", "description", "identified by", "from"), *kinds]))
+    headings = ("--set", "default", "limits", "of", "description")
+    print_rich("", listing("", [headings, *setting_rows()]))
 
 
 def render_comparison(comparison: Comparison) -> RenderableType:
     """Return the tables of a comparison."""
     title = f"models on {', '.join(comparison.sources)}"
-    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    for i, heading in enumerate(headings(comparison)):
-        table.add_column(heading, justify="right" if i else "left", no_wrap=True)
-    for row in table_rows(comparison):
-        table.add_row(*row)
-    names = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
-    for name, title in titles(comparison.rows):
-        names.add_row(name, title)
-    return Group(table, names, *notes(comparison))
+    errors = table(title, headings(comparison), table_rows(comparison))
+    return Group(errors, listing("", titles(comparison.rows)), *notes(comparison))

@@ -17,7 +17,7 @@ from hilctl.base.errors import InputError
 from hilctl.base.formatting import finite_json, printable, short_name
 from hilctl.cli.console import progress_bar
 from hilctl.cli.options import AsJson, FromTime, Overwrite, ToTime
-from hilctl.cli.safe_streams import print_json
+from hilctl.cli.output import print_json
 from hilctl.recording.metadata_keys import LABELS_FACT, RECORDINGS
 from hilctl.recording.recover import recover_recording
 from hilctl.run.control.client import finish_dead_runs
@@ -41,7 +41,7 @@ _NUMBERS = {"duration_s", "peak_hysteresis_percent", "peak_error_percent", "skip
 _TO_SECONDS = len("2000-01-01T00:00:00")
 
 
-def list_recordings(
+def list_(
     folder: Annotated[
         Path, typer.Argument(metavar="FOLDER", help="Folder to search, with its subfolders.")
     ] = Path(RECORDINGS),

@@ -2,26 +2,24 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import typer
 from rich.console import Group
-from rich.table import Table
 from rich.text import Text
 
 from hilctl import api
-from hilctl.analysis.report_table import quality_rows, run_rows, segment_table
+from hilctl.analysis.replay import ReplayResult
 from hilctl.base.errors import InputError
 from hilctl.base.formatting import printable, quantity
-from hilctl.cli.console import console, print_rich, progress_bar
+from hilctl.cli.console import console, print_rich, progress_bar, table
 from hilctl.cli.options import AsJson, FromTime, Overwrite, RecordingFile, ToTime
-from hilctl.cli.safe_streams import print_json
+from hilctl.cli.output import print_json
+from hilctl.cli.run import render_report
 from hilctl.run.control.client import finish_dead_runs
-
-if TYPE_CHECKING:
-    from hilctl.analysis.replay import ReplayResult
-    from hilctl.analysis.run_metrics import RunReport
-    from hilctl.studies.multi_run.collect import RunSeries
+from hilctl.studies.multi_run.collect import RunSeries
+from hilctl.studies.multi_run.multi_run_page import MOST_ROWS, run_table, series_mapping
+from hilctl.studies.multi_run.summary_text import headline
 
 RunsInput = Annotated[
     list[Path], typer.Argument(help="Recordings (MCAP), or a campaign folder.", metavar="RUN")
@@ -32,10 +30,6 @@ OtherModel = Annotated[
 ]
 FOLDER = "figures"
 """Default folder for figures, within the folder of the runs or the working folder."""
-
-_MOST_MINUTES = 20
-_COUNTS = {"minute", "ticks"}
-_PAGE_ONLY = {"cycles", "start s", "freq. Hz", "floor %", "loop area"}  # a terminal has 80 columns
 
 
 def report(
@@ -55,7 +49,7 @@ def report(
     overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
-    """Evaluate a recording (hysteresis, error, noise, lateness), several, or a campaign."""
+    """Evaluate recordings or a campaign: hysteresis, error, noise, lateness."""
     if len(runs) > 1 or runs[0].is_dir():
         if from_s is not None or to_s is not None or before is not None:
             raise InputError("--from, --to and --before apply to the report of one recording only")
@@ -85,7 +79,7 @@ def replay(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Recompute the commands from the recorded reference and compare them bit for bit."""
+    """Recompute commands from the recorded reference and compare them bit for bit."""
     finish_dead_runs()
     result = api.replay(recording, model)
     if as_json:
@@ -137,8 +131,6 @@ def report_series(
     as_json: bool,
 ) -> None:
     """Report several runs, and write their page if requested."""
-    from hilctl.studies.multi_run.multi_run_page import series_mapping  # imports matplotlib
-
     with progress_bar("read", quiet=as_json) as on_progress:
         series = api.report_runs(
             runs, html, model=model, overwrite=overwrite, on_progress=on_progress
@@ -149,75 +141,18 @@ def report_series(
         print_rich(render_series(series))
 
 
-def render_report(report: "RunReport") -> Group:
-    """Return the tables of a report; the segments have their own if there are several."""
-    title = printable(report.name) or "run"
-    quality = _two_columns(title, quality_rows(report))
-    parts = [quality, _two_columns("", run_rows(report))]
-    if len(report.segments) > 1:
-        parts.append(_segments(report))
-    if len(report.lateness_by_minute) > 1:
-        parts.append(_minutes(report))
-    return Group(*parts)
-
-
-def _two_columns(title: str, rows: Sequence[tuple[str, str]]) -> Table:
-    # Text, not str: names and labels come from files and must not be read as markup.
-    table = Table(title=Text(title) if title else None, show_header=False, title_justify="left")
-    table.add_column(style="bold", no_wrap=True)
-    table.add_column(overflow="fold")
-    for name, value in rows:
-        table.add_row(Text(name), Text(value))
-    return table
-
-
-def _segments(report: "RunReport") -> Table:
-    table = Table(title="segments, worst first", title_justify="left")
-    headings, rows = segment_table(report)
-    shown = [i for i, heading in enumerate(headings) if heading not in _PAGE_ONLY]
-    for i in shown:
-        table.add_column(headings[i], justify="right" if i else "left", no_wrap=True)
-    for cells in rows:
-        table.add_row(*(Text(cells[i]) for i in shown))
-    return table
-
-
-def _minutes(report: "RunReport") -> Table:
-    minutes = report.lateness_by_minute
-    title = "lateness per minute, µs"
-    if len(minutes) > _MOST_MINUTES:
-        # --json contains all of them.
-        title += f": worst {_MOST_MINUTES} of {len(minutes)}"
-        worst = sorted(minutes, key=lambda each: -each["max"])[:_MOST_MINUTES]
-        minutes = sorted(worst, key=lambda each: each["minute"])
-    table = Table(title=title, title_justify="left")
-    for heading in minutes[0]:
-        table.add_column(heading, justify="right", no_wrap=True)
-    for minute in minutes:
-        cells = (f"{v:,}" if name in _COUNTS else f"{v:.4g}" for name, v in minute.items())
-        table.add_row(*cells)
-    return table
-
-
-def render_series(series: "RunSeries") -> Group:
+def render_series(series: RunSeries) -> Group:
     """Return the summary of several runs and a table of them."""
-    from hilctl.studies.multi_run.multi_run_page import MOST_ROWS, run_table  # imports matplotlib
-    from hilctl.studies.multi_run.summary_text import headline
-
     headings, rows = run_table(series, MOST_ROWS, short=True)
-    table = Table(title=Text(printable(series.name)), title_justify="left")
-    for number, heading in enumerate(headings):
-        left = number == 0 or heading == "result"
-        table.add_column(heading, justify="left" if left else "right", overflow="fold")
-    for cells in rows:
-        table.add_row(*(Text(printable(cell)) for cell in cells))
+    cells = [[printable(cell) for cell in row] for row in rows]
+    runs = table(printable(series.name), headings, cells, left={"result"}, wrap=True)
     problems = [Text(f"not read: {printable(each)}", "red") for each in series.missing]
     named = [] if series.is_campaign else [(run.number, run.recording) for run in series.runs]
     files = [Text(f"{number}: {printable(name)}") for number, name in named]
-    return Group(Text(printable(" ".join(headline(series)))), *problems, table, *files)
+    return Group(Text(printable(" ".join(headline(series)))), *problems, runs, *files)
 
 
-def print_replay(result: "ReplayResult", *, other: Path | None) -> None:
+def print_replay(result: ReplayResult, *, other: Path | None) -> None:
     """Print the differences between recomputed and recorded commands."""
     terminal = console()
     unit = result.command_unit

@@ -7,45 +7,47 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING, Annotated, Any, Self
+from typing import Annotated, Any
 
 import numpy as np
 import typer
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
 from hilctl import api
+from hilctl.analysis.report_table import quality_rows, run_rows, segment_table
+from hilctl.analysis.run_metrics import RunReport
 from hilctl.base.errors import HilctlError, InputError
 from hilctl.base.events import adapted_text
-from hilctl.base.formatting import unit_text
-from hilctl.cli.compile_progress import compile_progress
-from hilctl.cli.console import console
+from hilctl.base.formatting import printable, unit_text
+from hilctl.cli.console import compile_progress, console, listing, progress_bar, table
 from hilctl.cli.options import AsJson, ExperimentFile, LabelTexts, Overwrite, Settings
-from hilctl.cli.reports import render_report
-from hilctl.cli.safe_streams import print_json
+from hilctl.cli.output import print_json
+from hilctl.experiment.preflight import CheckedExperiment
 from hilctl.experiment.run_labels import label_settings
+from hilctl.live.server_process import served_beside
 from hilctl.loop.safe_output import describe
 from hilctl.machine.checks import log_out
 from hilctl.machine.procfs import Machine
 from hilctl.run.control.client import finish_dead_runs
+from hilctl.run.detached import start_detached
+from hilctl.run.result import Progress as RunProgress
+from hilctl.run.result import RunResult
 from hilctl.run.run_folder import facts_of, require_linux
-
-if TYPE_CHECKING:
-    from hilctl.analysis.run_metrics import RunReport
-    from hilctl.experiment.preflight import CheckedExperiment
-    from hilctl.run.result import Progress as RunProgress
-    from hilctl.run.result import RunResult
+from hilctl.run.safety.manual_safe import put_safe
 
 _log = logging.getLogger(__name__)
 
 _REFRESH_S = 0.1
 _LARGEST_REPORTED = 5_000_000
 _VIEW_END_S = 2.0
+_MOST_MINUTES = 20
+_COUNTS = {"minute", "ticks"}
+_PAGE_ONLY = {"cycles", "start s", "freq. Hz", "floor %", "loop area"}  # a terminal has 80 columns
 
 
 def run(
@@ -98,10 +100,10 @@ def _run(
     with (
         _served(requested=live) as addresses,
         _watched(requested=watch),
-        LiveView(quiet=quiet, addresses=addresses) as view,
+        run_progress(quiet=quiet, addresses=addresses) as on_progress,
     ):
         result = api.run(
-            experiment, output, settings=settings, overwrite=overwrite, on_progress=view.update
+            experiment, output, settings=settings, overwrite=overwrite, on_progress=on_progress
         )
         if result.stop_signal:  # a second Ctrl-C must not suppress the result
             signal.signal(result.stop_signal, signal.SIG_IGN)
@@ -127,7 +129,7 @@ def _watched(*, requested: bool) -> Iterator[None]:
     if not requested:
         yield
         return
-    with subprocess.Popen([sys.executable, "-Pm", "hilctl.cli.watch", str(os.getpid())]) as process:
+    with subprocess.Popen([sys.executable, "-Pm", "hilctl.cli.live", str(os.getpid())]) as process:
         try:
             yield
         finally:
@@ -143,8 +145,6 @@ def _served(*, requested: bool) -> Iterator[list[str]]:
     if not requested:
         yield []
         return
-    from hilctl.live.server_process import served_beside
-
     with served_beside() as url:
         yield [url]
 
@@ -152,8 +152,6 @@ def _served(*, requested: bool) -> Iterator[list[str]]:
 def _detach(
     experiment: Path, output: Path | None, settings: list[str], *, overwrite: bool, as_json: bool
 ) -> None:
-    from hilctl.run.detached import start_detached
-
     finding = log_out(Machine())
     if finding.level != "ok":
         _log.warning("a log-out %s: %s", finding.text, finding.remedy)
@@ -182,8 +180,6 @@ def check(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson
 def safe(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson = False) -> None:
     """Set a device to its safe value (refused while a run uses it)."""
     require_linux()
-    from hilctl.run.safety.manual_safe import put_safe
-
     put = put_safe(experiment, settings or [])
     where = f"{put.device}: {describe(put.output, put.error)} ({put.value:g} {put.unit})"
     if as_json:
@@ -201,59 +197,35 @@ def safe(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson 
         raise typer.Exit(3)
 
 
-class LiveView:
-    """A progress line on standard error: samples, error, command, late ticks.
+@contextmanager
+def run_progress(
+    *, quiet: bool, addresses: Sequence[str] = ()
+) -> Iterator[Callable[[RunProgress], None]]:
+    """Show a progress line on standard error: samples, error, command, late ticks.
 
     Args:
         quiet: Show nothing.
         addresses: Addresses of live pages; printed with the first samples.
+
+    Yields:
+        Function that shows the newest samples, a few times per second.
     """
+    pages, shown_s = list(addresses), 0.0
 
-    def __init__(self, *, quiet: bool, addresses: Sequence[str] = ()) -> None:
-        self._addresses = list(addresses)
-        terminal = console(stderr=True)
-        self._progress = Progress(
-            TextColumn("[bold]run"),
-            BarColumn(bar_width=24),
-            TextColumn("{task.percentage:>3.0f} %"),
-            TextColumn("{task.fields[live]}"),
-            TimeRemainingColumn(),
-            console=terminal,
-            disable=quiet or not terminal.is_terminal,
-            refresh_per_second=8,
-        )
-        self._task: TaskID | None = None
-        self._shown = 0.0
+    def update(progress: RunProgress) -> None:
+        nonlocal shown_s
+        while pages:
+            print(f"live page: {pages.pop()}", file=sys.stderr)
+        now_s = time.monotonic()
+        if not quiet and (now_s - shown_s >= _REFRESH_S or progress.samples >= progress.total):
+            shown_s = now_s
+            show(min(progress.samples / max(progress.total, 1), 1.0), _live_text(progress))
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self._progress.stop()
-
-    def update(self, progress: "RunProgress") -> None:
-        """Show the newest samples, a few times per second."""
-        while self._addresses:
-            print(f"live page: {self._addresses.pop()}", file=sys.stderr)
-        if self._progress.disable:
-            return
-        now = time.monotonic()
-        if now - self._shown < _REFRESH_S and progress.samples < progress.total:
-            return
-        self._shown = now
-        if self._task is None:
-            self._progress.start()
-            self._task = self._progress.add_task("run", total=progress.total, live="")
-        done = min(progress.samples, progress.total)
-        self._progress.update(self._task, completed=done, live=_live_text(progress))
+    with progress_bar("run", quiet=quiet) as show:
+        yield update
 
 
-def _live_text(progress: "RunProgress") -> str:
+def _live_text(progress: RunProgress) -> str:
     newest = progress.batch.samples(slice(-1, None))
     command, displacement_um = newest.command, newest.displacement_um
     error_um = displacement_um - newest.reference_um
@@ -265,7 +237,7 @@ def _live_text(progress: "RunProgress") -> str:
     )
 
 
-def report_of(result: "RunResult", *, every: bool) -> "RunReport | None":
+def report_of(result: RunResult, *, every: bool) -> RunReport | None:
     """Return the report of a finished run.
 
     Args:
@@ -276,12 +248,12 @@ def report_of(result: "RunResult", *, every: bool) -> "RunReport | None":
     return api.summarize(result.path) if wanted else None
 
 
-def run_mapping(result: "RunResult", report: "RunReport | None") -> dict[str, Any]:
+def run_mapping(result: RunResult, report: RunReport | None) -> dict[str, Any]:
     """Return the result and report of a run as plain values."""
     return {**(report.to_mapping() if report else {}), **result.to_mapping()}
 
 
-def print_run(result: "RunResult", report: "RunReport | None") -> None:
+def print_run(result: RunResult, report: RunReport | None) -> None:
     """Print the result of a run and its report, if there is one."""
     terminal = console()
     colour = {"completed": "green", "stopped": "yellow"}.get(result.code, "red")
@@ -303,13 +275,52 @@ def print_run(result: "RunResult", report: "RunReport | None") -> None:
     terminal.print(f"  hilctl report {path} --html run.html", soft_wrap=True)
 
 
-def print_forecast(checked: "CheckedExperiment") -> None:
+def render_report(report: RunReport) -> Group:
+    """Return the tables of a report; the segments have their own if there are several."""
+    title = printable(report.name) or "run"
+    quality = _two_columns(title, quality_rows(report))
+    parts = [quality, _two_columns("", run_rows(report))]
+    if len(report.segments) > 1:
+        parts.append(_segments(report))
+    if len(report.lateness_by_minute) > 1:
+        parts.append(_minutes(report))
+    return Group(*parts)
+
+
+def _two_columns(title: str, rows: Sequence[tuple[str, str]]) -> Table:
+    made = table(title, ("", ""), rows, left={""}, wrap=True)
+    made.show_header, made.columns[0].style, made.columns[0].no_wrap = False, "bold", True
+    return made
+
+
+def _segments(report: RunReport) -> Table:
+    headings, rows = segment_table(report)
+    shown = [i for i, heading in enumerate(headings) if heading not in _PAGE_ONLY]
+    cells = [[row[i] for i in shown] for row in rows]
+    return table("segments, worst first", [headings[i] for i in shown], cells)
+
+
+def _minutes(report: RunReport) -> Table:
+    minutes = report.lateness_by_minute
+    title = "lateness per minute, µs"
+    if len(minutes) > _MOST_MINUTES:
+        # --json contains all of them.
+        title += f": worst {_MOST_MINUTES} of {len(minutes)}"
+        worst = sorted(minutes, key=lambda each: -each["max"])[:_MOST_MINUTES]
+        minutes = sorted(worst, key=lambda each: each["minute"])
+    rows = [
+        [f"{v:,}" if name in _COUNTS else f"{v:.4g}" for name, v in minute.items()]
+        for minute in minutes
+    ]
+    return table(title, [*minutes[0]], rows)
+
+
+def print_forecast(checked: CheckedExperiment) -> None:
     """Print the forecast of a run and its warnings."""
     forecast, config = checked.forecast, checked.loaded.config
     unit, reference_unit = forecast.command_unit, checked.reference.unit
     limits = config.limits
     low, high = limits.command_range
-    table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
     rows = {
         "experiment": config.name,
         "device": checked.loaded.device.info.description,
@@ -335,10 +346,8 @@ def print_forecast(checked: "CheckedExperiment") -> None:
         initial = f"initially {forecast.begins_rms_a or 0.0:.3g} A rms"
         maximum = f"{forecast.heating_rms_a:.4g} A rms (limit {limits.rms_current_a:g})"
         rows["heating"] = f"{maximum}, {initial}"
-    for name, text in rows.items():
-        table.add_row(name, text)
     terminal = console()
-    terminal.print(table)
+    terminal.print(listing("", rows.items()))
     for warning in checked.warnings:
         terminal.print(f"warning: {warning}", style="yellow")
     terminal.print("ready to run", style="green")

@@ -20,7 +20,7 @@ PROTOCOL = Subprotocol("hilctl.live.1")
 """Subprotocol of the page's connection; its number changes with the messages."""
 TOKEN_PREFIX = "token."  # noqa: S105  not a token itself
 MOST_PENDING = 64
-"""Connections at a time that have not been let in; the oldest gives way."""
+"""Largest number of unauthenticated connections; the oldest is aborted."""
 
 
 class Admission:
@@ -45,9 +45,9 @@ class Admission:
         """
         hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
         if len(hosts) != 1 or hosts[0].lower() not in self._hosts:
-            return HTTPStatus.MISDIRECTED_REQUEST, "this server is on loopback only"
+            return HTTPStatus.MISDIRECTED_REQUEST, "the host is not loopback"
         if (origins or upgrade) and (len(origins) != 1 or origins[0] not in self._origins):
-            return HTTPStatus.FORBIDDEN, "not from a page of this server"
+            return HTTPStatus.FORBIDDEN, "the origin is not this server"
         if upgrade and not self._has_token(headers):
             return HTTPStatus.UNAUTHORIZED, "the token is missing or wrong"
         return None

@@ -1,8 +1,8 @@
-"""Encode frames for a page: a JSON header and float32 values.
+"""Frames for a page (a JSON header and float32 values) and for programs.
 
 uint32 little endian   size of the JSON in bytes, with spaces up to a multiple of 4
-JSON                   ``mode`` of the window, its ``n`` buckets, ``loop`` points of the loops
-                       and ``cycle`` points per cycle
+JSON                   ``mode``, ``n`` buckets, number of ``signals``, ``loop`` points of the loops,
+                       ``cycle`` points per cycle
 float32 little endian  t_s[n], low[signals, n], high[signals, n], input[loop], output[loop]
 """
 
@@ -18,7 +18,7 @@ from hilctl.base.events import Event
 from hilctl.base.types import F64
 from hilctl.live.run_reader import RunReader
 from hilctl.live.scope import WINDOWS_S, Scope
-from hilctl.live.signals import SIGNALS
+from hilctl.live.traces import SIGNALS
 
 ScopeMode: TypeAlias = Literal["roll", "cycle"]
 
@@ -58,14 +58,14 @@ def frame_of(scope: Scope, mode: ScopeMode, window_s: float) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class RunFrame:
-    """A run at one time.
+    """State of a run at one time.
 
     Attributes:
-        status: Where it stands: figures, limits, lateness; see :meth:`RunReader.status`.
-        events: Those since the frame before.
-        t_s: float64[n], beginning of each bucket of samples, up to 0 for the newest.
-        low: Lowest value in each bucket by signal, float64[n]; NaN where there is none.
-        high: Highest value, likewise: no spike is lost.
+        status: Metrics, limits, lateness; see :meth:`RunReader.status`.
+        events: Events since the previous frame.
+        t_s: float64[n], start of each bucket of samples; 0 for the newest.
+        low: Minimum of each bucket by signal, float64[n]; NaN if there is no value.
+        high: Maximum of each bucket by signal.
     """
 
     status: dict[str, Any]
@@ -82,14 +82,14 @@ def frames_of(
     clock: Callable[[], float],
     sleep: Callable[[float], None],
 ) -> Iterator[RunFrame]:
-    """Give frames of a run until it is over, the last of them after its end.
+    """Yield frames of a run until it ends; the last follows its end.
 
     Args:
-        feed: The run.
-        every_s: Time from one frame to the next; one that is taken late does not hurry the next.
-        window_s: Time that each shows; the nearest that is kept.
+        feed: Reader of the run.
+        every_s: Interval of the frames; a late frame delays the following ones.
+        window_s: Duration that each frame shows; the nearest available window is used.
         clock: Monotonic time in s.
-        sleep: Lets that many s pass.
+        sleep: Sleeps for the given time in s.
     """
     window_s, seen = nearest_window_s(window_s), 0
     while True:

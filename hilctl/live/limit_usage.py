@@ -1,4 +1,4 @@
-"""Compute the current use of each limit and interlock of a run."""
+"""Current use of each limit and interlock of a run."""
 
 import math
 from dataclasses import dataclass
@@ -7,11 +7,11 @@ from typing import Literal
 import numpy as np
 
 from hilctl.base.types import F64, I64
-from hilctl.live.signals import ROW, Traces
+from hilctl.live.traces import ROW, Traces
 from hilctl.run.metadata import LimitBounds, RunDescription
 
 WARNING_USED, ERROR_USED = 0.8, 0.95
-"""Parts of a limit from which on a gauge is a warning and an error."""
+"""Used fractions of a limit above which a gauge is a warning or an error."""
 _HOLD_S = 1.0
 
 

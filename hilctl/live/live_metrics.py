@@ -1,6 +1,7 @@
-"""Compute running metrics of the newest complete cycles with the functions of a report.
+"""Running metrics of the newest samples: complete cycles, error spectrum, lateness.
 
-Without a period, the metrics that need none are computed over the newest half second.
+Metrics of cycles are computed with the functions of a report. Without a period, the metrics that
+need none are computed over the newest half second.
 """
 
 import math
@@ -8,10 +9,10 @@ from typing import TypeAlias
 
 import numpy as np
 
-from hilctl.base.samples import NO_WAVEFORM, Flag
+from hilctl.base.samples import NO_WAVEFORM, BlockBatch, BlockHeader, Flag
 from hilctl.base.segments import Segment
 from hilctl.base.types import F64, I64
-from hilctl.live.signals import ROW, Traces
+from hilctl.live.traces import ROW, Traces
 from hilctl.signals.cycle_metrics import (
     CycleAverager,
     noise_floor_percent,
@@ -27,6 +28,11 @@ FigureValues: TypeAlias = dict[str, float | None]
 _GROUP_S = 0.5
 _NOISE_SAMPLES = 4096
 _LEFT_OUT = NO_WAVEFORM | Flag.SENSOR_INVALID
+_SPECTRUM_SAMPLES = 16384
+_SPECTRUM_POINTS = 240
+EDGES_US: F64 = np.concatenate(([0.0], np.geomspace(1.0, 1e6, 31)))
+"""Edges of the histogram's bins; later ticks are in the last bin."""
+_TICKS = 20_000
 
 
 class RunningFigures:
@@ -42,7 +48,7 @@ class RunningFigures:
         self._segment: Segment | None = None
         self._group: _Group | None = None
         self.newest: FigureValues = {}
-        """Those of the last group of cycles that is whole, by name with unit; empty before."""
+        """Metrics of the last complete group of cycles by name with unit."""
 
     def add(self, traces: Traces, segment: Segment | None) -> None:
         """Add the next samples.
@@ -159,3 +165,62 @@ def _errors_percent(error_um: F64, stroke_um: float) -> FigureValues:
 def _trusted(traces: Traces) -> Traces:
     kept = (traces.flags & _LEFT_OUT) == 0
     return Traces(traces.index[kept], traces.values[:, kept], traces.flags[kept])
+
+
+class LiveErrorSpectrum:
+    """Amplitude spectrum of the newest samples of the error.
+
+    Args:
+        sample_rate_hz: Samples per second.
+    """
+
+    def __init__(self, sample_rate_hz: float) -> None:
+        self._rate_hz = sample_rate_hz
+        self._newest = np.empty(0)
+
+    def add(self, traces: Traces) -> None:
+        """Add the next samples; a gap or a missing error discards all earlier ones."""
+        error_um = traces.values[ROW["error"]]
+        broken = ~np.isfinite(error_um)
+        if broken.any():
+            last = int(np.flatnonzero(broken)[-1])
+            self._newest, error_um = np.empty(0), error_um[last + 1 :]
+        self._newest = np.concatenate((self._newest, error_um))[-_SPECTRUM_SAMPLES:]
+
+    def points(self) -> tuple[F64, F64]:
+        """Return frequencies in Hz and amplitudes in um, each the maximum of adjacent lines.
+
+        Both float64[k]; empty before there are 256 samples. A sine of 1 um has a line of 1 um.
+        """
+        size = 1 << (self._newest.size.bit_length() - 1) if self._newest.size else 0
+        if size < 256:
+            return np.empty(0), np.empty(0)
+        window = np.hanning(size)
+        error_um = self._newest[-size:]
+        lines_um = np.abs(np.fft.rfft((error_um - error_um.mean()) * window))
+        lines_um *= 2.0 / window.sum()
+        # Maximum, so that a single line remains visible.
+        edges = np.unique(np.geomspace(1, lines_um.size, _SPECTRUM_POINTS).astype(np.int64))[:-1]
+        largest_um: F64 = np.maximum.reduceat(lines_um, edges)
+        return edges.astype(np.float64) * np.float64(self._rate_hz / size), largest_um
+
+
+class LatenessCounts:
+    """Histogram of the lateness of all ticks read, and percentiles of the newest."""
+
+    def __init__(self) -> None:
+        self.counts: I64 = np.zeros(EDGES_US.size - 1, dtype=np.int64)
+        self._newest_us: F64 = np.empty(0)
+
+    def add(self, batch: BlockBatch) -> None:
+        """Add the next blocks."""
+        late_us = np.maximum(batch.heads[:, BlockHeader.LATE_NS] * 1e-3, 0.0)
+        self.counts += np.histogram(np.minimum(late_us, EDGES_US[-1]), EDGES_US)[0]
+        self._newest_us = np.concatenate((self._newest_us, late_us))[-_TICKS:]
+
+    def percentiles_us(self) -> dict[str, float]:
+        """Return ``p50``, ``p99`` and ``max`` of the newest ticks; empty before the first."""
+        if not self._newest_us.size:
+            return {}
+        p50, p99, most = np.percentile(self._newest_us, (50.0, 99.0, 100.0))
+        return {"p50": float(p50), "p99": float(p99), "max": float(most)}

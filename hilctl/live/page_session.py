@@ -18,9 +18,9 @@ from hilctl.base.strict import StrictModel
 from hilctl.live.frame_codec import ScopeMode
 
 MAX_MESSAGE_BYTES = 4096
-"""Longest message of a page."""
+"""Largest message of a page."""
 SLOW_S = 5.0
-"""A page that takes nothing for so long is cut."""
+"""A page that reads nothing for this time is disconnected."""
 _RATE_HZ, _BURST = 20.0, 40.0
 
 
@@ -55,9 +55,9 @@ class PageMessage(StrictModel):
     request: dict[str, Any] = Field(default_factory=dict)
 
 
-def answer_text(message: PageMessage, **said: Any) -> str:
+def answer_text(message: PageMessage, **values: Any) -> str:
     """Return the answer to a message as JSON."""
-    return finite_json({"kind": "answer", "id": message.id, "ask": message.ask, **said})
+    return finite_json({"kind": "answer", "id": message.id, "ask": message.ask, **values})
 
 
 class RateLimiter:
@@ -65,7 +65,7 @@ class RateLimiter:
 
     Args:
         rate_hz: Number per second in the long run.
-        burst: Number at once.
+        burst: Largest number at one time.
         clock: Monotonic time in s.
     """
 
@@ -74,7 +74,7 @@ class RateLimiter:
         self._left, self._at = burst, clock()
 
     def take(self) -> bool:
-        """Take one; return False if none is left."""
+        """Return whether one more is allowed now, and count it."""
         now = self._clock()
         self._left = min(self._burst, self._left + (now - self._at) * self._rate_hz)
         self._at = now
@@ -104,7 +104,7 @@ class PageSession:
     ) -> None:
         self.view = PageView()
         self._connection, self._answer, self._clock = connection, answer, clock
-        self._allowance = RateLimiter(_RATE_HZ, _BURST, clock)
+        self._limiter = RateLimiter(_RATE_HZ, _BURST, clock)
         self._sending: asyncio.Task[None] | None = None
         self._began_s = 0.0
 
@@ -129,16 +129,16 @@ class PageSession:
         except ConnectionClosed:
             return
 
-    async def attend(self) -> None:
+    async def serve(self) -> None:
         """Execute the requests of the page until it disconnects."""
         async for raw in self._connection:
-            if not self._allowance.take():
+            if not self._limiter.take():
                 await self._connection.close(1008, "too many messages")
                 return
             try:
                 message = PageMessage.model_validate_json(raw)
             except ValidationError:
-                await self._connection.close(1008, "not a message of the page")
+                await self._connection.close(1008, "invalid message")
                 return
             if message.ask == "view":
                 try:

@@ -1,4 +1,4 @@
-"""Read a live run from outside: its newest signals, metrics, limits and events.
+"""Readers of active runs: newest signals, metrics, limits and events of each.
 
 The ring is mapped read-only and copied data are validated, so that the loop and the recorder are
 not affected. Time is an argument.
@@ -6,95 +6,33 @@ not affected. Time is an argument.
 
 import math
 import os
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from hilctl.base.errors import RunError
 from hilctl.base.events import Event
-from hilctl.base.samples import BlockBatch, BlockHeader
-from hilctl.base.types import F64, I64
 from hilctl.live.limit_usage import Gauge, Headroom
-from hilctl.live.live_metrics import FigureValues, RunningFigures
+from hilctl.live.live_metrics import (
+    EDGES_US,
+    FigureValues,
+    LatenessCounts,
+    LiveErrorSpectrum,
+    RunningFigures,
+)
 from hilctl.live.scope import Scope
-from hilctl.live.signals import ROW, Traces, traces_of
+from hilctl.live.traces import Traces, traces_of
+from hilctl.run.control.client import active_runs
 from hilctl.run.metadata import RunDescription
 from hilctl.run.run_folder import RunFolder
 from hilctl.run.shared.ring import SampleRing
 from hilctl.run.shared.shared_page import PageField, Phase
 
-_SAMPLES = 16384
-_POINTS = 240
-
-
-class LiveErrorSpectrum:
-    """Amplitudes of what the newest samples of the error are made of.
-
-    Args:
-        sample_rate_hz: Samples a second.
-    """
-
-    def __init__(self, sample_rate_hz: float) -> None:
-        self._rate_hz = sample_rate_hz
-        self._newest = np.empty(0)
-
-    def add(self, traces: Traces) -> None:
-        """Take the next samples; what has no error, or comes after a gap, begins anew."""
-        error_um = traces.values[ROW["error"]]
-        broken = ~np.isfinite(error_um)
-        if broken.any():
-            last = int(np.flatnonzero(broken)[-1])
-            self._newest, error_um = np.empty(0), error_um[last + 1 :]
-        self._newest = np.concatenate((self._newest, error_um))[-_SAMPLES:]
-
-    def points(self) -> tuple[F64, F64]:
-        """Return frequencies in Hz and amplitudes in um, each the largest of its neighbours.
-
-        Both float64[k]; empty before there are 256 samples. A line of a sine of 1 um is 1 um high.
-        """
-        size = 1 << (self._newest.size.bit_length() - 1) if self._newest.size else 0
-        if size < 256:
-            return np.empty(0), np.empty(0)
-        window = np.hanning(size)
-        error_um = self._newest[-size:]
-        lines_um = np.abs(np.fft.rfft((error_um - error_um.mean()) * window))
-        lines_um *= 2.0 / window.sum()
-        # By the largest: a line must not vanish among its neighbours.
-        edges = np.unique(np.geomspace(1, lines_um.size, _POINTS).astype(np.int64))[:-1]
-        largest_um: F64 = np.maximum.reduceat(lines_um, edges)
-        return edges.astype(np.float64) * np.float64(self._rate_hz / size), largest_um
-
-
-EDGES_US: F64 = np.concatenate(([0.0], np.geomspace(1.0, 1e6, 31)))
-"""Edges of the histogram's bins; what is later is in the last one."""
-_TICKS = 20_000
-
-
-class LatenessCounts:
-    """Histogram of the whole run, as far as it was seen, and percentiles of its newest ticks."""
-
-    def __init__(self) -> None:
-        self.counts: I64 = np.zeros(EDGES_US.size - 1, dtype=np.int64)
-        self._newest_us: F64 = np.empty(0)
-
-    def add(self, batch: BlockBatch) -> None:
-        """Take the next blocks."""
-        late_us = np.maximum(batch.heads[:, BlockHeader.LATE_NS] * 1e-3, 0.0)
-        self.counts += np.histogram(np.minimum(late_us, EDGES_US[-1]), EDGES_US)[0]
-        self._newest_us = np.concatenate((self._newest_us, late_us))[-_TICKS:]
-
-    def percentiles_us(self) -> dict[str, float]:
-        """Return ``p50``, ``p99`` and ``max`` of the newest ticks; nothing before the first."""
-        if not self._newest_us.size:
-            return {}
-        p50, p99, most = np.percentile(self._newest_us, (50.0, 99.0, 100.0))
-        return {"p50": float(p50), "p99": float(p99), "max": float(most)}
-
-
 _EVENTS = 60
 _LOOK_S = 0.5  # interval of checks of the run's locks and the disk
+_SEARCH_S = 1.0  # interval of searches for runs
 
 
 @dataclass(frozen=True, slots=True)
@@ -287,3 +225,62 @@ def _disk_room(recording: Path) -> DiskRoom | None:
         return DiskRoom(disk.f_bavail * disk.f_frsize, recording.stat().st_size)
     except OSError:
         return None
+
+
+class RunList:
+    """Readers of the active runs, each created when it is first requested.
+
+    Args:
+        chosen: Returns the run to show if none is named; None if there is none.
+
+    Attributes:
+        runs: All active runs.
+    """
+
+    def __init__(self, chosen: Callable[[list[RunFolder]], RunFolder | None]) -> None:
+        self.runs: list[RunFolder] = []
+        self._chosen = chosen
+        self._feeds: dict[str, RunReader] = {}
+        self._main = ""
+        self._looked_s = float("-inf")
+
+    def __iter__(self) -> Iterator[RunReader]:
+        """Iterate over the readers that were requested."""
+        return iter(self._feeds.values())
+
+    def update(self, now_s: float, shown: Iterable[str | None] = ()) -> None:
+        """Update the list of active runs once per second; remove ended runs that are not shown.
+
+        Args:
+            now_s: Monotonic time.
+            shown: Names of the runs that are shown; None for the main one.
+        """
+        if now_s - self._looked_s < _SEARCH_S:
+            return
+        self._looked_s, self.runs = now_s, active_runs()
+        kept = {self._main} | {
+            feed.folder.card.name for name in shown if (feed := self.feed(name)) is not None
+        }
+        self._feeds = {
+            name: feed for name, feed in self._feeds.items() if not feed.ended or name in kept
+        }
+
+    def feed(self, name: str | None) -> RunReader | None:
+        """Return the reader of a run that is active, or was when first requested."""
+        if name is None:
+            name = self._main = self._main_run()
+        if name in self._feeds:
+            return self._feeds[name]
+        found = next((run for run in self.runs if run.card.name == name), None)
+        if found is not None:
+            with suppress(RunError):  # the run is just being started or removed
+                self._feeds[name] = RunReader(found)
+        return self._feeds.get(name)
+
+    def _main_run(self) -> str:
+        """Return the default run; an ended run remains until there is another."""
+        feed = self._feeds.get(self._main)
+        if feed is not None and not feed.ended:
+            return self._main
+        chosen = self._chosen(self.runs)
+        return self._main if chosen is None else chosen.card.name

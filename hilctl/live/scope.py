@@ -1,4 +1,4 @@
-"""Provide the windows of an oscilloscope (rolling or triggered) and hysteresis loops."""
+"""Windows of an oscilloscope (rolling or triggered) and hysteresis loops."""
 
 import math
 from dataclasses import dataclass
@@ -8,17 +8,17 @@ import numpy as np
 from hilctl.base.samples import NO_WAVEFORM
 from hilctl.base.segments import Segment
 from hilctl.base.types import F64, I64
-from hilctl.live.signals import ROW, SIGNALS, Traces
+from hilctl.live.traces import ROW, SIGNALS, Traces
 
 
 @dataclass(frozen=True, slots=True)
 class Buckets:
-    """Some buckets after one another.
+    """Consecutive buckets.
 
     Attributes:
-        low: float64[len(SIGNALS), n]; NaN where a bucket has no sample.
-        high: The same shape.
-        first: The same shape: values of one sample, so that they belong together.
+        low: Minimum of each signal, float64[len(SIGNALS), n]; NaN if a bucket has no sample.
+        high: Maximum of each signal, same shape.
+        first: Values of the first sample of each bucket, same shape.
     """
 
     low: F64
@@ -27,26 +27,26 @@ class Buckets:
 
 
 class MinMaxTrace:
-    """The newest buckets of a run, with the lowest, highest and first value of each signal.
+    """Newest buckets of a run, with minimum, maximum and first value of each signal.
 
     The range of each bucket is drawn, so an outlier is visible in an hour as well as in a second.
 
     Args:
-        origin: Sample with which bucket 0 begins.
-        width: Samples in a bucket, >= 1, not necessarily whole.
-        keep: Number of buckets that are kept.
+        origin: First sample of bucket 0.
+        width: Samples per bucket, >= 1, may be fractional.
+        keep: Number of stored buckets.
     """
 
     def __init__(self, origin: float, width: float, keep: int) -> None:
         self.origin, self.width, self.keep = origin, width, keep
         self.newest = -1
-        """Number of the newest bucket that has a sample; negative before the first."""
+        """Number of the newest bucket with a sample; -1 before the first."""
         shape = (len(SIGNALS), keep)
         self._low, self._high = np.full(shape, np.nan), np.full(shape, np.nan)
         self._first = np.full(shape, np.nan)
 
     def add(self, traces: Traces) -> None:
-        """Take the next samples; those before the origin, or older than the newest, are left."""
+        """Add the next samples; ignore those before the origin or the newest bucket."""
         numbers = np.floor((traces.index - self.origin) / self.width).astype(np.int64)
         begin = int(np.searchsorted(numbers, max(self.newest, 0)))
         if begin == numbers.size:
@@ -57,7 +57,7 @@ class MinMaxTrace:
         low = np.fmin.reduceat(values, starts, axis=1)
         high = np.fmax.reduceat(values, starts, axis=1)
         self._clear(int(numbers[-1]))
-        if numbers[0] == self.newest:  # it has samples from before
+        if numbers[0] == self.newest:  # it already has samples
             slot = self.newest % self.keep
             low[:, 0] = np.fmin(low[:, 0], self._low[:, slot])
             high[:, 0] = np.fmax(high[:, 0], self._high[:, slot])
@@ -69,14 +69,14 @@ class MinMaxTrace:
         self.newest = int(numbers[-1])
 
     def _clear(self, newest: int) -> None:
-        """Empty the buckets that come after the newest, up to the one that will be it."""
+        """Clear the buckets after the newest, up to the new newest."""
         numbers = np.arange(max(self.newest + 1, newest - self.keep + 1), newest + 1)
         slots = numbers % self.keep
         for values in (self._low, self._high, self._first):
             values[:, slots] = np.nan
 
     def window(self, begin: int, count: int) -> Buckets:
-        """Return the buckets from number ``begin`` on, empty ones where there is none."""
+        """Return buckets from number ``begin``; those that are not stored are empty."""
         numbers: I64 = np.arange(begin, begin + count)
         there = (numbers >= 0) & (numbers <= self.newest) & (numbers > self.newest - self.keep)
         slots = numbers % self.keep
@@ -89,11 +89,11 @@ class MinMaxTrace:
 
 
 WINDOWS_S = (0.02, 0.1, 0.5, 2.0, 10.0, 60.0, 600.0)
-"""Lengths of a rolling window, in s."""
+"""Lengths of rolling windows in s."""
 BUCKETS = 600
-"""Buckets in a window."""
+"""Buckets per window."""
 CYCLES = 6
-"""Cycles of the loop that are kept."""
+"""Stored cycles of the loop."""
 _CYCLE_BUCKETS = 300
 _LONG_S = 1.0
 _LOOP_S = 2.0
@@ -133,12 +133,12 @@ class Scope:
         }
         self._cycles: MinMaxTrace | None = None
         self.segment: Segment | None = None
-        """The stretch that the newest sample of the waveform is in."""
+        """Segment of the newest sample of the waveform."""
 
     def add(self, traces: Traces) -> None:
         """Add the next samples."""
-        for envelope in self._rolling.values():
-            envelope.add(traces)
+        for trace in self._rolling.values():
+            trace.add(traces)
         running = traces.index[(traces.flags & NO_WAVEFORM) == 0]
         if running.size:
             self._follow(int(running[-1]))
@@ -159,12 +159,10 @@ class Scope:
 
     def rolling(self, window_s: float) -> ScopeWindow:
         """Return the newest ``window_s``, one of :data:`WINDOWS_S`."""
-        envelope = self._rolling[window_s]
-        count = min(BUCKETS, max(2, math.ceil(window_s * self._rate_hz / envelope.width)))
-        t_s = np.arange(1 - count, 1) * (envelope.width / self._rate_hz)
-        return ScopeWindow(
-            t_s.astype(np.float64), envelope.window(envelope.newest - count + 1, count)
-        )
+        trace = self._rolling[window_s]
+        count = min(BUCKETS, max(2, math.ceil(window_s * self._rate_hz / trace.width)))
+        t_s = np.arange(1 - count, 1) * (trace.width / self._rate_hz)
+        return ScopeWindow(t_s.astype(np.float64), trace.window(trace.newest - count + 1, count))
 
     def whole_buckets(self, window_s: float, since: int) -> tuple[int, Buckets]:
         """Return the completed buckets of a rolling window.
@@ -176,9 +174,9 @@ class Scope:
         Returns:
             Number of the first bucket that is still stored, and the buckets from there on.
         """
-        envelope = self._rolling[window_s]
-        first = max(since, envelope.newest - envelope.keep + 1, 0)
-        return first, envelope.window(first, max(0, envelope.newest - first))
+        trace = self._rolling[window_s]
+        first = max(since, trace.newest - trace.keep + 1, 0)
+        return first, trace.window(first, max(0, trace.newest - first))
 
     def bucket_samples(self, window_s: float) -> int:
         """Return the number of samples per bucket of a rolling window."""
@@ -189,31 +187,31 @@ class Scope:
 
         A long cycle is shown while it is recorded.
         """
-        envelope, segment = self._cycles, self.segment
-        if envelope is None or segment is None or segment.period <= 0.0:
+        trace, segment = self._cycles, self.segment
+        if trace is None or segment is None or segment.period <= 0.0:
             return None
-        cycle = segment.period / envelope.width
-        done = (envelope.newest + 1) / cycle
+        cycle = segment.period / trace.width
+        done = (trace.newest + 1) / cycle
         live = segment.period > _LONG_S * self._rate_hz
         begin = math.floor(done) - (cycles - 1 if live else cycles)
         if begin < 0:
             return None
         first = math.ceil(begin * cycle - 1e-9)
         count = math.ceil(cycles * cycle)
-        t_s = (np.arange(first, first + count) - begin * cycle) * (envelope.width / self._rate_hz)
-        return ScopeWindow(t_s.astype(np.float64), envelope.window(first, count))
+        t_s = (np.arange(first, first + count) - begin * cycle) * (trace.width / self._rate_hz)
+        return ScopeWindow(t_s.astype(np.float64), trace.window(first, count))
 
     def loops(self) -> F64:
         """Return the newest loops: float64[2, n], oldest first.
 
         Input and displacement of the same sample.
         """
-        envelope, segment = self._cycles, self.segment
-        if envelope is None or segment is None:
+        trace, segment = self._cycles, self.segment
+        if trace is None or segment is None:
             return np.empty((2, 0))
-        cycle = segment.period / envelope.width if segment.period > 0.0 else _CYCLE_BUCKETS
-        count = min(math.ceil(CYCLES * cycle), envelope.newest + 1)
-        first = envelope.window(envelope.newest - count + 1, count).first
+        cycle = segment.period / trace.width if segment.period > 0.0 else _CYCLE_BUCKETS
+        count = min(math.ceil(CYCLES * cycle), trace.newest + 1)
+        first = trace.window(trace.newest - count + 1, count).first
         return first[[self._input, ROW["displacement"]]]
 
     def points_a_cycle(self) -> int:

@@ -27,9 +27,8 @@ from hilctl.base.os_errors import ADDRESS_REMEDIES, reason
 from hilctl.live.auth import PROTOCOL, Admission, PendingConnections, bounded
 from hilctl.live.frame_codec import frame_of, nearest_window_s
 from hilctl.live.page_session import MAX_MESSAGE_BYTES, PageMessage, PageSession, answer_text
-from hilctl.live.run_list import RunList
-from hilctl.live.run_reader import RunReader
-from hilctl.live.signals import SIGNALS
+from hilctl.live.run_reader import RunList, RunReader
+from hilctl.live.traces import SIGNALS
 from hilctl.run.control.client import ask, request_stop
 from hilctl.run.run_folder import RunFolder
 
@@ -41,7 +40,7 @@ FILES = {
     "/uplot.js": ("uplot/uPlot.iife.min.js", "text/javascript; charset=utf-8"),
     "/uplot.css": ("uplot/uPlot.min.css", "text/css; charset=utf-8"),
 }
-"""Path of each, its file and its type."""
+"""File and content type of each path."""
 _HEADERS = {
     "Content-Security-Policy": "default-src 'self'; base-uri 'none'; form-action 'none'; "
     "frame-ancestors 'none'",
@@ -61,7 +60,7 @@ def _content(name: str) -> bytes:
 
 
 def file_response(path: str) -> Response:
-    """Return the file at a path; 404 where there is none."""
+    """Return the file at a path; 404 if there is none."""
     if path not in FILES:
         return plain_response(HTTPStatus.NOT_FOUND, "no such file")
     name, kind = FILES[path]
@@ -69,7 +68,7 @@ def file_response(path: str) -> Response:
 
 
 def plain_response(status: HTTPStatus, text: str) -> Response:
-    """Return a line of text."""
+    """Return a response of one line of text."""
     return _response(status, "text/plain; charset=utf-8", f"{text}\n".encode())
 
 
@@ -125,7 +124,7 @@ class LiveServer:
     async def run(self, over: Callable[["LiveServer"], bool]) -> None:
         """Serve until ``over`` returns true."""
         settings: dict[str, Any] = {
-            "process_request": self._let_in,
+            "process_request": self._admit,
             "select_subprotocol": _our_protocol,
             "compression": None,  # slower than loopback
             "server_header": None,
@@ -138,18 +137,18 @@ class LiveServer:
         }
         async with AsyncExitStack() as stack:
             for listener in self._sockets:
-                await stack.enter_async_context(serve(self._attend, sock=listener, **settings))
+                await stack.enter_async_context(serve(self._serve_page, sock=listener, **settings))
             await self._tick(over)
 
     def feed(self, name: str | None) -> RunReader | None:
-        """Return the reader of a run, see :meth:`hilctl.live.run_list.RunList.feed`."""
+        """Return the reader of a run, see :meth:`hilctl.live.run_reader.RunList.feed`."""
         return self._feeds.feed(name)
 
-    def _let_in(self, connection: ServerConnection, request: Request) -> Response | None:
+    def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
         upgrade = request.path == _LIVE
         refused = self._admission.refusal(request.headers, upgrade=upgrade)
         if refused is None and upgrade and len(self._viewers) >= _MOST_VIEWERS:
-            refused = (HTTPStatus.SERVICE_UNAVAILABLE, "too many pages look on")
+            refused = (HTTPStatus.SERVICE_UNAVAILABLE, "too many pages are connected")
         if request.method != "GET":
             refused = (HTTPStatus.METHOD_NOT_ALLOWED, "only GET is served")
         if refused is not None:
@@ -159,22 +158,22 @@ class LiveServer:
         self._pending.remove(connection)
         return None
 
-    async def _attend(self, connection: ServerConnection) -> None:
+    async def _serve_page(self, connection: ServerConnection) -> None:
         viewer = PageSession(connection, self._answer, self._clock)
         self._viewers.add(viewer)
         try:
-            await viewer.attend()
+            await viewer.serve()
         finally:
             self._viewers.discard(viewer)
 
     async def _answer(self, viewer: PageSession, message: PageMessage) -> str:
         try:
-            answer = await self._followed(viewer, message)
+            answer = await self._executed(viewer, message)
         except HilctlError as error:
             answer = {"ok": False, "error": str(error)}
         return answer_text(message, **answer)
 
-    async def _followed(self, viewer: PageSession, message: PageMessage) -> dict[str, Any]:
+    async def _executed(self, viewer: PageSession, message: PageMessage) -> dict[str, Any]:
         feed = self.feed(viewer.view.run)
         if message.ask == "view":
             return {"ok": True}
@@ -200,7 +199,7 @@ class LiveServer:
 
     def _show(self, number: int) -> None:
         now_s = self._clock()
-        self._feeds.look(now_s, [each.view.run for each in self._viewers])
+        self._feeds.update(now_s, [each.view.run for each in self._viewers])
         self.feed(None)  # read from the first sample, even without a page
         for feed in self._feeds:
             feed.poll(now_s)
@@ -233,14 +232,14 @@ class LiveServer:
 def _our_protocol(
     connection: ServerConnection, offered: Sequence[Subprotocol]
 ) -> Subprotocol | None:
-    """Select the protocol of the page; the token is offered too, and never selected."""
+    """Select the protocol of the page, never the token, which is offered too."""
     del connection
     return PROTOCOL if PROTOCOL in offered else None
 
 
 def _quiet() -> logging.Logger:
     """Return a log that discards messages on invalid requests."""
-    log = _log.getChild("strangers")
+    log = _log.getChild("requests")
     log.propagate = False
     log.addHandler(logging.NullHandler())
     return log

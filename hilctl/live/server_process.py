@@ -1,4 +1,4 @@
-"""Run the servers as processes: beside a run that requested one, or alone.
+"""Server processes of the live page and for Foxglove, with a run or alone.
 
 A run starts it as ``python -m hilctl.live.server_process`` with the supervisor's process number
 on standard input; its first line of output is the address. It ends with its run.
@@ -16,6 +16,7 @@ from contextlib import contextmanager, suppress
 from typing import Protocol
 
 from hilctl.base.errors import RunError
+from hilctl.live.foxglove import PORT, FoxgloveServer
 from hilctl.live.run_reader import RunReader
 from hilctl.live.server import LiveServer
 from hilctl.machine.rt_setup import be_ordinary
@@ -87,7 +88,7 @@ def serve_foxglove(
     """Serve runs to Foxglove and compatible applications until it is over.
 
     Args:
-        chosen: See :class:`hilctl.live.run_list.RunList`.
+        chosen: See :class:`hilctl.live.run_reader.RunList`.
         over: Returns whether to end the server.
         on_url: Called with the address of the server.
         port: Port to listen on; 0 for any, None for the default port of the applications.
@@ -96,8 +97,6 @@ def serve_foxglove(
         InputError: The library is not installed.
         RunError: The port is not available.
     """
-    from hilctl.live.foxglove_server import PORT, FoxgloveServer
-
     _come_last()  # before the library starts threads, which inherit the priority
     server = FoxgloveServer(chosen, PORT if port is None else port)
     on_url(server.url)

@@ -1,5 +1,7 @@
 """Every module has its unit tests in the file of its name, and every such file its module."""
 
+import ast
+from collections import Counter
 from pathlib import Path
 
 UNIT = Path(__file__).parent
@@ -54,3 +56,17 @@ def test_no_exception_has_outlived_its_reason():
     """Each names a module that is there and has no file of its own."""
     stale = WITHOUT.keys() - (modules() - covered())
     assert not stale, "strike from the table:\n" + "\n".join(sorted(stale))
+
+
+def test_names_are_unique():
+    """No public class occurs twice, no module name more than three times."""
+    files = [file for package in PACKAGES.values() for file in package.rglob("*.py")]
+    classes = Counter(
+        node.name
+        for file in files
+        for node in ast.parse(file.read_text(encoding="utf-8")).body
+        if isinstance(node, ast.ClassDef) and not node.name.startswith("_")
+    )
+    stems = Counter(file.stem for file in files if not file.stem.startswith("__"))
+    assert [name for name, count in classes.items() if count > 1] == []
+    assert [name for name, count in stems.items() if count > 3] == []

@@ -1,10 +1,10 @@
-"""Many runs from Python: what is planned, run and returned."""
+"""Campaigns, characterisation and iterative learning from Python."""
 
 import pytest
 
 from hilctl import api
 from hilctl.base.errors import InputError
-from tests.unit.api.test_runs import SHORT, SINE
+from tests.unit.api.test_runs import CONFIGS, SHORT, SINE
 
 
 def test_a_campaign_runs_every_step(tmp_path):
@@ -18,11 +18,11 @@ def test_a_campaign_runs_every_step(tmp_path):
     assert [row.code for _, row in result.ordered] == ["completed"] * 2
     assert texts
     assert len(api.list_runs(tmp_path / "runs", where="waveform.amplitude > 0.7")) == 1
-    with pytest.raises(InputError, match="scheduler: for fast runs only"):
+    with pytest.raises(InputError, match="scheduler"):
         api.campaign(file, tmp_path / "runs", settings=SHORT, scheduler="processes")
 
 
-def test_a_dry_run_says_what_it_would_do_and_leaves_nothing(tmp_path):
+def test_a_dry_run_plans_and_writes_nothing(tmp_path):
     file = tmp_path / "two.yaml"
     file.write_text(f"name: two\nexperiment: {SINE}\nvary:\n  waveform.amplitude: [0.5, 1.0]\n")
     plans = []
@@ -39,6 +39,28 @@ def test_a_dry_run_says_what_it_would_do_and_leaves_nothing(tmp_path):
     assert [each.name for each in tmp_path.iterdir()] == ["two.yaml"]
 
 
-def test_the_model_is_not_named_like_its_page(tmp_path):
-    with pytest.raises(InputError, match="is the name of the page"):
+def test_the_model_and_its_page_have_different_names(tmp_path):
+    with pytest.raises(InputError, match="page"):
         api.characterise(SINE, tmp_path / "model.html", fast=True)
+
+
+@pytest.mark.slow
+def test_learning_keeps_its_runs_and_writes_a_correction(tmp_path):
+    rows = []
+    settings = {
+        "sample_rate_hz": 10000, "block": 10, "waveform.duration_s": 0.4,
+        "waveform.frequency_hz": 50.0, "waveform.soft_start_s": 0.1, "waveform.soft_end_s": 0.1,
+    }  # fmt: skip
+    file = tmp_path / "c.yaml"
+    learned = api.learn(
+        CONFIGS / "terfenol_sine_6a.yaml", file, cycles=1, settings=settings, fast=True,
+        on_rows=rows.extend,
+    )  # fmt: skip
+    assert learned.rows[1].error_percent < learned.rows[0].error_percent
+    assert len(rows) >= 2
+    assert file.exists()
+    assert (tmp_path / "c-runs" / "run-00.mcap").exists()
+    with pytest.raises(InputError, match="exists"):
+        api.learn(SINE, file, fast=True)
+    with pytest.raises(InputError, match="--folder"):
+        api.learn(SINE, tmp_path / "c.yml", folder=tmp_path / "c-runs", fast=True)

@@ -1,4 +1,4 @@
-"""Models from Python: what is passed on, and a fit from a table to a file."""
+"""Identify, refine and compare models from Python."""
 
 import numpy as np
 import pytest
@@ -36,8 +36,7 @@ def test_a_model_is_identified_and_written(table, tmp_path):
     assert texts
 
 
-def test_what_is_given_is_passed_on(monkeypatch, tmp_path):
-    """One path or several, texts or values; nothing is left out."""
+def test_arguments_are_passed_on(monkeypatch):
     seen = {}
     monkeypatch.setattr("hilctl.api.models.refine_files", lambda *given, **named: (given, named))
     monkeypatch.setattr("hilctl.comparison.compare.compare", lambda *given: seen.update(all=given))
@@ -62,6 +61,6 @@ def test_what_is_given_is_passed_on(monkeypatch, tmp_path):
         ("ppi", "processes", "processes"),
     ],
 )
-def test_candidates_are_fitted_beside_each_other(monkeypatch, model, asked, where):
+def test_default_scheduler(monkeypatch, model, asked, where):
     monkeypatch.setattr("hilctl.api.models.identify_files", lambda *given, **named: given[4])
     assert api.identify("a.mcap", model=model, scheduler=asked) == where

@@ -1,13 +1,20 @@
-"""Recordings from Python: tables with units, figures, what is found."""
+"""Read, evaluate, plot and export recordings from Python."""
+
+import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from hilctl import api
+from hilctl.api.recordings import SampleTable
 from hilctl.base.errors import DataError, InputError
 from tests.unit.api.test_runs import SHORT, SINE
+
+TABLE = SampleTable(
+    {"t_s": np.arange(3) / 2.0, "displacement_um": np.ones(3), "flags": np.zeros(3, np.uint32)},
+    {"t_s": "s", "displacement_um": "um"},
+)
 
 
 @pytest.fixture(scope="module")
@@ -33,15 +40,15 @@ def test_a_table_has_named_columns_with_units(file):
     assert run.facts["code"] == "completed"
 
 
-def test_a_stretch_is_read(file):
+def test_a_time_range_is_read(file):
     run = api.read(file, from_s=0.05, to_s=0.1)
     assert run.table["t_s"].min() >= 0.05
     assert run.table["t_s"].max() < 0.1
-    with pytest.raises(InputError, match="give them to read"):
+    with pytest.raises(InputError, match="read"):
         api.export(run, file.with_suffix(".csv"), from_s=0.0)
 
 
-def test_a_file_and_what_was_read_of_it_give_the_same(file, tmp_path):
+def test_a_file_and_its_recording_in_memory_give_the_same(file, tmp_path):
     run = api.read(file)
     assert api.summarize(run) == api.summarize(file)
     assert api.replay(run).identical
@@ -50,23 +57,13 @@ def test_a_file_and_what_was_read_of_it_give_the_same(file, tmp_path):
     assert (tmp_path / "a.csv").read_bytes() == (tmp_path / "b.csv").read_bytes()
 
 
-@pytest.mark.slow
-def test_figures_are_axes_and_files(file, tmp_path):
-    settings = SHORT | {"waveform": SHORT["waveform"] | {"amplitude": 2.0}}
-    other = api.run(SINE, tmp_path / "b.mcap", settings=settings, fast=True).path
-    figures = api.figures([file, other], tmp_path / "figures", formats="svg")
-    assert figures
-    assert all(isinstance(each, Axes) for axes in figures.values() for each in axes)
-    assert {path.stem for path in (tmp_path / "figures").iterdir()} == set(figures)
-
-
-def test_what_is_found_is_a_list(file):
+def test_the_catalogue_is_a_list(file):
     (found,) = api.list_runs(file.parent, where='label.sample == "A7"')
     assert found["labels"] == {"sample": "A7"}
     assert api.list_runs(file.parent, where="waveform.amplitude > 3") == []
 
 
-def test_what_is_no_recording_is_refused(tmp_path):
+def test_other_files_are_refused(tmp_path):
     (tmp_path / "x.mcap").write_bytes(b"no")
     with pytest.raises(DataError):
         api.read(tmp_path / "x.mcap")
@@ -74,20 +71,7 @@ def test_what_is_no_recording_is_refused(tmp_path):
         api.summarize(tmp_path / "y.mcap")
 
 
-def test_figures_of_one_recording_are_those_of_its_page(file, tmp_path, monkeypatch):
-    pages, seen = [], {}
-    monkeypatch.setattr("hilctl.analysis.html.figures", lambda sheets: pages.extend(sheets) or "")
-    monkeypatch.setattr("hilctl.studies.multi_run.plots.drawn", lambda sheet, width: Figure())
-    page = tmp_path / "page.html"
-    assert api.report_page(file, page) == api.summarize(file)
-    figures = api.figures(file, tmp_path / "one", formats="svg", on_written=seen.__setitem__)
-    assert [sheet.name for sheet in pages] == list(figures) == [path.stem for path in seen]
-    assert [sheet.caption for sheet in pages] == list(seen.values())
-    with pytest.raises(InputError, match="exists already"):
-        api.report_page(file, page)
-
-
-def test_a_stretch_is_judged(file):
+def test_a_time_range_is_evaluated(file):
     whole, part = api.summarize(file), api.summarize(file, from_s=0.1, to_s=0.2)
     assert part.samples < whole.samples
 
@@ -98,3 +82,38 @@ def test_dead_runs_are_finished_before_anything_is_read(file, monkeypatch):
     for act in (api.read, api.summarize, api.replay):
         act(file)
     assert len(finished) == 3
+
+
+def test_a_table_is_a_mapping_of_columns():
+    assert (len(TABLE), TABLE.rows) == (3, 3)
+    assert repr(TABLE) == "<3 samples: t_s [s], displacement_um [um], flags>"
+    assert SampleTable({}, {}).rows == 0
+
+
+def test_arrow_tables_have_units():
+    arrow = TABLE.to_arrow()
+    assert arrow.schema.field("displacement_um").metadata == {b"unit": b"um"}
+    assert arrow.column("t_s").to_pylist()[:2] == [0.0, 0.5]
+
+
+@pytest.mark.parametrize("name", ["pandas", "polars"])
+def test_a_table_library_that_is_not_installed(name, monkeypatch):
+    monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(InputError, match=f"pip install {name}"):
+        getattr(TABLE, f"to_{name}")()
+    made = SimpleNamespace(DataFrame=lambda columns: SimpleNamespace(columns=columns, attrs={}))
+    monkeypatch.setitem(sys.modules, name, made)
+    assert list(getattr(TABLE, f"to_{name}")().columns) == list(TABLE)
+
+
+@pytest.mark.parametrize("name", ["pandas", "polars"])
+def test_an_installed_table_library(name):
+    pytest.importorskip(name)
+    frame = getattr(TABLE, f"to_{name}")()
+    assert list(frame.columns) == list(TABLE)
+    for column, values in TABLE.items():
+        found = frame[column].to_numpy()
+        np.testing.assert_array_equal(found, values)
+        assert found.dtype == values.dtype
+    if name == "pandas":
+        assert frame.attrs["units"] == TABLE.units

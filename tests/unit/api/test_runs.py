@@ -1,4 +1,4 @@
-"""What moves an actuator, from Python: what it takes, what it returns, what it refuses."""
+"""Write, load, check and run experiments from Python."""
 
 from pathlib import Path
 
@@ -19,7 +19,6 @@ SHORT = {
 
 
 def test_an_experiment_is_run_and_recorded(tmp_path):
-    """Settings go over the file by their keys, whatever their values are."""
     result = api.run(SINE, tmp_path / "a.mcap", settings=SHORT, fast=True)
     assert (result.code, result.path) == ("completed", tmp_path / "a.mcap")
     assert api.read(result.path).recording.sample_rate_hz == 5000.0
@@ -28,7 +27,7 @@ def test_an_experiment_is_run_and_recorded(tmp_path):
     api.run(str(SINE), str(tmp_path / "a.mcap"), settings=SHORT, fast=True, overwrite=True)
 
 
-def test_without_a_name_it_goes_to_the_folder_of_the_experiment(tmp_path):
+def test_the_default_output_is_in_the_folder_of_the_experiment(tmp_path):
     settings = SHORT | {"recording.folder": str(tmp_path / "runs")}
     result = api.run(SINE, settings=settings, fast=True)
     assert result.path.parent == tmp_path / "runs"
@@ -36,7 +35,6 @@ def test_without_a_name_it_goes_to_the_folder_of_the_experiment(tmp_path):
 
 
 def test_an_experiment_is_loaded_and_checked():
-    """Settings may be texts, as the command line has them."""
     assert api.load(SINE, ["waveform.amplitude=2.5"]).config.waveform.amplitude == 2.5
     assert api.check(SINE, SHORT).forecast.samples == 1000
     with pytest.raises(ConfigError) as refused:
@@ -45,36 +43,39 @@ def test_an_experiment_is_loaded_and_checked():
 
 
 def test_a_real_device_does_not_run_fast(tmp_path):
-    with pytest.raises(InputError, match="only a simulated device can run without real time"):
+    with pytest.raises(InputError, match="simulated"):
         api.run(CONFIGS / "serial_scpi_kepco.yaml", tmp_path / "a.mcap", fast=True)
     assert not [*tmp_path.iterdir()]
 
 
-def test_a_real_run_goes_the_way_of_the_command(monkeypatch, tmp_path):
-    """It keeps real time, in processes of its own."""
+def test_a_run_in_real_time_is_started(monkeypatch, tmp_path):
     monkeypatch.setattr("hilctl.api.runs.start_run", lambda *given: given)
     seen = print
     given = api.run(SINE, settings={"block": 5}, overwrite=True, on_progress=seen)
     assert given == (SINE, ["block=5"], None, True, seen)
 
 
-@pytest.mark.slow
-def test_learning_keeps_its_runs_and_writes_a_correction(tmp_path):
-    rows = []
-    settings = {
-        "sample_rate_hz": 10000, "block": 10, "waveform.duration_s": 0.4,
-        "waveform.frequency_hz": 50.0, "waveform.soft_start_s": 0.1, "waveform.soft_end_s": 0.1,
-    }  # fmt: skip
-    file = tmp_path / "c.yaml"
-    learned = api.learn(
-        CONFIGS / "terfenol_sine_6a.yaml", file, cycles=1, settings=settings, fast=True,
-        on_rows=rows.extend,
-    )  # fmt: skip
-    assert learned.rows[1].error_percent < learned.rows[0].error_percent
-    assert len(rows) >= 2
-    assert file.exists()
-    assert (tmp_path / "c-runs" / "run-00.mcap").exists()
+def test_init_writes_a_valid_experiment(tmp_path):
+    written = api.init("simulated_piezo", tmp_path / "first.yaml", settings={"safe.ramp_s": 2.0})
+    assert (written.path, written.to_be_set) == (tmp_path / "first.yaml", {})
+    assert written.schema.is_file()
+    checked = api.check(written.path)
+    assert checked.loaded.config.safe.ramp_s == 2.0
+    assert checked.loaded.device.info == written.device
+
+
+def test_init_lists_the_values_to_be_set(tmp_path):
+    given = {"device.host": "10.0.0.5", "device.amplifier": {"gain_a_per_v": 2.0, "offset_a": -5.0}}
+    written = api.init("labjack_t7", tmp_path / "rig.yaml", settings=given)
+    assert "device.sensor.um_per_v" in written.to_be_set
+    assert not {"device.host", "device.amplifier.gain_a_per_v"} & set(written.to_be_set)
+
+
+def test_init_refuses_invalid_settings_and_existing_files(tmp_path):
+    with pytest.raises(InputError, match="within"):
+        api.init("simulated_piezo", tmp_path / "a.yaml", settings=["limits.drive_v=[0, 5000]"])
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "a.yaml").write_text("mine")
     with pytest.raises(InputError, match="exists"):
-        api.learn(SINE, file, fast=True)
-    with pytest.raises(InputError, match="holds runs already"):
-        api.learn(SINE, tmp_path / "c.yml", folder=tmp_path / "c-runs", fast=True)
+        api.init("simulated_piezo", tmp_path / "a.yaml")
+    assert (tmp_path / "a.yaml").read_text() == "mine"

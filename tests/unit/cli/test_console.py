@@ -1,15 +1,16 @@
-"""Terminal output: escaped text and progress bars."""
+"""Terminal output: escaped text, progress bars, names of compiled kernels."""
 
 import io
 import threading
 
+import numba
 import pytest
 from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from hilctl.cli.console import print_rich, progress_bar
-from hilctl.cli.safe_streams import safe_streams
+from hilctl.cli.console import compile_progress, print_rich, progress_bar
+from hilctl.cli.output import Verbosity, safe_streams
 
 
 class Terminal(io.StringIO):
@@ -69,3 +70,54 @@ def test_styles_are_kept_and_control_characters_escaped(printed):
     assert "\x1b[32m" in text
     assert text.count(r"a\x1b") == 4  # a cell is cut where it was measured before
     assert "\x1b[2J" not in text
+
+
+def compile_something():
+    """Compile a function that is not cached."""
+
+    @numba.njit("int64(int64)")
+    def inner(value):
+        return value + 1
+
+    return inner
+
+
+@pytest.fixture
+def at_terminal(monkeypatch):
+    """Return a function that replaces standard error by a terminal (pytest replaces it too)."""
+
+    def put():
+        made = Terminal()
+        monkeypatch.setattr("sys.stderr", made)
+        return made
+
+    return put
+
+
+def test_each_kernel_is_named(at_terminal):
+    terminal = at_terminal()
+    with compile_progress():
+        pass
+    assert terminal.getvalue() == ""  # nothing was compiled
+    with compile_progress():
+        compile_something()
+        compile_something()
+    lines = terminal.getvalue().splitlines()
+    assert "once" in lines[0]
+    assert lines[1:] == ["  inner", "  inner"]
+    compile_something()
+    assert len(terminal.getvalue().splitlines()) == 3
+
+
+def test_compilation_is_not_shown_without_a_terminal(capsys):
+    with compile_progress():
+        compile_something()
+    assert capsys.readouterr().err == ""
+
+
+def test_quiet_hides_compilation(at_terminal, monkeypatch):
+    terminal = at_terminal()
+    monkeypatch.setattr(Verbosity, "quiet", True)
+    with compile_progress():
+        compile_something()
+    assert terminal.getvalue() == ""

@@ -53,7 +53,7 @@ def runs(tmp_path, monkeypatch):
     def write(contents, summary, page, before):
         page.write_text(f"{summary.name}{' beside the one before' if before else ''}")
 
-    monkeypatch.setattr("hilctl.analysis.run_page.write_html", write)
+    monkeypatch.setattr("hilctl.api.reports.write_html", write)
     return seen, ends
 
 
@@ -103,13 +103,13 @@ def test_init_prints_one_json_object(here, capsys):
 
 def test_init_refuses_existing_files(here):
     (here / "simulated_piezo.yaml").write_text("mine")
-    with pytest.raises(InputError, match="exists already"):
+    with pytest.raises(InputError, match="exists"):
         init("simulated_piezo")
     assert (here / "simulated_piezo.yaml").read_text() == "mine"
 
 
 def test_init_refuses_invalid_settings(here):
-    with pytest.raises(InputError, match="must lie within"):
+    with pytest.raises(InputError, match="within"):
         init("simulated_terfenol", settings=["limits.peak_current_a=50"])
     assert not list(here.iterdir())
 

@@ -1,13 +1,369 @@
-"""``hilctl live``, without its server."""
+"""Live views of runs: ``hilctl watch`` without a run, ``hilctl live`` without its server."""
 
 import json
+import os
+import pty
+import select
+import sys
+import termios
+from contextlib import nullcontext
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
+from rich.text import Text
 from typer.testing import CliRunner
 
+from hilctl.base.errors import InputError, RunError
+from hilctl.base.events import Event
+from hilctl.cli import live as module
 from hilctl.cli.commands import app
+from hilctl.cli.console import print_rich
+from hilctl.cli.live import View, print_lines
+from hilctl.live.scope import WINDOWS_S, Buckets, ScopeWindow
+from hilctl.live.traces import SIGNALS
 from hilctl.run.run_folder import run_folder
+
+
+class FakeFeed:
+    """A run that ends after some polls."""
+
+    def __init__(self, polls=10**9, inverse="in"):
+        self.folder, self.inverse, self.loop_input, self.state = (
+            "folder",
+            inverse,
+            "reference",
+            "running",
+        )
+        self.ended, self._polls = False, polls
+        self.description = SimpleNamespace(command_unit="A", sample_rate_hz=1000.0)
+        self.events = [Event(1000 * k, "info", "mark", f"tap {k}") for k in range(5)]
+        t_s = np.linspace(0.0, 0.02, 300)
+        values = np.tile(40.0 * np.sin(628.0 * t_s), (len(SIGNALS), 1))
+        window = ScopeWindow(t_s, Buckets(values, values, values))
+        self.scope = SimpleNamespace(
+            triggered=lambda: window, rolling=lambda s: window, loops=lambda: values[:2]
+        )
+        self.values = {
+            "run": "demo-7",
+            "state": "running",
+            "reason": "",
+            "t_s": 12.34,
+            "total_s": 30.0,
+            "inverse": inverse,
+            "gain": 0.7,
+            "offset": -2.0,
+            "figures": {"peak_hysteresis_percent": 29.6, "rms_error_percent": None},
+            "lateness_us": {"p50": 3.0, "p99": 21.0, "max": 40.0},
+            "late_ticks": 9,
+            "gauges": [{"name": "command", "used": 0.84}],
+        }
+
+    def status(self):
+        return self.values
+
+    def poll(self, now_s):
+        self._polls -= 1
+        self.ended = self._polls <= 0
+
+    def events_since(self, seen):
+        return self.events[seen:], len(self.events)
+
+
+@pytest.fixture
+def sent(monkeypatch):
+    """Requests to the run, each made in the thread of the test."""
+    asked = []
+
+    def set_run(folder, **wanted):
+        asked.append(wanted)
+        if wanted.get("gain", 0.0) > 1.0:
+            raise InputError("set: too much")
+        return wanted
+
+    monkeypatch.setattr(module, "set_run", set_run)
+    monkeypatch.setattr(module, "mark_run", lambda folder, text: asked.append(text) or {"x": 1})
+    monkeypatch.setattr(module, "request_stop", lambda folder: asked.append("stop") or True)
+
+    def thread(target, daemon):
+        return SimpleNamespace(start=target)
+
+    monkeypatch.setattr(module, "threading", SimpleNamespace(Thread=thread))
+    return asked
+
+
+def shown(view, capsys, width=80, height=24):
+    print_rich(view.screen(width, height))
+    return capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("key", "inverse", "wanted"),
+    [
+        (b"i", "in", {"inverse": "out", "over_s": 0.5}),
+        (b"i", "out", {"inverse": "in", "over_s": 0.5}),
+        (b"+", "in", {"gain": 0.8, "over_s": 0.5}),
+        (b"-", "in", {"gain": 0.6, "over_s": 0.5}),
+        (b"s", "in", "stop"),
+    ],
+)
+def test_key_sends_one_request(sent, key, inverse, wanted):
+    view = View(FakeFeed(inverse=inverse))
+    view.press(key)
+    assert sent == [wanted]
+    assert view.message.endswith(": done")
+
+
+def test_refused_request_is_shown(sent, monkeypatch, capsys):
+    feed = FakeFeed()
+    feed.values["gain"] = 1.0
+    view = View(feed)
+    view.press(b"+")
+    assert "set: too much" in shown(view, capsys)
+
+    def refuse(folder):
+        raise RunError("no right")
+
+    monkeypatch.setattr(module, "request_stop", refuse)
+    view.press(b"s")
+    assert "no right" in view.message
+
+
+def test_slow_change_does_not_delay_a_stop(monkeypatch):
+    started = []
+    view = View(FakeFeed())
+    thread = SimpleNamespace(
+        Thread=lambda target, daemon: SimpleNamespace(start=lambda: started.append(target))
+    )
+    monkeypatch.setattr(module, "threading", thread)
+    monkeypatch.setattr(module, "request_stop", lambda folder: False)
+    view.press(b"is")
+    assert len(started) == 2
+    started[1]()
+    assert "ended" in view.message
+
+
+def test_letters_of_a_mark_are_not_keys(sent, capsys):
+    view = View(FakeFeed())
+    view.press(b"mtaqs\x7f\x07")
+    assert "mark: taq_" in shown(view, capsys)
+    view.press(b"\r")
+    view.press(b"mqsi")
+    view.press(b"\x1b")
+    view.press(b"m  \r")
+    view.press("mµ\n".encode())
+    assert sent == ["taq", "µ"]
+    assert not view.left
+
+
+def test_arrows_and_unknown_keys_do_nothing(sent):
+    view = View(FakeFeed())
+    for raw in (b"\x1b[A", b"z", b"\xff"):
+        view.press(raw)
+    assert (sent, view.left, view.message) == ([], False, "")
+    view.press(b"\x1b[A\x1bOB\x1b[3~sq")
+    assert (sent, view.left) == (["stop"], True)
+
+
+def test_windows_can_be_selected(capsys):
+    view = View(FakeFeed())
+    assert "newest cycles" in shown(view, capsys)
+    view.press(b"]" * 20)
+    assert f"last {WINDOWS_S[-1]:g} s" in shown(view, capsys)
+    view.press(b"[" * 20)
+    assert f"last {WINDOWS_S[0]:g} s" in shown(view, capsys)
+    view.press(b"t")
+    assert "newest cycles" in shown(view, capsys)
+    view.feed.scope.triggered = lambda: None
+    assert f"last {WINDOWS_S[0]:g} s" in shown(view, capsys)
+
+
+@pytest.mark.parametrize("size", [(80, 24), (160, 50), (40, 14), (39, 24), (80, 5)])
+def test_screen_fits_the_terminal(size):
+    view = View(FakeFeed())
+    view.message = "x" * 200
+    parts = view.screen(*size).renderables
+    width, height = size
+    plots = [each for each in parts if any(0x2800 < ord(c) < 0x2900 for c in each.plain)]
+    assert bool(plots) == (width >= 40 and height >= 14)
+    if plots:
+        lines = plots[0].plain.split("\n")
+        assert max(map(len, lines)) <= width
+        assert len(lines) + len(parts) - 1 <= height
+
+
+def test_the_screen_has_state_limits_figures_and_the_newest_events(capsys):
+    text = shown(View(FakeFeed()), capsys)
+    for value in ("demo-7", "running", "12.3/30.0 s", "gain 0.7", "offset -2", "29.60 %", "84 %"):
+        assert value in text
+    for value in ("late ticks 9", "21 us", "3.000 s  mark: tap 3", "tap 4"):
+        assert value in text
+    assert "tap 1" not in text
+
+
+def test_empty_signal_has_no_curve(capsys):
+    feed = FakeFeed()
+    nothing = np.full((len(SIGNALS), 3), np.nan)
+    empty = ScopeWindow(np.arange(3.0), Buckets(nothing, nothing, nothing))
+    feed.scope.triggered, feed.scope.loops = lambda: empty, lambda: np.empty((2, 0))
+    assert not any(0x2800 < ord(each) < 0x2900 for each in shown(View(feed), capsys))
+
+
+def test_a_missing_reference_does_not_change_the_scale(capsys):
+    feed = FakeFeed()
+    values = np.full((len(SIGNALS), 3), np.nan)
+    values[1] = 100.0, 110.0, 120.0
+    window = ScopeWindow(np.arange(3.0), Buckets(values, values, values))
+    feed.scope.triggered, feed.scope.loops = lambda: window, lambda: np.empty((2, 0))
+    text = shown(View(feed), capsys)
+    assert "120┤" in text
+    assert "100┤" in text
+    assert "newest cycles, axis in s" in text
+
+
+def test_control_characters_are_escaped(monkeypatch, capsys):
+    monkeypatch.setattr(module.time, "sleep", lambda s: None)
+    feed = FakeFeed(polls=3)
+    feed.events = [Event(1500, "info", "mark", "tapped \x1b[2J")]
+    feed.values["run"] = "demo\x07"
+    view = View(feed)
+    view.message = "refused: \x1b]0;x\x07"
+    text = shown(view, capsys)
+    print_lines(feed)
+    text += capsys.readouterr().out
+    assert not {"\x1b", "\x07"} & set(text)
+    assert text.count("1.500 s  mark: tapped \\x1b[2J") == 2
+
+
+def test_lines_show_each_event_once_and_the_state(monkeypatch, capsys):
+    monkeypatch.setattr(module.time, "sleep", lambda s: None)
+    print_lines(FakeFeed(polls=15))
+    lines = capsys.readouterr().out.splitlines()
+    assert [line for line in lines if "mark" in line] == [
+        f"{k}.000 s  mark: tap {k}" for k in range(5)
+    ]
+    assert sum(line.startswith("12.3 s  running  hyst. 29.60 %") for line in lines) == 2
+
+
+@pytest.fixture
+def terminal(monkeypatch):
+    """Make a pseudo terminal standard input and output; return the side of its user.
+
+    To be called by the test: pytest replaces the standard streams before each.
+    """
+    user, ours = pty.openpty()
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setattr(os, "tcgetpgrp", lambda _: os.getpgrp())
+
+    def take():
+        monkeypatch.setattr(sys, "stdin", stdin)
+        monkeypatch.setattr(sys, "stdout", stdout)
+        return user
+
+    with (
+        os.fdopen(ours, encoding="utf-8", closefd=False) as stdin,
+        os.fdopen(ours, "w", encoding="utf-8", closefd=False) as stdout,
+    ):
+        yield take
+    os.close(ours)
+    os.close(user)
+
+
+@pytest.mark.parametrize("way_out", ["q", "end", KeyboardInterrupt, SystemExit, ValueError])
+def test_terminal_is_restored_on_every_exit(terminal, monkeypatch, way_out):
+    user = terminal()
+    assert module._has_keys()
+    before = termios.tcgetattr(sys.stdin.fileno())
+    view = View(FakeFeed(polls=2 if way_out == "end" else 10**9))
+
+    def screen(width, height):
+        assert not termios.tcgetattr(sys.stdin.fileno())[3] & termios.ICANON
+        if way_out == "q":
+            os.write(user, b"q")
+        elif way_out != "end":
+            raise way_out
+        return Text("shown")
+
+    monkeypatch.setattr(view, "screen", screen)
+    raised = () if isinstance(way_out, str) else way_out
+    with pytest.raises(raised) if raised else nullcontext():
+        view.show()
+    sys.stdout.flush()
+    text = ""
+    while not text.endswith("\x1b[?1049l"):  # the kernel passes it on in parts
+        assert select.select([user], [], [], 5.0)[0]
+        text += os.read(user, 1000).decode()
+    assert text.startswith("\x1b[?1049h")
+    assert text.rindex("\x1b[?25l") < text.rindex("\x1b[?25h")
+    assert termios.tcgetattr(sys.stdin.fileno()) == before
+
+
+def test_lines_are_printed_in_the_background_and_without_a_terminal(terminal, monkeypatch):
+    terminal()
+    monkeypatch.setattr(os, "tcgetpgrp", lambda _: os.getpgrp() + 1)
+    assert not module._has_keys()
+    monkeypatch.setattr(os, "tcgetpgrp", lambda _: os.getpgrp())
+    monkeypatch.setenv("TERM", "dumb")
+    assert not module._has_keys()
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setattr(sys, "stdin", SimpleNamespace(isatty=lambda: False))
+    assert not module._has_keys()
+
+
+@pytest.fixture
+def run(monkeypatch):
+    """A run that is over, shown without a terminal."""
+    made = SimpleNamespace(card=SimpleNamespace(name="demo-7", supervisor=7))
+    made.description = SimpleNamespace(exists=lambda: True)
+    made.feed = FakeFeed()
+    made.feed.ended, made.feed.state = True, "stopped"
+    made.feed.values["reason"] = "by hand"
+    monkeypatch.setattr(module, "find_run", lambda name: made)
+    monkeypatch.setattr(module, "RunReader", lambda folder: made.feed)
+    monkeypatch.setattr(module, "print_lines", lambda feed: None)
+    monkeypatch.setattr(module.signal, "signal", lambda *given: None)
+    monkeypatch.setattr(module, "_has_keys", lambda: False)
+    return made
+
+
+def test_final_state_is_printed(run, monkeypatch, capsys):
+    module.watch("demo")
+    assert capsys.readouterr().out == "demo-7: stopped: by hand\n"
+    run.feed.ended = False
+
+    def interrupted(feed):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(module, "print_lines", interrupted)
+    module.watch(None)
+    assert "hilctl stop" in capsys.readouterr().out
+
+
+def test_subprocess_shows_the_run_of_its_parent(run, monkeypatch, capsys):
+    """It waits until that run exists; without a parent it ends."""
+    other = SimpleNamespace(card=SimpleNamespace(name="x", supervisor=8))
+    found = iter([[], [other], [other, run]])
+    monkeypatch.setattr(module, "runs", lambda: next(found))
+    monkeypatch.setattr(module.os, "getppid", lambda: 7)
+    monkeypatch.setattr(module.time, "sleep", lambda s: None)
+    monkeypatch.setattr(sys, "argv", ["watch", "7"])
+    module.main()
+    monkeypatch.setattr(module.os, "getppid", lambda: 1)
+    module.main()
+    assert capsys.readouterr().out == "demo-7: stopped: by hand\n"
+
+
+def test_run_that_ended_before_it_was_read_is_one_message(run, monkeypatch, capsys):
+    def refuse(folder):
+        raise RunError("demo-7: gone")
+
+    monkeypatch.setattr(module, "RunReader", refuse)
+    monkeypatch.setattr(module, "runs", lambda: [run])
+    monkeypatch.setattr(module.os, "getppid", lambda: 7)
+    monkeypatch.setattr(module.time, "sleep", lambda s: None)
+    monkeypatch.setattr(sys, "argv", ["watch", "7"])
+    module.main()
+    assert capsys.readouterr().err == "hilctl: demo-7: gone\n"
 
 
 @pytest.fixture
@@ -55,10 +411,10 @@ def test_run_is_found_by_the_beginning_of_its_name(served, tmp_path):
 
 def test_unknown_run_is_refused(served, tmp_path):
     said = CliRunner().invoke(app, ["live", "x"])
-    assert "no run is active" in str(said.exception)
+    assert isinstance(said.exception, InputError)
     with run_folder("demo", tmp_path / "a.mcap", 1.0):
         said = CliRunner().invoke(app, ["live", "x"])
-    assert "(active: demo-" in str(said.exception)
+    assert "'x'" in str(said.exception)
     assert not served
 
 

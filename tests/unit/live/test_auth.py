@@ -1,4 +1,4 @@
-"""Who is let in."""
+"""Authentication of requests."""
 
 import pytest
 from websockets.datastructures import Headers
@@ -21,7 +21,7 @@ def refusal(upgrade=True, **given):
 
 
 @pytest.mark.parametrize("name", ["127.0.0.1", "[::1]", "localhost"])
-def test_a_page_of_this_server_with_the_token_is_let_in(name):
+def test_page_with_token_is_accepted(name):
     host = f"{name}:{PORT}"
     assert not refusal(Host=host, Origin=f"http://{host}", Sec_WebSocket_Protocol=OFFER)
     assert not refusal(upgrade=False, Host=host)
@@ -32,7 +32,7 @@ def test_a_page_of_this_server_with_the_token_is_let_in(name):
 )
 @pytest.mark.parametrize("upgrade", [True, False])
 def test_a_foreign_host_is_refused(host, upgrade):
-    """A name that somebody else's server has made point here, above all."""
+    """DNS rebinding in particular."""
     assert refusal(upgrade, Host=host, Origin=ORIGIN, Sec_WebSocket_Protocol=OFFER) == 421
 
 
@@ -51,7 +51,7 @@ def test_a_foreign_origin_is_refused(origin):
     assert refusal(Host=HOST, Origin=origin, Sec_WebSocket_Protocol=OFFER) == 403
 
 
-def test_a_foreign_page_gets_no_file_either():
+def test_foreign_page_gets_no_file():
     assert refusal(upgrade=False, Host=HOST, Origin="http://evil.example") == 403
 
 
@@ -68,11 +68,11 @@ def test_a_foreign_page_gets_no_file_either():
         "a b, ;",
     ],
 )
-def test_without_the_token_nobody_is(offered):
+def test_missing_or_wrong_token_is_refused(offered):
     assert refusal(Host=HOST, Origin=ORIGIN, Sec_WebSocket_Protocol=offered) == 401
 
 
-def test_the_oldest_that_waits_gives_way():
+def test_oldest_pending_connection_is_aborted():
     pending, cut = PendingConnections(2), []
     for name in "abc":
         pending.add(name, lambda name=name: cut.append(name))

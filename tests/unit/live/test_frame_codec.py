@@ -1,4 +1,4 @@
-"""A frame, taken apart as the page does."""
+"""Encoding of frames."""
 
 import json
 import struct
@@ -11,7 +11,7 @@ from hilctl.base.events import Event
 from hilctl.base.segments import Segment
 from hilctl.live.frame_codec import frame_of, frames_of, nearest_window_s
 from hilctl.live.scope import Buckets, Scope, ScopeWindow
-from hilctl.live.signals import ROW, SIGNALS, Traces
+from hilctl.live.traces import ROW, SIGNALS, Traces
 from tests.fakes import SteppingClock
 
 
@@ -24,7 +24,7 @@ def scope():
     return made
 
 
-def taken_apart(frame):
+def decoded(frame):
     (size,) = struct.unpack_from("<I", frame)
     header = json.loads(frame[4 : 4 + size])
     values = np.frombuffer(frame, "<f4", offset=4 + size)
@@ -36,7 +36,7 @@ def taken_apart(frame):
 
 def test_a_frame_holds_the_window_and_the_loops(scope):
     frame = frame_of(scope, "cycle", 2.0)
-    header, t_s, low, high, loops = taken_apart(frame)
+    header, t_s, low, high, loops = decoded(frame)
     assert header == {"mode": "cycle", "n": 100, "signals": 6, "loop": 300, "cycle": 50}
     assert t_s == pytest.approx(np.arange(100) / 1000.0)
     assert low[ROW["error"]].tolist() == high[ROW["error"]].tolist() == list(range(500, 600))
@@ -45,23 +45,23 @@ def test_a_frame_holds_the_window_and_the_loops(scope):
     assert len(frame) % 4 == 0
 
 
-def test_what_has_no_cycle_rolls(scope):
-    header, t_s, *_ = taken_apart(frame_of(scope, "roll", 0.1))
+def test_frame_without_a_cycle_rolls(scope):
+    header, t_s, *_ = decoded(frame_of(scope, "roll", 0.1))
     assert (header["mode"], t_s[-1], t_s.size) == ("roll", 0.0, 100)
     empty = Scope(1000.0, [], "reference")
-    assert taken_apart(frame_of(empty, "cycle", 0.1))[0]["mode"] == "roll"
+    assert decoded(frame_of(empty, "cycle", 0.1))[0]["mode"] == "roll"
 
 
 @pytest.mark.parametrize(
     ("wanted_s", "given_s"), [(2.0, 2.0), (1e9, 600.0), (1e-9, 0.02), (3, 2.0)]
 )
-def test_a_window_is_one_of_those_there_are(wanted_s, given_s):
+def test_nearest_window(wanted_s, given_s):
     assert nearest_window_s(wanted_s) == given_s
 
 
 @pytest.fixture
 def feed():
-    """A run that is over at its fourth look, with one event at each."""
+    """A run that ends at its fourth poll, with one event per poll."""
     values = np.arange(3.0 * len(SIGNALS)).reshape(len(SIGNALS), 3)
     looked = []
     made = SimpleNamespace(ended=False, looked=looked, windows=[])
@@ -83,7 +83,7 @@ def feed():
     return made
 
 
-def test_frames_come_at_their_pace_until_the_run_is_over(feed):
+def test_frames_keep_their_interval_until_the_run_ends(feed):
     clock, slept = SteppingClock(), []
 
     def sleep(seconds):

@@ -1,4 +1,4 @@
-"""What is left to each limit."""
+"""Use of each limit."""
 
 import math
 from pathlib import Path
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hilctl.live.limit_usage import Gauge, Headroom
-from hilctl.live.signals import ROW, SIGNALS, Traces
+from hilctl.live.traces import ROW, SIGNALS, Traces
 from hilctl.run.metadata import RunDescription
 from hilctl.run.start import checked_experiment
 
@@ -36,7 +36,7 @@ def used(headroom, late_s=0.0):
     return {gauge.name: gauge.used for gauge in headroom.gauges(late_s)}
 
 
-def test_each_limit_has_its_part_used(description):
+def test_use_of_each_limit(description):
     headroom = Headroom(description)
     headroom.add(traces(0, command=[0.0, 0.1], displacement=[0.0, 26.25], error=[1.0, -4.0]))
     headroom.add(traces(2, command=[0.3], displacement=[0.0], error=[0.0]))
@@ -49,7 +49,7 @@ def test_each_limit_has_its_part_used(description):
     assert "measured - command" not in found
 
 
-def test_the_most_is_held_for_a_second_and_then_forgotten(description):
+def test_peak_is_held_for_a_second(description):
     headroom = Headroom(description)
     headroom.add(traces(0, command=[7.07]))
     headroom.add(traces(30_000, command=[1.0]))
@@ -58,7 +58,7 @@ def test_the_most_is_held_for_a_second_and_then_forgotten(description):
     assert used(headroom)["command"] == pytest.approx(1.0 / 7.07)
 
 
-def test_the_coil_warms_as_the_interlock_has_it(description):
+def test_coil_heat_agrees_with_the_interlock(description):
     headroom = Headroom(description)
     for start in range(0, 500_000, 50_000):  # one time constant
         headroom.add(traces(start, command=np.full(50_000, 5.0)))
@@ -66,5 +66,5 @@ def test_the_coil_warms_as_the_interlock_has_it(description):
 
 
 @pytest.mark.parametrize(("part", "level"), [(0.5, "info"), (0.81, "warning"), (0.96, "error")])
-def test_a_gauge_says_how_much_it_should_worry(part, level):
+def test_level_of_a_gauge(part, level):
     assert Gauge("slew", part, part, 1.0, "A/s").level == level

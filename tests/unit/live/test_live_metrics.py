@@ -1,12 +1,12 @@
-"""Running figures, by those of a report."""
+"""Running metrics of a run."""
 
 import numpy as np
 import pytest
 
-from hilctl.base.samples import Flag
+from hilctl.base.samples import BlockBatch, BlockHeader, Flag
 from hilctl.base.segments import Segment
-from hilctl.live.live_metrics import RunningFigures
-from hilctl.live.signals import ROW, SIGNALS, Traces
+from hilctl.live.live_metrics import EDGES_US, LatenessCounts, LiveErrorSpectrum, RunningFigures
+from hilctl.live.traces import ROW, SIGNALS, Traces
 from hilctl.signals.cycle_metrics import peak_hysteresis_percent
 
 RATE, PERIOD = 1000.0, 100.0
@@ -41,14 +41,14 @@ def test_figures_are_those_of_whole_cycles():
     assert figures["noise_floor_percent"] < 1e-3
 
 
-def test_the_newest_cycles_count_and_a_start_within_one_is_passed_over():
+def test_metrics_are_of_the_newest_complete_cycles():
     figures = added(RunningFigures(RATE, "reference"), loop(75, 2000, lag=0.4))
     assert figures.newest["peak_error_um"] == pytest.approx(20 * np.sin(0.2), rel=1e-3)
     added(figures, loop(2000, 4000, lag=0.1))
     assert figures.newest["peak_error_um"] == pytest.approx(20 * np.sin(0.05), rel=1e-3)
 
 
-def test_samples_that_are_not_trusted_are_left_out():
+def test_invalid_samples_are_omitted():
     traces = loop(30, 1200)
     traces.values[ROW["displacement"], 300] = 1e6
     traces.values[ROW["error"], 300] = 1e6
@@ -56,14 +56,52 @@ def test_samples_that_are_not_trusted_are_left_out():
     assert added(RunningFigures(RATE, "reference"), traces).newest["peak_error_um"] < 3.0
 
 
-def test_without_a_period_there_are_those_that_need_none():
+def test_metrics_without_a_period():
     plain = Segment("steps", 0, 100_000, 0, 100_000)
     figures = added(RunningFigures(RATE, "reference"), loop(0, 1200), plain).newest
     assert figures["peak_error_um"] == pytest.approx(20 * np.sin(0.1), rel=1e-3)
     assert "peak_hysteresis_percent" not in figures
 
 
-def test_before_the_first_whole_cycle_there_are_none():
+def test_no_metrics_before_the_first_complete_cycle():
     figures = RunningFigures(RATE, "reference")
     assert added(figures, loop(30, 90)).newest == {}
     assert added(figures, loop(90, 200), None).newest == {}
+
+
+def test_each_tick_is_counted_once():
+    counts = LatenessCounts()
+    assert counts.percentiles_us() == {}
+    batch = BlockBatch.empty(5, 1, 1)
+    batch.heads[:, BlockHeader.LATE_NS] = (-5, 0, 30_000, 30_000, 9_000_000_000)
+    counts.add(batch)
+    assert counts.counts.sum() == 5
+    assert counts.counts[-1] == 1
+    assert counts.counts[np.searchsorted(EDGES_US, 30.0) - 1] == 2
+    assert counts.percentiles_us()["p50"] == 30.0
+    assert counts.percentiles_us()["max"] == 9e6
+
+
+def error(error_um, start=0):
+    values = np.zeros((len(SIGNALS), error_um.size))
+    values[ROW["error"]] = error_um
+    index = np.arange(start, start + error_um.size)
+    return Traces(index, values, np.zeros(error_um.size, dtype=np.uint32))
+
+
+def test_line_of_a_sine_in_the_spectrum():
+    spectrum = LiveErrorSpectrum(50000.0)
+    t_s = np.arange(16384) / 50000.0
+    spectrum.add(error(5.0 + 0.3 * np.sin(2 * np.pi * 1000.0 * t_s)))
+    hz, um = spectrum.points()
+    assert um.max() == pytest.approx(0.3, rel=0.1)
+    assert hz[um.argmax()] == pytest.approx(1000.0, rel=0.05)
+
+
+def test_gap_clears_the_spectrum():
+    spectrum = LiveErrorSpectrum(1000.0)
+    assert spectrum.points()[0].size == 0
+    spectrum.add(error(np.zeros(300)))
+    assert spectrum.points()[0].size > 0
+    spectrum.add(error(np.array([np.nan, 1.0])))
+    assert spectrum.points()[0].size == 0

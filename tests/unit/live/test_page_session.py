@@ -1,4 +1,4 @@
-"""One page: what it asks for, and how much it gets."""
+"""Session of one page."""
 
 import asyncio
 import json
@@ -16,7 +16,7 @@ class Transport:
 
 
 class Connection:
-    """A connection whose other end says some messages, and takes none while it is held."""
+    """A connection that receives the given messages and blocks while ``free`` is unset."""
 
     def __init__(self, *messages):
         self.messages, self.sent, self.closed = list(messages), [], None
@@ -46,24 +46,24 @@ def message(**fields):
     return json.dumps({"id": 1, "ask": "view"} | fields)
 
 
-def test_messages_are_answered_and_a_view_is_taken():
-    async def told():
+def test_messages_are_answered_and_change_the_view():
+    async def exchanged():
         view = {"run": "a", "mode": "roll", "window_s": 10.0}
         connection = Connection(message(view=view), message(id=2, ask="stop"))
         viewer = PageSession(connection, answer)
-        await viewer.attend()
+        await viewer.serve()
         return viewer.view, connection.sent
 
-    assert asyncio.run(told()) == (
+    assert asyncio.run(exchanged()) == (
         PageView(run="a", mode="roll", window_s=10.0),
         ["1 view", "2 stop"],
     )
 
 
-def test_what_is_no_message_of_the_page_ends_the_connection():
+def test_invalid_message_ends_the_connection():
     async def closed(raw):
         connection = Connection(raw, message(id=2))
-        await PageSession(connection, answer).attend()
+        await PageSession(connection, answer).serve()
         return connection.closed[0], connection.sent
 
     for raw in ("", "{}", b"\xff\x00", message(ask="format"), message(more=1), message(id="1")):
@@ -74,17 +74,15 @@ BAD_TIMES = ("0", "-0.0", "-1", "1e-320", "1e308", "NaN", "Infinity", "1e999", "
 
 
 @pytest.mark.parametrize("value", [*BAD_TIMES, "null", "1" + "0" * 400])
-def test_a_window_that_is_no_time_is_refused_and_changes_nothing(value):
-    """The page gets an answer, and goes on."""
-
-    async def told():
+def test_invalid_window_is_refused_without_effect(value):
+    async def exchanged():
         raw = f'{{"id": 5, "ask": "view", "view": {{"window_s": {value}}}}}'
         connection = Connection(raw, message(id=6, ask="stop"))
         viewer = PageSession(connection, answer)
-        await viewer.attend()
+        await viewer.serve()
         return viewer.view, connection
 
-    view, connection = asyncio.run(told())
+    view, connection = asyncio.run(exchanged())
     assert view == PageView()
     assert connection.closed is None
     refused = json.loads(connection.sent[0])
@@ -96,7 +94,7 @@ def test_a_window_that_is_no_time_is_refused_and_changes_nothing(value):
 def test_too_many_messages_end_the_connection():
     async def flooded():
         connection = Connection(*[message()] * 500)
-        await PageSession(connection, answer, clock=lambda: 0.0).attend()
+        await PageSession(connection, answer, clock=lambda: 0.0).serve()
         return connection
 
     connection = asyncio.run(flooded())
@@ -104,7 +102,7 @@ def test_too_many_messages_end_the_connection():
     assert len(connection.sent) == 40
 
 
-def test_an_allowance_comes_back_with_time():
+def test_rate_limiter_refills():
     now = [0.0]
     allowance = RateLimiter(2.0, 3.0, lambda: now[0])
     assert [allowance.take() for _ in range(4)] == [True, True, True, False]
@@ -112,7 +110,7 @@ def test_an_allowance_comes_back_with_time():
     assert [allowance.take() for _ in range(3)] == [True, True, False]
 
 
-def test_a_slow_page_gets_the_newest_and_is_cut_in_the_end():
+def test_slow_page_gets_the_newest_frame_and_is_disconnected():
     async def slow():
         now = [0.0]
         connection = Connection()

@@ -1,4 +1,4 @@
-"""A run seen from outside, through its folder."""
+"""Readers of active runs."""
 
 import json
 from pathlib import Path
@@ -8,9 +8,9 @@ import pytest
 
 from hilctl.base.errors import RunError
 from hilctl.base.events import Event
-from hilctl.base.samples import BlockBatch, BlockHeader
-from hilctl.live.run_reader import EDGES_US, LatenessCounts, LiveErrorSpectrum, RunReader
-from hilctl.live.signals import ROW, SIGNALS, Traces
+from hilctl.base.samples import BlockHeader
+from hilctl.live.run_reader import RunList, RunReader
+from hilctl.live.traces import ROW
 from hilctl.loop.safe_output import LoopOutcome
 from hilctl.run.metadata import RunDescription
 from hilctl.run.run_folder import run_folder
@@ -29,7 +29,7 @@ def description():
 
 @pytest.fixture
 def run(description, tmp_path):
-    """A run's folder, and its ring as the loop has it."""
+    """Folder and ring of an active run."""
     with run_folder("demo", tmp_path / "a.mcap", 12.0) as (folder, _):
         description.write(folder.description)
         ring = SampleRing.create(folder.ring, slots=128, block=BLOCK, state_size=1)
@@ -54,7 +54,7 @@ def exchange(ring, blocks, spike=None):
         ring.answered(block)
 
 
-def test_what_the_loop_leaves_is_seen_and_nothing_is_taken(run):
+def test_samples_are_read_without_consuming_them(run):
     folder, ring = run
     feed = RunReader(folder)
     exchange(ring, range(80), spike=71)
@@ -67,7 +67,7 @@ def test_what_the_loop_leaves_is_seen_and_nothing_is_taken(run):
     assert feed.scope.segment.start == 100
 
 
-def test_what_is_gone_before_it_is_looked_at_is_counted(run):
+def test_overwritten_samples_are_counted(run):
     folder, ring = run
     feed = RunReader(folder)
     exchange(ring, range(2))
@@ -79,7 +79,7 @@ def test_what_is_gone_before_it_is_looked_at_is_counted(run):
     assert feed.missed == 48 * BLOCK
 
 
-def test_events_come_once_and_in_order(run):
+def test_events_are_read_once_in_order(run):
     folder, ring = run
     feed = RunReader(folder)
     for number in range(40):
@@ -93,7 +93,7 @@ def test_events_come_once_and_in_order(run):
     ]
 
 
-def test_status_is_json_and_says_where_the_run_stands(run):
+def test_status_is_json(run):
     folder, ring = run
     feed = RunReader(folder)
     exchange(ring, range(100))
@@ -109,7 +109,7 @@ def test_status_is_json_and_says_where_the_run_stands(run):
     assert feed.state == "stopped"
 
 
-def test_the_end_of_a_run_is_noticed_and_what_was_seen_stays(description, tmp_path):
+def test_end_of_a_run_keeps_its_data(description, tmp_path):
     with run_folder("demo", tmp_path / "a.mcap", 12.0) as (folder, _):
         description.write(folder.description)
         ring = SampleRing.create(folder.ring, slots=16, block=BLOCK, state_size=1)
@@ -123,12 +123,12 @@ def test_the_end_of_a_run_is_noticed_and_what_was_seen_stays(description, tmp_pa
     assert feed.status()["t_s"] == 3 * BLOCK / 50000.0
 
 
-def test_a_run_that_can_not_be_looked_at_is_said(tmp_path):
+def test_unreadable_run_is_an_error(tmp_path):
     with run_folder("demo", tmp_path / "a.mcap", 12.0) as (folder, _), pytest.raises(RunError):
         RunReader(folder)
 
 
-def test_where_the_inverse_is_led_is_said(run):
+def test_state_of_the_inverse(run):
     folder, ring = run
     feed = RunReader(folder)
     assert feed.inverse == "in"
@@ -140,8 +140,7 @@ def test_where_the_inverse_is_led_is_said(run):
     assert feed.inverse is None
 
 
-def test_events_since_those_that_were_seen(run):
-    """Each once, however many there have been; the oldest are not kept."""
+def test_events_since(run):
     folder, ring = run
     feed, seen = RunReader(folder), 0
     for number in range(100):
@@ -154,39 +153,43 @@ def test_events_since_those_that_were_seen(run):
     assert feed.events_since(100) == ([], 100)
 
 
-def test_every_tick_is_counted_once_whatever_its_lateness():
-    counts = LatenessCounts()
-    assert counts.percentiles_us() == {}
-    batch = BlockBatch.empty(5, 1, 1)
-    batch.heads[:, BlockHeader.LATE_NS] = (-5, 0, 30_000, 30_000, 9_000_000_000)
-    counts.add(batch)
-    assert counts.counts.sum() == 5
-    assert counts.counts[-1] == 1
-    assert counts.counts[np.searchsorted(EDGES_US, 30.0) - 1] == 2
-    assert counts.percentiles_us()["p50"] == 30.0
-    assert counts.percentiles_us()["max"] == 9e6
+def first(runs):
+    return runs[0] if runs else None
 
 
-def error(error_um, start=0):
-    values = np.zeros((len(SIGNALS), error_um.size))
-    values[ROW["error"]] = error_um
-    index = np.arange(start, start + error_um.size)
-    return Traces(index, values, np.zeros(error_um.size, dtype=np.uint32))
+def begun(folder, description):
+    description.write(folder.description)
+    SampleRing.create(folder.ring, slots=16, block=50, state_size=1)
 
 
-def test_a_line_is_as_high_as_its_sine_and_stands_at_its_frequency():
-    spectrum = LiveErrorSpectrum(50000.0)
-    t_s = np.arange(16384) / 50000.0
-    spectrum.add(error(5.0 + 0.3 * np.sin(2 * np.pi * 1000.0 * t_s)))
-    hz, um = spectrum.points()
-    assert um.max() == pytest.approx(0.3, rel=0.1)
-    assert hz[um.argmax()] == pytest.approx(1000.0, rel=0.05)
+def test_run_is_listed_until_it_has_ended_and_is_not_shown(description, tmp_path):
+    feeds = RunList(first)
+    feeds.update(0.0)
+    assert feeds.feed(None) is None
+    with run_folder("demo", tmp_path / "a.mcap", 12.0) as (folder, _):
+        begun(folder, description)
+        feeds.update(0.5)
+        assert feeds.feed(None) is None  # runs are looked for once a second
+        feeds.update(1.0)
+        feed = feeds.feed(folder.card.name)
+        assert feed is feeds.feed(None)
+        assert list(feeds) == [feed]
+    feed.poll(1.0)
+    assert feed.ended
+    feeds.update(2.0, [None])
+    assert list(feeds) == [feed]  # the main run stays until there is another
+    with run_folder("other", tmp_path / "b.mcap", 12.0) as (folder, _):
+        begun(folder, description)
+        feeds.update(3.0)
+        assert feeds.feed(None) is feeds.feed(folder.card.name)
+        feeds.update(4.0)
+        assert [each.folder for each in feeds] == [folder]
 
 
-def test_no_points_before_there_are_samples_and_a_gap_begins_anew():
-    spectrum = LiveErrorSpectrum(1000.0)
-    assert spectrum.points()[0].size == 0
-    spectrum.add(error(np.zeros(300)))
-    assert spectrum.points()[0].size > 0
-    spectrum.add(error(np.array([np.nan, 1.0])))
-    assert spectrum.points()[0].size == 0
+def test_starting_run_is_read_again(description, tmp_path):
+    feeds = RunList(first)
+    with run_folder("demo", tmp_path / "a.mcap", 12.0) as (folder, _):
+        feeds.update(0.0)
+        assert feeds.feed(None) is None
+        begun(folder, description)
+        assert feeds.feed(None).folder == folder

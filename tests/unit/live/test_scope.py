@@ -1,4 +1,4 @@
-"""Windows: rolling, triggered to the cycle, and loops."""
+"""Windows and loops of a scope."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import pytest
 from hilctl.base.samples import Flag
 from hilctl.base.segments import Segment
 from hilctl.live.scope import BUCKETS, WINDOWS_S, MinMaxTrace, Scope
-from hilctl.live.signals import ROW, SIGNALS, Traces
+from hilctl.live.traces import ROW, SIGNALS, Traces
 
 RATE = 1000.0
 
@@ -25,7 +25,6 @@ def segment(period, stop=100_000):
 
 @pytest.mark.parametrize("period", [50.0, 33.4])
 def test_a_triggered_window_begins_with_the_cycle(period):
-    """However many samples there are, it is the same picture."""
     scope = Scope(RATE, [segment(period)], "reference")
     scope.add(waves(0, 100, period, int(Flag.RAMP)))
     assert scope.triggered() is None
@@ -38,7 +37,7 @@ def test_a_triggered_window_begins_with_the_cycle(period):
         assert window.t_s[-1] == pytest.approx(2 * period / RATE, abs=1.01 / RATE)
 
 
-def test_a_long_cycle_is_shown_as_it_comes():
+def test_long_cycle_is_shown_while_recorded():
     period = 5000.0
     scope = Scope(RATE, [segment(period)], "reference")
     scope.add(waves(100, 100 + 7500, period))
@@ -49,7 +48,7 @@ def test_a_long_cycle_is_shown_as_it_comes():
 
 
 @pytest.mark.parametrize("window_s", WINDOWS_S)
-def test_a_rolling_window_ends_now_and_holds_every_spike(window_s):
+def test_rolling_window_has_every_spike(window_s):
     scope = Scope(RATE, [segment(50.0)], "reference")
     traces = waves(100, 8000, 50.0)
     traces.values[ROW["error"], -9] = 30.0
@@ -69,7 +68,7 @@ def test_loops_pair_one_samples_values():
     assert scope.points_a_cycle() == 50
 
 
-def test_each_stretch_has_its_own_cycle_and_one_without_a_period_none():
+def test_cycle_of_each_segment():
     first = Segment("a", 0, 500, 0, 500, 50.0)
     scope = Scope(RATE, [first, Segment("b", 500, 9000, 500, 9000)], "reference")
     scope.add(waves(0, 400, 50.0))
@@ -94,8 +93,7 @@ def traces(start, values, step=1):
 
 
 @pytest.mark.parametrize("width", [1, 3, 7.5])
-def test_each_sample_is_within_its_bucket_however_the_samples_come(width):
-    """So one spike of one sample is seen, and the first value is that of a sample."""
+def test_buckets_do_not_depend_on_chunk_size(width):
     rng = np.random.default_rng(3)
     values = rng.standard_normal(400)
     values[137] = 50.0
@@ -118,7 +116,7 @@ def test_each_sample_is_within_its_bucket_however_the_samples_come(width):
         assert np.array_equal(getattr(one, name), getattr(other, name))
 
 
-def test_gaps_and_what_is_gone_are_empty():
+def test_gaps_and_overwritten_buckets_are_empty():
     envelope = MinMaxTrace(0, 2, 4)
     envelope.add(traces(0, [1.0, 2.0, 3.0, 4.0]))
     envelope.add(traces(8, [5.0]))
@@ -128,7 +126,7 @@ def test_gaps_and_what_is_gone_are_empty():
     assert np.isnan(envelope.window(497, 4).low[0]).tolist() == [True, True, True, False]
 
 
-def test_a_value_that_is_missing_hides_no_other():
+def test_missing_value_does_not_hide_others():
     envelope = MinMaxTrace(0, 3, 4)
     envelope.add(traces(0, [np.nan, 2.0, 7.0, np.nan, np.nan, np.nan]))
     found = envelope.window(0, 2)
@@ -136,7 +134,7 @@ def test_a_value_that_is_missing_hides_no_other():
     assert np.isnan(found.low[0, 1])
 
 
-def test_what_comes_before_the_origin_is_left():
+def test_samples_before_the_origin_are_ignored():
     envelope = MinMaxTrace(10, 1, 4)
     envelope.add(traces(7, [1.0, 2.0]))
     assert envelope.newest == -1

@@ -1,4 +1,4 @@
-"""The server on loopback, with a run's folder behind it."""
+"""The server of the live page on loopback."""
 
 import asyncio
 import json
@@ -84,7 +84,7 @@ async def http(port, request):
     return answer
 
 
-def test_a_page_gets_frames_and_where_the_run_stands(description, tmp_path):
+def test_page_gets_frames_and_status(description, tmp_path):
     async def seen():
         async with serving() as server, opened(server) as connection:
             assert connection.subprotocol == "hilctl.live.1"
@@ -99,7 +99,7 @@ def test_a_page_gets_frames_and_where_the_run_stands(description, tmp_path):
     assert b'"signals": 6' in frame
 
 
-def test_stop_goes_the_way_of_hilctl_stop_and_is_acknowledged(description, tmp_path, monkeypatch):
+def test_stop_is_requested_and_acknowledged(description, tmp_path, monkeypatch):
     stopped = []
     monkeypatch.setattr(module, "request_stop", lambda run: stopped.append(run) or True)
 
@@ -113,9 +113,7 @@ def test_stop_goes_the_way_of_hilctl_stop_and_is_acknowledged(description, tmp_p
         assert stopped == [folder]
 
 
-def test_requests_go_to_the_control_socket_and_refusals_come_back(
-    description, tmp_path, monkeypatch
-):
+def test_requests_go_to_the_control_socket(description, tmp_path, monkeypatch):
     asked = []
 
     def ask(path, request, timeout_s):
@@ -140,9 +138,7 @@ def test_requests_go_to_the_control_socket_and_refusals_come_back(
     assert (no["ok"], no["error"]) == (False, "no room")
 
 
-def test_a_window_of_no_length_does_not_end_the_server(description, tmp_path):
-    """It did, for every page."""
-
+def test_invalid_window_does_not_end_the_server(description, tmp_path):
     async def shown():
         async with serving() as server, opened(server) as connection:
             await status_of(connection)
@@ -155,17 +151,17 @@ def test_a_window_of_no_length_does_not_end_the_server(description, tmp_path):
     assert status["state"] == "running"
 
 
-def test_without_a_run_a_page_says_so_and_a_stop_is_refused():
+def test_page_without_a_run():
     async def seen():
         async with serving(lambda runs: None) as server, opened(server) as connection:
             return await status_of(connection), await answer_to(connection, ask="stop")
 
     status, answer = asyncio.run(seen())
     assert "run" not in status
-    assert (answer["ok"], answer["error"]) == (False, "no such active run")
+    assert not answer["ok"]
 
 
-def test_strangers_are_refused_in_the_upgrade():
+def test_unauthenticated_upgrades_are_refused():
     async def refusals():
         found = []
         async with serving(lambda runs: None) as server:
@@ -176,14 +172,14 @@ def test_strangers_are_refused_in_the_upgrade():
             foreign = b"GET / HTTP/1.1\r\nHost: evil.example\r\n\r\n"
             found.append((await http(server.port, foreign)).split()[1])
             assert server.url.partition("#")[2] not in (await http(server.port, foreign)).decode()
-            async with opened(server) as connection:  # and nobody else is kept out by them
+            async with opened(server) as connection:  # others are still accepted
                 await status_of(connection)
         return found
 
     assert asyncio.run(refusals()) == [401, 401, 403, b"421"]
 
 
-def test_no_request_but_a_get_of_a_file_is_followed():
+def test_only_get_requests_of_files_are_served():
     async def answers():
         async with serving(lambda runs: None) as server:
             host = f"Host: 127.0.0.1:{server.port}\r\n".encode()
@@ -218,7 +214,7 @@ def test_a_message_that_is_too_long_ends_its_connection_only():
     assert asyncio.run(sent()) == 1009
 
 
-def test_a_crowd_of_silent_connections_is_bounded_and_keeps_nobody_out():
+def test_silent_connections_are_bounded():
     async def crowded():
         async with serving(lambda runs: None) as server:
             address = ("127.0.0.1", server.port)
@@ -247,15 +243,15 @@ def test_both_addresses_of_loopback_are_served():
     assert asyncio.run(seen())["kind"] == "status"
 
 
-def test_a_port_that_is_taken_is_said():
+def test_port_in_use_is_an_error():
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        with pytest.raises(RunError, match=f"port {port} of 127.0.0.1: Address already in use"):
+        with pytest.raises(RunError, match="in use"):
             LiveServer(lambda runs: None, port)
 
 
 @pytest.mark.parametrize("path", FILES)
-def test_each_file_is_there_and_comes_with_its_headers(path):
+def test_each_file_has_its_headers(path):
     response = file_response(path)
     assert response.status_code == 200
     assert len(response.body) == int(response.headers["Content-Length"]) > 100
@@ -268,8 +264,8 @@ def test_nothing_else_is_served(path):
     assert file_response(path).status_code == 404
 
 
-def test_the_page_names_no_address_outside_and_holds_no_script_of_its_own():
-    """So that it works with the cable out, and a strict policy lets all of it through."""
+def test_page_has_no_external_address_and_no_inline_script():
+    """It works offline and with a strict content security policy."""
     page = file_response("/").body.decode()
     script = file_response("/live.js").body.decode()
     assert not re.findall(r"""(?:https?:)?//[a-z0-9]""", page)

@@ -1,4 +1,4 @@
-"""The server's process."""
+"""Processes of the servers."""
 
 import os
 import signal
@@ -17,7 +17,7 @@ def server(feed):
     return SimpleNamespace(feed=lambda name: feed)
 
 
-def test_a_server_goes_on_until_its_pages_have_heard_of_the_end():
+def test_server_ends_some_time_after_its_run():
     now = [0.0]
     over = SingleRun(lambda: now[0])
     assert not over(server(None))
@@ -30,7 +30,7 @@ def test_a_server_goes_on_until_its_pages_have_heard_of_the_end():
     assert over(ended)
 
 
-def test_another_run_makes_it_go_on():
+def test_another_run_keeps_the_server_active():
     now = [0.0]
     over = SingleRun(lambda: now[0])
     over(server(SimpleNamespace(ended=True)))
@@ -41,7 +41,7 @@ def test_another_run_makes_it_go_on():
 
 @pytest.fixture
 def beside(monkeypatch):
-    """Return a function that has a program take the server's place; and the processes."""
+    """Return a function that replaces the server by a program and returns the processes."""
     started, popen = [], subprocess.Popen
 
     def take_place(code):
@@ -61,7 +61,7 @@ def beside(monkeypatch):
         process.wait()
 
 
-def test_a_server_that_is_stopped_does_not_keep_the_run_from_ending(beside, monkeypatch):
+def test_suspended_server_does_not_delay_the_run(beside, monkeypatch):
     started = beside("print('http://here', flush=True); input(); input()")
     monkeypatch.setattr(server_process, "_START_S", 60.0)
     with served_beside() as url:
@@ -70,7 +70,7 @@ def test_a_server_that_is_stopped_does_not_keep_the_run_from_ending(beside, monk
     assert started[0].wait(60) == -signal.SIGKILL
 
 
-def test_a_server_that_gives_no_address_does_not_keep_the_run_from_being_refused(beside):
+def test_server_without_address_is_killed(beside):
     started = beside("input(); input()")
     with pytest.raises(RunError), served_beside():
         pass

@@ -1,10 +1,10 @@
-"""Settings and paths as callers may give them."""
+"""Conversion of settings and paths."""
 
 from pathlib import Path
 
 import pytest
 
-from hilctl.api.given import path_or_none, paths_of, texts_of
+from hilctl.api._types import path_or_none, paths_of, texts_of
 
 
 def test_values_become_texts_that_yaml_reads_back():

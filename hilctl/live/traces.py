@@ -1,4 +1,4 @@
-"""Define the signals that are shown of a run."""
+"""Signals of a run that live views show."""
 
 from dataclasses import dataclass
 from typing import Literal, TypeAlias

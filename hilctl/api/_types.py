@@ -1,4 +1,4 @@
-"""Convert arguments that all functions accept."""
+"""Types of arguments that several functions accept, and their conversion."""
 
 import json
 import os
@@ -7,36 +7,36 @@ from pathlib import Path
 from typing import TypeAlias
 
 PathLike: TypeAlias = str | os.PathLike[str]
-Settings: TypeAlias = Mapping[str, object] | Sequence[str]
-"""Over an experiment: values by key, ``{"waveform.frequency_hz": 50.0}``, or ``key=value`` texts as
-``--set`` takes them."""
 Paths: TypeAlias = PathLike | Sequence[PathLike]
+Settings: TypeAlias = Mapping[str, object] | Sequence[str]
+"""Overrides of an experiment: values by dotted key, ``{"waveform.frequency_hz": 50.0}``, or
+``key=value`` texts as for ``--set``."""
 
 
 def texts_of(settings: Settings) -> list[str]:
     """Return settings as ``key=value`` texts.
 
     Raises:
-        TypeError: A value is none that YAML could hold.
+        TypeError: YAML cannot represent a value.
     """
     if not isinstance(settings, Mapping):
         return [*settings]
     return [f"{key}={json.dumps(value, ensure_ascii=False)}" for key, value in settings.items()]
 
 
-def paths_of(given: Paths) -> list[Path]:
+def paths_of(paths: Paths) -> list[Path]:
     """Return one or several paths as a list."""
-    if isinstance(given, str | os.PathLike):
-        return [Path(given)]
-    return [Path(each) for each in given]
+    if isinstance(paths, str | os.PathLike):
+        return [Path(paths)]
+    return [Path(each) for each in paths]
 
 
-def path_or_none(given: PathLike | None) -> Path | None:
-    """Return a path that may be left out."""
-    return None if given is None else Path(given)
+def path_or_none(path: PathLike | None) -> Path | None:
+    """Return an optional path."""
+    return None if path is None else Path(path)
 
 
 def runs_folder(output: PathLike, folder: PathLike | None = None) -> Path:
-    """Return where the runs that lead to a file are kept."""
+    """Return the folder for the runs that lead to a file; default: ``OUTPUT-runs``."""
     file = Path(output)
     return path_or_none(folder) or file.with_name(f"{file.stem}-runs")

@@ -1,0 +1,318 @@
+"""Serve a live run to Foxglove, Lichtblick and PlotJuggler with Foxglove's protocol, on loopback.
+
+`/scope` and `/events` have the schemas of a recording, so that one layout opens both. `/scope` has
+the first sample of each bucket; `/scope_low` and `/scope_high` have the minimum and maximum of each
+signal per bucket, so that every spike is visible. `/diagnostics` has the state and the limits.
+
+Clients are read-only. The library checks neither the user nor the origin of a request, so every
+user and every web page on this computer can read the run while the server is active. It is
+therefore started on request only.
+"""
+
+import json
+import logging
+import threading
+import time
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
+from itertools import repeat
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from hilctl.base.errors import InputError, RunError
+from hilctl.base.samples import COLUMNS
+from hilctl.base.types import F64
+from hilctl.live.run_reader import RunList, RunReader
+from hilctl.live.traces import ROW
+from hilctl.recording import schema
+from hilctl.recording.codec import encode_scope
+from hilctl.recording.encoder import Encoded, MessageMaker, RecordingLayout
+from hilctl.run.run_folder import RunFolder
+
+if TYPE_CHECKING:
+    from foxglove import Channel, Context
+    from foxglove.websocket import WebSocketServer
+
+PORT = 8765
+"""Default port of the applications."""
+_FRAME_S = 1.0 / 30.0
+_STATUS_FRAMES = 15
+_STOP_S = 1.0
+_BACKLOG = 4096  # messages for one client, about a second of them; the oldest are dropped
+SCOPE_TOPICS: dict[str, Literal["first", "low", "high"]] = {
+    "/scope": "first",
+    "/scope_low": "low",
+    "/scope_high": "high",
+}
+"""Topics of samples, and the value of each bucket that they contain."""
+MESSAGES = {
+    "/events": schema.TOPICS["/events"],
+    **dict.fromkeys(SCOPE_TOPICS, schema.TOPICS["/scope"]),
+}
+"""Protobuf message of each topic, of package ``hilctl``."""
+DIAGNOSTICS = "/diagnostics"
+_PAIR = {"key": {"type": "string"}, "value": {"type": "string"}}
+_STATUS = {
+    "level": {"type": "integer"},
+    "name": {"type": "string"},
+    "message": {"type": "string"},
+    "hardware_id": {"type": "string"},
+    "values": {"type": "array", "items": {"type": "object", "properties": _PAIR}},
+}
+_HEADER = {
+    "stamp": {
+        "type": "object",
+        "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}},
+    },
+    "frame_id": {"type": "string"},
+}
+DIAGNOSTICS_SCHEMA: dict[str, Any] = {
+    "title": "diagnostic_msgs/DiagnosticArray",  # name expected by the panels
+    "type": "object",
+    "properties": {
+        "header": {"type": "object", "properties": _HEADER},
+        "status": {"type": "array", "items": {"type": "object", "properties": _STATUS}},
+    },
+}
+"""Schema of ``/diagnostics``, which is JSON."""
+_WINDOW_S = 0.5  # buckets of 1/1200 s, similar to /scope of a recording
+_LEVELS = {"info": 0, "warning": 1, "error": 2}
+_COLUMNS = {
+    "reference_um": "reference",
+    "wanted": "wanted",
+    "command": "command",
+    "displacement_um": "displacement",
+}  # columns of a recording's /scope and their signals
+
+
+class LiveTopics:
+    """The messages of one run.
+
+    Args:
+        feed: Reader of the run.
+        start_unix_ns: Unix time of sample 0.
+    """
+
+    def __init__(self, feed: RunReader, start_unix_ns: int) -> None:
+        self._feed, about = feed, feed.description
+        self._layout = RecordingLayout(
+            sample_rate_hz=about.sample_rate_hz,
+            command_unit="V" if about.command_unit == "V" else "A",
+            measures_command=about.measures_command,
+            scope_rate_hz=about.sample_rate_hz,
+            start_unix_ns=start_unix_ns,
+            waveform_unit=about.waveform_unit,
+        )
+        self._maker = MessageMaker(self._layout)
+        self._next_bucket = self._seen_events = 0
+        fields = {name: COLUMNS[name].field(self._layout.command_unit) for name in _COLUMNS}
+        self._rows = {fields[name].name: ROW[signal] for name, signal in _COLUMNS.items()}
+
+    def scope(self, wanted: Collection[str] = SCOPE_TOPICS) -> Iterator[Encoded]:
+        """Yield the messages of completed buckets, the oldest first.
+
+        Buckets that were overwritten before the call are omitted.
+
+        Args:
+            wanted: Topics with subscribers.
+        """
+        first, buckets = self._feed.scope.whole_buckets(_WINDOW_S, self._next_bucket)
+        count, width = buckets.first.shape[1], self._feed.scope.bucket_samples(_WINDOW_S)
+        self._next_bucket = first + count
+        for topic in wanted:
+            values: F64 = getattr(buckets, SCOPE_TOPICS[topic])[list(self._rows.values())]
+            at = np.flatnonzero(~np.isnan(values).all(axis=0))
+            samples = (first + at) * width
+            columns = dict(zip(self._rows, values[:, at], strict=True))
+            columns["t_rel"] = samples / self._layout.sample_rate_hz
+            messages = encode_scope(samples, np.zeros(at.size, dtype=np.uint32), columns)
+            times_ns = self._layout.times_ns(samples).tolist()
+            yield from map(Encoded, repeat(topic), times_ns, messages)
+
+    def events(self) -> Iterator[Encoded]:
+        """Yield the messages of the events since the last call."""
+        events, self._seen_events = self._feed.events_since(self._seen_events)
+        yield from map(self._maker.event, events)
+
+    def diagnostics(self, now_unix_ns: int) -> Encoded:
+        """Return the state of the run and its use of each limit."""
+        status = self._feed.status()
+        seconds, nanoseconds = divmod(now_unix_ns, 10**9)
+        stamp = {"sec": seconds, "nsec": nanoseconds}
+        found = {"header": {"stamp": stamp, "frame_id": ""}, "status": _statuses(status)}
+        return Encoded(DIAGNOSTICS, now_unix_ns, json.dumps(found).encode())
+
+
+def _statuses(status: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return the parts of ``/diagnostics`` from :meth:`hilctl.live.run_reader.RunReader.status`."""
+    run, failed = status["run"], status["state"] == "fault" or status["safe"] is False
+    keys = ("t_s", "total_s", "segment", "gain", "offset", "inverse", "recording")
+    late = {f"{name}_us": value for name, value in status["lateness_us"].items()}
+    missed = {"missed_samples": status["missed_samples"]}
+    state = " ".join(filter(None, (status["state"], status["reason"])))
+    return [
+        _part(run, "run", "error" if failed else "info", state, {key: status[key] for key in keys}),
+        _part(run, "figures", "info", "newest cycles", status["figures"]),
+        _part(run, "lateness", "info", "", {**late, "late_ticks": status["late_ticks"]}),
+        _part(run, "recording", "info", "", {**missed, **(status["disk"] or {})}),
+        *(
+            _part(
+                run,
+                f"limit: {gauge['name']}",
+                gauge["level"],
+                f"{100.0 * gauge['used']:.1f} % used",
+                {"value": gauge["value"], "limit": gauge["limit"], "unit": gauge["unit"]},
+            )
+            for gauge in status["gauges"]
+        ),
+    ]
+
+
+def _part(
+    run: str, name: str, level: str, message: str, values: dict[str, object]
+) -> dict[str, Any]:
+    pairs = [{"key": key, "value": _text(value)} for key, value in values.items()]
+    return {
+        "level": _LEVELS[level],
+        "name": name,
+        "message": message,
+        "hardware_id": run,
+        "values": pairs,
+    }
+
+
+def _text(value: object) -> str:
+    if value is None:
+        return ""
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+class FoxgloveServer:
+    """Serves the active run.
+
+    Args:
+        chosen: See :class:`hilctl.live.run_reader.RunList`.
+        port: Port to listen on; 0 for any.
+        clock: Monotonic time in s.
+        unix_ns: Unix time in ns.
+        sleep: Sleeps for the given time in s.
+
+    Raises:
+        InputError: The library is not installed.
+        RunError: The port is not available.
+    """
+
+    def __init__(
+        self,
+        chosen: Callable[[list[RunFolder]], RunFolder | None],
+        port: int = PORT,
+        clock: Callable[[], float] = time.monotonic,
+        unix_ns: Callable[[], int] = time.time_ns,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self._feeds = RunList(chosen)
+        self._shown: RunReader | None = None
+        self._topics: LiveTopics | None = None
+        self._clock, self._unix_ns, self._sleep = clock, unix_ns, sleep
+        self._context, self._channels, self._server = _started(port)
+
+    @property
+    def url(self) -> str:
+        """Address for the applications."""
+        return f"ws://127.0.0.1:{self._server.port}"
+
+    def run(self, over: Callable[["FoxgloveServer"], bool]) -> None:
+        """Serve until ``over`` returns true."""
+        number = 0
+        try:
+            while not over(self):
+                began_s = self._clock()
+                self._show(number)
+                number += 1
+                self._sleep(max(_FRAME_S / 4.0, began_s + _FRAME_S - self._clock()))
+        finally:
+            # In a thread: the library waits for clients that do not read.
+            stopping = threading.Thread(target=self._server.stop, daemon=True)
+            stopping.start()
+            stopping.join(_STOP_S)
+
+    def feed(self, name: str | None) -> RunReader | None:
+        """Return the reader of a run, see :meth:`hilctl.live.run_reader.RunList.feed`."""
+        return self._feeds.feed(name)
+
+    def _show(self, number: int) -> None:
+        now_s = self._clock()
+        self._feeds.update(now_s)
+        feed = self.feed(None)
+        if feed is None:
+            return
+        feed.poll(now_s)
+        if feed is not self._shown and feed.start_ns:
+            start_unix_ns = self._unix_ns() - round(now_s * 1e9) + feed.start_ns
+            if self._shown is not None:
+                self._server.clear_session()  # discards client data of another run
+            self._shown, self._topics = feed, LiveTopics(feed, start_unix_ns)
+        if self._topics is None:
+            return
+        wanted = [topic for topic in SCOPE_TOPICS if self._channels[topic].has_sinks()]
+        for message in self._topics.scope(wanted):
+            self._log(message)
+        for message in self._topics.events():
+            self._log(message)
+        if number % _STATUS_FRAMES == 0:
+            self._log(self._topics.diagnostics(self._unix_ns()))
+
+    def _log(self, message: Encoded) -> None:
+        self._channels[message.topic].log(message.data, log_time=message.time_ns)
+
+
+@contextmanager
+def _logging_as_before() -> Iterator[None]:
+    """Restore the level and handlers of all logs, which the library changes globally."""
+    root = logging.getLogger()
+    level, handlers = root.level, root.handlers[:]
+    yield
+    root.setLevel(level)
+    root.handlers[:] = handlers
+
+
+def _started(port: int) -> tuple["Context", dict[str, "Channel"], "WebSocketServer"]:
+    """Return the channels by topic, the server, and the context that keeps them alive.
+
+    Without the context, the channels would be removed from the server.
+
+    Raises:
+        InputError: The library is not installed.
+        RunError: The port is not available.
+    """
+    try:
+        import foxglove
+    except ImportError:
+        raise InputError(
+            "--foxglove: its library is not installed: pip install 'hilctl[foxglove]'"
+        ) from None
+    with _logging_as_before():
+        foxglove.set_log_level("ERROR")  # discards messages on invalid requests
+    context = foxglove.Context()
+    descriptors = schema.descriptor_set()
+    channels = {
+        DIAGNOSTICS: foxglove.Channel(DIAGNOSTICS, schema=DIAGNOSTICS_SCHEMA, context=context)
+    }
+    for topic, name in MESSAGES.items():
+        form = foxglove.Schema(name=f"hilctl.{name}", encoding="protobuf", data=descriptors)
+        channels[topic] = foxglove.Channel(
+            topic, schema=form, message_encoding="protobuf", context=context
+        )
+    try:
+        # No capabilities: clients can only subscribe.
+        server = foxglove.start_server(
+            name="hilctl",
+            host="127.0.0.1",
+            port=port,
+            context=context,
+            message_backlog_size=_BACKLOG,
+        )
+    except RuntimeError as error:
+        raise RunError(f"port {port} of 127.0.0.1: {error}") from None
+    return context, channels, server
