@@ -325,8 +325,7 @@ def entry_of(file: Path, path: str, size_bytes: int, mtime_ns: int) -> Entry:
     """
     # What reads recordings takes a second to import: a catalogue that is known needs none of it.
     from hilctl.recording.run_summary import read_ends
-    from hilctl.recording.segments import segments_of
-    from hilctl.recording.validation import labels_of
+    from hilctl.recording.validation import labels_of, segments_of
 
     entry = unreadable(path, size_bytes, mtime_ns, "")
     try:

@@ -1,5 +1,6 @@
 """Recovery and the files around it: nothing is destroyed, nothing is touched without need."""
 
+import errno
 import io
 import subprocess
 import sys
@@ -9,10 +10,12 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
+from hilctl.base import private_dirs as locks
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.events import Event
 from hilctl.base.samples import COLUMNS, BlockHeader
 from hilctl.recording.reader import read
+from hilctl.recording.recording_files import is_being_recorded, lock
 from hilctl.recording.recover import recover_recording
 from hilctl.recording.writer import OutputFile
 
@@ -75,7 +78,7 @@ def test_output_leaves_the_file_where_it_is(torn):
 
 def test_a_full_disk_changes_nothing(torn, monkeypatch):
     """Where the new file can't be written, the old one is as it was and nothing is left over."""
-    import hilctl.recording.safe_replace as module
+    import hilctl.recording.recording_files as module
 
     def full(number):
         raise OSError(28, "No space left on device")
@@ -89,7 +92,7 @@ def test_a_full_disk_changes_nothing(torn, monkeypatch):
 
 def test_without_hard_links_the_old_file_is_renamed(torn, monkeypatch):
     """On file systems that have none, the old file is kept all the same."""
-    import hilctl.recording.safe_replace as module
+    import hilctl.recording.recording_files as module
 
     def refuse(self, target):
         raise OSError(1, "Operation not permitted")
@@ -258,3 +261,33 @@ def test_the_command(torn):
     assert f"original file: {torn}.torn" in first.stdout
     second = hilctl("recover", torn)
     assert second.stdout == f"{torn}: sound: nothing to recover\n"
+
+
+def test_a_recording_is_written_by_one(tmp_path):
+    path = tmp_path / "run.mcap"
+    with path.open("xb") as writer, path.open("rb") as reader:
+        lock(writer)
+        assert is_being_recorded(reader)
+        with pytest.raises(BlockingIOError, match="another hilctl is recording to it"):
+            lock(reader, shared=True)
+        assert reader.closed
+
+
+@pytest.mark.parametrize("code", [errno.ENOLCK, errno.ENOTSUP])
+def test_a_file_system_without_locks_is_no_error(tmp_path, monkeypatch, code):
+    def refuse(held, kind):
+        raise OSError(code, "no locks")
+
+    monkeypatch.setattr(locks.fcntl, "flock", refuse)
+    with (tmp_path / "run.mcap").open("xb") as writer:
+        lock(writer)
+        assert not is_being_recorded(writer)
+
+
+def test_any_other_error_is_one(tmp_path, monkeypatch):
+    def refuse(held, kind):
+        raise OSError(errno.EIO, "broken disk")
+
+    monkeypatch.setattr(locks.fcntl, "flock", refuse)
+    with (tmp_path / "run.mcap").open("xb") as writer, pytest.raises(OSError, match="broken"):
+        lock(writer)
