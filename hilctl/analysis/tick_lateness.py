@@ -98,25 +98,6 @@ def _percentiles_us(times_ns: Quantiles) -> dict[str, float]:
     return {**dict(zip(_PERCENTILES, values, strict=True)), "max": times_ns.largest * 1e-3}
 
 
-def by_minute(ticks: Ticks) -> list[dict[str, float]]:
-    """Return the lateness of each minute of a run, in order.
-
-    Returns:
-        For each minute with ticks: ``minute`` from 0, its ``ticks``, and the figures of
-        :func:`percentiles_us`. Of a run longer than a day, for stretches of several minutes, with
-        the first of them.
-    """
-    return gathered(ticks).by_minute()
-
-
-def gathered(ticks: Ticks) -> LatenessBuilder:
-    """Return all ticks of a run, gathered."""
-    span_ns = int(np.ptp(ticks.deadline_ns)) if ticks.deadline_ns.size else 0
-    found = LatenessBuilder(span_ns / _MINUTE_NS)
-    found.add(ticks)
-    return found
-
-
 def tick_period_ns(ticks: Ticks) -> float | None:
     """Return the usual time from one tick's deadline to the next; None with fewer than two."""
     if ticks.deadline_ns.size < 2:
@@ -157,8 +138,3 @@ def counter(recording: Recording, name: str, otherwise: int | None) -> int | Non
     except ValueError:
         text = f"{recording.path}: hilctl.end: {name} must be a whole number"
         raise DataError(f"{text}, got {recording.end[name]!r}") from None
-
-
-def late_ticks(ticks: Ticks) -> int | None:
-    """Count ticks that woke more than half a tick period late; None with fewer than two ticks."""
-    return gathered(ticks).late_ticks()

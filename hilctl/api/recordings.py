@@ -281,7 +281,7 @@ def figures(
         InputError: A run can't be read, no figure applies, or a file can't be written.
         DataError: A recording that was named can't be read.
     """
-    from hilctl.analysis.figure_export import formats_of
+    from hilctl.analysis.figure_layout import formats_of
     from hilctl.studies.multi_run.plots import draw_sheets, write_sheets
 
     chosen = formats_of(formats)
