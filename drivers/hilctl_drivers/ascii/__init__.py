@@ -7,5 +7,5 @@ session.py  one conversation
 wire.py     sample by sample
 """
 
-LINK_KINDS = {"ascii": f"{__name__}.profile:AsciiProfile"}
+LINK_KINDS = {"ascii": f"{__name__}.ascii_profile:AsciiProfile"}
 """What a profile's ``link.kind`` says of it: where the class of such profiles stands."""

@@ -11,5 +11,5 @@ look.py          input and output of a device that is only read
 device.py        the device, and the one that reads the sensor where it is another
 """
 
-LINK_KINDS = dict.fromkeys(("tcp", "rtu"), f"{__name__}.profile:ModbusProfile")
+LINK_KINDS = dict.fromkeys(("tcp", "rtu"), f"{__name__}.modbus_profile:ModbusProfile")
 """What a profile's ``link.kind`` says of it: where the class of such profiles stands."""

@@ -1,7 +1,8 @@
 """Reading a Modbus device: what its registers say, and nothing sent that changes them."""
 
 import pytest
-from tests.unit.drivers.modbus.test_device import exchange
+
+from tests.unit.drivers.modbus.test_modbus_dac import exchange
 
 
 @pytest.mark.parametrize(

@@ -1,11 +1,11 @@
 """What a campaign file may say."""
 
 import pytest
-from tests.unit.campaign.conftest import CAMPAIGN
 
 from hilctl.base.errors import ConfigError
 from hilctl.base.yaml import Document
 from hilctl.studies.campaign.file import CampaignFile
+from tests.unit.studies.campaign.conftest import CAMPAIGN
 
 
 def test_all_that_is_wrong_is_said_at_once_with_its_line():

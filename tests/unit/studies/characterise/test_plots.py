@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-from tests.unit.characterise.test_results import LOOP, UNSEEN
 
 from hilctl.studies.characterise.loops import ReversalCurves
 from hilctl.studies.characterise.plots import (
@@ -13,6 +12,7 @@ from hilctl.studies.characterise.plots import (
     reversal_figure,
 )
 from hilctl.studies.characterise.response import SmallSignal
+from tests.unit.studies.characterise.test_results import LOOP, UNSEEN
 
 HZ = np.geomspace(10.0, 1000.0, 30)
 SMALL = SmallSignal(

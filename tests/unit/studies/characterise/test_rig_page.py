@@ -4,8 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.unit.characterise.test_plots import SMALL
-from tests.unit.characterise.test_results import FOUND, LOOP, UNSEEN, identification
 
 from hilctl.models.mechanics import FurtherMode
 from hilctl.models.staged import StagedModel
@@ -16,6 +14,8 @@ from hilctl.studies.characterise.rig_page import (
     write_characterisation,
 )
 from tests.published import piezo_ppi
+from tests.unit.studies.characterise.test_plots import SMALL
+from tests.unit.studies.characterise.test_results import FOUND, LOOP, UNSEEN, identification
 
 LINE = np.linspace(0.0, 1.0, 50)
 SEEN = replace(UNSEEN, time_s=LINE, measured_um=LINE, modelled_um=LINE)

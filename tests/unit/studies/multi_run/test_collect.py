@@ -13,7 +13,7 @@ from hilctl.studies.multi_run import collect as module
 from hilctl.studies.multi_run.collect import collect
 from hilctl.studies.multi_run.run_figures import RunFigures
 
-GOLDEN = Path(__file__).parents[3] / "recordings" / "golden"
+GOLDEN = Path(__file__).parents[4] / "recordings" / "golden"
 RUNS = (GOLDEN / "terfenol_uncompensated.mcap",)
 
 

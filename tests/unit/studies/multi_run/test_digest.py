@@ -10,7 +10,7 @@ from hilctl.base.segments import Segment
 from hilctl.models.model_file import load_model
 from hilctl.studies.multi_run.digest import POINTS, digest_of
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[4]
 MODEL = ROOT / "configs" / "models" / "terfenol_omega.yaml"
 N, PERIOD = 20_000, 5000.0
 WAVE = np.sin(2.0 * np.pi * np.arange(N) / PERIOD)
