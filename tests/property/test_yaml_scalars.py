@@ -143,7 +143,7 @@ def test_every_reader_refuses_the_same(
     (problem,) = caught.value.problems
     assert problem.where.startswith("x.yaml:")
     assert int(problem.where.removeprefix("x.yaml:")) > 1
-    assert problem.rule == "is not readable YAML"
+    assert problem.rule.startswith("is not readable")
     assert reason in problem.hint
 
 
@@ -152,7 +152,7 @@ def test_files_that_can_not_be_read_are_refused_alike(load: Any, tmp_path: Path)
     """Models and profiles say the same of a file that is not text."""
     path = tmp_path / "x.yaml"
     path.write_bytes(b"\xff\xfe")
-    with pytest.raises(Exception, match=r"x\.yaml: is not UTF-8 text"):
+    with pytest.raises(Exception, match=r"x\.yaml: .*UTF-8"):
         load(path)
 
 

