@@ -5,15 +5,14 @@ highest displacement, reference, command and error, and each segment its last ev
 """
 
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields, replace
 
 import numpy as np
 
-from hilctl.analysis.report import RunReportBuilder, Windows
+from hilctl.analysis.report import Windows, build_report
 from hilctl.analysis.run_metrics import RunReport
 from hilctl.analysis.steady_state import Overview, SteadyPart, trusted
-from hilctl.base.errors import DataError
 from hilctl.base.events import Event
 from hilctl.base.samples import Samples
 from hilctl.base.types import F64, I64
@@ -40,28 +39,14 @@ def overview(pieces: Iterable[Recording]) -> tuple[RunReport, Recording]:
     Raises:
         DataError: As :func:`hilctl.analysis.report.summarize` does.
     """
-    planned: Windows | None = None
-    for _ in range(2):
-        gathering, shown = _gathered(pieces, planned)
-        planned = gathering.right_windows()
-        if planned == gathering.windows:
-            break
-    return gathering.report(), shown.recording(gathering.cycles())
+    shown: list[_Shown] = []
 
+    def observe(windows: Windows) -> Callable[[Recording], None]:
+        shown[:] = [_Shown(windows)]
+        return shown[0].add
 
-def _gathered(
-    pieces: Iterable[Recording], windows: Windows | None
-) -> tuple[RunReportBuilder, "_Shown"]:
-    gathering: RunReportBuilder | None = None
-    for piece in pieces:
-        if gathering is None:
-            gathering = RunReportBuilder(piece, windows)
-            shown = _Shown(gathering.windows)
-        gathering.add(piece)
-        shown.add(piece)
-    if gathering is None:
-        raise DataError("there is no recording to show")
-    return gathering, shown
+    builder = build_report(pieces, observe)
+    return builder.report(), shown[0].recording(builder.cycles())
 
 
 class _Shown:

@@ -1,7 +1,7 @@
 """Report of a recording: metrics of the run and of each segment."""
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import astuple
 from typing import Any, Literal, TypeAlias
 
@@ -51,23 +51,41 @@ def summarize(recording: Recording | Iterable[Recording]) -> RunReport:
         DataError: A counter in the metadata of the end is not a number.
     """
     pieces = [recording] if isinstance(recording, Recording) else recording
-    planned: Windows | None = None
-    for _ in range(2):
-        gathering = _gathered(pieces, planned)
-        planned = gathering.right_windows()
-        if planned == gathering.windows:
-            break
-    return gathering.report()
+    return build_report(pieces).report()
 
 
-def _gathered(pieces: Iterable[Recording], windows: Windows | None) -> "RunReportBuilder":
-    gathering: RunReportBuilder | None = None
-    for piece in pieces:
-        gathering = gathering or RunReportBuilder(piece, windows)
-        gathering.add(piece)
-    if gathering is None:
-        raise DataError("there is no recording to judge")
-    return gathering
+def build_report(
+    pieces: Iterable[Recording],
+    observe: Callable[[Windows], Callable[[Recording], None]] | None = None,
+) -> "RunReportBuilder":
+    """Return the builder of a report after the last piece.
+
+    The pieces are read again if the evaluated samples turn out to differ from the planned ones.
+
+    Args:
+        pieces: Pieces of the run in order, as a repeatable iterable.
+        observe: Called with the evaluated samples before each reading; returns a function that is
+            called with each piece.
+
+    Raises:
+        DataError: There is no piece.
+    """
+    windows: Windows | None = None
+    while True:
+        builder: RunReportBuilder | None = None
+        for piece in pieces:
+            if builder is None:
+                builder = RunReportBuilder(piece, windows)
+                add = observe(builder.windows) if observe else None
+            builder.add(piece)
+            if add:
+                add(piece)
+        if builder is None:
+            raise DataError("there is no recording to judge")
+        right = builder.right_windows()
+        if windows is not None or right == builder.windows:
+            return builder
+        windows = right
 
 
 def _windows(recording: Recording, events: Iterable[Event], end: int) -> Windows:
