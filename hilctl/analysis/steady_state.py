@@ -32,12 +32,6 @@ class SteadyPart:
     cycle: MeanCycle | None
     loop: F64
 
-    @property
-    def raw_error_um(self) -> F64:
-        """Finite displacement less reference, in um."""
-        error = self.samples.displacement_um - self.samples.reference_um
-        return error[np.isfinite(error)]
-
 
 @dataclass(frozen=True, slots=True)
 class Overview(Recording):
