@@ -1,8 +1,7 @@
-"""All recordings in a folder: read from head and tail of each file, searched with SQLite.
+"""Catalogue of the recordings in a folder: facts from both ends of each file, queries in SQLite.
 
-Each user has a cache of their own, so that recordings may be on a shared disk that is read-only. A
-file is known by its path, size and modification time. Only finished recordings are taken from the
-cache: the others may still change.
+The cache is per user, because recordings may be on a read-only shared disk. Its key is path, size
+and modification time of a file. Only finished recordings are cached; others may still change.
 """
 
 import hashlib
@@ -30,7 +29,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 Entry: TypeAlias = dict[str, Any]
-"""One recording by the names of :data:`COLUMNS`; None where something is not known."""
+"""One recording, by the names of :data:`COLUMNS`; unknown values are None."""
 
 _RUN: dict[str, type] = {
     **dict.fromkeys(("run_id", "name", "description", "started"), str),
@@ -45,7 +44,7 @@ _END: dict[str, type] = {
     **dict.fromkeys(END_FIGURES, float),
 }
 OPTIONS = ("device", "waveform")
-"""Facts of a run whose names begin so, and a point, are kept together in the column ``options``."""
+"""Prefixes of the facts in the column ``options``."""
 COLUMNS: dict[str, type] = {
     "path": str,
     "state": str,
@@ -60,7 +59,7 @@ COLUMNS: dict[str, type] = {
     LABELS_FACT: dict,
     "options": dict,
 }
-"""Names and types of what is known of a recording.
+"""Names and types of the columns.
 
 ``path`` is relative to the folder that was listed, ``state`` that of
 :class:`hilctl.recording.run_summary.RunSummary`, or ``unreadable``, ``waveform`` its text,
@@ -76,7 +75,7 @@ _SQL_TYPES = {str: "TEXT", int: "INTEGER", bool: "INTEGER", float: "REAL", dict:
 _CREATE = "CREATE TABLE recordings ({})".format(
     ", ".join(f"{name} {_SQL_TYPES[kind]}" for name, kind in COLUMNS.items())
 )
-_CACHE_VERSION = 1  # what the columns mean; a cache with other columns is not read either
+_CACHE_VERSION = 1  # increment if the meaning of a column changes
 _TOKEN = re.compile(
     r"""'[^']*' | "(?P<text>[^"]*)" | \[(?P<bracketed>[^]]*)\]
     | \b(?P<dotted>(?:label|device|waveform)(?:\.\w+)+)""",
@@ -99,13 +98,13 @@ def keys_of(entries: Iterable[Entry]) -> list[str]:
 def select(
     entries: Sequence[Entry], where: str = "", sort: str = "started", *, reverse: bool = False
 ) -> list[Entry]:
-    """Return the recordings that meet a condition, sorted.
+    """Return the recordings that match a condition, sorted.
 
     Args:
         entries: The recordings.
         where: A condition in the SQL of SQLite on the names of :func:`keys_of`; empty for all. A
-            text may be in double quotes too. A key that is not made of words is in square
-            brackets, as ``[label.batch no]``.
+            text may be in double quotes. A key with other characters is in square brackets, such
+            as ``[label.batch no]``.
         sort: Key to sort by; recordings without it are last.
         reverse: Largest or newest first.
 
@@ -132,7 +131,7 @@ def select(
 
 
 def _refuse_chains(condition: str) -> None:
-    """Raise ValueError for ``10 < x < 100``, which SQLite takes for ``(10 < x) < 100``."""
+    """Raise ValueError for ``10 < x < 100``, which SQLite reads as ``(10 < x) < 100``."""
     if any(found["chain"] for found in _CHAIN.finditer(condition)):
         raise ValueError("two comparisons need AND between them: x > 10 AND x < 100")
 
@@ -174,7 +173,7 @@ def _quoted(text: str) -> str:
 def _to_sql(value: Any) -> Any:
     if isinstance(value, dict):
         value = json.dumps(value, ensure_ascii=False)
-    # An escape in JSON of a recording may be half of a character, which is not valid UTF-8.
+    # A JSON escape in a recording may be half a character, which is not valid UTF-8.
     return value.encode(errors="backslashreplace").decode() if isinstance(value, str) else value
 
 
@@ -185,14 +184,14 @@ def _from_sql(kind: type, value: Any) -> Any:
 
 
 class CatalogueHit(NamedTuple):
-    """A file as it lies in a folder.
+    """A file in a listed folder.
 
     Attributes:
         file: The file.
-        path: Its name below the folder that is listed, as text that can be kept.
+        path: Its path in the listed folder, as printable text.
         size_bytes: Its size.
-        mtime_ns: Its time of modification, Unix time in ns.
-        problem: Why it can't be a recording; empty where it can.
+        mtime_ns: Its modification time, Unix time in ns.
+        problem: Why it cannot be a recording, or empty.
     """
 
     file: str
@@ -203,7 +202,7 @@ class CatalogueHit(NamedTuple):
 
 
 def read_catalogue(folder: Path) -> list[Entry]:
-    """Return what is known of all ``.mcap`` files in a folder, at any depth, sorted by path.
+    """Return the entries of all ``.mcap`` files in a folder, at any depth, sorted by path.
 
     Raises:
         InputError: It is not a folder, or cannot be listed.
@@ -241,11 +240,11 @@ def _cache_file(folder: Path) -> Path | None:
 
 
 def _read_cache(path: Path | None) -> list[Entry]:
-    """Return the recordings in a cache; none if it is missing or damaged."""
+    """Return the entries in a cache; none if it is missing or damaged."""
     if path is None:
         return []
     try:
-        # A cache file never changes: it is replaced as a whole.
+        # Immutable: a cache file is only replaced.
         with closing(sqlite3.connect(f"{path.as_uri()}?immutable=1", uri=True)) as db:
             return [
                 {
@@ -278,11 +277,11 @@ def _entry(found: CatalogueHit) -> Entry:
 
 
 def _scan(folder: str, below: str) -> Iterator[CatalogueHit]:
-    """Yield every recording below a folder; links to folders are not followed, they may lead round.
+    """Yield the recordings in a folder; links to folders are not followed, to avoid cycles.
 
     Args:
         folder: The folder.
-        below: Its name below the one that is listed, with a slash; empty for that one.
+        below: Its path in the listed folder, with a slash; empty for that folder.
     """
     try:
         with os.scandir(folder) as listed:
@@ -308,25 +307,24 @@ def _found(entry: "os.DirEntry[str]", path: str) -> CatalogueHit:
 
 
 def unreadable(path: str, size_bytes: int, mtime_ns: int, problem: str) -> Entry:
-    """Return the entry of what is no recording that can be read."""
+    """Return the entry of an unreadable file."""
     known: Entry = {"path": path, "size_bytes": size_bytes, "mtime_ns": mtime_ns}
     known |= {"state": "unreadable", "problem": problem, LABELS_FACT: {}, "options": {}}
     return dict.fromkeys(COLUMNS) | known
 
 
 def entry_of(file: Path, path: str, size_bytes: int, mtime_ns: int) -> Entry:
-    """Return the entry of a file, by its head and its tail.
+    """Return the entry of a file, by both its ends.
 
     Args:
         file: The file.
         path: Its name in the catalogue.
-        size_bytes: Its size when it was found.
-        mtime_ns: Its time of modification then, in ns.
+        size_bytes: Its size.
+        mtime_ns: Its modification time, in ns.
     """
-    # What reads recordings takes a second to import: a catalogue that is known needs none of it.
+    # A cached catalogue does not need these imports, which take a second.
     from hilctl.recording.run_summary import read_ends
-    from hilctl.recording.segments import segments_of
-    from hilctl.recording.validation import labels_of
+    from hilctl.recording.validation import labels_of, segments_of
 
     entry = unreadable(path, size_bytes, mtime_ns, "")
     try:
@@ -362,7 +360,7 @@ def _of_segments(segments: "Sequence[Segment]", sample_rate_hz: float | None) ->
 
 
 def _converted(kind: type, text: str | None) -> Any:
-    """Return a fact as a value; None where it is missing or none of that kind."""
+    """Return a fact as a value; None if it is missing or of another kind."""
     if text is None or kind is str:
         return text
     if kind is bool:
@@ -377,7 +375,7 @@ def _converted(kind: type, text: str | None) -> Any:
 
 
 def _plain(text: str) -> str | float | bool:
-    """Return a text as the number or truth value that it stands for, if it does for one."""
+    """Return a text as a number or truth value, if it is one."""
     if text in _BOOLEANS:
         return _BOOLEANS[text]
     try:

@@ -1,20 +1,18 @@
-"""What plots need of a recording of any length, in bounded memory.
+"""Decimation of long recordings for plots, in bounded memory.
 
-A recording that is short enough is taken as it is. Of a longer one every spike stays: of each even
-stretch the samples with the lowest and the highest displacement, reference, command and error are
-kept, and all of the last samples that are judged of each segment.
+A short recording is kept. Of a longer one, each interval keeps the samples with the lowest and the
+highest displacement, reference, command and error, and each segment its last evaluated samples.
 """
 
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields, replace
 
 import numpy as np
 
-from hilctl.analysis.report import RunReportBuilder, Windows
+from hilctl.analysis.report import Windows, build_report
 from hilctl.analysis.run_metrics import RunReport
 from hilctl.analysis.steady_state import Overview, SteadyPart, trusted
-from hilctl.base.errors import DataError
 from hilctl.base.events import Event
 from hilctl.base.samples import Samples
 from hilctl.base.types import F64, I64
@@ -22,7 +20,7 @@ from hilctl.recording.recording import Recording, Ticks
 from hilctl.signals.cycle_metrics import MeanCycle
 
 MOST_SAMPLES = 2**22
-"""Most samples of a recording that is taken as it is."""
+"""Most samples of a recording that is not decimated."""
 
 _STRETCHES = 2**16  # a plot has 4000 points
 _LAST_SAMPLES = 2**18  # all segments together
@@ -30,46 +28,32 @@ _MOST_TICKS = 2**20
 
 
 def overview(pieces: Iterable[Recording]) -> tuple[RunReport, Recording]:
-    """Return the figures of a recording, and one whose plots are those of the whole.
+    """Return the report of a recording, and a decimated recording with the same plots.
 
-    Of its ticks, where they are many, every so manieth is there, and the latest.
+    Ticks are decimated evenly; the latest one is kept.
 
     Args:
-        pieces: The run in order, which can be gone through again: one that ended early or was tuned
-            is read twice.
+        pieces: Pieces of the run in order, as a repeatable iterable: a run that ended early or was
+            tuned is read twice.
 
     Raises:
         DataError: As :func:`hilctl.analysis.report.summarize` does.
     """
-    planned: Windows | None = None
-    for _ in range(2):
-        gathering, shown = _gathered(pieces, planned)
-        planned = gathering.right_windows()
-        if planned == gathering.windows:
-            break
-    return gathering.report(), shown.recording(gathering.cycles())
+    shown: list[_Shown] = []
 
+    def observe(windows: Windows) -> Callable[[Recording], None]:
+        shown[:] = [_Shown(windows)]
+        return shown[0].add
 
-def _gathered(
-    pieces: Iterable[Recording], windows: Windows | None
-) -> tuple[RunReportBuilder, "_Shown"]:
-    gathering: RunReportBuilder | None = None
-    for piece in pieces:
-        if gathering is None:
-            gathering = RunReportBuilder(piece, windows)
-            shown = _Shown(gathering.windows)
-        gathering.add(piece)
-        shown.add(piece)
-    if gathering is None:
-        raise DataError("there is no recording to show")
-    return gathering, shown
+    builder = build_report(pieces, observe)
+    return builder.report(), shown[0].recording(builder.cycles())
 
 
 class _Shown:
-    """Gathers what plots need of a recording.
+    """Builder of the recording for plots.
 
     Args:
-        windows: What is judged of it.
+        windows: Evaluated samples of each segment.
     """
 
     def __init__(self, windows: Windows) -> None:
@@ -89,7 +73,7 @@ class _Shown:
                 self._thinned.add(self._held.pop(0))
 
     def recording(self, cycles: Sequence[MeanCycle | None]) -> Recording:
-        """Return it, at the end, when the average cycle of each segment is known."""
+        """Return the recording, with the average cycle of each segment."""
         return self._thinned.recording(cycles) if self._thinned else _joined(self._held)
 
 
@@ -118,7 +102,7 @@ def _ticks_of(parts: list[Ticks]) -> Ticks:
 
 
 class _Thinned:
-    """Thins out what plots do not show."""
+    """Builder of a decimated recording."""
 
     def __init__(self, windows: Windows) -> None:
         self._windows = windows
@@ -143,7 +127,7 @@ class _Thinned:
         rows = _extreme_rows(piece.samples, self._per_stretch)
         self._shown.append(_rows_of(piece.samples, rows))
         self._size += rows.size
-        if self._size > MOST_SAMPLES:  # longer than was planned
+        if self._size > MOST_SAMPLES:  # longer than planned
             self._per_stretch *= 4
             together = _samples_of(self._shown)
             rows = _extreme_rows(together, 32)
@@ -163,7 +147,7 @@ class _Thinned:
 
 
 def _extreme_rows(samples: Samples, per_stretch: int) -> I64:
-    """Return the rows of each stretch in which a signal is lowest or highest, and its first."""
+    """Return the first row of each interval, and those in which a signal is lowest or highest."""
     whole = samples.index.size // per_stretch * per_stretch
     places = np.arange(0, whole, per_stretch)
     rows = [places, np.arange(whole, samples.index.size)]
@@ -179,7 +163,7 @@ def _extreme_rows(samples: Samples, per_stretch: int) -> I64:
 
 
 def _with(samples: Samples, more: list[Samples]) -> Samples:
-    """Return samples and others, in order and each once."""
+    """Return the union of samples, in order."""
     together = _samples_of([samples, *more])
     _, rows = np.unique(together.index, return_index=True)
     return _rows_of(together, rows)
@@ -191,10 +175,10 @@ def _rows_of(samples: Samples, rows: I64) -> Samples:
 
 
 class _Part:
-    """Gathers the last steady samples of a segment.
+    """Last steady samples of a segment.
 
     Args:
-        window: Its judged samples: first, after the last, whole cycles.
+        window: Its evaluated samples: first, after the last, whole cycles.
         most: Most samples to keep.
     """
 
@@ -225,7 +209,7 @@ class _Part:
         return _samples_of(list(self._kept)).rows(slice(-self._most, None))
 
     def steady_part(self, cycle: MeanCycle | None) -> SteadyPart:
-        """Return it with the average cycle of all of its samples; None where it has no cycle."""
+        """Return the steady part with the average cycle of all its samples, if it has one."""
         samples = self.last_samples()
         if cycle is None:
             loop = self._loop(samples)
@@ -236,7 +220,7 @@ class _Part:
 
 
 class _SampledTicks:
-    """Keeps every so manieth tick, and the latest."""
+    """Evenly decimated ticks, and the latest one."""
 
     def __init__(self) -> None:
         self._every = 1

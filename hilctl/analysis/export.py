@@ -1,38 +1,53 @@
-"""A recording's samples as a table for other programs: CSV, NumPy, Parquet, MATLAB.
+"""Export of samples as tables: one recording, or all recordings of a folder as a data set.
 
-Numbers are kept bit for bit. What a format can't hold beside the columns is left out: CSV has no
-place for the facts of the run.
+Numbers are kept bit for bit. CSV files have no place for the facts of the run.
 """
 
 import json
+import re
 from collections import deque
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import BinaryIO
+from urllib.parse import quote
 
-from hilctl.analysis.export_files import FORMATS, ColumnFile, Columns, Facts, ParquetFile
+import numpy as np
+
+from hilctl.analysis.catalogue import Entry, read_catalogue
+from hilctl.analysis.export_files import FORMATS, ColumnFile, Columns, Facts, ParquetFile, arrow
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.files import check_writable, write_file
-from hilctl.base.samples import COLUMNS
+from hilctl.base.samples import COLUMNS, RECORDED_FIELDS
+from hilctl.recording.reader import RecordingStream
 from hilctl.recording.recording import Recording
 
 _MOST_WAITING = 4  # pieces: as many as fill a row group
+_UNKNOWN = "__HIVE_DEFAULT_PARTITION__"
+_DATE = re.compile(r"\d{4}-\d\d-\d\d")
+_MOST_BYTES = 72  # three times as many when escaped; a file name has 255
+_RUN_ID = 8
+_ADVICE = {
+    "recording": "is still being recorded",
+    "unfinished": "was cut short: 'hilctl recover' makes it whole",
+}
 
 
 def export(
     recording: Recording | Iterable[Recording], path: Path, *, overwrite: bool = False
 ) -> int:
-    """Write samples to a file whose suffix says the format; it appears whole or not at all.
+    """Write samples atomically to a file in the format of its suffix.
 
     Columns are ``sample``, ``t_s`` (since the start of the run), those of
-    :class:`hilctl.base.samples.Samples` under the names they are recorded by, and ``flags``.
-    ``measured_a`` or ``measured_v`` is there where the device measures it. NPZ, Parquet and MATLAB
-    files also hold the facts of the run and the experiment and model as YAML.
+    :class:`hilctl.base.samples.Samples` under their recorded names, and ``flags``. ``measured_a``
+    or ``measured_v`` exists if the device measures it. NPZ, Parquet and MATLAB files also have the
+    facts of the run, and the experiment and model as YAML.
 
     Args:
-        recording: The run, or its pieces in order, so that memory does not grow with its length
+        recording: The run, or its pieces in order for bounded memory
             (:class:`hilctl.recording.reader.RecordingStream`).
         path: File to write: ``.csv``, ``.npz``, ``.parquet`` or ``.mat``.
         overwrite: Replace a file of that name.
@@ -41,7 +56,7 @@ def export(
         Number of samples written.
 
     Raises:
-        InputError: Unknown suffix, a file of that name exists, it can't be written or hold as many
+        InputError: Unknown suffix, the file exists, cannot be written or cannot hold as many
             samples, or pyarrow is missing.
         DataError: There is no sample.
     """
@@ -55,7 +70,7 @@ def export(
 
     def write(stream: BinaryIO) -> None:
         nonlocal rows
-        with TemporaryFile(dir=path.parent) as aside:  # where there is room for the file itself
+        with TemporaryFile(dir=path.parent) as aside:  # on the same file system
             rows = write_pieces(pieces, begin(stream, aside))
 
     write_file(path, write, overwrite=overwrite)
@@ -67,12 +82,12 @@ def write_pieces(
     file: ColumnFile,
     table_of: Callable[[Recording], Columns] | None = None,
 ) -> int:
-    """Write the samples of pieces, and what the last of them says of the run.
+    """Write the samples of pieces, and the facts of the last one.
 
     Args:
         pieces: At least one, in order.
         file: Where to write.
-        table_of: Gives the columns of a piece; :func:`columns` where None.
+        table_of: Returns the columns of a piece; :func:`columns` by default.
 
     Returns:
         Number of samples written.
@@ -82,7 +97,7 @@ def write_pieces(
     """
     rows = 0
     waiting: deque[Future[None]] = deque()
-    # The next pieces are read while these are compressed, as both leave the interpreter to others.
+    # Reading and compressing run in parallel, because both release the interpreter lock.
     with ThreadPoolExecutor(1, thread_name_prefix="export") as worker:
         for piece in pieces:
             if piece.samples.index.size:
@@ -103,7 +118,7 @@ def _add(file: ColumnFile, piece: Recording, table_of: Callable[[Recording], Col
 
 
 def columns(recording: Recording) -> Columns:
-    """Return the columns that :func:`export` writes, by name."""
+    """Return the columns of an export by name."""
     samples = recording.samples
     named = {
         COLUMNS[name].field(recording.command_unit).name: values
@@ -121,7 +136,7 @@ def units(recording: Recording) -> dict[str, str]:
 
 
 def facts(recording: Recording) -> Facts:
-    """Return what is kept beside the columns: JSON of the run's facts, and YAML texts."""
+    """Return the facts of the run as JSON texts, and its YAML texts."""
     run = {
         **recording.run,
         "sample_rate_hz": recording.sample_rate_hz,
@@ -139,7 +154,7 @@ def facts(recording: Recording) -> Facts:
 
 
 def write_parquet(stream: BinaryIO, table: Columns, facts: Facts) -> None:
-    """Write columns, of NumPy or of Arrow, and facts as the file's metadata.
+    """Write columns of NumPy or Arrow, with facts as metadata.
 
     Raises:
         InputError: pyarrow is missing.
@@ -147,3 +162,104 @@ def write_parquet(stream: BinaryIO, table: Columns, facts: Facts) -> None:
     file = ParquetFile(stream)
     file.add(table)
     file.finish(facts)
+
+
+@dataclass(slots=True)
+class ExportedAll:
+    """Result of the export of a folder.
+
+    Attributes:
+        written: Files written.
+        there: Files that existed and were not changed.
+        left_out: Reason why a recording was not written, by its path in the folder.
+    """
+
+    written: int = 0
+    there: int = 0
+    left_out: dict[str, str] = field(default_factory=dict)
+
+
+def export_all(
+    folder: Path, output: Path, on_progress: Callable[[float, str], None]
+) -> ExportedAll:
+    """Write each finished recording to ``output/name=NAME/date=DATE/FILE-RUN.parquet``.
+
+    The files form one Hive-style data set with the same columns in all files. A column that a run
+    does not have is null, and so is NaN, which databases order above all numbers. Files are written
+    atomically and never replaced; another call continues an interrupted export.
+
+    Args:
+        folder: Folder with recordings, at any depth.
+        output: Folder to write to; created if missing.
+        on_progress: Called with the completed share and the next recording.
+
+    Raises:
+        InputError: The folder cannot be listed, a file cannot be written, or pyarrow is missing.
+    """
+    arrow()  # fails before any work is done
+    entries = read_catalogue(folder)
+    done = ExportedAll()
+    sources: dict[Path, str] = {}
+    for number, entry in enumerate(entries):
+        path = entry["path"]
+        on_progress(number / len(entries), path)
+        target = output / place_of(entry)
+        if entry["state"] != "finished":
+            done.left_out[path] = entry["problem"] or _ADVICE[entry["state"]]
+        elif (other := sources.setdefault(target, path)) != path:
+            done.left_out[path] = f"is the same run as {other}"
+        elif target.exists():
+            done.there += 1
+        else:
+            _export_one(folder / path, target, path, done)
+    on_progress(1.0, "")
+    return done
+
+
+def _export_one(source: Path, target: Path, path: str, done: ExportedAll) -> None:
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{target.parent}: can't be made: {error.strerror}") from None
+    try:
+        write_file(
+            target,
+            lambda stream: write_pieces(RecordingStream(source), ParquetFile(stream), _uniform),
+            overwrite=False,
+        )
+    except DataError as error:
+        with suppress(OSError):  # other files are in them
+            target.parent.rmdir()
+            target.parent.parent.rmdir()
+        done.left_out[path] = str(error).removeprefix(f"{source}: ")
+        return
+    done.written += 1
+
+
+def place_of(entry: Entry) -> Path:
+    """Return the path of a recording in the data set: its partitions and its file."""
+    started = entry["started"] or ""
+    date = started[:10] if _DATE.match(started) else _UNKNOWN
+    name = _escaped(entry["name"] or "") or _UNKNOWN
+    file = f"{_escaped(Path(entry['path']).stem)}-{_escaped(entry['run_id'] or 'run')[:_RUN_ID]}"
+    return Path(f"name={name}") / f"date={date}" / f"{file}.parquet"
+
+
+def _escaped(text: str) -> str:
+    """Return a text escaped as in the paths of Hive: ``%`` and two digits."""
+    return quote(text.encode()[:_MOST_BYTES], safe="")
+
+
+def _uniform(recording: Recording) -> Columns:
+    pa = arrow()
+    given = columns(recording)
+    rows = given["sample"].size
+    nulls = pa.nulls(rows, pa.float64())
+    known = {name: pa.array(values, from_pandas=True) for name, values in given.items()}
+    run_id = recording.run.get("run_id", "")
+    return {
+        "run_id": pa.DictionaryArray.from_arrays(np.zeros(rows, dtype=np.int32), [run_id]),
+        **{name: known[name] for name in ("sample", "t_s")},
+        **{each.name: known.get(each.name, nulls) for each in RECORDED_FIELDS},
+        "flags": known["flags"],
+    }

@@ -1,7 +1,7 @@
-"""Files of columns that come a piece at a time: CSV, NumPy, Parquet, MATLAB.
+"""Writers of column files: CSV, NumPy, Parquet, MATLAB.
 
-None holds more than a piece in memory. Where a format wants a column as a whole, or its length
-first, the columns are put aside on the disk.
+They keep one piece in memory. For formats that need whole columns, or their length first, columns
+are stored in a temporary file.
 """
 
 import struct
@@ -20,41 +20,41 @@ Facts: TypeAlias = Mapping[str, str]
 
 _CSV_ROWS = 20_000
 _GROUP_ROWS = 2**20  # as pyarrow has it
-_BATCH_ROWS = 2**16  # that are encoded at once; pages are of as many or twice that
-_WRITTEN_BYTES = 2**21  # at once: Arrow waits for the interpreter each time, at every page
-_LARGEST_MAT_BYTES = 2**31 - 1  # of a variable, as MATLAB reads files of this version
+_BATCH_ROWS = 2**16  # encoded together; a page has as many or twice that
+_WRITTEN_BYTES = 2**21  # per write: Arrow waits for the interpreter at each one
+_LARGEST_MAT_BYTES = 2**31 - 1  # per variable in this version of the format
 _MAT_HEADER_BYTES = 128
 _MATRIX, _DIMENSIONS, _NAME, _FLAGS = 14, 5, 1, 6
 _MAT_KINDS = {"int64": (14, 12), "float64": (6, 9), "uint32": (13, 6)}
 
 
 class ColumnFile(Protocol):
-    """A file in the making."""
+    """A file being written."""
 
     def add(self, columns: Columns) -> None:
         """Write more rows; the columns are those of the first call.
 
         Raises:
-            OSError: The disk refuses.
-            InputError: The format can't hold them.
+            OSError: The disk rejects them.
+            InputError: The format cannot hold them.
         """
         ...
 
     def finish(self, facts: Facts) -> None:
-        """Write the rest, and what is kept beside the columns.
+        """Write the remaining rows and the facts.
 
         Raises:
-            OSError: The disk refuses.
+            OSError: The disk rejects them.
         """
         ...
 
 
 class CsvFile:
-    """Lines of numbers; there is no place for facts.
+    """CSV file, without facts.
 
     Args:
-        stream: Where to write.
-        aside: Left empty.
+        stream: Output.
+        aside: Unused.
     """
 
     def __init__(self, stream: BinaryIO, aside: IO[bytes] | None = None) -> None:
@@ -63,7 +63,7 @@ class CsvFile:
         self._line = ""
 
     def add(self, columns: Columns) -> None:
-        """Write rows; ``%r`` is the shortest text that reads back as the same bits."""
+        """Write rows; ``%r`` is the shortest text with the same bits when read back."""
         if not self._line:
             kinds = ("%d" if each.dtype.kind in "iu" else "%r" for each in columns.values())
             self._line = ",".join(kinds) + "\n"
@@ -78,10 +78,10 @@ class CsvFile:
 
 
 class _RefusedOnce:
-    """A stream for Arrow, which tries again what was refused, and prints that it was in vain.
+    """Output of Arrow that raises only once, because Arrow repeats failed writes and prints errors.
 
     Args:
-        stream: Where it goes; it stays open.
+        stream: Output; it stays open.
     """
 
     def __init__(self, stream: BinaryIO) -> None:
@@ -105,13 +105,13 @@ class _RefusedOnce:
 
 
 class ParquetFile:
-    """Row groups of a million or two; facts are the schema's metadata.
+    """Parquet file with row groups of one or two million rows, and facts as schema metadata.
 
-    Columns may be of NumPy or of Arrow.
+    Columns may be of NumPy or Arrow.
 
     Args:
-        stream: Where to write.
-        aside: Left empty.
+        stream: Output.
+        aside: Unused.
 
     Raises:
         InputError: pyarrow is missing.
@@ -126,15 +126,15 @@ class ParquetFile:
         self._waiting: list[Any] = []
 
     def add(self, columns: Columns) -> None:
-        """Write a row group where there is enough for one, else keep the rows."""
+        """Keep the rows, and write a row group when there are enough."""
         self._waiting.append(self._table(columns))
         if sum(each.num_rows for each in self._waiting) >= _GROUP_ROWS:
             self._write()
 
     def _table(self, columns: Columns) -> Any:
-        """Return a table whose schema says which columns can't have nulls.
+        """Return a table whose schema marks columns without nulls.
 
-        To look for them in numbers of NumPy, which have none, takes a third of the writing.
+        A search for nulls in NumPy numbers, which have none, takes a third of the writing time.
         """
         table = self._pa.table(dict(columns))
         fields = [each.with_nullable(not _is_full(columns[each.name])) for each in table.schema]
@@ -159,15 +159,15 @@ class ParquetFile:
             return
         rows, self._waiting = self._pa.concat_tables(self._waiting), []
         if self._writer is None:
-            # Where the facts are not known yet, the schema that holds them is stored at the end.
+            # If the facts are not known yet, their schema is stored at the end.
             self._writer = self._begun(rows.schema, store_schema=store_schema)
         self._writer.write_table(rows, row_group_size=2 * _GROUP_ROWS)
 
     def _begun(self, schema: Any, *, store_schema: bool) -> Any:
-        """Return a writer that looks for repeated values only in columns that are of few.
+        """Return a writer with an encoding per column.
 
-        Measured numbers hardly repeat, but lie near one another: with like bytes side by side they
-        take half the space, in a third of the time.
+        Measured numbers seldom repeat but are close to one another: split into streams of bytes
+        they take half the space and a third of the time of a dictionary.
         """
         from pyarrow import parquet
 
@@ -187,12 +187,12 @@ class ParquetFile:
 
 
 def _is_full(values: Any) -> bool:
-    """Return whether a column is of NumPy's numbers, and so without nulls."""
+    """Return whether a column has NumPy numbers, and thus no nulls."""
     return isinstance(values, np.ndarray) and values.dtype.kind in "iuf"
 
 
 class _Aside:
-    """Columns put aside in one file, a piece of each after the other."""
+    """Temporary file of columns, one piece after the other."""
 
     def __init__(self, file: IO[bytes]) -> None:
         self._file = file
@@ -215,11 +215,11 @@ class _Aside:
 
 
 class NpzFile:
-    """An archive of arrays; facts are texts beside them.
+    """NumPy archive of columns, and of facts as texts.
 
     Args:
-        stream: Where to write.
-        aside: An empty file, for the columns until their length is known.
+        stream: Output.
+        aside: Empty temporary file.
     """
 
     def __init__(self, stream: BinaryIO, aside: IO[bytes]) -> None:
@@ -227,7 +227,7 @@ class NpzFile:
         self._aside = _Aside(aside)
 
     def add(self, columns: Columns) -> None:
-        """Put rows aside."""
+        """Store rows."""
         self._aside.add(columns)
 
     def finish(self, facts: Facts) -> None:
@@ -246,11 +246,11 @@ class NpzFile:
 
 
 class MatFile:
-    """Column vectors of a MATLAB 5 file; facts are texts beside them.
+    """MATLAB 5 file of column vectors, and of facts as texts.
 
     Args:
-        stream: Where to write.
-        aside: An empty file, for the columns until their length is known.
+        stream: Output.
+        aside: Empty temporary file.
     """
 
     def __init__(self, stream: BinaryIO, aside: IO[bytes]) -> None:
@@ -258,7 +258,7 @@ class MatFile:
         self._aside = _Aside(aside)
 
     def add(self, columns: Columns) -> None:
-        """Put rows aside."""
+        """Store rows."""
         self._aside.add(columns)
         if 8 * self._aside.rows > _LARGEST_MAT_BYTES:
             most = _LARGEST_MAT_BYTES // 8
@@ -267,7 +267,7 @@ class MatFile:
             )
 
     def finish(self, facts: Facts) -> None:
-        """Write the file: what SciPy would, which wants each column in memory, twice."""
+        """Write the file as SciPy does, which needs twice the memory of each column."""
         self._stream.write(_saved({})[:_MAT_HEADER_BYTES])
         for name, kind in self._aside.kinds.items():
             size = kind.itemsize * self._aside.rows
@@ -287,10 +287,10 @@ def _saved(facts: Facts) -> bytes:
 
 
 def _mat_head(name: str, kind: np.dtype[Any], rows: int) -> bytes:
-    """Return what stands before the numbers of a column vector.
+    """Return the header of a column vector.
 
-    Source: MAT-File Format, The MathWorks, version 5: a matrix is its flags with the class,
-    dimensions, name and numbers; each begins with its kind and bytes, and goes on to 8 bytes.
+    Source: MAT-File Format, The MathWorks, version 5: a matrix has flags with its class,
+    dimensions, name and numbers; each starts with its kind and size, and is padded to 8 bytes.
     """
     matrix_class, number_kind = _MAT_KINDS[kind.name]
     size = kind.itemsize * rows
@@ -326,4 +326,4 @@ FORMATS: dict[str, Callable[[BinaryIO, IO[bytes]], ColumnFile]] = {
     ".parquet": ParquetFile,
     ".mat": MatFile,
 }
-"""What writes a file, by its suffix."""
+"""Writer per suffix."""

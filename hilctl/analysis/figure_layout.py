@@ -1,33 +1,47 @@
-"""A figure before its size is known: panels that are drawn into axes, for any column's width.
+"""Figures of several panels: layout for the columns of journals and pages, and files.
 
-The widths are those of journals, and letters are as large in all of them. So one figure serves in
-print, and on a page beside others, or below them on a phone.
+Text has the same size in all widths, so that one figure serves in print and on a page.
 """
 
-from collections.abc import Callable
+import io
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from textwrap import wrap
-from typing import Any, Literal, TypeAlias
+from typing import Any, BinaryIO, Literal, TypeAlias
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from hilctl.analysis.plot_style import STYLE
+from hilctl.base.errors import InputError
+from hilctl.base.files import write_file
 
 ColumnWidth: TypeAlias = Literal["single", "double"]
 
 COLUMN_MM: dict[ColumnWidth, float] = {"single": 85.0, "double": 175.0}
 """Widths of one and of two columns of most journals."""
 
+FORMATS = ("svg", "pdf", "png")
+"""Formats of files, the vectors first."""
+UNDATED_SVG: dict[str, Any] = {"Date": None, "Creator": None, "Format": None, "Type": None}
+"""Metadata that makes the bytes of equal figures equal."""
+
+_DPI = 600  # of PNG files, as journals require for line drawings
+_UNDATED: dict[str, Any] = {
+    "svg": UNDATED_SVG,
+    "pdf": {"CreationDate": None},
+    "png": {"Software": None},
+}
 _MM_PER_INCH = 25.4
 _LEGEND_LINE_MM = 3.6
 _SPARE_MM = 4.0
-_CHARACTER_MM = 1.5  # of a letter, on the average
+_CHARACTER_MM = 1.5  # average width
 _HANDLE_MM = 9.0
 _NAMES_MM = 14.0  # of an axis and its ticks, beside a title
 _LEAST_MM = 48.0
-_FEWEST_NAMED = 2  # what stands alone is named by its axes
+_FEWEST_NAMED = 2  # a single line is named by its axes
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,9 +49,9 @@ class Panel:
     """One pair of axes.
 
     Attributes:
-        draw: Draws into axes, and names them.
-        title: What it shows; a letter comes before it where there are several.
-        height: Of its width, in a column of its own.
+        draw: Draws into axes and labels them.
+        title: Title, prefixed by a letter if there are several panels.
+        height: Share of its width, in a column of its own.
     """
 
     draw: Callable[[Axes], None]
@@ -50,13 +64,13 @@ class FigureSpec:
     """A figure of one or more panels, with one legend below all of them.
 
     Attributes:
-        name: Short name, of its file.
-        caption: What it shows, for people.
+        name: Name of its file.
+        caption: Caption.
         panels: The panels.
-        alike: Whether panels have the same axes: then they stand two abreast in a single column,
-            and only the outer ones are named.
-        stacked: Whether they share the axis along and stand one below the other.
-        most_beside: Most panels beside each other in two columns.
+        alike: Whether panels have the same axes: then a single column has two side by side, and
+            only the outer axes have labels.
+        stacked: Whether panels share the x axis, one below the other.
+        most_beside: Most panels side by side in two columns.
     """
 
     name: str
@@ -73,7 +87,7 @@ def drawn(sheet: FigureSpec, width: ColumnWidth = "single") -> Figure:
 
     Args:
         sheet: The figure.
-        width: Of one column of a journal, or of two.
+        width: One column of a journal, or two.
     """
     columns = _columns(sheet, width)
     rows = -(-len(sheet.panels) // columns)
@@ -106,14 +120,14 @@ def drawn(sheet: FigureSpec, width: ColumnWidth = "single") -> Figure:
         _name_outer(grid, len(sheet.panels))
     _legend(figure, [axes for axes in grid.flat if axes.axison], whole_mm)
     if (layout := figure.get_layout_engine()) is not None:
-        # Once, as it takes half the time of a figure: a file of each format would do it again.
+        # Once for all formats, because it takes half the time of a figure.
         layout.execute(figure)
         figure.set_layout_engine("none")
     return figure
 
 
 def _height_mm(panel: Panel, width_mm: float) -> float:
-    """Return the height of a panel; a narrow one is not made flat, its ticks need the room."""
+    """Return the height of a panel; ticks need a minimum in a narrow one."""
     highest_mm = panel.height * COLUMN_MM["single"]
     return min(max(panel.height * width_mm, _LEAST_MM), highest_mm) + _SPARE_MM
 
@@ -128,7 +142,7 @@ def _columns(sheet: FigureSpec, width: ColumnWidth) -> int:
 
 
 def _name_outer(grid: Any, panels: int) -> None:
-    """Leave names of axes only where no other panel of the same axes stands between."""
+    """Keep the labels of the outer axes only."""
     rows, columns = grid.shape
     for row in range(rows):
         for column in range(columns):
@@ -140,7 +154,7 @@ def _name_outer(grid: Any, panels: int) -> None:
 
 
 def _legend(figure: Figure, drawn_axes: list[Axes], whole_mm: float) -> None:
-    """Name all that is drawn, once, below the panels; the figure grows by it."""
+    """Add one legend below the panels; the figure grows."""
     entries: dict[str, Any] = {}
     for axes in drawn_axes:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
@@ -155,3 +169,48 @@ def _legend(figure: Figure, drawn_axes: list[Axes], whole_mm: float) -> None:
     wide, high = figure.get_size_inches()
     figure.set_size_inches(wide, high + (lines * _LEGEND_LINE_MM + 1.0) / _MM_PER_INCH)
     figure.legend(list(entries.values()), list(entries), loc="outside lower center", ncols=columns)
+
+
+def formats_of(text: str) -> tuple[str, ...]:
+    """Return the formats of a list such as ``svg,pdf``.
+
+    Raises:
+        InputError: A format is unknown.
+    """
+    chosen = tuple(part.strip().lower() for part in text.split(",") if part.strip())
+    unknown = [each for each in chosen if each not in FORMATS]
+    if unknown or not chosen:
+        got = ", ".join(unknown) or repr(text)
+        raise InputError(f"--format: must be of {', '.join(FORMATS)}, commas between: {got}")
+    return tuple(dict.fromkeys(chosen))
+
+
+def write_figure(
+    figure: Figure, folder: Path, name: str, formats: Sequence[str], *, overwrite: bool
+) -> list[Path]:
+    """Write a figure atomically in several formats.
+
+    Returns:
+        The files, ``NAME.FORMAT`` in the folder.
+
+    Raises:
+        InputError: A file exists and may not be replaced, or cannot be written.
+    """
+    written = []
+    for chosen in formats:
+        path = folder / f"{name}.{chosen}"
+        content = _file(figure, chosen)
+
+        def write(stream: BinaryIO, content: bytes = content) -> None:
+            stream.write(content)
+
+        write_file(path, write, overwrite=overwrite)
+        written.append(path)
+    return written
+
+
+@mpl.rc_context(STYLE)
+def _file(figure: Figure, chosen: str) -> bytes:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format=chosen, dpi=_DPI, metadata=_UNDATED[chosen])
+    return buffer.getvalue()

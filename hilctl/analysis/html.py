@@ -1,20 +1,28 @@
-"""Parts of self-contained pages: no scripts, nothing fetched, figures within as SVG.
+"""Parts of self-contained pages without scripts; figures are SVG elements.
 
-Figures have the width of a journal's column, and letters of 8 points: so many stand abreast as have
-room, on paper two, on a phone one, and none is shrunk. In the dark they are turned: light becomes
-dark and hues stay.
+Figures have the width of a journal's column and text of 8 points: two side by side on paper, one on
+a phone. In dark mode their lightness is inverted.
 """
 
 import html
+import io
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+import matplotlib as mpl
 from matplotlib.figure import Figure
 
-from hilctl.analysis.figure_export import svg
-from hilctl.analysis.figure_layout import FigureSpec, drawn
+from hilctl.analysis.figure_layout import UNDATED_SVG, FigureSpec, drawn
+from hilctl.analysis.plot_style import STYLE
 from hilctl.base.files import write_text
 from hilctl.base.formatting import printable
+
+_METADATA = re.compile(r"<metadata>.*?</metadata>", re.DOTALL)
+_GROUP = re.compile(r'<g id="[^"]*"')
+_SIZE = re.compile(r'<svg[^>]*viewBox="([^"]*)"[^>]*>')
+_PATH = re.compile(r'\bd="[^"]*"')
+_DIGITS = re.compile(r"(\.\d\d)\d+")
 
 _CSS = """
 :root { color-scheme: light dark; --ink: #1c1c1c; --quiet: #666; --paper: #fff; --line: #ddd;
@@ -61,21 +69,21 @@ _HEAD = """<!DOCTYPE html>
 
 
 def write_page(page: str, path: Path) -> None:
-    """Write a page; one of that name is replaced.
+    """Write a page; an existing file is replaced.
 
     Raises:
-        InputError: It can't be written.
+        InputError: It cannot be written.
     """
     write_text(path, page, overwrite=True)
 
 
 def document(title: str, body: Iterable[str]) -> str:
-    """Return a whole page; title and body are HTML."""
+    """Return a page; title and body are HTML."""
     return "\n".join((_HEAD.format(title=title, css=_CSS), *body, "</body></html>\n"))
 
 
 def text(plain: str, *, lines: bool = False) -> str:
-    """Return a text, perhaps from a file, as HTML that shows it."""
+    """Return a text as escaped HTML."""
     return html.escape(printable(plain, lines=lines))
 
 
@@ -101,7 +109,7 @@ def grid(headings: Iterable[str], cells: Iterable[Iterable[str]], css: str = "")
 
 
 def figures(sheets: Iterable[FigureSpec]) -> str:
-    """Return figures with their captions, as many abreast as have room."""
+    """Return figures with captions, side by side if there is room."""
     blocks = "\n".join(
         f'<figure role="img" aria-label="{text(sheet.caption)}">{svg(drawn(sheet))}'
         f"<figcaption>{text(sheet.caption)}</figcaption></figure>"
@@ -111,19 +119,34 @@ def figures(sheets: Iterable[FigureSpec]) -> str:
 
 
 def wide_figure(alternative: str, figure: Figure) -> str:
-    """Return a figure of its own size, or as wide as the page allows; the text is HTML."""
+    """Return a figure of its own size, limited by the page; the alternative text is HTML."""
     inner = f'style="max-width: {figure.get_figwidth():g}in">{svg(figure)}'
     return f'<figure class="alone" role="img" aria-label="{alternative}" {inner}</figure>\n'
 
 
+def svg(figure: Figure) -> str:
+    """Return a figure as an SVG element of any width, with text as text.
+
+    Ids of groups are removed because figures share a page, and so are URLs and invisible digits.
+    """
+    buffer = io.StringIO()
+    with mpl.rc_context({**STYLE, "svg.fonttype": "none"}):
+        figure.savefig(buffer, format="svg", transparent=True, metadata=UNDATED_SVG)
+    text = buffer.getvalue()
+    text = _METADATA.sub("", text[text.index("<svg") :])
+    text = _SIZE.sub(r'<svg viewBox="\1" aria-hidden="true">', text, count=1)
+    text = _GROUP.sub("<g", text).replace("xlink:href=", "href=")
+    return _PATH.sub(lambda found: _DIGITS.sub(r"\1", found[0]), text)
+
+
 def details(heading: str, plain: str) -> str:
-    """Return a text that is folded away."""
+    """Return a collapsed text."""
     shown = text(plain, lines=True)
     return f"<details><summary>{text(heading)}</summary><pre>{shown}</pre></details>"
 
 
 def definitions(heading: str, terms: Sequence[tuple[str, str]]) -> str:
-    """Return what terms mean."""
+    """Return terms and definitions."""
     body = "".join(f"<dt>{text(term)}</dt><dd>{text(meaning)}</dd>" for term, meaning in terms)
     return f"<h2>{text(heading)}</h2><dl>{body}</dl>"
 
@@ -131,16 +154,16 @@ def definitions(heading: str, terms: Sequence[tuple[str, str]]) -> str:
 DEFINITIONS: tuple[tuple[str, str], ...] = (
     (
         "average cycle",
-        "Mean of all whole steady cycles on bins of phase; every figure that is not raw is of it.",
+        "Mean of all whole steady cycles on bins of phase; basis of every figure that is not raw.",
     ),
     (
         "peak hysteresis",
         "Largest difference of displacement between a rising and a falling branch at one input, "
-        "over the peak-to-peak displacement. The input is the reference where a compensator stands "
-        "before the actuator, otherwise the command.",
+        "over the peak-to-peak displacement. The input is the reference with a compensator, "
+        "otherwise the command.",
     ),
-    ("noise floor", "What sensor noise alone would make of the peak hysteresis."),
-    ("loop area", "Area that displacement against input encloses."),
+    ("noise floor", "Peak hysteresis that sensor noise alone would cause."),
+    ("loop area", "Area enclosed by displacement against input."),
     (
         "peak and rms error",
         "Displacement less reference, offset included: largest magnitude, and root mean square, "
@@ -152,21 +175,21 @@ DEFINITIONS: tuple[tuple[str, str], ...] = (
     ),
     (
         "model error",
-        "Largest difference of measured displacement and what the model makes of the command, over "
-        "the peak-to-peak displacement.",
+        "Largest difference of the measured displacement and that of the model, over the "
+        "peak-to-peak displacement.",
     ),
     (
         "harmonics of the error",
         "Amplitudes of the error's steady part at multiples of the waveform's frequency.",
     ),
-    ("r²", "Share of the variance that a straight line explains."),
+    ("r²", "Share of the variance explained by a linear fit."),
     (
         "lateness",
-        "Time from a tick's deadline to its wake-up; p99 is kept by all but one of 100 ticks.",
+        "Time from a tick's deadline to its wake-up; 99 % of the ticks are within p99.",
     ),
 )
 
 
 def definitions_of(*terms: str) -> list[tuple[str, str]]:
-    """Return terms and meanings, in order."""
+    """Return terms and definitions, in order."""
     return [each for each in DEFINITIONS if each[0] in terms]

@@ -1,4 +1,4 @@
-"""The hysteresis loop as a figure, with the peak hysteresis marked in it."""
+"""Figures of the hysteresis loop: with its peak hysteresis, and before and after compensation."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -22,17 +22,17 @@ _DISPLACEMENT_AXIS = "displacement, µm"
 
 
 def hysteresis_loop(recording: Recording, focus: int = 0) -> FigureSpec | None:
-    """Return displacement against the loop's input, one average cycle a segment.
+    """Return displacement against the loop's input, one average cycle per segment.
 
-    Below it stands what is left when a straight line is taken off: the line that a compensated run
-    should follow, otherwise the closest one. What does not repeat is drawn as it was measured.
+    The second panel shows the deviation from the ideal line of a compensated run, otherwise from a
+    linear fit. Loops without a period are drawn as measured.
 
     Args:
         recording: The run.
         focus: Number of the segment whose peak hysteresis is marked.
 
     Returns:
-        None where no segment has steady samples.
+        None if no segment has steady samples.
     """
     parts = [steady_part(recording, segment) for segment in recording.segments]
     everything = np.concatenate([np.empty((2, 0)), *map(_loop, parts)], axis=1)
@@ -55,14 +55,14 @@ def _input_name(recording: Recording) -> str:
 
 
 def _loop(part: SteadyPart) -> F64:
-    """Return one loop, float64[2, m]: input and displacement, closed where it is an average."""
+    """Return one loop, float64[2, m]: input and displacement, closed if it is an average."""
     if part.cycle is not None:
         return np.concatenate((part.loop, part.loop[:, :1]), axis=1)
     return part.loop[:, :: max(1, part.loop.shape[1] // _LONGEST_PATH)]
 
 
 def _closest_line(everything: F64) -> F64:
-    """Return slope and offset of the least-squares line; a level one where the input stands."""
+    """Return slope and offset of the linear fit; horizontal with a constant input."""
     x, y = everything
     if np.ptp(x) == 0.0:
         return np.array([0.0, float(y.mean())])
@@ -99,14 +99,14 @@ def _draw(
 
 
 def _colours(loops: int) -> list[object]:
-    """Return a colour a loop; many of them in viridis, which keeps its order in grey too."""
+    """Return a colour per loop; several are from viridis, which keeps its order in grey."""
     if loops == 1:
         return [DISPLACEMENT]
     return list(mpl.colormaps["viridis"](np.linspace(0.0, 0.78, loops)))
 
 
 def _mark_gap(axes: Axes, part: SteadyPart, taken_off: F64) -> None:
-    """Mark the widest place, which taking a function of the input off does not change."""
+    """Mark the widest gap, which subtracting a function of the input does not change."""
     if part.cycle is None:
         return
     loop_input, displacement_um = part.cycle.signals
@@ -123,15 +123,15 @@ def _mark_gap(axes: Axes, part: SteadyPart, taken_off: F64) -> None:
 def before_and_after(before: Recording, after: Recording) -> FigureSpec | None:
     """Return the loops of one motion without and with a compensator, and the errors of both.
 
-    Each is shown over its own range, as command and reference have different units: a straight line
-    from corner to corner is what a compensator is for.
+    Each is shown over its own range, because command and reference have different units; ideal is a
+    straight line from corner to corner.
 
     Args:
-        before: The run without one.
-        after: The run with one.
+        before: The run without a compensator.
+        after: The run with a compensator.
 
     Returns:
-        None where one of them has no average cycle.
+        None if one of them has no average cycle.
     """
     loops = [_worst_loop(before), _worst_loop(after)]
     if any(loop is None for loop in loops):
@@ -157,7 +157,7 @@ def before_and_after(before: Recording, after: Recording) -> FigureSpec | None:
 
 
 def _worst_loop(recording: Recording) -> F64 | None:
-    """Return the closed loop of a run that has the widest gap; None without any."""
+    """Return the closed loop with the largest peak hysteresis; None without any."""
     parts = [steady_part(recording, segment) for segment in recording.segments]
     loops = [_loop(part) for part in parts if part.cycle is not None]
     return max(

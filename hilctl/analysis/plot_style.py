@@ -1,7 +1,7 @@
-"""What all plots share: style, colours, signals over time.
+"""Style, colours and drawing of signals over time, for all plots.
 
-Long signals are reduced to what a plot can show, without hiding spikes or inventing beats.
-Colours are those of Okabe and Ito, which colour-blind people can tell apart.
+Long signals are reduced without hiding spikes or creating beats. The colours are those of Okabe and
+Ito, which colour-blind people can distinguish.
 """
 
 from typing import Any
@@ -19,7 +19,7 @@ ERROR = "#009E73"
 MARK = "#CC79A7"
 QUIET = "#666666"
 WITHOUT, WITH = COMMAND, DISPLACEMENT
-"""Colours of a motion without a compensator and with one, wherever both are drawn."""
+"""Colours of motions without and with a compensator."""
 
 MAX_POINTS = 4000
 """Most points of one line."""
@@ -29,7 +29,7 @@ _MAX_BUCKETS = 600
 
 STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
-    "font.size": 8.0,  # on paper: figures have the width of a journal's column
+    "font.size": 8.0,  # at the width of a journal's column
     "axes.titlesize": 8.0,
     "axes.titlelocation": "left",
     "axes.spines.top": False,
@@ -51,14 +51,14 @@ STYLE: dict[Any, Any] = {
     "agg.path.chunksize": 20000,
     "text.parse_math": False,  # names and labels are not formulas
     "svg.hashsalt": "hilctl",  # the same run gives the same bytes
-    "pdf.fonttype": 42,  # journals refuse outlines of bitmaps
+    "pdf.fonttype": 42,  # journals require embedded TrueType fonts
 }
 
 
 def pieces(recording: Recording) -> list[tuple[int, int, float]]:
-    """Cut a run where its waveform changes: start, stop and period of each piece, in samples.
+    """Cut a run at changes of its waveform: start, stop and period of each piece, in samples.
 
-    What lies outside all segments, such as the safe ramp, has period 0.
+    Pieces outside all segments, such as the safe ramp, have period 0.
     """
     index = recording.samples.index
     if index.size == 0:
@@ -123,7 +123,7 @@ def draw_line(
 
 
 def legend(axes: Axes) -> None:
-    """Put a legend above the axes, at the right, out of the way of what is drawn."""
+    """Put a legend above the axes, at the right."""
     handles, labels = axes.get_legend_handles_labels()
     if labels:
         corner = (1.0, 1.0)
@@ -131,10 +131,10 @@ def legend(axes: Axes) -> None:
 
 
 def min_max(t: F64, values: F64, points: int = MAX_POINTS) -> tuple[F64, F64]:
-    """Reduce a signal to the lowest and highest value of each of even stretches.
+    """Reduce a signal to the lowest and highest value of each of equal intervals.
 
-    Every spike stays. Values that are not finite are left out; where a stretch has no other, the
-    line is broken by NaN.
+    Every spike is kept. Values that are not finite are omitted; an interval without others is NaN,
+    which breaks the line.
 
     Args:
         t: float64[n].
@@ -153,17 +153,17 @@ def min_max(t: F64, values: F64, points: int = MAX_POINTS) -> tuple[F64, F64]:
 
 
 def band(index: I64, values: F64, period: float) -> tuple[F64, F64, F64]:
-    """Reduce a periodic signal to the band it fills, on stretches of at least one period.
+    """Reduce a periodic signal to its band, on intervals of at least one period.
 
-    Shorter stretches would beat with the period and draw waves that are not there.
+    Shorter intervals would beat with the period.
 
     Args:
-        index: int64[n], n > 0, sample index, rising.
+        index: int64[n], n > 0, increasing sample indices.
         values: float64[n].
         period: Samples in one period, > 0.
 
     Returns:
-        Sample index of each stretch's middle, lowest and highest value in it: float64[m] each.
+        Sample index of the centre, lowest and highest value of each interval: float64[m] each.
     """
     span = int(index[-1] - index[0]) + 1
     stretches = max(1, min(_MAX_BUCKETS, int(span / period)))
@@ -175,11 +175,11 @@ def band(index: I64, values: F64, period: float) -> tuple[F64, F64, F64]:
 
 
 def shown_as_band(samples: int, period: float, shown: int) -> bool:
-    """Return whether cycles would be too narrow for a line.
+    """Return whether cycles are too narrow for a line.
 
     Args:
-        samples: Length of the stretch with this period.
-        period: Samples in one period; 0.0 where it does not repeat.
+        samples: Number of samples with this period.
+        period: Samples in one period; 0.0 without one.
         shown: Samples on the whole time axis.
     """
     return 0.0 < period < shown * _NARROWEST_CYCLE and samples > 4.0 * period

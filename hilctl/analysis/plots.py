@@ -1,6 +1,6 @@
 """Figures of a run over time and frequency: history, error and its spectrum, lateness.
 
-``focus`` is the number of the segment that is looked at closely.
+``focus`` is the number of the segment shown in detail.
 """
 
 from dataclasses import dataclass
@@ -32,8 +32,8 @@ from hilctl.signals.cycle_metrics import MAX_BINS, fold
 
 MOST_HARMONICS = 20
 _MOST_SAMPLES = 2**20
-_LARGEST_UM = 1e100  # readings near the end of all numbers have no spectrum
-_WIDEST_GAP = 0.02  # of the samples that may be missing
+_LARGEST_UM = 1e100  # larger readings have no spectrum
+_WIDEST_GAP = 0.02  # share of samples that may be missing
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +44,7 @@ class ErrorSpectrum:
         frequency_hz: float64[k], > 0.
         amplitude_um: float64[k], amplitude of a sine there, Hann window.
         harmonics_um: float64[h], amplitude at 1, 2, ... times the waveform's frequency; empty
-            where nothing repeats.
+            without a period.
         constant_um: Mean error.
     """
 
@@ -56,12 +56,12 @@ class ErrorSpectrum:
 
 def error_spectrum(recording: Recording, segment: Segment, index: I64, error_um: F64
                    ) -> ErrorSpectrum | None:  # fmt: skip
-    """Return the spectrum of an error; None where too little of it is finite.
+    """Return the spectrum of an error; None with too few finite values.
 
     Args:
         recording: The run.
-        segment: The segment that the samples are of.
-        index: int64[n], sample indexes, rising.
+        segment: The segment of the samples.
+        index: int64[n], increasing sample indices.
         error_um: float64[n].
     """
     finite = np.isfinite(error_um)
@@ -82,7 +82,7 @@ def error_spectrum(recording: Recording, segment: Segment, index: I64, error_um:
 
 
 def _harmonics(index: I64, error_um: F64, period: float) -> F64:
-    """Return the amplitudes of the average cycle's harmonics; noise is averaged away in it."""
+    """Return the amplitudes of the harmonics of the average cycle, which has little noise."""
     if period <= 2.0 * MOST_HARMONICS:
         return np.empty(0)
     cycle = fold(index, period, [error_um])
@@ -96,11 +96,11 @@ def _harmonics(index: I64, error_um: F64, period: float) -> F64:
 
 
 def thinned(spectrum: ErrorSpectrum, points: int) -> tuple[F64, F64]:
-    """Return frequency and the largest amplitude of stretches even in the logarithm of frequency.
+    """Return frequency and largest amplitude of intervals of equal ratio.
 
     Args:
         spectrum: The spectrum.
-        points: Most stretches.
+        points: Most intervals.
     """
     x, y = spectrum.frequency_hz, spectrum.amplitude_um
     if x.size <= points:
@@ -126,7 +126,7 @@ def time_history(recording: Recording) -> FigureSpec | None:
         Panel(partial(_draw_history, recording=recording)),
         Panel(partial(_draw_command, recording=recording), height=_LOW),
     )
-    caption = "Whole run: displacement, reference and command; grey: the part that is judged."
+    caption = "Whole run: displacement, reference and command; grey: the evaluated part."
     return FigureSpec("history", caption, panels, stacked=True)
 
 
@@ -145,7 +145,7 @@ def _draw_command(axes: Axes, recording: Recording) -> None:
 
 
 def steady_cycles(recording: Recording, focus: int = 0) -> FigureSpec | None:
-    """Return the same over the last two steady cycles of a segment; None where there is none."""
+    """Return the same over the last two steady cycles of a segment; None without any."""
     zoom = _zoom(recording, focus)
     if zoom is None:
         return None
@@ -169,7 +169,7 @@ def steady_cycles(recording: Recording, focus: int = 0) -> FigureSpec | None:
 
 
 def _zoom(recording: Recording, focus: int) -> Samples | None:
-    """Return the last few steady cycles of a segment, or None where there is none."""
+    """Return the last few steady cycles of a segment; None without any."""
     if focus >= len(recording.segments):
         return None
     samples, cycles = steady_samples(recording, recording.segments[focus])
@@ -181,8 +181,8 @@ def _zoom(recording: Recording, focus: int) -> Samples | None:
 
 
 def _mark_judged(axes: Axes, recording: Recording) -> None:
-    """Shade the samples that the figures of each segment are taken from."""
-    label = "judged"
+    """Shade the evaluated samples of each segment."""
+    label = "evaluated"
     for segment in recording.segments:
         index = steady_samples(recording, segment)[0].index
         if index.size:
@@ -195,7 +195,7 @@ def error(recording: Recording, focus: int = 0) -> FigureSpec | None:
     """Return displacement less reference, over the run and over one cycle.
 
     Returns:
-        None where no sample has a reference displacement.
+        None if no sample has a reference.
     """
     error_um = recording.samples.displacement_um - recording.samples.reference_um
     if not recording.compensated or not np.isfinite(error_um).any():
@@ -217,7 +217,7 @@ def error(recording: Recording, focus: int = 0) -> FigureSpec | None:
 
 
 def _draw_phase(axes: Axes, part: SteadyPart, segment: Segment) -> None:
-    """Draw the average cycle's error over phase, in the band that all samples fill."""
+    """Draw the error of the average cycle over phase, and the band of all samples."""
     if part.cycle is None:
         return
     phase, low, high = _spread(part, segment)
@@ -231,7 +231,7 @@ def _draw_phase(axes: Axes, part: SteadyPart, segment: Segment) -> None:
 
 
 def _spread(part: SteadyPart, segment: Segment) -> tuple[F64, F64, F64]:
-    """Return the middles of bins of phase, and the lowest and highest error of samples in each."""
+    """Return the centres of bins of phase, and the lowest and highest error in each."""
     error_um = part.samples.displacement_um - part.samples.reference_um
     finite = np.isfinite(error_um)
     cycles = np.mod(part.samples.index[finite] - segment.start, segment.period) / segment.period
@@ -245,7 +245,7 @@ def _spread(part: SteadyPart, segment: Segment) -> tuple[F64, F64, F64]:
 
 
 def spectrum(recording: Recording, focus: int = 0) -> FigureSpec | None:
-    """Return spectrum and harmonics of the error; None where there is none, or no steady part."""
+    """Return spectrum and harmonics of the error; None without an error or steady part."""
     if not recording.compensated or focus >= len(recording.segments):
         return None
     segment = recording.segments[focus]
@@ -280,14 +280,14 @@ def _draw_harmonics(axes: Axes, found: ErrorSpectrum) -> None:
 
 
 def lateness(recording: Recording) -> FigureSpec | None:
-    """Return how late ticks woke and how long exchanges took, as histograms with log counts.
+    """Return histograms of the lateness of ticks and the duration of exchanges.
 
     Returns:
-        None where there are no ticks, or the run did not keep real time.
+        None without ticks, or if the run was not in real time.
     """
     if recording.ticks.late_ns.size == 0 or recording.run.get("paced") == "false":
         return None
-    caption = "How late ticks woke up, and how long exchanges with the device took."
+    caption = "Lateness of ticks, and duration of exchanges with the device."
     return FigureSpec("lateness", caption, (Panel(partial(_draw_lateness, recording=recording)),))
 
 

@@ -1,4 +1,4 @@
-"""Percentiles of any number of values in bounded memory: exact of some millions, else in bins."""
+"""Percentiles in bounded memory: exact up to two million values, otherwise from bins."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -8,7 +8,7 @@ import numpy as np
 from hilctl.base.types import F64, I64
 
 MOST_EXACT = 2**21
-"""Most values that are kept as they are; percentiles of more are right to 6e-5 of their size."""
+"""Most values with exact percentiles; the relative error of more is 6e-5."""
 
 _BITS = 13  # of the fraction; a bin is 1.2e-4 of its value wide
 _SHIFT = 52 - _BITS
@@ -17,7 +17,7 @@ _MIDDLE = 2 ** (63 - _SHIFT)
 
 
 class Quantiles:
-    """Takes values, and says how they are distributed."""
+    """Distribution of values."""
 
     def __init__(self) -> None:
         self.size = 0
@@ -26,7 +26,7 @@ class Quantiles:
         self._counts = np.empty(0, dtype=np.int64)
 
     def add(self, values: F64 | I64) -> None:
-        """Take more values, float64[n] or int64[n]; none of them NaN."""
+        """Add values, float64[n] or int64[n], without NaN."""
         if values.size == 0:
             return
         self.size += values.size
@@ -42,8 +42,8 @@ class Quantiles:
                     self._count(each)
 
     def _count(self, values: F64 | I64) -> None:
-        """Count values by the first bits of their floating-point form."""
-        if not self._counts.size:  # pages that nothing is counted in take no memory
+        """Count values by the leading bits of their floating-point representation."""
+        if not self._counts.size:  # untouched pages take no memory
             self._counts = np.zeros(2 * _MIDDLE, dtype=np.int64)
         bits = np.ascontiguousarray(values, dtype=np.float64).view(np.int64)
         keys, counts = np.unique(_ordered(bits) >> _SHIFT, return_counts=True)
@@ -51,17 +51,17 @@ class Quantiles:
 
     @property
     def largest(self) -> float:
-        """The largest value, as it is.
+        """The largest value.
 
         Raises:
-            ValueError: There is none.
+            ValueError: There are no values.
         """
         if self._largest is None:
             raise ValueError("the largest of no values")
         return float(self._largest)
 
     def percentiles(self, percents: Sequence[float]) -> list[float]:
-        """Return percentiles as :func:`numpy.percentile` does; of at least one value."""
+        """Return percentiles as :func:`numpy.percentile`, of at least one value."""
         if self._values is not None:
             return list(np.percentile(np.concatenate(self._values), percents).tolist())
         centres, ends = self._centres()
@@ -69,13 +69,13 @@ class Quantiles:
         return list(centres[np.searchsorted(ends, places, side="right")].tolist())
 
     def median(self) -> float:
-        """Return the median; of at least one value."""
+        """Return the median of at least one value."""
         if self._values is not None:
             return float(np.median(np.concatenate(self._values)))
         return self.percentiles([50.0])[0]
 
     def above(self, threshold: float) -> int:
-        """Count the values above a threshold; in bins, those whose bin has its middle there."""
+        """Count the values above a threshold, or those in bins with centres above it."""
         if self._values is not None:
             return sum(int(np.count_nonzero(values > threshold)) for values in self._values)
         centres, ends = self._centres()
@@ -83,7 +83,7 @@ class Quantiles:
         return int(counts[centres > threshold].sum())
 
     def _centres(self) -> tuple[F64, I64]:
-        """Return the middle of each bin, rising, and how many values there are up to its end."""
+        """Return the centre of each bin, in order, and the number of values up to its end."""
         places = np.flatnonzero(self._counts)
         keys = places - _MIDDLE
         low, high = _ordered(np.array([keys, keys + 1], dtype=np.int64) << _SHIFT).view(np.float64)
@@ -91,5 +91,5 @@ class Quantiles:
 
 
 def _ordered(bits: I64) -> I64:
-    """Return the bits of floating-point numbers as integers in the same order; its own inverse."""
+    """Return the bits of floating-point numbers as integers of the same order; self-inverse."""
     return bits ^ ((bits >> 63) & _SIGN)

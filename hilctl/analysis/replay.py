@@ -1,4 +1,9 @@
-"""Recompute a recording's commands from the compensator's input, by the code that made them."""
+"""Replay: recompute the commands of a recording with the same code.
+
+With another model, the replay also predicts the error that its inverse would have left. Let u and y
+be the commands and displacements of the run, and M the model. The inverse gives commands u' with
+M(u') = reference. To first order in u' - u, their error is y - M(u), sensor noise included.
+"""
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -10,7 +15,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from hilctl.analysis.predicted_error import ErrorPrediction, PredictedError
 from hilctl.base.errors import DataError, ModelError
 from hilctl.base.events import INVERSE, Event
 from hilctl.base.samples import NO_WAVEFORM, Flag, Samples
@@ -30,23 +34,85 @@ _LIMIT_BITS = int(
 
 
 @dataclass(frozen=True, slots=True)
-class ReplayResult:
-    """How recomputed commands compare with the recorded ones.
+class PredictedError:
+    """Errors on the samples of the waveform, in percent of their peak-to-peak displacement.
 
     Attributes:
-        samples: Samples recomputed.
-        left_out_samples: Samples behind a damaged stretch of the file, where the compensator's
-            memory is not known.
+        peak_percent: Peak error of the other model.
+        rms_percent: Its root mean square.
+        recorded_peak_percent: Recorded peak error, on the same samples.
+        recorded_rms_percent: Its root mean square.
+    """
+
+    peak_percent: float
+    rms_percent: float
+    recorded_peak_percent: float
+    recorded_rms_percent: float
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return the fields as plain values."""
+        return asdict(self)
+
+
+class ErrorPrediction:
+    """Prediction of another model's error from pieces of a run.
+
+    Args:
+        model: The other model.
+        sample_rate_hz: Rate of the run.
+    """
+
+    def __init__(self, model: HysteresisModel, sample_rate_hz: float) -> None:
+        self._forward = model.forward(sample_rate_hz)
+        self._low, self._high = math.inf, -math.inf
+        self._count = 0
+        self._peaks = np.zeros(2)
+        self._squares = np.zeros(2)
+
+    def add(self, samples: Samples) -> None:
+        """Add samples; the model keeps its state across missing samples."""
+        if not samples.index.size:
+            return
+        modelled = self._forward.process(np.ascontiguousarray(samples.command))
+        displacement = samples.displacement_um
+        judged = (samples.flags & np.uint32(NO_WAVEFORM | Flag.INVALID)) == 0
+        judged &= np.isfinite(displacement) & np.isfinite(samples.reference_um)
+        if not judged.any():
+            return
+        seen: F64 = displacement[judged]
+        errors = np.stack((seen - modelled[judged], seen - samples.reference_um[judged]))
+        self._low, self._high = min(self._low, seen.min()), max(self._high, seen.max())
+        self._peaks = np.maximum(self._peaks, np.abs(errors).max(axis=1))
+        self._squares += (errors**2).sum(axis=1)
+        self._count += seen.size
+
+    def result(self) -> PredictedError | None:
+        """Return the errors; None without valid samples or motion."""
+        span = self._high - self._low
+        if self._count == 0 or span <= 0.0:
+            return None
+        peaks = (100.0 / span * self._peaks).tolist()
+        rms = (100.0 / span * np.sqrt(self._squares / self._count)).tolist()
+        return PredictedError(peaks[0], rms[0], peaks[1], rms[1])
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayResult:
+    """Comparison of recomputed and recorded commands.
+
+    Attributes:
+        samples: Recomputed samples.
+        left_out_samples: Samples after damage of the file, with unknown compensator memory.
         identical: Whether every wanted command, command and flag has the same bits.
         first_difference: Index of the first sample that differs, or None.
-        differing_samples: How many differ.
+        differing_samples: Number of samples that differ.
         largest_difference: Largest magnitude of a difference between commands.
         rms_difference: Root mean square of the differences.
         command_unit: ``A`` or ``V``.
         command_min: Lowest recomputed command.
         command_max: Highest recomputed command.
-        limited_samples: Recomputed samples that the limiter held back.
-        predicted: The error that another model would have had; None of the recorded one.
+        limited_samples: Recomputed samples that the limiter changed.
+        predicted: Predicted error of another model; None for the recorded model.
     """
 
     samples: int
@@ -73,17 +139,16 @@ def replay(
     """Recompute every command.
 
     Args:
-        recording: What was recorded, or its pieces in order
-            (:class:`hilctl.recording.reader.RecordingStream`), so that memory does not grow.
-            They are walked over twice where the inverse went out: what says so may stand behind
-            its samples.
-        model: Another model to invert instead of the recorded one; it starts from rest, its
-            input is the reference ahead by its own preview, and the limits stay as recorded.
+        recording: The run, or its pieces in order for bounded memory
+            (:class:`hilctl.recording.reader.RecordingStream`). Pieces are read twice if the inverse
+            was bypassed, because the event may follow its samples.
+        model: Another model to invert instead of the recorded one; it starts at rest with the
+            reference advanced by its own preview, within the recorded limits.
 
     Raises:
-        DataError: The recording holds no samples or not what a replay needs, or ``model`` does not
-            fit a run without a compensator, or one that was driven in another unit.
-        ConfigError: The recorded experiment or model breaks a rule.
+        DataError: The recording has no samples or lacks data for a replay, or ``model`` does not
+            match a run without a compensator or with another command unit.
+        ConfigError: The recorded experiment or model is invalid.
         ModelError: The model has no inverse.
     """
     pieces = [recording] if isinstance(recording, Recording) else recording
@@ -97,12 +162,12 @@ def replay(
 
 
 class _Running:
-    """A replay that goes on from piece to piece: the compensator and the limiter remember.
+    """Replay of successive pieces, with the state of compensator and limiter.
 
     Args:
-        first: The first piece; what the run was stands in each.
+        first: The first piece, with the facts of the run.
         model: Another model than the recorded one.
-        fades: Returns the events of the inverse going out and in, of all pieces.
+        fades: Returns the events of bypassing and enabling the inverse, of all pieces.
     """
 
     def __init__(
@@ -124,7 +189,7 @@ class _Running:
         self._recorded = first.compensated
         self._other = model is not None
         self._compensator, self._limiter = _parts_of(first, model)
-        # What another model is fed lies ahead, perhaps in the next piece.
+        # The input of another model is ahead, perhaps in the next piece.
         self._held_back = self._compensator.preview if self._other else 0
         self._waiting: Samples | None = None
         self._starts: list[ReplayStart] = []
@@ -135,10 +200,10 @@ class _Running:
         self._comparison = _Comparison(first.command_unit)
 
     def add(self, piece: Recording) -> None:
-        """Recompute what comes next."""
+        """Recompute the next piece."""
         samples = piece.samples
         if samples.index.size and not np.isfinite(samples.command).all():
-            # The limiter puts out no other.
+            # The limiter has no others.
             raise DataError(f"{self._path}: /samples: every command must be finite")
         if self._fades is None and (any(map(_is_fade, piece.events)) or _out(samples).any()):
             self._fades = self._find_fades()
@@ -153,10 +218,10 @@ class _Running:
         self._waiting = samples.rows(slice(ready, None)) if self._held_back else None
 
     def result(self) -> ReplayResult:
-        """Return how it went, at the end.
+        """Return the comparison, after the last piece.
 
         Raises:
-            DataError: There was nothing to recompute.
+            DataError: There were no samples to recompute.
         """
         if self._waiting is not None:
             self._go(self._waiting, self._waiting.index.size)
@@ -176,7 +241,7 @@ class _Running:
             if start is not None:
                 self._begin(start, first=rows.start == 0 and self._before is None)
             elif rows.start or not self._follows(samples):
-                self._known = self._unbegun = False  # nothing says what the memory is there
+                self._known = self._unbegun = False  # the memory is unknown
             if not self._known:
                 continue
             known[rows.start : min(rows.stop, ready)] = True
@@ -192,15 +257,15 @@ class _Running:
     def _stretches(
         self, samples: Samples, ready: int
     ) -> Iterator[tuple[slice, ReplayStart | None]]:
-        """Yield the gapless rows that begin before ``ready``, and what they start from.
+        """Yield the gapless rows that begin before ``ready``, and their start.
 
-        Blocks lost from a damaged file leave gaps that no start stands behind.
+        Gaps from damage of the file have no start.
         """
         index = samples.index
         firsts = np.searchsorted(index, [start.sample for start in self._starts]).tolist()
         starts = dict(zip(firsts, self._starts, strict=True))
         gaps = np.flatnonzero(np.diff(index) != 1) + 1
-        # No row twice: a start without a gap before it ends the stretch, too.
+        # A start without a gap before it also ends the rows.
         bounds = np.unique([0, *gaps.tolist(), *firsts, index.size]).tolist()
         self._starts = [start for row, start in starts.items() if row >= ready]
         for begin, end in pairwise(bounds):
@@ -221,7 +286,7 @@ class _Running:
     def _recompute(
         self, samples: Samples, part: slice, end: int, ready: int, out: tuple[F64, F64, U32]
     ) -> None:
-        """Recompute rows of one kind, as far as they are ready."""
+        """Recompute rows of one kind before ``ready``."""
         rows = slice(part.start, min(part.stop, ready))
         wanted, command, flags = out[0][rows], out[1][rows], out[2][rows]
         kind = int(samples.flags[part.start])
@@ -231,7 +296,7 @@ class _Running:
             return
         if kind & Flag.CONDITION.value:
             flags |= Flag.CONDITION.value
-            wanted[:] = samples.wanted[rows]  # what was fed here, as the input is to a compensator
+            wanted[:] = samples.wanted[rows]  # the conditioning input, like that of a compensator
         else:
             self._compensator.process(self._inputs(samples, part, end)[: wanted.size], wanted)
             if self._faded is not None:
@@ -240,12 +305,12 @@ class _Running:
         self._limiter.limit(wanted, command, flags)
 
     def _inverse_shares(self, samples: Samples) -> tuple[F64, LinearBypass] | None:
-        """Return the inverse's share in each sample, float64[n], and what else is in it.
+        """Return the share of the inverse in each sample, float64[n], and its linear bypass.
 
-        None where it never went out.
+        None if the inverse was never bypassed.
 
         Raises:
-            DataError: The samples say otherwise: of a damaged file, an event is not there.
+            DataError: An event is missing in a damaged file.
         """
         if self._fades is None:
             return None
@@ -253,7 +318,7 @@ class _Running:
         before, after, begins, lasts = 1.0, 1.0, 0, 1
         for event in self._fades:
             values = event.values
-            # Where it stands then: a change may begin before the one before it is through.
+            # A change may begin before the previous one ends.
             before = interpolate(before, after, min(event.sample - begins, lasts) / lasts)
             after, begins, lasts = values["share"], event.sample, int(values["samples"])
             rows = slice(int(np.searchsorted(index, begins)), None)
@@ -266,7 +331,7 @@ class _Running:
         return shares, line
 
     def _inputs(self, samples: Samples, part: slice, end: int) -> F64:
-        """Return what the compensator is fed on rows of the waveform."""
+        """Return the compensator's input on rows of the waveform."""
         if not self._other:
             return (samples.input_um if self._recorded else samples.wanted)[part]
         if self._unbegun:
@@ -274,11 +339,11 @@ class _Running:
             waveform = (samples.flags[rest] & NO_WAVEFORM.value) == 0
             self._compensator.begin(samples.reference_um[rest][waveform])
             self._unbegun = False
-        # Another model than the recorded one looks ahead by its own preview.
+        # Another model has its own preview.
         return self._compensator.ahead(samples.reference_um[part])[:]
 
     def _skipped_on_ramp(self, samples: Samples, row: int) -> int:
-        """Return how many samples of a ramp were skipped just before a row."""
+        """Return the number of samples of a ramp that were skipped before a row."""
         if row:
             before: tuple[int, int] | None = (
                 int(samples.index[row - 1]),
@@ -301,13 +366,13 @@ def _is_fade(event: Event) -> bool:
 
 
 def _out(samples: Samples) -> npt.NDArray[np.bool_]:
-    """Return in which samples the inverse is not alone."""
+    """Return the samples in which the inverse is at least partly bypassed."""
     out: npt.NDArray[np.bool_] = (samples.flags & Flag.INVERSE_OUT.value) != 0
     return out
 
 
 def _parts_of(first: Recording, model: HysteresisModel | None) -> tuple[Compensator, Limiter]:
-    """Return compensator and limiter as they were recorded, or with another model."""
+    """Return the recorded compensator and limiter, or those with another model."""
     document = Document(f"{first.path}: experiment.yaml", first.experiment_yaml)
     config = document.validate(Experiment)
     if config.sample_rate_hz != first.sample_rate_hz:
@@ -320,14 +385,14 @@ def _parts_of(first: Recording, model: HysteresisModel | None) -> tuple[Compensa
 
 
 def _alike(flags: U32, rows: slice) -> list[slice]:
-    """Cut rows where ramp, conditioning and waveform give way to one another."""
+    """Cut rows at transitions between ramp, conditioning and waveform."""
     cuts = np.flatnonzero(np.diff(flags[rows] & np.uint32(NO_WAVEFORM))) + rows.start + 1
     bounds = [rows.start, *cuts.tolist(), rows.stop]
     return [slice(a, b) for a, b in pairwise(bounds) if b > a]
 
 
 class _Comparison:
-    """How recomputed commands compare with recorded ones, summed up over the pieces."""
+    """Comparison of recomputed and recorded commands, accumulated over pieces."""
 
     def __init__(self, command_unit: str) -> None:
         self._unit = command_unit
@@ -354,7 +419,7 @@ class _Comparison:
         different = np.flatnonzero(~same)
         if different.size and self._first is None:
             self._first = int(samples.index[different[0]])
-        with np.errstate(over="ignore", invalid="ignore"):  # of commands near the end of all
+        with np.errstate(over="ignore", invalid="ignore"):  # of commands near the largest number
             change = command - samples.command
             self._squares += float(np.sum(change**2))
         self._differing += different.size

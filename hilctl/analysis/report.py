@@ -1,13 +1,14 @@
-"""From a recording to a report."""
+"""Report of a recording: metrics of the run and of each segment."""
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
-from typing import Any, TypeAlias
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import astuple
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
+from pydantic import TypeAdapter, ValidationError
 
 from hilctl.analysis import tick_lateness
-from hilctl.analysis.process_table import processes_of
 from hilctl.analysis.run_metrics import RunReport, SegmentReport
 from hilctl.analysis.segment_metrics import SegmentReportBuilder
 from hilctl.analysis.steady_state import judged, waveform_end
@@ -16,6 +17,8 @@ from hilctl.base.events import ADAPTED, CHANGES, MARK, Event
 from hilctl.base.samples import LAST_SAMPLE, NO_WAVEFORM, Flag, Samples
 from hilctl.base.segments import Segment
 from hilctl.base.types import F64
+from hilctl.machine.procfs import ProcessUsage
+from hilctl.recording.metadata_keys import USAGE_FACT
 from hilctl.recording.recording import Recording
 from hilctl.signals.cycle_metrics import MeanCycle
 
@@ -33,50 +36,66 @@ _WORST = (
 
 
 Windows: TypeAlias = list[tuple[Segment, tuple[int, int, int]]]
-"""Segments, each with the samples that are judged: first, after the last, whole cycles."""
+"""Segments with their evaluated samples: first, after the last, whole cycles."""
 
 
 def summarize(recording: Recording | Iterable[Recording]) -> RunReport:
-    """Work out all figures that a recording allows; one cut short gives those of what it holds.
+    """Return the report of a recording, complete or truncated.
 
     Args:
-        recording: The run, or its pieces in order, which can be gone through again
-            (:class:`hilctl.recording.reader.RecordingStream`), so that memory does not grow,
-            and a run that ended early or was tuned is read twice.
+        recording: The run, or its pieces in order for bounded memory, as a repeatable iterable
+            (:class:`hilctl.recording.reader.RecordingStream`): a run that ended early or was tuned
+            is read twice.
 
     Raises:
-        DataError: A counter in the record of the end is not a number.
+        DataError: A counter in the metadata of the end is not a number.
     """
-    if isinstance(recording, Recording):
-        windows = _windows(recording, recording.events, waveform_end(recording.samples))
-        return _gathered([recording], windows).report()
-    planned: Windows | None = None
-    for _ in range(2):
-        gathering = _gathered(recording, planned)
-        planned = gathering.right_windows()
-        if planned == gathering.windows:
-            break
-    return gathering.report()
+    pieces = [recording] if isinstance(recording, Recording) else recording
+    return build_report(pieces).report()
 
 
-def _gathered(pieces: Iterable[Recording], windows: Windows | None) -> "RunReportBuilder":
-    gathering: RunReportBuilder | None = None
-    for piece in pieces:
-        gathering = gathering or RunReportBuilder(piece, windows)
-        gathering.add(piece)
-    if gathering is None:
-        raise DataError("there is no recording to judge")
-    return gathering
+def build_report(
+    pieces: Iterable[Recording],
+    observe: Callable[[Windows], Callable[[Recording], None]] | None = None,
+) -> "RunReportBuilder":
+    """Return the builder of a report after the last piece.
+
+    The pieces are read again if the evaluated samples turn out to differ from the planned ones.
+
+    Args:
+        pieces: Pieces of the run in order, as a repeatable iterable.
+        observe: Called with the evaluated samples before each reading; returns a function that is
+            called with each piece.
+
+    Raises:
+        DataError: There is no piece.
+    """
+    windows: Windows | None = None
+    while True:
+        builder: RunReportBuilder | None = None
+        for piece in pieces:
+            if builder is None:
+                builder = RunReportBuilder(piece, windows)
+                add = observe(builder.windows) if observe else None
+            builder.add(piece)
+            if add:
+                add(piece)
+        if builder is None:
+            raise DataError("there is no recording to judge")
+        right = builder.right_windows()
+        if windows is not None or right == builder.windows:
+            return builder
+        windows = right
 
 
 def _windows(recording: Recording, events: Iterable[Event], end: int) -> Windows:
-    """Return the segments with the samples that are judged of each."""
+    """Return the segments with their evaluated samples."""
     known = list(events)
     return [(each, judged(each, known, end)) for each in recording.segments]
 
 
 def judge(recording: Recording, segment: Segment) -> SegmentReport:
-    """Work out the figures of one segment; None where it has not been reached."""
+    """Return the metrics of one segment; None for those that are not available."""
     window = judged(segment, recording.events, waveform_end(recording.samples))
     gathering = SegmentReportBuilder(recording, segment, window)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -85,15 +104,15 @@ def judge(recording: Recording, segment: Segment) -> SegmentReport:
 
 
 _KEPT = {*CHANGES, ADAPTED, MARK}
-"""Codes of events that figures go by, or that are shown among them."""
+"""Codes of events that a report uses or lists."""
 
 
 class RunReportBuilder:
-    """Gathers the figures of a run, piece by piece.
+    """Builder of a report from pieces of a run.
 
     Args:
         first: The first piece.
-        windows: What is judged of it; as it was planned where None.
+        windows: Evaluated samples; as planned if None.
     """
 
     def __init__(self, first: Recording, windows: Windows | None) -> None:
@@ -107,7 +126,7 @@ class RunReportBuilder:
         self._waveform: tuple[int, int] | None = None
         self._command, self._displacement_um = _Extremes(), _Extremes()
 
-    @np.errstate(over="ignore", invalid="ignore")  # of readings near the end of all numbers
+    @np.errstate(over="ignore", invalid="ignore")  # of readings near the largest number
     def add(self, piece: Recording) -> None:
         """Take the next piece."""
         self._last = piece
@@ -135,15 +154,15 @@ class RunReportBuilder:
         self._displacement_um.add(samples.displacement_um)
 
     def right_windows(self) -> Windows:
-        """Return what is to be judged by how far the run got and how it was tuned: at the end."""
+        """Return the windows by the progress and tuning of the run, after the last piece."""
         return _windows(self._last, self._events, self._waveform[1] if self._waveform else 0)
 
     def cycles(self) -> list[MeanCycle | None]:
-        """Return the average cycle of each segment, at the end; None where it has no period."""
+        """Return the average cycle of each segment, after the last piece; None without a period."""
         return [segment.cycle() for segment in self._segments]
 
     def report(self) -> RunReport:
-        """Return the figures, at the end."""
+        """Return the report, after the last piece."""
         segments = tuple(segment.report() for segment in self._segments)
         return RunReport(
             **_identity(self._last),
@@ -166,7 +185,7 @@ class RunReportBuilder:
         counts = {name: self._counts[name] for name in names}
         return {
             **counts,
-            # Ticks that a busy machine skipped may have been the last ones.
+            # Skipped ticks may be the last ones.
             "complete": bool(self._last.end) and stop + self._last.dropped >= end,
             "ramp_samples": counts["recorded_samples"] - counts["samples"],
             "duration_s": (stop - first) / self._last.sample_rate_hz,
@@ -195,7 +214,7 @@ class RunReportBuilder:
 
 
 class _Extremes:
-    """The lowest and the highest finite value; None where there is none."""
+    """Lowest and highest finite value; None if there is none."""
 
     def __init__(self) -> None:
         self.low: float | None = None
@@ -227,7 +246,7 @@ def _identity(recording: Recording) -> dict[str, Any]:
 
 
 def worst_segment(segments: Sequence[SegmentReport]) -> int:
-    """Return the number of the segment with the largest peak hysteresis; 0 where none has any."""
+    """Return the number of the segment with the largest peak hysteresis; 0 if none has any."""
     heights = [segment.peak_hysteresis_percent or 0.0 for segment in segments]
     return heights.index(max(heights)) if heights else 0
 
@@ -246,9 +265,31 @@ def _worst(segments: Sequence[SegmentReport]) -> dict[str, Any]:
 
 
 def _pooled_noise_um(segments: Sequence[SegmentReport]) -> float | None:
-    """Return the rms over the segments, each weighing as many samples as it has."""
+    """Return the rms over the segments, weighted by their samples."""
     known = [s for s in segments if s.sensor_noise_um is not None]
     if not known:
         return None
     squares = np.array([s.sensor_noise_um for s in known], dtype=np.float64) ** 2
     return float(np.sqrt(np.average(squares, weights=[s.steady_samples for s in known])))
+
+
+_PROCESSES = TypeAdapter(dict[Literal["loop", "supervisor"], ProcessUsage])
+_USAGE_LIMIT = 2**63
+
+
+def processes_of(recording: Recording) -> dict[str, ProcessUsage]:
+    """Return the resource usage of ``loop`` and ``supervisor``; empty if it is not recorded.
+
+    Raises:
+        DataError: The recorded text is invalid.
+    """
+    where = f"{recording.path}: hilctl.end: {USAGE_FACT}"
+    try:
+        found = _PROCESSES.validate_json(recording.end.get(USAGE_FACT, "{}"))
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        place = ".".join(str(part) for part in first["loc"])
+        raise DataError(f"{where}: {place}: {first['msg']}") from None
+    if any(not 0 <= value < _USAGE_LIMIT for each in found.values() for value in astuple(each)):
+        raise DataError(f"{where}: every number must be in [0, 2^63)")
+    return {str(name): usage for name, usage in found.items()}

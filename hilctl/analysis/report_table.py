@@ -1,9 +1,9 @@
-"""A report for people, as rows of text."""
+"""Report as rows of text."""
 
-from hilctl.analysis.process_table import usage_text
 from hilctl.analysis.run_metrics import RunReport, SegmentReport
 from hilctl.base.events import adapted_text
 from hilctl.base.formatting import MISSING, printable, quantity
+from hilctl.machine.procfs import ProcessUsage
 
 SIMULATED = "simulated: no hardware was driven"
 
@@ -22,12 +22,12 @@ _SEGMENT_HEADINGS = (
 
 
 def number(value: float | None, unit: str = "") -> str:
-    """Return a number with four significant digits and its unit; a dash for None."""
+    """Return a number with four significant digits and its unit; a dash if None."""
     return quantity(value, unit, 4)
 
 
 def run_rows(report: RunReport) -> list[tuple[str, str]]:
-    """Return name and value of what the run was and how it ended."""
+    """Return name and value of the run, its samples, timing and end."""
     simulated = f" ({SIMULATED})" if report.simulated else ""
     held_against = "reference" if report.compensated else "command: nothing compensated"
     reason = printable(report.reason) or MISSING
@@ -57,8 +57,18 @@ def run_rows(report: RunReport) -> list[tuple[str, str]]:
     ]
 
 
+def usage_text(usage: ProcessUsage) -> str:
+    """Return the resource usage of a process as text."""
+    megabytes = f"{usage.resident_bytes / 1e6:.0f} MB"
+    faults = f"{usage.minor_faults + usage.major_faults:,} page faults"
+    return (
+        f"{megabytes}, {quantity(usage.cpu_ns * 1e-9, 's')} of CPU, {faults}, "
+        f"{usage.major_faults:,} from a disk; {usage.involuntary_switches:,} involuntary switches"
+    )
+
+
 def quality_rows(report: RunReport) -> list[tuple[str, str]]:
-    """Return name and value of the figures of quality; the noise floor beside the hysteresis."""
+    """Return name and value of the metrics."""
     floor = number(report.noise_floor_percent, "%")
     raw = f"{number(report.peak_error_raw_percent, '%')} peak, "
     raw += f"{number(report.rms_error_raw_percent, '%')} rms"
@@ -77,7 +87,7 @@ def quality_rows(report: RunReport) -> list[tuple[str, str]]:
 
 
 def segment_table(report: RunReport) -> tuple[list[str], list[list[str]]]:
-    """Return headings and rows of all segments, without columns that are empty in all of them."""
+    """Return headings and rows of all segments, without empty columns."""
     columns = zip(*(_segment_cells(segment) for segment in report.segments), strict=True)
     filled = [
         (heading, column)

@@ -1,7 +1,6 @@
-"""What a report holds: plain figures of a run and of each of its segments.
+"""Metrics of a run and of each of its segments.
 
-None stands where a figure has no meaning: an average where nothing repeats, an error without a
-reference displacement.
+A metric without meaning is None: an average without a period, an error without a reference.
 """
 
 import math
@@ -16,25 +15,25 @@ from hilctl.recording.metadata_keys import LabelValue
 
 @dataclass(frozen=True, slots=True)
 class RunMetrics:
-    """Figures of quality; all but the raw ones are of the average cycle.
+    """Metrics of the average cycle, except the raw ones.
 
-    The loop is displacement against reference_um where a compensator stood before the actuator,
-    otherwise displacement against the command, and then there are no errors.
+    The loop is displacement against reference_um with a compensator, otherwise displacement against
+    the command, without errors.
 
     Attributes:
         peak_hysteresis_percent: Largest output difference of a rising and a falling branch at one
             input, over the peak-to-peak displacement (figure 2.4).
-        noise_floor_percent: What sensor noise alone would make of that figure.
+        noise_floor_percent: Peak hysteresis that sensor noise alone would cause.
         loop_area: Area enclosed by the loop, in um times the input's unit.
         peak_to_peak_um: Peak-to-peak displacement.
         peak_error_percent: Largest displacement less reference, offset included, over the
-            peak-to-peak displacement. Where nothing repeats it is the raw figure.
+            peak-to-peak displacement; the raw error without a period.
         rms_error_percent: Its root mean square.
-        peak_error_raw_percent: The same of all steady samples without averaging.
+        peak_error_raw_percent: Peak error of all steady samples without averaging.
         rms_error_raw_percent: Its root mean square.
         sensor_noise_um: Estimated rms noise of a single displacement sample.
-        steady_cycles: Whole cycles judged.
-        steady_samples: Samples judged.
+        steady_cycles: Evaluated whole cycles.
+        steady_samples: Evaluated samples.
     """
 
     peak_hysteresis_percent: float | None
@@ -52,12 +51,12 @@ class RunMetrics:
 
 @dataclass(frozen=True, slots=True)
 class SegmentReport(RunMetrics):
-    """Figures of one segment.
+    """Metrics of one segment.
 
     Attributes:
-        label: What ran there.
+        label: Its waveform.
         start_s: Time of its first sample since the start of the run.
-        frequency_hz: Of its period; None where it does not repeat.
+        frequency_hz: Frequency of its period; None without one.
         samples: Recorded samples in it, soft start and end included.
     """
 
@@ -69,52 +68,50 @@ class SegmentReport(RunMetrics):
 
 @dataclass(frozen=True, slots=True)
 class RunReport(RunMetrics):
-    """Figures of a whole run.
+    """Metrics of a run.
 
-    Figures of quality are the worst, that is the largest, of all segments. The noise floor is that
-    of the segment with the largest peak hysteresis, and the sensor noise that of all steady
-    samples. Cycles and steady samples are summed; extremes are of everything recorded.
+    Each metric is the largest of all segments. The noise floor is that of the segment with the
+    largest peak hysteresis, and the sensor noise that of all steady samples. Cycles and steady
+    samples are summed; extremes include all recorded samples.
 
     Attributes:
         path: File that was read.
         name: Name of the experiment.
-        labels: What the run is found by.
+        labels: Labels of the run.
         device: Name of the device.
-        simulated: Whether that is a simulation.
-        reason: Why the run ended, or that its record is cut short.
-        complete: Whether it has a record of its end, and the last sample of its last segment or as
-            many samples counted as dropped as are lacking there.
+        simulated: Whether the device is simulated.
+        reason: Why the run ended, or that the recording is truncated.
+        complete: Whether its end is recorded, and its last sample is recorded or counted as
+            dropped.
         samples: Samples of the waveform.
         ramp_samples: Samples of the ramps to the safe value, before and after it.
         recorded_samples: Both.
         dropped: Samples that were exchanged or due and are missing.
-        skipped_ticks: Ticks left out because one was too late; None where the record of the end
-            does not say.
-        sample_rate_hz: Samples a second.
-        duration_s: From the first to after the last sample of the waveform.
-        compensated: Whether a compensator stood before the actuator.
+        skipped_ticks: Ticks skipped because one was too late; None if not recorded.
+        sample_rate_hz: Samples per second.
+        duration_s: Duration of the waveform.
+        compensated: Whether a compensator was used.
         command_unit: ``A`` or ``V``.
         loop_area_unit: Unit of ``loop_area``.
-        command_min: Lowest command put out, in ``command_unit``.
-        command_max: Highest command put out.
-        displacement_min_um: Lowest displacement measured.
-        displacement_max_um: Highest displacement measured.
+        command_min: Lowest command, in ``command_unit``.
+        command_max: Highest command.
+        displacement_min_um: Lowest measured displacement.
+        displacement_max_um: Highest measured displacement.
         limited_samples: Samples of the waveform that the limiter changed.
-        sensor_invalid_samples: Samples of the waveform whose displacement could not be trusted.
-        deadline_misses: How many ticks were skipped of all, for people, and whether the timing was
-            kept; empty where none was, or where that is not known.
-        late_ticks: Ticks that woke late, as counted by the run; where its record does not say,
-            those later than half a tick period. None where neither is known.
-        lateness_us: ``p50``, ``p90``, ``p99``, ``p99.9`` and ``max`` of how late ticks woke; empty
-            without ticks.
+        sensor_invalid_samples: Samples of the waveform with an invalid displacement.
+        deadline_misses: Text with the share of skipped ticks and its evaluation; empty if there are
+            none or it is unknown.
+        late_ticks: Late ticks counted by the run; if not recorded, ticks later than half a tick
+            period. None if neither is known.
+        lateness_us: ``p50``, ``p90``, ``p99``, ``p99.9`` and ``max`` of the lateness of ticks;
+            empty without ticks.
         lateness_by_minute: The same of each minute, with ``minute`` from 0 and its ``ticks``.
-        adapted: What adaptation made of the model by the end, by name, see
-            :data:`hilctl.base.events.ADAPTED`; empty without it.
-        processes: What ``loop`` and ``supervisor`` took of the machine while the run went on, by
-            name; empty where its record does not say.
+        adapted: Final parameters of the adaptation, see :data:`hilctl.base.events.ADAPTED`; empty
+            without adaptation.
+        processes: Resource usage of ``loop`` and ``supervisor``; empty if not recorded.
         marks: Time since the start of the run, in s, and text of each mark.
-        exchange_us: The same of how long exchanges with the device took.
-        segments: Figures of each segment.
+        exchange_us: The same for the duration of exchanges with the device.
+        segments: Metrics of each segment.
     """
 
     path: str
@@ -151,7 +148,7 @@ class RunReport(RunMetrics):
     segments: tuple[SegmentReport, ...]
 
     def to_mapping(self) -> dict[str, Any]:
-        """Return plain values for JSON; a number that is not finite becomes None."""
+        """Return plain values for JSON; numbers that are not finite become None."""
         mapping: dict[str, Any] = _plain(asdict(self))
         return mapping
 

@@ -1,6 +1,8 @@
-"""A run as one self-contained page: what came out first, and a fault on top of it."""
+"""Page of a run: result, figures, tables, provenance and events."""
 
+import json
 from collections.abc import Iterator, Sequence
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -8,36 +10,43 @@ import numpy as np
 from hilctl.analysis import html, loop_plot, plots, report_table
 from hilctl.analysis.figure_layout import FigureSpec
 from hilctl.analysis.html import definitions_of
-from hilctl.analysis.provenance import FAULT, provenance_rows
 from hilctl.analysis.report import worst_segment
 from hilctl.analysis.run_metrics import RunReport
+from hilctl.base.errors import ConfigError
 from hilctl.base.events import Event
-from hilctl.base.formatting import quantity
+from hilctl.base.formatting import printable, quantity, significant
+from hilctl.models.base import HysteresisModel
+from hilctl.models.model_file import parse_model
+from hilctl.recording.metadata_keys import OVERRIDES_FACT
 from hilctl.recording.recording import Recording
 
 _MOST_EVENTS = 200
 _MOST_FAULTS = 3
 _LARGEST = 1e100
+_FAULT = "fault"
+_WAVEFORM = "waveform."
+_NOT_SHOWN = {"waveform.kind", "waveform.unit"}
+_USUAL = {"0.0", "None", ""}
 
 
 def write_html(
     recording: Recording, report: RunReport, path: Path, before: Recording | None = None
 ) -> None:
-    """Write the page of a run; a page of that name is replaced.
+    """Write the page of a run; an existing file is replaced.
 
     Args:
         recording: The run.
         report: Its figures.
         path: File to write.
-        before: The same motion without a compensator, to be shown beside it.
+        before: The same motion without a compensator, for comparison.
 
     Raises:
-        InputError: It can't be written.
+        InputError: It cannot be written.
     """
     html.write_page(page(recording, report, before), path)
 
 
-@np.errstate(over="ignore", invalid="ignore")  # of readings near the end of all numbers
+@np.errstate(over="ignore", invalid="ignore")  # of readings near the largest number
 def page(recording: Recording, report: RunReport, before: Recording | None = None) -> str:
     """Return the page of a run as HTML."""
     title = html.text(report.name or "run")
@@ -65,7 +74,7 @@ def page(recording: Recording, report: RunReport, before: Recording | None = Non
 
 
 def headline(report: RunReport) -> str:
-    """Return what came out of a run, in a line."""
+    """Return the result of a run in one line."""
     parts = []
     if report.peak_hysteresis_percent is not None:
         floor = quantity(report.noise_floor_percent, "%")
@@ -83,9 +92,9 @@ def headline(report: RunReport) -> str:
 
 
 def _fault(recording: Recording, report: RunReport) -> Iterator[str]:
-    """Yield why a run did not come to its end, above everything else."""
+    """Yield the reason if a run did not complete."""
     errors = [event for event in recording.events if event.level == "error"]
-    if recording.end.get("code") == FAULT:
+    if recording.end.get("code") == _FAULT:
         yield html.paragraph(f"Ended by a fault: {report.reason}.", "bad")
         for event in errors[-_MOST_FAULTS:]:
             at_s = event.sample / recording.sample_rate_hz
@@ -110,7 +119,7 @@ def _figures(recording: Recording, report: RunReport, before: Recording | None) 
 
 
 def run_sheets(recording: Recording, report: RunReport) -> list[FigureSpec]:
-    """Return the figures of a run's page, those that apply.
+    """Return the applicable figures of a run.
 
     Args:
         recording: The run.
@@ -124,7 +133,7 @@ def run_sheets(recording: Recording, report: RunReport) -> list[FigureSpec]:
 def _sheets(
     recording: Recording, report: RunReport, before: Recording | None
 ) -> list[tuple[FigureSpec | None, str]]:
-    """Return each figure, or what is said in its place."""
+    """Return each figure, or the text in its place."""
     focus = worst_segment(report.segments)
     no_error = "No error is drawn: no sample has a reference displacement."
     return [
@@ -139,7 +148,7 @@ def _sheets(
 
 
 def _drawable(recording: Recording) -> bool:
-    """Return whether axes can be found for all signals: matplotlib has none near 1e308."""
+    """Return whether matplotlib can scale axes for all signals; it fails near 1e308."""
     samples = recording.samples
     signals = (samples.displacement_um, samples.reference_um, samples.command)
     return not any(np.any(np.abs(signal) > _LARGEST) for signal in signals)
@@ -167,3 +176,95 @@ def _terms(report: RunReport) -> list[tuple[str, str]]:
     return definitions_of(
         "average cycle", "peak hysteresis", "noise floor", "loop area", "lateness", *errors
     )
+
+
+def provenance_rows(recording: Recording) -> list[tuple[str, str]]:
+    """Return name and value of the origin of a run: date, labels, device, waveform, model."""
+    return [(name, printable(value)) for name, value in _rows(recording) if value]
+
+
+def _rows(recording: Recording) -> Iterator[tuple[str, str]]:
+    run = recording.run
+    yield "date", _date(run.get("started", ""))
+    for key, value in recording.labels.items():
+        yield key, str(value)
+    simulated = " (simulated: no hardware was driven)" if run.get("simulated") == "true" else ""
+    yield "device", f"{run.get('device', '')}{simulated}"
+    yield "device is", run.get("device_description", "")
+    computer = ", ".join(filter(None, (run.get("host", ""), run.get("kernel", ""))))
+    yield "computer", computer
+    yield "hilctl", run.get("hilctl", "")
+    segments = recording.segments
+    more = f" and {len(segments) - 1} more" if len(segments) > 1 else ""
+    yield "waveform", f"{segments[0].label}{more}" if segments else ""
+    yield "its settings", _settings(recording)
+    yield "limits", _limits(run.get("limits", ""))
+    yield "overrides", _overrides(run.get(OVERRIDES_FACT, ""))
+    yield from _model(recording)
+
+
+def _date(started: str) -> str:
+    try:
+        return datetime.fromisoformat(started).strftime("%Y-%m-%d %H:%M:%S %Z").strip()
+    except ValueError:
+        return started
+
+
+def _settings(recording: Recording) -> str:
+    found = {
+        key.removeprefix(_WAVEFORM): text
+        for key, text in recording.run.items()
+        if key.startswith(_WAVEFORM) and key not in _NOT_SHOWN and text not in _USUAL
+    }
+    unit = recording.run.get("waveform.unit", "")
+    shown = [f"{key} {text}" for key, text in found.items()]
+    return ", ".join([*shown, *([f"unit {unit}"] if unit else [])])
+
+
+def _limits(text: str) -> str:
+    try:
+        limits = json.loads(text or "{}")
+    except ValueError:
+        return text
+    if not isinstance(limits, dict):
+        return text
+    return ", ".join(f"{key} {value}" for key, value in limits.items())
+
+
+def _overrides(text: str) -> str:
+    try:
+        settings = json.loads(text or "[]")
+    except ValueError:
+        return text
+    return ", ".join(map(str, settings)) if isinstance(settings, list) else text
+
+
+def _model(recording: Recording) -> Iterator[tuple[str, str]]:
+    kind = recording.run.get("compensator", "none")
+    if kind == "none":
+        yield "compensator", "none: the waveform goes straight to the actuator"
+        return
+    yield "compensator", f"inverse of a model of kind {kind}"
+    if recording.correction_yaml:
+        yield "correction", "learned, and added to the reference"
+    try:
+        model = parse_model(f"{recording.path}: model.yaml", recording.model_yaml)
+    except ConfigError:  # of another version
+        yield "model", "can't be read by this version"
+        return
+    provenance = model.provenance
+    yield "model from", ", ".join(provenance.source)
+    yield "model made", _date(provenance.created or "")
+    yield "model error", model_error(model)
+
+
+def model_error(model: HysteresisModel) -> str:
+    """Return the error of a model, on data outside the fit if known."""
+    errors = model.provenance.errors_percent
+    for prefix, of in (("held_out_", "on data that the fit did not see"),
+                       ("", "on the data of the fit; on others it is not known")):  # fmt: skip
+        peak, rms = errors.get(f"{prefix}peak"), errors.get(f"{prefix}rms")
+        if peak is not None:
+            also = f", {significant(rms)} % rms" if rms is not None else ""
+            return f"{quantity(peak, '%')} peak{also}, {of}"
+    return "not known"

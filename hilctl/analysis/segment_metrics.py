@@ -1,4 +1,4 @@
-"""Figures of one segment, gathered as its samples come: one pass, whatever its length."""
+"""Metrics of one segment, in one pass over its samples."""
 
 import math
 
@@ -15,15 +15,16 @@ from hilctl.signals import cycle_metrics
 
 
 class SegmentReportBuilder:
-    """Gathers the figures of a segment.
+    """Builder of the metrics of a segment.
 
-    Sums of a run in several pieces differ from those of the whole in their last digits; sensor
-    noise of more than :data:`~hilctl.analysis.quantiles.MOST_EXACT` samples is right to 6e-5 of it.
+    Sums over several pieces differ from those of the whole run in their last digits; the relative
+    error of the sensor noise of more than :data:`~hilctl.analysis.quantiles.MOST_EXACT` samples is
+    6e-5.
 
     Args:
-        recording: What the run was; its samples are not looked at.
+        recording: The run; its samples are not used.
         segment: The segment.
-        window: Its judged samples: first, after the last, whole cycles.
+        window: Its evaluated samples: first, after the last, whole cycles.
     """
 
     def __init__(
@@ -40,10 +41,10 @@ class SegmentReportBuilder:
         self._noise = _Noise()
 
     def add(self, samples: Samples) -> None:
-        """Take the next samples of the run; at least one."""
+        """Add the next samples of the run; at least one."""
         segment = self._segment
         if samples.index[-1] < segment.start or samples.index[0] >= segment.stop:
-            return  # a run may have a thousand segments, and each piece is of one or two
+            return  # each piece overlaps one or two of maybe a thousand segments
         first, end = np.searchsorted(samples.index, (segment.start, segment.stop)).tolist()
         self._samples += end - first
         part = trusted(samples.part(self._start, self._stop))
@@ -62,7 +63,7 @@ class SegmentReportBuilder:
             self._noise.add(part.index, output)
 
     def cycle(self) -> cycle_metrics.MeanCycle | None:
-        """Return the average cycle of the loop's input and output; None where it has no period."""
+        """Return the average cycle of the loop's input and output; None without a period."""
         return self._folding.fold() if self._folding else None
 
     @property
@@ -71,7 +72,7 @@ class SegmentReportBuilder:
         return period <= 0.0 or period >= cycle_metrics.SHORTEST_PERIOD
 
     def _loop(self, loop_input: F64, output: F64) -> None:
-        """Take a loop that has no cycle to average."""
+        """Add a loop without a period."""
         finite = np.isfinite(loop_input) & np.isfinite(output)
         if not finite.any():
             return
@@ -80,9 +81,9 @@ class SegmentReportBuilder:
         self._highest_um = max(self._highest_um, float(known.max()))
         self._averaged.add(known - loop_input[finite])
 
-    @np.errstate(over="ignore", invalid="ignore")  # of readings near the end of all numbers
+    @np.errstate(over="ignore", invalid="ignore")  # of readings near the largest number
     def report(self) -> SegmentReport:
-        """Return the figures; None where they have no meaning or the segment was not reached."""
+        """Return the metrics; None for those that are not available."""
         cycle = self.cycle()
         stroke_um = noise_um = hysteresis = area = floor = None
         peak_rms: tuple[float | None, float | None] = (None, None)
@@ -124,7 +125,7 @@ class SegmentReportBuilder:
 
 
 class _Errors:
-    """Peak and root mean square of errors, in um; those that are not finite are left out."""
+    """Peak and root mean square of finite errors, in um."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -139,7 +140,7 @@ class _Errors:
             self._squares_um2 += float(np.sum(np.square(known)))
 
     def percent(self, whole_um: float) -> tuple[float | None, float | None]:
-        """Return peak and root mean square in percent; None where there is none."""
+        """Return peak and root mean square in percent; None without errors."""
         if not self.count:
             return None, None
         rms_um = math.sqrt(self._squares_um2 / self.count)

@@ -1,4 +1,4 @@
-"""Which part of a recording is judged, and the average cycle of that part."""
+"""Steady part of a recording, which is evaluated, and its average cycle."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -15,16 +15,16 @@ from hilctl.signals.cycle_metrics import MeanCycle, fold
 
 @dataclass(frozen=True, slots=True)
 class SteadyPart:
-    """The steady samples of one segment that a recording holds.
+    """Steady samples of one segment.
 
     Attributes:
-        samples: Whole cycles where the waveform has a period, otherwise all at full amplitude.
+        samples: Whole cycles of a periodic waveform, otherwise all samples at full amplitude.
         cycles: Number of whole cycles; 0 without a period.
         cycle: The average cycle of the loop's input and displacement_um, phase 0 at the segment's
-            first sample; None without a whole cycle, or where samples are missing all through it.
-        loop: float64[2, m], the loop that is judged, input and displacement: the average cycle; of
-            what has no period every finite sample; nothing where a cycle is missing. Its input is
-            reference_um where a compensator stood before the actuator, otherwise the command.
+            first sample; None without a whole cycle.
+        loop: float64[2, m], input and displacement of the evaluated loop: the average cycle, or
+            every finite sample without a period; empty if the cycle is incomplete. Its input is
+            reference_um with a compensator, otherwise the command.
     """
 
     samples: Samples
@@ -32,22 +32,16 @@ class SteadyPart:
     cycle: MeanCycle | None
     loop: F64
 
-    @property
-    def raw_error_um(self) -> F64:
-        """Displacement less reference of every sample where both are finite, in um."""
-        error = self.samples.displacement_um - self.samples.reference_um
-        return error[np.isfinite(error)]
-
 
 @dataclass(frozen=True, slots=True)
 class Overview(Recording):
-    """What plots show of a recording too long for memory, see :mod:`hilctl.analysis.decimation`.
+    """Decimated recording for plots, see :mod:`hilctl.analysis.decimation`.
 
-    Its samples are thinned out. What is judged has been worked out from all of them.
+    The steady parts were computed from all samples.
 
     Attributes:
-        windows: Judged samples of each segment: first, after the last, whole cycles.
-        parts: The steady part of each segment, with only its last samples.
+        windows: Evaluated samples of each segment: first, after the last, whole cycles.
+        parts: The steady part of each segment, with its last samples only.
     """
 
     windows: Mapping[Segment, tuple[int, int, int]] = field(default_factory=dict)
@@ -61,14 +55,14 @@ def waveform_end(samples: Samples) -> int:
 
 
 def judged(segment: Segment, events: Iterable[Event], end: int) -> tuple[int, int, int]:
-    """Return which samples of a segment are judged: first, after the last, and whole cycles.
+    """Return the evaluated samples of a segment: first, after the last, and whole cycles.
 
-    Of a segment cut short, these are the last whole cycles it got to; of one that was tuned while
-    it ran, they lie behind the last change.
+    In a truncated segment they are its last whole cycles; in a tuned one they follow the last
+    change.
 
     Args:
         segment: The segment.
-        events: Those of the run, in order.
+        events: Events of the run, in order.
         end: Index after the last sample of the waveform.
     """
     begin = max(segment.steady_start, _tuned_until(events, segment))
@@ -78,16 +72,13 @@ def judged(segment: Segment, events: Iterable[Event], end: int) -> tuple[int, in
 
 
 def trusted(samples: Samples) -> Samples:
-    """Return the samples whose displacement the run has trusted."""
+    """Return the samples with a valid displacement."""
     doubtful = (samples.flags & np.uint32(Flag.SENSOR_INVALID)) != 0
     return samples.rows(~doubtful) if doubtful.any() else samples
 
 
 def steady_samples(recording: Recording, segment: Segment) -> tuple[Samples, int]:
-    """Return the samples to judge of a segment, and how many whole cycles they are.
-
-    They are :func:`judged`, and :func:`trusted`.
-    """
+    """Return the evaluated samples of a segment (:func:`judged`, :func:`trusted`) and cycles."""
     if isinstance(recording, Overview):
         start, stop, cycles = recording.windows[segment]
     else:
@@ -96,20 +87,20 @@ def steady_samples(recording: Recording, segment: Segment) -> tuple[Samples, int
 
 
 def _tuned_until(events: Iterable[Event], segment: Segment) -> int:
-    """Return the index after the last change of the reference that reaches a segment; 0 if none.
+    """Return the index after the last change of the reference before a segment's end; 0 if none.
 
-    A change ends the one before it, wherever that stands.
+    A change ends the previous one.
     """
     until = 0
     for event in events:
         if event.code in CHANGES and event.sample < segment.steady_stop:
-            # Where a recording does not say how long it took, nothing behind it is judged.
+            # Without a recorded duration, no sample after the change is evaluated.
             until = event.sample + int(event.values.get("samples", segment.steady_stop))
     return until
 
 
 def steady_part(recording: Recording, segment: Segment) -> SteadyPart:
-    """Return what there is to judge of a segment, with its average cycle."""
+    """Return the steady part of a segment."""
     if isinstance(recording, Overview):
         return recording.parts[segment]
     samples, cycles = steady_samples(recording, segment)

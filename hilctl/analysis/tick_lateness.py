@@ -1,4 +1,4 @@
-"""How well the loop kept its time."""
+"""Lateness of ticks: percentiles, late ticks and missed deadlines."""
 
 import numpy as np
 
@@ -9,17 +9,17 @@ from hilctl.loop.pacer import USUAL_MISSED_SHARE, deadline_misses
 from hilctl.recording.recording import Recording, Ticks
 
 MOST_ROWS = 1440
-"""Most stretches that lateness is given for: a day has as many minutes."""
+"""Most rows of lateness by minute: the minutes of a day."""
 
 _MINUTE_NS = 60_000_000_000
 _PERCENTILES = {"p50": 50.0, "p90": 90.0, "p99": 99.0, "p99.9": 99.9}
 
 
 class LatenessBuilder:
-    """Gathers how well the loop kept its time, as its ticks come.
+    """Builder of the lateness of a run.
 
     Args:
-        minutes: How long the run is to be; beyond a day several minutes share a row.
+        minutes: Planned duration of the run; beyond a day, several minutes share a row.
     """
 
     def __init__(self, minutes: float) -> None:
@@ -35,12 +35,12 @@ class LatenessBuilder:
         return self._late.size
 
     def add(self, ticks: Ticks) -> None:
-        """Take the next ticks."""
+        """Add the next ticks."""
         if ticks.late_ns.size == 0:
             return
         self._late.add(ticks.late_ns)
         self._exchange.add(ticks.exchange_ns)
-        if self._steps.size < MOST_EXACT:  # more of them say nothing new of what is usual
+        if self._steps.size < MOST_EXACT:  # enough for the median
             before = np.array([] if self._before is None else [self._before], dtype=np.int64)
             due_ns = np.concatenate((before, ticks.deadline_ns))
             self._steps.add(due_ns[1:] - due_ns[:-1])
@@ -65,13 +65,14 @@ class LatenessBuilder:
         return _percentiles_us(self._late)
 
     def exchange_us(self) -> dict[str, float]:
-        """Return those of the time that exchanges took."""
+        """Return the percentiles of the duration of exchanges."""
         return _percentiles_us(self._exchange)
 
     def by_minute(self) -> list[dict[str, float]]:
-        """Return the lateness of each minute so far, see :func:`by_minute`; nothing is added then.
+        """Return the lateness of each minute with ticks, after the last tick.
 
-        ``minute`` is the first where several share a row.
+        Each row has ``minute`` from 0 (the first, if several share a row), its ``ticks``, and the
+        values of :func:`percentiles_us`.
         """
         self._end_row()
         return self._rows
@@ -84,7 +85,7 @@ class LatenessBuilder:
 def percentiles_us(times_ns: I64) -> dict[str, float]:
     """Return ``p50``, ``p90``, ``p99``, ``p99.9`` and ``max`` in us of int64[m] in ns.
 
-    Empty where there is none.
+    Empty without ticks.
     """
     quantiles = Quantiles()
     quantiles.add(times_ns)
@@ -98,41 +99,22 @@ def _percentiles_us(times_ns: Quantiles) -> dict[str, float]:
     return {**dict(zip(_PERCENTILES, values, strict=True)), "max": times_ns.largest * 1e-3}
 
 
-def by_minute(ticks: Ticks) -> list[dict[str, float]]:
-    """Return the lateness of each minute of a run, in order.
-
-    Returns:
-        For each minute with ticks: ``minute`` from 0, its ``ticks``, and the figures of
-        :func:`percentiles_us`. Of a run longer than a day, for stretches of several minutes, with
-        the first of them.
-    """
-    return gathered(ticks).by_minute()
-
-
-def gathered(ticks: Ticks) -> LatenessBuilder:
-    """Return all ticks of a run, gathered."""
-    span_ns = int(np.ptp(ticks.deadline_ns)) if ticks.deadline_ns.size else 0
-    found = LatenessBuilder(span_ns / _MINUTE_NS)
-    found.add(ticks)
-    return found
-
-
 def tick_period_ns(ticks: Ticks) -> float | None:
-    """Return the usual time from one tick's deadline to the next; None with fewer than two."""
+    """Return the median time between deadlines; None with fewer than two ticks."""
     if ticks.deadline_ns.size < 2:
         return None
     return float(np.median(np.diff(ticks.deadline_ns)))
 
 
 def misses(recording: Recording, ticks: int) -> str:
-    """Return how many ticks a run has skipped, for people; empty where none or not known.
+    """Return a text on the share of skipped ticks; empty if there are none or it is unknown.
 
     Args:
-        recording: What is known of the run.
+        recording: The run.
         ticks: Ticks that were not skipped.
 
     Raises:
-        DataError: A number that the recording says of it is none.
+        DataError: A recorded number is invalid.
     """
     skipped = counter(recording, "skipped_ticks", None) or 0
     text = recording.run.get("max_missed_share", repr(USUAL_MISSED_SHARE))
@@ -145,7 +127,7 @@ def misses(recording: Recording, ticks: int) -> str:
 
 
 def counter(recording: Recording, name: str, otherwise: int | None) -> int | None:
-    """Return a counter from the record of the end, or what was counted otherwise.
+    """Return a counter from the metadata of the end, or a default.
 
     Raises:
         DataError: It is not a whole number.
@@ -157,8 +139,3 @@ def counter(recording: Recording, name: str, otherwise: int | None) -> int | Non
     except ValueError:
         text = f"{recording.path}: hilctl.end: {name} must be a whole number"
         raise DataError(f"{text}, got {recording.end[name]!r}") from None
-
-
-def late_ticks(ticks: Ticks) -> int | None:
-    """Count ticks that woke more than half a tick period late; None with fewer than two ticks."""
-    return gathered(ticks).late_ticks()

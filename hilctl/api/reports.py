@@ -7,8 +7,7 @@ from typing import Literal
 from matplotlib.axes import Axes
 
 from hilctl.analysis.decimation import overview
-from hilctl.analysis.figure_export import formats_of
-from hilctl.analysis.figure_layout import FigureSpec
+from hilctl.analysis.figure_layout import FigureSpec, formats_of
 from hilctl.analysis.replay import ReplayResult
 from hilctl.analysis.replay import replay as recompute
 from hilctl.analysis.run_metrics import RunReport

@@ -12,7 +12,7 @@ import typer
 
 from hilctl import api
 from hilctl.analysis.catalogue import Entry, keys_of, read_catalogue, select
-from hilctl.analysis.export_all import export_all
+from hilctl.analysis.export import export_all
 from hilctl.base.errors import InputError
 from hilctl.base.formatting import finite_json, printable, short_name
 from hilctl.cli.console import progress_bar

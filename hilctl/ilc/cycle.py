@@ -1,4 +1,4 @@
-"""The error of a recording's steady cycles, harmonic by harmonic: pure functions of arrays."""
+"""Error of a recording's steady cycles, per harmonic."""
 
 import cmath
 import math
@@ -14,7 +14,7 @@ from hilctl.recording.recording import Recording
 from hilctl.signals import cycle_metrics
 
 MAX_HARMONICS = 2000
-"""Most harmonics that are looked at; a bin of the fold is then a quarter of the shortest."""
+"""Most harmonics; a bin of the average cycle is then a quarter of the shortest one."""
 
 _BINS = 8192
 _FEWEST_CYCLES = 2
@@ -23,19 +23,19 @@ _STRONGEST_WITHIN = 16  # harmonics
 
 @dataclass(frozen=True, slots=True)
 class CycleScore:
-    """How far the steady cycles of one segment were from what was wanted.
+    """Error of the steady cycles of one segment.
 
     Attributes:
         harmonics_um: complex128[K + 1], coefficients c_k of displacement less reference.
-        noise_um: float64[K + 1], standard deviation of each, from the scatter of the cycles.
+        noise_um: float64[K + 1], their standard deviations, from the scatter of the cycles.
         step_hz: Frequency of the first harmonic.
-        cycles: Cycles averaged.
-        peak_um: Largest magnitude of the average cycle's error, as reports have it.
+        cycles: Averaged cycles.
+        peak_um: Peak error of the average cycle, as in reports.
         rms_um: Its root mean square.
         peak_to_peak_um: Peak-to-peak displacement of the average cycle.
-        floor_um: Peak that sensor noise alone would make of an average cycle without error.
+        floor_um: Peak error that sensor noise alone would cause.
         strongest_hz: Frequency of the reference's strongest harmonic.
-        answer: Displacement over reference there.
+        answer: Displacement over reference at that frequency.
     """
 
     harmonics_um: C128
@@ -51,7 +51,7 @@ class CycleScore:
 
     @property
     def delay_s(self) -> float:
-        """Delay of displacement against reference, by the phase of the strongest harmonic."""
+        """Delay of the displacement, from the phase of the strongest harmonic."""
         return -cmath.phase(self.answer) / (2.0 * math.pi * self.strongest_hz)
 
     @property
@@ -66,15 +66,15 @@ class CycleScore:
 
 
 def cycle_error(recording: Recording, segment: Segment, highest_hz: float) -> CycleScore:
-    """Judge the steady cycles of a segment.
+    """Return the error of the steady cycles of a segment.
 
     Args:
-        recording: What was recorded.
+        recording: The recording.
         segment: A segment with a period.
-        highest_hz: Highest frequency to look at.
+        highest_hz: Highest frequency of a harmonic.
 
     Raises:
-        DataError: It has fewer than two whole steady cycles, or nothing was wanted or moved.
+        DataError: It has fewer than two whole steady cycles, or no motion.
     """
     part = steady_part(recording, segment)
     if part.cycle is None or part.cycles < _FEWEST_CYCLES:
@@ -104,7 +104,7 @@ def cycle_error(recording: Recording, segment: Segment, highest_hz: float) -> Cy
 
 
 def harmonic_count(period: float, step_hz: float, highest_hz: float) -> int:
-    """Return how many harmonics of a period, in samples, are looked at."""
+    """Return the number of harmonics of a period, in samples, up to a frequency."""
     return max(1, min(int(period / 4.0), int(highest_hz / step_hz), MAX_HARMONICS))
 
 
@@ -112,9 +112,9 @@ def coefficients(index: I64, period: float, signal: F64, count: int) -> C128:
     """Return Fourier coefficients c_0 to c_count of whole cycles of a signal.
 
     Args:
-        index: int64[n], sample index; phase 0 is where it is a multiple of ``period``.
+        index: int64[n], sample index; phase 0 at multiples of ``period``.
         period: Samples in one period.
-        signal: float64[n]; values that are not finite are left out.
+        signal: float64[n]; values that are not finite are omitted.
         count: Highest harmonic.
 
     Returns:
@@ -134,7 +134,7 @@ def coefficients(index: I64, period: float, signal: F64, count: int) -> C128:
 
 
 def _each_cycle(part: SteadyPart, segment: Segment, count: int) -> C128:
-    """Return the error's coefficients in each cycle: complex128[cycles, count + 1], in um."""
+    """Return the coefficients of the error in each cycle: complex128[cycles, count + 1], in um."""
     samples = part.samples
     since = samples.index - segment.start
     error = samples.displacement_um - samples.reference_um
@@ -147,7 +147,7 @@ def _each_cycle(part: SteadyPart, segment: Segment, count: int) -> C128:
 
 
 def _answer(part: SteadyPart, segment: Segment, step_hz: float) -> tuple[float, complex]:
-    """Return frequency of the reference's strongest harmonic, and displacement over reference."""
+    """Return the frequency of the reference's strongest harmonic, and its response."""
     samples = part.samples
     count = harmonic_count(segment.period, step_hz, _STRONGEST_WITHIN * step_hz)
     since = samples.index - segment.start

@@ -1,4 +1,4 @@
-"""Learning, run by run: the same experiment over and over, each time with the next correction."""
+"""Session of iterative learning: repeated runs of one experiment, each with a new correction."""
 
 import json
 import signal
@@ -31,16 +31,16 @@ from hilctl.run.result import RunResult
 from hilctl.run.start import StepStoppedError, checked_experiment, paced
 
 HIGHEST_PART = 0.125
-"""Highest frequency that a correction reaches, as a part of the sample rate."""
+"""Highest frequency of a correction, as a share of the sample rate."""
 
 _FEWEST_CYCLES = 2
 
 
 def repeating(checked: CheckedExperiment) -> list[Segment]:
-    """Return the segments to learn, the first of those that are alike.
+    """Return the periodic segments to learn, the first of equal ones.
 
     Raises:
-        ConfigError: There is none, or one is too short; or no compensator stands there.
+        ConfigError: There is none with enough cycles, or no compensator.
     """
     loaded = checked.loaded
 
@@ -67,7 +67,7 @@ def repeating(checked: CheckedExperiment) -> list[Segment]:
 
 
 def beginning(checked: CheckedExperiment, segment: Segment) -> IlcState:
-    """Return where learning begins: with nothing, or with the correction the experiment has."""
+    """Return the initial state, from the correction of the experiment if it has one."""
     rate_hz = checked.reference.sample_rate_hz
     highest_hz = HIGHEST_PART * rate_hz
     count = harmonic_count(segment.period, rate_hz / segment.period, highest_hz)
@@ -81,23 +81,23 @@ def beginning(checked: CheckedExperiment, segment: Segment) -> IlcState:
 
 
 Runner: TypeAlias = Callable[[Path, Sequence[str], Path], RunResult]
-"""Runs an experiment file with settings into a recording."""
+"""Function that runs an experiment file with settings and records it."""
 
 
 def correction_setting(file: Path) -> str:
-    """Return the ``key=value`` text that has an experiment use a correction, whatever its name."""
-    # Quoted: "lab #3" would end at the space, and "a: b" be a mapping.
+    """Return the ``key=value`` text that selects a correction file."""
+    # Quoted, because "lab #3" would end at the space, and "a: b" would be a mapping.
     return f"compensator.correction={json.dumps(str(file.resolve()), ensure_ascii=False)}"
 
 
 class IlcSession:
-    """Learns the correction of every waveform of an experiment that repeats.
+    """Session that learns the correction of every periodic waveform of an experiment.
 
     Args:
-        experiment: Experiment file; where it has a correction already, learning goes on from it.
-        settings: ``key=value`` texts over it.
-        folder: Where each run's recording and correction go.
-        run: How an experiment is run.
+        experiment: Experiment file; learning continues from its correction, if it has one.
+        settings: ``key=value`` overrides.
+        folder: Folder of the recordings and corrections.
+        run: Function that runs an experiment.
 
     Raises:
         InputError: It has no compensator, or no waveform with enough whole steady cycles.
@@ -117,14 +117,14 @@ class IlcSession:
         self._refusals: list[str] = []
 
     def learn(self, cycles: int, on_rows: Callable[[Sequence[IlcRow]], None]) -> IlcResult:
-        """Run, learn, and run again, until nothing is left to learn.
+        """Run and learn until the error no longer improves.
 
         Args:
             cycles: Most runs after the first.
             on_rows: Called after each run.
 
         Raises:
-            InputError: The first run is refused; nothing has moved.
+            InputError: The first run is rejected; nothing has moved.
             RunError: The first run ended by a fault.
         """
         self._make_folder()
@@ -145,7 +145,7 @@ class IlcSession:
         return IlcResult(self._best(), tuple(self._rows), check, reason, stop_signal, fault)
 
     def _runs_until_done(self, cycles: int, on_rows: Callable[[Sequence[IlcRow]], None]) -> str:
-        """Run and learn; return why that ended."""
+        """Run and learn; return the reason for the end."""
         for number in range(cycles + 1):
             try:
                 path = self._next_run(number, [each.next_um for each in self._learning])
@@ -185,7 +185,7 @@ class IlcSession:
         return result.path
 
     def _other_noise(self, number: int) -> list[str]:
-        """Give each run of a simulated device noise of its own: it must not be learned."""
+        """Return a new seed for the noise of a simulated device, which must not be learned."""
         device = self._checked.loaded.device
         field = device.Options.model_fields.get("seed")
         if field is None:
@@ -207,14 +207,14 @@ class IlcSession:
             reach_hz = state.reach_hz
             if learning and not state.done:
                 state = learn(state, error)
-                if state.done:  # it stays as it is while others go on
+                if state.done:  # its correction stays while others are learned
                     state = replace(state, next_um=state.best.correction_um)
                 self._learning[i] = state
             rows.append(row_of(number, segment, error, state, reach_hz, path))
         return rows
 
     def _check(self) -> tuple[IlcRow, ...]:
-        """Run once more with the best corrections, under noise that they have not seen."""
+        """Verify the best corrections in another run, with new noise."""
         number = self._rows[-1].run + 1
         path = self._next_run(number, [each.best.correction_um for each in self._learning])
         return tuple(self._judge(number, path, learning=False))

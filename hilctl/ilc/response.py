@@ -1,9 +1,8 @@
-"""How the displacement answers a change of the correction: found from the runs themselves.
+"""Response of the displacement to a change of the correction, identified from the runs.
 
-Behind a compensator that is nearly exact, the answer is nearly the change itself, some samples
-late. What is left of the structure's resonance decides how high a correction may reach. So the
-answer is taken as gain, delay and one second-order resonance, and fitted to what each harmonic
-did when its correction was changed.
+With a nearly exact compensator the response is close to a delay of some samples. The remaining
+resonance of the structure limits the bandwidth of a correction. The response is therefore a gain, a
+delay and one second-order resonance, fitted to the changes of each harmonic.
 """
 
 import math
@@ -16,7 +15,7 @@ from scipy.optimize import least_squares
 from hilctl.base.types import C128, F64
 
 _COUPLING = 0.15
-"""Part of a harmonic's change that hysteresis scatters over its neighbours."""
+"""Share of a harmonic's change that hysteresis couples into its neighbours."""
 
 _CLEAR = 4.0
 _FIRST_DOUBT = 0.05
@@ -34,7 +33,7 @@ class Response:
 
     Attributes:
         gain: At frequency 0.
-        delay_s: Delay; below 0 where the compensator leads too far.
+        delay_s: Delay; negative if the compensator leads too far.
         inverse_natural_s2: 1 / w_n^2, in s^2; 0 without a resonance.
         damping_ratio: zeta.
     """
@@ -54,7 +53,7 @@ class Response:
 
     @property
     def natural_hz(self) -> float | None:
-        """Natural frequency; None where none was found."""
+        """Natural frequency; None without a resonance."""
         if self.inverse_natural_s2 <= 0.0:
             return None
         return float(1.0 / (2.0 * np.pi * np.sqrt(self.inverse_natural_s2)))
@@ -62,13 +61,13 @@ class Response:
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """What one change of a correction did.
+    """A change of a correction and its effect.
 
     Attributes:
         step_hz: Frequency of the first harmonic.
         correction_um: complex128[K + 1], change of the correction.
         error_um: complex128[K + 1], change of the error.
-        noise_um: float64[K + 1], standard deviation of that.
+        noise_um: float64[K + 1], standard deviation of the change of the error.
     """
 
     step_hz: float
@@ -77,7 +76,7 @@ class Change:
     noise_um: F64
 
     def points(self) -> tuple[F64, C128, F64]:
-        """Return frequencies, measured answers and their weights, where the change was clear."""
+        """Return frequencies, measured responses and weights of significant changes."""
         size = np.abs(self.correction_um)
         near = np.array([0.25, 0.5, 1.0, 0.0, 1.0, 0.5, 0.25])
         spread = np.sqrt(np.convolve(size**2, near)[3 : size.size + 3])
@@ -90,15 +89,15 @@ class Change:
 
 
 def fit(changes: Sequence[Change], first: tuple[float, complex], sample_rate_hz: float) -> Response:
-    """Find the response that explains the changes best.
+    """Fit the response to all changes.
 
-    Before there is any, the answer to the reference itself says something of delay and resonance,
-    as far as it is further off than hysteresis that is left would make it.
+    Before the first change, the response to the reference gives an estimate of delay and resonance,
+    beyond the error of the remaining hysteresis.
 
     Args:
-        changes: What was changed, and what came of it.
+        changes: Changes and their effects.
         first: Frequency of the reference's strongest harmonic, and displacement over reference.
-        sample_rate_hz: Samples a second.
+        sample_rate_hz: Samples per second.
     """
     parts = [change.points() for change in changes]
     frequency = np.concatenate([[first[0]], *(part[0] for part in parts)])

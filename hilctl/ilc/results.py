@@ -1,4 +1,4 @@
-"""What learning says of itself: every run, and what came of all of them."""
+"""Results of iterative learning: one row per run and waveform, and the overall result."""
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -12,18 +12,18 @@ from hilctl.ilc.update import IlcState
 
 @dataclass(frozen=True, slots=True)
 class IlcRow:
-    """What one run said of one waveform.
+    """Result of one run for one waveform.
 
     Attributes:
-        run: Number of the run; 0 is the start, without what is learned here.
+        run: Number of the run; 0 is the first, before learning.
         label: The waveform.
         error_percent: Peak error of the average cycle, in percent of the peak-to-peak.
         rms_percent: Its root mean square.
-        floor_percent: Peak error that sensor noise alone would make.
-        cycles: Cycles averaged.
-        reach_hz: Up to which frequency the correction had been moved.
-        delay_samples: Delay that the runs so far show between correction and displacement.
-        natural_hz: Resonance that they show; None where there is none.
+        floor_percent: Peak error that sensor noise alone would cause.
+        cycles: Averaged cycles.
+        reach_hz: Bandwidth of the correction.
+        delay_samples: Delay between correction and displacement, identified so far.
+        natural_hz: Resonance identified so far; None without one.
         recording: The run's recording.
     """
 
@@ -41,15 +41,15 @@ class IlcRow:
 
 @dataclass(frozen=True, slots=True)
 class IlcResult:
-    """What came of learning.
+    """Result of learning.
 
     Attributes:
         correction: The best correction.
         rows: Every run, for each waveform.
-        check: One more run with the best correction, for each waveform; none where it was stopped.
-        reason: Why it ended.
+        check: Verification run with the best correction, for each waveform; none if stopped.
+        reason: Reason for the end.
         stop_signal: Number of the signal that stopped it, or 0.
-        fault: Whether a run ended by a fault, or could not be run or judged.
+        fault: Whether a run ended by a fault, or could not be run or evaluated.
     """
 
     correction: Correction
@@ -79,14 +79,14 @@ class IlcResult:
 def row_of(
     number: int, segment: Segment, error: CycleScore, state: IlcState, reach_hz: float, path: Path
 ) -> IlcRow:
-    """Return what a run said of one waveform.
+    """Return the row of a run for one waveform.
 
     Args:
         number: Number of the run.
         segment: The waveform.
-        error: What came of it.
-        state: Where learning stands with it.
-        reach_hz: Up to which frequency the run's correction had been moved.
+        error: Its error.
+        state: State of learning after the run.
+        reach_hz: Bandwidth of the run's correction.
         path: The run's recording.
     """
     return IlcRow(

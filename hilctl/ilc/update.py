@@ -1,9 +1,8 @@
-"""From errors so far to the next correction: pure functions of frozen state.
+"""Update of the correction from the errors so far: pure functions of frozen state.
 
-Each harmonic of the correction is moved against its error by the inverse of the answer that the
-runs have shown so far (:mod:`hilctl.ilc.response`). How high harmonics reach grows while the
-error falls, so that each widening rests on what was learned below it. Where the error grows, the
-next step starts from the best correction again, with half the gain and a narrower reach.
+Each harmonic of the correction moves against its error by the inverse of the identified response
+(:mod:`hilctl.ilc.response`). The bandwidth grows while the error falls. If the error grows, the
+next step starts from the best correction, with half the gain and a smaller bandwidth.
 """
 
 from dataclasses import dataclass, field, replace
@@ -16,18 +15,18 @@ from hilctl.ilc.cycle import CycleScore
 from hilctl.ilc.response import Change, Response, fit
 
 FIRST_GAIN = 0.7
-"""Part of a harmonic's error that the first step takes away."""
+"""Share of a harmonic's error that the first step removes."""
 
 FULL_GAIN = 0.9
-"""The same where all goes well."""
+"""Largest share that a step removes."""
 
 _LEAST_GAIN = 0.2
 
 AT_FLOOR = 1.2
-"""Multiple of the noise floor at which there is nothing left to learn."""
+"""Multiple of the noise floor at which learning ends."""
 
 _FIRST_REACH = 0.01
-"""First reach as a part of the sample rate: a delay of a few samples is a few degrees there."""
+"""First bandwidth as a share of the sample rate, where a delay of some samples is some degrees."""
 
 _FIRST_TURN_RAD = np.pi / 6.0
 _WIDEN = 1.6
@@ -46,9 +45,9 @@ class IlcIteration:
     """One run.
 
     Attributes:
-        correction_um: complex128[K + 1], coefficients of the correction it had.
-        error: What came of it.
-        reach_hz: Up to which frequency the correction had been moved.
+        correction_um: complex128[K + 1], coefficients of its correction.
+        error: Its error.
+        reach_hz: Bandwidth of its correction.
     """
 
     correction_um: C128
@@ -58,18 +57,18 @@ class IlcIteration:
 
 @dataclass(frozen=True, slots=True)
 class IlcState:
-    """Where the learning of one waveform stands.
+    """State of the learning of one waveform.
 
     Attributes:
-        sample_rate_hz: Samples a second.
-        highest_hz: Where the reach ends.
+        sample_rate_hz: Samples per second.
+        highest_hz: Highest bandwidth.
         next_um: complex128[K + 1], correction for the next run.
-        reach_hz: Up to which frequency it was moved.
-        gain: Part of the error that the next step takes away.
-        widening: Factor of the reach after a run that went well.
-        response: How the displacement answers a change of the correction.
+        reach_hz: Its bandwidth.
+        gain: Share of the error that the next step removes.
+        widening: Factor of the bandwidth after an improvement.
+        response: Response of the displacement to a change of the correction.
         trials: Runs so far.
-        done: Why there is nothing more to learn; empty while there is.
+        done: Reason for the end of learning, or empty.
     """
 
     sample_rate_hz: float
@@ -89,7 +88,7 @@ class IlcState:
 
     @property
     def closest(self) -> IlcIteration:
-        """The run with the smallest rms error, which noise and single corners sway less."""
+        """The run with the smallest rms error, which is less sensitive to noise and corners."""
         return min(self.trials, key=lambda trial: trial.error.rms_um)
 
 
@@ -97,15 +96,15 @@ def begin(sample_rate_hz: float, first_um: C128, highest_hz: float) -> IlcState:
     """Return the state before the first run.
 
     Args:
-        sample_rate_hz: Samples a second.
+        sample_rate_hz: Samples per second.
         first_um: complex128[K + 1], correction of the first run.
-        highest_hz: Highest frequency that a correction may reach.
+        highest_hz: Highest bandwidth of a correction.
     """
     return IlcState(sample_rate_hz, highest_hz, first_um, reach_hz=0.0)
 
 
 def learn(before: IlcState, error: CycleScore) -> IlcState:
-    """Take what came of the run with ``before.next_um``, and work out the next correction."""
+    """Return the next state, from the error of the run with ``before.next_um``."""
     trial = IlcIteration(before.next_um, error, before.reach_hz)
     state = replace(before, trials=(*before.trials, trial))
     state = replace(state, response=_response(state))
@@ -125,7 +124,7 @@ def learn(before: IlcState, error: CycleScore) -> IlcState:
 
 
 def refused(before: IlcState) -> IlcState:
-    """Back off from a correction that the run's limits don't allow."""
+    """Return the next state after a correction that exceeds the limits of the run."""
     if before.done or not before.trials:
         return before
     base = before.closest
@@ -134,7 +133,7 @@ def refused(before: IlcState) -> IlcState:
 
 
 def _first(state: IlcState) -> IlcState:
-    """Set the first reach: no further than where the answer turns by 30 degrees."""
+    """Set the first bandwidth, below a phase of 30 degrees of the response."""
     step_hz = state.trials[0].error.step_hz
     frequency = np.linspace(0.0, 1.0, 101)[1:] * _FIRST_REACH * state.sample_rate_hz
     turned = np.abs(np.angle(state.response.at(frequency))) > _FIRST_TURN_RAD
@@ -143,11 +142,7 @@ def _first(state: IlcState) -> IlcState:
 
 
 def _backed_off(state: IlcState, base: IlcIteration) -> IlcState:
-    """Halve the gain, and reach no further than the run that is gone back to.
-
-    What went wrong shows how the displacement answers there; where it was not the reach that had
-    grown, it must shrink.
-    """
+    """Halve the gain, and return to the bandwidth of the base run, or reduce it if equal."""
     grown = state.reach_hz > base.reach_hz > 0.0
     reach_hz = base.reach_hz if grown else max(_NARROW * state.reach_hz, base.error.step_hz)
     widening = max(_LEAST_WIDENING, state.widening**0.5)
@@ -156,7 +151,7 @@ def _backed_off(state: IlcState, base: IlcIteration) -> IlcState:
 
 
 def _response(state: IlcState) -> Response:
-    """Fit the answer to all changes so far."""
+    """Fit the response to all changes so far."""
     changes = [
         Change(
             after.error.step_hz,
@@ -171,7 +166,7 @@ def _response(state: IlcState) -> Response:
 
 
 def _moved(state: IlcState, base: IlcIteration) -> C128:
-    """Return a correction one step on from a run's."""
+    """Return the correction one step from that of a run."""
     error = base.error
     frequency = np.arange(error.harmonics_um.size, dtype=np.float64) * error.step_hz
     answer = state.response.at(frequency)
@@ -183,14 +178,14 @@ def _moved(state: IlcState, base: IlcIteration) -> C128:
 
 
 def _above_noise(error: CycleScore) -> F64:
-    """Return how much of each harmonic's error is believed: 0 in the noise, 1 well above it."""
+    """Return the weight of each harmonic's error: 0 within the noise, 1 well above it."""
     size = np.maximum(np.abs(error.harmonics_um), 1e-300)
     believed: F64 = np.maximum(0.0, 1.0 - (_NOISE * error.noise_um / size) ** 2)
     return believed
 
 
 def _taper(frequency: F64, reach_hz: float) -> F64:
-    """Return the zero-phase low-pass: 1 up to the reach, 0 from 1.25 times it on."""
+    """Return the zero-phase low-pass: 1 up to the bandwidth, 0 from 1.25 times it on."""
     outside = np.clip((frequency / reach_hz - 1.0) / (_TAPER - 1.0), 0.0, 1.0)
     return 0.5 + 0.5 * np.cos(np.pi * outside)
 

@@ -1,4 +1,4 @@
-"""Builds a recording from the records of its file, whole or in pieces."""
+"""Builder of recordings, whole or in pieces, from the records of a file."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -15,7 +15,6 @@ from hilctl.recording.codec import BlockArrays
 from hilctl.recording.metadata_keys import unsealed
 from hilctl.recording.recording import TICK_COLUMNS, Recording, ReplayStart, Ticks
 from hilctl.recording.recovery_scan import RecoveryScan
-from hilctl.recording.segments import segments_of
 from hilctl.recording.time_range import TimeRange
 from hilctl.recording.validation import (
     RATES_HZ,
@@ -23,17 +22,18 @@ from hilctl.recording.validation import (
     count_of,
     labels_of,
     number_of,
+    segments_of,
     short,
 )
 
 _TEXTS = {"experiment.yaml", "model.yaml", "correction.yaml"}
 _NUMBER_BYTES = 8
-_EVENT_BYTES = 2048  # Python objects of a message that is kept
+_EVENT_BYTES = 2048  # Python objects per message
 _MOST_LOOSE = 512
 
 
 class ColumnTable:
-    """Columns that grow; small blocks are joined, because an array takes 100 bytes by itself."""
+    """Growing columns; small blocks are joined because every array has an overhead of 100 bytes."""
 
     def __init__(self) -> None:
         self._joined: dict[str, list[Any]] = {}
@@ -51,17 +51,17 @@ class ColumnTable:
             self._loose = {}
 
     def pop(self, name: str, kind: Any = np.float64) -> Any:
-        """Remove a column and return its values; empty if there is none."""
+        """Remove a column and return its values; an empty array if it is missing."""
         parts = [*self._joined.pop(name, []), *self._loose.pop(name, [])]
         return np.concatenate(parts).astype(kind, copy=False) if parts else np.empty(0, dtype=kind)
 
 
 class RecordingBuilder:
-    """Builds recordings from the records of a file, which it takes in order.
+    """Builder of recordings from the records of a file, in order.
 
     Args:
-        scan: Source of the records; its budget counts what is kept.
-        stretch: Keep only blocks and ticks that overlap it.
+        scan: Source of the records; its budget counts kept bytes.
+        stretch: Time range; only blocks and ticks that overlap it are kept.
 
     Attributes:
         samples: Samples taken.
@@ -83,7 +83,7 @@ class RecordingBuilder:
         self._begin()
 
     def _begin(self) -> None:
-        """Begin a piece."""
+        """Start a piece."""
         self.waiting = 0
         self._blocks, self._ticks = ColumnTable(), ColumnTable()
         self._starts: list[ReplayStart] = []
@@ -93,8 +93,7 @@ class RecordingBuilder:
         """Take a record.
 
         Raises:
-            DataError: hilctl can't have written it, or it is a fact of the run that follows samples
-                which have been returned already.
+            DataError: It is invalid, or a fact of the run that follows the first piece.
         """
         match record:
             case Message() if self._sound.topic(record.channel_id):
@@ -121,7 +120,7 @@ class RecordingBuilder:
             raise DataError(f"{what} stands behind the first samples")
 
     def _read_or_not(self, channel: int) -> None:
-        # It repeats /samples, and has nine of ten messages at 50 kHz in blocks.
+        # /scope is a copy of /samples and has 90 % of the messages at 50 kHz in blocks.
         if self._sound.topic(channel) == "/scope":
             self._scan.unread.add(channel)
         else:
@@ -142,7 +141,7 @@ class RecordingBuilder:
             self._events.append((record.log_time, decoded))
 
     def _within(self, start: int, stop: int) -> bool:
-        """Return whether samples from ``start`` up to ``stop`` overlap the stretch."""
+        """Return whether samples from ``start`` up to ``stop`` overlap the time range."""
         bounds = self._stretch_bounds()
         return start < bounds[1] and bounds[0] < stop
 
@@ -172,8 +171,8 @@ class RecordingBuilder:
 
         Args:
             path: The file, for error messages.
-            last: Whether nothing follows; the last piece has the end of the run and the number of
-                missing samples.
+            last: Whether it is the last piece, with the end of the run and the number of missing
+                samples.
 
         Raises:
             DataError: A fact of the run is missing or damaged, or a column is incomplete.
@@ -237,10 +236,10 @@ class RecordingBuilder:
 
 
 def _samples(index: I64, flags: U32, unit: CommandUnit, values_of: Callable[[str], F64]) -> Samples:
-    """Return samples from the values of their fields, or of the column that an omitted one equals.
+    """Return samples from the values of their fields; an omitted column equals another one.
 
     Raises:
-        DataError: A column that every recording has is missing, or has another length.
+        DataError: A required column is missing, or has another length.
     """
     columns: dict[str, F64] = {}
     for name, column in COLUMNS.items():

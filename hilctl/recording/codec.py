@@ -1,6 +1,6 @@
-"""Samples and ticks between protobuf bytes and arrays.
+"""Conversion of samples and ticks between protobuf bytes and arrays.
 
-Blocks of samples pass through the twin of their message, which declares packed lists as ``bytes``
+Blocks of samples use the twin of their message, in which packed lists are declared ``bytes``
 (:func:`hilctl.recording.schema.message_class`), so that no sample becomes a Python number.
 """
 
@@ -27,7 +27,7 @@ _LARGEST = 2**63 - 1
 
 @dataclass(frozen=True, slots=True)
 class BlockArrays:
-    """The content of a ``SampleBlock``; the lengths of its arrays are not checked.
+    """Content of a ``SampleBlock``; the lengths of its arrays are not checked.
 
     Attributes:
         tick0: Index of its first sample.

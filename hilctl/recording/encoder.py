@@ -1,4 +1,4 @@
-"""From ring batches and events to the messages of a recording's topics."""
+"""Encoder of ring batches and events as messages of a recording's topics."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -40,16 +40,16 @@ class Encoded(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class RecordingLayout:
-    """What messages are made by; a recording's facts say it, so that more can be made later.
+    """Parameters of the messages; stored among a recording's facts, so that messages can be added.
 
     Attributes:
-        sample_rate_hz: Samples a second.
+        sample_rate_hz: Samples per second.
         command_unit: ``A`` or ``V``.
         measures_command: Whether the device measures its command.
         scope_rate_hz: Highest rate of ``/scope``.
         start_unix_ns: Unix time of sample 0 in ns.
-        records_input: Whether the compensator's input is other than the reference.
-        waveform_unit: ``um``, or the command unit where nothing compensates.
+        records_input: Whether the compensator's input differs from the reference.
+        waveform_unit: ``um``, or the command unit without a compensator.
     """
 
     sample_rate_hz: float
@@ -61,11 +61,11 @@ class RecordingLayout:
     waveform_unit: str = "um"
 
     def __post_init__(self) -> None:
-        """Refuse what no recording can hold.
+        """Check rates and clock.
 
         Raises:
-            InputError: A rate is none, or the clock stands before 1970 or within a year of 2262,
-                where times in ns go beyond what 64 bits hold.
+            InputError: A rate is invalid, or the clock is before 1970 or after 2260, where times
+                in ns exceed 64 bits.
         """
         if not RATES_HZ[0] <= self.sample_rate_hz <= RATES_HZ[1] or not self.scope_rate_hz > 0.0:
             rates = f"{self.sample_rate_hz!r}, {self.scope_rate_hz!r}"
@@ -83,7 +83,7 @@ class RecordingLayout:
         return given.get(column.when, True)
 
     def recorded(self, samples: Samples | BlockBatch) -> Iterator[tuple[RecordedField, F64]]:
-        """Yield field and values of each column that is recorded."""
+        """Yield field and values of each recorded column."""
         for name, column in COLUMNS.items():
             if self.records(column):
                 values = samples.column(name)
@@ -114,10 +114,10 @@ class RecordingLayout:
 
     @classmethod
     def from_facts(cls, facts: Mapping[str, str]) -> Self:
-        """Undo :meth:`to_facts`.
+        """Return the layout from the facts of a recording.
 
         Raises:
-            DataError: A fact is missing, as in recordings of an older hilctl, or damaged.
+            DataError: A fact is missing (as in recordings of older versions) or damaged.
         """
         try:
             return cls(
@@ -138,7 +138,7 @@ def event_message(event: Event, before: Iterable[tuple[RecordedField, F64]] = ()
     """Return the message of one event.
 
     Args:
-        event: What happened, with its time.
+        event: The event, with its time.
         before: Field and values of each column of the samples before it.
     """
     out = schema.message("Event")
@@ -155,14 +155,14 @@ def event_message(event: Event, before: Iterable[tuple[RecordedField, F64]] = ()
 
 
 class MessageMaker:
-    """Makes the messages of one run.
+    """Encoder of one run.
 
     Args:
-        layout: What they are made by.
+        layout: Parameters of the messages.
 
     Attributes:
-        samples: Samples made into messages so far.
-        missing: Samples known to be missing between them.
+        samples: Samples encoded so far.
+        missing: Samples missing between them.
     """
 
     def __init__(self, layout: RecordingLayout) -> None:
@@ -232,7 +232,7 @@ class MessageMaker:
 
 
 class Topics:
-    """Puts messages into a file under their topics, and numbers them.
+    """Channels of a file: adds messages to their topics and numbers them.
 
     Args:
         writer: File to write to.
@@ -244,7 +244,7 @@ class Topics:
         self._sequence: dict[str, int] = {}
 
     def know(self, topic: str, channel: int, sequence: int) -> None:
-        """Go on with a channel that is in the file already.
+        """Continue an existing channel.
 
         Args:
             topic: Its topic.
@@ -254,7 +254,7 @@ class Topics:
         self._channels[topic], self._sequence[topic] = channel, sequence
 
     def register(self) -> None:
-        """Enter all of hilctl's topics that the file has not yet."""
+        """Register hilctl's topics that are not in the file yet."""
         descriptors = schema.descriptor_set()
         for topic, name in schema.TOPICS.items():
             if topic not in self._channels:

@@ -1,7 +1,7 @@
-"""MCAP records and chunks from bytes that may be damaged.
+"""MCAP records and chunks from bytes that may be damaged, within a budget of work and memory.
 
-A record is whole only if writing it again gives the same bytes: then every length in it is right,
-and so is the checksum of an attachment. A chunk is whole if its checksum is right.
+A record is valid if writing it again gives the same bytes: then all lengths in it are right, and so
+is the checksum of an attachment. A chunk is valid if its checksum is right.
 """
 
 import os
@@ -36,19 +36,30 @@ from mcap.records import (
     SummaryOffset,
 )
 
-from hilctl.recording.read_budget import LARGEST_CHUNK_BYTES, MOST_IN_CHUNK, ReadBudget
+from hilctl.base.errors import DataError
 
+LARGEST_CHUNK_BYTES = 32 * 2**20
+"""Largest uncompressed chunk; hilctl closes one at 5 MiB (formerly 8 MiB)."""
+MOST_IN_CHUNK = 2**18
+"""Most records in a chunk: three times as many as 8 MiB of the shortest messages."""
 FRAME = struct.Struct("<BQ")
 """Opcode and length before every record."""
 LARGEST_BYTES = 2 * LARGEST_CHUNK_BYTES
-"""No record that hilctl writes is larger; a length beyond it is a damaged one."""
+"""Largest record; a larger length is damaged."""
+FOOTER_BYTES = FRAME.size + 20
+"""Size of the footer, which the closing magic follows."""
 CHUNK_HEAD = struct.Struct("<QQQII")
-"""First and last time of a chunk, its uncompressed size, its checksum, and the length of the name
-of its compression, which follows, and then the length of its data and the data."""
+"""First and last time of a chunk, uncompressed size, checksum, and length of the compression's
+name; after it come the name, the length of the data, and the data."""
 LENGTH = struct.Struct("<Q")
 
+_FLOOR_BYTES = 64 * 2**20
+_EXPANSION = 128  # about 40 for a constant signal at a rate that is a power of two
+_READ_TIMES = 32
+_MESSAGES = 100_000
+_BYTES_PER_MESSAGE = 16  # its entry in the index
 _MESSAGE = struct.Struct("<BQHIQQ")  # opcode and length as well
-_MESSAGE_OPCODE = int(Opcode.MESSAGE)  # comparing with an enumeration is slow
+_MESSAGE_OPCODE = int(Opcode.MESSAGE)  # enumerations compare slowly
 _PIECE_BYTES = 65536
 _KINDS: dict[int, Any] = {
     Opcode.HEADER: Header,
@@ -67,8 +78,49 @@ _KINDS: dict[int, Any] = {
 }
 
 
+class ReadBudget:
+    """Limit of the work and memory spent on one file, in proportion to its size.
+
+    A file of a few kilobytes can ask for gigabytes: highly compressible streams, overlapping
+    records, empty messages. What hilctl writes stays far below these limits.
+
+    Args:
+        size: Bytes of the file.
+    """
+
+    def __init__(self, size: int) -> None:
+        expanded = _FLOOR_BYTES + _EXPANSION * size
+        self._left = {
+            "bytes to read again and again": _FLOOR_BYTES + _READ_TIMES * size,
+            "bytes uncompressed": expanded,
+            "bytes of samples, ticks and events": expanded,
+            "messages": _MESSAGES + size // _BYTES_PER_MESSAGE,
+        }
+
+    def read(self, size: int) -> None:
+        """Count bytes read; overlapping records are read more than once."""
+        self._take("bytes to read again and again", size)
+
+    def expand(self, size: int) -> None:
+        """Count decompressed bytes."""
+        self._take("bytes uncompressed", size)
+
+    def keep(self, size: int) -> None:
+        """Count bytes kept in memory."""
+        self._take("bytes of samples, ticks and events", size)
+
+    def message(self, count: int = 1) -> None:
+        """Count messages."""
+        self._take("messages", count)
+
+    def _take(self, what: str, amount: int) -> None:
+        self._left[what] -= amount
+        if self._left[what] < 0:
+            raise DataError(f"holds more {what} than a recording of its size can")
+
+
 def parse(opcode: int, body: bytes) -> McapRecord | None:
-    """Return the record, or None if the bytes are not exactly one of its kind."""
+    """Return the record, or None if the bytes are not exactly one record."""
     stream, builder = ReadDataStream(BytesIO(body)), RecordBuilder()
     try:
         if opcode == Opcode.MESSAGE:
@@ -84,7 +136,7 @@ def parse(opcode: int, body: bytes) -> McapRecord | None:
 
 
 def records_from(stream: BinaryIO, start: int, stop: int) -> Iterator[McapRecord]:
-    """Yield whole records of a file, up to the first that is damaged or holds messages."""
+    """Yield valid records of a file, up to the first damaged record, chunk or message."""
     stop = min(stop, stream.seek(0, os.SEEK_END))
     while start + FRAME.size <= stop:
         stream.seek(start)
@@ -99,7 +151,7 @@ def records_from(stream: BinaryIO, start: int, stop: int) -> Iterator[McapRecord
 
 
 def split(data: bytes) -> Iterator[tuple[int, int, McapRecord]]:
-    """Yield start, end and record of the content of a chunk, up to the first that is not whole."""
+    """Yield start, end and record of a chunk's content, up to the first invalid record."""
     at = 0
     for _ in range(MOST_IN_CHUNK):
         if at + FRAME.size > len(data):

@@ -1,4 +1,4 @@
-"""Names of facts in a recording that more than one module goes by; importing it costs nothing."""
+"""Names and checksums of the metadata of a recording."""
 
 import json
 import zlib
@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from typing import TypeAlias
 
 HOLDS_FACT = "holds"
-"""Fact of a run: JSON list of what its device holds alone while it is open."""
+"""Fact of a run: JSON list of the resources that its device locks."""
 HEAT_FACT = "coil_heat_a2"
-"""Fact of a run and of its end: heat of the coil then, the running mean square of its current."""
+"""Fact of a run and of its end: heat of the coil, the running mean square of its current."""
 LABELS_FACT = "labels"
 """Fact of a run: its labels as a JSON object."""
 END_FIGURES = (
@@ -18,20 +18,19 @@ END_FIGURES = (
     "peak_error_percent",
     "rms_error_percent",
 )
-"""Facts of the end of a run: the worst figure of its segments, where any has it; as in a report."""
+"""Facts of the end of a run: the worst value of its segments, as in a report."""
 USAGE_FACT = "processes"
-"""Fact of the end of a run: what ``loop`` and ``supervisor`` took of the machine while it went on,
-a JSON object of each."""
+"""Fact of the end of a run: resource usage of ``loop`` and ``supervisor``, as JSON objects."""
 OVERRIDES_FACT = "overrides"
-"""Fact of a run: JSON list of the key=value texts that were set over its file."""
+"""Fact of a run: JSON list of the key=value overrides of its file."""
 RECORDINGS = "recordings"
-"""Folder of recordings, relative to where hilctl runs, where no other is given."""
+"""Default folder of recordings, relative to the working directory."""
 
 CHECKSUM_FACT = "crc32"
-"""Fact of every metadata record: CRC-32 of its name and its other facts, as hexadecimal digits."""
+"""Fact of every metadata record: CRC-32 of its name and other facts, in hexadecimal digits."""
 
 LabelValue: TypeAlias = str | int | float
-"""A label says text or a number."""
+"""Value of a label."""
 
 
 def sealed(name: str, facts: Mapping[str, str]) -> dict[str, str]:
@@ -42,7 +41,7 @@ def sealed(name: str, facts: Mapping[str, str]) -> dict[str, str]:
 def unsealed(name: str, metadata: Mapping[str, str]) -> tuple[dict[str, str], bool]:
     """Return the facts of a metadata record, and whether their checksum is right.
 
-    A record of an older hilctl has none, and passes.
+    Records of older versions have no checksum and pass.
     """
     facts = dict(metadata)
     says = facts.pop(CHECKSUM_FACT, None)

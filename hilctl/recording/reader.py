@@ -1,4 +1,4 @@
-"""From an MCAP file to a recording in memory, whole or in pieces."""
+"""Reading of MCAP files, whole or in pieces."""
 
 import logging
 from collections.abc import Generator, Iterator
@@ -9,11 +9,10 @@ from pathlib import Path
 from hilctl.base.errors import DataError
 from hilctl.base.os_errors import no_such_file, reason
 from hilctl.recording.builder import RecordingBuilder
-from hilctl.recording.index import places_of
-from hilctl.recording.locks import is_being_recorded
 from hilctl.recording.recording import Recording
+from hilctl.recording.recording_files import is_being_recorded
 from hilctl.recording.recovery_scan import RecoveryScan
-from hilctl.recording.time_range import TimeRange
+from hilctl.recording.time_range import TimeRange, places_of
 
 _log = logging.getLogger(__name__)
 
@@ -22,35 +21,34 @@ PIECE_SAMPLES = 2**18
 
 
 def read(path: Path, stretch: TimeRange | None = None) -> Recording:
-    """Read a recording; if it was truncated or damaged, everything that is whole.
+    """Read a recording, or the valid part of a truncated or damaged one.
 
-    Nothing is written. Missing data is logged as a warning, in one line. All arrays have one shape
-    and rise where they must, whatever the file contains; time and memory stay in proportion to its
-    size, or to that of a stretch of it. Of a finished file, only the stretch is read and checked.
+    Missing data is logged as one warning. Arrays have consistent lengths and indices increase,
+    whatever the file contains; time and memory are in proportion to its size, or to that of the
+    time range. Of a finished file, only the time range is read and checked.
 
     Args:
         path: The recording.
-        stretch: What to keep of it; everything if None.
+        stretch: Time range to read; everything if None.
 
     Raises:
-        DataError: The file can't be read, is not an MCAP file, holds what hilctl can't have
-            written, or no sample of the stretch.
+        DataError: The file cannot be read, is not a valid recording, or has no sample in the range.
     """
     (whole,) = _read(path, stretch, piece_samples=None)
     return stretch.cut(whole) if stretch else whole
 
 
 class RecordingStream:
-    """A recording of any length, a piece at a time; each iteration reads the file anew.
+    """A recording of any length, in pieces; each iteration reads the file again.
 
     Every piece is a :class:`~hilctl.recording.recording.Recording` of the next samples, ticks,
-    events and replay starts. The last one, which may hold no sample, has the end, the number of
-    missing samples and, of a stretch, the segments as they are cut. Together they are what
-    :func:`read` returns.
+    events and replay starts. The last one, which may have no samples, also has the end, the number
+    of missing samples and the segments cut to the time range. Joined, the pieces are the result of
+    :func:`read`.
 
     Args:
         path: The recording.
-        stretch: What to read of it; everything if None.
+        stretch: Time range to read; everything if None.
     """
 
     def __init__(self, path: Path, stretch: TimeRange | None = None) -> None:
@@ -61,7 +59,7 @@ class RecordingStream:
         """Yield the pieces.
 
         Raises:
-            DataError: As :func:`read` does, and if facts of the run follow its samples.
+            DataError: See :func:`read`; also if facts of the run follow its samples.
         """
         pieces = _prefetched(_read(self.path, self.stretch, PIECE_SAMPLES))
         return self.stretch.cut_pieces(pieces) if self.stretch else pieces
@@ -79,7 +77,7 @@ def _prefetched(pieces: Generator[Recording, None, None]) -> Iterator[Recording]
 def _read(
     path: Path, stretch: TimeRange | None, piece_samples: int | None
 ) -> Generator[Recording, None, None]:
-    """Yield pieces of that many samples, uncut; all in one if None."""
+    """Yield pieces of at least that many samples, uncut; one piece if None."""
     try:
         with path.open("rb") as stream:
             places = places_of(stream, stretch) if stretch else None

@@ -1,4 +1,4 @@
-"""A recording in memory: arrays and facts, however they were stored."""
+"""A recording in memory: arrays and facts."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
@@ -18,8 +18,8 @@ class Ticks:
     Attributes:
         first_sample: int64[m], index of the tick's first sample.
         deadline_ns: int64[m], when the tick was due, since the start of the run.
-        late_ns: int64[m], how much later the loop woke; after a skip, than the first tick missed.
-        exchange_ns: int64[m], how long the exchange with the device took.
+        late_ns: int64[m], lateness of the wake-up; after a skip, from the first missed tick.
+        exchange_ns: int64[m], duration of the exchange with the device.
     """
 
     first_sample: I64
@@ -29,12 +29,12 @@ class Ticks:
 
 
 TICK_COLUMNS = tuple(each.name for each in fields(Ticks))
-"""Their names, which are those of a block's head as well."""
+"""Names of the columns of ticks, also those of a block's header."""
 
 
 @dataclass(frozen=True, slots=True)
 class ReplayStart:
-    """Where a replay can begin: the first block, and every block after a gap.
+    """Start of a replay: the first block, or a block after a gap.
 
     Attributes:
         sample: Index of the block's first sample.
@@ -49,25 +49,25 @@ class ReplayStart:
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """One run, read back.
+    """One recorded run.
 
     Attributes:
         path: File it was read from.
-        run: Facts of the run as recorded at its start (identity, versions, device, units).
-        end: Facts recorded at its end (counters, reason); empty where the file is cut short.
-        sample_rate_hz: Samples a second.
+        run: Facts from the start of the run (identity, versions, device, units).
+        end: Facts from its end (counters, reason); empty if the file is truncated.
+        sample_rate_hz: Samples per second.
         command_unit: Unit of commands, ``A`` or ``V``.
-        compensated: Whether a compensator stood between reference and command.
-        segments: The stretches of the run.
+        compensated: Whether a compensator computed the command from the reference.
+        segments: Segments of the run.
         samples: All samples.
-        dropped: Samples that were exchanged or due but are missing here.
+        dropped: Samples that were exchanged or due but are missing.
         ticks: Timing of every tick.
         events: Events in order.
-        experiment_yaml: The experiment as it was run.
+        experiment_yaml: The experiment.
         model_yaml: The compensator's model, or empty.
-        starts: Where a replay can begin.
-        correction_yaml: What had been learned and was added to the reference, or empty.
-        labels: What the run is found by.
+        starts: Possible starts of a replay.
+        correction_yaml: The learned correction that was added to the reference, or empty.
+        labels: Labels of the run.
     """
 
     path: Path

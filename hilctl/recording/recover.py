@@ -1,8 +1,7 @@
-"""Make a sound recording out of one that was cut short or damaged; its bytes are kept.
+"""Recovery of a truncated or damaged recording; the original bytes are kept.
 
-The file is walked through twice: first to see what is wrong and what it holds, then, only where
-something is wrong, to save every whole record into a new file through the MCAP library's writer,
-which makes index, statistics and checksums anew.
+The file is read twice: a survey of its damage and content, then, if it is damaged, a copy of every
+valid record to a new file with a new index, statistics and checksums.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -12,32 +11,39 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+from mcap.records import Attachment, Channel, McapRecord, Message, Metadata, Schema
 
+from hilctl import __version__
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.events import Event
 from hilctl.base.private_dirs import HAS_LOCKS
 from hilctl.base.samples import LAST_SAMPLE, BlockBatch, BlockHeader
-from hilctl.recording.encoder import RecordingLayout
-from hilctl.recording.locks import lock
+from hilctl.recording.encoder import MessageMaker, RecordingLayout, Topics, event_message
+from hilctl.recording.metadata_keys import CHECKSUM_FACT, sealed, unsealed
+from hilctl.recording.recording_files import Replacement, lock
 from hilctl.recording.recovery_scan import Damage, RecoveryScan
-from hilctl.recording.rewrite import Rewritten, Survey
-from hilctl.recording.safe_replace import Replacement
-from hilctl.recording.validation import MAX_UNIX_NS, MessageValidator, sound_blocks
+from hilctl.recording.validation import MAX_UNIX_NS, MessageValidator, count_of, sound_blocks
+from hilctl.recording.writer import mcap_writer
+
+_UNKNOWN_END = (
+    "what was exchanged after it is unknown: at most the last unflushed interval where hilctl was "
+    "killed, perhaps more where the power failed"
+)
 
 
 @dataclass(frozen=True, slots=True)
 class Recovered:
-    """What became of a recording.
+    """Result of a recovery.
 
     Attributes:
-        path: The sound file.
-        original: Where the bytes as they were are kept; None where nothing could be repaired, so
-            that nothing was written.
-        reason: What was wrong and what is lost, in one line.
-        samples: Samples in the sound file.
-        added_samples: Those of them that were not in the old file.
+        path: The recovered file.
+        original: Where the original bytes are kept; None if nothing was written because nothing
+            could be repaired.
+        reason: Damage and losses, in one line.
+        samples: Samples in the recovered file.
+        added_samples: Those of them that were not in the original.
         missing_samples: Samples known to be missing.
-        damages: Stretches that could not be read.
+        damages: Parts of the original that could not be read.
     """
 
     path: Path
@@ -50,7 +56,7 @@ class Recovered:
 
     @property
     def sound(self) -> bool:
-        """Whether the file was sound."""
+        """Whether the original was intact."""
         return self.original is None and not self.damages
 
     def to_mapping(self) -> dict[str, Any]:
@@ -67,6 +73,200 @@ class Recovered:
         }
 
 
+class Survey:
+    """Content and damage of a file.
+
+    Args:
+        stream: The file.
+
+    Attributes:
+        scan: Its damage.
+        run: Facts of the run; empty if lost.
+        end: Facts of its end; empty if lost or never written.
+        end_is_right: Whether their checksum is right.
+        last_time_ns: Unix time of the last message or attachment, in ns.
+        records: Number of valid metadata records and messages.
+
+    Raises:
+        OSError: The file cannot be read.
+        DataError: It exceeds its read budget.
+    """
+
+    def __init__(self, stream: BinaryIO) -> None:
+        self._sound = MessageValidator()
+        self.scan = RecoveryScan(stream, self._sound)
+        self.run: dict[str, str] = {}
+        self.end: dict[str, str] = {}
+        self.end_is_right = True
+        self.last_time_ns = 0
+        self.records = 0
+        for record in self.scan.records():
+            self._take(record)
+
+    def _take(self, record: McapRecord) -> None:
+        match record:
+            case Metadata(name="hilctl.run"):
+                self.run, _ = unsealed(record.name, record.metadata)
+            case Metadata(name="hilctl.end"):
+                self.end, self.end_is_right = unsealed(record.name, record.metadata)
+            case Attachment():
+                self.last_time_ns = max(self.last_time_ns, record.log_time)
+            case Message():
+                self.last_time_ns = max(self.last_time_ns, record.log_time)
+        self.records += isinstance(record, Metadata | Message)
+
+    @property
+    def samples(self) -> int:
+        """Samples in it."""
+        return self._sound.samples
+
+    @property
+    def next_sample(self) -> int:
+        """Index after the last sample in it."""
+        return self._sound.next_sample
+
+
+class Rewritten:
+    """The recovered file.
+
+    Args:
+        stream: File to write.
+        survey: Survey of the original.
+
+    Attributes:
+        samples: Samples in it.
+        added: Those of them that are not in the original.
+        missing: Samples known to be missing.
+    """
+
+    def __init__(self, stream: BinaryIO, survey: Survey) -> None:
+        header = survey.scan.header
+        self._survey = survey
+        self._writer = mcap_writer(stream)
+        self._topics = Topics(self._writer)
+        self._names: dict[int, str] = {}
+        self._schemas: dict[int, int] = {0: 0}
+        self._channels: dict[int, int] = {}
+        self.samples = survey.samples
+        self.added = 0
+        self.missing = survey.next_sample - survey.samples
+        self._last_time_ns = survey.last_time_ns
+        self._writer.start(
+            profile=header.profile if header else "",
+            library=header.library if header else f"hilctl {__version__}",
+        )
+
+    def copy(self, records: Iterable[McapRecord]) -> None:
+        """Copy all records except the facts of the end."""
+        for record in records:
+            self._record(record)
+        self._topics.register()
+
+    def _record(self, record: McapRecord) -> None:
+        writer = self._writer
+        match record:
+            case Message():
+                self._message(record)
+            case Schema():
+                self._schemas[record.id] = writer.register_schema(
+                    record.name, record.encoding, record.data
+                )
+            case Channel():
+                self._channel(record)
+            # `finish` writes the end: added samples come before it, and its counters change.
+            case Metadata() if record.name != "hilctl.end":
+                writer.add_metadata(record.name, record.metadata)
+            case Attachment():
+                times = record.create_time, record.log_time
+                writer.add_attachment(*times, record.name, record.media_type, record.data)
+
+    def _channel(self, record: Channel) -> None:
+        number = self._writer.register_channel(
+            record.topic,
+            record.message_encoding,
+            self._schemas.get(record.schema_id, 0),
+            record.metadata,
+        )
+        self._channels[record.id], self._names[record.id] = number, record.topic
+        self._topics.know(record.topic, number, 0)
+
+    def _message(self, record: Message) -> None:
+        number = self._channels[record.channel_id]
+        self._topics.know(self._names[record.channel_id], number, record.sequence + 1)
+        self._writer.add_message(
+            number, record.log_time, record.data, record.publish_time, record.sequence
+        )
+
+    def add(
+        self, batches: Iterable[BlockBatch], events: Iterable[Event], layout: RecordingLayout
+    ) -> None:
+        """Add batches and events that are not in the original, in order."""
+        maker = MessageMaker(layout)
+        maker.samples = self.samples
+        for batch in batches:
+            for message in maker.batch(batch):
+                self._topics.add(message)
+                self._last_time_ns = max(self._last_time_ns, message.time_ns)
+        for event in events:
+            self._topics.add(maker.event(event))
+        self.added = maker.samples - self.samples
+        self.samples = maker.samples
+        self.missing += maker.missing
+
+    def finish(self, end: Mapping[str, str] | None, ended_at: int) -> str:
+        """Write an event, the facts of the end, index and footer.
+
+        Args:
+            end: Facts of the end, if the original has none.
+            ended_at: Index after the last sample that was exchanged; 0 if unknown.
+
+        Returns:
+            Damage and losses, in one line.
+        """
+        own = self._survey.end
+        last = self.samples + self.missing - 1
+        exchanged = _number(own, "recorded_samples") + _number(own, "missing_samples")
+        self.missing = max(self.missing, ended_at - self.samples, exchanged - self.samples)
+        known = bool(ended_at or exchanged)
+        reason = self._reason(last, known=known)
+        level = "info" if known and not self.missing else "warning"
+        event = Event(max(0, last), level, "recovered", reason, time_ns=self._last_time_ns)
+        self._topics.add(event_message(event))
+        facts = own or end or {"code": "recovered", "reason": f"recovered: {reason}"}
+        counted = {
+            "recorded_samples": str(self.samples),
+            "missing_samples": str(self.missing),
+            "recovered": reason,
+        }
+        metadata = sealed("hilctl.end", {**facts, **counted})
+        if not self._survey.end_is_right:  # a right checksum would hide the damage
+            metadata[CHECKSUM_FACT] = "wrong before recovery"
+        self._writer.add_metadata("hilctl.end", metadata)
+        self._writer.finish()
+        return reason
+
+    def _reason(self, last: int, *, known: bool) -> str:
+        parts = [self._survey.scan.describe()]
+        if self.added:
+            parts.append(f"{self.added} samples added from the ring")
+        if self.missing:
+            parts.append(f"{self.missing} samples known to be missing")
+        if not known:
+            parts.append(f"the last sample is {last}" if self.samples else "no sample is left")
+            parts.append(_UNKNOWN_END)
+        elif not self.missing:
+            parts.append("no sample is lost")
+        return "; ".join(parts)
+
+
+def _number(facts: Mapping[str, str], name: str) -> int:
+    """Return a counter; 0 if it is missing or damaged."""
+    try:
+        return count_of(facts, name)
+    except ValueError:
+        return 0
+
+
 def recover_recording(
     path: Path,
     extra: Iterable[BlockBatch] = (),
@@ -76,27 +276,25 @@ def recover_recording(
     ended_at: int = 0,
     output: Path | None = None,
 ) -> Recovered:
-    """Make a recording sound.
+    """Repair a recording.
 
-    The new file takes the place of the old one, which is kept beside it as ``NAME.torn``, with a
-    number where there is one already. A sound file is left alone unless ``extra`` holds more.
+    The new file replaces the original, which is kept beside it as ``NAME.torn``, with a number if
+    that exists. An intact file is not changed unless ``extra`` has more samples.
 
     Args:
-        path: The recording; nobody may have it open for recording.
-        extra: Batches that were exchanged and perhaps not written, in order. Blocks whose samples
-            are in the file already are left out; what is missing before the others counts as
-            dropped. A block is in a file as a whole or not at all.
-        end: Facts of the run's end where the file has none of its own, with ``code`` and
-            ``reason``; else the code is ``recovered``.
-        events: Events of the loop that were perhaps not written; added with the batches.
-        ended_at: Index after the last sample that was exchanged; 0 where that is not known, and
-            where no run can have got there.
-        output: Put the sound file here instead, and leave the old one where it is.
+        path: The recording; no run may be recording to it.
+        extra: Batches that may not have been written, in order. Blocks that are in the file are
+            omitted; gaps before the others count as dropped. A block is written as a whole.
+        end: Facts of the run's end if the file has none, with ``code`` and ``reason``; by default
+            the code is ``recovered``.
+        events: Events of the loop that may not have been written; added with the batches.
+        ended_at: Index after the last sample that was exchanged; 0 if unknown.
+        output: Path of the new file; the original then stays in place.
 
     Raises:
-        DataError: The file can't be read, holds nothing to recover, or lacks what is needed to add
-            ``extra``.
-        InputError: It is being recorded, or the sound file can't be written. Nothing has changed.
+        DataError: The file cannot be read, has nothing to recover, or lacks the facts needed to
+            add ``extra``.
+        InputError: It is being recorded, or the new file cannot be written. Nothing has changed.
     """
     try:
         with path.open("rb") as stream:
@@ -142,7 +340,7 @@ def _survey(path: Path, stream: BinaryIO) -> Survey:
 
 
 def _is_one(event: Event) -> bool:
-    """Return whether an event is one that a loop can have left in memory."""
+    """Return whether an event from memory is plausible."""
     return 0 <= event.sample < LAST_SAMPLE and 0 <= event.time_ns <= MAX_UNIX_NS
 
 
@@ -155,7 +353,7 @@ def _left_alone(path: Path, survey: Survey) -> Recovered:
 
 
 def _check(path: Path, survey: Survey, more: list[BlockBatch]) -> RecordingLayout | None:
-    """Refuse what nothing can be made of; return how to add what is to be added."""
+    """Reject a file with nothing to recover; return the layout of the samples to add, if any."""
     if not survey.records:
         raise DataError(f"{path}: holds no whole record: there is nothing to recover")
     if not more:
@@ -167,9 +365,9 @@ def _check(path: Path, survey: Survey, more: list[BlockBatch]) -> RecordingLayou
 
 
 def _not_in_file(extra: Iterable[BlockBatch], next_sample: int) -> Iterator[BlockBatch]:
-    """Yield the blocks from ``next_sample`` on, with the gaps before them counted anew.
+    """Yield the blocks from ``next_sample`` on, with new counts of the gaps before them.
 
-    They come from memory that a dying process has left: what no loop can have written is left out.
+    They come from the memory of a process that died: implausible blocks are omitted.
     """
     for batch in extra:
         firsts = batch.heads[:, BlockHeader.FIRST_SAMPLE].tolist()

@@ -1,10 +1,9 @@
-"""Walk through an MCAP file, sound or not, and take every record that is whole.
+"""Scan of an MCAP file, intact or not, for all valid records.
 
-Chunks count by their checksum, all other records by their lengths. Behind a place that can't be
-read the walk goes on at the next thing that looks like a chunk, metadata, an attachment or the end
-of the data. Of a chunk that the file ends in, the messages are taken as far as its stream can be
-read; no checksum covers those, so each must be whole and decode. Of a damaged chunk with more
-behind it nothing is taken: any number in it may be wrong.
+A chunk is valid by its checksum, any other record by its lengths. After damage the scan continues
+at the next probable chunk, metadata, attachment or end of data. Of a chunk at the truncated end of
+a file, messages are read as far as possible; without a checksum, each must decode. A damaged chunk
+elsewhere is omitted, because any number in it may be wrong.
 """
 
 import zlib
@@ -27,9 +26,15 @@ from mcap.records import (
 )
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
-from hilctl.recording.mcap_records import FRAME, LARGEST_BYTES, Contents, contents, parse
+from hilctl.recording.mcap_records import (
+    FRAME,
+    LARGEST_BYTES,
+    Contents,
+    ReadBudget,
+    contents,
+    parse,
+)
 from hilctl.recording.metadata_keys import unsealed
-from hilctl.recording.read_budget import ReadBudget
 from hilctl.recording.truncated_chunks import next_likely, own_channels, tail_kind, take_chunk
 from hilctl.recording.validation import MessageValidator
 
@@ -39,18 +44,17 @@ _KNOWN = {opcode.value for opcode in Opcode}
 
 @dataclass(frozen=True, slots=True)
 class Damage:
-    """A stretch of a file that could not be read, or not all of it.
+    """A damaged part of a file.
 
     Attributes:
         start: Offset of its first byte.
         size: Bytes.
-        what: ``torn chunk``, ``damaged chunk``, ``damaged record``, ``index`` (nothing of the run
-            is lost with it), ``zeros``, ``unreadable bytes``, ``message of no channel``,
-            ``data section with a wrong checksum`` (where nothing else is found to be wrong: header
-            or times of chunks), ``metadata NAME with a wrong checksum``, or what is wrong with a
-            message that hilctl can't have written.
+        what: ``torn chunk``, ``damaged chunk``, ``damaged record``, ``index`` (no data of the run
+            is lost), ``zeros``, ``unreadable bytes``, ``message of no channel``, ``data section
+            with a wrong checksum`` (in a header or chunk time, if nothing else is damaged),
+            ``metadata NAME with a wrong checksum``, or the problem of an invalid message.
         saved: Messages saved from it.
-        lasting: Whether no rewriting repairs it.
+        lasting: Whether rewriting the file does not repair it.
     """
 
     start: int
@@ -65,7 +69,7 @@ class Damage:
 
 
 class _Found(NamedTuple):
-    """A whole record (None for a message index), what it holds if it is a chunk, and its end."""
+    """A valid record (None for a message index), its content if it is a chunk, and its end."""
 
     record: McapRecord | None
     inside: Contents | None
@@ -73,22 +77,21 @@ class _Found(NamedTuple):
 
 
 class RecoveryScan:
-    """What can be read of a file; all attributes are right once :meth:`records` is exhausted.
+    """Scan of a file; its attributes are final when :meth:`records` is exhausted.
 
     Args:
         stream: Open binary file that can seek.
-        sound: Omits messages that hilctl can't have written, and notes them as damage; if None,
-            they are yielded.
+        sound: Validator whose invalid messages are omitted and noted as damage; None yields all.
 
     Attributes:
         size: Bytes of the file.
-        budget: Limits of work and memory left for it.
-        is_mcap: Whether the file begins as an MCAP file does.
-        header: The file's header, if it is whole.
-        damages: Stretches that could not be read.
-        finished: Whether footer and closing magic are there and the index fits the data.
-        unread: Ids of channels whose messages are omitted from now on; the channels themselves must
-            have been yielded.
+        budget: Remaining limits of work and memory.
+        is_mcap: Whether the file begins with the MCAP magic.
+        header: The file's header, if it is valid.
+        damages: Damaged parts.
+        finished: Whether footer and closing magic exist and the index matches the data.
+        unread: Ids of channels whose messages are omitted from now on; the channels must have been
+            yielded.
     """
 
     def __init__(self, stream: BinaryIO, sound: MessageValidator | None = None) -> None:
@@ -112,16 +115,16 @@ class RecoveryScan:
 
     @property
     def sound(self) -> bool:
-        """Whether nothing is damaged and nothing missing."""
+        """Whether nothing is damaged or missing."""
         return self.finished and not self.damages
 
     @property
     def repairable(self) -> bool:
-        """Whether anything is missing, or damaged so that rewriting the file repairs it."""
+        """Whether rewriting the file repairs anything."""
         return not self.finished or not all(damage.lasting for damage in self.damages)
 
     def describe(self) -> str:
-        """Return the damage of the file in one line."""
+        """Describe the damage of the file in one line."""
         serious = [damage for damage in self.damages if damage.what != "index"]
         if not self.damages:
             return "its end and index are missing"
@@ -137,8 +140,8 @@ class RecoveryScan:
         Every message comes after its channel, and every channel after its schema.
 
         Raises:
-            OSError: The file can't be read.
-            DataError: It asks for more work or memory than a recording of its size can.
+            OSError: The file cannot be read.
+            DataError: It exceeds its read budget.
         """
         at = len(MAGIC)
         if not self.is_mcap:
@@ -158,14 +161,14 @@ class RecoveryScan:
             at = found.end
 
     def records_at(self, places: Iterable[int]) -> Iterator[McapRecord]:
-        """Yield the records at some places, from the index of a finished file.
+        """Yield the records at offsets from the index of a finished file.
 
         Raises:
-            OSError: The file can't be read.
-            DataError: It asks for more work or memory than a recording of its size can.
+            OSError: The file cannot be read.
+            DataError: It exceeds its read budget.
         """
         for at in places:
-            self._indexes = {}  # what follows a chunk is not read
+            self._indexes = {}  # message indexes are not read
             found = self._whole(at)
             if found is None:
                 self._note(at, 0, "damaged record")
@@ -188,7 +191,7 @@ class RecoveryScan:
         if opcode not in _KNOWN or length > LARGEST_BYTES or end > self.size:
             return None
         body = self._read(at + FRAME.size, length)
-        if opcode != Opcode.DATA_END:  # it covers everything before it
+        if opcode != Opcode.DATA_END:  # its checksum covers everything before it
             self._crc = zlib.crc32(body, zlib.crc32(frame, self._crc))
         if opcode == Opcode.MESSAGE_INDEX:  # the content of its chunk determines every byte
             right = self._indexes.pop(int.from_bytes(body[:2], "little"), None)
@@ -202,11 +205,11 @@ class RecoveryScan:
         return _Found(record, inside, end)
 
     def _take(self, at: int, found: _Found) -> list[McapRecord]:
-        """Note a whole record; return what of it is data."""
+        """Note a valid record; return its data records."""
         record = found.record
         if record is None:
             return []
-        if self._indexes:  # of the chunk before: not all of them are there
+        if self._indexes:  # some of those of the previous chunk are missing
             self._note(at, at, "index")
             self._indexes = {}
         if found.inside is not None:
@@ -228,7 +231,7 @@ class RecoveryScan:
         return [record]
 
     def _check_data(self, at: int, end: DataEnd) -> None:
-        """Compare the checksum of all bytes before the end of the data, where there is one."""
+        """Compare the checksum of the data section, if there is one."""
         explained = not all(damage.lasting for damage in self.damages)
         if end.data_section_crc and not explained and self._crc != end.data_section_crc:
             self._note(0, at, "data section with a wrong checksum")
@@ -241,7 +244,7 @@ class RecoveryScan:
             self._indexed.append(record.chunk_start_offset)
 
     def _close(self, start: int, at: int, footer: Footer) -> None:
-        """Check the file's end: the footer from ``start``, and the bytes from ``at`` on."""
+        """Check the footer from ``start`` and the bytes from ``at`` on."""
         begin = footer.summary_start
         summary = self._read(begin, start + FRAME.size + 16 - begin) if begin < start else b""
         right = footer.summary_crc in {0, zlib.crc32(summary)}
@@ -254,7 +257,7 @@ class RecoveryScan:
             self._note(end, self.size, tail_kind(self._stream, end, self.size))
 
     def _with_channels(self, records: list[McapRecord], at: int) -> Iterator[McapRecord]:
-        """Yield records, with hilctl's own channels before a message whose channel is lost."""
+        """Yield records, and hilctl's own channels before a message whose channel is lost."""
         for record in records:
             if isinstance(record, Channel):
                 self._channels.add(record.id)
@@ -282,7 +285,7 @@ class RecoveryScan:
                     yield record
 
     def _damaged(self, at: int, after: int) -> list[McapRecord]:
-        """Note a damaged stretch; return what can be taken from it."""
+        """Note damage; return the records saved from it."""
         opcode, records = self._read(at, 1)[0], list[McapRecord]()
         if self._data_ended or opcode in _INDEX_KINDS:
             what = "index"

@@ -1,4 +1,4 @@
-"""What the first and the last bytes of a recording say of its run; samples are not looked at."""
+"""Facts of a run from both ends of its file, without reading samples."""
 
 import os
 import stat
@@ -14,13 +14,12 @@ from mcap.writer import MCAP0_MAGIC as MAGIC
 
 from hilctl.base.errors import DataError
 from hilctl.base.os_errors import reason
-from hilctl.recording.locks import is_being_recorded
-from hilctl.recording.mcap_records import FRAME, records_from
+from hilctl.recording.mcap_records import FOOTER_BYTES, records_from
 from hilctl.recording.metadata_keys import CHECKSUM_FACT, unsealed
+from hilctl.recording.recording_files import is_being_recorded
 
 _BUFFER_BYTES = 4096
-_FOOTER_BYTES = FRAME.size + 20
-_MOST_BEFORE = 8  # records that may stand before the facts of the run: hilctl writes a header
+_MOST_BEFORE = 8  # records before the facts of the run; hilctl writes a header
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,12 +28,11 @@ class RunSummary:
 
     Attributes:
         run: Facts of its start.
-        end: Facts of its end; empty where the file is not finished.
-        state: ``finished``; ``recording`` where a run is writing to it; ``unfinished`` where it was
-            cut short; ``damaged`` where a checksum of the facts is wrong or the way to them is
-            lost: then facts that are not known to be right are left out. What lies between the ends
-            is not known to be sound.
-        problem: What is damaged; else empty.
+        end: Facts of its end; empty if the file is not finished.
+        state: ``finished``, ``recording`` (a run is writing to it), ``unfinished`` (truncated) or
+            ``damaged`` (a checksum of the facts or the index is wrong; unverified facts are
+            omitted). Damage between the ends is not detected.
+        problem: The damage, or empty.
     """
 
     run: Mapping[str, str]
@@ -44,18 +42,15 @@ class RunSummary:
 
 
 def recordings_in(folder: Path) -> list[Path]:
-    """Return the files of a folder that are named as recordings are, in the order of their names.
-
-    A folder or a pipe of such a name is none.
-    """
+    """Return the regular files of a folder with the suffix of recordings, sorted by name."""
     return sorted(path for path in folder.glob("*.mcap") if path.is_file())
 
 
 def read_ends(path: Path) -> RunSummary:
-    """Read what a recording says of its run at its start and at its end.
+    """Read the facts of a run from the start and the end of its recording.
 
     Raises:
-        DataError: The file can't be read, is not an MCAP file, or does not begin with a run.
+        DataError: The file cannot be read, is not an MCAP file, or does not begin with a run.
     """
     try:
         _check_is_file(path)  # first: opening a pipe waits for its writer
@@ -82,7 +77,7 @@ def _ends(stream: BinaryIO) -> RunSummary:
         end, right = unsealed("hilctl.end", end_metadata)
         if not right:
             return RunSummary(run, {}, "damaged", "metadata hilctl.end: its checksum is wrong")
-        if not end and CHECKSUM_FACT in metadata:  # who writes the one writes the other
+        if not end and CHECKSUM_FACT in metadata:  # a file with one checksum has both
             return RunSummary(run, {}, "damaged", "its index is damaged")
         return RunSummary(run, end, "finished")
     return RunSummary(run, {}, "recording" if is_being_recorded(stream) else "unfinished")
@@ -99,16 +94,16 @@ def _run_metadata(stream: BinaryIO, size: int) -> Mapping[str, str]:
 
 
 def _end_metadata(stream: BinaryIO, size: int) -> Mapping[str, str] | None:
-    """Return the facts of the end, found by footer and index; None if those are missing."""
-    footer_at = size - _FOOTER_BYTES - len(MAGIC)
+    """Return the facts of the end by footer and index; None if those are missing."""
+    footer_at = size - FOOTER_BYTES - len(MAGIC)
     stream.seek(max(0, size - len(MAGIC)))
     if footer_at < 0 or stream.read() != MAGIC:
         return None
-    footer = next(records_from(stream, footer_at, footer_at + _FOOTER_BYTES), None)
+    footer = next(records_from(stream, footer_at, footer_at + FOOTER_BYTES), None)
     if not isinstance(footer, Footer):
         return None
     found: Mapping[str, str] = {}
-    # By the offsets in the summary: its index of chunks may be long.
+    # The summary offsets skip the index of chunks, which may be long.
     start = footer.summary_offset_start or footer_at
     for group in records_from(stream, start, footer_at):
         if isinstance(group, SummaryOffset) and group.group_opcode == Opcode.METADATA_INDEX:

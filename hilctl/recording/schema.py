@@ -1,7 +1,6 @@
-"""Protobuf messages of a recording's topics, and the descriptors that make a file self-describing.
+"""Protobuf schemas of a recording's topics.
 
-Field numbers are for ever: a number that was used once is not used again. Those of the columns
-stand with them, in :class:`hilctl.base.samples.Samples`.
+A field number is never reused. Those of the columns are in :class:`hilctl.base.samples.Samples`.
 """
 
 from functools import cache
@@ -26,14 +25,14 @@ TOPICS: dict[str, str] = {
     "/scope": "Sample",
     "/events": "Event",
 }
-"""Topic to message name; all are of package ``hilctl``."""
+"""Message name per topic, in package ``hilctl``."""
 
 # name: (number, type, repeated); units are in the names
 _Fields: TypeAlias = dict[str, tuple[int, Any, bool]]
 
 
 def _columns(message: str, prefix: str = "", *, repeated: bool = True) -> _Fields:
-    """Return the fields of the columns, numbered by that attribute of theirs; 0 is none."""
+    """Return the fields of the columns, numbered by one of their attributes; 0 omits a column."""
     numbered = {each.name: getattr(each, message) for each in RECORDED_FIELDS}
     return {
         prefix + name: (number, _DOUBLE, repeated) for name, number in numbered.items() if number
@@ -47,8 +46,8 @@ _MESSAGES: dict[str, _Fields] = {
         "dropped": (3, _UINT64, False),  # samples missing before this block
         "t_rel": (4, _DOUBLE, True),  # s since the start of the run
         "flags": (9, _UINT32, True),
-        # Where a block stands first or after a gap: the compensator's memory before it, and the
-        # command before it, so that it can be replayed by itself.
+        # In the first block and after a gap, to start a replay: the compensator's memory and the
+        # command before it.
         "state": (14, _DOUBLE, True),
         "previous_command": (15, _DOUBLE, True),
         **_columns("block"),
@@ -70,11 +69,11 @@ _MESSAGES: dict[str, _Fields] = {
         "level": (2, _STRING, False),
         "code": (3, _STRING, False),
         "text": (4, _STRING, False),
-        # The last samples up to it, so that one message has what led there.
+        # The last samples up to it.
         "before_sample": (5, _UINT64, True),
         "before_flags": (10, _UINT32, True),
         **_columns("before", "before_"),
-        # Its numbers by name.
+        # Its values by name.
         "value_names": (13, _STRING, True),
         "values": (14, _DOUBLE, True),
     },
@@ -102,18 +101,16 @@ def file_descriptor(*, lists_as_bytes: bool = False) -> descriptor_pb2.FileDescr
 
 
 def descriptor_set() -> bytes:
-    """Return the serialized FileDescriptorSet that goes into the file as every topic's schema."""
+    """Return the serialized FileDescriptorSet, the schema of every topic."""
     return descriptor_pb2.FileDescriptorSet(file=[file_descriptor()]).SerializeToString()
 
 
 @cache
 def message_class(name: str, *, lists_as_bytes: bool = False) -> Any:
-    """Return the class of a message by its name without the package.
-
-    It is typed Any, because its fields exist only at run time.
+    """Return the class of a message, typed Any because its fields exist only at run time.
 
     Args:
-        name: Name of the message.
+        name: Name of the message, without the package.
         lists_as_bytes: Return its twin, see :func:`file_descriptor`.
     """
     pool = descriptor_pool.DescriptorPool()

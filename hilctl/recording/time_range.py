@@ -1,25 +1,45 @@
-"""A stretch of a run, by time: only its samples are kept in memory, however long the run was."""
+"""Time range of a run: cut it out of a recording, and find its records in a finished file."""
 
 import math
+import zlib
+from bisect import bisect_right
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields, replace
+from typing import BinaryIO
+
+from mcap.records import (
+    AttachmentIndex,
+    Channel,
+    ChunkIndex,
+    Footer,
+    McapRecord,
+    Metadata,
+    MetadataIndex,
+)
+from mcap.writer import MCAP0_MAGIC as MAGIC
 
 from hilctl.base.errors import DataError
 from hilctl.base.samples import LAST_SAMPLE
 from hilctl.base.segments import Segment
+from hilctl.recording.mcap_records import FOOTER_BYTES, LARGEST_BYTES, records_from
+from hilctl.recording.metadata_keys import unsealed
 from hilctl.recording.recording import Recording, Ticks
+from hilctl.recording.validation import RATES_HZ, number_of
 
-_OF_ANY_PART = {"code", "reason", "output_safe", "output_state", "ended", "recovered"}
-"""Facts of the end that hold for every part of a run; the others count the whole of it."""
+_END_OF_ANY_PART = {"code", "reason", "output_safe", "output_state", "ended", "recovered"}
+"""Facts of the end that hold for every part of a run; the others count the whole run."""
+_CRC_BYTES = 4
+_NS = 10**9
+_MAX_DIGITS = 20
 
 
 @dataclass(frozen=True, slots=True)
 class TimeRange:
-    """From one time of a run to another.
+    """Time range of a run.
 
     Attributes:
         from_s: First time, in s since the start of the run; None for its start.
-        to_s: Time to stop before; None for its end.
+        to_s: Time after the last sample; None for the end of the run.
     """
 
     from_s: float | None = None
@@ -36,13 +56,13 @@ class TimeRange:
         return start, stop
 
     def cut(self, recording: Recording) -> Recording:
-        """Return what a recording holds of it, with all events.
+        """Return the part of a recording in this range, with all events.
 
-        Segments are cut to what lies within. Counters of the whole run are left out; samples that
-        are missing are those between the first and the last that are there.
+        Segments are cut to the range, counters of the whole run are omitted, and missing samples
+        are counted between the first and the last sample of the part.
 
         Raises:
-            DataError: The recording holds no sample of it.
+            DataError: The recording has no sample in this range.
         """
         (whole,) = self.cut_pieces([recording])
         return whole
@@ -50,32 +70,31 @@ class TimeRange:
     def cut_pieces(self, pieces: Iterable[Recording]) -> Iterator[Recording]:
         """Cut the pieces of a :class:`hilctl.recording.reader.RecordingStream`.
 
-        What can be said only of all that is there stands in the last one: counters, and segments
-        that end with its last sample.
+        The last piece has the counters, and segments that end with its last sample.
 
         Raises:
-            DataError: There is no sample of it.
+            DataError: No piece has a sample in this range.
         """
         held: Recording | None = None
-        given = found = first = end = 0
+        read = found = first = end = 0
         for piece in pieces:
             if held is not None:
                 yield held
             held = self._part(piece)
             index = held.samples.index
-            given += piece.samples.index.size
+            read += piece.samples.index.size
             if index.size:
                 first, end = first if found else int(index[0]), int(index[-1]) + 1
                 found += index.size
         if held is None or not found:
-            whole = "its samples are elsewhere" if given else "it has none"
+            whole = "its samples are elsewhere" if read else "it has none"
             path = held.path if held else "the recording"
             raise DataError(f"{path}: holds no sample from {self}: {whole}")
         yield replace(
             held,
             segments=tuple(_cut(piece.segments, first, end)),
             dropped=end - first - found,
-            end={name: text for name, text in held.end.items() if name in _OF_ANY_PART},
+            end={name: text for name, text in held.end.items() if name in _END_OF_ANY_PART},
         )
 
     def _part(self, piece: Recording) -> Recording:
@@ -96,7 +115,7 @@ class TimeRange:
 
 
 def _cut(segments: tuple[Segment, ...], start: int, stop: int) -> Iterator[Segment]:
-    """Yield what lies within; a segment keeps its first sample, which its phase is counted from."""
+    """Yield segments cut to a range; each keeps its first sample, the origin of its phase."""
     for each in segments:
         end = min(each.stop, stop)
         steady_start = min(max(each.steady_start, start), end)
@@ -106,9 +125,87 @@ def _cut(segments: tuple[Segment, ...], start: int, stop: int) -> Iterator[Segme
 
 
 def _first_at_or_after(t_s: float, rate_hz: float) -> int:
-    """Return the index of the first sample at ``t_s`` or later, rounding errors forgiven."""
+    """Return the index of the first sample at ``t_s`` or later, within rounding errors."""
     if not math.isfinite(t_s):
         raise DataError(f"a time must be a finite number of seconds: {t_s!r}")
     far = float(LAST_SAMPLE)
-    place = min(max(t_s * rate_hz, -far), far)  # beyond it there is no sample
+    place = min(max(t_s * rate_hz, -far), far)
     return math.ceil(place - 1e-6)
+
+
+def places_of(stream: BinaryIO, time_range: TimeRange) -> list[int] | None:
+    """Return the offsets of the records of a time range, in order, from the index of the file.
+
+    These are chunks with its samples, ticks or any events, and all metadata and attachments.
+
+    Args:
+        stream: Open binary file that can seek.
+        time_range: Time range of the run.
+
+    Returns:
+        Offsets; None if the file has no valid index, or no start time.
+
+    Raises:
+        DataError: A time is not a finite number.
+    """
+    summary = _summary(stream)
+    chunks = [record for record in summary if isinstance(record, ChunkIndex)]
+    indexes = [record for record in summary if isinstance(record, AttachmentIndex | MetadataIndex)]
+    events = {r.id for r in summary if isinstance(r, Channel) and r.topic == "/events"}
+    facts = _run_facts(stream, indexes)
+    try:
+        rate_hz = number_of(facts, "sample_rate_hz", *RATES_HZ)
+        start_ns = int(facts["start_unix_ns"][:_MAX_DIGITS])
+    except (KeyError, ValueError):
+        return None
+    low, high = (start_ns + round(at * _NS / rate_hz) for at in time_range.samples(rate_hz))
+    chosen = _overlapping(chunks, low, high, events)
+    return sorted([*(each.offset for each in indexes), *chosen])
+
+
+def _overlapping(chunks: list[ChunkIndex], low: int, high: int, events: set[int]) -> set[int]:
+    """Return the offsets of chunks that overlap a time range or have events."""
+    chunks.sort(key=lambda each: each.chunk_start_offset)
+    within = {
+        k
+        for k, each in enumerate(chunks)
+        if low <= each.message_end_time and each.message_start_time < high
+    }
+    # A block extends beyond its time stamp, and its ticks may be in the next chunk.
+    before = bisect_right([each.message_start_time for each in chunks], low) - 1
+    near = {k + step for k in {*within, before} for step in (-1, 0, 1)}
+    with_events = {
+        k
+        for k, each in enumerate(chunks)
+        if not each.message_index_offsets or each.message_index_offsets.keys() & events
+    }
+    return {chunks[k].chunk_start_offset for k in near | with_events if 0 <= k < len(chunks)}
+
+
+def _run_facts(stream: BinaryIO, indexes: list[AttachmentIndex | MetadataIndex]) -> dict[str, str]:
+    for index in indexes:
+        if isinstance(index, MetadataIndex) and index.name == "hilctl.run":
+            record = next(records_from(stream, index.offset, index.offset + index.length), None)
+            if isinstance(record, Metadata):
+                facts, right = unsealed(record.name, record.metadata)
+                return facts if right else {}
+    return {}
+
+
+def _summary(stream: BinaryIO) -> list[McapRecord]:
+    """Return the records of the index; none if it is damaged, missing or too large."""
+    footer_at = stream.seek(0, 2) - FOOTER_BYTES - len(MAGIC)
+    if footer_at < 0:
+        return []
+    stream.seek(footer_at)
+    tail = stream.read()
+    footer = next(records_from(stream, footer_at, footer_at + FOOTER_BYTES), None)
+    if not isinstance(footer, Footer) or not tail.endswith(MAGIC):
+        return []
+    if not 0 < footer.summary_start < footer_at <= footer.summary_start + LARGEST_BYTES:
+        return []
+    stream.seek(footer.summary_start)
+    checked = stream.read(footer_at - footer.summary_start) + tail[: FOOTER_BYTES - _CRC_BYTES]
+    if footer.summary_crc != zlib.crc32(checked):
+        return []
+    return list(records_from(stream, footer.summary_start, footer_at))

@@ -1,4 +1,4 @@
-"""What is left of records and chunks that are not whole."""
+"""Salvage of truncated or damaged chunks, and search for the next record after damage."""
 
 import re
 from functools import cache
@@ -12,17 +12,18 @@ from hilctl.recording.mcap_records import (
     CHUNK_HEAD,
     FRAME,
     LARGEST_BYTES,
+    LARGEST_CHUNK_BYTES,
     LENGTH,
+    ReadBudget,
     contents,
     inflate,
     split,
 )
-from hilctl.recording.read_budget import LARGEST_CHUNK_BYTES, ReadBudget
 from hilctl.recording.validation import block_problem, decode
 
 _WINDOW_BYTES = 4 * 2**20
 _IN_CHUNKS = {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE}
-# Lengths are little-endian and far below 2**40, so their three highest bytes are 0.
+# Lengths are little-endian and far below 2**40: their three highest bytes are 0.
 _LIKELY = re.compile(
     rb"\x06.{5}\0{3}.{16}.{5}\0{3}.{4}(?:\x04\0{3}zstd|\x03\0{3}lz4|\0{4}).{5}\0{3}"
     rb"|\x0c.{5}\0{3}.\0{3}hilctl\."
@@ -35,8 +36,8 @@ _SECTOR = bytes(512)
 
 
 def next_likely(stream: BinaryIO, at: int, size: int) -> int:
-    """Return the offset of what looks like a record from ``at`` on, or ``size``."""
-    window = _LIKELY_BYTES  # small at first: a file full of likely places is still read but once
+    """Return the offset of the next probable record from ``at`` on, or ``size``."""
+    window = _LIKELY_BYTES  # small at first, so that a file full of candidates is read once
     while at < size:
         stream.seek(at)
         found = _LIKELY.search(stream.read(window + _LIKELY_BYTES))
@@ -48,7 +49,7 @@ def next_likely(stream: BinaryIO, at: int, size: int) -> int:
 
 
 def tail_kind(stream: BinaryIO, at: int, size: int) -> str:
-    """Return what a tail that holds no record is: ``zeros`` or ``unreadable bytes``."""
+    """Return the kind of a tail without records: ``zeros`` or ``unreadable bytes``."""
     for start in range(at, size, _WINDOW_BYTES):
         stream.seek(start)
         if stream.read(_WINDOW_BYTES).strip(b"\0"):
@@ -57,21 +58,21 @@ def tail_kind(stream: BinaryIO, at: int, size: int) -> str:
 
 
 def take_chunk(raw: bytes, budget: ReadBudget, *, last: bool) -> tuple[list[McapRecord], str]:
-    """Take what can be had of a chunk that is not whole.
+    """Return the readable records of an invalid chunk.
 
     Args:
         raw: The chunk from its opcode on, up to the next readable record.
-        budget: Counts what comes out of it.
+        budget: Counts decompressed bytes.
         last: Whether the file ends with these bytes.
 
     Returns:
-        Records, and what the stretch is (see :class:`hilctl.recording.recovery_scan.Damage`).
+        Records, and the kind of damage (see :class:`hilctl.recording.recovery_scan.Damage`).
     """
     chunk = _as_far_as_it_goes(raw)
     if chunk is None:
         return [], "torn chunk" if last else "damaged chunk"
     inside = contents(chunk, budget)
-    if inside is not None:  # only the frame around it is damaged
+    if inside is not None:  # only its frame is damaged
         return list(inside.records), "index"
     if not last or not _is_cut(chunk, raw):
         return [], "damaged chunk"
@@ -81,15 +82,15 @@ def take_chunk(raw: bytes, budget: ReadBudget, *, last: bool) -> tuple[list[Mcap
 
 
 def _before_zeros(chunk: Chunk) -> bytes:
-    """Return data up to where a failing power left zeros; values of 0.0 at the cut go with them."""
+    """Return data up to the zeros of a power failure; values of 0.0 before them are lost too."""
     data = chunk.data
-    if chunk.compression and _SECTOR in data:  # a compressed stream has no such stretch
+    if chunk.compression and _SECTOR in data:  # not valid in a compressed stream
         data = data[: data.index(_SECTOR)]
     return data.rstrip(b"\0")
 
 
 def _as_far_as_it_goes(raw: bytes) -> Chunk | None:
-    """Return a chunk by the length of its data, not of the record; its data ends with ``raw``."""
+    """Return a chunk by the length of its data instead of its record, cut at the end of ``raw``."""
     start = FRAME.size + CHUNK_HEAD.size
     if len(raw) < start:
         return None
@@ -110,16 +111,16 @@ def _as_far_as_it_goes(raw: bytes) -> Chunk | None:
 
 
 def _is_cut(chunk: Chunk, raw: bytes) -> bool:
-    """Return whether a chunk ends early, with the file or in zeros, rather than being wrong."""
+    """Return whether a chunk is truncated, by the end of the file or zeros, not damaged."""
     length = FRAME.unpack_from(raw)[1]
     return len(raw) < FRAME.size + length or chunk.data.endswith(b"\0")
 
 
 def _believable(data: bytes) -> list[McapRecord]:
-    """Return records that no checksum covers, up to the first that is not hilctl's.
+    """Return records without a valid checksum, up to the first that is not hilctl's.
 
-    Where nonsense follows rather than the beginning of one more record, the last record may have
-    some of it in its own last bytes, and is left out.
+    If invalid bytes follow instead of the start of another record, the last record may end with
+    some of them and is omitted.
     """
     records: list[McapRecord] = []
     end = 0
@@ -148,7 +149,7 @@ def _decodes(message: Message) -> bool:
 
 @cache
 def own_channels() -> dict[int, tuple[Schema, Channel]]:
-    """Return the schema and channel of each of hilctl's channel ids, in order."""
+    """Return schema and channel of each of hilctl's channel ids, in order."""
     descriptors = schema.descriptor_set()
     return {
         number: (

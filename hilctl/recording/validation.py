@@ -1,19 +1,20 @@
-"""What facts and messages of a recording must be. Compiled kernels index with what comes of them.
+"""Checks of the facts, segments and messages of a recording; compiled kernels rely on them.
 
-Every check returns what is wrong, in words, or nothing. The reader refuses a file for it; recovery
-leaves the message out.
+A check of a message returns the problem, or an empty text. The reader rejects the file; recovery
+omits the message.
 """
 
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cache
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
 from google.protobuf.message import DecodeError
 from mcap.records import Channel, McapRecord, Message, Schema
+from pydantic import Field, TypeAdapter, ValidationError
 
 from hilctl.base.events import CHANGES, INVERSE
 from hilctl.base.samples import (
@@ -24,6 +25,8 @@ from hilctl.base.samples import (
     BlockBatch,
     BlockHeader,
 )
+from hilctl.base.segments import SHORTEST_PERIOD, Segment
+from hilctl.base.strict import StrictModel
 from hilctl.base.types import CommandUnit
 from hilctl.recording import schema
 from hilctl.recording.codec import BlockArrays, decode_block, decode_ticks
@@ -31,11 +34,13 @@ from hilctl.recording.metadata_keys import LABELS_FACT, LabelValue
 from hilctl.recording.recording import TICK_COLUMNS, Ticks
 
 MAX_UNIX_NS = 2**63 - 1
-"""Latest time that 64 bits hold with a sign, as NumPy and Parquet have it: in the year 2262."""
+"""Latest time of a signed 64-bit integer: in the year 2262."""
 RATES_HZ = (1e-6, 1e9)
-"""Lowest and highest rate of samples: far beyond those of any experiment."""
+"""Lowest and highest sample rate."""
 
 _MOST_VALUES = 1000
+_MOST_TEXT = 2**24
+_Index = Annotated[int, Field(ge=0, lt=LAST_SAMPLE)]
 _UNITS: tuple[CommandUnit, ...] = ("A", "V")
 _MOST_DIGITS = 15
 _LINE = 60
@@ -50,7 +55,7 @@ _DECODERS: dict[str, Callable[[bytes], Any]] = {
 
 
 def decode(topic: str, data: bytes) -> tuple[Any, str]:
-    """Return a message of one of hilctl's topics, and why it can't be decoded, if so.
+    """Decode a message of one of hilctl's topics; also return the problem, if any.
 
     Returns:
         For ``/samples`` a :class:`~hilctl.recording.codec.BlockArrays`, for ``/ticks``
@@ -66,7 +71,7 @@ def block_problem(block: BlockArrays, next_sample: int) -> str:
     """Check samples.
 
     Args:
-        block: What a ``SampleBlock`` holds.
+        block: Content of a ``SampleBlock``.
         next_sample: Index after the last sample before it.
     """
     if not block.n:
@@ -75,7 +80,7 @@ def block_problem(block: BlockArrays, next_sample: int) -> str:
         return f"sample {block.tick0} can't follow sample {next_sample - 1}"
     lengths = {name: values.size for name, values in block.columns.items()}
     lengths["flags"] = block.flags.size
-    # Of a million samples there are thousands of blocks, and all have the same columns.
+    # A million samples are thousands of blocks, all with the same columns.
     complete = set(lengths.values()) == {block.n} and has_all(tuple(lengths))
     if not complete and (wrong := _wrong_lengths(lengths, "", block.n)):
         return f"{block.n} samples with {wrong}"
@@ -87,23 +92,23 @@ def block_problem(block: BlockArrays, next_sample: int) -> str:
 
 @cache
 def has_all(names: tuple[str, ...]) -> bool:
-    """Return whether columns of right lengths are all that there must be, by their fields."""
+    """Return whether the fields of complete columns are all the required ones."""
     return not _wrong_lengths(dict.fromkeys(names, 1), "", 1)
 
 
-def _wrong_lengths(given: Mapping[str, int], prefix: str, samples: int) -> str:
-    """Return which columns of a message have not one value a sample."""
-    lengths = {f"{prefix}flags": given.get(f"{prefix}flags", 0)}
+def _wrong_lengths(found: Mapping[str, int], prefix: str, samples: int) -> str:
+    """Return the columns of a message that do not have one value per sample."""
+    lengths = {f"{prefix}flags": found.get(f"{prefix}flags", 0)}
     for column in COLUMNS.values():
         names = sorted({prefix + column.field(unit).name for unit in _UNITS})
-        filled = {name: given[name] for name in names if given.get(name)}
+        filled = {name: found[name] for name in names if found.get(name)}
         missing = {" or ".join(names): 0} if column.when == "always" else {}
         lengths |= filled or missing
     return _listed({name: length for name, length in lengths.items() if length != samples})
 
 
 def ticks_problem(ticks: Ticks) -> str:
-    """Check what a ``TickBlock`` holds."""
+    """Check the content of a ``TickBlock``."""
     columns = {name: getattr(ticks, name) for name in TICK_COLUMNS}
     lengths = {name: values.size for name, values in columns.items()}
     if len(set(lengths.values())) != 1:
@@ -113,7 +118,7 @@ def ticks_problem(ticks: Ticks) -> str:
     if ticks.first_sample.max() >= LAST_SAMPLE:
         return f"sample {ticks.first_sample.max()} is beyond any run"
     for name in TICK_COLUMNS[1:]:
-        # Not by the magnitude: the lowest of all numbers has none.
+        # The lowest integer has no magnitude.
         lowest, highest = int(columns[name].min()), int(columns[name].max())
         if max(-lowest, highest) > LONGEST_NS:
             return f"{name} of {max(-lowest, highest)} ns is longer than any run"
@@ -121,7 +126,7 @@ def ticks_problem(ticks: Ticks) -> str:
 
 
 def event_problem(event: Any, time_ns: int) -> str:
-    """Check an ``Event``, and the time that it was logged at."""
+    """Check an ``Event`` and its log time."""
     names, values = len(event.value_names), len(event.values)
     if names != values or names > _MOST_VALUES:
         return f"{names} names for {values} values"
@@ -129,7 +134,7 @@ def event_problem(event: Any, time_ns: int) -> str:
         return f"its time, {time_ns} ns, is beyond the year 2262"
     if max(event.sample, *event.before_sample, 0) >= LAST_SAMPLE:
         return "a sample is beyond any run"
-    # How many samples a change takes is worked with.
+    # The replay uses the number of samples that a change takes.
     if event.code in CHANGES and not all(0.0 <= abs(value) < LAST_SAMPLE for value in event.values):
         return f"a change of the reference by {list(event.values)}"
     if event.code == INVERSE and not _is_fade(event):
@@ -146,14 +151,14 @@ def _lengths_before(event: Any) -> dict[str, int]:
 
 
 def _is_fade(event: Any) -> bool:
-    """Return whether a replay can go by its values."""
+    """Return whether its values are those of a crossfade that a replay can repeat."""
     values = dict(zip(event.value_names, event.values, strict=True))
     whole = values.keys() >= {"share", "samples", "slope", "at_zero"}
     return whole and 0.0 <= values["share"] <= 1.0 and values["samples"] >= 1.0
 
 
 def sound_blocks(batch: BlockBatch) -> npt.NDArray[np.bool_]:
-    """Return which blocks of a batch a loop can have written: bool[k]."""
+    """Return which blocks of a batch are plausible: bool[k]."""
     first = batch.heads[:, BlockHeader.FIRST_SAMPLE]
     times = batch.heads[:, [BlockHeader.DEADLINE_NS, BlockHeader.LATE_NS, BlockHeader.EXCHANGE_NS]]
     in_time = ((times >= -LONGEST_NS) & (times <= LONGEST_NS)).all(axis=1)
@@ -167,23 +172,23 @@ def _listed(lengths: Mapping[str, int]) -> str:
 
 
 class MessageValidator:
-    """Tells the messages that hilctl wrote from others under its topics, in the order of a file."""
+    """Validator of a file's messages under hilctl's topics, in order."""
 
     def __init__(self) -> None:
         self._schemas: dict[int, str] = {}
         self._topics: dict[int, str] = {}
         self._refused: dict[int, str] = {}
         self.next_sample = 0
-        """Index after the last sample of all messages that were found sound."""
+        """Index after the last sample of the valid messages."""
         self.samples = 0
-        """Samples in them."""
+        """Samples in valid messages."""
 
     def topic(self, channel: int) -> str:
-        """Return the topic of a channel where it is one of hilctl's; else nothing."""
+        """Return the topic of a channel if it is one of hilctl's, otherwise an empty text."""
         return self._topics.get(channel, "")
 
     def problem(self, record: McapRecord) -> str:
-        """Return why a record can't be hilctl's, though it says so; nothing where it can."""
+        """Return why hilctl cannot have written a record under its topics, or an empty text."""
         match record:
             case Schema():
                 self._schemas[record.id] = record.name
@@ -210,9 +215,9 @@ class MessageValidator:
             self._refused[channel.id] = text
 
     def decoded(self, record: Message) -> tuple[Any, str]:
-        """Return a message under one of hilctl's topics, and what is wrong with it."""
+        """Return a decoded message under one of hilctl's topics, and its problem, if any."""
         topic = self._topics[record.channel_id]
-        if topic == "/scope":  # it repeats /samples, and nothing here reads it
+        if topic == "/scope":  # a copy of /samples that nothing here reads
             return None, ""
         message, problem = decode(topic, record.data)
         if not problem:
@@ -229,10 +234,10 @@ class MessageValidator:
 
 
 def labels_of(facts: Mapping[str, str]) -> dict[str, LabelValue]:
-    """Return the labels of a run from the fact that holds them; none where it is missing.
+    """Return the labels of a run; none if the fact is missing.
 
     Raises:
-        ValueError: They are no JSON object of texts and finite numbers.
+        ValueError: They are not a JSON object of texts and finite numbers.
     """
     text = facts.get(LABELS_FACT, "{}")
     try:
@@ -251,10 +256,10 @@ def _is_label(value: object) -> bool:
 
 
 def number_of(facts: Mapping[str, str], name: str, low: float, high: float) -> float:
-    """Return a fact that is a number.
+    """Return a number.
 
     Raises:
-        ValueError: It is missing, is none, or lies outside of ``low`` to ``high``.
+        ValueError: It is missing, not a number, or outside ``low`` to ``high``.
     """
     if name not in facts:
         raise ValueError(f"{name} is missing")
@@ -269,10 +274,10 @@ def number_of(facts: Mapping[str, str], name: str, low: float, high: float) -> f
 
 
 def count_of(facts: Mapping[str, str], name: str) -> int:
-    """Return a fact that counts samples; 0 where it is missing.
+    """Return a count of samples; 0 if it is missing.
 
     Raises:
-        ValueError: It is no such number.
+        ValueError: It is not a whole number.
     """
     text = facts.get(name, "0")
     if not (text.isascii() and text.isdecimal() and len(text) <= _MOST_DIGITS):
@@ -281,5 +286,51 @@ def count_of(facts: Mapping[str, str], name: str) -> int:
 
 
 def short(text: str) -> str:
-    """Return a text from a file for a message: quoted, and no longer than a line."""
+    """Return a text from a file, quoted and shortened to one line."""
     return repr(text if len(text) <= _LINE else text[: _LINE - 3] + "...")
+
+
+class _RecordedSegment(StrictModel):
+    """Fields of a recorded :class:`~hilctl.base.segments.Segment`."""
+
+    label: str
+    start: _Index
+    stop: _Index
+    steady_start: _Index
+    steady_stop: _Index
+    period: Annotated[float, Field(ge=0.0, allow_inf_nan=False)] = 0.0
+
+
+_SEGMENTS = TypeAdapter(list[_RecordedSegment])
+
+
+def segments_of(text: str) -> tuple[Segment, ...]:
+    """Return the segments of a run from their JSON text.
+
+    Raises:
+        ValueError: They are not the output of :meth:`~hilctl.base.segments.Segment.to_mapping`, not
+            in order, or have an impossible steady part or period.
+    """
+    if len(text) > _MOST_TEXT:
+        raise ValueError(f"segments: {len(text)} characters are more than any run has")
+    try:
+        recorded = _SEGMENTS.validate_json(text)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        where = ".".join(map(str, first["loc"])) or "the text"
+        raise ValueError(f"segments: {where}: {first['msg']}") from None
+    segments = tuple(Segment(**each.model_dump()) for each in recorded)
+    for problem in _problems(segments):
+        raise ValueError(f"segments: {problem}")
+    return segments
+
+
+def _problems(segments: Iterable[Segment]) -> Iterator[str]:
+    end = 0
+    for number, each in enumerate(segments):
+        places = [end, each.start, each.steady_start, each.steady_stop, each.stop]
+        if places != sorted(places):
+            yield f"{number}: its samples must follow those before it and rise: {places}"
+        if 0.0 < each.period < SHORTEST_PERIOD:
+            yield f"{number}: a period of {each.period!r} samples can't be"
+        end = each.stop

@@ -1,8 +1,7 @@
-"""From ring batches to an MCAP file.
+"""Writer of a run's MCAP file, and the file that it writes to.
 
-Metadata and attachments come first, so that a file cut short still says what it is; chunks are
-closed and handed to the kernel at least every ``flush_s``, so that a killed recorder loses no more
-than that.
+Metadata and attachments come first, so that a truncated file can be identified. Chunks are closed
+and written every ``flush_s``, which limits the loss if the recorder is killed.
 """
 
 import errno
@@ -23,11 +22,11 @@ from hilctl.base.files import begins_as_recording
 from hilctl.base.samples import BlockBatch
 from hilctl.base.segments import Segment
 from hilctl.recording.encoder import MessageMaker, RecordingLayout, Topics
-from hilctl.recording.locks import lock
 from hilctl.recording.metadata_keys import sealed
+from hilctl.recording.recording_files import lock
 
 _CHUNK_BYTES = 5 << 20
-"""Size at which a chunk is closed: about 2 s of samples at 50 kHz, the default flush interval."""
+"""Size of a full chunk: about 2 s of samples at 50 kHz, the default flush interval."""
 
 
 def mcap_writer(stream: "IO[bytes] | PendingFile") -> Writer:
@@ -37,15 +36,15 @@ def mcap_writer(stream: "IO[bytes] | PendingFile") -> Writer:
 
 @dataclass(frozen=True, slots=True)
 class RunFacts:
-    """What a recording says of its run before the first sample.
+    """Description of a run, recorded before its first sample.
 
     Attributes:
-        facts: Identity, versions, device, units; text to text.
-        segments: The stretches of the run.
-        experiment_yaml: The experiment as it runs.
+        facts: Identity, versions, device, units.
+        segments: Segments of the run.
+        experiment_yaml: The experiment.
         model_yaml: The compensator's model, or empty.
-        layout: What messages are made by.
-        correction_yaml: What had been learned and was added to the reference, or empty.
+        layout: Parameters of the messages.
+        correction_yaml: The learned correction that is added to the reference, or empty.
     """
 
     facts: Mapping[str, str]
@@ -57,11 +56,11 @@ class RunFacts:
 
 
 class RecordingWriter:
-    """Writes one run.
+    """Writer of one run.
 
     Args:
         stream: Open binary file; the writer does not close it.
-        run: Facts of the run.
+        run: Description of the run.
     """
 
     def __init__(self, stream: "IO[bytes] | PendingFile", run: RunFacts) -> None:
@@ -83,7 +82,6 @@ class RecordingWriter:
         if run.correction_yaml:
             self._attach("correction.yaml", run.correction_yaml, start_unix_ns)
         self._topics.register()
-        # Before the first sample: a file that is cut short must say what it is.
         self._writer.flush()
 
     def _attach(self, name: str, text: str, time_ns: int) -> None:
@@ -100,7 +98,7 @@ class RecordingWriter:
         return max(self._maker.missing, self._late_missing)
 
     def flush(self) -> None:
-        """Close the chunk in work and hand it to the kernel."""
+        """Close the current chunk and write it."""
         self._writer.flush()
 
     def finish(self, end: Mapping[str, str], ended_at: int) -> None:
@@ -108,8 +106,8 @@ class RecordingWriter:
 
         Args:
             end: Facts of the end.
-            ended_at: Index after the last sample that was exchanged; what is not recorded before
-                it is missing, also where no later block could say so.
+            ended_at: Index after the last sample that was exchanged; unrecorded samples before it
+                are missing.
         """
         self._late_missing = ended_at - self.samples
         counted = {"recorded_samples": str(self.samples), "missing_samples": str(self.missing)}
@@ -130,17 +128,17 @@ _MOST_PENDING_BYTES = 1 << 20
 
 
 class PendingFile:
-    """A file whose writes wait in memory until the disk accepts them.
+    """A file that buffers writes in memory until the disk accepts them.
 
-    :meth:`write` never fails, so an MCAP writer is never left halfway. A failed :meth:`flush`
-    loses nothing: the next one starts again where the last complete one ended.
+    :meth:`write` never fails, so an MCAP writer stays consistent. A failed :meth:`flush` loses
+    nothing: the next one starts where the last complete one ended.
 
     Args:
         raw: Unbuffered file, opened for writing.
-        sync: Whether every flush waits until the disk itself has the bytes.
+        sync: Whether every flush syncs the disk.
 
     Attributes:
-        problem: Why the last attempt to write failed; empty if it succeeded.
+        problem: Error of the last attempt to write; empty if it succeeded.
     """
 
     def __init__(self, raw: FileIO, *, sync: bool = False) -> None:
@@ -151,11 +149,11 @@ class PendingFile:
         self.problem = ""
 
     def write(self, data: bytes | bytearray | memoryview) -> int:
-        """Append bytes; the next :meth:`flush` hands them to the kernel, if not this call."""
+        """Append bytes; this call or the next :meth:`flush` writes them."""
         self._pending.append(bytes(data))
         self._pending_bytes += len(data)
         if self._pending_bytes > _MOST_PENDING_BYTES:  # a run without a ring never flushes
-            with suppress(OSError):  # they stay pending, and `problem` says why
+            with suppress(OSError):  # they stay pending, and `problem` has the error
                 self.flush()
         return len(data)
 
@@ -164,15 +162,15 @@ class PendingFile:
         return self._written + self._pending_bytes
 
     def flush(self, *, sync: bool = False) -> None:
-        """Hand all pending bytes to the kernel.
+        """Write all pending bytes.
 
         Args:
-            sync: Whether to wait until the disk itself has the whole file.
+            sync: Whether to sync the disk.
 
         Raises:
-            OSError: The disk refuses them, or the file was deleted, renamed or truncated (ESTALE);
-                they stay pending. Or the disk has lost earlier bytes, which the kernel reports with
-                the first sync after it: then every flush fails.
+            OSError: The disk rejects them, or the file was deleted, renamed or truncated (ESTALE);
+                they stay pending. Or the disk has lost earlier bytes, which the kernel reports at
+                the next sync: then every flush fails.
         """
         if self._lost is not None:
             raise self._lost
@@ -190,7 +188,7 @@ class PendingFile:
         except OSError as error:
             self.problem = error.strerror or str(error)
             raise
-        # Only now: half a chunk is written again from its first byte.
+        # Only now: after an error, the next flush writes all pending bytes again.
         self._written += len(data)
         self._synced = self._written if sync else self._synced
         self._drop_pending()
@@ -204,7 +202,7 @@ class PendingFile:
             same = False
         if not same:
             raise OSError(errno.ESTALE, "the file was deleted or renamed")
-        if own.st_size < self._written:  # a write behind its end would leave a hole
+        if own.st_size < self._written:  # writing after its end would leave a hole
             raise OSError(errno.ESTALE, "the file was truncated")
 
     def _sync(self) -> None:
@@ -212,8 +210,8 @@ class PendingFile:
             os.fsync(self._raw.fileno())
         except OSError as error:
             error.strerror = f"not brought to the disk: {error.strerror}"
-            # The kernel reports a failed write-back once and does not say which bytes it was.
-            # Pending ones are written again; earlier ones are no longer in memory.
+            # The kernel reports a failed write-back once, without its position. Pending bytes are
+            # written again; earlier ones are no longer in memory.
             if self._written > self._synced:
                 self._lost = error
             raise
@@ -232,8 +230,8 @@ class PendingFile:
         self._drop_pending()
 
     def abandon(self) -> None:
-        """Close the file as the last complete :meth:`flush` left it."""
-        with suppress(OSError):  # recovery copes with half a chunk as well
+        """Close the file after the last complete :meth:`flush`."""
+        with suppress(OSError):  # recovery handles a truncated chunk
             if os.fstat(self._raw.fileno()).st_size > self._written:
                 self._raw.truncate(self._written)
         with suppress(OSError):
@@ -254,12 +252,12 @@ class PendingFile:
 
 
 class OutputFile:
-    """A recording's file, claimed before the start and given back if the run never starts.
+    """A recording's file, claimed before the start, and released if the run never starts.
 
-    A file that stands there already keeps its content until :meth:`begin`.
+    An existing file keeps its content until :meth:`begin`.
 
     Args:
-        path: Where to record.
+        path: Path of the recording.
         overwrite: Whether an existing file may be replaced.
         sync: See :class:`PendingFile`.
 
@@ -268,7 +266,7 @@ class OutputFile:
 
     Raises:
         FileExistsError: It exists and ``overwrite`` is False.
-        OSError: It can't be written, it is no recording, or another run is recording to it.
+        OSError: It cannot be written, is not a recording, or another run is recording to it.
     """
 
     def __init__(self, path: Path, *, overwrite: bool, sync: bool = False) -> None:
@@ -279,7 +277,7 @@ class OutputFile:
         if overwrite and not self._ours and not begins_as_recording(path):
             text = "Not a recording, and --overwrite replaces nothing else: name another file"
             raise OSError(errno.EINVAL, text, str(path))
-        # Not "wb": what stands there is emptied only once the run starts, and under the lock.
+        # Not "wb": an existing file is emptied when the run starts, under the lock.
         raw = path.open("r+b" if overwrite and not self._ours else "xb", buffering=0)
         lock(raw)
         self.stream = PendingFile(raw, sync=sync)
@@ -290,7 +288,7 @@ class OutputFile:
         return self.stream
 
     def give_back(self) -> None:
-        """Close the file unwritten; remove it unless it stood there before."""
+        """Close the file unwritten; remove it unless it existed before."""
         with suppress(OSError):
             self.stream.close()
         if self._ours:

@@ -11,7 +11,7 @@ from hilctl.base.errors import HilctlError
 from hilctl.base.events import Event
 from hilctl.base.samples import BlockBatch, BlockHeader
 from hilctl.loop.safe_output import LoopOutcome, describe
-from hilctl.recording.locks import is_being_recorded
+from hilctl.recording.recording_files import is_being_recorded
 from hilctl.recording.recover import recover_recording
 from hilctl.run.metadata import end_facts
 from hilctl.run.run_folder import RunFolder, runs, taken_over

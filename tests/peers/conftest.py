@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 
 HERE = Path(__file__).parent
-LIBMODBUS_SOURCE = HERE.parent / "benchmark" / "modbus_exchange.c"
+LIBMODBUS_SOURCE = HERE.parent / "benchmark" / "exchange.c"
 GIVE_UP_S = 240.0
 
 DEBIAN = "apt-get install {}"

@@ -132,7 +132,7 @@ class TestStart:
         rig = Rig(np.full(100, 1.0), device=FakeDevice(4.0, nan_at=10))
         outcome = rig.run()
         assert (outcome.code, rig.waveform_at) == ("fault", 40)
-        assert "displacement nan µm at sample 40" in outcome.reason
+        assert "at sample 40" in outcome.reason
 
     def test_the_heartbeat_counts_the_waveform_s_samples(self):
         """0 until it begins, and a tuning that comes before waits for it."""
@@ -236,7 +236,7 @@ class TestByTime:
         """The first step of a ramp is one step, however long the output had stood still."""
         clock = FakeClock(stall_ns={30: 2_000_000_000})
         rig = Rig(np.full(10_000, 5.0), clock=clock)
-        assert "woke 2.000 s late" in rig.run().reason
+        assert "2.000 s late" in rig.run().reason
         assert rig.device.commands[30] == pytest.approx(5.0 - RAMP_STEP)
 
     def test_deadlines_go_on_through_the_ramp_out(self):

@@ -70,7 +70,7 @@ def test_an_integrator_and_history_through_a_fifo(port, tmp_path):
     integral = "feedback={kind: integral, bandwidth_hz: 0.012, limit_um: 15.0}"
     before = ("condition={cycles: 3}", "compensator.offset=measured", "device.sensor.offset_um=2.0")
     _, said = ran(port, tmp_path / "a.mcap", *before, integral)
-    assert "begins where its condition leaves the actuator" in said
+    assert "its condition leaves" in said
     recording = read(tmp_path / "a.mcap")
     assert replay(recording).identical
     samples = recording.samples
@@ -79,5 +79,5 @@ def test_an_integrator_and_history_through_a_fifo(port, tmp_path):
     (event,) = (each for each in recording.events if each.code == OFFSET)
     assert event.values["offset_um"] == pytest.approx(2.0, abs=1.0)
     _, said = ran(port, tmp_path / "b.mcap")
-    assert f"begins where {tmp_path}/a.mcap left the actuator" in said
+    assert f"begins where {tmp_path}/a.mcap left" in said
     assert read(tmp_path / "b.mcap").run["initial_state_run_id"] == recording.run["run_id"]

@@ -11,7 +11,7 @@ from hilctl.base.errors import ConfigError, DataError, InputError
 from hilctl.base.private_dirs import HAS_LOCKS, take_lock
 from hilctl.base.yaml import load_document
 from hilctl.experiment.sections import RecordingConfig
-from hilctl.recording.locks import is_being_recorded
+from hilctl.recording.recording_files import is_being_recorded
 from hilctl.recording.recover import recover_recording
 from hilctl.recording.run_summary import read_ends, recordings_in
 from hilctl.run.run_folder import RunFolder, runs

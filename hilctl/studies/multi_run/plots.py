@@ -8,8 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from hilctl.analysis.figure_export import write_figure
-from hilctl.analysis.figure_layout import ColumnWidth, FigureSpec, Panel, drawn
+from hilctl.analysis.figure_layout import ColumnWidth, FigureSpec, Panel, drawn, write_figure
 from hilctl.analysis.plot_style import QUIET
 from hilctl.base.errors import InputError
 from hilctl.base.files import already_there
@@ -139,7 +138,7 @@ def write_sheets(
     Args:
         sheets: The figures.
         folder: Where they go; made where it is missing.
-        formats: See :data:`hilctl.analysis.figure_export.FORMATS`.
+        formats: See :data:`hilctl.analysis.figure_layout.FORMATS`.
         width: Of one column of a journal, or of two.
         overwrite: Whether files of these names may be replaced.
         on_done: Told of progress.

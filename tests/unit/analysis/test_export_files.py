@@ -65,7 +65,7 @@ def test_mat_says_what_it_can_not_hold(tmp_path, monkeypatch):
     with (tmp_path / "x.mat").open("xb") as stream, TemporaryFile() as aside:
         file = MatFile(stream, aside)
         file.add(columns(0, 1000))
-        with pytest.raises(InputError, match=r"at most 1000 samples: export a stretch"):
+        with pytest.raises(InputError, match=r"1000 samples"):
             file.add(columns(1000, 1001))
 
 
@@ -113,7 +113,7 @@ def test_parquet_that_is_refused_is_refused_once(monkeypatch, capfd, size):
         file.add(WHOLE)
         file.finish(FACTS)
 
-    with pytest.raises(OSError, match="No space left on device"):
+    with pytest.raises(OSError, match="No space"):
         refused()
     gc.collect()
     assert capfd.readouterr() == ("", "")

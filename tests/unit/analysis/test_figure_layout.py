@@ -2,7 +2,15 @@
 
 import pytest
 
-from hilctl.analysis.figure_layout import COLUMN_MM, FigureSpec, Panel, drawn
+from hilctl.analysis.figure_layout import (
+    COLUMN_MM,
+    FigureSpec,
+    Panel,
+    drawn,
+    formats_of,
+    write_figure,
+)
+from hilctl.base.errors import InputError
 
 
 def draw(axes, label="a line"):
@@ -64,3 +72,27 @@ def test_long_titles_are_broken():
         0
     ]
     assert "\n" in axes.get_title("left")
+
+
+@pytest.fixture
+def figure():
+    return drawn(FigureSpec("a", "", (Panel(lambda axes: axes.plot([0, 1], [0, 1]), "x"),)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("kind", "head"), [("svg", b"<?xml"), ("pdf", b"%PDF"), ("png", b"\x89PNG")]
+)
+def test_files_are_of_their_kind(figure, tmp_path, kind, head):
+    paths = write_figure(figure, tmp_path, "loops", [kind], overwrite=False)
+    assert paths == [tmp_path / f"loops.{kind}"]
+    assert paths[0].read_bytes().startswith(head)
+    with pytest.raises(InputError, match="exists already"):
+        write_figure(figure, tmp_path, "loops", [kind], overwrite=False)
+
+
+def test_formats_are_read_from_a_list():
+    assert formats_of("SVG, png,svg") == ("svg", "png")
+    for wrong in ("", "gif", "svg,jpg"):
+        with pytest.raises(InputError, match="svg, pdf, png"):
+            formats_of(wrong)

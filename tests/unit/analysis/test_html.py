@@ -1,11 +1,14 @@
 """Parts of pages."""
 
+import xml.etree.ElementTree as ET
+
 import pytest
 
 from hilctl.analysis import html
-from hilctl.analysis.figure_layout import FigureSpec, Panel
+from hilctl.analysis.figure_layout import FigureSpec, Panel, drawn
 from hilctl.analysis.html import DEFINITIONS, definitions_of
 
+SCRIPT = "<script>alert(1)</script> $x$ & 'y'"
 NASTY = "<b onclick='x'>&\x1b"
 
 
@@ -48,3 +51,24 @@ def test_terms_are_found_in_the_order_of_the_list():
 def test_every_term_is_defined_once_in_a_sentence():
     assert len({term for term, _ in DEFINITIONS}) == len(DEFINITIONS)
     assert all(meaning.endswith(".") for _, meaning in DEFINITIONS)
+
+
+@pytest.fixture
+def figure():
+    return drawn(FigureSpec("a", "", (Panel(lambda axes: axes.plot([0, 1], [0, 1]), SCRIPT),)))
+
+
+def test_a_page_s_figure_has_texts_of_any_width_and_no_address(figure):
+    text = html.svg(figure)
+    root = ET.fromstring(text)
+    assert root.attrib["viewBox"].startswith("0 0 ")
+    assert "width" not in root.attrib
+    assert "http" not in text
+    shown = " ".join("".join(element.itertext()) for element in root.iter("text"))
+    assert "<script>alert(1)</script>" in shown
+    assert "<script>" not in text
+    assert '<g id="' not in text
+
+
+def test_the_same_figure_has_the_same_bytes(figure):
+    assert html.svg(figure) == html.svg(figure)

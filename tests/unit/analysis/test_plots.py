@@ -7,8 +7,8 @@ import pytest
 from matplotlib.collections import FillBetweenPolyCollection
 
 from hilctl.analysis import loop_plot, plot_style, plots
-from hilctl.analysis.figure_export import svg
 from hilctl.analysis.figure_layout import drawn
+from hilctl.analysis.html import svg
 from hilctl.analysis.plots import ErrorSpectrum, error_spectrum, thinned
 from hilctl.base.segments import Segment
 from hilctl.recording.recording import Recording, Ticks

@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 from hilctl.analysis.report import summarize
-from hilctl.analysis.report_table import number, quality_rows, run_rows, segment_table
+from hilctl.analysis.report_table import number, quality_rows, run_rows, segment_table, usage_text
+from hilctl.machine.procfs import ProcessUsage
 from hilctl.recording.reader import read
 
 GOLDEN = Path(__file__).parents[3] / "recordings" / "golden"
@@ -55,3 +56,9 @@ def test_columns_that_are_empty_everywhere_are_left_out(report):
     headings, rows = segment_table(replace(report, segments=(blank,)))
     assert "freq. Hz" not in headings
     assert len(rows[0]) == len(headings)
+
+
+def test_people_read_megabytes_and_seconds():
+    text = usage_text(ProcessUsage(98_000_000, 1_500_000_000, 12, 3, 1234))
+    for part in ("98 MB", "1.50 s", "15 page faults", "3 from", "1,234 involuntary"):
+        assert part in text

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from hilctl.analysis import tick_lateness
+from hilctl.analysis.tick_lateness import LatenessBuilder
 from hilctl.recording.recording import Ticks
 
 
@@ -12,6 +13,13 @@ def ticks(late_ns: list[int], period_ns: int = 1_000_000) -> Ticks:
     first = np.arange(len(late_ns), dtype=np.int64)
     late = np.array(late_ns, dtype=np.int64)
     return Ticks(first, first * period_ns, late, late)
+
+
+def lateness(ticks: Ticks, minutes: float = 1.0) -> LatenessBuilder:
+    """Return the lateness of all ticks of a run."""
+    builder = LatenessBuilder(minutes)
+    builder.add(ticks)
+    return builder
 
 
 def test_percentiles_are_in_microseconds() -> None:
@@ -28,7 +36,7 @@ def test_percentiles_of_nothing_are_empty() -> None:
 
 def test_late_is_more_than_half_a_period() -> None:
     """Exactly half a period is not late yet."""
-    assert tick_lateness.late_ticks(ticks([0, 500_000, 500_001, 3_000_000])) == 2
+    assert lateness(ticks([0, 500_000, 500_001, 3_000_000])).late_ticks() == 2
 
 
 def test_period_survives_skipped_ticks() -> None:
@@ -36,29 +44,29 @@ def test_period_survives_skipped_ticks() -> None:
     many = ticks([600_000] * 10)
     late = Ticks(many.first_sample, many.deadline_ns * 1, many.late_ns, many.exchange_ns)
     late.deadline_ns[7:] += 50_000_000
-    assert tick_lateness.late_ticks(late) == 10
+    assert lateness(late).late_ticks() == 10
 
 
 def test_fewer_than_two_ticks_have_no_period() -> None:
     """With one tick nobody knows what late means."""
-    assert tick_lateness.late_ticks(ticks([5_000_000])) is None
-    assert tick_lateness.late_ticks(ticks([])) is None
+    assert lateness(ticks([5_000_000])).late_ticks() is None
+    assert lateness(ticks([])).late_ticks() is None
 
 
 def test_minutes_are_told_apart() -> None:
     """Each minute of deadlines has its own figures; one without ticks is left out."""
     run = ticks([1_000] * 60 + [2_000] * 60 + [5_000] * 10, period_ns=1_000_000_000)
     run.deadline_ns[120:] += 60_000_000_000
-    found = tick_lateness.by_minute(run)
+    found = lateness(run).by_minute()
     assert [(each["minute"], each["ticks"]) for each in found] == [(0, 60), (1, 60), (3, 10)]
     assert [each["max"] for each in found] == [1.0, 2.0, 5.0]
-    assert tick_lateness.by_minute(ticks([])) == []
+    assert lateness(ticks([])).by_minute() == []
 
 
 def test_long_runs_are_told_in_longer_stretches() -> None:
     """A table of a year by minutes is none; nor is one of ticks with absurd deadlines."""
     deadline_ns = np.arange(500_000, dtype=np.int64) * 60_000_000_000
     zeros = np.zeros_like(deadline_ns)
-    rows = tick_lateness.by_minute(Ticks(zeros, deadline_ns, zeros, zeros))
+    rows = lateness(Ticks(zeros, deadline_ns, zeros, zeros), 500_000.0).by_minute()
     assert len(rows) <= tick_lateness.MOST_ROWS + 1
     assert sum(row["ticks"] for row in rows) == 500_000

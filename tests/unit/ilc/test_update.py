@@ -95,7 +95,7 @@ def test_the_error_goes_to_the_noise_floor(response, coupling):
 def test_it_stops_at_the_noise_floor():
     """Once the error is that of the noise, there is nothing to learn."""
     state = learned(Plant(Response()))
-    assert state.done == "at the noise floor"
+    assert "noise floor" in state.done
     assert state.best.error.peak_um <= 1.2 * state.best.error.floor_um
     assert len(state.trials) < 15
 
@@ -169,5 +169,5 @@ def test_it_gives_up_where_nothing_helps():
     plant = Plant(Response())
     plant._answer = 0.0 * plant._answer
     state = learned(plant)
-    assert state.done == "no better in 5 runs"
+    assert "5 runs" in state.done
     assert len(state.trials) == 6

@@ -6,8 +6,8 @@ import pytest
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Header, Metadata, Schema
 
-from hilctl.recording.mcap_records import contents, inflate, parse
-from hilctl.recording.read_budget import ReadBudget
+from hilctl.base.errors import DataError
+from hilctl.recording.mcap_records import ReadBudget, contents, inflate, parse
 from tests.unit.recording.conftest import chunk, message, raw
 
 RECORDS = [
@@ -53,3 +53,25 @@ def test_a_chunk_must_be_records_to_its_last_byte():
 def test_unknown_compression_gives_nothing():
     """What can't be decompressed is not guessed at."""
     assert inflate("brotli", b"abc", 10, ReadBudget(3)) == b""
+
+
+@pytest.mark.parametrize("count", ["read", "expand", "keep"])
+def test_bytes_are_bounded_by_the_size(count):
+    budget = ReadBudget(10**6)
+    getattr(budget, count)(50 * 10**6)
+    with pytest.raises(DataError, match="its size"):
+        getattr(budget, count)(200 * 10**6)
+
+
+def test_messages_are_bounded_by_the_size():
+    budget = ReadBudget(16 * 1000)
+    for _ in range(101_000):
+        budget.message()
+    with pytest.raises(DataError, match="more messages"):
+        budget.message()
+
+
+def test_each_is_counted_by_itself():
+    budget = ReadBudget(0)
+    for count in (budget.read, budget.expand, budget.keep):
+        count(64 * 2**20)

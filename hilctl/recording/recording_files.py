@@ -1,0 +1,85 @@
+"""Locks of recording files, and the safe replacement of one."""
+
+import errno
+import os
+from io import FileIO
+from pathlib import Path
+from typing import BinaryIO
+
+from hilctl.base.files import AtomicFile
+from hilctl.base.private_dirs import is_locked, take_lock
+
+
+def lock(stream: BinaryIO, *, shared: bool = False) -> None:
+    """Mark a recording as being written, or as being recovered (shared), until it is closed.
+
+    Raises:
+        BlockingIOError: Another process is writing it.
+    """
+    try:
+        take_lock(stream, shared=shared)
+    except BlockingIOError:
+        stream.close()
+        raise BlockingIOError(errno.EAGAIN, "another hilctl is recording to it") from None
+    except OSError as error:
+        if error.errno not in {errno.ENOLCK, errno.ENOTSUP}:  # a file system without locks
+            raise
+
+
+def is_being_recorded(stream: BinaryIO | FileIO) -> bool:
+    """Return whether a run is recording to an open file; False if there are no locks."""
+    return is_locked(stream)
+
+
+class Replacement:
+    """A new file for the place of an old one; :meth:`close` without :meth:`put` removes it.
+
+    Args:
+        path: The old file; a link is followed.
+        output: Destination of the new file, if it does not replace the old one.
+
+    Attributes:
+        stream: The new file, open for writing.
+        final: Its destination.
+
+    Raises:
+        FileExistsError: ``output`` exists.
+        OSError: The folder cannot be written.
+    """
+
+    def __init__(self, path: Path, output: Path | None) -> None:
+        self._old = path.resolve()
+        self._in_place = output is None
+        self._file = AtomicFile(self._old if output is None else output, overwrite=output is None)
+        self.final = self._file.final
+        self.stream = self._file.stream
+        Path(self.stream.name).chmod(self._old.stat().st_mode)
+
+    def put(self) -> Path:
+        """Sync the new file, move it to its destination, and return the place of the old one.
+
+        A complete file has the old name at every moment, except during one renaming on file systems
+        without hard links.
+        """
+        self._file.secure()  # before the old file is touched: a full disk must change nothing
+        kept = self._keep() if self._in_place else self._old
+        self._file.commit()
+        return kept
+
+    def close(self) -> None:
+        """Close the new file; remove it unless it was put."""
+        self._file.close()
+
+    def _keep(self) -> Path:
+        number = 1
+        while True:
+            kept = self._old.with_name(f"{self._old.name}.torn{'' if number == 1 else number}")
+            try:
+                kept.hardlink_to(self._old)
+                return kept
+            except FileExistsError:
+                number += 1
+            except OSError:  # no hard links here
+                if not os.path.lexists(kept):
+                    return self._old.rename(kept)
+                number += 1
