@@ -16,7 +16,7 @@ from hilctl import api
 from hilctl.cli.console import console, print_rich
 from hilctl.cli.options import AsJson, ExperimentFile, Settings
 from hilctl.cli.safe_streams import print_json
-from hilctl.experiment.inventory import DeviceDescription, Inventory, describe, inventory
+from hilctl.experiment.devices import DeviceDescription, Inventory, describe, inventory
 from hilctl.machine.diagnosis import DEFAULT_RATE_HZ, Diagnosis, diagnose, lateness_counts
 from hilctl.machine.rt_setup import SetUpStep
 from hilctl.machine.settings import Realtime

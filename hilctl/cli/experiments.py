@@ -17,9 +17,9 @@ from hilctl.cli.console import print_rich
 from hilctl.cli.options import AsJson, Settings
 from hilctl.cli.run import LiveView
 from hilctl.cli.safe_streams import print_json
-from hilctl.experiment.device import known_devices
+from hilctl.experiment.devices import known_devices, shipped_profiles
 from hilctl.experiment.examples import copy_example, examples_folder, shipped_examples
-from hilctl.experiment.inventory import schema_text, shipped_profiles
+from hilctl.experiment.file import schema_text
 from hilctl.experiment.template import LIMITS_ASKED, starting_device
 from hilctl.run.architecture import require_linux
 from hilctl.run.dead_runs import finish_dead_runs

@@ -28,7 +28,7 @@ from hilctl.cli.console import console
 from hilctl.cli.options import AsJson, ExperimentFile, LabelTexts, Overwrite, Settings
 from hilctl.cli.reports import render_report
 from hilctl.cli.safe_streams import print_json
-from hilctl.experiment.run_labels import label_settings
+from hilctl.experiment.sections import label_settings
 from hilctl.loop.safe_output import describe
 from hilctl.machine.logind import log_out
 from hilctl.machine.procfs import Machine
