@@ -25,7 +25,7 @@ from hilctl.identify.registry import entry
 from hilctl.identify.resonances import WORTH, further_modes
 from hilctl.identify.settings import FitSettings, IdentifySettings
 from hilctl.models.base import HysteresisModel
-from hilctl.models.mechanics import FirstMode, FurtherMode
+from hilctl.models.linear_stages import FirstMode, FurtherMode
 from hilctl.models.model_file import dump_model
 
 TURNS = 4  # each finds a model anew

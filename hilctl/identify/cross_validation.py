@@ -15,7 +15,7 @@ from hilctl.identify.fit_data import FitData
 from hilctl.identify.fit_kind import fit_kind
 from hilctl.identify.parallel import MapFunction
 from hilctl.identify.settings import FitSettings
-from hilctl.models.mechanics import FurtherMode
+from hilctl.models.linear_stages import FurtherMode
 
 FEWEST_LOOPS = 4
 FOLDS = 3

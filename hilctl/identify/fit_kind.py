@@ -13,7 +13,7 @@ from hilctl.identify.parallel import MapFunction, serial_map
 from hilctl.identify.registry import CATALOGUE
 from hilctl.identify.resonances import without_modes
 from hilctl.identify.settings import FitSettings
-from hilctl.models.mechanics import FurtherMode
+from hilctl.models.linear_stages import FurtherMode
 
 
 def fit_kind(

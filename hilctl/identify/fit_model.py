@@ -19,7 +19,7 @@ from hilctl.identify.parallel import MapFunction, serial_map
 from hilctl.identify.registry import CATALOGUE
 from hilctl.identify.settings import FitSettings
 from hilctl.models.base import HysteresisModel, Provenance
-from hilctl.models.mechanics import FurtherMode
+from hilctl.models.linear_stages import FurtherMode
 
 VERSIONS = {"hilctl": hilctl.__version__, "numpy": np.__version__, "scipy": scipy.__version__}
 

@@ -12,7 +12,7 @@ from hilctl.identify.data.records import History, Record
 from hilctl.identify.fit_api import OnProgress, ignore_progress
 from hilctl.identify.parallel import MapFunction, serial_map
 from hilctl.identify.settings import IdentifySettings, kinds_of
-from hilctl.models.mechanics import FurtherMode
+from hilctl.models.linear_stages import FurtherMode
 
 WHOLE: tuple[Mapping[str, Any], ...] = (
     {"kind": "field", "drags": 0, "plays": 8, "cells": 12, "knots": 16},

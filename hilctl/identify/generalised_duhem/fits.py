@@ -11,7 +11,7 @@ from hilctl.identify.fit_api import FitJob, FoundModel
 from hilctl.identify.generalised_duhem.search import DuhemEnd, DuhemSearch
 from hilctl.identify.generalised_duhem.signals import NAMES
 from hilctl.models.generalised_duhem import GeneralisedDuhemModel
-from hilctl.models.mechanics import FirstMode
+from hilctl.models.linear_stages import FirstMode
 from hilctl.models.staged import StagedModel
 
 POINTS = 45  # samples that are left of the fastest cycle; a table has no thresholds to turn on

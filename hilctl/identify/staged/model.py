@@ -7,9 +7,8 @@ import numpy as np
 from hilctl.base.types import F64, CommandUnit
 from hilctl.identify.staged.fit_data import Linear, StagedFitData
 from hilctl.identify.staged.objective import Layers, Point, loop_delay_s
-from hilctl.models.deadband import DeadbandFunction
-from hilctl.models.integrated import IntegratedModel
-from hilctl.models.mechanics import FirstMode
+from hilctl.models.integrated import DeadbandFunction, IntegratedModel
+from hilctl.models.linear_stages import FirstMode
 from hilctl.models.plays import PlayModel
 from hilctl.models.staged import FieldLag, StagedModel
 

@@ -18,7 +18,7 @@ from hilctl.identify.staged.model import (
 )
 from hilctl.identify.staged.objective import Layers
 from hilctl.identify.staged.staged_search import StagedEnd, find_staged
-from hilctl.models.preisach import PreisachModel
+from hilctl.models.implicit_models import PreisachModel
 from hilctl.models.staged import StagedModel
 
 SPARE = 0.1  # span of commands beyond the data's, of their range

@@ -9,8 +9,8 @@ import pytest
 from hilctl.base.errors import DataError
 from hilctl.base.samples import COLUMNS, BlockBatch, BlockHeader, Flag
 from hilctl.experiment.initial_state import InitialState, initial_state_after, left_by
-from hilctl.models.creep import CreepModel
 from hilctl.models.integrated import exponential_integrated
+from hilctl.models.linear_stages import CreepModel
 from hilctl.models.staged import FieldLag, StagedModel
 from hilctl.recording.encoder import RecordingLayout
 from hilctl.recording.writer import RecordingWriter, RunFacts

@@ -18,7 +18,7 @@ from hilctl.identify.data.records import History, SteadyLoop
 from hilctl.identify.model_page import write_identification
 from hilctl.identify.resonances import WORTH
 from hilctl.identify.settings import FitSettings, IdentifySettings
-from hilctl.models.mechanics import FirstMode, FurtherMode
+from hilctl.models.linear_stages import FirstMode, FurtherMode
 from hilctl.models.model_file import load_model
 from hilctl.models.plays import PpiModel
 

@@ -9,9 +9,8 @@ from hilctl.base.errors import DataError
 from hilctl.identify.data.records import History
 from hilctl.identify.fit_kind import fit_kind
 from hilctl.identify.settings import FitSettings
-from hilctl.models.creep import CreepModel
 from hilctl.models.integrated import exponential_integrated
-from hilctl.models.mechanics import FurtherMode
+from hilctl.models.linear_stages import CreepModel, FurtherMode
 from hilctl.models.staged import FieldLag, StagedModel
 
 RATE_HZ = 2000.0

@@ -14,7 +14,7 @@ from hilctl.identify.evaluation import Evaluation
 from hilctl.identify.fit_api import ignore_progress
 from hilctl.identify.model_selection import LOOPS, SelectedModel, choose_kind
 from hilctl.identify.parallel import serial_map
-from hilctl.models.mechanics import FurtherMode
+from hilctl.models.linear_stages import FurtherMode
 
 WAVE = np.sin(np.linspace(0.0, 6.0, 64))
 HISTORY = History("history", WAVE, 9.0 * WAVE, 100.0)

@@ -17,8 +17,7 @@ from hilctl.kernels.dynamics import (
     unmode_stage,
 )
 from hilctl.kernels.hysteresis import rest_memory
-from hilctl.models.cascade import smoothing_weights
-from hilctl.models.mechanics import FirstMode, FurtherMode
+from hilctl.models.linear_stages import FirstMode, FurtherMode, smoothing_weights
 from hilctl.models.staged import FieldLag
 
 RATE_HZ = 20_000.0

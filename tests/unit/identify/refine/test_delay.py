@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from hilctl.identify.refine.delay import delayed_model, fastest_um_per_s
-from hilctl.models.butterfly import ButterflyModel
-from hilctl.models.deadband import DeadbandFunction
+from hilctl.models.integrated import ButterflyModel, DeadbandFunction
 from hilctl.models.staged import StagedModel
 from tests.unit.identify.refine.conftest import OLD, actuator, history
 

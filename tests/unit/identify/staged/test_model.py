@@ -16,7 +16,7 @@ from hilctl.identify.staged.model import (
 )
 from hilctl.identify.staged.objective import Layers, Point, loop_delay_s
 from hilctl.models.integrated import exponential_integrated
-from hilctl.models.mechanics import FirstMode
+from hilctl.models.linear_stages import FirstMode
 
 HALF_S = 1e-5
 LAYERS = Layers(plays=2, deadbands=1, half_period_s=HALF_S)

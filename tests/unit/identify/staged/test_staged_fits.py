@@ -9,9 +9,9 @@ import pytest
 
 from hilctl.identify.data.records import SteadyLoop
 from hilctl.identify.evaluation import judge
-from hilctl.models.mechanics import FirstMode
+from hilctl.models.implicit_models import PreisachModel
+from hilctl.models.linear_stages import FirstMode
 from hilctl.models.model_file import dump_model, parse_model
-from hilctl.models.preisach import PreisachModel
 from hilctl.models.staged import FieldLag, StagedModel
 from tests.staged import GRID, fit, truth
 
