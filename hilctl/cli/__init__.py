@@ -31,7 +31,7 @@ from contextlib import contextmanager
 from typing import NoReturn
 
 from hilctl.base.errors import ConfigError, HilctlError, InputError, RunError
-from hilctl.base.os_errors import reason
+from hilctl.base.files import reason
 from hilctl.cli.safe_streams import print_json, safe_streams
 from hilctl.cli.verbosity import output_as_requested, print_traceback, take_verbosity
 from hilctl.run.architecture import WORKS_ANYWHERE

@@ -16,8 +16,7 @@ from hilctl.base.files import check_writable
 from hilctl.cli.console import console, print_rich, progress_bar
 from hilctl.cli.options import AsJson, Overwrite, Settings
 from hilctl.cli.safe_streams import print_json
-from hilctl.comparison.compare import Comparison
-from hilctl.comparison.summary import headings, notes, table_rows, titles
+from hilctl.comparison.compare import Comparison, headings, notes, table_rows, titles
 from hilctl.identify.command import Identification
 from hilctl.identify.evaluation import LoopScore
 from hilctl.identify.model_page import write_identification

@@ -1,7 +1,6 @@
-"""Models of the literature on the same loops, identified, judged and tried alike.
+"""Comparison of hysteresis models on the same loops.
 
-compare.py  all of it together; identified models as files
-trials.py   each inverse before a simulated device, in this process; time a sample
-summary.py  the table's texts
-page.py     table and figure as one page
+compare.py           identify, evaluate and try models; the table as text; model files
+simulated_trials.py  each inverse on a simulated device, and its time per sample
+comparison_page.py   table and figure as an HTML page
 """

@@ -7,7 +7,7 @@ from contextlib import closing
 from pathlib import Path
 
 from hilctl.base.errors import DataError
-from hilctl.base.os_errors import no_such_file, reason
+from hilctl.base.files import no_such_file, reason
 from hilctl.recording.builder import RecordingBuilder
 from hilctl.recording.index import places_of
 from hilctl.recording.locks import is_being_recorded

@@ -13,7 +13,7 @@ from mcap.records import Footer, Metadata, MetadataIndex, SummaryOffset
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
 from hilctl.base.errors import DataError
-from hilctl.base.os_errors import reason
+from hilctl.base.files import reason
 from hilctl.recording.locks import is_being_recorded
 from hilctl.recording.mcap_records import FRAME, records_from
 from hilctl.recording.metadata_keys import CHECKSUM_FACT, unsealed

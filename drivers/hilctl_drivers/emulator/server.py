@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Sequence
 
 from hilctl.base.errors import InputError
-from hilctl.base.os_errors import ADDRESS_REMEDIES, reason
+from hilctl.base.files import ADDRESS_REMEDIES, reason
 from hilctl_drivers.emulator.connections import Connection, PtyConnection, TcpConnection
 from hilctl_drivers.emulator.faults import FaultPlan, WireFault, spoil
 from hilctl_drivers.emulator.wire import EmulatedReply, EmulatedWire
