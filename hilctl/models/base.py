@@ -14,9 +14,6 @@ from hilctl.kernels.hysteresis import rest_memory
 BlockKernel: TypeAlias = Callable[[F64, F64, F64], None]
 """A kernel with its parameters bound: (input[n], memory, output[n])."""
 
-StageKernel: TypeAlias = Callable[[F64, F64, F64, F64], None]
-"""A kernel of the signature :data:`hilctl.kernels.jit.STAGE`."""
-
 MAX_OPERATORS = 10_000
 """Largest number of operators of a model: more would take milliseconds per sample."""
 
@@ -53,29 +50,29 @@ class Operator:
         self._output_offset = output_offset
 
     @classmethod
-    def staged(
+    def bound(
         cls,
-        kernel: StageKernel,
-        parameters: F64,
+        kernel: Callable[..., None],
+        parameters: tuple[Any, ...],
         operators: int,
         *,
         input_offset: float = 0.0,
         output_offset: float = 0.0,
     ) -> "Operator":
-        """Return an operator whose kernel has its parameters in one array.
+        """Return an operator from a kernel and its parameters.
 
         Args:
-            kernel: See :data:`StageKernel`.
-            parameters: float64[p], its parameters.
+            kernel: Called with input, parameters, memory and output.
+            parameters: Parameters between input and memory.
             operators: Number of operators with memory.
             input_offset: Added to the input first.
             output_offset: Added to the output last.
         """
 
         def run(block: F64, memory: F64, out: F64) -> None:
-            kernel(block, parameters, memory, out)
+            kernel(block, *parameters, memory, out)
 
-        return Operator(run, operators, input_offset=input_offset, output_offset=output_offset)
+        return cls(run, operators, input_offset=input_offset, output_offset=output_offset)
 
     def process(self, block: F64, out: F64 | None = None) -> F64:
         """Process one block and update the memory.

@@ -2,12 +2,11 @@
 
 import math
 from collections.abc import Iterator
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 
 from hilctl.base.strict import Field, StrictModel, model_validator
-from hilctl.base.types import F64
 from hilctl.kernels.field import Bank, Losses, field_forward, field_inverse
 from hilctl.models.base import HysteresisModel, Operator, Thresholds, Weights, refuse
 from hilctl.models.implicit_models import cell_problems, table_problems
@@ -178,27 +177,17 @@ class FieldModel(HysteresisModel):
         width = self.cell * len(self.slopes[0])
         return self.lowest - width, self.lowest + 2.0 * width, _TOLERANCE_UM
 
-    def _curve(self) -> tuple[F64, F64]:
-        return np.array(self.curve.operators_um), np.array(self.curve.displacement_um)
+    def _parameters(self, sample_rate_hz: float) -> tuple[Any, ...]:
+        losses = self.losses.sampled(sample_rate_hz, self.cell * len(self.slopes[0]))
+        curve = np.array(self.curve.operators_um), np.array(self.curve.displacement_um)
+        return self._span(), self._bank(), self.coupling, losses, curve
 
     def forward(self, sample_rate_hz: float) -> Operator:
         """Return the operator from command to um, at rest."""
-        span, bank = self._span(), self._bank()
-        losses = self.losses.sampled(sample_rate_hz, self.cell * len(self.slopes[0]))
-        coupling, curve = self.coupling, self._curve()
-
-        def run(v: F64, memory: F64, out: F64) -> None:
-            field_forward(v, span, bank, coupling, losses, curve, memory, out)
-
-        return Operator(run, self._numbers(), output_offset=self.output_offset_um)
+        parameters, size = self._parameters(sample_rate_hz), self._numbers()
+        return Operator.bound(field_forward, parameters, size, output_offset=self.output_offset_um)
 
     def inverse(self, sample_rate_hz: float) -> Operator:
         """Return the operator from um to command, at rest."""
-        span, bank = self._span(), self._bank()
-        losses = self.losses.sampled(sample_rate_hz, self.cell * len(self.slopes[0]))
-        coupling, curve = self.coupling, self._curve()
-
-        def run(y: F64, memory: F64, out: F64) -> None:
-            field_inverse(y, span, bank, coupling, losses, curve, memory, out)
-
-        return Operator(run, self._numbers(), input_offset=-self.output_offset_um)
+        parameters, size = self._parameters(sample_rate_hz), self._numbers()
+        return Operator.bound(field_inverse, parameters, size, input_offset=-self.output_offset_um)

@@ -90,26 +90,20 @@ class GeneralisedModel(BoundedInputModel):
     def forward(self, sample_rate_hz: float) -> Operator:
         """Return the operator from command to um, at rest; independent of the rate."""
         del sample_rate_hz
-        rising, falling, direct = self.rising.array(), self.falling.array(), self.direct
-        thresholds, weights = np.array(self.thresholds), np.array(self.weights)
-
-        def run(v: F64, memory: F64, out: F64) -> None:
-            envelope_forward(v, rising, falling, direct, thresholds, weights, memory, out)
-
-        return Operator(run, self.operators, output_offset=self.output_offset_um)
+        plays = self.direct, np.array(self.thresholds), np.array(self.weights)
+        parameters = (self.rising.array(), self.falling.array(), *plays)
+        return Operator.bound(
+            envelope_forward, parameters, self.operators, output_offset=self.output_offset_um
+        )
 
     def inverse(self, sample_rate_hz: float) -> Operator:
         """Return the operator from um to command, at rest: inverse plays, inverse envelopes."""
         del sample_rate_hz
-        rising, falling = self.rising.array(), self.falling.array()
-        low, high = self.command_span
         direct, weights, thresholds = inverse_plays(
             self.direct, np.array(self.weights), np.array(self.thresholds)
         )
-
-        def run(y: F64, memory: F64, out: F64) -> None:
-            envelope_inverse(
-                y, rising, falling, low, high, direct, thresholds, weights, memory, out
-            )
-
-        return Operator(run, self.operators, input_offset=-self.output_offset_um)
+        envelopes = self.rising.array(), self.falling.array(), *self.command_span
+        parameters = (*envelopes, direct, thresholds, weights)
+        return Operator.bound(
+            envelope_inverse, parameters, self.operators, input_offset=-self.output_offset_um
+        )

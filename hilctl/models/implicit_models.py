@@ -14,7 +14,7 @@ from hilctl.kernels.implicit_models import (
     KRASNOSELSKII_POKROVSKII,
     PREISACH,
     implicit_forward,
-    implicit_inverse_stage,
+    implicit_inverse,
 )
 from hilctl.models.base import HysteresisModel, Operator, Thresholds, Weights, refuse
 
@@ -75,14 +75,12 @@ class ImplicitModel(BoundedInputModel):
     def inverse(self, sample_rate_hz: float) -> Operator:
         """Return the operator from um to command, at rest."""
         del sample_rate_hz
-        p = self.packed()
-        sizes = p.arrays[0].size, p.arrays[1].size
-        numbers = (p.kind, *self.command_span, TOLERANCE_UM, *sizes)
-        parameters = np.concatenate((numbers, *p.arrays))
-        offset = -self.output_offset_um
-        return Operator.staged(
-            implicit_inverse_stage, parameters, self.operators, input_offset=offset
-        )
+        p, span = self.packed(), self.command_span
+
+        def run(y: F64, memory: F64, out: F64) -> None:
+            implicit_inverse(p.kind, y, span, TOLERANCE_UM, p.arrays, memory, out)
+
+        return Operator(run, self.operators, input_offset=-self.output_offset_um)
 
 
 NOTHING = np.zeros(1)

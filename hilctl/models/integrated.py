@@ -12,7 +12,7 @@ from hilctl.base.types import F64
 from hilctl.kernels.hysteresis import (
     deadband_block,
     integrated_forward,
-    integrated_inverse_stage,
+    integrated_inverse,
     play_sum,
 )
 from hilctl.models.base import (
@@ -130,26 +130,20 @@ class IntegratedModel(RateDependentPlays):
 
     def forward(self, sample_rate_hz: float) -> Operator:
         """Return Omega, from command to um, at rest (6.5)."""
-        weights, thresholds = np.array(self.weights), np.array(self.thresholds)
-        rate_gain, direct = self.threshold_growth_s * sample_rate_hz, self.direct
-        deadband = self.deadband.arrays()
-
-        def run(v: F64, memory: F64, out: F64) -> None:
-            integrated_forward(v, rate_gain, direct, thresholds, weights, *deadband, memory, out)
-
-        return Operator(run, self.operators, output_offset=self.output_offset_um)
+        rate_gain = self.threshold_growth_s * sample_rate_hz
+        plays = (rate_gain, self.direct, np.array(self.thresholds), np.array(self.weights))
+        parameters = (*plays, *self.deadband.arrays())
+        return Operator.bound(
+            integrated_forward, parameters, self.operators, output_offset=self.output_offset_um
+        )
 
     def inverse(self, sample_rate_hz: float) -> Operator:
         """Return Omega^-1, from um to command, at rest (6.17)."""
         direct, weights, thresholds = self.inverse_parameters()
         rate_gain = self.inverse_rate_gain(sample_rate_hz)
-        slope, *sides = self.deadband.inverse().arrays()
-        sizes = sides[0].size, sides[2].size
-        numbers = (slope, rate_gain, direct, *sizes)
-        parameters = np.concatenate((numbers, *sides, thresholds, weights))
-        offset = -self.output_offset_um
-        return Operator.staged(
-            integrated_inverse_stage, parameters, self.operators, input_offset=offset
+        parameters = (*self.deadband.inverse().arrays(), rate_gain, direct, thresholds, weights)
+        return Operator.bound(
+            integrated_inverse, parameters, self.operators, input_offset=-self.output_offset_um
         )
 
 

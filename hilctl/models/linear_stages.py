@@ -1,7 +1,7 @@
 """Linear stages of a staged model (delay, smoothing, structure, creep), and chains of operators."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Annotated, Self
 
 import numpy as np
@@ -10,16 +10,16 @@ from hilctl.base.errors import ModelError
 from hilctl.base.strict import Field, StrictModel, model_validator
 from hilctl.base.types import C128, F64
 from hilctl.kernels.dynamics import (
-    between_stage,
-    creep_stage,
+    between_block,
+    creep_block,
     delay_block,
     exponential,
-    mode_stage,
+    mode_block,
     structure_block,
-    uncreep_stage,
-    unmode_stage,
+    uncreep_block,
+    unmode_block,
 )
-from hilctl.models.base import Operator, StageKernel, refuse, threshold_problems
+from hilctl.models.base import Operator, refuse, threshold_problems
 
 _WIDEST = 64
 
@@ -77,7 +77,7 @@ def delayed(samples: int) -> Operator:
 
 def between(part: float) -> Operator:
     """Return an operator that interpolates: ``part`` of the way from the previous sample."""
-    return Operator.staged(between_stage, np.array([part]), 0)
+    return Operator.bound(between_block, (part,), 0)
 
 
 def smoothing_weights(
@@ -141,11 +141,11 @@ class CreepModel(StrictModel):
 
     def forward(self, sample_rate_hz: float, rest_um: float = 0.0) -> Operator:
         """Return the operator that adds creep to displacements, which are ``rest_um`` at rest."""
-        return _CreepOperator(self, creep_stage, sample_rate_hz, rest_um)
+        return _CreepOperator(self, creep_block, sample_rate_hz, rest_um)
 
     def inverse(self, sample_rate_hz: float, rest_um: float = 0.0) -> Operator:
         """Return the exact inverse of :meth:`forward`."""
-        return _CreepOperator(self, uncreep_stage, sample_rate_hz, rest_um)
+        return _CreepOperator(self, uncreep_block, sample_rate_hz, rest_um)
 
     def over(self, seconds: float) -> tuple[F64, F64]:
         """Return the decay of each element over a time, and its gain from x: float64[m] each."""
@@ -158,21 +158,20 @@ class _CreepOperator(Operator):
 
     Args:
         creep: Its elements.
-        stage: Its kernel.
+        kernel: Its kernel.
         sample_rate_hz: Samples a second.
         rest_um: Displacement at rest.
     """
 
     def __init__(
-        self, creep: CreepModel, stage: StageKernel, sample_rate_hz: float, rest_um: float
+        self, creep: CreepModel, kernel: Callable[..., None], sample_rate_hz: float, rest_um: float
     ) -> None:
         parameters = np.concatenate(creep.over(1.0 / sample_rate_hz))
 
         def run(block: F64, memory: F64, out: F64) -> None:
-            stage(block, parameters, memory, out)
+            kernel(block, parameters, memory, out)
 
         super().__init__(run, len(creep.shares), input_offset=-rest_um, output_offset=rest_um)
-        self._staged = stage, parameters
         self._creep = creep
 
     def stand(self, seconds: float) -> None:
@@ -198,12 +197,7 @@ class FirstMode(StrictModel):
 
     def forward(self, sample_rate_hz: float) -> Operator:
         """Return the structure, exact for an x that changes linearly between samples."""
-        motion = self.motion(sample_rate_hz)
-
-        def run(x: F64, memory: F64, out: F64) -> None:
-            structure_block(x, motion, memory, out)
-
-        return Operator(run, 2)
+        return Operator.bound(structure_block, (self.motion(sample_rate_hz),), 2)
 
     @property
     def radian_s(self) -> float:
@@ -257,7 +251,7 @@ class FurtherMode(StrictModel):
         Raises:
             ModelError: A frequency is too low for the sample rate.
         """
-        return Operator.staged(mode_stage, self._parameters(sample_rate_hz), 2)
+        return Operator.bound(mode_block, (self._parameters(sample_rate_hz),), 2)
 
     def inverse(self, sample_rate_hz: float) -> Operator:
         """Return the exact inverse of :meth:`forward`.
@@ -272,7 +266,7 @@ class FurtherMode(StrictModel):
                 f"{self.antiresonance_hz:g} Hz has no inverse at {sample_rate_hz:g} samples per "
                 "second: use a higher rate, or remove the mode"
             )
-        return Operator.staged(unmode_stage, parameters, 2)
+        return Operator.bound(unmode_block, (parameters,), 2)
 
     def response(self, frequency_hz: F64) -> C128:
         """Return the frequency response: complex128[n]."""
@@ -281,7 +275,7 @@ class FurtherMode(StrictModel):
         return np.asarray(zeros / (1.0 + 2.0 * self.damping_ratio * down + down**2))
 
     def _parameters(self, sample_rate_hz: float) -> F64:
-        """Return float64[12], see :func:`~hilctl.kernels.dynamics.mode_stage`."""
+        """Return float64[12], see :func:`~hilctl.kernels.dynamics.mode_block`."""
         own = FirstMode(natural_hz=self.natural_hz, damping_ratio=self.damping_ratio)
         motion = own.motion(sample_rate_hz)
         ratio = self.natural_hz / self.antiresonance_hz

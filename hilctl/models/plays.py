@@ -7,7 +7,7 @@ import numpy as np
 from hilctl.base.errors import ModelError
 from hilctl.base.strict import Field, model_validator
 from hilctl.base.types import F64
-from hilctl.kernels.hysteresis import play_sum, play_sum_stage, stop_sum_stage
+from hilctl.kernels.hysteresis import play_sum, stop_sum
 from hilctl.models.base import (
     HysteresisModel,
     Operator,
@@ -94,21 +94,15 @@ class PlayModel(HysteresisModel):
 
     def forward(self, sample_rate_hz: float) -> Operator:
         """Return the operator from command to um, at rest."""
-        weights, thresholds = np.array(self.weights), np.array(self.thresholds)
-        rate_gain, direct = self.threshold_growth_s * sample_rate_hz, self.direct
-
-        def run(v: F64, memory: F64, out: F64) -> None:
-            play_sum(v, rate_gain, direct, thresholds, weights, memory, out)
-
-        return Operator(run, self.operators, output_offset=self.output_offset_um)
+        rate_gain = self.threshold_growth_s * sample_rate_hz
+        plays = (rate_gain, self.direct, np.array(self.thresholds), np.array(self.weights))
+        return Operator.bound(play_sum, plays, self.operators, output_offset=self.output_offset_um)
 
     def inverse(self, sample_rate_hz: float) -> Operator:
         """Return the operator from um to command, at rest."""
         direct, weights, thresholds = self.inverse_parameters()
-        rate_gain = self.inverse_rate_gain(sample_rate_hz)
-        parameters = np.concatenate(((rate_gain, direct), thresholds, weights))
-        offset = -self.output_offset_um
-        return Operator.staged(play_sum_stage, parameters, self.operators, input_offset=offset)
+        plays = (self.inverse_rate_gain(sample_rate_hz), direct, thresholds, weights)
+        return Operator.bound(play_sum, plays, self.operators, input_offset=-self.output_offset_um)
 
 
 class PpiModel(PlayModel):
@@ -168,6 +162,5 @@ class SpiModel(PlayModel):
         """Return the operator from um to command, at rest; independent of the rate."""
         del sample_rate_hz
         direct, weights, thresholds = self.stop_parameters()
-        parameters = np.concatenate(((direct,), thresholds, weights))
-        offset = -self.output_offset_um
-        return Operator.staged(stop_sum_stage, parameters, weights.size, input_offset=offset)
+        stops = (direct, thresholds, weights)
+        return Operator.bound(stop_sum, stops, weights.size, input_offset=-self.output_offset_um)

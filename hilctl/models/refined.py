@@ -1,6 +1,6 @@
 """A model with its identified residual, and the inverse of both."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cache
 from itertools import combinations
 from typing import Annotated, Any, Literal, Self, TypeAlias
@@ -156,23 +156,20 @@ class ResidualOperator(StrictModel):
 
     def forward(self, sample_rate_hz: float, rest_um: float = 0.0) -> Operator:
         """Return x + R[x] at rest, for displacements that are ``rest_um`` at rest."""
-        tables, window = self.tables(sample_rate_hz)
-
-        def run(x: F64, memory: F64, out: F64) -> None:
-            residual_forward(x, tables, memory, out)
-
-        numbers = self.operators + window + 2
-        return Operator(run, numbers, input_offset=-rest_um, output_offset=rest_um)
+        return self._operator(residual_forward, sample_rate_hz, rest_um)
 
     def inverse(self, sample_rate_hz: float, rest_um: float = 0.0) -> Operator:
         """Return the inverse of :meth:`forward`, at rest."""
+        return self._operator(residual_inverse, sample_rate_hz, rest_um)
+
+    def _operator(
+        self, kernel: Callable[..., None], sample_rate_hz: float, rest_um: float
+    ) -> Operator:
         tables, window = self.tables(sample_rate_hz)
-
-        def run(y: F64, memory: F64, out: F64) -> None:
-            residual_inverse(y, tables, memory, out)
-
         numbers = self.operators + window + 2
-        return Operator(run, numbers, input_offset=-rest_um, output_offset=rest_um)
+        return Operator.bound(
+            kernel, (tables,), numbers, input_offset=-rest_um, output_offset=rest_um
+        )
 
     def tables(self, sample_rate_hz: float) -> tuple[Tables, int]:
         """Return the tables of the kernels, and the window in samples."""

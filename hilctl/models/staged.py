@@ -16,11 +16,8 @@ that of further modes is exact.
 import math
 from typing import Annotated, Any, Literal, Self
 
-import numpy as np
-
 from hilctl.base.strict import Field, StrictModel, model_validator
-from hilctl.base.types import F64
-from hilctl.kernels.dynamics import lag_block, lead_stage, weigh_block
+from hilctl.kernels.dynamics import lag_block, lead_block, weigh_block
 from hilctl.models.base import HysteresisModel, Operator, Provenance, refuse
 from hilctl.models.effective_field import FieldModel
 from hilctl.models.generalised_duhem import GeneralisedDuhemModel
@@ -58,17 +55,13 @@ class FieldLag(StrictModel):
 
     def forward(self, sample_rate_hz: float) -> Operator:
         """Return the lag, exact for piecewise constant commands, with a delay of one sample."""
-        periods, growth = 1.0 / (sample_rate_hz * self.tau_s), self.growth_per_unit
-
-        def run(v: F64, memory: F64, out: F64) -> None:
-            lag_block(v, periods, growth, memory, out)
-
-        return Operator(run, 1)
+        periods = 1.0 / (sample_rate_hz * self.tau_s)
+        return Operator.bound(lag_block, (periods, self.growth_per_unit), 1)
 
     def inverse(self, sample_rate_hz: float) -> Operator:
         """Return the lead, exact within the speed of the lag, with a preview of one sample."""
         periods = 1.0 / (sample_rate_hz * self.tau_s)
-        lead = Operator.staged(lead_stage, np.array([periods, self.growth_per_unit]), 1)
+        lead = Operator.bound(lead_block, (periods, self.growth_per_unit), 1)
         lead.preview = 1
         return lead
 
@@ -192,7 +185,7 @@ class StagedModel(HysteresisModel):
         radian = radian_s * sample_rate_hz
         width = max(self.smoothing_s * sample_rate_hz, radian)
         weights, ahead = smoothing_weights(width, 2.0 * damping * radian, radian**2)
-        inverse = Operator.staged(weigh_block, weights, weights.size - 1)
+        inverse = Operator.bound(weigh_block, (weights,), weights.size - 1)
         inverse.preview = ahead
         return inverse
 

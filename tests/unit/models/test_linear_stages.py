@@ -9,7 +9,7 @@ import pytest
 from pydantic import ValidationError
 
 from hilctl.base.errors import ModelError
-from hilctl.kernels.dynamics import unmode_stage
+from hilctl.kernels.dynamics import unmode_block
 from hilctl.models.linear_stages import (
     Chain,
     CreepModel,
@@ -276,7 +276,7 @@ def test_what_is_known_of_the_inverse_s_decay_is_what_it_does(change):
     parameters = FurtherMode(**(MODE | change))._parameters(5000.0)
     memory, sizes = np.array([0.3, -0.7, 1.0]), []
     for _ in range(2):
-        unmode_stage(np.zeros(60), parameters, memory, np.empty(60))
+        unmode_block(np.zeros(60), parameters, memory, np.empty(60))
         sizes.append(float(np.abs(memory).max()))
     # Over a whole number of turns it would be exact.
     rate = (sizes[1] / sizes[0]) ** (1.0 / 60.0)
