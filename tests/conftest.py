@@ -16,7 +16,7 @@ from hypothesis import settings
 
 from hilctl.base.private_dirs import memory_folder
 from hilctl.base.yaml import io
-from hilctl.experiment import device as registry
+from hilctl.experiment import devices as registry
 from hilctl.kernels.jit import ensure_compiled
 from hilctl.run.processes import signal_guardian
 from hilctl.run.run_folder import runs

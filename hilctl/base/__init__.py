@@ -1,22 +1,20 @@
-"""What all rooms share; it knows none of them.
+"""Shared types, errors and file formats; imports no other room.
 
-types.py     array types, the unit of commands, and long arrays in chunks
-device.py    the contract of a device and of a clock
-errors.py    every exception that is raised on purpose
-strict.py    base of every pydantic model
-files.py     texts, each read once; files written whole or not at all
-private.py   folders that belong to one user alone, and locks on files
-samples.py   a sample's columns and flags, and blocks of samples
-events.py    what a run records beside its samples
-segments.py  which samples of a run are judged
-metrics.py   pure: folding onto one cycle, peak hysteresis, loop area, errors, sensor noise
-remedy.py    what the system says of files and ports, and what to do about it
-formatting.py  numbers with units, printable texts, and JSON
-text_table.py  columns of CSV and its relatives, mistakes with their line
-yaml/        plain YAML in, with the line of every value and all problems at once
+types.py       array types, the unit of commands, arrays in chunks
+device.py      the contracts of a device and of a clock
+errors.py      all exceptions raised on purpose
+strict.py      base of all pydantic models
+files.py       text files read once, atomic writes, OS errors in words
+private_dirs.py  folders of one user, file locks
+samples.py     columns and flags of samples, blocks of samples
+events.py      events of a run
+segments.py    segments of a run and their steady cycles
+formatting.py  numbers with units, printable texts, JSON
+csv_table.py   CSV tables
+yaml/          strict YAML with the line of every value
 
-A device outside of this repository needs ``Device``, ``DeviceInfo``, ``DeviceOptions``,
-``DeviceError`` and ``UnconfirmedError`` from here, and nothing else.
+A device in another package needs ``Device``, ``DeviceInfo``, ``DeviceOptions``, ``DeviceError`` and
+``UnconfirmedError`` only.
 """
 
 from importlib import import_module
@@ -31,7 +29,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Device", "DeviceError", "DeviceInfo", "DeviceOptions", "UnconfirmedError"]
 
-_STANDS_IN = {
+_MODULES = {
     "Device": "device",
     "DeviceInfo": "device",
     "DeviceOptions": "device",
@@ -41,7 +39,7 @@ _STANDS_IN = {
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name when it is asked for: a short command has no time for pydantic."""
-    if name not in _STANDS_IN:
+    """Import a public name on first use, so that short commands do not load pydantic."""
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"hilctl.base.{_STANDS_IN[name]}"), name)
+    return getattr(import_module(f"hilctl.base.{_MODULES[name]}"), name)

@@ -1,9 +1,9 @@
-"""Text tables: CSV and its relatives, columns by name or number, mistakes with file and line.
+"""Text tables such as CSV: columns by name or number, errors with file and line.
 
-Columns are separated by tabs, semicolons, commas or blanks: the first of these that the first row
-has. That row is a header where none of its cells is a number; else the names may stand in a comment
-above it, where ``numpy.savetxt`` puts them. Lines that are empty or begin with ``#`` or ``%`` are
-skipped. Numbers have a decimal point: ``1,5`` could be one number or two, so it is refused.
+Columns are separated by tabs, semicolons, commas or blanks: the first of these in the first row.
+That row is a header if none of its cells is a number; otherwise the names may be in a comment above
+it, as written by ``numpy.savetxt``. Empty lines and lines that begin with ``#`` or ``%`` are
+skipped. Numbers have a decimal point; ``1,5`` is ambiguous and rejected.
 """
 
 import csv
@@ -28,7 +28,7 @@ Column: TypeAlias = str | int
 """A column by its name, or by its number from 1."""
 
 MAX_TABLE_BYTES = 512 * 1024**2
-"""Largest table that is read; it takes a few times that in memory."""
+"""Largest table file; it takes a few times that in memory."""
 MAX_COLUMNS = 1000
 """Most columns of a table."""
 
@@ -44,7 +44,7 @@ class TableRows:
     Attributes:
         path: The file.
         values: float64[columns, rows], all finite.
-        lines: int64[rows], the line of the file that each row stands in.
+        lines: int64[rows], the line of each row in the file.
     """
 
     path: Path
@@ -52,11 +52,11 @@ class TableRows:
     lines: npt.NDArray[np.int64]
 
     def sample_rate_hz(self, time: int, tolerance: float) -> float:
-        """Return the rate of a time column in s, after a look for samples missing or doubled.
+        """Return the sample rate from a time column in s, which must be evenly spaced.
 
         Args:
             time: Index of the column in ``values``.
-            tolerance: Largest departure of a step from the median, as a part of it.
+            tolerance: Largest deviation of a step from the median, relative to it.
 
         Raises:
             DataError: Time does not rise, or not evenly; names the line.
@@ -69,7 +69,7 @@ class TableRows:
             raise DataError(f"{self.path}: {rule}, by {step:g} s as a rule here")
         span_s = float(time_s[-1] - time_s[0])
         wrong = np.abs(steps - step) > tolerance * step
-        if not wrong.any():  # steps that are each nearly right may add up to another rate
+        if not wrong.any():  # small errors of steps may add up
             mean = span_s / steps.size
             wrong = (np.abs(time_s - time_s[0] - mean * np.arange(time_s.size)) > _LATE * mean)[1:]
         if wrong.any():
@@ -82,24 +82,24 @@ class TableRows:
 
 
 class TextTable:
-    """A text table, of which columns and rows are read on request.
+    """A text table with its columns and rows read on request.
 
     Args:
         path: The file.
 
     Attributes:
-        names: Names of the columns; their numbers, from 1, where they have no names.
+        names: Names of the columns, or their numbers from 1.
 
     Raises:
-        InputError: The file can't be read, is too large, or is no UTF-8 text.
-        DataError: It holds no rows.
+        InputError: The file cannot be read, is too large, or is not UTF-8 text.
+        DataError: It has no rows.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        # Spreadsheets put a byte-order mark first: it would hide a name.
+        # Spreadsheets write a byte-order mark, which would become part of a name.
         self._text = read_text(path, MAX_TABLE_BYTES).removeprefix("\ufeff")
-        first, comments = "", deque[str](maxlen=MAX_COLUMNS)  # nobody's header stands further up
+        first, comments = "", deque[str](maxlen=MAX_COLUMNS)
         for _, line in self._lines():
             if line[0] not in _COMMENT:
                 first = line
@@ -125,16 +125,16 @@ class TextTable:
     def read(
         self, columns: Sequence[int], first_row: int = 1, last_row: int | None = None
     ) -> TableRows:
-        """Read some columns of some rows; what stands elsewhere may be anything.
+        """Read some columns of some rows; other cells may have any content.
 
         Args:
             columns: Their indices from 0.
             first_row: First row, counted from 1 without header and comments.
-            last_row: Last row; all where None.
+            last_row: Last row; None for all.
 
         Raises:
-            DataError: There are no such rows, a row is longer or shorter than the first, or a
-                value is not a finite number; names the line.
+            DataError: Rows are missing, a row is longer or shorter than the first, or a value is
+                not a finite number; names the line.
         """
         table, lines = self._whole(columns, first_row, last_row) or self._careful(
             columns, first_row, last_row
@@ -149,7 +149,7 @@ class TextTable:
     def _whole(
         self, columns: Sequence[int], first_row: int, last_row: int | None
     ) -> tuple[F64, "array[int]"] | None:
-        """Read a table of numbers only, three times as fast; None where it is none."""
+        """Read a purely numeric table, three times as fast; None for any other."""
         lines = array("q")
 
         def data() -> Iterator[str]:
@@ -174,7 +174,7 @@ class TextTable:
     def _careful(
         self, columns: Sequence[int], first_row: int, last_row: int | None
     ) -> tuple[F64, "array[int]"]:
-        """Read row by row, and say which one is wrong."""
+        """Read row by row, and name the invalid one."""
         values, lines, count = array("d"), array("q"), 0
         for count, (line, fields) in enumerate(self._rows(), start=1):
             if first_row <= count and (last_row is None or count <= last_row):
@@ -244,7 +244,7 @@ def column_index(path: Path, column: Column | None, names: Sequence[str]) -> int
         names: The names of all columns, in order.
 
     Raises:
-        DataError: There is no such column, or more than one.
+        DataError: The column does not exist or is ambiguous.
     """
     if column is None:
         if len(names) == 1:
@@ -263,16 +263,16 @@ def column_index(path: Path, column: Column | None, names: Sequence[str]) -> int
 
 
 def check_rows(path: Path, count: int, first_row: int, last_row: int | None) -> None:
-    """Refuse rows that are not there.
+    """Reject rows that do not exist.
 
     Args:
         path: The file, for the message.
-        count: How many rows it has.
-        first_row: First row asked for, counted from 1.
-        last_row: Last row asked for; the file's last where None.
+        count: Number of rows.
+        first_row: First row requested, counted from 1.
+        last_row: Last row requested; None for the last of the file.
 
     Raises:
-        DataError: One of them is not there, or the last comes before the first.
+        DataError: A row does not exist, or the last is before the first.
     """
     if not 1 <= first_row <= (count if last_row is None else last_row) <= count:
         last = "the last" if last_row is None else last_row
@@ -280,7 +280,7 @@ def check_rows(path: Path, count: int, first_row: int, last_row: int | None) -> 
 
 
 def _number(text: str) -> float:
-    if "_" in text:  # Python takes 1_000 for a number
+    if "_" in text:  # Python accepts 1_000
         raise ValueError(text)
     return float(text)
 

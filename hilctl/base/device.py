@@ -1,7 +1,7 @@
-"""What the loop needs from the world: a device to drive and a clock to keep time by.
+"""The contracts of a device and of a clock.
 
-Only contracts live here. Devices implement :class:`Device` in ``hilctl_drivers`` or in other
-people's packages; :mod:`hilctl.loop.pacer` and the tests supply clocks.
+Devices implement :class:`Device` in ``hilctl_drivers`` or in other packages;
+:mod:`hilctl.loop.pacer` and the tests implement clocks.
 """
 
 from collections.abc import Mapping
@@ -19,39 +19,39 @@ class DeviceOptions(StrictModel):
 
 @dataclass(frozen=True, slots=True)
 class DeviceInfo:
-    """What a device says of itself before anything moves.
+    """Properties of a device, known before anything moves.
 
     Attributes:
         name: Registry name, for example ``simulated_terfenol``.
-        description: One line for people.
+        description: One line of text.
         command_unit: Unit of the commands it takes.
         command_min: Lowest command it accepts, in ``command_unit``.
         command_max: Highest command it accepts, in ``command_unit``.
         sensor_min_um: Lowest displacement its sensor can report.
         sensor_max_um: Highest displacement its sensor can report.
         max_rate_hz: Highest sample rate it can keep.
-        rate_note: Why ``max_rate_hz`` is what it is, in words; empty where there is no more to say.
-        buffered: Whether it has a sample clock and a FIFO of its own. Then the sample index is
-            the truth and a late tick costs FIFO depth; otherwise the host's clock paces it.
-        fifo_depth: Samples its FIFO holds; 0 where it has none.
-        latency_blocks: Exchanges from the one that sends a block to the one that brings its
-            displacements. 0 where they are the same; more where blocks are played from a FIFO of
-            the device, which then keeps the pace: :meth:`Device.exchange` waits for its clock.
+        rate_note: Reason for ``max_rate_hz`` in words; may be empty.
+        buffered: Whether it has its own sample clock and FIFO. Then the sample index is the time
+            base and a late tick costs FIFO depth; otherwise the host's clock paces it.
+        fifo_depth: Capacity of its FIFO in samples; 0 without one.
+        latency_blocks: Exchanges from sending a block to receiving its displacements. 0 for the
+            same exchange; more for a device that plays blocks from a FIFO and sets the pace:
+            :meth:`Device.exchange` then waits for its clock.
         measures_command: Whether :meth:`Device.exchange` fills ``measured``.
-        holds: What it holds alone while it is open, each by a name that is the same for every
-            device that would hold it (``serial:/dev/ttyUSB0``, ``tcp:10.0.0.5:502``): one run at a
-            time may hold it. Empty where any number may run side by side.
-        simulated: Whether it drives no hardware and steps on sample count: it may run faster than
-            real time, and its recordings say so.
-        watchdog_command: Where the device's own watchdog puts the output when the host falls
-            silent, in ``command_unit``; None where it has none, or is not to use it.
-        watchdog_timeout_s: How long the host may be silent before it does; None without one.
-        arm_s: How long :meth:`WatchdogDevice.arm` takes on the wire, at most; 0 without one.
-        watchdog_reason: Why that is not the experiment's safe value; empty where it is.
-        safe_note: What is wrong with the safe value of this device, in words: a message with it
-            takes longer than 0.2 s, or the device cannot confirm it; empty if nothing is.
+        holds: Resources that it uses exclusively while open, with a name common to all devices
+            (``serial:/dev/ttyUSB0``, ``tcp:10.0.0.5:502``). Empty for a device without such a
+            resource.
+        simulated: Whether it drives no hardware and steps on sample count, so that it may run
+            faster than real time.
+        watchdog_command: Output set by the device's watchdog when the host is silent, in
+            ``command_unit``; None without a watchdog.
+        watchdog_timeout_s: Silence after which it does; None without a watchdog.
+        arm_s: Longest duration of :meth:`WatchdogDevice.arm` on the line; 0 without a watchdog.
+        watchdog_reason: Reason for a watchdog value other than the safe value; may be empty.
+        safe_note: Limitation of the safe value in words: its message takes longer than 0.2 s, or
+            the device cannot confirm it; may be empty.
         confirms: Whether an answer of the device is evidence of the command that it answers.
-        details: Anything worth keeping with a recording (serial numbers, physical parameters).
+        details: Facts for the recording (serial numbers, physical parameters).
     """
 
     name: str
@@ -79,18 +79,18 @@ class DeviceInfo:
 
 
 REQUIRED = ("info", "open", "exchange", "make_safe", "close")
-"""What a device must have of its own."""
+"""Required members of a device."""
 OPTIONAL = ("output",)
-"""Methods that it may lack; it then has those of :class:`Device`."""
+"""Optional methods with a default in :class:`Device`."""
 
 
 def complete(device: Any) -> "Device":
-    """Return a device with the optional methods that it lacks.
+    """Return a device with defaults for missing optional methods.
 
-    Its class need not have :class:`Device` as its base.
+    Its class need not derive from :class:`Device`.
 
     Raises:
-        InputError: It lacks what is required; all of it is named.
+        InputError: Required members are missing; all are named.
     """
     kind = type(device)
     missing = [
@@ -108,42 +108,42 @@ def complete(device: Any) -> "Device":
 
 
 class Device(Protocol):
-    """A DAC, its amplifier, the actuator and its sensor, seen as one thing.
+    """A DAC with its amplifier, the actuator and the sensor as one device.
 
-    A device refuses what it can't do with :class:`~hilctl.base.errors.DeviceError`; it never clips,
-    wraps or rounds a command into range.
+    A device rejects an impossible command with :class:`~hilctl.base.errors.DeviceError`; it never
+    clips, wraps or rounds it into range.
     """
 
     Options: ClassVar[type[DeviceOptions]]
 
     def __init__(self, options: Any) -> None:
-        """Take options, an instance of :attr:`Options`, and touch nothing outside."""
+        """Store options, an instance of :attr:`Options`, without any I/O."""
         ...
 
     @property
     def info(self) -> DeviceInfo:
-        """What the device is and what it accepts; constant and readable before :meth:`open`."""
+        """Properties of the device; constant and available before :meth:`open`."""
         ...
 
     def open(self, sample_rate_hz: float, block: int) -> None:
-        """Connect, check that the device is what it should be, and get ready to exchange.
+        """Connect, verify the device, and prepare the exchange.
 
         Must not move the output.
 
         Args:
-            sample_rate_hz: Samples a second.
+            sample_rate_hz: Samples per second.
             block: Samples in each exchange.
 
         Raises:
-            DeviceError: It can't be reached, or can't keep this rate or block.
+            DeviceError: It cannot be reached, or does not support this rate or block.
         """
         ...
 
     def output(self) -> float | None:
-        """Return what the open device puts out, before the first exchange.
+        """Return the output of the open device before the first exchange.
 
-        Optional. Read back where that can be had. The run begins with a ramp from there, so a guess
-        can do harm: None if the device can't know, as in the default.
+        Optional. The run begins with a ramp from there, so the value must be read back, not
+        guessed; None (the default) if the device cannot report it.
 
         Raises:
             DeviceError: It did not answer, or is not open.
@@ -155,10 +155,10 @@ class Device(Protocol):
     ) -> None:
         """Send one block of commands and read one block of displacements.
 
-        ``displacement_um[j]`` is sampled when ``command[j]`` is put out, so it can't yet show
-        that command's effect. Where ``info.latency_blocks`` is more than 0, displacements and
-        measured commands are those of the block sent that many exchanges before; the first ones,
-        which answer no block, are left alone.
+        ``displacement_um[j]`` is sampled when ``command[j]`` is output, so it does not show the
+        effect of that command. If ``info.latency_blocks`` is more than 0, displacements and
+        measured commands are those of the block sent that many exchanges before; the first
+        exchanges leave them unchanged.
 
         Args:
             first_sample: Index of the block's first sample since the start of the run. A jump
@@ -166,7 +166,7 @@ class Device(Protocol):
             command: float64[block], in ``info.command_unit``; not modified.
             displacement_um: float64[block], filled by the call.
             measured: float64[block], the command as measured by the device, filled by the call
-                if ``info.measures_command``; left alone otherwise.
+                if ``info.measures_command``; unchanged otherwise.
 
         Raises:
             DeviceError: A command is out of range or not finite (then nothing was sent), the
@@ -175,38 +175,39 @@ class Device(Protocol):
         ...
 
     def make_safe(self, command: float) -> None:
-        """Put the output at ``command`` in one attempt, and return if the device confirms it.
+        """Set the output to ``command`` in one attempt, and return if the device confirms it.
 
-        Open a connection if there is none, write, have the device confirm, and let go. The attempt
-        is bounded by the device's time-outs: it repeats nothing, waits for no older command and
-        watches nothing. It sends no self-test and no init step, and takes any command in range:
-        the caller retries until the value is confirmed, repeats the write while an older,
-        unanswered command may still be executed, and ramps with successive values.
+        Connect if necessary, write, await the confirmation, and disconnect. The attempt is bounded
+        by the device's timeouts: it does not retry or wait for older commands, sends no self-test
+        or init step, and accepts any command in range. The caller retries until the value is
+        confirmed, repeats the write while an older, unanswered command may still be executed, and
+        ramps with successive values.
 
-        On a serial line the value is sent before anything is waited for. The answer to an older
-        command is never taken as the confirmation.
+        On a serial line the value is sent before any wait. The answer to an older command is never
+        taken as the confirmation.
 
         Raises:
-            UnconfirmedError: The command was sent, and nothing that the device can answer would be
-                evidence of it. Repeating the attempt cannot confirm it.
-            DeviceError: The device cannot be reached, refused, or did not confirm in time.
+            UnconfirmedError: The command was sent, but the device cannot confirm it, not even in
+                another attempt.
+            DeviceError: The device cannot be reached, rejected the command, or did not confirm in
+                time.
         """
         ...
 
     def close(self) -> None:
-        """Let go of the port and leave the output as it is. Closing twice is fine."""
+        """Release the port and leave the output unchanged. May be called twice."""
         ...
 
 
 @runtime_checkable
 class WatchdogDevice(Protocol):
-    """A device with a watchdog of its own; devices without one need no :meth:`arm`."""
+    """A device with a watchdog."""
 
     def arm(self) -> None:
         """Arm the device's watchdog, if the experiment wants it.
 
-        Called once after the start signal, immediately before the first exchange: armed at
-        :meth:`Device.open`, it would count while the run waits to start. Must not move the output.
+        Called once after the start signal, immediately before the first exchange, because the run
+        may wait to start after :meth:`Device.open`. Must not move the output.
 
         Raises:
             DeviceError: The device did not confirm, or is not open.
@@ -216,16 +217,17 @@ class WatchdogDevice(Protocol):
 
 @runtime_checkable
 class ReadableDevice(Protocol):
-    """A device that can be read without being set up; devices need not be."""
+    """A device that can be read without opening it."""
 
     def look(self) -> tuple[float, float | None]:
-        """Connect, return displacement and output as they are, and let go; nothing is changed.
+        """Connect, return displacement and output, and disconnect without changing anything.
 
         Returns:
-            Displacement in um, and the output in the command's unit; None where it can't be known.
+            Displacement in um, and the output in the command's unit or None if unknown.
 
         Raises:
-            DeviceError: Open; or it can't be reached, is another device, or gives no good answer.
+            DeviceError: The device is open, cannot be reached, is another device, or answers
+                wrongly.
         """
         ...
 
@@ -238,5 +240,5 @@ class Clock(Protocol):
         ...
 
     def sleep_until_ns(self, deadline_ns: int) -> None:
-        """Sleep until ``deadline_ns``; return at once where that is past."""
+        """Sleep until ``deadline_ns``; return immediately if that is past."""
         ...

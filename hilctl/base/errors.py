@@ -1,13 +1,13 @@
-"""Every exception that hilctl raises on purpose.
+"""All exceptions that hilctl raises on purpose.
 
 HilctlError
-|-- InputError            what the user gave can't be used; nothing has moved (exit code 2)
+|-- InputError            invalid input; nothing has moved (exit code 2)
 |   |-- ConfigError       an experiment or model file breaks rules
-|   |-- ModelError        model parameters that can't describe or invert an actuator
-|   `-- DataError         a recording or a data file can't be read or doesn't hold what is asked
-`-- RunError              something went wrong while current was flowing (exit code 3)
-    `-- DeviceError       the device refused, answered wrongly or went away
-        `-- UnconfirmedError  the command was sent; this device has no way to confirm it
+|   |-- ModelError        model parameters break a condition of the model or its inverse
+|   `-- DataError         a recording or data file is unreadable or lacks data
+`-- RunError              a fault during a run (exit code 3)
+    `-- DeviceError       the device rejected a request, failed to answer or disconnected
+        `-- UnconfirmedError  the command was sent, but the device cannot confirm it
 """
 
 from collections.abc import Iterable
@@ -15,13 +15,13 @@ from dataclasses import dataclass
 
 
 class HilctlError(Exception):
-    """Base of all errors raised on purpose; its text is meant for the user as it stands."""
+    """Base of all errors raised on purpose; the text is shown to the user."""
 
 
 class InputError(HilctlError):
-    """What the user gave can't be used.
+    """Invalid input.
 
-    Example scenarios: a file is missing, an output path can't be written, a command-line value is
+    Examples: a file is missing, an output path can't be written, a command-line value is
     out of range. Raised before anything moves.
     """
 
@@ -33,9 +33,9 @@ class ConfigProblem:
     Attributes:
         where: ``file:line`` of the value, or the option it was given with.
         key: Dotted key, for example ``limits.peak_current_a``; empty for the file as a whole.
-        rule: What must hold, in words.
-        value: The offending value as the user wrote it; empty where there is none.
-        hint: What to do about it; empty where the rule says it all.
+        rule: The rule in words.
+        value: The invalid value as written; may be empty.
+        hint: Suggested fix; may be empty.
     """
 
     where: str
@@ -58,7 +58,7 @@ class ConfigProblem:
 class ConfigError(InputError):
     """An experiment or model file breaks one or more rules; all of them are listed.
 
-    Example scenarios: unknown key, a text where a number belongs, a limit of the wrong sign, a
+    Examples: unknown key, a text where a number belongs, a limit of the wrong sign, a
     compensator with a reference in amperes, a reference outside the model's range.
     """
 
@@ -73,34 +73,34 @@ class ConfigError(InputError):
 class ModelError(InputError):
     """Model parameters break a condition of the model or of its inverse.
 
-    Example scenarios: a weight below zero, thresholds out of order, a cumulative deadband slope
+    Examples: a weight below zero, thresholds out of order, a cumulative deadband slope
     that is not positive. The text names the condition and the index.
     """
 
 
 class DataError(InputError):
-    """A recording or data file can't be read, or doesn't hold what is asked of it.
+    """A recording or data file is unreadable or lacks the requested data.
 
-    Example scenarios: not an MCAP file, no ``/samples`` topic, a CSV column missing, no steady
+    Examples: not an MCAP file, no ``/samples`` topic, a CSV column missing, no steady
     cycle in the data.
     """
 
 
 class RunError(HilctlError):
-    """A run had to end early; the output was ramped to its safe value where that was possible."""
+    """A run ended early; the output was ramped to the safe value if possible."""
 
 
 class DeviceError(RunError):
-    """A device refused a value, answered wrongly, or went away.
+    """A device rejected a value, answered wrongly, or disconnected.
 
-    Example scenarios: a command outside the device's range, a time-out, an unplugged cable. The
-    text names the device and what it was doing.
+    Examples: a command outside the device's range, a time-out, an unplugged cable. The
+    text names the device and the operation.
     """
 
 
 class UnconfirmedError(DeviceError):
-    """The command was sent; this device has no way to confirm it.
+    """The command was sent, but the device cannot confirm it.
 
-    Example scenarios: an output that is set by lines that are not answered and that cannot be read
-    back; a write whose correct reply equals the request, on a serial line that may be an echo.
+    Examples: an output set by unanswered lines that cannot be read back; a write whose
+    correct reply equals the request, on a serial line that may echo.
     """

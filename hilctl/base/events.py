@@ -1,4 +1,4 @@
-"""What a run records beside its samples."""
+"""Events of a run: their codes and values."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -6,54 +6,50 @@ from dataclasses import dataclass, field
 from hilctl.base.samples import Samples
 
 TUNED = "tuned"
-"""Code of the event of a change of the reference, at the first sample that it moves.
+"""Event code of a change of the reference, at its first sample.
 
-Its values are ``gain``, ``offset`` and ``samples``, the number of samples that the change takes.
+Values: ``gain``, ``offset`` and ``samples``, the duration of the change.
 """
 
 INVERSE = "inverse"
-"""Code of the event of the inverse being faded out or in, at the first sample that it moves.
+"""Event code of bypassing or enabling the inverse, at its first sample.
 
-Its values are ``share``, the part of the inverse in the command that it leads to, ``samples``, the
-number of samples that it takes, and the straight line in the place of the inverse: ``slope``, in
-the command's unit per um, and ``at_zero``, its command at a reference of 0 um.
+Values: ``share``, the final share of the inverse in the command; ``samples``, the duration of the
+crossfade; and the line that replaces the inverse: ``slope``, in the command's unit per um, and
+``at_zero``, its command at a reference of 0 um.
 """
 
 CHANGES = (TUNED, INVERSE)
-"""Codes of the changes of a running reference or inverse: what is judged lies behind them."""
+"""Codes of changes of a running reference or inverse; metrics use the samples after them."""
 
 MARK = "mark"
-"""Code of the event of a mark that somebody has set; its text is theirs."""
+"""Event code of a mark set by the user, with the user's text."""
 
 OFFSET = "offset"
-"""Code of the event of an offset between sensor and model that is taken out, at the waveform's
-first sample.
+"""Event code of a corrected offset between sensor and model, at the waveform's first sample.
 
-Its values are ``offset_um``, and the displacements at rest, ``resting_um`` and ``model_um``.
+Values: ``offset_um``, and the displacements at rest, ``resting_um`` and ``model_um``.
 """
 
 ADAPTED = "adapted"
-"""Code of the event of what adaptation has made of the model: once a second where it has moved, and
-at the end of the run.
+"""Event code of adapted parameters, once per second if they have changed, and at the end.
 
-Its values are what the actuator does beside its model: ``offset_um`` and ``gain`` on the whole, and
-the operator exactly, see ``loop/adaptation.py``.
+Values: ``offset_um``, ``gain``, and the weights of the operator, see ``loop/adaptation.py``.
 """
 
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Something that happened during a run.
+    """An event of a run.
 
     Attributes:
-        sample: Sample index it belongs to.
+        sample: Its sample index.
         level: ``info``, ``warning`` or ``error``.
         code: Short name for programs, for example ``run_ended``.
-        text: One line for people.
-        values: Its numbers by name, for programs.
-        time_ns: Unix time in ns; 0 in the loop, which does not know it: then it is recorded with
-            the time at which its sample was due.
-        before: The last samples up to it; None where they are not recorded with it.
+        text: One line of text.
+        values: Its numbers by name.
+        time_ns: Unix time in ns; 0 for the due time of its sample.
+        before: The last samples up to it, or None.
     """
 
     sample: int

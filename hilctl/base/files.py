@@ -1,5 +1,6 @@
-"""Files in and out: texts, each read once and carried to whoever needs it; files written whole."""
+"""Read text files once, write files atomically, and describe OS errors with a fix."""
 
+import difflib
 import errno
 import os
 import secrets
@@ -10,20 +11,18 @@ from types import TracebackType
 from typing import BinaryIO, Self
 
 from hilctl.base.errors import InputError
-from hilctl.base.os_errors import no_such_file, reason
 
 
 class TextFiles:
-    """Text files, each read from disk the first time it is asked for, and never again.
+    """Text files that are read from disk once.
 
-    What was checked is what runs: the loop's process gets the texts that the check has read, and
-    reads nothing from disk itself.
+    The loop process gets the texts that the check has read, so that a run uses what was checked.
 
     Attributes:
         texts: The text of each file read so far, by its absolute path.
 
     Args:
-        texts: Files that were read before; then no others may be asked for.
+        texts: Texts read before; other files are then rejected.
     """
 
     def __init__(self, texts: Mapping[str, str] | None = None) -> None:
@@ -34,7 +33,7 @@ class TextFiles:
         """Return a file's text.
 
         Raises:
-            InputError: It can't be read, is no UTF-8 text, or is not among the files given.
+            InputError: The file cannot be read, is not UTF-8 text, or was not read before.
         """
         key = os.path.abspath(path)  # noqa: PTH100  a link stays the link that was named
         if key not in self.texts:
@@ -45,7 +44,7 @@ class TextFiles:
 
 
 MAX_TEXT_BYTES = 16 * 1024**2
-"""Largest text that is read; a model of ten thousand parameters has a fiftieth of it."""
+"""Largest text file; a model of ten thousand parameters is fifty times smaller."""
 
 
 def read_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
@@ -53,10 +52,10 @@ def read_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
 
     Args:
         path: The file.
-        max_bytes: Its largest size; looked at before any of it is read.
+        max_bytes: Its largest size, checked before reading.
 
     Raises:
-        InputError: It can't be read, is too large, or is no UTF-8 text.
+        InputError: The file cannot be read, is too large, or is not UTF-8 text.
     """
     try:
         if path.exists() and not path.is_file():
@@ -64,9 +63,7 @@ def read_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
         size = path.stat().st_size
         if size > max_bytes:
             limit = f"{max_bytes / 1e6:.0f} MB"
-            raise InputError(
-                f"{path}: has {size / 1e6:.0f} MB, more than the {limit} that are read"
-            )
+            raise InputError(f"{path}: has {size / 1e6:.0f} MB, more than the limit of {limit}")
         return path.read_text(encoding="utf-8")
     except FileNotFoundError:
         raise InputError(no_such_file(path)) from None
@@ -78,40 +75,40 @@ def read_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
 
 
 def sync_folder(path: Path) -> None:
-    """Bring a folder to the disk: only then is the name of a new file there.
+    """Flush a folder to the disk, so that the name of a new file survives a power cut.
 
     Raises:
-        OSError: The disk refuses it.
+        OSError: The disk reports an error.
     """
     try:
         folder = os.open(path, os.O_RDONLY)
-    except PermissionError:  # Windows opens no folder
+    except PermissionError:  # Windows cannot open folders
         return
     try:
         os.fsync(folder)
     except OSError as error:
-        if error.errno not in {errno.EINVAL, errno.ENOTSUP}:  # a file system without it
+        if error.errno not in {errno.EINVAL, errno.ENOTSUP}:  # not supported by the file system
             raise
     finally:
         os.close(folder)
 
 
 class AtomicFile:
-    """A file that stands under its name whole or not at all; one not committed leaves nothing.
+    """A file that appears complete or not at all.
 
-    It is written beside its place, with the permissions of any new file.
+    It is written under a temporary name in the same folder, and discarded unless committed.
 
     Args:
-        path: Its place; where it may be replaced and is a link, the file that the link leads to.
+        path: The file; if it may be replaced and is a link, the target of the link.
         overwrite: Whether a file of that name may be replaced.
 
     Attributes:
         stream: The new file, open for writing.
-        final: Where it goes.
+        final: Its final path.
 
     Raises:
         FileExistsError: A file of that name exists and may not be replaced.
-        OSError: The folder can't be written, or what stands there is no regular file.
+        OSError: The folder cannot be written, or the path is not a regular file.
     """
 
     def __init__(self, path: Path, *, overwrite: bool) -> None:
@@ -125,19 +122,19 @@ class AtomicFile:
         self.stream: BinaryIO = self._beside.open("xb")
 
     def secure(self) -> None:
-        """Bring what was written to the disk, so that a committed file outlives a power cut."""
+        """Flush the content to the disk, so that a committed file survives a power cut."""
         self.stream.flush()
         os.fsync(self.stream.fileno())
 
     def commit(self) -> None:
-        """Bring the file to the disk and put it in its place, in one step for everybody else.
+        """Flush the file to the disk and move it to its place atomically.
 
         Raises:
-            FileExistsError: Somebody has made a file of that name, and it may not be replaced.
-            OSError: It can't be written to its end.
+            FileExistsError: A file of that name exists and may not be replaced.
+            OSError: The file cannot be written.
         """
         self.secure()
-        self.stream.close()  # Windows moves and links no open file
+        self.stream.close()  # Windows cannot move an open file
         if self._overwrite:
             self._beside.replace(self.final)
         else:
@@ -146,10 +143,10 @@ class AtomicFile:
 
     def _link(self) -> None:
         try:
-            self.final.hardlink_to(self._beside)  # refuses a name that is taken; a rename doesn't
+            self.final.hardlink_to(self._beside)  # fails if the name exists, unlike a rename
         except FileExistsError:
             raise
-        except OSError:  # no hard links here: claim the name, then fill it
+        except OSError:  # no hard links: create the name, then replace it
             self.final.touch(exist_ok=False)
             try:
                 self._beside.replace(self.final)
@@ -158,8 +155,8 @@ class AtomicFile:
                 raise
 
     def close(self) -> None:
-        """Close the file; where it was not committed, nothing of it is left."""
-        with suppress(OSError):  # what can't be written has been reported before
+        """Close the file; discard it unless committed."""
+        with suppress(OSError):  # write errors were reported before
             self.stream.close()
         self._beside.unlink(missing_ok=True)
 
@@ -180,10 +177,10 @@ RECORDING_MAGIC = b"\x89MCAP0\r\n"
 
 
 def begins_as_recording(path: Path) -> bool:
-    """Return whether a file begins as a recording does: an empty one might become one.
+    """Return whether a file begins like a recording; an empty one does.
 
     Raises:
-        OSError: It can't be read.
+        OSError: The file cannot be read.
     """
     with path.open("rb") as stream:
         head = stream.read(len(RECORDING_MAGIC))
@@ -194,7 +191,7 @@ def begins_as_recording(path: Path) -> bool:
 def _written(path: Path, *, overwrite: bool) -> Iterator[AtomicFile]:
     try:
         if overwrite and path.is_file() and path.stat().st_size and begins_as_recording(path):
-            raise InputError(f"{path}: is a recording, and nothing else replaces it: name another")
+            raise InputError(f"{path}: is a recording, which is never replaced: give another name")
         with AtomicFile(path, overwrite=overwrite) as file:
             yield file
     except FileExistsError:
@@ -207,14 +204,14 @@ def _written(path: Path, *, overwrite: bool) -> Iterator[AtomicFile]:
 
 
 def already_there(path: Path, remedy: str) -> InputError:
-    """Return the refusal of a file that would be replaced; no remedy helps against a folder."""
+    """Return the error for an existing file, with its fix unless it is a folder."""
     if path.is_dir():
         return InputError(f"{path}: is a folder: name a file in it")
     return InputError(f"{path}: exists already: {remedy}")
 
 
 def write_file(path: Path, write: Callable[[BinaryIO], object], *, overwrite: bool) -> None:
-    """Write a file that appears whole or not at all.
+    """Write a file atomically.
 
     Args:
         path: The file.
@@ -222,7 +219,7 @@ def write_file(path: Path, write: Callable[[BinaryIO], object], *, overwrite: bo
         overwrite: Replace a file of that name.
 
     Raises:
-        InputError: A file of that name exists, or it can't be written.
+        InputError: A file of that name exists, or it cannot be written.
     """
     with _written(path, overwrite=overwrite) as file:
         write(file.stream)
@@ -230,12 +227,12 @@ def write_file(path: Path, write: Callable[[BinaryIO], object], *, overwrite: bo
 
 
 def write_text(path: Path, text: str, *, overwrite: bool) -> None:
-    """Write a UTF-8 text file that appears whole or not at all, see :func:`write_file`."""
+    """Write a UTF-8 text file atomically, see :func:`write_file`."""
     write_file(path, lambda stream: stream.write(text.encode()), overwrite=overwrite)
 
 
 def check_writable(path: Path, *, overwrite: bool, inputs: Iterable[Path] = ()) -> None:
-    """Refuse a file that could not be written, before work is done that would be in vain.
+    """Reject a file that cannot be written, before the work for it starts.
 
     Args:
         path: The file.
@@ -243,20 +240,74 @@ def check_writable(path: Path, *, overwrite: bool, inputs: Iterable[Path] = ()) 
         inputs: Files that are read for it; they are never replaced.
 
     Raises:
-        InputError: It is one of them, or what :func:`write_file` would raise now.
+        InputError: It is one of them, or :func:`write_file` would fail now.
     """
     check_no_input(path, inputs)
     with _written(path, overwrite=overwrite):
-        pass  # not committed: nothing of it is left
+        pass  # not committed, so discarded
 
 
 def check_no_input(path: Path, inputs: Iterable[Path]) -> None:
-    """Refuse an output that is an input.
+    """Reject an output that is also an input.
 
     Raises:
-        InputError: It is one.
+        InputError: It is an input.
     """
     for each in inputs:
-        with suppress(OSError):  # one that is not there is not the other
+        with suppress(OSError):  # a missing file is not an input
             if path.samefile(each):
                 raise InputError(f"{path}: is read by the same command: give another name")
+
+
+REMEDIES = {
+    errno.EACCES: "use a place of your own, or ask its owner (ls -l)",
+    errno.EPERM: "use a place of your own, or ask its owner (ls -l)",
+    errno.EROFS: "use another file system",
+    errno.ENOSPC: "df -h lists free space",
+    errno.EDQUOT: "delete files, or use another file system",
+    errno.ENAMETOOLONG: "use a shorter name",
+    errno.ENOTDIR: "a part of that path is a file",
+    errno.EISDIR: "name a file in that folder",
+    errno.EMFILE: "close some, or raise the limit: ulimit -n",
+}
+ADDRESS_REMEDIES = {
+    errno.EACCES: "ports below 1024 need root: use a higher one",
+    errno.EADDRINUSE: "another program uses it (ss -ltnp): use another port",
+    errno.EADDRNOTAVAIL: "not an address of this machine: ip address lists them",
+}
+CONNECT_REMEDIES = {
+    errno.ECONNREFUSED: "is the device on, and is the port right?",
+    errno.EHOSTUNREACH: "is the device on and connected, and is the address right?",
+    errno.ENETUNREACH: "is this machine on that network? see ip route",
+    errno.ETIMEDOUT: "is the device on and connected, and is the address right?",
+}
+PORT_REMEDIES = {
+    errno.EACCES: "sudo usermod --append --groups dialout $USER, and log in again",
+    errno.EBUSY: "another program uses it: lsof lists it",
+    errno.ENOENT: "hilctl devices lists the ports of this machine",
+}
+"""Fixes for serial ports."""
+
+
+def reason(error: OSError, remedies: Mapping[int, str] = REMEDIES) -> str:
+    """Return the text of an OS error, with a fix if one is known.
+
+    Args:
+        error: The error.
+        remedies: Fixes by ``errno``.
+    """
+    text = error.strerror or str(error)
+    remedy = remedies.get(error.errno or 0, "")
+    return f"{text} ({remedy})" if remedy else text
+
+
+def no_such_file(path: Path) -> str:
+    """Return the message for a missing file, with the closest existing name."""
+    if not path.parent.is_dir():
+        return f"{path}: no such file (there is no folder {path.parent})"
+    try:
+        names = [] if path.exists() else [each.name for each in path.parent.iterdir()]
+    except OSError:
+        names = []
+    close = difflib.get_close_matches(path.name, names, n=1, cutoff=0.75)
+    return f"{path}: no such file" + (f" (did you mean '{close[0]}'?)" if close else "")

@@ -17,7 +17,7 @@ MISSING = "-"
 
 
 def unit_text(unit: str) -> str:
-    """Return a unit as people read it: ``um*A`` is µm·A."""
+    """Return a unit for display: ``um*A`` is µm·A."""
     if unit in _SHOWN:
         return _SHOWN[unit]
     for divider in "*/":
@@ -28,7 +28,7 @@ def unit_text(unit: str) -> str:
 
 
 def significant(value: float, digits: int = _DIGITS) -> str:
-    """Return a number with that many significant digits, zeros at the end included.
+    """Return a number with significant digits including trailing zeros.
 
     Numbers of 1e6 and more, and those below 1e-4, have an exponent.
     """
@@ -48,7 +48,7 @@ def quantity(value: float | None, unit: str = "", digits: int = _DIGITS) -> str:
 
     Args:
         value: The value, in ``unit``.
-        unit: Its unit; s, us and um go to the multiple that fits.
+        unit: Its unit; s, us and um are scaled to a suitable multiple.
         digits: Significant digits.
     """
     if value is None:
@@ -63,18 +63,15 @@ def quantity(value: float | None, unit: str = "", digits: int = _DIGITS) -> str:
 
 
 MOST_SHOWN = 100
-"""Characters of a name that are shown where there is room for one line."""
+"""Longest displayed name in characters."""
 
 
 def printable(text: str, *, lines: bool = False) -> str:
-    r"""Return a text without characters that steer a terminal, a browser or a plot.
-
-    Control characters, such as an escape, and those that turn the direction of writing round stand
-    as ``\x1b`` and ``\u202e``.
+    r"""Return a text with control characters and direction marks escaped (``\x1b``, ``\u202e``).
 
     Args:
         text: Any text.
-        lines: Leave ends of lines and tabs as they are.
+        lines: Keep line ends and tabs.
     """
     if text.isprintable():  # nearly always
         return text

@@ -1,9 +1,7 @@
-"""Folders that belong to one user alone: nobody else can write there, or lead elsewhere by a link.
+"""Folders of one user that are safe from links and writes of other users, and file locks.
 
-A shared folder such as /dev/shm is anybody's: whoever comes first may put a link, or a folder of
-their own, where somebody else's files are expected.
-
-Locks on open files end with the process that holds them, however that ends.
+In a shared folder such as /dev/shm another user may create a link or a folder under any name first.
+Locks on open files end with the process that holds them.
 """
 
 import errno
@@ -14,15 +12,15 @@ from typing import IO
 
 try:
     import fcntl
-except ImportError:  # Windows: runs need Linux, so there is nobody to be kept out
+except ImportError:  # Windows, where no runs take place
     fcntl = None  # type: ignore[assignment]
 
 
 def memory_folder() -> Path:
-    """Return a folder whose files live in memory, or the folder for temporary files.
+    """Return a folder in memory, or the folder for temporary files.
 
     Raises:
-        OSError: There is neither.
+        OSError: Neither exists.
     """
     shared = Path("/dev/shm")  # noqa: S108  the kernel's own shared-memory mount
     if shared.is_dir() and os.access(shared, os.W_OK):
@@ -33,13 +31,13 @@ def memory_folder() -> Path:
 
 
 def user_folders() -> list[Path]:
-    """Return where this user's folder in memory may stand, the best place first.
+    """Return candidates for this user's folder in memory, the best first.
 
-    The second one is for a user whose place somebody else has taken: nobody but the user can write
-    to what stands above it. It comes second because it is small, and gone without a log-in.
+    The second one is safe if another user occupies the first, because only the user can write to
+    its parent. It is second because it is small and disappears at log-out.
 
     Raises:
-        OSError: No folder for temporary files can be written.
+        OSError: No folder for temporary files is writable.
     """
     if not hasattr(os, "geteuid"):  # Windows: the folder for temporary files is one's own
         return [memory_folder() / "hilctl"]
@@ -48,15 +46,15 @@ def user_folders() -> list[Path]:
 
 
 def private_folder(path: Path, *, make: bool = True) -> Path:
-    """Return a folder after a look at whose it is.
+    """Return a folder after checking its owner and permissions.
 
     Args:
-        path: The folder; what stands above it is trusted.
-        make: Make it where it is not there.
+        path: The folder; its parent is trusted.
+        make: Create it if missing.
 
     Raises:
-        OSError: It can't be made, is a link or no folder, belongs to somebody else, or can be
-            written by others.
+        OSError: It cannot be created, is a link or no folder, belongs to another user, or is
+            writable by others.
     """
     if make:
         with suppress(FileExistsError):
@@ -65,7 +63,7 @@ def private_folder(path: Path, *, make: bool = True) -> Path:
         if not path.is_dir():
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path))
         return path
-    # Opened, then looked at: a look at the name might see another folder than the one used.
+    # Check the opened folder: the name may be redirected in between.
     descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
     try:
         found = os.fstat(descriptor)
@@ -77,18 +75,18 @@ def private_folder(path: Path, *, make: bool = True) -> Path:
 
 
 HAS_LOCKS = fcntl is not None
-"""Whether the system has such locks; one without them (Windows) replaces no open file."""
+"""Whether the system has such locks."""
 
 
 def take_lock(held: int | IO[bytes], *, shared: bool = False) -> None:
-    """Lock an open file or folder until it is closed; nothing where the system has no such locks.
+    """Lock an open file or folder until it is closed; does nothing without system support.
 
     Args:
-        held: It, or its descriptor.
-        shared: Whether others may hold it with us; only one that wants it alone is kept out.
+        held: The file or its descriptor.
+        shared: Take a shared lock instead of an exclusive one.
 
     Raises:
-        BlockingIOError: Somebody else holds it.
+        BlockingIOError: Another process holds the lock.
         OSError: The file system has no locks.
     """
     if fcntl is not None:
@@ -96,9 +94,9 @@ def take_lock(held: int | IO[bytes], *, shared: bool = False) -> None:
 
 
 def is_locked(held: int | IO[bytes]) -> bool:
-    """Return whether somebody else holds a file alone; where there are no locks, False."""
+    """Return whether another process holds an exclusive lock; False without system support."""
     try:
-        # Shared: two that look at once must not take each other for the holder.
+        # Shared, so that two simultaneous checks do not see each other.
         take_lock(held, shared=True)
     except BlockingIOError:
         return True

@@ -1,7 +1,6 @@
-"""What a sample is: its columns, its flags, and blocks of samples from the loop to the recorder.
+"""Columns and flags of samples, and blocks of samples from the loop to the recorder.
 
-The fields of :class:`Samples` are the one table of the columns: ring, messages, reader, export and
-units are made from it. A new column is one more field there, and whoever fills it.
+The fields of :class:`Samples` define the columns of ring, messages, reader and export.
 """
 
 from dataclasses import dataclass, field, fields, replace
@@ -14,25 +13,25 @@ import numpy.typing as npt
 from hilctl.base.types import F64, I64, U32, CommandUnit
 
 LAST_SAMPLE = 2**40
-"""No index reaches it: a hundred million samples, and a safe ramp of an hour at 1 MHz."""
+"""Above every sample index: a hundred million samples and a safe ramp of an hour at 1 MHz."""
 LONGEST_NS = 2**60
-"""No time of a tick is longer, from the start of its machine on."""
+"""Above every time of a tick since the start of the machine."""
 
 WhenRecorded: TypeAlias = Literal["always", "measured", "own_input"]
-"""``measured``: where the device measures its command; ``own_input``: where the compensator's input
-is other than the reference."""
+"""``measured``: if the device measures its command; ``own_input``: if the compensator's input
+differs from the reference."""
 
 
 @dataclass(frozen=True, slots=True)
 class RecordedField:
-    """The protobuf field of a column. Its numbers are for ever: none is used a second time.
+    """The protobuf field of a column. Its numbers are never reused.
 
     Attributes:
-        name: With its unit; in events ``before_`` stands before it.
+        name: Name with unit; in events with the prefix ``before_``.
         unit: Unit of its values.
         block: Its number in ``hilctl.SampleBlock``.
         before: Its number in ``hilctl.Event``, for the samples before the event.
-        scope: Its number in ``hilctl.Sample``; 0 where that leaves it out.
+        scope: Its number in ``hilctl.Sample``; 0 if it has no such field.
     """
 
     name: str
@@ -44,17 +43,17 @@ class RecordedField:
 
 @dataclass(frozen=True, slots=True)
 class SampleColumn:
-    """One float64 a sample.
+    """A column with one float64 per sample.
 
     Attributes:
-        meaning: One line for people.
-        recorded_as: Its field; where commands are in volt, ``recorded_in_v`` if there is one.
-        recorded_in_v: Its field where commands are in volt; None where its unit is not theirs.
-        when: When it is recorded.
-        otherwise: Column that it equals where it is not recorded; without one it is empty there.
-        answered: Whether the device answers with it.
-        in_waveform_unit: Whether the loop's blocks hold it in the waveform's unit. Where that is
-            not um, NaN is recorded.
+        meaning: One line of text.
+        recorded_as: Its field, for commands in volt unless ``recorded_in_v`` is set.
+        recorded_in_v: Its field for commands in volt; None if its unit does not depend on them.
+        when: Condition for recording it.
+        otherwise: Column that it equals if not recorded; otherwise it is empty.
+        answered: Whether the device returns it.
+        in_waveform_unit: Whether the loop uses the waveform's unit; NaN is recorded unless that is
+            um.
     """
 
     meaning: str
@@ -76,15 +75,14 @@ def _empty() -> F64:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Samples:
-    """Samples in order; each array has one row a sample.
+    """Samples in order; each array has one row per sample.
 
     Attributes:
         index: int64[n], sample index since the start of the run; a jump is a gap.
         flags: uint32[n], bits of :class:`Flag`.
 
-    The columns are float64[n] each, the commands among them in the command unit; one that is not
-    recorded and equals no other is empty, and so is a new one in older recordings. Their order is
-    that of the rows of a block.
+    The columns are float64[n] each, commands in the command unit. A column that is neither
+    recorded nor equal to another one is empty. Their order is that of the rows of a block.
     """
 
     index: I64
@@ -200,7 +198,7 @@ _ALL = slice(None)
 
 
 class BlockHeader(IntEnum):
-    """Numbers at the head of each block, int64 each."""
+    """Header of a block, int64 each."""
 
     SEQUENCE = 0
     FIRST_SAMPLE = 1
@@ -267,11 +265,11 @@ class Flag(IntFlag):
     """Bits of a sample's ``flags``; those from 64 on belong to the interlocks of the loop."""
 
     RANGE_LIMITED = 1
-    """The wanted command was outside the limits' range."""
+    """The requested command was outside the range of the limits."""
     SLEW_LIMITED = 2
-    """The wanted command asked for more slew than the limits allow."""
+    """The requested command exceeded the slew limit."""
     INVALID = 4
-    """The wanted command was not finite; the last command was held."""
+    """The requested command was not finite; the last command was kept."""
     RAMP = 8
     """A ramp to the safe value, before the waveform or after it, which has no reference."""
     SENSOR_INVALID = 16
@@ -281,10 +279,10 @@ class Flag(IntFlag):
     CONDITION = 1 << 17
     """Of the conditioning before the waveform, which has no reference: its cycle, and the rest."""
     AFTER_SKIPPED = 1 << 16
-    """In the first block after skipped ticks: the output had been held, and has to catch up."""
+    """In the first block after skipped ticks, in which the output was constant."""
     INVERSE_OUT = 1 << 18
-    """The command was, in part or whole, that of a straight line in the place of the inverse."""
+    """The inverse was bypassed, partly or completely, by a line."""
 
 
 NO_WAVEFORM = Flag.RAMP | Flag.CONDITION
-"""What is not of the waveform: there is no reference, and nothing to judge."""
+"""Samples outside the waveform, without a reference and metrics."""

@@ -1,23 +1,23 @@
-"""Which samples of a run are judged: steady cycles, start-up and end excluded."""
+"""Segments of a run: its waveforms and their steady cycles, which metrics are computed on."""
 
 from dataclasses import asdict, dataclass
 from typing import Any, Self
 
 SHORTEST_PERIOD = 1.0
-"""Samples in the shortest period of a waveform; fewer can't show it."""
+"""Shortest period of a waveform in samples."""
 
 
 @dataclass(frozen=True, slots=True)
 class Segment:
-    """A stretch of a run with one waveform.
+    """A part of a run with one waveform.
 
     Attributes:
-        label: What runs there, for people: ``sine 6 A 10 Hz``.
+        label: The waveform in words: ``sine 6 A 10 Hz``.
         start: Index of its first sample since the start of the run.
         stop: Index after its last sample.
         steady_start: First sample at full amplitude, soft start excluded.
         steady_stop: After the last sample at full amplitude, soft end excluded.
-        period: Samples in one period, not necessarily whole; 0.0 where it does not repeat.
+        period: Samples in one period, not necessarily whole; 0.0 if it is not periodic.
     """
 
     label: str
@@ -28,7 +28,7 @@ class Segment:
     period: float = 0.0
 
     def shifted(self, samples: int) -> "Segment":
-        """Return the same stretch that many samples later."""
+        """Return the segment shifted by a number of samples."""
         return Segment(
             self.label,
             self.start + samples,
@@ -39,11 +39,11 @@ class Segment:
         )
 
     def steady_cycles(self) -> tuple[int, int, int]:
-        """Return the stretch of whole cycles to judge, and how many cycles it has.
+        """Return the complete steady cycles for metrics.
 
-        It ends with the steady part. One cycle after the soft start is left out, because the
-        hysteresis forgets its start only after it has been to both ends; where that leaves none,
-        the last whole cycle is taken, and where there is none, the count is 0.
+        They end with the steady part. The first cycle after the soft start is excluded, because
+        hysteresis depends on its start until it has reached both ends; if none remains, the last
+        complete cycle is used, and without one the count is 0.
 
         Returns:
             First sample, sample after the last, number of whole cycles.
@@ -61,5 +61,5 @@ class Segment:
 
     @classmethod
     def from_mapping(cls, mapping: dict[str, Any]) -> Self:
-        """Undo :meth:`to_mapping`."""
+        """Return the segment from :meth:`to_mapping`."""
         return cls(**mapping)

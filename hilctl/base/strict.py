@@ -1,4 +1,4 @@
-"""Base of every pydantic model of the house, and the names of pydantic that models use."""
+"""Base of all pydantic models, and the pydantic names that models use."""
 
 from pydantic import (
     AfterValidator,
@@ -29,6 +29,6 @@ __all__ = [
 
 
 class StrictModel(BaseModel):
-    """A frozen model that takes no unknown key, no other type, no NaN, no infinity."""
+    """A frozen model that rejects unknown keys, other types, NaN and infinity."""
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)

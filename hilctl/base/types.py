@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 F64: TypeAlias = npt.NDArray[np.float64]
-"""A float64 array; the docstring beside it gives the shape and the unit."""
+"""A float64 array; docstrings give its shape and unit."""
 
 U32: TypeAlias = npt.NDArray[np.uint32]
 """A uint32 array, used for sample flags."""

@@ -26,7 +26,7 @@ import sys
 from typing import NoReturn
 
 from hilctl.base.errors import ConfigError, HilctlError, InputError, RunError
-from hilctl.base.os_errors import reason
+from hilctl.base.files import reason
 from hilctl.cli.output import (
     output_as_requested,
     print_json,

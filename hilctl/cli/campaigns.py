@@ -28,7 +28,7 @@ from hilctl.cli.options import (
     Settings,
 )
 from hilctl.cli.output import print_json
-from hilctl.experiment.run_labels import label_settings
+from hilctl.experiment.sections import label_settings
 from hilctl.ilc.ilc_session import correction_setting
 from hilctl.ilc.results import IlcResult, IlcRow
 from hilctl.run.control.client import finish_dead_runs

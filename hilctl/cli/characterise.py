@@ -21,7 +21,7 @@ from hilctl.cli.options import (
     Settings,
 )
 from hilctl.cli.output import print_json
-from hilctl.experiment.run_labels import label_settings
+from hilctl.experiment.sections import label_settings
 from hilctl.run.start import StepStoppedError
 from hilctl.studies.characterise.characterisation_runner import CharacterisationPlan
 from hilctl.studies.characterise.results import Characterisation, StepRow

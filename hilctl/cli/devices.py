@@ -13,7 +13,7 @@ from hilctl import api
 from hilctl.cli.console import listing, print_rich, progress_bar
 from hilctl.cli.options import AsJson, ExperimentFile, Settings
 from hilctl.cli.output import print_json
-from hilctl.experiment.inventory import DeviceDescription, Inventory, describe, inventory
+from hilctl.experiment.devices import DeviceDescription, Inventory, describe, inventory
 from hilctl.machine.diagnosis import DEFAULT_RATE_HZ, Diagnosis, diagnose, lateness_counts
 from hilctl.machine.rt_setup import Realtime
 from hilctl.machine.timer_latency import Latency

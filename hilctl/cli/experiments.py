@@ -16,9 +16,9 @@ from hilctl.cli.console import listing, print_rich
 from hilctl.cli.options import AsJson, Settings
 from hilctl.cli.output import print_json
 from hilctl.cli.run import run_progress
-from hilctl.experiment.device import known_devices
+from hilctl.experiment.devices import known_devices, shipped_profiles
 from hilctl.experiment.examples import copy_example, examples_folder, shipped_examples
-from hilctl.experiment.inventory import schema_text, shipped_profiles
+from hilctl.experiment.file import schema_text
 from hilctl.experiment.template import LIMITS_ASKED, starting_device
 from hilctl.run.control.client import finish_dead_runs
 from hilctl.run.run_folder import require_linux

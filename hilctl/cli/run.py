@@ -28,7 +28,7 @@ from hilctl.cli.console import compile_progress, console, listing, progress_bar,
 from hilctl.cli.options import AsJson, ExperimentFile, LabelTexts, Overwrite, Settings
 from hilctl.cli.output import print_json
 from hilctl.experiment.preflight import CheckedExperiment
-from hilctl.experiment.run_labels import label_settings
+from hilctl.experiment.sections import label_settings
 from hilctl.live.server_process import served_beside
 from hilctl.loop.safe_output import describe
 from hilctl.machine.checks import log_out

@@ -1,4 +1,4 @@
-"""Models identified on the same loops, judged on them, and tried before the same device."""
+"""Compare models: identify and evaluate them on the same loops, try them on the same device."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -33,8 +33,8 @@ FREQUENCIES_HZ = (10.0, 100.0, 200.0)
 POINTS = 300
 _FILES = (".yaml", ".yml")
 
-# The simpler ones get every weight by itself and a constant displacement, which Omega as published
-# has not: what they lack is not for want of freedom.
+# The simpler models get free weights and an offset, unlike the published Omega, so that their error
+# is not due to a lack of parameters.
 _FREE: Mapping[str, Any] = {"plays": 12, "weights": "free", "weight_by": "equal", "offset": True}
 _FEW: Mapping[str, Any] = {"plays": 12}
 
@@ -51,25 +51,23 @@ COMPARED: Mapping[FitKind, Mapping[str, Any]] = {
     "duhem": {},
     "straight": {},
 }
-"""Kinds that are compared where none are named, the one that the others are held against first, and
-the settings that make them comparable. Left out: what has the same loops as another (spi), and what
-is for rods without a bias (butterfly)."""
+"""Default kinds, the reference first, with comparable settings. Without spi, which has the loops of
+ppi, and butterfly, which is for rods without a bias."""
 
 
 @dataclass(frozen=True, slots=True)
 class ComparisonRequest:
-    """What to compare.
+    """Request of a comparison.
 
     Attributes:
-        recordings: Recordings that hold the loops.
-        models: Kinds of model, or model files; :data:`COMPARED` where empty.
-        experiment: Experiment that gives device, limits and waveform of the trials; where None,
-            device and limits are those of the first recording and the waveform is a sine over
-            nearly the whole stroke.
+        recordings: Recordings with the loops.
+        models: Kinds of model, or model files; empty for :data:`COMPARED`.
+        experiment: Experiment with device, limits and waveform of the trials; None for device and
+            limits of the first recording and a sine over nearly the complete stroke.
         settings: ``key=value`` texts over the experiment.
-        frequencies_hz: Frequencies of the trials; where None, 10, 100 and 200 Hz for a sine or a
-            triangle, otherwise the waveform as it is.
-        points: Points a loop.
+        frequencies_hz: Frequencies of the trials; None for 10, 100 and 200 Hz with a sine or a
+            triangle, and for the unchanged waveform otherwise.
+        points: Points per loop.
     """
 
     recordings: Sequence[Path]
@@ -85,14 +83,14 @@ class ComparedModel:
     """One model of the comparison.
 
     Attributes:
-        name: Name in the catalogue, or of the model file.
-        title: What it is, for people.
+        name: Name of the kind or of the model file.
+        title: Description.
         model: The model.
-        numbers: How many numbers were identified for it; None for a model file.
-        identify_s: Time that took; None for a model file.
-        error: How far it is from the loops.
-        inverse_ns: Time that one sample of its inverse takes.
-        trials: What came of its inverse before the device; none without a simulated device.
+        numbers: Number of identified parameters; None for a model file.
+        identify_s: Duration of the identification; None for a model file.
+        error: Its evaluation on the loops.
+        inverse_ns: Time per sample of its inverse.
+        trials: Trials of its inverse; none without a simulated device.
     """
 
     name: str
@@ -106,7 +104,7 @@ class ComparedModel:
 
     @property
     def compensated_percent(self) -> float | None:
-        """Largest compensated error of all trials, in percent of the stroke; None without any."""
+        """Largest compensated error of all trials, in percent of the stroke, or None."""
         errors = [trial.peak_error_percent for trial in self.trials]
         known = [error for error in errors if error is not None]
         return max(known) if known else None
@@ -114,13 +112,13 @@ class ComparedModel:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """All rows, and what they stand on.
+    """A comparison and its data.
 
     Attributes:
         sources: Names of the recordings.
-        device: Device of the trials; empty where there were none.
+        device: Device of the trials; empty without trials.
         loops: The measured loops.
-        rows: One for each model, in the order asked for.
+        rows: One row per model, in the requested order.
     """
 
     sources: tuple[str, ...]
@@ -129,7 +127,7 @@ class Comparison:
     rows: tuple[ComparedModel, ...]
 
     def to_mapping(self) -> dict[str, Any]:
-        """Return all of it as plain mappings, lists and numbers, for JSON."""
+        """Return plain mappings, lists and numbers for JSON."""
         return {
             "sources": list(self.sources),
             "device": self.device or None,
@@ -158,15 +156,15 @@ def _row_mapping(loops: Sequence[SteadyLoop], row: ComparedModel) -> dict[str, A
 def compare(
     request: ComparisonRequest, clock: Callable[[], float], progress: OnProgress
 ) -> Comparison:
-    """Identify each model on the loops, judge it on them, and try its inverse before the device.
+    """Identify each model on the loops, evaluate it, and try its inverse on the device.
 
     Args:
-        request: What to compare.
-        clock: Time in s, for what is measured.
-        progress: Called with how far it is and what is being done.
+        request: The request.
+        clock: Time in s.
+        progress: Called with the progress and the current step.
 
     Raises:
-        InputError: Something asked for can't be used.
+        InputError: A part of the request is not usable.
     """
     names = tuple(request.models) or tuple(COMPARED)
     for name in names:
@@ -191,7 +189,7 @@ def compare(
 def _loops(recordings: Sequence[Recording], points: int) -> FitData:
     units = {recording.command_unit for recording in recordings}
     if len(units) != 1:
-        raise InputError("recordings of devices driven in A and in V can't be compared on together")
+        raise InputError("recordings in A and in V cannot be combined")
     loops = [loop for recording in recordings for loop in loops_from_recording(recording, points)]
     return FitData(loops, units.pop())
 
@@ -205,7 +203,7 @@ def _row(
     clock: Callable[[], float],
     tell: OnProgress,
 ) -> ComparedModel:
-    tell(0.0, "identified")
+    tell(0.0, "identify")
     found: FittedModel | None = None
     begin = clock()
     if name.endswith(_FILES):
@@ -218,7 +216,7 @@ def _row(
         found = fit_model(FitRequest(data.records, settings, unit=data.unit, source=sources))
         model, title = found.model, known.title
     elapsed_s = clock() - begin
-    tell(0.4, "judged")
+    tell(0.4, "evaluate")
     fastest = max(data.loops, key=lambda loop: loop.frequency_hz)
     return ComparedModel(
         name=name if found else Path(name).name,
@@ -236,12 +234,12 @@ def _trials(
     device: TrialDevice, model: HysteresisModel, tell: OnProgress
 ) -> Iterator[InverseTrial]:
     for k, reference in enumerate(device.references):
-        tell(0.5 + 0.5 * k / len(device.references), f"tried, {reference.segments[0].label}")
+        tell(0.5 + 0.5 * k / len(device.references), f"try {reference.segments[0].label}")
         yield from device.run(model, reference)
 
 
 def _device(request: ComparisonRequest, recording: Recording, data: FitData) -> TrialDevice | None:
-    """Return where inverses are tried; None where the recording's own device is a real one."""
+    """Return the device of the trials; None if the recording has a real device."""
     frequencies = request.frequencies_hz
     if request.experiment is not None:
         loaded = load_experiment(request.experiment, request.settings)
@@ -257,10 +255,7 @@ def _device(request: ComparisonRequest, recording: Recording, data: FitData) -> 
 
 
 def _recorded(recording: Recording, settings: Sequence[str]) -> LoadedExperiment | None:
-    """Return device and limits that a recording was made with; None of a real device.
-
-    Its waveform and its compensator, whose file may be elsewhere, are of no use here.
-    """
+    """Return the experiment of a recording without its compensator; None for a real device."""
     if not recording.experiment_yaml or recording.run.get("simulated") == "false":
         return None
     document = Document(f"{recording.path} (experiment)", recording.experiment_yaml)
@@ -272,16 +267,16 @@ def _recorded(recording: Recording, settings: Sequence[str]) -> LoadedExperiment
 def check_free(
     names: Sequence[str], folder: Path, *, overwrite: bool, inputs: Sequence[Path] = ()
 ) -> None:
-    """Refuse a folder in which a file of one of these models stands already.
+    """Reject a folder that already contains a file of one of these models.
 
     Args:
         names: Names of the models.
         folder: The folder.
         overwrite: Whether their files may be replaced.
-        inputs: Files that are read; they are never replaced.
+        inputs: Input files, which are never replaced.
 
     Raises:
-        InputError: One does, and may not be replaced.
+        InputError: A file exists and may not be replaced.
     """
     paths = [folder / f"{name}.yaml" for name in names]
     for path in paths:
@@ -294,11 +289,11 @@ def check_free(
 def save_models(
     comparison: Comparison, folder: Path, *, created: str, overwrite: bool
 ) -> tuple[Path, ...]:
-    """Write each model that was identified here to ``folder/NAME.yaml``, ready to run.
+    """Write each identified model to ``folder/NAME.yaml``.
 
     Args:
-        comparison: The models; those that came from files are left out.
-        folder: Made where it is not there.
+        comparison: The models; those from files are skipped.
+        folder: The folder; created if missing.
         created: Date and time in ISO 8601, UTC, for the provenance.
         overwrite: Whether a file of that name may be replaced.
 
@@ -306,7 +301,7 @@ def save_models(
         The files.
 
     Raises:
-        InputError: One exists already, and nothing is written, or the folder can't be written to.
+        InputError: A file exists, and nothing is written; or the folder is not writable.
     """
     rows = [row for row in comparison.rows if row.identify_s is not None]
     check_free([row.name for row in rows], folder, overwrite=overwrite)
@@ -338,7 +333,7 @@ def _most_trials(comparison: Comparison) -> Sequence[InverseTrial]:
 
 
 def table_rows(comparison: Comparison) -> Iterator[list[str]]:
-    """Return the texts of each row, in the order asked for."""
+    """Return the texts of each row, in the requested order."""
     for row in comparison.rows:
         figures = [
             row.name,
@@ -358,21 +353,21 @@ def _trial_text(trial: InverseTrial) -> str:
 
 
 def notes(comparison: Comparison) -> list[str]:
-    """Return what the table's reader has to know."""
+    """Return the notes of the table."""
     found = [
-        "par.: numbers found; fit s: time that took; ns: time one sample of the inverse takes",
-        "peak, rms %: error of the model's displacement on all loops, of the largest peak-to-peak",
+        "par.: identified parameters; fit s: duration; ns: inverse per sample",
+        "peak, rms %: model error on all loops, in percent of the largest peak-to-peak",
     ]
     if not comparison.device:
-        return [*found, "compensated errors: none, the recording's device is not a simulated one"]
+        return [*found, "compensated errors: not available, because the device is not simulated"]
     found.append(
-        "Hz: largest error with the inverse before the device, in percent of the stroke; "
+        "Hz: largest compensated error at that frequency, in percent of the stroke; "
         f"{comparison.device}"
     )
     limited = any(trial.limited_samples for row in comparison.rows for trial in row.trials)
-    return [*found, "*: the limiter changed judged commands"] if limited else found
+    return [*found, "*: the limiter changed evaluated commands"] if limited else found
 
 
 def titles(rows: Sequence[ComparedModel]) -> list[tuple[str, str]]:
-    """Return each model's name and what it is."""
+    """Return the name and the description of each model."""
     return [(row.name, row.title) for row in rows]

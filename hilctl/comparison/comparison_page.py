@@ -1,7 +1,4 @@
-"""The comparison as one self-contained page: the table, and a figure.
-
-The figure has errors against frequency, and each model on the fastest loop.
-"""
+"""The comparison as a self-contained HTML page with a table and a figure."""
 
 import html
 from collections.abc import Sequence
@@ -27,10 +24,10 @@ _STYLES = ("-", "--", ":")
 
 
 def write_comparison(comparison: Comparison, path: Path) -> None:
-    """Write the page; one of that name is replaced.
+    """Write the page, replacing a file of that name.
 
     Raises:
-        InputError: It can't be written.
+        InputError: It cannot be written.
     """
     write_page(comparison_page(comparison), path)
 
@@ -38,19 +35,19 @@ def write_comparison(comparison: Comparison, path: Path) -> None:
 def comparison_page(comparison: Comparison) -> str:
     """Return the page as HTML."""
     body = [
-        "<h1>Models compared</h1>",
+        "<h1>Comparison of models</h1>",
         f'<p class="file">{html.escape(", ".join(comparison.sources))}</p>',
         grid(headings(comparison), table_rows(comparison), "numbers"),
         *(f"<p>{html.escape(note)}</p>" for note in notes(comparison)),
-        grid(("model", "what it is"), titles(comparison.rows)),
+        grid(("model", "description"), titles(comparison.rows)),
         wide_figure("Errors against frequency, and loops", comparison_figure(comparison)),
     ]
-    return document("Models compared", body)
+    return document("Comparison of models", body)
 
 
 @mpl.rc_context(STYLE)
 def comparison_figure(comparison: Comparison) -> Figure:
-    """Draw model and compensated errors over frequency, and measured and modelled loops below."""
+    """Plot model and compensated errors over frequency, and measured and modelled loops."""
     shown = len(comparison.rows)
     lines = -(-shown // _COLUMNS)
     figure = Figure(figsize=(11.0, 4.2 + 2.3 * lines))
@@ -92,7 +89,7 @@ def _draw_errors(figure: SubFigure, comparison: Comparison) -> None:
         axes.set(yscale="log", xlabel="frequency, Hz")
         axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     model.set(title="model", ylabel="peak error, % of peak-to-peak")
-    compensated.set_title("compensated" if comparison.device else "compensated: not tried")
+    compensated.set_title("compensated" if comparison.device else "compensated: no trials")
     figure.legend(loc="outside right upper")
 
 
@@ -110,7 +107,7 @@ def _trial_points(row: ComparedModel) -> list[tuple[float, float]]:
 
 
 def _largest(points: list[tuple[float, float]]) -> tuple[F64, F64]:
-    """Return each frequency once, and the largest error there: two float64[n]."""
+    """Return unique frequencies with their largest errors: two float64[n]."""
     worst: dict[float, float] = {}
     for exact_hz, error in points:
         frequency_hz = round(exact_hz, 3)

@@ -1,7 +1,6 @@
-"""Each inverse before a simulated device, in this process: what a run would come to, and how fast.
+"""Trials of inverses on a simulated device in this process, and their time per sample.
 
-A trial is a run that keeps no pace and records nothing, without interlocks and feedback. That is
-for devices whose time is the sample count: any other is refused.
+A trial is an unpaced run without recording, interlocks and feedback, so only for simulated devices.
 """
 
 import math
@@ -26,10 +25,10 @@ from hilctl.waveforms.build import Reference, build
 from hilctl.waveforms.spec import AnyWaveform, Sine, Triangle
 
 CYCLES = 4
-"""Cycles of each trial at full amplitude; the first is not judged."""
+"""Cycles of each trial at full amplitude; the first is not evaluated."""
 
 STROKE = 0.98
-"""Part of the measured stroke that a trial covers where no experiment says otherwise."""
+"""Default share of the measured stroke in a trial."""
 
 TIMED_SAMPLES = 20_000
 _ROUNDS = 5
@@ -39,15 +38,15 @@ _LIMITED = int(Flag.RANGE_LIMITED | Flag.SLEW_LIMITED | Flag.INVALID)
 
 @dataclass(frozen=True, slots=True)
 class InverseTrial:
-    """What came of one model's inverse before the device, on the average steady cycle.
+    """Metrics of a trial on the mean steady cycle.
 
     Attributes:
         label: The waveform.
-        frequency_hz: Of its cycle.
+        frequency_hz: Its frequency.
         peak_hysteresis_percent: See :class:`hilctl.analysis.run_metrics.RunMetrics`.
         peak_error_percent: The same.
         rms_error_percent: The same.
-        limited_samples: Judged samples whose command the limiter changed.
+        limited_samples: Evaluated samples whose command the limiter changed.
     """
 
     label: str
@@ -61,21 +60,19 @@ class InverseTrial:
 def waveforms_of(
     waveform: AnyWaveform, frequencies_hz: Sequence[float] | None
 ) -> list[AnyWaveform]:
-    """Return an experiment's waveform at each frequency, no longer than it takes.
+    """Return a waveform at each frequency, with the necessary duration.
 
     Args:
-        waveform: A sine or a triangle; anything else is run as it is.
-        frequencies_hz: Frequencies wanted; None for the waveform as it is.
+        waveform: A sine or a triangle, or any other without frequencies.
+        frequencies_hz: The frequencies; None for the unchanged waveform.
 
     Raises:
-        InputError: Frequencies are wanted of another waveform, or one is not > 0.
+        InputError: Another waveform with frequencies, or a frequency is not > 0.
     """
     if frequencies_hz is None:
         return [waveform]
     if not isinstance(waveform, Sine | Triangle):
-        raise InputError(
-            f"--frequencies must be left out for a waveform of the kind {waveform.kind}"
-        )
+        raise InputError(f"--frequencies is for sine and triangle only, not for {waveform.kind}")
     if not all(0.0 < f < float("inf") for f in frequencies_hz):
         raise InputError(f"--frequencies must be > 0: {list(frequencies_hz)}")
     soft_s = waveform.soft_start_s + waveform.soft_end_s
@@ -86,7 +83,7 @@ def waveforms_of(
 
 
 def full_stroke(loops: Sequence[SteadyLoop]) -> Sine:
-    """Return a sine in um that covers nearly the stroke of the widest loop."""
+    """Return a sine in um over nearly the stroke of the widest loop."""
     widest = max(loops, key=lambda loop: float(np.ptp(loop.displacement_um)))
     low, high = float(widest.displacement_um.min()), float(widest.displacement_um.max())
     return Sine(
@@ -102,15 +99,15 @@ def full_stroke(loops: Sequence[SteadyLoop]) -> Sine:
 
 
 class TrialDevice:
-    """A simulated device and the limits of its experiment, for one trial after another.
+    """A simulated device with the limits of its experiment, for trials.
 
     Args:
-        loaded: Gives device, limits, sample rate and block.
-        waveforms: What each model is tried on.
-        folder: Folder that file names in them are relative to.
+        loaded: Device, limits, sample rate and block.
+        waveforms: Waveforms of the trials.
+        folder: Base of relative file names.
 
     Raises:
-        InputError: The device is not simulated, or a waveform can't be built or doesn't repeat.
+        InputError: The device is not simulated, or a waveform is invalid or not periodic.
     """
 
     def __init__(
@@ -119,8 +116,7 @@ class TrialDevice:
         info = loaded.device.info
         if not info.simulated:
             raise InputError(
-                f"inverses are tried on simulated devices only, not on {info.name}: run each with "
-                "'hilctl run'"
+                f"trials need a simulated device, not {info.name}: use 'hilctl run' for each model"
             )
         self._loaded = loaded
         rate_hz = loaded.config.sample_rate_hz
@@ -128,31 +124,31 @@ class TrialDevice:
         for reference in self.references:
             if reference.unit != "um" or reference.segments[0].period <= 0.0:
                 label = reference.segments[0].label
-                raise InputError(f"a trial needs a waveform in um that repeats: {label}")
+                raise InputError(f"a trial needs a periodic waveform in um: {label}")
 
     @property
     def description(self) -> str:
-        """The device, for people."""
+        """Description of the device."""
         return self._loaded.device.info.description
 
     @property
     def sample_rate_hz(self) -> float:
-        """Samples a second."""
+        """Samples per second."""
         return self._loaded.config.sample_rate_hz
 
     def run(self, model: HysteresisModel, reference: Reference) -> list[InverseTrial]:
-        """Run one model's inverse before the device from rest, and judge each segment.
+        """Run the inverse of a model from rest, and evaluate each segment.
 
         Raises:
-            ModelError: The model can't be inverted.
-            DeviceError: The device refuses something.
+            ModelError: The model has no inverse.
+            DeviceError: The device rejects a command.
         """
         loaded = replace(self._loaded, model=model)
         begun = begin(model, self.sample_rate_hz, reference.values)
         values = (reference.values, begun.input_um[:], begun.state)
         plan = replace(
             assemble(loaded, *values, paced=False),
-            # A model that is far off is to be judged, and not to be stopped.
+            # Evaluate inaccurate models, too, instead of stopping them.
             interlocks=InterlockContext(stroke_um=(-math.inf, math.inf)),
             interlock_settings=InterlockSettings(),
             feedback=None,
@@ -168,7 +164,7 @@ def _judged(reference: Reference, displacement_um: F64, flags: U32) -> list[Inve
     for segment in reference.segments:
         start, stop, cycles = segment.steady_cycles()
         if cycles == 0:
-            raise InputError(f"{segment.label}: no steady cycle: give the waveform more time")
+            raise InputError(f"{segment.label}: no steady cycle: use a longer waveform")
         signals = (reference.values[start:stop], displacement_um[start:stop])
         cycle = cycle_metrics.fold(np.arange(start, stop) - segment.start, segment.period, signals)
         wanted, moved = cycle.signals
@@ -191,15 +187,15 @@ def _judged(reference: Reference, displacement_um: F64, flags: U32) -> list[Inve
 def inverse_ns(
     model: HysteresisModel, loop: SteadyLoop, sample_rate_hz: float, clock: Callable[[], float]
 ) -> float:
-    """Measure what one sample of a model's inverse takes, in ns.
+    """Measure the time per sample of a model's inverse, in ns.
 
-    The reference is a sine of the loop's stroke and frequency; the shortest of some rounds counts,
-    because whatever else the machine does only adds to it.
+    The reference is a sine with the loop's stroke and frequency; the shortest of several rounds is
+    free of other load.
 
     Args:
         model: Any model.
-        loop: Gives stroke and frequency.
-        sample_rate_hz: Samples a second.
+        loop: Loop with stroke and frequency.
+        sample_rate_hz: Samples per second.
         clock: Time in s.
     """
     low, high = float(loop.displacement_um.min()), float(loop.displacement_um.max())

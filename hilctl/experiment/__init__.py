@@ -1,18 +1,17 @@
-"""The experiment: its file, what the file refers to, and whether it may start. Moves nothing.
+"""The experiment file, everything it refers to, and its check before a run. Moves nothing.
 
-file.py           pydantic models of the file; parts.py  its parts
-labels.py         what a lab finds a run by
-load.py           from a file to the experiment with all that it refers to
-correction.py     what learning has added to the compensator's input
-initial_state.py  what the run before left in the actuator
-heat.py           the coil's heat, from run to run; history.py  what the last run left
-device_state.py   which run was the last one of a device, kept between runs
-check.py          the whole run worked out beforehand, held against device, model and limits
-model_range.py    whether the reference stays within what the model was identified on
-forecast.py       what a run will do, by all of its commands; whole_run.py  works those out
-interlocks.py     interlocks, feedback.py feedback and adaptation.py adaptation, by the file's keys
-device.py         the device that it names, from the table of devices
-inventory.py      devices on this machine, JSON schema of the file
-examples.py       what comes with hilctl, to copy
-starting.py       a first experiment for a device
+file.py           the experiment file as a model, and its JSON schema; sections.py  its sections
+load.py           an experiment with its device, model and correction
+devices.py        devices by name
+preflight.py      the check of an experiment: all rules and the complete commands
+device_rules.py   rules between an experiment and its device
+conditioning.py, feedback_checks.py, adaptation_bounds.py  rules and settings by section
+model_validity.py comparison of the reference with the motions the model was identified on
+forecast.py       the commands of a run in numbers
+initial_state.py  initial state of the compensator
+device_state.py   the last run of each device, between runs
+coil_heat.py      heat of the coil through runs and pauses
+correction.py     correction by iterative learning
+template.py       a first experiment for a device
+examples.py       shipped examples and copies of them
 """

@@ -1,4 +1,4 @@
-"""Adaptation from an experiment: its bounds, what it can't be without, and the worst it may do."""
+"""The ``adaptation`` section: its bounds, its rules, and the commands at its bounds."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -15,17 +15,17 @@ from hilctl.loop.adaptation import Adaptation, AdaptationBounds, DisplacementOpe
 from hilctl.loop.compensator import Compensator
 from hilctl.waveforms.build import Reference
 
-_OFFSET_SHARE = 0.1  # of the stroke's limits, where no bound is given
+_OFFSET_SHARE = 0.1  # of the stroke limits, by default
 _SLOWER = 5.0
-"""Time constant over the loop's delay times the number of parameters, which may all be moved by the
-same samples: with it the phase margin is above 60 degrees."""
+"""Least time constant in loop delays per parameter (all may adapt to the same samples), which keeps
+the phase margin above 60 degrees."""
 
 
 def adaptation_bounds(config: Experiment) -> AdaptationBounds:
-    """Return how far a run may adapt its model; all 0 where it does not.
+    """Return the bounds of the adapted parameters; all 0 without adaptation.
 
-    Feedback takes the offset out by itself; and while a correction of learning is used, gain and
-    weights rest: it has what they would change, and only for the model as it was.
+    Feedback already removes the offset. A learned correction already contains the effect of gain
+    and weights, and is valid for the unchanged model only.
     """
     wanted, compensator = config.adaptation, config.compensator
     if wanted is None or compensator is None:
@@ -41,7 +41,7 @@ def adaptation_bounds(config: Experiment) -> AdaptationBounds:
 
 
 def adapted_operator(config: Experiment, reference: Reference) -> DisplacementOperator | None:
-    """Return what a run adapts, for its reference; None where nothing is adapted."""
+    """Return the adapted operator for a reference; None without adaptation."""
     bounds = adaptation_bounds(config)
     if not bounds.array.any():
         return None
@@ -51,12 +51,12 @@ def adapted_operator(config: Experiment, reference: Reference) -> DisplacementOp
 def make_adaptation(
     config: Experiment, operator: DisplacementOperator | None, compensator: Compensator
 ) -> Adaptation | None:
-    """Return the adaptation of a run, or None where nothing is adapted.
+    """Return the adaptation of a run, or None.
 
     Args:
         config: The experiment.
-        operator: What it adapts, see :func:`adapted_operator`.
-        compensator: What stands behind it.
+        operator: See :func:`adapted_operator`.
+        compensator: The compensator behind it.
     """
     wanted = config.adaptation
     if wanted is None or operator is None:
@@ -71,59 +71,57 @@ def make_adaptation(
 
 
 def adaptation_problems(loaded: LoadedExperiment, preview: int) -> list[ConfigProblem]:
-    """Return why an experiment can't have the adaptation that it asks for.
+    """Return the broken rules of the ``adaptation`` section.
 
     Args:
         loaded: The experiment.
-        preview: Samples by which its compensator looks ahead.
+        preview: Preview of its compensator in samples.
     """
     config, wanted = loaded.config, loaded.config.adaptation
     if wanted is None:
         return []
-    found: list[tuple[str, str, str, str]] = []
+    found: list[ConfigProblem] = []
     if config.compensator is None:
-        found.append(("adaptation", "needs a compensator: it adapts the model of one", "", ""))
+        found.append(loaded.problem("adaptation", "needs a compensator, whose model it adapts"))
     if config.feedback is not None and wanted.offset_um:
-        hint = "leave it out: both would take out the same offset"
-        rule = "must be 0 with feedback"
-        found.append(("adaptation.offset_um", rule, f"{wanted.offset_um:g}", hint))
+        hint = "remove it: feedback corrects the same offset"
+        rule, value = "must be 0 with feedback", f"{wanted.offset_um:g}"
+        found.append(loaded.problem("adaptation.offset_um", rule, value, hint))
     rests = config.condition is not None or (
         config.compensator is not None and config.compensator.offset == "measured"
     )
     if wanted.noise_um is None and not rests:
-        rule = "is needed where there is no rest before the waveform that shows it"
-        hint = "give it, or a condition, or compensator.offset: measured"
-        found.append(("adaptation.noise_um", rule, "", hint))
+        rule = "is required without a rest before the waveform to measure it in"
+        hint = "set it, or a condition, or compensator.offset: measured"
+        found.append(loaded.problem("adaptation.noise_um", rule, hint=hint))
     shortest_s = _shortest_s(loaded, preview)
     if wanted.time_constant_s < shortest_s:
         rule = f"must be >= {shortest_s:.3g} s, by the delay of the loop"
-        hint = "a smaller block or a higher rate makes the delay shorter"
-        found.append(("adaptation.time_constant_s", rule, f"{wanted.time_constant_s:g}", hint))
-    return [
-        ConfigProblem(loaded.document.where(tuple(key.split("."))), key, rule, value, hint)
-        for key, rule, value, hint in found
-    ]
+        hint = "a smaller block or a higher rate shortens the delay"
+        value = f"{wanted.time_constant_s:g}"
+        found.append(loaded.problem("adaptation.time_constant_s", rule, value, hint))
+    return found
 
 
 def adaptation_warnings(config: Experiment, segments: tuple[Segment, ...]) -> tuple[str, ...]:
-    """Return what keeps the adaptation of a run from doing what it may be there for.
+    """Return reasons why the adaptation may have no effect or an unwanted one.
 
     Args:
         config: The experiment.
-        segments: Those of its reference.
+        segments: Segments of its reference.
     """
     wanted = config.adaptation
     if wanted is None:
         return ()
     if not adaptation_bounds(config).array.any():
-        return ("nothing is adapted: feedback has the offset, and a correction or bounds the rest",)
+        return ("adaptation has no effect: feedback, a correction or bounds of 0 exclude it",)
     longest_s = max((each.period for each in segments), default=0.0) / config.sample_rate_hz
     if longest_s <= wanted.time_constant_s:
         return ()
     periods = (
         f"{wanted.time_constant_s:g} s is less than a period of the waveform, {longest_s:.3g} s"
     )
-    return (f"adaptation.time_constant_s: {periods}: parameters will follow each of them",)
+    return (f"adaptation.time_constant_s: {periods}: parameters will follow each period",)
 
 
 def _shortest_s(loaded: LoadedExperiment, preview: int) -> float:
@@ -138,16 +136,16 @@ def _shortest_s(loaded: LoadedExperiment, preview: int) -> float:
 def worst_inputs(
     config: Experiment, operator: DisplacementOperator | None, input_um: F64
 ) -> Iterator["WorstInput"]:
-    """Give the compensator's input with the adaptation at its bounds, where they make it largest.
+    """Yield the compensator's input with the adaptation at its bounds, where it is largest.
 
     Args:
         config: The experiment.
-        operator: What it adapts; None where nothing is adapted.
+        operator: The adapted operator; None without adaptation.
         input_um: float64[n], the input without adaptation.
     """
     if operator is None:
         return
-    # As far as they go in a run: over its lead-in, and no faster.
+    # Parameters move no faster than the lead-in.
     led = min(config.lead_in_samples, input_um.size)
     for sign in (1.0, -1.0) if operator.bounds[0] else (1.0,):
         worst = operator.form(
@@ -157,13 +155,13 @@ def worst_inputs(
 
 
 class WorstInput:
-    """The compensator's input with adapted parameters, one part after the other.
+    """The compensator's input with adapted parameters, called part by part.
 
     Args:
-        operator: What is adapted.
+        operator: The adapted operator.
         input_um: float64[n], the input without adaptation.
-        worst: float64[m], o, g and w_i that they come to.
-        led: Samples on the way there, at most n.
+        worst: float64[m], final o, g and w_i.
+        led: Samples of the transition, at most n.
     """
 
     def __init__(self, operator: DisplacementOperator, input_um: F64, worst: F64, led: int) -> None:
@@ -171,7 +169,7 @@ class WorstInput:
         self._memory = operator.at_rest(float(input_um[0:1][0]))
 
     def __call__(self, start: int, stop: int) -> F64:
-        """Return its next part, float64[stop - start]."""
+        """Return the next part, float64[stop - start]."""
         out, worst = np.array(self._input_um[start:stop]), self._worst
         on_the_way = max(min(stop, self._led) - start, 0)
         if on_the_way:
@@ -184,6 +182,6 @@ class WorstInput:
 
 
 def at_worst(problem: ConfigProblem) -> ConfigProblem:
-    """Return a problem that only the bounds of the adaptation make."""
-    hint = f"{problem.hint}; or smaller bounds of adaptation"
+    """Return a problem marked as caused by the bounds of the adaptation."""
+    hint = f"{problem.hint}; or reduce the bounds of adaptation"
     return replace(problem, rule=f"with adaptation at its bounds, {problem.rule}", hint=hint)

@@ -1,7 +1,7 @@
-"""The heat of a coil, the running mean square of its current in A^2, from run to run.
+"""The heat of a coil, the running mean square of its current in A^2, through runs and pauses.
 
-It follows ``d(heat)/dt = (current^2 - heat) / tau``, as the thermal interlock counts it, so heat is
-linear in what there was before: a run needs to be worked out only once.
+It follows ``d(heat)/dt = (current^2 - heat) / tau``, as in the thermal interlock. It is linear in
+the initial heat, so a run is simulated only once.
 """
 
 import math
@@ -16,22 +16,22 @@ from hilctl.experiment.sections import Limits
 from hilctl.kernels.interlock import heat_block
 from hilctl.loop.interlocks import warming
 
-_ROOM = 0.9  # of the budget, for measured currents: late by a sample, they add to the commands
+_ROOM = 0.9  # of the budget, for measured currents: one sample late, in addition to the commands
 _LEAST_DIFFERENCE = 1e-3
 
 
 class CoilHeat:
-    """Follows the thermal budget of the coil through the commands of a run.
+    """Thermal budget of the coil over the commands of a run.
 
     Args:
-        limits: The budget; without a time constant nothing is followed.
-        sample_rate_hz: Samples a second.
+        limits: The budget; without a time constant nothing is computed.
+        sample_rate_hz: Samples per second.
         heat_a2: Running mean square of the current before them, in A^2.
 
     Attributes:
         heat_a2: Running mean square after the last of them, in A^2.
         highest_a2: Highest running mean square so far, in A^2.
-        used_s: Time of the commands after which the budget is overdrawn; None where it is kept.
+        used_s: Time of the commands after which the budget is exceeded; None if it never is.
     """
 
     def __init__(self, limits: Limits, sample_rate_hz: float, heat_a2: float) -> None:
@@ -44,7 +44,7 @@ class CoilHeat:
         self.used_s: float | None = None
 
     def add(self, command: F64) -> None:
-        """Go on with the next commands: float64[n], in A."""
+        """Add the next commands: float64[n], in A."""
         if self._tau_s is None:
             return
         heat = np.empty(command.size)
@@ -56,7 +56,7 @@ class CoilHeat:
         self._samples += command.size
 
     def follow(self, samples: Samples) -> None:
-        """Go on with samples as they were exchanged; those in between held the output."""
+        """Add exchanged samples; the output is constant over missing ones."""
         if self._tau_s is None or not samples.index.size:
             return
         current = np.abs(samples.command)
@@ -66,7 +66,7 @@ class CoilHeat:
         for part in np.split(np.arange(current.size), ends):
             first = int(samples.index[part[0]])
             if first == 0 and samples.flags[part[0]] & Flag.RAMP:
-                # The ramp begins where the output was found: the coil is as hot as that keeps it.
+                # The ramp begins at the initial output: assume its steady heat.
                 self.heat_a2 = max(self.heat_a2, float(current[0]) ** 2)
             held_s = (first - self._samples) / self._rate_hz
             self.heat_a2 = cooled(self.heat_a2, self._last, self._tau_s, held_s)
@@ -74,13 +74,13 @@ class CoilHeat:
             self.add(np.ascontiguousarray(current[part]))
             self._last = float(samples.command[part[-1]])
 
-    def pass_over(self, before_a2: float, samples: int, times: int) -> None:
-        """Take a cycle that was added for added that many times more, but for the highest in it.
+    def repeat(self, before_a2: float, samples: int, times: int) -> None:
+        """Add the last cycle ``times`` more times, ignoring its highest heat.
 
         Args:
-            before_a2: Heat before it, in A^2.
-            samples: How many it has.
-            times: How often.
+            before_a2: Heat before that cycle, in A^2.
+            samples: Its samples.
+            times: Number of repeats.
         """
         if self._tau_s is None:
             return
@@ -97,12 +97,12 @@ class CoilHeat:
 
 @dataclass(frozen=True, slots=True)
 class RunHeat:
-    """What the commands of a run do to the heat of the coil, whatever that is before them.
+    """Effect of a run on the heat of the coil, for any initial heat.
 
     Attributes:
-        seconds: Time that they take.
-        alone_a2: Heat after them of a coil without any before, in A^2.
-        hottest_a2: Hottest before them that keeps the budget, in A^2; infinite without a budget.
+        seconds: Duration of the run.
+        alone_a2: Final heat of an initially cold coil, in A^2.
+        hottest_a2: Highest initial heat within the budget, in A^2; infinite without a budget.
     """
 
     seconds: float = 0.0
@@ -110,7 +110,7 @@ class RunHeat:
     hottest_a2: float = math.inf
 
     def then(self, command: F64, limits: Limits, sample_rate_hz: float) -> "RunHeat":
-        """Return it with the next commands: float64[n], in A."""
+        """Return the effect including the next commands: float64[n], in A."""
         before = round(self.seconds * sample_rate_hz)
         seconds = (before + command.size) / sample_rate_hz
         tau_s = limits.thermal_time_constant_s
@@ -119,31 +119,29 @@ class RunHeat:
         alone = np.empty(command.size)
         last = heat_block(command, warming(tau_s, sample_rate_hz), self.alone_a2, alone)
         times_s = np.arange(before + 1, before + command.size + 1) / sample_rate_hz
-        # What is so long after the start that nothing is left of it limits nothing.
+        # The initial heat has decayed long after the start.
         left = np.maximum(np.exp(-times_s / tau_s), 1e-300)
         budget_a2 = _ROOM * (limits.rms_current_a or math.inf) ** 2
         hottest = float(np.min((budget_a2 - alone) / left))
         return RunHeat(seconds, last, min(self.hottest_a2, hottest))
 
-    def pass_over(
+    def repeated(
         self, alone_a2: float, samples: int, times: int, limits: Limits, sample_rate_hz: float
     ) -> "RunHeat":
-        """Return it with a cycle that it has already, that many times more, and one to come.
+        """Return the effect including ``times`` more repeats of the last cycle.
 
-        The hottest before them is decided by the first cycle or by the last, which is still to be
-        added: from one to the next, the room that is left grows or shrinks.
+        The highest initial heat is set by the first cycle or by the last one, which is still to be
+        added, because the margin changes monotonically from one cycle to the next.
 
         Args:
             alone_a2: :attr:`alone_a2` before that cycle.
-            samples: How many it has.
-            times: How often.
+            samples: Its samples.
+            times: Number of repeats.
             limits: The budget.
-            sample_rate_hz: Samples a second.
+            sample_rate_hz: Samples per second.
         """
-        seconds, tau_s = (
-            self.seconds + times * samples / sample_rate_hz,
-            limits.thermal_time_constant_s,
-        )
+        seconds = self.seconds + times * samples / sample_rate_hz
+        tau_s = limits.thermal_time_constant_s
         if tau_s is None:
             return RunHeat(seconds)
         last = _repeated(alone_a2, self.alone_a2, samples / sample_rate_hz, tau_s, times)
@@ -151,14 +149,12 @@ class RunHeat:
 
 
 class CoolingCoil:
-    """Follows the heat of a coil through runs and pauses.
-
-    Where the experiment has no thermal budget, nothing is ever waited for.
+    """Heat of a coil through runs and pauses; constant without a thermal budget.
 
     Args:
         config: The experiment.
         heat_a2: Heat at ``now_s``, in A^2; at least that of the safe value.
-        now_s: Time in s, by any clock.
+        now_s: Time in s, on any clock.
     """
 
     def __init__(self, config: Experiment, heat_a2: float, now_s: float) -> None:
@@ -172,19 +168,19 @@ class CoolingCoil:
         return cooled(self._heat_a2, self._rest, self._tau_s, now_s - self._at_s)
 
     def ran(self, run: RunHeat, ended_s: float) -> None:
-        """Take a run that has ended."""
+        """Add a run that has ended."""
         if self._tau_s is not None:
             before_a2 = self.heat_a2(ended_s - run.seconds)
             self._heat_a2 = run.alone_a2 + before_a2 * math.exp(-run.seconds / self._tau_s)
         self._at_s = max(self._at_s, ended_s)
 
     def pause_s(self, run: RunHeat, now_s: float, to_rms_a: float = math.inf) -> float:
-        """Return how long the coil must cool before a run.
+        """Return the time in s that the coil must cool before a run.
 
         Args:
-            run: What is to be run.
+            run: The run.
             now_s: Present time in s.
-            to_rms_a: Running rms that it must have cooled to in any case, in A.
+            to_rms_a: Required running rms in A.
         """
         hottest_a2, heat_a2 = min(run.hottest_a2, to_rms_a**2), self.heat_a2(now_s)
         over_a2 = heat_a2 - self._rest**2
@@ -195,8 +191,8 @@ class CoolingCoil:
 
 
 def _repeated(before_a2: float, after_a2: float, seconds: float, tau_s: float, times: int) -> float:
-    """Return the heat after a cycle that took it from one to another has come that often more."""
-    # A cycle maps the heat before it to kept * heat + a constant: the rest is a geometric row.
+    """Return the heat after ``times`` more repeats of a cycle with known heat before and after."""
+    # A cycle maps the heat before it to kept * heat + a constant: a geometric series.
     kept = math.exp(-seconds / tau_s)
     final_a2 = before_a2 + (after_a2 - before_a2) / (1.0 - kept)
     return final_a2 + (before_a2 - final_a2) * kept ** (times + 1)

@@ -1,8 +1,7 @@
-"""What an experiment asks for before its waveform: a decaying cycle, and a rest to measure at.
+"""Conditioning before the waveform: a decaying cycle, and a rest to measure the offset at.
 
-Hysteresis forgets what it went through once it has been further than ever before, and then back in
-ever smaller loops: so a run that begins with such a cycle does not depend on what came before it,
-and the compensator begins with what the cycle leaves.
+A cycle that starts large and decays erases the hysteresis memory, so the run does not depend on
+earlier ones; the compensator starts from the state after the cycle.
 """
 
 import math
@@ -17,10 +16,10 @@ from hilctl.experiment.sections import REST_S
 from hilctl.loop.lead_in import Conditioning
 
 OFFSET_SHARE = 0.25
-"""Largest offset that is taken out, as a share of the limits of the stroke."""
-_HIGHEST_HZ = 10.0  # slow enough for fields to go through the whole of a rod
-_FEWEST_SAMPLES = 20  # a cycle of fewer misses its own peaks
-_SLEW_SHARE = 0.5  # of the slew limit, for a cycle for which no frequency is given
+"""Largest measured offset that is corrected, as a share of the stroke limits."""
+_HIGHEST_HZ = 10.0  # slow enough for fields to penetrate a rod
+_FEWEST_SAMPLES = 20  # a shorter cycle misses its own peaks
+_SLEW_SHARE = 0.5  # of the slew limit, by default
 
 
 def measures_offset(config: Experiment) -> bool:
@@ -31,11 +30,11 @@ def measures_offset(config: Experiment) -> bool:
 def conditioning_of(
     loaded: LoadedExperiment, stands_um: float | None = None
 ) -> Conditioning | None:
-    """Return what comes before the waveform; None where nothing does.
+    """Return the conditioning before the waveform, or None.
 
     Args:
         loaded: The experiment.
-        stands_um: Displacement at its end by the model; None where no offset is measured.
+        stands_um: Model displacement at its end; None if no offset is measured.
     """
     config, condition = loaded.config, loaded.config.condition
     if condition is None and not measures_offset(config):
@@ -59,35 +58,31 @@ def conditioning_of(
 
 
 def condition_problems(loaded: LoadedExperiment) -> list[ConfigProblem]:
-    """Return why an experiment can't have the condition that it asks for."""
+    """Return the broken rules of the ``condition`` section."""
     config, condition = loaded.config, loaded.config.condition
     if condition is None:
         return []
-    found: list[tuple[str, str, str]] = []
+    found: list[ConfigProblem] = []
     unit = config.limits.unit
     key = f"condition.amplitude_{unit.lower()}"
     given = {"A": condition.amplitude_a, "V": condition.amplitude_v}
     if any(value is not None for other, value in given.items() if other != unit):
-        found.append(("condition", f"must have amplitude_{unit.lower()}: limits are in {unit}", ""))
+        rule = f"must have amplitude_{unit.lower()}: limits are in {unit}"
+        found.append(loaded.problem("condition", rule))
     furthest = max(_room(config))
     amplitude = given[unit]
     if amplitude is not None and amplitude > furthest:
-        rule = f"must be <= {furthest:g}, the way from safe.value to the limits, in {unit}"
-        found.append((key, rule, f"{amplitude:g}"))
+        rule = f"must be <= {furthest:g} {unit}, the distance from safe.value to the limits"
+        found.append(loaded.problem(key, rule, f"{amplitude:g}"))
     hz, highest_hz = _frequency_hz(config), _highest_hz(config)
     if hz > highest_hz:
-        rule = (
-            f"must be <= {highest_hz:.4g} Hz: {_FEWEST_SAMPLES} samples a cycle, and the slew limit"
-        )
-        found.append(("condition.frequency_hz", rule, f"{hz:g}"))
-    return [
-        ConfigProblem(loaded.document.where(tuple(key.split("."))), key, rule, value)
-        for key, rule, value in found
-    ]
+        rule = f"must be <= {highest_hz:.4g} Hz (slew limit, {_FEWEST_SAMPLES} samples per cycle)"
+        found.append(loaded.problem("condition.frequency_hz", rule, f"{hz:g}"))
+    return found
 
 
 def _room(config: Experiment) -> tuple[float, float]:
-    """Return how far a cycle goes below and above the safe value, in the command's unit."""
+    """Return the amplitudes below and above the safe value, in the command's unit."""
     condition, limits = config.condition, config.command_limits()
     assert condition is not None
     given = condition.amplitude_a or condition.amplitude_v or math.inf
@@ -106,17 +101,17 @@ def _frequency_hz(config: Experiment) -> float:
 
 
 def _cycle(config: Experiment) -> F64:
-    """Return the commands of the cycle, float64[n]; the first period has the whole amplitude."""
+    """Return the commands of the cycle, float64[n]; the first period has the full amplitude."""
     condition, safe = config.condition, config.safe.value
     assert condition is not None
     below, above = _room(config)
-    turns_a_sample = _frequency_hz(config) / config.sample_rate_hz
-    turn = turns_a_sample * np.arange(1, round(condition.cycles / turns_a_sample) + 1)
+    cycles_per_sample = _frequency_hz(config) / config.sample_rate_hz
+    turn = cycles_per_sample * np.arange(1, round(condition.cycles / cycles_per_sample) + 1)
     wave = np.sin(2.0 * np.pi * turn)
     falling, span, decay = np.maximum(turn - 1.0, 0.0), condition.cycles - 1.0, condition.decay
     if decay == 1.0:
         envelope = 1.0 - falling / span
-    else:  # shifted so that it ends at 0; plain differences of powers near 1 are steps
+    else:  # shifted to end at 0; expm1, because differences of powers near 1 lose digits
         log = math.log(decay)
         envelope = decay**falling * np.expm1((span - falling) * log) / math.expm1(span * log)
     command: F64 = safe + envelope * np.where(wave > 0.0, above, below) * wave

@@ -1,8 +1,8 @@
-"""What has been learned: a correction of the compensator's input, one period of each waveform.
+"""Correction of the compensator's input by iterative learning: one period of each waveform.
 
-A correction is added to the wanted displacement before the compensator. It is kept as Fourier
-coefficients, so that it fits any sampling of its period, and with the cycle it was learned for: it
-is refused for another waveform, sample rate or model.
+A correction is added to the reference. It is stored as Fourier coefficients, so that it fits any
+sampling of its period, together with the cycle it was learned for; it is rejected for another
+waveform, sample rate or model.
 """
 
 import hashlib
@@ -24,7 +24,7 @@ from hilctl.models.model_file import dump_model
 from hilctl.waveforms.build import Reference
 
 PHASES = 64
-"""Points of the wanted cycle that tell one waveform from another."""
+"""Points of a cycle that identify a waveform."""
 
 _GRID = 1 << 16  # the highest harmonic of 2048 loses 0.5 % of its amplitude between points
 _TOLERANCE = 1e-3
@@ -35,11 +35,11 @@ class LearnedCycle(StrictModel):
     """One period of a correction: ``sum cosine_k cos(k phi) + sine_k sin(k phi)``.
 
     Attributes:
-        label: The waveform, for people.
+        label: The waveform in words.
         period_samples: Its period; phase 0 is at the waveform's first sample.
-        reference_um: The wanted displacement at 64 even phases.
+        reference_um: The reference at 64 even phases.
         cosine_um: Coefficients of k = 0, 1, ...
-        sine_um: Coefficients of the same k; that of k = 0 has no meaning and is 0.
+        sine_um: Coefficients of the same k; 0 for k = 0.
         start_percent: Peak error before learning, in percent of the peak-to-peak displacement.
         error_percent: Peak error with this correction.
     """
@@ -56,14 +56,14 @@ class LearnedCycle(StrictModel):
     def _same_length(self) -> "LearnedCycle":
         if len(self.cosine_um) != len(self.sine_um):
             text = f"{len(self.sine_um)} for {len(self.cosine_um)}"
-            raise ValueError(f"sine_um must have one value a value of cosine_um: {text}")
+            raise ValueError(f"sine_um must have one value for each value of cosine_um: {text}")
         return self
 
     @classmethod
     def from_coefficients(
         cls, label: str, period: float, signature_um: F64, coefficients: C128, **figures: float
     ) -> "LearnedCycle":
-        """Make it from complex coefficients c_k, see :attr:`coefficients`."""
+        """Build a cycle from complex coefficients c_k, see :attr:`coefficients`."""
         last = int(np.flatnonzero(np.abs(coefficients) > 0.0).max(initial=0))
         kept = coefficients[: last + 1] * np.where(np.arange(last + 1) > 0, 2.0, 1.0)
         return cls(
@@ -93,13 +93,13 @@ class LearnedCycle(StrictModel):
 
 
 class Correction(StrictModel):
-    """Learned cycles, and what they were learned with.
+    """Learned cycles with their origin.
 
     Attributes:
-        sample_rate_hz: Samples a second.
-        model_sha256: Of the compensator's model.
-        cycles: One for each waveform.
-        provenance: Experiment, runs, delay found, versions; text to text.
+        sample_rate_hz: Samples per second.
+        model_sha256: Digest of the compensator's model.
+        cycles: One per waveform.
+        provenance: Experiment, runs, identified delay, versions.
     """
 
     sample_rate_hz: Annotated[float, Field(gt=0.0)]
@@ -108,20 +108,19 @@ class Correction(StrictModel):
     provenance: Mapping[str, str] = Field(default_factory=dict)
 
     def added(self, reference: Reference, model: HysteresisModel | None) -> F64:
-        """Return a run's reference with the correction of every sample: float64[n], in um.
+        """Return the reference of a run plus its correction: float64[n], in um.
 
-        That grows and shrinks with the waveform's soft start and end; where there is no soft start,
-        it grows over the first period.
+        The correction follows the waveform's soft start and end; without a soft start it grows
+        over the first period.
 
         Raises:
-            InputError: It was learned at another rate or with another model, or no part of the
-                reference is a waveform that it was learned for.
+            InputError: The correction belongs to another rate, model or waveform.
         """
         if model_sha256(model) != self.model_sha256:
             raise InputError("was learned with another model")
         if not _alike(reference.sample_rate_hz, self.sample_rate_hz):
             was, now = self.sample_rate_hz, reference.sample_rate_hz
-            raise InputError(f"was learned at {was:g} samples a second, not at {now:g}")
+            raise InputError(f"was learned at {was:g} samples per second, not at {now:g}")
         found = [
             (segment, cycle)
             for segment in reference.segments
@@ -160,11 +159,11 @@ def signature(values: F64, segment: Segment) -> F64 | None:
     """Return one steady period of a reference at 64 even phases, in its unit.
 
     Args:
-        values: float64[n], the whole run's reference.
-        segment: Which part of it.
+        values: float64[n], the reference of the run.
+        segment: A part of it.
 
     Returns:
-        float64[64]; None where there is no period, or no whole one at full amplitude.
+        float64[64]; None without a complete period at full amplitude.
     """
     if segment.period <= 0.0:
         return None
@@ -173,14 +172,14 @@ def signature(values: F64, segment: Segment) -> F64 | None:
     place = first + np.arange(PHASES) / PHASES * segment.period
     if place[-1] + 1.0 > segment.steady_stop:
         return None
-    # The samples around it alone: of a long run, they are few.
+    # Interpolate within the period only: the run may be long.
     low, high = int(place[0]), min(int(place[-1]) + 2, values.size)
     cycle: F64 = np.interp(place - low, np.arange(high - low), values[low:high])
     return cycle
 
 
 def fits(cycle: LearnedCycle, values: F64, segment: Segment) -> bool:
-    """Return whether a cycle was learned for a segment: same period, same wanted displacement."""
+    """Return whether a cycle was learned for a segment: same period, same reference."""
     wanted = signature(values, segment)
     if wanted is None or not _alike(cycle.period_samples, segment.period):
         return False
@@ -189,7 +188,7 @@ def fits(cycle: LearnedCycle, values: F64, segment: Segment) -> bool:
 
 
 def envelope(segment: Segment, index: I64) -> F64:
-    """Return how much of a correction is added at samples of a segment, from 0 to 1.
+    """Return the weight of a correction at samples of a segment, from 0 to 1.
 
     Args:
         segment: The segment.
@@ -209,7 +208,7 @@ def _alike(a: float, b: float) -> bool:
 
 
 def model_sha256(model: HysteresisModel | None) -> str:
-    """Return what tells a compensator's model from another; empty without one."""
+    """Return the digest of a compensator's model; empty without one."""
     return hashlib.sha256(dump_model(model).encode()).hexdigest() if model else ""
 
 
@@ -218,7 +217,7 @@ def load_correction(path: Path, files: TextFiles | None = None) -> Correction:
 
     Args:
         path: The file.
-        files: Where it is read from; the disk where None.
+        files: Source of the file; None for the disk.
 
     Raises:
         InputError: The file can't be read.
@@ -234,7 +233,7 @@ def dump_correction(correction: Correction) -> str:
 
 
 def write_correction(path: Path, correction: Correction, *, overwrite: bool) -> None:
-    """Write a correction file; it appears whole or not at all.
+    """Write a correction file atomically.
 
     Raises:
         InputError: It exists and may not be replaced, or can't be written.

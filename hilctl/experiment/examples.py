@@ -1,7 +1,4 @@
-"""What comes with hilctl to begin with, and copies of it to work on.
-
-Experiments, campaigns, models, layouts of other programs, and profiles of devices.
-"""
+"""Shipped examples and copies of them: experiments, campaigns, models, layouts, profiles."""
 
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -11,7 +8,7 @@ from typing import Any
 from hilctl.base.errors import InputError
 from hilctl.base.files import read_text, write_text
 from hilctl.base.yaml import did_you_mean, load_document
-from hilctl.experiment.inventory import shipped_profiles
+from hilctl.experiment.devices import shipped_profiles
 
 _PACKAGE = Path(__file__).parents[1]
 _SCHEMA = "schema.json"
@@ -21,12 +18,12 @@ _LAYOUTS = {".json": "Foxglove and Lichtblick", ".xml": "PlotJuggler"}
 
 @dataclass(frozen=True, slots=True)
 class Example:
-    """A file that comes with hilctl.
+    """A shipped file.
 
     Attributes:
-        name: By which it is asked for: where its copy stands, without the ending.
-        description: What it is for, as it says itself.
-        path: Where it stands.
+        name: Path of its copy without suffix.
+        description: Description in the file.
+        path: The file.
     """
 
     name: str
@@ -35,7 +32,7 @@ class Example:
 
     @property
     def copy(self) -> Path:
-        """Where its copy stands, in the folder of copies."""
+        """Path of its copy in the folder of copies."""
         return Path(self.name + self.path.suffix)
 
     def to_mapping(self) -> dict[str, Any]:
@@ -44,13 +41,13 @@ class Example:
 
 
 def examples_folder() -> Path:
-    """Return where they stand: in the installed package, or in ``configs`` of a checkout."""
+    """Return the folder of examples: in the installed package, or ``configs`` of a checkout."""
     installed = _PACKAGE / "examples"
     return installed if installed.is_dir() else _PACKAGE.parent / "configs"
 
 
 def shipped_examples(folder: Path) -> tuple[Example, ...]:
-    """Return a folder's examples, those of the folder itself first, and the shipped profiles."""
+    """Return the examples in a folder, subfolders last, and the shipped profiles."""
     paths = sorted(folder.rglob("*.yaml"), key=lambda path: (len(path.parts), path))
     found = {path.relative_to(folder): _description(load_document(path).data) for path in paths}
     found |= {
@@ -59,8 +56,7 @@ def shipped_examples(folder: Path) -> tuple[Example, ...]:
         for path in sorted((folder / "layouts").glob(f"*{ending}"))
     }
     found |= {
-        path.relative_to(folder): "a run as a service of systemd"
-        for path in folder.glob("*.service")
+        path.relative_to(folder): "systemd service of a run" for path in folder.glob("*.service")
     }
     examples = [
         Example(place.with_suffix("").as_posix(), description, folder / place)
@@ -80,18 +76,18 @@ def _description(data: dict[str, Any]) -> str:
 
 
 def copy_example(name: str, into: Path, folder: Path) -> tuple[Path, ...]:
-    """Copy an example, and the files that it names, to where they can be changed.
+    """Copy an example and the files that it names.
 
     Args:
         name: The example.
-        into: Folder for the copies; made where it is missing.
-        folder: Where the examples stand.
+        into: Folder for the copies; created if missing.
+        folder: Folder of the examples.
 
     Returns:
-        The copies, the example's own first. One that is there already and is the same stays.
+        The copies, that of the example first. Identical existing files are kept.
 
     Raises:
-        InputError: There is no such example, a copy can't be written, or another file has its name;
+        InputError: The example is unknown, a copy cannot be written, or a different file exists;
             then nothing is written.
     """
     known = {example.name: example for example in shipped_examples(folder)}
@@ -107,22 +103,22 @@ def copy_example(name: str, into: Path, folder: Path) -> tuple[Path, ...]:
     texts = {copy: read_text(path) for path, copy in places.items()}
     for copy, text in texts.items():
         if copy.exists() and read_text(copy) != text:
-            raise InputError(f"{copy}: is there already and differs: give another folder, --into")
+            raise InputError(f"{copy}: exists already and differs: use another folder, --into")
     for copy, text in texts.items():
         try:
             copy.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise InputError(f"{copy.parent}: can't be made: {error.strerror}") from None
+            raise InputError(f"{copy.parent}: cannot be created: {error.strerror}") from None
         if not copy.exists():
             write_text(copy, text, overwrite=False)
     return tuple(texts)
 
 
 def copy_schema(into: Path) -> Path:
-    """Put the schema that editors check experiments by beside one, unless one is there.
+    """Copy the JSON schema of experiments into a folder that has none.
 
     Raises:
-        InputError: It can't be written.
+        InputError: It cannot be written.
     """
     copy = into / _SCHEMA
     if not copy.exists():
@@ -131,7 +127,7 @@ def copy_schema(into: Path) -> Path:
 
 
 def _needed(path: Path, folder: Path) -> tuple[Path, ...]:
-    """Return an example's file, those that it names, and the schema that its first line names."""
+    """Return the file of an example, the files it names, and the schema."""
     found = {path: None}
     for named in _texts(load_document(path).data):
         other = path.parent / named

@@ -1,7 +1,7 @@
-"""Feedback from an experiment: its design, what it can't be without, and the controller.
+"""The ``feedback`` section: design of the controller, and its rules.
 
-With the compensator before it, the actuator is a gain of about 1 and a delay, so what limits the
-bandwidth is the delay, and with it the rate.
+Behind the compensator the actuator is a gain of about 1 with a delay, so the delay, and with it
+the sample rate, limits the bandwidth.
 """
 
 import cmath
@@ -17,18 +17,18 @@ from hilctl.loop.compensator import Compensator
 from hilctl.loop.feedback import Controller, Feedback, Gains, IntegralFeedback
 
 LOOP_DELAY = 2
-"""Samples from a correction to the first tick that sees its effect: one until the sensor can show
-it, and one until the displacement that came with that exchange is used."""
+"""Samples from a correction to the first tick that sees its effect: one until the sensor shows it,
+and one until the displacement from that exchange is used."""
 
 LEAST_GAIN_MARGIN = 2.0
 LEAST_PHASE_MARGIN_DEG = 60.0
 SLOW_SHARE = 0.2
-"""Bandwidth of an integrator of block means, as a share of 1 / (2 pi delay): it leaves a phase
-margin of 79 degrees and a gain margin of nearly 8, also to an actuator of several times the gain
-that the model says, as on small loops."""
+"""Bandwidth of an integrator of block means, as a share of 1 / (2 pi delay): phase margin 79
+degrees, gain margin nearly 8, enough for an actual gain several times that of the model, as on
+small loops."""
 UNKNOWN_RESONANCE_HZ = 5.0
-"""Highest bandwidth of such an integrator where no resonance is known: it leaves a gain margin of 2
-to any above 500 Hz with a damping of 1 %."""
+"""Highest bandwidth of such an integrator without a known resonance: gain margin 2 for any above
+500 Hz with a damping of 1 %."""
 _FREQUENCIES = 4096
 _HIGHEST_RATE_HZ = 1e6
 
@@ -36,11 +36,11 @@ _HIGHEST_RATE_HZ = 1e6
 def make_feedback(
     config: Experiment, compensator: Compensator, latency_blocks: int = 0
 ) -> Controller | None:
-    """Return the feedback of a run, or None where there is none.
+    """Return the feedback controller of a run, or None.
 
     Args:
         config: The experiment.
-        compensator: What it corrects the input of.
+        compensator: Compensator whose input it corrects.
         latency_blocks: Exchanges from a block's commands to its displacements.
     """
     wanted = config.feedback
@@ -57,11 +57,11 @@ def make_feedback(
 
 
 def delays(sensor_delay_s: float, rate_hz: float, preview: int) -> tuple[int, int]:
-    """Return the samples from a reference, and from the input, to the displacement that shows it.
+    """Return the samples from the reference, and from the input, to the resulting displacement.
 
     Args:
-        sensor_delay_s: What the sensor and its line add.
-        rate_hz: Samples a second.
+        sensor_delay_s: Delay of the sensor and its line.
+        rate_hz: Samples per second.
         preview: Samples by which the compensator's input runs ahead of its commands.
     """
     due_after = round(sensor_delay_s * rate_hz) + (0 if preview else 1)
@@ -69,73 +69,65 @@ def delays(sensor_delay_s: float, rate_hz: float, preview: int) -> tuple[int, in
 
 
 def feedback_problems(loaded: LoadedExperiment, preview: int) -> list[ConfigProblem]:
-    """Return why an experiment can't have the feedback that it asks for.
+    """Return the broken rules of the ``feedback`` section.
 
     Args:
         loaded: The experiment.
-        preview: Samples by which its compensator looks ahead: so long a correction takes to show.
+        preview: Preview of its compensator in samples, which delays the effect of a correction.
     """
     config, wanted = loaded.config, loaded.config.feedback
     if wanted is None:
         return []
-    found: list[tuple[str, str, str, str]] = []
+    found = []
     if config.compensator is None:
-        found.append(("feedback", "needs a compensator: it corrects what goes into one", "", ""))
+        found.append(loaded.problem("feedback", "needs a compensator, whose input it corrects"))
     if isinstance(wanted, IntegralFeedbackConfig):
-        found += _slow_problems(loaded, wanted, preview)
-    else:
-        found += _fast_problems(loaded, wanted, preview)
-    return [
-        ConfigProblem(loaded.document.where(tuple(key.split("."))), key, rule, value, hint)
-        for key, rule, value, hint in found
-    ]
+        return [*found, *_slow_problems(loaded, wanted, preview)]
+    return [*found, *_fast_problems(loaded, wanted, preview)]
 
 
 def _fast_problems(
     loaded: LoadedExperiment, wanted: PiFeedbackConfig, preview: int
-) -> list[tuple[str, str, str, str]]:
+) -> list[ConfigProblem]:
     config, info = loaded.config, loaded.device.info
     found = []
-    slow = "feedback.kind integral takes out what is slow on every device"
+    hint = "use feedback.kind integral for slow errors"
     if info.latency_blocks:
-        rule = f"needs a device that answers each sample at once: {info.name} plays from a FIFO"
-        found.append(("feedback", rule, "", slow))
+        rule = f"needs a device that answers each sample immediately: {info.name} has a FIFO"
+        found.append(loaded.problem("feedback", rule, hint=hint))
     if config.block > 1:
-        hint = f"a block's first displacement would be as old as the block; {slow}"
-        found.append(("block", "must be 1 with feedback", str(config.block), hint))
+        rule = "must be 1 with PI feedback"
+        found.append(loaded.problem("block", rule, str(config.block), hint))
     if found or config.compensator is None:
         return found
     delay_s = wanted.sensor_delay_s + max(0, preview - 1) / config.sample_rate_hz
-    found += _gain_problems(wanted, config.sample_rate_hz, delay_s)
+    found += _gain_problems(loaded, wanted, delay_s)
     return found + _resonance_problems(loaded, wanted)
 
 
 def _slow_problems(
     loaded: LoadedExperiment, wanted: IntegralFeedbackConfig, preview: int
-) -> list[tuple[str, str, str, str]]:
-    """Hold the bandwidth of an integrator against the loop's delay and the resonance."""
+) -> list[ConfigProblem]:
+    """Compare the bandwidth of an integrator with the loop's delay and the resonance."""
     config, info = loaded.config, loaded.device.info
     shown_s = wanted.sensor_delay_s + max(1, preview) / config.sample_rate_hz
     delay_s = (info.latency_blocks + 1) * config.tick_s + shown_s
     highest_hz = SLOW_SHARE / (2.0 * math.pi * delay_s)
-    rule = (
-        f"must be <= {highest_hz:.4g} Hz, {SLOW_SHARE:g} / (2 pi {delay_s:.3g} s), the delay of "
-        "the loop"
-    )
+    rule = f"must be <= {highest_hz:.4g} Hz by the delay of the loop, {delay_s:.3g} s"
     natural_hz, damping = _resonance(loaded, wanted)
-    hint = "a smaller block or a higher rate makes the delay shorter"
+    hint = "a smaller block or a higher rate shortens the delay"
     if natural_hz is not None and damping is not None:
         if damping * natural_hz < highest_hz:
             highest_hz = damping * natural_hz
-            rule = f"must be <= {highest_hz:.4g} Hz, damping times frequency of the resonance"
+            rule = f"must be <= {highest_hz:.4g} Hz, damping times natural frequency"
             hint = f"the gain at {natural_hz:g} Hz must be at most {1.0 / LEAST_GAIN_MARGIN:g}"
     elif highest_hz > UNKNOWN_RESONANCE_HZ:
         highest_hz = UNKNOWN_RESONANCE_HZ
-        rule = f"must be <= {highest_hz:g} Hz where no resonance is known"
-        hint = "give resonance_hz and damping_ratio of the actuator with its load"
+        rule = f"must be <= {highest_hz:g} Hz without a known resonance"
+        hint = "set resonance_hz and damping_ratio of the actuator with its load"
     if wanted.bandwidth_hz <= highest_hz:
         return []
-    return [("feedback.bandwidth_hz", rule, f"{wanted.bandwidth_hz:g}", hint)]
+    return [loaded.problem("feedback.bandwidth_hz", rule, f"{wanted.bandwidth_hz:g}", hint)]
 
 
 def _gains(wanted: PiFeedbackConfig, rate_hz: float) -> Gains:
@@ -145,16 +137,17 @@ def _gains(wanted: PiFeedbackConfig, rate_hz: float) -> Gains:
 
 
 def _gain_problems(
-    wanted: PiFeedbackConfig, rate_hz: float, delay_s: float
-) -> list[tuple[str, str, str, str]]:
-    """Hold the gains against the delay: phase margin of 60 degrees, gain margin of 2."""
+    loaded: LoadedExperiment, wanted: PiFeedbackConfig, delay_s: float
+) -> list[ConfigProblem]:
+    """Check phase and gain margin for a delay."""
+    rate_hz = loaded.config.sample_rate_hz
     if wanted.bandwidth_hz is not None:
         highest_hz = highest_bandwidth_hz(rate_hz, delay_s)
         if wanted.bandwidth_hz <= highest_hz:
             return []
         rule = f"must be <= {highest_hz:.4g} Hz at {rate_hz:g} Hz and a delay of {delay_s:.3g} s"
-        needed_hz = rate_needed_hz(wanted.bandwidth_hz, delay_s)
-        return [("feedback.bandwidth_hz", rule, f"{wanted.bandwidth_hz:g}", _needs(needed_hz))]
+        hint = _needs(rate_needed_hz(wanted.bandwidth_hz, delay_s))
+        return [loaded.problem("feedback.bandwidth_hz", rule, f"{wanted.bandwidth_hz:g}", hint)]
     gains = _gains(wanted, rate_hz)
     if _stable(gains, rate_hz, delay_s):
         return []
@@ -164,7 +157,8 @@ def _gain_problems(
         f"{LEAST_PHASE_MARGIN_DEG:g} degrees at {rate_hz:g} Hz and a delay of {delay_s:.3g} s"
     )
     value = f"kp {gains.kp:g}, ki_per_s {gains.ki_per_s:g}: {gain_margin:.3g}, {phase_margin:.3g}"
-    return [("feedback", rule, value, _needs(_rate_for(gains, rate_hz, delay_s)))]
+    hint = _needs(_rate_for(gains, rate_hz, delay_s))
+    return [loaded.problem("feedback", rule, value, hint)]
 
 
 def _stable(gains: Gains, rate_hz: float, delay_s: float) -> bool:
@@ -173,7 +167,7 @@ def _stable(gains: Gains, rate_hz: float, delay_s: float) -> bool:
 
 
 def _rate_for(gains: Gains, rate_hz: float, delay_s: float) -> float:
-    """Return a rate, to 5 %, at which the gains have their margins; infinite without one."""
+    """Return a rate, within 5 %, with sufficient margins; infinite if there is none."""
     while rate_hz < _HIGHEST_RATE_HZ:
         rate_hz *= 1.05
         if _stable(gains, rate_hz, delay_s):
@@ -183,18 +177,16 @@ def _rate_for(gains: Gains, rate_hz: float, delay_s: float) -> float:
 
 def _needs(rate_hz: float) -> str:
     if rate_hz <= _HIGHEST_RATE_HZ:
-        return f"this needs at least {rate_hz:.4g} samples a second"
+        return f"this needs at least {rate_hz:.4g} samples per second"
     return "no sample rate is enough for this"
 
 
-def _resonance_problems(
-    loaded: LoadedExperiment, wanted: PiFeedbackConfig
-) -> list[tuple[str, str, str, str]]:
-    """Hold the gain at the resonance, where a light one multiplies it by 1/(2 damping), to half."""
+def _resonance_problems(loaded: LoadedExperiment, wanted: PiFeedbackConfig) -> list[ConfigProblem]:
+    """Limit the gain at the resonance, which amplifies it by 1 / (2 damping), to one half."""
     natural_hz, damping = _resonance(loaded, wanted)
     if natural_hz is None or damping is None:
         rule = "needs resonance_hz and damping_ratio of the actuator with its load"
-        return [("feedback", rule, "", "the model does not tell them, and feedback excites it")]
+        return [loaded.problem("feedback", rule, hint="feedback excites it; the model has none")]
     rate_hz = loaded.config.sample_rate_hz
     gains = _gains(wanted, rate_hz)
     turn = 1.0 - cmath.exp(-2j * math.pi * min(natural_hz / rate_hz, 0.5))
@@ -204,13 +196,13 @@ def _resonance_problems(
     rule = f"must have a gain of at most {1.0 / LEAST_GAIN_MARGIN:g} at the resonance"
     where = f"{natural_hz:g} Hz, damping {damping:g}"
     hint = f"at most bandwidth_hz {damping * natural_hz:.3g}, or ki_per_s of 2 pi times that"
-    return [("feedback", rule, f"{size:.3g} at {where}", hint)]
+    return [loaded.problem("feedback", rule, f"{size:.3g} at {where}", hint)]
 
 
 def _resonance(
     loaded: LoadedExperiment, wanted: PiFeedbackConfig | IntegralFeedbackConfig
 ) -> tuple[float | None, float | None]:
-    """Return natural frequency in Hz and damping: the experiment's, else those of the model."""
+    """Return natural frequency in Hz and damping: of the experiment or the model."""
     structure = getattr(loaded.model, "structure", None)
     natural_hz = wanted.resonance_hz or getattr(structure, "natural_hz", None)
     return natural_hz, wanted.damping_ratio or getattr(structure, "damping_ratio", None)
@@ -219,28 +211,28 @@ def _resonance(
 def gains_for(bandwidth_hz: float, rate_hz: float) -> Gains:
     """Return the gains whose open loop crosses 1 at ``bandwidth_hz``, below half the rate.
 
-    An actuator that is a gain of 1 and a delay needs no proportional part: the integral alone
-    crosses 1 at ``ki / (2 pi)``, and falls from there on.
+    An actuator with a gain of 1 and a delay needs no proportional part: the integral alone crosses
+    1 at ``ki / (2 pi)``.
     """
     return Gains(0.0, 2.0 * rate_hz * math.sin(math.pi * bandwidth_hz / rate_hz))
 
 
 def highest_bandwidth_hz(rate_hz: float, extra_delay_s: float = 0.0) -> float:
-    """Return the largest bandwidth that leaves the least phase margin.
+    """Return the largest bandwidth with the required phase margin.
 
-    The integral is 90 degrees late less half a sample, the loop two samples: together 1.5 samples.
-    The margin of 60 degrees leaves 30 degrees for these and the extra delay.
+    The integral lags by 90 degrees minus half a sample, the loop by two samples. The margin of 60
+    degrees leaves 30 degrees for these 1.5 samples and the extra delay.
 
     Args:
-        rate_hz: Samples a second.
-        extra_delay_s: What link and sensor add.
+        rate_hz: Samples per second.
+        extra_delay_s: Delay of link and sensor.
     """
     share = (90.0 - LEAST_PHASE_MARGIN_DEG) / 360.0
     return share / ((LOOP_DELAY - 0.5) / rate_hz + extra_delay_s)
 
 
 def rate_needed_hz(bandwidth_hz: float, extra_delay_s: float = 0.0) -> float:
-    """Return the sample rate that a bandwidth needs; infinite where the extra delay forbids it."""
+    """Return the sample rate for a bandwidth; infinite if the extra delay is too long."""
     share = (90.0 - LEAST_PHASE_MARGIN_DEG) / 360.0
     left_s = share / bandwidth_hz - extra_delay_s
     return (LOOP_DELAY - 0.5) / left_s if left_s > 0.0 else math.inf
@@ -249,8 +241,8 @@ def rate_needed_hz(bandwidth_hz: float, extra_delay_s: float = 0.0) -> float:
 def margins(gains: Gains, rate_hz: float, extra_delay_s: float = 0.0) -> tuple[float, float]:
     """Return gain margin and phase margin, in degrees, on an actuator of gain 1.
 
-    The gain margin is 1 over the largest open-loop gain wherever the loop is later than 180
-    degrees; 0 degrees of phase margin stand for a loop gain that never falls below 1.
+    The gain margin is 1 over the largest open-loop gain with a lag of more than 180 degrees. The
+    phase margin is 0 if the loop gain never falls below 1.
     """
     angle = np.geomspace(1e-6, math.pi, _FREQUENCIES)
     controller = gains.kp + gains.ki_per_s / rate_hz / (1.0 - np.exp(-1j * angle))

@@ -1,13 +1,16 @@
-"""The experiment file: frozen, strict models of the YAML, and all of its problems at once."""
+"""The experiment file as a strict model, and its JSON schema."""
 
-from typing import Annotated, Any, Literal, TypeVar
+import json
+from typing import Annotated, Any, Literal
 
+from hilctl.base.device import DeviceOptions
 from hilctl.base.strict import BeforeValidator, Field, StrictModel
-from hilctl.experiment.run_labels import Labels
+from hilctl.experiment.devices import device_class, known_devices
 from hilctl.experiment.sections import (
     AdaptationConfig,
     Condition,
     FeedbackConfig,
+    Labels,
     Limits,
     Name,
     RecordingConfig,
@@ -16,8 +19,6 @@ from hilctl.experiment.sections import (
 from hilctl.loop.limiter import CommandLimits
 from hilctl.machine.rt_setup import Realtime
 from hilctl.waveforms.spec import AnyWaveform
-
-T = TypeVar("T")
 
 
 def _none_or_mapping(value: Any) -> Any:
@@ -30,14 +31,13 @@ def _none_or_mapping(value: Any) -> Any:
 
 
 class Safe(StrictModel):
-    """The safe value, and the safe ramp to it with which every run ends.
+    """The safe value, and the safe ramp to it that ends every run.
 
     Attributes:
         value: Command of the safe state, in the device's unit.
-        ramp_s: Time that the ramp takes from the largest command allowed.
-        at_start: Command at which the output stands before the run, in the device's unit, for a
-            device that can't tell: the run ramps from there to the safe value before its waveform.
-            Nothing is asked for where the device knows.
+        ramp_s: Duration of the ramp from the largest allowed command.
+        at_start: Output before the run in the device's unit, for a device that cannot report it:
+            the run ramps from there to the safe value before its waveform.
     """
 
     value: float = 0.0
@@ -46,20 +46,18 @@ class Safe(StrictModel):
 
 
 class CompensatorConfig(StrictModel):
-    """The model whose inverse stands before the actuator.
+    """The model whose inverse drives the actuator.
 
     Attributes:
         model: Model file, relative to the experiment file's folder.
-        correction: File that ``hilctl learn`` has written for this waveform, relative to the same
-            folder; None where nothing is added to the reference.
-        initial_state: What the compensator begins with, unless there is a condition: what the
-            ``last`` run of this device left in the actuator, by its newest recording in
-            ``recording.folder``; ``rest``; or a recording of the run before this one, relative to
-            the same folder as the model. The reference is reached from there within
-            ``safe.ramp_s``.
-        offset: ``identified`` takes the model's offset as it is; ``measured`` takes out what the
-            sensor shows beside the model while it rests before the waveform, for a sensor or an
-            actuator that has moved since.
+        correction: Correction file of ``hilctl learn`` for this waveform, relative to the same
+            folder; None for no correction.
+        initial_state: Initial state without a condition: ``last`` for the state after the last run
+            of this device, ``rest``, or the recording of an earlier run, relative to the same
+            folder. A lead-in of ``safe.ramp_s`` connects it to the reference.
+        offset: ``identified`` uses the model's offset; ``measured`` corrects it by the difference
+            between sensor and model at rest before the waveform, for a sensor or an actuator that
+            has moved since.
     """
 
     model: str
@@ -69,26 +67,25 @@ class CompensatorConfig(StrictModel):
 
 
 class Experiment(StrictModel):
-    """One experiment: everything that a run needs to know.
+    """One experiment.
 
     Attributes:
         name: Short name, part of the recording's file name.
-        description: What it is for.
-        labels: What the run is found by: operator, sample, temperature and the like.
+        description: Purpose in words.
+        labels: Labels to find the run by, such as operator, sample or temperature.
         device: ``kind`` and the device's own options.
-        sample_rate_hz: Samples a second.
+        sample_rate_hz: Samples per second.
         block: Samples exchanged in one tick; more than 1 needs a device with a FIFO.
-        waveform: What to run.
+        waveform: The reference.
         compensator: ``none``, read as None, or the model to invert.
-        condition: What the actuator goes through before the waveform, so that it begins in a state
-            that does not depend on what was before; None for nothing.
-        feedback: A controller around the compensator; None where there is none.
-        adaptation: How the compensator's model is adapted while it runs; None where it is not.
-        limits: What the run is held to.
+        condition: Cycle before the waveform that erases the history of the actuator, or None.
+        feedback: Controller around the compensator, or None.
+        adaptation: Adaptation of the compensator's model during the run, or None.
+        limits: Limits of the run.
         safe: The safe value, and the safe ramp to it.
-        timing: What happens to late ticks.
-        recording: Where and how the run is recorded.
-        realtime: How the loop's process asks for real time.
+        timing: Policy for late ticks.
+        recording: Recording of the run.
+        realtime: Real-time settings of the loop process.
     """
 
     name: Name
@@ -120,11 +117,11 @@ class Experiment(StrictModel):
 
     @property
     def lead_in_samples(self) -> int:
-        """Samples of the waveform within which its reference is reached from where it stands."""
+        """Length of the lead-in from the initial displacement to the reference, in samples."""
         return max(1, round(self.safe.ramp_s * self.sample_rate_hz))
 
     def command_limits(self) -> CommandLimits:
-        """Return what the limiter holds commands to, in the device's unit."""
+        """Return the settings of the limiter, in the device's unit."""
         low, high = self.limits.command_range
         furthest = max(high - self.safe.value, self.safe.value - low)
         return CommandLimits(
@@ -134,3 +131,25 @@ class Experiment(StrictModel):
             safe=self.safe.value,
             ramp_per_s=min(self.limits.slew_per_s, furthest / self.safe.ramp_s),
         )
+
+
+def experiment_schema() -> dict[str, Any]:
+    """Return the JSON schema of experiment files, including the options of all known devices."""
+    schema = Experiment.model_json_schema()
+    definitions = schema["$defs"]
+    choices = []
+    for kind in known_devices():
+        options: type[DeviceOptions] = device_class(kind).Options
+        part = options.model_json_schema()
+        definitions.update(part.pop("$defs", {}))
+        part["properties"] = {"kind": {"const": kind}, **part.get("properties", {})}
+        part["required"] = ["kind", *part.get("required", [])]
+        definitions[f"device_{kind}"] = part
+        choices.append({"$ref": f"#/$defs/device_{kind}"})
+    schema["properties"]["device"] = {"oneOf": choices, "description": "kind and its options"}
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
+
+
+def schema_text() -> str:
+    """Return the JSON schema as the text of ``configs/schema.json``."""
+    return json.dumps(experiment_schema(), indent=1, sort_keys=True) + "\n"

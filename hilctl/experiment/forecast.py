@@ -1,52 +1,61 @@
-"""What a run will do, worked out by the same compensator that will run."""
+"""Forecast of a run: all of its commands by its own compensator, reduced to numbers.
+
+Long references are periodic as a rule, so the simulation skips cycles once two in a row agree: so
+closely that the last cycle would still agree if each differed from the one before by as much.
+"""
 
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
-from hilctl.base.types import F64
+from hilctl.base.types import CHUNK, F64
 from hilctl.experiment.coil_heat import CoilHeat, RunHeat
-from hilctl.experiment.command_simulation import CommandSimulation
 from hilctl.experiment.file import Experiment
 from hilctl.experiment.initial_state import CompensatorStart
-from hilctl.experiment.linear_bypass import LineEnds
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.tuning import LinearBypass
-from hilctl.waveforms.build import Reference
+from hilctl.waveforms.build import Reference, RepeatedPart
+from hilctl.waveforms.shapes import LONG
 
-_BYTES_A_SAMPLE = 45.0
+_BYTES_PER_SAMPLE = 45.0
 _BYTES_OF_INPUT = 8.0
+_MOST_PERIODS = 1024
+_LEAST_CYCLE = 65_536
+"""Least samples of a compared cycle; comparing shorter ones one by one would be slow."""
+_WHOLE = 1e-3
+"""Largest deviation of the skipped part from a whole number of samples, in samples."""
+_SAME = 1e-3
+"""Largest deviation of the last cycle from the computed one, relative to its span."""
 
 
 @dataclass(frozen=True, slots=True)
 class Forecast:
-    """What a run will do.
+    """The commands of a run in numbers.
 
     Attributes:
         samples: Samples of the waveform.
         duration_s: Its length.
         before_s: Time of the conditioning before it.
-        begins: Where the compensator begins, in words; empty without one.
+        begins: Initial state of the compensator in words; empty without a compensator.
         reference_min: Lowest reference, in the waveform's unit.
         reference_max: Highest reference.
         command_unit: ``A`` or ``V``.
         command_min: Lowest command.
         command_max: Highest command.
         slew_per_s: Fastest change of the command.
-        heat: What it does to the heat of the coil, whatever that is before.
-        begins_rms_a: Running rms of the coil current that it begins with, by what the last run of
-            the device left; None where there is no budget.
-        heating_rms_a: Highest running rms of the coil current, as the thermal budget has it; None
-            where there is no budget.
-        budget_used_s: Time after which the thermal budget is overdrawn; None where it is kept.
-        recording_mb: About how large the recording will be.
-        highest_rate_hz: Highest sample rate that the device can keep.
-        rate_note: Why that is so; empty where there is no more to say.
-        line: What can take the inverse's place; None where nothing can.
+        heat: Effect on the heat of the coil, whatever the heat before.
+        begins_rms_a: Initial running rms of the coil current, left by the last run of the device;
+            None without a thermal budget.
+        heating_rms_a: Highest running rms of the coil current; None without a budget.
+        budget_used_s: Time after which the thermal budget is exceeded; None if it never is.
+        recording_mb: Approximate size of the recording.
+        highest_rate_hz: Highest sample rate of the device.
+        rate_note: Reason for that rate; may be empty.
+        line: Replacement of the inverse while it is bypassed; None if there is none.
     """
 
     samples: int
@@ -69,10 +78,9 @@ class Forecast:
     line: LinearBypass | None
 
     def to_mapping(self) -> dict[str, Any]:
-        """Return the fields as plain values."""
+        """Return the fields for the user as plain values."""
         mapping = asdict(self)
-        del mapping["heat"]  # a part of a campaign's sums, of no meaning by itself
-        del mapping["line"]  # of no meaning before somebody asks for it
+        del mapping["heat"], mapping["line"]  # intermediate results
         return mapping
 
 
@@ -84,20 +92,20 @@ def forecast_of(
     heat_a2: float = 0.0,
     input_um: Callable[[int, int], F64] | None = None,
 ) -> Forecast:
-    """Run the compensator on its input, and note what comes of it.
+    """Compute all commands of a run.
 
     Args:
         loaded: The experiment.
         reference: Every sample of its waveform.
-        begun: The compensator's input, and its memory at the start.
-        conditioned: float64[m], commands that come before the waveform's.
+        begun: Input and initial state of the compensator.
+        conditioned: float64[m], commands before those of the waveform.
         heat_a2: Running mean square of the coil current before all of them, in A^2.
-        input_um: Gives another input from a start to a stop, one part after the other.
+        input_um: Returns a different input from a start to a stop; called in order.
 
     Raises:
         ModelError: The model has no inverse.
     """
-    config = loaded.config
+    config, info = loaded.config, loaded.device.info
     compensator = Compensator(loaded.model, config.sample_rate_hz)
     if begun.state is not None:
         compensator.restore(begun.state)
@@ -106,15 +114,14 @@ def forecast_of(
     if conditioned.size:
         figures.add_before(conditioned)
     values = reference.values
-    run = CommandSimulation(
+    CommandSimulation(
         compensator,
         input_um or (lambda start, stop: begun.input_um[start:stop]),
         lambda start, stop: values[start:stop],
         values.size,
         figures,
-    )
-    run.go_through(reference.repeats)
-    byte_count = _BYTES_A_SAMPLE + (0.0 if begun.input_um is values else _BYTES_OF_INPUT)
+    ).run(reference.repeats)
+    bytes_per_sample = _BYTES_PER_SAMPLE + (_BYTES_OF_INPUT if begun.input_um is not values else 0)
     low, high = reference.span
     command, heat = figures.command, figures.command.heat
     return Forecast(
@@ -124,7 +131,7 @@ def forecast_of(
         begins=begun.begins,
         reference_min=low,
         reference_max=high,
-        command_unit=loaded.device.info.command_unit,
+        command_unit=info.command_unit,
         command_min=command.low,
         command_max=command.high,
         slew_per_s=command.slew_per_s,
@@ -132,46 +139,112 @@ def forecast_of(
         begins_rms_a=None if heat.rms_a is None else math.sqrt(heat_a2),
         heating_rms_a=heat.rms_a,
         budget_used_s=heat.used_s,
-        recording_mb=(values.size + conditioned.size) * byte_count / 1e6,
-        highest_rate_hz=loaded.device.info.max_rate_hz,
-        rate_note=loaded.device.info.rate_note,
+        recording_mb=(values.size + conditioned.size) * bytes_per_sample / 1e6,
+        highest_rate_hz=info.max_rate_hz,
+        rate_note=info.rate_note,
         line=None if loaded.model is None else figures.ends.line(),
     )
 
 
-class _RunFigures:
-    """What is gathered from the commands of a whole run; see :class:`whole_run.Figures`."""
-
-    def __init__(self, config: Experiment, heat_a2: float) -> None:
-        self.command = CommandFigures(config, config.safe.value, heat_a2)
-        self.heat = RunHeat()
-        self.ends = LineEnds()
-        self._limits, self._rate_hz = config.limits, config.sample_rate_hz
-        self._marked = 0.0, 0.0
-
-    def add_before(self, command: F64) -> None:
-        """Take commands that come before the waveform: float64[n], n > 0."""
-        self.command.add(command)
-        self.heat = self.heat.then(command, self._limits, self._rate_hz)
+class CommandSink(Protocol):
+    """Consumer of simulated commands."""
 
     def add(self, reference: F64, command: F64) -> None:
-        """Take the next ones: float64[n] each, n > 0."""
-        self.add_before(command)
-        self.ends.add(reference, command)
+        """Add the next samples: float64[n] each, n > 0."""
+        ...
 
     def mark(self) -> None:
-        """Note that a cycle begins."""
-        self._marked = self.command.heat.heat_a2, self.heat.alone_a2
+        """Mark the start of a cycle."""
+        ...
 
-    def pass_over(self, samples: int, times: int) -> None:
-        """Take the cycle since the mark, of so many samples, that many times more."""
-        before_a2, alone_a2 = self._marked
-        self.command.heat.pass_over(before_a2, samples, times)
-        self.heat = self.heat.pass_over(alone_a2, samples, times, self._limits, self._rate_hz)
+    def skip(self, samples: int, times: int) -> None:
+        """Add the cycle since the mark, of ``samples`` samples, ``times`` more times."""
+        ...
+
+
+class CommandSimulation:
+    """Simulation of the commands of a run, without the repeats of cycles that agree.
+
+    Args:
+        compensator: Compensator in the initial state of the run.
+        input_um: Returns its input from a start to a stop, float64[stop - start]; called in order.
+        reference: Returns the reference in the same way.
+        size: Samples of the run.
+        figures: Consumer of the commands.
+    """
+
+    def __init__(
+        self,
+        compensator: Compensator,
+        input_um: Callable[[int, int], F64],
+        reference: Callable[[int, int], F64],
+        size: int,
+        figures: CommandSink,
+    ) -> None:
+        self._compensator, self._input_um, self._reference = compensator, input_um, reference
+        self._size, self._figures = size, figures
+        self._at = 0
+
+    def run(self, repeats: tuple[RepeatedPart, ...]) -> None:
+        """Simulate the run, given the periodic parts of its reference in order."""
+        for repeat in repeats:
+            self._advance(repeat.start)
+            self._skip_cycles(repeat)
+        self._advance(self._size)
+
+    def _advance(self, stop: int, cycle: F64 | None = None) -> None:
+        """Simulate up to a sample; fill ``cycle`` (float64[n]) with the commands."""
+        begins = self._at
+        while self._at < stop:
+            start = self._at
+            self._at = min(start + CHUNK, stop)
+            command = np.empty(self._at - start)
+            self._compensator.process(self._input_um(start, self._at), command)
+            self._figures.add(self._reference(start, self._at), command)
+            if cycle is not None:
+                cycle[start - begins : self._at - begins] = command
+
+    def _skip_cycles(self, repeat: RepeatedPart) -> None:
+        """Simulate cycles until two in a row agree, and skip the rest of a periodic part."""
+        # The input runs ahead of the reference, so its periodic part ends earlier.
+        stop = repeat.stop - self._compensator.preview
+        cycle = whole_cycle(repeat.period, stop - repeat.start)
+        if cycle == 0:
+            return
+        before, now = np.full((2, cycle), math.nan)
+        while stop - self._at >= 3 * cycle:
+            self._figures.mark()
+            self._advance(self._at + cycle, now)
+            times = (stop - self._at) // cycle - 1
+            with np.errstate(over="ignore", invalid="ignore"):  # NaN never agrees
+                same = bool(np.abs(now - before).max() * times <= _SAME * np.ptp(now))
+            if same:
+                self._figures.skip(cycle, times)
+                self._at += times * cycle
+                return
+            before, now = now, before
+
+
+def whole_cycle(period: float, samples: int) -> int:
+    """Return the shortest whole cycle worth comparing, in samples; 0 if there is none.
+
+    Args:
+        period: Samples of a period, > 0.
+        samples: Samples of the periodic part; fewer than four cycles are not worth it.
+    """
+    for periods in range(1, _MOST_PERIODS + 1):
+        length = periods * period
+        if length > LONG or 4 * length > samples:
+            return 0
+        if abs(length - round(length)) * (samples / length) <= _WHOLE:
+            times = max(1, math.ceil(_LEAST_CYCLE / length))
+            cycle = times * round(length)
+            return cycle if 4 * cycle <= samples else 0
+    return 0
 
 
 class CommandFigures:
-    """What limits are held against, gathered from commands that follow one another.
+    """Range, slew and heat of consecutive commands.
 
     Args:
         config: The experiment.
@@ -193,10 +266,10 @@ class CommandFigures:
         self._step = 0.0
 
     def add(self, command: F64) -> None:
-        """Go on with the next commands: float64[n], n > 0."""
-        with np.errstate(over="ignore", invalid="ignore"):  # what comes of it is refused
+        """Add the next commands: float64[n], n > 0."""
+        with np.errstate(over="ignore", invalid="ignore"):  # such commands are rejected later
             steps = np.abs(np.diff(command, prepend=self.last))
-        self.low = float(np.minimum(self.low, command.min()))  # keeps a NaN, where min() would not
+        self.low = float(np.minimum(self.low, command.min()))  # keeps a NaN, unlike min()
         self.high = float(np.maximum(self.high, command.max()))
         self._step = float(np.maximum(self._step, steps.max()))
         self.last = float(command[-1])
@@ -206,3 +279,85 @@ class CommandFigures:
     def slew_per_s(self) -> float:
         """Fastest change."""
         return self._step * self._rate_hz
+
+
+class _RunFigures:
+    """The :class:`CommandSink` of a forecast."""
+
+    def __init__(self, config: Experiment, heat_a2: float) -> None:
+        self.command = CommandFigures(config, config.safe.value, heat_a2)
+        self.heat = RunHeat()
+        self.ends = LineEnds()
+        self._limits, self._rate_hz = config.limits, config.sample_rate_hz
+        self._marked = 0.0, 0.0
+
+    def add_before(self, command: F64) -> None:
+        """Add commands before the waveform: float64[n], n > 0."""
+        self.command.add(command)
+        self.heat = self.heat.then(command, self._limits, self._rate_hz)
+
+    def add(self, reference: F64, command: F64) -> None:
+        """Add the next samples: float64[n] each, n > 0."""
+        self.add_before(command)
+        self.ends.add(reference, command)
+
+    def mark(self) -> None:
+        """Mark the start of a cycle."""
+        self._marked = self.command.heat.heat_a2, self.heat.alone_a2
+
+    def skip(self, samples: int, times: int) -> None:
+        """Add the cycle since the mark, of ``samples`` samples, ``times`` more times."""
+        before_a2, alone_a2 = self._marked
+        self.command.heat.repeat(before_a2, samples, times)
+        self.heat = self.heat.repeated(alone_a2, samples, times, self._limits, self._rate_hz)
+
+
+class LineEnds:
+    """Collects the ends of the line that replaces the inverse while it is bypassed.
+
+    The line has the stroke of the compensator but no hysteresis: it leads from the lowest to the
+    highest command over the waveform, so the difference between the two is the inverse's effect.
+    """
+
+    def __init__(self) -> None:
+        self._low, self._high = (math.inf, math.nan), (-math.inf, math.nan)
+        self._lowest, self._highest = math.inf, -math.inf
+
+    def add(self, reference: F64, command: F64) -> None:
+        """Add the next samples: float64[n] each, n > 0."""
+        low, high = int(reference.argmin()), int(reference.argmax())
+        self._low = min(self._low, (float(reference[low]), float(command[low])))
+        self._high = max(self._high, (float(reference[high]), float(command[high])))
+        self._lowest = float(np.minimum(self._lowest, command.min()))
+        self._highest = float(np.maximum(self._highest, command.max()))
+
+    def line(self) -> LinearBypass | None:
+        """Return the line; None if the reference is constant or a command is not finite."""
+        (low_um, at_low), (high_um, at_high) = self._low, self._high
+        rise = self._highest - self._lowest
+        if not (high_um > low_um and math.isfinite(rise)):
+            return None
+        # On one wing of a butterfly the displacement rises when the command falls.
+        slope = math.copysign(rise, at_high - at_low) / (high_um - low_um)
+        middle_um = 0.5 * (low_um + high_um)
+        return LinearBypass(slope, 0.5 * (self._lowest + self._highest) - slope * middle_um)
+
+
+def fade_refusal(loaded: LoadedExperiment, line: LinearBypass | None, wanted: str) -> str:
+    """Return why the inverse cannot be bypassed or enabled, or an empty text.
+
+    Args:
+        loaded: The experiment.
+        line: Its line.
+        wanted: ``in`` or ``out``.
+    """
+    if loaded.model is None:
+        return "the experiment has no compensator: there is no inverse to bypass"
+    if line is None:
+        return "the reference is constant: there is no line through its ends"
+    if wanted == "out" and loaded.config.limits.tracking_error_um is not None:
+        return (
+            "limits.tracking_error_um would end the run, because the displacement leaves its "
+            "reference without the inverse: remove that limit from the experiment first"
+        )
+    return ""

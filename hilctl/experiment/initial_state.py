@@ -1,4 +1,4 @@
-"""What a compensator begins with: the memory that a run before left in the actuator, or rest."""
+"""Initial state of a compensator: rest, or the memory that earlier commands left."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator
@@ -24,17 +24,17 @@ _STILL_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class CompensatorStart:
-    """What the compensator of a run is given, and what it begins with.
+    """Input and initial state of the compensator of a run.
 
     Attributes:
-        input_um: float64[n], its input; the values themselves where it is those.
+        input_um: float64[n], its input; the reference itself if nothing is added.
         preview: Samples by which its input runs ahead of the commands.
         state_size: Numbers in its memory.
-        state: float64[state_size], its memory before the first sample; None where it is at rest.
-        begins: Where the compensator begins, in words, and why.
-        run_id: The run that left this memory; empty where none did.
-        stands_um: Displacement before the first sample by the model, where the sensor is held
-            against it; None where it is not.
+        state: float64[state_size], its memory before the first sample; None at rest.
+        begins: Origin of the initial state in words.
+        run_id: The run that left this memory; empty if none did.
+        stands_um: Model displacement before the first sample, if the sensor's offset is measured;
+            otherwise None.
     """
 
     input_um: F64
@@ -48,12 +48,12 @@ class CompensatorStart:
 
 @dataclass(frozen=True, slots=True)
 class InitialState:
-    """Where a run before, or what comes before the waveform, leaves the actuator.
+    """State of the actuator after earlier commands.
 
     Attributes:
-        state: float64[state_size], the compensator's memory, at rest there.
-        stands_um: Displacement there, by the model.
-        run_id: That run; empty where it is this one.
+        state: float64[state_size], the compensator's memory.
+        stands_um: Displacement by the model.
+        run_id: The run of those commands; empty for the present one.
     """
 
     state: F64
@@ -61,11 +61,11 @@ class InitialState:
     run_id: str
 
     def lead_in(self, input_um: F64, samples: int) -> F64:
-        """Return the compensator's input, begun from where the actuator stands.
+        """Return the compensator's input with a lead-in from the actuator's displacement.
 
         Args:
             input_um: float64[n].
-            samples: Samples that the way takes; the whole of ``input_um`` where that is shorter.
+            samples: Length of the lead-in, which is cut off at the end of ``input_um``.
         """
         away_um = self.stands_um - float(input_um[0])
         led = input_um.copy()
@@ -81,14 +81,14 @@ def begin(
     before: InitialState | None = None,
     begins: str = "at rest",
 ) -> CompensatorStart:
-    """Return what the compensator is fed, and its memory once it has begun.
+    """Return input and initial state of a compensator.
 
     Args:
         model: Its model, or None.
-        sample_rate_hz: Samples a second.
-        values: float64[n], the reference with what is added to it, led in from where it begins.
-        before: Where the run before left the actuator; at rest where None.
-        begins: That, in words.
+        sample_rate_hz: Samples per second.
+        values: float64[n], the reference with correction and lead-in.
+        before: State of the actuator before; None at rest.
+        begins: Its origin in words.
 
     Raises:
         ModelError: The model has no inverse.
@@ -112,26 +112,26 @@ def begin(
 def initial_state_after(
     path: Path, model: HysteresisModel, sample_rate_hz: float, now_s: float
 ) -> InitialState:
-    """Return what a recorded run, taken to have begun at rest, left behind.
+    """Return the state of the actuator after a recorded run that began at rest.
 
-    All of its commands, the ramp out too, go through the model; what comes of it, through the
-    inverse. So any run will do, with or without a compensator, by this model or another. What has
-    crept goes back from its end to now, and for a second at least.
+    The model converts all of its commands to displacements, and the inverse follows those, so the
+    run may have used any compensator or none. Creep decays from the end of the run to the present,
+    for at least one second.
 
     Args:
         path: The run's recording.
         model: The model that the compensator inverts.
-        sample_rate_hz: Samples a second; the recording's must be the same.
+        sample_rate_hz: Samples per second; the recording must have the same rate.
         now_s: Unix time in s.
 
     Raises:
-        DataError: The recording can't be read, or is not of a whole run of such commands.
+        DataError: The recording is unreadable or incomplete, or its commands do not fit.
         ModelError: The model has no inverse.
     """
     followed = _Followed(path, model, sample_rate_hz)
     left = left_by(followed.commands(), model, sample_rate_hz, lambda: now_s - followed.ended_s)
     if not math.isfinite(left.stands_um):
-        raise DataError(f"{path}: has commands that the model has no displacement for")
+        raise DataError(f"{path}: has commands beyond the range of the model")
     return replace(left, run_id=followed.run_id)
 
 
@@ -141,14 +141,13 @@ def left_by(
     sample_rate_hz: float,
     stood_s: Callable[[], float] | None = None,
 ) -> InitialState:
-    """Return where commands from rest leave the model.
+    """Return the state of a model after commands from rest.
 
     Args:
-        commands: float64[n] each, one after the other; the last of them a rest, where nothing more
-            is said of it.
+        commands: float64[n] each, in order; without ``stood_s`` they must end with a rest.
         model: The model.
-        sample_rate_hz: Samples a second.
-        stood_s: Gives, after the commands, the time since then in s; a second at least is taken.
+        sample_rate_hz: Samples per second.
+        stood_s: Returns the time since the commands in s; at least one second is simulated.
     """
     forward, inverse = model.forward(sample_rate_hz), model.inverse(sample_rate_hz)
     rest = inverse.state()
@@ -169,7 +168,7 @@ def left_by(
 
 
 def _and_still(commands: Iterable[F64], samples: int) -> Iterator[F64]:
-    """Give commands, and then the last of them for so many samples."""
+    """Yield commands, then the last one for a number of samples."""
     last = 0.0
     for command in commands:
         if command.size:
@@ -180,17 +179,17 @@ def _and_still(commands: Iterable[F64], samples: int) -> Iterator[F64]:
 
 
 class _Followed:
-    """The commands of a recorded run, and whether it is one that can be followed."""
+    """The commands of a complete recorded run."""
 
     def __init__(self, path: Path, model: HysteresisModel, sample_rate_hz: float) -> None:
         self._path, self._unit, self._rate_hz = path, model.input_unit, sample_rate_hz
         self.run_id = ""
         self.ended_s = math.inf
-        """When it ended, Unix time in s, once its commands have been gone through."""
+        """Unix time of its end in s, known after all commands were read."""
 
     def commands(self) -> Iterator[F64]:
-        """Yield them, from the first sample to the last."""
-        from hilctl.recording.reader import RecordingStream  # most runs begin at rest
+        """Yield the commands in order."""
+        from hilctl.recording.reader import RecordingStream  # slow to import, rarely needed
 
         samples = 0
         unanswered = False
@@ -207,9 +206,9 @@ class _Followed:
         self._check_whole(whole=bool(samples and not piece.dropped and piece.end))
         if unanswered or piece.end.get("output_safe") == "false":
             lost = "lost its device, or did not confirm its safe value"
-            raise DataError(f"{self._path}: {lost}: where it left the actuator is not known")
+            raise DataError(f"{self._path}: {lost}: the state of the actuator is unknown")
         self.run_id = piece.run.get("run_id", "")
-        with suppress(ValueError):  # of an older hilctl, or a foreign one: a second, then
+        with suppress(ValueError):  # absent in old recordings: one second is simulated
             self.ended_s = datetime.fromisoformat(piece.end.get("ended", "")).timestamp()
 
     def _check(self, recording: "Recording") -> None:
@@ -223,5 +222,4 @@ class _Followed:
 
     def _check_whole(self, *, whole: bool) -> None:
         if not whole:
-            lost = "where it left the actuator is not known"
-            raise DataError(f"{self._path}: is not of a whole run: {lost}")
+            raise DataError(f"{self._path}: is incomplete: the state of the actuator is unknown")

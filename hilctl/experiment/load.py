@@ -1,4 +1,4 @@
-"""From an experiment file to the experiment with all that the file refers to."""
+"""Load an experiment file and all files that it refers to."""
 
 import json
 import os
@@ -12,7 +12,7 @@ from hilctl.base.errors import ConfigError, ConfigProblem, InputError
 from hilctl.base.files import TextFiles
 from hilctl.base.yaml import Document, dump, load_document
 from hilctl.experiment.correction import Correction, load_correction
-from hilctl.experiment.device import made_device
+from hilctl.experiment.devices import made_device
 from hilctl.experiment.file import Experiment
 from hilctl.models.base import HysteresisModel
 from hilctl.models.model_file import load_model
@@ -25,17 +25,17 @@ FILE_KEYS = {"compensator.model", "compensator.correction", "compensator.initial
 
 @dataclass(frozen=True, slots=True)
 class LoadedExperiment:
-    """An experiment with all that its file refers to.
+    """An experiment with everything that its file refers to.
 
     Attributes:
         config: The experiment.
-        device: The device, made but not opened.
+        device: The device, not opened.
         model: The compensator's model, or None.
-        folder: Folder that file names in it are relative to.
-        yaml_text: The experiment as it will run, command-line settings included.
-        document: The file, which knows where each value stands.
-        correction: What is added to the reference before the compensator, or None.
-        files: The files that it refers to, as they were read.
+        folder: Base of relative file names.
+        yaml_text: The experiment including command-line settings.
+        document: The file, with the line of each value.
+        correction: Learned correction of the reference, or None.
+        files: Contents of the files it refers to.
     """
 
     config: Experiment
@@ -47,12 +47,15 @@ class LoadedExperiment:
     correction: Correction | None = None
     files: TextFiles = field(default_factory=TextFiles)
 
+    def problem(self, key: str, rule: str, value: str = "", hint: str = "") -> ConfigProblem:
+        """Return a broken rule with the place of its key in the file."""
+        return ConfigProblem(self.document.where(tuple(key.split("."))), key, rule, value, hint)
+
 
 def load_experiment(path: Path, settings: Sequence[str] = ()) -> LoadedExperiment:
     """Read an experiment file, apply ``key=value`` settings, and load what it refers to.
 
-    A file that a setting names is looked for in the working folder first, where whoever types it
-    sees it, and then in the experiment's.
+    A file name in a setting is relative to the working folder, or else to the experiment's folder.
 
     Raises:
         InputError: The file can't be read.
@@ -63,7 +66,7 @@ def load_experiment(path: Path, settings: Sequence[str] = ()) -> LoadedExperimen
 
 
 def input_files(document: Document, path: Path) -> list[Path]:
-    """Return the files of an experiment: its own, and those that its keys name.
+    """Return the experiment file and the files that its keys name.
 
     Args:
         document: The experiment.
@@ -74,7 +77,7 @@ def input_files(document: Document, path: Path) -> list[Path]:
         value: object = document.data
         for name in key.split("."):
             value = value.get(name) if isinstance(value, dict) else None
-        if isinstance(value, str):  # a shipped profile is a name, and no file
+        if isinstance(value, str):  # may be the name of a shipped profile
             found.append(path.parent / value)
     return found
 
@@ -92,10 +95,10 @@ def inputs_of(path: Path, settings: Sequence[str] = ()) -> list[Path]:
 
 
 def named_from(folder: Path, setting: str) -> str:
-    """Return a setting with the file that it names in the working folder named from another one.
+    """Return a setting whose file name is made relative to another folder.
 
     Args:
-        folder: What file names in the experiment are relative to.
+        folder: The other folder.
         setting: ``key=value``.
     """
     key, _, text = setting.partition("=")
@@ -117,9 +120,9 @@ def resolve(
 
     Args:
         document: The experiment.
-        folder: What file names in it are relative to.
+        folder: Base of relative file names.
         settings: ``key=value`` texts over it.
-        files: Where those files are read from; the disk where None.
+        files: Source of those files; None for the disk.
     """
     files = TextFiles() if files is None else files
     for setting in settings:
@@ -139,7 +142,7 @@ def resolve(
 
 
 def _joint_problems(config: Experiment, document: Document) -> list[ConfigProblem]:
-    """Return broken rules that tie one part of the experiment to another."""
+    """Return broken rules between sections of the experiment."""
     found: list[ConfigProblem] = []
 
     def add(loc: tuple[str, str], rule: str, value: object = "", hint: str = "") -> None:
@@ -149,9 +152,9 @@ def _joint_problems(config: Experiment, document: Document) -> list[ConfigProble
     if unit is None:
         add(("waveform", "unit"), "is required", hint="um, A or V")
     elif config.compensator is not None and unit != "um":
-        add(("waveform", "unit"), "must be um where a compensator stands", unit)
+        add(("waveform", "unit"), "must be um with a compensator", unit)
     elif config.compensator is None and unit != limits.unit:
-        rule = f"must be {limits.unit}, the unit of the limits, where compensator is none"
+        rule = f"must be {limits.unit}, the unit of the limits, without a compensator"
         add(("waveform", "unit"), rule, unit)
     low, high = limits.command_range
     if not low <= config.safe.value <= high:
@@ -170,14 +173,14 @@ def _collect(problems: list[ConfigProblem], load: Callable[[], T]) -> T | None:
 
 @dataclass(frozen=True, slots=True)
 class _NamedFiles:
-    """Files that keys of the compensator name."""
+    """Files named in the ``compensator`` section."""
 
     document: Document
     folder: Path
     files: TextFiles
 
     def load(self, key: str, load: Callable[[Path, TextFiles], T]) -> T | None:
-        """Return what the file that ``key`` names holds; None where it names none."""
+        """Return the content of the file under ``key``; None without such a key."""
         compensator = self.document.data.get("compensator")
         name = compensator.get(key) if isinstance(compensator, dict) else None
         if not isinstance(name, str):

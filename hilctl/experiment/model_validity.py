@@ -1,4 +1,4 @@
-"""Whether a reference stays within the motions that the model was identified on."""
+"""Comparison of a reference with the motions that the model was identified on."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,11 +13,11 @@ from hilctl.waveforms.shapes import LONG, telling_samples
 
 WINDOW_S = 0.2
 FEWEST_SAMPLES = 256  # of a window
-BATCH = 64  # windows at a time: a run of minutes at 50 kHz must not fill the memory
+BATCH = 64  # windows at a time, to bound the memory
 ALL, MOST = 0.999, 0.5  # parts of a signal's power
-STILL = 0.02  # of the largest motion: windows that move less say nothing
+STILL = 0.02  # of the largest motion: quieter windows are ignored
 MARGIN = 1.1  # of the highest frequency
-FAR = 2.0  # the same, beyond which a run is refused
+FAR = 2.0  # the same, above which a run is rejected
 SMALL = 0.5  # of the smallest motion
 SLOW = 0.5  # of the lowest frequency
 FAST = 1.25  # of the largest speed
@@ -25,12 +25,12 @@ FAST = 1.25  # of the largest speed
 
 @dataclass(frozen=True, slots=True)
 class Spectrum:
-    """What frequencies a signal has.
+    """Frequencies of a signal.
 
     Attributes:
-        main_hz: Most of the power lies below it, where it lies highest.
-        highest_hz: All but a thousandth of the power lies below it, the same.
-        resolution_hz: How exactly these are known.
+        main_hz: Half of the power lies below it; maximum over all windows.
+        highest_hz: 99.9 % of the power lies below it; maximum over all windows.
+        resolution_hz: Resolution of these.
     """
 
     main_hz: float
@@ -40,11 +40,11 @@ class Spectrum:
 
 @dataclass(frozen=True, slots=True)
 class RangeFindings:
-    """Where a reference leaves what a model was identified on.
+    """Deviations of a reference from the motions a model was identified on.
 
     Attributes:
-        refused: So far that the run must not start.
-        warnings: So that the error is not known.
+        refused: Reasons to reject the run.
+        warnings: Reasons why the model error is unknown.
     """
 
     refused: tuple[str, ...] = ()
@@ -61,9 +61,9 @@ def spectrum(
 
     Args:
         values: float64[n].
-        sample_rate_hz: Samples a second.
-        least_move: Peak-to-peak value below which a window is left out.
-        told: Parts that show all there is to see; all of it where None.
+        sample_rate_hz: Samples per second.
+        least_move: Peak-to-peak value below which a window is ignored.
+        told: Representative parts; None for the whole signal.
     """
     size = min(max(round(WINDOW_S * sample_rate_hz), FEWEST_SAMPLES), values.size)
     step_hz = sample_rate_hz / size
@@ -80,7 +80,7 @@ def spectrum(
 
 
 def _windows(values: F64, size: int, parts: tuple[slice, ...]) -> Iterator[F64]:
-    """Give windows that overlap by half, of each part, some at a time: float64[k, size]."""
+    """Yield batches of windows that overlap by half: float64[k, size]."""
     hop = max(size // 2, 1)
     for part in parts:
         for start in range(part.start, part.stop - size + 1, hop * BATCH):
@@ -89,10 +89,7 @@ def _windows(values: F64, size: int, parts: tuple[slice, ...]) -> Iterator[F64]:
 
 
 def _lines(batch: F64) -> F64:
-    """Return the straight line nearest to each row, float64[k, n].
-
-    SciPy's ``detrend`` would bring 80 MB into every process of a run.
-    """
+    """Return the linear trend of each row, float64[k, n], without importing SciPy."""
     time = np.linspace(-1.0, 1.0, batch.shape[1])
     slopes = batch @ time / (time @ time)
     lines: F64 = batch.mean(axis=1, keepdims=True) + slopes[:, None] * time
@@ -100,7 +97,7 @@ def _lines(batch: F64) -> F64:
 
 
 def range_findings(known: IdentifiedRange, reference: Reference) -> RangeFindings:
-    """Hold a reference in um against what a model was identified on.
+    """Compare a reference in um with the motions a model was identified on.
 
     Args:
         known: The motions that the model was identified on.
@@ -109,7 +106,7 @@ def range_findings(known: IdentifiedRange, reference: Reference) -> RangeFinding
     rate_hz, told = reference.sample_rate_hz, reference.telling
     found = spectrum(reference.values, rate_hz, STILL * known.peak_to_peak_um[1], told)
     low_hz, high_hz = known.frequency_hz
-    beyond = 2.0 * found.resolution_hz  # what a window adds to any frequency
+    beyond = 2.0 * found.resolution_hz  # broadening by the window
     if found.main_hz > FAR * high_hz + beyond:
         text = (
             f"the reference moves at about {found.main_hz:.3g} Hz, and the model was identified "
@@ -150,7 +147,7 @@ def _motion_warnings(known: IdentifiedRange, reference: Reference) -> Iterator[s
 
 
 def _move_um(values: F64, segment: Segment) -> float:
-    """Return the steady peak-to-peak motion of a segment, by its first periods where it repeats."""
+    """Return the steady peak-to-peak motion of a segment, from its first periods if periodic."""
     start, stop = segment.steady_start, segment.steady_stop
     if segment.period > 0.0 and values.size > LONG:
         stop = min(stop, start + telling_samples(segment.period))

@@ -1,8 +1,11 @@
-"""Common types of the experiment file, and its sections: limits, timing, recording, real time."""
+"""Sections of the experiment file and their common types."""
 
+import json
 import re
+from collections.abc import Sequence
 from typing import Annotated, Any, Literal, Self, TypeAlias
 
+from hilctl.base.errors import ConfigError, ConfigProblem
 from hilctl.base.strict import (
     AfterValidator,
     BeforeValidator,
@@ -14,7 +17,7 @@ from hilctl.base.strict import (
 from hilctl.base.types import CommandUnit
 from hilctl.loop.interlocks import InterlockSettings
 from hilctl.loop.pacer import USUAL_MISSED_SHARE
-from hilctl.recording.metadata_keys import RECORDINGS
+from hilctl.recording.metadata_keys import RECORDINGS, LabelValue
 
 _NAME = "[A-Za-z0-9][A-Za-z0-9_.-]{0,79}"
 
@@ -52,26 +55,27 @@ Interval = Annotated[
 
 
 class Timing(StrictModel):
-    """What happens to late ticks.
+    """Policy for late ticks.
 
     Attributes:
-        late_policy: For devices paced by this machine: ``skip`` whole ticks and keep the phase,
-            ``catch_up`` with a burst, or ``slip`` the phase. Devices with a sample clock of their
-            own always catch up: their FIFO takes the burst. Before the waveform no tick is skipped.
-        late_after: A tick counts as late when it wakes this many tick periods after it was due.
+        late_policy: For devices paced by the host: ``skip`` whole ticks and keep the phase,
+            ``catch_up`` with a burst, or ``slip`` the phase. Devices with their own sample clock
+            always catch up, because their FIFO takes the burst. No tick is skipped before the
+            waveform.
+        late_after: Delay in tick periods after which a tick counts as late.
         max_late_s: A tick later than this ends the run.
-        max_consecutive_late: So many late ticks one after the other end the run; 0 for any number.
-            Left out, as many as come in two seconds: this machine can't keep the rate.
-        grace_s: Time after the start in which late ticks count, but don't end the run.
-        on_misses: What a run does that skips too many ticks: ``fault``, its safe ramp, or ``warn``,
-            which is said once it has ended. The command stands still in a skipped tick and jumps
-            after it, so that such a run does not put out the waveform that was checked.
-        max_missed_share: Share of ticks that may be skipped, over ten seconds or the whole waveform
-            where that is shorter; only as many as five stalls or more make end a run.
-        hang_s: A loop that gives no sign for this time and two tick periods is killed, and the
-            output made safe; while it waits for the device, ``max_late_s`` more. Left out, 80 ms;
-            for a simulated device, which has no coil to protect, ``max_late_s`` and half a second.
-            One that is stopped, as by SIGSTOP, has no more than 20 ms where there is a coil.
+        max_consecutive_late: Number of consecutive late ticks that ends the run; 0 for no limit.
+            Default: the ticks of two seconds.
+        grace_s: Time after the start in which late ticks count but do not end the run.
+        on_misses: Reaction to too many skipped ticks: ``fault`` ends the run with its safe ramp,
+            ``warn`` reports them after the run. The command is constant in a skipped tick and jumps
+            after it, so the output is no longer the checked waveform.
+        max_missed_share: Largest share of skipped ticks, over ten seconds or the whole waveform if
+            that is shorter; fewer than five stalls never end a run.
+        hang_s: A loop without heartbeat for this time and two tick periods is killed and the output
+            set to the safe value; ``max_late_s`` is added while it waits for the device. Default:
+            80 ms; ``max_late_s`` and half a second for a simulated device, which has no coil to
+            protect. A stopped process (SIGSTOP) is limited to 20 ms if there is a coil.
     """
 
     late_policy: Literal["skip", "catch_up", "slip"] = "skip"
@@ -85,18 +89,18 @@ class Timing(StrictModel):
 
 
 class RecordingConfig(StrictModel):
-    """Where and how a run is recorded.
+    """Recording of a run.
 
     Attributes:
-        folder: Folder for recordings without a name of their own, relative to where hilctl runs.
-        flush_s: Longest time that a sample stays out of the file; until then the ring keeps it.
-        sync: Whether every flush waits until the disk itself has the samples, so that a power cut
-            takes no more than ``flush_s``. At the end of a run that is always so.
+        folder: Folder of recordings without an explicit name, relative to the working folder.
+        flush_s: Longest time until a sample is in the file; until then it is in the ring.
+        sync: Whether every flush waits for the disk, so that a power cut loses at most ``flush_s``.
+            The end of a run always waits.
         scope_rate_hz: Highest rate of the ``/scope`` topic.
-        ring_s: Seconds of samples that the ring between loop and recorder holds.
-        on_failure: What a run does when the disk has accepted nothing for half of ``ring_s``:
-            ``stop`` by its safe ramp, or ``go_on`` and count what is lost once the ring is full.
-            Refused writes are retried all the while.
+        ring_s: Capacity of the ring between loop and recorder, in seconds of samples.
+        on_failure: Reaction when the disk has accepted nothing for half of ``ring_s``: ``stop``
+            with the safe ramp, or ``go_on`` and count the lost samples once the ring is full.
+            Failed writes are retried.
     """
 
     folder: str = RECORDINGS
@@ -110,29 +114,26 @@ class RecordingConfig(StrictModel):
     def _room(self) -> Self:
         if self.ring_s < 3.0 * self.flush_s:
             raise ValueError(
-                "ring_s must be at least three times flush_s, which the ring has to bridge: "
-                f"{self.ring_s:g} and {self.flush_s:g}"
+                f"ring_s must be at least three times flush_s: {self.ring_s:g} and {self.flush_s:g}"
             )
         return self
 
 
 REST_S = 0.1
-"""Rest before the waveform where an offset is measured and no other rest is given."""
+"""Default rest before the waveform."""
 
 
 class Condition(StrictModel):
-    """A decaying cycle around the safe value before the waveform, to a repeatable state.
-
-    It goes to both sides of the safe value as far as the amplitude, and no further than the limits.
+    """A decaying cycle around the safe value before the waveform, for a repeatable initial state.
 
     Attributes:
-        amplitude_a: Amplitude of the first cycle, for devices driven in A; as far as the limits go
-            where it is left out.
+        amplitude_a: Amplitude of the first cycle, for devices driven in A, cut off at the limits.
+            Default: up to the limits.
         amplitude_v: The same for devices driven in V.
-        frequency_hz: Left out, 10 Hz, or less where slew limit or rate ask for it.
-        cycles: How many.
-        decay: Amplitude of each cycle over that of the one before; 1 for one that falls in a line.
-        rest_s: Rest at the safe value after it; over its second half the displacement is averaged.
+        frequency_hz: Default: 10 Hz, or less if the slew limit or the sample rate requires it.
+        cycles: Number of cycles.
+        decay: Ratio of the amplitudes of consecutive cycles; 1 for a linear decay.
+        rest_s: Rest at the safe value after it; its second half gives the mean displacement.
     """
 
     amplitude_a: Annotated[float, Field(gt=0.0)] | None = None
@@ -144,14 +145,13 @@ class Condition(StrictModel):
 
 
 class _AnyFeedback(StrictModel):
-    """What every feedback has.
+    """Keys of every kind of feedback.
 
     Attributes:
-        limit_um: Largest correction of the compensator's input, either way.
-        sensor_delay_s: Age of a displacement when it is read, as far as the model does not know it:
-            the filter of the sensor, its line.
-        resonance_hz: Lowest natural frequency of the actuator with its load; the feedback must stay
-            well below it. Left out, that of the model's structure.
+        limit_um: Largest correction of the compensator's input, either sign.
+        sensor_delay_s: Delay of the sensor and its line that is not in the model.
+        resonance_hz: Lowest natural frequency of the actuator with its load; the bandwidth must be
+            well below it. Default: that of the model's structure.
         damping_ratio: Damping of that resonance.
     """
 
@@ -165,9 +165,9 @@ class PiFeedbackConfig(_AnyFeedback):
     """A PI controller around the compensator, for devices that exchange sample by sample.
 
     Attributes:
-        bandwidth_hz: Frequency up to which the error is brought down; gives the gains.
-        kp: Proportional gain, um of correction per um of error, where there is no bandwidth.
-        ki_per_s: Integral gain, per s, where there is no bandwidth.
+        bandwidth_hz: Frequency up to which the error is reduced; sets the gains.
+        kp: Proportional gain, um of correction per um of error, instead of a bandwidth.
+        ki_per_s: Integral gain per s, instead of a bandwidth.
     """
 
     kind: Literal["pi"] = "pi"
@@ -179,7 +179,7 @@ class PiFeedbackConfig(_AnyFeedback):
     def _one_way(self) -> Self:
         by_gains = self.kp is not None or self.ki_per_s is not None
         if by_gains == (self.bandwidth_hz is not None) or (by_gains and self.ki_per_s is None):
-            raise ValueError("must have either bandwidth_hz or ki_per_s, the latter with kp or not")
+            raise ValueError("must have either bandwidth_hz or ki_per_s (with or without kp)")
         return self
 
 
@@ -187,8 +187,8 @@ class IntegralFeedbackConfig(_AnyFeedback):
     """An integrator of the mean error of each block, for every device: see loop/feedback.py.
 
     Attributes:
-        bandwidth_hz: Frequency below which offset, creep and drift are taken out; a disturbance
-            that comes at once fades as e^(-2 pi bandwidth t).
+        bandwidth_hz: Frequency below which offset, creep and drift are corrected; a step
+            disturbance decays as e^(-2 pi bandwidth t).
     """
 
     kind: Literal["integral"]
@@ -199,13 +199,13 @@ class AdaptationConfig(StrictModel):
     """Slow adaptation of the compensator's model by the tracking error: see loop/adaptation.py.
 
     Attributes:
-        time_constant_s: Time in which what is wrong with the model falls to 1/e.
-        offset_um: Largest offset that is adapted; left out, a tenth of ``limits.stroke_um``, or 0
-            with feedback, which takes the offset out itself.
-        gain: Largest change of the gain, as a share of the identified one.
-        weight: Largest weight of each of the plays after the model, as such a share.
-        noise_um: Standard deviation of the sensor's noise, for the dead zone; left out, that of the
-            rest before the waveform, which ``condition`` or ``compensator.offset: measured`` gives.
+        time_constant_s: Time in which the model error decays to 1/e.
+        offset_um: Largest adapted offset. Default: a tenth of ``limits.stroke_um``, or 0 with
+            feedback, which corrects the offset itself.
+        gain: Largest change of the gain, relative to the identified one.
+        weight: Largest weight of each of the plays after the model, in the same way.
+        noise_um: Standard deviation of the sensor's noise, for the dead zone. Default: that of the
+            rest before the waveform (``condition`` or ``compensator.offset: measured``).
         sensor_delay_s: See ``feedback``.
     """
 
@@ -228,14 +228,14 @@ FeedbackConfig: TypeAlias = Annotated[
 
 
 class Limits(InterlockSettings):
-    """What the limiter and the interlocks hold the run to; the limiter is last before the device.
+    """Limits of the run for the limiter, which is last before the device, and the interlocks.
 
     Attributes:
         peak_current_a: Largest magnitude of the coil current, for devices driven in A.
         slew_a_per_s: Fastest change of the coil current.
         drive_v: Lowest and highest drive voltage, for devices driven in V.
         slew_v_per_s: Fastest change of the drive voltage.
-        stroke_um: Displacements that the sensor may show; outside, the run ends by its safe ramp.
+        stroke_um: Range of measured displacements; outside, the run ends with its safe ramp.
     """
 
     peak_current_a: Annotated[float, Field(gt=0.0)] | None = None
@@ -259,7 +259,7 @@ class Limits(InterlockSettings):
 
     @property
     def unit(self) -> CommandUnit:
-        """Unit of the commands that are limited."""
+        """Unit of the limited commands."""
         return "V" if self.drive_v is not None else "A"
 
     @property
@@ -272,5 +272,72 @@ class Limits(InterlockSettings):
 
     @property
     def slew_per_s(self) -> float:
-        """Fastest change of the command, in :attr:`unit` a second."""
+        """Fastest change of the command, in :attr:`unit` per second."""
         return self.slew_v_per_s or self.slew_a_per_s or 0.0
+
+
+MOST_LABELS = 32
+LONGEST_TEXT = 500
+_KEY = "[A-Za-z][A-Za-z0-9_]{0,39}"
+_NUMBER = re.compile(r"-?(?:0|[1-9]\d*)(?:\.\d+)?(?:[eE][+-]?\d+)?")  # as in JSON
+
+
+def _value(value: Any) -> Any:
+    if isinstance(value, bool) or not isinstance(value, str | int | float):
+        rule = "must be text or a number"
+        raise ValueError(f"{rule}: {value!r}")  # noqa: TRY004  pydantic wants this one
+    if isinstance(value, str) and len(value) > LONGEST_TEXT:
+        raise ValueError(f"must have at most {LONGEST_TEXT} characters: it has {len(value)}")
+    return value
+
+
+def _key(key: str) -> str:
+    if not re.fullmatch(_KEY, key):
+        rule = "a key must be at most 40 letters, digits and '_', and begin with a letter"
+        raise ValueError(f"{rule}: {key!r}")
+    return key
+
+
+def _not_too_many(labels: dict[str, Any]) -> dict[str, Any]:
+    if len(labels) > MOST_LABELS:
+        raise ValueError(f"must be at most {MOST_LABELS}: there are {len(labels)}")
+    return labels
+
+
+Labels: TypeAlias = Annotated[
+    dict[
+        Annotated[str, AfterValidator(_key)],
+        Annotated[
+            LabelValue,
+            BeforeValidator(_value),
+            WithJsonSchema(
+                {"anyOf": [{"type": "string", "maxLength": LONGEST_TEXT}, {"type": "number"}]}
+            ),
+        ],
+    ],
+    AfterValidator(_not_too_many),
+    Field(
+        json_schema_extra={"maxProperties": MOST_LABELS, "propertyNames": {"pattern": f"^{_KEY}$"}}
+    ),
+]
+
+
+def label_settings(texts: Sequence[str]) -> list[str]:
+    """Return ``--label key=value`` as settings over an experiment file.
+
+    A value in the form of a JSON number is a number (so not one with leading zeros, such as a
+    serial number); any other value is text.
+
+    Raises:
+        ConfigError: Texts of another form; all are listed.
+    """
+    problems, settings = [], []
+    for text in texts:
+        key, equals, value = text.partition("=")
+        if not equals or not re.fullmatch(_KEY, key):
+            rule = "must be key=value; the key is a letter and up to 39 letters, digits and '_'"
+            problems.append(ConfigProblem(f"--label {text}", "", rule))
+        settings.append(f"labels.{key}={value if _NUMBER.fullmatch(value) else json.dumps(value)}")
+    if problems:
+        raise ConfigError(problems)
+    return settings

@@ -1,7 +1,7 @@
-"""A first experiment for a device: small, slow, and with every value explained.
+"""Generate a first experiment for a device: small, slow, and with every value explained.
 
-It moves a fifth of what the device can put out, without a compensator: whoever has wired a rig sees
-by it whether signs, gains and ranges are as they thought, before a model is identified.
+It uses a fifth of the device's range without a compensator, to verify signs, gains and ranges of
+the wiring before a model is identified.
 """
 
 import math
@@ -17,8 +17,7 @@ from hilctl.base.errors import ConfigError, ConfigProblem, InputError
 from hilctl.base.files import TextFiles
 from hilctl.base.types import CommandUnit
 from hilctl.base.yaml import Document, commented, did_you_mean, dump
-from hilctl.experiment.device import known_devices, made_device
-from hilctl.experiment.inventory import describe, shipped_profiles
+from hilctl.experiment.devices import describe, known_devices, made_device, shipped_profiles
 from hilctl.experiment.load import resolve
 from hilctl.experiment.preflight import check
 
@@ -32,15 +31,15 @@ _BLOCK_S = 0.01
 
 @dataclass(frozen=True, slots=True)
 class TemplateDevice:
-    """What an experiment is written for.
+    """Device of a new experiment.
 
     Attributes:
-        name: What it was asked for by, without folder and ending.
-        title: The device, for people.
+        name: Requested name, without folder and suffix.
+        title: The device in words.
         section: Its section of the experiment, ``kind`` first.
-        remarks: What stands behind a value, by dotted key of the experiment.
-        asked: Dotted keys that only the owner of the rig can know, each with the question.
-        notes: What must be known before anything is wired.
+        remarks: Comments on values, by dotted key of the experiment.
+        asked: Dotted keys to ask the user for, each with the question.
+        notes: Notes to read before wiring.
     """
 
     name: str
@@ -55,22 +54,22 @@ LIMITS_ASKED = {
     "A": {"limits.peak_current_a": "largest current of the first runs, A"},
     "V": {"limits.drive_v": "lowest and highest voltage of the first runs, [low, high]"},
 }
-"""What is asked about limits, by the unit of the command."""
+"""Questions about limits, by the unit of the command."""
 
 
 def starting_device(
     name: str, folder: Path, unit: CommandUnit = "A", reader: str | None = None
 ) -> TemplateDevice:
-    """Return what an experiment for a device begins with.
+    """Return the device of a new experiment.
 
     Args:
         name: Device, shipped profile, or path of a profile.
-        folder: Where the experiment will stand: a profile is named from there.
-        unit: What the actuator is driven with, where an amplifier stands behind an output.
-        reader: Profile of the device that reads the sensor, where it is another one.
+        folder: Folder of the experiment, base of the profile's path.
+        unit: Unit that drives the actuator, if an amplifier follows the output.
+        reader: Profile of the device that reads the sensor, if it is another one.
 
     Raises:
-        InputError: There is none of this name, or it can't drive an actuator by itself.
+        InputError: The name is unknown, or the device cannot drive an actuator by itself.
     """
     kinds, profiles = known_devices(), shipped_profiles()
     if name in kinds and not any(option.name == "profile" for option in describe(name).options):
@@ -88,7 +87,7 @@ def starting_device(
     module, _, function = STARTING_SECTION.partition(":")
     made = getattr(import_module(module), function)(name, unit, reader)
     section = dict(made.values)
-    if own:  # a path in an experiment is from its own folder
+    if own:
         section["profile"] = os.path.relpath(name, folder)
     prefixed = ({f"device.{key}": text for key, text in each.items()}
                 for each in (made.remarks, made.asked))  # fmt: skip
@@ -99,15 +98,15 @@ def starting_device(
 def starting_experiment(
     device: TemplateDevice, path: Path, settings: Sequence[str] = ()
 ) -> tuple[str, DeviceInfo]:
-    """Return the text of a first experiment, which has been checked, and what its device says.
+    """Return the text of a first experiment that passes the check, and the device's facts.
 
     Args:
-        device: What it is for.
-        path: File that it will stand in; nothing is written.
+        device: The device.
+        path: Future file of the experiment; nothing is written.
         settings: ``key=value`` texts over it.
 
     Raises:
-        InputError: With these settings it may not start; all reasons are listed.
+        InputError: The experiment is rejected with these settings; all reasons are listed.
     """
     files = TextFiles()
     named = {"name": path.stem, "device": dict(device.section)}
@@ -139,16 +138,14 @@ def _set(document: Document, settings: Sequence[str]) -> None:
 def _head(device: TemplateDevice, path: Path) -> str:
     lines = [_SCHEMA_LINE, "#", f"# A first experiment for {device.title}, by hilctl init."]
     if any(text.startswith("set:") for text in device.remarks.values()):
-        lines.append(
-            "# Put your own values where it says 'set:'; those that stand there are nobody's."
-        )
+        lines.append("# Replace the values marked 'set:' by those of your rig.")
     if device.notes:
         profile = device.section.get("profile")
         lines.append(f"# Before anything is wired, read the notes: hilctl devices show {profile}")
     commands = {
-        f"hilctl check {path.name}": "what would it do? nothing moves",
-        f"hilctl run {path.name}": "it moves, and is recorded",
-        f"hilctl characterise {path.name} --output model.yaml": "finds a model within the limits",
+        f"hilctl check {path.name}": "forecast; nothing moves",
+        f"hilctl run {path.name}": "the actuator moves, and the run is recorded",
+        f"hilctl characterise {path.name} --output model.yaml": "identify a model",
     }
     width = max(map(len, commands))
     lines += [f"#     {command:{width}}   {what}" for command, what in commands.items()]
@@ -159,7 +156,7 @@ def _head(device: TemplateDevice, path: Path) -> str:
 
 
 def _first_values(info: DeviceInfo) -> tuple[dict[str, Any], dict[str, str]]:
-    """Return all keys but those of the device, and what stands behind them."""
+    """Return all keys except those of the device, and their comments."""
     rate_hz = _below(min(info.max_rate_hz, _BUFFERED_HZ if info.buffered else _PACED_HZ))
     frequency_hz = _below(min(rate_hz / 100.0, 1.0))
     low, high = (_rounded(_SHARE * each, 2) for each in (info.command_min, info.command_max))
@@ -186,7 +183,7 @@ def _first_values(info: DeviceInfo) -> tuple[dict[str, Any], dict[str, str]]:
 
 
 def _sine(unit: CommandUnit, low: float, high: float, frequency_hz: float) -> dict[str, Any]:
-    """Return a sine of half of the way between limits, around 0 where it can be."""
+    """Return a sine of half the range between limits, around 0 if possible."""
     cycle_s = 1.0 / frequency_hz
     offset = 0.0 if low < 0.0 < high else 0.5 * (low + high)
     return {
@@ -209,16 +206,16 @@ def _limits(
     value: Any = min(high, -low)
     if unit == "A" and value <= 0.0:
         raise InputError(
-            f"{info.name}: takes {ends} A, and limits.peak_current_a holds both ways, so that "
-            "0 A must lie inside: give the offset of its amplifier, device.amplifier.offset_a"
+            f"{info.name}: its range, {ends} A, must include 0 A, because limits.peak_current_a "
+            "applies to both signs: set the offset of its amplifier, device.amplifier.offset_a"
         )
     if unit == "V":
         peak, slew_key, value = "drive_v", "slew_v_per_s", [low, high]
     stroke = [_rounded(0.9 * each, 3) for each in (info.sensor_min_um, info.sensor_max_um)]
     return {peak: value, slew_key: slew, "stroke_um": stroke}, {
-        f"limits.{peak}": f"set: what your actuator bears; the device takes {ends} {unit}",
+        f"limits.{peak}": f"set: rating of your actuator; range of the device {ends} {unit}",
         f"limits.{slew_key}": f"fastest change of the command, {unit}/s",
-        "limits.stroke_um": "set: displacements beyond end the run by its safe ramp",
+        "limits.stroke_um": "set: displacements outside end the run with its safe ramp",
     }
 
 
@@ -227,7 +224,7 @@ def _below(limit: float) -> float:
 
 
 def _rounded(value: float, digits: int) -> float:
-    """Return a value with so many significant digits, towards zero: a limit must not grow."""
+    """Return a value rounded towards zero, because a limit must not grow."""
     if value == 0.0:
         return 0.0
     step = 10.0 ** (math.floor(math.log10(abs(value))) - digits + 1)

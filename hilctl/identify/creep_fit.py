@@ -12,7 +12,7 @@ from scipy.optimize import nnls
 
 from hilctl.base.types import F64, I64
 from hilctl.identify.data.records import FEWEST_POINTS, History, Record
-from hilctl.models.creep import CreepModel
+from hilctl.models.linear_stages import CreepModel
 
 COARSE_S = 1e-3
 LEAST_REST_S = 0.5

@@ -10,7 +10,7 @@ from hilctl.identify.fit_data import FitData
 from hilctl.identify.parallel import MapFunction, serial_map
 from hilctl.identify.settings import FitSettings
 from hilctl.models.base import HysteresisModel
-from hilctl.models.mechanics import FurtherMode
+from hilctl.models.linear_stages import FurtherMode
 
 LEAST_SLOPE = 0.01
 """Smallest slope that a model may have, of the mean slope of the data."""

@@ -17,8 +17,7 @@ from hilctl.identify.staged.sensitivity import (
     plays_and_slopes,
 )
 from hilctl.kernels.hysteresis import play_outputs, play_sum_shared, rest_memory
-from hilctl.models.butterfly import ButterflyModel
-from hilctl.models.integrated import IntegratedModel
+from hilctl.models.integrated import ButterflyModel, IntegratedModel
 from hilctl.models.plays import PlayModel
 
 # A lag needs every sample: models with one would take the others for a rest.

@@ -27,7 +27,7 @@ from hilctl.identify.parallel import MapFunction, workers
 from hilctl.identify.registry import entry
 from hilctl.identify.resonances import WORTH, further_modes
 from hilctl.identify.settings import IdentifySettings
-from hilctl.models.mechanics import FirstMode, FurtherMode
+from hilctl.models.linear_stages import FirstMode, FurtherMode
 from hilctl.models.model_file import dump_model
 
 TURNS = 4  # each identifies a new model

@@ -17,7 +17,7 @@ from scipy.optimize import least_squares
 from hilctl.base.errors import ModelError
 from hilctl.base.types import C128, F64
 from hilctl.identify.data.records import History, Record
-from hilctl.models.mechanics import FurtherMode
+from hilctl.models.linear_stages import FurtherMode
 
 SEGMENT_S = 0.3  # long beside the time that what rings takes to die away, short beside a record
 FASTEST_HZ = 20e3  # sample rate: no structure of an actuator is looked for beyond a quarter of it

@@ -1,20 +1,21 @@
-"""Compiled hysteresis operators, and what else is worked out sample by sample: pure functions.
+"""Compiled arithmetic per sample: pure functions of plain arrays.
 
-Rules of this folder: explicit signatures, no globals, no objects, state passed in and updated in
-place, and every kernel stands in one file with all that it calls, because numba's on-disk cache
-does not notice a callee that changed in another file. Units live one level above.
+Rules: explicit signatures, no globals, no objects; state is an argument, updated in place. A kernel
+and all kernels that it calls are in one file, because numba's on-disk cache does not detect a
+changed callee in another file.
 
-    jit.py       the decorator of all kernels
-    hysteresis.py  play, stop, deadband, their sums, the integrated model and its inverse
-    implicit.py  operators whose inverse is found root by root: Preisach, KP, Bouc-Wen, Duhem
-    envelope.py  play operators between envelopes
-    field.py     plays and drags of an effective field, its losses, and their inverse
-    residual.py  plays, drags and rate of a modelled displacement, and what undoes them
-    dynamics.py  field lag, structure, delay, creep and modes, and their inverses
-    atomics.py   numbers in shared memory that say of other data that they are there
-    limit.py     peak and slew limits of a command
-    interlock.py what ends a run, looked at in every sample
-    packed.py    messages of a recording's chunk, and their packed lists
+jit.py           the decorator of all kernels
+hysteresis.py    play, stop and deadband operators, the integrated model
+implicit_models.py  Preisach, KP, Bouc-Wen and Duhem models with numeric inverses
+generalised_play.py  plays between envelopes
+generalised_duhem.py the generalised Duhem operator
+field.py         plays and drags of an effective field with losses
+residual_operator.py the residual of a modelled displacement
+gradient.py      adaptation by the gradient
+dynamics.py      field lag, structure, delay, creep, modes
+atomics.py       ordered loads and stores in shared memory
+limit.py         range and slew limits of a command
+interlock.py     interlocks of a run
 """
 
 import os

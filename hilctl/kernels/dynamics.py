@@ -18,7 +18,7 @@ import math
 import numpy as np
 
 from hilctl.base.types import F64
-from hilctl.kernels.jit import STAGE, kernel
+from hilctl.kernels.jit import kernel
 
 # Share of the fastest change the lag allows that its inverse asks for; towards 1 the command that
 # takes grows beyond all bounds.
@@ -150,7 +150,7 @@ def _oldest(memory: F64, now: float) -> float:
     return left
 
 
-@kernel(STAGE)
+@kernel("void(float64[::1], float64[::1], float64[::1], float64[::1])")
 def weigh_block(x: F64, weights: F64, memory: F64, out: F64) -> None:
     """Sum a signal's last values, each with its weight.
 
@@ -198,18 +198,6 @@ def between_block(x: F64, part: float, memory: F64, out: F64) -> None:
         out[k] = before + part * (now - before)
 
 
-@kernel(STAGE)
-def lead_stage(x: F64, parameters: F64, memory: F64, out: F64) -> None:
-    """Run :func:`lead_block`; parameters: periods, growth."""
-    lead_block(x, parameters[0], parameters[1], memory, out)
-
-
-@kernel(STAGE)
-def between_stage(x: F64, parameters: F64, memory: F64, out: F64) -> None:
-    """Run :func:`between_block`; parameters: part."""
-    between_block(x, parameters[0], memory, out)
-
-
 # Creep
 
 
@@ -226,8 +214,8 @@ def _crept(parameters: F64, memory: F64) -> float:
     return total
 
 
-@kernel(STAGE)
-def creep_stage(x: F64, parameters: F64, memory: F64, out: F64) -> None:
+@kernel("void(float64[::1], float64[::1], float64[::1], float64[::1])")
+def creep_block(x: F64, parameters: F64, memory: F64, out: F64) -> None:
     """Add what creeps to a displacement.
 
     Args:
@@ -243,9 +231,9 @@ def creep_stage(x: F64, parameters: F64, memory: F64, out: F64) -> None:
         out[k] = x[k] + total
 
 
-@kernel(STAGE)
-def uncreep_stage(y: F64, parameters: F64, memory: F64, out: F64) -> None:
-    """Undo :func:`creep_stage`: take off what has crept."""
+@kernel("void(float64[::1], float64[::1], float64[::1], float64[::1])")
+def uncreep_block(y: F64, parameters: F64, memory: F64, out: F64) -> None:
+    """Undo :func:`creep_block`: take off what has crept."""
     for k in range(y.size):
         x = y[k] - _crept(parameters, memory)
         memory[memory.size - 1] = x
@@ -269,8 +257,8 @@ def _keep(position: float, velocity: float, x: float, memory: F64) -> None:
     memory[0], memory[1], memory[2] = position, velocity, x
 
 
-@kernel(STAGE)
-def mode_stage(x: F64, parameters: F64, memory: F64, out: F64) -> None:
+@kernel("void(float64[::1], float64[::1], float64[::1], float64[::1])")
+def mode_block(x: F64, parameters: F64, memory: F64, out: F64) -> None:
     """Let a displacement pass a pair.
 
     Args:
@@ -292,9 +280,9 @@ def mode_stage(x: F64, parameters: F64, memory: F64, out: F64) -> None:
         out[k] = parameters[8] * position + parameters[9] * velocity + parameters[10] * now
 
 
-@kernel(STAGE)
-def unmode_stage(y: F64, parameters: F64, memory: F64, out: F64) -> None:
-    """Undo :func:`mode_stage`, exactly."""
+@kernel("void(float64[::1], float64[::1], float64[::1], float64[::1])")
+def unmode_block(y: F64, parameters: F64, memory: F64, out: F64) -> None:
+    """Undo :func:`mode_block`, exactly."""
     for k in range(y.size):
         now = y[k]
         p, q = _carried(parameters, memory)

@@ -16,7 +16,7 @@ Magnetostrictive Actuators", Concordia; equation numbers are that dissertation's
 import numpy as np
 
 from hilctl.base.types import F64
-from hilctl.kernels.jit import STAGE, kernel
+from hilctl.kernels.jit import kernel
 
 
 @kernel("float64(float64, float64, float64, float64)")
@@ -250,46 +250,6 @@ def integrated_inverse(
         _move_plays(x, widening, thresholds, memory)
         out[k] = direct * x + _weigh(weights, memory)
         memory[thresholds.size] = x
-
-
-@kernel(STAGE)
-def play_sum_stage(v: F64, parameters: F64, memory: F64, out: F64) -> None:
-    """Run :func:`play_sum`; parameters: rate_gain, direct, thresholds, weights."""
-    m = memory.size - 1
-    thresholds, weights = parameters[2 : 2 + m], parameters[2 + m :]
-    play_sum(v, parameters[0], parameters[1], thresholds, weights, memory, out)
-
-
-@kernel(STAGE)
-def stop_sum_stage(v: F64, parameters: F64, memory: F64, out: F64) -> None:
-    """Run :func:`stop_sum`; parameters: direct, thresholds, weights."""
-    m = memory.size - 1
-    stop_sum(v, parameters[0], parameters[1 : 1 + m], parameters[1 + m :], memory, out)
-
-
-@kernel(STAGE)
-def integrated_inverse_stage(y: F64, parameters: F64, memory: F64, out: F64) -> None:
-    """Run :func:`integrated_inverse`.
-
-    Parameters: slope, rate_gain, direct, sizes of d_up and d_down, d_up, g_up, d_down, g_down,
-    thresholds, weights.
-    """
-    m, up, down = memory.size - 1, int(parameters[3]), int(parameters[4])
-    d_down, plays = 5 + 2 * up, 5 + 2 * up + 2 * down
-    integrated_inverse(
-        y,
-        parameters[0],
-        parameters[5 : 5 + up],
-        parameters[5 + up : d_down],
-        parameters[d_down : d_down + down],
-        parameters[d_down + down : plays],
-        parameters[1],
-        parameters[2],
-        parameters[plays : plays + m],
-        parameters[plays + m :],
-        memory,
-        out,
-    )
 
 
 def rest_memory(operators: int) -> F64:

@@ -21,7 +21,7 @@ from typing import TypeAlias
 import numpy as np
 
 from hilctl.base.types import F64
-from hilctl.kernels.jit import STAGE, kernel
+from hilctl.kernels.jit import kernel
 
 Arrays: TypeAlias = tuple[F64, F64, F64]
 
@@ -249,17 +249,3 @@ def implicit_inverse(
             out[k] = now
         else:
             out[k] = np.nan
-
-
-@kernel(STAGE)
-def implicit_inverse_stage(y: F64, parameters: F64, memory: F64, out: F64) -> None:
-    """Run :func:`implicit_inverse`.
-
-    Parameters: number of the model, low, high, tolerance, sizes of the first two arrays, the three
-    arrays.
-    """
-    first = 6 + int(parameters[4])
-    second = first + int(parameters[5])
-    arrays = parameters[6:first], parameters[first:second], parameters[second:]
-    span = parameters[1], parameters[2]
-    implicit_inverse(int(parameters[0]), y, span, parameters[3], arrays, memory, out)

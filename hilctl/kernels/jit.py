@@ -11,12 +11,6 @@ from numba.extending import typeof_impl
 _CONFIG: Any = numba.config
 Function = TypeVar("Function", bound=Callable[..., object])
 
-STAGE = "void(float64[::1], float64[::1], float64[::1], float64[::1])"
-"""Signature of a kernel whose parameters are in one array: input, parameters, memory, output.
-
-Output and input may be one array.
-"""
-
 
 class _Kernel:
     """A function that numba compiles, or loads from its cache, at the first use."""

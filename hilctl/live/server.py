@@ -22,8 +22,8 @@ from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
 from hilctl.base.errors import HilctlError, InputError, RunError
+from hilctl.base.files import ADDRESS_REMEDIES, reason
 from hilctl.base.formatting import finite_json
-from hilctl.base.os_errors import ADDRESS_REMEDIES, reason
 from hilctl.live.auth import PROTOCOL, Admission, PendingConnections, bounded
 from hilctl.live.frame_codec import frame_of, nearest_window_s
 from hilctl.live.page_session import MAX_MESSAGE_BYTES, PageMessage, PageSession, answer_text

@@ -1,4 +1,4 @@
-"""What every model has: parameters that obey its conditions, and operators that stream."""
+"""Common parts of all models: parameters with their conditions, and streaming operators."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -14,20 +14,17 @@ from hilctl.kernels.hysteresis import rest_memory
 BlockKernel: TypeAlias = Callable[[F64, F64, F64], None]
 """A kernel with its parameters bound: (input[n], memory, output[n])."""
 
-StageKernel: TypeAlias = Callable[[F64, F64, F64, F64], None]
-"""A kernel of the signature :data:`hilctl.kernels.jit.STAGE`."""
-
 MAX_OPERATORS = 10_000
-"""Most operators of a model: more would take milliseconds a sample."""
+"""Largest number of operators of a model: more would take milliseconds per sample."""
 
 Thresholds: TypeAlias = tuple[Annotated[float, Field(allow_inf_nan=False)], ...]
 Weights: TypeAlias = tuple[Annotated[float, Field(allow_inf_nan=False)], ...]
 
 
 class Operator:
-    """A hysteresis operator that works through a signal block by block.
+    """A hysteresis operator that processes a signal block by block.
 
-    Any cut of a signal into blocks gives the same bits as one call.
+    The results have the same bits for any division into blocks.
 
     Args:
         kernel: Bound kernel, see :data:`BlockKernel`.
@@ -53,36 +50,36 @@ class Operator:
         self._output_offset = output_offset
 
     @classmethod
-    def staged(
+    def bound(
         cls,
-        kernel: StageKernel,
-        parameters: F64,
+        kernel: Callable[..., None],
+        parameters: tuple[Any, ...],
         operators: int,
         *,
         input_offset: float = 0.0,
         output_offset: float = 0.0,
     ) -> "Operator":
-        """Return an operator whose kernel takes its parameters as one array.
+        """Return an operator from a kernel and its parameters.
 
         Args:
-            kernel: See :data:`StageKernel`.
-            parameters: float64[p], what it takes.
+            kernel: Called with input, parameters, memory and output.
+            parameters: Parameters between input and memory.
             operators: Number of operators with memory.
             input_offset: Added to the input first.
             output_offset: Added to the output last.
         """
 
         def run(block: F64, memory: F64, out: F64) -> None:
-            kernel(block, parameters, memory, out)
+            kernel(block, *parameters, memory, out)
 
-        return Operator(run, operators, input_offset=input_offset, output_offset=output_offset)
+        return cls(run, operators, input_offset=input_offset, output_offset=output_offset)
 
     def process(self, block: F64, out: F64 | None = None) -> F64:
-        """Run one block through and remember where it ended.
+        """Process one block and update the memory.
 
         Args:
             block: float64[n], contiguous.
-            out: float64[n] to fill; made anew where not given.
+            out: float64[n] to fill; None for a new array.
 
         Returns:
             float64[n], the output.
@@ -92,7 +89,7 @@ class Operator:
         if self._input_offset != 0.0:
             block = block + self._input_offset
         elif not block.flags.writeable:
-            block = block.copy()  # the kernels' signatures refuse read-only arrays
+            block = block.copy()  # the kernels reject read-only arrays
         self._kernel(block, self._memory, out)
         if self._output_offset != 0.0:
             out += self._output_offset
@@ -106,40 +103,40 @@ class Operator:
         return out
 
     def restore(self, state: F64) -> None:
-        """Go back to a state that :meth:`state` returned.
+        """Restore a state from :meth:`state`.
 
         Raises:
-            ModelError: The state is of another model.
+            ModelError: The state belongs to another model.
         """
         if state.shape != self._memory.shape:
             raise ModelError(
                 f"state must have {self._memory.size} values, as this model's memory has: "
                 f"got {state.size}"
             )
-        if np.isinf(state).any():  # NaN is right: no input yet, or one that was none
+        if np.isinf(state).any():  # NaN is allowed: no input yet
             raise ModelError("state must have no infinite value")
         self._memory[:] = state
 
     def keep_in(self, memory: F64) -> None:
-        """Keep the memory, as it is now, in a given place from now on."""
+        """Move the memory into a given array."""
         memory[:] = self._memory
         self._memory = memory
 
     def stand(self, seconds: float) -> None:
-        """Let time pass with the input as it was last: what that changes is creep alone."""
+        """Let time pass at constant input, which only affects creep."""
 
     def reset(self, first_input: float | None = None) -> None:
-        """Start from rest; where ``first_input`` is given, as if the signal had begun there."""
+        """Start from rest, or from a signal that began with ``first_input``."""
         self._memory[:] = self._rest
         if first_input is not None:
             self.process(np.array([first_input]))
 
 
 class IdentifiedRange(StrictModel):
-    """The motions that a model was identified on; beyond them its error is not known.
+    """The motions that a model was identified on; beyond them its error is unknown.
 
     Attributes:
-        peak_to_peak_um: Peak-to-peak displacement of the smallest and of the largest of them.
+        peak_to_peak_um: Smallest and largest peak-to-peak displacement.
         frequency_hz: Lowest fundamental, and highest frequency of a command.
         speed_um_per_s: Largest speed.
     """
@@ -157,15 +154,15 @@ class IdentifiedRange(StrictModel):
 
 
 class Provenance(StrictModel):
-    """Where a model's parameters come from.
+    """Origin of the parameters of a model.
 
     Attributes:
         source: Recordings, data files or publication.
-        method: How the parameters were found.
-        grid: The loops they were found on.
-        parameters: Parameters of the parametrisation that was fitted, by name.
+        method: Identification method.
+        grid: The loops used.
+        parameters: Fitted parameters by name.
         errors_percent: Model errors, by name, in percent of the peak-to-peak output.
-        identified_range: The motions that it was identified on; None where that is not known.
+        identified_range: The motions used; None if unknown.
         versions: Software versions, by name.
         created: Date and time in ISO 8601, UTC.
     """
@@ -185,11 +182,11 @@ class HysteresisModel(StrictModel, ABC):
 
     Attributes:
         input_unit: Unit of the command, ``A`` or ``V``.
-        input_range: Lowest and highest command that the model was found on.
-        output_range_um: Lowest and highest displacement that it was found on; beyond it the model
-            is a guess, and a reference that goes there is refused.
-        output_offset_um: Displacement where the operators' output is 0.
-        provenance: Where the parameters come from.
+        input_range: Lowest and highest command the model was identified on.
+        output_range_um: Lowest and highest displacement it was identified on; a reference beyond
+            them is rejected.
+        output_offset_um: Displacement at which the operators' output is 0.
+        provenance: Origin of the parameters.
     """
 
     input_unit: CommandUnit = "A"
@@ -234,13 +231,13 @@ class HysteresisModel(StrictModel, ABC):
 
 
 def refuse(problems: Iterable[str]) -> None:
-    """Raise one ValueError that names every broken condition; none where there is none."""
+    """Raise one ValueError that names every broken condition, if any."""
     if text := "; ".join(problems):
         raise ValueError(text)
 
 
 def threshold_problems(name: str, thresholds: Thresholds, *, sign: int = 1) -> Iterator[str]:
-    """Say where thresholds don't move away from 0, each further out; indices count from 1."""
+    """Yield thresholds that do not move away from 0; indices count from 1."""
     last = 0.0
     order = "rise from 0" if sign > 0 else "fall from 0"
     for i, threshold in enumerate(thresholds, start=1):
@@ -253,13 +250,13 @@ def threshold_problems(name: str, thresholds: Thresholds, *, sign: int = 1) -> I
 
 
 def length_problems(name: str, values: Weights, thresholds: Thresholds) -> Iterator[str]:
-    """Say whether there is not one weight for each threshold."""
+    """Yield a mismatch of the numbers of weights and thresholds."""
     if len(values) != len(thresholds):
-        yield f"{name} must have one value a threshold: {len(values)} for {len(thresholds)}"
+        yield f"{name} must have one value per threshold: {len(values)} for {len(thresholds)}"
 
 
 def play_weight_problems(direct: float, weights: Weights) -> Iterator[str]:
-    """Say which conditions for inverting a sum of plays are broken (5.5, 5.10)."""
+    """Yield broken conditions for the inverse of a sum of plays (5.5, 5.10)."""
     if not direct > 0.0:
         yield f"a_0 must be > 0 for the inverse to exist: {direct!r}"
     for i, weight in enumerate(weights, start=1):

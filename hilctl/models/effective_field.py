@@ -1,16 +1,15 @@
-"""Hysteresis of an effective field, with the losses that follow the permeability."""
+"""The effective-field model: plays and drags of a field, a curve, eddy-current losses."""
 
 import math
 from collections.abc import Iterator
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 
 from hilctl.base.strict import Field, StrictModel, model_validator
-from hilctl.base.types import F64
 from hilctl.kernels.field import Bank, Losses, field_forward, field_inverse
 from hilctl.models.base import HysteresisModel, Operator, Thresholds, Weights, refuse
-from hilctl.models.preisach import cell_problems, table_problems
+from hilctl.models.implicit_models import cell_problems, table_problems
 
 _TOLERANCE_UM = 1e-6
 _EVEN = 1e-3
@@ -20,21 +19,22 @@ NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 
 
 def even_excess(span: float) -> float:
-    """Return e_0, below which the excess loss is even, for a span of effective fields."""
+    """Return e_0, below which the excess loss is linear, for a span of effective fields."""
     return _EVEN * span
 
 
 class FieldLosses(StrictModel):
-    """What a command is ahead of the field by: v = w + z, z + decay_s z' = h(e).
+    """Lead of a command over the field: v = w + z, z + decay_s z' = h(e).
 
     e = field_s w' + output_s m', h(e) = e (1 + growth |e| + bend e^2 + excess / sqrt(|e| + e_0)).
 
     Attributes:
-        field_s: In s; a lag of the field that is always the same.
-        output_s: In command units s a um; eddy currents, which follow the slope of the hysteresis.
-        decay_s: In s; the field inside a rod comes later than that at its surface.
-        growth: One over the command's unit.
-        bend: One over the command's unit squared.
+        field_s: In s; constant lag of the field.
+        output_s: In command units times s per um; eddy currents, which follow the slope of the
+            hysteresis.
+        decay_s: In s; delay of the field inside a rod.
+        growth: Per command unit.
+        bend: Per command unit squared.
         excess: Square root of the command's unit; losses of domain walls in motion.
     """
 
@@ -46,10 +46,9 @@ class FieldLosses(StrictModel):
     excess: NotNegative = 0.0
 
     def sampled(self, sample_rate_hz: float, span: float) -> Losses:
-        """Return them as kernels take them, for a span of effective fields.
+        """Return the losses in the form of the kernels, for a span of effective fields.
 
-        Commands are means over a sample, and so must what is lost of them be: that at its end
-        would be later the shorter the samples are.
+        Commands are means over a sample, so losses must be means, too.
         """
         lags = self.decay_s * sample_rate_hz
         left = math.exp(-1.0 / lags) if lags > 0.0 else 0.0
@@ -66,11 +65,11 @@ class FieldLosses(StrictModel):
 
 
 class OutputCurve(StrictModel):
-    """A line through points, from what the operators give to displacement, both rising.
+    """A piecewise linear function from the operators' output to displacement, both rising.
 
     Attributes:
-        operators_um: What the operators give, of which 0 is at rest.
-        displacement_um: Displacement, without the model's offset. The ends go on straight.
+        operators_um: Output of the operators; 0 is at rest.
+        displacement_um: Displacement without the model's offset. The ends continue linearly.
     """
 
     operators_um: Weights
@@ -92,11 +91,10 @@ class OutputCurve(StrictModel):
 class FieldModel(HysteresisModel):
     """Plays and drags of an effective field u = w + coupling m, a curve after them, losses before.
 
-    Small loops inside a large one are what sums of plays of the command get wrong: theirs look
-    alike wherever they lie. Here they change with the output (the curve, the coupling), and, by
-    the drags, with how often they have run. See :mod:`hilctl.kernels.field` for the equations.
+    Unlike those of a sum of plays, minor loops depend on the output (curve, coupling) and, through
+    the drags, on their number of repeats. See :mod:`hilctl.kernels.field` for the equations.
 
-    Outputs come a sample after the commands of a run, as those of a lag do: put it into a
+    The output lags the commands of a run by one sample: use it in a
     :class:`~hilctl.models.staged.StagedModel`.
 
     Attributes:
@@ -104,12 +102,12 @@ class FieldModel(HysteresisModel):
         lengths: k of each drag, > 0.
         lowest: Lower end of the first cell of u, in the input unit.
         cell: Width of a cell of the plays, > 0.
-        slopes: For each line of plays, then for each drag, what it rises by in each cell, um per
-            input unit, >= 0; > 0 throughout the first line, which is what makes the inverse exist.
-            All plays have the same cells, and all drags have: over the same range as the plays'.
-        coupling: Effective field for each um of the operators', in input units a um.
+        slopes: For each line of plays, then for each drag, its slope in each cell, um per input
+            unit, >= 0; > 0 in the first line, so that the inverse exists. All plays have the same
+            cells; all drags have the same, over the range of the plays.
+        coupling: Effective field per um of the operators, in input units.
         curve: From the operators' output to displacement.
-        losses: What the command is ahead by.
+        losses: Lead of the command.
     """
 
     kind: Literal["field"] = "field"
@@ -143,7 +141,7 @@ class FieldModel(HysteresisModel):
             yield f"lengths must be > 0: {list(self.lengths)}"
         if len(self.slopes) != len(self.thresholds) + len(self.lengths):
             yield (
-                f"slopes must have one line a threshold and one a length: {len(self.slopes)} for "
+                f"slopes must have one line per threshold and per length: {len(self.slopes)} for "
                 f"{len(self.thresholds)} and {len(self.lengths)}"
             )
 
@@ -154,11 +152,11 @@ class FieldModel(HysteresisModel):
 
     @property
     def operators(self) -> int:
-        """Number of plays, and of cells of drags, each of which remembers something."""
+        """Number of plays and of cells of drags."""
         return len(self.thresholds) + sum(map(len, self._lines()[1]))
 
     def _numbers(self) -> int:
-        """Return how many numbers the memory has before the previous input."""
+        """Return the size of the memory before the previous input."""
         return self.operators + 3 * len(self.lengths) + 5
 
     def _bank(self) -> Bank:
@@ -175,31 +173,21 @@ class FieldModel(HysteresisModel):
         return np.array(self.thresholds), lengths, values.ravel(), drags.ravel(), grid
 
     def _span(self) -> tuple[float, float, float]:
-        """Return the lowest and the highest u that is tried, and the tolerance."""
+        """Return the lowest and highest u of the search, and the tolerance."""
         width = self.cell * len(self.slopes[0])
         return self.lowest - width, self.lowest + 2.0 * width, _TOLERANCE_UM
 
-    def _curve(self) -> tuple[F64, F64]:
-        return np.array(self.curve.operators_um), np.array(self.curve.displacement_um)
+    def _parameters(self, sample_rate_hz: float) -> tuple[Any, ...]:
+        losses = self.losses.sampled(sample_rate_hz, self.cell * len(self.slopes[0]))
+        curve = np.array(self.curve.operators_um), np.array(self.curve.displacement_um)
+        return self._span(), self._bank(), self.coupling, losses, curve
 
     def forward(self, sample_rate_hz: float) -> Operator:
         """Return the operator from command to um, at rest."""
-        span, bank = self._span(), self._bank()
-        losses = self.losses.sampled(sample_rate_hz, self.cell * len(self.slopes[0]))
-        coupling, curve = self.coupling, self._curve()
-
-        def run(v: F64, memory: F64, out: F64) -> None:
-            field_forward(v, span, bank, coupling, losses, curve, memory, out)
-
-        return Operator(run, self._numbers(), output_offset=self.output_offset_um)
+        parameters, size = self._parameters(sample_rate_hz), self._numbers()
+        return Operator.bound(field_forward, parameters, size, output_offset=self.output_offset_um)
 
     def inverse(self, sample_rate_hz: float) -> Operator:
         """Return the operator from um to command, at rest."""
-        span, bank = self._span(), self._bank()
-        losses = self.losses.sampled(sample_rate_hz, self.cell * len(self.slopes[0]))
-        coupling, curve = self.coupling, self._curve()
-
-        def run(y: F64, memory: F64, out: F64) -> None:
-            field_inverse(y, span, bank, coupling, losses, curve, memory, out)
-
-        return Operator(run, self._numbers(), input_offset=-self.output_offset_um)
+        parameters, size = self._parameters(sample_rate_hz), self._numbers()
+        return Operator.bound(field_inverse, parameters, size, input_offset=-self.output_offset_um)

@@ -1,4 +1,4 @@
-"""A generalised Duhem operator in a table, with the losses that follow the permeability."""
+"""The generalised Duhem model: tabulated slopes, with eddy-current losses."""
 
 from collections.abc import Iterator
 from typing import Literal, Self, TypeAlias
@@ -19,24 +19,23 @@ _NUMBERS = 3  # of the memory, before the previous input
 class GeneralisedDuhemModel(HysteresisModel):
     """dy/dw = g_up(y, w - c(y)) rising, g_down(y, w - c(y)) falling; losses before it.
 
-    The slope depends on where the actuator stands and on which way it goes, on nothing else. So
-    small loops neither close at once nor look alike wherever they lie: they move towards what
-    Jiles and Atherton call the anhysteretic, which a sum of plays has no means to. What it can't
-    do is remember a turn that it has gone past. See :mod:`hilctl.kernels.generalised_duhem`.
+    The slope depends on position and direction only. So minor loops drift towards the anhysteretic
+    curve of Jiles and Atherton, which a sum of plays cannot represent; but turns are not
+    remembered. See :mod:`hilctl.kernels.generalised_duhem`.
 
-    Outputs come a sample after the commands of a run, as those of a lag do: put it into a
+    The output lags the commands of a run by one sample: use it in a
     :class:`~hilctl.models.staged.StagedModel`.
 
     Attributes:
         lowest_um: First node of y.
         cell_um: Distance of the nodes of y, > 0.
-        centre: c at each node of y, rising, in the input unit; the ends go on straight.
-        flux: m at each, rising, in um; what eddy currents follow.
+        centre: c at each node of y, rising, in the input unit; the ends continue linearly.
+        flux: m at each node, rising, in um; source of eddy currents.
         half_width: Of the band around the centre, in the input unit, > |c(0)|: at rest y and w are
             0. Nodes across it are as far from each other.
         rising: For each node of y, g_up at each node across the band, um per input unit, > 0.
         falling: The same, g_down.
-        losses: What the command is ahead by.
+        losses: Lead of the command.
     """
 
     kind: Literal["generalised_duhem"] = "generalised_duhem"
@@ -88,7 +87,7 @@ class GeneralisedDuhemModel(HysteresisModel):
 
     @property
     def operators(self) -> int:
-        """Number of states: where it stands in the band."""
+        """Number of states: the position in the band."""
         return 1
 
     def _band(self) -> Band:
@@ -101,21 +100,17 @@ class GeneralisedDuhemModel(HysteresisModel):
 
     def forward(self, sample_rate_hz: float) -> Operator:
         """Return the operator from command to um, at rest."""
-        band, losses = self._band(), self._losses(sample_rate_hz)
-
-        def run(v: F64, memory: F64, out: F64) -> None:
-            duhem_forward(v, band, losses, memory, out)
-
-        return Operator(run, _NUMBERS, output_offset=self.output_offset_um)
+        parameters = self._band(), self._losses(sample_rate_hz)
+        return Operator.bound(
+            duhem_forward, parameters, _NUMBERS, output_offset=self.output_offset_um
+        )
 
     def inverse(self, sample_rate_hz: float) -> Operator:
         """Return the operator from um to command, at rest."""
-        band, losses = self._band(), self._losses(sample_rate_hz)
-
-        def run(y: F64, memory: F64, out: F64) -> None:
-            duhem_inverse(y, band, losses, memory, out)
-
-        return Operator(run, _NUMBERS, input_offset=-self.output_offset_um)
+        parameters = self._band(), self._losses(sample_rate_hz)
+        return Operator.bound(
+            duhem_inverse, parameters, _NUMBERS, input_offset=-self.output_offset_um
+        )
 
 
 def band_of(slopes: F64, lines: F64, lowest_um: float, cell_um: float, half_width: float) -> Band:

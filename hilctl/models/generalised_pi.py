@@ -17,18 +17,18 @@ from hilctl.models.base import (
     refuse,
     threshold_problems,
 )
-from hilctl.models.implicit_base import BoundedInputModel
+from hilctl.models.implicit_models import BoundedInputModel
 from hilctl.models.plays import inverse_plays
 
 
 class PlayEnvelope(StrictModel):
-    """``height tanh(slope v + shift) + level``, as in Al Janaideh's generalised plays.
+    """``height tanh(slope v + shift) + level``.
 
     Attributes:
         height: Half the difference of both saturated ends, > 0.
         slope: Per command unit, > 0.
-        shift: Where it is steepest, times -slope.
-        level: Middle between both saturated ends.
+        shift: -slope times the steepest point.
+        level: Mean of both saturated ends.
     """
 
     height: float = 1.0
@@ -37,7 +37,7 @@ class PlayEnvelope(StrictModel):
     level: float = 0.0
 
     def array(self) -> F64:
-        """Return float64[4], as the kernels take it."""
+        """Return float64[4] in the order of the kernels."""
         return np.array([self.height, self.slope, self.shift, self.level])
 
 
@@ -51,15 +51,15 @@ def _envelope_problems(name: str, envelope: PlayEnvelope) -> Iterator[str]:
 class GeneralisedModel(BoundedInputModel):
     """p_0 S_0[v] + sum p_i S_i[v], asymmetric and saturating, rate-independent (1.20).
 
-    Between a falling envelope that lies above the rising one the model holds still, and its inverse
-    jumps where it turns. Where the falling one would lie below, it follows the rising one.
+    If the falling envelope is above the rising one, the model has a dead zone after a turn, and its
+    inverse jumps. Where it would be below, it follows the rising one.
 
     Attributes:
         direct: p_0, um, > 0.
         weights: p_1 to p_n, um, >= 0.
         thresholds: r_1 to r_n, in the unit of the envelopes, rising from 0.
-        rising: gamma_l, which the command climbs along.
-        falling: gamma_r, which it comes down along.
+        rising: gamma_l, for a rising command.
+        falling: gamma_r, for a falling command.
     """
 
     kind: Literal["generalised"] = "generalised"
@@ -88,28 +88,22 @@ class GeneralisedModel(BoundedInputModel):
         return len(self.weights) + 1
 
     def forward(self, sample_rate_hz: float) -> Operator:
-        """Return the operator from command to um, at rest; no rate makes a difference."""
+        """Return the operator from command to um, at rest; independent of the rate."""
         del sample_rate_hz
-        rising, falling, direct = self.rising.array(), self.falling.array(), self.direct
-        thresholds, weights = np.array(self.thresholds), np.array(self.weights)
-
-        def run(v: F64, memory: F64, out: F64) -> None:
-            envelope_forward(v, rising, falling, direct, thresholds, weights, memory, out)
-
-        return Operator(run, self.operators, output_offset=self.output_offset_um)
+        plays = self.direct, np.array(self.thresholds), np.array(self.weights)
+        parameters = (self.rising.array(), self.falling.array(), *plays)
+        return Operator.bound(
+            envelope_forward, parameters, self.operators, output_offset=self.output_offset_um
+        )
 
     def inverse(self, sample_rate_hz: float) -> Operator:
         """Return the operator from um to command, at rest: inverse plays, inverse envelopes."""
         del sample_rate_hz
-        rising, falling = self.rising.array(), self.falling.array()
-        low, high = self.command_span
         direct, weights, thresholds = inverse_plays(
             self.direct, np.array(self.weights), np.array(self.thresholds)
         )
-
-        def run(y: F64, memory: F64, out: F64) -> None:
-            envelope_inverse(
-                y, rising, falling, low, high, direct, thresholds, weights, memory, out
-            )
-
-        return Operator(run, self.operators, input_offset=-self.output_offset_um)
+        envelopes = self.rising.array(), self.falling.array(), *self.command_span
+        parameters = (*envelopes, direct, thresholds, weights)
+        return Operator.bound(
+            envelope_inverse, parameters, self.operators, input_offset=-self.output_offset_um
+        )

@@ -1,56 +1,149 @@
-"""The integrated rate-dependent model, Omega[v] = Lambda(Pi[v]), and its inverse (chapter 6)."""
+"""Plays followed by a memoryless function: the integrated model (chapter 6), butterfly loops."""
 
-from typing import Literal
+import math
+from collections.abc import Iterator
+from typing import Literal, Self
 
 import numpy as np
 
-from hilctl.base.strict import Field
+from hilctl.base.errors import ModelError
+from hilctl.base.strict import StrictModel, ValidationError, model_validator
 from hilctl.base.types import F64
-from hilctl.kernels.hysteresis import integrated_forward, integrated_inverse_stage
-from hilctl.models.base import Operator
-from hilctl.models.deadband import DeadbandFunction
-from hilctl.models.plays import PlayModel
+from hilctl.kernels.hysteresis import (
+    deadband_block,
+    integrated_forward,
+    integrated_inverse,
+    play_sum,
+)
+from hilctl.models.base import (
+    Operator,
+    Thresholds,
+    Weights,
+    length_problems,
+    refuse,
+    threshold_problems,
+)
+from hilctl.models.plays import RateDependentPlays
 
 
-class IntegratedModel(PlayModel):
-    """Plays whose thresholds grow with the rate, then deadbands for asymmetry and saturation.
+class DeadbandFunction(StrictModel):
+    """Lambda(x) = g_0 x + sum g_j J_j(x): piecewise linear, for asymmetry and saturation.
+
+    The inverse exists if each cumulative slope (g_0 plus the weights from 0 outwards on one side)
+    is > 0.
 
     Attributes:
-        gamma_s: Growth of every threshold with the input's rate, in s, >= 0.
+        slope: g_0, slope around 0, > 0.
+        up_thresholds: d_1 to d_k, > 0, rising.
+        up_weights: g_1 to g_k, changes of slope above each threshold.
+        down_thresholds: d_-1 to d_-l, < 0, falling.
+        down_weights: g_-1 to g_-l, changes of slope below each threshold.
+    """
+
+    slope: float = 1.0
+    up_thresholds: Thresholds = ()
+    up_weights: Weights = ()
+    down_thresholds: Thresholds = ()
+    down_weights: Weights = ()
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        refuse(
+            (
+                *length_problems("up_weights", self.up_weights, self.up_thresholds),
+                *length_problems("down_weights", self.down_weights, self.down_thresholds),
+                *threshold_problems("d", self.up_thresholds),
+                *threshold_problems("d_-", self.down_thresholds, sign=-1),
+                *_slope_problems(self.slope, self.up_weights, ""),
+                *_slope_problems(self.slope, self.down_weights, "-"),
+            )
+        )
+        return self
+
+    def arrays(self) -> tuple[float, F64, F64, F64, F64]:
+        """Return the parameters in the order of the kernels."""
+        return (
+            self.slope,
+            np.array(self.up_thresholds, dtype=np.float64),
+            np.array(self.up_weights, dtype=np.float64),
+            np.array(self.down_thresholds, dtype=np.float64),
+            np.array(self.down_weights, dtype=np.float64),
+        )
+
+    def __call__(self, x: F64) -> F64:
+        """Return Lambda(x), float64[n] for float64[n]."""
+        out = np.empty_like(x)
+        deadband_block(x, *self.arrays(), out)
+        return out
+
+    def inverse(self) -> "DeadbandFunction":
+        """Return Lambda^-1, of the same form: thresholds Lambda(d_j), reciprocal slopes.
+
+        Raises:
+            ModelError: Slopes differ too much for the precision of the inverse.
+        """
+        up, up_weights = _inverse_side(self.slope, self.up_thresholds, self.up_weights)
+        down, down_weights = _inverse_side(self.slope, self.down_thresholds, self.down_weights)
+        try:
+            return DeadbandFunction(
+                slope=1.0 / self.slope,
+                up_thresholds=up,
+                up_weights=up_weights,
+                down_thresholds=down,
+                down_weights=down_weights,
+            )
+        except ValidationError as error:
+            reasons = "; ".join(problem["msg"] for problem in error.errors())
+            raise ModelError(f"the inverse of the deadbands is not usable: {reasons}") from None
+
+
+def _slope_problems(slope: float, weights: Weights, side: str) -> Iterator[str]:
+    for j, weight in enumerate((0.0, *weights)):
+        slope += weight
+        if not slope > 0.0:
+            if j or not side:  # g_0 belongs to both sides
+                yield (
+                    "every cumulative deadband slope must be > 0 for the inverse to exist: "
+                    f"g_0 + ... + g_{side if j else ''}{j} = {slope!r}"
+                )
+            return
+
+
+def _inverse_side(
+    slope: float, thresholds: Thresholds, weights: Weights
+) -> tuple[Thresholds, Weights]:
+    with np.errstate(over="ignore", invalid="ignore"):
+        slopes = np.cumsum((slope, *weights))
+        corners = np.cumsum(slopes[:-1] * np.diff(thresholds, prepend=0.0))
+        return tuple(corners.tolist()), tuple(np.diff(1.0 / slopes).tolist())
+
+
+class IntegratedModel(RateDependentPlays):
+    """Omega[v] = Lambda(Pi[v]): plays, then deadbands for asymmetry and saturation.
+
+    Attributes:
         deadband: Lambda, from the plays' output to um.
     """
 
     kind: Literal["integrated"] = "integrated"
-    gamma_s: float = Field(default=0.0, ge=0.0)
     deadband: DeadbandFunction
-
-    @property
-    def threshold_growth_s(self) -> float:
-        """Growth of every threshold with the input's rate, gamma, in s."""
-        return self.gamma_s
 
     def forward(self, sample_rate_hz: float) -> Operator:
         """Return Omega, from command to um, at rest (6.5)."""
-        weights, thresholds = np.array(self.weights), np.array(self.thresholds)
-        rate_gain, direct = self.threshold_growth_s * sample_rate_hz, self.direct
-        deadband = self.deadband.arrays()
-
-        def run(v: F64, memory: F64, out: F64) -> None:
-            integrated_forward(v, rate_gain, direct, thresholds, weights, *deadband, memory, out)
-
-        return Operator(run, self.operators, output_offset=self.output_offset_um)
+        rate_gain = self.threshold_growth_s * sample_rate_hz
+        plays = (rate_gain, self.direct, np.array(self.thresholds), np.array(self.weights))
+        parameters = (*plays, *self.deadband.arrays())
+        return Operator.bound(
+            integrated_forward, parameters, self.operators, output_offset=self.output_offset_um
+        )
 
     def inverse(self, sample_rate_hz: float) -> Operator:
         """Return Omega^-1, from um to command, at rest (6.17)."""
         direct, weights, thresholds = self.inverse_parameters()
         rate_gain = self.inverse_rate_gain(sample_rate_hz)
-        slope, *sides = self.deadband.inverse().arrays()
-        sizes = sides[0].size, sides[2].size
-        numbers = (slope, rate_gain, direct, *sizes)
-        parameters = np.concatenate((numbers, *sides, thresholds, weights))
-        offset = -self.output_offset_um
-        return Operator.staged(
-            integrated_inverse_stage, parameters, self.operators, input_offset=offset
+        parameters = (*self.deadband.inverse().arrays(), rate_gain, direct, thresholds, weights)
+        return Operator.bound(
+            integrated_inverse, parameters, self.operators, input_offset=-self.output_offset_um
         )
 
 
@@ -101,3 +194,76 @@ def exponential_integrated(
             down_weights=tuple(exponential_weights(alpha_2, beta_2, deadbands_a_side).tolist()),
         ),
     )
+
+
+class ButterflyModel(RateDependentPlays):
+    """S(|Pi[v] + bias|): plays, then an even function, for rods used on both sides of zero field.
+
+    Magnetostriction is even in the field: without magnets and bias current the loop is a
+    butterfly; a bias moves the rest position onto one of its wings.
+
+    The command v is the total current including the bias current; it is 0 at rest.
+
+    Attributes:
+        bias: Bias of permanent magnets, in the unit of the plays' output.
+        shape: S above 0, from there to um; S(0) = 0, and every slope > 0.
+    """
+
+    kind: Literal["butterfly"] = "butterfly"
+    bias: float = 0.0
+    shape: DeadbandFunction
+
+    @model_validator(mode="after")
+    def _check_even(self) -> Self:
+        if self.shape.down_thresholds:
+            refuse(["shape is even: it is given by its side above 0, without down_thresholds"])
+        return self
+
+    @property
+    def wing(self) -> float:
+        """Side of the inverse, 1.0 or -1.0: that of the bias, or else of input_range."""
+        middle = self.bias or sum(self.input_range or (0.0, 1.0))
+        return math.copysign(1.0, middle)
+
+    def forward(self, sample_rate_hz: float) -> Operator:
+        """Return the operator from command to um, at rest."""
+        weights, thresholds = np.array(self.weights), np.array(self.thresholds)
+        rate_gain, direct = self.threshold_growth_s * sample_rate_hz, self.direct
+        shape, bias = self.shape.arrays(), self.bias
+
+        def run(v: F64, memory: F64, out: F64) -> None:
+            play_sum(v, rate_gain, direct, thresholds, weights, memory, out)
+            out += bias
+            np.abs(out, out=out)
+            deadband_block(out, *shape, out)
+
+        return Operator(run, self.operators, output_offset=self.output_offset_um)
+
+    def inverse(self, sample_rate_hz: float) -> Operator:
+        """Return the operator from um to command, at rest, on one wing of the butterfly.
+
+        The actuator is shortest where the wings meet; a displacement below that gets the command
+        of that point.
+
+        Raises:
+            ModelError: The range of the displacement is unknown or reaches below that point.
+        """
+        turning_um = self.output_offset_um
+        if self.output_range_um is None or self.output_range_um[0] < turning_um:
+            given = "not given" if self.output_range_um is None else list(self.output_range_um)
+            raise ModelError(
+                "a butterfly can be inverted on one of its wings only: output_range_um must begin "
+                f"at {turning_um!r} µm, where they meet, or above: {given}"
+            )
+        direct, weights, thresholds = self.inverse_parameters()
+        rate_gain = self.inverse_rate_gain(sample_rate_hz)
+        shape, wing, bias = self.shape.inverse().arrays(), self.wing, self.bias
+
+        def run(y: F64, memory: F64, out: F64) -> None:
+            np.maximum(y, 0.0, out=out)
+            deadband_block(out, *shape, out)
+            out *= wing
+            out -= bias
+            play_sum(out, rate_gain, direct, thresholds, weights, memory, out)
+
+        return Operator(run, self.operators, input_offset=-turning_um)

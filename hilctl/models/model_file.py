@@ -1,4 +1,4 @@
-"""Model files: YAML in and out."""
+"""Read and write model files."""
 
 from pathlib import Path
 from typing import Annotated, TypeAlias
@@ -23,11 +23,11 @@ def load_model(path: Path, files: TextFiles | None = None) -> HysteresisModel:
 
     Args:
         path: The file.
-        files: Where it is read from; the disk where None.
+        files: Source of the file; None for the disk.
 
     Raises:
-        InputError: The file can't be read.
-        ConfigError: It breaks a rule, or the model can't be inverted; all problems are listed.
+        InputError: The file cannot be read.
+        ConfigError: It breaks a rule or has no inverse; all problems are listed.
     """
     return load_document(path, files).validate(ModelFile).model
 

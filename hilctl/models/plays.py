@@ -1,4 +1,4 @@
-"""Sums of play operators: what they have in common, and PPI, RDPI and SPI (chapters 3 and 5)."""
+"""Sums of play operators: PPI, RDPI and SPI (chapters 3 and 5)."""
 
 from typing import Literal, Self
 
@@ -7,7 +7,7 @@ import numpy as np
 from hilctl.base.errors import ModelError
 from hilctl.base.strict import Field, model_validator
 from hilctl.base.types import F64
-from hilctl.kernels.hysteresis import play_sum, play_sum_stage, stop_sum_stage
+from hilctl.kernels.hysteresis import play_sum, stop_sum
 from hilctl.models.base import (
     HysteresisModel,
     Operator,
@@ -30,8 +30,8 @@ def inverse_plays(direct: float, weights: F64, thresholds: F64) -> tuple[float, 
 
     Returns:
         The inverse's direct weight 1/a_0, its weights float64[n] (<= 0) and its thresholds
-        float64[n] at zero rate. With the rate, every one of them grows by ``a_0`` times what each
-        r_i grows by, because all r_i grow alike.
+        float64[n] at zero rate. With the rate, each grows by ``a_0`` times the common growth of
+        the r_i.
 
     Raises:
         ModelError: The numbers of the inverse are not finite.
@@ -80,10 +80,10 @@ class PlayModel(HysteresisModel):
         return 0.0
 
     def inverse_rate_gain(self, sample_rate_hz: float) -> float:
-        """Return what a change of 1 between samples adds to the inverse's thresholds.
+        """Return the growth of the inverse's thresholds for a change of 1 between samples.
 
-        The command's rate is not known before the inverse has run; that of ``x / sum a_i``, the
-        command at which the loop of an input x closes, stands for it.
+        The rate of ``x / sum a_i``, the command at which the loop of an input x closes,
+        approximates the rate of the unknown command.
         """
         total = self.direct + float(np.sum(self.weights))
         return self.direct * self.threshold_growth_s * sample_rate_hz / total
@@ -94,21 +94,15 @@ class PlayModel(HysteresisModel):
 
     def forward(self, sample_rate_hz: float) -> Operator:
         """Return the operator from command to um, at rest."""
-        weights, thresholds = np.array(self.weights), np.array(self.thresholds)
-        rate_gain, direct = self.threshold_growth_s * sample_rate_hz, self.direct
-
-        def run(v: F64, memory: F64, out: F64) -> None:
-            play_sum(v, rate_gain, direct, thresholds, weights, memory, out)
-
-        return Operator(run, self.operators, output_offset=self.output_offset_um)
+        rate_gain = self.threshold_growth_s * sample_rate_hz
+        plays = (rate_gain, self.direct, np.array(self.thresholds), np.array(self.weights))
+        return Operator.bound(play_sum, plays, self.operators, output_offset=self.output_offset_um)
 
     def inverse(self, sample_rate_hz: float) -> Operator:
         """Return the operator from um to command, at rest."""
         direct, weights, thresholds = self.inverse_parameters()
-        rate_gain = self.inverse_rate_gain(sample_rate_hz)
-        parameters = np.concatenate(((rate_gain, direct), thresholds, weights))
-        offset = -self.output_offset_um
-        return Operator.staged(play_sum_stage, parameters, self.operators, input_offset=offset)
+        plays = (self.inverse_rate_gain(sample_rate_hz), direct, thresholds, weights)
+        return Operator.bound(play_sum, plays, self.operators, input_offset=-self.output_offset_um)
 
 
 class PpiModel(PlayModel):
@@ -117,17 +111,16 @@ class PpiModel(PlayModel):
     kind: Literal["ppi"] = "ppi"
 
 
-class RdpiModel(PlayModel):
-    """Pi[v] = a_0 v + sum a_i Gamma_i[v], thresholds r_i + gamma |v'| (5.5, 6.18).
+class RateDependentPlays(PlayModel):
+    """a_0 v + sum a_i Gamma_i[v], thresholds r_i + gamma |v'|.
 
-    All thresholds grow alike, so their distances stay what they are and the dilation condition
-    for the inverse (5.7) holds at every rate.
+    All thresholds grow equally, so the dilation condition for the inverse (5.7) holds at every
+    rate.
 
     Attributes:
         gamma_s: Growth of every threshold with the input's rate, in s, >= 0.
     """
 
-    kind: Literal["rdpi"] = "rdpi"
     gamma_s: float = Field(default=0.0, ge=0.0)
 
     @property
@@ -136,8 +129,14 @@ class RdpiModel(PlayModel):
         return self.gamma_s
 
 
+class RdpiModel(RateDependentPlays):
+    """Pi[v] = a_0 v + sum a_i Gamma_i[v], thresholds r_i + gamma |v'| (5.5, 6.18)."""
+
+    kind: Literal["rdpi"] = "rdpi"
+
+
 class SpiModel(PlayModel):
-    """Phi[v] of a PPI (3.6), undone by Psi[y] = w_0 y + sum w_i E_i[y].
+    """Phi[v] of a PPI (3.6), inverted by Psi[y] = w_0 y + sum w_i E_i[y].
 
     Psi is the same operator as the inverse PPI: w_0 + sum w_i = 1/p_0, and w_i is minus the weight
     of the inverse's i-th play.
@@ -154,15 +153,14 @@ class SpiModel(PlayModel):
         Raises:
             ModelError: The numbers of the inverse are not finite.
         """
-        # Solved in closed form by the inverse plays: a linear solver's last bits are the
-        # processor's own, and a recording must replay to the same bits on any.
+        # In closed form from the inverse plays: the last bits of a linear solver depend on the
+        # processor, but a recording must replay to the same bits on all.
         _, weights, thresholds = self.inverse_parameters()
         return 1.0 / (self.direct + float(np.sum(self.weights))), -weights, thresholds
 
     def inverse(self, sample_rate_hz: float) -> Operator:
-        """Return the operator from um to command, at rest; no rate makes a difference."""
+        """Return the operator from um to command, at rest; independent of the rate."""
         del sample_rate_hz
         direct, weights, thresholds = self.stop_parameters()
-        parameters = np.concatenate(((direct,), thresholds, weights))
-        offset = -self.output_offset_um
-        return Operator.staged(stop_sum_stage, parameters, weights.size, input_offset=offset)
+        stops = (direct, thresholds, weights)
+        return Operator.bound(stop_sum, stops, weights.size, input_offset=-self.output_offset_um)

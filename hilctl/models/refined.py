@@ -1,6 +1,6 @@
-"""A model, and what recordings of its use have shown beyond it."""
+"""A model with its identified residual, and the inverse of both."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cache
 from itertools import combinations
 from typing import Annotated, Any, Literal, Self, TypeAlias
@@ -19,16 +19,16 @@ from hilctl.models.base import (
     refuse,
     threshold_problems,
 )
-from hilctl.models.bouc_wen import BoucWenModel
-from hilctl.models.butterfly import ButterflyModel
-from hilctl.models.cascade import Chain
-from hilctl.models.duhem import DuhemModel
 from hilctl.models.generalised_pi import GeneralisedModel
-from hilctl.models.integrated import IntegratedModel
-from hilctl.models.kp import KrasnoselskiiPokrovskiiModel
-from hilctl.models.mechanics import FirstMode
+from hilctl.models.implicit_models import (
+    BoucWenModel,
+    DuhemModel,
+    KrasnoselskiiPokrovskiiModel,
+    PreisachModel,
+)
+from hilctl.models.integrated import ButterflyModel, IntegratedModel
+from hilctl.models.linear_stages import Chain, FirstMode
 from hilctl.models.plays import PpiModel, RdpiModel, SpiModel
-from hilctl.models.preisach import PreisachModel
 from hilctl.models.staged import StagedModel
 
 Refinable: TypeAlias = (
@@ -44,16 +44,16 @@ Refinable: TypeAlias = (
     | BoucWenModel
     | DuhemModel
 )
-"""Every kind of model but the refined one."""
+"""Every kind of model except the refined one."""
 
 LEAST_SLOPE = 0.1
-"""Smallest slope of x + R[x] by the next x that a model may have, whatever came before."""
-_POSITIONS = 60  # of x that the slope is worked out at, each way
-_TURNS = (0.02, 2.0, 8)  # of the longest drag: nearest and furthest turn that is tried, how many
+"""Least allowed slope of x + R[x] by the next x, for any history."""
+_POSITIONS = 60  # of x at which the slope is evaluated
+_TURNS = (0.02, 2.0, 8)  # nearest and furthest turn in longest drag lengths, number of turns
 
 
 class ResidualOperator(StrictModel):
-    """R of the displacement x that a model gives, see :mod:`hilctl.kernels.residual_operator`.
+    """R of the model displacement x, see :mod:`hilctl.kernels.residual_operator`.
 
     Attributes:
         lowest_um: Lower end of the first cell of x.
@@ -63,8 +63,8 @@ class ResidualOperator(StrictModel):
         lengths_um: Of the drags, each > 0.
         drags_um: For each drag, a at the edges of the cells; then for each drag b.
         rate_um: c at the edges of the cells.
-        window_s: Time over which the change of x is its rate, in s.
-        fastest_um_per_s: Rate that counts as 1; faster ones do too.
+        window_s: Time over which the rate of x is measured, in s.
+        fastest_um_per_s: Rate that counts as 1, like all faster ones.
     """
 
     lowest_um: float
@@ -108,10 +108,10 @@ class ResidualOperator(StrictModel):
 
     @property
     def least_slope(self) -> float:
-        """Smallest slope of x + R[x] by the next x, whatever came before.
+        """Least slope of x + R[x] by the next x, for any history.
 
-        Where x turns, plays follow it one after the other, from the narrowest on, and drags stand
-        where turns before have left them.
+        After a turn of x the plays follow it one by one, the narrowest first; the drags have the
+        states of earlier turns.
         """
         edges = self._edges()
         slack = 0.01 * self.cell_um
@@ -127,7 +127,7 @@ class ResidualOperator(StrictModel):
         return edges
 
     def _play_slope(self, x: F64, edges: F64, way: float) -> F64:
-        """Return the least slope of the plays where x goes that way: float64[n]."""
+        """Return the least slope of the plays for a direction of x: float64[n]."""
         held = x[:, None] - way * np.array(self.thresholds_um)
         cell = np.floor((held - edges[0]) / self.cell_um).astype(np.int64)
         inside = (cell >= 0) & (cell < edges.size - 1)
@@ -137,12 +137,12 @@ class ResidualOperator(StrictModel):
         return np.asarray(np.cumsum(slopes * inside, axis=1).min(axis=1))
 
     def _drag_slope(self, x: F64, edges: F64, way: float) -> F64:
-        """Return the least slope of the drags where x goes that way: float64[n]."""
+        """Return the least slope of the drags for a direction of x: float64[n]."""
         if not self.lengths_um:
             return np.zeros(x.size)
         lengths, count = np.array(self.lengths_um), len(self.lengths_um)
         states = _states(self.lengths_um)
-        moves = (1.0 - way * states) / lengths  # of a state, by the way gone
+        moves = (1.0 - way * states) / lengths  # of a state, by the path of x
         lines = [_line(x, edges, np.array(line)) for line in self.drags_um]
         values, bends = (np.stack(each) for each in zip(*lines, strict=True))
         slopes = states @ bends[:count] + states**2 @ bends[count:]
@@ -155,27 +155,24 @@ class ResidualOperator(StrictModel):
         return np.asarray(-np.abs(bend) + np.minimum(value / change_um, 0.0))
 
     def forward(self, sample_rate_hz: float, rest_um: float = 0.0) -> Operator:
-        """Return x + R[x] at rest, for displacements that are ``rest_um`` there."""
-        tables, window = self.tables(sample_rate_hz)
-
-        def run(x: F64, memory: F64, out: F64) -> None:
-            residual_forward(x, tables, memory, out)
-
-        numbers = self.operators + window + 2
-        return Operator(run, numbers, input_offset=-rest_um, output_offset=rest_um)
+        """Return x + R[x] at rest, for displacements that are ``rest_um`` at rest."""
+        return self._operator(residual_forward, sample_rate_hz, rest_um)
 
     def inverse(self, sample_rate_hz: float, rest_um: float = 0.0) -> Operator:
-        """Return what undoes :meth:`forward`, at rest."""
+        """Return the inverse of :meth:`forward`, at rest."""
+        return self._operator(residual_inverse, sample_rate_hz, rest_um)
+
+    def _operator(
+        self, kernel: Callable[..., None], sample_rate_hz: float, rest_um: float
+    ) -> Operator:
         tables, window = self.tables(sample_rate_hz)
-
-        def run(y: F64, memory: F64, out: F64) -> None:
-            residual_inverse(y, tables, memory, out)
-
         numbers = self.operators + window + 2
-        return Operator(run, numbers, input_offset=-rest_um, output_offset=rest_um)
+        return Operator.bound(
+            kernel, (tables,), numbers, input_offset=-rest_um, output_offset=rest_um
+        )
 
     def tables(self, sample_rate_hz: float) -> tuple[Tables, int]:
-        """Return what the kernels take, and the window in samples."""
+        """Return the tables of the kernels, and the window in samples."""
         slopes = np.array(self.slopes)
         plays, cells = slopes.shape
         values = np.zeros((plays, cells + 1))
@@ -192,18 +189,18 @@ class ResidualOperator(StrictModel):
 
 @cache
 def _states(lengths_um: tuple[float, ...]) -> F64:
-    """Return where a few turns leave drags: float64[m, d].
+    """Return the states of drags after a few turns: float64[m, d].
 
-    A state is the sum over the way gone of its sign times e^(-way / l) / l. A sum of d such
-    exponentials changes its sign d - 1 times at most, so a weighted sum of drags is largest where
-    the way has turned as often.
+    A state is the integral over the path of its sign times e^(-path / l) / l. A sum of d such
+    exponentials has at most d - 1 sign changes, so a weighted sum of drags is largest after that
+    many turns.
     """
     lengths = np.array(lengths_um)
     at = float(lengths.max()) * np.geomspace(*_TURNS)
     states = []
     for turns in range(lengths.size):
         for chosen in combinations(at, turns):
-            left = np.exp(-np.array(chosen)[:, None] / lengths)  # of the way before each turn
+            left = np.exp(-np.array(chosen)[:, None] / lengths)  # of the path before each turn
             signs = (-1.0) ** np.arange(1, turns + 1)
             states.append(1.0 + 2.0 * signs @ left)
     both = np.array(states)
@@ -217,17 +214,17 @@ def _line(x: F64, edges: F64, values: F64) -> tuple[F64, F64]:
 
 
 def rest_um(model: HysteresisModel) -> float:
-    """Return the displacement that a model has at rest."""
+    """Return the displacement of a model at rest."""
     inner = getattr(model, "hysteresis", None)
     return model.output_offset_um + (inner.output_offset_um if inner is not None else 0.0)
 
 
 class RefinedModel(HysteresisModel):
-    """A model, then a constant displacement and an operator of what it gives.
+    """A model followed by a residual operator and a constant displacement.
 
     Attributes:
         base: The model; the unit and the ranges are the refined model's.
-        residual: R of the displacement that it gives, less that at rest.
+        residual: R of its displacement relative to rest.
     """
 
     kind: Literal["refined"] = "refined"
@@ -238,7 +235,7 @@ class RefinedModel(HysteresisModel):
     def of(
         cls, model: HysteresisModel, residual: ResidualOperator, offset_um: float
     ) -> "RefinedModel":
-        """Put an operator behind a model, whose unit, ranges and provenance become theirs."""
+        """Return a refined model with the unit, ranges and provenance of a model."""
         shared = {name: getattr(model, name) for name in _SHARED}
         bare = {"input_range": None, "output_range_um": None, "provenance": Provenance()}
         base: Any = model.model_copy(update=bare)
@@ -247,7 +244,7 @@ class RefinedModel(HysteresisModel):
     @model_validator(mode="after")
     def _check_one_truth(self) -> Self:
         if self.base.input_unit != self.input_unit:
-            raise ValueError(f"base.input_unit must be {self.input_unit}, as beside it")
+            raise ValueError(f"base.input_unit must be {self.input_unit}, as outside")
         return self
 
     @property
@@ -257,7 +254,7 @@ class RefinedModel(HysteresisModel):
 
     @property
     def structure(self) -> FirstMode | None:
-        """What the displacement goes through, where the base has it."""
+        """First mode of the structure, if the base has one."""
         return self.base.structure if isinstance(self.base, StagedModel) else None
 
     def forward(self, sample_rate_hz: float) -> Chain:
@@ -271,7 +268,7 @@ class RefinedModel(HysteresisModel):
         """Return the operator from displacement in um, ``preview`` samples ahead, to command.
 
         Raises:
-            ModelError: The numbers of the base's inverse are not finite.
+            ModelError: The inverse of the base is not finite.
         """
         operator = self.residual.inverse(sample_rate_hz, rest_um(self.base))
         inverse = self.base.inverse(sample_rate_hz)

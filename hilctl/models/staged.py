@@ -1,36 +1,38 @@
-"""Hysteresis between the stages that carry it: field lag, structure, transport delay, creep.
+"""Hysteresis between linear stages: field lag, structure, transport delay, creep.
 
-Command -> field lag -> hysteresis -> structure -> modes -> delay -> creep -> displacement. What is
-linear may stand in any order; creep, as the last, is undone first. A displacement is sampled when a
-command is put out and can't yet show it, as :mod:`hilctl.base.device` has it. So the forward
-operator answers one sample later than its input, whatever its stages; ``delay_s`` is what comes on
-top of that.
+Command -> field lag -> hysteresis -> structure -> modes -> delay -> creep -> displacement. A
+displacement is sampled when its command is output and cannot show its effect, see
+:mod:`hilctl.base.device`; so the forward operator lags its input by one sample, and ``delay_s`` is
+additional.
 
-The inverse goes the other way round, and its input must run ahead of its output by
-:attr:`~hilctl.models.base.Operator.preview` samples: one for the loop, then the delay, then what
-the smoothing reaches ahead. ``inverse.process(reference[k + preview])`` is the command of sample k.
-It is finite for every finite reference: the lag's inverse is held within what the lag can follow,
-the structure's is one of a displacement smoothed over a radian of its natural frequency, and
-further modes are undone exactly.
+The inverse has the reverse order. Its input must run ahead of its output by
+:attr:`~hilctl.models.base.Operator.preview` samples: one for the loop, then the delay, then the
+preview of the smoothing. ``inverse.process(reference[k + preview])`` is the command of sample k. It
+is finite for every finite reference: the inverse of the lag is limited to the speed of the lag,
+that of the structure acts on a displacement smoothed over a radian of its natural frequency, and
+that of further modes is exact.
 """
 
 import math
 from typing import Annotated, Any, Literal, Self
 
-import numpy as np
-
 from hilctl.base.strict import Field, StrictModel, model_validator
-from hilctl.base.types import F64
-from hilctl.kernels.dynamics import lag_block, lead_stage, weigh_block
+from hilctl.kernels.dynamics import lag_block, lead_block, weigh_block
 from hilctl.models.base import HysteresisModel, Operator, Provenance, refuse
-from hilctl.models.cascade import Chain, between, delayed, smoothing_weights
-from hilctl.models.creep import CreepModel
 from hilctl.models.effective_field import FieldModel
 from hilctl.models.generalised_duhem import GeneralisedDuhemModel
+from hilctl.models.implicit_models import PreisachModel
 from hilctl.models.integrated import IntegratedModel
-from hilctl.models.mechanics import FirstMode, FurtherMode
+from hilctl.models.linear_stages import (
+    Chain,
+    CreepModel,
+    FirstMode,
+    FurtherMode,
+    between,
+    delayed,
+    smoothing_weights,
+)
 from hilctl.models.plays import PpiModel, RdpiModel
-from hilctl.models.preisach import PreisachModel
 
 AnyHysteresis = Annotated[
     PpiModel | RdpiModel | IntegratedModel | PreisachModel | FieldModel | GeneralisedDuhemModel,
@@ -52,35 +54,31 @@ class FieldLag(StrictModel):
     growth_per_unit: float = Field(default=0.0, ge=0.0)
 
     def forward(self, sample_rate_hz: float) -> Operator:
-        """Return the lag, exact for commands that are held; it answers a sample later."""
-        periods, growth = 1.0 / (sample_rate_hz * self.tau_s), self.growth_per_unit
-
-        def run(v: F64, memory: F64, out: F64) -> None:
-            lag_block(v, periods, growth, memory, out)
-
-        return Operator(run, 1)
+        """Return the lag, exact for piecewise constant commands, with a delay of one sample."""
+        periods = 1.0 / (sample_rate_hz * self.tau_s)
+        return Operator.bound(lag_block, (periods, self.growth_per_unit), 1)
 
     def inverse(self, sample_rate_hz: float) -> Operator:
-        """Return the lead, exact where the lag can follow; with a preview of one sample."""
+        """Return the lead, exact within the speed of the lag, with a preview of one sample."""
         periods = 1.0 / (sample_rate_hz * self.tau_s)
-        lead = Operator.staged(lead_stage, np.array([periods, self.growth_per_unit]), 1)
+        lead = Operator.bound(lead_block, (periods, self.growth_per_unit), 1)
         lead.preview = 1
         return lead
 
 
 class StagedModel(HysteresisModel):
-    """A model of hysteresis with the linear stages around it.
+    """A hysteresis model with linear stages around it.
 
     Attributes:
         hysteresis: Model of the hysteresis; the unit and the ranges are the staged model's.
-        lag: Lag of the field behind the command; None where there is none.
-        structure: What the displacement goes through; None where it is rigid.
-        modes: Further modes of it, each with its antiresonance.
-        delay_s: Transport delay beyond the one sample that every loop has, in s.
-        smoothing_s: Standard deviation of the smoothing in the inverse, in s, not less than 1 / w
-            where there is a structure. Corners of a reference are rounded within about twice that;
-            a lead makes steps of the command out of corners that are not.
-        creep: What the displacement goes on by where it stays; None where there is none.
+        lag: Lag of the field behind the command, or None.
+        structure: First mode of the structure; None for a rigid one.
+        modes: Further modes, each with its antiresonance.
+        delay_s: Transport delay in addition to one sample, in s.
+        smoothing_s: Standard deviation of the smoothing in the inverse, in s; at least 1 / w with a
+            structure. It rounds corners of a reference within about twice that time; without it, a
+            lead converts corners to steps of the command.
+        creep: Creep of the displacement, or None.
     """
 
     kind: Literal["staged"] = "staged"
@@ -104,7 +102,7 @@ class StagedModel(HysteresisModel):
         smoothing_s: float = 0.0,
         creep: CreepModel | None = None,
     ) -> Self:
-        """Put stages around a model, whose unit, ranges and provenance become theirs."""
+        """Return a staged model with the unit, ranges and provenance of a hysteresis model."""
         shared = {name: getattr(hysteresis, name) for name in _SHARED}
         bare = {"input_range": None, "output_range_um": None, "provenance": Provenance()}
         inner = hysteresis.model_copy(update=bare)
@@ -123,12 +121,12 @@ class StagedModel(HysteresisModel):
     def _check_one_truth(self) -> Self:
         inner = self.hysteresis
         problems = [
-            f"hysteresis.{name} must be left out: give it beside hysteresis"
+            f"hysteresis.{name} must be set beside hysteresis instead"
             for name in ("input_range", "output_range_um")
             if getattr(inner, name) is not None
         ]
         if inner.input_unit != self.input_unit:
-            problems.append(f"hysteresis.input_unit must be {self.input_unit}, as beside it")
+            problems.append(f"hysteresis.input_unit must be {self.input_unit}, as outside")
         refuse(problems)
         return self
 
@@ -157,8 +155,8 @@ class StagedModel(HysteresisModel):
         """Return the operator from displacement in um, ``preview`` samples ahead, to command.
 
         Raises:
-            ModelError: The numbers of the hysteresis' inverse are not finite, or modes can't be
-                undone at this sample rate.
+            ModelError: The inverse of the hysteresis is not finite, or that of a mode is unstable
+                at this sample rate.
         """
         whole, part = self._delay(sample_rate_hz)
         preview = 1 + whole + (1 if part else 0)
@@ -177,9 +175,9 @@ class StagedModel(HysteresisModel):
         return Chain(stages, preview=preview, input_offset=-self.output_offset_um)
 
     def _unstructure(self, sample_rate_hz: float) -> Operator:
-        """Return what a smoothed displacement takes before the structure, by its derivatives.
+        """Return the inverse of the structure from derivatives of a smoothed displacement.
 
-        The exact inverse of the sampled structure would ring for ever: its zero lies near -1.
+        The exact inverse of the sampled structure is nearly unstable: it has a pole near -1.
         """
         radian_s, damping = 0.0, 0.0
         if self.structure is not None:
@@ -187,12 +185,12 @@ class StagedModel(HysteresisModel):
         radian = radian_s * sample_rate_hz
         width = max(self.smoothing_s * sample_rate_hz, radian)
         weights, ahead = smoothing_weights(width, 2.0 * damping * radian, radian**2)
-        inverse = Operator.staged(weigh_block, weights, weights.size - 1)
+        inverse = Operator.bound(weigh_block, (weights,), weights.size - 1)
         inverse.preview = ahead
         return inverse
 
     def _delay(self, sample_rate_hz: float) -> tuple[int, float]:
-        """Return the delay's whole samples, and the part of a sample beyond them."""
+        """Return the delay in whole samples and the remaining fraction."""
         samples = self.delay_s * sample_rate_hz
         whole = math.floor(samples + _WHOLE)
         part = samples - whole

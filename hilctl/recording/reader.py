@@ -7,7 +7,7 @@ from contextlib import closing
 from pathlib import Path
 
 from hilctl.base.errors import DataError
-from hilctl.base.os_errors import no_such_file, reason
+from hilctl.base.files import no_such_file, reason
 from hilctl.recording.builder import RecordingBuilder
 from hilctl.recording.recording import Recording
 from hilctl.recording.recording_files import is_being_recorded

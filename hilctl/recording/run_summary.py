@@ -13,7 +13,7 @@ from mcap.records import Footer, Metadata, MetadataIndex, SummaryOffset
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
 from hilctl.base.errors import DataError
-from hilctl.base.os_errors import reason
+from hilctl.base.files import reason
 from hilctl.recording.mcap_records import FOOTER_BYTES, records_from
 from hilctl.recording.metadata_keys import CHECKSUM_FACT, unsealed
 from hilctl.recording.recording_files import is_being_recorded

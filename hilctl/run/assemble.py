@@ -7,9 +7,9 @@ from hilctl.base.device import Device, DeviceInfo
 from hilctl.base.errors import InputError
 from hilctl.base.types import F64
 from hilctl.experiment.adaptation_bounds import make_adaptation
+from hilctl.experiment.device_rules import interlock_context
 from hilctl.experiment.feedback_checks import make_feedback
 from hilctl.experiment.file import Experiment
-from hilctl.experiment.interlocks import interlock_context
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.loop.adaptation import DisplacementOperator
 from hilctl.loop.compensator import Compensator

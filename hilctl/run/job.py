@@ -20,7 +20,7 @@ from hilctl.base.errors import InputError, RunError
 from hilctl.base.files import TextFiles
 from hilctl.base.types import F64
 from hilctl.base.yaml import Document
-from hilctl.experiment.device import made_device
+from hilctl.experiment.devices import made_device
 
 if TYPE_CHECKING:
     from hilctl.experiment.preflight import CheckedExperiment

@@ -19,8 +19,7 @@ import numpy as np
 
 from hilctl.base.errors import InputError
 from hilctl.base.events import ADAPTED, Event
-from hilctl.base.files import already_there, sync_folder
-from hilctl.base.os_errors import reason
+from hilctl.base.files import already_there, reason, sync_folder
 from hilctl.base.samples import BlockBatch, BlockHeader, Samples
 from hilctl.experiment.coil_heat import CoilHeat
 from hilctl.experiment.correction import dump_correction

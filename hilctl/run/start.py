@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Self, TypeAlias
 
 from hilctl.base.errors import DataError, InputError, RunError
-from hilctl.base.files import check_no_input
-from hilctl.base.os_errors import reason
+from hilctl.base.files import check_no_input, reason
 from hilctl.experiment.correction import dump_correction
 from hilctl.experiment.load import LoadedExperiment, input_files, load_experiment
 from hilctl.experiment.preflight import CheckedExperiment, check

@@ -1,7 +1,7 @@
-"""Figures of merit of an output-input loop, and of its sensor noise: pure functions of arrays.
+"""Metrics of an output-input loop and of its sensor noise: pure functions of arrays.
 
-Figures are judged on one average cycle: sensor noise would otherwise decide every maximum. What is
-left of it puts a floor under the peak hysteresis. A figure without a meaning (no output, no second
+Metrics use one mean cycle, because sensor noise would otherwise dominate every maximum; the
+remaining noise sets a floor for the peak hysteresis. An undefined metric (no output, no second
 branch) is None.
 """
 
@@ -14,26 +14,26 @@ import numpy as np
 from hilctl.base.types import F64, I64
 
 MAX_BINS = 1000
-"""Most phase bins of an average cycle: at 1000 a sine's peak loses 2e-6 of its amplitude."""
+"""Largest number of phase bins of a mean cycle; a sine's peak then loses 2e-6 of its amplitude."""
 
 SHORTEST_PERIOD = 16.0
-"""Shortest period, in samples, at which the signal still passes for smooth beside the noise."""
+"""Shortest period, in samples, of a signal that is smooth compared to the noise."""
 
 MAD_TO_SIGMA = 1.482602218505602
-"""Standard deviation of a normal distribution, of its median absolute deviation."""
+"""Ratio of standard deviation to median absolute deviation of a normal distribution."""
 
 _WIDEST_HOLE = 0.05
 _FEWEST_BINS = 4
 _ORDER = 6
 NOISE_OVERLAP = _ORDER
-"""Samples before a piece that its first windows of noise need."""
+"""Samples before a part that its first noise windows need."""
 _GAIN = 924.0**0.5  # of white noise: the root of binomial(12, 6)
 _FEWEST_WINDOWS = 32
 
 
 @dataclass(frozen=True, slots=True)
 class MeanCycle:
-    """One cycle, averaged over several; it closes on itself.
+    """The mean of several cycles, a closed loop.
 
     Attributes:
         phase: float64[m], mean phase of each bin's samples, in cycles from 0 to 1, rising.
@@ -47,11 +47,7 @@ class MeanCycle:
 
     @property
     def whole(self) -> bool:
-        """Whether the bins go round the cycle without a hole that a chord can't stand for.
-
-        A hole is a stretch of phase without samples, wider than 5 % of the cycle and than one
-        missing bin.
-        """
+        """Whether the bins cover the cycle without a gap of more than 5 % and one missing bin."""
         bins = self.phase.size
         if bins < _FEWEST_BINS:
             return False
@@ -60,17 +56,17 @@ class MeanCycle:
 
 
 class CycleAverager:
-    """Averages cycles of paired signals on bins of phase, as their samples come.
+    """Incremental mean of cycles of paired signals on phase bins.
 
-    A sample's phase is its index modulo the period, so that gaps and periods that are not whole
-    numbers of samples do no harm. All signals of a sample go to the same bin: their means stay
-    paired. There is at most one bin a sample of a period; empty bins are left out, and so are
-    samples of which a signal is not finite.
+    A sample's phase is its index modulo the period, so that gaps and fractional periods are
+    allowed. All signals of a sample go to the same bin, so their means stay paired. There is at
+    most one bin per sample of a period; empty bins and samples with a non-finite signal are
+    skipped.
 
     Args:
         period: Samples in one period, > 0, not necessarily whole.
-        signals: How many.
-        max_bins: Most bins.
+        signals: Number of signals.
+        max_bins: Largest number of bins.
     """
 
     def __init__(self, period: float, signals: int, max_bins: int = MAX_BINS) -> None:
@@ -80,27 +76,27 @@ class CycleAverager:
         self._sums = np.zeros((signals + 1, bins))
 
     def add(self, index: I64, signals: F64) -> None:
-        """Take more samples.
+        """Add samples.
 
         Args:
-            index: int64[n], sample index; phase 0 is where it is a multiple of the period.
+            index: int64[n], sample index; phase 0 at multiples of the period.
             signals: float64[k, n].
         """
-        # Whole numbers are divided in a tenth of the time, with the same result.
+        # Integer division is ten times faster, with the same result.
         whole = self._period.is_integer()
         finite = np.isfinite(signals).all(axis=0)
         if not finite.all():
             index, signals = index[finite], signals[:, finite]
         bins = self._counts.size
         phase = (index % int(self._period) if whole else np.mod(index, self._period)).astype(float)
-        # Multiply first: phase * bins is exact for whole periods, so that samples of one phase
-        # can't be torn apart by rounding.
+        # Multiply first: phase * bins is exact for whole periods, so that rounding cannot split
+        # samples of one phase.
         bin_of = np.minimum((phase * bins / self._period).astype(np.int64), bins - 1)
         self._counts += np.bincount(bin_of, minlength=bins)
         self._sums += [np.bincount(bin_of, row, bins) for row in (phase, *signals)]
 
     def fold(self) -> MeanCycle:
-        """Return the average cycle; of no bin where nothing is finite."""
+        """Return the mean cycle, without bins if nothing is finite."""
         filled = self._counts > 0
         counts = self._counts[filled]
         means = self._sums[:, filled] / counts
@@ -110,16 +106,16 @@ class CycleAverager:
 def fold(
     index: I64, period: float, signals: Sequence[F64] | F64, max_bins: int = MAX_BINS
 ) -> MeanCycle:
-    """Average cycles of paired signals on bins of phase, see :class:`CycleAverager`.
+    """Return the mean cycle of paired signals, see :class:`CycleAverager`.
 
     Args:
-        index: int64[n], sample index; phase 0 is where it is a multiple of ``period``.
+        index: int64[n], sample index; phase 0 at multiples of ``period``.
         period: Samples in one period, > 0, not necessarily whole.
         signals: float64[k, n], or k arrays, float64[n].
-        max_bins: Most bins.
+        max_bins: Largest number of bins.
 
     Returns:
-        The average cycle, of at most ``max_bins`` bins; of none where nothing is finite.
+        The mean cycle, of at most ``max_bins`` bins; without bins if nothing is finite.
     """
     stacked = np.asarray(signals, dtype=np.float64)
     folding = CycleAverager(period, stacked.shape[0], max_bins)
@@ -129,10 +125,10 @@ def fold(
 
 @dataclass(frozen=True, slots=True)
 class BranchGap:
-    """The widest place of a hysteresis loop.
+    """The largest distance between the branches of a hysteresis loop.
 
     Attributes:
-        at_input: Input at which the rising and the falling branch lie furthest apart.
+        at_input: Input at that distance.
         low: Output of the lower branch there.
         high: Output of the upper branch there.
     """
@@ -148,18 +144,17 @@ class BranchGap:
 
 
 def widest_gap(loop_input: F64, output: F64) -> BranchGap | None:
-    """Find where rising and falling branches of a closed loop differ most (figure 2.4).
+    """Return the largest distance of rising and falling branches of a closed loop (figure 2.4).
 
-    The loop is cut where its input turns round. At every input, each rising branch is held
-    against each falling one, straight lines between the points, whichever of them lies above.
-    Where the input has minor loops this takes in all pairs of branches.
+    The loop is split where its input turns. At every input each rising branch is compared with each
+    falling one, with linear interpolation; this includes the branches of minor loops.
 
     Args:
         loop_input: float64[m], one cycle in order of phase.
         output: float64[m].
 
     Returns:
-        The widest place; None where no rising and falling branch share an input.
+        The largest distance; None if no rising and falling branch share an input.
     """
     if loop_input.size < _FEWEST_BINS or np.ptp(loop_input) <= 0.0:
         return None
@@ -183,13 +178,13 @@ def widest_gap(loop_input: F64, output: F64) -> BranchGap | None:
 
 
 def _branches(loop_input: F64, output: F64) -> tuple[list[tuple[F64, F64]], list[tuple[F64, F64]]]:
-    """Cut a closed loop into rising and falling branches, each with its input rising."""
+    """Split a closed loop into rising and falling branches, each in order of rising input."""
     first = int(np.argmin(loop_input))
     u = np.append(np.roll(loop_input, -first), loop_input[first])
     y = np.append(np.roll(output, -first), output[first])
     sign = np.sign(np.diff(u))
     sign[0] = sign[0] or 1.0
-    # Where the input stands still the branch goes on.
+    # A branch continues while the input is constant.
     last_move = np.maximum.accumulate(np.where(sign != 0.0, np.arange(sign.size), 0))
     sign = sign[last_move]
     turns = np.flatnonzero(np.diff(sign)) + 1
@@ -205,7 +200,7 @@ def _branches(loop_input: F64, output: F64) -> tuple[list[tuple[F64, F64]], list
 
 
 def _band(branches: list[tuple[F64, F64]], grid: F64) -> tuple[F64, F64]:
-    """Return the lowest and highest output of the branches over the grid; NaN where none is."""
+    """Return the lowest and highest output of the branches over the grid; NaN without a branch."""
     low, high = np.full(grid.size, np.nan), np.full(grid.size, np.nan)
     for u, y in branches:
         values = np.interp(grid, u, y, left=np.nan, right=np.nan)
@@ -216,7 +211,7 @@ def _band(branches: list[tuple[F64, F64]], grid: F64) -> tuple[F64, F64]:
 def peak_hysteresis_percent(loop_input: F64, output: F64) -> float | None:
     """Return H_P / M_P: the widest gap over the peak-to-peak output, in percent (figure 2.4).
 
-    It has no sign: compensated loops may be run through either way.
+    It is unsigned, because compensated loops may have either direction.
 
     Args:
         loop_input: float64[m], one cycle in order of phase.
@@ -229,7 +224,7 @@ def peak_hysteresis_percent(loop_input: F64, output: F64) -> float | None:
 def loop_area(loop_input: F64, output: F64) -> float:
     """Return the area enclosed by a closed loop, in output times input units (shoelace formula).
 
-    Parts that are run through the other way round count against the rest.
+    Parts with the opposite direction count negatively.
 
     Args:
         loop_input: float64[m], one cycle in order of phase.
@@ -241,7 +236,7 @@ def loop_area(loop_input: F64, output: F64) -> float:
 
 
 def peak_to_peak(output: F64) -> float:
-    """Return the largest less the smallest of float64[n], n > 0, in its unit."""
+    """Return the peak-to-peak value of float64[n], n > 0, in its unit."""
     return float(np.ptp(output))
 
 
@@ -256,27 +251,26 @@ def rms(error: F64) -> float:
 
 
 def peak_and_rms_percent(error: F64, whole: float) -> tuple[float | None, float | None]:
-    """Return :func:`peak` and :func:`rms` in percent of ``whole``; None where that is 0."""
+    """Return :func:`peak` and :func:`rms` in percent of ``whole``; None if that is 0."""
     return percent(peak(error), whole), percent(rms(error), whole)
 
 
 def percent(part: float, whole: float) -> float | None:
-    """Return ``part`` in percent of ``whole``; None where ``whole`` is 0."""
+    """Return ``part`` in percent of ``whole``; None if ``whole`` is 0."""
     return 100.0 * part / whole if whole > 0.0 else None
 
 
 def sensor_noise_um(index: I64, displacement_um: F64) -> float | None:
-    """Estimate the rms of white noise that rides on a smooth displacement.
+    """Estimate the rms of white noise on a smooth displacement.
 
-    What seven neighbouring samples have that no polynomial of degree 5 explains (their sixth
-    difference, scaled to pass white noise with gain 1) is noise: of an 83 um sine at 250 Hz and
-    50 kHz it leaves 1 pm. Its spread is taken from the median magnitude, so that spikes, steps and
-    the corners of a triangle don't count. Noise that the sensor itself has low-passed is read too
-    low: by 13 % at a bandwidth of 0.3 times the sample rate.
+    The noise is the residual of seven neighbouring samples from a polynomial of degree 5 (their
+    sixth difference, scaled to gain 1 for white noise); for an 83 um sine at 250 Hz and 50 kHz that
+    is 1 pm. The median magnitude ignores spikes, steps and the corners of a triangle. Low-passed
+    noise is underestimated: by 13 % at a bandwidth of 0.3 times the sample rate.
 
     Args:
-        index: int64[n], sample index; windows with a gap are left out.
-        displacement_um: float64[n]; values that are not finite count as gaps.
+        index: int64[n], sample index; windows with a gap are skipped.
+        displacement_um: float64[n]; non-finite values count as gaps.
 
     Returns:
         rms in um; None with fewer than 32 windows.
@@ -287,10 +281,10 @@ def sensor_noise_um(index: I64, displacement_um: F64) -> float | None:
 
 
 def noise_windows_um(index: I64, displacement_um: F64) -> F64:
-    """Return the magnitude of what no polynomial explains, of each window: float64[m], m <= n - 6.
+    """Return the magnitude of the residual of each window: float64[m], m <= n - 6.
 
     Args:
-        index: int64[n], sample index; windows with a gap are left out.
+        index: int64[n], sample index; windows with a gap are skipped.
         displacement_um: float64[n], finite.
     """
     unbroken = index[_ORDER:] - index[:-_ORDER] == _ORDER
@@ -298,12 +292,12 @@ def noise_windows_um(index: I64, displacement_um: F64) -> F64:
 
 
 def noise_of(median_um: float, windows: int) -> float | None:
-    """Return the rms noise by the median of :func:`noise_windows_um`; None of too few windows."""
+    """Return the rms noise from the median of :func:`noise_windows_um`; None for few windows."""
     return MAD_TO_SIGMA * median_um / _GAIN if windows >= _FEWEST_WINDOWS else None
 
 
 def expected_maximum(values: int) -> float:
-    """Return the expected largest magnitude of that many independent standard normal values."""
+    """Return the expected largest magnitude of independent standard normal values."""
     x = np.linspace(0.0, 10.0, 2001)
     erf = np.array([math.erf(each) for each in (x / math.sqrt(2.0)).tolist()])
     below = erf**values
@@ -311,19 +305,19 @@ def expected_maximum(values: int) -> float:
 
 
 def noise_floor_percent(noise_um: float, counts: I64, peak_to_peak_um: float) -> float | None:
-    """Return the peak hysteresis that noise alone makes of a loop without any.
+    """Return the apparent peak hysteresis of a loop without hysteresis, due to noise.
 
-    An average cycle of m bins has m/2 pairs of a rising and a falling bin; the difference of each
-    pair has the noise of two bin means. The figure is the expected largest of them. Loops with
-    several branches have more pairs and a floor up to about a fifth higher.
+    A mean cycle of m bins has m/2 pairs of a rising and a falling bin; the difference of each pair
+    has the noise of two bin means. The result is the expected maximum. Loops with several branches
+    have more pairs and a floor up to about 20 % higher.
 
     Args:
         noise_um: rms of a single sample, in um.
-        counts: int64[m], samples in each bin of the average cycle.
+        counts: int64[m], samples in each bin of the mean cycle.
         peak_to_peak_um: Peak-to-peak of its output.
 
     Returns:
-        Floor in percent of the peak-to-peak; None where that is 0 or there is no bin.
+        Floor in percent of the peak-to-peak; None if that is 0 or there is no bin.
     """
     if counts.size == 0 or peak_to_peak_um <= 0.0:
         return None

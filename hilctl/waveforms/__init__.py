@@ -1,7 +1,7 @@
-"""Reference waveforms: what the experiment file may ask for, and the samples that come of it.
+"""Reference waveforms.
 
-spec.py     pydantic models of each kind
-shapes.py   pure: one kind and a sample rate -> label, spectrum, samples
-table.py    waveforms read from CSV, NPY and MCAP files
-build.py    a whole reference: shapes, soft starts and ends, sequences, segments, repetitions
+spec.py           waveforms in the experiment file
+shapes.py         samples of one waveform
+waveform_file.py  waveforms from CSV, NPY and MCAP files
+build.py          a complete reference: soft starts and ends, sequences, segments
 """

@@ -1,4 +1,4 @@
-"""A whole reference: shapes, soft starts and ends, sequences, and what of it is judged."""
+"""Build a complete reference: shapes, soft starts and ends, sequences, segments."""
 
 import math
 from collections.abc import Sequence
@@ -16,11 +16,11 @@ from hilctl.waveforms.waveform_file import read_samples
 
 @dataclass(frozen=True, slots=True)
 class RepeatedPart:
-    """What repeats within a reference, to the last bit or to a sample's part.
+    """A periodic part of a reference.
 
     Attributes:
         start: Its first sample.
-        stop: After its last one.
+        stop: Sample after its last one.
         period: Samples in a period, not necessarily whole.
     """
 
@@ -36,10 +36,10 @@ class Reference:
     Attributes:
         values: float64[n], read-only, in ``unit``.
         unit: ``um``, ``A`` or ``V``.
-        sample_rate_hz: Samples a second.
-        segments: Which samples belong to which waveform, and which of them are steady.
+        sample_rate_hz: Samples per second.
+        segments: Its waveforms with their steady parts.
         span: Lowest and highest value.
-        repeats: What repeats in a long one.
+        repeats: Periodic parts of a long one.
     """
 
     values: F64
@@ -51,13 +51,13 @@ class Reference:
 
     @property
     def telling(self) -> tuple[slice, ...]:
-        """Parts that show all there is to see: all of it, but for what repeats again and again."""
+        """Representative parts: all of it except most periods of long periodic parts."""
         return telling(self.values.size, self.repeats)
 
 
 @dataclass(frozen=True, slots=True)
 class _Part:
-    """One waveform of a reference, and whether its steady part is known to repeat."""
+    """One waveform of a reference, and whether its steady part is periodic."""
 
     values: F64
     segment: Segment
@@ -68,17 +68,17 @@ def build(waveform: spec.AnyWaveform, sample_rate_hz: float, folder: Path) -> Re
     """Compute every sample of a waveform.
 
     Args:
-        waveform: What the experiment asks for; its unit must be given.
-        sample_rate_hz: Samples a second.
-        folder: Folder that file names are relative to.
+        waveform: The waveform, with its unit.
+        sample_rate_hz: Samples per second.
+        folder: Base of relative file names.
 
     Raises:
-        InputError: A file can't be used, the waveform is too long, a soft start does not fit, a
+        InputError: A file is not usable, the waveform is too long, a soft start does not fit, a
             frequency is not below half the sample rate, or a value is too large for a float.
     """
     if waveform.unit is None:
         raise InputError("unit is required: um, A or V")
-    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused below
+    with np.errstate(over="ignore", invalid="ignore"):  # non-finite values are rejected below
         parts, repeat = _parts(waveform, waveform.unit, sample_rate_hz, folder)
         values = parts[0].values
         if len(parts) * repeat > 1:
@@ -87,7 +87,7 @@ def build(waveform: spec.AnyWaveform, sample_rate_hz: float, folder: Path) -> Re
         repeats = _repeats(parts, repeat) if values.size > shapes.LONG else ()
         told = telling(values.size, repeats)
         spans = [(each.min(), each.max()) for each in chunks(values, told)]
-    span = float(np.min(spans)), float(np.max(spans))  # keeps a NaN, where min() would not
+    span = float(np.min(spans)), float(np.max(spans))  # keeps a NaN, unlike min()
     if not np.isfinite(span).all():
         raise InputError("amplitude, offset or scale is too large: a value is not finite")
     segments, start = [], 0
@@ -98,7 +98,7 @@ def build(waveform: spec.AnyWaveform, sample_rate_hz: float, folder: Path) -> Re
 
 
 def _repeats(parts: list[_Part], repeat: int) -> tuple[RepeatedPart, ...]:
-    """Return what repeats in a long reference: all of it, or the steady parts of its waveforms."""
+    """Return the periodic parts of a long reference: all of it, or the steady parts."""
     once = sum(part.values.size for part in parts)
     if repeat > 1:
         return (RepeatedPart(0, repeat * once, float(once)),)
@@ -114,7 +114,7 @@ def _repeats(parts: list[_Part], repeat: int) -> tuple[RepeatedPart, ...]:
 def _parts(
     waveform: spec.AnyWaveform, unit: str, sample_rate_hz: float, folder: Path
 ) -> tuple[list[_Part], int]:
-    """Return a waveform's parts, and how often they come."""
+    """Return the parts of a waveform and the number of repeats."""
     if waveform.kind != "sequence":
         return [_part(waveform, waveform.kind, unit, sample_rate_hz, folder)], 1
     built = []
@@ -144,30 +144,30 @@ def _part(w: spec.SinglePart, name: str, unit: str, sample_rate_hz: float, folde
     period = period if math.isfinite(period) else 0.0
     segment = Segment(label, 0, n, soft_start, n - soft_end, period)
     _soften(values, w.rest, soft_start, soft_end)
-    # What a file says of its period is its author's word.
+    # The period of a file is not verified.
     return _Part(values, segment, period > 0.0 and w.kind != "file")
 
 
 def _soft_samples(w: spec.SinglePart, name: str, n: int, sample_rate_hz: float) -> tuple[int, int]:
-    """Return how many samples of start and end of ``n`` are bent to rest."""
+    """Return the lengths of soft start and soft end in ``n`` samples."""
     soft_s = w.soft_start_s + w.soft_end_s
     if soft_s * sample_rate_hz > n + 0.5:
         raise InputError(
             f"{name}: soft_start_s + soft_end_s = {soft_s:.10g} s must fit in its "
             f"{n / sample_rate_hz:.10g} s"
         )
-    # whole samples, and one that rounding kept from being whole: never more than n together
+    # tolerance for rounding; never more than n together
     return int(w.soft_start_s * sample_rate_hz + 1e-6), int(w.soft_end_s * sample_rate_hz + 1e-6)
 
 
 def _soften(values: F64, rest: float, start: int, end: int) -> None:
-    """Bend the first and the last values to rest, in place.
+    """Fade the first and last values from and to rest, in place.
 
     Args:
         values: float64[n].
-        rest: The value that they begin at and end at.
-        start: How many are bent at the start.
-        end: How many at the end; none of them twice.
+        rest: First and last value.
+        start: Samples of the fade at the start.
+        end: Samples of the fade at the end; no overlap.
     """
     first, last = values[:start], values[values.size - end :]
     first[:] = rest + _raised_cosine(start) * (first - rest)
@@ -175,17 +175,17 @@ def _soften(values: F64, rest: float, start: int, end: int) -> None:
 
 
 def _raised_cosine(n: int) -> F64:
-    """Return a raised cosine that grows from 0 to 1: float64[n]."""
+    """Return a raised cosine from 0 to 1: float64[n]."""
     values: F64 = 0.5 - 0.5 * np.cos(np.pi * np.arange(n) / max(n, 1))
     return values
 
 
 def telling(size: int, repeats: Sequence[RepeatedPart]) -> tuple[slice, ...]:
-    """Return the parts of a reference that show all there is to see in it.
+    """Return the representative parts of a reference.
 
     Args:
-        size: How many samples it has.
-        repeats: What repeats in it, in order.
+        size: Its samples.
+        repeats: Its periodic parts in order.
     """
     parts, at = [], 0
     for each in repeats:

@@ -1,4 +1,4 @@
-"""One waveform and a sample rate to samples: what each kind is, as pure functions of time."""
+"""Samples of one waveform, as pure functions of time."""
 
 import math
 from dataclasses import dataclass
@@ -11,27 +11,27 @@ from hilctl.base.types import CHUNK, F64, I64
 from hilctl.waveforms import spec
 
 MAX_SAMPLES = 100_000_000
-"""Most samples of a waveform: 0.8 GB, 33 minutes at 50 kHz."""
+"""Longest waveform in samples: 0.8 GB, 33 minutes at 50 kHz."""
 
 LONG = 400_000
-"""Samples above which a waveform is checked by one of its repetitions."""
+"""Samples above which a periodic waveform is checked by representative parts."""
 
 _TELLING_CYCLES = 8
-_LONGEST_PERIOD = 2**31  # samples; so that their products are no more than an integer holds
+_LONGEST_PERIOD = 2**31  # samples; products must fit an integer
 
 
 def sample_count(duration_s: float, sample_rate_hz: float) -> int:
-    """Return how many samples a duration has, at least one.
+    """Return the samples of a duration, at least one.
 
     Raises:
-        InputError: They are more than :data:`MAX_SAMPLES`.
+        InputError: There are more than :data:`MAX_SAMPLES`.
     """
     check_length(duration_s * sample_rate_hz)
     return max(1, round(duration_s * sample_rate_hz))
 
 
 def check_length(samples: float) -> None:
-    """Refuse a waveform that is too long.
+    """Reject a waveform that is too long.
 
     Raises:
         InputError: There are more than :data:`MAX_SAMPLES`.
@@ -77,10 +77,10 @@ def outline(w: spec.Shape, unit: str) -> tuple[str, float, float]:
 
 
 def sampled(w: spec.Shape, sample_rate_hz: float) -> F64:
-    """Return every sample of a waveform, offset included and not yet softened: float64[n].
+    """Return every sample of a waveform with its offset, without soft start: float64[n].
 
     Raises:
-        InputError: They are too many.
+        InputError: There are too many.
     """
     size = sample_count(_duration_s(w), sample_rate_hz)
     if isinstance(w, spec.RandomSines):
@@ -93,7 +93,7 @@ def sampled(w: spec.Shape, sample_rate_hz: float) -> F64:
 
 
 def _computed(w: spec.ShapeOfTime, sample_rate_hz: float, size: int) -> F64:
-    """Return a waveform's samples without its offset, from one period if it repeats: float64[n]."""
+    """Return a waveform without offset, from one period if periodic: float64[n]."""
     once = np.empty(min(size, _period(w, sample_rate_hz) or size))
     for start in range(0, once.size, CHUNK):
         stop = min(start + CHUNK, once.size)
@@ -103,11 +103,11 @@ def _computed(w: spec.ShapeOfTime, sample_rate_hz: float, size: int) -> F64:
 
 @dataclass(frozen=True, slots=True)
 class _Instants:
-    """When samples are taken.
+    """Sampling instants.
 
     Attributes:
-        sample: int64[n], their numbers.
-        rate_hz: Samples a second.
+        sample: int64[n], sample numbers.
+        rate_hz: Samples per second.
     """
 
     sample: I64
@@ -119,11 +119,10 @@ class _Instants:
         return self.sample / self.rate_hz
 
     def cycles(self, frequency_hz: float) -> F64:
-        """Return how far into its cycle a frequency is, in cycles: float64[n], 0 to 1.
+        """Return the phase of a frequency in cycles: float64[n], 0 to 1.
 
-        The same bits in each period that is a whole number of samples, for frequencies and rates
-        that are taken as the decimal numbers they were written as: rounded times would make each
-        cycle another, and what comes of it in a recording cannot be told from noise.
+        Frequency and rate are decimal numbers as written, so that each period of a whole number of
+        samples has the same bits. Rounded times would make every cycle differ slightly, like noise.
         """
         turn = _decimal(frequency_hz) / _decimal(self.rate_hz) % 1
         if turn.denominator > _LONGEST_PERIOD:
@@ -133,7 +132,7 @@ class _Instants:
 
 
 def _period(w: spec.ShapeOfTime, sample_rate_hz: float) -> int:
-    """Return after how many samples the same bits come again; 0 where that is never or too late."""
+    """Return the samples after which the bits repeat; 0 if never or too late."""
     match w:
         case spec.Sine() | spec.Triangle():
             common = [w.frequency_hz]
@@ -219,7 +218,7 @@ def _step(w: spec.Step, t: F64) -> F64:
 
 
 def _multisine(w: spec.Multisine, at: _Instants) -> F64:
-    """Return evenly spaced sines with Schroeder phases, of whatever peak: float64[n].
+    """Return evenly spaced sines with Schroeder phases, unscaled: float64[n].
 
     Source: M. R. Schroeder, IEEE Trans. Information Theory 16 (1970) 85: phases of a low crest
     factor, ``phi_m = -pi m (m - 1) / M``.
@@ -233,7 +232,7 @@ def _multisine(w: spec.Multisine, at: _Instants) -> F64:
 
 
 def _multisine_scale(w: spec.Multisine, sample_rate_hz: float, values: F64) -> float:
-    """Return the factor that gives a multisine its amplitude, from the peak of its samples."""
+    """Return the factor that scales the peak of a multisine to its amplitude."""
     told = values.size
     if told > LONG:
         period = outline(w, "")[2] * sample_rate_hz
@@ -243,12 +242,12 @@ def _multisine_scale(w: spec.Multisine, sample_rate_hz: float, values: F64) -> f
 
 
 def telling_samples(period: float) -> int:
-    """Return how many samples of what repeats stand for all of them.
+    """Return the number of representative samples of a periodic part.
 
     Args:
         period: Samples in a period, > 0 and finite.
     """
-    # Where a period is no whole number of samples, each cycle has others: several are looked at.
+    # Cycles differ unless the period is a whole number of samples, so several are needed.
     cycles = 1 if period.is_integer() else _TELLING_CYCLES
     return CHUNK + math.ceil(cycles * period)
 
@@ -256,7 +255,7 @@ def telling_samples(period: float) -> int:
 def _random(w: spec.RandomSines, size: int) -> F64:
     """Return sines of random phases at all multiples of 1 / duration within the band: float64[n].
 
-    Summed in the spectrum: there are more of them the longer it is.
+    The sum is an inverse FFT, because the number of sines grows with the duration.
     """
     first, last = math.ceil(w.first_hz * w.duration_s), math.floor(w.last_hz * w.duration_s)
     phases = np.random.default_rng(w.seed).random(last - first + 1)
@@ -267,31 +266,31 @@ def _random(w: spec.RandomSines, size: int) -> F64:
 
 
 def _levels(w: spec.LevelPath) -> F64:
-    """Return the levels, with the one that the path begins at: float64[m + 1]."""
+    """Return the levels including the initial one: float64[m + 1]."""
     return np.array((w.rest - w.offset, *w.levels))
 
 
 def _arrivals_s(w: spec.LevelPath) -> F64:
-    """Return when the path begins, and when it gets to each level: float64[m + 1], in s."""
+    """Return the start time of the path and its arrival at each level: float64[m + 1], in s."""
     lengths = np.abs(np.diff(_levels(w)))
     return np.concatenate(([0.0], np.cumsum(lengths))) / w.rate_per_s
 
 
 def _multisine_count(w: spec.Multisine) -> int:
-    """Return how many sines a multisine has."""
+    """Return the number of sines in a multisine."""
     return int((w.last_hz - w.first_hz) / w.step_hz + 1e-9) + 1
 
 
 def _decimal(value: float) -> Fraction:
-    """Return the decimal number that a value was written as."""
+    """Return the shortest decimal number of a value."""
     return Fraction(repr(float(value)))
 
 
 def common_period_s(frequencies_hz: list[float]) -> float:
     """Return the shortest period that all frequencies share, in s.
 
-    Frequencies are taken as the decimal numbers they were written as, so 0.1 and 0.3 Hz share
-    10 s. Infinite where it is too long for a float.
+    Frequencies are decimal numbers as written, so 0.1 and 0.3 Hz share 10 s. Infinite if it is too
+    long for a float.
     """
     fractions = [_decimal(f) for f in frequencies_hz]
     common = fractions[0]

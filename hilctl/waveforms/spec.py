@@ -1,7 +1,7 @@
-"""What the experiment file may say of a waveform.
+"""Waveforms in the experiment file.
 
-Amplitudes, offsets and levels are in the waveform's ``unit``: um where a compensator turns the
-reference into a command, A or V where none stands between.
+Amplitudes, offsets and levels are in the waveform's ``unit``: um with a compensator, A or V
+without one.
 """
 
 import math
@@ -14,11 +14,11 @@ Positive: TypeAlias = Annotated[float, Field(gt=0.0)]
 NotNegative: TypeAlias = Annotated[float, Field(ge=0.0)]
 
 MAX_SINES = 10_000
-"""Most sines in one multisine."""
+"""Largest number of sines in a multisine."""
 
 
 def _not_empty(values: tuple[Any, ...]) -> tuple[Any, ...]:
-    if not values:  # pydantic's min_length also complains of a list whose only item is broken
+    if not values:  # min_length also rejects a list whose only item is invalid
         raise ValueError("must have at least one value: []")
     return values
 
@@ -35,14 +35,14 @@ AtLeastOne = Field(json_schema_extra={"minItems": 1})
 
 
 class _Shape(StrictModel):
-    """What all kinds have.
+    """Keys of every kind of waveform.
 
     Attributes:
         unit: Unit of every amplitude, offset and level.
-        offset: Constant that the waveform is centred on.
-        rest: Value that a soft start grows from and a soft end leads back to.
-        soft_start_s: Time in which the whole waveform, offset included, grows from ``rest``.
-        soft_end_s: Time in which it shrinks back to there. Both lie within the duration.
+        offset: Constant added to the waveform.
+        rest: Value before a soft start and after a soft end.
+        soft_start_s: Duration of the fade from ``rest``, offset included.
+        soft_end_s: Duration of the fade back. Both are part of the waveform's duration.
     """
 
     unit: WaveformUnit | None = Field(default=None, description="um, A or V")
@@ -97,7 +97,7 @@ class GrowingOrDecaying(_Shape):
 
 
 class Chirp(_Shape):
-    """A sine whose frequency moves from ``start_hz`` to ``stop_hz``."""
+    """A sine whose frequency changes from ``start_hz`` to ``stop_hz``."""
 
     kind: Literal["chirp"]
     amplitude: Positive
@@ -108,7 +108,7 @@ class Chirp(_Shape):
 
 
 class Step(_Shape):
-    """Levels held one after the other, reached in ``rise_s`` each."""
+    """Consecutive constant levels, each reached in ``rise_s``."""
 
     kind: Literal["step"]
     levels: Annotated[tuple[float, ...], NotEmpty, AtLeastOne]
@@ -159,10 +159,10 @@ class Multisine(_Shape):
 class RandomSines(_Shape):
     """Equal sines of random phases over a whole band, scaled to a peak amplitude.
 
-    It repeats with its duration, and nowhere within it.
+    Its period is its duration.
 
     Attributes:
-        seed: Seed of the phases; another one gives another waveform of the same band.
+        seed: Seed of the phases.
     """
 
     kind: Literal["random"]
@@ -191,8 +191,8 @@ class LevelPath(_Shape):
     """Straight lines from level to level, all at one rate; begins at ``rest``.
 
     Attributes:
-        levels: Where the lines end, offset not included.
-        rate_per_s: How fast it moves, in the waveform's unit a second.
+        levels: End points of the lines, without offset.
+        rate_per_s: Rate in the waveform's unit per second.
     """
 
     kind: Literal["path"]
@@ -207,12 +207,12 @@ class FileWaveform(_Shape):
         path: File, relative to the experiment file's folder.
         column: Column by name, or by number counted from 1; for MCAP one of ``reference_um``,
             ``displacement_um``, ``command``, ``wanted``. Not used for a one-column file.
-        file_rate_hz: Sample rate of the file, where it holds no time of its own (column ``t_s``).
+        file_rate_hz: Sample rate of a file without a time column ``t_s``.
         first_row: First data row used, counted from 1.
-        last_row: Last data row used; all where not given.
-        resample: What to do where the file's rate is not the run's: ``refuse``, or interpolate
-            ``linear`` or with a ``cubic`` spline.
-        period_s: Period of the waveform, where it repeats, so that steady cycles can be judged.
+        last_row: Last data row used. Default: the last of the file.
+        resample: Method if the file has another sample rate: ``refuse``, ``linear`` interpolation
+            or a ``cubic`` spline.
+        period_s: Period of a periodic waveform, for metrics of steady cycles.
     """
 
     kind: Literal["file"]
@@ -259,7 +259,7 @@ SinglePart: TypeAlias = Annotated[_Single, Field(discriminator="kind")]
 
 
 class Sequence(StrictModel):
-    """Waveforms one after the other; the unit stands here, not in the parts."""
+    """Consecutive waveforms with a common unit."""
 
     kind: Literal["sequence"]
     unit: WaveformUnit | None = Field(default=None, description="um, A or V")

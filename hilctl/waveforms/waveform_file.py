@@ -1,4 +1,4 @@
-"""Waveforms from files: CSV, NPY or MCAP, resampled only where the experiment says so."""
+"""Waveforms from CSV, NPY and MCAP files, resampled on request."""
 
 from pathlib import Path
 from tokenize import TokenError
@@ -9,31 +9,31 @@ import numpy.typing as npt
 
 from hilctl.base.csv_table import MAX_COLUMNS, TextTable, check_rows, column_index
 from hilctl.base.errors import InputError
-from hilctl.base.os_errors import no_such_file, reason
+from hilctl.base.files import no_such_file, reason
 from hilctl.base.segments import SHORTEST_PERIOD
 from hilctl.base.types import F64
 from hilctl.waveforms.shapes import check_length
 from hilctl.waveforms.spec import FileWaveform
 
 _RATE_TOLERANCE = 1e-6
-_TIME_TOLERANCE = 0.01  # largest departure of one step from the median
+_TIME_TOLERANCE = 0.01  # largest deviation of a step from the median
 
 
 def read_samples(w: FileWaveform, sample_rate_hz: float, folder: Path) -> tuple[F64, float]:
-    """Read a waveform and bring it to the run's sample rate.
+    """Read a waveform at the run's sample rate.
 
     Args:
-        w: What to read.
-        sample_rate_hz: The run's samples a second.
-        folder: Folder that ``w.path`` is relative to.
+        w: The waveform.
+        sample_rate_hz: Samples per second of the run.
+        folder: Base of ``w.path``.
 
     Returns:
-        float64[n], the samples in the waveform's unit, and the period in samples (0.0 where it
-        does not repeat).
+        float64[n], the samples in the waveform's unit, and the period in samples (0.0 if it
+        is not periodic).
 
     Raises:
-        InputError: The file, column or a row is missing, a value is not finite, its rate is not
-            known, or it differs from the run's and ``resample`` is ``refuse``.
+        InputError: The file, column or a row is missing, a value is not finite, its rate is
+            unknown, or it differs from the run's and ``resample`` is ``refuse``.
     """
     path = folder / w.path
     try:
@@ -54,13 +54,13 @@ def read_samples(w: FileWaveform, sample_rate_hz: float, folder: Path) -> tuple[
 
 def _file_rate(w: FileWaveform, path: Path, own_rate_hz: float | None) -> float:
     if own_rate_hz is None and w.file_rate_hz is None:
-        raise InputError(f"{path}: holds no time column t_s: give file_rate_hz")
+        raise InputError(f"{path}: has no time column t_s: set file_rate_hz")
     if own_rate_hz is not None and w.file_rate_hz is not None:
         difference = abs(own_rate_hz / w.file_rate_hz - 1.0)
         if difference > _RATE_TOLERANCE:
             raise InputError(
-                f"{path}: its own time says {own_rate_hz:.10g} Hz, "
-                f"file_rate_hz says {w.file_rate_hz:.10g} Hz"
+                f"{path}: file_rate_hz is {w.file_rate_hz:.10g} Hz, but its time column gives "
+                f"{own_rate_hz:.10g} Hz"
             )
     return float(own_rate_hz or w.file_rate_hz or 0.0)
 
@@ -107,12 +107,12 @@ def _read_text(w: FileWaveform, path: Path) -> tuple[F64, float | None]:
 
 def _read_npy(path: Path) -> dict[str, npt.NDArray[Any]]:
     try:
-        # Mapped, not read: what its head says of its size must fit the file. NumPy parses the head
-        # as Python, multiplies what it finds, and hands the parser's own errors on.
+        # Mapped, not read, so that the size in the header must fit the file. NumPy parses the
+        # header as Python and passes on the errors of the parser.
         with np.errstate(over="ignore"):
             table = np.load(path, mmap_mode="r", allow_pickle=False)
     except (ValueError, OSError, EOFError, OverflowError, TypeError, TokenError):
-        raise InputError(f"{path}: is not a whole NumPy file (.npy) of numbers") from None
+        raise InputError(f"{path}: is not a complete NumPy file (.npy) of numbers") from None
     if not (isinstance(table, np.ndarray) and table.dtype.kind in "fiu" and table.ndim in (1, 2)):
         raise InputError(f"{path}: must hold a one- or two-dimensional array of numbers")
     if table.size == 0:
@@ -129,13 +129,13 @@ def _read_mcap(path: Path) -> tuple[dict[str, npt.NDArray[Any]], float]:
     recording = read(path)
     samples = recording.samples
     if np.any(np.diff(samples.index) != 1):
-        raise InputError(f"{path}: samples are missing in it, a waveform needs every one")
+        raise InputError(f"{path}: samples are missing")
     names = ("reference_um", "displacement_um", "command", "wanted")
     return {name: getattr(samples, name) for name in names}, recording.sample_rate_hz
 
 
 def _finite(path: Path, chosen: npt.NDArray[Any], first_row: int) -> F64:
-    """Return the rows that are asked for: float64[n], all finite."""
+    """Return the selected rows: float64[n], all finite."""
     _check_count(path, chosen.size)
     raw = np.array(chosen, dtype=np.float64)
     bad = np.flatnonzero(~np.isfinite(raw))

@@ -9,7 +9,7 @@ import pytest
 
 from hilctl.base.device import DeviceInfo
 from hilctl.base.errors import DeviceError
-from hilctl.experiment.device import BUILTIN
+from hilctl.experiment.devices import BUILTIN
 from hilctl_drivers import contract as CONTRACT  # noqa: N812
 
 UM_PER_A = 10.0

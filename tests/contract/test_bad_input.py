@@ -140,8 +140,8 @@ BROKEN: list[tuple[str, str, str]] = [
     (
         "reference beyond the model",
         IN_UM.replace("amplitude: 1.0", "amplitude: 12.5"),
-        "x.yaml:5: waveform: reference must stay within the range that compensator.model was found "
-        "on, -12 to 12 µm, got -12.5 to 12.5 µm (0.5 µm too far",
+        "x.yaml:5: waveform: reference must stay within the range that compensator.model was "
+        "identified on, -12 to 12 µm, got -12.5 to 12.5 µm (0.5 µm too far",
     ),
     (
         "unknown device",

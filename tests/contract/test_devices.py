@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from hilctl.base.device import Device
-from hilctl.experiment.device import BUILTIN, device_class, known_devices
+from hilctl.experiment.devices import BUILTIN, device_class, known_devices
 from hilctl_drivers.contract import *  # noqa: F403  the checks, and the fixture driven
 from hilctl_drivers.contract import RATE_HZ, SAMPLES, DrivenDevice, driven_device
 from hilctl_drivers.emulator.factory import build

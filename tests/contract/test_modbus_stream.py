@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hilctl.base.errors import DeviceError
-from hilctl.experiment.device import device_class
+from hilctl.experiment.devices import device_class
 from hilctl_drivers.modbus.modbus_profile import ModbusProfile
 from hilctl_drivers.profile import load_profile, shipped_profiles
 from tests.fakes import InProcess

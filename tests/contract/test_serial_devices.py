@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from hilctl.base.errors import DeviceError
-from hilctl.experiment.device import device_class
+from hilctl.experiment.devices import device_class
 from hilctl_drivers import contract
 from hilctl_drivers.contract import *  # noqa: F403  the checks, and the fixture driven
 from hilctl_drivers.emulator.options import EmulatorOptions

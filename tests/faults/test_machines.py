@@ -117,7 +117,7 @@ def test_a_full_disk_at_the_start_is_one_message(hilctl, own_mounts, tmp_path, b
     changes = {"device": device.section, "sample_rate_hz": 500, "block": 1}
     ended = hilctl(shell, output="disk/run.mcap", changes=changes)
     assert ended.returncode == 2, ended.stderr
-    why = "No space left on device (df -h says where there is room)"
+    why = "No space left on device (df -h lists free space)"
     assert ended.stderr == f"hilctl: disk/run.mcap: can't be written: {why}\n"
     assert ended.stdout.split() == ["full", *["run.mcap"][:before]]
     assert device.has_not_moved()

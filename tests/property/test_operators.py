@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from hilctl.kernels.hysteresis import play_sum_shared, rest_memory
-from hilctl.models.deadband import DeadbandFunction
-from hilctl.models.integrated import IntegratedModel
+from hilctl.models.integrated import DeadbandFunction, IntegratedModel
 from hilctl.models.model_file import dump_model, parse_model
 from hilctl.models.plays import PpiModel, RdpiModel, SpiModel
 

@@ -5,9 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from hilctl.models.cascade import smoothing_weights
 from hilctl.models.integrated import IntegratedModel
-from hilctl.models.mechanics import FirstMode
+from hilctl.models.linear_stages import FirstMode, smoothing_weights
 from hilctl.models.model_file import dump_model, parse_model
 from hilctl.models.plays import PpiModel, RdpiModel
 from hilctl.models.staged import FieldLag, StagedModel

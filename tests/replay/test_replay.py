@@ -17,7 +17,7 @@ from hilctl.base.samples import Flag
 from hilctl.experiment.initial_state import initial_state_after
 from hilctl.loop.compensator import Compensator
 from hilctl.models.base import HysteresisModel
-from hilctl.models.mechanics import FirstMode
+from hilctl.models.linear_stages import FirstMode
 from hilctl.models.model_file import dump_model
 from hilctl.models.staged import FieldLag, StagedModel
 from hilctl.recording.reader import read

@@ -10,7 +10,7 @@ from typing import IO, Any, TypeAlias
 import numpy as np
 
 from hilctl.base.errors import InputError
-from hilctl.base.os_errors import reason
+from hilctl.base.files import reason
 from hilctl.base.types import F64
 from hilctl_drivers.profile_base import Range
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters

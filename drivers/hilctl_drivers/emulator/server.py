@@ -17,7 +17,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 
 from hilctl.base.errors import InputError
-from hilctl.base.os_errors import ADDRESS_REMEDIES, reason
+from hilctl.base.files import ADDRESS_REMEDIES, reason
 from hilctl_drivers.emulator.options import FaultPlan, WireFault, spoil
 from hilctl_drivers.emulator.wire import EmulatedReply, EmulatedWire
 

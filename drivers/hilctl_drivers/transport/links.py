@@ -22,7 +22,7 @@ from types import MappingProxyType
 from typing import Protocol, TypeAlias
 
 from hilctl.base.errors import DeviceError
-from hilctl.base.os_errors import reason
+from hilctl.base.files import reason
 
 Missing: TypeAlias = Callable[[bytearray], int]
 """How many more bytes to wait for, at least, after those that have come; 0 where the reply is

@@ -16,7 +16,7 @@ from typing import Literal
 import serial
 
 from hilctl.base.errors import DeviceError
-from hilctl.base.os_errors import PORT_REMEDIES, reason
+from hilctl.base.files import PORT_REMEDIES, reason
 from hilctl_drivers.transport.links import LostError, Missing, NoAnswerError, cut, why
 from hilctl_drivers.transport.resource_names import admit_others, refuse_to_others
 

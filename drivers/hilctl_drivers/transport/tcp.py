@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 
 from hilctl.base.errors import DeviceError
-from hilctl.base.os_errors import CONNECT_REMEDIES
+from hilctl.base.files import CONNECT_REMEDIES
 from hilctl_drivers.transport.links import LostError, Missing, NoAnswerError, cut, why
 
 _FIRST = 256

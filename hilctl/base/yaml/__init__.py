@@ -1,7 +1,7 @@
-"""YAML as hilctl reads and writes it: the plain part of YAML 1.2, strictly.
+"""Strict subset of YAML 1.2.
 
-io.py      files and texts with the line of every value; settings over them; plain data as YAML
-errors.py  broken rules in words, and what is read although YAML has it otherwise
+io.py      documents with the line of every value; settings; plain data as YAML
+errors.py  validation errors in words, and tolerant readings of unambiguous values
 """
 
 from hilctl.base.yaml.errors import Loc, broken_rules, did_you_mean, dotted, loc_of

@@ -1,8 +1,8 @@
-"""Broken rules in words: where, key, rule, value, and what to do about it.
+"""Validation errors in words (place, key, rule, value, fix), and tolerant readings.
 
-What people write and YAML has otherwise (a decimal comma, a micro sign, ``1e3`` for a count) is
-read where a model wants a number, or one of a few words, and where there is one way only to read
-it: ``1,5`` is 1.5, but ``1,500`` may be a thousand and a half, and is refused.
+A decimal comma, a micro sign, or ``1e3`` for a count is accepted if a model expects a number or one
+of a few words and there is only one reading: ``1,5`` is 1.5, but ``1,500`` is ambiguous and
+rejected.
 """
 
 import difflib
@@ -18,14 +18,14 @@ from pydantic_core import ErrorDetails
 from hilctl.base.errors import ConfigError, ConfigProblem
 
 Loc: TypeAlias = tuple[str | int, ...]
-"""Keys and list indices that lead to a value."""
+"""Location of a value: keys and list indices."""
 
 NUMBERS = {
     "int": r"[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+",
     "float": r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?"
     r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)",
 }
-"""What a number without quotes looks like in YAML 1.2, as regular expressions."""
+"""Regular expressions for plain numbers in YAML 1.2."""
 
 _COMMA = re.compile(r"([-+]?\d+),(\d+)((?:[eE][-+]?\d+)?)")
 _MICRO = str.maketrans({"\N{MICRO SIGN}": "u", "\N{GREEK SMALL LETTER MU}": "u"})
@@ -59,13 +59,13 @@ _SPOKEN_BOOLEANS = {"yes", "no", "on", "off", "y", "n"}
 
 
 class _Broken(NamedTuple):
-    """One thing that pydantic says, with the keys that stand in the file.
+    """A validation error with its location in the file.
 
     Attributes:
-        detail: What it says.
-        loc: Keys and indices, without pydantic's names of choices.
-        parent: The model that the last key is in, where it is in one.
-        of_choice: Whether a value is not of the type of one choice of several.
+        detail: The error of pydantic.
+        loc: Keys and indices without pydantic's names of union members.
+        parent: The model with the last key, if any.
+        of_choice: Whether the value has the wrong type for one of several union members.
     """
 
     detail: ErrorDetails
@@ -80,7 +80,7 @@ def dotted(loc: Loc) -> str:
 
 
 def loc_of(key: str) -> Loc:
-    """Return a dotted key as a location; what looks like a number is a list index."""
+    """Return a dotted key as a location; numbers are list indices."""
     return tuple(int(part) if part.isdecimal() else part for part in key.split("."))
 
 
@@ -96,23 +96,23 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
 def broken_rules(
     error: ValidationError, model: type[BaseModel], where: Callable[[Loc], str], at: Loc = ()
 ) -> list[ConfigProblem]:
-    """Return all that pydantic says of a file, one problem a value.
+    """Return all validation errors of a file, one problem per value.
 
     Args:
-        error: What pydantic says.
-        model: What it tried to build.
-        where: Gives the ``file:line`` of a location, or of the nearest thing around it.
-        at: Where in the file the model's data stand.
+        error: The validation error.
+        model: The model.
+        where: Returns the ``file:line`` of a location, or of its nearest parent.
+        at: Location of the model's data in the file.
     """
     problems: list[ConfigProblem] = []
     broken: list[_Broken] = []
     for detail in error.errors(include_url=False):
         cause = detail.get("ctx", {}).get("error")
-        if isinstance(cause, ConfigError):  # read from another file: says itself where it stands
+        if isinstance(cause, ConfigError):  # from another file, with its own place
             problems += cause.problems
         else:
             broken.append(_located(model, detail))
-    # A choice that was not meant says nothing, where another one says what is wrong within it.
+    # Ignore type errors of union members if another member matched the type.
     meant = {
         each.loc[:n] for each in broken if not each.of_choice for n in range(len(each.loc) + 1)
     }
@@ -124,14 +124,14 @@ def broken_rules(
 
 
 def readings(error: ValidationError, model: type[BaseModel]) -> Iterator[tuple[Loc, Any, bool]]:
-    """Yield what can be read otherwise of what pydantic has refused.
+    """Yield tolerant readings of rejected values.
 
     Args:
-        error: What it says.
-        model: What it tried to build.
+        error: The validation error.
+        model: The model.
 
     Yields:
-        Where it stands, what it is read as, and whether it is the key that is read otherwise.
+        Location, reading, and whether the reading replaces the key instead of the value.
     """
     for each in (_located(model, detail) for detail in error.errors(include_url=False)):
         value = None if each.of_choice else _read_as(each.detail, each.parent)
@@ -156,7 +156,7 @@ def _read_as(detail: ErrorDetails, parent: type[BaseModel] | None) -> float | st
 
 
 def _decimal(text: str) -> float | None:
-    """Return a number with a decimal comma; None where it may be another one, or is none."""
+    """Return a number with a decimal comma; None if it is ambiguous or no number."""
     found = _COMMA.fullmatch(text.strip())
     if found is None:
         return None
@@ -172,7 +172,7 @@ def _problem(group: list[_Broken], where: Callable[[Loc], str], at: Loc) -> Conf
     place = loc = (*at, *first.loc)
     rule, *others = (_rule(each.detail) for each in group)
     rule = ", or ".join([rule, *(other.removeprefix("must be ") for other in others)])
-    if first.detail["type"] == "value_error":  # a rule of several keys names the one it is about
+    if first.detail["type"] == "value_error":  # a rule on several keys begins with the key
         place = (*loc, *loc_of(rule.split(" ", 1)[0]))
     known = first.parent.model_fields if first.parent else ()
     hint = next(filter(None, (_hint(each.detail, known) for each in group)), "")
@@ -196,7 +196,7 @@ def _expected(detail: ErrorDetails) -> str:
 
 
 def _value(detail: ErrorDetails) -> str:
-    """Return the offending value, short enough for one line; empty where the rule has it."""
+    """Return the invalid value on one line; empty if the rule includes it."""
     value, kind = detail["input"], detail["type"]
     if kind in _WITHOUT_VALUE:
         return ""
@@ -212,7 +212,7 @@ def _hint(detail: ErrorDetails, known: Iterable[str]) -> str:
     value, kind = detail["input"], detail["type"]
     if kind == "extra_forbidden":
         return did_you_mean(str(detail["loc"][-1]), known)
-    if kind in _WORDS:  # all are listed: name one only where it is near
+    if kind in _WORDS:  # all are listed: suggest only a close one
         given, words = detail.get("ctx", {}).get("tag", value), _QUOTED.findall(_expected(detail))
         close = difflib.get_close_matches(str(given), words, n=1, cutoff=0.75)
         return f"did you mean '{close[0]}'?" if close and len(words) > 1 else ""
@@ -242,7 +242,7 @@ def _is_number(text: str) -> bool:
 
 
 def _located(model: type[BaseModel], detail: ErrorDetails) -> _Broken:
-    """Follow pydantic's location through the types, and leave out its names of choices."""
+    """Map pydantic's location to the file, without its names of union members."""
     choices: list[Any] = [model]
     parent: type[BaseModel] | None = None
     plain: list[str | int] = []
@@ -267,9 +267,9 @@ def _is_model(annotation: Any) -> bool:
 
 
 def _is_named(choice: Any, name: str | int) -> bool:
-    """Return whether pydantic calls a choice so: by its kind, or by its class.
+    """Return whether pydantic's name of a union member, its kind or class, matches.
 
-    The class may stand within its validators: ``function-after[_fits(), Flag]``.
+    The class may be inside its validators: ``function-after[_fits(), Flag]``.
     """
     if not _is_model(choice):
         return False
@@ -280,7 +280,7 @@ def _is_named(choice: Any, name: str | int) -> bool:
 
 
 def _inner(annotation: Any, part: str | int) -> Any:
-    """Return the type of what stands at a key or an index; None where it is not known."""
+    """Return the type of the value at a key or index; None if unknown."""
     if _is_model(annotation):
         field = annotation.model_fields.get(part)
         return field.annotation if field else None
@@ -295,7 +295,7 @@ def _inner(annotation: Any, part: str | int) -> Any:
 
 
 def _choices(annotation: Any) -> list[Any]:
-    """Return what a value may be: several types where pydantic's location names the choice."""
+    """Return the union members of a type, or the type itself."""
     origin = typing.get_origin(annotation)
     if origin is Annotated:
         return _choices(typing.get_args(annotation)[0])

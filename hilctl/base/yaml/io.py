@@ -9,7 +9,7 @@ A scalar without quotes is, as the core schema says (YAML 1.2.2, section 10.3.2)
              (also ``.Inf``, ``.INF``, ``.NaN``, ``.NAN``)
     text     everything else: ``yes``, ``on``, ``1:30``, ``1_000``, ``2026-11-21``
 
-Aliases and tags can make loops and values that are neither numbers nor text, so they are refused.
+Aliases and tags are rejected, because they allow loops and values of other types.
 """
 
 import json
@@ -29,11 +29,11 @@ from hilctl.base.files import TextFiles
 from hilctl.base.yaml.errors import NUMBERS, Loc, broken_rules, dotted, readings
 
 MAX_DEPTH = 32
-"""Levels of nesting that are read; an experiment has about five."""
+"""Largest nesting depth; an experiment has about five levels."""
 MAX_CHARACTERS = 2_000_000
-"""Longest text that is read; a model of ten thousand operators has a fifth of it."""
+"""Longest text; a model of ten thousand operators has a fifth of it."""
 MAX_VALUES = 50_000
-"""Most values, lists and mappings in a text: their parser takes up to 0.1 ms for each."""
+"""Largest number of values, lists and mappings; the parser takes up to 0.1 ms for each."""
 
 Model = TypeVar("Model", bound=BaseModel)
 _log = logging.getLogger(__name__)
@@ -42,7 +42,7 @@ _TAG = "tag:yaml.org,2002:"
 
 
 class _PlainLoader(yaml.SafeLoader):
-    """Refuses what is not plain as it reads."""
+    """Loader that rejects everything but plain YAML."""
 
     yaml_implicit_resolvers = {}  # noqa: RUF012  PyYAML's own way; filled below
     _depth = 0
@@ -76,9 +76,9 @@ class _PlainLoader(yaml.SafeLoader):
 
 
 class _PlainDumper(yaml.SafeDumper):
-    """Writes no aliases, and quotes every text that YAML 1.1 or 1.2 would read as something else.
+    """Dumper without aliases that quotes texts with another meaning in YAML 1.1 or 1.2.
 
-    PyYAML's resolvers, which are those of 1.1, stay, so that other programs read the same.
+    It keeps PyYAML's resolvers of YAML 1.1, so that other programs read the same.
     """
 
     def ignore_aliases(self, data: Any) -> bool:
@@ -95,11 +95,10 @@ for _name, _pattern in {
 
 
 def compose(text: str) -> yaml.Node | None:
-    """Return the text's tree, or None where it holds nothing.
+    """Return the node tree of a text, or None if it is empty.
 
     Raises:
-        yaml.MarkedYAMLError: It is not YAML, more than the plain part of it, or too much; says
-            where.
+        yaml.MarkedYAMLError: It is not plain YAML or too large; with the place.
     """
     if len(text) > MAX_CHARACTERS:
         problem = f"{len(text)} characters, more than the {MAX_CHARACTERS} that are read"
@@ -118,9 +117,9 @@ def compose(text: str) -> yaml.Node | None:
 
 
 def _scalar(node: yaml.Node) -> Any:
-    """Return a leaf's value: None, a bool, an int, a float, or text where it is none of them.
+    """Return the value of a scalar: None, a bool, an int, a float, or else text.
 
-    A whole number of more than 64 bits is a float: Python won't write out very long ones.
+    An integer of more than 64 bits is a float, because Python does not print very long ones.
     """
     text: str = node.value
     match node.tag.removeprefix(_TAG):
@@ -140,25 +139,25 @@ def _scalar(node: yaml.Node) -> Any:
 
 
 def dump(data: Any) -> str:
-    """Return plain data as YAML; read back it is the same, bit for bit, lists as tuples.
+    """Return plain data as YAML; reading it gives the same data, lists as tuples.
 
     Args:
         data: Mappings with text keys, lists and tuples, text, None, booleans, floats, and whole
             numbers of up to 64 bits.
 
     Raises:
-        yaml.YAMLError: It holds anything else.
+        yaml.YAMLError: The data contain anything else.
     """
     return yaml.dump(data, Dumper=_PlainDumper, sort_keys=False, width=100)
 
 
 def commented(data: Mapping[str, Any], comments: Mapping[str, str], above: str = "") -> str:
-    """Return plain data as YAML for people, with short lists in one line; read back it is the same.
+    """Return plain data as readable YAML with comments and with lists on one line.
 
     Args:
-        data: What :func:`dump` takes.
-        comments: By dotted key, what stands behind the value, or above a mapping: one line each.
-        above: Dotted key of the data, with a full stop; empty at the top.
+        data: Plain data, see :func:`dump`.
+        comments: One-line comments by dotted key, after a value or above a mapping.
+        above: Dotted key of the data with a trailing dot; empty at the top.
     """
     lines: list[str] = []
     for key, value in data.items():
@@ -171,27 +170,27 @@ def commented(data: Mapping[str, Any], comments: Mapping[str, str], above: str =
             lines.append(f"{name} {json.dumps(value, ensure_ascii=False)}{comment}")
         else:
             first, *more = dump({key: value}).splitlines()
-            if more and comment:  # behind its first line it would be a part of it
+            if more and comment:  # after the first line it would be part of the text
                 lines.append(comment.strip())
             lines += [first, *more] if more else [f"{first}{comment}"]
     return "".join(f"{line}\n" for line in lines)
 
 
 class Document:
-    """A YAML file's content with the place of every value.
+    """The content of a YAML file with the place of every value.
 
     Attributes:
-        data: Mappings, tuples and scalars; each change makes it anew.
-        assignments: What :meth:`set` was called with, in order.
+        data: Mappings, tuples and scalars; replaced by each change.
+        assignments: Arguments of :meth:`set`, in order.
 
     Args:
-        name: File name as it should appear in messages.
+        name: File name in messages.
         text: The YAML text.
-        lines: How messages name lines that nobody wrote as such, from the first on; those that
-            are left out or empty are named by file and number.
+        lines: Names of generated lines in messages, from the first on; missing or empty ones are
+            named by file and number.
 
     Raises:
-        ConfigError: The text is not YAML, holds a key twice, or is not a mapping.
+        ConfigError: The text is not YAML, has a duplicate key, or is not a mapping.
     """
 
     def __init__(self, name: str, text: str, lines: Sequence[str] = ()) -> None:
@@ -235,11 +234,11 @@ class Document:
         return mapping
 
     def set(self, assignment: str) -> None:
-        """Apply one ``dotted.key=value`` from the command line; the value is read as YAML.
+        """Apply one ``dotted.key=value`` from the command line; the value is YAML.
 
         Raises:
-            ConfigError: It is not of that form, a part of the key is not a mapping, or the value
-                holds a key twice.
+            ConfigError: It has another form, a part of the key is not a mapping, or the value has
+                a duplicate key.
         """
         where = f"--set {assignment}"
         key, equals, text = assignment.partition("=")
@@ -273,11 +272,11 @@ class Document:
             )
 
     def holds(self, loc: Loc) -> bool:
-        """Return whether something stands at a location."""
+        """Return whether a location has a value."""
         return loc in self._places
 
     def where(self, loc: Loc) -> str:
-        """Return ``file:line`` of a value, or of the nearest thing around it."""
+        """Return ``file:line`` of a value, or of its nearest parent."""
         ends = range(len(loc), -1, -1)
         return next((self._places[loc[:end]] for end in ends if self.holds(loc[:end])), self.name)
 
@@ -289,16 +288,16 @@ class Document:
         without: tuple[str, ...] = (),
         context: Mapping[str, Any] | None = None,
     ) -> Model:
-        """Build a pydantic model from the document, or from a part of it.
+        """Build a pydantic model from the document or a part of it.
 
-        What can be read in one way only is read so, and stands so in :attr:`data` from then on: see
+        Tolerant readings replace values in :attr:`data`, see
         :func:`hilctl.base.yaml.errors.readings`.
 
         Args:
-            model: What to build.
-            at: Where the part stands; all of the document where empty.
-            without: Keys that are left out: they belong to somebody else.
-            context: What the model's validators find in ``info.context``.
+            model: The model.
+            at: Location of the part; empty for the complete document.
+            without: Ignored keys.
+            context: ``info.context`` of the validators.
 
         Raises:
             ConfigError: One or more rules are broken; all are listed.
@@ -343,10 +342,10 @@ def load_document(path: Path, files: TextFiles | None = None) -> Document:
 
     Args:
         path: The file.
-        files: Where it is read from; the disk where None.
+        files: Source of the file; None for the disk.
 
     Raises:
-        InputError: The file can't be read.
+        InputError: The file cannot be read.
         ConfigError: See :class:`Document`.
     """
     return Document(str(path), (files or TextFiles()).read(path))
@@ -359,7 +358,7 @@ def _at(data: Any, loc: Loc) -> Any:
 
 
 def _replaced(data: Any, loc: Loc, value: Any) -> Any:
-    """Return a copy of nested mappings and tuples with another value at one place."""
+    """Return a copy of nested mappings and tuples with one value replaced."""
     if not loc:
         return value
     head, rest = loc[0], loc[1:]

@@ -12,7 +12,7 @@ from hilctl.identify.field.preprocess import Prepared
 from hilctl.identify.field.stages import Stages
 from hilctl.identify.fit_api import FitJob, FoundModel
 from hilctl.models.effective_field import FieldModel, OutputCurve
-from hilctl.models.mechanics import FirstMode
+from hilctl.models.linear_stages import FirstMode
 from hilctl.models.staged import StagedModel
 
 FINER = 8  # cells of the model's tables to each piece of a spline

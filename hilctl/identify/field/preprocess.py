@@ -12,7 +12,7 @@ from hilctl.base.types import F64, I64
 from hilctl.identify.data.records import History
 from hilctl.identify.field.design_matrix import Motion, bare_displacement, corners
 from hilctl.identify.parallel import parallel_map
-from hilctl.models.cascade import smoothing_weights
+from hilctl.models.linear_stages import smoothing_weights
 
 WIDER = 4.0  # of the first width: the second
 MEDIAN_SQUARE = 0.4549  # of numbers whose mean square is 1, with Gauss's distribution

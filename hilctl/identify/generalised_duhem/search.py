@@ -36,7 +36,7 @@ from hilctl.identify.generalised_duhem.tables import (
 from hilctl.identify.parallel import parallel_map
 from hilctl.kernels.generalised_duhem import duhem_columns
 from hilctl.models.generalised_duhem import GeneralisedDuhemModel
-from hilctl.models.mechanics import FirstMode
+from hilctl.models.linear_stages import FirstMode
 from hilctl.models.staged import StagedModel
 
 COARSE_WAY, FINE_WAY = 0.03, 0.02  # of the span: furthest way between two points of a path

@@ -12,8 +12,7 @@ from hilctl.base.types import F64
 from hilctl.identify.fit_api import LEAST_SLOPE, FitJob, FoundModel
 from hilctl.identify.least_squares import converged, first_least
 from hilctl.identify.staged.objective import segments
-from hilctl.models.deadband import DeadbandFunction
-from hilctl.models.integrated import IntegratedModel
+from hilctl.models.integrated import DeadbandFunction, IntegratedModel
 
 _SPACINGS = (0.6, 0.8, 1.0)
 _EVALUATIONS = 100

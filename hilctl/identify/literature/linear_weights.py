@@ -5,9 +5,8 @@ import numpy as np
 from hilctl.base.types import F64, I64
 from hilctl.identify.fit_api import FitJob, FoundModel
 from hilctl.identify.least_squares import bounded_weights, numbered, smooth_densities
-from hilctl.models.kp import KrasnoselskiiPokrovskiiModel
+from hilctl.models.implicit_models import KrasnoselskiiPokrovskiiModel, PreisachModel
 from hilctl.models.plays import PpiModel
-from hilctl.models.preisach import PreisachModel
 
 SMOOTHNESS = 0.01  # so little that no error grows, and enough for one solution
 

@@ -13,9 +13,7 @@ from hilctl.identify.least_squares import converged, first_least
 from hilctl.identify.literature.linear_weights import weigh
 from hilctl.kernels.hysteresis import rest_memory
 from hilctl.kernels.implicit_models import BOUC_WEN, implicit_forward
-from hilctl.models.bouc_wen import BoucWenModel
-from hilctl.models.duhem import DuhemModel
-from hilctl.models.implicit_base import NOTHING
+from hilctl.models.implicit_models import NOTHING, BoucWenModel, DuhemModel
 
 _BETAS = (0.1, 0.3, 1.0, 3.0, 10.0)  # times the reach to the n
 _EVALUATIONS = 60

@@ -13,8 +13,7 @@ from hilctl.base.types import F64
 from hilctl.identify.data.records import SteadyLoop
 from hilctl.identify.fit_api import FitJob, FoundModel
 from hilctl.identify.least_squares import first_least
-from hilctl.models.butterfly import ButterflyModel
-from hilctl.models.deadband import DeadbandFunction
+from hilctl.models.integrated import ButterflyModel, DeadbandFunction
 
 _CORNERS = 16  # slopes of the even function
 _NEAR = 0.1  # of the stroke: so near to the turning point a loop may change from wing to wing

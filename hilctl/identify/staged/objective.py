@@ -12,9 +12,8 @@ from hilctl.base.types import F64, CommandUnit
 from hilctl.identify.fit_api import LEAST_SLOPE
 from hilctl.identify.staged.fit_data import Linear, StagedFitData
 from hilctl.identify.staged.sensitivity import LAG_S, PARAMETERS
-from hilctl.models.deadband import DeadbandFunction
-from hilctl.models.integrated import IntegratedModel
-from hilctl.models.mechanics import FirstMode
+from hilctl.models.integrated import DeadbandFunction, IntegratedModel
+from hilctl.models.linear_stages import FirstMode
 from hilctl.models.plays import PlayModel
 from hilctl.models.staged import FieldLag, StagedModel
 

@@ -21,7 +21,7 @@ from hilctl.identify.staged.objective import (
 )
 from hilctl.identify.staged.sensitivity import GAMMA_S, GROWTH, LAG_S, SPACING
 from hilctl.identify.staged.staged_search import StagedEnd, find_staged
-from hilctl.models.preisach import PreisachModel
+from hilctl.models.implicit_models import PreisachModel
 from hilctl.models.staged import StagedModel
 
 DELAY, C_S, Q_S2 = range(SPACING + 2, DYNAMIC)

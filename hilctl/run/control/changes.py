@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from hilctl.base.errors import InputError
-from hilctl.experiment.linear_bypass import fade_refusal
+from hilctl.experiment.forecast import fade_refusal
 from hilctl.experiment.preflight import CheckedExperiment, command_problems, reference_problems
 from hilctl.loop.compensator import Compensator
 from hilctl.run.control.client import InverseState

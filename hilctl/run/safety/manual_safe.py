@@ -11,7 +11,7 @@ from typing import Any
 from hilctl.base.errors import ConfigError, ConfigProblem, RunError
 from hilctl.base.files import TextFiles
 from hilctl.base.yaml import load_document
-from hilctl.experiment.device import made_device
+from hilctl.experiment.devices import made_device
 from hilctl.experiment.file import Safe
 from hilctl.loop.safe_output import (
     HOLD_S,

@@ -9,7 +9,7 @@ from typing import Protocol
 
 from hilctl.base.errors import ConfigError, DataError, InputError, RunError
 from hilctl.experiment.coil_heat import CoolingCoil
-from hilctl.experiment.history import heat_after, heat_before
+from hilctl.experiment.device_state import heat_after, heat_before
 from hilctl.recording.reader import read
 from hilctl.recording.recording import Recording
 from hilctl.run.recovery import recover_dead_runs

@@ -11,7 +11,7 @@ from typing import Any
 from hilctl.base.errors import ConfigError, ConfigProblem, InputError
 from hilctl.base.files import TextFiles
 from hilctl.base.yaml import Document, Loc, dotted, load_document
-from hilctl.experiment.device import device_class, known_devices
+from hilctl.experiment.devices import device_class, known_devices
 from hilctl.experiment.load import LoadedExperiment, named_from, resolve
 from hilctl.studies.campaign.file import CampaignFile
 from hilctl.studies.campaign.parameter_grid import MOST_STEPS, Point, groups_of, points

@@ -18,7 +18,7 @@ from hilctl.base.files import check_writable, write_text
 from hilctl.base.types import F64, CommandUnit
 from hilctl.base.yaml import Document, load_document
 from hilctl.experiment.coil_heat import CoolingCoil, RunHeat
-from hilctl.experiment.history import heat_before
+from hilctl.experiment.device_state import heat_before
 from hilctl.experiment.load import load_experiment
 from hilctl.loop.interlocks import InterlockRequirement, InterlockSettings
 from hilctl.models.model_file import dump_model

@@ -96,7 +96,7 @@ def test_mistakes_have_their_line(table, text: str, message: str) -> None:
 @pytest.mark.parametrize("text", ["", " \n\t\n", "# a,b\n"])
 def test_nothing(table, text: str) -> None:
     """Neither header nor rows."""
-    assert refusal(table, text) == "t.csv: holds no rows of numbers"
+    assert refusal(table, text).startswith("t.csv: holds no rows")
 
 
 def test_what_is_not_asked_for_may_be_anything(table) -> None:
@@ -166,7 +166,7 @@ def test_even_time(table) -> None:
 def test_a_table_too_large_is_not_read(table, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its size and the limit are told before any of it is read."""
     monkeypatch.setattr(csv_table, "MAX_TABLE_BYTES", 1_000_000)
-    with pytest.raises(InputError, match=r"t\.csv: has 2 MB, more than the 1 MB that are read"):
+    with pytest.raises(InputError, match=r"t\.csv: has 2 MB.* 1 MB"):
         table(b"\xff" * 2_000_000)
 
 
@@ -174,7 +174,7 @@ def test_a_table_too_large_is_not_read(table, monkeypatch: pytest.MonkeyPatch) -
 def test_lines_that_are_no_row_are_refused_at_once(tmp_path, line):
     path = tmp_path / "wide.csv"
     path.write_text(line + "\n1\n")
-    with pytest.raises(DataError, match="a row of a table, of at most 1000 columns"):
+    with pytest.raises(DataError, match="at most 1000 columns"):
         TextTable(path)
 
 

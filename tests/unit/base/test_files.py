@@ -10,9 +10,15 @@ import pytest
 
 from hilctl.base.errors import InputError
 from hilctl.base.files import (
+    ADDRESS_REMEDIES,
+    CONNECT_REMEDIES,
+    PORT_REMEDIES,
+    REMEDIES,
     TextFiles,
     check_writable,
+    no_such_file,
     read_text,
+    reason,
     sync_folder,
     write_file,
     write_text,
@@ -44,7 +50,7 @@ def test_nothing_else_is_read_where_texts_are_given(tmp_path):
     """A file that nobody has checked is refused."""
     path = tmp_path / "other.yaml"
     path.write_text("text")
-    with pytest.raises(InputError, match="was not read when the experiment was checked"):
+    with pytest.raises(InputError, match="was not read"):
         TextFiles({}).read(path)
 
 
@@ -69,9 +75,7 @@ def test_a_text_too_large_is_not_read(tmp_path):
     path = tmp_path / "run.mcap"
     with path.open("wb") as stream:
         stream.truncate(20_000_000)
-    with pytest.raises(
-        InputError, match=r"run\.mcap: has 20 MB, more than the 17 MB that are read"
-    ):
+    with pytest.raises(InputError, match=r"run\.mcap: has 20 MB.* 17 MB"):
         read_text(path)
 
 
@@ -95,7 +99,7 @@ class TestWriting:
         link = tmp_path / "link"
         link.symlink_to(path.name)
         for name in (path, link):
-            with pytest.raises(InputError, match="exists already: give another name, or --overw"):
+            with pytest.raises(InputError, match="--overw"):
                 write_text(name, "new", overwrite=False)
             with pytest.raises(InputError, match="exists already"):
                 check_writable(name, overwrite=False)
@@ -108,7 +112,7 @@ class TestWriting:
 
     def test_a_folder_is_no_file_to_overwrite(self, tmp_path):
         """The remedy must not be one that is refused next."""
-        with pytest.raises(InputError, match="is a folder: name a file in it"):
+        with pytest.raises(InputError, match="is a folder"):
             write_text(tmp_path, "new", overwrite=False)
 
     @pytest.mark.parametrize("links", [True, False])
@@ -234,3 +238,27 @@ def test_what_can_be_written_is_left_as_it_is(tmp_path):
     check_writable(tmp_path / "old.txt", overwrite=True)
     check_writable(tmp_path / "new.txt", overwrite=False)
     assert [(each.name, each.read_text()) for each in tmp_path.iterdir()] == [("old.txt", "old")]
+
+
+@pytest.mark.parametrize("remedies", [REMEDIES, ADDRESS_REMEDIES, CONNECT_REMEDIES, PORT_REMEDIES])
+def test_the_systems_words_come_first(remedies):
+    for code, remedy in remedies.items():
+        assert (
+            reason(OSError(code, os.strerror(code)), remedies) == f"{os.strerror(code)} ({remedy})"
+        )
+
+
+def test_what_is_not_known_is_said_as_it_is():
+    assert reason(OSError(errno.EIO, "Input/output error")) == "Input/output error"
+    assert reason(TimeoutError("timed out")) == "timed out"
+
+
+def test_the_file_that_is_likely_to_be_meant(tmp_path):
+    (tmp_path / "terfenol_sine_6a.yaml").touch()
+    meant = no_such_file(tmp_path / "terfenol_sine.yaml")
+    assert meant.endswith(
+        "terfenol_sine.yaml: no such file (did you mean 'terfenol_sine_6a.yaml'?)"
+    )
+    assert no_such_file(tmp_path / "other.csv").endswith("other.csv: no such file")
+    lost = no_such_file(tmp_path / "lost" / "x.yaml")
+    assert lost.endswith(f"(there is no folder {tmp_path / 'lost'})")

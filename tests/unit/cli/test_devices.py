@@ -16,7 +16,7 @@ from hilctl.cli.devices import (
     print_probed,
     render_diagnosis,
 )
-from hilctl.experiment.inventory import DeviceDescription, DeviceOption, Inventory, SerialPort
+from hilctl.experiment.devices import DeviceDescription, DeviceOption, Inventory, SerialPort
 from hilctl.machine.diagnosis import Diagnosis
 from hilctl.machine.timer_latency import Latency
 from hilctl.run.probe import Probed

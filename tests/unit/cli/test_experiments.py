@@ -10,7 +10,7 @@ import typer
 
 from hilctl.base.errors import InputError
 from hilctl.cli.experiments import demo, examples, init, schema
-from hilctl.experiment.inventory import schema_text
+from hilctl.experiment.file import schema_text
 from hilctl.experiment.load import load_experiment
 from hilctl.run.result import RunResult
 

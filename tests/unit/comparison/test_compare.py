@@ -77,7 +77,7 @@ def test_loops_of_a_real_device_are_judged_without_trials(monkeypatch, text):
     assert judged.rows[0].trials == ()
     assert judged.rows[0].compensated_percent is None
     assert judged.to_mapping()["device"] is None
-    assert any("not a simulated one" in note for note in notes(judged))
+    assert any("not simulated" in note for note in notes(judged))
     assert "straight" in comparison_page(judged)
 
 
@@ -145,13 +145,13 @@ def row(name, *trials, numbers=5, identify_s=1.5):
     )  # fmt: skip
 
 
-def comparison_of(*rows, device="a rig"):
+def table(*rows, device="a rig"):
     return SimpleNamespace(rows=rows, device=device)
 
 
 def test_a_model_of_a_file_has_dashes_where_nothing_was_found():
     """Columns are those of the model that was tried most often."""
-    found = comparison_of(
+    found = table(
         row("duhem", trial(50.0, 0.75), trial(100.0, None)),
         row("m.yaml", numbers=None, identify_s=None),
     )
@@ -164,13 +164,11 @@ def test_a_model_of_a_file_has_dashes_where_nothing_was_found():
 
 
 def test_a_trial_that_was_limited_has_a_star_and_a_note():
-    limited = comparison_of(row("duhem", trial(50.0, 0.75, limited=3)))
+    limited = table(row("duhem", trial(50.0, 0.75, limited=3)))
     assert next(table_rows(limited))[-1] == "0.75*"
     assert notes(limited)[-1].startswith("*: the limiter")
-    assert not any(
-        text.startswith("*") for text in notes(comparison_of(row("d", trial(50.0, 1.0))))
-    )
+    assert not any(text.startswith("*") for text in notes(table(row("d", trial(50.0, 1.0)))))
 
 
 def test_a_real_device_is_said_to_have_no_trials():
-    assert "not a simulated one" in notes(comparison_of(row("duhem"), device=""))[-1]
+    assert "not simulated" in notes(table(row("duhem"), device=""))[-1]

@@ -3,7 +3,7 @@
 import pytest
 
 from hilctl.base.errors import InputError
-from hilctl.experiment.device import device_class
+from hilctl.experiment.devices import device_class
 from hilctl_drivers.profile import load_profile, shipped_profiles
 from hilctl_drivers.template import starting_section
 

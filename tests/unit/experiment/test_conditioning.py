@@ -157,17 +157,15 @@ class TestCheck:
         assert checked.forecast.command_max == pytest.approx(6.0, rel=1e-6)
         assert checked.forecast.recording_mb > plain.forecast.recording_mb
         heat = ("limits.rms_current_a=1.0", "limits.thermal_time_constant_s=1.0")
-        with pytest.raises(
-            ConfigError, match="lower the condition's amplitude, or shorten the run"
-        ):
+        with pytest.raises(ConfigError, match="condition's amplitude"):
             check(loaded(*heat))
 
     @pytest.mark.parametrize(
         ("setting", "rule"),
         [
-            ("condition.amplitude_a=6.1", r"condition.amplitude_a: must be <= 6, the way from"),
+            ("condition.amplitude_a=6.1", r"condition.amplitude_a: must be <= 6 A"),
             ("condition.amplitude_v=1.0", r"condition: must have amplitude_a: limits are in A"),
-            ("condition.frequency_hz=531.0", r"condition.frequency_hz: must be <= 500 Hz: 20 sam"),
+            ("condition.frequency_hz=531.0", r"condition.frequency_hz: must be <= 500 Hz"),
             ("condition={frequency_hz: 90.0, amplitude_a: 6.0}", r"must be <= 79.58 Hz"),
         ],
     )

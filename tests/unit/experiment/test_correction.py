@@ -105,7 +105,7 @@ def test_another_waveform_is_refused(other, tmp_path):
     """A correction of another period, amplitude, offset or phase would do harm."""
     made = reference(sine(), tmp_path)
     correction = correction_for(made, made.segments[0])
-    with pytest.raises(InputError, match=r"another waveform: sine 10 um 150 Hz"):
+    with pytest.raises(InputError, match=r"sine 10 um 150 Hz"):
         correction.added(reference(other, tmp_path), None)
 
 
@@ -124,7 +124,7 @@ def test_another_rate_or_model_is_refused(tmp_path):
     with pytest.raises(InputError, match="another model"):
         correction.added(made, None)
     faster = build(sine(), 2.0 * RATE_HZ, tmp_path)
-    with pytest.raises(InputError, match=r"10000 samples a second, not at 20000"):
+    with pytest.raises(InputError, match=r"at 10000 .* at 20000"):
         correction.added(faster, terfenol_rdpi())
 
 
@@ -136,7 +136,7 @@ def test_a_file_with_unequal_coefficients_is_refused(tmp_path):
     assert broken != text
     path = tmp_path / "c.yaml"
     path.write_text(broken)
-    with pytest.raises(ConfigError, match="one value a value of cosine_um: 3 for 4"):
+    with pytest.raises(ConfigError, match="cosine_um: 3 for 4"):
         load_correction(path)
 
 

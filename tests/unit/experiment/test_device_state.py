@@ -1,15 +1,30 @@
 """The last run of a device: kept by the device alone, and never an older one for the last."""
 
+import os
+from dataclasses import replace
 from datetime import UTC, datetime
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
+from hilctl.base.errors import ConfigError
+from hilctl.base.yaml import Document
+from hilctl.experiment.coil_heat import CoilHeat
 from hilctl.experiment.device_state import (
     CoilState,
     DeviceState,
+    heat_after,
+    heat_before,
+    left_by_last_run,
     read_device_state,
     write_device_state,
 )
+from hilctl.experiment.load import resolve
+from hilctl.experiment.preflight import check
+from hilctl.models.model_file import dump_model
+from hilctl.recording.metadata_keys import HEAT_FACT
+from tests.unit.experiment.test_initial_state import COMMAND, OMEGA, record
 
 AT = datetime(2026, 1, 1, tzinfo=UTC)
 HOLDS = ("tcp:10.0.0.5:502", "serial:/dev/ttyUSB0")
@@ -20,12 +35,12 @@ STATE = DeviceState(
 
 
 @pytest.fixture(autouse=True)
-def folder(tmp_path, monkeypatch):
+def states(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     return tmp_path / "state" / "hilctl" / "devices"
 
 
-def test_what_was_written_is_read(folder, caplog):
+def test_what_was_written_is_read(states, caplog):
     assert read_device_state(HOLDS) is None
     write_device_state(STATE)
     assert read_device_state(HOLDS) == STATE
@@ -33,22 +48,22 @@ def test_what_was_written_is_read(folder, caplog):
     later = STATE.model_copy(update={"run_id": "two", "coil": None})
     write_device_state(later)
     assert read_device_state(HOLDS) == later
-    assert len([*folder.iterdir()]) == 1
+    assert len([*states.iterdir()]) == 1
     assert caplog.messages == []
 
 
-def test_a_device_that_holds_nothing_has_no_state(folder):
+def test_a_device_that_holds_nothing_has_no_state(states):
     write_device_state(STATE.model_copy(update={"holds": []}))
     assert read_device_state(()) is None
-    assert not folder.exists()
+    assert not states.exists()
 
 
 @pytest.mark.parametrize(
     "content", [b"", b"{", b"[]", b"\xff", b'{"holds": 1}', b"heat NaN", b"heat -1"]
 )
-def test_a_damaged_state_is_none_and_a_warning(folder, caplog, content):
+def test_a_damaged_state_is_none_and_a_warning(states, caplog, content):
     write_device_state(STATE)
-    (path,) = folder.iterdir()
+    (path,) = states.iterdir()
     if content.startswith(b"heat"):
         content = path.read_bytes().replace(b"4.25", content.split()[1])
     path.write_bytes(content)
@@ -58,7 +73,7 @@ def test_a_damaged_state_is_none_and_a_warning(folder, caplog, content):
     assert "\n" not in said
 
 
-def test_where_it_can_not_be_written_no_older_one_is_left(folder, caplog, monkeypatch):
+def test_where_it_can_not_be_written_no_older_one_is_left(states, caplog, monkeypatch):
     """An older one would be taken for the last."""
     write_device_state(STATE)
 
@@ -69,13 +84,249 @@ def test_where_it_can_not_be_written_no_older_one_is_left(folder, caplog, monkey
     write_device_state(STATE.model_copy(update={"run_id": "two"}))
     assert read_device_state(HOLDS) is None
     assert len(caplog.messages) == 1
-    assert [*folder.iterdir()] == []
+    assert [*states.iterdir()] == []
 
 
 @pytest.mark.parametrize("given", ["", "relative"])
 def test_without_a_folder_of_its_own_it_is_in_the_home(tmp_path, monkeypatch, given):
-    """A relative folder is to be ignored, says the standard."""
+    """The XDG standard ignores a relative folder."""
     monkeypatch.setenv("XDG_STATE_HOME", given)
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     write_device_state(STATE)
     assert len([*(tmp_path / "home/.local/state/hilctl/devices").iterdir()]) == 1
+
+
+EXPERIMENT = """\
+name: again
+device: {kind: simulated_terfenol}
+sample_rate_hz: 10000
+waveform: {kind: hold, unit: um, level: 0.0, duration_s: 0.5}
+compensator: {model: model.yaml}
+limits: {peak_current_a: 6.0, slew_a_per_s: 20000.0, stroke_um: [-75.0, 60.0]}
+recording: {folder: runs}
+"""
+
+NOW_S = 2e9
+
+
+STARTED = datetime.fromisoformat("2026-01-01T00:00:00+00:00")
+
+
+class Folder:
+    """An experiment, and the folder that its runs are written to."""
+
+    def __init__(self, path):
+        self.path, self.runs = path, path / "runs"
+        self.runs.mkdir()
+        (path / "model.yaml").write_text(dump_model(OMEGA))
+
+    def loaded(self, *settings, holds=HOLDS):
+        """The experiment on a device that holds this."""
+        where = f"recording.folder={self.runs}"
+        made = resolve(Document("x.yaml", EXPERIMENT), self.path, [where, *settings])
+        info = replace(made.device.info, holds=holds)
+        return replace(made, device=SimpleNamespace(info=info))
+
+    def record(self, name, *, holds=HOLDS, facts=None, coil=None, **made):
+        """Write a run, which is the last of its device."""
+        path = self.runs / f"{name}.mcap"
+        record(path, COMMAND, facts={"run_id": name, **(facts or {})}, **made)
+        self.begin(name, holds=holds, coil=coil)
+        return path
+
+    def begin(self, name, *, holds=HOLDS, coil=None):
+        """Have a run be the last of its device."""
+        path = str(self.runs / f"{name}.mcap")
+        write_device_state(
+            DeviceState(holds=[*holds], run_id=name, recording=path, started=STARTED, coil=coil)
+        )
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return Folder(tmp_path)
+
+
+def test_the_last_run_of_this_device_is_taken(folder):
+    """By its state, whatever the times of files say; other devices are passed over."""
+    folder.record("older")
+    path = folder.record("last")
+    folder.record("other", holds=("tcp:10.0.0.6:502",))
+    for each in folder.runs.iterdir():
+        # As after a recovery, a copy or a checkout of an old recording.
+        os.utime(each, (1e9, 1e9) if each == path else (2e9, 2e9))
+    left, words = left_by_last_run(folder.loaded(), NOW_S)
+    assert left is not None
+    assert left.run_id == "last"
+    assert abs(left.stands_um) > 0.5
+    assert words == f"where {path} left the actuator"
+
+
+@pytest.mark.parametrize(
+    ("made", "why"),
+    [
+        ({"whole": False}, "incomplete"),
+        ({"first": 50}, "incomplete"),
+        ({"end": {"output_safe": "false"}}, "safe value"),
+    ],
+)
+def test_no_older_one_stands_in_for_the_last(folder, made, why):
+    """What came after it is not known: rest, and the reason."""
+    folder.record("old")
+    folder.record("new", **made)
+    left, words = left_by_last_run(folder.loaded(), NOW_S)
+    assert left is None
+    assert words.startswith("at rest")
+    assert why in words
+    assert "new.mcap" in words
+
+
+def test_a_run_without_a_recording_is_not_known(folder):
+    """As one that was killed by a power cut before its first flush; or deleted, or replaced."""
+    folder.record("old")
+    folder.begin("new")
+    assert "new.mcap" in left_by_last_run(folder.loaded(), NOW_S)[1]
+    (folder.runs / "old.mcap").rename(folder.runs / "new.mcap")
+    left, words = left_by_last_run(folder.loaded(), NOW_S)
+    assert left is None
+    assert "new.mcap" in words
+
+
+def test_another_rate_or_a_large_file(folder, monkeypatch):
+    """A recording that does not fit is named with what does not."""
+    path = folder.record("new")
+    assert "10000 Hz" in left_by_last_run(folder.loaded("sample_rate_hz=5000"), NOW_S)[1]
+    monkeypatch.setattr("hilctl.experiment.device_state._LARGEST_BYTES", 1 << 10)
+    left, words = left_by_last_run(folder.loaded(), NOW_S)
+    assert (left, "0 MB" in words and str(path) in words) == (None, True)
+
+
+def test_nothing_there(folder):
+    """No run of this device; and no device that could have a past."""
+    words = left_by_last_run(folder.loaded(), NOW_S)[1]
+    assert words.startswith("at rest")
+    folder.record("new", holds=())
+    assert left_by_last_run(folder.loaded(holds=()), NOW_S) == (None, "at rest")
+
+
+class TestCheck:
+    """What the experiment says goes before."""
+
+    def test_by_default(self, folder):
+        """The compensator begins there, is led in from there, and says so."""
+        folder.record("new")
+        begun = check(folder.loaded()).begun
+        left, words = left_by_last_run(folder.loaded(), NOW_S)
+        np.testing.assert_array_equal(begun.state, left.state)
+        assert (begun.run_id, begun.begins) == ("new", words)
+        assert begun.input_um[0] == pytest.approx(left.stands_um)
+        assert check(folder.loaded()).forecast.begins == words
+
+    @pytest.mark.parametrize(
+        ("setting", "words"),
+        [
+            ("compensator.initial_state=rest", "at rest"),
+            ("condition={cycles: 2}", "where its condition leaves the actuator"),
+            ("compensator.initial_state=old.mcap", "where old.mcap left the actuator"),
+        ],
+    )
+    def test_switched_off_or_over(self, folder, setting, words):
+        """Rest, a condition and a recording that is named win over the last one."""
+        folder.record("new")
+        record(folder.path / "old.mcap", 0.5 * COMMAND)
+        begun = check(folder.loaded(setting)).begun
+        assert begun.begins == words
+        assert begun.run_id == ("before" if "old" in setting else "")
+
+    def test_without_a_compensator(self, folder):
+        """There is no memory to begin with."""
+        folder.record("new")
+        plain = folder.loaded("compensator=none", "waveform.unit=A")
+        assert check(plain).begun.begins == ""
+
+
+HOT = ["limits.rms_current_a=3.0", "limits.thermal_time_constant_s=20.0"]
+ENDED = datetime.fromisoformat("2026-01-01T00:01:00+00:00")
+ENDED_S = ENDED.timestamp()
+SAFE_END = {"output_safe": "true", "ended": ENDED.isoformat()}
+
+
+def coil(heat_a2=4.0, *, output_safe=True, tau_s=20.0):
+    return CoilState(
+        ended=ENDED, output_safe=output_safe, heat_a2=heat_a2, thermal_time_constant_s=tau_s
+    )
+
+
+class TestHeat:
+    """What the last run has left of the coil's heat."""
+
+    def record(self, folder, coil=None, end=None, **facts):
+        facts |= {
+            "started": STARTED.isoformat(),
+            "limits": folder.loaded(*HOT).config.limits.model_dump_json(exclude_none=True),
+        }
+        return folder.record("a", facts=facts, coil=coil, end=end)
+
+    def left(self, folder, waited_s, *settings):
+        return heat_before(folder.loaded(*HOT, *settings), ENDED_S + waited_s)
+
+    def test_it_has_cooled_since(self, folder):
+        """By the clock, without its recording, and not to below what the safe value makes."""
+        folder.begin("gone", coil=coil(4.0))
+        assert self.left(folder, 0.0) == 4.0
+        assert self.left(folder, 20.0) == pytest.approx(4.0 / np.e)
+        assert self.left(folder, 1e6, "safe.value=1.0") == pytest.approx(1.0)
+
+    def test_a_clock_that_was_set_back_leaves_it_hot(self, folder):
+        folder.begin("gone", coil=coil(4.0))
+        assert self.left(folder, -1e6) == 4.0
+
+    def test_without_a_budget_or_a_past_there_is_none(self, folder):
+        folder.begin("gone", coil=coil(4.0))
+        assert heat_before(folder.loaded(), ENDED_S) == 0.0
+        assert heat_before(folder.loaded(*HOT, holds=()), ENDED_S) == 0.0
+        assert heat_before(folder.loaded(*HOT, holds=("tcp:other",)), ENDED_S) == 0.0
+
+    @pytest.mark.parametrize("end", [{}, SAFE_END, {**SAFE_END, HEAT_FACT: "warm"}])
+    def test_a_killed_run_s_is_worked_out_from_its_samples(self, folder, end):
+        """With what it began with; a fact that is no number is as hot as can be."""
+        path = self.record(folder, end=end, **{HEAT_FACT: "4.0"})
+        limits = folder.loaded(*HOT).config.limits
+        sure = CoilHeat(limits, 10000.0, 4.0)
+        sure.add(COMMAND)
+        expected = 9.0 if HEAT_FACT in end else pytest.approx(sure.heat_a2, rel=1e-9)
+        assert heat_after(path, folder.loaded(*HOT).config, ENDED_S - 60.0) == expected
+        assert heat_before(folder.loaded(*HOT), ENDED_S - 60.0) == expected
+
+    def test_another_time_constant_asks_for_the_samples(self, folder):
+        self.record(folder, coil=coil(4.0), end=SAFE_END, **{HEAT_FACT: "0.0"})
+        other = self.left(folder, -1e6, "limits.thermal_time_constant_s=0.05")
+        sure = CoilHeat(
+            folder.loaded(*HOT, "limits.thermal_time_constant_s=0.05").config.limits, 10000.0, 0.0
+        )
+        sure.add(COMMAND)
+        assert other == pytest.approx(sure.heat_a2, rel=1e-9)
+
+    def test_an_output_that_is_not_known_to_be_safe_leaves_it_as_hot_as_can_be(self, folder):
+        folder.begin("gone", coil=coil(1.0, output_safe=False))
+        assert self.left(folder, 0.0) == 9.0
+        assert self.left(folder, 20.0) == pytest.approx(9.0 / np.e)
+
+    def test_a_killed_run_without_a_recording_leaves_it_as_hot_as_can_be(self, folder):
+        """Since the run began, or its folder was changed by what became of the recording."""
+        folder.begin("gone")
+        os.utime(folder.runs, (ENDED_S + 5.0, ENDED_S + 5.0))
+        assert self.left(folder, 5.0) == 9.0
+        assert self.left(folder, 25.0) == pytest.approx(9.0 / np.e)
+
+    def test_a_run_that_would_overheat_the_coil_is_refused_until_it_has_cooled(self, folder):
+        """And says how long that takes."""
+        folder.begin("gone", coil=coil(8.9))
+        sine = "waveform={kind: sine, unit: A, amplitude: 5.0, frequency_hz: 10.0, duration_s: 2.0}"
+        loaded = folder.loaded(*HOT, "compensator=none", sine)
+        with pytest.raises(ConfigError, match=r"2\.98 A .*wait"):
+            check(loaded, 0.0, ENDED_S)
+        later = check(loaded, 0.0, ENDED_S + 60.0)
+        assert later.heat_a2 == pytest.approx(8.9 * np.exp(-3.0))
+        with pytest.raises(ConfigError, match="rms_current_a"):
+            check(loaded, 8.9, ENDED_S + 60.0)

@@ -79,7 +79,7 @@ def test_profiles_are_carried_with_the_experiment(written, tmp_path):
         Document("experiment", first.yaml_text), tmp_path, files=TextFiles(first.files.texts)
     )
     assert again.device.info == first.device.info
-    with pytest.raises(InputError, match="was not read when the experiment was checked"):
+    with pytest.raises(InputError, match="was not read"):
         resolve(Document("experiment", first.yaml_text), tmp_path, files=TextFiles({}))
 
 

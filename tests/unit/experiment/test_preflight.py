@@ -1,4 +1,4 @@
-"""What is worked out and refused before anything moves."""
+"""Preflight: what is computed and rejected before anything moves."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +10,7 @@ import pytest
 from pydantic import ConfigDict
 
 from hilctl.base.device import DeviceInfo, DeviceOptions
-from hilctl.base.errors import ConfigError, DataError
+from hilctl.base.errors import ConfigError, ConfigProblem, DataError
 from hilctl.base.segments import Segment
 from hilctl.base.types import F64
 from hilctl.base.yaml import Document
@@ -19,8 +19,8 @@ from hilctl.experiment.coil_heat import RunHeat
 from hilctl.experiment.correction import Correction, LearnedCycle, model_sha256, signature
 from hilctl.experiment.file import CompensatorConfig
 from hilctl.experiment.initial_state import InitialState
-from hilctl.experiment.load import LoadedExperiment, load_experiment, resolve
-from hilctl.experiment.preflight import CheckedExperiment, check, command_problems, pace_warnings
+from hilctl.experiment.load import LoadedExperiment, resolve
+from hilctl.experiment.preflight import CheckedExperiment, check, command_problems
 from hilctl.models.base import HysteresisModel, IdentifiedRange, Operator, Provenance
 from hilctl.models.plays import RdpiModel
 from tests.published import piezo_ppi, terfenol_rdpi
@@ -139,7 +139,8 @@ def checked(text: str, *settings: str, **given: Any) -> CheckedExperiment:
     return check(loaded(text, *settings, **given))
 
 
-def refusals(text: str, *settings: str, **given: Any) -> list[str]:
+def refusals(text: str, *settings: str, **given: Any) -> list[ConfigProblem]:
+    """Return the problems; each names the line of its key."""
     with pytest.raises(ConfigError) as caught:
         checked(text, *settings, **given)
     lines = text.splitlines()
@@ -147,7 +148,12 @@ def refusals(text: str, *settings: str, **given: Any) -> list[str]:
         name, _, line = problem.where.partition(":")
         key = problem.key.rpartition(".")[2]
         assert name.startswith("--set") or key in lines[int(line) - 1], problem
-    return [str(replace(problem, where="x.yaml")) for problem in caught.value.problems]
+    return caught.value.problems
+
+
+def told(found: list[ConfigProblem]) -> list[tuple[str, str]]:
+    """Return keys and values."""
+    return [(problem.key, problem.value) for problem in found]
 
 
 @pytest.mark.parametrize("at_start", [-8.0, 8.0])
@@ -157,10 +163,7 @@ def test_a_start_within_the_device_s_range_is_taken(at_start: float) -> None:
 
 
 def test_a_start_that_the_device_can_not_hold_is_refused() -> None:
-    found = refusals(CURRENT, "safe.at_start=8.5")
-    assert len(found) == 1
-    assert "safe.at_start: must lie within what " in found[0]
-    assert found[0].endswith("-8 to 8 A, got 8.5")
+    assert told(refusals(CURRENT, "safe.at_start=8.5")) == [("safe.at_start", "8.5")]
 
 
 class TestReference:
@@ -168,38 +171,34 @@ class TestReference:
 
     def test_outside_the_stroke(self) -> None:
         """A reference outside the stroke limits is refused, by how much included."""
-        found = refusals(
+        (found,) = refusals(
             DISPLACEMENT,
             "waveform.soft_start_s=0.0",
             "limits.stroke_um=[-9.5, 60.0]",
             model=terfenol_rdpi(),
         )
-        assert found == [
-            "x.yaml: waveform: reference must stay within limits.stroke_um, -9.5 to 60 µm, got "
-            "-10 to 10 µm (0.5 µm too far: change the waveform's amplitude or offset)"
-        ]
+        assert (found.key, found.value) == ("waveform", "-10 to 10 µm")
+        assert "-9.5 to 60 µm" in found.rule
+        assert found.hint.startswith("0.5 µm")
 
     def test_outside_the_model(self) -> None:
         """A reference beyond what the model was found on is refused; just within is not."""
         model = terfenol_rdpi().model_copy(update={"output_range_um": (-12.0, 9.75)})
-        found = refusals(DISPLACEMENT, model=model)
-        assert found == [
-            "x.yaml: waveform: reference must stay within the range that compensator.model was "
-            "found on, -12 to 9.75 µm, got -10 to 10 µm (0.25 µm too far: change the waveform's "
-            "amplitude or offset)"
-        ]
+        (found,) = refusals(DISPLACEMENT, model=model)
+        assert (found.key, found.value) == ("waveform", "-10 to 10 µm")
+        assert "-12 to 9.75 µm" in found.rule
+        assert found.hint.startswith("0.25 µm")
         checked(DISPLACEMENT, "waveform.amplitude=9.75", model=model)
 
     def test_outside_both(self) -> None:
         """Both ranges are told, each with its own distance, and the current that would flow."""
         model = terfenol_rdpi().model_copy(update={"output_range_um": (-12.0, 12.0)})
         found = refusals(DISPLACEMENT, "waveform.amplitude=80.0", model=model)
-        assert len(found) == 3
-        assert "limits.stroke_um, -75 to 60 µm" in found[0]
-        assert "(20 µm too far" in found[0]
-        assert "-12 to 12 µm" in found[1]
-        assert "(68 µm too far" in found[1]
-        assert found[2].startswith("x.yaml: limits.peak_current_a: the run must stay within")
+        keys = [problem.key for problem in found]
+        assert keys == ["waveform", "waveform", "limits.peak_current_a"]
+        for problem, span, excess in zip(found, ("-75 to 60", "-12 to 12"), (20, 68), strict=False):
+            assert f"{span} µm" in problem.rule
+            assert problem.hint.startswith(f"{excess} µm")
 
     def test_a_current_is_no_displacement(self) -> None:
         """A waveform in ampere is not held against micrometres."""
@@ -211,34 +210,29 @@ class TestCommand:
 
     def test_peak(self) -> None:
         """A peak over the limit is refused, by how much included."""
-        assert refusals(CURRENT, "limits.peak_current_a=6.25") == [
-            "x.yaml: limits.peak_current_a: the run must stay within -6.25 to 6.25 A, got -5.5 to "
-            "6.5 A (0.25 A too much: lower the waveform's amplitude, or raise the limit)"
-        ]
+        (found,) = refusals(CURRENT, "limits.peak_current_a=6.25")
+        assert told([found]) == [("limits.peak_current_a", "-5.5 to 6.5 A")]
+        assert "-6.25 to 6.25 A" in found.rule
+        assert found.hint.startswith("0.25 A")
         checked(CURRENT, "limits.peak_current_a=6.5")
 
     def test_lowest(self) -> None:
         """The lower end counts as much as the upper."""
         found = refusals(CURRENT, "waveform.offset=-2.0")
-        assert found == [
-            "x.yaml: limits.peak_current_a: the run must stay within -7 to 7 A, got -8 to 4 A "
-            "(1 A too much: lower the waveform's amplitude, or raise the limit)"
-        ]
+        assert told(found) == [("limits.peak_current_a", "-8 to 4 A")]
 
     def test_slew(self) -> None:
         """A change faster than the limit is refused, with how many times too fast."""
-        found = refusals(CURRENT, "waveform.soft_start_s=0.1", "limits.slew_a_per_s=150.0")
-        assert found == [
-            "x.yaml: limits.slew_a_per_s: the run must change no faster than 150 A/s, got 377.004 "
-            "(2.51 times the limit: lower the frequency, soften the start, or raise it)"
-        ]
+        (found,) = refusals(CURRENT, "waveform.soft_start_s=0.1", "limits.slew_a_per_s=150.0")
+        assert told([found]) == [("limits.slew_a_per_s", "377.004")]
+        assert "150 A/s" in found.rule
+        assert found.hint.startswith("2.51 times")
         checked(CURRENT, "waveform.soft_start_s=0.1", "limits.slew_a_per_s=377.01")
 
     def test_first_step(self) -> None:
         """A waveform that does not begin at the safe value jumps there: that is a slew too."""
         found = refusals(CURRENT, "limits.slew_a_per_s=4000.0")
-        assert len(found) == 1
-        assert "got 5000 (1.25 times the limit" in found[0]
+        assert told(found) == [("limits.slew_a_per_s", "5000")]
 
     def test_voltage(self) -> None:
         """For a device driven in V the keys and units are those of a voltage."""
@@ -248,39 +242,30 @@ class TestCommand:
             .replace("slew_a_per_s: 20000.0", "slew_v_per_s: 100.0")
         )
         found = refusals(text, "waveform.soft_start_s=0.2", command_unit="V")
-        assert len(found) == 2
-        assert found[0].startswith(
-            "x.yaml: limits.drive_v: the run must stay within 0 to 5 V, got -5.5 to 6.5 V (5.5 V"
-        )
-        assert found[1].startswith(
-            "x.yaml: limits.slew_v_per_s: the run must change no faster than 100 V/s, got "
-        )
+        assert [problem.key for problem in found] == ["limits.drive_v", "limits.slew_v_per_s"]
+        assert found[0].value == "-5.5 to 6.5 V"
+        assert "100 V/s" in found[1].rule
 
     def test_model_that_can_not_be_inverted(self) -> None:
         """A model whose inverse leaves the numbers is refused with the rest."""
         model = RdpiModel(direct=1e-310, weights=(1.0, 1.0), thresholds=(0.3, 0.6))
         found = refusals(DISPLACEMENT, "block=5", model=model)
-        assert len(found) == 2
-        assert found[0].startswith("x.yaml: block: must be 1")
-        assert found[1].startswith("x.yaml: compensator.model: the weights and thresholds are")
+        assert [problem.key for problem in found] == ["block", "compensator.model"]
 
     @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
     @pytest.mark.parametrize("at", [0, 1, 1500])
     def test_not_a_number(self, monkeypatch: pytest.MonkeyPatch, bad: float, at: int) -> None:
         """A command that is not finite is refused, wherever and in whichever chunk it stands."""
-        monkeypatch.setattr("hilctl.experiment.command_simulation.CHUNK", 1000)
+        monkeypatch.setattr("hilctl.experiment.forecast.CHUNK", 1000)
         found = refusals(DISPLACEMENT, model=BrokenModel(bad=bad, at=at))
-        assert len(found) == 1
-        assert found[0].startswith(
-            "x.yaml: compensator.model: every command must be a finite number, got "
-        )
+        assert [problem.key for problem in found] == ["compensator.model"]
 
     def test_very_large_numbers(self) -> None:
         """Numbers near the end of the range are refused in words, without a warning."""
         found = refusals(CURRENT, "waveform.amplitude=1.0e+308", "waveform.offset=0.0")
-        assert len(found) == 2
-        assert "got -1e+308 to 1e+308 A (1e+308 A too much" in found[0]
-        assert "(inf times the limit" in found[1]
+        keys = ["limits.peak_current_a", "limits.slew_a_per_s"]
+        assert [problem.key for problem in found] == keys
+        assert found[0].value == "-1e+308 to 1e+308 A"
 
 
 class TestBudget:
@@ -296,7 +281,6 @@ class TestBudget:
         )  # fmt: skip
         (problem,) = command_problems(made, forecast)
         assert problem.key == "limits.rms_current_a"
-        assert problem.rule == "the coil must stay within 4 A rms over 20 s"
         assert problem.value == "4.5 A"
         return problem.hint
 
@@ -308,8 +292,9 @@ class TestBudget:
         self, begins_rms_a: float, hottest_a2: float, safe: float, wait_s: int
     ) -> None:
         """20 s times ln(9 / 4), ln(4.08 / 4), and ln(3.25 / 1) above what the safe value makes."""
-        begins = f"it begins at {begins_rms_a:.3g} A rms, left by the last run: wait {wait_s} s"
-        assert self.hint(begins_rms_a, hottest_a2, safe) == begins
+        hint = self.hint(begins_rms_a, hottest_a2, safe)
+        assert f"{begins_rms_a:.3g} A" in hint
+        assert hint.endswith(f"wait {wait_s} s")
 
     @pytest.mark.parametrize(
         ("begins_rms_a", "hottest_a2", "safe"),
@@ -319,10 +304,9 @@ class TestBudget:
         self, begins_rms_a: float | None, hottest_a2: float, safe: float
     ) -> None:
         """Or one that must begin colder than the safe value lets the coil become."""
-        assert self.hint(begins_rms_a, hottest_a2, safe) == (
-            "0.5 A too much, and the budget is used up after 1.5 s: lower the waveform's "
-            "amplitude, or shorten the run"
-        )
+        hint = self.hint(begins_rms_a, hottest_a2, safe)
+        assert hint.startswith("0.5 A")
+        assert "after 1.5 s" in hint
 
 
 class TestDevice:
@@ -330,66 +314,51 @@ class TestDevice:
 
     def test_range(self) -> None:
         """Limits wider than what the device takes are refused."""
-        assert refusals(CURRENT, command_max=6.9) == [
-            "x.yaml: limits: must lie within what fake takes, -8 to 6.9 A, got -7 to 7"
-        ]
-        assert refusals(CURRENT, command_min=-6.9) == [
-            "x.yaml: limits: must lie within what fake takes, -6.9 to 8 A, got -7 to 7"
-        ]
+        for info in ({"command_max": 6.9}, {"command_min": -6.9}):
+            assert told(refusals(CURRENT, **info)) == [("limits", "-7 to 7")]
         checked(CURRENT, command_min=-7.0, command_max=7.0)
 
     def test_unit(self) -> None:
         """Limits in A for a device driven in V are refused."""
-        found = refusals(CURRENT, command_unit="V")
-        assert found == ["x.yaml: limits: must be in V, what fake is driven with, got A"]
+        assert told(refusals(CURRENT, command_unit="V")) == [("limits", "A")]
 
     def test_rate(self) -> None:
         """A rate that the device can't keep is refused; the fastest that it can is not."""
-        assert refusals(CURRENT, max_rate_hz=9999.0) == [
-            "x.yaml: sample_rate_hz: must be <= 9999, the fastest that fake can keep, got 10000.0"
-        ]
+        assert told(refusals(CURRENT, max_rate_hz=9999.0)) == [("sample_rate_hz", "10000.0")]
         checked(CURRENT, max_rate_hz=10_000.0)
 
     def test_block(self) -> None:
         """Blocks are for devices that have a FIFO."""
-        assert refusals(CURRENT, "block=2") == [
-            "x.yaml: block: must be 1: fake has no sample clock and FIFO of its own, got 2"
-        ]
+        assert told(refusals(CURRENT, "block=2")) == [("block", "2")]
         checked(CURRENT, "block=2", buffered=True, fifo_depth=4)
 
     def test_fifo(self) -> None:
         """Two blocks must fit in the FIFO: one that plays and one that is sent."""
-        assert refusals(CURRENT, "block=33", buffered=True, fifo_depth=64) == [
-            "x.yaml: block: must be <= 32: 2 blocks must fit into the FIFO of fake, 64 samples, "
-            "got 33"
-        ]
+        (found,) = refusals(CURRENT, "block=33", buffered=True, fifo_depth=64)
+        assert (found.key, found.value) == ("block", "33")
+        assert "<= 32" in found.rule
         checked(CURRENT, "block=32", buffered=True, fifo_depth=64)
 
     def test_blocks_kept_in_the_fifo(self) -> None:
         """All blocks that the device keeps in its FIFO must fit, and the one being sent."""
         kept = {"buffered": True, "fifo_depth": 64, "latency_blocks": 7}
-        assert refusals(CURRENT, "block=9", **kept) == [
-            "x.yaml: block: must be <= 8: 8 blocks must fit into the FIFO of fake, 64 samples, "
-            "got 9"
-        ]
+        (found,) = refusals(CURRENT, "block=9", **kept)
+        assert (found.key, found.value) == ("block", "9")
+        assert "<= 8" in found.rule
         checked(CURRENT, "block=8", **kept)
 
     @pytest.mark.parametrize("stroke", ["[-100.5, 60.0]", "[-75.0, 100.5]"])
     def test_sensor(self, stroke: str) -> None:
         """A stroke that the sensor can't see can't be watched."""
         found = refusals(CURRENT, f"limits.stroke_um={stroke}")
-        assert len(found) == 1
-        assert found[0].startswith(
-            "x.yaml: limits.stroke_um: must lie within what the sensor can report, -100 to 100 µm"
-        )
+        assert [problem.key for problem in found] == ["limits.stroke_um"]
+        assert "-100 to 100 µm" in found[0].rule
         checked(CURRENT, "limits.stroke_um=[-100.0, 100.0]")
 
     def test_model_of_another_device(self) -> None:
         """A model that gives volts is refused for a device driven with amperes."""
         found = refusals(DISPLACEMENT, "limits.peak_current_a=8.0", model=piezo_ppi())
-        assert found[0] == (
-            "x.yaml: compensator.model: must give commands in A, what fake is driven with, got V"
-        )
+        assert ("compensator.model", "V") in told(found)
 
 
 class TestAllAtOnce:
@@ -405,7 +374,7 @@ class TestAllAtOnce:
             model=terfenol_rdpi(),
             max_rate_hz=100.0,
         )
-        keys = [each.split(": ")[1] for each in found]
+        keys = [problem.key for problem in found]
         assert keys == [
             "sample_rate_hz",
             "block",
@@ -417,11 +386,7 @@ class TestAllAtOnce:
     def test_device_and_a_waveform_that_can_not_be_built(self) -> None:
         """Where there is no waveform, what is known of the device is still told."""
         found = refusals(CURRENT, "block=5", "waveform.frequency_hz=6000.0")
-        assert found == [
-            "x.yaml: block: must be 1: fake has no sample clock and FIFO of its own, got 5",
-            "x.yaml: waveform: sine: every frequency must be below half the sample rate, 5000 Hz: "
-            "6000 Hz",
-        ]
+        assert [problem.key for problem in found] == ["block", "waveform"]
 
 
 class TestWatchdog:
@@ -446,29 +411,15 @@ class TestWatchdog:
         assert found.loaded.device.info.watchdog_command == command
 
     @pytest.mark.parametrize(
-        ("command", "reason", "rule"),
-        [
-            (
-                1.5,
-                "",
-                "must be the safe value, 0 A, got 1.5 (or say in device.watchdog.reason why it is "
-                "not)",
-            ),
-            (
-                1e-6,
-                "",
-                "must be the safe value, 0 A, got 1e-06 (or say in device.watchdog.reason why"
-                " it is not)",
-            ),
-            (7.5, "holds a load", "must lie within the limits, -7 to 7 A, got 7.5"),
-        ],
+        ("command", "reason", "value"),
+        [(1.5, "", "1.5"), (1e-6, "", "1e-06"), (7.5, "holds a load", "7.5")],
     )
-    def test_another_value_is_refused(self, command: float, reason: str, rule: str) -> None:
+    def test_another_value_is_refused(self, command: float, reason: str, value: str) -> None:
         """Without a reason, and outside the limits with any."""
         with pytest.raises(ConfigError) as caught:
             checked(CURRENT, watchdog_command=command, watchdog_reason=reason)
         (problem,) = caught.value.problems
-        assert str(problem).endswith(f"device.watchdog.safe_command: {rule}")
+        assert (problem.key, problem.value) == ("device.watchdog.safe_command", value)
 
     @pytest.mark.parametrize(
         ("timeout_s", "arm_s", "refused"),
@@ -500,9 +451,9 @@ def test_a_reference_beyond_what_the_model_was_identified_on_is_warned_or_refuse
     assert check(loaded(DISPLACEMENT, model=within(10.0))).warnings == ()
     assert "repeats at 10 Hz" in check(loaded(DISPLACEMENT, model=within(30.0))).warnings[0]
     faster = loaded(DISPLACEMENT, "waveform.frequency_hz=60", model=within(10.0))
-    with pytest.raises(ConfigError, match="waveform: the reference moves at about 60 Hz") as caught:
+    with pytest.raises(ConfigError, match="60 Hz") as caught:
         check(faster)
-    assert "identify the model on such motions too" in str(caught.value)
+    assert [problem.key for problem in caught.value.problems] == ["waveform"]
 
 
 def test_a_reference_that_begins_beside_the_rest_position_is_moved_not_hurried() -> None:
@@ -512,7 +463,7 @@ def test_a_reference_that_begins_beside_the_rest_position_is_moved_not_hurried()
         check(loaded(DISPLACEMENT, "waveform.offset=0", model=moved))
     (problem,) = caught.value.problems
     assert problem.key == "waveform"
-    assert "rests at 0 A, by the model 24.5 µm" in problem.rule
+    assert "24.5 µm" in problem.rule
     assert problem.value == "0 µm"
     assert "slew" not in str(problem)
     there = ("waveform.offset=24.5", "waveform.soft_start_s=0")
@@ -552,16 +503,15 @@ def test_where_it_rests_is_said_once_all_stages_do(rate_hz: float, rests_um: int
     """After a tenth of a second, and a sample at least."""
     slow = (f"sample_rate_hz={rate_hz}", "limits.slew_a_per_s=1.0", "waveform.frequency_hz=0.01")
     (found,) = refusals(DISPLACEMENT, *slow, "waveform.amplitude=1.0", model=Offset())
-    assert found.startswith(
-        "x.yaml: waveform: must begin where the actuator rests at 0 A, by the model "
-        f"{rests_um} µm, got 0 µm (its first command would step to 3 A at once"
-    )
+    assert (found.key, found.value) == ("waveform", "0 µm")
+    assert f" {rests_um} µm" in found.rule
+    assert "3 A" in found.hint
 
 
 def test_at_the_safe_value_there_is_no_step() -> None:
     """What is too fast further on is told then, and where it begins is not."""
     (found,) = refusals(DISPLACEMENT, *FAST, "safe.value=3.0", model=Offset())
-    assert found.startswith("x.yaml: limits.slew_a_per_s: the run must change no faster than 400")
+    assert found.key == "limits.slew_a_per_s"
 
 
 def test_the_first_command_is_that_of_the_state_it_begins_with(
@@ -618,10 +568,10 @@ def test_a_faster_change_further_on_is_what_is_told() -> None:
     holds = ", ".join(f"{{kind: hold, level: {um}, duration_s: 0.2}}" for um in (22.0, 18.0))
     steps = f"waveform={{kind: sequence, unit: A, parts: [{holds}]}}"
     (found,) = refusals(DISPLACEMENT, steps, "limits.slew_a_per_s=1000.0", model=moved)
-    assert found.startswith("x.yaml: limits.slew_a_per_s: the run must change no faster than")
+    assert found.key == "limits.slew_a_per_s"
     a_third_more = steps.replace("22.0", "0.0").replace("18.0", "3.9")
     (found,) = refusals(DISPLACEMENT, a_third_more, model=Offset())
-    assert found.startswith("x.yaml: limits.slew_a_per_s: the run must change no faster than")
+    assert found.key == "limits.slew_a_per_s"
 
 
 def learned(made: CheckedExperiment, waveform: Segment) -> Correction:
@@ -659,7 +609,7 @@ def test_what_was_learned_on_another_motion_is_refused() -> None:
         check(replace(faster.loaded, correction=correction))
     (problem,) = caught.value.problems
     assert problem.key == "compensator.correction"
-    assert problem.hint == "learn again with 'hilctl learn', or take it out"
+    assert "hilctl learn" in problem.hint
 
 
 def test_each_block_keeps_the_memory_and_the_command_before() -> None:
@@ -684,10 +634,8 @@ def test_work_that_takes_long_is_told(
     assert not caplog.records
     monkeypatch.setattr(module, "_MANY", samples - 1)
     checked(DISPLACEMENT, longer, model=terfenol_rdpi())
-    assert [record.getMessage() for record in caplog.records] == [
-        f"the waveform does not repeat: {samples * 1e-6:.3g} million samples are worked out before "
-        "it starts"
-    ]
+    (record,) = caplog.records
+    assert f"{samples * 1e-6:.3g} million samples" in record.getMessage()
 
 
 def test_a_rest_before_the_waveform_does_not_make_the_last_run_forgotten(
@@ -704,35 +652,3 @@ def test_a_rest_before_the_waveform_does_not_make_the_last_run_forgotten(
         found = check(replace(made, config=config))
         assert found.conditioning() is not None
         assert found.begun.run_id == run_id
-
-
-DEMO = Path(__file__).parents[3] / "configs" / "demo.yaml"
-
-
-def warned(*settings, **info):
-    loaded = load_experiment(DEMO, settings)
-    return pace_warnings(loaded.config, replace(loaded.device.info, **info))
-
-
-@pytest.mark.parametrize(("block", "told"), [(4, True), (5, False)])
-def test_ticks_of_less_than_a_tenth_of_a_millisecond_are_told(block, told):
-    """The demo has 50 kHz."""
-    assert bool(warned(f"block={block}")) == told
-
-
-def test_the_text_says_what_to_do():
-    (text,) = warned("block=1")
-    assert text.startswith("sample_rate_hz: 50000 ticks per second: ")
-    assert "larger block" in text
-    (text,) = warned("block=1", buffered=False)
-    assert "lower rate" in text
-
-
-def test_a_device_that_keeps_the_pace_needs_no_timer():
-    assert warned("block=1", latency_blocks=2) == ()
-
-
-def test_a_check_tells():
-    settings = ["sample_rate_hz=20000", "block=1", "waveform.duration_s=1.0"]
-    checked = check(load_experiment(DEMO, settings))
-    assert any("ticks per second" in each for each in checked.warnings)

@@ -1,9 +1,23 @@
 """Common types of the experiment file: names, intervals, and the ring that bridges flushes."""
 
+from pathlib import Path
+
 import pytest
 from pydantic import TypeAdapter, ValidationError
 
-from hilctl.experiment.sections import Interval, Limits, Name, PiFeedbackConfig, RecordingConfig
+from hilctl.base.errors import ConfigError
+from hilctl.experiment.load import load_experiment
+from hilctl.experiment.sections import (
+    LONGEST_TEXT,
+    MOST_LABELS,
+    Interval,
+    Labels,
+    Limits,
+    Name,
+    PiFeedbackConfig,
+    RecordingConfig,
+    label_settings,
+)
 
 NAME, INTERVAL = TypeAdapter(Name), TypeAdapter(Interval)
 
@@ -30,7 +44,7 @@ def test_an_interval_is_two_rising_numbers(given):
 def test_the_ring_bridges_three_flushes():
     """One that is being written, one that waits, and one that fills."""
     assert RecordingConfig(flush_s=2.0, ring_s=6.0).ring_s == 6.0
-    with pytest.raises(ValidationError, match="at least three times flush_s"):
+    with pytest.raises(ValidationError, match="flush_s"):
         RecordingConfig(flush_s=2.0, ring_s=5.9)
 
 
@@ -43,7 +57,7 @@ def test_one_way_of_feedback_is_enough(way):
 @pytest.mark.parametrize("ways", [{}, {"kp": 0.1}, {"bandwidth_hz": 5.0, "ki_per_s": 3.0},
                                   {"bandwidth_hz": 5.0, "kp": 0.1}])  # fmt: skip
 def test_no_way_of_feedback_and_both_are_refused(ways):
-    with pytest.raises(ValidationError, match="must have either bandwidth_hz or ki_per_s"):
+    with pytest.raises(ValidationError, match="either bandwidth_hz"):
         PiFeedbackConfig(limit_um=1.0, **ways)
 
 
@@ -63,5 +77,64 @@ def test_a_peak_current_counts_both_ways_and_a_drive_as_it_is():
                                    {**CURRENT, **VOLTAGE}])  # fmt: skip
 def test_incomplete_and_mixed_limits_are_refused(given):
     """Half a limiter is none."""
-    with pytest.raises(ValidationError, match="must have either peak_current_a and slew_a_per_s"):
+    with pytest.raises(ValidationError, match="either peak_current_a"):
         Limits(**STROKE, **given)
+
+
+DEMO = Path(__file__).parents[3] / "configs" / "demo.yaml"
+LABELS = TypeAdapter(Labels)
+
+
+def test_texts_and_numbers_stay_what_they_are():
+    given = {"sample": "A7", "temperature_c": 21.5, "count": 3, "note": "x" * LONGEST_TEXT}
+    kept = LABELS.validate_python(given)
+    assert kept == given
+    assert isinstance(kept["count"], int)
+
+
+@pytest.mark.parametrize(
+    ("labels", "rule"),
+    [
+        ({"a": True}, "must be text or a number"),
+        ({"a": None}, "must be text or a number"),
+        ({"a": "x" * (LONGEST_TEXT + 1)}, "must have at most 500 characters"),
+        ({"a b": 1}, "a key must be at most 40 letters"),
+        ({"9a": 1}, "a key must be at most 40 letters"),
+        ({"a" * 41: 1}, "a key must be at most 40 letters"),
+        ({f"a{n}": n for n in range(MOST_LABELS + 1)}, "must be at most 32: there are 33"),
+    ],
+)
+def test_what_is_no_label_is_refused(labels, rule):
+    with pytest.raises(ValidationError, match=rule):
+        LABELS.validate_python(labels)
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("sample=A7", "A7"),
+        ("serial=0012", "0012"),  # a number would lose its zeros
+        ("t=-21.5", -21.5),
+        ("n=3", 3),
+        ("x=1e3", 1000.0),
+        ("note=a: [b], \"c\" = 'd' #e", "a: [b], \"c\" = 'd' #e"),
+        ("empty=", ""),
+        ("lines=a\nb\u202e\x1b", "a\nb\u202e\x1b"),
+        ("flag=true", "true"),
+    ],
+)
+def test_a_label_of_the_command_line_stands_as_it_was_typed(text, value):
+    labels = load_experiment(DEMO, label_settings([text])).config.labels
+    assert labels == {text.partition("=")[0]: value}
+    assert type(*labels.values()) is type(value)
+
+
+def test_labels_of_the_command_line_join_those_of_the_file():
+    settings = ["labels={sample: A1, operator: Ann}", *label_settings(["sample=A7"])]
+    assert load_experiment(DEMO, settings).config.labels == {"sample": "A7", "operator": "Ann"}
+
+
+def test_all_that_are_none_are_listed():
+    with pytest.raises(ConfigError) as refused:
+        label_settings(["sample", "a=1", "a.b=2"])
+    assert [each.where for each in refused.value.problems] == ["--label sample", "--label a.b=2"]

@@ -7,7 +7,7 @@ import pytest
 
 from hilctl.identify.creep_fit import creep_of, without_creep
 from hilctl.identify.data.records import History
-from hilctl.models.creep import CreepModel
+from hilctl.models.linear_stages import CreepModel
 from hilctl.models.plays import PpiModel
 
 RATE_HZ = 1000.0

@@ -6,7 +6,7 @@ import pytest
 from hilctl.base.errors import DataError
 from hilctl.identify.data.records import History, SteadyLoop
 from hilctl.identify.evaluation import hysteresis_weights, judge
-from hilctl.models.mechanics import FirstMode
+from hilctl.models.linear_stages import FirstMode
 from hilctl.models.plays import PpiModel, RdpiModel
 from hilctl.models.staged import FieldLag, StagedModel
 

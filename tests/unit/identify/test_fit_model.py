@@ -16,9 +16,8 @@ from hilctl.identify.fit_api import LEAST_SLOPE, FitRequest
 from hilctl.identify.fit_data import FitData
 from hilctl.identify.fit_model import FittedModel, fit_kind, fit_model, identified_range
 from hilctl.identify.settings import FitKind, FitSettings
-from hilctl.models.creep import CreepModel
 from hilctl.models.integrated import IntegratedModel, even_thresholds, exponential_integrated
-from hilctl.models.mechanics import FurtherMode
+from hilctl.models.linear_stages import CreepModel, FurtherMode
 from hilctl.models.model_file import dump_model, parse_model
 from hilctl.models.plays import PpiModel, RdpiModel
 from hilctl.models.staged import FieldLag, StagedModel

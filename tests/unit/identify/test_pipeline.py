@@ -19,7 +19,7 @@ from hilctl.identify.model_selection import Selection
 from hilctl.identify.pipeline import TURNS, identify_files, settings_from, with_modes
 from hilctl.identify.resonances import WORTH
 from hilctl.identify.settings import FitSettings, IdentifySettings
-from hilctl.models.mechanics import FirstMode, FurtherMode
+from hilctl.models.linear_stages import FirstMode, FurtherMode
 from hilctl.models.model_file import load_model
 from hilctl.models.plays import PpiModel
 

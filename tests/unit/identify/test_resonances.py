@@ -13,7 +13,7 @@ from hilctl.identify.resonances import (
     further_modes,
     without_modes,
 )
-from hilctl.models.mechanics import FirstMode, FurtherMode
+from hilctl.models.linear_stages import FirstMode, FurtherMode
 
 RATE_HZ = 20e3
 FIRST = FirstMode(natural_hz=2300.0, damping_ratio=0.12)

@@ -10,15 +10,14 @@ from scipy.signal import StateSpace, cont2discrete, lfilter, lsim
 
 from hilctl.kernels import dynamics
 from hilctl.kernels.dynamics import (
-    creep_stage,
+    creep_block,
     exponential,
-    mode_stage,
-    uncreep_stage,
-    unmode_stage,
+    mode_block,
+    uncreep_block,
+    unmode_block,
 )
 from hilctl.kernels.hysteresis import rest_memory
-from hilctl.models.cascade import smoothing_weights
-from hilctl.models.mechanics import FirstMode, FurtherMode
+from hilctl.models.linear_stages import FirstMode, FurtherMode, smoothing_weights
 from hilctl.models.staged import FieldLag
 
 RATE_HZ = 20_000.0
@@ -182,21 +181,6 @@ def test_lag_refuses_other_types():
         )  # fmt: skip
 
 
-@pytest.mark.parametrize(("stage", "block", "parameters", "size"), [
-    (dynamics.lead_stage, dynamics.lead_block, (0.3, 0.4), 1),
-    (dynamics.between_stage, dynamics.between_block, (0.3,), 0),
-])  # fmt: skip
-def test_a_stage_is_its_block_with_parameters_in_a_row(stage, block, parameters, size):
-    ends = []
-    for kernel, given in ((stage, (np.array(parameters),)), (block, parameters)):
-        memory, out = rest_memory(size), np.empty_like(SIGNAL)
-        kernel(SIGNAL, *given, memory, out)
-        ends.append((out, memory))
-    np.testing.assert_array_equal(ends[0][0], ends[1][0])
-    np.testing.assert_array_equal(ends[0][1], ends[1][1])
-    assert (ends[0][0] != SIGNAL).any()
-
-
 LEFT, GAIN = np.array([0.5, 0.9, 0.999]), np.array([0.02, 0.004, 3e-5])
 PARAMETERS = np.concatenate((LEFT, GAIN))
 
@@ -215,27 +199,27 @@ def walk():
 
 def test_creep_is_a_sum_of_first_order_filters_a_sample_late(walk):
     crept = sum(lfilter([0.0, g], [1.0, -a], walk) for a, g in zip(LEFT, GAIN, strict=True))
-    out, memory = run(creep_stage, walk)
+    out, memory = run(creep_block, walk)
     np.testing.assert_allclose(out, walk + crept, rtol=0.0, atol=1e-10)
     assert memory[-1] == walk[-1]
 
 
 def test_undone_to_rounding_from_any_memory(walk):
     memory = np.array([0.3, -0.2, 0.1, 4.0])
-    y, _ = run(creep_stage, walk, memory.copy())
-    x, left = run(uncreep_stage, y, memory.copy())
+    y, _ = run(creep_block, walk, memory.copy())
+    x, left = run(uncreep_block, y, memory.copy())
     np.testing.assert_allclose(x, walk, rtol=0.0, atol=1e-10)
     assert left[-1] == x[-1]
 
 
 def test_output_and_input_may_be_one_array(walk):
-    wanted, _ = run(uncreep_stage, walk)
+    wanted, _ = run(uncreep_block, walk)
     memory, values = np.array([0.0, 0.0, 0.0, np.nan]), walk.copy()
-    uncreep_stage(values, PARAMETERS, memory, values)
+    uncreep_block(values, PARAMETERS, memory, values)
     np.testing.assert_array_equal(values, wanted)
 
 
-@pytest.mark.parametrize("kernel", [creep_stage, uncreep_stage])
+@pytest.mark.parametrize("kernel", [creep_block, uncreep_block])
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_what_is_no_displacement_creeps_nowhere(walk, kernel, bad):
     values = walk.copy()
@@ -263,20 +247,20 @@ def test_a_pair_is_what_scipy_makes_of_its_transfer_function(walk):
     transfer = [up**2, 2.0 * 0.02 * up, 1.0], [down**2, 2.0 * 0.04 * down, 1.0]
     numerator, denominator, _ = cont2discrete(transfer, 1.0 / RATE_HZ, method="foh")
     wanted = lfilter(numerator[0], denominator, walk - walk[0]) + walk[0]
-    out, memory = run_mode(mode_stage, walk)
+    out, memory = run_mode(mode_block, walk)
     np.testing.assert_allclose(out, wanted, rtol=0.0, atol=1e-8)
     assert memory[2] == walk[-1]
 
 
 def test_a_mode_is_undone_to_rounding_from_any_memory(walk):
     memory = np.array([0.3, -0.2, 4.0])
-    y, _ = run_mode(mode_stage, walk, memory.copy())
-    x, left = run_mode(unmode_stage, y, memory.copy())
+    y, _ = run_mode(mode_block, walk, memory.copy())
+    x, left = run_mode(unmode_block, y, memory.copy())
     np.testing.assert_allclose(x, walk, rtol=0.0, atol=1e-9)
     assert left[2] == x[-1]
 
 
-@pytest.mark.parametrize("kernel", [mode_stage, unmode_stage])
+@pytest.mark.parametrize("kernel", [mode_block, unmode_block])
 def test_any_cut_into_blocks_gives_the_same_bits_and_output_and_input_may_be_one(walk, kernel):
     whole, _ = run_mode(kernel, walk)
     memory, values = np.full(3, np.nan), walk.copy()
@@ -285,19 +269,19 @@ def test_any_cut_into_blocks_gives_the_same_bits_and_output_and_input_may_be_one
     np.testing.assert_array_equal(values, whole)
 
 
-@pytest.mark.parametrize("kernel", [mode_stage, unmode_stage])
+@pytest.mark.parametrize("kernel", [mode_block, unmode_block])
 def test_what_never_moved_stays(kernel):
     out, _ = run_mode(kernel, np.full(50, 3.25))
     np.testing.assert_allclose(out, 3.25, rtol=1e-13)
 
 
-@pytest.mark.parametrize("kernel", [mode_stage, unmode_stage])
+@pytest.mark.parametrize("kernel", [mode_block, unmode_block])
 def test_it_begins_at_rest_whatever_was_before(kernel):
     out, _ = run_mode(kernel, np.full(50, 3.25), np.array([1.0, 5.0, np.nan]))
     np.testing.assert_allclose(out, 3.25, rtol=1e-13)
 
 
-@pytest.mark.parametrize("kernel", [mode_stage, unmode_stage])
+@pytest.mark.parametrize("kernel", [mode_block, unmode_block])
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_what_is_no_displacement_is_forgotten(walk, kernel, bad):
     values = walk.copy()

@@ -19,7 +19,7 @@ from hilctl.loop.interlocks import InterlockContext
 from hilctl.loop.limiter import CommandLimits
 from hilctl.loop.loop import Loop
 from hilctl.loop.plan import LoopPlan
-from hilctl.models.mechanics import FirstMode
+from hilctl.models.linear_stages import FirstMode
 from hilctl.models.plays import PpiModel
 from hilctl.models.staged import FieldLag, StagedModel
 from tests.fakes import FakeClock, FakeFifoDevice, FakeHost, made_block

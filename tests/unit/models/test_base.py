@@ -5,8 +5,7 @@ import pytest
 from pydantic import ValidationError
 
 from hilctl.base.errors import ModelError
-from hilctl.models.deadband import DeadbandFunction
-from hilctl.models.integrated import IntegratedModel
+from hilctl.models.integrated import DeadbandFunction, IntegratedModel
 from hilctl.models.plays import PpiModel, RdpiModel
 
 SAMPLE_RATE_HZ = 10_000.0

@@ -8,7 +8,7 @@ from pydantic import ValidationError
 
 from hilctl.base.types import F64
 from hilctl.models.effective_field import FieldLosses, FieldModel, OutputCurve
-from hilctl.models.mechanics import FirstMode
+from hilctl.models.linear_stages import FirstMode
 from hilctl.models.model_file import dump_model, parse_model
 from hilctl.models.staged import StagedModel
 
@@ -117,7 +117,7 @@ def test_between_stages_and_through_a_file() -> None:
         ({"thresholds": (1.0, 2.0)}, "first threshold must be 0"),
         ({"thresholds": (0.0, 0.0)}, "thresholds must rise"),
         ({"lengths": (0.0,)}, "lengths must be > 0"),
-        ({"lengths": ()}, "one line a threshold and one a length"),
+        ({"lengths": ()}, "per threshold and per length"),
         ({"cell": 0.0}, "cell must be > 0"),
         ({"slopes": ((1.0, 0.0), (1.0, 1.0), (1.0, 1.0))}, "first line must be > 0"),
         ({"slopes": ((1.0, 1.0), (-1.0, 1.0), (1.0, 1.0))}, "slopes must be >= 0"),

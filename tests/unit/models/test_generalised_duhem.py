@@ -9,7 +9,7 @@ from pydantic import ValidationError
 from hilctl.base.types import F64
 from hilctl.models.effective_field import FieldLosses
 from hilctl.models.generalised_duhem import GeneralisedDuhemModel
-from hilctl.models.mechanics import FirstMode
+from hilctl.models.linear_stages import FirstMode
 from hilctl.models.model_file import dump_model, parse_model
 from hilctl.models.staged import StagedModel
 

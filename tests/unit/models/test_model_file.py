@@ -128,7 +128,7 @@ def test_every_problem_is_told_at_once():
 @pytest.mark.parametrize(("before", "after", "problem"), [
     ("direct: 2.7", "direct: -1", "m.yaml:1: model: a_0 must be > 0 for the inverse to exist: -1"),
     ("0.1]", "-0.1]", "m.yaml:1: model: a_2 must be >= 0 for the inverse to exist: -0.1"),
-    ("0.1]", "0.1, 1]", "m.yaml:4: model: weights must have one value a threshold: 3 for 2"),
+    ("0.1]", "0.1, 1]", "m.yaml:4: model: weights must have one value per threshold: 3 for 2"),
     ("2.0e-4", "-1", "m.yaml:6: model.gamma_s: must be >= 0.0, got -1"),
     ("  direct: 2.7\n", "", "m.yaml:1: model.direct: is required"),
     ("  kind: rdpi\n", "", "m.yaml:1: model: needs a 'kind'"),

@@ -6,8 +6,7 @@ from pydantic import ValidationError
 
 from hilctl.base.errors import ModelError
 from hilctl.models.base import HysteresisModel
-from hilctl.models.deadband import DeadbandFunction
-from hilctl.models.integrated import IntegratedModel
+from hilctl.models.integrated import DeadbandFunction, IntegratedModel
 from hilctl.models.plays import PpiModel, RdpiModel, SpiModel
 from tests.published import piezo_ppi
 
@@ -52,8 +51,8 @@ def test_admissible_parameters_are_taken(kind, more):
     ({"thresholds": (-0.1, 0.2, 0.5)}, "r_1 = -0.1 after 0.0"),
     ({"thresholds": (0.1, 0.2, 0.2)}, "the thresholds must dilate): r_3 = 0.2 after 0.2"),
     ({"thresholds": (0.1, 0.6, 0.5)}, "r_3 = 0.5 after 0.6"),
-    ({"weights": (0.5, 0.1)}, "weights must have one value a threshold: 2 for 3"),
-    ({"thresholds": ()}, "weights must have one value a threshold: 3 for 0"),
+    ({"weights": (0.5, 0.1)}, "weights must have one value per threshold: 2 for 3"),
+    ({"thresholds": ()}, "weights must have one value per threshold: 3 for 0"),
     ({"input_range": (2.0, 2.0)}, "the second value must be above the first: [2.0, 2.0]"),
     ({"output_range_um": (5.0, -5.0)}, "the second value must be above the first: [5.0, -5.0]"),
 ])  # fmt: skip

@@ -5,7 +5,7 @@ import pytest
 from pydantic import ValidationError
 
 from hilctl.models.base import Provenance
-from hilctl.models.mechanics import FirstMode
+from hilctl.models.linear_stages import FirstMode
 from hilctl.models.model_file import dump_model, parse_model
 from hilctl.models.refined import RefinedModel, ResidualOperator, rest_um
 from hilctl.models.staged import FieldLag, StagedModel
@@ -127,7 +127,7 @@ def test_conditions_are_named(change, message):
 
 
 def test_a_unit_of_its_own_is_refused():
-    with pytest.raises(ValidationError, match=r"base.input_unit must be A, as beside it"):
+    with pytest.raises(ValidationError, match=r"base.input_unit must be A"):
         RefinedModel(base=piezo_ppi(), residual=residual())
 
 

@@ -11,7 +11,7 @@ import yaml
 
 from hilctl.base.device import DeviceInfo
 from hilctl.base.errors import InputError
-from hilctl.experiment.device import device_class
+from hilctl.experiment.devices import device_class
 from hilctl.run.probe import judge, probe
 from hilctl.run.run_folder import held_devices
 from hilctl_drivers.emulator.options import EmulatorOptions

@@ -1,4 +1,4 @@
-"""Rules of the waveform section, as an experiment file that breaks them is told."""
+"""Rules of the waveform section: line and key of each problem."""
 
 from pathlib import Path
 
@@ -18,46 +18,41 @@ limits: {{peak_current_a: 2.0, slew_a_per_s: 5000.0, stroke_um: [-75.0, 60.0]}}
 """
 
 
-def problems(waveform: str) -> list[str]:
-    """Return what is said of a waveform section that starts in line 5."""
+def problems(waveform: str) -> list[tuple[str, str]]:
+    """Return place and key of each problem of a waveform section that starts in line 5."""
     with pytest.raises(ConfigError) as caught:
         resolve(Document("x.yaml", EXPERIMENT.format(waveform)), Path())
-    return [str(problem) for problem in caught.value.problems]
+    return [(problem.where, problem.key) for problem in caught.value.problems]
 
 
 def test_unknown_kind() -> None:
     """A kind that there is not is refused with those that there are."""
     found = problems("  unit: A\n  kind: sinus\n  duration_s: 1.0\n")
-    assert len(found) == 1
-    assert found[0].startswith("x.yaml:6: waveform.kind: must be one of 'sine', 'triangle', ")
-    assert ", got 'sinus'" in found[0]
+    assert found == [("x.yaml:6", "waveform.kind")]
 
 
 def test_no_kind() -> None:
     """Without a kind nothing can be said of the rest."""
     found = problems("  unit: A\n  duration_s: 1.0\n")
-    assert found == ["x.yaml:4: waveform: needs a 'kind'"]
+    assert found == [("x.yaml:4", "waveform")]
 
 
 def test_no_unit() -> None:
     """The unit has no default."""
     found = problems("  kind: hold\n  level: 1.0\n  duration_s: 1.0\n")
-    assert found == ["x.yaml:4: waveform.unit: is required (um, A or V)"]
+    assert found == [("x.yaml:4", "waveform.unit")]
 
 
 def test_unit_of_the_limits() -> None:
     """Without a compensator the waveform has the unit of the limits."""
     found = problems("  kind: hold\n  level: 1.0\n  duration_s: 1.0\n  unit: V\n")
-    assert found == [
-        "x.yaml:8: waveform.unit: must be A, the unit of the limits, where compensator is "
-        "none, got V"
-    ]
+    assert found == [("x.yaml:8", "waveform.unit")]
 
 
 def test_rise_longer_than_dwell() -> None:
     """A step's rise must fit its dwell."""
     found = problems("  kind: step\n  unit: A\n  levels: [1]\n  dwell_s: 1\n  rise_s: 2\n")
-    assert found == ["x.yaml:9: waveform.rise_s: must be <= dwell_s, 1.0: 2.0"]
+    assert found == [("x.yaml:9", "waveform.rise_s")]
 
 
 @pytest.mark.parametrize(
@@ -71,34 +66,28 @@ def test_rise_longer_than_dwell() -> None:
 def test_empty_list(section: str, key: str) -> None:
     """Levels, parts and components need at least one."""
     found = problems(section)
-    assert found == [f"x.yaml:7: waveform.{key}: must have at least one value: []"]
+    assert found == [("x.yaml:7", f"waveform.{key}")]
 
 
 @pytest.mark.parametrize("value", ["[a, 2.0]", "[a]"])
 def test_levels_that_are_no_numbers(value: str) -> None:
     """A level that is no number is all that is said, also where it is the only one."""
     found = problems(f"  kind: step\n  unit: A\n  levels: {value}\n  dwell_s: 1\n")
-    assert found == ["x.yaml:7: waveform.levels.0: must be a number, got 'a'"]
+    assert found == [("x.yaml:7", "waveform.levels.0")]
 
 
 @pytest.mark.parametrize(
-    ("numbers", "message"),
+    ("numbers", "key"),
     [
-        ("first_hz: 5, last_hz: 4, step_hz: 1", "last_hz: must be >= first_hz, 5.0: 4.0"),
-        (
-            "first_hz: 0.5, last_hz: 400, step_hz: 0.01",
-            "step_hz: must leave at most 10000 sines in 399.5 Hz: 0.01",
-        ),
-        (
-            "first_hz: 0.5, last_hz: 400, step_hz: 1.0e-320",
-            "step_hz: must leave at most 10000 sines in 399.5 Hz: 1e-320",
-        ),
+        ("first_hz: 5, last_hz: 4, step_hz: 1", "last_hz"),
+        ("first_hz: 0.5, last_hz: 400, step_hz: 0.01", "step_hz"),
+        ("first_hz: 0.5, last_hz: 400, step_hz: 1.0e-320", "step_hz"),
     ],
 )
-def test_multisine(numbers: str, message: str) -> None:
+def test_multisine(numbers: str, key: str) -> None:
     """A multisine's band must rise, and hold no more sines than anyone can wait for."""
     keys = f"  {{kind: multisine, unit: A, amplitude: 1, duration_s: 1, {numbers}}}\n"
-    assert problems(keys) == [f"x.yaml:5: waveform.{message}"]
+    assert problems(keys) == [("x.yaml:5", f"waveform.{key}")]
 
 
 def test_file() -> None:
@@ -108,13 +97,13 @@ def test_file() -> None:
         "  first_row: 0\n  last_row: 3.5\n"
     )
     assert sorted(found) == [
-        "x.yaml:10: waveform.first_row: must be >= 1, got 0",
-        "x.yaml:11: waveform.last_row: must be a whole number, got 3.5",
-        "x.yaml:8: waveform.column: must be a column's name, or its number from 1: True",
-        "x.yaml:9: waveform.resample: must be one of 'refuse', 'linear' or 'cubic', got 'nearest'",
+        ("x.yaml:10", "waveform.first_row"),
+        ("x.yaml:11", "waveform.last_row"),
+        ("x.yaml:8", "waveform.column"),
+        ("x.yaml:9", "waveform.resample"),
     ]
     rows = "  kind: file\n  unit: A\n  path: w.csv\n  first_row: 5\n  last_row: 4\n"
-    assert problems(rows) == ["x.yaml:9: waveform.last_row: must be >= first_row, 5: 4"]
+    assert problems(rows) == [("x.yaml:9", "waveform.last_row")]
 
 
 def test_parts_of_a_sequence() -> None:
@@ -135,13 +124,12 @@ def test_parts_of_a_sequence() -> None:
         "        - {amplitude: 1, frequency: 5}\n"
     )
     assert sorted(found) == [
-        "x.yaml:10: waveform.parts.1.amplitude: must be > 0.0, got -1",
-        "x.yaml:11: waveform.parts.2.levels: unknown key (did you mean 'level'?)",
-        "x.yaml:12: waveform.parts.3.frequency_hz: is required",
-        "x.yaml:17: waveform.parts.4.components.1.frequency: unknown key (did you mean "
-        "'frequency_hz'?)",
-        "x.yaml:17: waveform.parts.4.components.1.frequency_hz: is required",
-        "x.yaml:7: waveform.repeat: must be <= 10000, got 10001",
+        ("x.yaml:10", "waveform.parts.1.amplitude"),
+        ("x.yaml:11", "waveform.parts.2.levels"),
+        ("x.yaml:12", "waveform.parts.3.frequency_hz"),
+        ("x.yaml:17", "waveform.parts.4.components.1.frequency"),
+        ("x.yaml:17", "waveform.parts.4.components.1.frequency_hz"),
+        ("x.yaml:7", "waveform.repeat"),
     ]
 
 
@@ -154,14 +142,13 @@ def test_unit_in_a_part() -> None:
         "    - {kind: hold, unit: A, level: 1.0, duration_s: 1.0}\n"
         "    - {kind: hold, unit: um, level: 1.0, duration_s: 1.0}\n"
     )
-    assert found == ["x.yaml:9: waveform.parts: 1.unit must be that of the sequence, A: um"]
+    assert found == [("x.yaml:9", "waveform.parts")]
 
 
 def test_sequence_in_a_sequence() -> None:
     """Sequences do not nest."""
     found = problems("  kind: sequence\n  unit: A\n  parts:\n    - {kind: sequence, parts: []}\n")
-    assert len(found) == 1
-    assert found[0].startswith("x.yaml:8: waveform.parts.0.kind: must be one of 'sine', ")
+    assert found == [("x.yaml:8", "waveform.parts.0.kind")]
 
 
 def test_a_random_band_must_hold_a_line() -> None:
@@ -170,10 +157,7 @@ def test_a_random_band_must_hold_a_line() -> None:
         "  kind: random\n  unit: A\n  amplitude: 1.0\n  first_hz: 1.0\n  last_hz: 1.5\n"
         "  duration_s: 0.5\n"
     )
-    assert found == [
-        "x.yaml:10: waveform.duration_s: must hold whole cycles of a frequency from 1.0 to 1.5 Hz: "
-        "0.5"
-    ]
+    assert found == [("x.yaml:10", "waveform.duration_s")]
 
 
 def test_a_random_band_has_two_ends_in_order() -> None:
@@ -181,9 +165,9 @@ def test_a_random_band_has_two_ends_in_order() -> None:
         "  kind: random\n  unit: A\n  amplitude: 1.0\n  first_hz: 9.0\n  last_hz: 1.5\n"
         "  duration_s: 0.5\n"
     )
-    assert "x.yaml:9: waveform.last_hz: must be >= first_hz, 9.0: 1.5" in found
+    assert ("x.yaml:9", "waveform.last_hz") in found
 
 
 def test_a_path_needs_levels() -> None:
     found = problems("  kind: path\n  unit: A\n  levels: []\n  rate_per_s: 2.0\n")
-    assert found == ["x.yaml:7: waveform.levels: must have at least one value: []"]
+    assert found == [("x.yaml:7", "waveform.levels")]

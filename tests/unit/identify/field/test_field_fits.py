@@ -10,7 +10,7 @@ from hilctl.identify.evaluation import judge
 from hilctl.identify.fit_api import FitRequest
 from hilctl.identify.fit_model import fit_model
 from hilctl.identify.settings import FitSettings
-from hilctl.models.mechanics import FirstMode
+from hilctl.models.linear_stages import FirstMode
 from hilctl.models.staged import FieldLag, StagedModel
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 from tests.staged import truth

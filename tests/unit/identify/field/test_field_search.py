@@ -23,7 +23,7 @@ from hilctl.identify.field.field_search import (
 from hilctl.identify.field.preprocess import Prepared
 from hilctl.identify.field.stages import HIGH, LOW, STEP, Stages, row
 from hilctl.models.effective_field import FieldLosses, FieldModel, OutputCurve
-from hilctl.models.mechanics import FirstMode
+from hilctl.models.linear_stages import FirstMode
 from hilctl.models.staged import StagedModel
 
 RATE_HZ = 2000.0

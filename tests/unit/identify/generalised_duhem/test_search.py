@@ -40,7 +40,7 @@ from hilctl.identify.generalised_duhem.tables import (
 from hilctl.identify.settings import FitSettings
 from hilctl.models.effective_field import FieldLosses
 from hilctl.models.generalised_duhem import GeneralisedDuhemModel
-from hilctl.models.mechanics import FirstMode
+from hilctl.models.linear_stages import FirstMode
 from hilctl.models.staged import StagedModel
 from tests.unit.models.test_generalised_duhem import duhem_model
 

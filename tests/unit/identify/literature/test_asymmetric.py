@@ -6,8 +6,7 @@ import pytest
 from hilctl.identify.fit_api import FitJob
 from hilctl.identify.literature.asymmetric import _Problem, fit_asymmetric
 from hilctl.identify.settings import FitSettings
-from hilctl.models.deadband import DeadbandFunction
-from hilctl.models.integrated import IntegratedModel
+from hilctl.models.integrated import DeadbandFunction, IntegratedModel
 from hilctl.models.plays import PpiModel
 
 PLAYS = {"direct": 4.0, "weights": (1.0, 1.5, 2.0), "thresholds": (0.5, 1.5, 2.5)}

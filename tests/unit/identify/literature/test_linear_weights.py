@@ -9,10 +9,8 @@ from hilctl.identify.fit_api import FitJob
 from hilctl.identify.fit_data import FitData
 from hilctl.identify.literature.linear_weights import fit_kp, fit_preisach, fit_straight
 from hilctl.identify.settings import FitSettings
-from hilctl.models.bouc_wen import BoucWenModel
-from hilctl.models.kp import KrasnoselskiiPokrovskiiModel
+from hilctl.models.implicit_models import BoucWenModel, KrasnoselskiiPokrovskiiModel, PreisachModel
 from hilctl.models.plays import PpiModel
-from hilctl.models.preisach import PreisachModel
 
 RNG = np.random.default_rng(4)
 SPAN = (-7.0, 7.0)

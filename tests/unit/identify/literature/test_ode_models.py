@@ -5,8 +5,7 @@ import pytest
 from hilctl.identify.fit_api import FitJob
 from hilctl.identify.literature.ode_models import fit_bouc_wen, fit_duhem
 from hilctl.identify.settings import FitSettings
-from hilctl.models.bouc_wen import BoucWenModel
-from hilctl.models.duhem import DuhemModel
+from hilctl.models.implicit_models import BoucWenModel, DuhemModel
 
 SPAN = (-7.0, 7.0)
 COMMON = {"command_span": SPAN, "output_offset_um": -3.0}

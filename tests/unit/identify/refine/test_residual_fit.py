@@ -9,8 +9,7 @@ from hilctl.identify.refine.residual_fit import (
     delayed_model,
     fastest_um_per_s,
 )
-from hilctl.models.butterfly import ButterflyModel
-from hilctl.models.deadband import DeadbandFunction
+from hilctl.models.integrated import ButterflyModel, DeadbandFunction
 from hilctl.models.refined import LEAST_SLOPE, RefinedModel
 from hilctl.models.staged import StagedModel
 from tests.unit.identify.refine.conftest import OLD, RATE_HZ, actuator, history

@@ -8,8 +8,7 @@ from hilctl.identify.data.records import History
 from hilctl.identify.fit_api import FitRequest
 from hilctl.identify.fit_model import FittedModel, fit_model
 from hilctl.identify.settings import FitSettings
-from hilctl.models.butterfly import ButterflyModel
-from hilctl.models.deadband import DeadbandFunction
+from hilctl.models.integrated import ButterflyModel, DeadbandFunction
 
 KNOWN = ButterflyModel(
     direct=0.5,

@@ -23,7 +23,7 @@ from hilctl.identify.staged.objective import (
     structure_of,
 )
 from hilctl.models.integrated import exponential_integrated
-from hilctl.models.mechanics import FirstMode
+from hilctl.models.linear_stages import FirstMode
 from tests.staged import start
 
 Loops = Callable[..., list[SteadyLoop]]

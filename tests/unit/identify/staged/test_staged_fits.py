@@ -14,9 +14,9 @@ from hilctl.identify.staged.objective import DYNAMIC, Layers, Point
 from hilctl.identify.staged.sensitivity import SPACING
 from hilctl.identify.staged.staged_fits import at_bound, standard_errors
 from hilctl.identify.staged.staged_search import StagedEnd
-from hilctl.models.mechanics import FirstMode
+from hilctl.models.implicit_models import PreisachModel
+from hilctl.models.linear_stages import FirstMode
 from hilctl.models.model_file import dump_model, parse_model
-from hilctl.models.preisach import PreisachModel
 from hilctl.models.staged import FieldLag, StagedModel
 from tests.staged import GRID, fit, truth
 

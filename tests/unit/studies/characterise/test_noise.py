@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hilctl.base.segments import Segment
-from hilctl.models.creep import CreepModel
+from hilctl.models.linear_stages import CreepModel
 from hilctl.studies.characterise.noise import crept_percent, rest_noise, sine_reaction
 from hilctl.studies.characterise.rig_problem import RigProblemError
 from hilctl.studies.characterise.waveforms import at_rest, rests, sine

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilctl.models.mechanics import FurtherMode
+from hilctl.models.linear_stages import FurtherMode
 from hilctl.models.staged import StagedModel
 from hilctl.studies.characterise.results import Measured, StepRow
 from hilctl.studies.characterise.rig_page import (

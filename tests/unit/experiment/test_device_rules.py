@@ -1,4 +1,4 @@
-"""Interlocks from an experiment, what is refused of them, and the thermal budget foreseen."""
+"""Rules between an experiment and its device; the thermal budget in advance."""
 
 import math
 from dataclasses import replace
@@ -9,8 +9,8 @@ import pytest
 
 from hilctl.base.errors import ConfigError
 from hilctl.base.yaml import Document
-from hilctl.experiment.interlocks import interlock_context
-from hilctl.experiment.load import resolve
+from hilctl.experiment.device_rules import interlock_context, pace_warnings
+from hilctl.experiment.load import load_experiment, resolve
 from hilctl.experiment.preflight import check
 from hilctl.loop.interlocks import Interlocks, InterlockSettings
 from tests.published import terfenol_rdpi
@@ -51,7 +51,7 @@ def loaded(text, *settings, **info):
 def refusals(text, *settings, **info):
     with pytest.raises(ConfigError) as caught:
         check(loaded(text, *settings, **info))
-    return [str(replace(problem, where="x.yaml")) for problem in caught.value.problems]
+    return caught.value.problems
 
 
 class TestContext:
@@ -104,53 +104,35 @@ class TestConsistency:
     """Interlocks that could not do what they say."""
 
     @pytest.mark.parametrize(
-        ("text", "settings", "found"),
+        ("text", "settings", "word"),
         [
-            (
-                CURRENT,
-                ["tracking_error_um=2.0"],
-                ["tracking_error_um: needs a compensator: without one there is no reference in um "
-                 "to track"],
-            ),
-            (
-                CURRENT,
-                ["rms_current_a=4.0"],
-                ["rms_current_a: needs limits.thermal_time_constant_s"],
-            ),
-            (
-                CURRENT,
-                ["thermal_time_constant_s=4.0"],
-                ["thermal_time_constant_s: needs limits.rms_current_a"],
-            ),
-            (CURRENT, ["tracking_s=0.1"], ["tracking_s: needs limits.tracking_error_um"]),
-            (CURRENT, ["frozen_um=0.1"], ["frozen_um: needs limits.frozen_s"]),
-            (CURRENT, ["deviation_s=0.1"], ["deviation_s: needs limits.measured_deviation_a"]),
-            (VOLTAGE, ["deviation_s=0.1"], ["deviation_s: needs limits.measured_deviation_v"]),
-            (
-                CURRENT,
-                ["measured_deviation_v=1.0"],
-                ["measured_deviation_v: is for a device driven in V, but the limits are in A"],
-            ),
+            (CURRENT, ["tracking_error_um=2.0"], "compensator"),
+            (CURRENT, ["rms_current_a=4.0"], "limits.thermal_time_constant_s"),
+            (CURRENT, ["thermal_time_constant_s=4.0"], "limits.rms_current_a"),
+            (CURRENT, ["tracking_s=0.1"], "limits.tracking_error_um"),
+            (CURRENT, ["frozen_um=0.1"], "limits.frozen_s"),
+            (CURRENT, ["deviation_s=0.1"], "limits.measured_deviation_a"),
+            (VOLTAGE, ["deviation_s=0.1"], "limits.measured_deviation_v"),
+            (CURRENT, ["measured_deviation_v=1.0"], "in V"),
             (
                 VOLTAGE,
                 ["rms_current_a=1.0", "thermal_time_constant_s=1.0", "measured_deviation_a=1.0"],
-                [f"{key}: is for a device driven in A, but the limits are in V"
-                 for key in ("rms_current_a", "thermal_time_constant_s", "measured_deviation_a")],
+                "in A",
             ),
         ],
-    )  # fmt: skip
-    def test_refused_by_key(self, text, settings, found):
-        """Each is told with its key and what is missing, all at once."""
-        told = refusals(text, *(f"limits.{setting}" for setting in settings))
-        assert told == [f"x.yaml: limits.{each}" for each in found]
+    )
+    def test_refused_by_key(self, text, settings, word):
+        """Each key is listed with its missing requirement."""
+        found = refusals(text, *(f"limits.{setting}" for setting in settings))
+        keys = [f"limits.{setting.partition('=')[0]}" for setting in settings]
+        assert [problem.key for problem in found] == keys
+        assert all(word in problem.rule for problem in found)
 
     def test_device_that_does_not_measure(self):
         """A deviation can only be seen where the device measures its command."""
-        told = refusals(CURRENT, "limits.measured_deviation_a=1.0", measures_command=False)
-        assert told == [
-            "x.yaml: limits.measured_deviation_a: needs a device that measures its command: "
-            "simulated_terfenol does not"
-        ]
+        (found,) = refusals(CURRENT, "limits.measured_deviation_a=1.0", measures_command=False)
+        assert found.key == "limits.measured_deviation_a"
+        assert "simulated_terfenol" in found.rule
         check(loaded(CURRENT, "limits.measured_deviation_a=1.0"))
 
     def test_place_in_the_file(self):
@@ -206,20 +188,17 @@ class TestHeatForecast:
         budget = ("limits.rms_current_a=0.5", "limits.thermal_time_constant_s=1.0")
         assert check(loaded(CURRENT, *hold, *budget)).forecast.heating_rms_a == 0.5
         found = refusals(CURRENT, *hold, "limits.rms_current_a=0.4", budget[1])
-        assert found[0].endswith(
-            "got 0.5 A (0.1 A too much, and the budget is used up after 0 s: lower the waveform's "
-            "amplitude, or shorten the run)"
-        )
+        assert (found[0].key, found[0].value) == ("limits.rms_current_a", "0.5 A")
+        assert found[0].hint.startswith("0.1 A")
 
     @pytest.mark.parametrize("chunk", [1, 700, 4000, 1_000_000])
     def test_refused_with_when_and_by_how_much(self, monkeypatch, chunk):
         """A waveform whose budget would trip is refused, however it is cut into chunks."""
-        monkeypatch.setattr("hilctl.experiment.command_simulation.CHUNK", chunk)
-        assert refusals(CURRENT, *BUDGET) == [
-            "x.yaml: limits.rms_current_a: the coil must stay within 4 A rms over 1.5 s, got "
-            "4.105 A (0.105 A too much, and the budget is used up after 3.23 s: lower the "
-            "waveform's amplitude, or shorten the run)"
-        ]
+        monkeypatch.setattr("hilctl.experiment.forecast.CHUNK", chunk)
+        (found,) = refusals(CURRENT, *BUDGET)
+        assert (found.key, found.value) == ("limits.rms_current_a", "4.105 A")
+        assert found.hint.startswith("0.105 A")
+        assert "after 3.23 s" in found.hint
 
     def test_refused_at_its_line(self):
         """The refusal leads to the line of the budget."""
@@ -263,4 +242,36 @@ class TestHeatForecast:
         """Where the square overflows the refusal is in words, without a warning."""
         found = refusals(CURRENT, *BUDGET, "waveform.amplitude=1.0e+200")
         assert len(found) == 3
-        assert "limits.rms_current_a" in found[-1]
+        assert found[-1].key == "limits.rms_current_a"
+
+
+DEMO = Path(__file__).parents[3] / "configs" / "demo.yaml"
+
+
+def warned(*settings, **info):
+    loaded = load_experiment(DEMO, settings)
+    return pace_warnings(loaded.config, replace(loaded.device.info, **info))
+
+
+@pytest.mark.parametrize(("block", "told"), [(4, True), (5, False)])
+def test_ticks_of_less_than_a_tenth_of_a_millisecond_are_told(block, told):
+    """The demo has 50 kHz."""
+    assert bool(warned(f"block={block}")) == told
+
+
+def test_the_text_says_what_to_do():
+    (text,) = warned("block=1")
+    assert text.startswith("sample_rate_hz: 50000")
+    assert "larger block" in text
+    (text,) = warned("block=1", buffered=False)
+    assert "lower rate" in text
+
+
+def test_a_device_that_keeps_the_pace_needs_no_timer():
+    assert warned("block=1", latency_blocks=2) == ()
+
+
+def test_a_check_tells():
+    settings = ["sample_rate_hz=20000", "block=1", "waveform.duration_s=1.0"]
+    checked = check(load_experiment(DEMO, settings))
+    assert any("ticks per second" in each for each in checked.warnings)

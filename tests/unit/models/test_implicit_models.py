@@ -1,19 +1,24 @@
 """The comparison models: Preisach, K-P, Bouc-Wen, Duhem and generalised PI, on any signal."""
 
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from pydantic import ValidationError
+from scipy.integrate import solve_ivp
 
-from hilctl.models.bouc_wen import BoucWenModel
-from hilctl.models.duhem import DuhemModel
 from hilctl.models.generalised_pi import GeneralisedModel, PlayEnvelope
-from hilctl.models.implicit_base import TOLERANCE_UM
-from hilctl.models.kp import KrasnoselskiiPokrovskiiModel
+from hilctl.models.implicit_models import (
+    TOLERANCE_UM,
+    BoucWenModel,
+    DuhemModel,
+    KrasnoselskiiPokrovskiiModel,
+    PreisachModel,
+)
 from hilctl.models.model_file import dump_model, parse_model
-from hilctl.models.preisach import PreisachModel
 
 RATE_HZ = 50_000.0
 LOW, HIGH = SPAN = (-7.0, 8.0)
@@ -212,7 +217,7 @@ def test_a_reference_that_is_not_a_number_leaves_no_trace(model):
         (PREISACH, {"slopes": ((1.0, 0.0, 1.0),) * 3}, "first line must be > 0"),
         (PREISACH, {"slopes": ((1.0,), (-1.0,), (0.0,))}, "slopes must be >= 0"),
         (PREISACH, {"slopes": ((1.0,), (1.0, 2.0), (0.0,))}, "the same cells"),
-        (PREISACH, {"slopes": ((1.0,),)}, "one line a threshold"),
+        (PREISACH, {"slopes": ((1.0,),)}, "one line per threshold"),
         (KP, {"spacing": -1.0}, "spacing must be > 0"),
         (KP, {"weights": ()}, "at least one row"),
         (KP, {"weights": ((1.0,), (1.0,))}, "must have 2 values"),
@@ -230,3 +235,88 @@ def test_broken_conditions_are_refused(model, change, rule):
     """Each condition for a bounded model with an inverse is checked, and named."""
     with pytest.raises(ValidationError, match=rule):
         type(model)(**{**model.model_dump(exclude={"kind"}), **change})
+
+
+def test_preisach_is_a_sum_of_relays():
+    """Thousands of relays (1.1), each switched by itself, give the same displacement."""
+    v = np.array([0.0, 2.5, -0.4, 1.3, -2.9, 2.2, -1.0, 0.1, 2.9, -2.9])
+    parts = 2_000
+    expected = np.zeros(v.size)
+    for r, slopes in zip(PREISACH.thresholds, PREISACH.slopes, strict=True):
+        width = PREISACH.cell / parts
+        centres = PREISACH.lowest + width * (np.arange(3 * parts) + 0.5)
+        density = np.repeat(slopes, parts)
+        for k in range(v.size):
+            if k == 0:
+                up = centres < 0.0
+                rest = np.sum(density[up])
+            up = (up | (v[k] >= centres + r)) & ~(v[k] <= centres - r)
+            expected[k] += width * (np.sum(density[up]) - rest)
+    np.testing.assert_allclose(PREISACH.forward(RATE_HZ).process(v), expected, atol=0.02)
+
+
+@given(preisachs())
+def test_preisach_rests_at_its_offset(model):
+    """At rest the displacement is the offset, whether or not the cells reach there."""
+    rest = model.forward(RATE_HZ).process(np.zeros(1)).item()
+    assert rest == pytest.approx(model.output_offset_um, abs=1e-9)
+
+
+def test_kp_follows_its_definition():
+    """Each operator obeys (1.4), which tells rising from falling commands."""
+    v = np.array([0.0, 1.0, 3.0, 0.5, 0.2, -3.3, -1.0, 1.7, 1.7, -0.3, 4.0, -4.5])
+
+    def ridge(x):
+        return float(np.clip(-1.0 + 2.0 * x / KP.spacing, -1.0, 1.0))
+
+    expected = np.zeros(v.size)
+    for i, row in enumerate(KP.weights):
+        for j, weight in enumerate(row):
+            alpha, beta = KP.lowest + KP.spacing * np.array([i, j])
+            held = max(ridge(-alpha), min(ridge(-beta), 0.0))
+            for k in range(v.size):
+                if k and v[k] > v[k - 1]:
+                    held = max(held, ridge(v[k] - alpha))
+                elif k and v[k] < v[k - 1]:
+                    held = min(held, ridge(v[k] - beta))
+                expected[k] += weight * held
+    np.testing.assert_allclose(KP.forward(RATE_HZ).process(v), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("exponent", [1, 2])
+@pytest.mark.parametrize("gamma", [-0.2, 0.0, 0.7])
+def test_bouc_wen_solves_its_equation(exponent, gamma):
+    """Between samples z is what a differential-equation solver makes of (1.21)."""
+    model = BoucWenModel(
+        **PLAIN, direct=10.0, hysteretic=2.0, beta=0.7, gamma=gamma, exponent=exponent
+    )
+    v = np.array([0.0, 4.0, -1.0, 0.5, -5.0, 6.0, -6.0])
+    z, expected = 0.0, [0.0]
+    for begin, end in itertools.pairwise(v):
+        rate = end - begin
+
+        def slope(_, z, rate=rate):
+            size = np.abs(z)
+            return (
+                rate - 0.7 * abs(rate) * size ** (exponent - 1) * z - gamma * rate * size**exponent
+            )
+
+        z = solve_ivp(slope, (0.0, 1.0), [z], rtol=1e-10, atol=1e-12).y[0, -1]
+        expected.append(10.0 * end - 2.0 * z)
+    np.testing.assert_allclose(model.forward(RATE_HZ).process(v), expected, atol=1e-6)
+
+
+def test_duhem_solves_its_equation():
+    """Between samples the displacement is what a solver makes of (1.22)."""
+    v = np.array([0.0, 4.0, -1.0, 0.5, -5.0, 6.0, -6.0])
+    y, expected = 0.0, [0.0]
+    for begin, end in itertools.pairwise(v):
+        rate = end - begin
+
+        def slope(time, y, begin=begin, rate=rate):
+            command = begin + rate * time
+            return DUHEM.a * abs(rate) * (DUHEM.b * command - y) + DUHEM.c * rate
+
+        y = solve_ivp(slope, (0.0, 1.0), [y], rtol=1e-10, atol=1e-12).y[0, -1]
+        expected.append(y)
+    np.testing.assert_allclose(DUHEM.forward(RATE_HZ).process(v), expected, atol=1e-6)

@@ -1,0 +1,134 @@
+"""Rules between an experiment and its device: range, rate, blocks, watchdog, interlocks."""
+
+import math
+from collections.abc import Iterator
+
+from hilctl.base.device import DeviceInfo
+from hilctl.base.errors import ConfigProblem
+from hilctl.experiment.file import Experiment
+from hilctl.experiment.load import LoadedExperiment
+from hilctl.loop.interlocks import InterlockContext, InterlockRequirement, InterlockSettings
+
+SHORTEST_TICK_S = 1e-4
+"""Shortest tick that timers keep on most machines: an idle CPU takes up to 0.1 ms to wake."""
+_TRAVEL = 0.02  # of the command's range: far above noise, far below any useful run
+_TIMEOUT_TICKS = 3  # that devices ask for when they are opened
+
+
+def pace_warnings(config: Experiment, info: DeviceInfo) -> tuple[str, ...]:
+    """Return a warning if many ticks will be late; none for a device with its own clock."""
+    if info.latency_blocks or config.tick_s >= SHORTEST_TICK_S:
+        return ()
+    remedy = "Use a larger block." if info.buffered else "Use a lower rate."
+    return (
+        f"sample_rate_hz: {1.0 / config.tick_s:g} ticks per second: on most machines timers wake "
+        f"the loop too late for some of them. {remedy}",
+    )
+
+
+def device_problems(loaded: LoadedExperiment) -> list[ConfigProblem]:
+    """Return the settings that the device does not support."""
+    rules = (_range_problems, _pace_problems, _watchdog_problems)
+    return [problem for rule in rules for problem in rule(loaded)]
+
+
+def _range_problems(loaded: LoadedExperiment) -> Iterator[ConfigProblem]:
+    config, info, model = loaded.config, loaded.device.info, loaded.model
+    unit = info.command_unit
+    low, high = config.limits.command_range
+    rule = f"must lie within the range of {info.name}, {info.command_min:g} to "
+    rule += f"{info.command_max:g} {unit}"
+    at_start = config.safe.at_start
+    if config.limits.unit != unit:
+        yield loaded.problem(
+            "limits", f"must be in {unit}, the unit of {info.name}", config.limits.unit
+        )
+    else:
+        if low < info.command_min or high > info.command_max:
+            yield loaded.problem("limits", rule, f"{low:g} to {high:g}")
+        if at_start is not None and not info.command_min <= at_start <= info.command_max:
+            yield loaded.problem("safe.at_start", rule, f"{at_start:g}")
+    low_um, high_um = config.limits.stroke_um
+    if low_um < info.sensor_min_um or high_um > info.sensor_max_um:
+        span = f"{info.sensor_min_um:g} to {info.sensor_max_um:g} µm"
+        rule = f"must lie within the range of the sensor, {span}"
+        yield loaded.problem("limits.stroke_um", rule, f"{low_um:g} to {high_um:g}")
+    if model is not None and model.input_unit != unit:
+        rule = f"must give commands in {unit}, the unit of {info.name}"
+        yield loaded.problem("compensator.model", rule, model.input_unit)
+
+
+def _pace_problems(loaded: LoadedExperiment) -> Iterator[ConfigProblem]:
+    config, info = loaded.config, loaded.device.info
+    if config.sample_rate_hz > info.max_rate_hz:
+        note = f" ({info.rate_note})" if info.rate_note else ""
+        rule = f"must be <= {info.max_rate_hz:g}, the highest rate of {info.name}{note}"
+        yield loaded.problem("sample_rate_hz", rule, str(config.sample_rate_hz))
+    if config.block > 1 and not info.buffered:
+        rule = f"must be 1: {info.name} has no FIFO with a sample clock"
+        yield loaded.problem("block", rule, str(config.block))
+    blocks = max(2, info.latency_blocks + 1)
+    if info.buffered and blocks * config.block > info.fifo_depth:
+        fifo = f"the FIFO of {info.name}, {info.fifo_depth} samples"
+        rule = f"must be <= {info.fifo_depth // blocks}: {blocks} blocks must fit into {fifo}"
+        yield loaded.problem("block", rule, str(config.block))
+
+
+def _watchdog_problems(loaded: LoadedExperiment) -> Iterator[ConfigProblem]:
+    """Yield a watchdog value other than the safe value, and a timeout shorter than the start."""
+    info, config = loaded.device.info, loaded.config
+    command, safe, unit = info.watchdog_command, config.safe.value, info.command_unit
+    if command is not None and not math.isclose(command, safe, abs_tol=1e-9):
+        low, high = config.limits.command_range
+        rule, hint = "", ""
+        if not low <= command <= high:
+            rule = f"must lie within the limits, {low:g} to {high:g} {unit}"
+        elif not info.watchdog_reason:
+            rule = f"must be the safe value, {safe:g} {unit}"
+            hint = "or give the reason in device.watchdog.reason"
+        if rule:
+            yield loaded.problem("device.watchdog.safe_command", rule, f"{command:g}", hint)
+    timeout_s, least_s = info.watchdog_timeout_s, _TIMEOUT_TICKS * config.tick_s + info.arm_s
+    if timeout_s is not None and timeout_s < least_s:
+        rule = f"must be >= {least_s:.3g}, {_TIMEOUT_TICKS} ticks of {config.tick_s:g} s"
+        if info.arm_s:
+            rule += f" and {info.arm_s:.2g} s to arm it on this line"
+        yield loaded.problem("device.watchdog.timeout_s", rule, f"{timeout_s:g}")
+
+
+def interlock_context(config: Experiment, info: DeviceInfo) -> InterlockContext:
+    """Return the facts about the rig that the interlocks of a run need."""
+    low, high = config.limits.command_range
+    return InterlockContext(
+        stroke_um=config.limits.stroke_um,
+        sensor_um=(info.sensor_min_um, info.sensor_max_um),
+        unit=config.limits.unit,
+        safe=config.safe.value,
+        frozen_travel=_TRAVEL * (high - low),
+    )
+
+
+def interlock_problems(loaded: LoadedExperiment) -> list[ConfigProblem]:
+    """Return the interlocks whose requirements are not met."""
+    limits = loaded.config.limits
+    return [
+        loaded.problem(f"limits.{key}", rule)
+        for key, field in InterlockSettings.model_fields.items()
+        if getattr(limits, key) is not None
+        for needs in field.metadata
+        if isinstance(needs, InterlockRequirement)
+        for rule in _unmet(needs, loaded)
+    ]
+
+
+def _unmet(needs: InterlockRequirement, loaded: LoadedExperiment) -> Iterator[str]:
+    limits, info = loaded.config.limits, loaded.device.info
+    if needs.unit is not None and needs.unit != limits.unit:
+        yield f"is for a device driven in {needs.unit}, but the limits are in {limits.unit}"
+    if needs.key is not None and getattr(limits, needs.key) is None:
+        unit = f"_{limits.unit.lower()}" if needs.key == "measured_deviation" else ""
+        yield f"needs limits.{needs.key}{unit}"
+    if needs.reference_um and loaded.config.compensator is None:
+        yield "needs a compensator: without one there is no reference in um to track"
+    if needs.measured and not info.measures_command:
+        yield f"needs a device that measures its command: {info.name} does not"

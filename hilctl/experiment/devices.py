@@ -1,0 +1,211 @@
+"""Devices by name: make the one an experiment names, list and describe the available ones.
+
+The module of a device is imported only when the device is chosen. A package adds a device with::
+
+    [project.entry-points."hilctl.devices"]
+    my_amplifier = "my_package.amplifier:MyAmplifier"
+
+The guardian imports this module, so it must not import numba.
+"""
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from importlib import import_module
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any, cast
+
+from hilctl.base.device import Device, complete
+from hilctl.base.errors import ConfigError, ConfigProblem, InputError
+from hilctl.base.files import TextFiles
+from hilctl.base.yaml import Document, did_you_mean, load_document
+
+BUILTIN: dict[str, str] = {
+    "simulated_terfenol": "hilctl_drivers.simulated.devices:SimulatedTerfenol",
+    "simulated_piezo": "hilctl_drivers.simulated.devices:SimulatedPiezo",
+    "modbus_dac": "hilctl_drivers.modbus.modbus_dac:ModbusDac",
+    "modbus_stream": "hilctl_drivers.labjack.modbus_stream:ModbusStream",
+    "serial_dac": "hilctl_drivers.serial.serial_dac:SerialDac",
+}
+GROUP = "hilctl.devices"
+SHIPPED_PROFILES = "hilctl_drivers.profile:shipped_profiles"
+
+
+def known_devices() -> dict[str, str]:
+    """Return the name of every known device and its class as ``module:Class``."""
+    others = {point.name: point.value for point in entry_points(group=GROUP)}
+    return {**others, **BUILTIN}
+
+
+def device_class(kind: str) -> type[Device]:
+    """Return the class of a device.
+
+    Raises:
+        InputError: The device is unknown, its module cannot be imported, or its class has no
+            options.
+    """
+    known = known_devices()
+    if kind not in known:
+        raise InputError(f"unknown device '{kind}' ({did_you_mean(kind, list(known))})")
+    module_name, _, class_name = known[kind].partition(":")
+    try:
+        found: type[Device] = getattr(import_module(module_name), class_name)
+        _ = found.Options
+    except (ImportError, AttributeError) as error:
+        raise InputError(f"cannot load device '{kind}': {error}") from error
+    return found
+
+
+def made_device(document: Document, folder: Path, files: TextFiles) -> Device | None:
+    """Return the device of an experiment, not opened; None without a device section.
+
+    Args:
+        document: The experiment.
+        folder: Base of relative file names.
+        files: Source of those files.
+
+    Raises:
+        ConfigError: Rules are broken; the error lists every one of them.
+    """
+    given = document.data.get("device")
+    if not isinstance(given, dict):
+        return None
+    kind = given.get("kind")
+    where = document.where(("device", "kind"))
+    if not isinstance(kind, str):
+        rule, value = ("must be text", repr(kind)) if "kind" in given else ("is required", "")
+        hint = f"known: {', '.join(sorted(known_devices()))}"
+        raise ConfigError([ConfigProblem(where, "device.kind", rule, value, hint)])
+    try:
+        chosen = device_class(kind)
+    except InputError as error:
+        raise ConfigError([ConfigProblem(where, "device.kind", str(error))]) from None
+    context = {"folder": folder, "files": files}
+    options = document.validate(chosen.Options, at=("device",), without=("kind",), context=context)
+    try:
+        return complete(chosen(options))
+    except ConfigError:
+        raise
+    except InputError as error:
+        place = document.where(("device",))
+        raise ConfigError([ConfigProblem(place, "device", str(error))]) from None
+
+
+def shipped_profiles() -> dict[str, str]:
+    """Return the name and the file of every shipped profile.
+
+    Raises:
+        InputError: The drivers are not installed.
+    """
+    module_name, _, name = SHIPPED_PROFILES.partition(":")
+    try:
+        shipped = cast("Callable[[], dict[str, Path]]", getattr(import_module(module_name), name))
+    except (ImportError, AttributeError) as error:
+        raise InputError(f"cannot list the shipped profiles: {error}") from error
+    return {profile: str(path) for profile, path in sorted(shipped().items())}
+
+
+@dataclass(frozen=True, slots=True)
+class SerialPort:
+    """A serial port of this machine.
+
+    Attributes:
+        path: Device file; ``/dev/serial/by-id/...`` if it exists, which survives replugging.
+        description: Description by the operating system.
+    """
+
+    path: str
+    description: str
+
+
+@dataclass(frozen=True, slots=True)
+class Inventory:
+    """Possible values in the device section of an experiment.
+
+    Attributes:
+        devices: Kind to class.
+        profiles: Shipped profile to its file.
+        serial_ports: Ports of this machine.
+    """
+
+    devices: dict[str, str]
+    profiles: dict[str, str]
+    serial_ports: tuple[SerialPort, ...]
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return the fields as plain values."""
+        return asdict(self)
+
+
+def inventory() -> Inventory:
+    """List devices, profiles and serial ports without opening any."""
+    from serial.tools.list_ports import comports
+
+    by_id = {str(link.resolve()): str(link) for link in sorted(Path("/dev/serial/by-id").glob("*"))}
+    ports = (
+        SerialPort(by_id.get(port.device, port.device), port.description)
+        for port in sorted(comports())
+    )
+    return Inventory(known_devices(), shipped_profiles(), tuple(ports))
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceOption:
+    """A key of a device's section.
+
+    Attributes:
+        name: The key.
+        default: Default value as text; None if the key is required.
+        description: Its description.
+    """
+
+    name: str
+    default: str | None
+    description: str
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceDescription:
+    """A device or a profile, described without opening it.
+
+    Attributes:
+        name: The name.
+        place: Class of the device, or file of the profile.
+        options: Keys of the device's section; empty for a profile.
+        profile: Content of the profile; empty for a device.
+    """
+
+    name: str
+    place: str
+    options: tuple[DeviceOption, ...]
+    profile: dict[str, Any]
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return the fields as plain values."""
+        return asdict(self)
+
+
+def describe(name: str) -> DeviceDescription:
+    """Describe a device or a shipped profile without opening it.
+
+    Raises:
+        InputError: The name is unknown, or the device cannot be loaded.
+    """
+    kinds, profiles = known_devices(), shipped_profiles()
+    if name in profiles:
+        path = Path(profiles[name])
+        return DeviceDescription(name, str(path), (), load_document(path).data)
+    if name not in kinds:
+        hint = did_you_mean(name, [*kinds, *profiles])
+        raise InputError(f"there is no device or profile '{name}' ({hint})")
+    schema = device_class(name).Options.model_json_schema()
+    needed = schema.get("required", [])
+    options = tuple(
+        DeviceOption(
+            key,
+            None if key in needed else "" if (value := each.get("default")) is None else str(value),
+            str(each.get("description", "")),
+        )
+        for key, each in schema.get("properties", {}).items()
+    )
+    return DeviceDescription(name, kinds[name], options, {})

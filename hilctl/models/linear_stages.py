@@ -1,0 +1,296 @@
+"""Linear stages of a staged model (delay, smoothing, structure, creep), and chains of operators."""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Annotated, Self
+
+import numpy as np
+
+from hilctl.base.errors import ModelError
+from hilctl.base.strict import Field, StrictModel, model_validator
+from hilctl.base.types import C128, F64
+from hilctl.kernels.dynamics import (
+    between_block,
+    creep_block,
+    delay_block,
+    exponential,
+    mode_block,
+    structure_block,
+    uncreep_block,
+    unmode_block,
+)
+from hilctl.models.base import Operator, refuse, threshold_problems
+
+_WIDEST = 64
+
+
+class Chain(Operator):
+    """Operators in series as one operator with one memory.
+
+    Args:
+        stages: The operators in order; their memories become parts of the chain's.
+        preview: Samples by which the chain's input must run ahead of its output.
+        input_offset: Added to the input first.
+        output_offset: Added to the output last.
+    """
+
+    def __init__(
+        self,
+        stages: Sequence[Operator],
+        *,
+        preview: int = 0,
+        input_offset: float = 0.0,
+        output_offset: float = 0.0,
+    ) -> None:
+        rest = np.concatenate([stage.state() for stage in stages])
+        super().__init__(
+            self._run, rest.size - 1, input_offset=input_offset, output_offset=output_offset
+        )
+        self.preview = preview
+        self._rest = rest
+        self._stages = tuple(stages)
+        self.keep_in(self._memory)
+
+    def keep_in(self, memory: F64) -> None:
+        """Move the memory, including that of each stage, into a given array."""
+        super().keep_in(memory)
+        start = 0
+        for stage in self._stages:
+            stop = start + stage.state().size
+            stage.keep_in(memory[start:stop])
+            start = stop
+
+    def stand(self, seconds: float) -> None:
+        """Let time pass at constant input."""
+        for stage in self._stages:
+            stage.stand(seconds)
+
+    def _run(self, block: F64, memory: F64, out: F64) -> None:
+        for stage in self._stages:
+            block = stage.process(block, out)
+
+
+def delayed(samples: int) -> Operator:
+    """Return an operator that delays a signal by a number of samples, >= 1."""
+    return Operator(delay_block, samples)
+
+
+def between(part: float) -> Operator:
+    """Return an operator that interpolates: ``part`` of the way from the previous sample."""
+    return Operator.bound(between_block, (part,), 0)
+
+
+def smoothing_weights(
+    width: float, slope_gain: float = 0.0, bend_gain: float = 0.0
+) -> tuple[F64, int]:
+    """Return weights for y + slope_gain y' + bend_gain y'' of a smoothed y, per sample.
+
+    A cubic B-spline (four boxes in series) smooths, and minus half its variance times y'' flattens
+    its response to 1 - (w s)^4 / 8 at an angular frequency w, for a standard deviation s. So slow
+    signals pass unchanged, and corners are rounded within about 2 s.
+
+    Args:
+        width: Standard deviation s in samples; 0 for plain central differences.
+        slope_gain: In samples.
+        bend_gain: In samples squared.
+
+    Returns:
+        float64[2m + 1], weights from the oldest to the newest sample, with the sum 1; and m, the
+        preview in samples. Boxes are at most 64 samples long.
+    """
+    box = min(_WIDEST, round(math.sqrt(1.0 + 3.0 * width**2)))
+    ones = np.full(box, 1.0 / box)
+    pair = np.convolve(ones, ones)
+    spline = np.convolve(pair, pair)
+    variance = (box**2 - 1) / 3.0
+    weights = np.pad(spline, 1)
+    weights += slope_gain * np.convolve(spline, (-0.5, 0.0, 0.5))
+    weights += (bend_gain - 0.5 * variance) * np.convolve(spline, (1.0, -2.0, 1.0))
+    return weights, 2 * box - 1
+
+
+TimeConstant = Annotated[float, Field(ge=1e-3, le=1e6)]
+Share = Annotated[float, Field(gt=0.0, le=1.0)]
+
+
+class CreepModel(StrictModel):
+    """y = x + c_1 + c_2 + ..., T_i c_i' = s_i x - c_i: creep as springs and dampers in series.
+
+    As K. Kuhnen and H. Janocha, "Inverse feedforward controller for complex hysteretic
+    nonlinearities in smart-material systems", Control and Intelligent Systems 29 (2001) 74. x and y
+    are displacements from rest, where creep is 0.
+
+    Attributes:
+        time_constants_s: T of each element, rising, in s.
+        shares: s of each: final creep relative to a constant displacement.
+    """
+
+    time_constants_s: tuple[TimeConstant, ...] = Field(min_length=1, max_length=16)
+    shares: tuple[Share, ...]
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        problems = [*threshold_problems("T", self.time_constants_s)]
+        if len(self.shares) != len(self.time_constants_s):
+            problems.append(
+                "shares must have one value per time constant: "
+                f"{len(self.shares)} for {len(self.time_constants_s)}"
+            )
+        refuse(problems)
+        return self
+
+    def forward(self, sample_rate_hz: float, rest_um: float = 0.0) -> Operator:
+        """Return the operator that adds creep to displacements, which are ``rest_um`` at rest."""
+        return _CreepOperator(self, creep_block, sample_rate_hz, rest_um)
+
+    def inverse(self, sample_rate_hz: float, rest_um: float = 0.0) -> Operator:
+        """Return the exact inverse of :meth:`forward`."""
+        return _CreepOperator(self, uncreep_block, sample_rate_hz, rest_um)
+
+    def over(self, seconds: float) -> tuple[F64, F64]:
+        """Return the decay of each element over a time, and its gain from x: float64[m] each."""
+        left = np.exp(-seconds / np.array(self.time_constants_s))
+        return left, (1.0 - left) * np.array(self.shares)
+
+
+class _CreepOperator(Operator):
+    """Creep or its inverse, which continues at constant input.
+
+    Args:
+        creep: Its elements.
+        kernel: Its kernel.
+        sample_rate_hz: Samples a second.
+        rest_um: Displacement at rest.
+    """
+
+    def __init__(
+        self, creep: CreepModel, kernel: Callable[..., None], sample_rate_hz: float, rest_um: float
+    ) -> None:
+        parameters = np.concatenate(creep.over(1.0 / sample_rate_hz))
+
+        def run(block: F64, memory: F64, out: F64) -> None:
+            kernel(block, parameters, memory, out)
+
+        super().__init__(run, len(creep.shares), input_offset=-rest_um, output_offset=rest_um)
+        self._creep = creep
+
+    def stand(self, seconds: float) -> None:
+        """Let time pass at constant input."""
+        elements, x = self._memory[:-1], self._memory[-1]
+        left, gained = self._creep.over(seconds)
+        elements[:] = left * elements + gained * (x if np.isfinite(x) else 0.0)
+
+
+_SLOWEST = 1e12  # samples per radian of the structure; slower ones do not move
+
+
+class FirstMode(StrictModel):
+    """y'' / w^2 + 2 zeta y' / w + y = x: the mass of the actuator and its load on its stiffness.
+
+    Attributes:
+        natural_hz: w / (2 pi), in Hz.
+        damping_ratio: zeta.
+    """
+
+    natural_hz: float = Field(gt=0.0, le=1e9)
+    damping_ratio: float = Field(gt=0.0, le=10.0)
+
+    def forward(self, sample_rate_hz: float) -> Operator:
+        """Return the structure, exact for an x that changes linearly between samples."""
+        return Operator.bound(structure_block, (self.motion(sample_rate_hz),), 2)
+
+    @property
+    def radian_s(self) -> float:
+        """1 / w, in s."""
+        return 0.5 / (math.pi * self.natural_hz)
+
+    def motion(self, sample_rate_hz: float) -> F64:
+        """Return float64[2, 4], see :func:`~hilctl.kernels.dynamics.structure_block`.
+
+        Velocity is in um per radian of the natural frequency, so that the matrix is well scaled.
+
+        Raises:
+            ModelError: The natural frequency is too low for the sample rate.
+        """
+        rates = np.zeros((4, 4))  # position, velocity, x, its change over the step
+        rates[0, 1] = 1.0
+        rates[1, :3] = (-1.0, -2.0 * self.damping_ratio, 1.0)
+        step_s = 1.0 / sample_rate_hz
+        rates[2, 3] = 1.0 / (2.0 * math.pi * self.natural_hz * step_s)
+        if not rates[2, 3] < _SLOWEST:
+            raise ModelError(f"natural_hz is too low for a step of {step_s:g} s: {self.natural_hz}")
+        motion: F64 = np.ascontiguousarray(exponential(rates / rates[2, 3])[:2])
+        motion[:, 2] -= motion[:, 3]
+        return motion
+
+
+class FurtherMode(StrictModel):
+    """A further mode of the structure, with its antiresonance.
+
+    Modes side by side share the static displacement: y = ((1 - c) G_1 + c G_2) x, where
+    G = 1 / (1 + 2 zeta s / w + s^2 / w^2). That is the first of them followed by
+    (1 + 2 Z s / W + s^2 / W^2) G_2: the further mode's own resonance, and the antiresonance (W, Z)
+    where the two cancel; see A. Preumont, "Vibration Control of Active Structures" (Springer,
+    2011). The inverse exchanges the two, and is stable because both are damped.
+
+    Attributes:
+        natural_hz: w / (2 pi), in Hz.
+        damping_ratio: z.
+        antiresonance_hz: W / (2 pi), in Hz.
+        antiresonance_damping_ratio: Z.
+    """
+
+    natural_hz: float = Field(gt=0.0, le=1e6)
+    damping_ratio: float = Field(gt=0.0, le=1.0)
+    antiresonance_hz: float = Field(gt=0.0, le=1e6)
+    antiresonance_damping_ratio: float = Field(gt=0.0, le=1.0)
+
+    def forward(self, sample_rate_hz: float) -> Operator:
+        """Return the pair, exact for an x that changes linearly between samples.
+
+        Raises:
+            ModelError: A frequency is too low for the sample rate.
+        """
+        return Operator.bound(mode_block, (self._parameters(sample_rate_hz),), 2)
+
+    def inverse(self, sample_rate_hz: float) -> Operator:
+        """Return the exact inverse of :meth:`forward`.
+
+        Raises:
+            ModelError: The sample rate is too low: the inverse would be unstable.
+        """
+        parameters = self._parameters(sample_rate_hz)
+        if not _decay(parameters) < 1.0:
+            raise ModelError(
+                f"a mode at {self.natural_hz:g} Hz with its antiresonance at "
+                f"{self.antiresonance_hz:g} Hz has no inverse at {sample_rate_hz:g} samples per "
+                "second: use a higher rate, or remove the mode"
+            )
+        return Operator.bound(unmode_block, (parameters,), 2)
+
+    def response(self, frequency_hz: F64) -> C128:
+        """Return the frequency response: complex128[n]."""
+        up, down = 1j * frequency_hz / self.antiresonance_hz, 1j * frequency_hz / self.natural_hz
+        zeros = 1.0 + 2.0 * self.antiresonance_damping_ratio * up + up**2
+        return np.asarray(zeros / (1.0 + 2.0 * self.damping_ratio * down + down**2))
+
+    def _parameters(self, sample_rate_hz: float) -> F64:
+        """Return float64[12], see :func:`~hilctl.kernels.dynamics.mode_block`."""
+        own = FirstMode(natural_hz=self.natural_hz, damping_ratio=self.damping_ratio)
+        motion = own.motion(sample_rate_hz)
+        ratio = self.natural_hz / self.antiresonance_hz
+        damping = self.antiresonance_damping_ratio * ratio - self.damping_ratio * ratio**2
+        position, velocity, direct = 1.0 - ratio**2, 2.0 * damping, ratio**2
+        at_once = position * motion[0, 3] + velocity * motion[1, 3] + direct
+        return np.array([*motion.ravel(), position, velocity, direct, at_once])
+
+
+def _decay(parameters: F64) -> float:
+    """Return the largest decay factor per sample of the inverse of a pair."""
+    motion = parameters[:8].reshape(2, 4)
+    known = parameters[8] * motion[0, :3] + parameters[9] * motion[1, :3]
+    taken = -known / parameters[11]
+    step = np.stack(
+        (motion[0, :3] + motion[0, 3] * taken, motion[1, :3] + motion[1, 3] * taken, taken)
+    )
+    return float(np.abs(np.linalg.eigvals(step)).max())
