@@ -202,7 +202,7 @@ def _minutes(report: "RunReport") -> Table:
 def render_series(series: "RunSeries") -> Group:
     """Return the summary of several runs and a table of them."""
     from hilctl.studies.multi_run.multi_run_page import MOST_ROWS, run_table  # imports matplotlib
-    from hilctl.studies.multi_run.summary_text import headline
+    from hilctl.studies.multi_run.trend import headline
 
     headings, rows = run_table(series, MOST_ROWS, short=True)
     table = Table(title=Text(printable(series.name)), title_justify="left")

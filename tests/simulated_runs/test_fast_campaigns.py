@@ -1,11 +1,10 @@
 """Campaigns without real time over several processes: the same as in one."""
 
-from tests.unit.campaign.conftest import CAMPAIGN, EXPERIMENT
-
 from hilctl.recording.reader import read
 from hilctl.studies.campaign.campaign_runner import CampaignHost
 from hilctl.studies.campaign.parallel_simulation import planned_fast, run_fast
 from hilctl.studies.campaign.steps import load_campaign
+from tests.unit.studies.campaign.conftest import CAMPAIGN, EXPERIMENT
 
 BUDGET = "set: {limits.rms_current_a: 1.3, limits.thermal_time_constant_s: 2.0}\n"
 

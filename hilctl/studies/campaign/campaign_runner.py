@@ -26,10 +26,8 @@ from hilctl.studies.campaign.store import (
     standing_runs,
 )
 from hilctl.studies.campaign.table import CampaignRow, entry_of, write_table
-from hilctl.studies.multi_run.collect import series_of
-from hilctl.studies.multi_run.columns import COMPLETED
-from hilctl.studies.multi_run.digest import digest_of
-from hilctl.studies.multi_run.run_figures import SeriesDrift, drift_of
+from hilctl.studies.multi_run.collect import COMPLETED, series_of
+from hilctl.studies.multi_run.digest import SeriesDrift, digest_of, drift_of
 
 HARMLESS = frozenset({"late", "dropped", "invalid_command"})
 """Codes of events that end a run, and say nothing of device or rig: the next step may do better."""

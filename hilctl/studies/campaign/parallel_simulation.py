@@ -28,9 +28,8 @@ from hilctl.studies.campaign.plan import CampaignPlan, PlannedStep, planned
 from hilctl.studies.campaign.steps import CampaignSteps
 from hilctl.studies.campaign.store import new_recording, standing_runs
 from hilctl.studies.campaign.table import CampaignRow
-from hilctl.studies.multi_run.columns import COMPLETED
-from hilctl.studies.multi_run.digest import RunDigest, digest_of
-from hilctl.studies.multi_run.run_figures import RunFigures
+from hilctl.studies.multi_run.collect import COMPLETED
+from hilctl.studies.multi_run.digest import RunDigest, RunFigures, digest_of
 
 
 @dataclass(frozen=True, slots=True)

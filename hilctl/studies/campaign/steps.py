@@ -13,8 +13,7 @@ from hilctl.base.files import TextFiles
 from hilctl.base.yaml import Document, Loc, dotted, load_document
 from hilctl.experiment.device import device_class, known_devices
 from hilctl.experiment.load import LoadedExperiment, named_from, resolve
-from hilctl.studies.campaign.file import CampaignFile
-from hilctl.studies.campaign.parameter_grid import MOST_STEPS, Point, groups_of, points
+from hilctl.studies.campaign.file import MOST_STEPS, CampaignFile, Point, groups_of, points
 
 _SEEDS = 1_000_000
 

@@ -13,7 +13,7 @@ from hilctl.analysis.export import write_parquet
 from hilctl.base.files import write_file, write_text
 from hilctl.studies.campaign.plan import CampaignPlan
 from hilctl.studies.campaign.steps import CampaignStep, cell
-from hilctl.studies.multi_run.columns import (
+from hilctl.studies.multi_run.collect import (
     PLANNED,
     RECORDING,
     REFERENCE,
@@ -22,8 +22,7 @@ from hilctl.studies.multi_run.columns import (
     STEP,
     SeriesEntry,
 )
-from hilctl.studies.multi_run.digest import RunDigest
-from hilctl.studies.multi_run.run_figures import FIGURES, RunFigures
+from hilctl.studies.multi_run.digest import FIGURES, RunDigest, RunFigures
 
 
 @dataclass(frozen=True, slots=True)

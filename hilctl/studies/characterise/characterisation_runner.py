@@ -27,9 +27,14 @@ from hilctl.recording.recording import Recording
 from hilctl.run.result import RunResult
 from hilctl.run.start import OnPart, RunKey, StepStoppedError, checked_experiment, paced, unpaced
 from hilctl.studies.characterise.limits import CharacterisationLimits, limits_of
-from hilctl.studies.characterise.modelling import identified, judged
-from hilctl.studies.characterise.results import Characterisation, Measured, StepRow
-from hilctl.studies.characterise.rig_problem import RigProblemError
+from hilctl.studies.characterise.response import RigProblemError
+from hilctl.studies.characterise.results import (
+    Characterisation,
+    Measured,
+    StepRow,
+    identified,
+    judged,
+)
 from hilctl.studies.characterise.steps import STEPS, CharacterisationStep
 from hilctl.studies.characterise.waveforms import Keys, at_rest, within
 

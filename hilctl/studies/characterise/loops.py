@@ -12,7 +12,7 @@ from hilctl.base.segments import Segment
 from hilctl.base.types import F64
 from hilctl.recording.recording import Recording
 from hilctl.signals import cycle_metrics
-from hilctl.studies.characterise.rig_problem import RigProblemError
+from hilctl.studies.characterise.response import RigProblemError
 
 _FEWEST_STEPS = 500  # of the sensor in a motion, so that equal readings mean something
 _AT_END = 0.06  # of a sine's cycle at one and the same extreme reading

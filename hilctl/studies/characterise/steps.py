@@ -16,10 +16,14 @@ from hilctl.studies.characterise.loops import (
     repeatability,
     reversal_curves,
 )
-from hilctl.studies.characterise.noise import crept_percent, rest_noise, sine_reaction
-from hilctl.studies.characterise.response import small_signal
+from hilctl.studies.characterise.response import (
+    RigProblemError,
+    crept_percent,
+    rest_noise,
+    sine_reaction,
+    small_signal,
+)
 from hilctl.studies.characterise.results import Measured
-from hilctl.studies.characterise.rig_problem import RigProblemError
 from hilctl.studies.characterise.waveforms import Keys
 
 POLARITY_PARTS = (0.01, 0.03, 0.1)

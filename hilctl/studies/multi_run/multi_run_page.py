@@ -11,7 +11,6 @@ from hilctl.analysis.html import definitions_of
 from hilctl.base.formatting import quantity, unit_text
 from hilctl.studies.multi_run.collect import RunSeries, SeriesRun
 from hilctl.studies.multi_run.plots import sheets_of
-from hilctl.studies.multi_run.summary_text import headline
 from hilctl.studies.multi_run.trend import (
     AREA,
     ASYMMETRY,
@@ -24,6 +23,7 @@ from hilctl.studies.multi_run.trend import (
     STROKE,
     RunFigure,
     Trend,
+    headline,
     trends,
 )
 

@@ -1,8 +1,10 @@
-"""Select the figures of many runs; draw the step and frequency responses."""
+"""Figures of many runs: trends, sensitivity and order; selection and files."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
+from textwrap import wrap
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -10,15 +12,260 @@ from matplotlib.figure import Figure
 
 from hilctl.analysis.figure_export import write_figure
 from hilctl.analysis.figure_layout import ColumnWidth, FigureSpec, Panel, drawn
-from hilctl.analysis.plot_style import QUIET
+from hilctl.analysis.plot_style import COMMAND, DISPLACEMENT, ERROR, MARK, QUIET
 from hilctl.base.errors import InputError
 from hilctl.base.files import already_there
-from hilctl.base.formatting import quantity, significant
-from hilctl.base.types import C128, F64
-from hilctl.studies.multi_run import plots_loops, plots_trend
+from hilctl.base.formatting import unit_text
 from hilctl.studies.multi_run.collect import OnRead, RunSeries, SeriesRun
-from hilctl.studies.multi_run.series_style import line_of, looks, spread
+from hilctl.studies.multi_run.run_plots import (
+    before_after_sheet,
+    error_sheet,
+    frequency_sheet,
+    looks,
+    loop_sheets,
+    minor_loop_sheet,
+    model_sheet,
+    spread,
+    step_sheet,
+)
+from hilctl.studies.multi_run.trend import (
+    AREA,
+    ASYMMETRY,
+    DAMPING,
+    HYSTERESIS,
+    MINOR_HIGH,
+    MINOR_LOW,
+    MODEL_ERROR,
+    NATURAL,
+    PEAK_ERROR,
+    RMS_ERROR,
+    STROKE,
+    RunFigure,
+    Trend,
+    trends,
+)
 from hilctl.studies.multi_run.varied_parameter import VariedParameter
+
+_WIDE_RATIO = 30.0  # of a dimension's ends: then, with many values, its axis is logarithmic
+_MANY = 10
+_HEADROOM = 1.08
+_LONGEST_NAME = 24
+_MOST_LINES = 9
+_FITTED = (AREA, HYSTERESIS, MINOR_LOW, MINOR_HIGH)
+_FIT = {"color": QUIET, "linewidth": 0.7, "linestyle": "--"}
+_MOST_BARS = 12
+
+
+def trend_sheets(series: RunSeries) -> Iterator[FigureSpec]:
+    """Yield figures against each dimension of numbers; those of loops with a fit along frequency.
+
+    Stroke and area are drawn of runs without a compensator: with one, they are the reference's.
+    """
+    plain = [run for run in series.done if run.digest is None or run.digest.is_plain_loop]
+    for along in series.dimensions:
+        if not along.numeric:
+            continue
+        name = along.name.replace(" ", "_")
+        shown = [STROKE, AREA, HYSTERESIS, *([ASYMMETRY] if along.name == "amplitude" else [])]
+        panels = _trend_panels(series, along, shown, plain, fitted=along.is_frequency)
+        if panels:
+            fits = "; dashed: linear fits" if along.is_frequency else ""
+            caption = f"Stroke, area and peak hysteresis of the loops against {along.name}{fits}."
+            yield FigureSpec(f"hysteresis_against_{name}", caption, panels)
+        minor = _trend_panels(
+            series, along, [MINOR_LOW, MINOR_HIGH], plain, fitted=along.is_frequency
+        )
+        if minor:
+            caption = f"Peak hysteresis of minor loops against {along.name}."
+            yield FigureSpec(f"minor_loops_against_{name}", caption, minor)
+        left = _trend_panels(series, along, _compared(series), None)
+        if left and any(run.digest and run.digest.compensated for run in series.done):
+            caption = f"What compensators leave, and errors of models, against {along.name}."
+            yield FigureSpec(f"compensation_against_{name}", caption, left)
+
+
+def _compared(series: RunSeries) -> list[RunFigure]:
+    modelled = [MODEL_ERROR] if MODEL_ERROR.of(series.done) else []
+    return [HYSTERESIS, PEAK_ERROR, RMS_ERROR, *modelled]
+
+
+def _trend_panels(
+    series: RunSeries,
+    along: VariedParameter,
+    figures: Sequence[RunFigure],
+    runs: Sequence[SeriesRun] | None,
+    *,
+    fitted: bool = False,
+) -> tuple[Panel, ...]:
+    drawn = [(figure, trends(series, figure, along, runs)) for figure in figures]
+    return tuple(
+        Panel(partial(draw_trends, series=series, found=found, fitted=fitted))
+        for figure, found in drawn
+        if found
+    )
+
+
+def draw_trends(axes: Axes, series: RunSeries, found: Sequence[Trend], *, fitted: bool) -> None:
+    """Draw trends of one figure, a line for all values of the other dimensions.
+
+    Args:
+        axes: Where.
+        series: The runs.
+        found: The trends.
+        fitted: Whether lines are fitted to what grows with frequency.
+    """
+    along, figure = found[0].along, found[0].figure
+    found = spread(found, _MOST_LINES)
+    others = [each for each in series.dimensions if each is not along]
+    apart = (e for e in others if len({t.held.get(e.key) for t in found}) == len(found))
+    first = next(apart, None)  # that alone tells all lines apart
+    names = [_held(others, trend) or figure.text for trend in found]
+    look = _looks(first, found)
+    logarithmic = _is_logarithmic(along)
+    fitted = fitted and not logarithmic and figure in _FITTED
+    for trend, name, style in zip(found, names, look, strict=True):
+        with_fit = fitted and trend.slope is not None
+        line = {"linestyle": "none"} if with_fit else {"linewidth": 0.8}
+        axes.plot(trend.x, trend.y, **style, **line, label=name)
+        if with_fit and trend.slope is not None and trend.offset is not None:
+            ends = trend.x[[0, -1]]
+            axes.plot(ends, trend.slope * ends + trend.offset, **{**_FIT, "color": style["color"]})
+    r2 = [trend.r2 for trend in found if trend.r2 is not None]
+    if fitted and r2:
+        texts = dict.fromkeys(f"{value:.4f}" for value in (min(r2), max(r2)))
+        span = " to ".join(texts)
+        axes.annotate(f"r² = {span}", (0.03, 0.97), xycoords="axes fraction", va="top",
+                      fontsize=7, color=QUIET)  # fmt: skip
+    if logarithmic:
+        axes.set_xscale("log")
+        axes.xaxis.set_major_formatter("{x:g}")
+    unit = _unit(series, figure)
+    name = f"{figure.text}, {unit}" if unit else figure.text
+    axes.set(xlabel=along.axis, ylabel="\n".join(wrap(name, _LONGEST_NAME)))
+    everything = np.concatenate([trend.y for trend in found])
+    low, high = float(everything.min()), float(everything.max())
+    if low >= 0.0 and high > 0.0:
+        axes.set_ylim(0.0, _HEADROOM * high)
+
+
+def _is_logarithmic(along: VariedParameter) -> bool:
+    numbers = [float(str(value)) for value in along.values]
+    many = len(numbers) > _MANY
+    return many and numbers[0] > 0.0 and numbers[-1] / numbers[0] > _WIDE_RATIO
+
+
+def _looks(first: VariedParameter | None, found: Sequence[Trend]) -> list[dict[str, Any]]:
+    if first is None:
+        of = looks(None, list(range(len(found))))
+        return [dict(of[k]) for k in range(len(found))]
+    of = looks(first, first.values)  # of all, so that a value looks the same in every panel
+    return [dict(of[trend.held[first.key]]) for trend in found]
+
+
+def _held(others: Sequence[VariedParameter], trend: Trend) -> str:
+    texts = [e.text(trend.held[e.key]) for e in others if trend.held.get(e.key) is not None]
+    return ", ".join(texts)
+
+
+def _unit(series: RunSeries, figure: RunFigure) -> str:
+    if figure is not AREA:
+        return unit_text(figure.unit)
+    units = {run.digest.command_unit for run in series.done if run.digest is not None}
+    return f"µm·{units.pop()}" if len(units) == 1 else "µm·A"
+
+
+def resonance_sheet(series: RunSeries) -> FigureSpec | None:
+    """Return natural frequency and damping against what varied; None where no run has them."""
+    for along in series.dimensions:
+        found = trends(series, NATURAL, along) if along.numeric else []
+        if found:
+            panels = _trend_panels(series, along, [NATURAL, DAMPING], None)
+            caption = f"Natural frequency and damping against {along.name}."
+            return FigureSpec("resonance", caption, panels)
+    return None
+
+
+def sensitivity_sheet(series: RunSeries) -> FigureSpec | None:
+    """Return how far figures change over the range of each dimension; None with fewer than two.
+
+    The change is that of the mean over all other dimensions, of the mean of all: what it is most
+    sensitive to stands above.
+    """
+    numbers = [each for each in series.dimensions if len(each.values) > 1]
+    plain = [run for run in series.done if run.digest is None or run.digest.is_plain_loop]
+    figures = (STROKE, HYSTERESIS, AREA) if len(plain) > 1 else (HYSTERESIS, PEAK_ERROR, RMS_ERROR)
+    runs = plain if len(plain) > 1 else list(series.done)
+    found = [(figure, _changes(figure, numbers, runs)) for figure in figures]
+    panels = tuple(
+        Panel(partial(_draw_bars, bars=bars), figure.text, 0.12 + 0.09 * len(bars))
+        for figure, bars in found
+        if len(bars) > 1
+    )
+    if not panels:
+        return None
+    caption = (
+        "Sensitivity: change of each figure over the range of what varied, all else averaged, "
+        "in percent of its mean."
+    )
+    return FigureSpec("sensitivity", caption, panels, most_beside=1)
+
+
+def _changes(
+    figure: RunFigure, dimensions: Sequence[VariedParameter], runs: Sequence[SeriesRun]
+) -> list[tuple[str, float]]:
+    values = figure.of(runs)
+    whole = float(np.mean([value for _, value in values])) if values else 0.0
+    found = []
+    for each in dimensions:
+        by: dict[Hashable, list[float]] = {}
+        for run, value in values:
+            by.setdefault(run.values.get(each.key), []).append(value)
+        if len(by) > 1 and whole > 0.0:
+            means = [float(np.mean(members)) for members in by.values()]
+            low, high = each.text(each.values[0]), each.text(each.values[-1])
+            found.append((f"{each.name}\n{low} to {high}", 100.0 * float(np.ptp(means)) / whole))
+    return sorted(found, key=lambda bar: bar[1])[-_MOST_BARS:]
+
+
+def _draw_bars(axes: Axes, bars: Sequence[tuple[str, float]]) -> None:
+    axes.barh(
+        [name for name, _ in bars], [size for _, size in bars], color=DISPLACEMENT, height=0.6
+    )
+    for number, (_, size) in enumerate(bars):
+        axes.annotate(f"{size:.3g} %", (size, number), xytext=(3, 0), textcoords="offset points",
+                      va="center", fontsize=7)  # fmt: skip
+    axes.set(xlabel="change over the range, %")
+    axes.margins(x=0.18)
+    axes.grid(axis="y", visible=False)
+
+
+def order_sheet(series: RunSeries) -> FigureSpec | None:
+    """Return figures in the order of the runs, reference runs marked; None without those."""
+    known = [run for run in series.runs if run.completed]
+    panels = tuple(
+        Panel(partial(_draw_order, figure=figure, runs=known), figure.text, 0.45)
+        for figure in (STROKE, HYSTERESIS, PEAK_ERROR)
+        if len(figure.of(known)) > 2
+    )
+    if not panels or not any(run.is_reference for run in known):
+        return None
+    caption = "Figures in the order of the runs; what reference runs change by is drift."
+    return FigureSpec("in_order", caption, panels, stacked=True)
+
+
+def _draw_order(axes: Axes, figure: RunFigure, runs: Sequence[SeriesRun]) -> None:
+    for is_reference, colour, sign, label in (
+        (False, ERROR, ".", "runs"),
+        (True, COMMAND, "D", "reference runs"),
+    ):
+        found = figure.of([run for run in runs if run.is_reference == is_reference])
+        if found:
+            x, y = zip(*((run.number, value) for run, value in found), strict=True)
+            line = "-" if is_reference else "none"
+            axes.plot(x, y, sign, linestyle=line, color=colour, markersize=3.5, label=label)
+            if is_reference:
+                axes.axhline(y[0], color=MARK, linewidth=0.7, linestyle=":")
+    axes.set(xlabel="step", ylabel=f"{figure.text}, {unit_text(figure.unit)}")
 
 
 def sheets_of(series: RunSeries) -> list[FigureSpec]:
@@ -27,101 +274,17 @@ def sheets_of(series: RunSeries) -> list[FigureSpec]:
 
 
 def _sheets(series: RunSeries) -> Iterator[FigureSpec | None]:
-    yield plots_loops.before_after_sheet(series)
-    yield plots_trend.resonance_sheet(series)
+    yield before_after_sheet(series)
+    yield resonance_sheet(series)
     yield frequency_sheet(series)
     yield step_sheet(series)
-    yield from plots_trend.trend_sheets(series)
-    yield from plots_loops.loop_sheets(series)
-    yield plots_loops.minor_loop_sheet(series)
-    yield plots_loops.model_sheet(series)
-    yield plots_loops.error_sheet(series)
-    yield plots_trend.sensitivity_sheet(series)
-    yield plots_trend.order_sheet(series)
-
-
-_MOST_PANELS = 6
-
-
-def step_sheet(series: RunSeries) -> FigureSpec | None:
-    """Return displacements after a step, a panel a run; None where there is none."""
-    runs = [run for run in series.done if run.digest is not None and run.digest.step.size]
-    if not runs:
-        return None
-    shown = spread(runs, _MOST_PANELS)
-    panels = tuple(Panel(partial(_draw_step, run=run), _title(series, run)) for run in shown)
-    caption = "Displacement after a step of the command, with natural frequency and damping."
-    return FigureSpec("step_response", caption, panels)
-
-
-def _title(series: RunSeries, run: SeriesRun) -> str:
-    values = [
-        each.text(run.values[each.key])
-        for each in series.dimensions
-        if each.numeric and run.values.get(each.key) is not None
-    ]
-    return ", ".join(values) or series.text(run)
-
-
-def _draw_step(axes: Axes, run: SeriesRun) -> None:
-    if run.digest is None:
-        return
-    t, moved = run.digest.step
-    natural = run.figures.natural_hz
-    axes.plot(1e3 * t, moved, **line_of(looks(None, [0])[0]))
-    axes.set(xlabel="time after the step, ms", ylabel="displacement, µm")
-    if natural and run.figures.damping_ratio is not None:
-        text = f"{quantity(natural, 'Hz')}, damping ratio {significant(run.figures.damping_ratio)}"
-        axes.annotate(text, (0.97, 0.06), xycoords="axes fraction", ha="right", fontsize=7,
-                      color=QUIET)  # fmt: skip
-
-
-def frequency_sheet(series: RunSeries) -> FigureSpec | None:
-    """Return small-signal responses, measured and fitted; None where there is none."""
-    runs = [run for run in series.done if run.digest and run.digest.response is not None]
-    if not runs:
-        return None
-    shown = spread(runs)
-    along = next((each for each in series.dimensions if each.numeric), None)
-    text = partial(_title, series)
-    panels = tuple(
-        Panel(partial(_draw_response, runs=shown, along=along, text=text, part=part), part)
-        for part in ("magnitude", "phase")
-    )
-    caption = "Small-signal response: measured (dots) and fitted (lines)."
-    return FigureSpec("frequency_response", caption, panels)
-
-
-def _draw_response(
-    axes: Axes,
-    runs: Sequence[SeriesRun],
-    along: VariedParameter | None,
-    text: Callable[[SeriesRun], str],
-    part: str,
-) -> None:
-    values = [run.values.get(along.key) if along else text(run) for run in runs]
-    look = looks(along, list(dict.fromkeys(values)))
-    for run, value in zip(runs, values, strict=True):
-        found = run.digest.response if run.digest else None
-        if found is None or run.digest is None:
-            continue
-        measured, fitted = (_part(each, part) for each in (found.response, found.fitted))
-        colour = look[value]["color"]
-        axes.plot(found.frequency_hz, measured, ".", color=colour, markersize=2.0, alpha=0.7)
-        axes.plot(found.frequency_hz, fitted, color=colour, linewidth=0.9, label=text(run))
-        unit = run.digest.command_unit
-        axes.set_ylabel(f"magnitude, µm/{unit}" if part == "magnitude" else "phase, degrees")
-    axes.set(
-        xscale="log", xlabel="frequency, Hz", yscale="log" if part == "magnitude" else "linear"
-    )
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_formatter("{x:g}")
-
-
-def _part(response: C128, part: str) -> F64:
-    size: F64 = np.abs(response)
-    degrees: F64 = np.degrees(np.unwrap(np.angle(response)))
-    return size if part == "magnitude" else degrees
+    yield from trend_sheets(series)
+    yield from loop_sheets(series)
+    yield minor_loop_sheet(series)
+    yield model_sheet(series)
+    yield error_sheet(series)
+    yield sensitivity_sheet(series)
+    yield order_sheet(series)
 
 
 def write_sheets(

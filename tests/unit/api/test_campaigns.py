@@ -1,10 +1,10 @@
 """Many runs from Python: what is planned, run and returned."""
 
 import pytest
-from tests.unit.api.test_running import SHORT, SINE
 
 from hilctl import api
 from hilctl.base.errors import InputError
+from tests.unit.api.test_runs import SHORT, SINE
 
 
 def test_a_campaign_runs_every_step(tmp_path):

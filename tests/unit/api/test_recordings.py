@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from tests.unit.api.test_running import SHORT, SINE
 
 from hilctl import api
 from hilctl.base.errors import DataError, InputError
+from tests.unit.api.test_runs import SHORT, SINE
 
 
 @pytest.fixture(scope="module")

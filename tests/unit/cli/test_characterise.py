@@ -6,8 +6,6 @@ from pathlib import Path
 
 import pytest
 import typer
-from tests.unit.characterise.conftest import experiment, limits, limits_with
-from tests.unit.characterise.test_results import FOUND, identification
 
 from hilctl.base.errors import InputError, RunError
 from hilctl.cli.characterise import (
@@ -20,6 +18,8 @@ from hilctl.cli.characterise import (
 from hilctl.run.start import StepStoppedError, paced, unpaced
 from hilctl.studies.characterise.characterisation_runner import CharacterisationPlan
 from hilctl.studies.characterise.results import Characterisation, StepRow
+from tests.unit.studies.characterise.conftest import experiment, limits, limits_with
+from tests.unit.studies.characterise.test_results import FOUND, identification
 
 __all__ = ["experiment", "limits", "limits_with"]
 

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import typer
 from rich.console import Console
-from tests.unit.series.conftest import grown
 
 from hilctl.analysis import html
 from hilctl.analysis import replay as replaying
@@ -25,6 +24,7 @@ from hilctl.cli.console import print_rich
 from hilctl.cli.recordings import export, recover
 from hilctl.cli.reports import figures, print_replay, render_report, render_series, replay, report
 from hilctl.studies.multi_run.collect import RunSeries
+from tests.unit.studies.multi_run.conftest import grown
 
 UNCOMPENSATED = Path(__file__).parents[3] / "recordings" / "golden" / "terfenol_uncompensated.mcap"
 

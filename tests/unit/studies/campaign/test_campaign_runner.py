@@ -4,7 +4,6 @@ import time
 from dataclasses import replace
 
 import pytest
-from tests.unit.campaign.conftest import CAMPAIGN
 
 from hilctl.base.errors import DeviceError, InputError
 from hilctl.base.events import Event
@@ -18,6 +17,7 @@ from hilctl.studies.campaign.campaign_runner import (
     prepared,
     run_series,
 )
+from tests.unit.studies.campaign.conftest import CAMPAIGN
 
 BUDGET = "set: {limits.rms_current_a: 0.9, limits.thermal_time_constant_s: 3.0}\n"
 

@@ -4,13 +4,13 @@ import importlib.util
 from types import SimpleNamespace
 
 import pytest
-from tests.unit.campaign.conftest import CAMPAIGN
 
 from hilctl.base.errors import InputError
 from hilctl.recording.reader import read
 from hilctl.studies.campaign.campaign_runner import CampaignHost
 from hilctl.studies.campaign.parallel_simulation import planned_fast, run_fast
 from hilctl.studies.campaign.plan import CampaignPlan
+from tests.unit.studies.campaign.conftest import CAMPAIGN
 
 BUDGET = "set: {limits.rms_current_a: 1.3, limits.thermal_time_constant_s: 2.0}\n"
 

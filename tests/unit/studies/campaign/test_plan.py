@@ -1,10 +1,10 @@
 """Every step is held against its limits before the first one moves."""
 
 import pytest
-from tests.unit.campaign.conftest import CAMPAIGN
 
 from hilctl.base.errors import ConfigError, InputError
 from hilctl.studies.campaign.plan import planned
+from tests.unit.studies.campaign.conftest import CAMPAIGN
 
 HOT = "set: {limits.rms_current_a: 0.7, limits.thermal_time_constant_s: 2.0}\n"
 

@@ -3,11 +3,11 @@
 import json
 
 import pytest
-from tests.unit.campaign.conftest import CAMPAIGN
 
 from hilctl.base.errors import ConfigError
 from hilctl.base.files import TextFiles
 from hilctl.studies.campaign.steps import setting
+from tests.unit.studies.campaign.conftest import CAMPAIGN
 
 
 def test_each_step_is_the_experiment_with_its_values(campaign):

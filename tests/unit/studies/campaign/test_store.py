@@ -3,7 +3,6 @@
 import os
 
 import pytest
-from tests.unit.campaign.conftest import CAMPAIGN
 
 from hilctl.base.errors import ConfigError, InputError
 from hilctl.base.files import TextFiles
@@ -19,6 +18,7 @@ from hilctl.studies.campaign.store import (
     new_recording,
     standing_runs,
 )
+from tests.unit.studies.campaign.conftest import CAMPAIGN
 
 
 def never(seconds):

@@ -5,11 +5,11 @@ import os
 from dataclasses import replace
 
 import pytest
-from tests.unit.campaign.conftest import CAMPAIGN
 
 from hilctl.studies.campaign.plan import planned
 from hilctl.studies.campaign.table import CampaignRow, write_table
-from hilctl.studies.multi_run.run_figures import FIGURES, RunFigures
+from hilctl.studies.multi_run.digest import FIGURES, RunFigures
+from tests.unit.studies.campaign.conftest import CAMPAIGN
 
 DONE = CampaignRow("completed", RunFigures(peak_to_peak_um=0.1 + 0.2), "few-0001.mcap", "completed")
 
@@ -67,5 +67,5 @@ def test_parquet_has_the_same_and_its_facts(plan):
     table = parquet.read_table(path)
     assert table.column("peak_to_peak_um").to_pylist() == [0.1 + 0.2] * 2 + [None] * 2
     assert table.column("waveform.amplitude").to_pylist() == [None, 1.0, 2.0, None]
-    assert table.schema.metadata[b"hilctl.studies.campaign"] == b"few"
+    assert table.schema.metadata[b"hilctl.campaign"] == b"few"
     assert table.column_names == list(read_back(csv_path)[0])

@@ -16,7 +16,7 @@ from hilctl.studies.characterise.loops import (
     repeatability,
     reversal_curves,
 )
-from hilctl.studies.characterise.rig_problem import RigProblemError
+from hilctl.studies.characterise.response import RigProblemError
 from hilctl.studies.characterise.waveforms import biased_loops, sine
 from hilctl.studies.characterise.waveforms import reversal_curves as reversal_keys
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from hilctl.kernels.hysteresis import play_sum_shared, rest_memory
+from hilctl.studies.characterise.response import RigProblemError
 from hilctl.studies.characterise.results import Measured
-from hilctl.studies.characterise.rig_problem import RigProblemError
 from hilctl.studies.characterise.steps import STEPS, full_amplitude
 
 
@@ -113,7 +113,7 @@ def test_noise_that_leaves_no_loop(walked, limits):
 
 @pytest.mark.slow
 def test_a_resonance_in_the_band(walked, limits, limits_with):
-    from tests.unit.characterise.test_response import resonator
+    from tests.unit.studies.characterise.test_response import resonator
 
     structure = resonator(45.0, 0.05)
     error = problem_of(walked, limits, lambda v: 4.0 * structure(v))

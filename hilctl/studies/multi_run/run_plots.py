@@ -1,20 +1,73 @@
-"""Figures of loops: by what varied, minor ones, the model's, before and after, and their error."""
+"""Figures of runs side by side: loops, errors, step and frequency responses."""
 
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from functools import partial
+from itertools import cycle
+from typing import Any, TypeVar
 
+import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 
 from hilctl.analysis.figure_layout import FigureSpec, Panel
-from hilctl.analysis.plot_style import DISPLACEMENT, MARK, QUIET, REFERENCE
-from hilctl.base.formatting import quantity
-from hilctl.base.types import F64
+from hilctl.analysis.plot_style import DISPLACEMENT, ERROR, MARK, QUIET, REFERENCE, WITH, WITHOUT
+from hilctl.base.formatting import quantity, significant
+from hilctl.base.types import C128, F64
 from hilctl.studies.multi_run.collect import RunSeries, SeriesRun
 from hilctl.studies.multi_run.digest import RunDigest
 from hilctl.studies.multi_run.minor_loops import minor_parts
-from hilctl.studies.multi_run.series_style import line_of, looks, spread
 from hilctl.studies.multi_run.varied_parameter import WITHOUT_COMPENSATOR, VariedParameter
+
+Item = TypeVar("Item")
+
+_SIGNS = ("o", "s", "^", "D", "v", "P", "X", "<", ">")
+_LINES = ("-", "--", "-.", ":")
+_NAMED = (WITH, WITHOUT, ERROR, MARK, "#E69F00", "#56B4E9", REFERENCE, QUIET)
+_MOST_CURVES = 7
+"""More loops than that can't be told apart."""
+
+
+def spread(items: Sequence[Item], most: int = _MOST_CURVES) -> list[Item]:
+    """Return at most so many of a sequence, its ends among them, evenly spread."""
+    if len(items) <= most:
+        return list(items)
+    return [items[k] for k in np.unique(np.linspace(0, len(items) - 1, most).round().astype(int))]
+
+
+def looks(dimension: VariedParameter | None, values: Sequence[Hashable]) -> Mapping[Hashable, Any]:
+    """Return how a line of each value is drawn.
+
+    Numbers go through viridis, which keeps its order in grey and for colour-blind people; names
+    have colours of Okabe and Ito. Signs differ too.
+
+    Args:
+        dimension: What the values are of; None where they are names.
+        values: The values.
+    """
+    if dimension is not None and dimension.numeric and len(values) > 1:
+        shades = mpl.colormaps["viridis"](np.linspace(0.0, 0.78, len(values)))
+        colours = [mpl.colors.to_hex(shade) for shade in shades]
+    else:
+        names = [value if dimension is None else dimension.text(value) for value in values]
+        colours = _of_names(names)
+    return {
+        value: {"color": colour, "marker": _SIGNS[k % len(_SIGNS)]}
+        for k, (value, colour) in enumerate(zip(values, colours, strict=True))
+    }
+
+
+def _of_names(names: Sequence[Hashable]) -> list[str]:
+    """Return a colour a name; runs without a compensator have theirs, and no other has it then."""
+    if WITHOUT_COMPENSATOR not in names:
+        return [_NAMED[k % len(_NAMED)] for k in range(len(names))]
+    others = cycle(colour for colour in _NAMED if colour != WITHOUT)
+    return [WITHOUT if name == WITHOUT_COMPENSATOR else next(others) for name in names]
+
+
+def line_of(look: Mapping[str, Any], number: int = 0) -> dict[str, Any]:
+    """Return a look without its sign, for a long line, dashed otherwise by its number."""
+    return {"color": look["color"], "linestyle": _LINES[number % len(_LINES)]}
+
 
 _MOST_PANELS = 6
 _SQUARE = 0.9
@@ -250,3 +303,84 @@ def _note(axes: Axes, text: str) -> None:
         fontsize=6.5,
         color=QUIET,
     )
+
+
+def step_sheet(series: RunSeries) -> FigureSpec | None:
+    """Return displacements after a step, a panel a run; None where there is none."""
+    runs = [run for run in series.done if run.digest is not None and run.digest.step.size]
+    if not runs:
+        return None
+    shown = spread(runs, _MOST_PANELS)
+    panels = tuple(Panel(partial(_draw_step, run=run), _title(series, run)) for run in shown)
+    caption = "Displacement after a step of the command, with natural frequency and damping."
+    return FigureSpec("step_response", caption, panels)
+
+
+def _title(series: RunSeries, run: SeriesRun) -> str:
+    values = [
+        each.text(run.values[each.key])
+        for each in series.dimensions
+        if each.numeric and run.values.get(each.key) is not None
+    ]
+    return ", ".join(values) or series.text(run)
+
+
+def _draw_step(axes: Axes, run: SeriesRun) -> None:
+    if run.digest is None:
+        return
+    t, moved = run.digest.step
+    natural = run.figures.natural_hz
+    axes.plot(1e3 * t, moved, **line_of(looks(None, [0])[0]))
+    axes.set(xlabel="time after the step, ms", ylabel="displacement, µm")
+    if natural and run.figures.damping_ratio is not None:
+        text = f"{quantity(natural, 'Hz')}, damping ratio {significant(run.figures.damping_ratio)}"
+        axes.annotate(text, (0.97, 0.06), xycoords="axes fraction", ha="right", fontsize=7,
+                      color=QUIET)  # fmt: skip
+
+
+def frequency_sheet(series: RunSeries) -> FigureSpec | None:
+    """Return small-signal responses, measured and fitted; None where there is none."""
+    runs = [run for run in series.done if run.digest and run.digest.response is not None]
+    if not runs:
+        return None
+    shown = spread(runs)
+    along = next((each for each in series.dimensions if each.numeric), None)
+    text = partial(_title, series)
+    panels = tuple(
+        Panel(partial(_draw_response, runs=shown, along=along, text=text, part=part), part)
+        for part in ("magnitude", "phase")
+    )
+    caption = "Small-signal response: measured (dots) and fitted (lines)."
+    return FigureSpec("frequency_response", caption, panels)
+
+
+def _draw_response(
+    axes: Axes,
+    runs: Sequence[SeriesRun],
+    along: VariedParameter | None,
+    text: Callable[[SeriesRun], str],
+    part: str,
+) -> None:
+    values = [run.values.get(along.key) if along else text(run) for run in runs]
+    look = looks(along, list(dict.fromkeys(values)))
+    for run, value in zip(runs, values, strict=True):
+        found = run.digest.response if run.digest else None
+        if found is None or run.digest is None:
+            continue
+        measured, fitted = (_part(each, part) for each in (found.response, found.fitted))
+        colour = look[value]["color"]
+        axes.plot(found.frequency_hz, measured, ".", color=colour, markersize=2.0, alpha=0.7)
+        axes.plot(found.frequency_hz, fitted, color=colour, linewidth=0.9, label=text(run))
+        unit = run.digest.command_unit
+        axes.set_ylabel(f"magnitude, µm/{unit}" if part == "magnitude" else "phase, degrees")
+    axes.set(
+        xscale="log", xlabel="frequency, Hz", yscale="log" if part == "magnitude" else "linear"
+    )
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter("{x:g}")
+
+
+def _part(response: C128, part: str) -> F64:
+    size: F64 = np.abs(response)
+    degrees: F64 = np.degrees(np.unwrap(np.angle(response)))
+    return size if part == "magnitude" else degrees
