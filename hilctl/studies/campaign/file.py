@@ -1,4 +1,4 @@
-"""Campaign file: its models, varied values and their order."""
+"""Campaign file, and the grid of its varied values."""
 
 import random
 import re
@@ -16,11 +16,11 @@ RunOrder = Literal["as_written", "random", "alternating"]
 
 
 class ReferenceRun(StrictModel):
-    """The same run again and again: its change is the drift of rig and actuator.
+    """A repeated run whose change is the drift of rig and actuator.
 
     Attributes:
-        every: It comes first, after so many steps, and last.
-        set: Keys of the base experiment that it has otherwise.
+        every: Number of steps between reference runs; one is first and one is last.
+        set: Keys of the base experiment that it changes.
     """
 
     every: Annotated[int, Field(ge=1, le=10_000)]
@@ -28,36 +28,36 @@ class ReferenceRun(StrictModel):
 
 
 class CoolDown(StrictModel):
-    """How long the coil cools before a run, by its own thermal model in ``limits``.
+    """Cooling of the coil before a run, by its thermal model in ``limits``.
 
     Attributes:
-        to_rms_a: Running rms of the current that it cools to before every run; left out, only as
-            far as the run needs to keep its budget.
+        to_rms_a: Running rms of the current to cool to before every run; by default, only as far
+            as the run needs to keep its budget.
     """
 
     to_rms_a: Annotated[float, Field(gt=0.0)] | None = None
 
 
 class CampaignFile(StrictModel):
-    """One campaign: a base experiment, and what varies.
+    """A base experiment and the keys that vary.
 
     Attributes:
-        name: Short name; that of its recordings, and of their folder.
-        description: What it is for.
-        experiment: The base experiment's file, relative to this file's folder.
-        set: Keys of it that all steps have otherwise; dotted, as with ``--set``.
+        name: Short name of the campaign, its recordings and their folder.
+        description: Its purpose.
+        experiment: File of the base experiment, relative to this file's folder.
+        set: Keys that all steps change; dotted, as with ``--set``.
         vary: Dotted keys, each with a list of values, or with a range ``first:last:count`` of
             even steps, ``first:last:countlog`` of even ratios. The keys of a mapping are crossed;
             in a list of mappings, the keys of each go together and the mappings are crossed.
         order: ``as_written``, the last key fastest; ``random`` by ``seed``; or ``alternating`` up
             and down, against drift.
-        seed: Of the random order.
-        repeat: How often each step is run.
-        reference_run: A run that comes again and again; None for none.
-        condition: What the actuator goes through before every run.
-        cool_down: How long the coil cools before a run.
-        folder: Where recordings and table go, relative to where hilctl runs; left out, a folder of
-            the campaign's name in the experiment's ``recording.folder``.
+        seed: Seed of the random order.
+        repeat: Number of runs per step.
+        reference_run: A repeated run that measures drift; None for none.
+        condition: Conditioning of the actuator before every run.
+        cool_down: Cooling of the coil before a run.
+        folder: Folder of recordings and table, relative to the working directory; by default, a
+            folder of the campaign's name in the experiment's ``recording.folder``.
     """
 
     name: Name
@@ -77,20 +77,20 @@ class CampaignFile(StrictModel):
 Point: TypeAlias = Mapping[str, Any]
 """A value for each varied key."""
 Broken: TypeAlias = tuple[Loc, str, str, str]
-"""Where a rule is broken, the rule, the value, and what to do."""
+"""A broken rule: location, rule, value and hint."""
 
 MOST_STEPS = 10_000
 
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _RANGE = re.compile(rf"({_NUMBER}):({_NUMBER}):(\d+)(log|lin)?\Z")
-_DIGITS = 6  # of a value within a range: enough for any rig, and short enough to read
+_DIGITS = 6  # of a value within a range
 
 
 def values_of(given: Any) -> tuple[Any, ...]:
     """Return the values of a key: those of a list, or of a range ``first:last:count[log|lin]``.
 
     Raises:
-        ValueError: It is neither; the text is the rule.
+        ValueError: It is neither; the text states the rule.
     """
     if isinstance(given, tuple):
         if not given:
@@ -116,10 +116,10 @@ def _rounded(values: Iterable[float]) -> tuple[float, ...]:
 def groups_of(
     vary: Mapping[str, Any] | Sequence[Mapping[str, Any]],
 ) -> tuple[list[list[Point]], list[Broken]]:
-    """Return the groups that are crossed, each a list of points, and what is wrong with them.
+    """Return the groups to cross, each a list of points, and the broken rules.
 
     Args:
-        vary: A mapping whose keys are crossed, or mappings whose keys go together.
+        vary: A mapping whose keys are crossed, or mappings whose keys vary together.
     """
     single = isinstance(vary, Mapping)
     written: list[tuple[Loc, Mapping[str, Any]]] = (
@@ -138,13 +138,13 @@ def groups_of(
             except ValueError as error:
                 broken.append(((*loc, key), str(error), repr(given), ""))
             if key in seen:
-                broken.append(((*loc, key), "is varied already", "", "give it once"))
+                broken.append(((*loc, key), "is varied already", "", "vary it once"))
             seen.add(key)
         lengths = {len(values) for values in columns.values()}
         if len(lengths) > 1:
             counted = ", ".join(f"{key} {len(values)}" for key, values in columns.items())
-            rule = "must have as many values for each key, as they go together"
-            broken.append((loc, rule, counted, "keys of mappings of their own are crossed"))
+            rule = "must have the same number of values for each key of a group"
+            broken.append((loc, rule, counted, "keys of separate mappings are crossed"))
         elif columns:
             groups.append(
                 [
@@ -160,20 +160,20 @@ def groups_of(
 def points(
     groups: Sequence[Sequence[Point]], order: RunOrder, seed: int, repeat: int
 ) -> list[tuple[Point, int]]:
-    """Return every point in the order in which it is run, and which repeat of it that is, from 1.
+    """Return every point in its order, with the number of its repeat, from 1.
 
     Args:
-        groups: What is crossed; the last goes fastest.
-        order: See :class:`hilctl.studies.campaign.file.CampaignFile`.
-        seed: Of the random order.
-        repeat: How often each point is run.
+        groups: Groups to cross; the last varies fastest.
+        order: See :class:`CampaignFile`.
+        seed: Seed of the random order.
+        repeat: Number of runs per point.
     """
     alternating = order == "alternating"
     row: list[Point] = [{}]
     for group in groups:
         wider: list[Point] = []
         for number, point in enumerate(row):
-            # Every other row backwards: then no step goes from one end of a range to the other.
+            # Reverse every other row, so that no step jumps from one end of a range to the other.
             members = reversed(group) if alternating and number % 2 else group
             wider += [{**point, **member} for member in members]
         row = wider
@@ -182,5 +182,5 @@ def points(
         again = reversed(row) if alternating and number % 2 else row
         found += [(point, number + 1) for point in again]
     if order == "random":
-        random.Random(seed).shuffle(found)  # noqa: S311  an order, no secret
+        random.Random(seed).shuffle(found)  # noqa: S311  no secret
     return found

@@ -30,19 +30,19 @@ from hilctl.studies.characterise.response import (
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """What the steps so far have measured; what none has is None or empty.
+    """Measurements of the steps so far; None or empty if not measured yet.
 
     Attributes:
         rest: Noise and drift at rest.
-        reaction: First reaction, and its polarity.
+        reaction: First reaction and its polarity.
         small: Small-signal response.
         growing: Loops of growing amplitude.
         slow: Loops at the lowest frequency.
         fast: Loops at several frequencies.
         reversal: First-order reversal curves.
-        biased: Small loops at places all over the range.
-        crept_percent: How far the displacement moves on in each rest, of where it stands.
-        repeated: How the last of the growing loops compares with itself at the end.
+        biased: Small loops over the whole range.
+        crept_percent: Creep in each hold, of the displacement.
+        repeated: Change of the largest growing loop at the end.
     """
 
     rest: RestNoise | None = None
@@ -57,25 +57,25 @@ class Measured:
     repeated: Repeatability | None = None
 
     def also(self, **found: Any) -> Self:
-        """Return a copy with something more."""
+        """Return a copy with more measurements."""
         return replace(self, **found)
 
     def to_mapping(self) -> dict[str, Any]:
-        """Return the figures as plain values, without the signals."""
+        """Return plain values without signals."""
         return {field.name: _plain(getattr(self, field.name)) for field in fields(self)}
 
 
 @dataclass(frozen=True, slots=True)
 class ValidationReference:
-    """How far the model is from a reference that no fit has seen, the mean error included.
+    """Error of the model on a reference that was not used in any fit.
 
     Attributes:
-        label: The reference.
+        label: Name of the reference.
         peak_percent: Largest error, in percent of the displacement's peak-to-peak.
         rms_percent: Its root mean square.
-        mean_percent: Its mean: where the actuator stood, rather than how it moved.
-        floor_percent: Largest error that sensor noise alone would make.
-        time_s: float64[n], time of the samples judged.
+        mean_percent: Its mean.
+        floor_percent: Largest error expected from sensor noise alone.
+        time_s: float64[n], time of the evaluated samples.
         measured_um: float64[n], their displacement.
         modelled_um: float64[n], the model's.
     """
@@ -92,16 +92,16 @@ class ValidationReference:
 
 @dataclass(frozen=True, slots=True)
 class StepRow:
-    """One step, as it is shown.
+    """One step of the plan or the result.
 
     Attributes:
         name: Name of the step and of its recording.
-        purpose: What it is for.
+        purpose: Its purpose.
         seconds: Rig time.
-        megabytes: About how large its recording is.
-        text: What came of it; empty before.
-        recording: Its recording; empty where it was not run.
-        kept: Whether the recording was there already.
+        megabytes: Approximate size of its recording.
+        text: Summary of its result; empty before the run.
+        recording: Its recording; empty if it was not run.
+        kept: Whether the recording existed already.
     """
 
     name: str
@@ -115,19 +115,19 @@ class StepRow:
 
 @dataclass(frozen=True, slots=True)
 class Characterisation:
-    """What came of a campaign.
+    """Result of a characterisation.
 
     Attributes:
         experiment: Name of the experiment.
         device: Name of the device.
         unit: Unit of commands.
         band_hz: Lowest and highest frequency of loops.
-        steps: The steps that were run or kept.
-        measured: What they measured.
-        held_out: The random reference first; empty without a model.
-        identification: The model; None where there is none.
-        problem: Why the campaign ended early, with what to do; empty where it did not.
-        problem_code: The same, for programs.
+        steps: The steps, run or kept.
+        measured: Their measurements.
+        held_out: Validation errors, the random reference first; empty without a model.
+        identification: The model; None if none was identified.
+        problem: Problem of the rig with its remedy; empty if all steps were completed.
+        problem_code: Code of the problem.
     """
 
     experiment: str
@@ -143,10 +143,10 @@ class Characterisation:
 
     @property
     def verdict(self) -> Verdict | None:
-        """What the model is worth; None without one.
+        """Verdict on the model; None without one.
 
-        What identification says of the data stands; else the error on the random reference decides,
-        which has more of what a run will ask for than loops left out of a fit.
+        A rejection by the identification is final. Otherwise the error on the random reference
+        decides: it resembles a run more closely than held-out loops.
         """
         if self.identification is None or not self.held_out:
             return None
@@ -162,11 +162,11 @@ class Characterisation:
 
     @property
     def is_model(self) -> bool:
-        """Whether there is a model that may be used."""
+        """Whether there is a usable model."""
         return self.verdict is not None and self.verdict.grade != "not a model"
 
     def to_mapping(self) -> dict[str, Any]:
-        """Return plain values for JSON, the held-out error first."""
+        """Return plain values for JSON, the validation errors first."""
         found = self.identification
         return {
             "held_out": [_plain(each) for each in self.held_out],
@@ -185,7 +185,7 @@ class Characterisation:
 
 
 def _plain(value: Any) -> Any:
-    """Return a figure as plain values; signals are left out."""
+    """Return plain values without signals."""
     if isinstance(value, tuple):
         return [_plain(each) for each in value if not isinstance(each, np.ndarray)]
     if isinstance(value, Mapping):
@@ -207,28 +207,27 @@ Mask: TypeAlias = npt.NDArray[np.bool_]
 _SLACK = 0.01
 
 FITTED = ("slow-loops", "fast-loops", "creep", "small-motions", "training")
-"""Steps whose recordings a model is identified from: each begins with a motion of full size, so
-that what was before it does not matter."""
+"""Steps for identification. Each starts with a motion of full amplitude, which erases the earlier
+history."""
 
 JUDGED: Mapping[str, str] = {
     "held-out": "random reference",
     "reversal-curves": "first-order reversal curves",
     "biased-loops": "small loops all over the range",
 }
-"""Steps that no fit sees and what they are for people, the most telling first."""
+"""Steps for validation only, with their labels, the most important first."""
 
 
 def identified(
     recordings: Mapping[str, Path], progress: OnProgress = ignore_progress
 ) -> Identification:
-    """Identify the kind of model that suits the device: the only place that says how.
+    """Select the kind of model and identify it from complete histories.
 
-    It is found from whole histories: how an actuator came to where it stands is what small loops
-    depend on, and a steady loop does not say it.
+    Small loops depend on the history of the actuator, which steady loops do not contain.
 
     Args:
         recordings: The steps' recordings by name.
-        progress: Called with what is being done.
+        progress: Called with a description of the progress.
 
     Raises:
         InputError: No model can be identified from them.
@@ -245,7 +244,7 @@ def identified(
 
 
 def _history(recording: Recording) -> History:
-    """Return what a recording has to the end of its last waveform; gaps are filled in."""
+    """Return a recording up to the end of its last waveform, with gaps filled."""
     signals = without_gaps(recording, 0, recording.segments[-1].steady_stop)
     return History(recording.path.name, *signals, recording.sample_rate_hz)
 
@@ -253,7 +252,7 @@ def _history(recording: Recording) -> History:
 def judged(
     model: HysteresisModel, recordings: Mapping[str, Path], noise_um: float
 ) -> tuple[ValidationReference, ...]:
-    """Hold a model against the recordings that it was not identified from."""
+    """Validate a model on recordings that were not used to identify it."""
     return tuple(
         held_out(model, read(recordings[name]), noise_um, label)
         for name, label in JUDGED.items()
@@ -264,16 +263,16 @@ def judged(
 def held_out(
     model: HysteresisModel, recording: Recording, noise_um: float, label: str
 ) -> ValidationReference:
-    """Hold a model against what a recording has after its first waveform, run through as a whole.
+    """Validate a model on a recording.
 
-    Judged is what the waveforms have at full size, within the commands that the model was found on.
+    The model runs through the complete recording. The waveforms after the first are evaluated at
+    full amplitude, within the input range of the model.
 
     Args:
         model: The model.
-        recording: A run that begins with a conditioning cycle, so that what was before it does not
-            matter.
-        noise_um: rms of a single reading.
-        label: What it is, for people.
+        recording: A run that starts with a conditioning cycle.
+        noise_um: rms noise of a single reading.
+        label: Name of the reference.
 
     Raises:
         DataError: Too many samples are missing.
@@ -299,14 +298,14 @@ def held_out(
 
 
 def _in_range(command: F64, model: HysteresisModel) -> Mask:
-    """Return which commands the model was found on; all where it does not say: bool[n]."""
+    """Return which commands are in the model's input range, if it has one: bool[n]."""
     low, high = model.input_range or (-np.inf, np.inf)
     slack = _SLACK * (high - low) if np.isfinite(high - low) else 0.0
     return (command >= low - slack) & (command <= high + slack)
 
 
 def _steady(parts: Sequence[Segment], stop: int) -> Mask:
-    """Return which samples belong to a waveform at its full size: bool[stop]."""
+    """Return which samples belong to a waveform at full amplitude: bool[stop]."""
     found = np.zeros(stop, dtype=np.bool_)
     for part in parts:
         found[part.steady_start : part.steady_stop] = True

@@ -1,4 +1,4 @@
-"""Collect the runs of a folder, a campaign's table, or files; each recording is read once."""
+"""Collect runs of a campaign's table, a folder, or files; each recording is read once."""
 
 import csv
 import io
@@ -35,7 +35,7 @@ FIRST = (STEP, REPEAT, REFERENCE)
 """Columns before the varied keys."""
 RESULT, RECORDING = "result", "recording"
 LAST = (RESULT, RECORDING)
-"""Columns behind the figures."""
+"""Columns after the metrics."""
 COMPLETED = "completed"
 PLANNED = "planned"
 
@@ -46,12 +46,12 @@ class SeriesEntry:
 
     Attributes:
         step: Number of the step, from 1.
-        repeat: Which repeat of its point, or which reference run.
+        repeat: Number of the repeat or of the reference run.
         is_reference: Whether it is a reference run.
-        values: Value of each varied key; None where it has none.
-        figures: What its recording says.
-        result: ``completed``, ``planned``, or what went wrong.
-        recording: Name of its recording; empty where there is none.
+        values: Value of each varied key, or None.
+        figures: Metrics of its recording.
+        result: ``completed``, ``planned``, or code and reason.
+        recording: Name of its recording, or empty.
     """
 
     step: int
@@ -64,15 +64,15 @@ class SeriesEntry:
 
 
 def find_table(folder: Path) -> Path | None:
-    """Return the CSV table of a campaign in its folder; None where there is none.
+    """Return the CSV table in a campaign's folder; None without one.
 
     Raises:
-        InputError: There are several.
+        InputError: The folder has several tables.
     """
     found = [path for path in sorted(folder.glob("*.csv")) if _is_table(path)]
     if len(found) > 1:
         names = ", ".join(path.name for path in found)
-        raise InputError(f"{folder}: holds tables of several campaigns: {names}")
+        raise InputError(f"{folder}: contains tables of several campaigns: {names}")
     return found[0] if found else None
 
 
@@ -90,7 +90,7 @@ def read_entries(path: Path) -> list[SeriesEntry]:
 
     Raises:
         InputError: It can't be read.
-        DataError: A cell holds what no campaign writes.
+        DataError: A row is invalid.
     """
     reader = csv.DictReader(io.StringIO(read_text(path), newline=""))
     names = reader.fieldnames or ()
@@ -101,7 +101,7 @@ def read_entries(path: Path) -> list[SeriesEntry]:
             entries.append(_entry(row, keys))
         except (ValueError, KeyError, TypeError) as error:
             raise DataError(
-                f"{path}:{reader.line_num}: is no row of a campaign's table: {error}"
+                f"{path}:{reader.line_num}: invalid row of a campaign's table: {error}"
             ) from None
     return entries
 
@@ -125,7 +125,7 @@ def _number(name: str, text: str) -> Any:
 
 
 def plain_value(text: str) -> Any:
-    """Return what a cell stands for: a number, a mapping, a text; None where it is empty."""
+    """Return the value of a cell: a number, a mapping or a text; None if it is empty."""
     if not text:
         return None
     if text in {"True", "False"}:
@@ -137,10 +137,10 @@ def plain_value(text: str) -> Any:
 
 
 OnRead = Callable[[float, str], None]
-"""Called with what is done, from 0 to 1, and what is being read."""
+"""Called with progress from 0 to 1 and a description."""
 
 MOST_BYTES = 512 << 20
-"""Largest recording that is read into memory, where it takes some eight times as much."""
+"""Largest recording to read; it takes about eight times as much memory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,13 +148,13 @@ class SeriesRun:
     """One run of several.
 
     Attributes:
-        number: Its place, from 1.
+        number: Its position, from 1.
         is_reference: Whether it is a reference run of a campaign.
-        values: Value of each key that varied, as number or short text.
-        figures: Its figures.
-        result: ``completed``, ``planned``, or what went wrong.
-        recording: Name of its recording; empty where there is none.
-        digest: What its recording gives to figures; None where there is none.
+        values: Value of each varied key, as a number or short text.
+        figures: Its metrics.
+        result: ``completed``, ``planned``, or code and reason.
+        recording: Name of its recording, or empty.
+        digest: Data of its recording for figures, or None.
     """
 
     number: int
@@ -167,20 +167,20 @@ class SeriesRun:
 
     @property
     def completed(self) -> bool:
-        """Whether it was run to its end."""
+        """Whether the run was completed."""
         return self.result == COMPLETED
 
 
 @dataclass(frozen=True)
 class RunSeries:
-    """Runs side by side.
+    """Runs of one report.
 
     Attributes:
         name: Name of the campaign, or of the runs.
         runs: The runs in order.
-        keys: Keys that were varied.
-        missing: Recordings that can't be read, each with why.
-        is_campaign: Whether they are of a campaign.
+        keys: Varied keys.
+        missing: Errors of recordings that can't be read.
+        is_campaign: Whether they belong to a campaign.
     """
 
     name: str
@@ -191,12 +191,12 @@ class RunSeries:
 
     @cached_property
     def done(self) -> tuple[SeriesRun, ...]:
-        """Completed runs that are no reference runs: what trends and figures are of."""
+        """Completed runs without reference runs, for trends and figures."""
         return tuple(run for run in self.runs if run.completed and not run.is_reference)
 
     @cached_property
     def dimensions(self) -> tuple[VariedParameter, ...]:
-        """What varied among those that were run."""
+        """Varied parameters of the completed runs."""
         units = {
             str(value_at(run.digest.values, "waveform.unit")) for run in self.done if run.digest
         }
@@ -205,21 +205,21 @@ class RunSeries:
 
     @property
     def drift(self) -> SeriesDrift | None:
-        """What reference runs say of drift."""
+        """Drift over the reference runs."""
         return drift_of([run.figures for run in self.runs if run.is_reference and run.completed])
 
     @property
     def failed(self) -> tuple[SeriesRun, ...]:
-        """Runs that did not come to their end."""
+        """Runs that started and were not completed."""
         return tuple(run for run in self.runs if not run.completed and run.result != PLANNED)
 
     @property
     def planned(self) -> int:
-        """How many runs are still to come."""
+        """Number of remaining runs."""
         return sum(run.result == PLANNED for run in self.runs)
 
     def text(self, run: SeriesRun) -> str:
-        """Return what a run is known by among the others."""
+        """Return the label of a run among the others."""
         values = [each.text(run.values[each.key]) for each in self.dimensions
                   if run.values.get(each.key) is not None]  # fmt: skip
         return ", ".join(values) or ("reference run" if run.is_reference else f"run {run.number}")
@@ -233,17 +233,17 @@ def collect(
     """Read runs.
 
     Args:
-        paths: Recordings, or one folder: of a campaign, or with recordings in it.
-        model: Model to hold against what was measured; the recorded ones where None.
-        on_read: Told of progress.
+        paths: Recordings, or one folder of a campaign or of recordings.
+        model: Model to compare with the measurements; the recorded ones if None.
+        on_read: Called with the progress.
 
     Raises:
-        InputError: A folder holds no recordings, or stands among others.
-        DataError: A recording that was named, or a table, can't be read.
+        InputError: A folder contains no recordings, or is not the only path.
+        DataError: A named recording, or the table, can't be read.
     """
     folders = [path for path in paths if path.is_dir()]
     if folders and len(paths) > 1:
-        raise InputError(f"{folders[0]}: is a folder: name one folder, or recordings only")
+        raise InputError(f"{folders[0]}: is a folder. Specify one folder, or recordings only")
     if not folders:
         return _of_files(paths, "runs", model, on_read, missing=None)
     table = find_table(folders[0])
@@ -251,7 +251,7 @@ def collect(
         return _of_campaign(table, model, on_read)
     found = recordings_in(folders[0])
     if not found:
-        raise InputError(f"{folders[0]}: holds no recordings (*.mcap)")
+        raise InputError(f"{folders[0]}: contains no recordings (*.mcap)")
     return _of_files(found, folders[0].resolve().name, model, on_read, missing=[])
 
 
@@ -264,8 +264,8 @@ def series_of(
     Args:
         name: Name of the campaign.
         entries: Rows of its table.
-        digests: What recordings give to figures, by their names.
-        missing: Recordings that can't be read, each with why.
+        digests: Data of the recordings, by their names.
+        missing: Errors of recordings that can't be read.
     """
     keys = tuple(dict.fromkeys(key for entry in entries for key in entry.values))
     runs = tuple(
@@ -286,8 +286,8 @@ def series_of(
 def _digest(path: Path, model: HysteresisModel | None) -> RunDigest:
     if path.is_file() and path.stat().st_size > MOST_BYTES:
         raise DataError(
-            f"{path}: is larger than {MOST_BYTES >> 20} MB, too long for a page of many runs: "
-            f"'hilctl report {path}' makes one of its own, in little memory"
+            f"{path}: is larger than {MOST_BYTES >> 20} MB, the limit of a page of many runs. "
+            f"Use 'hilctl report {path}'"
         )
     return digest_of(read(path), model)
 
@@ -298,7 +298,7 @@ def _of_campaign(table: Path, model: HysteresisModel | None, on_read: OnRead) ->
     digests, missing = {}, []
     for number, entry in enumerate(named):
         on_read(number / len(named), f"read {entry.recording}")
-        # A name in the table must not lead elsewhere.
+        # A name in the table must not refer to another folder.
         path = table.parent / Path(entry.recording).name
         try:
             digests[entry.recording] = _digest(path, model)
@@ -314,7 +314,7 @@ def _of_files(
     on_read: OnRead,
     missing: list[str] | None,
 ) -> RunSeries:
-    """Read files; one that can't be read is left out where ``missing`` is a list."""
+    """Read files; add those that can't be read to ``missing``, if it is a list."""
     digests = []
     for number, path in enumerate(paths):
         on_read(number / len(paths), f"read {path.name}")
@@ -342,5 +342,5 @@ def _of_files(
 
 def _result(digest: RunDigest) -> str:
     if digest.code in {"", COMPLETED}:
-        return COMPLETED if digest.code else "cut short: its end was not recorded"
+        return COMPLETED if digest.code else "truncated: no end was recorded"
     return f"{digest.code}: {digest.reason}"

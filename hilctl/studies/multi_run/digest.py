@@ -1,4 +1,4 @@
-"""Metrics and figure data of one run among many."""
+"""Metrics of one run, and its data for figures; drift of reference runs."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
@@ -29,28 +29,28 @@ from hilctl.waveforms.spec import AnyWaveform, Multisine, Step
 
 @dataclass(frozen=True, slots=True)
 class RunFigures:
-    """Figures of one run; None where one has no meaning.
+    """Metrics of one run; None for those that do not apply.
 
     Attributes:
         peak_hysteresis_percent: Peak hysteresis, of the segment with the largest.
-        peak_error_percent: Largest displacement less reference, of the peak-to-peak.
-        rms_error_percent: Its root mean square.
+        peak_error_percent: Largest error (displacement minus reference), of the peak-to-peak.
+        rms_error_percent: rms error, of the peak-to-peak.
         loop_area: Area of the loop, in um times the unit of its input.
         peak_to_peak_um: Peak-to-peak displacement.
         low_um: Lowest displacement of the average cycle.
-        high_um: Highest displacement of it.
-        mean_um: Mean displacement of it.
-        offset_um: Offset that the run measured at rest, and took out.
+        high_um: Highest displacement of the average cycle.
+        mean_um: Mean displacement of the average cycle.
+        offset_um: Offset measured at rest and subtracted.
         minor_low_um: Peak-to-peak displacement of the minor loops at the lowest input.
         minor_high_um: The same of those at the highest input.
         minor_low_percent: Peak hysteresis of the minor loops at the lowest input, of their own
             peak-to-peak.
         minor_high_percent: The same of those at the highest input.
-        natural_hz: Natural frequency, by a step's ringing or a multisine's response.
-        damping_ratio: Its damping.
-        deadline_misses: Ticks that were skipped.
+        natural_hz: Natural frequency, from the ringing after a step or a multisine's response.
+        damping_ratio: Its damping ratio.
+        deadline_misses: Skipped ticks.
         heat_before_a: Running rms of the coil current before the run, in A.
-        heat_after_a: The same after it.
+        heat_after_a: The same after the run.
     """
 
     peak_hysteresis_percent: float | None = None
@@ -81,10 +81,10 @@ def figures_of(recording: Recording, waveform: Any) -> RunFigures:
 
     Args:
         recording: The run.
-        waveform: Its waveform, as the experiment has it.
+        waveform: Waveform of its experiment.
 
     Raises:
-        DataError: A fact of it is no number.
+        DataError: A metadata value is not a number.
     """
     return figures_with(recording, structure_of(recording, waveform))
 
@@ -129,7 +129,7 @@ def _cycle_figures(recording: Recording, segment: Segment, *, minor: bool) -> di
 
 
 def _minor(loop_input: F64, output: F64) -> dict[str, float]:
-    """Return the minor loops in the lower and in the upper half of the input, averaged."""
+    """Return averages over the minor loops in the lower and in the upper half of the input."""
     middle = 0.5 * float(loop_input.min() + loop_input.max())
     loops = minor_loops(loop_input, output)
     found = {}
@@ -145,16 +145,16 @@ def _minor(loop_input: F64, output: F64) -> dict[str, float]:
 
 
 def structure_of(recording: Recording, waveform: Any) -> SmallSignal | Ringing | None:
-    """Return natural frequency and damping, where a waveform is one to see them by.
+    """Return natural frequency and damping, if the waveform is a multisine or a step.
 
     Args:
         recording: The run.
-        waveform: Its waveform, as the experiment has it.
+        waveform: Waveform of its experiment.
     """
     if isinstance(waveform, Multisine):
         try:
             return small_signal(recording)
-        except RigProblemError:  # lost in noise: there is nothing to say
+        except RigProblemError:  # below the noise
             return None
     return _ringing(recording, waveform) if isinstance(waveform, Step) else None
 
@@ -166,7 +166,7 @@ def _ringing(recording: Recording, waveform: Step) -> Ringing | None:
 
 
 def after_step(recording: Recording, waveform: Step) -> Samples:
-    """Return the samples from the end of the largest step of a waveform up to the next one."""
+    """Return the samples from the end of the largest step to the next step."""
     segment, rate_hz = recording.segments[0], recording.sample_rate_hz
     levels = np.array([0.0, *waveform.levels])
     largest = int(np.argmax(np.abs(np.diff(levels))))
@@ -177,10 +177,10 @@ def after_step(recording: Recording, waveform: Step) -> Samples:
 
 @dataclass(frozen=True, slots=True)
 class SeriesDrift:
-    """How far reference runs moved away from the first of them; each the largest, with its sign.
+    """Largest change of the reference runs from the first of them, with its sign.
 
     Attributes:
-        runs: Reference runs that were completed.
+        runs: Number of completed reference runs.
         peak_to_peak_percent: Change of the peak-to-peak displacement, in percent of it.
         mean_um: Change of the mean displacement, in um.
         peak_hysteresis_percent: Change of the peak hysteresis, in points of percent.
@@ -202,14 +202,14 @@ class SeriesDrift:
             (self.peak_hysteresis_percent, "{:+.3g} points of hysteresis"),
         ]
         known = ", ".join(text.format(value) for value, text in parts if value is not None)
-        return f"drift over {self.runs} reference runs: {known or 'nothing to compare'}"
+        return f"drift over {self.runs} reference runs: {known or 'no metrics'}"
 
 
 def drift_of(done: Sequence[RunFigures]) -> SeriesDrift | None:
     """Return the drift; None with fewer than two reference runs.
 
     Args:
-        done: Figures of the reference runs that were completed, in the order of their runs.
+        done: Metrics of the completed reference runs, in their order.
     """
     if len(done) < 2:
         return None
@@ -226,7 +226,7 @@ def drift_of(done: Sequence[RunFigures]) -> SeriesDrift | None:
 
 
 POINTS = 300
-"""Points of a loop: what figures of dissertations and journals are drawn with."""
+"""Points per loop."""
 
 _STEP_POINTS = 800
 _STEP_CYCLES = 12.0  # of the ringing
@@ -235,30 +235,30 @@ _NO_LOOP = np.empty((2, 0))
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunDigest:
-    """One run among many.
+    """Data of one run, a few kilobytes for a run of any length.
 
     Attributes:
         name: Name of the experiment.
         path: File of the recording.
         started: When it began, ISO 8601.
-        labels: What it is found by.
+        labels: Its labels.
         device: Name of the device.
-        simulated: Whether that is a simulation.
-        code: How it ended: ``completed``, ``stopped``, ``fault``; empty where that is not recorded.
-        reason: Why.
+        simulated: Whether the device is simulated.
+        code: ``completed``, ``stopped`` or ``fault``; empty if no end was recorded.
+        reason: Why it ended.
         values: Its experiment as plain values, nested as in the file.
-        compensated: Whether a compensator stood before the actuator.
+        compensated: Whether a compensator was used.
         command_unit: ``A`` or ``V``.
-        waveform: What ran, for people, in the segment that is judged.
-        figures: Figures of the run.
-        loop: float64[2, m], the loop that is judged, input and displacement, closed; see
-            :class:`hilctl.analysis.steady_state.SteadyPart`. Empty where nothing repeats.
-        error_um: float64[2, m], phase in cycles and displacement less reference; empty without.
-        modelled: float64[3, m], command, displacement and what the model makes of it, in um, over
-            one cycle; empty without a model.
-        model_error_percent: Largest of their difference, of the peak-to-peak; None without.
-        step: float64[2, k], time in s and displacement in um after the largest step; empty without.
-        response: Small-signal response; None without one.
+        waveform: Label of the evaluated segment.
+        figures: Metrics of the run.
+        loop: float64[2, m], input and displacement of the evaluated loop, closed; see
+            :class:`hilctl.analysis.steady_state.SteadyPart`. Empty without a cycle.
+        error_um: float64[2, m], phase in cycles and error in um; empty without a reference.
+        modelled: float64[3, m], command, measured and modelled displacement over one cycle; empty
+            without a model.
+        model_error_percent: Largest model error, of the peak-to-peak; None without a model.
+        step: float64[2, k], time in s and displacement in um after the largest step, or empty.
+        response: Small-signal response, or None.
     """
 
     name: str
@@ -283,19 +283,19 @@ class RunDigest:
 
     @property
     def is_plain_loop(self) -> bool:
-        """Whether it shows the loop of the actuator itself: nothing compensated it."""
+        """Whether it has a loop of the actuator without a compensator."""
         return bool(self.loop.size) and not self.compensated
 
 
 def digest_of(recording: Recording, model: HysteresisModel | None = None) -> RunDigest:
-    """Take from a recording what figures of many runs need.
+    """Return the digest of a recording.
 
     Args:
         recording: The run.
-        model: Model to hold against what was measured; the recorded one where None.
+        model: Model to compare with the measurement; the recorded one if None.
 
     Raises:
-        DataError: A fact of it is no number.
+        DataError: A metadata value is not a number.
     """
     values = _experiment(recording)
     waveform = _waveform(values)
@@ -324,7 +324,7 @@ def digest_of(recording: Recording, model: HysteresisModel | None = None) -> Run
 def _experiment(recording: Recording) -> Mapping[str, Any]:
     try:
         data = Document(f"{recording.path}: experiment.yaml", recording.experiment_yaml).data
-    except InputError:  # of another version, or damaged: figures need no settings
+    except InputError:  # of another version, or damaged
         return {}
     return data if isinstance(data, dict) else {}
 
@@ -344,7 +344,7 @@ def _worst(recording: Recording) -> Segment | None:
 
 
 def _is_loop(segment: Segment | None, waveform: Any) -> TypeGuard[Segment]:
-    """Return whether displacement against input is a loop: of many sines at once it is a tangle."""
+    """Return whether displacement against input is a loop; for a multisine it is not."""
     return segment is not None and not isinstance(waveform, Multisine)
 
 
@@ -370,7 +370,7 @@ def _cycle(recording: Recording, segment: Segment) -> dict[str, Any]:
 def _modelled(
     recording: Recording, segment: Segment, model: HysteresisModel | None
 ) -> dict[str, Any]:
-    """Return the measured cycle beside what a model makes of its command."""
+    """Return the measured and the modelled cycle."""
     from hilctl.identify.data.cycles import loops_from_recording
     from hilctl.identify.evaluation import judge
 
@@ -382,7 +382,7 @@ def _modelled(
             return {}
         loop = loops_from_recording(recording, POINTS, [segment.label])[-1]
         found = judge(known, [loop])
-    except (DataError, ConfigError, ModelError):  # no cycle, or a model that can't be read
+    except (DataError, ConfigError, ModelError):  # no cycle, or an unreadable model
         return {}
     modelled = np.array((loop.command, loop.displacement_um, found.modelled_um[0]))
     return {
@@ -401,7 +401,7 @@ def _after_step(
         return _NO_LOOP.copy()
     t = (samples.index - samples.index[0]) / recording.sample_rate_hz
     if structure is not None and structure.natural_hz is not None:
-        # So few cycles that every so-manieth sample draws them: highs and lows would be a zigzag.
+        # Few cycles: decimate, because minima and maxima would form a zigzag.
         part = t <= _STEP_CYCLES / structure.natural_hz
         step = max(1, int(np.count_nonzero(part)) // _STEP_POINTS)
         return np.array((t[part][::step], samples.displacement_um[part][::step]))

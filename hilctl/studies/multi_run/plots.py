@@ -1,4 +1,4 @@
-"""Figures of many runs: trends, sensitivity and order; selection and files."""
+"""Figures of trends, sensitivity and drift; selection and files of all figures."""
 
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from functools import partial
@@ -46,7 +46,7 @@ from hilctl.studies.multi_run.trend import (
 )
 from hilctl.studies.multi_run.varied_parameter import VariedParameter
 
-_WIDE_RATIO = 30.0  # of a dimension's ends: then, with many values, its axis is logarithmic
+_WIDE_RATIO = 30.0  # of a range that needs a logarithmic axis
 _MANY = 10
 _HEADROOM = 1.08
 _LONGEST_NAME = 24
@@ -57,9 +57,9 @@ _MOST_BARS = 12
 
 
 def trend_sheets(series: RunSeries) -> Iterator[FigureSpec]:
-    """Yield figures against each dimension of numbers; those of loops with a fit along frequency.
+    """Yield metrics against each numeric parameter, with linear fits against frequency.
 
-    Stroke and area are drawn of runs without a compensator: with one, they are the reference's.
+    Stroke and area are plotted for runs without a compensator: with one, they follow the reference.
     """
     plain = [run for run in series.done if run.digest is None or run.digest.is_plain_loop]
     for along in series.dimensions:
@@ -80,7 +80,7 @@ def trend_sheets(series: RunSeries) -> Iterator[FigureSpec]:
             yield FigureSpec(f"minor_loops_against_{name}", caption, minor)
         left = _trend_panels(series, along, _compared(series), None)
         if left and any(run.digest and run.digest.compensated for run in series.done):
-            caption = f"What compensators leave, and errors of models, against {along.name}."
+            caption = f"Residual errors of compensators and models against {along.name}."
             yield FigureSpec(f"compensation_against_{name}", caption, left)
 
 
@@ -106,19 +106,19 @@ def _trend_panels(
 
 
 def draw_trends(axes: Axes, series: RunSeries, found: Sequence[Trend], *, fitted: bool) -> None:
-    """Draw trends of one figure, a line for all values of the other dimensions.
+    """Plot the trends of one metric, one line per combination of the other parameters.
 
     Args:
-        axes: Where.
+        axes: Axes to plot in.
         series: The runs.
         found: The trends.
-        fitted: Whether lines are fitted to what grows with frequency.
+        fitted: Whether to plot linear fits.
     """
     along, figure = found[0].along, found[0].figure
     found = spread(found, _MOST_LINES)
     others = [each for each in series.dimensions if each is not along]
     apart = (e for e in others if len({t.held.get(e.key) for t in found}) == len(found))
-    first = next(apart, None)  # that alone tells all lines apart
+    first = next(apart, None)  # a parameter that distinguishes all lines
     names = [_held(others, trend) or figure.text for trend in found]
     look = _looks(first, found)
     logarithmic = _is_logarithmic(along)
@@ -158,7 +158,7 @@ def _looks(first: VariedParameter | None, found: Sequence[Trend]) -> list[dict[s
     if first is None:
         of = looks(None, list(range(len(found))))
         return [dict(of[k]) for k in range(len(found))]
-    of = looks(first, first.values)  # of all, so that a value looks the same in every panel
+    of = looks(first, first.values)  # of all values, for the same colours in every panel
     return [dict(of[trend.held[first.key]]) for trend in found]
 
 
@@ -175,7 +175,7 @@ def _unit(series: RunSeries, figure: RunFigure) -> str:
 
 
 def resonance_sheet(series: RunSeries) -> FigureSpec | None:
-    """Return natural frequency and damping against what varied; None where no run has them."""
+    """Return natural frequency and damping against a parameter; None without any."""
     for along in series.dimensions:
         found = trends(series, NATURAL, along) if along.numeric else []
         if found:
@@ -186,10 +186,9 @@ def resonance_sheet(series: RunSeries) -> FigureSpec | None:
 
 
 def sensitivity_sheet(series: RunSeries) -> FigureSpec | None:
-    """Return how far figures change over the range of each dimension; None with fewer than two.
+    """Return the sensitivity of metrics to each parameter; None with fewer than two parameters.
 
-    The change is that of the mean over all other dimensions, of the mean of all: what it is most
-    sensitive to stands above.
+    Sensitivity is the change of the mean over all other parameters, in percent of the total mean.
     """
     numbers = [each for each in series.dimensions if len(each.values) > 1]
     plain = [run for run in series.done if run.digest is None or run.digest.is_plain_loop]
@@ -204,8 +203,8 @@ def sensitivity_sheet(series: RunSeries) -> FigureSpec | None:
     if not panels:
         return None
     caption = (
-        "Sensitivity: change of each figure over the range of what varied, all else averaged, "
-        "in percent of its mean."
+        "Sensitivity: change of each metric over the range of a parameter, averaged over the "
+        "others, in percent of its mean."
     )
     return FigureSpec("sensitivity", caption, panels, most_beside=1)
 
@@ -240,7 +239,7 @@ def _draw_bars(axes: Axes, bars: Sequence[tuple[str, float]]) -> None:
 
 
 def order_sheet(series: RunSeries) -> FigureSpec | None:
-    """Return figures in the order of the runs, reference runs marked; None without those."""
+    """Return metrics in the order of the runs; None without reference runs."""
     known = [run for run in series.runs if run.completed]
     panels = tuple(
         Panel(partial(_draw_order, figure=figure, runs=known), figure.text, 0.45)
@@ -249,7 +248,7 @@ def order_sheet(series: RunSeries) -> FigureSpec | None:
     )
     if not panels or not any(run.is_reference for run in known):
         return None
-    caption = "Figures in the order of the runs; what reference runs change by is drift."
+    caption = "Metrics in the order of the runs; a change of the reference runs is drift."
     return FigureSpec("in_order", caption, panels, stacked=True)
 
 
@@ -269,7 +268,7 @@ def _draw_order(axes: Axes, figure: RunFigure, runs: Sequence[SeriesRun]) -> Non
 
 
 def sheets_of(series: RunSeries) -> list[FigureSpec]:
-    """Return the figures of runs, what a reader wants first in front."""
+    """Return all figures that apply, the most important first."""
     return [sheet for sheet in _sheets(series) if sheet is not None]
 
 

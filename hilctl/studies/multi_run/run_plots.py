@@ -24,24 +24,24 @@ _SIGNS = ("o", "s", "^", "D", "v", "P", "X", "<", ">")
 _LINES = ("-", "--", "-.", ":")
 _NAMED = (WITH, WITHOUT, ERROR, MARK, "#E69F00", "#56B4E9", REFERENCE, QUIET)
 _MOST_CURVES = 7
-"""More loops than that can't be told apart."""
+"""Most distinguishable curves."""
 
 
 def spread(items: Sequence[Item], most: int = _MOST_CURVES) -> list[Item]:
-    """Return at most so many of a sequence, its ends among them, evenly spread."""
+    """Return at most ``most`` evenly spread items of a sequence, including both ends."""
     if len(items) <= most:
         return list(items)
     return [items[k] for k in np.unique(np.linspace(0, len(items) - 1, most).round().astype(int))]
 
 
 def looks(dimension: VariedParameter | None, values: Sequence[Hashable]) -> Mapping[Hashable, Any]:
-    """Return how a line of each value is drawn.
+    """Return colour and marker for each value.
 
-    Numbers go through viridis, which keeps its order in grey and for colour-blind people; names
-    have colours of Okabe and Ito. Signs differ too.
+    Numbers use viridis, which keeps its order in greyscale and for colour-blind readers. Names use
+    the colours of Okabe and Ito.
 
     Args:
-        dimension: What the values are of; None where they are names.
+        dimension: The parameter of the values; None for names.
         values: The values.
     """
     if dimension is not None and dimension.numeric and len(values) > 1:
@@ -57,7 +57,7 @@ def looks(dimension: VariedParameter | None, values: Sequence[Hashable]) -> Mapp
 
 
 def _of_names(names: Sequence[Hashable]) -> list[str]:
-    """Return a colour a name; runs without a compensator have theirs, and no other has it then."""
+    """Return one colour per name; one colour is reserved for runs without a compensator."""
     if WITHOUT_COMPENSATOR not in names:
         return [_NAMED[k % len(_NAMED)] for k in range(len(names))]
     others = cycle(colour for colour in _NAMED if colour != WITHOUT)
@@ -65,7 +65,7 @@ def _of_names(names: Sequence[Hashable]) -> list[str]:
 
 
 def line_of(look: Mapping[str, Any], number: int = 0) -> dict[str, Any]:
-    """Return a look without its sign, for a long line, dashed otherwise by its number."""
+    """Return a line style without a marker; its number selects the dashes."""
     return {"color": look["color"], "linestyle": _LINES[number % len(_LINES)]}
 
 
@@ -75,7 +75,7 @@ _DISPLACEMENT_AXIS = "displacement, µm"
 
 
 def loop_sheets(series: RunSeries) -> Iterator[FigureSpec]:
-    """Yield the loops by each dimension of numbers, one panel for values of the others."""
+    """Yield the loops against each numeric parameter, one panel per value of the others."""
     for along in series.dimensions:
         groups = _groups(series, along)
         if along.numeric and groups:
@@ -90,13 +90,13 @@ def loop_sheets(series: RunSeries) -> Iterator[FigureSpec]:
 
 
 def _alike(groups: Sequence[tuple[str, Sequence[SeriesRun]]]) -> bool:
-    """Return whether loops are of one input: then they have one axis."""
+    """Return whether all loops have the same input, so that their panels can share axes."""
     digests = [run.digest for _, runs in groups for run in runs if run.digest is not None]
     return len({_input_axis(digest) for digest in digests}) == 1
 
 
 def _groups(series: RunSeries, along: VariedParameter) -> list[tuple[str, list[SeriesRun]]]:
-    """Return the runs with loops that differ by a dimension only, with what they have in common."""
+    """Return groups of runs that differ in one parameter only, with their common values."""
     others = [each for each in series.dimensions if each is not along]
     found: dict[tuple[Hashable, ...], dict[Hashable, SeriesRun]] = {}
     for run in series.done:
@@ -134,7 +134,7 @@ def _draw_loops(axes: Axes, along: VariedParameter, runs: Sequence[SeriesRun]) -
 
 
 def minor_loop_sheet(series: RunSeries) -> FigureSpec | None:
-    """Return loops with the minor loops in them, one panel a run; None where no run has any."""
+    """Return loops with their minor loops, one panel per run; None without minor loops."""
     runs = [
         run
         for run in series.done
@@ -145,14 +145,14 @@ def minor_loop_sheet(series: RunSeries) -> FigureSpec | None:
     if not runs:
         return None
     panels, more = _panels(series, runs, _draw_minor)
-    caption = f"Minor loops, where the input turns back within the cycle{more}."
+    caption = f"Minor loops, at reversals of the input within the cycle{more}."
     return FigureSpec("minor_loops", caption, panels, alike=True)
 
 
 def _panels(
     series: RunSeries, runs: Sequence[SeriesRun], draw: Callable[..., None]
 ) -> tuple[tuple[Panel, ...], str]:
-    """Return a panel a run, spread over all where they are many, and what to say of that."""
+    """Return one panel per run, of a selection of many runs, and a note on the selection."""
     panels = tuple(
         Panel(partial(draw, run=run), series.text(run), _SQUARE)
         for run in spread(runs, _MOST_PANELS)
@@ -171,12 +171,12 @@ def _draw_minor(axes: Axes, run: SeriesRun) -> None:
 
 
 def model_sheet(series: RunSeries) -> FigureSpec | None:
-    """Return measured loops and what models make of their commands; None without models."""
+    """Return measured and modelled loops; None without models."""
     runs = [run for run in series.done if run.digest is not None and run.digest.modelled.size]
     if not runs:
         return None
     panels, more = _panels(series, runs, _draw_model)
-    caption = f"Measured loops and the model's, command against displacement{more}."
+    caption = f"Measured and modelled loops{more}."
     return FigureSpec("model_against_measured", caption, panels, alike=True)
 
 
@@ -192,10 +192,10 @@ def _draw_model(axes: Axes, run: SeriesRun) -> None:
 
 
 def before_after_sheet(series: RunSeries) -> FigureSpec | None:
-    """Return loops without and with each compensator, as parts of their range; None without both.
+    """Return loops without and with each compensator, normalised to their range; None without both.
 
-    Command and reference have different units, so that each is shown over its own range: a straight
-    line from corner to corner is what a compensator is for.
+    Command and reference have different units. A perfect compensator gives a straight line from
+    corner to corner.
     """
     pairs = pairs_of(series)
     if not pairs:
@@ -204,7 +204,7 @@ def before_after_sheet(series: RunSeries) -> FigureSpec | None:
         Panel(partial(_draw_pair, before=before, after=after), title, _SQUARE)
         for title, before, after in spread(pairs, _MOST_PANELS)
     )
-    caption = "Loops before and after compensation, each over its own range; dotted: no hysteresis."
+    caption = "Loops before and after compensation, normalised; dotted: no hysteresis."
     return FigureSpec("before_and_after", caption, panels, alike=True)
 
 
@@ -212,7 +212,7 @@ Pair = tuple[str, SeriesRun, list[tuple[str, SeriesRun]]]
 
 
 def pairs_of(series: RunSeries) -> list[Pair]:
-    """Return each run without a compensator, with those of the same settings that have one."""
+    """Return each run without a compensator, with the runs of the same settings with one."""
     with_loop = [run for run in series.done if run.digest is not None and run.digest.loop.size]
     before = [run for run in with_loop if run.digest and not run.digest.compensated]
     after = [run for run in with_loop if run.digest and run.digest.compensated]
@@ -253,7 +253,7 @@ def _of_range(values: F64) -> F64:
 
 
 def error_sheet(series: RunSeries) -> FigureSpec | None:
-    """Return the error over one cycle of compensated runs; None where no run has any."""
+    """Return the error over one cycle of compensated runs; None without any."""
     runs = [run for run in series.done if run.digest is not None and run.digest.error_um.size]
     if not runs:
         return None
@@ -271,7 +271,7 @@ def error_sheet(series: RunSeries) -> FigureSpec | None:
         Panel(partial(_draw_error, text=_text_of(series, along), runs=members), title)
         for title, members in spread(groups, _MOST_PANELS)
     )
-    caption = "Error over one average cycle: displacement less reference."
+    caption = "Error over one average cycle: displacement minus reference."
     return FigureSpec("error_history", caption, panels, alike=len(panels) > 1)
 
 
@@ -306,7 +306,7 @@ def _note(axes: Axes, text: str) -> None:
 
 
 def step_sheet(series: RunSeries) -> FigureSpec | None:
-    """Return displacements after a step, a panel a run; None where there is none."""
+    """Return displacements after a step, one panel per run; None without any."""
     runs = [run for run in series.done if run.digest is not None and run.digest.step.size]
     if not runs:
         return None
@@ -339,7 +339,7 @@ def _draw_step(axes: Axes, run: SeriesRun) -> None:
 
 
 def frequency_sheet(series: RunSeries) -> FigureSpec | None:
-    """Return small-signal responses, measured and fitted; None where there is none."""
+    """Return small-signal responses, measured and fitted; None without any."""
     runs = [run for run in series.done if run.digest and run.digest.response is not None]
     if not runs:
         return None

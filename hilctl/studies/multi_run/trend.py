@@ -18,14 +18,14 @@ _FEWEST = 3
 
 @dataclass(frozen=True, slots=True)
 class RunFigure:
-    """A figure that is compared among runs.
+    """A metric to compare among runs.
 
     Attributes:
         name: Its column in the table.
-        text: What it is, for people.
+        text: Its name.
         unit: Its unit; ``%`` or as in :func:`hilctl.base.formatting.quantity`.
-        short: Heading where there is no room for more.
-        value: Takes it from a run; None where it has none.
+        short: Short heading.
+        value: Returns it for a run, or None.
     """
 
     name: str
@@ -35,7 +35,7 @@ class RunFigure:
     value: Callable[[SeriesRun], float | None]
 
     def of(self, runs: Sequence[SeriesRun]) -> list[tuple[SeriesRun, float]]:
-        """Return the runs that have it, each with its value."""
+        """Return the runs that have a value, each with the value."""
         found = [(run, self.value(run)) for run in runs]
         return [(run, value) for run, value in found if value is not None]
 
@@ -75,17 +75,17 @@ ASYMMETRY = RunFigure("asymmetry_percent", "asymmetry", "%", "asym. %", _asymmet
 
 @dataclass(frozen=True, slots=True)
 class Trend:
-    """A figure against one dimension, all others held.
+    """A metric against one varied parameter, with the others constant.
 
     Attributes:
-        figure: The figure.
-        along: What varies along it.
-        held: Value of each other dimension, by its key.
-        x: float64[n], values of ``along``, rising.
-        y: float64[n], the figure, averaged over repeats.
-        slope: Of the closest line; None with fewer than three points.
-        offset: Of the closest line.
-        r2: Share of the variance that the line explains; None as ``slope``.
+        figure: The metric.
+        along: The varied parameter.
+        held: Value of each other parameter, by its key.
+        x: float64[n], values of ``along``, ascending.
+        y: float64[n], the metric, averaged over repeats.
+        slope: Slope of the linear fit; None with fewer than three points.
+        offset: Offset of the linear fit.
+        r2: Coefficient of determination; None like ``slope``.
     """
 
     figure: RunFigure
@@ -99,7 +99,7 @@ class Trend:
 
     @property
     def direction(self) -> str:
-        """``rises``, ``falls``, ``does not change``, or empty where it is neither."""
+        """``rises``, ``falls``, ``does not change``, or empty."""
         spread = float(np.ptp(self.y))
         if spread <= _SPREAD * float(np.mean(np.abs(self.y))):
             return "does not change"
@@ -129,13 +129,13 @@ def trends(
     along: VariedParameter,
     runs: Sequence[SeriesRun] | None = None,
 ) -> list[Trend]:
-    """Return a figure's trends along a dimension, one for all values of the others.
+    """Return the trends of a metric, one per combination of the other parameters.
 
     Args:
         series: The runs.
-        figure: The figure.
-        along: The dimension; of numbers.
-        runs: Those of the runs that count; all that were completed where None.
+        figure: The metric.
+        along: The varied parameter, with numeric values.
+        runs: The runs to use; all completed ones if None.
     """
     others = [each for each in series.dimensions if each.key != along.key]
     grouped: dict[tuple[Hashable, ...], dict[float, list[float]]] = defaultdict(
@@ -177,7 +177,7 @@ def _trend(
 def extremes(
     figure: RunFigure, runs: Sequence[SeriesRun]
 ) -> tuple[tuple[SeriesRun, float], tuple[SeriesRun, float]] | None:
-    """Return the runs with the lowest and the highest value of a figure; None without any."""
+    """Return the runs with the lowest and the highest value of a metric; None without any."""
     found = figure.of(runs)
     if not found:
         return None
@@ -185,11 +185,11 @@ def extremes(
 
 
 _MOST_FAILED = 3
-_LINEAR = 0.95  # least r2 of what is called linear
+_LINEAR = 0.95  # least r2 of a linear trend
 
 
 def headline(series: RunSeries) -> list[str]:
-    """Return sentences: how many runs, what came out with best and worst, and trends."""
+    """Return sentences on the number of runs, best and worst results, trends and drift."""
     return [_counted(series), *_results(series), *_trends(series), *_drift(series)]
 
 
@@ -208,7 +208,7 @@ def _counted(series: RunSeries) -> str:
             f"{len(series.failed)} failed: {shown}" + (f" and {more} more" if more > 0 else "")
         )
     if series.planned:
-        parts.append(f"{series.planned} still to come")
+        parts.append(f"{series.planned} remaining")
     return f"{', '.join(parts)}."
 
 
@@ -245,7 +245,7 @@ def _between(series: RunSeries, figure: RunFigure, runs: Sequence[SeriesRun]) ->
 
 
 def _compensators(series: RunSeries, compensator: VariedParameter) -> Iterator[str]:
-    """Say peak hysteresis before and after, with the worst place of each."""
+    """Yield peak hysteresis without and with compensators, and where each is worst."""
     parts = []
     for value in compensator.values:
         runs = [run for run in series.done if run.values.get(compensator.key) == value]
@@ -291,7 +291,7 @@ def _verb(names: Sequence[str], direction: str) -> str:
 
 
 def _uncompensated(series: RunSeries, trend: Trend) -> bool:
-    """Return whether a trend is of the actuator itself, not of what a compensator has left."""
+    """Return whether a trend is of runs without a compensator."""
     return not any(
         run.digest is not None and run.digest.compensated
         for run in series.done
@@ -308,7 +308,7 @@ def _linear(series: RunSeries, along: VariedParameter) -> Iterator[str]:
     if found and min(found) >= _LINEAR:
         low, high = f"{min(found):.4f}", f"{max(found):.4f}"
         between = low if low == high else f"{low} to {high}"
-        yield f"The loop's area is linear in {along.name} (r² {between})."
+        yield f"The loop area is linear in {along.name} (r² {between})."
 
 
 def _drift(series: RunSeries) -> Iterator[str]:

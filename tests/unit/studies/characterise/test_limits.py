@@ -19,7 +19,7 @@ def test_the_band_follows_from_the_sample_rate(limits_with, rate_hz, lowest_hz, 
 
 def test_the_highest_frequency_may_be_asked_for(limits_with):
     assert limits_with(highest_hz=20.0).highest_hz == 20.0
-    with pytest.raises(InputError, match="--highest-hz must be above 0 and at most 200 Hz"):
+    with pytest.raises(InputError, match=r"--highest-hz .*200 Hz"):
         limits_with(highest_hz=300.0)
 
 

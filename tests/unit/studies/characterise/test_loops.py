@@ -53,7 +53,7 @@ def test_cycles_that_differ_scatter(limits, played):
 
 
 def test_a_sensor_at_its_end_is_a_problem(limits, played):
-    with pytest.raises(RigProblemError, match="stands at 10 µm for") as caught:
+    with pytest.raises(RigProblemError, match="10 µm") as caught:
         loop(limits, played, lambda v: np.minimum(plays(v), 10.0), noise_um=0.0)
     assert caught.value.code == "saturated_sensor"
 
@@ -66,7 +66,7 @@ def test_a_coarse_sensor_is_not_at_its_end(limits, played):
 def test_a_segment_without_a_cycle_has_no_loop(make_recording):
     run = make_recording(np.zeros(100), segments=[Segment("chirp", 0, 100, 0, 100)])
     assert all_loops(run) == ()
-    with pytest.raises(DataError, match="no whole steady cycle"):
+    with pytest.raises(DataError, match="steady cycle"):
         loop_figures(run, run.segments[0])
 
 

@@ -158,7 +158,7 @@ def test_missing_samples_are_refused(make_recording, run):
         index=np.arange(100, 2000),
         sample_rate_hz=RATE_HZ,
     )
-    with pytest.raises(DataError, match="samples are missing or have no displacement"):
+    with pytest.raises(DataError, match="missing"):
         held_out(MODEL, short, 0.0, "x")
 
 

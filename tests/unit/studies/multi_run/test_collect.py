@@ -45,14 +45,14 @@ def test_other_tables_are_none(rows, tmp_path):
     assert find_table(tmp_path) is None
     for name in ("one", "two"):
         write(tmp_path / f"{name}.csv", rows)
-    with pytest.raises(InputError, match=r"several campaigns: one\.csv, two\.csv"):
+    with pytest.raises(InputError, match=r"one\.csv, two\.csv"):
         find_table(tmp_path)
 
 
 def test_a_broken_row_is_said_with_its_line(rows, tmp_path):
     path = write(tmp_path / "few.csv", rows)
     path.write_text(path.read_text().replace("\n2,3,False", "\nx,3,False"))
-    with pytest.raises(DataError, match=r"few\.csv:\d: is no row of a campaign's table"):
+    with pytest.raises(DataError, match=r"few\.csv:\d: "):
         read_entries(path)
 
 
@@ -108,11 +108,11 @@ def test_a_campaign_s_table_says_what_varied_and_what_failed(folder):
 def test_what_was_named_must_be_there(folder, tmp_path):
     with pytest.raises(DataError, match="no such file"):
         collect([tmp_path / "none.mcap"])
-    with pytest.raises(InputError, match="name one folder, or recordings only"):
+    with pytest.raises(InputError, match="one folder"):
         collect([folder, RUNS[0]])
     empty = tmp_path / "empty"
     empty.mkdir()
-    with pytest.raises(InputError, match="holds no recordings"):
+    with pytest.raises(InputError, match="no recordings"):
         collect([empty])
 
 
@@ -121,7 +121,7 @@ def test_a_recording_too_long_for_memory_is_left_out_and_named(folder, monkeypat
     short = [path for path in folder.glob("*.mcap") if path.stat().st_size <= module.MOST_BYTES]
     series = collect([folder])
     assert len(series.runs) == len(short) > 0
-    assert all("too long for a page of many runs" in text for text in series.missing)
+    assert all("hilctl report" in text for text in series.missing)
     assert len(series.missing) == len(list(folder.glob("*.mcap"))) - len(short) > 0
 
 
@@ -131,5 +131,5 @@ def test_a_recording_without_an_end_is_not_completed(monkeypatch):
     found = module.read
     monkeypatch.setattr(module, "read", lambda path: replace(found(path), end={}))
     series = collect([RUNS[0]])
-    assert series.runs[0].result == "cut short: its end was not recorded"
+    assert series.runs[0].result.startswith("truncated")
     assert series.done == ()
