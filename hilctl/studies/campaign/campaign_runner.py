@@ -26,6 +26,7 @@ from hilctl.studies.campaign.store import (
 from hilctl.studies.campaign.table import CampaignRow, entry_of, write_table
 from hilctl.studies.multi_run.collect import COMPLETED, series_of
 from hilctl.studies.multi_run.digest import SeriesDrift, digest_of, drift_of
+from hilctl.studies.multi_run.multi_run_page import write_series
 from hilctl.studies.step_runner import StepRunner, StudyHost, raise_if_stopped
 
 HARMLESS = frozenset({"late", "dropped", "invalid_command"})
@@ -132,14 +133,11 @@ class Campaign:
         return CampaignResult(self.plan, self.rows, tables, reason, stop_signal, self._page)
 
     def _write_page(self) -> None:
-        from hilctl.studies.multi_run.multi_run_page import write_series  # imports matplotlib
-
         start_s, name = self._host.now_s(), self.plan.campaign.config.name
         path = self.plan.folder / f"{name}.html"
-        rows = _ordered(self.plan, self.rows)
-        digests = {row.recording: row.digest for _, row in rows if row.digest is not None}
+        runs = [entry_of(*each) for each in _ordered(self.plan, self.rows)]
         try:
-            write_series(series_of(name, [entry_of(*each) for each in rows], digests), path)
+            write_series(series_of(name, runs), path)
         except InputError as error:  # recordings and table hold everything that is on it
             self._host.on_note(f"no page: {error}")
             return

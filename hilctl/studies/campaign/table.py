@@ -20,9 +20,10 @@ from hilctl.studies.multi_run.collect import (
     REPEAT,
     RESULT,
     STEP,
-    SeriesEntry,
+    SeriesRun,
 )
 from hilctl.studies.multi_run.digest import FIGURES, RunDigest, RunFigures
+from hilctl.studies.multi_run.varied_parameter import short_value
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,9 +122,10 @@ def csv_text(table: Mapping[str, Sequence[Any]]) -> str:
     return stream.getvalue()
 
 
-def entry_of(step: CampaignStep, row: CampaignRow) -> SeriesEntry:
-    """Return a step and its outcome as an entry that is read from the table."""
-    return SeriesEntry(
-        step.number, step.repeat, step.is_reference, step.point, row.figures, row.result,
-        row.recording,
+def entry_of(step: CampaignStep, row: CampaignRow) -> SeriesRun:
+    """Return a step and its outcome as a run of a report."""
+    values = {key: short_value(value) for key, value in step.point.items()}
+    return SeriesRun(
+        step.number, step.is_reference, values, row.figures, row.result, row.recording,
+        row.digest, step.repeat,
     )  # fmt: skip

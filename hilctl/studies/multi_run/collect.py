@@ -4,7 +4,7 @@ import csv
 import io
 import json
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -41,26 +41,33 @@ PLANNED = "planned"
 
 
 @dataclass(frozen=True, slots=True)
-class SeriesEntry:
-    """One row of a table.
+class SeriesRun:
+    """One run of several.
 
     Attributes:
-        step: Number of the step, from 1.
-        repeat: Number of the repeat or of the reference run.
-        is_reference: Whether it is a reference run.
-        values: Value of each varied key, or None.
-        figures: Metrics of its recording.
+        number: Its position, from 1.
+        is_reference: Whether it is a reference run of a campaign.
+        values: Value of each varied key, as a number or short text.
+        figures: Its metrics.
         result: ``completed``, ``planned``, or code and reason.
         recording: Name of its recording, or empty.
+        digest: Data of its recording for figures, or None.
+        repeat: Number of the repeat or of the reference run.
     """
 
-    step: int
-    repeat: int
+    number: int
     is_reference: bool
-    values: Mapping[str, Any]
+    values: Mapping[str, Hashable]
     figures: RunFigures
     result: str
     recording: str
+    digest: RunDigest | None = None
+    repeat: int = 1
+
+    @property
+    def completed(self) -> bool:
+        """Whether the run was completed."""
+        return self.result == COMPLETED
 
 
 def find_table(folder: Path) -> Path | None:
@@ -85,7 +92,7 @@ def _is_table(path: Path) -> bool:
     return tuple(head[: len(FIRST)]) == FIRST and tuple(head[-len(LAST) :]) == LAST
 
 
-def read_entries(path: Path) -> list[SeriesEntry]:
+def read_entries(path: Path) -> list[SeriesRun]:
     """Return the rows of a campaign's table.
 
     Raises:
@@ -106,15 +113,15 @@ def read_entries(path: Path) -> list[SeriesEntry]:
     return entries
 
 
-def _entry(row: Mapping[str, str], keys: list[str]) -> SeriesEntry:
-    return SeriesEntry(
-        step=int(row[STEP]),
-        repeat=int(row[REPEAT]),
+def _entry(row: Mapping[str, str], keys: list[str]) -> SeriesRun:
+    return SeriesRun(
+        number=int(row[STEP]),
         is_reference={"True": True, "False": False}[row[REFERENCE]],
-        values={key: plain_value(row[key]) for key in keys},
+        values={key: short_value(plain_value(row[key])) for key in keys},
         figures=RunFigures(**{name: _number(name, row.get(name, "")) for name in FIGURES}),
         result=row[RESULT],
         recording=row[RECORDING],
+        repeat=int(row[REPEAT]),
     )
 
 
@@ -141,34 +148,6 @@ OnRead = Callable[[float, str], None]
 
 MOST_BYTES = 512 << 20
 """Largest recording to read; it takes about eight times as much memory."""
-
-
-@dataclass(frozen=True, slots=True)
-class SeriesRun:
-    """One run of several.
-
-    Attributes:
-        number: Its position, from 1.
-        is_reference: Whether it is a reference run of a campaign.
-        values: Value of each varied key, as a number or short text.
-        figures: Its metrics.
-        result: ``completed``, ``planned``, or code and reason.
-        recording: Name of its recording, or empty.
-        digest: Data of its recording for figures, or None.
-    """
-
-    number: int
-    is_reference: bool
-    values: Mapping[str, Hashable]
-    figures: RunFigures
-    result: str
-    recording: str
-    digest: RunDigest | None = None
-
-    @property
-    def completed(self) -> bool:
-        """Whether the run was completed."""
-        return self.result == COMPLETED
 
 
 @dataclass(frozen=True)
@@ -255,32 +234,16 @@ def collect(
     return _of_files(found, folders[0].resolve().name, model, on_read, missing=[])
 
 
-def series_of(
-    name: str, entries: Sequence[SeriesEntry], digests: Mapping[str, RunDigest],
-    missing: Sequence[str] = (),
-) -> RunSeries:  # fmt: skip
-    """Return the runs of a campaign's table.
+def series_of(name: str, runs: Sequence[SeriesRun], missing: Sequence[str] = ()) -> RunSeries:
+    """Return the runs of a campaign.
 
     Args:
         name: Name of the campaign.
-        entries: Rows of its table.
-        digests: Data of the recordings, by their names.
+        runs: Runs of its table, with their digests.
         missing: Errors of recordings that can't be read.
     """
-    keys = tuple(dict.fromkeys(key for entry in entries for key in entry.values))
-    runs = tuple(
-        SeriesRun(
-            entry.step,
-            entry.is_reference,
-            {key: short_value(value) for key, value in entry.values.items()},
-            entry.figures,
-            entry.result,
-            entry.recording,
-            digests.get(entry.recording),
-        )
-        for entry in entries
-    )
-    return RunSeries(name, runs, keys, tuple(missing), is_campaign=True)
+    keys = tuple(dict.fromkeys(key for run in runs for key in run.values))
+    return RunSeries(name, tuple(runs), keys, tuple(missing), is_campaign=True)
 
 
 def _digest(path: Path, model: HysteresisModel | None) -> RunDigest:
@@ -293,18 +256,17 @@ def _digest(path: Path, model: HysteresisModel | None) -> RunDigest:
 
 
 def _of_campaign(table: Path, model: HysteresisModel | None, on_read: OnRead) -> RunSeries:
-    entries = read_entries(table)
-    named = [entry for entry in entries if entry.recording and entry.result == COMPLETED]
-    digests, missing = {}, []
-    for number, entry in enumerate(named):
-        on_read(number / len(named), f"read {entry.recording}")
-        # A name in the table must not refer to another folder.
-        path = table.parent / Path(entry.recording).name
-        try:
-            digests[entry.recording] = _digest(path, model)
-        except DataError as error:
-            missing.append(str(error))
-    return series_of(table.stem, entries, digests, missing)
+    runs, missing = read_entries(table), []
+    for number, run in enumerate(runs):
+        if run.recording and run.completed:
+            on_read(number / len(runs), f"read {run.recording}")
+            # A name in the table must not refer to another folder.
+            path = table.parent / Path(run.recording).name
+            try:
+                runs[number] = replace(run, digest=_digest(path, model))
+            except DataError as error:
+                missing.append(str(error))
+    return series_of(table.stem, runs, missing)
 
 
 def _of_files(

@@ -17,6 +17,8 @@ from hilctl.base.samples import Samples
 from hilctl.base.segments import Segment
 from hilctl.base.types import F64
 from hilctl.base.yaml import Document
+from hilctl.identify.data.cycles import loops_from_recording
+from hilctl.identify.evaluation import judge
 from hilctl.models.base import HysteresisModel
 from hilctl.models.model_file import parse_model
 from hilctl.recording.metadata_keys import HEAT_FACT, LabelValue
@@ -76,23 +78,18 @@ class RunFigures:
 FIGURES = tuple(field.name for field in fields(RunFigures))
 
 
-def figures_of(recording: Recording, waveform: Any) -> RunFigures:
-    """Work out the figures of a whole run.
+def figures_of(recording: Recording, structure: SmallSignal | Ringing | None) -> RunFigures:
+    """Return the metrics of a run.
 
     Args:
         recording: The run.
-        waveform: Waveform of its experiment.
+        structure: Its natural frequency and damping; see :func:`structure_of`.
 
     Raises:
         DataError: A metadata value is not a number.
     """
-    return figures_with(recording, structure_of(recording, waveform))
-
-
-def figures_with(recording: Recording, structure: SmallSignal | Ringing | None) -> RunFigures:
-    """Work out the figures of a whole run whose structure is known; see :func:`figures_of`."""
     report = summarize(recording)
-    loops = not isinstance(structure, SmallSignal)  # of many sines at once there is only a tangle
+    loops = not isinstance(structure, SmallSignal)  # a multisine has no loop
     worst = recording.segments[worst_segment(report.segments)] if recording.segments else None
     measured = [event.values.get("offset_um") for event in recording.events if event.code == OFFSET]
     return RunFigures(
@@ -314,7 +311,7 @@ def digest_of(recording: Recording, model: HysteresisModel | None = None) -> Run
         compensated=recording.compensated,
         command_unit=recording.command_unit,
         waveform=segment.label if segment else "",
-        figures=figures_with(recording, structure),
+        figures=figures_of(recording, structure),
         **(_of_cycle(recording, segment, model) if _is_loop(segment, waveform) else {}),
         step=_after_step(recording, waveform, structure),
         response=structure if isinstance(structure, SmallSignal) else None,
@@ -371,9 +368,6 @@ def _modelled(
     recording: Recording, segment: Segment, model: HysteresisModel | None
 ) -> dict[str, Any]:
     """Return the measured and the modelled cycle."""
-    from hilctl.identify.data.cycles import loops_from_recording
-    from hilctl.identify.evaluation import judge
-
     if model is None and not recording.model_yaml:
         return {}
     try:

@@ -296,19 +296,16 @@ def write_sheets(
     on_done: OnRead = lambda done, text: None,
     on_drawn: Callable[[str, Figure], None] = lambda name, figure: None,
 ) -> dict[Path, str]:
-    """Write figures.
+    """Write figures; return the files, each with its caption.
 
     Args:
         sheets: The figures.
-        folder: Where they go; made where it is missing.
+        folder: Folder of the files; created if missing.
         formats: See :data:`hilctl.analysis.figure_export.FORMATS`.
-        width: Of one column of a journal, or of two.
-        overwrite: Whether files of these names may be replaced.
-        on_done: Told of progress.
-        on_drawn: Called with each figure and its name.
-
-    Returns:
-        The files, each with its caption.
+        width: One or two columns of a journal.
+        overwrite: Whether existing files may be replaced.
+        on_done: Called with the progress.
+        on_drawn: Called with each name and figure.
 
     Raises:
         InputError: A file exists or can't be written.
@@ -322,30 +319,27 @@ def write_sheets(
     except OSError as error:
         raise InputError(f"{folder}: can't be made: {error.strerror}") from None
     written: dict[Path, str] = {}
-    for number, sheet in enumerate(sheets):
-        on_done(number / len(sheets), f"draw {sheet.name}")
-        figure = drawn(sheet, width)
-        on_drawn(sheet.name, figure)
-        paths = write_figure(figure, folder, sheet.name, formats, overwrite=overwrite)
-        written |= dict.fromkeys(paths, sheet.caption)
+    captions = {sheet.name: sheet.caption for sheet in sheets}
+    for name, figure in _drawn(sheets, width, on_done):
+        on_drawn(name, figure)
+        paths = write_figure(figure, folder, name, formats, overwrite=overwrite)
+        written |= dict.fromkeys(paths, captions[name])
     return written
 
 
 def draw_sheets(
     sheets: Sequence[FigureSpec], width: ColumnWidth, on_done: OnRead = lambda done, text: None
 ) -> dict[str, Figure]:
-    """Draw figures; return them by their names.
+    """Return figures by their names; see :func:`write_sheets`."""
+    return dict(_drawn(sheets, width, on_done))
 
-    Args:
-        sheets: The figures.
-        width: Of one column of a journal, or of two.
-        on_done: Told of progress.
-    """
-    figures = {}
+
+def _drawn(
+    sheets: Sequence[FigureSpec], width: ColumnWidth, on_done: OnRead
+) -> Iterator[tuple[str, Figure]]:
     for number, sheet in enumerate(sheets):
         on_done(number / len(sheets), f"draw {sheet.name}")
-        figures[sheet.name] = drawn(sheet, width)
-    return figures
+        yield sheet.name, drawn(sheet, width)
 
 
 def applying_sheets(series: RunSeries) -> list[FigureSpec]:

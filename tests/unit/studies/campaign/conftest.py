@@ -33,7 +33,7 @@ def drawn_pages(monkeypatch) -> list[tuple[str, int]]:
         path.write_text("page", encoding="utf-8")
         pages.append((path.name, len(series.done)))
 
-    monkeypatch.setattr("hilctl.studies.multi_run.multi_run_page.write_series", write)
+    monkeypatch.setattr("hilctl.studies.campaign.campaign_runner.write_series", write)
     return pages
 
 

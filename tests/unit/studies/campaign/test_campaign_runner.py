@@ -248,7 +248,7 @@ def test_a_page_that_can_t_be_written_ends_nothing(run, monkeypatch):
     def fail(series, path):
         raise InputError(f"{path.name}: no space left")
 
-    monkeypatch.setattr("hilctl.studies.multi_run.multi_run_page.write_series", fail)
+    monkeypatch.setattr("hilctl.studies.campaign.campaign_runner.write_series", fail)
     rig, notes = Rig(), []
     result = run(rig, CAMPAIGN, replace(rig.host, on_note=notes.append))
     assert codes(result) == ["completed"] * 4

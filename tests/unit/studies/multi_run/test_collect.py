@@ -126,8 +126,6 @@ def test_a_recording_too_long_for_memory_is_left_out_and_named(folder, monkeypat
 
 
 def test_a_recording_without_an_end_is_not_completed(monkeypatch):
-    from hilctl.studies.multi_run import collect as module
-
     found = module.read
     monkeypatch.setattr(module, "read", lambda path: replace(found(path), end={}))
     series = collect([RUNS[0]])

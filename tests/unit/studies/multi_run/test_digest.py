@@ -19,11 +19,16 @@ from hilctl.studies.multi_run.digest import (
     digest_of,
     drift_of,
     figures_of,
+    structure_of,
 )
 from hilctl.waveforms.spec import AnyWaveform
 
 RATE_HZ = 50_000.0
 TIME = np.arange(10_000) / RATE_HZ
+
+
+def figures(recording, waveform):
+    return figures_of(recording, structure_of(recording, waveform))
 
 
 def waveform(**keys):
@@ -36,7 +41,7 @@ SINE = waveform(kind="sine", amplitude=1.0, frequency_hz=100.0, duration_s=0.2)
 def test_a_sine_straight_to_the_coil(make_recording):
     command = np.sin(2 * np.pi * 100.0 * TIME)
     moved = 10.0 * np.sin(2 * np.pi * 100.0 * TIME - 0.1) - 2.0
-    found = figures_of(
+    found = figures(
         make_recording(
             moved,
             command=command,
@@ -61,7 +66,7 @@ def test_a_sine_straight_to_the_coil(make_recording):
 def test_a_compensated_run_has_errors_and_its_offset(make_recording):
     wanted = 10.0 * np.sin(2 * np.pi * 100.0 * TIME)
     event = Event(0, "info", OFFSET, "", {"offset_um": 0.7})
-    found = figures_of(
+    found = figures(
         make_recording(
             wanted + 0.2,
             reference_um=wanted,
@@ -79,7 +84,7 @@ def test_a_compensated_run_has_errors_and_its_offset(make_recording):
 
 def test_minor_loops_at_either_end(make_recording):
     command = 4.0 * np.sin(2 * np.pi * 100.0 * TIME) + 3.0 * np.sin(2 * np.pi * 300.0 * TIME)
-    found = figures_of(
+    found = figures(
         make_recording(
             command + 0.05 * command**2,
             command=command,
@@ -97,7 +102,7 @@ def test_a_step_s_ringing(make_recording):
     omega = 2.0 * np.pi * 300.0
     ring = 1.0 - np.exp(-0.1 * omega * TIME) * np.cos(omega * np.sqrt(0.99) * TIME)
     moved = np.concatenate([np.zeros(TIME.size), 5.0 * ring])
-    found = figures_of(
+    found = figures(
         make_recording(
             moved,
             command=np.repeat([0.0, 1.0], TIME.size),
@@ -111,8 +116,6 @@ def test_a_step_s_ringing(make_recording):
 
 
 def test_every_figure_has_its_meaning():
-    from hilctl.studies.multi_run.digest import RunFigures
-
     meanings = inspect.getdoc(RunFigures) or ""  # indented as the interpreter keeps it
     assert all(f"\n    {name}: " in meanings for name in FIGURES)
 
