@@ -5,11 +5,12 @@ from typing import Any
 import numpy as np
 
 from hilctl.identify.data.records import SteadyLoop
+from hilctl.identify.fit_api import FitRequest
 from hilctl.identify.fit_model import FittedModel, fit_model
 from hilctl.identify.settings import FitSettings
-from hilctl.identify.staged.convex_start import convex_start
 from hilctl.identify.staged.fit_data import StagedFitData
 from hilctl.identify.staged.objective import Layers, Point
+from hilctl.identify.staged.staged_search import convex_start
 from hilctl.models.integrated import exponential_integrated
 from hilctl.models.staged import StagedModel
 
@@ -41,7 +42,7 @@ def truth(**stages: Any) -> StagedModel:
 def fit(data: list[SteadyLoop], **choices: Any) -> FittedModel:
     """Identify a staged model of that structure."""
     settings = FitSettings(kind="staged", plays=8, deadbands=5, starts=2, **choices)
-    return fit_model(data, settings, lambda: 0.0)
+    return fit_model(FitRequest(data, settings))
 
 
 def start(data: StagedFitData, layers: Layers, before: list[float], delay_s: float) -> Point:

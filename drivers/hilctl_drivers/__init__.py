@@ -9,7 +9,7 @@ wiring.py         an experiment's options: place, amplifier, sensor, reader, wat
 starter.py        a device section to begin with
 profile.py        profiles of commercial devices, by name or path; profiles/ has them
 profile_parts.py  what all profiles have in common
-wire/             bytes there and back, and how long they take; knows no protocol
+wire/             transport of bytes, and how long it takes; independent of protocols
 modbus/           Modbus TCP and RTU; labjack/ streams over it
 text/             lines of text: SCPI, DCON and their like
 board/            framed messages of microcontroller boards
@@ -17,8 +17,7 @@ serial/           the device that text/ and board/ stand behind
 simulated/        simulated rigs
 emulator/         the simulated rig behind the same wires
 
-A protocol folder has ``profile`` (what a profile says), ``timing`` (how long an exchange takes),
-its messages (``pdu``, ``frames``, ``lines``), ``session`` (one conversation), and either ``setup``
-and ``device``, or ``wire`` where it stands behind ``serial_dac``. A new protocol is such a folder
-whose ``LINK_KINDS`` say what profiles of it are.
+A protocol folder has ``profile``, its messages (``pdu``, ``frames``, ``lines``), ``session`` (one
+conversation, and how long it takes), and either ``setup`` and ``device``, or ``wire`` for
+``serial_dac``. A new protocol is such a folder whose ``LINK_KINDS`` name its profiles.
 """

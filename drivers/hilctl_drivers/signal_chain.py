@@ -6,20 +6,24 @@ command = gain * output + offset, displacement = sensitivity * input + offset.
 """
 
 from collections.abc import Mapping
-from typing import Annotated, Literal, Self, TypeAlias, TypeVar
+from typing import Annotated, Any, Literal, Self, TypeAlias, TypeVar
 
 from pydantic import Field, model_validator
 
-from hilctl.base.device import DeviceOptions
+from hilctl.base.device import DeviceInfo, DeviceOptions
 from hilctl.base.errors import InputError
 from hilctl.base.strict import StrictModel
 from hilctl.base.types import CommandUnit
 from hilctl_drivers.profile import ProfileName
 from hilctl_drivers.profile_base import Range, Watchdog
+from hilctl_drivers.transport.wire_time import RateLimit
 
 PROFILE = "name of a shipped profile, or path of your own, from the experiment's folder"
 
 _Channel = TypeVar("_Channel", bound=Range)
+
+
+_GAINS = ("gain_a_per_v", "gain_a_per_ma", "gain_v_per_v", "gain_v_per_ma")
 
 
 class Amplifier(StrictModel):
@@ -34,39 +38,31 @@ class Amplifier(StrictModel):
 
     @model_validator(mode="after")
     def _one_gain(self) -> Self:
-        given = [gain for gain in self._gains.values() if gain is not None]
-        if len(given) != 1 or given[0] == 0.0:
-            raise ValueError(f"must have one of {', '.join(self._gains)}, and not 0")
+        if len(self._given) != 1 or self.gain == 0.0:
+            raise ValueError(f"must have one of {', '.join(_GAINS)}, and not 0")
         wrong = self.offset_v if self.command_unit == "A" else self.offset_a
         if wrong:
             raise ValueError("offset must be in the unit that the gain leads to")
         return self
 
     @property
-    def _gains(self) -> dict[str, float | None]:
-        return {
-            "gain_a_per_v": self.gain_a_per_v,
-            "gain_a_per_ma": self.gain_a_per_ma,
-            "gain_v_per_v": self.gain_v_per_v,
-            "gain_v_per_ma": self.gain_v_per_ma,
-        }
+    def _given(self) -> list[str]:
+        return [name for name in _GAINS if getattr(self, name) is not None]
 
     @property
     def command_unit(self) -> CommandUnit:
         """Unit of what drives the actuator."""
-        current = (self.gain_a_per_v, self.gain_a_per_ma)
-        return "V" if current == (None, None) else "A"
+        return "A" if self._given[0].startswith("gain_a") else "V"
 
     @property
     def output_unit(self) -> str:
         """Unit of the output that it is wired to."""
-        volts = (self.gain_a_per_v, self.gain_v_per_v)
-        return "mA" if volts == (None, None) else "V"
+        return "mA" if self._given[0].endswith("ma") else "V"
 
     @property
     def gain(self) -> float:
         """Command for one unit of the output."""
-        return next(gain for gain in self._gains.values() if gain is not None)
+        return float(getattr(self, self._given[0]))
 
     @property
     def offset(self) -> float:
@@ -238,6 +234,10 @@ class SignalChain:
         self._offset = 0.0 if amplifier is None else amplifier.offset
         self._um_per_unit = sensor.um_per_unit
         self._offset_um = sensor.offset_um
+        self.command_range = sorted(map(self.command, output.limits))
+        """Lowest and highest command of the output's range."""
+        self.displacement_range = sorted(map(self.displacement_um, sensor_input.limits))
+        """Lowest and highest displacement of the input's range, um."""
 
     @property
     def factors(self) -> tuple[float, float, float, float]:
@@ -256,15 +256,29 @@ class SignalChain:
         """Return the displacement of an input value, um."""
         return value * self._um_per_unit + self._offset_um
 
-    def command_range(self, low: float, high: float) -> tuple[float, float]:
-        """Return lowest and highest command of an output's range."""
-        ends = sorted((self.command(low), self.command(high)))
-        return ends[0], ends[1]
+    def info(self, name: str, options: DacOptions, rates: RateLimit, **more: Any) -> DeviceInfo:
+        """Return what a device is and what it accepts.
 
-    def displacement_range(self, low: float, high: float) -> tuple[float, float]:
-        """Return lowest and highest displacement of an input's range, um."""
-        ends = sorted((self.displacement_um(low), self.displacement_um(high)))
-        return ends[0], ends[1]
+        Args:
+            name: Its registry name.
+            options: The experiment's.
+            rates: Sample rates that it can keep.
+            **more: What depends on the protocol.
+        """
+        return DeviceInfo(
+            name=name,
+            command_unit=self.command_unit,
+            command_min=self.command_range[0],
+            command_max=self.command_range[1],
+            sensor_min_um=self.displacement_range[0],
+            sensor_max_um=self.displacement_range[1],
+            max_rate_hz=rates.highest_hz,
+            rate_note=rates.note,
+            watchdog_command=options.watchdog_command,
+            watchdog_timeout_s=options.watchdog_timeout_s,
+            watchdog_reason=options.watchdog_reason,
+            **more,
+        )
 
 
 def channel(what: str, name: str, channels: Mapping[str, _Channel], title: str) -> _Channel:
@@ -320,7 +334,7 @@ def check_watchdog(
             "machine dies; say watchdog: none if you accept that"
         )
     has.counts(wanted.timeout_s)
-    low, high = chain.command_range(*output.limits)
+    low, high = chain.command_range
     if not low <= wanted.safe_command <= high:
         raise InputError(
             f"watchdog.safe_command must be {low:g} to {high:g}, got {wanted.safe_command:g}"

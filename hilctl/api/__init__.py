@@ -7,8 +7,8 @@
     print(api.summarize(recorded).peak_error_percent)
     frame = recorded.table.to_pandas()
 
-starting.py     init: a first experiment for a device
-running.py      load, check, run
+first_experiment.py  init: a first experiment for a device
+runs.py         load, check, run
 campaigns.py    characterise, campaign, learn: many runs
 recordings.py   read, summarize, report_page, report_runs, replay, export, list_runs, figures
 models.py       identify, refine, compare
@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from hilctl.api.campaigns import campaign, characterise, learn
     from hilctl.api.connection import RunConnection, connect
-    from hilctl.api.init import WrittenExperiment, init
+    from hilctl.api.first_experiment import WrittenExperiment, init
     from hilctl.api.models import compare, identify, refine
     from hilctl.api.recordings import (
         RecordedRun,
@@ -74,25 +74,25 @@ _MODULES = {
     "RecordedRun": "recordings",
     "RunConnection": "connection",
     "SampleTable": "table",
-    "WrittenExperiment": "starting",
+    "WrittenExperiment": "first_experiment",
     "campaign": "campaigns",
     "characterise": "campaigns",
-    "check": "running",
+    "check": "runs",
     "compare": "models",
     "connect": "connection",
     "export": "recordings",
     "figures": "recordings",
     "identify": "models",
-    "init": "starting",
+    "init": "first_experiment",
     "learn": "campaigns",
     "list_runs": "recordings",
-    "load": "running",
+    "load": "runs",
     "read": "recordings",
     "refine": "models",
     "replay": "recordings",
     "report_page": "recordings",
     "report_runs": "recordings",
-    "run": "running",
+    "run": "runs",
     "summarize": "recordings",
 }
 """The module of each name."""

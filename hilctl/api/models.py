@@ -11,7 +11,7 @@ from hilctl.comparison import compare as library
 from hilctl.comparison.compare import Comparison
 from hilctl.comparison.comparison_page import write_comparison
 from hilctl.experiment.load import inputs_of
-from hilctl.identify.command import Identification, identify_files, settings_from
+from hilctl.identify.pipeline import Identification, identify_files, settings_from
 from hilctl.identify.refine.refinement import Refinement, refine_files
 from hilctl.run.dead_runs import finish_dead_runs
 

@@ -10,7 +10,7 @@ import typer
 from rich.table import Table
 
 from hilctl import api
-from hilctl.api.init import default_path, is_set, refuse_existing
+from hilctl.api.first_experiment import default_path, is_set, refuse_existing
 from hilctl.base.errors import InputError
 from hilctl.base.files import read_text, write_text
 from hilctl.cli.console import print_rich

@@ -16,18 +16,22 @@ from hilctl.base.files import check_writable
 from hilctl.cli.console import console, print_rich, progress_bar
 from hilctl.cli.options import AsJson, Overwrite, Settings
 from hilctl.cli.safe_streams import print_json
-from hilctl.comparison.compare import Comparison
-from hilctl.comparison.summary import headings, notes, table_rows, titles
-from hilctl.identify.command import Identification
+from hilctl.comparison.compare import Comparison, headings, notes, table_rows, titles
 from hilctl.identify.evaluation import LoopScore
-from hilctl.identify.model_page import write_identification
-from hilctl.identify.order_selection import OrderScore
-from hilctl.identify.refine.refined_page import HEADINGS as REFINEMENT_HEADINGS
-from hilctl.identify.refine.refined_page import refinement_rows, write_refinement
+from hilctl.identify.model_page import write_identification, write_refinement
+from hilctl.identify.model_selection import OrderScore
+from hilctl.identify.pipeline import Identification
 from hilctl.identify.refine.refinement import Refinement
 from hilctl.identify.registry import CATALOGUE
 from hilctl.identify.settings import setting_rows
-from hilctl.identify.summary import HEADINGS, error_rows, parameter_texts, summary
+from hilctl.identify.summary import (
+    HEADINGS,
+    REFINEMENT_HEADINGS,
+    error_rows,
+    parameter_texts,
+    refinement_rows,
+    summary,
+)
 from hilctl.run.dead_runs import finish_dead_runs
 
 IdentifyInput = Annotated[

@@ -19,7 +19,7 @@ from hilctl.experiment.load import LoadedExperiment, load_experiment, resolve
 from hilctl.identify.data.cycles import loops_from_recording
 from hilctl.identify.data.records import SteadyLoop
 from hilctl.identify.evaluation import Evaluation, judge
-from hilctl.identify.fit_api import OnProgress
+from hilctl.identify.fit_api import FitRequest, OnProgress
 from hilctl.identify.fit_data import FitData
 from hilctl.identify.fit_model import FittedModel, fit_model
 from hilctl.identify.registry import entry
@@ -207,6 +207,7 @@ def _row(
 ) -> ComparedModel:
     tell(0.0, "identified")
     found: FittedModel | None = None
+    begin = clock()
     if name.endswith(_FILES):
         model, title = load_model(Path(name)), "model file"
         if model.input_unit != data.unit:
@@ -214,8 +215,9 @@ def _row(
     else:
         kind, known = entry(name)
         settings = FitSettings(kind=kind, **COMPARED.get(kind, {}))
-        found = fit_model(data.records, settings, clock, unit=data.unit, source=sources)
+        found = fit_model(FitRequest(data.records, settings, unit=data.unit, source=sources))
         model, title = found.model, known.title
+    elapsed_s = clock() - begin
     tell(0.4, "judged")
     fastest = max(data.loops, key=lambda loop: loop.frequency_hz)
     return ComparedModel(
@@ -223,7 +225,7 @@ def _row(
         title=title,
         model=model,
         numbers=found.numbers if found else None,
-        identify_s=found.elapsed_s if found else None,
+        identify_s=elapsed_s if found else None,
         error=found or judge(model, data),
         inverse_ns=inverse_ns(model, fastest, rate_hz, clock),
         trials=tuple(_trials(device, model, tell)) if device else (),
@@ -320,3 +322,57 @@ def save_models(
     except OSError as error:
         raise InputError(f"{folder}: can't be written: {error.strerror}") from None
     return tuple(paths)
+
+
+def headings(comparison: Comparison) -> list[str]:
+    """Return the names of the columns."""
+    return ["model", "par.", "fit s", "ns", "peak %", "rms %", *_trial_names(comparison)]
+
+
+def _trial_names(comparison: Comparison) -> list[str]:
+    return [f"{trial.frequency_hz:.4g} Hz" for trial in _most_trials(comparison)]
+
+
+def _most_trials(comparison: Comparison) -> Sequence[InverseTrial]:
+    return max((row.trials for row in comparison.rows), key=len, default=())
+
+
+def table_rows(comparison: Comparison) -> Iterator[list[str]]:
+    """Return the texts of each row, in the order asked for."""
+    for row in comparison.rows:
+        figures = [
+            row.name,
+            "-" if row.numbers is None else str(row.numbers),
+            "-" if row.identify_s is None else f"{row.identify_s:.2f}",
+            f"{row.inverse_ns:.0f}",
+            f"{row.error.peak_percent:.2f}",
+            f"{row.error.rms_percent:.2f}",
+        ]
+        yield [*figures, *(_trial_text(trial) for trial in row.trials)]
+
+
+def _trial_text(trial: InverseTrial) -> str:
+    if trial.peak_error_percent is None:
+        return "-"
+    return f"{trial.peak_error_percent:.2f}{'*' if trial.limited_samples else ''}"
+
+
+def notes(comparison: Comparison) -> list[str]:
+    """Return what the table's reader has to know."""
+    found = [
+        "par.: numbers found; fit s: time that took; ns: time one sample of the inverse takes",
+        "peak, rms %: error of the model's displacement on all loops, of the largest peak-to-peak",
+    ]
+    if not comparison.device:
+        return [*found, "compensated errors: none, the recording's device is not a simulated one"]
+    found.append(
+        "Hz: largest error with the inverse before the device, in percent of the stroke; "
+        f"{comparison.device}"
+    )
+    limited = any(trial.limited_samples for row in comparison.rows for trial in row.trials)
+    return [*found, "*: the limiter changed judged commands"] if limited else found
+
+
+def titles(rows: Sequence[ComparedModel]) -> list[tuple[str, str]]:
+    """Return each model's name and what it is."""
+    return [(row.name, row.title) for row in rows]

@@ -15,8 +15,7 @@ from matplotlib.figure import Figure, SubFigure
 from hilctl.analysis.html import document, grid, wide_figure, write_page
 from hilctl.analysis.plot_style import DISPLACEMENT, QUIET, REFERENCE, STYLE
 from hilctl.base.types import F64
-from hilctl.comparison.compare import ComparedModel, Comparison
-from hilctl.comparison.summary import headings, notes, table_rows, titles
+from hilctl.comparison.compare import ComparedModel, Comparison, headings, notes, table_rows, titles
 from hilctl.identify.data.records import SteadyLoop
 
 _COLUMNS = 6

@@ -1,37 +1,35 @@
-"""How a fit does on data that it has not seen: parts of the data are left out of it in turn."""
+"""Errors of a fit on held-out data: parts of the data are left out of fits in turn."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from hilctl.base.errors import DataError
-from hilctl.base.types import F64, CommandUnit
+from hilctl.base.types import F64
 from hilctl.identify.data.records import History, Record, SteadyLoop
 from hilctl.identify.evaluation import Evaluation, judge, judgement_of
-from hilctl.identify.fit_api import OnProgress
+from hilctl.identify.fit_api import FitRequest, ignore_progress
 from hilctl.identify.fit_data import FitData
-from hilctl.identify.fit_kind import fit_kind
-from hilctl.identify.parallel import MapFunction
-from hilctl.identify.settings import FitSettings
-from hilctl.models.mechanics import FurtherMode
+from hilctl.identify.fit_model import fit_kind
+from hilctl.identify.parallel import MapFunction, serial_map
 
 FEWEST_LOOPS = 4
 FOLDS = 3
 SEED = 1
-HEAD = 0.7  # part of a history that is fitted, where the rest is held out
+HEAD = 0.7  # part of a history that is fitted if the rest is held out
 SAME = 0.02  # of a span: what counts as within it
-MOVES = 0.1  # of a history's peak-to-peak: what its last part must move by, or it says nothing
+MOVES = 0.1  # of a history's peak-to-peak: least motion of a last part that is held out
 
 
 @dataclass(frozen=True, slots=True)
 class Split:
-    """One fit for the sake of what it does not see.
+    """Records of one fit, and those that it is evaluated on.
 
     Attributes:
-        fitted: The records that it sees.
-        held_out: Those that it is judged on.
+        fitted: Fitted records.
+        held_out: Held-out records.
     """
 
     fitted: tuple[Record, ...]
@@ -40,13 +38,13 @@ class Split:
 
 @dataclass(frozen=True, slots=True)
 class HeldOut:
-    """How a model does on data that its fit did not see.
+    """Errors of a model on held-out data.
 
     Attributes:
         judgement: The errors.
         records: The data.
-        how: Where they come from, for people.
-        end: Where the last of the fits ended, for one to all the data to go on from.
+        how: Origin of the data, as text.
+        end: End of the last fit, from which a fit to all data can start.
     """
 
     judgement: Evaluation
@@ -59,20 +57,11 @@ class HeldOut:
         return self.judgement.to_mapping() | {"how": self.how}
 
 
-@dataclass(frozen=True, slots=True)
-class _Trial:
-    fold: Split
-    settings: FitSettings
-    unit: CommandUnit
-    start: object | None
-    modes: Sequence[FurtherMode]
-
-
 def folds_of(records: Sequence[Record]) -> list[Split]:
-    """Return what is held out of which fit; none where there are too few data.
+    """Return the folds; none if there are too few data.
 
-    What would narrow the range of commands, frequencies or speeds is not held out: beyond its
-    range a model need not hold, and a run is warned. Of whole histories the last part is held out.
+    Records that extend the range of commands, frequencies or speeds are not held out: a model need
+    not be valid beyond its range, and a run warns there. Of histories the last part is held out.
     """
     if any(isinstance(record, History) for record in records):
         heads, tails = zip(*map(_halved, records), strict=True)
@@ -93,57 +82,77 @@ def folds_of(records: Sequence[Record]) -> list[Split]:
     return folds
 
 
-def held_out_error(
-    records: Sequence[Record],
-    settings: FitSettings,
-    unit: CommandUnit,
-    run: MapFunction,
-    progress: OnProgress,
-    start: object | None = None,
-    modes: Sequence[FurtherMode] = (),
-) -> HeldOut | None:
-    """Fit with parts of the data left out, and judge on these; None where too few are left.
+def held_out_error(request: FitRequest) -> HeldOut | None:
+    """Fit with parts of the data left out, and evaluate on these; None if too few are left."""
+    request.progress(0.0, "fits with data left out")
+    (found,) = held_out_errors([request], request.run)
+    return found
+
+
+def held_out_errors(requests: Sequence[FitRequest], run: MapFunction) -> list[HeldOut | None]:
+    """Fit each request with parts of its data left out, and evaluate on these.
+
+    One start of each search is enough.
 
     Args:
-        records: All data.
-        settings: The choices of the fit; one start of its search is enough.
-        unit: Unit of the command.
-        run: Runs fits that do not depend on each other.
-        progress: Called with what is being done.
-        start: Where fits begin, see :class:`~hilctl.identify.fit_api.FitJob`.
-        modes: Further modes of the structure, for kinds that have them.
+        requests: What to fit.
+        run: Runs the fits, which do not depend on each other.
+
+    Returns:
+        For each request its errors; None if too few data are left.
     """
-    lean = settings.model_copy(update={"starts": 1})
-    trials = [_Trial(fold, lean, unit, start, modes) for fold in folds_of(records)]
-    progress(0.0, f"{len(trials)} fits with data left out")
-    done = [
-        (trial.fold.held_out, *found)
-        for trial, found in zip(trials, run(_tried, trials), strict=True)
-        if found is not None
-    ]
-    if not done:
-        return None
-    held_out = tuple(record for out, _, _ in done for record in out)
-    responses_um = np.concatenate([modelled for _, modelled, _ in done])
-    parts = "the last parts of histories" if isinstance(held_out[-1], History) else "loops"
-    how = f"{len(held_out)} of {len(records)} {parts}, left out of the fit in turn"
-    judgement = judgement_of(FitData(held_out, unit), responses_um)
-    return HeldOut(judgement, held_out, how, done[-1][2])
+    tasks = [
+        _Task(number, fold, replace(
+            request,
+            records=fold.fitted,
+            settings=request.settings.model_copy(update={"starts": 1}),
+            run=serial_map,
+            progress=ignore_progress,
+        ))
+        for number, request in enumerate(requests)
+        for fold in folds_of(request.records)
+    ]  # fmt: skip
+    done: list[list[tuple[Split, F64, object | None]]] = [[] for _ in requests]
+    for task, found in zip(tasks, run(_fitted, tasks), strict=True):
+        if found is not None:
+            done[task.number].append((task.fold, *found))
+    return [_together(*each) for each in zip(requests, done, strict=True)]
 
 
-def _tried(trial: _Trial) -> tuple[F64, object | None] | None:
-    """Return what a model gives of the data that it did not see, and where its search ended."""
-    fitted, settings = trial.fold.fitted, trial.settings
+@dataclass(frozen=True, slots=True)
+class _Task:
+    """One fit of the request of that number, to the fitted records of a fold."""
+
+    number: int
+    fold: Split
+    request: FitRequest
+
+
+def _fitted(task: _Task) -> tuple[F64, object | None] | None:
+    """Return the response to the held-out data, and where the search ended."""
     try:
-        found = fit_kind(fitted, settings, trial.unit, start=trial.start, modes=trial.modes)
-    except DataError:  # what is left is too little for this kind of fit; all of it need not be
+        found = fit_kind(task.request)
+    except DataError:  # too few records for this kind of fit; all of them may be enough
         return None
-    judged = judge(found.model, trial.fold.held_out, creep=settings.creep)
+    judged = judge(found.model, task.fold.held_out, creep=task.request.settings.creep)
     return np.concatenate(judged.modelled_um), found.end
 
 
+def _together(
+    request: FitRequest, done: Sequence[tuple[Split, F64, object | None]]
+) -> HeldOut | None:
+    if not done:
+        return None
+    held_out = tuple(record for fold, _, _ in done for record in fold.held_out)
+    responses_um = np.concatenate([modelled for _, modelled, _ in done])
+    parts = "the last parts of histories" if isinstance(held_out[-1], History) else "loops"
+    how = f"{len(held_out)} of {len(request.records)} {parts}, left out of the fit in turn"
+    judgement = judgement_of(FitData(held_out, request.unit), responses_um)
+    return HeldOut(judgement, held_out, how, done[-1][2])
+
+
 def _halved(record: Record) -> tuple[Record, Record | None]:
-    """Return what is fitted of a record, and what is held out; nothing of a loop."""
+    """Return the fitted and the held-out part of a record; no part of a loop is held out."""
     if isinstance(record, SteadyLoop):
         return record, None
     label, rate_hz = record.label, record.sample_rate_hz
@@ -164,7 +173,7 @@ def _within(record: Record, others: Sequence[Record]) -> bool:
 
 
 def _extremes(record: Record) -> F64:
-    """Return what no record held out may exceed: command, frequency and speed, both ways."""
+    """Return command, frequency and speed, both ways, that held-out records may not exceed."""
     command, rate, _ = record.run()
     frequency_hz = record.frequency_hz if isinstance(record, SteadyLoop) else 0.0
     speed = float(np.abs(rate).max())

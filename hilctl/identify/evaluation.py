@@ -12,7 +12,7 @@ from hilctl.identify.data.records import Record, Records, SteadyLoop
 from hilctl.identify.fit_data import PERIODS, FitData
 from hilctl.identify.parallel import parallel_map
 from hilctl.identify.staged.fit_data import StagedFitData
-from hilctl.identify.staged.model import response_um
+from hilctl.identify.staged.objective import response_um
 from hilctl.models.base import HysteresisModel
 from hilctl.models.plays import PlayModel
 from hilctl.models.staged import StagedModel

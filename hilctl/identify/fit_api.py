@@ -1,13 +1,19 @@
-"""What a fit takes, and what it returns: the contract of every way to identify a model."""
+"""Types of a fit: what every way to identify a model takes and returns."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
+from hilctl.base.types import CommandUnit
+from hilctl.identify.data.records import Record
 from hilctl.identify.fit_data import FitData
 from hilctl.identify.parallel import MapFunction, serial_map
 from hilctl.identify.settings import FitSettings
 from hilctl.models.base import HysteresisModel
+from hilctl.models.mechanics import FurtherMode
+
+LEAST_SLOPE = 0.01
+"""Smallest slope that a model may have, of the mean slope of the data."""
 
 OnProgress: TypeAlias = Callable[[float, str], None]
 """Called now and then with the part that is done (0 to 1) and what is being done."""
@@ -18,8 +24,33 @@ def ignore_progress(done: float, text: str) -> None:
 
 
 @dataclass(frozen=True, slots=True)
+class FitRequest:
+    """Records to fit, and how.
+
+    Attributes:
+        records: At least one loop or history; steady loops only for what has dynamics.
+        settings: The kind of model, and all other choices.
+        unit: Unit of the command.
+        source: Recordings or files that the data come from, for the provenance.
+        run: Runs fits that do not depend on each other.
+        progress: Called with what is being done.
+        start: Where the search begins, see :class:`FitJob`.
+        modes: Known further modes of the structure, for kinds that have them.
+    """
+
+    records: Sequence[Record]
+    settings: FitSettings
+    unit: CommandUnit = "A"
+    source: Sequence[str] = ()
+    run: MapFunction = serial_map
+    progress: OnProgress = ignore_progress
+    start: object | None = None
+    modes: Sequence[FurtherMode] = ()
+
+
+@dataclass(frozen=True, slots=True)
 class FitJob:
-    """What a fit is made of.
+    """Prepared data of one fit, and how it is made.
 
     Attributes:
         data: What the model is to describe.
@@ -39,7 +70,7 @@ class FitJob:
     @property
     def least(self) -> float:
         """Smallest slope that a model may have, in um per command unit."""
-        return self.settings.least_slope * self.data.gain
+        return LEAST_SLOPE * self.data.gain
 
 
 @dataclass(frozen=True, slots=True)

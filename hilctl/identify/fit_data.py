@@ -9,8 +9,7 @@ import numpy as np
 
 from hilctl.base.errors import DataError
 from hilctl.base.types import F64, CommandUnit
-from hilctl.identify.data.decimate import thinned
-from hilctl.identify.data.records import History, Records, SteadyLoop
+from hilctl.identify.data.records import History, Records, SteadyLoop, thinned
 from hilctl.identify.staged.sensitivity import (
     GAMMA_S,
     PARAMETERS,

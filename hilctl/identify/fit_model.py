@@ -1,25 +1,118 @@
 """Fit a model: measured data in, model and its errors out."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 import scipy
+from scipy.fft import rfft, rfftfreq
 
 import hilctl
-from hilctl.base.types import CommandUnit
-from hilctl.identify.data.records import Record, Records, SteadyLoop
+from hilctl.base.types import F64
+from hilctl.experiment.model_validity import ALL, spectrum
+from hilctl.identify.creep_fit import creep_of, without_creep
+from hilctl.identify.data.records import History, Record, SteadyLoop, turning_points
 from hilctl.identify.evaluation import Evaluation, judge
-from hilctl.identify.fit_api import OnProgress, StartOutcome, ignore_progress
-from hilctl.identify.fit_data import FitData
-from hilctl.identify.fit_kind import fit_kind
-from hilctl.identify.identified_range import identified_range
-from hilctl.identify.parallel import MapFunction, serial_map
+from hilctl.identify.fit_api import FitJob, FitRequest, FoundModel, StartOutcome
+from hilctl.identify.fit_data import FitData, search_data
 from hilctl.identify.registry import CATALOGUE
+from hilctl.identify.resonances import without_modes
 from hilctl.identify.settings import FitSettings
-from hilctl.models.base import HysteresisModel, Provenance
-from hilctl.models.mechanics import FurtherMode
+from hilctl.models.base import HysteresisModel, IdentifiedRange, Provenance
+
+
+def fit_kind(request: FitRequest) -> FoundModel:
+    """Fit a kind of model.
+
+    Creep that rests show is taken off the records first, and so are known modes; the model has
+    both.
+
+    Raises:
+        DataError: The data can't be used as asked, or there are none.
+    """
+    records, settings, unit = request.records, request.settings, request.unit
+    modes = request.modes if settings.looks_for("modes") else ()
+    creep = creep_of(records) if settings.looks_for("creep_stage") else None
+    bare = records if creep is None else without_creep(records, creep)
+    bare = without_modes(bare, modes) if modes else bare
+    job = FitJob(
+        search_data(bare, settings.kind, unit),
+        settings,
+        request.run,
+        request.progress,
+        request.start,
+    )
+    found = CATALOGUE[settings.kind].fit(job)
+    known, parameters, numbers = dict[str, Any](), dict(found.parameters), found.numbers
+    if creep is not None:
+        known["creep"] = creep
+        parameters["creep_share"] = sum(creep.shares)
+        numbers += len(creep.shares)
+    for k, mode in enumerate(modes, start=2):
+        known["modes"] = tuple(modes)
+        parameters |= {f"{name}_{k}": value for name, value in mode.model_dump().items()}
+        numbers += len(type(mode).model_fields)
+    if not known:
+        return found
+    known["output_range_um"] = FitData(records, unit).output_range_um
+    model = found.model.model_copy(update=known)
+    return replace(found, model=model, numbers=numbers, parameters=parameters)
+
+
+SMALL, FEWEST_SWINGS = 0.1, 10
+NOT_ZERO_UM = 1e-6
+LEAST = 0.01  # part of a history's power below its lowest frequency
+
+
+def identified_range(data: FitData) -> IdentifiedRange:
+    """Return what motions, frequencies and speeds the records have."""
+    moves = [float(np.ptp(data.target_um[place])) for place in data.places]
+    speeds = [
+        move * float(speed.max()) / float(np.ptp(record.command))
+        for move, speed, record in zip(moves, data.speeds, data.records, strict=True)
+    ]
+    lowest, highest = zip(*map(frequencies_hz, data.records), strict=True)
+    return IdentifiedRange(
+        peak_to_peak_um=(min(map(smallest_um, data.records)), max(moves)),
+        frequency_hz=(min(lowest), max(highest)),
+        speed_um_per_s=max(speeds),
+    )
+
+
+def smallest_um(record: Record) -> float:
+    """Return the peak-to-peak displacement of a loop, or of a history's smaller swings.
+
+    A history goes from turn to turn of its command. A tenth of its way it goes in smaller swings:
+    noise, or what is left of a decaying cycle, is not much of it.
+    """
+    if isinstance(record, History):
+        at = turning_points(record.command)
+        swings_um = np.sort(np.abs(np.diff(record.displacement_um[at])))
+        if swings_um.size >= FEWEST_SWINGS:
+            way_um = np.cumsum(swings_um)
+            found = float(swings_um[np.searchsorted(way_um, SMALL * way_um[-1])])
+            return max(found, NOT_ZERO_UM)
+    return float(np.ptp(record.displacement_um))
+
+
+def frequencies_hz(record: Record) -> tuple[float, float]:
+    """Return the lowest and the highest frequency of a record's command."""
+    command = record.command
+    if isinstance(record, SteadyLoop):
+        return record.frequency_hz, record.frequency_hz * _below(rfft(command - command.mean()))
+    rate_hz = record.sample_rate_hz
+    power = np.cumsum(np.abs(rfft(command - command.mean())) ** 2)
+    first = int(np.searchsorted(power, LEAST * power[-1]))
+    lowest = float(rfftfreq(command.size, 1.0 / rate_hz)[max(first, 1)])
+    return lowest, max(lowest, spectrum(command, rate_hz).highest_hz)
+
+
+def _below(harmonics: F64) -> int:
+    power = np.cumsum(np.abs(harmonics) ** 2)
+    return max(int(np.searchsorted(power, ALL * power[-1])), 1)
+
 
 VERSIONS = {"hilctl": hilctl.__version__, "numpy": np.__version__, "scipy": scipy.__version__}
 
@@ -60,19 +153,7 @@ class FittedModel(Evaluation):
         }
 
 
-def fit_model(
-    records: Records,
-    settings: FitSettings,
-    clock: Callable[[], float],
-    *,
-    unit: CommandUnit = "A",
-    source: Sequence[str] = (),
-    created: str = "",
-    progress: OnProgress = ignore_progress,
-    run: MapFunction = serial_map,
-    start: object | None = None,
-    modes: Sequence[FurtherMode] = (),
-) -> FittedModel:
+def fit_model(request: FitRequest) -> FittedModel:
     """Fit a model's parameters to steady loops and time histories.
 
     The criterion is the published sum of squared displacement errors (4.9, 5.14, 6.24) over all
@@ -81,36 +162,23 @@ def fit_model(
     The linear algebra is many small steps: with more than one BLAS thread on a busy machine they
     take up to 30 times as long, so programs set ``OPENBLAS_NUM_THREADS=1`` before NumPy loads.
 
-    Args:
-        records: At least one loop or history; steady loops only for what has dynamics.
-        settings: The kind of model, and all other choices.
-        clock: Time in s, for ``elapsed_s``.
-        unit: Unit of the command.
-        source: Recordings or files that the data come from, for the provenance.
-        created: Date and time in ISO 8601, UTC, for the provenance.
-        progress: Called with what is being done.
-        run: Follows starts that do not depend on each other.
-        start: Where the search begins, see :class:`~hilctl.identify.fit_api.FitJob`.
-        modes: Further modes of the structure, for kinds that have them.
-
     Raises:
         DataError: The data can't be used as asked, or there are none.
     """
-    begin = clock()
-    data = FitData(records, unit)
-    found = fit_kind(records, settings, unit, run=run, progress=progress, start=start, modes=modes)
+    begin, settings = time.perf_counter(), request.settings
+    data = FitData(request.records, request.unit)
+    found = fit_kind(request)
     judged = judge(found.model, data, creep=settings.creep)
     provenance = Provenance(
-        source=tuple(source),
+        source=tuple(request.source),
         method=_method(settings),
-        grid=tuple(map(_grid_line, records)),
+        grid=tuple(map(_grid_line, request.records)),
         parameters=found.parameters,
         errors_percent=error_table(judged),
         identified_range=identified_range(data),
         versions=VERSIONS,
-        created=created,
     )
-    progress(1.0, "done")
+    request.progress(1.0, "done")
     return FittedModel(
         errors=judged.errors,
         modelled_um=judged.modelled_um,
@@ -123,7 +191,7 @@ def fit_model(
         parameters=found.parameters,
         standard_errors=found.standard_errors,
         at_bound=found.at_bound,
-        elapsed_s=clock() - begin,
+        elapsed_s=time.perf_counter() - begin,
     )
 
 

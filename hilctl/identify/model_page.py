@@ -1,4 +1,4 @@
-"""An identified model as one self-contained page: model against data."""
+"""An identified or a refined model as one self-contained page: model against data."""
 
 import html
 from collections.abc import Sequence
@@ -11,14 +11,23 @@ from matplotlib.figure import Figure
 from hilctl.analysis.html import document, grid, wide_figure, write_page
 from hilctl.analysis.plot_style import DISPLACEMENT, ERROR, REFERENCE, STYLE
 from hilctl.base.types import F64
-from hilctl.identify.command import Identification
 from hilctl.identify.data.records import Record, SteadyLoop
 from hilctl.identify.evaluation import Evaluation
-from hilctl.identify.summary import HEADINGS, error_rows, parameter_texts, summary
+from hilctl.identify.pipeline import Identification
+from hilctl.identify.refine.refinement import Refinement
+from hilctl.identify.summary import (
+    HEADINGS,
+    REFINEMENT_HEADINGS,
+    error_rows,
+    parameter_texts,
+    refinement_rows,
+    summary,
+)
 from hilctl.models.model_file import dump_model
 
 COLUMNS = 3
 MOST_RECORDS = 36
+MOST_RUNS = 12
 MOST_DRAWN = 20_000  # samples of a history: more have no place on a page
 
 
@@ -92,3 +101,32 @@ def loops_figure(modelled_um: Sequence[F64], data: Sequence[Record], unit: str) 
         lower.set_visible(True)
     axes[0, 0].legend(loc="upper left")
     return figure
+
+
+def write_refinement(found: Refinement, path: Path) -> None:
+    """Write the page; one of that name is replaced.
+
+    Raises:
+        InputError: It can't be written.
+    """
+    write_page(refinement_page(found), path)
+
+
+def refinement_page(found: Refinement) -> str:
+    """Return the page as HTML."""
+    after = found.choice.after
+    shown = after.records[:MOST_RUNS]
+    title = html.escape(f"Refined: {', '.join(found.model.provenance.source)}")
+    body = [
+        f"<h1>{title}</h1>",
+        f"<p>{html.escape(str(found))}</p>",
+        f"<p>{html.escape(after.how)}</p>",
+        "<h2>Errors on runs not fitted</h2>",
+        grid(REFINEMENT_HEADINGS, refinement_rows(found), "numbers"),
+    ]
+    for heading, held in (("Before", found.choice.before), ("After", after)):
+        modelled = held.judgement.modelled_um[:MOST_RUNS]
+        figure = loops_figure(modelled, shown, found.model.input_unit)
+        body += [f"<h2>{heading}</h2>", wide_figure(heading, figure)]
+    body += [f"<details><summary>Model</summary><pre>{html.escape(dump_model(found.model))}</pre>"]
+    return document(title, [*body, "</details>"])

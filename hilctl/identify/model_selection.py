@@ -1,49 +1,56 @@
-"""The kind of model that does best on data held out: fitted to a part, judged on the rest."""
+"""Choose the kind of model, its size and the lag of tables by errors on held-out data."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import zip_longest
 from typing import Any
 
+import numpy as np
+
 from hilctl.base.errors import DataError
-from hilctl.base.types import CommandUnit
-from hilctl.identify.cross_validation import HeldOut, held_out_error
-from hilctl.identify.data.records import History, Record
-from hilctl.identify.fit_api import OnProgress, ignore_progress
-from hilctl.identify.parallel import MapFunction, serial_map
-from hilctl.identify.settings import IdentifySettings, kinds_of
-from hilctl.models.mechanics import FurtherMode
+from hilctl.identify.cross_validation import HeldOut, held_out_errors
+from hilctl.identify.data.records import History, Records
+from hilctl.identify.fit_api import FitRequest, OnProgress
+from hilctl.identify.fit_model import fit_model
+from hilctl.identify.parallel import MapFunction
+from hilctl.identify.settings import FitSettings, IdentifySettings, kinds_of
 
 WHOLE: tuple[Mapping[str, Any], ...] = (
     {"kind": "field", "drags": 0, "plays": 8, "cells": 12, "knots": 16},
     {"kind": "generalised_duhem", "cells": 12, "across": 8},
 )
-"""What is tried on histories: of each kind a model small enough to be found soon."""
+"""Candidates for histories: a small model of each kind, which is identified quickly."""
 PLAIN: Mapping[str, Any] = {"kind": "integrated", "offset": True}
-"""What is tried on them as well where none of these does well."""
-WELL_PERCENT = 1.0  # rms of the stroke: small models of the right kind come to a third of it
+"""Further candidate for histories if the error of all others is large."""
+WELL_PERCENT = 1.0  # rms, of the stroke: small models of the right kind reach a third of it
 IN_FULL: Mapping[str, tuple[Mapping[str, Any], ...]] = {
     "field": ({"kind": "field", "drags": 0}, {"kind": "field"}),
     "generalised_duhem": ({"kind": "generalised_duhem"},),
 }
-"""What is tried of a kind whose small model did well, one after the other: the small loops of a
-field may creep."""
+"""Larger candidates of a kind whose small model has a small error, one after the other: the small
+loops of a field may creep."""
 LONGEST = max(map(len, IN_FULL.values()))
-NEAR = 2.0  # times the least error: that of a small model whose kind may still be the best
-WORTH = 0.95  # of an error: what more operators must bring it to; each run takes longer by them
+NEAR = 2.0  # times the least error: a small model of the best kind may have it
+WORTH = 0.95  # of the error: a larger model must be below it, since it slows every run
 LOOPS: tuple[Mapping[str, Any], ...] = (
     {"kind": "staged"},
     {"kind": "integrated", "offset": True},
 )
-"""What is tried on steady loops."""
+"""Candidates for steady loops."""
+ORDERS = ((6, 4), (8, 6), (12, 8), (16, 10), (20, 12), (28, 16))
+"""Plays, and deadbands on each side if the model has any."""
+LINES = (8, 12, 16, 20, 28, 36)
+"""Lines of a Preisach triangle, instead of :data:`ORDERS`."""
+WORTH_SIZE = 1.03  # a larger model must lower the error by more than 3 %
+MOST_LAG = 8  # samples tried
 
 
 @dataclass(frozen=True, slots=True)
 class CandidateScore:
-    """How a kind of model did on data that it was not fitted to.
+    """Errors of one kind of model on held-out data.
 
     Attributes:
-        settings: The kind, and what was not left as published.
+        settings: The kind, and settings that differ from its published ones.
         rms_percent: Of the largest peak-to-peak displacement.
         peak_percent: The same for the largest error.
     """
@@ -54,47 +61,61 @@ class CandidateScore:
 
 
 @dataclass(frozen=True, slots=True)
-class SelectedModel:
-    """What a kind of model is chosen for.
+class OrderScore:
+    """Errors of a model of one size on held-out data.
 
     Attributes:
-        records: The data.
-        settings: How files were read, and which parts that may be left out are looked for; of the
-            fit, nothing else.
-        unit: Unit of the command.
-        modes: Further modes of the structure that are known, for kinds that have them.
+        plays: Play operators; lines, if the model has a Preisach triangle.
+        deadbands_a_side: Deadbands on each side of 0.
+        rms_percent: Of all held-out data, in percent of the largest peak-to-peak.
+        peak_percent: The same for the largest error.
     """
 
-    records: tuple[Record, ...]
-    settings: IdentifySettings
-    unit: CommandUnit
-    modes: tuple[FurtherMode, ...] = ()
+    plays: int
+    deadbands_a_side: int
+    rms_percent: float
+    peak_percent: float
 
 
-def choose_kind(
-    choice: SelectedModel, run: MapFunction, progress: OnProgress
-) -> tuple[IdentifySettings, HeldOut, tuple[CandidateScore, ...]]:
-    """Fit each candidate to a part of the data, and take the one that does best on the rest.
+@dataclass(frozen=True, slots=True)
+class Selection:
+    """Selected settings, and the errors that they were selected by.
 
-    Of histories, small models say which kinds are worth a large one: the errors of the wrong kind
-    are several times those of the right one at any size.
+    Attributes:
+        settings: The settings.
+        held_out: Their errors on held-out data; None if nothing was selected.
+        candidates: Errors of each kind that was tried.
+        orders: Errors of each size that was tried.
+    """
 
-    Args:
-        choice: The data, and what else all candidates share.
-        run: Runs fits that do not depend on each other.
-        progress: Called with what is being done.
+    settings: FitSettings
+    held_out: HeldOut | None = None
+    candidates: tuple[CandidateScore, ...] = ()
+    orders: tuple[OrderScore, ...] = ()
 
-    Returns:
-        The choices of the best, how it did, and how each of them did.
+
+def select(request: FitRequest) -> Selection:
+    """Select kind or size by errors on held-out data, as far as the settings leave them open.
 
     Raises:
         DataError: There are too few data to leave some out.
     """
-    whole = any(isinstance(record, History) for record in choice.records)
-    trials = _Trials(choice, run, progress)
-    errors = trials.of(WHOLE if whole else LOOPS)
+    settings = request.settings
+    if isinstance(settings, IdentifySettings) and settings.auto:
+        return _choose_kind(request, settings)
+    return _choose_order(request) if settings.size == "auto" else Selection(settings)
+
+
+def _choose_kind(request: FitRequest, given: IdentifySettings) -> Selection:
+    """Return the kind with the least error.
+
+    Of histories, small models say which kinds are worth a large one: the errors of the wrong kind
+    are several times those of the right one at any size.
+    """
+    whole = any(isinstance(record, History) for record in request.records)
+    errors = _candidates(request, given, WHOLE if whole else LOOPS)
     if whole and not any(each.rms_percent < WELL_PERCENT for each in errors):
-        errors += trials.of((PLAIN,))
+        errors += _candidates(request, given, (PLAIN,))
     if not errors:
         raise DataError("too few data to leave some out and choose by them: name a --model")
     best = min(errors, key=_rms_percent)
@@ -102,18 +123,31 @@ def choose_kind(
     for turn in range(LONGEST if whole else 0):
         chains = [(IN_FULL.get(each.settings.kind, ())[turn:], each) for each in near]
         larger = [(chain[0], each) for chain, each in chains if chain]
-        found = trials.of([more for more, _ in larger], [each.held_out.end for _, each in larger])
+        starts = [each.held_out.end for _, each in larger]
+        found = _candidates(request, given, [more for more, _ in larger], starts)
         errors += found
         best = min((best, *(x for x in found if x.rms_percent < WORTH * best.rms_percent)),
                    key=_rms_percent)  # fmt: skip
         near = [best] if best in found else []
-    return best.settings, best.held_out, tuple(each.error for each in errors)
+    return Selection(best.settings, best.held_out, candidates=tuple(e.candidate for e in errors))
+
+
+def _choose_order(request: FitRequest) -> Selection:
+    """Return the smallest size whose error is near the least."""
+    sizes = _sizes(request.settings)
+    request.progress(0.0, f"fits with data left out, of {len(sizes)} sizes")
+    errors = _tried(request, [("", settings) for settings in sizes])
+    if not errors:
+        raise DataError("too few data to leave some out and choose a number of plays by them")
+    most = WORTH_SIZE * min(each.rms_percent for each in errors)
+    best = next(each for each in errors if each.rms_percent <= most)
+    return Selection(best.settings, best.held_out, orders=tuple(each.order for each in errors))
 
 
 @dataclass(frozen=True, slots=True)
 class _Tried:
     name: str
-    settings: IdentifySettings
+    settings: FitSettings
     held_out: HeldOut
 
     @property
@@ -121,40 +155,47 @@ class _Tried:
         return self.held_out.judgement.rms_percent
 
     @property
-    def error(self) -> CandidateScore:
+    def candidate(self) -> CandidateScore:
         return CandidateScore(self.name, self.rms_percent, self.held_out.judgement.peak_percent)
+
+    @property
+    def order(self) -> OrderScore:
+        settings = self.settings
+        plays, deadbands = settings.plays, settings.deadbands if settings.has("deadbands") else 0
+        if settings.hysteresis == "preisach":
+            plays, deadbands = settings.lines, 0
+        return OrderScore(plays, deadbands, self.rms_percent, self.held_out.judgement.peak_percent)
 
 
 def _rms_percent(tried: _Tried) -> float:
     return tried.rms_percent
 
 
-@dataclass(frozen=True, slots=True)
-class _Trials:
-    """Fits of candidates to a part of the records."""
+def _tried(
+    request: FitRequest,
+    named: Sequence[tuple[str, FitSettings]],
+    starts: Sequence[object | None] = (),
+) -> list[_Tried]:
+    """Return the errors of settings that can be fitted; searches begin where others ended."""
+    requests = [
+        replace(request, settings=settings, start=start)
+        for (_, settings), start in zip_longest(named, starts)
+    ]
+    found = zip(named, held_out_errors(requests, request.run), strict=True)
+    return [_Tried(name, settings, out) for (name, settings), out in found if out is not None]
 
-    choice: SelectedModel
-    run: MapFunction
-    progress: OnProgress
 
-    def of(
-        self, candidates: Sequence[Mapping[str, Any]], starts: Sequence[object | None] = ()
-    ) -> list[_Tried]:
-        """Return how candidates do that can be fitted; searches begin where others ended."""
-        given = self.choice.settings
-        shared: dict[str, Any] = {
-            "whole": given.whole,
-            "table": given.table,
-            "points": given.points,
-        }
-        trials = [
-            _Trial(self.choice, IdentifySettings(**each, **shared, **_parts(each, given)), start)
-            for each, start in zip_longest(candidates, starts)
-        ]
-        names = [", ".join(f"{key} {value}" for key, value in each.items()) for each in candidates]
-        self.progress(0.0, "; ".join(names))
-        found = zip(names, trials, self.run(_held_out, trials), strict=True)
-        return [_Tried(name, trial.settings, out) for name, trial, out in found if out is not None]
+def _candidates(
+    request: FitRequest,
+    given: IdentifySettings,
+    candidates: Sequence[Mapping[str, Any]],
+    starts: Sequence[object | None] = (),
+) -> list[_Tried]:
+    shared: dict[str, Any] = {"whole": given.whole, "table": given.table, "points": given.points}
+    names = [", ".join(f"{key} {value}" for key, value in each.items()) for each in candidates]
+    request.progress(0.0, "; ".join(names))
+    settings = [IdentifySettings(**each, **shared, **_parts(each, given)) for each in candidates]
+    return _tried(request, list(zip(names, settings, strict=True)), starts)
 
 
 def _parts(candidate: Mapping[str, Any], given: IdentifySettings) -> dict[str, Any]:
@@ -164,16 +205,29 @@ def _parts(candidate: Mapping[str, Any], given: IdentifySettings) -> dict[str, A
     return {name: getattr(given, name) for name in has}
 
 
-@dataclass(frozen=True, slots=True)
-class _Trial:
-    choice: SelectedModel
-    settings: IdentifySettings
-    start: object | None
+def _sizes(settings: FitSettings) -> list[FitSettings]:
+    if settings.hysteresis == "preisach":
+        return [settings.model_copy(update={"lines": lines}) for lines in LINES]
+    return [settings.model_copy(update={"plays": n, "deadbands": k}) for n, k in ORDERS]
 
 
-def _held_out(trial: _Trial) -> HeldOut | None:
-    choice, settings = trial.choice, trial.settings
-    modes = choice.modes if settings.looks_for("modes") else ()
-    return held_out_error(
-        choice.records, settings, choice.unit, serial_map, ignore_progress, trial.start, modes
-    )
+def choose_lag(
+    load: Callable[[int], Records], settings: FitSettings, run: MapFunction, progress: OnProgress
+) -> int:
+    """Find by how many samples the displacement lags: the lag that leaves the least error.
+
+    Args:
+        load: Gives the data with the displacement taken that many samples earlier.
+        settings: The choices of the fit.
+        run: Runs fits that do not depend on each other.
+        progress: Called with what is being done.
+    """
+    progress(0.0, f"{MOST_LAG + 1} fits for the lag of the displacement")
+    lean = settings.model_copy(update={"starts": 1, "peak_goal_percent": None})
+    requests = [FitRequest(tuple(load(lag)), lean) for lag in range(MOST_LAG + 1)]
+    return int(np.argmin(run(_rms_um, requests)))
+
+
+def _rms_um(request: FitRequest) -> float:
+    fit = fit_model(request)
+    return fit.rms_percent * max(error.peak_to_peak_um for error in fit.errors)

@@ -3,52 +3,20 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-import numpy as np
-
 from hilctl.base.errors import InputError
 from hilctl.base.yaml import did_you_mean
-from hilctl.identify.evaluation import weight_roots
 from hilctl.identify.field.field_fits import fit_field
 from hilctl.identify.fit_api import FitJob, FoundModel
-from hilctl.identify.generalised_duhem.fits import fit_generalised_duhem
+from hilctl.identify.generalised_duhem.search import fit_generalised_duhem
 from hilctl.identify.literature.asymmetric import fit_asymmetric
 from hilctl.identify.literature.generalised_pi import fit_generalised
 from hilctl.identify.literature.linear_weights import fit_kp, fit_preisach, fit_straight
 from hilctl.identify.literature.ode_models import fit_bouc_wen, fit_duhem
 from hilctl.identify.searched.butterfly import fit_butterfly
-from hilctl.identify.searched.integrated import ExponentialProblem
-from hilctl.identify.searched.plays import PlaysProblem
-from hilctl.identify.searched.search import SearchProblem, refine_peak, search
+from hilctl.identify.searched.integrated import fit_exponential
+from hilctl.identify.searched.plays import fit_plays
 from hilctl.identify.settings import FitKind
 from hilctl.identify.staged.staged_fits import fit_free, fit_staged
-
-
-def fit_plays(job: FitJob) -> FoundModel:
-    """Fit a PPI or an RDPI; its weights follow from its thresholds."""
-    return _searched(PlaysProblem(job.data, job.settings), job)
-
-
-def fit_exponential(job: FitJob) -> FoundModel:
-    """Fit the integrated model with exponential weights."""
-    return _searched(ExponentialProblem(job.data, job.settings), job)
-
-
-def _searched(problem: SearchProblem, job: FitJob) -> FoundModel:
-    data, settings = job.data, job.settings
-    rng = np.random.default_rng(settings.seed)
-    roots = weight_roots(data.records, settings.weight_by)
-    scale = np.append(roots, np.ones(problem.held))
-    found = search(problem, scale, data.stroke_um, settings.starts, rng, job.progress)
-    if settings.peak_goal_percent is not None:
-        goal_um = settings.peak_goal_percent / 100.0 * data.stroke_um
-        found = refine_peak(problem, found, goal_um, job.progress)
-    known = problem.parameters(found.x, found.scale)
-    numbers = len(known.keys() - {"g_0"})  # which is 1 by definition
-    at_bound = problem.space.at_bound(found.x)
-    held = tuple(name for name, bound in zip(problem.searched, at_bound, strict=True) if bound)
-    model = problem.build(found.x, found.scale)
-    return FoundModel(model, numbers, known, found.starts, at_bound=held)
-
 
 ANY = "steady loops, or whole histories"
 HISTORIES = "whole histories"

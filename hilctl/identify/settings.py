@@ -79,9 +79,6 @@ class FitSettings(StrictModel):
         le=100,
         description="Lines of a Preisach triangle, and cells of the longest; or auto.",
     )
-    levels: int = _of(
-        "kp", default=16, ge=4, le=60, description="Levels of the Krasnosel'skii-Pokrovskii grid."
-    )
     drags: int = _of("field", default=3, ge=0, le=12, description="Drags, whose small loops creep.")
     cells: int = _of(
         "field",
@@ -100,9 +97,6 @@ class FitSettings(StrictModel):
     )
     knots: int = _of(
         "field", default=24, ge=2, le=60, description="Pieces of the curve after them."
-    )
-    corners: int = _of(
-        "butterfly", default=16, ge=1, le=100, description="Slopes of the even function."
     )
     size: Literal["given", "auto"] = _of(
         *_PLAYS,
@@ -170,13 +164,6 @@ class FitSettings(StrictModel):
     )
     starts: int = _of(
         *_PLAYS, default=6, ge=1, le=1000, description="Starting points of the search."
-    )
-    seed: int = _of(*_SEARCHED, default=1, ge=0, description="Seed of the random starts.")
-    least_slope: float = _of(
-        default=0.01,
-        gt=0.0,
-        lt=1.0,
-        description="Smallest slope of the model, of the data's mean slope.",
     )
     peak_goal_percent: float | None = _of(
         *_PLAYS,

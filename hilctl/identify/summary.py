@@ -1,11 +1,13 @@
-"""An identified model, as rows and lines of text."""
+"""An identified or a refined model, as rows and lines of text."""
 
 from collections.abc import Sequence
 
-from hilctl.identify.command import Identification
 from hilctl.identify.evaluation import Evaluation, LoopScore
 from hilctl.identify.fit_model import FittedModel
+from hilctl.identify.pipeline import Identification
+from hilctl.identify.refine.refinement import Refinement
 
+REFINEMENT_HEADINGS = ("run", "p-p µm", "peak % before", "after", "rms % before", "after")
 HEADINGS = ("loop", "p-p µm", "peak %", "rms %", "area %")
 
 
@@ -70,3 +72,24 @@ def _errors(judged: Evaluation) -> str:
 def _span(limits: tuple[float, float]) -> str:
     low, high = (f"{limit:.4g}" for limit in limits)
     return low if low == high else f"{low} to {high}"
+
+
+def refinement_rows(found: Refinement) -> list[tuple[str, ...]]:
+    """Return one row a run that was held out, under :data:`REFINEMENT_HEADINGS`."""
+    before, after = (held.judgement.errors for held in (found.choice.before, found.choice.after))
+    return [
+        (
+            was.label,
+            *(
+                f"{figure:.3g}"
+                for figure in (
+                    was.peak_to_peak_um,
+                    was.peak_percent,
+                    now.peak_percent,
+                    was.rms_percent,
+                    now.rms_percent,
+                )
+            ),
+        )
+        for was, now in zip(before, after, strict=True)
+    ]

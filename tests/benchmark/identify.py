@@ -18,6 +18,7 @@ from scipy.optimize import least_squares
 from hilctl.identify.data.cycles import average_cycle
 from hilctl.identify.data.records import SteadyLoop
 from hilctl.identify.evaluation import Evaluation, judge
+from hilctl.identify.fit_api import FitRequest
 from hilctl.identify.fit_data import FitData
 from hilctl.identify.fit_model import fit_model
 from hilctl.identify.settings import FitSettings
@@ -91,7 +92,7 @@ def fast(data: list[SteadyLoop], repeats: int = 10) -> tuple[IntegratedModel, fl
     settings = FitSettings(kind="integrated", weights="free", starts=1)
     begin = time.perf_counter()
     for _ in range(repeats):
-        found = fit_model(data, settings, time.perf_counter)
+        found = fit_model(FitRequest(data, settings))
     assert isinstance(found.model, IntegratedModel)
     return found.model, (time.perf_counter() - begin) / repeats
 

@@ -26,9 +26,10 @@ from hilctl.base.types import F64
 from hilctl.experiment.conditioning import conditioning_of
 from hilctl.experiment.initial_state import InitialState, begin, left_by
 from hilctl.experiment.load import LoadedExperiment, load_experiment
-from hilctl.identify.command import identify_records, settings_from
 from hilctl.identify.data.records import History
+from hilctl.identify.fit_api import FitRequest
 from hilctl.identify.fit_model import FittedModel
+from hilctl.identify.pipeline import identify_records, settings_from
 from hilctl.loop.compensator import Compensator
 from hilctl.models.base import HysteresisModel
 from hilctl.models.model_file import load_model
@@ -136,7 +137,7 @@ def identified(rig: Rig, kind: str, seed: int) -> tuple[FittedModel, float]:
     measured = driven(rig.at_rest(noise=True, seed=seed), command)
     records = [History("campaign", command, measured, RATE_HZ)]
     start = time.process_time()
-    found = identify_records(records, settings_from(kind, []), "A")
+    found = identify_records(FitRequest(records, settings_from(kind, []), "A"))
     return found.fit, time.process_time() - start
 
 

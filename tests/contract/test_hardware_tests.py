@@ -12,8 +12,7 @@ from pathlib import Path
 import pytest
 
 from hilctl_drivers.emulator.factory import Emulator, build
-from hilctl_drivers.emulator.faults import parse_fault
-from hilctl_drivers.emulator.options import EmulatorOptions
+from hilctl_drivers.emulator.options import EmulatorOptions, parse_fault
 
 ROOT = Path(__file__).parents[2]
 GIVE_UP_S = 120.0

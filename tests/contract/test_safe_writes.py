@@ -21,7 +21,7 @@ from hilctl_drivers.modbus.modbus_dac import ModbusDac
 from hilctl_drivers.modbus.pdu import rtu_adu
 from hilctl_drivers.profile import shipped_profiles
 from hilctl_drivers.serial.serial_dac import SerialDac
-from hilctl_drivers.serial.serial_setup import SerialOptions
+from hilctl_drivers.serial.serial_wire import SerialOptions
 from hilctl_drivers.transport.framing import binary_framing
 
 TIMEOUT_S = 0.15

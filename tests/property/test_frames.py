@@ -33,7 +33,7 @@ from hilctl_drivers.modbus.pdu import (
     write_single_pdu,
 )
 from hilctl_drivers.modbus.prepared_requests import RtuTransaction, TcpTransaction
-from hilctl_drivers.modbus.registers import RegisterFormat
+from hilctl_drivers.modbus.register_map import RegisterFormat
 from hilctl_drivers.transport.crc import CRCS
 from hilctl_drivers.transport.framing import binary_framing
 from hilctl_drivers.transport.links import CorruptError, FrameError

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from tests.unit.models.test_numeric_inverse import BOUC_WEN, DUHEM, KP, PREISACH
 
 from hilctl.base.samples import Flag
 from hilctl.loop.limiter import CommandLimits
@@ -12,6 +11,7 @@ from tests.fakes import FakeClock
 from tests.unit.loop.test_loop import CONFIGS, RATE_HZ, Rig
 from tests.unit.models.test_base import MODELS as PLAYS
 from tests.unit.models.test_generalised_duhem import duhem_model
+from tests.unit.models.test_implicit_base import BOUC_WEN, DUHEM, KP, PREISACH
 
 COMPARED = {"preisach": PREISACH, "kp": KP, "bouc_wen": BOUC_WEN, "duhem": DUHEM}
 SHIPPED = {path.stem: load_model(path) for path in sorted(CONFIGS.glob("*.yaml"))}

@@ -14,6 +14,7 @@ from hilctl.cli.commands import app
 from hilctl.identify.data.cycles import average_cycle
 from hilctl.identify.data.records import SteadyLoop
 from hilctl.identify.evaluation import judge
+from hilctl.identify.fit_api import FitRequest
 from hilctl.identify.fit_model import fit_model
 from hilctl.identify.settings import FitSettings
 from hilctl.models.model_file import dump_model, load_model
@@ -50,7 +51,7 @@ def found():
     tones += [(a, f, 3.5) for a in (2.0, 3.5) for f in (10.0, 100.0)]
     loops = [loop(*tone) for tone in tones]
     settings = FitSettings(kind="butterfly", plays=24, turning_um=0.0, magnets=False)
-    return fit_model(loops, settings, lambda: 0.0)
+    return fit_model(FitRequest(loops, settings))
 
 
 def test_displacement_repeats_twice_a_cycle_without_bias():

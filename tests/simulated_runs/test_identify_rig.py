@@ -15,6 +15,7 @@ from hilctl.base.types import F64
 from hilctl.identify.data.cycles import average_cycle
 from hilctl.identify.data.records import SteadyLoop
 from hilctl.identify.evaluation import judge
+from hilctl.identify.fit_api import FitRequest
 from hilctl.identify.fit_model import FittedModel, fit_model
 from hilctl.identify.settings import FitKind, FitSettings
 from hilctl.signals.cycle_metrics import fold, peak_hysteresis_percent
@@ -60,7 +61,7 @@ def sines(
 
 
 def fit(kind: FitKind, data: list[SteadyLoop], **choices: Any) -> FittedModel:
-    return fit_model(data, FitSettings(kind=kind, **choices), lambda: 0.0)
+    return fit_model(FitRequest(data, FitSettings(kind=kind, **choices)))
 
 
 @cache

@@ -19,6 +19,7 @@ import scipy
 from hilctl.base.types import F64
 from hilctl.identify.data.cycles import average_cycle
 from hilctl.identify.data.records import History, SteadyLoop
+from hilctl.identify.fit_api import FitRequest
 from hilctl.identify.fit_model import fit_model
 from hilctl.identify.registry import CATALOGUE, HISTORIES
 from hilctl.identify.settings import FitSettings
@@ -95,7 +96,7 @@ def fit_all() -> None:
     models = {}
     for name, choices in FITS.items():
         records = whole if CATALOGUE[choices["kind"]].data == HISTORIES else loops
-        fit = fit_model(records, FitSettings(**choices), lambda: 0.0)
+        fit = fit_model(FitRequest(records, FitSettings(**choices)))
         models[name] = fit.model.model_dump(mode="json", exclude={"provenance"})
     print(json.dumps(models))
 

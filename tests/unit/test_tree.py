@@ -7,13 +7,14 @@ ROOT = UNIT.parents[1]
 PACKAGES = {Path(): ROOT / "hilctl", Path("drivers"): ROOT / "drivers" / "hilctl_drivers"}
 
 WITHOUT = {
+    "identify/fit_api": "what a fit gets and returns; identify/test_fit_model.py fills both",
+    "identify/generalised_duhem/tables": "identify/generalised_duhem/test_search.py tests both",
     "run/guardian_process": "tests/faults/test_processes.py runs it; run/test_job.py the limits",
     "base/types": "names of types; waveforms/test_build.py reads arrays in chunks",
     "base/device": "the contract of devices: tests/contract/test_devices.py holds each to it",
     "base/events": "one record of plain values; seen in run/test_shared_page.py",
     "cli/options": "types of options; cli/test_commands.py loads every command that has them",
     "drivers/contract": "the checks of tests/contract; test_bad_devices.py makes each of them fail",
-    "drivers/emulator/wire": "a contract and a record; drivers/emulator/test_server.py uses both",
     "loop/host": "a contract and a record; loop/test_loop.py runs the loop on a double of it",
     "loop/plan": "two records of plain values; loop/test_loop.py fills and reads all of them",
     "recording/metadata_keys": "names; analysis/test_catalogue.py reads all of them",

@@ -3,16 +3,21 @@
 import re
 from string import Formatter
 
-from hilctl.base.errors import DeviceError, InputError, UnconfirmedError
+from hilctl.base.errors import InputError, UnconfirmedError
 from hilctl.base.types import F64
 from hilctl_drivers.ascii.ascii_profile import AsciiInput, AsciiOutput, AsciiProfile
-from hilctl_drivers.ascii.ascii_session import AsciiSession
-from hilctl_drivers.ascii.ascii_timing import arm_s, exchange_time, feed_time, query_time
+from hilctl_drivers.ascii.ascii_session import (
+    AsciiSession,
+    arm_s,
+    exchange_time,
+    feed_time,
+    query_time,
+)
 from hilctl_drivers.ascii.lines import parse_number
 from hilctl_drivers.profile_base import Range
-from hilctl_drivers.serial.serial_setup import SerialSetup
-from hilctl_drivers.serial.serial_wire import SerialWire, check_stands
+from hilctl_drivers.serial.serial_wire import SerialSetup, SerialWire
 from hilctl_drivers.transport.links import WatchdogTrippedError, naming
+from hilctl_drivers.transport.safe_exchange import try_out
 from hilctl_drivers.transport.wire_time import RateLimit, WireTime, check_feeds
 
 _NO_EVIDENCE = (
@@ -208,7 +213,7 @@ class AsciiWire(SerialWire):
         # A command without a reply may have been ignored.
         readback = self._output.readback
         if readback != "none":
-            check_stands(self._output, value, self._writer.number(readback))
+            self._check_read_back(value, self._writer.number(readback))
         elif self._profile.error_query != "none":
             self._writer.check_errors()
         elif not answered:
@@ -220,19 +225,18 @@ class AsciiWire(SerialWire):
         An output that cannot be read is left alone, as is a value that the command would round.
         """
         value = self.output()
-        low, high = self._output.limits
-        if value is None or not low <= value <= high:
+        if value is None:
             return
         fields = Formatter().parse(self._output.write)
         spec = next(spec for _, field, spec, _ in fields if field == "value")
         if float(format(value + 0.0, spec or "")) != value:
             return
-        text = self._command(value + 0.0)
-        try:
+
+        def put() -> None:
             self._write(value + 0.0)
             self._writer.check_errors()
-        except DeviceError as error:
-            raise DeviceError(f"the safe value cannot be set with {text}: {error}") from None
+
+        try_out(self._output, value, put, f"with {self._command(value + 0.0)}")
 
     def _unconfirmed(self) -> str:
         """Return why a value cannot be confirmed; empty if it can."""

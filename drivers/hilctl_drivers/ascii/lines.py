@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 from hilctl_drivers.transport.crc import Bytes, dcon_checksum, gen_checksum
-from hilctl_drivers.transport.deframers import DelimitedSplitter
+from hilctl_drivers.transport.framing import DelimitedSplitter
 from hilctl_drivers.transport.links import BadRequestError, CorruptError, IncompleteError
 
 ChecksumKind: TypeAlias = Literal["none", "dcon", "gen"]

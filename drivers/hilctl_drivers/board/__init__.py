@@ -6,5 +6,5 @@ session.py  one conversation
 wire.py     sample by sample, and through a FIFO
 """
 
-LINK_KINDS = {"frames": f"{__name__}.profile:FrameProfile"}
+LINK_KINDS = {"frames": f"{__name__}.board_profile:FrameProfile"}
 """What a profile's ``link.kind`` says of it: where the class of such profiles stands."""

@@ -6,9 +6,8 @@ from pydantic import Field, model_validator
 
 from hilctl.base.strict import StrictModel
 from hilctl_drivers.board.frames import exchange_sizes
-from hilctl_drivers.modbus.registers import RegisterFormat, RegisterType
-from hilctl_drivers.profile_base import BaseProfile, Name, Range, Watchdog
-from hilctl_drivers.transport.link_config import BinaryLineSettings
+from hilctl_drivers.modbus.register_map import RegisterFormat, RegisterType
+from hilctl_drivers.profile_base import BaseProfile, BinaryLineSettings, Name, Range, Watchdog
 
 CrcName: TypeAlias = Literal["crc16_modbus", "crc16_ccitt_false", "crc16_xmodem", "crc32", "none"]
 

@@ -8,16 +8,16 @@ is how long this machine may stall. The first sample is put out once that many a
 
 import numpy as np
 
-from hilctl.base.errors import DeviceError
+from hilctl.base.errors import DeviceError, InputError
 from hilctl.base.types import F64
 from hilctl_drivers.board import frames as board
 from hilctl_drivers.board.board_profile import FrameProfile, FramesLink, FrameStreaming
 from hilctl_drivers.board.board_session import BoardFacts, BoardSession, Readings
 from hilctl_drivers.board.frames import WATCHDOG_REPLY, WATCHDOG_REQUEST, exchange_sizes
-from hilctl_drivers.serial.serial_setup import SerialSetup
-from hilctl_drivers.serial.serial_wire import SerialWire, check_stands, refuse
+from hilctl_drivers.serial.serial_wire import SerialSetup, SerialWire
 from hilctl_drivers.transport.framing import binary_framing
 from hilctl_drivers.transport.links import WatchdogTrippedError
+from hilctl_drivers.transport.safe_exchange import try_out
 from hilctl_drivers.transport.serial_port import SerialLink
 from hilctl_drivers.transport.wire_time import RateLimit, WireTime, check_feeds
 
@@ -108,7 +108,9 @@ class BoardWire(SerialWire):
 
     def __init__(self, setup: SerialSetup, profile: FrameProfile) -> None:
         super().__init__(setup)
-        refuse(setup, "reader", "measure", "unit_id")
+        for name in ("reader", "measure", "unit_id"):
+            if getattr(setup.options, name) is not None:
+                raise InputError(f"{name} is for devices that speak lines of text")
         self._profile = profile
         self._session = BoardSession(profile, self._link)
         self._safe = setup.chain.output(setup.options.safe_command)
@@ -149,11 +151,11 @@ class BoardWire(SerialWire):
         try:
             self._session.put_out(value)
         except WatchdogTrippedError:
-            self._set_watchdog()
+            self._set_watchdog(self._setup.options.watchdog_timeout_s)
             self._session.put_out(value)
         state = self._session.state()
         if state is not None:
-            check_stands(self._setup.output, value, state.output)
+            self._check_read_back(value, state.output)
 
     def _connect(self, link: SerialLink) -> BoardFacts:
         """Connect and check that it is a board that this profile describes."""
@@ -178,32 +180,23 @@ class BoardWire(SerialWire):
     def arm(self) -> None:
         """See :meth:`~hilctl_drivers.serial.serial_wire.SerialWire.arm`."""
         if self._setup.options.watchdog != "none":
-            self._set_watchdog()
+            self._set_watchdog(self._setup.options.watchdog_timeout_s)
 
     def _try_out_safe_value(self) -> None:
         """Set the output to what it holds by SAFE, or to the safe value after a trip."""
         state = self._session.state()
-        self._disarm()  # which ends a trip of an earlier run
+        self._set_watchdog(None)  # which ends a trip of an earlier run
         if state is None:
             return
         # At once: a board that comes back to a command from before must not keep it.
         value = self._safe if state.tripped else state.output
-        low, high = self._setup.output.limits
-        if low <= value <= high:
-            try:  # the message of the safe value, with what the output holds
-                self._session.put_out(value)
-            except DeviceError as error:
-                raise DeviceError(f"the safe value cannot be written by SAFE: {error}") from None
+        put_out = self._session.put_out
+        try_out(self._setup.output, value, lambda: put_out(value), "by SAFE")
 
-    def _set_watchdog(self) -> None:
-        """Set the watchdog as the experiment wants it, which clears a trip."""
+    def _set_watchdog(self, timeout_s: float | None) -> None:
+        """Set the watchdog if the board has one, which clears a trip; None disarms it."""
         if self._profile.watchdog != "none":
-            timeout_s = self._setup.options.watchdog_timeout_s or 0.0
-            self._session.set_watchdog(timeout_s, self._safe)
-
-    def _disarm(self) -> None:
-        if self._profile.watchdog != "none":
-            self._session.set_watchdog(0.0, self._safe)
+            self._session.set_watchdog(timeout_s or 0.0, self._safe)
 
 
 class BoardSingle(BoardWire):
@@ -226,7 +219,7 @@ class BoardSingle(BoardWire):
 
     def close(self) -> None:
         """See :meth:`~hilctl_drivers.serial.serial_wire.SerialWire.close`."""
-        self._disarm()
+        self._set_watchdog(None)
 
 
 class BoardStream(BoardWire):
@@ -284,7 +277,7 @@ class BoardStream(BoardWire):
         """Stop the clock and disarm; the output holds its last value."""
         # The clock first: an output that moves must not be without its watchdog.
         self._session.set_clock(0.0, 0)
-        self._disarm()
+        self._set_watchdog(None)
 
     def _check_block(self, block: int, depth: int, block_max: int) -> None:
         if not 1 <= block <= block_max:

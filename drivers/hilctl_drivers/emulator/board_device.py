@@ -10,8 +10,7 @@ from hilctl_drivers.board import frames as board
 from hilctl_drivers.board.board_profile import FrameProfile, FrameStreaming
 from hilctl_drivers.board.board_session import BoardValues
 from hilctl_drivers.board.frames import Status
-from hilctl_drivers.emulator.fifo import SampleFifo
-from hilctl_drivers.emulator.rig import Rig, SimulatedWiring, WriteLog
+from hilctl_drivers.emulator.rig import Rig, SampleFifo, SimulatedWiring, WriteLog
 from hilctl_drivers.emulator.wire import EmulatedReply
 
 

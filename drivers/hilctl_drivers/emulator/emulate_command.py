@@ -1,9 +1,9 @@
-"""The command ``hilctl emulate``: serves an emulator until a signal ends it."""
+"""The command ``hilctl emulate``: serves a profile, or the device of an experiment."""
 
 import gc
 import shlex
 import signal
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import FrameType
@@ -11,14 +11,168 @@ from typing import Annotated, Any, cast
 
 import typer
 
-from hilctl.base.errors import InputError
+from hilctl.base.errors import ConfigError, ConfigProblem, InputError
+from hilctl.base.files import TextFiles
 from hilctl.base.formatting import finite_json
-from hilctl_drivers.emulator.experiment_rig import WiredExperiment, is_experiment, wired_experiment
+from hilctl.base.yaml import Document, load_document
 from hilctl_drivers.emulator.factory import Emulator, build
-from hilctl_drivers.emulator.faults import parse_fault
 from hilctl_drivers.emulator.modbus_device import EmulatedModbus
 from hilctl_drivers.emulator.modbus_wire import LinkKind
-from hilctl_drivers.emulator.options import EmulatorOptions, ReaderLine
+from hilctl_drivers.emulator.options import EmulatorOptions, ReaderLine, parse_fault
+from hilctl_drivers.emulator.rig import SimulatedWiring
+from hilctl_drivers.labjack.modbus_stream import ModbusStreamOptions
+from hilctl_drivers.modbus.config import ModbusReaderOptions
+from hilctl_drivers.modbus.modbus_profile import ModbusProfile
+from hilctl_drivers.profile import NamedProfile, load_profile
+from hilctl_drivers.serial.serial_wire import SerialOptions
+from hilctl_drivers.signal_chain import DacOptions, ReaderOptions
+
+_UNPRIVILEGED = 1024
+_HERE = ("127.0.0.1", "::1", "localhost")
+
+
+@dataclass(frozen=True, slots=True)
+class WiredExperiment:
+    """An experiment whose device is to be emulated.
+
+    Attributes:
+        path: Its file.
+        section: Its device section, as it stands there.
+        options: What to emulate.
+    """
+
+    path: Path
+    section: Mapping[str, Any]
+    options: EmulatorOptions
+
+    def words(self, emulator: Emulator) -> list[str]:
+        """Return the words behind ``hilctl`` that run it on an emulator.
+
+        That may be elsewhere than the experiment says.
+        """
+        places: dict[str, Any] = {
+            key: emulator.options[key]
+            for key in ("host", "tcp_port", "serial_port", "reader")
+            if key in emulator.options
+        }
+        own = self.section.get("unit_id")
+        unit = getattr(emulator.device, "profile", None)
+        if own is not None and isinstance(unit, ModbusProfile) and own != unit.unit_id:
+            places["unit_id"] = unit.unit_id
+        settings = [f"device.{key}={value}" for key, value in _differing(places, self.section)]
+        return ["run", str(self.path), *(word for each in settings for word in ("--set", each))]
+
+    def wiring(self) -> list[str]:
+        """Return what is wired to what, a line each, for people."""
+        wiring = self._wiring()
+        return [
+            f"{self.options.output}: current = {wiring.gain_a:g} A x output {wiring.offset_a:+g} A",
+            f"{self.options.sensor}: displacement = {wiring.sensor_um:g} µm x input "
+            f"{wiring.offset_um:+g} µm",
+        ]
+
+    def wiring_mapping(self) -> dict[str, Any]:
+        """Return what is wired to what, for programs.
+
+        The current is ``gain_a`` x output + ``offset_a``; the displacement ``sensor_um`` x input +
+        ``offset_um``.
+        """
+        ends = {"output": self.options.output, "input": self.options.sensor}
+        return {**ends, **asdict(self._wiring())}
+
+    def _wiring(self) -> SimulatedWiring:
+        assert self.options.wiring is not None
+        return self.options.wiring
+
+
+def is_experiment(name: str) -> bool:
+    """Return whether a name is that of an experiment file, not of a profile."""
+    path = Path(name)
+    if path.suffix not in {".yaml", ".yml"} or not path.is_file():
+        return False
+    return "device" in load_document(path).data
+
+
+def wired_experiment(path: Path, port: int = 0, host: str | None = None) -> WiredExperiment:
+    """Return what to emulate for an experiment.
+
+    Args:
+        path: Its file.
+        port: TCP port to listen on; where 0 that of the experiment, if a user may listen on it, or
+            else a free one.
+        host: Address to listen on; this machine's own where None.
+
+    Raises:
+        InputError: The file can't be read, names no device with a profile, or drives with voltage.
+    """
+    document, files = load_document(path), TextFiles()
+    section = document.data.get("device")
+    name = section.get("profile") if isinstance(section, dict) else None
+    if not isinstance(section, dict) or not isinstance(name, str):
+        rule = "must name a profile: what has none is not behind a wire, and needs no emulator"
+        raise ConfigError([ConfigProblem(document.where(("device",)), "device.profile", rule)])
+    options = _validated(document, load_profile(name, files, path.parent), path.parent, files)
+    wiring = _wiring(options)
+    reader = options.reader
+    made = EmulatorOptions(
+        profile=_found(options.profile, path.parent),
+        link=None if not hasattr(options, "host") else "rtu" if options.host is None else "tcp",
+        host=host or EmulatorOptions.host,
+        port=port or _port(options),
+        output=options.output,
+        sensor=options.input,
+        reader=_found(reader.profile, path.parent) if reader else None,
+        reader_line=_line(reader),
+        reader_unit_id=reader.unit_id if isinstance(reader, ModbusReaderOptions) else None,
+        reader_port=_port(reader),
+        wiring=wiring,
+    )
+    return WiredExperiment(path, section, made)
+
+
+def _validated(document: Document, profile: object, folder: Path, files: TextFiles) -> DacOptions:
+    kind = ModbusStreamOptions if isinstance(profile, ModbusProfile) else SerialOptions
+    context = {"folder": folder, "files": files}
+    made: DacOptions = document.validate(kind, at=("device",), without=("kind",), context=context)
+    return made
+
+
+def _found(named: NamedProfile, folder: Path) -> str:
+    """Return a profile's name as it is found from here."""
+    path = Path(named.name)
+    return str(folder / path) if path.suffix or len(path.parts) > 1 else named.name
+
+
+def _port(options: DacOptions | ReaderOptions | None) -> int:
+    """Return the TCP port that options name, if one can listen there; else 0, for a free one."""
+    given = getattr(options, "tcp_port", None) or 0
+    return given if getattr(options, "host", None) in _HERE and given >= _UNPRIVILEGED else 0
+
+
+def _line(reader: ReaderOptions | None) -> Any:
+    if reader is None:
+        return None
+    apart = reader.serial_port is not None or getattr(reader, "host", None) is not None
+    return "own" if apart else "same"
+
+
+def _wiring(options: DacOptions) -> SimulatedWiring:
+    amplifier, sensor = options.amplifier, options.sensor
+    gain, offset = (1.0, 0.0) if amplifier is None else (amplifier.gain, amplifier.offset)
+    if amplifier is not None and amplifier.command_unit != "A":
+        raise InputError("the emulated rig is driven with a current: gain_v_per_... has none")
+    return SimulatedWiring(gain, offset, sensor.um_per_unit, sensor.offset_um)
+
+
+def _differing(
+    places: Mapping[str, Any], section: Mapping[str, Any], above: str = ""
+) -> Iterator[tuple[str, Any]]:
+    for key, value in places.items():
+        stands = section.get(key)
+        if isinstance(value, Mapping):
+            yield from _differing(value, stands if isinstance(stands, Mapping) else {}, f"{key}.")
+        elif key != "profile" and value != stands and not (key == "unit_id" and stands is None):
+            yield f"{above}{key}", value
 
 
 def emulate(

@@ -19,10 +19,9 @@ from hilctl_drivers.emulator.modbus_device import EmulatedModbus
 from hilctl_drivers.emulator.modbus_wire import ModbusWire
 from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.emulator.rig import Rig, SimulatedWiring, WriteLog
-from hilctl_drivers.emulator.serial_wire import EmulatedLine, FrameFraming, TextFraming
 from hilctl_drivers.emulator.server import EmulatorServer
 from hilctl_drivers.emulator.text_device import EmulatedText
-from hilctl_drivers.emulator.wire import EmulatedWire
+from hilctl_drivers.emulator.wire import EmulatedLine, EmulatedWire
 from hilctl_drivers.modbus.modbus_profile import ModbusProfile
 from hilctl_drivers.profile import load_profile
 from hilctl_drivers.profile_base import BaseProfile
@@ -260,9 +259,9 @@ class _TextPlan(_Plan):
             device = self._device(self._profile, rig, log, self._output, None)
             reader = self._device(self._reader, rig, log, None, self._sensor)
         first = [device] if self._apart or reader is device else [device, reader]
-        ports = [Port(EmulatedLine(TextFraming(self._profile), first))]
+        ports = [Port(EmulatedLine(self._profile, first))]
         if self._apart:
-            ports.append(Port(EmulatedLine(TextFraming(self._reader), [reader]), faulty=False))
+            ports.append(Port(EmulatedLine(self._reader, [reader]), faulty=False))
         return device, reader, ports
 
     def _device(
@@ -290,7 +289,7 @@ class _BoardPlan(_Plan):
     def devices(self, rig: Rig, log: WriteLog) -> tuple[AnyDevice, AnyDevice, list[Port]]:
         noise = self._options.noise
         board = EmulatedBoard(self._profile, rig, log, self._wiring, noise=noise)
-        return board, board, [Port(EmulatedLine(FrameFraming(self._profile), [board]))]
+        return board, board, [Port(EmulatedLine(self._profile, [board]))]
 
     def places(self, addresses: list[str]) -> dict[str, Any]:
         return {"serial_port": addresses[0]}

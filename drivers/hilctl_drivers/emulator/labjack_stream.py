@@ -11,12 +11,10 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from hilctl.base.types import F64
-from hilctl_drivers.emulator.fifo import SampleFifo
 from hilctl_drivers.emulator.modbus_device import EmulatedModbus, RejectedRequest
-from hilctl_drivers.emulator.rig import Rig, WriteLog
+from hilctl_drivers.emulator.rig import Rig, SampleFifo, WriteLog
 from hilctl_drivers.labjack import stream
-from hilctl_drivers.labjack.labjack_profile import BYTES_A_SAMPLE, LabJackStreaming
-from hilctl_drivers.modbus.modbus_profile import ModbusProfile
+from hilctl_drivers.modbus.modbus_profile import BYTES_A_SAMPLE, LabJackStreaming, ModbusProfile
 from hilctl_drivers.modbus.register_map import RegisterStep
 
 _DROPPING, _DROPPED = 2940, 2941

@@ -4,8 +4,13 @@ import struct
 from collections.abc import Sequence
 
 from hilctl_drivers.modbus.modbus_profile import ModbusOutput, ModbusProfile
-from hilctl_drivers.modbus.register_map import ExpectStep, ModbusStep, Register, RegisterStep
-from hilctl_drivers.modbus.registers import RegisterFormat
+from hilctl_drivers.modbus.register_map import (
+    ExpectStep,
+    ModbusStep,
+    Register,
+    RegisterFormat,
+    RegisterStep,
+)
 
 Key = tuple[str, int]
 """Area and wire address."""

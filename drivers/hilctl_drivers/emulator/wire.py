@@ -1,8 +1,14 @@
-"""What a server needs of emulated devices: requests out of bytes, and answers, at once or later."""
+"""Requests out of bytes and replies into bytes: the contract, and devices on a serial line."""
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Protocol
+
+from hilctl_drivers.ascii.ascii_profile import AsciiProfile
+from hilctl_drivers.ascii.lines import LineFormat
+from hilctl_drivers.board.board_profile import FrameProfile, FramesLink
+from hilctl_drivers.transport.framing import Splitter, binary_framing
+from hilctl_drivers.transport.links import CorruptError
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,3 +54,83 @@ class EmulatedWire(Protocol):
     def corrupt_at(self, framed: bytes) -> int:
         """Return the byte of a framed reply whose damage no receiver may miss."""
         ...
+
+
+class SerialDevice(Protocol):
+    """An emulated device on a line; it sees messages without their framing."""
+
+    def tick(self, now_ns: int) -> None:
+        """Let time pass."""
+        ...
+
+    def answer(self, message: bytes, now_ns: int) -> EmulatedReply | None:
+        """Carry out a message; None where it is for another device."""
+        ...
+
+    def refusal(self, message: bytes) -> EmulatedReply | None:
+        """Return an answer that says no."""
+        ...
+
+    def wrong_id(self, reply: bytes) -> bytes:
+        """Return a reply in another's name, or to something else."""
+        ...
+
+
+class EmulatedLine:
+    """Devices on a serial line.
+
+    Args:
+        profile: What the line carries: lines of text, or binary frames.
+        devices: What is on it; the first that a message is for answers.
+    """
+
+    def __init__(
+        self, profile: AsciiProfile | FrameProfile, devices: Sequence[SerialDevice]
+    ) -> None:
+        self.devices = devices
+        self._splitter: Splitter[str] | Splitter[bytes]
+        self._encode: Callable[[bytes], bytes]
+        link = profile.link
+        if isinstance(link, FramesLink):
+            framing = binary_framing(link.framing, link.crc, link.payload_max)
+            self._splitter, self._encode = framing.splitter(), framing.encode
+        else:
+            self._splitter = LineFormat(link.terminator.encode(), link.checksum).splitter()
+            replies = LineFormat(link.reply_terminator.encode(), link.checksum)
+            self._encode = lambda message: replies.encode(message.decode())
+        self._is_text = not isinstance(link, FramesLink)
+
+    def tick(self, now_ns: int) -> None:
+        """Let time pass for all devices."""
+        for device in self.devices:
+            device.tick(now_ns)
+
+    def requests(self, received: bytearray) -> Iterator[bytes]:
+        """Yield the good messages; the splitter keeps what is not complete."""
+        data = bytes(received)
+        received.clear()
+        for each in self._splitter.feed(data):
+            if each and not isinstance(each, CorruptError):
+                yield each.encode() if isinstance(each, str) else each
+
+    def answer(self, request: bytes, now_ns: int) -> EmulatedReply | None:
+        """Carry out a message; None where it is for no device here."""
+        for device in self.devices:
+            answer = device.answer(request, now_ns)
+            if answer is not None:
+                return replace(answer, wrong_id=device.wrong_id)
+        return None
+
+    def refusal(self, request: bytes) -> EmulatedReply | None:
+        """Return an answer of the first device that says no."""
+        return self.devices[0].refusal(request)
+
+    def encode(self, data: bytes) -> bytes:
+        """Return a reply as it stands on the line."""
+        return self._encode(data)
+
+    def corrupt_at(self, framed: bytes) -> int:
+        """Return the byte of a framed reply whose damage must be detected."""
+        if self._is_text:
+            return 0 if len(framed) < 4 else 1
+        return len(framed) // 2

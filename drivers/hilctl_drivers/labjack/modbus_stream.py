@@ -6,27 +6,143 @@ LabJack's T4 and T7 put out one value in each scan of their own clock and read t
 which is how long this machine may stall. The first sample is put out once that many are there.
 """
 
+import math
 import time
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
 
-from hilctl.base.device import DeviceOptions
-from hilctl.base.errors import DeviceError
+from hilctl.base.device import DeviceInfo, DeviceOptions
+from hilctl.base.errors import DeviceError, InputError
 from hilctl.base.types import F64
 from hilctl_drivers.device import DacDevice
-from hilctl_drivers.labjack.frames import ModbusFeedback, ReadFrame, WriteFrame
-from hilctl_drivers.labjack.stream import ENABLE, InputCalibration, u32
+from hilctl_drivers.labjack.stream import (
+    ENABLE,
+    VALUES_MAX,
+    InputCalibration,
+    ModbusFeedback,
+    ReadFrame,
+    WriteFrame,
+    u32,
+)
 from hilctl_drivers.labjack.stream_session import StreamSession
-from hilctl_drivers.labjack.stream_setup import ModbusStreamOptions, StreamSetup
-from hilctl_drivers.modbus.config import ModbusEndpoint
-from hilctl_drivers.modbus.modbus_safe_write import Connect, ModbusSafeWrite
+from hilctl_drivers.modbus.config import ModbusEndpoint, ModbusOptions, ModbusSetup
+from hilctl_drivers.modbus.modbus_dac import ModbusPair
+from hilctl_drivers.modbus.modbus_profile import LabJackStreaming, ModbusProfile
 from hilctl_drivers.modbus.modbus_session import ModbusSession
-from hilctl_drivers.modbus.probe import look
-from hilctl_drivers.modbus.watchdog import ModbusWatchdogDriver
+from hilctl_drivers.modbus.watchdog import Connect, ModbusSafeWrite, ModbusWatchdogDriver
+from hilctl_drivers.signal_chain import FifoBlocks
 from hilctl_drivers.transport.links import RefusedError
-from hilctl_drivers.transport.wire_time import RateLimit
+from hilctl_drivers.transport.wire_time import RateLimit, WireTime
+
+
+def stream_time(profile: ModbusProfile, block: int) -> WireTime:
+    """Return what a block costs: messages that bring its values, and one that waits for the clock.
+
+    Readings come back in the same messages, so that fetching the last of them is one more.
+    """
+    messages = math.ceil(block / VALUES_MAX) + 1
+    what = f"{block} samples in {messages} messages over TCP"
+    return WireTime(what, 0.0, 0.0, 0, 0.0, messages * profile.turnaround_s, block)
+
+
+class ModbusStreamOptions(ModbusOptions):
+    """Options of ``modbus_stream``."""
+
+    fifo_blocks: FifoBlocks = 8
+
+
+@dataclass(frozen=True, slots=True)
+class StreamSetup:
+    """What an experiment's options come to.
+
+    Attributes:
+        base: What they say of the device, streaming or not.
+        streaming: What its profile says of streaming.
+        fifo_blocks: Blocks kept in its buffer.
+        channel: Number of the input, for its calibration.
+    """
+
+    base: ModbusSetup
+    streaming: LabJackStreaming
+    fifo_blocks: int
+    channel: int
+
+    @classmethod
+    def of(cls, options: ModbusStreamOptions) -> "StreamSetup":
+        """Hold options against their profile.
+
+        Raises:
+            InputError: They don't go together, or the device can't stream.
+        """
+        base = ModbusSetup.of(options)
+        profile = base.writer.profile
+        streaming = profile.streaming
+        if streaming == "none":
+            raise InputError(f"{profile.title} can't stream: take kind: modbus_dac, and block: 1")
+        if base.reads_elsewhere:
+            raise InputError("reader must be left out: input and output are in one scan list")
+        for what, name, known in (
+            ("output", options.output, streaming.outputs),
+            ("input", options.input, streaming.inputs),
+        ):
+            if name not in known:
+                rule = f"{what} must be one that {profile.title} can stream, {', '.join(known)}"
+                raise InputError(f"{rule}, got {name!r}")
+        return cls(base, streaming, options.fifo_blocks, base.writer.address(base.input) // 2)
+
+    @property
+    def block_max(self) -> int:
+        """Longest block of which one more than ``fifo_blocks`` fit into the buffer."""
+        return max(1, self.streaming.fifo_depth // (self.fifo_blocks + 1))
+
+    def rates(self, block: int) -> RateLimit:
+        """Return the sample rates that it can keep with that block."""
+        per_s, settle_s = self.streaming.samples_per_s_max, self.base.output.settle_s
+        most_hz, whose = self.streaming.rate_max_hz, f"{per_s:g} samples a second for an input and"
+        whose += " an output: its profile"
+        if settle_s * most_hz > 1.0:
+            most_hz, whose = 1.0 / settle_s, f"settling {settle_s * 1e3:.2f} ms: its profile"
+        wire = stream_time(self.base.writer.profile, block)
+        return RateLimit.of(wire, most_hz, whose, self.streaming.rate_min_hz)
+
+    def check_capacity(self, block: int, capacity: int) -> None:
+        """Refuse a block that the buffer is too small for.
+
+        Args:
+            block: Samples in an exchange.
+            capacity: Samples that the buffer holds.
+
+        Raises:
+            DeviceError: What can't be, and what would be possible.
+        """
+        if (self.fifo_blocks + 1) * block > capacity:
+            most = max(1, capacity // (self.fifo_blocks + 1))
+            rule = f"block must be 1 to {most}: fifo_blocks + 1 of them must fit into the FIFO"
+            raise DeviceError(f"{rule}, {capacity} samples, got {block}")
+
+    def info(self) -> DeviceInfo:
+        """Return what the device is and what it accepts."""
+        found = self.base.info()
+        rates = self.rates(self.block_max)
+        depth = self.streaming.fifo_depth
+        details = {
+            **found.details,
+            "fifo_depth": f"{depth} samples",
+            "fifo_level": f"{self.fifo_blocks} blocks",
+        }
+        return replace(
+            found,
+            name="modbus_stream",
+            max_rate_hz=rates.highest_hz,
+            rate_note=rates.note,
+            buffered=True,
+            fifo_depth=depth,
+            latency_blocks=self.fifo_blocks,
+            details=details,
+        )
 
 
 class StreamSafeWrite(ModbusSafeWrite):
@@ -190,7 +306,8 @@ class ModbusStream(DacDevice):
         self._safe_write.attempt(self._peer, value)
 
     def _look(self) -> tuple[float, float | None]:
-        return look(self._setup.base)
+        base = self._setup.base
+        return ModbusPair(base, base.writer.session()).look()
 
     def _close(self) -> None:
         session, stream = self._session, self._stream

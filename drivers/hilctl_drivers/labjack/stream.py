@@ -1,9 +1,14 @@
-"""Registers and messages of a LabJack T4's or T7's stream, read in command-response mode.
+"""LabJack's Modbus Feedback, and the registers and messages of a T4's or T7's stream.
 
-Sources: LabJack's ljm_constants.json (addresses, types, descriptions); T-Series Datasheet 3.2.3
-Stream-Out, 3.2.4 Low-Level Stream, 20.0.0 and 20.0.1 (calibration constants). A scan reads the
-input and then puts the next value out; stream-out addresses give no data back. Where
-``LOOP_NUM_VALUES`` is 1, an output that has nothing new to put out repeats its last value.
+Function 76 carries out many reads and writes in one message, in order ("Protocol Details [Direct
+Modbus TCP]"). A frame is ``00 address16 words8`` to read and ``01 address16 words8 data`` to write;
+a reply holds the words of each read. Messages are kept to the 253 bytes that the Modbus
+specification allows.
+
+The stream is read in command-response mode (ljm_constants.json; T-Series Datasheet 3.2.3
+Stream-Out, 3.2.4 Low-Level Stream, 20.0.0 and 20.0.1 calibration constants). A scan reads the input
+and then outputs the next value; stream-out addresses return no data. If ``LOOP_NUM_VALUES`` is 1,
+an output that has no new value repeats its last one.
 
 A read of ``DATA_CR`` gives four words, which are the number of samples in this read, the bytes left
 in the device's buffer, a status and what belongs to it; then that many samples of 16 bits, and
@@ -11,18 +16,132 @@ words of no meaning up to the number that was asked for.
 """
 
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final, Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from hilctl.base.errors import DeviceError
 from hilctl.base.types import F64
-from hilctl_drivers.labjack.frames import FRAME_HEAD, FeedbackFrame, ReadFrame, WriteFrame
-from hilctl_drivers.labjack.labjack_profile import BYTES_A_SAMPLE
-from hilctl_drivers.modbus.pdu import PDU_MAX
-from hilctl_drivers.transport.links import MismatchError
+from hilctl_drivers.modbus.modbus_profile import BYTES_A_SAMPLE
+from hilctl_drivers.modbus.pdu import (
+    FEEDBACK,
+    PDU_MAX,
+    TCP_HEAD,
+    reply_data,
+    tcp_adu,
+    tcp_missing,
+    tcp_pdu,
+)
+from hilctl_drivers.transport.links import BadRequestError, Link, MismatchError
+
+FRAME_HEAD: Final = 4
+"""Bytes of a frame before its data."""
+_WORDS_MAX = 255
+_HEAD = struct.Struct(">BHB")
+
+
+@dataclass(frozen=True, slots=True)
+class ReadFrame:
+    """Read ``words`` registers from ``address`` on."""
+
+    address: int
+    words: int
+
+    def encode(self) -> bytes:
+        """Return the frame's bytes."""
+        return _HEAD.pack(0, self.address, _counted(self.words))
+
+    @property
+    def reply_size(self) -> int:
+        """Bytes of the reply that are this frame's."""
+        return 2 * self.words
+
+
+@dataclass(frozen=True, slots=True)
+class WriteFrame:
+    """Write register bytes from ``address`` on; a buffer register takes all of them."""
+
+    address: int
+    data: bytes
+
+    def encode(self) -> bytes:
+        """Return the frame's bytes."""
+        words, odd = divmod(len(self.data), 2)
+        if odd:
+            raise BadRequestError(f"registers have 2 bytes each, got {len(self.data)} bytes")
+        return _HEAD.pack(1, self.address, _counted(words)) + self.data
+
+    @property
+    def reply_size(self) -> int:
+        """Bytes of the reply that are this frame's."""
+        return 0
+
+
+FeedbackFrame: TypeAlias = ReadFrame | WriteFrame
+
+
+def _counted(words: int) -> int:
+    if not 1 <= words <= _WORDS_MAX:
+        raise BadRequestError(f"a frame has 1 to {_WORDS_MAX} registers, got {words}")
+    return words
+
+
+def frames_pdu(frames: Sequence[FeedbackFrame]) -> bytes:
+    """Return the request for frames, in their order.
+
+    Raises:
+        BadRequest: It or its reply would be longer than a PDU may be, or a frame is too long.
+    """
+    pdu = bytes((FEEDBACK,)) + b"".join(frame.encode() for frame in frames)
+    longest = max(len(pdu), 1 + sum(frame.reply_size for frame in frames))
+    if longest > PDU_MAX:
+        raise BadRequestError(f"a PDU has at most {PDU_MAX} bytes, got {longest}")
+    return pdu
+
+
+class ModbusFeedback:
+    """A T-series device that is asked by function 76.
+
+    Args:
+        link: Open, or opened before the first call.
+        unit: Its unit id.
+    """
+
+    def __init__(self, link: Link, unit: int) -> None:
+        self._link = link
+        self._unit = unit
+        self._transaction = 0
+
+    def call(self, frames: Sequence[FeedbackFrame]) -> list[bytes]:
+        """Carry frames out in one message; return what each read frame found.
+
+        Raises:
+            DeviceError: No answer, not a good one, or a refusal; then the frames before the one
+                that was refused may have been carried out.
+        """
+        self._transaction = transaction = (self._transaction + 1) & 0xFFFF
+        sizes = [frame.reply_size for frame in frames if frame.reply_size]
+        pdu = frames_pdu(frames)
+        request = tcp_adu(transaction, self._unit, pdu)
+        reply = self._link.transact(request, tcp_missing, TCP_HEAD + 1 + sum(sizes))
+        data = reply_data(pdu, tcp_pdu(reply, transaction, self._unit))
+        found, start = [], 0
+        for size in sizes:
+            found.append(data[start : start + size])
+            start += size
+        return found
+
+    def read(self, address: int, words: int) -> bytes:
+        """Return registers' bytes.
+
+        Raises:
+            DeviceError: See :meth:`call`.
+        """
+        return self.call([ReadFrame(address, words)])[0]
+
 
 SCANRATE_HZ: Final = 4002
 NUM_ADDRESSES: Final = 4004

@@ -10,9 +10,8 @@ import numpy.typing as npt
 from hilctl.base.errors import DeviceError
 from hilctl.base.types import F64
 from hilctl_drivers.labjack import stream
-from hilctl_drivers.labjack.frames import FeedbackFrame, ModbusFeedback, WriteFrame
-from hilctl_drivers.labjack.labjack_profile import LabJackStreaming
-from hilctl_drivers.labjack.stream import f32, u32
+from hilctl_drivers.labjack.stream import FeedbackFrame, ModbusFeedback, WriteFrame, f32, u32
+from hilctl_drivers.modbus.modbus_profile import LabJackStreaming
 
 _RATE_TOLERANCE = 1e-4
 _MARGIN_SCANS = 2

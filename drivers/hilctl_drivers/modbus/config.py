@@ -13,8 +13,13 @@ from hilctl_drivers.modbus.modbus_profile import (
     ModbusProfile,
     ModbusRtuLink,
 )
-from hilctl_drivers.modbus.modbus_session import ModbusSession
-from hilctl_drivers.modbus.modbus_timing import arm_s, exchange_time, feed_time, read_time
+from hilctl_drivers.modbus.modbus_session import (
+    ModbusSession,
+    arm_s,
+    exchange_time,
+    feed_time,
+    read_time,
+)
 from hilctl_drivers.modbus.register_map import Register
 from hilctl_drivers.profile import NamedProfile, check_baud, with_link
 from hilctl_drivers.signal_chain import (
@@ -240,9 +245,6 @@ class ModbusSetup:
     def info(self) -> DeviceInfo:
         """Return what the device is and what it accepts."""
         options, writer, reader = self.options, self.writer, self.reader
-        low, high = self.chain.command_range(*self.output.limits)
-        low_um, high_um = self.chain.displacement_range(*self.input.limits)
-        rates = self.rates(self.may_combine)
         description = f"{writer.profile.title} at {writer.place}: {options.output}"
         details = {**writer.profile.provenance(), "link": writer.profile.link.model_dump_json()}
         details |= options.details()
@@ -252,21 +254,13 @@ class ModbusSetup:
             details |= reader.profile.provenance("reader_")
         else:
             description += f", {options.input}"
-        return DeviceInfo(
-            name="modbus_dac",
+        return self.chain.info(
+            "modbus_dac",
+            options,
+            self.rates(self.may_combine),
             description=description,
-            command_unit=self.chain.command_unit,
-            command_min=low,
-            command_max=high,
-            sensor_min_um=low_um,
-            sensor_max_um=high_um,
-            max_rate_hz=rates.highest_hz,
-            rate_note=rates.note,
             holds=tuple(dict.fromkeys(writer.holds + reader.holds)),
-            watchdog_command=options.watchdog_command,
-            watchdog_timeout_s=options.watchdog_timeout_s,
             arm_s=0.0 if options.watchdog == "none" else arm_s(writer.profile, options.output),
-            watchdog_reason=options.watchdog_reason,
             confirms=not self.unconfirmed,
             safe_note=self.unconfirmed,
             details=details,

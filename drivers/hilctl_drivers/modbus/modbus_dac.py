@@ -15,11 +15,9 @@ from hilctl.base.errors import DeviceError
 from hilctl.base.types import F64
 from hilctl_drivers.device import DacDevice
 from hilctl_drivers.modbus.config import ModbusEndpoint, ModbusOptions, ModbusSetup
-from hilctl_drivers.modbus.modbus_safe_write import Connect, ModbusSafeWrite
 from hilctl_drivers.modbus.modbus_session import ModbusSession
 from hilctl_drivers.modbus.pdu import feedback_pdu, read_pdu, write_read_pdu
-from hilctl_drivers.modbus.probe import look
-from hilctl_drivers.modbus.watchdog import ModbusWatchdogDriver
+from hilctl_drivers.modbus.watchdog import Connect, ModbusSafeWrite, ModbusWatchdogDriver
 from hilctl_drivers.transport.links import NoAnswerError, RefusedError, naming
 from hilctl_drivers.transport.serial_port import SerialLink
 
@@ -65,7 +63,7 @@ class ModbusDac(DacDevice):
         self._encode = setup.output.format.encode
         self._decode = setup.input.format.decode
         self._guard = ModbusWatchdogDriver(setup)
-        self._pair: _Pair | None = None
+        self._pair: ModbusPair | None = None
         self._swap: Swap = _not_open
         self._feeds = False
         self.one_transaction = False
@@ -81,7 +79,7 @@ class ModbusDac(DacDevice):
         del block
         self._guard.plan(sample_rate_hz)
         # Kept before it is opened: after a step that fails, _release must find it.
-        self._pair = pair = _Pair(self._setup, self._connect(self._setup.writer))
+        self._pair = pair = ModbusPair(self._setup, self._connect(self._setup.writer))
         pair.open()
         self._peer = self._setup.writer.reached(pair.writer.link)
         # A device that has tripped refuses the steps that follow.
@@ -131,7 +129,7 @@ class ModbusDac(DacDevice):
             self._release()
 
     def _look(self) -> tuple[float, float | None]:
-        return look(self._setup)
+        return ModbusPair(self._setup, self._setup.writer.session()).look()
 
     def _close(self) -> None:
         if self._pair is not None:
@@ -149,7 +147,7 @@ def _not_open(data: bytes) -> bytes:
     raise DeviceError("not open")
 
 
-class _Pair:
+class ModbusPair:
     """Two sessions, or one of them twice; nothing is sent before :meth:`open`.
 
     Args:
@@ -204,6 +202,33 @@ class _Pair:
         if not self._one:
             with naming(self._reader):
                 self.reader.run(self.reader.profile.close)
+
+    def look(self) -> tuple[float, float | None]:
+        """Connect, read input and output register, and close the links; nothing is changed.
+
+        Returns:
+            Displacement in um, and the output in the command's unit; None if it can't be read, or
+            the register holds a command from before a trip of the watchdog.
+
+        Raises:
+            DeviceError: A device can't be reached, is another one, or gives no good answer.
+        """
+        setup, writer = self._setup, self.writer
+        try:
+            self.open()
+            with naming(self._reader):
+                found = setup.input.format.decode(self.reader.read_bytes(setup.input))
+            watchdog = writer.profile.watchdog
+            flag = "none" if watchdog == "none" else watchdog.tripped
+            # A trip leaves the last command in the register.
+            knows = setup.output.readback_register is not None
+            held = None
+            if knows and (flag == "none" or not writer.is_set(flag)):
+                held = writer.held(setup.output)
+        finally:
+            self.release()
+        output = None if held is None else setup.chain.command(held)
+        return setup.chain.displacement_um(found), output
 
     def release(self) -> None:
         """Close the links."""

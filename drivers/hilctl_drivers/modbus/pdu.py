@@ -25,6 +25,8 @@ PDU_MAX = 253
 READ_MAX, WRITE_MAX, WRITE_READ_MAX, BITS_MAX = 125, 123, 121, 2000
 TCP_HEAD = 7
 """Bytes of the MBAP header, unit included."""
+_TCP_SHORTEST = TCP_HEAD + 1
+_tcp_start = struct.Struct(">HHH").unpack_from
 
 EXCEPTIONS = {
     1: "illegal function", 2: "illegal data address", 3: "illegal data value",
@@ -146,10 +148,21 @@ def reply_layout(pdu: bytes) -> tuple[bytes, int]:
     elif function in {WRITE_COIL, WRITE_REGISTER, WRITE_REGISTERS}:
         return pdu[:5], 0
     elif function == FEEDBACK:
-        return pdu[:1], 2 * pdu[4]
+        return pdu[:1], _feedback_reads(pdu)
     else:
         raise BadRequestError(f"function {function} is not one of those known here")
     return bytes((function, size)), size
+
+
+def _feedback_reads(pdu: bytes) -> int:
+    """Return how many bytes the read frames of a Modbus Feedback request read."""
+    size, at = 0, 1
+    while at < len(pdu):
+        words = 2 * pdu[at + 3]
+        write = pdu[at]
+        size += 0 if write else words
+        at += 4 + words * write
+    return size
 
 
 def reply_size(pdu: bytes) -> int:
@@ -219,6 +232,20 @@ def tcp_pdu(adu: Bytes, transaction: int, unit: int) -> bytes:
     if got_unit != unit:
         raise MismatchError(f"unit must be {unit}, got {got_unit}")
     return bytes(adu[TCP_HEAD:])
+
+
+def tcp_missing(received: Bytes) -> int:
+    """Return how many more bytes of a message to wait for; 0 if it is ready to be checked.
+
+    Nonsense is ready to be refused; its length is not worth waiting for.
+    """
+    count = len(received)
+    if count < _TCP_SHORTEST:
+        return _TCP_SHORTEST - count
+    _, protocol, length = _tcp_start(received)
+    if protocol or length > PDU_MAX + 1:
+        return 0
+    return max(0, int(length) + 6 - count)
 
 
 def rtu_adu(unit: int, pdu: bytes) -> bytes:

@@ -6,11 +6,11 @@ id, data and CRC to it, and compares. Only a reply that differs goes the long wa
 """
 
 import struct
-from typing import Protocol, cast
+from abc import ABC, abstractmethod
+from typing import cast
 
 from hilctl_drivers.modbus.pdu import (
     FEEDBACK,
-    PDU_MAX,
     TCP_HEAD,
     WRITE_READ,
     WRITE_REGISTER,
@@ -20,58 +20,13 @@ from hilctl_drivers.modbus.pdu import (
     rtu_adu,
     rtu_pdu,
     tcp_adu,
+    tcp_missing,
     tcp_pdu,
 )
 from hilctl_drivers.transport.crc import MODBUS_WORDS, Bytes, crc16_modbus
 from hilctl_drivers.transport.links import BadRequestError, IncompleteError
 
-_TCP_SHORTEST = TCP_HEAD + 2
 _RTU_SHORTEST = 5
-_tcp_start = struct.Struct(">HHH").unpack_from
-
-
-class Transaction(Protocol):
-    """A prepared request and the check of its reply."""
-
-    @property
-    def size(self) -> int:
-        """Bytes of the request."""
-        ...
-
-    @property
-    def reply_size(self) -> int:
-        """Bytes of a good reply."""
-        ...
-
-    def request(self, data: bytes = b"") -> bytes:
-        """Return the next request.
-
-        Args:
-            data: Register bytes to write, as many as the PDU was prepared with; empty for those
-                of the last call.
-
-        Raises:
-            BadRequest: Another length.
-        """
-        ...
-
-    def reply(self, adu: Bytes) -> bytes:
-        """Check the reply to the last request and return the register bytes read.
-
-        Raises:
-            Incomplete: More bytes belong to it; see :meth:`missing`.
-            Corrupt: A check or the structure is wrong.
-            Mismatch: Not the answer to the last request.
-            Refused: An exception reply.
-        """
-        ...
-
-    def missing(self, received: Bytes) -> int:
-        """Return how many more bytes to wait for; 0 where the reply is ready to be checked.
-
-        The first bytes tell a good reply from an exception reply, which is shorter.
-        """
-        ...
 
 
 def _data_span(pdu: bytes) -> tuple[int, int]:
@@ -88,8 +43,8 @@ def _data_span(pdu: bytes) -> tuple[int, int]:
     return len(pdu), len(pdu)
 
 
-class _Prepared:
-    """What stays the same in all requests and good replies of one PDU."""
+class Transaction(ABC):
+    """A prepared request and the check of its reply; what is the same in all of them is kept."""
 
     def __init__(self, adu: bytes, pdu: bytes, start: int) -> None:
         """Take the first request, its PDU, and where in the request the PDU begins."""
@@ -116,11 +71,41 @@ class _Prepared:
         """Bytes of a good reply."""
         return self._reply_size
 
+    @abstractmethod
+    def request(self, data: bytes = b"") -> bytes:
+        """Return the next request.
+
+        Args:
+            data: Register bytes to write, as many as the PDU was prepared with; empty for those
+                of the last call.
+
+        Raises:
+            BadRequest: Another length.
+        """
+
+    @abstractmethod
+    def reply(self, adu: Bytes) -> bytes:
+        """Check the reply to the last request and return the register bytes read.
+
+        Raises:
+            Incomplete: More bytes belong to it; see :meth:`missing`.
+            Corrupt: A check or the structure is wrong.
+            Mismatch: Not the answer to the last request.
+            Refused: An exception reply.
+        """
+
+    @abstractmethod
+    def missing(self, received: Bytes) -> int:
+        """Return how many more bytes to wait for; 0 if the reply is ready to be checked.
+
+        The first bytes tell a good reply from an exception reply, which is shorter.
+        """
+
     def _bad_size(self, data: bytes) -> BadRequestError:
         return BadRequestError(f"request was prepared for {self._data_size} bytes, got {len(data)}")
 
 
-class TcpTransaction(_Prepared):
+class TcpTransaction(Transaction):
     """A prepared Modbus TCP :class:`Transaction`; each request has the next transaction id."""
 
     def __init__(self, unit: int, pdu: bytes, transaction: int = 0) -> None:
@@ -162,17 +147,10 @@ class TcpTransaction(_Prepared):
 
     def missing(self, received: Bytes) -> int:
         """See :meth:`Transaction.missing`."""
-        count = len(received)
-        if count < _TCP_SHORTEST:
-            return _TCP_SHORTEST - count
-        _, protocol, length = _tcp_start(received)
-        # Nonsense is ready to be refused; its length is not worth waiting for.
-        if protocol or length > PDU_MAX + 1:
-            return 0
-        return max(0, int(length) + 6 - count)
+        return tcp_missing(received)
 
 
-class RtuTransaction(_Prepared):
+class RtuTransaction(Transaction):
     """A prepared Modbus RTU :class:`Transaction`; there is no id to tell a late reply by.
 
     CRCs of what never changes are worked out once; the rest is taken two bytes at a time.

@@ -1,6 +1,5 @@
-"""DACs on serial lines, whatever they speak.
+"""DACs on serial lines, whatever their protocol.
 
-setup.py   an experiment's options, held against the profile
-wire.py    what a protocol must do: text/wire.py and board/wire.py do it
+wire.py    an experiment's options, and what a protocol must implement: text/wire.py, board/wire.py
 device.py  the device
 """

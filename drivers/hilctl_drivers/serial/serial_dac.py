@@ -14,8 +14,7 @@ from hilctl.base.device import DeviceInfo, DeviceOptions
 from hilctl.base.types import F64
 from hilctl_drivers.device import DacDevice
 from hilctl_drivers.profile import named_class
-from hilctl_drivers.serial.serial_setup import SerialOptions, SerialSetup
-from hilctl_drivers.serial.serial_wire import SerialWire
+from hilctl_drivers.serial.serial_wire import SerialOptions, SerialSetup, SerialWire
 from hilctl_drivers.transport.wire_time import RateLimit
 
 _PROMPT_S = 0.2
@@ -105,33 +104,22 @@ class SerialDac(DacDevice):
 
 def _info(setup: SerialSetup, wire: SerialWire) -> DeviceInfo:
     options, streams = setup.options, wire.fifo_depth > 0
-    low, high = setup.chain.command_range(*setup.output.limits)
-    low_um, high_um = setup.chain.displacement_range(*setup.input.limits)
-    rates = wire.rates(wire.block_max)
     details = setup.details()
     if streams:
         details["fifo_depth"] = f"{wire.fifo_depth} samples"
         details["fifo_level"] = f"{options.fifo_blocks} blocks"
-    return DeviceInfo(
-        name="serial_dac",
+    return setup.chain.info(
+        "serial_dac",
+        options,
+        wire.rates(wire.block_max),
         description=f"{setup.profile.title} at {options.serial_port}: "
         f"{options.output}, {options.input}",
-        command_unit=setup.chain.command_unit,
-        command_min=low,
-        command_max=high,
-        sensor_min_um=low_um,
-        sensor_max_um=high_um,
-        max_rate_hz=rates.highest_hz,
-        rate_note=rates.note,
         buffered=streams,
         fifo_depth=wire.fifo_depth,
         latency_blocks=options.fifo_blocks if streams else 0,
         measures_command=wire.measures,
         holds=setup.holds,
-        watchdog_command=options.watchdog_command,
-        watchdog_timeout_s=options.watchdog_timeout_s,
         arm_s=0.0 if options.watchdog == "none" else wire.arm_s,
-        watchdog_reason=options.watchdog_reason,
         safe_note="; ".join(filter(None, (_late_note(setup, wire), wire.unconfirmed))),
         confirms=not wire.unconfirmed,
         details=details,

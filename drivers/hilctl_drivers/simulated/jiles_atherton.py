@@ -33,7 +33,7 @@ import numpy as np
 
 from hilctl.base.types import F64
 from hilctl.kernels.jit import kernel
-from hilctl_drivers.simulated.rod_model import (
+from hilctl_drivers.simulated.actuator_base import (
     ROD_LENGTH_M,
     ROD_RADIUS_M,
     VACUUM_PERMEABILITY,

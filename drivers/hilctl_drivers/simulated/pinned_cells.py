@@ -15,7 +15,7 @@ import numpy as np
 
 from hilctl.base.types import F64
 from hilctl.kernels.jit import ensure_compiled, kernel
-from hilctl_drivers.simulated.rod_model import Coil, RodParameters, Rods
+from hilctl_drivers.simulated.actuator_base import Coil, RodParameters, Rods
 
 
 @dataclass(frozen=True, slots=True)

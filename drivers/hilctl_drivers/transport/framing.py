@@ -1,68 +1,140 @@
-"""Binary frames for serial streams: COBS or length-prefixed, each with a named CRC.
+"""Binary frames for serial streams, and messages cut out of a stream.
 
 COBS frame: ``COBS(payload | crc LE) 00``. Length-prefixed frame: ``length u16 LE | payload | crc
 LE``, the length counting the payload alone, the CRC over length and payload. COBS: Cheshire and
 Baker, "Consistent Overhead Byte Stuffing", IEEE/ACM Transactions on Networking 7(2), 1999.
+
+Splitters find the next message again after damaged bytes.
 """
 
+from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, Protocol, TypeAlias
+from typing import Generic, Literal, TypeAlias, TypeVar
 
 from cobs import cobs
 
 from hilctl_drivers.transport.crc import Bytes, Crc, named_crc
-from hilctl_drivers.transport.deframers import DelimitedSplitter, PrefixedSplitter, Splitter
 from hilctl_drivers.transport.links import BadRequestError, CorruptError, IncompleteError
+
+Content = TypeVar("Content")
+
+
+class Splitter(ABC, Generic[Content]):
+    """Cuts a stream into messages and finds its way back after damaged bytes."""
+
+    def __init__(self) -> None:
+        self._buffer = bytearray()
+        self._lost = False
+
+    @abstractmethod
+    def feed(self, chunk: Bytes) -> list[Content | CorruptError]:
+        """Take what arrived and return the contents that it completed, in order.
+
+        Lost stretches are in their places as :class:`CorruptError`, one each, not raised.
+        """
+
+    def reset(self) -> None:
+        """Forget what has arrived so far, as after a timeout."""
+        self._buffer.clear()
+        self._lost = False
+
+
+class DelimitedSplitter(Splitter[Content]):
+    """A :class:`Splitter` for messages that end in bytes which occur nowhere else in them."""
+
+    def __init__(
+        self, parse: Callable[[Bytes], Content], end: bytes, size_max: int, *, skip_empty: bool
+    ) -> None:
+        """Take what parses a message without its end, or raises Corrupt.
+
+        Args:
+            parse: Bytes without the end to content.
+            end: The bytes that end a message.
+            size_max: Most bytes of a good message without its end; bounds the buffer.
+            skip_empty: Whether ends in a row mean nothing.
+        """
+        super().__init__()
+        self._parse = parse
+        self._end = end
+        self._size_max = size_max
+        self._skip_empty = skip_empty
+
+    def feed(self, chunk: Bytes) -> list[Content | CorruptError]:
+        """See :meth:`Splitter.feed`."""
+        out: list[Content | CorruptError] = []
+        self._buffer += chunk
+        *parts, self._buffer = self._buffer.split(self._end)
+        for part in parts:
+            if self._lost:
+                self._lost = False
+            elif part or not self._skip_empty:
+                out.append(self._parsed(part))
+        if len(self._buffer) > self._size_max + len(self._end):
+            if not self._lost:
+                out.append(CorruptError(f"no end within {self._size_max} bytes"))
+            self._lost = True
+            # The first bytes of an end may already be here.
+            del self._buffer[: -len(self._end)]
+        return out
+
+    def _parsed(self, part: Bytes) -> Content | CorruptError:
+        try:
+            return self._parse(part)
+        except CorruptError as error:
+            return error
+
+
+class PrefixedSplitter(Splitter[bytes]):
+    """A :class:`Splitter` for frames that say their length at their beginning.
+
+    After a bad frame it tries every byte as a beginning until a frame's check holds.
+    """
+
+    def __init__(
+        self, size_at: Callable[[Bytes, int], int], parse: Callable[[bytes], bytes]
+    ) -> None:
+        """Take what knows the frames.
+
+        Args:
+            size_at: Buffer and position to the size of the frame that begins there; 0 where it
+                can't be told yet; raises Corrupt where none can begin there.
+            parse: Whole frame to payload; raises Corrupt.
+        """
+        super().__init__()
+        self._size_at = size_at
+        self._parse = parse
+
+    def feed(self, chunk: Bytes) -> list[bytes | CorruptError]:
+        """See :meth:`Splitter.feed`."""
+        out: list[bytes | CorruptError] = []
+        self._buffer += chunk
+        at = 0
+        while True:
+            try:
+                size = self._size_at(self._buffer, at)
+                if not size or len(self._buffer) - at < size:
+                    break
+                out.append(self._parse(bytes(self._buffer[at : at + size])))
+                self._lost = False
+                at += size
+            except CorruptError as error:
+                if not self._lost:
+                    out.append(error)
+                self._lost = True
+                at += 1
+        del self._buffer[:at]
+        return out
+
 
 FramingKind: TypeAlias = Literal["cobs", "length"]
 PAYLOAD_MAX = 4096
 LENGTH_SIZE = 2
 
 
-def _check_payload(payload: Bytes, payload_max: int) -> None:
-    if not 1 <= len(payload) <= payload_max:
-        raise BadRequestError(f"payload must have 1 to {payload_max} bytes, got {len(payload)}")
-
-
-def _checked(payload: bytes, covered: bytes, sent: bytes, crc: Crc) -> bytes:
-    """Return ``payload`` if ``sent`` is the CRC of ``covered``; raise Corrupt otherwise."""
-    if crc.of(covered) != sent:
-        raise CorruptError(f"{crc.name} of {len(covered)} bytes is wrong: {covered[:16].hex(' ')}")
-    return payload
-
-
-class Framing(Protocol):
-    """A binary framing: payload to frame, frame to payload, stream to payloads."""
-
-    def encode(self, payload: Bytes) -> bytes:
-        """Return the whole frame of a payload.
-
-        Raises:
-            BadRequest: The payload is empty or longer than the framing allows.
-        """
-        ...
-
-    def decode(self, frame: Bytes) -> bytes:
-        """Return the payload of exactly one frame.
-
-        Raises:
-            Incomplete: More bytes belong to it.
-            Corrupt: Its CRC or structure is wrong, or bytes follow its end.
-        """
-        ...
-
-    def wire_size(self, payload_size: int) -> int:
-        """Return the most bytes that a payload of this size takes on the wire."""
-        ...
-
-    def splitter(self) -> Splitter[bytes]:
-        """Return a splitter at the beginning of a stream."""
-        ...
-
-
 @dataclass(frozen=True)
-class CobsFraming:
-    """COBS frames; see :class:`Framing` and the module.
+class Framing(ABC):
+    """A binary framing: payload to frame, frame to payload, stream to payloads.
 
     Attributes:
         crc: The check.
@@ -73,9 +145,53 @@ class CobsFraming:
     payload_max: int = PAYLOAD_MAX
 
     def encode(self, payload: Bytes) -> bytes:
-        """See :meth:`Framing.encode`."""
-        _check_payload(payload, self.payload_max)
-        body: bytes = cobs.encode(bytes(payload) + self.crc.of(payload))
+        """Return the complete frame of a payload.
+
+        Raises:
+            BadRequest: The payload is empty or longer than the framing allows.
+        """
+        if not 1 <= len(payload) <= self.payload_max:
+            rule = f"payload must have 1 to {self.payload_max} bytes"
+            raise BadRequestError(f"{rule}, got {len(payload)}")
+        return self._frame(bytes(payload))
+
+    @abstractmethod
+    def decode(self, frame: Bytes) -> bytes:
+        """Return the payload of exactly one frame.
+
+        Raises:
+            Incomplete: More bytes belong to it.
+            Corrupt: Its CRC or structure is wrong, or bytes follow its end.
+        """
+
+    @abstractmethod
+    def wire_size(self, payload_size: int) -> int:
+        """Return the most bytes that a payload of this size takes on the wire."""
+
+    @abstractmethod
+    def splitter(self) -> Splitter[bytes]:
+        """Return a splitter at the beginning of a stream."""
+
+    @abstractmethod
+    def _frame(self, payload: bytes) -> bytes:
+        """Return the frame of a payload of good size."""
+
+    def _check_size(self, size: int) -> None:
+        if not 1 <= size <= self.payload_max:
+            raise CorruptError(f"payload must have 1 to {self.payload_max} bytes, got {size}")
+
+    def _check_crc(self, covered: bytes, sent: bytes) -> None:
+        if self.crc.of(covered) != sent:
+            start = covered[:16].hex(" ")
+            raise CorruptError(f"{self.crc.name} of {len(covered)} bytes is wrong: {start}")
+
+
+@dataclass(frozen=True)
+class CobsFraming(Framing):
+    """COBS frames, see the module."""
+
+    def _frame(self, payload: bytes) -> bytes:
+        body: bytes = cobs.encode(payload + self.crc.of(payload))
         return body + b"\0"
 
     def decode(self, frame: Bytes) -> bytes:
@@ -95,7 +211,7 @@ class CobsFraming:
         body: int = cobs.max_encoded_length(payload_size + self.crc.size)
         return body + 1
 
-    def splitter(self) -> DelimitedSplitter[bytes]:
+    def splitter(self) -> Splitter[bytes]:
         """See :meth:`Framing.splitter`."""
         size_max = self.wire_size(self.payload_max) - 1
         return DelimitedSplitter(self._payload, b"\0", size_max, skip_empty=True)
@@ -106,28 +222,21 @@ class CobsFraming:
         except cobs.DecodeError as error:
             raise CorruptError(f"not a COBS frame: {error}") from None
         size = len(data) - self.crc.size
-        if not 1 <= size <= self.payload_max:
-            raise CorruptError(f"payload must have 1 to {self.payload_max} bytes, got {size}")
-        return _checked(data[:size], data[:size], data[size:], self.crc)
+        self._check_size(size)
+        self._check_crc(data[:size], data[size:])
+        return data[:size]
 
 
 @dataclass(frozen=True)
-class LengthFraming:
-    """Length-prefixed frames; see :class:`Framing` and the module.
+class LengthFraming(Framing):
+    """Length-prefixed frames, see the module; only a CRC can find the next beginning.
 
     Nothing marks a beginning, so a wrong length makes a stream wait for up to ``payload_max``
-    bytes: set that no higher than the protocol needs, and reset the splitter after a time-out.
-
-    Attributes:
-        crc: The check; ``none`` is refused, as only a check can find a beginning again.
-        payload_max: Most bytes of a payload.
+    bytes: set that no higher than the protocol needs, and reset the splitter after a timeout.
 
     Raises:
-        BadRequest: No check, or ``payload_max`` above what two bytes can say.
+        BadRequest: No check, or ``payload_max`` above what two bytes can hold.
     """
-
-    crc: Crc
-    payload_max: int = PAYLOAD_MAX
 
     def __post_init__(self) -> None:
         if not 1 <= self.payload_max <= 0xFFFF:
@@ -135,10 +244,8 @@ class LengthFraming:
         if not self.crc.size:
             raise BadRequestError("length-prefixed frames need a CRC: name one, or use COBS")
 
-    def encode(self, payload: Bytes) -> bytes:
-        """See :meth:`Framing.encode`."""
-        _check_payload(payload, self.payload_max)
-        body = len(payload).to_bytes(LENGTH_SIZE, "little") + bytes(payload)
+    def _frame(self, payload: bytes) -> bytes:
+        body = len(payload).to_bytes(LENGTH_SIZE, "little") + payload
         return body + self.crc.of(body)
 
     def decode(self, frame: Bytes) -> bytes:
@@ -154,7 +261,7 @@ class LengthFraming:
         """See :meth:`Framing.wire_size`."""
         return LENGTH_SIZE + payload_size + self.crc.size
 
-    def splitter(self) -> PrefixedSplitter:
+    def splitter(self) -> Splitter[bytes]:
         """See :meth:`Framing.splitter`."""
         return PrefixedSplitter(self._size_at, self._payload)
 
@@ -163,13 +270,13 @@ class LengthFraming:
         if len(data) - at < LENGTH_SIZE:
             return 0
         size = data[at] | data[at + 1] << 8
-        if not 1 <= size <= self.payload_max:
-            raise CorruptError(f"payload must have 1 to {self.payload_max} bytes, got {size}")
+        self._check_size(size)
         return self.wire_size(size)
 
     def _payload(self, frame: bytes) -> bytes:
         end = len(frame) - self.crc.size
-        return _checked(frame[LENGTH_SIZE:end], frame[:end], frame[end:], self.crc)
+        self._check_crc(frame[:end], frame[end:])
+        return frame[LENGTH_SIZE:end]
 
 
 def binary_framing(kind: FramingKind, crc: str, payload_max: int = PAYLOAD_MAX) -> Framing:

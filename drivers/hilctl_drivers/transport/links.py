@@ -1,26 +1,19 @@
-"""Bytes there and back: one request, one reply, never longer than the time-out.
+"""Links: one request, one reply, never longer than the timeout; and what can go wrong.
 
-Nothing is pipelined and nothing is sent twice. A reply ends where its own bytes say so, which the
-caller works out from what has come so far; pauses between bytes mean nothing. Texts of errors leave
-out who was asked for what: the device that owns the link adds it.
-
-This is what all links have in common; :mod:`hilctl_drivers.transport.tcp` and
-:mod:`hilctl_drivers.transport.serial_port` are the links.
-
-Errors of one message:
+Nothing is pipelined and nothing is sent twice. The caller computes from the bytes so far where a
+reply ends; pauses between bytes mean nothing. Texts of errors do not name the device or the action:
+the device that owns the link adds them.
 
 DeviceError
-|-- NoAnswerError     nothing, or not all of a reply, in time
+|-- NoAnswerError     no complete reply in time
 |-- LostError         the connection is gone
 `-- FrameError        any of the below
-    |-- BadRequest    the request is not possible on this wire; nothing was sent
+    |-- BadRequest    the request can't be put on this wire; nothing was sent
     |-- Incomplete    a good beginning, but more bytes are needed
     |-- Corrupt       a check or the structure is wrong
-    |-- Mismatch      well formed, but not the answer to the request
-    `-- Refused       the device understood and refused
-        `-- WatchdogTripped   its host watchdog has set the output to its safe value
-
-The texts describe the bytes; devices put their own name and the request in front.
+    |-- Mismatch      well formed, but not the answer to this request
+    `-- Refused       the device understood the request and refused it
+        `-- WatchdogTripped   its host watchdog has put the output at its safe value
 """
 
 from collections.abc import Callable, Iterator, Mapping

@@ -1,13 +1,14 @@
-"""One attempt to put a safe value on a serial line.
+"""The safe value of every protocol: tried out at open, written in one attempt, read back.
 
-It follows a failure, so the line may be full of late answers or never fall silent, and the device
-may be deaf or booting. The value is sent before any of this is examined; only the device's own
-answer to it counts.
+An attempt follows a failure, so the line may be full of late answers or never fall silent, and the
+device may be deaf or booting. The value is sent before any of this is examined; only the device's
+own answer to it counts.
 """
 
 from collections.abc import Callable
 
 from hilctl.base.errors import DeviceError, UnconfirmedError
+from hilctl_drivers.profile_base import Range
 from hilctl_drivers.transport.serial_port import SerialLink
 
 _QUIET_S = 0.05
@@ -61,3 +62,31 @@ class SafeExchange:
             self._quiet_s = 2.0 * min(self._quiet_s, link.timeout_s)
             raise
         self._quiet_s = _QUIET_S
+
+
+def try_out(output: Range, held: float | None, put: Callable[[], None], how: str) -> None:
+    """Write what an output holds, with the message that writes the safe value; nothing moves.
+
+    An output that cannot be read, or is out of range, is left alone.
+
+    Args:
+        output: The output.
+        held: What it holds, in its unit; None if that is not known.
+        put: Writes that.
+        how: Register or message, for errors.
+
+    Raises:
+        DeviceError: The device refuses the message, or does not answer.
+    """
+    if held is None or not output.min <= held <= output.max:
+        return
+    try:
+        put()
+    except DeviceError as error:
+        raise DeviceError(f"the safe value cannot be written {how}: {error}") from None
+
+
+def check_read_back(output: Range, wanted: float, found: float, tolerance: float) -> None:
+    """Raise DeviceError unless an output holds what was written, within a tolerance."""
+    if not abs(found - wanted) <= tolerance:
+        raise DeviceError(f"{wanted:g} {output.unit} was written, but {found:g} was read back")

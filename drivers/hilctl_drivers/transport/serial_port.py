@@ -17,8 +17,8 @@ import serial
 
 from hilctl.base.errors import DeviceError
 from hilctl.base.os_errors import PORT_REMEDIES, reason
-from hilctl_drivers.transport.exclusive import admit_others, refuse_to_others
 from hilctl_drivers.transport.links import LostError, Missing, NoAnswerError, cut, why
+from hilctl_drivers.transport.resource_names import admit_others, refuse_to_others
 
 _FIRST = 256
 """Most replies are shorter; see :mod:`hilctl_drivers.transport.tcp`."""

@@ -71,13 +71,10 @@ class WireTime:
         """Return this with what it is for."""
         return replace(self, what=f"{self.what} {purpose}")
 
-    def feeding(self, waits_s: list[float]) -> "WireTime":
-        """Return this as what feeds a watchdog, with the waits of its steps."""
-        return replace(
-            self.named("to feed the watchdog"),
-            gaps=self.gaps + len(waits_s),
-            gaps_s=self.gaps_s + sum(waits_s),
-        )
+    def waiting(self, waits_s: list[float]) -> "WireTime":
+        """Return this with waits between its requests."""
+        gaps_s = self.gaps_s + sum(waits_s)
+        return replace(self, gaps=self.gaps + len(waits_s), gaps_s=gaps_s)
 
     def __str__(self) -> str:
         parts = []

@@ -1,8 +1,1 @@
-"""What models are fitted to.
-
-records.py  steady loops and whole time histories
-thin.py     long histories with fewer samples
-cycles.py   loops from recordings and from histories that repeat
-period.py   the period of a command, and where it is steady
-files.py    recordings and tables in
-"""
+"""Records that models are fitted to: loops and histories, from recordings and tables."""

@@ -15,8 +15,7 @@ from scipy.optimize import nnls
 
 from hilctl.base.types import F64, I64
 from hilctl.identify.field.design_matrix import needed_points, play_columns, plays_given
-from hilctl.identify.field.gauss_newton import SearchPoint
-from hilctl.identify.nnls import RIDGE
+from hilctl.identify.least_squares import RIDGE, SearchPoint, differences
 from hilctl.kernels.field import drag_columns
 
 STEEPEST = 6.0  # slope of the curve, of its mean
@@ -281,14 +280,7 @@ def _prior(
     plays = number[1 : grid.thresholds.size]
     pairs.append((plays[:-1], plays[1:], 0.5 * smooth))
     width = count + others.size
-    out: list[F64] = []
-    for first, second, weight in pairs:
-        a, b = first.ravel(), second.ravel()
-        both = (a >= 0) & (b >= 0)
-        rows_of = np.zeros((int(both.sum()), width))
-        index = np.arange(len(rows_of))
-        rows_of[index, a[both]], rows_of[index, b[both]] = -weight * longest, weight * longest
-        out.append(rows_of)
+    out = [weight * longest * differences(a, b, width) for a, b, weight in pairs]
     ridge = np.zeros((count, width))
     ridge[:, :count] = RIDGE * longest * np.eye(count)
     out.append(ridge)

@@ -7,9 +7,8 @@ import numpy as np
 
 from hilctl.base.types import F64, I64
 from hilctl.identify.field.densities import Curve, Equations, Grid, Weights, outputs, solve, table
-from hilctl.identify.field.gauss_newton import SearchPoint, settle
+from hilctl.identify.field.design_matrix import Rows, chosen
 from hilctl.identify.field.preprocess import Prepared
-from hilctl.identify.field.sampling import Rows, chosen
 from hilctl.identify.field.stages import (
     HIGH,
     LOW,
@@ -24,6 +23,7 @@ from hilctl.identify.field.stages import (
     stages_of,
 )
 from hilctl.identify.fit_api import OnProgress
+from hilctl.identify.least_squares import SearchPoint, settle
 from hilctl.identify.parallel import parallel_map
 
 TRIED = 0.2  # of a unit: change that slopes are taken by; kinks of single rows are smoothed
@@ -48,10 +48,7 @@ class BareSignal:
 
 
 class JointRefinement:
-    """A sum of squares over the stages and thresholds of the whole model; its weights follow.
-
-    A search on fewer operators ends at their optimum, which is not that of all of them: small loops
-    need a slightly different lag, and thresholds beside those at which the rods yield.
+    """A sum of squares over stages and thresholds.
 
     Args:
         rows_of: From stages, float64[9], to the rows.

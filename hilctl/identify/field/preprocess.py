@@ -10,8 +10,7 @@ from scipy.ndimage import uniform_filter1d
 
 from hilctl.base.types import F64, I64
 from hilctl.identify.data.records import History
-from hilctl.identify.field.design_matrix import bare_displacement, corners
-from hilctl.identify.field.sampling import Motion
+from hilctl.identify.field.design_matrix import Motion, bare_displacement, corners
 from hilctl.identify.parallel import parallel_map
 from hilctl.models.cascade import smoothing_weights
 

@@ -9,8 +9,8 @@ import numpy as np
 from scipy.optimize import nnls
 
 from hilctl.base.types import F64
-from hilctl.identify.fit_api import FitJob, FoundModel
-from hilctl.identify.searched.search import converged, first_least
+from hilctl.identify.fit_api import LEAST_SLOPE, FitJob, FoundModel
+from hilctl.identify.least_squares import converged, first_least
 from hilctl.identify.staged.objective import segments
 from hilctl.models.deadband import DeadbandFunction
 from hilctl.models.integrated import IntegratedModel
@@ -30,7 +30,7 @@ class _Problem:
 
     def __init__(self, job: FitJob, spacing: float) -> None:
         self.data = data = job.data
-        self.least = job.settings.least_slope
+        self.least = LEAST_SLOPE
         self.plays, self.deadbands = job.settings.plays, job.settings.deadbands
         numbers = np.arange(1, self.plays + 1, dtype=np.float64)
         self.thresholds = spacing * data.reach / (self.plays + 0.5) * numbers

@@ -4,8 +4,8 @@ import numpy as np
 
 from hilctl.base.types import F64
 from hilctl.identify.fit_api import FitJob, FoundModel
+from hilctl.identify.least_squares import converged, first_least
 from hilctl.identify.literature.linear_weights import weigh
-from hilctl.identify.searched.search import converged, first_least
 from hilctl.kernels.generalised_play import envelope_outputs
 from hilctl.kernels.hysteresis import rest_memory
 from hilctl.models.generalised_pi import GeneralisedModel, PlayEnvelope

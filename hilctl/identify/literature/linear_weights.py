@@ -4,13 +4,14 @@ import numpy as np
 
 from hilctl.base.types import F64, I64
 from hilctl.identify.fit_api import FitJob, FoundModel
-from hilctl.identify.nnls import bounded_weights, numbered, smooth_densities
+from hilctl.identify.least_squares import bounded_weights, numbered, smooth_densities
 from hilctl.models.kp import KrasnoselskiiPokrovskiiModel
 from hilctl.models.plays import PpiModel
 from hilctl.models.preisach import PreisachModel
 
 SMOOTHNESS = 0.01  # so little that no error grows, and enough for one solution
 
+LEVELS = 16  # of the Krasnosel'skii-Pokrovskii grid
 STILL = 0.05
 """Part of its own range that an operator must move through in some loop to have a weight. One that
 moved on the way from rest and then stays would only say how loops differ in their mean."""
@@ -88,7 +89,7 @@ def fit_kp(job: FitJob) -> FoundModel:
     The grid goes one level beyond the measured range on either side, because the model stands still
     beyond its grid; the diagonal goes on there as it is next to it.
     """
-    data, levels = job.data, job.settings.levels
+    data, levels = job.data, LEVELS
     low, high = data.input_range
     spacing = (high - low) / (levels - 2)
     row, column = np.tril_indices(levels)

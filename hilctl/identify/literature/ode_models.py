@@ -9,8 +9,8 @@ import numpy as np
 
 from hilctl.base.types import F64
 from hilctl.identify.fit_api import FitJob, FoundModel
+from hilctl.identify.least_squares import converged, first_least
 from hilctl.identify.literature.linear_weights import weigh
-from hilctl.identify.searched.search import converged, first_least
 from hilctl.kernels.hysteresis import rest_memory
 from hilctl.kernels.implicit_models import BOUC_WEN, implicit_forward
 from hilctl.models.bouc_wen import BoucWenModel

@@ -15,8 +15,7 @@ from hilctl.identify.data.data_files import history_from_recording
 from hilctl.identify.data.records import History
 from hilctl.identify.fit_api import OnProgress, ignore_progress
 from hilctl.identify.fit_data import FitData
-from hilctl.identify.fit_model import VERSIONS, error_table
-from hilctl.identify.identified_range import identified_range
+from hilctl.identify.fit_model import VERSIONS, error_table, identified_range
 from hilctl.identify.model_quality import data_reasons
 from hilctl.identify.refine.regularisation import (
     WORTH,

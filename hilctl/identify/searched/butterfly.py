@@ -12,10 +12,11 @@ from hilctl.base.errors import DataError
 from hilctl.base.types import F64
 from hilctl.identify.data.records import SteadyLoop
 from hilctl.identify.fit_api import FitJob, FoundModel
-from hilctl.identify.searched.search import first_least
+from hilctl.identify.least_squares import first_least
 from hilctl.models.butterfly import ButterflyModel
 from hilctl.models.deadband import DeadbandFunction
 
+_CORNERS = 16  # slopes of the even function
 _NEAR = 0.1  # of the stroke: so near to the turning point a loop may change from wing to wing
 _DEEP = 0.01  # of the stroke: what goes up and down by less is noise
 _STEEPEST = 30.0  # slopes of S^-1, relative to the mean one
@@ -71,13 +72,12 @@ class _Problem:
         above_um = target_um - self.turning_um
         if not above_um.max() > 0.0:
             raise DataError(f"every displacement is below the turning point, {self.turning_um} µm")
-        corners = settings.corners
         self.plays = np.arange(1, settings.plays + 1, dtype=np.float64)
         # S is flat where the wings meet: there S^-1 is steep and needs its corners.
-        self.edges_um = above_um.max() * np.linspace(0.0, 1.0, corners + 1) ** 2
+        self.edges_um = above_um.max() * np.linspace(0.0, 1.0, _CORNERS + 1) ** 2
         self.inner = np.clip(above_um[:, None] - self.edges_um[:-1], 0.0, np.diff(self.edges_um))
         self.side = np.concatenate([_sides(loop, self.turning_um) for loop in loops])
-        self.place = np.clip(np.searchsorted(self.edges_um, above_um) - 1, 0, corners - 1)
+        self.place = np.clip(np.searchsorted(self.edges_um, above_um) - 1, 0, _CORNERS - 1)
         self.bias_limit = np.inf if settings.magnets else _NONE
 
     def solve(self, spacing: float, growth_s: float) -> tuple[F64, float]:

@@ -3,9 +3,10 @@
 import numpy as np
 
 from hilctl.base.types import F64
+from hilctl.identify.fit_api import LEAST_SLOPE, FitJob, FoundModel
 from hilctl.identify.fit_data import FitData
 from hilctl.identify.searched.plays import numbered, spacing_limit
-from hilctl.identify.searched.search import SearchSpace
+from hilctl.identify.searched.search import SearchSpace, searched_fit
 from hilctl.identify.settings import FitSettings
 from hilctl.kernels.hysteresis import deadband_block
 from hilctl.models.integrated import IntegratedModel, exponential_integrated, exponential_weights
@@ -47,14 +48,13 @@ class ExponentialProblem:
     @property
     def space(self) -> SearchSpace:
         """What is searched."""
-        least = self._settings.least_slope
         rows = [
             (0.05, 1.0, 0.6),
             (0.0, 1.0, 0.1),
-            (least, 4.0, 0.5),
+            (LEAST_SLOPE, 4.0, 0.5),
             (0.0, 4.0, 1.2 / self._settings.plays),
             (0.0, 40.0, 2.0),
-            (0.0, 1.0 - least, 0.5),
+            (0.0, 1.0 - LEAST_SLOPE, 0.5),
             (0.0, 40.0, 1.0),
             (0.02, 4.0, 0.8),
             (0.0, STEEPEST - 1.0, 0.3),
@@ -169,3 +169,8 @@ class ExponentialProblem:
         """Return what part of one side's change of slope each deadband has: float64[k]."""
         rates = exponential_weights(1.0, float(x[1]) / self._steps.size, self._steps.size)
         return np.asarray(rates / rates.sum())
+
+
+def fit_exponential(job: FitJob) -> FoundModel:
+    """Fit the integrated model with exponential weights."""
+    return searched_fit(ExponentialProblem(job.data, job.settings), job)

@@ -6,9 +6,10 @@ import numpy as np
 from scipy.linalg import qr
 
 from hilctl.base.types import F64
+from hilctl.identify.fit_api import LEAST_SLOPE, FitJob, FoundModel
 from hilctl.identify.fit_data import FitData
-from hilctl.identify.nnls import bounded_and_free
-from hilctl.identify.searched.search import SearchSpace
+from hilctl.identify.least_squares import bounded_and_free
+from hilctl.identify.searched.search import SearchSpace, searched_fit
 from hilctl.identify.settings import FitSettings
 from hilctl.models.plays import PlayModel, PpiModel, RdpiModel, SpiModel
 
@@ -171,7 +172,7 @@ class PlaysProblem:
     def _least(self) -> F64:
         """Return the lower bounds of the weights; the first is that of a_0."""
         least = np.zeros(2 if self._exponential else self._settings.plays + 1)
-        least[0] = self._settings.least_slope * self._data.gain
+        least[0] = LEAST_SLOPE * self._data.gain
         return least
 
     def _offset_um(self, free: F64) -> float:
@@ -198,3 +199,8 @@ class PlaysProblem:
     def _decay(self, x: F64) -> F64:
         i = np.arange(1, self._settings.plays + 1, dtype=np.float64)
         return np.exp(-self._beta(x) * i)
+
+
+def fit_plays(job: FitJob) -> FoundModel:
+    """Fit a PPI or an RDPI; its weights follow from its thresholds."""
+    return searched_fit(PlaysProblem(job.data, job.settings), job)

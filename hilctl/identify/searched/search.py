@@ -1,16 +1,17 @@
 """Least squares from several starts, within bounds, and a refinement for the peak error."""
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from hilctl.base.types import F64
-from hilctl.identify.fit_api import OnProgress, StartOutcome
-from hilctl.identify.nnls import Mask
+from hilctl.identify.evaluation import weight_roots
+from hilctl.identify.fit_api import FitJob, FoundModel, OnProgress, StartOutcome
+from hilctl.identify.least_squares import Mask, converged, first_least
 from hilctl.models.plays import PlayModel
+
+SEED = 1  # of the random starts
 
 DRAWS_A_START = 12  # random points looked at for each start that is followed
 EVALUATIONS = 60  # of the residuals, derivatives apart, for each start
@@ -20,7 +21,6 @@ ROUND = 15  # evaluations of the residuals in a round, derivatives apart
 EMPHASIS = 0.3  # what a sample beyond the goal gains in weight in each round
 NEARLY = 0.96  # of the goal: where samples begin to gain
 HELD = 1e-4  # of the space: so near to a bound, a search has run into it
-SAME = 1e-6  # relative difference of two ends that are one and the same minimum
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,49 +158,6 @@ def polished(problem: SearchProblem, x: F64, scale: F64, evaluations: int) -> tu
     return converged(residuals, x, space.low, space.high, evaluations, slopes)
 
 
-def converged(
-    errors: Callable[[F64], F64],
-    x: F64,
-    low: F64,
-    high: F64,
-    evaluations: int,
-    slopes: Callable[[F64], F64] | None = None,
-) -> tuple[F64, int]:
-    """Return where bounded least squares ends from ``x``, and the evaluations it took.
-
-    Where derivatives are differences, they are central ones: those to one side are known to eight
-    digits only, and what rounding makes of the rest, another thing on every processor, grows from
-    step to step.
-
-    Args:
-        errors: From a point float64[p] to float64[N].
-        x: float64[p], where to start.
-        low: float64[p].
-        high: float64[p].
-        evaluations: Most of the errors, derivatives apart.
-        slopes: Derivatives float64[N, p]; differences where None.
-    """
-    margin = 1e-9 * (high - low)
-    found = least_squares(
-        errors,
-        np.clip(x, low + margin, high - margin),
-        jac=slopes or "3-point",
-        bounds=(low, high),
-        x_scale="jac",
-        max_nfev=evaluations,
-    )
-    return np.asarray(found.x, dtype=np.float64), int(found.nfev)
-
-
-def first_least(values: Sequence[float]) -> int:
-    """Return the first of the values that are the least but for rounding.
-
-    Starts that end at one minimum differ in the last digits only, and those are another thing on
-    every processor: the first of them is taken.
-    """
-    return int(np.argmax(np.array(values) <= min(values) * (1.0 + SAME)))
-
-
 def refine_peak(
     problem: SearchProblem, found: SearchEnd, goal_um: float, progress: OnProgress
 ) -> SearchEnd:
@@ -237,3 +194,21 @@ def refine_peak(
         if peak < lowest:
             best, lowest = SearchEnd(x, scale, found.starts), peak
     return best
+
+
+def searched_fit(problem: SearchProblem, job: FitJob) -> FoundModel:
+    """Search a model of a problem, from several starts."""
+    data, settings = job.data, job.settings
+    rng = np.random.default_rng(SEED)
+    roots = weight_roots(data.records, settings.weight_by)
+    scale = np.append(roots, np.ones(problem.held))
+    found = search(problem, scale, data.stroke_um, settings.starts, rng, job.progress)
+    if settings.peak_goal_percent is not None:
+        goal_um = settings.peak_goal_percent / 100.0 * data.stroke_um
+        found = refine_peak(problem, found, goal_um, job.progress)
+    known = problem.parameters(found.x, found.scale)
+    numbers = len(known.keys() - {"g_0"})  # which is 1 by definition
+    at_bound = problem.space.at_bound(found.x)
+    held = tuple(name for name, bound in zip(problem.searched, at_bound, strict=True) if bound)
+    model = problem.build(found.x, found.scale)
+    return FoundModel(model, numbers, known, found.starts, at_bound=held)

@@ -1,47 +1,133 @@
-"""Fits of free weights, with or without lag, structure and delay around the hysteresis."""
+"""Fits with stages: from a job to a model with standard errors."""
+
+import math
 
 import numpy as np
 
 from hilctl.base.types import F64
 from hilctl.identify.evaluation import weight_roots
-from hilctl.identify.fit_api import FitJob, FoundModel
+from hilctl.identify.fit_api import LEAST_SLOPE, FitJob, FoundModel
+from hilctl.identify.least_squares import numbered, smooth_densities
 from hilctl.identify.literature.linear_weights import cells_below
-from hilctl.identify.nnls import numbered, smooth_densities
-from hilctl.identify.staged.confidence import at_bound, standard_errors
 from hilctl.identify.staged.fit_data import StagedFitData
-from hilctl.identify.staged.model import (
+from hilctl.identify.staged.objective import (
+    DYNAMIC,
     STAGE_PARAMETERS,
+    Layers,
     integrated_model,
     parameters,
     staged_model,
     stages_of,
 )
-from hilctl.identify.staged.objective import Layers
+from hilctl.identify.staged.sensitivity import GAMMA_S, GROWTH, LAG_S, SPACING
 from hilctl.identify.staged.staged_search import StagedEnd, find_staged
 from hilctl.models.preisach import PreisachModel
 from hilctl.models.staged import StagedModel
+
+DELAY, C_S, Q_S2 = range(SPACING + 2, DYNAMIC)
+RIDGE = 1e-9
+
+
+def standard_errors(
+    found: StagedEnd, layers: Layers, places: tuple[slice, ...], *, staged: bool
+) -> dict[str, float]:
+    """Return the standard error of each parameter.
+
+    Errors of a model within one record are anything but independent, so that the usual formula
+    would promise far too much. Records are taken as independent of each other instead (sandwich
+    estimate, clustered by record): G^-1 (sum of s s^T) G^-1 with G = J^T J and s = J^T e of each
+    record. Parameters held by a bound count as known.
+
+    Args:
+        found: The fit.
+        layers: What is in the model.
+        places: Each record's samples.
+        staged: Whether the delay is reported.
+
+    Returns:
+        Standard errors by the names of :func:`hilctl.identify.staged.objective.parameters`, without
+        those that a bound holds; none with fewer than two records.
+    """
+    if len(places) < 2:
+        return {}
+    covariance = _covariance(found, places)
+    out: dict[str, float] = {}
+    by = _stages(found, layers, staged=staged) | _operators(layers, covariance.shape[0])
+    for name, slopes in by.items():
+        if not found.free[list(slopes)].any():
+            continue
+        row = np.zeros(covariance.shape[0])
+        row[list(slopes)] = list(slopes.values())
+        out[name] = math.sqrt(max(float(row @ covariance @ row), 0.0))
+    return out
+
+
+def at_bound(found: StagedEnd, layers: Layers, *, staged: bool) -> tuple[str, ...]:
+    """Return the names of the parameters that a bound holds; arguments as above."""
+    by = _stages(found, layers, staged=staged) | _operators(layers, found.held.size)
+    return tuple(name for name, slopes in by.items() if found.held[next(iter(slopes))])
+
+
+def _stages(found: StagedEnd, layers: Layers, *, staged: bool) -> dict[str, dict[int, float]]:
+    """Return what each reported parameter of the stages changes with, and how much."""
+    by: dict[str, dict[int, float]] = {}
+    if layers.lag:
+        by |= {"tau_s": {LAG_S: 1.0}, "growth_per_unit": {GROWTH: 1.0}}
+    if layers.gamma:
+        by["gamma"] = {GAMMA_S: 1.0}
+    if staged and layers.delay:
+        by["delay_s"] = {DELAY: 1.0}
+    if layers.structure:
+        radian_s, c_s = math.sqrt(found.point.linear.q_s2), found.point.linear.c_s
+        by["natural_hz"] = {Q_S2: -0.25 / (math.pi * radian_s**3)}
+        by["damping_ratio"] = {C_S: 0.5 / radian_s, Q_S2: -0.25 * c_s / radian_s**3}
+    return by
+
+
+def _operators(layers: Layers, size: int) -> dict[str, dict[int, float]]:
+    by: dict[str, dict[int, float]] = {"alpha": {SPACING: 1.0}}
+    by |= {f"a_{i}": {DYNAMIC + i: 1.0} for i in range(layers.plays + 1)}
+    for side, first in enumerate((DYNAMIC + layers.plays + 1, size - 3 - layers.deadbands)):
+        for j in range(layers.deadbands):
+            # A weight is the change of slope from the deadband before; the first has slope 1.
+            before = {first + j - 1: -1.0} if j else {}
+            by[f"g_{'-' if side else ''}{j + 1}"] = {first + j: 1.0} | before
+    by |= {"d_p": {size - 3: 1.0}, "d_n": {size - 2: 1.0}}
+    return by | ({"output_offset_um": {size - 1: 1.0}} if layers.offset else {})
+
+
+def _covariance(found: StagedEnd, places: tuple[slice, ...]) -> F64:
+    free = np.flatnonzero(found.free)
+    slopes = found.slopes[:, free] * found.scale[:, None]
+    errors = found.errors_um * found.scale
+    length = np.linalg.norm(slopes, axis=0)
+    length[length == 0.0] = 1.0
+    slopes = slopes / length
+    normal = slopes.T @ slopes
+    normal[np.diag_indices_from(normal)] += RIDGE
+    scores = np.stack([slopes[place].T @ errors[place] for place in places])
+    records = len(places)
+    middle = scores.T @ scores * (records / (records - 1.0))
+    half = np.linalg.solve(normal, middle)
+    reduced = np.linalg.solve(normal, half.T) / np.outer(length, length)
+    out = np.zeros((found.free.size, found.free.size))
+    out[np.ix_(free, free)] = reduced
+    return out
+
 
 SPARE = 0.1  # span of commands beyond the data's, of their range
 SMOOTHNESS = 0.2  # weight of differences between neighbouring densities, beside the errors
 STILL = 0.05  # part of a cell that a play must move through in some record to have a density
 
 
-def with_triangle(
-    data: StagedFitData, model: StagedModel, lines: int, scale: F64, least_slope: float
-) -> StagedModel:
-    """Replace the hysteresis of a staged model by a Preisach triangle.
-
-    The sum of plays and the deadbands after it bend both branches of a loop alike. A triangle of
-    relays bends every play by itself. Once lag, structure and delay are known, its densities act
-    linearly on the displacement, so they need neither start nor search.
+def with_triangle(data: StagedFitData, model: StagedModel, lines: int, scale: F64) -> StagedModel:
+    """Put a triangle in the place of a staged model's hysteresis.
 
     Args:
         data: The data.
         model: The stages, found with another model of the hysteresis.
         lines: Lines of the triangle, and cells of the longest.
         scale: float64[N], square root of each sample's weight.
-        least_slope: Smallest density of the line without hysteresis, relative to the mean slope
-            of the data; the inverse needs it above 0.
     """
     low, high = data.input_range
     thresholds = data.reach / lines * np.arange(lines, dtype=np.float64)
@@ -55,7 +141,7 @@ def with_triangle(
     width = float(edges[1] - edges[0])
     moved = _largest_swing(columns, data.places) > STILL * width
     least = np.zeros(columns.shape[1])
-    least[:lines] = least_slope * data.gain
+    least[:lines] = LEAST_SLOPE * data.gain
     seen = data.through(columns[:, moved], stages_of(model, data.half_period_s))
     table = numbered(moved).reshape(lines, lines)
     found, offset_um = smooth_densities(
@@ -93,10 +179,9 @@ def fit_free(job: FitJob) -> FoundModel:
         delay=False,
         offset=settings.offset,
         midpoint=settings.layout == "midpoint",
-        least_slope=settings.least_slope,
     )
     data = StagedFitData(job.data.records, job.data.speeds)
-    found = _found(job, data, layers)
+    found = find_staged(job, data, layers)
     known = parameters(layers, found.point, staged=False)
     errors = standard_errors(found, layers, data.places, staged=False)
     model = integrated_model(data, layers, found.point, job.data.unit)
@@ -120,9 +205,8 @@ def fit_staged(job: FitJob) -> FoundModel:
         half_period_s=data.half_period_s,
         offset=settings.offset,
         midpoint=settings.layout == "midpoint",
-        least_slope=settings.least_slope,
     )
-    found = _found(job, data, layers)
+    found = find_staged(job, data, layers)
     known = parameters(layers, found.point, staged=True)
     errors = standard_errors(found, layers, data.places, staged=True)
     model = staged_model(data, layers, found.point, job.data.unit)
@@ -131,18 +215,10 @@ def fit_staged(job: FitJob) -> FoundModel:
         return FoundModel(model, len(known) - 1, known, found.starts, errors, held)
     job.progress(0.9, "densities of the Preisach triangle")
     scale = weight_roots(job.data.records, settings.weight_by)
-    model = with_triangle(data, model, settings.lines, scale, settings.least_slope)
+    model = with_triangle(data, model, settings.lines, scale)
     known = {name: known[name] for name in STAGE_PARAMETERS if name in known}
     errors = {name: errors[name] for name in STAGE_PARAMETERS if name in errors}
     known["output_offset_um"] = model.hysteresis.output_offset_um
     numbers = len(known) + settings.lines**2
     held = tuple(name for name in held if name in known)
     return FoundModel(model, numbers, known, found.starts, errors, held)
-
-
-def _found(job: FitJob, data: StagedFitData, layers: Layers) -> StagedEnd:
-    settings = job.settings
-    goal = settings.peak_goal_percent
-    goal_um = None if goal is None else goal / 100.0 * data.stroke_um
-    scale = weight_roots(job.data.records, settings.weight_by)
-    return find_staged(data, layers, scale, settings.starts, job.run, job.progress, goal_um)

@@ -10,11 +10,11 @@ import numpy.typing as npt
 
 from hilctl.base.segments import Segment
 from hilctl.base.types import F64
-from hilctl.identify.command import Identification, identify_records, settings_from
 from hilctl.identify.data.records import History
-from hilctl.identify.fit_api import OnProgress, ignore_progress
+from hilctl.identify.fit_api import FitRequest, OnProgress, ignore_progress
 from hilctl.identify.model_quality import GOOD_PERCENT, MOST_PERCENT, Grade, Verdict
 from hilctl.identify.parallel import parallel_map, workers
+from hilctl.identify.pipeline import Identification, identify_records, settings_from
 from hilctl.models.base import HysteresisModel
 from hilctl.recording.reader import read
 from hilctl.recording.recording import Recording
@@ -239,7 +239,7 @@ def identified(
     settings = settings_from("auto", [])
     with workers("threads") as run:
         return identify_records(
-            histories, settings, unit, source=source, run=run, progress=progress
+            FitRequest(histories, settings, unit, source=source, run=run, progress=progress)
         )
 
 

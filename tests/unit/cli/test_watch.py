@@ -315,7 +315,7 @@ def run(monkeypatch):
     made.feed.ended, made.feed.state = True, "stopped"
     made.feed.values["reason"] = "by hand"
     monkeypatch.setattr(module, "find_run", lambda name: made)
-    monkeypatch.setattr(module, "RunFeed", lambda folder: made.feed)
+    monkeypatch.setattr(module, "RunReader", lambda folder: made.feed)
     monkeypatch.setattr(module, "print_lines", lambda feed: None)
     monkeypatch.setattr(module.signal, "signal", lambda *given: None)
     monkeypatch.setattr(module, "_has_keys", lambda: False)
@@ -353,7 +353,7 @@ def test_run_that_ended_before_it_was_read_is_one_message(run, monkeypatch, caps
     def refuse(folder):
         raise RunError("demo-7: gone")
 
-    monkeypatch.setattr(module, "RunFeed", refuse)
+    monkeypatch.setattr(module, "RunReader", refuse)
     monkeypatch.setattr(module, "runs", lambda: [run])
     monkeypatch.setattr(module.os, "getppid", lambda: 7)
     monkeypatch.setattr(module.time, "sleep", lambda s: None)

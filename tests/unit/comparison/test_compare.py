@@ -3,12 +3,21 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from hilctl.base.errors import InputError
-from hilctl.cli.models import notes
-from hilctl.comparison.compare import COMPARED, ComparisonRequest, compare, save_models
+from hilctl.comparison.compare import (
+    COMPARED,
+    ComparisonRequest,
+    compare,
+    headings,
+    notes,
+    save_models,
+    table_rows,
+    titles,
+)
 from hilctl.comparison.comparison_page import comparison_page
 from hilctl.identify.registry import CATALOGUE, entry
 from hilctl.models.model_file import load_model
@@ -120,3 +129,48 @@ def test_saved_models_are_model_files(comparison, tmp_path):
         assert saved.provenance.errors_percent["peak"] == row.error.peak_percent
     with pytest.raises(InputError, match="--overwrite"):
         save_models(comparison, tmp_path / "models", created="2026-01-01", overwrite=False)
+
+
+def trial(frequency_hz, error_percent, limited=0):
+    return SimpleNamespace(
+        frequency_hz=frequency_hz, peak_error_percent=error_percent, limited_samples=limited
+    )
+
+
+def row(name, *trials, numbers=5, identify_s=1.5):
+    error = SimpleNamespace(peak_percent=1.25, rms_percent=0.5)
+    return SimpleNamespace(
+        name=name, title=f"the {name}", numbers=numbers, identify_s=identify_s, inverse_ns=312.4,
+        error=error, trials=trials,
+    )  # fmt: skip
+
+
+def comparison_of(*rows, device="a rig"):
+    return SimpleNamespace(rows=rows, device=device)
+
+
+def test_a_model_of_a_file_has_dashes_where_nothing_was_found():
+    """Columns are those of the model that was tried most often."""
+    found = comparison_of(
+        row("duhem", trial(50.0, 0.75), trial(100.0, None)),
+        row("m.yaml", numbers=None, identify_s=None),
+    )
+    assert headings(found)[-2:] == ["50 Hz", "100 Hz"]
+    assert list(table_rows(found)) == [
+        ["duhem", "5", "1.50", "312", "1.25", "0.50", "0.75", "-"],
+        ["m.yaml", "-", "-", "312", "1.25", "0.50"],
+    ]
+    assert titles(found.rows) == [("duhem", "the duhem"), ("m.yaml", "the m.yaml")]
+
+
+def test_a_trial_that_was_limited_has_a_star_and_a_note():
+    limited = comparison_of(row("duhem", trial(50.0, 0.75, limited=3)))
+    assert next(table_rows(limited))[-1] == "0.75*"
+    assert notes(limited)[-1].startswith("*: the limiter")
+    assert not any(
+        text.startswith("*") for text in notes(comparison_of(row("d", trial(50.0, 1.0))))
+    )
+
+
+def test_a_real_device_is_said_to_have_no_trials():
+    assert "not a simulated one" in notes(comparison_of(row("duhem"), device=""))[-1]

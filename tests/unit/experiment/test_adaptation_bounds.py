@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from tests.unit.experiment.test_feedback import EXPERIMENT, MODEL
 
 from hilctl.base.errors import ConfigError
 from hilctl.base.yaml import Document
@@ -16,6 +15,7 @@ from hilctl.experiment.load import resolve
 from hilctl.experiment.preflight import check
 from hilctl.loop.adaptation import DisplacementOperator
 from hilctl.loop.compensator import Compensator
+from tests.unit.experiment.test_feedback_checks import EXPERIMENT, MODEL
 
 PLAIN = EXPERIMENT.replace("feedback:", "# feedback:")
 NOISE = "adaptation={noise_um: 0.03}"

@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 
 from hilctl.identify import model_page as module
-from hilctl.identify.command import Identification
 from hilctl.identify.cross_validation import HeldOut
 from hilctl.identify.data.records import History
 from hilctl.identify.evaluation import judge
+from hilctl.identify.fit_api import FitRequest
 from hilctl.identify.fit_model import fit_model
 from hilctl.identify.model_page import identification_page, loops_figure
 from hilctl.identify.model_quality import verdict_of
+from hilctl.identify.pipeline import Identification
 from hilctl.identify.settings import FitSettings
 from hilctl.models.plays import PpiModel
 
@@ -23,7 +24,7 @@ def page_of(data_of):
 
     def make(held_out=()):
         records = data_of(TRUTH).records
-        fit = fit_model(records, FitSettings(kind="straight"), lambda: 0.0, source=["<a & b>.csv"])
+        fit = fit_model(FitRequest(records, FitSettings(kind="straight"), source=["<a & b>.csv"]))
         unseen = HeldOut(judge(fit.model, held_out), held_out, "others") if held_out else None
         verdict = verdict_of(fit, records, FitSettings(kind="straight"), unseen)
         return identification_page(Identification(fit, records, verdict, unseen, (), 0))

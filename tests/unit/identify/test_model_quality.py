@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilctl.identify.command import identify_records
 from hilctl.identify.data.records import History
+from hilctl.identify.fit_api import FitRequest
+from hilctl.identify.pipeline import identify_records
 from hilctl.identify.settings import FitSettings
 from hilctl.models.plays import PpiModel
 
@@ -22,7 +23,7 @@ def grid(loop_of):
 
 def judged(records, validate=(), **choices):
     chosen = {"plays": 2, "starts": 1, "weights": "free", **choices}
-    return identify_records(records, FitSettings(kind="ppi", **chosen), "A", validate)
+    return identify_records(FitRequest(records, FitSettings(kind="ppi", **chosen), "A"), validate)
 
 
 def changed(records, change):

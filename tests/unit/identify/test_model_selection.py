@@ -1,5 +1,7 @@
-"""The kind that does best on data held out is taken."""
+"""Kind and size are chosen by errors on held-out data."""
 
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -7,21 +9,22 @@ import pytest
 
 from hilctl.base.errors import DataError
 from hilctl.identify import model_selection
-from hilctl.identify.command import settings_from
 from hilctl.identify.cross_validation import HeldOut
 from hilctl.identify.data.records import History, Record, SteadyLoop
 from hilctl.identify.evaluation import Evaluation
-from hilctl.identify.fit_api import ignore_progress
-from hilctl.identify.model_selection import LOOPS, SelectedModel, choose_kind
+from hilctl.identify.fit_api import FitRequest, ignore_progress
+from hilctl.identify.fit_model import fit_model
+from hilctl.identify.model_selection import LOOPS, ORDERS, CandidateScore, choose_lag, select
 from hilctl.identify.parallel import serial_map
-from hilctl.models.mechanics import FurtherMode
+from hilctl.identify.pipeline import settings_from
+from hilctl.identify.settings import FitSettings, IdentifySettings
+from hilctl.models.integrated import exponential_integrated
+from hilctl.models.plays import PpiModel
+from tests.published import terfenol_rdpi
 
 WAVE = np.sin(np.linspace(0.0, 6.0, 64))
 HISTORY = History("history", WAVE, 9.0 * WAVE, 100.0)
 LOOP = SteadyLoop("loop", WAVE, 9.0 * WAVE, 1.0)
-MODE = FurtherMode(
-    natural_hz=20.0, damping_ratio=0.1, antiresonance_hz=18.0, antiresonance_damping_ratio=0.1
-)
 
 
 SMALL = {"field 0 8": 0.6, "generalised_duhem 12": 0.9, "field 0 32": 0.3, "field 3 32": 0.2}
@@ -31,34 +34,40 @@ def fake(monkeypatch: pytest.MonkeyPatch, errors: dict[str, float | None]) -> li
     """Let fits have errors by kind, drags and size; return the list of them and their starts."""
     seen: list[tuple[str, Any]] = []
 
-    def held_out_error(records: Any, settings: Any, *rest: Any) -> HeldOut | None:
+    def held_out(request: FitRequest) -> HeldOut | None:
+        settings = request.settings
         name = {
             "field": f"field {settings.drags} {settings.plays}",
             "generalised_duhem": f"generalised_duhem {settings.cells}",
         }.get(settings.kind, settings.kind)
-        seen.append((name, rest[-2]))
+        seen.append((name, request.start))
         rms = errors[name]
         if rms is None:
             return None
         judgement = Evaluation(
             errors=(), modelled_um=(), peak_percent=3.0 * rms, rms_percent=rms, own_peak_percent=0.0
         )
-        return HeldOut(judgement, tuple(records), "test", f"end of {name}")
+        return HeldOut(judgement, tuple(request.records), "test", f"end of {name}")
 
-    monkeypatch.setattr(model_selection, "held_out_error", held_out_error)
+    monkeypatch.setattr(
+        model_selection, "held_out_errors", lambda requests, run: run(held_out, requests)
+    )
     return seen
 
 
-def chosen(records: list[Record]) -> Any:
-    choice = SelectedModel(tuple(records), settings_from("auto", []), "A")
-    return choose_kind(choice, serial_map, ignore_progress)
+def chosen(records: list[Record], *texts: str) -> tuple[FitSettings, tuple[CandidateScore, ...]]:
+    found = select(FitRequest(records, settings_from("auto", texts)))
+    return found.settings, found.candidates
 
 
 def test_the_kind_whose_small_model_does_well_is_tried_in_full(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     seen = fake(monkeypatch, {**SMALL, "generalised_duhem 12": 1.3})
-    settings, held_out, errors = chosen([HISTORY])
+    found = select(FitRequest([HISTORY], settings_from("auto", [])))
+    settings, held_out, errors = found.settings, found.held_out, found.candidates
+    assert isinstance(settings, IdentifySettings)
+    assert held_out is not None
     assert (settings.kind, settings.drags, settings.whole) == ("field", 3, True)
     assert held_out.judgement.rms_percent == 0.2
     assert [error.rms_percent for error in errors] == [0.6, 1.3, 0.3, 0.2]
@@ -72,13 +81,13 @@ def test_more_operators_are_taken_only_where_they_are_worth_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     fake(monkeypatch, {**SMALL, "generalised_duhem 12": 1.3, "field 3 32": 0.99 * 0.3})
-    settings, _, _ = chosen([HISTORY])
+    settings, _ = chosen([HISTORY])
     assert (settings.kind, settings.drags) == ("field", 0)
 
 
 def test_a_kind_that_is_near_is_tried_in_full_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
     fake(monkeypatch, {**SMALL, "generalised_duhem 28": 0.25})
-    settings, _, errors = chosen([HISTORY])
+    settings, errors = chosen([HISTORY])
     assert settings.kind == "generalised_duhem"
     assert [error.rms_percent for error in errors] == [0.6, 0.9, 0.3, 0.25]
 
@@ -89,13 +98,13 @@ def test_a_plain_kind_is_tried_where_no_other_does_well(
 ) -> None:
     poor = {"field 0 8": 2.0, "generalised_duhem 12": 1.9, "field 0 32": 1.8, "field 3 32": 1.8}
     fake(monkeypatch, {**poor, "generalised_duhem 28": 1.7, "integrated": plain})
-    settings, _, _ = chosen([HISTORY])
+    settings, _ = chosen([HISTORY])
     assert settings.kind == ("integrated" if plain < 1.0 else "generalised_duhem")
 
 
 def test_loops_have_candidates_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
     fake(monkeypatch, {"staged": 0.1, "integrated": None})
-    settings, _, errors = chosen([LOOP])
+    settings, errors = chosen([LOOP])
     assert settings.kind == "staged"
     assert len(errors) == len(LOOPS) - 1
 
@@ -106,24 +115,100 @@ def test_without_anything_held_out_there_is_no_choice(monkeypatch: pytest.Monkey
         chosen([HISTORY])
 
 
-@pytest.mark.parametrize("looked_for", [True, False])
-def test_known_modes_are_for_kinds_that_look_for_them(
-    monkeypatch: pytest.MonkeyPatch, looked_for: bool
-) -> None:
-    given: list[tuple[str, bool, tuple[FurtherMode, ...]]] = []
+def test_candidates_look_for_the_parts_that_are_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    given: list[tuple[str, bool, bool]] = []
 
-    def held_out_error(records: Any, settings: Any, *rest: Any) -> HeldOut | None:
-        given.append((settings.kind, settings.creep_stage, rest[-1]))
-        return None
+    def held_out_errors(requests: Sequence[FitRequest], run: Any) -> list[None]:
+        asked = [request.settings for request in requests]
+        given.extend((each.kind, each.creep_stage, each.modes) for each in asked)
+        return [None] * len(requests)
 
-    monkeypatch.setattr(model_selection, "held_out_error", held_out_error)
-    texts = [f"modes={looked_for}".lower(), "creep_stage=false"]
-    choice = SelectedModel((HISTORY,), settings_from("auto", texts), "A", (MODE,))
+    monkeypatch.setattr(model_selection, "held_out_errors", held_out_errors)
     with pytest.raises(DataError, match="too few data"):
-        choose_kind(choice, serial_map, ignore_progress)
-    known = (MODE,) if looked_for else ()
+        chosen([HISTORY], "modes=false", "creep_stage=false")
     assert given == [
-        ("field", False, known),
-        ("generalised_duhem", False, known),
-        ("integrated", True, ()),
+        ("field", False, False),
+        ("generalised_duhem", False, False),
+        ("integrated", True, True),
     ]
+
+
+Loops = Callable[..., list[SteadyLoop]]
+POINTS = 150
+GRID = [(a, f) for a in (2.0, 3.0, 6.0) for f in (10.0, 100.0, 250.0)]
+
+
+@pytest.fixture
+def loops(loops_of: Loops) -> list[SteadyLoop]:
+    omega = exponential_integrated(
+        alpha=0.9, gamma_s=2e-4, a_0=3.0, alpha_0=1.4, beta_0=0.3, g_0=1.0, alpha_1=0.08,
+        beta_1=0.15, d_p=8.0, alpha_2=0.1, beta_2=0.4, d_n=8.0, plays=6, deadbands_a_side=4,
+    )  # fmt: skip
+    return loops_of(omega, GRID, POINTS)
+
+
+@pytest.mark.slow
+def test_smallest_order_that_is_as_good_is_chosen(loops: list[SteadyLoop]) -> None:
+    """Loops of 6 plays on a noisy sensor are not given 28; every order's error is told."""
+    rng = np.random.default_rng(2)
+    noisy = [
+        replace(loop, displacement_um=loop.displacement_um + rng.normal(0.0, 0.3, POINTS))
+        for loop in loops
+    ]
+    settings = FitSettings(kind="integrated", weights="free", size="auto")
+    found = select(FitRequest(noisy, settings))
+    chosen, errors = found.settings, found.orders
+    assert [error.plays for error in errors] == [plays for plays, _ in ORDERS]
+    assert chosen.plays <= 12
+    assert chosen.starts == settings.starts
+    least = min(error.rms_percent for error in errors)
+    (own,) = (error for error in errors if error.plays == chosen.plays)
+    assert own.rms_percent <= 1.03 * least
+    assert own.deadbands_a_side == chosen.deadbands
+
+
+@pytest.mark.slow
+def test_models_without_deadbands_have_none(loops_of: Loops) -> None:
+    """The order of an RDPI is its plays alone."""
+    data = loops_of(terfenol_rdpi(), [(2.3, f) for f in (1.0, 50.0, 100.0, 200.0)], POINTS)
+    settings = FitSettings(kind="rdpi", weight_by="equal", size="auto")
+    found = select(FitRequest(data, settings))
+    chosen, errors = found.settings, found.orders
+    assert chosen.plays in {error.plays for error in errors}
+    assert all(error.deadbands_a_side == 0 for error in errors)
+    with pytest.raises(DataError, match="too few data"):
+        select(FitRequest(data[:3], settings))
+
+
+@pytest.mark.slow
+def test_lag_of_a_table_is_found() -> None:
+    """A displacement recorded three samples late is seen to lag by three."""
+    stage = PpiModel(
+        input_unit="V", direct=1.0, weights=(0.5, 0.3, 0.2), thresholds=(0.2, 0.5, 0.9)
+    )
+    time = np.arange(1500)
+    command = 1.8 + 1.8 * np.sin(2.0 * np.pi * time / 200.0) * np.linspace(0.2, 1.0, 1500)
+    late = np.roll(stage.forward(200.0).process(command), 3)
+
+    def load(lag: int) -> Sequence[History]:
+        return [History("stage", command, late, 200.0, ignore=10).without_lag(lag)]
+
+    settings = FitSettings(kind="ppi", weights="free", offset=True)
+    assert choose_lag(load, settings, serial_map, ignore_progress) == 3
+
+
+def test_creep_and_zero_of_each_history_are_taken_out() -> None:
+    """Two runs whose sensor was set to zero anew, and that creep, give the weights all the same."""
+    truth = PpiModel(direct=1.0, weights=(0.8, 0.4), thresholds=(0.5, 1.0))
+    time = np.arange(2000)
+    command = 2.0 * np.sin(2.0 * np.pi * time / 200.0) * np.linspace(0.3, 1.0, 2000)
+    clean = truth.forward(200.0).process(command)
+    data = [
+        History(f"run {i}", command, clean + zero + creep * np.log1p(time / 20.0), 200.0, 10)
+        for i, (zero, creep) in enumerate([(3.0, 0.2), (-5.0, 0.1)])
+    ]
+    choices: dict[str, Any] = {"plays": 4, "weights": "free", "starts": 1}
+    for creep, low, high in ((True, 0.0, 0.02), (False, 5.0, 100.0)):
+        settings = FitSettings(kind="ppi", creep=creep, offset=True, **choices)
+        found = fit_model(FitRequest(data, settings))
+        assert low <= found.peak_percent <= high

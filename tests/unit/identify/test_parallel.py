@@ -9,6 +9,7 @@ import pytest
 
 from hilctl.base.errors import InputError
 from hilctl.identify.data.records import SteadyLoop
+from hilctl.identify.fit_api import FitRequest
 from hilctl.identify.fit_model import fit_model
 from hilctl.identify.parallel import _threads, parallel_map, workers
 from hilctl.identify.settings import FitSettings
@@ -79,9 +80,9 @@ def test_fits_that_nobody_waits_for_end():
 def test_workers_find_the_same(loops: list[SteadyLoop], scheduler: str) -> None:
     """Starts followed on other workers end at the same bits."""
     settings = FitSettings(kind="integrated", weights="free", starts=3)
-    alone = fit_model(loops[:4], settings, lambda: 0.0)
+    alone = fit_model(FitRequest(loops[:4], settings))
     with workers(scheduler) as run:
-        found = fit_model(loops[:4], settings, lambda: 0.0, run=run)
+        found = fit_model(FitRequest(loops[:4], settings, run=run))
     assert found.model == alone.model
     assert found.starts == alone.starts
 
@@ -96,7 +97,7 @@ def test_dask_cluster_finds_the_same(loops: list[SteadyLoop]) -> None:
     from distributed import LocalCluster
 
     settings = FitSettings(kind="integrated", weights="free", starts=3)
-    alone = fit_model(loops[:4], settings, lambda: 0.0)
+    alone = fit_model(FitRequest(loops[:4], settings))
     with (
         LocalCluster(
             n_workers=1, threads_per_worker=1, processes=False, protocol="tcp",
@@ -104,7 +105,7 @@ def test_dask_cluster_finds_the_same(loops: list[SteadyLoop]) -> None:
         ) as cluster,
         workers(cluster.scheduler_address) as run,
     ):  # fmt: skip
-        found = fit_model(loops[:4], settings, lambda: 0.0, run=run)
+        found = fit_model(FitRequest(loops[:4], settings, run=run))
     assert found.model == alone.model
 
 

@@ -15,7 +15,7 @@ from hilctl.identify.data.cycles import find_cycles
 from hilctl.identify.data.data_files import read_table
 from hilctl.identify.data.records import History
 from hilctl.identify.evaluation import judge
-from hilctl.identify.fit_api import FitJob
+from hilctl.identify.fit_api import FitJob, FitRequest
 from hilctl.identify.fit_model import FittedModel, fit_model
 from hilctl.identify.registry import CATALOGUE, entry
 from hilctl.identify.settings import FitSettings
@@ -74,7 +74,7 @@ def piezo_fit(history: History, **choices: Any) -> FittedModel:
         starts=2,
         **choices,
     )
-    return fit_model([history], settings, lambda: 0.0, unit="V")
+    return fit_model(FitRequest([history], settings, unit="V"))
 
 
 def test_model_and_test_file_within_the_published_baseline(
@@ -118,6 +118,6 @@ def test_published_weights_describe_it_too(model_file: History) -> None:
     loop = find_cycles(model_file.without_lag(1))
     assert loop.frequency_hz == pytest.approx(1.0, rel=1e-5)
     settings = FitSettings(kind="ppi", offset=True, starts=3)
-    found = fit_model([loop], settings, lambda: 0.0, unit="V")
+    found = fit_model(FitRequest([loop], settings, unit="V"))
     assert found.peak_percent <= 2.8
     assert set(found.parameters) == {"sigma", "alpha", "beta", "p_0", "output_offset_um"}

@@ -53,7 +53,6 @@ def test_staged_models_have_their_stages_unless_left_out() -> None:
         ({"kind": "staged", "weights": "exponential"}, "not of staged"),
         ({"kind": "staged", "creep": True}, "not of staged"),
         ({"kind": "staged", "hysteresis": "preisach", "lag": "none"}, "it needs a lag"),
-        ({"kind": "ppi", "least_slope": 0.0}, "greater than 0"),
         ({"kind": "ppi", "peak_goal_percent": -1.0}, "greater than 0"),
         ({"kind": "integrated", "plays": "auto", "deadbands": 4}, "finds the number of deadbands"),
         ({"kind": "kp", "plays": "auto"}, "not of kp"),

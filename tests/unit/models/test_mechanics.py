@@ -137,8 +137,8 @@ def test_a_run_needs_no_scipy_for_modes():
     """It would take the loop's process 0.2 s, and 9 MB that are kept in RAM."""
     code = """if True:
         import sys
-        from hilctl.models.mechanics import Mode
-        Mode(natural_hz=900.0, damping_ratio=0.04, antiresonance_hz=760.0,
+        from hilctl.models.mechanics import FurtherMode
+        FurtherMode(natural_hz=900.0, damping_ratio=0.04, antiresonance_hz=760.0,
              antiresonance_damping_ratio=0.02).inverse(50e3)
         print("scipy.linalg" in sys.modules)
     """

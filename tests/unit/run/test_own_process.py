@@ -37,8 +37,8 @@ def test_threads_are_seen():
 
 def test_errors_come_back_as_they_are(answering):
     answering(
-        "from hilctl.base.errors import ConfigError, Problem\n"
-        "error = ConfigError([Problem('x.yaml:1', 'name', 'is required')])\n"
+        "from hilctl.base.errors import ConfigError, ConfigProblem\n"
+        "error = ConfigError([ConfigProblem('x.yaml:1', 'name', 'is required')])\n"
         "pickle.dump(error, answers)"
     )
     with pytest.raises(ConfigError) as refused:

@@ -9,7 +9,7 @@ import pytest
 
 from hilctl.base.errors import InputError
 from hilctl_drivers.ascii.ascii_wire import AsciiWire
-from hilctl_drivers.serial.serial_setup import SerialOptions, SerialSetup
+from hilctl_drivers.serial.serial_wire import SerialOptions, SerialSetup
 
 DCON = str(Path(__file__).parents[3] / "data" / "dcon_module.yaml")
 OPTIONS = {

@@ -15,11 +15,10 @@ from hilctl.loop.loop import Loop
 from hilctl.loop.pacer import SystemClock
 from hilctl.loop.plan import LoopPlan
 from hilctl_drivers.board.board_wire import exchange_time
-from hilctl_drivers.emulator.faults import parse_fault
-from hilctl_drivers.emulator.options import EmulatorOptions
+from hilctl_drivers.emulator.options import EmulatorOptions, parse_fault
 from hilctl_drivers.profile import load_profile, shipped_profiles, with_link
 from hilctl_drivers.serial.serial_dac import SerialDac
-from hilctl_drivers.serial.serial_setup import SerialOptions
+from hilctl_drivers.serial.serial_wire import SerialOptions
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 from hilctl_drivers.transport.framing import binary_framing
 from tests.fakes import FakeHost, ShiftedClock, emulated, logged, made_safe

@@ -3,7 +3,7 @@
 import pytest
 
 from hilctl.base.errors import InputError
-from hilctl_drivers.emulator.faults import WireFault
+from hilctl_drivers.emulator.options import WireFault
 
 
 def test_port_in_use_is_one_line(served):

@@ -17,7 +17,7 @@ from hilctl_drivers.modbus.pdu import (
     write_read_pdu,
     write_single_pdu,
 )
-from hilctl_drivers.modbus.registers import RegisterFormat
+from hilctl_drivers.modbus.register_map import RegisterFormat
 from hilctl_drivers.profile import load_profile
 from hilctl_drivers.transport.links import RefusedError
 

@@ -3,7 +3,14 @@
 import pytest
 
 from hilctl.base.errors import InputError
-from hilctl_drivers.emulator.options import EmulatorOptions
+from hilctl_drivers.emulator.options import (
+    KINDS,
+    EmulatorOptions,
+    FaultPlan,
+    WireFault,
+    parse_fault,
+    spoil,
+)
 
 
 @pytest.mark.parametrize(
@@ -17,3 +24,48 @@ def test_words_that_mean_nothing_are_refused(options, words):
     """The message lists those that do."""
     with pytest.raises(InputError, match=words):
         EmulatorOptions("wago_750", **options)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_texts_are_read(kind):
+    """A count, a time, and how late."""
+    assert parse_fault(f"{kind}@12") == WireFault(kind, at_count=12)
+    assert parse_fault(f"{kind}@2.5s") == WireFault(kind, at_s=2.5)
+    if kind in {"delay", "late"}:
+        assert parse_fault(f"{kind}:0.3@1") == WireFault(kind, at_count=1, delay_s=0.3)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("silence", "KIND@COUNT"),
+        ("noise@1", "must be one of silence"),
+        ("reset:2@1", "only delay and late"),
+        ("reset@0", "whole number from 1"),
+        ("reset@1.5", "whole number from 1"),
+        ("", "KIND@COUNT"),
+    ],
+)
+def test_nonsense_is_refused(text, words):
+    """The message says how to write it."""
+    with pytest.raises(InputError, match=words):
+        parse_fault(text)
+
+
+def test_each_happens_once_when_it_is_due():
+    """By count or by time, whichever comes."""
+    plan = FaultPlan([parse_fault("cut@2"), parse_fault("reset@1s")])
+    seen = [plan.next(elapsed_s) for elapsed_s in (0.0, 0.5, 0.9, 1.0, 2.0)]
+    assert [fault.kind if fault else None for fault in seen] == [
+        None, "cut", None, "reset", None,
+    ]  # fmt: skip
+    assert plan.count == 5
+
+
+def test_bytes_are_spoilt_as_said():
+    """One byte changed, half left out, all sent twice."""
+    reply = bytes(range(8))
+    assert spoil("corrupt", reply, 3) == bytes([0, 1, 2, 3 ^ 0x10, 4, 5, 6, 7])
+    assert spoil("cut", reply, 3) == reply[:4]
+    assert spoil("duplicate", reply, 3) == reply + reply
+    assert spoil("delay", reply, 3) == reply

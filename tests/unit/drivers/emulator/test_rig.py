@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hilctl_drivers.emulator.rig import RATE_HZ, Rig
+from hilctl_drivers.emulator.rig import RATE_HZ, Rig, SampleFifo
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 
 MS = 1_000_000
@@ -51,3 +51,73 @@ def test_amplifier_saturates():
     rig = Rig(0)
     rig.put_out(50.0, 0)
     assert rig.current_a == 10.0
+
+
+class Record:
+    """A FIFO at 1 kHz that starts at time 0, and what it put out and read."""
+
+    def __init__(self, *, repeats):
+        self.firsts, self.current_a, self.displacement_um = [], [], []
+        self.fifo = SampleFifo(noise=False, repeats=repeats, on_played=self._played)
+        self.fifo.set_rate(1000.0)
+        self.fifo.start(0)
+
+    def _played(self, first, current_a, displacement_um, now_ns):
+        self.firsts.append(first)
+        self.current_a += current_a.tolist()
+        self.displacement_um += displacement_um.tolist()
+
+
+@pytest.mark.parametrize("repeats", [True, False])
+def test_each_value_is_put_out_once(repeats):
+    """Whatever the stretches, values and readings come in order, none missing and none twice."""
+    record = Record(repeats=repeats)
+    commands = np.linspace(0.0, 3.0, 60)
+    for part in np.array_split(commands, 7):
+        record.fifo.queue(part)
+    for now_ms in (3, 4, 11, 30, 31, 59, 60):
+        record.fifo.advance(now_ms * MS)
+        assert record.fifo.level == 60 - now_ms
+    assert record.firsts == [0, 3, 4, 11, 30, 31, 59]
+    assert record.current_a == commands.tolist()
+    assert len(record.displacement_um) == 60
+    assert (np.diff(record.displacement_um) > -1e-2).all()
+    assert (record.fifo.played, record.fifo.underruns) == (60, 0)
+
+
+def test_without_new_values_the_last_is_repeated_and_read():
+    """As a T-series device does: each period counts."""
+    record = Record(repeats=True)
+    record.fifo.queue(np.array([1.0, 2.0]))
+    record.fifo.advance(5 * MS)
+    assert record.current_a == [1.0, 2.0, 2.0, 2.0, 2.0]
+    assert len(record.displacement_um) == 5
+    assert (record.fifo.played, record.fifo.underruns) == (5, 3)
+
+
+def test_without_new_values_the_output_is_held_and_not_read():
+    """As a board does: the next value is the next number, later by the periods lost."""
+    record = Record(repeats=False)
+    record.fifo.queue(np.array([1.0, 2.0]))
+    record.fifo.advance(5 * MS)
+    record.fifo.queue(np.array([3.0]))
+    assert record.fifo.due_ns(3) == 6 * MS
+    record.fifo.advance(6 * MS)
+    assert record.current_a == [1.0, 2.0, 3.0]
+    assert record.firsts == [0, 2]
+    assert (record.fifo.played, record.fifo.underruns) == (3, 3)
+
+
+def test_a_stop_keeps_the_queue_and_the_output():
+    """Until it is cleared; a new rate counts from 0."""
+    record = Record(repeats=True)
+    record.fifo.queue(np.array([1.0, 2.0]))
+    record.fifo.advance(MS)
+    record.fifo.stop()
+    record.fifo.advance(9 * MS)
+    assert (record.fifo.level, record.fifo.current_a, record.fifo.running) == (1, 1.0, False)
+    record.fifo.set_rate(2000.0)
+    record.fifo.start(10 * MS)
+    record.fifo.advance(10 * MS + MS // 2)
+    assert record.firsts == [0, 0]
+    assert record.current_a == [1.0, 2.0]

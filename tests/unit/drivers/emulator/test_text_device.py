@@ -70,11 +70,11 @@ class TestDcon:
 
     def test_checksum_is_looked_at(self, dcon):
         """A line with a wrong checksum is ignored, as a module does."""
-        framing = dcon.emulator.wires[0].framing
+        wire = dcon.emulator.wires[0]
         good = b"#020+05.000"
         check = b"%02X" % (sum(good) & 0xFF)
-        assert framing.feed(good + check + b"\r") == [good]
-        assert framing.feed(good + b"00\r") == []
+        assert list(wire.requests(bytearray(good + check + b"\r"))) == [good]
+        assert list(wire.requests(bytearray(good + b"00\r"))) == []
 
 
 class TestHostWatchdog:

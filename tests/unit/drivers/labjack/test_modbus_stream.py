@@ -8,10 +8,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from hilctl.base.errors import DeviceError
+from hilctl.base.errors import DeviceError, InputError
 from hilctl_drivers.labjack import stream
-from hilctl_drivers.labjack.modbus_stream import ModbusStream
-from hilctl_drivers.labjack.stream_setup import ModbusStreamOptions
+from hilctl_drivers.labjack.modbus_stream import ModbusStream, ModbusStreamOptions, stream_time
+from hilctl_drivers.labjack.stream import VALUES_MAX
+from hilctl_drivers.profile import load_profile
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 from hilctl_drivers.transport.links import NoAnswerError
 from tests.fakes import FaultyLink, InProcess, InProcessLink, logged, made_safe
@@ -550,3 +551,36 @@ def test_safe_is_a_stopped_stream_and_an_output_that_holds(
     monkeypatch.setattr("hilctl_drivers.labjack.modbus_stream.ModbusFeedback", lambda *_: answer)
     with nullcontext() if holds else pytest.raises(DeviceError):
         safe_write._check_held(SimpleNamespace(link=None), 1.0)
+
+
+def test_check_counts_the_messages_of_a_block():
+    """Ten for 580 values and one that waits for the clock, at 1 ms each."""
+    wire = stream_time(load_profile("labjack_t7"), 580)
+    assert wire.total_s == pytest.approx(0.011)
+    assert wire.highest_rate_hz == pytest.approx(580 / 0.011)
+    assert "580 samples in 11 messages" in str(wire)
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"profile": "labjack_t8"}, "LabJack T8 can't stream: take kind: modbus_dac"),
+        ({"output": "TDAC0"}, "output must be one that LabJack T7 can stream, DAC0, DAC1"),
+        ({"reader": {"profile": "labjack_t4", "host": "10.0.0.9"}}, "reader must be left out"),
+    ],
+)
+def test_options_that_do_not_stream_are_refused(changes, text):
+    """Before anything is sent."""
+    with pytest.raises(InputError, match=text):
+        ModbusStream(options(**changes))
+
+
+@pytest.mark.parametrize(
+    ("block", "messages"), [(1, 2), (VALUES_MAX, 2), (VALUES_MAX + 1, 3), (10 * VALUES_MAX, 11)]
+)
+def test_a_block_costs_its_messages_and_one_that_waits(block, messages):
+    profile = load_profile("labjack_t7")
+    time = stream_time(profile, block)
+    assert time.total_s == pytest.approx(messages * profile.turnaround_s)
+    assert time.highest_rate_hz == pytest.approx(block / time.total_s)
+    assert f"{block} samples in {messages} messages" in str(time)

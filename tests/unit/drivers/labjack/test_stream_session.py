@@ -8,7 +8,7 @@ import pytest
 
 from hilctl.base.errors import DeviceError
 from hilctl_drivers.labjack import stream
-from hilctl_drivers.labjack.frames import ModbusFeedback, WriteFrame
+from hilctl_drivers.labjack.stream import ModbusFeedback, WriteFrame
 from hilctl_drivers.labjack.stream_session import StreamSession
 from hilctl_drivers.profile import load_profile
 from tests.fakes import InProcess

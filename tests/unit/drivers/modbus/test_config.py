@@ -2,12 +2,12 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from hilctl.base.errors import InputError
 from hilctl_drivers.modbus.config import ModbusOptions
 from hilctl_drivers.modbus.modbus_dac import ModbusDac
+from tests.unit.drivers.modbus.test_modbus_dac import exchange
 
 PAIR = {
     "profile": "icp_m7024",
@@ -22,12 +22,6 @@ PAIR = {
 READS = PAIR["reader"]
 SETTLE_S = 0.01
 """Of an M-7024's output."""
-
-
-def exchange(device: ModbusDac, value: float) -> float:
-    displacement_um = np.full(1, np.nan)
-    device.exchange(0, np.array([value]), displacement_um, np.full(1, np.nan))
-    return float(displacement_um[0])
 
 
 def made(**changes) -> ModbusDac:

@@ -11,8 +11,7 @@ from pydantic import ValidationError
 
 from hilctl.base.errors import DeviceError, InputError
 from hilctl_drivers.emulator.factory import Emulator, build
-from hilctl_drivers.emulator.faults import parse_fault
-from hilctl_drivers.emulator.options import EmulatorOptions
+from hilctl_drivers.emulator.options import EmulatorOptions, parse_fault
 from hilctl_drivers.modbus.config import ModbusOptions
 from hilctl_drivers.modbus.modbus_dac import ModbusDac
 from hilctl_drivers.profile import load_profile, shipped_profiles
@@ -360,7 +359,7 @@ class TestExchange:
         [
             ("silence", "no answer within 1 s"),
             ("corrupt", "not a Modbus TCP header"),
-            ("cut", "only 6 bytes, 3 short, within 1 s"),
+            ("cut", "only 6 bytes, 2 short, within 1 s"),
             ("duplicate", "bytes behind the end of the reply"),
             ("wrong_id", "transaction must be"),
             ("reset", "connection lost: connection reset by peer"),

@@ -2,22 +2,26 @@
 
 import struct
 
-import numpy as np
 import pytest
 
 from hilctl.base.errors import DeviceError
-from hilctl_drivers.emulator.faults import parse_fault
-from hilctl_drivers.modbus.modbus_dac import ModbusDac
-from hilctl_drivers.modbus.modbus_session import ModbusSession
+from hilctl_drivers.emulator.options import parse_fault
+from hilctl_drivers.modbus.config import ModbusOptions, ModbusSetup
+from hilctl_drivers.modbus.modbus_profile import ModbusProfile
+from hilctl_drivers.modbus.modbus_session import ModbusSession, exchange_time, feed_time
+from hilctl_drivers.modbus.pdu import (
+    coil_pdu,
+    read_pdu,
+    reply_size,
+    rtu_adu,
+    write_pdu,
+    write_single_pdu,
+)
 from hilctl_drivers.modbus.register_map import EnsureStep, ExpectStep, WriteStep
-from hilctl_drivers.profile import load_profile
+from hilctl_drivers.profile import load_profile, parse_profile, with_link
 from hilctl_drivers.profile_base import WaitStep
-
-
-def exchange(device: ModbusDac, value: float) -> float:
-    displacement_um = np.full(1, np.nan)
-    device.exchange(0, np.array([value]), displacement_um, np.full(1, np.nan))
-    return float(displacement_um[0])
+from hilctl_drivers.transport.wire_time import WireTime
+from tests.unit.drivers.modbus.test_modbus_dac import exchange
 
 
 class Line:
@@ -178,3 +182,284 @@ class TestReader:
         with pytest.raises(DeviceError, match=said):
             served.device(reader={**served.emulator.options["reader"], "tcp_port": 1}).open(5.0, 1)
         assert served.events() == []
+
+
+CHAR_S = 10 / 9600
+GAP_S = 3.5 * CHAR_S
+PROFILE = """\
+vendor: Acme
+model: DAQ-1
+source: [manual]
+verified: "yes"
+link: {kind: rtu, baud: 9600}
+address_base: 0
+exchange: none
+turnaround_s: 0.002
+max_rate_hz: 10000.0
+outputs:
+  AO: {address: 0, type: float32, unit: V, min: -10.0, max: 10.0}
+inputs:
+  AI: {address: 4, type: float32, unit: V, min: -10.0, max: 10.0}
+watchdog:
+  unit_s: 0.1
+  min_s: 0.1
+  max_s: 25.5
+  kick: strict
+  on_trip: zero
+  refuses_while_tripped: false
+  arm:
+    - {kind: write, address: 100, type: uint16, value: timeout}
+  feed:
+    - FEED
+"""
+FEED = "{kind: write, address: 101, type: uint16, value: 1}"
+RTU = """\
+vendor: Acme
+model: DAQ-1
+source: [manual]
+verified: partly
+unverified: [turnaround_s]
+link: {kind: rtu, baud: 9600}
+address_base: 0
+exchange: 23
+turnaround_s: 0.0
+max_rate_hz: 10000.0
+outputs:
+  AO: {address: 0, type: float32, unit: V, min: -10.0, max: 10.0}
+  SMALL: {address: 8, type: int16, function: 6, scale: 0.001, unit: V, min: -10.0, max: 10.0}
+inputs:
+  AI: {address: 4, type: float32, unit: V, min: -10.0, max: 10.0}
+watchdog: none
+"""
+LINES = [(9600, "N"), (19200, "E"), (115200, "N"), (921600, "N")]
+TABLE_MS = {
+    "FC16": (21.9, 12.0, 1.82, 0.23),
+    "FC06": (16.7, 9.2, 1.39, 0.17),
+    "FC03": (17.7, 9.7, 1.48, 0.18),
+    "FC23": (27.1, 14.9, 2.26, 0.28),
+}
+TABLE_HZ = {"gaps": (29.0, 53.0, 174.0, 264.0), "none": (37.0, 67.0, 443.0, 3545.0)}
+
+
+def rtu(baud: int = 115200, parity: str = "N", **link: object) -> ModbusProfile:
+    """Return a Modbus RTU device on a line."""
+    return with_link(parse_profile(RTU, "acme.yaml"), baud=baud, parity=parity, **link)
+
+
+def wire_s(time: WireTime) -> float:
+    """Return the time of the characters alone."""
+    return time.request_s + time.reply_s
+
+
+def acme(feed=FEED, link="{kind: rtu, baud: 9600}"):
+    """Return a Modbus device that is fed by these steps."""
+    text = PROFILE.replace("FEED", feed).replace("{kind: rtu, baud: 9600}", link)
+    return parse_profile(text, "acme.yaml")
+
+
+class TestRtu:
+    """Modbus RTU, against a table worked out by hand: two float32 registers each way."""
+
+    @pytest.mark.parametrize("column", range(4))
+    def test_characters(self, column: int) -> None:
+        """Characters of each function take what baud and character format say."""
+        profile = rtu(*LINES[column])
+        both = exchange_time(profile, "AO", "AI", one_transaction=False)
+        write = exchange_time(profile, "AO", None)
+        small = exchange_time(profile, "SMALL", None)
+        found = {
+            "FC16": wire_s(write),
+            "FC06": wire_s(small),
+            "FC03": wire_s(both) - wire_s(write),
+            "FC23": wire_s(exchange_time(profile, "AO", "AI")),
+        }
+        for function, row in TABLE_MS.items():
+            assert found[function] * 1e3 == pytest.approx(row[column], rel=0.03), function
+
+    @pytest.mark.parametrize("column", range(4))
+    def test_rate(self, column: int) -> None:
+        """The highest rate with the standard's gaps, and with none."""
+        baud, parity = LINES[column]
+        gaps = exchange_time(rtu(baud, parity), "AO", "AI")
+        none = exchange_time(rtu(baud, parity, gap_s=0.0), "AO", "AI")
+        assert gaps.highest_rate_hz == pytest.approx(TABLE_HZ["gaps"][column], rel=0.03)
+        assert none.highest_rate_hz == pytest.approx(TABLE_HZ["none"][column], rel=0.03)
+
+    def test_gap(self) -> None:
+        """A gap is 3.5 characters up to 19200 baud, 1.75 ms above, or what the profile says."""
+        for profile, gap_s in (
+            (rtu(9600), 3.5 * 10 / 9600),
+            (rtu(19200, "E"), 3.5 * 11 / 19200),
+            (rtu(38400), 1.75e-3),
+            (rtu(115200, gap_s=0.5e-3), 0.5e-3),
+        ):
+            time = exchange_time(profile, "AO", "AI")
+            assert time.gaps == 2
+            assert time.gaps_s == pytest.approx(2 * gap_s)
+
+    def test_two_transactions(self) -> None:
+        """Write, then read, has four gaps and the device's turnaround twice."""
+        profile = load_profile("icp_m7024")
+        one = exchange_time(profile, "AO0", None)
+        two = exchange_time(rtu(), "AO", "AI", one_transaction=False)
+        assert (one.gaps, two.gaps) == (2, 4)
+        assert one.turnaround_s == profile.turnaround_s
+        assert str(two).startswith("FC03+FC16 at 115200 8N1: request ")
+
+    def test_real_frames(self) -> None:
+        """The bytes counted are those of the frames that are sent."""
+        pdu = write_pdu(0, bytes(4))
+        time = exchange_time(rtu(9600), "AO", None)
+        assert time.request_s == pytest.approx(len(rtu_adu(1, pdu)) * 10 / 9600)
+        assert time.reply_s == pytest.approx((reply_size(pdu) + 3) * 10 / 9600)
+
+    def test_text(self) -> None:
+        """The explanation names each part."""
+        assert str(exchange_time(rtu(), "AO", "AI")) == (
+            "FC23 at 115200 8N1: request 1.48 ms, reply 0.78 ms, 2 gaps 3.50 ms,"
+            " turnaround 0.00 ms -> at most 174 Hz"
+        )
+
+    def test_stop_bits(self) -> None:
+        """A second stop bit is one more bit a character."""
+        one, two = rtu(gap_s=0.0), rtu(gap_s=0.0, stopbits=2)
+        ratio = exchange_time(two, "AO", "AI").total_s / exchange_time(one, "AO", "AI").total_s
+        assert ratio == pytest.approx(11 / 10)
+
+
+class TestTcp:
+    """Modbus TCP: the device's own time."""
+
+    def test_one_transaction(self) -> None:
+        """A LabJack T7 writes and reads in one round trip of 1 ms."""
+        profile = load_profile("labjack_t7")
+        time = exchange_time(profile, "DAC0", "AIN0")
+        assert time.total_s == pytest.approx(1e-3)
+        assert str(time) == "FC76 over TCP: turnaround 1.00 ms -> at most 1000 Hz"
+
+    def test_fallback(self) -> None:
+        """Without the exchange in one transaction it takes two."""
+        profile = load_profile("labjack_t7")
+        time = exchange_time(profile, "DAC0", "AIN0", one_transaction=False)
+        assert time.highest_rate_hz == pytest.approx(500.0)
+
+    def test_settling(self) -> None:
+        """An LJTick-DAC takes a millisecond to settle: its samples can't come any closer."""
+        profile = load_profile("labjack_t7")
+        time = exchange_time(profile, "TDAC0", "AIN0", one_transaction=False)
+        assert time.answered_s == pytest.approx(2e-3)
+        assert time.total_s == pytest.approx(3e-3)
+        assert str(time).endswith("turnaround 2.00 ms, settling 1.00 ms -> at most 333 Hz")
+
+    def test_no_time_at_all(self) -> None:
+        """A device without turnaround on TCP has no limit that can be worked out."""
+        profile = load_profile("labjack_t7").model_copy(update={"turnaround_s": 0.0})
+        assert exchange_time(profile, "DAC0", "AIN0").highest_rate_hz == float("inf")
+
+
+def requests_s(*pdus):
+    """Return what requests and replies take at 9600 baud, gaps and turnaround included."""
+    characters = sum(len(rtu_adu(1, pdu)) + reply_size(pdu) + 3 for pdu in pdus)
+    return characters * CHAR_S + len(pdus) * (2 * GAP_S + 0.002)
+
+
+READ, WRITE = read_pdu(3, 101, 1), write_single_pdu(101, bytes(2))
+
+
+@pytest.mark.parametrize(
+    ("feed", "seconds"),
+    [
+        (FEED, requests_s(WRITE)),
+        (FEED.replace("}", ", verify: true}"), requests_s(WRITE, READ)),
+        (FEED.replace("write", "ensure"), requests_s(READ, WRITE, READ)),
+        (FEED.replace("write", "expect"), requests_s(READ)),
+        ("{kind: wait, seconds: 0.25}", 0.25),
+        (f"{FEED}\n    - {{kind: wait, seconds: 0.25}}", requests_s(WRITE) + 0.25),
+        (
+            "{kind: write, area: coil, address: 7, type: bit, value: 1}",
+            requests_s(coil_pdu(7, True)),
+        ),
+    ],
+)
+def test_each_kind_of_step_counts_with_all_that_it_may_send(feed, seconds):
+    """A step that writes only what differs counts as if it did."""
+    assert feed_time(acme(feed)).total_s == pytest.approx(seconds)
+
+
+def test_over_tcp_the_turnaround_counts():
+    """There are no characters to wait for, but the device takes its time."""
+    assert feed_time(acme(link="{kind: tcp}")).total_s == pytest.approx(0.002)
+
+
+@pytest.mark.parametrize("name", ["labjack_t7", "wago_750", "adam_6024"])
+def test_watchdogs_that_exchanges_feed_cost_nothing(name):
+    """Nor do devices without one."""
+    assert feed_time(load_profile(name)) is None
+
+
+def test_a_tick_that_feeds_must_fit():
+    """The rate that is left is that of an exchange and a feeding, one after the other."""
+    profile = acme()
+    exchange = exchange_time(profile, "AO", "AI")
+    both = exchange.then(feed_time(profile))
+    assert both.total_s == pytest.approx(exchange.total_s + requests_s(WRITE))
+    assert (both.gaps, both.samples) == (6, 1)
+    assert str(both).startswith(
+        "FC03+FC16 at 9600 8N1, then FC06 at 9600 8N1 to feed the watchdog: request "
+    )
+
+
+def modbus_rate(path, watchdog):
+    """Return the highest rate and its reason that modbus_dac gives for a profile."""
+    options = {
+        "profile": str(path),
+        "serial_port": "/dev/ttyUSB0",
+        "output": "AO",
+        "input": "AI",
+        "amplifier": {"gain_a_per_v": 1.0},
+        "sensor": {"um_per_v": 10.0},
+        "timeout_s": 1.0,
+        "watchdog": watchdog,
+    }
+    info = ModbusSetup.of(ModbusOptions.model_validate(options)).info()
+    return info.max_rate_hz, info.rate_note
+
+
+def test_modbus_dac_leaves_room_for_feeding(tmp_path):
+    """Only where the experiment uses the watchdog."""
+    path = tmp_path / "acme.yaml"
+    path.write_text(PROFILE.replace("FEED", FEED))
+    exchange = exchange_time(acme(), "AO", "AI")
+    assert modbus_rate(path, "none")[0] == pytest.approx(exchange.highest_rate_hz)
+    rate_hz, note = modbus_rate(path, {"timeout_s": 1.0})
+    assert rate_hz == pytest.approx(1.0 / (exchange.total_s + requests_s(WRITE)))
+    assert "to feed the watchdog" in note
+
+
+@pytest.mark.parametrize(
+    ("profile", "reader"),
+    [("labjack_t7", "labjack_t7"), ("adam_6224", "adam_6217"), ("adam_4024", "adam_4117")],
+)
+def test_input_and_output_are_read(serve, profile, reader):
+    """From one device or two; nothing is put out."""
+    served = serve(profile, None if reader == profile else reader)
+    served.device().make_safe(3.0)
+    served.clock.pass_s(0.5)
+    before = served.events()
+    displacement_um, output = served.device().look()
+    assert output == pytest.approx(3.0, abs=0.02)
+    assert 10.0 < displacement_um < 45.0
+    assert served.events() == before
+
+
+def test_a_command_from_before_a_trip_is_not_taken_for_the_output(serve):
+    """The register keeps it; what the terminal is at is another thing."""
+    served = serve("wago_750", None)
+    device = served.device(watchdog={"timeout_s": 0.5})
+    device.open(100.0, 1)
+    device.arm()
+    exchange(device, 3.0)
+    device._release()
+    served.clock.pass_s(0.6)
+    assert served.device().look()[1] is None
+    assert served.emulator.device.tripped

@@ -1,9 +1,190 @@
-"""Registers in a profile: addresses as vendors write them, and values that fit."""
+"""Register bytes: vendors' own examples, every byte order, and what does not fit."""
+
+import itertools
+import math
+import struct
 
 import pytest
 from pydantic import ValidationError
 
-from hilctl_drivers.modbus.register_map import Channel, Register, TripFlag, WriteStep, wire_address
+from hilctl_drivers.modbus.register_map import (
+    Channel,
+    Register,
+    RegisterFormat,
+    TripFlag,
+    WriteStep,
+    wire_address,
+)
+from hilctl_drivers.transport.links import BadRequestError, FrameError, MismatchError
+
+CODES = {"int16": "h", "uint16": "H", "int32": "i", "uint32": "I", "float32": "f", "float64": "d"}
+
+
+def test_labjack_word_order_self_test():
+    """LabJack's TEST register is 0x00112233: low word first it would read 0x22330011."""
+    wire = bytes.fromhex("00112233")
+    assert RegisterFormat("uint32").decode(wire) == 0x00112233
+    assert RegisterFormat("uint32", "CDAB").decode(wire) == 0x22330011
+
+
+def test_labjack_float_default():
+    """LabJack's TEST_FLOAT32 has the default -9999.0: C6 1C 3C 00, big-endian."""
+    assert RegisterFormat("float32").encode(-9999.0) == bytes.fromhex("C61C3C00")
+
+
+@pytest.mark.parametrize(("volts", "raw"), [(10.0, 0x7FFF), (-10.0, 0x8001), (0.0, 0x0000)])
+def test_wago_full_scale(volts, raw):
+    """WAGO 750-556: int16 0x8001 to 0x7FFF is -10 V to +10 V."""
+    channel = RegisterFormat("int16", "AB", 10.0 / 32767)
+    assert channel.encode(volts) == raw.to_bytes(2, "big")
+    assert channel.decode(raw.to_bytes(2, "big")) == pytest.approx(volts, abs=1e-12)
+
+
+def test_waveshare_microampere():
+    """Waveshare Analog Output 8CH: 1 mA is 1000, 03 E8."""
+    channel = RegisterFormat("uint16", scale=1e-6)
+    assert channel.encode(1e-3) == bytes.fromhex("03E8")
+    assert channel.decode(bytes.fromhex("03E8")) == pytest.approx(1e-3, rel=1e-15)
+
+
+def test_offset_binary_of_a_bipolar_range():
+    """Offset binary across -10 V to +10 V: 0 V in the middle, both ends exact."""
+    channel = RegisterFormat("uint16", scale=20.0 / 65535, offset=-10.0)
+    assert channel.encode(-10.0) == b"\0\0"
+    assert channel.encode(10.0) == b"\xff\xff"
+    assert channel.limits == pytest.approx((-10.0, 10.0))
+    assert channel.encode(channel.offset + 0x8000 * channel.scale) == b"\x80\0"
+
+
+@pytest.mark.parametrize("kind", ["int32", "uint32", "float32"])
+@pytest.mark.parametrize("order", ["".join(p) for p in itertools.permutations("ABCD")])
+def test_every_order_of_four_bytes_travels_as_written(kind, order):
+    """The letters name bytes from the most significant one, in the order of travel."""
+    value = 123456789.0 if kind != "float32" else 1.2345678e7
+    big = struct.pack(">" + CODES[kind], value if kind == "float32" else int(value))
+    wire = RegisterFormat(kind, order).encode(value)
+    assert wire == bytes(big["ABCD".index(letter)] for letter in order)
+    assert RegisterFormat(kind, order).decode(wire) == value
+
+
+@pytest.mark.parametrize(
+    "order", ["ABCDEFGH", "HGFEDCBA", "GHEFCDAB", "BADCFEHG", "EFGHABCD", "CABDHEFG"]
+)
+def test_orders_of_eight_bytes_travel_as_written(order):
+    """Double precision in word-swapped, byte-swapped and odd orders."""
+    big = struct.pack(">d", math.pi)
+    wire = RegisterFormat("float64", order).encode(math.pi)
+    assert wire == bytes(big["ABCDEFGH".index(letter)] for letter in order)
+    assert RegisterFormat("float64", order).decode(wire) == math.pi
+
+
+@pytest.mark.parametrize("order", ["AB", "BA"])
+def test_orders_of_one_register(order):
+    """A 16-bit value can have its bytes swapped."""
+    assert RegisterFormat("int16", order).encode(-2) == (
+        b"\xff\xfe" if order == "AB" else b"\xfe\xff"
+    )
+
+
+@pytest.mark.parametrize(
+    ("kind", "low", "high"),
+    [
+        ("int16", -(2**15), 2**15 - 1),
+        ("uint16", 0, 2**16 - 1),
+        ("int32", -(2**31), 2**31 - 1),
+        ("uint32", 0, 2**32 - 1),
+    ],
+)
+def test_integers_reach_their_ends_and_no_further(kind, low, high):
+    """Both ends are held; one step past them is refused, not wrapped or clipped."""
+    channel = RegisterFormat(kind)
+    assert channel.limits == (low, high)
+    assert [channel.decode(channel.encode(v)) for v in (low, high)] == [low, high]
+    for value in (low - 1, high + 1, 1e300, -1e300):
+        with pytest.raises(BadRequestError, match=f"{kind} register holds"):
+            channel.encode(value)
+
+
+def test_integers_round_half_to_even():
+    """2.5 steps are 2, 3.5 steps are 4; half a step past the end is past the end."""
+    channel = RegisterFormat("int16")
+    assert [channel.decode(channel.encode(v)) for v in (2.5, 3.5, -2.5, 0.4999)] == [2, 4, -2, 0]
+    assert channel.encode(32767.4) == b"\x7f\xff"
+    with pytest.raises(BadRequestError):
+        channel.encode(32767.5)
+
+
+def test_float32_refuses_what_only_a_double_holds():
+    """3.5e38 is past float32; its largest number is not."""
+    largest = (2 - 2**-23) * 2.0**127
+    channel = RegisterFormat("float32")
+    assert channel.decode(channel.encode(largest)) == largest
+    assert channel.limits == (-largest, largest)
+    with pytest.raises(BadRequestError, match=r"float32 register holds .* got 3\.5e\+38"):
+        channel.encode(3.5e38)
+
+
+@pytest.mark.parametrize("kind", CODES)
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_nothing_that_is_not_a_number_is_sent(kind, value):
+    """Infinities and not a number are refused for every type."""
+    with pytest.raises(BadRequestError, match="can't hold"):
+        RegisterFormat(kind).encode(value)
+
+
+def test_scaling_past_the_doubles_is_refused():
+    """A finite value whose raw value overflows is refused as well."""
+    with pytest.raises(BadRequestError, match="can't hold"):
+        RegisterFormat("float64", scale=1e-300).encode(1e300)
+
+
+def test_negative_scale_turns_the_limits_round():
+    """Limits are lowest first whatever the sign of the scale."""
+    assert RegisterFormat("int16", scale=-2.0, offset=1.0).limits == (-65533.0, 65537.0)
+
+
+def test_a_device_that_sends_not_a_number_is_not_hidden():
+    """Decoding passes on not a number; it is the loop that decides about a bad reading."""
+    assert math.isnan(RegisterFormat("float32").decode(bytes.fromhex("7FC00000")))
+
+
+@pytest.mark.parametrize("size", [0, 1, 3, 5, 8])
+def test_decoding_wants_exactly_its_bytes(size):
+    """Too few or too many bytes are an error, with and without a byte order."""
+    for order in ("", "CDAB", "DCBA"):
+        with pytest.raises(MismatchError, match="float32 register has 4 bytes"):
+            RegisterFormat("float32", order).decode(bytes(size))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "rule"),
+    [
+        (("int24",), "unknown register type"),
+        (("int32", "AB"), "each of ABCD once"),
+        (("int32", "ABCC"), "each of ABCD once"),
+        (("int16", "ABCD"), "each of AB once"),
+        (("int32", "abcd"), "each of ABCD once"),
+        (("int16", "AB", 0.0), "scale"),
+        (("int16", "AB", math.nan), "scale"),
+        (("int16", "AB", 1.0, math.inf), "offset"),
+    ],
+)
+def test_formats_that_make_no_sense_are_refused(arguments, rule):
+    """The message names the rule; it is a ValueError too, for a profile's validation."""
+    with pytest.raises(BadRequestError, match=rule) as caught:
+        RegisterFormat(*arguments)
+    assert isinstance(caught.value, FrameError)
+    assert isinstance(caught.value, ValueError)
+
+
+def test_size_and_order_left_out():
+    """Size, register count and the order in full are there to be read."""
+    channel = RegisterFormat("float64")
+    assert (channel.size, channel.count, channel.order) == (8, 4, "ABCDEFGH")
+    assert not channel.is_integer
+    assert RegisterFormat("uint16").is_integer
+    assert RegisterFormat("int32", "ABCD") == RegisterFormat("int32")
+
 
 VOLTS = {"address": 1, "unit": "V", "min": -10.0, "max": 10.0}
 

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from hilctl.base.errors import DeviceError, InputError
-from hilctl_drivers.emulator.faults import parse_fault
-from hilctl_drivers.emulator.options import EmulatorOptions
+from hilctl_drivers.emulator.options import EmulatorOptions, parse_fault
 from hilctl_drivers.profile import shipped_profiles
 from hilctl_drivers.serial.serial_dac import SerialDac
-from hilctl_drivers.serial.serial_setup import SerialOptions
+from hilctl_drivers.serial.serial_wire import SerialOptions
 from tests.fakes import ShiftedClock, emulated, logged, made_safe
 
 DCON = (Path(__file__).parents[3] / "data" / "dcon_module.yaml").read_text()

@@ -1,11 +1,16 @@
 """Stepping a plant through blocks: cuts, seeds and restarts change nothing but the noise."""
 
+from dataclasses import replace
+from functools import cache
+
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hilctl.base.types import F64
-from hilctl_drivers.simulated.actuator_base import CHUNK, SensorNoise
+from hilctl_drivers.simulated.actuator_base import CHUNK, Coil, SensorNoise
+from hilctl_drivers.simulated.devices import PHYSICS, Physics
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 
 RATED = TerfenolParameters()
@@ -78,3 +83,171 @@ class TestBlocks:
         command_a = self.COMMAND_A.copy()
         command_a.setflags(write=False)
         run(TerfenolActuator(RATED, RATE_HZ), command_a)
+
+
+NEW = [name for name in PHYSICS if name != "pinned_cells"]
+rigs = pytest.mark.parametrize("physics", PHYSICS)
+
+
+def parameters(physics: Physics, **vary: float) -> TerfenolParameters:
+    factors = {"lag": 1.0, "pinning": 1.0, "strain": 1.0} | vary
+    rods = PHYSICS[physics]().varied(**factors)
+    return TerfenolParameters(sensor_noise_um=0.0, rods=rods)
+
+
+@cache
+def loop(
+    physics: Physics,
+    amplitude_a: float,
+    frequency_hz: float,
+    vary: tuple[str, float] = ("lag", 1.0),
+) -> tuple[F64, F64]:
+    """Command in A and displacement in um, the last cycle of a sine, from its minimum."""
+    rate_hz = RATE_HZ if frequency_hz > 10.0 else 2500.0
+    n = round(rate_hz / frequency_hz)
+    phase = 2.0 * np.pi * np.arange(n * (3 if frequency_hz < 50.0 else 10)) / n
+    command_a = -amplitude_a * np.cos(phase)
+    whole_um = run(TerfenolActuator(parameters(physics, **dict([vary])), rate_hz), command_a)
+    return command_a[-n:], whole_um[-n:]
+
+
+def hysteresis_percent(command_a: F64, displacement_um: F64) -> float:
+    """Largest gap between the branches at one command, per peak-to-peak."""
+    half = command_a.size // 2
+    levels = np.linspace(command_a[0], command_a[half], 1001)
+    up_um = np.interp(levels, command_a[: half + 1], displacement_um[: half + 1])
+    back = np.append(np.arange(half, command_a.size), 0)[::-1]
+    gap_um = np.interp(levels, command_a[back], displacement_um[back]) - up_um
+    return float(100.0 * gap_um.max() / np.ptp(displacement_um))
+
+
+class TestPublishedRanges:
+    """Near the figures of the dissertation's actuator, of which each is a variety."""
+
+    @rigs
+    def test_stroke(self, physics: Physics) -> None:
+        """A 6 A sine of 1 Hz moves it by 60 to 100 um (published: 83.1)."""
+        stroke_um = np.ptp(loop(physics, 6.0, 1.0)[1])
+        print(f"{physics}: {stroke_um:.1f} um")
+        assert 60.0 <= stroke_um <= 100.0
+
+    @rigs
+    def test_hysteresis_grows_with_the_frequency(self, physics: Physics) -> None:
+        """10 to 25 % at 1 Hz, 35 to 50 % at 250 Hz (published: 18.2 and 49.1)."""
+        figures = [hysteresis_percent(*loop(physics, 6.0, hz)) for hz in (1.0, 50.0, 100.0, 250.0)]
+        print(physics, " ".join(f"{figure:.1f}" for figure in figures))
+        assert figures == sorted(figures)
+        assert 10.0 <= figures[0] <= 25.0
+        assert 35.0 <= figures[-1] <= 50.0
+
+    @rigs
+    def test_monotone_inside_7_a(self, physics: Physics) -> None:
+        """Biased rods: more current is more displacement, on both branches (to an ADC code)."""
+        command_a, displacement_um = loop(physics, 7.0, 1.0)
+        moves = np.diff(displacement_um) * np.sign(np.diff(command_a))
+        assert moves.min() >= -0.0039
+
+
+class TestOneState:
+    """Nothing but what came before decides what comes."""
+
+    COMMAND_A = np.random.default_rng(5).uniform(-7.0, 7.0, 60).repeat(50)
+
+    @rigs
+    def test_cut_does_not_matter(self, physics: Physics) -> None:
+        """Readings are the same bit for bit wherever the blocks are cut."""
+        whole = run(TerfenolActuator(parameters(physics), RATE_HZ), self.COMMAND_A)
+        actuator = TerfenolActuator(parameters(physics), RATE_HZ)
+        parts = [run(actuator, part) for part in np.split(self.COMMAND_A, [1, 2, 50, 777, 2990])]
+        np.testing.assert_array_equal(np.concatenate(parts), whole)
+
+    @rigs
+    def test_cut_does_not_matter_at_a_low_rate(self, physics: Physics) -> None:
+        """Nor where a sample period has more steps than a kernel call takes."""
+        command_a = self.COMMAND_A[::600]
+        whole = run(TerfenolActuator(parameters(physics), 10.0), command_a)
+        actuator = TerfenolActuator(parameters(physics), 10.0)
+        parts = [run(actuator, command_a[k : k + 1]) for k in range(command_a.size)]
+        np.testing.assert_array_equal(np.concatenate(parts), whole)
+
+    @rigs
+    def test_reset_starts_over(self, physics: Physics) -> None:
+        """After a reset it is as new."""
+        actuator = TerfenolActuator(parameters(physics), RATE_HZ)
+        first = run(actuator, self.COMMAND_A)
+        actuator.reset()
+        np.testing.assert_array_equal(run(actuator, self.COMMAND_A), first)
+
+    @rigs
+    @pytest.mark.parametrize("bias_a", [0.0, -3.96, 5.89])
+    def test_rest_is_zero(self, physics: Physics, bias_a: float) -> None:
+        """With no command the displacement is 0, whatever the bias."""
+        actuator = TerfenolActuator(parameters(physics), RATE_HZ, bias_a=bias_a)
+        assert not run(actuator, np.zeros(500)).any()
+
+    @rigs
+    def test_opposite_magnets_mirror_the_current(self, physics: Physics) -> None:
+        """Magnetostriction does not know the sign of the field."""
+        rated = parameters(physics)
+        turned = replace(rated, magnet_field_a_per_m=-rated.magnet_field_a_per_m)
+        one = run(TerfenolActuator(rated, RATE_HZ), self.COMMAND_A)
+        other = run(TerfenolActuator(turned, RATE_HZ), -self.COMMAND_A)
+        np.testing.assert_allclose(one, other, atol=0.004)
+
+    @pytest.mark.parametrize("physics", NEW)
+    @pytest.mark.parametrize(("rate_hz", "frequency_hz"), [(50e3, 250.0), (500.0, 25.0)])
+    def test_integration_has_converged(
+        self, physics: Physics, rate_hz: float, frequency_hz: float
+    ) -> None:
+        """A tenth of the internal step moves no reading by more than 50 nm."""
+        rated = parameters(physics)
+        n = round(3 * rate_hz / frequency_hz)
+        command_a = 6.0 * np.sin(2.0 * np.pi * frequency_hz * np.arange(n) / rate_hz)
+        fine = replace(rated, step_max_s=rated.step_max_s / 10.0)
+        coarse_um = run(TerfenolActuator(rated, rate_hz), command_a)
+        fine_um = run(TerfenolActuator(fine, rate_hz), command_a)
+        assert np.abs(coarse_um - fine_um).max() < 0.050
+
+    @rigs
+    def test_comes_to_rest_after_a_step(self, physics: Physics) -> None:
+        """Held long enough, no current leaves anything moving."""
+        actuator = TerfenolActuator(parameters(physics), RATE_HZ)
+        held_um = run(actuator, np.repeat([5.0, -2.0], 10_000))
+        assert np.ptp(held_um[9000:10_000]) < 0.004
+        assert np.ptp(held_um[19_000:]) < 0.004
+
+
+class TestVaried:
+    """Factors on rods of any physics."""
+
+    @rigs
+    def test_strain_scales_the_displacement(self, physics: Physics) -> None:
+        """And nothing else: the loop is the same, larger."""
+        rated, varied = loop(physics, 6.0, 100.0), loop(physics, 6.0, 100.0, ("strain", 1.1))
+        np.testing.assert_allclose(varied[1], 1.1 * rated[1], atol=0.01)
+
+    @rigs
+    def test_lag_widens_fast_loops_only(self, physics: Physics) -> None:
+        """A longer lag shows at 250 Hz, not at 1 Hz."""
+        slow, fast = (
+            hysteresis_percent(*loop(physics, 6.0, hz, ("lag", 1.2)))
+            - hysteresis_percent(*loop(physics, 6.0, hz))
+            for hz in (1.0, 250.0)
+        )
+        assert abs(slow) < 0.1
+        assert fast > 1.0
+
+    @rigs
+    def test_pinning_widens_slow_loops(self, physics: Physics) -> None:
+        """More pinning is more hysteresis where nothing lags."""
+        rated = hysteresis_percent(*loop(physics, 6.0, 1.0))
+        assert hysteresis_percent(*loop(physics, 6.0, 1.0, ("pinning", 1.2))) > 1.02 * rated
+
+
+@rigs
+def test_rods_rest_where_the_bias_has_been_for_long(physics: Physics) -> None:
+    """Without a change of the current nothing moves, not in ten thousand steps."""
+    rods = PHYSICS[physics]().rods(Coil(5.09e3, 44.1e3, 1e-5))
+    rest_um, free_um = rods.rest(), np.empty(10_000)
+    rods.follow(np.zeros(20_001), free_um)
+    np.testing.assert_allclose(free_um, rest_um, rtol=0.0, atol=1e-9)

@@ -8,8 +8,8 @@ from scipy.integrate import solve_ivp
 from scipy.special import jv
 
 from hilctl.base.types import F64
+from hilctl_drivers.simulated.actuator_base import ROD_RADIUS_M, VACUUM_PERMEABILITY, Coil
 from hilctl_drivers.simulated.diffusion import Diffusion, DiffusionParameters, magnetise
-from hilctl_drivers.simulated.rod_model import ROD_RADIUS_M, VACUUM_PERMEABILITY, Coil
 
 RATED = DiffusionParameters()
 STEP_S = 1e-5

@@ -9,6 +9,7 @@ import pytest
 from scipy.optimize import minimize
 
 from hilctl.base.types import F64
+from hilctl_drivers.simulated.actuator_base import ROD_LENGTH_M, VACUUM_PERMEABILITY, Coil
 from hilctl_drivers.simulated.domains import (
     KIND_SIZES,
     ORIENTATIONS,
@@ -17,7 +18,6 @@ from hilctl_drivers.simulated.domains import (
     equilibrium,
     magnetise,
 )
-from hilctl_drivers.simulated.rod_model import ROD_LENGTH_M, VACUUM_PERMEABILITY, Coil
 
 RATED = DomainsParameters()
 # Next to no eddy currents: what is left does not know how fast the field goes.

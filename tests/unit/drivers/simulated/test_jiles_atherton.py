@@ -9,13 +9,13 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from hilctl.base.types import F64
+from hilctl_drivers.simulated.actuator_base import VACUUM_PERMEABILITY, Coil
 from hilctl_drivers.simulated.jiles_atherton import (
     JilesAtherton,
     JilesAthertonParameters,
     langevin,
     susceptibility,
 )
-from hilctl_drivers.simulated.rod_model import VACUUM_PERMEABILITY, Coil
 
 RATED = JilesAthertonParameters()
 # Next to no loss: what is left does not know how fast the field goes.

@@ -3,24 +3,12 @@
 import numpy as np
 import pytest
 
-from hilctl.base.device import Device
 from hilctl.base.types import F64
 from hilctl_drivers.simulated.devices import PiezoOptions, SimulatedPiezo
-from hilctl_drivers.simulated.simulated_device import SimulatedDevice
+from tests.unit.drivers.simulated.test_devices import opened, send
 
 RATE_HZ = 50e3
 BLOCK = 50
-
-
-def opened(device: SimulatedDevice, block: int = BLOCK) -> SimulatedDevice:
-    device.open(RATE_HZ, block)
-    return device
-
-
-def send(device: Device, first_sample: int, command: F64) -> F64:
-    displacement_um = np.full(command.size, -999.0)
-    device.exchange(first_sample, command, displacement_um, np.empty(command.size))
-    return displacement_um
 
 
 class TestPiezo:

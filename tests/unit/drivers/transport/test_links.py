@@ -3,15 +3,13 @@
 import os
 import pty
 import select
-import socket
 import threading
 import tty
-from collections.abc import Callable, Iterator
 
 import pytest
 
 from hilctl.base.errors import DeviceError
-from hilctl_drivers.transport import links as errors
+from hilctl_drivers.transport import links
 from hilctl_drivers.transport.links import (
     BadRequestError,
     FrameError,
@@ -21,59 +19,10 @@ from hilctl_drivers.transport.links import (
     WatchdogTrippedError,
 )
 from hilctl_drivers.transport.serial_port import SerialLink, SerialSettings
-from hilctl_drivers.transport.tcp import TcpLink
 from tests.fakes import received
+from tests.unit.drivers.transport.conftest import PATIENT_S, REPLY, missing, tcp
 
 QUICK_S = 0.05
-PATIENT_S = 5.0
-REPLY = b"0123456789"
-
-
-def missing(received: bytearray) -> int:
-    return max(0, len(REPLY) - len(received))
-
-
-class Peer:
-    """A TCP server that does one thing with its first connection, in a thread of its own."""
-
-    def __init__(self, act: Callable[[socket.socket], None]) -> None:
-        self.server = socket.create_server(("127.0.0.1", 0))
-        self.port = self.server.getsockname()[1]
-        self._act = act
-        self.done = threading.Event()
-        self.thread = threading.Thread(target=self._run)
-        self.thread.start()
-
-    def _run(self) -> None:
-        connection, _ = self.server.accept()
-        with connection:
-            self._act(connection)
-            self.done.wait(10.0)
-
-    def stop(self) -> None:
-        self.done.set()
-        self.thread.join()
-        self.server.close()
-
-
-@pytest.fixture
-def serve() -> Iterator[Callable[[Callable[[socket.socket], None]], int]]:
-    """Return a function that starts a peer and returns its port."""
-    peers = []
-
-    def start(act: Callable[[socket.socket], None]) -> int:
-        peers.append(Peer(act))
-        return peers[-1].port
-
-    yield start
-    for peer in peers:
-        peer.stop()
-
-
-def tcp(port, timeout_s=PATIENT_S):
-    link = TcpLink("127.0.0.1", port, timeout_s)
-    link.open()
-    return link
 
 
 def test_no_reply_wanted_is_not_waited_for(serve, line):
@@ -133,16 +82,6 @@ def test_full_serial_line_times_out(line):
     with pytest.raises(NoAnswerError, match="could not send within"):
         link.transact(b"ask", missing)
     link.close()
-
-
-@pytest.fixture
-def line() -> Iterator[tuple[int, str]]:
-    """Yield the far end of a pty and the device file of the near end."""
-    master, slave = pty.openpty()
-    tty.setraw(slave)
-    yield master, os.ttyname(slave)
-    os.close(slave)
-    os.close(master)
 
 
 def test_serial_exchanges(line):
@@ -270,7 +209,7 @@ def test_serial_chatter_does_not_hang(line):
 
 def test_every_frame_error_is_a_device_error():
     """The loop makes safe on any of them."""
-    found = [e for e in vars(errors).values() if isinstance(e, type) and issubclass(e, FrameError)]
+    found = [e for e in vars(links).values() if isinstance(e, type) and issubclass(e, FrameError)]
     assert len(found) == 7
     assert all(issubclass(each, DeviceError) for each in found)
     assert issubclass(BadRequestError, ValueError)

@@ -2,12 +2,9 @@
 
 import fcntl
 import os
-import pty
 import struct
 import termios
 import threading
-import tty
-from collections.abc import Iterator
 
 import pytest
 
@@ -16,20 +13,10 @@ from hilctl_drivers.profile import load_profile, with_link
 from hilctl_drivers.transport import serial_port as serial_link
 from hilctl_drivers.transport.links import NoAnswerError
 from hilctl_drivers.transport.serial_port import SerialLink, SerialSettings
+from tests.unit.drivers.transport.conftest import PATIENT_S
 
 QUICK_S = 0.05
-PATIENT_S = 5.0
 XOFF, XON = b"\x13", b"\x11"
-
-
-@pytest.fixture
-def line() -> Iterator[tuple[int, str]]:
-    """Yield the far end of a pty and the device file of the near end."""
-    master, slave = pty.openpty()
-    tty.setraw(slave)
-    yield master, os.ttyname(slave)
-    os.close(slave)
-    os.close(master)
 
 
 @pytest.fixture

@@ -3,64 +3,15 @@
 import socket
 import struct
 import threading
-from collections.abc import Callable, Iterator
 
 import pytest
 
 from hilctl.base.errors import DeviceError
 from hilctl_drivers.transport.links import LostError, NoAnswerError
 from hilctl_drivers.transport.tcp import TcpLink
+from tests.unit.drivers.transport.conftest import PATIENT_S, REPLY, missing, tcp
 
 QUICK_S = 0.05
-PATIENT_S = 5.0
-REPLY = b"0123456789"
-
-
-def missing(received: bytearray) -> int:
-    return max(0, len(REPLY) - len(received))
-
-
-class Peer:
-    """A TCP server that does one thing with its first connection, in a thread of its own."""
-
-    def __init__(self, act: Callable[[socket.socket], None]) -> None:
-        self.server = socket.create_server(("127.0.0.1", 0))
-        self.port = self.server.getsockname()[1]
-        self._act = act
-        self.done = threading.Event()
-        self.thread = threading.Thread(target=self._run)
-        self.thread.start()
-
-    def _run(self) -> None:
-        connection, _ = self.server.accept()
-        with connection:
-            self._act(connection)
-            self.done.wait(10.0)
-
-    def stop(self) -> None:
-        self.done.set()
-        self.thread.join()
-        self.server.close()
-
-
-@pytest.fixture
-def serve() -> Iterator[Callable[[Callable[[socket.socket], None]], int]]:
-    """Return a function that starts a peer and returns its port."""
-    peers = []
-
-    def start(act: Callable[[socket.socket], None]) -> int:
-        peers.append(Peer(act))
-        return peers[-1].port
-
-    yield start
-    for peer in peers:
-        peer.stop()
-
-
-def tcp(port, timeout_s=PATIENT_S):
-    link = TcpLink("127.0.0.1", port, timeout_s)
-    link.open()
-    return link
 
 
 def test_tcp_reply_in_pieces_is_put_together(serve):

@@ -9,7 +9,6 @@ import pytest
 
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.samples import Flag
-from hilctl.identify.command import settings_from
 from hilctl.identify.data import data_files
 from hilctl.identify.data.data_files import (
     history_from_pieces,
@@ -18,6 +17,7 @@ from hilctl.identify.data.data_files import (
     read_table,
 )
 from hilctl.identify.data.records import History, SteadyLoop
+from hilctl.identify.pipeline import settings_from
 
 GOLDEN = Path(__file__).parents[4] / "recordings" / "golden"
 CURRENT, VOLTAGE = GOLDEN / "terfenol_uncompensated.mcap", GOLDEN / "piezo_compensated.mcap"

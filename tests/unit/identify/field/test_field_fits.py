@@ -7,6 +7,7 @@ from hilctl.base.errors import DataError
 from hilctl.base.types import F64
 from hilctl.identify.data.records import History, SteadyLoop
 from hilctl.identify.evaluation import judge
+from hilctl.identify.fit_api import FitRequest
 from hilctl.identify.fit_model import fit_model
 from hilctl.identify.settings import FitSettings
 from hilctl.models.mechanics import FirstMode
@@ -40,7 +41,7 @@ def model() -> StagedModel:
 @pytest.mark.slow
 def test_a_history_that_was_not_fitted_is_met() -> None:
     settings = FitSettings(kind="field", plays=6, drags=1, cells=8, knots=6)
-    found = fit_model([history(1, 0.01)], settings, lambda: 0.0)
+    found = fit_model(FitRequest([history(1, 0.01)], settings))
     judged = judge(found.model, [history(2, 0.0)])
     assert judged.rms_percent < 0.6
     assert judged.peak_percent < 3.0
@@ -57,7 +58,7 @@ def test_a_structure_that_a_slow_record_leaves_open_does_not_bend_the_hysteresis
     command = np.ascontiguousarray(6.0 * np.clip(t / 0.02, 0.0, 1.0) * wave / np.ptp(wave))
     y, current_a = np.empty_like(command), np.empty_like(command)
     TerfenolActuator(TerfenolParameters(), 50e3, seed=3).step(command, y, current_a)
-    found = fit_model([History("slow", command, y, 50e3)], FitSettings(kind="field"), lambda: 0.0)
+    found = fit_model(FitRequest([History("slow", command, y, 50e3)], FitSettings(kind="field")))
     assert found.rms_percent < 0.6
 
 
@@ -66,4 +67,4 @@ def test_steady_loops_are_refused() -> None:
     wave = np.sin(2.0 * np.pi * np.arange(64) / 64)
     loop = SteadyLoop("3 A 10 Hz", 3.0 * wave, 20.0 * wave, 10.0, RATE_HZ)
     with pytest.raises(DataError, match="not from steady loops: 3 A 10 Hz"):
-        fit_model([loop], FitSettings(kind="field"), lambda: 0.0)
+        fit_model(FitRequest([loop], FitSettings(kind="field")))

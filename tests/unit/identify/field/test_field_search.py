@@ -11,12 +11,8 @@ from hilctl.identify.data.records import History
 from hilctl.identify.field import field_search
 from hilctl.identify.field.densities import Equations, Grid, outputs, solve, table
 from hilctl.identify.field.field_search import (
-    FINAL_ROWS,
-    LENGTHS,
-    MARGIN,
     ROOM,
     ROUNDS,
-    SEARCH_ROWS,
     STAGES,
     BareSignal,
     FieldEnd,
@@ -25,7 +21,6 @@ from hilctl.identify.field.field_search import (
     Size,
 )
 from hilctl.identify.field.preprocess import Prepared
-from hilctl.identify.field.sampling import Rows
 from hilctl.identify.field.stages import HIGH, LOW, STEP, Stages, row
 from hilctl.models.effective_field import FieldLosses, FieldModel, OutputCurve
 from hilctl.models.mechanics import FirstMode
@@ -146,69 +141,9 @@ def test_a_search_ends_within_its_bounds_though_it_starts_beyond() -> None:
     assert (ended != x).all()
 
 
-def test_cells_reach_beyond_the_effective_field_by_the_margin() -> None:
-    job = laid()
-    (u,), _ = job._signals(row(Stages()))
-    grid = job._laid()
-    assert grid.lowest == pytest.approx(u.min() - MARGIN * np.ptp(u), rel=1e-3)
-    highest = grid.lowest + grid.cells * grid.width
-    assert highest == pytest.approx(u.max() + MARGIN * np.ptp(u), rel=1e-3)
-    assert grid.lengths == pytest.approx([0.15 * 0.5 * np.ptp(u)], rel=1e-3)
-    assert grid.thresholds[0] == 0.0
-    steps = np.diff(grid.thresholds)
-    assert steps == pytest.approx(steps[0])
-    assert grid.thresholds[-1] < 0.5 * np.ptp(u)
-
-
-@pytest.mark.parametrize(("last", "part"), [(0, 1.2 * 1.0 / 8.0), (3, 1.2 * 4.0 / 8.0), (7, 1.0)])
-def test_thresholds_wider_than_what_has_weight_are_given_up(
-    last: int, part: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    size = Size(8, 1, 6, 5)
-    job = laid(size)
-    before, rows = job._laid().thresholds, job._chosen()
-    weights = job._solved(row(Stages()), rows)
-    slopes = np.where(np.arange(9)[:, None] <= last, np.ones((9, 6)), 0.0)
-    slopes[8] = 1.0
-    monkeypatch.setattr(job, "_solved", lambda *_: replace(weights, slopes=slopes))
-    job._learn(row(Stages()), rows)
-    job._lay(Stages(), size)
-    assert job._laid().thresholds == pytest.approx(part * before, rel=0.02)
-
-
-def test_the_last_fit_sees_more_of_a_path() -> None:
-    job = laid()
-    few, more = (job._chosen(most).scale.size for most in (SEARCH_ROWS, FINAL_ROWS))
-    assert few <= SEARCH_ROWS
-    assert few <= more <= FINAL_ROWS
-
-
-def test_errors_of_the_operators_are_brought_to_um_by_the_curve() -> None:
-    """Where it rises by 2 um an um, an error of the operators' is half of one of the output."""
-    job = laid()
-    two = Rows((np.array([1, 2]),), np.array([1.0, 3.0]))
-    assert job._scale(np.array([1.0, 2.0]), two).tolist() == [1.0, 3.0]
-    found_here = job._learn(row(Stages()), job._chosen())
-    curve = found_here.curve
-    middle = 0.5 * (curve.displacement_um[1:] + curve.displacement_um[:-1]) + found_here.offset_um
-    slopes = np.diff(curve.displacement_um) / np.diff(curve.operators)
-    alike = Rows((), np.ones(middle.size))
-    assert job._scale(middle, alike) == pytest.approx(slopes, rel=1e-6)
-
-
 def test_a_search_is_never_of_more_operators_than_were_asked_for() -> None:
     assert Size(40, 3, 50, 60).coarse == Size(8, 3, 12, 16)
     assert Size(4, 0, 6, 5).coarse == Size(4, 0, 6, 5)
-
-
-@pytest.mark.parametrize("count", [0, 1, 2, 5])
-def test_lengths_of_drags_rise_by_the_same_factor(count: int) -> None:
-    lengths = field_search._lengths(count)
-    assert len(lengths) == count
-    assert all(LENGTHS[0] - 1e-12 <= length <= LENGTHS[1] + 1e-12 for length in lengths)
-    if count > 1:
-        factors = np.divide(lengths[1:], lengths[:-1])
-        assert factors == pytest.approx((LENGTHS[1] / LENGTHS[0]) ** (1.0 / (count - 1)))
 
 
 def test_the_least_slope_of_the_first_line_holds_throughout_the_search() -> None:

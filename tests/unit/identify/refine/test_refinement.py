@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from hilctl.base.errors import DataError, InputError
+from hilctl.identify.model_page import refinement_page, write_refinement
 from hilctl.identify.refine.refinement import (
     STILL_S,
     _history,
@@ -15,6 +16,7 @@ from hilctl.identify.refine.refinement import (
     refine_files,
     refine_runs,
 )
+from hilctl.identify.summary import REFINEMENT_HEADINGS, refinement_rows
 from hilctl.models.model_file import dump_model, load_model
 from hilctl.models.refined import RefinedModel
 from hilctl.recording.reader import read
@@ -204,3 +206,19 @@ def test_what_can_not_be_used_is_said(tmp_path):
         load_runs([], OMEGA_runs)
     with pytest.raises(DataError, match="was recorded in A, the model takes V"):
         load_runs([copy], piezo_ppi())
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("undrawn")
+def test_page_has_verdict_table_figures_and_model(old, runs, tmp_path):
+    found = refine_runs(old, runs[:3], source="a<b>.yaml")
+    rows = refinement_rows(found)
+    assert [row[0] for row in rows] == ["run 0", "run 1", "run 2"]
+    assert all(len(row) == len(REFINEMENT_HEADINGS) for row in rows)
+    page = refinement_page(found)
+    assert "a&lt;b&gt;.yaml" in page
+    assert "<b>" not in page.replace("<body>", "")
+    assert page.count("<svg") == 2
+    assert "kind: refined" in page
+    write_refinement(found, tmp_path / "page.html")
+    assert (tmp_path / "page.html").read_text() == page

@@ -5,6 +5,7 @@ import pytest
 
 from hilctl.base.errors import DataError
 from hilctl.identify.data.records import History
+from hilctl.identify.fit_api import FitRequest
 from hilctl.identify.fit_model import FittedModel, fit_model
 from hilctl.identify.settings import FitSettings
 from hilctl.models.butterfly import ButterflyModel
@@ -20,7 +21,7 @@ KNOWN = ButterflyModel(
 
 
 def fit(loops, **choices) -> FittedModel:
-    return fit_model(loops, FitSettings(kind="butterfly", **choices), lambda: 0.0)
+    return fit_model(FitRequest(loops, FitSettings(kind="butterfly", **choices)))
 
 
 SINES = [(2.5, 10.0), (2.5, 100.0), (4.0, 50.0)]

@@ -9,6 +9,7 @@ from scipy.optimize import nnls
 
 from hilctl.base.types import F64
 from hilctl.identify.data.records import SteadyLoop
+from hilctl.identify.fit_api import FitRequest
 from hilctl.identify.fit_data import FitData
 from hilctl.identify.fit_model import fit_model
 from hilctl.identify.searched.plays import PlaysProblem
@@ -55,7 +56,7 @@ def test_free_weights_are_one_density_without_spikes(data: FitData) -> None:
     The first and the last stand for all plays beyond them.
     """
     settings = FitSettings(kind="rdpi", plays=20, offset=True, starts=2)
-    found = fit_model(data.records, settings, lambda: 0.0)
+    found = fit_model(FitRequest(data.records, settings))
     inner = np.array(found.model.weights)[1:-1]
     assert inner.min() > 0.05 * inner.max()
     assert np.abs(np.diff(inner)).max() < 0.25 * inner.max()

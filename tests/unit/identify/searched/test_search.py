@@ -5,8 +5,8 @@ import pytest
 from scipy.optimize import lsq_linear
 
 from hilctl.base.types import F64
-from hilctl.identify.nnls import bounded_weights
-from hilctl.identify.searched.search import SearchSpace, first_least, refine_peak, search
+from hilctl.identify.least_squares import bounded_weights, first_least
+from hilctl.identify.searched.search import SearchSpace, refine_peak, search
 from hilctl.models.plays import PlayModel
 
 TIME = np.linspace(0.0, 1.0, 200)

@@ -1,5 +1,6 @@
 """The sum of squares of the staged model: its derivatives agree with differences."""
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -7,8 +8,22 @@ import numpy as np
 import pytest
 
 from hilctl.identify.data.records import SteadyLoop
-from hilctl.identify.staged.fit_data import StagedFitData
-from hilctl.identify.staged.objective import Layers, bounds, error_and_slopes, loop_delay_s
+from hilctl.identify.fit_data import FitData
+from hilctl.identify.staged.fit_data import Linear, StagedFitData
+from hilctl.identify.staged.objective import (
+    Layers,
+    Point,
+    bounds,
+    error_and_slopes,
+    loop_delay_s,
+    parameters,
+    response_um,
+    staged_model,
+    stages_of,
+    structure_of,
+)
+from hilctl.models.integrated import exponential_integrated
+from hilctl.models.mechanics import FirstMode
 from tests.staged import start
 
 Loops = Callable[..., list[SteadyLoop]]
@@ -54,3 +69,63 @@ def test_the_longest_lag_leaves_half_a_period_and_none_a_whole_one() -> None:
     assert loop_delay_s(5e-6, 1.0) == pytest.approx(5e-6, rel=1e-4)
     assert loop_delay_s(5e-6, 0.0) == 1e-5
     assert loop_delay_s(0.0, 1e-4) == 0.0
+
+
+HALF_S = 1e-5
+LAYERS = Layers(plays=2, deadbands=1, half_period_s=HALF_S)
+RADIAN_S = 1.0 / (2.0 * math.pi * 2000.0)
+POINT = Point(
+    before=np.array([1e-4, 0.3, 0.5, 0.0]), linear=Linear(5e-5, 0.3 * RADIAN_S, RADIAN_S**2),
+    direct=3.0, weights=np.array([1.0, 0.5]), spacings_um=(6.0, 5.0), up=np.array([0.8]),
+    down=np.array([1.2]), offset_um=-2.0,
+)  # fmt: skip
+
+
+@pytest.fixture
+def data(loops_of):
+    omega = exponential_integrated(
+        alpha=0.33, gamma_s=0.0, a_0=3.0, alpha_0=1.4, beta_0=0.23, g_0=1.0, alpha_1=0.08,
+        beta_1=0.15, d_p=4.0, alpha_2=0.1, beta_2=0.4, d_n=3.0,
+    )  # fmt: skip
+    loops = loops_of(omega, [(6.0, 100.0)])
+    return StagedFitData(loops, FitData(loops).speeds)
+
+
+def test_structure_is_told_in_hertz_and_damping():
+    assert structure_of(POINT.linear) == pytest.approx((2000.0, 0.15))
+
+
+def test_a_low_pass_keeps_its_time_constant_and_is_a_structure():
+    """A sensor of 1 kHz has no mass: whatever the search found for one is too small to matter."""
+    low_pass = Linear(0.0, 1.6e-4, 1e-14)
+    natural_hz, damping = structure_of(low_pass)
+    FirstMode(natural_hz=natural_hz, damping_ratio=damping)
+    assert damping / (np.pi * natural_hz) == pytest.approx(1.6e-4)
+    s = 2j * np.pi * 250.0
+    kept = 1.0 / (1.0 + s * 1.6e-4 + (s / (2.0 * np.pi * natural_hz)) ** 2)
+    assert kept == pytest.approx(low_pass.response(np.array([s]))[0], abs=1e-3)
+
+
+def test_parameters_are_under_their_published_names():
+    found = parameters(LAYERS, POINT, staged=True)
+    assert found["delay_s"] == 5e-5
+    assert (found["a_1"], found["a_2"], found["g_0"]) == (1.0, 0.5, 1.0)
+    assert found["g_1"] == pytest.approx(-0.2)
+    assert found["g_-1"] == pytest.approx(0.2)
+    assert "delay_s" not in parameters(LAYERS, POINT, staged=False)
+
+
+def test_a_model_has_the_stages_of_its_point_and_gives_them_back(data):
+    model = staged_model(data, LAYERS, POINT, "A")
+    assert (model.lag.tau_s, model.lag.growth_per_unit) == (1e-4, 0.3)
+    assert model.structure.natural_hz == pytest.approx(2000.0)
+    assert model.hysteresis.thresholds == pytest.approx((0.5, 1.0))
+    back = stages_of(model, HALF_S)
+    assert back.delay_s == pytest.approx(POINT.linear.delay_s + loop_delay_s(HALF_S, 1e-4))
+    assert (back.c_s, back.q_s2) == pytest.approx((POINT.linear.c_s, POINT.linear.q_s2))
+
+
+def test_the_response_is_moved_by_the_offset(data):
+    model = staged_model(data, LAYERS, POINT, "A")
+    moved = model.model_copy(update={"output_offset_um": model.output_offset_um + 3.0})
+    np.testing.assert_allclose(response_um(moved, data), response_um(model, data) + 3.0)

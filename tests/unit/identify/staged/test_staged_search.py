@@ -9,8 +9,10 @@ import pytest
 
 from hilctl.base.errors import DataError
 from hilctl.identify.data.records import History, SteadyLoop
+from hilctl.identify.staged.fit_data import StagedFitData
+from hilctl.identify.staged.objective import Layers, error_and_slopes
 from hilctl.models.staged import FieldLag
-from tests.staged import GRID, fit, truth
+from tests.staged import GRID, fit, start, truth
 
 Loops = Callable[..., list[SteadyLoop]]
 
@@ -34,3 +36,11 @@ def test_whole_histories_and_wrong_choices_are_refused(loops_of: Loops) -> None:
     loops = loops_of(truth(), GRID[:2])
     with pytest.raises(DataError, match="found from runs at one sample rate"):
         fit([loops[0], replace(loops[1], sample_rate_hz=10_000.0)])
+
+
+def test_weights_follow_without_a_search(data: StagedFitData) -> None:
+    """With lag, spacing and delay known, the linear problem alone is within 1 % of the stroke."""
+    layers = Layers(8, 5, structure=False)
+    point = start(data, layers, [1e-4, 0.3, 0.5, 0.0], data.half_period_s)
+    errors, _ = error_and_slopes(data, layers, point)
+    assert np.max(np.abs(errors)) < 0.01 * data.stroke_um

@@ -9,9 +9,10 @@ import pytest
 
 from hilctl.base.errors import DataError
 from hilctl.base.segments import Segment
-from hilctl.identify.command import identify_records
 from hilctl.identify.data.records import History, SteadyLoop
+from hilctl.identify.fit_api import FitRequest
 from hilctl.identify.model_quality import Verdict
+from hilctl.identify.pipeline import identify_records
 from hilctl.identify.settings import FitSettings
 from hilctl.models.plays import PpiModel
 from hilctl.studies.characterise import results
@@ -47,7 +48,7 @@ def identification(grade="usable"):
     """Return a straight line through two loops, with a verdict of its own."""
     turns = np.linspace(0.0, 2.0 * np.pi, 60, endpoint=False)
     loops = [SteadyLoop(f"{a} A", a * np.sin(turns), 4.0 * a * np.sin(turns), 1.0) for a in (1, 2)]
-    found = identify_records(loops, FitSettings(kind="straight"), "A")
+    found = identify_records(FitRequest(loops, FitSettings(kind="straight"), "A"))
     reasons = ("units are others",) if grade == "not a model" else ()
     return replace(found, verdict=Verdict(grade, 9.0, False, reasons, ("a note",)))
 
@@ -166,16 +167,17 @@ def test_the_kind_is_chosen_on_whole_histories_of_what_may_be_fitted(run, monkey
     """Named by their files; to the end of the last waveform at full size, gaps filled in."""
     asked = []
 
-    def identify(records, settings, unit, **more):
-        asked.append((records, settings, unit, more["source"]))
+    def identify(request):
+        asked.append(request)
         return "found"
 
     monkeypatch.setattr(results, "identify_records", identify)
     monkeypatch.setattr(results, "read", lambda path: run())
     paths = {name: Path(f"{name}.mcap") for name in [*FITTED, *JUDGED, "growing-1"]}
     assert results.identified(paths) == "found"
-    ((records, settings, unit, source),) = asked
-    assert len(records) == len(source) == len(FITTED)
+    (request,) = asked
+    records, settings, unit = request.records, request.settings, request.unit
+    assert len(records) == len(request.source) == len(FITTED)
     assert (settings.auto, settings.whole, unit) == (True, True, "A")
     assert all(isinstance(record, History) for record in records)
     assert all(record.command.size == 1900 for record in records)

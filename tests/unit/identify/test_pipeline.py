@@ -12,10 +12,11 @@ import pytest
 
 from hilctl.base.errors import ConfigError, InputError
 from hilctl.cli.models import print_identification
-from hilctl.identify import command as subject
-from hilctl.identify.command import TURNS, identify_files, settings_from, with_modes
+from hilctl.identify import pipeline as subject
 from hilctl.identify.data.records import History, SteadyLoop
 from hilctl.identify.model_page import write_identification
+from hilctl.identify.model_selection import Selection
+from hilctl.identify.pipeline import TURNS, identify_files, settings_from, with_modes
 from hilctl.identify.resonances import WORTH
 from hilctl.identify.settings import FitSettings, IdentifySettings
 from hilctl.models.mechanics import FirstMode, FurtherMode
@@ -70,7 +71,7 @@ def test_order_and_lag_are_found_and_reported(
     assert len(mapping["orders"]) == len(found.orders)
     print_identification(found, output)
     shown = capsys.readouterr().out
-    assert "validation loops" in shown
+    assert "loops held out" in shown
     assert "2 samples later" in shown
     write_identification(found, page)
     text = page.read_text()
@@ -131,7 +132,7 @@ RECORD = History("h", np.sin(6.3 * TIME), np.sin(6.3 * TIME), 1000.0)
 class Found:
     """A model as it is found, with modes that were known."""
 
-    rms_percent: float
+    fit_percent: float
     held_out_percent: float | None = None
     modes: tuple = ()
     first: FirstMode | None = FIRST
@@ -141,13 +142,15 @@ class Found:
     def fit(self):
         model = SimpleNamespace(structure=self.first, modes=self.modes)
         um = (RECORD.displacement_um,)
-        return SimpleNamespace(model=model, rms_percent=self.rms_percent, modelled_um=um)
+        return SimpleNamespace(model=model, rms_percent=self.fit_percent, modelled_um=um)
 
     @property
-    def held_out(self):
-        if self.held_out_percent is None:
-            return None
-        return SimpleNamespace(judgement=SimpleNamespace(rms_percent=self.held_out_percent))
+    def selection(self):
+        return Selection(self.settings)
+
+    @property
+    def rms_percent(self):
+        return self.fit_percent if self.held_out_percent is None else self.held_out_percent
 
 
 def identifying(*found):

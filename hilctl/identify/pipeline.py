@@ -1,0 +1,227 @@
+"""Identify a model from files or records, evaluate it, and write it."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from hilctl.base.errors import InputError
+from hilctl.base.files import check_writable, write_text
+from hilctl.base.yaml import Document
+from hilctl.identify.cross_validation import HeldOut, held_out_error
+from hilctl.identify.data.data_files import load_records
+from hilctl.identify.data.records import History, Record
+from hilctl.identify.evaluation import judge
+from hilctl.identify.fit_api import FitRequest, OnProgress, ignore_progress
+from hilctl.identify.fit_model import FittedModel, error_table, fit_model
+from hilctl.identify.model_quality import Verdict, verdict_of
+from hilctl.identify.model_selection import (
+    CandidateScore,
+    OrderScore,
+    Selection,
+    choose_lag,
+    select,
+)
+from hilctl.identify.parallel import MapFunction, workers
+from hilctl.identify.registry import entry
+from hilctl.identify.resonances import WORTH, further_modes
+from hilctl.identify.settings import IdentifySettings
+from hilctl.models.mechanics import FirstMode, FurtherMode
+from hilctl.models.model_file import dump_model
+
+TURNS = 4  # each identifies a new model
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """A model with given modes, its settings, and its errors on held-out data if there are any."""
+
+    fit: FittedModel
+    held_out: HeldOut | None
+    selection: Selection
+
+    @property
+    def rms_percent(self) -> float:
+        """The error on held-out data; on all data if none were held out."""
+        return (self.held_out.judgement if self.held_out else self.fit).rms_percent
+
+
+def with_modes(
+    records: Sequence[Record], identify: Callable[[Sequence[FurtherMode]], Found]
+) -> Found:
+    """Return a model with the further modes that its records show.
+
+    A missing mode distorts all other parameters, so the model is identified again with each mode
+    that is found, and its residual shows the modes more clearly.
+
+    Args:
+        records: Fitted records.
+        identify: Identifies a model of them with known modes.
+    """
+    best = identify(())
+    histories = [record for record in records if isinstance(record, History)]
+    if not best.selection.settings.looks_for("modes") or len(histories) < len(records):
+        return best
+    for _ in range(TURNS):
+        model = best.fit.model
+        structure, known = getattr(model, "structure", None), getattr(model, "modes", ())
+        first_hz = structure.natural_hz if isinstance(structure, FirstMode) else None
+        better = further_modes(histories, best.fit.modelled_um, known, first_hz)
+        if better is None:
+            break
+        tried = identify(better)
+        if not tried.rms_percent < WORTH * best.rms_percent:
+            break
+        best = tried
+    return best
+
+
+@dataclass(frozen=True, slots=True)
+class Identification:
+    """An identified model, and its errors on held-out data.
+
+    Attributes:
+        fit: The fit.
+        data: Fitted records.
+        verdict: What the model is worth.
+        held_out: Errors on held-out data; None if there were none.
+        orders: Errors of each number of plays, if it was selected.
+        lag_samples: Assumed lag of tables' displacements in samples.
+        candidates: Errors of each kind, if it was selected.
+    """
+
+    fit: FittedModel
+    data: Sequence[Record]
+    verdict: Verdict
+    held_out: HeldOut | None
+    orders: tuple[OrderScore, ...]
+    lag_samples: int
+    candidates: tuple[CandidateScore, ...] = ()
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return all results as plain mappings, lists and numbers, for JSON."""
+        return {
+            "verdict": self.verdict.to_mapping(),
+            "held_out": None if self.held_out is None else self.held_out.to_mapping(),
+            **self.fit.to_mapping(),
+            "orders": [asdict(order) for order in self.orders],
+            "candidates": [asdict(candidate) for candidate in self.candidates],
+            "lag_samples": self.lag_samples,
+        }
+
+
+def settings_from(kind: str, texts: Sequence[str]) -> IdentifySettings:
+    """Return the settings of a fit: those of the kind, changed by ``key=value`` texts.
+
+    Args:
+        kind: Kind of model; ``auto`` for the one with the least error on held-out data.
+        texts: ``key=value``.
+
+    Raises:
+        InputError: The kind is unknown, or settings are invalid; all invalid ones are listed.
+    """
+    if kind == "auto":
+        document = Document("hilctl identify", "kind: field\nauto: true")
+    else:
+        known, _ = entry(kind)
+        document = Document("hilctl identify", f"kind: {known}")
+    for text in texts:
+        document.set(text)
+    return document.validate(IdentifySettings)
+
+
+def identify_files(
+    paths: Sequence[Path],
+    settings: IdentifySettings,
+    output: Path | None,
+    validate: Sequence[Path] = (),
+    scheduler: str = "none",
+    *,
+    overwrite: bool = False,
+    progress: OnProgress = ignore_progress,
+) -> Identification:
+    """Fit a model to files, evaluate it on held-out data, and write it.
+
+    A model with the grade "not a model" is not written.
+
+    Args:
+        paths: Recordings and text tables.
+        settings: Settings of the fit.
+        output: Model file to write; None for none.
+        validate: Files to evaluate the model on; if there are none, parts of the others.
+        scheduler: Where independent fits run, see :func:`hilctl.identify.parallel.workers`.
+        overwrite: Whether a model file of that name may be replaced.
+        progress: Called with what is being done.
+
+    Raises:
+        InputError: A file or a setting can't be used; nothing is written.
+    """
+    if output is not None:
+        check_writable(output, overwrite=overwrite, inputs=[*paths, *validate])
+    with workers(scheduler) as run:
+        lag = _lag(paths, settings, run, progress)
+        records, recorded = load_records(paths, settings, lag)
+        asked = settings.table.unit
+        if recorded and asked and recorded != asked:
+            raise InputError(f"--unit must be {recorded}, that of the recordings: {asked}")
+        others, _ = load_records(validate, settings.model_copy(update={"leave_out": ()}), lag)
+        source = [path.name for path in paths]
+        unit = settings.unit(recorded)
+        request = FitRequest(records, settings, unit, source, run, progress)
+        found = identify_records(request, others)
+    if output is not None and found.verdict.grade != "not a model":
+        write_text(output, dump_model(found.fit.model), overwrite=overwrite)
+    return replace(found, lag_samples=lag)
+
+
+def identify_records(request: FitRequest, validate: Sequence[Record] = ()) -> Identification:
+    """Fit a model to records, and evaluate it on held-out data.
+
+    Args:
+        request: Records and settings, which may leave the kind or the number of plays open.
+        validate: Held-out records; if there are none, parts of the fitted records are left out of
+            further fits.
+
+    Raises:
+        DataError: The data can't be used as asked, or there are none.
+    """
+    records = request.records
+
+    def found(modes: Sequence[FurtherMode]) -> Found:
+        asked = replace(request, modes=modes)
+        selection = select(asked)
+        held_out = selection.held_out
+        chosen = replace(asked, settings=selection.settings)
+        fit = fit_model(replace(chosen, start=held_out.end if held_out else None))
+        if held_out is None and not validate:
+            held_out = held_out_error(chosen)
+        return Found(fit, held_out, selection)
+
+    best = with_modes(records, found)
+    fit, held_out, selection = best.fit, best.held_out, best.selection
+    if validate:
+        others = judge(fit.model, validate, creep=request.settings.creep)
+        held_out = HeldOut(others, tuple(validate), "files that were not fitted")
+    verdict = verdict_of(fit, records, selection.settings, held_out)
+    update: dict[str, Any] = {"created": datetime.now(UTC).isoformat(timespec="seconds")}
+    if held_out is not None:
+        figures = {f"held_out_{k}": v for k, v in error_table(held_out.judgement).items()}
+        update["errors_percent"] = {**fit.model.provenance.errors_percent, **figures}
+    provenance = fit.model.provenance.model_copy(update=update)
+    fit = replace(fit, model=fit.model.model_copy(update={"provenance": provenance}))
+    return Identification(
+        fit, records, verdict, held_out, selection.orders, 0, selection.candidates
+    )
+
+
+def _lag(
+    paths: Sequence[Path], settings: IdentifySettings, run: MapFunction, progress: OnProgress
+) -> int:
+    if not settings.table.find_lag:
+        return settings.table.lag_samples
+
+    def load(lag: int) -> Sequence[Record]:
+        return load_records(paths, settings, lag)[0]
+
+    return choose_lag(load, settings, run, progress)

@@ -1,0 +1,72 @@
+"""A peer of a TCP link, and a pty, for the tests of links."""
+
+import os
+import pty
+import socket
+import threading
+import tty
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from hilctl_drivers.transport.tcp import TcpLink
+
+REPLY = b"0123456789"
+PATIENT_S = 5.0
+
+
+def missing(received: bytearray) -> int:
+    return max(0, len(REPLY) - len(received))
+
+
+class Peer:
+    """A TCP server that does one thing with its first connection, in a thread of its own."""
+
+    def __init__(self, act: Callable[[socket.socket], None]) -> None:
+        self.server = socket.create_server(("127.0.0.1", 0))
+        self.port = self.server.getsockname()[1]
+        self._act = act
+        self.done = threading.Event()
+        self.thread = threading.Thread(target=self._run)
+        self.thread.start()
+
+    def _run(self) -> None:
+        connection, _ = self.server.accept()
+        with connection:
+            self._act(connection)
+            self.done.wait(10.0)
+
+    def stop(self) -> None:
+        self.done.set()
+        self.thread.join()
+        self.server.close()
+
+
+@pytest.fixture
+def serve() -> Iterator[Callable[[Callable[[socket.socket], None]], int]]:
+    """Return a function that starts a peer and returns its port."""
+    peers = []
+
+    def start(act: Callable[[socket.socket], None]) -> int:
+        peers.append(Peer(act))
+        return peers[-1].port
+
+    yield start
+    for peer in peers:
+        peer.stop()
+
+
+def tcp(port, timeout_s=PATIENT_S):
+    link = TcpLink("127.0.0.1", port, timeout_s)
+    link.open()
+    return link
+
+
+@pytest.fixture
+def line() -> Iterator[tuple[int, str]]:
+    """Yield the far end of a pty and the device file of the near end."""
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    yield master, os.ttyname(slave)
+    os.close(slave)
+    os.close(master)

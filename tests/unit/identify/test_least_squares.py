@@ -1,0 +1,166 @@
+"""Bounded least squares, linear and from a start."""
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares, lsq_linear
+
+from hilctl.base.types import F64
+from hilctl.identify.least_squares import (
+    SETTLED_STEP,
+    STEPS,
+    TRIALS,
+    SearchPoint,
+    bounded_and_free,
+    descend,
+    numbered,
+    settle,
+    smooth_densities,
+)
+
+RNG = np.random.default_rng(6)
+
+
+def test_what_the_data_leave_open_is_shared_evenly() -> None:
+    """Of two columns that are one, each has half: least squares alone could say anything."""
+    column = RNG.normal(size=200)
+    columns = np.stack([column, column], axis=1)
+    table = np.array([[0, 1]])
+    found, constant = smooth_densities(
+        columns, 3.0 * column + 2.0, np.ones(200), np.zeros(2), table, 0.01
+    )
+    np.testing.assert_allclose(found, 1.5, rtol=1e-5)
+    assert abs(constant - 2.0) < 1e-5
+
+
+def test_densities_that_the_data_give_are_found() -> None:
+    """The hold is weak, lower bounds are kept, and places without a density are left out."""
+    columns, truth = RNG.normal(size=(300, 6)), np.array([0.5, 0.0, 2.0, 1.0, 0.3, 0.1])
+    table = numbered(np.array([True, True, False, True, True, True, True, False])).reshape(2, 4)
+    assert table.tolist() == [[0, 1, -1, 2], [3, 4, 5, -1]]
+    least = np.array([0.0, 0.0, 0.0, 0.0, 0.4, 0.0])
+    target = columns @ np.maximum(truth, least) - 1.0
+    found, constant = smooth_densities(columns, target, np.ones(300), least, table, 0.01)
+    np.testing.assert_allclose(found, np.maximum(truth, least), atol=1e-3)
+    assert found[4] >= 0.4
+    assert abs(constant + 1.0) < 1e-3
+
+
+RANDOM = np.random.default_rng(5)
+
+
+def test_linear_problem_with_bounds_is_solved() -> None:
+    """Weights within bounds equal those of an independent solver."""
+    table, target = RANDOM.normal(size=(50, 6)), RANDOM.normal(size=50)
+    low, high = np.full(6, -0.05), np.full(6, 0.08)
+    x, errors, slopes = descend(lambda x: (table @ x - target, table), np.zeros(6), low, high, 60)
+    expected = lsq_linear(table, target, (low, high), tol=1e-14)
+    assert float(errors @ errors) == pytest.approx(2.0 * expected.cost, rel=1e-3)
+    np.testing.assert_allclose(x, expected.x, atol=2e-3)
+    assert np.any(x == low) or np.any(x == high)
+    assert slopes is table
+
+
+def test_curved_problem_ends_where_scipy_does() -> None:
+    """A nonlinear fit ends at the same sum of squares; equal bounds hold a parameter."""
+    time = np.linspace(0.0, 1.0, 80)
+    target = 2.0 * np.exp(-3.0 * time) + 0.1 * np.cos(40.0 * time)
+
+    def evaluate(x: F64) -> tuple[F64, F64]:
+        decay = np.exp(-x[1] * time)
+        slopes = np.column_stack([decay, -x[0] * time * decay, np.ones(80)])
+        return x[0] * decay + x[2] - target, slopes
+
+    low, high = np.array([0.0, 0.0, 0.3]), np.array([5.0, 10.0, 0.3])
+    x, errors, _ = descend(evaluate, np.array([1.0, 1.0, 0.3]), low, high, 60)
+    assert x[2] == 0.3
+    free = least_squares(lambda p: evaluate(np.array([*p, 0.3]))[0], [1.0, 1.0])
+    assert float(errors @ errors) == pytest.approx(2.0 * free.cost, rel=1e-3)
+
+
+def test_free_columns_have_any_sign() -> None:
+    """Bounded and free weights together equal an independent solver's."""
+    columns, free, target = (
+        RANDOM.normal(size=(60, 4)),
+        RANDOM.normal(size=(60, 2)),
+        RANDOM.normal(size=60),
+    )
+    scale, least = RANDOM.uniform(0.5, 2.0, 60), np.array([0.1, 0.0, 0.0, 0.0])
+    w, c = bounded_and_free(columns, free, target, scale, least)
+    table = np.column_stack([columns, free]) * scale[:, None]
+    low = np.concatenate([least, [-np.inf, -np.inf]])
+    expected = lsq_linear(table, target * scale, (low, np.inf), tol=1e-14).x
+    np.testing.assert_allclose(np.concatenate([w, c]), expected, atol=1e-7)
+
+
+MATRIX = np.random.default_rng(5).standard_normal((40, 3))
+WANTED = np.array([1.0, -2.0, 0.5])
+UNIT = np.array([1.0, 0.1, 2.0])
+
+
+def errors(x: F64, bent: float) -> F64:
+    """Return what is 0 at the end, bent so that no straight step leads there."""
+    away = x - WANTED
+    return np.asarray(MATRIX @ (away + bent * away**3))
+
+
+class Counted:
+    """A sum of squares that counts how often it is asked for."""
+
+    def __init__(self, bent: float) -> None:
+        self.bent, self.tried, self.taken = bent, 0, 0
+
+    def sum_of(self, x: F64) -> float:
+        self.tried += 1
+        return float(np.sum(errors(x, self.bent) ** 2))
+
+    def place_of(self, x: F64) -> SearchPoint:
+        self.taken += 1
+        here = errors(x, self.bent)
+        slopes = MATRIX * (1.0 + 3.0 * self.bent * (x - WANTED) ** 2)
+        return SearchPoint(float(here @ here), slopes.T @ here, slopes.T @ slopes)
+
+
+def settled(bent: float, low: float = -9.0, high: float = 9.0) -> tuple[F64, Counted]:
+    counted = Counted(bent)
+    bounds = np.full(3, low), np.full(3, high)
+    return settle(counted.sum_of, counted.place_of, np.zeros(3), bounds, UNIT), counted
+
+
+@pytest.mark.parametrize("bent", [0.0, 0.1])
+def test_the_end_is_found(bent: float) -> None:
+    x, _ = settled(bent)
+    assert np.abs((x - WANTED) / UNIT).max() < 3.0 * SETTLED_STEP
+
+
+def test_a_bound_is_kept_and_the_rest_is_best_on_it() -> None:
+    x, _ = settled(0.0, low=-1.0, high=0.8)
+    assert x[:2] == pytest.approx([0.8, -1.0], abs=SETTLED_STEP)
+    rest = errors(np.array([0.8, -1.0, 0.0]), 0.0)
+    best = -(MATRIX[:, 2] @ rest) / (MATRIX[:, 2] @ MATRIX[:, 2])
+    assert x[2] == pytest.approx(best, abs=2.0 * SETTLED_STEP * UNIT[2])
+
+
+def test_a_start_beyond_its_bounds_is_brought_within() -> None:
+    counted = Counted(0.0)
+    bounds = np.full(3, -3.0), np.full(3, 3.0)
+    x = settle(counted.sum_of, counted.place_of, np.full(3, 50.0), bounds, UNIT)
+    assert np.abs(x).max() <= 3.0
+
+
+def test_no_more_steps_than_there_may_be() -> None:
+    _, counted = settled(30.0)
+    assert counted.tried <= TRIALS
+    assert counted.taken <= STEPS + 1
+
+
+def test_what_makes_no_difference_stays() -> None:
+    """No slope and no curvature: neither is divided by."""
+
+    def place_of(x: F64) -> SearchPoint:
+        return SearchPoint(
+            float((x[0] - 2.0) ** 2), np.array([x[0] - 2.0, 0.0]), np.diag([1.0, 0.0])
+        )
+
+    bounds = np.full(2, -9.0), np.full(2, 9.0)
+    found = settle(lambda x: (x[0] - 2.0) ** 2, place_of, np.full(2, 0.5), bounds, np.ones(2))
+    assert found == pytest.approx([2.0, 0.5], abs=SETTLED_STEP)
