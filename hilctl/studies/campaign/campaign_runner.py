@@ -17,11 +17,11 @@ from hilctl.studies.campaign.plan import CampaignPlan, PlannedStep, planned
 from hilctl.studies.campaign.steps import CampaignStep, CampaignSteps
 from hilctl.studies.campaign.store import (
     await_runs,
-    held_folder,
-    last_begun,
-    make_whole,
+    completed_runs,
+    last_started,
+    locked_folder,
     new_recording,
-    standing_runs,
+    repair_recordings,
 )
 from hilctl.studies.campaign.table import CampaignRow, entry_of, write_table
 from hilctl.studies.multi_run.collect import COMPLETED, series_of
@@ -168,11 +168,11 @@ def prepared(folder: Path, host: CampaignHost) -> Iterator[None]:
     Raises:
         InputError: Another campaign or a run writes to it.
     """
-    with held_folder(folder, host.sleep_s):
+    with locked_folder(folder, host.sleep_s):
         await_runs(folder, host.sleep_s)
         for orphan in recover_orphans():
             host.on_note(f"{orphan.name}: recording was incomplete: {orphan.text}")
-        for text in make_whole(folder):
+        for text in repair_recordings(folder):
             host.on_note(text)
         yield
 
@@ -184,13 +184,13 @@ def planned_in_real_time(campaign: CampaignSteps, folder: Path, now_s: float) ->
         ConfigError: One or more steps are not allowed.
         InputError: The base experiment can't be read.
     """
-    standing = standing_runs(folder) if folder.is_dir() else {}
-    last = last_begun(folder) if folder.is_dir() else None
-    plan = planned(campaign, folder, standing, 0.0)
+    completed = completed_runs(folder) if folder.is_dir() else {}
+    last = last_started(folder) if folder.is_dir() else None
+    plan = planned(campaign, folder, completed, 0.0)
     if not plan.left:
         return plan
     heat_a2 = _heat_a2(plan.left[0], last, now_s)
-    return planned(campaign, folder, standing, heat_a2) if heat_a2 > 0.0 else plan
+    return planned(campaign, folder, completed, heat_a2) if heat_a2 > 0.0 else plan
 
 
 def _heat_a2(each: PlannedStep, last: Path | None, now_s: float) -> float:
@@ -238,7 +238,7 @@ class _Steps:
 
     def __init__(self, state: Campaign, host: CampaignHost) -> None:
         self._state, self._host, self._plan = state, host, state.plan
-        self._last = last_begun(self._plan.folder)
+        self._last = last_started(self._plan.folder)
         self._runner = StepRunner(host, self._plan.seconds + self._plan.pauses_s)
 
     def run(self, each: PlannedStep) -> None:

@@ -26,7 +26,7 @@ from hilctl.studies.campaign.campaign_runner import (
 )
 from hilctl.studies.campaign.plan import CampaignPlan, PlannedStep, planned
 from hilctl.studies.campaign.steps import CampaignSteps
-from hilctl.studies.campaign.store import new_recording, standing_runs
+from hilctl.studies.campaign.store import completed_runs, new_recording
 from hilctl.studies.campaign.table import CampaignRow
 from hilctl.studies.multi_run.collect import COMPLETED
 from hilctl.studies.multi_run.digest import RunDigest, RunFigures, digest_of
@@ -91,7 +91,7 @@ def planned_fast(campaign: CampaignSteps, folder: Path) -> CampaignPlan:
         ConfigError: One or more steps are not allowed.
         InputError: A device is not simulated.
     """
-    plan = planned(campaign, folder, standing_runs(folder) if folder.is_dir() else {})
+    plan = planned(campaign, folder, completed_runs(folder) if folder.is_dir() else {})
     for each in plan.steps:
         info = each.loaded.device.info
         if not info.simulated:

@@ -95,7 +95,7 @@ class CampaignPlan:
 def planned(
     campaign: CampaignSteps,
     folder: Path,
-    standing: Mapping[RunKey, Sequence[Path]],
+    completed: Mapping[RunKey, Sequence[Path]],
     heat_a2: float | None = None,
     on_part: Callable[[float], None] = lambda part: None,
 ) -> CampaignPlan:
@@ -104,7 +104,7 @@ def planned(
     Args:
         campaign: The campaign.
         folder: Folder of the recordings.
-        standing: Completed recordings, in their order.
+        completed: Completed recordings, in their order.
         heat_a2: Heat of the coil before the first step, in A^2; None for steps without real time,
             where kept steps heat the coil as well.
         on_part: Called with progress from 0 to 1.
@@ -114,7 +114,7 @@ def planned(
         InputError: The base experiment can't be read.
     """
     files, problems = TextFiles(), _Problems(campaign)
-    left = {key: list(paths) for key, paths in standing.items()}
+    left = {key: list(paths) for key, paths in completed.items()}
     known: dict[tuple[str, ...], PlannedStep] = {}
     steps: list[PlannedStep] = []
     for number, step in enumerate(campaign.steps):

@@ -45,7 +45,7 @@ def campaign_folder(campaign: CampaignSteps) -> Path:
 
 
 @contextmanager
-def held_folder(
+def locked_folder(
     folder: Path, sleep_s: Callable[[float], None], wait_s: float = 5.0
 ) -> Iterator[None]:
     """Create a campaign's folder, and lock it against other campaigns.
@@ -114,7 +114,7 @@ def _is_in(run: RunFolder, folder: Path) -> bool:
     return Path(run.card.recording).parent == folder.resolve()
 
 
-def make_whole(folder: Path) -> list[str]:
+def repair_recordings(folder: Path) -> list[str]:
     """Repair truncated recordings; return one line per repaired file.
 
     A file of a run that never started has no samples: an empty file is deleted, and one with an
@@ -143,7 +143,7 @@ def _put_aside(path: Path) -> list[str]:
     return [f"{path}: run never started; kept as {torn.name}"]
 
 
-def standing_runs(folder: Path) -> dict[RunKey, list[Path]]:
+def completed_runs(folder: Path) -> dict[RunKey, list[Path]]:
     """Return the recordings of completed runs in a folder, sorted by name."""
     found: dict[RunKey, list[Path]] = {}
     for path in recordings_in(folder):
@@ -153,7 +153,7 @@ def standing_runs(folder: Path) -> dict[RunKey, list[Path]]:
     return found
 
 
-def last_begun(folder: Path) -> Path | None:
+def last_started(folder: Path) -> Path | None:
     """Return the recording in a folder that started last; None without any."""
     begun = []
     for path in recordings_in(folder):

@@ -26,7 +26,7 @@ from hilctl.studies.characterise.results import (
     Measured,
     StepRow,
     identified,
-    judged,
+    validated,
 )
 from hilctl.studies.characterise.steps import STEPS, CharacterisationStep
 from hilctl.studies.characterise.waveforms import Keys, at_rest, within
@@ -316,7 +316,7 @@ class CharacterisationRunner:
         rest = self._measured.rest
         try:
             found = identified(self._recordings)
-            apart = judged(found.fit.model, self._recordings, rest.noise_um if rest else 0.0)
+            apart = validated(found.fit.model, self._recordings, rest.noise_um if rest else 0.0)
         except InputError as error:
             remedy = "check the loops on the page, or run 'hilctl identify' on the recordings"
             raise RigProblemError("no_model", f"no model identified: {error}", remedy) from None

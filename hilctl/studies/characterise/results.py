@@ -210,7 +210,7 @@ FITTED = ("slow-loops", "fast-loops", "creep", "small-motions", "training")
 """Steps for identification. Each starts with a motion of full amplitude, which erases the earlier
 history."""
 
-JUDGED: Mapping[str, str] = {
+VALIDATED: Mapping[str, str] = {
     "held-out": "random reference",
     "reversal-curves": "first-order reversal curves",
     "biased-loops": "small loops all over the range",
@@ -249,18 +249,18 @@ def _history(recording: Recording) -> History:
     return History(recording.path.name, *signals, recording.sample_rate_hz)
 
 
-def judged(
+def validated(
     model: HysteresisModel, recordings: Mapping[str, Path], noise_um: float
 ) -> tuple[ValidationReference, ...]:
     """Validate a model on recordings that were not used to identify it."""
     return tuple(
-        held_out(model, read(recordings[name]), noise_um, label)
-        for name, label in JUDGED.items()
+        validate(model, read(recordings[name]), noise_um, label)
+        for name, label in VALIDATED.items()
         if name in recordings
     )
 
 
-def held_out(
+def validate(
     model: HysteresisModel, recording: Recording, noise_um: float, label: str
 ) -> ValidationReference:
     """Validate a model on a recording.

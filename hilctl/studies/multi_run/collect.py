@@ -174,11 +174,14 @@ class RunSeries:
         return tuple(run for run in self.runs if run.completed and not run.is_reference)
 
     @cached_property
+    def measured(self) -> tuple[tuple[SeriesRun, RunDigest], ...]:
+        """Completed runs with a readable recording, each with its digest."""
+        return tuple((run, run.digest) for run in self.done if run.digest is not None)
+
+    @cached_property
     def dimensions(self) -> tuple[VariedParameter, ...]:
         """Varied parameters of the completed runs."""
-        units = {
-            str(value_at(run.digest.values, "waveform.unit")) for run in self.done if run.digest
-        }
+        units = {str(value_at(digest.values, "waveform.unit")) for _, digest in self.measured}
         unit = units.pop() if len(units) == 1 else ""
         return dimensions(self.keys, [run.values for run in self.done], unit)
 

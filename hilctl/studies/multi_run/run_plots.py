@@ -3,7 +3,7 @@
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import cycle
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import matplotlib as mpl
 import numpy as np
@@ -19,6 +19,7 @@ from hilctl.studies.multi_run.minor_loops import minor_parts
 from hilctl.studies.multi_run.varied_parameter import WITHOUT_COMPENSATOR, VariedParameter
 
 Item = TypeVar("Item")
+Measured: TypeAlias = tuple[SeriesRun, RunDigest]
 
 _SIGNS = ("o", "s", "^", "D", "v", "P", "X", "<", ">")
 _LINES = ("-", "--", "-.", ":")
@@ -89,20 +90,19 @@ def loop_sheets(series: RunSeries) -> Iterator[FigureSpec]:
             yield FigureSpec(name, caption, tuple(panels), alike=_alike(groups))
 
 
-def _alike(groups: Sequence[tuple[str, Sequence[SeriesRun]]]) -> bool:
+def _alike(groups: Sequence[tuple[str, Sequence[Measured]]]) -> bool:
     """Return whether all loops have the same input, so that their panels can share axes."""
-    digests = [run.digest for _, runs in groups for run in runs if run.digest is not None]
-    return len({_input_axis(digest) for digest in digests}) == 1
+    return len({_input_axis(digest) for _, runs in groups for _, digest in runs}) == 1
 
 
-def _groups(series: RunSeries, along: VariedParameter) -> list[tuple[str, list[SeriesRun]]]:
+def _groups(series: RunSeries, along: VariedParameter) -> list[tuple[str, list[Measured]]]:
     """Return groups of runs that differ in one parameter only, with their common values."""
     others = [each for each in series.dimensions if each is not along]
-    found: dict[tuple[Hashable, ...], dict[Hashable, SeriesRun]] = {}
-    for run in series.done:
-        if run.digest is not None and run.digest.loop.size:
+    found: dict[tuple[Hashable, ...], dict[Hashable, Measured]] = {}
+    for run, digest in series.measured:
+        if digest.loop.size:
             held = tuple(run.values.get(each.key) for each in others)
-            found.setdefault(held, {}).setdefault(run.values.get(along.key), run)
+            found.setdefault(held, {}).setdefault(run.values.get(along.key), (run, digest))
     order = {each.key: {v: n for n, v in enumerate(each.values)} for each in others}
 
     def place(held: tuple[Hashable, ...]) -> list[int]:
@@ -121,26 +121,23 @@ def _input_axis(digest: RunDigest) -> str:
     return "reference, µm" if digest.compensated else f"command, {digest.command_unit}"
 
 
-def _draw_loops(axes: Axes, along: VariedParameter, runs: Sequence[SeriesRun]) -> None:
+def _draw_loops(axes: Axes, along: VariedParameter, runs: Sequence[Measured]) -> None:
     shown = spread(runs)
     look = looks(along, spread(along.values))
-    own = looks(along, [run.values[along.key] for run in shown])
-    for run in shown:
-        if run.digest is not None:
-            value = run.values[along.key]
-            style = line_of(look.get(value) or own[value])
-            axes.plot(*run.digest.loop, **style, linewidth=0.9, label=along.text(value))
-            axes.set(xlabel=_input_axis(run.digest), ylabel=_DISPLACEMENT_AXIS)
+    own = looks(along, [run.values[along.key] for run, _ in shown])
+    for run, digest in shown:
+        value = run.values[along.key]
+        style = line_of(look.get(value) or own[value])
+        axes.plot(*digest.loop, **style, linewidth=0.9, label=along.text(value))
+        axes.set(xlabel=_input_axis(digest), ylabel=_DISPLACEMENT_AXIS)
 
 
 def minor_loop_sheet(series: RunSeries) -> FigureSpec | None:
     """Return loops with their minor loops, one panel per run; None without minor loops."""
     runs = [
-        run
-        for run in series.done
-        if run.digest is not None
-        and run.digest.loop.size
-        and (run.figures.minor_low_um or run.figures.minor_high_um)
+        (run, digest)
+        for run, digest in series.measured
+        if digest.loop.size and (run.figures.minor_low_um or run.figures.minor_high_um)
     ]
     if not runs:
         return None
@@ -150,29 +147,27 @@ def minor_loop_sheet(series: RunSeries) -> FigureSpec | None:
 
 
 def _panels(
-    series: RunSeries, runs: Sequence[SeriesRun], draw: Callable[..., None]
+    series: RunSeries, runs: Sequence[Measured], draw: Callable[..., None]
 ) -> tuple[tuple[Panel, ...], str]:
     """Return one panel per run, of a selection of many runs, and a note on the selection."""
     panels = tuple(
-        Panel(partial(draw, run=run), series.text(run), _SQUARE)
-        for run in spread(runs, _MOST_PANELS)
+        Panel(partial(draw, digest=digest), series.text(run), _SQUARE)
+        for run, digest in spread(runs, _MOST_PANELS)
     )
     return panels, f"; {len(panels)} of {len(runs)} runs" if len(panels) < len(runs) else ""
 
 
-def _draw_minor(axes: Axes, run: SeriesRun) -> None:
-    if run.digest is None:
-        return
-    loop = run.digest.loop
+def _draw_minor(axes: Axes, digest: RunDigest) -> None:
+    loop = digest.loop
     axes.plot(*loop, color=QUIET, linewidth=0.8, label="cycle")
     for part in minor_parts(loop[0, :-1], loop[1, :-1]):
         axes.plot(*part, color=MARK, linewidth=1.3, label="minor loop")
-    axes.set(xlabel=_input_axis(run.digest), ylabel=_DISPLACEMENT_AXIS)
+    axes.set(xlabel=_input_axis(digest), ylabel=_DISPLACEMENT_AXIS)
 
 
 def model_sheet(series: RunSeries) -> FigureSpec | None:
     """Return measured and modelled loops; None without models."""
-    runs = [run for run in series.done if run.digest is not None and run.digest.modelled.size]
+    runs = [each for each in series.measured if each[1].modelled.size]
     if not runs:
         return None
     panels, more = _panels(series, runs, _draw_model)
@@ -180,15 +175,12 @@ def model_sheet(series: RunSeries) -> FigureSpec | None:
     return FigureSpec("model_against_measured", caption, panels, alike=True)
 
 
-def _draw_model(axes: Axes, run: SeriesRun) -> None:
-    if run.digest is None:
-        return
-    command, measured, modelled = run.digest.modelled
+def _draw_model(axes: Axes, digest: RunDigest) -> None:
+    command, measured, modelled = digest.modelled
     axes.plot(command, measured, color=QUIET, linewidth=2.2, alpha=0.6, label="measured")
     axes.plot(command, modelled, color=DISPLACEMENT, linewidth=0.9, label="model")
-    unit = run.digest.command_unit
-    axes.set(xlabel=f"command, {unit}", ylabel=_DISPLACEMENT_AXIS)
-    _note(axes, f"error {quantity(run.digest.model_error_percent, '%')}")
+    axes.set(xlabel=f"command, {digest.command_unit}", ylabel=_DISPLACEMENT_AXIS)
+    _note(axes, f"error {quantity(digest.model_error_percent, '%')}")
 
 
 def before_after_sheet(series: RunSeries) -> FigureSpec | None:
@@ -208,25 +200,25 @@ def before_after_sheet(series: RunSeries) -> FigureSpec | None:
     return FigureSpec("before_and_after", caption, panels, alike=True)
 
 
-Pair = tuple[str, SeriesRun, list[tuple[str, SeriesRun]]]
+Pair = tuple[str, RunDigest, list[tuple[str, RunDigest]]]
 
 
 def pairs_of(series: RunSeries) -> list[Pair]:
     """Return each run without a compensator, with the runs of the same settings with one."""
-    with_loop = [run for run in series.done if run.digest is not None and run.digest.loop.size]
-    before = [run for run in with_loop if run.digest and not run.digest.compensated]
-    after = [run for run in with_loop if run.digest and run.digest.compensated]
+    with_loop = [each for each in series.measured if each[1].loop.size]
+    before = [each for each in with_loop if not each[1].compensated]
+    after = [each for each in with_loop if each[1].compensated]
     others = [each for each in series.dimensions if not each.is_compensator]
     found = []
-    for run in before:
+    for run, digest in before:
         same = [
-            (_compensator(other), other)
-            for other in after
+            (_compensator(other), with_one)
+            for other, with_one in after
             if all(run.values.get(e.key) == other.values.get(e.key) for e in others)
         ]
         if same:
             texts = [e.text(run.values[e.key]) for e in others if run.values.get(e.key) is not None]
-            found.append((", ".join(texts), run, same))
+            found.append((", ".join(texts), digest, same))
     return found
 
 
@@ -235,14 +227,13 @@ def _compensator(run: SeriesRun) -> str:
     return str(name) if name not in {None, "none"} else "with compensator"
 
 
-def _draw_pair(axes: Axes, before: SeriesRun, after: Sequence[tuple[str, SeriesRun]]) -> None:
+def _draw_pair(axes: Axes, before: RunDigest, after: Sequence[tuple[str, RunDigest]]) -> None:
     lines = [(WITHOUT_COMPENSATOR, before), *after]
     look = looks(None, [name for name, _ in lines])
     axes.plot([0, 100], [0, 100], color=REFERENCE, linestyle=":", linewidth=0.8)
-    for name, run in lines:
-        if run.digest is not None:
-            loop_input, moved = (_of_range(each) for each in run.digest.loop)
-            axes.plot(loop_input, moved, **line_of(look[name]), linewidth=0.9, label=name)
+    for name, digest in lines:
+        loop_input, moved = (_of_range(each) for each in digest.loop)
+        axes.plot(loop_input, moved, **line_of(look[name]), linewidth=0.9, label=name)
     axes.set(xlabel="input, % of its range", ylabel="displacement, %")
 
 
@@ -254,16 +245,15 @@ def _of_range(values: F64) -> F64:
 
 def error_sheet(series: RunSeries) -> FigureSpec | None:
     """Return the error over one cycle of compensated runs; None without any."""
-    runs = [run for run in series.done if run.digest is not None and run.digest.error_um.size]
+    runs = [each for each in series.measured if each[1].error_um.size]
     if not runs:
         return None
     along = next((each for each in series.dimensions if each.numeric), None)
     if along is None:
         groups = [("", runs)]
     else:
-        kept = {id(run) for run in runs}
         groups = [
-            (title, [run for run in members if id(run) in kept])
+            (title, [each for each in members if each[1].error_um.size])
             for title, members in _groups(series, along)
         ]
         groups = [(title, members) for title, members in groups if members] or [("", runs)]
@@ -281,16 +271,13 @@ def _text_of(series: RunSeries, along: VariedParameter | None) -> Callable[[Seri
     return lambda run: along.text(run.values[along.key])
 
 
-def _draw_error(axes: Axes, text: Callable[[SeriesRun], str], runs: Sequence[SeriesRun]) -> None:
+def _draw_error(axes: Axes, text: Callable[[SeriesRun], str], runs: Sequence[Measured]) -> None:
     shown = spread(runs)
-    names = [text(run) for run in shown]
     shades = looks(
         VariedParameter("", "", "", tuple(map(float, range(len(shown))))), range(len(shown))
     )
-    for number, (run, name) in enumerate(zip(shown, names, strict=True)):
-        if run.digest is not None:
-            style = line_of(shades[number])
-            axes.plot(*run.digest.error_um, **style, linewidth=0.9, label=name)
+    for number, (run, digest) in enumerate(shown):
+        axes.plot(*digest.error_um, **line_of(shades[number]), linewidth=0.9, label=text(run))
     axes.set(xlabel="phase, cycles", ylabel="error, µm", xlim=(0.0, 1.0))
 
 
@@ -307,11 +294,13 @@ def _note(axes: Axes, text: str) -> None:
 
 def step_sheet(series: RunSeries) -> FigureSpec | None:
     """Return displacements after a step, one panel per run; None without any."""
-    runs = [run for run in series.done if run.digest is not None and run.digest.step.size]
+    runs = [each for each in series.measured if each[1].step.size]
     if not runs:
         return None
     shown = spread(runs, _MOST_PANELS)
-    panels = tuple(Panel(partial(_draw_step, run=run), _title(series, run)) for run in shown)
+    panels = tuple(
+        Panel(partial(_draw_step, digest=digest), _title(series, run)) for run, digest in shown
+    )
     caption = "Displacement after a step of the command, with natural frequency and damping."
     return FigureSpec("step_response", caption, panels)
 
@@ -325,22 +314,20 @@ def _title(series: RunSeries, run: SeriesRun) -> str:
     return ", ".join(values) or series.text(run)
 
 
-def _draw_step(axes: Axes, run: SeriesRun) -> None:
-    if run.digest is None:
-        return
-    t, moved = run.digest.step
-    natural = run.figures.natural_hz
+def _draw_step(axes: Axes, digest: RunDigest) -> None:
+    t, moved = digest.step
+    natural, damping = digest.figures.natural_hz, digest.figures.damping_ratio
     axes.plot(1e3 * t, moved, **line_of(looks(None, [0])[0]))
     axes.set(xlabel="time after the step, ms", ylabel="displacement, µm")
-    if natural and run.figures.damping_ratio is not None:
-        text = f"{quantity(natural, 'Hz')}, damping ratio {significant(run.figures.damping_ratio)}"
+    if natural and damping is not None:
+        text = f"{quantity(natural, 'Hz')}, damping ratio {significant(damping)}"
         axes.annotate(text, (0.97, 0.06), xycoords="axes fraction", ha="right", fontsize=7,
                       color=QUIET)  # fmt: skip
 
 
 def frequency_sheet(series: RunSeries) -> FigureSpec | None:
     """Return small-signal responses, measured and fitted; None without any."""
-    runs = [run for run in series.done if run.digest and run.digest.response is not None]
+    runs = [each for each in series.measured if each[1].response is not None]
     if not runs:
         return None
     shown = spread(runs)
@@ -356,22 +343,21 @@ def frequency_sheet(series: RunSeries) -> FigureSpec | None:
 
 def _draw_response(
     axes: Axes,
-    runs: Sequence[SeriesRun],
+    runs: Sequence[Measured],
     along: VariedParameter | None,
     text: Callable[[SeriesRun], str],
     part: str,
 ) -> None:
-    values = [run.values.get(along.key) if along else text(run) for run in runs]
+    values = [run.values.get(along.key) if along else text(run) for run, _ in runs]
     look = looks(along, list(dict.fromkeys(values)))
-    for run, value in zip(runs, values, strict=True):
-        found = run.digest.response if run.digest else None
-        if found is None or run.digest is None:
+    for (run, digest), value in zip(runs, values, strict=True):
+        if (found := digest.response) is None:
             continue
         measured, fitted = (_part(each, part) for each in (found.response, found.fitted))
         colour = look[value]["color"]
         axes.plot(found.frequency_hz, measured, ".", color=colour, markersize=2.0, alpha=0.7)
         axes.plot(found.frequency_hz, fitted, color=colour, linewidth=0.9, label=text(run))
-        unit = run.digest.command_unit
+        unit = digest.command_unit
         axes.set_ylabel(f"magnitude, µm/{unit}" if part == "magnitude" else "phase, degrees")
     axes.set(
         xscale="log", xlabel="frequency, Hz", yscale="log" if part == "magnitude" else "linear"

@@ -41,7 +41,7 @@ B = {"b": ("x", "y")}
     ],
 )
 def test_ranges(text, values):
-    """Both ends are in it; what lies between is short enough to be read."""
+    """A range includes both ends; values between them are rounded."""
     assert values_of(text) == values
 
 
@@ -72,13 +72,13 @@ def test_mappings_are_crossed_and_their_keys_go_together():
 
 
 def test_alternating_never_goes_from_one_end_to_the_other():
-    """Neither within a pass nor between two."""
+    """Neither within a pass nor between passes."""
     assert ran({**A, **B}, "alternating") == ["1x", "1y", "2y", "2x", "3x", "3y"]
     assert ran(A, "alternating", repeat=2) == ["1", "2", "3", "3", "2", "1"]
 
 
 def test_random_is_the_same_for_a_seed():
-    """And runs everything."""
+    """All points are included."""
     first, again, other = (ran({**A, **B}, "random", seed, 2) for seed in (1, 1, 2))
     assert first == again != other
     assert sorted(first) == sorted(ran({**A, **B}, repeat=2))

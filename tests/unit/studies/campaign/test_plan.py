@@ -1,4 +1,4 @@
-"""Every step is held against its limits before the first one moves."""
+"""Plans: every step is checked in advance."""
 
 import pytest
 
@@ -19,7 +19,7 @@ def test_what_it_takes(campaign, tmp_path):
 
 
 def test_a_step_that_breaks_a_limit_is_refused_before_the_first_run(campaign, tmp_path):
-    """With the value's place in the campaign file, the step, and how many others there are."""
+    """The problem has the value's location in the campaign file and the first step."""
     text = CAMPAIGN.replace("[1.0, 2.0]", "[1.0, -2.0, 5.0]")
     with pytest.raises(ConfigError) as found:
         planned(campaign(text), tmp_path / "runs", {}, 0.0)
@@ -49,7 +49,7 @@ def test_no_experiment(campaign, experiment, tmp_path):
 
 
 def test_the_coil_cools_between_steps(campaign, tmp_path):
-    """As long as each step needs, and what the last run has left counts."""
+    """Pauses depend on each step and on the initial heat."""
     few = campaign(CAMPAIGN + HOT)
     cold, hot = (planned(few, tmp_path, {}, heat_a2) for heat_a2 in (0.0, 0.48))
     assert cold.steps[0].pause_s == 0.0
@@ -60,13 +60,15 @@ def test_the_coil_cools_between_steps(campaign, tmp_path):
     assert to.pauses_s > cold.pauses_s
 
 
-def test_what_stands_is_not_run(campaign, tmp_path):
-    """As often as it stands; another experiment's does not count."""
+def test_completed_steps_are_not_planned(campaign, tmp_path):
+    """Each recording counts once, for the same experiment only."""
     plan = planned(campaign(CAMPAIGN + "repeat: 2"), tmp_path, {}, 0.0)
-    standing = {plan.steps[0].key: [tmp_path / "a.mcap"]}
-    again = planned(campaign(CAMPAIGN + "repeat: 2"), tmp_path, standing, 0.0)
+    completed = {plan.steps[0].key: [tmp_path / "a.mcap"]}
+    again = planned(campaign(CAMPAIGN + "repeat: 2"), tmp_path, completed, 0.0)
     assert [each.kept is not None for each in again.steps] == [True] + [False] * 7
-    other = planned(campaign(CAMPAIGN + "set: {waveform.duration_s: 0.5}"), tmp_path, standing, 0.0)
+    other = planned(
+        campaign(CAMPAIGN + "set: {waveform.duration_s: 0.5}"), tmp_path, completed, 0.0
+    )
     assert len(other.left) == 4
 
 

@@ -1,4 +1,4 @@
-"""The steps of a campaign: settings over one experiment."""
+"""Steps of a campaign: settings over one experiment."""
 
 import json
 
@@ -19,8 +19,8 @@ def test_each_step_is_the_experiment_with_its_values(campaign):
     assert {each.name for each in loaded} == {"few"}
 
 
-def test_each_run_has_noise_of_its_own_that_depends_on_nothing_but_the_step(campaign):
-    """A value more, or another order, and what stands still counts."""
+def test_each_step_has_its_own_noise(campaign):
+    """Noise depends on the step only, not on order or number of steps."""
     texts = {}
     for text in (
         CAMPAIGN,

@@ -1,4 +1,4 @@
-"""The table of a campaign."""
+"""Table of a campaign."""
 
 import csv
 import os
@@ -26,7 +26,7 @@ def read_back(path):
 
 
 def test_every_step_is_a_row_whether_it_was_run_or_not(plan):
-    """Numbers read back as the same bits; what there is not is empty."""
+    """Numbers read back bit for bit; missing values are empty."""
     paths = write_table(plan, {1: DONE}, {"campaign": "few"})
     rows = read_back(paths[0])
     assert paths[0].name == "few.csv"

@@ -56,7 +56,7 @@ def reaction(limits, played, actuator, **more):
 
 @pytest.mark.parametrize("gain_um", [4.0, -4.0])
 def test_a_reaction_far_below_the_noise_shows_with_its_sign(limits, played, gain_um):
-    """The motion is 0.16 um, and each reading off by 0.2 um rms."""
+    """A motion of 0.16 um in noise of 0.2 um rms."""
     found = reaction(limits, played, lambda v: 3.0 + gain_um * v, noise_um=0.2)
     assert found.clear
     assert not found.even
@@ -86,13 +86,13 @@ def test_drift_is_no_reaction(limits, played):
 
 
 def test_the_phase_is_that_of_a_delay(limits, played):
-    """Ten samples at the middle frequency."""
+    """A delay of ten samples."""
     found = reaction(limits, played, lambda v: 4.0 * np.roll(v, 10))
     assert found.angle_deg == pytest.approx(360.0 * found.frequency_hz * 10 / 5000.0, rel=0.05)
 
 
 def test_a_segment_says_where_the_sine_is(make_recording):
-    """A run that ramped to its waveform has that before its segment."""
+    """A ramp before the segment is ignored."""
     index = np.arange(3000)
     command = np.where(index < 500, 1.0, np.sin(2.0 * np.pi * (index - 500) / 250.0))
     segment = Segment("sine", 500, 3000, 500, 3000, 250.0)
@@ -101,7 +101,7 @@ def test_a_segment_says_where_the_sine_is(make_recording):
 
 
 def test_what_creeps_in_a_rest_is_told_of_where_it_stands(limits, played):
-    """Either side, from a displacement that is not 0 at rest; nothing where nothing creeps."""
+    """Creep at both ends, with an offset at rest; none without creep."""
     creep = CreepModel(time_constants_s=(0.02, 3.0), shares=(0.1, 0.05))
 
     def creeping(command):
@@ -110,8 +110,7 @@ def test_what_creeps_in_a_rest_is_told_of_where_it_stands(limits, played):
 
     keys = rests(limits, limits.reach)
     found = crept_percent(played(limits, keys, creeping, noise_um=0.01))
-    # From a tenth of a second on the element of 0.02 s is through with it. What the other one has
-    # gone to on one side it must come back from on the other.
+    # After 0.1 s the element of 0.02 s has settled. The other one must return from the first side.
     rested_s = keys["parts"][1]["dwell_s"] - keys["parts"][1]["rise_s"] - 0.2
     once = 5.0 / 1.1 * -np.expm1(-rested_s / 3.0)
     assert found[0] == pytest.approx(once, rel=0.1)
@@ -124,7 +123,7 @@ RATE_HZ = 5000.0
 
 
 def resonator(natural_hz, damping_ratio):
-    """Return a second-order structure, sampled by matched poles, as a filter of gain 1."""
+    """Return a second-order resonator of gain 1, with matched poles."""
     pole = (
         2.0 * np.pi * natural_hz / RATE_HZ * (-damping_ratio + 1j * np.sqrt(1 - damping_ratio**2))
     )
@@ -147,7 +146,7 @@ def test_a_resonance_is_found(limits, played):
 
 
 def test_a_lag_and_a_delay_are_no_resonance(limits, played):
-    """Three samples late, behind a low-pass of 1 ms."""
+    """A delay of three samples and a low-pass of 1 ms."""
     kept = np.exp(-1.0 / (RATE_HZ * 1e-3))
     found = response(
         limits, played, lambda v: -2.0 + 4.0 * np.roll(lfilter([1 - kept], [1, -kept], v), 3)

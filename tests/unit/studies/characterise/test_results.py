@@ -20,12 +20,12 @@ from hilctl.studies.characterise.loops import LoopFigures, ReversalCurves
 from hilctl.studies.characterise.response import RestNoise
 from hilctl.studies.characterise.results import (
     FITTED,
-    JUDGED,
+    VALIDATED,
     Characterisation,
     Measured,
     StepRow,
     ValidationReference,
-    held_out,
+    validate,
 )
 from hilctl.studies.characterise.steps import STEPS
 
@@ -45,7 +45,7 @@ FOUND = Characterisation(
 
 
 def identification(grade="usable"):
-    """Return a straight line through two loops, with a verdict of its own."""
+    """Return the identification of a straight line, with a given verdict."""
     turns = np.linspace(0.0, 2.0 * np.pi, 60, endpoint=False)
     loops = [SteadyLoop(f"{a} A", a * np.sin(turns), 4.0 * a * np.sin(turns), 1.0) for a in (1, 2)]
     found = identify_records(FitRequest(loops, FitSettings(kind="straight"), "A"))
@@ -107,7 +107,7 @@ RATE_HZ = 1000.0
 
 @pytest.fixture
 def run(make_recording):
-    """A conditioning cycle, then a reference that is judged between 600 and 1900."""
+    """A conditioning cycle, then a reference that is evaluated between 600 and 1900."""
 
     def make(off_um=0.0, reach=1.0):
         command = reach * np.sin(np.arange(2000) ** 1.5 / 900.0)
@@ -120,20 +120,20 @@ def run(make_recording):
 
 def test_what_is_judged_is_not_fitted():
     names = [step.name for step in STEPS]
-    assert set(JUDGED) <= set(names)
+    assert set(VALIDATED) <= set(names)
     assert set(FITTED) <= set(names)
-    assert not set(FITTED) & set(JUDGED)
+    assert not set(FITTED) & set(VALIDATED)
 
 
 def test_a_perfect_model_has_no_error(run):
-    found = held_out(MODEL, run(), 0.0, "random reference")
+    found = validate(MODEL, run(), 0.0, "random reference")
     assert found.peak_percent < 1e-9
     assert found.label == "random reference"
     assert (found.time_s[0], found.time_s.size) == (0.6, 1300)
 
 
 def test_an_offset_is_an_error_and_is_told_apart(run):
-    found = held_out(MODEL, run(-0.5), 0.0, "x")
+    found = validate(MODEL, run(-0.5), 0.0, "x")
     whole_um = np.ptp(found.measured_um)
     assert found.peak_percent == pytest.approx(50.0 / whole_um)
     assert found.mean_percent == pytest.approx(50.0 / whole_um)
@@ -141,13 +141,13 @@ def test_an_offset_is_an_error_and_is_told_apart(run):
 
 
 def test_the_floor_is_what_noise_makes(run):
-    """Of 1300 normal values the largest is about 3.4 standard deviations."""
-    found = held_out(MODEL, run(), 0.01, "x")
+    """The largest of 1300 normal values is about 3.4 standard deviations."""
+    found = validate(MODEL, run(), 0.01, "x")
     assert found.floor_percent == pytest.approx(3.4 / np.ptp(found.measured_um), rel=0.05)
 
 
 def test_commands_that_the_model_was_not_found_on_are_not_judged(run):
-    assert held_out(MODEL, run(reach=1.5), 0.0, "x").time_s.size < 1000
+    assert validate(MODEL, run(reach=1.5), 0.0, "x").time_s.size < 1000
 
 
 def test_missing_samples_are_refused(make_recording, run):
@@ -160,11 +160,11 @@ def test_missing_samples_are_refused(make_recording, run):
         sample_rate_hz=RATE_HZ,
     )
     with pytest.raises(DataError, match="missing"):
-        held_out(MODEL, short, 0.0, "x")
+        validate(MODEL, short, 0.0, "x")
 
 
 def test_the_kind_is_chosen_on_whole_histories_of_what_may_be_fitted(run, monkeypatch):
-    """Named by their files; to the end of the last waveform at full size, gaps filled in."""
+    """Histories end with the last waveform at full amplitude, with gaps filled."""
     asked = []
 
     def identify(request):
@@ -173,7 +173,7 @@ def test_the_kind_is_chosen_on_whole_histories_of_what_may_be_fitted(run, monkey
 
     monkeypatch.setattr(results, "identify_records", identify)
     monkeypatch.setattr(results, "read", lambda path: run())
-    paths = {name: Path(f"{name}.mcap") for name in [*FITTED, *JUDGED, "growing-1"]}
+    paths = {name: Path(f"{name}.mcap") for name in [*FITTED, *VALIDATED, "growing-1"]}
     assert results.identified(paths) == "found"
     (request,) = asked
     records, settings, unit = request.records, request.settings, request.unit

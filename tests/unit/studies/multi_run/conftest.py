@@ -1,4 +1,4 @@
-"""Runs side by side, made of formulas."""
+"""Synthetic runs of a report."""
 
 from collections.abc import Callable
 from typing import Any

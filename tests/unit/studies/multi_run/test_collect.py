@@ -99,7 +99,7 @@ def test_a_campaign_s_table_says_what_varied_and_what_failed(folder):
     assert (series.name, series.is_campaign) == ("few", True)
     assert series.keys == ("waveform.amplitude",)
     assert series.runs[0].digest.name == "terfenol_sine_6a_uncompensated"
-    # What a table names lies beside it, whatever the table says.
+    # A recording is in the table's folder, whatever the table says.
     assert series.missing == (f"{folder / 'lost.mcap'}: no such file",)
     assert [run.number for run in series.failed] == [3]
     assert series.planned == 0

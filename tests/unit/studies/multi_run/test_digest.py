@@ -98,7 +98,7 @@ def test_minor_loops_at_either_end(make_recording):
 
 
 def test_a_step_s_ringing(make_recording):
-    """After the largest step, not before it."""
+    """The ringing after the largest step is evaluated."""
     omega = 2.0 * np.pi * 300.0
     ring = 1.0 - np.exp(-0.1 * omega * TIME) * np.cos(omega * np.sqrt(0.99) * TIME)
     moved = np.concatenate([np.zeros(TIME.size), 5.0 * ring])

@@ -1,4 +1,4 @@
-"""The page of many runs."""
+"""Page and JSON of many runs."""
 
 import json
 import math

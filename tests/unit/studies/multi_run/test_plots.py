@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from hilctl.base.errors import InputError
 from hilctl.studies.characterise.response import SmallSignal
 from hilctl.studies.multi_run.collect import RunSeries
+from hilctl.studies.multi_run.digest import RunFigures
 from hilctl.studies.multi_run.plots import (
     applying_sheets,
     frequency_sheet,
@@ -55,7 +56,7 @@ def test_what_compensators_leave_is_a_figure_of_its_own(compensated):
     lines = drawn(sheets["compensation_against_frequency"].panels[0]).lines
     assert [line.get_label() for line in lines] == ["without compensator", "omega"]
     error = drawn(sheets["compensation_against_frequency"].panels[1]).lines
-    # One compensator looks the same in every panel.
+    # A compensator has one colour in all panels.
     assert error[0].get_color() == lines[1].get_color()
 
 
@@ -122,8 +123,9 @@ def series(run):
 
 def test_a_step_with_its_resonance(make_run, make_digest):
     t = np.linspace(0.0, 0.01, 50)
-    run = make_run(1.0, 10.0, digest=make_digest(step=np.array((t, np.sin(t)))))
-    run = replace(run, figures=replace(run.figures, natural_hz=469.5, damping_ratio=0.12))
+    ringing = RunFigures(natural_hz=469.5, damping_ratio=0.12)
+    digest = make_digest(step=np.array((t, np.sin(t))), figures=ringing)
+    run = make_run(1.0, 10.0, digest=digest)
     axes = drawn(step_sheet(series(run)).panels[0])
     assert axes.lines[0].get_xdata()[-1] == 10.0
     assert axes.get_xlabel().endswith(", ms")

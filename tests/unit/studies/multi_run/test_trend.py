@@ -44,7 +44,7 @@ def test_directions(crossed):
 
 
 def test_two_points_have_no_fit_and_repeats_count_once(crossed):
-    """A line through two points says nothing about being one."""
+    """Two points give no linear fit."""
     along = by_name(crossed)["amplitude"]
     found = trends(crossed, AREA, along, [*crossed.runs, *crossed.runs])
     assert len(found) == 3
