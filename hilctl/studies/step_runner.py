@@ -1,7 +1,7 @@
 """Step runner of campaigns and characterisations: host, disk space, cooling and progress.
 
-The recordings are the checkpoint: a completed recording of the experiment that a step would run
-stands for that step. A study that was killed loses one run and resumes with the same command.
+The recordings are the checkpoint: a step is done if a completed recording of its experiment exists.
+A killed study loses one run and resumes with the same command.
 """
 
 import shutil

@@ -105,7 +105,7 @@ def values_of(given: Any) -> tuple[Any, ...]:
     if found[4] != "log":
         return _rounded(np.linspace(first, last, count))
     if not (first > 0.0 and last > 0.0):
-        raise ValueError("must have ends above 0 where it is log")
+        raise ValueError("must have ends above 0 with log")
     return _rounded(np.geomspace(first, last, count))
 
 

@@ -64,7 +64,7 @@ def locked_folder(
         # Windows has no locks and cannot open a folder.
         held = os.open(folder if HAS_LOCKS else os.devnull, os.O_RDONLY)
     except OSError as error:
-        raise InputError(f"{folder}: can't be made: {error.strerror}") from None
+        raise InputError(f"{folder}: can't be created: {error.strerror}") from None
     try:
         waited_s = 0.0
         while not _locked(held):

@@ -239,7 +239,7 @@ class CharacterisationRunner:
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise InputError(f"{self._folder}: can't be made: {error.strerror}") from None
+            raise InputError(f"{self._folder}: can't be created: {error.strerror}") from None
 
     def _run_steps(self) -> None:
         for number, step in enumerate(STEPS, 1):

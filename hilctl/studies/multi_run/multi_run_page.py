@@ -8,7 +8,7 @@ from typing import Any
 
 from hilctl.analysis import html
 from hilctl.analysis.html import definitions_of
-from hilctl.base.formatting import quantity, unit_text
+from hilctl.base.formatting import quantity
 from hilctl.studies.multi_run.collect import RunSeries, SeriesRun
 from hilctl.studies.multi_run.plots import sheets_of
 from hilctl.studies.multi_run.trend import (
@@ -21,8 +21,8 @@ from hilctl.studies.multi_run.trend import (
     PEAK_ERROR,
     RMS_ERROR,
     STROKE,
-    RunFigure,
     Trend,
+    axis_name,
     headline,
     trends,
 )
@@ -83,7 +83,7 @@ def run_table(
     """
     figures = [each for each in _COLUMNS if each.of(series.runs)]
     headings = ["run", *(each.axis for each in series.dimensions)]
-    headings += [each.short if short else _heading(series, each) for each in figures]
+    headings += [each.short if short else axis_name(series, each) for each in figures]
     last = _last(series, short=short)
     rows = [
         [
@@ -95,14 +95,6 @@ def run_table(
         for run in series.runs[:most]
     ]
     return [*headings, *last], rows
-
-
-def _heading(series: RunSeries, figure: RunFigure) -> str:
-    unit = unit_text(figure.unit)
-    if figure is AREA:
-        units = {run.digest.command_unit for run in series.runs if run.digest is not None}
-        unit = f"µm·{units.pop()}" if len(units) == 1 else ""
-    return f"{figure.text}, {unit}" if unit else figure.text
 
 
 def _last(series: RunSeries, *, short: bool) -> dict[str, Callable[[SeriesRun], str]]:

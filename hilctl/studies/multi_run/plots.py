@@ -42,6 +42,7 @@ from hilctl.studies.multi_run.trend import (
     STROKE,
     RunFigure,
     Trend,
+    axis_name,
     trends,
 )
 from hilctl.studies.multi_run.varied_parameter import VariedParameter
@@ -139,9 +140,8 @@ def draw_trends(axes: Axes, series: RunSeries, found: Sequence[Trend], *, fitted
     if logarithmic:
         axes.set_xscale("log")
         axes.xaxis.set_major_formatter("{x:g}")
-    unit = _unit(series, figure)
-    name = f"{figure.text}, {unit}" if unit else figure.text
-    axes.set(xlabel=along.axis, ylabel="\n".join(wrap(name, _LONGEST_NAME)))
+    name = "\n".join(wrap(axis_name(series, figure), _LONGEST_NAME))
+    axes.set(xlabel=along.axis, ylabel=name)
     everything = np.concatenate([trend.y for trend in found])
     low, high = float(everything.min()), float(everything.max())
     if low >= 0.0 and high > 0.0:
@@ -165,13 +165,6 @@ def _looks(first: VariedParameter | None, found: Sequence[Trend]) -> list[dict[s
 def _held(others: Sequence[VariedParameter], trend: Trend) -> str:
     texts = [e.text(trend.held[e.key]) for e in others if trend.held.get(e.key) is not None]
     return ", ".join(texts)
-
-
-def _unit(series: RunSeries, figure: RunFigure) -> str:
-    if figure is not AREA:
-        return unit_text(figure.unit)
-    units = {run.digest.command_unit for run in series.done if run.digest is not None}
-    return f"µm·{units.pop()}" if len(units) == 1 else "µm·A"
 
 
 def resonance_sheet(series: RunSeries) -> FigureSpec | None:
@@ -317,7 +310,7 @@ def write_sheets(
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{folder}: can't be made: {error.strerror}") from None
+        raise InputError(f"{folder}: can't be created: {error.strerror}") from None
     written: dict[Path, str] = {}
     captions = {sheet.name: sheet.caption for sheet in sheets}
     for name, figure in _drawn(sheets, width, on_done):
@@ -346,9 +339,9 @@ def applying_sheets(series: RunSeries) -> list[FigureSpec]:
     """Return all figures that apply to runs.
 
     Raises:
-        InputError: There is none.
+        InputError: No figure applies.
     """
     sheets = sheets_of(series)
     if not sheets:
-        raise InputError(f"{series.name}: no completed run holds what a figure could be drawn of")
+        raise InputError(f"{series.name}: no figure applies to the completed runs")
     return sheets

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from hilctl.base.formatting import quantity, significant
+from hilctl.base.formatting import quantity, significant, unit_text
 from hilctl.base.types import F64
 from hilctl.studies.multi_run.collect import RunSeries, SeriesRun
 from hilctl.studies.multi_run.varied_parameter import VariedParameter
@@ -67,6 +67,15 @@ def _asymmetry(run: SeriesRun) -> float | None:
     if low is None or high is None or not stroke:
         return None
     return 100.0 * abs(high + low) / stroke
+
+
+def axis_name(series: RunSeries, figure: RunFigure) -> str:
+    """Return the name of a metric with its unit; the unit of areas depends on the runs."""
+    unit = unit_text(figure.unit)
+    if figure is AREA:
+        units = {digest.command_unit for _, digest in series.measured}
+        unit = f"µm·{units.pop()}" if len(units) == 1 else ""
+    return f"{figure.text}, {unit}" if unit else figure.text
 
 
 ASYMMETRY = RunFigure("asymmetry_percent", "asymmetry", "%", "asym. %", _asymmetry)

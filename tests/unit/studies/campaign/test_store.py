@@ -62,7 +62,7 @@ def test_one_campaign_at_a_time(tmp_path):
     with locked_folder(folder, never):
         pass
     (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="can't be made"), locked_folder(tmp_path / "file", never):
+    with pytest.raises(InputError, match="created"), locked_folder(tmp_path / "file", never):
         pass
 
 

@@ -166,5 +166,5 @@ def test_each_figure_is_a_file_of_each_format(crossed, tmp_path):
 
 def test_no_figure_is_refused(crossed):
     nothing = replace(crossed, runs=())
-    with pytest.raises(InputError, match="no completed run"):
+    with pytest.raises(InputError, match="no figure applies"):
         applying_sheets(nothing)
