@@ -190,8 +190,7 @@ def test_disk_that_stands_still_longer_than_the_ring_ends_the_run(tmp_path):
     """The loop ramps down before the ring is full: nothing is lost."""
     process = start(tmp_path, code=stall(2.0), on_failure="stop")
     printed = end(process, 3)
-    assert printed["code"] == "fault"
-    assert "disk" in printed["reason"]
+    assert "disk keeps" in printed["reason"]
     assert printed["output_safe"]
     recording = read(tmp_path / "run.mcap")
     assert recording.dropped == 0
