@@ -1,4 +1,4 @@
-"""Doubles that tests of several rooms share: clocks, devices, hosts and links."""
+"""Test doubles for several rooms: clocks, devices, hosts and links."""
 
 import errno
 import io
@@ -35,7 +35,7 @@ from hilctl_drivers.transport.links import LostError, Missing, NoAnswerError
 
 @dataclass
 class FakeClock:
-    """Time moves only in sleeps; some of them, by number, last longer."""
+    """A clock that advances in sleeps only; sleeps with given numbers last longer."""
 
     now: int = 0
     stall_ns: dict[int, int] = field(default_factory=dict)
@@ -51,7 +51,7 @@ class FakeClock:
 
 @dataclass
 class ManualClock:
-    """Time in ns that passes only when a test lets it."""
+    """A clock in ns that the test advances."""
 
     now_ns: int = 1_000_000_000
 
@@ -64,7 +64,7 @@ class ManualClock:
 
 @dataclass
 class ShiftedClock:
-    """The machine's time in ns, and what a test lets pass on top."""
+    """The machine's clock in ns with an offset that the test advances."""
 
     extra_ns: int = 0
 
@@ -74,7 +74,7 @@ class ShiftedClock:
 
 @dataclass
 class SteppingClock:
-    """Time in s that goes on by a step whenever it is looked at."""
+    """A clock in s that advances by a step at each reading."""
 
     step_s: float = 0.0
     now: float = 0.0
@@ -86,7 +86,7 @@ class SteppingClock:
 
 @dataclass(frozen=True)
 class FakeInfo:
-    """What the loop asks of a device's info."""
+    """Device info for the loop."""
 
     measures_command: bool = False
     simulated: bool = False
@@ -96,7 +96,7 @@ class FakeInfo:
 
 @dataclass
 class FakeDevice:
-    """Answers ten times the last command; may break at a sample."""
+    """A device that returns ten times the last command, and may fail at a sample."""
 
     output_at_open: float = 0.0
     break_at: int = 10**9
@@ -128,10 +128,7 @@ class FakeDevice:
 
 @dataclass
 class FakeFifoDevice:
-    """Plays blocks later: the displacement of each sample is ten times the command before it.
-
-    It hands out each block's displacements ``latency`` exchanges after it was sent.
-    """
+    """A FIFO device that returns ten times the previous command, ``latency`` exchanges later."""
 
     info = FakeInfo(measures_command=True)
     latency: int
@@ -165,19 +162,19 @@ class FakeFifoDevice:
 
 
 class FakeHost:
-    """Keeps all that the loop gives it; asks for a stop or a tuning when told to.
+    """A host that stores all blocks of the loop, and requests a stop or a tuning.
 
     Args:
-        clock: Time.
-        block: Samples in a block.
-        state_size: Numbers of state kept with each block.
-        full: First samples of blocks that find no room.
-        stop: Why the run should end, or an empty text.
-        tunings: Changes of the reference by the sample at which they come.
+        clock: The clock.
+        block: Samples per block.
+        state_size: State values per block.
+        full: First samples of blocks that are dropped.
+        stop: Reason to end the run, or empty.
+        tunings: Changes of the reference, by sample.
 
     Attributes:
-        heads: Numbers of each recorded block, by :class:`BlockHeader`.
-        sent: First sample and commands of each block that was on its way, as they were then.
+        heads: Header of each recorded block, a :class:`BlockHeader`.
+        sent: First sample and commands of each pending block.
     """
 
     def __init__(
@@ -237,7 +234,7 @@ class FakeHost:
 
 
 def made_block(block=1, state_size=1, fill=np.nan):
-    """Return a block in memory of its own."""
+    """Return a new block."""
     area = BlockBatch.empty(1, block, state_size)
     area.columns[:] = fill
     return Block(area.heads[0].data.cast("B").cast("q"), area, 0)
@@ -245,7 +242,7 @@ def made_block(block=1, state_size=1, fill=np.nan):
 
 @dataclass(frozen=True)
 class RigInterlocks:
-    """What interlocks know of a rig and what they are set to, in one, so that tests can vary it."""
+    """Rig properties and settings of interlocks in one, so that tests can vary them."""
 
     stroke_um: tuple[float, float]
     sensor_um: tuple[float, float] = (-math.inf, math.inf)
@@ -279,7 +276,7 @@ class RigInterlocks:
 
 @dataclass(slots=True)
 class VirtualTime:
-    """Time that passes when told to, and by each message.
+    """A clock that advances on request and by each message.
 
     Attributes:
         now_ns: The time.
@@ -292,17 +289,17 @@ class VirtualTime:
         return self.now_ns * 1e-9
 
     def sleep(self, seconds: float) -> None:
-        """Let time pass."""
+        """Advance the clock."""
         self.now_ns += max(0, round(seconds * 1e9))
 
 
 class InProcessLink:
-    """A :class:`~hilctl_drivers.transport.links.Link` that hands each request to a wire.
+    """A :class:`~hilctl_drivers.transport.links.Link` that passes each request to emulated devices.
 
     Args:
         wire: Emulated devices and their framing.
-        time: Its time.
-        message_s: How long a request and its reply take.
+        time: The clock.
+        message_s: Duration of a request and its reply.
     """
 
     def __init__(self, wire: ModbusWire, time: VirtualTime, message_s: float = 0.0) -> None:
@@ -315,7 +312,7 @@ class InProcessLink:
 
     @property
     def name(self) -> str:
-        """Where it leads."""
+        """Its address."""
         return "in process"
 
     def open(self) -> None:
@@ -340,7 +337,7 @@ class InProcessLink:
         return reply
 
     def spoil(self, reply: bytes) -> bytes:
-        """Return what arrives of a reply; faults are made by overriding this."""
+        """Return the received reply; override it to inject faults."""
         return reply
 
     def close(self) -> None:
@@ -352,7 +349,7 @@ _READ_FUNCTIONS = (1, 2, 3, 4)
 
 
 def made_safe(device: Device, command: float, attempts: int = 50) -> int:
-    """Attempt to make a device safe until it confirms; return the number of attempts."""
+    """Call make_safe until the device confirms; return the number of attempts."""
     for attempt in range(1, attempts):
         try:
             device.make_safe(command)
@@ -364,13 +361,13 @@ def made_safe(device: Device, command: float, attempts: int = 50) -> int:
 
 
 class FaultyLink(InProcessLink):
-    """Loses requests, and delivers them later, when a test says so; over all connections.
+    """A link that loses or delays requests, over all connections.
 
     Attributes:
-        timeout_s: Time that a lost request costs.
-        silent_until_s: Time until which no request reaches the device.
-        late_s: How late the next write is carried out; None where nothing is wrong with it.
-        late_if: Which request that is.
+        timeout_s: Timeout of a lost request.
+        silent_until_s: Time until which requests are lost.
+        late_s: Delay of the next write; None for none.
+        late_if: Selects the delayed request.
     """
 
     timeout_s = 0.1
@@ -395,7 +392,7 @@ class FaultyLink(InProcessLink):
         raise NoAnswerError(f"no answer within {self.timeout_s:g} s")
 
     def deliver(self) -> None:
-        """Carry out what is due by now; nobody gets the answer."""
+        """Execute the due requests without an answer."""
         for due_s, request in self._held_back:
             if due_s <= self._time():
                 for asked in self._wire.requests(bytearray(request)):
@@ -405,14 +402,14 @@ class FaultyLink(InProcessLink):
 
 @dataclass(frozen=True, slots=True)
 class InProcess:
-    """An emulated device in the caller's process and time.
+    """An emulated device in the caller's process, with virtual time.
 
     Attributes:
         device: The device.
-        rig: What it drives.
-        link: Leads to it.
-        time: Its time.
-        log: What it writes; close it at the end.
+        rig: Its rig.
+        link: Link to it.
+        time: Its clock.
+        log: Its log; close it at the end.
     """
 
     device: EmulatedModbus
@@ -432,18 +429,18 @@ class InProcess:
         noise: bool = False,
         current_a: float | None = 0.0,
     ) -> "InProcess":
-        """Put one together, with the profile's first output and input.
+        """Return an emulated device with the profile's first output and input.
 
         Args:
-            profile: Name of a shipped Modbus profile, or path of one.
-            link: Makes the link.
+            profile: Name of a shipped Modbus profile, or a path.
+            link: Factory of the link.
             log: File for a log of every write.
-            message_s: How long a request and its reply take.
+            message_s: Duration of a request and its reply.
             noise: Whether the sensor has noise.
-            current_a: Current at the start; as the device powers up where None.
+            current_a: Initial current; the power-up value if None.
 
         Raises:
-            InputError: It is not a Modbus profile with an output and an input.
+            InputError: The profile is no Modbus profile with an output and an input.
         """
         loaded = load_profile(profile)
         if not isinstance(loaded, ModbusProfile) or not (loaded.outputs and loaded.inputs):
@@ -460,7 +457,7 @@ class InProcess:
 def emulated(
     options: EmulatorOptions, clock_ns: Callable[[], int] = time.monotonic_ns
 ) -> Iterator[Emulator]:
-    """Serve an emulator in a thread; its ``options`` say how to reach it."""
+    """Run an emulator in a thread; its ``options`` have its address."""
     emulator = build(options, clock_ns)
     thread = threading.Thread(target=emulator.server.run)
     thread.start()
@@ -473,13 +470,13 @@ def emulated(
 
 
 def logged(path: Path) -> list[dict]:
-    """Return what an emulated device says it put out, from a log that it may be writing still."""
+    """Return the outputs in an emulated device's log, which may still grow."""
     *lines, _half = path.read_text(encoding="utf-8").split("\n")
     return [json.loads(line) for line in lines]
 
 
 def loop_of(supervisor: int) -> int:
-    """Find a run's loop process among the children of its supervisor."""
+    """Return the process id of a run's loop process."""
     children = Path(f"/proc/{supervisor}/task/{supervisor}/children")
     for child in children.read_text().split():
         if b"hilctl.run.loop_process" in Path(f"/proc/{child}/cmdline").read_bytes():
@@ -488,7 +485,7 @@ def loop_of(supervisor: int) -> int:
 
 
 def received(descriptor: int, size: int, wait_s: float = 5.0) -> bytes:
-    """Read so many bytes of a line, which come in parts where the system is busy."""
+    """Read a number of bytes from a line, in several parts if necessary."""
     got = b""
     while len(got) < size and select.select([descriptor], [], [], wait_s)[0]:
         got += os.read(descriptor, size - len(got))
@@ -496,11 +493,11 @@ def received(descriptor: int, size: int, wait_s: float = 5.0) -> bytes:
 
 
 class FailingFile(io.FileIO):
-    """A file on a disk that refuses writes, or to bring them to the disk.
+    """A file with write and sync errors.
 
     Attributes:
-        room: Bytes that there is room for; a write beyond is cut, the next one refused.
-        write_errors: Error numbers of the next writes, in order; None for one that is accepted.
+        room: Free bytes; a write beyond is truncated, and the next one fails.
+        write_errors: Error numbers of the next writes, in order; None for success.
     """
 
     def __init__(self, path, mode="r+b"):

@@ -42,7 +42,7 @@ from hilctl.studies.campaign.steps import (
     load_campaign,
 )
 from hilctl.studies.campaign.table import CampaignRow
-from hilctl.studies.multi_run.columns import COMPLETED
+from hilctl.studies.multi_run.collect import COMPLETED
 
 _RESUMES = "the same command resumes from there"
 Folder = Annotated[

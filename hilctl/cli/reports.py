@@ -19,7 +19,7 @@ from hilctl.cli.run import render_report
 from hilctl.run.control.client import finish_dead_runs
 from hilctl.studies.multi_run.collect import RunSeries
 from hilctl.studies.multi_run.multi_run_page import MOST_ROWS, run_table, series_mapping
-from hilctl.studies.multi_run.summary_text import headline
+from hilctl.studies.multi_run.trend import headline
 
 RunsInput = Annotated[
     list[Path], typer.Argument(help="Recordings (MCAP), or a campaign folder.", metavar="RUN")

@@ -1,4 +1,4 @@
-"""The contract of devices must be able to fail: each of these breaks one rule, and is found out."""
+"""Devices that each break one rule of the contract; the contract tests must detect every one."""
 
 from collections import deque
 from dataclasses import replace
@@ -24,7 +24,7 @@ REFUSED = next(
 
 
 class Ideal:
-    """Keeps the contract: a spring without mass, whose output stays where it was put."""
+    """A spring without mass that keeps the contract; its output persists."""
 
     info = DeviceInfo(
         name="modbus_dac",
@@ -78,13 +78,13 @@ class Ideal:
 
 
 class GoesToTheEndsOfItsSensor(Ideal):
-    """Reads its lowest value at rest and its highest at the command that it is tried with."""
+    """A sensor that is at its lowest value at rest and at its highest at the test command."""
 
     info = replace(Ideal.info, sensor_min_um=0.0, sensor_max_um=0.5 * HIGHEST_A * UM_PER_A)
 
 
 class DrivesOneWay(Ideal):
-    """As supplies do, and amplifiers of piezos."""
+    """A unipolar output, like a power supply or a piezo amplifier."""
 
     info = replace(Ideal.info, command_min=0.0)
 
@@ -94,13 +94,13 @@ class KeepsJustThisRate(Ideal):
 
 
 class MovesLittle(Ideal):
-    """1.5 um at the command that it is tried with."""
+    """Moves 1.5 um at the test command."""
 
     um_per_a = 0.6
 
 
 class CountsItsSamples(Ideal):
-    """Takes no block that does not follow the one before; the first has number 0."""
+    """Rejects a block that does not follow the previous one; the first has number 0."""
 
     due = 0
 
@@ -123,7 +123,7 @@ class OpensOnlyWhenClosed(Ideal):
 
 
 class HasAnOffset(Ideal):
-    """Its sensor was not set to zero."""
+    """A sensor with an offset."""
 
     def exchange(self, first_sample, command, displacement_um, measured):
         super().exchange(first_sample, command, displacement_um, measured)
@@ -131,7 +131,7 @@ class HasAnOffset(Ideal):
 
 
 class MovesOnlyInTheEnd(Ideal):
-    """Nearly a whole block later."""
+    """Moves almost one block late."""
 
     def __init__(self):
         super().__init__()
@@ -145,7 +145,7 @@ class MovesOnlyInTheEnd(Ideal):
 
 
 class Sluggish(Ideal):
-    """Goes a twentieth of the way with each sample: 1.3 um after one block, 0.5 after two."""
+    """Approaches the target by 5 % per sample: 1.3 um left after one block, 0.5 um after two."""
 
     um_per_a = 28.0
     reached_um = 0.0
@@ -157,7 +157,7 @@ class Sluggish(Ideal):
 
 
 class BeginsAtRest(Ideal):
-    """As simulated ones do: with each opening."""
+    """Starts at rest at each opening, like a simulated device."""
 
     info = replace(Ideal.info, name="simulated_piezo")
 
@@ -186,7 +186,7 @@ class SafeOnlyWhileOpen(Ideal):
 
 
 class SafeOnceItWasOpen(Ideal):
-    """Can't connect by itself the first time."""
+    """make_safe cannot connect before the first opening."""
 
     was_open = False
 
@@ -200,7 +200,7 @@ class SafeOnceItWasOpen(Ideal):
 
 
 class SafeUntilItIsClosed(SafeOnceItWasOpen):
-    """Can't connect by itself again."""
+    """make_safe cannot connect after closing."""
 
     def make_safe(self, command):
         if self.is_open or not self.was_open:
@@ -208,7 +208,7 @@ class SafeUntilItIsClosed(SafeOnceItWasOpen):
 
 
 class SafeOnceItIsClosed(Ideal):
-    """Takes the safe value, and puts it out when nobody uses it any more."""
+    """Applies the safe value only when it is closed."""
 
     def make_safe(self, command):
         if self.is_open:
@@ -222,7 +222,7 @@ class SafeOnceItIsClosed(Ideal):
 
 
 class SafeOnlyOnce(Ideal):
-    """Until it is opened again."""
+    """Applies the safe value only once per opening."""
 
     was_safe = False
 
@@ -237,14 +237,14 @@ class SafeOnlyOnce(Ideal):
 
 
 class SafeElsewhere(Ideal):
-    """Puts out zero, whatever the safe value is."""
+    """Applies zero instead of the safe value."""
 
     def make_safe(self, command):
         self.current_a = 0.0
 
 
 class TakesTheFirstOfARamp(Ideal):
-    """Ignores safe values after the first one of a run."""
+    """Ignores safe values after the first one of a ramp."""
 
     was_safe = False
 
@@ -274,7 +274,7 @@ class MovesWhenItIsArmed(Ideal):
 
 
 class LiesAboutItsOutput(Ideal):
-    """Takes what it would like to be there for what is there."""
+    """Reports the last request instead of the actual output."""
 
     def output(self):
         self.need_open()
@@ -292,13 +292,13 @@ class SaysItsOutputWhenClosed(Ideal):
 
 
 class MovesTooLittle(Ideal):
-    """1 um at the command that it is tried with: as much as a reading may be off."""
+    """Moves 1 um at the test command, which is the tolerance of a reading."""
 
     um_per_a = 0.4
 
 
 class PutsOutHalf(Ideal):
-    """With a reading to go with it, as where the wiring's scale is wrong twice."""
+    """Applies half the command and reads accordingly, like a scale that is wrong twice."""
 
     um_per_a = 2.0 * UM_PER_A
 
@@ -308,7 +308,7 @@ class PutsOutHalf(Ideal):
 
 
 class NeverMoves(Ideal):
-    """Fills every reading with that of its rest."""
+    """Returns the reading at rest for every sample."""
 
     def exchange(self, first_sample, command, displacement_um, measured):
         super().exchange(first_sample, command, displacement_um, measured)
@@ -328,7 +328,7 @@ class ReadsBelowItsSensor(Ideal):
 
 
 class MeasuresNothing(Ideal):
-    """Says that it measures its command, and does not."""
+    """Claims to measure its current and does not."""
 
     info = replace(Ideal.info, measures_command=True)
 
@@ -349,14 +349,14 @@ class TakesMinusInfinity(Ideal):
 
 
 class TakesMore(Ideal):
-    """A little, above its range only."""
+    """Accepts commands slightly above its range."""
 
     def refuse(self, command):
         super().refuse(np.where(command > HIGHEST_A, command / 1.003, command))
 
 
 class TakesLess(Ideal):
-    """A little, below its range only."""
+    """Accepts commands slightly below its range."""
 
     def refuse(self, command):
         super().refuse(np.where(command < -HIGHEST_A, command / 1.003, command))
@@ -377,14 +377,14 @@ class Clips(Ideal):
 
 
 class ClipsWhatIsWritten(Ideal):
-    """Refuses nothing, and leaves its caller another command than it gave."""
+    """Clips commands in the caller's array instead of rejecting them."""
 
     def refuse(self, command):
         np.clip(np.nan_to_num(command, copy=False), -HIGHEST_A, HIGHEST_A, out=command)
 
 
 class SendsTheGoodPart(Ideal):
-    """Finds a bad value only when it comes to it."""
+    """Sends the samples before an invalid one."""
 
     def exchange(self, first_sample, command, displacement_um, measured):
         for j in range(command.size):
@@ -393,7 +393,7 @@ class SendsTheGoodPart(Ideal):
 
 
 class SendsALittle(Ideal):
-    """Of a block that it refuses."""
+    """Sends part of a block that it rejects."""
 
     def refuse(self, command):
         self.current_a = 0.05
@@ -401,14 +401,14 @@ class SendsALittle(Ideal):
 
 
 class RoundsItsRange(Ideal):
-    """Takes a little less than it says."""
+    """Rejects the ends of its stated range."""
 
     def refuse(self, command):
         super().refuse(command * 1.001)
 
 
 class Late(Ideal):
-    """Hands out the displacements of the block before."""
+    """Returns the displacements of the previous block."""
 
     def __init__(self):
         super().__init__()
@@ -422,7 +422,7 @@ class Late(Ideal):
 
 
 class Early(Ideal):
-    """Reads its sensor after the command has acted."""
+    """Reads its sensor after the command takes effect."""
 
     def exchange(self, first_sample, command, displacement_um, measured):
         super().exchange(first_sample, command, displacement_um, measured)
@@ -430,7 +430,7 @@ class Early(Ideal):
 
 
 class EarlyByAFifth(Ideal):
-    """Reads its sensor while the command begins to act: 0.5 um of the step that is tried."""
+    """Reads its sensor while the command takes effect: 0.5 um of the test step."""
 
     def exchange(self, first_sample, command, displacement_um, measured):
         super().exchange(first_sample, command, displacement_um, measured)
@@ -474,7 +474,7 @@ class MovesALittleAtOpen(Ideal):
 
 
 class MovesAtClose(Ideal):
-    """Lets go of its output with the port."""
+    """Releases its output when the port is closed."""
 
     def close(self):
         if self.is_open:
@@ -483,7 +483,7 @@ class MovesAtClose(Ideal):
 
 
 class OpensOnce(Ideal):
-    """Comes back without an error, but does not work any more."""
+    """Reopens without an error and does not work."""
 
     was_open = False
 
@@ -547,7 +547,7 @@ class SaysWhatIsNoText(Ideal):
 
 
 class ByChance(Ideal):
-    """Adds noise of a generator that nobody has seeded."""
+    """Adds noise from an unseeded generator."""
 
     def exchange(self, first_sample, command, displacement_um, measured):
         super().exchange(first_sample, command, displacement_um, measured)
@@ -648,7 +648,7 @@ def failures(kind):
 
 @pytest.mark.parametrize("kind", KEEPS_IT)
 def test_a_device_that_keeps_the_contract_fails_nothing(kind):
-    """So what others fail is what they break."""
+    """The base device passes, so a failure comes from the broken rule."""
     assert failures(kind) == set()
 
 
@@ -658,7 +658,7 @@ def test_a_device_that_breaks_the_contract_is_found_out(kind):
 
 
 def test_each_check_finds_somebody_out():
-    """A check that nobody could fail would be none."""
+    """Every check fails for at least one device."""
     checks = {name for name in vars(CONTRACT) if name.startswith("test_")}
     able = {f"test_{name}" for names in MUST_FAIL.values() for name in names}
     assert {name for name in checks - able if not name.endswith("_left_out")} == set()

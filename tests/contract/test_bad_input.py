@@ -1,4 +1,4 @@
-"""Bad input through the command line: one message, exit code 2, and nothing left behind."""
+"""Invalid input on the command line: one message, exit code 2, no files left."""
 
 import json
 import subprocess
@@ -53,7 +53,7 @@ def contents(folder: Path) -> dict[Path, bytes | None]:
 
 @pytest.fixture
 def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A working folder; what a run keeps in memory goes to a folder that must stay empty."""
+    """A working folder, and an empty folder for files in shared memory."""
     memory = tmp_path / "memory"
     memory.mkdir()
     monkeypatch.setenv("HILCTL_RUNS", str(memory))
@@ -80,7 +80,7 @@ def hilctl(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) 
 
 
 def check_refused(ended: Ended, message: str) -> None:
-    """Hold a command's end against what every refusal must be."""
+    """Check the properties of every rejection."""
     assert ended.code == 2
     assert "Traceback" not in ended.out + ended.err
     lines = ended.err.splitlines()
@@ -91,7 +91,7 @@ def check_refused(ended: Ended, message: str) -> None:
 
 
 def refused_everywhere(hilctl: Run, place: Path, message: str, *arguments: object) -> None:
-    """Check, run and run with JSON refuse alike and change no file."""
+    """check, run and run --json reject alike and change no file."""
     before = contents(place)
     for command in (("check",), ("run",), ("run", "--output", "run.mcap")):
         ended = hilctl(*command, *arguments)
@@ -169,7 +169,7 @@ BROKEN: list[tuple[str, str, str]] = [
     ("text", "message"), [case[1:] for case in BROKEN], ids=[case[0] for case in BROKEN]
 )
 def test_experiment(hilctl: Run, place: Path, text: str, message: str) -> None:
-    """A broken experiment is refused with file, line, key, rule and value."""
+    """An invalid experiment is rejected with file, line, key, rule and value."""
     (place / "x.yaml").write_text(text)
     (place / "model.yaml").write_text(MODEL)
     refused_everywhere(hilctl, place, message, "x.yaml")
@@ -190,24 +190,24 @@ def test_experiment(hilctl: Run, place: Path, text: str, message: str) -> None:
 def test_model_that_can_not_be_inverted(
     hilctl: Run, place: Path, old: str, new: str, message: str
 ) -> None:
-    """A model without an inverse is refused by its own file, with condition and index."""
+    """A model without an inverse is rejected with its file, condition and index."""
     (place / "x.yaml").write_text(IN_UM)
     (place / "model.yaml").write_text(MODEL.replace(old, new))
     refused_everywhere(hilctl, place, message, "x.yaml")
 
 
 def test_missing_experiment(hilctl: Run, place: Path) -> None:
-    """An experiment that is not there is named."""
+    """A missing experiment is named."""
     refused_everywhere(hilctl, place, "lost.yaml: no such file", "lost.yaml")
 
 
 def test_folder_instead_of_an_experiment(hilctl: Run, place: Path) -> None:
-    """A folder is no experiment."""
+    """A folder is rejected."""
     refused_everywhere(hilctl, place, "is not a file", place)
 
 
 def test_binary_experiment(hilctl: Run, place: Path) -> None:
-    """Bytes that are no text are no experiment."""
+    """A binary file is rejected."""
     (place / "x.yaml").write_bytes(bytes(range(256)))
     refused_everywhere(hilctl, place, "x.yaml: is not UTF-8 text", "x.yaml")
 
@@ -222,13 +222,13 @@ def test_binary_experiment(hilctl: Run, place: Path) -> None:
     ],
 )
 def test_setting(hilctl: Run, place: Path, setting: str, message: str) -> None:
-    """A broken setting is refused by the option it was given with."""
+    """An invalid setting is rejected with its option."""
     (place / "x.yaml").write_text(GOOD)
     refused_everywhere(hilctl, place, message, "x.yaml", "--set", setting)
 
 
 def test_every_problem_is_told(hilctl: Run, place: Path) -> None:
-    """Several problems are a line each, and a list for programs."""
+    """Each problem is one line, and one item in JSON."""
     (place / "x.yaml").write_text(
         GOOD.replace("block: 10", "block: 0.5").replace("unit: A", "unit: mA")
     )
@@ -249,7 +249,7 @@ class TestOutput:
 
     @pytest.fixture(autouse=True)
     def experiment(self, place: Path) -> None:
-        """Put down an experiment that may start, and a regular file."""
+        """Write a valid experiment and a regular file."""
         (place / "x.yaml").write_text(GOOD)
         (place / "regular").write_text("kept")
 
@@ -265,7 +265,7 @@ class TestOutput:
     def test_unwritable(
         self, hilctl: Run, place: Path, output: str, message: str, overwrite: tuple[str, ...]
     ) -> None:
-        """A recording that can't be created is refused before anything moves."""
+        """A recording that can't be created is rejected before anything moves."""
         before = contents(place)
         ended = hilctl("run", "x.yaml", "--output", output, *overwrite)
         check_refused(ended, message)
@@ -277,7 +277,7 @@ class TestOutput:
 
     @pytest.mark.parametrize("overwrite", [(), ("--overwrite",)])
     def test_folder(self, hilctl: Run, place: Path, overwrite: tuple[str, ...]) -> None:
-        """A folder can't be the recording, and is never replaced."""
+        """A folder is rejected as the recording and never replaced."""
         (place / "runs").mkdir()
         before = contents(place)
         ended = hilctl("run", "x.yaml", "--output", "runs", *overwrite)
@@ -285,7 +285,7 @@ class TestOutput:
         assert contents(place) == before
 
     def test_existing(self, hilctl: Run, place: Path) -> None:
-        """An existing recording is kept unless --overwrite says otherwise."""
+        """An existing recording is kept without --overwrite."""
         (place / "run.mcap").write_bytes(b"an older run")
         before = contents(place)
         ended = hilctl("run", "x.yaml", "--output", "run.mcap")
@@ -295,7 +295,7 @@ class TestOutput:
     def test_existing_is_kept_where_the_experiment_is_refused(
         self, hilctl: Run, place: Path
     ) -> None:
-        """With --overwrite an older recording still outlives an experiment that may not start."""
+        """An existing recording survives an invalid experiment, even with --overwrite."""
         (place / "run.mcap").write_bytes(b"an older run")
         before = contents(place)
         ended = hilctl("run", "x.yaml", "--overwrite", "--output", "run.mcap", "--set", "block=0")
@@ -303,7 +303,7 @@ class TestOutput:
         assert contents(place) == before
 
     def test_folder_for_recordings(self, hilctl: Run, place: Path) -> None:
-        """A folder for recordings that can't be made is refused."""
+        """A recording folder that can't be created is rejected."""
         before = contents(place)
         ended = hilctl("run", "x.yaml", "--set", "recording.folder=regular/runs")
         check_refused(ended, "regular/runs: can't be made: Not a directory")
@@ -317,12 +317,12 @@ class TestOtherCommands:
         "arguments", [("report", "{}"), ("replay", "{}"), ("export", "{}", "out.csv")]
     )
     def test_recording(self, hilctl: Run, place: Path, arguments: tuple[str, ...]) -> None:
-        """A recording that is missing, a folder, or no recording is refused by name."""
+        """A missing or invalid recording is rejected by name."""
         (place / "folder.mcap").mkdir()
         (place / "text.mcap").write_text("no recording")
         before = contents(place)
         folder = "can't be read: Is a directory"
-        if arguments[0] == "report":  # of a folder it judges all that is in it
+        if arguments[0] == "report":  # a folder stands for all of its recordings
             folder = "holds no recordings (*.mcap)"
         for name, message in [
             ("lost.mcap", "lost.mcap: no such file"),
@@ -339,13 +339,13 @@ class TestOtherCommands:
         assert contents(place) == before
 
     def test_schema(self, hilctl: Run, place: Path) -> None:
-        """A schema that can't be written is refused."""
+        """An unwritable schema file is rejected."""
         ended = hilctl("schema", "--output", "lost/schema.json")
         check_refused(ended, "lost/schema.json: can't be written: No such file or directory")
         assert contents(place) == {}
 
     def test_unknown_option(self, hilctl: Run, place: Path) -> None:
-        """An option that there is not is a matter of usage: exit code 2 as well."""
+        """An unknown option ends with exit code 2."""
         ended = hilctl("run", "--speed", "11")
         assert ended.code == 2
         assert "--speed" in ended.err
@@ -370,7 +370,7 @@ class TestOtherCommands:
     ids=["malformed", "not a number, for programs", "unwritable"],
 )  # fmt: skip
 def test_process(tmp_path: Path, text: str, arguments: tuple[str, ...], message: str) -> None:
-    """As a process of its own, too, a refusal is a message, an exit code, and nothing else."""
+    """A rejection in a separate process is a message and an exit code only."""
     (tmp_path / "x.yaml").write_text(text)
     before = contents(tmp_path)
     ended = subprocess.run(

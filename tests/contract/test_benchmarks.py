@@ -1,4 +1,4 @@
-"""Every benchmark starts: its imports and options exist."""
+"""Every benchmark script starts and prints its options."""
 
 import subprocess
 import sys

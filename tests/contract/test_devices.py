@@ -1,8 +1,8 @@
-"""The contract of every device that hilctl ships: the same tests for each.
+"""The device contract, tested for every shipped device.
 
-Simulated devices stand for themselves. Devices on a wire meet an emulator on loopback, one for each
-shipped profile: alone where it can drive and measure, else beside the one that it goes with. Its
-time passes by the exchanges, so that nothing depends on how fast this machine is.
+Simulated devices are tested directly. Devices with a transport are tested with an emulator on
+loopback, one per shipped profile, together with a second profile if one cannot drive and measure.
+The emulator's time advances with the exchanges, so results do not depend on the machine's speed.
 """
 
 import threading
@@ -37,7 +37,7 @@ PHYSICS = ("domains", "diffusion", "jiles_atherton")
 MODBUS = (
     "adam_6024", "beckhoff_bk9000", "generic_float32", "icp_et7000", "labjack_t4", "labjack_t7",
     "labjack_t8", "wago_750", "rtu",
-    # What drives, what reads, and whether they share a line or connection by unit id.
+    # Output profile, input profile, and whether they share a connection.
     "adam_4024 adam_4117 same", "adam_4024 adam_4117 own", "adam_6224 adam_6217 same",
     "adam_6224 adam_6217 own", "icp_m7024 icp_m7017 same", "waveshare_ao_8ch waveshare_ai_8ch same",
     "waveshare_ao_8ch_b waveshare_ai_8ch_b same", "adam_4024 adam_6217 own",
@@ -54,7 +54,7 @@ def simulated(kind: str, words: list[str]) -> DrivenDevice:
 
 
 def of_another_package(kind: str) -> DrivenDevice:
-    """Return a simulated device that is installed beside hilctl, or the example of one."""
+    """Return an installed third-party simulated device, or the example device."""
     chosen = EXAMPLES[kind]() if kind in EXAMPLES else device_class(kind)
     device = chosen(chosen.Options())
     if not device.info.simulated:
@@ -95,7 +95,7 @@ watchdog: none
 
 
 def modbus(words: list[str], stack: list[Callable[[], None]]) -> DrivenDevice:
-    """Return a modbus_dac that is wired to an emulator of the profile, or of two."""
+    """Return a modbus_dac connected to an emulator of one or two profiles."""
     clock = ManualClock()
     name, reader, line = [*words, None, None][:3]
     options = EmulatorOptions(name, reader=reader, reader_line=line, current_a=0.0)
@@ -124,7 +124,7 @@ def modbus(words: list[str], stack: list[Callable[[], None]]) -> DrivenDevice:
 
 
 def _fast(section: dict) -> dict:
-    """Return a section with a fast line, where it has one of its own."""
+    """Return a section with a fast serial line, if it has one."""
     return {**section, "baud": 115200} if "serial_port" in section else section
 
 
@@ -138,7 +138,7 @@ CASES = [
 
 @pytest.fixture
 def make(tmp_path) -> Iterator[Callable[[str], DrivenDevice]]:
-    """Return a function that makes a device of a kind; all are closed afterwards."""
+    """Return a factory of devices, which are closed afterwards."""
     benches: list[DrivenDevice] = []
     stack: list[Callable[[], None]] = []
 
@@ -165,19 +165,19 @@ def make(tmp_path) -> Iterator[Callable[[str], DrivenDevice]]:
 
 @pytest.fixture(params=CASES)
 def case(request) -> str:
-    """A device by its registry name, and the profile where it needs one."""
+    """A device by its registry name, with a profile if it needs one."""
     return request.param
 
 
 def test_no_device_is_left_out():
-    """Each device of the table is tried here, or in a file that is there."""
+    """Each registered device is tested here or in a named file."""
     assert {case.split()[0] for case in CASES} | set(ELSEWHERE) == {*BUILTIN, *OTHERS}
     folder = Path(__file__).parent
     assert [name for name in ELSEWHERE.values() if not (folder / name).exists()] == []
 
 
 def test_no_modbus_profile_is_left_out():
-    """Each shipped Modbus profile meets its own emulation, those that only read as readers."""
+    """Each shipped Modbus profile is tested with its emulation, input-only profiles as readers."""
     shipped = {name: load_profile(name) for name in shipped_profiles()}
     kept = {name: each for name, each in shipped.items() if isinstance(each, ModbusProfile)}
     pairs = [words.split()[:2] for words in MODBUS if words != "rtu"]

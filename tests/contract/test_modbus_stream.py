@@ -1,6 +1,6 @@
-"""The contract of ``modbus_stream``, the part of it that streams have, for each profile that can.
+"""The device contract of ``modbus_stream`` for each profile that can stream.
 
-Time is the test's own: it passes by the messages and by what the device waits.
+Virtual time advances with messages and waits.
 """
 
 import numpy as np
@@ -20,7 +20,7 @@ STREAMING = ("labjack_t4", "labjack_t7")
 
 
 class DrivenStream:
-    """A device that was not opened yet, and how to use it."""
+    """A closed device and its emulation."""
 
     def __init__(self, profile):
         self.profile = profile
@@ -64,14 +64,14 @@ class DrivenStream:
 
 @pytest.fixture(params=STREAMING)
 def driven(request):
-    """A device on an emulated one, for each profile."""
+    """A device with an emulator of each profile."""
     made = DrivenStream(request.param)
     yield made
     made.device.close()
 
 
 def test_no_streaming_profile_is_left_out():
-    """Each shipped profile that streams over Modbus meets its own emulation."""
+    """Each shipped profile that streams over Modbus is tested with its emulation."""
     shipped = {name: load_profile(name) for name in shipped_profiles()}
     assert {
         name
@@ -81,7 +81,7 @@ def test_no_streaming_profile_is_left_out():
 
 
 def test_says_what_it_is_before_it_is_opened(driven):
-    """Info is complete and sensible without a connection."""
+    """The device info is complete without a connection."""
     info = driven.device.info
     assert info.name == "modbus_stream"
     assert info.buffered
@@ -95,7 +95,7 @@ def test_says_what_it_is_before_it_is_opened(driven):
 
 
 def test_displacements_come_that_many_blocks_later(driven):
-    """The first exchanges leave their arrays alone; then each sample has its displacement."""
+    """The first exchanges leave their arrays unchanged; then each sample has its displacement."""
     driven.open()
     n, info = 10 * BLOCK, driven.device.info
     displacement_um, measured = driven.exchange(0, np.linspace(0.0, driven.middle, n))
@@ -108,7 +108,7 @@ def test_displacements_come_that_many_blocks_later(driven):
 
 
 def test_displacement_is_sampled_before_the_command_acts(driven):
-    """The sample of a jump still shows the rest; a later one does not."""
+    """The sample of a step still shows the initial displacement; a later one does not."""
     driven.open()
     command = np.zeros(10 * BLOCK)
     command[2 * BLOCK :] = driven.middle
@@ -119,7 +119,7 @@ def test_displacement_is_sampled_before_the_command_acts(driven):
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, "above", "below"])
 def test_refuses_what_it_can_not_do(driven, bad):
-    """A value that is not finite or out of range is refused whole: nothing of the block is sent."""
+    """A block with a non-finite or out-of-range value is rejected, and no part of it is sent."""
     driven.open()
     info = driven.device.info
     value = {"above": info.command_max * 1.001 + 1e-6, "below": info.command_min * 1.001 - 1e-6}
@@ -155,14 +155,14 @@ def test_use_before_open_and_after_close_is_refused(driven):
 
 
 def test_a_block_of_another_size_is_refused(driven):
-    """Its size was agreed at open."""
+    """The block size is fixed at open."""
     driven.open()
-    with pytest.raises(DeviceError, match="block must be 50 samples"):
+    with pytest.raises(DeviceError, match="50 samples"):
         driven.exchange(0, np.zeros(BLOCK - 1))
 
 
 def test_opening_does_not_move_the_output(driven):
-    """What was put out before stays through closing and opening."""
+    """The output persists through closing and opening."""
     driven.open()
     driven.exchange(0, np.full(10 * BLOCK, driven.middle))
     held = driven.emulated.rig.current_a
@@ -173,13 +173,13 @@ def test_opening_does_not_move_the_output(driven):
 
 
 def test_rate_beyond_its_limit_is_refused(driven):
-    """A sample rate that it can't keep is refused at open."""
+    """An excessive sample rate is rejected at open."""
     with pytest.raises(DeviceError):
         driven.device.open(driven.device.info.max_rate_hz * 1.01, BLOCK)
 
 
 def test_make_safe_works_open_or_closed(driven):
-    """The last resort needs no open connection, and what is queued is not put out after it."""
+    """make_safe needs no open connection, and queued samples are not output after it."""
     rig, safe = driven.emulated.rig, 0.5 * driven.middle
     driven.device.make_safe(safe)
     assert rig.current_a == pytest.approx(safe, abs=1e-6)
@@ -197,7 +197,7 @@ def test_make_safe_works_open_or_closed(driven):
 
 
 def test_says_what_it_puts_out(driven):
-    """After opening it knows what stands there."""
+    """An opened device reports its output."""
     with pytest.raises(DeviceError):
         driven.device.output()
     driven.open()
@@ -209,7 +209,7 @@ def test_says_what_it_puts_out(driven):
 
 
 def test_two_of_a_kind_agree(driven):
-    """A second one with the same options gives the same bits: runs can be repeated."""
+    """Two devices with the same options return the same bits."""
     other = DrivenStream(driven.profile)
     command = np.linspace(0.0, driven.middle, 8 * BLOCK)
     results = []

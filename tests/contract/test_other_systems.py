@@ -1,4 +1,4 @@
-"""What needs no device works where Python lacks what only Linux has, and files behave otherwise."""
+"""Commands without a device work on systems without Linux-only modules and file semantics."""
 
 import json
 import os
@@ -20,7 +20,7 @@ SYSTEMS = ["win32", "darwin"] if sys.platform == "linux" else [sys.platform]
 
 
 def on(system: str, commands: list[list[str]], folder: Path) -> tuple[list[int | str], str]:
-    """Run commands in a folder of another system; return their codes and standard error."""
+    """Run commands as on another system; return their exit codes and standard error."""
     done = subprocess.run(
         [sys.executable, "-P", OTHER_SYSTEM, system],
         input=json.dumps(commands),
@@ -78,7 +78,7 @@ def test_the_offline_half_works(tmp_path: Path, system: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("system", SYSTEMS)
 def test_the_online_half_says_what_it_needs(tmp_path: Path, system: str) -> None:
-    """In one line, and exit code 2 or 3."""
+    """Commands that need Linux end with one line and exit code 2 or 3."""
     demo = str(CONFIGS / "demo.yaml")
     commands = [["run", demo], ["demo"], ["doctor"], ["live"], ["safe", demo],
                 ["devices", "probe", demo]]  # fmt: skip

@@ -1,4 +1,4 @@
-"""No command writes an output over a file that it reads, or over what it can't have written."""
+"""No command overwrites a file that it reads, or a file that it has not written."""
 
 import shutil
 from pathlib import Path
@@ -72,7 +72,7 @@ def files(place):
     ],
 )
 def test_an_output_is_no_input(hilctl, place, words):
-    """Not even with --overwrite: one message, and every file as it was."""
+    """An input is not overwritten even with --overwrite."""
     (place / "linked.mcap").symlink_to("run.mcap")
     (place / "run.csv").symlink_to("run.mcap")
     before = contents(place)
@@ -90,7 +90,7 @@ def test_what_is_written_over_was_written_by_the_same_command(hilctl, place, wor
 
 
 def test_an_empty_file_and_a_torn_recording_are_replaced(hilctl, place):
-    """Nothing is lost with them."""
+    """An empty file and a truncated recording are replaced."""
     for text in (b"", b"\x89MCA", (place / "run.mcap").read_bytes()[:5000]):
         (place / "run.mcap").write_bytes(text)
         ended = hilctl("run", "x.yaml", "--output", "run.mcap", "--overwrite")

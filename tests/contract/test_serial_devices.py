@@ -1,7 +1,7 @@
-"""The same contract for ``serial_dac``: every shipped profile of a serial line, emulated on a pty.
+"""The device contract of ``serial_dac`` for every shipped serial profile, emulated on a pty.
 
-The checks are those of ``test_devices.py``, run with the benches of this file. Where a device has
-no input, the sensor stands on another one, with a line of its own or on the same.
+The checks are those of ``test_devices.py``. If a device has no input, a second device reads the
+sensor, on its own or on the same line.
 """
 
 import time
@@ -45,7 +45,7 @@ watchdog: none
 SETTLED_NS = 2_000_000
 STREAM_RATE_HZ = 640.0
 BLOCK = 10
-FIFO_BLOCKS = 32  # 500 ms, which is what a busy machine may stall for
+FIFO_BLOCKS = 32  # 500 ms, the longest stall of a busy machine
 MUST_BE_AT_REST = {"kepco_bop", "tdk_lambda_gen"}
 
 
@@ -56,7 +56,7 @@ def serial_profiles():
 
 
 class EmulatorClock:
-    """The emulator's time: for streams the machine's, else it passes by the exchanges."""
+    """The emulator's time: real time for streams, otherwise advanced by exchanges."""
 
     def __init__(self, *, real):
         self.now_ns = 1_000_000_000
@@ -67,10 +67,10 @@ class EmulatorClock:
 
 
 class DrivenSerial:
-    """A serial_dac and how to use it, as the checks expect it.
+    """A serial_dac and its emulation, for the checks.
 
-    Behind a FIFO it holds the last command until the answers of what was sent have come. Where a
-    command is not answered, time passes only after it has arrived: another line is no faster.
+    With a FIFO, the last command is held until all answers have arrived. Without answers, time
+    advances only after a command has arrived.
     """
 
     name = "serial_dac"
@@ -108,13 +108,13 @@ class DrivenSerial:
             before = sent.copy()
             self.device.exchange(self._sent, sent, displacement_um[part], measured[part])
             assert np.array_equal(sent, before)
-            self._await(float(np.clip(sent[-1], -10.0, 10.0)))  # what the rig's amplifier gives
+            self._await(float(np.clip(sent[-1], -10.0, 10.0)))  # the rig's amplifier
             self._sent += self.block
         answers = displacement_um[held.size :]
         return answers[: command.size], measured[: command.size]
 
     def assert_stands(self, command):
-        """Wait for it: some commands are not answered, and another line is no faster."""
+        """Wait for the output, because some commands are not answered."""
         end_s = time.monotonic() + 5.0
         while abs(self.stands() - command) > contract.STEP:
             assert time.monotonic() < end_s, f"{command} A does not stand"
@@ -128,13 +128,13 @@ class DrivenSerial:
 
     @property
     def middle(self):
-        """A command well inside the range that is not the resting one."""
+        """A command well inside the range, different from the resting one."""
         info = self.device.info
         return 0.5 * (info.command_max + max(0.0, info.command_min))
 
 
 def wired(case, tmp_path, stack):
-    """Return a serial_dac that is wired to an emulator of the profile, or of two."""
+    """Return a serial_dac connected to an emulator of one or two profiles."""
     name, reader, line = [*case.split(), None, None][:3]
     profile = load_profile(name)
     path = tmp_path / f"{name}.yaml"
@@ -161,13 +161,13 @@ def wired(case, tmp_path, stack):
 
     made = DrivenSerial(device, rate_hz, clock, stands, stands if apart else None)
     made.must_be_at_rest = name in MUST_BE_AT_REST
-    made.reads_back = name != "adam_4024_ascii"  # which gives its last command, not its output
+    made.reads_back = name != "adam_4024_ascii"  # returns its last command, not its output
     return made
 
 
 @pytest.fixture
 def make(tmp_path):
-    """Return a function that makes a device of a profile; all are closed afterwards."""
+    """Return a factory of devices, which are closed afterwards."""
     with ExitStack() as stack:
         yield lambda name: wired(name, tmp_path, stack)
 
@@ -177,36 +177,36 @@ STREAMS = "cobs_board_fifo"
 
 @pytest.fixture(
     params=[
-        # Its FIFO runs empty in real time.
+        # The FIFO drains in real time.
         pytest.param(case, marks=pytest.mark.slow) if case == STREAMS else case
         for case in SERIAL
     ]
 )
 def case(request):
-    """A shipped profile of a serial device, and its reader where it needs one."""
+    """A shipped serial profile, with a reader if it needs one."""
     return request.param
 
 
 @pytest.fixture
 def driven(make, case):
-    """A device that was not opened yet."""
+    """A closed device."""
     return make(case)
 
 
 def test_opening_does_not_move_the_output(driven, case):
-    """Supplies that must be set up at 0 A are refused while current flows; others stay put."""
+    """Opening is rejected for supplies that need set-up at 0 A while current flows."""
     if case.split()[0] not in MUST_BE_AT_REST:
         contract.test_opening_does_not_move_the_output(driven)
         return
     driven.open()
     driven.exchange(np.full(5, driven.middle))
     driven.device.close()
-    with pytest.raises(DeviceError, match="no current may flow when it is taken over"):
+    with pytest.raises(DeviceError, match="no current"):
         driven.open()
 
 
 def test_no_serial_profile_is_left_out():
-    """Each shipped profile of a line of text or of frames meets its own emulation."""
+    """Each shipped serial profile is tested with its emulation."""
     drives = {case.split()[0] for case in SERIAL}
     reads = {word for case in SERIAL for word in case.split()[1:2]}
     assert drives | (reads - {"only_reads"}) == set(serial_profiles())

@@ -1,4 +1,4 @@
-"""The experiments and models that come with the project."""
+"""Shipped experiments and models are valid."""
 
 from pathlib import Path
 
@@ -14,14 +14,14 @@ MODELS = sorted(path.name for path in (CONFIGS / "models").glob("*.yaml"))
 
 
 def test_there_are_some() -> None:
-    """The lists that the other tests go through are not empty."""
+    """The lists of the other tests are not empty."""
     assert EXPERIMENTS
     assert MODELS
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_experiment(name: str) -> None:
-    """Each experiment loads, may start, and tells editors of its schema."""
+    """Each experiment is ready to run and refers to its schema."""
     path = CONFIGS / name
     first = path.read_text(encoding="utf-8").splitlines()[0]
     assert first == "# yaml-language-server: $schema=schema.json"

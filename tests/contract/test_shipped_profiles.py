@@ -1,4 +1,4 @@
-"""The shipped device profiles: each says what its vendor's documents say."""
+"""Shipped device profiles agree with the vendors' documents."""
 
 import pytest
 
@@ -109,14 +109,14 @@ EXCHANGES = {
 
 
 def modbus(name: str) -> ModbusProfile:
-    """Return a shipped profile that must speak Modbus."""
+    """Return a shipped Modbus profile."""
     profile = load_profile(name)
     assert isinstance(profile, ModbusProfile)
     return profile
 
 
 def text_based(name: str) -> AsciiProfile:
-    """Return a shipped profile that must speak lines of text."""
+    """Return a shipped text profile."""
     profile = load_profile(name)
     assert isinstance(profile, AsciiProfile)
     return profile
@@ -130,31 +130,31 @@ def name(request: pytest.FixtureRequest) -> str:
 
 
 class TestEach:
-    """What holds for every shipped profile."""
+    """Every shipped profile."""
 
     def test_names(self) -> None:
-        """All promised profiles are there, and no others."""
+        """The list of profiles is complete."""
         assert tuple(shipped_profiles()) == NAMES
 
     def test_no_two_alike(self) -> None:
-        """No two profiles are of the same device."""
+        """No two profiles describe the same device."""
         titles = [load_profile(name).title for name in NAMES]
         assert len(set(titles)) == len(titles)
 
     def test_schema_line(self, name: str) -> None:
-        """The first line tells editors where the schema is."""
+        """The first line refers to the schema."""
         text = (FOLDER / f"{name}.yaml").read_text(encoding="utf-8")
         assert text.startswith("# yaml-language-server: $schema=schema.json\n")
         assert max(map(len, text.splitlines())) <= 120
 
     def test_round_trip(self, name: str) -> None:
-        """A profile written out and read again is the same."""
+        """A profile survives writing and reading."""
         profile = load_profile(name)
         assert type(profile).model_validate(profile.model_dump()) == profile
         assert type(profile) in {profile_class(kind) for kind in link_kinds()}
 
     def test_provenance(self, name: str) -> None:
-        """Documents are named, and what is unverified is in the file and named once."""
+        """Documents are named, and each unverified value is in the file and named once."""
         profile = load_profile(name)
         document = load_document(FOLDER / f"{name}.yaml")
         assert profile.verified in {"partly", "no"}
@@ -163,7 +163,7 @@ class TestEach:
         assert all(document.holds(loc_of(key)) for key in profile.unverified)
 
     def test_no_sensor_is_said_so(self, name: str) -> None:
-        """A device that reads no sensor says in its notes that another one must."""
+        """The notes of an output-only device mention a second device for the sensor."""
         profile = load_profile(name)
         channels = profile.inputs.values()
         reads = [getattr(channel, "measures", "terminal") == "terminal" for channel in channels]
@@ -171,13 +171,13 @@ class TestEach:
         assert said is not any(reads)
 
     def test_no_output_is_said_so(self, name: str) -> None:
-        """A device that only reads says so, and beside which one that drives it can stand."""
+        """The notes of an input-only device name a device for the output."""
         profile = load_profile(name)
         said = [note for note in profile.notes if note.startswith("It only reads.")]
         assert bool(said) is not bool(profile.outputs)
 
     def test_watchdog(self, name: str) -> None:
-        """Unit, feeding and trip of the watchdog are the device's."""
+        """Unit, feeding and trip of the watchdog agree with the device."""
         watchdog = load_profile(name).watchdog
         if name not in WATCHDOGS:
             assert watchdog == "none"
@@ -190,7 +190,7 @@ class TestEach:
 
 
 class TestModbus:
-    """Registers on the wire."""
+    """Modbus registers."""
 
     @pytest.mark.parametrize(("name", "output", "address", "function", "value", "data"), OUTPUTS)
     def test_output(
@@ -217,32 +217,32 @@ class TestModbus:
 
     @pytest.mark.parametrize(("name", "key", "area", "address"), SPECIAL)
     def test_other_registers(self, name: str, key: str, area: str, address: int) -> None:
-        """Settings, watchdog and self test stand where the documents have them."""
+        """Addresses of settings, watchdog and self test agree with the documents."""
         profile = modbus(name)
         register = dict(profile.registers())[key]
         assert (register.area, profile.wire_address(register)) == (area, address)
 
     @pytest.mark.parametrize("name", [name for name in NAMES if name not in EXCHANGES])
     def test_two_transactions(self, name: str) -> None:
-        """Only devices whose documents have it use one transaction."""
+        """Devices without function 23 use two transactions."""
         profile = load_profile(name)
         if isinstance(profile, ModbusProfile):
             assert profile.exchange == "none"
 
     @pytest.mark.parametrize(("name", "function"), EXCHANGES.items())
     def test_one_transaction(self, name: str, function: int) -> None:
-        """The others write and read at once."""
+        """Devices with function 23 use one transaction."""
         assert modbus(name).exchange == function
 
     def test_waveshare_example(self) -> None:
-        """The vendor's own example frame comes out: register 0 set to 1000."""
+        """The vendor's example frame: register 0 set to 1000."""
         profile = modbus("waveshare_ao_8ch")
         channel = profile.outputs["AO0"]
         pdu = write_single_pdu(profile.wire_address(channel), channel.format.encode(1.0))
         assert rtu_adu(profile.unit_id, pdu).hex(" ") == "01 06 00 00 03 e8 89 74"
 
     def test_waveshare_input_examples(self) -> None:
-        """The vendor's own example frames come out: all eight values, and their settings."""
+        """The vendor's example frames: all eight inputs and their settings."""
         profile = modbus("waveshare_ai_8ch")
         values, settings = profile.inputs["AI0"], dict(profile.registers())["init.0"]
         frames = [
@@ -275,13 +275,13 @@ class TestModbus:
         assert register.format.decode(bytes.fromhex("8001")) == pytest.approx(-10.0)
 
     def test_resolution(self) -> None:
-        """The smallest step counts the bits that the device drops."""
+        """The resolution includes the bits that the device drops."""
         assert modbus("wago_750").outputs["AO0"].step == pytest.approx(8 * 10.0 / 32767)
         assert modbus("adam_4024").outputs["AO0"].step == pytest.approx(20.0 / 4095)
         assert modbus("labjack_t7").outputs["DAC0"].step == 1.22e-3
 
     def test_flash_is_not_rewritten(self) -> None:
-        """LabJack keeps its watchdog in flash: nothing is written that is right already."""
+        """LabJack keeps its watchdog settings in flash: unchanged values are not written."""
         for name in ("labjack_t4", "labjack_t7", "labjack_t8"):
             watchdog = modbus(name).watchdog
             assert watchdog != "none"
@@ -296,7 +296,7 @@ class TestModbus:
 
 
 class TestText:
-    """Lines on the wire."""
+    """Text lines."""
 
     @pytest.mark.parametrize(
         ("name", "output", "value", "line"),
@@ -310,7 +310,7 @@ class TestText:
         ],
     )
     def test_write(self, name: str, output: str, value: float, line: str) -> None:
-        """An output's line is the manual's, without exponents."""
+        """The output line agrees with the manual and has no exponent."""
         profile = text_based(name)
         address = 0 if profile.address == "none" else profile.address
         assert profile.outputs[output].write.format(value=value, address=address) == line
@@ -325,17 +325,17 @@ class TestText:
         assert line == "~013164"
 
     def test_kepco_exchange(self) -> None:
-        """One line sets the current and asks for it."""
+        """One line sets the current and reads it back."""
         profile = text_based("kepco_bop")
         assert profile.exchange != "none"
         assert profile.exchange.write.format(value=1.0) == "CURR 1.000000;:MEAS:CURR?"
 
     def test_gap(self) -> None:
-        """TDK-Lambda wants 5 ms between commands."""
+        """TDK-Lambda needs 5 ms between commands."""
         assert text_based("tdk_lambda_gen").link.min_gap_s == 0.005
 
     def test_no_timeout_in_outputs(self) -> None:
-        """An output's line needs nothing but the value and the address."""
+        """An output line contains the value and the address only."""
         for name in NAMES:
             profile = load_profile(name)
             if isinstance(profile, AsciiProfile):

@@ -1,6 +1,6 @@
-"""Runs of hilctl and emulated devices for the tests of this folder, each in processes of its own.
+"""Runs of hilctl and emulated devices in separate processes.
 
-What a device says it put out is the judge: its own log, not what hilctl believes.
+Tests assert the emulated device's own log of its output, not what hilctl reports.
 """
 
 import json
@@ -31,7 +31,7 @@ PATIENT_TIMING = {"on_misses": "warn", "max_late_s": 30.0, "hang_s": 30.0}
 
 
 def each_kind(cases, shown):
-    """Return cases for ``parametrize``; those that are much like one shown are long tests."""
+    """Return cases for ``parametrize``; all but the named ones are marked long."""
     return [
         pytest.param(
             *(case if isinstance(case, tuple) else (case,)),
@@ -55,14 +55,14 @@ EXPERIMENT = {
     "compensator": "none",
     "limits": {"peak_current_a": 5.0, "slew_a_per_s": 500.0, "stroke_um": [-100.0, 100.0]},
     "safe": {"value": 0.0, "ramp_s": 0.2},
-    # A busy machine must not decide what a test of something else says.
+    # Tolerance of a busy machine, for tests of other properties.
     "timing": {"on_misses": "warn", "max_late_s": 5.0, "hang_s": 5.0},
     "recording": {"flush_s": 0.1},
 }
 
 
 class Log:
-    """What an emulated device says it put out."""
+    """Log of an emulated device's output."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -84,7 +84,7 @@ class Log:
             time.sleep(0.02)
 
     def await_events(self, output: str, count: int, run: subprocess.Popen) -> None:
-        """Wait until so many events have come; the run that makes them must go on."""
+        """Wait for a number of events while the run continues."""
         deadline = time.monotonic() + 240.0
         while (seen := len(self.events(output))) < count:
             assert run.poll() is None, f"{seen} of {count}: {run.communicate()}"
@@ -93,7 +93,7 @@ class Log:
 
 
 class Run:
-    """A ``hilctl run`` in a process of its own."""
+    """A ``hilctl run`` in a separate process."""
 
     def __init__(self, folder: Path, device: dict, name: str = "run", **changes) -> None:
         path = folder / f"{name}.yaml"
@@ -107,44 +107,44 @@ class Run:
         )
 
     def loop_pid(self) -> int:
-        """Find the loop process among the run's children."""
+        """Return the process id of the run's loop process."""
         return loop_of(self.process.pid)
 
     def kill_all(self, number: int) -> None:
         """Send a signal to supervisor, loop and guardian at once."""
         children = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children")
-        # The supervisor first: it would start another guardian.
+        # Supervisor first, because it would restart the guardian.
         for pid in (self.process.pid, *map(int, children.read_text().split())):
             os.kill(pid, number)
         self.process.communicate(timeout=240)
 
     def end(self) -> dict:
-        """Wait for the end; return the JSON it printed."""
+        """Wait for the end; return the printed JSON."""
         out, err = self.process.communicate(timeout=240)
         assert "Traceback" not in err
         assert self.process.returncode == 3, err
         return json.loads(out)
 
     def refused(self) -> str:
-        """Wait until it is refused; return what it said, and see that it left no file."""
+        """Wait until the run is rejected; return its message and assert that it left no file."""
         _, err = self.process.communicate(timeout=240)
         assert self.process.returncode == 2, err
         assert not self.output.exists()
         return err
 
     def interrupt(self) -> dict:
-        """Press Ctrl-C; return the JSON it printed."""
+        """Send SIGINT; return the printed JSON."""
         self.process.send_signal(signal.SIGINT)
         out, err = self.process.communicate(timeout=240)
         assert self.process.returncode == 130, err
         return json.loads(out)
 
     def readable_samples(self) -> int:
-        """Return how many samples the recording gives, whole or cut short."""
+        """Return the number of readable samples of the recording, even if it is truncated."""
         return read(self.output).samples.index.size
 
     def assert_recorded(self, at_least: int):
-        """The recording is whole, readable, and replays bit for bit; return it."""
+        """Assert that the recording is complete and replays bit for bit; return it."""
         recording = read(self.output)
         assert recording.end["code"] == "fault"
         assert recording.end["recorded_samples"] == str(recording.samples.index.size)
@@ -153,21 +153,21 @@ class Run:
         return recording
 
     def assert_put_out(self, writes: list[dict], at_least: int = 100) -> None:
-        """Every command that the device executed in the run is in the recording.
+        """Assert that every executed command of the run is in the recording.
 
-        The last recorded one may have reached the device or not; what follows it is the way to
-        the safe value, which is no sample.
+        The last recorded command may or may not have reached the device. The ramp to the safe
+        value follows it and is not recorded.
         """
         samples = self.assert_recorded(at_least).samples
         put_out = np.array([each["current_a"] for each in writes])
         known = samples.index.size - 1
         commands = pytest.approx(samples.command[:known], abs=2e-3)
-        # Opening the device may repeat what the output held, some times.
+        # Opening the device may repeat the present output.
         assert any(put_out[first : first + known] == commands for first in range(4))
 
 
 class Emulated:
-    """A ``hilctl emulate`` in a process of its own."""
+    """A ``hilctl emulate`` in a separate process."""
 
     def __init__(self, folder: Path, *words: str, lines: int = 1) -> None:
         self.log = Log(folder / "writes.jsonl")
@@ -182,7 +182,7 @@ class Emulated:
         return self.addresses[0]
 
     def end(self) -> None:
-        """Tell it to end; it must."""
+        """Stop it, and assert that it ends."""
         self.process.terminate()
         self.process.communicate(timeout=30)
         assert self.process.returncode == 0
@@ -190,7 +190,7 @@ class Emulated:
 
 @pytest.fixture
 def emulate(tmp_path):
-    """Return a function that starts ``hilctl emulate``; all must end when told to."""
+    """Return a function that starts ``hilctl emulate``; all must end on request."""
     started = []
 
     def start(*words, lines=1):
@@ -204,7 +204,7 @@ def emulate(tmp_path):
 
 @pytest.fixture
 def run(tmp_path):
-    """Return a function that starts ``hilctl run`` on a device section; none outlives its test."""
+    """Return a function that starts ``hilctl run`` on a device section; all end with the test."""
     started = []
 
     def start(device, **changes):
@@ -220,7 +220,7 @@ def run(tmp_path):
 
 @pytest.fixture
 def profile():
-    """Return a function that gives the path of a profile of ``tests/data``."""
+    """Return a function that returns the path of a profile in ``tests/data``."""
     return lambda name: str(PROFILES / f"{name}.yaml")
 
 
@@ -244,13 +244,13 @@ class Device:
         }
 
     def has_not_moved(self) -> bool:
-        """Return whether it has put out only what it powered up with."""
+        """Return whether its output is still the power-up value."""
         return len({each["current_a"] for each in self.log.writes("DAC0")}) <= 1
 
 
 @pytest.fixture
 def device(emulate):
-    """An emulated T7."""
+    """An emulated LabJack T7."""
     return Device(emulate("labjack_t7"))
 
 
@@ -266,14 +266,14 @@ def own_mounts():
 
 @pytest.fixture
 def nobody():
-    """Return the words that run a command as another user, who can run hilctl."""
+    """Return the command prefix that runs hilctl as another user."""
     if os.geteuid() or not shutil.which("setpriv"):
         pytest.skip("needs a second user: only root can be one, by setpriv of util-linux")
     user = pwd.getpwnam("nobody")
     words = ["setpriv", f"--reuid={user.pw_uid}", f"--regid={user.pw_gid}", "--clear-groups"]
     may_read = ["--inh-caps=+dac_read_search", "--ambient-caps=+dac_read_search"]
     code = "import subprocess as s, sys; s.run([sys.executable, '-c', 'import hilctl'], check=True)"
-    # Where the interpreter stands in root's home, another user may read all, and still write none.
+    # If the interpreter is in root's home, another user gets read access only.
     for more in ([], may_read):
         command = [*words, *more, sys.executable, "-c", code]
         tried = subprocess.run(command, cwd="/", capture_output=True, text=True)

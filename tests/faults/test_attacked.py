@@ -1,4 +1,4 @@
-"""The judge of attacked runs: what a device's log must say for an attack to count as harmless."""
+"""Criteria for a harmless attack on a run, from the device's log."""
 
 import json
 import math
@@ -52,13 +52,13 @@ def test_a_ramp_takes_no_time_beyond_itself(tmp_path):
     ],
 )
 def test_what_comes_late_or_moves_again_is_seen(tmp_path, currents_a, beyond_s):
-    """Safe is what stays safe."""
+    """The output must stay at the safe value."""
     assert log(tmp_path, currents_a).beyond_ramp_s(0) == pytest.approx(beyond_s, abs=3 * PERIOD_S)
 
 
 @pytest.mark.parametrize("before", [1, 50])
 def test_a_jump_is_seen(tmp_path, before):
-    """Also where the output had stood still before it."""
+    """A step is detected even after a constant output."""
     found = log(tmp_path, [4.0] * before + [0.0])
     assert found.largest_step(0) == pytest.approx(4.0 / (RAMP_A_PER_S * (2 * PERIOD_S + 0.01)))
 
@@ -75,7 +75,7 @@ def test_a_jump_is_seen(tmp_path, before):
     ],
 )
 def test_writes_that_are_not_recorded_are_counted(tmp_path, commands, unanswered, lost):
-    """Opening may write what is put out already, and the last write is the safe value's."""
+    """Opening may repeat the present output, and the last write is the safe value."""
     found = log(tmp_path, [3.0, 2.0, 1.0, 0.0])
     assert found.lost(samples(commands, unanswered), math.inf) == lost
 

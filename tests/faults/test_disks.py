@@ -1,4 +1,4 @@
-"""Runs whose disk is full or slow, and whose wall clock is set: what is lost is counted."""
+"""Runs with a full or slow disk, or a wall clock that is set: losses are counted."""
 
 import json
 import os
@@ -45,7 +45,7 @@ from hilctl.recording import writer
 from hilctl import cli
 
 class Faulty(FileIO):
-    '''A file on a disk with one fault, once it holds some bytes.'''
+    '''A file with one write fault after some bytes.'''
 
     due = True
 
@@ -67,7 +67,7 @@ EIO = FAULTY.format(at_bytes=100_000, fault="raise OSError(5, 'Input/output erro
 
 
 def stall(seconds: float) -> str:
-    """Return a program whose disk stands still once for so long."""
+    """Return a program whose disk stalls once."""
     return FAULTY.format(at_bytes=200_000, fault=f"time.sleep({seconds})")
 
 
@@ -89,7 +89,7 @@ datetime.datetime = Stepped
 
 
 def start(folder: Path, *, code: str = "", preexec=None, environment=None, **recording):
-    """Start a run in a process of its own; ``code`` stands for ``python -m hilctl``."""
+    """Start a run in a separate process; ``code`` replaces ``python -m hilctl``."""
     path = folder / "experiment.yaml"
     section = {"flush_s": 0.1, "ring_s": 1.0, **recording}
     path.write_text(yaml.safe_dump({**EXPERIMENT, "recording": section}), encoding="utf-8")
@@ -106,7 +106,7 @@ def start(folder: Path, *, code: str = "", preexec=None, environment=None, **rec
 
 
 def end(process, code: int) -> dict:
-    """Wait for the end; return the JSON it printed."""
+    """Wait for the end; return the printed JSON."""
     out, err = process.communicate(timeout=240)
     assert "Traceback" not in err
     assert process.returncode == code, f"{out}\n{err}"
@@ -123,12 +123,12 @@ def await_size(process, output: Path, size: int = 100_000) -> None:
 
 
 def limit_files(process, size: int) -> None:
-    """Let no file of a process grow beyond ``size`` bytes."""
+    """Limit the size of files that a process writes."""
     resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
 
 
 def assert_whole(recording, printed) -> None:
-    """Every sample is in the recording, once, and replays bit for bit."""
+    """Assert that the recording has every sample once and replays bit for bit."""
     index = recording.samples.index
     assert np.array_equal(index, np.arange(index.size))
     assert (recording.dropped, printed["dropped"]) == (0, 0)
@@ -162,14 +162,14 @@ def test_disk_that_is_full_for_a_while_loses_nothing(tmp_path, on_failure):
     ("on_failure", "whole"), [("stop", False), ("go_on", True)], ids=["stop", "go_on"]
 )
 def test_disk_that_stays_full(tmp_path, on_failure, whole):
-    """The run ramps down, or goes on to its end; the next command adds what the file lacks."""
+    """The run ramps down or continues to its end; the next command completes the recording."""
     process = start(tmp_path, on_failure=on_failure, ring_s=5.0 if whole else 3.0)
     await_size(process, tmp_path / "run.mcap")
     limit_files(process, 200_000)
     printed = end(process, 3)
     assert printed["code"] == "fault"
     assert printed["output_safe"]
-    assert "can't be written: File too large" in printed["reason"]
+    assert "File too large" in printed["reason"]
     assert printed["reason"].startswith("waveform completed") == whole
     recorded = read(tmp_path / "run.mcap").samples.index
     assert np.array_equal(recorded, np.arange(recorded.size))
@@ -187,7 +187,7 @@ def test_disk_that_stays_full(tmp_path, on_failure, whole):
 
 
 def test_disk_that_stands_still_longer_than_the_ring_ends_the_run(tmp_path):
-    """The loop ramps down before there is no room left: nothing is lost."""
+    """The loop ramps down before the ring is full: nothing is lost."""
     process = start(tmp_path, code=stall(2.0), on_failure="stop")
     printed = end(process, 3)
     assert "disk stalls" in printed["reason"]
@@ -200,7 +200,7 @@ def test_disk_that_stands_still_longer_than_the_ring_ends_the_run(tmp_path):
 
 
 def test_run_that_goes_on_counts_what_a_slow_disk_lost(tmp_path):
-    """The ring keeps a second, the rest is gone: the numbers say how much, and the file where."""
+    """The ring holds one second; the number of lost samples is reported and recorded."""
     process = start(tmp_path, code=stall(2.5), on_failure="go_on")
     printed = end(process, 0)
     assert printed["reason"] == "waveform completed"
@@ -211,21 +211,21 @@ def test_run_that_goes_on_counts_what_a_slow_disk_lost(tmp_path):
     assert printed["dropped"] > RATE_HZ
     assert index.size + printed["dropped"] == index[-1] + 1
     assert int(recording.end["dropped_in_ring"]) == printed["dropped"]
-    # Ticks are late on a busy machine; a loop that waited for the disk would have stood still.
+    # A loop that waits for the disk would be later than a busy machine makes it.
     assert int(recording.end["worst_late_ns"]) < 2.0e9
     assert replay(recording).identical
 
 
 @pytest.mark.parametrize(("seconds", "ring_s"), [(0.3, 4.0), (3.0, 10.0)])
 def test_stall_that_the_ring_bridges_loses_nothing(tmp_path, seconds, ring_s):
-    """What the ring can take is no fault."""
+    """A stall within the ring's capacity is no fault."""
     printed = end(start(tmp_path, code=stall(seconds), ring_s=ring_s), 0)
     assert printed["reason"] == "waveform completed"
     assert_whole(read(tmp_path / "run.mcap"), printed)
 
 
 def test_wall_clock_that_is_set_changes_nothing(tmp_path):
-    """An hour back and three forward in the middle of a run: its times go on as they began."""
+    """Setting the clock one hour back and two forward does not change a run's timestamps."""
     clock, output = tmp_path / "clock", tmp_path / "run.mcap"
     clock.write_text("0", encoding="utf-8")
     (tmp_path / "sitecustomize.py").write_text(OTHER_CLOCK, encoding="utf-8")
@@ -249,7 +249,7 @@ def test_wall_clock_that_is_set_changes_nothing(tmp_path):
 
 
 def test_memory_that_is_not_to_be_had_is_told(tmp_path):
-    """Where the ring can't be made, nothing starts, no file is left, and one line says why."""
+    """Without memory for the ring the run does not start, leaves no file and prints one line."""
 
     def nothing() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, 50_000))
@@ -258,17 +258,17 @@ def test_memory_that_is_not_to_be_had_is_told(tmp_path):
     _, err = process.communicate(timeout=240)
     assert process.returncode == 3, err
     assert err.count("\n") == 1
-    assert "ring: no memory: File too large; less recording.ring_s needs less of it" in err
+    assert "recording.ring_s" in err
     assert not (tmp_path / "run.mcap").exists()
 
 
 def test_a_full_disk_below_standard_output_does_not_make_a_good_run_a_fault(tmp_path):
-    """The run's result counts; that it could not be printed is said."""
+    """A full disk on standard output is reported and does not change the run's result."""
     output = tmp_path / "run.mcap"
     command = [sys.executable, "-m", "hilctl", "run", str(DEMO)]
     command += ["--set", "waveform.duration_s=0.5", "--output", str(output), "--json"]
     with Path("/dev/full").open("w") as full:
         ended = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=240)
     assert ended.returncode == 0, ended.stderr
-    assert "No space left on device" in ended.stderr
+    assert "No space left" in ended.stderr
     assert read(output).end["code"] == "completed"

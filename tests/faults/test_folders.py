@@ -1,4 +1,4 @@
-"""Where hilctl is run from does not matter, whatever lies there."""
+"""The working folder and its contents do not affect a run."""
 
 import json
 import shutil
@@ -27,7 +27,7 @@ def run(folder, tmp_path, *settings):
 
 @pytest.mark.parametrize("name", ["-a: lab #3 [x] 50 % {y}\n\"ü'"])
 def test_folder_of_any_name(tmp_path, name):
-    """A run is started there, and records there."""
+    """A run starts and records in a folder of any name."""
     folder = tmp_path / name
     folder.mkdir()
     ended = run(folder, folder)
@@ -36,7 +36,7 @@ def test_folder_of_any_name(tmp_path, name):
 
 
 def test_modules_of_the_lab_are_never_imported(tmp_path):
-    """A file of the name of a module is not taken for it, in any of hilctl's processes."""
+    """Local files with names of modules are not imported by any process."""
     sprung = tmp_path / "sprung"
     for name in TRAPS:
         text = f"open({str(sprung)!r}, 'a').write({name!r} + chr(10)); raise SystemExit({name!r})"
@@ -47,7 +47,7 @@ def test_modules_of_the_lab_are_never_imported(tmp_path):
 
 
 def test_from_above_the_checkout():
-    """Folders there are called as packages are; they must not be taken for them."""
+    """Folders with names of packages are not imported."""
     code = "import hilctl, hilctl_drivers; print(hilctl.__version__)"
     command = [sys.executable, "-c", code]
     ended = subprocess.run(command, cwd=ROOT.parent, capture_output=True, text=True, timeout=240)
@@ -66,7 +66,7 @@ GONE = 'mkdir gone; cd gone; rmdir ../gone; exec "$@"'
     ],
 )
 def test_working_folder_that_is_gone_before_the_start(tmp_path, experiment, output, code, said):
-    """Names that begin there are refused in one message; a run that needs none of them runs."""
+    """Relative paths are rejected with one message; a run without relative paths completes."""
     shutil.copy(ROOT / "configs" / "demo.yaml", tmp_path)
     shutil.copytree(ROOT / "configs" / "models", tmp_path / "models")
     names = [f"{tmp_path}{each}" if each[0] == "/" else each for each in (experiment, output)]
@@ -84,7 +84,7 @@ def test_working_folder_that_is_gone_before_the_start(tmp_path, experiment, outp
 
 @pytest.mark.parametrize("inside", [False, True])
 def test_folder_that_is_deleted_while_a_run_starts(tmp_path, device, inside):
-    """With the recording that was claimed in it: nothing has moved, and one message says so."""
+    """A folder deleted with the new recording ends the start with one message; nothing moves."""
     (tmp_path / "e.yaml").write_text(yaml.safe_dump({**EXPERIMENT, "device": device.section}))
     lab = tmp_path / "lab"
     lab.mkdir()
@@ -99,7 +99,7 @@ def test_folder_that_is_deleted_while_a_run_starts(tmp_path, device, inside):
             time.sleep(0.002)
         shutil.rmtree(lab)
         _, err = process.communicate(timeout=240)
-    # Inside, it depends on how far it has come which of the two is noticed first.
+    # Which of the two is noticed first depends on timing.
     gone = "hilctl: the working folder has been deleted: change to another one"
     taken = "run.mcap: can't be written: the file was deleted or renamed"
     (line,) = err.splitlines()

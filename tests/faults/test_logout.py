@@ -1,4 +1,4 @@
-"""A run whose files in memory are removed, as systemd-logind does when a user logs out."""
+"""Runs whose shared memory files are removed, as systemd-logind does at logout."""
 
 import os
 import shutil
@@ -17,7 +17,7 @@ from tests.faults.test_daemon import await_state, hilctl, start, stop_all
 
 @pytest.fixture
 def logged_out(tmp_path):
-    """A run in the background after a log-out: its recording."""
+    """Recording of a background run after a logout."""
     recording = start(tmp_path)
     shutil.rmtree(base_folder())
     yield recording
@@ -25,7 +25,7 @@ def logged_out(tmp_path):
 
 
 def test_it_is_still_found_changed_watched_and_stopped(logged_out):
-    """Every command works; the recording lacks nothing."""
+    """All commands work, and the recording is complete."""
     assert await_state("running")["recording"] == str(logged_out)
     assert hilctl("set", "gain=0.5", "--over", "0.1")["gain"] == 0.5
     hilctl("mark", "logged in again")
@@ -39,7 +39,7 @@ def test_it_is_still_found_changed_watched_and_stopped(logged_out):
 
 
 def test_a_supervisor_that_crashes_afterwards_loses_no_sample(logged_out):
-    """The loop ramps down, and keeps what nobody has recorded where the next command finds it."""
+    """The loop ramps down and saves unrecorded samples for the next command."""
     await_state("running")
     (run,) = runs()
     os.kill(run.card.supervisor, signal.SIGKILL)
@@ -53,7 +53,7 @@ def test_a_supervisor_that_crashes_afterwards_loses_no_sample(logged_out):
     assert recording.end["reason"] == "stopped because the supervisor died"
     assert recording.end["recorded_samples"] == str(recording.samples.index.size)
     assert recording.dropped == 0
-    assert abs(recording.samples.command[-1]) < 0.01  # the ramp is there to its end
+    assert abs(recording.samples.command[-1]) < 0.01  # the complete ramp is recorded
     assert runs() == []
 
 

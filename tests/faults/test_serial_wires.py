@@ -1,4 +1,4 @@
-"""Whole runs over text lines and board frames with things going wrong: one ramp, every time."""
+"""Faults in runs over text lines and board frames: one safe ramp."""
 
 import os
 import re
@@ -47,7 +47,7 @@ FAULT_AT = {"dcon": 81, "scpi": 30, "cobs": 60, "fifo": 80}
 
 @pytest.fixture
 def boards(tmp_path, profile):
-    """Return where the profile of each kind is; a board of the tests needs no time to boot."""
+    """Return the profile of each kind; the test board boots immediately."""
     found = {"dcon": profile("dcon_module"), "scpi": "agilent_34970a"}
     for kind, name in {"cobs": "cobs_board", "fifo": "cobs_board_fifo"}.items():
         text = shipped_profiles()[name].read_text(encoding="utf-8")
@@ -59,7 +59,7 @@ def boards(tmp_path, profile):
 
 @pytest.fixture
 def meet(emulate, run, boards):
-    """Return a function that starts an emulated device of a kind and a run on it."""
+    """Return a function that starts an emulated device and a run on it."""
 
     def start(kind, *faults, patient=False):
         words = [word for fault in faults for word in ("--fault", f"{fault}@{FAULT_AT[kind]}")]
@@ -95,13 +95,13 @@ SHOWN = {("dcon", "corrupt"), ("scpi", "cut"), ("cobs", "exception"), ("fifo", "
 
 @pytest.mark.parametrize(("kind", "fault"), each_kind(FAULTS, SHOWN))
 def test_fault_ends_the_run_safely(meet, boards, kind, fault):
-    """The run stops in time, one line says which device did what, and the coil is at 0 A."""
+    """The run stops in time, one line names device and fault, and the coil is at 0 A."""
     device, started, output = meet(kind, fault)
     printed = started.end()
-    # A watchdog that is armed stays so, and may have tripped since.
+    # An armed watchdog may have tripped since.
     events = [each for each in device.log.events(output) if each["event"] != "watchdog"]
     assert printed["code"] == "fault"
-    assert printed["output_state"] == "set"  # the command that was not answered may still follow
+    assert printed["output_state"] == "set"  # the unanswered command may still be executed
     said = printed["reason"]
     assert said.startswith(f"serial_dac {boards[kind]} at {device.address}: ")
     assert re.search(FAULTS[kind, fault], said)
@@ -113,7 +113,7 @@ def test_fault_ends_the_run_safely(meet, boards, kind, fault):
     if kind == "fifo":
         started.assert_recorded(at_least=5000)
     else:
-        # The last ones are the safe value's: it is sent again where an answer was lost.
+        # The last writes are the safe value, repeated after a lost answer.
         writes = device.log.writes(output)
         moving = np.flatnonzero([abs(each["current_a"]) > 2e-3 for each in writes])
         started.assert_put_out(writes[: moving[-1] + 1], at_least=20)
@@ -121,15 +121,15 @@ def test_fault_ends_the_run_safely(meet, boards, kind, fault):
 
 @pytest.mark.parametrize("kind", each_kind(SETUPS, {"dcon", "fifo"}))
 def test_pulled_adapter_takes_the_port_along(meet, kind):
-    """Nobody can be reached: the run says so, and a device with a watchdog goes safe by itself."""
+    """The run reports a lost port, and a watchdog sets the safe value."""
     device, started, output = meet(kind, "unplug")
     printed = started.end()
     assert printed["output_safe"] is False
     assert "port lost, unplugged?" in printed["reason"]
-    assert "the safe value could not be confirmed" in printed["reason"]
+    assert "not be confirmed" in printed["reason"]
     assert "\n" not in printed["reason"]
     started.assert_recorded(at_least=20)
-    if kind == "scpi":  # it has no watchdog: the voltage stays, as its profile says
+    if kind == "scpi":  # without a watchdog the voltage persists
         assert device.log.events(output)[-1]["event"] == "write"
         return
     trip = device.log.await_event(output, "watchdog")
@@ -138,7 +138,7 @@ def test_pulled_adapter_takes_the_port_along(meet, kind):
 
 @pytest.mark.parametrize(("kind", "events"), [("dcon", 80), ("cobs", 80), ("fifo", 300)])
 def test_dead_loop_is_followed_by_a_message(meet, boards, kind, events):
-    """The supervisor's, not the watchdog's doing: no boot of the board is waited for."""
+    """The supervisor sets the safe value without a reboot of the board."""
     for name in ("cobs", "fifo"):
         path = Path(boards[name])
         path.write_text(path.read_text().replace("boot_wait_s: 0.0", "boot_wait_s: 2.0"))
@@ -156,7 +156,7 @@ def test_dead_loop_is_followed_by_a_message(meet, boards, kind, events):
 
 @pytest.mark.parametrize(("kind", "events"), [("dcon", 80), ("fifo", 300)])
 def test_dead_host_is_noticed_by_the_device(meet, kind, events):
-    """With all of hilctl killed at once, the device's watchdog makes the output safe in time."""
+    """With all processes killed, the device's watchdog sets the safe value in time."""
     device, started, output = meet(kind)
     # Long enough for the recording to be flushed.
     device.log.await_events(output, events, started.process)
@@ -169,7 +169,7 @@ def test_dead_host_is_noticed_by_the_device(meet, kind, events):
 
 
 def test_silent_reader_is_named(emulate, run):
-    """Where the sensor stands on another device, the line says which of the two did not answer."""
+    """With two devices the message names the one that did not answer."""
     sensor = "agilent_34970a:AI101"
     device = emulate("kepco_bop", "--sensor", sensor, lines=2)
     section = {
@@ -199,7 +199,7 @@ def test_silent_reader_is_named(emulate, run):
 
 @pytest.mark.parametrize("kind", ["dcon", pytest.param("fifo", marks=pytest.mark.long)])
 def test_second_run_on_the_same_port_is_refused(meet, run, tmp_path, boards, kind):
-    """Also where it has another name for the port; the first run is not disturbed."""
+    """A second run on the port is rejected, also by another port name; the first continues."""
     device, first, output = meet(kind, patient=True)
     device.log.await_events(output, 40, first.process)
     other = tmp_path / "by-id"
@@ -208,7 +208,8 @@ def test_second_run_on_the_same_port_is_refused(meet, run, tmp_path, boards, kin
     section = {**DEVICE, "profile": boards[kind], "serial_port": str(other), **options}
     said = run(section, name="second", waveform=WAVEFORM, **changes).refused()
     who = f"run wire_fault (process {first.process.pid}, recording {first.output})"
-    assert f"serial:{device.address} is in use by {who}" in said
+    assert f"serial:{device.address} " in said
+    assert who in said
     printed = first.interrupt()
     assert printed["code"] == "stopped"
     assert printed["dropped"] == printed["skipped_ticks"]  # a busy machine may be late
@@ -216,7 +217,7 @@ def test_second_run_on_the_same_port_is_refused(meet, run, tmp_path, boards, kin
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only a privileged run keeps a pty to itself")
 def test_another_program_cannot_open_the_port(meet):
-    """A shell without privileges; the run is not disturbed, and afterwards the port is free."""
+    """An unprivileged program cannot open the port during a run, and can afterwards."""
     device, first, output = meet("dcon", patient=True)
     device.log.await_events(output, 40, first.process)
 

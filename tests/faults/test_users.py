@@ -1,4 +1,4 @@
-"""Two users of one machine who want the same device: one has it, the other is told by whom."""
+"""Two users of one device: the second run is rejected and names the first."""
 
 import json
 import os
@@ -14,7 +14,7 @@ import yaml
 
 from tests.faults.conftest import EXPERIMENT
 
-# No machine is too busy for it, and no second run comes after its end.
+# A slow rate for a busy machine, and long enough for a second run.
 PATIENT = {
     "sample_rate_hz": 50,
     "waveform": {**EXPERIMENT["waveform"], "duration_s": 3600.0},
@@ -23,7 +23,7 @@ PATIENT = {
 
 
 class Neighbour:
-    """Another user with a folder of their own."""
+    """Another user with a separate folder."""
 
     def __init__(self, words, folder, section):
         self._words, self.folder, self.process = words, folder, None
@@ -45,7 +45,7 @@ class Neighbour:
 
 @pytest.fixture
 def neighbour(nobody, device):
-    # Not below tmp_path, which is this user's alone.
+    # Not below tmp_path, which only this user can read.
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         os.chown(folder, *(int(each.partition("=")[2]) for each in nobody[1:3]))
@@ -57,28 +57,28 @@ def neighbour(nobody, device):
 
 
 def test_the_second_user_of_a_device_is_refused(neighbour, device, run):
-    """In one message, and the first one's run goes on."""
+    """The second run is rejected with one message, and the first continues."""
     mine = run(device.section, **PATIENT)
     device.log.await_events("DAC0", 40, mine.process)
     theirs = neighbour.start()
     out, err = theirs.communicate(timeout=240)
     assert theirs.returncode == 2, err
     assert len(err.splitlines()) == 1
-    assert f" is in use by process {mine.process.pid} of root: wait for its end" in err
+    assert f"process {mine.process.pid} of root" in err
     assert json.loads(out)["error"]
     assert not (neighbour.folder / "theirs.mcap").exists()
     device.log.await_events("DAC0", len(device.log.events("DAC0")) + 20, mine.process)
     assert mine.interrupt()["code"] == "stopped"
 
 
-@pytest.mark.long  # the other user's kernels are compiled anew
+@pytest.mark.long  # the other user compiles the kernels
 def test_root_is_warned_of_a_device_that_a_user_has(neighbour, device, run):
-    """It is not refused: any user could say that they have it."""
+    """Root gets a warning only, because a user's claim is not trusted."""
     theirs = neighbour.start()
     device.log.await_events("DAC0", 40, theirs)
     mine = run(device.section, **PATIENT)
     deadline = time.monotonic() + 240.0
-    while not mine.output.exists():  # it is claimed once the device is held
+    while not mine.output.exists():  # claimed after the device is locked
         assert time.monotonic() < deadline
         time.sleep(0.02)
     theirs.terminate()
@@ -89,7 +89,7 @@ def test_root_is_warned_of_a_device_that_a_user_has(neighbour, device, run):
     device.log.await_events("DAC0", len(device.log.events("DAC0")) + 20, mine.process)
     mine.process.send_signal(signal.SIGINT)
     _, err = mine.process.communicate(timeout=240)
-    assert f"may be in use by process {theirs.pid} of nobody" in err
+    assert f"process {theirs.pid} of nobody" in err
 
 
 SQUATTER = """
@@ -103,7 +103,7 @@ input()
 
 
 def test_a_user_who_only_takes_the_name_keeps_nobody_out(nobody, device, run, tmp_path):
-    """Neither a run nor ``hilctl safe`` is refused."""
+    """A claim without a lock rejects neither a run nor ``hilctl safe``."""
     section = device.section
     name = f"tcp:{section['host']}:{section['tcp_port']}"
     squatter = subprocess.Popen(
@@ -116,10 +116,10 @@ def test_a_user_who_only_takes_the_name_keeps_nobody_out(nobody, device, run, tm
         device.log.await_events("DAC0", 40, mine.process)
         words = [sys.executable, "-m", "hilctl", "safe", str(tmp_path / "run.yaml")]
         refused = subprocess.run(words, capture_output=True, text=True, timeout=240)
-        assert refused.returncode == 2, refused.stderr  # by the run, whose lock is real
+        assert refused.returncode == 2, refused.stderr  # by the run, which has the lock
         mine.process.send_signal(signal.SIGINT)
         _, err = mine.process.communicate(timeout=240)
-        assert f"may be in use by process {squatter.pid} of nobody" in err
+        assert f"process {squatter.pid} of nobody" in err
         done = subprocess.run(words, capture_output=True, text=True, timeout=240)
         assert done.returncode == 0, done.stderr
         assert "confirmed" in done.stdout

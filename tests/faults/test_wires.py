@@ -1,4 +1,4 @@
-"""Whole runs over Modbus with things going wrong: one safe ramp, judged by what was put out."""
+"""Faults in runs over Modbus: one safe ramp, according to the device's log."""
 
 import os
 import signal
@@ -50,36 +50,36 @@ def over_tcp(address: str) -> dict:
 
 
 def left() -> DeviceState:
-    """Return the state of the one device that this test's runs had."""
+    """Return the device state file of the test's device."""
     (path,) = Path(os.environ["XDG_STATE_HOME"]).glob("hilctl/devices/*.json")
     return DeviceState.model_validate_json(path.read_text())
 
 
 TCP_FAULTS: dict[str, str] = {
-    "silence": "no answer within 2 s",
-    "delay:6": "no answer within 2 s",
-    "late:3": "no answer within 2 s",
+    "silence": "no answer",
+    "delay:6": "no answer",
+    "late:3": "no answer",
     "exception": "function 76 refused with exception 4 (device failure)",
     "corrupt": "not a Modbus TCP header",
     "reset": "connection lost: connection reset by peer",
 }
-"""Ways in which a run meets trouble; more, without a run, are in ``test_modbus_dac.py``."""
+"""Faults during a run; faults of the driver alone are in ``test_modbus_dac.py``."""
 
 
 @pytest.mark.parametrize("fault", each_kind(TCP_FAULTS, {"silence", "late:3", "corrupt"}))
 def test_tcp_fault_ends_the_run_safely(emulate, run, fault):
-    """The run stops in time, says in one line what happened where, and the output is safe."""
+    """The run stops in time with one line on the fault, and the output is at the safe value."""
     device = emulate("labjack_t7", "--fault", f"{fault}@{FAULT_AT}")
     started = run(over_tcp(device.address))
     printed = started.end()
     writes = device.log.writes("DAC0")
     assert printed["code"] == "fault"
-    # The command that was not answered may still be executed: the guardian watches for it.
+    # The unanswered command may still be executed, so the guardian keeps watching.
     assert (printed["output_state"], printed["guardian_active"]) == ("set", True)
     said = printed["reason"]
     assert said.startswith(f"modbus_dac labjack_t7 at {device.address}: ")
     assert TCP_FAULTS[fault] in said
-    assert "write DAC0, read AIN0" in said
+    assert "read AIN0" in said
     assert "\n" not in said
     assert writes[-1]["current_a"] == pytest.approx(0.0, abs=1e-5)
     waits_s = np.diff([each["unix_s"] for each in writes])
@@ -88,15 +88,15 @@ def test_tcp_fault_ends_the_run_safely(emulate, run, fault):
 
 
 def test_pulled_cable_leaves_it_to_the_watchdog(emulate, run):
-    """Nobody can be reached: the run says so, and the device makes its output safe by itself."""
+    """The run reports a lost connection, and the device's watchdog sets the safe value."""
     device = emulate("labjack_t7", "--fault", f"unplug@{FAULT_AT}")
     started = run(over_tcp(device.address))
     printed = started.end()
     trip = device.log.await_event("DAC0", "watchdog")
     writes = device.log.writes("DAC0")
     assert printed["output_safe"] is False
-    assert "no answer within 2 s" in printed["reason"]
-    assert "the safe value could not be confirmed" in printed["reason"]
+    assert "no answer" in printed["reason"]
+    assert "not be confirmed" in printed["reason"]
     assert trip["current_a"] == pytest.approx(0.0, abs=1e-5)
     silent_s = (trip["monotonic_ns"] - writes[-1]["monotonic_ns"]) * 1e-9
     assert 0.99 * WATCHDOG_S < silent_s < 2.0 * WATCHDOG_S
@@ -106,7 +106,7 @@ def test_pulled_cable_leaves_it_to_the_watchdog(emulate, run):
 @pytest.mark.parametrize(
     ("fault", "words", "state"),
     [
-        ("silence", "no answer within 2 s", "set"),
+        ("silence", "no answer", "set"),
         pytest.param(
             "exception", "function 23 refused with exception 4", "set", marks=pytest.mark.long
         ),
@@ -115,7 +115,7 @@ def test_pulled_cable_leaves_it_to_the_watchdog(emulate, run):
     ],
 )
 def test_rtu_fault_ends_the_run(emulate, run, profile, fault, words, state):
-    """The same on a serial line, where a pulled adapter takes its port along."""
+    """The same on a serial line, where an unplugged adapter removes its port."""
     module = profile("rtu_module")
     device = emulate(module, "--fault", f"{fault}@120")
     options = {**MODULE, "profile": module, "serial_port": device.address}
@@ -131,19 +131,19 @@ def test_rtu_fault_ends_the_run(emulate, run, profile, fault, words, state):
 
 
 def test_killed_loop_is_made_safe_by_the_supervisor(emulate, run):
-    """Its connection is gone with it; the supervisor's own reaches the device."""
+    """The supervisor sets the safe value over its own connection."""
     device = emulate("labjack_t7")
     started = run(over_tcp(device.address))
     device.log.await_events("DAC0", FAULT_AT, started.process)
     os.kill(started.loop_pid(), signal.SIGKILL)
     printed = started.end()
-    assert "the loop process died: killed by SIGKILL" in printed["reason"]
+    assert "killed by SIGKILL" in printed["reason"]
     assert printed["output_state"] in {"confirmed", "set"}  # set if it was killed in an exchange
     assert device.log.writes("DAC0")[-1]["current_a"] == pytest.approx(0.0, abs=1e-5)
 
 
 def test_dead_host_is_noticed_by_the_device(emulate, run):
-    """With all of hilctl killed at once, the device's watchdog makes the output safe in time."""
+    """With all processes killed, the device's watchdog sets the safe value in time."""
     device = emulate("labjack_t7")
     started = run(over_tcp(device.address))
     # Long enough for the recording to be flushed.
@@ -155,20 +155,19 @@ def test_dead_host_is_noticed_by_the_device(emulate, run):
     silent_s = (trip["monotonic_ns"] - last["monotonic_ns"]) * 1e-9
     assert 0.99 * WATCHDOG_S < silent_s < 2.0 * WATCHDOG_S
     assert started.readable_samples() > 100
-    # A power cut looks the same: this run was the device's last, and nobody knows how it ended.
+    # As after a power cut, the run is the device's last and its end is unknown.
     assert (left().recording, left().coil) == (str(started.output), None)
 
 
 def test_second_run_on_the_same_device_is_refused(emulate, run):
-    """It is told who has the device, whatever it is called there, and the first goes on."""
+    """A second run names the first, also by another host name; the first continues."""
     device = emulate("labjack_t7")
     section = {**over_tcp(device.address), **PATIENT_DEVICE}
     first = run(section, timing=PATIENT_TIMING)
     device.log.await_events("DAC0", FAULT_AT, first.process)
     said = run({**section, "host": "localhost"}, name="second").refused()
     who = f"run wire_fault (process {first.process.pid}, recording {first.output})"
-    assert f"is in use by {who}" in said
-    assert "wait for its end, or stop it first" in said
+    assert who in said
     seen = len(device.log.events("DAC0"))
     device.log.await_events("DAC0", seen + 50, first.process)
     printed = first.interrupt()
@@ -178,7 +177,7 @@ def test_second_run_on_the_same_device_is_refused(emulate, run):
 
 
 def test_profile_exchanged_after_the_check_changes_nothing(emulate, tmp_path, profile):
-    """What was checked is what runs: the loop's process reads no profile from disk."""
+    """The loop process uses the checked profile and reads none from disk."""
     device = emulate(profile("rtu_module"))
     mine = tmp_path / "mine.yaml"
     mine.write_text(Path(profile("rtu_module")).read_text())

@@ -1,21 +1,21 @@
-"""The contract of devices, held by a real one: ``pytest --device EXPERIMENT.yaml tests/hardware``.
+"""The device contract on a real device: ``pytest --device EXPERIMENT.yaml tests/hardware``.
 
-Look at the experiment's limits first; the tests do this to the coil or the piezo:
+Check the experiment's limits first. The tests do this to the coil or the piezo:
 
 - They open and close the experiment's device some fifteen times, at the experiment's sample rate.
-- They put out the safe value. The output should be there already, as before a run: if it is not, it
+- They output the safe value. The output should be there already, as before a run: otherwise it
   jumps.
 - Three times, they ramp from the safe value a tenth of the way to the limit that is further off,
   hold that for a third of a second, and ramp back; once they step back, and twice where the device
   can't be opened away from its safe value. Each command passes hilctl's own limiter, which is set
   to this tenth and to the speed of the experiment's ramp to the safe value. The displacement must
   stay within the experiment's stroke.
-- Once, they ask for commands that are no number or beyond the device's range. The driver must
-  refuse them before anything is sent, as it does in the other tests; this one comes last.
-- At the end of each test, failed or not, they ramp to the safe value and close the device; where
-  that fails, they put out the safe value at once.
+- Once, they request commands that are not finite or out of range. The driver must reject them
+  before anything is sent. This test is the last one.
+- At the end of each test, failed or not, they ramp to the safe value and close the device; if that
+  fails, they output the safe value immediately.
 
-Nothing else may use the device meanwhile.
+No other program may use the device during the tests.
 """
 
 from collections.abc import Iterator
@@ -38,7 +38,7 @@ CLEARLY = 6.0
 
 
 class RealDevice:
-    """A device under gentle commands.
+    """A real device with slow, small commands.
 
     Args:
         loaded: The experiment.
@@ -70,7 +70,7 @@ class RealDevice:
         self._was_open = False
 
     def open(self) -> None:
-        """Open the device; the limiter goes on from where its output is."""
+        """Open the device; the limiter starts at its output."""
         self.device.open(self._rate_hz, self._block)
         self._open = self._was_open = True
         self._sample = 0
@@ -79,16 +79,16 @@ class RealDevice:
             self.device.arm()
 
     def close(self) -> None:
-        """Close the device and leave the output as it is."""
+        """Close the device without changing the output."""
         self._open = False
         self.device.close()
 
     def _exchange(self, command: np.ndarray) -> np.ndarray:
-        """Put out one block in its time; return the displacements that came, um."""
+        """Output one block in real time; return the displacements in um."""
         info = self.device.info
-        if not info.latency_blocks:  # else it waits for the device's clock by itself
+        if not info.latency_blocks:  # otherwise exchange waits for the device's clock
             self._clock.sleep_until_ns(self._due_ns)
-        # Never sooner than a period after the one before: a burst would be a steeper ramp.
+        # At least one period after the previous block: a burst would be a steeper ramp.
         self._due_ns = self._clock.now_ns() + self._period_ns
         displacement_um, measured = np.full(command.size, np.nan), np.full(command.size, np.nan)
         self.device.exchange(self._sample, command, displacement_um, measured)
@@ -102,17 +102,17 @@ class RealDevice:
         return displacement_um
 
     def make_safe(self) -> None:
-        """Put out the safe value at once; the limiter goes on from there."""
+        """Output the safe value immediately; the limiter continues from it."""
         self.device.make_safe(self.safe)
         self.limiter.last = self.safe
 
     def ask(self, command: float) -> None:
-        """Ask for a command past the limiter, which must not pass the driver."""
+        """Request a command without the limiter, which the driver must reject."""
         block = np.full(self._block, command)
         self.device.exchange(self._sample, block, np.empty(block.size), np.empty(block.size))
 
     def go(self, wanted: float) -> np.ndarray:
-        """Ramp to a command and hold it; return the second half of what was seen meanwhile, um."""
+        """Ramp to a command and hold it; return the second half of the displacements, in um."""
         held = max(HOLD_SAMPLES, round(HOLD_S * self._rate_hz))
         held += self.device.info.latency_blocks * self._block
         command, flags = np.empty(self._block), np.zeros(self._block, dtype=np.uint32)
@@ -125,7 +125,7 @@ class RealDevice:
         return np.concatenate(seen)[held // 2 :]
 
     def look(self) -> np.ndarray:
-        """Return the first displacement seen with the output where it was left: float64[1], um."""
+        """Return the first displacement without a change of the output: float64[1], um."""
         command = np.full(self._block, self.limiter.last)
         while True:
             part = self._exchange(command)
@@ -133,7 +133,7 @@ class RealDevice:
                 return part[:1]
 
     def end(self) -> None:
-        """Ramp to the safe value and close; put it out at once where that fails."""
+        """Ramp to the safe value and close; output it immediately if that fails."""
         if not self._was_open:
             return
         command, flags = np.empty(self._block), np.zeros(self._block, dtype=np.uint32)
@@ -152,14 +152,14 @@ class RealDevice:
 
 @pytest.fixture
 def real(request) -> Iterator[RealDevice]:
-    """The device of the experiment, not open."""
+    """The device of the experiment, closed."""
     made = RealDevice(load_experiment(request.config.getoption("--device")))
     yield made
     made.end()
 
 
 def step_um(rest: np.ndarray, there: np.ndarray) -> float:
-    """Return how far the move went; fail where noise alone could explain it."""
+    """Return the distance of a move; fail if it is within the noise."""
     noise_um = float(np.sqrt(rest.var() / rest.size + there.var() / there.size))
     moved_um = float(abs(there.mean() - rest.mean()))
     assert moved_um > CLEARLY * noise_um, "nothing moved: is the amplifier on, the sensor wired?"
@@ -167,12 +167,12 @@ def step_um(rest: np.ndarray, there: np.ndarray) -> float:
 
 
 def distance_um(first: np.ndarray, second: np.ndarray) -> float:
-    """Return how far two stretches are apart."""
+    """Return the distance between two signals."""
     return float(abs(first.mean() - second.mean()))
 
 
 def test_answers_a_probe(request):
-    """What ``hilctl devices probe`` does works, twice in a row, and finds nothing wrong."""
+    """The check of ``hilctl devices probe`` passes twice in a row."""
     path = request.config.getoption("--device")
     first, second = probe(path, []), probe(path, [])
     assert first.details == second.details
@@ -181,9 +181,9 @@ def test_answers_a_probe(request):
 
 
 def test_small_move_is_seen_and_comes_back(real):
-    """The displacement follows a tenth of the range beyond noise, and most of it comes back."""
+    """The displacement follows a tenth of the range above the noise, and most of it returns."""
     real.open()
-    real.go(real.target)  # once before: the loop closes only round where it came from last
+    real.go(real.target)  # once before, because a loop closes only after the first cycle
     rest = real.go(real.safe)
     there = real.go(real.target)
     back = real.go(real.safe)
@@ -191,7 +191,7 @@ def test_small_move_is_seen_and_comes_back(real):
 
 
 def test_opening_and_closing_move_nothing(real):
-    """The output stays where it was left while the device is closed, opened and probed."""
+    """The output persists while the device is closed, opened and probed."""
     if real.device.info.simulated:
         pytest.skip("opening a simulated device puts it at rest")
     real.open()
@@ -209,7 +209,7 @@ def test_opening_and_closing_move_nothing(real):
 
 
 def test_exchange_needs_an_open_device(real):
-    """Commands before open and after close are refused; closing twice is fine."""
+    """Commands before open and after close are rejected; closing twice is allowed."""
     command = np.full(1, real.safe)
     with pytest.raises(DeviceError):
         real.device.exchange(0, command, np.empty(1), np.empty(1))
@@ -222,7 +222,7 @@ def test_exchange_needs_an_open_device(real):
 
 
 def test_make_safe_needs_no_open_device(real):
-    """The last resort takes the output from a small command to the safe value."""
+    """make_safe takes the output from a small command to the safe value."""
     real.open()
     rest = real.go(real.safe)
     there = real.go(real.target)
@@ -235,7 +235,7 @@ def test_make_safe_needs_no_open_device(real):
 
 @pytest.mark.parametrize("bad", ["not a number", "infinite", "above", "below"])
 def test_refuses_what_it_can_not_do(real, bad):
-    """A command that is no number or out of range is refused before anything is sent."""
+    """A non-finite or out-of-range command is rejected before anything is sent."""
     info = real.device.info
     beyond = 1e-3 * (info.command_max - info.command_min)
     command = {

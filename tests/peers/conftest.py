@@ -1,7 +1,6 @@
-"""Finding, starting and stopping programs of other people.
+"""Find, start and stop third-party programs.
 
-One that is not installed is skipped on a desk, and an error where CI is set: there it would go
-unnoticed that nothing was held against anything.
+A missing program skips its tests, and is an error if CI is set.
 """
 
 import ctypes.util
@@ -27,7 +26,7 @@ PYTHON = "pip install -e '.[dev]'"
 
 
 def missing(what: str, remedy: str) -> None:
-    """Skip, or fail where CI is set."""
+    """Skip the test, or fail if CI is set."""
     text = f"{what} is not installed: {remedy}"
     if os.environ.get("CI"):
         pytest.fail(text)
@@ -43,7 +42,7 @@ def program(name: str, package: str = "") -> str:
 
 
 class Programs:
-    """Where the programs of other people are; each method skips or fails where one is missing."""
+    """Paths of third-party programs; each method skips or fails if one is missing."""
 
     program = staticmethod(program)
 
@@ -51,26 +50,26 @@ class Programs:
         self._folder = folder
 
     def module(self, name: str) -> None:
-        """Check that a Python package is there, without importing it."""
+        """Check that a Python package is installed, without importing it."""
         if importlib.util.find_spec(name) is None:
             missing(name, PYTHON)
 
     def node_package(self, name: str) -> str:
-        """Return the path of node, after a look for an npm package."""
+        """Return the path of node if an npm package is installed."""
         node = program("node", "nodejs")
         if not (HERE / "node_modules" / name).is_dir():
             missing(f"npm package {name}", NPM)
         return node
 
     def libmodbus(self) -> str:
-        """Return the name of libmodbus, the library."""
+        """Return the name of the libmodbus library."""
         found = ctypes.util.find_library("modbus")
         if found is None:
             missing("libmodbus", DEBIAN.format("libmodbus-dev"))
         return str(found)
 
     def libmodbus_server(self) -> str:
-        """Return the path of a server that is built on libmodbus."""
+        """Return the path of a libmodbus server."""
         self.libmodbus()
         if not Path("/usr/include/modbus/modbus.h").exists():
             missing("libmodbus's header", DEBIAN.format("libmodbus-dev"))
@@ -83,12 +82,12 @@ class Programs:
 
 @pytest.fixture(scope="session")
 def programs(tmp_path_factory) -> Programs:
-    """Where the programs of other people are."""
+    """Paths of third-party programs."""
     return Programs(tmp_path_factory.mktemp("programs"))
 
 
 def read_line(process: subprocess.Popen) -> str:
-    """Return the first line that a program prints."""
+    """Return the first line of a program's output."""
     if not select.select([process.stdout], [], [], GIVE_UP_S)[0]:
         raise AssertionError(f"{process.args} said nothing within {GIVE_UP_S:g} s")
     line = process.stdout.readline().strip()
@@ -110,7 +109,7 @@ def running(command: list[str], fds: tuple[int, ...] = ()) -> Iterator[subproces
 
 @contextmanager
 def serial_cable(folder: Path) -> Iterator[tuple[str, str]]:
-    """Connect two ptys, as a null modem does; yield the device files of both ends."""
+    """Connect two ptys like a null modem; yield the device files of both ends."""
     ends = [str(folder / f"end{k}") for k in (0, 1)]
     command = [program("socat"), *(f"pty,raw,echo=0,link={end}" for end in ends)]
     with running(command) as process, ExitStack() as held:
@@ -119,14 +118,14 @@ def serial_cable(folder: Path) -> Iterator[tuple[str, str]]:
             assert process.poll() is None, "socat ended at once"
             assert time.monotonic() < deadline, "socat made no ptys"
             time.sleep(0.005)
-        for end in ends:  # a pty that nobody holds hangs up, and socat ends
+        for end in ends:  # a pty without an open end hangs up, and socat ends
             held.callback(os.close, os.open(end, os.O_RDWR | os.O_NOCTTY))
         yield ends[0], ends[1]
 
 
 @pytest.fixture(scope="session")
 def run_program() -> Callable:
-    """Return the context manager that runs a program: (command, fds) to its process."""
+    """Return the context manager that runs a program."""
     return running
 
 
@@ -138,5 +137,5 @@ def first_line() -> Callable[[subprocess.Popen], str]:
 
 @pytest.fixture(scope="session")
 def cable() -> Callable:
-    """Return the context manager that connects two ptys: folder to both device files."""
+    """Return the context manager that connects two ptys."""
     return serial_cable

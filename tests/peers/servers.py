@@ -1,7 +1,7 @@
-"""Modbus servers of other people, one a process: ``servers.py NAME tcp`` or ``NAME rtu DEVICE``.
+"""Third-party Modbus servers, one per process: ``servers.py NAME tcp`` or ``NAME rtu DEVICE``.
 
-Each holds 16 holding registers of unit 1 from address 0 on, all 0. It prints its TCP port, or
-``ready``, once it answers, and serves until it is killed.
+Each serves 16 holding registers of unit 1 from address 0, all 0. It prints its TCP port or
+``ready`` when it answers, and runs until it is killed.
 """
 
 import asyncio
@@ -21,7 +21,7 @@ def say(text: object) -> None:
 def pymodbustcp(link: str, device: str) -> None:
     from pyModbusTCP.server import DataBank, ModbusServer
 
-    del link, device  # it speaks TCP only
+    del link, device  # TCP only
     bank = DataBank(coils_size=0, d_inputs_size=0, h_regs_size=REGISTERS, i_regs_size=0)
     server = ModbusServer(HOST, 0, no_block=True, data_bank=bank)
     server.start()
@@ -39,7 +39,7 @@ def modbus_tk(link: str, device: str) -> None:
         server = modbus_rtu.RtuServer(serial.Serial(device, BAUD))
     server.add_slave(1).add_block("all", defines.HOLDING_REGISTERS, 0, REGISTERS)
     if link == "tcp":
-        server._do_init()  # it listens later, in its thread; the port is wanted now
+        server._do_init()  # the thread listens later, and the port is needed now
         say(server._sock.getsockname()[1])
         server._do_init = lambda: None
     server.start()

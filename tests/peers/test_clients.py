@@ -1,7 +1,7 @@
-"""Clients of other people against the emulated device, over TCP and over a pty.
+"""Third-party clients with the emulated device, over TCP and over a pty.
 
-What they read must be the rig's displacement by the profile's scaling, and what they write must
-drive its current; all factors are worked out here by hand, not by the profile's code.
+They must read the rig's displacement and set its current. The scale factors are computed by hand,
+independently of the profile's code.
 """
 
 import ctypes
@@ -37,11 +37,11 @@ watchdog: none
 
 
 class RefusedError(Exception):
-    """A client says that the device refused; its text is the client's own."""
+    """The device rejected a request, in the client's words."""
 
 
 class Mbpoll:
-    """The program mbpoll (C, on libmodbus)."""
+    """The program mbpoll (C, libmodbus)."""
 
     can_write_and_read = False
 
@@ -77,11 +77,11 @@ class Mbpoll:
         self._run("-t", "4", "-r", str(address), values=values)
 
     def close(self) -> None:
-        """Nothing to do: each run of it connects anew."""
+        """Do nothing: each run opens its own connection."""
 
 
 class Libmodbus:
-    """libmodbus itself, by ctypes."""
+    """libmodbus through ctypes."""
 
     can_write_and_read = True
 
@@ -181,7 +181,7 @@ class Pymodbus:
 
 
 class PyModbusTcp:
-    """pyModbusTCP's client, which has no serial side."""
+    """pyModbusTCP's client, TCP only."""
 
     can_write_and_read = True
 
@@ -270,7 +270,7 @@ class ModbusTk:
 
 
 class Emulated:
-    """An emulated device with its time and its physics in sight."""
+    """An emulated device with access to its time and physics."""
 
     def __init__(self, emulator: Emulator, clock: ManualClock) -> None:
         self.emulator = emulator
@@ -280,13 +280,13 @@ class Emulated:
         self.where = {"host": host, "port": int(port)} if port else {"serial_port": host}
 
     def settle(self) -> None:
-        """Let the rig come to rest."""
+        """Wait until the rig is at rest."""
         self._clock.now_ns += 500_000_000
 
 
 @pytest.fixture
 def emulate() -> Iterator[Callable[[str], Emulated]]:
-    """Return a function that serves the emulated device of a profile."""
+    """Return a function that starts the emulated device of a profile."""
     stops: list[Callable[[], None]] = []
 
     def start(profile: str) -> Emulated:
@@ -323,7 +323,7 @@ def connect(programs) -> Iterator[Callable]:
 
 @pytest.fixture
 def module(tmp_path) -> str:
-    """A profile for a serial line, by path."""
+    """Path of a profile for a serial line."""
     path = tmp_path / "module.yaml"
     path.write_text(RTU_PROFILE, encoding="utf-8")
     return str(path)
@@ -335,7 +335,7 @@ ON_SERIAL = pytest.mark.parametrize("kind", [Mbpoll, Libmodbus, Pymodbus, Modbus
 
 @ON_TCP
 def test_floats_over_tcp(emulate, connect, kind):
-    """A LabJack's DAC0 drives 4 A/V about 2.5 V, and AIN0 shows the displacement by 12.5 um/V."""
+    """A LabJack's DAC0 has 4 A/V about 2.5 V, and AIN0 has 12.5 um/V."""
     emulated = emulate("labjack_t7")
     client = connect(kind, emulated)
     seen = []
@@ -351,7 +351,7 @@ def test_floats_over_tcp(emulate, connect, kind):
 
 @ON_TCP
 def test_sixteen_bits_over_tcp(emulate, connect, kind):
-    """A WAGO's words are volts by 10 / 32767, signed; function 23 writes and reads in one go."""
+    """A WAGO's words are signed, 10 V / 32767; function 23 writes and reads in one transaction."""
     emulated = emulate("wago_750")
     client = connect(kind, emulated)
     for raw in (0x2000, 0xE000):
@@ -371,7 +371,7 @@ def test_sixteen_bits_over_tcp(emulate, connect, kind):
 
 @ON_SERIAL
 def test_registers_over_a_serial_line(emulate, connect, module, kind):
-    """A module's mA and swapped floats come through with RTU framing, CRC and unit id."""
+    """A module's mA and swapped floats are correct with RTU framing, CRC and unit id."""
     emulated = emulate(module)
     client = connect(kind, emulated)
     for raw in (8000, 0x10000 - 12_000):
@@ -390,7 +390,7 @@ def test_registers_over_a_serial_line(emulate, connect, module, kind):
 
 @ON_TCP
 def test_refusals_are_understood(emulate, connect, kind):
-    """Each client tells in its own words what the device refuses, and the output stays."""
+    """Each client reports the device's rejection, and the output does not change."""
     emulated = emulate("labjack_t7")
     client = connect(kind, emulated)
     with pytest.raises(RefusedError, match=re.compile("address|exception_code=2", re.IGNORECASE)):

@@ -1,7 +1,6 @@
-"""The Modbus driver against servers of other people, over TCP and over a serial cable of ptys.
+"""The Modbus driver with third-party servers, over TCP and over connected ptys.
 
-What is written is read back, and what is to be read is written, by pymodbus's client: the driver
-and the server alone could agree on something wrong.
+pymodbus's client reads back outputs and writes inputs, independently of the driver.
 """
 
 import os
@@ -56,16 +55,16 @@ INPUT_AT = {"FLOAT": 8, "SWAPPED": 10, "INT": 12}
 
 @dataclass(frozen=True)
 class Server:
-    """A server of somebody else.
+    """A third-party server.
 
     Attributes:
-        name: What it is built on.
+        name: Its library.
         link: tcp or rtu.
-        writes_and_reads: Whether it knows function 23.
-        reads_first: Whether its function 23 reads before it writes, which the standard has the
-            other way round (section 6.17).
-        no_such_register: How a read past its end looks.
-        timeout_s: Longest wait for one answer; those that never answer cost this.
+        writes_and_reads: Whether it supports function 23.
+        reads_first: Whether its function 23 reads before it writes, contrary to the standard
+            (section 6.17).
+        no_such_register: Error of a read past its end.
+        timeout_s: Timeout of one answer.
     """
 
     name: str
@@ -87,7 +86,7 @@ SERVERS = {
         Server("pymodbus", "tcp"),
         Server("pymodbus", "rtu"),
         Server("modbus-serial", "tcp", writes_and_reads=False),
-        Server(  # silent about function 23, deaf from then on, and sends a reply without data
+        Server(  # does not answer function 23 and later requests
             "jsmodbus",
             "tcp",
             writes_and_reads=False,
@@ -100,13 +99,13 @@ MODULES = {"pyModbusTCP": "pyModbusTCP", "modbus-tk": "modbus_tk", "pymodbus": "
 
 
 class Served:
-    """A server that runs.
+    """A running server.
 
     Args:
-        server: What it is.
+        server: The server.
         process: Its process.
-        where: How the driver finds it.
-        folder: For profiles.
+        where: Options of the driver for its address.
+        folder: Folder for profiles.
     """
 
     def __init__(
@@ -120,7 +119,7 @@ class Served:
         self._profile.write_text(PROFILE.format(link=link), encoding="utf-8")
 
     def device(self, output: str = "FLOAT", sensor: str = "FLOAT", **more) -> ModbusDac:
-        """Return a device on it: 2 A/V and 1 A at 0 V, 12.5 um/V and -4 um at 0 V."""
+        """Return a device on this server: 2 A/V and 1 A at 0 V, 12.5 um/V and -4 um at 0 V."""
         options = {
             "profile": str(self._profile),
             "output": output,
@@ -136,7 +135,7 @@ class Served:
 
     @contextmanager
     def client(self):
-        """Give pymodbus's client; over a serial cable, the driver must be closed meanwhile."""
+        """Yield pymodbus's client; over a serial cable the driver must be closed."""
         from pymodbus.client import ModbusSerialClient, ModbusTcpClient
 
         if self.server.link == "tcp":
@@ -150,7 +149,7 @@ class Served:
             made.close()
 
     def put(self, kind: str, volts: float) -> None:
-        """Make an input show this voltage."""
+        """Set the voltage of an input."""
         with self.client() as client:
             if kind == "INT":
                 words = client.convert_to_registers(
@@ -161,7 +160,7 @@ class Served:
             assert not client.write_registers(INPUT_AT[kind], words).isError()
 
     def get(self, kind: str) -> float:
-        """Return the voltage that an output holds."""
+        """Return the voltage of an output."""
         with self.client() as client:
             count = 1 if kind == "INT" else 2
             reply = client.read_holding_registers(OUTPUT_AT[kind], count=count)
@@ -216,13 +215,13 @@ def start(programs, run_program, first_line, cable, tmp_path_factory) -> Callabl
 
 @pytest.fixture(scope="module", params=SERVERS)
 def served(request, start) -> Iterator[Served]:
-    """A server that runs, each of them in turn."""
+    """A running server, each of them in turn."""
     with start(SERVERS[request.param]) as made:
         yield made
 
 
 def exchange(device: ModbusDac, *commands: float) -> list[float]:
-    """Exchange one sample after the other; return what was measured, um."""
+    """Exchange single samples; return the measured displacements in um."""
     measured = []
     for k, command in enumerate(commands):
         displacement_um = np.full(1, np.nan)
@@ -233,7 +232,7 @@ def exchange(device: ModbusDac, *commands: float) -> list[float]:
 
 @pytest.mark.parametrize("kind", ["FLOAT", "SWAPPED", "INT"])
 def test_values_come_back_right(served, kind):
-    """What the server holds is what was commanded, and what it shows is what is measured."""
+    """The server's registers agree with commands and measurements."""
     device = served.device(kind, kind)
     for volts, command in ((-7.5, 3.5), (4.125, -11.0), (9.9995, 20.5)):
         served.put(kind, volts)
@@ -245,7 +244,7 @@ def test_values_come_back_right(served, kind):
 
 
 def test_finds_out_whether_a_sample_is_one_transaction(served):
-    """Function 23 is used where the server knows it, and a write and a read where it doesn't."""
+    """Function 23 is used if the server supports it, otherwise a write and a read."""
     device = served.device()
     device.open(RATE_HZ, 1)
     device.close()
@@ -253,7 +252,7 @@ def test_finds_out_whether_a_sample_is_one_transaction(served):
 
 
 def test_opening_does_not_move_the_output(served):
-    """Finding out what the server can do leaves the output as it was."""
+    """Probing the server does not change the output."""
     device = served.device()
     device.open(RATE_HZ, 1)
     exchange(device, 8.0)
@@ -264,9 +263,9 @@ def test_opening_does_not_move_the_output(served):
 
 
 def test_reads_after_it_writes(served):
-    """An input at the output's own address shows this sample's command if function 23 writes first.
+    """With an input at the output's address, function 23 returns this sample's command.
 
-    Where there is no function 23, hilctl reads first and then writes.
+    Without function 23, hilctl reads before it writes.
     """
     device = served.device("FLOAT", "ECHO")
     device.open(RATE_HZ, 1)
@@ -283,7 +282,7 @@ def test_reads_after_it_writes(served):
 
 @pytest.mark.parametrize(("output", "sensor"), [("GONE", "FLOAT"), ("FLOAT", "GONE")])
 def test_says_in_words_that_a_register_is_missing(served, output, sensor):
-    """A wrong address ends as an error that names the exception, at the first sample or before."""
+    """A wrong address raises an error that names the exception, by the first sample."""
     device = served.device(output, sensor)
 
     def use() -> None:
@@ -296,7 +295,7 @@ def test_says_in_words_that_a_register_is_missing(served, output, sensor):
 
 
 def test_make_safe_works_open_or_closed(served):
-    """The last resort puts the output where it is told to, with or without a connection."""
+    """make_safe sets the output with or without a connection."""
     device = served.device("INT", "INT")
     device.open(RATE_HZ, 1)
     exchange(device, 9.0)
@@ -307,7 +306,7 @@ def test_make_safe_works_open_or_closed(served):
 
 
 def test_out_of_range_never_reaches_the_server(served):
-    """A command beyond the range is refused, and the output holds what it held."""
+    """An out-of-range command is rejected, and the output does not change."""
     device = served.device()
     device.open(RATE_HZ, 1)
     exchange(device, 5.0)
@@ -320,7 +319,7 @@ def test_out_of_range_never_reaches_the_server(served):
 
 @pytest.mark.parametrize("name", [name for name in SERVERS if name.endswith("rtu")])
 def test_only_its_own_unit_answers(start, name):
-    """Another unit on the line is not there; after its silence the right one still answers."""
+    """A missing unit does not answer; afterwards the right one still does."""
     with start(SERVERS[name]) as served:
         with pytest.raises(DeviceError, match=r"no answer|exception"):
             served.device(unit_id=9, timeout_s=SHORT_S).open(RATE_HZ, 1)
@@ -333,7 +332,7 @@ def test_only_its_own_unit_answers(start, name):
 
 @pytest.mark.parametrize("name", SERVERS)
 def test_death_of_the_server_is_an_error_within_the_time_out(start, name):
-    """A server that dies between two samples costs one time-out, not the machine."""
+    """A server that dies between two samples is an error within one timeout."""
     with start(SERVERS[name]) as served:
         device = served.device(timeout_s=2.0)
         device.open(RATE_HZ, 1)

@@ -22,7 +22,6 @@ from hilctl.studies.campaign.parallel_simulation import planned_fast, run_fast
 from hilctl.studies.campaign.steps import load_campaign
 from hilctl.studies.multi_run.collect import collect
 from hilctl.studies.multi_run.plots import sheets_of
-from hilctl.studies.multi_run.summary_text import headline
 from hilctl.studies.multi_run.trend import (
     AREA,
     ASYMMETRY,
@@ -30,6 +29,7 @@ from hilctl.studies.multi_run.trend import (
     HYSTERESIS,
     NATURAL,
     STROKE,
+    headline,
     trends,
 )
 

@@ -12,7 +12,7 @@ BUDGET = "set: {limits.rms_current_a: 1.3, limits.thermal_time_constant_s: 2.0}\
 def test_processes_give_the_table_of_one(tmp_path, monkeypatch):
     """To the last bit, with the heat that goes from run to run and the noise of each."""
     monkeypatch.setattr(
-        "hilctl.studies.multi_run.multi_run_page.write_series", lambda _series, path: path.touch()
+        "hilctl.studies.campaign.campaign_runner.write_series", lambda _series, path: path.touch()
     )
     (tmp_path / "rig.yaml").write_text(EXPERIMENT, encoding="utf-8")
     (tmp_path / "few.yaml").write_text(CAMPAIGN + BUDGET, encoding="utf-8")

@@ -1,8 +1,8 @@
-"""A campaign of simulated runs that need no real time: at once, over processes or a Dask cluster.
+"""Campaign of simulated runs without real time, in parallel processes or on a Dask cluster.
 
-Each run is made of the texts that were checked, and gives back its recording as bytes: no worker
-needs to see the campaign's folder, and a file appears in it whole or not at all. The coil begins
-each run with the heat that it would have if the steps and their pauses followed each other.
+A worker receives the checked texts and returns the recording as bytes, so it does not need access
+to the campaign's folder. The coil starts each run with the heat that it would have if the steps and
+their pauses followed each other.
 """
 
 import tempfile
@@ -26,21 +26,20 @@ from hilctl.studies.campaign.campaign_runner import (
 )
 from hilctl.studies.campaign.plan import CampaignPlan, PlannedStep, planned
 from hilctl.studies.campaign.steps import CampaignSteps
-from hilctl.studies.campaign.store import new_recording, standing_runs
+from hilctl.studies.campaign.store import completed_runs, new_recording
 from hilctl.studies.campaign.table import CampaignRow
-from hilctl.studies.multi_run.columns import COMPLETED
-from hilctl.studies.multi_run.digest import RunDigest, digest_of
-from hilctl.studies.multi_run.run_figures import RunFigures
+from hilctl.studies.multi_run.collect import COMPLETED
+from hilctl.studies.multi_run.digest import RunDigest, RunFigures, digest_of
 
 
 @dataclass(frozen=True, slots=True)
 class FastTask:
-    """One run, as text.
+    """Input of one run.
 
     Attributes:
         experiment: The experiment as YAML.
-        files: Texts of the files that it refers to, by absolute path.
-        folder: Folder that file names in it are relative to.
+        files: Texts of the files it uses, by absolute path.
+        folder: Folder that its file names are relative to.
         heat_a2: Heat of the coil before it, in A^2.
     """
 
@@ -52,14 +51,14 @@ class FastTask:
 
 @dataclass(frozen=True, slots=True)
 class FastRun:
-    """What became of a run.
+    """Outcome of one run.
 
     Attributes:
-        recording: Its recording, as bytes; empty where it was refused.
+        recording: Its recording as bytes; empty if it was refused.
         code: ``completed``, ``fault`` or ``refused``.
-        reason: One line for people.
-        harmless: Whether it says nothing against running the next one.
-        digest: What its recording says; None where it was not completed.
+        reason: Why it ended, in one line.
+        harmless: Whether the next step may run.
+        digest: Data of its recording; None if it was not completed.
     """
 
     recording: bytes
@@ -70,7 +69,7 @@ class FastRun:
 
 
 def run_task(task: FastTask) -> FastRun:
-    """Run one step, on whatever machine this is called."""
+    """Run one step on a worker."""
     document = Document("experiment", task.experiment)
     loaded = resolve(document, Path(task.folder), files=TextFiles(task.files))
     with tempfile.TemporaryDirectory(prefix="hilctl-campaign-") as folder:
@@ -86,44 +85,44 @@ def run_task(task: FastTask) -> FastRun:
 
 
 def planned_fast(campaign: CampaignSteps, folder: Path) -> CampaignPlan:
-    """Return the plan of a campaign whose runs need no real time.
+    """Return the plan of a campaign without real time.
 
     Raises:
-        ConfigError: One or more steps must not be run.
-        InputError: A device is not a simulated one.
+        ConfigError: One or more steps are not allowed.
+        InputError: A device is not simulated.
     """
-    plan = planned(campaign, folder, standing_runs(folder) if folder.is_dir() else {})
+    plan = planned(campaign, folder, completed_runs(folder) if folder.is_dir() else {})
     for each in plan.steps:
         info = each.loaded.device.info
         if not info.simulated:
-            rule = "only a simulated device can do without real time"
+            rule = "only simulated devices run without real time"
             raise InputError(f"--fast: {each.step.text}: {info.name}: {rule}")
     return plan
 
 
 def run_fast(plan: CampaignPlan, host: CampaignHost, scheduler: str = "none") -> CampaignResult:
-    """Run what is left of a campaign as fast as it goes.
+    """Run the remaining steps of a campaign as fast as possible.
 
     Args:
-        plan: Its plan.
-        host: Who watches.
-        scheduler: Where runs go, see :func:`hilctl.identify.parallel.streams`.
+        plan: The plan.
+        host: The observers.
+        scheduler: Scheduler of the runs, see :func:`hilctl.identify.parallel.streams`.
 
     Raises:
-        InputError: There is no room, the table can't be written, or the scheduler can't be reached.
+        InputError: No disk space, the table can't be written, or the scheduler is unreachable.
     """
     plan.require_room()
     left = plan.left
     with streams(scheduler) as stream:
-        series = Campaign(plan, host)
-        series.keep()
+        state = Campaign(plan, host)
+        state.keep()
         runs = stream(run_task, [_task(each) for each in left])
         for number, (each, run) in enumerate(zip(left, runs, strict=True), 1):
-            _take(series, each, run)
+            _take(state, each, run)
             host.on_progress(number / len(left), f"{len(left) - number} of {len(left)} runs left")
             if not run.harmless:
-                return series.result(f"{each.step.text}: {run.reason}")
-    return series.result()
+                return state.result(f"{each.step.text}: {run.reason}")
+    return state.result()
 
 
 def _task(each: PlannedStep) -> FastTask:
@@ -132,13 +131,13 @@ def _task(each: PlannedStep) -> FastTask:
     return FastTask(loaded.yaml_text, dict(loaded.files.texts), folder, each.heat_a2)
 
 
-def _take(series: Campaign, each: PlannedStep, run: FastRun) -> None:
-    name = series.plan.campaign.config.name
+def _take(state: Campaign, each: PlannedStep, run: FastRun) -> None:
+    name = state.plan.campaign.config.name
     if not run.recording:
-        series.add(each, CampaignRow(f"refused: {run.reason}", code="refused"))
+        state.add(each, CampaignRow(f"refused: {run.reason}", code="refused"))
         return
-    path = new_recording(series.plan.folder, name, each.step.number)
+    path = new_recording(state.plan.folder, name, each.step.number)
     write_file(path, lambda stream: stream.write(run.recording), overwrite=False)
     result = COMPLETED if run.code == COMPLETED else f"{run.code}: {run.reason}"
     figures = run.digest.figures if run.digest else RunFigures()
-    series.add(each, CampaignRow(result, figures, path.name, run.code, digest=run.digest))
+    state.add(each, CampaignRow(result, figures, path.name, run.code, digest=run.digest))

@@ -1,6 +1,5 @@
-"""Every step of a campaign held against device, model and limits, before the first one moves."""
+"""Plan of a campaign: every step is checked against device, model and limits in advance."""
 
-import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,8 +12,8 @@ from hilctl.experiment.load import LoadedExperiment
 from hilctl.experiment.preflight import check
 from hilctl.run.start import RunKey
 from hilctl.studies.campaign.steps import CampaignStep, CampaignSteps, base_problem, key_of
+from hilctl.studies.step_runner import free_mb, require_room
 
-_SPARE = 1.2
 _MOST_PROBLEMS = 20
 _LONG_AFTER_S = 1e12
 _NO_HEAT = RunHeat()
@@ -22,18 +21,18 @@ _NO_HEAT = RunHeat()
 
 @dataclass(frozen=True, slots=True)
 class PlannedStep:
-    """A step that may be run, or stands already.
+    """A step to run, or done already.
 
     Attributes:
         step: The step.
         loaded: Its experiment.
         settings: All ``key=value`` texts over the base experiment.
-        key: What a recording of it says that it is of.
-        kept: Its recording, where it stands already.
-        heat: What it does to the heat of the coil.
-        megabytes: About how large its recording will be.
-        heat_a2: Heat of the coil before it, in A^2, where steps and pauses follow each other.
-        pause_s: Time for which the coil must cool before it then.
+        key: Fingerprint of its experiment in a recording.
+        kept: Its recording, if it is done already.
+        heat: Heat of its current in the coil.
+        megabytes: Approximate size of its recording.
+        heat_a2: Heat of the coil before it, in A^2, if all steps run without interruption.
+        pause_s: Time for the coil to cool before it.
     """
 
     step: CampaignStep
@@ -48,19 +47,19 @@ class PlannedStep:
 
     @property
     def seconds(self) -> float:
-        """Time that it takes."""
+        """Duration of the run."""
         return self.heat.seconds
 
 
 @dataclass(frozen=True, slots=True)
 class CampaignPlan:
-    """What a campaign will do.
+    """Plan of a campaign.
 
     Attributes:
         campaign: The campaign.
-        folder: Where its recordings and its table go.
+        folder: Folder of its recordings and its table.
         steps: Its steps in order.
-        free_mb: Room on the disk.
+        free_mb: Free disk space.
     """
 
     campaign: CampaignSteps
@@ -70,58 +69,52 @@ class CampaignPlan:
 
     @property
     def left(self) -> tuple[PlannedStep, ...]:
-        """The steps that are still to be run."""
+        """The remaining steps."""
         return tuple(each for each in self.steps if each.kept is None)
 
     @property
     def seconds(self) -> float:
-        """Rig time that is left, without pauses."""
+        """Rig time of the remaining steps, without pauses."""
         return sum(each.seconds for each in self.left)
 
     @property
     def pauses_s(self) -> float:
-        """Time for which the coil must cool, as far as steps that are left ask for it."""
+        """Time for the coil to cool before the remaining steps."""
         return sum(each.pause_s for each in self.left)
 
     @property
     def megabytes(self) -> float:
-        """About how large the recordings that are left will be."""
+        """Approximate size of the remaining recordings."""
         return sum(each.megabytes for each in self.left)
 
     def require_room(self) -> None:
-        """Refuse what the disk has no room for.
-
-        Raises:
-            InputError: It has not.
-        """
-        if self.free_mb < _SPARE * self.megabytes:
-            room = f"{self.megabytes:.0f} MB, and there are {self.free_mb:.0f} MB"
-            raise InputError(f"{self.folder}: no room for the recordings: they take {room}")
+        """Raise InputError if the disk has no room for the recordings."""
+        require_room(self.folder, self.megabytes, self.free_mb)
 
 
 def planned(
     campaign: CampaignSteps,
     folder: Path,
-    standing: Mapping[RunKey, Sequence[Path]],
+    completed: Mapping[RunKey, Sequence[Path]],
     heat_a2: float | None = None,
     on_part: Callable[[float], None] = lambda part: None,
 ) -> CampaignPlan:
-    """Check every step that is still to be run, and plan them.
+    """Check and plan the remaining steps.
 
     Args:
         campaign: The campaign.
-        folder: Where recordings go.
-        standing: Completed recordings that are there, in the order in which they were made.
-        heat_a2: Heat of the coil before the first step, in A^2; None where its steps need not
-            keep real time, and the kept ones count as well.
-        on_part: Called with how much is checked, from 0 to 1.
+        folder: Folder of the recordings.
+        completed: Completed recordings, in their order.
+        heat_a2: Heat of the coil before the first step, in A^2; None for steps without real time,
+            where kept steps heat the coil as well.
+        on_part: Called with progress from 0 to 1.
 
     Raises:
-        ConfigError: One or more steps must not be run; all reasons are listed.
+        ConfigError: One or more steps are not allowed; all problems are listed.
         InputError: The base experiment can't be read.
     """
     files, problems = TextFiles(), _Problems(campaign)
-    left = {key: list(paths) for key, paths in standing.items()}
+    left = {key: list(paths) for key, paths in completed.items()}
     known: dict[tuple[str, ...], PlannedStep] = {}
     steps: list[PlannedStep] = []
     for number, step in enumerate(campaign.steps):
@@ -130,16 +123,14 @@ def planned(
             each = _loaded(campaign, step, files)
             kept = left.get(each.key)
             each = replace(each, kept=kept.pop(0) if kept else None)
-            # What only differs by its noise is checked once; what stands is not checked again.
+            # Steps that differ in noise only are checked once; kept steps are not checked again.
             if each.kept is None or (heat_a2 is None and _has_budget(each)):
                 each = _checked(each, known, folder)
             steps.append(each)
         except ConfigError as error:
             problems.add(step, error.problems)
     problems.refuse()
-    around = next(p for p in (folder, *folder.absolute().parents) if p.exists())
-    free_mb = shutil.disk_usage(around).free / 1e6
-    return CampaignPlan(campaign, folder, _cooling(campaign, steps, heat_a2), free_mb)
+    return CampaignPlan(campaign, folder, _cooling(campaign, steps, heat_a2), free_mb(folder))
 
 
 def _has_budget(each: PlannedStep) -> bool:
@@ -162,7 +153,7 @@ def _checked(
 ) -> PlannedStep:
     same = known.get(each.step.settings)
     if same is None:
-        # At a far time: what the last run has left is waited for, and no reason to refuse a step.
+        # Far in the future: heat of the last run causes a pause, not an error.
         forecast = check(each.loaded, now_s=_LONG_AFTER_S).forecast
         same = replace(each, heat=forecast.heat, megabytes=forecast.recording_mb)
         known[each.step.settings] = same
@@ -172,7 +163,7 @@ def _checked(
 def _cooling(
     campaign: CampaignSteps, steps: Sequence[PlannedStep], heat_a2: float | None
 ) -> tuple[PlannedStep, ...]:
-    """Return the steps with their pauses, each begun as soon as the coil allows it."""
+    """Return the steps with their pauses, each started as soon as the coil allows."""
     to_rms_a = campaign.config.cool_down.to_rms_a or float("inf")
     found: list[PlannedStep] = []
     now_s, heat_now_a2 = 0.0, heat_a2 or 0.0
@@ -190,7 +181,7 @@ def _cooling(
 
 
 class _Problems:
-    """Broken rules of many steps: each once, with the place in the campaign's file.
+    """Problems of many steps, each listed once with its location in the campaign file.
 
     Args:
         campaign: The campaign.
@@ -201,14 +192,14 @@ class _Problems:
         self._found: dict[tuple[str, str, str], tuple[ConfigProblem, list[CampaignStep]]] = {}
 
     def add(self, step: CampaignStep, problems: Sequence[ConfigProblem]) -> None:
-        """Take what is wrong with a step."""
+        """Add the problems of a step."""
         for problem in problems:
             moved = replace(problem, where=self._where(step, problem))
             known = self._found.setdefault((moved.where, moved.key, moved.rule), (moved, []))
             known[1].append(step)
 
     def refuse(self) -> None:
-        """Raise ConfigError where there is any."""
+        """Raise ConfigError if there are problems."""
         if self._found:
             raise ConfigError(
                 replace(problem, hint="; ".join(filter(None, (problem.hint, self._whom(steps)))))
@@ -222,7 +213,7 @@ class _Problems:
         return f"in {steps[0].text}{more}"
 
     def _where(self, step: CampaignStep, problem: ConfigProblem) -> str:
-        """Return where a value stands: one that a step sets, in the campaign's file."""
+        """Return the location of a value; values of a step are in the campaign file."""
         if not problem.where.startswith("--set "):
             return problem.where
         key, document = key_of(problem.where.removeprefix("--set ")), self._campaign.document

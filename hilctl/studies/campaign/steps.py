@@ -1,4 +1,4 @@
-"""A campaign's steps, in the order in which they are run: each is settings over one experiment."""
+"""Steps of a campaign in their order, each as settings over the base experiment."""
 
 import json
 import math
@@ -13,20 +13,19 @@ from hilctl.base.files import TextFiles
 from hilctl.base.yaml import Document, Loc, dotted, load_document
 from hilctl.experiment.devices import device_class, known_devices
 from hilctl.experiment.load import LoadedExperiment, named_from, resolve
-from hilctl.studies.campaign.file import CampaignFile
-from hilctl.studies.campaign.parameter_grid import MOST_STEPS, Point, groups_of, points
+from hilctl.studies.campaign.file import MOST_STEPS, CampaignFile, Point, groups_of, points
 
 _SEEDS = 1_000_000
 
 
 @dataclass(frozen=True, slots=True)
 class CampaignStep:
-    """One step of a campaign: one run.
+    """One run of a campaign.
 
     Attributes:
-        number: Its place in the order, from 1.
+        number: Its position, from 1.
         point: A value for each varied key; empty for a reference run.
-        repeat: Which repeat of the point it is, or which reference run, from 1.
+        repeat: Number of the repeat or of the reference run, from 1.
         is_reference: Whether it is a reference run.
         settings: ``key=value`` texts over the base experiment.
     """
@@ -39,20 +38,20 @@ class CampaignStep:
 
     @property
     def text(self) -> str:
-        """The step in words: its number and its values."""
+        """Its number and its values."""
         values = ", ".join(f"{key}={cell(value)}" for key, value in self.point.items())
         return f"step {self.number} ({values or f'reference run {self.repeat}'})"
 
 
 @dataclass(frozen=True, slots=True)
 class CampaignSteps:
-    """A campaign file with its steps, none of them checked.
+    """A campaign file with its steps, not checked yet.
 
     Attributes:
         config: The file.
-        document: Where each of its values stands.
+        document: The file's YAML with the location of each value.
         experiment: File of the base experiment.
-        settings: ``key=value`` texts over it that came from outside of the campaign file.
+        settings: ``key=value`` texts over it from outside the campaign file.
         keys: The varied keys.
         steps: The steps in order.
     """
@@ -68,8 +67,8 @@ class CampaignSteps:
         """Return the experiment of a step.
 
         Raises:
-            InputError: It, or what it names, can't be read.
-            ConfigError: It breaks rules.
+            InputError: The experiment, or a file it uses, can't be read.
+            ConfigError: The experiment is invalid.
         """
         document = load_document(self.experiment, files)
         return resolve(document, self.experiment.parent, self.settings_for(step, files), files)
@@ -77,11 +76,11 @@ class CampaignSteps:
     def settings_for(self, step: CampaignStep, files: TextFiles) -> list[str]:
         """Return all ``key=value`` texts of a step, outermost last.
 
-        Each run of a simulated device gets noise of its own, the same whenever it is run.
+        Each run of a simulated device gets its own, reproducible noise.
 
         Raises:
             InputError: The base experiment can't be read.
-            ConfigError: A setting is none.
+            ConfigError: A setting is invalid.
         """
         settings = [*self.settings, *step.settings]
         document = load_document(self.experiment, files)
@@ -108,7 +107,7 @@ def load_campaign(path: Path, settings: Sequence[str] = ()) -> CampaignSteps:
 
     Raises:
         InputError: It can't be read.
-        ConfigError: Rules are broken; all of them are listed.
+        ConfigError: The file is invalid; all problems are listed.
     """
     return campaign_of(load_document(path), path.parent, settings)
 
@@ -118,11 +117,11 @@ def campaign_of(document: Document, folder: Path, settings: Sequence[str]) -> Ca
 
     Args:
         document: The campaign.
-        folder: What the experiment's file name is relative to.
+        folder: Folder that the experiment's file name is relative to.
         settings: ``key=value`` texts over its base experiment.
 
     Raises:
-        ConfigError: Rules are broken; all of them are listed.
+        ConfigError: The file is invalid; all problems are listed.
     """
     config = document.validate(CampaignFile)
     groups, broken = groups_of(config.vary)
@@ -144,7 +143,7 @@ def campaign_of(document: Document, folder: Path, settings: Sequence[str]) -> Ca
     ]
     if config.condition is not None and "condition" in {key.split(".")[0] for key in keys}:
         where = document.where(("condition",))
-        problems.append(ConfigProblem(where, "condition", "must not stand here where it is varied"))
+        problems.append(ConfigProblem(where, "condition", "must not be set, because it is varied"))
     if problems:
         raise ConfigError(problems)
     steps = tuple(_steps(config, points(groups, config.order, config.seed, config.repeat)))
@@ -192,7 +191,7 @@ def settings_of(given: Mapping[str, Any]) -> list[str]:
 
 
 def setting(key: str, value: Any) -> str:
-    """Return the ``key=value`` text that sets a key to any plain value."""
+    """Return the ``key=value`` text that sets a key to a plain value."""
     return f"{key}={json.dumps(value, ensure_ascii=False)}"
 
 
@@ -202,13 +201,13 @@ def key_of(text: str) -> str:
 
 
 def cell(value: Any) -> Any:
-    """Return a value as it stands in a table: a number or a text."""
+    """Return a value as a table cell: a number or a text."""
     if value is None or isinstance(value, str | int | float):
         return value
     return json.dumps(value, ensure_ascii=False)
 
 
 def base_problem(campaign: CampaignSteps, error: InputError) -> ConfigError:
-    """Return the problem of a base experiment that can't be read."""
+    """Return the error for a base experiment that can't be read."""
     where = campaign.document.where(("experiment",))
     return ConfigError([ConfigProblem(where, "experiment", str(error))])

@@ -1,4 +1,4 @@
-"""A campaign's folder: the recordings in it, made whole, and who works on it."""
+"""Campaign folder: its lock, its recordings, and repair of truncated ones."""
 
 import os
 from collections.abc import Callable, Iterator
@@ -23,10 +23,10 @@ _POLL_S = 0.1
 
 
 def campaign_folder(campaign: CampaignSteps) -> Path:
-    """Return the folder of a campaign that is given no other: as its file says, or by its name.
+    """Return the default folder of a campaign: from its file, or named after it.
 
     Raises:
-        ConfigError: The base experiment can't be read, or breaks rules.
+        ConfigError: The base experiment can't be read or is invalid.
     """
     config = campaign.config
     if config.folder is not None:
@@ -45,26 +45,26 @@ def campaign_folder(campaign: CampaignSteps) -> Path:
 
 
 @contextmanager
-def held_folder(
+def locked_folder(
     folder: Path, sleep_s: Callable[[float], None], wait_s: float = 5.0
 ) -> Iterator[None]:
-    """Make a campaign's folder, and hold it against every other campaign.
+    """Create a campaign's folder, and lock it against other campaigns.
 
     Args:
         folder: The folder.
-        sleep_s: Waits that long.
-        wait_s: How long to wait for one that is just ending.
+        sleep_s: Sleeps for a time in s.
+        wait_s: Time to wait for the lock.
 
     Raises:
-        InputError: It can't be made, or another campaign works on it.
+        InputError: The folder can't be created, or another campaign uses it.
     """
     made = [each for each in (folder, *folder.parents) if not each.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        # Windows opens no folder and has no locks: there is nothing to hold.
+        # Windows has no locks and cannot open a folder.
         held = os.open(folder if HAS_LOCKS else os.devnull, os.O_RDONLY)
     except OSError as error:
-        raise InputError(f"{folder}: can't be made: {error.strerror}") from None
+        raise InputError(f"{folder}: can't be created: {error.strerror}") from None
     try:
         waited_s = 0.0
         while not _locked(held):
@@ -74,9 +74,9 @@ def held_folder(
             waited_s += _POLL_S
         try:
             yield
-        except InputError:  # nothing has been written: the folders are not left behind either
+        except InputError:  # nothing was written: remove the new folders
             for each in made:
-                with suppress(OSError):  # something stands in it, which is somebody's
+                with suppress(OSError):  # not empty
                     each.rmdir()
             raise
     finally:
@@ -92,19 +92,19 @@ def _locked(held: int) -> bool:
 
 
 def await_runs(folder: Path, sleep_s: Callable[[float], None]) -> None:
-    """Wait for the end of runs that record to a folder: of one whose supervisor was killed.
+    """Wait for runs that record to a folder and whose supervisor has died.
 
-    Its loop goes on until it misses the supervisor, and leaves by its safe ramp.
+    Their loop ends by its safe ramp when it misses the supervisor's heartbeat.
 
     Raises:
-        InputError: One does not end.
+        InputError: A run does not end.
     """
     waited_s = 0.0
     while living := [run for run in runs() if run.alive and _is_in(run, folder)]:
         if living[0].supervised or waited_s > _LONGEST_WAIT_S:
             run = living[0].card
             raise InputError(
-                f"{folder}: run {run.name} records to it: wait for its end, or stop it"
+                f"{folder}: run {run.name} records to this folder. Wait for its end, or stop it"
             )
         sleep_s(_POLL_S)
         waited_s += _POLL_S
@@ -114,11 +114,11 @@ def _is_in(run: RunFolder, folder: Path) -> bool:
     return Path(run.card.recording).parent == folder.resolve()
 
 
-def make_whole(folder: Path) -> list[str]:
-    """Make recordings whole that were cut short; return what was done, for people.
+def repair_recordings(folder: Path) -> list[str]:
+    """Repair truncated recordings; return one line per repaired file.
 
-    What was killed before its run began holds nothing of one: an empty file is removed, and one
-    with less than a head is kept as ``NAME.torn``.
+    A file of a run that never started has no samples: an empty file is deleted, and one with an
+    incomplete header is kept as ``NAME.torn``.
     """
     done = []
     for path in recordings_in(folder):
@@ -131,20 +131,20 @@ def make_whole(folder: Path) -> list[str]:
 
 
 def _put_aside(path: Path) -> list[str]:
-    """Take a file out of the way that was claimed for a run that never began."""
+    """Remove or rename a file of a run that never started."""
     with path.open("rb") as stream:
         head = stream.read(len(MCAP0_MAGIC))
         if is_being_recorded(stream) or head not in {b"", MCAP0_MAGIC}:
             return []
     if not head:
         path.unlink()
-        return [f"{path}: its run never began; the empty file is removed"]
+        return [f"{path}: empty file of a run that never started; deleted"]
     torn = path.rename(f"{path}.torn")
-    return [f"{path}: its run never began; what there is is kept as {torn.name}"]
+    return [f"{path}: run never started; kept as {torn.name}"]
 
 
-def standing_runs(folder: Path) -> dict[RunKey, list[Path]]:
-    """Return the completed runs whose recordings are in a folder, in the order of their names."""
+def completed_runs(folder: Path) -> dict[RunKey, list[Path]]:
+    """Return the recordings of completed runs in a folder, sorted by name."""
     found: dict[RunKey, list[Path]] = {}
     for path in recordings_in(folder):
         key = completed_key(path)
@@ -153,8 +153,8 @@ def standing_runs(folder: Path) -> dict[RunKey, list[Path]]:
     return found
 
 
-def last_begun(folder: Path) -> Path | None:
-    """Return the recording in a folder whose run began last; None without any."""
+def last_started(folder: Path) -> Path | None:
+    """Return the recording in a folder that started last; None without any."""
     begun = []
     for path in recordings_in(folder):
         try:
@@ -165,7 +165,7 @@ def last_begun(folder: Path) -> Path | None:
 
 
 def new_recording(folder: Path, name: str, number: int) -> Path:
-    """Return a name that no file has: ``NAME-0001.mcap``, and ``NAME-0001-2.mcap`` after that."""
+    """Return an unused name: ``NAME-0001.mcap``, then ``NAME-0001-2.mcap``."""
     path, attempt = folder / f"{name}-{number:04d}.mcap", 1
     while os.path.lexists(path):
         attempt += 1

@@ -1,4 +1,4 @@
-"""The table of a campaign: a row a step, what varied, what came out, and where it is recorded."""
+"""Table of a campaign: one row per step with varied values, metrics, result and recording."""
 
 import csv
 import io
@@ -13,30 +13,30 @@ from hilctl.analysis.export import write_parquet
 from hilctl.base.files import write_file, write_text
 from hilctl.studies.campaign.plan import CampaignPlan
 from hilctl.studies.campaign.steps import CampaignStep, cell
-from hilctl.studies.multi_run.columns import (
+from hilctl.studies.multi_run.collect import (
     PLANNED,
     RECORDING,
     REFERENCE,
     REPEAT,
     RESULT,
     STEP,
-    SeriesEntry,
+    SeriesRun,
 )
-from hilctl.studies.multi_run.digest import RunDigest
-from hilctl.studies.multi_run.run_figures import FIGURES, RunFigures
+from hilctl.studies.multi_run.digest import FIGURES, RunDigest, RunFigures
+from hilctl.studies.multi_run.varied_parameter import short_value
 
 
 @dataclass(frozen=True, slots=True)
 class CampaignRow:
-    """What became of a step.
+    """Outcome of a step.
 
     Attributes:
-        result: ``planned``, ``completed``, or what went wrong.
-        figures: What its recording says.
-        recording: Name of its recording in the campaign's folder; empty where there is none.
+        result: ``planned``, ``completed``, or code and reason.
+        figures: Metrics of its recording.
+        recording: Name of its recording in the campaign's folder, or empty.
         code: ``planned``, ``completed``, ``refused``, ``fault`` or ``stopped``.
-        kept: Whether it stood already.
-        digest: What its recording gives to figures; None where there is none.
+        kept: Whether it was done already.
+        digest: Data of its recording for figures, or None.
     """
 
     result: str = PLANNED
@@ -50,11 +50,11 @@ class CampaignRow:
 def columns_of(
     keys: Sequence[str], rows: Sequence[tuple[CampaignStep, CampaignRow]]
 ) -> dict[str, list[Any]]:
-    """Return the columns of the table, each a list with a value a step; None where there is none.
+    """Return the columns of the table, each with one value per step, or None.
 
     Args:
         keys: The varied keys.
-        rows: The steps in order, each with what became of it.
+        rows: The steps in order, each with its outcome.
     """
     columns: dict[str, list[Any]] = {
         STEP: [step.number for step, _ in rows],
@@ -71,7 +71,7 @@ def columns_of(
 
 
 def _one_type(values: list[Any]) -> list[Any]:
-    """Return a column of numbers, or one of texts: no other program takes both in one."""
+    """Return a column of numbers only, or of texts only, as other programs expect."""
     given = [value for value in values if value is not None]
     if all(isinstance(value, bool) for value in given):
         return values
@@ -85,18 +85,18 @@ def _one_type(values: list[Any]) -> list[Any]:
 def write_table(
     plan: CampaignPlan, rows: Mapping[int, CampaignRow], facts: Mapping[str, str]
 ) -> list[Path]:
-    """Write the table as CSV and, where pyarrow is installed, as Parquet; each whole or not at all.
+    """Write the table atomically as CSV and, if pyarrow is installed, as Parquet.
 
     Args:
         plan: The campaign's plan.
-        rows: What became of steps, by their number.
-        facts: What is kept beside the columns of a Parquet file.
+        rows: Outcomes by step number.
+        facts: Metadata of the Parquet file.
 
     Returns:
         The files.
 
     Raises:
-        InputError: One can't be written.
+        InputError: A file can't be written.
     """
     known = [(each.step, rows.get(each.step.number, CampaignRow())) for each in plan.steps]
     table = columns_of(plan.campaign.keys, known)
@@ -114,7 +114,7 @@ def write_table(
 
 
 def csv_text(table: Mapping[str, Sequence[Any]]) -> str:
-    """Return columns as CSV; numbers read back as the same bits, what there is not is empty."""
+    """Return columns as CSV; numbers read back bit for bit, None is empty."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(table)
@@ -122,9 +122,10 @@ def csv_text(table: Mapping[str, Sequence[Any]]) -> str:
     return stream.getvalue()
 
 
-def entry_of(step: CampaignStep, row: CampaignRow) -> SeriesEntry:
-    """Return a step and what became of it, as it is read back from the table."""
-    return SeriesEntry(
-        step.number, step.repeat, step.is_reference, step.point, row.figures, row.result,
-        row.recording,
+def entry_of(step: CampaignStep, row: CampaignRow) -> SeriesRun:
+    """Return a step and its outcome as a run of a report."""
+    values = {key: short_value(value) for key, value in step.point.items()}
+    return SeriesRun(
+        step.number, step.is_reference, values, row.figures, row.result, row.recording,
+        row.digest, step.repeat,
     )  # fmt: skip

@@ -1,17 +1,10 @@
-"""A campaign: one run a step, each after looking at what those before it measured.
-
-The recordings are the checkpoint. A whole one, of the very experiment that a step would run, is
-that step done: a campaign that was killed goes on where it was, and loses one step.
-"""
+"""Characterisation runner: one run per step, each planned from the steps before it."""
 
 import json
-import shutil
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TypeAlias
 
 from hilctl.base.errors import DataError, InputError, RunError
 from hilctl.base.files import check_writable, write_text
@@ -25,27 +18,39 @@ from hilctl.models.model_file import dump_model
 from hilctl.recording.reader import read
 from hilctl.recording.recording import Recording
 from hilctl.run.result import RunResult
-from hilctl.run.start import OnPart, RunKey, StepStoppedError, checked_experiment, paced, unpaced
+from hilctl.run.start import RunKey, checked_experiment, unpaced
 from hilctl.studies.characterise.limits import CharacterisationLimits, limits_of
-from hilctl.studies.characterise.modelling import identified, judged
-from hilctl.studies.characterise.results import Characterisation, Measured, StepRow
-from hilctl.studies.characterise.rig_problem import RigProblemError
+from hilctl.studies.characterise.response import RigProblemError
+from hilctl.studies.characterise.results import (
+    Characterisation,
+    Measured,
+    StepRow,
+    identified,
+    validated,
+)
 from hilctl.studies.characterise.steps import STEPS, CharacterisationStep
 from hilctl.studies.characterise.waveforms import Keys, at_rest, within
+from hilctl.studies.step_runner import (
+    StepRunner,
+    StudyHost,
+    free_mb,
+    raise_if_stopped,
+    require_room,
+)
 
 
 def waveform_setting(keys: Keys) -> str:
-    """Return the ``key=value`` text that has an experiment run a waveform."""
+    """Return the ``key=value`` text that sets the waveform of an experiment."""
     return f"waveform={json.dumps(keys)}"
 
 
 def unit_of(experiment: Path, settings: Sequence[str]) -> CommandUnit:
-    """Return the unit of the commands that an experiment limits."""
+    """Return the command unit of an experiment."""
     return "V" if _document(experiment, settings).holds(("limits", "drive_v")) else "A"
 
 
 def without_reference(experiment: Path, settings: Sequence[str]) -> list[str]:
-    """Return settings that take out what needs a compensator: a step has none.
+    """Return settings that remove the compensator and everything that needs one.
 
     Args:
         experiment: Experiment file.
@@ -53,7 +58,7 @@ def without_reference(experiment: Path, settings: Sequence[str]) -> list[str]:
 
     Raises:
         InputError: The file can't be read.
-        ConfigError: It is no YAML, or a text is none of these.
+        ConfigError: The file is not YAML, or a setting is invalid.
     """
     document = _document(experiment, settings)
     found = ["compensator=none"]
@@ -71,7 +76,7 @@ def _document(experiment: Path, settings: Sequence[str]) -> Document:
 
 
 def _tracking_keys() -> Iterator[str]:
-    """Give the interlocks that need a reference, and those that need one of them."""
+    """Yield the interlocks that need a reference, and those that depend on one of them."""
     known = {
         key: [each for each in field.metadata if isinstance(each, InterlockRequirement)]
         for key, field in InterlockSettings.model_fields.items()
@@ -82,23 +87,19 @@ def _tracking_keys() -> Iterator[str]:
             yield key
 
 
-StepRunner: TypeAlias = Callable[[Path, Sequence[str], Path, OnPart], RunResult]
-"""Runs an experiment file with settings into a recording, over one that stands there."""
-
-_BYTES_A_SAMPLE = 45.0
-_SPARE = 1.2
+_BYTES_PER_SAMPLE = 45.0
 _NAME_LENGTH = 80
 
 
 @dataclass(frozen=True, slots=True)
 class CharacterisationPlan:
-    """What a campaign will do at most, before anything is measured.
+    """Plan of a characterisation, at full amplitude.
 
     Attributes:
-        limits: What it keeps to.
-        steps: Its steps; of those for the first reaction, mostly only one is needed.
-        pauses_s: Time for which the coil must cool between them.
-        free_mb: Room on the disk.
+        limits: Its limits.
+        steps: Its steps; most polarity and response steps are skipped in the end.
+        pauses_s: Time for the coil to cool.
+        free_mb: Free disk space.
     """
 
     limits: CharacterisationLimits
@@ -108,48 +109,38 @@ class CharacterisationPlan:
 
     @property
     def seconds(self) -> float:
-        """Rig time, without pauses."""
+        """Rig time without pauses."""
         return sum(step.seconds for step in self.steps)
 
     @property
     def megabytes(self) -> float:
-        """About how large all recordings will be."""
+        """Approximate size of all recordings."""
         return sum(step.megabytes for step in self.steps)
 
 
 @dataclass(frozen=True, slots=True)
-class CharacterisationHost:
-    """What a campaign needs from outside: runs, time, and whoever watches.
+class CharacterisationHost(StudyHost):
+    """Runs, time and observers of a characterisation.
 
     Attributes:
-        run: How a step is run.
-        now_s: Unix time in s.
-        sleep_s: Waits that long.
-        on_step: Called with each step that is done.
-        on_progress: Called with what is done, from 0 to 1, and what is being done.
+        on_step: Called with each finished step.
     """
 
-    run: StepRunner = paced
-    now_s: Callable[[], float] = time.time
-    sleep_s: Callable[[float], None] = time.sleep
     on_step: Callable[[StepRow], None] = field(default=lambda row: None)
-    on_progress: Callable[[float, str], None] = field(default=lambda done, text: None)
 
 
 class CharacterisationRunner:
-    """Characterises the device of an experiment.
+    """Characterise the device of an experiment.
 
     Args:
-        experiment: Experiment file: device, rate, limits, safe value; its waveform and compensator
-            are not used.
+        experiment: Experiment file; its waveform and compensator are not used.
         settings: ``key=value`` texts over it.
-        folder: Where each step's recording goes.
-        highest_hz: Highest frequency of loops; from the sample rate where None.
-        host: What runs it.
+        folder: Folder of the recordings.
+        highest_hz: Highest frequency of loops; derived from the sample rate if None.
+        host: Runs and observers.
 
     Raises:
-        InputError: The experiment can't be used; or it is not to keep real time, and the device is
-            no simulated one.
+        InputError: The experiment is invalid, or a real device is to run without real time.
     """
 
     def __init__(
@@ -171,10 +162,8 @@ class CharacterisationRunner:
         self.limits = limits_of(self._loaded, highest_hz)
         info = self._loaded.device.info
         if self._host.run is unpaced and not info.simulated:
-            raise InputError(
-                f"--fast: {info.name}: only a simulated device can do without real time"
-            )
-        # What does not depend on the waveform is refused here, before anything moves.
+            raise InputError(f"--fast: {info.name}: only simulated devices run without real time")
+        # Reject everything that does not depend on the waveform before anything moves.
         checked_experiment(experiment, [*self._settings, waveform_setting(at_rest(self.limits))])
         self._coil = CoolingCoil(self._loaded.config, 0.0, 0.0)
         self._measured = Measured()
@@ -183,7 +172,7 @@ class CharacterisationRunner:
 
     @cached_property
     def plan(self) -> CharacterisationPlan:
-        """What there is to do, at full amplitude."""
+        """Plan of all steps at full amplitude."""
         coil, now_s, pauses_s = CoolingCoil(self._loaded.config, 0.0, 0.0), 0.0, 0.0
         rows = []
         for step in STEPS:
@@ -196,34 +185,35 @@ class CharacterisationRunner:
             now_s += pause_s + seconds
             coil.ran(heat, now_s)
             pauses_s += pause_s
-            megabytes = command.size * _BYTES_A_SAMPLE / 1e6
+            megabytes = command.size * _BYTES_PER_SAMPLE / 1e6
             rows.append(StepRow(step.name, step.purpose, seconds, megabytes))
-        around = next(p for p in (self._folder, *self._folder.absolute().parents) if p.exists())
-        return CharacterisationPlan(
-            self.limits, tuple(rows), pauses_s, shutil.disk_usage(around).free / 1e6
-        )
+        return CharacterisationPlan(self.limits, tuple(rows), pauses_s, free_mb(self._folder))
+
+    @cached_property
+    def _runner(self) -> StepRunner:
+        return StepRunner(self._host, self.plan.seconds)
 
     def _heat(self, command: F64) -> RunHeat:
         return RunHeat().then(command, self._loaded.config.limits, self.limits.sample_rate_hz)
 
     def discard(self) -> None:
-        """Remove the recordings of steps that stand in the folder, so that all begins anew."""
+        """Delete the recordings of all steps."""
         for number, step in enumerate(STEPS, 1):
             path = self._path(number, step)
-            if path.is_file():  # a folder of that name is none of them
+            if path.is_file():
                 path.unlink()
 
     def characterise(self, output: Path, *, overwrite: bool = False) -> Characterisation:
-        """Run every step, identify the model, and judge it.
+        """Run all steps, then identify and validate the model.
 
         Args:
             output: Model file to write.
-            overwrite: Whether one of that name may be replaced.
+            overwrite: Whether an existing file may be replaced.
 
         Raises:
-            InputError: A file can't be written, or there is no room; nothing has moved.
-            StepStoppedError: Somebody stopped a step.
-            RunError: A step ended by a fault that no measurement explains.
+            InputError: A file can't be written, or no disk space; nothing has moved.
+            StepStoppedError: The user stopped a step.
+            RunError: A step ended by a fault that is no known problem of the rig.
         """
         check_writable(output, overwrite=overwrite)
         self._make_room()
@@ -245,14 +235,11 @@ class CharacterisationRunner:
         return replace(result, steps=tuple(self._rows), measured=self._measured)
 
     def _make_room(self) -> None:
-        plan = self.plan
-        if plan.free_mb < _SPARE * plan.megabytes:
-            room = f"{plan.megabytes:.0f} MB, and there are {plan.free_mb:.0f} MB"
-            raise InputError(f"{self._folder}: no room for the recordings: they take {room}")
+        require_room(self._folder, self.plan.megabytes, self.plan.free_mb)
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise InputError(f"{self._folder}: can't be made: {error.strerror}") from None
+            raise InputError(f"{self._folder}: can't be created: {error.strerror}") from None
 
     def _run_steps(self) -> None:
         for number, step in enumerate(STEPS, 1):
@@ -267,10 +254,14 @@ class CharacterisationRunner:
         recording = self._kept(path, settings)
         kept, heat = recording is not None, self._heat(command)
         if recording is None:
-            self._cool(step, self._pause_s(heat))
-            recording = self._recorded(number, step, settings, path)
+            planned = {each.name: each.seconds for each in self.plan.steps}
+            before = list(planned)[: list(planned).index(step.name)]
+            self._runner.done_s = sum(planned[name] for name in before)
+            if self._host.run is not unpaced:  # without real time there is no coil
+                self._runner.cool(step.name, self._pause_s(heat))
+            recording = self._recorded(step, settings, path, planned[step.name])
         now_s = self._host.now_s()
-        # One that was kept has cooled the coil since.
+        # The coil has cooled since a kept run.
         self._coil.ran(heat, min(path.stat().st_mtime, now_s) if kept else now_s)
         self._recordings[step.name] = path
         seconds = command.size / self.limits.sample_rate_hz
@@ -283,57 +274,40 @@ class CharacterisationRunner:
         self._host.on_step(self._rows[-1])
 
     def _recorded(
-        self, number: int, step: CharacterisationStep, settings: Sequence[str], path: Path
+        self, step: CharacterisationStep, settings: list[str], path: Path, seconds: float
     ) -> Recording:
-        def part_done(part: float) -> None:
-            self._progress(step, f"{step.name}: {step.purpose}", part)
-
-        part_done(0.0)
         try:
-            result = self._host.run(self._experiment, settings, path, part_done)
+            text = f"{step.name}: {step.purpose}"
+            result = self._runner.run(
+                self._experiment, settings, path, text, seconds, overwrite=True
+            )
         except InputError as error:
             if not self._rows:
                 raise
             raise RunError(f"{step.name} is refused: {error}") from None
-        if result.stop_signal:
-            raise StepStoppedError(f"{step.name}: {result.reason}", result.stop_signal)
+        raise_if_stopped(step.name, result)
         if result.code != "completed":
             raise _fault(step, result, read(path))
         return read(path)
 
-    def _kept(self, path: Path, settings: Sequence[str]) -> Recording | None:
-        """Return the recording of a step that is done; None where there is none, or another's."""
+    def _kept(self, path: Path, settings: list[str]) -> Recording | None:
+        """Return the recording of a step that is done; otherwise None."""
         if not path.exists():
             return None
         try:
             recording = read(path)
-        except DataError:  # cut short before its first sample: the step is run again
+        except DataError:  # truncated before its first sample
             return None
         key = RunKey.of(load_experiment(self._experiment, settings))
         same = RunKey.of_facts(recording.run) == key
         return recording if same and recording.end.get("code") == "completed" else None
 
     def _pause_s(self, heat: RunHeat) -> float:
-        """Return how long the coil must cool, by the steps here and by the device's last run."""
+        """Return the time to cool after the steps so far and the device's last run."""
         now_s = self._host.now_s()
         last_a2 = heat_before(self._loaded, now_s)
         last = CoolingCoil(self._loaded.config, last_a2, now_s)
         return max(coil.pause_s(heat, now_s) for coil in (self._coil, last))
-
-    def _cool(self, step: CharacterisationStep, pause_s: float) -> None:
-        """Let the coil cool; a run that need not keep real time is one of a rig without a coil."""
-        if pause_s > 0.0 and self._host.run is not unpaced:
-            self._progress(step, f"{step.name}: the coil cools for {pause_s:.0f} s", 0.0)
-            self._host.sleep_s(pause_s)
-
-    def _progress(self, step: CharacterisationStep, text: str, part: float) -> None:
-        """Say where the campaign stands, by its rig time."""
-        planned = {each.name: each.seconds for each in self.plan.steps}
-        before = list(planned)[: list(planned).index(step.name)]
-        done_s = sum(planned[name] for name in before) + part * planned[step.name]
-        left_s = round(self.plan.seconds - done_s)
-        left = f"{left_s // 60}:{left_s % 60:02d} left"
-        self._host.on_progress(done_s / self.plan.seconds, f"{text}; {left}")
 
     def _with_model(
         self, result: Characterisation, output: Path, *, overwrite: bool
@@ -342,12 +316,10 @@ class CharacterisationRunner:
         rest = self._measured.rest
         try:
             found = identified(self._recordings)
-            apart = judged(found.fit.model, self._recordings, rest.noise_um if rest else 0.0)
+            apart = validated(found.fit.model, self._recordings, rest.noise_um if rest else 0.0)
         except InputError as error:
-            remedy = "look at the loops on the page, and try 'hilctl identify' on the recordings"
-            raise RigProblemError(
-                "no_model", f"no model can be identified: {error}", remedy
-            ) from None
+            remedy = "check the loops on the page, or run 'hilctl identify' on the recordings"
+            raise RigProblemError("no_model", f"no model identified: {error}", remedy) from None
         result = replace(self._so_far(result), held_out=apart, identification=found)
         if result.is_model:
             write_text(output, dump_model(found.fit.model), overwrite=overwrite)
@@ -360,22 +332,22 @@ class CharacterisationRunner:
         name = f"{self._loaded.config.name}-{step.name}"[-_NAME_LENGTH:].lstrip("._-")
         settings = [*self._settings, f"name={json.dumps(name)}", waveform_setting(keys)]
         if self._rows and self._loaded.config.safe.at_start is not None:
-            settings.append(f"safe.at_start={self.limits.rest!r}")  # the steps before ended there
+            settings.append(f"safe.at_start={self.limits.rest!r}")  # where the previous step ended
         seed = self._loaded.device.Options.model_fields.get("seed")
-        if seed is not None:  # noise that all steps share would be fitted
+        if seed is not None:  # noise common to all steps would be fitted
             first = self._loaded.config.device.get("seed", seed.default)
             settings.append(f"device.seed={first + number}")
         return settings
 
 
 def _fault(step: CharacterisationStep, result: RunResult, recording: Recording) -> RunError:
-    """Return what a run that ended by a fault says of the rig."""
+    """Return the problem of the rig behind a fault, or the fault itself."""
     codes = {event.code for event in recording.events}
     text = f"{step.name}: {result.reason}"
     if "sensor_range" in codes:
         return RigProblemError(
-            "saturated_sensor", text, "give the sensor a wider range, or narrow limits.stroke_um"
+            "saturated_sensor", text, "set a wider sensor range, or a narrower limits.stroke_um"
         )
     if "sensor_frozen" in codes:
-        return RigProblemError("no_reading", text, "look at the sensor and its wires")
+        return RigProblemError("no_reading", text, "check the sensor and its wiring")
     return RunError(text)

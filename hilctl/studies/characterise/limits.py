@@ -1,4 +1,4 @@
-"""What an experiment allows its actuator, and the band of frequencies that follows from it."""
+"""Limits of a characterisation, and the frequency band that follows from the sample rate."""
 
 import math
 from dataclasses import dataclass
@@ -8,11 +8,11 @@ from hilctl.base.types import F64, CommandUnit
 from hilctl.experiment.forecast import CommandFigures
 from hilctl.experiment.load import LoadedExperiment
 
-_SAMPLES_A_CYCLE = 125.0  # in the shortest cycle of loops
-_FEWER = 40.0  # with slow devices, so that a campaign takes minutes
+_SAMPLES_PER_CYCLE = 125.0  # in the shortest cycle of loops
+_FEWER = 40.0  # with slow devices, so that a characterisation takes minutes
 _SLOW_TOP_HZ = 80.0
 _DECADES = 400.0  # highest over lowest frequency
-_SLOWEST_HZ = 0.5  # what is slower takes minutes, and shows creep rather than rate
+_SLOWEST_HZ = 0.5  # slower loops take minutes and show creep
 _NARROWEST = 4.0
 _FEWEST_SAMPLES = 25.0
 _OF_RANGE = 0.95
@@ -24,16 +24,16 @@ _OF_HEAT = 0.9
 
 @dataclass(frozen=True, slots=True)
 class CharacterisationLimits:
-    """What a campaign keeps to.
+    """Limits of a characterisation.
 
     Attributes:
         loaded: The experiment.
         unit: Unit of commands.
         low: Lowest command.
         high: Highest command.
-        rest: Safe value, at which each run begins and ends.
-        stroke_um: Displacements that the sensor may show.
-        sample_rate_hz: Samples a second.
+        rest: Safe value, where each run starts and ends.
+        stroke_um: Allowed range of displacement.
+        sample_rate_hz: Samples per second.
         lowest_hz: Lowest frequency of loops.
         highest_hz: Highest frequency of loops.
     """
@@ -50,17 +50,17 @@ class CharacterisationLimits:
 
     @property
     def centre(self) -> float:
-        """Middle of the range, round which loops go."""
+        """Centre of the range and of loops."""
         return 0.5 * (self.low + self.high)
 
     @property
     def reach(self) -> float:
-        """Largest amplitude round the middle."""
+        """Largest amplitude about the centre."""
         return _OF_RANGE * 0.5 * (self.high - self.low)
 
     @property
     def middle_hz(self) -> float:
-        """Frequency of loops that are neither slow nor fast."""
+        """Geometric mean of the lowest and highest frequency of loops."""
         return round_hz(math.sqrt(self.lowest_hz * self.highest_hz))
 
     @property
@@ -70,31 +70,28 @@ class CharacterisationLimits:
 
     @property
     def slew_per_s(self) -> float:
-        """Fastest change of a command, with some room to the limit."""
+        """Largest rate of change of a command, with a margin to the limit."""
         return _OF_SLEW * self.loaded.config.limits.slew_per_s
 
     def beside_rest(self, amplitude: float) -> float:
-        """Return the command nearest to rest with room for an amplitude either way."""
+        """Return the command nearest to rest with room for an amplitude on both sides."""
         room = min(1.02 * amplitude, 0.5 * (self.high - self.low))
         return min(max(self.rest, self.low + room), self.high - room)
 
     def by_slew(self, amplitude: float, frequency_hz: float) -> float:
-        """Return an amplitude, or the largest that a sine of a frequency may have."""
+        """Return an amplitude, lowered to the slew limit of a sine at a frequency."""
         return min(amplitude, self.slew_per_s / (2.0 * math.pi * frequency_hz))
 
     def soft_s(self, amplitude: float, offset: float) -> float:
-        """Return the shortest soft start that leaves a sine the slew that it may have."""
+        """Return the shortest soft start of a sine within the slew limit."""
         travel = amplitude + abs(offset - self.rest)
         return math.pi * travel / (2.0 * _OF_SLEW_TO_START * self.loaded.config.limits.slew_per_s)
 
     def scale(self, values: F64) -> float:
-        """Return what a command must be multiplied by to keep slew and heat with some room.
+        """Return the factor, at most 1, that keeps a command within slew and heat with a margin.
 
         Args:
             values: float64[n], every command of a run.
-
-        Returns:
-            At most 1.
         """
         config = self.loaded.config
         figures = CommandFigures(config, self.rest, self.rest**2)
@@ -109,23 +106,23 @@ class CharacterisationLimits:
 
 
 def limits_of(loaded: LoadedExperiment, highest_hz: float | None = None) -> CharacterisationLimits:
-    """Return what a campaign keeps to.
+    """Return the limits of a characterisation.
 
     Args:
         loaded: The experiment.
-        highest_hz: Highest frequency of loops; one that follows from the sample rate where None.
+        highest_hz: Highest frequency of loops; derived from the sample rate if None.
 
     Raises:
-        InputError: That frequency has too few samples a cycle.
+        InputError: That frequency has too few samples per cycle.
     """
     config = loaded.config
     rate_hz = config.sample_rate_hz
     most_hz = rate_hz / _FEWEST_SAMPLES
     if highest_hz is not None and not 0.0 < highest_hz <= most_hz:
-        rule = f"must be above 0 and at most {most_hz:g} Hz, {_FEWEST_SAMPLES:g} samples a cycle"
-        raise InputError(f"--highest-hz {rule}: {highest_hz:g}")
+        rule = f"must be above 0 and at most {most_hz:g} Hz, {_FEWEST_SAMPLES:g} samples per cycle"
+        raise InputError(f"--highest-hz {rule} (got {highest_hz:g})")
     slow_hz = min(rate_hz / _FEWER, _SLOW_TOP_HZ)
-    top_hz = highest_hz or round_hz(max(rate_hz / _SAMPLES_A_CYCLE, slow_hz))
+    top_hz = highest_hz or round_hz(max(rate_hz / _SAMPLES_PER_CYCLE, slow_hz))
     low, high = config.limits.command_range
     return CharacterisationLimits(
         loaded=loaded,
@@ -141,5 +138,5 @@ def limits_of(loaded: LoadedExperiment, highest_hz: float | None = None) -> Char
 
 
 def round_hz(value: float) -> float:
-    """Return a frequency with two digits, as people write it."""
+    """Return a frequency rounded to two digits."""
     return float(f"{value:.2g}")

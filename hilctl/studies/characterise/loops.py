@@ -1,4 +1,4 @@
-"""Loops and reversal curves: their figures, what repeats, and how far amplitudes may grow."""
+"""Loops and reversal curves: metrics, repeatability, and growth of amplitudes."""
 
 import math
 from collections.abc import Sequence
@@ -12,12 +12,12 @@ from hilctl.base.segments import Segment
 from hilctl.base.types import F64
 from hilctl.recording.recording import Recording
 from hilctl.signals import cycle_metrics
-from hilctl.studies.characterise.rig_problem import RigProblemError
+from hilctl.studies.characterise.response import RigProblemError
 
-_FEWEST_STEPS = 500  # of the sensor in a motion, so that equal readings mean something
-_AT_END = 0.06  # of a sine's cycle at one and the same extreme reading
+_FEWEST_STEPS = 500  # distinct readings in a motion, for equal readings to mean saturation
+_AT_END = 0.06  # of a cycle at the same extreme reading
 _OF_STROKE = 0.94
-_FIRST_GROWTH = 1.5  # exponent of displacement over amplitude where it isn't known yet
+_FIRST_GROWTH = 1.5  # exponent of displacement over amplitude, until it is known
 _MORE_GROWTH = 0.2
 _LEAST_RATIO = 0.01
 _WORTHWHILE = 1.03
@@ -31,14 +31,14 @@ class LoopFigures:
     """One steady loop.
 
     Attributes:
-        label: What ran.
+        label: Label of the segment.
         amplitude: Half the peak-to-peak command.
-        bias: Its middle.
-        frequency_hz: Cycles a second.
+        bias: Mid-range of the command.
+        frequency_hz: Cycles per second.
         low_um: Lowest displacement of the average cycle.
         high_um: Highest.
-        hysteresis_percent: Peak hysteresis; None where the loop has no two branches.
-        scatter_percent: rms by which cycles differ beyond noise, of the peak-to-peak.
+        hysteresis_percent: Peak hysteresis; None if the loop has no two branches.
+        scatter_percent: rms difference of cycles beyond noise, of the peak-to-peak.
         command: float64[m], the average cycle's command.
         displacement_um: float64[m], its displacement.
     """
@@ -61,16 +61,16 @@ class LoopFigures:
 
     @property
     def gain_um(self) -> float:
-        """Peak-to-peak displacement over peak-to-peak command, um a command unit."""
+        """Peak-to-peak displacement over peak-to-peak command, um per command unit."""
         return 0.5 * self.peak_to_peak_um / self.amplitude
 
 
 def loop_figures(recording: Recording, segment: Segment) -> LoopFigures:
-    """Judge the steady cycles of a segment.
+    """Evaluate the steady cycles of a segment.
 
     Raises:
-        RigProblemError: The sensor stands at one reading while the command moves on.
-        DataError: It has no whole steady cycle.
+        RigProblemError: The sensor is saturated.
+        DataError: The segment has no whole steady cycle.
     """
     part = steady_part(recording, segment)
     if part.cycle is None:
@@ -103,7 +103,7 @@ def loop_figures(recording: Recording, segment: Segment) -> LoopFigures:
 
 
 def all_loops(recording: Recording) -> tuple[LoopFigures, ...]:
-    """Judge every segment that repeats."""
+    """Evaluate every periodic segment."""
     return tuple(loop_figures(recording, each) for each in recording.segments if each.period > 0.0)
 
 
@@ -116,27 +116,26 @@ def _refuse_saturated(displacement_um: F64, label: str) -> None:
         if share > _AT_END:
             raise RigProblemError(
                 "saturated_sensor",
-                f"{label}: the sensor stands at {end:.4g} µm for {100.0 * share:.0f} % of the time",
-                "move the sensor, give it a wider range, or narrow limits.stroke_um to less than "
-                "that",
+                f"{label}: the sensor reads {end:.4g} µm for {100.0 * share:.0f} % of the time",
+                "move the sensor, set a wider range, or narrow limits.stroke_um below that",
             )
 
 
 def next_amplitude(
     loops: Sequence[LoopFigures], wanted: float, stroke_um: tuple[float, float]
 ) -> float | None:
-    """Return the amplitude of the next of a row of growing loops.
+    """Return the amplitude of the next growing loop.
 
-    Displacement grows faster than the command in most actuators; by how much is taken from the
-    last two loops.
+    In most actuators displacement grows faster than the command. The exponent is estimated from
+    the last two loops.
 
     Args:
-        loops: The loops so far, each larger than the one before.
-        wanted: Amplitude that it is to have.
-        stroke_um: Displacements that are allowed.
+        loops: The loops so far, in increasing order.
+        wanted: Wanted amplitude.
+        stroke_um: Allowed range of displacement.
 
     Returns:
-        The wanted one, or as much of it as the stroke allows; None where that isn't worth a run.
+        The wanted amplitude, lowered to the stroke; None if it is hardly larger than the last.
     """
     if not loops:
         return wanted
@@ -160,11 +159,11 @@ def next_amplitude(
 
 @dataclass(frozen=True, slots=True)
 class Repeatability:
-    """One and the same loop, once more at the end.
+    """Change of a loop that is measured twice.
 
     Attributes:
-        shape_percent: Largest difference with the means taken out, of the peak-to-peak.
-        shift_um: By how much the mean has moved.
+        shape_percent: Largest difference without the means, of the peak-to-peak.
+        shift_um: Change of the mean.
         shift_percent: The same, of the peak-to-peak.
     """
 
@@ -174,7 +173,7 @@ class Repeatability:
 
 
 def repeatability(first: LoopFigures, again: LoopFigures) -> Repeatability:
-    """Compare a loop with itself at another time."""
+    """Compare two measurements of one loop."""
     phase = np.linspace(0.0, 1.0, _POINTS, endpoint=False)
     one, two = (
         np.interp(phase, np.arange(y.size) / y.size, y, period=1.0)
@@ -182,7 +181,7 @@ def repeatability(first: LoopFigures, again: LoopFigures) -> Repeatability:
     )
     shift_um = float(two.mean() - one.mean())
     whole = max(first.peak_to_peak_um, 1e-12)
-    # Sensor noise is spread over all harmonics; what a loop has changed by, over the lowest.
+    # Sensor noise spreads over all harmonics, a change of shape over the lowest.
     harmonics = np.fft.rfft(two - one - shift_um)
     harmonics[_SHAPE_HARMONICS + 1 :] = 0.0
     shape = float(np.max(np.abs(np.fft.irfft(harmonics, _POINTS))))
@@ -194,10 +193,10 @@ class ReversalCurves:
     """First-order reversal curves.
 
     Attributes:
-        turns: Commands at which the curves turn, the highest first.
+        turns: Commands of the turning points, the highest first.
         curves: Command and displacement of each, float64[2, n], from its turn up to the top.
-        return_um: rms by which the displacement at the top differs from curve to curve: what
-            return-point memory says is nothing.
+        return_um: rms difference of displacement at the top between curves; zero with
+            return-point memory.
         return_percent: The same, of the span of the curves.
     """
 
@@ -208,13 +207,13 @@ class ReversalCurves:
 
 
 def reversal_curves(recording: Recording) -> ReversalCurves:
-    """Cut a path of reversal curves where it turns."""
+    """Split a path of reversal curves at its turning points."""
     segment = recording.segments[-1]
     samples = recording.samples.part(segment.start, segment.stop)
     command, displacement_um = samples.command, samples.displacement_um
     moving = np.flatnonzero(np.diff(command))  # a corner may be two samples wide
     edges = moving[1:][np.diff(np.sign(command[moving + 1] - command[moving])) != 0.0]
-    # The first turn is the top; then the bottom, and the top again: the outer loop.
+    # The first three turns are the outer loop: top, bottom, top.
     pairs = list(zip(edges[1::2].tolist(), edges[2::2].tolist(), strict=False))
     curves = [np.array((command[a : b + 1], displacement_um[a : b + 1])) for a, b in pairs]
     top, span = float(command.max()), float(np.ptp(command))

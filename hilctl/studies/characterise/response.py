@@ -1,26 +1,212 @@
-"""Small-signal response: measured line by line, and gain, delay, lag and resonance that explain it.
+"""Noise at rest, first reaction and small-signal response; problems of the rig.
 
-The displacement answers a multisine of small amplitude. The scatter from period to period is the
-noise of each line.
+The small-signal response is measured with a multisine of small amplitude. The scatter between its
+periods is the noise of each line. A gain, a delay, a lag and a resonance are fitted to it.
 """
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import Literal, TypeAlias
 
 import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
 
-from hilctl.base.errors import DataError
-from hilctl.base.types import C128, F64
+from hilctl.analysis.steady_state import steady_samples
+from hilctl.base.errors import DataError, RunError
+from hilctl.base.types import C128, F64, I64
+from hilctl.ilc.cycle import coefficients
 from hilctl.recording.recording import Recording
-from hilctl.studies.characterise.rig_problem import RigProblemError
+
+ProblemCode: TypeAlias = Literal[
+    "no_reading",
+    "no_reaction",
+    "wrong_polarity",
+    "no_bias",
+    "noise",
+    "saturated_sensor",
+    "resonance",
+    "not_repeatable",
+    "no_model",
+]
+
+
+class RigProblemError(RunError):
+    """A problem of the rig that prevents its characterisation.
+
+    Args:
+        code: Code of the problem.
+        text: The observation.
+        remedy: The remedy.
+
+    Attributes:
+        code: Code of the problem.
+    """
+
+    def __init__(self, code: ProblemCode, text: str, remedy: str) -> None:
+        super().__init__(f"{text}: {remedy}")
+        self.code = code
+
+
+_CLEAR = 6.0  # standard errors of a clear reaction
+_EVEN = 2.0
+_FEWEST_CYCLES = 4
+_MEAN_S = 0.1
+_LONG = 10  # times that: shortest hold for creep
+
+
+@dataclass(frozen=True, slots=True)
+class RestNoise:
+    """Sensor signal at rest.
+
+    Attributes:
+        mean_um: Mean displacement.
+        noise_um: rms about the linear trend.
+        span_um: Range of the readings.
+        drift_um_per_s: Slope of the linear trend.
+        line_hz: Frequency of the strongest spectral line.
+        line_um: Its amplitude.
+    """
+
+    mean_um: float
+    noise_um: float
+    span_um: float
+    drift_um_per_s: float
+    line_hz: float
+    line_um: float
+
+
+def rest_noise(recording: Recording) -> RestNoise:
+    """Evaluate a recording at constant command.
+
+    Raises:
+        RigProblemError: More than 10 % of the readings are not numbers.
+    """
+    segment = recording.segments[0]
+    displacement_um = recording.samples.part(segment.start, segment.stop).displacement_um
+    good = np.isfinite(displacement_um)
+    if np.count_nonzero(good) < 0.9 * max(good.size, 1):
+        text = f"{np.count_nonzero(~good)} of {good.size} readings at rest are not numbers"
+        raise RigProblemError("no_reading", text, "check the sensor, its range and its wiring")
+    time_s = np.arange(good.size)[good] / recording.sample_rate_hz
+    values = displacement_um[good]
+    slope, mean = np.polynomial.polynomial.polyfit(time_s - time_s.mean(), values, 1)[::-1]
+    left = values - mean - slope * (time_s - time_s.mean())
+    lines = np.abs(np.fft.rfft(left * np.hanning(left.size))) * 4.0 / left.size
+    strongest = int(np.argmax(lines[1:])) + 1
+    return RestNoise(
+        mean_um=float(mean),
+        noise_um=float(np.std(left)),
+        span_um=float(np.ptp(values)),
+        drift_um_per_s=float(slope),
+        line_hz=strongest * recording.sample_rate_hz / left.size,
+        line_um=float(lines[strongest]),
+    )
+
+
+def crept_percent(recording: Recording) -> tuple[float, ...]:
+    """Return the creep in each long hold, in percent of the displacement from the start.
+
+    Creep counts from 0.1 s after the preceding motion. Holds at the initial command are omitted.
+    """
+    segment = recording.segments[-1]
+    samples = recording.samples.part(segment.start, segment.stop)
+    command, part = samples.command, round(_MEAN_S * recording.sample_rate_hz)
+    began = float(recording.samples.command[0])
+    began_um = float(np.nanmean(recording.samples.displacement_um[:part]))
+    turns = np.flatnonzero(np.diff(command))
+    edges = np.concatenate(([0], turns + 1, [command.size]))
+    crept = []
+    for start, stop in pairwise(edges.tolist()):
+        if stop - start < _LONG * part or abs(command[start] - began) < 1e-9 * np.ptp(command):
+            continue
+        moving_um = samples.displacement_um[start:stop]
+        first_um = float(np.nanmean(moving_um[part : 2 * part]))
+        last_um = float(np.nanmean(moving_um[-part:]))
+        crept.append(100.0 * (last_um - first_um) / (first_um - began_um))
+    return tuple(crept)
+
+
+@dataclass(frozen=True, slots=True)
+class StepResponseCheck:
+    """Response of the displacement to a sine.
+
+    Attributes:
+        frequency_hz: Its frequency.
+        amplitude: Its amplitude, in the command's unit.
+        gain_um: Gain in um per command unit; negative if the displacement falls as the command
+            rises.
+        angle_deg: Phase lag of the displacement, from -180 to 180.
+        doubt_um: Standard error of the gain, in the same unit.
+        second_um: Amplitude at twice the frequency, in um.
+        motion_um: Amplitude at the frequency, in um.
+    """
+
+    frequency_hz: float
+    amplitude: float
+    gain_um: float
+    angle_deg: float
+    doubt_um: float
+    second_um: float
+    motion_um: float
+
+    @property
+    def clear(self) -> bool:
+        """Whether it is above the noise."""
+        return abs(self.gain_um) > _CLEAR * self.doubt_um and self.gain_um != 0.0
+
+    @property
+    def even(self) -> bool:
+        """Whether the displacement responds alike to both signs of the command."""
+        doubt_um = self.doubt_um * self.amplitude
+        return self.second_um > max(_EVEN * self.motion_um, _CLEAR * doubt_um)
+
+
+def sine_reaction(recording: Recording) -> StepResponseCheck:
+    """Evaluate a recording of one sine by its first and second harmonic."""
+    segment = recording.segments[-1]
+    samples, cycles = steady_samples(recording, segment)
+    since = samples.index - segment.start
+    command = coefficients(since, segment.period, samples.command, 2)
+    each = _each_cycle(since, segment.period, samples.displacement_um, max(cycles, 1))
+    mean = each.mean(axis=0)
+    error = float(np.std(np.abs(each[:, 1] - mean[1]))) if len(each) < _FEWEST_CYCLES else 0.0
+    if len(each) >= _FEWEST_CYCLES:
+        scatter = np.sqrt(np.mean(np.abs(each[:, 1] - mean[1]) ** 2))
+        error = float(scatter / math.sqrt(len(each) - 1))
+    answer = mean[1] / command[1]
+    size = abs(answer)
+    return StepResponseCheck(
+        frequency_hz=recording.sample_rate_hz / segment.period,
+        amplitude=2.0 * abs(command[1]),
+        gain_um=float(math.copysign(size, answer.real)),
+        angle_deg=-math.degrees(np.angle(answer)),
+        doubt_um=error / abs(command[1]),
+        second_um=2.0 * float(abs(mean[2])),
+        motion_um=2.0 * float(abs(mean[1])),
+    )
+
+
+def _each_cycle(since: I64, period: float, values: F64, cycles: int) -> np.ndarray:
+    """Return coefficients 0 to 2 of each whole cycle without drift: complex128[cycles, 3]."""
+    good = np.isfinite(values)
+    since, values = since[good], values[good]
+    number = np.floor((since - since[-1] - 0.5) / period).astype(np.int64) + cycles
+    rows = [number == k for k in range(cycles)]
+    rows = [row for row in rows if row.any()]
+    if len(rows) > 1:  # a line through the samples would remove part of the sine
+        means = [float(values[row].mean()) for row in rows]
+        slope = np.polynomial.polynomial.polyfit(np.arange(len(rows)), means, 1)[1]
+        values = values - slope * since / period
+    return np.array([coefficients(since[r], period, values[r], 2) for r in rows])
+
 
 MOST_MISSING = 0.01
-"""Largest part of the samples that may be missing; a run that skips more ends by itself."""
+"""Largest share of samples that may be missing."""
 
 
 def without_gaps(recording: Recording, start: int, stop: int) -> tuple[F64, F64]:
-    """Return every command and displacement between two samples, those skipped included.
+    """Return every command and displacement between two samples, with gaps filled.
 
     Args:
         recording: A run.
@@ -28,7 +214,7 @@ def without_gaps(recording: Recording, start: int, stop: int) -> tuple[F64, F64]
         stop: Index after the last.
 
     Returns:
-        Command, held where samples are missing, and displacement in um, straight lines there:
+        Command, held over gaps, and displacement in um, interpolated linearly over gaps:
         float64[stop - start] each.
 
     Raises:
@@ -40,7 +226,7 @@ def without_gaps(recording: Recording, start: int, stop: int) -> tuple[F64, F64]
     missing = wanted.size - np.count_nonzero(good)
     if missing > MOST_MISSING * wanted.size:
         rule = f"{missing} of {wanted.size} samples are missing or have no displacement"
-        raise DataError(f"{recording.path}: {rule}: look at late ticks and at the sensor")
+        raise DataError(f"{recording.path}: {rule}: check late ticks and the sensor")
     last = np.maximum(np.searchsorted(samples.index, wanted, side="right") - 1, 0)
     displacement_um = np.interp(wanted, samples.index[good], samples.displacement_um[good])
     return np.ascontiguousarray(samples.command[last]), displacement_um
@@ -48,7 +234,7 @@ def without_gaps(recording: Recording, start: int, stop: int) -> tuple[F64, F64]
 
 _FEWEST_LINES = 8
 _USABLE = 0.3  # largest relative noise of a line that is fitted
-_HYSTERESIS = 0.03  # of a line, which no linear response explains
+_HYSTERESIS = 0.03  # of a line, that no linear response explains
 _WORTH = 0.5  # of the misfit that a resonance must explain
 _MOST_DAMPING = 0.8
 
@@ -61,16 +247,16 @@ class SmallSignal:
 
     Attributes:
         frequency_hz: float64[k], the lines.
-        response: complex128[k], displacement over command, um a command unit.
+        response: complex128[k], displacement over command, um per command unit.
         noise: float64[k], standard deviation of each.
         amplitude: Peak of the multisine.
-        gain_um: Gain at low frequencies, um a command unit.
-        delay_s: Transport delay, half a sample of the output's hold included.
-        lag_s: Time constant of a first-order lag; 0 where there is none.
-        natural_hz: Natural frequency; None where no resonance shows.
-        damping_ratio: Its damping; None without.
-        misfit_percent: rms of what the fit leaves of the lines, of the gain.
-        fitted: complex128[k], what the fit makes of the lines.
+        gain_um: Gain at low frequencies, um per command unit.
+        delay_s: Transport delay, including the half sample of the output's hold.
+        lag_s: Time constant of a first-order lag; 0 for none.
+        natural_hz: Natural frequency; None without a resonance.
+        damping_ratio: Its damping ratio; None without a resonance.
+        misfit_percent: rms residual of the fit, of the gain.
+        fitted: complex128[k], the fitted response.
     """
 
     frequency_hz: F64
@@ -86,22 +272,22 @@ class SmallSignal:
     fitted: C128
 
     def size_at(self, frequency_hz: float) -> float:
-        """Return the magnitude of the fitted response at a frequency, over that at the lowest."""
+        """Return the fitted magnitude at a frequency, over that at the lowest line."""
         size = np.abs(self.fitted)
         return float(np.interp(frequency_hz, self.frequency_hz, size) / size[0])
 
 
 def small_signal(recording: Recording) -> SmallSignal:
-    """Judge a recording of one multisine whose period is whole samples.
+    """Evaluate a recording of one multisine whose period is a whole number of samples.
 
     Raises:
-        RigProblemError: Too few lines stand out of the noise.
+        RigProblemError: Too few lines are above the noise.
     """
     frequency_hz, response, noise, amplitude = _lines(recording)
     usable = noise < _USABLE * np.abs(response)
     if np.count_nonzero(usable) < _FEWEST_LINES:
-        text = f"only {np.count_nonzero(usable)} of {usable.size} frequencies show above the noise"
-        remedy = "find out what else moves the sensor, or widen the limits: the campaign scales"
+        text = f"only {np.count_nonzero(usable)} of {usable.size} frequencies are above the noise"
+        remedy = "find what else moves the sensor, or widen the limits"
         raise RigProblemError("noise", f"small-signal response: {text}", remedy)
     frequency_hz, response, noise = frequency_hz[usable], response[usable], noise[usable]
     found, resonant = _fit(frequency_hz, response, noise, recording.sample_rate_hz)
@@ -134,7 +320,7 @@ def _lines(recording: Recording) -> tuple[F64, C128, F64, float]:
     except DataError as error:
         raise RigProblemError("no_reading", str(error), "then run it again") from None
     shape = (periods, period)
-    # Drift from period to period: a line through the samples would take low frequencies with it.
+    # Drift between periods: a line through the samples would remove low frequencies.
     means = moved.reshape(shape).mean(axis=1)
     slope = np.polynomial.polynomial.polyfit(np.arange(periods), means, 1)[1]
     moved = moved - slope * np.arange(moved.size) / period
@@ -154,7 +340,7 @@ def _lines(recording: Recording) -> tuple[F64, C128, F64, float]:
 
 
 def _response(x: F64, frequency_hz: F64, *, resonant: bool) -> C128:
-    """Return gain, delay, lag and, where there is one, resonance: complex128[k]."""
+    """Return the response of gain, delay, lag and optional resonance: complex128[k]."""
     s = 2j * np.pi * frequency_hz
     answer: C128 = np.exp(x[0] - s * x[1]) / (1.0 + s * np.exp(x[2]))
     if resonant:
@@ -164,7 +350,7 @@ def _response(x: F64, frequency_hz: F64, *, resonant: bool) -> C128:
 
 
 def _fit(frequency_hz: F64, response: C128, noise: F64, rate_hz: float) -> tuple[F64, bool]:
-    """Return the parameters, and whether a resonance is among them."""
+    """Return the parameters, and whether they include a resonance."""
     plain = _best(frequency_hz, response, noise, rate_hz, [None])
     tries = np.geomspace(2.0 * frequency_hz[0], frequency_hz[-1], 6)
     resonant = _best(frequency_hz, response, noise, rate_hz, list(tries))
@@ -181,7 +367,7 @@ def _best(
     rate_hz: float,
     tries: list[float] | list[None],
 ) -> OptimizeResult:
-    """Fit from several starts; a start of None has no resonance."""
+    """Return the best fit from several starting frequencies; None fits no resonance."""
     doubt = np.hypot(noise, _HYSTERESIS * np.abs(response))
     top = float(frequency_hz[-1])
 

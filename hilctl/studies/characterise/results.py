@@ -1,35 +1,48 @@
-"""What a campaign has found: figures, and the verdict on its model."""
+"""Results of a characterisation: measurements, model, and validation."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
+from hilctl.base.segments import Segment
 from hilctl.base.types import F64
+from hilctl.identify.data.records import History
+from hilctl.identify.fit_api import FitRequest, OnProgress, ignore_progress
 from hilctl.identify.model_quality import GOOD_PERCENT, MOST_PERCENT, Grade, Verdict
-from hilctl.identify.pipeline import Identification
+from hilctl.identify.parallel import parallel_map, workers
+from hilctl.identify.pipeline import Identification, identify_records, settings_from
+from hilctl.models.base import HysteresisModel
+from hilctl.recording.reader import read
+from hilctl.recording.recording import Recording
+from hilctl.signals import cycle_metrics
 from hilctl.studies.characterise.loops import LoopFigures, Repeatability, ReversalCurves
-from hilctl.studies.characterise.noise import RestNoise, StepResponseCheck
-from hilctl.studies.characterise.response import SmallSignal
+from hilctl.studies.characterise.response import (
+    RestNoise,
+    SmallSignal,
+    StepResponseCheck,
+    without_gaps,
+)
 
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """What the steps so far have measured; what none has is None or empty.
+    """Measurements of the steps so far; None or empty if not measured yet.
 
     Attributes:
         rest: Noise and drift at rest.
-        reaction: First reaction, and its polarity.
+        reaction: First reaction and its polarity.
         small: Small-signal response.
         growing: Loops of growing amplitude.
         slow: Loops at the lowest frequency.
         fast: Loops at several frequencies.
         reversal: First-order reversal curves.
-        biased: Small loops at places all over the range.
-        crept_percent: How far the displacement moves on in each rest, of where it stands.
-        repeated: How the last of the growing loops compares with itself at the end.
+        biased: Small loops over the whole range.
+        crept_percent: Creep in each hold, of the displacement.
+        repeated: Change of the largest growing loop at the end.
     """
 
     rest: RestNoise | None = None
@@ -44,25 +57,25 @@ class Measured:
     repeated: Repeatability | None = None
 
     def also(self, **found: Any) -> Self:
-        """Return a copy with something more."""
+        """Return a copy with more measurements."""
         return replace(self, **found)
 
     def to_mapping(self) -> dict[str, Any]:
-        """Return the figures as plain values, without the signals."""
+        """Return plain values without signals."""
         return {field.name: _plain(getattr(self, field.name)) for field in fields(self)}
 
 
 @dataclass(frozen=True, slots=True)
 class ValidationReference:
-    """How far the model is from a reference that no fit has seen, the mean error included.
+    """Error of the model on a reference that was not used in any fit.
 
     Attributes:
-        label: The reference.
+        label: Name of the reference.
         peak_percent: Largest error, in percent of the displacement's peak-to-peak.
         rms_percent: Its root mean square.
-        mean_percent: Its mean: where the actuator stood, rather than how it moved.
-        floor_percent: Largest error that sensor noise alone would make.
-        time_s: float64[n], time of the samples judged.
+        mean_percent: Its mean.
+        floor_percent: Largest error expected from sensor noise alone.
+        time_s: float64[n], time of the evaluated samples.
         measured_um: float64[n], their displacement.
         modelled_um: float64[n], the model's.
     """
@@ -79,16 +92,16 @@ class ValidationReference:
 
 @dataclass(frozen=True, slots=True)
 class StepRow:
-    """One step, as it is shown.
+    """One step of the plan or the result.
 
     Attributes:
         name: Name of the step and of its recording.
-        purpose: What it is for.
+        purpose: Its purpose.
         seconds: Rig time.
-        megabytes: About how large its recording is.
-        text: What came of it; empty before.
-        recording: Its recording; empty where it was not run.
-        kept: Whether the recording was there already.
+        megabytes: Approximate size of its recording.
+        text: Summary of its result; empty before the run.
+        recording: Its recording; empty if it was not run.
+        kept: Whether the recording existed already.
     """
 
     name: str
@@ -102,19 +115,19 @@ class StepRow:
 
 @dataclass(frozen=True, slots=True)
 class Characterisation:
-    """What came of a campaign.
+    """Result of a characterisation.
 
     Attributes:
         experiment: Name of the experiment.
         device: Name of the device.
         unit: Unit of commands.
         band_hz: Lowest and highest frequency of loops.
-        steps: The steps that were run or kept.
-        measured: What they measured.
-        held_out: The random reference first; empty without a model.
-        identification: The model; None where there is none.
-        problem: Why the campaign ended early, with what to do; empty where it did not.
-        problem_code: The same, for programs.
+        steps: The steps, run or kept.
+        measured: Their measurements.
+        held_out: Validation errors, the random reference first; empty without a model.
+        identification: The model; None if none was identified.
+        problem: Problem of the rig with its remedy; empty if all steps were completed.
+        problem_code: Code of the problem.
     """
 
     experiment: str
@@ -130,10 +143,10 @@ class Characterisation:
 
     @property
     def verdict(self) -> Verdict | None:
-        """What the model is worth; None without one.
+        """Verdict on the model; None without one.
 
-        What identification says of the data stands; else the error on the random reference decides,
-        which has more of what a run will ask for than loops left out of a fit.
+        A rejection by the identification is final. Otherwise the error on the random reference
+        decides: it resembles a run more closely than held-out loops.
         """
         if self.identification is None or not self.held_out:
             return None
@@ -149,11 +162,11 @@ class Characterisation:
 
     @property
     def is_model(self) -> bool:
-        """Whether there is a model that may be used."""
+        """Whether there is a usable model."""
         return self.verdict is not None and self.verdict.grade != "not a model"
 
     def to_mapping(self) -> dict[str, Any]:
-        """Return plain values for JSON, the held-out error first."""
+        """Return plain values for JSON, the validation errors first."""
         found = self.identification
         return {
             "held_out": [_plain(each) for each in self.held_out],
@@ -172,7 +185,7 @@ class Characterisation:
 
 
 def _plain(value: Any) -> Any:
-    """Return a figure as plain values; signals are left out."""
+    """Return plain values without signals."""
     if isinstance(value, tuple):
         return [_plain(each) for each in value if not isinstance(each, np.ndarray)]
     if isinstance(value, Mapping):
@@ -187,3 +200,113 @@ def _is_signal(value: Any) -> bool:
     return isinstance(value, np.ndarray) or (
         isinstance(value, tuple) and bool(value) and isinstance(value[0], np.ndarray)
     )
+
+
+Mask: TypeAlias = npt.NDArray[np.bool_]
+
+_SLACK = 0.01
+
+FITTED = ("slow-loops", "fast-loops", "creep", "small-motions", "training")
+"""Steps for identification. Each starts with a motion of full amplitude, which erases the earlier
+history."""
+
+VALIDATED: Mapping[str, str] = {
+    "held-out": "random reference",
+    "reversal-curves": "first-order reversal curves",
+    "biased-loops": "small loops all over the range",
+}
+"""Steps for validation only, with their labels, the most important first."""
+
+
+def identified(
+    recordings: Mapping[str, Path], progress: OnProgress = ignore_progress
+) -> Identification:
+    """Select the kind of model and identify it from complete histories.
+
+    Small loops depend on the history of the actuator, which steady loops do not contain.
+
+    Args:
+        recordings: The steps' recordings by name.
+        progress: Called with a description of the progress.
+
+    Raises:
+        InputError: No model can be identified from them.
+    """
+    fitted = parallel_map(read, [p for name, p in recordings.items() if name in FITTED])
+    source = [recording.path.name for recording in fitted]
+    histories = [_history(recording) for recording in fitted]
+    unit = fitted[0].command_unit
+    settings = settings_from("auto", [])
+    with workers("threads") as run:
+        return identify_records(
+            FitRequest(histories, settings, unit, source=source, run=run, progress=progress)
+        )
+
+
+def _history(recording: Recording) -> History:
+    """Return a recording up to the end of its last waveform, with gaps filled."""
+    signals = without_gaps(recording, 0, recording.segments[-1].steady_stop)
+    return History(recording.path.name, *signals, recording.sample_rate_hz)
+
+
+def validated(
+    model: HysteresisModel, recordings: Mapping[str, Path], noise_um: float
+) -> tuple[ValidationReference, ...]:
+    """Validate a model on recordings that were not used to identify it."""
+    return tuple(
+        validate(model, read(recordings[name]), noise_um, label)
+        for name, label in VALIDATED.items()
+        if name in recordings
+    )
+
+
+def validate(
+    model: HysteresisModel, recording: Recording, noise_um: float, label: str
+) -> ValidationReference:
+    """Validate a model on a recording.
+
+    The model runs through the complete recording. The waveforms after the first are evaluated at
+    full amplitude, within the input range of the model.
+
+    Args:
+        model: The model.
+        recording: A run that starts with a conditioning cycle.
+        noise_um: rms noise of a single reading.
+        label: Name of the reference.
+
+    Raises:
+        DataError: Too many samples are missing.
+    """
+    parts = recording.segments[1:]
+    stop = parts[-1].steady_stop
+    command, measured_um = without_gaps(recording, 0, stop)
+    modelled_um = model.forward(recording.sample_rate_hz).process(command)
+    good = _in_range(command, model) & _steady(parts, stop)
+    error_um = modelled_um[good] - measured_um[good]
+    whole_um = max(float(np.ptp(measured_um[good])), 1e-12)
+    floor_um = noise_um * cycle_metrics.expected_maximum(error_um.size)
+    return ValidationReference(
+        label=label,
+        peak_percent=100.0 * cycle_metrics.peak(error_um) / whole_um,
+        rms_percent=100.0 * cycle_metrics.rms(error_um) / whole_um,
+        mean_percent=100.0 * float(error_um.mean()) / whole_um,
+        floor_percent=100.0 * floor_um / whole_um,
+        time_s=np.flatnonzero(good) / recording.sample_rate_hz,
+        measured_um=measured_um[good],
+        modelled_um=modelled_um[good],
+    )
+
+
+def _in_range(command: F64, model: HysteresisModel) -> Mask:
+    """Return which commands are in the model's input range, if it has one: bool[n]."""
+    low, high = model.input_range or (-np.inf, np.inf)
+    slack = _SLACK * (high - low) if np.isfinite(high - low) else 0.0
+    return (command >= low - slack) & (command <= high + slack)
+
+
+def _steady(parts: Sequence[Segment], stop: int) -> Mask:
+    """Return which samples belong to a waveform at full amplitude: bool[stop]."""
+    found = np.zeros(stop, dtype=np.bool_)
+    for part in parts:
+        found[part.steady_start : part.steady_stop] = True
+    return found

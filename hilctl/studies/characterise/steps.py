@@ -1,14 +1,15 @@
-"""The steps of a campaign, in order: each is one run, and knows what those before it measured."""
+"""Steps of a characterisation: waveform and evaluation of each run, in order."""
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NoReturn, TypeAlias
 
 import numpy as np
 
 from hilctl.recording.recording import Recording
 from hilctl.studies.characterise import waveforms
-from hilctl.studies.characterise.limits import CharacterisationLimits
+from hilctl.studies.characterise.limits import CharacterisationLimits as Limits
 from hilctl.studies.characterise.loops import (
     all_loops,
     loop_figures,
@@ -16,63 +17,79 @@ from hilctl.studies.characterise.loops import (
     repeatability,
     reversal_curves,
 )
-from hilctl.studies.characterise.noise import crept_percent, rest_noise, sine_reaction
-from hilctl.studies.characterise.response import small_signal
+from hilctl.studies.characterise.response import (
+    RigProblemError,
+    crept_percent,
+    rest_noise,
+    sine_reaction,
+    small_signal,
+)
 from hilctl.studies.characterise.results import Measured
-from hilctl.studies.characterise.rig_problem import RigProblemError
 from hilctl.studies.characterise.waveforms import Keys
 
 POLARITY_PARTS = (0.01, 0.03, 0.1)
 SMALL_PARTS = (0.05, 0.25)
 GROWING_PARTS = (0.1, 0.25, 0.5, 0.75, 1.0)
 
-_MOST_RANDOM = 0.95
+_RANDOM_PART = 0.95
 _CYCLES = 12.0
-_LOUD = 0.05  # rms noise over the whole stroke at which nothing can be told from it
+_LOUD = 0.05  # rms noise, of the whole stroke, that hides any motion
 _LEAST_MOTION = 6.0  # peak-to-peak displacement of the largest loop, over the rms noise
 _CLEAR_OF_BAND = 1.5
 _SAFE_OF_RESONANCE = 3.0
 _MOST_SCATTER_PERCENT = 5.0
 
+Waveform: TypeAlias = Callable[[Limits, Measured], Keys | None]
+Evaluated: TypeAlias = tuple[Measured, str]
+Evaluate: TypeAlias = Callable[[Recording, Limits, Measured], Evaluated]
+
 
 @dataclass(frozen=True, slots=True)
 class CharacterisationStep:
-    """One step: one run.
+    """One run.
 
     Attributes:
-        name: Its name, and that of its recording.
-        purpose: What it is for.
-        waveform: Gives the waveform's keys; None where the step is not needed.
-        take: Judges its recording; gives what is known then, and a line for people.
+        name: Name of the step and of its recording.
+        purpose: Its purpose.
+        waveform: Returns the keys of its waveform; None if the step is not needed.
+        take: Evaluates its recording; returns all measurements so far, and a summary line.
     """
 
     name: str
     purpose: str
-    waveform: Callable[[CharacterisationLimits, Measured], Keys | None]
-    take: Callable[[Recording, CharacterisationLimits, Measured], tuple[Measured, str]]
+    waveform: Waveform
+    take: Evaluate
 
 
-def full_amplitude(limits: CharacterisationLimits, measured: Measured) -> float:
-    """Return the largest amplitude that has been tried, or is about to be."""
+def full_amplitude(limits: Limits, measured: Measured) -> float:
+    """Return the largest amplitude reached; the largest allowed one before the growing loops."""
     return measured.growing[-1].amplitude if measured.growing else limits.reach
 
 
-def _rest(limits: CharacterisationLimits, measured: Measured) -> Keys:
-    del measured
-    return waveforms.at_rest(limits)
+def _at_full(build: Callable[[Limits, float], Keys]) -> Waveform:
+    return lambda limits, measured: build(limits, full_amplitude(limits, measured))
 
 
-def _take_rest(
-    recording: Recording, limits: CharacterisationLimits, measured: Measured
-) -> tuple[Measured, str]:
+def _random(seed: int) -> Waveform:
+    return _at_full(
+        lambda limits, full: waveforms.random_reference(limits, _RANDOM_PART * full, seed)
+    )
+
+
+def _unevaluated(text: str) -> Evaluate:
+    """Return the evaluation of a recording that only the model uses."""
+    return lambda recording, limits, measured: (measured, text)
+
+
+def _take_rest(recording: Recording, limits: Limits, measured: Measured) -> Evaluated:
     del limits
     found = rest_noise(recording)
     text = f"noise {found.noise_um:.3g} µm rms, drift {found.drift_um_per_s:+.2g} µm/s"
     return measured.also(rest=found), text
 
 
-def _polarity(part: float) -> Callable[[CharacterisationLimits, Measured], Keys | None]:
-    def make(limits: CharacterisationLimits, measured: Measured) -> Keys | None:
+def _polarity(part: float) -> Waveform:
+    def make(limits: Limits, measured: Measured) -> Keys | None:
         if measured.reaction is not None and measured.reaction.clear:
             return None
         amplitude = part * limits.reach
@@ -82,63 +99,56 @@ def _polarity(part: float) -> Callable[[CharacterisationLimits, Measured], Keys 
     return make
 
 
-def _take_polarity(
-    recording: Recording, limits: CharacterisationLimits, measured: Measured
-) -> tuple[Measured, str]:
+def _take_polarity(recording: Recording, limits: Limits, measured: Measured) -> Evaluated:
     found = sine_reaction(recording)
     after = measured.also(reaction=found)
     percent = 100.0 * found.amplitude / limits.reach
-    last = found.amplitude > 0.9 * POLARITY_PARTS[-1] * limits.reach
+    gain = f"{found.gain_um:.3g} µm/{limits.unit} at {percent:.2g} % of the range"
     if found.clear and not found.even:
-        _refuse_negative(found.gain_um, percent, limits.unit)
-        return after, f"{found.gain_um:.3g} µm/{limits.unit} at {percent:.2g} % of the range"
-    if last and found.even:
-        raise RigProblemError(
-            "no_bias",
-            f"the displacement reacts alike to both signs of the command ({found.second_um:.3g} µm "
-            f"at twice its frequency, {found.motion_um:.3g} µm at it)",
-            "give the rods their bias, magnet or current, or record loops and use 'hilctl identify "
-            "--model butterfly'",
-        )
-    if last:
+        if found.gain_um < 0.0:
+            raise RigProblemError(
+                "wrong_polarity",
+                f"the displacement falls as the command rises, {gain}",
+                "swap the wires of the coil or the sensor, or invert the sensor's scale in the "
+                "device profile",
+            )
+        return after, gain
+    if found.amplitude > 0.9 * POLARITY_PARTS[-1] * limits.reach:
+        if found.even:
+            raise RigProblemError(
+                "no_bias",
+                "the displacement responds alike to both signs of the command "
+                f"({found.second_um:.3g} µm at twice its frequency, {found.motion_um:.3g} µm at "
+                "its frequency)",
+                "apply a bias magnet or bias current, or record loops and use 'hilctl identify "
+                "--model butterfly'",
+            )
         _refuse_silent(measured, limits, found.amplitude, percent)
-    return after, f"nothing clear at {percent:.2g} % of the range"
-
-
-def _refuse_negative(gain_um: float, percent: float, unit: str) -> None:
-    if gain_um < 0.0:
-        raise RigProblemError(
-            "wrong_polarity",
-            f"the displacement falls as the command rises, {gain_um:.3g} µm/{unit} at "
-            f"{percent:.2g} % of the range",
-            "swap the wires of coil or sensor, or turn the sign of the sensor's scale in the "
-            "device's profile",
-        )
+    return after, f"no clear response at {percent:.2g} % of the range"
 
 
 def _refuse_silent(
-    measured: Measured, limits: CharacterisationLimits, amplitude: float, percent: float
-) -> None:
+    measured: Measured, limits: Limits, amplitude: float, percent: float
+) -> NoReturn:
     noise_um = measured.rest.noise_um if measured.rest else 0.0
-    moved = f"a sine of {amplitude:.3g} {limits.unit}, {percent:.2g} % of the range,"
+    sine = f"a sine of {amplitude:.3g} {limits.unit}, {percent:.2g} % of the range"
     if noise_um > _LOUD * limits.stroke_span_um:
         share = 100.0 * noise_um / limits.stroke_span_um
         raise RigProblemError(
             "noise",
             f"noise is larger than the motion: {noise_um:.3g} µm rms at rest, {share:.0f} % of the "
-            f"allowed stroke, hides what {moved} does",
-            "look at the sensor's ground, shield and range",
+            f"allowed stroke, hides the response to {sine}",
+            "check the sensor's grounding, shielding and range",
         )
     raise RigProblemError(
         "no_reaction",
-        f"no reaction: {moved} moves nothing that shows above {noise_um:.3g} µm rms of noise",
-        "look whether the amplifier is on and enabled, at the coil's wires, and whether the sensor "
-        "sees the actuator",
+        f"no response to {sine}, above {noise_um:.3g} µm rms of noise",
+        "check that the amplifier is on and enabled, the coil's wiring, and the sensor's alignment",
     )
 
 
-def _response(part: float) -> Callable[[CharacterisationLimits, Measured], Keys | None]:
-    def make(limits: CharacterisationLimits, measured: Measured) -> Keys | None:
+def _response(part: float) -> Waveform:
+    def make(limits: Limits, measured: Measured) -> Keys | None:
         if measured.small is not None:
             return None
         return waveforms.small_multisine(limits, part * limits.reach)
@@ -146,16 +156,14 @@ def _response(part: float) -> Callable[[CharacterisationLimits, Measured], Keys 
     return make
 
 
-def _take_response(
-    recording: Recording, limits: CharacterisationLimits, measured: Measured
-) -> tuple[Measured, str]:
+def _take_response(recording: Recording, limits: Limits, measured: Measured) -> Evaluated:
     try:
         found = small_signal(recording)
     except RigProblemError as error:
         tried = 0.5 * float(np.ptp(recording.samples.command))
         if error.code != "noise" or tried > 0.9 * SMALL_PARTS[-1] * limits.reach:
             raise
-        return measured, f"lost in noise at {100.0 * tried / limits.reach:.2g} % of the range"
+        return measured, f"below the noise at {100.0 * tried / limits.reach:.2g} % of the range"
     natural_hz = found.natural_hz
     delay = f"delay {1e3 * found.delay_s:.3g} ms, lag {1e3 * found.lag_s:.3g} ms"
     text = f"gain {found.gain_um:.3g} µm/{limits.unit}, {delay}"
@@ -163,32 +171,29 @@ def _take_response(
         return measured.also(small=found), f"{text}, no resonance"
     if natural_hz < _CLEAR_OF_BAND * limits.highest_hz:
         band = f"{limits.lowest_hz:g} to {limits.highest_hz:g} Hz"
-        lower_hz = natural_hz / _SAFE_OF_RESONANCE
         raise RigProblemError(
             "resonance",
-            f"a resonance at {natural_hz:.4g} Hz (damping {found.damping_ratio:.2g}) lies inside "
+            f"the resonance at {natural_hz:.4g} Hz (damping {found.damping_ratio:.2g}) is within "
             f"or just above the band of the loops, {band}",
-            f"give --highest-hz {lower_hz:.2g} or less, or stiffen the load",
+            f"set --highest-hz {natural_hz / _SAFE_OF_RESONANCE:.2g} or less, or stiffen the load",
         )
     text += f", resonance {natural_hz:.4g} Hz, damping {found.damping_ratio:.2g}"
     return measured.also(small=found), text
 
 
-def _growing(part: float) -> Callable[[CharacterisationLimits, Measured], Keys | None]:
-    def make(limits: CharacterisationLimits, measured: Measured) -> Keys | None:
+def _growing(part: float) -> Waveform:
+    def make(limits: Limits, measured: Measured) -> Keys | None:
         amplitude = next_amplitude(measured.growing, part * limits.reach, limits.stroke_um)
         return None if amplitude is None else _middle_loop(limits, amplitude)
 
     return make
 
 
-def _middle_loop(limits: CharacterisationLimits, amplitude: float) -> Keys:
+def _middle_loop(limits: Limits, amplitude: float) -> Keys:
     return waveforms.sine(limits, amplitude, limits.middle_hz, max(4.0, 0.4 * limits.middle_hz))
 
 
-def _take_growing(
-    recording: Recording, limits: CharacterisationLimits, measured: Measured
-) -> tuple[Measured, str]:
+def _take_growing(recording: Recording, limits: Limits, measured: Measured) -> Evaluated:
     found = loop_figures(recording, recording.segments[-1])
     loop = f"{found.amplitude:.3g} {limits.unit} moves {found.peak_to_peak_um:.3g} µm"
     if found.scatter_percent > _MOST_SCATTER_PERCENT:
@@ -198,22 +203,17 @@ def _take_growing(
     return measured.also(growing=(*measured.growing, found)), f"{loop}: {span}"
 
 
-def _refuse_unrepeatable(text: str) -> None:
+def _refuse_unrepeatable(text: str) -> NoReturn:
     raise RigProblemError(
         "not_repeatable",
         f"not repeatable: {text} of their peak-to-peak",
-        "look for play in the mounting, a loose preload, a sensor that slips, or warming; then "
-        "run it all again",
+        "check for play in the mounting, a loose preload, a slipping sensor, or warming; then "
+        "repeat the characterisation with --overwrite",
     )
 
 
-def _slow(limits: CharacterisationLimits, measured: Measured) -> Keys:
-    return waveforms.slow_loops(limits, full_amplitude(limits, measured))
-
-
-def _fast(limits: CharacterisationLimits, measured: Measured) -> Keys:
-    full = full_amplitude(limits, measured)
-    small = measured.small
+def _fast(limits: Limits, measured: Measured) -> Keys:
+    full, small = full_amplitude(limits, measured), measured.small
     amplitudes = {
         frequency_hz: full / max(1.0, small.size_at(frequency_hz) if small else 1.0)
         for frequency_hz in waveforms.frequencies_hz(limits)
@@ -221,110 +221,58 @@ def _fast(limits: CharacterisationLimits, measured: Measured) -> Keys:
     return waveforms.fast_loops(limits, amplitudes)
 
 
-def _take_slow(
-    recording: Recording, limits: CharacterisationLimits, measured: Measured
-) -> tuple[Measured, str]:
+def _take_slow(recording: Recording, limits: Limits, measured: Measured) -> Evaluated:
     del limits
-    largest = max(all_loops(recording), key=lambda each: each.amplitude)
+    loops = all_loops(recording)
+    largest = max(loops, key=lambda each: each.amplitude)
     if measured.rest and largest.peak_to_peak_um < _LEAST_MOTION * measured.rest.noise_um:
         raise RigProblemError(
             "noise",
             f"noise is larger than the motion: {measured.rest.noise_um:.3g} µm rms at rest, "
             f"{largest.peak_to_peak_um:.3g} µm peak-to-peak at the largest amplitude",
-            "widen the limits as far as the actuator allows, or take a better sensor",
+            "widen the limits as far as the actuator allows, or use a better sensor",
         )
-    after = measured.also(slow=all_loops(recording))
-    return after, f"hysteresis {largest.hysteresis_percent or 0.0:.3g} %"
+    return measured.also(slow=loops), f"hysteresis {largest.hysteresis_percent or 0.0:.3g} %"
 
 
-def _take_fast(
-    recording: Recording, limits: CharacterisationLimits, measured: Measured
-) -> tuple[Measured, str]:
+def _take_fast(recording: Recording, limits: Limits, measured: Measured) -> Evaluated:
     del limits
     loops = all_loops(recording)
     fastest = max(loops, key=lambda each: (each.frequency_hz, each.amplitude))
     percent = fastest.hysteresis_percent or 0.0
-    text = f"hysteresis {percent:.3g} % at {fastest.frequency_hz:g} Hz"
-    return measured.also(fast=loops), text
+    return measured.also(fast=loops), f"hysteresis {percent:.3g} % at {fastest.frequency_hz:g} Hz"
 
 
-def _reversal(limits: CharacterisationLimits, measured: Measured) -> Keys:
-    return waveforms.reversal_curves(limits, full_amplitude(limits, measured))
-
-
-def _take_reversal(
-    recording: Recording, limits: CharacterisationLimits, measured: Measured
-) -> tuple[Measured, str]:
+def _take_reversal(recording: Recording, limits: Limits, measured: Measured) -> Evaluated:
     del limits
     found = reversal_curves(recording)
     text = f"{len(found.turns)} curves return to {found.return_percent:.2g} % of their span"
     return measured.also(reversal=found), text
 
 
-def _biased(limits: CharacterisationLimits, measured: Measured) -> Keys:
-    return waveforms.biased_loops(limits, full_amplitude(limits, measured))
-
-
-def _take_biased(
-    recording: Recording, limits: CharacterisationLimits, measured: Measured
-) -> tuple[Measured, str]:
+def _take_biased(recording: Recording, limits: Limits, measured: Measured) -> Evaluated:
     found = all_loops(recording)
     gains = [each.gain_um for each in found]
     text = f"gain {min(gains):.3g} to {max(gains):.3g} µm/{limits.unit} over the range"
     return measured.also(biased=found), text
 
 
-def _rests(limits: CharacterisationLimits, measured: Measured) -> Keys:
-    return waveforms.rests(limits, full_amplitude(limits, measured))
-
-
-def _take_rests(
-    recording: Recording, limits: CharacterisationLimits, measured: Measured
-) -> tuple[Measured, str]:
+def _take_creep(recording: Recording, limits: Limits, measured: Measured) -> Evaluated:
     del limits
     found = crept_percent(recording)
     crept = " and ".join(f"{percent:+.2g}" for percent in found)
-    text = f"moves on by {crept} % in {waveforms.CREEP_S:g} s"
-    return measured.also(crept_percent=found), text
+    return measured.also(crept_percent=found), f"creep {crept} % in {waveforms.CREEP_S:g} s"
 
 
-def _small(limits: CharacterisationLimits, measured: Measured) -> Keys:
-    return waveforms.small_motions(limits, full_amplitude(limits, measured))
-
-
-def _random(seed: int) -> Callable[[CharacterisationLimits, Measured], Keys]:
-    def make(limits: CharacterisationLimits, measured: Measured) -> Keys:
-        amplitude = _MOST_RANDOM * full_amplitude(limits, measured)
-        return waveforms.random_reference(limits, amplitude, seed)
-
-    return make
-
-
-def _taken(
-    text: str,
-) -> Callable[[Recording, CharacterisationLimits, Measured], tuple[Measured, str]]:
-    """Return what takes a recording that nothing is measured from before the model."""
-
-    def take(
-        recording: Recording, limits: CharacterisationLimits, measured: Measured
-    ) -> tuple[Measured, str]:
-        del recording, limits
-        return measured, text
-
-    return take
-
-
-def _again(limits: CharacterisationLimits, measured: Measured) -> Keys:
+def _again(limits: Limits, measured: Measured) -> Keys:
     return _middle_loop(limits, full_amplitude(limits, measured))
 
 
-def _take_again(
-    recording: Recording, limits: CharacterisationLimits, measured: Measured
-) -> tuple[Measured, str]:
+def _take_again(recording: Recording, limits: Limits, measured: Measured) -> Evaluated:
     del limits
     again = loop_figures(recording, recording.segments[-1])
     found = repeatability(measured.growing[-1], again)
-    shape, shift = f"{found.shape_percent:.2g} % in shape", f"{found.shift_percent:.2g} % in place"
+    shape, shift = f"{found.shape_percent:.2g} % in shape", f"{found.shift_percent:.2g} % in offset"
     if math.hypot(found.shape_percent, found.shift_percent) > _MOST_SCATTER_PERCENT:
         _refuse_unrepeatable(f"the largest loop has changed by {shape} and {shift}")
     return measured.also(repeated=found), f"differs by {shape}, {shift} ({found.shift_um:+.3g} µm)"
@@ -334,8 +282,8 @@ def _numbered(
     name: str,
     purpose: str,
     parts: tuple[float, ...],
-    waveform: Callable[[float], Callable[[CharacterisationLimits, Measured], Keys | None]],
-    take: Callable[[Recording, CharacterisationLimits, Measured], tuple[Measured, str]],
+    waveform: Callable[[float], Waveform],
+    take: Evaluate,
 ) -> list[CharacterisationStep]:
     return [
         CharacterisationStep(f"{name}-{i}", f"{purpose}, {100.0 * part:g} %", waveform(part), take)
@@ -344,29 +292,48 @@ def _numbered(
 
 
 STEPS: tuple[CharacterisationStep, ...] = (
-    CharacterisationStep("rest", "noise and drift at rest", _rest, _take_rest),
+    CharacterisationStep(
+        "rest", "noise and drift at rest", lambda limits, _: waveforms.at_rest(limits), _take_rest
+    ),
     *_numbered("polarity", "first reaction, its sign", POLARITY_PARTS, _polarity, _take_polarity),
     *_numbered("response", "small-signal response", SMALL_PARTS, _response, _take_response),
     *_numbered("growing", "loop of growing amplitude", GROWING_PARTS, _growing, _take_growing),
-    CharacterisationStep("slow-loops", "loops at the lowest frequency", _slow, _take_slow),
+    CharacterisationStep(
+        "slow-loops", "loops at the lowest frequency", _at_full(waveforms.slow_loops), _take_slow
+    ),
     CharacterisationStep("fast-loops", "loops at several frequencies", _fast, _take_fast),
     CharacterisationStep(
-        "reversal-curves", "first-order reversal curves", _reversal, _take_reversal
+        "reversal-curves",
+        "first-order reversal curves",
+        _at_full(waveforms.reversal_curves),
+        _take_reversal,
     ),
-    CharacterisationStep("biased-loops", "small loops all over the range", _biased, _take_biased),
-    CharacterisationStep("creep", "creep in rests on either side", _rests, _take_rests),
-    CharacterisationStep("small-motions", "small random motions", _small, _taken("for the fit")),
+    CharacterisationStep(
+        "biased-loops",
+        "small loops over the whole range",
+        _at_full(waveforms.biased_loops),
+        _take_biased,
+    ),
+    CharacterisationStep(
+        "creep", "creep at both ends of the range", _at_full(waveforms.rests), _take_creep
+    ),
+    CharacterisationStep(
+        "small-motions",
+        "small random motions",
+        _at_full(waveforms.small_motions),
+        _unevaluated("for the fit"),
+    ),
     CharacterisationStep(
         "training",
-        "a random reference, for the fit",
+        "random reference for the fit",
         _random(waveforms.TRAINING_SEED),
-        _taken("for the fit"),
+        _unevaluated("for the fit"),
     ),
     CharacterisationStep(
         "held-out",
-        "a random reference, for the judgement",
+        "random reference for the validation",
         _random(waveforms.HELD_OUT_SEED),
-        _taken("kept from every fit"),
+        _unevaluated("not used in any fit"),
     ),
-    CharacterisationStep("repeated", "the largest loop once more", _again, _take_again),
+    CharacterisationStep("repeated", "the largest loop again", _again, _take_again),
 )

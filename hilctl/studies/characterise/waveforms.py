@@ -1,6 +1,6 @@
-"""The waveform of each step, as keys of an experiment: pure functions of what is allowed.
+"""Waveforms of the steps, as keys of an experiment.
 
-Every part begins and ends at rest, so that parts may stand in any order.
+Every part starts and ends at rest, so that parts may be in any order.
 """
 
 import json
@@ -40,18 +40,18 @@ _RANDOM_BAND = (5.0, 0.5)  # of the lowest and of the highest frequency of loops
 
 
 def reference_of(limits: CharacterisationLimits, keys: Keys) -> Reference:
-    """Return every command of a waveform, and its segments."""
+    """Return the commands of a waveform, and its segments."""
     return build(_ADAPTER.validate_json(json.dumps(keys)), limits.sample_rate_hz, Path())
 
 
 def within(limits: CharacterisationLimits, keys: Keys) -> tuple[Keys, F64]:
-    """Shrink a waveform towards rest until slew and heat are kept, where that is what it takes.
+    """Shrink a waveform towards rest until it keeps slew and heat.
 
     Returns:
-        Its keys, and every command: float64[n].
+        Its keys, and its commands: float64[n].
     """
     for _ in range(_TRIES):
-        command = reference_of(limits, keys).values.copy()  # kernels take no read-only one
+        command = reference_of(limits, keys).values.copy()  # kernels need a writable array
         scale = limits.scale(command)
         if scale >= 1.0:
             break
@@ -60,7 +60,7 @@ def within(limits: CharacterisationLimits, keys: Keys) -> tuple[Keys, F64]:
 
 
 def _scaled(limits: CharacterisationLimits, keys: Keys, scale: float) -> Keys:
-    """Shrink a waveform towards rest: within the range it stays."""
+    """Scale a waveform about rest."""
     changed = {
         key: scale * value if key in {"amplitude", "rate_per_s"} else value
         for key, value in keys.items()
@@ -91,12 +91,12 @@ def sine(
     """Return a sine with soft ends.
 
     Args:
-        limits: What is allowed.
-        amplitude: Its amplitude, lowered to what the slew limit leaves.
+        limits: Limits of the characterisation.
+        amplitude: Its amplitude, lowered to the slew limit.
         frequency_hz: Its frequency.
         cycles: Cycles at full amplitude.
-        offset: What it goes round; the middle of the range where None.
-        soft: Cycles of the soft start; the soft end has half as many.
+        offset: Its mean; the centre of the range if None.
+        soft: Cycles of the soft start; the soft end is half as long.
     """
     keys = {
         "kind": "sine",
@@ -109,7 +109,7 @@ def sine(
 
 
 def _softened(limits: CharacterisationLimits, keys: Keys, whole_s: float, soft_s: float) -> Keys:
-    """Return keys with a soft start and an end of half its length, about a time at full size."""
+    """Return keys with a soft start and a soft end of half its length."""
     least_s = limits.soft_s(keys["amplitude"], keys["offset"])
     start_s, end_s = max(soft_s, least_s), max(0.5 * soft_s, least_s)
     return {
@@ -122,7 +122,7 @@ def _softened(limits: CharacterisationLimits, keys: Keys, whole_s: float, soft_s
 
 
 def small_multisine(limits: CharacterisationLimits, amplitude: float) -> Keys:
-    """Return equal sines far beyond the band of loops, whose period is whole samples."""
+    """Return a multisine far beyond the band of loops; its period is a whole number of samples."""
     wanted_hz = limits.highest_hz / _LINES_BELOW_TOP
     step_hz = limits.sample_rate_hz / round(limits.sample_rate_hz / wanted_hz)
     periods = min(max(round(_RESPONSE_S * step_hz), _PERIODS[0]), _PERIODS[1])
@@ -139,7 +139,7 @@ def small_multisine(limits: CharacterisationLimits, amplitude: float) -> Keys:
 
 
 def conditioning(limits: CharacterisationLimits, amplitude: float) -> Keys:
-    """Return the decaying cycle that leads every run to the same state."""
+    """Return the decaying cycle that brings the actuator to the same state in every run."""
     return {
         **sine(limits, amplitude, limits.middle_hz, _CONDITIONING_CYCLES, soft=1.0),
         "kind": "decaying",
@@ -147,7 +147,7 @@ def conditioning(limits: CharacterisationLimits, amplitude: float) -> Keys:
 
 
 def slow_loops(limits: CharacterisationLimits, amplitude: float) -> Keys:
-    """Return loops at the lowest frequency, the largest first: it makes the others repeatable."""
+    """Return loops at the lowest frequency, the largest first to make the others repeatable."""
     parts = [
         sine(limits, part * amplitude, limits.lowest_hz, 3.0, soft=1.0)
         for part in (1.0, 0.75, 0.5, 0.25)
@@ -162,12 +162,7 @@ def frequencies_hz(limits: CharacterisationLimits) -> list[float]:
 
 
 def fast_loops(limits: CharacterisationLimits, amplitudes: dict[float, float]) -> Keys:
-    """Return loops at several frequencies.
-
-    Args:
-        limits: What is allowed.
-        amplitudes: Largest amplitude at each frequency.
-    """
+    """Return loops at several frequencies, given the largest amplitude at each."""
     parts = [
         sine(limits, part * amplitude, frequency_hz, max(4.0, math.ceil(0.2 * frequency_hz)))
         for part in (1.0, 0.5, 0.2)
@@ -178,10 +173,7 @@ def fast_loops(limits: CharacterisationLimits, amplitudes: dict[float, float]) -
 
 
 def reversal_curves(limits: CharacterisationLimits, amplitude: float) -> Keys:
-    """Return first-order reversal curves: from the top down to ever lower turns, and up again.
-
-    They follow a conditioning cycle.
-    """
+    """Return first-order reversal curves with ever lower turning points, after conditioning."""
     turns = [1.0 - 2.0 * k / _REVERSALS for k in range(1, _REVERSALS + 1)]
     levels = [1.0, -1.0, 1.0]
     for turn in turns:
@@ -198,7 +190,7 @@ def reversal_curves(limits: CharacterisationLimits, amplitude: float) -> Keys:
 
 
 def biased_loops(limits: CharacterisationLimits, amplitude: float) -> Keys:
-    """Return small loops at places all over the range, after a conditioning cycle."""
+    """Return small loops over the whole range, after conditioning."""
     small = _OF_BIAS * amplitude
     parts = [
         sine(limits, small, limits.middle_hz, 4.0, offset=limits.centre + part * amplitude)
@@ -208,13 +200,13 @@ def biased_loops(limits: CharacterisationLimits, amplitude: float) -> Keys:
 
 
 def random_reference(limits: CharacterisationLimits, amplitude: float, seed: int) -> Keys:
-    """Return a reference that never repeats, after a conditioning cycle."""
+    """Return an aperiodic reference, after conditioning."""
     part = _random_part(limits, amplitude, seed, RANDOM_S, limits.centre)
     return _sequence(limits, [conditioning(limits, amplitude), part])
 
 
 def rests(limits: CharacterisationLimits, amplitude: float) -> Keys:
-    """Return rests on either side and at rest, after a conditioning cycle: they tell creep."""
+    """Return holds at both ends and at rest for creep, after conditioning."""
     level = _OF_REST * amplitude
     rate_per_s = min(8.0 * amplitude * limits.lowest_hz, limits.slew_per_s)
     rise_s = min(2.0 * level / rate_per_s, 0.5 * CREEP_S)
@@ -249,9 +241,9 @@ def _random_part(
 
 
 def small_motions(limits: CharacterisationLimits, amplitude: float) -> Keys:
-    """Return small aperiodic motions of two sizes all over the range, after a conditioning cycle.
+    """Return small aperiodic motions of two sizes over the whole range, after conditioning.
 
-    Loops of a tenth of the stroke depend on what larger ones say nothing of, most at the ends.
+    They identify what large loops do not excite, especially near the ends of the range.
     """
     parts = [
         _random_part(limits, size * amplitude, seed, 0.5 * RANDOM_S, limits.centre + at * amplitude)
@@ -261,7 +253,7 @@ def small_motions(limits: CharacterisationLimits, amplitude: float) -> Keys:
 
 
 def _rounded(amplitude: float) -> float:
-    """Return an amplitude as people write it; it is far enough from the limits."""
+    """Return an amplitude rounded to four digits; limits have a larger margin."""
     return float(f"{amplitude:.4g}")
 
 

@@ -1,19 +1,12 @@
-"""Many runs side by side: what varied among them, what came out, figures and one page.
+"""Reports of many runs: of a campaign, a folder, or named recordings.
 
-Nothing is run here. The runs are those of a campaign, by its table and recordings, or recordings
-that somebody names.
-
-run_figures.py   what a recording says of its run, as one row of a table; drift of reference runs
-minor_loops.py   pure: the minor loops of an average cycle
-ringing.py       pure: natural frequency and damping of a step's ringing
-digest.py        what one run gives to figures of many: loop, error and response, some kilobytes
-columns.py       names of a campaign's table; written and read
-collect.py       runs of a folder or of files, each read once
-dimension.py     pure: what varied, and in which words
-trend.py         pure: a figure against what varied, with linear fit and direction
-headline.py      what came out, in a line or two
-sheets.py        selection of figures, figures as files, step and frequency responses;
-                 loop_sheets.py, trend_sheets.py draw the others
-look.py          how runs are told apart in figures
-page.py          one page of many runs, and the same for programs
+collect.py           runs of a campaign's table, a folder, or files
+digest.py            metrics of one run, and its data for figures
+minor_loops.py       minor loops of an average cycle
+ringdown.py          natural frequency and damping after a step
+varied_parameter.py  varied keys with names and units
+trend.py             metrics against varied parameters; headline
+run_plots.py         figures of runs side by side
+plots.py             figures of trends; selection and files of all figures
+multi_run_page.py    HTML page and JSON
 """

@@ -1,23 +1,27 @@
-"""Runs to be seen side by side: of a campaign's folder, or of files; each is read once."""
+"""Collect runs of a campaign's table, a folder, or files; each recording is read once."""
 
+import csv
+import io
+import json
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 from hilctl.base.errors import DataError, InputError
+from hilctl.base.files import read_text
 from hilctl.models.base import HysteresisModel
 from hilctl.recording.reader import read
 from hilctl.recording.run_summary import recordings_in
-from hilctl.studies.multi_run.columns import (
-    COMPLETED,
-    PLANNED,
-    SeriesEntry,
-    find_table,
-    read_entries,
+from hilctl.studies.multi_run.digest import (
+    FIGURES,
+    RunDigest,
+    RunFigures,
+    SeriesDrift,
+    digest_of,
+    drift_of,
 )
-from hilctl.studies.multi_run.digest import RunDigest, digest_of
-from hilctl.studies.multi_run.run_figures import RunFigures, SeriesDrift, drift_of
 from hilctl.studies.multi_run.varied_parameter import (
     VariedParameter,
     dimensions,
@@ -26,11 +30,14 @@ from hilctl.studies.multi_run.varied_parameter import (
     value_at,
 )
 
-OnRead = Callable[[float, str], None]
-"""Called with what is done, from 0 to 1, and what is being read."""
-
-MOST_BYTES = 512 << 20
-"""Largest recording that is read into memory, where it takes some eight times as much."""
+STEP, REPEAT, REFERENCE = "step", "repeat", "reference_run"
+FIRST = (STEP, REPEAT, REFERENCE)
+"""Columns before the varied keys."""
+RESULT, RECORDING = "result", "recording"
+LAST = (RESULT, RECORDING)
+"""Columns after the metrics."""
+COMPLETED = "completed"
+PLANNED = "planned"
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,13 +45,14 @@ class SeriesRun:
     """One run of several.
 
     Attributes:
-        number: Its place, from 1.
+        number: Its position, from 1.
         is_reference: Whether it is a reference run of a campaign.
-        values: Value of each key that varied, as number or short text.
-        figures: Its figures.
-        result: ``completed``, ``planned``, or what went wrong.
-        recording: Name of its recording; empty where there is none.
-        digest: What its recording gives to figures; None where there is none.
+        values: Value of each varied key, as a number or short text.
+        figures: Its metrics.
+        result: ``completed``, ``planned``, or code and reason.
+        recording: Name of its recording, or empty.
+        digest: Data of its recording for figures, or None.
+        repeat: Number of the repeat or of the reference run.
     """
 
     number: int
@@ -54,23 +62,104 @@ class SeriesRun:
     result: str
     recording: str
     digest: RunDigest | None = None
+    repeat: int = 1
 
     @property
     def completed(self) -> bool:
-        """Whether it was run to its end."""
+        """Whether the run was completed."""
         return self.result == COMPLETED
+
+
+def find_table(folder: Path) -> Path | None:
+    """Return the CSV table in a campaign's folder; None without one.
+
+    Raises:
+        InputError: The folder has several tables.
+    """
+    found = [path for path in sorted(folder.glob("*.csv")) if _is_table(path)]
+    if len(found) > 1:
+        names = ", ".join(path.name for path in found)
+        raise InputError(f"{folder}: contains tables of several campaigns: {names}")
+    return found[0] if found else None
+
+
+def _is_table(path: Path) -> bool:
+    try:
+        with path.open(encoding="utf-8", newline="") as stream:
+            head = stream.readline(100_000).rstrip("\n").split(",")
+    except (OSError, UnicodeDecodeError):
+        return False
+    return tuple(head[: len(FIRST)]) == FIRST and tuple(head[-len(LAST) :]) == LAST
+
+
+def read_entries(path: Path) -> list[SeriesRun]:
+    """Return the rows of a campaign's table.
+
+    Raises:
+        InputError: It can't be read.
+        DataError: A row is invalid.
+    """
+    reader = csv.DictReader(io.StringIO(read_text(path), newline=""))
+    names = reader.fieldnames or ()
+    keys = [name for name in names if name not in {*FIRST, *FIGURES, *LAST}]
+    entries = []
+    for row in reader:
+        try:
+            entries.append(_entry(row, keys))
+        except (ValueError, KeyError, TypeError) as error:
+            raise DataError(
+                f"{path}:{reader.line_num}: invalid row of a campaign's table: {error}"
+            ) from None
+    return entries
+
+
+def _entry(row: Mapping[str, str], keys: list[str]) -> SeriesRun:
+    return SeriesRun(
+        number=int(row[STEP]),
+        is_reference={"True": True, "False": False}[row[REFERENCE]],
+        values={key: short_value(plain_value(row[key])) for key in keys},
+        figures=RunFigures(**{name: _number(name, row.get(name, "")) for name in FIGURES}),
+        result=row[RESULT],
+        recording=row[RECORDING],
+        repeat=int(row[REPEAT]),
+    )
+
+
+def _number(name: str, text: str) -> Any:
+    if not text:
+        return None
+    return int(text) if name == "deadline_misses" else float(text)
+
+
+def plain_value(text: str) -> Any:
+    """Return the value of a cell: a number, a mapping or a text; None if it is empty."""
+    if not text:
+        return None
+    if text in {"True", "False"}:
+        return text == "True"
+    try:
+        return json.loads(text)
+    except ValueError:
+        return text
+
+
+OnRead = Callable[[float, str], None]
+"""Called with progress from 0 to 1 and a description."""
+
+MOST_BYTES = 512 << 20
+"""Largest recording to read; it takes about eight times as much memory."""
 
 
 @dataclass(frozen=True)
 class RunSeries:
-    """Runs side by side.
+    """Runs of one report.
 
     Attributes:
         name: Name of the campaign, or of the runs.
         runs: The runs in order.
-        keys: Keys that were varied.
-        missing: Recordings that can't be read, each with why.
-        is_campaign: Whether they are of a campaign.
+        keys: Varied keys.
+        missing: Errors of recordings that can't be read.
+        is_campaign: Whether they belong to a campaign.
     """
 
     name: str
@@ -81,35 +170,38 @@ class RunSeries:
 
     @cached_property
     def done(self) -> tuple[SeriesRun, ...]:
-        """Completed runs that are no reference runs: what trends and figures are of."""
+        """Completed runs without reference runs, for trends and figures."""
         return tuple(run for run in self.runs if run.completed and not run.is_reference)
 
     @cached_property
+    def measured(self) -> tuple[tuple[SeriesRun, RunDigest], ...]:
+        """Completed runs with a readable recording, each with its digest."""
+        return tuple((run, run.digest) for run in self.done if run.digest is not None)
+
+    @cached_property
     def dimensions(self) -> tuple[VariedParameter, ...]:
-        """What varied among those that were run."""
-        units = {
-            str(value_at(run.digest.values, "waveform.unit")) for run in self.done if run.digest
-        }
+        """Varied parameters of the completed runs."""
+        units = {str(value_at(digest.values, "waveform.unit")) for _, digest in self.measured}
         unit = units.pop() if len(units) == 1 else ""
         return dimensions(self.keys, [run.values for run in self.done], unit)
 
     @property
     def drift(self) -> SeriesDrift | None:
-        """What reference runs say of drift."""
+        """Drift over the reference runs."""
         return drift_of([run.figures for run in self.runs if run.is_reference and run.completed])
 
     @property
     def failed(self) -> tuple[SeriesRun, ...]:
-        """Runs that did not come to their end."""
+        """Runs that started and were not completed."""
         return tuple(run for run in self.runs if not run.completed and run.result != PLANNED)
 
     @property
     def planned(self) -> int:
-        """How many runs are still to come."""
+        """Number of remaining runs."""
         return sum(run.result == PLANNED for run in self.runs)
 
     def text(self, run: SeriesRun) -> str:
-        """Return what a run is known by among the others."""
+        """Return the label of a run among the others."""
         values = [each.text(run.values[each.key]) for each in self.dimensions
                   if run.values.get(each.key) is not None]  # fmt: skip
         return ", ".join(values) or ("reference run" if run.is_reference else f"run {run.number}")
@@ -123,17 +215,17 @@ def collect(
     """Read runs.
 
     Args:
-        paths: Recordings, or one folder: of a campaign, or with recordings in it.
-        model: Model to hold against what was measured; the recorded ones where None.
-        on_read: Told of progress.
+        paths: Recordings, or one folder of a campaign or of recordings.
+        model: Model to compare with the measurements; the recorded ones if None.
+        on_read: Called with the progress.
 
     Raises:
-        InputError: A folder holds no recordings, or stands among others.
-        DataError: A recording that was named, or a table, can't be read.
+        InputError: A folder contains no recordings, or is not the only path.
+        DataError: A named recording, or the table, can't be read.
     """
     folders = [path for path in paths if path.is_dir()]
     if folders and len(paths) > 1:
-        raise InputError(f"{folders[0]}: is a folder: name one folder, or recordings only")
+        raise InputError(f"{folders[0]}: is a folder. Specify one folder, or recordings only")
     if not folders:
         return _of_files(paths, "runs", model, on_read, missing=None)
     table = find_table(folders[0])
@@ -141,60 +233,43 @@ def collect(
         return _of_campaign(table, model, on_read)
     found = recordings_in(folders[0])
     if not found:
-        raise InputError(f"{folders[0]}: holds no recordings (*.mcap)")
+        raise InputError(f"{folders[0]}: contains no recordings (*.mcap)")
     return _of_files(found, folders[0].resolve().name, model, on_read, missing=[])
 
 
-def series_of(
-    name: str, entries: Sequence[SeriesEntry], digests: Mapping[str, RunDigest],
-    missing: Sequence[str] = (),
-) -> RunSeries:  # fmt: skip
-    """Return the runs of a campaign's table.
+def series_of(name: str, runs: Sequence[SeriesRun], missing: Sequence[str] = ()) -> RunSeries:
+    """Return the runs of a campaign.
 
     Args:
         name: Name of the campaign.
-        entries: Rows of its table.
-        digests: What recordings give to figures, by their names.
-        missing: Recordings that can't be read, each with why.
+        runs: Runs of its table, with their digests.
+        missing: Errors of recordings that can't be read.
     """
-    keys = tuple(dict.fromkeys(key for entry in entries for key in entry.values))
-    runs = tuple(
-        SeriesRun(
-            entry.step,
-            entry.is_reference,
-            {key: short_value(value) for key, value in entry.values.items()},
-            entry.figures,
-            entry.result,
-            entry.recording,
-            digests.get(entry.recording),
-        )
-        for entry in entries
-    )
-    return RunSeries(name, runs, keys, tuple(missing), is_campaign=True)
+    keys = tuple(dict.fromkeys(key for run in runs for key in run.values))
+    return RunSeries(name, tuple(runs), keys, tuple(missing), is_campaign=True)
 
 
 def _digest(path: Path, model: HysteresisModel | None) -> RunDigest:
     if path.is_file() and path.stat().st_size > MOST_BYTES:
         raise DataError(
-            f"{path}: is larger than {MOST_BYTES >> 20} MB, too long for a page of many runs: "
-            f"'hilctl report {path}' makes one of its own, in little memory"
+            f"{path}: is larger than {MOST_BYTES >> 20} MB, the limit of a page of many runs. "
+            f"Use 'hilctl report {path}'"
         )
     return digest_of(read(path), model)
 
 
 def _of_campaign(table: Path, model: HysteresisModel | None, on_read: OnRead) -> RunSeries:
-    entries = read_entries(table)
-    named = [entry for entry in entries if entry.recording and entry.result == COMPLETED]
-    digests, missing = {}, []
-    for number, entry in enumerate(named):
-        on_read(number / len(named), f"read {entry.recording}")
-        # A name in the table must not lead elsewhere.
-        path = table.parent / Path(entry.recording).name
-        try:
-            digests[entry.recording] = _digest(path, model)
-        except DataError as error:
-            missing.append(str(error))
-    return series_of(table.stem, entries, digests, missing)
+    runs, missing = read_entries(table), []
+    for number, run in enumerate(runs):
+        if run.recording and run.completed:
+            on_read(number / len(runs), f"read {run.recording}")
+            # A name in the table must not refer to another folder.
+            path = table.parent / Path(run.recording).name
+            try:
+                runs[number] = replace(run, digest=_digest(path, model))
+            except DataError as error:
+                missing.append(str(error))
+    return series_of(table.stem, runs, missing)
 
 
 def _of_files(
@@ -204,7 +279,7 @@ def _of_files(
     on_read: OnRead,
     missing: list[str] | None,
 ) -> RunSeries:
-    """Read files; one that can't be read is left out where ``missing`` is a list."""
+    """Read files; add those that can't be read to ``missing``, if it is a list."""
     digests = []
     for number, path in enumerate(paths):
         on_read(number / len(paths), f"read {path.name}")
@@ -232,5 +307,5 @@ def _of_files(
 
 def _result(digest: RunDigest) -> str:
     if digest.code in {"", COMPLETED}:
-        return COMPLETED if digest.code else "cut short: its end was not recorded"
+        return COMPLETED if digest.code else "truncated: no end was recorded"
     return f"{digest.code}: {digest.reason}"

@@ -1,7 +1,7 @@
-"""What one run gives to figures of many: some kilobytes, however long the run was."""
+"""Metrics of one run, and its data for figures; drift of reference runs."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields
 from typing import Any, TypeGuard
 
 import numpy as np
@@ -9,23 +9,221 @@ from pydantic import TypeAdapter, ValidationError
 
 from hilctl.analysis.plot_style import min_max
 from hilctl.analysis.report import judge as judge_segment
-from hilctl.analysis.report import worst_segment
+from hilctl.analysis.report import summarize, worst_segment
 from hilctl.analysis.steady_state import steady_part
 from hilctl.base.errors import ConfigError, DataError, InputError, ModelError
+from hilctl.base.events import OFFSET
+from hilctl.base.samples import Samples
 from hilctl.base.segments import Segment
 from hilctl.base.types import F64
 from hilctl.base.yaml import Document
+from hilctl.identify.data.cycles import loops_from_recording
+from hilctl.identify.evaluation import judge
 from hilctl.models.base import HysteresisModel
 from hilctl.models.model_file import parse_model
-from hilctl.recording.metadata_keys import LabelValue
+from hilctl.recording.metadata_keys import HEAT_FACT, LabelValue
 from hilctl.recording.recording import Recording
-from hilctl.studies.characterise.response import SmallSignal
-from hilctl.studies.multi_run.ringdown import Ringing
-from hilctl.studies.multi_run.run_figures import RunFigures, after_step, figures_with, structure_of
+from hilctl.studies.characterise.response import RigProblemError, SmallSignal, small_signal
+from hilctl.studies.multi_run.minor_loops import minor_loops
+from hilctl.studies.multi_run.ringdown import Ringing, ringing
 from hilctl.waveforms.spec import AnyWaveform, Multisine, Step
 
+
+@dataclass(frozen=True, slots=True)
+class RunFigures:
+    """Metrics of one run; None for those that do not apply.
+
+    Attributes:
+        peak_hysteresis_percent: Peak hysteresis, of the segment with the largest.
+        peak_error_percent: Largest error (displacement minus reference), of the peak-to-peak.
+        rms_error_percent: rms error, of the peak-to-peak.
+        loop_area: Area of the loop, in um times the unit of its input.
+        peak_to_peak_um: Peak-to-peak displacement.
+        low_um: Lowest displacement of the average cycle.
+        high_um: Highest displacement of the average cycle.
+        mean_um: Mean displacement of the average cycle.
+        offset_um: Offset measured at rest and subtracted.
+        minor_low_um: Peak-to-peak displacement of the minor loops at the lowest input.
+        minor_high_um: The same of those at the highest input.
+        minor_low_percent: Peak hysteresis of the minor loops at the lowest input, of their own
+            peak-to-peak.
+        minor_high_percent: The same of those at the highest input.
+        natural_hz: Natural frequency, from the ringing after a step or a multisine's response.
+        damping_ratio: Its damping ratio.
+        deadline_misses: Skipped ticks.
+        heat_before_a: Running rms of the coil current before the run, in A.
+        heat_after_a: The same after the run.
+    """
+
+    peak_hysteresis_percent: float | None = None
+    peak_error_percent: float | None = None
+    rms_error_percent: float | None = None
+    loop_area: float | None = None
+    peak_to_peak_um: float | None = None
+    low_um: float | None = None
+    high_um: float | None = None
+    mean_um: float | None = None
+    offset_um: float | None = None
+    minor_low_um: float | None = None
+    minor_high_um: float | None = None
+    minor_low_percent: float | None = None
+    minor_high_percent: float | None = None
+    natural_hz: float | None = None
+    damping_ratio: float | None = None
+    deadline_misses: int | None = None
+    heat_before_a: float | None = None
+    heat_after_a: float | None = None
+
+
+FIGURES = tuple(field.name for field in fields(RunFigures))
+
+
+def figures_of(recording: Recording, structure: SmallSignal | Ringing | None) -> RunFigures:
+    """Return the metrics of a run.
+
+    Args:
+        recording: The run.
+        structure: Its natural frequency and damping; see :func:`structure_of`.
+
+    Raises:
+        DataError: A metadata value is not a number.
+    """
+    report = summarize(recording)
+    loops = not isinstance(structure, SmallSignal)  # a multisine has no loop
+    worst = recording.segments[worst_segment(report.segments)] if recording.segments else None
+    measured = [event.values.get("offset_um") for event in recording.events if event.code == OFFSET]
+    return RunFigures(
+        peak_hysteresis_percent=report.peak_hysteresis_percent if loops else None,
+        peak_error_percent=report.peak_error_percent,
+        rms_error_percent=report.rms_error_percent,
+        loop_area=report.loop_area if loops else None,
+        peak_to_peak_um=report.peak_to_peak_um,
+        **(_cycle_figures(recording, worst, minor=loops) if worst else {}),
+        offset_um=measured[0] if measured else None,
+        natural_hz=structure.natural_hz if structure else None,
+        damping_ratio=structure.damping_ratio if structure else None,
+        deadline_misses=report.skipped_ticks,
+        heat_before_a=_rms_a(recording.run.get(HEAT_FACT)),
+        heat_after_a=_rms_a(recording.end.get(HEAT_FACT)),
+    )
+
+
+def _rms_a(heat: str | None) -> float | None:
+    return None if heat is None else float(np.sqrt(float(heat)))
+
+
+def _cycle_figures(recording: Recording, segment: Segment, *, minor: bool) -> dict[str, float]:
+    part = steady_part(recording, segment)
+    if part.cycle is None or not part.loop.size:
+        return {}
+    loop_input, output = part.loop
+    found = {
+        "low_um": float(output.min()),
+        "high_um": float(output.max()),
+        "mean_um": float(output.mean()),
+    }
+    return found | _minor(loop_input, output) if minor else found
+
+
+def _minor(loop_input: F64, output: F64) -> dict[str, float]:
+    """Return averages over the minor loops in the lower and in the upper half of the input."""
+    middle = 0.5 * float(loop_input.min() + loop_input.max())
+    loops = minor_loops(loop_input, output)
+    found = {}
+    for name, side in (
+        ("low", [loop for loop in loops if loop.middle < middle]),
+        ("high", [loop for loop in loops if loop.middle > middle]),
+    ):
+        if side:
+            found[f"minor_{name}_um"] = float(np.mean([loop.peak_to_peak_um for loop in side]))
+            percents = [loop.peak_hysteresis_percent for loop in side]
+            found[f"minor_{name}_percent"] = float(np.mean(percents))
+    return found
+
+
+def structure_of(recording: Recording, waveform: Any) -> SmallSignal | Ringing | None:
+    """Return natural frequency and damping, if the waveform is a multisine or a step.
+
+    Args:
+        recording: The run.
+        waveform: Waveform of its experiment.
+    """
+    if isinstance(waveform, Multisine):
+        try:
+            return small_signal(recording)
+        except RigProblemError:  # below the noise
+            return None
+    return _ringing(recording, waveform) if isinstance(waveform, Step) else None
+
+
+def _ringing(recording: Recording, waveform: Step) -> Ringing | None:
+    samples = after_step(recording, waveform)
+    whole = samples.index.size and np.isfinite(samples.displacement_um).all()
+    return ringing(samples.displacement_um, recording.sample_rate_hz) if whole else None
+
+
+def after_step(recording: Recording, waveform: Step) -> Samples:
+    """Return the samples from the end of the largest step to the next step."""
+    segment, rate_hz = recording.segments[0], recording.sample_rate_hz
+    levels = np.array([0.0, *waveform.levels])
+    largest = int(np.argmax(np.abs(np.diff(levels))))
+    dwell = round(waveform.dwell_s * rate_hz)
+    begin = segment.start + largest * dwell + round(waveform.rise_s * rate_hz) + 1
+    return recording.samples.part(begin, segment.start + (largest + 1) * dwell)
+
+
+@dataclass(frozen=True, slots=True)
+class SeriesDrift:
+    """Largest change of the reference runs from the first of them, with its sign.
+
+    Attributes:
+        runs: Number of completed reference runs.
+        peak_to_peak_percent: Change of the peak-to-peak displacement, in percent of it.
+        mean_um: Change of the mean displacement, in um.
+        peak_hysteresis_percent: Change of the peak hysteresis, in points of percent.
+    """
+
+    runs: int
+    peak_to_peak_percent: float | None
+    mean_um: float | None
+    peak_hysteresis_percent: float | None
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return the fields as plain values."""
+        return asdict(self)
+
+    def __str__(self) -> str:
+        parts = [
+            (self.peak_to_peak_percent, "{:+.3g} % in peak-to-peak"),
+            (self.mean_um, "{:+.3g} µm in mean"),
+            (self.peak_hysteresis_percent, "{:+.3g} points of hysteresis"),
+        ]
+        known = ", ".join(text.format(value) for value, text in parts if value is not None)
+        return f"drift over {self.runs} reference runs: {known or 'no metrics'}"
+
+
+def drift_of(done: Sequence[RunFigures]) -> SeriesDrift | None:
+    """Return the drift; None with fewer than two reference runs.
+
+    Args:
+        done: Metrics of the completed reference runs, in their order.
+    """
+    if len(done) < 2:
+        return None
+
+    def largest(name: str) -> float | None:
+        values: list[float] = [getattr(each, name) for each in done]
+        if None in values:
+            return None
+        return max((value - values[0] for value in values[1:]), key=abs)
+
+    stroke, first = largest("peak_to_peak_um"), done[0].peak_to_peak_um
+    percent = 100.0 * stroke / first if stroke is not None and first else None
+    return SeriesDrift(len(done), percent, largest("mean_um"), largest("peak_hysteresis_percent"))
+
+
 POINTS = 300
-"""Points of a loop: what figures of dissertations and journals are drawn with."""
+"""Points per loop."""
 
 _STEP_POINTS = 800
 _STEP_CYCLES = 12.0  # of the ringing
@@ -34,30 +232,30 @@ _NO_LOOP = np.empty((2, 0))
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunDigest:
-    """One run among many.
+    """Data of one run, a few kilobytes for a run of any length.
 
     Attributes:
         name: Name of the experiment.
         path: File of the recording.
         started: When it began, ISO 8601.
-        labels: What it is found by.
+        labels: Its labels.
         device: Name of the device.
-        simulated: Whether that is a simulation.
-        code: How it ended: ``completed``, ``stopped``, ``fault``; empty where that is not recorded.
-        reason: Why.
+        simulated: Whether the device is simulated.
+        code: ``completed``, ``stopped`` or ``fault``; empty if no end was recorded.
+        reason: Why it ended.
         values: Its experiment as plain values, nested as in the file.
-        compensated: Whether a compensator stood before the actuator.
+        compensated: Whether a compensator was used.
         command_unit: ``A`` or ``V``.
-        waveform: What ran, for people, in the segment that is judged.
-        figures: Figures of the run.
-        loop: float64[2, m], the loop that is judged, input and displacement, closed; see
-            :class:`hilctl.analysis.steady_state.SteadyPart`. Empty where nothing repeats.
-        error_um: float64[2, m], phase in cycles and displacement less reference; empty without.
-        modelled: float64[3, m], command, displacement and what the model makes of it, in um, over
-            one cycle; empty without a model.
-        model_error_percent: Largest of their difference, of the peak-to-peak; None without.
-        step: float64[2, k], time in s and displacement in um after the largest step; empty without.
-        response: Small-signal response; None without one.
+        waveform: Label of the evaluated segment.
+        figures: Metrics of the run.
+        loop: float64[2, m], input and displacement of the evaluated loop, closed; see
+            :class:`hilctl.analysis.steady_state.SteadyPart`. Empty without a cycle.
+        error_um: float64[2, m], phase in cycles and error in um; empty without a reference.
+        modelled: float64[3, m], command, measured and modelled displacement over one cycle; empty
+            without a model.
+        model_error_percent: Largest model error, of the peak-to-peak; None without a model.
+        step: float64[2, k], time in s and displacement in um after the largest step, or empty.
+        response: Small-signal response, or None.
     """
 
     name: str
@@ -82,19 +280,19 @@ class RunDigest:
 
     @property
     def is_plain_loop(self) -> bool:
-        """Whether it shows the loop of the actuator itself: nothing compensated it."""
+        """Whether it has a loop of the actuator without a compensator."""
         return bool(self.loop.size) and not self.compensated
 
 
 def digest_of(recording: Recording, model: HysteresisModel | None = None) -> RunDigest:
-    """Take from a recording what figures of many runs need.
+    """Return the digest of a recording.
 
     Args:
         recording: The run.
-        model: Model to hold against what was measured; the recorded one where None.
+        model: Model to compare with the measurement; the recorded one if None.
 
     Raises:
-        DataError: A fact of it is no number.
+        DataError: A metadata value is not a number.
     """
     values = _experiment(recording)
     waveform = _waveform(values)
@@ -113,7 +311,7 @@ def digest_of(recording: Recording, model: HysteresisModel | None = None) -> Run
         compensated=recording.compensated,
         command_unit=recording.command_unit,
         waveform=segment.label if segment else "",
-        figures=figures_with(recording, structure),
+        figures=figures_of(recording, structure),
         **(_of_cycle(recording, segment, model) if _is_loop(segment, waveform) else {}),
         step=_after_step(recording, waveform, structure),
         response=structure if isinstance(structure, SmallSignal) else None,
@@ -123,7 +321,7 @@ def digest_of(recording: Recording, model: HysteresisModel | None = None) -> Run
 def _experiment(recording: Recording) -> Mapping[str, Any]:
     try:
         data = Document(f"{recording.path}: experiment.yaml", recording.experiment_yaml).data
-    except InputError:  # of another version, or damaged: figures need no settings
+    except InputError:  # of another version, or damaged
         return {}
     return data if isinstance(data, dict) else {}
 
@@ -143,7 +341,7 @@ def _worst(recording: Recording) -> Segment | None:
 
 
 def _is_loop(segment: Segment | None, waveform: Any) -> TypeGuard[Segment]:
-    """Return whether displacement against input is a loop: of many sines at once it is a tangle."""
+    """Return whether displacement against input is a loop; for a multisine it is not."""
     return segment is not None and not isinstance(waveform, Multisine)
 
 
@@ -169,10 +367,7 @@ def _cycle(recording: Recording, segment: Segment) -> dict[str, Any]:
 def _modelled(
     recording: Recording, segment: Segment, model: HysteresisModel | None
 ) -> dict[str, Any]:
-    """Return the measured cycle beside what a model makes of its command."""
-    from hilctl.identify.data.cycles import loops_from_recording
-    from hilctl.identify.evaluation import judge
-
+    """Return the measured and the modelled cycle."""
     if model is None and not recording.model_yaml:
         return {}
     try:
@@ -181,7 +376,7 @@ def _modelled(
             return {}
         loop = loops_from_recording(recording, POINTS, [segment.label])[-1]
         found = judge(known, [loop])
-    except (DataError, ConfigError, ModelError):  # no cycle, or a model that can't be read
+    except (DataError, ConfigError, ModelError):  # no cycle, or an unreadable model
         return {}
     modelled = np.array((loop.command, loop.displacement_um, found.modelled_um[0]))
     return {
@@ -200,7 +395,7 @@ def _after_step(
         return _NO_LOOP.copy()
     t = (samples.index - samples.index[0]) / recording.sample_rate_hz
     if structure is not None and structure.natural_hz is not None:
-        # So few cycles that every so-manieth sample draws them: highs and lows would be a zigzag.
+        # Few cycles: decimate, because minima and maxima would form a zigzag.
         part = t <= _STEP_CYCLES / structure.natural_hz
         step = max(1, int(np.count_nonzero(part)) // _STEP_POINTS)
         return np.array((t[part][::step], samples.displacement_um[part][::step]))

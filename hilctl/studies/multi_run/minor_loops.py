@@ -1,7 +1,7 @@
-"""The minor loops of an average cycle: pure functions of arrays.
+"""Minor loops of an average cycle.
 
-Where the input turns back within what it has gone through before, and comes by the turn again, the
-stretch between is a minor loop. They are found as rain-flow counting finds closed cycles.
+A minor loop starts where the input reverses within its earlier range, and ends where the input
+returns to that reversal. The algorithm is rain-flow counting of closed cycles.
 """
 
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ import numpy as np
 from hilctl.base.types import F64
 from hilctl.signals import cycle_metrics
 
-_LEAST = 0.01  # of the input's span: smaller turns are noise of a measured input
+_LEAST = 0.01  # of the input's span: smaller reversals are noise
 _GRID = 200
 _FEWEST = 8
 
@@ -21,10 +21,10 @@ class MinorLoop:
     """One minor loop.
 
     Attributes:
-        middle: Middle of its input, in the input's unit.
+        middle: Mid-range of its input, in the input's unit.
         span: Peak-to-peak input.
         peak_to_peak_um: Peak-to-peak displacement.
-        peak_hysteresis_percent: Largest distance of its two branches, of its peak-to-peak.
+        peak_hysteresis_percent: Largest distance between its branches, of its peak-to-peak.
     """
 
     middle: float
@@ -34,7 +34,7 @@ class MinorLoop:
 
 
 def minor_loops(loop_input: F64, output_um: F64) -> tuple[MinorLoop, ...]:
-    """Return the minor loops of a cycle, by the middle of their input.
+    """Return the minor loops of a cycle, sorted by mid-range input.
 
     Args:
         loop_input: float64[m], one cycle in order of phase.
@@ -46,7 +46,7 @@ def minor_loops(loop_input: F64, output_um: F64) -> tuple[MinorLoop, ...]:
 
 
 def minor_parts(loop_input: F64, output_um: F64) -> list[F64]:
-    """Return the stretches of a cycle that are minor loops: float64[2, k] each.
+    """Return the input and displacement of each minor loop: float64[2, k] each.
 
     Args:
         loop_input: float64[m], one cycle in order of phase.
@@ -57,7 +57,7 @@ def minor_parts(loop_input: F64, output_um: F64) -> list[F64]:
 
 
 def _found(loop_input: F64, output_um: F64) -> tuple[F64, F64, list[tuple[int, int, int]]]:
-    """Return a cycle from its highest input on, and its minor loops as :func:`_closed` does."""
+    """Return a cycle that starts at its highest input, and its minor loops; see :func:`_closed`."""
     span = float(np.ptp(loop_input))
     if loop_input.size < _FEWEST or span <= 0.0:
         return loop_input, output_um, []
@@ -68,7 +68,7 @@ def _found(loop_input: F64, output_um: F64) -> tuple[F64, F64, list[tuple[int, i
 
 
 def _turns(u: F64, least: float) -> list[int]:
-    """Return where an input turns by more than ``least``, its ends included."""
+    """Return the indices of reversals by more than ``least``, including both ends."""
     turns, candidate, direction = [0], 0, -1.0
     for k in range(1, u.size):
         if direction * (u[k] - u[candidate]) >= 0.0:
@@ -81,9 +81,9 @@ def _turns(u: F64, least: float) -> list[int]:
 
 
 def _closed(u: F64, turns: list[int]) -> list[tuple[int, int, int]]:
-    """Return the minor loops: where each begins, turns, and is over, as the input comes by again.
+    """Return the start, turning point and end of each minor loop.
 
-    The cycle begins and ends at its highest input, so that all loops within close.
+    The cycle starts and ends at its highest input, so that all minor loops are closed.
     """
     found = []
     stack: list[int] = []
@@ -101,7 +101,7 @@ def _closed(u: F64, turns: list[int]) -> list[tuple[int, int, int]]:
 
 
 def _comes_by(u: F64, start: int, stop: int, level: float) -> int:
-    """Return the first place from ``start`` on where an input has reached a level again."""
+    """Return the first index from ``start`` where the input reaches a level again."""
     sign = 1.0 if level >= u[start] else -1.0
     reached = np.flatnonzero(sign * (u[start : stop + 1] - level) >= 0.0)
     return start + int(reached[0]) if reached.size else stop
@@ -115,7 +115,7 @@ def _minor_loop(u: F64, y: F64, begin: int, turn: int, over: int) -> MinorLoop:
     for part in (there, back):
         order = np.argsort(u[part], kind="stable")
         branches.append(np.interp(grid, u[part][order], y[part][order]))
-    whole = cycle_metrics.peak_to_peak(y[begin:over])  # at its end it has gone by already
+    whole = cycle_metrics.peak_to_peak(y[begin:over])  # its end is past the closing point
     gap = float(np.max(np.abs(branches[0] - branches[1])))
     percent = cycle_metrics.percent(gap, whole) or 0.0
     return MinorLoop(0.5 * (low + high), high - low, whole, percent)

@@ -1,4 +1,4 @@
-"""Write the page of many runs, and their result for programs."""
+"""HTML page and JSON of many runs."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator
@@ -8,10 +8,9 @@ from typing import Any
 
 from hilctl.analysis import html
 from hilctl.analysis.html import definitions_of
-from hilctl.base.formatting import quantity, unit_text
+from hilctl.base.formatting import quantity
 from hilctl.studies.multi_run.collect import RunSeries, SeriesRun
 from hilctl.studies.multi_run.plots import sheets_of
-from hilctl.studies.multi_run.summary_text import headline
 from hilctl.studies.multi_run.trend import (
     AREA,
     ASYMMETRY,
@@ -22,22 +21,23 @@ from hilctl.studies.multi_run.trend import (
     PEAK_ERROR,
     RMS_ERROR,
     STROKE,
-    RunFigure,
     Trend,
+    axis_name,
+    headline,
     trends,
 )
 
 MOST_ROWS = 1000
-"""Rows of the table on a page: more are in the campaign's table."""
+"""Most rows of the table on a page."""
 
 _COLUMNS = (STROKE, HYSTERESIS, AREA, PEAK_ERROR, RMS_ERROR, MODEL_ERROR, NATURAL, DAMPING)
 
 
 def write_series(series: RunSeries, path: Path) -> None:
-    """Write the page; one of that name is replaced, as a whole or not at all.
+    """Write the page atomically, replacing an existing file.
 
     Raises:
-        InputError: It can't be written.
+        InputError: The file can't be written.
     """
     html.write_page(series_page(series), path)
 
@@ -53,13 +53,13 @@ def series_page(series: RunSeries) -> str:
         *(html.paragraph(f"Not read: {problem}", "bad") for problem in series.missing),
         *(html.paragraph(f"{series.text(run)}: {run.result}", "bad") for run in series.failed),
         *_simulated(series),
-        html.figures(sheets) if sheets else html.paragraph("No completed run holds a figure."),
+        html.figures(sheets) if sheets else html.paragraph("No figure applies to these runs."),
         *_trends(series),
         "<h2>Runs</h2>",
         html.grid(*run_table(series, MOST_ROWS), "numbers"),
         *_left_out(series),
         *_made_of(series),
-        html.definitions("What the figures mean", _terms(series)),
+        html.definitions("Definitions", _terms(series)),
     ]
     return html.document(html.text(series.name), filter(None, body))
 
@@ -74,16 +74,16 @@ def _simulated(series: RunSeries) -> Iterator[str]:
 def run_table(
     series: RunSeries, most: int, *, short: bool = False
 ) -> tuple[list[str], list[list[str]]]:
-    """Return headings and rows of a table of runs, without columns that are empty.
+    """Return headings and rows of a table of runs, without empty columns.
 
     Args:
         series: The runs.
         most: Most rows.
-        short: For a terminal: short headings, and no names of files.
+        short: Whether to use short headings and omit file names, for a terminal.
     """
     figures = [each for each in _COLUMNS if each.of(series.runs)]
     headings = ["run", *(each.axis for each in series.dimensions)]
-    headings += [each.short if short else _heading(series, each) for each in figures]
+    headings += [each.short if short else axis_name(series, each) for each in figures]
     last = _last(series, short=short)
     rows = [
         [
@@ -97,16 +97,8 @@ def run_table(
     return [*headings, *last], rows
 
 
-def _heading(series: RunSeries, figure: RunFigure) -> str:
-    unit = unit_text(figure.unit)
-    if figure is AREA:
-        units = {run.digest.command_unit for run in series.runs if run.digest is not None}
-        unit = f"µm·{units.pop()}" if len(units) == 1 else ""
-    return f"{figure.text}, {unit}" if unit else figure.text
-
-
 def _last(series: RunSeries, *, short: bool) -> dict[str, Callable[[SeriesRun], str]]:
-    """Return the last columns, by their headings."""
+    """Return the last columns by their headings."""
     found: dict[str, Callable[[SeriesRun], str]] = {}
     if not short or series.failed or series.planned:
         found["result"] = lambda run: run.result
@@ -130,7 +122,9 @@ def _shown(run: SeriesRun, key: str) -> str:
 
 def _left_out(series: RunSeries) -> Iterator[str]:
     if len(series.runs) > MOST_ROWS:
-        yield html.paragraph(f"{len(series.runs) - MOST_ROWS} more are in the campaign's table.")
+        yield html.paragraph(
+            f"{len(series.runs) - MOST_ROWS} more runs are in the campaign's table."
+        )
 
 
 def _trends(series: RunSeries) -> Iterator[str]:
@@ -154,7 +148,7 @@ def _trends(series: RunSeries) -> Iterator[str]:
 
 
 def fitted_trends(series: RunSeries) -> Iterator[Trend]:
-    """Yield the trends of loops along frequencies, as far as nothing compensated them."""
+    """Yield the trends of uncompensated loops against frequency."""
     plain = [run for run in series.done if run.digest is None or run.digest.is_plain_loop]
     for along in series.dimensions:
         if along.is_frequency:
@@ -163,13 +157,13 @@ def fitted_trends(series: RunSeries) -> Iterator[Trend]:
 
 
 def held_text(series: RunSeries, trend: Trend) -> str:
-    """Return what was held along a trend, for people."""
+    """Return the constant parameters of a trend."""
     known = [each for each in series.dimensions if trend.held.get(each.key) is not None]
     return ", ".join(each.text(trend.held[each.key]) for each in known)
 
 
 def _made_of(series: RunSeries) -> Iterator[str]:
-    """Yield what all runs have in common: device, dates, labels."""
+    """Yield devices, dates and labels of all runs."""
     digests = [run.digest for run in series.runs if run.digest is not None]
     if not digests:
         return
@@ -182,7 +176,7 @@ def _made_of(series: RunSeries) -> Iterator[str]:
             for key in dict.fromkeys(key for digest in digests for key in digest.labels)
         ),
     ]
-    yield html.rows("Made with", rows)
+    yield html.rows("Provenance", rows)
 
 
 def _several(texts: Iterable[str]) -> str:
@@ -201,7 +195,7 @@ def _terms(series: RunSeries) -> list[tuple[str, str]]:
 
 
 def series_mapping(series: RunSeries) -> dict[str, Any]:
-    """Return plain values for JSON; a number that is not finite becomes None."""
+    """Return plain values for JSON; numbers that are not finite become None."""
     return {
         "name": series.name,
         "headline": " ".join(headline(series)),

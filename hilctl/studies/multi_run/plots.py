@@ -1,126 +1,281 @@
-"""Select the figures of many runs; draw the step and frequency responses."""
+"""Figures of trends, sensitivity and drift; selection and files of all figures."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
+from textwrap import wrap
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from hilctl.analysis.figure_layout import ColumnWidth, FigureSpec, Panel, drawn, write_figure
-from hilctl.analysis.plot_style import QUIET
+from hilctl.analysis.plot_style import COMMAND, DISPLACEMENT, ERROR, MARK, QUIET
 from hilctl.base.errors import InputError
 from hilctl.base.files import already_there
-from hilctl.base.formatting import quantity, significant
-from hilctl.base.types import C128, F64
-from hilctl.studies.multi_run import plots_loops, plots_trend
+from hilctl.base.formatting import unit_text
 from hilctl.studies.multi_run.collect import OnRead, RunSeries, SeriesRun
-from hilctl.studies.multi_run.series_style import line_of, looks, spread
+from hilctl.studies.multi_run.run_plots import (
+    before_after_sheet,
+    error_sheet,
+    frequency_sheet,
+    looks,
+    loop_sheets,
+    minor_loop_sheet,
+    model_sheet,
+    spread,
+    step_sheet,
+)
+from hilctl.studies.multi_run.trend import (
+    AREA,
+    ASYMMETRY,
+    DAMPING,
+    HYSTERESIS,
+    MINOR_HIGH,
+    MINOR_LOW,
+    MODEL_ERROR,
+    NATURAL,
+    PEAK_ERROR,
+    RMS_ERROR,
+    STROKE,
+    RunFigure,
+    Trend,
+    axis_name,
+    trends,
+)
 from hilctl.studies.multi_run.varied_parameter import VariedParameter
+
+_WIDE_RATIO = 30.0  # of a range that needs a logarithmic axis
+_MANY = 10
+_HEADROOM = 1.08
+_LONGEST_NAME = 24
+_MOST_LINES = 9
+_FITTED = (AREA, HYSTERESIS, MINOR_LOW, MINOR_HIGH)
+_FIT = {"color": QUIET, "linewidth": 0.7, "linestyle": "--"}
+_MOST_BARS = 12
+
+
+def trend_sheets(series: RunSeries) -> Iterator[FigureSpec]:
+    """Yield metrics against each numeric parameter, with linear fits against frequency.
+
+    Stroke and area are plotted for runs without a compensator: with one, they follow the reference.
+    """
+    plain = [run for run in series.done if run.digest is None or run.digest.is_plain_loop]
+    for along in series.dimensions:
+        if not along.numeric:
+            continue
+        name = along.name.replace(" ", "_")
+        shown = [STROKE, AREA, HYSTERESIS, *([ASYMMETRY] if along.name == "amplitude" else [])]
+        panels = _trend_panels(series, along, shown, plain, fitted=along.is_frequency)
+        if panels:
+            fits = "; dashed: linear fits" if along.is_frequency else ""
+            caption = f"Stroke, area and peak hysteresis of the loops against {along.name}{fits}."
+            yield FigureSpec(f"hysteresis_against_{name}", caption, panels)
+        minor = _trend_panels(
+            series, along, [MINOR_LOW, MINOR_HIGH], plain, fitted=along.is_frequency
+        )
+        if minor:
+            caption = f"Peak hysteresis of minor loops against {along.name}."
+            yield FigureSpec(f"minor_loops_against_{name}", caption, minor)
+        left = _trend_panels(series, along, _compared(series), None)
+        if left and any(run.digest and run.digest.compensated for run in series.done):
+            caption = f"Residual errors of compensators and models against {along.name}."
+            yield FigureSpec(f"compensation_against_{name}", caption, left)
+
+
+def _compared(series: RunSeries) -> list[RunFigure]:
+    modelled = [MODEL_ERROR] if MODEL_ERROR.of(series.done) else []
+    return [HYSTERESIS, PEAK_ERROR, RMS_ERROR, *modelled]
+
+
+def _trend_panels(
+    series: RunSeries,
+    along: VariedParameter,
+    figures: Sequence[RunFigure],
+    runs: Sequence[SeriesRun] | None,
+    *,
+    fitted: bool = False,
+) -> tuple[Panel, ...]:
+    drawn = [(figure, trends(series, figure, along, runs)) for figure in figures]
+    return tuple(
+        Panel(partial(draw_trends, series=series, found=found, fitted=fitted))
+        for figure, found in drawn
+        if found
+    )
+
+
+def draw_trends(axes: Axes, series: RunSeries, found: Sequence[Trend], *, fitted: bool) -> None:
+    """Plot the trends of one metric, one line per combination of the other parameters.
+
+    Args:
+        axes: Axes to plot in.
+        series: The runs.
+        found: The trends.
+        fitted: Whether to plot linear fits.
+    """
+    along, figure = found[0].along, found[0].figure
+    found = spread(found, _MOST_LINES)
+    others = [each for each in series.dimensions if each is not along]
+    apart = (e for e in others if len({t.held.get(e.key) for t in found}) == len(found))
+    first = next(apart, None)  # a parameter that distinguishes all lines
+    names = [_held(others, trend) or figure.text for trend in found]
+    look = _looks(first, found)
+    logarithmic = _is_logarithmic(along)
+    fitted = fitted and not logarithmic and figure in _FITTED
+    for trend, name, style in zip(found, names, look, strict=True):
+        with_fit = fitted and trend.slope is not None
+        line = {"linestyle": "none"} if with_fit else {"linewidth": 0.8}
+        axes.plot(trend.x, trend.y, **style, **line, label=name)
+        if with_fit and trend.slope is not None and trend.offset is not None:
+            ends = trend.x[[0, -1]]
+            axes.plot(ends, trend.slope * ends + trend.offset, **{**_FIT, "color": style["color"]})
+    r2 = [trend.r2 for trend in found if trend.r2 is not None]
+    if fitted and r2:
+        texts = dict.fromkeys(f"{value:.4f}" for value in (min(r2), max(r2)))
+        span = " to ".join(texts)
+        axes.annotate(f"r² = {span}", (0.03, 0.97), xycoords="axes fraction", va="top",
+                      fontsize=7, color=QUIET)  # fmt: skip
+    if logarithmic:
+        axes.set_xscale("log")
+        axes.xaxis.set_major_formatter("{x:g}")
+    name = "\n".join(wrap(axis_name(series, figure), _LONGEST_NAME))
+    axes.set(xlabel=along.axis, ylabel=name)
+    everything = np.concatenate([trend.y for trend in found])
+    low, high = float(everything.min()), float(everything.max())
+    if low >= 0.0 and high > 0.0:
+        axes.set_ylim(0.0, _HEADROOM * high)
+
+
+def _is_logarithmic(along: VariedParameter) -> bool:
+    numbers = [float(str(value)) for value in along.values]
+    many = len(numbers) > _MANY
+    return many and numbers[0] > 0.0 and numbers[-1] / numbers[0] > _WIDE_RATIO
+
+
+def _looks(first: VariedParameter | None, found: Sequence[Trend]) -> list[dict[str, Any]]:
+    if first is None:
+        of = looks(None, list(range(len(found))))
+        return [dict(of[k]) for k in range(len(found))]
+    of = looks(first, first.values)  # of all values, for the same colours in every panel
+    return [dict(of[trend.held[first.key]]) for trend in found]
+
+
+def _held(others: Sequence[VariedParameter], trend: Trend) -> str:
+    texts = [e.text(trend.held[e.key]) for e in others if trend.held.get(e.key) is not None]
+    return ", ".join(texts)
+
+
+def resonance_sheet(series: RunSeries) -> FigureSpec | None:
+    """Return natural frequency and damping against a parameter; None without any."""
+    for along in series.dimensions:
+        found = trends(series, NATURAL, along) if along.numeric else []
+        if found:
+            panels = _trend_panels(series, along, [NATURAL, DAMPING], None)
+            caption = f"Natural frequency and damping against {along.name}."
+            return FigureSpec("resonance", caption, panels)
+    return None
+
+
+def sensitivity_sheet(series: RunSeries) -> FigureSpec | None:
+    """Return the sensitivity of metrics to each parameter; None with fewer than two parameters.
+
+    Sensitivity is the change of the mean over all other parameters, in percent of the total mean.
+    """
+    numbers = [each for each in series.dimensions if len(each.values) > 1]
+    plain = [run for run in series.done if run.digest is None or run.digest.is_plain_loop]
+    figures = (STROKE, HYSTERESIS, AREA) if len(plain) > 1 else (HYSTERESIS, PEAK_ERROR, RMS_ERROR)
+    runs = plain if len(plain) > 1 else list(series.done)
+    found = [(figure, _changes(figure, numbers, runs)) for figure in figures]
+    panels = tuple(
+        Panel(partial(_draw_bars, bars=bars), figure.text, 0.12 + 0.09 * len(bars))
+        for figure, bars in found
+        if len(bars) > 1
+    )
+    if not panels:
+        return None
+    caption = (
+        "Sensitivity: change of each metric over the range of a parameter, averaged over the "
+        "others, in percent of its mean."
+    )
+    return FigureSpec("sensitivity", caption, panels, most_beside=1)
+
+
+def _changes(
+    figure: RunFigure, dimensions: Sequence[VariedParameter], runs: Sequence[SeriesRun]
+) -> list[tuple[str, float]]:
+    values = figure.of(runs)
+    whole = float(np.mean([value for _, value in values])) if values else 0.0
+    found = []
+    for each in dimensions:
+        by: dict[Hashable, list[float]] = {}
+        for run, value in values:
+            by.setdefault(run.values.get(each.key), []).append(value)
+        if len(by) > 1 and whole > 0.0:
+            means = [float(np.mean(members)) for members in by.values()]
+            low, high = each.text(each.values[0]), each.text(each.values[-1])
+            found.append((f"{each.name}\n{low} to {high}", 100.0 * float(np.ptp(means)) / whole))
+    return sorted(found, key=lambda bar: bar[1])[-_MOST_BARS:]
+
+
+def _draw_bars(axes: Axes, bars: Sequence[tuple[str, float]]) -> None:
+    axes.barh(
+        [name for name, _ in bars], [size for _, size in bars], color=DISPLACEMENT, height=0.6
+    )
+    for number, (_, size) in enumerate(bars):
+        axes.annotate(f"{size:.3g} %", (size, number), xytext=(3, 0), textcoords="offset points",
+                      va="center", fontsize=7)  # fmt: skip
+    axes.set(xlabel="change over the range, %")
+    axes.margins(x=0.18)
+    axes.grid(axis="y", visible=False)
+
+
+def order_sheet(series: RunSeries) -> FigureSpec | None:
+    """Return metrics in the order of the runs; None without reference runs."""
+    known = [run for run in series.runs if run.completed]
+    panels = tuple(
+        Panel(partial(_draw_order, figure=figure, runs=known), figure.text, 0.45)
+        for figure in (STROKE, HYSTERESIS, PEAK_ERROR)
+        if len(figure.of(known)) > 2
+    )
+    if not panels or not any(run.is_reference for run in known):
+        return None
+    caption = "Metrics in the order of the runs; a change of the reference runs is drift."
+    return FigureSpec("in_order", caption, panels, stacked=True)
+
+
+def _draw_order(axes: Axes, figure: RunFigure, runs: Sequence[SeriesRun]) -> None:
+    for is_reference, colour, sign, label in (
+        (False, ERROR, ".", "runs"),
+        (True, COMMAND, "D", "reference runs"),
+    ):
+        found = figure.of([run for run in runs if run.is_reference == is_reference])
+        if found:
+            x, y = zip(*((run.number, value) for run, value in found), strict=True)
+            line = "-" if is_reference else "none"
+            axes.plot(x, y, sign, linestyle=line, color=colour, markersize=3.5, label=label)
+            if is_reference:
+                axes.axhline(y[0], color=MARK, linewidth=0.7, linestyle=":")
+    axes.set(xlabel="step", ylabel=f"{figure.text}, {unit_text(figure.unit)}")
 
 
 def sheets_of(series: RunSeries) -> list[FigureSpec]:
-    """Return the figures of runs, what a reader wants first in front."""
+    """Return all figures that apply, the most important first."""
     return [sheet for sheet in _sheets(series) if sheet is not None]
 
 
 def _sheets(series: RunSeries) -> Iterator[FigureSpec | None]:
-    yield plots_loops.before_after_sheet(series)
-    yield plots_trend.resonance_sheet(series)
+    yield before_after_sheet(series)
+    yield resonance_sheet(series)
     yield frequency_sheet(series)
     yield step_sheet(series)
-    yield from plots_trend.trend_sheets(series)
-    yield from plots_loops.loop_sheets(series)
-    yield plots_loops.minor_loop_sheet(series)
-    yield plots_loops.model_sheet(series)
-    yield plots_loops.error_sheet(series)
-    yield plots_trend.sensitivity_sheet(series)
-    yield plots_trend.order_sheet(series)
-
-
-_MOST_PANELS = 6
-
-
-def step_sheet(series: RunSeries) -> FigureSpec | None:
-    """Return displacements after a step, a panel a run; None where there is none."""
-    runs = [run for run in series.done if run.digest is not None and run.digest.step.size]
-    if not runs:
-        return None
-    shown = spread(runs, _MOST_PANELS)
-    panels = tuple(Panel(partial(_draw_step, run=run), _title(series, run)) for run in shown)
-    caption = "Displacement after a step of the command, with natural frequency and damping."
-    return FigureSpec("step_response", caption, panels)
-
-
-def _title(series: RunSeries, run: SeriesRun) -> str:
-    values = [
-        each.text(run.values[each.key])
-        for each in series.dimensions
-        if each.numeric and run.values.get(each.key) is not None
-    ]
-    return ", ".join(values) or series.text(run)
-
-
-def _draw_step(axes: Axes, run: SeriesRun) -> None:
-    if run.digest is None:
-        return
-    t, moved = run.digest.step
-    natural = run.figures.natural_hz
-    axes.plot(1e3 * t, moved, **line_of(looks(None, [0])[0]))
-    axes.set(xlabel="time after the step, ms", ylabel="displacement, µm")
-    if natural and run.figures.damping_ratio is not None:
-        text = f"{quantity(natural, 'Hz')}, damping ratio {significant(run.figures.damping_ratio)}"
-        axes.annotate(text, (0.97, 0.06), xycoords="axes fraction", ha="right", fontsize=7,
-                      color=QUIET)  # fmt: skip
-
-
-def frequency_sheet(series: RunSeries) -> FigureSpec | None:
-    """Return small-signal responses, measured and fitted; None where there is none."""
-    runs = [run for run in series.done if run.digest and run.digest.response is not None]
-    if not runs:
-        return None
-    shown = spread(runs)
-    along = next((each for each in series.dimensions if each.numeric), None)
-    text = partial(_title, series)
-    panels = tuple(
-        Panel(partial(_draw_response, runs=shown, along=along, text=text, part=part), part)
-        for part in ("magnitude", "phase")
-    )
-    caption = "Small-signal response: measured (dots) and fitted (lines)."
-    return FigureSpec("frequency_response", caption, panels)
-
-
-def _draw_response(
-    axes: Axes,
-    runs: Sequence[SeriesRun],
-    along: VariedParameter | None,
-    text: Callable[[SeriesRun], str],
-    part: str,
-) -> None:
-    values = [run.values.get(along.key) if along else text(run) for run in runs]
-    look = looks(along, list(dict.fromkeys(values)))
-    for run, value in zip(runs, values, strict=True):
-        found = run.digest.response if run.digest else None
-        if found is None or run.digest is None:
-            continue
-        measured, fitted = (_part(each, part) for each in (found.response, found.fitted))
-        colour = look[value]["color"]
-        axes.plot(found.frequency_hz, measured, ".", color=colour, markersize=2.0, alpha=0.7)
-        axes.plot(found.frequency_hz, fitted, color=colour, linewidth=0.9, label=text(run))
-        unit = run.digest.command_unit
-        axes.set_ylabel(f"magnitude, µm/{unit}" if part == "magnitude" else "phase, degrees")
-    axes.set(
-        xscale="log", xlabel="frequency, Hz", yscale="log" if part == "magnitude" else "linear"
-    )
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_formatter("{x:g}")
-
-
-def _part(response: C128, part: str) -> F64:
-    size: F64 = np.abs(response)
-    degrees: F64 = np.degrees(np.unwrap(np.angle(response)))
-    return size if part == "magnitude" else degrees
+    yield from trend_sheets(series)
+    yield from loop_sheets(series)
+    yield minor_loop_sheet(series)
+    yield model_sheet(series)
+    yield error_sheet(series)
+    yield sensitivity_sheet(series)
+    yield order_sheet(series)
 
 
 def write_sheets(
@@ -133,19 +288,16 @@ def write_sheets(
     on_done: OnRead = lambda done, text: None,
     on_drawn: Callable[[str, Figure], None] = lambda name, figure: None,
 ) -> dict[Path, str]:
-    """Write figures.
+    """Write figures; return the files, each with its caption.
 
     Args:
         sheets: The figures.
-        folder: Where they go; made where it is missing.
+        folder: Folder of the files; created if missing.
         formats: See :data:`hilctl.analysis.figure_layout.FORMATS`.
-        width: Of one column of a journal, or of two.
-        overwrite: Whether files of these names may be replaced.
-        on_done: Told of progress.
-        on_drawn: Called with each figure and its name.
-
-    Returns:
-        The files, each with its caption.
+        width: One or two columns of a journal.
+        overwrite: Whether existing files may be replaced.
+        on_done: Called with the progress.
+        on_drawn: Called with each name and figure.
 
     Raises:
         InputError: A file exists or can't be written.
@@ -157,41 +309,38 @@ def write_sheets(
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{folder}: can't be made: {error.strerror}") from None
+        raise InputError(f"{folder}: can't be created: {error.strerror}") from None
     written: dict[Path, str] = {}
-    for number, sheet in enumerate(sheets):
-        on_done(number / len(sheets), f"draw {sheet.name}")
-        figure = drawn(sheet, width)
-        on_drawn(sheet.name, figure)
-        paths = write_figure(figure, folder, sheet.name, formats, overwrite=overwrite)
-        written |= dict.fromkeys(paths, sheet.caption)
+    captions = {sheet.name: sheet.caption for sheet in sheets}
+    for name, figure in _drawn(sheets, width, on_done):
+        on_drawn(name, figure)
+        paths = write_figure(figure, folder, name, formats, overwrite=overwrite)
+        written |= dict.fromkeys(paths, captions[name])
     return written
 
 
 def draw_sheets(
     sheets: Sequence[FigureSpec], width: ColumnWidth, on_done: OnRead = lambda done, text: None
 ) -> dict[str, Figure]:
-    """Draw figures; return them by their names.
+    """Return figures by their names; see :func:`write_sheets`."""
+    return dict(_drawn(sheets, width, on_done))
 
-    Args:
-        sheets: The figures.
-        width: Of one column of a journal, or of two.
-        on_done: Told of progress.
-    """
-    figures = {}
+
+def _drawn(
+    sheets: Sequence[FigureSpec], width: ColumnWidth, on_done: OnRead
+) -> Iterator[tuple[str, Figure]]:
     for number, sheet in enumerate(sheets):
         on_done(number / len(sheets), f"draw {sheet.name}")
-        figures[sheet.name] = drawn(sheet, width)
-    return figures
+        yield sheet.name, drawn(sheet, width)
 
 
 def applying_sheets(series: RunSeries) -> list[FigureSpec]:
     """Return all figures that apply to runs.
 
     Raises:
-        InputError: There is none.
+        InputError: No figure applies.
     """
     sheets = sheets_of(series)
     if not sheets:
-        raise InputError(f"{series.name}: no completed run holds what a figure could be drawn of")
+        raise InputError(f"{series.name}: no figure applies to the completed runs")
     return sheets

@@ -1,7 +1,7 @@
-"""Natural frequency and damping of the ringing after a step: a pure function of arrays.
+"""Natural frequency and damping from the ringing after a step.
 
-A step is answered by the structure's ringing, and by what creeps: field and hysteresis. So a
-decaying sine and a decaying exponential are fitted together to what comes after the step.
+A decaying sine, for the mechanical structure, and a decaying exponential, for creep, are fitted
+together to the displacement after the step.
 """
 
 import math
@@ -12,16 +12,16 @@ from scipy.optimize import least_squares
 
 from hilctl.base.types import F64
 
-_CYCLES = 8.0  # of the ringing that are looked at
+_CYCLES = 8.0  # of the ringing, in the fit
 _FEWEST = 40  # samples
-_SEEN = 5.0  # amplitude of the ringing over the misfit from which it counts
+_SEEN = 5.0  # least amplitude of the ringing over the misfit
 _MOST_DAMPING = 0.9
-_LOWEST_CYCLES = 4.0  # within what there is
+_LOWEST_CYCLES = 4.0  # in the signal
 _HIGHEST = 0.1  # of the sample rate
 _FREQUENCIES = 40
 _REFINED = 3
 _DAMPINGS = (0.05, 0.15, 0.4)
-_RATES = (0.1, 0.5, 2.0)  # of what creeps, over the angular frequency
+_RATES = (0.1, 0.5, 2.0)  # of the creep, over the angular frequency
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,9 +29,9 @@ class Ringing:
     """The ringing after a step.
 
     Attributes:
-        natural_hz: Natural frequency, undamped.
-        damping_ratio: Its damping.
-        misfit_um: rms of what the fit leaves.
+        natural_hz: Undamped natural frequency.
+        damping_ratio: Its damping ratio.
+        misfit_um: rms residual of the fit.
     """
 
     natural_hz: float
@@ -43,11 +43,11 @@ def ringing(displacement_um: F64, sample_rate_hz: float) -> Ringing | None:
     """Fit the ringing of a displacement after a step of the command.
 
     Args:
-        displacement_um: float64[n], from the end of the step on, until it is still.
-        sample_rate_hz: Samples a second.
+        displacement_um: float64[n], from the end of the step until it settles.
+        sample_rate_hz: Samples per second.
 
     Returns:
-        None where no ringing stands out of the noise.
+        None if no ringing is above the noise.
     """
     if displacement_um.size < 2 * _FEWEST or not np.ptp(displacement_um) > 0.0:
         return None
@@ -64,11 +64,11 @@ def ringing(displacement_um: F64, sample_rate_hz: float) -> Ringing | None:
 
 
 def _shapes(t: F64, x: F64) -> F64:
-    """Return float64[4, n]: both phases of the ringing, what creeps, and a constant.
+    """Return both phases of the ringing, the creep, and a constant: float64[4, n].
 
     Args:
         t: float64[n], time in s.
-        x: Logarithms of natural angular frequency, damping ratio, and rate of what creeps.
+        x: Logarithms of natural angular frequency, damping ratio, and creep rate.
     """
     omega, damping, rate = np.exp(x)
     decay, damped = np.exp(-damping * omega * t), omega * math.sqrt(max(1.0 - damping**2, 1e-6))
@@ -77,7 +77,7 @@ def _shapes(t: F64, x: F64) -> F64:
 
 
 def _left(shapes: F64, y: F64) -> tuple[F64, F64]:
-    """Return what shapes of the best sizes leave of a signal, and their sizes."""
+    """Return the residual of a least-squares fit of shapes, and its coefficients."""
     sizes = np.asarray(np.linalg.lstsq(shapes.T, y, rcond=None)[0], dtype=np.float64)
     return np.asarray(sizes @ shapes - y), sizes
 
@@ -89,7 +89,7 @@ def _window(displacement_um: F64, sample_rate_hz: float, hz: float) -> tuple[F64
 
 
 def _start(displacement_um: F64, sample_rate_hz: float, hz: float) -> tuple[float, F64]:
-    """Return how much a ringing of this frequency explains, and where to begin the search."""
+    """Return the misfit ratio of a ringing at a frequency, and starting values."""
     t, y = _window(displacement_um, sample_rate_hz, hz)
     omega = 2.0 * math.pi * hz
     best, start = math.inf, np.empty(0)
@@ -106,7 +106,7 @@ def _start(displacement_um: F64, sample_rate_hz: float, hz: float) -> tuple[floa
 
 
 def _refined(displacement_um: F64, sample_rate_hz: float, start: F64) -> tuple[Ringing, float]:
-    """Return the fit from a start on, and the amplitude of its ringing in um."""
+    """Return the fit from starting values, and the amplitude of its ringing in um."""
     t, y = _window(displacement_um, sample_rate_hz, math.exp(start[0]) / (2.0 * math.pi))
     spread = np.log([1.5, 20.0, 1e2])
     high = np.minimum(start + spread, [math.inf, math.log(0.98), math.inf])

@@ -1,12 +1,13 @@
-"""A figure of runs against what varied among them: linear fit, direction, and its extremes."""
+"""Trends of metrics against varied parameters, and the headline of many runs."""
 
 from collections import defaultdict
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from hilctl.base.formatting import quantity, significant, unit_text
 from hilctl.base.types import F64
 from hilctl.studies.multi_run.collect import RunSeries, SeriesRun
 from hilctl.studies.multi_run.varied_parameter import VariedParameter
@@ -17,14 +18,14 @@ _FEWEST = 3
 
 @dataclass(frozen=True, slots=True)
 class RunFigure:
-    """A figure that is compared among runs.
+    """A metric to compare among runs.
 
     Attributes:
         name: Its column in the table.
-        text: What it is, for people.
+        text: Its name.
         unit: Its unit; ``%`` or as in :func:`hilctl.base.formatting.quantity`.
-        short: Heading where there is no room for more.
-        value: Takes it from a run; None where it has none.
+        short: Short heading.
+        value: Returns it for a run, or None.
     """
 
     name: str
@@ -34,7 +35,7 @@ class RunFigure:
     value: Callable[[SeriesRun], float | None]
 
     def of(self, runs: Sequence[SeriesRun]) -> list[tuple[SeriesRun, float]]:
-        """Return the runs that have it, each with its value."""
+        """Return the runs that have a value, each with the value."""
         found = [(run, self.value(run)) for run in runs]
         return [(run, value) for run, value in found if value is not None]
 
@@ -68,23 +69,32 @@ def _asymmetry(run: SeriesRun) -> float | None:
     return 100.0 * abs(high + low) / stroke
 
 
+def axis_name(series: RunSeries, figure: RunFigure) -> str:
+    """Return the name of a metric with its unit; the unit of areas depends on the runs."""
+    unit = unit_text(figure.unit)
+    if figure is AREA:
+        units = {digest.command_unit for _, digest in series.measured}
+        unit = f"µm·{units.pop()}" if len(units) == 1 else ""
+    return f"{figure.text}, {unit}" if unit else figure.text
+
+
 ASYMMETRY = RunFigure("asymmetry_percent", "asymmetry", "%", "asym. %", _asymmetry)
 """Difference of the two peaks, of the peak-to-peak."""
 
 
 @dataclass(frozen=True, slots=True)
 class Trend:
-    """A figure against one dimension, all others held.
+    """A metric against one varied parameter, with the others constant.
 
     Attributes:
-        figure: The figure.
-        along: What varies along it.
-        held: Value of each other dimension, by its key.
-        x: float64[n], values of ``along``, rising.
-        y: float64[n], the figure, averaged over repeats.
-        slope: Of the closest line; None with fewer than three points.
-        offset: Of the closest line.
-        r2: Share of the variance that the line explains; None as ``slope``.
+        figure: The metric.
+        along: The varied parameter.
+        held: Value of each other parameter, by its key.
+        x: float64[n], values of ``along``, ascending.
+        y: float64[n], the metric, averaged over repeats.
+        slope: Slope of the linear fit; None with fewer than three points.
+        offset: Offset of the linear fit.
+        r2: Coefficient of determination; None like ``slope``.
     """
 
     figure: RunFigure
@@ -98,7 +108,7 @@ class Trend:
 
     @property
     def direction(self) -> str:
-        """``rises``, ``falls``, ``does not change``, or empty where it is neither."""
+        """``rises``, ``falls``, ``does not change``, or empty."""
         spread = float(np.ptp(self.y))
         if spread <= _SPREAD * float(np.mean(np.abs(self.y))):
             return "does not change"
@@ -128,13 +138,13 @@ def trends(
     along: VariedParameter,
     runs: Sequence[SeriesRun] | None = None,
 ) -> list[Trend]:
-    """Return a figure's trends along a dimension, one for all values of the others.
+    """Return the trends of a metric, one per combination of the other parameters.
 
     Args:
         series: The runs.
-        figure: The figure.
-        along: The dimension; of numbers.
-        runs: Those of the runs that count; all that were completed where None.
+        figure: The metric.
+        along: The varied parameter, with numeric values.
+        runs: The runs to use; all completed ones if None.
     """
     others = [each for each in series.dimensions if each.key != along.key]
     grouped: dict[tuple[Hashable, ...], dict[float, list[float]]] = defaultdict(
@@ -176,8 +186,141 @@ def _trend(
 def extremes(
     figure: RunFigure, runs: Sequence[SeriesRun]
 ) -> tuple[tuple[SeriesRun, float], tuple[SeriesRun, float]] | None:
-    """Return the runs with the lowest and the highest value of a figure; None without any."""
+    """Return the runs with the lowest and the highest value of a metric; None without any."""
     found = figure.of(runs)
     if not found:
         return None
     return min(found, key=lambda each: each[1]), max(found, key=lambda each: each[1])
+
+
+_MOST_FAILED = 3
+_LINEAR = 0.95  # least r2 of a linear trend
+
+
+def headline(series: RunSeries) -> list[str]:
+    """Return sentences on the number of runs, best and worst results, trends and drift."""
+    return [_counted(series), *_results(series), *_trends(series), *_drift(series)]
+
+
+def _counted(series: RunSeries) -> str:
+    whole = len(series.runs)
+    done = sum(run.completed for run in series.runs)
+    if not series.failed and not series.planned:
+        return f"{_runs(whole)}, all completed." if whole > 1 else f"{_runs(whole)}, completed."
+    parts = [f"{done} of {_runs(whole)} completed"]
+    if series.failed:
+        shown = "; ".join(
+            f"{series.text(run)} ({run.result})" for run in series.failed[:_MOST_FAILED]
+        )
+        more = len(series.failed) - _MOST_FAILED
+        parts.append(
+            f"{len(series.failed)} failed: {shown}" + (f" and {more} more" if more > 0 else "")
+        )
+    if series.planned:
+        parts.append(f"{series.planned} remaining")
+    return f"{', '.join(parts)}."
+
+
+def _runs(count: int) -> str:
+    return f"{count} run{'' if count == 1 else 's'}"
+
+
+def _results(series: RunSeries) -> Iterator[str]:
+    if NATURAL.of(series.done):
+        yield _between(series, NATURAL, series.done)
+        yield _between(series, DAMPING, series.done)
+        return
+    compensator = next((each for each in series.dimensions if each.is_compensator), None)
+    if compensator is not None:
+        yield from _compensators(series, compensator)
+        return
+    for figure in (PEAK_ERROR, HYSTERESIS):
+        if figure.of(series.done):
+            yield _between(series, figure, series.done)
+    if not HYSTERESIS.of(series.done) and STROKE.of(series.done):
+        yield _between(series, STROKE, series.done)
+
+
+def _between(series: RunSeries, figure: RunFigure, runs: Sequence[SeriesRun]) -> str:
+    found = extremes(figure, runs)
+    if found is None:
+        return f"No run has a {figure.text}."
+    (best, low), (worst, high) = found
+    name = figure.text[0].upper() + figure.text[1:]
+    if best is worst:
+        return f"{name} {quantity(low, figure.unit)}."
+    low_text, high_text = (quantity(value, figure.unit) for value in (low, high))
+    return f"{name} {low_text} ({series.text(best)}) to {high_text} ({series.text(worst)})."
+
+
+def _compensators(series: RunSeries, compensator: VariedParameter) -> Iterator[str]:
+    """Yield peak hysteresis without and with compensators, and where each is worst."""
+    parts = []
+    for value in compensator.values:
+        runs = [run for run in series.done if run.values.get(compensator.key) == value]
+        found = extremes(HYSTERESIS, runs)
+        if found is None:
+            continue
+        (_, low), (worst, high) = found
+        others = ", ".join(
+            each.text(worst.values[each.key])
+            for each in series.dimensions
+            if each is not compensator and worst.values.get(each.key) is not None
+        )
+        name = "without compensator" if value == "none" else f"with {value}"
+        at = f", worst at {others}" if others and len(runs) > 1 else ""
+        between = f"{significant(low)} to " if significant(low) != significant(high) else ""
+        parts.append(f"{name} {between}{quantity(high, '%')}{at}")
+    if parts:
+        yield f"Peak hysteresis {'; '.join(parts)}."
+
+
+def _trends(series: RunSeries) -> Iterator[str]:
+    for along in series.dimensions:
+        if not along.numeric:
+            continue
+        said = defaultdict(list)
+        for figure in (STROKE, HYSTERESIS, NATURAL):
+            found = [each for each in trends(series, figure, along) if _uncompensated(series, each)]
+            directions = {each.direction for each in found}
+            if len(directions) == 1 and (direction := directions.pop()):
+                said[direction].append(figure.text)
+        parts = [f"{' and '.join(names)} {_verb(names, how)}" for how, names in said.items()]
+        if parts:
+            text = "; ".join(parts)
+            yield f"With {along.name}, {text}."
+        if along.is_frequency:
+            yield from _linear(series, along)
+
+
+def _verb(names: Sequence[str], direction: str) -> str:
+    if len(names) == 1:
+        return direction
+    return {"rises": "rise", "falls": "fall", "does not change": "do not change"}[direction]
+
+
+def _uncompensated(series: RunSeries, trend: Trend) -> bool:
+    """Return whether a trend is of runs without a compensator."""
+    return not any(
+        run.digest is not None and run.digest.compensated
+        for run in series.done
+        if all(run.values.get(key) == value for key, value in trend.held.items())
+    )
+
+
+def _linear(series: RunSeries, along: VariedParameter) -> Iterator[str]:
+    found = [
+        each.r2
+        for each in trends(series, AREA, along)
+        if each.r2 is not None and _uncompensated(series, each)
+    ]
+    if found and min(found) >= _LINEAR:
+        low, high = f"{min(found):.4f}", f"{max(found):.4f}"
+        between = low if low == high else f"{low} to {high}"
+        yield f"The loop area is linear in {along.name} (r² {between})."
+
+
+def _drift(series: RunSeries) -> Iterator[str]:
+    if series.drift is not None:
+        text = str(series.drift)
+        yield f"{text[0].upper()}{text[1:]}."

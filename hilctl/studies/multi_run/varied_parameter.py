@@ -1,4 +1,4 @@
-"""What varied among runs, and in which words: pure functions of plain values."""
+"""Varied parameters of runs, with their names and units."""
 
 import json
 import re
@@ -20,26 +20,26 @@ _NAMES = {
     "kind": ("kind", ""),
     "sample_rate_hz": ("sample rate", "Hz"),
 }
-"""Words for the last part of a key, and its unit."""
+"""Name and unit for the last part of a key."""
 _CHOICES = ("compensator", "waveform", "kind")
 _FIRST = (*_CHOICES, "frequency_hz", "amplitude", "bias_a", "load_kg")
-"""Last parts of keys, what runs are told apart by coming first."""
+"""Last parts of keys, in order of importance."""
 _UNITS = ("a", "v", "um", "hz", "s", "kg", "ohm", "k", "ms", "us")
 _UNIT_NAMES = {"a": "A", "v": "V", "hz": "Hz", "k": "K", "ohm": "ohm"}
 WITHOUT_COMPENSATOR = "without compensator"
-"""Name of the runs that have none."""
+"""Label of runs without a compensator."""
 _COMPONENT = re.compile(r"\.components\.(\d+)\.")
 
 
 @dataclass(frozen=True, slots=True)
 class VariedParameter:
-    """One thing that varied.
+    """One varied parameter.
 
     Attributes:
         key: Dotted key of the experiment.
-        name: What it is, for people.
-        unit: Its unit; empty for none.
-        values: Its values: numbers rising, others in the order of the runs.
+        name: Its name.
+        unit: Its unit, or empty.
+        values: Its values: numbers in ascending order, others in the order of the runs.
     """
 
     key: str
@@ -54,7 +54,7 @@ class VariedParameter:
 
     @property
     def axis(self) -> str:
-        """Name of an axis of it, with its unit."""
+        """Label of its axis, with the unit."""
         return f"{self.name}, {unit_text(self.unit)}" if self.unit else self.name
 
     @property
@@ -64,11 +64,11 @@ class VariedParameter:
 
     @property
     def is_compensator(self) -> bool:
-        """Whether it is what stands before the actuator."""
+        """Whether it is the compensator."""
         return self.key.split(".")[0] == "compensator"
 
     def text(self, value: Hashable) -> str:
-        """Return one value with its unit."""
+        """Return a value with its unit."""
         if _is_number(value):
             number = float(str(value))
             shown = f"{number:g}" if len(f"{number:g}") <= 6 else significant(number)
@@ -77,7 +77,7 @@ class VariedParameter:
 
 
 def value_at(values: Mapping[str, Any], key: str) -> Hashable:
-    """Return the value of a dotted key, as number or short text; None where there is none."""
+    """Return the value of a dotted key, as a number or short text; None without one."""
     found: Any = values
     for part in key.split("."):
         if isinstance(found, Mapping):
@@ -90,7 +90,7 @@ def value_at(values: Mapping[str, Any], key: str) -> Hashable:
 
 
 def short_value(value: Any) -> Hashable:
-    """Return a value as a number, or as the text by which people know it."""
+    """Return a value as a number or a short text."""
     if isinstance(value, Mapping):
         if "model" in value:
             return PurePath(str(value["model"])).stem
@@ -104,7 +104,7 @@ def short_value(value: Any) -> Hashable:
 
 
 def keys_of(runs: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return the dotted keys in which experiments differ, in the order of the first of them."""
+    """Return the dotted keys in which experiments differ, in the order of the first one."""
     found: dict[str, None] = {}
     for run in runs:
         found |= dict.fromkeys(_leaves(run, ""))
@@ -126,12 +126,12 @@ def _leaves(value: Any, at: str) -> Iterator[str]:
 def dimensions(
     keys: Sequence[str], rows: Sequence[Mapping[str, Hashable]], unit: str = ""
 ) -> tuple[VariedParameter, ...]:
-    """Return what varied, without keys that only follow others.
+    """Return the varied parameters, without keys that depend on others.
 
     Args:
         keys: Dotted keys.
-        rows: Value of each key, one mapping a run.
-        unit: Unit of amplitudes, where all runs have the same.
+        rows: Value of each key, one mapping per run.
+        unit: Unit of amplitudes, if it is the same in all runs.
     """
     columns = {key: [row.get(key) for row in rows] for key in keys}
     varied = [key for key in keys if len(set(columns[key]) - {None}) > 1]
@@ -148,10 +148,10 @@ def _rank(key: str) -> int:
 
 
 def _follows(columns: Mapping[str, list[Hashable]], key: str, other: str) -> bool:
-    """Return whether a key says no more than another one.
+    """Return whether a key depends on another one: it has one value for each of the other's.
 
-    It does where it has one value for each of the other's. A main one with fewer values of its own
-    stays all the same: three runs at three frequencies may have two amplitudes.
+    An important key with fewer values is independent: three runs at three frequencies may have two
+    amplitudes.
     """
     pairs = set(zip(columns[other], columns[key], strict=True))
     values = len(set(columns[other]))

@@ -25,7 +25,7 @@ from hilctl.studies.campaign.campaign_runner import CampaignResult
 from hilctl.studies.campaign.plan import planned
 from hilctl.studies.campaign.steps import CampaignStep, load_campaign
 from hilctl.studies.campaign.table import CampaignRow
-from hilctl.studies.multi_run.run_figures import RunFigures
+from hilctl.studies.multi_run.digest import RunFigures
 from tests.unit.studies.campaign.conftest import CAMPAIGN, EXPERIMENT
 
 pytestmark = pytest.mark.usefixtures("undrawn")

@@ -26,14 +26,14 @@ vary:
 
 @pytest.fixture(autouse=True)
 def drawn_pages(monkeypatch) -> list[tuple[str, int]]:
-    """Leave pages undrawn, which takes seconds; return name and completed runs of each."""
+    """Replace the page, which takes seconds; return its name and number of completed runs."""
     pages: list[tuple[str, int]] = []
 
     def write(series, path):
         path.write_text("page", encoding="utf-8")
         pages.append((path.name, len(series.done)))
 
-    monkeypatch.setattr("hilctl.studies.multi_run.multi_run_page.write_series", write)
+    monkeypatch.setattr("hilctl.studies.campaign.campaign_runner.write_series", write)
     return pages
 
 
@@ -47,7 +47,7 @@ def experiment(tmp_path) -> Path:
 
 @pytest.fixture
 def campaign(experiment):
-    """Return a campaign of a text, and of settings over its experiment."""
+    """Return a factory of campaigns from YAML text and settings."""
 
     def make(text=CAMPAIGN, *settings):
         path = experiment.with_name("few.yaml")

@@ -1,4 +1,4 @@
-"""A campaign's folder."""
+"""Campaign folder."""
 
 import os
 
@@ -12,11 +12,11 @@ from hilctl.run.unpaced import run_unpaced
 from hilctl.studies.campaign.store import (
     await_runs,
     campaign_folder,
-    held_folder,
-    last_begun,
-    make_whole,
+    completed_runs,
+    last_started,
+    locked_folder,
     new_recording,
-    standing_runs,
+    repair_recordings,
 )
 from tests.unit.studies.campaign.conftest import CAMPAIGN
 
@@ -27,7 +27,7 @@ def never(seconds):
 
 @pytest.fixture
 def recorded(campaign, tmp_path):
-    """Run the first step of a campaign into a file; return that, and what it is of."""
+    """Record the first step of a campaign; return file and fingerprint."""
 
     def make(name):
         few = campaign()
@@ -38,7 +38,7 @@ def recorded(campaign, tmp_path):
     return make
 
 
-def test_where_a_campaign_goes(campaign):
+def test_default_folder(campaign):
     assert str(campaign_folder(campaign())) == "recordings/few"
     assert str(campaign_folder(campaign(CAMPAIGN, "recording.folder=/lab"))) == "/lab/few"
     assert str(campaign_folder(campaign(CAMPAIGN + "set: {recording: {folder: day}}"))) == "day/few"
@@ -50,76 +50,76 @@ def test_where_a_campaign_goes(campaign):
 
 
 def test_one_campaign_at_a_time(tmp_path):
-    """Another one waits a little, for one that is just ending."""
+    """A second campaign waits briefly for the lock."""
     folder, waits = tmp_path / "runs", []
-    with held_folder(folder, never):
+    with locked_folder(folder, never):
         with (
-            pytest.raises(InputError, match="another campaign is writing to it"),
-            held_folder(folder, waits.append),
+            pytest.raises(InputError, match="another campaign"),
+            locked_folder(folder, waits.append),
         ):
             pass
         assert 3.0 < sum(waits) < 10.0
-    with held_folder(folder, never):
+    with locked_folder(folder, never):
         pass
     (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="can't be made"), held_folder(tmp_path / "file", never):
+    with pytest.raises(InputError, match="created"), locked_folder(tmp_path / "file", never):
         pass
 
 
 def test_a_refusal_leaves_no_folder_that_it_has_made(tmp_path):
-    """Nothing is written where there is a mistake; what stood there before is somebody's."""
+    """A rejected campaign removes its new folders only."""
     (tmp_path / "mine").mkdir()
     for name in ("mine", "new/deep"):
-        with pytest.raises(InputError, match="wrong"), held_folder(tmp_path / name, never):
+        with pytest.raises(InputError, match="wrong"), locked_folder(tmp_path / name, never):
             raise InputError("wrong")
     assert [each.name for each in tmp_path.iterdir()] == ["mine"]
 
 
-def test_only_completed_runs_stand(recorded, tmp_path):
-    """By what they are of; not one that was cut short, and not other files."""
+def test_only_completed_runs_count(recorded, tmp_path):
+    """Truncated recordings and other files do not count."""
     path, key = recorded("a.mcap")
     again, _ = recorded("b.mcap")
     content = path.read_bytes()
     (tmp_path / "torn.mcap").write_bytes(content[: len(content) // 2])
     (tmp_path / "text.mcap").write_text("no recording")
-    assert standing_runs(tmp_path) == {key: [path, again]}
-    assert last_begun(tmp_path) == again
+    assert completed_runs(tmp_path) == {key: [path, again]}
+    assert last_started(tmp_path) == again
 
 
-def test_what_was_cut_short_is_made_whole(recorded, tmp_path):
-    """It still counts for nothing, but any program can read it."""
+def test_truncated_recordings_are_repaired(recorded, tmp_path):
+    """A repaired recording is readable and does not count as completed."""
     path, key = recorded("a.mcap")
     content = path.read_bytes()
     torn = tmp_path / "torn.mcap"
     torn.write_bytes(content[: len(content) // 2])
     (tmp_path / "text.mcap").write_text("no recording")
-    assert [text.startswith(f"{torn}: ") for text in make_whole(tmp_path)] == [True]
-    assert make_whole(tmp_path) == []
-    assert standing_runs(tmp_path) == {key: [path]}
-    assert last_begun(tmp_path / "absent") is None
+    assert [text.startswith(f"{torn}: ") for text in repair_recordings(tmp_path)] == [True]
+    assert repair_recordings(tmp_path) == []
+    assert completed_runs(tmp_path) == {key: [path]}
+    assert last_started(tmp_path / "absent") is None
 
 
-def test_what_was_killed_before_its_run_began_is_out_of_the_way(recorded, tmp_path):
-    """Nobody should have to wonder about a file with nothing in it; other files stay."""
+def test_files_of_runs_that_never_started_are_moved(recorded, tmp_path):
+    """Empty files are removed, incomplete headers renamed, other files kept."""
     path, _ = recorded("a.mcap")
     (tmp_path / "empty.mcap").touch()
     (tmp_path / "head.mcap").write_bytes(path.read_bytes()[:20])
     (tmp_path / "text.mcap").write_text("no recording")
-    assert len(make_whole(tmp_path)) == 2
+    assert len(repair_recordings(tmp_path)) == 2
     left = {each.name for each in tmp_path.iterdir() if each.suffix != ".yaml"}
     assert left == {"a.mcap", "head.mcap.torn", "text.mcap"}
 
 
-def test_what_is_no_file_is_no_recording(recorded, tmp_path):
-    """A folder, a pipe and a link that leads nowhere keep no campaign from going on."""
+def test_special_files_are_ignored(recorded, tmp_path):
+    """Folders, pipes and broken links are ignored."""
     path, key = recorded("a.mcap")
     (tmp_path / "b.mcap").mkdir()
     os.mkfifo(tmp_path / "c.mcap")
     (tmp_path / "d.mcap").symlink_to("nowhere")
     (tmp_path / "e.mcap").symlink_to("b.mcap")
-    assert make_whole(tmp_path) == []
-    assert standing_runs(tmp_path) == {key: [path]}
-    assert last_begun(tmp_path) == path
+    assert repair_recordings(tmp_path) == []
+    assert completed_runs(tmp_path) == {key: [path]}
+    assert last_started(tmp_path) == path
 
 
 def test_names_are_never_taken_twice(tmp_path):
@@ -130,7 +130,7 @@ def test_names_are_never_taken_twice(tmp_path):
 
 
 def test_a_run_that_records_there_is_waited_for(tmp_path, monkeypatch):
-    """One whose supervisor lives is somebody's; one without ends soon."""
+    """A run without a supervisor is awaited; a supervised one is an error."""
 
     class Run:
         card = type("Card", (), {"recording": str(tmp_path / "a.mcap"), "name": "a-1"})
@@ -147,5 +147,5 @@ def test_a_run_that_records_there_is_waited_for(tmp_path, monkeypatch):
     await_runs(tmp_path, wait)
     assert len(waits) == 3
     Run.alive = Run.supervised = True
-    with pytest.raises(InputError, match="run a-1 records to it"):
+    with pytest.raises(InputError, match="a-1"):
         await_runs(tmp_path, never)

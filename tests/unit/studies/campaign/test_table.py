@@ -1,4 +1,4 @@
-"""The table of a campaign."""
+"""Table of a campaign."""
 
 import csv
 import os
@@ -8,7 +8,7 @@ import pytest
 
 from hilctl.studies.campaign.plan import planned
 from hilctl.studies.campaign.table import CampaignRow, write_table
-from hilctl.studies.multi_run.run_figures import FIGURES, RunFigures
+from hilctl.studies.multi_run.digest import FIGURES, RunFigures
 from tests.unit.studies.campaign.conftest import CAMPAIGN
 
 DONE = CampaignRow("completed", RunFigures(peak_to_peak_um=0.1 + 0.2), "few-0001.mcap", "completed")
@@ -26,7 +26,7 @@ def read_back(path):
 
 
 def test_every_step_is_a_row_whether_it_was_run_or_not(plan):
-    """Numbers read back as the same bits; what there is not is empty."""
+    """Numbers read back bit for bit; missing values are empty."""
     paths = write_table(plan, {1: DONE}, {"campaign": "few"})
     rows = read_back(paths[0])
     assert paths[0].name == "few.csv"

@@ -1,4 +1,4 @@
-"""Limits of an experiment, and steps played on an actuator that is a formula."""
+"""Limits of an experiment, and recordings of a formula as the actuator."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -46,7 +46,7 @@ def limits(limits_with):
 
 @pytest.fixture
 def played(make_recording):
-    """Return a recording of a waveform's keys on an actuator: its displacement of a command."""
+    """Return a function that records a waveform on an actuator function."""
 
     def play(limits, keys, actuator, noise_um=0.0, seed=1):
         keys, _ = within(limits, keys)

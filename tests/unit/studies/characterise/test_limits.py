@@ -1,4 +1,4 @@
-"""What a campaign keeps to, and the band that follows from the sample rate."""
+"""Limits, and the band that follows from the sample rate."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from hilctl.base.errors import InputError
     [(50_000, 1.0, 400.0), (10_000, 0.5, 80.0), (1000, 0.5, 25.0), (40, 0.25, 1.0)],
 )
 def test_the_band_follows_from_the_sample_rate(limits_with, rate_hz, lowest_hz, highest_hz):
-    """Slow devices get fewer samples a cycle, or a campaign would take an hour."""
+    """Slow devices get fewer samples per cycle to limit the duration."""
     found = limits_with(f"sample_rate_hz={rate_hz}")
     assert (found.lowest_hz, found.highest_hz) == (lowest_hz, highest_hz)
     assert found.lowest_hz < found.middle_hz < found.highest_hz
@@ -19,12 +19,12 @@ def test_the_band_follows_from_the_sample_rate(limits_with, rate_hz, lowest_hz, 
 
 def test_the_highest_frequency_may_be_asked_for(limits_with):
     assert limits_with(highest_hz=20.0).highest_hz == 20.0
-    with pytest.raises(InputError, match="--highest-hz must be above 0 and at most 200 Hz"):
+    with pytest.raises(InputError, match=r"--highest-hz .*200 Hz"):
         limits_with(highest_hz=300.0)
 
 
-def test_a_small_amplitude_stands_as_near_to_rest_as_it_may(limits_with):
-    """A drive that begins at 0 V can't swing round it."""
+def test_offset_of_small_amplitudes(limits_with):
+    """A unipolar drive needs an offset."""
     piezo = limits_with(
         "device={kind: simulated_piezo}", "waveform.unit=V",
         "limits={drive_v: [0.0, 100.0], slew_v_per_s: 1e4, stroke_um: [-1.0, 38.0]}",
@@ -42,7 +42,7 @@ def test_an_amplitude_is_lowered_to_what_the_slew_leaves(limits):
 
 
 def test_commands_are_scaled_to_slew_and_heat(limits_with):
-    """With a budget of 1 A rms over 1 s, 4 A for a second are too much."""
+    """4 A for one second exceed a budget of 1 A rms over 1 s."""
     limits = limits_with("limits.rms_current_a=1.0", "limits.thermal_time_constant_s=1.0")
     held = np.full(5000, 4.0)
     scale = limits.scale(np.concatenate((np.linspace(0.0, 4.0, 100), held)))

@@ -1,4 +1,4 @@
-"""Figures of loops and reversal curves, what repeats, and how far amplitudes may grow."""
+"""Metrics of loops and reversal curves, repeatability, growth of amplitudes."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ from hilctl.studies.characterise.loops import (
     repeatability,
     reversal_curves,
 )
-from hilctl.studies.characterise.rig_problem import RigProblemError
+from hilctl.studies.characterise.response import RigProblemError
 from hilctl.studies.characterise.waveforms import biased_loops, sine
 from hilctl.studies.characterise.waveforms import reversal_curves as reversal_keys
 
@@ -53,20 +53,20 @@ def test_cycles_that_differ_scatter(limits, played):
 
 
 def test_a_sensor_at_its_end_is_a_problem(limits, played):
-    with pytest.raises(RigProblemError, match="stands at 10 µm for") as caught:
+    with pytest.raises(RigProblemError, match="10 µm") as caught:
         loop(limits, played, lambda v: np.minimum(plays(v), 10.0), noise_um=0.0)
     assert caught.value.code == "saturated_sensor"
 
 
 def test_a_coarse_sensor_is_not_at_its_end(limits, played):
-    """Forty steps in the whole motion: some readings are alike."""
+    """With forty distinct readings, equal extremes are no saturation."""
     loop(limits, played, lambda v: np.round(plays(v)), noise_um=0.0)
 
 
 def test_a_segment_without_a_cycle_has_no_loop(make_recording):
     run = make_recording(np.zeros(100), segments=[Segment("chirp", 0, 100, 0, 100)])
     assert all_loops(run) == ()
-    with pytest.raises(DataError, match="no whole steady cycle"):
+    with pytest.raises(DataError, match="steady cycle"):
         loop_figures(run, run.segments[0])
 
 
@@ -81,7 +81,7 @@ LOOP = LoopFigures("x", 1.0, 0.0, 5.0, -5.0, 5.0, 10.0, 0.0, np.zeros(4), np.zer
 
 
 def grown(*sizes):
-    """Return loops of amplitudes and displacements either way."""
+    """Return loops of given amplitudes and displacements."""
     return [replace(LOOP, amplitude=a, low_um=-y, high_um=y) for a, y in sizes]
 
 
@@ -91,7 +91,7 @@ def test_amplitudes_grow_as_wanted_while_there_is_room():
 
 
 def test_growth_stops_short_of_the_stroke():
-    """Displacement goes as the square here: at 2.4 it would be 57.6 um."""
+    """Displacement is quadratic here: 57.6 um at 2.4."""
     loops = grown((1.0, 10.0), (2.0, 40.0))
     chosen = next_amplitude(loops, 4.0, (-50.0, 50.0))
     assert 2.06 < chosen < 2.2
@@ -119,7 +119,7 @@ def test_repeatability_tells_shape_from_place():
 
 
 def test_noise_is_no_change_of_shape(limits, played):
-    """A sensor noise of 3 % of the peak-to-peak: the loop is what it was."""
+    """Sensor noise of 3 % of the peak-to-peak is no change of shape."""
     first, again = (loop(limits, played, noise_um=1.0 + 1e-9 * k) for k in range(2))
     again = replace(again, displacement_um=again.displacement_um + np.random.default_rng(5).normal(
         0.0, 0.35, again.displacement_um.size))  # fmt: skip
@@ -127,7 +127,7 @@ def test_noise_is_no_change_of_shape(limits, played):
 
 
 def test_reversal_curves_return_to_one_point(limits, played):
-    """Plays do by their nature; what forgets does not."""
+    """Plays have return-point memory; a drifting actuator does not."""
     found = reversal_curves(played(limits, reversal_keys(limits, 3.0), plays))
     assert found.turns[0] == pytest.approx(-3.0, abs=0.05)
     assert list(found.turns[1:]) == sorted(found.turns[1:], reverse=True)

@@ -1,4 +1,4 @@
-"""Waveforms of the steps: within all limits, from rest and back to it."""
+"""Waveforms of the steps: within all limits, from rest to rest."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ WAVEFORMS = {
 @pytest.mark.parametrize("settings", [(), PIEZO, RESTING_HIGH, BUDGET], ids=lambda s: s[:1])
 @pytest.mark.parametrize("name", WAVEFORMS)
 def test_every_step_may_start(experiment, limits_with, settings, name):
-    """The check of a run holds it against slew, range, heat and the value that it begins from."""
+    """Every waveform passes the checks of a run."""
     base = [] if settings is not PIEZO else ["waveform.unit=V"]
     limits = limits_with(*settings, *base)
     keys, command = w.within(limits, WAVEFORMS[name](limits))
@@ -51,7 +51,7 @@ def test_the_multisine_has_whole_periods(limits):
 
 
 def test_the_largest_of_the_slow_loops_comes_first(limits):
-    """It brings the actuator to a repeatable state for the others."""
+    """The largest loop makes the others repeatable."""
     amplitudes = [part["amplitude"] for part in w.slow_loops(limits, 2.0)["parts"]]
     assert amplitudes == [2.0, 1.5, 1.0, 0.5]
 

@@ -1,4 +1,4 @@
-"""Runs side by side, made of formulas."""
+"""Synthetic runs of a report."""
 
 from collections.abc import Callable
 from typing import Any
@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from hilctl.studies.multi_run.collect import RunSeries, SeriesRun
-from hilctl.studies.multi_run.digest import RunDigest
-from hilctl.studies.multi_run.run_figures import RunFigures
+from hilctl.studies.multi_run.digest import RunDigest, RunFigures
 
 PHASE = np.linspace(0.0, 2.0 * np.pi, 101)
 

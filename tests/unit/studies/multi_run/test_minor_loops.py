@@ -16,7 +16,7 @@ def complex_harmonic(first, third):
     ("first", "third", "span"), [(4.0, 3.0, 4.2), (5.0, 2.0, 1.96), (3.0, 4.0, 6.6)]
 )
 def test_one_at_either_end_of_a_complex_harmonic(first, third, span):
-    """Of a line they have the span of the input, and no hysteresis."""
+    """Minor loops of a line have no hysteresis."""
     u = complex_harmonic(first, third)
     low, high = minor_loops(u, 2.0 * u)
     assert low.middle == pytest.approx(-high.middle, abs=0.02)
@@ -27,7 +27,7 @@ def test_one_at_either_end_of_a_complex_harmonic(first, third, span):
 
 
 def test_the_distance_of_their_branches_is_theirs():
-    """A play of 0.5 beside a line: 0.5 um of what the minor loop moves."""
+    """A play of 0.5 parallel to a line: 0.5 um of the minor loop's motion."""
     u = complex_harmonic(4.0, 3.0)
     y, held = np.empty(u.size), 0.0
     for _ in range(2):

@@ -1,4 +1,4 @@
-"""Which figures apply."""
+"""Selection and files of figures; trends, sensitivity and order."""
 
 from dataclasses import replace
 
@@ -9,13 +9,90 @@ from matplotlib.figure import Figure
 from hilctl.base.errors import InputError
 from hilctl.studies.characterise.response import SmallSignal
 from hilctl.studies.multi_run.collect import RunSeries
+from hilctl.studies.multi_run.digest import RunFigures
 from hilctl.studies.multi_run.plots import (
     applying_sheets,
     frequency_sheet,
+    order_sheet,
+    resonance_sheet,
+    sensitivity_sheet,
     sheets_of,
     step_sheet,
+    trend_sheets,
     write_sheets,
 )
+
+
+def drawn(panel):
+    axes = Figure().subplots()
+    panel.draw(axes)
+    return axes
+
+
+def test_fits_are_drawn_along_frequency_only(crossed):
+    sheets = {sheet.name: sheet for sheet in trend_sheets(crossed)}
+    assert list(sheets) == ["hysteresis_against_frequency", "hysteresis_against_amplitude"]
+    stroke, area, hysteresis = map(drawn, sheets["hysteresis_against_frequency"].panels)
+    assert area.get_ylabel() == "loop area, µm·A"
+    assert [text.get_text() for text in area.texts] == ["r² = 1.0000"]
+    assert [line.get_label() for line in area.lines[::2]] == ["3 A", "6 A"]
+    assert len(stroke.lines) == 2
+    assert len(hysteresis.lines) == 4
+    along_amplitude = sheets["hysteresis_against_amplitude"].panels
+    assert all(not drawn(panel).texts for panel in along_amplitude)
+    assert drawn(along_amplitude[3]).get_ylabel() == "asymmetry, %"
+
+
+def test_points_are_never_cut_by_the_edge(crossed):
+    sheet = next(iter(trend_sheets(crossed)))
+    axes = drawn(sheet.panels[0])
+    assert axes.get_ylim()[0] == 0.0
+    assert axes.get_ylim()[1] > 60.0
+
+
+def test_what_compensators_leave_is_a_figure_of_its_own(compensated):
+    sheets = {sheet.name: sheet for sheet in trend_sheets(compensated)}
+    assert list(sheets) == ["hysteresis_against_frequency", "compensation_against_frequency"]
+    lines = drawn(sheets["compensation_against_frequency"].panels[0]).lines
+    assert [line.get_label() for line in lines] == ["without compensator", "omega"]
+    error = drawn(sheets["compensation_against_frequency"].panels[1]).lines
+    # A compensator has one colour in all panels.
+    assert error[0].get_color() == lines[1].get_color()
+
+
+def test_sensitivity_is_the_change_over_the_range(crossed):
+    sheet = sensitivity_sheet(crossed)
+    axes = drawn(sheet.panels[0])
+    sizes = {
+        label.get_text().split("\n")[0]: bar.get_width()
+        for label, bar in zip(axes.get_yticklabels(), axes.patches, strict=True)
+    }
+    assert sizes["amplitude"] == pytest.approx(100.0 * 30.0 / 45.0)
+    assert sizes["frequency"] == pytest.approx(0.0)
+    one = RunSeries("one", crossed.runs[:3], crossed.keys)
+    assert sensitivity_sheet(one) is None
+
+
+def test_reference_runs_are_marked_in_order(crossed):
+    assert order_sheet(crossed) is None
+    runs = [replace(run, is_reference=run.number in {1, 6}) for run in crossed.runs]
+    sheet = order_sheet(replace(crossed, runs=tuple(runs)))
+    axes = drawn(sheet.panels[0])
+    assert [line.get_label() for line in axes.lines[:2]] == ["runs", "reference runs"]
+    assert axes.lines[1].get_xdata().tolist() == [1, 6]
+
+
+def test_resonances_against_what_varied(crossed):
+    assert resonance_sheet(crossed) is None
+    runs = [
+        replace(run, figures=replace(run.figures, natural_hz=2300.0, damping_ratio=0.12))
+        for run in crossed.runs
+    ]
+    sheet = resonance_sheet(replace(crossed, runs=tuple(runs)))
+    assert [drawn(panel).get_ylabel() for panel in sheet.panels] == [
+        "natural frequency, Hz",
+        "damping ratio",
+    ]
 
 
 def test_they_are_found_from_what_varied(crossed, compensated):
@@ -40,23 +117,18 @@ def test_nothing_run_draws_nothing(crossed):
     assert sheets_of(replace(crossed, runs=planned)) == []
 
 
-def drawn(panel):
-    axes = Figure().subplots()
-    panel.draw(axes)
-    return axes
-
-
 def series(run):
     return RunSeries("loads", (run,), ("waveform.amplitude",))
 
 
 def test_a_step_with_its_resonance(make_run, make_digest):
     t = np.linspace(0.0, 0.01, 50)
-    run = make_run(1.0, 10.0, digest=make_digest(step=np.array((t, np.sin(t)))))
-    run = replace(run, figures=replace(run.figures, natural_hz=469.5, damping_ratio=0.12))
+    ringing = RunFigures(natural_hz=469.5, damping_ratio=0.12)
+    digest = make_digest(step=np.array((t, np.sin(t))), figures=ringing)
+    run = make_run(1.0, 10.0, digest=digest)
     axes = drawn(step_sheet(series(run)).panels[0])
     assert axes.lines[0].get_xdata()[-1] == 10.0
-    assert axes.get_xlabel() == "time after the step, ms"
+    assert axes.get_xlabel().endswith(", ms")
     assert axes.texts[0].get_text() == "470 Hz, damping ratio 0.120"
 
 
@@ -94,5 +166,5 @@ def test_each_figure_is_a_file_of_each_format(crossed, tmp_path):
 
 def test_no_figure_is_refused(crossed):
     nothing = replace(crossed, runs=())
-    with pytest.raises(InputError, match="no completed run"):
+    with pytest.raises(InputError, match="no figure applies"):
         applying_sheets(nothing)

@@ -1,10 +1,18 @@
-"""A figure against what varied."""
+"""Trends of metrics and the headline."""
 
 from dataclasses import replace
 
 import pytest
 
-from hilctl.studies.multi_run.trend import AREA, ASYMMETRY, HYSTERESIS, STROKE, extremes, trends
+from hilctl.studies.multi_run.trend import (
+    AREA,
+    ASYMMETRY,
+    HYSTERESIS,
+    STROKE,
+    extremes,
+    headline,
+    trends,
+)
 
 
 def by_name(series):
@@ -36,7 +44,7 @@ def test_directions(crossed):
 
 
 def test_two_points_have_no_fit_and_repeats_count_once(crossed):
-    """A line through two points says nothing about being one."""
+    """Two points give no linear fit."""
     along = by_name(crossed)["amplitude"]
     found = trends(crossed, AREA, along, [*crossed.runs, *crossed.runs])
     assert len(found) == 3
@@ -55,3 +63,37 @@ def test_extremes_and_asymmetry(crossed):
     assert best.values["waveform.frequency_hz"] == 10.0
     assert worst.values["waveform.frequency_hz"] == 200.0
     assert ASYMMETRY.value(crossed.runs[0]) == pytest.approx(20.0)
+
+
+def test_best_worst_and_trends_of_loops(crossed):
+    runs, hysteresis, frequency, area, amplitude = headline(crossed)
+    assert runs.startswith("6 runs")
+    assert "11.0 % (10 Hz, 3 A)" in hysteresis
+    assert "30.0 % (200 Hz, 3 A)" in hysteresis
+    assert "hysteresis rises" in frequency
+    assert "r² 1.0000" in area
+    assert "peak-to-peak rises" in amplitude
+
+
+def test_failures_come_first(crossed):
+    broken = replace(crossed.runs[2], result="fault: the coil is hot")
+    later = replace(crossed.runs[5], result="planned")
+    series = replace(crossed, runs=(*crossed.runs[:2], broken, *crossed.runs[3:5], later))
+    first = headline(series)[0]
+    assert first.startswith("4 of 6 runs")
+    assert "1 failed: 200 Hz, 3 A (fault: the coil is hot)" in first
+
+
+def test_before_and_after(compensated):
+    text = " ".join(headline(compensated))
+    assert "20.0 to 21.0 %, worst at 100 Hz" in text
+    assert "omega 2.01 to 3.00 %" in text
+
+
+def test_resonances(crossed):
+    runs = [
+        replace(run, figures=replace(run.figures, natural_hz=2300.0 / n, damping_ratio=0.12))
+        for n, run in enumerate(crossed.runs, 1)
+    ]
+    text = " ".join(headline(replace(crossed, runs=tuple(runs))))
+    assert "383 Hz (200 Hz, 6 A) to 2300 Hz" in text

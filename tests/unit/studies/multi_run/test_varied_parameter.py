@@ -1,4 +1,4 @@
-"""What varied, and in which words."""
+"""Varied parameters with names and units."""
 
 import pytest
 
@@ -8,7 +8,7 @@ HZ, A, S = "waveform.frequency_hz", "waveform.amplitude", "waveform.duration_s"
 
 
 def test_keys_that_follow_others_are_left_out():
-    """A duration goes with its frequency; a unit and an amplitude with the compensator."""
+    """A duration depends on its frequency, an amplitude on the compensator."""
     rows = [{HZ: hz, A: a, S: 1.0 / hz} for hz in (1.0, 10.0) for a in (3.0, 6.0)]
     assert [each.key for each in dimensions([A, HZ, S], rows)] == [HZ, A]
     rows = [
@@ -26,7 +26,7 @@ def test_an_amplitude_stays_where_each_run_has_a_frequency_of_its_own():
 
 def test_names_have_units():
     keys = [HZ, A, "device.load_kg", "waveform.components.0.frequency_hz", "x.gap_um", "order"]
-    # By a full cross, so that no key follows another one.
+    # A full grid, so that no key depends on another.
     crossed = [{}]
     for key in keys:
         crossed = [row | {key: value} for row in crossed for value in (1.0, 2.0)]
@@ -66,7 +66,7 @@ def test_a_value_is_shown_by_what_people_call_it(value, short):
 
 
 def test_experiments_are_compared_key_by_key():
-    """Noise and names of runs are no difference of the rig."""
+    """Seeds and names of runs are ignored."""
     one = {"name": "a", "device": {"seed": 1, "load_kg": 0.0}, "compensator": "none",
            "waveform": {"components": ({"amplitude": 1.0}, {"amplitude": 5.0})}}  # fmt: skip
     other = {"name": "b", "device": {"seed": 2, "load_kg": 3.7}, "compensator": {"model": "m.yaml"},

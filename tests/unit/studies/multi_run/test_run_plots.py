@@ -1,13 +1,61 @@
-"""Figures of loops."""
+"""Figures of runs side by side."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
-from hilctl.studies.multi_run import plots_loops
+from hilctl.analysis.plot_style import WITH, WITHOUT
 from hilctl.studies.multi_run.collect import RunSeries
+from hilctl.studies.multi_run.run_plots import (
+    before_after_sheet,
+    error_sheet,
+    line_of,
+    looks,
+    loop_sheets,
+    minor_loop_sheet,
+    model_sheet,
+    spread,
+)
+from hilctl.studies.multi_run.varied_parameter import WITHOUT_COMPENSATOR, VariedParameter
+
+AMPLITUDE = VariedParameter("a", "amplitude", "A", (1.0, 2.0, 3.0))
+
+
+def lightness(colour):
+    return sum(w * c for w, c in zip((0.21, 0.72, 0.07), to_rgb(colour), strict=True))
+
+
+def test_numbers_keep_their_order_in_grey():
+    found = looks(AMPLITUDE, AMPLITUDE.values)
+    shades = [lightness(found[value]["color"]) for value in AMPLITUDE.values]
+    assert shades == sorted(shades)
+    assert shades[2] - shades[0] > 0.35
+
+
+def test_names_have_colours_and_signs_of_their_own():
+    found = looks(None, ["none", "b", "c"])
+    assert len({look["color"] for look in found.values()}) == 3
+    assert len({look["marker"] for look in found.values()}) == 3
+    assert "marker" not in line_of(found["b"])
+
+
+def test_runs_without_a_compensator_look_as_on_the_page_of_a_single_run():
+    """The colour is the same for values and names."""
+    kinds = VariedParameter("compensator", "compensator", "", ("none", "a", "b"))
+    for found, plain in (
+        (looks(kinds, kinds.values), "none"),
+        (looks(None, [WITHOUT_COMPENSATOR, "a", "b"]), WITHOUT_COMPENSATOR),
+    ):
+        assert (found[plain]["color"], found["a"]["color"]) == (WITHOUT, WITH)
+        assert found["b"]["color"] not in {WITHOUT, WITH}
+
+
+def test_many_are_spread_with_both_ends():
+    assert spread(list(range(20)), 4) == [0, 6, 13, 19]
+    assert spread([1, 2], 7) == [1, 2]
 
 
 def drawn(panel):
@@ -21,7 +69,7 @@ def labels(axes):
 
 
 def test_loops_by_each_number_at_values_of_the_others(crossed):
-    sheets = {sheet.name: sheet for sheet in plots_loops.loop_sheets(crossed)}
+    sheets = {sheet.name: sheet for sheet in loop_sheets(crossed)}
     assert list(sheets) == ["loops_by_frequency", "loops_by_amplitude"]
     assert [panel.title for panel in sheets["loops_by_frequency"].panels] == ["3 A", "6 A"]
     axes = drawn(sheets["loops_by_frequency"].panels[0])
@@ -30,13 +78,13 @@ def test_loops_by_each_number_at_values_of_the_others(crossed):
 
 
 def test_a_value_has_one_colour_in_all_panels(crossed):
-    sheet = next(iter(plots_loops.loop_sheets(crossed)))
+    sheet = next(iter(loop_sheets(crossed)))
     colours = [[line.get_color() for line in drawn(panel).lines] for panel in sheet.panels]
     assert colours[0] == colours[1]
 
 
 def test_before_and_after_of_the_same_settings(compensated):
-    sheet = plots_loops.before_after_sheet(compensated)
+    sheet = before_after_sheet(compensated)
     assert [panel.title for panel in sheet.panels] == ["1 Hz", "100 Hz"]
     axes = drawn(sheet.panels[1])
     assert labels(axes)[1:] == ["without compensator", "omega"]
@@ -45,14 +93,14 @@ def test_before_and_after_of_the_same_settings(compensated):
 
 
 def test_runs_of_one_kind_have_no_before_and_after(crossed):
-    assert plots_loops.before_after_sheet(crossed) is None
-    assert plots_loops.error_sheet(crossed) is None
-    assert plots_loops.model_sheet(crossed) is None
-    assert plots_loops.minor_loop_sheet(crossed) is None
+    assert before_after_sheet(crossed) is None
+    assert error_sheet(crossed) is None
+    assert model_sheet(crossed) is None
+    assert minor_loop_sheet(crossed) is None
 
 
 def test_errors_of_compensated_runs(compensated):
-    sheet = plots_loops.error_sheet(compensated)
+    sheet = error_sheet(compensated)
     axes = drawn(sheet.panels[0])
     assert labels(axes) == ["1 Hz", "100 Hz"]
     assert np.ptp(axes.lines[0].get_ydata()) == pytest.approx(80.0 * 2.0 * np.sin(0.01), rel=0.01)
@@ -61,7 +109,7 @@ def test_errors_of_compensated_runs(compensated):
 
 def test_a_run_alone_shows_its_error(compensated):
     alone = RunSeries("one", compensated.runs[2:3], ())
-    assert len(plots_loops.error_sheet(alone).panels) == 1
+    assert len(error_sheet(alone).panels) == 1
 
 
 def test_minor_loops_are_marked_within_the_cycle(make_run, make_digest):
@@ -69,7 +117,7 @@ def test_minor_loops_are_marked_within_the_cycle(make_run, make_digest):
     wave = 4.0 * np.sin(phase) + 3.0 * np.sin(3.0 * phase)
     run = make_run(4.0, 20.0, digest=make_digest(loop=np.array((wave, 5.0 * wave))))
     run = replace(run, figures=replace(run.figures, minor_low_um=26.0))
-    sheet = plots_loops.minor_loop_sheet(RunSeries("minor", (run,), tuple(run.values)))
+    sheet = minor_loop_sheet(RunSeries("minor", (run,), tuple(run.values)))
     assert labels(drawn(sheet.panels[0])) == ["cycle", "minor loop", "minor loop"]
 
 
@@ -77,6 +125,6 @@ def test_the_model_s_error_stands_beside_its_loop(make_run, make_digest):
     modelled = np.array(([0.0, 1.0, 0.0], [0.0, 10.0, 0.0], [0.0, 9.0, 0.0]))
     digest = make_digest(modelled=modelled, model_error_percent=10.0)
     run = make_run(4.0, 20.0, digest=digest)
-    axes = drawn(plots_loops.model_sheet(RunSeries("m", (run,), ())).panels[0])
+    axes = drawn(model_sheet(RunSeries("m", (run,), ())).panels[0])
     assert labels(axes) == ["measured", "model"]
     assert [text.get_text() for text in axes.texts] == ["error 10.0 %"]

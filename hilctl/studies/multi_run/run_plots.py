@@ -1,0 +1,372 @@
+"""Figures of runs side by side: loops, errors, step and frequency responses."""
+
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from functools import partial
+from itertools import cycle
+from typing import Any, TypeAlias, TypeVar
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+
+from hilctl.analysis.figure_layout import FigureSpec, Panel
+from hilctl.analysis.plot_style import DISPLACEMENT, ERROR, MARK, QUIET, REFERENCE, WITH, WITHOUT
+from hilctl.base.formatting import quantity, significant
+from hilctl.base.types import C128, F64
+from hilctl.studies.multi_run.collect import RunSeries, SeriesRun
+from hilctl.studies.multi_run.digest import RunDigest
+from hilctl.studies.multi_run.minor_loops import minor_parts
+from hilctl.studies.multi_run.varied_parameter import WITHOUT_COMPENSATOR, VariedParameter
+
+Item = TypeVar("Item")
+Measured: TypeAlias = tuple[SeriesRun, RunDigest]
+
+_SIGNS = ("o", "s", "^", "D", "v", "P", "X", "<", ">")
+_LINES = ("-", "--", "-.", ":")
+_NAMED = (WITH, WITHOUT, ERROR, MARK, "#E69F00", "#56B4E9", REFERENCE, QUIET)
+_MOST_CURVES = 7
+"""Most distinguishable curves."""
+
+
+def spread(items: Sequence[Item], most: int = _MOST_CURVES) -> list[Item]:
+    """Return at most ``most`` evenly spread items of a sequence, including both ends."""
+    if len(items) <= most:
+        return list(items)
+    return [items[k] for k in np.unique(np.linspace(0, len(items) - 1, most).round().astype(int))]
+
+
+def looks(dimension: VariedParameter | None, values: Sequence[Hashable]) -> Mapping[Hashable, Any]:
+    """Return colour and marker for each value.
+
+    Numbers use viridis, which keeps its order in greyscale and for colour-blind readers. Names use
+    the colours of Okabe and Ito.
+
+    Args:
+        dimension: The parameter of the values; None for names.
+        values: The values.
+    """
+    if dimension is not None and dimension.numeric and len(values) > 1:
+        shades = mpl.colormaps["viridis"](np.linspace(0.0, 0.78, len(values)))
+        colours = [mpl.colors.to_hex(shade) for shade in shades]
+    else:
+        names = [value if dimension is None else dimension.text(value) for value in values]
+        colours = _of_names(names)
+    return {
+        value: {"color": colour, "marker": _SIGNS[k % len(_SIGNS)]}
+        for k, (value, colour) in enumerate(zip(values, colours, strict=True))
+    }
+
+
+def _of_names(names: Sequence[Hashable]) -> list[str]:
+    """Return one colour per name; one colour is reserved for runs without a compensator."""
+    if WITHOUT_COMPENSATOR not in names:
+        return [_NAMED[k % len(_NAMED)] for k in range(len(names))]
+    others = cycle(colour for colour in _NAMED if colour != WITHOUT)
+    return [WITHOUT if name == WITHOUT_COMPENSATOR else next(others) for name in names]
+
+
+def line_of(look: Mapping[str, Any], number: int = 0) -> dict[str, Any]:
+    """Return a line style without a marker; its number selects the dashes."""
+    return {"color": look["color"], "linestyle": _LINES[number % len(_LINES)]}
+
+
+_MOST_PANELS = 6
+_SQUARE = 0.9
+_DISPLACEMENT_AXIS = "displacement, µm"
+
+
+def loop_sheets(series: RunSeries) -> Iterator[FigureSpec]:
+    """Yield the loops against each numeric parameter, one panel per value of the others."""
+    for along in series.dimensions:
+        groups = _groups(series, along)
+        if along.numeric and groups:
+            panels = [
+                Panel(partial(_draw_loops, along=along, runs=runs), title, _SQUARE)
+                for title, runs in spread(groups, _MOST_PANELS)
+            ]
+            more = f", {len(panels)} of {len(groups)} shown" if len(panels) < len(groups) else ""
+            caption = f"Average steady loops by {along.name}{more}."
+            name = f"loops_by_{along.name.replace(' ', '_')}"
+            yield FigureSpec(name, caption, tuple(panels), alike=_alike(groups))
+
+
+def _alike(groups: Sequence[tuple[str, Sequence[Measured]]]) -> bool:
+    """Return whether all loops have the same input, so that their panels can share axes."""
+    return len({_input_axis(digest) for _, runs in groups for _, digest in runs}) == 1
+
+
+def _groups(series: RunSeries, along: VariedParameter) -> list[tuple[str, list[Measured]]]:
+    """Return groups of runs that differ in one parameter only, with their common values."""
+    others = [each for each in series.dimensions if each is not along]
+    found: dict[tuple[Hashable, ...], dict[Hashable, Measured]] = {}
+    for run, digest in series.measured:
+        if digest.loop.size:
+            held = tuple(run.values.get(each.key) for each in others)
+            found.setdefault(held, {}).setdefault(run.values.get(along.key), (run, digest))
+    order = {each.key: {v: n for n, v in enumerate(each.values)} for each in others}
+
+    def place(held: tuple[Hashable, ...]) -> list[int]:
+        return [order[e.key].get(v, -1) for e, v in zip(others, held, strict=True)]
+
+    groups = []
+    for held in sorted(found, key=place):
+        runs = [found[held][value] for value in along.values if value in found[held]]
+        texts = [e.text(v) for e, v in zip(others, held, strict=True) if v is not None]
+        if len(runs) > 1:
+            groups.append((", ".join(texts), runs))
+    return groups
+
+
+def _input_axis(digest: RunDigest) -> str:
+    return "reference, µm" if digest.compensated else f"command, {digest.command_unit}"
+
+
+def _draw_loops(axes: Axes, along: VariedParameter, runs: Sequence[Measured]) -> None:
+    shown = spread(runs)
+    look = looks(along, spread(along.values))
+    own = looks(along, [run.values[along.key] for run, _ in shown])
+    for run, digest in shown:
+        value = run.values[along.key]
+        style = line_of(look.get(value) or own[value])
+        axes.plot(*digest.loop, **style, linewidth=0.9, label=along.text(value))
+        axes.set(xlabel=_input_axis(digest), ylabel=_DISPLACEMENT_AXIS)
+
+
+def minor_loop_sheet(series: RunSeries) -> FigureSpec | None:
+    """Return loops with their minor loops, one panel per run; None without minor loops."""
+    runs = [
+        (run, digest)
+        for run, digest in series.measured
+        if digest.loop.size and (run.figures.minor_low_um or run.figures.minor_high_um)
+    ]
+    if not runs:
+        return None
+    panels, more = _panels(series, runs, _draw_minor)
+    caption = f"Minor loops, at reversals of the input within the cycle{more}."
+    return FigureSpec("minor_loops", caption, panels, alike=True)
+
+
+def _panels(
+    series: RunSeries, runs: Sequence[Measured], draw: Callable[..., None]
+) -> tuple[tuple[Panel, ...], str]:
+    """Return one panel per run, of a selection of many runs, and a note on the selection."""
+    panels = tuple(
+        Panel(partial(draw, digest=digest), series.text(run), _SQUARE)
+        for run, digest in spread(runs, _MOST_PANELS)
+    )
+    return panels, f"; {len(panels)} of {len(runs)} runs" if len(panels) < len(runs) else ""
+
+
+def _draw_minor(axes: Axes, digest: RunDigest) -> None:
+    loop = digest.loop
+    axes.plot(*loop, color=QUIET, linewidth=0.8, label="cycle")
+    for part in minor_parts(loop[0, :-1], loop[1, :-1]):
+        axes.plot(*part, color=MARK, linewidth=1.3, label="minor loop")
+    axes.set(xlabel=_input_axis(digest), ylabel=_DISPLACEMENT_AXIS)
+
+
+def model_sheet(series: RunSeries) -> FigureSpec | None:
+    """Return measured and modelled loops; None without models."""
+    runs = [each for each in series.measured if each[1].modelled.size]
+    if not runs:
+        return None
+    panels, more = _panels(series, runs, _draw_model)
+    caption = f"Measured and modelled loops{more}."
+    return FigureSpec("model_against_measured", caption, panels, alike=True)
+
+
+def _draw_model(axes: Axes, digest: RunDigest) -> None:
+    command, measured, modelled = digest.modelled
+    axes.plot(command, measured, color=QUIET, linewidth=2.2, alpha=0.6, label="measured")
+    axes.plot(command, modelled, color=DISPLACEMENT, linewidth=0.9, label="model")
+    axes.set(xlabel=f"command, {digest.command_unit}", ylabel=_DISPLACEMENT_AXIS)
+    _note(axes, f"error {quantity(digest.model_error_percent, '%')}")
+
+
+def before_after_sheet(series: RunSeries) -> FigureSpec | None:
+    """Return loops without and with each compensator, normalised to their range; None without both.
+
+    Command and reference have different units. A perfect compensator gives a straight line from
+    corner to corner.
+    """
+    pairs = pairs_of(series)
+    if not pairs:
+        return None
+    panels = tuple(
+        Panel(partial(_draw_pair, before=before, after=after), title, _SQUARE)
+        for title, before, after in spread(pairs, _MOST_PANELS)
+    )
+    caption = "Loops before and after compensation, normalised; dotted: no hysteresis."
+    return FigureSpec("before_and_after", caption, panels, alike=True)
+
+
+Pair = tuple[str, RunDigest, list[tuple[str, RunDigest]]]
+
+
+def pairs_of(series: RunSeries) -> list[Pair]:
+    """Return each run without a compensator, with the runs of the same settings with one."""
+    with_loop = [each for each in series.measured if each[1].loop.size]
+    before = [each for each in with_loop if not each[1].compensated]
+    after = [each for each in with_loop if each[1].compensated]
+    others = [each for each in series.dimensions if not each.is_compensator]
+    found = []
+    for run, digest in before:
+        same = [
+            (_compensator(other), with_one)
+            for other, with_one in after
+            if all(run.values.get(e.key) == other.values.get(e.key) for e in others)
+        ]
+        if same:
+            texts = [e.text(run.values[e.key]) for e in others if run.values.get(e.key) is not None]
+            found.append((", ".join(texts), digest, same))
+    return found
+
+
+def _compensator(run: SeriesRun) -> str:
+    name = run.values.get("compensator")
+    return str(name) if name not in {None, "none"} else "with compensator"
+
+
+def _draw_pair(axes: Axes, before: RunDigest, after: Sequence[tuple[str, RunDigest]]) -> None:
+    lines = [(WITHOUT_COMPENSATOR, before), *after]
+    look = looks(None, [name for name, _ in lines])
+    axes.plot([0, 100], [0, 100], color=REFERENCE, linestyle=":", linewidth=0.8)
+    for name, digest in lines:
+        loop_input, moved = (_of_range(each) for each in digest.loop)
+        axes.plot(loop_input, moved, **line_of(look[name]), linewidth=0.9, label=name)
+    axes.set(xlabel="input, % of its range", ylabel="displacement, %")
+
+
+def _of_range(values: F64) -> F64:
+    low, whole = float(values.min()), float(np.ptp(values))
+    percent: F64 = 100.0 * (values - low) / whole if whole > 0.0 else values - low
+    return percent
+
+
+def error_sheet(series: RunSeries) -> FigureSpec | None:
+    """Return the error over one cycle of compensated runs; None without any."""
+    runs = [each for each in series.measured if each[1].error_um.size]
+    if not runs:
+        return None
+    along = next((each for each in series.dimensions if each.numeric), None)
+    if along is None:
+        groups = [("", runs)]
+    else:
+        groups = [
+            (title, [each for each in members if each[1].error_um.size])
+            for title, members in _groups(series, along)
+        ]
+        groups = [(title, members) for title, members in groups if members] or [("", runs)]
+    panels = tuple(
+        Panel(partial(_draw_error, text=_text_of(series, along), runs=members), title)
+        for title, members in spread(groups, _MOST_PANELS)
+    )
+    caption = "Error over one average cycle: displacement minus reference."
+    return FigureSpec("error_history", caption, panels, alike=len(panels) > 1)
+
+
+def _text_of(series: RunSeries, along: VariedParameter | None) -> Callable[[SeriesRun], str]:
+    if along is None:
+        return series.text
+    return lambda run: along.text(run.values[along.key])
+
+
+def _draw_error(axes: Axes, text: Callable[[SeriesRun], str], runs: Sequence[Measured]) -> None:
+    shown = spread(runs)
+    shades = looks(
+        VariedParameter("", "", "", tuple(map(float, range(len(shown))))), range(len(shown))
+    )
+    for number, (run, digest) in enumerate(shown):
+        axes.plot(*digest.error_um, **line_of(shades[number]), linewidth=0.9, label=text(run))
+    axes.set(xlabel="phase, cycles", ylabel="error, µm", xlim=(0.0, 1.0))
+
+
+def _note(axes: Axes, text: str) -> None:
+    axes.annotate(
+        text,
+        (0.04, 0.96),
+        xycoords="axes fraction",
+        va="top",
+        fontsize=6.5,
+        color=QUIET,
+    )
+
+
+def step_sheet(series: RunSeries) -> FigureSpec | None:
+    """Return displacements after a step, one panel per run; None without any."""
+    runs = [each for each in series.measured if each[1].step.size]
+    if not runs:
+        return None
+    shown = spread(runs, _MOST_PANELS)
+    panels = tuple(
+        Panel(partial(_draw_step, digest=digest), _title(series, run)) for run, digest in shown
+    )
+    caption = "Displacement after a step of the command, with natural frequency and damping."
+    return FigureSpec("step_response", caption, panels)
+
+
+def _title(series: RunSeries, run: SeriesRun) -> str:
+    values = [
+        each.text(run.values[each.key])
+        for each in series.dimensions
+        if each.numeric and run.values.get(each.key) is not None
+    ]
+    return ", ".join(values) or series.text(run)
+
+
+def _draw_step(axes: Axes, digest: RunDigest) -> None:
+    t, moved = digest.step
+    natural, damping = digest.figures.natural_hz, digest.figures.damping_ratio
+    axes.plot(1e3 * t, moved, **line_of(looks(None, [0])[0]))
+    axes.set(xlabel="time after the step, ms", ylabel="displacement, µm")
+    if natural and damping is not None:
+        text = f"{quantity(natural, 'Hz')}, damping ratio {significant(damping)}"
+        axes.annotate(text, (0.97, 0.06), xycoords="axes fraction", ha="right", fontsize=7,
+                      color=QUIET)  # fmt: skip
+
+
+def frequency_sheet(series: RunSeries) -> FigureSpec | None:
+    """Return small-signal responses, measured and fitted; None without any."""
+    runs = [each for each in series.measured if each[1].response is not None]
+    if not runs:
+        return None
+    shown = spread(runs)
+    along = next((each for each in series.dimensions if each.numeric), None)
+    text = partial(_title, series)
+    panels = tuple(
+        Panel(partial(_draw_response, runs=shown, along=along, text=text, part=part), part)
+        for part in ("magnitude", "phase")
+    )
+    caption = "Small-signal response: measured (dots) and fitted (lines)."
+    return FigureSpec("frequency_response", caption, panels)
+
+
+def _draw_response(
+    axes: Axes,
+    runs: Sequence[Measured],
+    along: VariedParameter | None,
+    text: Callable[[SeriesRun], str],
+    part: str,
+) -> None:
+    values = [run.values.get(along.key) if along else text(run) for run, _ in runs]
+    look = looks(along, list(dict.fromkeys(values)))
+    for (run, digest), value in zip(runs, values, strict=True):
+        if (found := digest.response) is None:
+            continue
+        measured, fitted = (_part(each, part) for each in (found.response, found.fitted))
+        colour = look[value]["color"]
+        axes.plot(found.frequency_hz, measured, ".", color=colour, markersize=2.0, alpha=0.7)
+        axes.plot(found.frequency_hz, fitted, color=colour, linewidth=0.9, label=text(run))
+        unit = digest.command_unit
+        axes.set_ylabel(f"magnitude, µm/{unit}" if part == "magnitude" else "phase, degrees")
+    axes.set(
+        xscale="log", xlabel="frequency, Hz", yscale="log" if part == "magnitude" else "linear"
+    )
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter("{x:g}")
+
+
+def _part(response: C128, part: str) -> F64:
+    size: F64 = np.abs(response)
+    degrees: F64 = np.degrees(np.unwrap(np.angle(response)))
+    return size if part == "magnitude" else degrees
