@@ -9,7 +9,7 @@ from scipy.interpolate import CubicSpline
 from hilctl.base.errors import DataError
 from hilctl.base.types import F64
 from hilctl.identify.data.records import Record, Records, SteadyLoop
-from hilctl.identify.fit_data import PERIODS, FitData
+from hilctl.identify.fit_api import PERIODS, FitData
 from hilctl.identify.parallel import parallel_map
 from hilctl.identify.staged.fit_data import StagedFitData
 from hilctl.identify.staged.objective import response_um

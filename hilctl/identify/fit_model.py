@@ -15,8 +15,14 @@ from hilctl.experiment.model_validity import ALL, spectrum
 from hilctl.identify.creep_fit import creep_of, without_creep
 from hilctl.identify.data.records import History, Record, SteadyLoop, turning_points
 from hilctl.identify.evaluation import Evaluation, judge
-from hilctl.identify.fit_api import FitJob, FitRequest, FoundModel, StartOutcome
-from hilctl.identify.fit_data import FitData, search_data
+from hilctl.identify.fit_api import (
+    FitData,
+    FitJob,
+    FitRequest,
+    FoundModel,
+    StartOutcome,
+    search_data,
+)
 from hilctl.identify.registry import CATALOGUE
 from hilctl.identify.resonances import without_modes
 from hilctl.identify.settings import FitSettings

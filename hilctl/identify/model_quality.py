@@ -7,9 +7,9 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from hilctl.base.types import F64
-from hilctl.identify.cross_validation import HeldOut
 from hilctl.identify.data.records import Record, SteadyLoop
 from hilctl.identify.fit_model import FittedModel
+from hilctl.identify.model_selection import HeldOut
 from hilctl.identify.settings import FitSettings
 
 Grade: TypeAlias = Literal["good", "usable", "not a model"]

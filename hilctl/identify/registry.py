@@ -5,16 +5,20 @@ from dataclasses import dataclass
 
 from hilctl.base.errors import InputError
 from hilctl.base.yaml import did_you_mean
-from hilctl.identify.field.field_fits import fit_field
+from hilctl.identify.field.duhem_search import fit_generalised_duhem
+from hilctl.identify.field.field_search import fit_field
 from hilctl.identify.fit_api import FitJob, FoundModel
-from hilctl.identify.generalised_duhem.search import fit_generalised_duhem
-from hilctl.identify.literature.asymmetric import fit_asymmetric
-from hilctl.identify.literature.generalised_pi import fit_generalised
-from hilctl.identify.literature.linear_weights import fit_kp, fit_preisach, fit_straight
-from hilctl.identify.literature.ode_models import fit_bouc_wen, fit_duhem
+from hilctl.identify.literature import (
+    fit_asymmetric,
+    fit_bouc_wen,
+    fit_duhem,
+    fit_generalised,
+    fit_kp,
+    fit_preisach,
+    fit_straight,
+)
 from hilctl.identify.searched.butterfly import fit_butterfly
-from hilctl.identify.searched.integrated import fit_exponential
-from hilctl.identify.searched.plays import fit_plays
+from hilctl.identify.searched.plays import fit_exponential, fit_plays
 from hilctl.identify.settings import FitKind
 from hilctl.identify.staged.staged_fits import fit_free, fit_staged
 

@@ -7,8 +7,6 @@ ROOT = UNIT.parents[1]
 PACKAGES = {Path(): ROOT / "hilctl", Path("drivers"): ROOT / "drivers" / "hilctl_drivers"}
 
 WITHOUT = {
-    "identify/fit_api": "what a fit gets and returns; identify/test_fit_model.py fills both",
-    "identify/generalised_duhem/tables": "identify/generalised_duhem/test_search.py tests both",
     "run/guardian_process": "tests/faults/test_processes.py runs it; run/test_job.py the limits",
     "base/types": "names of types; waveforms/test_build.py reads arrays in chunks",
     "base/device": "the contract of devices: tests/contract/test_devices.py holds each to it",

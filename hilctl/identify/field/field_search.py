@@ -1,4 +1,4 @@
-"""From a few starts to the stages; the weights follow from them, round by round."""
+"""Fit of the effective-field model: stages from a few starts, weights round by round."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -8,7 +8,7 @@ import numpy as np
 from hilctl.base.types import F64, I64
 from hilctl.identify.field.densities import Curve, Equations, Grid, Weights, outputs, solve, table
 from hilctl.identify.field.design_matrix import Rows, chosen
-from hilctl.identify.field.preprocess import Prepared
+from hilctl.identify.field.preprocess import Prepared, histories_of
 from hilctl.identify.field.stages import (
     HIGH,
     LOW,
@@ -22,9 +22,11 @@ from hilctl.identify.field.stages import (
     stages_in,
     stages_of,
 )
-from hilctl.identify.fit_api import OnProgress
+from hilctl.identify.fit_api import FitJob, FoundModel, OnProgress
 from hilctl.identify.least_squares import SearchPoint, settle
 from hilctl.identify.parallel import parallel_map
+from hilctl.models.effective_field import FieldModel, OutputCurve
+from hilctl.models.staged import StagedModel
 
 TRIED = 0.2  # of a unit: change that slopes are taken by; kinks of single rows are smoothed
 MOVES = 0.1  # of the way to the next: change of a threshold that makes about as much difference
@@ -342,3 +344,58 @@ def _lengths(count: int) -> tuple[float, ...]:
         return (0.15,)[:count]
     first, last = np.log(LENGTHS[0]), np.log(LENGTHS[-1])
     return tuple(np.exp(np.linspace(first, last, count)).tolist())
+
+
+FINER = 8  # cells of the model's tables to each piece of a spline
+
+
+def fit_field(job: FitJob) -> FoundModel:
+    """Fit plays and drags of a field, losses, structure and delay.
+
+    Raises:
+        DataError: A record is a steady loop: loops leave curve and losses undetermined.
+    """
+    settings = job.settings
+    data = Prepared(histories_of(job.data.records, "an effective field"))
+    size = Size(settings.plays, settings.drags, settings.cells, settings.knots)
+    search = FieldSearch(data, size, job.least)
+    if isinstance(job.start, FieldEnd):
+        found = search.go_on(job.start)
+    else:
+        found = search.find(Stages(), job.progress)
+    known = found.known.parameters(found.weights.offset_um)
+    numbers = len(known) + int((found.weights.slopes > 0.0).sum()) + settings.knots
+    return FoundModel(_model(job, found), numbers, known, end=found)
+
+
+def _model(job: FitJob, found: FieldEnd) -> StagedModel:
+    grid, weights, known = found.grid, found.weights, found.known
+    drags = weights.slopes[grid.thresholds.size :].tolist()
+    lines = (*tabled(weights.slopes[: grid.thresholds.size]), *drags)
+    hysteresis = FieldModel(
+        thresholds=tuple(grid.thresholds.tolist()),
+        lengths=tuple(grid.lengths.tolist()),
+        lowest=grid.lowest,
+        cell=grid.piece / FINER,
+        slopes=tuple(tuple(line) for line in lines),
+        curve=OutputCurve(
+            operators_um=tuple(weights.curve.operators.tolist()),
+            displacement_um=tuple(weights.curve.displacement_um.tolist()),
+        ),
+        losses=known.losses,
+        **job.data.common(weights.offset_um),
+    )
+    return StagedModel.around(hysteresis, structure=known.structure, delay_s=known.delay_s)
+
+
+def tabled(splines: F64) -> list[list[float]]:
+    """Return the slopes that splines come to, in FINER cells to each of their pieces.
+
+    Args:
+        splines: float64[p, c], weights of the splines of each play.
+    """
+    t = (np.arange(FINER) + 0.5) / FINER
+    parts = 0.5 * (1.0 - t) ** 2, 0.5 + t - t**2, 0.5 * t**2
+    pieces = splines.shape[1] - 2
+    found = sum(splines[:, k : k + pieces, None] * part for k, part in enumerate(parts))
+    return np.reshape(found, (len(splines), -1)).tolist()

@@ -13,8 +13,7 @@ from hilctl.base.files import check_writable, write_text
 from hilctl.base.samples import Flag
 from hilctl.identify.data.data_files import history_from_recording
 from hilctl.identify.data.records import History
-from hilctl.identify.fit_api import OnProgress, ignore_progress
-from hilctl.identify.fit_data import FitData
+from hilctl.identify.fit_api import FitData, OnProgress, ignore_progress
 from hilctl.identify.fit_model import VERSIONS, error_table, identified_range
 from hilctl.identify.model_quality import data_reasons
 from hilctl.identify.refine.regularisation import (

@@ -7,11 +7,10 @@ import numpy as np
 
 from hilctl.base.errors import DataError
 from hilctl.base.types import F64, CommandUnit
-from hilctl.identify.cross_validation import HeldOut, folds_of
 from hilctl.identify.data.records import History
 from hilctl.identify.evaluation import judgement_of
-from hilctl.identify.fit_api import OnProgress
-from hilctl.identify.fit_data import FitData
+from hilctl.identify.fit_api import FitData, OnProgress
+from hilctl.identify.model_selection import HeldOut, folds_of
 from hilctl.identify.refine.residual_fit import NormalEquations, ResidualFit
 from hilctl.models.base import HysteresisModel
 from hilctl.models.refined import RefinedModel

@@ -10,8 +10,7 @@ import numpy as np
 
 from hilctl.base.types import F64, CommandUnit
 from hilctl.identify.fit_api import LEAST_SLOPE
-from hilctl.identify.staged.fit_data import Linear, StagedFitData
-from hilctl.identify.staged.sensitivity import LAG_S, PARAMETERS
+from hilctl.identify.staged.fit_data import LAG_S, PARAMETERS, Linear, StagedFitData
 from hilctl.models.deadband import DeadbandFunction
 from hilctl.models.integrated import IntegratedModel
 from hilctl.models.mechanics import FirstMode

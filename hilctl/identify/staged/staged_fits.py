@@ -8,8 +8,8 @@ from hilctl.base.types import F64
 from hilctl.identify.evaluation import weight_roots
 from hilctl.identify.fit_api import LEAST_SLOPE, FitJob, FoundModel
 from hilctl.identify.least_squares import numbered, smooth_densities
-from hilctl.identify.literature.linear_weights import cells_below
-from hilctl.identify.staged.fit_data import StagedFitData
+from hilctl.identify.literature import cells_below
+from hilctl.identify.staged.fit_data import GAMMA_S, GROWTH, LAG_S, SPACING, StagedFitData
 from hilctl.identify.staged.objective import (
     DYNAMIC,
     STAGE_PARAMETERS,
@@ -19,7 +19,6 @@ from hilctl.identify.staged.objective import (
     staged_model,
     stages_of,
 )
-from hilctl.identify.staged.sensitivity import GAMMA_S, GROWTH, LAG_S, SPACING
 from hilctl.identify.staged.staged_search import StagedEnd, find_staged
 from hilctl.models.preisach import PreisachModel
 from hilctl.models.staged import StagedModel

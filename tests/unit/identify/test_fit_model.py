@@ -12,8 +12,7 @@ from hilctl.base.errors import DataError
 from hilctl.base.types import CommandUnit
 from hilctl.identify.data.records import History, Records, SteadyLoop
 from hilctl.identify.evaluation import judge
-from hilctl.identify.fit_api import LEAST_SLOPE, FitRequest
-from hilctl.identify.fit_data import FitData
+from hilctl.identify.fit_api import LEAST_SLOPE, FitData, FitRequest
 from hilctl.identify.fit_model import FittedModel, fit_kind, fit_model, identified_range
 from hilctl.identify.settings import FitKind, FitSettings
 from hilctl.models.creep import CreepModel

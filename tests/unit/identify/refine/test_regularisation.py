@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from hilctl.base.errors import DataError
-from hilctl.identify.cross_validation import HeldOut
 from hilctl.identify.evaluation import judgement_of
-from hilctl.identify.fit_data import FitData
+from hilctl.identify.fit_api import FitData
+from hilctl.identify.model_selection import HeldOut
 from hilctl.identify.refine.regularisation import (
     STRENGTHS,
     Regularisation,

@@ -5,22 +5,16 @@ command leaves. It forgets, as the loops do, so that an error of one place does 
 all the rest; and its fields depend on the table by the same equation, with the same forgetting.
 """
 
-import math
 from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
-from hilctl.base.errors import DataError
 from hilctl.base.types import F64, I64
-from hilctl.identify.data.records import History, SteadyLoop
 from hilctl.identify.field.densities import Curve
 from hilctl.identify.field.design_matrix import chosen
-from hilctl.identify.field.preprocess import OFF, Prepared
-from hilctl.identify.field.stages import Physical
-from hilctl.identify.fit_api import FitJob, FoundModel, OnProgress
-from hilctl.identify.generalised_duhem.tables import (
+from hilctl.identify.field.duhem_tables import (
     FIRST,
     HIGHEST,
     LOWEST,
@@ -33,10 +27,12 @@ from hilctl.identify.generalised_duhem.tables import (
     laid_over,
     prior,
 )
+from hilctl.identify.field.preprocess import OFF, Prepared, histories_of
+from hilctl.identify.field.stages import Physical
+from hilctl.identify.fit_api import FitJob, FoundModel, OnProgress
 from hilctl.identify.parallel import parallel_map
 from hilctl.kernels.generalised_duhem import duhem_columns
 from hilctl.models.generalised_duhem import GeneralisedDuhemModel
-from hilctl.models.mechanics import FirstMode
 from hilctl.models.staged import StagedModel
 
 COARSE_WAY, FINE_WAY = 0.03, 0.02  # of the span: furthest way between two points of a path
@@ -274,24 +270,16 @@ def fit_generalised_duhem(job: FitJob) -> FoundModel:
     """Fit a table of slopes, losses, structure and delay.
 
     Raises:
-        DataError: There are steady loops among the data: how a loop came to lie where it lies is
-            what tells the slopes inside the band from each other.
+        DataError: A record is a steady loop: slopes inside the band follow from the path to loops.
     """
-    loops = [record.label for record in job.data.records if isinstance(record, SteadyLoop)]
-    if loops:
-        raise DataError(
-            f"slopes all over a band are found from whole histories, not from steady loops:"
-            f" {loops[0]}; configs/identify_any.yaml is a campaign for it, --model staged takes"
-            " loops"
-        )
-    data = Prepared([r for r in job.data.records if isinstance(r, History)], POINTS, OFF)
+    data = Prepared(histories_of(job.data.records, "a table of slopes"), POINTS, OFF)
     settings = job.settings
     search = DuhemSearch(data, settings.cells, settings.across, job.least)
     if isinstance(job.start, DuhemEnd):
         found = search.go_on(job.start)
     else:
         found = search.find(job.progress)
-    parameters = _parameters(found)
+    parameters = found.known.parameters(found.offset_um)
     numbers = found.logs.size + len(NAMES)
     return FoundModel(_model(job, found), numbers, parameters, end=found)
 
@@ -310,18 +298,4 @@ def _model(job: FitJob, found: DuhemEnd) -> StagedModel:
         losses=known.losses,
         **job.data.common(found.offset_um),
     )
-    structure = FirstMode(
-        natural_hz=0.5 / (math.pi * known.radian_s), damping_ratio=known.damping_ratio
-    )
-    return StagedModel.around(hysteresis, structure=structure, delay_s=known.delay_s)
-
-
-def _parameters(found: DuhemEnd) -> dict[str, float]:
-    known = found.known
-    return {
-        **known.losses.model_dump(),
-        "natural_hz": 0.5 / (math.pi * known.radian_s),
-        "damping_ratio": known.damping_ratio,
-        "delay_s": known.delay_s,
-        "output_offset_um": found.offset_um,
-    }
+    return StagedModel.around(hysteresis, structure=known.structure, delay_s=known.delay_s)
