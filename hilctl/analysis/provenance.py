@@ -100,7 +100,7 @@ def _model(recording: Recording) -> Iterator[tuple[str, str]]:
 def model_error(model: HysteresisModel) -> str:
     """Return how far a model is from data: from those that its fit did not see, where known."""
     errors = model.provenance.errors_percent
-    for prefix, of in (("held_out_", "on data that the fit did not see"),
+    for prefix, of in (("held_out_", "on held-out data"),
                        ("", "on the data of the fit; on others it is not known")):  # fmt: skip
         peak, rms = errors.get(f"{prefix}peak"), errors.get(f"{prefix}rms")
         if peak is not None:

@@ -20,19 +20,18 @@ from hilctl.models.integrated import IntegratedModel
 from hilctl.models.mechanics import FurtherMode
 from hilctl.models.plays import PlayModel
 
-# A lag needs every sample: models with one would take the others for a rest.
+# Models with a lag need every sample.
 _EVERY_SAMPLE = {"staged", "field", "generalised_duhem"}
 PERIODS = 3
-"""Periods of a loop that a model of any kind is run through; the last is judged. Differential
-models forget slowly."""
+"""Simulated periods of a loop; the last is evaluated, since differential models settle slowly."""
 
-CREEP_S = 0.1  # time that creep is counted from
-BEYOND = 0.15  # of half the range: commands past it that an inverse may give out
+CREEP_S = 0.1  # time constant in the law of creep
+BEYOND = 0.15  # of half the range: margin of commands that an inverse may output
 
 
 @dataclass(frozen=True, slots=True)
 class _Run:
-    """One record: command and |rate|, float64[n]; the judged samples; their place among all."""
+    """One record: command and |rate|, float64[n]; its evaluated samples; their place among all."""
 
     command: F64
     speed: F64
@@ -42,38 +41,38 @@ class _Run:
 
 
 def search_data(records: Records, kind: str, unit: CommandUnit) -> "FitData":
-    """Return the records as a search of that kind of model goes through them, long ones thinned.
+    """Return the data of a search; long records are thinned if the kind of model permits it.
 
     Raises:
-        DataError: There are none.
+        DataError: There are no records.
     """
     return FitData(records if kind in _EVERY_SAMPLE else thinned(records), unit)
 
 
 class FitData:
-    """All records' commands, rates and judged displacements.
+    """Commands, rates and evaluated displacements of all records.
 
     Attributes:
         records: The records.
         unit: Unit of the command.
-        target_um: float64[N], measured displacement of all judged samples, record after record.
+        target_um: float64[N], measured displacement of all evaluated samples.
         places: For each record, its part of the N samples.
-        reach: Half the largest peak-to-peak command: no play with a larger threshold ever moves
-            in a steady cycle.
-        speed: Largest |rate| of the command, in command units a second.
+        reach: Half the largest peak-to-peak command; plays with a larger threshold do not move in a
+            steady cycle.
+        speed: Largest |rate| of the command, in command units per second.
         stroke_um: Largest peak-to-peak displacement of a record.
         input_range: Lowest and highest command.
-        output_range_um: Lowest and highest judged displacement.
+        output_range_um: Lowest and highest evaluated displacement.
     """
 
     def __init__(self, records: Records, unit: CommandUnit = "A") -> None:
         """Prepare records.
 
         Raises:
-            DataError: There are none.
+            DataError: There are no records.
         """
         if not records:
-            raise DataError("nothing to identify a model from: the list of loops is empty")
+            raise DataError("no records to fit: the list of loops and histories is empty")
         self.records = tuple(records)
         self.unit = unit
         self._runs: list[_Run] = []
@@ -100,9 +99,9 @@ class FitData:
 
     @cached_property
     def creep(self) -> F64:
-        """What each record may have of its own beside a model: float64[N, f].
+        """Columns of offset and creep per record, float64[N, f].
 
-        A constant, and for a whole history ln(1 + t / 0.1 s) as well, the usual law of creep.
+        A constant per record, and the usual law of creep ln(1 + t / 0.1 s) per history.
         """
         columns: list[F64] = []
         for record, place in zip(self.records, self.places, strict=True):
@@ -122,7 +121,7 @@ class FitData:
 
     @property
     def speeds(self) -> list[F64]:
-        """|rate| of each record's judged samples, command units a second; whole of a history."""
+        """|rate| of each loop's evaluated samples and of each whole history, per second."""
         return [run.speed[run.judged] if run.loop else run.speed for run in self._runs]
 
     @property
@@ -132,13 +131,13 @@ class FitData:
 
     @property
     def command_span(self) -> tuple[float, float]:
-        """The command's range and 15 % more, for inverses that need an end."""
+        """The range of the command plus 15 %, for inverses that need a bounded range."""
         low, high = self.input_range
         more = BEYOND * 0.5 * (high - low)
         return low - more, high + more
 
     def play_sum(self, direct: float, thresholds: F64, weights: F64, growth_s: float) -> F64:
-        """Return ``direct v + sum weights_i F_i[v]`` of all judged samples: float64[N]."""
+        """Return ``direct v + sum weights_i F_i[v]`` of all evaluated samples: float64[N]."""
         out = np.empty(self.target_um.size)
         for run in self._runs:
             response = np.empty(run.command.size)
@@ -150,7 +149,7 @@ class FitData:
         return out
 
     def columns(self, thresholds: F64, growth_s: float = 0.0) -> F64:
-        """Return the command and each play's output of all judged samples: float64[N, n + 1]."""
+        """Return command and output of each play for all evaluated samples: float64[N, n + 1]."""
         out = np.empty((self.target_um.size, thresholds.size + 1))
         for run in self._runs:
             response = np.empty((run.command.size, thresholds.size))
@@ -182,7 +181,7 @@ class FitData:
         return command, outputs, slopes
 
     def response_um(self, model: PlayModel) -> F64:
-        """Return a model's displacement of all judged samples: float64[N]."""
+        """Return a model's displacement of all evaluated samples: float64[N]."""
         x = self.play_sum(
             model.direct,
             np.array(model.thresholds),
@@ -196,7 +195,7 @@ class FitData:
         return x + model.output_offset_um
 
     def stack(self, run: Callable[[F64], F64]) -> F64:
-        """Run something without a rate on each record's command, and stack what is judged.
+        """Run a rate-independent function on each command, and stack the evaluated samples.
 
         Args:
             run: From a command, float64[n], to float64[n] or float64[n, m].
@@ -211,7 +210,7 @@ class FitData:
         return np.concatenate(parts)
 
     def swing(self, columns: F64) -> F64:
-        """Return how far each column, float64[N, m], moves in one record at most: float64[m]."""
+        """Return the largest peak-to-peak in a record of each column, float64[N, m]: float64[m]."""
         return np.asarray(np.max([np.ptp(columns[place], axis=0) for place in self.places], axis=0))
 
     def common(self, offset_um: float) -> dict[str, Any]:
@@ -228,25 +227,25 @@ LEAST_SLOPE = 0.01
 """Smallest slope that a model may have, of the mean slope of the data."""
 
 OnProgress: TypeAlias = Callable[[float, str], None]
-"""Called now and then with the part that is done (0 to 1) and what is being done."""
+"""Progress callback: completed part (0 to 1) and current step."""
 
 
 def ignore_progress(done: float, text: str) -> None:
-    """Take a progress report and do nothing with it."""
+    """Ignore a progress report."""
 
 
 @dataclass(frozen=True, slots=True)
 class FitRequest:
-    """Records to fit, and how.
+    """Records to fit, and settings.
 
     Attributes:
-        records: At least one loop or history; steady loops only for what has dynamics.
-        settings: The kind of model, and all other choices.
+        records: Loops and histories, at least one.
+        settings: Kind of model and all other settings.
         unit: Unit of the command.
-        source: Recordings or files that the data come from, for the provenance.
-        run: Runs fits that do not depend on each other.
-        progress: Called with what is being done.
-        start: Where the search begins, see :class:`FitJob`.
+        source: Names of recordings or files, for the provenance.
+        run: Runs independent fits.
+        progress: Progress callback.
+        start: Start of the search, see :class:`FitJob`.
         modes: Known further modes of the structure, for kinds that have them.
     """
 
@@ -262,15 +261,15 @@ class FitRequest:
 
 @dataclass(frozen=True, slots=True)
 class FitJob:
-    """Prepared data of one fit, and how it is made.
+    """Prepared data of one fit, and settings.
 
     Attributes:
-        data: What the model is to describe.
-        settings: The choices; only those of the kind count.
-        run: Runs what does not depend on each other.
-        progress: Called with what is being done.
-        start: ``end`` of a fit of this kind to other data, or of another size, to go on from;
-            kinds that have no use for it, and ends of others, are found from the beginning.
+        data: The data.
+        settings: The settings; only those of the kind count.
+        run: Runs independent parts of the fit.
+        progress: Progress callback.
+        start: ``end`` of a fit of this kind to other data, or of another size, to continue from;
+            ignored if it is of another kind.
     """
 
     data: FitData
@@ -290,12 +289,11 @@ class StartOutcome:
     """One start of a search.
 
     Attributes:
-        start: ``data`` for the rough values from the data, ``random 1`` and on for random ones,
-            ``weights 1`` and on for those that follow from a linear problem.
-        first_rms_percent: Error at the start, in percent of the largest peak-to-peak output,
-            weighted as in the criterion.
-        rms_percent: The same where the search ended.
-        evaluations: Of the criterion, derivatives apart.
+        start: ``data`` for rough values from the data, ``random N`` for random values,
+            ``weights N`` for the solution of a linear problem.
+        first_rms_percent: Weighted error at the start, in percent of the largest peak-to-peak.
+        rms_percent: The same at the end.
+        evaluations: Evaluations of the criterion, without those for derivatives.
     """
 
     start: str
@@ -310,13 +308,13 @@ class FoundModel:
 
     Attributes:
         model: The model.
-        numbers: How many numbers were found for it.
+        numbers: Number of fitted numbers.
         parameters: Parameters under their published names, in command units, um and s; empty for
-            models that are nothing but a table of weights.
-        starts: What became of each start of the search; empty where there was none.
-        standard_errors: Of the parameters, by the same names; empty where a fit has none.
-        at_bound: Parameters that stand on a bound: not found, but as far as they may go.
-        end: Where the search ended, for one that goes on from there; None of kinds without.
+            models that are only a table of weights.
+        starts: Starts of the search.
+        standard_errors: Standard errors of the parameters, if known.
+        at_bound: Parameters at a bound.
+        end: End of the search, from which another fit can start.
     """
 
     model: HysteresisModel

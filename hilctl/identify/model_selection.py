@@ -61,8 +61,8 @@ class HeldOut:
 def folds_of(records: Sequence[Record]) -> list[Split]:
     """Return the folds; none if there are too few data.
 
-    Records that extend the range of commands, frequencies or speeds are not held out: a model need
-    not be valid beyond its range, and a run warns there. Of histories the last part is held out.
+    Records that extend the range of commands, frequencies or speeds are not held out, since a model
+    need not be valid beyond its range. Of histories the last part is held out.
     """
     if any(isinstance(record, History) for record in records):
         heads, tails = zip(*map(_halved, records), strict=True)
@@ -84,14 +84,14 @@ def folds_of(records: Sequence[Record]) -> list[Split]:
 
 
 def held_out_error(request: FitRequest) -> HeldOut | None:
-    """Fit with parts of the data left out, and evaluate on these; None if too few are left."""
-    request.progress(0.0, "fits with data left out")
+    """Return errors of a fit on held-out parts of its data; None if they are too few."""
+    request.progress(0.0, "fits with held-out data")
     (found,) = held_out_errors([request], request.run)
     return found
 
 
 def held_out_errors(requests: Sequence[FitRequest], run: MapFunction) -> list[HeldOut | None]:
-    """Fit each request with parts of its data left out, and evaluate on these.
+    """Return errors of each fit on held-out parts of its data.
 
     One start of each search is enough.
 
@@ -147,7 +147,7 @@ def _together(
     held_out = tuple(record for fold, _, _ in done for record in fold.held_out)
     responses_um = np.concatenate([modelled for _, modelled, _ in done])
     parts = "the last parts of histories" if isinstance(held_out[-1], History) else "loops"
-    how = f"{len(held_out)} of {len(request.records)} {parts}, left out of the fit in turn"
+    how = f"{len(held_out)} of {len(request.records)} {parts}, each held out of one fit"
     judgement = judgement_of(FitData(held_out, request.unit), responses_um)
     return HeldOut(judgement, held_out, how, done[-1][2])
 
@@ -275,15 +275,15 @@ def select(request: FitRequest) -> Selection:
 def _choose_kind(request: FitRequest, given: IdentifySettings) -> Selection:
     """Return the kind with the least error.
 
-    Of histories, small models say which kinds are worth a large one: the errors of the wrong kind
-    are several times those of the right one at any size.
+    For histories, small models select the kinds to try at full size: a wrong kind has several times
+    the error of the right one at any size.
     """
     whole = any(isinstance(record, History) for record in request.records)
     errors = _candidates(request, given, WHOLE if whole else LOOPS)
     if whole and not any(each.rms_percent < WELL_PERCENT for each in errors):
         errors += _candidates(request, given, (PLAIN,))
     if not errors:
-        raise DataError("too few data to leave some out and choose by them: name a --model")
+        raise DataError("too few data to hold some out and select a model: use --model NAME")
     best = min(errors, key=_rms_percent)
     near = [each for each in errors if each.rms_percent <= NEAR * best.rms_percent]
     for turn in range(LONGEST if whole else 0):
@@ -301,10 +301,10 @@ def _choose_kind(request: FitRequest, given: IdentifySettings) -> Selection:
 def _choose_order(request: FitRequest) -> Selection:
     """Return the smallest size whose error is near the least."""
     sizes = _sizes(request.settings)
-    request.progress(0.0, f"fits with data left out, of {len(sizes)} sizes")
+    request.progress(0.0, f"fits of {len(sizes)} sizes with held-out data")
     errors = _tried(request, [("", settings) for settings in sizes])
     if not errors:
-        raise DataError("too few data to leave some out and choose a number of plays by them")
+        raise DataError("too few data to hold some out and select the number of plays: set plays=N")
     most = WORTH_SIZE * min(each.rms_percent for each in errors)
     best = next(each for each in errors if each.rms_percent <= most)
     return Selection(best.settings, best.held_out, orders=tuple(each.order for each in errors))
@@ -365,7 +365,7 @@ def _candidates(
 
 
 def _parts(candidate: Mapping[str, Any], given: IdentifySettings) -> dict[str, Any]:
-    """Return whether parts that may be left out are looked for, those that a kind has."""
+    """Return the settings of optional parts that a kind has."""
     fields, kind = IdentifySettings.model_fields, candidate["kind"]
     has = [name for name in ("creep_stage", "modes") if kind in kinds_of(fields[name])]
     return {name: getattr(given, name) for name in has}
@@ -380,13 +380,13 @@ def _sizes(settings: FitSettings) -> list[FitSettings]:
 def choose_lag(
     load: Callable[[int], Records], settings: FitSettings, run: MapFunction, progress: OnProgress
 ) -> int:
-    """Find by how many samples the displacement lags: the lag that leaves the least error.
+    """Return the lag of the displacement, in samples, with the least error.
 
     Args:
-        load: Gives the data with the displacement taken that many samples earlier.
-        settings: The choices of the fit.
-        run: Runs fits that do not depend on each other.
-        progress: Called with what is being done.
+        load: Loads the data with the displacement shifted by that many samples.
+        settings: Settings of the fit.
+        run: Runs independent fits.
+        progress: Progress callback.
     """
     progress(0.0, f"{MOST_LAG + 1} fits for the lag of the displacement")
     lean = settings.model_copy(update={"starts": 1, "peak_goal_percent": None})

@@ -85,7 +85,7 @@ class Identification:
     Attributes:
         fit: The fit.
         data: Fitted records.
-        verdict: What the model is worth.
+        verdict: Grade of the model.
         held_out: Errors on held-out data; None if there were none.
         orders: Errors of each number of plays, if it was selected.
         lag_samples: Assumed lag of tables' displacements in samples.

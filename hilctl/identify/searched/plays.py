@@ -19,27 +19,25 @@ RIDGE = 1e-4  # weight of the weights themselves
 
 
 def spacing_limit(data: FitData, settings: FitSettings) -> float:
-    """Return the largest threshold spacing at which every play still moves in a full cycle.
+    """Return the largest threshold spacing at which every play moves in a full cycle.
 
-    A play whose threshold comes near half the peak-to-peak command moves in the first cycle and
-    then rests: its weight would only describe how the data drifts.
+    A play with a larger threshold moves in the first cycle only.
     """
     shift = 0.5 if settings.layout == "even" else 0.0
     return data.reach / (settings.plays + shift)
 
 
 def numbered(settings: FitSettings) -> F64:
-    """Return what the spacing is multiplied with to give r_1 to r_n: float64[n]."""
+    """Return r_1 to r_n over the spacing: float64[n]."""
     shift = 0.0 if settings.layout == "even" else 0.5
     return np.arange(1, settings.plays + 1, dtype=np.float64) - shift
 
 
 def _held(data: FitData, plays: int) -> F64:
-    """Return what holds free weights, float64[m, n + 1], relative to the command itself.
+    """Return the rows of the smoothness prior of free weights: float64[m, n + 1].
 
-    Weights are a density times the spacing, so the mean square slope of one density is n^3 times
-    the differences' squares: however many plays, it counts alike. The first play stands for all
-    that are narrower as well, the last for all that are wider: neither is of the density.
+    The factor n^1.5 makes it independent of the number of plays. The first play also represents
+    all narrower ones and the last all wider ones, so neither is compared with its neighbour.
     """
     longest = float(np.linalg.norm(data.columns(np.empty(0))))
     between = SMOOTHNESS * plays**1.5 * np.diff(np.eye(plays), axis=0)[1:-1]
@@ -50,22 +48,19 @@ def _held(data: FitData, plays: int) -> F64:
 class PlaysProblem:
     """Fit a PPI (3.25-3.27) or an RDPI (5.11, 5.14).
 
-    The sum of squares is linear in the weights, so for each set of thresholds they are worked out
-    rather than searched (variable projection). With free weights they are a_0 and a_1 to a_n;
-    with exponential ones, a_0 and the factor of e^(-beta i).
+    For each set of thresholds the weights follow from linear least squares (variable projection):
+    free weights a_0 to a_n, or a_0 and the factor of e^(-beta i).
 
-    Loops leave the free weights of neighbouring thresholds all but open: least squares alone would
-    make spikes of them, of which an inverse asks more current than the loops had. So rows after
-    those of the samples hold differences of neighbours small and, far less, the weights themselves,
-    which leaves one solution.
+    Loops leave free weights of neighbouring thresholds nearly undetermined. Rows of a prior on
+    differences of neighbours, and a small one on the weights, avoid spikes, for which an inverse
+    would need more current than the loops had.
 
-    Searched, in this order: the spacing, relative to the largest that makes sense; for an RDPI,
-    the largest growth of the thresholds relative to half the peak-to-peak command; for
-    exponential weights, beta n.
+    Search variables: the spacing, relative to the largest one; for an RDPI, the largest growth of
+    the thresholds relative to half the peak-to-peak command; for exponential weights, beta n.
 
     Args:
         data: The data.
-        settings: The choices.
+        settings: The settings.
     """
 
     def __init__(self, data: FitData, settings: FitSettings) -> None:
@@ -90,33 +85,33 @@ class PlaysProblem:
 
     @property
     def space(self) -> SearchSpace:
-        """What is searched."""
+        """The search variables."""
         return self._space
 
     @property
     def searched(self) -> tuple[str, ...]:
-        """Names of what is searched, in the order of the space."""
+        """Names of the search variables, in the order of the space."""
         names = ("alpha", "gamma") if self._rate_dependent else ("sigma",)
         beta = "beta_0" if self._rate_dependent else "beta"
         return (*names, beta) if self._exponential else names
 
     @property
     def held(self) -> int:
-        """Rows after those of the samples."""
+        """Number of rows of the prior."""
         return len(self._held)
 
     def error_um(self, x: F64, scale: F64) -> F64:
-        """Return modelled minus measured displacement, see :class:`search.Problem`."""
+        """Return modelled minus measured displacement, see :class:`SearchProblem`."""
         columns = self._columns(x)
         weights, free = self._solve(columns, scale)
         beside = self._free @ free
         return np.asarray(columns @ weights + (beside - self._target), dtype=np.float64)
 
     def slopes_um(self, x: F64, scale: F64) -> F64:
-        """Return the derivatives of the error, but for what the weights make up for themselves.
+        """Return the derivatives of the error with compensation by the weights.
 
-        That is Kaufman's form of variable projection: the gradient is exact. Weights that a bound
-        holds do not move.
+        Kaufman's form of variable projection, whose gradient is exact. Weights at a bound are
+        fixed.
         """
         columns = self._columns(x)
         found, _ = self._solve(columns, scale)
@@ -203,7 +198,7 @@ class PlaysProblem:
 
 
 def fit_plays(job: FitJob) -> FoundModel:
-    """Fit a PPI or an RDPI; its weights follow from its thresholds."""
+    """Fit a PPI, SPI or RDPI."""
     return searched_fit(PlaysProblem(job.data, job.settings), job)
 
 
@@ -217,19 +212,18 @@ STEEPEST = 5.0  # largest slope of the deadband function, relative to that aroun
 class ExponentialProblem:
     """Fit the published parametrisation (6.19-6.23).
 
-    The scale between the plays and the deadbands is free: c a_i and g_j / c, with thresholds
-    c d_j, give the same model. So g_0 is fixed to 1, which leaves the plays' output in um, and
-    the published twelve parameters are eleven.
+    The scale between plays and deadbands is redundant: c a_i and g_j / c, with thresholds c d_j,
+    give the same model. So g_0 is 1, and eleven of the published twelve parameters remain.
 
-    Searched, in this order: the spacing alpha, relative to the largest that makes sense; gamma
-    times the highest rate, relative to half the peak-to-peak command; a_0 and alpha_0 over the mean
-    slope of the data; beta_0 n; the loss of slope over all deadbands above 0, below 1 so that the
-    cumulative slopes stay > 0; beta_1 k; d_p (k + 1) over half the stroke; the same three below 0,
-    where the slope gains; and the constant displacement, where there is one, over half the stroke.
+    Search variables: the spacing alpha, relative to the largest one; gamma times the highest rate,
+    relative to half the peak-to-peak command; a_0 and alpha_0 over the mean slope of the data;
+    beta_0 n; the loss of slope over all deadbands above 0, below 1 so that cumulative slopes stay
+    > 0; beta_1 k; d_p (k + 1) over half the stroke; the same three below 0, where the slope gains;
+    and the constant displacement, if fitted, over half the stroke.
 
     Args:
         data: The data.
-        settings: The choices.
+        settings: The settings.
     """
 
     def __init__(self, data: FitData, settings: FitSettings) -> None:
@@ -243,7 +237,7 @@ class ExponentialProblem:
 
     @property
     def space(self) -> SearchSpace:
-        """What is searched."""
+        """The search variables."""
         rows = [
             (0.05, 1.0, 0.6),
             (0.0, 1.0, 0.1),
@@ -263,12 +257,12 @@ class ExponentialProblem:
 
     @property
     def searched(self) -> tuple[str, ...]:
-        """Names of what is searched, in the order of the space."""
+        """Names of the search variables, in the order of the space."""
         return SEARCHED if self._settings.offset else SEARCHED[:-1]
 
     @property
     def held(self) -> int:
-        """Rows after those of the samples: none, two numbers each make the weights smooth."""
+        """No prior: exponential weights are smooth."""
         return 0
 
     def error_um(self, x: F64, scale: F64) -> F64:
@@ -362,7 +356,7 @@ class ExponentialProblem:
         return float(x[0]) / total, beta, float(x[2]) * self._half_stroke / (size + 1)
 
     def _shares(self, x: F64) -> F64:
-        """Return what part of one side's change of slope each deadband has: float64[k]."""
+        """Return the share of each deadband in the change of slope of a side: float64[k]."""
         rates = exponential_weights(1.0, float(x[1]) / self._steps.size, self._steps.size)
         return np.asarray(rates / rates.sum())
 

@@ -57,7 +57,7 @@ def test_a_model_s_error_on_unseen_data_comes_first():
     errors = errors | {"held_out_peak": 2.0, "held_out_rms": 0.7}
     known = model.provenance.model_copy(update={"errors_percent": errors})
     text = model_error(model.model_copy(update={"provenance": known}))
-    assert text == "2.00 % peak, 0.700 % rms, on data that the fit did not see"
+    assert text == "2.00 % peak, 0.700 % rms, on held-out data"
 
 
 def test_what_is_not_recorded_has_no_row(recording):

@@ -258,7 +258,7 @@ def test_provenance_and_mapping_say_where_the_model_is_from(loops_of: Loops) -> 
 
 def test_no_data_are_refused() -> None:
     """Nothing comes of an empty list."""
-    with pytest.raises(DataError, match="the list of loops is empty"):
+    with pytest.raises(DataError, match="empty"):
         fit("ppi", [])
 
 
@@ -340,7 +340,7 @@ def test_kinds_without_stages_have_no_creep(records):
 
 
 def test_no_records_are_refused():
-    with pytest.raises(DataError, match="nothing to identify a model from"):
+    with pytest.raises(DataError, match="no records"):
         fit_kind(FitRequest([], FIELD, "A"))
 
 

@@ -170,7 +170,7 @@ def test_loops_have_candidates_of_their_own(monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_without_anything_held_out_there_is_no_choice(monkeypatch: pytest.MonkeyPatch) -> None:
     fake(monkeypatch, dict.fromkeys(("field 0 8", "generalised_duhem 12", "integrated")))
-    with pytest.raises(DataError, match="name a --model"):
+    with pytest.raises(DataError, match="--model"):
         chosen([HISTORY])
 
 
