@@ -9,7 +9,6 @@ from hilctl.api._types import PathLike, Paths, Settings, path_or_none, paths_of,
 from hilctl.base.files import check_writable
 from hilctl.comparison import compare as library
 from hilctl.comparison.compare import Comparison
-from hilctl.comparison.comparison_page import write_comparison
 from hilctl.experiment.load import inputs_of
 from hilctl.identify.pipeline import Identification, identify_files, settings_from
 from hilctl.identify.refine.refinement import Refinement, refine_files
@@ -139,6 +138,8 @@ def compare(
     )
     comparison = library.compare(request, time.perf_counter, on_progress)
     if html is not None:
+        from hilctl.comparison.comparison_page import write_comparison  # it imports matplotlib
+
         write_comparison(comparison, Path(html))
     if save is not None:
         created = datetime.now(UTC).isoformat(timespec="seconds")

@@ -16,7 +16,6 @@ from hilctl.cli.console import listing, print_rich, progress_bar, table
 from hilctl.cli.options import AsJson, Overwrite, Settings
 from hilctl.cli.output import print_json
 from hilctl.comparison.compare import Comparison, headings, notes, table_rows, titles
-from hilctl.identify.model_page import write_identification, write_refinement
 from hilctl.identify.model_selection import OrderScore
 from hilctl.identify.pipeline import Identification
 from hilctl.identify.refine.refinement import Refinement
@@ -147,6 +146,8 @@ def identify(
             on_progress=progress,
         )
     if html is not None:
+        from hilctl.identify.model_page import write_identification  # it imports matplotlib
+
         write_identification(result, html)
     refused = result.verdict.grade == "not a model"
     if as_json:
@@ -185,6 +186,8 @@ def refine(
             model, runs, output, validate=validate or [], overwrite=overwrite, on_progress=progress
         )
     if html is not None:
+        from hilctl.identify.model_page import write_refinement  # it imports matplotlib
+
         write_refinement(result, html)
     if as_json:
         print_json({"output": str(output) if output and result.better else None,

@@ -1,7 +1,7 @@
-"""Creep, from what the displacement does where the command stands still.
+"""Fit of creep to the displacement while the command is constant.
 
-No hysteresis moves then, whatever its kind, nor a lag or a structure once they have settled. So
-creep is found before any model is, and taken off the records; models are fitted to the rest.
+During such rests neither hysteresis nor settled dynamics move the displacement. So creep is fitted
+first and removed from the records, and models are fitted to the rest.
 """
 
 from collections.abc import Iterator, Sequence
@@ -17,32 +17,32 @@ from hilctl.models.linear_stages import CreepModel
 COARSE_S = 1e-3
 LEAST_REST_S = 0.5
 STILL = 1e-6  # of the command's range, from sample to sample
-SETTLED_S = 0.01  # of a rest: lags and structures are still by then
+SETTLED_S = 0.01  # start of a rest that is ignored, until lags and structures have settled
 SHORTEST_S = 0.03  # time constant
-LONGEST = 10.0  # times the longest rest: slower creep than this goes straight throughout
-APART = 2.0  # of time constants: any law of creep is near a sum of such
-FIRST_S, GROWTH = 0.005, 1.3  # of stretches of a rest, each averaged
-ROUNDS = 4  # what has crept does not creep on: each round leaves a few percent of what it adds
+LONGEST = 10.0  # longest time constant, of the longest rest: slower creep looks linear
+APART = 2.0  # ratio of time constants, which approximate any law of creep
+FIRST_S, GROWTH = 0.005, 1.3  # first averaged interval of a rest, and ratio to the next
+ROUNDS = 4  # of a fixed-point iteration: each leaves a few percent of the error
 LEAST_SHARE = 1e-4
-CLEAR = 0.8  # least part of the motion during rests that creep must explain
-MOST = 0.5  # share of all together: a displacement that wanders asks for more
-LEAST = 3e-4  # of the stroke: motion during rests that is worth an element
+CLEAR = 0.8  # part of the motion during rests that creep must explain
+MOST = 0.5  # maximum total share: a larger one is drift
+LEAST = 3e-4  # of the stroke: minimum motion during rests
 
 
 @dataclass(frozen=True, slots=True)
 class _Rest:
-    """A stretch of a history in which the command stands still.
+    """An interval of a history in which the command is constant.
 
     Attributes:
         of: Number of the history.
-        edges: int64[m + 1], of its parts that are averaged, in samples.
+        edges: int64[m + 1], edges of its averaged parts, in samples.
     """
 
     of: int
     edges: I64
 
     def means(self, signal: F64) -> F64:
-        """Return the mean of a signal in each part, less what they have in common: float64[m]."""
+        """Return the mean of a signal in each part, less their mean: float64[m]."""
         sums = np.add.reduceat(signal[: self.edges[-1]], self.edges[:-1])
         means: F64 = sums / np.diff(self.edges)
         means -= means.mean()
@@ -50,11 +50,7 @@ class _Rest:
 
 
 def creep_of(records: Sequence[Record]) -> CreepModel | None:
-    """Return the creep that rests show; None where there are too few, or nothing creeps.
-
-    Args:
-        records: Of which histories tell that rest for half a second and more, twice or more.
-    """
+    """Return the creep during rests; None if there is none, or fewer than two rests of 0.5 s."""
     histories = [_coarse(record) for record in records if isinstance(record, History)]
     rests = [rest for i, history in enumerate(histories) for rest in _rests(i, history)]
     if len(rests) < 2:
@@ -69,7 +65,7 @@ def creep_of(records: Sequence[Record]) -> CreepModel | None:
 
 
 def without_creep(records: Sequence[Record], creep: CreepModel) -> tuple[Record, ...]:
-    """Return records as they were without creep: that is, histories; steady loops as they are."""
+    """Return records with creep removed from histories."""
     return tuple(
         replace(record, displacement_um=_bare_um(record, creep) + record.displacement_um[0])
         if isinstance(record, History)
@@ -79,7 +75,7 @@ def without_creep(records: Sequence[Record], creep: CreepModel) -> tuple[Record,
 
 
 def _coarse(history: History) -> History:
-    """Return means over a millisecond: creep is slower by far, and there are fewer of them."""
+    """Return a history averaged over milliseconds: creep is slower by far."""
     together = max(1, int(COARSE_S * history.sample_rate_hz))
     count = history.command.size // together
     if together == 1 or count < FEWEST_POINTS:
@@ -90,7 +86,7 @@ def _coarse(history: History) -> History:
 
 
 def _rests(number: int, history: History) -> Iterator[_Rest]:
-    """Give where a history rests."""
+    """Yield the rests of a history."""
     rate_hz = history.sample_rate_hz
     still = np.abs(np.diff(history.command)) <= STILL * np.ptp(history.command)
     turns = np.flatnonzero(np.diff(np.concatenate(([False], still, [False])).astype(np.int8)))
@@ -100,7 +96,7 @@ def _rests(number: int, history: History) -> Iterator[_Rest]:
 
 
 def _edges(start: int, stop: int, rate_hz: float) -> I64:
-    """Return the ends of parts, each longer than the one before: creep is ever slower."""
+    """Return edges of parts that become longer, as creep becomes slower."""
     parts = int(np.log1p((stop - start) / rate_hz * (GROWTH - 1.0) / FIRST_S) / np.log(GROWTH))
     ends_s = SETTLED_S + FIRST_S * (GROWTH ** np.arange(parts + 1) - 1.0) / (GROWTH - 1.0)
     edges = np.unique(start + np.round(rate_hz * ends_s).astype(np.int64))
@@ -108,16 +104,15 @@ def _edges(start: int, stop: int, rate_hz: float) -> I64:
 
 
 def _bare_um(history: History, creep: CreepModel | None) -> F64:
-    """Return what is left of a displacement without creep, from where it begins: float64[n]."""
+    """Return a displacement less its first value and without creep: float64[n]."""
     y_um: F64 = history.displacement_um - history.displacement_um[0]
     return y_um if creep is None else creep.inverse(history.sample_rate_hz).process(y_um)
 
 
 class _LeastSquares:
-    """Shares of time constants, so that what creeps moves during rests as was measured.
+    """Least-squares fit of the shares of given time constants to the motion during rests.
 
-    Heat and drift move the displacement too, alike on both sides: as the square of the command
-    gathers, and with time.
+    Heat (the integral of the squared command) and drift (time) are fitted beside them.
     """
 
     def __init__(self, histories: Sequence[History], rests: Sequence[_Rest]) -> None:
@@ -135,7 +130,7 @@ class _LeastSquares:
         self._least_um = LEAST * max(float(np.ptp(each.displacement_um)) for each in histories)
 
     def solve(self, bare_um: Sequence[F64]) -> CreepModel | None:
-        """Return the creep of displacements, float64[n] each; None where it is none."""
+        """Return the creep of displacements, float64[n] each; None if there is none."""
         moves = np.stack([self._moved(bare_um, time_s) for time_s in self._times_s], axis=1)
         shares, left = nnls(moves, self._measured_um)
         explained = 1.0 - (left / max(float(np.linalg.norm(self._measured_um)), 1e-300)) ** 2
@@ -149,7 +144,7 @@ class _LeastSquares:
         )
 
     def _moved(self, bare_um: Sequence[F64], time_s: float) -> F64:
-        """Return how an element of share 1 moves during rests: float64[M]."""
+        """Return the motion of an element of share 1 during rests: float64[M]."""
         element = CreepModel(time_constants_s=(time_s,), shares=(1.0,))
         crept = [
             element.forward(history.sample_rate_hz).process(x_um) - x_um
@@ -161,5 +156,5 @@ class _LeastSquares:
         return np.concatenate([rest.means(signals[rest.of]) for rest in self._rests])
 
     def _rest_of(self, means: F64) -> F64:
-        """Return what heat and drift do not explain."""
+        """Return the part that heat and drift do not explain."""
         return means - self._others @ (self._others.T @ means)

@@ -1,4 +1,4 @@
-"""How far a model is from data: one judge for every kind of model."""
+"""Errors of a model of any kind on records."""
 
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
@@ -9,7 +9,7 @@ from scipy.interpolate import CubicSpline
 from hilctl.base.errors import DataError
 from hilctl.base.types import F64
 from hilctl.identify.data.records import Record, Records, SteadyLoop
-from hilctl.identify.fit_data import PERIODS, FitData
+from hilctl.identify.fit_api import PERIODS, FitData
 from hilctl.identify.parallel import parallel_map
 from hilctl.identify.staged.fit_data import StagedFitData
 from hilctl.identify.staged.objective import response_um
@@ -21,14 +21,13 @@ from hilctl.signals.cycle_metrics import loop_area, peak_hysteresis_percent
 
 @dataclass(frozen=True, slots=True)
 class LoopScore:
-    """How far a model is from one record.
+    """Errors of a model on one record.
 
     Attributes:
-        label: The record's.
+        label: Label of the record.
         peak_percent: Largest displacement error, in percent of the record's own peak-to-peak.
         rms_percent: Root mean square displacement error, in percent of the same.
-        area_error_percent: Area of the modelled loop less that of the measured one, in percent of
-            the latter; None for a whole time history.
+        area_error_percent: Error of the loop area in percent; None for a history.
         peak_to_peak_um: The record's peak-to-peak displacement.
     """
 
@@ -41,15 +40,15 @@ class LoopScore:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Evaluation:
-    """How far a model is from all records.
+    """Errors of a model on all records.
 
     Attributes:
-        errors: One for each record.
-        modelled_um: The model's displacement of each record's judged samples, float64[n].
-        peak_percent: Largest displacement error of all, in percent of the largest peak-to-peak
-            displacement of a record, as publications report it.
-        rms_percent: Root mean square displacement error of all, in percent of the same.
-        own_peak_percent: The largest of the records' own ``peak_percent``.
+        errors: Errors on each record.
+        modelled_um: Modelled displacement of the evaluated samples of each record, float64[n].
+        peak_percent: Largest displacement error in percent of the largest peak-to-peak displacement
+            of a record, as publications report it.
+        rms_percent: Root mean square displacement error, in percent of the same.
+        own_peak_percent: Largest ``peak_percent`` of single records.
     """
 
     errors: tuple[LoopScore, ...]
@@ -59,7 +58,7 @@ class Evaluation:
     own_peak_percent: float
 
     def to_mapping(self) -> dict[str, Any]:
-        """Return the figures as plain mappings, lists and numbers, for JSON."""
+        """Return the errors as plain mappings, lists and numbers, for JSON."""
         return {
             "errors": [asdict(error) for error in self.errors],
             "peak_percent": self.peak_percent,
@@ -69,16 +68,14 @@ class Evaluation:
 
 
 def judge(model: HysteresisModel, data: Records | FitData, *, creep: bool = False) -> Evaluation:
-    """Work out a model's errors on records, those it was fitted to or others.
+    """Return the errors of a model on records.
 
-    Loops are compared in their periodic steady state, with the rate as :meth:`SteadyLoop.rate` has
-    it.
+    Loops are compared in their periodic steady state, at the rate of :meth:`SteadyLoop.rate`.
 
     Args:
         model: The model.
-        data: The records, prepared already or not.
-        creep: Whether each record has a constant displacement of its own, and a whole history
-            creep of its own as well; what is judged is the rest.
+        data: The records, prepared or not.
+        creep: Whether to remove an offset per record, and creep per history, from the errors.
 
     Raises:
         DataError: There are no records.
@@ -92,7 +89,7 @@ def judge(model: HysteresisModel, data: Records | FitData, *, creep: bool = Fals
 
 
 def judgement_of(data: FitData, responses_um: F64) -> Evaluation:
-    """Return how far responses, float64[N], are from the records' judged samples."""
+    """Return the errors of responses, float64[N], at the evaluated samples of the records."""
     errors_um = responses_um - data.target_um
     errors = tuple(
         _loop_error(record, responses_um[place], data.target_um[place])
@@ -109,7 +106,7 @@ def judgement_of(data: FitData, responses_um: F64) -> Evaluation:
 
 
 def _modelled_um(model: HysteresisModel, data: FitData) -> F64:
-    """Return a model's displacement of all judged samples: float64[N]."""
+    """Return the modelled displacement of all evaluated samples: float64[N]."""
     if isinstance(model, PlayModel):
         return data.response_um(model)
     pairs = zip(data.records, data.speeds, strict=True)
@@ -117,7 +114,7 @@ def _modelled_um(model: HysteresisModel, data: FitData) -> F64:
 
 
 def _record_um(model: HysteresisModel, record: Record, speed: F64) -> F64:
-    """Return a model's displacement of a record's judged samples: float64[n]."""
+    """Return the modelled displacement of the evaluated samples of a record: float64[n]."""
     if not isinstance(record, SteadyLoop):
         command, _, ignored = record.run()
         return model.forward(record.sample_rate_hz).process(command)[ignored:]
@@ -131,10 +128,10 @@ def _record_um(model: HysteresisModel, record: Record, speed: F64) -> F64:
 
 
 def _sampled_cycle_um(model: HysteresisModel, loop: SteadyLoop) -> F64:
-    """Return what a model does with a loop's command, sample by sample as in a run: float64[M].
+    """Return the steady response to a loop's command, simulated sample by sample: float64[M].
 
-    A fit takes stages with dynamics as they are in continuous time; a run has samples, and at a
-    low rate the difference is the larger part of the error.
+    A fit models dynamic stages in continuous time. At a low sample rate the difference to a run
+    is the larger part of the error.
     """
     points = loop.command.size
     turns = np.arange(points + 1) / points
@@ -158,7 +155,7 @@ def _loop_error(record: Record, response_um: F64, target_um: F64) -> LoopScore:
     area_error: float | None = None
     if isinstance(record, SteadyLoop):
         measured = loop_area(record.command, target_um)
-        if measured > 0.0:  # a line has no area to be wrong by a part of
+        if measured > 0.0:  # a line has no area
             area_error = 100.0 * (loop_area(record.command, response_um) / measured - 1.0)
     return LoopScore(
         label=record.label,
@@ -170,7 +167,7 @@ def _loop_error(record: Record, response_um: F64, target_um: F64) -> LoopScore:
 
 
 def weight_roots(data: Records, weight_by: Literal["equal", "hysteresis"]) -> F64:
-    """Return the square root of each judged sample's weight: float64[N].
+    """Return the square root of the weight of each evaluated sample: float64[N].
 
     Raises:
         DataError: See :func:`hysteresis_weights`.
@@ -186,8 +183,8 @@ def weight_roots(data: Records, weight_by: Literal["equal", "hysteresis"]) -> F6
 def hysteresis_weights(data: Records) -> F64:
     """Return the published weight A of each record's squared errors (5.14).
 
-    It is the peak hysteresis of a loop, in percent, over that at the lowest frequency there is
-    (of the largest command, where several have that frequency).
+    The weight is the peak hysteresis of a loop over that of the slowest loop (of the largest one,
+    if several have the lowest frequency).
 
     Returns:
         float64[records].
@@ -198,8 +195,7 @@ def hysteresis_weights(data: Records) -> F64:
     loops = [record for record in data if isinstance(record, SteadyLoop)]
     if len(loops) < len(data):
         raise DataError(
-            "weights by hysteresis need steady loops, and there is a whole time history among the "
-            "data: weight the data equally"
+            "weight_by=hysteresis needs steady loops, but there is a history: set weight_by=equal"
         )
     slowest = min(loops, key=lambda loop: (loop.frequency_hz, -float(np.ptp(loop.command))))
     widths = np.array([_width_percent(loop) for loop in loops])

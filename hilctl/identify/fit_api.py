@@ -1,40 +1,250 @@
-"""Types of a fit: what every way to identify a model takes and returns."""
+"""Types of a fit: its prepared data, what it is asked for, and what it returns."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import TypeAlias
+from functools import cached_property
+from typing import Any, TypeAlias
 
-from hilctl.base.types import CommandUnit
-from hilctl.identify.data.records import Record
-from hilctl.identify.fit_data import FitData
+import numpy as np
+
+from hilctl.base.errors import DataError
+from hilctl.base.types import F64, CommandUnit
+from hilctl.identify.data.records import History, Record, Records, SteadyLoop, thinned
 from hilctl.identify.parallel import MapFunction, serial_map
 from hilctl.identify.settings import FitSettings
+from hilctl.identify.staged.fit_data import GAMMA_S, PARAMETERS, SPACING, plays_and_slopes
+from hilctl.kernels.hysteresis import play_outputs, play_sum_shared, rest_memory
 from hilctl.models.base import HysteresisModel
+from hilctl.models.integrated import ButterflyModel, IntegratedModel
 from hilctl.models.linear_stages import FurtherMode
+from hilctl.models.plays import PlayModel
+
+# Models with a lag need every sample.
+_EVERY_SAMPLE = {"staged", "field", "generalised_duhem"}
+PERIODS = 3
+"""Simulated periods of a loop; the last is evaluated, since differential models settle slowly."""
+
+CREEP_S = 0.1  # time constant in the law of creep
+BEYOND = 0.15  # of half the range: margin of commands that an inverse may output
+
+
+@dataclass(frozen=True, slots=True)
+class _Run:
+    """One record: command and |rate|, float64[n]; its evaluated samples; their place among all."""
+
+    command: F64
+    speed: F64
+    judged: slice
+    place: slice
+    loop: bool
+
+
+def search_data(records: Records, kind: str, unit: CommandUnit) -> "FitData":
+    """Return the data of a search; long records are thinned if the kind of model permits it.
+
+    Raises:
+        DataError: There are no records.
+    """
+    return FitData(records if kind in _EVERY_SAMPLE else thinned(records), unit)
+
+
+class FitData:
+    """Commands, rates and evaluated displacements of all records.
+
+    Attributes:
+        records: The records.
+        unit: Unit of the command.
+        target_um: float64[N], measured displacement of all evaluated samples.
+        places: For each record, its part of the N samples.
+        reach: Half the largest peak-to-peak command; plays with a larger threshold do not move in a
+            steady cycle.
+        speed: Largest |rate| of the command, in command units per second.
+        stroke_um: Largest peak-to-peak displacement of a record.
+        input_range: Lowest and highest command.
+        output_range_um: Lowest and highest evaluated displacement.
+    """
+
+    def __init__(self, records: Records, unit: CommandUnit = "A") -> None:
+        """Prepare records.
+
+        Raises:
+            DataError: There are no records.
+        """
+        if not records:
+            raise DataError("no records to fit: the list of loops and histories is empty")
+        self.records = tuple(records)
+        self.unit = unit
+        self._runs: list[_Run] = []
+        targets: list[F64] = []
+        end = 0
+        for record in self.records:
+            command, rate, ignored = record.run()
+            targets.append(record.displacement_um[ignored - command.size :])
+            judged = slice(ignored, command.size)
+            place = slice(end, end + command.size - ignored)
+            end = place.stop
+            loop = isinstance(record, SteadyLoop)
+            self._runs.append(_Run(command, np.abs(rate), judged, place, loop))
+        self.target_um = np.concatenate(targets)
+        self.places = tuple(run.place for run in self._runs)
+        self.reach = max(0.5 * float(np.ptp(run.command)) for run in self._runs)
+        self.speed = max(float(run.speed.max()) for run in self._runs)
+        self.stroke_um = max(float(np.ptp(target)) for target in targets)
+        self.input_range = (
+            min(float(run.command.min()) for run in self._runs),
+            max(float(run.command.max()) for run in self._runs),
+        )
+        self.output_range_um = (float(self.target_um.min()), float(self.target_um.max()))
+
+    @cached_property
+    def creep(self) -> F64:
+        """Columns of offset and creep per record, float64[N, f].
+
+        A constant per record, and the usual law of creep ln(1 + t / 0.1 s) per history.
+        """
+        columns: list[F64] = []
+        for record, place in zip(self.records, self.places, strict=True):
+            part = np.ones((place.stop - place.start, 1))
+            if isinstance(record, History):
+                time_s = record.time_s[record.ignore :]
+                part = np.column_stack([part, np.log1p(time_s / CREEP_S)])
+            column = np.zeros((self.target_um.size, part.shape[1]))
+            column[place] = part
+            columns.append(column)
+        return np.hstack(columns)
+
+    @property
+    def loops(self) -> tuple[SteadyLoop, ...]:
+        """The records that are steady loops."""
+        return tuple(record for record in self.records if isinstance(record, SteadyLoop))
+
+    @property
+    def speeds(self) -> list[F64]:
+        """|rate| of each loop's evaluated samples and of each whole history, per second."""
+        return [run.speed[run.judged] if run.loop else run.speed for run in self._runs]
+
+    @property
+    def gain(self) -> float:
+        """Largest stroke over largest peak-to-peak command, in um per command unit."""
+        return self.stroke_um / (2.0 * self.reach)
+
+    @property
+    def command_span(self) -> tuple[float, float]:
+        """The range of the command plus 15 %, for inverses that need a bounded range."""
+        low, high = self.input_range
+        more = BEYOND * 0.5 * (high - low)
+        return low - more, high + more
+
+    def play_sum(self, direct: float, thresholds: F64, weights: F64, growth_s: float) -> F64:
+        """Return ``direct v + sum weights_i F_i[v]`` of all evaluated samples: float64[N]."""
+        out = np.empty(self.target_um.size)
+        for run in self._runs:
+            response = np.empty(run.command.size)
+            memory = rest_memory(thresholds.size)
+            play_sum_shared(
+                run.command, growth_s * run.speed, direct, thresholds, weights, memory, response
+            )
+            out[run.place] = response[run.judged]
+        return out
+
+    def columns(self, thresholds: F64, growth_s: float = 0.0) -> F64:
+        """Return command and output of each play for all evaluated samples: float64[N, n + 1]."""
+        out = np.empty((self.target_um.size, thresholds.size + 1))
+        for run in self._runs:
+            response = np.empty((run.command.size, thresholds.size))
+            memory = rest_memory(thresholds.size)
+            play_outputs(run.command, growth_s * run.speed, thresholds, memory, response)
+            out[run.place, 0] = run.command[run.judged]
+            out[run.place, 1:] = response[run.judged]
+        return out
+
+    def plays(
+        self, spacing: float, growth_s: float, numbers: F64, weights: F64
+    ) -> tuple[F64, F64, F64]:
+        """Run plays of thresholds ``spacing numbers_i``, with derivatives.
+
+        Returns:
+            The command float64[N], each play's output float64[N, n], and the derivatives of their
+            weighted sum by spacing and growth, float64[N, 2].
+        """
+        size = self.target_um.size
+        command, outputs = np.empty(size), np.empty((size, numbers.size))
+        slopes = np.empty((size, 2))
+        for run in self._runs:
+            v = run.command
+            out, by = np.empty((v.size, numbers.size)), np.empty((v.size, PARAMETERS))
+            none = np.zeros((v.size, PARAMETERS))  # the command itself depends on nothing
+            plays_and_slopes(v, none, run.speed, spacing, growth_s, numbers, weights, 1, out, by)
+            command[run.place], outputs[run.place] = v[run.judged], out[run.judged]
+            slopes[run.place] = by[run.judged][:, [SPACING, GAMMA_S]]
+        return command, outputs, slopes
+
+    def response_um(self, model: PlayModel) -> F64:
+        """Return a model's displacement of all evaluated samples: float64[N]."""
+        x = self.play_sum(
+            model.direct,
+            np.array(model.thresholds),
+            np.array(model.weights),
+            model.threshold_growth_s,
+        )
+        if isinstance(model, IntegratedModel):
+            x = model.deadband(x)
+        elif isinstance(model, ButterflyModel):
+            x = model.shape(np.abs(x + model.bias))
+        return x + model.output_offset_um
+
+    def stack(self, run: Callable[[F64], F64]) -> F64:
+        """Run a rate-independent function on each command, and stack the evaluated samples.
+
+        Args:
+            run: From a command, float64[n], to float64[n] or float64[n, m].
+
+        Returns:
+            float64[N] or float64[N, m].
+        """
+        parts = []
+        for record, place in zip(self.records, self.places, strict=True):
+            periods = PERIODS if isinstance(record, SteadyLoop) else 1
+            parts.append(run(np.tile(record.command, periods))[place.start - place.stop :])
+        return np.concatenate(parts)
+
+    def swing(self, columns: F64) -> F64:
+        """Return the largest peak-to-peak in a record of each column, float64[N, m]: float64[m]."""
+        return np.asarray(np.max([np.ptp(columns[place], axis=0) for place in self.places], axis=0))
+
+    def common(self, offset_um: float) -> dict[str, Any]:
+        """Return the fields that every model has, by name."""
+        return {
+            "input_unit": self.unit,
+            "input_range": self.input_range,
+            "output_range_um": self.output_range_um,
+            "output_offset_um": offset_um,
+        }
+
 
 LEAST_SLOPE = 0.01
 """Smallest slope that a model may have, of the mean slope of the data."""
 
 OnProgress: TypeAlias = Callable[[float, str], None]
-"""Called now and then with the part that is done (0 to 1) and what is being done."""
+"""Progress callback: completed part (0 to 1) and current step."""
 
 
 def ignore_progress(done: float, text: str) -> None:
-    """Take a progress report and do nothing with it."""
+    """Ignore a progress report."""
 
 
 @dataclass(frozen=True, slots=True)
 class FitRequest:
-    """Records to fit, and how.
+    """Records to fit, and settings.
 
     Attributes:
-        records: At least one loop or history; steady loops only for what has dynamics.
-        settings: The kind of model, and all other choices.
+        records: Loops and histories, at least one.
+        settings: Kind of model and all other settings.
         unit: Unit of the command.
-        source: Recordings or files that the data come from, for the provenance.
-        run: Runs fits that do not depend on each other.
-        progress: Called with what is being done.
-        start: Where the search begins, see :class:`FitJob`.
+        source: Names of recordings or files, for the provenance.
+        run: Runs independent fits.
+        progress: Progress callback.
+        start: Start of the search, see :class:`FitJob`.
         modes: Known further modes of the structure, for kinds that have them.
     """
 
@@ -50,15 +260,15 @@ class FitRequest:
 
 @dataclass(frozen=True, slots=True)
 class FitJob:
-    """Prepared data of one fit, and how it is made.
+    """Prepared data of one fit, and settings.
 
     Attributes:
-        data: What the model is to describe.
-        settings: The choices; only those of the kind count.
-        run: Runs what does not depend on each other.
-        progress: Called with what is being done.
-        start: ``end`` of a fit of this kind to other data, or of another size, to go on from;
-            kinds that have no use for it, and ends of others, are found from the beginning.
+        data: The data.
+        settings: The settings; only those of the kind count.
+        run: Runs independent parts of the fit.
+        progress: Progress callback.
+        start: ``end`` of a fit of this kind to other data, or of another size, to continue from;
+            ignored if it is of another kind.
     """
 
     data: FitData
@@ -78,12 +288,11 @@ class StartOutcome:
     """One start of a search.
 
     Attributes:
-        start: ``data`` for the rough values from the data, ``random 1`` and on for random ones,
-            ``weights 1`` and on for those that follow from a linear problem.
-        first_rms_percent: Error at the start, in percent of the largest peak-to-peak output,
-            weighted as in the criterion.
-        rms_percent: The same where the search ended.
-        evaluations: Of the criterion, derivatives apart.
+        start: ``data`` for rough values from the data, ``random N`` for random values,
+            ``weights N`` for the solution of a linear problem.
+        first_rms_percent: Weighted error at the start, in percent of the largest peak-to-peak.
+        rms_percent: The same at the end.
+        evaluations: Evaluations of the criterion, without those for derivatives.
     """
 
     start: str
@@ -98,13 +307,13 @@ class FoundModel:
 
     Attributes:
         model: The model.
-        numbers: How many numbers were found for it.
+        numbers: Number of fitted numbers.
         parameters: Parameters under their published names, in command units, um and s; empty for
-            models that are nothing but a table of weights.
-        starts: What became of each start of the search; empty where there was none.
-        standard_errors: Of the parameters, by the same names; empty where a fit has none.
-        at_bound: Parameters that stand on a bound: not found, but as far as they may go.
-        end: Where the search ended, for one that goes on from there; None of kinds without.
+            models that are only a table of weights.
+        starts: Starts of the search.
+        standard_errors: Standard errors of the parameters, if known.
+        at_bound: Parameters at a bound.
+        end: End of the search, from which another fit can start.
     """
 
     model: HysteresisModel

@@ -1,4 +1,4 @@
-"""Fit a model: measured data in, model and its errors out."""
+"""Fit of a model to records: the model, its errors, its provenance and its identified range."""
 
 import time
 from collections.abc import Mapping
@@ -15,8 +15,14 @@ from hilctl.experiment.model_validity import ALL, spectrum
 from hilctl.identify.creep_fit import creep_of, without_creep
 from hilctl.identify.data.records import History, Record, SteadyLoop, turning_points
 from hilctl.identify.evaluation import Evaluation, judge
-from hilctl.identify.fit_api import FitJob, FitRequest, FoundModel, StartOutcome
-from hilctl.identify.fit_data import FitData, search_data
+from hilctl.identify.fit_api import (
+    FitData,
+    FitJob,
+    FitRequest,
+    FoundModel,
+    StartOutcome,
+    search_data,
+)
 from hilctl.identify.registry import CATALOGUE
 from hilctl.identify.resonances import without_modes
 from hilctl.identify.settings import FitSettings
@@ -26,8 +32,8 @@ from hilctl.models.base import HysteresisModel, IdentifiedRange, Provenance
 def fit_kind(request: FitRequest) -> FoundModel:
     """Fit a kind of model.
 
-    Creep that rests show is taken off the records first, and so are known modes; the model has
-    both.
+    Creep that shows during rests, and known modes, are removed from the records first and become
+    parts of the model.
 
     Raises:
         DataError: The data can't be used as asked, or there are none.
@@ -67,7 +73,7 @@ LEAST = 0.01  # part of a history's power below its lowest frequency
 
 
 def identified_range(data: FitData) -> IdentifiedRange:
-    """Return what motions, frequencies and speeds the records have."""
+    """Return the range of motions, frequencies and speeds of the records."""
     moves = [float(np.ptp(data.target_um[place])) for place in data.places]
     speeds = [
         move * float(speed.max()) / float(np.ptp(record.command))
@@ -84,8 +90,8 @@ def identified_range(data: FitData) -> IdentifiedRange:
 def smallest_um(record: Record) -> float:
     """Return the peak-to-peak displacement of a loop, or of a history's smaller swings.
 
-    A history goes from turn to turn of its command. A tenth of its way it goes in smaller swings:
-    noise, or what is left of a decaying cycle, is not much of it.
+    Swings are those between turns of the command; a tenth of the total path is in smaller swings,
+    which excludes noise and the end of decaying cycles.
     """
     if isinstance(record, History):
         at = turning_points(record.command)
@@ -119,16 +125,16 @@ VERSIONS = {"hilctl": hilctl.__version__, "numpy": np.__version__, "scipy": scip
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FittedModel(Evaluation):
-    """An identified model, and how far it is from what it was fitted to.
+    """An identified model, and its errors on the fitted records.
 
     Attributes:
         model: The model, with its provenance.
-        numbers: How many numbers were found for it.
-        starts: What became of each start of the search.
+        numbers: Number of fitted numbers.
+        starts: Starts of the search.
         parameters: Fitted parameters under their published names, in command units, um and s.
-        standard_errors: Of the parameters, by the same names; empty where a fit has none.
-        at_bound: Parameters that stand on a bound: not found, but as far as they may go.
-        elapsed_s: How long it took.
+        standard_errors: Standard errors of the parameters, if known.
+        at_bound: Parameters at a bound.
+        elapsed_s: Duration of the fit.
     """
 
     model: HysteresisModel
@@ -140,7 +146,7 @@ class FittedModel(Evaluation):
     elapsed_s: float
 
     def to_mapping(self) -> dict[str, Any]:
-        """Return all of it as plain mappings, lists and numbers, for JSON."""
+        """Return all fields as plain mappings, lists and numbers, for JSON."""
         return {
             "model": {"kind": getattr(self.model, "kind"), **self.model.to_mapping()},  # noqa: B009
             **Evaluation.to_mapping(self),
@@ -196,14 +202,14 @@ def fit_model(request: FitRequest) -> FittedModel:
 
 
 def _method(settings: FitSettings) -> str:
-    """Return the kind of model, and what was not left as published, in one line."""
+    """Return the kind of model and the settings that differ from the published ones."""
     title = CATALOGUE[settings.kind].title
     changes = settings.changes()
     return f"{title}; {changes}" if changes else title
 
 
 def _grid_line(record: Record) -> str:
-    """Return what one record holds in one line."""
+    """Return a one-line description of a record."""
     command = record.command
     low, high = float(command.min()), float(command.max())
     if isinstance(record, SteadyLoop):

@@ -1,4 +1,4 @@
-"""Bounded least squares: linear problems, and descents from a start."""
+"""Bounded least squares: linear problems, and nonlinear ones from a start."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -41,8 +41,8 @@ def bounded_and_free(
 ) -> tuple[F64, F64]:
     """Minimise the sum of (scale (columns w + free c - target))^2 over w >= least, and c.
 
-    The lower bounds are taken out by a shift and the free columns by projection, which leaves a
-    non-negative least-squares problem; a QR decomposition makes it square first.
+    A shift removes the lower bounds, a projection the free columns, and a QR decomposition makes
+    the non-negative least-squares problem square.
 
     Args:
         columns: float64[N, m].
@@ -62,7 +62,7 @@ def bounded_and_free(
         basis, corner = np.linalg.qr(free * scale[:, None])
         inside = basis.T @ table
         table -= basis @ inside
-    # Raw: mode "r" hands out the zeros below the triangle too, a row for each sample.
+    # Mode "r" would return all rows, with the zeros below the triangle.
     _, triangle = qr(table, mode="raw", overwrite_a=True)
     extra, _ = nnls(triangle[:, :size], triangle[:, size])
     if not others:
@@ -76,17 +76,17 @@ def smooth_densities(
 ) -> tuple[F64, float]:
     """Minimise the sum of (scale (columns w + c - target))^2 over densities w >= least, and c.
 
-    Loops leave many of the densities of a triangle open: least squares alone would make spikes of
-    them, other ones on every processor. So differences of neighbours count too, and, far less, the
-    densities themselves, which leaves one solution.
+    Loops leave many densities of a triangle undetermined, and least squares alone would turn them
+    into spikes. A penalty on differences of neighbours, and a small one on the densities
+    themselves, makes the solution unique.
 
     Args:
         columns: float64[N, m].
         target: float64[N].
         scale: float64[N], square root of each sample's weight.
         least: float64[m], lower bounds.
-        table: int64[lines, cells], for each place of the triangle its density; -1 for none.
-        smoothness: Weight of the differences along a line, relative to the longest column.
+        table: int64[lines, cells], number of the density of each cell; -1 for none.
+        smoothness: Weight of differences along a line, relative to the longest column.
 
     Returns:
         The densities float64[m] and the constant.
@@ -102,10 +102,10 @@ def smooth_densities(
 
 
 def differences(first: I64, second: I64, size: int) -> F64:
-    """Return rows that take the second of two unknowns less the first: float64[k, size].
+    """Return rows of the differences of pairs of unknowns, second less first: float64[k, size].
 
     Args:
-        first: int64, numbers of unknowns; pairs with a negative number are left out.
+        first: int64, numbers of unknowns; pairs with a negative number are ignored.
         second: int64, of the same shape.
         size: Number of unknowns.
     """
@@ -117,12 +117,12 @@ def differences(first: I64, second: I64, size: int) -> F64:
 
 
 def numbered(moved: Mask) -> I64:
-    """Return the number of each density that is fitted, and -1 where none is: int64[m]."""
+    """Return the numbers of fitted densities, -1 for the others: int64[m]."""
     return np.where(moved, np.cumsum(moved) - 1, -1)
 
 
 ErrorAndSlopes: TypeAlias = Callable[[F64], tuple[F64, F64]]
-"""From a point to scaled errors float64[N] and their derivatives float64[N, p]."""
+"""Returns scaled errors float64[N] and their derivatives float64[N, p] at a point."""
 
 SETTLED_SQUARES = 1e-3  # relative fall of the sum of squares that ends a descent
 SLACK = 1e-6  # slope at a bound that is left alone, relative to the largest
@@ -132,17 +132,17 @@ STEP_RIDGE = 1e-10  # of the largest diagonal element
 def descend(
     evaluate: ErrorAndSlopes, x: F64, low: F64, high: F64, rounds: int
 ) -> tuple[F64, F64, F64]:
-    """Follow the sum of squares down within bounds (Levenberg and Marquardt).
+    """Minimise the sum of squares within bounds (Levenberg-Marquardt).
 
-    Columns are scaled to length 1. A parameter whose step would leave its bounds goes to the bound
-    and may leave it again at the next step.
+    Columns are scaled to length 1. A parameter whose step would exceed a bound stops there and may
+    leave it in the next step.
 
     Args:
-        evaluate: The errors.
-        x: float64[p], where to start; parameters with equal bounds stay.
+        evaluate: Errors and derivatives.
+        x: float64[p], start; parameters with equal bounds are fixed.
         low: float64[p].
         high: float64[p].
-        rounds: Most steps tried.
+        rounds: Maximum number of steps tried.
 
     Returns:
         The point, its errors and their derivatives.
@@ -182,8 +182,8 @@ def _step(errors: F64, slopes: F64, low: F64, high: F64, damping: float) -> F64:
 def bounded_solution(normal: F64, right: F64, low: F64, high: F64) -> F64:
     """Minimise x^T A x / 2 - b^T x within bounds, by an active set.
 
-    What would leave its bounds is held there, the rest solved anew; then whatever a bound holds
-    against the slope is let go, one at a time.
+    Variables beyond a bound are fixed there and the rest is solved again; then fixed variables
+    that the slope pulls inwards are released one by one.
 
     Args:
         normal: float64[p, p], A, positive definite.
@@ -203,7 +203,7 @@ def bounded_solution(normal: F64, right: F64, low: F64, high: F64) -> F64:
             inside &= ~beyond
             continue
         push = np.where(held, right - normal @ x, 0.0)
-        wrong = np.where(x <= low, push, -push)  # > 0 where it wants to go inwards
+        wrong = np.where(x <= low, push, -push)  # > 0 if the slope pulls inwards
         worst = int(np.argmax(wrong))
         if not wrong[worst] > SLACK * float(np.max(np.abs(right))):
             break
@@ -211,10 +211,10 @@ def bounded_solution(normal: F64, right: F64, low: F64, high: F64) -> F64:
     return np.clip(x, low, high)
 
 
-STEPS, TRIALS = 5, 8  # most that are taken, and that are tried
-SETTLED_STEP = 0.02  # of a unit: a step that ends the search
-ENOUGH = 3e-3  # of the sum of squares: a step that gains less ends it as well
-HELD = 1e-6  # of the first sum of squares: what a unit away from the start costs
+STEPS, TRIALS = 5, 8  # maximum of steps taken, and of steps tried
+SETTLED_STEP = 0.02  # units: a smaller step ends the search
+ENOUGH = 3e-3  # of the sum of squares: a smaller gain ends the search
+HELD = 1e-6  # of the first sum of squares: penalty of one unit away from the start
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,17 +223,13 @@ class SearchPoint:
 
     Attributes:
         squares: The sum of squares.
-        slope: float64[p], half its derivatives.
-        normal: float64[p, p], half its second ones, about.
+        slope: float64[p], half its gradient.
+        normal: float64[p, p], half its approximate Hessian.
     """
 
     squares: float
     slope: F64
     normal: F64
-
-    def scaled(self, factor: float) -> "SearchPoint":
-        """Return the place of that many times the sum."""
-        return SearchPoint(factor * self.squares, factor * self.slope, factor * self.normal)
 
 
 def settle(
@@ -243,17 +239,17 @@ def settle(
     bounds: tuple[F64, F64],
     unit: F64,
 ) -> F64:
-    """Return where a sum of squares is least (Levenberg and Marquardt).
+    """Return the minimum of a sum of squares (Levenberg-Marquardt).
 
-    What the data leave open stays as it was, so the end is a smooth function of the data, and
-    rounding that differs from processor to processor stays rounding.
+    A small penalty on the distance from the start makes the result a smooth function of the data,
+    so that rounding differences between processors stay small.
 
     Args:
-        sum_of: From a point to the sum of squares.
-        place_of: The same with its derivatives.
-        first: float64[p], where to start.
+        sum_of: Returns the sum of squares at a point.
+        place_of: Returns the same with derivatives.
+        first: float64[p], start.
         bounds: float64[p] each, lowest and highest.
-        unit: float64[p], changes that make about as much difference as each other.
+        unit: float64[p], changes that have about the same effect.
     """
     low, high = bounds
     x = first = np.clip(first, low, high)
@@ -282,7 +278,7 @@ def settle(
     return x
 
 
-SAME = 1e-6  # relative difference of two ends that are one and the same minimum
+SAME = 1e-6  # relative difference of sums at one and the same minimum
 
 
 def converged(
@@ -293,19 +289,18 @@ def converged(
     evaluations: int,
     slopes: Callable[[F64], F64] | None = None,
 ) -> tuple[F64, int]:
-    """Return where bounded least squares ends from ``x``, and the evaluations it took.
+    """Return the end of bounded least squares from ``x``, and the number of evaluations.
 
-    Where derivatives are differences, they are central ones: those to one side are known to eight
-    digits only, and what rounding makes of the rest, another thing on every processor, grows from
-    step to step.
+    Numerical derivatives are central differences: one-sided ones have eight digits only, and the
+    rounding, which differs between processors, would grow from step to step.
 
     Args:
-        errors: From a point float64[p] to float64[N].
-        x: float64[p], where to start.
+        errors: Returns float64[N] at a point float64[p].
+        x: float64[p], start.
         low: float64[p].
         high: float64[p].
-        evaluations: Most of the errors, derivatives apart.
-        slopes: Derivatives float64[N, p]; differences where None.
+        evaluations: Maximum number, without those for derivatives.
+        slopes: Returns derivatives float64[N, p]; None for differences.
     """
     margin = 1e-9 * (high - low)
     found = least_squares(
@@ -320,9 +315,8 @@ def converged(
 
 
 def first_least(values: Sequence[float]) -> int:
-    """Return the first of the values that are the least but for rounding.
+    """Return the index of the first value that equals the least except for rounding.
 
-    Starts that end at one minimum differ in the last digits only, and those are another thing on
-    every processor: the first of them is taken.
+    Starts that end at one minimum differ in the last digits, which depend on the processor.
     """
     return int(np.argmax(np.array(values) <= min(values) * (1.0 + SAME)))

@@ -1,4 +1,4 @@
-"""An identified or a refined model as one self-contained page: model against data."""
+"""HTML pages of an identified or a refined model, with plots of model and data."""
 
 import html
 from collections.abc import Sequence
@@ -28,11 +28,11 @@ from hilctl.models.model_file import dump_model
 COLUMNS = 3
 MOST_RECORDS = 36
 MOST_RUNS = 12
-MOST_DRAWN = 20_000  # samples of a history: more have no place on a page
+MOST_DRAWN = 20_000  # samples of a history per plot
 
 
 def write_identification(found: Identification, path: Path) -> None:
-    """Write the page; one of that name is replaced.
+    """Write the page, replacing an existing file.
 
     Raises:
         InputError: It can't be written.
@@ -73,7 +73,7 @@ def loops_figure(modelled_um: Sequence[F64], data: Sequence[Record], unit: str) 
     """Draw displacement against command, measured and modelled, and the error below each.
 
     Args:
-        modelled_um: The model's displacement of each record's judged samples.
+        modelled_um: Modelled displacement of the evaluated samples of each record.
         data: Loops and histories.
         unit: Unit of the command.
     """
@@ -104,7 +104,7 @@ def loops_figure(modelled_um: Sequence[F64], data: Sequence[Record], unit: str) 
 
 
 def write_refinement(found: Refinement, path: Path) -> None:
-    """Write the page; one of that name is replaced.
+    """Write the page, replacing an existing file.
 
     Raises:
         InputError: It can't be written.

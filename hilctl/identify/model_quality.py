@@ -1,4 +1,4 @@
-"""What a model is worth: good, usable within an error, or not a model of this, and why."""
+"""Grade of a model: good, usable within an error, or not a model, with reasons."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -7,40 +7,40 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from hilctl.base.types import F64
-from hilctl.identify.cross_validation import HeldOut
 from hilctl.identify.data.records import Record, SteadyLoop
 from hilctl.identify.fit_model import FittedModel
+from hilctl.identify.model_selection import HeldOut
 from hilctl.identify.settings import FitSettings
 
 Grade: TypeAlias = Literal["good", "usable", "not a model"]
 
 GOOD_PERCENT = 2.0
-MOST_PERCENT = 25.0  # of a record's own peak-to-peak: a straight line does as well on most
-FOLLOWED = 0.5  # least part of the displacement's variance that a model must explain
-AGAINST = -0.3  # correlation of command and displacement: the one falls where the other rises
-LEADING = -0.02  # area of a loop, of its rectangle: the displacement is ahead of the command
+MOST_PERCENT = 25.0  # of a record's own peak-to-peak, the typical error of a straight line
+FOLLOWED = 0.5  # part of the variance of the displacement that a model must explain
+AGAINST = -0.3  # correlation of command and displacement with the wrong sign
+LEADING = -0.02  # area of a loop, of its rectangle, whose displacement leads the command
 EVEN = 0.5  # correlation with the command's distance from its middle
 MOST_UM = 5000.0
 LIKELY_UM = 500.0
-APART = 30.0  # times: gains of two records of one actuator
-ALIKE = 1.2  # times: amplitudes or frequencies that are one and the same
-SLOW = 1.5  # times the lowest frequency: loops whose phase is the hysteresis', not the delay's
+APART = 30.0  # maximum ratio of the gains of records of one actuator
+ALIKE = 1.2  # ratio of amplitudes or frequencies that count as one
+SLOW = 1.5  # of the lowest frequency: loops whose phase is due to hysteresis, not delay
 CONSTANT = 0.5  # part of the mean square error that is a constant
 CLEAR_PERCENT = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What a model is worth.
+    """Grade of a model.
 
     Attributes:
-        grade: ``not a model`` where it must not be used; ``good`` only where data that the fit did
-            not see, of several amplitudes and frequencies, say so.
-        within_percent: Largest error, in percent of a record's own peak-to-peak displacement: on
-            data that the fit did not see, where there were any.
-        held_out: Whether there were any.
-        reasons: Why it is not a model of this.
-        notes: What can't be known from these data, and what to try.
+        grade: ``not a model`` if it must not be used; ``good`` only with held-out data of several
+            amplitudes and frequencies.
+        within_percent: Largest error in percent of a record's own peak-to-peak displacement, on
+            held-out data if there are any.
+        held_out: Whether there are held-out data.
+        reasons: Reasons for ``not a model``.
+        notes: Limits of the data, and suggestions.
     """
 
     grade: Grade
@@ -51,12 +51,12 @@ class Verdict:
 
     def __str__(self) -> str:
         if self.reasons:
-            return f"not a model of this, because {'; and '.join(self.reasons)}"
+            return f"not a model: {'; and '.join(self.reasons)}"
         percent = f"{self.within_percent:.2f} % of a record's own peak-to-peak"
         if not self.held_out:
-            return f"usable within {percent} on these very data; elsewhere its error is not known"
+            return f"fit error {percent} (no validation data, so the error elsewhere is unknown)"
         within = "good: within" if self.grade == "good" else "usable within"
-        return f"{within} {percent}, on data that the fit did not see"
+        return f"{within} {percent}, on held-out data"
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the fields as plain values."""
@@ -66,13 +66,13 @@ class Verdict:
 def verdict_of(
     fit: FittedModel, records: Sequence[Record], settings: FitSettings, held_out: HeldOut | None
 ) -> Verdict:
-    """Judge a fit.
+    """Return the grade of a fit.
 
     Args:
         fit: The fit.
-        records: What it was fitted to.
-        settings: Its choices.
-        held_out: Its errors on data that it did not see; None where there were none.
+        records: Fitted records.
+        settings: Settings of the fit.
+        held_out: Errors on held-out data; None if there are none.
     """
     judged = held_out.judgement if held_out else fit
     within = judged.own_peak_percent
@@ -82,24 +82,24 @@ def verdict_of(
     unknown, suggestions = _unknown(records, held_out), _suggestions(fit, records, settings)
     if reasons:
         return Verdict("not a model", within, held_out is not None, reasons, tuple(suggestions))
-    # Loops held out from a campaign of one amplitude or frequency say nothing of others.
+    # Held-out loops of one amplitude or frequency say nothing about others.
     grade: Grade = "usable" if unknown or within > GOOD_PERCENT else "good"
     return Verdict(grade, within, held_out is not None, notes=(*unknown, *suggestions))
 
 
 def data_reasons(records: Sequence[Record], *, even: bool = False) -> Iterator[str]:
-    """Give what is wrong with the data themselves, whatever the model.
+    """Yield faults of the data that do not depend on the model.
 
     Args:
         records: The data.
-        even: Whether the displacement may rise both ways, as that of rods without a bias does.
+        even: Whether the displacement may rise with commands of both signs (rods without bias).
     """
     moves = [float(np.ptp(record.displacement_um)) for record in records]
     largest = int(np.argmax(moves))
     if moves[largest] > MOST_UM:
         yield (
-            f"'{records[largest].label}' moves by {moves[largest]:.3g} µm, further than any such "
-            "actuator: is the displacement in nm? Give it in um"
+            f"'{records[largest].label}' moves by {moves[largest]:.3g} µm, more than any such "
+            "actuator. Is the displacement in nm? It must be in um"
         )
         return
     gains = np.array([m / np.ptp(r.command) for m, r in zip(moves, records, strict=True)])
@@ -107,8 +107,8 @@ def data_reasons(records: Sequence[Record], *, even: bool = False) -> Iterator[s
     odd = int(np.argmax(np.abs(np.log(ratio))))
     if not 1.0 / APART < ratio[odd] < APART:
         yield (
-            f"'{records[odd].label}' moves {ratio[odd]:.3g} times as far for its command as the "
-            "others: are its units others, or is its coil dead? Mend it or leave it out"
+            f"'{records[odd].label}' has {ratio[odd]:.3g} times the median gain. Check its units "
+            "and the coil, or exclude it with --leave-out"
         )
         return
     slow = _slow(records)
@@ -117,13 +117,13 @@ def data_reasons(records: Sequence[Record], *, even: bool = False) -> Iterator[s
         return
     if along < AGAINST:
         yield (
-            "the displacement falls where the command rises: swap the wires of the coil, or turn "
+            "the displacement falls when the command rises: swap the wires of the coil, or invert "
             "the sign of the sensor"
         )
     elif along > 0.0 and float(np.median([_area(record) for record in slow])) < LEADING:
         yield (
-            "the displacement is ahead of the command, as no actuator's is: swap the columns of "
-            "command and displacement, or mend their timing"
+            "the displacement leads the command: swap the columns of command and displacement, or "
+            "correct their timing"
         )
 
 
@@ -133,13 +133,13 @@ def _fit_reasons(
     explained = _explained(fit, records)
     if explained < FOLLOWED:
         yield (
-            f"the displacement does not follow the command: {100.0 * max(explained, 0.0):.0f} % of "
-            f"its variance goes with it; {_cause(records)}"
+            f"the displacement does not follow the command: the model explains "
+            f"{100.0 * max(explained, 0.0):.0f} % of its variance; {_cause(records)}"
         )
         return
     unseen = held_out is not None and held_out.judgement.own_peak_percent > MOST_PERCENT
     judged = held_out.judgement if held_out and unseen else fit
-    what = ", which the fit did not see" if unseen else ""
+    what = ", which was held out" if unseen else ""
     if judged.own_peak_percent > MOST_PERCENT:
         worst = max(judged.errors, key=lambda error: error.peak_percent)
         yield (
@@ -155,31 +155,33 @@ def _cause(records: Sequence[Record]) -> str:
         for record, centre in zip(records, middle, strict=True)
     ]
     if float(np.mean(folded)) > EVEN:
-        return "it goes the same way on both sides, as rods without a bias do: --model butterfly"
-    return "look for a dead coil or amplifier, a loose sensor, or the wrong column"
+        return (
+            "it rises with commands of both signs, as rods without bias do: use --model butterfly"
+        )
+    return "check coil, amplifier, sensor and columns"
 
 
 def _unknown(records: Sequence[Record], held_out: HeldOut | None) -> list[str]:
-    """Return what can't be known from these data."""
+    """Return notes on the limits of the data."""
     found = []
     loops = [record for record in records if isinstance(record, SteadyLoop)]
     if len(loops) == len(records):
         turns = [loop.frequency_hz for loop in loops]
         if max(turns) < ALIKE * min(turns):
             found.append(
-                f"all loops are at {turns[0]:.3g} Hz: what the rate does to hysteresis, lag and "
-                "resonance can't be known from these: add loops at other frequencies"
+                f"all loops are at {turns[0]:.3g} Hz, so the influence of the rate is unknown: add "
+                "loops at other frequencies"
             )
         moves = [float(np.ptp(loop.command)) for loop in loops]
         if max(moves) < ALIKE * min(moves):
             found.append(
-                "all loops have one amplitude: what smaller ones do can't be known from these: "
-                "add loops at other amplitudes"
+                "all loops have one amplitude, so smaller loops are unknown: add loops at other "
+                "amplitudes"
             )
     if held_out is None:
         found.append(
-            "nothing was held out, so the error is that of what was fitted: give four loops or "
-            "more at several amplitudes and frequencies, or other files with --validate"
+            "no data were held out: use four loops or more at several amplitudes and frequencies, "
+            "or other files with --validate"
         )
     return found
 
@@ -194,11 +196,11 @@ def _suggestions(
     shown = 100.0 * abs(constant) / stroke_um
     if shown > CLEAR_PERCENT and constant**2 > CONSTANT * float(np.mean(error_um**2)):
         offset = settings.has("offset") and not settings.offset
-        hint = ": --set offset=true finds it" if offset else ""
+        hint = ": fit it with --set offset=true" if offset else ""
         share = f"{-constant:.3g} µm, {shown:.1f} % of the stroke"
         yield f"most of the error is a constant, {share}{hint}"
     if stroke_um > LIKELY_UM:
-        yield f"a stroke of {stroke_um:.3g} µm is large: is the displacement in um?"
+        yield f"a stroke of {stroke_um:.3g} µm is large. Is the displacement in um?"
 
 
 def _explained(fit: FittedModel, records: Sequence[Record]) -> float:
@@ -230,7 +232,7 @@ def _correlation(signal: F64, record: Record) -> float:
 
 
 def _area(record: Record) -> float:
-    """Return the area between command and displacement, of its rectangle; > 0 where it lags."""
+    """Return the area of a loop, of its rectangle; > 0 if the displacement lags."""
     command, displacement_um = record.command, record.displacement_um
     if isinstance(record, SteadyLoop):
         command = np.append(command, command[0])

@@ -8,12 +8,178 @@ from typing import Any
 import numpy as np
 
 from hilctl.base.errors import DataError
-from hilctl.identify.cross_validation import HeldOut, held_out_errors
-from hilctl.identify.data.records import History, Records
-from hilctl.identify.fit_api import FitRequest, OnProgress
-from hilctl.identify.fit_model import fit_model
-from hilctl.identify.parallel import MapFunction
+from hilctl.base.types import F64
+from hilctl.identify.data.records import History, Record, Records, SteadyLoop
+from hilctl.identify.evaluation import Evaluation, judge, judgement_of
+from hilctl.identify.fit_api import FitData, FitRequest, OnProgress, ignore_progress
+from hilctl.identify.fit_model import fit_kind, fit_model
+from hilctl.identify.parallel import MapFunction, serial_map
 from hilctl.identify.settings import FitSettings, IdentifySettings, kinds_of
+
+FEWEST_LOOPS = 4
+FOLDS = 3
+SEED = 1
+HEAD = 0.7  # part of a history that is fitted if the rest is held out
+SAME = 0.02  # of a span: what counts as within it
+MOVES = 0.1  # of a history's peak-to-peak: least motion of a last part that is held out
+
+
+@dataclass(frozen=True, slots=True)
+class Split:
+    """Records of one fit, and those that it is evaluated on.
+
+    Attributes:
+        fitted: Fitted records.
+        held_out: Held-out records.
+    """
+
+    fitted: tuple[Record, ...]
+    held_out: tuple[Record, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class HeldOut:
+    """Errors of a model on held-out data.
+
+    Attributes:
+        judgement: The errors.
+        records: The data.
+        how: Origin of the data, as text.
+        end: End of the last fit, from which a fit to all data can start.
+    """
+
+    judgement: Evaluation
+    records: tuple[Record, ...]
+    how: str
+    end: object | None = None
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return the errors as plain mappings, lists and numbers, for JSON."""
+        return self.judgement.to_mapping() | {"how": self.how}
+
+
+def folds_of(records: Sequence[Record]) -> list[Split]:
+    """Return the folds; none if there are too few data.
+
+    Records that extend the range of commands, frequencies or speeds are not held out, since a model
+    need not be valid beyond its range. Of histories the last part is held out.
+    """
+    if any(isinstance(record, History) for record in records):
+        heads, tails = zip(*map(_halved, records), strict=True)
+        held_out = tuple(tail for tail in tails if tail is not None)
+        return [Split(heads, held_out)] if held_out else []
+    if len(records) < FEWEST_LOOPS:
+        return []
+    folds = []
+    # Every third of a grid in its own order would be all loops of one frequency.
+    mixed = np.random.default_rng(SEED).permutation(len(records)).tolist()
+    for first in range(FOLDS):
+        members = sorted(mixed[first::FOLDS])
+        rest = [record for i, record in enumerate(records) if i not in members]
+        out = [records[i] for i in members if _within(records[i], rest)]
+        fitted = tuple(r for r in records if not any(r is other for other in out))
+        if out:
+            folds.append(Split(fitted, tuple(out)))
+    return folds
+
+
+def held_out_error(request: FitRequest) -> HeldOut | None:
+    """Return errors of a fit on held-out parts of its data; None if they are too few."""
+    request.progress(0.0, "fits with held-out data")
+    (found,) = held_out_errors([request], request.run)
+    return found
+
+
+def held_out_errors(requests: Sequence[FitRequest], run: MapFunction) -> list[HeldOut | None]:
+    """Return errors of each fit on held-out parts of its data.
+
+    One start of each search is enough.
+
+    Args:
+        requests: What to fit.
+        run: Runs the fits, which do not depend on each other.
+
+    Returns:
+        For each request its errors; None if too few data are left.
+    """
+    tasks = [
+        _Task(number, fold, replace(
+            request,
+            records=fold.fitted,
+            settings=request.settings.model_copy(update={"starts": 1}),
+            run=serial_map,
+            progress=ignore_progress,
+        ))
+        for number, request in enumerate(requests)
+        for fold in folds_of(request.records)
+    ]  # fmt: skip
+    done: list[list[tuple[Split, F64, object | None]]] = [[] for _ in requests]
+    for task, found in zip(tasks, run(_fitted, tasks), strict=True):
+        if found is not None:
+            done[task.number].append((task.fold, *found))
+    return [_together(*each) for each in zip(requests, done, strict=True)]
+
+
+@dataclass(frozen=True, slots=True)
+class _Task:
+    """One fit of the request of that number, to the fitted records of a fold."""
+
+    number: int
+    fold: Split
+    request: FitRequest
+
+
+def _fitted(task: _Task) -> tuple[F64, object | None] | None:
+    """Return the response to the held-out data, and where the search ended."""
+    try:
+        found = fit_kind(task.request)
+    except DataError:  # too few records for this kind of fit; all of them may be enough
+        return None
+    judged = judge(found.model, task.fold.held_out, creep=task.request.settings.creep)
+    return np.concatenate(judged.modelled_um), found.end
+
+
+def _together(
+    request: FitRequest, done: Sequence[tuple[Split, F64, object | None]]
+) -> HeldOut | None:
+    if not done:
+        return None
+    held_out = tuple(record for fold, _, _ in done for record in fold.held_out)
+    responses_um = np.concatenate([modelled for _, modelled, _ in done])
+    parts = "the last parts of histories" if isinstance(held_out[-1], History) else "loops"
+    how = f"{len(held_out)} of {len(request.records)} {parts}, each held out of one fit"
+    judgement = judgement_of(FitData(held_out, request.unit), responses_um)
+    return HeldOut(judgement, held_out, how, done[-1][2])
+
+
+def _halved(record: Record) -> tuple[Record, Record | None]:
+    """Return the fitted and the held-out part of a record; no part of a loop is held out."""
+    if isinstance(record, SteadyLoop):
+        return record, None
+    label, rate_hz = record.label, record.sample_rate_hz
+    command, displacement_um = record.command, record.displacement_um
+    cut = record.ignore + round(HEAD * (command.size - record.ignore))
+    try:
+        head = History(label, command[:cut], displacement_um[:cut], rate_hz, record.ignore)
+        tail = History(label, command, displacement_um, rate_hz, cut)
+    except DataError:
+        return record, None
+    moves = np.ptp(displacement_um[cut:]) > MOVES * np.ptp(displacement_um)
+    return (head, tail) if moves and _within(record, [head]) else (record, None)
+
+
+def _within(record: Record, others: Sequence[Record]) -> bool:
+    reached = np.max([_extremes(other) for other in others], axis=0)
+    return bool(np.all(_extremes(record) <= reached + SAME * np.abs(reached)))
+
+
+def _extremes(record: Record) -> F64:
+    """Return command, frequency and speed, both ways, that held-out records may not exceed."""
+    command, rate, _ = record.run()
+    frequency_hz = record.frequency_hz if isinstance(record, SteadyLoop) else 0.0
+    speed = float(np.abs(rate).max())
+    return np.array([command.max(), -command.min(), frequency_hz, -frequency_hz, speed])
+
 
 WHOLE: tuple[Mapping[str, Any], ...] = (
     {"kind": "field", "drags": 0, "plays": 8, "cells": 12, "knots": 16},
@@ -109,15 +275,15 @@ def select(request: FitRequest) -> Selection:
 def _choose_kind(request: FitRequest, given: IdentifySettings) -> Selection:
     """Return the kind with the least error.
 
-    Of histories, small models say which kinds are worth a large one: the errors of the wrong kind
-    are several times those of the right one at any size.
+    For histories, small models select the kinds to try at full size: a wrong kind has several times
+    the error of the right one at any size.
     """
     whole = any(isinstance(record, History) for record in request.records)
     errors = _candidates(request, given, WHOLE if whole else LOOPS)
     if whole and not any(each.rms_percent < WELL_PERCENT for each in errors):
         errors += _candidates(request, given, (PLAIN,))
     if not errors:
-        raise DataError("too few data to leave some out and choose by them: name a --model")
+        raise DataError("too few data to hold some out and select a model: use --model NAME")
     best = min(errors, key=_rms_percent)
     near = [each for each in errors if each.rms_percent <= NEAR * best.rms_percent]
     for turn in range(LONGEST if whole else 0):
@@ -135,10 +301,10 @@ def _choose_kind(request: FitRequest, given: IdentifySettings) -> Selection:
 def _choose_order(request: FitRequest) -> Selection:
     """Return the smallest size whose error is near the least."""
     sizes = _sizes(request.settings)
-    request.progress(0.0, f"fits with data left out, of {len(sizes)} sizes")
+    request.progress(0.0, f"fits of {len(sizes)} sizes with held-out data")
     errors = _tried(request, [("", settings) for settings in sizes])
     if not errors:
-        raise DataError("too few data to leave some out and choose a number of plays by them")
+        raise DataError("too few data to hold some out and select the number of plays: set plays=N")
     most = WORTH_SIZE * min(each.rms_percent for each in errors)
     best = next(each for each in errors if each.rms_percent <= most)
     return Selection(best.settings, best.held_out, orders=tuple(each.order for each in errors))
@@ -199,7 +365,7 @@ def _candidates(
 
 
 def _parts(candidate: Mapping[str, Any], given: IdentifySettings) -> dict[str, Any]:
-    """Return whether parts that may be left out are looked for, those that a kind has."""
+    """Return the settings of optional parts that a kind has."""
     fields, kind = IdentifySettings.model_fields, candidate["kind"]
     has = [name for name in ("creep_stage", "modes") if kind in kinds_of(fields[name])]
     return {name: getattr(given, name) for name in has}
@@ -214,13 +380,13 @@ def _sizes(settings: FitSettings) -> list[FitSettings]:
 def choose_lag(
     load: Callable[[int], Records], settings: FitSettings, run: MapFunction, progress: OnProgress
 ) -> int:
-    """Find by how many samples the displacement lags: the lag that leaves the least error.
+    """Return the lag of the displacement, in samples, with the least error.
 
     Args:
-        load: Gives the data with the displacement taken that many samples earlier.
-        settings: The choices of the fit.
-        run: Runs fits that do not depend on each other.
-        progress: Called with what is being done.
+        load: Loads the data with the displacement shifted by that many samples.
+        settings: Settings of the fit.
+        run: Runs independent fits.
+        progress: Progress callback.
     """
     progress(0.0, f"{MOST_LAG + 1} fits for the lag of the displacement")
     lean = settings.model_copy(update={"starts": 1, "peak_goal_percent": None})

@@ -1,4 +1,4 @@
-"""Independent fits at the same time: here, over threads or processes, or on a Dask cluster."""
+"""Parallel maps: serial, over threads or processes, or on a Dask cluster."""
 
 import os
 import threading
@@ -7,7 +7,7 @@ from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cache
 from multiprocessing import get_context
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 from hilctl.base.errors import InputError
 
@@ -16,24 +16,11 @@ Result = TypeVar("Result")
 SCHEDULERS = ("none", "threads", "processes")
 
 
-class MapFunction(Protocol):
-    """Runs a function on each task and returns the results in the tasks' order."""
+MapFunction: TypeAlias = Callable[[Callable[[Any], Any], Sequence[Any]], list[Any]]
+"""Runs a function on each task and returns the results in the order of the tasks."""
 
-    def __call__(
-        self, function: Callable[[Task], Result], tasks: Sequence[Task], /
-    ) -> list[Result]:
-        """Return ``[function(task) for task in tasks]``; the first error is raised."""
-        ...
-
-
-class StreamFunction(Protocol):
-    """Runs a function on each task and yields the results in the tasks' order, as they come."""
-
-    def __call__(
-        self, function: Callable[[Task], Result], tasks: Sequence[Task], /
-    ) -> Iterator[Result]:
-        """Yield ``function(task) for task in tasks``; the first error is raised."""
-        ...
+StreamFunction: TypeAlias = Callable[[Callable[[Any], Any], Sequence[Any]], Iterator[Any]]
+"""Runs a function on each task and yields the results in the order of the tasks."""
 
 
 def serial_map(function: Callable[[Task], Result], tasks: Sequence[Task], /) -> list[Result]:
@@ -42,10 +29,10 @@ def serial_map(function: Callable[[Task], Result], tasks: Sequence[Task], /) -> 
 
 
 def parallel_map(function: Callable[[Task], Result], tasks: Iterable[Task], /) -> list[Result]:
-    """Return ``[function(task) for task in tasks]``, worked out on all cores; the order is kept.
+    """Return ``[function(task) for task in tasks]``, computed by threads on all cores.
 
-    For the short parts of one fit, most of whose time goes to kernels that leave the interpreter to
-    others (``nogil``) and to BLAS; a part must not come here itself.
+    For short parts of one fit that spend their time in ``nogil`` kernels and BLAS. A part must not
+    call this function itself.
     """
     if _worker.unwanted.is_set():
         raise _UnwantedError
@@ -53,11 +40,11 @@ def parallel_map(function: Callable[[Task], Result], tasks: Iterable[Task], /) -
 
 
 class _UnwantedError(Exception):
-    """Ends a fit whose result nobody waits for any more."""
+    """Cancels a fit whose result is not wanted any more."""
 
 
 class _Worker(threading.local):
-    """Whether what a thread of :func:`streams` works out is still wanted."""
+    """Cancellation of the tasks of a thread of :func:`streams`."""
 
     def __init__(self) -> None:
         self.unwanted = threading.Event()
@@ -76,7 +63,7 @@ def _threads() -> ThreadPoolExecutor:
 
 @contextmanager
 def workers(scheduler: str = "none") -> Iterator[MapFunction]:
-    """Give a :class:`MapFunction`; see :func:`streams`."""
+    """Yield a :data:`MapFunction`; see :func:`streams`."""
     if scheduler == "none":
         yield serial_map
         return
@@ -90,10 +77,10 @@ def workers(scheduler: str = "none") -> Iterator[MapFunction]:
 
 @contextmanager
 def streams(scheduler: str = "none") -> Iterator[StreamFunction]:
-    """Give a :class:`StreamFunction`; results do not depend on which.
+    """Yield a :data:`StreamFunction`; results do not depend on the scheduler.
 
     Args:
-        scheduler: ``none`` for one after the other, ``threads`` or ``processes`` on this machine,
+        scheduler: ``none`` for serial, ``threads`` or ``processes`` on this machine,
             or the address of a Dask scheduler, such as ``tcp://host:8786``. Its workers need the
             same hilctl.
 
@@ -129,7 +116,7 @@ def _local(scheduler: str) -> Iterator[Executor]:
         try:
             yield threads
         except BaseException:
-            unwanted.set()  # a Ctrl-C is not to wait seconds for fits to end
+            unwanted.set()  # Ctrl-C does not wait for fits to end
             raise
 
 

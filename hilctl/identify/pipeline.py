@@ -9,7 +9,6 @@ from typing import Any
 from hilctl.base.errors import InputError
 from hilctl.base.files import check_writable, write_text
 from hilctl.base.yaml import Document
-from hilctl.identify.cross_validation import HeldOut, held_out_error
 from hilctl.identify.data.data_files import load_records
 from hilctl.identify.data.records import History, Record
 from hilctl.identify.evaluation import judge
@@ -18,9 +17,11 @@ from hilctl.identify.fit_model import FittedModel, error_table, fit_model
 from hilctl.identify.model_quality import Verdict, verdict_of
 from hilctl.identify.model_selection import (
     CandidateScore,
+    HeldOut,
     OrderScore,
     Selection,
     choose_lag,
+    held_out_error,
     select,
 )
 from hilctl.identify.parallel import MapFunction, workers
@@ -84,7 +85,7 @@ class Identification:
     Attributes:
         fit: The fit.
         data: Fitted records.
-        verdict: What the model is worth.
+        verdict: Grade of the model.
         held_out: Errors on held-out data; None if there were none.
         orders: Errors of each number of plays, if it was selected.
         lag_samples: Assumed lag of tables' displacements in samples.

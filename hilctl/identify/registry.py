@@ -1,20 +1,24 @@
-"""Every kind of model that can be identified: its name, how, and what data that takes."""
+"""Registry of the kinds of model that can be identified, with their fits."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from hilctl.base.errors import InputError
 from hilctl.base.yaml import did_you_mean
-from hilctl.identify.field.field_fits import fit_field
+from hilctl.identify.field.duhem_search import fit_generalised_duhem
+from hilctl.identify.field.field_search import fit_field
 from hilctl.identify.fit_api import FitJob, FoundModel
-from hilctl.identify.generalised_duhem.search import fit_generalised_duhem
-from hilctl.identify.literature.asymmetric import fit_asymmetric
-from hilctl.identify.literature.generalised_pi import fit_generalised
-from hilctl.identify.literature.linear_weights import fit_kp, fit_preisach, fit_straight
-from hilctl.identify.literature.ode_models import fit_bouc_wen, fit_duhem
+from hilctl.identify.literature import (
+    fit_asymmetric,
+    fit_bouc_wen,
+    fit_duhem,
+    fit_generalised,
+    fit_kp,
+    fit_preisach,
+    fit_straight,
+)
 from hilctl.identify.searched.butterfly import fit_butterfly
-from hilctl.identify.searched.integrated import fit_exponential
-from hilctl.identify.searched.plays import fit_plays
+from hilctl.identify.searched.plays import fit_exponential, fit_plays
 from hilctl.identify.settings import FitKind
 from hilctl.identify.staged.staged_fits import fit_free, fit_staged
 
@@ -29,10 +33,10 @@ class CatalogueEntry:
     """A kind of model.
 
     Attributes:
-        title: What it is, for people.
-        found_by: How it is identified, for people.
-        data: What that takes, for people.
-        fit: Identifies it.
+        title: Name and equations.
+        found_by: Method of the fit.
+        data: Records that it takes.
+        fit: The fit.
     """
 
     title: str
@@ -46,15 +50,15 @@ def _fit_integrated(job: FitJob) -> FoundModel:
 
 
 _SEARCH = "least squares from several starts"
-_NNLS = "non-negative least squares, held smooth"
-_WEIGHTS_FOLLOW = "least squares on the shape, the weights follow"
+_NNLS = "non-negative least squares with a smoothness prior"
+_WEIGHTS_FOLLOW = "least squares on the shape, linear in the weights"
 
 CATALOGUE: Mapping[FitKind, CatalogueEntry] = {
     "integrated": CatalogueEntry(
         "integrated, Omega: rate, asymmetry (6.18-6.24)", _SEARCH, ANY, _fit_integrated
     ),
     "staged": CatalogueEntry(
-        "Omega between field lag, structure and delay", "identified together", STAGES, fit_staged
+        "Omega between field lag, structure and delay", "all parts together", STAGES, fit_staged
     ),
     "rdpi": CatalogueEntry("rate-dependent PI: no deadbands (5.11, 5.14)", _SEARCH, ANY, fit_plays),
     "asymmetric": CatalogueEntry(
@@ -74,13 +78,13 @@ CATALOGUE: Mapping[FitKind, CatalogueEntry] = {
     ),
     "field": CatalogueEntry(
         "plays and drags of an effective field, with its losses",
-        "densities by non-negative least squares, the stages searched",
+        "densities by non-negative least squares, stages by search",
         HISTORIES,
         fit_field,
     ),
     "generalised_duhem": CatalogueEntry(
         "generalised Duhem: slopes by place and direction, with losses",
-        "slopes and stages together, held smooth",
+        "slopes and stages together, with a smoothness prior",
         HISTORIES,
         fit_generalised_duhem,
     ),
@@ -89,10 +93,10 @@ CATALOGUE: Mapping[FitKind, CatalogueEntry] = {
 
 
 def entry(name: str) -> tuple[FitKind, CatalogueEntry]:
-    """Return a kind of model and what is known of it.
+    """Return a kind of model and its entry.
 
     Raises:
-        InputError: There is none of that name.
+        InputError: The name is unknown.
     """
     for kind, known in CATALOGUE.items():
         if kind == name:

@@ -1,9 +1,8 @@
-"""Further modes of the structure, from what a model with one mode leaves of the displacement.
+"""Fit of further modes of the structure to the residual of a model with one mode.
 
-A linear part that was left out shows as a transfer function from what the model gives to what was
-measured, whatever the hysteresis before it. Cross-spectra of the records tell it from what is not
-linear; where a resonance with its antiresonance has its shape, both are taken off the records, and
-the model is fitted to the rest.
+A missing linear part shows in the transfer function from modelled to measured displacement, which
+follows from cross-spectra whatever the hysteresis before it. Pairs of resonance and antiresonance
+with a clear shape are removed from the records, and the model is fitted to the rest.
 """
 
 import math
@@ -19,34 +18,34 @@ from hilctl.base.types import C128, F64
 from hilctl.identify.data.records import History, Record
 from hilctl.models.linear_stages import FurtherMode
 
-SEGMENT_S = 0.3  # long beside the time that what rings takes to die away, short beside a record
-FASTEST_HZ = 20e3  # sample rate: no structure of an actuator is looked for beyond a quarter of it
+SEGMENT_S = 0.3  # long compared with the decay of a mode, short compared with a record
+FASTEST_HZ = 20e3  # sample rate of the analysis; modes are below a quarter of it
 FEWEST_SEGMENTS = 12
 FEWEST_BINS = 40
-AT_ONCE = 64  # segments, of which a long record has many
-LOWEST_BIN = 2  # those below have the trend of each segment in them
-WORTH = 0.9  # of a model's rms error: what better modes must bring it to
-ROUNDING = 1e-20  # of the power of a displacement: less than that is left by no model
-TRIES = 24, (0.01, 0.03, 0.1, 0.3)  # natural frequencies and damping ratios that are tried first
-FOLLOWED = 3  # of the best of them
-APART = 1.4  # from the first mode, either way: what is nearer is that mode, found not quite right
-DISTINCT = 1.15  # of two further modes' frequencies: nearer ones are one, cut in two
-LEAST_DAMPING, MOST_DAMPING = 2e-3, 0.3  # what is damped more does not ring
-NEAR = math.log(2.0)  # of antiresonance over resonance
-SMOOTH = 3  # numbers of what is smooth
+AT_ONCE = 64  # segments transformed together, to limit memory
+LOWEST_BIN = 2  # lower ones contain the trend of each segment
+WORTH = 0.9  # of the rms error of a model: maximum with better modes
+ROUNDING = 1e-20  # of the power of a displacement: minimum residual of a model
+TRIES = 24, (0.01, 0.03, 0.1, 0.3)  # number of frequencies, and damping ratios, of starts
+FOLLOWED = 3  # starts that are optimised
+APART = 1.4  # minimum frequency ratio to the first mode, whose own error would be nearer
+DISTINCT = 1.15  # minimum frequency ratio of two further modes
+LEAST_DAMPING, MOST_DAMPING = 2e-3, 0.3
+NEAR = math.log(2.0)  # maximum of antiresonance over resonance
+SMOOTH = 3  # parameters of the smooth part: gain, slope, bend
 PAIR = 4
 MOST = 3
 
 
 @dataclass(frozen=True, slots=True)
 class _Spectra:
-    """From what is modelled to what was measured, by frequency.
+    """Transfer function from modelled to measured displacement.
 
     Attributes:
         frequency_hz: float64[k].
-        transfer: complex128[k], the part of the measured that follows the modelled linearly.
-        power: float64[k], of the modelled.
-        left: Power of what the model leaves of the measured, linear or not, at all frequencies.
+        transfer: complex128[k].
+        power: float64[k], of the modelled displacement.
+        left: Power of the residual at all frequencies.
     """
 
     frequency_hz: F64
@@ -61,13 +60,13 @@ def further_modes(
     known: Sequence[FurtherMode],
     first_hz: float | None,
 ) -> tuple[FurtherMode, ...] | None:
-    """Return better modes than those that are known, or one more; None where it is not worth it.
+    """Return improved modes, with one more if the residual shows it; None if nothing improves.
 
     Args:
-        records: What was measured.
-        modelled_um: float64[n] each, what the model gives for their judged samples.
-        known: Further modes that the model has.
-        first_hz: Natural frequency of its first mode; None where it has none.
+        records: The records.
+        modelled_um: float64[n] each, modelled displacement of their evaluated samples.
+        known: Further modes of the model.
+        first_hz: Natural frequency of its first mode; None if it has none.
     """
     bare_um = [
         _undone(model_um, known, record.sample_rate_hz)
@@ -89,7 +88,7 @@ def further_modes(
 
 
 def without_modes(records: Sequence[Record], modes: Sequence[FurtherMode]) -> tuple[Record, ...]:
-    """Return records as they were without modes: that is, histories; steady loops as they are."""
+    """Return records with modes removed from histories."""
     return tuple(
         replace(record, displacement_um=_bare_um(record, modes))
         if isinstance(record, History)
@@ -111,7 +110,7 @@ def _undone(y_um: F64, modes: Sequence[FurtherMode], rate_hz: float) -> F64:
 def _spectra(
     records: Sequence[History], modelled_um: Sequence[F64], bare_um: Sequence[F64]
 ) -> _Spectra | None:
-    """Return the transfer function of all records together; None where they are too few."""
+    """Return the transfer function of all records together; None if they are too few."""
     top = min(FASTEST_HZ, *(record.sample_rate_hz for record in records))
     count = int(0.25 * top * SEGMENT_S)
     own, cross, left, segments = np.zeros(count), np.zeros(count, np.complex128), 0.0, 0
@@ -130,13 +129,13 @@ def _spectra(
         frequency_hz=(np.arange(count) / SEGMENT_S)[bins],
         transfer=np.asarray(cross / np.maximum(own, 1e-300), dtype=np.complex128)[bins],
         power=own[bins],
-        # Of a model that leaves nothing, whatever makes rounding a little less would be worth all.
+        # A residual of 0 would make every change of rounding an improvement.
         left=max(left, ROUNDING * float(own.sum()), 1e-300),
     )
 
 
 def _pieces(signals: F64, rate_hz: float) -> Iterator[C128]:
-    """Give the spectra of stretches of signals, each under a window: complex128[s, m, k].
+    """Yield windowed spectra of segments of signals: complex128[s, m, k].
 
     Args:
         signals: float64[s, n].
@@ -157,12 +156,12 @@ def _pieces(signals: F64, rate_hz: float) -> Iterator[C128]:
 
 @dataclass(frozen=True, slots=True)
 class _Pairs:
-    """Pairs, and what is smooth beside them.
+    """Pairs of resonance and antiresonance, and a smooth part.
 
     Attributes:
-        x: float64[4 m + 3]: of each pair natural frequency and damping ratio, then the
-            antiresonance's frequency over it and damping ratio, logarithms all; gain, slope, bend.
-        misfit: What they leave of the transfer function, in power.
+        x: float64[4 m + 3], per pair the logarithms of natural frequency, damping ratio, ratio of
+            the antiresonance's frequency to it, and its damping ratio; then gain, slope, bend.
+        misfit: Residual of the transfer function, in power.
     """
 
     x: F64
@@ -170,15 +169,15 @@ class _Pairs:
 
 
 def _left(spectra: _Spectra, before: _Pairs, now: _Pairs) -> float:
-    """Return the part of a model's error that is left, in power.
+    """Return the remaining part of a model's error, in power.
 
-    What is smooth is no gain of the pairs: the next fit finds it without them.
+    Improvements by the smooth part do not count, since the next fit makes them without pairs.
     """
     return 1.0 - (before.misfit - now.misfit) / spectra.left
 
 
 def _one_more(spectra: _Spectra, x: F64, first_hz: float | None) -> _Pairs | None:
-    """Return the best pairs with one more; None where none can be tried."""
+    """Return the best pairs with one more; None if none can be tried."""
     known = _response(x, spectra.frequency_hz)
     rest = replace(
         spectra, transfer=spectra.transfer / known, power=spectra.power * np.abs(known) ** 2
@@ -218,20 +217,20 @@ def _tried(spectra: _Spectra, natural_hz: float, damping: float) -> _Pairs:
 
 
 def _smooth(spectra: _Spectra) -> tuple[C128, C128, C128]:
-    """Return what a gain, a slope and a bend change: complex128[k] each."""
+    """Return the columns of gain, slope and bend: complex128[k] each."""
     s = 1j * spectra.frequency_hz / spectra.frequency_hz[-1]
     return np.ones_like(s), s, s**2
 
 
 def _smooth_misfit(spectra: _Spectra, known: Sequence[FurtherMode]) -> float:
-    """Return what known modes leave with a gain, a slope and a bend beside them."""
+    """Return the misfit of known modes with a gain, a slope and a bend."""
     answer = _response(_packed(known), spectra.frequency_hz)
     columns = np.stack(_smooth(spectra), axis=1) * answer[:, None]
     return _least_squares(replace(spectra, transfer=spectra.transfer - answer + 1.0), columns)[1]
 
 
 def _least_squares(spectra: _Spectra, columns: C128) -> tuple[F64, float]:
-    """Return real weights of columns, as near to the transfer function less 1, and the misfit."""
+    """Return real weights of columns that fit the transfer function less 1, and the misfit."""
     scale = np.sqrt(spectra.power)
     rows, target = columns * scale[:, None], (spectra.transfer - 1.0) * scale
     both = np.concatenate((rows.real, rows.imag)), np.concatenate((target.real, target.imag))
@@ -240,7 +239,7 @@ def _least_squares(spectra: _Spectra, columns: C128) -> tuple[F64, float]:
 
 
 def _followed(spectra: _Spectra, start: F64, first_hz: float | None) -> _Pairs:
-    """Return the pairs that a start leads to; each stays on its side of the first mode."""
+    """Optimise pairs from a start; each stays on its side of the first mode."""
     low, high = _bounds(spectra, start, first_hz)
     scale, smooth = np.sqrt(spectra.power), np.stack(_smooth(spectra), axis=1)
 
@@ -270,7 +269,7 @@ def _bounds(spectra: _Spectra, x: F64, first_hz: float | None) -> tuple[F64, F64
 
 
 def _packed(modes: Sequence[FurtherMode]) -> F64:
-    """Return modes as :class:`_Pairs` has them, with nothing smooth beside them."""
+    """Return modes as ``_Pairs.x`` with a smooth part of 0."""
     numbers: list[float] = []
     for each in modes:
         ratio = each.antiresonance_hz / each.natural_hz
@@ -301,7 +300,7 @@ def _response(x: F64, frequency_hz: F64) -> C128:
 
 
 def _stands(modes: Sequence[FurtherMode], first_hz: float | None, rate_hz: float) -> bool:
-    """Return whether modes are modes of their own, and can be undone."""
+    """Return whether modes are distinct and have an inverse."""
     ends = [hz for mode in modes for hz in (mode.natural_hz, mode.antiresonance_hz)]
     ladder = sorted(mode.natural_hz for mode in modes)
     if not all(_apart(hz, first_hz) for hz in ends):

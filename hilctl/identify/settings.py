@@ -1,7 +1,7 @@
-"""What can be chosen about a fit: each setting once, with its default, its limits and its kinds.
+"""Settings of a fit, each with its default, limits and kinds of model.
 
-A new setting is a field of :class:`FitSettings`. The command line, the list that ``hilctl identify
---settings`` prints and the line that a model file has of its fit all follow from the fields.
+A new setting is a field of :class:`FitSettings`. The command line, the list of ``hilctl identify
+--settings`` and the provenance in a model file follow from the fields.
 """
 
 from collections.abc import Iterator, Mapping
@@ -37,18 +37,18 @@ PUBLISHED: Mapping[str, Choices] = {
     "butterfly": {"plays": 16},
     "field": {"plays": 32, "cells": 12},
 }
-"""Defaults of a kind that are not those of all; sections 3.4.2 (PPI), 5.3 (RDPI), 6.4."""
+"""Defaults of single kinds; sections 3.4.2 (PPI), 5.3 (RDPI), 6.4."""
 
 
 def _of(*kinds: str, default: Any, description: str, **limits: Any) -> Any:
-    """Return a field that only these kinds of model have; all, where none is named."""
+    """Return a field of these kinds of model; of all kinds if none is named."""
     return Field(
         default, description=description, json_schema_extra={"kinds": list(kinds)}, **limits
     )
 
 
 class FitSettings(StrictModel):
-    """Choices of a fit; what is not given is as published for the kind of model."""
+    """Settings of a fit; the defaults are those published for the kind of model."""
 
     kind: FitKind = Field("integrated", description="Kind of model.")
     plays: int = _of(
@@ -60,7 +60,7 @@ class FitSettings(StrictModel):
         default=12,
         ge=1,
         le=200,
-        description="Play operators n; auto for as many as loops held out bear.",
+        description="Play operators n; auto selects the number by held-out loops.",
     )
     deadbands: int = _of(
         "integrated",
@@ -77,9 +77,11 @@ class FitSettings(StrictModel):
         default=28,
         ge=2,
         le=100,
-        description="Lines of a Preisach triangle, and cells of the longest; or auto.",
+        description="Lines of a Preisach triangle, and cells of the longest line; or auto.",
     )
-    drags: int = _of("field", default=3, ge=0, le=12, description="Drags, whose small loops creep.")
+    drags: int = _of(
+        "field", default=3, ge=0, le=12, description="Drag operators; their small loops creep."
+    )
     cells: int = _of(
         "field",
         "generalised_duhem",
@@ -95,18 +97,16 @@ class FitSettings(StrictModel):
         le=60,
         description="Cells of a table of slopes across its band.",
     )
-    knots: int = _of(
-        "field", default=24, ge=2, le=60, description="Pieces of the curve after them."
-    )
+    knots: int = _of("field", default=24, ge=2, le=60, description="Pieces of the output curve.")
     size: Literal["given", "auto"] = _of(
         *_PLAYS,
         default="given",
-        description="auto: the smallest number of operators that loops held out bear.",
+        description="auto selects the number of operators by held-out loops.",
     )
     weights: Literal["exponential", "free"] = _of(
         *_SEARCHED,
         default="exponential",
-        description="Weights that fall as a e^(-b i) (3.26, 6.19-6.23), or one by one.",
+        description="Weights a e^(-b i) (3.26, 6.19-6.23), or each weight by itself.",
     )
     layout: Literal["even", "midpoint"] = _of(
         *_PLAYS, default="even", description="Thresholds alpha i (3.25, 6.18), or alpha (i - 1/2)."
@@ -119,49 +119,45 @@ class FitSettings(StrictModel):
     offset: bool = _of(
         *_PLAYS,
         default=False,
-        description="Find a constant displacement too; published models have none.",
+        description="Fit a constant displacement; published models have none.",
     )
     creep: bool = _of(
         *_PLAIN,
         default=False,
-        description="A zero and creep, c + d ln(1 + t / 0.1 s), of each record's own.",
+        description="Fit an offset and creep, c + d ln(1 + t / 0.1 s), per record.",
     )
     creep_stage: bool = _of(
         "staged",
         "field",
         "generalised_duhem",
         default=True,
-        description="Whether creep is looked for, where histories rest for 0.5 s and more.",
+        description="Fit creep if histories rest for 0.5 s or longer.",
     )
     modes: bool = _of(
         "staged",
         "field",
         "generalised_duhem",
         default=True,
-        description="Whether further modes of the structure are looked for in histories.",
+        description="Fit further modes of the structure to histories.",
     )
     hysteresis: Literal["integrated", "preisach"] = _of(
         "staged",
         default="integrated",
-        description="Plays and deadbands, or a Preisach triangle in their place.",
+        description="Plays and deadbands, or a Preisach triangle.",
     )
     lag: Literal["growth", "plain", "none"] = _of(
         "staged",
         default="growth",
-        description="Field lag: one that grows with its distance, plain, or none.",
+        description="Field lag: growing with its distance, constant, or none.",
     )
-    structure: bool = _of(
-        "staged", default=True, description="Whether there is a second-order structure."
-    )
-    delay: bool = _of("staged", default=True, description="Whether there is a transport delay.")
+    structure: bool = _of("staged", default=True, description="Fit a second-order structure.")
+    delay: bool = _of("staged", default=True, description="Fit a transport delay.")
     turning_um: float | None = _of(
         "butterfly",
         default=None,
-        description="Displacement where the wings meet; else the lowest of all.",
+        description="Displacement where the wings meet; the lowest one if not set.",
     )
-    magnets: bool = _of(
-        "butterfly", default=True, description="Whether something biases the rods at no command."
-    )
+    magnets: bool = _of("butterfly", default=True, description="Fit a bias field at zero command.")
     starts: int = _of(
         *_PLAYS, default=6, ge=1, le=1000, description="Starting points of the search."
     )
@@ -169,19 +165,19 @@ class FitSettings(StrictModel):
         *_PLAYS,
         default=None,
         gt=0.0,
-        description="Reweight after the fit until no error is larger, of the stroke.",
+        description="Reweight after the fit until no error is larger; percent of the stroke.",
     )
-    points: int = _of(default=300, ge=16, le=100_000, description="Points a loop.")
+    points: int = _of(default=300, ge=16, le=100_000, description="Points per loop.")
 
     @model_validator(mode="before")
     @classmethod
     def _published(cls, given: Any) -> Any:
-        """Fill in the kind's own defaults; ``auto`` for a number of operators is a size."""
+        """Fill in the defaults of the kind; ``auto`` for a number of operators sets the size."""
         if not isinstance(given, dict):
             return given
         sized = [name for name in ("plays", "lines") if given.get(name) == "auto"]
         if sized and "deadbands" in given:
-            raise ValueError(f"{sized[0]}=auto finds the number of deadbands too: leave it out")
+            raise ValueError(f"{sized[0]}=auto selects the number of deadbands too: omit deadbands")
         kept = {name: value for name, value in given.items() if name not in sized}
         kind = kept.get("kind", "integrated")
         published = PUBLISHED.get(kind, {}) if isinstance(kind, str) else {}
@@ -192,13 +188,15 @@ class FitSettings(StrictModel):
     def _belongs(cls, value: Any, info: ValidationInfo) -> Any:
         kinds, kind = kinds_of(cls.model_fields[str(info.field_name)]), info.data.get("kind")
         if kinds and kind is not None and kind not in kinds:
-            raise ValueError(f"is a setting of {', '.join(kinds)}, not of {kind}: leave it out")
+            raise ValueError(f"is a setting of {', '.join(kinds)}, not of {kind}: omit it")
         return value
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
         if self.hysteresis == "preisach" and self.lag == "none":
-            raise ValueError("hysteresis: a Preisach triangle has no rate: it needs a lag")
+            raise ValueError(
+                "hysteresis: a Preisach triangle needs a lag, since it has no rate: omit lag=none"
+            )
         return self
 
     def has(self, name: str) -> bool:
@@ -207,11 +205,11 @@ class FitSettings(StrictModel):
         return not kinds or self.kind in kinds
 
     def looks_for(self, name: str) -> bool:
-        """Whether a part that may be left out belongs to this kind, and is looked for."""
+        """Whether an optional part belongs to this kind, and is to be fitted."""
         return self.has(name) and bool(getattr(self, name))
 
     def changes(self) -> str:
-        """Return what is not as published for the kind, as ``key=value`` with commas between."""
+        """Return settings that differ from the published ones, as ``key=value, key=value``."""
         published = type(self)(kind=self.kind).model_dump()
         return ", ".join(
             f"{name}={value}" for name, value in _differing(self.model_dump(), published)
@@ -219,20 +217,28 @@ class FitSettings(StrictModel):
 
 
 class TableSettings(StrictModel):
-    """How text tables are read; recordings need none of it."""
+    """How text tables are read; not used for recordings."""
 
     unit: CommandUnit | None = Field(None, description="Unit of the command.")
-    command_column: str | int = Field("current_a", description="Name, or number from 1.")
-    displacement_column: str | int = Field("displacement_um", description="The same, in um.")
-    time_column: str | int | None = Field(None, description="The same, in s, or give rate_hz.")
-    rate_hz: float | None = Field(None, gt=0.0, description="Samples a second without a time.")
-    first_row: int = Field(1, ge=1, description="First data row used, from 1.")
-    last_row: int | None = Field(None, ge=1, description="Last data row used; else all.")
-    ignore: int = Field(0, ge=0, description="Rows at the start that are run but not judged.")
-    lag_samples: int = Field(
-        0, ge=0, le=10_000, description="Samples by which the displacement lags; or auto."
+    command_column: str | int = Field("current_a", description="Column name, or number from 1.")
+    displacement_column: str | int = Field(
+        "displacement_um", description="The same for the displacement in um."
     )
-    find_lag: bool = Field(False, description="Take the lag that leaves the least error.")
+    time_column: str | int | None = Field(
+        None, description="The same for the time in s; or set rate_hz."
+    )
+    rate_hz: float | None = Field(
+        None, gt=0.0, description="Samples per second if there is no time column."
+    )
+    first_row: int = Field(1, ge=1, description="First data row used, from 1.")
+    last_row: int | None = Field(None, ge=1, description="Last data row used; all if not set.")
+    ignore: int = Field(
+        0, ge=0, description="Rows at the start that are simulated but not evaluated."
+    )
+    lag_samples: int = Field(
+        0, ge=0, le=10_000, description="Lag of the displacement in samples; or auto."
+    )
+    find_lag: bool = Field(False, description="Select the lag with the least error.")
 
     @model_validator(mode="before")
     @classmethod
@@ -243,38 +249,38 @@ class TableSettings(StrictModel):
 
 
 class IdentifySettings(FitSettings):
-    """Choices of a fit to files: those of the fit, and how the files are read."""
+    """Settings of a fit to files: those of the fit, and how the files are read."""
 
-    leave_out: tuple[str, ...] = Field((), description="Labels of loops, or files, not to use.")
-    auto: bool = Field(False, description="Take the kind that does best on data held out.")
-    whole: bool = Field(False, description="Judge whole histories, not their steady cycles.")
+    leave_out: tuple[str, ...] = Field((), description="Labels of loops or files to exclude.")
+    auto: bool = Field(False, description="Select the kind with the least error on held-out data.")
+    whole: bool = Field(False, description="Fit whole histories, not their steady cycles.")
     table: TableSettings = Field(TableSettings(), description="How text tables are read.")
 
     @model_validator(mode="before")
     @classmethod
     def _histories(cls, given: Any) -> Any:
-        """Whole histories for a kind whose small loops remember the large ones before them.
+        """Select whole histories for kinds whose small loops depend on earlier large ones.
 
-        And for those that know no rate: their range must reach to where a run begins, at rest.
+        Also for kinds without rate, whose range must include the state of rest.
         """
         if isinstance(given, dict) and given.get("kind") in _HISTORIES:
             return {"whole": True, **given}
         return given
 
     def unit(self, recorded: CommandUnit | None) -> CommandUnit:
-        """Return the command's unit, that of the recordings where there are any."""
+        """Return the unit of the command: that of the recordings if there are any."""
         return recorded or self.table.unit or ("V" if self.kind in {"ppi", "spi"} else "A")
 
 
 def kinds_of(field: FieldInfo) -> tuple[str, ...]:
-    """Return the kinds of model that have a setting; none where all have it."""
+    """Return the kinds of model that have a setting; none if all have it."""
     extra = field.json_schema_extra
     kinds = extra.get("kinds", []) if isinstance(extra, dict) else []
     return tuple(map(str, kinds)) if isinstance(kinds, list) else ()
 
 
 def setting_rows() -> Iterator[tuple[str, str, str, str, str]]:
-    """Give name, default, limits, kinds and meaning of all settings, in order."""
+    """Yield name, default, limits, kinds and meaning of all settings."""
     for name, field in IdentifySettings.model_fields.items():
         if name == "table":
             for key, inner in TableSettings.model_fields.items():

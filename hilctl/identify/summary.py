@@ -1,4 +1,4 @@
-"""An identified or a refined model, as rows and lines of text."""
+"""Text rows and lines about an identified or a refined model."""
 
 from collections.abc import Sequence
 
@@ -12,7 +12,7 @@ HEADINGS = ("loop", "p-p µm", "peak %", "rms %", "area %")
 
 
 def error_rows(errors: Sequence[LoopScore]) -> list[tuple[str, ...]]:
-    """Return one row a loop under :data:`HEADINGS`."""
+    """Return one row per loop under :data:`HEADINGS`."""
     rows = []
     for error in errors:
         area = "-" if error.area_error_percent is None else f"{error.area_error_percent:+.2f}"
@@ -22,22 +22,22 @@ def error_rows(errors: Sequence[LoopScore]) -> list[tuple[str, ...]]:
 
 
 def parameter_texts(fit: FittedModel) -> list[tuple[str, str]]:
-    """Return names and values, with standard errors where there are any, and bounds marked."""
+    """Return names and values, with standard errors if known, and marks at bounds."""
     return [(name, f"{value:.6g}" + _mark(fit, name)) for name, value in fit.parameters.items()]
 
 
 def _mark(fit: FittedModel, name: str) -> str:
     if name in fit.at_bound:
-        return " (on its bound)"
+        return " (at its bound)"
     sure = fit.standard_errors
     return f" ± {sure[name]:.2g}" if name in sure else ""
 
 
 def summary(found: Identification) -> list[str]:
-    """Return the result in a few lines, what it is worth first."""
+    """Return the result in a few lines, the grade first."""
     fit, held_out, known = found.fit, found.held_out, found.fit.model.provenance.identified_range
     spread = [start.rms_percent for start in fit.starts]
-    ended = f"{fit.numbers} numbers found"
+    ended = f"{fit.numbers} fitted numbers"
     if spread:
         ended = f"{len(spread)} starts ended at rms {min(spread):.3f} to {max(spread):.3f} %"
     lines = [str(found.verdict), *found.verdict.notes]
@@ -51,14 +51,14 @@ def summary(found: Identification) -> list[str]:
     lines += [f"fitted: {_errors(fit)}", f"{ended}, in {fit.elapsed_s:.2f} s"]
     if fit.at_bound:
         shown = ", ".join(fit.at_bound)
-        lines.append(f"on a bound, so not found but as far as they may go: {shown}")
+        lines.append(f"at a bound, so not determined by the data: {shown}")
     if known is not None:
         lines.append(
-            f"found for {_span(known.peak_to_peak_um)} µm peak-to-peak, "
+            f"identified for {_span(known.peak_to_peak_um)} µm peak-to-peak, "
             f"{_span(known.frequency_hz)} Hz, up to {known.speed_um_per_s:.4g} µm/s"
         )
     if found.lag_samples:
-        lines.append(f"displacements taken {found.lag_samples} samples later than the commands")
+        lines.append(f"lag of the displacements: {found.lag_samples} samples")
     return lines
 
 
@@ -75,7 +75,7 @@ def _span(limits: tuple[float, float]) -> str:
 
 
 def refinement_rows(found: Refinement) -> list[tuple[str, ...]]:
-    """Return one row a run that was held out, under :data:`REFINEMENT_HEADINGS`."""
+    """Return one row per held-out run under :data:`REFINEMENT_HEADINGS`."""
     before, after = (held.judgement.errors for held in (found.choice.before, found.choice.after))
     return [
         (

@@ -9,8 +9,6 @@ ROOT = UNIT.parents[1]
 PACKAGES = {Path(): ROOT / "hilctl", Path("drivers"): ROOT / "drivers" / "hilctl_drivers"}
 
 WITHOUT = {
-    "identify/fit_api": "what a fit gets and returns; identify/test_fit_model.py fills both",
-    "identify/generalised_duhem/tables": "identify/generalised_duhem/test_search.py tests both",
     "base/types": "names of types; waveforms/test_build.py reads arrays in chunks",
     "base/device": "the contract of devices: tests/contract/test_devices.py holds each to it",
     "base/events": "one record of plain values; seen in run/shared/test_shared_page.py",

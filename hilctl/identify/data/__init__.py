@@ -1,1 +1,1 @@
-"""Records that models are fitted to: loops and histories, from recordings and tables."""
+"""Loops and histories from recordings and tables."""

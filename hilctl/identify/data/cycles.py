@@ -15,24 +15,24 @@ from hilctl.identify.data.records import FEWEST_POINTS, History, SteadyLoop
 from hilctl.recording.recording import Recording
 from hilctl.signals.cycle_metrics import MAD_TO_SIGMA
 
-LIKELY = 0.3  # least similarity worth a closer look; a decay lowers it
-PROMINENT = 0.02  # how far a top stands out: noise has many that do not
-LONGEST = 0.6  # of the samples: longest period looked for
-CANDIDATES = 50  # periods looked at, from the shortest
+LIKELY = 0.3  # minimum similarity of a candidate; a decay lowers it
+PROMINENT = 0.02  # minimum prominence of a maximum above noise
+LONGEST = 0.6  # longest period, of the number of samples
+CANDIDATES = 50  # periods tried, from the shortest
 STEADY = 0.02  # largest change from cycle to cycle in a steady part, of the peak-to-peak command
 SURE = 4.5  # standard deviations of noise beyond it
-ROUNDING = 0.02  # of a period that may be missing of two
-FULL = 0.5  # least peak-to-peak command of the steady part, of that of all
+ROUNDING = 0.02  # part of a period that may be missing from two
+FULL = 0.5  # minimum peak-to-peak command of the steady part, of the total
 
 
 def similarity(signal: F64) -> F64:
-    """Return the autocorrelation of a signal with its mean taken out.
+    """Return the autocorrelation of a signal without its mean.
 
-    Each lag is divided by the energy of the two parts it compares, so that 1 is a perfect
-    repetition however few samples are left to compare.
+    Each lag is normalised by the energy of the two parts it compares, so that 1 is a perfect
+    repetition whatever the number of samples.
 
     Returns:
-        float64[m], for lags from 0 to a little beyond n / 2: two cycles have their period there.
+        float64[m], for lags from 0 to beyond n / 2, the period of two cycles.
     """
     x = signal - signal.mean()
     n = x.size
@@ -47,11 +47,11 @@ def similarity(signal: F64) -> F64:
 
 
 def find_period(label: str, command: F64) -> tuple[float, int, int]:
-    """Find the shortest period with which a command repeats at full amplitude, and where it does.
+    """Find the shortest period of a command at full amplitude, and its steady part.
 
     Returns:
-        Period in samples, not necessarily whole; first sample and sample after the last of the
-        steady part, which is at least two periods long.
+        Period in samples, not necessarily an integer; first sample and end of the steady part,
+        which is at least two periods long.
 
     Raises:
         DataError: It does not repeat.
@@ -64,17 +64,17 @@ def find_period(label: str, command: F64) -> tuple[float, int, int]:
             continue
         refined = _refined(command[slice(*stretch)], period)
         better = steady_stretch(command, refined)
-        # Of two cycles the spectral line is so wide that it need not be where their period is.
+        # The spectral line of two cycles is too wide to give their period.
         return (period, *stretch) if better is None else (refined, *better)
     raise DataError(
-        f"{label}: no steady part in {command.size} samples: the command doesn't repeat at full "
-        "amplitude for two cycles: judge it as a whole with --whole, and a model without stages "
-        "(--model integrated, say), or record steady cycles"
+        f"{label}: no steady part in {command.size} samples: the command does not repeat at full "
+        "amplitude for two cycles. Record steady cycles, or use --whole and a model without stages "
+        "such as --model integrated"
     )
 
 
 def _tops(alike: F64) -> I64:
-    """Return the lags of the maxima beyond the first zero: nearer ones are noise."""
+    """Return the lags of maxima beyond the first zero; nearer ones are noise."""
     from scipy.signal import find_peaks  # it imports scipy.stats, which whole histories don't need
 
     first = max(int(np.argmax(alike <= 0.0)), FEWEST_POINTS)
@@ -88,7 +88,7 @@ def _parabola(values: F64, top: int) -> float:
 
 
 def _refined(command: F64, period: float) -> float:
-    """Sharpen a period on as many cycles as there are: their spectral line is the strongest."""
+    """Refine a period by the spectral lines of all cycles."""
     window = np.hanning(command.size) * (command - command.mean())
     time = np.arange(command.size)
 
@@ -105,15 +105,14 @@ def _refined(command: F64, period: float) -> float:
 
 
 def steady_stretch(command: F64, period: float) -> tuple[int, int] | None:
-    """Return the longest stretch over which a command repeats at full amplitude.
+    """Return the longest interval in which a command repeats at full amplitude.
 
     Args:
         command: float64[n].
-        period: Samples a period.
+        period: Samples per period.
 
     Returns:
-        First sample and sample after the last, two periods at least but for rounding; None where
-        there is none.
+        First sample and end, at least two periods except for rounding; None if there is none.
     """
     span = float(np.ptp(command))
     later = np.arange(command.size - math.ceil(period))
@@ -133,21 +132,21 @@ def steady_stretch(command: F64, period: float) -> tuple[int, int] | None:
     return best
 
 
-_LARGEST = 1e100  # no reading is; the spline's differences and products stay finite below it
+_LARGEST = 1e100  # limit of values, so that the spline stays finite
 
 
 class CycleMean:
-    """The mean of cycles, of samples that come in any number of pieces.
+    """Mean cycle of samples that arrive in any number of pieces.
 
-    Samples fall into bins around evenly spaced phases, no more bins than samples a period, so
-    that a period of any length, whole or not, fills all of them. A bin's mean stands at its
-    samples' mean phase; a periodic spline through them gives the points.
+    Samples are averaged in bins around evenly spaced phases, at most one bin per sample of a
+    period, so that a period of any length fills all bins. A periodic spline through the means, at
+    the mean phase of their samples, gives the points.
 
     Args:
-        label: Named in errors.
-        period: Samples a period.
-        points: Points wanted.
-        signals: Signals that a sample has.
+        label: Label for errors.
+        period: Samples per period.
+        points: Points of the mean cycle.
+        signals: Number of signals.
 
     Raises:
         DataError: The period is too short.
@@ -166,7 +165,7 @@ class CycleMean:
         self._sums = np.zeros((signals, bins))
 
     def add(self, phase: F64, values: F64) -> None:
-        """Take in samples.
+        """Add samples.
 
         Args:
             phase: float64[n], time in periods since the start of the first cycle.
@@ -177,27 +176,25 @@ class CycleMean:
         index = nearest.astype(np.int64) % bins
         self._count += np.bincount(index, minlength=bins)
         self._offset += np.bincount(index, phase * bins - nearest, bins)
-        with np.errstate(invalid="ignore", over="ignore"):  # that is refused at the end
+        with np.errstate(invalid="ignore", over="ignore"):  # cycle() checks the sums
             self._sums += [np.bincount(index, row, bins) for row in values]
 
     def cycle(self) -> F64:
         """Return the mean cycle: float64[m, points]; the first point has phase 0.
 
         Raises:
-            DataError: Samples are missing around a phase, or are no numbers to be averaged.
+            DataError: Samples are missing around a phase, or values can't be averaged.
         """
         if not self._count.all():
             missing = int(np.argmin(self._count))
             raise DataError(
-                f"{self._label}: no sample at {missing / self._bins:.3f} of the cycle in any "
-                "cycle: samples are missing in the data"
+                f"{self._label}: samples are missing at {missing / self._bins:.3f} of the "
+                "cycle in all cycles"
             )
         knots = (np.arange(self._bins) + self._offset / self._count) / self._bins
         means = self._sums / self._count
         if not (np.abs(means) < _LARGEST).all():
-            raise DataError(
-                f"{self._label}: holds values that are not finite, or too large to be averaged"
-            )
+            raise DataError(f"{self._label}: has values that are not finite or too large")
         closed = np.append(knots, knots[0] + 1.0), np.hstack([means, means[:, :1]])
         spline = CubicSpline(*closed, 1, bc_type="periodic")
         at = np.arange(self._points) / self._points
@@ -205,14 +202,14 @@ class CycleMean:
 
 
 def average_cycle(label: str, phase: F64, values: F64, period: float, points: int) -> F64:
-    """Average cycles into one, at points evenly spaced in time, see :class:`CycleMean`.
+    """Return the mean cycle at points evenly spaced in time, see :class:`CycleMean`.
 
     Args:
-        label: Named in errors.
+        label: Label for errors.
         phase: float64[n], time in periods since the start of the first cycle.
         values: float64[m, n], signals.
-        period: Samples a period.
-        points: Points wanted.
+        period: Samples per period.
+        points: Points of the mean cycle.
 
     Returns:
         float64[m, points]; the first point has phase 0.
@@ -237,13 +234,13 @@ def loops_from_pieces(
 ) -> tuple[SteadyLoop, ...]:
     """Return the averaged steady cycle of each segment of a recording.
 
-    Samples with a displacement that is not finite are left out.
+    Samples with a displacement that is not finite are ignored.
 
     Args:
         pieces: A run with at least one repeating segment, see
             :class:`hilctl.recording.reader.RecordingStream`.
-        points: Points a loop; published are 200, 300 and 400.
-        labels: Segments to take, by label; all where empty.
+        points: Points per loop; published are 200, 300 and 400.
+        labels: Labels of segments to use; all if empty.
 
     Raises:
         DataError: A label is unknown, a segment has no steady cycle, or there is no segment.
@@ -270,7 +267,7 @@ def _chosen(recording: Recording, labels: Collection[str]) -> list[Segment]:
 
 
 class _SegmentMean:
-    """The mean cycle of one segment of a recording that comes in pieces."""
+    """Mean cycle of one segment of a recording that arrives in pieces."""
 
     def __init__(self, recording: Recording, segment: Segment, points: int) -> None:
         where = f"{recording.path}: segment {segment.label!r}"
@@ -278,7 +275,7 @@ class _SegmentMean:
         if cycles == 0:
             raise DataError(
                 f"{where}: no steady cycle (period {segment.period:g} samples, full amplitude from "
-                f"{segment.steady_start} to {segment.steady_stop}): run it longer or leave it out"
+                f"{segment.steady_start} to {segment.steady_stop}). Run it longer or exclude it"
             )
         self._segment, self._rate_hz = segment, recording.sample_rate_hz
         self._mean = CycleMean(where, segment.period, points, 2)
@@ -300,12 +297,12 @@ class _SegmentMean:
 def find_cycles(history: History, points: int = 300) -> SteadyLoop:
     """Find the steady periodic part of a history and return its averaged cycle.
 
-    The period is that of the command; the first cycle of the steady part is left out where there
-    is more than one, because the hysteresis has yet to forget what came before.
+    The period is that of the command. If there is more than one cycle, the first is ignored,
+    because the hysteresis still depends on what came before.
 
     Args:
-        history: Samples that repeat at full amplitude for two cycles at least.
-        points: Points a loop.
+        history: Samples that repeat at full amplitude for at least two cycles.
+        points: Points per loop.
 
     Raises:
         DataError: Nothing repeats.

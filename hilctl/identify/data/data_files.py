@@ -1,4 +1,4 @@
-"""From recordings and tables to the data of an identification."""
+"""Records of an identification, read from recordings and text tables."""
 
 from collections.abc import Iterable, Sequence
 from itertools import chain
@@ -16,7 +16,7 @@ from hilctl.identify.settings import IdentifySettings
 from hilctl.recording.reader import RecordingStream
 from hilctl.recording.recording import Recording
 
-UNEVEN = 0.5  # largest departure of one step from the median; text rounds each time anew
+UNEVEN = 0.5  # maximum deviation of a time step from the median, due to rounding in text
 
 
 def read_table(
@@ -29,25 +29,25 @@ def read_table(
     rows: tuple[int, int | None] = (0, None),
     ignore: int = 0,
 ) -> History:
-    """Read a command and the displacement it gave, see :mod:`hilctl.base.csv_table`.
+    """Read command and displacement from a text table, see :mod:`hilctl.base.csv_table`.
 
     Args:
         path: The file.
-        command_column: Command, in the device's unit.
+        command_column: Command in the device's unit.
         displacement_column: Displacement in um.
-        time_column: Time in s, evenly spaced; or give ``rate_hz``.
-        rate_hz: Samples a second; or give ``time_column``.
-        rows: First data row and row after the last, counted from 0; None is the end.
-        ignore: Samples at the start of these rows that are run but not judged.
+        time_column: Time in s, evenly spaced; or set ``rate_hz``.
+        rate_hz: Samples per second; or set ``time_column``.
+        rows: First data row and end, counted from 0; None for all.
+        ignore: Samples at the start of these rows that are simulated but not evaluated.
 
     Raises:
         InputError: The file can't be read.
         DataError: A column is unknown, a value is not a finite number (names ``file:line``), time
-            is not even, or not just one of ``time_column`` and ``rate_hz`` is given.
+            steps are uneven, or not exactly one of ``time_column`` and ``rate_hz`` is set.
     """
     if (time_column is None) == (rate_hz is None):
         given = "neither" if rate_hz is None else "both"
-        raise DataError(f"{path}: give its time column or its rate in Hz: got {given}")
+        raise DataError(f"{path}: set either table.time_column or table.rate_hz (got {given})")
     wanted = [command_column, displacement_column]
     wanted += [] if time_column is None else [time_column]
     table = TextTable(path)
@@ -58,22 +58,21 @@ def read_table(
 
 
 MOST_WHOLE = 20_000_000
-"""Samples of a run that is fitted as a whole; a fit takes some 100 bytes and 10 us of each."""
+"""Maximum samples of a run that is fitted as a whole: about 100 bytes and 10 us per sample."""
 
 
 def load_records(
     paths: Sequence[Path], settings: IdentifySettings, lag_samples: int
 ) -> tuple[list[Record], CommandUnit | None]:
-    """Read everything that a model is to be identified from.
+    """Read recordings and text tables as records.
 
     Args:
         paths: Recordings (``.mcap``) and text tables.
-        settings: Points a loop, and how files are read.
-        lag_samples: Samples by which tables' displacements are taken to lag.
+        settings: Points per loop, and how files are read.
+        lag_samples: Lag of the displacements of tables.
 
     Returns:
-        The loops and histories, and the recordings' command unit (None where there are only
-        tables).
+        Loops and histories, and the command unit of the recordings (None if all are tables).
 
     Raises:
         DataError: A file can't be used.
@@ -99,43 +98,38 @@ def load_records(
         elif settings.whole:
             records.append(history_from_pieces(chain([first], pieces)))
         else:
-            # Before their cycles are looked for: one that has none can be left out too.
+            # Excluded segments need not have a steady cycle.
             chosen = kept if left_out else ()
             records += loops_from_pieces(chain([first], pieces), settings.points, chosen)
     if len(units) > 1:
-        raise InputError("recordings of devices driven in A and in V can't be fitted together")
+        raise InputError("recordings with commands in A and in V can't be fitted together")
     _check_left_out(settings.leave_out, known, records)
     return records, next(iter(units), None)
 
 
 def _check_left_out(labels: Sequence[str], known: Sequence[str], kept: Sequence[Record]) -> None:
-    """Refuse labels of which there is none, and those that leave nothing.
-
-    Raises:
-        InputError: See above.
-    """
+    """Raise InputError if a label is unknown, or no record is left."""
     for label in labels:
         if not any(each.startswith(label) for each in known):
-            raise InputError(f"--leave-out {label!r}: there is none of {', '.join(known)}")
+            raise InputError(f"--leave-out {label!r}: unknown label; known are {', '.join(known)}")
     if known and not kept:
-        raise InputError("--leave-out: leaves nothing to identify a model from")
+        raise InputError("--leave-out excludes all records")
 
 
 def history_from_recording(recording: Recording) -> History:
-    """Return a run's waveform as a whole, see :func:`history_from_pieces`."""
+    """Return the whole waveform of a run, see :func:`history_from_pieces`."""
     return history_from_pieces([recording])
 
 
 def history_from_pieces(pieces: Iterable[Recording]) -> History:
-    """Return a run's waveform as a whole, from rest, without the ramp at its end.
+    """Return the whole waveform of a run from rest, without the ramp at its end.
 
     Args:
         pieces: The run, see :class:`hilctl.recording.reader.RecordingStream`.
 
     Raises:
-        DataError: Samples are missing or have no displacement, the run is too long to be fitted
-            as a whole, or it ramped to its waveform from another output, so the hysteresis can't
-            be followed from rest.
+        DataError: Samples are missing or have no displacement, the run is too long, or it begins
+            with a ramp from another output, so that its initial state is unknown.
     """
     command: list[F64] = []
     displacement_um: list[F64] = []
@@ -144,11 +138,11 @@ def history_from_pieces(pieces: Iterable[Recording]) -> History:
     for piece in pieces:
         samples = piece.samples
         condition = (samples.flags & Flag.CONDITION.value) != 0
-        if condition.any() and not conditioned:  # what was before its conditioning is forgotten
+        if condition.any() and not conditioned:  # conditioning erases what came before
             samples = samples.rows(slice(int(np.argmax(condition)), None))
             command, displacement_um, size, begins_at = [], [], 0, int(samples.index[0])
             ramped = broken = False
-        conditioned += int(np.count_nonzero(condition))  # it makes the state, and is not judged
+        conditioned += int(np.count_nonzero(condition))  # sets the state; not evaluated
         rows = (samples.flags & Flag.RAMP.value) == 0
         ramped |= bool(rows.size) and samples.index[0] == 0 and not rows[0]
         index = samples.index[rows]
@@ -159,21 +153,21 @@ def history_from_pieces(pieces: Iterable[Recording]) -> History:
         _check_length(piece, size)
     if ramped:
         raise DataError(
-            f"{piece.path}: begins with a ramp from where the output was, so the actuator was "
-            "not at rest: leave out --whole to use its steady cycles"
+            f"{piece.path}: begins with a ramp, so the actuator was not at rest. Omit --whole to "
+            "use its steady cycles"
         )
     broken |= not all(np.isfinite(each).all() for each in displacement_um)
     if broken or not size:
         raise DataError(
-            f"{piece.path}: samples are missing, so it can't be judged as a whole: "
-            "leave out --whole to use its steady cycles"
+            f"{piece.path}: samples are missing, so it can't be fitted as a whole. "
+            "Omit --whole to use its steady cycles"
         )
     label, rate_hz = piece.path.name, piece.sample_rate_hz
     return History(label, _joined(command), _joined(displacement_um), rate_hz, conditioned)
 
 
 def _joined(parts: list[F64]) -> F64:
-    """Return one array of all parts; they are let go of."""
+    """Return one array of all parts, and empty the list to free memory."""
     joined = np.concatenate(parts)
     parts.clear()
     return joined
@@ -183,7 +177,7 @@ def _check_length(recording: Recording, size: int) -> None:
     if size > MOST_WHOLE:
         raise DataError(
             f"{recording.path}: has more than {MOST_WHOLE:,} samples, too many to be fitted as a "
-            "whole: leave out --whole to use its steady cycles, or record a shorter run"
+            "whole. Omit --whole to use its steady cycles, or record a shorter run"
         )
 
 

@@ -1,4 +1,4 @@
-"""What models are fitted to: steady loops and whole time histories."""
+"""Records that models are fitted to: steady loops and time histories."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,11 +21,11 @@ class SteadyLoop:
     Published numbers of points are 200 (chapter 4), 400 (5.14) and 300 (6.24).
 
     Attributes:
-        label: What ran, for people: ``sine 6 A 10 Hz``.
+        label: Name of the record, such as ``sine 6 A 10 Hz``.
         command: float64[M], command in the device's unit.
         displacement_um: float64[M].
-        frequency_hz: Cycles a second.
-        sample_rate_hz: Rate of the run that it was averaged from; 0.0 where that is not known.
+        frequency_hz: Cycles per second.
+        sample_rate_hz: Sample rate of the run that it was averaged from; 0.0 if unknown.
     """
 
     label: str
@@ -40,20 +40,17 @@ class SteadyLoop:
             raise DataError(f"{self.label}: frequency_hz must be > 0: {self.frequency_hz!r}")
 
     def rate(self) -> F64:
-        """Return the command's rate at each point as a run at ``sample_rate_hz`` sees it.
+        """Return the rate of the command at each point, as in a run at ``sample_rate_hz``.
 
-        A model takes its rate from the last two samples of a run, so at 50 kHz its rate is
-        10 us late. A backward difference of this loop's own points would be late by half a point
-        instead: 167 us for 300 points at 10 Hz. So the difference is taken over one sample of the
-        run, between points of a periodic spline; where the run's rate is not known, it is the
-        spline's derivative, which is not late at all.
+        A model uses the backward difference over one sample of a run. So the difference is taken
+        over one sample of the run on a periodic spline, not over points of the loop, which would
+        be late by half a point. If the sample rate is unknown, it is the derivative of the spline.
 
-        What is left is that a run with fewer samples a cycle than there are points turns its
-        command at other phases: 0.2 % of the stroke for 200 samples (250 Hz at 50 kHz), less than
-        0.02 % for 333 and more.
+        A run with fewer samples per cycle than points turns its command at other phases: the error
+        is 0.2 % of the stroke for 200 samples, and below 0.02 % for 333 and more.
 
         Returns:
-            float64[M], command units a second.
+            float64[M], command units per second.
         """
         points = self.command.size
         time = np.arange(points + 1) / (points * self.frequency_hz)
@@ -64,30 +61,30 @@ class SteadyLoop:
         return np.asarray((self.command - before) * self.sample_rate_hz, dtype=np.float64)
 
     def run(self) -> tuple[F64, F64, int]:
-        """Return what a model is run on: two periods, of which the second is judged.
+        """Return two periods to simulate, of which the second is evaluated.
 
-        One period from rest brings every play operator to its periodic state: an operator clips
-        its state to a range, so a period as a whole does, and doing it again changes nothing.
+        One period from rest brings every play operator to its periodic state, because it clips its
+        state to a range.
 
         Returns:
-            Command float64[2 M], its rate float64[2 M], number of samples that are not judged.
+            Command float64[2 M], its rate float64[2 M], number of samples that are not evaluated.
         """
         return np.tile(self.command, 2), np.tile(self.rate(), 2), self.command.size
 
 
 @dataclass(frozen=True, slots=True)
 class History:
-    """A whole time history judged sample by sample, for data that does not repeat.
+    """Time history that is evaluated sample by sample, for data that does not repeat.
 
-    The hysteresis starts from the first sample, so the start of the data must be the start of the
-    motion or lie far enough before the first judged sample.
+    The hysteresis starts at the first sample, which must be the start of the motion or far enough
+    before the first evaluated sample.
 
     Attributes:
-        label: What ran, for people.
+        label: Name of the record.
         command: float64[n], command in the device's unit.
         displacement_um: float64[n].
-        sample_rate_hz: Samples a second.
-        ignore: Samples at the start that are not judged.
+        sample_rate_hz: Samples per second.
+        ignore: Samples at the start that are not evaluated.
     """
 
     label: str
@@ -114,8 +111,8 @@ class History:
     def without_lag(self, lag_samples: int) -> "History":
         """Return the history with the displacement taken ``lag_samples`` later.
 
-        Some sensors and recorders deliver a displacement late. What is taken out here is not in
-        the model any more, and a compensator made from it does not undo it.
+        For sensors or recorders with a delay. The model does not contain this lag, and its
+        compensator does not invert it.
 
         Args:
             lag_samples: Whole samples by which the displacement lags the command, >= 0.
@@ -135,11 +132,11 @@ class History:
         )
 
     def run(self) -> tuple[F64, F64, int]:
-        """Return what a model is run on.
+        """Return the samples to simulate.
 
         Returns:
-            Command float64[n], its rate float64[n] (backward difference, as models take it; 0 at
-            the first sample), number of samples that are not judged.
+            Command float64[n], its rate float64[n] (backward difference; 0 at the first sample),
+            number of samples that are not evaluated.
         """
         rate = np.diff(self.command, prepend=self.command[0]) * self.sample_rate_hz
         return np.ascontiguousarray(self.command), rate, self.ignore
@@ -150,15 +147,15 @@ Records: TypeAlias = Sequence[SteadyLoop | History]
 
 
 def check_signals(label: str, command: F64, displacement_um: F64) -> None:
-    """Check that two signals belong together and can be judged.
+    """Check that command and displacement can be used.
 
     Raises:
-        DataError: They differ in length, are too short, hold a value that is not finite, or the
-            command or the displacement never changes.
+        DataError: They differ in length, are too short, contain a value that is not finite, or
+            one of them is constant.
     """
     if command.ndim != 1 or command.shape != displacement_um.shape:
         raise DataError(
-            f"{label}: command and displacement_um must be equally long: "
+            f"{label}: command and displacement_um must have the same length: "
             f"{command.shape} and {displacement_um.shape}"
         )
     if command.size < FEWEST_POINTS:
@@ -172,7 +169,7 @@ def check_signals(label: str, command: F64, displacement_um: F64) -> None:
             )
         if np.ptp(values) == 0.0:
             value = float(values[0])
-            raise DataError(f"{label}: {name} never changes, it is {value!r} throughout")
+            raise DataError(f"{label}: {name} is constant ({value!r})")
 
 
 MOST_SAMPLES = 12_000
@@ -186,7 +183,7 @@ class ThinHistory(History):
 
     Attributes:
         index: int64[n], their numbers in the whole.
-        rates: float64[n], rate of the command at each, as the whole has it.
+        rates: float64[n], rate of the command at each, computed from the whole.
     """
 
     index: I64
@@ -205,9 +202,8 @@ class ThinHistory(History):
 def thinned(records: Sequence[Record], most: int = MOST_SAMPLES) -> tuple[Record, ...]:
     """Return records, of each longer history about ``most`` samples and its turning points.
 
-    What has memory is in its turning points, so a model that has no other dynamics ends where the
-    whole history would take it. The others are spread at random, one of each of many stretches:
-    evenly spaced ones might meet a command that repeats at a few phases only.
+    Turning points determine the memory of a model without dynamics. The other samples are random,
+    one per interval: evenly spaced ones might meet a few phases of a periodic command only.
     """
     return tuple(
         _thin(record, most)
@@ -218,9 +214,9 @@ def thinned(records: Sequence[Record], most: int = MOST_SAMPLES) -> tuple[Record
 
 
 def turning_points(command: F64) -> I64:
-    """Return where a command turns, but for what is smaller than :data:`SMALLEST_TURN`.
+    """Return where a command turns by more than :data:`SMALLEST_TURN`.
 
-    A play of that width follows the command up to each turn and rests from there to the next.
+    A play of that width follows the command up to each turn.
     """
     threshold = np.array([0.5 * SMALLEST_TURN * np.ptp(command)])
     followed = np.empty((command.size, 1))

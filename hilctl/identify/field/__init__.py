@@ -1,1 +1,1 @@
-"""Fit of the effective-field model to whole histories."""
+"""Fits of the effective-field model and the generalised Duhem operator to histories."""

@@ -1,8 +1,8 @@
-"""Densities of plays and drags, and the curve after them, by one non-negative least squares.
+"""Densities of plays and drags, and the output curve, by one non-negative least squares.
 
-With the effective field known, the operators' output is linear in what each rises by in each cell,
-and so is the curve's inverse in its slopes. Its mean slope is set to 1, since a common factor of
-both sides makes no difference. What data leave open, smoothness decides, so there is one solution.
+For a known effective field the output of the operators is linear in their densities, and the
+inverse curve is linear in its slopes. Its mean slope is 1, since both sides have a common factor.
+A smoothness prior makes the solution unique.
 """
 
 from collections.abc import Sequence
@@ -18,25 +18,25 @@ from hilctl.identify.field.design_matrix import needed_points, play_columns, pla
 from hilctl.identify.least_squares import RIDGE, SearchPoint, differences
 from hilctl.kernels.field import drag_columns
 
-STEEPEST = 6.0  # slope of the curve, of its mean
+STEEPEST = 6.0  # maximum slope of the curve, of its mean
 SMOOTH = 0.01  # weight of a difference of neighbours, relative to the longest column
-SMOOTH_PLAYS = 10  # lines beyond which it falls with their number, as their densities do
+SMOOTH_PLAYS = 10  # number of plays from which the weight decreases, as their densities do
 CURVE_SMOOTH = 0.02  # the same for the curve's slopes
-EDGE = 0.1  # of half a turn: how much closer they lie
-MOVED = 1e-3  # of the furthest: a column that moves less is left out
+EDGE = 0.1  # of half a turn: spacing of corners at the ends
+MOVED = 1e-3  # of the largest motion: columns that move less are ignored
 
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """What operators there are, in units of the command.
+    """Thresholds and cells of the operators, in command units.
 
     Attributes:
         thresholds: float64[p], of the plays, rising from 0.
         lengths: float64[d], of the drags.
         lowest: Lower end of the first cell of the effective field.
-        width: Of a cell.
-        cells: Number of cells of the drags, and of splines of the plays over the same range, >= 3.
-        knots: Corners of the curve.
+        width: Width of a cell.
+        cells: Number of cells of a drag, and of splines of a play over the same range, >= 3.
+        knots: Pieces of the curve.
     """
 
     thresholds: F64
@@ -48,7 +48,7 @@ class Grid:
 
     @property
     def lines(self) -> int:
-        """Plays and drags."""
+        """Number of plays and drags."""
         return int(self.thresholds.size + self.lengths.size)
 
     @property
@@ -59,13 +59,13 @@ class Grid:
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """The curve after the operators: points, float64[K + 1] each, the operators' 0 among them."""
+    """The output curve as points, float64[K + 1] each."""
 
     operators: F64
     displacement_um: F64
 
     def operators_of(self, y: F64) -> F64:
-        """Return the operators' output for displacements; the ends go on straight."""
+        """Return the output of the operators for displacements; extrapolates linearly."""
         inside = np.interp(y, self.displacement_um, self.operators)
         first, last = self.displacement_um[0], self.displacement_um[-1]
         slopes = np.diff(self.operators) / np.diff(self.displacement_um)
@@ -75,14 +75,14 @@ class Curve:
 
 @dataclass(frozen=True, slots=True)
 class Weights:
-    """What was found.
+    """Fitted densities and curve.
 
     Attributes:
-        slopes: float64[lines, cells], um per command unit; of plays those of their splines.
-        curve: From the operators' output to displacement, without the offset.
+        slopes: float64[lines, cells], um per command unit; for plays, weights of their splines.
+        curve: From the output of the operators to displacement, without the offset.
         offset_um: Displacement at rest.
         errors_um: float64[N], modelled less measured displacement of the rows.
-        squares: Sum of the weighted squares of the operators' errors, and of the prior's.
+        squares: Weighted sum of squares of the operators' errors and of the prior.
     """
 
     slopes: F64
@@ -92,17 +92,17 @@ class Weights:
     squares: float = 0.0
 
     def errors_of(self, given: F64, y: F64) -> F64:
-        """Return errors of what operators give at rows that may be others: float64[N]."""
+        """Return the errors of outputs of the operators at any rows: float64[N]."""
         curve = Curve(self.curve.operators, self.curve.displacement_um + self.offset_um)
         return np.asarray(given - curve.operators_of(y))
 
 
 def table(paths: Sequence[F64], kept: Sequence[I64], grid: Grid) -> F64:
-    """Return what each operator gives for each cell: float64[N, lines cells].
+    """Return the output of each operator for each cell: float64[N, lines cells].
 
     Args:
-        paths: For each record, float64[n], its effective field from rest.
-        kept: For each record, int64[N_i], which of these are rows.
+        paths: For each record, float64[n], effective field from rest.
+        kept: For each record, int64[N_i], samples that are rows.
         grid: The operators.
     """
     plays, cells = grid.thresholds.size, grid.cells
@@ -120,7 +120,7 @@ def table(paths: Sequence[F64], kept: Sequence[I64], grid: Grid) -> F64:
 
 
 def outputs(paths: Sequence[F64], kept: Sequence[I64], grid: Grid, slopes: F64) -> tuple[F64, F64]:
-    """Return what operators of known weights give, and its derivatives by the thresholds.
+    """Return the output of operators with known weights, and its derivatives by thresholds.
 
     Args:
         paths: See :func:`table`.
@@ -149,10 +149,10 @@ def outputs(paths: Sequence[F64], kept: Sequence[I64], grid: Grid, slopes: F64) 
 
 
 class Equations:
-    """Linear equations of all weights, of which the operators' output and the curve's differ least.
+    """Linear least squares of all weights, between operators and inverse curve.
 
     Args:
-        columns: What :func:`table` returned.
+        columns: Result of :func:`table`.
         y: float64[N], displacement without structure and delay, in um.
         grid: The operators.
         least: Smallest slope of the first line, um per command unit.
@@ -160,12 +160,12 @@ class Equations:
     """
 
     def __init__(self, columns: F64, y: F64, grid: Grid, least: float, scale: F64) -> None:
-        """Leave out what does not move, and lay the curve's corners."""
+        """Select columns that move, and place the corners of the curve."""
         self._y, self._grid, self._scale = y, grid, scale
         moved = np.ptp(columns, axis=0)
         self._used = moved > MOVED * float(moved.max())
         self._used[: grid.cells] = True
-        # Magnetostriction begins and ends flat: there its inverse bends most, corners lie closer.
+        # Magnetostriction begins and ends flat, where its inverse bends most and needs corners.
         even = 0.5 - 0.5 * np.cos(np.pi * np.linspace(EDGE, 1.0 - EDGE, grid.knots + 1))
         self._knots = float(y.min()) + float(np.ptp(y)) * (even - even[0]) / (even[-1] - even[0])
         parts = _segments(y, self._knots)
@@ -184,7 +184,7 @@ class Equations:
         self._prior, self._wanted = _prior(self._used, grid, longest, curve)
 
     def solve(self) -> Weights:
-        """Find all weights; once, however often it is asked for."""
+        """Return all weights; they are computed once."""
         found, constant = self._found
         grid, others = self._grid, self._others
         curve_slopes = np.empty(grid.knots)
@@ -197,7 +197,7 @@ class Equations:
             curve_slopes[np.clip(np.searchsorted(self._knots, self._y) - 1, 0, grid.knots - 1)]
         )
         values = np.concatenate(([0.0], np.cumsum(curve_slopes * np.diff(self._knots))))
-        operators = values - constant  # these give 0 at rest
+        operators = values - constant  # 0 at rest
         offset_um = float(Curve(self._knots, operators).operators_of(np.zeros(1))[0])
         curve = Curve(operators, self._knots - offset_um)
         residual = (self._left @ found + constant - self._target) * self._scale
@@ -207,10 +207,9 @@ class Equations:
         return Weights(lines, curve, offset_um, errors, squares)
 
     def place(self, errors: F64, changes: F64) -> SearchPoint:
-        """Return the sum of squares where changes of the rows lead, the weights following.
+        """Return the sum of squares with derivatives by the changes, by variable projection.
 
-        The weights that are free take up what they can of each change (Kaufman's variable
-        projection), so a step down from here needs no other solution.
+        Free weights compensate each change as far as they can (Kaufman's approximation).
 
         Args:
             errors: float64[N], of the operators' output with the weights of :meth:`solve`.
@@ -234,8 +233,7 @@ class Equations:
     def _found(self) -> tuple[F64, float]:
         """Minimise |scale (left w + c - target)|^2 + |prior w - wanted|^2 over w >= lows, and c.
 
-        On normal equations: the prior keeps them well conditioned, and a search solves many of
-        them.
+        By normal equations, which are fast, and well conditioned because of the prior.
         """
         means, mean = self._means(self._left), float(self._means(self._target))
         left = (self._left - means) * self._scale[:, None]
@@ -255,12 +253,12 @@ class Equations:
 
 
 def solve(columns: F64, y: F64, grid: Grid, least: float, scale: F64) -> Weights:
-    """Find all weights; see :class:`Equations` for the arguments."""
+    """Return all weights; see :class:`Equations` for the arguments."""
     return Equations(columns, y, grid, least, scale).solve()
 
 
 def _segments(y: F64, knots: F64) -> F64:
-    """Return how far y has gone between each two knots; the ends go on: float64[N, K]."""
+    """Return the part of y between each two knots; the end parts are unlimited: float64[N, K]."""
     width = np.diff(knots)
     out = np.clip(y[:, None] - knots[:-1], 0.0, width)
     out[:, 0] += np.minimum(y - knots[0], 0.0)
@@ -271,7 +269,7 @@ def _segments(y: F64, knots: F64) -> F64:
 def _prior(
     used: F64, grid: Grid, longest: float, curve: tuple[I64, int, F64, float]
 ) -> tuple[F64, F64]:
-    """Return rows that hold neighbours alike and densities small, and what they are to give."""
+    """Return rows and targets of the prior: smooth and small densities."""
     others, anchor, share, held = curve
     count = int(used.sum())
     number = np.where(used, np.cumsum(used) - 1, -1).reshape(grid.lines, grid.cells)
@@ -284,7 +282,7 @@ def _prior(
     ridge = np.zeros((count, width))
     ridge[:, :count] = RIDGE * longest * np.eye(count)
     out.append(ridge)
-    # Slopes of the curve, of which the anchor's follows from the mean; their second differences.
+    # Second differences of the slopes of the curve; that of the anchor follows from the mean.
     full, constant = np.zeros((grid.knots, width)), np.zeros(grid.knots)
     full[others, count + np.arange(others.size)] = 1.0
     full[anchor, count:], constant[anchor] = -share[others], float(share.sum())

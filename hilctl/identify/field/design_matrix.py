@@ -1,4 +1,4 @@
-"""Kernels of the fit: which samples count, and what plays give, each cell by itself."""
+"""Rows and columns of the linear problem: selected samples, and outputs of plays per cell."""
 
 import math
 from collections.abc import Sequence
@@ -12,19 +12,19 @@ from hilctl.kernels.jit import kernel
 
 @kernel("int64(float64[::1], float64[::1], float64, float64, int64, int64, int64[::1])", nogil=True)
 def corners(x: F64, y: F64, off_x: float, off_y: float, thin: int, furthest: int, out: I64) -> int:
-    """Find the samples between which straight lines are near enough to two signals.
+    """Find samples between which straight lines approximate two signals.
 
     Args:
         x: float64[n].
         y: float64[n].
-        off_x: How far a line may be from x.
-        off_y: How far one may be from y.
-        thin: Samples that a step must have; all steps are multiples of it.
-        furthest: Most samples in a step.
-        out: int64[n], filled with samples, the first and the last multiple among them.
+        off_x: Maximum deviation from x.
+        off_y: Maximum deviation from y.
+        thin: Minimum samples in a step; steps are multiples of it.
+        furthest: Maximum samples in a step.
+        out: int64[n], filled with samples, from the first to the last multiple.
 
     Returns:
-        How many there are.
+        Number of samples.
     """
     out[0] = 0
     first, count = 0, 1
@@ -54,15 +54,15 @@ def corners(x: F64, y: F64, off_x: float, off_y: float, thin: int, furthest: int
 def bare_displacement(
     derivatives: F64, kept: I64, late: float, slope_gain: float, bend_gain: float, out: F64
 ) -> None:
-    """Fill in y + slope_gain y' + bend_gain y'' of what comes some samples later.
+    """Fill in y + slope_gain y' + bend_gain y'' of later samples.
 
     Args:
         derivatives: float64[3, n], y and its first two derivatives.
-        kept: int64[N], samples that are wanted.
-        late: Samples by which they are taken later, >= 0.
+        kept: int64[N], samples to compute.
+        late: Shift in samples, >= 0.
         slope_gain: In the unit of time of the derivatives.
         bend_gain: In its square.
-        out: float64[N], filled; the end goes on as it is.
+        out: float64[N], filled; the last sample is repeated.
     """
     whole = math.floor(late)
     part, end = late - whole, derivatives.shape[1] - 1
@@ -83,15 +83,15 @@ def bare_displacement(
 
 @kernel("int64(float64[::1], float64, int64[::1])")
 def turning_points(u: F64, distance: float, out: I64) -> int:
-    """Find the samples that a path of operators can't do without.
+    """Find the turns of a path, and samples between them.
 
     Args:
-        u: float64[n], what the operators act on.
-        distance: Furthest way between two samples that are kept.
-        out: int64[n], filled with samples, the first and the last among them.
+        u: float64[n], input of the operators.
+        distance: Maximum distance of two samples.
+        out: int64[n], filled with samples, from the first to the last.
 
     Returns:
-        How many there are.
+        Number of samples.
     """
     out[0] = 0
     last, count = u[0], 1
@@ -108,12 +108,12 @@ def turning_points(u: F64, distance: float, out: I64) -> int:
 
 @kernel("void(float64[::1], float64, float64[::1])")
 def swings(y: F64, turn: float, out: F64) -> None:
-    """Work out how far a path goes between the turns before and after each sample.
+    """Compute the swing of a path between the turns around each sample.
 
     Args:
         y: float64[n].
-        turn: What it has to go back by for that to be a turn.
-        out: float64[n], filled with the way between the turns.
+        turn: Minimum reversal that counts as a turn.
+        out: float64[n], filled with the swings.
     """
     first = last = 0  # the last turn, and the furthest sample since
     way = 0.0
@@ -132,16 +132,16 @@ def swings(y: F64, turn: float, out: F64) -> None:
 
 @kernel("int64(float64[::1], int64[::1], int64[::1], int64[::1])", nogil=True)
 def needed_points(u: F64, rows: I64, points: I64, places: I64) -> int:
-    """Find the rows of a path and all samples at which it turns: operators need no others.
+    """Find the rows and turns of a path, which are all samples that operators need.
 
     Args:
         u: float64[n].
         rows: int64[N], rising.
         points: int64[n], filled with samples.
-        places: int64[N], filled with where each row stands among these.
+        places: int64[N], filled with the index of each row among the samples.
 
     Returns:
-        How many points there are.
+        Number of samples.
     """
     count = row = 0
     for k in range(u.size):
@@ -205,17 +205,15 @@ def _risen(u: float, lowest: float, width: float, s: F64, edges: F64) -> tuple[f
 def play_columns(
     u: F64, rows: I64, thresholds: F64, lowest: float, width: float, splines: int, out: F64
 ) -> None:
-    """Fill in what each play gives from rest for slopes that are a quadratic B-spline.
-
-    Sums of these are as smooth as what rods do, and not negative where their weights are not.
+    """Fill in the output of each play from rest, with a quadratic B-spline as its slope.
 
     Args:
-        u: float64[n], a path from rest; it need hold no more than its turning points.
+        u: float64[n], a path from rest with at least its turning points.
         rows: int64[N], samples of the path that are filled in, rising.
         thresholds: float64[p].
-        lowest: Where the pieces of the splines begin; slopes go on even before it.
-        width: Of a piece.
-        splines: How many there are, c >= 3, over c - 2 pieces.
+        lowest: Start of the first piece of the splines; slopes are constant before it.
+        width: Width of a piece.
+        splines: Number of splines c >= 3, over c - 2 pieces.
         out: float64[N, m], of which the first p c columns are filled.
     """
     rest = np.zeros(splines)
@@ -247,16 +245,14 @@ def plays_given(
     total: F64,
     by: F64,
 ) -> None:
-    """Work out what plays of known weights give together, and what it changes by with thresholds.
-
-    A search needs the columns of :func:`play_columns` where it looks for weights alone.
+    """Compute the total output of plays with known weights, and its derivatives.
 
     Args:
-        u: See :func:`play_columns`.
-        rows: See :func:`play_columns`.
-        thresholds: See :func:`play_columns`.
-        lowest: See :func:`play_columns`.
-        width: See :func:`play_columns`.
+        u: See :func:`play_columns`, as for rows, thresholds, lowest and width.
+        rows: See above.
+        thresholds: See above.
+        lowest: See above.
+        width: See above.
         weights: float64[p, c], of the splines.
         total: float64[N], filled.
         by: float64[N, p], filled with the derivatives of the total by each threshold.
@@ -283,20 +279,20 @@ def plays_given(
 
 
 LEAST_SWING = 0.1  # of the stroke: smaller swings count as this one
-TURN = 0.02  # of the stroke: what is no turn yet
-AT_REST = 1e-4  # of the command's peak-to-peak: shorter steps count for less time than they took
-REPEATED = 0.5  # exponent of how closely rows lie, by which each of them counts for less
+TURN = 0.02  # of the stroke: minimum reversal of a turn
+AT_REST = 1e-4  # of the command's peak-to-peak: time of shorter steps counts less
+REPEATED = 0.5  # exponent by which the density of rows reduces their weight
 
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """How a record moves.
+    """Motion of a record.
 
     Attributes:
-        travel: float64[n], of the command since the sample before, of its peak-to-peak.
-        step_s: float64[n], time since then.
-        swing: float64[n], displacement between the turns around a sample, of the stroke.
-        judged: First sample that counts.
+        travel: float64[n], change of the command since the sample before, of its peak-to-peak.
+        step_s: float64[n], time since the sample before.
+        swing: float64[n], swing of the displacement around a sample, of the stroke.
+        judged: First evaluated sample.
     """
 
     travel: F64
@@ -318,9 +314,9 @@ class Motion:
         Args:
             signals: Command and displacement in um, float64[n] each.
             step_s: float64[n].
-            judged: First sample that counts.
+            judged: First evaluated sample.
             reach: Half the command's peak-to-peak.
-            stroke_um: Of the displacement.
+            stroke_um: Peak-to-peak displacement.
         """
         command, displacement_um = signals
         swing = np.empty(command.size)
@@ -329,7 +325,7 @@ class Motion:
         return cls(travel, step_s, np.maximum(swing / stroke_um, LEAST_SWING), judged)
 
     def at(self, samples: I64) -> "Motion":
-        """Return the motion at some samples alone, the first among them."""
+        """Return the motion at some samples, including the first."""
         return Motion(
             np.diff(np.cumsum(self.travel)[samples], prepend=0.0),
             np.diff(np.cumsum(self.step_s)[samples], prepend=0.0),
@@ -344,7 +340,7 @@ class Rows:
 
     Attributes:
         samples: For each record, int64[N_i], rising.
-        scale: float64[N], square root of each row's weight; of all the mean square is 1.
+        scale: float64[N], square root of the weight of each row; the mean square is 1.
     """
 
     samples: tuple[I64, ...]
@@ -352,13 +348,11 @@ class Rows:
 
 
 def chosen(motions: Sequence[Motion], most: int) -> Rows:
-    """Choose rows, as many for each swing as for each other one, and as many for each second.
-
-    Their errors are of the swing around them, as what is judged is of its own peak-to-peak.
+    """Choose rows evenly over swings and over time, weighted by the swing around them.
 
     Args:
-        motions: The records.
-        most: Rows.
+        motions: Motions of the records.
+        most: Maximum number of rows.
     """
     swung = [motion.travel / motion.swing for motion in motions]
     passed = [m.step_s * np.minimum(m.travel / AT_REST, 1.0) for m in motions]

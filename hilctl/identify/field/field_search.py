@@ -1,4 +1,4 @@
-"""From a few starts to the stages; the weights follow from them, round by round."""
+"""Fit of the effective-field model: stages from a few starts, weights round by round."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -8,7 +8,7 @@ import numpy as np
 from hilctl.base.types import F64, I64
 from hilctl.identify.field.densities import Curve, Equations, Grid, Weights, outputs, solve, table
 from hilctl.identify.field.design_matrix import Rows, chosen
-from hilctl.identify.field.preprocess import Prepared
+from hilctl.identify.field.preprocess import Prepared, histories_of
 from hilctl.identify.field.stages import (
     HIGH,
     LOW,
@@ -22,24 +22,26 @@ from hilctl.identify.field.stages import (
     stages_in,
     stages_of,
 )
-from hilctl.identify.fit_api import OnProgress
+from hilctl.identify.fit_api import FitJob, FoundModel, OnProgress
 from hilctl.identify.least_squares import SearchPoint, settle
 from hilctl.identify.parallel import parallel_map
+from hilctl.models.effective_field import FieldModel, OutputCurve
+from hilctl.models.staged import StagedModel
 
-TRIED = 0.2  # of a unit: change that slopes are taken by; kinks of single rows are smoothed
-MOVES = 0.1  # of the way to the next: change of a threshold that makes about as much difference
-ROOM = 0.45  # the same: how far one may go from where the search has laid it
+TRIED = 0.2  # units: step of numerical derivatives, large enough to smooth kinks
+MOVES = 0.1  # unit of a threshold, of the distance to the next
+ROOM = 0.45  # maximum change of a threshold, of the distance to the next
 STAGES = len(NAMES)
 
 
 @dataclass(frozen=True, slots=True)
 class BareSignal:
-    """What stages make of the records.
+    """Effective fields and displacements of the records for some stages.
 
     Attributes:
-        fields: For each record, float64[n], its effective field.
+        fields: For each record, float64[n], effective field.
         y: float64[N], displacement of the rows without structure and delay, in um.
-        scale: float64[N], square root of each row's weight.
+        scale: float64[N], square root of the weight of each row.
     """
 
     fields: Sequence[F64]
@@ -48,12 +50,12 @@ class BareSignal:
 
 
 class JointRefinement:
-    """A sum of squares over stages and thresholds.
+    """Minimisation of a sum of squares over stages and thresholds.
 
     Args:
-        rows_of: From stages, float64[9], to the rows.
+        rows_of: Returns the rows for stages, float64[9].
         paths: For each record int64[N_i], the samples that are rows.
-        grid: The operators; their thresholds are where to start.
+        grid: The operators, with the thresholds of the start.
         least: Smallest slope of the first line, um per command unit.
     """
 
@@ -64,12 +66,12 @@ class JointRefinement:
         self._tried: tuple[F64, Equations, BareSignal] | None = None
 
     def follow(self, stages: F64) -> tuple[F64, Grid]:
-        """Return the stages and the operators where the sum is least."""
+        """Return the stages and the operators at the minimum."""
         first = self._grid.thresholds[1:]
         below = np.diff(self._grid.thresholds)
         above = np.append(below[1:], below[-1:])
         unit = np.concatenate((row(STEP), MOVES * below))
-        # Each goes less than halfway to its neighbours, so that they stay in order.
+        # Thresholds move less than half of their distance, so that they stay in order.
         low = np.concatenate((row(LOW), first - ROOM * below))
         high = np.concatenate((row(HIGH), first + ROOM * above))
         x = settle(
@@ -85,7 +87,7 @@ class JointRefinement:
         return replace(self._grid, thresholds=np.append(0.0, x[STAGES:]))
 
     def _equations(self, x: F64) -> tuple[Equations, BareSignal]:
-        """Return the equations of a point: a step is tried first, and taken from there."""
+        """Return the equations of a point; those of the last point are cached."""
         if self._tried is None or not np.array_equal(self._tried[0], x):
             rows, grid = self._rows_of(x[:STAGES]), self._laid(x)
             columns = table(rows.fields, self._paths, grid)
@@ -109,20 +111,20 @@ class JointRefinement:
         return equations.place(here, changes)
 
 
-MARGIN = 0.1  # of the span: room of the tables beyond what the data reach
+MARGIN = 0.1  # of the span: margin of the tables beyond the data
 LENGTHS = (0.05, 0.4)  # of half the span: shortest and longest drag
 SEARCH_ROWS, POLISH_ROWS, FINAL_ROWS = 2500, 4000, 12_000
 ROUNDS = 2
-FIRST_LAGS = (0.02, 0.1, 0.4)  # starts: lag of the field
+FIRST_LAGS = (0.02, 0.1, 0.4)  # lags of the field of the starts
 NEAR_BOUND = 0.95
-STIFFER = (0.02, 0.05)  # radians of other starts, where the first leads to a bound
-LEAST_WIDEST = 0.1  # of half the span
-TAIL = 0.02  # of all weights: those of thresholds beyond the widest that is worth its place
+STIFFER = (0.02, 0.05)  # radians of further starts, if the first ends at a bound
+LEAST_WIDEST = 0.1  # minimum of the largest threshold, of half the span
+TAIL = 0.02  # of all weights: those beyond the largest useful threshold
 
 
 @dataclass(frozen=True, slots=True)
 class Size:
-    """How many operators."""
+    """Numbers of operators and cells."""
 
     plays: int
     drags: int
@@ -131,20 +133,20 @@ class Size:
 
     @property
     def coarse(self) -> "Size":
-        """Fewer of them, for the search."""
+        """Smaller numbers, for the search."""
         return Size(min(self.plays, 8), self.drags, min(self.cells, 12), min(self.knots, 16))
 
 
 @dataclass(frozen=True, slots=True)
 class FieldEnd:
-    """What was found, and what another search goes on from.
+    """End of a search, from which another search can start.
 
     Attributes:
         known: The stages.
         grid: The operators.
-        weights: Of the operators, and the curve.
-        met: The curve by which errors were judged, by displacement with its offset.
-        widest: Largest threshold that is worth its place, of half the span.
+        weights: Weights of the operators, and the curve.
+        met: The curve that the losses depend on, by displacement with its offset.
+        widest: Largest useful threshold, of half the span.
     """
 
     known: Physical
@@ -156,7 +158,7 @@ class FieldEnd:
 
 @dataclass(frozen=True, slots=True)
 class _Descent:
-    """Where a descent has led, and what was learned of curve and cells on the way."""
+    """End of a descent: its error and stages, with curve and cells."""
 
     error: float
     stages: Stages
@@ -166,7 +168,7 @@ class _Descent:
 
 
 class FieldSearch:
-    """Weights and stages of one size of model.
+    """Search of weights and stages of one size of model.
 
     Args:
         data: The records.
@@ -183,11 +185,10 @@ class FieldSearch:
         self._widest = 1.0
 
     def find(self, first: Stages, progress: OnProgress) -> FieldEnd:
-        """Follow the best of some starts down, and work out all weights there."""
+        """Return the end of the best start, with all weights."""
         found = self._descended(first, progress, 0.0)
         if _at_bound(found.stages):
-            # A slow record says little of the structure: a soft one can bend what the hysteresis
-            # should.
+            # Slow records determine the structure poorly: a soft one may replace hysteresis.
             for k, radian in enumerate(STIFFER, start=1):
                 start = replace(first, radian=radian, delay=0.3 * radian)
                 other = self._descended(start, progress, 1.0 - 0.5**k)
@@ -196,12 +197,12 @@ class FieldSearch:
         return self._end(row(found.stages), None)
 
     def go_on(self, end: FieldEnd) -> FieldEnd:
-        """Return where a search leads that begins where one of other operators or data ended."""
+        """Return the end of a search from the end of one with other operators or data."""
         self._curve, self._grid, self._widest = end.met, end.grid, end.widest
         return self._end(row(stages_of(end.known, self._data)), end.grid)
 
     def _descended(self, first: Stages, progress: OnProgress, done: float) -> "_Descent":
-        """Return where the best of some starts leads."""
+        """Return the descent from the best of some starts."""
         coarse = self._size.coarse
         tried = [self._tried(replace(first, field=lag), coarse) for lag in FIRST_LAGS]
         first = min(tried, key=_error)[1]
@@ -224,7 +225,7 @@ class FieldSearch:
         self._widest = 1.0
 
     def _tried(self, stages: Stages, size: Size) -> tuple[float, Stages]:
-        """Return the error of a start whose weights have been learned twice."""
+        """Return the error of a start after two solutions for its weights."""
         self._forget()
         for _ in range(2):
             self._lay(stages, size)
@@ -265,7 +266,7 @@ class FieldSearch:
         return [u for u, _ in both], [y for _, y in both]
 
     def _scale(self, y: F64, rows: Rows) -> F64:
-        """Return what makes errors of the operators' weighted ones of the displacement."""
+        """Return factors from errors of operators to weighted errors of displacement."""
         if self._curve is None:
             return rows.scale
         step = 0.01 * self._data.stroke_um
@@ -277,7 +278,7 @@ class FieldSearch:
         return self._grid
 
     def _learn(self, x: F64, rows: Rows) -> Weights:
-        """Work out weights; what drags and curve do follows from them the next time."""
+        """Solve for weights, and update the curve and the largest threshold for the next time."""
         found = self._solved(x, rows)
         grid = self._laid()
         plays = grid.thresholds.size
@@ -291,14 +292,14 @@ class FieldSearch:
         return found
 
     def _between(self, found: Weights) -> Curve:
-        """Return the new curve, halfway from the one before: whole steps would swing round it."""
+        """Return the mean of the new and the old curve, since full steps would oscillate."""
         y = found.curve.displacement_um + found.offset_um
         if self._curve is None:
             return Curve(found.curve.operators, y)
         return Curve(0.5 * (found.curve.operators + self._curve.operators_of(y)), y)
 
     def _lay(self, stages: Stages, size: Size) -> None:
-        """Lay the cells over the field that the stages give."""
+        """Place the cells over the range of the field."""
         fields, _ = self._signals(row(stages))
         low = min(float(u.min()) for u in fields)
         high = max(float(u.max()) for u in fields)
@@ -329,7 +330,7 @@ class FieldSearch:
 
 
 def _at_bound(stages: Stages) -> bool:
-    """Return whether the structure has become about as soft as it may."""
+    """Return whether the structure is about as soft as its bound."""
     return stages.radian > NEAR_BOUND * HIGH.radian
 
 
@@ -342,3 +343,58 @@ def _lengths(count: int) -> tuple[float, ...]:
         return (0.15,)[:count]
     first, last = np.log(LENGTHS[0]), np.log(LENGTHS[-1])
     return tuple(np.exp(np.linspace(first, last, count)).tolist())
+
+
+FINER = 8  # cells of the model's tables per piece of a spline
+
+
+def fit_field(job: FitJob) -> FoundModel:
+    """Fit plays and drags of a field, losses, structure and delay.
+
+    Raises:
+        DataError: A record is a steady loop: loops leave curve and losses undetermined.
+    """
+    settings = job.settings
+    data = Prepared(histories_of(job.data.records, "an effective field"))
+    size = Size(settings.plays, settings.drags, settings.cells, settings.knots)
+    search = FieldSearch(data, size, job.least)
+    if isinstance(job.start, FieldEnd):
+        found = search.go_on(job.start)
+    else:
+        found = search.find(Stages(), job.progress)
+    known = found.known.parameters(found.weights.offset_um)
+    numbers = len(known) + int((found.weights.slopes > 0.0).sum()) + settings.knots
+    return FoundModel(_model(job, found), numbers, known, end=found)
+
+
+def _model(job: FitJob, found: FieldEnd) -> StagedModel:
+    grid, weights, known = found.grid, found.weights, found.known
+    drags = weights.slopes[grid.thresholds.size :].tolist()
+    lines = (*tabled(weights.slopes[: grid.thresholds.size]), *drags)
+    hysteresis = FieldModel(
+        thresholds=tuple(grid.thresholds.tolist()),
+        lengths=tuple(grid.lengths.tolist()),
+        lowest=grid.lowest,
+        cell=grid.piece / FINER,
+        slopes=tuple(tuple(line) for line in lines),
+        curve=OutputCurve(
+            operators_um=tuple(weights.curve.operators.tolist()),
+            displacement_um=tuple(weights.curve.displacement_um.tolist()),
+        ),
+        losses=known.losses,
+        **job.data.common(weights.offset_um),
+    )
+    return StagedModel.around(hysteresis, structure=known.structure, delay_s=known.delay_s)
+
+
+def tabled(splines: F64) -> list[list[float]]:
+    """Return the slopes of splines in FINER cells per piece.
+
+    Args:
+        splines: float64[p, c], weights of the splines of each play.
+    """
+    t = (np.arange(FINER) + 0.5) / FINER
+    parts = 0.5 * (1.0 - t) ** 2, 0.5 + t - t**2, 0.5 * t**2
+    pieces = splines.shape[1] - 2
+    found = sum(splines[:, k : k + pieces, None] * part for k, part in enumerate(parts))
+    return np.reshape(found, (len(splines), -1)).tolist()

@@ -1,4 +1,4 @@
-"""Records as the fit needs them: thinned in time, the displacement ready to lose its structure."""
+"""Preparation of histories for a fit: smoothing, thinning, and removal of structure and delay."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -8,25 +8,25 @@ from typing import Generic, TypeVar
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
+from hilctl.base.errors import DataError
 from hilctl.base.types import F64, I64
-from hilctl.identify.data.records import History
+from hilctl.identify.data.records import History, Record, SteadyLoop
 from hilctl.identify.field.design_matrix import Motion, bare_displacement, corners
 from hilctl.identify.parallel import parallel_map
 from hilctl.models.linear_stages import smoothing_weights
 
 WIDER = 4.0  # of the first width: the second
-MEDIAN_SQUARE = 0.4549  # of numbers whose mean square is 1, with Gauss's distribution
-LEAST = 0.01  # part of the noise that a smoothing has to take away to say how much there is
+MEDIAN_SQUARE = 0.4549  # of normally distributed numbers with mean square 1
+LEAST = 0.01  # part of the noise that a window must remove to tell its level
 
 
 def smoothed(displacement_um: F64, width: float, rate_hz: float) -> F64:
     """Return the displacement and its first two derivatives by time: float64[3, n].
 
-    A window that is narrow enough for the fastest loop leaves most of the sensor noise. In small
-    and slow loops noise reverses the path where the actuator did not, which would bend a model.
-    Of what a wider smoothing takes away more, that part is kept by which it is more than noise (J.
-    S. Lee, IEEE Trans. Pattern Anal. Mach. Intell. 2 (1980) 165). How much noise would be is known
-    from what the first smoothing takes away.
+    A window narrow enough for the fastest loop leaves most of the sensor noise, which reverses the
+    path in small and slow loops. So a second, wider window is used, and the difference of both is
+    kept as far as it exceeds noise (J. S. Lee, IEEE Trans. Pattern Anal. Mach. Intell. 2 (1980)
+    165). The noise follows from the residual of the first window.
 
     Args:
         displacement_um: float64[n].
@@ -55,34 +55,29 @@ def _derivatives(y: F64, width: float, rate_hz: float) -> F64:
 
 
 def _convolved(y: F64, weights: F64) -> F64:
-    """Return y under odd weights of which the middle one is its own, its ends going on as are."""
+    """Return y convolved with an odd number of weights; the ends are repeated."""
     padded = np.pad(y, weights.size // 2, mode="edge")
     return np.convolve(padded, weights[::-1], "valid")
 
 
-POINTS = 90  # samples that are left of the fastest cycle
-SMOOTHED = 0.09  # of a radian of the fastest cycle: how far the displacement is smoothed at least
-OFF = 5e-4  # of the displacement's peak-to-peak: how far straight lines may be from it
-COMMAND_OFF = 1e-4  # the same for commands, on which the operators turn
-LONGEST = 0.3  # cycles of the fastest: longest step
+POINTS = 90  # samples kept of the fastest cycle
+SMOOTHED = 0.09  # window, in radians of the fastest cycle
+OFF = 5e-4  # deviation of straight lines from the displacement, of its peak-to-peak
+COMMAND_OFF = 1e-4  # the same for commands, at whose turns the operators turn
+LONGEST = 0.3  # longest step, in cycles of the fastest
 
 
 _Found = TypeVar("_Found")
 
 
 class Latest(Generic[_Found]):
-    """What was found last: a search changes one stage at a time, and most depends on few."""
+    """The last result of a computation; a search often changes what it does not depend on."""
 
     def __init__(self) -> None:
         self._known: tuple[object, _Found] | None = None
 
     def of(self, key: object, work: Callable[[], _Found]) -> _Found:
-        """Return what ``work`` gives for a key; the same again where the key is the same.
-
-        Args:
-            key: All that the result depends on; compared by ``==``.
-            work: Works it out.
-        """
+        """Return the result for a key, computed by ``work`` if the key has changed."""
         known = self._known
         if known is None or known[0] != key:
             self._known = known = key, work()
@@ -91,16 +86,16 @@ class Latest(Generic[_Found]):
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """One record; what its methods return is not to be changed, as it may be returned again.
+    """One record; callers must not change returned arrays, since they are cached.
 
     Attributes:
-        rate_hz: Of the record.
-        kept: int64[n], the samples that are left.
-        step_s: float64[n], time since the one before.
+        rate_hz: Sample rate of the record.
+        kept: int64[n], the samples that are kept.
+        step_s: float64[n], time since the sample before.
         command: float64[n], at the end of each step.
         mean: float64[n], the command's mean over each step.
         derivatives: float64[3, N], displacement of all samples in um and its derivatives by time.
-        motion: How it moves, at the samples that are left.
+        motion: Motion at the samples that are kept.
     """
 
     rate_hz: float
@@ -115,15 +110,14 @@ class Run:
 
     @property
     def time_s(self) -> F64:
-        """Time of each sample that is left."""
+        """Time of each sample that is kept."""
         return self.kept / self.rate_hz
 
     def late_command(self, lag_s: float) -> tuple[F64, F64]:
-        """Return when in each step to take its command, and the command there: float64[n] each.
+        """Return at which part of each step to take its command, and the command: float64[n] each.
 
-        A lag's steps are exact for commands that go straight if their ends are weighed as its
-        answer to a constant asks: the middle of a short step, the end of one that it has settled
-        in. Steps are of all lengths, so no one rule does.
+        The step of a lag is exact for a straight command if the command is taken at this part: the
+        middle of a short step, the end of a step in which the lag settles.
 
         Args:
             lag_s: Time constant, > 0.
@@ -148,18 +142,18 @@ class Run:
 
 
 class Prepared:
-    """All records.
+    """All records, prepared.
 
     Args:
         records: The records.
-        points: Samples that are left of the fastest cycle.
-        command_off: Of the peak-to-peak command: how far straight lines may be from it.
+        points: Samples kept of the fastest cycle.
+        command_off: Deviation of straight lines from the command, of its peak-to-peak.
 
     Attributes:
         runs: The records.
         reach: Half the largest peak-to-peak command.
         stroke_um: Largest peak-to-peak displacement.
-        top_hz: Frequency of a sine that is as fast as the fastest record.
+        top_hz: Frequency of a sine as fast as the fastest record.
     """
 
     def __init__(
@@ -193,7 +187,22 @@ class Prepared:
         return Run(rate_hz, kept, step_s, at_end, mean, derivatives, motion)
 
 
+def histories_of(records: Sequence[Record], what: str) -> list[History]:
+    """Return the records if all are histories.
+
+    Raises:
+        DataError: One is a steady loop, which leaves the parameters undetermined.
+    """
+    loops = [record.label for record in records if isinstance(record, SteadyLoop)]
+    if loops:
+        raise DataError(
+            f"{what} needs whole histories, not steady loops such as '{loops[0]}': record the "
+            "campaign configs/identify_any.yaml, or use --model staged for loops"
+        )
+    return [record for record in records if isinstance(record, History)]
+
+
 def _speed(record: History) -> float:
-    """Return the largest rate of a command; noise on a measured one is told from it."""
+    """Return the largest rate of a command; a quantile, because a measured one has noise."""
     _, rate, _ = record.run()
     return float(np.quantile(np.abs(rate), 0.999))

@@ -1,4 +1,4 @@
-"""Losses, structure and delay: in a row for the search, out of it for a model."""
+"""Losses, structure and delay of a fit to histories: search variables and physical values."""
 
 import math
 from dataclasses import dataclass, fields
@@ -10,19 +10,20 @@ from hilctl.identify.field.densities import Curve
 from hilctl.identify.field.preprocess import Prepared, Run
 from hilctl.kernels.field import field_left
 from hilctl.models.effective_field import FieldLosses, even_excess
+from hilctl.models.linear_stages import FirstMode
 
 
 @dataclass(frozen=True, slots=True)
 class Stages:
-    """All that is not a weight; times in units of 1 / (2 pi top_hz), commands of the reach.
+    """All parameters but the weights; times per 1 / (2 pi top_hz), commands per reach.
 
     Attributes:
-        field: Lag of the field that is always the same.
-        output: Loss that follows the slope of the hysteresis, at its mean slope.
-        decay: By which the losses come later.
-        growth: Of the losses with themselves.
-        bend: The same, squared.
-        excess: Of the losses' square root.
+        field: Constant lag of the field.
+        output: Loss proportional to the slope of the hysteresis, at its mean slope.
+        decay: Delay of the losses.
+        growth: Linear growth of the losses with themselves.
+        bend: Quadratic growth.
+        excess: Loss that grows with the square root.
         radian: 1 / w of the structure.
         damping: Its damping ratio.
         delay: Transport delay.
@@ -45,7 +46,7 @@ NAMES = tuple(field.name for field in fields(Stages))
 LOW = Stages(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.01, 0.02, 0.0)
 HIGH = Stages(2.0, 2.0, 0.3, 10.0, 20.0, 0.5, 0.3, 2.0, 0.3)
 STEP = Stages(0.02, 0.02, 0.01, 0.05, 0.05, 0.01, 0.02, 0.05, 0.01)
-"""Bounds, and changes that make about as much difference as each other."""
+"""Bounds, and changes that have about the same effect."""
 
 
 def row(stages: Stages) -> F64:
@@ -60,7 +61,7 @@ def stages_in(x: F64) -> Stages:
 
 @dataclass(frozen=True, slots=True)
 class Physical:
-    """The same in s, um and the unit of the command; and the lag of small, slow changes in all."""
+    """Stages in s, um and command units, and the total lag of small, slow changes."""
 
     losses: FieldLosses
     radian_s: float
@@ -68,9 +69,24 @@ class Physical:
     delay_s: float
     lag_s: float
 
+    @property
+    def structure(self) -> FirstMode:
+        """The structure as a stage of a model."""
+        natural_hz = 0.5 / (math.pi * self.radian_s)
+        return FirstMode(natural_hz=natural_hz, damping_ratio=self.damping_ratio)
+
+    def parameters(self, offset_um: float) -> dict[str, float]:
+        """Return all stages by their published names, with the displacement at rest."""
+        return {
+            **self.losses.model_dump(),
+            **self.structure.model_dump(),
+            "delay_s": self.delay_s,
+            "output_offset_um": offset_um,
+        }
+
 
 def physical(stages: Stages, data: Prepared) -> Physical:
-    """Give stages their units."""
+    """Return stages in physical units."""
     unit_s = 1.0 / (2.0 * math.pi * data.top_hz)
     gain = 2.0 * data.reach / data.stroke_um
     losses = FieldLosses(
@@ -91,7 +107,7 @@ def physical(stages: Stages, data: Prepared) -> Physical:
 
 
 def stages_of(known: Physical, data: Prepared) -> Stages:
-    """Undo :func:`physical`, for records that may be others; within the bounds of a search."""
+    """Undo :func:`physical`, for the same or other records; clipped to the bounds."""
     unit_s = 1.0 / (2.0 * math.pi * data.top_hz)
     gain = 2.0 * data.reach / data.stroke_um
     losses = known.losses
@@ -110,14 +126,13 @@ def stages_of(known: Physical, data: Prepared) -> Stages:
 
 
 def signals(run: Run, known: Physical, curve: Curve | None, span: float) -> tuple[F64, F64]:
-    """Return field that is left and bare displacement of a record: float64[n] each.
+    """Return the effective field and the displacement before structure: float64[n] each.
 
     Args:
         run: The record.
         known: The stages.
-        curve: From displacement to what the operators give; None where it is not known yet, and
-            the displacement itself stands for it.
-        span: Of the field, which says below what size the excess loss is even.
+        curve: From displacement to the output of the operators; None for the displacement itself.
+        span: Of the field; the excess loss is linear below a part of it.
     """
     y = run.bare_um(known.delay_s, 2.0 * known.damping_ratio * known.radian_s, known.radian_s**2)
     m = y if curve is None else curve.operators_of(y)

@@ -1,1 +1,1 @@
-"""Better models from recordings of their use."""
+"""Refinement of models by recordings of their use."""

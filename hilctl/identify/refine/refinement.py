@@ -1,4 +1,4 @@
-"""Refine from files: a model and recordings in, a better model out, or why there is none."""
+"""Refinement of a model by recordings: a better model, or reasons why there is none."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,8 +13,7 @@ from hilctl.base.files import check_writable, write_text
 from hilctl.base.samples import Flag
 from hilctl.identify.data.data_files import history_from_recording
 from hilctl.identify.data.records import History
-from hilctl.identify.fit_api import OnProgress, ignore_progress
-from hilctl.identify.fit_data import FitData
+from hilctl.identify.fit_api import FitData, OnProgress, ignore_progress
 from hilctl.identify.fit_model import VERSIONS, error_table, identified_range
 from hilctl.identify.model_quality import data_reasons
 from hilctl.identify.refine.regularisation import (
@@ -33,22 +32,21 @@ STILL_S = 1.0  # between a run and the one that began where it ended
 
 
 def load_runs(paths: Sequence[Path], model: HysteresisModel) -> list[History]:
-    """Read runs, with a compensator or without one, each from rest.
+    """Read runs, compensated or not, each from rest.
 
-    What moves the actuator is the command that was put out, so it makes no difference which model
-    the run had, or what it had learned. A run that began where another one had left the actuator
-    has that one's samples before its own, not judged.
+    The actuator responds to the output command, whatever the model of the run. A run that begins
+    in the end state of another has the samples of that run before its own; they are not evaluated.
 
     Args:
         paths: Recordings.
-        model: The model; its command has the unit of theirs.
+        model: The model, with a command in the unit of the recordings.
 
     Raises:
         InputError: A file is named twice, or there is none.
-        DataError: A recording can't be read or followed from rest, or is of another unit.
+        DataError: A recording can't be read, has no known initial state, or another unit.
     """
     if not paths:
-        raise InputError("nothing to refine a model from: name recordings")
+        raise InputError("no recordings to refine the model: name at least one")
     twice = {path for path in paths if list(paths).count(path) > 1}
     if twice:
         raise InputError(f"named twice: {', '.join(map(str, sorted(twice)))}")
@@ -71,14 +69,14 @@ def _history(recording: Recording, known: Mapping[str, Recording]) -> History:
         return history
     if before not in known:
         raise DataError(
-            f"{recording.path}: began {recording.run.get('initial_state', 'where a run ended')}: "
-            "give that recording too, so that it can be followed from rest"
+            f"{recording.path}: began {recording.run.get('initial_state', 'where a run ended')}. "
+            "Add that recording, so that the initial state is known"
         )
     first = known[before].samples
     last = float(first.command[-1])
     still = round(STILL_S * recording.sample_rate_hz)
     command = np.concatenate((first.command, np.full(still, last), history.command))
-    ahead = np.zeros(command.size - history.command.size)  # not judged, and need not be known
+    ahead = np.zeros(command.size - history.command.size)  # not evaluated
     return History(
         history.label,
         command,
@@ -90,12 +88,12 @@ def _history(recording: Recording, known: Mapping[str, Recording]) -> History:
 
 @dataclass(frozen=True, slots=True)
 class Refinement:
-    """A refined model, and what it is worth.
+    """A refined model, and its errors.
 
     Attributes:
-        model: The refined model; to be used where it is better.
-        choice: How it was refined, with the errors before and after on what was held out.
-        reasons: Why it is no better than the old model; empty where it is.
+        model: The refined model.
+        choice: Selected regularisation, with errors before and after on held-out runs.
+        reasons: Why it is no better than the old model; empty if it is better.
     """
 
     model: RefinedModel
@@ -104,15 +102,15 @@ class Refinement:
 
     @property
     def better(self) -> bool:
-        """Whether it is better than the old model on what was held out, and on no run worse."""
+        """Whether it is better than the old model on held-out runs, and worse on none."""
         return not self.reasons
 
     def __str__(self) -> str:
         was, now = self.choice.before.judgement, self.choice.after.judgement
-        what = f"{now.own_peak_percent:.2f} % at most where it was {was.own_peak_percent:.2f} %"
+        what = f"peak error {now.own_peak_percent:.2f} % (before {was.own_peak_percent:.2f} %)"
         if self.better:
-            return f"better: {self.choice.ratio:.2f} times the old error on runs not fitted; {what}"
-        return f"no better than the old model, because {'; '.join(self.reasons)}"
+            return f"better: {self.choice.ratio:.2f} times the old error on held-out runs; {what}"
+        return f"no better than the old model: {'; '.join(self.reasons)}"
 
     def to_mapping(self) -> dict[str, Any]:
         """Return all figures as plain mappings, lists and numbers, for JSON."""
@@ -138,15 +136,15 @@ def refine_files(
     overwrite: bool = False,
     progress: OnProgress = ignore_progress,
 ) -> Refinement:
-    """Refine a model from recordings, and write it where it is better than it was.
+    """Refine a model from recordings, and write it if it is better.
 
     Args:
         model: Model file.
-        paths: Recordings of runs, compensated by this model, another or none, learned or not.
+        paths: Recordings of runs, compensated or not.
         output: Model file to write; None for none.
-        validate: Recordings to judge by; where there are none, those of ``paths`` in turn.
+        validate: Recordings to evaluate on; if there are none, those of ``paths`` in turn.
         overwrite: Whether a model file of that name may be replaced.
-        progress: Called with what is being done.
+        progress: Progress callback.
 
     Raises:
         InputError: A file can't be used; nothing is written.
@@ -169,17 +167,17 @@ def refine_runs(
     source: str = "",
     progress: OnProgress = ignore_progress,
 ) -> Refinement:
-    """Refine a model from runs, and judge it on runs that it was not refined on.
+    """Refine a model from runs, and evaluate it on held-out runs.
 
     Args:
         old: The model.
-        runs: What it is refined on.
-        validate: What it is judged on; ``runs`` in turn where there is none.
+        runs: Runs to refine it on.
+        validate: Runs to evaluate it on; if there are none, ``runs`` in turn.
         source: Name of the model, for the provenance.
-        progress: Called with what is being done.
+        progress: Progress callback.
 
     Raises:
-        InputError: These are no runs of an actuator, or too few, or nothing found has an inverse.
+        InputError: The runs are implausible or too few, or no refined model has an inverse.
     """
     if reasons := tuple(data_reasons([*runs, *validate])):
         raise InputError("\n".join(reasons))
@@ -194,10 +192,10 @@ def _reasons(choice: SelectedRegularisation) -> list[str]:
     if choice.better:
         return []
     if choice.ratio <= WORTH:
-        return [f"'{label}', which was not fitted, would become worse" for label in choice.worse]
+        return [f"held-out run '{label}' would become worse" for label in choice.worse]
     return [
-        f"runs that were not fitted would have {choice.ratio:.2f} times the old error: what is "
-        "left of it is noise, or drifts, or is beyond what such a model can say"
+        f"held-out runs would have {choice.ratio:.2f} times the old error: the rest is noise or "
+        "drift, or beyond this kind of model"
     ]
 
 
@@ -221,7 +219,7 @@ def _provenance(
 
 
 def _wider(old: IdentifiedRange | None, new: IdentifiedRange) -> IdentifiedRange:
-    """Return a range that has both: where runs say nothing, the old model still holds."""
+    """Return the union of both ranges: beyond the runs, the old model still holds."""
     if old is None:
         return new
     moves, turns = (old.peak_to_peak_um, new.peak_to_peak_um), (old.frequency_hz, new.frequency_hz)

@@ -1,4 +1,4 @@
-"""How firmly the old model is held to: what does best on runs that it was not refined on."""
+"""Selection of the regularisation towards the old model, by held-out runs."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -7,29 +7,28 @@ import numpy as np
 
 from hilctl.base.errors import DataError
 from hilctl.base.types import F64, CommandUnit
-from hilctl.identify.cross_validation import HeldOut, folds_of
 from hilctl.identify.data.records import History
 from hilctl.identify.evaluation import judgement_of
-from hilctl.identify.fit_api import OnProgress
-from hilctl.identify.fit_data import FitData
+from hilctl.identify.fit_api import FitData, OnProgress
+from hilctl.identify.model_selection import HeldOut, folds_of
 from hilctl.identify.refine.residual_fit import NormalEquations, ResidualFit
 from hilctl.models.base import HysteresisModel
 from hilctl.models.refined import RefinedModel
 
 STRENGTHS = (0.003, 0.01, 0.02, 0.03, 0.05, 0.1, 0.3, 1.0)
 ANCHORS = (100.0, 10.0, 3.0)
-"""Times the least weight of the old model on motions that runs may say nothing of."""
-AS_GOOD = 1.02  # times the least error on runs held out
-WORTH = 0.9  # of the old error: less gain is not worth what runs do not show
-STRETCHES = 10  # of a run, each of them judged by itself
-MOST = 1.12  # times the old error of any one: shorter than a run, they are known less well
-FOREGONE = 0.5  # of what could be gained: no more is left for the sake of such a stretch
-LOSS = 0.5  # of what is gained in the mean: more must not be lost on any one run
+"""Weights of the old model on motions of its whole range, of the least weight."""
+AS_GOOD = 1.02  # of the least error on held-out runs
+WORTH = 0.9  # maximum error, of the old one: a smaller gain is not worth the risk
+STRETCHES = 10  # parts of a run that are evaluated separately
+MOST = 1.12  # maximum error of a part, of the old one
+FOREGONE = 0.5  # part of the possible gain that even errors may cost
+LOSS = 0.5  # maximum loss on one run, of the mean gain
 
 
 @dataclass(frozen=True, slots=True)
 class RegularisationSplit:
-    """What is fitted, and what is judged, by their numbers among all runs."""
+    """Fitted and evaluated runs, by their numbers."""
 
     fitted: tuple[int, ...]
     judged: tuple[int, ...]
@@ -37,14 +36,14 @@ class RegularisationSplit:
 
 @dataclass(frozen=True, slots=True)
 class SelectedRegularisation:
-    """A way to refine, and what it did on runs held out.
+    """A regularisation, and its errors on held-out runs.
 
     Attributes:
-        strength: How firmly the old model is held to.
-        anchor: Times the least weight that it has on motions of its whole range.
-        own: Whether runs have constants, creep and drift of their own.
-        before: Errors of the old model on what was held out.
-        after: Errors of the refined ones, each fitted without the run that it is judged on.
+        strength: Weight of the old model.
+        anchor: Weight of the old model on motions of its whole range, of the least.
+        own: Whether each run has an offset, creep and drift.
+        before: Errors of the old model on held-out runs.
+        after: Errors of the refined models, each on runs that it was not fitted to.
     """
 
     strength: float
@@ -55,10 +54,9 @@ class SelectedRegularisation:
 
     @property
     def worse(self) -> tuple[str, ...]:
-        """Labels of runs held out that lose more than their part of what all gain.
+        """Labels of held-out runs that lose more than a part of the mean gain.
 
-        The last run of its kind is judged by a model that has seen none, the model that is written
-        has seen all.
+        A small loss is allowed, since the final model is fitted to all runs.
         """
         most = 1.0 + LOSS * max(1.0 - self.ratio, 0.0)
         pairs = zip(self.after.judgement.errors, self.before.judgement.errors, strict=True)
@@ -66,9 +64,9 @@ class SelectedRegularisation:
 
     @property
     def even(self) -> bool:
-        """Whether no stretch of a run is worse by more than such a short one tells.
+        """Whether no part of a run is much worse.
 
-        Small motions are stretches of larger runs: what they lose does not show in all of it.
+        Small motions are parts of larger runs, whose total error does not show their loss.
         """
         worst = 1.0
         sides = zip(
@@ -87,7 +85,7 @@ class SelectedRegularisation:
 
     @property
     def ratio(self) -> float:
-        """Error after over error before: root mean square over runs, each of its own motion."""
+        """Error after over error before: root mean square of the relative errors of the runs."""
         after, before = (
             np.mean([error.rms_percent**2 for error in held.judgement.errors])
             for held in (self.after, self.before)
@@ -96,11 +94,11 @@ class SelectedRegularisation:
 
     @property
     def better(self) -> bool:
-        """Whether it is better than the old model, and on no run worse."""
+        """Whether it is better than the old model, and worse on no run."""
         return self.ratio <= WORTH and not self.worse
 
     def as_good(self, other: "SelectedRegularisation") -> bool:
-        """Return whether it is as good as another way, or next to."""
+        """Return whether it is about as good as another one."""
         fair = self.better >= other.better and self.even >= other.even
         return fair and self.ratio <= AS_GOOD * other.ratio
 
@@ -108,13 +106,13 @@ class SelectedRegularisation:
 def parts_of(
     runs: Sequence[History], validate: Sequence[History]
 ) -> tuple[tuple[History, ...], tuple[RegularisationSplit, ...]]:
-    """Return what is fitted or judged, and which in turn.
+    """Return the parts that are fitted or evaluated, and their splits.
 
-    Of several runs each is held out once; of one, its last part; where there are others to validate
-    with, these.
+    Of several runs each is held out once; of one, its last part. Runs to validate are held out
+    instead, if there are any.
 
     Raises:
-        DataError: There is too little.
+        DataError: There are too few data.
     """
     every = tuple(range(len(runs)))
     if validate:
@@ -126,9 +124,7 @@ def parts_of(
         )
     folds = folds_of(runs)
     if not folds:
-        raise DataError(
-            f"{runs[0].label}: too little of it can be held out to judge by: give more recordings"
-        )
+        raise DataError(f"{runs[0].label}: too short to hold out a part: add more recordings")
     head, tail = folds[0].fitted[0], folds[0].held_out[0]
     assert isinstance(head, History)
     assert isinstance(tail, History)
@@ -136,12 +132,12 @@ def parts_of(
 
 
 class Regularisation:
-    """Tries ways to refine on runs held out.
+    """Refinements of a model with any regularisation.
 
     Args:
         model: The old model.
-        parts: What is fitted or judged.
-        splits: Which in turn.
+        parts: Records that are fitted or evaluated.
+        splits: Splits of the records.
         unit: Unit of the command.
     """
 
@@ -153,7 +149,7 @@ class Regularisation:
         unit: CommandUnit,
     ) -> None:
         self._parts, self._splits, self._unit = parts, splits, unit
-        # All that is not only there to be judged; of one run that is cut in two, its end too.
+        # All fitted parts; also the end of a single run that is cut in two.
         fitted = {i for split in splits for i in split.fitted}
         cut = parts[-1].label == parts[0].label
         self._whole = tuple(range(len(parts))) if cut else tuple(sorted(fitted))
@@ -164,17 +160,17 @@ class Regularisation:
         self._before = {own: self._held_out(old, own=own) for own in (False, True)}
 
     def best(self, progress: OnProgress) -> tuple[SelectedRegularisation, RefinedModel]:
-        """Return the way that does best, and the model that it makes of all runs.
+        """Return the best regularisation, and its model of all runs.
 
-        Where none is better than the old model on what was held out, it is the best all the same.
+        The best one may be worse than the old model.
         """
         found: list[tuple[SelectedRegularisation, RefinedModel, float]] = []
         ways = [(strength, own) for own in (False, True) for strength in STRENGTHS]
         for i, (strength, own) in enumerate(ways):
             progress(i / len(ways), f"strength {strength:g}")
             found.append(self._tried(strength, 1.0, own=own))
-        # Small loops stand where hysteresis has left them, so a constant of a run's own would take
-        # what is to be learned; it is one only where runs held out do better for it as they are.
+        # An offset per run may hide hysteresis, so it is used only if it lowers the total error of
+        # held-out runs.
         own = min(found, key=lambda each: each[2])[0].own
         left = [(choice, whole) for choice, whole, _ in found if choice.own == own]
         best = min(left, key=lambda way: (not way[0].better, way[0].ratio))
@@ -182,8 +178,7 @@ class Regularisation:
         even = [way for way in left if way[0].even and way[0].better]
         even = [way for way in even if 1.0 - way[0].ratio >= least_gain]
         best = min(even, key=lambda way: way[0].ratio, default=best)
-        # Runs say nothing of what is faster or larger than they are: where holding to the old model
-        # there costs them next to nothing, it is held to.
+        # Beyond the motions of the runs the old model is kept, if that costs almost nothing.
         if not best[0].better:
             return best
         held = [self._tried(best[0].strength, anchor, own=own)[:2] for anchor in ANCHORS]
@@ -194,7 +189,7 @@ class Regularisation:
     def _tried(
         self, strength: float, anchor: float, *, own: bool
     ) -> tuple[SelectedRegularisation, RefinedModel, float]:
-        """Return a way to refine, what it makes of all runs, and its error on those held out."""
+        """Return a regularisation, its model of all runs, and its error on held-out runs."""
         models = {s: self._refined(s.fitted, strength, anchor, own=own) for s in self._splits}
         after = self._held_out(models)
         bare = self._held_out(models, own=True) if own else after
@@ -212,7 +207,7 @@ class Regularisation:
 
     def _solved(self, sums: NormalEquations, strength: float) -> F64:
         firm = self._remainder.firm(strength, sums)
-        # What is held small is what is new: the anchor says what has been.
+        # The penalty is on the residual operator; the anchor contains the old one.
         return np.asarray(np.linalg.solve(sums.normal + firm, sums.right), dtype=np.float64)
 
     def _held_out(
@@ -223,9 +218,9 @@ class Regularisation:
         modelled = [self._remainder.modelled_um(model, i) for i, model in judged]
         bare = [m[record.ignore :] for m, record in zip(modelled, records, strict=True)]
         data, responses_um = FitData(records, self._unit), np.concatenate(bare)
-        how = f"{len(records)} recordings, none of them fitted where it is judged"
+        how = f"{len(records)} recordings, each held out of one fit"
         if own:
             mine = np.linalg.lstsq(data.creep, data.target_um - responses_um, rcond=None)[0]
             responses_um = responses_um + data.creep @ mine
-            how += ", each less a constant and creep of its own"
+            how += ", without an offset and creep per recording"
         return HeldOut(judgement_of(data, responses_um), records, how)

@@ -1,8 +1,7 @@
-"""Fit what a model leaves of the displacement: a transport delay first, then an operator.
+"""Fit of the residual of a model: a transport delay first, then a residual operator.
 
-No residual operator can represent a delay: one that moves a displacement far in time has no
-inverse, and one of its rate alone is a poor delay. So a delay that the runs show goes into the
-model's own transport delay first. The rest is one linear problem in the operator's numbers.
+A residual operator can't represent a delay, so that of the runs becomes part of the model's own
+transport delay first. The rest is a linear problem.
 """
 
 import math
@@ -21,26 +20,17 @@ from hilctl.models.refined import LEAST_SLOPE, RefinedModel, ResidualOperator, r
 from hilctl.models.staged import AnyHysteresis, StagedModel
 
 ROUNDS = 3
-NEAR = 0.02  # of the window: what is less is no delay
+NEAR = 0.02  # of the window: minimum change of the delay
 DELAY_ROWS = 4000
-DELAY_LENGTHS = (
-    0.02,
-    0.06,
-    0.2,
-    0.6,
-)  # of the span, of drags that stand for an error of the loops' width
-MOST = 0.25  # of a cycle of the fastest sine: a delay beyond it is none
+DELAY_LENGTHS = (0.02, 0.06, 0.2, 0.6)  # of the span: drags that take errors of the loop width
+MOST = 0.25  # of a cycle of the fastest sine: maximum delay
 
 
 def delayed_model(model: HysteresisModel, runs: Sequence[History]) -> HysteresisModel:
-    """Return a model whose transport delay is as the runs have it; itself where it can have none.
+    """Return the model with the transport delay of the runs; unchanged if it can't have one.
 
-    Errors of the width of loops look like a delay at one frequency; drags beside it take them, and
-    a gain and a constant of all runs.
-
-    Args:
-        model: The model.
-        runs: Commands and displacements.
+    At one frequency, errors of the loop width look like a delay. So drags, a gain and an offset
+    are fitted beside it.
     """
     staged = _staged(model)
     if staged is None:
@@ -56,9 +46,9 @@ def delayed_model(model: HysteresisModel, runs: Sequence[History]) -> Hysteresis
 
 
 def fastest_um_per_s(xs: Sequence[F64], runs: Sequence[History]) -> float:
-    """Return the largest speed of displacements, float64[n] each; single steps don't count."""
+    """Return the largest speed of displacements, float64[n] each, without single steps."""
     return max(
-        # Of a run that rests most of the time all but steps is still.
+        # A run may rest most of the time, so that the quantile is 0.
         max(float(np.quantile(step_um, 0.999)), 0.01 * float(step_um.max())) * run.sample_rate_hz
         for step_um, run in zip((np.abs(np.diff(x)) for x in xs), runs, strict=True)
     )
@@ -67,7 +57,7 @@ def fastest_um_per_s(xs: Sequence[F64], runs: Sequence[History]) -> float:
 def _staged(model: HysteresisModel) -> StagedModel | None:
     if isinstance(model, StagedModel):
         return model
-    # A staged model's outputs come a sample after its commands, and so do those of every loop.
+    # The output of a staged model is one sample late, as in every loop.
     return (
         StagedModel.around(model)
         if isinstance(model, get_args(get_args(AnyHysteresis)[0]))
@@ -76,7 +66,7 @@ def _staged(model: HysteresisModel) -> StagedModel | None:
 
 
 def _late_s(model: StagedModel, runs: Sequence[History]) -> tuple[float, float, float]:
-    """Return how much later than the model the runs are, the window of a rate, and a frequency."""
+    """Return the delay of the runs to the model, the window of a rate, and the top frequency."""
     rest = rest_um(model)
     xs = [model.forward(run.sample_rate_hz).process(run.command) - rest for run in runs]
     low, high = min(float(x.min()) for x in xs), max(float(x.max()) for x in xs)
@@ -116,21 +106,21 @@ PLAYS, DRAGS, CELLS = 8, 5, 12
 LENGTHS = (0.03, 0.6)  # of the span: shortest and longest drag
 SPREAD = 1.6  # exponent: thresholds are closer together near 0
 WINDOW = 0.05  # of a cycle of the fastest sine: over which a change is its rate
-ROWS = 6000  # samples of a run that are looked at
+ROWS = 6000  # samples of a run that are used
 SEED = 1
 DRAGGED, FREE, SMOOTH, BENT = 0.3, 0.1, 3.0, 1.0
-"""How firm: drags, the constant, differences of plays and of drags beside each other."""
-SMALL = 0.05  # of the span, by which errors of runs that move little are no heavier than that
-ANCHOR = 0.005  # weight of each run's worth of the old model on motions of its whole range
+"""Penalties of drags, the constant, and differences of neighbouring plays and drags."""
+SMALL = 0.05  # of the span: limits the weight of runs with small motions
+ANCHOR = 0.005  # weight of the old model on motions of its whole range, per run
 CREEP_S = 0.1
-GOLDEN = 1.618  # ratio of frequencies that never meet again
-ROOM = 1.1  # times the least slope that a model may have
-OWN = 1e-4  # ridge of what a run may have of its own, of its weight
+GOLDEN = 1.618  # ratio of incommensurable frequencies
+ROOM = 1.1  # of the least slope that a model may have
+OWN = 1e-4  # ridge of offset, creep and drift per run
 
 
 @dataclass(frozen=True, slots=True)
 class NormalEquations:
-    """Sums that a least-squares problem is made of.
+    """Normal equations of a least-squares problem.
 
     Attributes:
         normal: float64[m, m], of products of columns.
@@ -144,30 +134,27 @@ class NormalEquations:
         return NormalEquations(self.normal + other.normal, self.right + other.right)
 
     def scaled(self, factor: float) -> "NormalEquations":
-        """Return them with as many times their weight."""
+        """Return the equations with another weight."""
         return NormalEquations(factor * self.normal, factor * self.right)
-
-    def __sub__(self, other: "NormalEquations") -> "NormalEquations":
-        return NormalEquations(self.normal - other.normal, self.right - other.right)
 
 
 class ResidualFit:
-    """The remainders of all runs, and the operator that is to give them.
+    """Linear fit of a residual operator to the residuals of all runs.
 
     Attributes:
-        base: What stays as it is: the model, or that which has been refined before.
-        x_um: For each run, float64[n], what the base gives, less that at rest.
+        base: The model before any refinement.
+        x_um: For each run, float64[n], displacement of the base relative to rest.
     """
 
     def __init__(
         self, model: HysteresisModel, runs: Sequence[History], fitted: Sequence[History]
     ) -> None:
-        """Run the base on what was put out, and lay the operator's cells over what comes of it.
+        """Simulate the base, and place the cells of the operator over its range.
 
         Args:
             model: The old model.
-            runs: All that is fitted or judged.
-            fitted: Those of them that a delay is taken from.
+            runs: Runs that are fitted or evaluated.
+            fitted: Runs that determine the delay.
         """
         self._old = model
         bare: HysteresisModel = model.base if isinstance(model, RefinedModel) else model
@@ -180,33 +167,32 @@ class ResidualFit:
         high = max(high - self._rest_um, *(float(x.max()) for x in self.x_um), 0.0)
         self._low, self._span = low, high - low
         self.fastest_um_per_s = fastest_um_per_s(self.x_um, self._runs)
-        if isinstance(model, RefinedModel):  # what is held to at its speeds must be known there
+        if isinstance(model, RefinedModel):  # the anchor needs its range of speeds
             self.fastest_um_per_s = max(self.fastest_um_per_s, model.residual.fastest_um_per_s)
         self._window_s = WINDOW * math.pi * self._span / self.fastest_um_per_s
         self._grid = self._operator(np.zeros(self.size - 1))
 
     @property
     def size(self) -> int:
-        """Numbers that are looked for; the last is a constant displacement."""
+        """Number of unknowns; the last is a constant displacement."""
         return PLAYS * CELLS + (2 * DRAGS + 1) * (CELLS + 1) + 1
 
     def moments(self, *, own: bool) -> list[NormalEquations]:
-        """Return the sums of each run.
+        """Return the normal equations of each run.
 
         Args:
-            own: Whether each run may have a constant, creep and drift of its own; they are taken
-                out, so that they are not learned as hysteresis.
+            own: Whether to eliminate an offset, creep and drift per run, so that they are not
+                fitted as hysteresis.
         """
         return [self._of(x, run, own=own) for x, run in zip(self.x_um, self._runs, strict=True)]
 
     def anchor(self) -> NormalEquations:
-        """Return the sums by which the old model is held to where runs say nothing.
+        """Return the normal equations of the old model on motions of its whole range.
 
-        Small motions must not spoil large ones: on motions of the model's whole range, slow and
-        fast, it is to stay what it was, but for what runs say with more weight.
+        They keep the old model for motions that the runs do not have.
         """
         total = NormalEquations(np.zeros((self.size, self.size)), np.zeros(self.size))
-        rate_hz = 1.0 / self._window_s  # one window is one sample here: rates are those of runs
+        rate_hz = 1.0 / self._window_s  # one sample per window, so that rates are those of runs
         for x in self._motions():
             rows = np.unique(np.linspace(0, x.size - 1, ROWS).astype(np.int64))
             columns, was = self._columns(x, rows, rate_hz), self._was(x, rate_hz)[rows]
@@ -214,7 +200,7 @@ class ResidualFit:
         return total.scaled(ANCHOR * len(self._runs))
 
     def _motions(self) -> Iterator[F64]:
-        """Give motions of the whole range: growing sines, slow and fast, and small in large."""
+        """Yield motions of the whole range: growing sines, slow and fast, and small in large."""
         half, middle = 0.5 * self._span, self._low + 0.5 * self._span
         for speed in (0.05, 0.9):
             points = round(2.0 * math.pi * half / (speed * self.fastest_um_per_s * self._window_s))
@@ -227,7 +213,7 @@ class ResidualFit:
         yield np.minimum(turns, 1.0) * (middle + half * mixed / np.max(np.abs(mixed)))
 
     def firm(self, strength: float, moments: NormalEquations) -> F64:
-        """Return what holds all numbers small and neighbours alike: float64[m, m]."""
+        """Return the penalty on unknowns and differences of neighbours: float64[m, m]."""
         plays = PLAYS * CELLS
         longest = math.sqrt(float(moments.normal.diagonal()[:plays].max()))
         # A slope of 1 over all cells is as much as a span of displacement.
@@ -245,7 +231,7 @@ class ResidualFit:
         return firm
 
     def model(self, numbers: F64) -> RefinedModel:
-        """Return the model with these numbers, all of them less where it would have no inverse."""
+        """Return the refined model, with a weaker operator if it would have no inverse."""
         ranges = {name: getattr(self._old, name) for name in _RANGES}
         ranges |= {"provenance": self._old.provenance}
         base = self.base.model_copy(update=ranges)
@@ -254,7 +240,7 @@ class ResidualFit:
         return RefinedModel.of(base, self._operator(part * numbers[:-1]), float(numbers[-1]))
 
     def modelled_um(self, model: HysteresisModel, number: int) -> F64:
-        """Return the displacement of a run by the old model or one with other numbers."""
+        """Return the displacement of a run by the old or a refined model."""
         run, x = self._runs[number], self.x_um[number]
         if not isinstance(model, RefinedModel):
             return self._base_um(model, run) + rest_um(model)
@@ -270,7 +256,7 @@ class ResidualFit:
         return operator.process(x + self._rest_um) + model.output_offset_um
 
     def _was(self, x: F64, rate_hz: float) -> F64:
-        """Return the remainder as the old model has it: float64[n]."""
+        """Return the output of the old residual operator: float64[n]."""
         if not isinstance(self._old, RefinedModel):
             return np.zeros(x.size)
         return self._through(self._old, x, rate_hz) - self._rest_um - x
@@ -325,7 +311,7 @@ def _sums(columns: F64, target: F64, weight: float) -> NormalEquations:
 
 
 def _without(columns: F64, target: F64, weight: float, mine: F64) -> NormalEquations:
-    """Return the sums of what is left when a run has taken out what it may have of its own."""
+    """Return the normal equations after elimination of the columns ``mine``."""
     whole = _sums(np.column_stack([columns, mine]), target, weight)
     kept = columns.shape[1]
     inner = whole.normal[kept:, kept:].copy()
@@ -339,14 +325,14 @@ def _without(columns: F64, target: F64, weight: float, mine: F64) -> NormalEquat
 
 
 def _rows(run: History) -> I64:
-    """Return samples that are looked at, one of each of many stretches: int64[N]."""
+    """Return random samples, one per interval: int64[N]."""
     judged = run.command.size - run.ignore
     edges = np.linspace(run.ignore, run.command.size, min(ROWS, judged) + 1).astype(np.int64)
     return np.asarray(np.random.default_rng(SEED).integers(edges[:-1], edges[1:]), dtype=np.int64)
 
 
 def _alike() -> F64:
-    """Return what takes differences of the plays' slopes beside each other: float64[k, p c]."""
+    """Return the differences of neighbouring slopes of the plays: float64[k, p c]."""
     number = np.arange(PLAYS * CELLS).reshape(PLAYS, CELLS)
     pairs = ((number[:, :-1], number[:, 1:], 1.0), (number[1:-1], number[2:], 0.5))
     return np.vstack([weight * differences(a, b, number.size) for a, b, weight in pairs])

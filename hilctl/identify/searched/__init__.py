@@ -1,1 +1,1 @@
-"""Fits whose thresholds are searched from several starts."""
+"""Fits of play models whose thresholds are searched."""

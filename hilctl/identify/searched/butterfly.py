@@ -1,8 +1,8 @@
-"""Identify a butterfly: plays and an even function, from loops that may run over both wings.
+"""Fit of a butterfly model (plays and an even function) to loops over one or both wings.
 
-On a wing, S^-1(y) = |Pi[v] + bias|. For given thresholds both sides are linear in what is looked
-for, the slopes of S^-1 and the weights of the plays, so that a bounded least squares finds them;
-around it stands a search over the thresholds' spacing and their growth with the rate.
+On a wing, S^-1(y) = |Pi[v] + bias|. For given thresholds both sides are linear in the slopes of
+S^-1 and the weights of the plays, which follow from bounded least squares. Spacing and growth of
+the thresholds are searched.
 """
 
 import numpy as np
@@ -16,8 +16,8 @@ from hilctl.identify.least_squares import first_least
 from hilctl.models.integrated import ButterflyModel, DeadbandFunction
 
 _CORNERS = 16  # slopes of the even function
-_NEAR = 0.1  # of the stroke: so near to the turning point a loop may change from wing to wing
-_DEEP = 0.01  # of the stroke: what goes up and down by less is noise
+_NEAR = 0.1  # of the stroke: distance to the turning point for a change of wing
+_DEEP = 0.01  # of the stroke: smaller minima are noise
 _STEEPEST = 30.0  # slopes of S^-1, relative to the mean one
 _LEAST = 0.1
 _NONE = 1e-12  # least squares take no bounds that are equal
@@ -26,10 +26,10 @@ _ROUNDS = 4
 
 
 def fit_butterfly(job: FitJob) -> FoundModel:
-    """Identify a butterfly model; the command is all of the current, bias current included.
+    """Fit a butterfly model; the command includes the bias current.
 
     Raises:
-        DataError: A record is not a steady loop, or lies below the turning point altogether.
+        DataError: A record is not a steady loop, or all displacements are below the turning point.
     """
     problem = _Problem(job)
     data = job.data
@@ -59,13 +59,13 @@ def _bounded(place: F64, limit: float, slowest: float) -> tuple[float, float]:
 
 
 class _Problem:
-    """The linear part: columns, sides of the wings, and their bounded least squares."""
+    """The linear problem: columns, sides of the wings, and bounded least squares."""
 
     def __init__(self, job: FitJob) -> None:
         self.data, settings = job.data, job.settings
         loops = self.data.loops
         if len(loops) < len(self.data.records):
-            raise DataError("a butterfly is found from steady loops: leave out --whole")
+            raise DataError("a butterfly model needs steady loops: omit --whole")
         target_um, turning_um = self.data.target_um, settings.turning_um
         self.turning_um = float(target_um.min()) if turning_um is None else turning_um
         above_um = target_um - self.turning_um
@@ -82,7 +82,7 @@ class _Problem:
     def solve(self, spacing: float, growth_s: float) -> tuple[F64, float]:
         """Return bias, weights a_0 to a_n and slopes of S^-1, and the rms error in um.
 
-        The rows are weighted by the slope of S, so that what is small is the displacement's error.
+        Rows are weighted by the slope of S, so that errors of the displacement are minimised.
         """
         columns = self.data.columns(spacing * self.plays, growth_s)
         n, k = columns.shape[1], self.inner.shape[1]
@@ -135,7 +135,7 @@ def _sides(loop: SteadyLoop, turning_um: float) -> F64:
     """Return the wing of each point of a loop, 1.0 or -1.0: float64[M].
 
     A loop changes wings at its lowest points, near the turning point. Between two of these, the
-    wing is that of most of the command.
+    sign of the mean command gives the wing.
     """
     from scipy.signal import find_peaks  # it imports scipy.stats, which is slow: not for others
 
@@ -147,7 +147,7 @@ def _sides(loop: SteadyLoop, turning_um: float) -> F64:
     side = np.empty(command.size)
     for a, b in zip([0, *cuts], [*cuts, command.size], strict=True):
         side[a:b] = 1.0 if command[a:b].sum() >= 0.0 else -1.0
-    if len(cuts) > 1:  # the last stretch goes on in the first
+    if len(cuts) > 1:  # the last interval continues in the first
         both = command[: cuts[0]].sum() + command[cuts[-1] :].sum()
         side[: cuts[0]] = side[cuts[-1] :] = 1.0 if both >= 0.0 else -1.0
     return np.roll(side, start)

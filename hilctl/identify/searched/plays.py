@@ -1,4 +1,4 @@
-"""PPI and RDPI: thresholds are searched, weights follow from them."""
+"""Search problems of play models: PPI, RDPI, and the integrated model."""
 
 from typing import Any
 
@@ -6,11 +6,12 @@ import numpy as np
 from scipy.linalg import qr
 
 from hilctl.base.types import F64
-from hilctl.identify.fit_api import LEAST_SLOPE, FitJob, FoundModel
-from hilctl.identify.fit_data import FitData
+from hilctl.identify.fit_api import LEAST_SLOPE, FitData, FitJob, FoundModel
 from hilctl.identify.least_squares import bounded_and_free
 from hilctl.identify.searched.search import SearchSpace, searched_fit
 from hilctl.identify.settings import FitSettings
+from hilctl.kernels.hysteresis import deadband_block
+from hilctl.models.integrated import IntegratedModel, exponential_integrated, exponential_weights
 from hilctl.models.plays import PlayModel, PpiModel, RdpiModel, SpiModel
 
 SMOOTHNESS = 1e-4  # weight of a density's slope, see _held
@@ -18,27 +19,25 @@ RIDGE = 1e-4  # weight of the weights themselves
 
 
 def spacing_limit(data: FitData, settings: FitSettings) -> float:
-    """Return the largest threshold spacing at which every play still moves in a full cycle.
+    """Return the largest threshold spacing at which every play moves in a full cycle.
 
-    A play whose threshold comes near half the peak-to-peak command moves in the first cycle and
-    then rests: its weight would only describe how the data drifts.
+    A play with a larger threshold moves in the first cycle only.
     """
     shift = 0.5 if settings.layout == "even" else 0.0
     return data.reach / (settings.plays + shift)
 
 
 def numbered(settings: FitSettings) -> F64:
-    """Return what the spacing is multiplied with to give r_1 to r_n: float64[n]."""
+    """Return r_1 to r_n over the spacing: float64[n]."""
     shift = 0.0 if settings.layout == "even" else 0.5
     return np.arange(1, settings.plays + 1, dtype=np.float64) - shift
 
 
 def _held(data: FitData, plays: int) -> F64:
-    """Return what holds free weights, float64[m, n + 1], relative to the command itself.
+    """Return the rows of the smoothness prior of free weights: float64[m, n + 1].
 
-    Weights are a density times the spacing, so the mean square slope of one density is n^3 times
-    the differences' squares: however many plays, it counts alike. The first play stands for all
-    that are narrower as well, the last for all that are wider: neither is of the density.
+    The factor n^1.5 makes it independent of the number of plays. The first play also represents
+    all narrower ones and the last all wider ones, so neither is compared with its neighbour.
     """
     longest = float(np.linalg.norm(data.columns(np.empty(0))))
     between = SMOOTHNESS * plays**1.5 * np.diff(np.eye(plays), axis=0)[1:-1]
@@ -49,22 +48,19 @@ def _held(data: FitData, plays: int) -> F64:
 class PlaysProblem:
     """Fit a PPI (3.25-3.27) or an RDPI (5.11, 5.14).
 
-    The sum of squares is linear in the weights, so for each set of thresholds they are worked out
-    rather than searched (variable projection). With free weights they are a_0 and a_1 to a_n;
-    with exponential ones, a_0 and the factor of e^(-beta i).
+    For each set of thresholds the weights follow from linear least squares (variable projection):
+    free weights a_0 to a_n, or a_0 and the factor of e^(-beta i).
 
-    Loops leave the free weights of neighbouring thresholds all but open: least squares alone would
-    make spikes of them, of which an inverse asks more current than the loops had. So rows after
-    those of the samples hold differences of neighbours small and, far less, the weights themselves,
-    which leaves one solution.
+    Loops leave free weights of neighbouring thresholds nearly undetermined. Rows of a prior on
+    differences of neighbours, and a small one on the weights, avoid spikes, for which an inverse
+    would need more current than the loops had.
 
-    Searched, in this order: the spacing, relative to the largest that makes sense; for an RDPI,
-    the largest growth of the thresholds relative to half the peak-to-peak command; for
-    exponential weights, beta n.
+    Search variables: the spacing, relative to the largest one; for an RDPI, the largest growth of
+    the thresholds relative to half the peak-to-peak command; for exponential weights, beta n.
 
     Args:
         data: The data.
-        settings: The choices.
+        settings: The settings.
     """
 
     def __init__(self, data: FitData, settings: FitSettings) -> None:
@@ -89,33 +85,33 @@ class PlaysProblem:
 
     @property
     def space(self) -> SearchSpace:
-        """What is searched."""
+        """The search variables."""
         return self._space
 
     @property
     def searched(self) -> tuple[str, ...]:
-        """Names of what is searched, in the order of the space."""
+        """Names of the search variables, in the order of the space."""
         names = ("alpha", "gamma") if self._rate_dependent else ("sigma",)
         beta = "beta_0" if self._rate_dependent else "beta"
         return (*names, beta) if self._exponential else names
 
     @property
     def held(self) -> int:
-        """Rows after those of the samples."""
+        """Number of rows of the prior."""
         return len(self._held)
 
     def error_um(self, x: F64, scale: F64) -> F64:
-        """Return modelled minus measured displacement, see :class:`search.Problem`."""
+        """Return modelled minus measured displacement, see :class:`SearchProblem`."""
         columns = self._columns(x)
         weights, free = self._solve(columns, scale)
         beside = self._free @ free
         return np.asarray(columns @ weights + (beside - self._target), dtype=np.float64)
 
     def slopes_um(self, x: F64, scale: F64) -> F64:
-        """Return the derivatives of the error, but for what the weights make up for themselves.
+        """Return the derivatives of the error with compensation by the weights.
 
-        That is Kaufman's form of variable projection: the gradient is exact. Weights that a bound
-        holds do not move.
+        Kaufman's form of variable projection, whose gradient is exact. Weights at a bound are
+        fixed.
         """
         columns = self._columns(x)
         found, _ = self._solve(columns, scale)
@@ -202,5 +198,169 @@ class PlaysProblem:
 
 
 def fit_plays(job: FitJob) -> FoundModel:
-    """Fit a PPI or an RDPI; its weights follow from its thresholds."""
+    """Fit a PPI, SPI or RDPI."""
     return searched_fit(PlaysProblem(job.data, job.settings), job)
+
+
+SEARCHED = (
+    "alpha", "gamma", "a_0", "alpha_0", "beta_0", "alpha_1", "beta_1", "d_p", "alpha_2", "beta_2",
+    "d_n", "output_offset_um",
+)  # fmt: skip
+STEEPEST = 5.0  # largest slope of the deadband function, relative to that around 0
+
+
+class ExponentialProblem:
+    """Fit the published parametrisation (6.19-6.23).
+
+    The scale between plays and deadbands is redundant: c a_i and g_j / c, with thresholds c d_j,
+    give the same model. So g_0 is 1, and eleven of the published twelve parameters remain.
+
+    Search variables: the spacing alpha, relative to the largest one; gamma times the highest rate,
+    relative to half the peak-to-peak command; a_0 and alpha_0 over the mean slope of the data;
+    beta_0 n; the loss of slope over all deadbands above 0, below 1 so that cumulative slopes stay
+    > 0; beta_1 k; d_p (k + 1) over half the stroke; the same three below 0, where the slope gains;
+    and the constant displacement, if fitted, over half the stroke.
+
+    Args:
+        data: The data.
+        settings: The settings.
+    """
+
+    def __init__(self, data: FitData, settings: FitSettings) -> None:
+        self._data = data
+        self._settings = settings
+        self._half_stroke = 0.5 * data.stroke_um
+        self._limit = spacing_limit(data, settings)
+        self._slowest_s = data.reach / data.speed
+        self._numbers = numbered(settings)
+        self._steps = np.arange(1, settings.deadbands + 1, dtype=np.float64)
+
+    @property
+    def space(self) -> SearchSpace:
+        """The search variables."""
+        rows = [
+            (0.05, 1.0, 0.6),
+            (0.0, 1.0, 0.1),
+            (LEAST_SLOPE, 4.0, 0.5),
+            (0.0, 4.0, 1.2 / self._settings.plays),
+            (0.0, 40.0, 2.0),
+            (0.0, 1.0 - LEAST_SLOPE, 0.5),
+            (0.0, 40.0, 1.0),
+            (0.02, 4.0, 0.8),
+            (0.0, STEEPEST - 1.0, 0.3),
+            (0.0, 40.0, 1.0),
+            (0.02, 4.0, 0.8),
+            *([(-1.0, 1.0, 0.0)] if self._settings.offset else []),
+        ]
+        low, high, guess = np.array(rows).T
+        return SearchSpace(low.copy(), high.copy(), guess.copy())
+
+    @property
+    def searched(self) -> tuple[str, ...]:
+        """Names of the search variables, in the order of the space."""
+        return SEARCHED if self._settings.offset else SEARCHED[:-1]
+
+    @property
+    def held(self) -> int:
+        """No prior: exponential weights are smooth."""
+        return 0
+
+    def error_um(self, x: F64, scale: F64) -> F64:
+        """Return modelled minus measured displacement, see :class:`SearchProblem`."""
+        known, data = self.parameters(x, scale), self._data
+        thresholds = known["alpha"] * self._numbers
+        inner = data.play_sum(known["a_0"], thresholds, self._play_weights(x), known["gamma"])
+        (up, g_up), (down, g_down) = self._side(x[5:8], -1.0), self._side(x[8:11], 1.0)
+        out = np.empty_like(inner)
+        deadband_block(inner, 1.0, up, g_up, -down, g_down, out)
+        return out + (known.get("output_offset_um", 0.0) - data.target_um)
+
+    def slopes_um(self, x: F64, scale: F64) -> F64:
+        """Return the derivatives of the error: float64[N, p]."""
+        gain, weights = self._data.gain, self._play_weights(x)
+        alpha, gamma_s = float(x[0]) * self._limit, float(x[1]) * self._slowest_s
+        v, plays, by = self._data.plays(alpha, gamma_s, self._numbers, weights)
+        inner = float(x[2]) * gain * v + plays @ weights
+        i = np.arange(1, weights.size + 1)
+        fall = np.exp(-float(x[4]) / weights.size * i)
+        above, rate_up = self._side_slopes(inner, x[5:8], -1.0)
+        below, rate_down = self._side_slopes(-inner, x[8:11], 1.0)
+        before = np.column_stack([
+            by * (self._limit, self._slowest_s),
+            gain * v,
+            gain * (plays @ fall),
+            plays @ (-i * weights) / weights.size,
+        ])  # fmt: skip
+        # Below 0 the deadbands are those above it, mirrored in both input and output.
+        parts = [(1.0 + rate_up + rate_down)[:, None] * before, above, -below]
+        if self._settings.offset:
+            parts.append(np.full((v.size, 1), self._half_stroke))
+        return np.hstack(parts)
+
+    def _side_slopes(self, outwards: F64, x: F64, sign: float) -> tuple[F64, F64]:
+        """Return the derivatives by one side's three parameters, and the slope that it adds."""
+        thresholds, weights = self._side(x, sign)
+        shares = self._shares(x)
+        beyond = np.maximum(outwards[:, None] - thresholds, 0.0)
+        passed = beyond > 0.0
+        bent = shares * (float(shares @ self._steps) - self._steps) / self._steps.size
+        apart = self._half_stroke / (self._steps.size + 1)
+        by = (beyond @ (sign * shares), beyond @ (sign * float(x[0]) * bent),
+              passed @ (-weights * self._steps * apart))  # fmt: skip
+        return np.column_stack(by), passed @ weights
+
+    def build(self, x: F64, scale: F64) -> IntegratedModel:
+        """Return the model at a point of the space."""
+        known = self.parameters(x, scale)
+        offset_um = known.pop("output_offset_um", 0.0)
+        model = exponential_integrated(
+            gamma_s=known.pop("gamma"),
+            plays=self._settings.plays,
+            deadbands_a_side=self._settings.deadbands,
+            **known,
+        )
+        thresholds = tuple((known["alpha"] * self._numbers).tolist())
+        return model.model_copy(update={"thresholds": thresholds, **self._data.common(offset_um)})
+
+    def parameters(self, x: F64, scale: F64) -> dict[str, float]:
+        """Return the fitted parameters under their published names."""
+        gain = self._data.gain
+        sides = [self._side_parameters(x[5:8]), self._side_parameters(x[8:11])]
+        known = {
+            "alpha": float(x[0]) * self._limit,
+            "gamma": float(x[1]) * self._slowest_s,
+            "a_0": float(x[2]) * gain,
+            "g_0": 1.0,
+            "alpha_0": float(x[3]) * gain,
+            "beta_0": float(x[4]) / self._settings.plays,
+            **dict(zip(("alpha_1", "beta_1", "d_p"), sides[0], strict=True)),
+            **dict(zip(("alpha_2", "beta_2", "d_n"), sides[1], strict=True)),
+        }
+        offset = {"output_offset_um": float(x[-1]) * self._half_stroke}
+        return known | (offset if self._settings.offset else {})
+
+    def _play_weights(self, x: F64) -> F64:
+        plays = self._settings.plays
+        return exponential_weights(float(x[3]) * self._data.gain, float(x[4]) / plays, plays)
+
+    def _side(self, x: F64, sign: float) -> tuple[F64, F64]:
+        """Return thresholds, as distances from 0 in um, and weights of one side's deadbands."""
+        factor, beta, spacing = self._side_parameters(x)
+        return spacing * self._steps, sign * exponential_weights(factor, beta, self._steps.size)
+
+    def _side_parameters(self, x: F64) -> tuple[float, float, float]:
+        """Return the factor and the exponent of one side's weights, and its spacing in um."""
+        size = self._steps.size
+        beta = float(x[1]) / size
+        total = float(exponential_weights(1.0, beta, size).sum())
+        return float(x[0]) / total, beta, float(x[2]) * self._half_stroke / (size + 1)
+
+    def _shares(self, x: F64) -> F64:
+        """Return the share of each deadband in the change of slope of a side: float64[k]."""
+        rates = exponential_weights(1.0, float(x[1]) / self._steps.size, self._steps.size)
+        return np.asarray(rates / rates.sum())
+
+
+def fit_exponential(job: FitJob) -> FoundModel:
+    """Fit the integrated model with exponential weights."""
+    return searched_fit(ExponentialProblem(job.data, job.settings), job)

@@ -1,4 +1,4 @@
-"""Least squares from several starts, within bounds, and a refinement for the peak error."""
+"""Bounded least squares from several starts, and reweighting for the peak error."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -13,19 +13,19 @@ from hilctl.models.plays import PlayModel
 
 SEED = 1  # of the random starts
 
-DRAWS_A_START = 12  # random points looked at for each start that is followed
-EVALUATIONS = 60  # of the residuals, derivatives apart, for each start
-POLISH = 300  # the same for the best of them
-ROUNDS = 30  # of the refinement for the peak error
-ROUND = 15  # evaluations of the residuals in a round, derivatives apart
-EMPHASIS = 0.3  # what a sample beyond the goal gains in weight in each round
-NEARLY = 0.96  # of the goal: where samples begin to gain
-HELD = 1e-4  # of the space: so near to a bound, a search has run into it
+DRAWS_A_START = 12  # random points tried per start
+EVALUATIONS = 60  # maximum per start
+POLISH = 300  # maximum for the best start
+ROUNDS = 30  # of reweighting
+ROUND = 15  # maximum evaluations per round of reweighting
+EMPHASIS = 0.3  # gain in weight per round of a sample beyond the goal
+NEARLY = 0.96  # of the goal, from which samples gain weight
+HELD = 1e-4  # of the space: distance to a bound that counts as at the bound
 
 
 @dataclass(frozen=True, slots=True)
 class SearchSpace:
-    """The parameters that are searched, in units that make all of them about 1.
+    """Search variables, scaled to about 1.
 
     Attributes:
         low: float64[p], lower bounds.
@@ -38,45 +38,41 @@ class SearchSpace:
     guess: F64
 
     def at_bound(self, x: F64) -> Mask:
-        """Return what of a point, float64[p], stands on a bound: bool[p]."""
+        """Return which variables of a point, float64[p], are at a bound: bool[p]."""
         near = HELD * (self.high - self.low)
         return np.asarray((x <= self.low + near) | (x >= self.high - near))
 
     def draw(self, rng: np.random.Generator) -> F64:
-        """Return a random point: each parameter up to 4 times below or above its rough value."""
+        """Return a random point, each variable within a factor of 4 of its rough value."""
         drawn = self.guess * np.exp(rng.uniform(-1.4, 1.4, self.guess.size))
         inside = self.low + (self.high - self.low) * rng.uniform(0.02, 0.98, self.guess.size)
         return np.where((drawn > self.low) & (drawn < self.high), drawn, inside)
 
 
 class SearchProblem(Protocol):
-    """A model family with its data, as the search sees it."""
+    """A family of models with its data."""
 
     @property
     def space(self) -> SearchSpace:
-        """What is searched."""
+        """The search variables."""
         ...
 
     @property
     def searched(self) -> tuple[str, ...]:
-        """Names of what is searched, in the order of the space."""
+        """Names of the search variables, in the order of the space."""
         ...
 
     @property
     def held(self) -> int:
-        """Rows of the errors after those of the samples, which hold weights smooth."""
+        """Number of rows of a smoothness prior, after those of the samples."""
         ...
 
     def error_um(self, x: F64, scale: F64) -> F64:
-        """Return modelled minus measured displacement, and the rows that hold weights smooth.
+        """Return modelled minus measured displacement, and the rows of the prior: float64[N].
 
         Args:
             x: float64[p], a point of the space.
-            scale: float64[N], what each error will be multiplied with; a family whose weights
-                follow from a linear solution needs it.
-
-        Returns:
-            float64[N].
+            scale: float64[N], scale of the errors, which linear weights depend on.
         """
         ...
 
@@ -95,7 +91,7 @@ class SearchProblem(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class SearchEnd:
-    """Where the search ended: the point, the scale of the errors there, and all starts."""
+    """End of the search: the point, the scale of the errors, and all starts."""
 
     x: F64
     scale: F64
@@ -112,13 +108,12 @@ def search(
 ) -> SearchEnd:
     """Minimise the sum of the squared, scaled errors.
 
-    The rough values from the data are followed, and the best of some random points; the best
-    result is followed to the end.
+    Starts are the rough values from the data and the best random points.
 
     Args:
-        problem: What is fitted.
-        scale: float64[N], square root of each sample's weight.
-        stroke_um: Largest peak-to-peak output, for the figures.
+        problem: The problem.
+        scale: float64[N], square root of the weight of each sample.
+        stroke_um: Largest peak-to-peak output, for percentages.
         starts: Number of starts.
         rng: Source of the random points.
         progress: Called at each start.
@@ -146,7 +141,7 @@ def search(
 
 
 def polished(problem: SearchProblem, x: F64, scale: F64, evaluations: int) -> tuple[F64, int]:
-    """Return where least squares within the bounds ends from ``x``, and the evaluations it took."""
+    """Return the end of bounded least squares from ``x``, and the evaluations."""
     space = problem.space
 
     def residuals(point: F64) -> F64:
@@ -161,19 +156,16 @@ def polished(problem: SearchProblem, x: F64, scale: F64, evaluations: int) -> tu
 def refine_peak(
     problem: SearchProblem, found: SearchEnd, goal_um: float, progress: OnProgress
 ) -> SearchEnd:
-    """Give weight to samples whose error is beyond a goal, until none is.
-
-    After Lawson's algorithm for the smallest peak error, stopped as soon as the goal is met, so
-    that the fit stays as near to least squares as the goal allows.
+    """Raise the weight of samples with errors beyond a goal, until there are none (Lawson).
 
     Args:
-        problem: What is fitted.
-        found: Where least squares ended.
-        goal_um: Largest error wanted.
-        progress: Called at each round.
+        problem: The problem.
+        found: End of least squares.
+        goal_um: Goal of the largest error.
+        progress: Called in each round.
 
     Returns:
-        The point with the smallest peak error that was met on the way.
+        The point with the smallest peak error.
     """
     best, x, scale = found, found.x, found.scale
     samples = slice(scale.size - problem.held)
@@ -183,8 +175,7 @@ def refine_peak(
         if peak <= goal_um:
             break
         progress(i / ROUNDS, f"peak error {peak:.3g} µm, goal {goal_um:.3g} µm")
-        # Samples gain little by little as they near the goal: with a sharp border, rounding would
-        # decide on which side a sample is.
+        # The gain rises smoothly near the goal, so that rounding does not decide.
         near = errors_um / goal_um
         scale = scale.copy()
         scale[samples] *= 1.0 + EMPHASIS * np.clip((near - NEARLY) / (1.0 - NEARLY), 0.0, 1.0)
@@ -197,7 +188,7 @@ def refine_peak(
 
 
 def searched_fit(problem: SearchProblem, job: FitJob) -> FoundModel:
-    """Search a model of a problem, from several starts."""
+    """Return the model that solves a problem."""
     data, settings = job.data, job.settings
     rng = np.random.default_rng(SEED)
     roots = weight_roots(data.records, settings.weight_by)

@@ -1,1 +1,1 @@
-"""Fits of free weights and stages: what is linear needs no search."""
+"""Fits of free weights and stages to steady loops."""

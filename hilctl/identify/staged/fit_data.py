@@ -1,8 +1,4 @@
-"""Records made ready for a fit with dynamics: lag in time, structure and delay by harmonics.
-
-A steady cycle repeats, so a linear stage multiplies each of its harmonics by a number, exactly and
-whatever the cycle's frequency; only the lag, which may grow with its distance, is followed in time.
-"""
+"""Records for a fit with dynamics: lag and plays in time, structure and delay by harmonics."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -17,22 +13,142 @@ from scipy.fft import irfft, rfft
 from hilctl.base.errors import DataError
 from hilctl.base.types import F64
 from hilctl.identify.data.records import Record, Records, SteadyLoop
-from hilctl.identify.staged.sensitivity import PARAMETERS, lagged, plays_and_slopes
+from hilctl.kernels.jit import kernel
 from hilctl.models.base import Operator
 
+LAG_S, GROWTH, SPACING, GAMMA_S = range(4)
+"""Columns of derivatives by the parameters before the deadbands."""
+PARAMETERS = 4
+
+
+@kernel("UniTuple(float64, 3)(float64, float64, float64, float64)")
+def _relaxed(behind: float, slope: float, lag: float, step: float) -> tuple[float, float, float]:
+    """Return e after a step of e' = slope - e / lag, and its derivatives by e and by lag."""
+    left = math.exp(-step / lag)
+    rest = behind - slope * lag
+    by_lag = slope * (1.0 - left) + rest * left * step / (lag * lag)
+    return slope * lag + rest * left, left, by_lag
+
+
+@kernel(
+    "void(float64[::1], float64, float64, float64, int64, int64, float64[::1], float64[:, ::1])"
+)
+def lagged(
+    v: F64, step_s: float, lag_s: float, growth: float, substeps: int, settle: int, w: F64, dw: F64
+) -> None:
+    """Compute the response of w' = (v - w) / (lag (1 + growth |v - w|)) to a periodic command.
+
+    The command is linear between points; each substep is exact for the lag at its middle.
+
+    Args:
+        v: float64[n], one cycle.
+        step_s: Time between its points.
+        lag_s: Time constant for small changes.
+        growth: Relative growth of the lag per unit of v - w.
+        substeps: Steps between two points.
+        settle: Points simulated before the first one, to reach the steady cycle.
+        w: float64[n], filled.
+        dw: float64[n, 4], filled with derivatives by lag and growth; other columns are 0.
+    """
+    n = v.size
+    step = step_s / substeps
+    e = 0.0
+    e_lag = 0.0
+    e_growth = 0.0
+    for j in range(-settle, n):
+        slope = (v[j % n] - v[(j - 1) % n]) / step_s
+        for _ in range(substeps):
+            size = abs(e)
+            sign = math.copysign(growth * lag_s, e)
+            lag = lag_s * (1.0 + growth * size)
+            lag_1 = 1.0 + growth * size + sign * e_lag
+            lag_2 = lag_s * size + sign * e_growth
+            middle, by_e, by_lag = _relaxed(e, slope, lag, 0.5 * step)
+            m_1 = by_e * e_lag + by_lag * lag_1
+            m_2 = by_e * e_growth + by_lag * lag_2
+            size = abs(middle)
+            sign = math.copysign(growth * lag_s, middle)
+            lag = lag_s * (1.0 + growth * size)
+            lag_1 = 1.0 + growth * size + sign * m_1
+            lag_2 = lag_s * size + sign * m_2
+            e, by_e, by_lag = _relaxed(e, slope, lag, step)
+            e_lag = by_e * e_lag + by_lag * lag_1
+            e_growth = by_e * e_growth + by_lag * lag_2
+        if j >= 0:
+            w[j] = v[j] - e
+            dw[j, 0] = -e_lag
+            dw[j, 1] = -e_growth
+
+
+@kernel(
+    "void(float64[::1], float64[:, ::1], float64[::1], float64, float64, float64[::1],"
+    " float64[::1], int64, float64[:, ::1], float64[:, ::1])"
+)
+def plays_and_slopes(
+    w: F64,
+    dw: F64,
+    speed: F64,
+    spacing: float,
+    gamma_s: float,
+    numbers: F64,
+    weights: F64,
+    turns: int,
+    out: F64,
+    slopes: F64,
+) -> None:
+    """Run plays of thresholds ``spacing numbers_i + gamma speed``, from rest.
+
+    Args:
+        w: float64[n], input.
+        dw: float64[n, 4], its derivatives by the parameters.
+        speed: float64[n], |rate| of the input.
+        spacing: Distance of two thresholds.
+        gamma_s: Growth of the thresholds with the speed.
+        numbers: float64[m], thresholds in units of the spacing.
+        weights: float64[m].
+        turns: Simulated repetitions of the input, of which the last counts; two give the steady
+            cycle, see :meth:`hilctl.identify.data.records.SteadyLoop.run`.
+        out: float64[n, m], filled with each play's output.
+        slopes: float64[n, 4], filled with the derivatives of the weighted sum of the plays.
+    """
+    held = np.zeros(numbers.size)
+    by = np.zeros((numbers.size, 4))
+    for _ in range(turns):
+        for k in range(w.size):
+            wide = gamma_s * speed[k]
+            for q in range(4):
+                slopes[k, q] = 0.0
+            for i in range(numbers.size):
+                threshold = spacing * numbers[i] + wide
+                side = 0.0
+                if held[i] < w[k] - threshold:
+                    side = -1.0
+                elif held[i] > w[k] + threshold:
+                    side = 1.0
+                if side != 0.0:
+                    held[i] = w[k] + side * threshold
+                    by[i, 0] = dw[k, 0]
+                    by[i, 1] = dw[k, 1]
+                    by[i, 2] = side * numbers[i]
+                    by[i, 3] = side * speed[k]
+                out[k, i] = held[i]
+                for q in range(4):
+                    slopes[k, q] += weights[i] * by[i, q]
+
+
 Spectrum: TypeAlias = npt.NDArray[np.complex128]
-SETTLED = 20.0  # time constants after which a lag has forgotten its start
+SETTLED = 20.0  # time constants until a lag is settled
 MOST_SUBSTEPS = 200
 WITHOUT_STAGES = (
-    "leave out --whole where they repeat; where they do not, take a model without stages "
+    "omit --whole if they repeat, otherwise use a model without stages "
     "(--model integrated, or --set lag=none --set structure=false --set delay=false)"
 )
-"""What to do about data that are no steady loops."""
+"""Remedy for data that are not steady loops."""
 
 
 @dataclass(frozen=True, slots=True)
 class Linear:
-    """1 / (1 + c s + q s^2) and a delay, each 0 where there is none.
+    """1 / (1 + c s + q s^2) and a delay; parameters are 0 for missing parts.
 
     Attributes:
         delay_s: Transport delay.
@@ -46,17 +162,17 @@ class Linear:
 
     @property
     def none(self) -> bool:
-        """Whether nothing is done."""
+        """Whether there is neither structure nor delay."""
         return self.delay_s == 0.0 and self.c_s == 0.0 and self.q_s2 == 0.0
 
     def response(self, s: Spectrum) -> Spectrum:
-        """Return what each s = j w is multiplied with."""
+        """Return the transfer function at each s = j w."""
         return np.asarray(np.exp(-s * self.delay_s) / (1.0 + s * (self.c_s + s * self.q_s2)))
 
 
 @dataclass(frozen=True, slots=True)
 class _Run:
-    """One record: signals float64[n], judged samples, place among all, s of each harmonic."""
+    """One record: signals float64[n], evaluated samples, place among all, s per harmonic."""
 
     command: F64
     speed: F64
@@ -76,19 +192,19 @@ class _Run:
 
 
 class StagedFitData:
-    """All records' commands and displacements, judged samples one after the other.
+    """Commands and displacements of all records, with evaluated samples in sequence.
 
     Attributes:
         target_um: float64[N], measured displacement.
         places: For each record, its part of the N samples.
         reach: Half the largest peak-to-peak command.
         top_speed: Largest |rate| of the command.
-        top_hz: Highest fundamental of a loop; of histories, that of a sine as fast as they are.
+        top_hz: Highest frequency of a loop; for histories, of a sine as fast as they are.
         stroke_um: Largest peak-to-peak displacement.
         one_rate: Whether all records are of runs at one sample rate.
-        half_period_s: Half a sample period of the runs; 0.0 where it is not known.
+        half_period_s: Half a sample period of the runs; 0.0 if unknown.
         input_range: Lowest and highest command.
-        output_range_um: Lowest and highest judged displacement.
+        output_range_um: Lowest and highest evaluated displacement.
     """
 
     def __init__(self, data: Records, speeds: Sequence[F64]) -> None:
@@ -96,7 +212,7 @@ class StagedFitData:
 
         Args:
             data: One record or more.
-            speeds: |rate| of each, see :attr:`hilctl.identify.fit_data.FitData.speeds`.
+            speeds: |rate| of each, see :attr:`hilctl.identify.fit_api.FitData.speeds`.
         """
         runs = [_run(record, speed) for record, speed in zip(data, speeds, strict=True)]
         targets = [r.displacement_um[run.judged] for r, run in zip(data, runs, strict=True)]
@@ -117,11 +233,11 @@ class StagedFitData:
         self.output_range_um = (float(self.target_um.min()), float(self.target_um.max()))
 
     def thinned(self, scale: F64, points: int) -> tuple["StagedFitData", F64]:
-        """Return the data with fewer points a loop, and ``scale``, float64[N], of these.
+        """Return the data with fewer points per loop, and their part of ``scale``, float64[N].
 
         Args:
-            scale: Square root of each sample's weight.
-            points: About as many are left of each loop; of histories, all are.
+            scale: Square root of the weight of each sample.
+            points: Points per loop, about; histories are kept.
         """
         kept, runs = np.zeros(scale.size, dtype=bool), []
         for run in self._runs:
@@ -144,7 +260,7 @@ class StagedFitData:
 
     @property
     def all_steady(self) -> bool:
-        """Whether every record is a steady cycle, as stages with dynamics need it."""
+        """Whether every record is a steady loop, as dynamic stages need."""
         return all(run.s is not None for run in self._runs)
 
     def lagged(self, lag_s: float, growth: float) -> tuple[list[F64], list[F64]]:
@@ -164,8 +280,8 @@ class StagedFitData:
         """Run plays on commands after a lag.
 
         Args:
-            lagged: What :meth:`lagged` returned.
-            before: float64[4], of which the spacing of thresholds and gamma in s count here.
+            lagged: Result of :meth:`lagged`.
+            before: float64[4], with the spacing of thresholds and gamma in s.
             numbers: float64[n], thresholds in units of the spacing.
             weights: float64[n].
 
@@ -194,7 +310,7 @@ class StagedFitData:
         return out
 
     def through(self, signals: F64, linear: Linear) -> F64:
-        """Send signals float64[N, k] through the linear stages."""
+        """Return the response of the linear stages to signals float64[N, k]."""
         if linear.none:
             return signals
         out = np.empty_like(signals)
@@ -205,7 +321,7 @@ class StagedFitData:
         return out
 
     def undelayed(self, delay_s: float) -> F64:
-        """Return the measured displacements that much earlier: float64[N]."""
+        """Return the measured displacements without a delay: float64[N]."""
         return self.through(self.target_um[:, None], Linear(-delay_s))[:, 0]
 
     def linear_slopes(self, signal: F64, linear: Linear) -> F64:
@@ -223,7 +339,7 @@ class StagedFitData:
 
 
 def _placed(runs: Sequence[_Run]) -> list[_Run]:
-    """Put the judged samples of each run behind those of the one before."""
+    """Set the place of each run after that of the one before."""
     ends = np.cumsum([0, *(_size(run.judged) for run in runs)]).tolist()
     places = map(slice, ends[:-1], ends[1:])
     return [replace(run, place=place) for run, place in zip(runs, places, strict=True)]
@@ -235,7 +351,7 @@ def _size(place: slice) -> int:
 
 def _harmonics(run: _Run) -> Spectrum:
     if run.s is None:
-        raise DataError(f"lag, structure and delay are found from steady loops: {WITHOUT_STAGES}")
+        raise DataError(f"lag, structure and delay need steady loops: {WITHOUT_STAGES}")
     return run.s
 
 

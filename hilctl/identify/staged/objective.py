@@ -10,8 +10,7 @@ import numpy as np
 
 from hilctl.base.types import F64, CommandUnit
 from hilctl.identify.fit_api import LEAST_SLOPE
-from hilctl.identify.staged.fit_data import Linear, StagedFitData
-from hilctl.identify.staged.sensitivity import LAG_S, PARAMETERS
+from hilctl.identify.staged.fit_data import LAG_S, PARAMETERS, Linear, StagedFitData
 from hilctl.models.integrated import DeadbandFunction, IntegratedModel
 from hilctl.models.linear_stages import FirstMode
 from hilctl.models.plays import PlayModel
@@ -19,17 +18,16 @@ from hilctl.models.staged import FieldLag, StagedModel
 
 STEEPEST = 5.0  # largest slope of the deadband function, relative to that around 0
 DYNAMIC = PARAMETERS + 3
-FORGOTTEN = 300.0  # half periods in time constants: nothing is left of a lag
+FORGOTTEN = 300.0  # half periods per time constant, beyond which a lag has no effect
 RADIAN = 0.16  # 1 / (2 pi)
 
 
 def loop_delay_s(half_period_s: float, lag_s: float) -> float:
-    """Return the delay of a sampled loop that a staged model has without any of its own.
+    """Return the delay of a sampled loop without a transport delay.
 
-    A displacement is sampled one period T after the command that it can first show was put out.
-    Sampled, a lag tau of a command that is held is T / (1 - e^(-T / tau)) late at low frequencies,
-    of which tau is the lag's own. What is left is T / 2 where the lag is long beside T, and T
-    where there is none.
+    A displacement is sampled one period T after the command. A sampled lag tau with a zero-order
+    hold delays by T / (1 - e^(-T / tau)) at low frequencies, of which tau is due to the lag. The
+    rest is T / 2 for a lag much longer than T, and T without a lag.
     """
     period_s = 2.0 * half_period_s
     if lag_s <= 0.0 or period_s <= 0.0:
@@ -47,7 +45,7 @@ def loop_delay_slope(half_period_s: float, lag_s: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Layers:
-    """What is in the model.
+    """Parts of the model.
 
     Attributes:
         plays: Number n of plays.
@@ -57,7 +55,7 @@ class Layers:
         gamma: Whether thresholds grow with the rate.
         structure: Whether there is a second-order structure.
         delay: Whether a transport delay is fitted.
-        half_period_s: Half a sample period of the loop; 0.0 where its delay does not count.
+        half_period_s: Half a sample period of the loop; 0.0 to ignore its delay.
         offset: Whether a constant displacement is fitted.
         midpoint: Whether thresholds are alpha (i - 1/2) instead of alpha i.
     """
@@ -75,7 +73,7 @@ class Layers:
 
     @property
     def numbers(self) -> F64:
-        """What the spacing is multiplied with to give the thresholds: float64[n]."""
+        """Thresholds over their spacing: float64[n]."""
         first = 0.5 if self.midpoint else 1.0
         return np.arange(self.plays, dtype=np.float64) + first
 
@@ -95,7 +93,7 @@ class Point:
 
     Attributes:
         before: float64[4]: lag in s, its growth, spacing of the thresholds, gamma in s.
-        linear: Structure, and delay beyond that of any sampled loop.
+        linear: Structure, and delay in addition to that of a sampled loop.
         direct: a_0 in um per command unit.
         weights: float64[n], a_1 to a_n.
         spacings_um: d_p and d_n, distances of the deadbands above and below 0.
@@ -114,7 +112,7 @@ class Point:
     offset_um: float
 
     def pack(self) -> F64:
-        """Return all that is fitted as float64[p]."""
+        """Return all parameters as float64[p]."""
         linear = (self.linear.delay_s, self.linear.c_s, self.linear.q_s2)
         inner = (self.direct, *self.weights, *self.up, *self.down)
         return np.array([*self.before, *linear, *inner, *self.spacings_um, self.offset_um])
@@ -144,7 +142,7 @@ class Point:
 
 
 def bounds(data: StagedFitData, layers: Layers, point: Point) -> tuple[F64, F64]:
-    """Return the lowest and highest values, float64[p]; equal where nothing is fitted."""
+    """Return lowest and highest values, float64[p]; equal for fixed parameters."""
     radian_s = RADIAN / data.top_hz
     limit, steepest = layers.spacing_limit(data.reach), 4.0 * data.gain
     apart = data.stroke_um / (layers.deadbands + 1)
@@ -221,7 +219,7 @@ def segments(x: F64, corners: F64) -> F64:
     return np.asarray(np.clip(x[..., None], low, high) - np.clip(0.0, low, high))
 
 
-HIGHEST_DAMPING = 10.0  # that a Structure takes
+HIGHEST_DAMPING = 10.0  # of a FirstMode
 STAGE_PARAMETERS = ("tau_s", "growth_per_unit", "natural_hz", "damping_ratio", "delay_s")
 
 
@@ -273,8 +271,7 @@ def staged_model(
 def structure_of(linear: Linear) -> tuple[float, float]:
     """Return natural frequency in Hz and damping ratio.
 
-    A first-order low-pass, that of a sensor say, is a structure without a mass: it has no damping
-    ratio. It keeps its time constant, and a mass far too small to matter.
+    A first-order low-pass, such as a sensor, has no damping ratio: it gets a negligible mass.
     """
     least_s = 0.5 * linear.c_s / HIGHEST_DAMPING
     radian_s = max(math.sqrt(linear.q_s2), least_s * (1.0 + 1e-9))
@@ -301,7 +298,7 @@ def parameters(layers: Layers, point: Point, *, staged: bool) -> dict[str, float
 
 
 def response_um(model: StagedModel, data: StagedFitData) -> F64:
-    """Return a model's displacement of all judged samples: float64[N]."""
+    """Return the modelled displacement of all evaluated samples: float64[N]."""
     inner, lag = model.hysteresis, model.lag
     lagged = data.lagged(lag.tau_s if lag else 0.0, lag.growth_per_unit if lag else 0.0)
     if isinstance(inner, PlayModel):

@@ -1,6 +1,7 @@
 """Fits with stages: from a job to a model with standard errors."""
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -8,8 +9,9 @@ from hilctl.base.types import F64
 from hilctl.identify.evaluation import weight_roots
 from hilctl.identify.fit_api import LEAST_SLOPE, FitJob, FoundModel
 from hilctl.identify.least_squares import numbered, smooth_densities
-from hilctl.identify.literature.linear_weights import cells_below
-from hilctl.identify.staged.fit_data import StagedFitData
+from hilctl.identify.literature import cells_below
+from hilctl.identify.settings import FitSettings
+from hilctl.identify.staged.fit_data import GAMMA_S, GROWTH, LAG_S, SPACING, StagedFitData
 from hilctl.identify.staged.objective import (
     DYNAMIC,
     STAGE_PARAMETERS,
@@ -19,7 +21,6 @@ from hilctl.identify.staged.objective import (
     staged_model,
     stages_of,
 )
-from hilctl.identify.staged.sensitivity import GAMMA_S, GROWTH, LAG_S, SPACING
 from hilctl.identify.staged.staged_search import StagedEnd, find_staged
 from hilctl.models.implicit_models import PreisachModel
 from hilctl.models.staged import StagedModel
@@ -33,20 +34,19 @@ def standard_errors(
 ) -> dict[str, float]:
     """Return the standard error of each parameter.
 
-    Errors of a model within one record are anything but independent, so that the usual formula
-    would promise far too much. Records are taken as independent of each other instead (sandwich
-    estimate, clustered by record): G^-1 (sum of s s^T) G^-1 with G = J^T J and s = J^T e of each
-    record. Parameters held by a bound count as known.
+    Errors within a record are correlated, so the estimate is clustered by record (sandwich):
+    G^-1 (sum of s s^T) G^-1 with G = J^T J and s = J^T e of each record. Parameters at a bound
+    count as known.
 
     Args:
         found: The fit.
-        layers: What is in the model.
-        places: Each record's samples.
+        layers: Parts of the model.
+        places: Samples of each record.
         staged: Whether the delay is reported.
 
     Returns:
         Standard errors by the names of :func:`hilctl.identify.staged.objective.parameters`, without
-        those that a bound holds; none with fewer than two records.
+        parameters at a bound; none for fewer than two records.
     """
     if len(places) < 2:
         return {}
@@ -63,13 +63,13 @@ def standard_errors(
 
 
 def at_bound(found: StagedEnd, layers: Layers, *, staged: bool) -> tuple[str, ...]:
-    """Return the names of the parameters that a bound holds; arguments as above."""
+    """Return the names of parameters at a bound; see :func:`standard_errors`."""
     by = _stages(found, layers, staged=staged) | _operators(layers, found.held.size)
     return tuple(name for name, slopes in by.items() if found.held[next(iter(slopes))])
 
 
 def _stages(found: StagedEnd, layers: Layers, *, staged: bool) -> dict[str, dict[int, float]]:
-    """Return what each reported parameter of the stages changes with, and how much."""
+    """Return the derivatives of each reported parameter of the stages by fitted ones."""
     by: dict[str, dict[int, float]] = {}
     if layers.lag:
         by |= {"tau_s": {LAG_S: 1.0}, "growth_per_unit": {GROWTH: 1.0}}
@@ -115,19 +115,19 @@ def _covariance(found: StagedEnd, places: tuple[slice, ...]) -> F64:
     return out
 
 
-SPARE = 0.1  # span of commands beyond the data's, of their range
-SMOOTHNESS = 0.2  # weight of differences between neighbouring densities, beside the errors
-STILL = 0.05  # part of a cell that a play must move through in some record to have a density
+SPARE = 0.1  # margin of the command span, of the range of the data
+SMOOTHNESS = 0.2  # weight of differences between neighbouring densities
+STILL = 0.05  # part of a cell that a play must move through in a record to have a density
 
 
 def with_triangle(data: StagedFitData, model: StagedModel, lines: int, scale: F64) -> StagedModel:
-    """Put a triangle in the place of a staged model's hysteresis.
+    """Replace the hysteresis of a staged model by a fitted Preisach triangle.
 
     Args:
         data: The data.
-        model: The stages, found with another model of the hysteresis.
-        lines: Lines of the triangle, and cells of the longest.
-        scale: float64[N], square root of each sample's weight.
+        model: The stages, fitted with another model of hysteresis.
+        lines: Lines of the triangle, and cells of the longest line.
+        scale: float64[N], square root of the weight of each sample.
     """
     low, high = data.input_range
     thresholds = data.reach / lines * np.arange(lines, dtype=np.float64)
@@ -167,58 +167,60 @@ def _largest_swing(columns: F64, places: tuple[slice, ...]) -> F64:
 
 
 def fit_free(job: FitJob) -> FoundModel:
-    """Fit the integrated model, every weight by itself."""
-    settings = job.settings
-    layers = Layers(
-        plays=settings.plays,
-        deadbands=settings.deadbands,
-        lag=False,
-        growth=False,
-        gamma=True,
-        structure=False,
-        delay=False,
-        offset=settings.offset,
-        midpoint=settings.layout == "midpoint",
-    )
+    """Fit the integrated model with free weights."""
     data = StagedFitData(job.data.records, job.data.speeds)
-    found = find_staged(job, data, layers)
-    known = parameters(layers, found.point, staged=False)
-    errors = standard_errors(found, layers, data.places, staged=False)
-    model = integrated_model(data, layers, found.point, job.data.unit)
-    held = at_bound(found, layers, staged=False)
-    return FoundModel(model, len(known) - 1, known, found.starts, errors, held)
+    layers = _layers(
+        job.settings, lag=False, growth=False, gamma=True, structure=False, delay=False
+    )
+    return _fitted(job, data, layers, staged=False)
 
 
 def fit_staged(job: FitJob) -> FoundModel:
-    """Fit hysteresis, lag, structure and delay; a Preisach triangle last, where asked for."""
+    """Fit hysteresis, lag, structure and delay, then a Preisach triangle if requested."""
     settings = job.settings
     data = StagedFitData(job.data.records, job.data.speeds)
-    lag = settings.lag != "none"
-    layers = Layers(
-        plays=settings.plays,
-        deadbands=settings.deadbands,
-        lag=lag,
+    layers = _layers(
+        settings,
+        lag=settings.lag != "none",
         growth=settings.lag == "growth",
-        gamma=not lag,
+        gamma=settings.lag == "none",
         structure=settings.structure,
         delay=settings.delay,
         half_period_s=data.half_period_s,
-        offset=settings.offset,
-        midpoint=settings.layout == "midpoint",
     )
-    found = find_staged(job, data, layers)
-    known = parameters(layers, found.point, staged=True)
-    errors = standard_errors(found, layers, data.places, staged=True)
-    model = staged_model(data, layers, found.point, job.data.unit)
-    held = at_bound(found, layers, staged=True)
+    found = _fitted(job, data, layers, staged=True)
     if settings.hysteresis == "integrated":
-        return FoundModel(model, len(known) - 1, known, found.starts, errors, held)
+        return found
     job.progress(0.9, "densities of the Preisach triangle")
     scale = weight_roots(job.data.records, settings.weight_by)
-    model = with_triangle(data, model, settings.lines, scale)
-    known = {name: known[name] for name in STAGE_PARAMETERS if name in known}
-    errors = {name: errors[name] for name in STAGE_PARAMETERS if name in errors}
+    assert isinstance(found.model, StagedModel)
+    model = with_triangle(data, found.model, settings.lines, scale)
+    known = {name: found.parameters[name] for name in STAGE_PARAMETERS if name in found.parameters}
+    errors = {name: error for name, error in found.standard_errors.items() if name in known}
+    held = tuple(name for name in found.at_bound if name in known)
     known["output_offset_um"] = model.hysteresis.output_offset_um
-    numbers = len(known) + settings.lines**2
-    held = tuple(name for name in held if name in known)
-    return FoundModel(model, numbers, known, found.starts, errors, held)
+    return FoundModel(model, len(known) + settings.lines**2, known, found.starts, errors, held)
+
+
+def _layers(settings: FitSettings, **stages: Any) -> Layers:
+    return Layers(
+        plays=settings.plays,
+        deadbands=settings.deadbands,
+        offset=settings.offset,
+        midpoint=settings.layout == "midpoint",
+        **stages,
+    )
+
+
+def _fitted(job: FitJob, data: StagedFitData, layers: Layers, *, staged: bool) -> FoundModel:
+    found = find_staged(job, data, layers)
+    build = staged_model if staged else integrated_model
+    known = parameters(layers, found.point, staged=staged)
+    return FoundModel(
+        build(data, layers, found.point, job.data.unit),
+        len(known) - 1,
+        known,
+        found.starts,
+        standard_errors(found, layers, data.places, staged=staged),
+        at_bound(found, layers, staged=staged),
+    )

@@ -1,12 +1,12 @@
-"""What is linear, found without a start: Lambda^-1(y) = Pi(v) as non-negative least squares.
+"""Search of the staged model: starts by linear least squares, then all parameters together.
 
-With lag, thresholds and delay fixed, Pi is linear in its weights and Lambda^-1, piecewise linear
-between fixed displacements, is linear in its slopes. The mean slope of Lambda^-1 is set to 1, since
-a common factor of both sides makes no difference.
+For fixed lag, thresholds and delay, Lambda^-1(y) = Pi(v) is linear in the weights of Pi and in the
+slopes of Lambda^-1, so non-negative least squares gives a start. The mean slope of Lambda^-1 is 1,
+since both sides have a common factor.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -50,14 +50,14 @@ class WeightedStart:
 def convex_start(
     data: StagedFitData, layers: Layers, before: F64, delay_s: float, scale: F64
 ) -> WeightedStart:
-    """Work out all weights for fixed lag, thresholds and delay.
+    """Return a start with all weights for fixed lag, thresholds and delay.
 
     Args:
         data: The data.
-        layers: What is in the model.
+        layers: Parts of the model.
         before: float64[4], see :class:`hilctl.identify.staged.objective.Point`.
-        delay_s: All delay, that of a structure included.
-        scale: float64[N], square root of each sample's weight.
+        delay_s: Total delay, including that of a structure.
+        scale: float64[N], square root of the weight of each sample.
     """
     blank = np.zeros(layers.plays)
     lagged = data.lagged(float(before[0]), float(before[1]))
@@ -65,7 +65,7 @@ def convex_start(
     y = data.undelayed(delay_s) if delay_s else data.target_um
     knots = np.linspace(float(y.min()), float(y.max()), KNOTS + 1)
     middle = 0.5 * (knots[0] + knots[-1]) if layers.offset else 0.0
-    # The mean slope of 1 leaves one slope to follow from the others: that around the middle.
+    # The slope around the middle follows from the others and the mean of 1.
     anchor = int(np.clip(np.searchsorted(knots, middle) - 1, 0, KNOTS - 1))
     others = np.delete(np.arange(KNOTS), anchor)
     table = segments(y - middle, knots[1:-1] - middle)
@@ -110,47 +110,38 @@ def _point(data: StagedFitData, layers: Layers, weights: F64, inverse: _Inverse)
 def _placed(
     data: StagedFitData, layers: Layers, point: Point, before: F64, delay_s: float
 ) -> Point:
-    """Put the stages in, a delay shared between a structure well above the data and transport."""
+    """Add the stages; the delay is split between a structure above the data and transport."""
     own_s = delay_s - loop_delay_s(layers.half_period_s, float(before[0]))
     linear = Linear(max(own_s, 0.0) if layers.delay else 0.0)
     if layers.structure:
         q_s = 0.016 / data.top_hz
         c_s = float(np.clip(own_s, 0.1 * q_s, 0.4 * q_s))
         linear = Linear(max(own_s - c_s, 0.0) if layers.delay else 0.0, c_s, q_s * q_s)
-    return Point(
-        before=before.copy(),
-        linear=linear,
-        direct=point.direct,
-        weights=point.weights,
-        spacings_um=point.spacings_um,
-        up=point.up,
-        down=point.down,
-        offset_um=point.offset_um,
-    )
+    return replace(point, before=before.copy(), linear=linear)
 
 
 ROUNDS = 10  # steps from every start
-FEW_POINTS = 50  # a loop, until the best start is known
-SOME_POINTS = 100  # a loop, until that has all but settled
-POLISH = 60  # steps from the best of them
-SPACINGS = (1.0, 0.6)  # of the largest that makes sense
-LAGS = (0.05, 0.12, 0.3, 0.8)  # of the time of a radian at the highest frequency
-GAMMAS = (0.02, 0.06, 0.15, 0.4)  # of what makes thresholds reach the largest command
-DELAYS = (0.04, 0.15)  # of the time of a radian, beyond the least
+FEW_POINTS = 50  # points per loop until the best start is known
+SOME_POINTS = 100  # points per loop in the next step
+POLISH = 60  # steps from the best start
+SPACINGS = (1.0, 0.6)  # of the largest possible spacing
+LAGS = (0.05, 0.12, 0.3, 0.8)  # of a radian at the highest frequency
+GAMMAS = (0.02, 0.06, 0.15, 0.4)  # of the growth at which thresholds reach the largest command
+DELAYS = (0.04, 0.15)  # of a radian
 PEAK_ROUNDS = 40
 PEAK_STEPS = 3
 
 
 @dataclass(frozen=True, slots=True)
 class StagedEnd:
-    """Where the search ended.
+    """End of the search.
 
     Attributes:
         point: The parameters.
         errors_um: float64[N], modelled less measured displacement.
         slopes: float64[N, p], their derivatives by ``point.pack()``.
-        free: bool[p], parameters that are neither fixed nor held by a bound.
-        held: bool[p], parameters that a bound holds.
+        free: bool[p], parameters that are neither fixed nor at a bound.
+        held: bool[p], parameters at a bound.
         scale: float64[N], square root of the weights at the end.
         starts: All starts.
     """
@@ -166,7 +157,7 @@ class StagedEnd:
 
 @dataclass(frozen=True, slots=True)
 class StagedTask:
-    """One start to descended, with all that it takes."""
+    """One start and the data to fit."""
 
     data: StagedFitData
     layers: Layers
@@ -188,7 +179,7 @@ class StagedTask:
 
 
 def descended(task: StagedTask) -> tuple[F64, float]:
-    """Return where a start ends, float64[p], and its sum of squares."""
+    """Return the end of a start, float64[p], and its sum of squares."""
     low, high = bounds(task.data, task.layers, task.point)
     x, errors, _ = descend(task.evaluate(task.scale), task.point.pack(), low, high, task.rounds)
     return x, float(errors @ errors)
@@ -197,13 +188,13 @@ def descended(task: StagedTask) -> tuple[F64, float]:
 def find_staged(job: FitJob, data: StagedFitData, layers: Layers) -> StagedEnd:
     """Minimise the sum of squared, weighted errors over all parameters.
 
-    A few values of the nonlinear parameters are tried with all weights solved for each. The best
-    are followed with all parameters free on some of the points, and the best of these to its end.
+    Starts are a grid of the nonlinear parameters, with linear solutions for all weights. The best
+    ones are optimised on few points, and the best of these on all points.
 
     Args:
         job: Settings and records.
         data: The records, prepared.
-        layers: What is in the model.
+        layers: Parts of the model.
 
     Raises:
         DataError: A stage has dynamics, and a record is not a steady cycle, or sample rates
@@ -243,13 +234,12 @@ def find_staged(job: FitJob, data: StagedFitData, layers: Layers) -> StagedEnd:
 def _check(data: StagedFitData, layers: Layers) -> None:
     if layers.dynamic and not data.all_steady:
         raise DataError(
-            "lag, structure and delay are found from steady loops, and there is a whole time "
-            f"history among the data: {WITHOUT_STAGES}"
+            f"lag, structure and delay need steady loops, but there is a history: {WITHOUT_STAGES}"
         )
     if layers.dynamic and not data.one_rate:
         raise DataError(
-            "lag, structure and delay are found from runs at one sample rate: give those of one "
-            "rate, since a loop's own delay depends on it"
+            "lag, structure and delay need runs at one sample rate, since the delay of a loop "
+            "depends on it"
         )
 
 
@@ -281,19 +271,16 @@ def _outcome(number: int, task: StagedTask, end: tuple[F64, float]) -> StartOutc
 
 
 def lower_peak(task: StagedTask, x: F64, goal_um: float, progress: OnProgress) -> tuple[F64, F64]:
-    """Lower the largest error by Lawson's algorithm, down to a goal.
-
-    Weights grow with the errors that they leave, so that the fit moves from least squares towards
-    the smallest peak, no further than the goal asks for.
+    """Reduce the largest error to a goal by Lawson's reweighting.
 
     Args:
         task: The fit.
-        x: float64[p], where least squares ended.
-        goal_um: Largest error wanted.
-        progress: Called at each round.
+        x: float64[p], end of least squares.
+        goal_um: Goal of the largest error.
+        progress: Called in each round.
 
     Returns:
-        The point with the smallest peak error that was met, and the scale there.
+        The point with the smallest peak error, and its scale.
     """
     low, high = bounds(task.data, task.layers, task.point.unpack(x))
     scale, plain = task.scale, np.ones_like(task.scale)

@@ -103,5 +103,5 @@ def test_weights_are_relative_to_the_slowest_and_largest() -> None:
 def test_weights_need_loops() -> None:
     """A whole history has no peak hysteresis to be weighted by."""
     history = History("decay", np.sin(TURN), np.sin(TURN), 100.0)
-    with pytest.raises(DataError, match="whole time history"):
+    with pytest.raises(DataError, match="weight_by"):
         hysteresis_weights([ellipse(0.3), history])

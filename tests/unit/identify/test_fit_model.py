@@ -12,8 +12,7 @@ from hilctl.base.errors import DataError
 from hilctl.base.types import CommandUnit
 from hilctl.identify.data.records import History, Records, SteadyLoop
 from hilctl.identify.evaluation import judge
-from hilctl.identify.fit_api import LEAST_SLOPE, FitRequest
-from hilctl.identify.fit_data import FitData
+from hilctl.identify.fit_api import LEAST_SLOPE, FitData, FitRequest
 from hilctl.identify.fit_model import FittedModel, fit_kind, fit_model, identified_range
 from hilctl.identify.settings import FitKind, FitSettings
 from hilctl.models.integrated import IntegratedModel, even_thresholds, exponential_integrated
@@ -258,7 +257,7 @@ def test_provenance_and_mapping_say_where_the_model_is_from(loops_of: Loops) -> 
 
 def test_no_data_are_refused() -> None:
     """Nothing comes of an empty list."""
-    with pytest.raises(DataError, match="the list of loops is empty"):
+    with pytest.raises(DataError, match="empty"):
         fit("ppi", [])
 
 
@@ -340,7 +339,7 @@ def test_kinds_without_stages_have_no_creep(records):
 
 
 def test_no_records_are_refused():
-    with pytest.raises(DataError, match="nothing to identify a model from"):
+    with pytest.raises(DataError, match="no records"):
         fit_kind(FitRequest([], FIELD, "A"))
 
 

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from hilctl.identify import model_page as module
-from hilctl.identify.cross_validation import HeldOut
 from hilctl.identify.data.records import History
 from hilctl.identify.evaluation import judge
 from hilctl.identify.fit_api import FitRequest
 from hilctl.identify.fit_model import fit_model
 from hilctl.identify.model_page import identification_page, loops_figure
 from hilctl.identify.model_quality import verdict_of
+from hilctl.identify.model_selection import HeldOut
 from hilctl.identify.pipeline import Identification
 from hilctl.identify.settings import FitSettings
 from hilctl.models.plays import PpiModel
@@ -40,7 +40,7 @@ def test_the_page_fetches_nothing_and_shows_names_as_they_are(page_of):
     assert "&lt;a &amp; b&gt;.csv" in page
     assert "<a & b>" not in page
     assert "not fitted" not in page
-    assert "usable within" in page
+    assert "fit error" in page
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -47,14 +47,14 @@ def test_staged_models_have_their_stages_unless_left_out() -> None:
 @pytest.mark.parametrize(
     ("choices", "reason"),
     [
-        ({"kind": "integrated", "lag": "plain"}, "is a setting of staged, not of integrated"),
-        ({"kind": "ppi", "deadbands": 8}, "not of ppi: leave it out"),
+        ({"kind": "integrated", "lag": "plain"}, "not of integrated"),
+        ({"kind": "ppi", "deadbands": 8}, "not of ppi"),
         ({"kind": "integrated", "deadbands": 0}, "greater than or equal to 1"),
         ({"kind": "staged", "weights": "exponential"}, "not of staged"),
         ({"kind": "staged", "creep": True}, "not of staged"),
-        ({"kind": "staged", "hysteresis": "preisach", "lag": "none"}, "it needs a lag"),
+        ({"kind": "staged", "hysteresis": "preisach", "lag": "none"}, "needs a lag"),
         ({"kind": "ppi", "peak_goal_percent": -1.0}, "greater than 0"),
-        ({"kind": "integrated", "plays": "auto", "deadbands": 4}, "finds the number of deadbands"),
+        ({"kind": "integrated", "plays": "auto", "deadbands": 4}, "deadbands"),
         ({"kind": "kp", "plays": "auto"}, "not of kp"),
     ],
 )

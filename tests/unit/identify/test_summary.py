@@ -36,14 +36,14 @@ def test_a_parameter_stands_with_its_standard_error_where_there_is_one():
 
 def test_a_parameter_on_a_bound_is_marked_and_named():
     shown = found(at_bound=("a_0",))
-    assert parameter_texts(shown.fit)[0] == ("a_0", "4 (on its bound)")
-    assert summary(shown)[-1].endswith("as far as they may go: a_0")
+    assert parameter_texts(shown.fit)[0] == ("a_0", "4 (at its bound)")
+    assert summary(shown)[-1].endswith(": a_0")
 
 
 def test_starts_that_ended_apart_are_shown_by_their_spread():
     spread = "2 starts ended at rms 0.750 to 0.800 %, in 1.23 s"
     assert summary(found(starts=(0.75, 0.8)))[-1] == spread
-    assert summary(found())[-1] == "7 numbers found, in 1.23 s"
+    assert summary(found())[-1] == "7 fitted numbers, in 1.23 s"
 
 
 def test_what_was_not_fitted_comes_before_what_was():
@@ -53,14 +53,14 @@ def test_what_was_not_fitted_comes_before_what_was():
     assert lines[1] == "one note"
     assert lines[2].startswith("not fitted: peak error 3.00 %")
     assert lines[3].startswith("fitted: peak error 2.50 %")
-    assert lines[-1] == "displacements taken 2 samples later than the commands"
+    assert lines[-1] == "lag of the displacements: 2 samples"
 
 
 def test_the_range_that_it_was_found_for_is_said():
     known = IdentifiedRange(
         peak_to_peak_um=(20.0, 80.0), frequency_hz=(50.0, 50.0), speed_um_per_s=12e3
     )
-    line = "found for 20 to 80 µm peak-to-peak, 50 Hz, up to 1.2e+04 µm/s"
+    line = "identified for 20 to 80 µm peak-to-peak, 50 Hz, up to 1.2e+04 µm/s"
     assert summary(found(known=known))[-1] == line
 
 

@@ -32,7 +32,7 @@ def test_a_recording_gives_loops_or_its_history():
 
 
 def test_currents_and_voltages_are_not_fitted_together():
-    with pytest.raises(InputError, match="driven in A and in V can't be fitted together"):
+    with pytest.raises(InputError, match="in A and in V"):
         load_records([CURRENT, VOLTAGE], settings_from("ppi", ["whole=true"]), 0)
 
 
@@ -49,7 +49,7 @@ def test_a_history_that_begins_with_a_ramp_is_refused(recording_of):
     """It did not begin at rest; no sample is missing from it."""
     recording = recording_of(np.zeros(100), np.zeros(100), [])
     recording.samples.flags[:20] |= Flag.RAMP.value
-    with pytest.raises(DataError, match="begins with a ramp from where the output was"):
+    with pytest.raises(DataError, match="ramp"):
         history_from_recording(recording)
 
 
@@ -76,7 +76,7 @@ def test_a_history_with_missing_samples_is_refused(recording_of, what):
         index[50:] += 1
     else:
         displacement_um[50] = np.nan
-    with pytest.raises(DataError, match="samples are missing, so it can't be judged as a whole"):
+    with pytest.raises(DataError, match="samples are missing"):
         history_from_recording(recording_of(np.zeros(100), displacement_um, [], index=index))
 
 
@@ -104,7 +104,7 @@ def test_a_history_in_pieces_is_that_of_the_whole(recording_of):
 def test_a_run_that_is_too_long_for_memory_is_refused_as_a_whole(recording_of, monkeypatch):
     monkeypatch.setattr(data_files, "MOST_WHOLE", 99)
     recording = recording_of(np.linspace(0.0, 1.0, 150), np.linspace(0.0, 1.0, 150), [])
-    with pytest.raises(DataError, match=r"more than 99 samples, .* leave out --whole"):
+    with pytest.raises(DataError, match=r"more than 99"):
         history_from_pieces(pieces_of(recording, [50]))
 
 
@@ -130,9 +130,7 @@ def test_a_loop_is_left_out_by_its_label():
     assert [each.label for each in kept] == [each.label for each in every if each.label != first]
 
 
-@pytest.mark.parametrize(
-    ("label", "rule"), [("nothing", "there is none of"), ("", "leaves nothing")]
-)
+@pytest.mark.parametrize(("label", "rule"), [("nothing", "unknown label"), ("", "excludes all")])
 def test_leaving_out_what_is_not_there_or_all_is_refused(label, rule):
     with pytest.raises(InputError, match=rule):
         load_records([CURRENT], settings_from("ppi", [f"leave_out=['{label}']"]), 0)
@@ -186,13 +184,11 @@ def test_bad_values_name_file_and_line(tmp_path: Path) -> None:
 def test_unknown_columns_list_the_known_ones(tmp_path: Path) -> None:
     """A wrong name or number is answered with what there is."""
     path = write(tmp_path, ["t,v,y", *rows(",")])
-    with pytest.raises(
-        DataError, match="no column 'volts': its columns are t, v, y; numbers are 1"
-    ):
+    with pytest.raises(DataError, match=r"'volts'.*t, v, y"):
         read_table(path, "volts", "y", rate_hz=1.0)
-    with pytest.raises(DataError, match="has no column 4"):
+    with pytest.raises(DataError, match="column 4"):
         read_table(path, 4, "y", rate_hz=1.0)
-    with pytest.raises(DataError, match="has no column 0"):
+    with pytest.raises(DataError, match="column 0"):
         read_table(path, 0, "y", rate_hz=1.0)
 
 
@@ -206,7 +202,7 @@ def test_uneven_time_is_refused(tmp_path: Path, change: str) -> None:
         lines.insert(20, lines[19])
     else:
         lines[20] = "0.10,1,1"
-    with pytest.raises(DataError, match=r"t\.csv:21: samples must be evenly spaced"):
+    with pytest.raises(DataError, match=r"t\.csv:21: "):
         read_table(write(tmp_path, lines), 2, 3, time_column=1)
 
 
@@ -228,7 +224,7 @@ def test_times_rounded_in_the_text_are_fine(tmp_path: Path) -> None:
 def test_rate_or_time_not_both(tmp_path: Path) -> None:
     """Exactly one of time column and rate is needed."""
     path = write(tmp_path, rows(","))
-    with pytest.raises(DataError, match="its rate in Hz: got neither"):
+    with pytest.raises(DataError, match="neither"):
         read_table(path, 2, 3)
     with pytest.raises(DataError, match="got both"):
         read_table(path, 2, 3, time_column=1, rate_hz=100.0)
@@ -241,7 +237,7 @@ def test_unreadable_and_empty_tables(tmp_path: Path) -> None:
     for path, reason in ((tmp_path / "none.csv", "no such file"), (binary, "is not UTF-8 text")):
         with pytest.raises(InputError, match=reason):
             read_table(path, 1, 2, rate_hz=1.0)
-    with pytest.raises(DataError, match="holds no rows of numbers"):
+    with pytest.raises(DataError, match="no rows"):
         read_table(write(tmp_path, ["v,y"]), 1, 2, rate_hz=1.0)
-    with pytest.raises(DataError, match="has 40 rows: rows 51 to the last are not"):
+    with pytest.raises(DataError, match="40 rows"):
         read_table(write(tmp_path, rows(",")), 2, 3, rate_hz=1.0, rows=(50, None))

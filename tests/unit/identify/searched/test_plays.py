@@ -1,4 +1,4 @@
-"""Derivatives of the search for plays agree with differences."""
+"""Search problems of play models."""
 
 from collections.abc import Callable
 from typing import Any
@@ -9,10 +9,9 @@ from scipy.optimize import nnls
 
 from hilctl.base.types import F64
 from hilctl.identify.data.records import SteadyLoop
-from hilctl.identify.fit_api import FitRequest
-from hilctl.identify.fit_data import FitData
+from hilctl.identify.fit_api import FitData, FitRequest
 from hilctl.identify.fit_model import fit_model
-from hilctl.identify.searched.plays import PlaysProblem
+from hilctl.identify.searched.plays import ExponentialProblem, PlaysProblem
 from hilctl.identify.settings import FitSettings
 from hilctl.models.integrated import exponential_integrated
 
@@ -71,3 +70,16 @@ def test_samples_decide_where_they_can(data: FitData) -> None:
     bare, _ = nnls(columns, data.target_um)
     least = columns @ bare - data.target_um
     assert np.linalg.norm(held) < 1.01 * np.linalg.norm(least)
+
+
+@pytest.mark.parametrize("choices", [{}, {"offset": True, "layout": "midpoint"}])
+def test_slopes_of_the_exponential_problem(data: FitData, choices: dict[str, Any]) -> None:
+    """Each of eleven or twelve parameters; kinks of plays leave a little."""
+    problem = ExponentialProblem(data, FitSettings(kind="integrated", **choices))
+    x, ones = 1.1 * problem.space.guess + 0.01, np.ones(data.target_um.size)
+    found = problem.slopes_um(x, ones)
+    expected = differences(lambda at: problem.error_um(at, ones), x, 1e-5)
+    assert found.shape == expected.shape
+    for i in range(x.size):
+        missed = np.linalg.norm(found[:, i] - expected[:, i])
+        assert missed <= 2e-3 * np.linalg.norm(expected[:, i]), i

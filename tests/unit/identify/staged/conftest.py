@@ -5,7 +5,7 @@ from collections.abc import Callable
 import pytest
 
 from hilctl.identify.data.records import SteadyLoop
-from hilctl.identify.fit_data import FitData
+from hilctl.identify.fit_api import FitData
 from hilctl.identify.staged.fit_data import StagedFitData
 from hilctl.models.staged import FieldLag
 from tests.staged import GRID, truth

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hilctl.identify.data.records import SteadyLoop
-from hilctl.identify.fit_data import FitData
+from hilctl.identify.fit_api import FitData
 from hilctl.identify.staged.fit_data import Linear, StagedFitData
 from hilctl.identify.staged.objective import (
     Layers,

@@ -9,9 +9,8 @@ import pytest
 
 from hilctl.identify.data.records import SteadyLoop
 from hilctl.identify.evaluation import judge
-from hilctl.identify.staged.fit_data import Linear
+from hilctl.identify.staged.fit_data import SPACING, Linear
 from hilctl.identify.staged.objective import DYNAMIC, Layers, Point
-from hilctl.identify.staged.sensitivity import SPACING
 from hilctl.identify.staged.staged_fits import at_bound, standard_errors
 from hilctl.identify.staged.staged_search import StagedEnd
 from hilctl.models.implicit_models import PreisachModel

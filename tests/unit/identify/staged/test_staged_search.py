@@ -31,10 +31,10 @@ def test_whole_histories_and_wrong_choices_are_refused(loops_of: Loops) -> None:
     """Dynamics need steady loops; stages belong to staged models."""
     command = 3.0 * np.sin(0.02 * np.arange(2000))
     history = History("growing", command, 5.0 * command, 10_000.0)
-    with pytest.raises(DataError, match=r"found from steady loops.*leave out --whole"):
+    with pytest.raises(DataError, match=r"--whole"):
         fit([history])  # type: ignore[list-item]
     loops = loops_of(truth(), GRID[:2])
-    with pytest.raises(DataError, match="found from runs at one sample rate"):
+    with pytest.raises(DataError, match="one sample rate"):
         fit([loops[0], replace(loops[1], sample_rate_hz=10_000.0)])
 
 

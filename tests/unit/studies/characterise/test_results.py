@@ -58,7 +58,7 @@ def identification(grade="usable"):
     [
         (1.5, "good", "good: within 1.50 %"),
         (5.0, "usable", "usable within 5.00 %"),
-        (30.0, "not a model", "not a model of this, because its error reaches 30 %"),
+        (30.0, "not a model", "not a model: "),
     ],
 )
 def test_the_verdict_is_that_of_the_random_reference(peak, grade, text):

@@ -1,26 +1,19 @@
-"""Table and stages together, by damped Gauss-Newton steps on the error of the inverse.
+"""Fit of a generalised Duhem operator, by damped Gauss-Newton steps on the error of its inverse.
 
-The inverse is what is fitted: fed with the measured displacement, it is to give the field that the
-command leaves. It forgets, as the loops do, so that an error of one place does not run on through
-all the rest; and its fields depend on the table by the same equation, with the same forgetting.
+The inverse maps the measured displacement to the effective field. It has fading memory, so that a
+local error of the table does not affect all later samples.
 """
 
-import math
 from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
-from hilctl.base.errors import DataError
 from hilctl.base.types import F64, I64
-from hilctl.identify.data.records import History, SteadyLoop
 from hilctl.identify.field.densities import Curve
 from hilctl.identify.field.design_matrix import chosen
-from hilctl.identify.field.preprocess import OFF, Prepared
-from hilctl.identify.field.stages import Physical
-from hilctl.identify.fit_api import FitJob, FoundModel, OnProgress
-from hilctl.identify.generalised_duhem.tables import (
+from hilctl.identify.field.duhem_tables import (
     FIRST,
     HIGHEST,
     LOWEST,
@@ -33,30 +26,32 @@ from hilctl.identify.generalised_duhem.tables import (
     laid_over,
     prior,
 )
+from hilctl.identify.field.preprocess import OFF, Prepared, histories_of
+from hilctl.identify.field.stages import Physical
+from hilctl.identify.fit_api import FitJob, FoundModel, OnProgress
 from hilctl.identify.parallel import parallel_map
 from hilctl.kernels.generalised_duhem import duhem_columns
 from hilctl.models.generalised_duhem import GeneralisedDuhemModel
-from hilctl.models.linear_stages import FirstMode
 from hilctl.models.staged import StagedModel
 
-COARSE_WAY, FINE_WAY = 0.03, 0.02  # of the span: furthest way between two points of a path
+COARSE_WAY, FINE_WAY = 0.03, 0.02  # maximum distance of two points of a path, of the span
 COARSE_ROWS, FINE_ROWS = 4000, 7000
 COARSE = (12, 8)  # cells of the first table
-FIRM, FIRMER = 100.0, 3000.0  # times the prior: for the first table, and for the first steps
-TABLE_ALONE = 3  # first steps, with the stages as they are
+FIRM, FIRMER = 100.0, 3000.0  # factors of the prior: for the first table, for its first steps
+TABLE_ALONE = 3  # first steps, with constant stages
 STEPS_COARSE, STEPS_FINE = 18, 8
-COARSE_GAIN, FINE_GAIN = 3e-2, 3e-3  # of the error's square in a step: less ends the search
-SHORT_GAIN = 0.03  # of these, for a step that was not the first to be tried
+COARSE_GAIN, FINE_GAIN = 3e-2, 3e-3  # relative gain of a step that ends the search
+SHORT_GAIN = 0.03  # factor of the gain, if the damping of the step was raised
 TRIALS = 7
 FIRST_DAMPING, LEAST_DAMPING = 1e-4, 1e-9
-REFUSED_DAMPING = 1e-5  # after a step that did not lessen the error, at least
-DIFFERENCE = 0.2  # of a stage's step, for its slope
-HELD = 1e-3  # weight of a stage's way from where it began, percent of the stroke for a step
+REFUSED_DAMPING = 1e-5  # minimum after a rejected step
+DIFFERENCE = 0.2  # step of numerical derivatives, of the step of a stage
+HELD = 1e-3  # penalty of the change of a stage, percent of the stroke per step
 
 
 @dataclass(frozen=True, slots=True)
 class DuhemEnd:
-    """What was found.
+    """End of a search, from which another search can start.
 
     Attributes:
         known: The stages.
@@ -76,7 +71,7 @@ class DuhemEnd:
 
 
 class DuhemSearch:
-    """Table and stages.
+    """Search of table and stages.
 
     Args:
         data: The records.
@@ -93,14 +88,14 @@ class DuhemSearch:
         self._log_range = float(np.log(least)), float(mean + STEEPEST)
 
     def find(self, progress: OnProgress) -> DuhemEnd:
-        """Search with a coarse table, then with one of the size that is wanted."""
+        """Search with a coarse table, then with the requested size."""
         x = FIRST.copy()
         paths = self._chosen(x, COARSE_WAY, COARSE_ROWS)
         self._lay(laid_over(paths, *COARSE))
         self._first_um = self._rest_um(paths[0])
         logs = self._layout.first_logs()
-        # Long steps with little to hold them take what few loops reach to where no other step
-        # leads it back from: slopes of a tenth of their neighbours', with a field along the edge.
+        # Without a strong prior, first steps bring slopes that few loops reach to extreme values,
+        # from which the search does not return.
         self._hold(FIRMER)
         x, logs = self._descend(x, logs, TABLE_ALONE, 0.0, stages=False)
         progress(0.1, "a coarse table")
@@ -110,7 +105,7 @@ class DuhemSearch:
         return self._end(x, logs, self._layout)
 
     def go_on(self, end: DuhemEnd) -> DuhemEnd:
-        """Return where a search leads that begins where one of another table or data ended."""
+        """Return the end of a search from the end of one with another table or data."""
         x = self._signals.row_of(end.known, end.x)
         path = self._chosen(x, COARSE_WAY, COARSE_ROWS)[0]
         self._layout = end.layout
@@ -119,7 +114,7 @@ class DuhemSearch:
         return self._end(x, end.logs, end.layout)
 
     def _end(self, x: F64, logs: F64, before: Layout) -> DuhemEnd:
-        """Follow a table of the size that is wanted down, from one of another."""
+        """Search with a table of the requested size, from another table."""
         self._lay(laid_over(self._chosen(x, FINE_WAY, FINE_ROWS), *self._size))
         x, logs = self._descend(x, self._layout.moved(logs, before), STEPS_FINE, FINE_GAIN)
         offset_um = self._signals.offset_um(x, self._first_um)
@@ -139,11 +134,11 @@ class DuhemSearch:
         self._smooth = self._prior = rows.T @ rows
 
     def _hold(self, times: float) -> None:
-        """Hold neighbouring slopes alike by so many times what the table itself is held by."""
+        """Multiply the prior by a factor."""
         self._prior = times * self._smooth
 
     def _rest_um(self, path: Path) -> float:
-        """Return the displacement at no field, by the first point and the centre line."""
+        """Return the displacement at zero field, from the first point and the centre line."""
         layout = self._layout
         ends = np.interp([path.field[0], 0.0], layout.centre, layout.nodes_um)
         return float(path.displacement_um[0] + ends[1] - ends[0])
@@ -151,7 +146,7 @@ class DuhemSearch:
     def _descend(
         self, x: F64, logs: F64, most: int, enough: float, *, stages: bool = True
     ) -> tuple[F64, F64]:
-        """Take steps until there are ``most``, or a whole one gains no more than ``enough``."""
+        """Take up to ``most`` steps, until the relative gain is at most ``enough``."""
         errors, damping = self._errors(x, logs), FIRST_DAMPING
         cost = self._cost(x, logs, errors)
         for _ in range(most):
@@ -170,7 +165,7 @@ class DuhemSearch:
                 break
             gained = 1.0 - to_cost / cost
             x, logs, errors, cost = to_x, to_logs, to_errors, to_cost
-            # A short step, after others that did not do, says little of how much there is to gain.
+            # The gain of a short step, after rejected ones, does not tell what is left to gain.
             if gained <= (enough if damping == first else SHORT_GAIN * enough):
                 break
             damping = max(0.1 * damping, LEAST_DAMPING)
@@ -186,11 +181,11 @@ class DuhemSearch:
         return float(errors @ errors + held + HELD**2 * np.sum(((x - FIRST) / STEPS) ** 2))
 
     def _normal(self, x: F64, logs: F64, errors: F64, *, stages: bool) -> tuple[F64, F64]:
-        """Return the normal equations of a step, table first, and the way down."""
+        """Return the normal equations of a step (table first, then stages)."""
         size = logs.size
         slopes = np.empty((errors.size, size + (len(NAMES) if stages else 0)))
         self._errors(x, logs, slopes[:, :size])
-        for k in reversed(range(size, slopes.shape[1])):  # the offset first: signals stay the same
+        for k in reversed(range(size, slopes.shape[1])):  # the offset first: paths are still cached
             there, stage = x.copy(), k - size
             step = DIFFERENCE * STEPS[stage]
             there[stage] += step if x[stage] + step <= HIGHEST[stage] else -step
@@ -205,16 +200,16 @@ class DuhemSearch:
         return normal, down
 
     def _errors(self, x: F64, logs: F64, slopes: F64 | None = None) -> F64:
-        """Return weighted errors in percent of the stroke, over the square root of their number.
+        """Return weighted errors in percent of the stroke over the square root of their number.
 
         Args:
             x: The stages.
             logs: float64[2, k, l].
-            slopes: float64[N, 2 k l], filled with what the errors grow by with these.
+            slopes: float64[N, 2 k l], filled with the derivatives by the logarithms.
         """
         layout = self._layout
         start_um = self._signals.offset_um(x, self._first_um)
-        flux = np.arange(layout.centre.size, dtype=np.float64)  # of which nothing here depends
+        flux = np.arange(layout.centre.size, dtype=np.float64)  # not used by the inverse
         band = layout.band(logs, flux)
         to_percent = 100.0 / self._stroke_um / np.sqrt(self._rows.scale.size)
         middles = layout.nodes_um[:-1] + 0.5 * layout.cell_um
@@ -239,10 +234,9 @@ class DuhemSearch:
 
 
 def _bounded_step(normal: F64, down: F64, damping: float, table: int, x: F64) -> F64 | None:
-    """Return the step of damped normal equations, with stages that it would take too far held.
+    """Return the step of damped normal equations, with stages limited to their bounds.
 
-    None where the damping is too little for one: far from any solution, errors are so large that
-    rounding hides what holds the table.
+    None if the damping is too small: rounding of large errors may exceed the prior.
     """
     damped = normal.copy()
     damped[np.diag_indices_from(damped)] += damping
@@ -267,31 +261,23 @@ def _step_within(damped: F64, down: F64, table: int, x: F64) -> F64:
     return step
 
 
-POINTS = 45  # samples that are left of the fastest cycle; a table has no thresholds to turn on
+POINTS = 45  # samples kept of the fastest cycle
 
 
 def fit_generalised_duhem(job: FitJob) -> FoundModel:
     """Fit a table of slopes, losses, structure and delay.
 
     Raises:
-        DataError: There are steady loops among the data: how a loop came to lie where it lies is
-            what tells the slopes inside the band from each other.
+        DataError: A record is a steady loop: slopes inside the band follow from the path to loops.
     """
-    loops = [record.label for record in job.data.records if isinstance(record, SteadyLoop)]
-    if loops:
-        raise DataError(
-            f"slopes all over a band are found from whole histories, not from steady loops:"
-            f" {loops[0]}; configs/identify_any.yaml is a campaign for it, --model staged takes"
-            " loops"
-        )
-    data = Prepared([r for r in job.data.records if isinstance(r, History)], POINTS, OFF)
+    data = Prepared(histories_of(job.data.records, "a table of slopes"), POINTS, OFF)
     settings = job.settings
     search = DuhemSearch(data, settings.cells, settings.across, job.least)
     if isinstance(job.start, DuhemEnd):
         found = search.go_on(job.start)
     else:
         found = search.find(job.progress)
-    parameters = _parameters(found)
+    parameters = found.known.parameters(found.offset_um)
     numbers = found.logs.size + len(NAMES)
     return FoundModel(_model(job, found), numbers, parameters, end=found)
 
@@ -310,18 +296,4 @@ def _model(job: FitJob, found: DuhemEnd) -> StagedModel:
         losses=known.losses,
         **job.data.common(found.offset_um),
     )
-    structure = FirstMode(
-        natural_hz=0.5 / (math.pi * known.radian_s), damping_ratio=known.damping_ratio
-    )
-    return StagedModel.around(hysteresis, structure=structure, delay_s=known.delay_s)
-
-
-def _parameters(found: DuhemEnd) -> dict[str, float]:
-    known = found.known
-    return {
-        **known.losses.model_dump(),
-        "natural_hz": 0.5 / (math.pi * known.radian_s),
-        "damping_ratio": known.damping_ratio,
-        "delay_s": known.delay_s,
-        "output_offset_um": found.offset_um,
-    }
+    return StagedModel.around(hysteresis, structure=known.structure, delay_s=known.delay_s)

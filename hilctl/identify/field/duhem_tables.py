@@ -1,4 +1,4 @@
-"""Stages in a row for the search, and the field and displacement that they leave of a record."""
+"""Tables of slopes of the generalised Duhem operator, and the signals that they are fitted to."""
 
 import math
 from collections.abc import Sequence
@@ -29,8 +29,8 @@ STAGES = ("field", "output", "decay", "growth", "bend", "excess", "radian", "dam
 POWERS = np.arange(1.0, 5.0)
 FLUX = slice(len(STAGES), len(STAGES) + POWERS.size)
 NAMES = (*STAGES, *(f"flux_{power:g}" for power in POWERS), "offset")
-"""Of the row; the flux is exp(flux_1 n + flux_2 n^2 + ...) steep, n from -1 to 1 over the stroke,
-and the offset, in half strokes, is of the displacement at rest from what the first samples say."""
+"""Search variables. The slope of the flux is exp(flux_1 n + flux_2 n^2 + ...), n from -1 to 1 over
+the stroke; the offset of the displacement at rest is relative to a first guess, in half strokes."""
 _FLUX, _OFFSET = 2.0, 0.5  # bounds
 _FLUX_NODES = 33
 
@@ -43,19 +43,19 @@ def _row(stages: Stages, flux: float, offset: float) -> F64:
 LOWEST = _row(LOW, -_FLUX, -_OFFSET)
 HIGHEST = _row(HIGH, _FLUX, _OFFSET)
 STEPS = _row(STEP, 0.05, 0.005)
-# Rods conduct. From a start with nearly no eddy currents, the lag of the field took their place for
-# good: where they are 0 nothing says how the flux goes, and so nothing brings them back.
+# The start has eddy currents: without them the flux has no influence, and the lag of the field
+# would replace them.
 FIRST = _row(Stages(field=0.05, output=0.08, decay=0.005), 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Path:
-    """What is left of a record: points far enough apart, and all turning points.
+    """Points of a record, with all turning points.
 
     Attributes:
         field: float64[n], w.
         displacement_um: float64[n], y before structure and delay.
-        motion: How the record moves, at these points.
+        motion: Motion of the record at these points.
     """
 
     field: F64
@@ -64,11 +64,7 @@ class Path:
 
 
 class Signals:
-    """Field and displacement of all records.
-
-    Args:
-        data: The records.
-    """
+    """Field and displacement of all records."""
 
     def __init__(self, data: Prepared) -> None:
         self._data = data
@@ -80,12 +76,12 @@ class Signals:
         self._half_um = 0.5 * float(np.ptp(measured))
 
     def known(self, x: F64) -> Physical:
-        """Return the stages of a row in s, um and the unit of the command."""
+        """Return the stages of a row in physical units."""
         given = dict(zip(STAGES, x.tolist(), strict=False))
         return physical(replace(Stages(), **given), self._data)
 
     def flux(self, x: F64) -> Curve:
-        """Return the flux of a row, in um, by the displacement."""
+        """Return the flux of a row, in um, by displacement."""
         place = np.linspace(-1.0, 1.0, _FLUX_NODES)
         steep = np.exp(place[:, None] ** POWERS @ x[FLUX])
         flux = np.concatenate(([0.0], np.cumsum(steep[1:] + steep[:-1])))
@@ -93,15 +89,15 @@ class Signals:
         return Curve(flux, self._middle_um + self._half_um * place)
 
     def offset_um(self, x: F64, first_um: float) -> float:
-        """Return the displacement at rest, from a first guess and what a row adds to it."""
+        """Return the displacement at rest of a row, from a first guess."""
         return first_um + float(x[-1]) * self._half_um
 
     def offset_in(self, offset_um: float, first_um: float) -> float:
-        """Undo :meth:`offset_um`: return what a row holds; within its bounds."""
+        """Undo :meth:`offset_um`, clipped to the bounds."""
         return float(np.clip((offset_um - first_um) / self._half_um, -_OFFSET, _OFFSET))
 
     def row_of(self, known: Physical, other: F64) -> F64:
-        """Return a row of stages, its flux and its offset as in one of other records."""
+        """Return a row of stages, with flux and offset of another row."""
         stages = stages_of(known, self._data)
         return np.array([*(getattr(stages, name) for name in STAGES), *other[len(STAGES) :]])
 
@@ -119,7 +115,7 @@ class Signals:
         self._paths = Latest()
 
     def paths(self, x: F64) -> list[Path]:
-        """Return what a row leaves of each record: not to be changed, nor does the offset do so."""
+        """Return the paths of all records; cached, so do not change them."""
         return self._paths.of(x[:-1].tobytes(), lambda: self._left(x))
 
     def _left(self, x: F64) -> list[Path]:
@@ -136,13 +132,13 @@ class Signals:
         return parallel_map(lambda run: signals(run, known, flux, span), self._data.runs)
 
 
-MARGIN = 0.02  # of the stroke: room of the table beyond what the data reach
-WIDER = 1.1  # band, of what the data take up
+MARGIN = 0.02  # of the stroke: margin of the table beyond the data
+WIDER = 1.1  # width of the band, of that of the data
 BINS = 60
-FLATTEST = 0.02  # slope of the centre, of its mean
-TILT = 0.6  # a first guess: logarithm of the slope, from the centre to the edge of the band
+FLATTEST = 0.02  # minimum slope of the centre, of its mean
+TILT = 0.6  # first guess: change of the logarithm of the slope from centre to edge
 BENT, TILTED = 0.009, 0.0016  # weights of second and first differences, percent of the stroke
-SHORTEST = 0.125  # of a cell: steps of a search
+SHORTEST = 0.125  # of a cell: minimum step of a search
 STEEPEST = 5.0  # logarithm of the largest slope, of the mean
 
 
@@ -185,18 +181,18 @@ class Layout:
         slopes, steps, lines, grid = band_of(
             np.exp(logs), lines, self.lowest_um, self.cell_um, self.half_width
         )
-        # A search needs no inverse, so that steps may be longer than those of a model.
+        # A search needs no inverse, so its steps may be longer.
         return slopes, np.maximum(steps, SHORTEST * self.cell_um), lines, grid
 
     def first_logs(self) -> F64:
-        """Return slopes that bring every loop towards the edges: float64[2, k, l]."""
+        """Return a first guess of the logarithms: slopes towards the edges: float64[2, k, l]."""
         middles = self.nodes_um[:-1] + 0.5 * self.cell_um
         mean = np.log(np.interp(self.nodes_um, middles, self.slopes))[:, None]
         tilt = TILT * np.linspace(-1.0, 1.0, self.across)
         return np.stack([mean + tilt - 0.4 * TILT, mean - tilt - 0.4 * TILT])
 
     def moved(self, logs: F64, other: "Layout") -> F64:
-        """Return the logarithms that a table of another layout has at the nodes of this one."""
+        """Interpolate a table of another layout at the nodes of this one."""
         y = np.clip(self.nodes_um, other.nodes_um[0], other.nodes_um[-1])
         shift = self.centre - np.interp(y, other.nodes_um, other.centre)
         across = np.clip(
@@ -208,13 +204,7 @@ class Layout:
 
 
 def laid_over(paths: Sequence[Path], cells: int, across: int) -> Layout:
-    """Lay a table over what paths take up.
-
-    Args:
-        paths: The paths.
-        cells: Cells of y.
-        across: Cells across the band.
-    """
+    """Return a layout over the range of paths, with cells of y and across the band."""
     w = np.concatenate([path.field for path in paths])
     y = np.concatenate([path.displacement_um for path in paths])
     edges = np.linspace(float(y.min()), float(y.max()), BINS + 1)
@@ -235,7 +225,7 @@ def laid_over(paths: Sequence[Path], cells: int, across: int) -> Layout:
 
 
 def _extended(x: F64, knots: F64, values: F64) -> F64:
-    """Return a line through points whose ends go on as over a twentieth of them."""
+    """Interpolate points; extrapolate by the slope over a twentieth of them."""
     inside = np.interp(x, knots, values)
     some = max(1, knots.size // 20)
     first = (values[some] - values[0]) / (knots[some] - knots[0])
@@ -245,7 +235,7 @@ def _extended(x: F64, knots: F64, values: F64) -> F64:
 
 
 def prior(layout: Layout) -> F64:
-    """Return rows that hold neighbouring logarithms alike: float64[K, 2 k l]."""
+    """Return rows of the smoothness prior: float64[K, 2 k l]."""
     shape = 2, layout.centre.size, layout.across
     nodes = np.eye(math.prod(shape)).reshape(*shape, -1)
     parts = [

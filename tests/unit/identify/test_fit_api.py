@@ -1,10 +1,9 @@
-"""The data that a fit is made on."""
+"""Data and jobs of a fit."""
 
 import pytest
 
 from hilctl.base.errors import DataError
-from hilctl.identify.fit_api import LEAST_SLOPE, FitJob
-from hilctl.identify.fit_data import FitData
+from hilctl.identify.fit_api import LEAST_SLOPE, FitData, FitJob
 from hilctl.identify.settings import FitSettings
 from hilctl.models.plays import PpiModel
 

@@ -1,1 +1,0 @@
-"""Fit of the generalised Duhem operator to whole histories."""

@@ -1,1 +1,0 @@
-"""Fits of other models of the literature."""
