@@ -258,3 +258,20 @@ class DacDevice(ABC):
         unit = self._info.command_unit
         rule = f"{name} must be in [{self._low:g}, {self._high:g}] {unit}"
         return self._error(self._action, f"{rule}, got {command[index]} {unit}, nothing was sent")
+
+
+def check_fifo(block: int, fifo_blocks: int, depth: int) -> None:
+    """Raise DeviceError if ``fifo_blocks`` + 1 blocks do not fit into a FIFO of ``depth``."""
+    need = (fifo_blocks + 1) * block
+    if need > depth:
+        most = depth // block - 1
+        hint = f"at most {most} with this block" if most > 0 else "take smaller blocks"
+        rule = f"fifo_blocks + 1 blocks must fit into the FIFO, {depth} samples"
+        raise DeviceError(f"{rule}, got {need} ({hint})")
+
+
+def check_next(first_sample: int, expected: int) -> None:
+    """Raise DeviceError unless a block follows the last one."""
+    if first_sample != expected:
+        rule = f"samples must follow one another, {expected} is next"
+        raise DeviceError(f"{rule}, got {first_sample}: open again to start at 0")

@@ -8,12 +8,13 @@ command = gain * output + offset, displacement = sensitivity * input + offset.
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, Self, TypeAlias, TypeVar
 
+import numpy as np
 from pydantic import Field, model_validator
 
 from hilctl.base.device import DeviceInfo, DeviceOptions
 from hilctl.base.errors import InputError
 from hilctl.base.strict import StrictModel
-from hilctl.base.types import CommandUnit
+from hilctl.base.types import F64, CommandUnit
 from hilctl_drivers.profile import ProfileName
 from hilctl_drivers.profile_base import Range, Watchdog
 from hilctl_drivers.transport.wire_time import RateLimit
@@ -248,6 +249,11 @@ class SignalChain:
         """Return the output value of a command."""
         return (command - self._offset) / self._gain
 
+    def outputs(self, command: F64) -> F64:
+        """Return the output values of a block of commands."""
+        values: F64 = (command - self._offset) / self._gain
+        return values
+
     def command(self, output: float) -> float:
         """Return the command of an output value."""
         return output * self._gain + self._offset
@@ -255,6 +261,11 @@ class SignalChain:
     def displacement_um(self, value: float) -> float:
         """Return the displacement of an input value, um."""
         return value * self._um_per_unit + self._offset_um
+
+    def fill_um(self, values: F64, displacement_um: F64) -> None:
+        """Fill in the displacements of a block of input values, um."""
+        np.multiply(values, self._um_per_unit, out=displacement_um)
+        displacement_um += self._offset_um
 
     def info(self, name: str, options: DacOptions, rates: RateLimit, **more: Any) -> DeviceInfo:
         """Return what a device is and what it accepts.

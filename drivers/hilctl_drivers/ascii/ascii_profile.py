@@ -224,7 +224,6 @@ class AsciiProfile(BaseProfile):
     """A device that speaks lines of text."""
 
     DEVICE: ClassVar[str] = "serial_dac"
-    WIRE: ClassVar[str] = "hilctl_drivers.ascii.ascii_wire:AsciiWire"
 
     link: AsciiLink
     address: int | Literal["none"] = Field(description="device address as shipped, for {address}")
@@ -259,3 +258,8 @@ class AsciiProfile(BaseProfile):
                         f"errors: {error.pattern!r} matches the good reply of outputs.{name}"
                     )
         return self
+
+    @property
+    def driver(self) -> str:
+        """See :attr:`~hilctl_drivers.profile_base.BaseProfile.driver`."""
+        return "hilctl_drivers.ascii.ascii_dac:AsciiDac"

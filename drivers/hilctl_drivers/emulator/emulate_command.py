@@ -24,7 +24,7 @@ from hilctl_drivers.labjack.modbus_stream import ModbusStreamOptions
 from hilctl_drivers.modbus.config import ModbusReaderOptions
 from hilctl_drivers.modbus.modbus_profile import ModbusProfile
 from hilctl_drivers.profile import NamedProfile, load_profile
-from hilctl_drivers.serial.serial_wire import SerialOptions
+from hilctl_drivers.serial_dac import SerialOptions
 from hilctl_drivers.signal_chain import DacOptions, ReaderOptions
 
 _UNPRIVILEGED = 1024

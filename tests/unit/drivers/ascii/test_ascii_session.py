@@ -5,10 +5,10 @@ from pathlib import Path
 import pytest
 
 from hilctl.base.errors import DeviceError
+from hilctl_drivers.ascii.ascii_dac import AsciiDac
 from hilctl_drivers.ascii.ascii_session import AsciiSession, exchange_time, feed_time
-from hilctl_drivers.ascii.ascii_wire import AsciiWire
 from hilctl_drivers.profile import load_profile, with_link
-from hilctl_drivers.serial.serial_wire import SerialOptions, SerialSetup
+from hilctl_drivers.serial_dac import SerialOptions
 from hilctl_drivers.transport.links import (
     CorruptError,
     MismatchError,
@@ -204,7 +204,7 @@ def serial_rates(path, watchdog):
         "sensor": {"um_per_v": 10.0},
         "watchdog": watchdog,
     }
-    return AsciiWire(SerialSetup.of(SerialOptions.model_validate(options))).rates(1)
+    return AsciiDac(SerialOptions.model_validate(options)).info
 
 
 def test_serial_dac_leaves_room_for_feeding(tmp_path):
@@ -212,9 +212,9 @@ def test_serial_dac_leaves_room_for_feeding(tmp_path):
     path = tmp_path / "reader.yaml"
     path.write_text(READER)
     bare, fed = serial_rates(path, "none"), serial_rates(path, {"timeout_s": 1.0})
-    assert 1.0 / fed.highest_hz - 1.0 / bare.highest_hz == pytest.approx(4 * CHAR_S)
-    assert "to feed the watchdog: request" in fed.note
-    assert "to feed" not in bare.note
+    assert 1.0 / fed.max_rate_hz - 1.0 / bare.max_rate_hz == pytest.approx(4 * CHAR_S)
+    assert "to feed the watchdog: request" in fed.rate_note
+    assert "to feed" not in bare.rate_note
 
 
 def test_settling_is_told():

@@ -14,11 +14,10 @@ from hilctl.loop.limiter import CommandLimits
 from hilctl.loop.loop import Loop
 from hilctl.loop.pacer import SystemClock
 from hilctl.loop.plan import LoopPlan
-from hilctl_drivers.board.board_wire import exchange_time
+from hilctl_drivers.board.board_dac import exchange_time
 from hilctl_drivers.emulator.options import EmulatorOptions, parse_fault
 from hilctl_drivers.profile import load_profile, shipped_profiles, with_link
-from hilctl_drivers.serial.serial_dac import SerialDac
-from hilctl_drivers.serial.serial_wire import SerialOptions
+from hilctl_drivers.serial_dac import SerialDac, SerialOptions
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 from hilctl_drivers.transport.framing import binary_framing
 from tests.fakes import FakeHost, ShiftedClock, emulated, logged, made_safe
@@ -81,7 +80,7 @@ def board(tmp_path):
 
     yield of
     for made, served in stack:
-        made.device.wire.release()
+        made.device._release()
         served.__exit__(None, None, None)
 
 
@@ -122,7 +121,7 @@ def test_the_board_keeps_the_pace(board):
     start = time.monotonic()
     driven.hold(1.0, 10)
     assert time.monotonic() - start > 0.9 * 10 * BLOCK / RATE_HZ
-    assert driven.device.wire.fifo_level_min > BLOCK  # a busy machine takes some for itself
+    assert driven.device.fifo_level_min > BLOCK  # a busy machine takes some for itself
 
 
 def test_a_stall_of_this_machine_costs_fifo_and_no_sample(board):
