@@ -27,20 +27,20 @@ def test_a_reader_that_speaks_otherwise_needs_a_line_of_its_own(tmp_path):
     text = Path(DCON).read_text().replace("checksum: dcon", "checksum: none")
     (tmp_path / "plain.yaml").write_text(text)
     reader = {"profile": str(tmp_path / "plain.yaml"), "unit_id": 3}
-    with pytest.raises(InputError, match=r"can't share the line of .* give reader.serial_port"):
+    with pytest.raises(InputError, match=r"share the line.*reader\.serial_port"):
         device(reader=reader)
     assert device(reader={**reader, "serial_port": "/dev/y"}).block_max == 1
 
 
 def test_a_board_is_no_reader_of_text():
     reader = {"profile": "cobs_board", "serial_port": "/dev/y"}
-    with pytest.raises(InputError, match="reader is for devices that speak lines of text"):
+    with pytest.raises(InputError, match="reader is for"):
         device(reader=reader, input="ADC")
 
 
 def test_what_measures_the_output_is_an_input_that_says_so():
     assert not device().measures
-    with pytest.raises(InputError, match=r"must be an input .* got 'AI0' \(it has none\)"):
+    with pytest.raises(InputError, match=r"measure.*'AI0'"):
         device(measure="AI0")
 
 

