@@ -11,9 +11,9 @@ from hilctl_drivers.ascii.ascii_session import (
     arm_s,
     exchange_time,
     feed_time,
+    parse_number,
     query_time,
 )
-from hilctl_drivers.ascii.lines import parse_number
 from hilctl_drivers.profile_base import Range
 from hilctl_drivers.serial_dac import SerialDac, SerialSetup
 from hilctl_drivers.transport.links import WatchdogTrippedError, naming

@@ -5,7 +5,7 @@ from typing import Protocol
 
 from hilctl.base.errors import InputError
 from hilctl_drivers.emulator.registers import NoSuchRegister, RegisterMap, Words
-from hilctl_drivers.emulator.rig import Rig, SimulatedWiring, WriteLog
+from hilctl_drivers.emulator.rig import Rig, SimulatedWiring, WatchdogTimer, WriteLog
 from hilctl_drivers.modbus.modbus_profile import ModbusProfile, ModbusWatchdog
 from hilctl_drivers.modbus.register_map import EnsureStep, ModbusStep, RegisterStep, WriteStep
 
@@ -13,7 +13,7 @@ Target = tuple[Words, list[int] | None]
 """A value and the words that trigger something; None stands for any words but zeros."""
 
 
-class EmulatedWatchdog:
+class EmulatedWatchdog(WatchdogTimer):
     """Trips when the host has been silent for the timeout.
 
     It is armed by the last of the profile's arm steps and disarmed by the last of the disarm steps,
@@ -25,6 +25,7 @@ class EmulatedWatchdog:
     """
 
     def __init__(self, profile: ModbusWatchdog, words: dict[int, Words]) -> None:
+        super().__init__()
         self._profile = profile
         self._arm = _last(profile.arm, words)
         self._disarm = _last(profile.disarm, words)
@@ -33,9 +34,7 @@ class EmulatedWatchdog:
         self._timeout = next(
             (words[id(s)] for s in profile.arm if getattr(s, "value", "") == "timeout"), None
         )
-        self._fed_ns = 0
         self.armed = False
-        self.tripped = False
 
     @property
     def timeout_s(self) -> float:
@@ -48,10 +47,9 @@ class EmulatedWatchdog:
 
     @property
     def due_ns(self) -> int | None:
-        """When it will trip if nothing comes, or None."""
-        if not self.armed or self.tripped:
-            return None
-        return self._fed_ns + round(self.timeout_s * 1e9)
+        """See :attr:`WatchdogTimer.due_ns`; the timeout is in a register."""
+        self.timeout_ns = round(self.timeout_s * 1e9) if self.armed else 0
+        return super().due_ns
 
     def request(self, now_ns: int) -> None:
         """Note that a request has come."""
@@ -66,13 +64,13 @@ class EmulatedWatchdog:
             self.armed = False
         if self._arm is not None and self._arm[0] is target:  # any other value there stops it
             self.armed = _hit(self._arm, target) and self.timeout_s > 0.0
-            self._fed_ns = now_ns
+            self.fed_ns = now_ns
         if _hit(self._clear, target):
             self.tripped = False
-            self._fed_ns = now_ns
+            self.fed_ns = now_ns
 
     def _fed(self, now_ns: int) -> None:
-        self._fed_ns = now_ns
+        self.fed_ns = now_ns
         if not self._profile.clear:  # nothing else could end the trip
             self.tripped = False
 
@@ -195,15 +193,14 @@ class EmulatedModbus:
             if name == self._output:
                 if value is None or current_a is not None:
                     value = ((current_a or 0.0) - self.wiring.offset_a) / self.wiring.gain_a
-                self._rig.put_out(self.wiring.gain_a * value + self.wiring.offset_a, 0)
+                self._rig.put_out(self.wiring.current_a(value), 0)
             if value is not None:
                 words.value = value
 
     def tick(self, now_ns: int) -> None:
         """Let time pass; the watchdog may trip on the way."""
-        due_ns = self._watchdog.due_ns if self._watchdog else None
-        if self._watchdog is not None and due_ns is not None and due_ns <= now_ns:
-            self._watchdog.tripped = True
+        due_ns = self._watchdog.trip(now_ns) if self._watchdog else None
+        if due_ns is not None:
             self._trip(due_ns)
         self._now_ns = max(self._now_ns, now_ns)
         if self.overlay is not None:
@@ -307,7 +304,7 @@ class EmulatedModbus:
     def _put_value(self, name: str, value: float, event: str, now_ns: int) -> None:
         more: dict[str, float] = {}
         if name == self._output:
-            self._rig.put_out(self.wiring.gain_a * value + self.wiring.offset_a, now_ns)
+            self._rig.put_out(self.wiring.current_a(value), now_ns)
             more["current_a"] = self._rig.current_a
         unit = self.profile.outputs[name].unit
         self._log.event(now_ns, event, output=name, value=value, unit=unit, **more)
@@ -347,10 +344,9 @@ class EmulatedModbus:
 
     def _measure(self) -> None:
         if self._sensor is not None:
-            offset_um, sensor_um = self.wiring.offset_um, self.wiring.sensor_um
-            at_terminal = (self._rig.displacement_um - offset_um) / sensor_um
-            low, high = self.profile.inputs[self._sensor].limits
-            self._inputs[self._sensor].value = min(max(at_terminal, low), high)  # as an ADC does
+            channel = self.profile.inputs[self._sensor]
+            value = float(self.wiring.at_terminal(self._rig.displacement_um, channel))
+            self._inputs[self._sensor].value = value
         watchdog = self.profile.watchdog
         if watchdog != "none" and watchdog.tripped != "none":
             self._steps[id(watchdog.tripped)].words[-1] = watchdog.tripped.mask * self.tripped

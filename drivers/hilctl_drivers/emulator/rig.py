@@ -87,6 +87,16 @@ class SimulatedWiring:
     sensor_um: float
     offset_um: float
 
+    def current_a(self, value: float) -> float:
+        """Return the coil current for an output value."""
+        return self.gain_a * value + self.offset_a
+
+    def at_terminal(self, displacement_um: F64 | float, channel: Range) -> F64:
+        """Return the sensor's signal, clipped to the input's range as by an ADC."""
+        signal = (displacement_um - self.offset_um) / self.sensor_um
+        clipped: F64 = np.clip(signal, *channel.limits)
+        return clipped
+
     @classmethod
     def spread(cls, output: Range, sensor: Range) -> "SimulatedWiring":
         """Return a wiring that spreads the rig's ranges over those of the two channels.
@@ -103,6 +113,28 @@ class SimulatedWiring:
 def _spread(channel: Range, reach: float) -> tuple[float, float]:
     gain = 2.0 * reach / (channel.max - channel.min)
     return gain, -0.5 * gain * (channel.max + channel.min)
+
+
+class WatchdogTimer:
+    """Host watchdog of an emulated device; a ``timeout_ns`` of 0 disarms it."""
+
+    def __init__(self) -> None:
+        self.timeout_ns = 0
+        self.fed_ns = 0
+        self.tripped = False
+
+    @property
+    def due_ns(self) -> int | None:
+        """Time of the next trip without another request; None if disarmed or tripped."""
+        return None if self.tripped or not self.timeout_ns else self.fed_ns + self.timeout_ns
+
+    def trip(self, now_ns: int) -> int | None:
+        """Trip if it is due; return the time of the trip, None without one."""
+        due_ns = self.due_ns
+        if due_ns is None or due_ns > now_ns:
+            return None
+        self.tripped = True
+        return due_ns
 
 
 _BEGIN = b'{"event": '

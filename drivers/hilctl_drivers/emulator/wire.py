@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 from hilctl_drivers.ascii.ascii_profile import AsciiProfile
-from hilctl_drivers.ascii.lines import LineFormat
+from hilctl_drivers.ascii.ascii_session import LineFormat
 from hilctl_drivers.board.board_profile import FrameProfile, FramesLink
 from hilctl_drivers.transport.framing import Splitter, binary_framing
 from hilctl_drivers.transport.links import CorruptError
