@@ -96,7 +96,7 @@ Name: TypeAlias = Annotated[str, StringConstraints(pattern=r"^[A-Za-z][A-Za-z0-9
 class Range(StrictModel):
     """What a channel means at the terminals.
 
-    ``min`` and ``max`` are what the device puts out or takes in, not what its register could hold.
+    ``min`` and ``max`` are what the device outputs or takes in, not what its register could hold.
     """
 
     unit: Literal["V", "A", "mA"] = Field(description="unit of min, max and of the value")

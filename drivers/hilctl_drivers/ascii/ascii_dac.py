@@ -104,7 +104,7 @@ class AsciiDac(SerialDac):
 
     def _arm(self) -> None:
         if self._profile.watchdog != "none" and self._setup.options.watchdog != "none":
-            # The safe value before the time-out: once it counts, it must know where to go.
+            # The safe value before the timeout: once it counts, it must know where to go.
             self._run("safe")
             self._run("arm")
             self._writer.check_errors()  # commands without a reply leave theirs there
@@ -280,7 +280,7 @@ class AsciiDac(SerialDac):
         self._writer.run(steps, timeout=counts, safe=safe)
 
     def _feed(self) -> None:
-        """Feed a watchdog that exchanges don't feed; three times in its timeout."""
+        """Feed a watchdog that exchanges do not feed; three times in its timeout."""
         if not self._feed_every:
             return
         self._ticks += 1
@@ -297,7 +297,7 @@ def _value(source: AsciiInput, number: float) -> float:
 
 
 def _address(wanted: int | None, profile: AsciiProfile) -> int:
-    """Return a device's address on a shared line; 0 where there is none."""
+    """Return a device's address on a shared line; 0 if there is none."""
     if wanted is not None:
         return wanted
     return 0 if profile.address == "none" else profile.address
@@ -307,7 +307,7 @@ def _reader_profile(setup: SerialSetup, profile: AsciiProfile) -> AsciiProfile:
     """Return the profile of the device that has the input, often the same.
 
     Raises:
-        InputError: It speaks no lines of text, or can't share the other's line.
+        InputError: It speaks no lines of text, or cannot share the other's line.
     """
     reader, options = setup.reader, setup.options.reader
     if not isinstance(reader, AsciiProfile):
@@ -322,7 +322,7 @@ def _reader_profile(setup: SerialSetup, profile: AsciiProfile) -> AsciiProfile:
 
 
 def _measuring_input(profile: AsciiProfile, name: str | None, output: Range) -> AsciiInput | None:
-    """Return the input that measures the output itself; None where none is wanted.
+    """Return the input that measures the output itself; None if none is wanted.
 
     Args:
         profile: The device's profile.

@@ -180,7 +180,7 @@ class AsciiSession:
         return template.format(address=self._address, **values)
 
     def line(self, text: str) -> bytes:
-        """Return a line as it stands on the wire."""
+        """Return a line in the form sent on the wire."""
         return self._lines.encode(text)
 
     def send(self, text: str) -> None:
@@ -242,7 +242,7 @@ class AsciiSession:
             self.send(text)
 
     def run(self, steps: Sequence[AsciiStep], **values: float) -> None:
-        """Carry out a profile's steps.
+        """Execute a profile's steps.
 
         Args:
             steps: The steps.
@@ -287,7 +287,7 @@ class AsciiSession:
             raise DeviceError(f"{text} must be answered like {test.example!r}, got {reply!r}")
 
     def tripped(self) -> bool:
-        """Return whether the host watchdog says that it has tripped; no where it can't say."""
+        """Return whether the host watchdog says that it has tripped; no if it cannot say."""
         watchdog = self._profile.watchdog
         if watchdog == "none" or watchdog.tripped == "none":
             return False
@@ -340,7 +340,7 @@ class AsciiSession:
 
 
 Line: TypeAlias = tuple[str, str | None]
-"""What is sent, and an example of its reply; None where it is not answered."""
+"""What is sent, and an example of its reply; None if it is not answered."""
 
 _CHECKSUM_CHARS = {"none": 0, "dcon": 2, "gen": 3}
 
@@ -383,7 +383,7 @@ def query_time(profile: AsciiProfile, query: AsciiInput, address: int, what: str
         profile: The device that is asked, with the settings of the line that it stands on.
         query: The input that is asked for.
         address: The device's address.
-        what: What it is for, in words.
+        what: What it is for, as text.
     """
     lines = [(query.ask.format(address=address), query.example)]
     return lines_time(profile, lines, query.settle_s).named(what)
@@ -398,7 +398,7 @@ def feed_time(profile: AsciiProfile) -> WireTime | None:
 
 
 def arm_s(profile: AsciiProfile, output: str) -> float:
-    """Return how long arming the device's watchdog takes at most, s; 0 without a watchdog."""
+    """Return the time that arming the device's watchdog takes at most, s; 0 without a watchdog."""
     watchdog = profile.watchdog
     if watchdog == "none":
         return 0.0
@@ -444,7 +444,7 @@ def _step_lines(profile: AsciiProfile, watchdog: AsciiWatchdog, step: AsciiStep)
 
 
 def _steps_time(profile: AsciiProfile, steps: Sequence[AsciiStep]) -> WireTime:
-    """Return how long steps take."""
+    """Return the time that steps take."""
     watchdog = profile.watchdog
     assert watchdog != "none"
     lines = [line for step in steps for line in _step_lines(profile, watchdog, step)]

@@ -1,9 +1,9 @@
-"""A microcontroller board: asked sample by sample, or fed block by block through its FIFO.
+"""``serial_dac`` for microcontroller boards: single samples, or blocks through the board's FIFO.
 
 A board with a FIFO answers a block when all but ``prefill`` of the samples queued so far have been
 put out, and gives back the readings of those. So its clock is the pace; a block's readings come
 ``fifo_blocks`` exchanges after it; and between two exchanges the FIFO holds that many blocks, which
-is how long this machine may stall. The first sample is put out once that many are there.
+is how long this machine may stall. The first sample is output once that many are there.
 """
 
 import numpy as np
@@ -54,7 +54,7 @@ def exchange_time(profile: FrameProfile, block: int = 1) -> WireTime:
 
 
 def arm_s(profile: FrameProfile) -> float:
-    """Return how long a WATCHDOG message and its reply take, s."""
+    """Return the time that a WATCHDOG message and its reply take, s."""
     link = profile.link
     size = next(iter(profile.outputs.values())).format.size
     framing = binary_framing(link.framing, link.crc, link.payload_max)
@@ -65,13 +65,13 @@ def arm_s(profile: FrameProfile) -> float:
 
 
 def settle_s(profile: FrameProfile) -> float:
-    """Return how long output and input take to settle, s."""
+    """Return the time that output and input take to settle, s."""
     channels = (*profile.outputs.values(), *profile.inputs.values())
     return sum(channel.settle_s for channel in channels)
 
 
 def _line(link: FramesLink) -> tuple[float, int, float, str]:
-    """Return time of a byte, number and time of gaps, and the line in words."""
+    """Return time of a byte, number and time of gaps, and the line as text."""
     if not link.usb:
         return link.char_s, 0, 0.0, f"at {link.format}"
     full_speed = link.usb_frame_s >= 1e-3

@@ -32,7 +32,7 @@ class EmulatedBoard:
     Args:
         profile: What it is.
         rig: What it drives sample by sample.
-        log: Where what it puts out goes.
+        log: Where what it outputs goes.
         wiring: Amplifier and sensor between.
         noise: Whether the sensor has noise, when streaming.
     """
@@ -76,7 +76,7 @@ class EmulatedBoard:
         if self._version > 1:
             self._kinds[board.STATE] = self._state
         low, high = self._output.limits
-        # As a board powers up, whatever that is behind its amplifier.
+        # The power-up value is 0 at the terminal, not at the coil.
         current_a = wiring.current_a(min(max(0.0, low), high))
         rig.put_out(current_a, 0)
         self.fifo.current_a = current_a
@@ -87,7 +87,7 @@ class EmulatedBoard:
         return self._timer.tripped
 
     def tick(self, now_ns: int) -> None:
-        """Let time pass; the watchdog may trip on the way."""
+        """Advance the time; the watchdog may trip on the way."""
         due_ns = self._timer.trip(now_ns)
         if due_ns is not None:
             self.fifo.advance(due_ns)
@@ -125,7 +125,7 @@ class EmulatedBoard:
         return self.fifo.played + self.fifo.level
 
     def _values(self, data: bytes, count: int) -> F64:
-        """Return the values of a message, all of them good."""
+        """Return the values of a message, all good."""
         if count < 1 or len(data) != count * self._outputs.size:
             raise _Refuse(Status.BAD_MESSAGE)
         values = self._outputs.decode(data)

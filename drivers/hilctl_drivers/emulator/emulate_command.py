@@ -1,4 +1,4 @@
-"""The command ``hilctl emulate``: serves a profile, or the device of an experiment."""
+"""The command ``hilctl emulate``: emulate a profile, or the device of an experiment."""
 
 import gc
 import shlex
@@ -103,7 +103,7 @@ def wired_experiment(path: Path, port: int = 0, host: str | None = None) -> Wire
         host: Address to listen on; this machine's own where None.
 
     Raises:
-        InputError: The file can't be read, names no device with a profile, or drives with voltage.
+        InputError: The file cannot be read, names no device with a profile, or drives with voltage.
     """
     document, files = load_document(path), TextFiles()
     section = document.data.get("device")

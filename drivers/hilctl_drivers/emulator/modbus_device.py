@@ -112,15 +112,15 @@ class Overlay(Protocol):
         ...
 
     def read(self, address: int, count: int) -> list[int]:
-        """Return register words; raise ``RejectedRequest`` where they can't be read."""
+        """Return register words; raise ``RejectedRequest`` where they cannot be read."""
         ...
 
     def write(self, address: int, values: Sequence[int]) -> None:
-        """Write register words; raise ``RejectedRequest`` where they can't be written."""
+        """Write register words; raise ``RejectedRequest`` where they cannot be written."""
         ...
 
     def tick(self, now_ns: int) -> None:
-        """Let time pass."""
+        """Advance the time."""
         ...
 
     def stop(self, now_ns: int) -> None:
@@ -147,8 +147,8 @@ class EmulatedModbus:
         profile: What it is.
         rig: What it stands at.
         log: Where writes go.
-        output: Output that drives the rig; None where another device does.
-        sensor: Input that shows the displacement; None where another device does.
+        output: Output that drives the rig; None if another device does.
+        sensor: Input that shows the displacement; None if another device does.
         wiring: Amplifier and sensor between; spread over the channels' ranges where None.
         current_a: Current at the start, as if its power-up value had been set so.
 
@@ -198,7 +198,7 @@ class EmulatedModbus:
                 words.value = value
 
     def tick(self, now_ns: int) -> None:
-        """Let time pass; the watchdog may trip on the way."""
+        """Advance the time; the watchdog may trip on the way."""
         due_ns = self._watchdog.trip(now_ns) if self._watchdog else None
         if due_ns is not None:
             self._trip(due_ns)
@@ -208,7 +208,7 @@ class EmulatedModbus:
         self._rig.advance(self._now_ns)
 
     def request(self, now_ns: int) -> None:
-        """Note that a request has come; before it is carried out."""
+        """Note that a request has come; before it is executed."""
         self.tick(now_ns)
         if self._watchdog is not None:
             self._watchdog.request(self._now_ns)
@@ -217,7 +217,7 @@ class EmulatedModbus:
         """Return register words.
 
         Raises:
-            Declined: Not all of them exist.
+            Declined: Not all exist.
         """
         if self.overlay is not None and self.overlay.has(address):
             return self.overlay.read(address, count)
@@ -228,10 +228,10 @@ class EmulatedModbus:
             raise RejectedRequest(2) from None
 
     def write(self, area: str, address: int, values: Sequence[int]) -> None:
-        """Write register words; all of them or none.
+        """Write register words; all or none.
 
         Raises:
-            Declined: Not all of them can be written, a value is beyond its channel's range, or the
+            Declined: Not all can be written, a value is beyond its channel's range, or the
                 watchdog has tripped and the device wants that cleared first.
         """
         if self.overlay is not None and self.overlay.has(address):
@@ -288,7 +288,7 @@ class EmulatedModbus:
         return self.profile.watchdog != "none" and bool(self.profile.watchdog.clear)
 
     def _resume(self) -> None:
-        """Put out what the registers hold, as a device may once its trip is cleared.
+        """Output what the registers hold, as a device may once its trip is cleared.
 
         No document says so of the shipped ones; those that refuse commands until then wait here for
         the next one.
@@ -326,7 +326,7 @@ class EmulatedModbus:
             self._put_value(name, value, "watchdog", due_ns)
 
     def _safe_value(self, name: str, steps: tuple[ModbusStep, ...]) -> float | None:
-        """Return what the safe-value register holds; None where it was not switched on."""
+        """Return what the safe-value register holds; None if it was not switched on."""
         channel = self.profile.outputs[name]
         found: float | None = None
         for step in steps:

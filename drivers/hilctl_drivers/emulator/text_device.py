@@ -1,4 +1,4 @@
-"""An emulated device that speaks lines of text: a profile's templates in front of the rig."""
+"""An emulated device with a text protocol: a profile's templates in front of the rig."""
 
 import re
 from string import Formatter
@@ -44,7 +44,7 @@ class TemplateMatcher:
         self._pattern = re.compile("".join(parts), re.ASCII)
 
     def match(self, text: str) -> dict[str, float] | None:
-        """Return the fields of a line, or None where it is another one."""
+        """Return the fields of a line, or None if it is another one."""
         found = self._pattern.fullmatch(text)
         if found is None:
             return None
@@ -76,10 +76,10 @@ class EmulatedText:
     Args:
         profile: What it is.
         rig: What it drives, or what its sensor stands on.
-        log: Where what it puts out goes.
+        log: Where what it outputs goes.
         wiring: Amplifier and sensor between.
-        output: Output that drives the rig; None where another device does.
-        sensor: Input that shows the displacement; None where another device does.
+        output: Output that drives the rig; None if another device does.
+        sensor: Input that shows the displacement; None if another device does.
         address: Its address.
     """
 
@@ -100,7 +100,7 @@ class EmulatedText:
         self._wiring = wiring
         self._output, self._sensor = output, sensor
         self._address = address
-        # As devices power up, whatever that is behind the amplifier.
+        # The power-up value is 0 at the terminal, not at the coil.
         self._values = {
             name: min(max(0.0, each.min), each.max) for name, each in profile.outputs.items()
         }
@@ -122,7 +122,7 @@ class EmulatedText:
         return self._timer.tripped
 
     def tick(self, now_ns: int) -> None:
-        """Let time pass; the watchdog may trip on the way."""
+        """Advance the time; the watchdog may trip on the way."""
         due_ns = self._timer.trip(now_ns)
         if due_ns is not None:
             self._trip(due_ns)
@@ -130,7 +130,7 @@ class EmulatedText:
         self._rig.advance(self._now_ns)
 
     def answer(self, message: bytes, now_ns: int) -> EmulatedReply | None:
-        """Carry out a line; None where it is for another address."""
+        """Execute a line; None if it is for another address."""
         self.tick(now_ns)
         text = message.decode("ascii", "replace")
         watchdog = self._profile.watchdog

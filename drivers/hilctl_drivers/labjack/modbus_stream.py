@@ -1,9 +1,9 @@
-"""A DAC that plays blocks from the device's own buffer, over Modbus TCP: ``modbus_stream``.
+"""``modbus_stream``: a DAC that plays blocks from the device's own buffer, over Modbus TCP.
 
 LabJack's T4 and T7 put out one value in each scan of their own clock and read the input just before
 (stream-out and stream-in in one scan list). So that clock is the pace, a block's displacements come
 ``fifo_blocks`` exchanges after it, and between two exchanges the buffer holds that many blocks,
-which is how long this machine may stall. The first sample is put out once that many are there.
+which is how long this machine may stall. The first sample is output once that many are there.
 """
 
 import math
@@ -73,7 +73,7 @@ class StreamSetup:
         """Hold options against their profile.
 
         Raises:
-            InputError: They don't go together, or the device can't stream.
+            InputError: They do not fit together, or the device cannot stream.
         """
         base = ModbusSetup.of(options)
         profile = base.writer.profile
@@ -171,7 +171,7 @@ class ModbusStream(DacDevice):
             clock: Monotonic time in s.
 
         Raises:
-            InputError: The profile can't be used, or options don't go with it.
+            InputError: The profile cannot be used, or options do not go with it.
         """
         setup = StreamSetup.of(options)
         writer = setup.base.writer
