@@ -253,13 +253,15 @@ def run_loop(driven, n):
         limits=limits,
         interlocks=InterlockContext(stroke_um=(-100.0, 100.0)),
         late_policy="follow",
+        start_policy="follow",
+        ramp_policy="follow",
     )
     return Loop(plan, driven.device, host).run(host.clock.now_ns()), host
 
 
 def test_a_whole_run_loses_nothing(board):
     """Every sample of the waveform and the ramp is recorded with the displacement it caused."""
-    driven = board(noise=True)
+    driven = board(noise=True, fifo_blocks=30)  # 1.2 s: a busy machine stalls for more than 0.2 s
     outcome, host = run_loop(driven, 5_050)
     assert (outcome.code, outcome.safe, outcome.dropped) == ("completed", True, 0)
     firsts = [head[BlockHeader.FIRST_SAMPLE] for head in host.heads]
