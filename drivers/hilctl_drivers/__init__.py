@@ -1,23 +1,18 @@
-"""Devices that hilctl can drive: simulated rigs, and DACs on a serial line or Modbus.
+"""Devices that hilctl can drive: simulated rigs, and DACs over a serial line or Modbus.
 
-``hilctl`` never imports this package; its registry loads a device by name. Modules here see only
+``hilctl`` never imports this package; its registry loads a device by name. Modules here import only
 ``hilctl.base`` and ``hilctl.kernels``.
 
-contract.py       the contract of devices as pytest checks, for any package
-device.py         the base of every device: range, sizes, rate, safe value, wording
-wiring.py         an experiment's options: place, amplifier, sensor, reader, watchdog
-starter.py        a device section to begin with
-profile.py        profiles of commercial devices, by name or path; profiles/ has them
-profile_parts.py  what all profiles have in common
-wire/             transport of bytes, and how long it takes; independent of protocols
-modbus/           Modbus TCP and RTU; labjack/ streams over it
-text/             lines of text: SCPI, DCON and their like
-board/            framed messages of microcontroller boards
-serial/           the device that text/ and board/ stand behind
-simulated/        simulated rigs
-emulator/         the simulated rig behind the same wires
+device.py, serial_dac.py    bases of devices
+signal_chain.py             options of every DAC: address, amplifier, sensor, reader, watchdog
+profile.py, profile_base.py profiles of commercial devices; the files are in profiles/
+template.py                 device section of a new experiment
+contract.py                 the device contract as tests, for any package
+transport/                  links, framing, wire time
+modbus/  labjack/           Modbus TCP and RTU, and LabJack streaming
+ascii/  board/              text protocols and binary frames, for ``serial_dac``
+simulated/  emulator/       simulated rigs, and the same rigs behind real wires
 
-A protocol folder has ``profile``, its messages (``pdu``, ``frames``, ``lines``), ``session`` (one
-conversation, and how long it takes), and either ``setup`` and ``device``, or ``wire`` for
-``serial_dac``. A new protocol is such a folder whose ``LINK_KINDS`` name its profiles.
+A protocol folder holds profiles, messages, a session and a device. Its ``LINK_KINDS`` registers its
+profiles.
 """

@@ -1,4 +1,4 @@
-"""The contract of devices as pytest checks, for the devices of any package.
+"""The device contract as pytest checks, for the devices of any package.
 
 They send commands up to both ends of the device's range: only for a device that is simulated, or
 wired to an emulator. In a test file of the package::
@@ -39,7 +39,7 @@ class DrivenDevice:
         block: Samples it takes in one exchange.
         rate_hz: A sample rate that it can keep.
         stands: Returns what stands at its output, if possible not by its own word: the emulated
-            device's, or the simulated plant's; None where nothing can tell.
+            device's, or the simulated plant's; None if nothing can tell.
         pass_time: Called before each exchange.
         exchanged: Samples since it was opened.
         name: Its registry name; empty if it has none yet.
@@ -57,7 +57,7 @@ class DrivenDevice:
     must_be_at_rest: ClassVar[bool] = False
     """Whether opening is refused while it puts anything out."""
     reads_back: ClassVar[bool | None] = True
-    """Whether it knows what it puts out; None where that is up to it."""
+    """Whether it knows what it outputs; None if that is up to it."""
 
     def open(self) -> None:
         """Open and arm the device, as a run does; the next sample is the first."""
@@ -225,7 +225,7 @@ def test_use_before_open_and_after_close_is_refused(driven: DrivenDevice) -> Non
 
 
 def test_opening_does_not_move_the_output(driven: DrivenDevice) -> None:
-    """What was put out before stays through closing and opening; simulated ones start at rest."""
+    """What was output before stays through closing and opening; simulated ones start at rest."""
     driven.open()
     driven.exchange(np.full(SAMPLES, driven.middle))
     held, _ = driven.exchange(np.full(SAMPLES, driven.middle))
@@ -237,7 +237,7 @@ def test_opening_does_not_move_the_output(driven: DrivenDevice) -> None:
 
 
 def test_rate_beyond_its_limit_is_refused(driven: DrivenDevice) -> None:
-    """A sample rate that it can't keep is refused at open."""
+    """A sample rate that it cannot keep is refused at open."""
     with pytest.raises(DeviceError):
         driven.device.open(driven.device.info.max_rate_hz * 1.01, driven.block)
 

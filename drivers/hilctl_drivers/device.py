@@ -1,8 +1,8 @@
-"""The base of every device here: what a DAC must do whatever it speaks.
+"""Base class of all devices, independent of the protocol.
 
-It checks block, rate, sizes and range before anything is sent, never clips, names the device and
-the action in each error, and lets go of the connection after a failure: nobody knows then what the
-device holds, so it must be opened again. A back end connects, exchanges and disconnects.
+It checks block, rate, sizes and range before anything is sent, and never clips. Each error names
+the device and the action. After a failure the state of the device is unknown, so the connection is
+closed and the device must be opened again. A subclass connects, exchanges and disconnects.
 """
 
 from abc import ABC, abstractmethod
@@ -22,9 +22,9 @@ class DacDevice(ABC):
     """A :class:`~hilctl.base.device.Device`; back ends implement the underscored methods.
 
     Args:
-        info: What it says of itself.
-        title: Its name in messages.
-        action: What an exchange does, in messages: ``write AO0, read AI0``.
+        info: Description of the device.
+        title: Name in messages.
+        action: Name of an exchange in messages: ``write AO0, read AI0``.
         output: Name of its output, in messages.
     """
 
@@ -76,7 +76,7 @@ class DacDevice(ABC):
             raise self._error("arm the watchdog", str(error)) from None
 
     def output(self) -> float | None:
-        """Return what the open device puts out, see :meth:`hilctl.base.device.Device.output`.
+        """Return what the open device outputs, see :meth:`hilctl.base.device.Device.output`.
 
         Raises:
             DeviceError: Not open, or no good answer in time; it must be opened again.
@@ -91,15 +91,15 @@ class DacDevice(ABC):
             raise self._error("read the output back", str(error)) from None
 
     def look(self) -> tuple[float, float | None]:
-        """Connect, return displacement and output as they are, and let go; nothing is changed.
+        """Connect, return displacement and output, and disconnect; nothing is changed.
 
         No step of the profile is sent, no watchdog armed, fed on purpose or cleared.
 
         Returns:
-            Displacement in um, and the output in the command's unit; None where it can't be known.
+            Displacement in um, and the output in the command's unit; None if it cannot be known.
 
         Raises:
-            DeviceError: Open; or it can't be reached, is another device, or gives no good answer.
+            DeviceError: Open; or it cannot be reached, is another device, or gives no good answer.
         """
         if self._block:
             raise self._error("look", "open")
@@ -134,7 +134,7 @@ class DacDevice(ABC):
             raise self._error(self._action, str(error)) from None
 
     def make_safe(self, command: float) -> None:
-        """Put the output at ``command`` in one attempt, and let go; an armed watchdog stays armed.
+        """Set the output to ``command`` in one attempt and disconnect; the watchdog stays armed.
 
         See :meth:`hilctl.base.device.Device.make_safe`.
 
@@ -145,7 +145,7 @@ class DacDevice(ABC):
         """
         if not self._low <= command <= self._high:
             raise self._out_of_range(np.array([command]))
-        # Closed first: whatever comes of it, no exchange may follow as if nothing had happened.
+        # Closed first: no exchange may follow, whether the attempt succeeds or fails.
         self._block = 0
         try:
             self._put_out(command)
@@ -158,7 +158,7 @@ class DacDevice(ABC):
             self._release()
 
     def close(self) -> None:
-        """Disarm and let go of the device; the output stays. Closing twice is fine.
+        """Disarm and disconnect; the output stays. Closing twice is allowed.
 
         After an error in an exchange there is no connection any more, and a watchdog stays armed.
 
@@ -175,7 +175,7 @@ class DacDevice(ABC):
             self._release()
 
     def _longest_block(self) -> tuple[int, str]:
-        """Return the most samples of an exchange and, in words that follow it, why."""
+        """Return the most samples of an exchange and, as text that follow it, why."""
         return 1, ""
 
     def _rates(self, block: int) -> RateLimit:
@@ -191,7 +191,7 @@ class DacDevice(ABC):
         """Arm the watchdog, if the experiment wants it. :meth:`_abandon` follows an error."""
 
     def _output(self) -> float | None:
-        """Return the output of a device that is open; None where it can't be known."""
+        """Return the output of a device that is open; None if it cannot be known."""
         return None
 
     def _look(self) -> tuple[float, float | None]:
@@ -218,17 +218,17 @@ class DacDevice(ABC):
 
     @abstractmethod
     def _release(self) -> None:
-        """Let go of what is held, without a message to the device; it may be held no more."""
+        """Close the connection, if open, without a message to the device."""
 
     def _check_block(self, block: int) -> None:
-        """Refuse a block that is too long."""
+        """Reject a block that is too long."""
         most, why = self._longest_block()
         if not 1 <= block <= most:
             span = "1 sample" if most == 1 else f"1 to {most} samples"
             raise DeviceError(f"block must be {span}{why}, got {block}")
 
     def _check_sizes(self, command: F64, displacement_um: F64, measured: F64) -> None:
-        """Refuse a block that is not as agreed at open."""
+        """Reject a block that is not as agreed at open."""
         if not self._block:
             raise self._error(self._action, "not open")
         sizes = ", ".join(str(each.size) for each in (command, displacement_um, measured))
@@ -258,3 +258,20 @@ class DacDevice(ABC):
         unit = self._info.command_unit
         rule = f"{name} must be in [{self._low:g}, {self._high:g}] {unit}"
         return self._error(self._action, f"{rule}, got {command[index]} {unit}, nothing was sent")
+
+
+def check_fifo(block: int, fifo_blocks: int, depth: int) -> None:
+    """Raise DeviceError if ``fifo_blocks`` + 1 blocks do not fit into a FIFO of ``depth``."""
+    need = (fifo_blocks + 1) * block
+    if need > depth:
+        most = depth // block - 1
+        hint = f"at most {most} with this block" if most > 0 else "take smaller blocks"
+        rule = f"fifo_blocks + 1 blocks must fit into the FIFO, {depth} samples"
+        raise DeviceError(f"{rule}, got {need} ({hint})")
+
+
+def check_next(first_sample: int, expected: int) -> None:
+    """Raise DeviceError unless a block follows the last one."""
+    if first_sample != expected:
+        rule = f"samples must follow one another, {expected} is next"
+        raise DeviceError(f"{rule}, got {first_sample}: open again to start at 0")

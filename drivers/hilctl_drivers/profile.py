@@ -1,4 +1,4 @@
-"""Device profiles: what a commercial device is, loaded from YAML and checked whole.
+"""Profiles of commercial devices: load and validate them from YAML.
 
 A profile says everything that a driver must know of a device and nothing of what is wired to it.
 Shipped profiles are in ``profiles/``; a user's own is given by its path.
@@ -86,7 +86,7 @@ def link_kinds() -> dict[str, str]:
 
 
 def named_class(place: str) -> Any:
-    """Return what stands at ``module:name``."""
+    """Return the object named ``module:name``."""
     module, _, name = place.partition(":")
     return getattr(import_module(module), name)
 
@@ -114,11 +114,11 @@ def load_profile(
 
     Args:
         name_or_path: The name or the path.
-        files: Where the text is read from; the disk where None.
+        files: Where the text is read from; the disk if None.
         folder: What a path is relative to; the working folder where None.
 
     Raises:
-        InputError: There is no such profile, or the file can't be read.
+        InputError: There is no such profile, or the file cannot be read.
         ConfigError: It breaks rules; all are listed.
     """
     shipped = shipped_profiles()
@@ -177,7 +177,7 @@ def with_link(profile: _Profile, **changes: Any) -> _Profile:
         **changes: Settings by name; those that are None stay as they are.
 
     Raises:
-        InputError: The link has no such setting, the value breaks a rule, or the device can't be
+        InputError: The link has no such setting, the value breaks a rule, or the device cannot be
             set to that baud.
     """
     changes = {key: value for key, value in changes.items() if value is not None}
@@ -195,10 +195,10 @@ def with_link(profile: _Profile, **changes: Any) -> _Profile:
 
 
 def check_baud(profile: BaseProfile, baud: int) -> None:
-    """Refuse a baud that the device can't be set to, where its profile knows those that it can.
+    """Reject a baud that the device cannot be set to, where its profile knows those that it can.
 
     Raises:
-        InputError: It can't.
+        InputError: It cannot.
     """
     others: tuple[int, ...] = getattr(profile.link, "bauds", ())
     known = sorted({*others, getattr(profile.link, "baud", baud)})

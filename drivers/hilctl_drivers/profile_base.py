@@ -96,7 +96,7 @@ Name: TypeAlias = Annotated[str, StringConstraints(pattern=r"^[A-Za-z][A-Za-z0-9
 class Range(StrictModel):
     """What a channel means at the terminals.
 
-    ``min`` and ``max`` are what the device puts out or takes in, not what its register could hold.
+    ``min`` and ``max`` are what the device outputs or takes in, not what its register could hold.
     """
 
     unit: Literal["V", "A", "mA"] = Field(description="unit of min, max and of the value")
@@ -176,13 +176,9 @@ class BaseProfile(StrictModel):
 
     Attributes:
         DEVICE: The kind of device in an experiment that such profiles are for.
-        WIRE: What makes a :class:`~hilctl_drivers.serial.serial_wire.SerialWire` from a
-            :class:`~hilctl_drivers.serial.serial_wire.SerialSetup`, as ``module:name``;
-            empty if the protocol has a device of its own.
     """
 
     DEVICE: ClassVar[str]
-    WIRE: ClassVar[str] = ""
 
     vendor: Text
     model: Text = Field(description="model, as ordered")
@@ -217,6 +213,11 @@ class BaseProfile(StrictModel):
         if self.watchdog != "none" and not self.outputs:
             raise ValueError("watchdog must be none where there are no outputs to make safe")
         return self
+
+    @property
+    def driver(self) -> str:
+        """The :class:`~hilctl_drivers.serial_dac.SerialDac` for it; empty for other devices."""
+        return ""
 
     @property
     def title(self) -> str:

@@ -1,19 +1,20 @@
-"""What an experiment says of a DAC with a profile: where it is and what its terminals are wired to.
+"""Options of a DAC with a profile: its address, and the wiring of its terminals.
 
-The device's profile says what its terminals do; these options say which of them are used, what
-stands between them and the actuator, and which device reads the sensor where it is another one.
+The profile describes the terminals. The options select the output and the input, describe amplifier
+and sensor, and name the reader if another device reads the sensor.
 command = gain * output + offset, displacement = sensitivity * input + offset.
 """
 
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, Self, TypeAlias, TypeVar
 
+import numpy as np
 from pydantic import Field, model_validator
 
 from hilctl.base.device import DeviceInfo, DeviceOptions
 from hilctl.base.errors import InputError
 from hilctl.base.strict import StrictModel
-from hilctl.base.types import CommandUnit
+from hilctl.base.types import F64, CommandUnit
 from hilctl_drivers.profile import ProfileName
 from hilctl_drivers.profile_base import Range, Watchdog
 from hilctl_drivers.transport.wire_time import RateLimit
@@ -195,7 +196,7 @@ class DacOptions(DeviceOptions):
 
     @property
     def watchdog_reason(self) -> str:
-        """Why that is not the experiment's safe value; empty where nothing was said."""
+        """Why that is not the experiment's safe value; empty if nothing was said."""
         return "" if self.watchdog == "none" else self.watchdog.reason
 
     def details(self) -> dict[str, str]:
@@ -204,16 +205,16 @@ class DacOptions(DeviceOptions):
 
 
 class SignalChain:
-    """Commands to output values and input values to displacements.
+    """Conversion of commands to output values and of input values to displacements.
 
     Args:
         output: The output's range.
         sensor_input: The input's range.
-        amplifier: Between output and actuator; None where an output in A drives the coil itself.
+        amplifier: Between output and actuator; None if an output in A drives the coil itself.
         sensor: Between actuator and input.
 
     Raises:
-        InputError: Units that don't go together.
+        InputError: The units do not match.
     """
 
     def __init__(
@@ -248,6 +249,11 @@ class SignalChain:
         """Return the output value of a command."""
         return (command - self._offset) / self._gain
 
+    def outputs(self, command: F64) -> F64:
+        """Return the output values of a block of commands."""
+        values: F64 = (command - self._offset) / self._gain
+        return values
+
     def command(self, output: float) -> float:
         """Return the command of an output value."""
         return output * self._gain + self._offset
@@ -255,6 +261,11 @@ class SignalChain:
     def displacement_um(self, value: float) -> float:
         """Return the displacement of an input value, um."""
         return value * self._um_per_unit + self._offset_um
+
+    def fill_um(self, values: F64, displacement_um: F64) -> None:
+        """Fill in the displacements of a block of input values, um."""
+        np.multiply(values, self._um_per_unit, out=displacement_um)
+        displacement_um += self._offset_um
 
     def info(self, name: str, options: DacOptions, rates: RateLimit, **more: Any) -> DeviceInfo:
         """Return what a device is and what it accepts.
@@ -313,7 +324,7 @@ def check_watchdog(
     chain: SignalChain,
     has: Watchdog | Literal["none"],
 ) -> None:
-    """Refuse a watchdog that the device hasn't got, or that can't do what is asked of it.
+    """Reject a watchdog that the device has not got, or that cannot do what is asked of it.
 
     Args:
         title: The device.
@@ -323,7 +334,7 @@ def check_watchdog(
         has: What the device has.
 
     Raises:
-        InputError: It has none, can't take the time-out, or would not go to the safe command.
+        InputError: It has none, cannot take the timeout, or would not go to the safe command.
     """
     wanted, name = options.watchdog, options.output
     if wanted == "none":
@@ -349,7 +360,7 @@ def check_watchdog(
 
 
 def _check_protects(title: str, name: str, has: Watchdog) -> None:
-    """Refuse a watchdog whose trip leaves the output where it is."""
+    """Reject a watchdog whose trip leaves the output where it is."""
     safe = getattr(has, "safe", {})
     if has.on_trip == "hold":
         raise InputError(

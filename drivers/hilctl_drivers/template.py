@@ -1,7 +1,7 @@
-"""The device section of a first experiment with a profile; the values in it are nobody's yet.
+"""Template of the device section of a new experiment.
 
-It is what every DAC with a profile needs to be named, in an order for people. What only the owner
-of a rig can know stands there as a value that is easy to see through, and in ``asked``.
+It holds the keys that every DAC with a profile needs. Values that depend on the rig are obvious
+placeholders; ``asked`` lists them.
 """
 
 from collections.abc import Mapping
@@ -51,7 +51,7 @@ def starting_section(
         name_or_path: Name of a shipped profile, or path of one.
         unit: What the actuator is driven with; an output in A drives it itself.
         reader_name: Profile of the device that has the sensor, where it is another one.
-        files: Where profiles are read from; the disk where None.
+        files: Where profiles are read from; the disk if None.
 
     Raises:
         InputError: There is no such profile, or it has no output, or there is no input that a
@@ -111,7 +111,7 @@ def _place(made: StartingSection, prefix: str, profile: BaseProfile) -> dict[str
     where = {} if prefix else made.values
     if profile.link.kind == "tcp":
         where["host"] = _HERE
-        # Two devices can't have one place: at addresses of their own both have the usual port.
+        # Two devices cannot have one place: at addresses of their own both have the usual port.
         where["tcp_port"] = getattr(profile.link, "port", 502) + bool(prefix)
         made.remarks[f"{prefix}host"] = "set: name or address; this machine is hilctl emulate's"
         made.asked[f"{prefix}host"] = f"name or address of the {profile.title}"

@@ -20,8 +20,7 @@ from hilctl_drivers.modbus.config import ModbusOptions
 from hilctl_drivers.modbus.modbus_dac import ModbusDac
 from hilctl_drivers.modbus.pdu import rtu_adu
 from hilctl_drivers.profile import shipped_profiles
-from hilctl_drivers.serial.serial_dac import SerialDac
-from hilctl_drivers.serial.serial_wire import SerialOptions
+from hilctl_drivers.serial_dac import SerialDac, SerialOptions
 from hilctl_drivers.transport.framing import binary_framing
 
 TIMEOUT_S = 0.15
@@ -402,11 +401,11 @@ def test_attempts_at_a_silent_board_wait_for_no_boot_and_cause_none(tmp_path, li
     options = _options(path, line(dead), output="DAC", input="ADC")
     device = SerialDac(SerialOptions.model_validate(options))
     slept = []
-    device.wire._link._sleep = slept.append
+    device._link._sleep = slept.append
     for _ in range(3):
         with pytest.raises(DeviceError, match="no answer"):
             device.make_safe(SAFE)
-        assert not device.wire._link.is_open
+        assert not device._link.is_open
         descriptor = os.open(options["serial_port"], os.O_RDWR | os.O_NOCTTY)
         assert not termios.tcgetattr(descriptor)[2] & termios.HUPCL
         os.close(descriptor)

@@ -19,7 +19,7 @@ from pymodbus.pdu.register_message import (
     WriteMultipleRegistersResponse,
 )
 
-from hilctl_drivers.ascii.lines import LineFormat, parse_number
+from hilctl_drivers.ascii.ascii_session import LineFormat, parse_number
 from hilctl_drivers.modbus.pdu import (
     feedback_pdu,
     read_pdu,

@@ -1,4 +1,4 @@
-"""Profiles of devices that speak lines of text: templates for what is sent, patterns for replies.
+"""Profiles of devices with a text protocol: templates of requests and patterns of replies.
 
 A template is a Python format string with the fields ``{value}``, ``{address}``, ``{timeout}`` and
 ``{safe}``, such as ``#{address:02X}0{value:+07.3f}``. A pattern is a regular expression that must
@@ -161,7 +161,7 @@ class SendStep(StrictModel):
 
 
 class AskStep(Reply):
-    """Ask, and refuse to go on where the reply doesn't match."""
+    """Ask, and refuse to go on where the reply does not match."""
 
     kind: Literal["ask"]
     ask: LineTemplate
@@ -224,7 +224,6 @@ class AsciiProfile(BaseProfile):
     """A device that speaks lines of text."""
 
     DEVICE: ClassVar[str] = "serial_dac"
-    WIRE: ClassVar[str] = "hilctl_drivers.ascii.ascii_wire:AsciiWire"
 
     link: AsciiLink
     address: int | Literal["none"] = Field(description="device address as shipped, for {address}")
@@ -259,3 +258,8 @@ class AsciiProfile(BaseProfile):
                         f"errors: {error.pattern!r} matches the good reply of outputs.{name}"
                     )
         return self
+
+    @property
+    def driver(self) -> str:
+        """See :attr:`~hilctl_drivers.profile_base.BaseProfile.driver`."""
+        return "hilctl_drivers.ascii.ascii_dac:AsciiDac"

@@ -1,9 +1,14 @@
-"""One conversation with a device that speaks lines of text, and how long its lines take."""
+"""Session with a text device: lines, checksums, numbers, and transmission times.
+
+DCON (ICP DAS, Advantech ADAM): ICP DAS "DCON protocol command set". GEN (TDK-Lambda): "Genesys User
+Manual" 7.5. SCPI: SCPI-1999 volume 1, 7.2.1 for numbers; number forms as in IEEE 488.2, 8.7.
+"""
 
 import re
 import time
 from collections.abc import Callable, Sequence
-from typing import TypeAlias
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
 
 from hilctl.base.errors import DeviceError
 from hilctl_drivers.ascii.ascii_profile import (
@@ -17,10 +22,13 @@ from hilctl_drivers.ascii.ascii_profile import (
     Reply,
     SendStep,
 )
-from hilctl_drivers.ascii.lines import LineFormat, parse_number
 from hilctl_drivers.profile_base import WaitStep
+from hilctl_drivers.transport.crc import Bytes, dcon_checksum, gen_checksum
+from hilctl_drivers.transport.framing import DelimitedSplitter
 from hilctl_drivers.transport.links import (
+    BadRequestError,
     CorruptError,
+    IncompleteError,
     Link,
     MismatchError,
     NoAnswerError,
@@ -28,6 +36,108 @@ from hilctl_drivers.transport.links import (
     WatchdogTrippedError,
 )
 from hilctl_drivers.transport.wire_time import WireTime
+
+ChecksumKind: TypeAlias = Literal["none", "dcon", "gen"]
+
+_SCPI_INFINITY = 9.9e37
+"""SCPI-1999 sends this for infinity and 9.91e37 for not a number."""
+
+_CHECKSUMS = {"none": lambda _text: b"", "dcon": dcon_checksum, "gen": gen_checksum}
+_CHECKSUM_SIZES = {"none": 0, "dcon": 2, "gen": 3}
+_NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,4})?", re.ASCII)
+
+
+def _is_text(text: str) -> bool:
+    return text.isascii() and text.isprintable()
+
+
+@dataclass(frozen=True)
+class LineFormat:
+    """How one line stands on the wire: ``text | checksum | terminator``.
+
+    Attributes:
+        terminator: Bytes that end a line: control characters.
+        checksum: ``none``, ``dcon`` (two hex digits) or ``gen`` (``$`` and two hex digits).
+        size_max: Most bytes of a line without its terminator.
+
+    Raises:
+        BadRequest: Unknown checksum, or a terminator that could be part of the text.
+    """
+
+    terminator: bytes = b"\r"
+    checksum: ChecksumKind = "none"
+    size_max: int = 255
+
+    def __post_init__(self) -> None:
+        if self.checksum not in _CHECKSUMS:
+            known = ", ".join(_CHECKSUMS)
+            raise BadRequestError(f"unknown line checksum {self.checksum!r}; known are {known}")
+        if not self.terminator or any(32 <= byte < 127 for byte in self.terminator):
+            raise BadRequestError(f"terminator must be control characters, got {self.terminator!r}")
+
+    def encode(self, text: str) -> bytes:
+        """Return a line.
+
+        Raises:
+            BadRequest: Empty, too long, or more than printable ASCII.
+        """
+        if not text or not _is_text(text):
+            raise BadRequestError(f"a line must be printable ASCII, got {text!r}")
+        body = text.encode("ascii")
+        body += _CHECKSUMS[self.checksum](body)
+        if len(body) > self.size_max:
+            raise BadRequestError(
+                f"a line has at most {self.size_max} bytes, got {len(body)}: {text!r}"
+            )
+        return body + self.terminator
+
+    def decode(self, line: Bytes) -> str:
+        """Return the text of exactly one line.
+
+        Raises:
+            Incomplete: The terminator has not come yet.
+            Corrupt: Wrong checksum, too long, more than printable ASCII, or bytes behind the end.
+        """
+        data = bytes(line)
+        end = data.find(self.terminator)
+        if end < 0 and len(data) < self.size_max + len(self.terminator):
+            raise IncompleteError(f"{data!r} without {self.terminator!r}")
+        if end != len(data) - len(self.terminator):
+            raise CorruptError(f"must be one line that ends in {self.terminator!r}, got {data!r}")
+        return self._text(data[:end])
+
+    def splitter(self) -> DelimitedSplitter[str]:
+        """Return a splitter at the beginning of a stream of lines."""
+        return DelimitedSplitter(self._text, self.terminator, self.size_max, skip_empty=False)
+
+    def _text(self, part: Bytes) -> str:
+        body = bytes(part)
+        if len(body) > self.size_max:
+            raise CorruptError(f"a line has at most {self.size_max} bytes, got {len(body)}")
+        text = body.decode("latin-1")
+        if not _is_text(text):
+            raise CorruptError(f"a line must be printable ASCII, got {body!r}")
+        split = max(0, len(body) - _CHECKSUM_SIZES[self.checksum])
+        want = _CHECKSUMS[self.checksum](body[:split])
+        if body[split:] != want:
+            raise CorruptError(f"checksum of {text!r} must be {want.decode()}")
+        return text[:split]
+
+
+def parse_number(text: str) -> float:
+    """Return the number in a text that is exactly one number; blanks around it are fine.
+
+    Raises:
+        Corrupt: Anything else, or SCPI's marks for infinity and not a number.
+    """
+    body = text.strip(" ")
+    if not _NUMBER.fullmatch(body):
+        raise CorruptError(f"must be one number, got {text!r}")
+    value = float(body)
+    if abs(value) >= _SCPI_INFINITY:
+        raise CorruptError(f"stands for no measurement: {text!r}")
+    return value
+
 
 _ADDRESSED = re.compile(r"[!?]([0-9A-F]{2})")
 
@@ -70,7 +180,7 @@ class AsciiSession:
         return template.format(address=self._address, **values)
 
     def line(self, text: str) -> bytes:
-        """Return a line as it stands on the wire."""
+        """Return a line in the form sent on the wire."""
         return self._lines.encode(text)
 
     def send(self, text: str) -> None:
@@ -132,7 +242,7 @@ class AsciiSession:
             self.send(text)
 
     def run(self, steps: Sequence[AsciiStep], **values: float) -> None:
-        """Carry out a profile's steps.
+        """Execute a profile's steps.
 
         Args:
             steps: The steps.
@@ -177,7 +287,7 @@ class AsciiSession:
             raise DeviceError(f"{text} must be answered like {test.example!r}, got {reply!r}")
 
     def tripped(self) -> bool:
-        """Return whether the host watchdog says that it has tripped; no where it can't say."""
+        """Return whether the host watchdog says that it has tripped; no if it cannot say."""
         watchdog = self._profile.watchdog
         if watchdog == "none" or watchdog.tripped == "none":
             return False
@@ -230,7 +340,7 @@ class AsciiSession:
 
 
 Line: TypeAlias = tuple[str, str | None]
-"""What is sent, and an example of its reply; None where it is not answered."""
+"""What is sent, and an example of its reply; None if it is not answered."""
 
 _CHECKSUM_CHARS = {"none": 0, "dcon": 2, "gen": 3}
 
@@ -273,7 +383,7 @@ def query_time(profile: AsciiProfile, query: AsciiInput, address: int, what: str
         profile: The device that is asked, with the settings of the line that it stands on.
         query: The input that is asked for.
         address: The device's address.
-        what: What it is for, in words.
+        what: What it is for, as text.
     """
     lines = [(query.ask.format(address=address), query.example)]
     return lines_time(profile, lines, query.settle_s).named(what)
@@ -288,7 +398,7 @@ def feed_time(profile: AsciiProfile) -> WireTime | None:
 
 
 def arm_s(profile: AsciiProfile, output: str) -> float:
-    """Return how long arming the device's watchdog takes at most, s; 0 without a watchdog."""
+    """Return the time that arming the device's watchdog takes at most, s; 0 without a watchdog."""
     watchdog = profile.watchdog
     if watchdog == "none":
         return 0.0
@@ -334,7 +444,7 @@ def _step_lines(profile: AsciiProfile, watchdog: AsciiWatchdog, step: AsciiStep)
 
 
 def _steps_time(profile: AsciiProfile, steps: Sequence[AsciiStep]) -> WireTime:
-    """Return how long steps take."""
+    """Return the time that steps take."""
     watchdog = profile.watchdog
     assert watchdog != "none"
     lines = [line for step in steps for line in _step_lines(profile, watchdog, step)]

@@ -73,7 +73,6 @@ class FrameProfile(BaseProfile):
     """A board that speaks binary frames."""
 
     DEVICE: ClassVar[str] = "serial_dac"
-    WIRE: ClassVar[str] = "hilctl_drivers.board.board_wire:board_wire"
 
     link: FramesLink
     protocol: Literal["hilctl-1", "hilctl-2"] = Field(
@@ -104,3 +103,9 @@ class FrameProfile(BaseProfile):
                 f" {self.link.payload_max}"
             )
         return self
+
+    @property
+    def driver(self) -> str:
+        """See :attr:`~hilctl_drivers.profile_base.BaseProfile.driver`."""
+        name = "BoardSingle" if self.streaming == "none" else "BoardStream"
+        return f"hilctl_drivers.board.board_dac:{name}"

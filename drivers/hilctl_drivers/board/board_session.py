@@ -1,4 +1,4 @@
-"""Asking a microcontroller board: one message, one reply, checked whole before it is believed."""
+"""Session with a microcontroller board: one message, one reply, fully checked."""
 
 import math
 from collections.abc import Callable
@@ -133,11 +133,11 @@ class Readings:
 
 @dataclass(frozen=True, slots=True)
 class BoardState:
-    """What a board puts out and reads.
+    """What a board outputs and reads.
 
     Attributes:
         tripped: Whether its watchdog has tripped, and was not cleared since.
-        output: What it puts out, in the output's unit.
+        output: What it outputs, in the output's unit.
         reading: What it reads, in the input's unit.
     """
 
@@ -191,7 +191,7 @@ class BoardSession:
         return reply.unpack_from(payload)[2:], payload[reply.size :]
 
     def facts(self) -> BoardFacts:
-        """Ask what the board is."""
+        """Query what the board is."""
         fields, name = self.ask(board.INFO, b"", board.INFO_REPLY)
         _, version, depth, block_max, rate, low, high = fields
         # Escaped: it goes to terminals, and a board may send anything.
@@ -199,7 +199,7 @@ class BoardSession:
         return BoardFacts(int(version), int(depth), int(block_max), rate, low, high, text)
 
     def state(self) -> BoardState | None:
-        """Ask what the board puts out and reads; None where it does not know the question."""
+        """Query what the board outputs and reads; None if it does not know the question."""
         try:
             (_, flags), rest = self.ask(board.STATE, b"", board.STATE_REPLY)
         except RefusedError as refused:
@@ -214,7 +214,7 @@ class BoardSession:
         return BoardState(tripped, float(output[0]), float(reading[0]))
 
     def exchange(self, value: F64) -> Readings:
-        """Put out float64[1] and return one reading."""
+        """Output float64[1] and return one reading."""
         body = board.EXCHANGE_REQUEST.pack(0, 0, value.size)[2:] + self.outputs.encode(value)
         (_, count), rest = self.ask(board.EXCHANGE, body, board.EXCHANGE_REPLY)
         return self._readings(0, int(count), rest)
@@ -266,7 +266,7 @@ class BoardSession:
             prefill: Samples.
 
         Raises:
-            DeviceError: The board can't make that rate, to 100 ppm.
+            DeviceError: The board cannot make that rate, to 100 ppm.
         """
         body = board.CLOCK_REQUEST.pack(0, 0, rate_hz, prefill)[2:]
         (_, real_hz), _ = self.ask(board.CLOCK, body, board.CLOCK_REPLY)

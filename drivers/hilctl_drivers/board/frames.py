@@ -4,7 +4,7 @@ Each message is the payload of one binary frame, least significant byte first th
 
     byte 0  type   byte 1  seq, counted up by the host and repeated in the reply   then the body
 
-    EXCHANGE  10  n u16, n values          puts out one sample, n = 1, and samples the input
+    EXCHANGE  10  n u16, n values          outputs one sample, n = 1, and samples the input
            -> 90  status u8, n u16, n values, fifo_level u16, underruns u16
     STREAM    11  first u32, n u16, n values     queues samples first .. first + n - 1
            -> 91  status u8, first u32, n u16, n values, fifo_level u16, underruns u16
@@ -17,18 +17,18 @@ Each message is the payload of one binary frame, least significant byte first th
                   min f32, max f32, name in ASCII
     CLOCK     15  rate_hz f32 (0: stop), prefill u16    empties the queue, counts samples from 0
            -> 95  status u8, rate_hz f32 as really set
-    STATE     16  (nothing)                changes nothing; boards of version 1 don't know it
-           -> 96  status u8, flags u8, value as it is put out, reading
+    STATE     16  (nothing)                changes nothing; boards of version 1 do not know it
+           -> 96  status u8, flags u8, value as it is output, reading
 
 A value is a float32 in volts unless the profile's channel has another type. The board samples its
-input when it puts out a command, so ``first`` of a STREAM reply numbers the command that each
+input when it outputs a command, so ``first`` of a STREAM reply numbers the command that each
 reading belongs to; a reply carries all readings since the last one. The sample clock starts when
 ``prefill`` samples are queued. With nothing left to put out the board holds the last value, and
 counts that in ``underruns``. A refused message changes nothing.
 
 A STREAM reply is held back until sample ``queued - prefill - 1`` is out, with ``queued`` the
 samples taken since CLOCK, this message included, and carries the readings up to that sample.
-Sample j is put out (j + 1 + underruns) periods after the clock's start. While ``queued <=
+Sample j is output (j + 1 + underruns) periods after the clock's start. While ``queued <=
 prefill``, where the moment is past, and where the status is not 0, the reply goes out at once. A
 newer message means that a reply held back is never sent; where the watchdog trips meanwhile, it
 says TRIPPED.

@@ -1,16 +1,12 @@
-"""The simulated rig behind real wires: emulated devices, register by register.
+"""Emulated devices: the simulated rig behind real TCP connections and ptys.
 
-What a driver sees over TCP or a pty is what the profile's device would show; except for the magnet,
-the complete path of a run is real.
-
-command.py         ``hilctl emulate``, for a profile or an experiment
-options.py         what to emulate, and which faults to inject
-setup.py           devices, rig and ports put together
-server.py          one thread that answers, over connections and ptys
-wire.py            requests out of bytes, replies into bytes, on a serial line; modbus_wire.py
-modbus_device.py   a device of registers.py, with its watchdog
-labjack_stream.py  the streams of a LabJack
-text_device.py     a device that speaks lines of text
-board_device.py    a microcontroller board
-rig.py             the rig, in real time or by a sample clock, its wiring, and a log of its output
+emulate_command.py    the command ``hilctl emulate``
+options.py            options and injected faults
+factory.py            devices, rig and ports of one emulator
+server.py             one thread that serves all connections
+wire.py               requests and replies on a serial line; modbus_wire.py for Modbus
+modbus_device.py      a Modbus device with its watchdog; registers.py, labjack_stream.py
+text_device.py        a device with a text protocol
+board_device.py       a microcontroller board
+rig.py                the rig, its wiring, FIFO and watchdog timer, and the log of its output
 """

@@ -10,7 +10,13 @@ from hilctl_drivers.board import frames as board
 from hilctl_drivers.board.board_profile import FrameProfile, FrameStreaming
 from hilctl_drivers.board.board_session import BoardValues
 from hilctl_drivers.board.frames import Status
-from hilctl_drivers.emulator.rig import Rig, SampleFifo, SimulatedWiring, WriteLog
+from hilctl_drivers.emulator.rig import (
+    Rig,
+    SampleFifo,
+    SimulatedWiring,
+    WatchdogTimer,
+    WriteLog,
+)
 from hilctl_drivers.emulator.wire import EmulatedReply
 
 
@@ -26,7 +32,7 @@ class EmulatedBoard:
     Args:
         profile: What it is.
         rig: What it drives sample by sample.
-        log: Where what it puts out goes.
+        log: Where what it outputs goes.
         wiring: Amplifier and sensor between.
         noise: Whether the sensor has noise, when streaming.
     """
@@ -55,11 +61,9 @@ class EmulatedBoard:
         self._readings = np.empty(0)
         self._played_um = 0.0
         self._returned = 0
-        self._timeout_ns = 0
         self._safe = 0.0
-        self._received_ns = 0
+        self._timer = WatchdogTimer()
         self._now_ns = 0
-        self.tripped = False
         self._kinds: dict[int, Callable[[bytes, bytes], EmulatedReply]] = {
             board.EXCHANGE: self._exchange,
             board.STREAM: self._stream,
@@ -72,18 +76,22 @@ class EmulatedBoard:
         if self._version > 1:
             self._kinds[board.STATE] = self._state
         low, high = self._output.limits
-        # As a board powers up, whatever that is behind its amplifier.
-        current_a = wiring.gain_a * min(max(0.0, low), high) + wiring.offset_a
+        # The power-up value is 0 at the terminal, not at the coil.
+        current_a = wiring.current_a(min(max(0.0, low), high))
         rig.put_out(current_a, 0)
         self.fifo.current_a = current_a
 
+    @property
+    def tripped(self) -> bool:
+        """Whether the watchdog has tripped."""
+        return self._timer.tripped
+
     def tick(self, now_ns: int) -> None:
-        """Let time pass; the watchdog may trip on the way."""
-        due_ns = self._received_ns + self._timeout_ns
-        if self._timeout_ns and not self.tripped and due_ns <= now_ns:
+        """Advance the time; the watchdog may trip on the way."""
+        due_ns = self._timer.trip(now_ns)
+        if due_ns is not None:
             self.fifo.advance(due_ns)
             self._stop()
-            self.tripped = True
             self._put_out(self._safe, "watchdog", due_ns)
         self._now_ns = max(self._now_ns, now_ns)
         self.fifo.advance(self._now_ns)
@@ -93,7 +101,7 @@ class EmulatedBoard:
     def answer(self, message: bytes, now_ns: int) -> EmulatedReply:
         """Take one message and return what to answer; a refused one changes nothing."""
         self.tick(now_ns)
-        self._received_ns = self._now_ns
+        self._timer.fed_ns = self._now_ns
         head = message[: board.HEAD.size]
         if len(head) < board.HEAD.size or head[0] not in self._kinds:
             return self.refusal(message, Status.BAD_MESSAGE)
@@ -117,7 +125,7 @@ class EmulatedBoard:
         return self.fifo.played + self.fifo.level
 
     def _values(self, data: bytes, count: int) -> F64:
-        """Return the values of a message, all of them good."""
+        """Return the values of a message, all good."""
         if count < 1 or len(data) != count * self._outputs.size:
             raise _Refuse(Status.BAD_MESSAGE)
         values = self._outputs.decode(data)
@@ -134,7 +142,7 @@ class EmulatedBoard:
         values = self._values(body[size:], 1)
         if self.tripped:
             raise _Refuse(Status.TRIPPED)
-        reading = self._terminal(np.array([self._rig.displacement_um]))
+        reading = self._at_terminal(np.array([self._rig.displacement_um]))
         self._put_out(float(values[0]), "write", self._now_ns)
         reply = board.EXCHANGE_REPLY.pack(head[0] | board.REPLY_BIT, head[1], 0, 1)
         return EmulatedReply(reply + self._inputs.encode(reading) + board.FIFO_TAIL.pack(0, 0))
@@ -176,7 +184,7 @@ class EmulatedBoard:
             head[0] | board.REPLY_BIT, head[1], 0, first & 0xFFFFFFFF, readings.size
         )
         tail = board.FIFO_TAIL.pack(level, underruns)
-        return reply + self._inputs.encode(self._terminal(readings)) + tail
+        return reply + self._inputs.encode(self._at_terminal(readings)) + tail
 
     def _watchdog(self, head: bytes, body: bytes) -> EmulatedReply:
         size = board.WATCHDOG_REQUEST.size - board.HEAD.size
@@ -184,8 +192,8 @@ class EmulatedBoard:
             raise _Refuse(Status.BAD_MESSAGE)
         _, _, timeout_ms = board.WATCHDOG_REQUEST.unpack(head + body[:size])
         self._safe = float(self._values(body[size:], 1)[0])
-        self._timeout_ns = timeout_ms * 1_000_000
-        self.tripped = False
+        self._timer.timeout_ns = timeout_ms * 1_000_000
+        self._timer.tripped = False
         reply = board.WATCHDOG_REPLY.pack(head[0] | board.REPLY_BIT, head[1], 0, timeout_ms)
         return EmulatedReply(reply)
 
@@ -229,7 +237,7 @@ class EmulatedBoard:
         output = (self.fifo.current_a - self._wiring.offset_a) / self._wiring.gain_a
         reply = board.STATE_REPLY.pack(head[0] | board.REPLY_BIT, head[1], 0, flags)
         read_um = self._played_um if self.fifo.started else self._rig.displacement_um
-        reading = self._terminal(np.array([read_um]))
+        reading = self._at_terminal(np.array([read_um]))
         return EmulatedReply(
             reply + self._outputs.encode(np.array([output])) + self._inputs.encode(reading)
         )
@@ -248,7 +256,7 @@ class EmulatedBoard:
         return EmulatedReply(board.CLOCK_REPLY.pack(head[0] | board.REPLY_BIT, head[1], 0, rate_hz))
 
     def _put_out(self, value: float, event: str, now_ns: int) -> None:
-        current_a = self._wiring.gain_a * value + self._wiring.offset_a
+        current_a = self._wiring.current_a(value)
         self._rig.put_out(current_a, now_ns)
         self.fifo.current_a = current_a
         self._log.event(
@@ -265,9 +273,5 @@ class EmulatedBoard:
             value=value, unit=self._output.unit, current_a=float(current_a[-1]),
         )  # fmt: skip
 
-    def _terminal(self, displacement_um: F64) -> F64:
-        """Return what the sensor gives at the input's terminal; an ADC ends at its range."""
-        low, high = self._sensor.limits
-        values = (displacement_um - self._wiring.offset_um) / self._wiring.sensor_um
-        clipped: F64 = np.clip(values, low, high)
-        return clipped
+    def _at_terminal(self, displacement_um: F64) -> F64:
+        return self._wiring.at_terminal(displacement_um, self._sensor)

@@ -1,4 +1,4 @@
-"""The command ``hilctl emulate``: serves a profile, or the device of an experiment."""
+"""The command ``hilctl emulate``: emulate a profile, or the device of an experiment."""
 
 import gc
 import shlex
@@ -24,7 +24,7 @@ from hilctl_drivers.labjack.modbus_stream import ModbusStreamOptions
 from hilctl_drivers.modbus.config import ModbusReaderOptions
 from hilctl_drivers.modbus.modbus_profile import ModbusProfile
 from hilctl_drivers.profile import NamedProfile, load_profile
-from hilctl_drivers.serial.serial_wire import SerialOptions
+from hilctl_drivers.serial_dac import SerialOptions
 from hilctl_drivers.signal_chain import DacOptions, ReaderOptions
 
 _UNPRIVILEGED = 1024
@@ -103,7 +103,7 @@ def wired_experiment(path: Path, port: int = 0, host: str | None = None) -> Wire
         host: Address to listen on; this machine's own where None.
 
     Raises:
-        InputError: The file can't be read, names no device with a profile, or drives with voltage.
+        InputError: The file cannot be read, names no device with a profile, or drives with voltage.
     """
     document, files = load_document(path), TextFiles()
     section = document.data.get("device")

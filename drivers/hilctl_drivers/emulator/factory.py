@@ -1,4 +1,4 @@
-"""Puts emulated devices together: one that drives the rig, and often another that reads it.
+"""Factory of emulators: a device that drives the rig, and optionally another that reads it.
 
 Two Modbus devices share a line, or a gateway, by unit id, and two text devices a line by address;
 or each has a port of its own.
@@ -56,7 +56,7 @@ class Emulator:
         wires: What is served: one, or the reader's too.
         address: ``host:port``, or the pty's device file.
         reader_address: Where the reader is.
-        reader_unit_id: Its unit id there; None where it is no Modbus device.
+        reader_unit_id: Its unit id there; None if it is no Modbus device.
         options: What the driver needs to know, as in an experiment's device section.
     """
 
@@ -80,7 +80,7 @@ def build(options: EmulatorOptions, clock_ns: Callable[[], int] = time.monotonic
 
     Raises:
         InputError: There is no such profile, it has no such channels, an option or a fault does not
-            go with it, the log can't be written, a port is taken, or two devices have one unit id.
+            go with it, the log cannot be written, a port is taken, or two devices have one unit id.
     """
     plan = _plan(options)
     now_ns = clock_ns()

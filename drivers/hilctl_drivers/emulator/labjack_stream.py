@@ -1,8 +1,7 @@
 """Stream-out and stream-in of an emulated LabJack T4 or T7: registers in front of a FIFO.
 
-It does what :mod:`hilctl_drivers.labjack.stream` says of the device. What no document was
-seen for is made up: that a trip of the watchdog ends the stream, and in which order queued sets of
-values are put out.
+It follows :mod:`hilctl_drivers.labjack.stream`. Two behaviours are assumptions, because no document
+describes them: a trip of the watchdog ends the stream, and the order of queued sets of values.
 """
 
 import struct
@@ -155,7 +154,7 @@ class LabJackStream:
         return known or scanned or (self.running and address in self._analog)
 
     def tick(self, now_ns: int) -> None:
-        """Let time pass."""
+        """Advance the time."""
         self._now_ns = max(self._now_ns, now_ns)
         self.fifo.advance(self._now_ns)
 
@@ -315,7 +314,7 @@ def attach_stream(
     Args:
         device: Which.
         rig: What it stands at.
-        log: Where what is put out goes.
+        log: Where what is output goes.
         output: Output that drives the rig.
         sensor: Input that shows the displacement.
         noise: Whether the sensor has noise.

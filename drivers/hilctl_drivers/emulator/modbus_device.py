@@ -5,7 +5,7 @@ from typing import Protocol
 
 from hilctl.base.errors import InputError
 from hilctl_drivers.emulator.registers import NoSuchRegister, RegisterMap, Words
-from hilctl_drivers.emulator.rig import Rig, SimulatedWiring, WriteLog
+from hilctl_drivers.emulator.rig import Rig, SimulatedWiring, WatchdogTimer, WriteLog
 from hilctl_drivers.modbus.modbus_profile import ModbusProfile, ModbusWatchdog
 from hilctl_drivers.modbus.register_map import EnsureStep, ModbusStep, RegisterStep, WriteStep
 
@@ -13,7 +13,7 @@ Target = tuple[Words, list[int] | None]
 """A value and the words that trigger something; None stands for any words but zeros."""
 
 
-class EmulatedWatchdog:
+class EmulatedWatchdog(WatchdogTimer):
     """Trips when the host has been silent for the timeout.
 
     It is armed by the last of the profile's arm steps and disarmed by the last of the disarm steps,
@@ -25,6 +25,7 @@ class EmulatedWatchdog:
     """
 
     def __init__(self, profile: ModbusWatchdog, words: dict[int, Words]) -> None:
+        super().__init__()
         self._profile = profile
         self._arm = _last(profile.arm, words)
         self._disarm = _last(profile.disarm, words)
@@ -33,9 +34,7 @@ class EmulatedWatchdog:
         self._timeout = next(
             (words[id(s)] for s in profile.arm if getattr(s, "value", "") == "timeout"), None
         )
-        self._fed_ns = 0
         self.armed = False
-        self.tripped = False
 
     @property
     def timeout_s(self) -> float:
@@ -48,10 +47,9 @@ class EmulatedWatchdog:
 
     @property
     def due_ns(self) -> int | None:
-        """When it will trip if nothing comes, or None."""
-        if not self.armed or self.tripped:
-            return None
-        return self._fed_ns + round(self.timeout_s * 1e9)
+        """See :attr:`WatchdogTimer.due_ns`; the timeout is in a register."""
+        self.timeout_ns = round(self.timeout_s * 1e9) if self.armed else 0
+        return super().due_ns
 
     def request(self, now_ns: int) -> None:
         """Note that a request has come."""
@@ -66,13 +64,13 @@ class EmulatedWatchdog:
             self.armed = False
         if self._arm is not None and self._arm[0] is target:  # any other value there stops it
             self.armed = _hit(self._arm, target) and self.timeout_s > 0.0
-            self._fed_ns = now_ns
+            self.fed_ns = now_ns
         if _hit(self._clear, target):
             self.tripped = False
-            self._fed_ns = now_ns
+            self.fed_ns = now_ns
 
     def _fed(self, now_ns: int) -> None:
-        self._fed_ns = now_ns
+        self.fed_ns = now_ns
         if not self._profile.clear:  # nothing else could end the trip
             self.tripped = False
 
@@ -114,15 +112,15 @@ class Overlay(Protocol):
         ...
 
     def read(self, address: int, count: int) -> list[int]:
-        """Return register words; raise ``RejectedRequest`` where they can't be read."""
+        """Return register words; raise ``RejectedRequest`` where they cannot be read."""
         ...
 
     def write(self, address: int, values: Sequence[int]) -> None:
-        """Write register words; raise ``RejectedRequest`` where they can't be written."""
+        """Write register words; raise ``RejectedRequest`` where they cannot be written."""
         ...
 
     def tick(self, now_ns: int) -> None:
-        """Let time pass."""
+        """Advance the time."""
         ...
 
     def stop(self, now_ns: int) -> None:
@@ -149,8 +147,8 @@ class EmulatedModbus:
         profile: What it is.
         rig: What it stands at.
         log: Where writes go.
-        output: Output that drives the rig; None where another device does.
-        sensor: Input that shows the displacement; None where another device does.
+        output: Output that drives the rig; None if another device does.
+        sensor: Input that shows the displacement; None if another device does.
         wiring: Amplifier and sensor between; spread over the channels' ranges where None.
         current_a: Current at the start, as if its power-up value had been set so.
 
@@ -195,15 +193,14 @@ class EmulatedModbus:
             if name == self._output:
                 if value is None or current_a is not None:
                     value = ((current_a or 0.0) - self.wiring.offset_a) / self.wiring.gain_a
-                self._rig.put_out(self.wiring.gain_a * value + self.wiring.offset_a, 0)
+                self._rig.put_out(self.wiring.current_a(value), 0)
             if value is not None:
                 words.value = value
 
     def tick(self, now_ns: int) -> None:
-        """Let time pass; the watchdog may trip on the way."""
-        due_ns = self._watchdog.due_ns if self._watchdog else None
-        if self._watchdog is not None and due_ns is not None and due_ns <= now_ns:
-            self._watchdog.tripped = True
+        """Advance the time; the watchdog may trip on the way."""
+        due_ns = self._watchdog.trip(now_ns) if self._watchdog else None
+        if due_ns is not None:
             self._trip(due_ns)
         self._now_ns = max(self._now_ns, now_ns)
         if self.overlay is not None:
@@ -211,7 +208,7 @@ class EmulatedModbus:
         self._rig.advance(self._now_ns)
 
     def request(self, now_ns: int) -> None:
-        """Note that a request has come; before it is carried out."""
+        """Note that a request has come; before it is executed."""
         self.tick(now_ns)
         if self._watchdog is not None:
             self._watchdog.request(self._now_ns)
@@ -220,7 +217,7 @@ class EmulatedModbus:
         """Return register words.
 
         Raises:
-            Declined: Not all of them exist.
+            Declined: Not all exist.
         """
         if self.overlay is not None and self.overlay.has(address):
             return self.overlay.read(address, count)
@@ -231,10 +228,10 @@ class EmulatedModbus:
             raise RejectedRequest(2) from None
 
     def write(self, area: str, address: int, values: Sequence[int]) -> None:
-        """Write register words; all of them or none.
+        """Write register words; all or none.
 
         Raises:
-            Declined: Not all of them can be written, a value is beyond its channel's range, or the
+            Declined: Not all can be written, a value is beyond its channel's range, or the
                 watchdog has tripped and the device wants that cleared first.
         """
         if self.overlay is not None and self.overlay.has(address):
@@ -291,7 +288,7 @@ class EmulatedModbus:
         return self.profile.watchdog != "none" and bool(self.profile.watchdog.clear)
 
     def _resume(self) -> None:
-        """Put out what the registers hold, as a device may once its trip is cleared.
+        """Output what the registers hold, as a device may once its trip is cleared.
 
         No document says so of the shipped ones; those that refuse commands until then wait here for
         the next one.
@@ -307,7 +304,7 @@ class EmulatedModbus:
     def _put_value(self, name: str, value: float, event: str, now_ns: int) -> None:
         more: dict[str, float] = {}
         if name == self._output:
-            self._rig.put_out(self.wiring.gain_a * value + self.wiring.offset_a, now_ns)
+            self._rig.put_out(self.wiring.current_a(value), now_ns)
             more["current_a"] = self._rig.current_a
         unit = self.profile.outputs[name].unit
         self._log.event(now_ns, event, output=name, value=value, unit=unit, **more)
@@ -329,7 +326,7 @@ class EmulatedModbus:
             self._put_value(name, value, "watchdog", due_ns)
 
     def _safe_value(self, name: str, steps: tuple[ModbusStep, ...]) -> float | None:
-        """Return what the safe-value register holds; None where it was not switched on."""
+        """Return what the safe-value register holds; None if it was not switched on."""
         channel = self.profile.outputs[name]
         found: float | None = None
         for step in steps:
@@ -347,10 +344,9 @@ class EmulatedModbus:
 
     def _measure(self) -> None:
         if self._sensor is not None:
-            offset_um, sensor_um = self.wiring.offset_um, self.wiring.sensor_um
-            at_terminal = (self._rig.displacement_um - offset_um) / sensor_um
-            low, high = self.profile.inputs[self._sensor].limits
-            self._inputs[self._sensor].value = min(max(at_terminal, low), high)  # as an ADC does
+            channel = self.profile.inputs[self._sensor]
+            value = float(self.wiring.at_terminal(self._rig.displacement_um, channel))
+            self._inputs[self._sensor].value = value
         watchdog = self.profile.watchdog
         if watchdog != "none" and watchdog.tripped != "none":
             self._steps[id(watchdog.tripped)].words[-1] = watchdog.tripped.mask * self.tripped

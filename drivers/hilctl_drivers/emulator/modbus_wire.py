@@ -1,4 +1,4 @@
-"""Modbus as an emulated device speaks it: pymodbus's framing and messages.
+"""Modbus side of an emulated device: framing and messages of pymodbus.
 
 The only module that imports pymodbus. It is used on this side because the driver has framing of its
 own: a mistake in either then shows. Its server is not used: it loses the second of two requests in
@@ -51,7 +51,7 @@ class FeedbackPdu(ModbusPDU):
         self.data = data
 
     async def datastore_update(self, context: Any, device_id: int) -> ModbusPDU:
-        """Carry out frame after frame, as LabJack's protocol page describes them."""
+        """Execute frame after frame, as LabJack's protocol page describes them."""
         reply = b""
         rest = self.data
         while rest:
@@ -121,7 +121,7 @@ class ModbusWire:
         kind: ``tcp`` or ``rtu``.
         devices: What carries requests out: one, or several by unit id.
         lacking: Functions that the devices are to refuse as unknown, with exception 1.
-        mute: Functions that are never answered, as some devices do with those they don't know.
+        mute: Functions that are never answered, as some devices do with those they do not know.
     """
 
     def __init__(
@@ -143,7 +143,7 @@ class ModbusWire:
         self._mute = mute
 
     def tick(self, now_ns: int) -> None:
-        """Let time pass for all devices."""
+        """Advance the time for all devices."""
         for device in self._devices.values():
             device.tick(now_ns)
 
@@ -164,7 +164,7 @@ class ModbusWire:
                 yield struct.pack(">HB", transaction, unit) + pdu
 
     def answer(self, request: bytes, now_ns: int) -> EmulatedReply | None:
-        """Carry out a request of :meth:`requests`; None where it is never answered."""
+        """Execute a request of :meth:`requests`; None if it is never answered."""
         if request[3] in self._mute:
             return None
         return self._answered(self._reply(request, now_ns), request)

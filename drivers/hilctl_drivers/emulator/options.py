@@ -1,4 +1,4 @@
-"""What to emulate, how it is reached, and which faults to inject."""
+"""Options of an emulator, and the faults to inject."""
 
 import re
 from collections.abc import Sequence
@@ -31,8 +31,8 @@ class WireFault:
     """One fault.
 
     Attributes:
-        kind: ``silence`` ignores the request; ``delay`` answers late; ``late`` carries it out late,
-            whoever was answered meanwhile; ``exception`` refuses it; ``corrupt`` spoils a byte of
+        kind: ``silence`` ignores the request; ``delay`` answers late; ``late`` executes it late,
+            after other requests; ``exception`` refuses it; ``corrupt`` spoils a byte of
             the reply; ``cut`` leaves out its end; ``duplicate`` sends it twice; ``wrong_id``
             answers in another's name; ``reset`` breaks the connection instead; ``unplug`` is
             silence for good, for every connection.
@@ -98,7 +98,7 @@ class FaultPlan:
 
 
 def spoil(kind: FaultKind, reply: bytes, corrupt_at: int) -> bytes:
-    """Return a reply with a fault on its bytes; kinds that don't change bytes leave it as it is.
+    """Return a reply with a fault on its bytes; kinds that do not change bytes leave it as it is.
 
     Args:
         kind: The fault.

@@ -1,4 +1,4 @@
-"""The registers of an emulated Modbus device: which exist, what stands in them, who may write."""
+"""Registers of an emulated Modbus device: addresses, contents, and access."""
 
 import struct
 from collections.abc import Sequence
@@ -56,7 +56,7 @@ class Words:
 
 
 class RegisterBank:
-    """Addresses in two maps, because couplers read at one address what they don't write there."""
+    """Addresses in two maps, because couplers read at one address what they do not write there."""
 
     def __init__(self) -> None:
         self._readable: dict[Key, tuple[Words, int]] = {}

@@ -1,4 +1,4 @@
-"""The rig of an emulated device, in real time or by a sample clock, its wiring, and a log."""
+"""The rig of an emulated device: in real time or by a sample clock, wiring, watchdog, and log."""
 
 import json
 from collections import deque
@@ -45,7 +45,7 @@ class Rig:
         self._step(1)
 
     def advance(self, now_ns: int) -> None:
-        """Let time pass until ``now_ns``, with the output held."""
+        """Advance the time until ``now_ns``, with the output held."""
         due = int((now_ns - self._origin_ns) * RATE_HZ * 1e-9)
         if due - self._samples > SETTLED_S * RATE_HZ:
             # Nothing changes any more on a held output, and catching up with hours takes minutes.
@@ -73,7 +73,7 @@ class Rig:
 
 @dataclass(frozen=True, slots=True)
 class SimulatedWiring:
-    """What stands between the device's terminals and the rig.
+    """Amplifier and sensor between the device's terminals and the rig.
 
     Attributes:
         gain_a: Amplifier, A for one unit of the output.
@@ -86,6 +86,16 @@ class SimulatedWiring:
     offset_a: float
     sensor_um: float
     offset_um: float
+
+    def current_a(self, value: float) -> float:
+        """Return the coil current for an output value."""
+        return self.gain_a * value + self.offset_a
+
+    def at_terminal(self, displacement_um: F64 | float, channel: Range) -> F64:
+        """Return the sensor's signal, clipped to the input's range as by an ADC."""
+        signal = (displacement_um - self.offset_um) / self.sensor_um
+        clipped: F64 = np.clip(signal, *channel.limits)
+        return clipped
 
     @classmethod
     def spread(cls, output: Range, sensor: Range) -> "SimulatedWiring":
@@ -105,6 +115,28 @@ def _spread(channel: Range, reach: float) -> tuple[float, float]:
     return gain, -0.5 * gain * (channel.max + channel.min)
 
 
+class WatchdogTimer:
+    """Host watchdog of an emulated device; a ``timeout_ns`` of 0 disarms it."""
+
+    def __init__(self) -> None:
+        self.timeout_ns = 0
+        self.fed_ns = 0
+        self.tripped = False
+
+    @property
+    def due_ns(self) -> int | None:
+        """Time of the next trip without another request; None if disarmed or tripped."""
+        return None if self.tripped or not self.timeout_ns else self.fed_ns + self.timeout_ns
+
+    def trip(self, now_ns: int) -> int | None:
+        """Trip if it is due; return the time of the trip, None without one."""
+        due_ns = self.due_ns
+        if due_ns is None or due_ns > now_ns:
+            return None
+        self.tripped = True
+        return due_ns
+
+
 _BEGIN = b'{"event": '
 
 
@@ -116,7 +148,7 @@ class WriteLog:
         unix_offset_ns: What to add to the monotonic clock to get Unix time.
 
     Raises:
-        InputError: The file can't be written.
+        InputError: The file cannot be written.
     """
 
     def __init__(self, path: Path | None, unix_offset_ns: int) -> None:
@@ -160,13 +192,13 @@ Played: TypeAlias = Callable[[int, F64, F64, int], None]
 
 
 class SampleFifo:
-    """Puts out one queued value each period; the simulated rig moves with it.
+    """FIFO that outputs one queued value per period to the simulated rig.
 
     Args:
         noise: Whether the sensor has noise.
         repeats: Whether a period that finds nothing queued counts as one that put the last value
             out again, with a reading. Else the output is held, and nothing is read.
-        on_played: Called with each stretch that was put out.
+        on_played: Called with each stretch that was output.
     """
 
     def __init__(self, *, noise: bool, repeats: bool, on_played: Played) -> None:
@@ -210,7 +242,7 @@ class SampleFifo:
         self._periods = self.played = self.underruns = 0
 
     def start(self, now_ns: int) -> None:
-        """Start; the first value is put out one period from now."""
+        """Start; the first value is output one period from now."""
         self._start_ns = now_ns
 
     def stop(self) -> None:
@@ -229,13 +261,13 @@ class SampleFifo:
         self.level += current_a.size
 
     def due_ns(self, values: int) -> int | None:
-        """Return when that many values will have been put out; None before the start."""
+        """Return when that many values will have been output; None before the start."""
         if self._start_ns is None:
             return None
         return self._start_ns + round((values + self.underruns) * 1e9 / self._rate_hz)
 
     def advance(self, now_ns: int) -> None:
-        """Put out what is due by now; repeat or hold the last value where nothing is queued."""
+        """Output what is due by now; repeat or hold the last value where nothing is queued."""
         if self._start_ns is None or self._plant is None:
             return
         due = int((now_ns - self._start_ns) * self._rate_hz * 1e-9 + 1e-6) - self._periods

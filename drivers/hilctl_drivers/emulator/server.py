@@ -1,4 +1,4 @@
-"""Serves emulated devices at TCP ports and ptys, with injected faults.
+"""Server of emulated devices on TCP ports and ptys, with injected faults.
 
 One thread and no locks: requests, the rig's time, watchdogs and sample clocks take turns.
 """
@@ -48,7 +48,7 @@ class Connection(ABC):
 
     @abstractmethod
     def read(self) -> bytes | None:
-        """Return what came; None where the host has gone."""
+        """Return what came; None if the host has gone."""
 
     @abstractmethod
     def send(self, data: bytes) -> None:
@@ -103,7 +103,7 @@ class TcpConnection(Connection):
 
 
 class PtyConnection(Connection):
-    """Whatever opens the other end of a pty.
+    """Connection to the program at the other end of a pty.
 
     Args:
         wire: What it asks.
@@ -112,7 +112,7 @@ class PtyConnection(Connection):
 
     def __init__(self, wire: EmulatedWire, *, faulty: bool) -> None:
         super().__init__(wire, faulty=faulty)
-        # Our own hold on the other end keeps the line from ending when a host lets go of it.
+        # Kept open, so that the line does not end when a host closes it.
         self._master, self._slave = pty.openpty()
         tty.setraw(self._slave, termios.TCSANOW)
         os.set_blocking(self._master, False)
@@ -217,7 +217,7 @@ class EmulatorServer:
         self._stopping = True  # noticed at the next tick of the rig
 
     def close(self) -> None:
-        """Let go of everything, where it is not going to :meth:`run`."""
+        """Close everything; for a server that does not :meth:`run`."""
         for each in (*self._connections, *self._listeners, *self._unplugged):
             each.close()
         self._connections.clear()
@@ -235,7 +235,7 @@ class EmulatorServer:
         if source in self._listeners:
             assert isinstance(source, socket.socket)
             self._add(TcpConnection(source.accept()[0], self._listeners[source]))
-        elif source in self._connections:  # else it was let go of since
+        elif source in self._connections:  # otherwise it was closed since
             assert isinstance(source, Connection)
             if events & selectors.EVENT_WRITE:
                 self._selector.modify(source, selectors.EVENT_READ)
@@ -318,7 +318,7 @@ class EmulatorServer:
         self._listeners.clear()
 
     def _carry_out_due(self, now_ns: int) -> None:
-        """Carry out what was put off, though its host may have gone since."""
+        """Execute what was put off, though its host may have gone since."""
         while self._undone and self._undone[0][0] <= now_ns:
             _, _, connection, request = heapq.heappop(self._undone)
             answer = connection.wire.answer(request, now_ns)

@@ -1,4 +1,4 @@
-"""An emulated device that speaks lines of text: a profile's templates in front of the rig."""
+"""An emulated device with a text protocol: a profile's templates in front of the rig."""
 
 import re
 from string import Formatter
@@ -12,7 +12,7 @@ from hilctl_drivers.ascii.ascii_profile import (
     Reply,
     SendStep,
 )
-from hilctl_drivers.emulator.rig import Rig, SimulatedWiring, WriteLog
+from hilctl_drivers.emulator.rig import Rig, SimulatedWiring, WatchdogTimer, WriteLog
 from hilctl_drivers.emulator.wire import EmulatedReply
 
 _NUMBER = r"[-+]?[0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?"
@@ -44,7 +44,7 @@ class TemplateMatcher:
         self._pattern = re.compile("".join(parts), re.ASCII)
 
     def match(self, text: str) -> dict[str, float] | None:
-        """Return the fields of a line, or None where it is another one."""
+        """Return the fields of a line, or None if it is another one."""
         found = self._pattern.fullmatch(text)
         if found is None:
             return None
@@ -76,10 +76,10 @@ class EmulatedText:
     Args:
         profile: What it is.
         rig: What it drives, or what its sensor stands on.
-        log: Where what it puts out goes.
+        log: Where what it outputs goes.
         wiring: Amplifier and sensor between.
-        output: Output that drives the rig; None where another device does.
-        sensor: Input that shows the displacement; None where another device does.
+        output: Output that drives the rig; None if another device does.
+        sensor: Input that shows the displacement; None if another device does.
         address: Its address.
     """
 
@@ -100,7 +100,7 @@ class EmulatedText:
         self._wiring = wiring
         self._output, self._sensor = output, sensor
         self._address = address
-        # As devices power up, whatever that is behind the amplifier.
+        # The power-up value is 0 at the terminal, not at the coil.
         self._values = {
             name: min(max(0.0, each.min), each.max) for name, each in profile.outputs.items()
         }
@@ -111,29 +111,31 @@ class EmulatedText:
             for name, each in profile.outputs.items()
         }
         if output is not None:
-            rig.put_out(wiring.gain_a * self._values[output] + wiring.offset_a, 0)
+            rig.put_out(wiring.current_a(self._values[output]), 0)
         self._errors: list[str] = []
-        self._timeout_ns = 0
-        self._received_ns = 0
+        self._timer = WatchdogTimer()
         self._now_ns = 0
-        self.tripped = False
+
+    @property
+    def tripped(self) -> bool:
+        """Whether the host watchdog has tripped."""
+        return self._timer.tripped
 
     def tick(self, now_ns: int) -> None:
-        """Let time pass; the watchdog may trip on the way."""
-        due_ns = self._received_ns + self._timeout_ns
-        if self._timeout_ns and not self.tripped and due_ns <= now_ns:
-            self.tripped = True
+        """Advance the time; the watchdog may trip on the way."""
+        due_ns = self._timer.trip(now_ns)
+        if due_ns is not None:
             self._trip(due_ns)
         self._now_ns = max(self._now_ns, now_ns)
         self._rig.advance(self._now_ns)
 
     def answer(self, message: bytes, now_ns: int) -> EmulatedReply | None:
-        """Carry out a line; None where it is for another address."""
+        """Execute a line; None if it is for another address."""
         self.tick(now_ns)
         text = message.decode("ascii", "replace")
         watchdog = self._profile.watchdog
         if watchdog != "none" and watchdog.kick == "any":
-            self._received_ns = self._now_ns
+            self._timer.fed_ns = self._now_ns
         for part in (self._outputs, self._inputs, self._watchdog, self._questions, self._steps):
             found = part(text)
             if found is not None:
@@ -201,7 +203,7 @@ class EmulatedText:
         if self.tripped and watchdog != "none" and watchdog.refuses_while_tripped:
             return "" if watchdog.refusal == "none" else watchdog.refusal.example
         if watchdog != "none" and watchdog.kick == "write":
-            self._received_ns = self._now_ns
+            self._timer.fed_ns = self._now_ns
         if not output.min <= value <= output.max:
             if self._profile.errors:
                 return self._profile.errors[0].example
@@ -223,7 +225,7 @@ class EmulatedText:
                 self._values[self._output]
             )  # fmt: skip
         elif name == self._sensor:
-            value = (self._rig.displacement_um - self._wiring.offset_um) / self._wiring.sensor_um
+            value = float(self._wiring.at_terminal(self._rig.displacement_um, source))
         else:
             value = 0.0
         value = min(max(value, source.min), source.max)
@@ -252,15 +254,15 @@ class EmulatedText:
     def _switch(self, name: str, template: str, text: str) -> None:
         watchdog = self._profile.watchdog
         assert watchdog != "none"
-        self._received_ns = self._now_ns
+        self._timer.fed_ns = self._now_ns
         if name == "arm":
             fields = TemplateMatcher(template, self._address).match(text) or {}
             counts = fields.get("timeout", watchdog.min_s / watchdog.unit_s)
-            self._timeout_ns = round(counts * watchdog.unit_s * 1e9)
+            self._timer.timeout_ns = round(counts * watchdog.unit_s * 1e9)
         elif name == "disarm":
-            self._timeout_ns = 0
+            self._timer.timeout_ns = 0
         elif name == "clear":
-            self.tripped = False
+            self._timer.tripped = False
 
     def _questions(self, text: str) -> str | None:
         query = self._profile.error_query
@@ -288,7 +290,7 @@ class EmulatedText:
         self._values[name] = value
         more: dict[str, float] = {}
         if name == self._output:
-            self._rig.put_out(self._wiring.gain_a * value + self._wiring.offset_a, now_ns)
+            self._rig.put_out(self._wiring.current_a(value), now_ns)
             more["current_a"] = self._rig.current_a
         unit = self._profile.outputs[name].unit
         self._log.event(now_ns, event, output=name, value=value, unit=unit, **more)
@@ -296,10 +298,8 @@ class EmulatedText:
     def _trip(self, due_ns: int) -> None:
         watchdog = self._profile.watchdog
         assert watchdog != "none"
-        for name in self._values:
-            if watchdog.on_trip == "safe":
-                self._put_out(name, self._safe[name], "watchdog", due_ns)
-            elif watchdog.on_trip in {"zero", "reset"}:
-                self._put_out(name, 0.0, "watchdog", due_ns)
-            else:
-                self._put_out(name, self._values[name], "watchdog", due_ns)
+        at_zero = watchdog.on_trip in {"zero", "reset"}
+        for name, value in self._values.items():
+            held = 0.0 if at_zero else value
+            target = self._safe[name] if watchdog.on_trip == "safe" else held
+            self._put_out(name, target, "watchdog", due_ns)

@@ -1,11 +1,11 @@
-"""Requests out of bytes and replies into bytes: the contract, and devices on a serial line."""
+"""Parsing of requests and framing of replies: the contract, and devices on a serial line."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
 from hilctl_drivers.ascii.ascii_profile import AsciiProfile
-from hilctl_drivers.ascii.lines import LineFormat
+from hilctl_drivers.ascii.ascii_session import LineFormat
 from hilctl_drivers.board.board_profile import FrameProfile, FramesLink
 from hilctl_drivers.transport.framing import Splitter, binary_framing
 from hilctl_drivers.transport.links import CorruptError
@@ -16,7 +16,7 @@ class EmulatedReply:
     """A reply, before its framing.
 
     Attributes:
-        data: The reply; None where there is none, or it isn't known yet.
+        data: The reply; None if there is none, or it is not known yet.
         due_ns: When it is sent; 0 for at once.
         make: What makes it when it is due.
         wrong_id: What turns it into one in another's name, for a fault.
@@ -32,7 +32,7 @@ class EmulatedWire(Protocol):
     """Devices that share a line, or a port, and how they are spoken to."""
 
     def tick(self, now_ns: int) -> None:
-        """Let time pass for all devices."""
+        """Advance the time for all devices."""
         ...
 
     def requests(self, received: bytearray) -> Iterator[bytes]:
@@ -40,7 +40,7 @@ class EmulatedWire(Protocol):
         ...
 
     def answer(self, request: bytes, now_ns: int) -> EmulatedReply | None:
-        """Carry out a request; None where it is for no device here."""
+        """Execute a request; None if it is for no device here."""
         ...
 
     def refusal(self, request: bytes) -> EmulatedReply | None:
@@ -48,7 +48,7 @@ class EmulatedWire(Protocol):
         ...
 
     def encode(self, data: bytes) -> bytes:
-        """Return a reply as it stands on the line."""
+        """Return a reply in the form sent on the line."""
         ...
 
     def corrupt_at(self, framed: bytes) -> int:
@@ -60,11 +60,11 @@ class SerialDevice(Protocol):
     """An emulated device on a line; it sees messages without their framing."""
 
     def tick(self, now_ns: int) -> None:
-        """Let time pass."""
+        """Advance the time."""
         ...
 
     def answer(self, message: bytes, now_ns: int) -> EmulatedReply | None:
-        """Carry out a message; None where it is for another device."""
+        """Execute a message; None if it is for another device."""
         ...
 
     def refusal(self, message: bytes) -> EmulatedReply | None:
@@ -101,7 +101,7 @@ class EmulatedLine:
         self._is_text = not isinstance(link, FramesLink)
 
     def tick(self, now_ns: int) -> None:
-        """Let time pass for all devices."""
+        """Advance the time for all devices."""
         for device in self.devices:
             device.tick(now_ns)
 
@@ -114,7 +114,7 @@ class EmulatedLine:
                 yield each.encode() if isinstance(each, str) else each
 
     def answer(self, request: bytes, now_ns: int) -> EmulatedReply | None:
-        """Carry out a message; None where it is for no device here."""
+        """Execute a message; None if it is for no device here."""
         for device in self.devices:
             answer = device.answer(request, now_ns)
             if answer is not None:
@@ -126,7 +126,7 @@ class EmulatedLine:
         return self.devices[0].refusal(request)
 
     def encode(self, data: bytes) -> bytes:
-        """Return a reply as it stands on the line."""
+        """Return a reply in the form sent on the line."""
         return self._encode(data)
 
     def corrupt_at(self, framed: bytes) -> int:

@@ -1,9 +1,9 @@
-"""A DAC that plays blocks from the device's own buffer, over Modbus TCP: ``modbus_stream``.
+"""``modbus_stream``: a DAC that plays blocks from the device's own buffer, over Modbus TCP.
 
 LabJack's T4 and T7 put out one value in each scan of their own clock and read the input just before
 (stream-out and stream-in in one scan list). So that clock is the pace, a block's displacements come
 ``fifo_blocks`` exchanges after it, and between two exchanges the buffer holds that many blocks,
-which is how long this machine may stall. The first sample is put out once that many are there.
+which is how long this machine may stall. The first sample is output once that many are there.
 """
 
 import math
@@ -12,12 +12,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
-import numpy as np
-
 from hilctl.base.device import DeviceInfo, DeviceOptions
 from hilctl.base.errors import DeviceError, InputError
 from hilctl.base.types import F64
-from hilctl_drivers.device import DacDevice
+from hilctl_drivers.device import DacDevice, check_fifo, check_next
 from hilctl_drivers.labjack.stream import (
     ENABLE,
     VALUES_MAX,
@@ -75,7 +73,7 @@ class StreamSetup:
         """Hold options against their profile.
 
         Raises:
-            InputError: They don't go together, or the device can't stream.
+            InputError: They do not fit together, or the device cannot stream.
         """
         base = ModbusSetup.of(options)
         profile = base.writer.profile
@@ -107,21 +105,6 @@ class StreamSetup:
             most_hz, whose = 1.0 / settle_s, f"settling {settle_s * 1e3:.2f} ms: its profile"
         wire = stream_time(self.base.writer.profile, block)
         return RateLimit.of(wire, most_hz, whose, self.streaming.rate_min_hz)
-
-    def check_capacity(self, block: int, capacity: int) -> None:
-        """Refuse a block that the buffer is too small for.
-
-        Args:
-            block: Samples in an exchange.
-            capacity: Samples that the buffer holds.
-
-        Raises:
-            DeviceError: What can't be, and what would be possible.
-        """
-        if (self.fifo_blocks + 1) * block > capacity:
-            most = max(1, capacity // (self.fifo_blocks + 1))
-            rule = f"block must be 1 to {most}: fifo_blocks + 1 of them must fit into the FIFO"
-            raise DeviceError(f"{rule}, {capacity} samples, got {block}")
 
     def info(self) -> DeviceInfo:
         """Return what the device is and what it accepts."""
@@ -188,7 +171,7 @@ class ModbusStream(DacDevice):
             clock: Monotonic time in s.
 
         Raises:
-            InputError: The profile can't be used, or options don't go with it.
+            InputError: The profile cannot be used, or options do not go with it.
         """
         setup = StreamSetup.of(options)
         writer = setup.base.writer
@@ -200,7 +183,7 @@ class ModbusStream(DacDevice):
         )
         self._setup = setup
         self._connect, self._sleep, self._clock = connect, sleep, clock
-        self._factors = setup.base.chain.factors
+        self._chain = setup.base.chain
         self._guard = ModbusWatchdogDriver(setup.base)
         self._session: ModbusSession | None = None
         self._stream: StreamSession | None = None
@@ -241,7 +224,7 @@ class ModbusStream(DacDevice):
         self._calibration = stream.calibration(setup.channel)
         addresses = base.writer.address(base.output), base.writer.address(base.input)
         stream.prepare(sample_rate_hz, *addresses)
-        setup.check_capacity(block, stream.capacity)
+        check_fifo(block, setup.fifo_blocks, stream.capacity)
         self._safe_write.try_out(session)
         self._stream = stream
         self._next_sample = 0
@@ -253,7 +236,7 @@ class ModbusStream(DacDevice):
     def _output(self) -> float | None:
         assert self._session is not None
         held = self._session.held(self._setup.base.output)
-        return None if held is None else self._setup.base.chain.command(held)
+        return None if held is None else self._chain.command(held)
 
     def _stream_on(self, session: ModbusSession) -> StreamSession:
         base = self._setup.base
@@ -274,19 +257,15 @@ class ModbusStream(DacDevice):
         stream = self._stream
         if stream is None:
             raise DeviceError("not open")
-        if first_sample != self._next_sample:
-            rule = f"samples must follow one another, {self._next_sample} is next"
-            raise DeviceError(f"{rule}, got {first_sample}: open again to start at 0")
-        gain, offset, um_per_unit, offset_um = self._factors
+        check_next(first_sample, self._next_sample)
         # Queued before the readings are waited for: meanwhile the device must not run dry.
-        stream.feed((command - offset) / gain)
+        stream.feed(self._chain.outputs(command))
         self._next_sample += command.size
         readings = self._readings(stream, command.size)
         if self._guard.feed_every and self._session is not None:
             self._guard.feed(self._session)
         if readings is not None:
-            np.multiply(readings, um_per_unit, out=displacement_um)
-            displacement_um += offset_um
+            self._chain.fill_um(readings, displacement_um)
 
     def _readings(self, stream: StreamSession, block: int) -> F64 | None:
         """Return a block's volts, float64[B]; None before the first one is due."""
@@ -302,7 +281,7 @@ class ModbusStream(DacDevice):
     def _put_out(self, command: float) -> None:
         """Stop the stream and put the output at ``command``; what is queued is dropped."""
         self._release()
-        value = self._setup.base.chain.output(command)
+        value = self._chain.output(command)
         self._safe_write.attempt(self._peer, value)
 
     def _look(self) -> tuple[float, float | None]:

@@ -62,7 +62,7 @@ class ReadFrame:
 
 @dataclass(frozen=True, slots=True)
 class WriteFrame:
-    """Write register bytes from ``address`` on; a buffer register takes all of them."""
+    """Write register bytes from ``address`` on; a buffer register takes all."""
 
     address: int
     data: bytes
@@ -120,7 +120,7 @@ class ModbusFeedback:
 
         Raises:
             DeviceError: No answer, not a good one, or a refusal; then the frames before the one
-                that was refused may have been carried out.
+                that was refused may have been executed.
         """
         self._transaction = transaction = (self._transaction + 1) & 0xFFFF
         sizes = [frame.reply_size for frame in frames if frame.reply_size]
@@ -168,7 +168,7 @@ FLASH_READ: Final = 61812
 COMMAND_RESPONSE: Final = 16
 """``AUTO_TARGET``: data are fetched by reading ``DATA_CR``."""
 USE_AT_ONCE: Final = 1
-"""``OUT_SET_LOOP``: new values follow those that are still to be put out."""
+"""``OUT_SET_LOOP``: new values follow those that are still to be output."""
 MISSING: Final = 0xFFFF
 """Stands for dropped scans; the first input of a scan list has no such reading."""
 
@@ -275,7 +275,7 @@ class InputCalibration:
             data: From :func:`calibration_span` on.
 
         Raises:
-            DeviceError: They can't be any.
+            DeviceError: They cannot be any.
         """
         if form == "two_slopes":
             positive, negative, center, _ = struct.unpack(">4f", data)

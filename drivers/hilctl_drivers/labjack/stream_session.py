@@ -1,4 +1,4 @@
-"""The stream of a LabJack T4 or T7: set up, started, fed with values, and asked for readings."""
+"""Session with the stream of a LabJack T4 or T7: set up, start, queue values, read."""
 
 import math
 import time
@@ -20,7 +20,7 @@ _MARGIN_SCANS = 2
 class StreamSession:
     """One stream of one device: an output played from its buffer, an input read in each scan.
 
-    The count of scans is the clock. A value that was queued as number k is put out in scan k, and
+    The count of scans is the clock. A value that was queued as number k is output in scan k, and
     reading k is taken just before; this holds as long as the output's buffer never runs dry, and
     that is judged in each message, before the message's own values come.
 
@@ -67,7 +67,7 @@ class StreamSession:
         return stream.InputCalibration.decode(form, data)
 
     def stop(self) -> None:
-        """Stop the stream, whoever started it; the output holds its value.
+        """Stop the stream, also one of another program; the output holds its value.
 
         Raises:
             DeviceError: The device did not confirm.
@@ -85,7 +85,7 @@ class StreamSession:
             source: Address of the input.
 
         Raises:
-            DeviceError: The device did not take it, or can't make that rate, to 100 ppm.
+            DeviceError: The device did not take it, or cannot make that rate, to 100 ppm.
         """
         size = u32(self._streaming.buffer_bytes)
         self._write(
@@ -128,7 +128,7 @@ class StreamSession:
         return self._capacity
 
     def start(self) -> None:
-        """Start the clock; the first value is put out in the first scan.
+        """Start the clock; the first value is output in the first scan.
 
         Raises:
             DeviceError: The device did not take it, or its buffer does not hold what was queued.

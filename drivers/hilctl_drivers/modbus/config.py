@@ -1,4 +1,4 @@
-"""What an experiment says of a Modbus device, held against the device's profile."""
+"""Options of a Modbus device, resolved against its profile."""
 
 from dataclasses import dataclass, replace
 from typing import Literal, Self
@@ -164,10 +164,10 @@ class ModbusSetup:
 
     @classmethod
     def of(cls, options: ModbusOptions) -> "ModbusSetup":
-        """Hold options against their profiles.
+        """Resolve options against their profiles.
 
         Raises:
-            InputError: They don't go together, a time-out is too short, or the watchdog can't do
+            InputError: They do not fit together, a timeout is too short, or the watchdog cannot do
                 what is asked of it.
         """
         writer = _writer_of(options)
@@ -199,7 +199,7 @@ class ModbusSetup:
     def may_combine(self) -> bool:
         """Whether a sample may be one transaction; :meth:`ModbusDac.open` finds out.
 
-        Trying it moves an output that can't be read back, so it is not tried there.
+        Trying it moves an output that cannot be read back, so it is not tried there.
         """
         if self.reads_elsewhere:
             return False
@@ -207,7 +207,7 @@ class ModbusSetup:
 
     @property
     def unconfirmed(self) -> str:
-        """Why a value that was written cannot be confirmed, in words; empty if it can."""
+        """Why a value that was written cannot be confirmed, as text; empty if it can."""
         if self.output.readback_register is not None or self.output.function != 6:
             return ""
         if self.writer.host:

@@ -46,7 +46,7 @@ class ModbusDac(DacDevice):
             connect: Makes a session on a new link to the device that has the output.
 
         Raises:
-            InputError: The profile can't be used, or options don't go with it.
+            InputError: The profile cannot be used, or options do not go with it.
         """
         setup = ModbusSetup.of(options)
         super().__init__(
@@ -67,7 +67,7 @@ class ModbusDac(DacDevice):
         self._swap: Swap = _not_open
         self._feeds = False
         self.one_transaction = False
-        """Whether a tick is one transaction; known once it is open."""
+        """Whether a tick is one transaction; known after opening."""
 
     def _open(self, sample_rate_hz: float, block: int) -> None:
         """Self-test, init steps, one reading of the input; see :class:`DacDevice`.
@@ -170,7 +170,7 @@ class ModbusPair:
         """Connect and run the self-tests.
 
         Raises:
-            DeviceError: A device can't be reached, or is another one.
+            DeviceError: A device cannot be reached, or is another one.
         """
         self.writer.link.open()
         self.writer.check_selftest()
@@ -207,11 +207,11 @@ class ModbusPair:
         """Connect, read input and output register, and close the links; nothing is changed.
 
         Returns:
-            Displacement in um, and the output in the command's unit; None if it can't be read, or
+            Displacement in um, and the output in the command's unit; None if it cannot be read, or
             the register holds a command from before a trip of the watchdog.
 
         Raises:
-            DeviceError: A device can't be reached, is another one, or gives no good answer.
+            DeviceError: A device cannot be reached, is another one, or gives no good answer.
         """
         setup, writer = self._setup, self.writer
         try:
@@ -243,7 +243,7 @@ class ModbusPair:
         already.
 
         Raises:
-            DeviceError: The input or the output can't be read.
+            DeviceError: The input or the output cannot be read.
         """
         with naming(self._reader):
             self.reader.read_bytes(self._setup.input)

@@ -1,4 +1,4 @@
-"""Profiles of devices that speak Modbus, TCP or RTU, and of those that stream over it."""
+"""Profiles of Modbus devices (TCP and RTU), including streaming."""
 
 from collections.abc import Container, Iterator
 from typing import Annotated, ClassVar, Literal, Self
@@ -135,7 +135,7 @@ class ModbusOutput(Channel):
 
     @property
     def readback_register(self) -> Register | None:
-        """Where the value can be read again with the output's scale; None where it can't be."""
+        """Where the value can be read again with the output's scale; None if it cannot be."""
         if self.readback == "none":
             return None
         if self.readback == "same":

@@ -1,4 +1,4 @@
-"""One conversation with a Modbus device: registers, steps, and how long an exchange takes."""
+"""Session with a Modbus device: registers, steps, and exchange times."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -123,7 +123,7 @@ class ModbusSession:
         return (write_single_pdu if output.function == 6 else write_pdu)(address, data)
 
     def held(self, output: ModbusOutput) -> float | None:
-        """Return what an output's register holds, in its unit; None where it can't be read.
+        """Return what an output's register holds, in its unit; None if it cannot be read.
 
         Raises:
             DeviceError: No answer, not a good one, or a refusal.
@@ -132,7 +132,7 @@ class ModbusSession:
         return None if register is None else register.format.decode(self.read_bytes(register))
 
     def run(self, steps: Sequence[ModbusStep]) -> None:
-        """Carry out a profile's steps.
+        """Execute a profile's steps.
 
         Raises:
             DeviceError: One of them failed; the text says which.
@@ -240,7 +240,7 @@ def feed_time(profile: ModbusProfile) -> WireTime | None:
 
 
 def arm_s(profile: ModbusProfile, output: str) -> float:
-    """Return how long arming the device's watchdog takes at most, s; 0 without a watchdog."""
+    """Return the time that arming the device's watchdog takes at most, s; 0 without a watchdog."""
     watchdog = profile.watchdog
     if watchdog == "none":
         return 0.0

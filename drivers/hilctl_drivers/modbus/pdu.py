@@ -45,7 +45,7 @@ def _check_span(what: str, address: int, count: int, count_max: int) -> None:
 
 
 def _written(address: int, data: bytes, count_max: int) -> int:
-    """Return how many registers ``data`` is; raise BadRequest where they can't be written."""
+    """Return how many registers ``data`` is; raise BadRequest where they cannot be written."""
     if len(data) % 2:
         raise BadRequestError(f"registers have 2 bytes each, got {len(data)} bytes")
     _check_span("written register", address, len(data) // 2, count_max)
@@ -123,7 +123,7 @@ def write_read_pdu(read_address: int, read_count: int, write_address: int, data:
 def feedback_pdu(write_address: int, data: bytes, read_address: int, read_count: int) -> bytes:
     """Return a LabJack Modbus Feedback request: one read frame, then one write frame (76).
 
-    Frames are carried out in their order, so what is read does not show yet what is written.
+    Frames are executed in their order, so what is read does not show yet what is written.
 
     Arguments and errors are as for :func:`write_read_pdu`, with at most 122 registers to write and
     126 to read: what fits a PDU of 253 bytes.

@@ -1,4 +1,4 @@
-"""Modbus requests built once and sent many times: the loop's hot path.
+"""Prepared Modbus requests: built once and sent in every tick.
 
 A transaction keeps what never changes of its request and of its good reply. A tick puts transaction
 id, data and CRC to it, and compares. Only a reply that differs goes the long way through
@@ -44,7 +44,7 @@ def _data_span(pdu: bytes) -> tuple[int, int]:
 
 
 class Transaction(ABC):
-    """A prepared request and the check of its reply; what is the same in all of them is kept."""
+    """A prepared request and the check of its reply; what is the same in all is kept."""
 
     def __init__(self, adu: bytes, pdu: bytes, start: int) -> None:
         """Take the first request, its PDU, and where in the request the PDU begins."""
@@ -153,7 +153,7 @@ class TcpTransaction(Transaction):
 class RtuTransaction(Transaction):
     """A prepared Modbus RTU :class:`Transaction`; there is no id to tell a late reply by.
 
-    CRCs of what never changes are worked out once; the rest is taken two bytes at a time.
+    CRCs of what never changes are computed once; the rest is taken two bytes at a time.
     """
 
     def __init__(self, unit: int, pdu: bytes) -> None:

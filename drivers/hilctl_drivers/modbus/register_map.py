@@ -1,4 +1,4 @@
-"""Registers in a profile: channels, steps, the flag of a trip, and values as register bytes.
+"""Registers of a profile: channels, steps, trip flag, and encoding of values.
 
 ``value = raw * scale + offset``. Byte order is in ABCD notation: the letters name a value's bytes
 from the most significant one, in the order in which they travel. ``ABCD`` is big-endian, ``CDAB``
@@ -38,7 +38,7 @@ class RegisterFormat:
         offset: Value where raw is 0, in the channel's unit.
 
     Raises:
-        BadRequest: Unknown type, an order that doesn't name each byte once, a scale of 0, or a
+        BadRequest: Unknown type, an order that does not name each byte once, a scale of 0, or a
             scale or offset that is not finite.
     """
 
@@ -116,7 +116,7 @@ class RegisterFormat:
         """Return ``value`` as register bytes: bytes[size], integers rounded half to even.
 
         Raises:
-            BadRequest: ``value`` is not finite or the type can't hold it; never clipped.
+            BadRequest: ``value`` is not finite or the type cannot hold it; never clipped.
         """
         raw = (value - self.offset) / self.scale
         if not isfinite(raw):
@@ -258,7 +258,7 @@ class Channel(Register, Range):
 
     @property
     def step(self) -> float:
-        """Smallest step in ``unit``; 0 where the profile doesn't say and the type is a float."""
+        """Smallest step in ``unit``; 0 if the profile does not say and the type is a float."""
         if self.resolution is not None:
             return self.resolution
         whole = not self.type.startswith("float")
@@ -323,7 +323,7 @@ ModbusStep: TypeAlias = Annotated[
 
 
 class TripFlag(Register):
-    """A register that says yes where any bit of ``mask`` is set."""
+    """A register that says yes if any bit of ``mask`` is set."""
 
     mask: int = Field(ge=1, le=0xFFFFFFFF, description="bits of the raw value that say yes")
 

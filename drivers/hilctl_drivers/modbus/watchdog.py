@@ -1,4 +1,4 @@
-"""The host watchdog of a Modbus device, and the write of the safe value, tripped or not."""
+"""Host watchdog of a Modbus device, and the write of the safe value."""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -28,7 +28,7 @@ class ModbusWatchdogDriver:
         self._has = setup.writer.profile.watchdog
         self._ticks = 0
         self.feed_every = 0
-        """Ticks from one feeding to the next; 0 where exchanges feed it."""
+        """Ticks from one feeding to the next; 0 if exchanges feed it."""
 
     def write_through(self, session: ModbusSession, put: Callable[[], None]) -> None:
         """Write the output, also where the watchdog has tripped.
@@ -58,7 +58,7 @@ class ModbusWatchdogDriver:
         """End a trip of an earlier run, with the output where the trip has put it.
 
         Raises:
-            DeviceError: A step failed, or nobody knows where that is.
+            DeviceError: A step failed, or that value is unknown.
         """
         if self._has == "none" or not self._has.clear or not self._tripped(session):
             return
@@ -88,7 +88,7 @@ class ModbusWatchdogDriver:
         return False
 
     def _trip_value(self, session: ModbusSession, has: ModbusWatchdog) -> float | None:
-        """Return what a tripped device puts out, in the output's unit; None where not known."""
+        """Return what a tripped device outputs, in the output's unit; None if not known."""
         output = self._setup.output
         for step in has.safe.get(self._setup.options.output, ()):
             if isinstance(step, RegisterStep) and step.value == "safe":
@@ -118,7 +118,7 @@ class ModbusWatchdogDriver:
             self.feed_every = ticks
 
     def arm(self, session: ModbusSession) -> None:
-        """Set safe value and time-out and start it, if the experiment wants one.
+        """Set safe value and timeout and start it, if the experiment wants one.
 
         Raises:
             DeviceError: A step failed.
@@ -126,7 +126,7 @@ class ModbusWatchdogDriver:
         has = self._has
         if self._wanted == "none" or has == "none":
             return
-        # The safe value before the time-out: once it counts, it must know where to go.
+        # The safe value before the timeout: once it counts, it must know where to go.
         steps = self._bound(has, (*has.safe.get(self._setup.options.output, ()), *has.arm))
         if session.would_change(steps):
             session.run(self._bound(has, has.unlock))
@@ -142,7 +142,7 @@ class ModbusWatchdogDriver:
             session.run(self._bound(self._has, self._has.disarm))
 
     def feed(self, session: ModbusSession) -> None:
-        """Feed a watchdog that exchanges don't feed; three times in its timeout.
+        """Feed a watchdog that exchanges do not feed; three times in its timeout.
 
         Raises:
             DeviceError: A step failed.

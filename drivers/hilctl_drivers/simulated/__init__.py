@@ -1,11 +1,11 @@
-"""Simulated actuators behind the contract of a device.
+"""Simulated actuators.
 
-terfenol.py        a Terfenol-D actuator and its options; terfenol_kernel.py  its compiled steps
-pinned_cells.py    cells with dry friction behind one lag of the field
-domains.py         domains of eight orientations, averaged over their energies
-diffusion.py       the field diffuses into conducting rods, shell by shell
-jiles_atherton.py  Jiles and Atherton's equations with eddy and excess loss
-piezo.py           a piezo stage
-plant.py           the base of both actuators, and of every physics of the rods
-rigs.py            both actuators as devices: blocks, FIFO, injected faults
+devices.py         both actuators as devices, with injected faults
+actuator_base.py   base of the actuators and of all rod models
+terfenol.py        Terfenol-D actuator; terfenol_kernel.py has its compiled steps
+piezo.py           piezo stage
+pinned_cells.py    rod model: cells with dry friction
+domains.py         rod model: domains of eight orientations
+diffusion.py       rod model: field diffusion in conducting rods
+jiles_atherton.py  rod model: Jiles-Atherton with eddy and excess losses
 """

@@ -1,4 +1,4 @@
-"""The base of simulated actuators, and of every physics of magnetostrictive rods."""
+"""Base classes of simulated actuators and of models of magnetostrictive rods."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -49,7 +49,7 @@ class SensorNoise:
 class Plant(ABC):
     """A simulated actuator with its amplifier and sensor, advanced sample by sample.
 
-    A reading is taken at the instant its command is put out and can't show that command's effect;
+    A reading is taken at the instant its command is output and cannot show that command's effect;
     the DAC then holds the command for one sample period. Blocks may be cut anywhere: the readings
     are the same bit for bit, noise included.
     """
@@ -71,7 +71,7 @@ class Plant(ABC):
         self._rest()
 
     def step(self, command: F64, displacement_um: F64, measured: F64) -> None:
-        """Put out a block of commands and read the sensors before each.
+        """Output a block of commands and read the sensors before each.
 
         Args:
             command: float64[n], finite and within the DAC's range: the caller checks, nothing is

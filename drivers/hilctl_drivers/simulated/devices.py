@@ -1,4 +1,4 @@
-"""The simulated rigs as devices: ``simulated_terfenol`` and ``simulated_piezo``.
+"""Simulated rigs as devices: ``simulated_terfenol`` and ``simulated_piezo``.
 
 They step on sample count, so a run needs no real time: time passes only in an exchange, one sample
 period per command. From outside that is a device with a sample clock and a FIFO of its own, so they

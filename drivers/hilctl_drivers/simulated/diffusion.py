@@ -1,4 +1,4 @@
-"""Rods into which the field has to diffuse: a conducting cylinder, shell by shell.
+"""Rod model with field diffusion: a conducting cylinder, divided into shells.
 
 Maxwell's equations without displacement current in a long cylinder, as in R. L. Stoll, "The
 Analysis of Eddy Currents" (Oxford 1974), and for magnetostrictive rods M. E. H. Benbouzid et al.,

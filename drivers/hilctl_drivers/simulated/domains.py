@@ -1,4 +1,4 @@
-"""Rods of domains in eight orientations, averaged over their energies.
+"""Rod model with domains of eight orientations, averaged over their energies.
 
 W. D. Armstrong, "Magnetization and magnetostriction processes in Tb(0.27-0.30)Dy(0.73-0.70)
 Fe(1.9-2.0)", J. Appl. Phys. 81 (1997) 2321, and "An incremental theory of magneto-elastic

@@ -1,4 +1,4 @@
-"""Rods after Jiles and Atherton, with the losses of eddy currents and domain walls.
+"""Jiles-Atherton rod model with eddy-current and excess losses.
 
 Magnetisation: D. C. Jiles and D. L. Atherton, "Theory of ferromagnetic hysteresis", J. Magn. Magn.
 Mater. 61 (1986) 48, as taken up for Terfenol-D transducers by F. T. Calkins, R. C. Smith and A. B.

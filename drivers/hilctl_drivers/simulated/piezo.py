@@ -1,4 +1,4 @@
-"""Physics of the simulated piezo stage: the published play-operator model and its sensor.
+"""Simulated piezo stage: the published play-operator model and its sensor.
 
 Source: "Modeling and Compensation of Rate-Dependent Asymmetric Hysteresis Nonlinearities of
 Magnetostrictive Actuators", Concordia, chapter 3, section 4.4: stage PI P-753.31C driven over

@@ -1,4 +1,4 @@
-"""Rods of pinned cells behind a lag of the field: the physics that the rig had first.
+"""Rod model with pinned cells behind a lag of the field; the default.
 
 The pinned cells follow A. Bergqvist, "Magnetic vector hysteresis model with dry friction-like
 pinning", Physica B 233 (1997) 342, and F. Henrotte et al., "An energy-based vector hysteresis model

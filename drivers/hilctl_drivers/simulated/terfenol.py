@@ -1,4 +1,4 @@
-"""The simulated Terfenol-D actuator, from DAC code to ADC code: what is round its rods.
+"""Simulated Terfenol-D actuator, from DAC code to ADC code.
 
 Amplifier, rods, structure and sensor are chained as in the rig of the dissertation "Modeling and
 Compensation of Rate-Dependent Asymmetric Hysteresis Nonlinearities of Magnetostrictive Actuators",
@@ -101,7 +101,7 @@ class TerfenolParameters:
         dac_codes: Codes on either side of zero (DAC and ADCs).
         amplifier_bandwidth_hz: Corner of the first-order current loop.
         coil_factor_per_m: Field of one ampere, k_o in H = k_o I + H_PM.
-        magnet_field_a_per_m: Field of the permanent magnets, H_PM; 0 where there are none: the
+        magnet_field_a_per_m: Field of the permanent magnets, H_PM; 0 if there are none: the
             displacement is then even in the current.
         stiffness_n_per_m: Stiffness of the rods.
         damping_ratio: Damping of the structure, measured without a load and kept with any: the
@@ -281,7 +281,7 @@ class TerfenolActuator(Plant):
     def _move(self, command: F64, noise_um: F64, displacement_um: F64, measured: F64) -> None:
         """Pass some samples through amplifier, rods and structure, one after the other.
 
-        The rods don't act back on the amplifier, nor the structure on the rods; so each may take
+        The rods do not act back on the amplifier, nor the structure on the rods; so each may take
         all the steps at once.
         """
         steps = command.size * self._substeps

@@ -1,7 +1,7 @@
-"""Compiled steps of the simulated actuator around its rods, from amplifier to sensor.
+"""Compiled steps of the Terfenol-D actuator: amplifier, creep, heat, structure and sensor.
 
-numba's on-disk cache does not notice a callee that changed in another file: all that a kernel calls
-stands in its own. Displacements are in um.
+numba's on-disk cache does not notice a callee that changed in another file, so a kernel's callees
+are in its own file. Displacements are in um.
 """
 
 from typing import TypeAlias
@@ -23,7 +23,7 @@ def _toward(start: float, target: float, left: float, limit: tuple[float, float]
         target: Current in A that is wanted.
         left: What is then left of the error, had the amplifier all voltages.
         limit: What is then left of a current that nothing drives, and the current in A that the
-            largest voltage holds, infinite where there is no limit.
+            largest voltage holds, infinite if there is no limit.
     """
     decay, most = limit
     free = target + left * (start - target)
@@ -41,7 +41,7 @@ def amplify(
     amplifier: Amplification,
     substeps: int,
 ) -> None:
-    """Put out commands and let the current follow.
+    """Output commands and let the current follow.
 
     Args:
         command: float64[n], current in A.

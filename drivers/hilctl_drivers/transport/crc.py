@@ -1,4 +1,4 @@
-"""Checks that travel with a message: cyclic redundancy checks and byte sums.
+"""Checksums of messages: cyclic redundancy checks and byte sums.
 
 Names follow the "Catalogue of parametrised CRC algorithms": CRC-16/MODBUS, CRC-16/IBM-3740 (also
 called CCITT-FALSE), CRC-16/XMODEM, CRC-32/ISO-HDLC.

@@ -1,4 +1,4 @@
-"""Binary frames for serial streams, and messages cut out of a stream.
+"""Binary frames, and splitters that find messages in a stream.
 
 COBS frame: ``COBS(payload | crc LE) 00``. Length-prefixed frame: ``length u16 LE | payload | crc
 LE``, the length counting the payload alone, the CRC over length and payload. COBS: Cheshire and
@@ -94,11 +94,11 @@ class PrefixedSplitter(Splitter[bytes]):
     def __init__(
         self, size_at: Callable[[Bytes, int], int], parse: Callable[[bytes], bytes]
     ) -> None:
-        """Take what knows the frames.
+        """Set up.
 
         Args:
-            size_at: Buffer and position to the size of the frame that begins there; 0 where it
-                can't be told yet; raises Corrupt where none can begin there.
+            size_at: Buffer and position to the size of the frame that begins there; 0 if it
+                cannot be told yet; raises Corrupt where none can begin there.
             parse: Whole frame to payload; raises Corrupt.
         """
         super().__init__()
@@ -266,7 +266,7 @@ class LengthFraming(Framing):
         return PrefixedSplitter(self._size_at, self._payload)
 
     def _size_at(self, data: Bytes, at: int) -> int:
-        """Return the size of the frame that begins at ``at``, 0 where that can't be told yet."""
+        """Return the size of the frame that begins at ``at``, 0 if that cannot be told yet."""
         if len(data) - at < LENGTH_SIZE:
             return 0
         size = data[at] | data[at + 1] << 8

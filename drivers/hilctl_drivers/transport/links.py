@@ -1,4 +1,4 @@
-"""Links: one request, one reply, never longer than the timeout; and what can go wrong.
+"""Link contract (one request, one reply, within the timeout) and the errors of a link.
 
 Nothing is pipelined and nothing is sent twice. The caller computes from the bytes so far where a
 reply ends; pauses between bytes mean nothing. Texts of errors do not name the device or the action:
@@ -8,7 +8,7 @@ DeviceError
 |-- NoAnswerError     no complete reply in time
 |-- LostError         the connection is gone
 `-- FrameError        any of the below
-    |-- BadRequest    the request can't be put on this wire; nothing was sent
+    |-- BadRequest    the request cannot be put on this wire; nothing was sent
     |-- Incomplete    a good beginning, but more bytes are needed
     |-- Corrupt       a check or the structure is wrong
     |-- Mismatch      well formed, but not the answer to this request
@@ -25,8 +25,8 @@ from hilctl.base.errors import DeviceError
 from hilctl.base.files import reason
 
 Missing: TypeAlias = Callable[[bytearray], int]
-"""How many more bytes to wait for, at least, after those that have come; 0 where the reply is
-there. It may raise where they can't be the beginning of one."""
+"""How many more bytes to wait for, at least, after those that have come; 0 if the reply is
+there. It may raise where they cannot be the beginning of one."""
 
 
 class NoAnswerError(DeviceError):
@@ -49,7 +49,7 @@ class Link(Protocol):
         """Connect.
 
         Raises:
-            LostError: There is nobody, or the port is in use.
+            LostError: No device answers, or the port is in use.
         """
         ...
 
@@ -72,13 +72,13 @@ class Link(Protocol):
         ...
 
     def close(self) -> None:
-        """Let go of it; closing twice is fine."""
+        """Close the link; closing twice is fine."""
         ...
 
 
 @contextmanager
 def naming(who: str) -> Iterator[None]:
-    """Let errors of a device say which one it is; an empty name leaves them as they are."""
+    """Prefix errors with the name of a device; an empty name changes nothing."""
     try:
         yield
     except DeviceError as error:
@@ -88,7 +88,7 @@ def naming(who: str) -> Iterator[None]:
 
 
 def why(error: OSError, remedies: Mapping[int, str] = MappingProxyType({})) -> str:
-    """Return the system's own words for an error, to stand in a sentence, and what to do about it.
+    """Return the text of an OS error, for use in a sentence, with a suggested fix.
 
     Args:
         error: What was raised.
@@ -104,18 +104,18 @@ def cut(got: int, wanted: int, timeout_s: float) -> str:
     Args:
         got: Bytes that have come.
         wanted: Bytes that were still waited for.
-        timeout_s: Time-out of the exchange, s.
+        timeout_s: Timeout of the exchange, s.
     """
     what = f"only {got} bytes, {wanted} short," if got else "no answer"
     return f"{what} within {timeout_s:g} s"
 
 
 class FrameError(DeviceError):
-    """A message can't be built, or what came back is not a good answer to it."""
+    """A message cannot be built, or what came back is not a good answer to it."""
 
 
 class BadRequestError(FrameError, ValueError):
-    """What is asked can't be put on this wire; nothing was sent.
+    """What is asked cannot be put on this wire; nothing was sent.
 
     Example scenarios: more registers than a frame holds, a value that the register's type or the
     number's field can't hold. Also a ``ValueError``, so that a profile's validation can collect it.

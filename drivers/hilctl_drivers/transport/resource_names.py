@@ -1,7 +1,7 @@
-"""One device, one user: a port closed to other programs, and the names of a device's locks.
+"""Exclusive use of a device: exclusive access to a port, and names of locks.
 
 pyserial's lock is heeded only by programs that take one too; a shell, a terminal program or a
-daemon that probes ports does not. The kernel refuses the port to all of them after TIOCEXCL, except
+daemon that probes ports does not. The kernel refuses the port to all after TIOCEXCL, except
 to privileged ones. It keeps that as long as *any* descriptor of the port is open, also when the
 process that asked for it was killed. Then the guardian must open the port to make the output safe,
 often without privileges. So it is asked for only if it ends with this process:
@@ -28,7 +28,7 @@ _PTY_MAJORS = range(136, 144)
 
 
 def refuse_to_others(descriptor: int, path: str) -> bool:
-    """Refuse an open port to other programs, where that ends with this process.
+    """Reject an open port to other programs, where that ends with this process.
 
     Args:
         descriptor: The port.
@@ -146,7 +146,7 @@ def _addresses(name: str) -> tuple[str, ...]:
             return
         found.extend(str(answer[4][0]) for answer in answers)
 
-    # The resolver has no time-out of its own; it is left behind where it takes too long.
+    # The resolver has no timeout of its own; it is left behind where it takes too long.
     thread = Thread(target=ask, daemon=True)
     thread.start()
     thread.join(_LOOKUP_S)

@@ -1,8 +1,8 @@
-"""The safe value of every protocol: tried out at open, written in one attempt, read back.
+"""The safe value on a serial line: tested at open, written in one attempt, read back.
 
-An attempt follows a failure, so the line may be full of late answers or never fall silent, and the
-device may be deaf or booting. The value is sent before any of this is examined; only the device's
-own answer to it counts.
+An attempt usually follows a failure: late answers may be on the line, it may never become silent,
+and the device may be booting. So the value is sent first and confirmed afterwards. Only the
+device's own answer to it counts.
 """
 
 from collections.abc import Callable
@@ -21,7 +21,7 @@ class SafeExchange:
 
     Serial protocols do not number their replies, or repeat the numbers: after a failure the answer
     to an older message would pass for the next one's, and so on. The silence that is required grows
-    with each failed attempt, up to the time-out.
+    with each failed attempt, up to the timeout.
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""Bytes over a serial line."""
+"""Serial port as a link."""
 
 import array
 import contextlib
@@ -217,7 +217,7 @@ class SerialLink:
         """Exchange, see :meth:`~hilctl_drivers.transport.links.Link.transact`.
 
         After a failure the next request waits until the line is quiet and throws away what came:
-        serial protocols don't number their replies, so a late one would pass for the next.
+        serial protocols do not number their replies, so a late one would pass for the next.
         """
         if self._port is None:
             raise LostError("not open")
@@ -264,7 +264,7 @@ class SerialLink:
         try:
             self._port.write(request)
         except serial.SerialTimeoutException as error:
-            # What waits there would be carried out before the next try, or hold it up for good.
+            # What waits there would be executed before the next try, or hold it up for good.
             self._port.reset_output_buffer()
             raise self._failed(error) from None
         except OSError as error:

@@ -1,4 +1,4 @@
-"""Bytes over TCP."""
+"""TCP connection as a link."""
 
 import math
 import select

@@ -1,9 +1,9 @@
-"""How long an exchange takes on a wire, and the highest rate that leaves; knows no protocol.
+"""Duration of an exchange on a wire, and the highest sample rate; independent of the protocol.
 
-What is counted can't be beaten: characters at the line's baud, gaps that the protocol or the device
-asks for, USB frames, the device's turnaround, and the time that its terminals take to settle. What
-the operating system adds is not counted, so a rate that is refused here is impossible, and one that
-is not may still be out of reach. Each protocol's own ``timing`` works out what it sends.
+It is a lower bound: characters at the line's baud, gaps that the protocol or the device requires,
+USB frames, the device's turnaround, and the settling time of its terminals. Delays of the operating
+system are not included. So a rejected rate is impossible, and an accepted one may still be too
+high. Each protocol computes its own messages.
 """
 
 from dataclasses import dataclass, replace
@@ -97,8 +97,8 @@ class RateLimit:
 
     Attributes:
         highest_hz: Highest sample rate.
-        note: Why it is that, in words.
-        lowest_hz: Lowest sample rate; 0 where any above 0 will do.
+        note: Why it is that, as text.
+        lowest_hz: Lowest sample rate; 0 if any above 0 will do.
     """
 
     highest_hz: float
@@ -107,12 +107,12 @@ class RateLimit:
 
     @classmethod
     def of(cls, wire: WireTime, most_hz: float, whose: str, lowest_hz: float = 0.0) -> "RateLimit":
-        """Return the limit of a wire, or of what stands behind it where that is slower.
+        """Return the limit of the wire or of the device, whichever is lower.
 
         Args:
-            wire: What an exchange costs.
-            most_hz: What the device itself can do.
-            whose: Who says so.
+            wire: Time of an exchange.
+            most_hz: Highest rate of the device itself.
+            whose: Source of that rate.
             lowest_hz: Lowest sample rate.
         """
         if wire.highest_rate_hz <= most_hz:
@@ -120,7 +120,7 @@ class RateLimit:
         return cls(most_hz, f"{whose} says so; the wire alone: {wire}", lowest_hz)
 
     def check(self, rate_hz: float) -> None:
-        """Refuse a sample rate that is outside.
+        """Reject a sample rate outside the limits.
 
         Raises:
             DeviceError: What would be possible, and why.

@@ -66,7 +66,7 @@ def test_a_command_out_of_range_is_refused_and_not_sent(longest, bad, place):
     command = [0.0] * longest
     exchange(device, *command)
     command[place] = bad
-    with pytest.raises(DeviceError, match=r"must be in \[-2, 2\] A, got .* nothing was sent"):
+    with pytest.raises(DeviceError, match=r"\[-2, 2\] A.*nothing"):
         exchange(device, *command)
     with pytest.raises(DeviceError, match="nothing was sent"):
         device.make_safe(bad)
@@ -80,9 +80,9 @@ def test_blocks_are_as_agreed_at_open():
     with pytest.raises(DeviceError, match="not open"):
         exchange(device, 0.0)
     device.open(1000.0, 2)
-    with pytest.raises(DeviceError, match="block must be 2 samples, as at open, got 1, 1, 1"):
+    with pytest.raises(DeviceError, match=r"2 samples.* 1, 1, 1"):
         exchange(device, 0.0)
-    with pytest.raises(DeviceError, match="block must be 1 to 3 samples, as its queue holds"):
+    with pytest.raises(DeviceError, match="1 to 3 samples"):
         device.open(1000.0, 4)
     with pytest.raises(DeviceError, match="not open"):
         exchange(device, 0.0, 0.0)

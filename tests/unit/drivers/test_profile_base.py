@@ -28,9 +28,9 @@ def test_other_timeouts_are_refused_not_rounded(timeout_s, said):
 
 
 def test_ranges_and_spans_are_ordered():
-    with pytest.raises(ValidationError, match="min must be < max, got 1 and 1"):
+    with pytest.raises(ValidationError, match=r"min .*< max"):
         Range(unit="V", min=1.0, max=1.0)
-    with pytest.raises(ValidationError, match="min_s must be <= max_s, got 2 and 1"):
+    with pytest.raises(ValidationError, match=r"min_s .*<= max_s"):
         Watchdog(**{**WATCHDOG.model_dump(), "min_s": 2.0, "max_s": 1.0})
 
 

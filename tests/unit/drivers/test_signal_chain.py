@@ -66,7 +66,7 @@ def test_channels_are_found_by_name():
     """An unknown name lists those that there are; none is said where there are none."""
     assert channel("input", "A", {"A": VOLTS}, "Acme") is VOLTS
     two = {"A": VOLTS, "B": VOLTS}
-    with pytest.raises(InputError, match=r"must be one that Acme has, got 'C' \(it has A, B\)"):
+    with pytest.raises(InputError, match=r"'C' .*A, B"):
         channel("input", "C", two, "Acme")
     with pytest.raises(InputError, match=r"\(it has none\)"):
         channel("input", "C", {}, "Acme")
@@ -75,5 +75,5 @@ def test_channels_are_found_by_name():
 def test_input_of_its_own_output_is_no_sensor():
     """A supply's own meter can't be the displacement sensor."""
     supply = load_profile("kepco_bop")
-    with pytest.raises(InputError, match="name the device that reads the sensor as reader"):
+    with pytest.raises(InputError, match="as reader"):
         channel("input", "current", supply.inputs, supply.title)

@@ -53,21 +53,21 @@ def test_a_number_is_the_one_group_of_its_pattern(pattern, example, said):
 
 
 def test_an_output_is_written_with_its_value():
-    with pytest.raises(ValidationError, match=r"write must have the field \{value\}"):
+    with pytest.raises(ValidationError, match=r"\{value\}"):
         AsciiOutput(write="OUT ON", reply="none", unit="V", min=0.0, max=1.0)
 
 
 def test_an_error_must_not_look_like_a_good_reply():
     """Else every command would fail, or none."""
     errors = ({"pattern": ".?", "example": "", "meaning": "trouble"},)
-    with pytest.raises(ValidationError, match="matches the good reply of outputs"):
+    with pytest.raises(ValidationError, match="reply of outputs"):
         AsciiProfile.model_validate({**DCON.model_dump(), "errors": errors})
 
 
 def test_a_strict_watchdog_has_what_feeds_it():
     plain = DCON.model_dump()
     plain["watchdog"]["feed"] = ()
-    with pytest.raises(ValidationError, match="feed steps and kick: strict go together"):
+    with pytest.raises(ValidationError, match="kick: strict"):
         AsciiProfile.model_validate(plain)
 
 

@@ -92,19 +92,19 @@ def test_what_is_no_good_answer_is_not_believed(board, reply, error, said):
 
 def test_a_reply_with_fewer_values_than_it_says_is_refused(board):
     board.link.make = answer(body=struct.pack("<HfHH", 2, 2.5, 7, 3))
-    with pytest.raises(MismatchError, match="behind the head of a reply with 2 values"):
+    with pytest.raises(MismatchError, match="with 2 values"):
         board.exchange(np.array([0.0]))
 
 
 def test_a_setting_that_the_board_took_otherwise_is_an_error(board):
     """Watchdogs to the millisecond, clocks within a ten-thousandth."""
     board.link.make = answer(body=struct.pack("<I", 60))
-    with pytest.raises(DeviceError, match="was set to 50 ms, the board took 60"):
+    with pytest.raises(DeviceError, match=r"50 ms, .* 60"):
         board.set_watchdog(0.05, 0.0)
     board.link.make = answer(body=struct.pack("<f", 10_000.5))
     board.set_clock(10_000.0, 5)
     board.link.make = answer(body=struct.pack("<f", 10_010.0))
-    with pytest.raises(DeviceError, match="set to 10000 Hz, the board makes 10010"):
+    with pytest.raises(DeviceError, match=r"10000 Hz, .* 10010"):
         board.set_clock(10_000.0, 5)
 
 
@@ -114,14 +114,14 @@ def test_values_are_rounded_and_never_clipped():
     assert data == struct.pack("<hh", 1, -10_000)
     np.testing.assert_allclose(values.decode(data), [0.001, -10.0])
     for bad in (10.001, float("nan")):
-        with pytest.raises(BadRequestError, match="value 1 must be -10 to 10 V"):
+        with pytest.raises(BadRequestError, match="-10 to 10"):
             values.encode(np.array([0.0, bad]))
 
 
 def test_mixed_byte_orders_are_refused():
     """Frames have no registers that words could be swapped in."""
     channel = FrameChannel(type="float32", order="CDAB", unit="V", min=0.0, max=1.0)
-    with pytest.raises(InputError, match="must be ABCD or DCBA in frames, got CDAB"):
+    with pytest.raises(InputError, match=r"ABCD or DCBA.* CDAB"):
         BoardValues(channel)
 
 
@@ -138,7 +138,7 @@ def test_a_state_byte_by_byte(board):
     assert board.link.asked == [b"\x16\x01"]
     assert (found.tripped, found.output, found.reading) == (True, 0.5, -2.5)
     board.link.make = answer(body=b"\x00" + struct.pack("<f", 0.5))
-    with pytest.raises(MismatchError, match="4 bytes behind the flags of a state"):
+    with pytest.raises(MismatchError, match="4 bytes behind"):
         board.state()
 
 

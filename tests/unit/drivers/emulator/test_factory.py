@@ -41,7 +41,7 @@ def test_what_can_not_be_emulated_is_refused(served, profile, options, words):
 def test_second_port_in_use_leaves_nothing_open(served):
     """What was opened before the refusal is let go of."""
     port = int(served("labjack_t7").split(":")[1])
-    with pytest.raises(InputError, match=f"can't listen on 127.0.0.1:{port}"):
+    with pytest.raises(InputError, match=f"listen on 127.0.0.1:{port}"):
         served("adam_6224", reader="adam_6217", reader_port=port)
 
 

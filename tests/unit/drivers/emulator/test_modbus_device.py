@@ -15,7 +15,7 @@ def device_of(name: str, output: str, sensor: str, **more: float) -> EmulatedMod
 
 def test_unknown_channels_are_refused():
     """The message says which there are."""
-    with pytest.raises(InputError, match="DAC9 and AIN0: outputs DAC0, DAC1"):
+    with pytest.raises(InputError, match=r"DAC9 .* outputs DAC0,"):
         device_of("labjack_t7", "DAC9", "AIN0")
 
 

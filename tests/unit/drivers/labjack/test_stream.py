@@ -47,7 +47,7 @@ def test_a_message_is_as_long_as_it_may_be():
     full = [*stream.READ_FRAMES, *stream.value_frames(np.zeros(stream.VALUES_MAX))]
     assert len(frames_pdu(full)) == 253
     assert 1 + sum(frame.reply_size for frame in full) == 253
-    with pytest.raises(DeviceError, match="at most 253 bytes"):
+    with pytest.raises(DeviceError, match="253 bytes"):
         frames_pdu([*full[:2], WriteFrame(4400, bytes(236)), full[3]])
 
 
@@ -79,7 +79,7 @@ def test_a_stream_that_lost_something_is_an_error_in_words(head, text):
 
 def test_more_samples_than_asked_for_are_no_answer():
     """A count that the message can't hold is not believed."""
-    with pytest.raises(MismatchError, match="121 samples in an answer that holds 120"):
+    with pytest.raises(MismatchError, match=r"121 samples .* 120"):
         stream.stream_data(words(121, 0, 0, 0) + bytes(240), stream.u32(0))
 
 
@@ -104,7 +104,7 @@ def test_t4_readings_lie_on_a_line():
 @pytest.mark.parametrize("numbers", [(0.0, 0.0), (float("nan"), 0.0), (-1e-4, 0.0)])
 def test_constants_that_are_none_are_refused(numbers):
     """An erased flash must not turn readings into displacements."""
-    with pytest.raises(DeviceError, match="calibration constants in flash are none"):
+    with pytest.raises(DeviceError, match="calibration constants"):
         stream.InputCalibration.decode("line", struct.pack(">2f", *numbers))
 
 
@@ -174,8 +174,8 @@ def test_each_read_frame_gets_its_words():
     [
         ([ReadFrame(0, 0)], "1 to 255 registers, got 0"),
         ([WriteFrame(0, b"123")], "2 bytes each, got 3"),
-        ([WriteFrame(4400, bytes(250))], "at most 253 bytes, got 255"),
-        ([ReadFrame(0, 127)], "at most 253 bytes, got 255"),
+        ([WriteFrame(4400, bytes(250))], "253 bytes, got 255"),
+        ([ReadFrame(0, 127)], "253 bytes, got 255"),
     ],
 )
 def test_what_no_message_holds_is_refused(frames, text):
@@ -209,7 +209,7 @@ def test_an_answer_to_something_else_is_an_error(link, error, text):
 def test_nonsense_is_not_waited_for():
     """Bytes that are not Modbus are refused at once."""
     link = Link(lambda request: bytes.fromhex("0001 0700 0006 01 4c00"))
-    with pytest.raises(CorruptError, match="not a Modbus TCP header"):
+    with pytest.raises(CorruptError, match="TCP header"):
         ModbusFeedback(link, 1).read(0, 2)
 
 

@@ -49,7 +49,7 @@ def test_a_stream_that_runs_dry_is_an_error(rig):
     session.feed(np.full(20, 2.0))
     session.start()
     made.time.sleep(0.1)
-    with pytest.raises(DeviceError, match="underrun: the device had nothing new"):
+    with pytest.raises(DeviceError, match="underrun: the"):
         session.take(10)
 
 
@@ -64,7 +64,7 @@ def test_values_that_were_lost_on_the_way_are_noticed_before_the_start(rig):
     _, session = rig
     session.feed(np.full(50, 2.0))
     session._queued += 10
-    with pytest.raises(DeviceError, match="60 values were queued, the device holds 50"):
+    with pytest.raises(DeviceError, match=r"60 values .* 50"):
         session.start()
 
 
@@ -203,7 +203,7 @@ def test_a_late_device_is_waited_for_and_a_standing_one_is_not(scene):
     assert sum(at_last.slept_s) > 0.11
     standing = scene(*[(0, 0, 100)] * 20)
     standing.session.start()
-    with pytest.raises(DeviceError, match=r"stands: 0 of 10 readings within 0\.1 s"):
+    with pytest.raises(DeviceError, match=r"0 of 10 readings"):
         standing.session.take(10)
     assert sum(standing.slept_s) == pytest.approx(0.12)
 
@@ -259,7 +259,7 @@ def test_a_buffer_holds_what_was_queued_before_the_start(scene, lost, refused):
 
 def test_a_stream_that_does_not_run_is_an_error(scene):
     made = scene(starts=False)
-    with pytest.raises(DeviceError, match="was started, but does not run"):
+    with pytest.raises(DeviceError, match="does not run"):
         made.session.start()
     assert not made.session.running
 
@@ -293,7 +293,7 @@ def test_a_rate_that_the_device_can_not_make_is_refused(scene):
     scene(makes_hz=RATE_HZ * (1.0 + 0.9e-4))
     scene(makes_hz=RATE_HZ * (1.0 - 0.9e-4))
     for off in (1.2e-4, -1.2e-4):
-        with pytest.raises(DeviceError, match="was set to 1000 Hz, the device makes"):
+        with pytest.raises(DeviceError, match="1000 Hz, the"):
             scene(makes_hz=RATE_HZ * (1.0 + off))
 
 

@@ -103,7 +103,7 @@ class TestPlaces:
         ours = {"serial_port": str(tmp_path / "port")}
         theirs = {**READS, "serial_port": str(tmp_path / "by-id")}
         assert made(**ours, reader=theirs).info.holds == (f"serial:{tmp_path / 'port'}",)
-        with pytest.raises(InputError, match="can't both be unit 1"):
+        with pytest.raises(InputError, match="both be unit"):
             made(**ours, reader={**theirs, "unit_id": 1})
 
     def test_what_it_is_is_kept(self):
@@ -119,5 +119,5 @@ class TestPlaces:
 
     def test_an_input_that_measures_the_output_is_no_sensor(self, reader):
         """What a supply says of itself is not what the sensor says."""
-        with pytest.raises(InputError, match=r"OWN .* measures the device's own output"):
+        with pytest.raises(InputError, match=r"OWN .* own output"):
             made(reader={"profile": reader, "unit_id": 2}, input="OWN")

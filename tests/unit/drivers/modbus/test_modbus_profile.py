@@ -53,9 +53,9 @@ def test_what_does_not_go_together_is_refused(changes, said):
 
 def test_an_output_is_a_register_that_its_function_can_write():
     output = {"address": 1, "type": "float32", "unit": "V", "min": 0.0, "max": 5.0}
-    with pytest.raises(ValidationError, match="area of an output must be holding"):
+    with pytest.raises(ValidationError, match="must be holding"):
         ModbusOutput(**output, area="input")
-    with pytest.raises(ValidationError, match="function 6 writes one register, float32 takes 2"):
+    with pytest.raises(ValidationError, match=r"function 6 .*float32"):
         ModbusOutput(**output, function=6)
     assert ModbusOutput(**output, readback="none").readback_register is None
 

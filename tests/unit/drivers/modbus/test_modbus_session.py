@@ -156,7 +156,7 @@ class TestReader:
     def test_errors_of_the_one_that_drives_are_not_the_readers(self, serve):
         """A write that is refused is told of the device itself, at opening."""
         served = serve("icp_m7024", "icp_m7017", lacking=frozenset({6}))
-        with pytest.raises(DeviceError, match="function 6 refused with exception 1") as refused:
+        with pytest.raises(DeviceError, match=r"function 6 .*exception 1") as refused:
             served.device().open(5.0, 1)
         assert "reader" not in str(refused.value)
 
@@ -433,7 +433,7 @@ def test_modbus_dac_leaves_room_for_feeding(tmp_path):
     assert modbus_rate(path, "none")[0] == pytest.approx(exchange.highest_rate_hz)
     rate_hz, note = modbus_rate(path, {"timeout_s": 1.0})
     assert rate_hz == pytest.approx(1.0 / (exchange.total_s + requests_s(WRITE)))
-    assert "to feed the watchdog" in note
+    assert "feed the watchdog" in note
 
 
 @pytest.mark.parametrize(

@@ -125,7 +125,7 @@ def test_late_replies_are_not_taken_for_the_next(case):
     transaction, wrap, (_, size, reply, _) = prepared(case, "tcp")
     late = wrap(transaction.request(NEW[:size]), reply(NEW[:size]))
     transaction.request(NEW[:size])
-    with pytest.raises(MismatchError, match="transaction must be 2, got 1"):
+    with pytest.raises(MismatchError, match=r"transaction .*2, got 1"):
         transaction.reply(late)
 
 
@@ -214,11 +214,11 @@ def test_nonsense_is_not_waited_for():
 def test_bad_units_and_transactions_are_refused():
     """RTU unit 0 is broadcast: nobody answers."""
     pdu = read_pdu(3, 0, 1)
-    with pytest.raises(BadRequestError, match="unit must be 1 to 255, got 0"):
+    with pytest.raises(BadRequestError, match="1 to 255"):
         RtuTransaction(0, pdu)
-    with pytest.raises(BadRequestError, match="unit must be 0 to 255, got 256"):
+    with pytest.raises(BadRequestError, match="0 to 255"):
         TcpTransaction(256, pdu)
-    with pytest.raises(BadRequestError, match="transaction must be 0 to 65535"):
+    with pytest.raises(BadRequestError, match=r"transaction .* 65535"):
         TcpTransaction(1, pdu, transaction=-1)
 
 

@@ -120,7 +120,7 @@ def test_float32_refuses_what_only_a_double_holds():
     channel = RegisterFormat("float32")
     assert channel.decode(channel.encode(largest)) == largest
     assert channel.limits == (-largest, largest)
-    with pytest.raises(BadRequestError, match=r"float32 register holds .* got 3\.5e\+38"):
+    with pytest.raises(BadRequestError, match=r"float32 .* 3\.5e\+38"):
         channel.encode(3.5e38)
 
 
@@ -152,7 +152,7 @@ def test_a_device_that_sends_not_a_number_is_not_hidden():
 def test_decoding_wants_exactly_its_bytes(size):
     """Too few or too many bytes are an error, with and without a byte order."""
     for order in ("", "CDAB", "DCBA"):
-        with pytest.raises(MismatchError, match="float32 register has 4 bytes"):
+        with pytest.raises(MismatchError, match=r"float32 .*4 bytes"):
             RegisterFormat("float32", order).decode(bytes(size))
 
 
@@ -228,9 +228,9 @@ def test_a_channel_s_range_is_inside_its_raw_codes():
     dac = Channel(**VOLTS, type="int16", scale=0.0003051944, ignored_low_bits=4)
     assert dac.step == pytest.approx(16 * 0.0003051944)
     assert dac.raw_limits == (-32768.0, 32767.0)
-    with pytest.raises(ValidationError, match="must be inside what the register holds"):
+    with pytest.raises(ValidationError, match="the register holds"):
         Channel(**VOLTS, type="int16", scale=0.0003051944, raw_max=20000)
-    with pytest.raises(ValidationError, match="raw_min and raw_max are for whole-number types"):
+    with pytest.raises(ValidationError, match="raw_min and raw_max"):
         Channel(**VOLTS, type="float32", raw_max=20000)
 
 
@@ -242,7 +242,7 @@ def test_an_inverted_scale_keeps_low_below_high():
 def test_steps_and_masks_fit_their_register():
     step = {"kind": "write", "address": 1, "type": "uint16"}
     assert WriteStep(**step, value="timeout").value == "timeout"
-    with pytest.raises(ValidationError, match="value must fit into uint16, got 65536"):
+    with pytest.raises(ValidationError, match="uint16, got 65536"):
         WriteStep(**step, value=65536.0)
-    with pytest.raises(ValidationError, match="mask must fit into uint16, got 0x10000"):
+    with pytest.raises(ValidationError, match="uint16, got 0x10000"):
         TripFlag(address=1, type="uint16", mask=0x10000)

@@ -195,13 +195,13 @@ class TestRefusals:
         """A block whose samples have passed already is refused."""
         device = terfenol()
         send(device, 0, np.zeros(BLOCK))
-        with pytest.raises(DeviceError, match=r"first sample must be >= 50.*got 49"):
+        with pytest.raises(DeviceError, match=r">= 50.*got 49"):
             send(device, BLOCK - 1, np.zeros(BLOCK))
 
     @pytest.mark.parametrize("sizes", [(0, 0, 0), (51, 51, 51), (50, 49, 50), (50, 50, 51)])
     def test_wrong_sizes(self, sizes: tuple[int, int, int]) -> None:
         """Blocks that are empty, too long or of unequal length are refused."""
-        with pytest.raises(DeviceError, match="block must be 50 samples"):
+        with pytest.raises(DeviceError, match="50 samples"):
             terfenol().exchange(0, *(np.zeros(size) for size in sizes))
 
 

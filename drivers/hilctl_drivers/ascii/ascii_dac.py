@@ -1,4 +1,4 @@
-"""A device that speaks lines of text, sample by sample; its sensor may stand behind another one."""
+"""``serial_dac`` for devices with a text protocol; another such device may read the sensor."""
 
 import re
 from string import Formatter
@@ -11,11 +11,11 @@ from hilctl_drivers.ascii.ascii_session import (
     arm_s,
     exchange_time,
     feed_time,
+    parse_number,
     query_time,
 )
-from hilctl_drivers.ascii.lines import parse_number
 from hilctl_drivers.profile_base import Range
-from hilctl_drivers.serial.serial_wire import SerialSetup, SerialWire
+from hilctl_drivers.serial_dac import SerialDac, SerialSetup
 from hilctl_drivers.transport.links import WatchdogTrippedError, naming
 from hilctl_drivers.transport.safe_exchange import try_out
 from hilctl_drivers.transport.wire_time import RateLimit, WireTime, check_feeds
@@ -26,17 +26,17 @@ _NO_EVIDENCE = (
 )
 
 
-class AsciiWire(SerialWire):
-    """A :class:`~hilctl_drivers.serial.serial_wire.SerialWire` of lines."""
+class AsciiDac(SerialDac):
+    """A :class:`~hilctl_drivers.serial_dac.SerialDac` with lines of text."""
 
-    def __init__(self, setup: SerialSetup) -> None:
-        super().__init__(setup)
+    def _prepare(self) -> None:
+        setup = self._setup
         assert isinstance(setup.profile, AsciiProfile)
         assert isinstance(setup.output, AsciiOutput)
         self._profile = setup.profile
         self._reader_profile = _reader_profile(setup, setup.profile)
         assert isinstance(setup.input, AsciiInput)
-        self._output, self._input = setup.output, setup.input
+        self._target, self._input = setup.output, setup.input
         self._measure = _measuring_input(setup.profile, setup.options.measure, setup.output)
         self.measures = self._measure is not None
         self._address = _address(setup.options.unit_id, self._profile)
@@ -60,8 +60,7 @@ class AsciiWire(SerialWire):
         self.unconfirmed = self._unconfirmed()
         self.arm_s = arm_s(self._profile, setup.options.output)
 
-    def rates(self, block: int) -> RateLimit:
-        """See :meth:`~hilctl_drivers.serial.serial_wire.SerialWire.rates`."""
+    def _rates(self, block: int) -> RateLimit:
         del block
         slowest = min((self._profile, self._reader_profile), key=lambda each: each.max_rate_hz)
         whose = f"the profile of {slowest.title}"
@@ -84,8 +83,7 @@ class AsciiWire(SerialWire):
             wire = wire.then(feed_time(profile))
         return wire
 
-    def open(self, sample_rate_hz: float, block: int) -> None:
-        """See :meth:`~hilctl_drivers.serial.serial_wire.SerialWire.open`."""
+    def _open(self, sample_rate_hz: float, block: int) -> None:
         del block
         feed_every = check_feeds(self._setup.options.watchdog_timeout_s, sample_rate_hz)
         self._open_links()
@@ -104,18 +102,18 @@ class AsciiWire(SerialWire):
         writer.check_errors()  # after all steps: commands without a reply leave theirs there
         self._ticks = 0
 
-    def arm(self) -> None:
-        """See :meth:`~hilctl_drivers.serial.serial_wire.SerialWire.arm`."""
+    def _arm(self) -> None:
         if self._profile.watchdog != "none" and self._setup.options.watchdog != "none":
-            # The safe value before the time-out: once it counts, it must know where to go.
+            # The safe value before the timeout: once it counts, it must know where to go.
             self._run("safe")
             self._run("arm")
             self._writer.check_errors()  # commands without a reply leave theirs there
 
-    def exchange(self, first_sample: int, output: F64, reading: F64, measured: F64) -> None:
-        """See :meth:`~hilctl_drivers.serial.serial_wire.SerialWire.exchange`."""
+    def _exchange(
+        self, first_sample: int, command: F64, displacement_um: F64, measured: F64
+    ) -> None:
         del first_sample
-        value = output.item() + 0.0  # makes 0.0 of -0.0
+        value = self._chain.output(command.item()) + 0.0  # makes 0.0 of -0.0
         combined = self._profile.exchange
         if combined != "none" and self._is_combined:
             text = self._writer.text(combined.write, value=value)
@@ -124,41 +122,46 @@ class AsciiWire(SerialWire):
             # First the reading, which must not show yet what the command does.
             found = self._read()
             self._write(value)
-        reading[0] = _value(self._input, found)
+        displacement_um[0] = self._chain.displacement_um(_value(self._input, found))
         if self._measure is not None:
-            measured[0] = _value(self._measure, self._writer.number(self._measure))
+            value = _value(self._measure, self._writer.number(self._measure))
+            measured[0] = self._chain.command(value)
         self._feed()
 
-    def output(self) -> float | None:
-        """See :meth:`~hilctl_drivers.serial.serial_wire.SerialWire.output`."""
-        readback, watchdog = self._output.readback, self._profile.watchdog
+    def _output(self) -> float | None:
+        return self._as_command(self._held())
+
+    def _held(self) -> float | None:
+        """Return the output's value in its unit; None if it cannot be known."""
+        readback, watchdog = self._target.readback, self._profile.watchdog
         if readback == "none":
             return None
-        # A trip that nobody can ask about has perhaps put out something else than the last command.
+        # An undetectable trip may have changed the output since the last command.
         if readback.of == "command" and watchdog != "none" and watchdog.tripped == "none":
             return None
         return self._writer.number(readback)
 
-    def look(self) -> tuple[float, float | None]:
-        """See :meth:`~hilctl_drivers.serial.serial_wire.SerialWire.look`."""
+    def _look(self) -> tuple[float, float | None]:
         self._open_links()
         self._writer.check_selftest()
         if self._setup.reads_elsewhere:
             with naming(self._reader_name):
                 self._reader.check_selftest()
-        return _value(self._input, self._read()), self._measured_output()
+        displacement_um = self._chain.displacement_um(_value(self._input, self._read()))
+        return displacement_um, self._as_command(self._measured_output())
 
-    def close(self) -> None:
-        """See :meth:`~hilctl_drivers.serial.serial_wire.SerialWire.close`."""
+    def _as_command(self, value: float | None) -> float | None:
+        return None if value is None else self._chain.command(value)
+
+    def _close(self) -> None:
         if self._profile.watchdog != "none" and self._setup.options.watchdog != "none":
             # First: nothing feeds it any more, and it would trip while the close steps run.
             self._run("disarm")
         self._writer.run(self._profile.close)
         self._writer.check_errors()
 
-    def release(self) -> None:
-        """See :meth:`~hilctl_drivers.serial.serial_wire.SerialWire.release`."""
-        self._link.close()
+    def _release(self) -> None:
+        super()._release()
         self._reader_link.close()
 
     @property
@@ -180,7 +183,7 @@ class AsciiWire(SerialWire):
 
     def _write(self, value: float) -> bool:
         """Write the output; return whether the answer shows that a device has received it."""
-        text, reply = self._command(value), self._output.reply
+        text, reply = self._command(value), self._target.reply
         if reply == "none":
             self._writer.send(text)
             return False
@@ -188,30 +191,30 @@ class AsciiWire(SerialWire):
         return self._writer.ask(text, reply.pattern).string != text
 
     def _command(self, value: float) -> str:
-        return self._writer.text(self._output.write, value=value)
+        return self._writer.text(self._target.write, value=value)
 
     def _measured_output(self) -> float | None:
         """Return the output as the device measures it, or as it says that it is, tripped or not."""
-        unit = self._output.unit
+        unit = self._target.unit
         for source in self._profile.inputs.values():
             if source.measures == "output" and source.unit == unit:
                 return _value(source, self._writer.number(source))
-        readback = self._output.readback
+        readback = self._target.readback
         if readback != "none" and readback.of == "command" and self._writer.tripped():
             return None
-        return self.output()
+        return self._held()
 
     def _send(self, value: float) -> None:
         self._link.send_now(self._writer.line(self._command(value)))
 
-    def _put_out(self, value: float) -> None:
+    def _confirm(self, value: float) -> None:
         try:
             answered = self._write(value)
         except WatchdogTrippedError:
             self._run("clear")
             answered = self._write(value)
         # A command without a reply may have been ignored.
-        readback = self._output.readback
+        readback = self._target.readback
         if readback != "none":
             self._check_read_back(value, self._writer.number(readback))
         elif self._profile.error_query != "none":
@@ -224,10 +227,10 @@ class AsciiWire(SerialWire):
 
         An output that cannot be read is left alone, as is a value that the command would round.
         """
-        value = self.output()
+        value = self._held()
         if value is None:
             return
-        fields = Formatter().parse(self._output.write)
+        fields = Formatter().parse(self._target.write)
         spec = next(spec for _, field, spec, _ in fields if field == "value")
         if float(format(value + 0.0, spec or "")) != value:
             return
@@ -236,12 +239,12 @@ class AsciiWire(SerialWire):
             self._write(value + 0.0)
             self._writer.check_errors()
 
-        try_out(self._output, value, put, f"with {self._command(value + 0.0)}")
+        try_out(self._target, value, put, f"with {self._command(value + 0.0)}")
 
     def _unconfirmed(self) -> str:
         """Return why a value cannot be confirmed; empty if it can."""
-        reply = self._output.reply
-        if self._output.readback != "none" or self._profile.error_query != "none":
+        reply = self._target.reply
+        if self._target.readback != "none" or self._profile.error_query != "none":
             return ""
         if reply == "none" or _without_numbers(reply.example) == _without_numbers(
             self._command(0.0)
@@ -260,7 +263,7 @@ class AsciiWire(SerialWire):
         if not watchdog.refuses_while_tripped:
             self._write(safe)
         self._run("clear")
-        self._put_out(safe)
+        self._confirm(safe)
 
     def _run(self, name: str) -> None:
         """Run the watchdog's steps of that name."""
@@ -277,7 +280,7 @@ class AsciiWire(SerialWire):
         self._writer.run(steps, timeout=counts, safe=safe)
 
     def _feed(self) -> None:
-        """Feed a watchdog that exchanges don't feed; three times in its timeout."""
+        """Feed a watchdog that exchanges do not feed; three times in its timeout."""
         if not self._feed_every:
             return
         self._ticks += 1
@@ -294,7 +297,7 @@ def _value(source: AsciiInput, number: float) -> float:
 
 
 def _address(wanted: int | None, profile: AsciiProfile) -> int:
-    """Return a device's address on a shared line; 0 where there is none."""
+    """Return a device's address on a shared line; 0 if there is none."""
     if wanted is not None:
         return wanted
     return 0 if profile.address == "none" else profile.address
@@ -304,7 +307,7 @@ def _reader_profile(setup: SerialSetup, profile: AsciiProfile) -> AsciiProfile:
     """Return the profile of the device that has the input, often the same.
 
     Raises:
-        InputError: It speaks no lines of text, or can't share the other's line.
+        InputError: It speaks no lines of text, or cannot share the other's line.
     """
     reader, options = setup.reader, setup.options.reader
     if not isinstance(reader, AsciiProfile):
@@ -319,7 +322,7 @@ def _reader_profile(setup: SerialSetup, profile: AsciiProfile) -> AsciiProfile:
 
 
 def _measuring_input(profile: AsciiProfile, name: str | None, output: Range) -> AsciiInput | None:
-    """Return the input that measures the output itself; None where none is wanted.
+    """Return the input that measures the output itself; None if none is wanted.
 
     Args:
         profile: The device's profile.

@@ -1,9 +1,9 @@
-"""A microcontroller board: asked sample by sample, or fed block by block through its FIFO.
+"""``serial_dac`` for microcontroller boards: single samples, or blocks through the board's FIFO.
 
 A board with a FIFO answers a block when all but ``prefill`` of the samples queued so far have been
 put out, and gives back the readings of those. So its clock is the pace; a block's readings come
 ``fifo_blocks`` exchanges after it; and between two exchanges the FIFO holds that many blocks, which
-is how long this machine may stall. The first sample is put out once that many are there.
+is how long this machine may stall. The first sample is output once that many are there.
 """
 
 import numpy as np
@@ -11,10 +11,11 @@ import numpy as np
 from hilctl.base.errors import DeviceError, InputError
 from hilctl.base.types import F64
 from hilctl_drivers.board import frames as board
-from hilctl_drivers.board.board_profile import FrameProfile, FramesLink, FrameStreaming
+from hilctl_drivers.board.board_profile import FrameProfile, FramesLink
 from hilctl_drivers.board.board_session import BoardFacts, BoardSession, Readings
 from hilctl_drivers.board.frames import WATCHDOG_REPLY, WATCHDOG_REQUEST, exchange_sizes
-from hilctl_drivers.serial.serial_wire import SerialSetup, SerialWire
+from hilctl_drivers.device import check_fifo, check_next
+from hilctl_drivers.serial_dac import SerialDac
 from hilctl_drivers.transport.framing import binary_framing
 from hilctl_drivers.transport.links import WatchdogTrippedError
 from hilctl_drivers.transport.safe_exchange import try_out
@@ -53,7 +54,7 @@ def exchange_time(profile: FrameProfile, block: int = 1) -> WireTime:
 
 
 def arm_s(profile: FrameProfile) -> float:
-    """Return how long a WATCHDOG message and its reply take, s."""
+    """Return the time that a WATCHDOG message and its reply take, s."""
     link = profile.link
     size = next(iter(profile.outputs.values())).format.size
     framing = binary_framing(link.framing, link.crc, link.payload_max)
@@ -64,13 +65,13 @@ def arm_s(profile: FrameProfile) -> float:
 
 
 def settle_s(profile: FrameProfile) -> float:
-    """Return how long output and input take to settle, s."""
+    """Return the time that output and input take to settle, s."""
     channels = (*profile.outputs.values(), *profile.inputs.values())
     return sum(channel.settle_s for channel in channels)
 
 
 def _line(link: FramesLink) -> tuple[float, int, float, str]:
-    """Return time of a byte, number and time of gaps, and the line in words."""
+    """Return time of a byte, number and time of gaps, and the line as text."""
     if not link.usb:
         return link.char_s, 0, 0.0, f"at {link.format}"
     full_speed = link.usb_frame_s >= 1e-3
@@ -82,32 +83,12 @@ def _line(link: FramesLink) -> tuple[float, int, float, str]:
 _FIRST_MAX = 2**32
 
 
-def board_wire(setup: SerialSetup) -> SerialWire:
-    """Return how a board is talked to, as its profile says.
+class BoardDac(SerialDac):
+    """A :class:`~hilctl_drivers.serial_dac.SerialDac` with binary frames."""
 
-    Args:
-        setup: What the experiment says of it.
-
-    Raises:
-        InputError: Options that a board has no use for.
-    """
-    profile = setup.profile
-    assert isinstance(profile, FrameProfile)
-    if profile.streaming == "none":
-        return BoardSingle(setup, profile)
-    return BoardStream(setup, profile, profile.streaming)
-
-
-class BoardWire(SerialWire):
-    """What both forms of a board share.
-
-    Args:
-        setup: What the experiment says of it.
-        profile: What the board is.
-    """
-
-    def __init__(self, setup: SerialSetup, profile: FrameProfile) -> None:
-        super().__init__(setup)
+    def _prepare(self) -> None:
+        setup, profile = self._setup, self._setup.profile
+        assert isinstance(profile, FrameProfile)
         for name in ("reader", "measure", "unit_id"):
             if getattr(setup.options, name) is not None:
                 raise InputError(f"{name} is for devices that speak lines of text")
@@ -116,8 +97,7 @@ class BoardWire(SerialWire):
         self._safe = setup.chain.output(setup.options.safe_command)
         self.arm_s = arm_s(profile)
 
-    def rates(self, block: int) -> RateLimit:
-        """See :meth:`~hilctl_drivers.serial.serial_wire.SerialWire.rates`."""
+    def _rates(self, block: int) -> RateLimit:
         most_hz, whose = self._profile.max_rate_hz, f"the profile of {self._profile.title}"
         if settle_s(self._profile) * most_hz > 1.0:
             most_hz = 1.0 / settle_s(self._profile)
@@ -126,28 +106,22 @@ class BoardWire(SerialWire):
         lowest_hz = 0.0 if streaming == "none" else streaming.rate_min_hz
         return RateLimit.of(exchange_time(self._profile, block), most_hz, whose, lowest_hz)
 
-    def output(self) -> float | None:
-        """See :meth:`~hilctl_drivers.serial.serial_wire.SerialWire.output`."""
+    def _output(self) -> float | None:
         state = self._session.state()
-        return None if state is None else state.output
+        return None if state is None else self._chain.command(state.output)
 
-    def look(self) -> tuple[float, float | None]:
-        """See :meth:`~hilctl_drivers.serial.serial_wire.SerialWire.look`."""
+    def _look(self) -> tuple[float, float | None]:
         facts = self._connect(self._setup.link())
         state = self._session.state()
         if state is None:
             who = facts.name or "the board"
             raise DeviceError(f"{who} speaks version 1 of the protocol: no message only reads")
-        return state.reading, state.output
-
-    def release(self) -> None:
-        """See :meth:`~hilctl_drivers.serial.serial_wire.SerialWire.release`."""
-        self._link.close()
+        return self._chain.displacement_um(state.reading), self._chain.command(state.output)
 
     def _send(self, value: float) -> None:
         self._link.send_now(self._session.safe_frame(value))
 
-    def _put_out(self, value: float) -> None:
+    def _confirm(self, value: float) -> None:
         try:
             self._session.put_out(value)
         except WatchdogTrippedError:
@@ -177,8 +151,7 @@ class BoardWire(SerialWire):
             )
         return facts
 
-    def arm(self) -> None:
-        """See :meth:`~hilctl_drivers.serial.serial_wire.SerialWire.arm`."""
+    def _arm(self) -> None:
         if self._setup.options.watchdog != "none":
             self._set_watchdog(self._setup.options.watchdog_timeout_s)
 
@@ -199,113 +172,92 @@ class BoardWire(SerialWire):
             self._session.set_watchdog(timeout_s or 0.0, self._safe)
 
 
-class BoardSingle(BoardWire):
-    """A board that takes one sample a message, paced by this machine."""
+class BoardSingle(BoardDac):
+    """A board that takes one sample per message, paced by this machine."""
 
-    def open(self, sample_rate_hz: float, block: int) -> None:
-        """See :meth:`~hilctl_drivers.serial.serial_wire.SerialWire.open`."""
+    def _open(self, sample_rate_hz: float, block: int) -> None:
         del block
         check_feeds(self._setup.options.watchdog_timeout_s, sample_rate_hz)
         self._connect(self._setup.link())
         self._try_out_safe_value()
 
-    def exchange(self, first_sample: int, output: F64, reading: F64, measured: F64) -> None:
-        """See :meth:`~hilctl_drivers.serial.serial_wire.SerialWire.exchange`."""
+    def _exchange(
+        self, first_sample: int, command: F64, displacement_um: F64, measured: F64
+    ) -> None:
         del first_sample, measured
-        found = self._session.exchange(output)
+        found = self._session.exchange(self._chain.outputs(command))
         if found.values.size != 1:
             raise DeviceError(f"{found.values.size} readings came for one sample")
-        reading[:] = found.values
+        self._chain.fill_um(found.values, displacement_um)
 
-    def close(self) -> None:
-        """See :meth:`~hilctl_drivers.serial.serial_wire.SerialWire.close`."""
+    def _close(self) -> None:
         self._set_watchdog(None)
 
 
-class BoardStream(BoardWire):
-    """A board that plays blocks from its FIFO.
+class BoardStream(BoardDac):
+    """A board that plays blocks from its FIFO."""
 
-    Args:
-        setup: What the experiment says of it.
-        profile: What the board is.
-        streaming: What its FIFO is.
-    """
-
-    def __init__(
-        self, setup: SerialSetup, profile: FrameProfile, streaming: FrameStreaming
-    ) -> None:
-        super().__init__(setup, profile)
+    def _prepare(self) -> None:
+        super()._prepare()
+        streaming = self._profile.streaming
+        assert streaming != "none"
         self.block_max, self.fifo_depth = streaming.block_max, streaming.fifo_depth
-        self._latency_blocks = setup.options.fifo_blocks
-        self._block = 0
+        self._latency_blocks = self._setup.options.fifo_blocks
+        self._samples = 0
         self._next_sample = 0
         self.fifo_level_min = 0
         """Lowest level that an answer has reported since the output began to move."""
 
-    def open(self, sample_rate_hz: float, block: int) -> None:
-        """See :meth:`~hilctl_drivers.serial.serial_wire.SerialWire.open`; starts no clock yet."""
-        self._check_block(block, self.fifo_depth, self.block_max)
+    def _open(self, sample_rate_hz: float, block: int) -> None:
+        check_fifo(block, self._latency_blocks, self.fifo_depth)
         check_feeds(self._setup.options.watchdog_timeout_s, sample_rate_hz / block)
         facts = self._connect(self._setup.link(extra_s=block / sample_rate_hz))
         self._check_board(facts, sample_rate_hz, block)
         self._try_out_safe_value()  # before the clock, which SAFE stops
         prefill = self._latency_blocks * block
         self._session.set_clock(sample_rate_hz, prefill)
-        self._block = block
+        self._samples = block
         self._next_sample = 0
         self.fifo_level_min = prefill
 
-    def exchange(self, first_sample: int, output: F64, reading: F64, measured: F64) -> None:
-        """Queue a block and wait for the readings of the one that it pushes out.
-
-        Raises:
-            DeviceError: No good answer in time; samples that don't follow the last ones; the board
-                ran out of samples.
-        """
+    def _exchange(
+        self, first_sample: int, command: F64, displacement_um: F64, measured: F64
+    ) -> None:
+        """Queue a block and wait for the readings of the one that it pushes out."""
         del measured
-        if first_sample != self._next_sample:
-            rule = f"samples must follow one another, {self._next_sample} is next"
-            raise DeviceError(f"{rule}, got {first_sample}: open again to start at 0")
-        found = self._session.stream(first_sample, output)
+        check_next(first_sample, self._next_sample)
+        found = self._session.stream(first_sample, self._chain.outputs(command))
         self._check_answer(found, first_sample)
-        self._next_sample += output.size
+        self._next_sample += command.size
         if found.values.size:
-            reading[:] = found.values
+            self._chain.fill_um(found.values, displacement_um)
             self.fifo_level_min = min(self.fifo_level_min, found.fifo_level)
 
-    def close(self) -> None:
+    def _close(self) -> None:
         """Stop the clock and disarm; the output holds its last value."""
         # The clock first: an output that moves must not be without its watchdog.
         self._session.set_clock(0.0, 0)
         self._set_watchdog(None)
 
-    def _check_block(self, block: int, depth: int, block_max: int) -> None:
-        if not 1 <= block <= block_max:
-            raise DeviceError(f"block must be 1 to {block_max} samples, got {block}")
-        need = (self._latency_blocks + 1) * block
-        if need > depth:
-            most = depth // block - 1
-            rule = f"fifo_blocks + 1 blocks must fit into the FIFO, {depth} samples"
-            hint = f"at most {most} with this block" if most else "take smaller blocks"
-            raise DeviceError(f"{rule}, got {need} ({hint})")
-
     def _check_board(self, facts: BoardFacts, sample_rate_hz: float, block: int) -> None:
-        """Hold what is wanted against what the board itself says, which may be less."""
+        """Check rate and block against the limits that the board itself reports."""
         if sample_rate_hz > facts.rate_max_hz * (1.0 + 1e-6):
             rule = f"sample rate must be <= {facts.rate_max_hz:g} Hz, says {facts.name}"
             raise DeviceError(f"{rule}, got {sample_rate_hz:g}")
-        self._check_block(block, facts.fifo_depth, facts.block_max)
+        if block > facts.block_max:
+            raise DeviceError(f"block must be 1 to {facts.block_max} samples, got {block}")
+        check_fifo(block, self._latency_blocks, facts.fifo_depth)
 
     def _check_answer(self, found: Readings, first_sample: int) -> None:
         if found.underruns:
-            played = first_sample - self._latency_blocks * self._block
+            played = first_sample - self._latency_blocks * self._samples
             raise DeviceError(
                 f"underrun: the board had nothing to put out for {found.underruns} sample periods, "
                 f"about sample {max(0, played)}; its FIFO kept {self._latency_blocks} blocks of "
-                f"{self._block}: this machine or the line was slower than that"
+                f"{self._samples}: this machine or the line was slower than that"
             )
-        answered = first_sample - self._latency_blocks * self._block
-        want = self._block if answered >= 0 else 0
+        answered = first_sample - self._latency_blocks * self._samples
+        want = self._samples if answered >= 0 else 0
         if found.values.size != want or (want and found.first != answered % _FIRST_MAX):
             raise DeviceError(
                 f"readings must be {want} from sample {max(0, answered)} on, got "

@@ -1,6 +1,6 @@
 """Text devices behind ``serial_dac``: whose line a reader may share, and what measures the output.
 
-Exchanges over a line are in ``tests/unit/drivers/serial/test_device.py``.
+Exchanges over a line are in ``tests/unit/drivers/test_serial_dac.py``.
 """
 
 from pathlib import Path
@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from hilctl.base.errors import InputError
-from hilctl_drivers.ascii.ascii_wire import AsciiWire
-from hilctl_drivers.serial.serial_wire import SerialOptions, SerialSetup
+from hilctl_drivers.ascii.ascii_dac import AsciiDac
+from hilctl_drivers.serial_dac import SerialOptions
 
 DCON = str(Path(__file__).parents[3] / "data" / "dcon_module.yaml")
 OPTIONS = {
@@ -18,8 +18,8 @@ OPTIONS = {
 }  # fmt: skip
 
 
-def wire(**options):
-    return AsciiWire(SerialSetup.of(SerialOptions.model_validate({**OPTIONS, **options})))
+def device(**options):
+    return AsciiDac(SerialOptions.model_validate({**OPTIONS, **options}))
 
 
 def test_a_reader_that_speaks_otherwise_needs_a_line_of_its_own(tmp_path):
@@ -27,24 +27,24 @@ def test_a_reader_that_speaks_otherwise_needs_a_line_of_its_own(tmp_path):
     text = Path(DCON).read_text().replace("checksum: dcon", "checksum: none")
     (tmp_path / "plain.yaml").write_text(text)
     reader = {"profile": str(tmp_path / "plain.yaml"), "unit_id": 3}
-    with pytest.raises(InputError, match=r"can't share the line of .* give reader.serial_port"):
-        wire(reader=reader)
-    assert wire(reader={**reader, "serial_port": "/dev/y"}).block_max == 1
+    with pytest.raises(InputError, match=r"share the line.*reader\.serial_port"):
+        device(reader=reader)
+    assert device(reader={**reader, "serial_port": "/dev/y"}).block_max == 1
 
 
 def test_a_board_is_no_reader_of_text():
     reader = {"profile": "cobs_board", "serial_port": "/dev/y"}
-    with pytest.raises(InputError, match="reader is for devices that speak lines of text"):
-        wire(reader=reader, input="ADC")
+    with pytest.raises(InputError, match="reader is for"):
+        device(reader=reader, input="ADC")
 
 
 def test_what_measures_the_output_is_an_input_that_says_so():
-    assert not wire().measures
-    with pytest.raises(InputError, match=r"must be an input .* got 'AI0' \(it has none\)"):
-        wire(measure="AI0")
+    assert not device().measures
+    with pytest.raises(InputError, match=r"measure.*'AI0'"):
+        device(measure="AI0")
 
 
 def test_a_strict_watchdog_slows_the_loop():
     """Feeding takes a line of its own, and the rate leaves room for it."""
-    guarded = wire(watchdog={"timeout_s": 1.0})
-    assert guarded.rates(1).highest_hz < wire().rates(1).highest_hz
+    guarded = device(watchdog={"timeout_s": 1.0})
+    assert guarded.info.max_rate_hz < device().info.max_rate_hz
