@@ -15,3 +15,24 @@ correction.py     correction by iterative learning
 template.py       a first experiment for a device
 examples.py       shipped examples and copies of them
 """
+
+PUBLIC = (
+    "adaptation_bounds",
+    "coil_heat",
+    "conditioning",
+    "correction",
+    "device_rules",
+    "device_state",
+    "devices",
+    "examples",
+    "feedback_checks",
+    "file",
+    "forecast",
+    "initial_state",
+    "load",
+    "model_validity",
+    "preflight",
+    "sections",
+    "template",
+)
+"""Modules that other rooms import; the others are private."""

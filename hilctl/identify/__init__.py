@@ -10,3 +10,21 @@ field       effective field and generalised Duhem operator for histories
 literature  other models of the literature
 refine      better models from recordings of their use
 """
+
+PUBLIC = (
+    "data.cycles",
+    "data.records",
+    "evaluation",
+    "fit_api",
+    "fit_model",
+    "model_page",
+    "model_quality",
+    "model_selection",
+    "parallel",
+    "pipeline",
+    "refine.refinement",
+    "registry",
+    "settings",
+    "summary",
+)
+"""Modules that other rooms import; the others are private."""

@@ -12,3 +12,12 @@ server.py, auth.py, page_session.py  the page on loopback, authentication, sessi
 foxglove.py      server for Foxglove and compatible applications
 server_process.py  server processes
 """
+
+PUBLIC = (
+    "frame_codec",
+    "run_reader",
+    "scope",
+    "server_process",
+    "traces",
+)
+"""Modules that other rooms import; the others are private."""

@@ -13,3 +13,19 @@ limiter.py      range and slew of every command
 interlocks.py   conditions that end a run, checked in every answer
 safe_output.py  writes of the safe value, and the outcome of a run
 """
+
+PUBLIC = (
+    "adaptation",
+    "block",
+    "compensator",
+    "feedback",
+    "interlocks",
+    "lead_in",
+    "limiter",
+    "loop",
+    "pacer",
+    "plan",
+    "safe_output",
+    "tuning",
+)
+"""Modules that other rooms import; the others are private."""

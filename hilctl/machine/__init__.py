@@ -6,3 +6,13 @@ checks.py         one function per check, each with a remedy
 timer_latency.py  wake-up lateness, measured in a separate process with the loop's pacer
 diagnosis.py      all checks, the verdict, and metadata for a recording
 """
+
+PUBLIC = (
+    "checks",
+    "diagnosis",
+    "procfs",
+    "rt_setup",
+    "syscalls",
+    "timer_latency",
+)
+"""Modules that other rooms import; the others are private."""

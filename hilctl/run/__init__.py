@@ -19,3 +19,20 @@ shared/          ring of sample blocks, and the page of numbers, texts and event
 safety/          the safe value if the loop cannot set it: guardian, supervisor, hilctl safe
 control/         requests to a supervisor: client, socket, validation, changes
 """
+
+PUBLIC = (
+    "assemble",
+    "control.client",
+    "detached",
+    "metadata",
+    "probe",
+    "recovery",
+    "result",
+    "run_folder",
+    "safety.manual_safe",
+    "shared.ring",
+    "shared.shared_page",
+    "start",
+    "unpaced",
+)
+"""Modules that other rooms import; the others are private."""
