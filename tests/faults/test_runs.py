@@ -274,9 +274,7 @@ def test_a_supervisor_that_breaks_ends_the_run_by_its_ramp(tmp_path, monkeypatch
 
     monkeypatch.setattr("hilctl.run.supervisor.SystemdNotifier.alive", alive)
     result, recording = supervised(tmp_path)
-    assert result.reason == (
-        "stopped because the supervisor broke; the supervisor broke: ZeroDivisionError: a bug"
-    )
+    assert result.reason.endswith("ZeroDivisionError: a bug")
     assert (result.code, result.safe, result.missing) == ("fault", True, 0)
     assert recording.samples.index.size == result.samples > 1000
     assert recording.samples.command[-1] == 0.0

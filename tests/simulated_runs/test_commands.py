@@ -51,7 +51,7 @@ def test_run_prints_its_result(run):
     assert result["dropped"] == 0
     assert result["peak_hysteresis_percent"] < 3.7
     # Where its kernels had to be compiled, too: a process keeps what that takes.
-    assert result["processes"]["supervisor"]["resident_bytes"] < 200e6
+    assert result["processes"]["supervisor"]["resident_bytes"] < 300e6
 
 
 def test_report_is_what_run_printed(run):

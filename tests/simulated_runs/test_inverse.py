@@ -46,7 +46,7 @@ def switched(tmp_path_factory):
     output = tmp_path_factory.mktemp("inverse") / "run.mcap"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(_Switched, "changes", changes)
-        patch.setattr(unpaced, "BatchHost", _Switched)
+        patch.setattr(unpaced, "OfflineHost", _Switched)
         assert unpaced.run_unpaced(checked, output).code == "completed"
     return read(output), checked
 
@@ -114,7 +114,7 @@ def test_what_learns_from_the_error_stands_still_meanwhile(learns, tmp_path, mon
         Tuning(1.0, 0.0, 1000, at, share, line) for at, share in ((8000, 0.0), (14000, 1.0))
     )
     monkeypatch.setattr(_Switched, "changes", (out, back))
-    monkeypatch.setattr(unpaced, "BatchHost", _Switched)
+    monkeypatch.setattr(unpaced, "OfflineHost", _Switched)
     unpaced.run_unpaced(checked, tmp_path / "run.mcap")
     recording = read(tmp_path / "run.mcap")
     samples = recording.samples

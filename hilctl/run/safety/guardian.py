@@ -81,7 +81,7 @@ class HangWatch:
         """
         page = self._page
         heartbeat_ns, phase = page.get(PageField.LOOP_HEARTBEAT_NS), page.get(PageField.PHASE)
-        watched = phase in {Phase.RUNNING, Phase.CLOSING}
+        watched = phase in {Phase.RUNNING, Phase.CLOSING, Phase.ENDED, Phase.FAILED}
         if heartbeat_ns != self._heartbeat_ns or not watched:
             self._heartbeat_ns, self._seen_ns, self._polls = heartbeat_ns, now_ns, 0
             return False
@@ -91,9 +91,10 @@ class HangWatch:
             return False
         limits = self._limits
         loop_s = limits.real_time_s if page.get(PageField.REAL_TIME) else limits.ordinary_s
-        if silent_s > loop_s + self._wait_s(phase):
+        beats = phase in {Phase.RUNNING, Phase.CLOSING}
+        if beats and silent_s > loop_s + self._wait_s(phase):
             return True
-        # Last: it reads /proc.
+        # A process that is stopped never exits. Last: it reads /proc.
         return silent_s > limits.stopped_s and self._is_stopped()
 
     def _wait_s(self, phase: int) -> float:
@@ -225,6 +226,8 @@ class Guardian:
                 return act(page, self._device, self._goal(), hung=False, prepare=self._prepare)
             if self._watch.hangs(now_ns):
                 self._kill_loop()
+                if page.ended_safely():
+                    return True
                 return act(page, self._device, self._goal(), hung=True, prepare=self._prepare)
 
     def _goal(self) -> SafeGoal:

@@ -100,7 +100,9 @@ class SafetyMonitor:
     def _in_trouble(self, now_ns: int, *, ended: bool) -> bool:
         if not self._trouble_ns:
             hung = not ended and self._watch.hangs(now_ns)
-            if hung or (ended and not self._page.ended_safely()):
+            if hung and self._page.ended_safely():
+                self._child.kill(0.0)
+            elif hung or (ended and not self._page.ended_safely()):
                 self._trouble_ns, self._hung = now_ns, hung
         return self._trouble_ns != 0
 

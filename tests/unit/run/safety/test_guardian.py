@@ -179,6 +179,16 @@ def test_a_loop_that_ended_by_itself_is_left_to_what_it_said(guarded):
     assert guarded.page.safe_result() is None
 
 
+def test_a_loop_that_is_stopped_after_its_end_is_killed_only(guarded):
+    """Its output is safe, and the supervisor waits for its exit."""
+    guarded.page.leave_outcome(LoopOutcome("completed", "completed", 7, "confirmed", 0))
+    guarded.loop.send_signal(signal.SIGSTOP)
+    os.waitid(os.P_PID, guarded.loop.pid, os.WSTOPPED | os.WNOWAIT)
+    assert guarded.guard(hang_s=0.03)
+    assert guarded.device.asked == []
+    assert guarded.loop.wait() == -signal.SIGKILL
+
+
 def test_a_loop_that_died_before_the_start_has_moved_nothing(guarded):
     guarded.page.put(PageField.GO, 0)
     guarded.page.put(PageField.PHASE, Phase.READY)
@@ -421,6 +431,13 @@ def test_loop_that_does_not_run_yet_or_any_more_does_not_hang(watched):
     for phase in (Phase.STARTING, Phase.READY, Phase.ENDED, Phase.FAILED):
         watched.page.put(PageField.PHASE, phase)
         assert not any(watched.looks(*[0.5 * k for k in range(20)]))
+
+
+@pytest.mark.parametrize("phase", [Phase.ENDED, Phase.FAILED])
+def test_a_loop_that_is_stopped_before_its_process_exits_hangs(watched, phase):
+    watched.page.put(PageField.PHASE, phase)
+    watched.stopped = True
+    assert watched.hangs_after_s() == 0.5
 
 
 def test_a_device_that_keeps_the_loop_waiting_is_no_hang_at_once(watched):
