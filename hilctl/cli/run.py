@@ -81,6 +81,8 @@ def run(
         _detach(experiment, output, settings, overwrite=overwrite, as_json=as_json)
         return
     require_linux()
+    # With stty tostop, output of a background job would stop the supervisor.
+    signal.signal(signal.SIGTTOU, signal.SIG_IGN)
     with compile_progress():
         _run(experiment, output, settings, overwrite, watch=watch, live=live, as_json=as_json)
 
