@@ -88,6 +88,17 @@ def kernel(
     return decorate
 
 
+def compiled(function: Function) -> Function:
+    """Return the compiled function of a kernel: a call of it has no Python frame in between.
+
+    Compiles it now, or loads it from the cache. Any other function is returned unchanged.
+
+    Raises:
+        numba.TypingError: The kernel does not match its signatures.
+    """
+    return function.dispatcher if isinstance(function, _Kernel) else function
+
+
 def ensure_compiled(*kernels: object) -> None:
     """Compile kernels now, or load them from the cache, so that their first call does not wait.
 
@@ -98,4 +109,4 @@ def ensure_compiled(*kernels: object) -> None:
     """
     for each in kernels:
         if isinstance(each, _Kernel):
-            each.dispatcher  # noqa: B018
+            compiled(each)

@@ -16,7 +16,7 @@ from hilctl.base.strict import Field, StrictModel
 from hilctl.base.types import F64, U32, CommandUnit
 from hilctl.kernels import interlock as kernels
 from hilctl.kernels.interlock import InterlockFlag
-from hilctl.kernels.jit import ensure_compiled
+from hilctl.kernels.jit import compiled
 from hilctl.loop.block import Block
 
 TripCode: TypeAlias = Literal[
@@ -162,7 +162,7 @@ class Interlocks:
         self._memory[kernels.COMMAND] = context.safe
         self._memory[kernels.HEAT] = max(context.heat_a2, context.safe**2)
         self._next_sample = 0
-        ensure_compiled(kernels.interlock_block)
+        self._interlock_block = compiled(kernels.interlock_block)
 
     def begin_at(self, command: float) -> None:
         """Set the present output; the coil is at least as hot as this command keeps it."""
@@ -203,7 +203,7 @@ class Interlocks:
             self._hold(first_sample - self._next_sample)
         self._next_sample = first_sample + command.size
         before = self._memory.item(kernels.COMMAND)
-        k = kernels.interlock_block(
+        k = self._interlock_block(
             self._numbers, self._memory, command, reference, displacement_um, measured, flags
         )
         if k < 0:

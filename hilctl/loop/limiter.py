@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from hilctl.base.errors import InputError
 from hilctl.base.samples import Flag
 from hilctl.base.types import F64, U32
-from hilctl.kernels.jit import ensure_compiled
+from hilctl.kernels.jit import compiled
 from hilctl.kernels.limit import limit_block
 
 
@@ -67,7 +67,7 @@ class Limiter:
         self._ramp_step = limits.ramp_per_s * dt_s
         furthest = max(limits.high - limits.safe, limits.safe - limits.low)
         self._stride = max(self._ramp_step, _LARGEST_STRIDE * furthest)
-        ensure_compiled(limit_block)
+        self._limit_block = compiled(limit_block)
 
     def limit(self, wanted: F64, command: F64, flags: U32) -> int:
         """Fill ``command`` (float64[n]) with limited commands; add to ``flags`` (uint32[n]).
@@ -113,7 +113,7 @@ class Limiter:
         return self.last == self.limits.safe
 
     def _apply(self, wanted: F64, max_step: float, command: F64, flags: U32) -> int:
-        first_invalid = limit_block(
+        first_invalid = self._limit_block(
             wanted,
             self.last,
             *self._range,

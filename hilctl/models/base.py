@@ -10,6 +10,7 @@ from hilctl.base.errors import ModelError
 from hilctl.base.strict import Field, StrictModel, field_validator, model_validator
 from hilctl.base.types import F64, CommandUnit
 from hilctl.kernels.hysteresis import rest_memory
+from hilctl.kernels.jit import compiled
 
 BlockKernel: TypeAlias = Callable[[F64, F64, F64], None]
 """A kernel with its parameters bound: (input[n], memory, output[n])."""
@@ -68,9 +69,10 @@ class Operator:
             input_offset: Added to the input first.
             output_offset: Added to the output last.
         """
+        process = compiled(kernel)
 
         def run(block: F64, memory: F64, out: F64) -> None:
-            kernel(block, *parameters, memory, out)
+            process(block, *parameters, memory, out)
 
         return cls(run, operators, input_offset=input_offset, output_offset=output_offset)
 
