@@ -1,12 +1,14 @@
 """Authenticate requests to the live page.
 
 Every process of every user of this computer can reach a loopback port, and so can every web page in
-a browser. A request must name this server as its host; an upgrade must come from a page of this
-server and carry the token. The number of unauthenticated connections is limited.
+a browser. A request must name a loopback host; an upgrade must come from a page of that host and
+port and carry the token. The port may differ from the server's, as it does through an SSH tunnel.
+The number of unauthenticated connections is limited.
 """
 
 import asyncio
 import hmac
+import re
 from collections.abc import Callable
 from http import HTTPStatus
 
@@ -19,6 +21,7 @@ from websockets.typing import Subprotocol
 PROTOCOL = Subprotocol("hilctl.live.1")
 """Subprotocol of the page's connection; its number changes with the messages."""
 TOKEN_PREFIX = "token."  # noqa: S105  not a token itself
+_LOOPBACK = re.compile(r"(127\.0\.0\.1|\[::1\]|localhost)(:\d+)?")
 MOST_PENDING = 64
 """Largest number of unauthenticated connections; the oldest is aborted."""
 
@@ -27,14 +30,11 @@ class Admission:
     """Accepts or refuses requests.
 
     Args:
-        port: Port of the server.
         token: 32 hexadecimal digits.
     """
 
-    def __init__(self, port: int, token: str) -> None:
+    def __init__(self, token: str) -> None:
         self._token = token
-        self._hosts = {f"{name}:{port}" for name in ("127.0.0.1", "[::1]", "localhost")}
-        self._origins = {f"http://{host}" for host in self._hosts}
 
     def refusal(self, headers: Headers, *, upgrade: bool) -> tuple[HTTPStatus, str] | None:
         """Return the reason to refuse a request, or None.
@@ -44,9 +44,9 @@ class Admission:
             upgrade: Whether it requests the live connection rather than a file.
         """
         hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
-        if len(hosts) != 1 or hosts[0].lower() not in self._hosts:
+        if len(hosts) != 1 or not _LOOPBACK.fullmatch(hosts[0].lower()):
             return HTTPStatus.MISDIRECTED_REQUEST, "the host is not loopback"
-        if (origins or upgrade) and (len(origins) != 1 or origins[0] not in self._origins):
+        if (origins or upgrade) and origins != [f"http://{hosts[0].lower()}"]:
             return HTTPStatus.FORBIDDEN, "the origin is not this server"
         if upgrade and not self._has_token(headers):
             return HTTPStatus.UNAUTHORIZED, "the token is missing or wrong"

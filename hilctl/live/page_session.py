@@ -43,14 +43,14 @@ class PageMessage(StrictModel):
 
     Attributes:
         id: Number that is returned with the answer.
-        ask: ``view`` changes the selection, ``stop`` stops the run, ``run`` sends a request to the
-            run's control socket.
+        ask: ``view`` changes the selection, ``stop`` stops the run, ``report`` makes the report of
+            its recording, ``run`` sends a request to the run's control socket.
         view: New selection, a :class:`PageView`.
         request: Request to the run.
     """
 
     id: int
-    ask: Literal["view", "stop", "run"]
+    ask: Literal["view", "stop", "report", "run"]
     view: dict[str, Any] = Field(default_factory=dict)
     request: dict[str, Any] = Field(default_factory=dict)
 

@@ -143,7 +143,9 @@ class Scope:
         if running.size:
             self._follow(int(running[-1]))
         if self._cycles is not None and running.size:
-            self._cycles.add(traces.part(running[0], running[-1] + 1))
+            # Not the soft end: the last steady cycle stays visible.
+            stop = running[-1] + 1 if self.segment is None else self.segment.steady_stop
+            self._cycles.add(traces.part(running[0], min(running[-1] + 1, stop)))
 
     def _follow(self, sample: int) -> None:
         here = next((each for each in self._segments if each.start <= sample < each.stop), None)

@@ -8,12 +8,16 @@ import asyncio
 import logging
 import secrets
 import socket
+import sys
+import tempfile
 import time
+from asyncio.subprocess import DEVNULL, PIPE
 from collections.abc import Callable, Sequence
 from contextlib import AsyncExitStack, ExitStack, suppress
 from functools import cache
 from http import HTTPStatus
 from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
 from websockets.asyncio.server import ServerConnection, serve
@@ -23,7 +27,7 @@ from websockets.typing import Subprotocol
 
 from hilctl.base.errors import HilctlError, InputError, RunError
 from hilctl.base.files import ADDRESS_REMEDIES, reason
-from hilctl.base.formatting import finite_json
+from hilctl.base.formatting import finite_json, printable
 from hilctl.live.auth import PROTOCOL, Admission, PendingConnections, bounded
 from hilctl.live.frame_codec import frame_of, nearest_window_s
 from hilctl.live.page_session import MAX_MESSAGE_BYTES, PageMessage, PageSession, answer_text
@@ -32,8 +36,9 @@ from hilctl.live.traces import SIGNALS
 from hilctl.run.control.client import ask, request_stop
 from hilctl.run.run_folder import RunFolder
 
+HTML = "text/html; charset=utf-8"
 FILES = {
-    "/": ("index.html", "text/html; charset=utf-8"),
+    "/": ("index.html", HTML),
     "/live.js": ("live.js", "text/javascript; charset=utf-8"),
     "/icon.svg": ("icon.svg", "image/svg+xml"),
     "/live.css": ("live.css", "text/css; charset=utf-8"),
@@ -41,9 +46,10 @@ FILES = {
     "/uplot.css": ("uplot/uPlot.min.css", "text/css; charset=utf-8"),
 }
 """File and content type of each path."""
+_POLICY = "default-src 'self'"
+_REPORT_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
+_NO_FRAMES = "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 _HEADERS = {
-    "Content-Security-Policy": "default-src 'self'; base-uri 'none'; form-action 'none'; "
-    "frame-ancestors 'none'",
     "X-Content-Type-Options": "nosniff",
     "X-Frame-Options": "DENY",
     "Referrer-Policy": "no-referrer",
@@ -72,8 +78,9 @@ def plain_response(status: HTTPStatus, text: str) -> Response:
     return _response(status, "text/plain; charset=utf-8", f"{text}\n".encode())
 
 
-def _response(status: HTTPStatus, kind: str, body: bytes) -> Response:
+def _response(status: HTTPStatus, kind: str, body: bytes, policy: str = _POLICY) -> Response:
     more = {"Content-Type": kind, "Content-Length": str(len(body))}
+    more["Content-Security-Policy"] = f"{policy}; {_NO_FRAMES}"
     return Response(status.value, status.phrase, Headers({**_HEADERS, **more}), body)
 
 
@@ -111,10 +118,11 @@ class LiveServer:
         self._sockets = _listeners(port)
         self.port = int(self._sockets[0].getsockname()[1])
         self._token = secrets.token_hex(16)
-        self._admission = Admission(self.port, self._token)
+        self._admission = Admission(self._token)
         self._pending = PendingConnections()
         self._viewers: set[PageSession] = set()
         self._feeds = RunList(chosen)
+        self._reports: dict[str, bytes] = {}
 
     @property
     def url(self) -> str:
@@ -154,7 +162,10 @@ class LiveServer:
         if refused is not None:
             return plain_response(*refused)
         if not upgrade:
-            return file_response(request.path.partition("?")[0])
+            path = request.path.partition("?")[0]
+            if path in self._reports:
+                return _response(HTTPStatus.OK, HTML, self._reports[path], _REPORT_POLICY)
+            return file_response(path)
         self._pending.remove(connection)
         return None
 
@@ -183,9 +194,30 @@ class LiveServer:
             # Without a supervisor its loop ramps down by itself.
             requested = request_stop(feed.folder)
             return {"ok": requested or not feed.folder.alive, "requested": requested}
+        if message.ask == "report":
+            return {"ok": True, "path": await self._report(Path(feed.folder.card.recording))}
         place = feed.folder.socket
         answer = await asyncio.to_thread(ask, place, message.request, _REQUEST_S)
         return {"ok": True, **answer}
+
+    async def _report(self, recording: Path) -> str:
+        """Return the path of the report of a recording, which only this page knows.
+
+        Raises:
+            InputError: There is no report of it.
+        """
+        with tempfile.TemporaryDirectory(prefix="hilctl-") as folder:
+            page = Path(folder) / "report.html"
+            words = ["report", str(recording), "--html", str(page)]
+            made = await asyncio.create_subprocess_exec(
+                *(sys.executable, "-m", "hilctl", *words), stdout=DEVNULL, stderr=PIPE
+            )
+            _, error = await made.communicate()
+            if made.returncode:
+                raise InputError(printable(error.decode(errors="replace").strip()))
+            path = f"/report/{secrets.token_hex(16)}"
+            self._reports[path] = page.read_bytes()
+        return path
 
     async def _tick(self, over: Callable[["LiveServer"], bool]) -> None:
         number, due_s = 0, self._clock()

@@ -21,9 +21,11 @@ const $ = (id) => document.getElementById(id);
 const token = location.hash.slice(1);
 const calm = matchMedia("(prefers-reduced-motion: reduce)");
 const view = { run: new URLSearchParams(location.search).get("run"), mode: "cycle", window_s: 2 };
+const scope = { trigger: "cycle", frozen: false, zoom: null, at: null, anchor: null, hidden: new Set(), ranges: new Map() };
 let socket = null;
 let status = null;
 let frame = null;
+let shown = null; // what the scope shows
 let drawn = 0;
 let lastFrameMs = 0;
 let nextId = 1;
@@ -82,7 +84,7 @@ function said(message) {
 // ---- text and numbers
 
 function notice(text, kind = "bad") {
-  $("notice").hidden = !text;
+  $("ending").hidden = !text;
   $("notice").textContent = text;
   $("notice").dataset.kind = kind;
 }
@@ -137,13 +139,19 @@ function showStatus() {
   $("room").textContent = `${disk}ring ${(100 * status.ring_used).toFixed(0)} % full · `
     + `${status.missed_samples} samples not seen`;
   $("stop").disabled = status.ended;
-  if (status.ended) notice(`Run ended: ${status.reason || status.state}${safeText()}`, status.state === "fault" || status.safe === false ? "bad" : "calm");
+  $("report").hidden = !status.ended;
+  if (status.ended) notice(`Run ended: ${status.reason || status.state}${safeText()}`, endKind());
   showFigures();
   showGauges();
   showControls();
   showEvents();
   showKeys();
   drawSmall();
+}
+
+function endKind() {
+  if (status.state === "completed" && status.safe) return "good";
+  return status.state === "stopped" && status.safe ? "calm" : "bad";
 }
 
 function safeText() {
@@ -223,6 +231,7 @@ function showControls() {
     if (document.activeElement !== input && !input.dataset.touched) input.value = status[field];
   }
   $("offset-unit").textContent = status.description.waveform_unit.replace("um", "µm");
+  showChange();
   $("inverse-row").hidden = !status.description.compensator;
   $("inverse-in").setAttribute("aria-pressed", String(status.inverse === "in"));
   $("inverse-out").setAttribute("aria-pressed", String(status.inverse === "out"));
@@ -336,18 +345,17 @@ function build() {
   const measured = status.description.measures_command;
   add("plot-um", [["reference", series("reference", colour("reference"), dash)],
     ["displacement", series("displacement", colour("displacement"))]], "displacement, µm");
-  add("plot-error", [["error", series("error", colour("error"))]], "error, µm");
+  const follows = status.description.waveform_unit === "um"; // otherwise there is no error
+  for (const id of ["plot-error", "spectrum"]) $(id).hidden = !follows;
+  if (follows) add("plot-error", [["error", series("error", colour("error"))]], "error, µm");
   add("plot-command", [["command", series("command", colour("command"))],
     ...(measured ? [["measured", series("measured", colour("measured"), dash)]] : [])], `command, ${command}`, "time, s");
-  $("key").replaceChildren(...Object.values(plots).flatMap(({ plot }) => plot.series.slice(1)).map((each) => {
-    const name = document.createElement("span");
-    const sample = document.createElement("i");
-    sample.style.borderTop = `${each.dash ? "dashed" : "solid"} 2px ${each.stroke()}`;
-    name.append(sample, each.label);
-    return name;
-  }));
+  const chosen = $("level-signal").value || "displacement";
+  $("level-signal").replaceChildren(...scopePlots().flatMap(({ signals }) => signals).map((name) => new Option(name, name, false, name === chosen)));
+  showKey();
+  showRanges();
   const log = { distr: 3 };
-  small("plot-spectrum", [{}, series("error", colour("error"))], { x: { time: false, ...log }, y: { ...log, range: spectrumRange } },
+  if (follows) small("plot-spectrum", [{}, series("error", colour("error"))], { x: { time: false, ...log }, y: { ...log, range: spectrumRange } },
     axes("amplitude, µm", "frequency, Hz"));
   small("plot-late", [{}, series("ticks", colour("bar"), { fill: `${colour("bar")}55`, paths: uPlot.paths.stepped({ align: 1 }) })],
     { x: { time: false, ...log }, y: { range: (_, low, high) => [0, Math.max(1, high * 1.1)] } }, axes("ticks", "late by, µs"));
@@ -366,12 +374,21 @@ function sizes(box) {
 function add(id, signals, yLabel, xLabel = "") {
   const box = $(id);
   const options = {
-    ...sizes(box), cursor: { drag: { x: false, y: false } }, legend: { show: false },
-    scales: { x: { time: false, range: (_, low, high) => [low, high] }, y: { range: (_, low, high) => steady(id, low, high) } },
+    ...sizes(box), legend: { show: false },
+    cursor: { drag: { x: true, y: false, setScale: false }, sync: { key: "scope" }, points: { show: false } },
+    hooks: { setCursor: [readOut], setSelect: [zoomIn], draw: [drawAnchor] },
+    scales: {
+      x: { time: false, range: (_, low, high) => scope.zoom ?? [low, high] },
+      y: { range: (_, low, high) => scope.ranges.get(id) ?? steady(id, low, high) },
+    },
     // By their own digits: the default rounds 0.0025 to 0.003.
     axes: axes(yLabel, xLabel).map((axis) => ({ ...axis, values: (_, splits) => splits.map(tidy) })), series: [{}, ...signals.map(([, each]) => each)],
   };
-  plots[id] = { plot: new uPlot(options, [[0, 1], ...signals.map(() => [null, null])], box), signals: signals.map(([name]) => name) };
+  for (const each of options.series.slice(1)) each.show = !scope.hidden.has(each.label);
+  const plot = new uPlot(options, [[0, 1], ...signals.map(() => [null, null])], box);
+  plot.over.addEventListener("click", () => { if (scope.at !== null) setAnchor(scope.anchor ? null : shown.t[scope.at]); });
+  plot.over.addEventListener("dblclick", () => { scope.zoom = null; setAnchor(null); });
+  plots[id] = { plot, signals: signals.map(([name]) => name) };
 }
 
 function small(id, lines, scales, axis) {
@@ -395,7 +412,7 @@ function drawSmall() {
   plots["plot-late"].plot.setData([edges.slice(first, last + 1), counts.slice(first, last + 1)]);
   const late = status.lateness_us;
   $("late-text").textContent = `p50 ${number(late.p50, 0, 5)}  p99 ${number(late.p99, 0, 6)}  max ${number(late.max, 0, 7)} µs · ${status.late_ticks} late`;
-  if (status.spectrum.hz.length) {
+  if (plots["plot-spectrum"] && status.spectrum.hz.length) {
     plots["plot-spectrum"].plot.setData([status.spectrum.hz, status.spectrum.um.map((um) => Math.max(um, 1e-12))]);
   }
 }
@@ -433,21 +450,192 @@ function line(low, high, still) {
 }
 
 function draw(data) {
-  const names = status.signals.map(([name]) => name);
+  drawLoops(data);
+  drawScope(scope.trigger === "level" ? fromCrossing(data) : data);
+}
+
+// Half a window, from the newest crossing of the level that has half a window after it.
+function fromCrossing(data) {
+  const row = rowOf($("level-signal").value), level = typed("level-value"), edge = Number($("level-edge").value);
+  const half = data.n >> 1;
+  const above = (at) => edge * (0.5 * (data.low[row][at] + data.high[row][at]) - level) >= 0;
+  const below = (at) => edge * (0.5 * (data.low[row][at] + data.high[row][at]) - level) < 0;
+  let at = data.n - half;
+  while (at > 0 && !(above(at) && below(at - 1))) at -= 1;
+  $("level-state").textContent = at ? "" : "no crossing in the window";
+  if (!at && shown) return shown;
+  const part = (values) => values.subarray(at, at + half);
+  return { ...data, n: half, t: part(data.t).map((t) => t - data.t[at]), low: data.low.map(part), high: data.high.map(part) };
+}
+
+function rowOf(name) {
+  return status.signals.findIndex(([each]) => each === name);
+}
+
+function drawScope(data) {
+  shown = data;
   const times = new Array(2 * data.n);
-  for (let at = 0; at < data.n; at += 1) times[2 * at] = times[2 * at + 1] = data.t[at];
-  for (const id of ["plot-um", "plot-error", "plot-command"]) {
-    const { plot, signals } = plots[id];
+  const half = 0.5 * (data.t[1] - data.t[0]);
+  for (let at = 0; at < data.n; at += 1) { times[2 * at] = data.t[at]; times[2 * at + 1] = data.t[at] + half; }
+  for (const { plot, signals } of scopePlots()) {
     const { min, max } = plot.scales.y;
     const still = (HALF_A_PIXEL * (max - min)) / plot.bbox.height;
     plot.setData([times, ...signals.map((name) => {
-      const row = names.indexOf(name);
+      const row = rowOf(name);
       return line(data.low[row], data.high[row], still);
     })]);
   }
-  $("mode").textContent = data.mode === "cycle" ? "triggered by the cycle" : "rolling";
   $("window").disabled = data.mode === "cycle";
-  drawLoops(data);
+  readOut();
+}
+
+// ---- tools of the scope
+
+function scopePlots() {
+  return Object.values(plots).filter(({ signals }) => signals);
+}
+
+function redraw() {
+  if (shown) drawScope(shown);
+}
+
+function showKey() {
+  $("key").replaceChildren(...scopePlots().flatMap(({ plot }) => plot.series.slice(1).map((each, at) => {
+    const name = document.createElement("button");
+    const sample = document.createElement("i");
+    name.type = "button";
+    name.setAttribute("aria-pressed", String(each.show));
+    sample.style.borderTop = `${each.dash ? "dashed" : "solid"} 2px ${each.stroke()}`;
+    name.append(sample, each.label);
+    name.addEventListener("click", () => {
+      scope.hidden[each.show ? "add" : "delete"](each.label);
+      plot.setSeries(at + 1, { show: !each.show });
+      name.setAttribute("aria-pressed", String(each.show));
+    });
+    return name;
+  })));
+}
+
+// Two fields per plot; without a number the range follows the signals.
+function showRanges() {
+  const open = $("ranges").firstElementChild;
+  $("ranges").replaceChildren(open, ...Object.keys(plots).filter((id) => plots[id].signals).map((id) => {
+    const row = document.createElement("div");
+    row.className = "row";
+    const name = document.createElement("span");
+    name.textContent = plots[id].plot.axes[1].label;
+    const ends = ["low", "high"].map((end, at) => {
+      const field = document.createElement("input");
+      field.inputMode = "decimal";
+      field.id = `${id}-${end}`;
+      field.placeholder = "automatic";
+      field.setAttribute("aria-label", `${name.textContent}: ${end} end`);
+      field.value = scope.ranges.get(id)?.[at] ?? "";
+      field.addEventListener("change", () => setRange(id));
+      return field;
+    });
+    row.append(name, ...ends);
+    return row;
+  }));
+}
+
+function setRange(id) {
+  const [low, high] = ["low", "high"].map((end) => ($(`${id}-${end}`).value.trim() ? typed(`${id}-${end}`) : NaN));
+  if (low < high) scope.ranges.set(id, [low, high]);
+  else scope.ranges.delete(id);
+  redraw();
+}
+
+function zoomIn(plot) {
+  if (plot.select.width < 4) return;
+  const { left, width } = plot.select;
+  scope.zoom = [plot.posToVal(left, "x"), plot.posToVal(left + width, "x")];
+  plot.setSelect({ left: 0, width: 0, top: 0, height: 0 }, false);
+  redraw();
+}
+
+function setAnchor(t) {
+  scope.anchor = t === null ? null : { t, values: shown.low.map((low, row) => 0.5 * (low[scope.at] + shown.high[row][scope.at])) };
+  redraw();
+}
+
+function drawAnchor(plot) {
+  if (scope.anchor === null) return;
+  const x = plot.valToPos(scope.anchor.t, "x", true);
+  const pen = plot.ctx;
+  pen.save();
+  pen.strokeStyle = colour("ink");
+  pen.setLineDash([2, 3]);
+  stroke(pen, [[x, plot.bbox.top], [x, plot.bbox.top + plot.bbox.height]]);
+  pen.restore();
+}
+
+// Values at the cursor, and from the reference cursor to it.
+function readOut(plot) {
+  if (plot) scope.at = plot.cursor.idx === null || plot.cursor.idx === undefined ? null : plot.cursor.idx >> 1;
+  const at = scope.at;
+  if (at === null || !shown || at >= shown.n) return;
+  const { anchor } = scope;
+  const parts = [`t ${tidy(shown.t[at])} s`];
+  const dt = anchor && shown.t[at] - anchor.t;
+  if (dt) parts.push(`Δt ${tidy(dt)} s (${tidy(1 / Math.abs(dt))} Hz)`);
+  for (const { plot: each, signals } of scopePlots()) {
+    signals.forEach((name, line) => {
+      const row = rowOf(name), low = shown.low[row][at], high = shown.high[row][at];
+      if (!each.series[line + 1].show || Number.isNaN(low)) return;
+      const what = unit(status.signals[row][2]);
+      const range = short(low) === short(high) ? short(low) : `${short(low)} to ${short(high)}`;
+      const moved = dt ? ` (Δ ${short(0.5 * (low + high) - anchor.values[row])})` : "";
+      parts.push(`${name} ${range}${moved} ${what}`);
+    });
+  }
+  $("readout").textContent = parts.join("   ");
+}
+
+function short(value) {
+  return String(Number(value.toPrecision(4)));
+}
+
+function freeze() {
+  scope.frozen = !scope.frozen;
+  $("freeze").setAttribute("aria-pressed", String(scope.frozen));
+}
+
+function save(blob, kind) {
+  const link = document.createElement("a");
+  link.href = URL.createObjectURL(blob);
+  link.download = `${status.run}-${time(status.t_s).replace(":", "m")}s.${kind}`;
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 1000);
+}
+
+// The buckets of the window: the smallest and the largest value of each signal.
+function saveCsv() {
+  const used = scopePlots().flatMap(({ signals }) => signals).map((name) => [name, rowOf(name)]);
+  const names = used.flatMap(([name, row]) => ["min", "max"].map((end) => `${name}_${unit(status.signals[row][2]).replace("µ", "u").toLowerCase()}_${end}`));
+  const lines = Array.from({ length: shown.n }, (_, at) => [shown.t[at], ...used.flatMap(([, row]) => [shown.low[row][at], shown.high[row][at]])]
+    .map((value) => (Number.isNaN(value) ? "" : Number(value.toPrecision(7)))).join());
+  save(new Blob([`${["t_s", ...names].join()}\n${lines.join("\n")}\n`], { type: "text/csv" }), "csv");
+}
+
+function savePng() {
+  const parts = scopePlots().map(({ plot }) => plot.ctx.canvas);
+  const page = document.createElement("canvas");
+  const head = 2.4 * letter * devicePixelRatio;
+  page.width = Math.max(...parts.map((each) => each.width));
+  page.height = head + parts.reduce((sum, each) => sum + each.height, 0);
+  const pen = page.getContext("2d");
+  pen.fillStyle = colour("card");
+  pen.fillRect(0, 0, page.width, page.height);
+  pen.font = `${letter * devicePixelRatio}px system-ui, sans-serif`;
+  pen.fillStyle = colour("ink");
+  let x = 0.6 * head;
+  const write = (text, style) => { pen.fillStyle = style; pen.fillText(text, x, 0.65 * head); x += pen.measureText(text).width + 0.5 * head; };
+  write(`${status.run}, ${time(status.t_s)}`, colour("ink"));
+  for (const { plot } of scopePlots()) for (const each of plot.series.slice(1)) if (each.show) write(each.label, each.stroke());
+  let y = head;
+  for (const each of parts) { pen.drawImage(each, 0, y); y += each.height; }
+  page.toBlob((blob) => save(blob, "png"));
 }
 
 // ---- loops
@@ -558,6 +746,34 @@ function stop() {
   });
 }
 
+function report() {
+  const tab = open("", "_blank"); // now: browsers block a tab that is opened later
+  $("report").disabled = true;
+  ask("report", {}, (answer) => {
+    $("report").disabled = false;
+    if (answer.ok) { tab.location = answer.path; return; }
+    tab.close();
+    notice(`No report: ${answer.error}`);
+  });
+}
+
+// "0,5" and "0.5" are the same number; anything else is marked as invalid.
+function typed(id) {
+  const text = $(id).value.trim().replace(",", ".");
+  const value = /^[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?$/i.test(text) ? Number(text) : NaN;
+  $(id).setCustomValidity(Number.isNaN(value) ? "a number such as 0.5 or 0,5" : "");
+  return value;
+}
+
+// What "set" will send, before it is sent.
+function showChange() {
+  const { waveform_unit: what } = status.description;
+  const parts = ["gain", "offset"].map((id) => [id, status[id], typed(id)]).filter(([, now, then]) => now !== then)
+    .map(([id, now, then]) => `${id} ${now} → ${Number.isNaN(then) ? "not a number" : then}${id === "offset" ? ` ${what.replace("um", "µm")}` : ""}`);
+  const over_s = typed("over");
+  $("change").textContent = parts.length ? `${parts.join(", ")}, over ${Number.isNaN(over_s) ? "not a number" : over_s} s` : "";
+}
+
 function request(command, what) {
   say(`${what} …`);
   ask("run", { request: command }, (answer) => {
@@ -567,11 +783,15 @@ function request(command, what) {
 }
 
 function inverse(place) {
-  request({ command: "set", inverse: place, over_s: Number($("over").value) }, `inverse ${place}`);
+  const over_s = typed("over");
+  if ($("over").reportValidity()) request({ command: "set", inverse: place, over_s }, `inverse ${place}`);
 }
 
-function toggleMode() {
-  view.mode = view.mode === "cycle" ? "roll" : "cycle";
+function setTrigger(name) {
+  $("trigger").value = scope.trigger = name;
+  $("level").hidden = name !== "level";
+  view.mode = name === "cycle" ? "cycle" : "roll";
+  scope.zoom = scope.anchor = shown = null;
   ranges.clear();
   ask("view", { view });
 }
@@ -579,16 +799,21 @@ function toggleMode() {
 $("stop").addEventListener("click", stop);
 $("inverse-in").addEventListener("click", () => inverse("in"));
 $("inverse-out").addEventListener("click", () => inverse("out"));
-$("mode").addEventListener("click", toggleMode);
+$("report").addEventListener("click", report);
+$("trigger").addEventListener("change", () => setTrigger($("trigger").value));
+$("freeze").addEventListener("click", freeze);
+$("csv").addEventListener("click", () => shown && saveCsv());
+$("png").addEventListener("click", () => shown && savePng());
 $("window").replaceChildren(...WINDOWS_S.map((seconds) => new Option(`${seconds} s`, seconds, false, seconds === view.window_s)));
 $("window").addEventListener("change", () => {
   view.window_s = Number($("window").value);
   ask("view", { view });
 });
-for (const id of ["gain", "offset"]) $(id).addEventListener("input", () => { $(id).dataset.touched = "1"; });
+for (const id of ["gain", "offset", "over"]) $(id).addEventListener("input", () => { $(id).dataset.touched = "1"; showChange(); });
 $("tune").addEventListener("submit", (event) => {
   event.preventDefault();
-  const [gain, offset, over_s] = ["gain", "offset", "over"].map((id) => Number($(id).value));
+  const [gain, offset, over_s] = ["gain", "offset", "over"].map(typed);
+  if (!$("tune").reportValidity()) return;
   request({ command: "set", gain, offset, over_s }, `gain ${gain}, offset ${offset}`);
 });
 $("marking").addEventListener("submit", (event) => {
@@ -598,12 +823,18 @@ $("marking").addEventListener("submit", (event) => {
   $("mark").blur();
 });
 addEventListener("keydown", (event) => {
-  if (event.key === "Escape") { event.preventDefault(); stop(); return; }
-  if (event.target.closest?.("input, select, textarea") || event.ctrlKey || event.metaKey || event.altKey) return;
+  const field = event.target.closest?.("input, select, textarea");
+  if (event.key === "Escape") {
+    event.preventDefault();
+    if (field) { delete field.dataset.touched; field.blur(); } else stop(); // it leaves a field first
+    return;
+  }
+  if (field || event.ctrlKey || event.metaKey || event.altKey) return;
   const key = event.key.toLowerCase();
   if (key === "i" && !$("inverse-row").hidden) inverse(status?.inverse === "out" ? "in" : "out");
   else if (key === "m") { event.preventDefault(); $("mark").focus(); }
-  else if (key === "r") toggleMode();
+  else if (key === "r") setTrigger(scope.trigger === "cycle" ? "roll" : "cycle");
+  else if (key === "f") freeze();
 });
 
 // ---- theme
@@ -627,6 +858,7 @@ function refresh(now) {
   if (frame === null || !status?.description || (calm.matches && now - drawn < 250)) return;
   const data = unpack(frame);
   frame = null;
+  if (scope.frozen && shown) return;
   if (!plots["plot-um"] || plots.unit !== status.run) { build(); Object.defineProperty(plots, "unit", { value: status.run }); }
   draw(data);
   const gap = now - lastFrameMs;

@@ -68,6 +68,18 @@ def test_loops_pair_one_samples_values():
     assert scope.points_a_cycle() == 50
 
 
+def test_last_steady_cycle_stays():
+    """Neither the soft end nor the safe ramp replaces it."""
+    soft = Segment("sine", 100, 1000, 100, 900, 50.0)
+    scope = Scope(RATE, [soft], "reference")
+    scope.add(waves(100, 900, 50.0))
+    before = scope.triggered().buckets.low, scope.loops()
+    scope.add(waves(900, 1000, 50.0))
+    scope.add(waves(1000, 1100, 50.0, int(Flag.RAMP)))
+    np.testing.assert_array_equal(scope.triggered().buckets.low, before[0])
+    np.testing.assert_array_equal(scope.loops(), before[1])
+
+
 def test_cycle_of_each_segment():
     first = Segment("a", 0, 500, 0, 500, 50.0)
     scope = Scope(RATE, [first, Segment("b", 500, 9000, 500, 9000)], "reference")

@@ -4,6 +4,8 @@ import asyncio
 import json
 import re
 import socket
+import subprocess
+import sys
 from contextlib import asynccontextmanager, contextmanager, suppress
 from pathlib import Path
 
@@ -149,6 +151,31 @@ def test_invalid_window_does_not_end_the_server(description, tmp_path):
         refused, status = asyncio.run(shown())
     assert not refused["ok"]
     assert status["state"] == "running"
+
+
+@pytest.mark.slow
+def test_report_is_served_to_the_page_that_asked_for_it(description, tmp_path):
+    recording = tmp_path / "a.mcap"
+    command = [sys.executable, "-m", "hilctl", "run", str(DEMO), "--output", str(recording)]
+    subprocess.run([*command, "--set", "waveform.duration_s=0.5"], check=True, capture_output=True)
+
+    async def run():
+        async with serving() as server, opened(server) as connection:
+            await status_of(connection)
+            answer = await answer_to(connection, ask="report")
+            request = f"GET {answer['path']} HTTP/1.1\r\nHost: localhost:1\r\n\r\n"
+            served = await http(server.port, request.encode())
+            recording.unlink()
+            return served, await answer_to(connection, ask="report")
+
+    with active_runs(description, tmp_path):
+        served, refused = asyncio.run(run())
+    head, _, body = served.partition(b"\r\n\r\n")
+    assert b" 200 " in head
+    assert b"default-src 'none'" in head
+    assert b"<svg" in body
+    assert not refused["ok"]
+    assert str(recording) in refused["error"]
 
 
 def test_page_without_a_run():
