@@ -191,6 +191,7 @@ function showFigures() {
     const small = document.createElement("small");
     small.textContent = ` ${what}`;
     $(`figure-${key}`).replaceChildren(number(status.figures[key], decimals), small);
+    $(`figure-${key}`).parentElement.hidden = key.includes("error") && status.description.waveform_unit !== "um";
   }
 }
 
@@ -343,9 +344,9 @@ function build() {
   const command = status.description.command_unit;
   const dash = { dash: [6, 4] };
   const measured = status.description.measures_command;
-  add("plot-um", [["reference", series("reference", colour("reference"), dash)],
-    ["displacement", series("displacement", colour("displacement"))]], "displacement, µm");
   const follows = status.description.waveform_unit === "um"; // otherwise there is no error
+  add("plot-um", [...(follows ? [["reference", series("reference", colour("reference"), dash)]] : []),
+    ["displacement", series("displacement", colour("displacement"))]], "displacement, µm");
   for (const id of ["plot-error", "spectrum"]) $(id).hidden = !follows;
   if (follows) add("plot-error", [["error", series("error", colour("error"))]], "error, µm");
   add("plot-command", [["command", series("command", colour("command"))],
