@@ -1,13 +1,13 @@
 """Linear stages of a staged model (delay, smoothing, structure, creep), and chains of operators."""
 
 import math
-from collections.abc import Callable, Sequence
-from typing import Annotated, Self
+from collections.abc import Callable, Iterator, Sequence
+from typing import Annotated
 
 import numpy as np
 
 from hilctl.base.errors import ModelError
-from hilctl.base.strict import Field, StrictModel, model_validator
+from hilctl.base.strict import CheckedModel, Field, StrictModel
 from hilctl.base.types import C128, F64
 from hilctl.kernels.dynamics import (
     between_block,
@@ -19,7 +19,7 @@ from hilctl.kernels.dynamics import (
     uncreep_block,
     unmode_block,
 )
-from hilctl.models.base import Operator, refuse, threshold_problems
+from hilctl.models.base import Operator, threshold_problems
 
 _WIDEST = 64
 
@@ -113,7 +113,7 @@ TimeConstant = Annotated[float, Field(ge=1e-3, le=1e6)]
 Share = Annotated[float, Field(gt=0.0, le=1.0)]
 
 
-class CreepModel(StrictModel):
+class CreepModel(CheckedModel):
     """y = x + c_1 + c_2 + ..., T_i c_i' = s_i x - c_i: creep as springs and dampers in series.
 
     As K. Kuhnen and H. Janocha, "Inverse feedforward controller for complex hysteretic
@@ -128,16 +128,11 @@ class CreepModel(StrictModel):
     time_constants_s: tuple[TimeConstant, ...] = Field(min_length=1, max_length=16)
     shares: tuple[Share, ...]
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        problems = [*threshold_problems("T", self.time_constants_s)]
+    def _problems(self) -> Iterator[str]:
+        yield from threshold_problems("T", self.time_constants_s)
         if len(self.shares) != len(self.time_constants_s):
-            problems.append(
-                "shares must have one value per time constant: "
-                f"{len(self.shares)} for {len(self.time_constants_s)}"
-            )
-        refuse(problems)
-        return self
+            numbers = f"{len(self.shares)} for {len(self.time_constants_s)}"
+            yield f"shares must have one value per time constant: {numbers}"
 
     def forward(self, sample_rate_hz: float, rest_um: float = 0.0) -> Operator:
         """Return the operator that adds creep to displacements, which are ``rest_um`` at rest."""

@@ -1,11 +1,12 @@
 """Sums of play operators: PPI, RDPI and SPI (chapters 3 and 5)."""
 
-from typing import Literal, Self
+from collections.abc import Iterator
+from typing import Literal
 
 import numpy as np
 
 from hilctl.base.errors import ModelError
-from hilctl.base.strict import Field, model_validator
+from hilctl.base.strict import CheckedModel, Field
 from hilctl.base.types import F64
 from hilctl.kernels.hysteresis import play_sum, stop_sum
 from hilctl.models.base import (
@@ -15,7 +16,6 @@ from hilctl.models.base import (
     Weights,
     length_problems,
     play_weight_problems,
-    refuse,
     threshold_problems,
 )
 
@@ -45,7 +45,7 @@ def inverse_plays(direct: float, weights: F64, thresholds: F64) -> tuple[float, 
     return inverse_direct, inverse_weights, corners
 
 
-class PlayModel(HysteresisModel):
+class PlayModel(CheckedModel, HysteresisModel):
     """a_0 v + sum a_i F_i[v], with the conditions for its inverse.
 
     Attributes:
@@ -58,16 +58,10 @@ class PlayModel(HysteresisModel):
     weights: Weights
     thresholds: Thresholds
 
-    @model_validator(mode="after")
-    def _check_plays(self) -> Self:
-        refuse(
-            (
-                *length_problems("weights", self.weights, self.thresholds),
-                *play_weight_problems(self.direct, self.weights),
-                *threshold_problems("r", self.thresholds),
-            )
-        )
-        return self
+    def _problems(self) -> Iterator[str]:
+        yield from length_problems("weights", self.weights, self.thresholds)
+        yield from play_weight_problems(self.direct, self.weights)
+        yield from threshold_problems("r", self.thresholds)
 
     @property
     def operators(self) -> int:
