@@ -7,7 +7,7 @@ import pytest
 
 from hilctl.base.events import OFFSET
 from hilctl.base.samples import Flag
-from hilctl.loop.lead_in import Conditioning, LeadIn, RestingOffset
+from hilctl.loop.lead_in import Conditioning, LeadIn
 from tests.fakes import FakeClock, FakeDevice, FakeFifoDevice
 from tests.published import terfenol_rdpi
 from tests.unit.loop.test_loop import LIMITS, RATE_HZ, Rig, sine
@@ -189,7 +189,7 @@ class TestOffset:
 
     def test_no_reading_is_no_offset(self):
         """Where nothing was read at rest there is no number, which is beyond every limit."""
-        resting = RestingOffset(conditioning(stands_um=0.0), 40)
+        resting = LeadIn(conditioning(stands_um=0.0), 40)
         resting.take(150, np.zeros(10))
         assert math.isnan(resting.resting_um)
         given = conditioning(block=1, stands_um=math.nan)
@@ -200,7 +200,7 @@ class TestOffset:
     def test_mean_over_the_rest_whatever_the_block(self, size):
         """Samples of the window alone count."""
         shown = np.arange(220.0)
-        resting = RestingOffset(conditioning(), 40)
+        resting = LeadIn(conditioning(), 40)
         for first in range(0, 220, size):
             resting.take(first, shown[first : first + size])
         assert resting.resting_um == np.arange(160.0, 180.0).mean()
@@ -209,7 +209,7 @@ class TestOffset:
     def test_noise_of_the_rest(self, size):
         """The standard deviation of the window's samples, also far from 0; NaN of none."""
         shown = 1e5 + np.random.default_rng(1).normal(0.0, 0.03, 220)
-        resting = RestingOffset(conditioning(), 40)
+        resting = LeadIn(conditioning(), 40)
         assert math.isnan(resting.noise_um)
         for first in range(0, 220, size):
             resting.take(first, shown[first : first + size])
