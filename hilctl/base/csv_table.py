@@ -42,7 +42,6 @@ class TableRows:
     """Rows of a text table.
 
     Attributes:
-        path: The file.
         values: float64[columns, rows], all finite.
         lines: int64[rows], the line of each row in the file.
     """
@@ -83,9 +82,6 @@ class TableRows:
 
 class TextTable:
     """A text table with its columns and rows read on request.
-
-    Args:
-        path: The file.
 
     Attributes:
         names: Names of the columns, or their numbers from 1.
@@ -236,12 +232,7 @@ class TextTable:
 
 
 def column_index(path: Path, column: Column | None, names: Sequence[str]) -> int:
-    """Return a column's index from 0.
-
-    Args:
-        path: The file, for the message.
-        column: Its name, or its number from 1; None for the only one.
-        names: The names of all columns, in order.
+    """Return a column's index from 0, by its name or its number from 1; None for the only one.
 
     Raises:
         DataError: The column does not exist or is ambiguous.
@@ -263,13 +254,7 @@ def column_index(path: Path, column: Column | None, names: Sequence[str]) -> int
 
 
 def check_rows(path: Path, count: int, first_row: int, last_row: int | None) -> None:
-    """Reject rows that do not exist.
-
-    Args:
-        path: The file, for the message.
-        count: Number of rows.
-        first_row: First row requested, counted from 1.
-        last_row: Last row requested; None for the last of the file.
+    """Reject rows, counted from 1, that do not exist; ``last_row`` None is the last of the file.
 
     Raises:
         DataError: A row does not exist, or the last is before the first.

@@ -33,7 +33,6 @@ class ConfigProblem:
     Attributes:
         where: ``file:line`` of the value, or the option it was given with.
         key: Dotted key, for example ``limits.peak_current_a``; empty for the file as a whole.
-        rule: The rule in words.
         value: The invalid value as written; may be empty.
         hint: Suggested fix; may be empty.
     """

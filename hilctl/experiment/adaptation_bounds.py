@@ -51,13 +51,7 @@ def adapted_operator(config: Experiment, reference: Reference) -> DisplacementOp
 def make_adaptation(
     config: Experiment, operator: DisplacementOperator | None, compensator: Compensator
 ) -> Adaptation | None:
-    """Return the adaptation of a run, or None.
-
-    Args:
-        config: The experiment.
-        operator: See :func:`adapted_operator`.
-        compensator: The compensator behind it.
-    """
+    """Return the adaptation of a run, or None."""
     wanted = config.adaptation
     if wanted is None or operator is None:
         return None
@@ -71,12 +65,7 @@ def make_adaptation(
 
 
 def adaptation_problems(loaded: LoadedExperiment, preview: int) -> list[ConfigProblem]:
-    """Return the broken rules of the ``adaptation`` section.
-
-    Args:
-        loaded: The experiment.
-        preview: Preview of its compensator in samples.
-    """
+    """Return the broken rules of the ``adaptation`` section."""
     config, wanted = loaded.config, loaded.config.adaptation
     if wanted is None:
         return []
@@ -104,12 +93,7 @@ def adaptation_problems(loaded: LoadedExperiment, preview: int) -> list[ConfigPr
 
 
 def adaptation_warnings(config: Experiment, segments: tuple[Segment, ...]) -> tuple[str, ...]:
-    """Return reasons why the adaptation may have no effect or an unwanted one.
-
-    Args:
-        config: The experiment.
-        segments: Segments of its reference.
-    """
+    """Return reasons why the adaptation may have no effect or an unwanted one."""
     wanted = config.adaptation
     if wanted is None:
         return ()
@@ -136,13 +120,7 @@ def _shortest_s(loaded: LoadedExperiment, preview: int) -> float:
 def worst_inputs(
     config: Experiment, operator: DisplacementOperator | None, input_um: F64
 ) -> Iterator["WorstInput"]:
-    """Yield the compensator's input with the adaptation at its bounds, where it is largest.
-
-    Args:
-        config: The experiment.
-        operator: The adapted operator; None without adaptation.
-        input_um: float64[n], the input without adaptation.
-    """
+    """Yield the compensator's input with the adaptation at its bounds, where it is largest."""
     if operator is None:
         return
     # Parameters move no faster than the lead-in.
@@ -157,11 +135,7 @@ def worst_inputs(
 class WorstInput:
     """The compensator's input with adapted parameters, called part by part.
 
-    Args:
-        operator: The adapted operator.
-        input_um: float64[n], the input without adaptation.
-        worst: float64[m], final o, g and w_i.
-        led: Samples of the transition, at most n.
+    The parameters move over ``led`` samples from 0 to ``worst``: float64[m], o, g and w_i.
     """
 
     def __init__(self, operator: DisplacementOperator, input_um: F64, worst: F64, led: int) -> None:

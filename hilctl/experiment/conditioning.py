@@ -32,9 +32,7 @@ def conditioning_of(
 ) -> Conditioning | None:
     """Return the conditioning before the waveform, or None.
 
-    Args:
-        loaded: The experiment.
-        stands_um: Model displacement at its end; None if no offset is measured.
+    ``stands_um`` is the model displacement at its end, or None if no offset is measured.
     """
     config, condition = loaded.config, loaded.config.condition
     if condition is None and not measures_offset(config):

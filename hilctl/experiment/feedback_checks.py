@@ -38,10 +38,7 @@ def make_feedback(
 ) -> Controller | None:
     """Return the feedback controller of a run, or None.
 
-    Args:
-        config: The experiment.
-        compensator: Compensator whose input it corrects.
-        latency_blocks: Exchanges from a block's commands to its displacements.
+    ``latency_blocks`` counts the exchanges from a block's commands to its displacements.
     """
     wanted = config.feedback
     if wanted is None:
@@ -59,22 +56,14 @@ def make_feedback(
 def delays(sensor_delay_s: float, rate_hz: float, preview: int) -> tuple[int, int]:
     """Return the samples from the reference, and from the input, to the resulting displacement.
 
-    Args:
-        sensor_delay_s: Delay of the sensor and its line.
-        rate_hz: Samples per second.
-        preview: Samples by which the compensator's input runs ahead of its commands.
+    ``preview`` is the number of samples by which the input runs ahead of the commands.
     """
     due_after = round(sensor_delay_s * rate_hz) + (0 if preview else 1)
     return due_after, due_after + preview
 
 
 def feedback_problems(loaded: LoadedExperiment, preview: int) -> list[ConfigProblem]:
-    """Return the broken rules of the ``feedback`` section.
-
-    Args:
-        loaded: The experiment.
-        preview: Preview of its compensator in samples, which delays the effect of a correction.
-    """
+    """Return the broken rules of the ``feedback`` section."""
     config, wanted = loaded.config, loaded.config.feedback
     if wanted is None:
         return []
@@ -221,11 +210,7 @@ def highest_bandwidth_hz(rate_hz: float, extra_delay_s: float = 0.0) -> float:
     """Return the largest bandwidth with the required phase margin.
 
     The integral lags by 90 degrees minus half a sample, the loop by two samples. The margin of 60
-    degrees leaves 30 degrees for these 1.5 samples and the extra delay.
-
-    Args:
-        rate_hz: Samples per second.
-        extra_delay_s: Delay of link and sensor.
+    degrees leaves 30 degrees for these 1.5 samples and the extra delay of link and sensor.
     """
     share = (90.0 - LEAST_PHASE_MARGIN_DEG) / 360.0
     return share / ((LOOP_DELAY - 0.5) / rate_hz + extra_delay_s)

@@ -7,7 +7,7 @@ closely that the last cycle would still agree if each differed from the one befo
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -37,15 +37,9 @@ class Forecast:
     """The commands of a run in numbers.
 
     Attributes:
-        samples: Samples of the waveform.
-        duration_s: Its length.
-        before_s: Time of the conditioning before it.
+        before_s: Time of the conditioning before the waveform.
         begins: Initial state of the compensator in words; empty without a compensator.
         reference_min: Lowest reference, in the waveform's unit.
-        reference_max: Highest reference.
-        command_unit: ``A`` or ``V``.
-        command_min: Lowest command.
-        command_max: Highest command.
         slew_per_s: Fastest change of the command.
         heat: Effect on the heat of the coil, whatever the heat before.
         begins_rms_a: Initial running rms of the coil current, left by the last run of the device;
@@ -53,8 +47,7 @@ class Forecast:
         heating_rms_a: Highest running rms of the coil current; None without a budget.
         budget_used_s: Time after which the thermal budget is exceeded; None if it never is.
         recording_mb: Approximate size of the recording.
-        highest_rate_hz: Highest sample rate of the device.
-        rate_note: Reason for that rate; may be empty.
+        rate_note: Reason for the highest rate; may be empty.
         line: Replacement of the inverse while it is bypassed; None if there is none.
     """
 
@@ -92,15 +85,10 @@ def forecast_of(
     heat_a2: float = 0.0,
     input_um: Callable[[int, int], F64] | None = None,
 ) -> Forecast:
-    """Compute all commands of a run.
+    """Compute all commands of a run: ``conditioned``, float64[m], then those of the waveform.
 
-    Args:
-        loaded: The experiment.
-        reference: Every sample of its waveform.
-        begun: Input and initial state of the compensator.
-        conditioned: float64[m], commands before those of the waveform.
-        heat_a2: Running mean square of the coil current before all of them, in A^2.
-        input_um: Returns a different input from a start to a stop; called in order.
+    ``heat_a2`` is the coil's heat before, in A^2. ``input_um`` returns a different input from a
+    start to a stop, and is called in order.
 
     Raises:
         ModelError: The model has no inverse.
@@ -146,31 +134,11 @@ def forecast_of(
     )
 
 
-class CommandSink(Protocol):
-    """Consumer of simulated commands."""
-
-    def add(self, reference: F64, command: F64) -> None:
-        """Add the next samples: float64[n] each, n > 0."""
-        ...
-
-    def mark(self) -> None:
-        """Mark the start of a cycle."""
-        ...
-
-    def skip(self, samples: int, times: int) -> None:
-        """Add the cycle since the mark, of ``samples`` samples, ``times`` more times."""
-        ...
-
-
 class CommandSimulation:
     """Simulation of the commands of a run, without the repeats of cycles that agree.
 
-    Args:
-        compensator: Compensator in the initial state of the run.
-        input_um: Returns its input from a start to a stop, float64[stop - start]; called in order.
-        reference: Returns the reference in the same way.
-        size: Samples of the run.
-        figures: Consumer of the commands.
+    ``input_um`` and ``reference`` return their samples from a start to a stop, and are called in
+    order. The compensator is in the initial state of the run.
     """
 
     def __init__(
@@ -179,7 +147,7 @@ class CommandSimulation:
         input_um: Callable[[int, int], F64],
         reference: Callable[[int, int], F64],
         size: int,
-        figures: CommandSink,
+        figures: "_RunFigures",
     ) -> None:
         self._compensator, self._input_um, self._reference = compensator, input_um, reference
         self._size, self._figures = size, figures
@@ -228,9 +196,7 @@ class CommandSimulation:
 def whole_cycle(period: float, samples: int) -> int:
     """Return the shortest whole cycle worth comparing, in samples; 0 if there is none.
 
-    Args:
-        period: Samples of a period, > 0.
-        samples: Samples of the periodic part; fewer than four cycles are not worth it.
+    Fewer than four cycles in the samples of the periodic part are not worth it.
     """
     for periods in range(1, _MOST_PERIODS + 1):
         length = periods * period
@@ -246,16 +212,8 @@ def whole_cycle(period: float, samples: int) -> int:
 class CommandFigures:
     """Range, slew and heat of consecutive commands.
 
-    Args:
-        config: The experiment.
-        last: Command before the first of them.
-        heat_a2: Running mean square of the coil current before them, in A^2.
-
     Attributes:
-        low: Lowest command.
-        high: Highest command.
         last: Command before the next ones.
-        heat: The thermal budget.
     """
 
     def __init__(self, config: Experiment, last: float, heat_a2: float) -> None:
@@ -282,7 +240,7 @@ class CommandFigures:
 
 
 class _RunFigures:
-    """The :class:`CommandSink` of a forecast."""
+    """Consumer of the simulated commands of a forecast."""
 
     def __init__(self, config: Experiment, heat_a2: float) -> None:
         self.command = CommandFigures(config, config.safe.value, heat_a2)
@@ -344,13 +302,7 @@ class LineEnds:
 
 
 def fade_refusal(loaded: LoadedExperiment, line: LinearBypass | None, wanted: str) -> str:
-    """Return why the inverse cannot be bypassed or enabled, or an empty text.
-
-    Args:
-        loaded: The experiment.
-        line: Its line.
-        wanted: ``in`` or ``out``.
-    """
+    """Return why the inverse cannot be bypassed (``out``) or enabled (``in``), or an empty text."""
     if loaded.model is None:
         return "the experiment has no compensator: there is no inverse to bypass"
     if line is None:

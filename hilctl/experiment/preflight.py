@@ -65,10 +65,6 @@ class CheckedExperiment:
     """An experiment that is ready to run.
 
     Attributes:
-        loaded: The experiment.
-        reference: Every sample of its waveform.
-        forecast: Its commands in numbers.
-        begun: Input and initial state of the compensator.
         warnings: Reasons why the run may be less accurate or less punctual than expected.
         heat_a2: Heat of the coil before it, the running mean square of its current in A^2.
         operator: Subject of the adaptation; None without adaptation.
@@ -107,10 +103,8 @@ def check(
 ) -> CheckedExperiment:
     """Compute the complete run and check it against device, model and limits.
 
-    Args:
-        loaded: The experiment.
-        heat_a2: Least heat of its coil, in A^2, whatever the last run left.
-        now_s: Unix time of the start in s; None for the present.
+    The heat of the coil is at least ``heat_a2``, in A^2, whatever the last run left. ``now_s`` is
+    the Unix time of the start; None for the present.
 
     Raises:
         ConfigError: The run is rejected; all reasons are listed, each with its amount.
@@ -197,15 +191,7 @@ def _state_before(
 ) -> tuple[InitialState | None, str]:
     """Return the actuator's state before the waveform (None at rest) and its origin in words.
 
-    Args:
-        loaded: The experiment.
-        conditioned: float64[m], commands before the waveform: a cycle that erases the history and
-            a rest, the rest alone, or none.
-        now_s: Unix time in s.
-        problems: Gets an entry if the state is unknown.
-
-    Raises:
-        ModelError: The model has no inverse.
+    ``problems`` gets an entry if the state is unknown.
     """
     config, model = loaded.config, loaded.model
     if model is None or config.compensator is None:

@@ -95,11 +95,7 @@ for _name, _pattern in {
 
 
 def compose(text: str) -> yaml.Node | None:
-    """Return the node tree of a text, or None if it is empty.
-
-    Raises:
-        yaml.MarkedYAMLError: It is not plain YAML or too large; with the place.
-    """
+    """Return the node tree of a text, None if it is empty; raise MarkedYAMLError if not plain."""
     if len(text) > MAX_CHARACTERS:
         problem = f"{len(text)} characters, more than the {MAX_CHARACTERS} that are read"
         raise yaml.MarkedYAMLError(problem=problem)
@@ -152,12 +148,10 @@ def dump(data: Any) -> str:
 
 
 def commented(data: Mapping[str, Any], comments: Mapping[str, str], above: str = "") -> str:
-    """Return plain data as readable YAML with comments and with lists on one line.
+    """Return plain data as readable YAML with lists on one line, and comments by dotted key.
 
-    Args:
-        data: Plain data, see :func:`dump`.
-        comments: One-line comments by dotted key, after a value or above a mapping.
-        above: Dotted key of the data with a trailing dot; empty at the top.
+    A comment is after a value, or above a mapping. ``above`` is the dotted key of the data with a
+    trailing dot; empty at the top.
     """
     lines: list[str] = []
     for key, value in data.items():
@@ -339,10 +333,6 @@ class Document:
 
 def load_document(path: Path, files: TextFiles | None = None) -> Document:
     """Read a YAML file.
-
-    Args:
-        path: The file.
-        files: Source of the file; None for the disk.
 
     Raises:
         InputError: The file cannot be read.
