@@ -42,7 +42,6 @@ def test_steady_cycles(
 @pytest.mark.parametrize("frequency_hz", [1.0, 3.0, 7.0, 10.0, 33.3, 60.0, 150.0, 249.9])
 @pytest.mark.parametrize("cycles", [1, 2, 3, 30])
 def test_whole_cycles_are_all_counted(frequency_hz: float, cycles: int) -> None:
-    """A steady part of whole cycles has them all, whatever binary fractions make of the period."""
     period = 1.0 / frequency_hz * 50e3
     samples = round(cycles * period)
     start, stop, counted = segment(1000, 1000 + samples + 1, period).steady_cycles()
@@ -58,7 +57,6 @@ def test_shifted() -> None:
 
 
 def test_mapping_goes_through_json() -> None:
-    """A segment written to a recording's metadata comes back the same, bit for bit."""
     original = Segment("complex harmonic 4 um 20 Hz", 7, 12345, 100, 12000, 50e3 / 3.0)
     text = json.dumps(original.to_mapping())
     assert Segment.from_mapping(json.loads(text)) == original

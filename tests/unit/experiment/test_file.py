@@ -113,8 +113,6 @@ def changed(old: str, new: str, text: str = FULL) -> str:
 
 
 class TestAccepted:
-    """Files that keep all rules."""
-
     def test_full_example(self, folder: Path) -> None:
         """Every key arrives where it belongs."""
         loaded = load(FULL, folder)
@@ -195,12 +193,6 @@ class TestAccepted:
         limits = load(text).config.limits
         assert (limits.unit, limits.command_range, limits.slew_per_s) == ("V", (-1.0, 5.0), 5000.0)
 
-    def test_frozen(self) -> None:
-        """Nothing can be changed once it is read."""
-        config = load(MINIMAL).config
-        with pytest.raises(ValueError, match="frozen"):
-            config.block = 2  # type: ignore[misc]
-
     def test_ramp(self, folder: Path) -> None:
         """The safe ramp takes ramp_s from the command furthest away, within the slew limit."""
         limits = load(FULL, folder).config.command_limits()
@@ -210,7 +202,6 @@ class TestAccepted:
         assert load(slow, folder).config.command_limits().ramp_per_s == 10.0
 
     def test_text_reads_back_the_same(self, folder: Path) -> None:
-        """The experiment as it will run, settings included, reads back as the same experiment."""
         text = changed("description: Everything that an experiment can say.", "description: '1e3'")
         loaded = load(text, folder, ("waveform.frequency_hz=12.5", "limits.stroke_um.0=-70"))
         again = load(loaded.yaml_text, folder)
@@ -278,6 +269,7 @@ ONE_RULE = [
     ("scope_rate_hz", "scope_rate_hz: 500.0", "scope_rate_hz: 1001", "recording.scope_rate_hz"),
     ("ring_s", "ring_s: 20.0", "ring_s: 0.5", "recording.ring_s"),
     ("ring_s", "ring_s: 20.0", "ring_s: 61", "recording.ring_s"),
+    ("ring_s", "ring_s: 20.0", "ring_s: 1.0", "recording"),
     ("seed", "seed: 3", "seed: -3", "device.seed"),
     ("seed", "seed: 3", "seed: 3.5", "device.seed"),
     ("seed", "seed: 3", "sed: 3", "device.sed"),
@@ -294,12 +286,6 @@ def test_one_broken_rule(folder: Path, line: str, old: str, new: str, key: str) 
     assert problems(changed(old, new), folder) == [(f"x.yaml:{LINES[line]}", key)]
 
 
-def test_ring_must_bridge_the_time_between_flushes(folder: Path) -> None:
-    """The rule has two keys; its line is that of ring_s."""
-    text = changed("ring_s: 20.0", "ring_s: 1.0")
-    assert problems(text, folder) == [(f"x.yaml:{LINES['ring_s']}", "recording")]
-
-
 @pytest.mark.parametrize(
     "key", ["name", "device", "sample_rate_hz", "waveform", "compensator", "limits"]
 )
@@ -312,15 +298,12 @@ def test_required(key: str) -> None:
 @pytest.mark.parametrize("key", ["waveform", "limits", "safe", "timing", "recording", "device"])
 @pytest.mark.parametrize("value", ["5", "[1]", "text"])
 def test_section_that_is_no_mapping(key: str, value: str) -> None:
-    """A section must be a mapping."""
     lines = [line for line in MINIMAL.splitlines() if not line.startswith(f"{key}:")]
     text = "\n".join([*lines, f"{key}: {value}"])
     assert problems(text) == [(f"x.yaml:{len(lines) + 1}", key)]
 
 
 class TestMany:
-    """Several broken rules at once."""
-
     def test_all_are_listed(self, folder: Path) -> None:
         """One error lists every problem of the file, its device's options and its model."""
         text = FULL
@@ -349,7 +332,6 @@ class TestMany:
         ]
 
     def test_units_and_safe_value_together(self) -> None:
-        """Rules between sections are reported together, each where it is broken."""
         text = MINIMAL.replace("unit: A", "unit: um") + "safe:\n  value: -2.5\n"
         assert problems(text) == [("x.yaml:4", "waveform.unit"), ("x.yaml:8", "safe.value")]
 
@@ -365,8 +347,6 @@ class TestMany:
 
 
 class TestSet:
-    """Values given on the command line."""
-
     def test_over_the_file(self, folder: Path) -> None:
         """Values, nested values, list items and whole sections replace the file's."""
         config = load(
@@ -387,13 +367,11 @@ class TestSet:
         assert config.timing.late_after == 0.5
 
     def test_a_section_the_file_has_not(self) -> None:
-        """A key in a section that is not in the file makes the section."""
         loaded = load(MINIMAL, settings=("recording.folder=elsewhere", "device.seed=9"))
         assert loaded.config.recording.folder == "elsewhere"
         assert loaded.device.info.details["seed"] == "9"
 
     def test_item_of_a_list_of_mappings(self, folder: Path) -> None:
-        """A part of a sequence can be set by its index."""
         sequence = (
             "waveform={kind: sequence, unit: um, parts: ["
             "{kind: hold, level: 1.0, duration_s: 1.0}, {kind: hold, level: 2.0, duration_s: 1.0}]}"
@@ -425,28 +403,22 @@ class TestSet:
         assert problems(FULL, folder, (setting,)) == [(f"--set {setting}", key)]
 
     def test_a_broken_file_can_be_mended(self, folder: Path) -> None:
-        """What is set stands in for what the file says, so that is not held against it."""
         text = changed("frequency_hz: 10.0", "frequency_hz: 1:30")
         assert load(text, folder, ("waveform.frequency_hz=10.0",)).config.block == 50
 
 
 class TestDevice:
-    """The device section."""
-
     @pytest.mark.parametrize("section", ["{kind: simulated_terfanol}", "{seed: 1}", "{kind: 5}"])
     def test_kind_that_is_none(self, section: str) -> None:
-        """A kind that is unknown, missing or no text."""
         found = problems(MINIMAL.replace("{kind: simulated_terfenol}", section))
         assert found == [("x.yaml:2", "device.kind")]
 
     @pytest.mark.parametrize("kind", sorted(registry.BUILTIN))
     def test_options_of_every_built_in_device(self, kind: str) -> None:
-        """Each built-in device refuses an option that it does not have, with its line."""
         text = MINIMAL.replace("simulated_terfenol", f"{kind}, nosuchoption: 1")
         assert ("x.yaml:2", "device.nosuchoption") in problems(text)
 
     def test_device_that_refuses_its_options(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        """What a device says on being made is a problem of the device section."""
 
         class Picky:
             Options: ClassVar[type[DeviceOptions]] = DeviceOptions
@@ -461,8 +433,6 @@ class TestDevice:
 
 
 class TestModel:
-    """The compensator's model file."""
-
     @pytest.mark.parametrize("name", ["sub/lost.yaml", "."])
     def test_missing(self, folder: Path, name: str) -> None:
         """A missing file or a folder is a problem of the line that names it."""
@@ -492,7 +462,6 @@ class TestModel:
         assert problems(FULL, folder) == [(f"{path}:{line}", key)]
 
     def test_deadband_that_turns_back(self, folder: Path) -> None:
-        """A cumulative slope that is not positive is named with the index it fails at."""
         (folder / "model.yaml").write_text(
             "model:\n"
             "  kind: integrated\n"
@@ -514,10 +483,7 @@ class TestModel:
 
 
 class TestFile:
-    """Files that are no experiment."""
-
     def test_missing_folder_or_binary(self, tmp_path: Path) -> None:
-        """The error names the file."""
         binary = tmp_path / "x.yaml"
         binary.write_bytes(b"\x89PNG\r\n\x1a\n\x00\x00\xff\xfe")
         for path in (tmp_path / "no.yaml", tmp_path, binary):

@@ -61,7 +61,6 @@ def record(path: Path, command, *, first=0, whole=True, flags=0, facts=None, end
 
 @pytest.mark.parametrize("model", [OMEGA, STAGED], ids=["integrated", "staged"])
 def test_compensator_goes_on_where_the_actuator_was_left(tmp_path, model):
-    """An actuator that is the model, left away from rest, then follows the reference exactly."""
     memory = initial_state_after(record(tmp_path / "run.mcap", COMMAND), model, RATE_HZ, NOW_S)
     plant, inverse = model.forward(RATE_HZ), model.inverse(RATE_HZ)
     plant.process(np.concatenate((COMMAND, np.full(20_000, COMMAND[-1]))))
@@ -81,7 +80,6 @@ def test_compensator_goes_on_where_the_actuator_was_left(tmp_path, model):
 
 @pytest.mark.parametrize("model", [OMEGA, STAGED, CREEPING], ids=["integrated", "staged", "creep"])
 def test_a_run_in_pieces_leaves_what_the_whole_leaves(model):
-    """To the bit, where a piece is shorter than what the inverse looks ahead, and where empty."""
     whole = left_by([COMMAND], model, RATE_HZ)
     pieces = np.split(COMMAND, [1, 2, 2, COMMAND.size // 2])
     left = left_by(pieces, model, RATE_HZ)
@@ -95,7 +93,6 @@ def test_a_run_in_pieces_leaves_what_the_whole_leaves(model):
     ("yesterday", 1.0),
 ])  # fmt: skip
 def test_what_has_crept_goes_back_until_the_next_run(tmp_path, ended, still_s):
-    """As if all the time since the end had been gone through; a clock set back is a second."""
     path = record(tmp_path / "run.mcap", COMMAND, end={"ended": ended})
     left = initial_state_after(path, CREEPING, RATE_HZ, NOW_S)
     still = np.full(round(still_s * RATE_HZ), COMMAND[-1])
@@ -107,7 +104,6 @@ def test_what_has_crept_goes_back_until_the_next_run(tmp_path, ended, still_s):
 
 
 def test_from_rest_the_same_reference_is_missed(tmp_path):
-    """The comparison: a compensator that thinks the actuator at rest is off by what was left."""
     plant, inverse = OMEGA.forward(RATE_HZ), OMEGA.inverse(RATE_HZ)
     plant.process(COMMAND)
     reference = np.linspace(0.0, 2.0, 500)
@@ -115,7 +111,6 @@ def test_from_rest_the_same_reference_is_missed(tmp_path):
 
 
 def test_lead_in_of_a_run_that_is_shorter():
-    """The way from where the actuator stands is cut where the run ends; nothing else changes."""
     memory = InitialState(np.zeros(1), 3.0, "")
     fed = np.zeros(10)
     led = memory.lead_in(fed, 20)
@@ -134,7 +129,6 @@ def test_lead_in_of_a_run_that_is_shorter():
     (OMEGA, RATE_HZ, {"end": {"output_safe": "false"}}, "safe value"),
 ])  # fmt: skip
 def test_recordings_that_don_t_tell_are_refused(tmp_path, model, rate_hz, made, message):
-    """Another rate, another unit, lost samples, no end: refused with the reason."""
     path = record(tmp_path / "run.mcap", COMMAND, **made)
     with pytest.raises(DataError, match=message):
         initial_state_after(path, model, rate_hz, NOW_S)

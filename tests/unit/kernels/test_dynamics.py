@@ -45,7 +45,6 @@ def stream(name, signal, memory=None, *, plain=False, out=None):
 
 @pytest.mark.parametrize("name", STREAMING)
 def test_compiled_and_python_agree_bit_for_bit(name):
-    """The function as written, run by Python, gives the same bits as its compiled form."""
     out, memory = stream(name, SIGNAL)
     plain, plain_memory = stream(name, SIGNAL, plain=True)
     np.testing.assert_array_equal(out, plain)
@@ -54,7 +53,6 @@ def test_compiled_and_python_agree_bit_for_bit(name):
 
 @pytest.mark.parametrize("name", STREAMING)
 def test_any_cut_and_the_input_itself_as_output(name):
-    """Blocks of any size, each written over its input, give the bits of one call."""
     whole, end = stream(name, SIGNAL)
     memory = None
     parts = []
@@ -67,14 +65,12 @@ def test_any_cut_and_the_input_itself_as_output(name):
 
 @pytest.mark.parametrize("name", STREAMING)
 def test_a_constant_passes_from_the_first_sample(name):
-    """A signal counts as having stood at its first value before."""
     out, _ = stream(name, np.full(50, -3.7))
     np.testing.assert_allclose(out, -3.7, rtol=1e-14)
 
 
 @pytest.mark.parametrize(("periods", "growth"), [(0.2, 0.0), (0.2, 0.3), (3.0, 2.0), (0.01, 50.0)])
 def test_lag_solves_its_equation(periods, growth):
-    """For held commands the lag is what a general solver makes of its equation."""
     v = np.array([0.0, 1.0, 1.0, -2.0, 0.5, 0.5, 4.0, 0.0])
     out = np.empty_like(v)
     dynamics.lag_block(v, periods, growth, rest_memory(1), out)
@@ -92,7 +88,6 @@ def test_lag_solves_its_equation(periods, growth):
 @pytest.mark.parametrize("growth", [0.0, 1e-300, 1e-9, 0.3, 1e3, 1e9])
 @pytest.mark.parametrize("behind", [5e-324, 1e-9, 1.0, 1e9])
 def test_lag_is_never_past_its_command(periods, growth, behind):
-    """Whatever the numbers, a held command is approached and not passed."""
     out = np.empty(4)
     dynamics.lag_block(np.array([0.0, *[behind] * 3]), periods, growth, rest_memory(1), out)
     assert np.all(np.diff(out) >= 0.0)
@@ -100,7 +95,6 @@ def test_lag_is_never_past_its_command(periods, growth, behind):
 
 
 def test_lead_brings_the_lag_to_wanted_values():
-    """What the lead asks for makes the lag be there a sample later."""
     wanted = 2.0 * np.sin(np.arange(400) / 30.0)
     command, out = np.empty(400), np.empty(400)
     dynamics.lead_block(wanted, 0.2, 0.4, rest_memory(1), command)
@@ -124,7 +118,6 @@ def test_lead_of_a_jump_stays_below_the_lag_s_limit_and_catches_up():
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("growth", [0.0, 0.4])
 def test_lead_shows_what_is_not_a_number_and_goes_on(bad, growth):
-    """A wish that is not finite gives none, and the next ones give numbers again."""
     wanted = np.array([1.0, 1.1, bad, 1.2, 1.3])
     command = np.empty(5)
     dynamics.lead_block(wanted, 0.2, growth, rest_memory(1), command)
@@ -132,7 +125,6 @@ def test_lead_shows_what_is_not_a_number_and_goes_on(bad, growth):
 
 
 def test_structure_is_the_exact_solution():
-    """For an input of straight pieces the structure is what scipy makes of its equation."""
     omega = 2.0 * math.pi * 1500.0
     system = StateSpace([[0.0, 1.0], [-(omega**2), -0.2 * omega]], [[0.0], [omega**2]],
                         [[1.0, 0.0]], [[0.0]])  # fmt: skip
@@ -144,7 +136,6 @@ def test_structure_is_the_exact_solution():
 
 
 def test_delay_holds_back_whole_samples_and_parts():
-    """Four samples back is four samples back; a part lies on the line between two."""
     ramp = np.arange(20.0)
     delayed, _ = stream("delay", ramp)
     assert delayed.tolist() == [0.0] * 4 + ramp[:-4].tolist()
@@ -311,6 +302,5 @@ def test_nothing_is_one_and_a_turn_turns():
 
 
 def test_a_stiff_one_that_is_damped_dies_away():
-    """As a structure that is much faster than the samples."""
     stiff = 1e6 * np.array([[0.0, 1.0], [-1.0, -0.2]])
     np.testing.assert_allclose(exponential(stiff), 0.0, atol=1e-12)

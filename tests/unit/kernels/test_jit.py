@@ -34,7 +34,6 @@ def stream(kernel, signal, parameters, memory=None):
 
 @pytest.mark.parametrize("name", STREAMING)
 def test_compiled_and_python_agree_bit_for_bit(name):
-    """The function as written, run by Python, gives the same bits as its compiled form."""
     kernel, parameters = STREAMING[name]
     compiled, memory = stream(kernel, SIGNAL, parameters)
     plain, plain_memory = stream(kernel.py_func, SIGNAL, parameters)
@@ -45,7 +44,6 @@ def test_compiled_and_python_agree_bit_for_bit(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", STREAMING)
 def test_callable_from_another_kernel(name):
-    """Called inside somebody else's compiled function, a kernel does the same."""
     kernel, parameters = STREAMING[name]
 
     @numba.njit
@@ -60,7 +58,6 @@ def test_callable_from_another_kernel(name):
 
 @pytest.mark.parametrize("name", STREAMING)
 def test_output_may_replace_the_input(name):
-    """Writing over the input array changes nothing."""
     kernel, parameters = STREAMING[name]
     expected, expected_memory = stream(kernel, SIGNAL, parameters)
     both, memory = SIGNAL.copy(), hysteresis.rest_memory(3)
@@ -71,7 +68,6 @@ def test_output_may_replace_the_input(name):
 
 @pytest.mark.parametrize("name", STREAMING)
 def test_an_empty_block_changes_nothing(name):
-    """A block of no samples leaves the memory as it is."""
     kernel, parameters = STREAMING[name]
     _, memory = stream(kernel, SIGNAL, parameters)
     before = memory.copy()
@@ -81,7 +77,6 @@ def test_an_empty_block_changes_nothing(name):
 
 @pytest.mark.parametrize("name", STREAMING)
 def test_nan_is_not_swallowed(name):
-    """An input that is not a number gives an output that is not one."""
     kernel, parameters = STREAMING[name]
     signal = SIGNAL.copy()
     signal[200] = np.nan
@@ -92,7 +87,6 @@ def test_nan_is_not_swallowed(name):
 
 @pytest.mark.parametrize("v", [-1.7, -0.2, 0.0, 0.3, 2.0])
 def test_scalar_kernels_agree_with_python(v):
-    """The scalar operators give Python's bits, alone and inside another compiled function."""
     stop = hysteresis.stop_step
     value = hysteresis.deadband_value
 
@@ -117,7 +111,6 @@ def test_float32_is_refused(name):
 
 
 def test_float32_is_refused_everywhere_else():
-    """So it is by the kernels without memory."""
     narrow, out = SIGNAL.astype(np.float32), np.empty(400)
     flags = np.zeros(400, dtype=np.uint32)
     grid, memory = np.empty((400, 3)), hysteresis.rest_memory(3)
@@ -130,7 +123,6 @@ def test_float32_is_refused_everywhere_else():
 
 
 def test_a_strided_view_is_refused():
-    """A view that is not contiguous is refused too: it would need another compilation."""
     kernel, parameters = STREAMING["play_sum"]
     with pytest.raises(TypeError, match="No matching definition"):
         kernel(SIGNAL[::2], *parameters, hysteresis.rest_memory(3), np.empty(200))
@@ -168,7 +160,6 @@ def test_second_process_loads_the_kernel_from_the_cache(cache):
 
 
 def test_compiled_without_a_cache_folder():
-    """numba finds no folder for a function that has no source file."""
     names = {}
     exec("def double(value):\n    return 2.0 * value", names)
     assert not stats_of_first_call(names["double"]).cache_path
@@ -247,7 +238,6 @@ def test_nothing_is_compiled_before_the_first_use(cache):
 
 
 def test_kernels_compile_the_kernels_that_they_call(cache):
-    """With their declared signatures: an integer argument is converted."""
     assert twice(2) == 4.0
     assert [str(types) for types in double_kernel.dispatcher.overloads] == ["(float64,)"]
 
@@ -257,5 +247,4 @@ def test_another_process_gets_the_kernel_by_its_name():
 
 
 def test_called_with_a_type_that_casts(cache):
-    """The first call converts an integer to a number, as later calls do."""
     assert jit.kernel("float64(float64)")(double)(2) == 4.0

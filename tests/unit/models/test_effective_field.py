@@ -60,7 +60,6 @@ def test_any_cut_into_blocks_gives_the_same_bits() -> None:
 
 
 def test_small_biased_loops_creep_by_drags_and_close_by_plays() -> None:
-    """A play's loop comes back to where it began; a drag's has moved on."""
     loop = [*np.linspace(5.0, 4.0), *np.linspace(4.0, 5.0)]
     turns = np.concatenate([np.linspace(0.0, 5.0), np.tile(loop, 8)])
     no_losses = {"losses": FieldLosses(), "coupling": 0.0}

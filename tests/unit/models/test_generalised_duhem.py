@@ -74,7 +74,6 @@ def test_rest_is_no_command_at_the_offset() -> None:
 
 
 def test_small_biased_loops_creep_down_from_the_falling_branch() -> None:
-    """Less from loop to loop: no memory of turns holds them."""
     loop = [*np.linspace(1.0, 1.2), *np.linspace(1.2, 1.0)]
     turns = np.concatenate([np.linspace(0.0, 4.0), np.linspace(4.0, 1.0), np.tile(loop, 6)])
     out = duhem_model(losses=FieldLosses()).forward(RATE_HZ).process(turns)

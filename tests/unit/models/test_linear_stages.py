@@ -28,7 +28,6 @@ SIGNAL = np.array([1.0, 2.0, 4.0, 3.0, -1.0, 0.5])
 
 @pytest.mark.parametrize("samples", [1, 2, 5])
 def test_delayed_holds_back_that_many_samples(samples):
-    """Before the first has come through, it stands where the signal began."""
     expected = [SIGNAL[max(k - samples, 0)] for k in range(SIGNAL.size)]
     assert delayed(samples).process(SIGNAL).tolist() == expected
 
@@ -39,7 +38,6 @@ def test_between_goes_that_part_of_the_way():
 
 
 def test_a_chain_is_its_operators_one_after_another():
-    """Between the offsets, and with no preview where none is given."""
     chain = Chain([delayed(2), PLAYS.forward(1.0), between(0.5)], input_offset=3.0,
                   output_offset=-0.5)  # fmt: skip
     by_hand = SIGNAL + 3.0
@@ -52,7 +50,6 @@ def test_a_chain_is_its_operators_one_after_another():
 
 
 def test_a_chain_s_memory_is_that_of_its_operators():
-    """One array, in their order, that they go on from; at rest it is theirs at rest."""
     stages = [delayed(2), PLAYS.forward(1.0), between(0.5)]
     rest = np.concatenate([stage.state() for stage in stages])
     chain = Chain(stages)
@@ -70,7 +67,6 @@ def test_a_chain_s_memory_is_that_of_its_operators():
 
 
 def test_a_chain_may_be_part_of_another():
-    """Its memory is then a part of that one's, as those of its operators are."""
     inner = Chain([delayed(2), PLAYS.forward(1.0)])
     outer = Chain([between(0.5), inner])
     outer.process(SIGNAL)
@@ -85,7 +81,6 @@ def test_a_chain_may_be_part_of_another():
 
 
 def test_a_chain_begins_where_its_operators_stood():
-    """Operators that have seen a signal are taken as they are, and reset to that."""
     moved = PLAYS.forward(1.0)
     moved.process(SIGNAL)
     left = moved.state()
@@ -126,13 +121,11 @@ def test_smoothing_passes_slow_signals(angle):
 
 
 def test_plain_differences_without_a_width():
-    """A central difference a sample, and a second one."""
     weights, _ = smoothing_weights(0.0, 2.0, 5.0)
     np.testing.assert_allclose(weights, [5.0 - 1.0, 1.0 - 10.0, 5.0 + 1.0])
 
 
 def test_weights_add_up_and_follow_slope_and_bend():
-    """Constant, ramp and parabola come out as their derivatives say, whatever the width."""
     k = np.arange(400.0)
     for width in (0.0, 0.4, 3.6, 30.0, 1e6):
         weights, m = smoothing_weights(width, 2.0, 5.0)
@@ -155,7 +148,6 @@ def signal(n=4000):
 
 
 def test_a_displacement_that_stays_creeps_on_by_each_share():
-    """After a step each element goes after its share by first order."""
     x_um = np.concatenate(([0.0], np.full(20_000, 10.0)))
     time_s = np.arange(x_um.size - 1) / RATE_HZ
     crept = CREEP.forward(RATE_HZ).process(x_um) - x_um
@@ -178,14 +170,12 @@ def test_any_cut_into_blocks_gives_the_same_bits():
 
 
 def test_only_what_is_away_from_rest_creeps():
-    """A displacement that stands at rest stays there, wherever that is."""
     still = np.full(3000, -7.5)
     for operator in (CREEP.forward(RATE_HZ, rest_um=-7.5), CREEP.inverse(RATE_HZ, rest_um=-7.5)):
         np.testing.assert_array_equal(operator.process(still), still)
 
 
 def test_a_value_that_is_none_is_not_gone_on_from():
-    """It comes out as none; those after it are as good as ever."""
     y_um = np.full(100, 5.0)
     y_um[40] = np.nan
     came = CREEP.inverse(RATE_HZ).process(y_um)
@@ -272,7 +262,6 @@ def test_a_mode_beyond_what_samples_show_is_refused_in_words():
     {"natural_hz": 8000.0, "antiresonance_hz": 700.0},
 ])  # fmt: skip
 def test_what_is_known_of_the_inverse_s_decay_is_what_it_does(change):
-    """Whether it dies away or grows, by what is left of a moment's input after some time."""
     parameters = FurtherMode(**(MODE | change))._parameters(5000.0)
     memory, sizes = np.array([0.3, -0.7, 1.0]), []
     for _ in range(2):

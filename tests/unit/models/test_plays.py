@@ -35,7 +35,6 @@ def broken(kind, **parameters):
 
 @pytest.mark.parametrize(("kind", "more"), KINDS)
 def test_admissible_parameters_are_taken(kind, more):
-    """The set that the refusals below start from is a good one."""
     model = kind(**GOOD, **more)
     assert isinstance(model, HysteresisModel)
     assert model.operators == 3
@@ -57,12 +56,10 @@ def test_admissible_parameters_are_taken(kind, more):
     ({"output_range_um": (5.0, -5.0)}, "the second value must be above the first: [5.0, -5.0]"),
 ])  # fmt: skip
 def test_each_condition_of_the_plays_is_named(kind, more, change, message):
-    """Weights, thresholds, lengths, ranges: the condition, the index and the value are named."""
     assert message in broken(kind, **{**GOOD, **more, **change})
 
 
 def test_all_broken_conditions_are_named_at_once():
-    """One error lists every condition and every index, not the first."""
     text = broken(RdpiModel, direct=-1.0, weights=(-1.0, 0.1, -2.0), thresholds=(0.2, 0.1))
     for part in ("3 for 2", "a_0 must be", "a_1 must be", "a_3 must be", "r_2 = 0.1 after 0.2"):
         assert part in text
@@ -77,7 +74,6 @@ def test_all_broken_conditions_are_named_at_once():
     "place", ["direct", "weights", "thresholds", "gamma_s", "output_offset_um"]
 )
 def test_numbers_must_be_finite(place, value):
-    """NaN and the infinities are refused wherever a number stands."""
     given = (value, 0.1, 0.2) if place in {"weights", "thresholds"} else value
     text = broken(RdpiModel, **{**GOOD, place: given})
     assert place in text
@@ -90,7 +86,6 @@ def test_growth_must_not_be_negative():
 
 
 def test_numbers_are_not_guessed_from_text():
-    """Text, true and None are no numbers."""
     for value in ("1.0", True, None):
         assert "valid number" in broken(PpiModel, **{**GOOD, "direct": value})
 
@@ -99,14 +94,12 @@ def test_numbers_are_not_guessed_from_text():
     (1e308, (1e308,), (1.0,)), (5e-324, (1.0,), (1.0,)), (1.0, (1.0, 1.0), (1e308, 1.5e308)),
 ])  # fmt: skip
 def test_plays_beyond_the_range_of_numbers_have_no_inverse(direct, weights, thresholds):
-    """Where the inverse's numbers overflow, it is refused, not handed out as infinities."""
     model = RdpiModel(direct=direct, weights=weights, thresholds=thresholds)
     with pytest.raises(ModelError, match="too large or too small"):
         model.inverse(1_000.0)
 
 
 def test_models_do_not_change():
-    """Parameters are frozen."""
     model = PpiModel(**GOOD)
     with pytest.raises(ValidationError, match="frozen"):
         model.direct = 2.0
@@ -145,7 +138,6 @@ def make(request, model):
 
 
 def test_only_the_rate_dependent_models_know_the_sample_rate():
-    """A PPI does the same at every sample rate; the others don't, the inverse included."""
     for name, model in MODELS.items():
         for make in (model.forward, model.inverse):
             same = np.array_equal(make(1_000.0).process(SIGNAL), make(9_000.0).process(SIGNAL))
@@ -187,7 +179,6 @@ def test_spi_direct_weight_from_the_published_ppi():
 
 @pytest.mark.parametrize("i", range(10))
 def test_spi_from_the_published_ppi(i):
-    """Each threshold and weight is the published one, within its inputs' rounding."""
     _, weights, thresholds = spi(piezo_ppi()).stop_parameters()
     assert thresholds[i] == pytest.approx(SPI_THRESHOLDS[i], abs=0.002)
     assert weights[i] == pytest.approx(SPI_WEIGHTS[i], abs=0.002)

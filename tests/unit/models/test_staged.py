@@ -58,14 +58,12 @@ def ahead(reference, preview):
 
 @pytest.mark.parametrize("name", STAGES)
 def test_round_trip_gives_the_same_model(name):
-    """Dumped and read back, a staged model is equal to itself, its stages' kinds included."""
     for hysteresis in (OMEGA, piezo_ppi(), terfenol_rdpi()):
         model = StagedModel.around(hysteresis, **STAGES[name])
         assert parse_model("text", dump_model(model)) == model
 
 
 def test_around_takes_over_unit_ranges_and_provenance():
-    """What the hysteresis said of itself is said of the whole, and in one place only."""
     source = Provenance(source=("run.mcap",))
     inner = piezo_ppi().model_copy(
         update={"input_range": (0.0, 5.0), "output_range_um": (-1.0, 9.0), "provenance": source}
@@ -114,7 +112,6 @@ def test_inverse_undoes_the_model(name, frequency_hz):
 
 
 def test_model_answers_later_than_its_input():
-    """No command shows in the displacement sampled when it is put out, nor before the delay."""
     step = np.zeros(40)
     step[10:] = 2.0
     stages = (
@@ -131,7 +128,6 @@ def test_model_answers_later_than_its_input():
 
 
 def test_offsets_of_hysteresis_and_whole_add_up():
-    """Both offsets are undone, and a constant reference is met from the start."""
     inner = OMEGA.model_copy(update={"output_offset_um": 4.0})
     model = StagedModel.around(inner, **STAGES["all"]).model_copy(update={"output_offset_um": -1.5})
     command = model.inverse(RATE_HZ).process(np.full(60, 2.5))
@@ -164,7 +160,6 @@ def test_structure_s_inverse_asks_for_little_more_than_it_is_given():
 
 
 def test_state_goes_back_and_another_model_s_is_refused():
-    """The chain's memory is one array: copied, given back, and checked for its size."""
     operator = StagedModel.around(OMEGA, **STAGES["all"]).inverse(RATE_HZ)
     reference = sine(250.0, 400)
     operator.process(reference[:150])

@@ -25,8 +25,6 @@ def raised_cosine(x: float) -> float:
 
 
 class TestSoft:
-    """Soft starts and ends."""
-
     def test_envelope(self, made: Made) -> None:
         """A soft waveform is 0 at both ends, and between them as if there were no softness."""
         hard = made(1000.0, **SINE, offset=3.0, duration_s=1.0).values
@@ -63,12 +61,10 @@ class TestSoft:
         assert np.all(np.diff(values[500:]) > 0.0)
 
     def test_segment_leaves_soft_parts_out(self, made: Made) -> None:
-        """The steady part lies between soft start and soft end."""
         reference = made(1000.0, **SINE, duration_s=1.0, soft_start_s=0.2, soft_end_s=0.3)
         assert reference.segments == (Segment("sine 6 A 10 Hz", 0, 1000, 200, 700, 100.0),)
 
     def test_halves_of_an_odd_number_of_samples(self, made: Made) -> None:
-        """Soft start and end that fill the duration fit, however the samples round."""
         keys = {"soft_start_s": 0.5, "soft_end_s": 0.5}
         reference = made(1003.0, **SINE, duration_s=1.0, **keys)
         segment = reference.segments[0]
@@ -84,8 +80,6 @@ class TestSoft:
 
 
 class TestSequence:
-    """Waveforms one after the other."""
-
     PARTS: tuple[dict[str, Any], ...] = (
         {**SINE, "duration_s": 0.5, "soft_start_s": 0.1},
         {"kind": "hold", "level": 2.0, "duration_s": 0.2},
@@ -93,7 +87,6 @@ class TestSequence:
     )
 
     def test_is_its_parts_one_after_the_other(self, made: Made) -> None:
-        """The samples of a sequence are those of its parts, repeated as often as asked."""
         alone = np.concatenate([made(1000.0, **part).values for part in self.PARTS])
         once = made(1000.0, kind="sequence", parts=self.PARTS)
         thrice = made(1000.0, kind="sequence", parts=self.PARTS, repeat=3)
@@ -101,7 +94,6 @@ class TestSequence:
         np.testing.assert_array_equal(thrice.values, np.tile(alone, 3))
 
     def test_segments_stand_where_their_parts_do(self, made: Made) -> None:
-        """Each part is a segment of its own, steady part and period included."""
         reference = made(1000.0, kind="sequence", unit="A", parts=self.PARTS, repeat=2)
         one = (
             Segment("sine 6 A 10 Hz", 0, 500, 100, 500, 100.0),
@@ -174,7 +166,6 @@ def test_label_and_period(made: Made, keys: dict[str, Any], label: str, period: 
 
 
 def test_period_too_long_to_count_is_none(made: Made) -> None:
-    """A waveform that would repeat only after longer than a float can hold has no period."""
     reference = made(1000.0, kind="sine", amplitude=1.0, frequency_hz=1e-320, duration_s=0.1)
     assert reference.segments[0].period == 0.0
     assert reference.segments[0].steady_cycles() == (0, 100, 0)
@@ -255,10 +246,7 @@ def test_refused(made: Made, keys: dict[str, Any], text: str) -> None:
 
 
 class TestSequenceRefused:
-    """Parts of a sequence that can't be sampled."""
-
     def test_the_part_is_named(self, made: Made) -> None:
-        """The message says which part, counted as in the file's key."""
         parts = ({**SINE, "duration_s": 1.0}, {**SINE, "frequency_hz": 900.0, "duration_s": 1.0})
         with pytest.raises(InputError, match=r"^parts\.1 \(sine\): every frequency .*: 900 Hz$"):
             made(1000.0, kind="sequence", parts=parts)
@@ -266,7 +254,6 @@ class TestSequenceRefused:
     def test_length_counts_repeats_before_anything_is_repeated(
         self, made: Made, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        """A sequence too long by its repeats is refused; one that just fits is built."""
         monkeypatch.setattr(shapes, "MAX_SAMPLES", 6000)
         parts = ({**SINE, "duration_s": 1.0},) * 2
         assert made(1000.0, kind="sequence", parts=parts, repeat=3).values.size == 6000
@@ -338,7 +325,6 @@ def test_the_same_samples_however_long(
 
 
 def test_what_repeats_is_told_by_some_of_it(made: Made, small: None) -> None:
-    """All values and steps of a long sine stand in its ends and in its first cycles."""
     long = made(1000.0, **WAVES[0] | {"duration_s": 1000.0}, **SOFT)
     told = np.concatenate([*chunks(long.values, long.telling)])
     assert told.size < 5000 < long.values.size
@@ -349,7 +335,6 @@ def test_what_repeats_is_told_by_some_of_it(made: Made, small: None) -> None:
 
 
 def test_a_repeated_sequence_is_told_by_one_of_it(made: Made, small: None) -> None:
-    """And by the way from its end to its beginning."""
     sequence = waveforms()[-1] | {"repeat": 50}
     long = made(1000.0, **sequence)
     first = long.telling[0]
@@ -359,7 +344,6 @@ def test_a_repeated_sequence_is_told_by_one_of_it(made: Made, small: None) -> No
 
 
 def test_what_does_not_repeat_is_told_by_all_of_it(made: Made, small: None) -> None:
-    """So is what a file says of its own period."""
     chirp = made(1000.0, **WAVES[4])
     assert chirp.telling == (slice(0, 4000),)
 

@@ -118,10 +118,7 @@ def test_closed_form(
 
 
 class TestStep:
-    """Levels one after the other."""
-
     def test_levels_without_a_rise(self, made: Made) -> None:
-        """Each level stands from the first sample of its dwell to the last."""
         values = made(100.0, kind="step", levels=(1.0, -2.0, 0.5), dwell_s=0.3, offset=10.0).values
         np.testing.assert_array_equal(values, np.repeat([11.0, 8.0, 10.5], 30))
 
@@ -133,7 +130,6 @@ class TestStep:
         np.testing.assert_allclose(values, first + second, rtol=0.0, atol=1e-12)
 
     def test_rise_as_long_as_the_dwell(self, made: Made) -> None:
-        """A staircase whose rises fill the dwells is a ramp."""
         values = made(100.0, kind="step", levels=(1.0, 2.0, 3.0), dwell_s=0.5, rise_s=0.5).values
         np.testing.assert_allclose(values, np.arange(150) / 50.0, rtol=0.0, atol=1e-12)
 
@@ -145,8 +141,6 @@ class TestStep:
 
 
 class TestRandom:
-    """Equal sines of random phases."""
-
     KEYS: ClassVar[dict[str, Any]] = {
         "kind": "random", "amplitude": 3.0, "first_hz": 5.0, "last_hz": 200.0, "duration_s": 2.0,
     }  # fmt: skip
@@ -163,7 +157,6 @@ class TestRandom:
         assert np.max(np.abs(values + 1.0)) == pytest.approx(3.0)
 
     def test_another_seed_is_another_waveform(self, made: Made) -> None:
-        """Held out means that the fit has not seen it: they share nothing but the band."""
         first, second = (made(RATE_HZ, **self.KEYS, seed=seed).values for seed in (1, 2))
         assert abs(np.corrcoef(first, second)[0, 1]) < 0.2
         np.testing.assert_array_equal(first, made(RATE_HZ, **self.KEYS, seed=1).values)
@@ -176,8 +169,6 @@ class TestRandom:
 
 
 class TestPath:
-    """Straight lines at one rate."""
-
     def test_lines(self, made: Made) -> None:
         """From 0 to 2, to -1, to 0.5 at 10 a second."""
         values = made(RATE_HZ, kind="path", levels=(2.0, -1.0, 0.5), rate_per_s=10.0).values
@@ -202,8 +193,6 @@ def rising_crossings_s(values: F64, rate_hz: float) -> F64:
 
 
 class TestChirp:
-    """The frequency that a chirp has at each time."""
-
     @pytest.mark.parametrize(("start_hz", "stop_hz"), [(10.0, 200.0), (200.0, 10.0)])
     def test_linear_frequency(self, made: Made, start_hz: float, stop_hz: float) -> None:
         """A cycle of a linear chirp lasts one over the frequency at its middle."""
@@ -229,14 +218,12 @@ class TestChirp:
 
     @pytest.mark.parametrize("stop_hz", [5.0, np.nextafter(5.0, 6.0)])
     def test_a_frequency_that_stands_still(self, made: Made, stop_hz: float) -> None:
-        """A logarithmic chirp from a frequency to the same, or to its neighbour, is a sine."""
         keys = {"start_hz": 5.0, "stop_hz": float(stop_hz), "duration_s": 1.0}
         values = made(1000.0, kind="chirp", amplitude=2.0, spacing="logarithmic", **keys).values
         expected = sampled(lambda t: 2.0 * math.sin(10 * math.pi * t), 1000, 1000.0)
         np.testing.assert_allclose(values, expected, rtol=0.0, atol=1e-11)
 
     def test_from_a_frequency_near_nothing(self, made: Made) -> None:
-        """Frequencies hundreds of decades apart give finite samples."""
         keys = {"start_hz": 400.0, "stop_hz": 1e-320, "duration_s": 1.0}
         values = made(1000.0, kind="chirp", amplitude=2.0, spacing="logarithmic", **keys).values
         assert np.isfinite(values).all()
@@ -246,8 +233,6 @@ BAND: dict[str, Any] = {"kind": "multisine", "first_hz": 10.0, "last_hz": 100.0,
 
 
 class TestMultisine:
-    """Equal sines at evenly spaced frequencies."""
-
     def test_lines(self, made: Made) -> None:
         """The spectrum has equal lines at first, first + step, ... last, and nothing else."""
         values = made(1000.0, amplitude=3.0, duration_s=2.0, **BAND).values
@@ -269,7 +254,6 @@ class TestMultisine:
 
     @pytest.mark.parametrize("amplitude", [0.5, 6.0])
     def test_peak_is_the_amplitude(self, made: Made, amplitude: float) -> None:
-        """The largest magnitude is the amplitude, and the offset comes on top."""
         values = made(5000.0, amplitude=amplitude, duration_s=1.0, offset=2.0, **BAND).values
         assert np.max(np.abs(values - 2.0)) == pytest.approx(amplitude, rel=1e-12)
 
@@ -307,8 +291,6 @@ class TestMultisine:
 
 
 class TestEnvelope:
-    """Growing and decaying sines."""
-
     @pytest.mark.parametrize("kind", ["growing", "decaying"])
     def test_peaks_follow_time(self, made: Made, kind: str) -> None:
         """The crest of each cycle is as large as its time says."""
@@ -368,12 +350,10 @@ def test_common_period(frequencies_hz: list[float], period_s: float) -> None:
 
 
 def test_common_period_too_long_for_a_float() -> None:
-    """Where the period is too long for a float, it is infinite."""
     assert common_period_s([1e-320, 1.0]) == math.inf
 
 
 def test_same_keys_same_bits(made: Made) -> None:
-    """Nothing is random: a waveform built twice is the same, bit for bit."""
     for keys, _ in CASES:
         first, second = made(RATE_HZ, **keys), made(RATE_HZ, **keys)
         assert first.values.tobytes() == second.values.tobytes()
@@ -381,7 +361,6 @@ def test_same_keys_same_bits(made: Made) -> None:
 
 
 def test_values_are_read_only(made: Made) -> None:
-    """Nobody can change a reference once it is built."""
     values = made(RATE_HZ, **CASES[0][0]).values
     with pytest.raises(ValueError, match="read-only"):
         values[0] = 1.0
@@ -393,7 +372,6 @@ def test_values_are_read_only(made: Made) -> None:
 )
 @pytest.mark.parametrize("kind", ["sine", "triangle", "multisine"])
 def test_cycles_are_the_same_bit_for_bit(kind, frequency_hz, rate_hz, period):
-    """And right after any time: a month later no phase is lost to rounding."""
     common = {"amplitude": 3.0, "duration_s": (2 * period + 700) / rate_hz, "unit": "um"}
     shape: spec.Sine | spec.Triangle | spec.Multisine
     if kind == "multisine":
@@ -421,7 +399,6 @@ def test_cycles_are_the_same_bit_for_bit(kind, frequency_hz, rate_hz, period):
 
 
 def test_periods_longer_than_numbers_hold_are_rounded():
-    """What is no short decimal repeats after more samples than anybody has."""
     sine = spec.Sine(kind="sine", amplitude=1.0, frequency_hz=1.0 / 3.0, duration_s=10.0, unit="um")
     values = shapes.sampled(sine, 10_000.0 / 7.0)
     t = np.arange(values.size) / (10_000.0 / 7.0)
@@ -429,7 +406,6 @@ def test_periods_longer_than_numbers_hold_are_rounded():
 
 
 def test_one_period_is_computed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is repeated if more samples are needed."""
     sizes = []
     shape_of = shapes._shape
 

@@ -44,13 +44,11 @@ def test_no_unit() -> None:
 
 
 def test_unit_of_the_limits() -> None:
-    """Without a compensator the waveform has the unit of the limits."""
     found = problems("  kind: hold\n  level: 1.0\n  duration_s: 1.0\n  unit: V\n")
     assert found == [("x.yaml:8", "waveform.unit")]
 
 
 def test_rise_longer_than_dwell() -> None:
-    """A step's rise must fit its dwell."""
     found = problems("  kind: step\n  unit: A\n  levels: [1]\n  dwell_s: 1\n  rise_s: 2\n")
     assert found == [("x.yaml:9", "waveform.rise_s")]
 
@@ -71,7 +69,6 @@ def test_empty_list(section: str, key: str) -> None:
 
 @pytest.mark.parametrize("value", ["[a, 2.0]", "[a]"])
 def test_levels_that_are_no_numbers(value: str) -> None:
-    """A level that is no number is all that is said, also where it is the only one."""
     found = problems(f"  kind: step\n  unit: A\n  levels: {value}\n  dwell_s: 1\n")
     assert found == [("x.yaml:7", "waveform.levels.0")]
 
@@ -107,7 +104,6 @@ def test_file() -> None:
 
 
 def test_parts_of_a_sequence() -> None:
-    """Every broken part is listed with its index and line."""
     found = problems(
         "  kind: sequence\n"
         "  unit: A\n"
@@ -134,7 +130,6 @@ def test_parts_of_a_sequence() -> None:
 
 
 def test_unit_in_a_part() -> None:
-    """A part can't have a unit of its own."""
     found = problems(
         "  kind: sequence\n"
         "  unit: A\n"
@@ -146,7 +141,6 @@ def test_unit_in_a_part() -> None:
 
 
 def test_sequence_in_a_sequence() -> None:
-    """Sequences do not nest."""
     found = problems("  kind: sequence\n  unit: A\n  parts:\n    - {kind: sequence, parts: []}\n")
     assert found == [("x.yaml:8", "waveform.parts.0.kind")]
 

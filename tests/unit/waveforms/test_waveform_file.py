@@ -58,20 +58,16 @@ def test_name_that_no_file_can_have(made: Made, tmp_path: Path, suffix: str) -> 
 
 
 def test_period_shorter_than_a_sample(read: Read) -> None:
-    """It could be run, but its recording could not be judged."""
     text = refusal(read, "1\n2\n", period_s=1e-9, file_rate_hz=RATE_HZ)
     assert text.startswith("period_s must be")
 
 
 class TestText:
-    """CSV and its relatives."""
-
     @pytest.mark.parametrize("delimiter", [",", ";", "\t", " "])
     @pytest.mark.parametrize("header", ["", "t_s{}x_um{}y_um\n"])
     def test_delimiters_with_and_without_header(
         self, read: Read, delimiter: str, header: str
     ) -> None:
-        """Commas, semicolons, tabs and blanks all separate columns."""
         text = header.format(delimiter, delimiter) + rows(T_S, WAVE, -WAVE, delimiter=delimiter)
         keys = {} if header else {"file_rate_hz": RATE_HZ}
         reference = read(text, column=2, **keys)
@@ -92,7 +88,6 @@ class TestText:
         np.testing.assert_array_equal(read(bare, column="2", file_rate_hz=1e3).values, -WAVE)
 
     def test_one_column_needs_no_name(self, read: Read) -> None:
-        """A file with one column needs no column key, with a header or without."""
         for header in ("", "x_um\n"):
             reference = read(header + rows(WAVE), file_rate_hz=RATE_HZ)
             np.testing.assert_array_equal(reference.values, WAVE)
@@ -105,13 +100,11 @@ class TestText:
         np.testing.assert_array_equal(read(bare, file_rate_hz=RATE_HZ).values, WAVE)
 
     def test_blank_lines_and_line_ends(self, read: Read) -> None:
-        """Blank lines and Windows line ends do no harm."""
         text = "\n\nt_s,x_um\n\n" + rows(T_S, WAVE) + "\n"
         reference = read(text.replace("\n", "\r\n"), column="x_um")
         np.testing.assert_array_equal(reference.values, WAVE)
 
     def test_header_of_numpy_savetxt(self, read: Read, tmp_path: Path) -> None:
-        """Names in a comment line are names; other comments are skipped."""
         table = np.column_stack([T_S, WAVE])
         header = "recorded by hand\nt_s,x_um"
         np.savetxt(tmp_path / "raw.csv", table, fmt="%.9g", delimiter=",", header=header)
@@ -119,7 +112,6 @@ class TestText:
         np.testing.assert_allclose(reference.values, WAVE, rtol=0.0, atol=1e-8)
 
     def test_scale_offset_and_softness(self, read: Read) -> None:
-        """Samples are offset + scale times value, then softened like any other waveform."""
         text = rows(WAVE)
         plain = read(text, file_rate_hz=RATE_HZ, scale=-2.0, offset=5.0)
         np.testing.assert_array_equal(plain.values, 5.0 - 2.0 * WAVE)
@@ -130,7 +122,6 @@ class TestText:
         assert (soft.segments[0].steady_start, soft.segments[0].steady_stop) == (50, 150)
 
     def test_period_makes_steady_cycles(self, read: Read) -> None:
-        """With period_s the file's whole cycles can be judged."""
         segment = read(rows(WAVE), file_rate_hz=RATE_HZ, period_s=0.1).segments[0]
         assert segment.period == pytest.approx(100.0)
         assert segment.steady_cycles() == (100, 200, 1)
@@ -146,8 +137,6 @@ class TestText:
 
 
 class TestTextRefused:
-    """CSV files that can't be used."""
-
     def test_not_a_number(self, read: Read) -> None:
         """A row that is not finite is named by its line in the file."""
         bad = WAVE.copy()
@@ -229,7 +218,6 @@ class TestTextRefused:
 
     @pytest.mark.parametrize(("first", "last"), [(1, 201), (201, None), (500, 600)])
     def test_rows_that_are_not_there(self, read: Read, first: int, last: int | None) -> None:
-        """Rows beyond the end are refused, not left out in silence."""
         text = refusal(read, rows(WAVE), file_rate_hz=1e3, first_row=first, last_row=last)
         assert text.startswith(f"has 200 rows: rows {first} to {last or ''}")
 
@@ -240,8 +228,6 @@ class TestTextRefused:
 
 
 class TestRate:
-    """The file's rate and the run's."""
-
     def test_unknown(self, read: Read) -> None:
         """Without time of its own the file needs file_rate_hz."""
         text = refusal(read, rows(WAVE))
@@ -262,7 +248,6 @@ class TestRate:
         assert "1000.01 Hz" in nearly
 
     def test_rounded_times_keep_the_rate(self, read: Read) -> None:
-        """Rates that differ by rounding alone are one rate: no sample is touched."""
         times = [f"{t:.9f}" for t in T_S + 12.3456789]
         text = "t_s,x\n" + "".join(
             f"{t},{x!r}\n" for t, x in zip(times, WAVE.tolist(), strict=True)
@@ -294,7 +279,6 @@ class TestRate:
         assert np.max(np.abs(straight - expected)) > 1e-4
 
     def test_resampling_where_rates_agree(self, read: Read) -> None:
-        """Where the rates agree nothing is interpolated."""
         for how in ("linear", "cubic"):
             values = read(rows(WAVE), file_rate_hz=RATE_HZ, resample=how).values
             np.testing.assert_array_equal(values, WAVE)
@@ -305,7 +289,6 @@ class TestRate:
         assert reference.segments[0].period == pytest.approx(400.0)
 
     def test_row_range_keeps_the_rate(self, read: Read) -> None:
-        """A part of the rows is resampled at the whole file's rate."""
         text = "t_s,x\n" + rows(T_S * 2.0, WAVE)
         part = read(text, column="x", resample="linear", first_row=51, last_row=100)
         assert part.values.size == 99
@@ -347,8 +330,6 @@ def npy(tmp_path: Path, array: Any) -> bytes:
 
 
 class TestNpy:
-    """NumPy files."""
-
     @pytest.mark.parametrize("dtype", ["<f8", "<f4", ">f8"])
     def test_one_dimension(self, read: Read, tmp_path: Path, dtype: str) -> None:
         """A one-dimensional array needs no column."""
@@ -397,7 +378,6 @@ class TestNpy:
         assert text.startswith("has 200 samples")
 
     def test_objects_are_never_unpickled(self, read: Read, tmp_path: Path) -> None:
-        """Pickled objects are refused: reading them would run whatever they hold."""
         content = npy(tmp_path, np.array([1.0, None], dtype=object))
         text = refusal(read, content, "w.npy", file_rate_hz=RATE_HZ)
         assert "NumPy file" in text
@@ -498,7 +478,6 @@ def test_columns(made: Made, recording: Path, name: str, k: int) -> None:
 
 
 def test_rows_scale_and_rate(made: Made, recording: Path) -> None:
-    """Rows, scale and resampling work as for other files."""
     keys = {"kind": "file", "path": recording.name, "column": "command", "scale": 2.0}
     part = made(RATE_HZ, recording.parent, **keys, first_row=11, last_row=20)
     np.testing.assert_array_equal(part.values, 2.0 * column(2)[10:20])

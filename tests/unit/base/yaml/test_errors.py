@@ -59,7 +59,6 @@ class Several(StrictModel):
      ["x:1: names.A1: string should match pattern '^[a-z]+$', got 'A1'"]),
 ])  # fmt: skip
 def test_what_may_be_of_several_types(text: str, problems: list[str]) -> None:
-    """One problem a value, with every choice; the choice that was meant speaks alone."""
     with pytest.raises(ConfigError) as caught:
         Document("x", text).validate(Several)
     assert [str(each) for each in caught.value.problems] == problems
