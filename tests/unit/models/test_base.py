@@ -5,26 +5,10 @@ import pytest
 from pydantic import ValidationError
 
 from hilctl.base.errors import ModelError
-from hilctl.models.integrated import DeadbandFunction, IntegratedModel
-from hilctl.models.plays import PpiModel, RdpiModel
+from hilctl.models.plays import PpiModel
+from tests.unit.models.test_plays import MODELS
 
 SAMPLE_RATE_HZ = 10_000.0
-PLAYS = {"direct": 2.0, "weights": (0.5, 0.3, 0.8), "thresholds": (0.2, 0.5, 1.1)}
-MODELS = {
-    "ppi": PpiModel(**PLAYS),
-    "rdpi": RdpiModel(**PLAYS, gamma_s=3e-4),
-    "integrated": IntegratedModel(
-        **PLAYS,
-        gamma_s=3e-4,
-        deadband=DeadbandFunction(
-            slope=1.2,
-            up_thresholds=(1.0, 3.0),
-            up_weights=(-0.3, -0.2),
-            down_thresholds=(-2.0,),
-            down_weights=(0.6,),
-        ),
-    ),
-}
 SIGNAL = 3.0 * np.sin(np.arange(500) / 30.0) + 0.4 * np.sin(np.arange(500) / 3.0)
 
 

@@ -12,9 +12,10 @@ from hilctl.models.generalised_duhem import GeneralisedDuhemModel
 from hilctl.models.linear_stages import FirstMode
 from hilctl.models.model_file import dump_model, parse_model
 from hilctl.models.staged import StagedModel
+from tests.unit.models.test_effective_field import LOSSES
+from tests.unit.models.test_effective_field import reference_um as field_reference_um
 
 RATE_HZ = 50_000.0
-LOSSES = FieldLosses(field_s=1e-4, output_s=2e-6, decay_s=3e-5, growth=0.1, bend=0.02, excess=0.05)
 ACROSS = np.linspace(-1.0, 1.0, 5)
 
 
@@ -38,10 +39,7 @@ def duhem_model(**changes: Any) -> GeneralisedDuhemModel:
 
 def reference_um(seed: int) -> F64:
     """Return a smooth, aperiodic reference from rest: float64[n]."""
-    t = np.arange(4000) / RATE_HZ
-    rng = np.random.default_rng(seed)
-    sines = sum(np.sin(2 * np.pi * f * t + rng.uniform(0, 6)) for f in (11.0, 57.0, 143.0, 231.0))
-    return np.ascontiguousarray(0.7 + 9.0 * np.minimum(t / 0.02, 1.0) * sines)
+    return 0.7 + field_reference_um(seed)
 
 
 def test_inverse_undoes_the_model() -> None:

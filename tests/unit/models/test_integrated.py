@@ -15,24 +15,9 @@ from hilctl.models.integrated import (
     exponential_integrated,
 )
 from hilctl.models.model_file import dump_model, parse_model
-from hilctl.models.plays import PpiModel, RdpiModel, inverse_plays
-from tests.published import piezo_ppi, terfenol_rdpi
-
-GOOD = {"direct": 1.0, "weights": (0.5, 0.0, 0.2), "thresholds": (0.1, 0.2, 0.5)}
-DEADBAND = {
-    "slope": 2.0,
-    "up_thresholds": (1.0, 2.0),
-    "up_weights": (-0.5, -0.5),
-    "down_thresholds": (-1.0, -3.0),
-    "down_weights": (-0.5, 1.0),
-}
-
-
-def broken(kind, **parameters):
-    """Return the messages of all broken rules, one a line."""
-    with pytest.raises(ValidationError) as caught:
-        kind(**parameters)
-    return "\n".join(f"{e['loc']} {e['msg']}" for e in caught.value.errors())
+from hilctl.models.plays import inverse_plays
+from tests.published import terfenol_rdpi
+from tests.unit.models.test_plays import DEADBAND, GOOD, MODELS, broken
 
 
 @pytest.mark.parametrize(("change", "message"), [
@@ -70,24 +55,6 @@ def test_deadbands_that_rounding_takes_apart_have_no_inverse(parameters, message
     model = IntegratedModel(**GOOD, deadband=DeadbandFunction(**parameters))
     with pytest.raises(ModelError, match=message):
         model.inverse(1_000.0)
-
-
-PLAYS = {"direct": 2.0, "weights": (0.5, 0.3, 0.8), "thresholds": (0.2, 0.5, 1.1)}
-MODELS = {
-    "ppi": PpiModel(**PLAYS),
-    "rdpi": RdpiModel(**PLAYS, gamma_s=3e-4),
-    "integrated": IntegratedModel(
-        **PLAYS,
-        gamma_s=3e-4,
-        deadband=DeadbandFunction(
-            slope=1.2,
-            up_thresholds=(1.0, 3.0),
-            up_weights=(-0.3, -0.2),
-            down_thresholds=(-2.0,),
-            down_weights=(0.6,),
-        ),
-    ),
-}
 
 
 def test_deadband_function_and_its_inverse_cancel():
@@ -250,12 +217,6 @@ def test_exponential_parameters_are_the_published_ones(omega):
     np.testing.assert_allclose(deadband.up_weights, -0.3 * np.exp(-0.1 * np.arange(1, 9)))
     np.testing.assert_allclose(deadband.down_thresholds, -0.8 * np.arange(1, 9))
     np.testing.assert_allclose(deadband.down_weights, 0.4 * np.exp(-0.1 * np.arange(1, 9)))
-
-
-def test_published_models_say_where_they_come_from():
-    assert piezo_ppi().input_unit == "V"
-    assert terfenol_rdpi().input_unit == "A"
-    assert "Concordia" in piezo_ppi().provenance.source[0]
 
 
 RATE_HZ = 10_000.0

@@ -148,17 +148,6 @@ def test_deadband_problems_are_placed_below_the_model():
     ]
 
 
-def test_files_that_cannot_be_read_say_so(tmp_path):
-    with pytest.raises(InputError, match=r"none\.yaml: no such file"):
-        load_model(tmp_path / "none.yaml")
-    with pytest.raises(InputError, match="is not a file"):
-        load_model(tmp_path)
-    binary = tmp_path / "binary.yaml"
-    binary.write_bytes(b"model: \xff\xfe")
-    with pytest.raises(InputError, match="is not UTF-8 text"):
-        load_model(binary)
-
-
 @pytest.mark.parametrize("count", [200, pytest.param(2_000, marks=pytest.mark.slow)])
 def test_damaged_files_are_refused_in_words(count):
     texts = [RDPI, dump_model(OMEGA)]

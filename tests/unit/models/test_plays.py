@@ -80,16 +80,6 @@ def test_numbers_must_be_finite(place, value):
     assert "finite number" in text
 
 
-def test_growth_must_not_be_negative():
-    """Gamma below 0 would let thresholds shrink with the rate."""
-    assert "greater than or equal to 0" in broken(RdpiModel, **GOOD, gamma_s=-1e-6)
-
-
-def test_numbers_are_not_guessed_from_text():
-    for value in ("1.0", True, None):
-        assert "valid number" in broken(PpiModel, **{**GOOD, "direct": value})
-
-
 @pytest.mark.parametrize(("direct", "weights", "thresholds"), [
     (1e308, (1e308,), (1.0,)), (5e-324, (1.0,), (1.0,)), (1.0, (1.0, 1.0), (1e308, 1.5e308)),
 ])  # fmt: skip
@@ -97,12 +87,6 @@ def test_plays_beyond_the_range_of_numbers_have_no_inverse(direct, weights, thre
     model = RdpiModel(direct=direct, weights=weights, thresholds=thresholds)
     with pytest.raises(ModelError, match="too large or too small"):
         model.inverse(1_000.0)
-
-
-def test_models_do_not_change():
-    model = PpiModel(**GOOD)
-    with pytest.raises(ValidationError, match="frozen"):
-        model.direct = 2.0
 
 
 SAMPLE_RATE_HZ = 10_000.0
@@ -122,25 +106,13 @@ MODELS = {
         ),
     ),
 }
-SIGNAL = 3.0 * np.sin(np.arange(500) / 30.0) + 0.4 * np.sin(np.arange(500) / 3.0)
-
-
-@pytest.fixture(params=MODELS)
-def model(request):
-    """One model of each kind."""
-    return MODELS[request.param]
-
-
-@pytest.fixture(params=["forward", "inverse"])
-def make(request, model):
-    """A maker of that model's operator, forward or inverse."""
-    return lambda: getattr(model, request.param)(SAMPLE_RATE_HZ)
 
 
 def test_only_the_rate_dependent_models_know_the_sample_rate():
+    signal = 3.0 * np.sin(np.arange(500) / 30.0) + 0.4 * np.sin(np.arange(500) / 3.0)
     for name, model in MODELS.items():
         for make in (model.forward, model.inverse):
-            same = np.array_equal(make(1_000.0).process(SIGNAL), make(9_000.0).process(SIGNAL))
+            same = np.array_equal(make(1_000.0).process(signal), make(9_000.0).process(signal))
             assert same == (name == "ppi")
 
 

@@ -116,38 +116,16 @@ LABELS: list[tuple[dict[str, Any], str, float]] = [
     ({**SINE, "frequency_hz": 3.0, "duration_s": 1.0}, "sine 6 A 3 Hz", 1000.0 / 3.0),
     ({**SINE, "kind": "growing", "duration_s": 1.0}, "growing 6 A 10 Hz", 0.0),
     ({**SINE, "kind": "decaying", "duration_s": 1.0}, "decaying 6 A 10 Hz", 0.0),
-    (
-        {
-            "kind": "complex_harmonic",
-            "components": (
-                {"amplitude": 4.0, "frequency_hz": 2.5},
-                {"amplitude": 3.0, "frequency_hz": 7.5},
-            ),
-            "duration_s": 1.0,
-        },
-        "complex harmonic 4 A 2.5 Hz + 3 A 7.5 Hz",
-        400.0,
-    ),
-    (
-        {"kind": "chirp", "amplitude": 2.0, "start_hz": 1.0, "stop_hz": 50.0, "duration_s": 1.0},
-        "chirp 2 A 1-50 Hz",
-        0.0,
-    ),
+    ({"kind": "complex_harmonic", "duration_s": 1.0, "components": (
+        {"amplitude": 4.0, "frequency_hz": 2.5}, {"amplitude": 3.0, "frequency_hz": 7.5})},
+     "complex harmonic 4 A 2.5 Hz + 3 A 7.5 Hz", 400.0),
+    ({"kind": "chirp", "amplitude": 2.0, "start_hz": 1.0, "stop_hz": 50.0, "duration_s": 1.0},
+     "chirp 2 A 1-50 Hz", 0.0),
     ({"kind": "step", "levels": (1.0, 2.0), "dwell_s": 0.5}, "step", 0.0),
     ({"kind": "hold", "level": -2.5, "duration_s": 1.0}, "hold -2.5 A", 0.0),
-    (
-        {
-            "kind": "multisine",
-            "amplitude": 3.0,
-            "first_hz": 15.0,
-            "last_hz": 45.0,
-            "step_hz": 10.0,
-            "duration_s": 1.0,
-        },
-        "multisine 3 A 15-45 Hz",
-        200.0,
-    ),
-]
+    ({"kind": "multisine", "amplitude": 3.0, "first_hz": 15.0, "last_hz": 45.0, "step_hz": 10.0,
+      "duration_s": 1.0}, "multisine 3 A 15-45 Hz", 200.0),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("keys", "label", "period"), LABELS, ids=[case[1] for case in LABELS])
@@ -172,69 +150,36 @@ def test_period_too_long_to_count_is_none(made: Made) -> None:
 
 
 SAME: dict[str, Any] = {"amplitude": 1.0, "duration_s": 1.0}
+NYQUIST = "{}: every frequency must be below half the sample rate, 500 Hz: {} Hz"
+SOFT_S = "{}: soft_start_s + soft_end_s = {} s must fit in its {} s"
+LENGTH = (
+    "has {} samples, more than the 100000000 that fit in memory: shorten it, or lower "
+    "sample_rate_hz"
+)
 REFUSED: list[tuple[dict[str, Any], str]] = [
-    (
-        {"kind": "sine", "frequency_hz": 500.5, **SAME},
-        "sine: every frequency must be below half the sample rate, 500 Hz: 500.5 Hz",
-    ),
-    (
-        {"kind": "triangle", "frequency_hz": 500.0, **SAME},
-        "triangle: every frequency must be below half the sample rate, 500 Hz: 500 Hz",
-    ),
-    (
-        {"kind": "chirp", "start_hz": 1.0, "stop_hz": 600.0, **SAME},
-        "chirp: every frequency must be below half the sample rate, 500 Hz: 600 Hz",
-    ),
-    (
-        {"kind": "chirp", "start_hz": 600.0, "stop_hz": 1.0, **SAME},
-        "chirp: every frequency must be below half the sample rate, 500 Hz: 600 Hz",
-    ),
-    (
-        {"kind": "multisine", "first_hz": 1.0, "last_hz": 501.0, "step_hz": 1.0, **SAME},
-        "multisine: every frequency must be below half the sample rate, 500 Hz: 501 Hz",
-    ),
-    (
-        {
-            "kind": "complex_harmonic",
-            "duration_s": 1.0,
-            "components": (
-                {"amplitude": 1.0, "frequency_hz": 10.0},
-                {"amplitude": 1.0, "frequency_hz": 700.0},
-            ),
-        },
-        "complex_harmonic: every frequency must be below half the sample rate, 500 Hz: 700 Hz",
-    ),
-    (
-        {**SINE, "duration_s": 1.0, "soft_start_s": 0.7, "soft_end_s": 0.4},
-        "sine: soft_start_s + soft_end_s = 1.1 s must fit in its 1 s",
-    ),
-    (
-        {**SINE, "duration_s": 1.0, "soft_start_s": 0.501, "soft_end_s": 0.5},
-        "sine: soft_start_s + soft_end_s = 1.001 s must fit in its 1 s",
-    ),
-    (
-        {**SINE, "duration_s": 1.0, "soft_start_s": 1e308, "soft_end_s": 1e308},
-        "sine: soft_start_s + soft_end_s = inf s must fit in its 1 s",
-    ),
-    (
-        {"kind": "step", "levels": (1.0,) * 5, "dwell_s": 0.1, "soft_end_s": 0.6},
-        "step: soft_start_s + soft_end_s = 0.6 s must fit in its 0.5 s",
-    ),
-    (
-        {"kind": "random", "amplitude": 1.0, "first_hz": 1, "last_hz": 2, "duration_s": 100_001.0},
-        "has 100001000 samples, more than the 100000000 that fit in memory: shorten it, or "
-        "lower sample_rate_hz",
-    ),
-    (
-        {**SINE, "duration_s": 1e308},
-        "has inf samples, more than the 100000000 that fit in memory: shorten it, or lower "
-        "sample_rate_hz",
-    ),
-    (
-        {**SINE, "amplitude": 1.7e308, "offset": 1.7e308, "duration_s": 1.0, "soft_start_s": 0.1},
-        "amplitude, offset or scale is too large: a value is not finite",
-    ),
-]
+    ({"kind": "sine", "frequency_hz": 500.5, **SAME}, NYQUIST.format("sine", "500.5")),
+    ({"kind": "triangle", "frequency_hz": 500.0, **SAME}, NYQUIST.format("triangle", "500")),
+    ({"kind": "chirp", "start_hz": 1.0, "stop_hz": 600.0, **SAME}, NYQUIST.format("chirp", "600")),
+    ({"kind": "chirp", "start_hz": 600.0, "stop_hz": 1.0, **SAME}, NYQUIST.format("chirp", "600")),
+    ({"kind": "multisine", "first_hz": 1.0, "last_hz": 501.0, "step_hz": 1.0, **SAME},
+     NYQUIST.format("multisine", "501")),
+    ({"kind": "complex_harmonic", "duration_s": 1.0, "components": (
+        {"amplitude": 1.0, "frequency_hz": 10.0}, {"amplitude": 1.0, "frequency_hz": 700.0})},
+     NYQUIST.format("complex_harmonic", "700")),
+    ({**SINE, "duration_s": 1.0, "soft_start_s": 0.7, "soft_end_s": 0.4},
+     SOFT_S.format("sine", "1.1", "1")),
+    ({**SINE, "duration_s": 1.0, "soft_start_s": 0.501, "soft_end_s": 0.5},
+     SOFT_S.format("sine", "1.001", "1")),
+    ({**SINE, "duration_s": 1.0, "soft_start_s": 1e308, "soft_end_s": 1e308},
+     SOFT_S.format("sine", "inf", "1")),
+    ({"kind": "step", "levels": (1.0,) * 5, "dwell_s": 0.1, "soft_end_s": 0.6},
+     SOFT_S.format("step", "0.6", "0.5")),
+    ({"kind": "random", "amplitude": 1.0, "first_hz": 1, "last_hz": 2, "duration_s": 100_001.0},
+     LENGTH.format("100001000")),
+    ({**SINE, "duration_s": 1e308}, LENGTH.format("inf")),
+    ({**SINE, "amplitude": 1.7e308, "offset": 1.7e308, "duration_s": 1.0, "soft_start_s": 0.1},
+     "amplitude, offset or scale is too large: a value is not finite"),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("keys", "text"), REFUSED)

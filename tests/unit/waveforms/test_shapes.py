@@ -29,76 +29,28 @@ def triangle_wave(cycles: float) -> float:
 
 
 CASES: list[tuple[dict[str, Any], Callable[[float], float]]] = [
-    (
-        {"kind": "sine", "amplitude": 6.0, "frequency_hz": 12.5, "duration_s": 0.5},
-        lambda t: 6.0 * math.sin(2 * math.pi * 12.5 * t),
-    ),
-    (
-        {
-            "kind": "sine",
-            "amplitude": 2.0,
-            "frequency_hz": 100,
-            "phase_deg": -30.0,
-            "offset": -7.25,
-            "duration_s": 0.3,
-        },
-        lambda t: -7.25 + 2.0 * math.sin(2 * math.pi * 100 * t - math.pi / 6),
-    ),
-    (
-        {
-            "kind": "triangle",
-            "amplitude": 3.0,
-            "frequency_hz": 7.0,
-            "offset": 1.0,
-            "duration_s": 0.4,
-        },
-        lambda t: 1.0 + 3.0 * triangle_wave(7.0 * t),
-    ),
-    (
-        {
-            "kind": "complex_harmonic",
-            "components": (
-                {"amplitude": 4.0, "frequency_hz": 20.0},
-                {"amplitude": 3.0, "frequency_hz": 60.0, "phase_deg": 90.0},
-            ),
-            "duration_s": 0.2,
-        },
-        lambda t: 4.0 * math.sin(2 * math.pi * 20 * t) + 3.0 * math.cos(2 * math.pi * 60 * t),
-    ),
-    (
-        {"kind": "growing", "amplitude": 7.0, "frequency_hz": 10.0, "duration_s": 1.0},
-        lambda t: 7.0 * t * math.sin(2 * math.pi * 10 * t),
-    ),
-    (
-        {"kind": "decaying", "amplitude": 7.0, "frequency_hz": 10.0, "duration_s": 2.0},
-        lambda t: 7.0 * (1 - t / 2.0) * math.sin(2 * math.pi * 10 * t),
-    ),
-    (
-        {
-            "kind": "chirp",
-            "amplitude": 2.0,
-            "start_hz": 5.0,
-            "stop_hz": 45.0,
-            "duration_s": 0.8,
-        },
-        lambda t: 2.0 * math.sin(2 * math.pi * (5.0 * t + 25.0 * t * t)),
-    ),
-    (
-        {
-            "kind": "chirp",
-            "amplitude": 2.0,
-            "start_hz": 5.0,
-            "stop_hz": 80.0,
-            "spacing": "logarithmic",
-            "duration_s": 0.5,
-        },
-        lambda t: 2.0 * math.sin(2 * math.pi * 5.0 * 0.5 / math.log(16) * (16 ** (2 * t) - 1)),
-    ),
-    (
-        {"kind": "hold", "level": -3.5, "offset": 1.0, "duration_s": 0.1},
-        lambda _: -2.5,
-    ),
-]
+    ({"kind": "sine", "amplitude": 6.0, "frequency_hz": 12.5, "duration_s": 0.5},
+     lambda t: 6.0 * math.sin(2 * math.pi * 12.5 * t)),
+    ({"kind": "sine", "amplitude": 2.0, "frequency_hz": 100, "phase_deg": -30.0, "offset": -7.25,
+      "duration_s": 0.3},
+     lambda t: -7.25 + 2.0 * math.sin(2 * math.pi * 100 * t - math.pi / 6)),
+    ({"kind": "triangle", "amplitude": 3.0, "frequency_hz": 7.0, "offset": 1.0, "duration_s": 0.4},
+     lambda t: 1.0 + 3.0 * triangle_wave(7.0 * t)),
+    ({"kind": "complex_harmonic", "duration_s": 0.2, "components": (
+        {"amplitude": 4.0, "frequency_hz": 20.0},
+        {"amplitude": 3.0, "frequency_hz": 60.0, "phase_deg": 90.0})},
+     lambda t: 4.0 * math.sin(2 * math.pi * 20 * t) + 3.0 * math.cos(2 * math.pi * 60 * t)),
+    ({"kind": "growing", "amplitude": 7.0, "frequency_hz": 10.0, "duration_s": 1.0},
+     lambda t: 7.0 * t * math.sin(2 * math.pi * 10 * t)),
+    ({"kind": "decaying", "amplitude": 7.0, "frequency_hz": 10.0, "duration_s": 2.0},
+     lambda t: 7.0 * (1 - t / 2.0) * math.sin(2 * math.pi * 10 * t)),
+    ({"kind": "chirp", "amplitude": 2.0, "start_hz": 5.0, "stop_hz": 45.0, "duration_s": 0.8},
+     lambda t: 2.0 * math.sin(2 * math.pi * (5.0 * t + 25.0 * t * t))),
+    ({"kind": "chirp", "amplitude": 2.0, "start_hz": 5.0, "stop_hz": 80.0,
+      "spacing": "logarithmic", "duration_s": 0.5},
+     lambda t: 2.0 * math.sin(2 * math.pi * 5.0 * 0.5 / math.log(16) * (16 ** (2 * t) - 1))),
+    ({"kind": "hold", "level": -3.5, "offset": 1.0, "duration_s": 0.1}, lambda _: -2.5),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(
