@@ -51,14 +51,11 @@ class TableRows:
     lines: npt.NDArray[np.int64]
 
     def sample_rate_hz(self, time: int, tolerance: float) -> float:
-        """Return the sample rate from a time column in s, which must be evenly spaced.
-
-        Args:
-            time: Index of the column in ``values``.
-            tolerance: Largest deviation of a step from the median, relative to it.
+        """Return the sample rate from the column ``time`` in s, which must be evenly spaced.
 
         Raises:
-            DataError: Time does not rise, or not evenly; names the line.
+            DataError: Time does not rise, or a step deviates from the median by more than the
+                relative tolerance; names the line.
         """
         time_s: F64 = self.values[time]
         steps = np.diff(time_s)
@@ -121,12 +118,7 @@ class TextTable:
     def read(
         self, columns: Sequence[int], first_row: int = 1, last_row: int | None = None
     ) -> TableRows:
-        """Read some columns of some rows; other cells may have any content.
-
-        Args:
-            columns: Their indices from 0.
-            first_row: First row, counted from 1 without header and comments.
-            last_row: Last row; None for all.
+        """Read the columns of some rows, counted from 1; other cells may have any content.
 
         Raises:
             DataError: Rows are missing, a row is longer or shorter than the first, or a value is

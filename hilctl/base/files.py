@@ -88,11 +88,8 @@ def sync_folder(path: Path) -> None:
 class AtomicFile:
     """A file that appears complete or not at all.
 
-    It is written under a temporary name in the same folder, and discarded unless committed.
-
-    Args:
-        path: The file; if it may be replaced and is a link, the target of the link.
-        overwrite: Whether a file of that name may be replaced.
+    It is written under a temporary name in the same folder, and discarded unless committed. If it
+    may be replaced and is a link, the target of the link is replaced.
 
     Attributes:
         stream: The new file, open for writing.

@@ -39,15 +39,11 @@ def user_folders() -> list[Path]:
 
 
 def private_folder(path: Path, *, make: bool = True) -> Path:
-    """Return a folder after checking its owner and permissions.
-
-    Args:
-        path: The folder; its parent is trusted.
-        make: Create it if missing.
+    """Return a folder, created if ``make``, after checking its owner and permissions.
 
     Raises:
         OSError: It cannot be created, is a link or no folder, belongs to another user, or is
-            writable by others.
+            writable by others. Its parent is trusted.
     """
     if make:
         with suppress(FileExistsError):

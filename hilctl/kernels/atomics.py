@@ -68,22 +68,17 @@ if not _numba.DISABLE_JIT:
 
 @kernel("void(int64[::1], int64, int64)")
 def publish(numbers: I64, index: int, value: int) -> None:
-    """Set a number after all that was written before, and before all that will be.
+    """Set a number after all earlier writes and before all later ones.
 
-    Args:
-        numbers: int64[n] in shared memory.
-        index: Place of the number, not checked.
-        value: The number.
+    ``numbers`` is int64[n] in shared memory; the index is not checked.
     """
     _store(numbers, index, value)
 
 
 @kernel("int64(Array(int64, 1, 'C', readonly=True), int64)")
 def observe(numbers: I64, index: int) -> int:
-    """Return a number, read after all that was read before, and before all that will be.
+    """Return a number, read after all earlier reads and before all later ones.
 
-    Args:
-        numbers: int64[n] in shared memory, may be mapped for reading only.
-        index: Place of the number, not checked.
+    ``numbers`` is int64[n] in shared memory, possibly read-only; the index is not checked.
     """
     return _load(numbers, index)

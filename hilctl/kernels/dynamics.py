@@ -53,15 +53,9 @@ def _left_behind(behind: float, growth: float, periods: float) -> float:
 def lag_block(v: F64, periods: float, growth: float, memory: F64, out: F64) -> None:
     """Let a first-order lag follow a command that is held from sample to sample.
 
-    tau (1 + b |v - x|) dx/dt = v - x, integrated exactly. ``out[k]`` is x when ``v[k]`` is put
-    out, so it shows the commands up to ``v[k - 1]``.
-
-    Args:
-        v: float64[n], command.
-        periods: T / tau, > 0.
-        growth: b, one over the unit of ``v``, >= 0.
-        memory: float64[2]: x, the previous command.
-        out: float64[n], filled with x.
+    tau (1 + b |v - x|) dx/dt = v - x, integrated exactly. ``out[k]`` is x when ``v[k]`` is output,
+    so it shows the commands up to ``v[k - 1]``. ``periods`` is T / tau > 0, ``growth`` is b >= 0,
+    per unit of ``v``. ``memory`` is float64[2]: x, the previous command.
     """
     for k in range(v.size):
         now, held, x = v[k], memory[1], memory[0]
@@ -77,19 +71,12 @@ def lag_block(v: F64, periods: float, growth: float, memory: F64, out: F64) -> N
 
 @kernel("void(float64[::1], float64, float64, float64[::1], float64[::1])")
 def lead_block(x: F64, periods: float, growth: float, memory: F64, out: F64) -> None:
-    """Find the commands that bring the lag of :func:`lag_block` to wanted values.
+    """Find the commands that bring the lag of :func:`lag_block` to requested values, float64[n].
 
-    ``out[k]`` brings it to ``x[k]`` when ``out[k + 1]`` is put out. To go by D within a sample the
-    command must be ahead by D / (1 - exp(b D - T / tau)), which asks for b D < T / tau: no lag of
-    this kind moves faster than 1 / (tau b). D is held below 0.8 of that, and what is missing is
-    made good at the samples after it.
-
-    Args:
-        x: float64[n], wanted output of the lag.
-        periods: T / tau, > 0.
-        growth: b, one over the unit of ``x``, >= 0.
-        memory: float64[2]: the lag's output, the previous command.
-        out: float64[n], filled with commands.
+    ``out[k]`` brings it to ``x[k]`` when ``out[k + 1]`` is output. To move by D within a sample the
+    command must lead by D / (1 - exp(b D - T / tau)), which requires b D < T / tau: no lag of
+    this kind moves faster than 1 / (tau b). D stays below 0.8 of that, and the following samples
+    make up for the rest. ``memory`` is float64[2]: the lag's output, the previous command.
     """
     furthest = _REACH * periods / growth if growth > 0.0 else math.inf
     for k in range(x.size):
@@ -111,12 +98,8 @@ def lead_block(x: F64, periods: float, growth: float, memory: F64, out: F64) -> 
 def structure_block(x: F64, motion: F64, memory: F64, out: F64) -> None:
     """Let a mass on a damped spring follow ``x``, which changes linearly between samples.
 
-    Args:
-        x: float64[n], where it would rest.
-        motion: float64[2, 4]: position and velocity after a sample, from those before it and
-            from ``x`` before and after it.
-        memory: float64[3]: position, velocity, the previous ``x``.
-        out: float64[n], filled with positions.
+    ``motion`` is float64[2, 4]: position and velocity after a sample, from those before it and from
+    ``x`` before and after it. ``memory`` is float64[3]: position, velocity, the previous ``x``.
     """
     for k in range(x.size):
         now, before = x[k], memory[2]
@@ -152,13 +135,9 @@ def _oldest(memory: F64, now: float) -> float:
 
 @kernel("void(float64[::1], float64[::1], float64[::1], float64[::1])")
 def weigh_block(x: F64, weights: F64, memory: F64, out: F64) -> None:
-    """Sum a signal's last values, each with its weight.
+    """Sum a signal's last n >= 2 values; ``weights`` (float64[n]) begins with that of the oldest.
 
-    Args:
-        x: float64[k].
-        weights: float64[n], n >= 2, of the oldest value first.
-        memory: float64[n]: the last n - 1 values, the previous one.
-        out: float64[k], filled.
+    ``memory`` is float64[n]: the last n - 1 values, the previous one.
     """
     for k in range(x.size):
         total = weights[0] * _oldest(memory, x[k])
@@ -169,26 +148,16 @@ def weigh_block(x: F64, weights: F64, memory: F64, out: F64) -> None:
 
 @kernel("void(float64[::1], float64[::1], float64[::1])")
 def delay_block(x: F64, memory: F64, out: F64) -> None:
-    """Hold a signal back by n samples.
-
-    Args:
-        x: float64[k].
-        memory: float64[n + 1]: the last n values, the previous one.
-        out: float64[k], filled.
-    """
+    """Delay a signal by n samples; ``memory``, float64[n + 1], holds them and the previous value."""
     for k in range(x.size):
         out[k] = _oldest(memory, x[k])
 
 
 @kernel("void(float64[::1], float64, float64[::1], float64[::1])")
 def between_block(x: F64, part: float, memory: F64, out: F64) -> None:
-    """Take a signal between its samples: ``part`` of the way from the one before to each.
+    """Interpolate a signal: ``part`` (0 to 1) of the way from the previous sample to each.
 
-    Args:
-        x: float64[n].
-        part: 0 to 1.
-        memory: float64[1]: the previous value.
-        out: float64[n], filled.
+    ``memory`` is float64[1]: the previous value.
     """
     for k in range(x.size):
         now, before = x[k], memory[0]
@@ -216,14 +185,11 @@ def _crept(parameters: F64, memory: F64) -> float:
 
 @kernel("void(float64[::1], float64[::1], float64[::1], float64[::1])")
 def creep_block(x: F64, parameters: F64, memory: F64, out: F64) -> None:
-    """Add what creeps to a displacement.
+    """Add creep to a displacement from rest.
 
-    Args:
-        x: float64[n], from rest.
-        parameters: float64[2 m]: of each element what a sample leaves of it, exp(-1 / (T f)), then
-            of each what of x it gains in a sample, s (1 - exp(-1 / (T f))).
-        memory: float64[m + 1]: the elements, the previous x; updated.
-        out: float64[n], filled.
+    ``parameters`` is float64[2 m]: for each element the share that remains after a sample,
+    exp(-1 / (T f)), then for each its gain from x in a sample, s (1 - exp(-1 / (T f))). ``memory``
+    is float64[m + 1]: the elements, the previous x.
     """
     for k in range(x.size):
         total = _crept(parameters, memory)
@@ -259,15 +225,11 @@ def _keep(position: float, velocity: float, x: float, memory: F64) -> None:
 
 @kernel("void(float64[::1], float64[::1], float64[::1], float64[::1])")
 def mode_block(x: F64, parameters: F64, memory: F64, out: F64) -> None:
-    """Let a displacement pass a pair.
+    """Pass a displacement through a pair of antiresonance and resonance.
 
-    Args:
-        x: float64[n].
-        parameters: float64[12]: position and velocity after a sample, each from those before it and
-            from x before and after it; weights of position, velocity and x in the output; what x
-            comes to in the output of its own sample.
-        memory: float64[3]: position, velocity, the previous x; updated.
-        out: float64[n], filled.
+    ``parameters`` is float64[12]: position and velocity after a sample, each from those before it
+    and from x before and after it; weights of position, velocity and x in the output; the weight of
+    x in the output of its own sample. ``memory`` is float64[3]: position, velocity, the previous x.
     """
     for k in range(x.size):
         now = x[k]
@@ -296,12 +258,9 @@ def unmode_block(y: F64, parameters: F64, memory: F64, out: F64) -> None:
 
 
 def exponential(matrix: F64) -> F64:
-    """Return exp(matrix): float64[m, m], the Taylor series of a small part of it, squared.
+    """Return exp(matrix), float64[m, m] finite: the Taylor series of a small part of it, squared.
 
-    SciPy's to 13 digits, but a run would wait 0.2 s for SciPy, and keep 9 MB of it.
-
-    Args:
-        matrix: float64[m, m], finite.
+    It has 13 digits in common with SciPy's, whose import takes a run 0.2 s and 9 MB.
     """
     halvings = max(0, math.frexp(np.abs(matrix).sum(axis=1).max())[1] + 3)
     part = matrix * 0.5**halvings  # its norm is at most 1/8: the twelfth term is below 1e-19

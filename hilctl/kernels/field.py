@@ -72,14 +72,10 @@ def _gone(x: float) -> float:
 
 @kernel("float64(float64, float64, float64, float64, float64)")
 def dragged(held: float, low: float, width: float, last: float, way: float) -> float:
-    """Return a drag's output in a cell after the field has gone up by a way, in lengths.
+    """Return a drag's output in a cell after the field has risen by ``way`` >= 0, in lengths.
 
-    Args:
-        held: Output before, 0 to ``width``.
-        low: Lower end of the cell.
-        width: Of the cell.
-        last: Field before.
-        way: How far it goes up, >= 0; nothing moves before it has passed ``low + held``.
+    ``held`` is the output before, 0 to ``width``; ``low`` is the cell's lower end and ``last`` the
+    field before. Nothing moves before the field has passed ``low + held``.
     """
     begin = max(last, low + held)
     end = last + way
@@ -130,14 +126,14 @@ def _waited(held: float, width: float, above: int, up: float, down: float) -> fl
 def drag_columns(
     u: F64, rows: I64, length: float, lowest: float, width: float, cells: int, first: int, out: F64
 ) -> None:
-    """Fill in what a drag of weight 1 gives in each cell, for identification.
+    """Fill in the output of a drag of weight 1 in each cell, for identification.
 
     Args:
-        u: float64[n], a path from rest; it need hold no more than its turning points.
+        u: float64[n], a path from rest; its turning points are enough.
         rows: int64[N], samples of the path that are filled in, rising.
         length: k.
         lowest: Lower end of the first cell.
-        width: Of a cell.
+        width: Width of a cell.
         cells: Number of cells c.
         first: Column of the first cell.
         out: float64[N, m], of which c columns are filled; 0 is rest.
@@ -416,14 +412,13 @@ def field_forward(
     """Run the model.
 
     Args:
-        v: float64[n], commands, each held through the sample that ends with its output. One that is
-            not a number gives an output that is none, and leaves no trace.
-        span: Lowest and highest effective field, and by how much a root may miss, > 0.
+        v: float64[n], commands, each held through the sample that ends with its output. A command
+            that is not finite gives NaN and leaves no trace.
+        span: Lowest and highest effective field, and the tolerance of a root, > 0.
         bank: The operators.
-        coupling: Effective field for each unit of the operators' output.
+        coupling: Effective field per unit of the operators' output.
         losses: See :data:`Losses`.
-        curve: float64[k], output of the operators, and float64[k], displacement there in um, both
-            rising.
+        curve: float64[k], output of the operators, and float64[k], displacement in um, both rising.
         memory: See the module's docstring.
         out: float64[n], filled with um.
     """

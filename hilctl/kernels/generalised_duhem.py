@@ -133,7 +133,7 @@ def _share_out(
 def duhem_columns(
     y: F64, start_y: float, start_w: float, band: Band, rows: I64, w: F64, out: F64
 ) -> None:
-    """Follow a path, and work out how the fields depend on the logarithm of each slope.
+    """Follow a path, and compute the dependence of the fields on the logarithm of each slope.
 
     Args:
         y: float64[n], the path.
@@ -142,7 +142,7 @@ def duhem_columns(
         band: The operator.
         rows: int64[N], points that are filled in, rising.
         w: float64[n], filled with the field.
-        out: float64[N, m], filled; no columns where m is 0.
+        out: float64[N, m], filled; no columns if m is 0.
     """
     slopes, steps, lines, grid = band
     by_node = np.zeros(out.shape[1])
@@ -238,13 +238,8 @@ def _root(command: float, memory: F64, band: Band, losses: Losses) -> float:
 def duhem_forward(v: F64, band: Band, losses: Losses, memory: F64, out: F64) -> None:
     """Run the model.
 
-    Args:
-        v: float64[n], commands, each held through the sample that ends with its output. One that is
-            not a number gives an output that is none, and leaves no trace.
-        band: The operator.
-        losses: See :data:`Losses`.
-        memory: See the module's docstring.
-        out: float64[n], filled with y.
+    ``v`` is float64[n], commands, each held through the sample that ends with its output; a command
+    that is not finite gives NaN and leaves no trace. ``out`` is float64[n], filled with y.
     """
     for k in range(v.size):
         if abs(v[k]) < math.inf:

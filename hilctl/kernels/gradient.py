@@ -79,17 +79,17 @@ def adapted_input(
     thresholds: F64,
     memory: F64,
 ) -> None:
-    """Turn the displacements wanted into a model's input, in place, by the operator's inverse.
+    """Convert requested displacements to a model's input, in place, by the operator's inverse.
 
     Args:
-        input_um: float64[n]; what is not finite is left, and no play moves by it.
-        size: Samples over which these go from ``before`` to ``after`` in a line, >= n.
+        input_um: float64[n]; values that are not finite stay, and move no play.
+        size: Samples over which the parameters change linearly, >= n.
         before: float64[m], o, g and w_i before the first sample.
         after: float64[m], the same after ``size`` samples.
         settings: float64[8], see the names above.
         table: float64[3, m], see :func:`adapt_block`.
         thresholds: float64[m - 2], rising, in half spans.
-        memory: float64[m - 1], outputs of the plays and the input before, in half spans.
+        memory: float64[m - 1], outputs of the plays and the previous input, in half spans.
     """
     middle, half = settings[MIDDLE_UM], settings[HALF_UM]
     for k in range(input_um.size):
@@ -141,18 +141,9 @@ def regressor_sums(
     sums: F64,
     products: F64,
 ) -> None:
-    """Add up the regressors of an input, and their products.
+    """Add the regressors of an input to ``sums``, float64[m], and their products to ``products``.
 
-    Args:
-        input_um: float64[n].
-        settings: float64[8].
-        table: float64[3, m].
-        shape: float64[m, m].
-        thresholds: float64[m - 2].
-        memory: float64[m - 1].
-        found: float64[m], scratch.
-        sums: float64[m], added to.
-        products: float64[m, m], added to.
+    ``found`` is scratch, float64[m]; see :func:`adapt_block` for the other arguments.
     """
     for k in range(input_um.size):
         _regressors(input_um[k], settings, table, shape, thresholds, memory, found)

@@ -231,15 +231,8 @@ def implicit_inverse(
 ) -> None:
     """Run a model's inverse, root by root; its memory is that of the model.
 
-    Args:
-        kind: Number of the model.
-        y: float64[n], displacement in um. One that is not a number gives a command that is none,
-            and leaves no trace.
-        span: Lowest and highest command given out.
-        tolerance: Displacement by which the model may miss, in um, > 0.
-        arrays: The model's, see the module's docstring.
-        memory: float64[m + 1].
-        out: float64[n], filled with commands within the span.
+    ``y`` is float64[n], displacement in um; a value that is not finite gives NaN and leaves no
+    trace. Commands stay within ``span``; the model misses y by ``tolerance`` > 0 um at most.
     """
     for k in range(y.size):
         target = y[k]

@@ -133,19 +133,19 @@ def interlock_block(
     measured: F64,
     flags: U32,
 ) -> int:
-    """Hold a block of samples against all interlocks.
+    """Check a block of samples against all interlocks.
 
     Args:
         settings: float64[13], see the names above.
         memory: float64[8], updated in place; any cut into blocks gives the same bits.
         command: float64[n], in A or V.
-        reference: float64[n], in um; NaN where there is none.
+        reference: float64[n], in um; NaN without one.
         displacement_um: float64[n].
-        measured: float64[n], the command as measured, in A or V; NaN where it is not.
-        flags: uint32[n]; the bit of each interlock is added where it trips.
+        measured: float64[n], the measured command, in A or V; NaN without one.
+        flags: uint32[n]; the bit of each tripped interlock is added.
 
     Returns:
-        Index of the first sample at which one trips, or -1.
+        Index of the first trip, or -1.
     """
     first = -1
     for k in range(command.size):
@@ -163,16 +163,10 @@ def interlock_block(
 
 @kernel("float64(float64[::1], float64, float64, float64[::1])")
 def heat_block(command: F64, warming: float, heat: float, out: F64) -> float:
-    """Follow the heat of a coil through a block of commands, as :func:`interlock_block` does.
+    """Fill ``out`` with the heat of a coil after each command, as :func:`interlock_block` does.
 
-    Args:
-        command: float64[n], in A.
-        warming: 1 - exp(-dt / tau).
-        heat: Heat before the block, in A^2.
-        out: float64[n], filled with the heat after each sample, in A^2.
-
-    Returns:
-        Heat after the block.
+    ``command`` is float64[n], in A; ``warming`` is 1 - exp(-dt / tau), ``heat`` the heat before the
+    block, in A^2. Return the heat after it.
     """
     for k in range(command.size):
         heat = _warmed(heat, command[k], command[k], warming)

@@ -104,13 +104,9 @@ def _fastest(memory: F64, tables: Tables) -> float:
 
 @kernel(f"void(float64[::1], {_TABLES}, float64[::1], float64[::1])")
 def residual_forward(x: F64, tables: Tables, memory: F64, out: F64) -> None:
-    """Give x + R[x].
+    """Return x + R[x] in ``out``, float64[n], for ``x``, float64[n], in um.
 
-    Args:
-        x: float64[n], in um. One that is not a number gives one that is none, and leaves no trace.
-        tables: See :data:`Tables`.
-        memory: See the module's docstring.
-        out: float64[n], filled.
+    A value that is not finite gives NaN and leaves no trace.
     """
     for k in range(x.size):
         now = x[k]
@@ -167,13 +163,13 @@ def residual_inverse(y: F64, tables: Tables, memory: F64, out: F64) -> None:
 
 @kernel(f"void(float64[::1], int64[::1], int64, {_TABLES}, float64[:, ::1])")
 def residual_columns(x: F64, rows: I64, window: int, tables: Tables, out: F64) -> None:
-    """Fill in what R is linear in, for identification: its slopes in each cell, and a, b and c.
+    """Fill in the terms that R is linear in, for identification: slopes in each cell, a, b and c.
 
     Args:
         x: float64[m], from rest.
         rows: int64[N], samples that are filled in, rising.
         window: Samples.
-        tables: See :data:`Tables`; thresholds, lengths and grid count.
+        tables: See :data:`Tables`; only thresholds, lengths and grid are used.
         out: float64[N, p c + (2 d + 1) (c + 1)], of zeros.
     """
     thresholds, lengths, _, _, grid = tables

@@ -50,7 +50,7 @@ class SystemClock:
     """Return the time in ns."""
 
     def sleep_until_ns(self, deadline_ns: int) -> None:
-        """Sleep until ``deadline_ns``; return immediately if it has passed."""
+        """Sleep until a time; return immediately if it has passed."""
         if deadline_ns <= self.now_ns():
             return  # faster than a call of the kernel
         self._spec.tv_sec, self._spec.tv_nsec = divmod(deadline_ns, 1_000_000_000)
@@ -64,12 +64,7 @@ class SystemClock:
 
 @dataclass(slots=True)
 class Lateness:
-    """Exact counters of late ticks.
-
-    Attributes:
-        late_ticks: Ticks later than the limit.
-        skipped_ticks: Ticks skipped to keep the phase.
-    """
+    """Exact counters of late ticks, and the most consecutive ones (``longest_run``)."""
 
     late_ticks: int = 0
     skipped_ticks: int = 0

@@ -111,14 +111,9 @@ class GeneralisedDuhemModel(CheckedModel, HysteresisModel):
 
 
 def band_of(slopes: F64, lines: F64, lowest_um: float, cell_um: float, half_width: float) -> Band:
-    """Return an operator as its kernels take it.
+    """Return an operator for its kernels, from slopes float64[2, k, l] > 0 and lines float64[2, k].
 
-    Args:
-        slopes: float64[2, k, l], > 0.
-        lines: float64[2, k], centre and flux.
-        lowest_um: First node of y.
-        cell_um: Distance of the nodes of y.
-        half_width: Of the band.
+    The lines are centre and flux at k nodes of y, ``cell_um`` apart from ``lowest_um`` on.
     """
     apart = 2.0 * half_width / (slopes.shape[2] - 1)
     steps = longest_steps(slopes, lines[0], cell_um, apart)
@@ -128,15 +123,9 @@ def band_of(slopes: F64, lines: F64, lowest_um: float, cell_um: float, half_widt
 def longest_steps(slopes: F64, centre: F64, cell_um: float, apart: float) -> F64:
     """Return the longest steps of y for which w rises with y whatever the step's length.
 
-    A step s takes dw = s / g at its middle, which rises with s where
-    g > s / 2 (dg/dy + dg/dw (1 / g - c')). Each cell is taken with the lowest slope of it and its
-    neighbours, and a step with all the cells that its middle may lie in, which are these.
-
-    Args:
-        slopes: float64[2, k, l].
-        centre: float64[k].
-        cell_um: Distance of the nodes of y.
-        apart: Distance of the nodes across the band.
+    A step s takes dw = s / g at its middle, which rises with s if
+    g > s / 2 (dg/dy + dg/dw (1 / g - c')). Each cell has the lowest slope of it and its
+    neighbours, and a step the limits of all cells that its middle may lie in, which are these.
 
     Returns:
         float64[2, k - 1, l - 1], by the cell that a step begins in.

@@ -25,13 +25,10 @@ _WIDEST = 64
 
 
 class Chain(Operator):
-    """Operators in series as one operator with one memory.
+    """Operators in series as one operator with one memory, of which theirs are parts.
 
     Args:
-        stages: The operators in order; their memories become parts of the chain's.
         preview: Samples by which the chain's input must run ahead of its output.
-        input_offset: Added to the input first.
-        output_offset: Added to the output last.
     """
 
     def __init__(
@@ -86,17 +83,13 @@ def smoothing_weights(
     """Return weights for y + slope_gain y' + bend_gain y'' of a smoothed y, per sample.
 
     A cubic B-spline (four boxes in series) smooths, and minus half its variance times y'' flattens
-    its response to 1 - (w s)^4 / 8 at an angular frequency w, for a standard deviation s. So slow
-    signals pass unchanged, and corners are rounded within about 2 s.
-
-    Args:
-        width: Standard deviation s in samples; 0 for plain central differences.
-        slope_gain: In samples.
-        bend_gain: In samples squared.
+    its response to 1 - (w s)^4 / 8 at an angular frequency w, for a standard deviation s (``width``,
+    in samples; 0 for plain central differences). So slow signals pass unchanged, and corners are
+    rounded within about 2 s. Boxes are at most 64 samples long.
 
     Returns:
         float64[2m + 1], weights from the oldest to the newest sample, with the sum 1; and m, the
-        preview in samples. Boxes are at most 64 samples long.
+        preview in samples.
     """
     box = min(_WIDEST, round(math.sqrt(1.0 + 3.0 * width**2)))
     ones = np.full(box, 1.0 / box)
@@ -149,14 +142,7 @@ class CreepModel(CheckedModel):
 
 
 class _CreepOperator(Operator):
-    """Creep or its inverse, which continues at constant input.
-
-    Args:
-        creep: Its elements.
-        kernel: Its kernel.
-        sample_rate_hz: Samples a second.
-        rest_um: Displacement at rest.
-    """
+    """Creep or its inverse, which continues at constant input."""
 
     def __init__(
         self, creep: CreepModel, kernel: Callable[..., None], sample_rate_hz: float, rest_um: float

@@ -21,12 +21,7 @@ from hilctl.models.base import (
 
 
 def inverse_plays(direct: float, weights: F64, thresholds: F64) -> tuple[float, F64, F64]:
-    """Return the inverse of a sum of plays, itself a sum of plays (5.8-5.10).
-
-    Args:
-        direct: a_0 > 0.
-        weights: float64[n], a_1 to a_n, all >= 0.
-        thresholds: float64[n], r_1 to r_n, rising.
+    """Return the inverse of a sum of plays (a_0 > 0, a_i >= 0, r_i rising), itself one (5.8-5.10).
 
     Returns:
         The inverse's direct weight 1/a_0, its weights float64[n] (<= 0) and its thresholds

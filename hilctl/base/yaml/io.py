@@ -137,12 +137,8 @@ def _scalar(node: yaml.Node) -> Any:
 def dump(data: Any) -> str:
     """Return plain data as YAML; reading it gives the same data, lists as tuples.
 
-    Args:
-        data: Mappings with text keys, lists and tuples, text, None, booleans, floats, and whole
-            numbers of up to 64 bits.
-
     Raises:
-        yaml.YAMLError: The data contain anything else.
+        yaml.YAMLError: The data contain other types, or whole numbers of more than 64 bits.
     """
     return yaml.dump(data, Dumper=_PlainDumper, sort_keys=False, width=100)
 
@@ -178,8 +174,6 @@ class Document:
         assignments: Arguments of :meth:`set`, in order.
 
     Args:
-        name: File name in messages.
-        text: The YAML text.
         lines: Names of generated lines in messages, from the first on; missing or empty ones are
             named by file and number.
 
@@ -282,16 +276,10 @@ class Document:
         without: tuple[str, ...] = (),
         context: Mapping[str, Any] | None = None,
     ) -> Model:
-        """Build a pydantic model from the document or a part of it.
+        """Build a pydantic model from the document or its part ``at``, except the keys ``without``.
 
         Tolerant readings replace values in :attr:`data`, see
-        :func:`hilctl.base.yaml.errors.readings`.
-
-        Args:
-            model: The model.
-            at: Location of the part; empty for the complete document.
-            without: Ignored keys.
-            context: ``info.context`` of the validators.
+        :func:`hilctl.base.yaml.errors.readings`. ``context`` is for the validators.
 
         Raises:
             ConfigError: One or more rules are broken; all are listed.

@@ -147,13 +147,11 @@ def test_column_that_nobody_named(tmp_path: Path) -> None:
     ([*np.arange(50), *(50 + 1.2 * np.arange(50))], 0.5, "t.csv:"),
 ])  # fmt: skip
 def test_uneven_time(table, times: list[float], tolerance: float, message: str) -> None:
-    """The first step that is wrong is named by its line; a rate that creeps is found as well."""
     rows = table("".join(f"{t}\n" for t in times)).read([0])
     assert refusal(rows.sample_rate_hz, 0, tolerance).startswith(message)
 
 
 def test_even_time(table) -> None:
-    """The rate is that of all rows together: rounding of single times does not matter."""
     rows = table("".join(f"{k / 3000:.4f}\n" for k in range(301))).read([0])
     assert rows.sample_rate_hz(0, 0.5) == pytest.approx(3000.0)
 

@@ -76,7 +76,6 @@ def test_a_text_too_large_is_not_read(tmp_path):
 
 class TestWriting:
     def test_new_file(self, tmp_path):
-        """It has its content, the permissions of any new file, and nothing stands beside it."""
         path = tmp_path / "out.txt"
         plain = tmp_path / "plain"
         plain.touch()
@@ -122,7 +121,6 @@ class TestWriting:
         assert list(tmp_path.iterdir()) == [path]
 
     def test_without_hard_links(self, tmp_path, monkeypatch):
-        """Where the file system has none, the file is written all the same."""
         monkeypatch.setattr(Path, "hardlink_to", _refuse)
         write_text(tmp_path / "out.txt", "text", overwrite=False)
         assert (tmp_path / "out.txt").read_text() == "text"
@@ -189,7 +187,6 @@ class TestWriting:
         assert str(caught.value).startswith(str(tmp_path / name))
 
     def test_long_names(self, tmp_path):
-        """A name may be as long as the file system allows."""
         write_text(tmp_path / ("x" * 255), "text", overwrite=False)
         write_text(tmp_path / ("x" * 255), "again", overwrite=True)
 

@@ -35,7 +35,6 @@ def segment(steady_start: int, steady_stop: int, period: float) -> Segment:
 def test_steady_cycles(
     steady_start: int, steady_stop: int, period: float, expected: tuple[int, int, int]
 ) -> None:
-    """Whole cycles at the end of the steady part, one after the soft start left out."""
     assert segment(steady_start, steady_stop, period).steady_cycles() == expected
 
 

@@ -140,7 +140,6 @@ class TestCheck:
         assert conditioning_of(loaded(text=PIEZO)).stands_um is None
 
     def test_forecast_counts_it(self):
-        """Range, heat and size of the run are those of all that is put out."""
         checked, plain = check(loaded()), check(loaded("condition=null"))
         assert plain.forecast.before_s == 0.0
         assert checked.forecast.before_s == 2.1

@@ -69,7 +69,6 @@ class TestContext:
         assert all(getattr(limits, key) is None for key in InterlockSettings.model_fields)
 
     def test_in_volt(self):
-        """A device driven in V has its deviation and travel in V."""
         made = loaded(VOLTAGE, "limits.measured_deviation_v=0.3", "limits.frozen_s=0.1")
         context = interlock_context(made.config, made.device.info)
         assert (context.unit, made.config.limits.measured_deviation) == ("V", 0.3)
@@ -116,7 +115,6 @@ class TestConsistency:
         ],
     )
     def test_refused_by_key(self, text, settings, word):
-        """Each key is listed with its missing requirement."""
         found = refusals(text, *(f"limits.{setting}" for setting in settings))
         keys = [f"limits.{setting.partition('=')[0]}" for setting in settings]
         assert [problem.key for problem in found] == keys
@@ -150,13 +148,11 @@ class TestConsistency:
 
 class TestHeatForecast:
     def test_without_a_budget(self):
-        """Nothing is forecast where nothing is held to it."""
         forecast = check(loaded(CURRENT)).forecast
         assert forecast.heating_rms_a is None
         assert forecast.to_mapping()["heating_rms_a"] is None
 
     def test_highest_running_rms(self):
-        """The forecast is the highest root of the heat, which starts at that of the safe value."""
         settings = ("limits.rms_current_a=4.3", "limits.thermal_time_constant_s=0.5")
         found = check(loaded(CURRENT, *settings)).forecast.heating_rms_a
         command = 6.0 * np.sin(2.0 * np.pi * 10.0 * np.arange(4000) / 1e3)
@@ -167,7 +163,6 @@ class TestHeatForecast:
         assert found == pytest.approx(math.sqrt(highest), rel=1e-9)
 
     def test_safe_value_alone(self):
-        """A run that never leaves the safe value shows its rms, and a smaller budget refuses it."""
         hold = ["waveform={kind: hold, unit: A, level: 0.5, duration_s: 1.0}"]
         budget = ("limits.rms_current_a=0.5", "limits.thermal_time_constant_s=1.0")
         assert check(loaded(CURRENT, *hold, *budget)).forecast.heating_rms_a == 0.5

@@ -196,7 +196,6 @@ def test_another_rate_or_a_large_file(folder, monkeypatch):
 
 
 def test_nothing_there(folder):
-    """No run of this device; and no device that could have a past."""
     words = left_by_last_run(folder.loaded(), NOW_S)[1]
     assert words.startswith("at rest")
     folder.record("new", holds=())
@@ -205,7 +204,6 @@ def test_nothing_there(folder):
 
 class TestCheck:
     def test_by_default(self, folder):
-        """The compensator begins there, is led in from there, and says so."""
         folder.record("new")
         begun = check(folder.loaded()).begun
         left, words = left_by_last_run(folder.loaded(), NOW_S)
@@ -230,7 +228,6 @@ class TestCheck:
         assert begun.run_id == ("before" if "old" in setting else "")
 
     def test_without_a_compensator(self, folder):
-        """There is no memory to begin with."""
         folder.record("new")
         plain = folder.loaded("compensator=none", "waveform.unit=A")
         assert check(plain).begun.begins == ""

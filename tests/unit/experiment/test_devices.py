@@ -109,7 +109,6 @@ def devices_package(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("kind", sorted(registry.BUILTIN))
 def test_built_in(kind: str) -> None:
-    """Every built-in device can be imported, and its options are described for the schema."""
     found = registry.device_class(kind)
     module, _, name = registry.BUILTIN[kind].partition(":")
     assert (found.__module__, found.__qualname__) == (module, name)
@@ -118,14 +117,12 @@ def test_built_in(kind: str) -> None:
 
 
 def test_known_devices(devices_package: None) -> None:
-    """Built-in devices and installed ones are known; a built-in name can't be taken over."""
     known = registry.known_devices()
     assert set(known) >= {*registry.BUILTIN, "my_amplifier"}
     assert known["simulated_piezo"] == registry.BUILTIN["simulated_piezo"]
 
 
 def test_entry_point(devices_package: None) -> None:
-    """An installed device is found by its entry point."""
     assert registry.device_class("my_amplifier") is Amplifier
 
 
@@ -251,7 +248,6 @@ class TestSchema:
             assert set(part["properties"]) == {"kind", *options.model_fields}
 
     def test_required_sections(self, schema: dict[str, Any]) -> None:
-        """What has no default is required."""
         assert sorted(schema["required"]) == [
             "compensator", "device", "limits", "name", "sample_rate_hz", "waveform",
         ]  # fmt: skip

@@ -50,7 +50,6 @@ class TestExperiment:
         assert "block: must be 1" in self.problems(tmp_path, "block=50")
 
     def test_too_much_bandwidth(self, tmp_path):
-        """The message says how much there can be, and the rate that it needs."""
         text = self.problems(tmp_path, "feedback.bandwidth_hz=500.0", "feedback.damping_ratio=1.0")
         assert "feedback.bandwidth_hz: must be <= 277.8 Hz" in text
         assert "at least 9000 samples" in text
@@ -60,7 +59,6 @@ class TestExperiment:
         assert "no sample rate" in text
 
     def test_gains_without_margin(self, tmp_path):
-        """Gains are held against their margins."""
         gains = "feedback={limit_um: 5.0, kp: 0.2, ki_per_s: 4000.0, resonance_hz: 2300.0,"
         text = self.problems(tmp_path, gains + " damping_ratio: 1.0}")
         assert "phase margin of 60" in text
@@ -77,7 +75,6 @@ class TestExperiment:
         assert "bandwidth_hz 36" in text
 
     def test_without_a_compensator(self, tmp_path):
-        """There is nothing to correct the input of."""
         settings = ("compensator=none", "waveform.unit=A", "waveform.amplitude=1.0")
         assert "feedback: needs a compensator" in self.problems(tmp_path, *settings)
 
@@ -103,7 +100,6 @@ class TestExperiment:
         ],
     )
     def test_integral_too_fast(self, tmp_path, settings, model, rule):
-        """Its bandwidth stays well below the loop's delay, and below the resonance."""
         keys = settings[1].replace("b:", "bandwidth_hz:")
         chosen = f"feedback={{kind: integral, limit_um: 5.0, {keys[1:]}"
         text = self.problems(tmp_path, settings[0], chosen, model=model)
@@ -118,7 +114,6 @@ class TestExperiment:
         assert problem.rule.startswith("must be <= 0.6341 Hz")
 
     def test_unknown_kind(self, tmp_path):
-        """The kinds are named."""
         (tmp_path / "model.yaml").write_text(MODEL)
         with pytest.raises(ConfigError, match="'pi', 'integral'"):
             resolve(Document("e", EXPERIMENT), tmp_path, ["feedback={kind: pid, limit_um: 1.0}"])

@@ -12,7 +12,7 @@ from hilctl.base.errors import ConfigError, InputError
 from hilctl.base.yaml import Document
 from hilctl.experiment import devices as registry
 from hilctl.experiment.load import LoadedExperiment, load_experiment, resolve
-from hilctl.models.plays import PpiModel, RdpiModel
+from hilctl.models.plays import RdpiModel
 from hilctl.waveforms.spec import Sine
 
 FULL = """\
@@ -114,7 +114,6 @@ def changed(old: str, new: str, text: str = FULL) -> str:
 
 class TestAccepted:
     def test_full_example(self, folder: Path) -> None:
-        """Every key arrives where it belongs."""
         loaded = load(FULL, folder)
         config = loaded.config
         assert (config.name, config.sample_rate_hz, config.block) == ("full_example", 50e3, 50)
@@ -282,7 +281,6 @@ ONE_RULE = [
 
 @pytest.mark.parametrize(("line", "old", "new", "key"), ONE_RULE)
 def test_one_broken_rule(folder: Path, line: str, old: str, new: str, key: str) -> None:
-    """One broken rule is one problem with its line and key."""
     assert problems(changed(old, new), folder) == [(f"x.yaml:{LINES[line]}", key)]
 
 
@@ -305,7 +303,6 @@ def test_section_that_is_no_mapping(key: str, value: str) -> None:
 
 class TestMany:
     def test_all_are_listed(self, folder: Path) -> None:
-        """One error lists every problem of the file, its device's options and its model."""
         text = FULL
         for old, new in [
             ("name: full_example", "name: ''"),
@@ -348,7 +345,6 @@ class TestMany:
 
 class TestSet:
     def test_over_the_file(self, folder: Path) -> None:
-        """Values, nested values, list items and whole sections replace the file's."""
         config = load(
             FULL,
             folder,
@@ -443,15 +439,8 @@ class TestModel:
         ("old", "new", "line", "key"),
         [
             ("direct: 2.7", "direct: 0.0", 1, "model"),
-            ("[2.3, 0.1, 0.4]", "[2.3, -0.1, 0.4]", 1, "model"),
-            ("[0.3, 0.6, 0.9]", "[0.3, 0.9, 0.6]", 1, "model"),
-            ("[0.3, 0.6, 0.9]", "[0.0, 0.6, 0.9]", 1, "model"),
             ("[0.3, 0.6, 0.9]", "[0.3, 0.6]", 5, "model"),
             ("gamma_s: 0.0003", "gamma_s: -0.1", 7, "model.gamma_s"),
-            ("gamma_s: 0.0003", "gama_s: 0.1", 7, "model.gama_s"),
-            ("direct: 2.7", "direct: 3_0", 4, "model.direct"),
-            ("weights: [2.3, 0.1, 0.4]", "weights: [2.3, .nan, 0.4]", 5, "model.weights.1"),
-            ("input_unit: A", "input_unit: mA", 3, "model.input_unit"),
             ("weights: [2.3, 0.1, 0.4]", "weights: [2.3, 0.1, 0.4", 6, ""),
         ],
     )
@@ -460,58 +449,3 @@ class TestModel:
         path = folder / "model.yaml"
         path.write_text(changed(old, new, MODEL))
         assert problems(FULL, folder) == [(f"{path}:{line}", key)]
-
-    def test_deadband_that_turns_back(self, folder: Path) -> None:
-        (folder / "model.yaml").write_text(
-            "model:\n"
-            "  kind: integrated\n"
-            "  direct: 2.7\n"
-            "  weights: [2.3]\n"
-            "  thresholds: [0.3]\n"
-            "  deadband:\n"
-            "    up_thresholds: [5.0, 10.0]\n"
-            "    up_weights: [-0.5, -0.5]\n"
-        )
-        assert problems(FULL, folder) == [(f"{folder / 'model.yaml'}:6", "model.deadband")]
-
-    def test_rate_independent_model(self, folder: Path) -> None:
-        """Any kind of model can stand there."""
-        (folder / "model.yaml").write_text(
-            "model: {kind: ppi, direct: 2.7, weights: [2.3], thresholds: [0.3]}\n"
-        )
-        assert isinstance(load(FULL, folder).model, PpiModel)
-
-
-class TestFile:
-    def test_missing_folder_or_binary(self, tmp_path: Path) -> None:
-        binary = tmp_path / "x.yaml"
-        binary.write_bytes(b"\x89PNG\r\n\x1a\n\x00\x00\xff\xfe")
-        for path in (tmp_path / "no.yaml", tmp_path, binary):
-            with pytest.raises(InputError) as caught:
-                load_experiment(path)
-            assert str(caught.value).startswith(f"{path}: ")
-
-    @pytest.mark.parametrize(
-        "text", ["\0\1", "", "\n\n", "# only a comment\n", "- 1\n- 2\n", "text\n"]
-    )
-    def test_no_mapping(self, tmp_path: Path, text: str) -> None:
-        """A file must hold a mapping: nothing, a list or a word is none."""
-        path = tmp_path / "x.yaml"
-        path.write_text(text)
-        with pytest.raises(InputError) as caught:
-            load_experiment(path)
-        assert str(caught.value).startswith(f"{path}:1: ")
-
-    def test_key_twice(self) -> None:
-        """A key that stands twice is refused with both places, nested or not."""
-        twice = FULL.replace("  soft_end_s: 0.2\n", "  soft_end_s: 0.2\n  amplitude: 3.0\n")
-        twice += "name: again\n"
-        assert problems(twice) == [
-            (f"x.yaml:{LINES['soft_end_s'] + 1}", "waveform.amplitude"),
-            (f"x.yaml:{FULL.count(chr(10)) + 2}", "name"),
-        ]
-
-    def test_syntax(self) -> None:
-        """A syntax error is named with the line where reading stopped."""
-        found = problems(FULL.replace("  unit: um\n", "  unit: um\n bad: [\n"))
-        assert found == [(f"x.yaml:{LINES['unit'] + 1}", "")]

@@ -34,7 +34,6 @@ MODEL = Path(__file__).parents[3] / "configs" / "models" / "terfenol_rdpi.yaml"
 
 class TestForecast:
     def test_without_a_compensator(self) -> None:
-        """The command is the waveform; its slew counts the step from the safe value."""
         result = checked(CURRENT, "safe.value=-0.5")
         values = 0.5 + 6.0 * np.sin(2.0 * np.pi * 10.0 * np.arange(10_000) / 10e3)
         forecast = result.forecast
@@ -48,7 +47,6 @@ class TestForecast:
         assert forecast.recording_mb == pytest.approx(10_000 * 45.0 / 1e6)
 
     def test_with_a_compensator(self) -> None:
-        """The command is that of the inverse, run through in one piece."""
         model = terfenol_rdpi()
         result = checked(DISPLACEMENT, model=model)
         command = model.inverse(10e3).process(result.reference.values)
@@ -62,7 +60,6 @@ class TestForecast:
         )
 
     def test_safe_value_counts(self) -> None:
-        """The output starts at the safe value, so the range holds it."""
         settings = ("waveform.amplitude=1.0", "safe.value=-2.0", "limits.slew_a_per_s=25000.0")
         forecast = checked(CURRENT, *settings).forecast
         assert forecast.command_min == -2.0
@@ -70,7 +67,6 @@ class TestForecast:
 
     @pytest.mark.parametrize("chunk", [1, 7, 1000, 9999, 10_000, 10_001])
     def test_chunks_change_nothing(self, monkeypatch: pytest.MonkeyPatch, chunk: int) -> None:
-        """However the reference is cut, the forecast is the same, bit for bit."""
         model = terfenol_rdpi()
         whole = checked(DISPLACEMENT, model=model).forecast
         monkeypatch.setattr("hilctl.experiment.forecast.CHUNK", chunk)
@@ -93,7 +89,6 @@ class TestForecast:
         assert result.forecast.recording_mb > plain.forecast.recording_mb
 
     def test_nothing_is_touched(self) -> None:
-        """The device is neither opened nor driven, and the experiment comes out as it went in."""
         given = loaded(CURRENT)
         assert check(given).loaded is given
 
@@ -200,7 +195,6 @@ def test_what_is_not_finite_is_worked_out() -> None:
     ],
 )
 def test_whole_cycles(period: float, samples: int, cycle: int) -> None:
-    """Whole samples and whole periods, to the last of those that are passed over."""
     assert whole_cycle(period, samples) == cycle
     assert whole_cycle(period + 1e-6, 10**9) == 0
 

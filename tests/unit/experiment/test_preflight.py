@@ -153,7 +153,6 @@ def test_a_start_that_the_device_can_not_hold_is_refused() -> None:
 
 class TestReference:
     def test_outside_the_stroke(self) -> None:
-        """A reference outside the stroke limits is refused, by how much included."""
         (found,) = refusals(
             DISPLACEMENT,
             "waveform.soft_start_s=0.0",
@@ -165,7 +164,6 @@ class TestReference:
         assert found.hint.startswith("0.5 µm")
 
     def test_outside_the_model(self) -> None:
-        """A reference beyond what the model was found on is refused; just within is not."""
         model = terfenol_rdpi().model_copy(update={"output_range_um": (-12.0, 9.75)})
         (found,) = refusals(DISPLACEMENT, model=model)
         assert (found.key, found.value) == ("waveform", "-10 to 10 µm")
@@ -174,7 +172,6 @@ class TestReference:
         checked(DISPLACEMENT, "waveform.amplitude=9.75", model=model)
 
     def test_outside_both(self) -> None:
-        """Both ranges are told, each with its own distance, and the current that would flow."""
         model = terfenol_rdpi().model_copy(update={"output_range_um": (-12.0, 12.0)})
         found = refusals(DISPLACEMENT, "waveform.amplitude=80.0", model=model)
         keys = [problem.key for problem in found]
@@ -234,13 +231,11 @@ class TestCommand:
     @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
     @pytest.mark.parametrize("at", [0, 1, 1500])
     def test_not_a_number(self, monkeypatch: pytest.MonkeyPatch, bad: float, at: int) -> None:
-        """A command that is not finite is refused, wherever and in whichever chunk it stands."""
         monkeypatch.setattr("hilctl.experiment.forecast.CHUNK", 1000)
         found = refusals(DISPLACEMENT, model=BrokenModel(bad=bad, at=at))
         assert [problem.key for problem in found] == ["compensator.model"]
 
     def test_very_large_numbers(self) -> None:
-        """Numbers near the end of the range are refused in words, without a warning."""
         found = refusals(CURRENT, "waveform.amplitude=1.0e+308", "waveform.offset=0.0")
         keys = ["limits.peak_current_a", "limits.slew_a_per_s"]
         assert [problem.key for problem in found] == keys
@@ -322,7 +317,6 @@ class TestDevice:
     def test_beyond_the_device(
         self, given: Any, problem: tuple[str, str], rule: str, allowed: Any
     ) -> None:
-        """The largest allowed value passes."""
         info, *settings = given
         (found,) = refusals(CURRENT, *settings, **info)
         assert (found.key, found.value) == problem

@@ -22,6 +22,14 @@ from hilctl.models.linear_stages import FirstMode, FurtherMode, smoothing_weight
 RATE_HZ = 20_000.0
 SIGNAL = 2.0 * np.sin(np.arange(400) / 9.0) + 0.6 * np.cos(np.arange(400) / 2.3)
 MOTION = FirstMode(natural_hz=1500.0, damping_ratio=0.1).motion(RATE_HZ)
+
+
+LEFT, GAIN = np.array([0.5, 0.9, 0.999]), np.array([0.02, 0.004, 3e-5])
+PARAMETERS = np.concatenate((LEFT, GAIN))
+PAIR = FurtherMode(
+    natural_hz=900.0, damping_ratio=0.04, antiresonance_hz=760.0, antiresonance_damping_ratio=0.02
+)
+MODE_PARAMETERS = PAIR._parameters(RATE_HZ)
 STREAMING = {
     "lag": (dynamics.lag_block, (0.3, 0.4), 1),
     "linear lag": (dynamics.lag_block, (0.3, 0.0), 1),
@@ -31,6 +39,10 @@ STREAMING = {
     "weigh": (dynamics.weigh_block, (smoothing_weights(1.5, 0.3, 5.0)[0],), 10),
     "delay": (dynamics.delay_block, (), 4),
     "between": (dynamics.between_block, (0.3,), 0),
+    "mode": (mode_block, (MODE_PARAMETERS,), 2),
+    "inverse mode": (unmode_block, (MODE_PARAMETERS,), 2),
+    "creep": (creep_block, (PARAMETERS,), 3),
+    "inverse creep": (uncreep_block, (PARAMETERS,), 3),
 }
 
 
@@ -62,7 +74,7 @@ def test_any_cut_and_the_input_itself_as_output(name):
     np.testing.assert_array_equal(memory, end)
 
 
-@pytest.mark.parametrize("name", STREAMING)
+@pytest.mark.parametrize("name", [name for name in STREAMING if "creep" not in name])
 def test_a_constant_passes_from_the_first_sample(name):
     out, _ = stream(name, np.full(50, -3.7))
     np.testing.assert_allclose(out, -3.7, rtol=1e-14)
@@ -160,10 +172,6 @@ def test_a_structure_begins_at_rest_whatever_its_memory_held():
     np.testing.assert_allclose(out, 2.0, rtol=1e-12)
 
 
-LEFT, GAIN = np.array([0.5, 0.9, 0.999]), np.array([0.02, 0.004, 3e-5])
-PARAMETERS = np.concatenate((LEFT, GAIN))
-
-
 def run(kernel, values, memory=None, parameters=PARAMETERS):
     memory = rest_memory(3 if parameters is PARAMETERS else 2) if memory is None else memory
     out = np.empty_like(values)
@@ -191,13 +199,6 @@ def test_undone_to_rounding_from_any_memory(walk):
     assert left[-1] == x[-1]
 
 
-def test_output_and_input_may_be_one_array(walk):
-    wanted, _ = run(uncreep_block, walk)
-    memory, values = np.array([0.0, 0.0, 0.0, np.nan]), walk.copy()
-    uncreep_block(values, PARAMETERS, memory, values)
-    np.testing.assert_array_equal(values, wanted)
-
-
 @pytest.mark.parametrize("kernel", [creep_block, uncreep_block])
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_what_is_no_displacement_creeps_nowhere(walk, kernel, bad):
@@ -206,12 +207,6 @@ def test_what_is_no_displacement_creeps_nowhere(walk, kernel, bad):
     out, _ = run(kernel, values)
     assert not np.isfinite(out[100])
     assert np.isfinite(np.delete(out, 100)).all()
-
-
-PAIR = FurtherMode(
-    natural_hz=900.0, damping_ratio=0.04, antiresonance_hz=760.0, antiresonance_damping_ratio=0.02
-)
-MODE_PARAMETERS = PAIR._parameters(RATE_HZ)
 
 
 def test_a_pair_is_what_scipy_makes_of_its_transfer_function(walk):
@@ -230,15 +225,6 @@ def test_a_mode_is_undone_to_rounding_from_any_memory(walk):
     x, left = run(unmode_block, y, memory.copy(), MODE_PARAMETERS)
     np.testing.assert_allclose(x, walk, rtol=0.0, atol=1e-9)
     assert left[2] == x[-1]
-
-
-@pytest.mark.parametrize("kernel", [mode_block, unmode_block])
-def test_any_cut_into_blocks_gives_the_same_bits_and_output_and_input_may_be_one(walk, kernel):
-    whole, _ = run(kernel, walk, parameters=MODE_PARAMETERS)
-    memory, values = np.full(3, np.nan), walk.copy()
-    for part in np.split(values, [1, 2, 700, 701]):
-        kernel(part, MODE_PARAMETERS, memory, part)
-    np.testing.assert_array_equal(values, whole)
 
 
 @pytest.mark.parametrize("kernel", [mode_block, unmode_block])

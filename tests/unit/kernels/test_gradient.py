@@ -53,7 +53,6 @@ def adapted(values, form=FORM, memory=None, size=None):
 
 
 def test_inverse_is_exact():
-    """What the operator makes of the inverse's output is what was wanted."""
     wanted = wanted_um()
     np.testing.assert_allclose(displaced(adapted(wanted)), wanted, atol=1e-10)
 
@@ -135,7 +134,6 @@ def test_pace_and_bounds_hold():
 
 
 def test_dead_zone():
-    """What explains no more than noise may moves nothing; the same a little above it does."""
     for error, moved in ((0.9, False), (1.1, True)):
         step = Step(DEAD_UM2=1.0, SMOOTHING=1e9)
         step.take(np.full(10, MIDDLE_UM), error)

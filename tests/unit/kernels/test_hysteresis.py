@@ -121,7 +121,6 @@ def test_play_sum_widens_with_its_own_rate(signal, rate_gain):
 
 
 def test_the_rate_matters(signal):
-    """The rate-dependent output differs clearly from the rate-independent one."""
     still = run(hysteresis.play_sum, signal, 0.0, DIRECT, THRESHOLDS, WEIGHTS)
     moving = run(hysteresis.play_sum, signal, GROWTH_S * RATE_HZ, DIRECT, THRESHOLDS, WEIGHTS)
     assert np.max(np.abs(still - moving)) > 0.05

@@ -96,7 +96,6 @@ def limits(draw):
 
 @given(limits(), st.lists(ANY_FLOAT, max_size=60))
 def test_nothing_gets_past(settings, wanted):
-    """Whatever is wanted: always within range, no step above the limit but for its last bit."""
     previous, low, high, max_step = settings
     command, flags = limited(wanted, previous, low, high, max_step)
     assert np.all((command >= low) & (command <= high))

@@ -154,7 +154,6 @@ class TestPolarity:
     @pytest.mark.parametrize("bandwidth_hz", [2.0, 20.0, 200.0])
     @pytest.mark.parametrize("limit_um", [0.5, 5.0, 50.0])
     def test_a_sine(self, frequency_hz, bandwidth_hz, limit_um):
-        """Wherever in it the limit is met, as long as it is met."""
         feedback = loop(bandwidth_hz, limit_um)
         plant(feedback, 4000, gain=-1.0, reference=self.sine(frequency_hz))
         assert feedback.against
@@ -325,7 +324,6 @@ class TestIntegralCorrection:
         assert abs(feedback.correction_um) < 1e-12
 
     def test_noise_is_averaged(self):
-        """White noise comes through as its mean over blocks, and that over the bandwidth's time."""
         noise = np.random.default_rng(3).normal(size=(4000, BLOCK))
         fed = blocks_with(integral(), noise)
         expected = math.sqrt(GAIN / 2.0 / BLOCK)
@@ -374,7 +372,6 @@ class TestFrozen:
 
     @pytest.mark.parametrize("reading", [math.nan, math.inf, -math.inf])
     def test_a_lost_sensor(self, reading):
-        """The correction stays as it was, and is never a NaN."""
         feedback = integral()
         blocks(feedback, 50, offset_um=3.0)
         fed = blocks(feedback, 20, offset_um=reading)

@@ -76,7 +76,6 @@ class TestStroke:
         assert bench.flagged(Flag.SENSOR_INVALID) == [1, 3]
 
     def test_sensor_without_ends(self):
-        """Where nothing is known of the sensor, an infinite reading is outside the stroke."""
         limits = RigInterlocks(stroke_um=(-1.0, 2.0))
         assert trips(limits, 1, displacement=np.inf)[0].code == "stroke"
         assert trips(limits, 1, displacement=-np.inf)[0].code == "stroke"
@@ -85,7 +84,6 @@ class TestStroke:
 class TestSensorRange:
     @pytest.mark.parametrize("rail", [-100.0, 100.0, 100.5, -101.0])
     def test_at_the_end(self, rail):
-        """A reading at or beyond an end of the sensor's range is told as such."""
         trip, bench = trips(STROKE, 3, displacement=[0.0, 0.0, rail])
         assert trip.code == "sensor_range"
         assert trip.sample == 2
@@ -115,7 +113,6 @@ class TestFrozen:
         assert bench.flagged(InterlockFlag.SENSOR_FROZEN) == list(range(30, 60))
 
     def test_names_the_unit(self):
-        """A device driven in V is told in V."""
         limits = replace(FROZEN, unit="V")
         trip, _ = trips(limits, 60, command=np.arange(60.0), displacement=1.0)
         assert "moved by 0.5 V" in trip.reason
@@ -131,7 +128,6 @@ class TestFrozen:
         assert trips(FROZEN, 50, command=command)[0].sample == 20
 
     def test_hold_never_trips(self):
-        """However long nothing moves, a reading that stays is what is to be expected."""
         assert trips(FROZEN, 5000, command=3.0)[0] is None
 
     def test_travel_starts_at_the_first_command(self):
@@ -304,7 +300,6 @@ class TestTracking:
         assert bench.flagged(InterlockFlag.TRACKING_ERROR) == list(range(15, 30))
 
     def test_without_a_time(self):
-        """Without a time the first sample beyond trips; the limit itself does not."""
         limits = replace(TRACKING, tracking_s=0.0)
         assert trips(limits, 9, reference=3.0, displacement=1.0)[0] is None
         assert trips(limits, 9, reference=-1.0, displacement=1.0)[0] is None
@@ -333,7 +328,6 @@ EVERYTHING = replace(
 
 class TestSeveral:
     def test_cause_before_consequence(self):
-        """Of all that trip at one sample, the one that explains the others is told."""
         limits = replace(EVERYTHING, frozen_s=1e-6)
         moving = {"command": 9.0, "reference": 9.0, "displacement": 1.0}
         told = []
@@ -436,7 +430,6 @@ def test_rig_that_means_nothing_is_refused(field, value, text):
 
 
 def test_smallest_limits_hold():
-    """Next to no distance may be asked for."""
     limits = replace(
         STROKE, measured_deviation_a=1e-9, tracking_error_um=1e-9, frozen_um=0.0, safe=1.0
     )

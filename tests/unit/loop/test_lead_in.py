@@ -20,7 +20,6 @@ def short_conditioning(**options):
 
 
 def test_nothing_before():
-    """A run from the safe value begins with its waveform, whose input is left as it is."""
     beginning, input_um = LeadIn(None, 0), np.ones(3)
     assert (beginning.condition_at, beginning.waveform_at) == (0, 0)
     assert beginning.condition_event() is None

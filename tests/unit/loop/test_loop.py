@@ -73,7 +73,6 @@ def sine(n=200, amplitude=3.0):
 
 @pytest.mark.parametrize("block", [1, 7, 50])
 def test_waveform_then_ramp(block):
-    """Every sample of the waveform is put out, then the ramp ends at the safe value."""
     rig = Rig(sine(230), block=block)
     outcome = rig.run()
     assert (outcome.code, outcome.safe, outcome.dropped) == ("completed", True, 0)
@@ -107,7 +106,6 @@ def test_each_sample_is_recorded_with_what_belongs_to_it():
 
 @pytest.mark.parametrize("latency", [0, 4])
 def test_state_before_a_block_is_recorded(latency):
-    """The commands of a block can be computed again from its recorded state, bit for bit."""
     model = terfenol_rdpi()
     rig = Rig(10.0 * sine(200), block=10, model=model, device=FakeFifoDevice(latency))
     rig.run()

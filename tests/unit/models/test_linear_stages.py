@@ -162,13 +162,6 @@ def test_inverse_undoes_creep_exactly():
     np.testing.assert_allclose(CREEP.inverse(RATE_HZ).process(y_um), x_um, rtol=0.0, atol=1e-10)
 
 
-def test_any_cut_into_blocks_gives_the_same_bits():
-    y_um = signal()
-    whole, parts = CREEP.inverse(RATE_HZ), CREEP.inverse(RATE_HZ)
-    came = np.concatenate([parts.process(part) for part in np.split(y_um, (1, 2, 40, 1000))])
-    np.testing.assert_array_equal(came, whole.process(y_um))
-
-
 def test_only_what_is_away_from_rest_creeps():
     still = np.full(3000, -7.5)
     for operator in (CREEP.forward(RATE_HZ, rest_um=-7.5), CREEP.inverse(RATE_HZ, rest_um=-7.5)):

@@ -59,7 +59,6 @@ class TestFold:
             np.testing.assert_allclose(folded.signals[0], cycle, rtol=1e-12)
 
     def test_signals_stay_paired(self) -> None:
-        """A straight relation between two signals survives folding, lost samples and all."""
         rng = np.random.default_rng(1)
         index = np.sort(rng.choice(20_000, 7_000, replace=False)).astype(np.int64)
         x = np.sin(2.0 * np.pi * index / 333.3) + rng.normal(size=index.size)

@@ -130,7 +130,6 @@ LABELS: list[tuple[dict[str, Any], str, float]] = [
 
 @pytest.mark.parametrize(("keys", "label", "period"), LABELS, ids=[case[1] for case in LABELS])
 def test_label_and_period(made: Made, keys: dict[str, Any], label: str, period: float) -> None:
-    """A segment says what runs there; its period is that of the samples."""
     reference = made(1000.0, **keys)
     segment = reference.segments[0]
     assert segment.label == label
@@ -209,7 +208,6 @@ class TestSequenceRefused:
 
 
 def test_unit_is_needed() -> None:
-    """Without a unit nobody knows what the numbers are."""
     with pytest.raises(InputError, match="unit is required"):
         build(Hold(kind="hold", level=1.0, duration_s=1.0), 1000.0, Path())
 
@@ -294,7 +292,6 @@ def test_what_does_not_repeat_is_told_by_all_of_it(made: Made, small: None) -> N
 
 
 def test_telling_parts() -> None:
-    """Nothing twice, nothing left out but the middle of what repeats."""
     n, chunk = 10**9, types.CHUNK
     (all_of_it,) = telling(n, ())
     assert (all_of_it.start, all_of_it.stop) == (0, n)

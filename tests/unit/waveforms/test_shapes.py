@@ -59,7 +59,6 @@ CASES: list[tuple[dict[str, Any], Callable[[float], float]]] = [
 def test_closed_form(
     made: Made, keys: dict[str, Any], closed_form: Callable[[float], float]
 ) -> None:
-    """Every sample is the closed form at k / sample rate."""
     reference = made(RATE_HZ, **keys)
     n = round(keys["duration_s"] * RATE_HZ)
     assert reference.values.dtype == np.float64
@@ -129,7 +128,6 @@ class TestPath:
         np.testing.assert_allclose(values, expected, atol=1e-12)
 
     def test_begins_at_rest(self, made: Made) -> None:
-        """Wherever that is, and whatever the offset."""
         values = made(
             100.0, kind="path", levels=(2.0,), rate_per_s=1.0, offset=50.0, rest=49.0
         ).values
@@ -147,7 +145,6 @@ def rising_crossings_s(values: F64, rate_hz: float) -> F64:
 class TestChirp:
     @pytest.mark.parametrize(("start_hz", "stop_hz"), [(10.0, 200.0), (200.0, 10.0)])
     def test_linear_frequency(self, made: Made, start_hz: float, stop_hz: float) -> None:
-        """A cycle of a linear chirp lasts one over the frequency at its middle."""
         keys = {"start_hz": start_hz, "stop_hz": stop_hz, "duration_s": 2.0}
         values = made(50e3, kind="chirp", amplitude=1.0, **keys).values
         times = rising_crossings_s(values, 50e3)
@@ -158,7 +155,6 @@ class TestChirp:
 
     @pytest.mark.parametrize(("start_hz", "stop_hz"), [(10.0, 1000.0), (1000.0, 10.0)])
     def test_logarithmic_frequency(self, made: Made, start_hz: float, stop_hz: float) -> None:
-        """A logarithmic chirp takes the same time for every decade."""
         keys = {"start_hz": start_hz, "stop_hz": stop_hz, "duration_s": 2.0}
         values = made(50e3, kind="chirp", amplitude=1.0, spacing="logarithmic", **keys).values
         times = rising_crossings_s(values, 50e3)
@@ -210,7 +206,6 @@ class TestMultisine:
         assert np.max(np.abs(values - 2.0)) == pytest.approx(amplitude, rel=1e-12)
 
     def test_crest_factor(self, made: Made) -> None:
-        """Schroeder's phases keep the peak far below that of sines in phase."""
         values = made(5000.0, amplitude=1.0, duration_s=1.0, **BAND).values
         crest = 1.0 / math.sqrt(float(np.mean(values**2)))
         t = np.arange(5000) / 5000.0
@@ -219,7 +214,6 @@ class TestMultisine:
         assert np.max(in_phase) / np.sqrt(np.mean(in_phase**2)) > 6.0
 
     def test_one_sine(self, made: Made) -> None:
-        """A band that holds one frequency gives that sine at full amplitude."""
         keys = {"first_hz": 10.0, "last_hz": 14.9, "step_hz": 5.0}
         reference = made(1000.0, kind="multisine", amplitude=2.0, duration_s=1.0, **keys)
         expected = sampled(lambda t: 2.0 * math.sin(20 * math.pi * t), 1000, 1000.0)
@@ -245,7 +239,6 @@ class TestMultisine:
 class TestEnvelope:
     @pytest.mark.parametrize("kind", ["growing", "decaying"])
     def test_peaks_follow_time(self, made: Made, kind: str) -> None:
-        """The crest of each cycle is as large as its time says."""
         keys = {"amplitude": 7.0, "frequency_hz": 10.0, "duration_s": 1.0}
         values = made(1000.0, kind=kind, **keys).values.reshape(10, 100)
         crest_s = 0.025 + 0.1 * np.arange(10)
@@ -266,7 +259,6 @@ class TestEnvelope:
     ],
 )
 def test_sample_count(duration_s: float, rate_hz: float, samples: int) -> None:
-    """A duration has duration times rate samples, whatever binary fractions make of it."""
     assert sample_count(duration_s, rate_hz) == samples
 
 
@@ -294,7 +286,6 @@ def test_thirty_seconds_at_full_rate(made: Made) -> None:
     ],
 )
 def test_common_period(frequencies_hz: list[float], period_s: float) -> None:
-    """Decimal frequencies share the period that their decimals say, in either order."""
     assert common_period_s(frequencies_hz) == pytest.approx(period_s, rel=1e-15)
     assert common_period_s(frequencies_hz[::-1]) == pytest.approx(period_s, rel=1e-15)
     for f in frequencies_hz:

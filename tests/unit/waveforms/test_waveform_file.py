@@ -75,7 +75,6 @@ class TestText:
         assert reference.segments == (Segment("file w.csv", 0, 200, 0, 200, 0.0),)
 
     def test_column_by_name(self, read: Read) -> None:
-        """A column is found by its name, blanks around it ignored."""
         text = "t_s, x_um , y_um\n" + rows(T_S, WAVE, -WAVE)
         np.testing.assert_array_equal(read(text, column="y_um").values, -WAVE)
         np.testing.assert_array_equal(read(text, column="x_um").values, WAVE)
@@ -114,7 +113,6 @@ class TestText:
 
 class TestTextRefused:
     def test_not_a_number(self, read: Read) -> None:
-        """A row that is not finite is named by its line in the file."""
         bad = WAVE.copy()
         bad[16] = np.nan
         text = "t_s,x_um\n" + rows(T_S, bad)
@@ -124,14 +122,12 @@ class TestTextRefused:
         assert read(text, column="x_um", first_row=18).values.size == 183
 
     def test_value_that_overflows(self, read: Read) -> None:
-        """A scale that makes a value infinite is refused, softness or not."""
         text = rows(WAVE)
         for soft_s in (0.0, 0.1):
             with pytest.raises(InputError, match="too large"):
                 read(text, file_rate_hz=RATE_HZ, scale=1e308, offset=-1e308, soft_end_s=soft_s)
 
     def test_missing_file(self, made: Made, tmp_path: Path) -> None:
-        """A file that is not there, or is a folder, is named with its folder."""
         for name in ("no.csv", "."):
             with pytest.raises(InputError) as caught:
                 made(RATE_HZ, tmp_path, kind="file", path=name)
@@ -143,7 +139,6 @@ class TestTextRefused:
         assert text.startswith(f"has 200 rows: rows {first} to {last or ''}")
 
     def test_one_row(self, read: Read) -> None:
-        """One row is no waveform."""
         text = refusal(read, rows(WAVE), file_rate_hz=1e3, first_row=200)
         assert "two rows" in text
 
@@ -156,7 +151,6 @@ class TestRate:
         assert read("t_s,x\n" + rows(T_S, WAVE), column="x", file_rate_hz=1000).values.size == 200
 
     def test_mismatch_is_refused(self, read: Read) -> None:
-        """Another rate than the run's is refused unless the experiment says how to resample."""
         text = refusal(read, rows(WAVE), file_rate_hz=500.0)
         assert "500 Hz" in text
         assert "resample" in text
@@ -200,7 +194,6 @@ class TestRate:
             np.testing.assert_array_equal(values, WAVE)
 
     def test_period_after_resampling(self, read: Read) -> None:
-        """The period counts the run's samples, not the file's."""
         reference = read(rows(WAVE), file_rate_hz=250.0, resample="linear", period_s=0.4)
         assert reference.segments[0].period == pytest.approx(400.0)
 
@@ -211,7 +204,6 @@ class TestRate:
         np.testing.assert_allclose(part.values[::2], WAVE[50:100], rtol=0.0, atol=1e-12)
 
     def test_resampled_too_long(self, read: Read, monkeypatch: pytest.MonkeyPatch) -> None:
-        """A file that would become too long is refused before memory is allocated."""
         with pytest.raises(InputError, match=r"^has 1\.99e\+14 samples"):
             read(rows(WAVE), file_rate_hz=1e-9, resample="linear")
         monkeypatch.setattr(shapes, "MAX_SAMPLES", 300)
@@ -227,21 +219,18 @@ def npy(tmp_path: Path, array: Any) -> bytes:
 class TestNpy:
     @pytest.mark.parametrize("dtype", ["<f8", "<f4", ">f8"])
     def test_one_dimension(self, read: Read, tmp_path: Path, dtype: str) -> None:
-        """A one-dimensional array needs no column."""
         content = npy(tmp_path, WAVE.astype(dtype))
         values = read(content, "w.npy", file_rate_hz=RATE_HZ).values
         np.testing.assert_array_equal(values, WAVE.astype(dtype))
         assert values.dtype == np.float64
 
     def test_whole_numbers(self, read: Read, tmp_path: Path) -> None:
-        """Integers become floats."""
         content = npy(tmp_path, np.arange(-5, 5, dtype=np.int16))
         values = read(content, "w.npy", file_rate_hz=RATE_HZ).values
         np.testing.assert_array_equal(values, np.arange(-5.0, 5.0))
 
     @pytest.mark.parametrize("order", ["C", "F"])
     def test_two_dimensions(self, read: Read, tmp_path: Path, order: Any) -> None:
-        """Columns of a two-dimensional array are found by number, in either memory order."""
         table = np.array(np.column_stack([WAVE, -WAVE]), order=order)
         content = npy(tmp_path, table)
         values = read(content, "w.npy", column=2, file_rate_hz=RATE_HZ).values
@@ -250,7 +239,6 @@ class TestNpy:
         assert text.endswith("1, 2")
 
     def test_upper_case_ending(self, read: Read, tmp_path: Path) -> None:
-        """The ending tells the format in either case."""
         values = read(npy(tmp_path, WAVE), "W.NPY", file_rate_hz=RATE_HZ).values
         np.testing.assert_array_equal(values, WAVE)
 
@@ -260,14 +248,12 @@ class TestNpy:
         assert "file_rate_hz" in refusal(read, content, name)
 
     def test_not_finite(self, read: Read, tmp_path: Path) -> None:
-        """A row that is not finite is named."""
         bad = WAVE.copy()
         bad[3] = np.inf
         text = refusal(read, npy(tmp_path, bad), "w.npy", file_rate_hz=RATE_HZ)
         assert text.startswith("row 4: ")
 
     def test_too_large(self, read: Read, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        """More rows than fit in memory are refused before they are read."""
         monkeypatch.setattr(shapes, "MAX_SAMPLES", 100)
         text = refusal(read, npy(tmp_path, WAVE), "w.npy", file_rate_hz=RATE_HZ)
         assert text.startswith("has 200 samples")
@@ -279,7 +265,6 @@ class TestNpy:
 
     @pytest.mark.parametrize("cut", [0, 5, 60, 300])
     def test_cut_short(self, read: Read, tmp_path: Path, cut: int) -> None:
-        """A file that lacks its end is refused."""
         content = npy(tmp_path, WAVE)[:cut]
         text = refusal(read, content, "w.npy", file_rate_hz=RATE_HZ)
         assert "NumPy file" in text
@@ -288,7 +273,6 @@ class TestNpy:
         "array", [np.float64(3.0), np.ones((2, 2, 2)), np.array(["a", "b"]), np.ones(3) * 1j]
     )
     def test_wrong_kind(self, read: Read, tmp_path: Path, array: Any) -> None:
-        """One or two dimensions of real numbers, nothing else."""
         text = refusal(read, npy(tmp_path, array), "w.npy", file_rate_hz=RATE_HZ)
         assert "array of numbers" in text
 
@@ -298,7 +282,6 @@ class TestNpy:
          "(-1,)", "(True,)", "(" * 5000, "('''"],
     )  # fmt: skip
     def test_head_that_lies(self, read: Read, shape: str) -> None:
-        """What a head says of its size is held against the file, whatever it is."""
         head = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
         content = b"\x93NUMPY\x01\x00" + len(head).to_bytes(2, "little") + head + bytes(80)
         text = refusal(read, content, "w.npy", file_rate_hz=RATE_HZ)
@@ -383,7 +366,6 @@ def test_rows_scale_and_rate(made: Made, recording: Path) -> None:
 
 
 def test_column_is_needed(made: Made, recording: Path) -> None:
-    """Without a column, or with one that is not there, the known ones are listed."""
     known = "reference_um, displacement_um, command, wanted"
     with pytest.raises(InputError, match=f"one of {known}"):
         made(RATE_HZ, recording.parent, kind="file", path=recording.name)
@@ -392,7 +374,6 @@ def test_column_is_needed(made: Made, recording: Path) -> None:
 
 
 def test_not_a_number(made: Made, tmp_path: Path) -> None:
-    """A recorded value that is not a number is refused with its row."""
     columns = np.array([column(k) for k in range(len(COLUMNS))])
     columns[0, 30:] = np.nan
     record(tmp_path / "run.mcap", [0, 20, 40, 60, 80], columns)
@@ -413,7 +394,6 @@ def test_gap(made: Made, tmp_path: Path) -> None:
 
 
 def test_not_a_recording(made: Made, tmp_path: Path) -> None:
-    """Bytes that are no recording are refused by name."""
     (tmp_path / "run.mcap").write_bytes(b"not an MCAP file at all")
     with pytest.raises(DataError, match="MCAP file"):
         made(RATE_HZ, tmp_path, kind="file", path="run.mcap", column="command")

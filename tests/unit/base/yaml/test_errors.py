@@ -65,7 +65,6 @@ def test_what_may_be_of_several_types(text: str, problems: list[str]) -> None:
 
 
 def test_keys_and_suggestions() -> None:
-    """Dotted keys there and back, and suggestions."""
     assert dotted(("a", 0, "b")) == "a.0.b"
     assert loc_of("a.0.b") == ("a", 0, "b")
     assert loc_of("a.².b") == ("a", "²", "b")

@@ -72,7 +72,6 @@ def changed(before, after):
 
 
 def test_values_are_plain():
-    """Mappings, tuples, numbers, text and None: what pydantic's strict mode takes."""
     data = document("a: 1\nb: [1.5, x, true, null]\nc: {d: 0x10, e: 1.0e+3}\nf:\n").data
     assert data == {"a": 1, "b": (1.5, "x", True, None), "c": {"d": 16, "e": 1000.0}, "f": None}
 
@@ -249,7 +248,6 @@ def test_odd_scalars_become_text_or_numbers(text, value):
 
 
 def test_keys_are_text():
-    """Numbers, null and booleans as keys are their text."""
     assert document("1: a\nnull: b\ntrue: c\n2024-01-01: d\n").data == {
         "1": "a", "null": "b", "true": "c", "2024-01-01": "d",
     }  # fmt: skip
@@ -282,7 +280,6 @@ def test_set_changes_one_place(assignment, loc, value):
 
 
 def test_settings_add_up():
-    """Later settings see what earlier ones made."""
     one = document()
     one.set("limits={peak_a: 1.0}")
     one.set("limits.steps=[1]")
