@@ -19,7 +19,7 @@ class HilctlError(Exception):
 
 
 class InputError(HilctlError):
-    """Invalid input, such as a missing file or a value out of range; raised before anything moves."""
+    """Invalid input, such as a missing file or a value out of range."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -99,10 +99,7 @@ def named_from(folder: Path, setting: str) -> str:
 
 
 def resolve(
-    document: Document,
-    folder: Path,
-    settings: Sequence[str] = (),
-    files: TextFiles | None = None,
+    document: Document, folder: Path, settings: Sequence[str] = (), files: TextFiles | None = None
 ) -> LoadedExperiment:
     """Build an experiment from a YAML document, see :func:`load_experiment`."""
     files = TextFiles() if files is None else files

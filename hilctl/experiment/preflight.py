@@ -97,9 +97,7 @@ class CheckedExperiment:
 
 
 def check(
-    loaded: LoadedExperiment,
-    heat_a2: float = 0.0,
-    now_s: float | None = None,
+    loaded: LoadedExperiment, heat_a2: float = 0.0, now_s: float | None = None
 ) -> CheckedExperiment:
     """Compute the complete run and check it against device, model and limits.
 
@@ -184,10 +182,7 @@ def _start(
 
 
 def _state_before(
-    loaded: LoadedExperiment,
-    conditioned: F64,
-    now_s: float,
-    problems: list[ConfigProblem],
+    loaded: LoadedExperiment, conditioned: F64, now_s: float, problems: list[ConfigProblem]
 ) -> tuple[InitialState | None, str]:
     """Return the actuator's state before the waveform (None at rest) and its origin in words.
 

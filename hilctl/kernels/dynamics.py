@@ -148,7 +148,7 @@ def weigh_block(x: F64, weights: F64, memory: F64, out: F64) -> None:
 
 @kernel("void(float64[::1], float64[::1], float64[::1])")
 def delay_block(x: F64, memory: F64, out: F64) -> None:
-    """Delay a signal by n samples; ``memory``, float64[n + 1], holds them and the previous value."""
+    """Delay a signal by n samples; ``memory``, float64[n + 1], has these and the previous value."""
     for k in range(x.size):
         out[k] = _oldest(memory, x[k])
 

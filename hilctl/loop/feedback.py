@@ -81,12 +81,7 @@ class Feedback(Controller):
     """
 
     def __init__(
-        self,
-        gains: Gains,
-        rate_hz: float,
-        limit_um: float,
-        due_after: int,
-        shown_after: int = 2,
+        self, gains: Gains, rate_hz: float, limit_um: float, due_after: int, shown_after: int = 2
     ) -> None:
         super().__init__(limit_um, shown_after)
         self._kp = gains.kp

@@ -15,13 +15,7 @@ from hilctl.kernels.hysteresis import (
     integrated_inverse,
     play_sum,
 )
-from hilctl.models.base import (
-    Operator,
-    Thresholds,
-    Weights,
-    length_problems,
-    threshold_problems,
-)
+from hilctl.models.base import Operator, Thresholds, Weights, length_problems, threshold_problems
 from hilctl.models.plays import RateDependentPlays
 
 

@@ -83,8 +83,8 @@ def smoothing_weights(
     """Return weights for y + slope_gain y' + bend_gain y'' of a smoothed y, per sample.
 
     A cubic B-spline (four boxes in series) smooths, and minus half its variance times y'' flattens
-    its response to 1 - (w s)^4 / 8 at an angular frequency w, for a standard deviation s (``width``,
-    in samples; 0 for plain central differences). So slow signals pass unchanged, and corners are
+    its response to 1 - (w s)^4 / 8 at an angular frequency w. The standard deviation s is ``width``
+    in samples; 0 for plain central differences. So slow signals pass unchanged, and corners are
     rounded within about 2 s. Boxes are at most 64 samples long.
 
     Returns:

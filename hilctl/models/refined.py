@@ -10,13 +10,7 @@ import numpy as np
 from hilctl.base.strict import CheckedModel, Field
 from hilctl.base.types import F64
 from hilctl.kernels.residual_operator import Tables, residual_forward, residual_inverse
-from hilctl.models.base import (
-    HysteresisModel,
-    Operator,
-    Thresholds,
-    Weights,
-    threshold_problems,
-)
+from hilctl.models.base import HysteresisModel, Operator, Thresholds, Weights, threshold_problems
 from hilctl.models.generalised_pi import GeneralisedModel
 from hilctl.models.implicit_models import (
     BoucWenModel,

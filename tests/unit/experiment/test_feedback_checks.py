@@ -91,11 +91,7 @@ class TestExperiment:
         [
             (("block=50", "{b: 3.2}"), MODEL, "must be <= 3.121 Hz"),
             (("block=1", "{b: 5.1}"), MODEL, "must be <= 5 Hz"),
-            (
-                ("block=1", "{b: 13.0}"),
-                STAGED.replace("0.12", "0.04"),
-                "must be <= 12 Hz",
-            ),
+            (("block=1", "{b: 13.0}"), STAGED.replace("0.12", "0.04"), "must be <= 12 Hz"),
             (("block=1", "{b: 1.0, sensor_delay_s: 0.1}"), MODEL, "must be <= 0.317 Hz"),
         ],
     )

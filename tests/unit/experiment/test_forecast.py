@@ -105,10 +105,7 @@ LONG = {
     "no cycle at all": ("waveform.duration_s=40.0", f"waveform.frequency_hz={10 * math.pi}"),
     "sequence": (SEQUENCE,),
 }
-MODELS = {
-    "rdpi": terfenol_rdpi(),
-    "staged": load_model(MODEL.parent / "terfenol_staged.yaml"),
-}
+MODELS = {"rdpi": terfenol_rdpi(), "staged": load_model(MODEL.parent / "terfenol_staged.yaml")}
 
 
 class Counter:

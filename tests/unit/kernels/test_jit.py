@@ -80,10 +80,7 @@ def test_scalar_kernels_agree_with_python(v):
     def caller(v, deadbands):
         return stop(v, 0.2, 0.4, 0.1), value(v, *deadbands)
 
-    expected = (
-        stop.py_func(v, 0.2, 0.4, 0.1),
-        value.py_func(v, *DEADBANDS),
-    )
+    expected = (stop.py_func(v, 0.2, 0.4, 0.1), value.py_func(v, *DEADBANDS))
     assert (stop(v, 0.2, 0.4, 0.1), value(v, *DEADBANDS)) == expected
     assert caller(v, DEADBANDS) == expected
 

@@ -72,12 +72,6 @@ def test_a_jump_is_walked_in_steps():
     assert flags.tolist() == [SLEW, SLEW, SLEW, 0, 0, 0]
 
 
-def test_both_limits_at_once_set_both_flags():
-    command, flags = limited([50.0, -50.0])
-    assert command.tolist() == [0.25, 0.0]
-    assert flags.tolist() == [RANGE | SLEW, RANGE | SLEW]
-
-
 def test_flags_are_added_to_what_is_there():
     wanted = np.array([0.1, np.nan, 9.0, -9.0, 1.0])
     command, flags = np.empty(5), np.full(5, 64, dtype=np.uint32)

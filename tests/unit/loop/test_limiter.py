@@ -48,13 +48,6 @@ def test_the_sweep_covers_both_limits():
     assert limited(limiter, [-1e9] * 100)[0][-1] == LIMITS.low
 
 
-def test_wishes_within_limits_pass_untouched():
-    wanted = 0.5 + 0.3 * np.sin(np.linspace(0.0, 3.0, 200))
-    command, flags = limited(Limiter(LIMITS, DT_S), wanted)
-    assert np.array_equal(command, wanted)
-    assert not flags.any()
-
-
 def test_ramp_ends_exactly_at_the_safe_value():
     limiter = Limiter(LIMITS, DT_S)
     limited(limiter, np.full(100, 3.0))

@@ -4,12 +4,7 @@ import errno
 
 import pytest
 
-from hilctl.loop.pacer import (
-    LateRules,
-    Pacer,
-    SystemClock,
-    deadline_misses,
-)
+from hilctl.loop.pacer import LateRules, Pacer, SystemClock, deadline_misses
 from tests.fakes import FakeClock
 
 PERIOD_NS = 1_000_000

@@ -144,10 +144,7 @@ def test_the_model_undoes_its_inverse(model, v):
     assert np.max(np.abs(back - y)) <= 10.0 * TOLERANCE_UM
 
 
-@given(
-    MODELS,
-    hnp.arrays(np.float64, st.integers(1, 60), elements=st.floats(-1e150, 1e150)),
-)
+@given(MODELS, hnp.arrays(np.float64, st.integers(1, 60), elements=st.floats(-1e150, 1e150)))
 def test_the_inverse_never_leaves_its_span(model, y):
     command = model.inverse(RATE_HZ).process(y)
     assert np.all((command >= LOW) & (command <= HIGH))

@@ -344,8 +344,7 @@ def recording(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("name", "k"),
-    [("reference_um", 0), ("wanted", 1), ("command", 2), ("displacement_um", 3)],
+    ("name", "k"), [("reference_um", 0), ("wanted", 1), ("command", 2), ("displacement_um", 3)]
 )
 def test_columns(made: Made, recording: Path, name: str, k: int) -> None:
     """Each signal of a recording can be a waveform, at the recording's own rate."""
