@@ -32,8 +32,8 @@ NOW_S = datetime.fromisoformat("2026-01-01T00:01:00+00:00").timestamp()
 COMMAND = 4.0 * np.sin(np.pi * np.arange(1000) / 999.0)
 
 
-def record(path: Path, command, *, first=0, whole=True, flags=0, facts=None, end=None) -> Path:
-    """Write a run of these commands, of which the compensator knew nothing."""
+def record(path: Path, command, *, first=0, flags=0, facts=None, **made) -> Path:
+    """Write a run of these commands without a compensator."""
     blocks = command.size // BLOCK
     batch = BlockBatch.empty(blocks, BLOCK, 1)
     batch.heads[:, BlockHeader.FIRST_SAMPLE] = first + BLOCK * np.arange(blocks)
@@ -41,11 +41,18 @@ def record(path: Path, command, *, first=0, whole=True, flags=0, facts=None, end
     batch.heads[0, BlockHeader.DROPPED_BEFORE] = first
     batch.columns[:, list(COLUMNS).index("command")] = command.reshape(blocks, BLOCK)
     batch.flags[-1, -1] = flags
+    return write_recording(path, batch, facts={"run_id": "before", **(facts or {})}, **made)
+
+
+def write_recording(
+    path: Path, batch, rate_hz=RATE_HZ, *, whole=True, facts=None, end=None, measured=False
+) -> Path:
+    """Write blocks of a run without a compensator."""
     run = RunFacts(
-        facts={"run_id": "before", "compensator": "none", **(facts or {})},
+        facts={"compensator": "none", **(facts or {})},
         segments=(), experiment_yaml="name: made\n", model_yaml="",
         layout=RecordingLayout(
-            sample_rate_hz=RATE_HZ, command_unit="A", measures_command=False,
+            sample_rate_hz=rate_hz, command_unit="A", measures_command=measured,
             scope_rate_hz=1000.0, start_unix_ns=1_700_000_000_000_000_000,
         ),
     )  # fmt: skip
@@ -53,7 +60,7 @@ def record(path: Path, command, *, first=0, whole=True, flags=0, facts=None, end
         writer = RecordingWriter(stream, run)
         writer.batch(batch)
         if whole:
-            writer.finish({"code": "completed", **(end or {})}, first + command.size)
+            writer.finish({"code": "completed", **(end or {})}, writer.samples)
         else:
             writer.flush()
     return path

@@ -11,10 +11,9 @@ from hilctl.base.errors import DataError, InputError
 from hilctl.base.samples import COLUMNS, BlockBatch, BlockHeader
 from hilctl.base.segments import Segment
 from hilctl.base.types import F64
-from hilctl.recording.encoder import RecordingLayout
-from hilctl.recording.writer import RecordingWriter, RunFacts
 from hilctl.waveforms import shapes
 from hilctl.waveforms.build import Reference
+from tests.unit.experiment.test_initial_state import write_recording
 
 RATE_HZ = 1000.0
 WAVE = np.round(3.0 * np.sin(2.0 * np.pi * 10.0 * np.arange(200) / RATE_HZ), 6)
@@ -304,35 +303,12 @@ def column(k: int) -> F64:
 
 def record(path: Path, firsts: list[int], columns: F64) -> None:
     blocks = len(firsts)
-    heads = np.zeros((blocks, len(BlockHeader)), dtype=np.int64)
-    heads[:, BlockHeader.FIRST_SAMPLE] = firsts
-    heads[:, BlockHeader.SAMPLES] = BLOCK
-    heads[1:, BlockHeader.DROPPED_BEFORE] = np.diff(firsts) - BLOCK
-    batch = BlockBatch(
-        heads=heads,
-        states=np.zeros((blocks, 1)),
-        columns=np.ascontiguousarray(
-            columns.reshape(len(COLUMNS), blocks, BLOCK).transpose(1, 0, 2)
-        ),
-        flags=np.zeros((blocks, BLOCK), dtype=np.uint32),
-    )
-    facts = RunFacts(
-        facts={"compensator": "none"},
-        segments=(),
-        experiment_yaml="name: made\n",
-        model_yaml="",
-        layout=RecordingLayout(
-            sample_rate_hz=RATE_HZ,
-            command_unit="A",
-            measures_command=True,
-            scope_rate_hz=1000.0,
-            start_unix_ns=1_700_000_000_000_000_000,
-        ),
-    )
-    with path.open("xb") as stream:
-        writer = RecordingWriter(stream, facts)
-        writer.batch(batch)
-        writer.finish({"code": "completed"}, writer.samples)
+    batch = BlockBatch.empty(blocks, BLOCK, 1)
+    batch.heads[:, BlockHeader.FIRST_SAMPLE] = firsts
+    batch.heads[:, BlockHeader.SAMPLES] = BLOCK
+    batch.heads[1:, BlockHeader.DROPPED_BEFORE] = np.diff(firsts) - BLOCK
+    batch.columns[:] = columns.reshape(len(COLUMNS), blocks, BLOCK).transpose(1, 0, 2)
+    write_recording(path, batch, RATE_HZ, measured=True)
 
 
 @pytest.fixture
