@@ -64,32 +64,30 @@ def make_adaptation(
     )
 
 
-def adaptation_problems(loaded: LoadedExperiment, preview: int) -> list[ConfigProblem]:
-    """Return the broken rules of the ``adaptation`` section."""
+def adaptation_problems(loaded: LoadedExperiment, preview: int) -> Iterator[ConfigProblem]:
+    """Yield the broken rules of the ``adaptation`` section."""
     config, wanted = loaded.config, loaded.config.adaptation
     if wanted is None:
-        return []
-    found: list[ConfigProblem] = []
+        return
     if config.compensator is None:
-        found.append(loaded.problem("adaptation", "needs a compensator, whose model it adapts"))
+        yield loaded.problem("adaptation", "needs a compensator, whose model it adapts")
     if config.feedback is not None and wanted.offset_um:
         hint = "remove it: feedback corrects the same offset"
         rule, value = "must be 0 with feedback", f"{wanted.offset_um:g}"
-        found.append(loaded.problem("adaptation.offset_um", rule, value, hint))
+        yield loaded.problem("adaptation.offset_um", rule, value, hint)
     rests = config.condition is not None or (
         config.compensator is not None and config.compensator.offset == "measured"
     )
     if wanted.noise_um is None and not rests:
         rule = "is required without a rest before the waveform to measure it in"
         hint = "set it, or a condition, or compensator.offset: measured"
-        found.append(loaded.problem("adaptation.noise_um", rule, hint=hint))
+        yield loaded.problem("adaptation.noise_um", rule, hint=hint)
     shortest_s = _shortest_s(loaded, preview)
     if wanted.time_constant_s < shortest_s:
         rule = f"must be >= {shortest_s:.3g} s, by the delay of the loop"
         hint = "a smaller block or a higher rate shortens the delay"
         value = f"{wanted.time_constant_s:g}"
-        found.append(loaded.problem("adaptation.time_constant_s", rule, value, hint))
-    return found
+        yield loaded.problem("adaptation.time_constant_s", rule, value, hint)
 
 
 def adaptation_warnings(config: Experiment, segments: tuple[Segment, ...]) -> tuple[str, ...]:

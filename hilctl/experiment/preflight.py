@@ -7,7 +7,7 @@ in advance; the commands are compared with the limits.
 import logging
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -40,18 +40,6 @@ from hilctl.loop.adaptation import DisplacementOperator
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.lead_in import Conditioning
 from hilctl.waveforms.build import Reference, build
-
-RULES: tuple[Callable[[LoadedExperiment], list[ConfigProblem]], ...] = (
-    device_problems,
-    interlock_problems,
-    condition_problems,
-)
-"""Rules on the loaded experiment alone."""
-CORRECTION_RULES: tuple[Callable[[LoadedExperiment, int], list[ConfigProblem]], ...] = (
-    feedback_problems,
-    adaptation_problems,
-)
-"""Rules on the experiment and the preview of its compensator in samples."""
 
 _log = logging.getLogger(__name__)
 
@@ -108,7 +96,11 @@ def check(
         ConfigError: The run is rejected; all reasons are listed, each with its amount.
     """
     config = loaded.config
-    problems = [problem for rule in RULES for problem in rule(loaded)]
+    problems = [
+        *device_problems(loaded),
+        *interlock_problems(loaded),
+        *condition_problems(loaded),
+    ]
     try:
         reference = build(config.waveform, config.sample_rate_hz, loaded.folder)
     except InputError as error:
@@ -127,7 +119,8 @@ def check(
         forecast = forecast_of(loaded, reference, begun, conditioned, heat_a2)
     except ModelError as error:
         raise ConfigError([*problems, loaded.problem("compensator.model", str(error))]) from None
-    problems += [each for rule in CORRECTION_RULES for each in rule(loaded, begun.preview)]
+    problems += feedback_problems(loaded, begun.preview)
+    problems += adaptation_problems(loaded, begun.preview)
     problems += _start_problems(loaded, begun, forecast) or command_problems(loaded, forecast)
     if problems:
         raise ConfigError(problems)

@@ -10,13 +10,10 @@ from hilctl.base.events import ADAPTED
 from hilctl.base.samples import Flag
 from hilctl.kernels import gradient as kernel
 from hilctl.loop.adaptation import THRESHOLDS, Adaptation, AdaptationBounds, DisplacementOperator
-from hilctl.loop.compensator import Compensator
-from hilctl.loop.interlocks import InterlockContext
 from hilctl.loop.limiter import CommandLimits
-from hilctl.loop.loop import Loop
-from hilctl.loop.plan import LoopPlan
 from hilctl.models.plays import PpiModel
-from tests.fakes import FakeClock, FakeFifoDevice, FakeHost, made_block
+from tests.fakes import FakeFifoDevice, made_block
+from tests.unit.loop.test_loop import Rig
 
 RATE_HZ = 1000.0
 BOUNDS = AdaptationBounds(6.0, 0.1, 0.03)
@@ -204,25 +201,13 @@ def test_bad_bounds_and_time():
 class TestLoop:
     MODEL = PpiModel(direct=10.0, weights=(), thresholds=())
 
-    def ran(self, latency, block, device=None, reference=REFERENCE, **options):
-        device = device or FakeFifoDevice(latency)
+    def ran(self, latency, block, device=None):
         adapting, _ = adaptation(1, 1, bounds=AdaptationBounds(6.0, 0.1, 0.02))
-        compensator = Compensator(self.MODEL, RATE_HZ)
-        host = FakeHost(FakeClock(), block, compensator.state_size + 1, **options)
-        plan = LoopPlan(
-            reference=reference,
-            input_um=reference,
-            block=block,
-            latency_blocks=latency,
-            sample_rate_hz=RATE_HZ,
-            compensator=compensator,
-            limits=CommandLimits(-6.0, 6.0, 3000.0, 0.0, 100.0),
-            interlocks=InterlockContext(stroke_um=(-60.0, 60.0)),
-            adaptation=adapting,
-        )
-        loop = Loop(plan, device, host)
-        loop.begin_at(0.0)
-        return loop.run(0), adapting, host
+        rig = Rig(
+            REFERENCE, block=block, device=device or FakeFifoDevice(latency), model=self.MODEL,
+            limits=CommandLimits(-6.0, 6.0, 3000.0, 0.0, 100.0), adaptation=adapting,
+        )  # fmt: skip
+        return rig.run(), adapting, rig.host
 
     @pytest.mark.slow
     @pytest.mark.parametrize(("latency", "block"), [(0, 1), (0, 50), (3, 10)])

@@ -15,14 +15,12 @@ from hilctl.experiment.file import Experiment
 from hilctl.experiment.sections import PiFeedbackConfig
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.feedback import Feedback, Gains, IntegralFeedback
-from hilctl.loop.interlocks import InterlockContext
 from hilctl.loop.limiter import CommandLimits
-from hilctl.loop.loop import Loop
-from hilctl.loop.plan import LoopPlan
 from hilctl.models.linear_stages import FirstMode
 from hilctl.models.plays import PpiModel
 from hilctl.models.staged import FieldLag, StagedModel
-from tests.fakes import FakeClock, FakeFifoDevice, FakeHost, made_block
+from tests.fakes import FakeFifoDevice, made_block
+from tests.unit.loop.test_loop import Rig
 
 RATE_HZ = 5000.0
 EXPERIMENT = """\
@@ -424,31 +422,21 @@ MODEL = PpiModel(direct=9.0, weights=(1.0,), thresholds=(0.01,))
 @pytest.mark.parametrize("latency", [0, 3])
 def test_in_the_loop_of_a_fifo_device(latency, block):
     reference = 5.0 * np.sin(2.0 * np.pi * 5.0 * np.arange(3000) / INTEGRAL_RATE_HZ)
-    compensator = Compensator(MODEL, INTEGRAL_RATE_HZ)
-    device = FakeFifoDevice(latency)
-    host = FakeHost(FakeClock(), block, compensator.state_size + 1)
-    plan = LoopPlan(
-        reference=reference,
-        input_um=reference + 2.0,  # what the actuator is wrong by
-        block=block,
-        latency_blocks=latency,
-        sample_rate_hz=INTEGRAL_RATE_HZ,
-        compensator=compensator,
+    rig = Rig(
+        reference, block=block, device=FakeFifoDevice(latency), model=MODEL,
+        input_um=reference + 2.0,  # the actuator's error
         limits=CommandLimits(low=-5.0, high=5.0, slew_per_s=2000.0, safe=0.0, ramp_per_s=10.0),
-        interlocks=InterlockContext(stroke_um=(-60.0, 60.0)),
         feedback=integral(gain=2.0 * np.pi * block / INTEGRAL_RATE_HZ),
-    )
-    loop = Loop(plan, device, host)
-    loop.begin_at(0.0)
-    assert loop.run(0).code == "completed"
-    wanted, _, _, shown, _, fed = (host.column(row)[:3000] for row in range(6))
+    )  # fmt: skip
+    assert rig.run().code == "completed"
+    wanted, _, _, shown, _, fed = (rig.host.column(row)[:3000] for row in range(6))
     error_um = shown[1:] - wanted[:-1]
     assert np.abs(error_um[:200].mean()) > 1.0
     assert np.abs(error_um[-400:].mean()) < 0.05
     correction_um = fed - reference - 2.0
     assert np.abs(correction_um[: (latency + 1) * block]).max() < 1e-12
     assert np.abs(np.diff(correction_um)).max() < 0.05
-    assert np.isnan(host.column(5)[3000:]).all()
+    assert np.isnan(rig.host.column(5)[3000:]).all()
 
 
 @pytest.mark.parametrize(

@@ -46,6 +46,8 @@ class Rig:
             interlocks=InterlockContext(stroke_um=options.get("stroke_um", (-60.0, 60.0))),
             late_policy=options.get("policy", "skip"),
             late_rules=LateRules(**{**late, **options.get("late", {})}),
+            feedback=options.get("feedback"),
+            adaptation=options.get("adaptation"),
             conditioning=options.get("conditioning"),
             keep_all=options.get("keep_all", False),
         )
