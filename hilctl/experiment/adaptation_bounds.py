@@ -1,6 +1,6 @@
 """The ``adaptation`` section: its bounds, its rules, and the commands at its bounds."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -117,40 +117,37 @@ def _shortest_s(loaded: LoadedExperiment, preview: int) -> float:
 
 def worst_inputs(
     config: Experiment, operator: DisplacementOperator | None, input_um: F64
-) -> Iterator["WorstInput"]:
-    """Yield the compensator's input with the adaptation at its bounds, where it is largest."""
+) -> Iterator[Callable[[int, int], F64]]:
+    """Yield the compensator's input with the adaptation at its bounds, where it is largest.
+
+    Each input, float64[n] in all, returns its parts from a start to a stop, called in order.
+    """
     if operator is None:
         return
     # Parameters move no faster than the lead-in.
     led = min(config.lead_in_samples, input_um.size)
     for sign in (1.0, -1.0) if operator.bounds[0] else (1.0,):
-        worst = operator.form(
-            -operator.bounds * np.array([sign, *[1.0] * (operator.bounds.size - 1)])
-        )
-        yield WorstInput(operator, input_um, worst, led)
+        signs = np.array([sign, *[1.0] * (operator.bounds.size - 1)])
+        yield _worst_input(operator, input_um, operator.form(-operator.bounds * signs), led)
 
 
-class WorstInput:
-    """The compensator's input with adapted parameters, called part by part.
+def _worst_input(
+    operator: DisplacementOperator, input_um: F64, worst: F64, led: int
+) -> Callable[[int, int], F64]:
+    """Return the input with parameters that move over ``led`` samples from 0 to ``worst``."""
+    memory = operator.at_rest(float(input_um[0:1][0]))
 
-    The parameters move over ``led`` samples from 0 to ``worst``: float64[m], o, g and w_i.
-    """
-
-    def __init__(self, operator: DisplacementOperator, input_um: F64, worst: F64, led: int) -> None:
-        self._operator, self._input_um, self._worst, self._led = operator, input_um, worst, led
-        self._memory = operator.at_rest(float(input_um[0:1][0]))
-
-    def __call__(self, start: int, stop: int) -> F64:
-        """Return the next part, float64[stop - start]."""
-        out, worst = np.array(self._input_um[start:stop]), self._worst
-        on_the_way = max(min(stop, self._led) - start, 0)
+    def part(start: int, stop: int) -> F64:
+        out = np.array(input_um[start:stop])
+        on_the_way = max(min(stop, led) - start, 0)
         if on_the_way:
-            begins, ends = (at / self._led * worst for at in (start, start + on_the_way))
-            part = out[:on_the_way]
-            self._operator.invert(part, on_the_way, begins, ends, self._memory)
+            begins, ends = (at / led * worst for at in (start, start + on_the_way))
+            operator.invert(out[:on_the_way], on_the_way, begins, ends, memory)
         there = out[on_the_way:]
-        self._operator.invert(there, there.size, worst, worst, self._memory)
+        operator.invert(there, there.size, worst, worst, memory)
         return out
+
+    return part
 
 
 def at_worst(problem: ConfigProblem) -> ConfigProblem:

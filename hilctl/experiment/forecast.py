@@ -102,13 +102,14 @@ def forecast_of(
     if conditioned.size:
         figures.add_before(conditioned)
     values = reference.values
-    CommandSimulation(
+    simulate_commands(
         compensator,
         input_um or (lambda start, stop: begun.input_um[start:stop]),
         lambda start, stop: values[start:stop],
         values.size,
         figures,
-    ).run(reference.repeats)
+        reference.repeats,
+    )
     bytes_per_sample = _BYTES_PER_SAMPLE + (_BYTES_OF_INPUT if begun.input_um is not values else 0)
     low, high = reference.span
     command, heat = figures.command, figures.command.heat
@@ -134,63 +135,51 @@ def forecast_of(
     )
 
 
-class CommandSimulation:
-    """Simulation of the commands of a run, without the repeats of cycles that agree.
+def simulate_commands(
+    compensator: Compensator,
+    input_um: Callable[[int, int], F64],
+    reference: Callable[[int, int], F64],
+    size: int,
+    figures: "_RunFigures",
+    repeats: tuple[RepeatedPart, ...],
+) -> None:
+    """Simulate the commands of a run, without the repeats of cycles that agree.
 
     ``input_um`` and ``reference`` return their samples from a start to a stop, and are called in
-    order. The compensator is in the initial state of the run.
+    order. ``repeats`` are the periodic parts of the reference in order.
     """
+    at = 0
 
-    def __init__(
-        self,
-        compensator: Compensator,
-        input_um: Callable[[int, int], F64],
-        reference: Callable[[int, int], F64],
-        size: int,
-        figures: "_RunFigures",
-    ) -> None:
-        self._compensator, self._input_um, self._reference = compensator, input_um, reference
-        self._size, self._figures = size, figures
-        self._at = 0
-
-    def run(self, repeats: tuple[RepeatedPart, ...]) -> None:
-        """Simulate the run, given the periodic parts of its reference in order."""
-        for repeat in repeats:
-            self._advance(repeat.start)
-            self._skip_cycles(repeat)
-        self._advance(self._size)
-
-    def _advance(self, stop: int, cycle: F64 | None = None) -> None:
+    def advance(stop: int, cycle: F64 | None = None) -> None:
         """Simulate up to a sample; fill ``cycle`` (float64[n]) with the commands."""
-        begins = self._at
-        while self._at < stop:
-            start = self._at
-            self._at = min(start + CHUNK, stop)
-            command = np.empty(self._at - start)
-            self._compensator.process(self._input_um(start, self._at), command)
-            self._figures.add(self._reference(start, self._at), command)
+        nonlocal at
+        begins = at
+        while at < stop:
+            start, at = at, min(at + CHUNK, stop)
+            command = np.empty(at - start)
+            compensator.process(input_um(start, at), command)
+            figures.add(reference(start, at), command)
             if cycle is not None:
-                cycle[start - begins : self._at - begins] = command
+                cycle[start - begins : at - begins] = command
 
-    def _skip_cycles(self, repeat: RepeatedPart) -> None:
-        """Simulate cycles until two in a row agree, and skip the rest of a periodic part."""
+    for repeat in repeats:
+        advance(repeat.start)
         # The input runs ahead of the reference, so its periodic part ends earlier.
-        stop = repeat.stop - self._compensator.preview
+        stop = repeat.stop - compensator.preview
         cycle = whole_cycle(repeat.period, stop - repeat.start)
-        if cycle == 0:
-            return
         before, now = np.full((2, cycle), math.nan)
-        while stop - self._at >= 3 * cycle:
-            self._figures.mark()
-            self._advance(self._at + cycle, now)
-            times = (stop - self._at) // cycle - 1
+        while cycle and stop - at >= 3 * cycle:
+            figures.mark()
+            advance(at + cycle, now)
+            times = (stop - at) // cycle - 1
             with np.errstate(over="ignore", invalid="ignore"):  # NaN never agrees
                 same = bool(np.abs(now - before).max() * times <= _SAME * np.ptp(now))
             if same:
-                self._figures.skip(cycle, times)
-                self._at += times * cycle
-                return
+                figures.skip(cycle, times)
+                at += times * cycle
+                break
             before, now = now, before
+    advance(size)
 
 
 def whole_cycle(period: float, samples: int) -> int:

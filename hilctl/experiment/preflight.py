@@ -106,7 +106,9 @@ def check(
     except InputError as error:
         raise ConfigError([*problems, loaded.problem("waveform", str(error))]) from None
     _warn_of_long_work(reference)
-    findings = _range_findings(loaded, reference)
+    known = loaded.model.provenance.identified_range if loaded.model else None
+    in_um = reference.unit == "um"
+    findings = range_findings(known, reference) if known and in_um else RangeFindings()
     problems += reference_problems(loaded, reference.unit, *reference.span)
     hint = "identify the model on such motions, or keep the waveform within those it was fitted on"
     problems += [loaded.problem("waveform", text, hint=hint) for text in findings.refused]
@@ -141,14 +143,6 @@ def _warn_of_long_work(reference: Reference) -> None:
             "the waveform is not periodic: computing %.3g million samples before the start",
             samples * 1e-6,
         )
-
-
-def _range_findings(loaded: LoadedExperiment, reference: Reference) -> RangeFindings:
-    """Compare the reference with the motions that the model was identified on."""
-    known = loaded.model.provenance.identified_range if loaded.model else None
-    if known is None or reference.unit != "um":
-        return RangeFindings()
-    return range_findings(known, reference)
 
 
 def _start(

@@ -151,15 +151,12 @@ class FieldModel(CheckedModel, HysteresisModel):
         lengths = np.array(self.lengths, dtype=np.float64)
         return np.array(self.thresholds), lengths, values.ravel(), drags.ravel(), grid
 
-    def _span(self) -> tuple[float, float, float]:
-        """Return the lowest and highest u of the search, and the tolerance."""
-        width = self.cell * len(self.slopes[0])
-        return self.lowest - width, self.lowest + 2.0 * width, _TOLERANCE_UM
-
     def _parameters(self, sample_rate_hz: float) -> tuple[Any, ...]:
-        losses = self.losses.sampled(sample_rate_hz, self.cell * len(self.slopes[0]))
+        width = self.cell * len(self.slopes[0])
+        span = self.lowest - width, self.lowest + 2.0 * width, _TOLERANCE_UM
+        losses = self.losses.sampled(sample_rate_hz, width)
         curve = np.array(self.curve.operators_um), np.array(self.curve.displacement_um)
-        return self._span(), self._bank(), self.coupling, losses, curve
+        return span, self._bank(), self.coupling, losses, curve
 
     def forward(self, sample_rate_hz: float) -> Operator:
         """Return the operator from command to um, at rest."""

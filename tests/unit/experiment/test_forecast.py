@@ -12,10 +12,10 @@ import pytest
 from hilctl.base.types import F64
 from hilctl.experiment import forecast as command_simulation
 from hilctl.experiment.forecast import (
-    CommandSimulation,
     Forecast,
     LineEnds,
     fade_refusal,
+    simulate_commands,
     whole_cycle,
 )
 from hilctl.experiment.preflight import check
@@ -157,8 +157,8 @@ def gone_through(period: float, n: int, command_of: Any = None) -> Counter:
     def part(start: int, stop: int) -> F64:
         return np.asarray(reference(np.arange(start, stop, dtype=np.float64)))
 
-    run = CommandSimulation(Compensator(None, 1000.0), part, part, n, counted)
-    run.run((RepeatedPart(1000, n - 1000, period),))
+    repeats = (RepeatedPart(1000, n - 1000, period),)
+    simulate_commands(Compensator(None, 1000.0), part, part, n, counted, repeats)
     return counted
 
 
