@@ -18,18 +18,10 @@ from pydantic import (
 )
 
 __all__ = [
-    "AfterValidator",
-    "BeforeValidator",
-    "CheckedModel",
-    "Field",
-    "StrictModel",
-    "StringConstraints",
-    "ValidationError",
-    "ValidationInfo",
-    "WithJsonSchema",
-    "field_validator",
+    "AfterValidator", "BeforeValidator", "CheckedModel", "Field", "StrictModel",
+    "StringConstraints", "ValidationError", "ValidationInfo", "WithJsonSchema", "field_validator",
     "model_validator",
-]
+]  # fmt: skip
 
 
 class StrictModel(BaseModel):
