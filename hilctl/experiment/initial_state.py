@@ -176,19 +176,17 @@ class _Followed:
         """Yield the commands in order."""
         from hilctl.recording.reader import RecordingStream  # slow to import, rarely needed
 
-        samples = 0
-        unanswered = False
+        samples, whole, unanswered = 0, True, False
         for piece in RecordingStream(self._path):
             self._check(piece)
             index, flags = piece.samples.index, piece.samples.flags
             unanswered |= bool(np.any(flags & Flag.UNANSWERED.value))
-            if index.size:
-                self._check_whole(
-                    whole=index[0] == samples and index[-1] + 1 == samples + index.size
-                )
-            samples += index.size
+            stop = samples + index.size
+            whole &= not index.size or (index[0] == samples and index[-1] + 1 == stop)
+            samples = stop
             yield piece.samples.command
-        self._check_whole(whole=bool(samples and not piece.dropped and piece.end))
+        if not (whole and samples and piece.end) or piece.dropped:
+            raise DataError(f"{self._path}: is incomplete: the state of the actuator is unknown")
         if unanswered or piece.end.get("output_safe") == "false":
             lost = "lost its device, or did not confirm its safe value"
             raise DataError(f"{self._path}: {lost}: the state of the actuator is unknown")
@@ -204,7 +202,3 @@ class _Followed:
         if recording.sample_rate_hz != self._rate_hz:
             rates = f"{recording.sample_rate_hz:g} Hz, this run is at {self._rate_hz:g} Hz"
             raise DataError(f"{path}: was recorded at {rates}")
-
-    def _check_whole(self, *, whole: bool) -> None:
-        if not whole:
-            raise DataError(f"{self._path}: is incomplete: the state of the actuator is unknown")
