@@ -18,7 +18,6 @@ from hilctl.experiment.forecast import (
     simulate_commands,
     whole_cycle,
 )
-from hilctl.experiment.preflight import check
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.tuning import LinearBypass
 from hilctl.models.base import HysteresisModel
@@ -27,7 +26,7 @@ from hilctl.models.staged import FieldLag, StagedModel
 from hilctl.waveforms import shapes
 from hilctl.waveforms.build import RepeatedPart
 from tests.published import terfenol_rdpi
-from tests.unit.experiment.test_preflight import CURRENT, DISPLACEMENT, checked, loaded
+from tests.unit.experiment.test_preflight import CURRENT, DISPLACEMENT, checked
 
 MODEL = Path(__file__).parents[3] / "configs" / "models" / "terfenol_rdpi.yaml"
 
@@ -87,10 +86,6 @@ class TestForecast:
         assert plain.begun.state is None
         assert plain.begun.input_um is plain.reference.values
         assert result.forecast.recording_mb > plain.forecast.recording_mb
-
-    def test_nothing_is_touched(self) -> None:
-        given = loaded(CURRENT)
-        assert check(given).loaded is given
 
 
 BUDGET = ("limits.rms_current_a=4.0", "limits.thermal_time_constant_s=7.0")

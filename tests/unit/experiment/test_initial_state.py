@@ -110,13 +110,6 @@ def test_what_has_crept_goes_back_until_the_next_run(tmp_path, ended, still_s):
     np.testing.assert_allclose(left.state, wanted.state, rtol=0.0, atol=1e-6)
 
 
-def test_from_rest_the_same_reference_is_missed(tmp_path):
-    plant, inverse = OMEGA.forward(RATE_HZ), OMEGA.inverse(RATE_HZ)
-    plant.process(COMMAND)
-    reference = np.linspace(0.0, 2.0, 500)
-    assert np.abs(plant.process(inverse.process(reference.copy())) - reference).max() > 0.5
-
-
 def test_lead_in_of_a_run_that_is_shorter():
     memory = InitialState(np.zeros(1), 3.0, "")
     fed = np.zeros(10)

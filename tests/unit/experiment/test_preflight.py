@@ -556,13 +556,6 @@ def test_what_was_learned_on_another_motion_is_refused() -> None:
     assert "hilctl learn" in problem.hint
 
 
-def test_each_block_keeps_the_memory_and_the_command_before() -> None:
-    model = terfenol_rdpi()
-    kept = model.inverse(10_000.0).state().size
-    assert checked(DISPLACEMENT, model=model).state_size == kept + 1
-    assert checked(CURRENT).state_size == 1
-
-
 def test_work_that_takes_long_is_told(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -7,7 +7,6 @@ import numba
 import numpy as np
 import pytest
 
-from hilctl.kernels import atomics
 from hilctl.kernels.atomics import observe, publish
 
 SIGNATURES = {
@@ -38,12 +37,6 @@ def test_what_is_published_is_observed(page, value):
 def test_a_mapping_that_cannot_be_written_is_refused(page):
     with pytest.raises(TypeError):
         publish(page[1], 7, 1)
-
-
-def test_without_the_compiler_they_are_plain(page):
-    written, _ = page
-    atomics._plain_store(written, 7, 5)
-    assert atomics._plain_load(written, 7) == 5
 
 
 @pytest.mark.parametrize(

@@ -120,12 +120,6 @@ def test_play_sum_widens_with_its_own_rate(signal, rate_gain):
     close(out, plays_weighed(signal, growth))
 
 
-def test_the_rate_matters(signal):
-    still = run(hysteresis.play_sum, signal, 0.0, DIRECT, THRESHOLDS, WEIGHTS)
-    moving = run(hysteresis.play_sum, signal, GROWTH_S * RATE_HZ, DIRECT, THRESHOLDS, WEIGHTS)
-    assert np.max(np.abs(still - moving)) > 0.05
-
-
 def test_play_sum_shared_takes_the_widening_it_is_given(signal):
     growth = widenings(signal)
     shared = hysteresis.play_sum_shared
@@ -178,10 +172,3 @@ def test_integrated_inverse_is_deadbands_then_plays(signal):
 def test_no_operators_leave_the_direct_part(signal):
     out = run(hysteresis.play_sum, signal, 1.0, 2.0, np.empty(0), np.empty(0), operators=0)
     np.testing.assert_array_equal(out, 2.0 * signal)
-
-
-def test_rest_memory_has_no_previous_input():
-    """At rest the plays hold 0 and there is no previous input."""
-    memory = hysteresis.rest_memory(3)
-    assert memory[:3].tolist() == [0.0, 0.0, 0.0]
-    assert np.isnan(memory[3])

@@ -42,12 +42,6 @@ def test_no_pair_of_wishes_gets_out(before, after):
         last = command[0]
 
 
-def test_the_sweep_covers_both_limits():
-    limiter = Limiter(LIMITS, DT_S)
-    assert limited(limiter, [1e9] * 100)[0][-1] == LIMITS.high
-    assert limited(limiter, [-1e9] * 100)[0][-1] == LIMITS.low
-
-
 def test_ramp_ends_exactly_at_the_safe_value():
     limiter = Limiter(LIMITS, DT_S)
     limited(limiter, np.full(100, 3.0))
@@ -126,31 +120,24 @@ def test_a_block_of_no_samples_changes_nothing():
 
 
 FIELDS = {"low": -2.0, "high": 3.0, "slew_per_s": 100.0, "safe": 0.5, "ramp_per_s": 50.0}
-RANGE = "limits must be finite and rising: "
-SAFE = "the safe value must lie within -2.0 to 3.0: "
-RAMP = "the ramp must be > 0 and no faster than the slew limit "
 
 
 @pytest.mark.parametrize(
-    ("change", "text"),
+    ("rule", "key", "values"),
     [
-        ({"low": 4.0}, RANGE + "4.0, 3.0"),
-        ({"low": 3.0}, RANGE + "3.0, 3.0"),
-        ({"high": np.inf}, RANGE + "-2.0, inf"),
-        ({"low": -np.inf}, RANGE + "-inf, 3.0"),
-        ({"low": np.nan}, RANGE + "nan, 3.0"),
-        ({"safe": 3.1}, SAFE + "3.1"),
-        ({"safe": -2.1}, SAFE + "-2.1"),
-        ({"safe": np.nan}, SAFE + "nan"),
-        ({"ramp_per_s": 0.0}, RAMP + "100.0: 0.0"),
-        ({"ramp_per_s": 101.0}, RAMP + "100.0: 101.0"),
-        ({"slew_per_s": np.inf}, RAMP + "inf: 50.0"),
+        ("finite and rising", "low", [4.0, 3.0, -np.inf, np.nan]),
+        ("finite and rising", "high", [np.inf]),
+        ("safe value", "safe", [3.1, -2.1, np.nan]),
+        ("slew limit", "ramp_per_s", [0.0, 101.0]),
+        ("slew limit", "slew_per_s", [np.inf]),
     ],
 )
-def test_limits_that_mean_nothing_are_refused(change, text):
-    with pytest.raises(InputError) as caught:
-        CommandLimits(**{**FIELDS, **change})
-    assert str(caught.value) == text
+def test_limits_that_mean_nothing_are_refused(rule, key, values):
+    """The error names the values that break the rule."""
+    for value in values:
+        with pytest.raises(InputError, match=rule) as caught:
+            CommandLimits(**{**FIELDS, key: value})
+        assert str(value) in str(caught.value)
 
 
 @pytest.mark.parametrize(

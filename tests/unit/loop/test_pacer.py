@@ -208,14 +208,6 @@ def test_system_clock_sleeps_to_a_deadline():
     clock.sleep_until_ns(deadline_ns)
 
 
-@pytest.mark.parametrize("past_ns", [0, 1, 10**9])
-def test_the_kernel_is_not_asked_for_a_sleep_that_is_over(monkeypatch, past_ns):
-    clock = SystemClock()
-    monkeypatch.setattr(clock, "now_ns", lambda: 2 * 10**9)
-    monkeypatch.setattr(clock, "_nanosleep", lambda *_: 1 / 0)
-    clock.sleep_until_ns(2 * 10**9 - past_ns)
-
-
 def test_sleep_that_a_signal_interrupts_goes_on(monkeypatch):
     clock, codes, deadlines = SystemClock(), [errno.EINTR, errno.EINTR, 0], []
 
