@@ -92,7 +92,6 @@ def test_mistakes_have_their_line(table, text: str, message: str) -> None:
 
 @pytest.mark.parametrize("text", ["", " \n\t\n", "# a,b\n"])
 def test_nothing(table, text: str) -> None:
-    """Neither header nor rows."""
     assert refusal(table, text).startswith("t.csv: holds no rows")
 
 
@@ -120,7 +119,6 @@ def test_rows(table, other: str, first: int, last: int | None, found: list[int] 
 
 
 def test_columns(tmp_path: Path) -> None:
-    """By name or by number; what is not there, or twice, is refused with what is."""
     path, names = tmp_path / "t.csv", ["t", "x", "x", "4"]
     assert [column_index(path, column, names) for column in ("t", 1, "4", 4, 2)] == [0, 0, 3, 3, 1]
     known = "its columns are t, x, x, 4; numbers are 1 to 4"

@@ -50,7 +50,6 @@ def test_whole_cycles_are_all_counted(frequency_hz: float, cycles: int) -> None:
 
 
 def test_shifted() -> None:
-    """Shifting moves every index and nothing else."""
     moved = Segment("sine 6 A 10 Hz", 10, 500, 60, 450, 33.25).shifted(1000)
     assert moved == Segment("sine 6 A 10 Hz", 1010, 1500, 1060, 1450, 33.25)
 

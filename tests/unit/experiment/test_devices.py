@@ -234,7 +234,6 @@ class TestSchema:
         assert all(set(each.get("required", [])) <= set(each["properties"]) for each in found)
 
     def test_devices(self, schema: dict[str, Any]) -> None:
-        """Every built-in device is a choice, with its kind and its own options."""
         choices = [each["$ref"] for each in schema["properties"]["device"]["oneOf"]]
         assert choices == [f"#/$defs/device_{kind}" for kind in registry.known_devices()]
         for kind in registry.known_devices():
@@ -250,14 +249,12 @@ class TestSchema:
         ]  # fmt: skip
 
     def test_compensator(self, schema: dict[str, Any]) -> None:
-        """The compensator is the word none, or a model."""
         choices = schema["properties"]["compensator"]["anyOf"]
         assert {"const": "none", "type": "string"} in choices
         assert {"$ref": "#/$defs/CompensatorConfig"} in choices
         assert len(choices) == 2
 
     def test_waveforms(self, schema: dict[str, Any]) -> None:
-        """Every kind of waveform is a choice."""
         mapping = schema["properties"]["waveform"]["discriminator"]["mapping"]
         assert set(mapping) == {
             "sine", "triangle", "complex_harmonic", "growing", "decaying", "chirp", "step", "hold",

@@ -46,7 +46,6 @@ class TestExperiment:
         np.testing.assert_array_equal(checked.begun.input_um, checked.reference.values)
 
     def test_block_of_more_than_one(self, tmp_path):
-        """Feedback needs a block of 1."""
         assert "block: must be 1" in self.problems(tmp_path, "block=50")
 
     def test_too_much_bandwidth(self, tmp_path):
@@ -81,7 +80,6 @@ class TestExperiment:
     INTEGRAL = "feedback={kind: integral, limit_um: 5.0, bandwidth_hz: 1.0}"
 
     def test_integral_takes_blocks(self, tmp_path):
-        """An integrator needs neither a block of 1 nor a resonance, and its input is recorded."""
         (tmp_path / "model.yaml").write_text(MODEL)
         checked = check(resolve(Document("e", EXPERIMENT), tmp_path, ["block=50", self.INTEGRAL]))
         assert checked.records_input
@@ -121,7 +119,6 @@ RATE_HZ = 5000.0
 class TestMargins:
     @pytest.mark.parametrize("bandwidth_hz", [1.0, 50.0, 270.0])
     def test_bandwidth_is_where_the_loop_crosses_one(self, bandwidth_hz):
-        """The integral's gain is 1 at the bandwidth, whatever the rate."""
         step = gains_for(bandwidth_hz, RATE_HZ).ki_per_s / RATE_HZ
         turn = 1.0 - np.exp(-2j * np.pi * bandwidth_hz / RATE_HZ)
         assert abs(step / turn) == pytest.approx(1.0)
@@ -156,7 +153,6 @@ class TestMargins:
             assert (errors[-50:].max() < errors[10:60].max()) == fades
 
     def test_a_loop_that_never_falls_below_one_has_no_phase_margin(self):
-        """A proportional gain above 1 keeps the loop gain above 1 for ever."""
         assert margins(Gains(1.5, 1.0), RATE_HZ)[1] == 0.0
 
     @pytest.mark.parametrize(("kp", "ki"), [(-0.1, 1.0), (0.0, 0.0), (math.nan, 1.0)])

@@ -152,7 +152,6 @@ class TestAccepted:
         assert loaded.folder == folder
 
     def test_defaults(self) -> None:
-        """What is not given has its documented default."""
         loaded = load(MINIMAL)
         config = loaded.config
         assert config.block == 1
@@ -182,7 +181,6 @@ class TestAccepted:
         assert config.waveform.model_dump()["offset"] == 0.0
 
     def test_voltage(self) -> None:
-        """A device driven in V has its limits in V."""
         text = (
             MINIMAL.replace("simulated_terfenol", "simulated_piezo")
             .replace("unit: A", "unit: V")
@@ -211,7 +209,6 @@ class TestAccepted:
         assert again.yaml_text == loaded.yaml_text
 
     def test_file(self, folder: Path) -> None:
-        """Files in an experiment are found beside it."""
         (folder / "x.yaml").write_text(FULL)
         loaded = load_experiment(folder / "x.yaml")
         assert loaded.model is not None
@@ -317,7 +314,6 @@ class TestMany:
         assert problems(text) == [("x.yaml:4", "waveform.unit"), ("x.yaml:8", "safe.value")]
 
     def test_safe_value_not_given(self) -> None:
-        """Limits that leave 0 out need a safe value."""
         text = (
             MINIMAL.replace("simulated_terfenol", "simulated_piezo")
             .replace("unit: A", "unit: V")
@@ -372,7 +368,6 @@ class TestSet:
         ],
     )
     def test_broken(self, folder: Path, setting: str, key: str) -> None:
-        """A broken rule names the option it was given with."""
         assert problems(FULL, folder, (setting,)) == [(f"--set {setting}", key)]
 
     def test_a_broken_file_can_be_mended(self, folder: Path) -> None:
@@ -408,7 +403,6 @@ class TestDevice:
 class TestModel:
     @pytest.mark.parametrize("name", ["sub/lost.yaml", "."])
     def test_missing(self, folder: Path, name: str) -> None:
-        """A missing file or a folder is a problem of the line that names it."""
         found = problems(changed("model: model.yaml", f"model: {name}"), folder)
         assert found == [(f"x.yaml:{LINES['model']}", "compensator.model")]
 
@@ -422,7 +416,6 @@ class TestModel:
         ],
     )
     def test_broken(self, folder: Path, old: str, new: str, line: int, key: str) -> None:
-        """A broken model names its own file, line and key."""
         path = folder / "model.yaml"
         path.write_text(changed(old, new, MODEL))
         assert problems(FULL, folder) == [(f"{path}:{line}", key)]

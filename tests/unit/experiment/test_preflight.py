@@ -196,7 +196,6 @@ class TestReference:
 
 class TestCommand:
     def test_peak(self) -> None:
-        """A peak over the limit is refused, by how much included."""
         (found,) = refusals(CURRENT, "limits.peak_current_a=6.25")
         assert told([found]) == [("limits.peak_current_a", "-5.5 to 6.5 A")]
         assert "-6.25 to 6.25 A" in found.rule
@@ -214,7 +213,6 @@ class TestCommand:
         assert told(refusals(CURRENT, setting)) == [problem]
 
     def test_slew(self) -> None:
-        """A change faster than the limit is refused, with how many times too fast."""
         (found,) = refusals(CURRENT, "waveform.soft_start_s=0.1", "limits.slew_a_per_s=150.0")
         assert told([found]) == [("limits.slew_a_per_s", "377.004")]
         assert "150 A/s" in found.rule
@@ -222,7 +220,6 @@ class TestCommand:
         checked(CURRENT, "waveform.soft_start_s=0.1", "limits.slew_a_per_s=377.01")
 
     def test_voltage(self) -> None:
-        """For a device driven in V the keys and units are those of a voltage."""
         text = (
             CURRENT.replace("unit: A", "unit: V")
             .replace("peak_current_a: 7.0", "drive_v: [0.0, 5.0]")

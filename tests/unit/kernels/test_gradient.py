@@ -58,7 +58,6 @@ def test_inverse_is_exact():
 
 
 def test_identified_parameters_change_nothing():
-    """With all of them 0 the input goes through."""
     wanted = wanted_um()
     np.testing.assert_allclose(adapted(wanted, np.zeros(5)), wanted, atol=1e-12)
 
@@ -125,7 +124,6 @@ def test_parameters_go_where_the_error_is_less():
 
 
 def test_pace_and_bounds_hold():
-    """No faster than from 0 to the bound in the time constant, and no further."""
     step = Step()
     for k in range(400):
         step.take(np.full(5, MIDDLE_UM + 20.0), 15.0)
@@ -141,7 +139,6 @@ def test_dead_zone():
 
 
 def test_leakage():
-    """Gain and weights that nothing asks for go back; the offset stays."""
     step = Step(LEAK=0.1)
     step.values[:] = 0.5
     step.take(np.full(10, MIDDLE_UM - 0.5), 0.0)

@@ -141,7 +141,6 @@ def test_deadband_sum_follows_its_equation(x):
     (-0.5, -2.0, -1.5), (-0.5, -0.5, 0.0), (-0.5, 2.0, 0.0),
 ])  # fmt: skip
 def test_one_deadband_lets_through_what_is_beyond_it(d, x, expected):
-    """J_d is x - d beyond d and 0 elsewhere, for d of either sign."""
     none, one = np.empty(0), np.ones(1)
     up = (np.array([d]), one) if d > 0 else (none, none)
     down = (np.array([d]), one) if d < 0 else (none, none)

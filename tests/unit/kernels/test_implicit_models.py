@@ -24,7 +24,6 @@ def arrays(exponent):
 @pytest.mark.parametrize("change", [3.0, -3.0])
 @pytest.mark.parametrize("z", [-0.8, 0.0, 0.8])
 def test_a_large_step_is_the_same_as_many_small_ones(exponent, change, z):
-    """The step is exact, so its size makes no difference, also through z = 0."""
     small = z
     for _ in range(1000):
         small = bouc_wen_step(small, change / 1000.0, 0.7, -0.2, exponent)

@@ -87,7 +87,6 @@ def test_scalar_kernels_agree_with_python(v):
 
 @pytest.mark.parametrize("name", STREAMING)
 def test_float32_is_refused(name):
-    """A float32 array is an error at once, not a new compilation."""
     kernel, parameters = STREAMING[name]
     with pytest.raises(TypeError, match="No matching definition"):
         kernel(SIGNAL.astype(np.float32), *parameters, hysteresis.rest_memory(3), SIGNAL.copy())

@@ -305,7 +305,6 @@ class TestIntegralCorrection:
         assert fed[-1] == pytest.approx(-3.0, abs=1e-6)
 
     def test_it_fades_by_the_bandwidth(self):
-        """1 / (2 pi bandwidth) after a disturbance, 1/e of it is left."""
         fed = blocks(integral(), 60, offset_um=3.0)
         after = round(BLOCK / GAIN)
         assert fed[after + BLOCK] == pytest.approx(-3.0 * (1.0 - 1.0 / np.e), rel=0.03)

@@ -59,7 +59,6 @@ def test_interlocks_are_off_without_a_limit(columns):
 class TestStroke:
     @pytest.mark.parametrize("value", [-60.0, 0.0, 50.0])
     def test_within(self, value):
-        """The limits themselves are allowed."""
         trip, bench = trips(STROKE, 3, displacement=value)
         assert trip is None
         assert not bench.flags.any()
@@ -69,7 +68,6 @@ class TestStroke:
         [(-60.001, "-60"), (50.001, "50"), (77.7, "77.7"), (np.nan, "nan"), (np.inf, "inf")],
     )
     def test_outside(self, value, shown):
-        """What is outside, or not a number, trips where it stands and is flagged there only."""
         trip, bench = trips(STROKE, 4, first=100, displacement=[1.0, value, 2.0, value])
         reason = f"displacement {shown} µm at sample 101 is outside the stroke limits -60 to 50 µm"
         assert trip == Trip(101, "stroke", reason)
@@ -158,7 +156,6 @@ class TestFrozen:
         assert trip.sample == 42  # 30: the change; 32: more than 0.5 A from it; and 10 samples
 
     def test_resolution(self):
-        """Changes up to the resolution count as none; more than that counts."""
         limits = replace(FROZEN, frozen_um=0.25)
         command = np.arange(100.0)
         flicker = 1.0 + 0.25 * (np.arange(100) % 2)
@@ -188,7 +185,6 @@ class TestDeviation:
 
     @pytest.mark.parametrize("measured", [1.5, 2.0, 2.5])
     def test_within(self, measured):
-        """The limit itself is allowed, either way."""
         limits = replace(DEVIATION, safe=2.0, deviation_s=0.0)
         assert trips(limits, 50, command=2.0, measured=measured)[0] is None
 
@@ -279,7 +275,6 @@ class TestThermal:
         assert bench.feed(5).code == "thermal"
 
     def test_budget_is_the_square_of_the_rms(self):
-        """A current of 3 A may flow for ever where 3 A rms are allowed, one of 3.01 A not."""
         limits = replace(THERMAL, rms_current_a=3.0)
         assert trips(limits, 5000, command=3.0)[0] is None
         assert trips(limits, 5000, command=3.01)[0] is not None

@@ -189,7 +189,6 @@ class TestOffset:
 
     @pytest.mark.parametrize("size", [1, 7, 200])
     def test_noise_of_the_rest(self, size):
-        """The standard deviation of the window's samples, also far from 0; NaN of none."""
         shown = 1e5 + np.random.default_rng(1).normal(0.0, 0.03, 220)
         resting = LeadIn(conditioning(), 40)
         assert math.isnan(resting.noise_um)

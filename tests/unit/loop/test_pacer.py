@@ -60,7 +60,6 @@ def test_late_is_later_than_the_limit(late_ns, counted):
 
 
 def test_skip_leaves_out_ticks_and_keeps_the_phase():
-    """After 3.2 periods of stall, three ticks are left out and the next is on the old grid."""
     clock = FakeClock(5_000, {2: 3_200_000})
     paced = pacer(clock)
     assert [paced.wait() for _ in range(4)] == [0, 0, 3, 0]

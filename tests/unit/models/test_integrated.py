@@ -261,7 +261,6 @@ def test_the_inverse_undoes_the_model_on_its_wing(bias, input_range, wing):
 
 
 def test_rest_takes_no_command():
-    """Where the offset puts rest at 0 um, the inverse puts out nothing there."""
     rest_um = float(SHAPE(np.array([5.0]))[0])
     model = butterfly(bias=5.0, output_offset_um=-rest_um, output_range_um=(-rest_um, 5.0))
     assert model.inverse(RATE_HZ).process(np.zeros(3)) == pytest.approx(np.zeros(3), abs=1e-12)
@@ -282,13 +281,11 @@ def test_what_no_command_reaches_gets_the_turning_point():
 
 
 def test_an_odd_shape_is_refused():
-    """The side below 0 follows from evenness and can't be given."""
     with pytest.raises(ValidationError, match="even"):
         butterfly(shape=DeadbandFunction(down_thresholds=(-1.0,), down_weights=(0.2,)))
 
 
 def test_falling_shape_is_refused():
-    """A cumulative slope that is not above 0 has no inverse, and is named."""
     with pytest.raises(ValidationError, match="cumulative deadband slope"):
         butterfly(shape={"slope": 1.0, "up_thresholds": (1.0,), "up_weights": (-1.0,)})
 

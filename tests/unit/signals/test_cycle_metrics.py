@@ -211,7 +211,6 @@ def test_peak_and_rms_include_the_offset() -> None:
 
 
 def test_percent_of_nothing_is_none() -> None:
-    """A share of a stroke of 0 has no meaning."""
     assert cycle_metrics.percent(1.0, 0.0) is None
     assert cycle_metrics.percent(1.0, 4.0) == 25.0
 

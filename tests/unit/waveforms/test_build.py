@@ -26,7 +26,6 @@ def raised_cosine(x: float) -> float:
 
 class TestSoft:
     def test_envelope(self, made: Made) -> None:
-        """A soft waveform is 0 at both ends, and between them as if there were no softness."""
         hard = made(1000.0, **SINE, offset=3.0, duration_s=1.0).values
         soft = made(1000.0, **SINE, offset=3.0, duration_s=1.0, soft_start_s=0.2, soft_end_s=0.3)
         values = soft.values
@@ -39,7 +38,6 @@ class TestSoft:
         np.testing.assert_allclose(values[700:], shrink * hard[700:], rtol=0.0, atol=1e-12)
 
     def test_from_and_to_where_the_actuator_rests(self, made: Made) -> None:
-        """A safe value that is not 0 is left and reached without a step."""
         keys = {**SINE, "offset": 40.0, "duration_s": 1.0}
         hard = made(1000.0, **keys).values
         soft = made(1000.0, **keys, rest=50.0, soft_start_s=0.2, soft_end_s=0.3).values
@@ -49,7 +47,6 @@ class TestSoft:
         np.testing.assert_allclose(soft[:200], 50.0 + grow * (hard[:200] - 50.0), atol=1e-12)
 
     def test_offset_is_softened_too(self, made: Made) -> None:
-        """A held level grows from 0 and shrinks to 0 without a step, and never overshoots."""
         keys = {"kind": "hold", "level": 2.0, "offset": -7.0, "duration_s": 1.0}
         values = made(1000.0, **keys, soft_start_s=0.5, soft_end_s=0.5).values
         assert values[0] == 0.0
@@ -103,7 +100,6 @@ class TestSequence:
         assert reference.segments == one + tuple(each.shifted(1000) for each in one)
 
     def test_time_starts_anew_in_each_part(self, made: Made) -> None:
-        """The second of two equal sines starts at its own phase 0, mid-cycle cuts or not."""
         part = {**SINE, "duration_s": 0.13}
         values = made(1000.0, kind="sequence", parts=(part, part)).values
         np.testing.assert_array_equal(values[130:], values[:130])
@@ -183,7 +179,6 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
 
 @pytest.mark.parametrize(("keys", "text"), REFUSED)
 def test_refused(made: Made, keys: dict[str, Any], text: str) -> None:
-    """What can't be sampled is refused with the numbers that say why."""
     with pytest.raises(InputError) as caught:
         made(1000.0, **keys)
     assert str(caught.value) == text

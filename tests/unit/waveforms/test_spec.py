@@ -60,7 +60,6 @@ def test_broken_rules(section: str, line: int, key: str) -> None:
 
 
 def test_file() -> None:
-    """Keys of a file waveform are checked like all others."""
     found = problems(
         "  kind: file\n  unit: A\n  path: w.csv\n  column: true\n  resample: nearest\n"
         "  first_row: 0\n  last_row: 3.5\n"

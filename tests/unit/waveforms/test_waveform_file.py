@@ -104,7 +104,6 @@ class TestText:
         ("first", "last"), [(1, None), (11, None), (1, 50), (11, 50), (199, 200)]
     )
     def test_row_range(self, read: Read, first: int, last: int | None) -> None:
-        """Rows count from 1, header excluded, and the last one is used."""
         text = "t_s,x_um\n" + rows(T_S, WAVE)
         reference = read(text, column="x_um", first_row=first, last_row=last)
         np.testing.assert_array_equal(reference.values, WAVE[first - 1 : last])
@@ -144,7 +143,6 @@ class TestTextRefused:
 
 class TestRate:
     def test_contradiction(self, read: Read) -> None:
-        """A file_rate_hz that the time column contradicts is refused."""
         text = refusal(read, "t_s,x\n" + rows(T_S, WAVE), column="x", file_rate_hz=999.0)
         assert "file_rate_hz is 999 Hz" in text
         assert read("t_s,x\n" + rows(T_S, WAVE), column="x", file_rate_hz=1000).values.size == 200
@@ -165,7 +163,6 @@ class TestRate:
 
     @pytest.mark.parametrize("file_rate_hz", [250.0, 400.0, 2500.0])
     def test_linear(self, read: Read, file_rate_hz: float) -> None:
-        """Linear resampling follows the straight lines between the file's samples."""
         corners = np.array([0.0, 2.0, -1.0, 4.0, 4.0, 0.5])
         values = read(rows(corners), file_rate_hz=file_rate_hz, resample="linear").values
         last_s = 5.0 / file_rate_hz
@@ -288,7 +285,6 @@ class TestNpy:
 
     @pytest.mark.parametrize("shape", [(0,), (0, 2), (5, 0)])
     def test_empty(self, read: Read, tmp_path: Path, shape: tuple[int, ...]) -> None:
-        """An array without values holds no data."""
         text = refusal(read, npy(tmp_path, np.empty(shape)), "w.npy", file_rate_hz=RATE_HZ)
         assert text == "holds no data"
 
@@ -323,7 +319,6 @@ def recording(tmp_path: Path) -> Path:
     ("name", "k"), [("reference_um", 0), ("wanted", 1), ("command", 2), ("displacement_um", 3)]
 )
 def test_columns(made: Made, recording: Path, name: str, k: int) -> None:
-    """Each signal of a recording can be a waveform, at the recording's own rate."""
     keys = {"kind": "file", "path": recording.name, "column": name}
     reference = made(RATE_HZ, recording.parent, **keys)
     np.testing.assert_array_equal(reference.values, column(k))
