@@ -1,15 +1,12 @@
-"""Numbers in shared memory that say of other data that they are there: published, and observed.
+"""Flags in shared memory that announce other data: published by a writer, observed by a reader.
 
-A process that writes data and then a number that says so needs the number to be seen last; the
-process that reads the number needs to read the data after it. x86-64 keeps both orders by itself.
-ARM64 keeps neither: a block of samples could be taken out of the ring before it is whole. Python
-has no means for that, so this is the one place where kernels use instructions of LLVM: a store with
-release order and a load with acquire order. They also keep what comes after a store, and before a
-load, on its own side: a reader that copies data and then looks whether they still stood has them
-copied by then, and a writer that says that data are about to change has said so before they do.
+A reader must see data before the number that announces them. x86-64 keeps the order of writes and
+reads by itself, ARM64 does not, and Python cannot request it. So these kernels use LLVM
+instructions: a store with release order and a load with acquire order. They also order later writes
+after a store, and earlier reads before a load: a reader that copies data and then checks that they
+are still valid has copied them by then.
 
-A number that says nothing of other data needs none of it: eight bytes in their place are written
-and read whole.
+A number that announces nothing needs none of this: aligned eight bytes are written and read whole.
 """
 
 from collections.abc import Callable

@@ -1,12 +1,12 @@
-"""Field lag, structure, transport delay and creep between samples, forwards and backwards.
+"""Field lag, structure, transport delay and creep between samples, and their inverses.
 
-Memory of every kernel ends with the previous input; NaN means that there is none yet, and then the
-signal counts as having stood at its first value for ever. It is updated in place, so any cut of a
-signal into blocks gives the same bits as one call. ``out`` may be the input array itself.
+The memory of every kernel ends with the previous input; NaN means that there is none yet, and then
+the signal counts as constant before its first value. It is updated in place, so any cut into blocks
+gives the same bits. All signals are float64[n]; ``out`` may be the input array itself.
 
 Creep: every element follows its share of the displacement x by first order, T c' = s x - c, and
-y = x + c_1 + c_2 + ... Each step takes x from the sample before, so that the inverse is exact.
-Creep begins with the first sample, from none.
+y = x + c_1 + c_2 + ... Each step uses the previous x, so that the inverse is exact. Creep begins
+with the first sample, from 0.
 
 A mode is a pair of antiresonance and resonance. A mass on a damped spring follows x as in
 :func:`structure_block`; the output is (1 + 2 Z s / W + s^2 / W^2) of its position, with the
@@ -29,10 +29,10 @@ _SMALL = 1e-17  # a growth that rounding hides
 
 @kernel("float64(float64, float64, float64)")
 def _left_behind(behind: float, growth: float, periods: float) -> float:
-    """Return what is left of ``behind`` > 0 after a sample in which the command is held.
+    """Return the distance > 0 that remains after a sample with a constant command.
 
     With e the distance, tau de/dt = -e / (1 + b e), so ln e + b e falls by T / tau. Newton's
-    method for ln(b e) comes down to the root from above, because the function is convex.
+    method for ln(b e) converges from above, because the function is convex.
     """
     wide = growth * behind
     if wide < _SMALL:
@@ -120,7 +120,7 @@ def structure_block(x: F64, motion: F64, memory: F64, out: F64) -> None:
 
 @kernel("float64(float64[::1], float64)", inline=True)
 def _oldest(memory: F64, now: float) -> float:
-    """Put ``now`` into a row of values, oldest first, and return the one that leaves it."""
+    """Append ``now`` to a queue of values, and return the oldest one, which leaves it."""
     last = memory.size - 1
     if not abs(memory[last]) >= 0.0:
         for i in range(last):
@@ -172,7 +172,7 @@ def between_block(x: F64, part: float, memory: F64, out: F64) -> None:
 
 @kernel("float64(float64[::1], float64[::1])", inline=True)
 def _crept(parameters: F64, memory: F64) -> float:
-    """Let all elements go on by a sample, and return what they come to."""
+    """Advance all elements by a sample, and return their sum."""
     elements = memory.size - 1
     before = memory[elements]
     x = before if abs(before) < math.inf else 0.0  # none yet, or one that was no displacement
@@ -199,7 +199,7 @@ def creep_block(x: F64, parameters: F64, memory: F64, out: F64) -> None:
 
 @kernel("void(float64[::1], float64[::1], float64[::1], float64[::1])")
 def uncreep_block(y: F64, parameters: F64, memory: F64, out: F64) -> None:
-    """Undo :func:`creep_block`: take off what has crept."""
+    """Subtract the creep: the inverse of :func:`creep_block`."""
     for k in range(y.size):
         x = y[k] - _crept(parameters, memory)
         memory[memory.size - 1] = x
@@ -211,7 +211,7 @@ def uncreep_block(y: F64, parameters: F64, memory: F64, out: F64) -> None:
 
 @kernel("UniTuple(float64, 2)(float64[::1], float64[::1])", inline=True)
 def _carried(parameters: F64, memory: F64) -> tuple[float, float]:
-    """Return position and velocity a sample later, but for what the next x adds to them."""
+    """Return position and velocity a sample later, without the effect of the next x."""
     position, velocity, before = memory[0], memory[1], memory[2]
     p = parameters[0] * position + parameters[1] * velocity + parameters[2] * before
     q = parameters[4] * position + parameters[5] * velocity + parameters[6] * before
@@ -244,7 +244,7 @@ def mode_block(x: F64, parameters: F64, memory: F64, out: F64) -> None:
 
 @kernel("void(float64[::1], float64[::1], float64[::1], float64[::1])")
 def unmode_block(y: F64, parameters: F64, memory: F64, out: F64) -> None:
-    """Undo :func:`mode_block`, exactly."""
+    """Run the exact inverse of :func:`mode_block`."""
     for k in range(y.size):
         now = y[k]
         p, q = _carried(parameters, memory)

@@ -1,13 +1,13 @@
 """The generalised Prandtl-Ishlinskii model: plays with envelope functions, and its inverse.
 
-A generalised play holds ``max(gamma_l(v) - r, min(gamma_r(v) + r, held))`` (1.17). Where
+A generalised play has the output ``max(gamma_l(v) - r, min(gamma_r(v) + r, held))`` (1.17). If
 ``gamma_l <= gamma_r``, all of them are ordinary plays of one signal z, the generalised play of
-threshold 0: so the model is a sum of plays behind z, and its inverse is the inverse sum of plays
+threshold 0: so the model is a sum of plays of z, and its inverse is the inverse sum of plays
 before the inverse envelopes. Each envelope is ``c tanh(k v + s) + o``; where the falling one would
 lie below the rising one, it follows the rising one.
 
 Memory, float64[m + 2]: m play outputs, z, then the previous command (NaN: none yet, which is 0).
-It is updated in place, so any cut of a signal into blocks gives the same bits.
+It is updated in place, so any cut into blocks gives the same bits. Signals are float64[n].
 
 Source: section 2.2.6 of "Modeling and Compensation of Rate-Dependent Asymmetric Hysteresis
 Nonlinearities of Magnetostrictive Actuators", Concordia; equation numbers are that dissertation's.

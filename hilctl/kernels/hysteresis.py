@@ -1,13 +1,12 @@
 """Play, stop and deadband operators, their weighted sums, and the integrated model.
 
-Notation: ``v`` is an input, ``x`` what stands between the plays and the deadbands, ``y`` an output.
-A *widening* is what the rate adds to every threshold: ``r_i(v') = r_i + gamma |v'|`` (6.18).
+Notation: ``v`` is an input, ``x`` the signal between plays and deadbands, ``y`` an output. The
+*widening* is the rate's addition to every threshold: ``r_i(v') = r_i + gamma |v'|`` (6.18).
 
-Memory of a sum of m plays, float64[m + 1]: the m operator outputs, then the previous input. A
-previous input of NaN means that there is none yet: the rate is then zero, and an operator that
-holds 0 starts at ``max(v_0 - r, min(v_0 + r, 0))`` as the literature has it. Memory is updated in
-place, so any cut of a signal into blocks gives the same bits as one call. ``out`` may be the input
-array itself.
+Memory of a sum of m plays, float64[m + 1]: the m operator outputs, then the previous input. NaN
+means that there is none yet: then the rate is zero, and an operator with output 0 starts at
+``max(v_0 - r, min(v_0 + r, 0))`` as in the literature. Memory is updated in place, so any cut into
+blocks gives the same bits. ``out`` may be the input array itself.
 
 Source: "Modeling and Compensation of Rate-Dependent Asymmetric Hysteresis Nonlinearities of
 Magnetostrictive Actuators", Concordia; equation numbers are that dissertation's.

@@ -1,8 +1,8 @@
-"""Interlocks on the samples of a run: all of them in one pass, with memory from block to block.
+"""Interlocks on the samples of a run: all of them in one pass, with memory between blocks.
 
-Settings and memory are arrays with a named place for each number, so that one call a block does it
-all; see :class:`hilctl.loop.interlocks.Interlocks` for what they mean. A time is a whole number of
-samples; one that is infinite switches its interlock off.
+Settings and memory are arrays with a named place for each number, so that one call per block is
+enough; see :class:`hilctl.loop.interlocks.Interlocks` for their meaning. A time is a whole number
+of samples; an infinite one disables its interlock.
 """
 
 from enum import IntFlag
@@ -43,7 +43,7 @@ _TRACKING = int(InterlockFlag.TRACKING_ERROR)
 
 @kernel("int64(float64, float64[::1])", inline=True)
 def _invalid(displacement_um: float, settings: F64) -> int:
-    """Judge one reading by itself: within the stroke, and short of the sensor's ends."""
+    """Return the flag of a reading outside the stroke or at an end of the sensor's range."""
     within = settings[STROKE_LOW] <= displacement_um <= settings[STROKE_HIGH]
     seen = settings[RAIL_LOW] < displacement_um < settings[RAIL_HIGH]
     return 0 if within and seen else _INVALID
@@ -51,10 +51,10 @@ def _invalid(displacement_um: float, settings: F64) -> int:
 
 @kernel("int64(float64, float64, float64[::1], float64[::1])", inline=True)
 def _frozen(displacement_um: float, command: float, settings: F64, memory: F64) -> int:
-    """Count the samples for which the reading has stayed although the command has travelled.
+    """Count the samples with a constant reading after the command has travelled.
 
-    Time counts from the moment the command has gone far enough, so that a hold, however long, or
-    a step out of one does not look like a dead sensor.
+    Time counts from the moment of sufficient travel, so that a hold, however long, or a step after
+    one does not look like a dead sensor.
     """
     reading, run = memory[READING], memory[FROZEN_RUN]
     low, high = min(memory[LOWEST], command), max(memory[HIGHEST], command)
@@ -69,10 +69,10 @@ def _frozen(displacement_um: float, command: float, settings: F64, memory: F64) 
 
 @kernel("int64(float64, float64, float64[::1], float64[::1])", inline=True)
 def _deviating(measured: float, command: float, settings: F64, memory: F64) -> int:
-    """Count the samples at which the measured command is away from what was put out.
+    """Count the samples with a deviation of the measured command.
 
-    A reading may be taken before or after its own command takes effect, so it is held against the
-    span of this command and the one before. NaN is away from anything.
+    A reading may be taken before or after its own command takes effect, so it is compared with the
+    span of this command and the previous one. NaN always deviates.
     """
     previous, away = memory[COMMAND], settings[DEVIATION]
     low, high = min(previous, command) - away, max(previous, command) + away
@@ -101,7 +101,7 @@ def _too_hot(command: float, measured: float, settings: F64, memory: F64) -> int
 
 @kernel("int64(float64, float64, float64[::1], float64[::1])", inline=True)
 def _off_track(reference: float, displacement_um: float, settings: F64, memory: F64) -> int:
-    """Count the samples with too large an error; NaN, no reference, is none."""
+    """Count the samples with too large an error; without a reference (NaN) there is none."""
     run = memory[TRACKING_RUN] + 1.0
     if not abs(reference - displacement_um) > settings[TRACKING_UM]:
         run = 0.0
