@@ -94,12 +94,6 @@ def test_two_may_share(two):
     assert not is_locked(two[0])
 
 
-def test_a_look_leaves_no_lock(two):
-    one, other = two
-    assert not is_locked(one)
-    take_lock(other)
-
-
 def test_without_locks_nobody_is_kept_out(two, monkeypatch):
     monkeypatch.setattr(locks, "fcntl", None)
     for each in two:

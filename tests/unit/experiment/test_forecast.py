@@ -16,7 +16,6 @@ from hilctl.experiment.forecast import (
     LineEnds,
     fade_refusal,
     simulate_commands,
-    whole_cycle,
 )
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.tuning import LinearBypass
@@ -173,22 +172,6 @@ def test_what_drifts_is_worked_out(drift: float) -> None:
 def test_what_is_not_finite_is_worked_out() -> None:
     counted = gone_through(500.0, 1_000_000, lambda t: np.where(t > 10, np.nan, t))
     assert (counted.samples, counted.passed) == (1_000_000, 0)
-
-
-@pytest.mark.parametrize(
-    ("period", "samples", "cycle"),
-    [
-        (500.0, 10**9, 66_000),
-        (500.0 / 3.0, 10**9, 65_536 // 500 * 500 + 500),
-        (200_000.0, 10**9, 200_000),
-        (200_000.0, 799_999, 0),
-        (100.0 * math.sqrt(2.0), 10**9, 0),
-        (shapes.LONG + 1.0, 10**12, 0),
-    ],
-)
-def test_whole_cycles(period: float, samples: int, cycle: int) -> None:
-    assert whole_cycle(period, samples) == cycle
-    assert whole_cycle(period + 1e-6, 10**9) == 0
 
 
 REFERENCE = 10.0 + 5.0 * np.sin(np.arange(1000) / 50.0)

@@ -94,27 +94,6 @@ def test_parameters_say_the_whole_operator():
     np.testing.assert_allclose(out, actuator.displacement_um(REFERENCE - 4.0), atol=1e-9)
 
 
-def test_regressors_are_apart_over_the_reference():
-    _, operator = adaptation()
-    m = operator.bounds.size
-    sums, products = np.zeros(m), np.zeros((m, m))
-    kernel.regressor_sums(
-        REFERENCE.copy(),
-        operator.settings,
-        operator.table,
-        operator.shape,
-        operator.thresholds,
-        operator.at_rest(float(REFERENCE[0])),
-        np.zeros(m),
-        sums,
-        products,
-    )
-    size = np.sqrt(np.diag(products))
-    assert np.abs(sums[1:] / REFERENCE.size).max() < 1e-9
-    assert np.abs(products / np.outer(size, size) - np.eye(m)).max() < 0.4
-    assert np.abs(products[:2, :2] / np.outer(size[:2], size[:2]) - np.eye(2)).max() < 1e-9
-
-
 def test_noise_alone_moves_hardly_anything():
     noise = np.random.default_rng(2).normal(0.0, 0.05, REFERENCE.size)
     adapting, operator = adaptation(noise_um=0.05)

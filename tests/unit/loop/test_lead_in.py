@@ -180,18 +180,13 @@ class TestOffset:
         assert (outcome.code, "the model nan µm" in outcome.reason) == ("fault", True)
 
     @pytest.mark.parametrize("size", [1, 7, 20, 200])
-    def test_mean_over_the_rest_whatever_the_block(self, size):
-        shown = np.arange(220.0)
-        resting = LeadIn(conditioning(), 40)
-        for first in range(0, 220, size):
-            resting.take(first, shown[first : first + size])
-        assert resting.resting_um == np.arange(160.0, 180.0).mean()
-
-    @pytest.mark.parametrize("size", [1, 7, 200])
-    def test_noise_of_the_rest(self, size):
+    def test_mean_and_noise_of_the_rest(self, size):
+        """Mean and standard deviation of the samples at rest, also far from 0."""
         shown = 1e5 + np.random.default_rng(1).normal(0.0, 0.03, 220)
         resting = LeadIn(conditioning(), 40)
+        assert math.isnan(resting.resting_um)
         assert math.isnan(resting.noise_um)
         for first in range(0, 220, size):
             resting.take(first, shown[first : first + size])
+        assert resting.resting_um == pytest.approx(shown[160:180].mean(), rel=1e-12)
         assert resting.noise_um == pytest.approx(shown[160:180].std(), rel=1e-6)

@@ -79,26 +79,6 @@ def test_two_arrays_are_moved_alike():
     assert tuner.advance(1) == (2.0, 1.0, 1.0)
 
 
-@given(st.integers(0, 80), st.integers(1, 60))
-def test_samples_that_go_by_count(passed, samples):
-    looked, gone_by = ReferenceTuner(), ReferenceTuner()
-    for tuner in (looked, gone_by):
-        tuner.move(Tuning(0.3, -2.0, samples))
-    if passed:
-        looked.advance(passed)
-    gone_by.pass_over(passed)
-    assert (looked.gain, looked.offset, looked.moving) == (
-        gone_by.gain,
-        gone_by.offset,
-        gone_by.moving,
-    )
-    gain, offset = looked.gain, looked.offset
-    if passed:
-        gains, offsets, _ = (np.broadcast_to(each, 1) for each in looked.advance(1))
-        assert gains[0] <= gain
-        assert offsets[0] <= offset
-
-
 FADE = Tuning(1.0, 0.0, 30, 0, 0.0, LinearBypass(0.5, -1.0))
 BACK = replace(FADE, samples=20, inverse_share=1.0)
 

@@ -13,7 +13,7 @@ from hilctl.base.segments import Segment
 from hilctl.base.types import chunks
 from hilctl.waveforms import build as module
 from hilctl.waveforms import shapes
-from hilctl.waveforms.build import Reference, RepeatedPart, build, telling
+from hilctl.waveforms.build import Reference, RepeatedPart, build
 from hilctl.waveforms.spec import Hold
 
 Made = Callable[..., Reference]
@@ -284,19 +284,6 @@ def test_a_repeated_sequence_is_told_by_one_of_it(made: Made, small: None) -> No
 def test_what_does_not_repeat_is_told_by_all_of_it(made: Made, small: None) -> None:
     chirp = made(1000.0, **WAVES[4])
     assert chirp.telling == (slice(0, 4000),)
-
-
-def test_telling_parts() -> None:
-    n, chunk = 10**9, types.CHUNK
-    (all_of_it,) = telling(n, ())
-    assert (all_of_it.start, all_of_it.stop) == (0, n)
-    two = (RepeatedPart(100, 4 * 10**8, 500.0), RepeatedPart(5 * 10**8, n, 1e7 / 3.0))
-    first, second, last = telling(n, two)
-    assert (first.start, first.stop) == (0, 100 + chunk + 500)
-    assert second.start == 4 * 10**8 - chunk
-    assert second.stop == 5 * 10**8 + chunk + -(-8 * 10**7 // 3)
-    assert (last.start, last.stop) == (n - chunk, n)
-    assert telling(n, (RepeatedPart(0, chunk, 500.0),)) == (slice(0, n),)
 
 
 def test_a_value_that_is_none_is_refused_wherever_it_is(made: Made, small: None) -> None:
