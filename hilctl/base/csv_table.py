@@ -42,7 +42,6 @@ class TableRows:
     """Rows of a text table.
 
     Attributes:
-        path: The file.
         values: float64[columns, rows], all finite.
         lines: int64[rows], the line of each row in the file.
     """
@@ -52,14 +51,11 @@ class TableRows:
     lines: npt.NDArray[np.int64]
 
     def sample_rate_hz(self, time: int, tolerance: float) -> float:
-        """Return the sample rate from a time column in s, which must be evenly spaced.
-
-        Args:
-            time: Index of the column in ``values``.
-            tolerance: Largest deviation of a step from the median, relative to it.
+        """Return the sample rate from the column ``time`` in s, which must be evenly spaced.
 
         Raises:
-            DataError: Time does not rise, or not evenly; names the line.
+            DataError: Time does not rise, or a step deviates from the median by more than the
+                relative tolerance; names the line.
         """
         time_s: F64 = self.values[time]
         steps = np.diff(time_s)
@@ -83,9 +79,6 @@ class TableRows:
 
 class TextTable:
     """A text table with its columns and rows read on request.
-
-    Args:
-        path: The file.
 
     Attributes:
         names: Names of the columns, or their numbers from 1.
@@ -125,12 +118,7 @@ class TextTable:
     def read(
         self, columns: Sequence[int], first_row: int = 1, last_row: int | None = None
     ) -> TableRows:
-        """Read some columns of some rows; other cells may have any content.
-
-        Args:
-            columns: Their indices from 0.
-            first_row: First row, counted from 1 without header and comments.
-            last_row: Last row; None for all.
+        """Read the columns of some rows, counted from 1; other cells may have any content.
 
         Raises:
             DataError: Rows are missing, a row is longer or shorter than the first, or a value is
@@ -236,12 +224,7 @@ class TextTable:
 
 
 def column_index(path: Path, column: Column | None, names: Sequence[str]) -> int:
-    """Return a column's index from 0.
-
-    Args:
-        path: The file, for the message.
-        column: Its name, or its number from 1; None for the only one.
-        names: The names of all columns, in order.
+    """Return a column's index from 0, by its name or its number from 1; None for the only one.
 
     Raises:
         DataError: The column does not exist or is ambiguous.
@@ -263,13 +246,7 @@ def column_index(path: Path, column: Column | None, names: Sequence[str]) -> int
 
 
 def check_rows(path: Path, count: int, first_row: int, last_row: int | None) -> None:
-    """Reject rows that do not exist.
-
-    Args:
-        path: The file, for the message.
-        count: Number of rows.
-        first_row: First row requested, counted from 1.
-        last_row: Last row requested; None for the last of the file.
+    """Reject rows, counted from 1, that do not exist; ``last_row`` None is the last of the file.
 
     Raises:
         DataError: A row does not exist, or the last is before the first.

@@ -130,10 +130,6 @@ class Device(Protocol):
 
         Must not move the output.
 
-        Args:
-            sample_rate_hz: Samples per second.
-            block: Samples in each exchange.
-
         Raises:
             DeviceError: It cannot be reached, or does not support this rate or block.
         """

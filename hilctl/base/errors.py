@@ -19,11 +19,7 @@ class HilctlError(Exception):
 
 
 class InputError(HilctlError):
-    """Invalid input.
-
-    Examples: a file is missing, an output path can't be written, a command-line value is
-    out of range. Raised before anything moves.
-    """
+    """Invalid input, such as a missing file or a value out of range."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +29,6 @@ class ConfigProblem:
     Attributes:
         where: ``file:line`` of the value, or the option it was given with.
         key: Dotted key, for example ``limits.peak_current_a``; empty for the file as a whole.
-        rule: The rule in words.
         value: The invalid value as written; may be empty.
         hint: Suggested fix; may be empty.
     """
@@ -56,11 +51,7 @@ class ConfigProblem:
 
 
 class ConfigError(InputError):
-    """An experiment or model file breaks one or more rules; all of them are listed.
-
-    Examples: unknown key, a text where a number belongs, a limit of the wrong sign, a
-    compensator with a reference in amperes, a reference outside the model's range.
-    """
+    """An experiment or model file breaks one or more rules; all of them are listed."""
 
     def __init__(self, problems: Iterable[ConfigProblem]) -> None:
         self.problems = tuple(problems)
@@ -71,19 +62,11 @@ class ConfigError(InputError):
 
 
 class ModelError(InputError):
-    """Model parameters break a condition of the model or of its inverse.
-
-    Examples: a weight below zero, thresholds out of order, a cumulative deadband slope
-    that is not positive. The text names the condition and the index.
-    """
+    """Model parameters break a condition, named with its index, of the model or of its inverse."""
 
 
 class DataError(InputError):
-    """A recording or data file is unreadable or lacks the requested data.
-
-    Examples: not an MCAP file, no ``/samples`` topic, a CSV column missing, no steady
-    cycle in the data.
-    """
+    """A recording or data file is unreadable or lacks the requested data."""
 
 
 class RunError(HilctlError):
@@ -91,16 +74,12 @@ class RunError(HilctlError):
 
 
 class DeviceError(RunError):
-    """A device rejected a value, answered wrongly, or disconnected.
-
-    Examples: a command outside the device's range, a time-out, an unplugged cable. The
-    text names the device and the operation.
-    """
+    """A device rejected a value, answered wrongly, or disconnected; names device and operation."""
 
 
 class UnconfirmedError(DeviceError):
     """The command was sent, but the device cannot confirm it.
 
-    Examples: an output set by unanswered lines that cannot be read back; a write whose
-    correct reply equals the request, on a serial line that may echo.
+    Examples: an output set by unanswered lines that cannot be read back; a write whose correct
+    reply equals the request, on a serial line that may echo.
     """

@@ -43,10 +43,8 @@ class Event:
     """An event of a run.
 
     Attributes:
-        sample: Its sample index.
         level: ``info``, ``warning`` or ``error``.
         code: Short name for programs, for example ``run_ended``.
-        text: One line of text.
         values: Its numbers by name.
         time_ns: Unix time in ns; 0 for the due time of its sample.
         before: The last samples up to it, or None.

@@ -50,12 +50,8 @@ MAX_TEXT_BYTES = 16 * 1024**2
 def read_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
     """Return a file's text.
 
-    Args:
-        path: The file.
-        max_bytes: Its largest size, checked before reading.
-
     Raises:
-        InputError: The file cannot be read, is too large, or is not UTF-8 text.
+        InputError: The file cannot be read, is too large (checked before reading), or is not UTF-8.
     """
     try:
         if path.exists() and not path.is_file():
@@ -75,11 +71,7 @@ def read_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
 
 
 def sync_folder(path: Path) -> None:
-    """Flush a folder to the disk, so that the name of a new file survives a power cut.
-
-    Raises:
-        OSError: The disk reports an error.
-    """
+    """Flush a folder to the disk, so that the name of a new file survives a power cut."""
     try:
         folder = os.open(path, os.O_RDONLY)
     except PermissionError:  # Windows cannot open folders
@@ -96,11 +88,8 @@ def sync_folder(path: Path) -> None:
 class AtomicFile:
     """A file that appears complete or not at all.
 
-    It is written under a temporary name in the same folder, and discarded unless committed.
-
-    Args:
-        path: The file; if it may be replaced and is a link, the target of the link.
-        overwrite: Whether a file of that name may be replaced.
+    It is written under a temporary name in the same folder, and discarded unless committed. If it
+    may be replaced and is a link, the target of the link is replaced.
 
     Attributes:
         stream: The new file, open for writing.
@@ -177,11 +166,7 @@ RECORDING_MAGIC = b"\x89MCAP0\r\n"
 
 
 def begins_as_recording(path: Path) -> bool:
-    """Return whether a file begins like a recording; an empty one does.
-
-    Raises:
-        OSError: The file cannot be read.
-    """
+    """Return whether a file begins like a recording; an empty one does."""
     with path.open("rb") as stream:
         head = stream.read(len(RECORDING_MAGIC))
     return head == RECORDING_MAGIC[: len(head)]
@@ -213,11 +198,6 @@ def already_there(path: Path, remedy: str) -> InputError:
 def write_file(path: Path, write: Callable[[BinaryIO], object], *, overwrite: bool) -> None:
     """Write a file atomically.
 
-    Args:
-        path: The file.
-        write: Writes its content to a stream.
-        overwrite: Replace a file of that name.
-
     Raises:
         InputError: A file of that name exists, or it cannot be written.
     """
@@ -234,13 +214,8 @@ def write_text(path: Path, text: str, *, overwrite: bool) -> None:
 def check_writable(path: Path, *, overwrite: bool, inputs: Iterable[Path] = ()) -> None:
     """Reject a file that cannot be written, before the work for it starts.
 
-    Args:
-        path: The file.
-        overwrite: Whether a file of that name may be replaced.
-        inputs: Files that are read for it; they are never replaced.
-
     Raises:
-        InputError: It is one of them, or :func:`write_file` would fail now.
+        InputError: It is one of the inputs, or :func:`write_file` would fail now.
     """
     check_no_input(path, inputs)
     with _written(path, overwrite=overwrite):
@@ -248,11 +223,7 @@ def check_writable(path: Path, *, overwrite: bool, inputs: Iterable[Path] = ()) 
 
 
 def check_no_input(path: Path, inputs: Iterable[Path]) -> None:
-    """Reject an output that is also an input.
-
-    Raises:
-        InputError: It is an input.
-    """
+    """Raise InputError if an output is also an input."""
     for each in inputs:
         with suppress(OSError):  # a missing file is not an input
             if path.samefile(each):
@@ -290,12 +261,7 @@ PORT_REMEDIES = {
 
 
 def reason(error: OSError, remedies: Mapping[int, str] = REMEDIES) -> str:
-    """Return the text of an OS error, with a fix if one is known.
-
-    Args:
-        error: The error.
-        remedies: Fixes by ``errno``.
-    """
+    """Return the text of an OS error, with a fix if one is known by its ``errno``."""
     text = error.strerror or str(error)
     remedy = remedies.get(error.errno or 0, "")
     return f"{text} ({remedy})" if remedy else text

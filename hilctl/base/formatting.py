@@ -46,10 +46,7 @@ def significant(value: float, digits: int = _DIGITS) -> str:
 def quantity(value: float | None, unit: str = "", digits: int = _DIGITS) -> str:
     """Return a value with its unit: 39910 us is 39.9 ms; a dash for None.
 
-    Args:
-        value: The value, in ``unit``.
-        unit: Its unit; s, us and um are scaled to a suitable multiple.
-        digits: Significant digits.
+    The units s, us and um are scaled to a suitable multiple.
     """
     if value is None:
         return MISSING
@@ -69,9 +66,7 @@ MOST_SHOWN = 100
 def printable(text: str, *, lines: bool = False) -> str:
     r"""Return a text with control characters and direction marks escaped (``\x1b``, ``\u202e``).
 
-    Args:
-        text: Any text.
-        lines: Keep line ends and tabs.
+    Line ends and tabs are kept with ``lines``.
     """
     if text.isprintable():  # nearly always
         return text

@@ -17,11 +17,7 @@ except ImportError:  # Windows, where no runs take place
 
 
 def memory_folder() -> Path:
-    """Return a folder in memory, or the folder for temporary files.
-
-    Raises:
-        OSError: Neither exists.
-    """
+    """Return a folder in memory, or the folder for temporary files."""
     shared = Path("/dev/shm")  # noqa: S108  the kernel's own shared-memory mount
     if shared.is_dir() and os.access(shared, os.W_OK):
         return shared
@@ -35,9 +31,6 @@ def user_folders() -> list[Path]:
 
     The second one is safe if another user occupies the first, because only the user can write to
     its parent. It is second because it is small and disappears at log-out.
-
-    Raises:
-        OSError: No folder for temporary files is writable.
     """
     if not hasattr(os, "geteuid"):  # Windows: the folder for temporary files is one's own
         return [memory_folder() / "hilctl"]
@@ -46,15 +39,11 @@ def user_folders() -> list[Path]:
 
 
 def private_folder(path: Path, *, make: bool = True) -> Path:
-    """Return a folder after checking its owner and permissions.
-
-    Args:
-        path: The folder; its parent is trusted.
-        make: Create it if missing.
+    """Return a folder, created if ``make``, after checking its owner and permissions.
 
     Raises:
         OSError: It cannot be created, is a link or no folder, belongs to another user, or is
-            writable by others.
+            writable by others. Its parent is trusted.
     """
     if make:
         with suppress(FileExistsError):
@@ -80,10 +69,6 @@ HAS_LOCKS = fcntl is not None
 
 def take_lock(held: int | IO[bytes], *, shared: bool = False) -> None:
     """Lock an open file or folder until it is closed; does nothing without system support.
-
-    Args:
-        held: The file or its descriptor.
-        shared: Take a shared lock instead of an exclusive one.
 
     Raises:
         BlockingIOError: Another process holds the lock.

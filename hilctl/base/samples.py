@@ -28,7 +28,6 @@ class RecordedField:
 
     Attributes:
         name: Name with unit; in events with the prefix ``before_``.
-        unit: Unit of its values.
         block: Its number in ``hilctl.SampleBlock``.
         before: Its number in ``hilctl.Event``, for the samples before the event.
         scope: Its number in ``hilctl.Sample``; 0 if it has no such field.
@@ -46,7 +45,6 @@ class SampleColumn:
     """A column with one float64 per sample.
 
     Attributes:
-        meaning: One line of text.
         recorded_as: Its field, for commands in volt unless ``recorded_in_v`` is set.
         recorded_in_v: Its field for commands in volt; None if its unit does not depend on them.
         when: Condition for recording it.
@@ -142,13 +140,7 @@ class Samples:
 
     @classmethod
     def of(cls, index: I64, values: F64, flags: U32) -> Self:
-        """Return samples by the rows of a block's columns; nothing is copied.
-
-        Args:
-            index: int64[n].
-            values: float64[len(COLUMNS), n].
-            flags: uint32[n].
-        """
+        """Return samples by the rows of a block's columns, float64[len(COLUMNS), n], not copied."""
         return cls(index=index, flags=flags, **dict(zip(COLUMNS, values, strict=True)))
 
     def column(self, name: str) -> F64:

@@ -1,6 +1,6 @@
 """Segments of a run: its waveforms and their steady cycles, which metrics are computed on."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Self
 
 SHORTEST_PERIOD = 1.0
@@ -29,14 +29,8 @@ class Segment:
 
     def shifted(self, samples: int) -> "Segment":
         """Return the segment shifted by a number of samples."""
-        return Segment(
-            self.label,
-            self.start + samples,
-            self.stop + samples,
-            self.steady_start + samples,
-            self.steady_stop + samples,
-            self.period,
-        )
+        names = ("start", "stop", "steady_start", "steady_stop")
+        return replace(self, **{name: getattr(self, name) + samples for name in names})
 
     def steady_cycles(self) -> tuple[int, int, int]:
         """Return the complete steady cycles for metrics.

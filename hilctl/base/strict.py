@@ -1,5 +1,8 @@
 """Base of all pydantic models, and the pydantic names that models use."""
 
+from collections.abc import Iterable
+from typing import Self
+
 from pydantic import (
     AfterValidator,
     BaseModel,
@@ -15,20 +18,27 @@ from pydantic import (
 )
 
 __all__ = [
-    "AfterValidator",
-    "BeforeValidator",
-    "Field",
-    "StrictModel",
-    "StringConstraints",
-    "ValidationError",
-    "ValidationInfo",
-    "WithJsonSchema",
-    "field_validator",
+    "AfterValidator", "BeforeValidator", "CheckedModel", "Field", "StrictModel",
+    "StringConstraints", "ValidationError", "ValidationInfo", "WithJsonSchema", "field_validator",
     "model_validator",
-]
+]  # fmt: skip
 
 
 class StrictModel(BaseModel):
     """A frozen model that rejects unknown keys, other types, NaN and infinity."""
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
+
+
+class CheckedModel(StrictModel):
+    """A model with conditions on several keys; one error lists every broken one."""
+
+    def _problems(self) -> Iterable[str]:
+        """Return the broken conditions."""
+        return ()
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if text := "; ".join(self._problems()):
+            raise ValueError(text)
+        return self

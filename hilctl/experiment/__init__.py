@@ -17,22 +17,8 @@ examples.py       shipped examples and copies of them
 """
 
 PUBLIC = (
-    "adaptation_bounds",
-    "coil_heat",
-    "conditioning",
-    "correction",
-    "device_rules",
-    "device_state",
-    "devices",
-    "examples",
-    "feedback_checks",
-    "file",
-    "forecast",
-    "initial_state",
-    "load",
-    "model_validity",
-    "preflight",
-    "sections",
-    "template",
-)
+    "adaptation_bounds", "coil_heat", "conditioning", "correction", "device_rules", "device_state",
+    "devices", "examples", "feedback_checks", "file", "forecast", "initial_state", "load",
+    "model_validity", "preflight", "sections", "template",
+)  # fmt: skip
 """Modules that other rooms import; the others are private."""

@@ -1,6 +1,6 @@
 """The ``adaptation`` section: its bounds, its rules, and the commands at its bounds."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -51,13 +51,7 @@ def adapted_operator(config: Experiment, reference: Reference) -> DisplacementOp
 def make_adaptation(
     config: Experiment, operator: DisplacementOperator | None, compensator: Compensator
 ) -> Adaptation | None:
-    """Return the adaptation of a run, or None.
-
-    Args:
-        config: The experiment.
-        operator: See :func:`adapted_operator`.
-        compensator: The compensator behind it.
-    """
+    """Return the adaptation of a run, or None."""
     wanted = config.adaptation
     if wanted is None or operator is None:
         return None
@@ -70,46 +64,34 @@ def make_adaptation(
     )
 
 
-def adaptation_problems(loaded: LoadedExperiment, preview: int) -> list[ConfigProblem]:
-    """Return the broken rules of the ``adaptation`` section.
-
-    Args:
-        loaded: The experiment.
-        preview: Preview of its compensator in samples.
-    """
+def adaptation_problems(loaded: LoadedExperiment, preview: int) -> Iterator[ConfigProblem]:
+    """Yield the broken rules of the ``adaptation`` section."""
     config, wanted = loaded.config, loaded.config.adaptation
     if wanted is None:
-        return []
-    found: list[ConfigProblem] = []
+        return
     if config.compensator is None:
-        found.append(loaded.problem("adaptation", "needs a compensator, whose model it adapts"))
+        yield loaded.problem("adaptation", "needs a compensator, whose model it adapts")
     if config.feedback is not None and wanted.offset_um:
         hint = "remove it: feedback corrects the same offset"
         rule, value = "must be 0 with feedback", f"{wanted.offset_um:g}"
-        found.append(loaded.problem("adaptation.offset_um", rule, value, hint))
+        yield loaded.problem("adaptation.offset_um", rule, value, hint)
     rests = config.condition is not None or (
         config.compensator is not None and config.compensator.offset == "measured"
     )
     if wanted.noise_um is None and not rests:
         rule = "is required without a rest before the waveform to measure it in"
         hint = "set it, or a condition, or compensator.offset: measured"
-        found.append(loaded.problem("adaptation.noise_um", rule, hint=hint))
+        yield loaded.problem("adaptation.noise_um", rule, hint=hint)
     shortest_s = _shortest_s(loaded, preview)
     if wanted.time_constant_s < shortest_s:
         rule = f"must be >= {shortest_s:.3g} s, by the delay of the loop"
         hint = "a smaller block or a higher rate shortens the delay"
         value = f"{wanted.time_constant_s:g}"
-        found.append(loaded.problem("adaptation.time_constant_s", rule, value, hint))
-    return found
+        yield loaded.problem("adaptation.time_constant_s", rule, value, hint)
 
 
 def adaptation_warnings(config: Experiment, segments: tuple[Segment, ...]) -> tuple[str, ...]:
-    """Return reasons why the adaptation may have no effect or an unwanted one.
-
-    Args:
-        config: The experiment.
-        segments: Segments of its reference.
-    """
+    """Return reasons why the adaptation may have no effect or an unwanted one."""
     wanted = config.adaptation
     if wanted is None:
         return ()
@@ -135,50 +117,37 @@ def _shortest_s(loaded: LoadedExperiment, preview: int) -> float:
 
 def worst_inputs(
     config: Experiment, operator: DisplacementOperator | None, input_um: F64
-) -> Iterator["WorstInput"]:
+) -> Iterator[Callable[[int, int], F64]]:
     """Yield the compensator's input with the adaptation at its bounds, where it is largest.
 
-    Args:
-        config: The experiment.
-        operator: The adapted operator; None without adaptation.
-        input_um: float64[n], the input without adaptation.
+    Each input, float64[n] in all, returns its parts from a start to a stop, called in order.
     """
     if operator is None:
         return
     # Parameters move no faster than the lead-in.
     led = min(config.lead_in_samples, input_um.size)
     for sign in (1.0, -1.0) if operator.bounds[0] else (1.0,):
-        worst = operator.form(
-            -operator.bounds * np.array([sign, *[1.0] * (operator.bounds.size - 1)])
-        )
-        yield WorstInput(operator, input_um, worst, led)
+        signs = np.array([sign, *[1.0] * (operator.bounds.size - 1)])
+        yield _worst_input(operator, input_um, operator.form(-operator.bounds * signs), led)
 
 
-class WorstInput:
-    """The compensator's input with adapted parameters, called part by part.
+def _worst_input(
+    operator: DisplacementOperator, input_um: F64, worst: F64, led: int
+) -> Callable[[int, int], F64]:
+    """Return the input with parameters that move over ``led`` samples from 0 to ``worst``."""
+    memory = operator.at_rest(float(input_um[0:1][0]))
 
-    Args:
-        operator: The adapted operator.
-        input_um: float64[n], the input without adaptation.
-        worst: float64[m], final o, g and w_i.
-        led: Samples of the transition, at most n.
-    """
-
-    def __init__(self, operator: DisplacementOperator, input_um: F64, worst: F64, led: int) -> None:
-        self._operator, self._input_um, self._worst, self._led = operator, input_um, worst, led
-        self._memory = operator.at_rest(float(input_um[0:1][0]))
-
-    def __call__(self, start: int, stop: int) -> F64:
-        """Return the next part, float64[stop - start]."""
-        out, worst = np.array(self._input_um[start:stop]), self._worst
-        on_the_way = max(min(stop, self._led) - start, 0)
+    def part(start: int, stop: int) -> F64:
+        out = np.array(input_um[start:stop])
+        on_the_way = max(min(stop, led) - start, 0)
         if on_the_way:
-            begins, ends = (at / self._led * worst for at in (start, start + on_the_way))
-            part = out[:on_the_way]
-            self._operator.invert(part, on_the_way, begins, ends, self._memory)
+            begins, ends = (at / led * worst for at in (start, start + on_the_way))
+            operator.invert(out[:on_the_way], on_the_way, begins, ends, memory)
         there = out[on_the_way:]
-        self._operator.invert(there, there.size, worst, worst, self._memory)
+        operator.invert(there, there.size, worst, worst, memory)
         return out
+
+    return part
 
 
 def at_worst(problem: ConfigProblem) -> ConfigProblem:

@@ -23,11 +23,6 @@ _LEAST_DIFFERENCE = 1e-3
 class CoilHeat:
     """Thermal budget of the coil over the commands of a run.
 
-    Args:
-        limits: The budget; without a time constant nothing is computed.
-        sample_rate_hz: Samples per second.
-        heat_a2: Running mean square of the current before them, in A^2.
-
     Attributes:
         heat_a2: Running mean square after the last of them, in A^2.
         highest_a2: Highest running mean square so far, in A^2.
@@ -75,13 +70,7 @@ class CoilHeat:
             self._last = float(samples.command[part[-1]])
 
     def repeat(self, before_a2: float, samples: int, times: int) -> None:
-        """Add the last cycle ``times`` more times, ignoring its highest heat.
-
-        Args:
-            before_a2: Heat before that cycle, in A^2.
-            samples: Its samples.
-            times: Number of repeats.
-        """
+        """Add the last cycle, begun at ``before_a2``, more times without its highest heat."""
         if self._tau_s is None:
             return
         self.heat_a2 = _repeated(
@@ -128,17 +117,10 @@ class RunHeat:
     def repeated(
         self, alone_a2: float, samples: int, times: int, limits: Limits, sample_rate_hz: float
     ) -> "RunHeat":
-        """Return the effect including ``times`` more repeats of the last cycle.
+        """Return the effect including more repeats of the last cycle, begun at ``alone_a2``.
 
         The highest initial heat is set by the first cycle or by the last one, which is still to be
         added, because the margin changes monotonically from one cycle to the next.
-
-        Args:
-            alone_a2: :attr:`alone_a2` before that cycle.
-            samples: Its samples.
-            times: Number of repeats.
-            limits: The budget.
-            sample_rate_hz: Samples per second.
         """
         seconds = self.seconds + times * samples / sample_rate_hz
         tau_s = limits.thermal_time_constant_s
@@ -152,9 +134,7 @@ class CoolingCoil:
     """Heat of a coil through runs and pauses; constant without a thermal budget.
 
     Args:
-        config: The experiment.
         heat_a2: Heat at ``now_s``, in A^2; at least that of the safe value.
-        now_s: Time in s, on any clock.
     """
 
     def __init__(self, config: Experiment, heat_a2: float, now_s: float) -> None:
@@ -175,13 +155,7 @@ class CoolingCoil:
         self._at_s = max(self._at_s, ended_s)
 
     def pause_s(self, run: RunHeat, now_s: float, to_rms_a: float = math.inf) -> float:
-        """Return the time in s that the coil must cool before a run.
-
-        Args:
-            run: The run.
-            now_s: Present time in s.
-            to_rms_a: Required running rms in A.
-        """
+        """Return the time in s that the coil must cool before a run, down to an rms at most."""
         hottest_a2, heat_a2 = min(run.hottest_a2, to_rms_a**2), self.heat_a2(now_s)
         over_a2 = heat_a2 - self._rest**2
         if self._tau_s is None or heat_a2 <= hottest_a2 or over_a2 <= 0.0:

@@ -5,6 +5,7 @@ earlier ones; the compensator starts from the state after the cycle.
 """
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -32,9 +33,7 @@ def conditioning_of(
 ) -> Conditioning | None:
     """Return the conditioning before the waveform, or None.
 
-    Args:
-        loaded: The experiment.
-        stands_um: Model displacement at its end; None if no offset is measured.
+    ``stands_um`` is the model displacement at its end, or None if no offset is measured.
     """
     config, condition = loaded.config, loaded.config.condition
     if condition is None and not measures_offset(config):
@@ -57,28 +56,26 @@ def conditioning_of(
     )
 
 
-def condition_problems(loaded: LoadedExperiment) -> list[ConfigProblem]:
-    """Return the broken rules of the ``condition`` section."""
+def condition_problems(loaded: LoadedExperiment) -> Iterator[ConfigProblem]:
+    """Yield the broken rules of the ``condition`` section."""
     config, condition = loaded.config, loaded.config.condition
     if condition is None:
-        return []
-    found: list[ConfigProblem] = []
+        return
     unit = config.limits.unit
     key = f"condition.amplitude_{unit.lower()}"
     given = {"A": condition.amplitude_a, "V": condition.amplitude_v}
     if any(value is not None for other, value in given.items() if other != unit):
         rule = f"must have amplitude_{unit.lower()}: limits are in {unit}"
-        found.append(loaded.problem("condition", rule))
+        yield loaded.problem("condition", rule)
     furthest = max(_room(config))
     amplitude = given[unit]
     if amplitude is not None and amplitude > furthest:
         rule = f"must be <= {furthest:g} {unit}, the distance from safe.value to the limits"
-        found.append(loaded.problem(key, rule, f"{amplitude:g}"))
+        yield loaded.problem(key, rule, f"{amplitude:g}")
     hz, highest_hz = _frequency_hz(config), _highest_hz(config)
     if hz > highest_hz:
         rule = f"must be <= {highest_hz:.4g} Hz (slew limit, {_FEWEST_SAMPLES} samples per cycle)"
-        found.append(loaded.problem("condition.frequency_hz", rule, f"{hz:g}"))
-    return found
+        yield loaded.problem("condition.frequency_hz", rule, f"{hz:g}")
 
 
 def _room(config: Experiment) -> tuple[float, float]:

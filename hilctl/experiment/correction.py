@@ -156,14 +156,9 @@ def evaluate(coefficients: C128, points: int) -> F64:
 
 
 def signature(values: F64, segment: Segment) -> F64 | None:
-    """Return one steady period of a reference at 64 even phases, in its unit.
+    """Return one steady period of a reference, float64[n], at 64 even phases: float64[64].
 
-    Args:
-        values: float64[n], the reference of the run.
-        segment: A part of it.
-
-    Returns:
-        float64[64]; None without a complete period at full amplitude.
+    None without a complete period at full amplitude.
     """
     if segment.period <= 0.0:
         return None
@@ -188,12 +183,7 @@ def fits(cycle: LearnedCycle, values: F64, segment: Segment) -> bool:
 
 
 def envelope(segment: Segment, index: I64) -> F64:
-    """Return the weight of a correction at samples of a segment, from 0 to 1.
-
-    Args:
-        segment: The segment.
-        index: int64[n], its samples, from 0 on.
-    """
+    """Return the weight of a correction, 0 to 1, at samples (int64[n], from 0 on) of a segment."""
     n = segment.stop - segment.start
     rise = segment.steady_start - segment.start or min(n, int(segment.period))
     fall = segment.stop - segment.steady_stop
@@ -214,10 +204,6 @@ def model_sha256(model: HysteresisModel | None) -> str:
 
 def load_correction(path: Path, files: TextFiles | None = None) -> Correction:
     """Read a correction file.
-
-    Args:
-        path: The file.
-        files: Source of the file; None for the disk.
 
     Raises:
         InputError: The file can't be read.

@@ -26,10 +26,11 @@ def pace_warnings(config: Experiment, info: DeviceInfo) -> tuple[str, ...]:
     )
 
 
-def device_problems(loaded: LoadedExperiment) -> list[ConfigProblem]:
-    """Return the settings that the device does not support."""
-    rules = (_range_problems, _pace_problems, _watchdog_problems)
-    return [problem for rule in rules for problem in rule(loaded)]
+def device_problems(loaded: LoadedExperiment) -> Iterator[ConfigProblem]:
+    """Yield the settings that the device does not support."""
+    yield from _range_problems(loaded)
+    yield from _pace_problems(loaded)
+    yield from _watchdog_problems(loaded)
 
 
 def _range_problems(loaded: LoadedExperiment) -> Iterator[ConfigProblem]:

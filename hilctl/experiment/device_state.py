@@ -107,9 +107,7 @@ _LARGEST_BYTES = 256 << 20  # some minutes at 50 kHz: more would delay the start
 def left_by_last_run(loaded: LoadedExperiment, now_s: float) -> tuple[InitialState | None, str]:
     """Return the actuator's state after the last run (None at rest) and its origin in words.
 
-    Args:
-        loaded: The experiment; it has a compensator.
-        now_s: Unix time in s.
+    ``now_s`` is Unix time here and below.
 
     Raises:
         ModelError: The model has no inverse.
@@ -139,12 +137,7 @@ def _check_run(state: DeviceState) -> None:
 
 
 def heat_before(loaded: LoadedExperiment, now_s: float) -> float:
-    """Return the coil's heat left by the last run, in A^2; at least that of the safe value.
-
-    Args:
-        loaded: The experiment.
-        now_s: Unix time in s.
-    """
+    """Return the coil's heat left by the last run, in A^2; at least that of the safe value."""
     config, holds = loaded.config, loaded.device.info.holds
     rest, tau_s = config.safe.value, config.limits.thermal_time_constant_s
     state = read_device_state(holds) if tau_s is not None else None
@@ -178,15 +171,10 @@ def _last_seen_s(state: DeviceState) -> float:
 
 
 def heat_after(path: Path, config: Experiment, now_s: float) -> float:
-    """Return the coil's heat left by a recorded run, in A^2.
+    """Return the coil's heat left by a recorded run, in A^2, with the limits of ``config``.
 
     It is in the recording, or computed from the samples if the supervisor was killed. If those
     cannot be read, or the safe value was not confirmed, the full thermal budget is assumed.
-
-    Args:
-        path: The recording.
-        config: Experiment with the current limit, time constant and safe value.
-        now_s: Unix time in s.
     """
     rest = config.safe.value
     try:

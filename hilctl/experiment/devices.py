@@ -59,11 +59,6 @@ def device_class(kind: str) -> type[Device]:
 def made_device(document: Document, folder: Path, files: TextFiles) -> Device | None:
     """Return the device of an experiment, not opened; None without a device section.
 
-    Args:
-        document: The experiment.
-        folder: Base of relative file names.
-        files: Source of those files.
-
     Raises:
         ConfigError: Rules are broken; the error lists every one of them.
     """
@@ -111,7 +106,6 @@ class SerialPort:
 
     Attributes:
         path: Device file; ``/dev/serial/by-id/...`` if it exists, which survives replugging.
-        description: Description by the operating system.
     """
 
     path: str
@@ -120,13 +114,7 @@ class SerialPort:
 
 @dataclass(frozen=True, slots=True)
 class Inventory:
-    """Possible values in the device section of an experiment.
-
-    Attributes:
-        devices: Kind to class.
-        profiles: Shipped profile to its file.
-        serial_ports: Ports of this machine.
-    """
+    """Possible values in the device section of an experiment."""
 
     devices: dict[str, str]
     profiles: dict[str, str]
@@ -154,9 +142,7 @@ class DeviceOption:
     """A key of a device's section.
 
     Attributes:
-        name: The key.
         default: Default value as text; None if the key is required.
-        description: Its description.
     """
 
     name: str
@@ -169,7 +155,6 @@ class DeviceDescription:
     """A device or a profile, described without opening it.
 
     Attributes:
-        name: The name.
         place: Class of the device, or file of the profile.
         options: Keys of the device's section; empty for a profile.
         profile: Content of the profile; empty for a device.

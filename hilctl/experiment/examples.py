@@ -22,8 +22,6 @@ class Example:
 
     Attributes:
         name: Path of its copy without suffix.
-        description: Description in the file.
-        path: The file.
     """
 
     name: str
@@ -76,12 +74,7 @@ def _description(data: dict[str, Any]) -> str:
 
 
 def copy_example(name: str, into: Path, folder: Path) -> tuple[Path, ...]:
-    """Copy an example and the files that it names.
-
-    Args:
-        name: The example.
-        into: Folder for the copies; created if missing.
-        folder: Folder of the examples.
+    """Copy an example and the files that it names from one folder into another, created if missing.
 
     Returns:
         The copies, that of the example first. Identical existing files are kept.

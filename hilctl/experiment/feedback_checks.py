@@ -6,6 +6,7 @@ the sample rate, limits the bandwidth.
 
 import cmath
 import math
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -38,10 +39,7 @@ def make_feedback(
 ) -> Controller | None:
     """Return the feedback controller of a run, or None.
 
-    Args:
-        config: The experiment.
-        compensator: Compensator whose input it corrects.
-        latency_blocks: Exchanges from a block's commands to its displacements.
+    ``latency_blocks`` counts the exchanges from a block's commands to its displacements.
     """
     wanted = config.feedback
     if wanted is None:
@@ -59,55 +57,44 @@ def make_feedback(
 def delays(sensor_delay_s: float, rate_hz: float, preview: int) -> tuple[int, int]:
     """Return the samples from the reference, and from the input, to the resulting displacement.
 
-    Args:
-        sensor_delay_s: Delay of the sensor and its line.
-        rate_hz: Samples per second.
-        preview: Samples by which the compensator's input runs ahead of its commands.
+    ``preview`` is the number of samples by which the input runs ahead of the commands.
     """
     due_after = round(sensor_delay_s * rate_hz) + (0 if preview else 1)
     return due_after, due_after + preview
 
 
-def feedback_problems(loaded: LoadedExperiment, preview: int) -> list[ConfigProblem]:
-    """Return the broken rules of the ``feedback`` section.
-
-    Args:
-        loaded: The experiment.
-        preview: Preview of its compensator in samples, which delays the effect of a correction.
-    """
+def feedback_problems(loaded: LoadedExperiment, preview: int) -> Iterator[ConfigProblem]:
+    """Yield the broken rules of the ``feedback`` section."""
     config, wanted = loaded.config, loaded.config.feedback
     if wanted is None:
-        return []
-    found = []
+        return
     if config.compensator is None:
-        found.append(loaded.problem("feedback", "needs a compensator, whose input it corrects"))
+        yield loaded.problem("feedback", "needs a compensator, whose input it corrects")
     if isinstance(wanted, IntegralFeedbackConfig):
-        return [*found, *_slow_problems(loaded, wanted, preview)]
-    return [*found, *_fast_problems(loaded, wanted, preview)]
+        yield from _slow_problems(loaded, wanted, preview)
+    else:
+        yield from _fast_problems(loaded, wanted, preview)
 
 
 def _fast_problems(
     loaded: LoadedExperiment, wanted: PiFeedbackConfig, preview: int
-) -> list[ConfigProblem]:
+) -> Iterator[ConfigProblem]:
     config, info = loaded.config, loaded.device.info
-    found = []
     hint = "use feedback.kind integral for slow errors"
     if info.latency_blocks:
         rule = f"needs a device that answers each sample immediately: {info.name} has a FIFO"
-        found.append(loaded.problem("feedback", rule, hint=hint))
+        yield loaded.problem("feedback", rule, hint=hint)
     if config.block > 1:
-        rule = "must be 1 with PI feedback"
-        found.append(loaded.problem("block", rule, str(config.block), hint))
-    if found or config.compensator is None:
-        return found
-    delay_s = wanted.sensor_delay_s + max(0, preview - 1) / config.sample_rate_hz
-    found += _gain_problems(loaded, wanted, delay_s)
-    return found + _resonance_problems(loaded, wanted)
+        yield loaded.problem("block", "must be 1 with PI feedback", str(config.block), hint)
+    if not (info.latency_blocks or config.block > 1 or config.compensator is None):
+        delay_s = wanted.sensor_delay_s + max(0, preview - 1) / config.sample_rate_hz
+        yield from _gain_problems(loaded, wanted, delay_s)
+        yield from _resonance_problems(loaded, wanted)
 
 
 def _slow_problems(
     loaded: LoadedExperiment, wanted: IntegralFeedbackConfig, preview: int
-) -> list[ConfigProblem]:
+) -> Iterator[ConfigProblem]:
     """Compare the bandwidth of an integrator with the loop's delay and the resonance."""
     config, info = loaded.config, loaded.device.info
     shown_s = wanted.sensor_delay_s + max(1, preview) / config.sample_rate_hz
@@ -125,9 +112,8 @@ def _slow_problems(
         highest_hz = UNKNOWN_RESONANCE_HZ
         rule = f"must be <= {highest_hz:g} Hz without a known resonance"
         hint = "set resonance_hz and damping_ratio of the actuator with its load"
-    if wanted.bandwidth_hz <= highest_hz:
-        return []
-    return [loaded.problem("feedback.bandwidth_hz", rule, f"{wanted.bandwidth_hz:g}", hint)]
+    if wanted.bandwidth_hz > highest_hz:
+        yield loaded.problem("feedback.bandwidth_hz", rule, f"{wanted.bandwidth_hz:g}", hint)
 
 
 def _gains(wanted: PiFeedbackConfig, rate_hz: float) -> Gains:
@@ -138,19 +124,21 @@ def _gains(wanted: PiFeedbackConfig, rate_hz: float) -> Gains:
 
 def _gain_problems(
     loaded: LoadedExperiment, wanted: PiFeedbackConfig, delay_s: float
-) -> list[ConfigProblem]:
+) -> Iterator[ConfigProblem]:
     """Check phase and gain margin for a delay."""
     rate_hz = loaded.config.sample_rate_hz
     if wanted.bandwidth_hz is not None:
         highest_hz = highest_bandwidth_hz(rate_hz, delay_s)
-        if wanted.bandwidth_hz <= highest_hz:
-            return []
-        rule = f"must be <= {highest_hz:.4g} Hz at {rate_hz:g} Hz and a delay of {delay_s:.3g} s"
-        hint = _needs(rate_needed_hz(wanted.bandwidth_hz, delay_s))
-        return [loaded.problem("feedback.bandwidth_hz", rule, f"{wanted.bandwidth_hz:g}", hint)]
+        if wanted.bandwidth_hz > highest_hz:
+            rule = (
+                f"must be <= {highest_hz:.4g} Hz at {rate_hz:g} Hz and a delay of {delay_s:.3g} s"
+            )
+            hint = _needs(rate_needed_hz(wanted.bandwidth_hz, delay_s))
+            yield loaded.problem("feedback.bandwidth_hz", rule, f"{wanted.bandwidth_hz:g}", hint)
+        return
     gains = _gains(wanted, rate_hz)
     if _stable(gains, rate_hz, delay_s):
-        return []
+        return
     gain_margin, phase_margin = margins(gains, rate_hz, delay_s)
     rule = (
         f"must leave a gain margin of {LEAST_GAIN_MARGIN:g} and a phase margin of "
@@ -158,7 +146,7 @@ def _gain_problems(
     )
     value = f"kp {gains.kp:g}, ki_per_s {gains.ki_per_s:g}: {gain_margin:.3g}, {phase_margin:.3g}"
     hint = _needs(_rate_for(gains, rate_hz, delay_s))
-    return [loaded.problem("feedback", rule, value, hint)]
+    yield loaded.problem("feedback", rule, value, hint)
 
 
 def _stable(gains: Gains, rate_hz: float, delay_s: float) -> bool:
@@ -181,22 +169,24 @@ def _needs(rate_hz: float) -> str:
     return "no sample rate is enough for this"
 
 
-def _resonance_problems(loaded: LoadedExperiment, wanted: PiFeedbackConfig) -> list[ConfigProblem]:
+def _resonance_problems(
+    loaded: LoadedExperiment, wanted: PiFeedbackConfig
+) -> Iterator[ConfigProblem]:
     """Limit the gain at the resonance, which amplifies it by 1 / (2 damping), to one half."""
     natural_hz, damping = _resonance(loaded, wanted)
     if natural_hz is None or damping is None:
         rule = "needs resonance_hz and damping_ratio of the actuator with its load"
-        return [loaded.problem("feedback", rule, hint="feedback excites it; the model has none")]
+        yield loaded.problem("feedback", rule, hint="feedback excites it; the model has none")
+        return
     rate_hz = loaded.config.sample_rate_hz
     gains = _gains(wanted, rate_hz)
     turn = 1.0 - cmath.exp(-2j * math.pi * min(natural_hz / rate_hz, 0.5))
     size = abs(gains.kp + gains.ki_per_s / rate_hz / turn) / (2.0 * damping)
-    if size * LEAST_GAIN_MARGIN <= 1.0:
-        return []
-    rule = f"must have a gain of at most {1.0 / LEAST_GAIN_MARGIN:g} at the resonance"
-    where = f"{natural_hz:g} Hz, damping {damping:g}"
-    hint = f"at most bandwidth_hz {damping * natural_hz:.3g}, or ki_per_s of 2 pi times that"
-    return [loaded.problem("feedback", rule, f"{size:.3g} at {where}", hint)]
+    if size * LEAST_GAIN_MARGIN > 1.0:
+        rule = f"must have a gain of at most {1.0 / LEAST_GAIN_MARGIN:g} at the resonance"
+        where = f"{natural_hz:g} Hz, damping {damping:g}"
+        hint = f"at most bandwidth_hz {damping * natural_hz:.3g}, or ki_per_s of 2 pi times that"
+        yield loaded.problem("feedback", rule, f"{size:.3g} at {where}", hint)
 
 
 def _resonance(
@@ -221,11 +211,7 @@ def highest_bandwidth_hz(rate_hz: float, extra_delay_s: float = 0.0) -> float:
     """Return the largest bandwidth with the required phase margin.
 
     The integral lags by 90 degrees minus half a sample, the loop by two samples. The margin of 60
-    degrees leaves 30 degrees for these 1.5 samples and the extra delay.
-
-    Args:
-        rate_hz: Samples per second.
-        extra_delay_s: Delay of link and sensor.
+    degrees leaves 30 degrees for these 1.5 samples and the extra delay of link and sensor.
     """
     share = (90.0 - LEAST_PHASE_MARGIN_DEG) / 360.0
     return share / ((LOOP_DELAY - 0.5) / rate_hz + extra_delay_s)

@@ -7,7 +7,7 @@ closely that the last cycle would still agree if each differed from the one befo
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -37,15 +37,9 @@ class Forecast:
     """The commands of a run in numbers.
 
     Attributes:
-        samples: Samples of the waveform.
-        duration_s: Its length.
-        before_s: Time of the conditioning before it.
+        before_s: Time of the conditioning before the waveform.
         begins: Initial state of the compensator in words; empty without a compensator.
         reference_min: Lowest reference, in the waveform's unit.
-        reference_max: Highest reference.
-        command_unit: ``A`` or ``V``.
-        command_min: Lowest command.
-        command_max: Highest command.
         slew_per_s: Fastest change of the command.
         heat: Effect on the heat of the coil, whatever the heat before.
         begins_rms_a: Initial running rms of the coil current, left by the last run of the device;
@@ -53,8 +47,7 @@ class Forecast:
         heating_rms_a: Highest running rms of the coil current; None without a budget.
         budget_used_s: Time after which the thermal budget is exceeded; None if it never is.
         recording_mb: Approximate size of the recording.
-        highest_rate_hz: Highest sample rate of the device.
-        rate_note: Reason for that rate; may be empty.
+        rate_note: Reason for the highest rate; may be empty.
         line: Replacement of the inverse while it is bypassed; None if there is none.
     """
 
@@ -92,15 +85,10 @@ def forecast_of(
     heat_a2: float = 0.0,
     input_um: Callable[[int, int], F64] | None = None,
 ) -> Forecast:
-    """Compute all commands of a run.
+    """Compute all commands of a run: ``conditioned``, float64[m], then those of the waveform.
 
-    Args:
-        loaded: The experiment.
-        reference: Every sample of its waveform.
-        begun: Input and initial state of the compensator.
-        conditioned: float64[m], commands before those of the waveform.
-        heat_a2: Running mean square of the coil current before all of them, in A^2.
-        input_um: Returns a different input from a start to a stop; called in order.
+    ``heat_a2`` is the coil's heat before, in A^2. ``input_um`` returns a different input from a
+    start to a stop, and is called in order.
 
     Raises:
         ModelError: The model has no inverse.
@@ -114,13 +102,14 @@ def forecast_of(
     if conditioned.size:
         figures.add_before(conditioned)
     values = reference.values
-    CommandSimulation(
+    simulate_commands(
         compensator,
         input_um or (lambda start, stop: begun.input_um[start:stop]),
         lambda start, stop: values[start:stop],
         values.size,
         figures,
-    ).run(reference.repeats)
+        reference.repeats,
+    )
     bytes_per_sample = _BYTES_PER_SAMPLE + (_BYTES_OF_INPUT if begun.input_um is not values else 0)
     low, high = reference.span
     command, heat = figures.command, figures.command.heat
@@ -146,91 +135,57 @@ def forecast_of(
     )
 
 
-class CommandSink(Protocol):
-    """Consumer of simulated commands."""
+def simulate_commands(
+    compensator: Compensator,
+    input_um: Callable[[int, int], F64],
+    reference: Callable[[int, int], F64],
+    size: int,
+    figures: "_RunFigures",
+    repeats: tuple[RepeatedPart, ...],
+) -> None:
+    """Simulate the commands of a run, without the repeats of cycles that agree.
 
-    def add(self, reference: F64, command: F64) -> None:
-        """Add the next samples: float64[n] each, n > 0."""
-        ...
-
-    def mark(self) -> None:
-        """Mark the start of a cycle."""
-        ...
-
-    def skip(self, samples: int, times: int) -> None:
-        """Add the cycle since the mark, of ``samples`` samples, ``times`` more times."""
-        ...
-
-
-class CommandSimulation:
-    """Simulation of the commands of a run, without the repeats of cycles that agree.
-
-    Args:
-        compensator: Compensator in the initial state of the run.
-        input_um: Returns its input from a start to a stop, float64[stop - start]; called in order.
-        reference: Returns the reference in the same way.
-        size: Samples of the run.
-        figures: Consumer of the commands.
+    ``input_um`` and ``reference`` return their samples from a start to a stop, and are called in
+    order. ``repeats`` are the periodic parts of the reference in order.
     """
+    at = 0
 
-    def __init__(
-        self,
-        compensator: Compensator,
-        input_um: Callable[[int, int], F64],
-        reference: Callable[[int, int], F64],
-        size: int,
-        figures: CommandSink,
-    ) -> None:
-        self._compensator, self._input_um, self._reference = compensator, input_um, reference
-        self._size, self._figures = size, figures
-        self._at = 0
-
-    def run(self, repeats: tuple[RepeatedPart, ...]) -> None:
-        """Simulate the run, given the periodic parts of its reference in order."""
-        for repeat in repeats:
-            self._advance(repeat.start)
-            self._skip_cycles(repeat)
-        self._advance(self._size)
-
-    def _advance(self, stop: int, cycle: F64 | None = None) -> None:
+    def advance(stop: int, cycle: F64 | None = None) -> None:
         """Simulate up to a sample; fill ``cycle`` (float64[n]) with the commands."""
-        begins = self._at
-        while self._at < stop:
-            start = self._at
-            self._at = min(start + CHUNK, stop)
-            command = np.empty(self._at - start)
-            self._compensator.process(self._input_um(start, self._at), command)
-            self._figures.add(self._reference(start, self._at), command)
+        nonlocal at
+        begins = at
+        while at < stop:
+            start, at = at, min(at + CHUNK, stop)
+            command = np.empty(at - start)
+            compensator.process(input_um(start, at), command)
+            figures.add(reference(start, at), command)
             if cycle is not None:
-                cycle[start - begins : self._at - begins] = command
+                cycle[start - begins : at - begins] = command
 
-    def _skip_cycles(self, repeat: RepeatedPart) -> None:
-        """Simulate cycles until two in a row agree, and skip the rest of a periodic part."""
+    for repeat in repeats:
+        advance(repeat.start)
         # The input runs ahead of the reference, so its periodic part ends earlier.
-        stop = repeat.stop - self._compensator.preview
+        stop = repeat.stop - compensator.preview
         cycle = whole_cycle(repeat.period, stop - repeat.start)
-        if cycle == 0:
-            return
         before, now = np.full((2, cycle), math.nan)
-        while stop - self._at >= 3 * cycle:
-            self._figures.mark()
-            self._advance(self._at + cycle, now)
-            times = (stop - self._at) // cycle - 1
+        while cycle and stop - at >= 3 * cycle:
+            figures.mark()
+            advance(at + cycle, now)
+            times = (stop - at) // cycle - 1
             with np.errstate(over="ignore", invalid="ignore"):  # NaN never agrees
                 same = bool(np.abs(now - before).max() * times <= _SAME * np.ptp(now))
             if same:
-                self._figures.skip(cycle, times)
-                self._at += times * cycle
-                return
+                figures.skip(cycle, times)
+                at += times * cycle
+                break
             before, now = now, before
+    advance(size)
 
 
 def whole_cycle(period: float, samples: int) -> int:
     """Return the shortest whole cycle worth comparing, in samples; 0 if there is none.
 
-    Args:
-        period: Samples of a period, > 0.
-        samples: Samples of the periodic part; fewer than four cycles are not worth it.
+    Fewer than four cycles in the samples of the periodic part are not worth it.
     """
     for periods in range(1, _MOST_PERIODS + 1):
         length = periods * period
@@ -246,16 +201,8 @@ def whole_cycle(period: float, samples: int) -> int:
 class CommandFigures:
     """Range, slew and heat of consecutive commands.
 
-    Args:
-        config: The experiment.
-        last: Command before the first of them.
-        heat_a2: Running mean square of the coil current before them, in A^2.
-
     Attributes:
-        low: Lowest command.
-        high: Highest command.
         last: Command before the next ones.
-        heat: The thermal budget.
     """
 
     def __init__(self, config: Experiment, last: float, heat_a2: float) -> None:
@@ -282,7 +229,7 @@ class CommandFigures:
 
 
 class _RunFigures:
-    """The :class:`CommandSink` of a forecast."""
+    """Consumer of the simulated commands of a forecast."""
 
     def __init__(self, config: Experiment, heat_a2: float) -> None:
         self.command = CommandFigures(config, config.safe.value, heat_a2)
@@ -344,13 +291,7 @@ class LineEnds:
 
 
 def fade_refusal(loaded: LoadedExperiment, line: LinearBypass | None, wanted: str) -> str:
-    """Return why the inverse cannot be bypassed or enabled, or an empty text.
-
-    Args:
-        loaded: The experiment.
-        line: Its line.
-        wanted: ``in`` or ``out``.
-    """
+    """Return why the inverse cannot be bypassed (``out``) or enabled (``in``), or an empty text."""
     if loaded.model is None:
         return "the experiment has no compensator: there is no inverse to bypass"
     if line is None:

@@ -61,11 +61,9 @@ class InitialState:
     run_id: str
 
     def lead_in(self, input_um: F64, samples: int) -> F64:
-        """Return the compensator's input with a lead-in from the actuator's displacement.
+        """Return the compensator's input, float64[n], led in from the actuator's displacement.
 
-        Args:
-            input_um: float64[n].
-            samples: Length of the lead-in, which is cut off at the end of ``input_um``.
+        The lead-in of ``samples`` is cut off at the end of the input.
         """
         away_um = self.stands_um - float(input_um[0])
         led = input_um.copy()
@@ -83,12 +81,8 @@ def begin(
 ) -> CompensatorStart:
     """Return input and initial state of a compensator.
 
-    Args:
-        model: Its model, or None.
-        sample_rate_hz: Samples per second.
-        values: float64[n], the reference with correction and lead-in.
-        before: State of the actuator before; None at rest.
-        begins: Its origin in words.
+    ``values``, float64[n], is the reference with correction and lead-in, and ``before`` the state
+    of the actuator (None at rest) with its origin ``begins`` in words.
 
     Raises:
         ModelError: The model has no inverse.
@@ -115,14 +109,8 @@ def initial_state_after(
     """Return the state of the actuator after a recorded run that began at rest.
 
     The model converts all of its commands to displacements, and the inverse follows those, so the
-    run may have used any compensator or none. Creep decays from the end of the run to the present,
-    for at least one second.
-
-    Args:
-        path: The run's recording.
-        model: The model that the compensator inverts.
-        sample_rate_hz: Samples per second; the recording must have the same rate.
-        now_s: Unix time in s.
+    run may have used any compensator or none. Creep decays from the end of the run to ``now_s``, a
+    Unix time, for at least one second.
 
     Raises:
         DataError: The recording is unreadable or incomplete, or its commands do not fit.
@@ -141,13 +129,10 @@ def left_by(
     sample_rate_hz: float,
     stood_s: Callable[[], float] | None = None,
 ) -> InitialState:
-    """Return the state of a model after commands from rest.
+    """Return the state of a model after commands from rest, float64[n] each, in order.
 
-    Args:
-        commands: float64[n] each, in order; without ``stood_s`` they must end with a rest.
-        model: The model.
-        sample_rate_hz: Samples per second.
-        stood_s: Returns the time since the commands in s; at least one second is simulated.
+    ``stood_s`` returns the time since the commands, of which at least one second is simulated;
+    without it they must end with a rest.
     """
     forward, inverse = model.forward(sample_rate_hz), model.inverse(sample_rate_hz)
     rest = inverse.state()
@@ -191,19 +176,17 @@ class _Followed:
         """Yield the commands in order."""
         from hilctl.recording.reader import RecordingStream  # slow to import, rarely needed
 
-        samples = 0
-        unanswered = False
+        samples, whole, unanswered = 0, True, False
         for piece in RecordingStream(self._path):
             self._check(piece)
             index, flags = piece.samples.index, piece.samples.flags
             unanswered |= bool(np.any(flags & Flag.UNANSWERED.value))
-            if index.size:
-                self._check_whole(
-                    whole=index[0] == samples and index[-1] + 1 == samples + index.size
-                )
-            samples += index.size
+            stop = samples + index.size
+            whole &= not index.size or (index[0] == samples and index[-1] + 1 == stop)
+            samples = stop
             yield piece.samples.command
-        self._check_whole(whole=bool(samples and not piece.dropped and piece.end))
+        if not (whole and samples and piece.end) or piece.dropped:
+            raise DataError(f"{self._path}: is incomplete: the state of the actuator is unknown")
         if unanswered or piece.end.get("output_safe") == "false":
             lost = "lost its device, or did not confirm its safe value"
             raise DataError(f"{self._path}: {lost}: the state of the actuator is unknown")
@@ -219,7 +202,3 @@ class _Followed:
         if recording.sample_rate_hz != self._rate_hz:
             rates = f"{recording.sample_rate_hz:g} Hz, this run is at {self._rate_hz:g} Hz"
             raise DataError(f"{path}: was recorded at {rates}")
-
-    def _check_whole(self, *, whole: bool) -> None:
-        if not whole:
-            raise DataError(f"{self._path}: is incomplete: the state of the actuator is unknown")

@@ -28,9 +28,7 @@ class LoadedExperiment:
     """An experiment with everything that its file refers to.
 
     Attributes:
-        config: The experiment.
         device: The device, not opened.
-        model: The compensator's model, or None.
         folder: Base of relative file names.
         yaml_text: The experiment including command-line settings.
         document: The file, with the line of each value.
@@ -66,12 +64,7 @@ def load_experiment(path: Path, settings: Sequence[str] = ()) -> LoadedExperimen
 
 
 def input_files(document: Document, path: Path) -> list[Path]:
-    """Return the experiment file and the files that its keys name.
-
-    Args:
-        document: The experiment.
-        path: Its file.
-    """
+    """Return the experiment file and the files that its keys name."""
     found = [path]
     for key in sorted(FILE_KEYS):
         value: object = document.data
@@ -95,12 +88,7 @@ def inputs_of(path: Path, settings: Sequence[str] = ()) -> list[Path]:
 
 
 def named_from(folder: Path, setting: str) -> str:
-    """Return a setting whose file name is made relative to another folder.
-
-    Args:
-        folder: The other folder.
-        setting: ``key=value``.
-    """
+    """Return a ``key=value`` setting with its file name made relative to another folder."""
     key, _, text = setting.partition("=")
     name = text.strip().strip("'\"")
     if key.strip() not in FILE_KEYS or not name or Path(name).is_absolute():
@@ -111,28 +99,32 @@ def named_from(folder: Path, setting: str) -> str:
 
 
 def resolve(
-    document: Document,
-    folder: Path,
-    settings: Sequence[str] = (),
-    files: TextFiles | None = None,
+    document: Document, folder: Path, settings: Sequence[str] = (), files: TextFiles | None = None
 ) -> LoadedExperiment:
-    """Build an experiment from a YAML document, see :func:`load_experiment`.
-
-    Args:
-        document: The experiment.
-        folder: Base of relative file names.
-        settings: ``key=value`` texts over it.
-        files: Source of those files; None for the disk.
-    """
+    """Build an experiment from a YAML document, see :func:`load_experiment`."""
     files = TextFiles() if files is None else files
     for setting in settings:
         document.set(setting)
     problems: list[ConfigProblem] = []
+
+    def named(key: str, load: Callable[[Path, TextFiles], T]) -> T | None:
+        """Return the content of the file under a key of ``compensator``; None without the key."""
+        compensator = document.data.get("compensator")
+        name = compensator.get(key) if isinstance(compensator, dict) else None
+        if not isinstance(name, str):
+            return None
+        try:
+            return load(folder / name, files)
+        except ConfigError:
+            raise
+        except InputError as error:
+            where = document.where(("compensator", key))
+            raise ConfigError([ConfigProblem(where, f"compensator.{key}", str(error))]) from None
+
     config = _collect(problems, lambda: document.validate(Experiment))
     device = _collect(problems, lambda: made_device(document, folder, files))
-    named = _NamedFiles(document, folder, files)
-    model = _collect(problems, lambda: named.load("model", load_model))
-    correction = _collect(problems, lambda: named.load("correction", load_correction))
+    model = _collect(problems, lambda: named("model", load_model))
+    correction = _collect(problems, lambda: named("correction", load_correction))
     if config is not None:
         problems += _joint_problems(config, document)
     if problems or config is None or device is None:
@@ -169,26 +161,3 @@ def _collect(problems: list[ConfigProblem], load: Callable[[], T]) -> T | None:
     except ConfigError as error:
         problems.extend(error.problems)
     return None
-
-
-@dataclass(frozen=True, slots=True)
-class _NamedFiles:
-    """Files named in the ``compensator`` section."""
-
-    document: Document
-    folder: Path
-    files: TextFiles
-
-    def load(self, key: str, load: Callable[[Path, TextFiles], T]) -> T | None:
-        """Return the content of the file under ``key``; None without such a key."""
-        compensator = self.document.data.get("compensator")
-        name = compensator.get(key) if isinstance(compensator, dict) else None
-        if not isinstance(name, str):
-            return None
-        try:
-            return load(self.folder / name, self.files)
-        except ConfigError:
-            raise
-        except InputError as error:
-            where = self.document.where(("compensator", key))
-            raise ConfigError([ConfigProblem(where, f"compensator.{key}", str(error))]) from None

@@ -30,7 +30,6 @@ class Spectrum:
     Attributes:
         main_hz: Half of the power lies below it; maximum over all windows.
         highest_hz: 99.9 % of the power lies below it; maximum over all windows.
-        resolution_hz: Resolution of these.
     """
 
     main_hz: float
@@ -97,12 +96,7 @@ def _lines(batch: F64) -> F64:
 
 
 def range_findings(known: IdentifiedRange, reference: Reference) -> RangeFindings:
-    """Compare a reference in um with the motions a model was identified on.
-
-    Args:
-        known: The motions that the model was identified on.
-        reference: The reference.
-    """
+    """Compare a reference in um with the motions a model was identified on."""
     rate_hz, told = reference.sample_rate_hz, reference.telling
     found = spectrum(reference.values, rate_hz, STILL * known.peak_to_peak_um[1], told)
     low_hz, high_hz = known.frequency_hz

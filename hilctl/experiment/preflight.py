@@ -7,7 +7,7 @@ in advance; the commands are compared with the limits.
 import logging
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -41,18 +41,6 @@ from hilctl.loop.compensator import Compensator
 from hilctl.loop.lead_in import Conditioning
 from hilctl.waveforms.build import Reference, build
 
-RULES: tuple[Callable[[LoadedExperiment], list[ConfigProblem]], ...] = (
-    device_problems,
-    interlock_problems,
-    condition_problems,
-)
-"""Rules on the loaded experiment alone."""
-CORRECTION_RULES: tuple[Callable[[LoadedExperiment, int], list[ConfigProblem]], ...] = (
-    feedback_problems,
-    adaptation_problems,
-)
-"""Rules on the experiment and the preview of its compensator in samples."""
-
 _log = logging.getLogger(__name__)
 
 _MANY = 50_000_000  # samples, which take some seconds
@@ -65,10 +53,6 @@ class CheckedExperiment:
     """An experiment that is ready to run.
 
     Attributes:
-        loaded: The experiment.
-        reference: Every sample of its waveform.
-        forecast: Its commands in numbers.
-        begun: Input and initial state of the compensator.
         warnings: Reasons why the run may be less accurate or less punctual than expected.
         heat_a2: Heat of the coil before it, the running mean square of its current in A^2.
         operator: Subject of the adaptation; None without adaptation.
@@ -101,28 +85,30 @@ class CheckedExperiment:
 
 
 def check(
-    loaded: LoadedExperiment,
-    heat_a2: float = 0.0,
-    now_s: float | None = None,
+    loaded: LoadedExperiment, heat_a2: float = 0.0, now_s: float | None = None
 ) -> CheckedExperiment:
     """Compute the complete run and check it against device, model and limits.
 
-    Args:
-        loaded: The experiment.
-        heat_a2: Least heat of its coil, in A^2, whatever the last run left.
-        now_s: Unix time of the start in s; None for the present.
+    The heat of the coil is at least ``heat_a2``, in A^2, whatever the last run left. ``now_s`` is
+    the Unix time of the start; None for the present.
 
     Raises:
         ConfigError: The run is rejected; all reasons are listed, each with its amount.
     """
     config = loaded.config
-    problems = [problem for rule in RULES for problem in rule(loaded)]
+    problems = [
+        *device_problems(loaded),
+        *interlock_problems(loaded),
+        *condition_problems(loaded),
+    ]
     try:
         reference = build(config.waveform, config.sample_rate_hz, loaded.folder)
     except InputError as error:
         raise ConfigError([*problems, loaded.problem("waveform", str(error))]) from None
     _warn_of_long_work(reference)
-    findings = _range_findings(loaded, reference)
+    known = loaded.model.provenance.identified_range if loaded.model else None
+    in_um = reference.unit == "um"
+    findings = range_findings(known, reference) if known and in_um else RangeFindings()
     problems += reference_problems(loaded, reference.unit, *reference.span)
     hint = "identify the model on such motions, or keep the waveform within those it was fitted on"
     problems += [loaded.problem("waveform", text, hint=hint) for text in findings.refused]
@@ -135,7 +121,8 @@ def check(
         forecast = forecast_of(loaded, reference, begun, conditioned, heat_a2)
     except ModelError as error:
         raise ConfigError([*problems, loaded.problem("compensator.model", str(error))]) from None
-    problems += [each for rule in CORRECTION_RULES for each in rule(loaded, begun.preview)]
+    problems += feedback_problems(loaded, begun.preview)
+    problems += adaptation_problems(loaded, begun.preview)
     problems += _start_problems(loaded, begun, forecast) or command_problems(loaded, forecast)
     if problems:
         raise ConfigError(problems)
@@ -156,14 +143,6 @@ def _warn_of_long_work(reference: Reference) -> None:
             "the waveform is not periodic: computing %.3g million samples before the start",
             samples * 1e-6,
         )
-
-
-def _range_findings(loaded: LoadedExperiment, reference: Reference) -> RangeFindings:
-    """Compare the reference with the motions that the model was identified on."""
-    known = loaded.model.provenance.identified_range if loaded.model else None
-    if known is None or reference.unit != "um":
-        return RangeFindings()
-    return range_findings(known, reference)
 
 
 def _start(
@@ -190,22 +169,11 @@ def _start(
 
 
 def _state_before(
-    loaded: LoadedExperiment,
-    conditioned: F64,
-    now_s: float,
-    problems: list[ConfigProblem],
+    loaded: LoadedExperiment, conditioned: F64, now_s: float, problems: list[ConfigProblem]
 ) -> tuple[InitialState | None, str]:
     """Return the actuator's state before the waveform (None at rest) and its origin in words.
 
-    Args:
-        loaded: The experiment.
-        conditioned: float64[m], commands before the waveform: a cycle that erases the history and
-            a rest, the rest alone, or none.
-        now_s: Unix time in s.
-        problems: Gets an entry if the state is unknown.
-
-    Raises:
-        ModelError: The model has no inverse.
+    ``problems`` gets an entry if the state is unknown.
     """
     config, model = loaded.config, loaded.model
     if model is None or config.compensator is None:

@@ -31,26 +31,18 @@ def _name(text: str) -> str:
     return text
 
 
-def _two(value: Any) -> Any:
-    if isinstance(value, tuple) and len(value) != 2:
+def _interval(value: Any) -> Any:
+    numbers = isinstance(value, tuple) and all(isinstance(each, int | float) for each in value)
+    if isinstance(value, tuple) and (len(value) != 2 or (numbers and not value[0] < value[1])):
         raise ValueError(f"must be [lowest, highest]: {list(value)}")
     return value
-
-
-def _rising(interval: tuple[float, float]) -> tuple[float, float]:
-    if not interval[0] < interval[1]:
-        raise ValueError(f"must be [lowest, highest]: {list(interval)}")
-    return interval
 
 
 Name = Annotated[
     str, AfterValidator(_name), WithJsonSchema({"type": "string", "pattern": f"^{_NAME}$"})
 ]
 Interval = Annotated[
-    tuple[float, float],
-    BeforeValidator(_two),
-    AfterValidator(_rising),
-    Field(description="lowest, highest"),
+    tuple[float, float], BeforeValidator(_interval), Field(description="lowest, highest")
 ]
 
 

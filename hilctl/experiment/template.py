@@ -35,7 +35,6 @@ class TemplateDevice:
 
     Attributes:
         name: Requested name, without folder and suffix.
-        title: The device in words.
         section: Its section of the experiment, ``kind`` first.
         remarks: Comments on values, by dotted key of the experiment.
         asked: Dotted keys to ask the user for, each with the question.
@@ -100,10 +99,7 @@ def starting_experiment(
 ) -> tuple[str, DeviceInfo]:
     """Return the text of a first experiment that passes the check, and the device's facts.
 
-    Args:
-        device: The device.
-        path: Future file of the experiment; nothing is written.
-        settings: ``key=value`` texts over it.
+    ``path`` is the future file; nothing is written.
 
     Raises:
         InputError: The experiment is rejected with these settings; all reasons are listed.

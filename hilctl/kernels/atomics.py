@@ -1,15 +1,12 @@
-"""Numbers in shared memory that say of other data that they are there: published, and observed.
+"""Flags in shared memory that announce other data: published by a writer, observed by a reader.
 
-A process that writes data and then a number that says so needs the number to be seen last; the
-process that reads the number needs to read the data after it. x86-64 keeps both orders by itself.
-ARM64 keeps neither: a block of samples could be taken out of the ring before it is whole. Python
-has no means for that, so this is the one place where kernels use instructions of LLVM: a store with
-release order and a load with acquire order. They also keep what comes after a store, and before a
-load, on its own side: a reader that copies data and then looks whether they still stood has them
-copied by then, and a writer that says that data are about to change has said so before they do.
+A reader must see data before the number that announces them. x86-64 keeps the order of writes and
+reads by itself, ARM64 does not, and Python cannot request it. So these kernels use LLVM
+instructions: a store with release order and a load with acquire order. They also order later writes
+after a store, and earlier reads before a load: a reader that copies data and then checks that they
+are still valid has copied them by then.
 
-A number that says nothing of other data needs none of it: eight bytes in their place are written
-and read whole.
+A number that announces nothing needs none of this: aligned eight bytes are written and read whole.
 """
 
 from collections.abc import Callable
@@ -68,22 +65,17 @@ if not _numba.DISABLE_JIT:
 
 @kernel("void(int64[::1], int64, int64)")
 def publish(numbers: I64, index: int, value: int) -> None:
-    """Set a number after all that was written before, and before all that will be.
+    """Set a number after all earlier writes and before all later ones.
 
-    Args:
-        numbers: int64[n] in shared memory.
-        index: Place of the number, not checked.
-        value: The number.
+    ``numbers`` is int64[n] in shared memory; the index is not checked.
     """
     _store(numbers, index, value)
 
 
 @kernel("int64(Array(int64, 1, 'C', readonly=True), int64)")
 def observe(numbers: I64, index: int) -> int:
-    """Return a number, read after all that was read before, and before all that will be.
+    """Return a number, read after all earlier reads and before all later ones.
 
-    Args:
-        numbers: int64[n] in shared memory, may be mapped for reading only.
-        index: Place of the number, not checked.
+    ``numbers`` is int64[n] in shared memory, possibly read-only; the index is not checked.
     """
     return _load(numbers, index)

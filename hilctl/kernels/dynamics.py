@@ -1,12 +1,12 @@
-"""Field lag, structure, transport delay and creep between samples, forwards and backwards.
+"""Field lag, structure, transport delay and creep between samples, and their inverses.
 
-Memory of every kernel ends with the previous input; NaN means that there is none yet, and then the
-signal counts as having stood at its first value for ever. It is updated in place, so any cut of a
-signal into blocks gives the same bits as one call. ``out`` may be the input array itself.
+The memory of every kernel ends with the previous input; NaN means that there is none yet, and then
+the signal counts as constant before its first value. It is updated in place, so any cut into blocks
+gives the same bits. All signals are float64[n]; ``out`` may be the input array itself.
 
 Creep: every element follows its share of the displacement x by first order, T c' = s x - c, and
-y = x + c_1 + c_2 + ... Each step takes x from the sample before, so that the inverse is exact.
-Creep begins with the first sample, from none.
+y = x + c_1 + c_2 + ... Each step uses the previous x, so that the inverse is exact. Creep begins
+with the first sample, from 0.
 
 A mode is a pair of antiresonance and resonance. A mass on a damped spring follows x as in
 :func:`structure_block`; the output is (1 + 2 Z s / W + s^2 / W^2) of its position, with the
@@ -29,10 +29,10 @@ _SMALL = 1e-17  # a growth that rounding hides
 
 @kernel("float64(float64, float64, float64)")
 def _left_behind(behind: float, growth: float, periods: float) -> float:
-    """Return what is left of ``behind`` > 0 after a sample in which the command is held.
+    """Return the distance > 0 that remains after a sample with a constant command.
 
     With e the distance, tau de/dt = -e / (1 + b e), so ln e + b e falls by T / tau. Newton's
-    method for ln(b e) comes down to the root from above, because the function is convex.
+    method for ln(b e) converges from above, because the function is convex.
     """
     wide = growth * behind
     if wide < _SMALL:
@@ -53,15 +53,9 @@ def _left_behind(behind: float, growth: float, periods: float) -> float:
 def lag_block(v: F64, periods: float, growth: float, memory: F64, out: F64) -> None:
     """Let a first-order lag follow a command that is held from sample to sample.
 
-    tau (1 + b |v - x|) dx/dt = v - x, integrated exactly. ``out[k]`` is x when ``v[k]`` is put
-    out, so it shows the commands up to ``v[k - 1]``.
-
-    Args:
-        v: float64[n], command.
-        periods: T / tau, > 0.
-        growth: b, one over the unit of ``v``, >= 0.
-        memory: float64[2]: x, the previous command.
-        out: float64[n], filled with x.
+    tau (1 + b |v - x|) dx/dt = v - x, integrated exactly. ``out[k]`` is x when ``v[k]`` is output,
+    so it shows the commands up to ``v[k - 1]``. ``periods`` is T / tau > 0, ``growth`` is b >= 0,
+    per unit of ``v``. ``memory`` is float64[2]: x, the previous command.
     """
     for k in range(v.size):
         now, held, x = v[k], memory[1], memory[0]
@@ -77,19 +71,12 @@ def lag_block(v: F64, periods: float, growth: float, memory: F64, out: F64) -> N
 
 @kernel("void(float64[::1], float64, float64, float64[::1], float64[::1])")
 def lead_block(x: F64, periods: float, growth: float, memory: F64, out: F64) -> None:
-    """Find the commands that bring the lag of :func:`lag_block` to wanted values.
+    """Find the commands that bring the lag of :func:`lag_block` to requested values, float64[n].
 
-    ``out[k]`` brings it to ``x[k]`` when ``out[k + 1]`` is put out. To go by D within a sample the
-    command must be ahead by D / (1 - exp(b D - T / tau)), which asks for b D < T / tau: no lag of
-    this kind moves faster than 1 / (tau b). D is held below 0.8 of that, and what is missing is
-    made good at the samples after it.
-
-    Args:
-        x: float64[n], wanted output of the lag.
-        periods: T / tau, > 0.
-        growth: b, one over the unit of ``x``, >= 0.
-        memory: float64[2]: the lag's output, the previous command.
-        out: float64[n], filled with commands.
+    ``out[k]`` brings it to ``x[k]`` when ``out[k + 1]`` is output. To move by D within a sample the
+    command must lead by D / (1 - exp(b D - T / tau)), which requires b D < T / tau: no lag of
+    this kind moves faster than 1 / (tau b). D stays below 0.8 of that, and the following samples
+    make up for the rest. ``memory`` is float64[2]: the lag's output, the previous command.
     """
     furthest = _REACH * periods / growth if growth > 0.0 else math.inf
     for k in range(x.size):
@@ -111,12 +98,8 @@ def lead_block(x: F64, periods: float, growth: float, memory: F64, out: F64) -> 
 def structure_block(x: F64, motion: F64, memory: F64, out: F64) -> None:
     """Let a mass on a damped spring follow ``x``, which changes linearly between samples.
 
-    Args:
-        x: float64[n], where it would rest.
-        motion: float64[2, 4]: position and velocity after a sample, from those before it and
-            from ``x`` before and after it.
-        memory: float64[3]: position, velocity, the previous ``x``.
-        out: float64[n], filled with positions.
+    ``motion`` is float64[2, 4]: position and velocity after a sample, from those before it and from
+    ``x`` before and after it. ``memory`` is float64[3]: position, velocity, the previous ``x``.
     """
     for k in range(x.size):
         now, before = x[k], memory[2]
@@ -137,7 +120,7 @@ def structure_block(x: F64, motion: F64, memory: F64, out: F64) -> None:
 
 @kernel("float64(float64[::1], float64)", inline=True)
 def _oldest(memory: F64, now: float) -> float:
-    """Put ``now`` into a row of values, oldest first, and return the one that leaves it."""
+    """Append ``now`` to a queue of values, and return the oldest one, which leaves it."""
     last = memory.size - 1
     if not abs(memory[last]) >= 0.0:
         for i in range(last):
@@ -152,13 +135,9 @@ def _oldest(memory: F64, now: float) -> float:
 
 @kernel("void(float64[::1], float64[::1], float64[::1], float64[::1])")
 def weigh_block(x: F64, weights: F64, memory: F64, out: F64) -> None:
-    """Sum a signal's last values, each with its weight.
+    """Sum a signal's last n >= 2 values; ``weights`` (float64[n]) begins with that of the oldest.
 
-    Args:
-        x: float64[k].
-        weights: float64[n], n >= 2, of the oldest value first.
-        memory: float64[n]: the last n - 1 values, the previous one.
-        out: float64[k], filled.
+    ``memory`` is float64[n]: the last n - 1 values, the previous one.
     """
     for k in range(x.size):
         total = weights[0] * _oldest(memory, x[k])
@@ -169,26 +148,16 @@ def weigh_block(x: F64, weights: F64, memory: F64, out: F64) -> None:
 
 @kernel("void(float64[::1], float64[::1], float64[::1])")
 def delay_block(x: F64, memory: F64, out: F64) -> None:
-    """Hold a signal back by n samples.
-
-    Args:
-        x: float64[k].
-        memory: float64[n + 1]: the last n values, the previous one.
-        out: float64[k], filled.
-    """
+    """Delay a signal by n samples; ``memory``, float64[n + 1], has these and the previous value."""
     for k in range(x.size):
         out[k] = _oldest(memory, x[k])
 
 
 @kernel("void(float64[::1], float64, float64[::1], float64[::1])")
 def between_block(x: F64, part: float, memory: F64, out: F64) -> None:
-    """Take a signal between its samples: ``part`` of the way from the one before to each.
+    """Interpolate a signal: ``part`` (0 to 1) of the way from the previous sample to each.
 
-    Args:
-        x: float64[n].
-        part: 0 to 1.
-        memory: float64[1]: the previous value.
-        out: float64[n], filled.
+    ``memory`` is float64[1]: the previous value.
     """
     for k in range(x.size):
         now, before = x[k], memory[0]
@@ -203,7 +172,7 @@ def between_block(x: F64, part: float, memory: F64, out: F64) -> None:
 
 @kernel("float64(float64[::1], float64[::1])", inline=True)
 def _crept(parameters: F64, memory: F64) -> float:
-    """Let all elements go on by a sample, and return what they come to."""
+    """Advance all elements by a sample, and return their sum."""
     elements = memory.size - 1
     before = memory[elements]
     x = before if abs(before) < math.inf else 0.0  # none yet, or one that was no displacement
@@ -216,14 +185,11 @@ def _crept(parameters: F64, memory: F64) -> float:
 
 @kernel("void(float64[::1], float64[::1], float64[::1], float64[::1])")
 def creep_block(x: F64, parameters: F64, memory: F64, out: F64) -> None:
-    """Add what creeps to a displacement.
+    """Add creep to a displacement from rest.
 
-    Args:
-        x: float64[n], from rest.
-        parameters: float64[2 m]: of each element what a sample leaves of it, exp(-1 / (T f)), then
-            of each what of x it gains in a sample, s (1 - exp(-1 / (T f))).
-        memory: float64[m + 1]: the elements, the previous x; updated.
-        out: float64[n], filled.
+    ``parameters`` is float64[2 m]: for each element the share that remains after a sample,
+    exp(-1 / (T f)), then for each its gain from x in a sample, s (1 - exp(-1 / (T f))). ``memory``
+    is float64[m + 1]: the elements, the previous x.
     """
     for k in range(x.size):
         total = _crept(parameters, memory)
@@ -233,7 +199,7 @@ def creep_block(x: F64, parameters: F64, memory: F64, out: F64) -> None:
 
 @kernel("void(float64[::1], float64[::1], float64[::1], float64[::1])")
 def uncreep_block(y: F64, parameters: F64, memory: F64, out: F64) -> None:
-    """Undo :func:`creep_block`: take off what has crept."""
+    """Subtract the creep: the inverse of :func:`creep_block`."""
     for k in range(y.size):
         x = y[k] - _crept(parameters, memory)
         memory[memory.size - 1] = x
@@ -245,7 +211,7 @@ def uncreep_block(y: F64, parameters: F64, memory: F64, out: F64) -> None:
 
 @kernel("UniTuple(float64, 2)(float64[::1], float64[::1])", inline=True)
 def _carried(parameters: F64, memory: F64) -> tuple[float, float]:
-    """Return position and velocity a sample later, but for what the next x adds to them."""
+    """Return position and velocity a sample later, without the effect of the next x."""
     position, velocity, before = memory[0], memory[1], memory[2]
     p = parameters[0] * position + parameters[1] * velocity + parameters[2] * before
     q = parameters[4] * position + parameters[5] * velocity + parameters[6] * before
@@ -259,15 +225,11 @@ def _keep(position: float, velocity: float, x: float, memory: F64) -> None:
 
 @kernel("void(float64[::1], float64[::1], float64[::1], float64[::1])")
 def mode_block(x: F64, parameters: F64, memory: F64, out: F64) -> None:
-    """Let a displacement pass a pair.
+    """Pass a displacement through a pair of antiresonance and resonance.
 
-    Args:
-        x: float64[n].
-        parameters: float64[12]: position and velocity after a sample, each from those before it and
-            from x before and after it; weights of position, velocity and x in the output; what x
-            comes to in the output of its own sample.
-        memory: float64[3]: position, velocity, the previous x; updated.
-        out: float64[n], filled.
+    ``parameters`` is float64[12]: position and velocity after a sample, each from those before it
+    and from x before and after it; weights of position, velocity and x in the output; the weight of
+    x in the output of its own sample. ``memory`` is float64[3]: position, velocity, the previous x.
     """
     for k in range(x.size):
         now = x[k]
@@ -282,7 +244,7 @@ def mode_block(x: F64, parameters: F64, memory: F64, out: F64) -> None:
 
 @kernel("void(float64[::1], float64[::1], float64[::1], float64[::1])")
 def unmode_block(y: F64, parameters: F64, memory: F64, out: F64) -> None:
-    """Undo :func:`mode_block`, exactly."""
+    """Run the exact inverse of :func:`mode_block`."""
     for k in range(y.size):
         now = y[k]
         p, q = _carried(parameters, memory)
@@ -296,12 +258,9 @@ def unmode_block(y: F64, parameters: F64, memory: F64, out: F64) -> None:
 
 
 def exponential(matrix: F64) -> F64:
-    """Return exp(matrix): float64[m, m], the Taylor series of a small part of it, squared.
+    """Return exp(matrix), float64[m, m] finite: the Taylor series of a small part of it, squared.
 
-    SciPy's to 13 digits, but a run would wait 0.2 s for SciPy, and keep 9 MB of it.
-
-    Args:
-        matrix: float64[m, m], finite.
+    It has 13 digits in common with SciPy's, whose import takes a run 0.2 s and 9 MB.
     """
     halvings = max(0, math.frexp(np.abs(matrix).sum(axis=1).max())[1] + 3)
     part = matrix * 0.5**halvings  # its norm is at most 1/8: the twelfth term is below 1e-19

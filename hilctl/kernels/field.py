@@ -1,24 +1,24 @@
-"""Hysteresis of an effective field: plays and drags of it, and the field that losses take.
+"""Hysteresis of an effective field: plays and drags, and losses between command and field.
 
-Notation: ``v`` is a command, ``w`` the field that is left of it, ``m`` what the operators give,
-``u = w + coupling m`` the effective field that they act on, ``T`` the sample period. All operators
-are tables over even cells of ``u``, so that next to one another in memory they are quick.
+Notation: ``v`` is a command, ``w`` the field behind the losses, ``m`` the operators' output,
+``u = w + coupling m`` the effective field, their input, and ``T`` the sample period. All operators
+are tables over even cells of ``u``, contiguous in memory for speed.
 
-A *play* of threshold r gives q(F_r[u]); a line of them for each r is Preisach's triangle. A *drag*
-of length k follows how far u is through a cell, s, as u travels: ds/d|u| = (s_u - s) / k where that
-is the way that u goes, else ds = 0. Its small loops creep from one to the next, as plays' never do.
-Each sample moves every cell of a drag but one place in the table of a play, so drags have cells of
-their own, which may be wider.
+A *play* of threshold r has the output q(F_r[u]); a line of them for each r is Preisach's triangle.
+A *drag* of length k relaxes to the position s_u of u in a cell while u moves towards it:
+ds/d|u| = (s_u - s) / k, otherwise ds = 0. Unlike those of plays, its small loops creep. A sample
+moves every cell of a drag but one place in the table of a play, so drags have their own cells,
+which may be wider.
 
-The command is ahead of the field by what the losses take, in the mean over a sample::
+The command leads the field by the losses, in the mean over a sample::
 
     v = w + z,  z + tau_b z' = h(e),  e = tau_0 w' + tau_1 m',
     h(e) = e (1 + b |e| + c e^2 + x / sqrt(|e| + e_0))
 
-Memory, float64[p + d c + 3 d + 6]: the plays' outputs, each drag's in each of c cells less those at
-rest, three sums over each drag, then u, m, z, w, what u last went by for each unit of v, of m in
-the inverse, and the previous input; NaN means that there is none yet. It is updated in place, so
-any cut into blocks gives the same bits.
+Memory, float64[p + d c + 3 d + 6]: the plays' outputs, each drag's in each of c cells relative to
+rest, three sums over each drag, then u, m, z, w, the last du/dv (du/dm in the inverse), and the
+previous input; NaN means that there is none yet. It is updated in place, so any cut into blocks
+gives the same bits.
 
 Sources: I. D. Mayergoyz, "Mathematical Models of Hysteresis", Springer 1991 (plays as Preisach's
 triangle); E. Della Torre, "Magnetic Hysteresis", IEEE Press 1999 (the moving model); D. C. Jiles,
@@ -56,14 +56,14 @@ _RUN = f"void({_ARRAY}, {_SPAN}, {_BANK}, float64, {_LOSSES}, {_CURVE}, {_ARRAY}
 
 @kernel("int64(float64, float64)", inline=True)
 def _cell(place: float, cells: float) -> int:
-    """Return the cell that a place lies in, or the one at the end that it is beyond."""
+    """Return the cell of a place; outside the cells, the nearest one."""
     # What is not a number must not become an index.
     return int(min(place, cells - 1.0)) if place > 0.0 else 0
 
 
 @kernel("float64(float64)", inline=True)
 def _gone(x: float) -> float:
-    """Return 1 - exp(-x) for x >= 0: by its series where x is small, as it is at most samples."""
+    """Return 1 - exp(-x) for x >= 0, as a series for small x, as in most samples."""
     if x > 0.06:
         return -math.expm1(-x)
     tail = 1.0 - x / 6.0 * (1.0 - x / 7.0 * (1.0 - x / 8.0))
@@ -72,14 +72,10 @@ def _gone(x: float) -> float:
 
 @kernel("float64(float64, float64, float64, float64, float64)")
 def dragged(held: float, low: float, width: float, last: float, way: float) -> float:
-    """Return a drag's output in a cell after the field has gone up by a way, in lengths.
+    """Return a drag's output in a cell after the field has risen by ``way`` >= 0, in lengths.
 
-    Args:
-        held: Output before, 0 to ``width``.
-        low: Lower end of the cell.
-        width: Of the cell.
-        last: Field before.
-        way: How far it goes up, >= 0; nothing moves before it has passed ``low + held``.
+    ``held`` is the output before, 0 to ``width``; ``low`` is the cell's lower end and ``last`` the
+    field before. Nothing moves before the field has passed ``low + held``.
     """
     begin = max(last, low + held)
     end = last + way
@@ -113,13 +109,13 @@ def drag_step(held: float, low: float, width: float, last: float, u: float, leng
 
 @kernel("float64(int64, float64, float64)", inline=True)
 def _rest(cell: int, lowest: float, width: float) -> float:
-    """Return how far a field of 0 is through a cell."""
+    """Return the part of a cell, as a length, below a field of 0."""
     return min(max(-(lowest + cell * width), 0.0), width)
 
 
 @kernel("float64(float64, float64, int64, float64, float64)", inline=True)
 def _waited(held: float, width: float, above: int, up: float, down: float) -> float:
-    """Return what a drag gives in a cell that the field left, which is so many cells above it."""
+    """Return a drag's output in a cell that the field has left, ``above`` cells above the field."""
     # Below the field it takes its part in what has gone up since, above it in what has gone down.
     if above < 0:
         return width - (width - held) * math.exp(-up)
@@ -130,14 +126,14 @@ def _waited(held: float, width: float, above: int, up: float, down: float) -> fl
 def drag_columns(
     u: F64, rows: I64, length: float, lowest: float, width: float, cells: int, first: int, out: F64
 ) -> None:
-    """Fill in what a drag of weight 1 gives in each cell, for identification.
+    """Fill in the output of a drag of weight 1 in each cell, for identification.
 
     Args:
-        u: float64[n], a path from rest; it need hold no more than its turning points.
+        u: float64[n], a path from rest; its turning points are enough.
         rows: int64[N], samples of the path that are filled in, rising.
         length: k.
         lowest: Lower end of the first cell.
-        width: Of a cell.
+        width: Width of a cell.
         cells: Number of cells c.
         first: Column of the first cell.
         out: float64[N, m], of which c columns are filled; 0 is rest.
@@ -163,7 +159,7 @@ def drag_columns(
 
 @kernel("float64(float64, float64[::1], float64[::1])")
 def mapped(x: float, knots: F64, values: F64) -> float:
-    """Return the value at ``x`` of a line through points, whose ends go on straight."""
+    """Return the value at ``x`` of a line through points, continued straight at its ends."""
     low, high = 0, knots.size - 1
     while high - low > 1:
         middle = (low + high) // 2
@@ -177,9 +173,9 @@ def mapped(x: float, knots: F64, values: F64) -> float:
 
 @kernel(f"UniTuple(float64, 2)(float64, float64, int64, float64[::1], {_BANK})", inline=True)
 def _drag(u: float, last: float, i: int, memory: F64, bank: Bank) -> tuple[float, float]:
-    """Return what a drag would give at a next u, and its slope.
+    """Return a drag's output at a next u, and its slope, without moving it.
 
-    In the cells that the field has passed all goes alike, so their sums do.
+    All cells that the field has passed move alike, so their sums are enough.
     """
     thresholds, lengths, _, weights, grid = bank
     lowest, width, cells = grid[0], grid[3], int(grid[4])
@@ -204,7 +200,7 @@ def _drag(u: float, last: float, i: int, memory: F64, bank: Bank) -> tuple[float
 
 @kernel(f"void(float64, float64, int64, float64[::1], {_BANK})", inline=True)
 def _move_drag(u: float, last: float, i: int, memory: F64, bank: Bank) -> None:
-    """Bring a drag to a next u, and keep what :func:`_drag` needs from there on."""
+    """Move a drag to a next u, and update the sums that :func:`_drag` uses."""
     thresholds, lengths, _, weights, grid = bank
     lowest, width, cells = grid[0], grid[3], int(grid[4])
     start, first = i * cells, thresholds.size + i * cells
@@ -230,7 +226,7 @@ def _move_drag(u: float, last: float, i: int, memory: F64, bank: Bank) -> None:
 
 @kernel(f"UniTuple(float64, 2)(float64, float64[::1], {_BANK})", inline=True)
 def _peek(u: float, memory: F64, bank: Bank) -> tuple[float, float]:
-    """Return what the operators would give at a next u, and its slope; change nothing."""
+    """Return the output of the operators at a next u, and its slope, without moving them."""
     thresholds, lengths, values, _, grid = bank
     low, per_cell, cells = grid[0], 1.0 / grid[1], grid[2]
     stride, plays = int(cells) + 1, thresholds.size
@@ -253,7 +249,7 @@ def _peek(u: float, memory: F64, bank: Bank) -> tuple[float, float]:
 
 @kernel(f"void(float64, float64[::1], {_BANK})", inline=True)
 def _settle(u: float, memory: F64, bank: Bank) -> None:
-    """Bring all operators to an effective field, and keep it."""
+    """Move all operators to an effective field."""
     thresholds, lengths = bank[0], bank[1]
     for i in range(thresholds.size):
         memory[i] = max(min(memory[i], u + thresholds[i]), u - thresholds[i])
@@ -279,7 +275,7 @@ def lost_field(e: float, losses: Losses) -> tuple[float, float]:
     nogil=True,
 )
 def field_left(v: F64, late: F64, step_s: F64, m: F64, losses: Losses, w: F64) -> None:
-    """Work out the field that the losses leave of a command, for outputs that are known.
+    """Compute the field behind the losses of a command, for known outputs of the operators.
 
     Args:
         v: float64[n], command after a part, at least half, of the step that ends at each sample.
@@ -287,7 +283,7 @@ def field_left(v: F64, late: F64, step_s: F64, m: F64, losses: Losses, w: F64) -
         step_s: float64[n], time of each step.
         m: float64[n], the operators' output at each sample.
         losses: See :data:`Losses`; the first three are in s, tau_b itself the third, and the last
-            is worked out for each step.
+            is computed for each step.
         w: float64[n], filled; the first is the first command.
     """
     w[0] = v[0]
@@ -316,7 +312,7 @@ def field_left(v: F64, late: F64, step_s: F64, m: F64, losses: Losses, w: F64) -
 def _given(
     what: int, u: float, memory: F64, bank: Bank, coupling: float, losses: Losses
 ) -> tuple[float, float, float]:
-    """Return what a next u gives, output, command or field, with its slope; and the output."""
+    """Return output, command or field at a next u, with its slope; and the output."""
     m, slope = _peek(u, memory, bank)
     w, w_slope = u - coupling * m, 1.0 - coupling * slope
     k = memory.size - 6
@@ -334,10 +330,10 @@ def _given(
 def _root(
     what: int, target: float, span: Span, memory: F64, bank: Bank, coupling: float, losses: Losses
 ) -> tuple[float, float]:
-    """Return the u that gives ``target``, or the end of the span that comes nearest; and m there.
+    """Return the u for ``target``, or the nearest end of the span; and m there.
 
-    Newton's steps from where u would be if it went on as it last did, within the bounds that the
-    signs so far have set, or halfway between these where a step leaves them or gains too little.
+    Newton's steps from the extrapolated u, within the bounds from the signs so far; bisection if a
+    step leaves these or gains too little.
     """
     low, high, tolerance = span
     ends = memory.size - 6
@@ -379,7 +375,7 @@ def _root(
 def _advance(
     what: int, target: float, span: Span, memory: F64, bank: Bank, coupling: float, losses: Losses
 ) -> float:
-    """Advance by a sample with a given output or command, and return the other of the two."""
+    """Advance by a sample with a known output or command, and return the other of the two."""
     k = memory.size - 6
     fresh = not abs(memory[k + 5]) >= 0.0
     # The first command counts as having stood there for ever: nothing of it is lost.
@@ -416,14 +412,13 @@ def field_forward(
     """Run the model.
 
     Args:
-        v: float64[n], commands, each held through the sample that ends with its output. One that is
-            not a number gives an output that is none, and leaves no trace.
-        span: Lowest and highest effective field, and by how much a root may miss, > 0.
+        v: float64[n], commands, each held through the sample that ends with its output. A command
+            that is not finite gives NaN and leaves no trace.
+        span: Lowest and highest effective field, and the tolerance of a root, > 0.
         bank: The operators.
-        coupling: Effective field for each unit of the operators' output.
+        coupling: Effective field per unit of the operators' output.
         losses: See :data:`Losses`.
-        curve: float64[k], output of the operators, and float64[k], displacement there in um, both
-            rising.
+        curve: float64[k], output of the operators, and float64[k], displacement in um, both rising.
         memory: See the module's docstring.
         out: float64[n], filled with um.
     """
@@ -448,8 +443,8 @@ def field_inverse(
 ) -> None:
     """Run the inverse; arguments as for :func:`field_forward`, with um in and commands out.
 
-    The field that gives an output is a root of a function that rises, the rest is explicit: so it
-    undoes :func:`field_forward` to within the tolerance wherever the span reaches.
+    The field of an output is a root of a rising function, and the rest is explicit, so it inverts
+    :func:`field_forward` to within the tolerance throughout the span.
     """
     for k in range(y.size):
         if abs(y[k]) < math.inf:

@@ -1,16 +1,16 @@
-"""A generalised Duhem operator: slopes of rising and of falling branches all over a band.
+"""A generalised Duhem operator: slopes of rising and of falling branches over a band.
 
-Notation: ``v`` is a command, ``w`` the field that is left of it, ``y`` a displacement, ``T`` the
+Notation: ``v`` is a command, ``w`` the field behind the losses, ``y`` a displacement, ``T`` the
 sample period. The operator is the differential equation
 
-    dy/dw = g_up(y, w - c(y)) where y rises, g_down(y, w - c(y)) where it falls,  |w - c(y)| <= b,
+    dy/dw = g_up(y, w - c(y)) rising, g_down(y, w - c(y)) falling,  |w - c(y)| <= b,
 
-with positive slopes g that are bilinear between the nodes of a grid, and a centre line c that
-rises. At the edge of the band w goes along with the centre. It is worked out by the midpoint rule
-in steps of y, short enough where each begins for w to rise with y throughout: so each displacement
-has one field, and each field one displacement.
+with positive slopes g, bilinear between the nodes of a grid, and a rising centre line c. At the
+edge of the band w moves with the centre. The midpoint rule integrates it in steps of y that are
+short enough for w to rise with y: so each displacement has one field, and each field one
+displacement.
 
-The command is ahead of the field by what the losses take, in the mean over a sample::
+The command leads the field by the losses, in the mean over a sample::
 
     v = w + z,  z + tau_b z' = h(e),  e = tau_0 w' + tau_1 m(y)',
     h(e) = e (1 + b |e| + c e^2 + x / sqrt(|e| + e_0))
@@ -50,14 +50,14 @@ _LOSSES = "UniTuple(float64, 8)"
 
 @kernel("int64(float64, float64)", inline=True)
 def _cell(place: float, cells: float) -> int:
-    """Return the cell that a place lies in, or the one at the end that it is beyond."""
+    """Return the cell of a place; outside the cells, the nearest one."""
     # A place that is not a number, from a memory that is none, must not become an index.
     return int(min(place, cells - 1.0)) if place > 0.0 else 0
 
 
 @kernel("float64(float64, float64[:, ::1], int64, float64[::1])", inline=True)
 def _along(y: float, lines: F64, line: int, grid: F64) -> float:
-    """Return the centre (line 0) or the flux (line 1) at a y; the ends go on straight."""
+    """Return the centre (line 0) or the flux (line 1) at a y, continued straight at its ends."""
     place = (y - grid[0]) / grid[1]
     i = _cell(place, lines.shape[1] - 1.0)
     return float(lines[line, i] + (lines[line, i + 1] - lines[line, i]) * (place - i))
@@ -71,7 +71,7 @@ def _along(y: float, lines: F64, line: int, grid: F64) -> float:
 def _slope(
     y: float, d: float, way: int, slopes: F64, grid: F64
 ) -> tuple[float, float, int, int, float, float]:
-    """Return g and its slope across the band, and where that lies: its cells, how far through."""
+    """Return g, its slope across the band, the cells, and the position in these."""
     place, across = (y - grid[0]) / grid[1], (d + grid[2]) / grid[3]
     i, j = _cell(place, slopes.shape[1] - 1.0), _cell(across, slopes.shape[2] - 1.0)
     a, b = min(max(place - i, 0.0), 1.0), min(max(across - j, 0.0), 1.0)
@@ -82,7 +82,7 @@ def _slope(
 
 @kernel(f"UniTuple(float64, 2)(float64, float64, float64, {_BAND})", inline=True)
 def _followed(y: float, w: float, target: float, band: Band) -> tuple[float, float]:
-    """Return the field after y has gone to ``target``, and dw/dy of the last step."""
+    """Return the field after y has moved to ``target``, and dw/dy of the last step."""
     slopes, steps, lines, grid = band
     way = 0 if target >= y else 1
     by_y, going, k = 0.0, True, 0
@@ -116,7 +116,7 @@ def _share_out(
     slopes: F64,
     by_node: F64,
 ) -> None:
-    """Add what a field gains by a slope to what it gains by the logarithms of four nodes."""
+    """Distribute the derivative by a slope to the derivatives by the logarithms of four nodes."""
     _, _, i, j, a, b = found
     stride = slopes.shape[2]
     node = (way * slopes.shape[1] + i) * stride + j
@@ -133,7 +133,7 @@ def _share_out(
 def duhem_columns(
     y: F64, start_y: float, start_w: float, band: Band, rows: I64, w: F64, out: F64
 ) -> None:
-    """Follow a path, and work out how the fields depend on the logarithm of each slope.
+    """Follow a path, and compute the dependence of the fields on the logarithm of each slope.
 
     Args:
         y: float64[n], the path.
@@ -142,7 +142,7 @@ def duhem_columns(
         band: The operator.
         rows: int64[N], points that are filled in, rising.
         w: float64[n], filled with the field.
-        out: float64[N, m], filled; no columns where m is 0.
+        out: float64[N, m], filled; no columns if m is 0.
     """
     slopes, steps, lines, grid = band
     by_node = np.zeros(out.shape[1])
@@ -206,10 +206,9 @@ def _moved(y: float, memory: F64, band: Band, losses: Losses) -> tuple[float, fl
 
 @kernel(f"float64(float64, float64[::1], {_BAND}, {_LOSSES})")
 def _root(command: float, memory: F64, band: Band, losses: Losses) -> float:
-    """Return the y that takes a command; one that takes it as its field where none came before.
+    """Return the y of a command; of a field before the first sample.
 
-    Newton's steps within the bounds that the signs so far have set, or halfway between these where
-    a step leaves them.
+    Newton's steps within the bounds from the signs so far; bisection if a step leaves these.
     """
     fresh = not abs(memory[3]) >= 0.0
     low, high = -math.inf, math.inf
@@ -238,13 +237,8 @@ def _root(command: float, memory: F64, band: Band, losses: Losses) -> float:
 def duhem_forward(v: F64, band: Band, losses: Losses, memory: F64, out: F64) -> None:
     """Run the model.
 
-    Args:
-        v: float64[n], commands, each held through the sample that ends with its output. One that is
-            not a number gives an output that is none, and leaves no trace.
-        band: The operator.
-        losses: See :data:`Losses`.
-        memory: See the module's docstring.
-        out: float64[n], filled with y.
+    ``v`` is float64[n], commands, each held through the sample that ends with its output; a command
+    that is not finite gives NaN and leaves no trace. ``out`` is float64[n], filled with y.
     """
     for k in range(v.size):
         if abs(v[k]) < math.inf:
@@ -259,10 +253,7 @@ def duhem_forward(v: F64, band: Band, losses: Losses, memory: F64, out: F64) -> 
 
 @kernel(f"void(float64[::1], {_BAND}, {_LOSSES}, float64[::1], float64[::1])")
 def duhem_inverse(y: F64, band: Band, losses: Losses, memory: F64, out: F64) -> None:
-    """Run the inverse; arguments as for :func:`duhem_forward`, with y in and commands out.
-
-    It is explicit: no root is looked for.
-    """
+    """Run the inverse, which is explicit; y in and commands out, see :func:`duhem_forward`."""
     for k in range(y.size):
         if abs(y[k]) < math.inf:
             w, z, command, _ = _moved(y[k], memory, band, losses)

@@ -1,13 +1,13 @@
 """The generalised Prandtl-Ishlinskii model: plays with envelope functions, and its inverse.
 
-A generalised play holds ``max(gamma_l(v) - r, min(gamma_r(v) + r, held))`` (1.17). Where
+A generalised play has the output ``max(gamma_l(v) - r, min(gamma_r(v) + r, held))`` (1.17). If
 ``gamma_l <= gamma_r``, all of them are ordinary plays of one signal z, the generalised play of
-threshold 0: so the model is a sum of plays behind z, and its inverse is the inverse sum of plays
+threshold 0: so the model is a sum of plays of z, and its inverse is the inverse sum of plays
 before the inverse envelopes. Each envelope is ``c tanh(k v + s) + o``; where the falling one would
 lie below the rising one, it follows the rising one.
 
 Memory, float64[m + 2]: m play outputs, z, then the previous command (NaN: none yet, which is 0).
-It is updated in place, so any cut of a signal into blocks gives the same bits.
+It is updated in place, so any cut into blocks gives the same bits. Signals are float64[n].
 
 Source: section 2.2.6 of "Modeling and Compensation of Rate-Dependent Asymmetric Hysteresis
 Nonlinearities of Magnetostrictive Actuators", Concordia; equation numbers are that dissertation's.
@@ -65,15 +65,9 @@ def envelope_forward(
 ) -> None:
     """Run the generalised model (1.20).
 
-    Args:
-        v: float64[n], command.
-        rising: float64[4], c, k, s and o of gamma_l; c and k are > 0.
-        falling: float64[4], those of gamma_r.
-        direct: p_0, weight of the play of threshold 0.
-        thresholds: float64[m], rising, in the unit of the envelopes.
-        weights: float64[m].
-        memory: float64[m + 2], see the module's docstring.
-        out: float64[n], filled.
+    ``rising`` and ``falling`` are float64[4]: c, k, s and o of gamma_l and gamma_r, with c and k
+    > 0. ``direct`` is p_0; ``thresholds`` (rising, in the unit of the envelopes) and ``weights``
+    are float64[m].
     """
     m = thresholds.size
     for k in range(v.size):
@@ -123,20 +117,10 @@ def envelope_inverse(
 ) -> None:
     """Run the inverse: the inverse sum of plays, then the inverse envelopes.
 
-    While z rises the command follows the inverse of gamma_l, while it falls that of gamma_r, and
-    where it turns the command jumps from one to the other; where z rests, so does the command.
-
-    Args:
-        y: float64[n], displacement in um.
-        rising: float64[4], see :func:`envelope_forward`.
-        falling: float64[4].
-        low: Lowest command given out.
-        high: Highest command given out.
-        direct: Direct weight of the inverse sum of plays.
-        thresholds: float64[m], its thresholds in um.
-        weights: float64[m], its weights.
-        memory: float64[m + 2], see the module's docstring.
-        out: float64[n], filled.
+    While z rises the command follows the inverse of gamma_l, while it falls that of gamma_r; the
+    command jumps where z turns and is constant where z is. ``y`` is float64[n], displacement in
+    um; commands stay within ``low`` to ``high``. ``direct``, ``thresholds`` (in um) and
+    ``weights`` are those of the inverse sum of plays.
     """
     m = thresholds.size
     for k in range(y.size):

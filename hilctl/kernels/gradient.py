@@ -1,14 +1,13 @@
-"""An operator of plays after a model, inverted sample by sample, and the step of its parameters.
+"""An operator of plays after a model, its inverse, and the adaptation of its parameters.
 
-The operator is x + g (x - c) + sum w_i (P_i[x] - c_i), in um, of a model's output and an offset, x:
-what the actuator does beside its model. The offset comes before it, so that x stays where the
-references are, wherever the offset is. It is a Prandtl-Ishlinskii operator, with an exact inverse
-as long as 1 + g and all sums 1 + g + w_1 + ... + w_i are above 0: K. Kuhnen and H. Janocha,
-"Adaptive inverse control of piezoelectric actuators with hysteresis operators", Proc. European
-Control Conference (1999).
+The operator is x + g (x - c) + sum w_i (P_i[x] - c_i), in um, with x the sum of a model's output
+and an offset: the difference between actuator and model. The offset comes first, so that x stays in
+the range of the references. It is a Prandtl-Ishlinskii operator, with an exact inverse if 1 + g and
+all sums 1 + g + w_1 + ... + w_i are above 0: K. Kuhnen and H. Janocha, "Adaptive inverse control of
+piezoelectric actuators with hysteresis operators", Proc. European Control Conference (1999).
 
-The parameters that are adapted are not o, g and w_i, whose regressors are much alike: each has the
-part of its regressor that those before it have not. So a step or a bound of one is none of another.
+The adapted parameters are not o, g and w_i, whose regressors are similar, but those of regressors
+orthogonalised one after the other. So a step or a bound of one does not affect another.
 """
 
 import math
@@ -33,8 +32,8 @@ def _inverted(
 ) -> float:
     """Return u with (1 + g) u + sum w_i P_i(u) = target, from the plays' memory [z_1..., u].
 
-    The plays that move with the input are engaged one after the other in the order of their
-    thresholds, and each adds its weight to the slope from there on.
+    Plays start to move with the input in the order of their thresholds, and each then adds its
+    weight to the slope.
     """
     n = thresholds.size
     last: float = memory[n]
@@ -79,17 +78,17 @@ def adapted_input(
     thresholds: F64,
     memory: F64,
 ) -> None:
-    """Turn the displacements wanted into a model's input, in place, by the operator's inverse.
+    """Convert requested displacements to a model's input, in place, by the operator's inverse.
 
     Args:
-        input_um: float64[n]; what is not finite is left, and no play moves by it.
-        size: Samples over which these go from ``before`` to ``after`` in a line, >= n.
+        input_um: float64[n]; values that are not finite stay, and move no play.
+        size: Samples over which the parameters change linearly, >= n.
         before: float64[m], o, g and w_i before the first sample.
         after: float64[m], the same after ``size`` samples.
         settings: float64[8], see the names above.
         table: float64[3, m], see :func:`adapt_block`.
         thresholds: float64[m - 2], rising, in half spans.
-        memory: float64[m - 1], outputs of the plays and the input before, in half spans.
+        memory: float64[m - 1], outputs of the plays and the previous input, in half spans.
     """
     middle, half = settings[MIDDLE_UM], settings[HALF_UM]
     for k in range(input_um.size):
@@ -112,7 +111,7 @@ def adapted_input(
 def _regressors(
     x_um: float, settings: F64, table: F64, shape: F64, thresholds: F64, memory: F64, out: F64
 ) -> None:
-    """Fill ``out`` (float64[m], um) with what the adapted parameters multiply."""
+    """Fill ``out`` (float64[m], um) with the regressors of the adapted parameters."""
     half = settings[HALF_UM]
     u = _played((x_um - settings[MIDDLE_UM]) / half, thresholds, memory)
     out[OFFSET] = 1.0
@@ -141,18 +140,9 @@ def regressor_sums(
     sums: F64,
     products: F64,
 ) -> None:
-    """Add up the regressors of an input, and their products.
+    """Add the regressors of an input to ``sums``, float64[m], and their products to ``products``.
 
-    Args:
-        input_um: float64[n].
-        settings: float64[8].
-        table: float64[3, m].
-        shape: float64[m, m].
-        thresholds: float64[m - 2].
-        memory: float64[m - 1].
-        found: float64[m], scratch.
-        sums: float64[m], added to.
-        products: float64[m, m], added to.
+    ``found`` is scratch, float64[m]; see :func:`adapt_block` for the other arguments.
     """
     for k in range(input_um.size):
         _regressors(input_um[k], settings, table, shape, thresholds, memory, found)
@@ -164,7 +154,7 @@ def regressor_sums(
 
 @kernel("float64(float64, float64[::1], int64[::1], int64)", inline=True)
 def _delayed(value: float, line: F64, places: I64, which: int) -> float:
-    """Put a value into a line, and return the oldest one in it: itself where there is one place."""
+    """Put a value into a delay line, and return its oldest one; the same value in a line of one."""
     at = places[which]
     line[at] = value
     at = (at + 1) % line.size
@@ -175,7 +165,7 @@ def _delayed(value: float, line: F64, places: I64, which: int) -> float:
 
 @kernel("float64(float64[::1], float64[:, ::1], float64)", inline=True)
 def _excess(found: F64, table: F64, count: float) -> float:
-    """Return how much larger than on average the regressors are, squared; 1 where they are not."""
+    """Return the square of the regressors relative to its mean, at least 1."""
     total = 0.0
     for j in range(found.size):
         total += found[j] * found[j] / table[POWER, j]
@@ -186,7 +176,8 @@ def _excess(found: F64, table: F64, count: float) -> float:
 def _step(size: int, settings: F64, table: F64, shape: F64, state: F64) -> None:
     """Move the parameters by ``size`` samples of the smoothed gradient, within their bounds.
 
-    The dead zone is of what a gradient explains of the squared error: below it, that may be noise.
+    The dead zone applies to the part of the squared error that a gradient explains: below it, that
+    may be noise.
     """
     pace, dead = size * settings[RATE], settings[DEAD_UM2]
     for j in range(state.shape[1]):
@@ -224,29 +215,29 @@ def adapt_block(
     memory: F64,
     state: F64,
 ) -> int:
-    """Hold a block's displacements against the references due, and step the parameters by them.
+    """Compare a block's displacements with the references due, and step the parameters.
 
-    A sample whose error is larger than the parameters can make is left out: that is no change of
-    the actuator. By a block in which none is left nothing changes.
+    A sample with a larger error than the parameters can cause is ignored, because that is no change
+    of the actuator. A block without any other sample changes nothing.
 
     Args:
         reference_um: float64[n].
         input_um: float64[n], the model's input.
         displacement_um: float64[n].
-        flags: uint32[n]: where one is set, the actuator was not given what the samples ask for.
-        settings: float64[8].
-        table: float64[3, m]: bound of each parameter, centre of its regressor before the others are
-            taken out, and mean square after that; infinite where it is not adapted.
-        shape: float64[m, m], lower triangle: how much of the others each regressor is given.
+        flags: uint32[n]; samples with a flag are ignored.
+        settings: float64[8], see the names above.
+        table: float64[3, m]: bound of each parameter, centre of its regressor before it is
+            orthogonalised, and mean square after that; infinite if it is not adapted.
+        shape: float64[m, m], lower triangle: share of the others in each regressor.
         thresholds: float64[m - 2], rising, in half spans.
-        due: float64[d + 1], a line of references, to the displacement that is to show them.
-        shown: float64[e + 1], a line of inputs, to the displacement that shows them.
-        places: int64[2], where both lines stand.
+        due: float64[d + 1], delay line of references, to the displacement that shows them.
+        shown: float64[e + 1], delay line of inputs, to the displacement that shows them.
+        places: int64[2], positions in both lines.
         memory: float64[m - 1], of the plays.
         state: float64[5, m], parameters, the same as o, g and w_i, smoothed gradient, scratch.
 
     Returns:
-        Samples that were taken.
+        Number of samples used.
     """
     found, total = state[FOUND], state[TOTAL]
     size, last, taken, usable = reference_um.size, memory.size - 1, 0, 1.0

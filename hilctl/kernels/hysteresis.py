@@ -1,13 +1,12 @@
 """Play, stop and deadband operators, their weighted sums, and the integrated model.
 
-Notation: ``v`` is an input, ``x`` what stands between the plays and the deadbands, ``y`` an output.
-A *widening* is what the rate adds to every threshold: ``r_i(v') = r_i + gamma |v'|`` (6.18).
+Notation: ``v`` is an input, ``x`` the signal between plays and deadbands, ``y`` an output. The
+*widening* is the rate's addition to every threshold: ``r_i(v') = r_i + gamma |v'|`` (6.18).
 
-Memory of a sum of m plays, float64[m + 1]: the m operator outputs, then the previous input. A
-previous input of NaN means that there is none yet: the rate is then zero, and an operator that
-holds 0 starts at ``max(v_0 - r, min(v_0 + r, 0))`` as the literature has it. Memory is updated in
-place, so any cut of a signal into blocks gives the same bits as one call. ``out`` may be the input
-array itself.
+Memory of a sum of m plays, float64[m + 1]: the m operator outputs, then the previous input. NaN
+means that there is none yet: then the rate is zero, and an operator with output 0 starts at
+``max(v_0 - r, min(v_0 + r, 0))`` as in the literature. Memory is updated in place, so any cut into
+blocks gives the same bits. ``out`` may be the input array itself.
 
 Source: "Modeling and Compensation of Rate-Dependent Asymmetric Hysteresis Nonlinearities of
 Magnetostrictive Actuators", Concordia; equation numbers are that dissertation's.
@@ -21,16 +20,9 @@ from hilctl.kernels.jit import kernel
 
 @kernel("float64(float64, float64, float64, float64)")
 def stop_step(v: float, v_previous: float, threshold: float, held: float) -> float:
-    """Advance one stop operator by one sample (section 3.3).
+    """Advance one stop operator by one sample (section 3.3); its output stays within the threshold.
 
-    Args:
-        v: Input.
-        v_previous: Previous input.
-        threshold: Largest magnitude of the output, > 0, in the unit of ``v``.
-        held: The operator's previous output.
-
-    Returns:
-        The operator's output, within ``threshold`` of 0.
+    ``threshold`` is > 0, in the unit of ``v``; ``held`` is the operator's previous output.
     """
     return min(threshold, max(-threshold, v - v_previous + held))
 
@@ -62,16 +54,8 @@ def _weigh(weights: F64, values: F64) -> float:
 def deadband_value(x: float, slope: float, d_up: F64, g_up: F64, d_down: F64, g_down: F64) -> float:
     """Evaluate the memoryless function Lambda, a weighted sum of deadband operators (6.6).
 
-    Args:
-        x: Input.
-        slope: Weight g_0 of the operator with threshold 0.
-        d_up: float64[k], thresholds > 0, rising, in the unit of ``x``.
-        g_up: float64[k], their weights.
-        d_down: float64[l], thresholds < 0, falling.
-        g_down: float64[l], their weights.
-
-    Returns:
-        Lambda(x).
+    ``slope`` is g_0; ``d_up`` (rising, > 0) and ``d_down`` (falling, < 0) are thresholds in the
+    unit of ``x``, and ``g_up`` and ``g_down`` their weights.
     """
     total = slope * x
     j = 0
@@ -104,18 +88,10 @@ def deadband_block(
 def play_sum_shared(
     v: F64, widening: F64, direct: float, thresholds: F64, weights: F64, memory: F64, out: F64
 ) -> None:
-    """Sum weighted plays whose widening is given sample by sample.
+    """Sum weighted plays whose widening, float64[n] >= 0, is given for each sample.
 
-    Two sums fed with one and the same widening cancel exactly where one is the other's inverse.
-
-    Args:
-        v: float64[n], input.
-        widening: float64[n], added to every threshold, >= 0.
-        direct: Weight of the input itself, a_0.
-        thresholds: float64[m], rising, in the unit of ``v``.
-        weights: float64[m].
-        memory: float64[m + 1], see the module's docstring.
-        out: float64[n], filled.
+    Two sums with the same widening cancel exactly if one is the other's inverse. The other
+    arguments are those of :func:`play_sum`.
     """
     for k in range(v.size):
         now = v[k]
@@ -135,7 +111,7 @@ def play_sum(
     Args:
         v: float64[n], input.
         rate_gain: Widening for a change of 1 between samples: gamma times the sample rate; 0
-            gives the rate-independent model.
+            for the rate-independent model.
         direct: Weight of the input itself, a_0.
         thresholds: float64[m], rising, in the unit of ``v``.
         weights: float64[m].
@@ -151,14 +127,9 @@ def play_sum(
 
 @kernel("void(float64[::1], float64[::1], float64[::1], float64[::1], float64[:, ::1])")
 def play_outputs(v: F64, widening: F64, thresholds: F64, memory: F64, out: F64) -> None:
-    """Record each play operator's output by itself, as regressors for identification.
+    """Fill ``out`` (float64[n, m]) with the output of each play, as regressors for identification.
 
-    Args:
-        v: float64[n], input.
-        widening: float64[n], added to every threshold, >= 0.
-        thresholds: float64[m], in the unit of ``v``.
-        memory: float64[m + 1], see the module's docstring.
-        out: float64[n, m], filled.
+    ``widening`` is float64[n] >= 0, ``thresholds`` float64[m] in the unit of ``v`` (float64[n]).
     """
     for k in range(v.size):
         _move_plays(v[k], widening[k], thresholds, memory)
@@ -171,14 +142,9 @@ def play_outputs(v: F64, widening: F64, thresholds: F64, memory: F64, out: F64) 
 def stop_sum(v: F64, direct: float, thresholds: F64, weights: F64, memory: F64, out: F64) -> None:
     """Sum weighted stop operators: the stop-operator-based compensator (3.11).
 
-    Args:
-        v: float64[n], input.
-        direct: Weight w_0 of the operator whose threshold is never reached: the input itself.
-        thresholds: float64[m], rising, in the unit of ``v``.
-        weights: float64[m].
-        memory: float64[m + 1]: the operators' outputs, then the previous input. A previous input
-            of NaN counts as 0, the input at rest.
-        out: float64[n], filled.
+    ``direct`` is w_0, the weight of the input itself; ``thresholds`` (rising, in the unit of ``v``)
+    and ``weights`` are float64[m]. ``memory`` is float64[m + 1]: the operators' outputs, then the
+    previous input; NaN counts as 0, the input at rest.
     """
     for k in range(v.size):
         now = v[k]
@@ -253,7 +219,7 @@ def integrated_inverse(
 
 
 def rest_memory(operators: int) -> F64:
-    """Return the memory of that many operators at rest: float64[operators + 1]."""
+    """Return the memory of a number of operators at rest: float64[operators + 1]."""
     memory = np.zeros(operators + 1)
     memory[operators] = np.nan
     return memory

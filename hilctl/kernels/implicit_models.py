@@ -1,15 +1,15 @@
 """Models without an analytic inverse: Preisach, Krasnosel'skii-Pokrovskii, Bouc-Wen.
 
-Given the memory, the displacement never falls as the next command rises, so the inverse is a root.
+For a given memory, the displacement never falls with the next command, so the inverse is a root.
 
 A model is a number and three arrays. Preisach (0): thresholds r_i, float64[m]; q_i at the edges of
 c cells, float64[m (c + 1)]; lowest edge, width of a cell, c. Krasnosel'skii-Pokrovskii (1): alpha,
 float64[m]; beta, float64[m]; weights, then the ridge's width. Bouc-Wen (2): direct, hysteretic,
 beta, gamma, exponent (1 or 2); the other two are not used.
 
-Memory, float64[m + 1]: the operators' outputs (for Bouc-Wen its one z), then the previous command;
-NaN means that there is none yet, and Bouc-Wen then sets out from 0. It is updated in place, so any
-cut of a signal into blocks gives the same bits.
+Memory, float64[m + 1]: the operators' outputs (z of Bouc-Wen), then the previous command; NaN means
+that there is none yet, and Bouc-Wen then begins at 0. It is updated in place, so any cut of a
+signal into blocks gives the same bits.
 
 Source: sections 2.2 and 2.3 of "Modeling and Compensation of Rate-Dependent Asymmetric
 Hysteresis Nonlinearities of Magnetostrictive Actuators", Concordia.
@@ -39,7 +39,7 @@ def _ridge(v: float, threshold: float, width: float) -> float:  # (1.3)
 
 @kernel("float64(float64, float64, float64)")
 def _time_to_zero(depth: float, opening: float, exponent: float) -> float:
-    """Return the travel that takes z back to 0 from ``depth`` on the far side."""
+    """Return the travel that returns z to 0 from ``depth`` on the other side."""
     if opening <= 0.0:
         return depth
     if exponent < 1.5:
@@ -49,7 +49,7 @@ def _time_to_zero(depth: float, opening: float, exponent: float) -> float:
 
 @kernel("float64(float64, float64, float64)")
 def _depth_left(travel: float, opening: float, exponent: float) -> float:
-    """Undo :func:`_time_to_zero`."""
+    """Return the depth for a travel: the inverse of :func:`_time_to_zero`."""
     if opening <= 0.0:
         return travel
     if exponent < 1.5:
@@ -118,7 +118,7 @@ def _next_z(v: float, memory: F64, p: F64) -> float:
 
 @kernel("float64(int64, float64, float64[::1], UniTuple(float64[::1], 3))")
 def _peek(kind: int, v: float, memory: F64, arrays: Arrays) -> float:
-    """Return the displacement that a next command would give, in um; change nothing."""
+    """Return the displacement at a next command, in um, without moving the operators."""
     if kind == PREISACH:
         return _preisach(v, memory, arrays[0], arrays[1], arrays[2])
     if kind == KRASNOSELSKII_POKROVSKII:
@@ -168,7 +168,7 @@ def _between(
     memory: F64,
     arrays: Arrays,
 ) -> float:
-    """Return the root between two commands, one short and one over, by secants and bisection."""
+    """Return the root between two commands with errors of opposite sign (secants, bisection)."""
     near, far = command
     near_short, far_short = shortage
     for k in range(_STEPS):
@@ -197,7 +197,7 @@ def _root(
     memory: F64,
     arrays: Arrays,
 ) -> float:
-    """Return the command that gives ``target``, or the end of the span that comes nearest."""
+    """Return the command for ``target``, or the nearest end of the span."""
     low, high = span
     held = memory[memory.size - 1]
     near = max(low, min(high, held if abs(held) >= 0.0 else 0.0))
@@ -231,15 +231,8 @@ def implicit_inverse(
 ) -> None:
     """Run a model's inverse, root by root; its memory is that of the model.
 
-    Args:
-        kind: Number of the model.
-        y: float64[n], displacement in um. One that is not a number gives a command that is none,
-            and leaves no trace.
-        span: Lowest and highest command given out.
-        tolerance: Displacement by which the model may miss, in um, > 0.
-        arrays: The model's, see the module's docstring.
-        memory: float64[m + 1].
-        out: float64[n], filled with commands within the span.
+    ``y`` is float64[n], displacement in um; a value that is not finite gives NaN and leaves no
+    trace. Commands stay within ``span``; the model misses y by ``tolerance`` > 0 um at most.
     """
     for k in range(y.size):
         target = y[k]

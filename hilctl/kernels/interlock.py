@@ -1,8 +1,8 @@
-"""Interlocks on the samples of a run: all of them in one pass, with memory from block to block.
+"""Interlocks on the samples of a run: all of them in one pass, with memory between blocks.
 
-Settings and memory are arrays with a named place for each number, so that one call a block does it
-all; see :class:`hilctl.loop.interlocks.Interlocks` for what they mean. A time is a whole number of
-samples; one that is infinite switches its interlock off.
+Settings and memory are arrays with a named place for each number, so that one call per block is
+enough; see :class:`hilctl.loop.interlocks.Interlocks` for their meaning. A time is a whole number
+of samples; an infinite one disables its interlock.
 """
 
 from enum import IntFlag
@@ -26,20 +26,9 @@ class InterlockFlag(IntFlag):
 
 
 (
-    STROKE_LOW,
-    STROKE_HIGH,
-    RAIL_LOW,
-    RAIL_HIGH,
-    FROZEN_UM,
-    FROZEN_TRAVEL,
-    FROZEN_SAMPLES,
-    DEVIATION,
-    DEVIATION_SAMPLES,
-    WARMING,
-    BUDGET,
-    TRACKING_UM,
-    TRACKING_SAMPLES,
-) = range(13)
+    STROKE_LOW, STROKE_HIGH, RAIL_LOW, RAIL_HIGH, FROZEN_UM, FROZEN_TRAVEL, FROZEN_SAMPLES,
+    DEVIATION, DEVIATION_SAMPLES, WARMING, BUDGET, TRACKING_UM, TRACKING_SAMPLES,
+) = range(13)  # fmt: skip
 SETTINGS = 13
 
 COMMAND, READING, LOWEST, HIGHEST, FROZEN_RUN, DEVIATION_RUN, HEAT, TRACKING_RUN = range(8)
@@ -54,7 +43,7 @@ _TRACKING = int(InterlockFlag.TRACKING_ERROR)
 
 @kernel("int64(float64, float64[::1])", inline=True)
 def _invalid(displacement_um: float, settings: F64) -> int:
-    """Judge one reading by itself: within the stroke, and short of the sensor's ends."""
+    """Return the flag of a reading outside the stroke or at an end of the sensor's range."""
     within = settings[STROKE_LOW] <= displacement_um <= settings[STROKE_HIGH]
     seen = settings[RAIL_LOW] < displacement_um < settings[RAIL_HIGH]
     return 0 if within and seen else _INVALID
@@ -62,10 +51,10 @@ def _invalid(displacement_um: float, settings: F64) -> int:
 
 @kernel("int64(float64, float64, float64[::1], float64[::1])", inline=True)
 def _frozen(displacement_um: float, command: float, settings: F64, memory: F64) -> int:
-    """Count the samples for which the reading has stayed although the command has travelled.
+    """Count the samples with a constant reading after the command has travelled.
 
-    Time counts from the moment the command has gone far enough, so that a hold, however long, or
-    a step out of one does not look like a dead sensor.
+    Time counts from the moment of sufficient travel, so that a hold, however long, or a step after
+    one does not look like a dead sensor.
     """
     reading, run = memory[READING], memory[FROZEN_RUN]
     low, high = min(memory[LOWEST], command), max(memory[HIGHEST], command)
@@ -80,10 +69,10 @@ def _frozen(displacement_um: float, command: float, settings: F64, memory: F64) 
 
 @kernel("int64(float64, float64, float64[::1], float64[::1])", inline=True)
 def _deviating(measured: float, command: float, settings: F64, memory: F64) -> int:
-    """Count the samples at which the measured command is away from what was put out.
+    """Count the samples with a deviation of the measured command.
 
-    A reading may be taken before or after its own command takes effect, so it is held against the
-    span of this command and the one before. NaN is away from anything.
+    A reading may be taken before or after its own command takes effect, so it is compared with the
+    span of this command and the previous one. NaN always deviates.
     """
     previous, away = memory[COMMAND], settings[DEVIATION]
     low, high = min(previous, command) - away, max(previous, command) + away
@@ -112,7 +101,7 @@ def _too_hot(command: float, measured: float, settings: F64, memory: F64) -> int
 
 @kernel("int64(float64, float64, float64[::1], float64[::1])", inline=True)
 def _off_track(reference: float, displacement_um: float, settings: F64, memory: F64) -> int:
-    """Count the samples with too large an error; NaN, no reference, is none."""
+    """Count the samples with too large an error; without a reference (NaN) there is none."""
     run = memory[TRACKING_RUN] + 1.0
     if not abs(reference - displacement_um) > settings[TRACKING_UM]:
         run = 0.0
@@ -133,19 +122,19 @@ def interlock_block(
     measured: F64,
     flags: U32,
 ) -> int:
-    """Hold a block of samples against all interlocks.
+    """Check a block of samples against all interlocks.
 
     Args:
         settings: float64[13], see the names above.
         memory: float64[8], updated in place; any cut into blocks gives the same bits.
         command: float64[n], in A or V.
-        reference: float64[n], in um; NaN where there is none.
+        reference: float64[n], in um; NaN without one.
         displacement_um: float64[n].
-        measured: float64[n], the command as measured, in A or V; NaN where it is not.
-        flags: uint32[n]; the bit of each interlock is added where it trips.
+        measured: float64[n], the measured command, in A or V; NaN without one.
+        flags: uint32[n]; the bit of each tripped interlock is added.
 
     Returns:
-        Index of the first sample at which one trips, or -1.
+        Index of the first trip, or -1.
     """
     first = -1
     for k in range(command.size):
@@ -163,16 +152,10 @@ def interlock_block(
 
 @kernel("float64(float64[::1], float64, float64, float64[::1])")
 def heat_block(command: F64, warming: float, heat: float, out: F64) -> float:
-    """Follow the heat of a coil through a block of commands, as :func:`interlock_block` does.
+    """Fill ``out`` with the heat of a coil after each command, as :func:`interlock_block` does.
 
-    Args:
-        command: float64[n], in A.
-        warming: 1 - exp(-dt / tau).
-        heat: Heat before the block, in A^2.
-        out: float64[n], filled with the heat after each sample, in A^2.
-
-    Returns:
-        Heat after the block.
+    ``command`` is float64[n], in A; ``warming`` is 1 - exp(-dt / tau), ``heat`` the heat before the
+    block, in A^2. Return the heat after it.
     """
     for k in range(command.size):
         heat = _warmed(heat, command[k], command[k], warming)

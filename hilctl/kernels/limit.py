@@ -20,26 +20,26 @@ def limit_block(
     command: F64,
     flags: U32,
 ) -> int:
-    """Bring wanted commands within a range and a largest change from sample to sample.
+    """Limit requested commands, float64[n], to a range and a largest change per sample.
 
-    A wanted value that is not finite is replaced by the last command. No step is larger than
-    ``max_step``. Where ``previous`` lies within [low, high] every result does; where it does not,
-    the results come in by whole steps.
+    A request that is not finite is replaced by the last command. No step is larger than
+    ``max_step``. If ``previous``, the last command, lies within [low, high], every result does;
+    otherwise the results return by whole steps.
 
     Args:
-        wanted: float64[n], what the compensator asks for.
-        previous: Last command that was put out.
-        low: Lowest command allowed.
-        high: Highest command allowed.
+        wanted: float64[n], requested commands.
+        previous: Last command.
+        low: Lowest command.
+        high: Highest command.
         max_step: Largest change from one sample to the next, > 0.
-        range_bit: Flag to set where the range limited.
-        slew_bit: Flag to set where the slew limited.
-        invalid_bit: Flag to set where ``wanted`` was not finite.
+        range_bit: Flag of commands limited by the range.
+        slew_bit: Flag of commands limited by the slew.
+        invalid_bit: Flag of requests that are not finite.
         command: float64[n], filled.
-        flags: uint32[n]; bits are added to what is there.
+        flags: uint32[n]; bits are added.
 
     Returns:
-        Index of the first wanted value that was not finite, or -1.
+        Index of the first request that is not finite, or -1.
     """
     last = previous
     first_invalid = -1

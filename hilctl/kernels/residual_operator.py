@@ -1,14 +1,13 @@
-"""What a displacement has beyond what a model says: an operator of the modelled displacement.
+"""The residual of a model: an operator of the modelled displacement.
 
-With ``x`` the displacement that a model gives, less that at rest, the actuator's is x + R[x], and
+With ``x`` the displacement by a model, relative to rest, that of the actuator is x + R[x], and
 
     R[x] = sum q_i(F_i[x]) + sum (a_i(x) s_i + b_i(x) s_i^2) + c(x) rate
 
-*Plays* F_i of rising thresholds; *drags* s_i of lengths l_i, -1 to 1, which relax along the way
-that x travels, ds = (sign(dx) - s) |dx| / l; *rate*, -1 to 1, the change of x over a window of
-samples, of the fastest that was seen. All tables are lines through the same even edges of ``x``,
-and flat beyond them. So R is bounded, whatever the past, and so is the root of x + R[x] = y, the
-inverse.
+*Plays* F_i have rising thresholds; *drags* s_i of lengths l_i, -1 to 1, relax along the path of x,
+ds = (sign(dx) - s) |dx| / l; *rate*, -1 to 1, is the change of x over a window of samples, relative
+to the fastest one. All tables are lines through the same even edges of ``x``, constant outside. So
+R is bounded for any history, and so is the inverse, the root of x + R[x] = y.
 
 Memory, float64[p + d + n + 2]: the plays' outputs, the drags', ``x`` of the last n samples of the
 window, the last slope dx / dy, and the previous input; NaN means that there is none yet. It is
@@ -41,13 +40,13 @@ _TOLERANCE_UM = 1e-6
 
 @kernel("float64(float64, float64)", inline=True)
 def _within(place: float, cells: float) -> float:
-    """Return a place held within the cells; one that is not a number counts as the first."""
+    """Return a place limited to the cells; 0 for NaN."""
     return min(place, cells) if place > 0.0 else 0.0
 
 
 @kernel(f"float64(float64, float64, float64[::1], {_TABLES})")
 def _peek(x: float, fastest: float, memory: F64, tables: Tables) -> float:
-    """Return R for a next x; change nothing."""
+    """Return R for a next x, without moving the operators."""
     thresholds, lengths, values, weights, grid = tables
     low, per_cell, cells = grid[0], 1.0 / grid[1], grid[2]
     stride, plays, drags = int(cells) + 1, thresholds.size, lengths.size
@@ -77,7 +76,7 @@ def _peek(x: float, fastest: float, memory: F64, tables: Tables) -> float:
 
 @kernel(f"void(float64, float64, float64[::1], {_TABLES})")
 def _settle(x: float, given: float, memory: F64, tables: Tables) -> None:
-    """Bring all operators to a next x."""
+    """Move all operators to a next x."""
     thresholds, lengths = tables[0], tables[1]
     plays, drags, last = thresholds.size, lengths.size, memory.size - 3
     for i in range(plays):
@@ -98,19 +97,15 @@ def _settle(x: float, given: float, memory: F64, tables: Tables) -> None:
 
 @kernel(f"float64(float64[::1], {_TABLES})", inline=True)
 def _fastest(memory: F64, tables: Tables) -> float:
-    """Return the change that counts as rate 1; none does where nothing has been before."""
+    """Return the change that counts as rate 1; infinite at the first sample."""
     return tables[4][3] if abs(memory[memory.size - 1]) >= 0.0 else math.inf
 
 
 @kernel(f"void(float64[::1], {_TABLES}, float64[::1], float64[::1])")
 def residual_forward(x: F64, tables: Tables, memory: F64, out: F64) -> None:
-    """Give x + R[x].
+    """Return x + R[x] in ``out``, float64[n], for ``x``, float64[n], in um.
 
-    Args:
-        x: float64[n], in um. One that is not a number gives one that is none, and leaves no trace.
-        tables: See :data:`Tables`.
-        memory: See the module's docstring.
-        out: float64[n], filled.
+    A value that is not finite gives NaN and leaves no trace.
     """
     for k in range(x.size):
         now = x[k]
@@ -123,7 +118,7 @@ def residual_forward(x: F64, tables: Tables, memory: F64, out: F64) -> None:
 
 @kernel(f"float64(float64, float64[::1], {_TABLES})")
 def _root(y: float, memory: F64, tables: Tables) -> float:
-    """Return the x that gives y: by secants from where the last ones lead, kept between bounds."""
+    """Return the x of a y, by secants from the extrapolated x, within bounds."""
     fastest, most = _fastest(memory, tables), tables[4][4]
     low, high, last = y - most, y + most, memory.size - 3
     slope = memory[last + 1]
@@ -155,7 +150,7 @@ def _root(y: float, memory: F64, tables: Tables) -> float:
 
 @kernel(f"void(float64[::1], {_TABLES}, float64[::1], float64[::1])")
 def residual_inverse(y: F64, tables: Tables, memory: F64, out: F64) -> None:
-    """Find the x of which x + R[x] is y; arguments as for :func:`residual_forward`."""
+    """Find the x with x + R[x] = y; arguments as for :func:`residual_forward`."""
     for k in range(y.size):
         now = y[k]
         if abs(now) < math.inf:
@@ -167,13 +162,13 @@ def residual_inverse(y: F64, tables: Tables, memory: F64, out: F64) -> None:
 
 @kernel(f"void(float64[::1], int64[::1], int64, {_TABLES}, float64[:, ::1])")
 def residual_columns(x: F64, rows: I64, window: int, tables: Tables, out: F64) -> None:
-    """Fill in what R is linear in, for identification: its slopes in each cell, and a, b and c.
+    """Fill in the terms that R is linear in, for identification: slopes in each cell, a, b and c.
 
     Args:
         x: float64[m], from rest.
         rows: int64[N], samples that are filled in, rising.
         window: Samples.
-        tables: See :data:`Tables`; thresholds, lengths and grid count.
+        tables: See :data:`Tables`; only thresholds, lengths and grid are used.
         out: float64[N, p c + (2 d + 1) (c + 1)], of zeros.
     """
     thresholds, lengths, _, _, grid = tables

@@ -15,17 +15,7 @@ safe_output.py  writes of the safe value, and the outcome of a run
 """
 
 PUBLIC = (
-    "adaptation",
-    "block",
-    "compensator",
-    "feedback",
-    "interlocks",
-    "lead_in",
-    "limiter",
-    "loop",
-    "pacer",
-    "plan",
-    "safe_output",
-    "tuning",
-)
+    "adaptation", "block", "compensator", "feedback", "interlocks", "lead_in", "limiter", "loop",
+    "pacer", "plan", "safe_output", "tuning",
+)  # fmt: skip
 """Modules that other rooms import; the others are private."""

@@ -65,11 +65,7 @@ class AdaptationBounds:
 class DisplacementOperator:
     """Operator of the difference between actuator and model, for a reference.
 
-    Args:
-        bounds: float64[m], largest deviations of the parameters.
-        settings: float64[SETTINGS], see :mod:`hilctl.kernels.gradient`.
-        table: float64[3, m], see :mod:`hilctl.kernels.gradient`.
-        shape: float64[m, m], see :mod:`hilctl.kernels.gradient`.
+    ``bounds`` is float64[m]; see :mod:`hilctl.kernels.gradient` for the other arrays.
     """
 
     def __init__(self, bounds: F64, settings: F64, table: F64, shape: F64) -> None:
@@ -80,12 +76,9 @@ class DisplacementOperator:
     def over(
         cls, reference_um: F64, bounds: AdaptationBounds, told: tuple[slice, ...] | None = None
     ) -> Self:
-        """Return the operator for a reference; plays and centre follow from its span.
+        """Return the operator for a reference, float64[n]; plays and centre follow from its span.
 
-        Args:
-            reference_um: float64[n], n > 0.
-            bounds: Largest deviations of the parameters.
-            told: Representative parts of the reference; all of it if None.
+        ``told`` selects representative parts of the reference; None for all of it.
 
         Raises:
             InputError: Within these bounds the operator may have no inverse.
@@ -290,12 +283,7 @@ class Adaptation:
         )
 
     def event(self, sample: int, *, ended: bool = False) -> Event | None:
-        """Return an event with the parameters if they have changed enough.
-
-        Args:
-            sample: Next sample of the run.
-            ended: Whether the run has ended: then there is always an event.
-        """
+        """Return an event with the parameters if they have changed enough or the run has ended."""
         values, bounds = self._state[kernel.VALUE], self._operator.bounds
         if not ended:
             if sample - self._said_at < self._event_after:

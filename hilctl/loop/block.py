@@ -10,8 +10,6 @@ class Block:
 
     Args:
         head: Fields of :class:`hilctl.base.samples.BlockHeader`, int64 each.
-        area: Arrays of all slots.
-        slot: Index of the slot.
 
     Attributes:
         number: Number of the block in the run; -1 in a spare slot, which is not recorded.
@@ -30,24 +28,6 @@ class Block:
         measured: Measured command, filled by the device if it has one: float64[B].
         input_um: The compensator's input: float64[B]; in the waveform's unit without a model.
     """
-
-    __slots__ = (
-        "columns",
-        "command",
-        "displacement_um",
-        "due",
-        "flags",
-        "guarded",
-        "head",
-        "input_um",
-        "measured",
-        "memory",
-        "number",
-        "reference",
-        "skipped",
-        "state",
-        "wanted",
-    )
 
     def __init__(self, head: "memoryview[int]", area: BlockBatch, slot: int) -> None:
         self.head = head

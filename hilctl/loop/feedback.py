@@ -10,9 +10,9 @@ bandwidth well below 1 / (2 pi times the loop's delay) no FIFO makes it oscillat
 """
 
 import math
+from abc import ABC, abstractmethod
 from collections import deque
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -24,29 +24,35 @@ from hilctl.loop.block import Block
 _INVERSE_OUT = int(Flag.INVERSE_OUT)
 
 
-class Controller(Protocol):
-    """A controller that corrects the compensator's input; called in every tick, it never waits."""
+class Controller(ABC):
+    """A controller that corrects the compensator's input; called in every tick, it never waits.
 
-    correction_um: float
-    """Last correction, in um."""
+    Args:
+        limit_um: Largest correction, > 0; the correction is always finite and within it.
+        shown_after: Steps of the integral from a correction to the displacement that contains it.
+    """
+
+    def __init__(self, limit_um: float, shown_after: int) -> None:
+        if not 0.0 < limit_um < math.inf:
+            raise InputError(f"limit_um must be > 0: {limit_um}")
+        self._limit_um = limit_um
+        self._integral_um = 0.0
+        self.correction_um = 0.0
+        """Last correction, in um."""
+        self._polarity = Polarity(limit_um, shown_after)
 
     @property
     def against(self) -> str:
         """Why the sensor seems to have the opposite sign of the command; empty otherwise."""
-        ...
+        return self._polarity.against
 
+    @abstractmethod
     def follow(self, block: Block, input_um: F64) -> None:
-        """Correct the input of a block's samples in the waveform.
+        """Correct the input, float64[n], of a block's samples in the waveform, in place."""
 
-        Args:
-            block: The block, with reference and skipped samples.
-            input_um: float64[n], corrected in place.
-        """
-        ...
-
+    @abstractmethod
     def take(self, block: Block) -> None:
         """Process an answered block, in any phase of the run."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,42 +72,22 @@ class Gains:
             raise InputError(f"kp must be >= 0 and ki_per_s > 0: {self.kp}, {self.ki_per_s}")
 
 
-class Feedback:
-    """PI controller for one sample per tick; its correction is always finite.
+class Feedback(Controller):
+    """PI controller for one sample per tick.
 
     Args:
-        gains: Its gains.
-        rate_hz: Samples per second.
-        limit_um: Largest correction, > 0.
         due_after: Samples from a reference to its displacement: 0 if the compensator has a preview
             for it, otherwise 1, plus the delay of link and sensor.
-        shown_after: Samples from a correction to the displacement that contains it.
     """
 
     def __init__(
-        self,
-        gains: Gains,
-        rate_hz: float,
-        limit_um: float,
-        due_after: int,
-        shown_after: int = 2,
+        self, gains: Gains, rate_hz: float, limit_um: float, due_after: int, shown_after: int = 2
     ) -> None:
-        if not 0.0 < limit_um < math.inf:
-            raise InputError(f"limit_um must be > 0: {limit_um}")
+        super().__init__(limit_um, shown_after)
         self._kp = gains.kp
         self._step = gains.ki_per_s / rate_hz
-        self._limit_um = limit_um
         self._due: deque[float] = deque([math.nan] * (due_after + 1), due_after + 1)
-        self._integral_um = 0.0
-        self.correction_um = 0.0
-        """Present correction, in um, within the limit."""
         self._seen = math.nan, False
-        self._polarity = Polarity(limit_um, shown_after)
-
-    @property
-    def against(self) -> str:
-        """Why the sensor seems to have the opposite sign of the command; empty otherwise."""
-        return self._polarity.against
 
     def follow(self, block: Block, input_um: F64) -> None:
         """Correct the input of the next sample, see :class:`Controller`."""
@@ -118,14 +104,10 @@ class Feedback:
         self._seen = math.nan if bypassed else block.displacement_um.item(0), limited
 
     def correct(self, reference_um: float, displacement_um: float, *, limited: bool) -> float:
-        """Return the correction of the next sample, in um.
+        """Return the correction of the next sample, in um, from the last displacement.
 
         Without a finite error (at the start, after a gap, with a lost sensor) the correction stays.
-
-        Args:
-            reference_um: Reference of this sample, after tuning.
-            displacement_um: Displacement of the last exchange.
-            limited: Whether the last command was limited: then the integral may only shrink.
+        If the last command was limited, the integral may only shrink.
         """
         due_um = self._due[0]
         error_um = due_um - displacement_um
@@ -158,11 +140,8 @@ class Polarity:
     With a reversed sign the correction increases the error, and grows to its limit. Disturbances
     can drive it there too. The sum of input and displacement separates both: with a reversed sign
     it is constant, otherwise it moves twice as far as the input. It is observed from half of the
-    limit on, and evaluated after as many samples at the limit.
-
-    Args:
-        limit_um: Largest correction.
-        shown_after: Samples from a correction to the displacement that contains it.
+    limit on, and evaluated after as many samples at the limit. ``shown_after`` is the number of
+    samples from a correction to the displacement that contains it.
     """
 
     def __init__(self, limit_um: float, shown_after: int) -> None:
@@ -207,34 +186,22 @@ def _spanning(span: tuple[float, float], value: float) -> tuple[float, float]:
 _LIMITED = int(Flag.RANGE_LIMITED | Flag.SLEW_LIMITED)
 
 
-class IntegralFeedback:
-    """Integral controller for blocks; its correction is always finite.
+class IntegralFeedback(Controller):
+    """Integral controller for blocks; it steps once per block.
 
     Args:
         gain_per_block: um of correction per um of error and block, > 0.
-        limit_um: Largest correction, > 0.
         due_after: Samples from a reference to its displacement.
-        shown_after: Blocks from a correction to the displacements that contain it.
     """
 
     def __init__(
         self, gain_per_block: float, limit_um: float, due_after: int, shown_after: int
     ) -> None:
+        super().__init__(limit_um, shown_after)
         if not 0.0 < gain_per_block < 1.0:
             raise InputError(f"gain_per_block must be > 0 and < 1: {gain_per_block}")
-        if not 0.0 < limit_um < math.inf:
-            raise InputError(f"limit_um must be > 0: {limit_um}")
-        self._gain, self._limit_um = gain_per_block, limit_um
+        self._gain = gain_per_block
         self._before_due: F64 = np.full(due_after, math.nan)
-        self._integral_um = 0.0
-        self.correction_um = 0.0
-        """Correction at the end of the last block, in um, within the limit."""
-        self._polarity = Polarity(limit_um, shown_after)
-
-    @property
-    def against(self) -> str:
-        """Why the sensor seems to have the opposite sign of the command; empty otherwise."""
-        return self._polarity.against
 
     def follow(self, block: Block, input_um: F64) -> None:
         """Correct the input, float64[n], of a block's samples in the waveform.

@@ -28,13 +28,7 @@ _FIRST_SAMPLE = int(BlockHeader.FIRST_SAMPLE)
 
 @dataclass(frozen=True, slots=True)
 class Trip:
-    """Why a run must end.
-
-    Attributes:
-        sample: Sample at which an interlock tripped first.
-        code: Code of the interlock.
-        reason: One line of text.
-    """
+    """Why a run must end: first sample, code of the interlock, one line of text."""
 
     sample: int
     code: TripCode
@@ -120,7 +114,6 @@ class InterlockContext:
     Attributes:
         stroke_um: Lowest and highest permitted displacement.
         sensor_um: Range of the sensor; a reading at its end is invalid.
-        unit: Unit of commands.
         safe: Safe value, the command before the run.
         frozen_travel: Travel of the command after which a reading must change, in ``unit``.
         heat_a2: Heat of the coil before the run: running mean square of the current in A^2, at
@@ -143,13 +136,7 @@ class InterlockContext:
 
 
 class Interlocks:
-    """Check blocks of samples against the interlocks.
-
-    Args:
-        context: The rig.
-        settings: Settings of the interlocks.
-        sample_rate_hz: Samples per second.
-    """
+    """Check blocks of samples against the interlocks."""
 
     def __init__(
         self, context: InterlockContext, settings: InterlockSettings, sample_rate_hz: float
@@ -233,11 +220,7 @@ class Interlocks:
     ) -> Trip:
         """Return the trip; of several, a cause before its consequence.
 
-        Args:
-            sample: Sample of the trip.
-            bits: Its flags.
-            sent: Command before it, command, measured command.
-            seen: Reference, displacement.
+        ``sent`` is command before, command, measured command; ``seen`` is reference, displacement.
         """
         reference, displacement = seen
         settings = self.settings

@@ -36,80 +36,27 @@ class Conditioning:
     lead_in: int = 1
 
 
-class RestingOffset:
-    """Measure the offset between sensor and model at rest, and subtract it from the input.
-
-    Args:
-        conditioning: The conditioning.
-        begins_at: Its first sample.
-    """
-
-    def __init__(self, conditioning: Conditioning, begins_at: int) -> None:
-        first, stop = conditioning.rest
-        self._first, self._stop = begins_at + first, begins_at + stop
-        self._sum_um, self._count = 0.0, 0
-        self._about_um, self._square_um2 = math.nan, 0.0
-        self._offset_um = 0.0
-        way = np.arange(1, conditioning.lead_in + 1) / conditioning.lead_in
-        self._rise: F64 = 0.5 * (1.0 - np.cos(np.pi * way))
-
-    def take(self, first_sample: int, displacement_um: F64) -> None:
-        """Add the displacements of a block, float64[B]; only samples at rest count."""
-        low, high = self._first - first_sample, self._stop - first_sample
-        if low < displacement_um.size and high > 0:
-            resting = displacement_um[max(low, 0) : high]
-            self._sum_um += float(resting.sum())
-            if not self._count:
-                self._about_um = resting.item(0)
-            # Relative to the first sample: squares of the displacement itself would hide the noise.
-            self._square_um2 += float(np.square(resting - self._about_um).sum())
-            self._count += resting.size
-
-    @property
-    def resting_um(self) -> float:
-        """Mean displacement at rest; NaN without samples."""
-        return self._sum_um / self._count if self._count else math.nan
-
-    @property
-    def noise_um(self) -> float:
-        """Standard deviation of the displacement at rest; NaN without samples."""
-        if not self._count:
-            return math.nan
-        mean_um = self.resting_um - self._about_um
-        return math.sqrt(max(0.0, self._square_um2 / self._count - mean_um**2))
-
-    def remove(self, offset_um: float) -> None:
-        """Subtract an offset from the input from now on."""
-        self._offset_um = offset_um
-
-    def apply(self, input_um: F64, start: int) -> None:
-        """Correct the input (float64[n]) from sample ``start`` of the waveform on, in place.
-
-        The correction fades in, so that the compensator starts with the model's value.
-        """
-        if not self._offset_um:
-            return
-        rising = self._rise[start : start + input_um.size]
-        input_um[: rising.size] -= self._offset_um * rising
-        input_um[rising.size :] -= self._offset_um
-
-
 class LeadIn:
-    """Samples of a run before its waveform.
+    """Samples of a run before its waveform: a ramp of whole blocks, then the conditioning.
 
-    Args:
-        conditioning: Follows the ramp; may be None.
-        ramp_samples: Samples of the ramp to the safe value, whole blocks.
+    At rest it measures the offset between sensor and model, which is then subtracted from the
+    compensator's input.
     """
 
     def __init__(self, conditioning: Conditioning | None, ramp_samples: int) -> None:
         self.condition_at = self.waveform_at = ramp_samples
         """First samples of the conditioning and of the waveform."""
         self._conditioning = conditioning
-        self._resting: RestingOffset | None = None
+        self._rest = 0, 0
+        self._sum_um, self._count = 0.0, 0
+        self._about_um, self._square_um2 = math.nan, 0.0
+        self._offset_um = 0.0
         if conditioning is not None:
             self.waveform_at += conditioning.command.size
-            self._resting = RestingOffset(conditioning, self.condition_at)
+            first, stop = conditioning.rest
+            self._rest = ramp_samples + first, ramp_samples + stop
+            way = np.arange(1, conditioning.lead_in + 1) / conditioning.lead_in
+            self._rise: F64 = 0.5 * (1.0 - np.cos(np.pi * way))
 
     def ramp_event(self, output: float, safe: float) -> Event:
         """Return the event of the initial ramp."""
@@ -134,9 +81,16 @@ class LeadIn:
         wanted[:] = self._conditioning.command[start : start + wanted.size]
 
     def take(self, first_sample: int, displacement_um: F64) -> None:
-        """Add the displacements of a block, float64[B], of any part of the run."""
-        if self._resting is not None:
-            self._resting.take(first_sample, displacement_um)
+        """Add the displacements of a block, float64[B]; only samples at rest count."""
+        low, high = self._rest[0] - first_sample, self._rest[1] - first_sample
+        if low < displacement_um.size and high > 0:
+            resting = displacement_um[max(low, 0) : high]
+            self._sum_um += float(resting.sum())
+            if not self._count:
+                self._about_um = resting.item(0)
+            # Relative to the first sample: squares of the displacement itself would hide the noise.
+            self._square_um2 += float(np.square(resting - self._about_um).sum())
+            self._count += resting.size
 
     def remove_offset(self) -> tuple[str, dict[str, float], bool]:
         """Compare the resting displacement with the model's, and remove the difference.
@@ -145,26 +99,40 @@ class LeadIn:
             Text, empty if nothing was measured; values; whether the offset exceeds the limit, so
             that the run must end.
         """
-        conditioning, resting = self._conditioning, self._resting
-        if conditioning is None or resting is None or conditioning.stands_um is None:
+        conditioning = self._conditioning
+        if conditioning is None or conditioning.stands_um is None:
             return "", {}, False
-        stands_um, measured_um = conditioning.stands_um, resting.resting_um
+        stands_um, measured_um = conditioning.stands_um, self.resting_um
         offset_um = measured_um - stands_um
         values = {"offset_um": offset_um, "resting_um": measured_um, "model_um": stands_um}
         rests = f"at rest the sensor shows {measured_um:.4g} µm, the model {stands_um:.4g} µm"
         if not abs(offset_um) <= conditioning.largest_um:
             limit = f"an offset beyond {conditioning.largest_um:.4g} µm"
             return f"{rests}: {limit}: identify the model anew", values, True
-        resting.remove(offset_um)
+        self._offset_um = offset_um
         text = f"{rests}: {offset_um:.4g} µm are subtracted from the compensator's input"
         return text, values, False
 
     @property
+    def resting_um(self) -> float:
+        """Mean displacement at rest; NaN without samples."""
+        return self._sum_um / self._count if self._count else math.nan
+
+    @property
     def noise_um(self) -> float:
         """Standard deviation of the displacement at rest; NaN without samples."""
-        return math.nan if self._resting is None else self._resting.noise_um
+        if not self._count:
+            return math.nan
+        mean_um = self.resting_um - self._about_um
+        return math.sqrt(max(0.0, self._square_um2 / self._count - mean_um**2))
 
     def correct(self, input_um: F64, start: int) -> None:
-        """Subtract the measured offset from the input (float64[n]) from sample ``start`` on."""
-        if self._resting is not None:
-            self._resting.apply(input_um, start)
+        """Subtract the measured offset from the input (float64[n]) from sample ``start`` on.
+
+        The correction fades in, so that the compensator starts with the model's value.
+        """
+        if not self._offset_um:
+            return
+        rising = self._rise[start : start + input_um.size]
+        input_um[: rising.size] -= self._offset_um * rising
+        input_um[rising.size :] -= self._offset_um

@@ -15,8 +15,6 @@ class CommandLimits:
     """Limits of a command, in the device's unit (A or V).
 
     Attributes:
-        low: Lowest command.
-        high: Highest command.
         slew_per_s: Slew rate, > 0.
         safe: Command of the safe state, within [low, high].
         ramp_per_s: Slew rate of the safe ramp, > 0 and at most ``slew_per_s``.
@@ -52,10 +50,6 @@ class Limiter:
 
     The last command may be set to the present output. If that is outside the limits, commands
     return into the range with limited slew.
-
-    Args:
-        limits: The limits.
-        dt_s: Sample period.
     """
 
     def __init__(self, limits: CommandLimits, dt_s: float) -> None:
@@ -89,18 +83,10 @@ class Limiter:
         return 0 if self.at_rest else math.ceil(round(steps, 6))
 
     def ramp(self, command: F64, flags: U32, skipped: int = 0) -> bool:
-        """Fill ``command`` with the next part of the safe ramp.
+        """Fill ``command`` (float64[n]) with the next part of the safe ramp.
 
         The ramp is a function of time: after skipped samples the first step is larger, at most a
-        quarter of the distance from the far limit.
-
-        Args:
-            command: float64[n], filled.
-            flags: uint32[n], changed in place.
-            skipped: Samples of the ramp skipped before.
-
-        Returns:
-            Whether the ramp has ended.
+        quarter of the distance from the far limit. Return whether the ramp has ended.
         """
         flags |= Flag.RAMP.value
         scratch = flags.copy()

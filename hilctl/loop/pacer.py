@@ -29,10 +29,7 @@ class _Timespec(ctypes.Structure):
 def deadline_misses(skipped: int, due: int, max_share: float) -> str:
     """Return text such as ``deadline misses 944 of 3003 (31 %)``; empty without any.
 
-    Args:
-        skipped: Skipped ticks.
-        due: All ticks, skipped ones included.
-        max_share: Share above which ``timing not kept`` is added.
+    ``due`` includes the skipped ticks; above ``max_share`` the text adds ``timing not kept``.
     """
     if not skipped:
         return ""
@@ -53,7 +50,7 @@ class SystemClock:
     """Return the time in ns."""
 
     def sleep_until_ns(self, deadline_ns: int) -> None:
-        """Sleep until ``deadline_ns``; return immediately if it has passed."""
+        """Sleep until a time; return immediately if it has passed."""
         if deadline_ns <= self.now_ns():
             return  # faster than a call of the kernel
         self._spec.tv_sec, self._spec.tv_nsec = divmod(deadline_ns, 1_000_000_000)
@@ -67,15 +64,7 @@ class SystemClock:
 
 @dataclass(slots=True)
 class Lateness:
-    """Exact counters of late ticks.
-
-    Attributes:
-        late_ticks: Ticks later than the limit.
-        skipped_ticks: Ticks skipped to keep the phase.
-        worst_ns: Largest lateness.
-        worst_tick: Tick with the largest lateness.
-        longest_run: Most consecutive late ticks.
-    """
+    """Exact counters of late ticks, and the most consecutive ones (``longest_run``)."""
 
     late_ticks: int = 0
     skipped_ticks: int = 0
@@ -110,7 +99,6 @@ class Pacer:
     """Wake the loop at absolute times.
 
     Args:
-        clock: The clock.
         period_ns: Period of the ticks; may be fractional.
         policy: What follows a tick that is a period or more late; may be changed between ticks.
             ``skip``: skip ticks to keep the phase. ``catch_up``: run all ticks. ``slip``: shift the
@@ -118,7 +106,6 @@ class Pacer:
             follow that clock. ``spaced``, for the start of a run: each tick waits a whole period
             after the end of the previous one, so two writes are never closer, however long an
             exchange took.
-        rules: Rules for late ticks.
     """
 
     def __init__(

@@ -27,18 +27,9 @@ class LoopPlan:
             corrections; the reference itself without a compensator.
         block: Samples per exchange.
         latency_blocks: Exchanges from a block's commands to its displacements.
-        sample_rate_hz: Samples per second.
-        compensator: Warmed up, with its initial state.
-        limits: Limits of the commands.
-        interlocks: Properties of the rig that interlocks need.
-        interlock_settings: Settings of the interlocks.
         late_policy: Policy for late ticks in the waveform.
         start_policy: Policy in the initial ramp and the conditioning.
         ramp_policy: Policy in the safe ramp.
-        late_rules: When a tick counts as late, and when lateness ends the run.
-        feedback: Corrects the compensator's input; may be None.
-        adaptation: Adapts the compensator's model; may be None.
-        conditioning: Precedes the waveform; may be None.
         keep_all: Whether a block that is dropped because the ring is full ends the run.
     """
 
@@ -92,9 +83,7 @@ class Host(Protocol):
     def heartbeat(self, next_sample: int, late_ticks: int) -> str:
         """Write the heartbeat, once per tick; return the reason to stop, or an empty text.
 
-        Args:
-            next_sample: Index of the next sample in the waveform; 0 before it begins.
-            late_ticks: Number of late ticks so far.
+        ``next_sample`` is an index in the waveform; 0 before it begins.
         """
         ...
 

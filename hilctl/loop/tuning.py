@@ -23,12 +23,7 @@ _AS_IT_IS = (1.0, 0.0, 1.0)
 
 @dataclass(frozen=True, slots=True)
 class LinearBypass:
-    """Replacement for the inverse: a command that is linear in the reference.
-
-    Attributes:
-        slope: Slope in the command's unit per um.
-        at_zero: Command at a reference of 0 um.
-    """
+    """Replacement for the inverse: the command ``slope`` times the reference plus ``at_zero``."""
 
     slope: float = 0.0
     at_zero: float = 0.0
@@ -39,12 +34,9 @@ class Tuning:
     """A requested change of the reference or of the inverse's share.
 
     Attributes:
-        gain: Factor of the reference.
-        offset: Added to it, in the waveform's unit.
         samples: Duration of the change.
         begins_at: First sample of the change; if it has passed, the next block.
         inverse_share: Share of the inverse in the command, 0 to 1; the rest is the line's.
-        line: The straight line.
     """
 
     gain: float
@@ -56,13 +48,7 @@ class Tuning:
 
 
 class TuningFactors(NamedTuple):
-    """Factors of a block: numbers, or float64[n] each during a change.
-
-    Attributes:
-        gain: Factor of the reference.
-        offset: Added to it.
-        inverse_share: Share of the inverse in the command.
-    """
+    """Factors of a block: numbers, or float64[n] each during a change."""
 
     gain: float | F64
     offset: float | F64
@@ -140,14 +126,7 @@ class ReferenceTuner:
         return TuningFactors(*factors)
 
     def fade(self, factors: TuningFactors, reference: F64, wanted: F64, flags: U32) -> None:
-        """Mix the straight line into the commands of the inverse.
-
-        Args:
-            factors: Factors of these samples.
-            reference: float64[n], in um, tuned.
-            wanted: float64[n], the inverse's commands, changed in place.
-            flags: uint32[n], changed in place.
-        """
+        """Mix the straight line into the commands of the inverse, see :func:`crossfade`."""
         share = factors.inverse_share
         if isinstance(share, np.ndarray) or share < 1.0:
             crossfade(share, self._to.line, reference, wanted, flags)
@@ -170,14 +149,10 @@ def tune(factors: TuningFactors, values: F64, out: F64) -> None:
 def crossfade(
     share: float | F64, line: LinearBypass, reference: F64, wanted: F64, flags: U32
 ) -> None:
-    """Crossfade commands of the inverse (float64[n]) with those of a straight line, in place.
+    """Crossfade commands of the inverse with those of a straight line, in place.
 
-    Args:
-        share: Share of the inverse, a number or float64[n]; if it is 1, no bit changes.
-        line: The straight line.
-        reference: float64[n], in um.
-        wanted: float64[n], the inverse's commands.
-        flags: uint32[n]; ``INVERSE_OUT`` is set for changed samples.
+    All arrays are of n samples; the reference is in um. No bit changes where the share of the
+    inverse is 1; ``INVERSE_OUT`` is set for all other samples.
     """
     out = np.broadcast_to(share < 1.0, wanted.shape)
     straight = line.slope * reference + line.at_zero

@@ -2,14 +2,14 @@
 
 import math
 from collections.abc import Iterator
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from hilctl.base.strict import Field, StrictModel, model_validator
+from hilctl.base.strict import CheckedModel, Field, StrictModel
 from hilctl.kernels.field import Bank, Losses, field_forward, field_inverse
-from hilctl.models.base import HysteresisModel, Operator, Thresholds, Weights, refuse
-from hilctl.models.implicit_models import cell_problems, table_problems
+from hilctl.models.base import HysteresisModel, Operator, Thresholds, Weights
+from hilctl.models.implicit_models import cell_problems, line_problems, play_tables, table_problems
 
 _TOLERANCE_UM = 1e-6
 _EVEN = 1e-3
@@ -64,7 +64,7 @@ class FieldLosses(StrictModel):
         )
 
 
-class OutputCurve(StrictModel):
+class OutputCurve(CheckedModel):
     """A piecewise linear function from the operators' output to displacement, both rising.
 
     Attributes:
@@ -75,11 +75,6 @@ class OutputCurve(StrictModel):
     operators_um: Weights
     displacement_um: Weights
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        refuse(self._problems())
-        return self
-
     def _problems(self) -> Iterator[str]:
         if len(self.operators_um) != len(self.displacement_um) or len(self.operators_um) < 2:
             yield "the curve needs as many displacement_um as operators_um, and two at least"
@@ -88,7 +83,7 @@ class OutputCurve(StrictModel):
                 yield f"{name} must rise for the inverse to exist: {list(getattr(self, name))}"
 
 
-class FieldModel(HysteresisModel):
+class FieldModel(CheckedModel, HysteresisModel):
     """Plays and drags of an effective field u = w + coupling m, a curve after them, losses before.
 
     Unlike those of a sum of plays, minor loops depend on the output (curve, coupling) and, through
@@ -120,23 +115,11 @@ class FieldModel(HysteresisModel):
     curve: OutputCurve
     losses: FieldLosses = FieldLosses()
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
+    def _problems(self) -> Iterator[str]:
         plays, drags = self._lines()
-        refuse(
-            (
-                *self._operator_problems(),
-                *cell_problems(self.cell, plays),
-                *table_problems(drags),
-            )
-        )
-        return self
-
-    def _operator_problems(self) -> Iterator[str]:
-        if not self.thresholds or self.thresholds[0] != 0.0:
-            yield f"the first threshold must be 0: {list(self.thresholds[:1])}"
-        if any(np.diff(self.thresholds) <= 0.0):
-            yield f"thresholds must rise: {list(self.thresholds)}"
+        yield from line_problems(self.thresholds)
+        yield from cell_problems(self.cell, plays)
+        yield from table_problems(drags)
         if any(not length > 0.0 for length in self.lengths):
             yield f"lengths must be > 0: {list(self.lengths)}"
         if len(self.slopes) != len(self.thresholds) + len(self.lengths):
@@ -161,26 +144,19 @@ class FieldModel(HysteresisModel):
 
     def _bank(self) -> Bank:
         slopes, drags = map(np.array, self._lines())
-        lines, cells = slopes.shape
+        cells = slopes.shape[1]
         wide = drags.shape[1] if drags.size else cells
-        values = np.zeros((lines, cells + 1))
-        np.cumsum(slopes * self.cell, axis=1, out=values[:, 1:])
-        place = -self.lowest / self.cell
-        of_rest = int(min(max(np.floor(place), 0.0), cells - 1.0))
-        values -= values[:, [of_rest]] + slopes[:, [of_rest]] * self.cell * (place - of_rest)
+        values = play_tables(slopes, self.lowest, self.cell)
         grid = np.array([self.lowest, self.cell, cells, self.cell * (cells / wide), wide])
         lengths = np.array(self.lengths, dtype=np.float64)
         return np.array(self.thresholds), lengths, values.ravel(), drags.ravel(), grid
 
-    def _span(self) -> tuple[float, float, float]:
-        """Return the lowest and highest u of the search, and the tolerance."""
-        width = self.cell * len(self.slopes[0])
-        return self.lowest - width, self.lowest + 2.0 * width, _TOLERANCE_UM
-
     def _parameters(self, sample_rate_hz: float) -> tuple[Any, ...]:
-        losses = self.losses.sampled(sample_rate_hz, self.cell * len(self.slopes[0]))
+        width = self.cell * len(self.slopes[0])
+        span = self.lowest - width, self.lowest + 2.0 * width, _TOLERANCE_UM
+        losses = self.losses.sampled(sample_rate_hz, width)
         curve = np.array(self.curve.operators_um), np.array(self.curve.displacement_um)
-        return self._span(), self._bank(), self.coupling, losses, curve
+        return span, self._bank(), self.coupling, losses, curve
 
     def forward(self, sample_rate_hz: float) -> Operator:
         """Return the operator from command to um, at rest."""

@@ -1,14 +1,14 @@
 """The generalised Duhem model: tabulated slopes, with eddy-current losses."""
 
 from collections.abc import Iterator
-from typing import Literal, Self, TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
 
-from hilctl.base.strict import model_validator
+from hilctl.base.strict import CheckedModel
 from hilctl.base.types import F64
 from hilctl.kernels.generalised_duhem import Band, Losses, duhem_forward, duhem_inverse
-from hilctl.models.base import HysteresisModel, Operator, Weights, refuse
+from hilctl.models.base import HysteresisModel, Operator, Weights
 from hilctl.models.effective_field import FieldLosses
 
 Slopes: TypeAlias = tuple[Weights, ...]
@@ -16,7 +16,7 @@ _LEAST_STEPS = 2.0  # steps of y from node to node, at least
 _NUMBERS = 3  # of the memory, before the previous input
 
 
-class GeneralisedDuhemModel(HysteresisModel):
+class GeneralisedDuhemModel(CheckedModel, HysteresisModel):
     """dy/dw = g_up(y, w - c(y)) rising, g_down(y, w - c(y)) falling; losses before it.
 
     The slope depends on position and direction only. So minor loops drift towards the anhysteretic
@@ -48,17 +48,14 @@ class GeneralisedDuhemModel(HysteresisModel):
     falling: Slopes
     losses: FieldLosses = FieldLosses()
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        refuse(self._problems())
-        if not abs(self._centre_at_rest()) <= self.half_width:
-            raise ValueError(
-                f"half_width must be at least |c(0)|, {abs(self._centre_at_rest()):g}, for rest to "
-                f"lie in the band: {self.half_width!r}"
-            )
-        return self
-
     def _problems(self) -> Iterator[str]:
+        if problems := list(self._table_problems()):
+            yield from problems
+        elif not (least := abs(self._centre_at_rest())) <= self.half_width:
+            rule = f"half_width must be at least |c(0)|, {least:g}, for rest to lie in the band"
+            yield f"{rule}: {self.half_width!r}"
+
+    def _table_problems(self) -> Iterator[str]:
         if not self.cell_um > 0.0:
             yield f"cell_um must be > 0: {self.cell_um!r}"
         nodes = len(self.centre)
@@ -114,14 +111,9 @@ class GeneralisedDuhemModel(HysteresisModel):
 
 
 def band_of(slopes: F64, lines: F64, lowest_um: float, cell_um: float, half_width: float) -> Band:
-    """Return an operator as its kernels take it.
+    """Return an operator for its kernels, from slopes float64[2, k, l] > 0 and lines float64[2, k].
 
-    Args:
-        slopes: float64[2, k, l], > 0.
-        lines: float64[2, k], centre and flux.
-        lowest_um: First node of y.
-        cell_um: Distance of the nodes of y.
-        half_width: Of the band.
+    The lines are centre and flux at k nodes of y, ``cell_um`` apart from ``lowest_um`` on.
     """
     apart = 2.0 * half_width / (slopes.shape[2] - 1)
     steps = longest_steps(slopes, lines[0], cell_um, apart)
@@ -131,15 +123,9 @@ def band_of(slopes: F64, lines: F64, lowest_um: float, cell_um: float, half_widt
 def longest_steps(slopes: F64, centre: F64, cell_um: float, apart: float) -> F64:
     """Return the longest steps of y for which w rises with y whatever the step's length.
 
-    A step s takes dw = s / g at its middle, which rises with s where
-    g > s / 2 (dg/dy + dg/dw (1 / g - c')). Each cell is taken with the lowest slope of it and its
-    neighbours, and a step with all the cells that its middle may lie in, which are these.
-
-    Args:
-        slopes: float64[2, k, l].
-        centre: float64[k].
-        cell_um: Distance of the nodes of y.
-        apart: Distance of the nodes across the band.
+    A step s takes dw = s / g at its middle, which rises with s if
+    g > s / 2 (dg/dy + dg/dw (1 / g - c')). Each cell has the lowest slope of it and its
+    neighbours, and a step the limits of all cells that its middle may lie in, which are these.
 
     Returns:
         float64[2, k - 1, l - 1], by the cell that a step begins in.

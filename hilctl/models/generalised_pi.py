@@ -1,11 +1,11 @@
 """The generalised Prandtl-Ishlinskii model: plays between envelope functions (1.17-1.20)."""
 
 from collections.abc import Iterator
-from typing import Literal, Self
+from typing import Literal
 
 import numpy as np
 
-from hilctl.base.strict import StrictModel, model_validator
+from hilctl.base.strict import StrictModel
 from hilctl.base.types import F64
 from hilctl.kernels.generalised_play import envelope_forward, envelope_inverse
 from hilctl.models.base import (
@@ -14,7 +14,6 @@ from hilctl.models.base import (
     Weights,
     length_problems,
     play_weight_problems,
-    refuse,
     threshold_problems,
 )
 from hilctl.models.implicit_models import BoundedInputModel
@@ -41,13 +40,6 @@ class PlayEnvelope(StrictModel):
         return np.array([self.height, self.slope, self.shift, self.level])
 
 
-def _envelope_problems(name: str, envelope: PlayEnvelope) -> Iterator[str]:
-    for key in ("height", "slope"):
-        value = getattr(envelope, key)
-        if not value > 0.0:
-            yield f"{name}.{key} must be > 0 for the envelope to rise: {value!r}"
-
-
 class GeneralisedModel(BoundedInputModel):
     """p_0 S_0[v] + sum p_i S_i[v], asymmetric and saturating, rate-independent (1.20).
 
@@ -69,18 +61,14 @@ class GeneralisedModel(BoundedInputModel):
     rising: PlayEnvelope
     falling: PlayEnvelope
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        refuse(
-            (
-                *length_problems("weights", self.weights, self.thresholds),
-                *play_weight_problems(self.direct, self.weights),
-                *threshold_problems("r", self.thresholds),
-                *_envelope_problems("rising", self.rising),
-                *_envelope_problems("falling", self.falling),
-            )
-        )
-        return self
+    def _problems(self) -> Iterator[str]:
+        yield from length_problems("weights", self.weights, self.thresholds)
+        yield from play_weight_problems(self.direct, self.weights)
+        yield from threshold_problems("r", self.thresholds)
+        for name, envelope in (("rising", self.rising), ("falling", self.falling)):
+            for key in ("height", "slope"):
+                if not (value := getattr(envelope, key)) > 0.0:
+                    yield f"{name}.{key} must be > 0 for the envelope to rise: {value!r}"
 
     @property
     def operators(self) -> int:

@@ -2,35 +2,30 @@
 
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import Literal, Self
+from typing import Literal, Self, TypeAlias
 
 import numpy as np
 
-from hilctl.base.strict import model_validator
+from hilctl.base.strict import CheckedModel, model_validator
 from hilctl.base.types import F64
 from hilctl.kernels.implicit_models import (
     BOUC_WEN,
     KRASNOSELSKII_POKROVSKII,
     PREISACH,
+    Arrays,
     implicit_forward,
     implicit_inverse,
 )
-from hilctl.models.base import HysteresisModel, Operator, Thresholds, Weights, refuse
+from hilctl.models.base import HysteresisModel, Operator, Thresholds, Weights
 
 TOLERANCE_UM = 1e-7
 """Largest error of a root in um, far below any sensor's noise."""
 
-
-@dataclass(frozen=True, slots=True)
-class PackedParameters:
-    """Parameters for the kernels, see :mod:`hilctl.kernels.implicit_models`."""
-
-    kind: int
-    arrays: tuple[F64, F64, F64]
+PackedParameters: TypeAlias = tuple[int, Arrays]
+"""Number of a model and its arrays, see :mod:`hilctl.kernels.implicit_models`."""
 
 
-class BoundedInputModel(HysteresisModel):
+class BoundedInputModel(CheckedModel, HysteresisModel):
     """A model whose inverse stays within a span of commands.
 
     Attributes:
@@ -62,23 +57,28 @@ class ImplicitModel(BoundedInputModel):
     def packed(self) -> PackedParameters:
         """Return the parameters in the form of the kernels."""
 
+    @property
+    def operators(self) -> int:
+        """Number of states."""
+        return 1
+
     def forward(self, sample_rate_hz: float) -> Operator:
         """Return the operator from command to um, at rest; independent of the rate."""
         del sample_rate_hz
-        p = self.packed()
+        kind, arrays = self.packed()
 
         def run(v: F64, memory: F64, out: F64) -> None:
-            implicit_forward(p.kind, v, p.arrays, memory, out)
+            implicit_forward(kind, v, arrays, memory, out)
 
         return Operator(run, self.operators, output_offset=self.output_offset_um)
 
     def inverse(self, sample_rate_hz: float) -> Operator:
         """Return the operator from um to command, at rest."""
         del sample_rate_hz
-        p, span = self.packed(), self.command_span
+        (kind, arrays), span = self.packed(), self.command_span
 
         def run(y: F64, memory: F64, out: F64) -> None:
-            implicit_inverse(p.kind, y, span, TOLERANCE_UM, p.arrays, memory, out)
+            implicit_inverse(kind, y, span, TOLERANCE_UM, arrays, memory, out)
 
         return Operator(run, self.operators, input_offset=-self.output_offset_um)
 
@@ -109,12 +109,12 @@ class PreisachModel(ImplicitModel):
     cell: float
     slopes: tuple[Weights, ...]
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        refuse(
-            (*_line_problems(self.thresholds, self.slopes), *cell_problems(self.cell, self.slopes))
-        )
-        return self
+    def _problems(self) -> Iterator[str]:
+        if len(self.thresholds) != len(self.slopes):
+            rule = "slopes must have one line per threshold"
+            yield f"{rule}: {len(self.slopes)} for {len(self.thresholds)}"
+        yield from line_problems(self.thresholds)
+        yield from cell_problems(self.cell, self.slopes)
 
     @property
     def operators(self) -> int:
@@ -124,20 +124,25 @@ class PreisachModel(ImplicitModel):
     def packed(self) -> PackedParameters:
         """Return the parameters in the form of the kernels."""
         slopes = np.array(self.slopes)
-        lines, cells = slopes.shape
-        values = np.zeros((lines, cells + 1))
-        np.cumsum(slopes * self.cell, axis=1, out=values[:, 1:])
-        # q_i(0) is 0, so that the displacement at rest is the offset
-        place = -self.lowest / self.cell
-        of_rest = int(min(max(np.floor(place), 0.0), cells - 1.0))
-        values -= values[:, [of_rest]] + slopes[:, [of_rest]] * self.cell * (place - of_rest)
-        third = np.array([self.lowest, self.cell, float(cells)])
-        return PackedParameters(PREISACH, (np.array(self.thresholds), values.ravel(), third))
+        third = np.array([self.lowest, self.cell, float(slopes.shape[1])])
+        values = play_tables(slopes, self.lowest, self.cell)
+        return PREISACH, (np.array(self.thresholds), values.ravel(), third)
 
 
-def _line_problems(thresholds: Thresholds, slopes: tuple[Weights, ...]) -> Iterator[str]:
-    if len(thresholds) != len(slopes):
-        yield f"slopes must have one line per threshold: {len(slopes)} for {len(thresholds)}"
+def play_tables(slopes: F64, lowest: float, cell: float) -> F64:
+    """Return q_i at the edges of the cells for slopes, float64[m, c]: float64[m, c + 1]."""
+    lines, cells = slopes.shape
+    values = np.zeros((lines, cells + 1))
+    np.cumsum(slopes * cell, axis=1, out=values[:, 1:])
+    # q_i(0) is 0, so that the displacement at rest is the offset
+    place = -lowest / cell
+    of_rest = int(min(max(np.floor(place), 0.0), cells - 1.0))
+    values -= values[:, [of_rest]] + slopes[:, [of_rest]] * cell * (place - of_rest)
+    return values
+
+
+def line_problems(thresholds: Thresholds) -> Iterator[str]:
+    """Yield broken conditions for the thresholds of lines of slopes."""
     if not thresholds or thresholds[0] != 0.0:
         yield f"the first threshold must be 0: {list(thresholds[:1])}"
     if any(np.diff(thresholds) <= 0.0):
@@ -180,11 +185,6 @@ class KrasnoselskiiPokrovskiiModel(ImplicitModel):
     spacing: float
     weights: tuple[Weights, ...]
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        refuse(self._problems())
-        return self
-
     def _problems(self) -> Iterator[str]:
         if not self.spacing > 0.0:
             yield f"spacing must be > 0: {self.spacing!r}"
@@ -210,7 +210,7 @@ class KrasnoselskiiPokrovskiiModel(ImplicitModel):
         levels = self.lowest + self.spacing * np.arange(len(self.weights), dtype=np.float64)
         weights = np.array([weight for row in self.weights for weight in row])
         third = np.append(weights, self.spacing).astype(np.float64)
-        return PackedParameters(KRASNOSELSKII_POKROVSKII, (levels[row], levels[column], third))
+        return KRASNOSELSKII_POKROVSKII, (levels[row], levels[column], third)
 
 
 def bouc_wen_problems(direct: float, hysteretic: float, beta: float, gamma: float) -> Iterator[str]:
@@ -248,22 +248,15 @@ class BoucWenModel(ImplicitModel):
     gamma: float
     exponent: Literal[1, 2] = 1
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        refuse(bouc_wen_problems(self.direct, self.hysteretic, self.beta, self.gamma))
-        return self
-
-    @property
-    def operators(self) -> int:
-        """Number of states: z."""
-        return 1
+    def _problems(self) -> Iterator[str]:
+        return bouc_wen_problems(self.direct, self.hysteretic, self.beta, self.gamma)
 
     def packed(self) -> PackedParameters:
         """Return the parameters in the form of the kernels."""
         first = np.array(
             [self.direct, self.hysteretic, self.beta, self.gamma, float(self.exponent)]
         )
-        return PackedParameters(BOUC_WEN, (first, NOTHING, NOTHING))
+        return BOUC_WEN, (first, NOTHING, NOTHING)
 
 
 class DuhemModel(ImplicitModel):
@@ -284,11 +277,6 @@ class DuhemModel(ImplicitModel):
     b: float
     c: float
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        refuse(self._problems())
-        return self
-
     def _problems(self) -> Iterator[str]:
         if not self.a > 0.0:
             yield f"a must be > 0: {self.a!r}"
@@ -298,12 +286,7 @@ class DuhemModel(ImplicitModel):
                 f"{self.b!r}"
             )
 
-    @property
-    def operators(self) -> int:
-        """Number of states: z."""
-        return 1
-
     def packed(self) -> PackedParameters:
         """Return the parameters in the form of the kernels."""
         first = np.array([self.b, self.b - self.c, self.a, 0.0, 1.0])
-        return PackedParameters(BOUC_WEN, (first, NOTHING, NOTHING))
+        return BOUC_WEN, (first, NOTHING, NOTHING)

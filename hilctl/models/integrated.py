@@ -2,12 +2,12 @@
 
 import math
 from collections.abc import Iterator
-from typing import Literal, Self
+from typing import Literal
 
 import numpy as np
 
 from hilctl.base.errors import ModelError
-from hilctl.base.strict import StrictModel, ValidationError, model_validator
+from hilctl.base.strict import CheckedModel, ValidationError
 from hilctl.base.types import F64
 from hilctl.kernels.hysteresis import (
     deadband_block,
@@ -15,18 +15,11 @@ from hilctl.kernels.hysteresis import (
     integrated_inverse,
     play_sum,
 )
-from hilctl.models.base import (
-    Operator,
-    Thresholds,
-    Weights,
-    length_problems,
-    refuse,
-    threshold_problems,
-)
+from hilctl.models.base import Operator, Thresholds, Weights, length_problems, threshold_problems
 from hilctl.models.plays import RateDependentPlays
 
 
-class DeadbandFunction(StrictModel):
+class DeadbandFunction(CheckedModel):
     """Lambda(x) = g_0 x + sum g_j J_j(x): piecewise linear, for asymmetry and saturation.
 
     The inverse exists if each cumulative slope (g_0 plus the weights from 0 outwards on one side)
@@ -46,19 +39,13 @@ class DeadbandFunction(StrictModel):
     down_thresholds: Thresholds = ()
     down_weights: Weights = ()
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        refuse(
-            (
-                *length_problems("up_weights", self.up_weights, self.up_thresholds),
-                *length_problems("down_weights", self.down_weights, self.down_thresholds),
-                *threshold_problems("d", self.up_thresholds),
-                *threshold_problems("d_-", self.down_thresholds, sign=-1),
-                *_slope_problems(self.slope, self.up_weights, ""),
-                *_slope_problems(self.slope, self.down_weights, "-"),
-            )
-        )
-        return self
+    def _problems(self) -> Iterator[str]:
+        yield from length_problems("up_weights", self.up_weights, self.up_thresholds)
+        yield from length_problems("down_weights", self.down_weights, self.down_thresholds)
+        yield from threshold_problems("d", self.up_thresholds)
+        yield from threshold_problems("d_-", self.down_thresholds, sign=-1)
+        yield from _slope_problems(self.slope, self.up_weights, "")
+        yield from _slope_problems(self.slope, self.down_weights, "-")
 
     def arrays(self) -> tuple[float, F64, F64, F64, F64]:
         """Return the parameters in the order of the kernels."""
@@ -213,11 +200,10 @@ class ButterflyModel(RateDependentPlays):
     bias: float = 0.0
     shape: DeadbandFunction
 
-    @model_validator(mode="after")
-    def _check_even(self) -> Self:
+    def _problems(self) -> Iterator[str]:
+        yield from super()._problems()
         if self.shape.down_thresholds:
-            refuse(["shape is even: it is given by its side above 0, without down_thresholds"])
-        return self
+            yield "shape is even: it is given by its side above 0, without down_thresholds"
 
     @property
     def wing(self) -> float:

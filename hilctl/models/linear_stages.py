@@ -1,13 +1,13 @@
 """Linear stages of a staged model (delay, smoothing, structure, creep), and chains of operators."""
 
 import math
-from collections.abc import Callable, Sequence
-from typing import Annotated, Self
+from collections.abc import Callable, Iterator, Sequence
+from typing import Annotated
 
 import numpy as np
 
 from hilctl.base.errors import ModelError
-from hilctl.base.strict import Field, StrictModel, model_validator
+from hilctl.base.strict import CheckedModel, Field, StrictModel
 from hilctl.base.types import C128, F64
 from hilctl.kernels.dynamics import (
     between_block,
@@ -19,19 +19,16 @@ from hilctl.kernels.dynamics import (
     uncreep_block,
     unmode_block,
 )
-from hilctl.models.base import Operator, refuse, threshold_problems
+from hilctl.models.base import Operator, threshold_problems
 
 _WIDEST = 64
 
 
 class Chain(Operator):
-    """Operators in series as one operator with one memory.
+    """Operators in series as one operator with one memory, of which theirs are parts.
 
     Args:
-        stages: The operators in order; their memories become parts of the chain's.
         preview: Samples by which the chain's input must run ahead of its output.
-        input_offset: Added to the input first.
-        output_offset: Added to the output last.
     """
 
     def __init__(
@@ -86,17 +83,13 @@ def smoothing_weights(
     """Return weights for y + slope_gain y' + bend_gain y'' of a smoothed y, per sample.
 
     A cubic B-spline (four boxes in series) smooths, and minus half its variance times y'' flattens
-    its response to 1 - (w s)^4 / 8 at an angular frequency w, for a standard deviation s. So slow
-    signals pass unchanged, and corners are rounded within about 2 s.
-
-    Args:
-        width: Standard deviation s in samples; 0 for plain central differences.
-        slope_gain: In samples.
-        bend_gain: In samples squared.
+    its response to 1 - (w s)^4 / 8 at an angular frequency w. The standard deviation s is ``width``
+    in samples; 0 for plain central differences. So slow signals pass unchanged, and corners are
+    rounded within about 2 s. Boxes are at most 64 samples long.
 
     Returns:
         float64[2m + 1], weights from the oldest to the newest sample, with the sum 1; and m, the
-        preview in samples. Boxes are at most 64 samples long.
+        preview in samples.
     """
     box = min(_WIDEST, round(math.sqrt(1.0 + 3.0 * width**2)))
     ones = np.full(box, 1.0 / box)
@@ -113,7 +106,7 @@ TimeConstant = Annotated[float, Field(ge=1e-3, le=1e6)]
 Share = Annotated[float, Field(gt=0.0, le=1.0)]
 
 
-class CreepModel(StrictModel):
+class CreepModel(CheckedModel):
     """y = x + c_1 + c_2 + ..., T_i c_i' = s_i x - c_i: creep as springs and dampers in series.
 
     As K. Kuhnen and H. Janocha, "Inverse feedforward controller for complex hysteretic
@@ -128,16 +121,11 @@ class CreepModel(StrictModel):
     time_constants_s: tuple[TimeConstant, ...] = Field(min_length=1, max_length=16)
     shares: tuple[Share, ...]
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        problems = [*threshold_problems("T", self.time_constants_s)]
+    def _problems(self) -> Iterator[str]:
+        yield from threshold_problems("T", self.time_constants_s)
         if len(self.shares) != len(self.time_constants_s):
-            problems.append(
-                "shares must have one value per time constant: "
-                f"{len(self.shares)} for {len(self.time_constants_s)}"
-            )
-        refuse(problems)
-        return self
+            numbers = f"{len(self.shares)} for {len(self.time_constants_s)}"
+            yield f"shares must have one value per time constant: {numbers}"
 
     def forward(self, sample_rate_hz: float, rest_um: float = 0.0) -> Operator:
         """Return the operator that adds creep to displacements, which are ``rest_um`` at rest."""
@@ -154,14 +142,7 @@ class CreepModel(StrictModel):
 
 
 class _CreepOperator(Operator):
-    """Creep or its inverse, which continues at constant input.
-
-    Args:
-        creep: Its elements.
-        kernel: Its kernel.
-        sample_rate_hz: Samples a second.
-        rest_um: Displacement at rest.
-    """
+    """Creep or its inverse, which continues at constant input."""
 
     def __init__(
         self, creep: CreepModel, kernel: Callable[..., None], sample_rate_hz: float, rest_um: float

@@ -21,10 +21,6 @@ class ModelFile(StrictModel):
 def load_model(path: Path, files: TextFiles | None = None) -> HysteresisModel:
     """Read a model file.
 
-    Args:
-        path: The file.
-        files: Source of the file; None for the disk.
-
     Raises:
         InputError: The file cannot be read.
         ConfigError: It breaks a rule or has no inverse; all problems are listed.

@@ -1,11 +1,12 @@
 """Sums of play operators: PPI, RDPI and SPI (chapters 3 and 5)."""
 
-from typing import Literal, Self
+from collections.abc import Iterator
+from typing import Literal
 
 import numpy as np
 
 from hilctl.base.errors import ModelError
-from hilctl.base.strict import Field, model_validator
+from hilctl.base.strict import CheckedModel, Field
 from hilctl.base.types import F64
 from hilctl.kernels.hysteresis import play_sum, stop_sum
 from hilctl.models.base import (
@@ -15,18 +16,12 @@ from hilctl.models.base import (
     Weights,
     length_problems,
     play_weight_problems,
-    refuse,
     threshold_problems,
 )
 
 
 def inverse_plays(direct: float, weights: F64, thresholds: F64) -> tuple[float, F64, F64]:
-    """Return the inverse of a sum of plays, itself a sum of plays (5.8-5.10).
-
-    Args:
-        direct: a_0 > 0.
-        weights: float64[n], a_1 to a_n, all >= 0.
-        thresholds: float64[n], r_1 to r_n, rising.
+    """Return the inverse of a sum of plays (a_0 > 0, a_i >= 0, r_i rising), itself one (5.8-5.10).
 
     Returns:
         The inverse's direct weight 1/a_0, its weights float64[n] (<= 0) and its thresholds
@@ -45,7 +40,7 @@ def inverse_plays(direct: float, weights: F64, thresholds: F64) -> tuple[float, 
     return inverse_direct, inverse_weights, corners
 
 
-class PlayModel(HysteresisModel):
+class PlayModel(CheckedModel, HysteresisModel):
     """a_0 v + sum a_i F_i[v], with the conditions for its inverse.
 
     Attributes:
@@ -58,16 +53,10 @@ class PlayModel(HysteresisModel):
     weights: Weights
     thresholds: Thresholds
 
-    @model_validator(mode="after")
-    def _check_plays(self) -> Self:
-        refuse(
-            (
-                *length_problems("weights", self.weights, self.thresholds),
-                *play_weight_problems(self.direct, self.weights),
-                *threshold_problems("r", self.thresholds),
-            )
-        )
-        return self
+    def _problems(self) -> Iterator[str]:
+        yield from length_problems("weights", self.weights, self.thresholds)
+        yield from play_weight_problems(self.direct, self.weights)
+        yield from threshold_problems("r", self.thresholds)
 
     @property
     def operators(self) -> int:

@@ -3,22 +3,14 @@
 from collections.abc import Callable, Iterator
 from functools import cache
 from itertools import combinations
-from typing import Annotated, Any, Literal, Self, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 import numpy as np
 
-from hilctl.base.strict import Field, StrictModel, model_validator
+from hilctl.base.strict import CheckedModel, Field
 from hilctl.base.types import F64
 from hilctl.kernels.residual_operator import Tables, residual_forward, residual_inverse
-from hilctl.models.base import (
-    HysteresisModel,
-    Operator,
-    Provenance,
-    Thresholds,
-    Weights,
-    refuse,
-    threshold_problems,
-)
+from hilctl.models.base import HysteresisModel, Operator, Thresholds, Weights, threshold_problems
 from hilctl.models.generalised_pi import GeneralisedModel
 from hilctl.models.implicit_models import (
     BoucWenModel,
@@ -29,7 +21,7 @@ from hilctl.models.implicit_models import (
 from hilctl.models.integrated import ButterflyModel, IntegratedModel
 from hilctl.models.linear_stages import Chain, FirstMode
 from hilctl.models.plays import PpiModel, RdpiModel, SpiModel
-from hilctl.models.staged import StagedModel
+from hilctl.models.staged import StagedModel, split_frame
 
 Refinable: TypeAlias = (
     PpiModel
@@ -52,7 +44,7 @@ _POSITIONS = 60  # of x at which the slope is evaluated
 _TURNS = (0.02, 2.0, 8)  # nearest and furthest turn in longest drag lengths, number of turns
 
 
-class ResidualOperator(StrictModel):
+class ResidualOperator(CheckedModel):
     """R of the model displacement x, see :mod:`hilctl.kernels.residual_operator`.
 
     Attributes:
@@ -77,14 +69,12 @@ class ResidualOperator(StrictModel):
     window_s: float = Field(gt=0.0, le=1.0)
     fastest_um_per_s: float = Field(gt=0.0, allow_inf_nan=False)
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        refuse(self._shape_problems())
-        if not (least := self.least_slope) >= LEAST_SLOPE:
-            raise ValueError(
-                f"the slope of x + R[x] must be >= {LEAST_SLOPE} for one inverse to exist: {least}"
-            )
-        return self
+    def _problems(self) -> Iterator[str]:
+        if problems := list(self._shape_problems()):
+            yield from problems
+        elif not (least := self.least_slope) >= LEAST_SLOPE:
+            rule = f"the slope of x + R[x] must be >= {LEAST_SLOPE} for one inverse to exist"
+            yield f"{rule}: {least}"
 
     def _shape_problems(self) -> Iterator[str]:
         if not self.thresholds_um or self.thresholds_um[0] != 0.0:
@@ -219,7 +209,7 @@ def rest_um(model: HysteresisModel) -> float:
     return model.output_offset_um + (inner.output_offset_um if inner is not None else 0.0)
 
 
-class RefinedModel(HysteresisModel):
+class RefinedModel(CheckedModel, HysteresisModel):
     """A model followed by a residual operator and a constant displacement.
 
     Attributes:
@@ -236,16 +226,12 @@ class RefinedModel(HysteresisModel):
         cls, model: HysteresisModel, residual: ResidualOperator, offset_um: float
     ) -> "RefinedModel":
         """Return a refined model with the unit, ranges and provenance of a model."""
-        shared = {name: getattr(model, name) for name in _SHARED}
-        bare = {"input_range": None, "output_range_um": None, "provenance": Provenance()}
-        base: Any = model.model_copy(update=bare)
-        return cls(base=base, residual=residual, output_offset_um=offset_um, **shared)
+        base, shared = split_frame(model)
+        return cls(base=base, residual=residual, output_offset_um=offset_um, **shared)  # type: ignore[arg-type]
 
-    @model_validator(mode="after")
-    def _check_one_truth(self) -> Self:
+    def _problems(self) -> Iterator[str]:
         if self.base.input_unit != self.input_unit:
-            raise ValueError(f"base.input_unit must be {self.input_unit}, as outside")
-        return self
+            yield f"base.input_unit must be {self.input_unit}, as outside"
 
     @property
     def operators(self) -> int:
@@ -279,6 +265,3 @@ class RefinedModel(HysteresisModel):
     def to_mapping(self) -> dict[str, Any]:
         """Return the parameters as plain mappings, lists and numbers, defaults left out."""
         return super().to_mapping() | {"base": {"kind": self.base.kind, **self.base.to_mapping()}}
-
-
-_SHARED = ("input_unit", "input_range", "output_range_um", "provenance")

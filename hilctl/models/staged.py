@@ -14,11 +14,12 @@ that of further modes is exact.
 """
 
 import math
-from typing import Annotated, Any, Literal, Self
+from collections.abc import Iterator
+from typing import Annotated, Any, Literal, Self, TypeVar
 
-from hilctl.base.strict import Field, StrictModel, model_validator
+from hilctl.base.strict import CheckedModel, Field, StrictModel
 from hilctl.kernels.dynamics import lag_block, lead_block, weigh_block
-from hilctl.models.base import HysteresisModel, Operator, Provenance, refuse
+from hilctl.models.base import HysteresisModel, Operator, Provenance
 from hilctl.models.effective_field import FieldModel
 from hilctl.models.generalised_duhem import GeneralisedDuhemModel
 from hilctl.models.implicit_models import PreisachModel
@@ -38,7 +39,15 @@ AnyHysteresis = Annotated[
     PpiModel | RdpiModel | IntegratedModel | PreisachModel | FieldModel | GeneralisedDuhemModel,
     Field(discriminator="kind"),
 ]
+Model = TypeVar("Model", bound=HysteresisModel)
 _WHOLE = 1e-6
+
+
+def split_frame(model: Model) -> tuple[Model, dict[str, Any]]:
+    """Return a model as a part of another one, and the unit, ranges and provenance of both."""
+    names = ("input_unit", "input_range", "output_range_um", "provenance")
+    bare = {"input_range": None, "output_range_um": None, "provenance": Provenance()}
+    return model.model_copy(update=bare), {name: getattr(model, name) for name in names}
 
 
 class FieldLag(StrictModel):
@@ -66,7 +75,7 @@ class FieldLag(StrictModel):
         return lead
 
 
-class StagedModel(HysteresisModel):
+class StagedModel(CheckedModel, HysteresisModel):
     """A hysteresis model with linear stages around it.
 
     Attributes:
@@ -91,44 +100,17 @@ class StagedModel(HysteresisModel):
     creep: CreepModel | None = None
 
     @classmethod
-    def around(
-        cls,
-        hysteresis: AnyHysteresis,
-        *,
-        lag: FieldLag | None = None,
-        structure: FirstMode | None = None,
-        modes: tuple[FurtherMode, ...] = (),
-        delay_s: float = 0.0,
-        smoothing_s: float = 0.0,
-        creep: CreepModel | None = None,
-    ) -> Self:
-        """Return a staged model with the unit, ranges and provenance of a hysteresis model."""
-        shared = {name: getattr(hysteresis, name) for name in _SHARED}
-        bare = {"input_range": None, "output_range_um": None, "provenance": Provenance()}
-        inner = hysteresis.model_copy(update=bare)
-        return cls(
-            hysteresis=inner,
-            lag=lag,
-            structure=structure,
-            modes=modes,
-            delay_s=delay_s,
-            smoothing_s=smoothing_s,
-            creep=creep,
-            **shared,
-        )
+    def around(cls, hysteresis: AnyHysteresis, **stages: Any) -> Self:
+        """Return a hysteresis model between stages, with its unit, ranges and provenance."""
+        inner, shared = split_frame(hysteresis)
+        return cls(hysteresis=inner, **stages, **shared)
 
-    @model_validator(mode="after")
-    def _check_one_truth(self) -> Self:
-        inner = self.hysteresis
-        problems = [
-            f"hysteresis.{name} must be set beside hysteresis instead"
-            for name in ("input_range", "output_range_um")
-            if getattr(inner, name) is not None
-        ]
-        if inner.input_unit != self.input_unit:
-            problems.append(f"hysteresis.input_unit must be {self.input_unit}, as outside")
-        refuse(problems)
-        return self
+    def _problems(self) -> Iterator[str]:
+        for name in ("input_range", "output_range_um"):
+            if getattr(self.hysteresis, name) is not None:
+                yield f"hysteresis.{name} must be set beside hysteresis instead"
+        if self.hysteresis.input_unit != self.input_unit:
+            yield f"hysteresis.input_unit must be {self.input_unit}, as outside"
 
     @property
     def operators(self) -> int:
@@ -201,6 +183,3 @@ class StagedModel(HysteresisModel):
         mapping = super().to_mapping()
         kind = self.hysteresis.kind
         return mapping | {"hysteresis": {"kind": kind, **self.hysteresis.to_mapping()}}
-
-
-_SHARED = ("input_unit", "input_range", "output_range_um", "provenance")

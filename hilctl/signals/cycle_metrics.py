@@ -106,17 +106,7 @@ class CycleAverager:
 def fold(
     index: I64, period: float, signals: Sequence[F64] | F64, max_bins: int = MAX_BINS
 ) -> MeanCycle:
-    """Return the mean cycle of paired signals, see :class:`CycleAverager`.
-
-    Args:
-        index: int64[n], sample index; phase 0 at multiples of ``period``.
-        period: Samples in one period, > 0, not necessarily whole.
-        signals: float64[k, n], or k arrays, float64[n].
-        max_bins: Largest number of bins.
-
-    Returns:
-        The mean cycle, of at most ``max_bins`` bins; without bins if nothing is finite.
-    """
+    """Return the mean cycle of k paired signals, float64[n] each, see :class:`CycleAverager`."""
     stacked = np.asarray(signals, dtype=np.float64)
     folding = CycleAverager(period, stacked.shape[0], max_bins)
     folding.add(index, stacked)
@@ -146,12 +136,9 @@ class BranchGap:
 def widest_gap(loop_input: F64, output: F64) -> BranchGap | None:
     """Return the largest distance of rising and falling branches of a closed loop (figure 2.4).
 
-    The loop is split where its input turns. At every input each rising branch is compared with each
-    falling one, with linear interpolation; this includes the branches of minor loops.
-
-    Args:
-        loop_input: float64[m], one cycle in order of phase.
-        output: float64[m].
+    Input and output are float64[m], one cycle in order of phase. The loop is split where its input
+    turns. At every input each rising branch is compared with each falling one, with linear
+    interpolation; this includes the branches of minor loops.
 
     Returns:
         The largest distance; None if no rising and falling branch share an input.
@@ -209,26 +196,18 @@ def _band(branches: list[tuple[F64, F64]], grid: F64) -> tuple[F64, F64]:
 
 
 def peak_hysteresis_percent(loop_input: F64, output: F64) -> float | None:
-    """Return H_P / M_P: the widest gap over the peak-to-peak output, in percent (figure 2.4).
+    """Return H_P / M_P of :func:`widest_gap`: the gap over the peak-to-peak output, in percent.
 
     It is unsigned, because compensated loops may have either direction.
-
-    Args:
-        loop_input: float64[m], one cycle in order of phase.
-        output: float64[m].
     """
     gap = widest_gap(loop_input, output)
     return None if gap is None else percent(gap.height, peak_to_peak(output))
 
 
 def loop_area(loop_input: F64, output: F64) -> float:
-    """Return the area enclosed by a closed loop, in output times input units (shoelace formula).
+    """Return the area of a closed loop, see :func:`widest_gap`, in output times input units.
 
-    Parts with the opposite direction count negatively.
-
-    Args:
-        loop_input: float64[m], one cycle in order of phase.
-        output: float64[m].
+    Parts with the opposite direction count negatively (shoelace formula).
     """
     u = loop_input - loop_input.mean()
     y = output - output.mean()
@@ -314,10 +293,7 @@ def noise_floor_percent(noise_um: float, counts: I64, peak_to_peak_um: float) ->
     Args:
         noise_um: rms of a single sample, in um.
         counts: int64[m], samples in each bin of the mean cycle.
-        peak_to_peak_um: Peak-to-peak of its output.
-
-    Returns:
-        Floor in percent of the peak-to-peak; None if that is 0 or there is no bin.
+        peak_to_peak_um: Peak-to-peak of its output; the result is in percent of it, or None.
     """
     if counts.size == 0 or peak_to_peak_um <= 0.0:
         return None

@@ -6,9 +6,5 @@ waveform_file.py  waveforms from CSV, NPY and MCAP files
 build.py          a complete reference: soft starts and ends, sequences, segments
 """
 
-PUBLIC = (
-    "build",
-    "shapes",
-    "spec",
-)
+PUBLIC = ("build", "shapes", "spec")
 """Modules that other rooms import; the others are private."""

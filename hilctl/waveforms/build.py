@@ -16,13 +16,7 @@ from hilctl.waveforms.waveform_file import read_samples
 
 @dataclass(frozen=True, slots=True)
 class RepeatedPart:
-    """A periodic part of a reference.
-
-    Attributes:
-        start: Its first sample.
-        stop: Sample after its last one.
-        period: Samples in a period, not necessarily whole.
-    """
+    """A periodic part of a reference; the period in samples need not be whole."""
 
     start: int
     stop: int
@@ -36,7 +30,6 @@ class Reference:
     Attributes:
         values: float64[n], read-only, in ``unit``.
         unit: ``um``, ``A`` or ``V``.
-        sample_rate_hz: Samples per second.
         segments: Its waveforms with their steady parts.
         span: Lowest and highest value.
         repeats: Periodic parts of a long one.
@@ -66,11 +59,6 @@ class _Part:
 
 def build(waveform: spec.AnyWaveform, sample_rate_hz: float, folder: Path) -> Reference:
     """Compute every sample of a waveform.
-
-    Args:
-        waveform: The waveform, with its unit.
-        sample_rate_hz: Samples per second.
-        folder: Base of relative file names.
 
     Raises:
         InputError: A file is not usable, the waveform is too long, a soft start does not fit, a
@@ -161,14 +149,7 @@ def _soft_samples(w: spec.SinglePart, name: str, n: int, sample_rate_hz: float) 
 
 
 def _soften(values: F64, rest: float, start: int, end: int) -> None:
-    """Fade the first and last values from and to rest, in place.
-
-    Args:
-        values: float64[n].
-        rest: First and last value.
-        start: Samples of the fade at the start.
-        end: Samples of the fade at the end; no overlap.
-    """
+    """Fade the first ``start`` and the last ``end`` values from and to rest, in place."""
     first, last = values[:start], values[values.size - end :]
     first[:] = rest + _raised_cosine(start) * (first - rest)
     last[:] = rest + _raised_cosine(end)[::-1] * (last - rest)
@@ -181,12 +162,7 @@ def _raised_cosine(n: int) -> F64:
 
 
 def telling(size: int, repeats: Sequence[RepeatedPart]) -> tuple[slice, ...]:
-    """Return the representative parts of a reference.
-
-    Args:
-        size: Its samples.
-        repeats: Its periodic parts in order.
-    """
+    """Return the representative parts of a reference."""
     parts, at = [], 0
     for each in repeats:
         shown, ends_at = each.start + shapes.telling_samples(each.period), each.stop - CHUNK

@@ -46,17 +46,15 @@ def check_length(samples: float) -> None:
 def outline(w: spec.Shape, unit: str) -> tuple[str, float, float]:
     """Return a waveform's label, its highest frequency in Hz, and its period in s or 0.0."""
     match w:
-        case spec.Sine() | spec.Triangle():
+        case spec.Sine() | spec.Triangle() | spec.GrowingOrDecaying():
             label = f"{w.kind} {w.amplitude:g} {unit} {w.frequency_hz:g} Hz"
-            return label, w.frequency_hz, 1.0 / w.frequency_hz
+            period_s = 0.0 if w.kind in {"growing", "decaying"} else 1.0 / w.frequency_hz
+            return label, w.frequency_hz, period_s
         case spec.ComplexHarmonic():
             parts = [f"{c.amplitude:g} {unit} {c.frequency_hz:g} Hz" for c in w.components]
             frequencies = [c.frequency_hz for c in w.components]
             label = f"complex harmonic {' + '.join(parts)}"
             return label, max(frequencies), common_period_s(frequencies)
-        case spec.GrowingOrDecaying():
-            label = f"{w.kind} {w.amplitude:g} {unit} {w.frequency_hz:g} Hz"
-            return label, w.frequency_hz, 0.0
         case spec.Chirp():
             label = f"{w.kind} {w.amplitude:g} {unit} {w.start_hz:g}-{w.stop_hz:g} Hz"
             return label, max(w.start_hz, w.stop_hz), 0.0
@@ -77,11 +75,7 @@ def outline(w: spec.Shape, unit: str) -> tuple[str, float, float]:
 
 
 def sampled(w: spec.Shape, sample_rate_hz: float) -> F64:
-    """Return every sample of a waveform with its offset, without soft start: float64[n].
-
-    Raises:
-        InputError: There are too many.
-    """
+    """Return every sample of a waveform with its offset, without soft start: float64[n]."""
     size = sample_count(_duration_s(w), sample_rate_hz)
     if isinstance(w, spec.RandomSines):
         return w.offset + _random(w, size)
@@ -103,12 +97,7 @@ def _computed(w: spec.ShapeOfTime, sample_rate_hz: float, size: int) -> F64:
 
 @dataclass(frozen=True, slots=True)
 class _Instants:
-    """Sampling instants.
-
-    Attributes:
-        sample: int64[n], sample numbers.
-        rate_hz: Samples per second.
-    """
+    """Sampling instants: int64[n] sample numbers at a rate."""
 
     sample: I64
     rate_hz: float
@@ -165,11 +154,7 @@ def _shape(w: spec.ShapeOfTime, at: _Instants) -> F64:
             phase = np.mod(at.cycles(w.frequency_hz) + 0.25, 1.0)
             return w.amplitude * (1.0 - 4.0 * np.abs(phase - 0.5))
         case spec.ComplexHarmonic():
-            total = np.zeros(at.sample.size)
-            for part in w.components:
-                angle = math.radians(part.phase_deg)
-                total += part.amplitude * _sine(part.frequency_hz, angle, at)
-            return total
+            return _complex_harmonic(w, at)
         case spec.GrowingOrDecaying():
             elapsed = at.t / w.duration_s
             envelope = elapsed if w.kind == "growing" else 1.0 - elapsed
@@ -178,22 +163,23 @@ def _shape(w: spec.ShapeOfTime, at: _Instants) -> F64:
             return _chirp(w, at.t)
         case spec.Multisine():
             return _multisine(w, at)
-        case spec.Step() | spec.Hold() | spec.LevelPath():
-            return _levelled(w, at.t)
-
-
-def _levelled(w: spec.Step | spec.Hold | spec.LevelPath, t: F64) -> F64:
-    match w:
         case spec.Step():
-            return _step(w, t)
+            return _step(w, at.t)
         case spec.Hold():
-            return np.full_like(t, w.level)
+            return np.full(at.sample.size, w.level)
         case spec.LevelPath():
-            return np.interp(t, _arrivals_s(w), _levels(w))
+            return np.interp(at.t, _arrivals_s(w), _levels(w))
 
 
 def _sine(frequency_hz: float, angle: float, at: _Instants) -> F64:
     return np.sin(2.0 * np.pi * at.cycles(frequency_hz) + angle)
+
+
+def _complex_harmonic(w: spec.ComplexHarmonic, at: _Instants) -> F64:
+    total = np.zeros(at.sample.size)
+    for part in w.components:
+        total += part.amplitude * _sine(part.frequency_hz, math.radians(part.phase_deg), at)
+    return total
 
 
 def _chirp(w: spec.Chirp, t: F64) -> F64:
@@ -242,11 +228,7 @@ def _multisine_scale(w: spec.Multisine, sample_rate_hz: float, values: F64) -> f
 
 
 def telling_samples(period: float) -> int:
-    """Return the number of representative samples of a periodic part.
-
-    Args:
-        period: Samples in a period, > 0 and finite.
-    """
+    """Return the number of representative samples of a periodic part, by its finite period > 0."""
     # Cycles differ unless the period is a whole number of samples, so several are needed.
     cycles = 1 if period.is_integer() else _TELLING_CYCLES
     return CHUNK + math.ceil(cycles * period)
@@ -293,15 +275,8 @@ def common_period_s(frequencies_hz: list[float]) -> float:
     long for a float.
     """
     fractions = [_decimal(f) for f in frequencies_hz]
-    common = fractions[0]
-    for fraction in fractions[1:]:
-        common = Fraction(
-            math.gcd(
-                common.numerator * fraction.denominator, fraction.numerator * common.denominator
-            ),
-            common.denominator * fraction.denominator,
-        )
+    periods = math.lcm(*(each.denominator for each in fractions))
     try:
-        return float(1 / common)
+        return float(Fraction(periods, math.gcd(*(each.numerator for each in fractions))))
     except OverflowError:
         return math.inf

@@ -23,13 +23,14 @@ def _not_empty(values: tuple[Any, ...]) -> tuple[Any, ...]:
     return values
 
 
-def _not_below(value: float, info: ValidationInfo, other: str) -> float:
-    least = info.data.get(other, value)
-    if value < least:
-        raise ValueError(f"must be >= {other}, {least}: {value}")
-    return value
+def _not_below_first(last_hz: float, info: ValidationInfo) -> float:
+    first_hz = info.data.get("first_hz", last_hz)
+    if last_hz < first_hz:
+        raise ValueError(f"must be >= first_hz, {first_hz}: {last_hz}")
+    return last_hz
 
 
+LastFrequency: TypeAlias = Annotated[Positive, AfterValidator(_not_below_first)]
 NotEmpty = AfterValidator(_not_empty)
 AtLeastOne = Field(json_schema_extra={"minItems": 1})
 
@@ -138,14 +139,9 @@ class Multisine(_Shape):
     kind: Literal["multisine"]
     amplitude: Positive
     first_hz: Positive
-    last_hz: Positive
+    last_hz: LastFrequency
     step_hz: Positive
     duration_s: Positive
-
-    @field_validator("last_hz")
-    @classmethod
-    def _ordered(cls, last_hz: float, info: ValidationInfo) -> float:
-        return _not_below(last_hz, info, "first_hz")
 
     @field_validator("step_hz")
     @classmethod
@@ -168,14 +164,9 @@ class RandomSines(_Shape):
     kind: Literal["random"]
     amplitude: Positive
     first_hz: Positive
-    last_hz: Positive
+    last_hz: LastFrequency
     seed: Annotated[int, Field(ge=0)] = 1
     duration_s: Positive
-
-    @field_validator("last_hz")
-    @classmethod
-    def _ordered(cls, last_hz: float, info: ValidationInfo) -> float:
-        return _not_below(last_hz, info, "first_hz")
 
     @field_validator("duration_s")
     @classmethod

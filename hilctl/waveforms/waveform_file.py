@@ -22,11 +22,6 @@ _TIME_TOLERANCE = 0.01  # largest deviation of a step from the median
 def read_samples(w: FileWaveform, sample_rate_hz: float, folder: Path) -> tuple[F64, float]:
     """Read a waveform at the run's sample rate.
 
-    Args:
-        w: The waveform.
-        sample_rate_hz: Samples per second of the run.
-        folder: Base of ``w.path``.
-
     Returns:
         float64[n], the samples in the waveform's unit, and the period in samples (0.0 if it
         is not periodic).

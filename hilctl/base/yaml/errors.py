@@ -62,7 +62,6 @@ class _Broken(NamedTuple):
     """A validation error with its location in the file.
 
     Attributes:
-        detail: The error of pydantic.
         loc: Keys and indices without pydantic's names of union members.
         parent: The model with the last key, if any.
         of_choice: Whether the value has the wrong type for one of several union members.
@@ -98,11 +97,8 @@ def broken_rules(
 ) -> list[ConfigProblem]:
     """Return all validation errors of a file, one problem per value.
 
-    Args:
-        error: The validation error.
-        model: The model.
-        where: Returns the ``file:line`` of a location, or of its nearest parent.
-        at: Location of the model's data in the file.
+    ``where`` returns the ``file:line`` of a location, or of its nearest parent; ``at`` is the
+    location of the model's data in the file.
     """
     problems: list[ConfigProblem] = []
     broken: list[_Broken] = []
@@ -126,12 +122,7 @@ def broken_rules(
 def readings(error: ValidationError, model: type[BaseModel]) -> Iterator[tuple[Loc, Any, bool]]:
     """Yield tolerant readings of rejected values.
 
-    Args:
-        error: The validation error.
-        model: The model.
-
-    Yields:
-        Location, reading, and whether the reading replaces the key instead of the value.
+    Each is a location, a reading, and whether the reading replaces the key instead of the value.
     """
     for each in (_located(model, detail) for detail in error.errors(include_url=False)):
         value = None if each.of_choice else _read_as(each.detail, each.parent)

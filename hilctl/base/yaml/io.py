@@ -95,11 +95,7 @@ for _name, _pattern in {
 
 
 def compose(text: str) -> yaml.Node | None:
-    """Return the node tree of a text, or None if it is empty.
-
-    Raises:
-        yaml.MarkedYAMLError: It is not plain YAML or too large; with the place.
-    """
+    """Return the node tree of a text, None if it is empty; raise MarkedYAMLError if not plain."""
     if len(text) > MAX_CHARACTERS:
         problem = f"{len(text)} characters, more than the {MAX_CHARACTERS} that are read"
         raise yaml.MarkedYAMLError(problem=problem)
@@ -141,23 +137,17 @@ def _scalar(node: yaml.Node) -> Any:
 def dump(data: Any) -> str:
     """Return plain data as YAML; reading it gives the same data, lists as tuples.
 
-    Args:
-        data: Mappings with text keys, lists and tuples, text, None, booleans, floats, and whole
-            numbers of up to 64 bits.
-
     Raises:
-        yaml.YAMLError: The data contain anything else.
+        yaml.YAMLError: The data contain other types, or whole numbers of more than 64 bits.
     """
     return yaml.dump(data, Dumper=_PlainDumper, sort_keys=False, width=100)
 
 
 def commented(data: Mapping[str, Any], comments: Mapping[str, str], above: str = "") -> str:
-    """Return plain data as readable YAML with comments and with lists on one line.
+    """Return plain data as readable YAML with lists on one line, and comments by dotted key.
 
-    Args:
-        data: Plain data, see :func:`dump`.
-        comments: One-line comments by dotted key, after a value or above a mapping.
-        above: Dotted key of the data with a trailing dot; empty at the top.
+    A comment is after a value, or above a mapping. ``above`` is the dotted key of the data with a
+    trailing dot; empty at the top.
     """
     lines: list[str] = []
     for key, value in data.items():
@@ -184,8 +174,6 @@ class Document:
         assignments: Arguments of :meth:`set`, in order.
 
     Args:
-        name: File name in messages.
-        text: The YAML text.
         lines: Names of generated lines in messages, from the first on; missing or empty ones are
             named by file and number.
 
@@ -288,16 +276,10 @@ class Document:
         without: tuple[str, ...] = (),
         context: Mapping[str, Any] | None = None,
     ) -> Model:
-        """Build a pydantic model from the document or a part of it.
+        """Build a pydantic model from the document or its part ``at``, except the keys ``without``.
 
         Tolerant readings replace values in :attr:`data`, see
-        :func:`hilctl.base.yaml.errors.readings`.
-
-        Args:
-            model: The model.
-            at: Location of the part; empty for the complete document.
-            without: Ignored keys.
-            context: ``info.context`` of the validators.
+        :func:`hilctl.base.yaml.errors.readings`. ``context`` is for the validators.
 
         Raises:
             ConfigError: One or more rules are broken; all are listed.
@@ -339,10 +321,6 @@ class Document:
 
 def load_document(path: Path, files: TextFiles | None = None) -> Document:
     """Read a YAML file.
-
-    Args:
-        path: The file.
-        files: Source of the file; None for the disk.
 
     Raises:
         InputError: The file cannot be read.

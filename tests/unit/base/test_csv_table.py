@@ -34,7 +34,6 @@ def refusal(action, *arguments) -> str:
 @pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
 @pytest.mark.parametrize("footer", ["", "# the end\n"])
 def test_separators_and_line_ends(table, separator: str, end: str, footer: str) -> None:
-    """All give the same names, numbers and lines; empty lines and comments are no rows."""
     rows = (f"{k}{separator}{-k / 8}{separator}1e{k % 3}" for k in range(5))
     lines = ["% rig 3", "", separator.join(["t", "x", "y"]), *rows, footer]
     made = table(end.join(lines))
@@ -47,7 +46,6 @@ def test_separators_and_line_ends(table, separator: str, end: str, footer: str) 
 
 
 def test_numbers_keep_their_bits(table) -> None:
-    """Both ways of reading give the nearest double, so that shortest texts come back exactly."""
     values = [0.1, 1 / 3, 5e-324, 1.7976931348623157e308, -0.0, 123456789.123456789]
     for other in ("0", "words"):
         text = "".join(f"{value!r},{other}\n" for value in values)
@@ -89,18 +87,15 @@ def test_names(table, text: str, names: list[str]) -> None:
      "t.csv:2: is not a row of a table: field larger than field limit (131072)"),
 ])  # fmt: skip
 def test_mistakes_have_their_line(table, text: str, message: str) -> None:
-    """Words, gaps, infinities, decimal commas, short and long rows."""
     assert refusal(table(text).read, [0]) == message
 
 
 @pytest.mark.parametrize("text", ["", " \n\t\n", "# a,b\n"])
 def test_nothing(table, text: str) -> None:
-    """Neither header nor rows."""
     assert refusal(table, text).startswith("t.csv: holds no rows")
 
 
 def test_what_is_not_asked_for_may_be_anything(table) -> None:
-    """Other columns may hold words, other rows may be no rows at all."""
     made = table("t,label\n1,up\n2,down\n3,\nthe end\n")
     found = made.read([0], 1, 3)
     np.testing.assert_array_equal(found.values, [[1.0, 2.0, 3.0]])
@@ -124,7 +119,6 @@ def test_rows(table, other: str, first: int, last: int | None, found: list[int] 
 
 
 def test_columns(tmp_path: Path) -> None:
-    """By name or by number; what is not there, or twice, is refused with what is."""
     path, names = tmp_path / "t.csv", ["t", "x", "x", "4"]
     assert [column_index(path, column, names) for column in ("t", 1, "4", 4, 2)] == [0, 0, 3, 3, 1]
     known = "its columns are t, x, x, 4; numbers are 1 to 4"
@@ -134,7 +128,6 @@ def test_columns(tmp_path: Path) -> None:
 
 
 def test_column_that_nobody_named(tmp_path: Path) -> None:
-    """The only one there is; where there are several, one has to be named."""
     path = tmp_path / "t.csv"
     assert column_index(path, None, ["x"]) == 0
     text = "t.csv: has several columns: set column to one of x, y"
@@ -152,19 +145,16 @@ def test_column_that_nobody_named(tmp_path: Path) -> None:
     ([*np.arange(50), *(50 + 1.2 * np.arange(50))], 0.5, "t.csv:"),
 ])  # fmt: skip
 def test_uneven_time(table, times: list[float], tolerance: float, message: str) -> None:
-    """The first step that is wrong is named by its line; a rate that creeps is found as well."""
     rows = table("".join(f"{t}\n" for t in times)).read([0])
     assert refusal(rows.sample_rate_hz, 0, tolerance).startswith(message)
 
 
 def test_even_time(table) -> None:
-    """The rate is that of all rows together: rounding of single times does not matter."""
     rows = table("".join(f"{k / 3000:.4f}\n" for k in range(301))).read([0])
     assert rows.sample_rate_hz(0, 0.5) == pytest.approx(3000.0)
 
 
 def test_a_table_too_large_is_not_read(table, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its size and the limit are told before any of it is read."""
     monkeypatch.setattr(csv_table, "MAX_TABLE_BYTES", 1_000_000)
     with pytest.raises(InputError, match=r"t\.csv: has 2 MB.* 1 MB"):
         table(b"\xff" * 2_000_000)

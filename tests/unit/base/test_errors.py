@@ -25,7 +25,6 @@ def test_a_problem_has_place_key_rule_value_and_hint(problem, text):
 
 
 def test_all_problems_of_a_file_are_one_error():
-    """One line each, in order, from any iterable, and still there for programs."""
     problems = [ConfigProblem("a", "x", "one"), ConfigProblem("b", "y", "two")]
     error = ConfigError(iter(problems))
     assert str(error) == "a: x: one\nb: y: two"

@@ -26,7 +26,6 @@ from hilctl.base.files import (
 
 
 def test_file_is_read_once(tmp_path):
-    """What is asked for again is what was read first."""
     path = tmp_path / "model.yaml"
     path.write_text("first")
     files = TextFiles()
@@ -36,7 +35,6 @@ def test_file_is_read_once(tmp_path):
 
 
 def test_given_texts_stand_for_the_disk(tmp_path, monkeypatch):
-    """The other process finds the same texts by the same paths, from another folder too."""
     path = tmp_path / "model.yaml"
     path.write_text("first")
     monkeypatch.chdir(tmp_path)
@@ -47,7 +45,6 @@ def test_given_texts_stand_for_the_disk(tmp_path, monkeypatch):
 
 
 def test_nothing_else_is_read_where_texts_are_given(tmp_path):
-    """A file that nobody has checked is refused."""
     path = tmp_path / "other.yaml"
     path.write_text("text")
     with pytest.raises(InputError, match="was not read"):
@@ -63,7 +60,6 @@ def test_nothing_else_is_read_where_texts_are_given(tmp_path):
     ],
 )
 def test_unreadable_files_are_told(tmp_path, make, message):
-    """Each reason has its message, with the path."""
     path = tmp_path / "thing"
     make(path)
     with pytest.raises(InputError, match=f"thing: {message}"):
@@ -71,7 +67,6 @@ def test_unreadable_files_are_told(tmp_path, make, message):
 
 
 def test_a_text_too_large_is_not_read(tmp_path):
-    """A recording that is named by mistake is refused by its size."""
     path = tmp_path / "run.mcap"
     with path.open("wb") as stream:
         stream.truncate(20_000_000)
@@ -80,10 +75,7 @@ def test_a_text_too_large_is_not_read(tmp_path):
 
 
 class TestWriting:
-    """Files that appear whole or not at all."""
-
     def test_new_file(self, tmp_path):
-        """It has its content, the permissions of any new file, and nothing stands beside it."""
         path = tmp_path / "out.txt"
         plain = tmp_path / "plain"
         plain.touch()
@@ -93,7 +85,6 @@ class TestWriting:
         assert sorted(tmp_path.iterdir()) == [path, plain]
 
     def test_what_exists_is_kept_or_replaced(self, tmp_path):
-        """As the caller says; a link stays a link, to the file that was replaced."""
         path = tmp_path / "out.txt"
         path.write_text("precious")
         link = tmp_path / "link"
@@ -111,13 +102,11 @@ class TestWriting:
         assert sorted(tmp_path.iterdir()) == [link, path]
 
     def test_a_folder_is_no_file_to_overwrite(self, tmp_path):
-        """The remedy must not be one that is refused next."""
         with pytest.raises(InputError, match="is a folder"):
             write_text(tmp_path, "new", overwrite=False)
 
     @pytest.mark.parametrize("links", [True, False])
     def test_a_file_made_meanwhile_is_kept(self, tmp_path, monkeypatch, links):
-        """A name that was free when writing began may be taken when it ends: nothing is lost."""
         path = tmp_path / "out.txt"
         if not links:
             monkeypatch.setattr(Path, "hardlink_to", _refuse)
@@ -132,7 +121,6 @@ class TestWriting:
         assert list(tmp_path.iterdir()) == [path]
 
     def test_without_hard_links(self, tmp_path, monkeypatch):
-        """Where the file system has none, the file is written all the same."""
         monkeypatch.setattr(Path, "hardlink_to", _refuse)
         write_text(tmp_path / "out.txt", "text", overwrite=False)
         assert (tmp_path / "out.txt").read_text() == "text"
@@ -146,7 +134,6 @@ class TestWriting:
         "error", [OSError(28, "No space left"), KeyboardInterrupt(), ValueError()]
     )
     def test_what_breaks_off_leaves_nothing(self, tmp_path, overwrite, error):
-        """Half a file is never seen under the name, nor left beside it; the old one stays."""
         path = tmp_path / "out.txt"
         if overwrite:
             path.write_text("precious")
@@ -166,7 +153,6 @@ class TestWriting:
         assert left == (["precious"] if overwrite else [])
 
     def test_a_disk_that_fails_at_the_end(self, tmp_path, monkeypatch):
-        """What can't be brought to the disk does not take the name."""
         monkeypatch.setattr(os, "fsync", _refuse)
         with pytest.raises(
             InputError, match=r"out\.txt: can't be written: Operation not permitted"
@@ -175,7 +161,6 @@ class TestWriting:
         assert list(tmp_path.iterdir()) == []
 
     def test_a_folder_that_can_not_be_brought_to_the_disk(self, tmp_path, monkeypatch):
-        """Some file systems can't do it at all: no reason to refuse the file."""
         for number in (errno.EINVAL, errno.EIO):
             monkeypatch.setattr(os, "fsync", partial(_refuse_by, number))
             refused = pytest.raises(OSError, match="Input/output")
@@ -183,7 +168,6 @@ class TestWriting:
                 sync_folder(tmp_path)
 
     def test_what_is_no_regular_file_is_not_replaced(self, tmp_path):
-        """A folder, a pipe or a device such as /dev/null never gives way to a file."""
         os.mkfifo(tmp_path / "pipe")
         for path in (tmp_path, tmp_path / "pipe"):
             with pytest.raises(InputError, match="can't be written: Not a regular file"):
@@ -197,14 +181,12 @@ class TestWriting:
     )  # fmt: skip
     @pytest.mark.parametrize("overwrite", [True, False])
     def test_places_that_can_not_be_written(self, tmp_path, name, reason, overwrite):
-        """The message has the path and the reason."""
         (tmp_path / "plain").touch()
         with pytest.raises(InputError, match=f"can't be written: {reason}") as caught:
             write_text(tmp_path / name, "text", overwrite=overwrite)
         assert str(caught.value).startswith(str(tmp_path / name))
 
     def test_long_names(self, tmp_path):
-        """A name may be as long as the file system allows."""
         write_text(tmp_path / ("x" * 255), "text", overwrite=False)
         write_text(tmp_path / ("x" * 255), "again", overwrite=True)
 
@@ -219,7 +201,6 @@ def _refuse(*_arguments):
 
 @pytest.mark.parametrize("name", ["folder", "fifo", "null", "missing/out.txt", "x" * 300])
 def test_what_could_not_be_written_is_refused_beforehand(tmp_path, name):
-    """With the words that writing has for it, and nothing is left or replaced."""
     (tmp_path / "folder").mkdir()
     os.mkfifo(tmp_path / "fifo")
     (tmp_path / "null").symlink_to("/dev/null")

@@ -15,7 +15,6 @@ from hilctl.base.private_dirs import (
 
 
 def test_made_for_its_user_alone(tmp_path):
-    """Whatever the umask, and again where it stands already."""
     before = os.umask(0)
     try:
         made = private_folder(tmp_path / "own")
@@ -33,7 +32,6 @@ def test_not_made_where_it_is_only_looked_for(tmp_path):
 
 @pytest.mark.parametrize("target", ["elsewhere", "missing"])
 def test_link_is_not_followed(tmp_path, target):
-    """Neither one to a folder of this user, nor one to where a folder could be made."""
     (tmp_path / "elsewhere").mkdir(mode=0o700)
     (tmp_path / "own").symlink_to(tmp_path / target)
     with pytest.raises(OSError, match=r"Not a directory|Too many levels"):
@@ -57,7 +55,6 @@ def test_writable_by_others_is_refused(tmp_path, mode):
 
 
 def test_of_somebody_else_is_refused(tmp_path, monkeypatch):
-    """As it looks to another user."""
     (tmp_path / "own").mkdir(mode=0o700)
     owner = os.geteuid()
     monkeypatch.setattr(os, "geteuid", lambda: owner + 1)
@@ -95,12 +92,6 @@ def test_two_may_share(two):
     take_lock(one, shared=True)
     take_lock(other, shared=True)
     assert not is_locked(two[0])
-
-
-def test_a_look_leaves_no_lock(two):
-    one, other = two
-    assert not is_locked(one)
-    take_lock(other)
 
 
 def test_without_locks_nobody_is_kept_out(two, monkeypatch):

@@ -28,7 +28,6 @@ def same(found: Samples, expected: Samples) -> bool:
 
 
 def test_no_field_and_no_number_stands_for_two_columns() -> None:
-    """Within a message every number is one column's in one unit."""
     assert len({each.name for each in RECORDED_FIELDS}) == len(RECORDED_FIELDS)
     for message in ("block", "before", "scope"):
         numbers = [number for each in RECORDED_FIELDS if (number := getattr(each, message))]
@@ -36,7 +35,6 @@ def test_no_field_and_no_number_stands_for_two_columns() -> None:
 
 
 def test_rows_of_a_block_are_the_columns_in_order() -> None:
-    """Blocks become samples one after the other, each row under its column's name."""
     made = batch(3)
     samples = made.samples(slice(1, None))
     assert samples.index.tolist() == list(range(105, 115))
@@ -47,7 +45,6 @@ def test_rows_of_a_block_are_the_columns_in_order() -> None:
 
 
 def test_rows_are_chosen_of_every_column() -> None:
-    """By slice, by mask or by sample index; a column that is not there stays away."""
     samples = batch(3).samples()
     odd = samples.index % 2 == 1
     for name, values in samples.rows(odd).columns().items():

@@ -35,14 +35,12 @@ def segment(steady_start: int, steady_stop: int, period: float) -> Segment:
 def test_steady_cycles(
     steady_start: int, steady_stop: int, period: float, expected: tuple[int, int, int]
 ) -> None:
-    """Whole cycles at the end of the steady part, one after the soft start left out."""
     assert segment(steady_start, steady_stop, period).steady_cycles() == expected
 
 
 @pytest.mark.parametrize("frequency_hz", [1.0, 3.0, 7.0, 10.0, 33.3, 60.0, 150.0, 249.9])
 @pytest.mark.parametrize("cycles", [1, 2, 3, 30])
 def test_whole_cycles_are_all_counted(frequency_hz: float, cycles: int) -> None:
-    """A steady part of whole cycles has them all, whatever binary fractions make of the period."""
     period = 1.0 / frequency_hz * 50e3
     samples = round(cycles * period)
     start, stop, counted = segment(1000, 1000 + samples + 1, period).steady_cycles()
@@ -52,13 +50,11 @@ def test_whole_cycles_are_all_counted(frequency_hz: float, cycles: int) -> None:
 
 
 def test_shifted() -> None:
-    """Shifting moves every index and nothing else."""
     moved = Segment("sine 6 A 10 Hz", 10, 500, 60, 450, 33.25).shifted(1000)
     assert moved == Segment("sine 6 A 10 Hz", 1010, 1500, 1060, 1450, 33.25)
 
 
 def test_mapping_goes_through_json() -> None:
-    """A segment written to a recording's metadata comes back the same, bit for bit."""
     original = Segment("complex harmonic 4 um 20 Hz", 7, 12345, 100, 12000, 50e3 / 3.0)
     text = json.dumps(original.to_mapping())
     assert Segment.from_mapping(json.loads(text)) == original

@@ -36,7 +36,6 @@ def problems(loaded):
 
 
 def test_a_good_one_is_taken(load):
-    """It starts, and its input is recorded beside the reference."""
     checked = check(load(NOISE))
     assert checked.records_input
     np.testing.assert_array_equal(checked.begun.input_um, checked.reference.values)
@@ -63,7 +62,6 @@ def test_a_good_one_is_taken(load):
     ],
 )
 def test_what_it_can_not_have(load, settings, rule):
-    """One message for each, with the key."""
     with pytest.raises(ConfigError) as caught:
         check(load(*settings))
     assert rule in str(caught.value)
@@ -71,12 +69,10 @@ def test_what_it_can_not_have(load, settings, rule):
 
 @pytest.mark.parametrize("rest", ["condition={}", "compensator.offset=measured"])
 def test_a_rest_says_the_noise(load, rest):
-    """Then it need not be given."""
     assert check(load("adaptation={}", rest)).records_input
 
 
 def test_bounds_follow_from_what_else_acts(load):
-    """A tenth of the stroke; none beside an integrator; no shape beside what was learned."""
     config = load(NOISE).config
     assert adaptation_bounds(config).array.tolist() == [13.5, 0.1, 0.02, 0.02, 0.02]
     assert adaptation_bounds(load(NOISE, INTEGRAL).config).offset_um == 0.0
@@ -90,7 +86,6 @@ def test_bounds_follow_from_what_else_acts(load):
 
 
 def test_what_adaptation_can_not_do_is_said(load):
-    """A time constant below a period; nothing that is left to adapt; else nothing."""
     assert check(load("adaptation={noise_um: 0.03}")).warnings == ()
     (text,) = check(load("adaptation={noise_um: 0.03, time_constant_s: 0.09}")).warnings
     assert "0.09 s" in text
@@ -100,7 +95,6 @@ def test_what_adaptation_can_not_do_is_said(load):
 
 
 def test_the_limits_hold_with_the_bounds_at_their_worst(load):
-    """A run within them is refused where adaptation might leave them, and says so."""
     settings = ("limits.peak_current_a=2.0", "waveform.amplitude=10.0")
     assert check(load(*settings)).forecast.command_max < 2.0
     text = problems(load(*settings, "adaptation={noise_um: 0.03, offset_um: 5.0}"))
@@ -110,7 +104,6 @@ def test_the_limits_hold_with_the_bounds_at_their_worst(load):
 
 
 def test_worst_inputs_reach_further_than_any_adaptation(load):
-    """Both ways, coming in over the lead-in."""
     config = load("adaptation={noise_um: 0.03, offset_um: 5.0}").config
     reference = 10.0 * np.sin(np.arange(5000) / 100.0)
     operator = DisplacementOperator.over(reference, adaptation_bounds(config))

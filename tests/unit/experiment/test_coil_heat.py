@@ -77,7 +77,6 @@ def test_a_cold_coil_runs_at_once(coil, held):
 
 
 def test_the_pause_is_just_long_enough(coil, held, config):
-    """After it the run keeps the budget, as the interlock counts it; a little less does not do."""
     run = held(2.5, 1.0)
     coil.ran(run, 101.0)
     pause_s = coil.pause_s(run, 101.0)
@@ -89,7 +88,6 @@ def test_the_pause_is_just_long_enough(coil, held, config):
 
 
 def test_in_parts_a_run_does_the_same(config):
-    """And the same as sample by sample."""
     command = np.sin(np.arange(9000) / 50.0) * 2.0
     whole = RunHeat().then(command, config.limits, RATE_HZ)
     parts = RunHeat()
@@ -115,7 +113,6 @@ def test_time_that_passes_anyway_is_no_pause(coil, held):
 
 
 def test_a_run_that_never_fits_is_waited_for_no_longer_than_for_a_cold_coil(coil, held):
-    """The amplitude was lowered before; here it was not."""
     coil.ran(held(2.5, 1.0), 101.0)
     assert coil.pause_s(held(4.0, 5.0), 101.0) < 100.0
 
@@ -126,8 +123,6 @@ def test_a_clock_that_goes_back_cools_nothing():
 
 
 class TestSamples:
-    """What was exchanged, not what was meant."""
-
     def test_what_was_measured_counts_where_it_is_more(self, config):
         heat, sure = (CoilHeat(config.limits, RATE_HZ, 0.5) for _ in range(2))
         heat.follow(samples(range(4), [1, 1, 1, 1], [np.nan, 3.0, np.inf, 0.5]))

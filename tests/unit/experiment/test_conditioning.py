@@ -51,8 +51,6 @@ def command_of(*given, text=EXPERIMENT):
 
 
 class TestCycle:
-    """Its commands."""
-
     def test_from_the_limits(self):
         """By itself it goes to the limits at 10 Hz, 20 times, ever less far, and rests 0.1 s."""
         cycle, made = command_of()
@@ -66,7 +64,6 @@ class TestCycle:
         assert cycle.reshape(20, 1000).min(axis=1)[0] == pytest.approx(-6.0, rel=1e-6)
 
     def test_each_side_as_far_as_there_is_room(self):
-        """A drive that is mostly positive goes less far below its safe value than above."""
         cycle, _ = command_of(text=PIEZO)
         assert cycle.max() == pytest.approx(120.0, rel=1e-6)
         assert cycle.min() == pytest.approx(-20.0, rel=1e-6)
@@ -83,7 +80,6 @@ class TestCycle:
     )
     @example(cycles=2, decay=math.nextafter(1.0, 0.0), slew=100.0, safe=0.0, rate_hz=200.0)
     def test_within_limits_and_to_the_safe_value(self, cycles, decay, slew, safe, rate_hz):
-        """Whatever is asked for: range and slew are kept, and the last command is the safe one."""
         cycle, made = command_of(
             f"condition={{cycles: {cycles}, decay: {decay!r}}}",
             f"limits.slew_a_per_s={slew!r}",
@@ -96,7 +92,6 @@ class TestCycle:
         assert set(made.command[cycle.size - 1 :]) == {safe}
 
     def test_a_fifo_answers_before_the_waveform(self):
-        """The rest is followed by as many blocks as its displacements take to come."""
         made = loaded()
         info = replace(made.device.info, latency_blocks=3)
         late = conditioning_of(replace(made, device=SimpleNamespace(info=info)))
@@ -105,7 +100,6 @@ class TestCycle:
         assert late.rest == (20_500, 21_000)
 
     def test_it_makes_what_was_before_forgotten(self):
-        """From any history, the model stands where it stands after the cycle from rest."""
         cycle, _ = command_of()
         model, random = load_model(MODEL), np.random.default_rng(5)
         stands = []
@@ -122,10 +116,7 @@ class TestCycle:
 
 
 class TestCheck:
-    """What a run with one begins with."""
-
     def test_the_compensator_begins_where_the_cycle_ends(self):
-        """Model and inverse stand at the same displacement, and the input is led in from there."""
         checked = check(loaded("compensator.offset=measured"))
         conditioning, begun = checked.conditioning(), checked.begun
         assert conditioning is not None
@@ -140,7 +131,6 @@ class TestCheck:
         assert checked.records_input
 
     def test_offset_is_measured_where_told_to(self):
-        """After a condition or without one; never without a compensator."""
         assert check(loaded()).conditioning().stands_um is None
         plain = loaded("condition=null")
         assert check(plain).conditioning() is None
@@ -150,7 +140,6 @@ class TestCheck:
         assert conditioning_of(loaded(text=PIEZO)).stands_um is None
 
     def test_forecast_counts_it(self):
-        """Range, heat and size of the run are those of all that is put out."""
         checked, plain = check(loaded()), check(loaded("condition=null"))
         assert plain.forecast.before_s == 0.0
         assert checked.forecast.before_s == 2.1
@@ -170,7 +159,6 @@ class TestCheck:
         ],
     )
     def test_what_it_can_t_be(self, setting, rule):
-        """Further or faster than the limits: refused with the limit."""
         slew = "limits.slew_a_per_s=3000.0" if "90.0" in setting else "name=x"
         with pytest.raises(ConfigError, match=rule):
             check(loaded(setting, slew))

@@ -48,7 +48,6 @@ def correction_of(correction: Correction, made: Reference, model=None):
 
 
 def test_a_file_gives_back_the_same_correction(tmp_path):
-    """Written and read again, every coefficient has the same bits."""
     made = reference(sine(), tmp_path)
     correction = correction_for(made, made.segments[0])
     text = dump_correction(correction)
@@ -59,7 +58,6 @@ def test_a_file_gives_back_the_same_correction(tmp_path):
 
 
 def test_the_correction_follows_the_phase_where_a_period_is_no_whole_number(tmp_path):
-    """In the steady part it is the Fourier sum at each sample's own phase."""
     made = reference(sine(), tmp_path)
     segment = made.segments[0]
     added = correction_of(correction_for(made, segment), made)
@@ -82,7 +80,6 @@ def test_the_correction_fades_with_the_waveform(tmp_path):
 
 
 def test_without_a_soft_start_it_fades_in_over_one_period():
-    """Where the waveform starts at once, the correction still does not jump."""
     fade = envelope(Segment("x", 0, 1000, 0, 1000, 100.0), np.arange(1000))
     assert fade[0] == 0.0
     assert fade[50] == pytest.approx(0.5)
@@ -90,7 +87,6 @@ def test_without_a_soft_start_it_fades_in_over_one_period():
 
 
 def test_only_the_waveform_that_was_learned_is_corrected(tmp_path):
-    """In a sequence, the other parts stay as they are; a repeated one is corrected each time."""
     parts = (sine(100.0), sine(150.0), sine(150.0, amplitude=9.0))
     made = reference(Sequence(kind="sequence", unit="um", parts=parts, repeat=2), tmp_path)
     added = correction_of(correction_for(made, made.segments[1]), made)
@@ -102,7 +98,6 @@ def test_only_the_waveform_that_was_learned_is_corrected(tmp_path):
     "other", [sine(151.0), sine(amplitude=10.1), sine(offset=0.1), sine(phase_deg=2.0)]
 )
 def test_another_waveform_is_refused(other, tmp_path):
-    """A correction of another period, amplitude, offset or phase would do harm."""
     made = reference(sine(), tmp_path)
     correction = correction_for(made, made.segments[0])
     with pytest.raises(InputError, match=r"sine 10 um 150 Hz"):
@@ -110,7 +105,6 @@ def test_another_waveform_is_refused(other, tmp_path):
 
 
 def test_another_length_or_fade_is_the_same_waveform(tmp_path):
-    """What was learned in a short run serves a long one."""
     made = reference(sine(), tmp_path)
     correction = correction_for(made, made.segments[0])
     longer = sine(soft_s=0.2).model_copy(update={"duration_s": 3.0})
@@ -118,7 +112,6 @@ def test_another_length_or_fade_is_the_same_waveform(tmp_path):
 
 
 def test_another_rate_or_model_is_refused(tmp_path):
-    """Samples and compensator must be those that it was learned with."""
     made = reference(sine(), tmp_path)
     correction = correction_for(made, made.segments[0], terfenol_rdpi())
     with pytest.raises(InputError, match="another model"):
@@ -129,7 +122,6 @@ def test_another_rate_or_model_is_refused(tmp_path):
 
 
 def test_a_file_with_unequal_coefficients_is_refused(tmp_path):
-    """The message names both lengths."""
     made = reference(sine(), tmp_path)
     text = dump_correction(correction_for(made, made.segments[0]))
     broken = text.replace("    sine_um:\n    - 0.0\n", "    sine_um:\n")
@@ -141,6 +133,5 @@ def test_a_file_with_unequal_coefficients_is_refused(tmp_path):
 
 
 def test_evaluation_drops_what_a_coarse_grid_can_not_show():
-    """Harmonics at or above half the points are left out instead of folded back."""
     values = evaluate(np.array([1.0, 0.0, 0.5, 0.5, 0.25]), 6)
     np.testing.assert_allclose(values, 1.0 + np.cos(2.0 * 2.0 * np.pi * np.arange(6) / 6))

@@ -74,7 +74,6 @@ def test_a_damaged_state_is_none_and_a_warning(states, caplog, content):
 
 
 def test_where_it_can_not_be_written_no_older_one_is_left(states, caplog, monkeypatch):
-    """An older one would be taken for the last."""
     write_device_state(STATE)
 
     def full(*_, **__):
@@ -89,7 +88,6 @@ def test_where_it_can_not_be_written_no_older_one_is_left(states, caplog, monkey
 
 @pytest.mark.parametrize("given", ["", "relative"])
 def test_without_a_folder_of_its_own_it_is_in_the_home(tmp_path, monkeypatch, given):
-    """The XDG standard ignores a relative folder."""
     monkeypatch.setenv("XDG_STATE_HOME", given)
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     write_device_state(STATE)
@@ -148,7 +146,6 @@ def folder(tmp_path):
 
 
 def test_the_last_run_of_this_device_is_taken(folder):
-    """By its state, whatever the times of files say; other devices are passed over."""
     folder.record("older")
     path = folder.record("last")
     folder.record("other", holds=("tcp:10.0.0.6:502",))
@@ -171,7 +168,6 @@ def test_the_last_run_of_this_device_is_taken(folder):
     ],
 )
 def test_no_older_one_stands_in_for_the_last(folder, made, why):
-    """What came after it is not known: rest, and the reason."""
     folder.record("old")
     folder.record("new", **made)
     left, words = left_by_last_run(folder.loaded(), NOW_S)
@@ -182,7 +178,6 @@ def test_no_older_one_stands_in_for_the_last(folder, made, why):
 
 
 def test_a_run_without_a_recording_is_not_known(folder):
-    """As one that was killed by a power cut before its first flush; or deleted, or replaced."""
     folder.record("old")
     folder.begin("new")
     assert "new.mcap" in left_by_last_run(folder.loaded(), NOW_S)[1]
@@ -193,7 +188,6 @@ def test_a_run_without_a_recording_is_not_known(folder):
 
 
 def test_another_rate_or_a_large_file(folder, monkeypatch):
-    """A recording that does not fit is named with what does not."""
     path = folder.record("new")
     assert "10000 Hz" in left_by_last_run(folder.loaded("sample_rate_hz=5000"), NOW_S)[1]
     monkeypatch.setattr("hilctl.experiment.device_state._LARGEST_BYTES", 1 << 10)
@@ -202,7 +196,6 @@ def test_another_rate_or_a_large_file(folder, monkeypatch):
 
 
 def test_nothing_there(folder):
-    """No run of this device; and no device that could have a past."""
     words = left_by_last_run(folder.loaded(), NOW_S)[1]
     assert words.startswith("at rest")
     folder.record("new", holds=())
@@ -210,10 +203,7 @@ def test_nothing_there(folder):
 
 
 class TestCheck:
-    """What the experiment says goes before."""
-
     def test_by_default(self, folder):
-        """The compensator begins there, is led in from there, and says so."""
         folder.record("new")
         begun = check(folder.loaded()).begun
         left, words = left_by_last_run(folder.loaded(), NOW_S)
@@ -231,7 +221,6 @@ class TestCheck:
         ],
     )
     def test_switched_off_or_over(self, folder, setting, words):
-        """Rest, a condition and a recording that is named win over the last one."""
         folder.record("new")
         record(folder.path / "old.mcap", 0.5 * COMMAND)
         begun = check(folder.loaded(setting)).begun
@@ -239,7 +228,6 @@ class TestCheck:
         assert begun.run_id == ("before" if "old" in setting else "")
 
     def test_without_a_compensator(self, folder):
-        """There is no memory to begin with."""
         folder.record("new")
         plain = folder.loaded("compensator=none", "waveform.unit=A")
         assert check(plain).begun.begins == ""
@@ -258,8 +246,6 @@ def coil(heat_a2=4.0, *, output_safe=True, tau_s=20.0):
 
 
 class TestHeat:
-    """What the last run has left of the coil's heat."""
-
     def record(self, folder, coil=None, end=None, **facts):
         facts |= {
             "started": STARTED.isoformat(),
@@ -271,7 +257,6 @@ class TestHeat:
         return heat_before(folder.loaded(*HOT, *settings), ENDED_S + waited_s)
 
     def test_it_has_cooled_since(self, folder):
-        """By the clock, without its recording, and not to below what the safe value makes."""
         folder.begin("gone", coil=coil(4.0))
         assert self.left(folder, 0.0) == 4.0
         assert self.left(folder, 20.0) == pytest.approx(4.0 / np.e)
@@ -289,7 +274,6 @@ class TestHeat:
 
     @pytest.mark.parametrize("end", [{}, SAFE_END, {**SAFE_END, HEAT_FACT: "warm"}])
     def test_a_killed_run_s_is_worked_out_from_its_samples(self, folder, end):
-        """With what it began with; a fact that is no number is as hot as can be."""
         path = self.record(folder, end=end, **{HEAT_FACT: "4.0"})
         limits = folder.loaded(*HOT).config.limits
         sure = CoilHeat(limits, 10000.0, 4.0)
@@ -313,14 +297,12 @@ class TestHeat:
         assert self.left(folder, 20.0) == pytest.approx(9.0 / np.e)
 
     def test_a_killed_run_without_a_recording_leaves_it_as_hot_as_can_be(self, folder):
-        """Since the run began, or its folder was changed by what became of the recording."""
         folder.begin("gone")
         os.utime(folder.runs, (ENDED_S + 5.0, ENDED_S + 5.0))
         assert self.left(folder, 5.0) == 9.0
         assert self.left(folder, 25.0) == pytest.approx(9.0 / np.e)
 
     def test_a_run_that_would_overheat_the_coil_is_refused_until_it_has_cooled(self, folder):
-        """And says how long that takes."""
         folder.begin("gone", coil=coil(8.9))
         sine = "waveform={kind: sine, unit: A, amplitude: 5.0, frequency_hz: 10.0, duration_s: 2.0}"
         loaded = folder.loaded(*HOT, "compensator=none", sine)

@@ -49,7 +49,6 @@ def test_layouts_and_profiles_are_copied_too(tmp_path, name, files):
 
 @pytest.mark.parametrize("name", ["demo", "modbus_adam_6224"])
 def test_a_copy_stands_on_its_own(tmp_path, name):
-    """Without the folder that it came from: the model stands beside it, and the schema."""
     own = tmp_path / "new" / "folder"
     first, *others = copy_example(name, own, CONFIGS)
     assert first == own / f"{name}.yaml"
@@ -77,7 +76,6 @@ def test_what_can_not_be_had_is_said(tmp_path):
 
 
 def test_examples_may_name_each_other(tmp_path):
-    """A model that is named by two, in a folder of its own."""
     folder = tmp_path / "shipped"
     (folder / "models").mkdir(parents=True)
     (folder / "a.yaml").write_text("base: b.yaml\nothers: [models/m.yaml, {deep: models/m.yaml}]\n")

@@ -21,23 +21,8 @@ from hilctl.experiment.feedback_checks import (
 from hilctl.experiment.load import resolve
 from hilctl.experiment.preflight import check
 from hilctl.loop.feedback import Feedback, Gains
+from tests.unit.loop.test_feedback import EXPERIMENT, plant
 
-EXPERIMENT = """\
-name: feedback
-device: {kind: simulated_terfenol}
-sample_rate_hz: 5000
-block: 1
-waveform:
-  kind: sine
-  unit: um
-  amplitude: 10.0
-  frequency_hz: 10.0
-  duration_s: 0.5
-  soft_start_s: 0.1
-compensator: {model: model.yaml}
-limits: {peak_current_a: 7.0, slew_a_per_s: 20000.0, stroke_um: [-75.0, 60.0]}
-feedback: {limit_um: 5.0, bandwidth_hz: 50.0, resonance_hz: 2300.0, damping_ratio: 0.12}
-"""
 MODEL = "model: {kind: ppi, direct: 5.0, weights: [1.0, 0.5], thresholds: [0.3, 0.6]}\n"
 STAGED = """\
 model:
@@ -48,8 +33,6 @@ model:
 
 
 class TestExperiment:
-    """What an experiment may ask for."""
-
     def problems(self, folder, *settings, model=MODEL):
         (folder / "model.yaml").write_text(model)
         loaded = resolve(Document("experiment", EXPERIMENT), folder, settings)
@@ -58,54 +41,45 @@ class TestExperiment:
         return str(caught.value)
 
     def test_good_one_is_taken(self, tmp_path):
-        """It starts, and its input is recorded beside the reference."""
         (tmp_path / "model.yaml").write_text(MODEL)
         checked = check(resolve(Document("experiment", EXPERIMENT), tmp_path, []))
         np.testing.assert_array_equal(checked.begun.input_um, checked.reference.values)
 
     def test_block_of_more_than_one(self, tmp_path):
-        """Feedback needs a block of 1."""
         assert "block: must be 1" in self.problems(tmp_path, "block=50")
 
     def test_too_much_bandwidth(self, tmp_path):
-        """The message says how much there can be, and the rate that it needs."""
         text = self.problems(tmp_path, "feedback.bandwidth_hz=500.0", "feedback.damping_ratio=1.0")
         assert "feedback.bandwidth_hz: must be <= 277.8 Hz" in text
         assert "at least 9000 samples" in text
 
     def test_delay_that_no_rate_makes_good(self, tmp_path):
-        """A sensor too late for a bandwidth is said to be so."""
         text = self.problems(tmp_path, "feedback.sensor_delay_s=0.01")
         assert "no sample rate" in text
 
     def test_gains_without_margin(self, tmp_path):
-        """Gains are held against their margins."""
         gains = "feedback={limit_um: 5.0, kp: 0.2, ki_per_s: 4000.0, resonance_hz: 2300.0,"
         text = self.problems(tmp_path, gains + " damping_ratio: 1.0}")
         assert "phase margin of 60" in text
         assert "samples per second" in text
 
     def test_resonance_must_be_known(self, tmp_path):
-        """A model that does not tell the resonance leaves it to the experiment."""
         text = self.problems(tmp_path, "feedback={limit_um: 5.0, bandwidth_hz: 20.0}")
         assert "needs resonance_hz" in text
 
     def test_resonance_of_the_model(self, tmp_path):
-        """That of a staged model's structure is taken, and held against the gain there."""
         settings = "feedback={limit_um: 5.0, bandwidth_hz: 50.0}"
         text = self.problems(tmp_path, settings, model=STAGED)
         assert "at the resonance" in text
         assert "bandwidth_hz 36" in text
 
     def test_without_a_compensator(self, tmp_path):
-        """There is nothing to correct the input of."""
         settings = ("compensator=none", "waveform.unit=A", "waveform.amplitude=1.0")
         assert "feedback: needs a compensator" in self.problems(tmp_path, *settings)
 
     INTEGRAL = "feedback={kind: integral, limit_um: 5.0, bandwidth_hz: 1.0}"
 
     def test_integral_takes_blocks(self, tmp_path):
-        """An integrator needs neither a block of 1 nor a resonance, and its input is recorded."""
         (tmp_path / "model.yaml").write_text(MODEL)
         checked = check(resolve(Document("e", EXPERIMENT), tmp_path, ["block=50", self.INTEGRAL]))
         assert checked.records_input
@@ -115,23 +89,17 @@ class TestExperiment:
         [
             (("block=50", "{b: 3.2}"), MODEL, "must be <= 3.121 Hz"),
             (("block=1", "{b: 5.1}"), MODEL, "must be <= 5 Hz"),
-            (
-                ("block=1", "{b: 13.0}"),
-                STAGED.replace("0.12", "0.04"),
-                "must be <= 12 Hz",
-            ),
+            (("block=1", "{b: 13.0}"), STAGED.replace("0.12", "0.04"), "must be <= 12 Hz"),
             (("block=1", "{b: 1.0, sensor_delay_s: 0.1}"), MODEL, "must be <= 0.317 Hz"),
         ],
     )
     def test_integral_too_fast(self, tmp_path, settings, model, rule):
-        """Its bandwidth stays well below the loop's delay, and below the resonance."""
         keys = settings[1].replace("b:", "bandwidth_hz:")
         chosen = f"feedback={{kind: integral, limit_um: 5.0, {keys[1:]}"
         text = self.problems(tmp_path, settings[0], chosen, model=model)
         assert f"feedback.bandwidth_hz: {rule}" in text
 
     def test_integral_counts_a_fifo(self, tmp_path):
-        """What the device plays later than it is sent is part of the delay."""
         (tmp_path / "model.yaml").write_text(MODEL)
         loaded = resolve(Document("experiment", EXPERIMENT), tmp_path, ["block=50", self.INTEGRAL])
         info = replace(loaded.device.info, latency_blocks=4)
@@ -140,46 +108,17 @@ class TestExperiment:
         assert problem.rule.startswith("must be <= 0.6341 Hz")
 
     def test_unknown_kind(self, tmp_path):
-        """The kinds are named."""
         (tmp_path / "model.yaml").write_text(MODEL)
         with pytest.raises(ConfigError, match="'pi', 'integral'"):
             resolve(Document("e", EXPERIMENT), tmp_path, ["feedback={kind: pid, limit_um: 1.0}"])
-
-    @pytest.mark.parametrize("keys", ["{}", "{kp: 0.1}", "{bandwidth_hz: 1.0, ki_per_s: 1.0}"])
-    def test_bandwidth_or_gains(self, tmp_path, keys):
-        """Exactly one of the two ways to say how fast it is."""
-        (tmp_path / "model.yaml").write_text(MODEL)
-        setting = f"feedback={keys[:-1]}{', ' if len(keys) > 2 else ''}limit_um: 1.0}}"
-        with pytest.raises(ConfigError, match="ki_per_s"):
-            resolve(Document("experiment", EXPERIMENT), tmp_path, [setting])
 
 
 RATE_HZ = 5000.0
 
 
-def plant(feedback, samples=2000, *, gain=1.0, offset_um=0.0, reference=None, hold_back=math.inf):
-    """Run the controller on a gain and an offset, as the loop does; return errors in um.
-
-    A displacement shows the input of the sample before; the controller sees it a sample later.
-    """
-    wanted = np.zeros(samples) if reference is None else reference
-    errors, inputs, seen, limited = [], [0.0], math.nan, False
-    for k in range(samples):
-        wish = wanted[k] + feedback.correct(wanted[k], seen, limited=limited)
-        put_out = min(hold_back, max(-hold_back, wish))
-        limited = put_out != wish
-        seen = gain * inputs[-1] + offset_um
-        errors.append((wanted[k - 1] if k else 0.0) - seen)
-        inputs.append(put_out)
-    return np.array(errors)
-
-
 class TestMargins:
-    """What the delay leaves."""
-
     @pytest.mark.parametrize("bandwidth_hz", [1.0, 50.0, 270.0])
     def test_bandwidth_is_where_the_loop_crosses_one(self, bandwidth_hz):
-        """The integral's gain is 1 at the bandwidth, whatever the rate."""
         step = gains_for(bandwidth_hz, RATE_HZ).ki_per_s / RATE_HZ
         turn = 1.0 - np.exp(-2j * np.pi * bandwidth_hz / RATE_HZ)
         assert abs(step / turn) == pytest.approx(1.0)
@@ -193,12 +132,10 @@ class TestMargins:
         assert gain > 2.0
 
     def test_one_and_a_half_samples_of_delay(self):
-        """Without any other delay, the bandwidth is an eighteenth of the rate."""
         assert highest_bandwidth_hz(1800.0) == pytest.approx(100.0)
 
     @given(bandwidth_hz=st.floats(0.1, 1e3), delay_s=st.floats(0.0, 1e-2))
     def test_rate_needed_is_the_inverse(self, bandwidth_hz, delay_s):
-        """At the rate that a bandwidth needs, it is the highest; where no rate will do, none is."""
         rate_hz = rate_needed_hz(bandwidth_hz, delay_s)
         if math.isinf(rate_hz):
             assert highest_bandwidth_hz(1e12, delay_s) < bandwidth_hz * (1.0 + 1e-6)
@@ -216,11 +153,9 @@ class TestMargins:
             assert (errors[-50:].max() < errors[10:60].max()) == fades
 
     def test_a_loop_that_never_falls_below_one_has_no_phase_margin(self):
-        """A proportional gain above 1 keeps the loop gain above 1 for ever."""
         assert margins(Gains(1.5, 1.0), RATE_HZ)[1] == 0.0
 
     @pytest.mark.parametrize(("kp", "ki"), [(-0.1, 1.0), (0.0, 0.0), (math.nan, 1.0)])
     def test_gains_out_of_range(self, kp, ki):
-        """Gains that could not be a controller's are refused."""
         with pytest.raises(InputError, match="kp must be"):
             Gains(kp, ki)

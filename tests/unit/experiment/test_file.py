@@ -12,7 +12,7 @@ from hilctl.base.errors import ConfigError, InputError
 from hilctl.base.yaml import Document
 from hilctl.experiment import devices as registry
 from hilctl.experiment.load import LoadedExperiment, load_experiment, resolve
-from hilctl.models.plays import PpiModel, RdpiModel
+from hilctl.models.plays import RdpiModel
 from hilctl.waveforms.spec import Sine
 
 FULL = """\
@@ -113,10 +113,7 @@ def changed(old: str, new: str, text: str = FULL) -> str:
 
 
 class TestAccepted:
-    """Files that keep all rules."""
-
     def test_full_example(self, folder: Path) -> None:
-        """Every key arrives where it belongs."""
         loaded = load(FULL, folder)
         config = loaded.config
         assert (config.name, config.sample_rate_hz, config.block) == ("full_example", 50e3, 50)
@@ -155,7 +152,6 @@ class TestAccepted:
         assert loaded.folder == folder
 
     def test_defaults(self) -> None:
-        """What is not given has its documented default."""
         loaded = load(MINIMAL)
         config = loaded.config
         assert config.block == 1
@@ -185,7 +181,6 @@ class TestAccepted:
         assert config.waveform.model_dump()["offset"] == 0.0
 
     def test_voltage(self) -> None:
-        """A device driven in V has its limits in V."""
         text = (
             MINIMAL.replace("simulated_terfenol", "simulated_piezo")
             .replace("unit: A", "unit: V")
@@ -194,12 +189,6 @@ class TestAccepted:
         )
         limits = load(text).config.limits
         assert (limits.unit, limits.command_range, limits.slew_per_s) == ("V", (-1.0, 5.0), 5000.0)
-
-    def test_frozen(self) -> None:
-        """Nothing can be changed once it is read."""
-        config = load(MINIMAL).config
-        with pytest.raises(ValueError, match="frozen"):
-            config.block = 2  # type: ignore[misc]
 
     def test_ramp(self, folder: Path) -> None:
         """The safe ramp takes ramp_s from the command furthest away, within the slew limit."""
@@ -210,7 +199,6 @@ class TestAccepted:
         assert load(slow, folder).config.command_limits().ramp_per_s == 10.0
 
     def test_text_reads_back_the_same(self, folder: Path) -> None:
-        """The experiment as it will run, settings included, reads back as the same experiment."""
         text = changed("description: Everything that an experiment can say.", "description: '1e3'")
         loaded = load(text, folder, ("waveform.frequency_hz=12.5", "limits.stroke_um.0=-70"))
         again = load(loaded.yaml_text, folder)
@@ -221,7 +209,6 @@ class TestAccepted:
         assert again.yaml_text == loaded.yaml_text
 
     def test_file(self, folder: Path) -> None:
-        """Files in an experiment are found beside it."""
         (folder / "x.yaml").write_text(FULL)
         loaded = load_experiment(folder / "x.yaml")
         assert loaded.model is not None
@@ -232,25 +219,14 @@ ONE_RULE = [
     # key whose line is named, text to replace, replacement, key of the problem
     ("name", "name: full_example", "name: a b", "name"),
     ("name", "name: full_example", "name: 12", "name"),
-    ("name", "name: full_example", "name: true", "name"),
     ("sample_rate_hz", "sample_rate_hz: 50000", "sample_rate_hz: 50_000", "sample_rate_hz"),
-    ("sample_rate_hz", "sample_rate_hz: 50000", "sample_rate_hz: '50000'", "sample_rate_hz"),
     ("sample_rate_hz", "sample_rate_hz: 50000", "sample_rate_hz: 0", "sample_rate_hz"),
     ("sample_rate_hz", "sample_rate_hz: 50000", "sample_rate_hz: 2.0e+6", "sample_rate_hz"),
-    ("sample_rate_hz", "sample_rate_hz: 50000", "sample_rate_hz: .inf", "sample_rate_hz"),
-    ("sample_rate_hz", "sample_rate_hz: 50000", "sample_rate_hz:", "sample_rate_hz"),
     ("block", "block: 50", "block: 0", "block"),
     ("block", "block: 50", "block: 4097", "block"),
-    ("block", "block: 50", "block: 50.5", "block"),
-    ("block", "block: 50", "block: true", "block"),
-    ("block", "block: 50", "block: 55e-1", "block"),
     ("unit", "unit: um", "unit: mm", "waveform.unit"),
     ("unit", "unit: um", "unit: A", "waveform.unit"),
     ("amplitude", "amplitude: 2.5", "amplitude: 0", "waveform.amplitude"),
-    ("amplitude", "amplitude: 2.5", "amplitude: .nan", "waveform.amplitude"),
-    ("amplitude", "amplitude: 2.5", "amplitude: [2.5]", "waveform.amplitude"),
-    ("offset", "offset: -1.0", "offset: -1,250", "waveform.offset"),
-    ("frequency_hz", "frequency_hz: 10.0", "frequency_hz: 1:30", "waveform.frequency_hz"),
     ("duration_s", "duration_s: 2.0", "duration_s: -2.0", "waveform.duration_s"),
     ("soft_start_s", "soft_start_s: 0.1", "soft_start_s: -0.1", "waveform.soft_start_s"),
     ("phase_deg", "phase_deg: 90", "phase: 90", "waveform.phase"),
@@ -263,9 +239,7 @@ ONE_RULE = [
     ("peak_current_a", "peak_current_a: 7.07", "peak_current_a: -7.07", "limits.peak_current_a"),
     ("slew_a_per_s", "slew_a_per_s: 20000.0", "slew_a_per_s: 0", "limits.slew_a_per_s"),
     ("stroke_um", "[-75.0, 60.0]", "[60.0, -75.0]", "limits.stroke_um"),
-    ("stroke_um", "[-75.0, 60.0]", "[5, 5]", "limits.stroke_um"),
     ("stroke_um", "[-75.0, 60.0]", "[-75.0]", "limits.stroke_um"),
-    ("stroke_um", "[-75.0, 60.0]", "[-75.0, 0, 60.0]", "limits.stroke_um"),
     ("stroke_um", "[-75.0, 60.0]", "60.0", "limits.stroke_um"),
     ("stroke_um", "[-75.0, 60.0]", "[low, 60.0]", "limits.stroke_um.0"),
     ("value", "value: 0.5", "value: 7.1", "safe.value"),
@@ -273,15 +247,13 @@ ONE_RULE = [
     ("late_policy", "late_policy: catch_up", "late_policy: hurry", "timing.late_policy"),
     ("late_after", "late_after: 0.25", "late_after: 0", "timing.late_after"),
     ("max_late_s", "max_late_s: 2.0", "max_late_s: -1", "timing.max_late_s"),
-    ("folder", "folder: runs", "folder: false", "recording.folder"),
     ("flush_s", "flush_s: 0.5", "flush_s: 10.5", "recording.flush_s"),
     ("scope_rate_hz", "scope_rate_hz: 500.0", "scope_rate_hz: 1001", "recording.scope_rate_hz"),
     ("ring_s", "ring_s: 20.0", "ring_s: 0.5", "recording.ring_s"),
     ("ring_s", "ring_s: 20.0", "ring_s: 61", "recording.ring_s"),
+    ("ring_s", "ring_s: 20.0", "ring_s: 1.0", "recording"),
     ("seed", "seed: 3", "seed: -3", "device.seed"),
-    ("seed", "seed: 3", "seed: 3.5", "device.seed"),
     ("seed", "seed: 3", "sed: 3", "device.sed"),
-    ("noise", "noise: false", "noise: 0", "device.noise"),
     ("load_kg", "load_kg: 3.7", "load_kg: 101", "device.load_kg"),
     ("at_sample", "at_sample: 9000", "at_sample: soon", "device.fault.at_sample"),
     ("fault", "    at_sample: 9000\n", "", "device.fault.at_sample"),
@@ -290,14 +262,7 @@ ONE_RULE = [
 
 @pytest.mark.parametrize(("line", "old", "new", "key"), ONE_RULE)
 def test_one_broken_rule(folder: Path, line: str, old: str, new: str, key: str) -> None:
-    """One broken rule is one problem with its line and key."""
     assert problems(changed(old, new), folder) == [(f"x.yaml:{LINES[line]}", key)]
-
-
-def test_ring_must_bridge_the_time_between_flushes(folder: Path) -> None:
-    """The rule has two keys; its line is that of ring_s."""
-    text = changed("ring_s: 20.0", "ring_s: 1.0")
-    assert problems(text, folder) == [(f"x.yaml:{LINES['ring_s']}", "recording")]
 
 
 @pytest.mark.parametrize(
@@ -312,17 +277,13 @@ def test_required(key: str) -> None:
 @pytest.mark.parametrize("key", ["waveform", "limits", "safe", "timing", "recording", "device"])
 @pytest.mark.parametrize("value", ["5", "[1]", "text"])
 def test_section_that_is_no_mapping(key: str, value: str) -> None:
-    """A section must be a mapping."""
     lines = [line for line in MINIMAL.splitlines() if not line.startswith(f"{key}:")]
     text = "\n".join([*lines, f"{key}: {value}"])
     assert problems(text) == [(f"x.yaml:{len(lines) + 1}", key)]
 
 
 class TestMany:
-    """Several broken rules at once."""
-
     def test_all_are_listed(self, folder: Path) -> None:
-        """One error lists every problem of the file, its device's options and its model."""
         text = FULL
         for old, new in [
             ("name: full_example", "name: ''"),
@@ -349,12 +310,10 @@ class TestMany:
         ]
 
     def test_units_and_safe_value_together(self) -> None:
-        """Rules between sections are reported together, each where it is broken."""
         text = MINIMAL.replace("unit: A", "unit: um") + "safe:\n  value: -2.5\n"
         assert problems(text) == [("x.yaml:4", "waveform.unit"), ("x.yaml:8", "safe.value")]
 
     def test_safe_value_not_given(self) -> None:
-        """Limits that leave 0 out need a safe value."""
         text = (
             MINIMAL.replace("simulated_terfenol", "simulated_piezo")
             .replace("unit: A", "unit: V")
@@ -365,10 +324,7 @@ class TestMany:
 
 
 class TestSet:
-    """Values given on the command line."""
-
     def test_over_the_file(self, folder: Path) -> None:
-        """Values, nested values, list items and whole sections replace the file's."""
         config = load(
             FULL,
             folder,
@@ -387,13 +343,11 @@ class TestSet:
         assert config.timing.late_after == 0.5
 
     def test_a_section_the_file_has_not(self) -> None:
-        """A key in a section that is not in the file makes the section."""
         loaded = load(MINIMAL, settings=("recording.folder=elsewhere", "device.seed=9"))
         assert loaded.config.recording.folder == "elsewhere"
         assert loaded.device.info.details["seed"] == "9"
 
     def test_item_of_a_list_of_mappings(self, folder: Path) -> None:
-        """A part of a sequence can be set by its index."""
         sequence = (
             "waveform={kind: sequence, unit: um, parts: ["
             "{kind: hold, level: 1.0, duration_s: 1.0}, {kind: hold, level: 2.0, duration_s: 1.0}]}"
@@ -406,47 +360,33 @@ class TestSet:
         ("setting", "key"),
         [
             ("block=2.5", "block"),
-            ("waveform.frequency_hz=1_0", "waveform.frequency_hz"),
-            ("waveform.frequency_hz=.nan", "waveform.frequency_hz"),
             ("limits.stroke_um.0=x", "limits.stroke_um.0"),
             ("waveform.freq_hz=3.0", "waveform.freq_hz"),
             ("device.seeds=3", "device.seeds"),
             ("safe.value=99", "safe.value"),
             ("limits.stroke_um.2=5", "limits.stroke_um.2"),
-            ("block.size=5", "block.size"),
-            ("waveform.unit=[um", "waveform.unit"),
-            ("name", ""),
-            ("=5", ""),
-            ("waveform..unit=um", ""),
         ],
     )
     def test_broken(self, folder: Path, setting: str, key: str) -> None:
-        """A broken rule names the option it was given with."""
         assert problems(FULL, folder, (setting,)) == [(f"--set {setting}", key)]
 
     def test_a_broken_file_can_be_mended(self, folder: Path) -> None:
-        """What is set stands in for what the file says, so that is not held against it."""
         text = changed("frequency_hz: 10.0", "frequency_hz: 1:30")
         assert load(text, folder, ("waveform.frequency_hz=10.0",)).config.block == 50
 
 
 class TestDevice:
-    """The device section."""
-
     @pytest.mark.parametrize("section", ["{kind: simulated_terfanol}", "{seed: 1}", "{kind: 5}"])
     def test_kind_that_is_none(self, section: str) -> None:
-        """A kind that is unknown, missing or no text."""
         found = problems(MINIMAL.replace("{kind: simulated_terfenol}", section))
         assert found == [("x.yaml:2", "device.kind")]
 
     @pytest.mark.parametrize("kind", sorted(registry.BUILTIN))
     def test_options_of_every_built_in_device(self, kind: str) -> None:
-        """Each built-in device refuses an option that it does not have, with its line."""
         text = MINIMAL.replace("simulated_terfenol", f"{kind}, nosuchoption: 1")
         assert ("x.yaml:2", "device.nosuchoption") in problems(text)
 
     def test_device_that_refuses_its_options(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        """What a device says on being made is a problem of the device section."""
 
         class Picky:
             Options: ClassVar[type[DeviceOptions]] = DeviceOptions
@@ -461,11 +401,8 @@ class TestDevice:
 
 
 class TestModel:
-    """The compensator's model file."""
-
     @pytest.mark.parametrize("name", ["sub/lost.yaml", "."])
     def test_missing(self, folder: Path, name: str) -> None:
-        """A missing file or a folder is a problem of the line that names it."""
         found = problems(changed("model: model.yaml", f"model: {name}"), folder)
         assert found == [(f"x.yaml:{LINES['model']}", "compensator.model")]
 
@@ -473,79 +410,12 @@ class TestModel:
         ("old", "new", "line", "key"),
         [
             ("direct: 2.7", "direct: 0.0", 1, "model"),
-            ("[2.3, 0.1, 0.4]", "[2.3, -0.1, 0.4]", 1, "model"),
-            ("[0.3, 0.6, 0.9]", "[0.3, 0.9, 0.6]", 1, "model"),
-            ("[0.3, 0.6, 0.9]", "[0.0, 0.6, 0.9]", 1, "model"),
             ("[0.3, 0.6, 0.9]", "[0.3, 0.6]", 5, "model"),
             ("gamma_s: 0.0003", "gamma_s: -0.1", 7, "model.gamma_s"),
-            ("gamma_s: 0.0003", "gama_s: 0.1", 7, "model.gama_s"),
-            ("direct: 2.7", "direct: 3_0", 4, "model.direct"),
-            ("weights: [2.3, 0.1, 0.4]", "weights: [2.3, .nan, 0.4]", 5, "model.weights.1"),
-            ("input_unit: A", "input_unit: mA", 3, "model.input_unit"),
             ("weights: [2.3, 0.1, 0.4]", "weights: [2.3, 0.1, 0.4", 6, ""),
         ],
     )
     def test_broken(self, folder: Path, old: str, new: str, line: int, key: str) -> None:
-        """A broken model names its own file, line and key."""
         path = folder / "model.yaml"
         path.write_text(changed(old, new, MODEL))
         assert problems(FULL, folder) == [(f"{path}:{line}", key)]
-
-    def test_deadband_that_turns_back(self, folder: Path) -> None:
-        """A cumulative slope that is not positive is named with the index it fails at."""
-        (folder / "model.yaml").write_text(
-            "model:\n"
-            "  kind: integrated\n"
-            "  direct: 2.7\n"
-            "  weights: [2.3]\n"
-            "  thresholds: [0.3]\n"
-            "  deadband:\n"
-            "    up_thresholds: [5.0, 10.0]\n"
-            "    up_weights: [-0.5, -0.5]\n"
-        )
-        assert problems(FULL, folder) == [(f"{folder / 'model.yaml'}:6", "model.deadband")]
-
-    def test_rate_independent_model(self, folder: Path) -> None:
-        """Any kind of model can stand there."""
-        (folder / "model.yaml").write_text(
-            "model: {kind: ppi, direct: 2.7, weights: [2.3], thresholds: [0.3]}\n"
-        )
-        assert isinstance(load(FULL, folder).model, PpiModel)
-
-
-class TestFile:
-    """Files that are no experiment."""
-
-    def test_missing_folder_or_binary(self, tmp_path: Path) -> None:
-        """The error names the file."""
-        binary = tmp_path / "x.yaml"
-        binary.write_bytes(b"\x89PNG\r\n\x1a\n\x00\x00\xff\xfe")
-        for path in (tmp_path / "no.yaml", tmp_path, binary):
-            with pytest.raises(InputError) as caught:
-                load_experiment(path)
-            assert str(caught.value).startswith(f"{path}: ")
-
-    @pytest.mark.parametrize(
-        "text", ["\0\1", "", "\n\n", "# only a comment\n", "- 1\n- 2\n", "text\n"]
-    )
-    def test_no_mapping(self, tmp_path: Path, text: str) -> None:
-        """A file must hold a mapping: nothing, a list or a word is none."""
-        path = tmp_path / "x.yaml"
-        path.write_text(text)
-        with pytest.raises(InputError) as caught:
-            load_experiment(path)
-        assert str(caught.value).startswith(f"{path}:1: ")
-
-    def test_key_twice(self) -> None:
-        """A key that stands twice is refused with both places, nested or not."""
-        twice = FULL.replace("  soft_end_s: 0.2\n", "  soft_end_s: 0.2\n  amplitude: 3.0\n")
-        twice += "name: again\n"
-        assert problems(twice) == [
-            (f"x.yaml:{LINES['soft_end_s'] + 1}", "waveform.amplitude"),
-            (f"x.yaml:{FULL.count(chr(10)) + 2}", "name"),
-        ]
-
-    def test_syntax(self) -> None:
-        """A syntax error is named with the line where reading stopped."""
-        found = problems(FULL.replace("  unit: um\n", "  unit: um\n bad: [\n"))
-        assert found == [(f"x.yaml:{LINES['unit'] + 1}", "")]

@@ -1,130 +1,37 @@
 """What a run will ask of its device is worked out before it starts, and nothing is touched."""
 
 import math
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import pytest
 
-from hilctl.base import types
-from hilctl.base.device import DeviceInfo, DeviceOptions
-from hilctl.base.errors import ConfigError
 from hilctl.base.types import F64
-from hilctl.base.yaml import Document
 from hilctl.experiment import forecast as command_simulation
-from hilctl.experiment import preflight as check_module
 from hilctl.experiment.forecast import (
-    CommandSimulation,
     Forecast,
     LineEnds,
     fade_refusal,
-    whole_cycle,
+    simulate_commands,
 )
-from hilctl.experiment.load import LoadedExperiment, resolve
-from hilctl.experiment.preflight import CheckedExperiment, check
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.tuning import LinearBypass
 from hilctl.models.base import HysteresisModel
 from hilctl.models.model_file import load_model
 from hilctl.models.staged import FieldLag, StagedModel
-from hilctl.waveforms import build, shapes
+from hilctl.waveforms import shapes
 from hilctl.waveforms.build import RepeatedPart
 from tests.published import terfenol_rdpi
+from tests.unit.experiment.test_preflight import CURRENT, DISPLACEMENT, checked
 
-CURRENT = """\
-name: current
-device: {kind: simulated_terfenol}
-sample_rate_hz: 10000
-waveform: {kind: sine, unit: A, amplitude: 6.0, offset: 0.5, frequency_hz: 10.0, duration_s: 1.0}
-compensator: none
-limits: {peak_current_a: 7.0, slew_a_per_s: 20000.0, stroke_um: [-75.0, 60.0]}
-"""
-DISPLACEMENT = """\
-name: displacement
-device: {kind: simulated_terfenol}
-sample_rate_hz: 10000
-waveform:
-  kind: sine
-  unit: um
-  amplitude: 10.0
-  frequency_hz: 10.0
-  duration_s: 1.0
-  soft_start_s: 0.1
-compensator: {model: model.yaml}
-limits: {peak_current_a: 7.0, slew_a_per_s: 20000.0, stroke_um: [-75.0, 60.0]}
-"""
 MODEL = Path(__file__).parents[3] / "configs" / "models" / "terfenol_rdpi.yaml"
-INFO = DeviceInfo(
-    name="fake",
-    description="a device that does nothing",
-    command_unit="A",
-    command_min=-8.0,
-    command_max=8.0,
-    sensor_min_um=-100.0,
-    sensor_max_um=100.0,
-    max_rate_hz=20e3,
-)
-
-
-class DescribedDevice:
-    """A device that only says what it is."""
-
-    Options: ClassVar[type[DeviceOptions]] = DeviceOptions
-
-    def __init__(self, info: DeviceInfo) -> None:
-        self.info = info
-
-    def open(self, sample_rate_hz: float, block: int) -> None:
-        """Refuse: nothing may be opened before the run."""
-        raise AssertionError("opened")
-
-    def output(self) -> float:
-        """Refuse: nothing may be opened before the run."""
-        raise AssertionError("opened")
-
-    def exchange(
-        self, first_sample: int, command: F64, displacement_um: F64, measured: F64
-    ) -> None:
-        """Refuse: nothing may move before the run."""
-        raise AssertionError("moved")
-
-    def make_safe(self, command: float) -> None:
-        """Refuse: nothing may move before the run."""
-        raise AssertionError("moved")
-
-    def close(self) -> None:
-        """Do nothing."""
-
-
-def loaded(
-    text: str,
-    *settings: str,
-    model: HysteresisModel | None = None,
-    **info: Any,
-) -> LoadedExperiment:
-    """Read an experiment and put a fake device and a model in."""
-    without_model = text.replace("{model: model.yaml}", "none").replace("unit: um", "unit: A")
-    made = resolve(Document("x.yaml", text if model is None else without_model), Path(), settings)
-    device = DescribedDevice(replace(INFO, **info))
-    if model is None:
-        return replace(made, device=device)
-    waveform = made.config.waveform.model_copy(update={"unit": "um"})
-    config = made.config.model_copy(update={"waveform": waveform})
-    return replace(made, config=config, device=device, model=model)
-
-
-def checked(text: str, *settings: str, **given: Any) -> CheckedExperiment:
-    return check(loaded(text, *settings, **given))
 
 
 class TestForecast:
-    """What a run will do, in numbers."""
-
     def test_without_a_compensator(self) -> None:
-        """The command is the waveform; its slew counts the step from the safe value."""
         result = checked(CURRENT, "safe.value=-0.5")
         values = 0.5 + 6.0 * np.sin(2.0 * np.pi * 10.0 * np.arange(10_000) / 10e3)
         forecast = result.forecast
@@ -137,13 +44,7 @@ class TestForecast:
         assert forecast.slew_per_s == pytest.approx(1.0 * 10e3)  # from -0.5 to 0.5 in one sample
         assert forecast.recording_mb == pytest.approx(10_000 * 45.0 / 1e6)
 
-    def test_slew_of_the_waveform_itself(self) -> None:
-        """Where the start is soft, the slew is the steepest part of the waveform."""
-        forecast = checked(CURRENT, "waveform.soft_start_s=0.1").forecast
-        assert forecast.slew_per_s == pytest.approx(2.0 * np.pi * 10.0 * 6.0, rel=1e-3)
-
     def test_with_a_compensator(self) -> None:
-        """The command is that of the inverse, run through in one piece."""
         model = terfenol_rdpi()
         result = checked(DISPLACEMENT, model=model)
         command = model.inverse(10e3).process(result.reference.values)
@@ -157,7 +58,6 @@ class TestForecast:
         )
 
     def test_safe_value_counts(self) -> None:
-        """The output starts at the safe value, so the range holds it."""
         settings = ("waveform.amplitude=1.0", "safe.value=-2.0", "limits.slew_a_per_s=25000.0")
         forecast = checked(CURRENT, *settings).forecast
         assert forecast.command_min == -2.0
@@ -165,22 +65,12 @@ class TestForecast:
 
     @pytest.mark.parametrize("chunk", [1, 7, 1000, 9999, 10_000, 10_001])
     def test_chunks_change_nothing(self, monkeypatch: pytest.MonkeyPatch, chunk: int) -> None:
-        """However the reference is cut, the forecast is the same, bit for bit."""
         model = terfenol_rdpi()
         whole = checked(DISPLACEMENT, model=model).forecast
         monkeypatch.setattr("hilctl.experiment.forecast.CHUNK", chunk)
         assert checked(DISPLACEMENT, model=model).forecast == whole
 
-    def test_longer_than_a_chunk(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        """A run of more than a million samples is forecast as if in one piece."""
-        settings = ("waveform.duration_s=120.0", "waveform.frequency_hz=0.37")
-        forecast = checked(DISPLACEMENT, *settings, model=terfenol_rdpi()).forecast
-        assert forecast.samples == 1_200_000
-        monkeypatch.setattr("hilctl.experiment.forecast.CHUNK", 2_000_000)
-        assert checked(DISPLACEMENT, *settings, model=terfenol_rdpi()).forecast == forecast
-
     def test_what_is_fed_ahead_is_what_is_forecast(self) -> None:
-        """A compensator that looks ahead is fed the reference shifted, and held at its end."""
         model = StagedModel.around(terfenol_rdpi(), lag=FieldLag(tau_s=2e-4), delay_s=3e-4)
         result = checked(DISPLACEMENT, model=model)
         values = result.reference.values
@@ -196,26 +86,6 @@ class TestForecast:
         assert plain.begun.input_um is plain.reference.values
         assert result.forecast.recording_mb > plain.forecast.recording_mb
 
-    def test_run_before_that_can_t_be_read_is_refused(self) -> None:
-        """A recording that is not there is named with its key."""
-        text = DISPLACEMENT.replace("{model: model.yaml}", "{model: m, initial_state: gone.mcap}")
-        made = resolve(Document("x.yaml", text.replace("model: m,", f"model: {MODEL},")), Path())
-        with pytest.raises(ConfigError, match=r"initial_state: gone\.mcap: no such"):
-            check(replace(made, device=DescribedDevice(INFO)))
-
-    def test_to_mapping(self) -> None:
-        """A forecast can be printed as JSON."""
-        forecast = checked(CURRENT).forecast
-        mapping = forecast.to_mapping()
-        assert mapping["samples"] == 10_000
-        assert mapping["command_unit"] == "A"
-        assert mapping["slew_per_s"] == forecast.slew_per_s
-
-    def test_nothing_is_touched(self) -> None:
-        """The device is neither opened nor driven, and the experiment comes out as it went in."""
-        given = loaded(CURRENT)
-        assert check(given).loaded is given
-
 
 BUDGET = ("limits.rms_current_a=4.0", "limits.thermal_time_constant_s=7.0")
 SEQUENCE = "waveform={kind: sequence, unit: A, repeat: 40, parts: [{kind: sine, \
@@ -229,10 +99,7 @@ LONG = {
     "no cycle at all": ("waveform.duration_s=40.0", f"waveform.frequency_hz={10 * math.pi}"),
     "sequence": (SEQUENCE,),
 }
-MODELS = {
-    "rdpi": terfenol_rdpi(),
-    "staged": load_model(MODEL.parent / "terfenol_staged.yaml"),
-}
+MODELS = {"rdpi": terfenol_rdpi(), "staged": load_model(MODEL.parent / "terfenol_staged.yaml")}
 
 
 class Counter:
@@ -264,7 +131,6 @@ def forecast(name: str, model: HysteresisModel, monkeypatch: pytest.MonkeyPatch)
 def test_it_is_that_of_the_whole(
     name: str, model: HysteresisModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Range, slew, heat, how hot the coil may be before: as if all of it had been worked out."""
     whole = asdict(checked(DISPLACEMENT, *LONG[name], *BUDGET, model=model).forecast)
     found = asdict(forecast(name, model, monkeypatch))
     plain: dict[str, Any] = {}
@@ -285,8 +151,8 @@ def gone_through(period: float, n: int, command_of: Any = None) -> Counter:
     def part(start: int, stop: int) -> F64:
         return np.asarray(reference(np.arange(start, stop, dtype=np.float64)))
 
-    run = CommandSimulation(Compensator(None, 1000.0), part, part, n, counted)
-    run.run((RepeatedPart(1000, n - 1000, period),))
+    repeats = (RepeatedPart(1000, n - 1000, period),)
+    simulate_commands(Compensator(None, 1000.0), part, part, n, counted, repeats)
     return counted
 
 
@@ -298,7 +164,6 @@ def test_a_cycle_that_came_out_the_same_is_the_last_to_be_worked_out() -> None:
 
 @pytest.mark.parametrize("drift", [1e-6, 1e-9, 1e-10])
 def test_what_drifts_is_worked_out(drift: float) -> None:
-    """Be it so slow that no two cycles show it: but for what comes to nothing."""
     counted = gone_through(500.0, 5_000_000, lambda t: np.sin(np.pi * t / 250.0) + drift * t)
     assert counted.samples + counted.passed == 5_000_000
     assert counted.passed * drift < 1.01e-3 * 2.0
@@ -309,49 +174,12 @@ def test_what_is_not_finite_is_worked_out() -> None:
     assert (counted.samples, counted.passed) == (1_000_000, 0)
 
 
-@pytest.mark.parametrize(("repeats", "told"), [(True, []), (False, ["0.4 million"])])
-def test_long_work_is_told(
-    repeats: bool,
-    told: list[str],
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    """Where much of it has to be worked out, and not where it repeats."""
-    for module in (types, build, shapes):
-        monkeypatch.setattr(module, "CHUNK", 1000)
-    monkeypatch.setattr(check_module, "_MANY", 100_000)
-    monkeypatch.setattr(shapes, "LONG", 100_000)
-    monkeypatch.setattr(command_simulation, "LONG", 100_000)
-    waveform = "waveform.duration_s=40.0" if repeats else CHIRP
-    checked(DISPLACEMENT, waveform, model=terfenol_rdpi())
-    texts = [each.getMessage().partition("computing ")[2] for each in caplog.records]
-    assert [text.partition(" samples")[0] for text in texts] == told
-
-
-@pytest.mark.parametrize(
-    ("period", "samples", "cycle"),
-    [
-        (500.0, 10**9, 66_000),
-        (500.0 / 3.0, 10**9, 65_536 // 500 * 500 + 500),
-        (200_000.0, 10**9, 200_000),
-        (200_000.0, 799_999, 0),
-        (100.0 * math.sqrt(2.0), 10**9, 0),
-        (shapes.LONG + 1.0, 10**12, 0),
-    ],
-)
-def test_whole_cycles(period: float, samples: int, cycle: int) -> None:
-    """Whole samples and whole periods, to the last of those that are passed over."""
-    assert whole_cycle(period, samples) == cycle
-    assert whole_cycle(period + 1e-6, 10**9) == 0
-
-
 REFERENCE = 10.0 + 5.0 * np.sin(np.arange(1000) / 50.0)
 
 
 @pytest.mark.parametrize("slope", [0.2, -0.2])
 @pytest.mark.parametrize("cut", [1, 77, 1000])
 def test_line_leads_from_the_lowest_to_the_highest_command(slope, cut):
-    """Whatever the lag between the two, and however they come."""
     command = 3.0 + slope * (10.0 + 5.0 * np.sin(np.arange(1000) / 50.0 + 0.3))
     ends = LineEnds()
     for start in range(0, 1000, cut):
@@ -374,7 +202,6 @@ def test_what_stands_still_or_is_no_number_has_no_line():
 
 
 def test_what_can_not_go_out_is_said():
-    """An interlock on the tracking error would end the run; the way back in is never barred."""
 
     def refused(line=LinearBypass(), wanted="out", model=1, tracking_error_um=None):  # noqa: B008
         limits = SimpleNamespace(tracking_error_um=tracking_error_um)

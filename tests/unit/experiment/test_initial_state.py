@@ -32,8 +32,8 @@ NOW_S = datetime.fromisoformat("2026-01-01T00:01:00+00:00").timestamp()
 COMMAND = 4.0 * np.sin(np.pi * np.arange(1000) / 999.0)
 
 
-def record(path: Path, command, *, first=0, whole=True, flags=0, facts=None, end=None) -> Path:
-    """Write a run of these commands, of which the compensator knew nothing."""
+def record(path: Path, command, *, first=0, flags=0, facts=None, **made) -> Path:
+    """Write a run of these commands without a compensator."""
     blocks = command.size // BLOCK
     batch = BlockBatch.empty(blocks, BLOCK, 1)
     batch.heads[:, BlockHeader.FIRST_SAMPLE] = first + BLOCK * np.arange(blocks)
@@ -41,11 +41,18 @@ def record(path: Path, command, *, first=0, whole=True, flags=0, facts=None, end
     batch.heads[0, BlockHeader.DROPPED_BEFORE] = first
     batch.columns[:, list(COLUMNS).index("command")] = command.reshape(blocks, BLOCK)
     batch.flags[-1, -1] = flags
+    return write_recording(path, batch, facts={"run_id": "before", **(facts or {})}, **made)
+
+
+def write_recording(
+    path: Path, batch, rate_hz=RATE_HZ, *, whole=True, facts=None, end=None, measured=False
+) -> Path:
+    """Write blocks of a run without a compensator."""
     run = RunFacts(
-        facts={"run_id": "before", "compensator": "none", **(facts or {})},
+        facts={"compensator": "none", **(facts or {})},
         segments=(), experiment_yaml="name: made\n", model_yaml="",
         layout=RecordingLayout(
-            sample_rate_hz=RATE_HZ, command_unit="A", measures_command=False,
+            sample_rate_hz=rate_hz, command_unit="A", measures_command=measured,
             scope_rate_hz=1000.0, start_unix_ns=1_700_000_000_000_000_000,
         ),
     )  # fmt: skip
@@ -53,7 +60,7 @@ def record(path: Path, command, *, first=0, whole=True, flags=0, facts=None, end
         writer = RecordingWriter(stream, run)
         writer.batch(batch)
         if whole:
-            writer.finish({"code": "completed", **(end or {})}, first + command.size)
+            writer.finish({"code": "completed", **(end or {})}, writer.samples)
         else:
             writer.flush()
     return path
@@ -61,7 +68,6 @@ def record(path: Path, command, *, first=0, whole=True, flags=0, facts=None, end
 
 @pytest.mark.parametrize("model", [OMEGA, STAGED], ids=["integrated", "staged"])
 def test_compensator_goes_on_where_the_actuator_was_left(tmp_path, model):
-    """An actuator that is the model, left away from rest, then follows the reference exactly."""
     memory = initial_state_after(record(tmp_path / "run.mcap", COMMAND), model, RATE_HZ, NOW_S)
     plant, inverse = model.forward(RATE_HZ), model.inverse(RATE_HZ)
     plant.process(np.concatenate((COMMAND, np.full(20_000, COMMAND[-1]))))
@@ -81,7 +87,6 @@ def test_compensator_goes_on_where_the_actuator_was_left(tmp_path, model):
 
 @pytest.mark.parametrize("model", [OMEGA, STAGED, CREEPING], ids=["integrated", "staged", "creep"])
 def test_a_run_in_pieces_leaves_what_the_whole_leaves(model):
-    """To the bit, where a piece is shorter than what the inverse looks ahead, and where empty."""
     whole = left_by([COMMAND], model, RATE_HZ)
     pieces = np.split(COMMAND, [1, 2, 2, COMMAND.size // 2])
     left = left_by(pieces, model, RATE_HZ)
@@ -95,7 +100,6 @@ def test_a_run_in_pieces_leaves_what_the_whole_leaves(model):
     ("yesterday", 1.0),
 ])  # fmt: skip
 def test_what_has_crept_goes_back_until_the_next_run(tmp_path, ended, still_s):
-    """As if all the time since the end had been gone through; a clock set back is a second."""
     path = record(tmp_path / "run.mcap", COMMAND, end={"ended": ended})
     left = initial_state_after(path, CREEPING, RATE_HZ, NOW_S)
     still = np.full(round(still_s * RATE_HZ), COMMAND[-1])
@@ -106,16 +110,7 @@ def test_what_has_crept_goes_back_until_the_next_run(tmp_path, ended, still_s):
     np.testing.assert_allclose(left.state, wanted.state, rtol=0.0, atol=1e-6)
 
 
-def test_from_rest_the_same_reference_is_missed(tmp_path):
-    """The comparison: a compensator that thinks the actuator at rest is off by what was left."""
-    plant, inverse = OMEGA.forward(RATE_HZ), OMEGA.inverse(RATE_HZ)
-    plant.process(COMMAND)
-    reference = np.linspace(0.0, 2.0, 500)
-    assert np.abs(plant.process(inverse.process(reference.copy())) - reference).max() > 0.5
-
-
 def test_lead_in_of_a_run_that_is_shorter():
-    """The way from where the actuator stands is cut where the run ends; nothing else changes."""
     memory = InitialState(np.zeros(1), 3.0, "")
     fed = np.zeros(10)
     led = memory.lead_in(fed, 20)
@@ -134,7 +129,6 @@ def test_lead_in_of_a_run_that_is_shorter():
     (OMEGA, RATE_HZ, {"end": {"output_safe": "false"}}, "safe value"),
 ])  # fmt: skip
 def test_recordings_that_don_t_tell_are_refused(tmp_path, model, rate_hz, made, message):
-    """Another rate, another unit, lost samples, no end: refused with the reason."""
     path = record(tmp_path / "run.mcap", COMMAND, **made)
     with pytest.raises(DataError, match=message):
         initial_state_after(path, model, rate_hz, NOW_S)

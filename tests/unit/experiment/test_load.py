@@ -47,7 +47,6 @@ def written(tmp_path):
 
 
 def test_profiles_are_found_from_the_experiments_folder(written, tmp_path, monkeypatch):
-    """Wherever the command is given."""
     path = written()
     monkeypatch.chdir("/")
     assert load_experiment(path).device.info.details["profile"] == "mine/module.yaml"
@@ -56,7 +55,6 @@ def test_profiles_are_found_from_the_experiments_folder(written, tmp_path, monke
 def test_a_file_of_a_setting_is_looked_for_in_the_working_folder_first(
     written, tmp_path, monkeypatch
 ):
-    """Then in the experiment's: what a shell completes is what is meant."""
     path, shell = written(), tmp_path / "shell"
     shell.mkdir()
     (shell / "own.yaml").write_text(PROFILE.read_text(encoding="utf-8"), encoding="utf-8")
@@ -69,7 +67,6 @@ def test_a_file_of_a_setting_is_looked_for_in_the_working_folder_first(
 
 
 def test_profiles_are_carried_with_the_experiment(written, tmp_path):
-    """Shipped ones and one's own: with the texts at hand, nothing is read from disk."""
     reader = {"profile": "icp_m7017", "serial_port": "/dev/ttyOTHER"}
     first = load_experiment(written(input="AI0", reader=reader))
     names = {Path(path).name for path in first.files.texts}
@@ -84,7 +81,6 @@ def test_profiles_are_carried_with_the_experiment(written, tmp_path):
 
 
 def test_all_problems_come_together(written):
-    """Those of the profile by its own name, beside those of the experiment by its lines."""
     text = PROFILE.read_text(encoding="utf-8").replace("max_rate_hz: 1000.0", "max_rate_hz: -1.0")
     path = written(text, timeout_s=-3.0)
     with pytest.raises(ConfigError) as caught:
@@ -104,7 +100,6 @@ def test_all_problems_come_together(written):
     ],
 )
 def test_profiles_that_can_not_be_had_are_told_by_their_line(written, name, rule):
-    """The device's, and the reader's."""
     path = written(profile=name, reader={"profile": name})
     with pytest.raises(ConfigError) as caught:
         load_experiment(path)

@@ -37,7 +37,6 @@ def test_somewhat_faster_is_warned_and_much_faster_refused():
 
 
 def test_a_corner_is_warned_not_refused():
-    """A triangle within the range has harmonics beyond it, but does not live on them."""
     triangle = 40.0 * (2.0 / np.pi) * np.arcsin(sine(80.0, 1.0))
     found = findings(triangle, 80.0)
     assert not found.refused
@@ -59,7 +58,6 @@ def test_smaller_slower_and_faster_motions_are_warned(values, frequency_hz, text
 
 
 def test_what_hardly_moves_has_no_frequency():
-    """A quiver of a hundredth beside a slow motion, and a rest."""
     rest = np.concatenate((sine(20.0), sine(900.0, 0.5), np.zeros(5000)))
     assert not findings(rest).refused
     assert findings(rest).warnings == ()

@@ -29,7 +29,6 @@ def test_names_that_can_be_file_names(text):
 
 @pytest.mark.parametrize("text", ["", ".hidden", "a b", "a/b", "../a", "a" * 81, "ä", "a\n"])
 def test_other_names_are_refused(text):
-    """A recording is named after its experiment."""
     with pytest.raises(ValidationError, match="at most 80 letters"):
         NAME.validate_python(text)
 
@@ -42,7 +41,6 @@ def test_an_interval_is_two_rising_numbers(given):
 
 
 def test_the_ring_bridges_three_flushes():
-    """One that is being written, one that waits, and one that fills."""
     assert RecordingConfig(flush_s=2.0, ring_s=6.0).ring_s == 6.0
     with pytest.raises(ValidationError, match="flush_s"):
         RecordingConfig(flush_s=2.0, ring_s=5.9)
@@ -76,7 +74,6 @@ def test_a_peak_current_counts_both_ways_and_a_drive_as_it_is():
                                    {**CURRENT, "drive_v": (0.0, 1.0)},
                                    {**CURRENT, **VOLTAGE}])  # fmt: skip
 def test_incomplete_and_mixed_limits_are_refused(given):
-    """Half a limiter is none."""
     with pytest.raises(ValidationError, match="either peak_current_a"):
         Limits(**STROKE, **given)
 

@@ -7,7 +7,6 @@ import numba
 import numpy as np
 import pytest
 
-from hilctl.kernels import atomics
 from hilctl.kernels.atomics import observe, publish
 
 SIGNATURES = {
@@ -29,7 +28,6 @@ def page(tmp_path):
 
 @pytest.mark.parametrize("value", [0, 1, -1, 2**63 - 1, -(2**63)])
 def test_what_is_published_is_observed(page, value):
-    """Whole, in its place, and through a mapping that can't be written."""
     written, seen = page
     publish(written, 7, value)
     assert observe(seen, 7) == observe(written, 7) == value
@@ -41,12 +39,6 @@ def test_a_mapping_that_cannot_be_written_is_refused(page):
         publish(page[1], 7, 1)
 
 
-def test_without_the_compiler_they_are_plain(page):
-    written, _ = page
-    atomics._plain_store(written, 7, 5)
-    assert atomics._plain_load(written, 7) == 5
-
-
 @pytest.mark.parametrize(
     ("kernel", "operations"),
     [
@@ -55,7 +47,6 @@ def test_without_the_compiler_they_are_plain(page):
     ],
 )
 def test_what_the_processor_is_asked_for(kernel, operations):
-    """A store after what came before it, a load before what comes after it, and the other way."""
     compiled = numba.njit(SIGNATURES[kernel], error_model="numpy")(kernel.py_func)
     (text,) = compiled.inspect_llvm().values()
     body = re.search(rf"^define [^\n]*{kernel.__name__}.*?^}}", text, re.DOTALL | re.MULTILINE)

@@ -118,7 +118,6 @@ def test_the_first_command_counts_as_having_stood_for_ever():
 
 
 def test_drags_have_cells_of_their_own():
-    """One drag over one cell, by hand, beside plays whose cells are half as wide."""
     length, u = 2.0, np.array([0.5, 1.5, -1.0])
     plays = np.array([-8.0, -4.0, 0.0, 4.0, 8.0])
     bank = (
@@ -229,7 +228,6 @@ def test_the_slope_of_the_losses_is_their_derivative(only, e):
 
 @pytest.mark.parametrize("step_s", [1.0, 2e-5])
 def test_the_field_left_is_the_one_that_the_losses_were_added_to(step_s):
-    """The fit has times, where a run has what becomes of them in one sample."""
     w, m = path(), 5.0 * np.cos(np.arange(500) / 9.0)
     left, half, steps_s = np.empty_like(w), np.full(w.size, 0.5), np.full(w.size, step_s)
     field_s, output_s = step_s * LOSSES[0], step_s * LOSSES[1]

@@ -76,7 +76,6 @@ def test_a_branch_is_the_solution_of_the_equation(begin, end):
 
 
 def test_the_edge_of_the_band_is_not_left():
-    """Where a slope would take the field out of it, the field goes along with the centre."""
     flat = np.full_like(SLOPES, 1.0)  # 1 um a unit: the field would run away
     w = np.empty(1)
     for begin, end, edge in ((-50.0, 30.0, 1.0), (30.0, -50.0, -1.0)):
@@ -88,7 +87,6 @@ def test_the_edge_of_the_band_is_not_left():
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
 def test_the_field_rises_with_the_displacement_however_rough_the_table(seed):
-    """Which is what gives each command one displacement; over all lengths of a step."""
     rng = np.random.default_rng(seed)
     rough = np.exp(rng.uniform(-2.0, 2.0, SLOPES.shape))
     targets = np.concatenate([np.linspace(-70.0, 50.0, 4001), rng.uniform(-70.0, 50.0, 500)])
@@ -110,7 +108,6 @@ def test_the_inverse_undoes_the_model(losses):
 
 
 def test_the_command_is_ahead_by_the_losses():
-    """By their equations, sample by sample, on fields and fluxes that are known."""
     y = path()
     w = fields(y)
     ends = np.concatenate(([NODES[0] - 50.0], NODES, [NODES[-1] + 50.0]))

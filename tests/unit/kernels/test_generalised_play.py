@@ -24,7 +24,6 @@ def forward(v, memory):
 
 
 def test_outputs_follow_the_definition():
-    """Each play holds max(gamma_l - r, min(gamma_r + r, held)), gamma_r never below gamma_l."""
     out = np.empty((SIGNAL.size, 4))
     envelope_outputs(SIGNAL, RISING, FALLING, THRESHOLDS, rest(), out)
     held = np.zeros(4)
@@ -51,7 +50,6 @@ def test_cuts_change_no_bit(cut):
 
 
 def test_the_inverse_brings_displacements_back_and_stays_in_its_span():
-    """What the model can reach is reached; what it can't ends at the span."""
     wanted = 1.8 * np.sin(np.arange(800) / 60.0)
     direct, weights, thresholds = inverse_plays(DIRECT, WEIGHTS, THRESHOLDS)
     command = np.empty_like(wanted)

@@ -53,26 +53,22 @@ def adapted(values, form=FORM, memory=None, size=None):
 
 
 def test_inverse_is_exact():
-    """What the operator makes of the inverse's output is what was wanted."""
     wanted = wanted_um()
     np.testing.assert_allclose(displaced(adapted(wanted)), wanted, atol=1e-10)
 
 
 def test_identified_parameters_change_nothing():
-    """With all of them 0 the input goes through."""
     wanted = wanted_um()
     np.testing.assert_allclose(adapted(wanted, np.zeros(5)), wanted, atol=1e-12)
 
 
 def test_any_cut_gives_the_same_bits():
-    """Blocks of any length, for parameters that stand."""
     wanted, memory = wanted_um(), rest()
     parts = [adapted(each, memory=memory) for each in np.split(wanted, [1, 2, 50, 333])]
     np.testing.assert_array_equal(np.concatenate(parts), adapted(wanted))
 
 
 def test_parameters_move_in_a_line():
-    """Over the block from one value to the next, also where the block is cut short."""
     before, after = np.zeros(5), np.array([1.0, 0.0, 0.0, 0.0, 0.0])
     out = np.full(3, MIDDLE_UM)
     kernel.adapted_input(out, 4, before, after, settings(), table(), THRESHOLDS, rest())
@@ -81,7 +77,6 @@ def test_parameters_move_in_a_line():
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_what_is_no_number_moves_nothing(bad):
-    """It comes out as it went in, and what follows is as if it had not been there."""
     wanted = wanted_um(20)
     out = adapted(np.insert(wanted, 7, bad))
     assert out[7] == bad or np.isnan(out[7])
@@ -123,14 +118,12 @@ class Step:
 
 
 def test_parameters_go_where_the_error_is_less():
-    """Where the displacement is above its reference, the offset rises."""
     step = Step()
     assert step.take(np.full(10, MIDDLE_UM), 2.0) == 10
     assert 0.0 < step.values[kernel.OFFSET] <= 0.1
 
 
 def test_pace_and_bounds_hold():
-    """No faster than from 0 to the bound in the time constant, and no further."""
     step = Step()
     for k in range(400):
         step.take(np.full(5, MIDDLE_UM + 20.0), 15.0)
@@ -139,7 +132,6 @@ def test_pace_and_bounds_hold():
 
 
 def test_dead_zone():
-    """What explains no more than noise may moves nothing; the same a little above it does."""
     for error, moved in ((0.9, False), (1.1, True)):
         step = Step(DEAD_UM2=1.0, SMOOTHING=1e9)
         step.take(np.full(10, MIDDLE_UM), error)
@@ -147,7 +139,6 @@ def test_dead_zone():
 
 
 def test_leakage():
-    """Gain and weights that nothing asks for go back; the offset stays."""
     step = Step(LEAK=0.1)
     step.values[:] = 0.5
     step.take(np.full(10, MIDDLE_UM - 0.5), 0.0)
@@ -157,7 +148,6 @@ def test_leakage():
 
 @pytest.mark.parametrize("error", [np.nan, np.inf, 20.1, -20.1])
 def test_errors_that_no_parameter_makes_are_left_out(error):
-    """And a block of nothing else changes nothing."""
     step = Step()
     step.values[:] = 0.5
     assert step.take(np.full(10, MIDDLE_UM), error) == 0
@@ -165,7 +155,6 @@ def test_errors_that_no_parameter_makes_are_left_out(error):
 
 
 def test_flags_hold_for_what_is_shown_later():
-    """Nothing is taken of a flagged block, nor of displacements that show its inputs."""
     step, reference = Step(due_after=2, shown_after=3), np.full(10, MIDDLE_UM)
     assert step.take(reference, 1.0) == 7
     flags = np.zeros(10, dtype=np.uint32)
@@ -176,7 +165,6 @@ def test_flags_hold_for_what_is_shown_later():
 
 
 def test_large_regressors_count_no_more():
-    """The step of a sample far out of the usual is that of a usual one, or less."""
     near, far = Step(RATE=1e-6), Step(RATE=1e-6)
     near.take([MIDDLE_UM + HALF_UM], 1.0)
     far.take([MIDDLE_UM + 3.9 * HALF_UM], 1.0)

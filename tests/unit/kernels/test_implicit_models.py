@@ -24,7 +24,6 @@ def arrays(exponent):
 @pytest.mark.parametrize("change", [3.0, -3.0])
 @pytest.mark.parametrize("z", [-0.8, 0.0, 0.8])
 def test_a_large_step_is_the_same_as_many_small_ones(exponent, change, z):
-    """The step is exact, so its size makes no difference, also through z = 0."""
     small = z
     for _ in range(1000):
         small = bouc_wen_step(small, change / 1000.0, 0.7, -0.2, exponent)
@@ -40,7 +39,6 @@ def test_z_stays_bounded(exponent):
 
 @pytest.mark.parametrize("exponent", [1.0, 2.0])
 def test_the_root_meets_the_displacement_within_its_tolerance(exponent):
-    """The forward model of the inverse's commands misses by no more than was allowed."""
     wanted = 30.0 * np.sin(np.arange(400) / 25.0)
     command, back = np.empty(400), np.empty(400)
     implicit_inverse(BOUC_WEN, wanted, SPAN, 1e-6, arrays(exponent), rest_memory(1), command)
@@ -49,7 +47,6 @@ def test_the_root_meets_the_displacement_within_its_tolerance(exponent):
 
 
 def test_what_can_not_be_reached_ends_at_the_span_and_nan_leaves_no_trace():
-    """Behind a displacement that is no number the inverse goes on as if it had not come."""
     wanted = np.array([1e3, 5.0, np.nan, 4.0, -1e3])
     command, without = np.empty(5), np.empty(4)
     implicit_inverse(BOUC_WEN, wanted, SPAN, 1e-6, arrays(1.0), rest_memory(1), command)
@@ -62,7 +59,6 @@ def test_what_can_not_be_reached_ends_at_the_span_and_nan_leaves_no_trace():
 
 @pytest.mark.parametrize("wrong", [np.nan, np.inf, -np.inf, 1e300, -1e300])
 def test_no_number_leads_out_of_the_cells(wrong):
-    """Neither an input nor a memory that is none may become an index."""
     preisach = np.array([0.0, 0.5]), np.arange(8.0), np.array([-1.0, 1.0, 3.0])
     for memory in (np.full(3, wrong), rest_memory(2)):
         out = np.zeros(2)

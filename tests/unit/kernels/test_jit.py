@@ -9,6 +9,7 @@ import pytest
 
 from hilctl import kernels
 from hilctl.kernels import hysteresis, jit
+from hilctl.kernels.interlock import heat_block
 from hilctl.kernels.limit import limit_block
 
 PLAYS = (1.3, np.array([0.2, 0.5, 0.9]), np.array([0.7, 0.1, 0.4]))
@@ -34,7 +35,6 @@ def stream(kernel, signal, parameters, memory=None):
 
 @pytest.mark.parametrize("name", STREAMING)
 def test_compiled_and_python_agree_bit_for_bit(name):
-    """The function as written, run by Python, gives the same bits as its compiled form."""
     kernel, parameters = STREAMING[name]
     compiled, memory = stream(kernel, SIGNAL, parameters)
     plain, plain_memory = stream(kernel.py_func, SIGNAL, parameters)
@@ -42,25 +42,8 @@ def test_compiled_and_python_agree_bit_for_bit(name):
     np.testing.assert_array_equal(memory, plain_memory)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", STREAMING)
-def test_callable_from_another_kernel(name):
-    """Called inside somebody else's compiled function, a kernel does the same."""
-    kernel, parameters = STREAMING[name]
-
-    @numba.njit
-    def caller(signal, parameters, memory, out):
-        kernel(signal, *parameters, memory, out)
-
-    expected, _ = stream(kernel, SIGNAL, parameters)
-    out = np.empty_like(SIGNAL)
-    caller(SIGNAL, parameters, hysteresis.rest_memory(3), out)
-    np.testing.assert_array_equal(out, expected)
-
-
 @pytest.mark.parametrize("name", STREAMING)
 def test_output_may_replace_the_input(name):
-    """Writing over the input array changes nothing."""
     kernel, parameters = STREAMING[name]
     expected, expected_memory = stream(kernel, SIGNAL, parameters)
     both, memory = SIGNAL.copy(), hysteresis.rest_memory(3)
@@ -71,7 +54,6 @@ def test_output_may_replace_the_input(name):
 
 @pytest.mark.parametrize("name", STREAMING)
 def test_an_empty_block_changes_nothing(name):
-    """A block of no samples leaves the memory as it is."""
     kernel, parameters = STREAMING[name]
     _, memory = stream(kernel, SIGNAL, parameters)
     before = memory.copy()
@@ -81,7 +63,6 @@ def test_an_empty_block_changes_nothing(name):
 
 @pytest.mark.parametrize("name", STREAMING)
 def test_nan_is_not_swallowed(name):
-    """An input that is not a number gives an output that is not one."""
     kernel, parameters = STREAMING[name]
     signal = SIGNAL.copy()
     signal[200] = np.nan
@@ -92,7 +73,6 @@ def test_nan_is_not_swallowed(name):
 
 @pytest.mark.parametrize("v", [-1.7, -0.2, 0.0, 0.3, 2.0])
 def test_scalar_kernels_agree_with_python(v):
-    """The scalar operators give Python's bits, alone and inside another compiled function."""
     stop = hysteresis.stop_step
     value = hysteresis.deadband_value
 
@@ -100,37 +80,33 @@ def test_scalar_kernels_agree_with_python(v):
     def caller(v, deadbands):
         return stop(v, 0.2, 0.4, 0.1), value(v, *deadbands)
 
-    expected = (
-        stop.py_func(v, 0.2, 0.4, 0.1),
-        value.py_func(v, *DEADBANDS),
-    )
+    expected = (stop.py_func(v, 0.2, 0.4, 0.1), value.py_func(v, *DEADBANDS))
     assert (stop(v, 0.2, 0.4, 0.1), value(v, *DEADBANDS)) == expected
     assert caller(v, DEADBANDS) == expected
 
 
 @pytest.mark.parametrize("name", STREAMING)
 def test_float32_is_refused(name):
-    """A float32 array is an error at once, not a new compilation."""
     kernel, parameters = STREAMING[name]
     with pytest.raises(TypeError, match="No matching definition"):
         kernel(SIGNAL.astype(np.float32), *parameters, hysteresis.rest_memory(3), SIGNAL.copy())
 
 
 def test_float32_is_refused_everywhere_else():
-    """So it is by the kernels without memory."""
     narrow, out = SIGNAL.astype(np.float32), np.empty(400)
     flags = np.zeros(400, dtype=np.uint32)
     grid, memory = np.empty((400, 3)), hysteresis.rest_memory(3)
-    with pytest.raises(TypeError, match="No matching definition"):
-        hysteresis.deadband_block(narrow, *DEADBANDS, out)
-    with pytest.raises(TypeError, match="No matching definition"):
-        hysteresis.play_outputs(narrow, WIDENING, PLAYS[1], memory, grid)
-    with pytest.raises(TypeError, match="No matching definition"):
-        limit_block(narrow, 0.0, -1.0, 1.0, 0.1, 1, 2, 4, out, flags)
+    for kernel, arguments in (
+        (hysteresis.deadband_block, (*DEADBANDS, out)),
+        (hysteresis.play_outputs, (WIDENING, PLAYS[1], memory, grid)),
+        (limit_block, (0.0, -1.0, 1.0, 0.1, 1, 2, 4, out, flags)),
+        (heat_block, (0.1, 0.0, out)),
+    ):
+        with pytest.raises(TypeError, match="No matching definition"):
+            kernel(narrow, *arguments)
 
 
 def test_a_strided_view_is_refused():
-    """A view that is not contiguous is refused too: it would need another compilation."""
     kernel, parameters = STREAMING["play_sum"]
     with pytest.raises(TypeError, match="No matching definition"):
         kernel(SIGNAL[::2], *parameters, hysteresis.rest_memory(3), np.empty(200))
@@ -168,7 +144,6 @@ def test_second_process_loads_the_kernel_from_the_cache(cache):
 
 
 def test_compiled_without_a_cache_folder():
-    """numba finds no folder for a function that has no source file."""
     names = {}
     exec("def double(value):\n    return 2.0 * value", names)
     assert not stats_of_first_call(names["double"]).cache_path
@@ -183,24 +158,17 @@ def test_compiled_with_a_full_disk(cache, monkeypatch):
     assert not [path for path in cache.rglob("*") if path.is_file()]
 
 
-def emptied(whole: bytes) -> bytes:
-    return b""
-
-
-def halved(whole: bytes) -> bytes:
-    return whole[: len(whole) // 2]
-
-
-def zeroed(whole: bytes) -> bytes:
-    return bytes(len(whole))
-
-
-def random_bytes(whole: bytes) -> bytes:
-    return np.random.default_rng(4).bytes(len(whole))
-
-
 @pytest.mark.parametrize("suffix", ["nbi", "nbc"])
-@pytest.mark.parametrize("damage", [emptied, halved, zeroed, random_bytes])
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda whole: b"",
+        lambda whole: whole[: len(whole) // 2],
+        lambda whole: bytes(len(whole)),
+        lambda whole: np.random.default_rng(4).bytes(len(whole)),
+    ],
+    ids=["emptied", "halved", "zeroed", "random"],
+)
 def test_damaged_cache_file_is_replaced(cache, suffix, damage):
     stats_of_first_call()
     (file,) = cache.rglob(f"*.{suffix}")
@@ -247,7 +215,6 @@ def test_nothing_is_compiled_before_the_first_use(cache):
 
 
 def test_kernels_compile_the_kernels_that_they_call(cache):
-    """With their declared signatures: an integer argument is converted."""
     assert twice(2) == 4.0
     assert [str(types) for types in double_kernel.dispatcher.overloads] == ["(float64,)"]
 
@@ -257,5 +224,4 @@ def test_another_process_gets_the_kernel_by_its_name():
 
 
 def test_called_with_a_type_that_casts(cache):
-    """The first call converts an integer to a number, as later calls do."""
     assert jit.kernel("float64(float64)")(double)(2) == 4.0

@@ -52,7 +52,6 @@ def given(x, parts, memory=None):
 
 
 def test_the_inverse_undoes_it_within_its_tolerance():
-    """Whatever came before, small loops inside large ones and what lies beyond the cells."""
     parts = tables(*numbers())
     y, x = 1.6 * path(), np.empty(3000)
     residual_inverse(y, parts, rest(), x)
@@ -73,7 +72,6 @@ def test_any_cut_into_blocks_gives_the_same_bits():
 
 
 def test_columns_times_numbers_are_what_it_gives():
-    """A fit is linear in what a run then uses."""
     slopes, lines = numbers()
     parts, x = tables(slopes, lines), path()
     rows = np.arange(3, 3000, 11)
@@ -84,7 +82,6 @@ def test_columns_times_numbers_are_what_it_gives():
 
 
 def test_it_is_bounded_and_its_inverse_finite_where_no_slope_is_right():
-    """A table that has no one inverse gives a jump, but neither a search without end nor more."""
     parts = tables(*numbers(size=3.0))
     y, x = path(), np.empty(3000)
     residual_inverse(y, parts, rest(), x)

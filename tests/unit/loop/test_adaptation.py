@@ -10,13 +10,10 @@ from hilctl.base.events import ADAPTED
 from hilctl.base.samples import Flag
 from hilctl.kernels import gradient as kernel
 from hilctl.loop.adaptation import THRESHOLDS, Adaptation, AdaptationBounds, DisplacementOperator
-from hilctl.loop.compensator import Compensator
-from hilctl.loop.interlocks import InterlockContext
 from hilctl.loop.limiter import CommandLimits
-from hilctl.loop.loop import Loop
-from hilctl.loop.plan import LoopPlan
 from hilctl.models.plays import PpiModel
-from tests.fakes import FakeClock, FakeFifoDevice, FakeHost, made_block
+from tests.fakes import FakeFifoDevice, made_block
+from tests.unit.loop.test_loop import Rig
 
 RATE_HZ = 1000.0
 BOUNDS = AdaptationBounds(6.0, 0.1, 0.03)
@@ -70,7 +67,6 @@ def follow(adapting, actuator, block, noise=None, reference=REFERENCE):
 @pytest.mark.parametrize("block", [1, 50])
 @pytest.mark.parametrize("delay", [0, 13])
 def test_it_finds_what_the_actuator_does(block, delay):
-    """Offset, gain and weights; what is left of the error is what leakage leaves."""
     adapting, operator = adaptation(delay, delay)
     errors = follow(adapting, Actuator(operator, TRUE, delay), block)
     assert np.abs(errors[:500]).max() > 3.0
@@ -81,7 +77,6 @@ def test_it_finds_what_the_actuator_does(block, delay):
 
 
 def test_parameters_say_the_whole_operator():
-    """By the definition that they come with, they give the displacements of the actuator."""
     adapting, operator = adaptation()
     follow(adapting, Actuator(operator, TRUE, 0), 50)
     found = adapting.parameters
@@ -99,30 +94,7 @@ def test_parameters_say_the_whole_operator():
     np.testing.assert_allclose(out, actuator.displacement_um(REFERENCE - 4.0), atol=1e-9)
 
 
-def test_regressors_are_apart_over_the_reference():
-    """None has a part of another, nor a mean: so none of them makes up for another."""
-    _, operator = adaptation()
-    m = operator.bounds.size
-    sums, products = np.zeros(m), np.zeros((m, m))
-    kernel.regressor_sums(
-        REFERENCE.copy(),
-        operator.settings,
-        operator.table,
-        operator.shape,
-        operator.thresholds,
-        operator.at_rest(float(REFERENCE[0])),
-        np.zeros(m),
-        sums,
-        products,
-    )
-    size = np.sqrt(np.diag(products))
-    assert np.abs(sums[1:] / REFERENCE.size).max() < 1e-9
-    assert np.abs(products / np.outer(size, size) - np.eye(m)).max() < 0.4
-    assert np.abs(products[:2, :2] / np.outer(size[:2], size[:2]) - np.eye(2)).max() < 1e-9
-
-
 def test_noise_alone_moves_hardly_anything():
-    """A right model under noise stays right: a thousandth of the bounds, or less than the noise."""
     noise = np.random.default_rng(2).normal(0.0, 0.05, REFERENCE.size)
     adapting, operator = adaptation(noise_um=0.05)
     follow(adapting, Actuator(operator, np.zeros(5), 0), 50, noise)
@@ -131,7 +103,6 @@ def test_noise_alone_moves_hardly_anything():
 
 
 def test_noise_measured_at_rest():
-    """Nothing is adapted before the noise is known, and what was given is not replaced."""
     adapting, operator = adaptation(noise_um=None)
     follow(adapting, Actuator(operator, TRUE, 0), 50)
     assert adapting.parameters["offset_um"] == 0.0
@@ -145,7 +116,6 @@ def test_noise_measured_at_rest():
 
 @pytest.mark.parametrize("flag", [*Flag, 64, 128, 256, 512])
 def test_any_flag_holds_everything(flag):
-    """An interlock, the limiter, a ramp or a late tick: the parameters stand."""
     adapting, _ = adaptation()
     for k in range(20):
         made = made_block(10)
@@ -158,7 +128,6 @@ def test_any_flag_holds_everything(flag):
 
 
 def test_after_skipped_ticks_lines_begin_anew():
-    """A displacement is not held against references that were due before the gap."""
     adapting, _ = adaptation(due_after=5, shown_after=5)
     made = made_block(5)
     made.reference[:] = made.input_um[:] = 10.0
@@ -174,7 +143,6 @@ def test_after_skipped_ticks_lines_begin_anew():
 
 
 def test_a_reference_that_stands_shows_the_offset_alone():
-    """Gain and weights stay as they are."""
     reference = np.full(4000, 10.0)
     adapting, operator = adaptation(reference=reference)
     follow(adapting, Actuator(operator, np.array([2.0, 0, 0, 0, 0]), 0), 50, reference=reference)
@@ -201,7 +169,6 @@ def test_events():
 
 
 def test_bad_bounds_and_time():
-    """Negative ones, a slope that might vanish, and a time that is none."""
     with pytest.raises(InputError, match="must be >= 0"):
         AdaptationBounds(-1.0, 0.1, 0.0)
     with pytest.raises(InputError, match="slope"):
@@ -211,29 +178,15 @@ def test_bad_bounds_and_time():
 
 
 class TestLoop:
-    """In a whole loop on a device that plays from a FIFO."""
-
     MODEL = PpiModel(direct=10.0, weights=(), thresholds=())
 
-    def ran(self, latency, block, device=None, reference=REFERENCE, **options):
-        device = device or FakeFifoDevice(latency)
+    def ran(self, latency, block, device=None):
         adapting, _ = adaptation(1, 1, bounds=AdaptationBounds(6.0, 0.1, 0.02))
-        compensator = Compensator(self.MODEL, RATE_HZ)
-        host = FakeHost(FakeClock(), block, compensator.state_size + 1, **options)
-        plan = LoopPlan(
-            reference=reference,
-            input_um=reference,
-            block=block,
-            latency_blocks=latency,
-            sample_rate_hz=RATE_HZ,
-            compensator=compensator,
-            limits=CommandLimits(-6.0, 6.0, 3000.0, 0.0, 100.0),
-            interlocks=InterlockContext(stroke_um=(-60.0, 60.0)),
-            adaptation=adapting,
-        )
-        loop = Loop(plan, device, host)
-        loop.begin_at(0.0)
-        return loop.run(0), adapting, host
+        rig = Rig(
+            REFERENCE, block=block, device=device or FakeFifoDevice(latency), model=self.MODEL,
+            limits=CommandLimits(-6.0, 6.0, 3000.0, 0.0, 100.0), adaptation=adapting,
+        )  # fmt: skip
+        return rig.run(), adapting, rig.host
 
     @pytest.mark.slow
     @pytest.mark.parametrize(("latency", "block"), [(0, 1), (0, 50), (3, 10)])
@@ -257,7 +210,6 @@ class TestLoop:
         assert dict(last.values) == found
 
     def test_a_lost_device_ends_with_the_parameters(self):
-        """They are said after the fault."""
         outcome, adapting, host = self.ran(0, 10, FakeFifoDevice(0, break_at=3000))
         assert outcome.code == "fault"
         assert host.events[-1].code == ADAPTED

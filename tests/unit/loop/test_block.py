@@ -7,7 +7,6 @@ BLOCK_NAMES = {"reference_um": "reference"}  # in the command's unit where nothi
 
 
 def test_each_name_is_the_column_of_that_name():
-    """In the order of the recorded columns, without a copy."""
     area = BlockBatch.empty(3, 5, 4)
     block, columns = Block(area.heads[1].data, area, 1), area.columns[1]
     for number, name in enumerate(COLUMNS, start=1):
@@ -16,7 +15,6 @@ def test_each_name_is_the_column_of_that_name():
 
 
 def test_memory_is_the_state_without_the_command_before():
-    """The compensator writes there, and the limiter's last command stands behind it."""
     area = BlockBatch.empty(3, 1, 4)
     block = Block(area.heads[1].data, area, 1)
     block.memory[:] = 1.0

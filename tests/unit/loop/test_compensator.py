@@ -14,7 +14,6 @@ STAGED = StagedModel.around(terfenol_rdpi(), lag=FieldLag(tau_s=2e-4), delay_s=3
 
 @pytest.mark.parametrize("model", [None, terfenol_rdpi()])
 def test_without_preview_the_reference_itself_is_fed(model):
-    """Where nothing looks ahead, nothing is copied."""
     reference = np.arange(5.0)
     compensator = Compensator(model, RATE_HZ)
     assert compensator.preview == 0
@@ -27,14 +26,12 @@ def test_without_preview_the_reference_itself_is_fed(model):
     (1, [0.0]),
 ])  # fmt: skip
 def test_reference_is_fed_ahead_of_its_time_and_held_at_its_end(size, fed):
-    """As many samples early as the inverse looks ahead, however short the reference."""
     compensator = Compensator(STAGED, RATE_HZ)
     assert compensator.preview == 4
     assert compensator.ahead(np.arange(float(size))).tolist() == fed
 
 
 def test_first_command_belongs_to_what_stood_before():
-    """Begun, a compensator gives for a step at the start what it would give for one later on."""
     step = np.where(np.arange(60) < 1, 0.0, 3.0)
     later = np.concatenate((np.zeros(30), step))
     begun, whole = np.empty(60), np.empty(90)
@@ -47,7 +44,6 @@ def test_first_command_belongs_to_what_stood_before():
 
 
 def test_warm_up_leaves_no_trace():
-    """Warmed up, the memory is what it was, and so is what comes next."""
     signal = np.sin(np.arange(50) / 5.0)
     wanted, cold = np.empty(50), np.empty(50)
     Compensator(STAGED, RATE_HZ).process(signal, cold)
@@ -61,7 +57,6 @@ def test_warm_up_leaves_no_trace():
 
 
 def test_without_a_model_there_is_no_memory():
-    """The input passes as it is, and a state can't be given back."""
     compensator, wanted = Compensator(None, RATE_HZ), np.empty(3)
     compensator.process(np.arange(3.0), wanted)
     assert wanted.tolist() == [0.0, 1.0, 2.0]

@@ -15,14 +15,12 @@ from hilctl.experiment.file import Experiment
 from hilctl.experiment.sections import PiFeedbackConfig
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.feedback import Feedback, Gains, IntegralFeedback
-from hilctl.loop.interlocks import InterlockContext
 from hilctl.loop.limiter import CommandLimits
-from hilctl.loop.loop import Loop
-from hilctl.loop.plan import LoopPlan
 from hilctl.models.linear_stages import FirstMode
 from hilctl.models.plays import PpiModel
 from hilctl.models.staged import FieldLag, StagedModel
-from tests.fakes import FakeClock, FakeFifoDevice, FakeHost, made_block
+from tests.fakes import FakeFifoDevice, made_block
+from tests.unit.loop.test_loop import Rig
 
 RATE_HZ = 5000.0
 EXPERIMENT = """\
@@ -66,8 +64,6 @@ def loop(bandwidth_hz=100.0, limit_um=50.0, due_after=1):
 
 
 class TestCorrection:
-    """What comes of an error."""
-
     def test_offset_is_removed(self):
         """A constant disturbance fades as e^(-2 pi bandwidth t)."""
         errors = plant(loop(20.0), offset_um=3.0)
@@ -77,7 +73,6 @@ class TestCorrection:
         assert errors[2 + after] == pytest.approx(-3.0 / np.e, rel=0.05)
 
     def test_a_right_model_is_left_alone(self):
-        """References are held against the displacements that are to show them: no error, no act."""
         reference = np.sin(np.arange(500) / 7.0)
         feedback = loop(270.0)
         errors = plant(feedback, 500, reference=reference)
@@ -85,27 +80,23 @@ class TestCorrection:
         assert feedback.correction_um == 0.0
 
     def test_wrong_gain_is_brought_down(self):
-        """A tenth too much gain matters ten times less at a tenth of the bandwidth."""
         reference = 10.0 * np.sin(2.0 * np.pi * 10.0 * np.arange(4000) / RATE_HZ)
         without = plant(loop(1e-6), 4000, gain=1.1, reference=reference)[1000:]
         with_it = plant(loop(100.0), 4000, gain=1.1, reference=reference)[1000:]
         assert np.abs(with_it).max() < 0.15 * np.abs(without).max()
 
     def test_correction_stays_within_its_limit(self):
-        """A disturbance beyond the limit is corrected as far as it goes, and left at once after."""
         feedback = loop(100.0, limit_um=2.0)
         assert plant(feedback, 500, offset_um=10.0)[-1] == pytest.approx(-8.0)
         assert feedback.correction_um == -2.0
         assert abs(plant(feedback, 60)[-1]) < 0.2
 
     def test_integral_does_not_wind_up_behind_the_limiter(self):
-        """While commands are held back the integral stays, and does not grow to the limit."""
         feedback = loop(100.0, limit_um=1e3)
         plant(feedback, 5000, offset_um=10.0, hold_back=0.5)
         assert abs(feedback.correction_um) < 3.0
 
     def test_integral_may_shrink_behind_the_limiter(self):
-        """What was too much is taken back even while commands are held back."""
         feedback = loop(20.0)
         plant(feedback, 500, offset_um=4.0)
         assert feedback.correction_um == pytest.approx(-4.0, abs=1e-3)
@@ -115,14 +106,12 @@ class TestCorrection:
 
     @pytest.mark.parametrize("reading", [math.nan, math.inf, -math.inf])
     def test_a_lost_sensor_changes_nothing(self, reading):
-        """The correction stays what it was, to the bit, and is never a NaN."""
         feedback = loop()
         plant(feedback, 100, offset_um=1.0)
         before = feedback.correction_um
         assert feedback.correct(0.0, reading, limited=False) == before
 
     def test_nothing_is_judged_after_a_gap_until_references_are_new(self):
-        """Skipped samples leave the correction for as long as displacements are of old ones."""
         feedback = loop(due_after=2)
         for _ in range(5):
             feedback.correct(0.0, 1.0, limited=False)
@@ -139,15 +128,12 @@ class TestCorrection:
         limited=st.booleans(),
     )
     def test_never_more_than_the_limit(self, readings, kp, ki, limited):
-        """Whatever is read, the correction is a number within the limit."""
         feedback = Feedback(Gains(kp, ki), RATE_HZ, 2.0, 1)
         for reading in readings:
             assert abs(feedback.correct(0.0, reading, limited=limited)) <= 2.0
 
 
 class TestPolarity:
-    """A sensor of the wrong sign is found; what else drives the correction to its limit is not."""
-
     STILL = np.full(2000, 4.0)
     TIMES = np.arange(4000) / RATE_HZ
 
@@ -166,7 +152,6 @@ class TestPolarity:
     @pytest.mark.parametrize("bandwidth_hz", [2.0, 20.0, 200.0])
     @pytest.mark.parametrize("limit_um", [0.5, 5.0, 50.0])
     def test_a_sine(self, frequency_hz, bandwidth_hz, limit_um):
-        """Wherever in it the limit is met, as long as it is met."""
         feedback = loop(bandwidth_hz, limit_um)
         plant(feedback, 4000, gain=-1.0, reference=self.sine(frequency_hz))
         assert feedback.against
@@ -199,13 +184,10 @@ class TestPolarity:
 
 
 class TestFollow:
-    """What it takes from a block of the loop."""
-
     def block(self):
         return made_block(fill=0.0)
 
     def test_correction_is_added_to_the_input(self):
-        """The input of the block is what it was, and the correction."""
         feedback, block = loop(due_after=0), self.block()
         feedback.follow(block, block.input_um)
         block.displacement_um[0], block.input_um[0] = -1.0, 7.0
@@ -215,7 +197,6 @@ class TestFollow:
         assert feedback.correction_um == pytest.approx(gains_for(100.0, RATE_HZ).ki_per_s / RATE_HZ)
 
     def test_gap_is_passed_over(self):
-        """After skipped samples, old displacements are held against nothing."""
         feedback, block = loop(due_after=0), self.block()
         feedback.follow(block, block.input_um)
         block.displacement_um[0], block.skipped = -1.0, 3
@@ -224,7 +205,6 @@ class TestFollow:
         assert feedback.correction_um == 0.0
 
     def test_a_command_that_was_held_back_stops_the_integral(self):
-        """The limiter is known to have acted where wanted and command differ."""
         feedback, block = loop(due_after=0), self.block()
         feedback.follow(block, block.input_um)
         block.displacement_um[0], block.wanted[0] = -1.0, 1.0
@@ -242,8 +222,6 @@ LATE = StagedModel.around(
 
 @pytest.mark.parametrize("model", [PLAYS, LAGGING, LATE], ids=["plays", "lag", "structure, delay"])
 class TestAroundModels:
-    """Feedback around compensators that look ahead and such that don't, on the model itself."""
-
     def errors(self, model, offset_um, limit_um=20.0):
         """Run reference, feedback, compensator and actuator sample by sample; errors in um."""
         compensator = Compensator(model, RATE_HZ)
@@ -276,14 +254,12 @@ class TestAroundModels:
         assert without < 0.1
 
     def test_an_offset_is_removed(self, model):
-        """It is taken out, and the loop is stable with all the delay that the compensator has."""
         errors = np.abs(self.errors(model, 3.0))
         assert errors[0] > 2.9
         assert errors[-1000:].max() < 0.1
 
 
 def test_correction_stands_while_the_inverse_is_out():
-    """The error is the actuator's own then, and the correction is not put out: it must not grow."""
     feedback, found = loop(), []
     for k in range(100):
         block = made_block()
@@ -323,27 +299,21 @@ def blocks(feedback, count, *, offset_um=0.0, flags=0, size=BLOCK, sign=1.0, ref
 
 
 class TestIntegralCorrection:
-    """What comes of an error."""
-
     @pytest.mark.parametrize("due_after", [0, 1, 13])
     def test_offset_is_taken_out(self, due_after):
-        """What stands for long is gone, whatever the age of the reference that is shown."""
         fed = blocks(integral(due_after=due_after), 400, offset_um=3.0)
         assert fed[-1] == pytest.approx(-3.0, abs=1e-6)
 
     def test_it_fades_by_the_bandwidth(self):
-        """1 / (2 pi bandwidth) after a disturbance, 1/e of it is left."""
         fed = blocks(integral(), 60, offset_um=3.0)
         after = round(BLOCK / GAIN)
         assert fed[after + BLOCK] == pytest.approx(-3.0 * (1.0 - 1.0 / np.e), rel=0.03)
 
     def test_correction_moves_without_a_step(self):
-        """From sample to sample it moves by its block's share, also from block to block."""
         fed = blocks(integral(), 50, offset_um=3.0)
         assert np.abs(np.diff(fed)).max() <= GAIN * 3.0 / BLOCK * (1 + 1e-9)
 
     def test_a_right_model_is_left_alone(self):
-        """References are held against the samples that are to show them."""
         reference = np.sin(np.arange(40 * BLOCK) / 7.0).reshape(-1, BLOCK)
         feedback = integral()
         fed = blocks(feedback, 40, reference_um=reference)
@@ -351,7 +321,6 @@ class TestIntegralCorrection:
         assert abs(feedback.correction_um) < 1e-12
 
     def test_noise_is_averaged(self):
-        """White noise comes through as its mean over blocks, and that over the bandwidth's time."""
         noise = np.random.default_rng(3).normal(size=(4000, BLOCK))
         fed = blocks_with(integral(), noise)
         expected = math.sqrt(GAIN / 2.0 / BLOCK)
@@ -359,7 +328,6 @@ class TestIntegralCorrection:
 
     @given(offset_um=st.floats(-1e6, 1e6), limit_um=st.floats(0.01, 100.0))
     def test_never_more_than_the_limit(self, offset_um, limit_um):
-        """The correction stays within its own limit, and leaves it at once when it may."""
         feedback = integral(limit_um=limit_um)
         fed = blocks(feedback, 80, offset_um=offset_um)
         assert np.abs(fed).max() <= limit_um * (1 + 1e-12)
@@ -382,8 +350,6 @@ def blocks_with(feedback, noise):
 
 
 class TestFrozen:
-    """What nothing is integrated of."""
-
     @pytest.mark.parametrize(
         "flag",
         [
@@ -398,13 +364,11 @@ class TestFrozen:
         ],
     )
     def test_ramps_gaps_and_interlocks(self, flag):
-        """One such sample in a block is enough."""
         feedback = integral()
         assert blocks(feedback, 20, offset_um=3.0, flags=int(flag)).tolist() == [0.0] * 20 * BLOCK
 
     @pytest.mark.parametrize("reading", [math.nan, math.inf, -math.inf])
     def test_a_lost_sensor(self, reading):
-        """The correction stays as it was, and is never a NaN."""
         feedback = integral()
         blocks(feedback, 50, offset_um=3.0)
         fed = blocks(feedback, 20, offset_um=reading)
@@ -413,7 +377,6 @@ class TestFrozen:
 
     @pytest.mark.parametrize("flag", [Flag.RANGE_LIMITED, Flag.SLEW_LIMITED])
     def test_limiter_lets_it_shrink_only(self, flag):
-        """While commands are held back nothing winds up, and what was too much is taken back."""
         feedback = integral()
         assert set(blocks(feedback, 20, offset_um=3.0, flags=int(flag))) == {0.0}
         blocks(feedback, 100, offset_um=3.0)
@@ -421,7 +384,6 @@ class TestFrozen:
         assert feedback.correction_um == pytest.approx(-1.0, abs=0.02)
 
     def test_references_before_a_gap(self):
-        """A block after skipped ticks is held against no reference from before them."""
         feedback, block = integral(due_after=3), made_block(BLOCK)
         block.reference[:] = block.input_um[:] = 0.0
         block.displacement_um[:] = 2.0
@@ -437,17 +399,13 @@ class TestFrozen:
 
 
 class TestIntegralPolarity:
-    """A sensor of the wrong sign."""
-
     def test_wrong_sign_is_noticed(self):
-        """Before the correction has stood at its limit for longer than it took to get there."""
         reference = 3.0 * np.sin(np.arange(4000) / 30.0).reshape(-1, BLOCK)
         feedback = integral(limit_um=2.0)
         blocks(feedback, 400, reference_um=reference, offset_um=0.1, sign=-1.0)
         assert "the sign of the sensor or of the command is wrong" in feedback.against
 
     def test_offset_beyond_the_limit_is_no_wrong_sign(self):
-        """A disturbance that is too large is corrected as far as it goes."""
         reference = 3.0 * np.sin(np.arange(4000) / 30.0).reshape(-1, BLOCK)
         feedback = integral(limit_um=2.0)
         blocks(feedback, 400, reference_um=reference, offset_um=10.0)
@@ -462,39 +420,27 @@ MODEL = PpiModel(direct=9.0, weights=(1.0,), thresholds=(0.01,))
 @pytest.mark.parametrize("block", [1, 10])
 @pytest.mark.parametrize("latency", [0, 3])
 def test_in_the_loop_of_a_fifo_device(latency, block):
-    """With displacements some blocks late, drift is taken out, and stays out of the ramp."""
     reference = 5.0 * np.sin(2.0 * np.pi * 5.0 * np.arange(3000) / INTEGRAL_RATE_HZ)
-    compensator = Compensator(MODEL, INTEGRAL_RATE_HZ)
-    device = FakeFifoDevice(latency)
-    host = FakeHost(FakeClock(), block, compensator.state_size + 1)
-    plan = LoopPlan(
-        reference=reference,
-        input_um=reference + 2.0,  # what the actuator is wrong by
-        block=block,
-        latency_blocks=latency,
-        sample_rate_hz=INTEGRAL_RATE_HZ,
-        compensator=compensator,
+    rig = Rig(
+        reference, block=block, device=FakeFifoDevice(latency), model=MODEL,
+        input_um=reference + 2.0,  # the actuator's error
         limits=CommandLimits(low=-5.0, high=5.0, slew_per_s=2000.0, safe=0.0, ramp_per_s=10.0),
-        interlocks=InterlockContext(stroke_um=(-60.0, 60.0)),
         feedback=integral(gain=2.0 * np.pi * block / INTEGRAL_RATE_HZ),
-    )
-    loop = Loop(plan, device, host)
-    loop.begin_at(0.0)
-    assert loop.run(0).code == "completed"
-    wanted, _, _, shown, _, fed = (host.column(row)[:3000] for row in range(6))
+    )  # fmt: skip
+    assert rig.run().code == "completed"
+    wanted, _, _, shown, _, fed = (rig.host.column(row)[:3000] for row in range(6))
     error_um = shown[1:] - wanted[:-1]
     assert np.abs(error_um[:200].mean()) > 1.0
     assert np.abs(error_um[-400:].mean()) < 0.05
     correction_um = fed - reference - 2.0
     assert np.abs(correction_um[: (latency + 1) * block]).max() < 1e-12
     assert np.abs(np.diff(correction_um)).max() < 0.05
-    assert np.isnan(host.column(5)[3000:]).all()
+    assert np.isnan(rig.host.column(5)[3000:]).all()
 
 
 @pytest.mark.parametrize(
     ("gain", "limit_um"), [(0.0, 1.0), (1.0, 1.0), (0.1, 0.0), (0.1, math.inf)]
 )
 def test_numbers_out_of_range(gain, limit_um):
-    """What could not be an integrator is refused."""
     with pytest.raises(InputError, match="must be > 0"):
         IntegralFeedback(gain, limit_um, 1, 3)

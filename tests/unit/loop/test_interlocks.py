@@ -5,12 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pydantic import ValidationError
 
 from hilctl.base.errors import InputError
 from hilctl.base.samples import Flag
 from hilctl.kernels.interlock import InterlockFlag
-from hilctl.loop.interlocks import InterlockSettings, Trip, warming
+from hilctl.loop.interlocks import Trip, warming
 from tests.fakes import RigInterlocks
 
 RATE_HZ = 1000.0
@@ -44,12 +43,22 @@ def trips(limits, n, **columns):
     return trip, bench
 
 
-class TestStroke:
-    """Displacements that may not be."""
+@pytest.mark.parametrize(
+    "columns",
+    [
+        {"command": 2.0},
+        {"command": 2.0, "measured": 1e9},
+        {"command": 1e6},
+        {"reference": 1e9, "displacement": 1.0},
+    ],
+)
+def test_interlocks_are_off_without_a_limit(columns):
+    assert trips(STROKE, 1000, **columns)[0] is None
 
+
+class TestStroke:
     @pytest.mark.parametrize("value", [-60.0, 0.0, 50.0])
     def test_within(self, value):
-        """The limits themselves are allowed."""
         trip, bench = trips(STROKE, 3, displacement=value)
         assert trip is None
         assert not bench.flags.any()
@@ -59,25 +68,20 @@ class TestStroke:
         [(-60.001, "-60"), (50.001, "50"), (77.7, "77.7"), (np.nan, "nan"), (np.inf, "inf")],
     )
     def test_outside(self, value, shown):
-        """What is outside, or not a number, trips where it stands and is flagged there only."""
         trip, bench = trips(STROKE, 4, first=100, displacement=[1.0, value, 2.0, value])
         reason = f"displacement {shown} µm at sample 101 is outside the stroke limits -60 to 50 µm"
         assert trip == Trip(101, "stroke", reason)
         assert bench.flagged(Flag.SENSOR_INVALID) == [1, 3]
 
     def test_sensor_without_ends(self):
-        """Where nothing is known of the sensor, an infinite reading is outside the stroke."""
         limits = RigInterlocks(stroke_um=(-1.0, 2.0))
         assert trips(limits, 1, displacement=np.inf)[0].code == "stroke"
         assert trips(limits, 1, displacement=-np.inf)[0].code == "stroke"
 
 
 class TestSensorRange:
-    """A sensor that is at its end measures nothing."""
-
     @pytest.mark.parametrize("rail", [-100.0, 100.0, 100.5, -101.0])
     def test_at_the_end(self, rail):
-        """A reading at or beyond an end of the sensor's range is told as such."""
         trip, bench = trips(STROKE, 3, displacement=[0.0, 0.0, rail])
         assert trip.code == "sensor_range"
         assert trip.sample == 2
@@ -86,7 +90,6 @@ class TestSensorRange:
 
     @pytest.mark.parametrize("rail", [-100.0, 100.0])
     def test_stroke_as_wide_as_the_sensor(self, rail):
-        """A stroke that reaches to the sensor's ends does not allow them."""
         limits = replace(STROKE, stroke_um=(-100.0, 100.0))
         assert trips(limits, 1, displacement=rail)[0].code == "sensor_range"
         assert trips(limits, 1, displacement=np.nextafter(rail, 0.0))[0] is None
@@ -96,10 +99,7 @@ FROZEN = replace(STROKE, frozen_s=0.01, frozen_travel=0.5)
 
 
 class TestFrozen:
-    """A reading that stays the same although the command moves."""
-
     def test_trips_after_its_time(self):
-        """The time counts from the sample at which the command has gone far enough."""
         command = np.concatenate((np.zeros(20), np.full(40, 0.6)))
         trip, bench = trips(FROZEN, 60, command=command, displacement=12.34567)
         assert trip == Trip(
@@ -111,25 +111,21 @@ class TestFrozen:
         assert bench.flagged(InterlockFlag.SENSOR_FROZEN) == list(range(30, 60))
 
     def test_names_the_unit(self):
-        """A device driven in V is told in V."""
         limits = replace(FROZEN, unit="V")
         trip, _ = trips(limits, 60, command=np.arange(60.0), displacement=1.0)
         assert "moved by 0.5 V" in trip.reason
 
     def test_exactly_that_far_is_not_far_enough(self):
-        """The command must have moved by more than the travel, either way."""
         still = np.zeros(50)
         assert trips(FROZEN, 100, command=np.concatenate((still, still + 0.5)))[0] is None
         assert trips(FROZEN, 100, command=np.concatenate((still, still - 0.5)))[0] is None
         assert trips(FROZEN, 100, command=np.concatenate((still, still - 0.51)))[0].sample == 60
 
     def test_travel_is_from_lowest_to_highest(self):
-        """Small moves up and down from rest add up to their span."""
         command = np.concatenate((np.zeros(5), np.full(5, 0.3), np.full(40, -0.3)))
         assert trips(FROZEN, 50, command=command)[0].sample == 20
 
     def test_hold_never_trips(self):
-        """However long nothing moves, a reading that stays is what is to be expected."""
         assert trips(FROZEN, 5000, command=3.0)[0] is None
 
     def test_travel_starts_at_the_first_command(self):
@@ -137,7 +133,6 @@ class TestFrozen:
         assert trips(replace(FROZEN, safe=3.0), 500, command=3.0, displacement=0.0)[0] is None
 
     def test_step_out_of_a_long_hold(self):
-        """After a long hold the reading has all of the time to answer a step."""
         command = np.concatenate((np.zeros(500), np.full(500, 4.0)))
         reading = np.concatenate((np.zeros(510), np.full(490, 30.0)))
         assert trips(FROZEN, 1000, command=command, displacement=reading)[0] is None
@@ -145,7 +140,6 @@ class TestFrozen:
         assert trips(FROZEN, 1000, command=command, displacement=late)[0].sample == 510
 
     def test_change_starts_everything_anew(self):
-        """A reading that changes, by a single bit, takes time and travel back to nothing."""
         command = np.concatenate((np.zeros(20), np.full(40, 0.6)))
         reading = np.full(60, 5.0)
         reading[25:] = np.nextafter(5.0, 6.0)
@@ -154,7 +148,6 @@ class TestFrozen:
         assert trips(FROZEN, 60, command=command, displacement=reading)[0].sample == 50
 
     def test_travel_before_a_change_does_not_count(self):
-        """Travel is measured from the command at which the reading last changed."""
         command = np.linspace(0.0, 30.0, 61)
         reading = np.full(61, 1.0)
         reading[:30] = np.arange(30.0)
@@ -163,7 +156,6 @@ class TestFrozen:
         assert trip.sample == 42  # 30: the change; 32: more than 0.5 A from it; and 10 samples
 
     def test_resolution(self):
-        """Changes up to the resolution count as none; more than that counts."""
         limits = replace(FROZEN, frozen_um=0.25)
         command = np.arange(100.0)
         flicker = 1.0 + 0.25 * (np.arange(100) % 2)
@@ -174,7 +166,6 @@ class TestFrozen:
         assert trips(limits, 100, command=command, displacement=creep)[0] is None
 
     def test_invalid_readings_are_not_frozen(self):
-        """A reading that is not a number is told as that, never as frozen."""
         trip, bench = trips(FROZEN, 100, command=np.arange(100.0), displacement=np.nan)
         assert trip.code == "stroke"
         assert bench.flagged(InterlockFlag.SENSOR_FROZEN) == []
@@ -184,10 +175,7 @@ DEVIATION = replace(STROKE, measured_deviation_a=0.5, deviation_s=0.003)
 
 
 class TestDeviation:
-    """A current that is not the one that was asked for."""
-
     def test_trips_after_its_time(self):
-        """Too far away for longer than the time trips, and says all numbers."""
         measured = np.concatenate((np.full(10, 2.0), np.full(10, 2.75)))
         trip, bench = trips(DEVIATION, 20, first=0, command=2.0, measured=measured)
         assert (trip.sample, trip.code) == (13, "deviation")
@@ -197,20 +185,17 @@ class TestDeviation:
 
     @pytest.mark.parametrize("measured", [1.5, 2.0, 2.5])
     def test_within(self, measured):
-        """The limit itself is allowed, either way."""
         limits = replace(DEVIATION, safe=2.0, deviation_s=0.0)
         assert trips(limits, 50, command=2.0, measured=measured)[0] is None
 
     @pytest.mark.parametrize("measured", [1.49, 2.51, np.nan, np.inf, -np.inf])
     def test_beyond_without_a_time(self, measured):
-        """Without a time the first sample beyond trips; a lost reading is beyond."""
         limits = replace(DEVIATION, safe=2.0, deviation_s=0.0, unit="V")
         trip, _ = trips(limits, 5, first=7, command=2.0, measured=measured)
         assert trip.sample == 7
         assert f"{measured:.4g} V" in trip.reason
 
     def test_either_command_may_be_measured(self):
-        """A reading before or after its own command takes effect is as good, in any block."""
         limits = replace(DEVIATION, deviation_s=0.0)
         command = np.array([0.0, 5.0, -5.0, 5.0])
         for measured in (command, np.array([0.0, 0.0, 5.0, -5.0]), np.array([0.0, 2.0, -5.5, 5.5])):
@@ -226,27 +211,19 @@ class TestDeviation:
         assert trip.reason.startswith("measured -5.6 A at sample 1, with a command of 5 to -5 A")
 
     def test_starts_from_the_output_that_is_found(self):
-        """A measurement taken before the first command took effect is no deviation."""
         bench = Fed(replace(STROKE, measured_deviation_a=0.1))
         bench.interlocks.begin_at(3.0)
         assert bench.feed(1, command=2.9, measured=3.05) is None
         assert Fed(replace(STROKE, measured_deviation_a=0.1)).feed(1, command=2.9, measured=3.05)
 
     def test_starts_from_the_safe_value(self):
-        """Before the first command the output was at the safe value."""
         limits = replace(DEVIATION, safe=-1.0, deviation_s=0.0)
         assert trips(limits, 1, command=1.0, measured=-1.4)[0] is None
         assert trips(limits, 1, command=1.0, measured=-1.6)[0].code == "deviation"
 
     def test_back_in_time_starts_anew(self):
-        """Spikes shorter than the time don't add up."""
         measured = np.tile([9.0, 9.0, 9.0, 0.0], 50)
         assert trips(DEVIATION, 200, command=0.0, measured=measured)[0] is None
-
-    def test_off_without_a_limit(self):
-        """Where there is no limit, a device that does not measure is no fault."""
-        assert trips(STROKE, 100, command=2.0)[0] is None
-        assert trips(STROKE, 100, command=2.0, measured=1e9)[0] is None
 
 
 THERMAL = replace(STROKE, rms_current_a=2.0, thermal_time_constant_s=0.1)
@@ -254,8 +231,6 @@ HEATING = [(0.0, -3.0), (-3.0, 0.0), (3.0, np.nan), (3.0, np.inf)]
 
 
 class TestThermal:
-    """The thermal budget of the coil, I2t."""
-
     def test_trips_when_the_budget_is_used_up(self):
         """At a constant current, after tau ln(i^2 / (i^2 - rms^2))."""
         trip, bench = trips(THERMAL, 100, command=-3.0)
@@ -268,31 +243,26 @@ class TestThermal:
         assert bench.flagged(InterlockFlag.THERMAL) == list(range(trip.sample, 100))
 
     def test_the_budget_itself_can_be_kept_for_ever(self):
-        """The rms current of the budget never trips; a little more does."""
         assert trips(THERMAL, 20_000, command=2.0)[0] is None
         assert trips(replace(THERMAL, safe=2.0), 20, command=2.0)[0] is None
         assert trips(THERMAL, 20_000, command=2.001)[0] is not None
 
     def test_sine_is_judged_by_its_rms(self):
-        """A fast sine may have a peak of the square root of two times the budget, and no more."""
         sine = np.sin(2.0 * np.pi * 200.0 * np.arange(5000) / RATE_HZ)
         assert trips(THERMAL, 5000, command=2.75 * sine)[0] is None
         assert trips(THERMAL, 5000, command=2.9 * sine)[0].code == "thermal"
 
     @pytest.mark.parametrize(("command", "measured"), HEATING)
     def test_the_larger_of_commanded_and_measured(self, command, measured):
-        """Either current heats, whichever is larger; one that is not measured does not."""
         trip, _ = trips(THERMAL, 100, command=command, measured=measured)
         assert trip.sample == trips(THERMAL, 100, command=3.0)[0].sample
 
     def test_starts_at_the_heat_of_the_safe_value(self):
-        """A coil that rests at a current is warm already."""
         rested = replace(THERMAL, safe=-1.0)
         trip, _ = trips(rested, 100, command=3.0)
         assert trip.sample == math.ceil(0.1 * RATE_HZ * math.log(8.0 / 5.0)) - 1
 
     def test_starts_at_the_heat_that_the_last_run_has_left(self):
-        """A waveform that a cold coil stands for long is then too much at once."""
         hot = replace(THERMAL, heat_a2=3.99)
         assert trips(hot, 5, command=2.9)[0].code == "thermal"
         assert trips(THERMAL, 5, command=2.9)[0] is None
@@ -305,24 +275,16 @@ class TestThermal:
         assert bench.feed(5).code == "thermal"
 
     def test_budget_is_the_square_of_the_rms(self):
-        """A current of 3 A may flow for ever where 3 A rms are allowed, one of 3.01 A not."""
         limits = replace(THERMAL, rms_current_a=3.0)
         assert trips(limits, 5000, command=3.0)[0] is None
         assert trips(limits, 5000, command=3.01)[0] is not None
-
-    def test_off_for_whatever_current(self):
-        """Without a budget nothing is too hot."""
-        assert trips(STROKE, 1000, command=1e6)[0] is None
 
 
 TRACKING = replace(STROKE, tracking_error_um=2.0, tracking_s=0.005)
 
 
 class TestTracking:
-    """A displacement that is not where it should be."""
-
     def test_trips_after_its_time(self):
-        """Too far away for longer than the time trips, and says by how much."""
         reference = np.concatenate((np.full(10, 1.0), np.full(20, -1.5)))
         trip, bench = trips(TRACKING, 30, reference=reference, displacement=1.0)
         assert trip == Trip(
@@ -333,7 +295,6 @@ class TestTracking:
         assert bench.flagged(InterlockFlag.TRACKING_ERROR) == list(range(15, 30))
 
     def test_without_a_time(self):
-        """Without a time the first sample beyond trips; the limit itself does not."""
         limits = replace(TRACKING, tracking_s=0.0)
         assert trips(limits, 9, reference=3.0, displacement=1.0)[0] is None
         assert trips(limits, 9, reference=-1.0, displacement=1.0)[0] is None
@@ -341,18 +302,12 @@ class TestTracking:
         assert trip.reason == "tracking error 2.01 µm at sample 0 is beyond 2 µm"
 
     def test_back_in_time_starts_anew(self):
-        """Errors shorter than the time don't add up."""
         reference = np.tile([9.0] * 5 + [1.0], 50)
         assert trips(TRACKING, 300, reference=reference, displacement=1.0)[0] is None
 
     def test_without_a_reference_there_is_no_error(self):
-        """The ramp and current runs have none, and end a stretch of errors."""
         reference = np.array([9.0] * 5 + [np.nan] + [9.0] * 5 + [np.nan] * 50)
         assert trips(TRACKING, 61, reference=reference, displacement=1.0)[0] is None
-
-    def test_off_without_a_limit(self):
-        """Without a limit any error will do."""
-        assert trips(STROKE, 100, reference=1e9, displacement=1.0)[0] is None
 
 
 EVERYTHING = replace(
@@ -367,10 +322,7 @@ EVERYTHING = replace(
 
 
 class TestSeveral:
-    """Where several interlocks trip."""
-
     def test_cause_before_consequence(self):
-        """Of all that trip at one sample, the one that explains the others is told."""
         limits = replace(EVERYTHING, frozen_s=1e-6)
         moving = {"command": 9.0, "reference": 9.0, "displacement": 1.0}
         told = []
@@ -388,14 +340,12 @@ class TestSeveral:
         assert told == ["stroke", "sensor_frozen", "deviation", "thermal", "tracking_error"]
 
     def test_the_first_sample_counts(self):
-        """A sample before another is told first, whatever trips there."""
         reference = np.array([0.0, 9.0, 0.0])
         displacement = np.array([0.0, 0.0, np.nan])
         trip, _ = trips(EVERYTHING, 3, reference=reference, displacement=displacement, measured=0.0)
         assert (trip.sample, trip.code) == (1, "tracking_error")
 
     def test_conditions_that_last_are_told_in_every_block(self):
-        """Nothing is held back after the first trip: whoever asks decides."""
         bench = Fed(STROKE)
         assert bench.feed(5, displacement=99.0).sample == 0
         assert bench.feed(5, first=5, displacement=99.0).sample == 5
@@ -403,10 +353,7 @@ class TestSeveral:
 
 
 class TestGaps:
-    """Samples that were never exchanged."""
-
     def test_time_passes_with_the_output_held(self):
-        """Heat after a gap is that of the same samples with the last command held."""
         whole, gap = Fed(THERMAL), Fed(THERMAL)
         for bench in (whole, gap):
             assert bench.feed(20, command=2.5) is None
@@ -416,7 +363,6 @@ class TestGaps:
         assert gap.feed(300, first=50, command=2.5).sample == first
 
     def test_coil_cools_over_a_gap(self):
-        """Heat falls, too, while nothing flows."""
         bench = Fed(THERMAL)
         bench.feed(40, command=3.0)
         bench.feed(1, first=40, command=0.0)
@@ -432,7 +378,6 @@ class TestGaps:
         ],
     )
     def test_conditions_last_over_a_gap(self, limits, columns):
-        """What was wrong before a gap and after it counts for all of it."""
         bench = Fed(limits)
         bench.feed(1, command=0.0, measured=0.0)
         start = {name: values[:2] for name, values in columns.items()}
@@ -442,7 +387,6 @@ class TestGaps:
 
     @pytest.mark.parametrize("limits", [FROZEN, DEVIATION, TRACKING])
     def test_gap_alone_is_no_condition(self, limits):
-        """A gap after which all is as it should be trips nothing; what starts then starts anew."""
         bench = Fed(limits)
         assert bench.feed(5, measured=0.0, reference=1.0) is None
         assert bench.feed(5, first=5000, measured=0.0, reference=1.0) is None
@@ -451,8 +395,6 @@ class TestGaps:
 
 
 class TestTimes:
-    """Seconds to samples."""
-
     @pytest.mark.parametrize(
         ("time_s", "rate_hz", "samples"),
         [(0.0, 1e3, 0), (1e-6, 1e3, 1), (0.07, 100.0, 7), (0.0101, 1e3, 11), (0.003, 5e4, 150)],
@@ -477,33 +419,12 @@ class TestTimes:
     ],
 )
 def test_rig_that_means_nothing_is_refused(field, value, text):
-    """What is known of the rig is checked, each rule by name."""
     with pytest.raises(InputError) as caught:
         replace(STROKE, **{field: value}).made(RATE_HZ)
     assert str(caught.value) == text
 
 
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("frozen_s", 0.0),
-        ("rms_current_a", -1.0),
-        ("thermal_time_constant_s", math.nan),
-        ("frozen_um", -0.1),
-        ("measured_deviation_a", math.inf),
-        ("deviation_s", -1.0),
-        ("tracking_error_um", 0.0),
-        ("tracking_s", math.nan),
-    ],
-)
-def test_settings_that_mean_nothing_are_refused(key, value):
-    """Each key has its rule."""
-    with pytest.raises(ValidationError, match=key):
-        InterlockSettings(**{key: value})
-
-
 def test_smallest_limits_hold():
-    """Next to no distance may be asked for."""
     limits = replace(
         STROKE, measured_deviation_a=1e-9, tracking_error_um=1e-9, frozen_um=0.0, safe=1.0
     )

@@ -7,7 +7,7 @@ import pytest
 
 from hilctl.base.events import OFFSET
 from hilctl.base.samples import Flag
-from hilctl.loop.lead_in import Conditioning, LeadIn, RestingOffset
+from hilctl.loop.lead_in import Conditioning, LeadIn
 from tests.fakes import FakeClock, FakeDevice, FakeFifoDevice
 from tests.published import terfenol_rdpi
 from tests.unit.loop.test_loop import LIMITS, RATE_HZ, Rig, sine
@@ -20,7 +20,6 @@ def short_conditioning(**options):
 
 
 def test_nothing_before():
-    """A run from the safe value begins with its waveform, whose input is left as it is."""
     beginning, input_um = LeadIn(None, 0), np.ones(3)
     assert (beginning.condition_at, beginning.waveform_at) == (0, 0)
     assert beginning.condition_event() is None
@@ -31,7 +30,6 @@ def test_nothing_before():
 
 
 def test_parts_follow_one_another():
-    """The conditioning begins after the ramp, and the waveform after both."""
     beginning, wanted = LeadIn(short_conditioning(), 10), np.empty(5)
     assert (beginning.condition_at, beginning.waveform_at) == (10, 50)
     beginning.condition(wanted, 17)
@@ -44,7 +42,6 @@ def test_parts_follow_one_another():
 
 @pytest.mark.parametrize(("largest_um", "left_um"), [(5.0, -3.0), (2.0, 0.0)])
 def test_offset_within_the_limit_is_taken_out(largest_um, left_um):
-    """What the rest shows beside the model; none of it where the run must end for it."""
     beginning = LeadIn(short_conditioning(stands_um=1.0, largest_um=largest_um), 10)
     beginning.take(35, np.full(20, 4.0))
     _, values, refused = beginning.remove_offset()
@@ -72,12 +69,9 @@ class Biased(FakeDevice):
 
 
 class TestLoop:
-    """The way through it."""
-
     @pytest.mark.parametrize("output", [0.0, 4.0])
     @pytest.mark.parametrize("latency", [0, 3])
     def test_it_comes_after_the_ramp_and_before_the_waveform(self, latency, output):
-        """Every command of it is put out and flagged; the waveform follows in whole blocks."""
         device = FakeFifoDevice(latency, output) if latency else FakeDevice(output)
         given = conditioning(latency)
         rig = Rig(sine(230), block=10, device=device, conditioning=given)
@@ -96,7 +90,6 @@ class TestLoop:
         assert (event.sample, event.values["cycle_samples"]) == (ramp, 100.0)
 
     def test_it_passes_the_limiter(self):
-        """What is out of range or too fast does not come out, and is flagged."""
         command = np.concatenate((np.full(20, 9.0), np.zeros(20)))
         given = Conditioning(command, rest=(30, 40), cycle_samples=20)
         rig = Rig(sine(50), block=10, conditioning=given)
@@ -108,7 +101,6 @@ class TestLoop:
         assert (flags & (Flag.RANGE_LIMITED | Flag.SLEW_LIMITED)).all()
 
     def test_an_interlock_ends_the_run_in_it(self):
-        """By the safe ramp, and no waveform follows."""
         rig = Rig(sine(50), conditioning=conditioning(block=1), stroke_um=(-15.0, 15.0))
         outcome = rig.run()
         assert (outcome.code, outcome.safe) == ("fault", True)
@@ -118,7 +110,6 @@ class TestLoop:
         assert rig.device.commands[-1] == LIMITS.safe
 
     def test_a_stop_on_the_way_to_it(self):
-        """A run that is stopped on the ramp before it does not say that it was conditioned."""
         rig = Rig(
             sine(50), device=FakeDevice(4.0), conditioning=conditioning(block=1), stop=lambda: "x"
         )
@@ -127,7 +118,6 @@ class TestLoop:
         assert not any(flags[0] & Flag.CONDITION for flags in rig.host.flags)
 
     def test_a_stop_leaves_it_by_the_safe_ramp(self):
-        """At once, not after the cycle."""
         beats = iter(range(10_000))
         rig = Rig(
             sine(50),
@@ -141,7 +131,6 @@ class TestLoop:
         assert np.abs(np.diff(commands[13:])).max() <= LIMITS.ramp_per_s / RATE_HZ + 1e-12
 
     def test_late_ticks_skip_none_of_it(self):
-        """The schedule shifts; cycle and waveform have all of their samples."""
         clock = FakeClock(stall_ns={20: 15_000_000, 123: 30_000_000, 139: 5_000_000})
         rig = Rig(sine(50), conditioning=conditioning(block=1), clock=clock)
         assert rig.run().code == "completed"
@@ -150,12 +139,9 @@ class TestLoop:
 
 
 class TestOffset:
-    """The resting displacement against the model's."""
-
     @pytest.mark.parametrize("block", [1, 10])
     @pytest.mark.parametrize("latency", [0, 3])
     def test_what_the_sensor_shows_beside_the_model_is_taken_out(self, latency, block):
-        """From the first sample on within the lead-in, out of the input only; once said."""
         device = FakeFifoDevice(latency) if latency else FakeDevice()
         given = conditioning(latency, block, stands_um=-3.0, lead_in=50)
         rig = Rig(
@@ -173,13 +159,11 @@ class TestOffset:
         assert dict(event.values) == {"offset_um": 3.0, "resting_um": 0.0, "model_um": -3.0}
 
     def test_nothing_is_taken_out_where_none_is_measured(self):
-        """Without the model's displacement there is nothing to hold the sensor against."""
         rig = Rig(sine(50), device=Biased(), conditioning=conditioning(block=1))
         assert rig.run().code == "completed"
         assert rig.host.column(5)[140:190].tolist() == sine(50).tolist()
 
     def test_an_offset_beyond_the_limit_ends_the_run(self):
-        """It is no offset, but another actuator, another sensor, or a model of neither."""
         given = conditioning(block=1, stands_um=-3.0, largest_um=2.0)
         rig = Rig(sine(50), conditioning=given)
         outcome = rig.run()
@@ -188,8 +172,7 @@ class TestOffset:
         assert np.isnan(rig.host.column(0)).all()
 
     def test_no_reading_is_no_offset(self):
-        """Where nothing was read at rest there is no number, which is beyond every limit."""
-        resting = RestingOffset(conditioning(stands_um=0.0), 40)
+        resting = LeadIn(conditioning(stands_um=0.0), 40)
         resting.take(150, np.zeros(10))
         assert math.isnan(resting.resting_um)
         given = conditioning(block=1, stands_um=math.nan)
@@ -197,20 +180,13 @@ class TestOffset:
         assert (outcome.code, "the model nan µm" in outcome.reason) == ("fault", True)
 
     @pytest.mark.parametrize("size", [1, 7, 20, 200])
-    def test_mean_over_the_rest_whatever_the_block(self, size):
-        """Samples of the window alone count."""
-        shown = np.arange(220.0)
-        resting = RestingOffset(conditioning(), 40)
-        for first in range(0, 220, size):
-            resting.take(first, shown[first : first + size])
-        assert resting.resting_um == np.arange(160.0, 180.0).mean()
-
-    @pytest.mark.parametrize("size", [1, 7, 200])
-    def test_noise_of_the_rest(self, size):
-        """The standard deviation of the window's samples, also far from 0; NaN of none."""
+    def test_mean_and_noise_of_the_rest(self, size):
+        """Mean and standard deviation of the samples at rest, also far from 0."""
         shown = 1e5 + np.random.default_rng(1).normal(0.0, 0.03, 220)
-        resting = RestingOffset(conditioning(), 40)
+        resting = LeadIn(conditioning(), 40)
+        assert math.isnan(resting.resting_um)
         assert math.isnan(resting.noise_um)
         for first in range(0, 220, size):
             resting.take(first, shown[first : first + size])
+        assert resting.resting_um == pytest.approx(shown[160:180].mean(), rel=1e-12)
         assert resting.noise_um == pytest.approx(shown[160:180].std(), rel=1e-6)

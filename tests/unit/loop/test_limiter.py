@@ -20,7 +20,6 @@ def limited(limiter, wanted):
 
 
 def test_starts_at_the_safe_value():
-    """The first step is measured from the safe value, where the output rests before a run."""
     command, flags = limited(Limiter(LIMITS, DT_S), [3.0])
     assert command.tolist() == [0.6]
     assert flags.tolist() == [Flag.SLEW_LIMITED]
@@ -29,7 +28,6 @@ def test_starts_at_the_safe_value():
 @pytest.mark.parametrize("before", SWEEP)
 @pytest.mark.parametrize("after", SWEEP)
 def test_no_pair_of_wishes_gets_out(before, after):
-    """Whatever is asked for, commands are finite, within range and within slew."""
     limiter = Limiter(LIMITS, DT_S)
     last = limiter.last
     for wish in (before, after) * 40:
@@ -44,23 +42,7 @@ def test_no_pair_of_wishes_gets_out(before, after):
         last = command[0]
 
 
-def test_the_sweep_covers_both_limits():
-    """The sweep above means something: both range limits are reached by it."""
-    limiter = Limiter(LIMITS, DT_S)
-    assert limited(limiter, [1e9] * 100)[0][-1] == LIMITS.high
-    assert limited(limiter, [-1e9] * 100)[0][-1] == LIMITS.low
-
-
-def test_wishes_within_limits_pass_untouched():
-    """Nothing is rounded, flagged or delayed where nothing has to be limited."""
-    wanted = 0.5 + 0.3 * np.sin(np.linspace(0.0, 3.0, 200))
-    command, flags = limited(Limiter(LIMITS, DT_S), wanted)
-    assert np.array_equal(command, wanted)
-    assert not flags.any()
-
-
 def test_ramp_ends_exactly_at_the_safe_value():
-    """The ramp goes straight to the safe value, in its own slew, and says when it is there."""
     limiter = Limiter(LIMITS, DT_S)
     limited(limiter, np.full(100, 3.0))
     way, done = [], False
@@ -77,11 +59,8 @@ def test_ramp_ends_exactly_at_the_safe_value():
 
 
 class TestFromElsewhere:
-    """The last command may be set to where the output is, outside the limits too."""
-
     @pytest.mark.parametrize("start", [-50.0, -2.001, -1.9, 0.61, 2.9, 3.1, 40.0])
     def test_the_ramp_takes_the_samples_that_it_says(self, start):
-        """Every step goes towards the safe value by the ramp's slew, and none is larger."""
         limiter = Limiter(LIMITS, DT_S)
         limiter.last = start
         samples = limiter.ramp_samples
@@ -95,7 +74,6 @@ class TestFromElsewhere:
 
     @pytest.mark.parametrize(("start", "samples"), [(0.5, 0), (0.549, 0), (0.451, 0), (0.551, 2)])
     def test_what_one_step_of_it_reaches_needs_no_ramp(self, start, samples):
-        """The slew limit of the first sample counts from there all the same."""
         limiter = Limiter(LIMITS, DT_S)
         limiter.last = start
         assert limiter.ramp_samples == samples
@@ -105,7 +83,6 @@ class TestFromElsewhere:
     @pytest.mark.parametrize("wish", [np.nan, -1e9, 0.0, 1e9])
     @pytest.mark.parametrize("start", [-9.0, 9.0])
     def test_no_wish_jumps_from_outside(self, start, wish):
-        """A step at a time towards the limits."""
         limiter = Limiter(LIMITS, DT_S)
         limiter.last = start
         command, _ = limited(limiter, np.full(3, wish))
@@ -114,8 +91,6 @@ class TestFromElsewhere:
 
 
 class TestLateRamp:
-    """A ramp whose samples were skipped goes on by the time that passed."""
-
     @pytest.mark.parametrize(
         ("skipped", "step"), [(0, 0.05), (1, 0.1), (9, 0.5), (12, 0.625), (10**9, 0.625)]
     )
@@ -137,7 +112,6 @@ class TestLateRamp:
 
 
 def test_a_block_of_no_samples_changes_nothing():
-    """An empty block leaves the last command as it is."""
     limiter = Limiter(LIMITS, DT_S)
     limited(limiter, [0.55])
     limited(limiter, [])
@@ -146,38 +120,29 @@ def test_a_block_of_no_samples_changes_nothing():
 
 
 FIELDS = {"low": -2.0, "high": 3.0, "slew_per_s": 100.0, "safe": 0.5, "ramp_per_s": 50.0}
-RANGE = "limits must be finite and rising: "
-SAFE = "the safe value must lie within -2.0 to 3.0: "
-RAMP = "the ramp must be > 0 and no faster than the slew limit "
 
 
 @pytest.mark.parametrize(
-    ("change", "text"),
+    ("rule", "key", "values"),
     [
-        ({"low": 4.0}, RANGE + "4.0, 3.0"),
-        ({"low": 3.0}, RANGE + "3.0, 3.0"),
-        ({"high": np.inf}, RANGE + "-2.0, inf"),
-        ({"low": -np.inf}, RANGE + "-inf, 3.0"),
-        ({"low": np.nan}, RANGE + "nan, 3.0"),
-        ({"safe": 3.1}, SAFE + "3.1"),
-        ({"safe": -2.1}, SAFE + "-2.1"),
-        ({"safe": np.nan}, SAFE + "nan"),
-        ({"ramp_per_s": 0.0}, RAMP + "100.0: 0.0"),
-        ({"ramp_per_s": 101.0}, RAMP + "100.0: 101.0"),
-        ({"slew_per_s": np.inf}, RAMP + "inf: 50.0"),
+        ("finite and rising", "low", [4.0, 3.0, -np.inf, np.nan]),
+        ("finite and rising", "high", [np.inf]),
+        ("safe value", "safe", [3.1, -2.1, np.nan]),
+        ("slew limit", "ramp_per_s", [0.0, 101.0]),
+        ("slew limit", "slew_per_s", [np.inf]),
     ],
 )
-def test_limits_that_mean_nothing_are_refused(change, text):
-    """Limits themselves are checked, each rule by name and with the values that break it."""
-    with pytest.raises(InputError) as caught:
-        CommandLimits(**{**FIELDS, **change})
-    assert str(caught.value) == text
+def test_limits_that_mean_nothing_are_refused(rule, key, values):
+    """The error names the values that break the rule."""
+    for value in values:
+        with pytest.raises(InputError, match=rule) as caught:
+            CommandLimits(**{**FIELDS, key: value})
+        assert str(value) in str(caught.value)
 
 
 @pytest.mark.parametrize(
     "change", [{"safe": -2.0}, {"safe": 3.0}, {"ramp_per_s": 100.0}, {"ramp_per_s": 1e-3}]
 )
 def test_edges_of_limits_are_allowed(change):
-    """The safe value may be at an end of the range, and the ramp as fast as the slew or slow."""
     limits = CommandLimits(**{**FIELDS, **change})
     assert {name: getattr(limits, name) for name in FIELDS} == {**FIELDS, **change}

@@ -55,7 +55,6 @@ def driven(amplifier, until_s=1e3, *, start=4.0, pending=False, ramp_per_s=20.0)
 @pytest.mark.parametrize("start", [4.0, -4.0])
 @pytest.mark.parametrize("takes_s", [0.0, 0.001, 0.03])
 def test_the_way_is_a_ramp_by_time(start, takes_s):
-    """No step is larger than the slew of the ramp allows since the write before."""
     amplifier = Amplifier(start, takes_s)
     output = driven(amplifier, start=start)
     times, values = zip(*amplifier.writes, strict=True)
@@ -113,7 +112,6 @@ def test_until_then_it_is_set_and_repeated():
 
 
 def test_a_silence_starts_the_time_again():
-    """A device that was silent may find the older command beside the newer ones."""
     amplifier = Amplifier()
     goal = SafeGoal(0.0, 20.0, None, pending=True)
     output = SafeOutput(amplifier, goal, amplifier.clock)
@@ -146,7 +144,6 @@ def test_a_device_that_cannot_confirm_is_sent_the_value_several_times():
 
 @pytest.mark.parametrize("number", [errno.EMFILE, errno.ENFILE, errno.ENOMEM])
 def test_what_this_process_lacks_is_not_taken_for_the_device(number):
-    """Another process may be able to drive it."""
     amplifier = Amplifier()
     amplifier.error = DeviceError("cannot connect")
     amplifier.error.__context__ = OSError(number, "none left")

@@ -33,13 +33,11 @@ def run(tuner, reference, block, moves):
 
 
 def test_untouched_reference_passes_bit_for_bit():
-    """Nothing is multiplied or added before somebody asks for it."""
     reference = np.random.default_rng(1).normal(size=100)
     assert run(ReferenceTuner(), reference, 7, {}).tobytes() == reference.tobytes()
 
 
 def test_change_is_a_straight_ramp_to_exactly_what_is_wanted():
-    """Every step is the same, and the end is the wanted value, not one near it."""
     out = run(ReferenceTuner(), np.ones(100), 10, {20: Tuning(0.3, 0.4, 30)})
     assert (out[:20] == 1.0).all()
     assert np.diff(out[19:50]) == pytest.approx(np.full(30, -0.3 / 30))
@@ -47,7 +45,6 @@ def test_change_is_a_straight_ramp_to_exactly_what_is_wanted():
 
 
 def test_second_change_begins_where_the_first_stands():
-    """A change that overtakes another makes no jump."""
     out = run(
         ReferenceTuner(), np.ones(100), 5, {10: Tuning(0.0, 0.0, 50), 30: Tuning(1.0, 0.0, 20)}
     )
@@ -57,7 +54,6 @@ def test_second_change_begins_where_the_first_stands():
 
 @given(st.integers(1, 40), st.integers(0, 3), st.integers(1, 60))
 def test_block_cuts_make_no_difference(block, start, samples):
-    """A change comes out the same however the samples are cut into blocks."""
     reference = np.sin(np.arange(240) / 5.0)
     begin = start * 40
     whole, cut = ReferenceTuner(), ReferenceTuner()
@@ -74,7 +70,6 @@ def test_block_cuts_make_no_difference(block, start, samples):
 
 
 def test_two_arrays_are_moved_alike():
-    """Reference and input get the same gain and offset, sample by sample."""
     tuner, a, b = ReferenceTuner(), np.empty(10), np.empty(10)
     tuner.move(Tuning(2.0, 1.0, 10))
     factors = tuner.advance(10)
@@ -82,27 +77,6 @@ def test_two_arrays_are_moved_alike():
     tune(factors, np.zeros(10), b)
     assert a - b == pytest.approx(1.0 + np.arange(1, 11) / 10)
     assert tuner.advance(1) == (2.0, 1.0, 1.0)
-
-
-@given(st.integers(0, 80), st.integers(1, 60))
-def test_samples_that_go_by_count(passed, samples):
-    """Gain and offset are then as if each sample had been looked at, to the bit."""
-    looked, gone_by = ReferenceTuner(), ReferenceTuner()
-    for tuner in (looked, gone_by):
-        tuner.move(Tuning(0.3, -2.0, samples))
-    if passed:
-        looked.advance(passed)
-    gone_by.pass_over(passed)
-    assert (looked.gain, looked.offset, looked.moving) == (
-        gone_by.gain,
-        gone_by.offset,
-        gone_by.moving,
-    )
-    gain, offset = looked.gain, looked.offset
-    if passed:
-        gains, offsets, _ = (np.broadcast_to(each, 1) for each in looked.advance(1))
-        assert gains[0] <= gain
-        assert offsets[0] <= offset
 
 
 FADE = Tuning(1.0, 0.0, 30, 0, 0.0, LinearBypass(0.5, -1.0))
@@ -122,7 +96,6 @@ def faded(tuner, reference, wanted, block, moves):
 
 
 def test_inverse_goes_over_to_the_line_and_back_to_the_bit():
-    """In a line from sample to sample; before and after, the inverse's commands are untouched."""
     reference, wanted = np.random.default_rng(1).normal(size=(2, 200))
     wanted[150] = -0.0
     out, flagged = faded(ReferenceTuner(), reference, wanted, 10, {40: FADE, 100: BACK})
@@ -136,7 +109,6 @@ def test_inverse_goes_over_to_the_line_and_back_to_the_bit():
 
 @given(st.sampled_from([1, 2, 5, 10, 20]), st.integers(0, 6))
 def test_block_cuts_give_the_same_bits_of_a_fade(block, overtaken):
-    """Also of one that the next overtakes in its midst."""
     reference, wanted = np.random.default_rng(2).normal(size=(2, 200))
     moves = {40: FADE, 40 + 20 * overtaken: BACK} if overtaken else {40: FADE}
     whole, _ = faded(ReferenceTuner(), reference, wanted, 20, moves)
@@ -145,7 +117,6 @@ def test_block_cuts_give_the_same_bits_of_a_fade(block, overtaken):
 
 
 def test_events_name_what_moves_and_no_more():
-    """A fade alone is no change of the reference; both together are one event each."""
     tuner = ReferenceTuner()
     (event,) = tuner.events(FADE, 40)
     assert (event.sample, event.code, event.text) == (40, INVERSE, "inverse out, over 30 samples")

@@ -5,26 +5,10 @@ import pytest
 from pydantic import ValidationError
 
 from hilctl.base.errors import ModelError
-from hilctl.models.integrated import DeadbandFunction, IntegratedModel
-from hilctl.models.plays import PpiModel, RdpiModel
+from hilctl.models.plays import PpiModel
+from tests.unit.models.test_plays import MODELS
 
 SAMPLE_RATE_HZ = 10_000.0
-PLAYS = {"direct": 2.0, "weights": (0.5, 0.3, 0.8), "thresholds": (0.2, 0.5, 1.1)}
-MODELS = {
-    "ppi": PpiModel(**PLAYS),
-    "rdpi": RdpiModel(**PLAYS, gamma_s=3e-4),
-    "integrated": IntegratedModel(
-        **PLAYS,
-        gamma_s=3e-4,
-        deadband=DeadbandFunction(
-            slope=1.2,
-            up_thresholds=(1.0, 3.0),
-            up_weights=(-0.3, -0.2),
-            down_thresholds=(-2.0,),
-            down_weights=(0.6,),
-        ),
-    ),
-}
 SIGNAL = 3.0 * np.sin(np.arange(500) / 30.0) + 0.4 * np.sin(np.arange(500) / 3.0)
 
 
@@ -41,7 +25,6 @@ def make(request, model):
 
 
 def test_state_is_a_copy(make):
-    """What state() hands out does not follow the operator, nor the operator it."""
     operator = make()
     operator.process(SIGNAL[:100])
     state = operator.state()
@@ -54,7 +37,6 @@ def test_state_is_a_copy(make):
 
 
 def test_reset_goes_back_to_rest(make):
-    """After reset() the operator does what a new one does."""
     operator = make()
     operator.process(SIGNAL)
     operator.reset()
@@ -71,20 +53,17 @@ def test_reset_at_a_first_input_continues_from_there(make):
 
 
 def test_operators_of_one_model_are_independent(model):
-    """Two operators of one model keep their memories apart."""
     first, second = model.forward(SAMPLE_RATE_HZ), model.forward(SAMPLE_RATE_HZ)
     first.process(SIGNAL)
     np.testing.assert_array_equal(second.state()[:3], np.zeros(3))
 
 
 def test_a_state_of_another_model_is_refused(make):
-    """A state with another number of operators does not fit."""
     with pytest.raises(ModelError, match=r"4 values.*got 7"):
         make().restore(np.zeros(7))
 
 
 def test_out_is_filled_and_returned(make):
-    """Given an output array, process() fills that one; the input stays as it is."""
     out, block = np.empty_like(SIGNAL), SIGNAL.copy()
     assert make().process(block, out) is out
     np.testing.assert_array_equal(out, make().process(SIGNAL))
@@ -92,14 +71,12 @@ def test_out_is_filled_and_returned(make):
 
 
 def test_out_may_be_the_block_itself(make):
-    """Working in place gives the same output."""
     block = SIGNAL.copy()
     make().process(block, block)
     np.testing.assert_array_equal(block, make().process(SIGNAL))
 
 
 def test_offset_moves_the_output_and_comes_off_first(model):
-    """An offset is added to the displacement and taken off before the inverse, block untouched."""
     moved = model.model_copy(update={"output_offset_um": 7.0})
     plain = model.forward(SAMPLE_RATE_HZ).process(SIGNAL)
     np.testing.assert_array_equal(moved.forward(SAMPLE_RATE_HZ).process(SIGNAL), plain + 7.0)

@@ -8,9 +8,6 @@ from pydantic import ValidationError
 
 from hilctl.base.types import F64
 from hilctl.models.effective_field import FieldLosses, FieldModel, OutputCurve
-from hilctl.models.linear_stages import FirstMode
-from hilctl.models.model_file import dump_model, parse_model
-from hilctl.models.staged import StagedModel
 
 RATE_HZ = 50_000.0
 CURVE = OutputCurve(operators_um=(-60.0, 0.0, 60.0), displacement_um=(-50.0, 0.0, 45.0))
@@ -50,17 +47,7 @@ def test_inverse_undoes_the_model(coupling: float) -> None:
     assert np.ptp(command) > 5.0
 
 
-def test_any_cut_into_blocks_gives_the_same_bits() -> None:
-    wanted_um = reference_um(2)
-    for operator in (field_model().inverse, field_model().forward):
-        whole = operator(RATE_HZ).process(wanted_um)
-        parts, starts = operator(RATE_HZ), range(0, wanted_um.size, 37)
-        cut = [parts.process(wanted_um[start : start + 37].copy()) for start in starts]
-        assert np.array_equal(np.concatenate(cut), whole)
-
-
 def test_small_biased_loops_creep_by_drags_and_close_by_plays() -> None:
-    """A play's loop comes back to where it began; a drag's has moved on."""
     loop = [*np.linspace(5.0, 4.0), *np.linspace(4.0, 5.0)]
     turns = np.concatenate([np.linspace(0.0, 5.0), np.tile(loop, 8)])
     no_losses = {"losses": FieldLosses(), "coupling": 0.0}
@@ -81,34 +68,6 @@ def test_a_loop_is_the_narrower_the_slower_it_is() -> None:
         return float(abs(np.interp(0.0, v[half:][: half // 4], y[: half // 4]) - y[half // 2]))
 
     assert width_um(200.0) > 1.5 * width_um(5.0)
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_what_is_no_number_leaves_no_trace(bad: float) -> None:
-    wanted_um = reference_um(3)
-    inverse = field_model().inverse(RATE_HZ)
-    first = inverse.process(wanted_um[:100].copy())
-    assert np.isnan(inverse.process(np.array([bad])))
-    after = inverse.process(wanted_um[100:].copy())
-    whole = field_model().inverse(RATE_HZ).process(wanted_um)
-    assert np.array_equal(np.concatenate([first, after]), whole)
-
-
-def test_every_finite_reference_gives_a_finite_command() -> None:
-    wild_um = np.array([0.0, 1e3, -1e3, 1e9, -1e9, 0.0, 1e-9])
-    command = field_model().inverse(RATE_HZ).process(wild_um)
-    assert np.isfinite(command).all()
-
-
-def test_between_stages_and_through_a_file() -> None:
-    structure = FirstMode(natural_hz=2300.0, damping_ratio=0.12)
-    staged = StagedModel.around(field_model(), structure=structure, delay_s=3e-5)
-    back = parse_model("model", dump_model(staged))
-    assert back == staged
-    inverse, wanted_um = back.inverse(RATE_HZ), reference_um(4)
-    ahead = np.append(wanted_um[inverse.preview :], np.full(inverse.preview, wanted_um[-1]))
-    got_um = back.forward(RATE_HZ).process(inverse.process(ahead))
-    assert np.max(np.abs(got_um - wanted_um)[500:]) < 0.05 * np.ptp(wanted_um) / 10.0
 
 
 @pytest.mark.parametrize(

@@ -6,15 +6,14 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from hilctl.base.types import F64
-from hilctl.models.effective_field import FieldLosses
+from hilctl.models.effective_field import FieldLosses, FieldModel
 from hilctl.models.generalised_duhem import GeneralisedDuhemModel
 from hilctl.models.linear_stages import FirstMode
 from hilctl.models.model_file import dump_model, parse_model
 from hilctl.models.staged import StagedModel
+from tests.unit.models.test_effective_field import LOSSES, field_model, reference_um
 
 RATE_HZ = 50_000.0
-LOSSES = FieldLosses(field_s=1e-4, output_s=2e-6, decay_s=3e-5, growth=0.1, bend=0.02, excess=0.05)
 ACROSS = np.linspace(-1.0, 1.0, 5)
 
 
@@ -36,36 +35,11 @@ def duhem_model(**changes: Any) -> GeneralisedDuhemModel:
     return GeneralisedDuhemModel(**(given | changes))
 
 
-def reference_um(seed: int) -> F64:
-    """Return a smooth, aperiodic reference from rest: float64[n]."""
-    t = np.arange(4000) / RATE_HZ
-    rng = np.random.default_rng(seed)
-    sines = sum(np.sin(2 * np.pi * f * t + rng.uniform(0, 6)) for f in (11.0, 57.0, 143.0, 231.0))
-    return np.ascontiguousarray(0.7 + 9.0 * np.minimum(t / 0.02, 1.0) * sines)
-
-
 def test_inverse_undoes_the_model() -> None:
-    wanted_um = reference_um(1)
+    wanted_um = 0.7 + reference_um(1)
     command = duhem_model().inverse(RATE_HZ).process(wanted_um)
     assert duhem_model().forward(RATE_HZ).process(command) == pytest.approx(wanted_um, abs=1e-7)
     assert np.ptp(command) > 2.0
-
-
-def test_any_cut_into_blocks_gives_the_same_bits() -> None:
-    wanted_um = reference_um(2)
-    for operator in (duhem_model().inverse, duhem_model().forward):
-        whole = operator(RATE_HZ).process(wanted_um)
-        parts, starts = operator(RATE_HZ), range(0, wanted_um.size, 37)
-        cut = [parts.process(wanted_um[start : start + 37].copy()) for start in starts]
-        assert np.array_equal(np.concatenate(cut), whole)
-
-
-def test_a_restored_state_goes_on_as_the_old_one_did() -> None:
-    wanted_um = reference_um(3)
-    first, second = (duhem_model().inverse(RATE_HZ) for _ in range(2))
-    first.process(wanted_um[:900].copy())
-    second.restore(first.state())
-    assert np.array_equal(second.process(wanted_um[900:]), first.process(wanted_um[900:]))
 
 
 def test_rest_is_no_command_at_the_offset() -> None:
@@ -74,7 +48,6 @@ def test_rest_is_no_command_at_the_offset() -> None:
 
 
 def test_small_biased_loops_creep_down_from_the_falling_branch() -> None:
-    """Less from loop to loop: no memory of turns holds them."""
     loop = [*np.linspace(1.0, 1.2), *np.linspace(1.2, 1.0)]
     turns = np.concatenate([np.linspace(0.0, 4.0), np.linspace(4.0, 1.0), np.tile(loop, 6)])
     out = duhem_model(losses=FieldLosses()).forward(RATE_HZ).process(turns)
@@ -95,21 +68,50 @@ def test_a_loop_is_the_wider_the_faster_it_is() -> None:
     assert area(200.0) > 1.1 * area(5.0)
 
 
-def test_every_finite_reference_gives_a_finite_command() -> None:
+RODS = {"field": field_model(), "duhem": duhem_model()}
+of_rods = pytest.mark.parametrize("model", RODS.values(), ids=RODS)
+
+
+@of_rods
+def test_any_cut_into_blocks_gives_the_same_bits(model: FieldModel) -> None:
+    wanted_um = reference_um(2)
+    for operator in (model.inverse, model.forward):
+        whole = operator(RATE_HZ).process(wanted_um)
+        parts, starts = operator(RATE_HZ), range(0, wanted_um.size, 37)
+        cut = [parts.process(wanted_um[start : start + 37].copy()) for start in starts]
+        assert np.array_equal(np.concatenate(cut), whole)
+
+
+@of_rods
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_what_is_no_number_leaves_no_trace_and_a_state_goes_on(model: FieldModel, bad: float):
+    wanted_um = reference_um(3)
+    inverse, other = model.inverse(RATE_HZ), model.inverse(RATE_HZ)
+    first = inverse.process(wanted_um[:100].copy())
+    other.restore(inverse.state())
+    assert np.isnan(inverse.process(np.array([bad])))
+    after = inverse.process(wanted_um[100:].copy())
+    whole = model.inverse(RATE_HZ).process(wanted_um)
+    assert np.array_equal(np.concatenate([first, after]), whole)
+    assert np.array_equal(other.process(wanted_um[100:].copy()), after)
+
+
+@of_rods
+def test_every_finite_reference_gives_a_finite_command(model: FieldModel) -> None:
     wild_um = np.array([0.0, 1e3, -1e3, 1e9, -1e9, 0.0, 1e-9])
-    inverse = duhem_model().inverse(RATE_HZ)
+    inverse = model.inverse(RATE_HZ)
     assert np.isfinite(inverse.process(wild_um)).all()
-    calm_um = reference_um(5)
-    again = inverse.process(np.concatenate([[0.0], calm_um]))
+    again = inverse.process(np.concatenate([[0.0], reference_um(5)]))
     assert np.abs(again[200:]).max() < 20.0  # it has come back
 
 
-def test_between_stages_and_through_a_file() -> None:
+@of_rods
+def test_between_stages_and_through_a_file(model: FieldModel) -> None:
     structure = FirstMode(natural_hz=2300.0, damping_ratio=0.12)
-    staged = StagedModel.around(duhem_model(), structure=structure, delay_s=3e-5)
+    staged = StagedModel.around(model, structure=structure, delay_s=3e-5)
     back = parse_model("model", dump_model(staged))
     assert back == staged
-    inverse, wanted_um = back.inverse(RATE_HZ), reference_um(4)
+    inverse, wanted_um = back.inverse(RATE_HZ), model.output_offset_um + reference_um(4)
     ahead = np.append(wanted_um[inverse.preview :], np.full(inverse.preview, wanted_um[-1]))
     got_um = back.forward(RATE_HZ).process(inverse.process(ahead))
     assert np.max(np.abs(got_um - wanted_um)[500:-500]) < 0.005 * np.ptp(wanted_um)

@@ -34,7 +34,6 @@ def test_the_generalised_model_follows_its_definition():
 
 
 def test_envelopes_must_rise():
-    """A model file with a falling envelope is refused, and says which one."""
     text = """
     model: {kind: generalised, command_span: [-6.0, 6.0], direct: 1.0, weights: [],
             thresholds: [], rising: {slope: 0.1}, falling: {slope: -0.1}}

@@ -138,26 +138,20 @@ def bits(array):
 
 @given(MODELS, signals(*SPAN))
 def test_the_model_undoes_its_inverse(model, v):
-    """What a command within the span gives is given again by the inverse's command."""
     y = model.forward(RATE_HZ).process(v)
     command = model.inverse(RATE_HZ).process(y)
     back = model.forward(RATE_HZ).process(command)
     assert np.max(np.abs(back - y)) <= 10.0 * TOLERANCE_UM
 
 
-@given(
-    MODELS,
-    hnp.arrays(np.float64, st.integers(1, 60), elements=st.floats(-1e150, 1e150)),
-)
+@given(MODELS, hnp.arrays(np.float64, st.integers(1, 60), elements=st.floats(-1e150, 1e150)))
 def test_the_inverse_never_leaves_its_span(model, y):
-    """For any displacement, however far out, the command is a number within the span."""
     command = model.inverse(RATE_HZ).process(y)
     assert np.all((command >= LOW) & (command <= HIGH))
 
 
 @given(MODELS, signals(-90.0, 90.0), DIRECTION, st.data())
 def test_any_cut_into_blocks_gives_the_same_bits(model, signal, direction, data):
-    """One call, single samples or any blocks: the same output and the same memory."""
     whole = getattr(model, direction)(RATE_HZ)
     expected = whole.process(signal)
     cuts = sorted(data.draw(st.lists(st.integers(0, signal.size), max_size=8)))
@@ -170,7 +164,6 @@ def test_any_cut_into_blocks_gives_the_same_bits(model, signal, direction, data)
 
 @given(MODELS, signals(*SPAN), st.data())
 def test_a_model_rises_with_its_command(model, v, data):
-    """From any memory, a higher next command never gives a lower displacement."""
     steps = sorted(data.draw(st.lists(st.floats(*SPAN), min_size=2, max_size=6)))
     after = []
     for step in steps:
@@ -182,7 +175,6 @@ def test_a_model_rises_with_its_command(model, v, data):
 
 @given(MODELS, signals(*SPAN), st.floats(0.05, 0.95))
 def test_samples_on_the_way_make_no_difference(model, v, part):
-    """An extra sample between two commands changes none of the others' displacements."""
     between = v[:-1] + part * np.diff(v)
     finer = np.empty(2 * v.size - 1)
     finer[::2], finer[1::2] = v, between
@@ -193,13 +185,11 @@ def test_samples_on_the_way_make_no_difference(model, v, part):
 
 @given(MODELS)
 def test_a_model_survives_its_file(model):
-    """Through YAML and back it is the same model."""
     assert parse_model("round trip", dump_model(model)) == model
 
 
 @pytest.mark.parametrize("model", [PREISACH, KP, BOUC_WEN, DUHEM], ids=lambda m: m.kind)
 def test_a_reference_that_is_not_a_number_leaves_no_trace(model):
-    """It gives a command that is none, for the loop to refuse; what follows is as without it."""
     y = 5.0 * np.sin(np.arange(40) / 5.0)
     broken = np.insert(y, 20, np.nan)
     got = model.inverse(RATE_HZ).process(broken)
@@ -232,7 +222,6 @@ def test_a_reference_that_is_not_a_number_leaves_no_trace(model):
     ],
 )  # fmt: skip
 def test_broken_conditions_are_refused(model, change, rule):
-    """Each condition for a bounded model with an inverse is checked, and named."""
     with pytest.raises(ValidationError, match=rule):
         type(model)(**{**model.model_dump(exclude={"kind"}), **change})
 
@@ -257,7 +246,6 @@ def test_preisach_is_a_sum_of_relays():
 
 @given(preisachs())
 def test_preisach_rests_at_its_offset(model):
-    """At rest the displacement is the offset, whether or not the cells reach there."""
     rest = model.forward(RATE_HZ).process(np.zeros(1)).item()
     assert rest == pytest.approx(model.output_offset_um, abs=1e-9)
 

@@ -15,24 +15,9 @@ from hilctl.models.integrated import (
     exponential_integrated,
 )
 from hilctl.models.model_file import dump_model, parse_model
-from hilctl.models.plays import PpiModel, RdpiModel, inverse_plays
-from tests.published import piezo_ppi, terfenol_rdpi
-
-GOOD = {"direct": 1.0, "weights": (0.5, 0.0, 0.2), "thresholds": (0.1, 0.2, 0.5)}
-DEADBAND = {
-    "slope": 2.0,
-    "up_thresholds": (1.0, 2.0),
-    "up_weights": (-0.5, -0.5),
-    "down_thresholds": (-1.0, -3.0),
-    "down_weights": (-0.5, 1.0),
-}
-
-
-def broken(kind, **parameters):
-    """Return the messages of all broken rules, one a line."""
-    with pytest.raises(ValidationError) as caught:
-        kind(**parameters)
-    return "\n".join(f"{e['loc']} {e['msg']}" for e in caught.value.errors())
+from hilctl.models.plays import inverse_plays
+from tests.published import terfenol_rdpi
+from tests.unit.models.test_plays import DEADBAND, GOOD, MODELS, broken
 
 
 @pytest.mark.parametrize(("change", "message"), [
@@ -50,16 +35,7 @@ def broken(kind, **parameters):
     ({"down_weights": (1.0,)}, "down_weights must have one value per threshold: 1 for 2"),
 ])  # fmt: skip
 def test_each_condition_of_the_deadbands_is_named(change, message):
-    """Slopes, thresholds and lengths of both sides are named with their index."""
     assert message in broken(DeadbandFunction, **{**DEADBAND, **change})
-
-
-@pytest.mark.parametrize("value", [float("nan"), float("inf")])
-@pytest.mark.parametrize("place", ["slope", "up_weights", "down_thresholds"])
-def test_deadband_numbers_must_be_finite(place, value):
-    """So are they in the deadbands."""
-    given = value if place == "slope" else (value, 1.0)
-    assert "finite number" in broken(DeadbandFunction, **{**DEADBAND, place: given})
 
 
 @pytest.mark.parametrize(("parameters", "message"), [
@@ -69,32 +45,12 @@ def test_deadband_numbers_must_be_finite(place, value):
     ({"slope": 1e-300, "down_thresholds": (-1.0,), "down_weights": (1e300,)}, "g_-1 = 0.0"),
 ])  # fmt: skip
 def test_deadbands_that_rounding_takes_apart_have_no_inverse(parameters, message):
-    """Slopes too far apart for the number format are refused with the reason."""
     model = IntegratedModel(**GOOD, deadband=DeadbandFunction(**parameters))
     with pytest.raises(ModelError, match=message):
         model.inverse(1_000.0)
 
 
-PLAYS = {"direct": 2.0, "weights": (0.5, 0.3, 0.8), "thresholds": (0.2, 0.5, 1.1)}
-MODELS = {
-    "ppi": PpiModel(**PLAYS),
-    "rdpi": RdpiModel(**PLAYS, gamma_s=3e-4),
-    "integrated": IntegratedModel(
-        **PLAYS,
-        gamma_s=3e-4,
-        deadband=DeadbandFunction(
-            slope=1.2,
-            up_thresholds=(1.0, 3.0),
-            up_weights=(-0.3, -0.2),
-            down_thresholds=(-2.0,),
-            down_weights=(0.6,),
-        ),
-    ),
-}
-
-
 def test_deadband_function_and_its_inverse_cancel():
-    """Lambda after its inverse, and the other way round, return what went in."""
     function = MODELS["integrated"].deadband
     x = np.linspace(-9.0, 9.0, 2_001)
     np.testing.assert_allclose(function.inverse()(function(x)), x, rtol=0, atol=1e-13)
@@ -204,16 +160,6 @@ def test_rdpi_and_its_inverse_cancel_with_shared_thresholds(frequency_hz):
         assert np.max(np.abs(again - v)) <= 1e-12 * np.max(np.abs(v))
 
 
-def test_thresholds_that_are_not_shared_do_not_cancel():
-    """The test above means something: leaving out the scale a_0 costs far more than rounding."""
-    model = terfenol_rdpi()
-    v = sine(2.3, 100.0)
-    growth = widening_of(model, v)
-    y = shared(v, growth, model.direct, np.array(model.weights), np.array(model.thresholds))
-    back = shared(y, growth, *model.inverse_parameters())
-    assert np.max(np.abs(back - v)) > 1e-3
-
-
 def test_inverse_plays_follow_the_published_relations():
     """Rising by (a_0 + ... + a_i)(r_{i+1} - r_i) from a_0 r_1; reciprocal slopes (5.8-5.10)."""
     a, r = [1.2, 0.3, 0.0, 0.7, 0.2], [0.4, 0.9, 1.0, 2.5]
@@ -245,7 +191,6 @@ def test_inverse_deadbands_follow_the_published_relations(omega):
 
 
 def test_exponential_parameters_are_the_published_ones(omega):
-    """Omega has evenly spaced thresholds and exponential weights of the published signs."""
     assert omega.operators == 12
     np.testing.assert_allclose(omega.thresholds, 0.3 * np.arange(1, 13))
     np.testing.assert_allclose(omega.weights, 0.2 * np.exp(-0.3 * np.arange(1, 13)))
@@ -255,13 +200,6 @@ def test_exponential_parameters_are_the_published_ones(omega):
     np.testing.assert_allclose(deadband.up_weights, -0.3 * np.exp(-0.1 * np.arange(1, 9)))
     np.testing.assert_allclose(deadband.down_thresholds, -0.8 * np.arange(1, 9))
     np.testing.assert_allclose(deadband.down_weights, 0.4 * np.exp(-0.1 * np.arange(1, 9)))
-
-
-def test_published_models_say_where_they_come_from():
-    """Units and provenance travel with the parameters."""
-    assert piezo_ppi().input_unit == "V"
-    assert terfenol_rdpi().input_unit == "A"
-    assert "Concordia" in piezo_ppi().provenance.source[0]
 
 
 RATE_HZ = 10_000.0
@@ -285,7 +223,6 @@ def tone(samples=2000, amplitude=6.0, offset=0.0):
 
 
 def test_without_bias_displacement_is_even():
-    """A command and its opposite give the same displacement, never below the turning point."""
     model = butterfly()
     up = model.forward(RATE_HZ).process(tone())
     down = model.forward(RATE_HZ).process(-tone())
@@ -295,7 +232,6 @@ def test_without_bias_displacement_is_even():
 
 
 def test_each_cycle_of_the_command_gives_two_of_displacement():
-    """Without bias the displacement repeats twice a cycle; with enough bias, once."""
     two = butterfly().forward(RATE_HZ).process(tone())[-500:]
     one = butterfly(bias=30.0).forward(RATE_HZ).process(tone())[-500:]
     np.testing.assert_allclose(two[:250], two[250:], atol=1e-9)
@@ -307,7 +243,6 @@ def test_each_cycle_of_the_command_gives_two_of_displacement():
     [(0.0, None, 1.0), (0.0, (-6.0, 0.0), -1.0), (8.0, None, 1.0), (-8.0, (-2.0, 6.0), -1.0)],
 )
 def test_the_inverse_undoes_the_model_on_its_wing(bias, input_range, wing):
-    """Displacements above the turning point come back; the command stays on one wing."""
     rest_um = float(SHAPE(np.array([abs(bias)]))[0])
     model = butterfly(
         bias=bias,
@@ -326,7 +261,6 @@ def test_the_inverse_undoes_the_model_on_its_wing(bias, input_range, wing):
 
 
 def test_rest_takes_no_command():
-    """Where the offset puts rest at 0 um, the inverse puts out nothing there."""
     rest_um = float(SHAPE(np.array([5.0]))[0])
     model = butterfly(bias=5.0, output_offset_um=-rest_um, output_range_um=(-rest_um, 5.0))
     assert model.inverse(RATE_HZ).process(np.zeros(3)) == pytest.approx(np.zeros(3), abs=1e-12)
@@ -335,13 +269,11 @@ def test_rest_takes_no_command():
 
 @pytest.mark.parametrize("output_range_um", [None, (-0.1, 20.0)])
 def test_both_wings_at_once_are_refused(output_range_um):
-    """A range that is not known, or that no command reaches, has no inverse."""
     with pytest.raises(ModelError, match="one of its wings only"):
         butterfly(output_range_um=output_range_um).inverse(RATE_HZ)
 
 
 def test_what_no_command_reaches_gets_the_turning_point():
-    """Below the turning point the inverse stays finite: it holds that point."""
     inverse = butterfly().inverse(RATE_HZ)
     command = inverse.process(np.array([3.0, 1.0, -5.0, -50.0, -5.0, 0.0]))
     assert np.isfinite(command).all()
@@ -349,19 +281,16 @@ def test_what_no_command_reaches_gets_the_turning_point():
 
 
 def test_an_odd_shape_is_refused():
-    """The side below 0 follows from evenness and can't be given."""
     with pytest.raises(ValidationError, match="even"):
         butterfly(shape=DeadbandFunction(down_thresholds=(-1.0,), down_weights=(0.2,)))
 
 
 def test_falling_shape_is_refused():
-    """A cumulative slope that is not above 0 has no inverse, and is named."""
     with pytest.raises(ValidationError, match="cumulative deadband slope"):
         butterfly(shape={"slope": 1.0, "up_thresholds": (1.0,), "up_weights": (-1.0,)})
 
 
 def test_file_gives_the_same_model():
-    """A model file brings back every parameter, bit for bit."""
     model = butterfly(bias=0.1 + 0.2, gamma_s=1e-4, input_range=(0.0, 6.0))
     assert parse_model("model", dump_model(model)) == model
 
@@ -373,7 +302,6 @@ def test_file_gives_the_same_model():
     direction=st.sampled_from(["forward", "inverse"]),
 )
 def test_cuts_make_no_difference_and_nothing_blows_up(signal, cut, gamma_s, direction):
-    """Any cut into blocks gives the same bits, finite for anything finite, either way."""
     model = butterfly(gamma_s=gamma_s, bias=-3.0, output_range_um=(0.0, 20.0))
     values = np.array(signal)
     whole = getattr(model, direction)(RATE_HZ).process(values)

@@ -26,7 +26,6 @@ SIGNAL = np.array([1.0, 2.0, 4.0, 3.0, -1.0, 0.5])
 
 @pytest.mark.parametrize("samples", [1, 2, 5])
 def test_delayed_holds_back_that_many_samples(samples):
-    """Before the first has come through, it stands where the signal began."""
     expected = [SIGNAL[max(k - samples, 0)] for k in range(SIGNAL.size)]
     assert delayed(samples).process(SIGNAL).tolist() == expected
 
@@ -37,7 +36,6 @@ def test_between_goes_that_part_of_the_way():
 
 
 def test_a_chain_is_its_operators_one_after_another():
-    """Between the offsets, and with no preview where none is given."""
     chain = Chain([delayed(2), PLAYS.forward(1.0), between(0.5)], input_offset=3.0,
                   output_offset=-0.5)  # fmt: skip
     by_hand = SIGNAL + 3.0
@@ -50,7 +48,6 @@ def test_a_chain_is_its_operators_one_after_another():
 
 
 def test_a_chain_s_memory_is_that_of_its_operators():
-    """One array, in their order, that they go on from; at rest it is theirs at rest."""
     stages = [delayed(2), PLAYS.forward(1.0), between(0.5)]
     rest = np.concatenate([stage.state() for stage in stages])
     chain = Chain(stages)
@@ -68,7 +65,6 @@ def test_a_chain_s_memory_is_that_of_its_operators():
 
 
 def test_a_chain_may_be_part_of_another():
-    """Its memory is then a part of that one's, as those of its operators are."""
     inner = Chain([delayed(2), PLAYS.forward(1.0)])
     outer = Chain([between(0.5), inner])
     outer.process(SIGNAL)
@@ -83,7 +79,6 @@ def test_a_chain_may_be_part_of_another():
 
 
 def test_a_chain_begins_where_its_operators_stood():
-    """Operators that have seen a signal are taken as they are, and reset to that."""
     moved = PLAYS.forward(1.0)
     moved.process(SIGNAL)
     left = moved.state()
@@ -124,13 +119,11 @@ def test_smoothing_passes_slow_signals(angle):
 
 
 def test_plain_differences_without_a_width():
-    """A central difference a sample, and a second one."""
     weights, _ = smoothing_weights(0.0, 2.0, 5.0)
     np.testing.assert_allclose(weights, [5.0 - 1.0, 1.0 - 10.0, 5.0 + 1.0])
 
 
 def test_weights_add_up_and_follow_slope_and_bend():
-    """Constant, ramp and parabola come out as their derivatives say, whatever the width."""
     k = np.arange(400.0)
     for width in (0.0, 0.4, 3.6, 30.0, 1e6):
         weights, m = smoothing_weights(width, 2.0, 5.0)
@@ -153,7 +146,6 @@ def signal(n=4000):
 
 
 def test_a_displacement_that_stays_creeps_on_by_each_share():
-    """After a step each element goes after its share by first order."""
     x_um = np.concatenate(([0.0], np.full(20_000, 10.0)))
     time_s = np.arange(x_um.size - 1) / RATE_HZ
     crept = CREEP.forward(RATE_HZ).process(x_um) - x_um
@@ -168,22 +160,13 @@ def test_inverse_undoes_creep_exactly():
     np.testing.assert_allclose(CREEP.inverse(RATE_HZ).process(y_um), x_um, rtol=0.0, atol=1e-10)
 
 
-def test_any_cut_into_blocks_gives_the_same_bits():
-    y_um = signal()
-    whole, parts = CREEP.inverse(RATE_HZ), CREEP.inverse(RATE_HZ)
-    came = np.concatenate([parts.process(part) for part in np.split(y_um, (1, 2, 40, 1000))])
-    np.testing.assert_array_equal(came, whole.process(y_um))
-
-
 def test_only_what_is_away_from_rest_creeps():
-    """A displacement that stands at rest stays there, wherever that is."""
     still = np.full(3000, -7.5)
     for operator in (CREEP.forward(RATE_HZ, rest_um=-7.5), CREEP.inverse(RATE_HZ, rest_um=-7.5)):
         np.testing.assert_array_equal(operator.process(still), still)
 
 
 def test_a_value_that_is_none_is_not_gone_on_from():
-    """It comes out as none; those after it are as good as ever."""
     y_um = np.full(100, 5.0)
     y_um[40] = np.nan
     came = CREEP.inverse(RATE_HZ).process(y_um)
@@ -194,8 +177,6 @@ def test_a_value_that_is_none_is_not_gone_on_from():
 @pytest.mark.parametrize(("times_s", "shares", "message"), [
     ((1.0, 0.5), (0.1, 0.1), "T must rise from 0"),
     ((1.0,), (0.1, 0.1), "shares must have one value per time constant: 2 for 1"),
-    ((1.0,), (0.0,), "greater than 0"),
-    ((1e-5,), (0.1,), "greater than or equal to 0.001"),
     ((), (), "at least 1 item"),
 ])  # fmt: skip
 def test_conditions_are_named(times_s, shares, message):
@@ -270,7 +251,6 @@ def test_a_mode_beyond_what_samples_show_is_refused_in_words():
     {"natural_hz": 8000.0, "antiresonance_hz": 700.0},
 ])  # fmt: skip
 def test_what_is_known_of_the_inverse_s_decay_is_what_it_does(change):
-    """Whether it dies away or grows, by what is left of a moment's input after some time."""
     parameters = FurtherMode(**(MODE | change))._parameters(5000.0)
     memory, sizes = np.array([0.3, -0.7, 1.0]), []
     for _ in range(2):
@@ -291,18 +271,6 @@ def test_a_mode_that_would_come_to_grow_slowly_is_refused_too():
         mode.inverse(2000.0)
 
 
-@pytest.mark.parametrize(("made", "limits"), [
-    (FurtherMode, {"natural_hz": 1e6, "damping_ratio": 1.0, "antiresonance_hz": 1e6,
-            "antiresonance_damping_ratio": 1.0}),
-    (FirstMode, {"natural_hz": 1e9, "damping_ratio": 10.0}),
-])  # fmt: skip
-def test_limits_are_within(made, limits):
-    assert made(**limits).model_dump() == limits
-    for name, limit in limits.items():
-        with pytest.raises(ValidationError, match=name):
-            made(**(limits | {name: math.nextafter(limit, math.inf)}))
-
-
 @pytest.mark.parametrize("frequency_hz", [100.0, 2300.0])
 def test_a_structure_answers_sines_as_a_second_order_does(frequency_hz):
     structure = FirstMode(natural_hz=2300.0, damping_ratio=0.12)
@@ -310,13 +278,6 @@ def test_a_structure_answers_sines_as_a_second_order_does(frequency_hz):
     came = answer(structure.forward(FAST_HZ), frequency_hz)
     assert came == pytest.approx(wanted, rel=1e-2, abs=3e-3)
     assert structure.radian_s == pytest.approx(1.0 / (2.0 * math.pi * 2300.0))
-
-
-@pytest.mark.parametrize("name", MODE)
-@pytest.mark.parametrize("value", [0.0, -1.0, math.inf])
-def test_a_mode_has_frequencies_and_damping_above_0(name, value):
-    with pytest.raises(ValidationError, match=name):
-        FurtherMode(**(MODE | {name: value}))
 
 
 def test_a_structure_that_does_not_move_is_refused():

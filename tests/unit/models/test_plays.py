@@ -35,7 +35,6 @@ def broken(kind, **parameters):
 
 @pytest.mark.parametrize(("kind", "more"), KINDS)
 def test_admissible_parameters_are_taken(kind, more):
-    """The set that the refusals below start from is a good one."""
     model = kind(**GOOD, **more)
     assert isinstance(model, HysteresisModel)
     assert model.operators == 3
@@ -57,12 +56,10 @@ def test_admissible_parameters_are_taken(kind, more):
     ({"output_range_um": (5.0, -5.0)}, "the second value must be above the first: [5.0, -5.0]"),
 ])  # fmt: skip
 def test_each_condition_of_the_plays_is_named(kind, more, change, message):
-    """Weights, thresholds, lengths, ranges: the condition, the index and the value are named."""
     assert message in broken(kind, **{**GOOD, **more, **change})
 
 
 def test_all_broken_conditions_are_named_at_once():
-    """One error lists every condition and every index, not the first."""
     text = broken(RdpiModel, direct=-1.0, weights=(-1.0, 0.1, -2.0), thresholds=(0.2, 0.1))
     for part in ("3 for 2", "a_0 must be", "a_1 must be", "a_3 must be", "r_2 = 0.1 after 0.2"):
         assert part in text
@@ -77,39 +74,19 @@ def test_all_broken_conditions_are_named_at_once():
     "place", ["direct", "weights", "thresholds", "gamma_s", "output_offset_um"]
 )
 def test_numbers_must_be_finite(place, value):
-    """NaN and the infinities are refused wherever a number stands."""
     given = (value, 0.1, 0.2) if place in {"weights", "thresholds"} else value
     text = broken(RdpiModel, **{**GOOD, place: given})
     assert place in text
     assert "finite number" in text
 
 
-def test_growth_must_not_be_negative():
-    """Gamma below 0 would let thresholds shrink with the rate."""
-    assert "greater than or equal to 0" in broken(RdpiModel, **GOOD, gamma_s=-1e-6)
-
-
-def test_numbers_are_not_guessed_from_text():
-    """Text, true and None are no numbers."""
-    for value in ("1.0", True, None):
-        assert "valid number" in broken(PpiModel, **{**GOOD, "direct": value})
-
-
 @pytest.mark.parametrize(("direct", "weights", "thresholds"), [
     (1e308, (1e308,), (1.0,)), (5e-324, (1.0,), (1.0,)), (1.0, (1.0, 1.0), (1e308, 1.5e308)),
 ])  # fmt: skip
 def test_plays_beyond_the_range_of_numbers_have_no_inverse(direct, weights, thresholds):
-    """Where the inverse's numbers overflow, it is refused, not handed out as infinities."""
     model = RdpiModel(direct=direct, weights=weights, thresholds=thresholds)
     with pytest.raises(ModelError, match="too large or too small"):
         model.inverse(1_000.0)
-
-
-def test_models_do_not_change():
-    """Parameters are frozen."""
-    model = PpiModel(**GOOD)
-    with pytest.raises(ValidationError, match="frozen"):
-        model.direct = 2.0
 
 
 SAMPLE_RATE_HZ = 10_000.0
@@ -129,26 +106,13 @@ MODELS = {
         ),
     ),
 }
-SIGNAL = 3.0 * np.sin(np.arange(500) / 30.0) + 0.4 * np.sin(np.arange(500) / 3.0)
-
-
-@pytest.fixture(params=MODELS)
-def model(request):
-    """One model of each kind."""
-    return MODELS[request.param]
-
-
-@pytest.fixture(params=["forward", "inverse"])
-def make(request, model):
-    """A maker of that model's operator, forward or inverse."""
-    return lambda: getattr(model, request.param)(SAMPLE_RATE_HZ)
 
 
 def test_only_the_rate_dependent_models_know_the_sample_rate():
-    """A PPI does the same at every sample rate; the others don't, the inverse included."""
+    signal = 3.0 * np.sin(np.arange(500) / 30.0) + 0.4 * np.sin(np.arange(500) / 3.0)
     for name, model in MODELS.items():
         for make in (model.forward, model.inverse):
-            same = np.array_equal(make(1_000.0).process(SIGNAL), make(9_000.0).process(SIGNAL))
+            same = np.array_equal(make(1_000.0).process(signal), make(9_000.0).process(signal))
             assert same == (name == "ppi")
 
 
@@ -160,7 +124,6 @@ def test_inverse_rate_is_scaled_to_the_command():
         assert MODELS[name].inverse_rate_gain(SAMPLE_RATE_HZ) == pytest.approx(gain, rel=1e-14)
 
 
-SAMPLE_RATE_HZ_spi = 50_000.0
 SPI_DIRECT = 2.146
 SPI_THRESHOLDS = (
     0.9108, 1.9418, 3.0797, 4.3122, 5.6285, 7.0194, 8.4762, 9.9915, 11.5587, 13.1716,
@@ -170,27 +133,16 @@ SPI_WEIGHTS = (
 )  # fmt: skip
 
 
-def sine(amplitude, frequency_hz, cycles=3):
-    n = round(cycles * SAMPLE_RATE_HZ_spi / frequency_hz)
-    return amplitude * np.sin(2 * np.pi * frequency_hz * np.arange(n) / SAMPLE_RATE_HZ_spi)
-
-
 def spi(ppi):
     """Return the same PPI, compensated by stops."""
     return SpiModel(**ppi.model_dump(exclude={"kind"}))
 
 
-def test_spi_direct_weight_from_the_published_ppi():
-    """w_0 from the published PPI is the published one."""
-    assert spi(piezo_ppi()).stop_parameters()[0] == pytest.approx(SPI_DIRECT, abs=0.002)
-
-
-@pytest.mark.parametrize("i", range(10))
-def test_spi_from_the_published_ppi(i):
-    """Each threshold and weight is the published one, within its inputs' rounding."""
-    _, weights, thresholds = spi(piezo_ppi()).stop_parameters()
-    assert thresholds[i] == pytest.approx(SPI_THRESHOLDS[i], abs=0.002)
-    assert weights[i] == pytest.approx(SPI_WEIGHTS[i], abs=0.002)
+def test_spi_from_the_published_ppi():
+    direct, weights, thresholds = spi(piezo_ppi()).stop_parameters()
+    assert direct == pytest.approx(SPI_DIRECT, abs=0.002)
+    np.testing.assert_allclose(thresholds, SPI_THRESHOLDS, rtol=0.0, atol=0.002)
+    np.testing.assert_allclose(weights, SPI_WEIGHTS, rtol=0.0, atol=0.002)
 
 
 def test_spi_weights_solve_the_published_equations():
@@ -210,14 +162,13 @@ def test_spi_is_the_inverse_ppi(seed):
     rng = np.random.default_rng(seed)
     y = 12.0 * rng.uniform(-1.0, 1.0, 400).repeat(3) + 0.3 * rng.standard_normal(1_200)
     ppi = piezo_ppi().model_copy(update={"output_offset_um": 1.5 * (seed % 2)})
-    by_stops = spi(ppi).inverse(SAMPLE_RATE_HZ_spi).process(y)
-    by_plays = ppi.inverse(SAMPLE_RATE_HZ_spi).process(y)
+    by_stops = spi(ppi).inverse(SAMPLE_RATE_HZ).process(y)
+    by_plays = ppi.inverse(SAMPLE_RATE_HZ).process(y)
     assert np.max(np.abs(by_stops - by_plays)) <= 1e-12 * np.max(np.abs(by_plays))
 
 
 def test_spi_of_a_model_without_hysteresis_is_a_gain():
-    """No plays, no stops: the compensator divides by p_0."""
     ppi = piezo_ppi().model_copy(update={"weights": (), "thresholds": ()})
-    y = sine(3.0, 50.0)
-    command = spi(ppi).inverse(SAMPLE_RATE_HZ_spi).process(y)
+    y = 3.0 * np.sin(np.arange(500) / 30.0)
+    command = spi(ppi).inverse(SAMPLE_RATE_HZ).process(y)
     np.testing.assert_allclose(command, y / 0.2567, rtol=1e-15)

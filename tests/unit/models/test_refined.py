@@ -56,7 +56,6 @@ def test_round_trip_gives_the_same_model(name):
 
 @pytest.mark.parametrize("name", BASES)
 def test_forward_of_the_inverse_is_the_reference(name):
-    """As well as the base's own does: what is added is undone exactly."""
     base = BASES[name]
     model = RefinedModel.of(base, residual(), 0.4)
     reference = sine() + rest_um(base)
@@ -73,7 +72,6 @@ def test_forward_of_the_inverse_is_the_reference(name):
 
 
 def test_at_rest_it_stands_where_its_base_does_and_its_own_offset_further():
-    """An offset is no hysteresis: it has a number of its own."""
     base = BASES["with an offset"]
     model = RefinedModel.of(base, residual(), 0.4)
     rest = model.forward(RATE_HZ).process(np.zeros(4))
@@ -98,7 +96,6 @@ def test_feedback_finds_the_resonance_where_the_base_has_one():
 @pytest.mark.parametrize("name", BASES)
 @pytest.mark.parametrize("direction", ["forward", "inverse"])
 def test_a_state_that_is_restored_goes_on_with_the_same_bits(name, direction):
-    """All of it, that of the base's own stages too: a run replays from such states."""
     model = RefinedModel.of(BASES[name], residual(), 0.4)
     signal = sine() if direction == "inverse" else 0.2 * sine()
     operator, other = (getattr(model, direction)(RATE_HZ) for _ in range(2))
@@ -133,7 +130,6 @@ def test_a_unit_of_its_own_is_refused():
 
 @pytest.mark.parametrize("seed", range(4))
 def test_least_slope_is_below_every_slope_that_a_walk_meets(seed):
-    """A certificate that a walk could beat would be none."""
     operator = residual(scale=2.0)
     rng = np.random.default_rng(seed)
     walk = np.cumsum(rng.choice([-1.0, 1.0], 400) * rng.exponential(6.0, 400))

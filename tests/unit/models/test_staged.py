@@ -8,9 +8,8 @@ from hilctl.base.errors import ModelError
 from hilctl.models.base import Provenance
 from hilctl.models.integrated import exponential_integrated
 from hilctl.models.linear_stages import CreepModel, FirstMode, FurtherMode, smoothing_weights
-from hilctl.models.model_file import dump_model, parse_model
 from hilctl.models.staged import FieldLag, StagedModel
-from tests.published import piezo_ppi, terfenol_rdpi
+from tests.published import piezo_ppi
 
 RATE_HZ = 50_000.0
 LAG = FieldLag(tau_s=1e-4, growth_per_unit=0.28)
@@ -56,16 +55,7 @@ def ahead(reference, preview):
     return np.concatenate((reference[preview:], np.full(preview, reference[-1])))
 
 
-@pytest.mark.parametrize("name", STAGES)
-def test_round_trip_gives_the_same_model(name):
-    """Dumped and read back, a staged model is equal to itself, its stages' kinds included."""
-    for hysteresis in (OMEGA, piezo_ppi(), terfenol_rdpi()):
-        model = StagedModel.around(hysteresis, **STAGES[name])
-        assert parse_model("text", dump_model(model)) == model
-
-
 def test_around_takes_over_unit_ranges_and_provenance():
-    """What the hysteresis said of itself is said of the whole, and in one place only."""
     source = Provenance(source=("run.mcap",))
     inner = piezo_ppi().model_copy(
         update={"input_range": (0.0, 5.0), "output_range_um": (-1.0, 9.0), "provenance": source}
@@ -82,17 +72,11 @@ def test_around_takes_over_unit_ranges_and_provenance():
     ({"hysteresis": piezo_ppi()}, "hysteresis.input_unit must be A"),
     ({"hysteresis": OMEGA.model_copy(update={"input_range": (0.0, 1.0)})},
      "hysteresis.input_range must be"),
-    ({"lag": {"tau_s": 0.0}}, "greater than 0"),
-    ({"lag": {"tau_s": 1e-4, "growth_per_unit": -0.1}}, "greater than or equal to 0"),
-    ({"structure": {"natural_hz": 0.0, "damping_ratio": 0.1}}, "greater than 0"),
-    ({"structure": {"natural_hz": 100.0, "damping_ratio": 0.0}}, "greater than 0"),
     ({"modes": ({**MODE.model_dump(), "damping_ratio": 0.0},)}, "greater than 0"),
     ({"modes": (MODE,) * 9}, "at most 8 items"),
     ({"delay_s": -1e-6}, "greater than or equal to 0"),
-    ({"delay_s": float("nan")}, "finite number"),
 ])  # fmt: skip
 def test_conditions_are_named(change, message):
-    """Every broken condition is refused with its name."""
     with pytest.raises(ValidationError, match=message):
         StagedModel.model_validate({"hysteresis": OMEGA, **change})
 
@@ -114,7 +98,6 @@ def test_inverse_undoes_the_model(name, frequency_hz):
 
 
 def test_model_answers_later_than_its_input():
-    """No command shows in the displacement sampled when it is put out, nor before the delay."""
     step = np.zeros(40)
     step[10:] = 2.0
     stages = (
@@ -131,7 +114,6 @@ def test_model_answers_later_than_its_input():
 
 
 def test_offsets_of_hysteresis_and_whole_add_up():
-    """Both offsets are undone, and a constant reference is met from the start."""
     inner = OMEGA.model_copy(update={"output_offset_um": 4.0})
     model = StagedModel.around(inner, **STAGES["all"]).model_copy(update={"output_offset_um": -1.5})
     command = model.inverse(RATE_HZ).process(np.full(60, 2.5))
@@ -164,7 +146,6 @@ def test_structure_s_inverse_asks_for_little_more_than_it_is_given():
 
 
 def test_state_goes_back_and_another_model_s_is_refused():
-    """The chain's memory is one array: copied, given back, and checked for its size."""
     operator = StagedModel.around(OMEGA, **STAGES["all"]).inverse(RATE_HZ)
     reference = sine(250.0, 400)
     operator.process(reference[:150])

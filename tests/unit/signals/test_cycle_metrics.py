@@ -40,7 +40,6 @@ def crossing_gap(u: F64, y: F64, level: float) -> float:
 class TestFold:
     @pytest.mark.parametrize("period", PERIODS)
     def test_average_of_a_repeating_signal_lies_on_its_cycle(self, period: float) -> None:
-        """Whatever the period, bin means follow the cycle they were taken from."""
         index = np.arange(int(period * 6), dtype=np.int64)
         signal = np.sin(2.0 * np.pi * index / period)
         folded = cycle_metrics.fold(index, period, [signal])
@@ -52,7 +51,6 @@ class TestFold:
         assert np.abs(folded.signals[0] - expected).max() <= (2.0 * np.pi / bins) ** 2 / 8 + 1e-12
 
     def test_whole_period_keeps_each_phase_by_itself(self) -> None:
-        """With one bin a sample of the period, samples of one phase are never torn apart."""
         for period in (200, 333, 777, 999):
             index = np.arange(5 * period, dtype=np.int64)
             cycle = np.random.default_rng(period).normal(size=period)
@@ -61,7 +59,6 @@ class TestFold:
             np.testing.assert_allclose(folded.signals[0], cycle, rtol=1e-12)
 
     def test_signals_stay_paired(self) -> None:
-        """A straight relation between two signals survives folding, lost samples and all."""
         rng = np.random.default_rng(1)
         index = np.sort(rng.choice(20_000, 7_000, replace=False)).astype(np.int64)
         x = np.sin(2.0 * np.pi * index / 333.3) + rng.normal(size=index.size)
@@ -69,7 +66,6 @@ class TestFold:
         np.testing.assert_allclose(folded.signals[1], 3.0 * folded.signals[0] - 2.0, atol=1e-12)
 
     def test_samples_that_are_not_finite_are_left_out_of_all_signals(self) -> None:
-        """One NaN takes its whole sample out, and nothing else."""
         index = np.arange(400, dtype=np.int64)
         x, y = np.ones(400), np.full(400, 2.0)
         x[7], y[50] = np.nan, np.inf
@@ -79,7 +75,6 @@ class TestFold:
         assert set(folded.signals[1]) == {2.0}
 
     def test_empty_bins_are_dropped_and_a_hole_is_told(self) -> None:
-        """A bin or two may be missing; a twentieth of the cycle may not."""
         index = np.arange(1000, dtype=np.int64)
         for lost, whole in ((1, True), (40, True), (60, False), (500, False)):
             kept = index[index % 1000 >= lost]
@@ -88,7 +83,6 @@ class TestFold:
             assert folded.whole is whole
 
     def test_nothing_finite_folds_to_nothing(self) -> None:
-        """A signal of NaN gives an average cycle without bins, which is not whole."""
         folded = cycle_metrics.fold(np.arange(100, dtype=np.int64), 50.0, [np.full(100, np.nan)])
         assert folded.phase.size == 0
         assert not folded.whole
@@ -122,7 +116,6 @@ class TestPeakHysteresis:
         assert cycle_metrics.peak_hysteresis_percent(u, y) == pytest.approx(100.0, rel=1e-6)
 
     def test_is_the_same_either_way_round_and_from_any_start(self) -> None:
-        """Direction of travel and the phase at which the cycle begins make no difference."""
         u = triangle(6.0, 1200)
         y = steady_play(u, 1.0, 2.0, 1.5)
         expected = cycle_metrics.peak_hysteresis_percent(u, y)
@@ -133,7 +126,6 @@ class TestPeakHysteresis:
             assert rolled == pytest.approx(expected)
 
     def test_does_not_see_what_is_a_function_of_the_input(self) -> None:
-        """Saturation moves both branches alike: the gap keeps its height and place."""
         t = 2.0 * np.pi * np.arange(500) / 500
         u, y = np.sin(t), np.sin(t - 0.2)
         plain, bent = (
@@ -147,7 +139,6 @@ class TestPeakHysteresis:
 
     @pytest.mark.parametrize(("first", "third"), [(4.0, 3.0), (3.0, 4.0)])
     def test_minor_loops_take_in_all_pairs_of_branches(self, first: float, third: float) -> None:
-        """On a complex harmonic input the gap is that found by looking at every crossing."""
         t = 2.0 * np.pi * np.arange(600) / 600
         u = first * np.sin(t) + third * np.sin(3.0 * t)
         y = steady_play(u, 1.0, 2.0, 1.1) + steady_play(u, 0.5, 1.0, 2.3)
@@ -160,7 +151,6 @@ class TestPeakHysteresis:
         assert found.height == pytest.approx(crossing_gap(u, y, found.at_input), rel=1e-9)
 
     def test_input_that_stands_still_goes_on_with_its_branch(self) -> None:
-        """A clipped input does not make branches of its own, and none is lost."""
         t = 2.0 * np.pi * np.arange(1000) / 1000
         u = np.clip(np.sin(t), -0.8, 0.8)
         y = np.sin(t - 0.2)
@@ -181,14 +171,12 @@ class TestPeakHysteresis:
         assert gap.at_input == 1.0
 
     def test_straight_line_has_none(self) -> None:
-        """Output that follows its input has no hysteresis beyond rounding."""
         u = np.sin(2.0 * np.pi * np.arange(777) / 777)
         assert cycle_metrics.peak_hysteresis_percent(u, 7.0 * u - 3.0) == pytest.approx(
             0.0, abs=1e-10
         )
 
     def test_no_meaning_gives_none(self) -> None:
-        """An input or an output that stands still, or three points, make no loop."""
         wave = np.sin(np.arange(10.0))
         assert cycle_metrics.peak_hysteresis_percent(np.ones(10), wave) is None
         assert cycle_metrics.peak_hysteresis_percent(wave, np.ones(10)) is None
@@ -210,7 +198,6 @@ class TestLoopArea:
         assert area == pytest.approx(2.0 * 4.0 * 1.5 * 4.5, rel=1e-12)
 
     def test_figure_of_eight_cancels(self) -> None:
-        """Lobes run through opposite ways count against each other."""
         t = 2.0 * np.pi * np.arange(1000) / 1000
         assert cycle_metrics.loop_area(np.sin(t), np.sin(2.0 * t)) == pytest.approx(0.0, abs=1e-12)
 
@@ -224,7 +211,6 @@ def test_peak_and_rms_include_the_offset() -> None:
 
 
 def test_percent_of_nothing_is_none() -> None:
-    """A share of a stroke of 0 has no meaning."""
     assert cycle_metrics.percent(1.0, 0.0) is None
     assert cycle_metrics.percent(1.0, 4.0) == 25.0
 
@@ -255,7 +241,6 @@ def test_shortest_period_still_passes_for_smooth() -> None:
 
 
 def test_spikes_corners_and_gaps_do_not_count() -> None:
-    """Outliers, a triangle's corners, NaN and missing samples leave the estimate where it was."""
     rng = np.random.default_rng(5)
     index = np.arange(60_000, dtype=np.int64)
     reading = 40.0 * np.abs((index / 1000) % 2.0 - 1.0) + rng.normal(0.0, NOISE_UM, index.size)
@@ -267,13 +252,11 @@ def test_spikes_corners_and_gaps_do_not_count() -> None:
 
 
 def test_joins_across_gaps_are_not_noise() -> None:
-    """A jump of the index between steps of the signal leaves a clean signal clean."""
     index = np.concatenate([np.arange(20) + 1000 * k for k in range(50)]).astype(np.int64)
     assert cycle_metrics.sensor_noise_um(index, index * 1.0) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_too_few_samples_give_none() -> None:
-    """No estimate from a handful of windows, nor from windows that all have a gap."""
     few = np.arange(30, dtype=np.int64)
     assert cycle_metrics.sensor_noise_um(few, few * 1.0) is None
     gappy = 2 * np.arange(1000, dtype=np.int64)
@@ -307,6 +290,5 @@ def test_floor_is_what_a_straight_line_shows(period: float, cycles: int) -> None
 
 
 def test_floor_of_no_stroke_or_no_bins_is_none() -> None:
-    """A share of nothing has no meaning."""
     assert cycle_metrics.noise_floor_percent(NOISE_UM, np.ones(10, dtype=np.int64), 0.0) is None
     assert cycle_metrics.noise_floor_percent(NOISE_UM, np.empty(0, dtype=np.int64), 83.0) is None

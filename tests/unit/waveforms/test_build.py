@@ -13,7 +13,7 @@ from hilctl.base.segments import Segment
 from hilctl.base.types import chunks
 from hilctl.waveforms import build as module
 from hilctl.waveforms import shapes
-from hilctl.waveforms.build import Reference, RepeatedPart, build, telling
+from hilctl.waveforms.build import Reference, RepeatedPart, build
 from hilctl.waveforms.spec import Hold
 
 Made = Callable[..., Reference]
@@ -25,10 +25,7 @@ def raised_cosine(x: float) -> float:
 
 
 class TestSoft:
-    """Soft starts and ends."""
-
     def test_envelope(self, made: Made) -> None:
-        """A soft waveform is 0 at both ends, and between them as if there were no softness."""
         hard = made(1000.0, **SINE, offset=3.0, duration_s=1.0).values
         soft = made(1000.0, **SINE, offset=3.0, duration_s=1.0, soft_start_s=0.2, soft_end_s=0.3)
         values = soft.values
@@ -41,7 +38,6 @@ class TestSoft:
         np.testing.assert_allclose(values[700:], shrink * hard[700:], rtol=0.0, atol=1e-12)
 
     def test_from_and_to_where_the_actuator_rests(self, made: Made) -> None:
-        """A safe value that is not 0 is left and reached without a step."""
         keys = {**SINE, "offset": 40.0, "duration_s": 1.0}
         hard = made(1000.0, **keys).values
         soft = made(1000.0, **keys, rest=50.0, soft_start_s=0.2, soft_end_s=0.3).values
@@ -51,7 +47,6 @@ class TestSoft:
         np.testing.assert_allclose(soft[:200], 50.0 + grow * (hard[:200] - 50.0), atol=1e-12)
 
     def test_offset_is_softened_too(self, made: Made) -> None:
-        """A held level grows from 0 and shrinks to 0 without a step, and never overshoots."""
         keys = {"kind": "hold", "level": 2.0, "offset": -7.0, "duration_s": 1.0}
         values = made(1000.0, **keys, soft_start_s=0.5, soft_end_s=0.5).values
         assert values[0] == 0.0
@@ -63,12 +58,10 @@ class TestSoft:
         assert np.all(np.diff(values[500:]) > 0.0)
 
     def test_segment_leaves_soft_parts_out(self, made: Made) -> None:
-        """The steady part lies between soft start and soft end."""
         reference = made(1000.0, **SINE, duration_s=1.0, soft_start_s=0.2, soft_end_s=0.3)
         assert reference.segments == (Segment("sine 6 A 10 Hz", 0, 1000, 200, 700, 100.0),)
 
     def test_halves_of_an_odd_number_of_samples(self, made: Made) -> None:
-        """Soft start and end that fill the duration fit, however the samples round."""
         keys = {"soft_start_s": 0.5, "soft_end_s": 0.5}
         reference = made(1003.0, **SINE, duration_s=1.0, **keys)
         segment = reference.segments[0]
@@ -84,8 +77,6 @@ class TestSoft:
 
 
 class TestSequence:
-    """Waveforms one after the other."""
-
     PARTS: tuple[dict[str, Any], ...] = (
         {**SINE, "duration_s": 0.5, "soft_start_s": 0.1},
         {"kind": "hold", "level": 2.0, "duration_s": 0.2},
@@ -93,7 +84,6 @@ class TestSequence:
     )
 
     def test_is_its_parts_one_after_the_other(self, made: Made) -> None:
-        """The samples of a sequence are those of its parts, repeated as often as asked."""
         alone = np.concatenate([made(1000.0, **part).values for part in self.PARTS])
         once = made(1000.0, kind="sequence", parts=self.PARTS)
         thrice = made(1000.0, kind="sequence", parts=self.PARTS, repeat=3)
@@ -101,7 +91,6 @@ class TestSequence:
         np.testing.assert_array_equal(thrice.values, np.tile(alone, 3))
 
     def test_segments_stand_where_their_parts_do(self, made: Made) -> None:
-        """Each part is a segment of its own, steady part and period included."""
         reference = made(1000.0, kind="sequence", unit="A", parts=self.PARTS, repeat=2)
         one = (
             Segment("sine 6 A 10 Hz", 0, 500, 100, 500, 100.0),
@@ -111,7 +100,6 @@ class TestSequence:
         assert reference.segments == one + tuple(each.shifted(1000) for each in one)
 
     def test_time_starts_anew_in_each_part(self, made: Made) -> None:
-        """The second of two equal sines starts at its own phase 0, mid-cycle cuts or not."""
         part = {**SINE, "duration_s": 0.13}
         values = made(1000.0, kind="sequence", parts=(part, part)).values
         np.testing.assert_array_equal(values[130:], values[:130])
@@ -124,43 +112,20 @@ LABELS: list[tuple[dict[str, Any], str, float]] = [
     ({**SINE, "frequency_hz": 3.0, "duration_s": 1.0}, "sine 6 A 3 Hz", 1000.0 / 3.0),
     ({**SINE, "kind": "growing", "duration_s": 1.0}, "growing 6 A 10 Hz", 0.0),
     ({**SINE, "kind": "decaying", "duration_s": 1.0}, "decaying 6 A 10 Hz", 0.0),
-    (
-        {
-            "kind": "complex_harmonic",
-            "components": (
-                {"amplitude": 4.0, "frequency_hz": 2.5},
-                {"amplitude": 3.0, "frequency_hz": 7.5},
-            ),
-            "duration_s": 1.0,
-        },
-        "complex harmonic 4 A 2.5 Hz + 3 A 7.5 Hz",
-        400.0,
-    ),
-    (
-        {"kind": "chirp", "amplitude": 2.0, "start_hz": 1.0, "stop_hz": 50.0, "duration_s": 1.0},
-        "chirp 2 A 1-50 Hz",
-        0.0,
-    ),
+    ({"kind": "complex_harmonic", "duration_s": 1.0, "components": (
+        {"amplitude": 4.0, "frequency_hz": 2.5}, {"amplitude": 3.0, "frequency_hz": 7.5})},
+     "complex harmonic 4 A 2.5 Hz + 3 A 7.5 Hz", 400.0),
+    ({"kind": "chirp", "amplitude": 2.0, "start_hz": 1.0, "stop_hz": 50.0, "duration_s": 1.0},
+     "chirp 2 A 1-50 Hz", 0.0),
     ({"kind": "step", "levels": (1.0, 2.0), "dwell_s": 0.5}, "step", 0.0),
     ({"kind": "hold", "level": -2.5, "duration_s": 1.0}, "hold -2.5 A", 0.0),
-    (
-        {
-            "kind": "multisine",
-            "amplitude": 3.0,
-            "first_hz": 15.0,
-            "last_hz": 45.0,
-            "step_hz": 10.0,
-            "duration_s": 1.0,
-        },
-        "multisine 3 A 15-45 Hz",
-        200.0,
-    ),
-]
+    ({"kind": "multisine", "amplitude": 3.0, "first_hz": 15.0, "last_hz": 45.0, "step_hz": 10.0,
+      "duration_s": 1.0}, "multisine 3 A 15-45 Hz", 200.0),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("keys", "label", "period"), LABELS, ids=[case[1] for case in LABELS])
 def test_label_and_period(made: Made, keys: dict[str, Any], label: str, period: float) -> None:
-    """A segment says what runs there; its period is that of the samples."""
     reference = made(1000.0, **keys)
     segment = reference.segments[0]
     assert segment.label == label
@@ -174,91 +139,53 @@ def test_label_and_period(made: Made, keys: dict[str, Any], label: str, period: 
 
 
 def test_period_too_long_to_count_is_none(made: Made) -> None:
-    """A waveform that would repeat only after longer than a float can hold has no period."""
     reference = made(1000.0, kind="sine", amplitude=1.0, frequency_hz=1e-320, duration_s=0.1)
     assert reference.segments[0].period == 0.0
     assert reference.segments[0].steady_cycles() == (0, 100, 0)
 
 
 SAME: dict[str, Any] = {"amplitude": 1.0, "duration_s": 1.0}
+NYQUIST = "{}: every frequency must be below half the sample rate, 500 Hz: {} Hz"
+SOFT_S = "{}: soft_start_s + soft_end_s = {} s must fit in its {} s"
+LENGTH = (
+    "has {} samples, more than the 100000000 that fit in memory: shorten it, or lower "
+    "sample_rate_hz"
+)
 REFUSED: list[tuple[dict[str, Any], str]] = [
-    (
-        {"kind": "sine", "frequency_hz": 500.5, **SAME},
-        "sine: every frequency must be below half the sample rate, 500 Hz: 500.5 Hz",
-    ),
-    (
-        {"kind": "triangle", "frequency_hz": 500.0, **SAME},
-        "triangle: every frequency must be below half the sample rate, 500 Hz: 500 Hz",
-    ),
-    (
-        {"kind": "chirp", "start_hz": 1.0, "stop_hz": 600.0, **SAME},
-        "chirp: every frequency must be below half the sample rate, 500 Hz: 600 Hz",
-    ),
-    (
-        {"kind": "chirp", "start_hz": 600.0, "stop_hz": 1.0, **SAME},
-        "chirp: every frequency must be below half the sample rate, 500 Hz: 600 Hz",
-    ),
-    (
-        {"kind": "multisine", "first_hz": 1.0, "last_hz": 501.0, "step_hz": 1.0, **SAME},
-        "multisine: every frequency must be below half the sample rate, 500 Hz: 501 Hz",
-    ),
-    (
-        {
-            "kind": "complex_harmonic",
-            "duration_s": 1.0,
-            "components": (
-                {"amplitude": 1.0, "frequency_hz": 10.0},
-                {"amplitude": 1.0, "frequency_hz": 700.0},
-            ),
-        },
-        "complex_harmonic: every frequency must be below half the sample rate, 500 Hz: 700 Hz",
-    ),
-    (
-        {**SINE, "duration_s": 1.0, "soft_start_s": 0.7, "soft_end_s": 0.4},
-        "sine: soft_start_s + soft_end_s = 1.1 s must fit in its 1 s",
-    ),
-    (
-        {**SINE, "duration_s": 1.0, "soft_start_s": 0.501, "soft_end_s": 0.5},
-        "sine: soft_start_s + soft_end_s = 1.001 s must fit in its 1 s",
-    ),
-    (
-        {**SINE, "duration_s": 1.0, "soft_start_s": 1e308, "soft_end_s": 1e308},
-        "sine: soft_start_s + soft_end_s = inf s must fit in its 1 s",
-    ),
-    (
-        {"kind": "step", "levels": (1.0,) * 5, "dwell_s": 0.1, "soft_end_s": 0.6},
-        "step: soft_start_s + soft_end_s = 0.6 s must fit in its 0.5 s",
-    ),
-    (
-        {"kind": "random", "amplitude": 1.0, "first_hz": 1, "last_hz": 2, "duration_s": 100_001.0},
-        "has 100001000 samples, more than the 100000000 that fit in memory: shorten it, or "
-        "lower sample_rate_hz",
-    ),
-    (
-        {**SINE, "duration_s": 1e308},
-        "has inf samples, more than the 100000000 that fit in memory: shorten it, or lower "
-        "sample_rate_hz",
-    ),
-    (
-        {**SINE, "amplitude": 1.7e308, "offset": 1.7e308, "duration_s": 1.0, "soft_start_s": 0.1},
-        "amplitude, offset or scale is too large: a value is not finite",
-    ),
-]
+    ({"kind": "sine", "frequency_hz": 500.5, **SAME}, NYQUIST.format("sine", "500.5")),
+    ({"kind": "triangle", "frequency_hz": 500.0, **SAME}, NYQUIST.format("triangle", "500")),
+    ({"kind": "chirp", "start_hz": 1.0, "stop_hz": 600.0, **SAME}, NYQUIST.format("chirp", "600")),
+    ({"kind": "chirp", "start_hz": 600.0, "stop_hz": 1.0, **SAME}, NYQUIST.format("chirp", "600")),
+    ({"kind": "multisine", "first_hz": 1.0, "last_hz": 501.0, "step_hz": 1.0, **SAME},
+     NYQUIST.format("multisine", "501")),
+    ({"kind": "complex_harmonic", "duration_s": 1.0, "components": (
+        {"amplitude": 1.0, "frequency_hz": 10.0}, {"amplitude": 1.0, "frequency_hz": 700.0})},
+     NYQUIST.format("complex_harmonic", "700")),
+    ({**SINE, "duration_s": 1.0, "soft_start_s": 0.7, "soft_end_s": 0.4},
+     SOFT_S.format("sine", "1.1", "1")),
+    ({**SINE, "duration_s": 1.0, "soft_start_s": 0.501, "soft_end_s": 0.5},
+     SOFT_S.format("sine", "1.001", "1")),
+    ({**SINE, "duration_s": 1.0, "soft_start_s": 1e308, "soft_end_s": 1e308},
+     SOFT_S.format("sine", "inf", "1")),
+    ({"kind": "step", "levels": (1.0,) * 5, "dwell_s": 0.1, "soft_end_s": 0.6},
+     SOFT_S.format("step", "0.6", "0.5")),
+    ({"kind": "random", "amplitude": 1.0, "first_hz": 1, "last_hz": 2, "duration_s": 100_001.0},
+     LENGTH.format("100001000")),
+    ({**SINE, "duration_s": 1e308}, LENGTH.format("inf")),
+    ({**SINE, "amplitude": 1.7e308, "offset": 1.7e308, "duration_s": 1.0, "soft_start_s": 0.1},
+     "amplitude, offset or scale is too large: a value is not finite"),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("keys", "text"), REFUSED)
 def test_refused(made: Made, keys: dict[str, Any], text: str) -> None:
-    """What can't be sampled is refused with the numbers that say why."""
     with pytest.raises(InputError) as caught:
         made(1000.0, **keys)
     assert str(caught.value) == text
 
 
 class TestSequenceRefused:
-    """Parts of a sequence that can't be sampled."""
-
     def test_the_part_is_named(self, made: Made) -> None:
-        """The message says which part, counted as in the file's key."""
         parts = ({**SINE, "duration_s": 1.0}, {**SINE, "frequency_hz": 900.0, "duration_s": 1.0})
         with pytest.raises(InputError, match=r"^parts\.1 \(sine\): every frequency .*: 900 Hz$"):
             made(1000.0, kind="sequence", parts=parts)
@@ -266,7 +193,6 @@ class TestSequenceRefused:
     def test_length_counts_repeats_before_anything_is_repeated(
         self, made: Made, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        """A sequence too long by its repeats is refused; one that just fits is built."""
         monkeypatch.setattr(shapes, "MAX_SAMPLES", 6000)
         parts = ({**SINE, "duration_s": 1.0},) * 2
         assert made(1000.0, kind="sequence", parts=parts, repeat=3).values.size == 6000
@@ -277,7 +203,6 @@ class TestSequenceRefused:
 
 
 def test_unit_is_needed() -> None:
-    """Without a unit nobody knows what the numbers are."""
     with pytest.raises(InputError, match="unit is required"):
         build(Hold(kind="hold", level=1.0, duration_s=1.0), 1000.0, Path())
 
@@ -338,7 +263,6 @@ def test_the_same_samples_however_long(
 
 
 def test_what_repeats_is_told_by_some_of_it(made: Made, small: None) -> None:
-    """All values and steps of a long sine stand in its ends and in its first cycles."""
     long = made(1000.0, **WAVES[0] | {"duration_s": 1000.0}, **SOFT)
     told = np.concatenate([*chunks(long.values, long.telling)])
     assert told.size < 5000 < long.values.size
@@ -349,7 +273,6 @@ def test_what_repeats_is_told_by_some_of_it(made: Made, small: None) -> None:
 
 
 def test_a_repeated_sequence_is_told_by_one_of_it(made: Made, small: None) -> None:
-    """And by the way from its end to its beginning."""
     sequence = waveforms()[-1] | {"repeat": 50}
     long = made(1000.0, **sequence)
     first = long.telling[0]
@@ -359,23 +282,8 @@ def test_a_repeated_sequence_is_told_by_one_of_it(made: Made, small: None) -> No
 
 
 def test_what_does_not_repeat_is_told_by_all_of_it(made: Made, small: None) -> None:
-    """So is what a file says of its own period."""
     chirp = made(1000.0, **WAVES[4])
     assert chirp.telling == (slice(0, 4000),)
-
-
-def test_telling_parts() -> None:
-    """Nothing twice, nothing left out but the middle of what repeats."""
-    n, chunk = 10**9, types.CHUNK
-    (all_of_it,) = telling(n, ())
-    assert (all_of_it.start, all_of_it.stop) == (0, n)
-    two = (RepeatedPart(100, 4 * 10**8, 500.0), RepeatedPart(5 * 10**8, n, 1e7 / 3.0))
-    first, second, last = telling(n, two)
-    assert (first.start, first.stop) == (0, 100 + chunk + 500)
-    assert second.start == 4 * 10**8 - chunk
-    assert second.stop == 5 * 10**8 + chunk + -(-8 * 10**7 // 3)
-    assert (last.start, last.stop) == (n - chunk, n)
-    assert telling(n, (RepeatedPart(0, chunk, 500.0),)) == (slice(0, n),)
 
 
 def test_a_value_that_is_none_is_refused_wherever_it_is(made: Made, small: None) -> None:

@@ -59,14 +59,12 @@ class Several(StrictModel):
      ["x:1: names.A1: string should match pattern '^[a-z]+$', got 'A1'"]),
 ])  # fmt: skip
 def test_what_may_be_of_several_types(text: str, problems: list[str]) -> None:
-    """One problem a value, with every choice; the choice that was meant speaks alone."""
     with pytest.raises(ConfigError) as caught:
         Document("x", text).validate(Several)
     assert [str(each) for each in caught.value.problems] == problems
 
 
 def test_keys_and_suggestions() -> None:
-    """Dotted keys there and back, and suggestions."""
     assert dotted(("a", 0, "b")) == "a.0.b"
     assert loc_of("a.0.b") == ("a", 0, "b")
     assert loc_of("a.².b") == ("a", "²", "b")

@@ -72,13 +72,11 @@ def changed(before, after):
 
 
 def test_values_are_plain():
-    """Mappings, tuples, numbers, text and None: what pydantic's strict mode takes."""
     data = document("a: 1\nb: [1.5, x, true, null]\nc: {d: 0x10, e: 1.0e+3}\nf:\n").data
     assert data == {"a": 1, "b": (1.5, "x", True, None), "c": {"d": 16, "e": 1000.0}, "f": None}
 
 
 def test_a_good_document_becomes_a_model():
-    """All of it, lists and unions included, is built."""
     bench = document().validate(SetUp)
     assert bench.limits == Limits(peak_a=6.0, steps=(1, 2, 3))
     assert bench.parts == (Round(radius_um=2.5), Square(side_um=4.0))
@@ -89,7 +87,6 @@ def test_a_good_document_becomes_a_model():
     (("parts", 1, "side_um"), 9), (("parts", 1, "missing"), 8), (("nowhere", "at", "all"), 1),
 ])  # fmt: skip
 def test_every_value_has_its_line(loc, place):
-    """A value's line, or that of the nearest thing around it."""
     assert document().where(loc) == f"bench.yaml:{place}"
 
 
@@ -144,12 +141,10 @@ def test_every_value_has_its_line(loc, place):
      "bench.yaml:5: colours.red: must be a number, got 'x'"),
 ])  # fmt: skip
 def test_broken_rules_in_words(before, after, problem):
-    """Line, key, rule, value and hint of each kind of mistake."""
     assert problem in problems(changed(before, after))
 
 
 def test_all_problems_come_together():
-    """One error holds them all."""
     text = changed("bench", "7").replace("6.0", "x").replace("2.5", "-1").replace("4.0", "y")
     assert [line.split(": ")[:2] for line in problems(text)] == [
         ["bench.yaml:1", "name"],
@@ -160,7 +155,6 @@ def test_all_problems_come_together():
 
 
 def test_part_of_a_document():
-    """A part is validated by itself, with whole keys, and without what belongs to others."""
     first = ("parts", 0)
     assert document().validate(Round, at=first).radius_um == 2.5
     with pytest.raises(ConfigError, match=r"bench\.yaml:6: parts\.0\.kind: unknown key"):
@@ -174,7 +168,6 @@ def test_part_of_a_document():
 
 
 def test_context_reaches_the_validators():
-    """What validates a value may depend on what the caller knows."""
 
     class Named(Strict):
         name: str
@@ -193,14 +186,12 @@ def test_context_reaches_the_validators():
 
 
 def test_long_values_are_cut():
-    """A value fits on the line of its message."""
     (line,) = problems(changed("6.0", "x" * 500))
     assert len(line) < 120
     assert line.endswith("...")
 
 
 def test_duplicate_keys_are_all_named():
-    """Each key that stands twice is named with both lines."""
     text = changed("peak_a: 6.0", "peak_a: 6.0\n  peak_a: 7.0") + "name: again\n"
     assert refusal(document, text).split("\n") == [
         "bench.yaml:4: limits.peak_a: stands already at bench.yaml:3",
@@ -232,12 +223,10 @@ def test_duplicate_keys_are_all_named():
     ("a: 1\nb: 2\nc: \x07\n", "bench.yaml:3: is not readable YAML (the character U+0007 is not"),
 ])  # fmt: skip
 def test_what_is_not_plain_yaml_is_refused(text, message):
-    """Broken syntax, tags, aliases, odd keys, deep nesting: one line that says which and where."""
     assert refusal(document, text).startswith(message)
 
 
 def test_nesting_up_to_the_limit_is_read():
-    """The limit on nesting is far from what a configuration needs."""
     value = document("a: " + 31 * "[" + "1" + 31 * "]").data["a"]
     for _ in range(31):
         (value,) = value
@@ -253,14 +242,12 @@ def test_nesting_up_to_the_limit_is_read():
     pytest.param("1" + "0" * 400, float("inf"), id="400 digits"),
 ])  # fmt: skip
 def test_odd_scalars_become_text_or_numbers(text, value):
-    """Dates stay text, very long whole numbers are floats."""
     read = document(f"a: {text}\n").data["a"]
     assert read == value
     assert type(read) is type(value)
 
 
 def test_keys_are_text():
-    """Numbers, null and booleans as keys are their text."""
     assert document("1: a\nnull: b\ntrue: c\n2024-01-01: d\n").data == {
         "1": "a", "null": "b", "true": "c", "2024-01-01": "d",
     }  # fmt: skip
@@ -282,7 +269,6 @@ def test_keys_are_text():
     ("name=a=b", ("name",), "a=b"),
 ])  # fmt: skip
 def test_set_changes_one_place(assignment, loc, value):
-    """A setting reaches mappings and list items, makes new keys, and leaves the rest."""
     changed_document, data = document(), document().data
     changed_document.set(assignment)
     found = changed_document.data
@@ -294,7 +280,6 @@ def test_set_changes_one_place(assignment, loc, value):
 
 
 def test_settings_add_up():
-    """Later settings see what earlier ones made."""
     one = document()
     one.set("limits={peak_a: 1.0}")
     one.set("limits.steps=[1]")
@@ -303,7 +288,6 @@ def test_settings_add_up():
 
 
 def test_problems_of_a_setting_point_to_it():
-    """What a setting broke is reported with the setting, not with a line of the file."""
     one = document()
     for assignment in ("limits.peak_a=1_0", "parts.0={kind: round, radius: 1.0}", "colors.red=1"):
         one.set(assignment)
@@ -320,7 +304,6 @@ def test_problems_of_a_setting_point_to_it():
 
 
 def test_a_setting_forgets_the_places_it_replaces():
-    """Lines of replaced values are not used for the new ones; other lines stay."""
     one = document()
     one.set("parts=[{kind: round, radius_um: 1.0}]")
     assert one.where(("parts", 0, "radius_um")).startswith("--set parts=")
@@ -347,12 +330,10 @@ def test_a_setting_forgets_the_places_it_replaces():
      "--set limits={peak_a: 1, peak_a: 2}: limits.peak_a: stands twice"),
 ])  # fmt: skip
 def test_settings_that_cannot_be_made(assignment, message):
-    """A bad path, an unreadable value, a key twice: refused, with the setting in the message."""
     assert refusal(document().set, assignment).startswith(message)
 
 
 def test_files_are_read_or_refused(tmp_path):
-    """A file's name is in its places; what can't be read is an InputError with the path."""
     path = tmp_path / "bench.yaml"
     path.write_text(TEXT, encoding="utf-8")
     assert load_document(path).where(("limits", "peak_a")) == f"{path}:3"
