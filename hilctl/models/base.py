@@ -1,13 +1,13 @@
 """Common parts of all models: parameters with their conditions, and streaming operators."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Annotated, Any, Self, TypeAlias
 
 import numpy as np
 
 from hilctl.base.errors import ModelError
-from hilctl.base.strict import Field, StrictModel, field_validator, model_validator
+from hilctl.base.strict import CheckedModel, Field, StrictModel, field_validator, model_validator
 from hilctl.base.types import F64, CommandUnit
 from hilctl.kernels.hysteresis import rest_memory
 from hilctl.kernels.jit import compiled
@@ -179,7 +179,7 @@ class Provenance(StrictModel):
     created: str = ""
 
 
-class HysteresisModel(StrictModel, ABC):
+class HysteresisModel(CheckedModel, ABC):
     """Parameters of a model from command to displacement, and of its inverse.
 
     Attributes:
@@ -230,12 +230,6 @@ class HysteresisModel(StrictModel, ABC):
     def to_mapping(self) -> dict[str, Any]:
         """Return the parameters as plain mappings, lists and numbers, defaults left out."""
         return self.model_dump(mode="json", exclude_defaults=True, exclude_none=True)
-
-
-def refuse(problems: Iterable[str]) -> None:
-    """Raise one ValueError that names every broken condition, if any."""
-    if text := "; ".join(problems):
-        raise ValueError(text)
 
 
 def threshold_problems(name: str, thresholds: Thresholds, *, sign: int = 1) -> Iterator[str]:

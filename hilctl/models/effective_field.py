@@ -83,7 +83,7 @@ class OutputCurve(CheckedModel):
                 yield f"{name} must rise for the inverse to exist: {list(getattr(self, name))}"
 
 
-class FieldModel(CheckedModel, HysteresisModel):
+class FieldModel(HysteresisModel):
     """Plays and drags of an effective field u = w + coupling m, a curve after them, losses before.
 
     Unlike those of a sum of plays, minor loops depend on the output (curve, coupling) and, through

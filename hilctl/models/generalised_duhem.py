@@ -5,7 +5,6 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from hilctl.base.strict import CheckedModel
 from hilctl.base.types import F64
 from hilctl.kernels.generalised_duhem import Band, Losses, duhem_forward, duhem_inverse
 from hilctl.models.base import HysteresisModel, Operator, Weights
@@ -16,7 +15,7 @@ _LEAST_STEPS = 2.0  # steps of y from node to node, at least
 _NUMBERS = 3  # of the memory, before the previous input
 
 
-class GeneralisedDuhemModel(CheckedModel, HysteresisModel):
+class GeneralisedDuhemModel(HysteresisModel):
     """dy/dw = g_up(y, w - c(y)) rising, g_down(y, w - c(y)) falling; losses before it.
 
     The slope depends on position and direction only. So minor loops drift towards the anhysteretic

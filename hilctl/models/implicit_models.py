@@ -6,7 +6,7 @@ from typing import Literal, Self, TypeAlias
 
 import numpy as np
 
-from hilctl.base.strict import CheckedModel, model_validator
+from hilctl.base.strict import model_validator
 from hilctl.base.types import F64
 from hilctl.kernels.implicit_models import (
     BOUC_WEN,
@@ -25,7 +25,7 @@ PackedParameters: TypeAlias = tuple[int, Arrays]
 """Number of a model and its arrays, see :mod:`hilctl.kernels.implicit_models`."""
 
 
-class BoundedInputModel(CheckedModel, HysteresisModel):
+class BoundedInputModel(HysteresisModel):
     """A model whose inverse stays within a span of commands.
 
     Attributes:

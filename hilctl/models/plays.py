@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 
 from hilctl.base.errors import ModelError
-from hilctl.base.strict import CheckedModel, Field
+from hilctl.base.strict import Field
 from hilctl.base.types import F64
 from hilctl.kernels.hysteresis import play_sum, stop_sum
 from hilctl.models.base import (
@@ -40,7 +40,7 @@ def inverse_plays(direct: float, weights: F64, thresholds: F64) -> tuple[float, 
     return inverse_direct, inverse_weights, corners
 
 
-class PlayModel(CheckedModel, HysteresisModel):
+class PlayModel(HysteresisModel):
     """a_0 v + sum a_i F_i[v], with the conditions for its inverse.
 
     Attributes:

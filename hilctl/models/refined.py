@@ -209,7 +209,7 @@ def rest_um(model: HysteresisModel) -> float:
     return model.output_offset_um + (inner.output_offset_um if inner is not None else 0.0)
 
 
-class RefinedModel(CheckedModel, HysteresisModel):
+class RefinedModel(HysteresisModel):
     """A model followed by a residual operator and a constant displacement.
 
     Attributes:

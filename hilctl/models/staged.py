@@ -17,7 +17,7 @@ import math
 from collections.abc import Iterator
 from typing import Annotated, Any, Literal, Self, TypeVar
 
-from hilctl.base.strict import CheckedModel, Field, StrictModel
+from hilctl.base.strict import Field, StrictModel
 from hilctl.kernels.dynamics import lag_block, lead_block, weigh_block
 from hilctl.models.base import HysteresisModel, Operator, Provenance
 from hilctl.models.effective_field import FieldModel
@@ -75,7 +75,7 @@ class FieldLag(StrictModel):
         return lead
 
 
-class StagedModel(CheckedModel, HysteresisModel):
+class StagedModel(HysteresisModel):
     """A hysteresis model with linear stages around it.
 
     Attributes:
