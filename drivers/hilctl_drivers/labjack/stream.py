@@ -90,11 +90,7 @@ def _counted(words: int) -> int:
 
 
 def frames_pdu(frames: Sequence[FeedbackFrame]) -> bytes:
-    """Return the request for frames, in their order.
-
-    Raises:
-        BadRequest: It or its reply would be longer than a PDU may be, or a frame is too long.
-    """
+    """Return the request for frames, in their order; it and its reply must fit a PDU."""
     pdu = bytes((FEEDBACK,)) + b"".join(frame.encode() for frame in frames)
     longest = max(len(pdu), 1 + sum(frame.reply_size for frame in frames))
     if longest > PDU_MAX:
@@ -103,12 +99,7 @@ def frames_pdu(frames: Sequence[FeedbackFrame]) -> bytes:
 
 
 class ModbusFeedback:
-    """A T-series device that is asked by function 76.
-
-    Args:
-        link: Open, or opened before the first call.
-        unit: Its unit id.
-    """
+    """Requests with function 76 to a T-series device."""
 
     def __init__(self, link: Link, unit: int) -> None:
         self._link = link
@@ -116,11 +107,11 @@ class ModbusFeedback:
         self._transaction = 0
 
     def call(self, frames: Sequence[FeedbackFrame]) -> list[bytes]:
-        """Carry frames out in one message; return what each read frame found.
+        """Execute frames in one message; return the bytes of each read frame.
 
         Raises:
-            DeviceError: No answer, not a good one, or a refusal; then the frames before the one
-                that was refused may have been executed.
+            DeviceError: No answer, not a good one, or a refusal of a frame; those before it may
+                have been executed.
         """
         self._transaction = transaction = (self._transaction + 1) & 0xFFFF
         sizes = [frame.reply_size for frame in frames if frame.reply_size]
@@ -135,11 +126,7 @@ class ModbusFeedback:
         return found
 
     def read(self, address: int, words: int) -> bytes:
-        """Return registers' bytes.
-
-        Raises:
-            DeviceError: See :meth:`call`.
-        """
+        """Return the bytes of registers."""
         return self.call([ReadFrame(address, words)])[0]
 
 
@@ -217,7 +204,7 @@ def value_frames(values: F64) -> tuple[FeedbackFrame, ...]:
 
 @dataclass(frozen=True, slots=True)
 class StreamData:
-    """What a message of a run found.
+    """Readings in a message, and the state of both buffers.
 
     Attributes:
         raw: uint16[n], readings of the oldest scans that had not been fetched.
@@ -231,11 +218,10 @@ class StreamData:
 
 
 def stream_data(data: bytes, free: bytes) -> StreamData:
-    """Return what the answers to :data:`READ_FRAMES` say.
+    """Return the content of the answers to :data:`READ_FRAMES`.
 
     Raises:
-        DeviceError: The device dropped scans, or its stream stopped.
-        Mismatch: More samples than were asked for.
+        DeviceError: The device dropped scans, its stream stopped, or it sent too many samples.
     """
     count, backlog_bytes, status, more = DATA_HEAD.unpack_from(data)
     if status:
@@ -251,7 +237,7 @@ def stream_data(data: bytes, free: bytes) -> StreamData:
 
 @dataclass(frozen=True, slots=True)
 class InputCalibration:
-    """How raw readings of one input become volts.
+    """Conversion of raw readings of one input to volts.
 
     Attributes:
         center: Raw reading at ``offset_v``.
@@ -268,15 +254,7 @@ class InputCalibration:
 
     @classmethod
     def decode(cls, form: Literal["two_slopes", "line"], data: bytes) -> "InputCalibration":
-        """Return the constants in internal flash.
-
-        Args:
-            form: As in the profile.
-            data: From :func:`calibration_span` on.
-
-        Raises:
-            DeviceError: They cannot be any.
-        """
+        """Return the constants in flash, or raise DeviceError if they cannot be valid."""
         if form == "two_slopes":
             positive, negative, center, _ = struct.unpack(">4f", data)
             found = cls(center, positive, negative)
@@ -299,11 +277,8 @@ class InputCalibration:
 def calibration_span(
     form: Literal["two_slopes", "line"], address: int, channel: int
 ) -> tuple[int, int]:
-    """Return flash address and bytes of an input's constants.
+    """Return flash address and bytes of an input's constants; all start at ``address``.
 
-    Args:
-        form: As in the profile. ``two_slopes`` are those of the high-speed converter at gain 1.
-        address: Where the constants begin.
-        channel: Number of the input.
+    ``two_slopes`` are those of the high-speed converter at gain 1.
     """
     return (address, 16) if form == "two_slopes" else (address + 8 * channel, 8)

@@ -65,11 +65,7 @@ class LabJackStreaming(StrictModel):
         return self.samples_per_s_max / 2.0
 
     def check_names(self, outputs: Container[str], inputs: Container[str]) -> None:
-        """Refuse names that the profile does not have.
-
-        Raises:
-            ValueError: One of them.
-        """
+        """Raise ValueError for a name that is not an output or input of the profile."""
         for key, names, known in (
             ("outputs", self.outputs, outputs),
             ("inputs", self.inputs, inputs),
@@ -176,10 +172,6 @@ class ModbusWatchdog(Watchdog):
     )
     tripped: TripFlag | Literal["none"] = Field(default="none", description="where a trip shows")
 
-    def protects(self, output: str) -> bool:
-        """Return whether a trip makes an output safe; some devices do so for some outputs only."""
-        return self.on_trip != "safe" or not self.safe or output in self.safe
-
     def steps(self) -> dict[str, tuple[ModbusStep, ...]]:
         """Return all steps by dotted key in the profile."""
         named = {name: getattr(self, name) for name in ("unlock", "arm", "disarm", "feed", "clear")}
@@ -198,11 +190,8 @@ class ModbusWatchdog(Watchdog):
         Args:
             steps: Any of the watchdog's steps.
             output: The output in use; its scale and offset go with ``safe``.
-            timeout_s: Timeout in s.
+            timeout_s: Timeout, see :meth:`Watchdog.counts`.
             safe: Safe value in the output's unit.
-
-        Raises:
-            InputError: The timeout is out of range, see :meth:`Watchdog.counts`.
         """
         self.counts(timeout_s)
         changes: dict[str, dict[str, float]] = {

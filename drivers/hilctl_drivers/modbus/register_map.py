@@ -29,17 +29,16 @@ _Permute: TypeAlias = Callable[[Bytes], tuple[int, ...]]
 
 @dataclass(frozen=True)
 class RegisterFormat:
-    """How one value stands in its registers.
+    """Encoding of one value in its registers.
 
     Attributes:
         type: Number type of the raw value.
         order: Byte order in ABCD notation; empty for most significant byte first.
-        scale: Value of one raw step, in the channel's unit.
-        offset: Value where raw is 0, in the channel's unit.
+        scale: Value of one raw step, in the channel's unit; finite and not 0.
+        offset: Value at raw 0, in the channel's unit; finite.
 
     Raises:
-        BadRequest: Unknown type, an order that does not name each byte once, a scale of 0, or a
-            scale or offset that is not finite.
+        BadRequestError: One of them is not valid.
     """
 
     type: RegisterType
@@ -73,17 +72,18 @@ class RegisterFormat:
             )
         little = order == natural[::-1]
         plain = little or order == natural
-        to_wire = tuple(natural.index(letter) for letter in order)
-        from_wire = tuple(order.index(letter) for letter in natural)
-        code = ("<" if little else ">") + _CODES[self.type]
-        form = struct.Struct(code)
-        object.__setattr__(self, "size", size)
-        object.__setattr__(self, "_pack", form.pack)
-        object.__setattr__(self, "_unpack", form.unpack)
-        object.__setattr__(self, "_to_wire", None if plain else itemgetter(*to_wire))
-        object.__setattr__(self, "_from_wire", None if plain else itemgetter(*from_wire))
-        object.__setattr__(self, "_whole", self.is_integer)
-        object.__setattr__(self, "order", order)
+        form = struct.Struct(("<" if little else ">") + _CODES[self.type])
+        derived = {
+            "size": size,
+            "order": order,
+            "_pack": form.pack,
+            "_unpack": form.unpack,
+            "_to_wire": None if plain else itemgetter(*map(natural.index, order)),
+            "_from_wire": None if plain else itemgetter(*map(order.index, natural)),
+            "_whole": self.is_integer,
+        }
+        for name, value in derived.items():
+            object.__setattr__(self, name, value)
 
     @property
     def count(self) -> int:
@@ -116,7 +116,7 @@ class RegisterFormat:
         """Return ``value`` as register bytes: bytes[size], integers rounded half to even.
 
         Raises:
-            BadRequest: ``value`` is not finite or the type cannot hold it; never clipped.
+            BadRequestError: ``value`` is not finite or the type cannot hold it; never clipped.
         """
         raw = (value - self.offset) / self.scale
         if not isfinite(raw):
@@ -130,13 +130,10 @@ class RegisterFormat:
         return data if self._to_wire is None else bytes(self._to_wire(data))
 
     def decode(self, data: Bytes) -> float:
-        """Return the value in register bytes; not a number where the device sent just that.
-
-        Args:
-            data: bytes[size].
+        """Return the value in register bytes, bytes[size]; NaN if the device sent it.
 
         Raises:
-            Mismatch: Too many or too few bytes.
+            MismatchError: Too many or too few bytes.
         """
         if len(data) != self.size:
             raise MismatchError(f"{self.type} register has {self.size} bytes, got {len(data)}")
@@ -189,11 +186,7 @@ class Register(StrictModel):
 
     @property
     def format(self) -> RegisterFormat:
-        """How the value becomes bytes.
-
-        Raises:
-            BadRequest: It is a bit, or order or scale is wrong.
-        """
+        """Encoding of the value; a bit has none and raises BadRequestError."""
         if self.type == "bit":
             raise BadRequestError("a bit has no register format")
         return RegisterFormat(self.type, self.order, self.scale, self.offset)
@@ -335,7 +328,7 @@ class TripFlag(Register):
 
 
 def wire_address(register: Register, base: AddressBase) -> int:
-    """Return the address that goes into the frame; out of 0..65535 where there is none.
+    """Return the address in the frame; outside 0 to 65535 if there is none.
 
     With base ``modicon``, holding register 1 is 40001 or 400001, input register 1 is 30001 or
     300001, discrete input 1 is 10001 or 100001 and coil 1 is 1.

@@ -423,12 +423,3 @@ class TestWatchdog:
         assert value.format.encode(value.value) == (-32767).to_bytes(2, "big", signed=True)
         with pytest.raises(InputError, match="multiple"):
             profile.watchdog.bound(profile.watchdog.arm, output, 0.15, 0.0)
-
-    def test_protects(self) -> None:
-        """The LabJack's watchdog knows its own outputs, not those of a LJTick-DAC."""
-        profile = load_profile("labjack_t7")
-        assert isinstance(profile, ModbusProfile)
-        assert profile.watchdog != "none"
-        assert [profile.watchdog.protects(name) for name in profile.outputs] == [
-            True, True, False, False,
-        ]  # fmt: skip
