@@ -6,6 +6,7 @@ closed and the device must be opened again. A subclass connects, exchanges and d
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from typing import ClassVar
 
 import numpy as np
@@ -56,8 +57,7 @@ class DacDevice(ABC):
             self._rates(block).check(sample_rate_hz)
             self._open(sample_rate_hz, block)
         except DeviceError as error:
-            self._release()
-            raise self._error("open", str(error)) from None
+            raise self._failed("open", error, self._release) from None
         self._block = block
 
     def arm(self) -> None:
@@ -66,14 +66,13 @@ class DacDevice(ABC):
         Raises:
             DeviceError: Not open, or the device did not confirm; then it must be opened again.
         """
+        action = "arm the watchdog"
         if not self._block:
-            raise self._error("arm the watchdog", "not open")
+            raise self._error(action, "not open")
         try:
             self._arm()
         except DeviceError as error:
-            self._block = 0
-            self._abandon()
-            raise self._error("arm the watchdog", str(error)) from None
+            raise self._failed(action, error, self._abandon) from None
 
     def output(self) -> float | None:
         """Return what the open device outputs, see :meth:`hilctl.base.device.Device.output`.
@@ -81,19 +80,18 @@ class DacDevice(ABC):
         Raises:
             DeviceError: Not open, or no good answer in time; it must be opened again.
         """
+        action = "read the output back"
         if not self._block:
-            raise self._error("read the output back", "not open")
+            raise self._error(action, "not open")
         try:
             return self._output()
         except DeviceError as error:
-            self._block = 0
-            self._release()
-            raise self._error("read the output back", str(error)) from None
+            raise self._failed(action, error, self._release) from None
 
     def look(self) -> tuple[float, float | None]:
         """Connect, return displacement and output, and disconnect; nothing is changed.
 
-        No step of the profile is sent, no watchdog armed, fed on purpose or cleared.
+        No step of the profile is sent, and no watchdog is armed, fed on purpose or cleared.
 
         Returns:
             Displacement in um, and the output in the command's unit; None if it cannot be known.
@@ -129,9 +127,7 @@ class DacDevice(ABC):
         try:
             self._exchange(first_sample, command, displacement_um, measured)
         except DeviceError as error:
-            self._block = 0
-            self._abandon()
-            raise self._error(self._action, str(error)) from None
+            raise self._failed(self._action, error, self._abandon) from None
 
     def make_safe(self, command: float) -> None:
         """Set the output to ``command`` in one attempt and disconnect; the watchdog stays armed.
@@ -147,13 +143,13 @@ class DacDevice(ABC):
             raise self._out_of_range(np.array([command]))
         # Closed first: no exchange may follow, whether the attempt succeeds or fails.
         self._block = 0
+        action = f"make safe, {self._output_name}"
         try:
             self._put_out(command)
+        except UnconfirmedError as error:
+            raise UnconfirmedError(str(self._error(action, str(error)))) from None
         except DeviceError as error:
-            made = self._error(f"make safe, {self._output_name}", str(error))
-            if isinstance(error, UnconfirmedError):
-                raise UnconfirmedError(str(made)) from None
-            raise made from None
+            raise self._error(action, str(error)) from None
         finally:
             self._release()
 
@@ -175,7 +171,7 @@ class DacDevice(ABC):
             self._release()
 
     def _longest_block(self) -> tuple[int, str]:
-        """Return the most samples of an exchange and, as text that follow it, why."""
+        """Return the most samples of an exchange, and the reason as text."""
         return 1, ""
 
     def _rates(self, block: int) -> RateLimit:
@@ -221,14 +217,14 @@ class DacDevice(ABC):
         """Close the connection, if open, without a message to the device."""
 
     def _check_block(self, block: int) -> None:
-        """Reject a block that is too long."""
+        """Raise DeviceError for a block that is too long."""
         most, why = self._longest_block()
         if not 1 <= block <= most:
             span = "1 sample" if most == 1 else f"1 to {most} samples"
             raise DeviceError(f"block must be {span}{why}, got {block}")
 
     def _check_sizes(self, command: F64, displacement_um: F64, measured: F64) -> None:
-        """Reject a block that is not as agreed at open."""
+        """Raise DeviceError for a block that is not as agreed at open."""
         if not self._block:
             raise self._error(self._action, "not open")
         sizes = ", ".join(str(each.size) for each in (command, displacement_um, measured))
@@ -237,19 +233,21 @@ class DacDevice(ABC):
         raise self._error(self._action, f"{rule}, got {sizes}")
 
     def _in_range(self, command: F64) -> bool:
-        """Return whether all of a block's commands are in range; one that is no number is not."""
+        """Return whether all commands of a block are in range; NaN is not."""
         low, high = self._low, self._high
         if command.size > _SHORT:
             return bool(low <= command.min() and command.max() <= high)  # both NaN for a NaN
-        for value in command.tolist():  # numpy takes as long for a few as for hundreds
-            if not low <= value <= high:
-                break
-        else:
-            return True
-        return False
+        # For a few values numpy takes as long as for hundreds.
+        return all(low <= value <= high for value in command.tolist())
 
     def _error(self, action: str, what: str) -> DeviceError:
         return DeviceError(f"{self._title}: {what} (to {action})")
+
+    def _failed(self, action: str, error: DeviceError, give_up: Callable[[], None]) -> DeviceError:
+        """Give the connection up and return the error with device and action."""
+        self._block = 0
+        give_up()
+        return self._error(action, str(error))
 
     def _out_of_range(self, command: F64) -> DeviceError:
         """Return the error for a block with a command out of range or not a number."""

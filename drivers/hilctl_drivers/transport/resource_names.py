@@ -28,14 +28,11 @@ _PTY_MAJORS = range(136, 144)
 
 
 def refuse_to_others(descriptor: int, path: str) -> bool:
-    """Reject an open port to other programs, where that ends with this process.
+    """Refuse an open port to other programs if that ends with this process; return whether it does.
 
     Args:
         descriptor: The port.
         path: Its device file.
-
-    Returns:
-        Whether they are refused.
     """
     device = os.fstat(descriptor).st_rdev
     is_pty = os.major(device) in _PTY_MAJORS
@@ -44,7 +41,7 @@ def refuse_to_others(descriptor: int, path: str) -> bool:
     if not _set(descriptor, on=True):
         return False
     if is_pty and not _can_open(path):
-        _set(descriptor, on=False)
+        admit_others(descriptor)
         return False
     return True
 
@@ -55,12 +52,7 @@ def admit_others(descriptor: int) -> None:
 
 
 def others_have(device: int, processes: Path = Path("/proc")) -> bool:
-    """Return whether another process has a device open, as far as this user can see.
-
-    Args:
-        device: Number of the device.
-        processes: Where the kernel shows processes.
-    """
+    """Return whether another process has a device open, as far as this user can see."""
     for folder in processes.glob("[0-9]*/fd"):
         if folder.parent.name == str(os.getpid()):
             continue
@@ -111,9 +103,9 @@ def held_port(path: str) -> tuple[str, ...]:
 
 
 def held_address(host: str, port: int) -> tuple[str, ...]:
-    """Return the names of a TCP port: by host name, and by each address that the name stands for.
+    """Return the names of a TCP port: by host name, and by each of its addresses.
 
-    Where a name server does not answer in time only the name is left.
+    Without an answer of the name server in time, only the host name is left.
     """
     address = _literal(host)
     if address is not None:
@@ -124,7 +116,7 @@ def held_address(host: str, port: int) -> tuple[str, ...]:
 
 
 def _literal(host: str) -> str | None:
-    """Return an address that was written as one, in its shortest form; None for a name."""
+    """Return an address in its shortest form; None for a name."""
     try:
         return str(ipaddress.ip_address(host))
     except ValueError:

@@ -23,7 +23,7 @@ class TcpLink:
     Args:
         host: Name or address.
         port: TCP port.
-        timeout_s: Longest that connecting, or one exchange, may take.
+        timeout_s: Longest time to connect, or of one exchange.
         clock: Monotonic time in s.
     """
 
@@ -35,7 +35,7 @@ class TcpLink:
         self._clock = clock
         self._socket: socket.socket | None = None
         self.peer_host = host
-        """Numeric address of the peer, once it was reached; the host as given before."""
+        """Numeric address of the peer after connecting; before that, ``host``."""
 
     @property
     def name(self) -> str:
