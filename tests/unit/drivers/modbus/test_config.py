@@ -7,7 +7,7 @@ import pytest
 from hilctl.base.errors import InputError
 from hilctl_drivers.modbus.config import ModbusOptions
 from hilctl_drivers.modbus.modbus_dac import ModbusDac
-from tests.unit.drivers.modbus.test_modbus_dac import exchange
+from tests.unit.drivers.modbus.conftest import exchange
 
 PAIR = {
     "profile": "icp_m7024",

@@ -21,7 +21,7 @@ from hilctl_drivers.modbus.register_map import EnsureStep, ExpectStep, WriteStep
 from hilctl_drivers.profile import load_profile, parse_profile, with_link
 from hilctl_drivers.profile_base import WaitStep
 from hilctl_drivers.transport.wire_time import WireTime
-from tests.unit.drivers.modbus.test_modbus_dac import exchange
+from tests.unit.drivers.modbus.conftest import exchange
 
 
 class Line:

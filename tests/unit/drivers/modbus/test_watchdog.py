@@ -7,7 +7,7 @@ from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.modbus.config import ModbusOptions
 from hilctl_drivers.modbus.modbus_dac import ModbusDac
 from tests.fakes import FaultyLink, emulated, made_safe
-from tests.unit.drivers.modbus.test_modbus_dac import exchange
+from tests.unit.drivers.modbus.conftest import exchange
 
 TIMEOUT_S = 0.5
 TRIPPED = {"timeout_s": TIMEOUT_S}
