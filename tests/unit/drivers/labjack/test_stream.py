@@ -10,7 +10,6 @@ from hilctl_drivers.labjack import stream
 from hilctl_drivers.labjack.stream import ModbusFeedback, ReadFrame, WriteFrame, frames_pdu
 from hilctl_drivers.transport.links import (
     BadRequestError,
-    CorruptError,
     MismatchError,
     RefusedError,
 )
@@ -204,27 +203,3 @@ def test_an_answer_to_something_else_is_an_error(link, error, text):
     """Refusals keep the exception code; nothing of another answer is believed."""
     with pytest.raises(error, match=text):
         ModbusFeedback(link, 1).read(0, 2)
-
-
-def test_nonsense_is_not_waited_for():
-    """Bytes that are not Modbus are refused at once."""
-    link = Link(lambda request: bytes.fromhex("0001 0700 0006 01 4c00"))
-    with pytest.raises(CorruptError, match="TCP header"):
-        ModbusFeedback(link, 1).read(0, 2)
-
-
-@pytest.mark.parametrize(
-    ("received", "lacking"), [(b"", 8), (b"\0\1\0\0", 4), (b"\0\1\0\0\0\6\1\x4c\0", 3)]
-)
-def test_a_cut_reply_is_waited_for(received, lacking):
-    """As many bytes as the header says are still to come; before it, as many as any reply has."""
-    asked = []
-
-    class Cut(Link):
-        def transact(self, request, missing, usual=0):
-            asked.append(missing(bytearray(received)))
-            return super().transact(request, missing, usual)
-
-    whole = answered(bytes.fromhex("4c 00000000"))
-    ModbusFeedback(Cut(whole._answer), 1).read(0, 2)
-    assert asked == [lacking]

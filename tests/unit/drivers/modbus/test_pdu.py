@@ -287,14 +287,6 @@ def test_answers_to_something_else_are_mismatches(pdu, reply):
         reply_data(pdu, H(reply))
 
 
-def test_another_function_is_named():
-    """The message says what was asked and what came."""
-    with pytest.raises(MismatchError, match=r"function 3, .* 4"):
-        reply_data(read_pdu(3, 0, 2), H("04 04 00000000"))
-    with pytest.raises(MismatchError, match="answered with nothing"):
-        reply_data(read_pdu(3, 0, 2), b"")
-
-
 GOOD = H("0102 0000 0005 11 03 02 0005")
 
 
