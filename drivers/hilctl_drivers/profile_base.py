@@ -64,17 +64,10 @@ class SerialLineSettings(LinkSettings):
     @property
     def settings(self) -> SerialSettings:
         """Settings of the port."""
-        return SerialSettings(
-            self.baud,
-            self.bytesize,
-            self.parity,
-            self.stopbits,
-            self.silence_s,
-            self.boot_wait_s,
-            flow=self.flow,
-            dtr=self.dtr,
-            rts=self.rts,
+        same = self.model_dump(
+            include={"baud", "bytesize", "parity", "stopbits", "flow", "dtr", "rts"}
         )
+        return SerialSettings(gap_s=self.silence_s, boot_s=self.boot_wait_s, **same)
 
 
 class BinaryLineSettings(SerialLineSettings):

@@ -21,8 +21,6 @@ from hilctl_drivers.labjack.stream import (
     VALUES_MAX,
     InputCalibration,
     ModbusFeedback,
-    ReadFrame,
-    WriteFrame,
     u32,
 )
 from hilctl_drivers.labjack.stream_session import StreamSession
@@ -30,6 +28,7 @@ from hilctl_drivers.modbus.config import ModbusEndpoint, ModbusOptions, ModbusSe
 from hilctl_drivers.modbus.modbus_dac import ModbusDevice
 from hilctl_drivers.modbus.modbus_profile import LabJackStreaming, ModbusProfile
 from hilctl_drivers.modbus.modbus_session import ModbusSession
+from hilctl_drivers.modbus.pdu import ReadFrame, WriteFrame
 from hilctl_drivers.modbus.watchdog import Connect, ModbusSafeWrite
 from hilctl_drivers.signal_chain import FifoBlocks
 from hilctl_drivers.transport.links import RefusedError

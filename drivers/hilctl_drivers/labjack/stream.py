@@ -18,7 +18,7 @@ words of no meaning up to the number that was asked for.
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, Literal, TypeAlias
+from typing import Final, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -27,75 +27,19 @@ from hilctl.base.errors import DeviceError
 from hilctl.base.types import F64
 from hilctl_drivers.modbus.modbus_profile import BYTES_A_SAMPLE
 from hilctl_drivers.modbus.pdu import (
-    FEEDBACK,
+    FRAME_HEAD,
     PDU_MAX,
     TCP_HEAD,
+    FeedbackFrame,
+    ReadFrame,
+    WriteFrame,
+    feedback_pdu,
     reply_data,
     tcp_adu,
     tcp_missing,
     tcp_pdu,
 )
-from hilctl_drivers.transport.links import BadRequestError, Link, MismatchError
-
-FRAME_HEAD: Final = 4
-"""Bytes of a frame before its data."""
-_WORDS_MAX = 255
-_HEAD = struct.Struct(">BHB")
-
-
-@dataclass(frozen=True, slots=True)
-class ReadFrame:
-    """Read ``words`` registers from ``address`` on."""
-
-    address: int
-    words: int
-
-    def encode(self) -> bytes:
-        """Return the frame's bytes."""
-        return _HEAD.pack(0, self.address, _counted(self.words))
-
-    @property
-    def reply_size(self) -> int:
-        """Bytes of the reply that are this frame's."""
-        return 2 * self.words
-
-
-@dataclass(frozen=True, slots=True)
-class WriteFrame:
-    """Write register bytes from ``address`` on; a buffer register takes all."""
-
-    address: int
-    data: bytes
-
-    def encode(self) -> bytes:
-        """Return the frame's bytes."""
-        words, odd = divmod(len(self.data), 2)
-        if odd:
-            raise BadRequestError(f"registers have 2 bytes each, got {len(self.data)} bytes")
-        return _HEAD.pack(1, self.address, _counted(words)) + self.data
-
-    @property
-    def reply_size(self) -> int:
-        """Bytes of the reply that are this frame's."""
-        return 0
-
-
-FeedbackFrame: TypeAlias = ReadFrame | WriteFrame
-
-
-def _counted(words: int) -> int:
-    if not 1 <= words <= _WORDS_MAX:
-        raise BadRequestError(f"a frame has 1 to {_WORDS_MAX} registers, got {words}")
-    return words
-
-
-def frames_pdu(frames: Sequence[FeedbackFrame]) -> bytes:
-    """Return the request for frames, in their order; it and its reply must fit a PDU."""
-    pdu = bytes((FEEDBACK,)) + b"".join(frame.encode() for frame in frames)
-    longest = max(len(pdu), 1 + sum(frame.reply_size for frame in frames))
-    if longest > PDU_MAX:
-        raise BadRequestError(f"a PDU has at most {PDU_MAX} bytes, got {longest}")
-    return pdu
+from hilctl_drivers.transport.links import Link, MismatchError
 
 
 class ModbusFeedback:
@@ -115,7 +59,7 @@ class ModbusFeedback:
         """
         self._transaction = transaction = (self._transaction + 1) & 0xFFFF
         sizes = [frame.reply_size for frame in frames if frame.reply_size]
-        pdu = frames_pdu(frames)
+        pdu = feedback_pdu(*frames)
         request = tcp_adu(transaction, self._unit, pdu)
         reply = self._link.transact(request, tcp_missing, TCP_HEAD + 1 + sum(sizes))
         data = reply_data(pdu, tcp_pdu(reply, transaction, self._unit))

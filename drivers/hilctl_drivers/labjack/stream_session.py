@@ -10,8 +10,9 @@ import numpy.typing as npt
 from hilctl.base.errors import DeviceError
 from hilctl.base.types import F64
 from hilctl_drivers.labjack import stream
-from hilctl_drivers.labjack.stream import FeedbackFrame, ModbusFeedback, WriteFrame, f32, u32
+from hilctl_drivers.labjack.stream import ModbusFeedback, f32, u32
 from hilctl_drivers.modbus.modbus_profile import LabJackStreaming
+from hilctl_drivers.modbus.pdu import FeedbackFrame, WriteFrame
 
 _RATE_TOLERANCE = 1e-4
 _MARGIN_SCANS = 2

@@ -12,6 +12,8 @@ from hilctl_drivers.modbus.modbus_profile import (
     ModbusRtuLink,
 )
 from hilctl_drivers.modbus.pdu import (
+    ReadFrame,
+    WriteFrame,
     coil_pdu,
     feedback_pdu,
     read_pdu,
@@ -61,7 +63,7 @@ def combined_request(
     if profile.exchange == 23:
         return write_read_pdu(source, sensor.words, target, data)
     if profile.exchange == 76:
-        return feedback_pdu(target, data, source, sensor.words)
+        return feedback_pdu(ReadFrame(source, sensor.words), WriteFrame(target, data))
     return None
 
 

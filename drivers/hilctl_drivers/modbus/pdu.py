@@ -10,6 +10,8 @@ registers, odd data, an address past 65535, an unknown unit, or a PDU over 253 b
 """
 
 import struct
+from dataclasses import dataclass
+from typing import ClassVar, TypeAlias
 
 from hilctl_drivers.transport.crc import Bytes, crc16_modbus
 from hilctl_drivers.transport.links import (
@@ -29,6 +31,10 @@ READ_MAX, WRITE_MAX, WRITE_READ_MAX, BITS_MAX = 125, 123, 121, 2000
 TCP_HEAD = 7
 """Bytes of the MBAP header, unit included."""
 _TCP_SHORTEST = TCP_HEAD + 1
+FRAME_HEAD = 4
+"""Bytes of a feedback frame before its data."""
+_FRAME_MAX = 255
+_frame_head = struct.Struct(">BHB").pack
 _tcp_start = struct.Struct(">HHH").unpack_from
 
 EXCEPTIONS = {
@@ -92,16 +98,51 @@ def write_read_pdu(read_address: int, read_count: int, write_address: int, data:
     return struct.pack(">BHHHHB", *head) + data
 
 
-def feedback_pdu(write_address: int, data: bytes, read_address: int, read_count: int) -> bytes:
-    """Return a LabJack Modbus Feedback request: one read frame, then one write frame (76).
+@dataclass(frozen=True, slots=True)
+class ReadFrame:
+    """Read ``words`` registers from ``address`` on."""
 
-    Frames are executed in their order, so the reading does not show the written value yet. A PDU of
-    253 bytes holds 122 registers to write and 126 to read.
+    address: int
+    words: int
+
+    def encode(self) -> bytes:
+        """Return the frame's bytes."""
+        _check_span("register", self.address, self.words, _FRAME_MAX)
+        return _frame_head(0, self.address, self.words)
+
+    @property
+    def reply_size(self) -> int:
+        """Bytes of the reply to this frame."""
+        return 2 * self.words
+
+
+@dataclass(frozen=True, slots=True)
+class WriteFrame:
+    """Write register bytes from ``address`` on; a buffer register takes all."""
+
+    address: int
+    data: bytes
+    reply_size: ClassVar[int] = 0
+
+    def encode(self) -> bytes:
+        """Return the frame's bytes."""
+        count = _written(self.address, self.data, _FRAME_MAX)
+        return _frame_head(1, self.address, count) + self.data
+
+
+FeedbackFrame: TypeAlias = ReadFrame | WriteFrame
+
+
+def feedback_pdu(*frames: FeedbackFrame) -> bytes:
+    """Return a LabJack Modbus Feedback request (76); it and its reply must fit a PDU.
+
+    Frames are executed in their order, so what is read first does not show a value written later.
     """
-    count = _written(write_address, data, (PDU_MAX - 9) // 2)
-    _check_span("register", read_address, read_count, (PDU_MAX - 1) // 2)
-    read = struct.pack(">BBHB", FEEDBACK, 0, read_address, read_count)
-    return read + struct.pack(">BHB", 1, write_address, count) + data
+    pdu = bytes((FEEDBACK,)) + b"".join(frame.encode() for frame in frames)
+    longest = max(len(pdu), 1 + sum(frame.reply_size for frame in frames))
+    if longest > PDU_MAX:
+        raise BadRequestError(f"a PDU has at most {PDU_MAX} bytes, got {longest}")
+    return pdu
 
 
 def reply_layout(pdu: bytes) -> tuple[bytes, int]:

@@ -7,7 +7,8 @@ import pytest
 
 from hilctl.base.errors import DeviceError
 from hilctl_drivers.labjack import stream
-from hilctl_drivers.labjack.stream import ModbusFeedback, ReadFrame, WriteFrame, frames_pdu
+from hilctl_drivers.labjack.stream import ModbusFeedback
+from hilctl_drivers.modbus.pdu import ReadFrame, WriteFrame, feedback_pdu
 from hilctl_drivers.transport.links import (
     BadRequestError,
     MismatchError,
@@ -36,7 +37,7 @@ def test_addresses_are_the_documented_ones():
 
 def test_values_go_into_the_buffer_and_are_taken_into_use():
     """Big-endian floats at 4400, then 1 at 4070."""
-    pdu = frames_pdu(stream.value_frames(np.array([1.0, 2.5])))
+    pdu = feedback_pdu(*stream.value_frames(np.array([1.0, 2.5])))
     assert pdu == bytes.fromhex("4c 01 1130 04 3f800000 40200000 01 0fe6 02 00000001")
 
 
@@ -44,10 +45,10 @@ def test_a_message_is_as_long_as_it_may_be():
     """58 values and 120 readings fill a message of 253 bytes, and one more does not fit."""
     assert (stream.VALUES_MAX, stream.SAMPLES_MAX) == (58, 120)
     full = [*stream.READ_FRAMES, *stream.value_frames(np.zeros(stream.VALUES_MAX))]
-    assert len(frames_pdu(full)) == 253
+    assert len(feedback_pdu(*full)) == 253
     assert 1 + sum(frame.reply_size for frame in full) == 253
     with pytest.raises(DeviceError, match="253 bytes"):
-        frames_pdu([*full[:2], WriteFrame(4400, bytes(236)), full[3]])
+        feedback_pdu(*full[:2], WriteFrame(4400, bytes(236)), full[3])
 
 
 def test_data_tell_readings_backlog_and_room():
@@ -142,12 +143,6 @@ def answered(pdu, transaction=None, unit=1):
     return Link(answer)
 
 
-def test_frames_stand_one_behind_the_other():
-    """DAC0 to 2.5 V, then AIN0: as LabJack's protocol page lays out function 76."""
-    pdu = frames_pdu([WriteFrame(1000, bytes.fromhex("40200000")), ReadFrame(0, 2)])
-    assert pdu == bytes.fromhex("4c 01 03e8 02 40200000 00 0000 02")
-
-
 def test_the_whole_message_is_modbus_tcp():
     """Transaction ids count up; the length covers unit and PDU."""
     link = answered(bytes.fromhex("4c 3f800000"))
@@ -171,7 +166,7 @@ def test_each_read_frame_gets_its_words():
 @pytest.mark.parametrize(
     ("frames", "text"),
     [
-        ([ReadFrame(0, 0)], "1 to 255 registers, got 0"),
+        ([ReadFrame(0, 0)], "must be 1 to 255 .*got 0"),
         ([WriteFrame(0, b"123")], "2 bytes each, got 3"),
         ([WriteFrame(4400, bytes(250))], "253 bytes, got 255"),
         ([ReadFrame(0, 127)], "253 bytes, got 255"),

@@ -8,8 +8,8 @@ import pytest
 
 from hilctl.base.errors import DeviceError
 from hilctl_drivers.labjack import stream
-from hilctl_drivers.labjack.stream import WriteFrame
 from hilctl_drivers.labjack.stream_session import StreamSession
+from hilctl_drivers.modbus.pdu import WriteFrame
 from hilctl_drivers.profile import load_profile
 
 RATE_HZ = 1000.0

@@ -3,6 +3,8 @@
 import pytest
 
 from hilctl_drivers.modbus.pdu import (
+    ReadFrame,
+    WriteFrame,
     coil_pdu,
     feedback_pdu,
     read_pdu,
@@ -33,7 +35,12 @@ CASES = {
     "single": (lambda d: write_single_pdu(7, d), 2, lambda d: H("06 0007") + d, b""),
     "multiple": (lambda d: write_pdu(7, d), 4, lambda _: H("10 0007 0002"), b""),
     "write_read": (lambda d: write_read_pdu(0, 2, 9, d), 4, lambda _: H("17 04") + READ, READ),
-    "feedback": (lambda d: feedback_pdu(9, d, 0, 2), 4, lambda _: b"\x4c" + READ, READ),
+    "feedback": (
+        lambda d: feedback_pdu(ReadFrame(0, 2), WriteFrame(9, d)),
+        4,
+        lambda _: b"\x4c" + READ,
+        READ,
+    ),
 }
 ALL = pytest.mark.parametrize("case", CASES)
 BOTH = pytest.mark.parametrize("wire", ["tcp", "rtu"])
