@@ -1,8 +1,9 @@
 """Base class of all devices, independent of the protocol.
 
-It checks block, rate, sizes and range before anything is sent, and never clips. Each error names
-the device and the action. After a failure the state of the device is unknown, so the connection is
-closed and the device must be opened again. A subclass connects, exchanges and disconnects.
+It checks block, rate, sizes and range before anything is sent, and never clips. Each error is a
+``DeviceError`` that names the device and the action. After a failure the state of the device is
+unknown, so the connection is closed and the device must be opened again. A subclass connects,
+exchanges and disconnects.
 """
 
 from abc import ABC, abstractmethod
@@ -61,11 +62,7 @@ class DacDevice(ABC):
         self._block = block
 
     def arm(self) -> None:
-        """Arm the watchdog, see :meth:`hilctl.base.device.WatchdogDevice.arm`.
-
-        Raises:
-            DeviceError: Not open, or the device did not confirm; then it must be opened again.
-        """
+        """Arm the watchdog, see :meth:`hilctl.base.device.WatchdogDevice.arm`."""
         action = "arm the watchdog"
         if not self._block:
             raise self._error(action, "not open")
@@ -75,11 +72,7 @@ class DacDevice(ABC):
             raise self._failed(action, error, self._abandon) from None
 
     def output(self) -> float | None:
-        """Return what the open device outputs, see :meth:`hilctl.base.device.Device.output`.
-
-        Raises:
-            DeviceError: Not open, or no good answer in time; it must be opened again.
-        """
+        """Return the output of the open device, see :meth:`hilctl.base.device.Device.output`."""
         action = "read the output back"
         if not self._block:
             raise self._error(action, "not open")
@@ -95,9 +88,6 @@ class DacDevice(ABC):
 
         Returns:
             Displacement in um, and the output in the command's unit; None if it cannot be known.
-
-        Raises:
-            DeviceError: Open; or it cannot be reached, is another device, or gives no good answer.
         """
         if self._block:
             raise self._error("look", "open")
@@ -113,11 +103,8 @@ class DacDevice(ABC):
     ) -> None:
         """Send one block of commands, see :meth:`hilctl.base.device.Device.exchange`.
 
-        After an error on the wire the device must be opened again.
-
-        Raises:
-            DeviceError: Not open, a block of another size than agreed, or a command out of range or
-                not finite, and then nothing was sent; or no good answer in time.
+        Nothing is sent of a block of another size than agreed at open, or with a command that is
+        out of range or not finite.
         """
         block = self._block
         if not command.size == displacement_um.size == measured.size == block or not block:
@@ -136,8 +123,7 @@ class DacDevice(ABC):
 
         Raises:
             UnconfirmedError: It was sent; the device has no way to confirm it.
-            DeviceError: ``command`` is out of range or not finite; the device cannot be reached, or
-                does not confirm.
+            DeviceError: ``command`` is out of range, or the device does not confirm it.
         """
         if not self._low <= command <= self._high:
             raise self._out_of_range(np.array([command]))
@@ -157,9 +143,6 @@ class DacDevice(ABC):
         """Disarm and disconnect; the output stays. Closing twice is allowed.
 
         After an error in an exchange there is no connection any more, and a watchdog stays armed.
-
-        Raises:
-            DeviceError: The device did not confirm; the connection is given up all the same.
         """
         opened, self._block = self._block != 0, 0
         try:

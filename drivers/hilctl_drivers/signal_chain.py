@@ -22,6 +22,7 @@ from hilctl_drivers.transport.wire_time import RateLimit
 PROFILE = "name of a shipped profile, or path of your own, from the experiment's folder"
 
 _Channel = TypeVar("_Channel", bound=Range)
+_Value = TypeVar("_Value", float, F64)
 _GAINS = ("gain_a_per_v", "gain_a_per_ma", "gain_v_per_v", "gain_v_per_ma")
 
 
@@ -226,14 +227,9 @@ class SignalChain:
         """Gain and offset of the command, sensitivity and offset of the displacement."""
         return self._gain, self._offset, self._um_per_unit, self._offset_um
 
-    def output(self, command: float) -> float:
-        """Return the output value of a command."""
+    def output(self, command: _Value) -> _Value:
+        """Return the output value of a command, or of a block of them."""
         return (command - self._offset) / self._gain
-
-    def outputs(self, command: F64) -> F64:
-        """Return the output values of a block of commands."""
-        values: F64 = (command - self._offset) / self._gain
-        return values
 
     def command(self, output: float) -> float:
         """Return the command of an output value."""

@@ -58,7 +58,7 @@ class StreamSetup:
     Attributes:
         base: Options of the device, streaming or not.
         streaming: The profile's section on streaming.
-        fifo_blocks: Blocks kept in its buffer.
+        fifo_blocks: Blocks kept in the device's buffer.
         target: Address of the output.
         source: Address of the input.
     """
@@ -138,14 +138,14 @@ class StreamSafeWrite(ModbusSafeWrite):
         except RefusedError:  # a stream that does not run can't be stopped
             feedback.call([write])
 
-    def _check_held(self, session: ModbusSession, value: float) -> None:
+    def _held(self, session: ModbusSession) -> float:
         output = self._setup.output
         feedback = ModbusFeedback(session.link, self._setup.writer.unit)
         target = ReadFrame(self._setup.writer.profile.wire_address(output), output.words)
         running, held = feedback.call([ReadFrame(ENABLE, 2), target])
         if running != u32(0):
             raise DeviceError("the stream was stopped, but still runs")
-        self._check(output.format.decode(held), value)
+        return output.format.decode(held)
 
 
 class ModbusStream(ModbusDevice):
@@ -197,7 +197,7 @@ class ModbusStream(ModbusDevice):
         pair = self._connected()
         stream = self._stream_on(pair.writer)
         stream.stop()  # whoever started it: no other setting is taken while it runs
-        pair.set_up()
+        pair.run("init")
         pair.writer.run(setup.streaming.setup)
         self._calibration = stream.calibration(setup.source // 2)
         stream.prepare(sample_rate_hz, setup.target, setup.source)
@@ -227,7 +227,7 @@ class ModbusStream(ModbusDevice):
             raise DeviceError("not open")
         check_next(first_sample, self._next_sample)
         # Queued before the readings are waited for: meanwhile the device must not run dry.
-        stream.feed(self._chain.outputs(command))
+        stream.feed(self._chain.output(command))
         self._next_sample += command.size
         readings = self._readings(stream, command.size)
         if self._guard.feed_every and self._pair is not None:

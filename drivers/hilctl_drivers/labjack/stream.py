@@ -1,18 +1,12 @@
 """LabJack's Modbus Feedback, and the registers and messages of a T4's or T7's stream.
 
-Function 76 carries out many reads and writes in one message, in order ("Protocol Details [Direct
-Modbus TCP]"). A frame is ``00 address16 words8`` to read and ``01 address16 words8 data`` to write;
-a reply holds the words of each read. Messages are kept to the 253 bytes that the Modbus
-specification allows.
-
 The stream is read in command-response mode (ljm_constants.json; T-Series Datasheet 3.2.3
 Stream-Out, 3.2.4 Low-Level Stream, 20.0.0 and 20.0.1 calibration constants). A scan reads the input
 and then outputs the next value; stream-out addresses return no data. If ``LOOP_NUM_VALUES`` is 1,
 an output that has no new value repeats its last one.
 
-A read of ``DATA_CR`` gives four words, which are the number of samples in this read, the bytes left
-in the device's buffer, a status and what belongs to it; then that many samples of 16 bits, and
-words of no meaning up to the number that was asked for.
+A read of ``DATA_CR`` returns four words: number of samples, bytes left in the device's buffer,
+status, and its argument. Then follow the samples of 16 bits, and padding up to the requested words.
 """
 
 import struct
@@ -63,11 +57,7 @@ class ModbusFeedback:
         request = tcp_adu(transaction, self._unit, pdu)
         reply = self._link.transact(request, tcp_missing, TCP_HEAD + 1 + sum(sizes))
         data = reply_data(pdu, tcp_pdu(reply, transaction, self._unit))
-        found, start = [], 0
-        for size in sizes:
-            found.append(data[start : start + size])
-            start += size
-        return found
+        return list(struct.unpack("".join(f"{size}s" for size in sizes), data))
 
     def read(self, address: int, words: int) -> bytes:
         """Return the bytes of registers."""
@@ -123,25 +113,20 @@ STATUS: Final = {
 }
 
 
-def u32(value: int) -> bytes:
-    """Return register bytes of a whole number."""
-    return struct.pack(">I", value)
-
-
-def f32(value: float) -> bytes:
-    """Return register bytes of a float."""
-    return struct.pack(">f", value)
+u32 = struct.Struct(">I").pack
+f32 = struct.Struct(">f").pack
+"""Register bytes of a number."""
 
 
 READ_FRAMES: Final[tuple[FeedbackFrame, ...]] = (
     ReadFrame(DATA_CR, DATA_HEAD.size // 2 + SAMPLES_MAX),
     ReadFrame(OUT_BUFFER_STATUS, _U32_WORDS),
 )
-"""What each message of a run begins with: what was before its own values came."""
+"""First frames of each message of a run: the state before its own values."""
 
 
 def value_frames(values: F64) -> tuple[FeedbackFrame, ...]:
-    """Return what queues float64[n] values, n at most :data:`VALUES_MAX`."""
+    """Return the frames that queue float64[n] values, n at most :data:`VALUES_MAX`."""
     data = values.astype(">f4").tobytes()
     return WriteFrame(OUT_BUFFER_F32, data), WriteFrame(OUT_SET_LOOP, u32(USE_AT_ONCE))
 
@@ -151,9 +136,9 @@ class StreamData:
     """Readings in a message, and the state of both buffers.
 
     Attributes:
-        raw: uint16[n], readings of the oldest scans that had not been fetched.
-        backlog: Scans that are left in the device.
-        free: Values that the output's buffer has room for.
+        raw: uint16[n], readings of the oldest scans.
+        backlog: Scans left in the device.
+        free: Values that still fit into the output's buffer.
     """
 
     raw: npt.NDArray[np.uint16]

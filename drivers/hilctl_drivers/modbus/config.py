@@ -1,7 +1,7 @@
 """Options of a Modbus device, resolved against its profile."""
 
 from dataclasses import dataclass, replace
-from typing import Literal, Self
+from typing import Self
 
 from pydantic import Field, model_validator
 
@@ -83,7 +83,7 @@ class ModbusEndpoint:
     """A device and its place: TCP, a gateway, or a serial line.
 
     Attributes:
-        name: Its profile's name, as the experiment has it.
+        name: Its profile's name in the experiment.
         profile: Its profile, with the experiment's line settings.
         unit: Its unit id.
         host: Host name or address; empty on a serial port.
@@ -120,21 +120,18 @@ class ModbusEndpoint:
             return held_address(self.host, int(self.port))
         return held_port(str(self.port))
 
-    def link(self) -> Link:
-        """Return a new link to it."""
-        if self.host:
-            return TcpLink(self.host, int(self.port), self.timeout_s)
-        assert isinstance(self.profile.link, ModbusRtuLink)
-        return SerialLink(str(self.port), self.profile.link.settings, self.timeout_s)
-
     def reached(self, link: Link) -> "ModbusEndpoint":
         """Return this with the numeric address of an open link, so no name is looked up again."""
         return replace(self, host=link.peer_host) if isinstance(link, TcpLink) else self
 
     def session(self, link: Link | None = None) -> ModbusSession:
         """Return a session, on a link that it shares with others or on a new one."""
-        framing: Literal["tcp", "rtu"] = "tcp" if self.host else "rtu"
-        return ModbusSession(self.profile, link or self.link(), self.unit, framing=framing)
+        if self.host:
+            link = link or TcpLink(self.host, int(self.port), self.timeout_s)
+            return ModbusSession(self.profile, link, self.unit, framing="tcp")
+        assert isinstance(self.profile.link, ModbusRtuLink)
+        link = link or SerialLink(str(self.port), self.profile.link.settings, self.timeout_s)
+        return ModbusSession(self.profile, link, self.unit, framing="rtu")
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,16 +231,15 @@ class ModbusSetup:
         details = {**writer.profile.provenance(), "link": writer.profile.link.model_dump_json()}
         details |= options.details()
         if self.reads_elsewhere:
-            description += f"; {reader.profile.title}, unit {reader.unit} at {reader.place}:"
-            description += f" {options.input}"
+            description += f"; {reader.profile.title}, unit {reader.unit} at {reader.place}: "
             details |= reader.profile.provenance("reader_")
         else:
-            description += f", {options.input}"
+            description += ", "
         return self.chain.info(
             "modbus_dac",
             options,
             self.rates(self.may_combine),
-            description=description,
+            description=description + options.input,
             holds=tuple(dict.fromkeys(writer.holds + reader.holds)),
             arm_s=0.0 if options.watchdog == "none" else arm_s(writer.profile, options.output),
             confirms=not self.unconfirmed,

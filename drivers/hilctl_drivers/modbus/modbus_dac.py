@@ -7,7 +7,7 @@ another device may have the input. No request is repeated, and none precedes the
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import ClassVar, TypeAlias
+from typing import ClassVar, Literal, TypeAlias
 
 from hilctl.base.device import DeviceInfo, DeviceOptions
 from hilctl.base.errors import DeviceError
@@ -33,15 +33,7 @@ specification lets the device write first.
 
 
 class ModbusDevice(DacDevice):
-    """Session, watchdog and safe value of ``modbus_dac`` and ``modbus_stream``.
-
-    Args:
-        setup: The experiment's options, resolved.
-        info: Description of the device.
-        action: Name of an exchange in messages.
-        safe_write: Writes the safe value.
-        connect: Makes a session on a new link to the device that has the output.
-    """
+    """Session, watchdog and safe value of ``modbus_dac`` and ``modbus_stream``."""
 
     def __init__(
         self,
@@ -87,7 +79,7 @@ class ModbusDevice(DacDevice):
         if self._pair is not None:
             # First: nothing feeds it any more, and it would trip while the close steps run.
             self._guard.disarm(self._pair.writer)
-            self._pair.tear_down()
+            self._pair.run("close")
 
     def _release(self) -> None:
         pair, self._pair = self._pair, None
@@ -124,7 +116,7 @@ class ModbusDac(ModbusDevice):
         del block
         self._guard.plan(sample_rate_hz)
         pair = self._connected()
-        pair.set_up()
+        pair.run("init")
         swap, self.one_transaction = pair.find_swap()
         self._safe_write.try_out(pair.writer)
         rates = self._setup.rates(self.one_transaction)
@@ -171,10 +163,6 @@ class ModbusPair:
     """Sessions with the device that has the output and the one that has the input, often the same.
 
     Errors of the latter name it. Nothing is sent before :meth:`open`.
-
-    Args:
-        setup: The experiment's options, resolved.
-        writer: Session with the device that has the output.
     """
 
     def __init__(self, setup: ModbusSetup, writer: ModbusSession) -> None:
@@ -198,17 +186,11 @@ class ModbusPair:
                 opened = session.link
                 session.check_selftest()
 
-    def set_up(self) -> None:
-        """Run the init steps of the profiles."""
+    def run(self, steps: Literal["init", "close"]) -> None:
+        """Run these steps of the profiles."""
         for name, session in self._sessions:
             with naming(name):
-                session.run(session.profile.init)
-
-    def tear_down(self) -> None:
-        """Run the close steps of the profiles."""
-        for name, session in self._sessions:
-            with naming(name):
-                session.run(session.profile.close)
+                session.run(getattr(session.profile, steps))
 
     def look(self) -> tuple[float, float | None]:
         """Connect, read input and output register, and close the links; nothing is changed.
@@ -222,13 +204,11 @@ class ModbusPair:
             self.open()
             with naming(self._reader):
                 found = setup.input.format.decode(self.reader.read_bytes(setup.input))
+            held = writer.held(setup.output)
             watchdog = writer.profile.watchdog
             flag = "none" if watchdog == "none" else watchdog.tripped
-            # A trip leaves the last command in the register.
-            knows = setup.output.readback_register is not None
-            held = None
-            if knows and (flag == "none" or not writer.is_set(flag)):
-                held = writer.held(setup.output)
+            if held is not None and flag != "none" and writer.is_set(flag):
+                held = None  # the register keeps the last command
         finally:
             self.release()
         output = None if held is None else setup.chain.command(held)

@@ -134,9 +134,10 @@ FeedbackFrame: TypeAlias = ReadFrame | WriteFrame
 
 
 def feedback_pdu(*frames: FeedbackFrame) -> bytes:
-    """Return a LabJack Modbus Feedback request (76); it and its reply must fit a PDU.
+    """Return a LabJack Modbus Feedback request (76), which executes frames in their order.
 
-    Frames are executed in their order, so what is read first does not show a value written later.
+    A frame is ``00 address16 words8`` to read and ``01 address16 words8 data`` to write. A reply
+    has the words of each read. Both must fit a PDU of the Modbus specification.
     """
     pdu = bytes((FEEDBACK,)) + b"".join(frame.encode() for frame in frames)
     longest = max(len(pdu), 1 + sum(frame.reply_size for frame in frames))

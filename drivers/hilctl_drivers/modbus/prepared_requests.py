@@ -53,27 +53,15 @@ class Transaction(ABC):
 
     @abstractmethod
     def request(self, data: bytes = b"") -> bytes:
-        """Return the next request.
-
-        Args:
-            data: Register bytes to write, as many as the PDU was prepared with, otherwise it raises
-                BadRequestError; empty for those of the last call.
-        """
+        """Return the next request; without ``data`` it writes those of the last call."""
 
     @abstractmethod
     def reply(self, adu: Bytes) -> bytes:
-        """Check the reply to the last request and return the register bytes read.
-
-        Raises:
-            FrameError: Incomplete, corrupt, a refusal, or the answer to another request.
-        """
+        """Return the register bytes in the reply to the last request, or raise FrameError."""
 
     @abstractmethod
     def missing(self, received: Bytes) -> int:
-        """Return how many more bytes to wait for; 0 if the reply is ready to be checked.
-
-        The first bytes tell a good reply from an exception reply, which is shorter.
-        """
+        """Return the number of missing bytes; 0 if the reply is complete."""
 
     def _bad_size(self, data: bytes) -> BadRequestError:
         return BadRequestError(f"request was prepared for {self._data_size} bytes, got {len(data)}")

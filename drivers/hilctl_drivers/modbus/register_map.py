@@ -23,22 +23,27 @@ RegisterType: TypeAlias = Literal["int16", "uint16", "int32", "uint32", "float32
 
 _CODES = {"int16": "h", "uint16": "H", "int32": "i", "uint32": "I", "float32": "f", "float64": "d"}
 _FLOAT32_MAX = struct.unpack(">f", b"\x7f\x7f\xff\xff")[0]
+_RAW_LIMITS: dict[RegisterType, tuple[float, float]] = {
+    "int16": (-(2**15), 2**15 - 1),
+    "uint16": (0, 2**16 - 1),
+    "int32": (-(2**31), 2**31 - 1),
+    "uint32": (0, 2**32 - 1),
+    "float32": (-_FLOAT32_MAX, _FLOAT32_MAX),
+    "float64": (-inf, inf),
+}
 _LETTERS = "ABCDEFGH"
 _Permute: TypeAlias = Callable[[Bytes], tuple[int, ...]]
 
 
 @dataclass(frozen=True)
 class RegisterFormat:
-    """Encoding of one value in its registers.
+    """Encoding of one value in its registers; what is not valid raises BadRequestError.
 
     Attributes:
         type: Number type of the raw value.
         order: Byte order in ABCD notation; empty for most significant byte first.
         scale: Value of one raw step, in the channel's unit; finite and not 0.
         offset: Value at raw 0, in the channel's unit; finite.
-
-    Raises:
-        BadRequestError: One of them is not valid.
     """
 
     type: RegisterType
@@ -52,7 +57,8 @@ class RegisterFormat:
     _unpack: Callable[[Bytes], tuple[float]] = field(init=False, repr=False, compare=False)
     _to_wire: _Permute | None = field(init=False, repr=False, compare=False)
     _from_wire: _Permute | None = field(init=False, repr=False, compare=False)
-    _whole: bool = field(init=False, repr=False, compare=False)
+    is_integer: bool = field(init=False, repr=False, compare=False)
+    """Whether the raw value is an integer."""
 
     def __post_init__(self) -> None:
         if self.type not in _CODES:
@@ -80,36 +86,15 @@ class RegisterFormat:
             "_unpack": form.unpack,
             "_to_wire": None if plain else itemgetter(*map(natural.index, order)),
             "_from_wire": None if plain else itemgetter(*map(order.index, natural)),
-            "_whole": self.is_integer,
+            "is_integer": "int" in self.type,
         }
         for name, value in derived.items():
             object.__setattr__(self, name, value)
 
     @property
-    def count(self) -> int:
-        """Registers of the value."""
-        return self.size // 2
-
-    @property
-    def is_integer(self) -> bool:
-        """Whether the raw value is an integer."""
-        return "int" in self.type
-
-    @property
     def limits(self) -> tuple[float, float]:
         """Lowest and highest value that the type can hold, in the channel's unit."""
-        bits = 8 * self.size
-        low: float
-        high: float
-        if self.type == "float64":
-            return -inf, inf
-        if self.type == "float32":
-            low, high = -_FLOAT32_MAX, _FLOAT32_MAX
-        elif self.type.startswith("u"):
-            low, high = 0, 2**bits - 1
-        else:
-            low, high = -(2 ** (bits - 1)), 2 ** (bits - 1) - 1
-        ends = (low * self.scale + self.offset, high * self.scale + self.offset)
+        ends = [raw * self.scale + self.offset for raw in _RAW_LIMITS[self.type]]
         return min(ends), max(ends)
 
     def encode(self, value: float) -> bytes:
@@ -122,7 +107,7 @@ class RegisterFormat:
         if not isfinite(raw):
             raise BadRequestError(f"{self.type} register can't hold {value}")
         try:
-            data = self._pack(round(raw) if self._whole else raw)
+            data = self._pack(round(raw) if self.is_integer else raw)
         except (struct.error, OverflowError):
             raise BadRequestError(
                 f"{self.type} register holds {self.limits[0]:g} to {self.limits[1]:g}, got {value}"
@@ -130,11 +115,7 @@ class RegisterFormat:
         return data if self._to_wire is None else bytes(self._to_wire(data))
 
     def decode(self, data: Bytes) -> float:
-        """Return the value in register bytes, bytes[size]; NaN if the device sent it.
-
-        Raises:
-            MismatchError: Too many or too few bytes.
-        """
+        """Return the value in register bytes, bytes[size]; NaN if the device sent it."""
         if len(data) != self.size:
             raise MismatchError(f"{self.type} register has {self.size} bytes, got {len(data)}")
         if self._from_wire is not None:
@@ -194,7 +175,7 @@ class Register(StrictModel):
     @property
     def words(self) -> int:
         """Registers (or bits) that it takes up."""
-        return 1 if self.type == "bit" else self.format.count
+        return 1 if self.type == "bit" else self.format.size // 2
 
     @property
     def read_function(self) -> int:
@@ -222,7 +203,7 @@ class Channel(Register, Range):
             raise ValueError(f"an analogue channel can't be in area {self.area}")
         if self.type.startswith("float") and (self.raw_min, self.raw_max) != (None, None):
             raise ValueError("raw_min and raw_max are for whole-number types")
-        low, high = RegisterFormat(self.format.type).limits
+        low, high = _RAW_LIMITS[self.format.type]
         if not low <= self.raw_limits[0] < self.raw_limits[1] <= high:
             raise ValueError(f"raw_min and raw_max must be ordered and fit into {self.type}")
         low, high = self.representable
@@ -237,7 +218,7 @@ class Channel(Register, Range):
     @property
     def raw_limits(self) -> tuple[float, float]:
         """Lowest and highest raw value in use."""
-        low, high = RegisterFormat(self.format.type).limits
+        low, high = _RAW_LIMITS[self.format.type]
         return (
             low if self.raw_min is None else float(self.raw_min),
             high if self.raw_max is None else float(self.raw_max),

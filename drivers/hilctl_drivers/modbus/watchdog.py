@@ -155,10 +155,6 @@ class ModbusSafeWrite:
             peer: The device; best with a numeric address, which needs no name server.
             value: In the output's unit.
             opened: A session on an open serial line; None to open a connection.
-
-        Raises:
-            UnconfirmedError: It was written; the device has no way to confirm it.
-            DeviceError: It was not confirmed.
         """
         if opened is None and self._session is not None:
             opened = self._session  # which knows whether answers are outstanding on the line
@@ -205,19 +201,15 @@ class ModbusSafeWrite:
         self._guard.write_through(session, lambda: self._put(session, data))
         if self._setup.unconfirmed:
             raise UnconfirmedError(f"the value was sent, but {self._setup.unconfirmed}")
-        self._check_held(session, value)
+        found, output = self._held(session), self._setup.output
+        if found is not None:
+            tolerance = max(output.step, 1e-6 * (output.max - output.min))
+            check_read_back(output, value, found, tolerance)
 
     def _put(self, session: ModbusSession, data: bytes) -> None:
         """Write the output's register bytes once."""
         session.write_bytes(self._setup.output, data)
 
-    def _check_held(self, session: ModbusSession, value: float) -> None:
-        """Raise unless the output holds the value, if it can be read back."""
-        found = session.held(self._setup.output)
-        if found is not None:
-            self._check(found, value)
-
-    def _check(self, found: float, value: float) -> None:
-        output = self._setup.output
-        tolerance = max(output.step, 1e-6 * (output.max - output.min))
-        check_read_back(output, value, found, tolerance)
+    def _held(self, session: ModbusSession) -> float | None:
+        """Return the content of the output's register; None if it cannot be read."""
+        return session.held(self._setup.output)

@@ -1,18 +1,17 @@
 """Exclusive use of a device: exclusive access to a port, and names of locks.
 
-pyserial's lock is heeded only by programs that take one too; a shell, a terminal program or a
-daemon that probes ports does not. The kernel refuses the port to all after TIOCEXCL, except
-to privileged ones. It keeps that as long as *any* descriptor of the port is open, also when the
-process that asked for it was killed. Then the guardian must open the port to make the output safe,
-often without privileges. So it is asked for only if it ends with this process:
+Only programs that use pyserial's lock respect it; a shell or a daemon that probes ports does not.
+After TIOCEXCL the kernel refuses the port to all unprivileged programs. It does so as long as *any*
+descriptor of the port is open, even if this process was killed. Then the guardian must open the
+port to make the output safe, often without privileges. So TIOCEXCL is set only if it ends with this
+process:
 
 - on a real port that no other program has open, as far as this process can see;
 - on a pseudo-terminal, which its far end keeps, only if this process could open it all the same.
 
-Between experiments one device is one lock, as :attr:`hilctl.base.device.DeviceInfo.holds` has it.
-So each place has all the names that another experiment could know it by: a port its path, the file
-that its links lead to and the number that the kernel knows it by, a host its name and its
-addresses.
+Between experiments one device is one lock, see :attr:`hilctl.base.device.DeviceInfo.holds`. So each
+place has all the names that another experiment could use: a port its path, the target of its links
+and its device number, a host its name and its addresses.
 """
 
 import ipaddress

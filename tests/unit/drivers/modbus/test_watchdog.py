@@ -252,14 +252,16 @@ def test_a_value_that_is_written_over_is_not_confirmed(driven, late_s):
 
 def test_a_step_of_the_output_is_no_other_value(driven):
     """Which of two neighbours a device rounds to is its own affair; floats round to a millionth."""
-    for profile in ("wago_750", "generic_float32"):
+    for profile in ("adam_6024", "generic_float32"):
         safe_write = driven(profile).device._safe_write
         output = safe_write._setup.output
         step = output.step or 1e-6 * (output.max - output.min)
         assert step > 0.0
-        safe_write._check(step, 0.0)
+        safe_write._put = lambda session, data: None
+        safe_write._held = lambda session, found=step: found
+        safe_write._write(None, 0.0)
         with pytest.raises(DeviceError):
-            safe_write._check(1.01 * step, 0.0)
+            safe_write._write(None, -0.01 * step)
 
 
 def test_no_name_is_looked_up_for_it():
