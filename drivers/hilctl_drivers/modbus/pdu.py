@@ -63,12 +63,8 @@ def _written(address: int, data: bytes, count_max: int) -> int:
 
 def read_pdu(function: int, address: int, count: int) -> bytes:
     """Return a request to read at most 2000 bits (functions 1, 2) or 125 registers (3, 4)."""
-    if function in {READ_COILS, READ_DISCRETE}:
-        _check_span("bit", address, count, BITS_MAX)
-    elif function in {READ_HOLDING, READ_INPUT}:
-        _check_span("register", address, count, READ_MAX)
-    else:
-        raise BadRequestError(f"functions that read are 1, 2, 3 and 4, got {function}")
+    bits = function in {READ_COILS, READ_DISCRETE}
+    _check_span("bit" if bits else "register", address, count, BITS_MAX if bits else READ_MAX)
     return struct.pack(">BHH", function, address, count)
 
 
@@ -155,10 +151,8 @@ def reply_layout(pdu: bytes) -> tuple[bytes, int]:
         size = 2 * int.from_bytes(pdu[3:5], "big")
     elif function in {WRITE_COIL, WRITE_REGISTER, WRITE_REGISTERS}:
         return pdu[:5], 0
-    elif function == FEEDBACK:
-        return pdu[:1], _feedback_reads(pdu)
     else:
-        raise BadRequestError(f"function {function} is not one of those known here")
+        return pdu[:1], _feedback_reads(pdu)
     return bytes((function, size)), size
 
 
@@ -206,8 +200,6 @@ def reply_data(request_pdu: bytes, reply_pdu: bytes) -> bytes:
 def tcp_adu(transaction: int, unit: int, pdu: bytes) -> bytes:
     """Return ``pdu`` with its MBAP header, for a unit from 0 to 255."""
     _check_envelope(unit, 0, pdu)
-    if not 0 <= transaction <= 0xFFFF:
-        raise BadRequestError(f"transaction must be 0 to 65535, got {transaction}")
     return struct.pack(">HHHB", transaction, 0, len(pdu) + 1, unit) + pdu
 
 

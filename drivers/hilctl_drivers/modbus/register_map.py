@@ -61,10 +61,6 @@ class RegisterFormat:
     """Whether the raw value is an integer."""
 
     def __post_init__(self) -> None:
-        if self.type not in _CODES:
-            raise BadRequestError(
-                f"unknown register type {self.type!r}; known are {', '.join(_CODES)}"
-            )
         if not (isfinite(self.scale) and isfinite(self.offset) and self.scale):
             raise BadRequestError(
                 f"scale must be finite and not 0 and offset finite, got {self.scale}, {self.offset}"

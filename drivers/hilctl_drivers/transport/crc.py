@@ -18,8 +18,6 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import TypeAlias
 
-from hilctl_drivers.transport.links import BadRequestError
-
 Bytes: TypeAlias = bytes | bytearray | memoryview
 
 
@@ -88,14 +86,6 @@ CRCS: Mapping[str, Crc] = MappingProxyType({crc.name: crc for crc in (
     Crc("none", 0, lambda _data: 0),
 )})  # fmt: skip
 """All CRCs that profiles can name."""
-
-
-def named_crc(name: str) -> Crc:
-    """Return the CRC of that name, or raise BadRequestError."""
-    try:
-        return CRCS[name]
-    except KeyError:
-        raise BadRequestError(f"unknown CRC {name!r}; known are {', '.join(CRCS)}") from None
 
 
 def dcon_checksum(text: Bytes) -> bytes:

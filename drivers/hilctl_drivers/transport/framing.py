@@ -14,7 +14,7 @@ from typing import Generic, Literal, TypeAlias, TypeVar
 
 from cobs import cobs
 
-from hilctl_drivers.transport.crc import Bytes, Crc, named_crc
+from hilctl_drivers.transport.crc import CRCS, Bytes, Crc
 from hilctl_drivers.transport.links import BadRequestError, CorruptError, IncompleteError
 
 Content = TypeVar("Content")
@@ -268,5 +268,5 @@ class LengthFraming(Framing):
 
 def binary_framing(kind: FramingKind, crc: str, payload_max: int = PAYLOAD_MAX) -> Framing:
     """Return a framing by the names in profiles; length-prefixed frames need a CRC."""
-    check = named_crc(crc)
-    return CobsFraming(check, payload_max) if kind == "cobs" else LengthFraming(check, payload_max)
+    framing = CobsFraming if kind == "cobs" else LengthFraming
+    return framing(CRCS[crc], payload_max)

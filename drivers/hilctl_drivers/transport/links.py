@@ -39,11 +39,6 @@ class LostError(DeviceError):
 class Link(Protocol):
     """A connection to a device."""
 
-    @property
-    def name(self) -> str:
-        """``host:port`` or the serial port, for messages."""
-        ...
-
     def open(self) -> None:
         """Connect.
 

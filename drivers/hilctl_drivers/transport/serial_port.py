@@ -141,14 +141,6 @@ class SerialLink:
         self._stale = True
         self._exclusive = False
         self._quiet_at = 0.0
-        self.low_latency = False
-        """Whether the driver took the low-latency setting; without it an FTDI adapter holds bytes
-        back for up to 16 ms."""
-
-    @property
-    def name(self) -> str:
-        """The port's device file."""
-        return self._path
 
     @property
     def is_open(self) -> bool:
@@ -175,11 +167,9 @@ class SerialLink:
         except (OSError, ValueError) as error:
             text = reason(error, PORT_REMEDIES) if isinstance(error, OSError) else str(error)
             raise LostError(f"can't be opened: {text}") from None
-        try:
+        # Otherwise an FTDI adapter holds bytes back for up to 16 ms; ptys and USB CDC refuse it.
+        with contextlib.suppress(OSError, ValueError, NotImplementedError):
             port.set_low_latency_mode(True)
-            self.low_latency = True
-        except (OSError, ValueError, NotImplementedError):  # ptys and USB CDC have no such setting
-            self.low_latency = False
         self._port, self._fd = port, port.fileno()
         self._count_waiting = _counts_waiting(self._fd, self._waiting)
         self._poll = select.poll()

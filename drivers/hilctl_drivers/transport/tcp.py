@@ -37,11 +37,6 @@ class TcpLink:
         self.peer_host = host
         """Numeric address of the peer after connecting; before that, ``host``."""
 
-    @property
-    def name(self) -> str:
-        """``host:port``."""
-        return f"{self._address[0]}:{self._address[1]}"
-
     def open(self) -> None:
         """Connect, see :meth:`~hilctl_drivers.transport.links.Link.open`."""
         self.close()

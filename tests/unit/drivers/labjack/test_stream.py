@@ -120,8 +120,6 @@ def test_constants_stand_where_the_flash_map_says(form, channel, span):
 class Link:
     """Keeps the request and answers with what a test wants."""
 
-    name = "nowhere"
-
     def __init__(self, answer):
         self._answer = answer
         self.request = b""

@@ -27,8 +27,6 @@ from tests.unit.drivers.modbus.conftest import exchange
 class Line:
     """A device over Modbus TCP with coils and registers at any address."""
 
-    name = "line"
-
     def __init__(self):
         self.asked, self.coils, self.registers = [], {}, {}
 

@@ -156,7 +156,6 @@ def test_decoding_wants_exactly_its_bytes(size):
 @pytest.mark.parametrize(
     ("arguments", "rule"),
     [
-        (("int24",), "unknown register type"),
         (("int32", "AB"), "each of ABCD once"),
         (("int32", "ABCC"), "each of ABCD once"),
         (("int16", "ABCD"), "each of AB once"),
