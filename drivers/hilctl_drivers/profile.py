@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from pathlib import Path
-from pkgutil import iter_modules
+from pkgutil import iter_modules, resolve_name
 from typing import Annotated, Any, TypeAlias, TypeVar, cast
 
 from pydantic import PlainSerializer, PlainValidator, ValidationError, ValidationInfo
@@ -77,15 +77,9 @@ def link_kinds() -> dict[str, str]:
     return dict(sorted(kinds.items()))
 
 
-def named_class(place: str) -> Any:
-    """Return the object named ``module:name``."""
-    module, _, name = place.partition(":")
-    return getattr(import_module(module), name)
-
-
 def profile_class(kind: str) -> type[BaseProfile]:
     """Return the class of profiles with this ``link.kind``."""
-    return cast("type[BaseProfile]", named_class(link_kinds()[kind]))
+    return cast("type[BaseProfile]", resolve_name(link_kinds()[kind]))
 
 
 def shipped_profiles() -> dict[str, Path]:

@@ -147,11 +147,7 @@ class StreamData:
 
 
 def stream_data(data: bytes, free: bytes) -> StreamData:
-    """Return the content of the answers to :data:`READ_FRAMES`.
-
-    Raises:
-        DeviceError: The device dropped scans, its stream stopped, or it sent too many samples.
-    """
+    """Return the content of the answers to :data:`READ_FRAMES`, or raise if scans were lost."""
     count, backlog_bytes, status, more = DATA_HEAD.unpack_from(data)
     if status:
         text = STATUS.get(status, "stream status {}")

@@ -25,13 +25,8 @@ class StreamSession:
     before. This holds as long as the output's buffer never runs dry, which each message checks
     before its own values come. Every error is a ``DeviceError``.
 
-    Args:
-        feedback: Sends messages to the device.
-        streaming: The profile's section on streaming.
-        timeout_s: Longest wait for scans that are due.
-        turnaround_s: Longest time from the first to the last frame of a message.
-        sleep: Waits that many s.
-        clock: Monotonic time in s.
+    ``timeout_s`` is the longest wait for readings that are due, ``turnaround_s`` the longest time
+    from the first to the last frame of a message.
     """
 
     def __init__(

@@ -229,17 +229,16 @@ class ModbusPair:
             self.reader.read_bytes(self._setup.input)
         swap = self._combined()
         readback = self._setup.output.readback_register
-        if swap is None or readback is None:
-            return self._one_after_the_other(), False
-        held = self.writer.read_bytes(readback)  # who is silent here is not there at all
-        try:
-            swap(held)
-        except RefusedError:
-            return self._one_after_the_other(), False
-        except NoAnswerError:  # some devices are silent about functions they don't know
-            self.writer.link.open()
-            return self._one_after_the_other(), False
-        return swap, True
+        if swap is not None and readback is not None:
+            held = self.writer.read_bytes(readback)  # no answer here: there is no device
+            try:
+                swap(held)
+                return swap, True
+            except NoAnswerError:  # some devices do not answer to an unknown function
+                self.writer.link.open()
+            except RefusedError:
+                pass
+        return self._one_after_the_other(), False
 
     def _one_after_the_other(self) -> Swap:
         setup, writer, reader = self._setup, self.writer, self.reader

@@ -177,11 +177,7 @@ class ModbusWatchdog(Watchdog):
     ) -> tuple[ModbusStep, ...]:
         """Return steps with numbers for ``timeout`` and ``safe``, scaled to the device's units.
 
-        Args:
-            steps: Any of the watchdog's steps.
-            output: The output in use; its scale and offset go with ``safe``.
-            timeout_s: Timeout, see :meth:`Watchdog.counts`.
-            safe: Safe value in the output's unit.
+        ``safe`` is in the unit of the output in use.
         """
         self.counts(timeout_s)
         changes: dict[str, dict[str, float]] = {

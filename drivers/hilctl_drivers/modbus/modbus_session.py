@@ -70,12 +70,7 @@ def combined_request(
 class ModbusSession:
     """A link to one device, with one request at a time; every error is a ``DeviceError``.
 
-    Args:
-        profile: The device.
-        link: Not yet open.
-        unit: Its unit id.
-        sleep: Waits that many s.
-        framing: Of the link, if it differs from the profile's, as behind a gateway.
+    ``framing`` is that of the link, if it differs from the profile's, as behind a gateway.
     """
 
     def __init__(
@@ -185,14 +180,7 @@ def _named(step: RegisterStep) -> str:
 def exchange_time(
     profile: ModbusProfile, output: str, sensor: str | None, *, one_transaction: bool = True
 ) -> WireTime:
-    """Return the time of one exchange: write an output and read an input.
-
-    Args:
-        profile: The device; see :func:`hilctl_drivers.profile.with_link` for another baud or gap.
-        output: Name of the output.
-        sensor: Name of the input; None to write only.
-        one_transaction: Whether the exchange in one transaction may be used, if there is one.
-    """
+    """Return the time to write an output and read an input, by name; None to write only."""
     written = profile.outputs[output]
     write = write_request(profile, written)
     if sensor is None:

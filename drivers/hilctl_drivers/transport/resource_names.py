@@ -29,9 +29,7 @@ _PTY_MAJORS = range(136, 144)
 def refuse_to_others(descriptor: int, path: str) -> bool:
     """Refuse an open port to other programs if that ends with this process; return whether it does.
 
-    Args:
-        descriptor: The port.
-        path: Its device file.
+    ``path`` is its device file.
     """
     device = os.fstat(descriptor).st_rdev
     is_pty = os.major(device) in _PTY_MAJORS

@@ -107,15 +107,7 @@ def _counts_waiting(fd: int, waiting: "array.array[int]") -> Callable[[], object
 
 
 class SerialLink:
-    """A serial port with exclusive access.
-
-    Args:
-        port: Device file; ``/dev/serial/by-id/...`` stays the same when ports are renumbered.
-        settings: Settings of the line.
-        timeout_s: Longest time of one exchange.
-        clock: Monotonic time in s.
-        sleep: Waits that many s.
-    """
+    """A serial port with exclusive access."""
 
     def __init__(
         self,

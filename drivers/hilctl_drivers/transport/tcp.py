@@ -20,11 +20,7 @@ _CHUNK = 4096
 class TcpLink:
     """A TCP connection without Nagle's delay.
 
-    Args:
-        host: Name or address.
-        port: TCP port.
-        timeout_s: Longest time to connect, or of one exchange.
-        clock: Monotonic time in s.
+    ``timeout_s`` is the longest time to connect, and of one exchange.
     """
 
     def __init__(

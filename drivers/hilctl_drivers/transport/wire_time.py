@@ -106,11 +106,7 @@ class RateLimit:
 
 
 def check_feeds(timeout_s: float | None, ticks_per_s: float) -> int:
-    """Return the ticks in a third of the watchdog's timeout; 0 without a watchdog.
-
-    Raises:
-        DeviceError: There is less than one.
-    """
+    """Return the ticks in a third of the watchdog's timeout, at least 1; 0 without a watchdog."""
     if timeout_s is None:
         return 0
     ticks = timeout_s * ticks_per_s / _FEEDS_A_TIMEOUT
