@@ -154,7 +154,7 @@ def test_as_many_values_as_ours_are_held_within_the_margin(scene, off):
     if abs(off) == 3:
         assert made.session.take(10).size == 10
         return
-    with pytest.raises(DeviceError, match=f"holds {90 + off} values, by its scans it must be 90"):
+    with pytest.raises(DeviceError, match=f" {90 + off} .* 90"):
         made.session.take(10)
 
 
@@ -166,7 +166,7 @@ def test_a_buffer_holds_what_was_queued_before_the_start(scene, lost, refused):
         made.session.start()
         assert made.session.running
         return
-    with pytest.raises(DeviceError, match=f"100 values were queued, the device holds {100 - lost}"):
+    with pytest.raises(DeviceError, match=f"^100 .* {100 - lost}$"):
         made.session.start()
     assert not made.session.running
 

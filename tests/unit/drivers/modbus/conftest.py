@@ -34,8 +34,6 @@ max_rate_hz: 1000.0
 outputs: {}
 inputs:
   IN: {area: input, address: 0, type: int16, scale: 0.001, unit: V, min: -10.0, max: 10.0}
-  OWN: {area: input, address: 1, type: int16, scale: 0.001, unit: V, min: -10.0, max: 10.0,
-        measures: output}
 init:
   - {kind: write, address: 7, type: uint16, value: 1, verify: true, note: take over}
 close:
