@@ -96,14 +96,6 @@ def test_a_beginning_is_incomplete_and_a_tail_is_corrupt(framing):
             framing.decode(frame + tail)
 
 
-def test_an_endless_frame_is_corrupt():
-    """Past the largest frame there is nothing left to wait for."""
-    with pytest.raises(CorruptError, match="no final 00"):
-        CobsFraming(CRCS["crc32"], payload_max=8).decode(b"\x01" * 40)
-    with pytest.raises(CorruptError, match="8 bytes, got 9"):
-        LengthFraming(CRCS["crc32"], payload_max=8).decode(b"\x09\x00")
-
-
 def test_cobs_size_on_the_wire_is_the_largest_there_is():
     """A payload without a zero takes all of it; a frame may be awaited up to there, no further."""
     framing = CobsFraming(CRCS["none"], payload_max=8)
