@@ -196,7 +196,7 @@ class ModbusStream(ModbusDevice):
         self._guard.plan(sample_rate_hz / block)
         pair = self._connected()
         stream = self._stream_on(pair.writer)
-        stream.stop()  # whoever started it: no other setting is taken while it runs
+        stream.stop()  # also one of another program: a running stream accepts no settings
         pair.run("init")
         pair.writer.run(setup.streaming.setup)
         self._calibration = stream.calibration(setup.source // 2)

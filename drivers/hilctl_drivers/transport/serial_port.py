@@ -243,7 +243,7 @@ class SerialLink:
 
     def _await_gap(self) -> None:
         if self._waiting[0]:
-            raise DeviceError(f"{self._waiting[0]} bytes that nobody asked for")
+            raise DeviceError(f"{self._waiting[0]} bytes that answer no request")
         early_s = self._quiet_at - self._clock()
         if early_s > 0.0:
             self._sleep(early_s)
@@ -292,7 +292,7 @@ class SerialLink:
         while self._poll.poll(quiet_ms):
             self._read()
             if self._clock() > deadline:
-                raise DeviceError("the line does not get quiet: somebody keeps sending")
+                raise DeviceError("the line does not get quiet: another device keeps sending")
         self._stale = False
 
     def close(self) -> None:
