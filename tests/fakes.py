@@ -310,11 +310,6 @@ class InProcessLink:
         self.requests: list[bytes] = []
         """All requests, oldest first."""
 
-    @property
-    def name(self) -> str:
-        """Its address."""
-        return "in process"
-
     def open(self) -> None:
         """See :meth:`~hilctl_drivers.transport.links.Link.open`."""
         self.is_open = True

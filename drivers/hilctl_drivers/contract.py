@@ -14,7 +14,6 @@ wired to an emulator. In a test file of the package::
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -38,12 +37,14 @@ class DrivenDevice:
         device: Not yet open.
         block: Samples it takes in one exchange.
         rate_hz: A sample rate that it can keep.
-        stands: Returns what stands at its output, if possible not by its own word: the emulated
-            device's, or the simulated plant's; None if nothing can tell.
+        stands: Returns its output as a command, if possible that of the emulated device or the
+            simulated plant; None if it is not known.
         pass_time: Called before each exchange.
         exchanged: Samples since it was opened.
         name: Its registry name; empty if it has none yet.
         starts_at_rest: Whether opening it starts anew, as a simulation does.
+        must_be_at_rest: Whether opening is refused unless its output is 0.
+        reads_back: Whether it can read its output back; None if either is allowed.
     """
 
     device: Device
@@ -54,10 +55,8 @@ class DrivenDevice:
     exchanged: int = 0
     name: str = ""
     starts_at_rest: bool = False
-    must_be_at_rest: ClassVar[bool] = False
-    """Whether opening is refused while it puts anything out."""
-    reads_back: ClassVar[bool | None] = True
-    """Whether it knows what it outputs; None if that is up to it."""
+    must_be_at_rest: bool = False
+    reads_back: bool | None = True
 
     def open(self) -> None:
         """Open and arm the device, as a run does; the next sample is the first."""
@@ -89,12 +88,6 @@ class DrivenDevice:
         return 0.5 * (info.command_max + max(0.0, info.command_min))
 
 
-class _OtherDevice(DrivenDevice):
-    """A device that nothing but itself tells the output of."""
-
-    reads_back = None
-
-
 def driven_device(device: Device) -> DrivenDevice:
     """Return a device to check, whose output is what it says itself."""
     rate_hz = min(RATE_HZ, device.info.max_rate_hz)
@@ -108,7 +101,7 @@ def driven_device(device: Device) -> DrivenDevice:
             device.close()
             return current
 
-    return _OtherDevice(device, SAMPLES, rate_hz, stands)
+    return DrivenDevice(device, SAMPLES, rate_hz, stands, reads_back=None)
 
 
 @pytest.fixture

@@ -1,11 +1,13 @@
 """Base class of all devices, independent of the protocol.
 
-It checks block, rate, sizes and range before anything is sent, and never clips. Each error names
-the device and the action. After a failure the state of the device is unknown, so the connection is
-closed and the device must be opened again. A subclass connects, exchanges and disconnects.
+It checks block, rate, sizes and range before anything is sent, and never clips. Each error is a
+``DeviceError`` that names the device and the action. After a failure the state of the device is
+unknown, so the connection is closed and the device must be opened again. A subclass connects,
+exchanges and disconnects.
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from typing import ClassVar
 
 import numpy as np
@@ -56,50 +58,36 @@ class DacDevice(ABC):
             self._rates(block).check(sample_rate_hz)
             self._open(sample_rate_hz, block)
         except DeviceError as error:
-            self._release()
-            raise self._error("open", str(error)) from None
+            raise self._failed("open", error, self._release) from None
         self._block = block
 
     def arm(self) -> None:
-        """Arm the watchdog, see :meth:`hilctl.base.device.WatchdogDevice.arm`.
-
-        Raises:
-            DeviceError: Not open, or the device did not confirm; then it must be opened again.
-        """
+        """Arm the watchdog, see :meth:`hilctl.base.device.WatchdogDevice.arm`."""
+        action = "arm the watchdog"
         if not self._block:
-            raise self._error("arm the watchdog", "not open")
+            raise self._error(action, "not open")
         try:
             self._arm()
         except DeviceError as error:
-            self._block = 0
-            self._abandon()
-            raise self._error("arm the watchdog", str(error)) from None
+            raise self._failed(action, error, self._abandon) from None
 
     def output(self) -> float | None:
-        """Return what the open device outputs, see :meth:`hilctl.base.device.Device.output`.
-
-        Raises:
-            DeviceError: Not open, or no good answer in time; it must be opened again.
-        """
+        """Return the output of the open device, see :meth:`hilctl.base.device.Device.output`."""
+        action = "read the output back"
         if not self._block:
-            raise self._error("read the output back", "not open")
+            raise self._error(action, "not open")
         try:
             return self._output()
         except DeviceError as error:
-            self._block = 0
-            self._release()
-            raise self._error("read the output back", str(error)) from None
+            raise self._failed(action, error, self._release) from None
 
     def look(self) -> tuple[float, float | None]:
         """Connect, return displacement and output, and disconnect; nothing is changed.
 
-        No step of the profile is sent, no watchdog armed, fed on purpose or cleared.
+        No step of the profile is sent, and no watchdog is armed, fed on purpose or cleared.
 
         Returns:
             Displacement in um, and the output in the command's unit; None if it cannot be known.
-
-        Raises:
-            DeviceError: Open; or it cannot be reached, is another device, or gives no good answer.
         """
         if self._block:
             raise self._error("look", "open")
@@ -115,11 +103,8 @@ class DacDevice(ABC):
     ) -> None:
         """Send one block of commands, see :meth:`hilctl.base.device.Device.exchange`.
 
-        After an error on the wire the device must be opened again.
-
-        Raises:
-            DeviceError: Not open, a block of another size than agreed, or a command out of range or
-                not finite, and then nothing was sent; or no good answer in time.
+        Nothing is sent of a block of another size than agreed at open, or with a command that is
+        out of range or not finite.
         """
         block = self._block
         if not command.size == displacement_um.size == measured.size == block or not block:
@@ -129,9 +114,7 @@ class DacDevice(ABC):
         try:
             self._exchange(first_sample, command, displacement_um, measured)
         except DeviceError as error:
-            self._block = 0
-            self._abandon()
-            raise self._error(self._action, str(error)) from None
+            raise self._failed(self._action, error, self._abandon) from None
 
     def make_safe(self, command: float) -> None:
         """Set the output to ``command`` in one attempt and disconnect; the watchdog stays armed.
@@ -140,20 +123,19 @@ class DacDevice(ABC):
 
         Raises:
             UnconfirmedError: It was sent; the device has no way to confirm it.
-            DeviceError: ``command`` is out of range or not finite; the device cannot be reached, or
-                does not confirm.
+            DeviceError: ``command`` is out of range, or the device does not confirm it.
         """
         if not self._low <= command <= self._high:
             raise self._out_of_range(np.array([command]))
         # Closed first: no exchange may follow, whether the attempt succeeds or fails.
         self._block = 0
+        action = f"make safe, {self._output_name}"
         try:
             self._put_out(command)
+        except UnconfirmedError as error:
+            raise UnconfirmedError(str(self._error(action, str(error)))) from None
         except DeviceError as error:
-            made = self._error(f"make safe, {self._output_name}", str(error))
-            if isinstance(error, UnconfirmedError):
-                raise UnconfirmedError(str(made)) from None
-            raise made from None
+            raise self._error(action, str(error)) from None
         finally:
             self._release()
 
@@ -161,9 +143,6 @@ class DacDevice(ABC):
         """Disarm and disconnect; the output stays. Closing twice is allowed.
 
         After an error in an exchange there is no connection any more, and a watchdog stays armed.
-
-        Raises:
-            DeviceError: The device did not confirm; the connection is given up all the same.
         """
         opened, self._block = self._block != 0, 0
         try:
@@ -175,7 +154,7 @@ class DacDevice(ABC):
             self._release()
 
     def _longest_block(self) -> tuple[int, str]:
-        """Return the most samples of an exchange and, as text that follow it, why."""
+        """Return the most samples of an exchange, and the reason as text."""
         return 1, ""
 
     def _rates(self, block: int) -> RateLimit:
@@ -221,14 +200,14 @@ class DacDevice(ABC):
         """Close the connection, if open, without a message to the device."""
 
     def _check_block(self, block: int) -> None:
-        """Reject a block that is too long."""
+        """Raise DeviceError for a block that is too long."""
         most, why = self._longest_block()
         if not 1 <= block <= most:
             span = "1 sample" if most == 1 else f"1 to {most} samples"
             raise DeviceError(f"block must be {span}{why}, got {block}")
 
     def _check_sizes(self, command: F64, displacement_um: F64, measured: F64) -> None:
-        """Reject a block that is not as agreed at open."""
+        """Raise DeviceError for a block that is not as agreed at open."""
         if not self._block:
             raise self._error(self._action, "not open")
         sizes = ", ".join(str(each.size) for each in (command, displacement_um, measured))
@@ -237,19 +216,21 @@ class DacDevice(ABC):
         raise self._error(self._action, f"{rule}, got {sizes}")
 
     def _in_range(self, command: F64) -> bool:
-        """Return whether all of a block's commands are in range; one that is no number is not."""
+        """Return whether all commands of a block are in range; NaN is not."""
         low, high = self._low, self._high
         if command.size > _SHORT:
             return bool(low <= command.min() and command.max() <= high)  # both NaN for a NaN
-        for value in command.tolist():  # numpy takes as long for a few as for hundreds
-            if not low <= value <= high:
-                break
-        else:
-            return True
-        return False
+        # For a few values numpy takes as long as for hundreds.
+        return all(low <= value <= high for value in command.tolist())
 
     def _error(self, action: str, what: str) -> DeviceError:
         return DeviceError(f"{self._title}: {what} (to {action})")
+
+    def _failed(self, action: str, error: DeviceError, give_up: Callable[[], None]) -> DeviceError:
+        """Give the connection up and return the error with device and action."""
+        self._block = 0
+        give_up()
+        return self._error(action, str(error))
 
     def _out_of_range(self, command: F64) -> DeviceError:
         """Return the error for a block with a command out of range or not a number."""

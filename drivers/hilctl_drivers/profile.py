@@ -1,7 +1,7 @@
 """Profiles of commercial devices: load and validate them from YAML.
 
-A profile says everything that a driver must know of a device and nothing of what is wired to it.
-Shipped profiles are in ``profiles/``; a user's own is given by its path.
+A profile describes a device, not its wiring. Shipped profiles are in ``profiles/``; a user's own is
+named by its path.
 """
 
 import json
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from pathlib import Path
-from pkgutil import iter_modules
+from pkgutil import iter_modules, resolve_name
 from typing import Annotated, Any, TypeAlias, TypeVar, cast
 
 from pydantic import PlainSerializer, PlainValidator, ValidationError, ValidationInfo
@@ -31,12 +31,7 @@ class BrokenProfileError(ConfigError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class NamedProfile:
-    """A profile, and how the experiment names it.
-
-    Attributes:
-        name: Name of a shipped profile, or path.
-        profile: What it holds.
-    """
+    """A profile, and its name in the experiment: that of a shipped one, or a path."""
 
     name: str
     profile: BaseProfile
@@ -45,8 +40,8 @@ class NamedProfile:
 def _named(value: object, info: ValidationInfo) -> NamedProfile:
     """Resolve a profile's name while options are validated.
 
-    The validation's context may have ``files``, where texts are read from, and ``folder``, what
-    paths are relative to. So what was checked is what runs, also in another process.
+    The validation's context may have ``files``, which reads texts, and ``folder``, the base of
+    relative paths. So a run uses the checked text, also in another process.
     """
     if isinstance(value, NamedProfile):
         return value
@@ -73,10 +68,7 @@ ProfileName: TypeAlias = Annotated[
 
 @cache
 def link_kinds() -> dict[str, str]:
-    """Return every ``link.kind`` of a profile, and where the class of such profiles stands.
-
-    Each protocol's folder says its own, so that a new one edits nothing outside of it.
-    """
+    """Return the class of profiles as ``module:name`` per ``link.kind``, of all protocols."""
     here = __name__.rpartition(".")[0]
     folders = [each.name for each in iter_modules([str(Path(__file__).parent)]) if each.ispkg]
     kinds: dict[str, str] = {}
@@ -85,19 +77,9 @@ def link_kinds() -> dict[str, str]:
     return dict(sorted(kinds.items()))
 
 
-def named_class(place: str) -> Any:
-    """Return the object named ``module:name``."""
-    module, _, name = place.partition(":")
-    return getattr(import_module(module), name)
-
-
 def profile_class(kind: str) -> type[BaseProfile]:
-    """Return the class of profiles with this ``link.kind``.
-
-    Raises:
-        KeyError: There is none.
-    """
-    return cast("type[BaseProfile]", named_class(link_kinds()[kind]))
+    """Return the class of profiles with this ``link.kind``."""
+    return cast("type[BaseProfile]", resolve_name(link_kinds()[kind]))
 
 
 def shipped_profiles() -> dict[str, Path]:
@@ -110,12 +92,10 @@ def load_profile(
 ) -> BaseProfile:
     """Return a profile by the name of a shipped one, or by path.
 
-    What has a suffix or a slash is a path.
-
     Args:
-        name_or_path: The name or the path.
-        files: Where the text is read from; the disk if None.
-        folder: What a path is relative to; the working folder where None.
+        name_or_path: The name, or the path, which has a slash or the suffix of YAML.
+        files: Reads the text; from the disk if None.
+        folder: Base of a relative path; the working folder if None.
 
     Raises:
         InputError: There is no such profile, or the file cannot be read.
@@ -136,11 +116,7 @@ def load_profile(
 
 
 def parse_profile(text: str, where: str) -> BaseProfile:
-    """Return the profile in a YAML text.
-
-    Args:
-        text: The YAML.
-        where: Its name in messages.
+    """Return the profile in a YAML text; ``where`` names it in messages.
 
     Raises:
         ConfigError: It breaks rules; all are listed.
@@ -170,11 +146,7 @@ def parse_profile(text: str, where: str) -> BaseProfile:
 
 
 def with_link(profile: _Profile, **changes: Any) -> _Profile:
-    """Return a profile with other link settings, such as the baud that a device was set to.
-
-    Args:
-        profile: The device.
-        **changes: Settings by name; those that are None stay as they are.
+    """Return a profile with other link settings by name, except those that are None.
 
     Raises:
         InputError: The link has no such setting, the value breaks a rule, or the device cannot be
@@ -195,11 +167,7 @@ def with_link(profile: _Profile, **changes: Any) -> _Profile:
 
 
 def check_baud(profile: BaseProfile, baud: int) -> None:
-    """Reject a baud that the device cannot be set to, where its profile knows those that it can.
-
-    Raises:
-        InputError: It cannot.
-    """
+    """Raise InputError for a baud that is not among those in the profile, if it lists any."""
     others: tuple[int, ...] = getattr(profile.link, "bauds", ())
     known = sorted({*others, getattr(profile.link, "baud", baud)})
     if others and baud not in known:

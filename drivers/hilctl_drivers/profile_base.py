@@ -1,4 +1,4 @@
-"""The parts of a device profile that all protocols share: link, ranges, watchdog, provenance."""
+"""Parts of a device profile that all protocols share: link, ranges, watchdog, provenance."""
 
 import math
 from collections.abc import Mapping
@@ -63,18 +63,11 @@ class SerialLineSettings(LinkSettings):
 
     @property
     def settings(self) -> SerialSettings:
-        """How the port is set."""
-        return SerialSettings(
-            self.baud,
-            self.bytesize,
-            self.parity,
-            self.stopbits,
-            self.silence_s,
-            self.boot_wait_s,
-            flow=self.flow,
-            dtr=self.dtr,
-            rts=self.rts,
+        """Settings of the port."""
+        same = self.model_dump(
+            include={"baud", "bytesize", "parity", "stopbits", "flow", "dtr", "rts"}
         )
+        return SerialSettings(gap_s=self.silence_s, boot_s=self.boot_wait_s, **same)
 
 
 class BinaryLineSettings(SerialLineSettings):
@@ -144,11 +137,7 @@ class Watchdog(StrictModel):
         return self
 
     def counts(self, timeout_s: float) -> int:
-        """Return a timeout in the device's own counts.
-
-        Raises:
-            InputError: It is out of range, or no whole number of counts.
-        """
+        """Return a timeout in the device's own counts, or raise InputError if it has none."""
         if not self.min_s <= timeout_s <= self.max_s:
             raise InputError(
                 f"watchdog timeout_s must be {self.min_s:g} to {self.max_s:g}, got {timeout_s:g}"
@@ -225,7 +214,7 @@ class BaseProfile(StrictModel):
         return f"{self.vendor} {self.model}"
 
     def provenance(self, prefix: str = "") -> dict[str, str]:
-        """Return what the profile is of, and where it was taken from, to keep with a recording."""
+        """Return device and sources of the profile, to keep with a recording."""
         return {
             f"{prefix}vendor": self.vendor,
             f"{prefix}model": self.model,

@@ -8,6 +8,7 @@ come, and the line is drained after a timeout.
 
 from abc import abstractmethod
 from dataclasses import dataclass
+from pkgutil import resolve_name
 from typing import ClassVar
 
 from pydantic import Field
@@ -15,7 +16,7 @@ from pydantic import Field
 from hilctl.base.device import DeviceInfo, DeviceOptions
 from hilctl.base.errors import InputError
 from hilctl_drivers.device import DacDevice
-from hilctl_drivers.profile import NamedProfile, check_baud, named_class, with_link
+from hilctl_drivers.profile import NamedProfile, check_baud, with_link
 from hilctl_drivers.profile_base import BaseProfile, Range, SerialLineSettings
 from hilctl_drivers.signal_chain import DacOptions, FifoBlocks, SignalChain, channel, check_watchdog
 from hilctl_drivers.transport.resource_names import held_port
@@ -179,7 +180,7 @@ class SerialDac(DacDevice):
             InputError: The profile is for another kind of device.
         """
         driver = _serial_profile(options.profile).driver
-        made: SerialDac = object.__new__(named_class(driver) if cls is SerialDac else cls)
+        made: SerialDac = object.__new__(resolve_name(driver) if cls is SerialDac else cls)
         return made
 
     def __init__(self, options: SerialOptions) -> None:

@@ -22,8 +22,7 @@ from hilctl_drivers.transport.wire_time import RateLimit
 PROFILE = "name of a shipped profile, or path of your own, from the experiment's folder"
 
 _Channel = TypeVar("_Channel", bound=Range)
-
-
+_Value = TypeVar("_Value", float, F64)
 _GAINS = ("gain_a_per_v", "gain_a_per_ma", "gain_v_per_v", "gain_v_per_ma")
 
 
@@ -181,23 +180,13 @@ class DacOptions(DeviceOptions):
 
     @property
     def watchdog_timeout_s(self) -> float | None:
-        """The timeout that is wanted, s; None without a watchdog."""
+        """Timeout of the watchdog, s; None without one."""
         return None if self.watchdog == "none" else self.watchdog.timeout_s
 
     @property
     def safe_command(self) -> float:
-        """Where a watchdog is to put the output; 0 without one."""
+        """Output after a trip of the watchdog, as a command; 0 without one."""
         return 0.0 if self.watchdog == "none" else self.watchdog.safe_command
-
-    @property
-    def watchdog_command(self) -> float | None:
-        """Where the watchdog is to put the output; None without one."""
-        return None if self.watchdog == "none" else self.watchdog.safe_command
-
-    @property
-    def watchdog_reason(self) -> str:
-        """Why that is not the experiment's safe value; empty if nothing was said."""
-        return "" if self.watchdog == "none" else self.watchdog.reason
 
     def details(self) -> dict[str, str]:
         """Return the options as text, to keep with a recording."""
@@ -207,14 +196,7 @@ class DacOptions(DeviceOptions):
 class SignalChain:
     """Conversion of commands to output values and of input values to displacements.
 
-    Args:
-        output: The output's range.
-        sensor_input: The input's range.
-        amplifier: Between output and actuator; None if an output in A drives the coil itself.
-        sensor: Between actuator and input.
-
-    Raises:
-        InputError: The units do not match.
+    The units must match; without an amplifier an output in A drives the coil itself.
     """
 
     def __init__(
@@ -245,14 +227,9 @@ class SignalChain:
         """Gain and offset of the command, sensitivity and offset of the displacement."""
         return self._gain, self._offset, self._um_per_unit, self._offset_um
 
-    def output(self, command: float) -> float:
-        """Return the output value of a command."""
+    def output(self, command: _Value) -> _Value:
+        """Return the output value of a command, or of a block of them."""
         return (command - self._offset) / self._gain
-
-    def outputs(self, command: F64) -> F64:
-        """Return the output values of a block of commands."""
-        values: F64 = (command - self._offset) / self._gain
-        return values
 
     def command(self, output: float) -> float:
         """Return the command of an output value."""
@@ -268,14 +245,13 @@ class SignalChain:
         displacement_um += self._offset_um
 
     def info(self, name: str, options: DacOptions, rates: RateLimit, **more: Any) -> DeviceInfo:
-        """Return what a device is and what it accepts.
-
-        Args:
-            name: Its registry name.
-            options: The experiment's.
-            rates: Sample rates that it can keep.
-            **more: What depends on the protocol.
-        """
+        """Return the description of a device; ``more`` depends on the protocol."""
+        if options.watchdog != "none":
+            more |= {
+                "watchdog_command": options.watchdog.safe_command,
+                "watchdog_timeout_s": options.watchdog.timeout_s,
+                "watchdog_reason": options.watchdog.reason,
+            }
         return DeviceInfo(
             name=name,
             command_unit=self.command_unit,
@@ -285,9 +261,6 @@ class SignalChain:
             sensor_max_um=self.displacement_range[1],
             max_rate_hz=rates.highest_hz,
             rate_note=rates.note,
-            watchdog_command=options.watchdog_command,
-            watchdog_timeout_s=options.watchdog_timeout_s,
-            watchdog_reason=options.watchdog_reason,
             **more,
         )
 
@@ -298,12 +271,11 @@ def channel(what: str, name: str, channels: Mapping[str, _Channel], title: str) 
     Args:
         what: The option that names it.
         name: Its name.
-        channels: What the device has.
+        channels: Outputs or inputs of the device.
         title: The device.
 
     Raises:
-        InputError: There is none of this name; or it is an input that no sensor can be wired to,
-            because it measures the device's own output.
+        InputError: There is none, or it is an input that measures the device's own output.
     """
     if name not in channels:
         known = ", ".join(channels) or "none"
@@ -324,14 +296,7 @@ def check_watchdog(
     chain: SignalChain,
     has: Watchdog | Literal["none"],
 ) -> None:
-    """Reject a watchdog that the device has not got, or that cannot do what is asked of it.
-
-    Args:
-        title: The device.
-        options: What the experiment asks for.
-        output: The output in use.
-        chain: What that is wired to.
-        has: What the device has.
+    """Reject options of a watchdog that differs from the one that the device ``has``.
 
     Raises:
         InputError: It has none, cannot take the timeout, or would not go to the safe command.
@@ -360,7 +325,7 @@ def check_watchdog(
 
 
 def _check_protects(title: str, name: str, has: Watchdog) -> None:
-    """Reject a watchdog whose trip leaves the output where it is."""
+    """Reject a watchdog whose trip does not change the output."""
     safe = getattr(has, "safe", {})
     if has.on_trip == "hold":
         raise InputError(

@@ -1,7 +1,7 @@
 """Template of the device section of a new experiment.
 
-It holds the keys that every DAC with a profile needs. Values that depend on the rig are obvious
-placeholders; ``asked`` lists them.
+It has the keys that every DAC with a profile needs. Values that depend on the rig are placeholders;
+``asked`` lists them.
 """
 
 from collections.abc import Mapping
@@ -30,9 +30,9 @@ class StartingSection:
     Attributes:
         title: The device.
         values: The section, ``kind`` first.
-        remarks: What stands behind a value, by dotted key of the section.
-        asked: Keys that only the owner of the rig can know, each with the question.
-        notes: What the profile says must be known before anything is wired.
+        remarks: Comment behind a value, by dotted key of the section.
+        asked: Question to the user, by dotted key of a value that depends on the rig.
+        notes: Notes of the profile on wiring.
     """
 
     title: str
@@ -49,13 +49,12 @@ def starting_section(
 
     Args:
         name_or_path: Name of a shipped profile, or path of one.
-        unit: What the actuator is driven with; an output in A drives it itself.
-        reader_name: Profile of the device that has the sensor, where it is another one.
-        files: Where profiles are read from; the disk if None.
+        unit: Unit of the command; an output in A drives the actuator itself.
+        reader_name: Profile of the device that has the sensor, if it is another one.
+        files: Reads profiles; from the disk if None.
 
     Raises:
-        InputError: There is no such profile, or it has no output, or there is no input that a
-            sensor can be wired to.
+        InputError: There is no such profile, no output, or no input for a sensor.
     """
     profile = load_profile(name_or_path, files)
     reader = profile if reader_name is None else load_profile(reader_name, files)
@@ -106,19 +105,24 @@ def _add(made: StartingSection, key: str, value: object, remark: str = "") -> No
         made.remarks[key] = remark
 
 
+def _ask(made: StartingSection, key: str, question: str, remark: str) -> None:
+    made.asked[key] = question
+    made.remarks[key] = f"set: {remark}"
+
+
 def _place(made: StartingSection, prefix: str, profile: BaseProfile) -> dict[str, Any]:
-    """Say where a device is; return that for a reader, whose keys begin with ``prefix``."""
+    """Add the place of a device, or return it for a reader, whose keys begin with ``prefix``."""
     where = {} if prefix else made.values
     if profile.link.kind == "tcp":
         where["host"] = _HERE
         # Two devices cannot have one place: at addresses of their own both have the usual port.
         where["tcp_port"] = getattr(profile.link, "port", 502) + bool(prefix)
-        made.remarks[f"{prefix}host"] = "set: name or address; this machine is hilctl emulate's"
-        made.asked[f"{prefix}host"] = f"name or address of the {profile.title}"
+        remark = "name or address; this machine is hilctl emulate's"
+        _ask(made, f"{prefix}host", f"name or address of the {profile.title}", remark)
     else:
         where["serial_port"] = _PORT
-        made.remarks[f"{prefix}serial_port"] = "set: hilctl devices lists the ports of this machine"
-        made.asked[f"{prefix}serial_port"] = f"serial port of the {profile.title}"
+        remark = "hilctl devices lists the ports of this machine"
+        _ask(made, f"{prefix}serial_port", f"serial port of the {profile.title}", remark)
     return where
 
 
@@ -141,10 +145,9 @@ def _amplifier(made: StartingSection, output: Range, unit: CommandUnit) -> None:
     middle = 0.5 * (output.min + output.max) if unit == "A" else 0.0
     made.values["amplifier"] = {key: 1.0, f"offset_{unit.lower()}": 0.0 - middle}
     of = {"A": "coil current", "V": "drive voltage"}[unit]
-    made.remarks[f"amplifier.{key}"] = f"set: {of} of one {output.unit} of the output"
-    made.remarks[f"amplifier.offset_{unit.lower()}"] = f"set: {of} at 0 {output.unit}"
-    made.asked[f"amplifier.{key}"] = f"{of} of one {output.unit} of {made.values['output']}"
-    made.asked[f"amplifier.offset_{unit.lower()}"] = f"{of} at 0 {output.unit}"
+    per_unit, at_zero = f"{of} of one {output.unit} of ", f"{of} at 0 {output.unit}"
+    _ask(made, f"amplifier.{key}", per_unit + made.values["output"], per_unit + "the output")
+    _ask(made, f"amplifier.offset_{unit.lower()}", at_zero, at_zero)
 
 
 def _sensor(made: StartingSection, sensor_input: Range) -> None:
@@ -153,10 +156,10 @@ def _sensor(made: StartingSection, sensor_input: Range) -> None:
     key = f"um_per_{_SUFFIX[sensor_input.unit]}"
     middle = 0.5 * (sensor_input.min + sensor_input.max)
     made.values["sensor"] = {key: _UM_PER_UNIT, "offset_um": 0.0 - _UM_PER_UNIT * middle}
-    made.remarks[f"sensor.{key}"] = f"set: displacement of one {sensor_input.unit} of the input, um"
-    made.remarks["sensor.offset_um"] = f"set: displacement at 0 {sensor_input.unit}, um"
-    made.asked[f"sensor.{key}"] = f"displacement of one {sensor_input.unit} of the sensor, um"
-    made.asked["sensor.offset_um"] = f"displacement at 0 {sensor_input.unit}, um"
+    per_unit = f"displacement of one {sensor_input.unit} of the "
+    at_zero = f"displacement at 0 {sensor_input.unit}, um"
+    _ask(made, f"sensor.{key}", f"{per_unit}sensor, um", f"{per_unit}input, um")
+    _ask(made, "sensor.offset_um", at_zero, at_zero)
 
 
 def _watchdog(made: StartingSection, has: Watchdog | str) -> None:

@@ -10,7 +10,7 @@ import select
 import shutil
 import subprocess
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
@@ -121,21 +121,3 @@ def serial_cable(folder: Path) -> Iterator[tuple[str, str]]:
         for end in ends:  # a pty without an open end hangs up, and socat ends
             held.callback(os.close, os.open(end, os.O_RDWR | os.O_NOCTTY))
         yield ends[0], ends[1]
-
-
-@pytest.fixture(scope="session")
-def run_program() -> Callable:
-    """Return the context manager that runs a program."""
-    return running
-
-
-@pytest.fixture(scope="session")
-def first_line() -> Callable[[subprocess.Popen], str]:
-    """Return the function that waits for the first line of a program."""
-    return read_line
-
-
-@pytest.fixture(scope="session")
-def cable() -> Callable:
-    """Return the context manager that connects two ptys."""
-    return serial_cable

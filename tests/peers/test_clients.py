@@ -8,14 +8,14 @@ import ctypes
 import re
 import struct
 import subprocess
-import threading
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 
 import pytest
 
-from hilctl_drivers.emulator.factory import Emulator, build
+from hilctl_drivers.emulator.factory import Emulator
 from hilctl_drivers.emulator.options import EmulatorOptions
-from tests.fakes import ManualClock
+from tests.fakes import ManualClock, emulated
 
 BAUD = 115_200
 RTU_PROFILE = """\
@@ -40,7 +40,19 @@ class RefusedError(Exception):
     """The device rejected a request, in the client's words."""
 
 
-class Mbpoll:
+class Client:
+    """A client; all but mbpoll have function 23."""
+
+    can_write_and_read = True
+
+    def read_float(self, address: int, *, low_word_first: bool) -> float:
+        words = self.read(address, 2)
+        if low_word_first:
+            words.reverse()
+        return struct.unpack(">f", struct.pack(">HH", *words))[0]
+
+
+class Mbpoll(Client):
     """The program mbpoll (C, libmodbus)."""
 
     can_write_and_read = False
@@ -80,10 +92,8 @@ class Mbpoll:
         """Do nothing: each run opens its own connection."""
 
 
-class Libmodbus:
+class Libmodbus(Client):
     """libmodbus through ctypes."""
-
-    can_write_and_read = True
 
     def __init__(self, programs, where: dict) -> None:
         self._code = code = ctypes.CDLL(programs.libmodbus(), use_errno=True)
@@ -109,20 +119,10 @@ class Libmodbus:
         self._check(self._code.modbus_read_registers(self._context, address, count, words))
         return list(words)
 
-    def read_float(self, address: int, *, low_word_first: bool) -> float:
-        words = (ctypes.c_uint16 * 2)(*self.read(address, 2))
-        names = {False: "modbus_get_float_abcd", True: "modbus_get_float_cdab"}
-        get = getattr(self._code, names[low_word_first])
-        get.restype = ctypes.c_float
-        return get(words)
-
     def write(self, address: int, words: list[int]) -> None:
         array = (ctypes.c_uint16 * len(words))(*words)
-        if len(words) == 1:
-            self._check(self._code.modbus_write_register(self._context, address, words[0]))
-        else:
-            call = self._code.modbus_write_registers
-            self._check(call(self._context, address, len(words), array))
+        call = self._code.modbus_write_registers
+        self._check(call(self._context, address, len(words), array))
 
     def write_and_read(self, at: int, words: list[int], address: int, count: int) -> list[int]:
         array, read = (ctypes.c_uint16 * len(words))(*words), (ctypes.c_uint16 * count)()
@@ -135,10 +135,8 @@ class Libmodbus:
         self._code.modbus_free(self._context)
 
 
-class Pymodbus:
+class Pymodbus(Client):
     """pymodbus's synchronous clients."""
-
-    can_write_and_read = True
 
     def __init__(self, programs, where: dict) -> None:
         programs.module("pymodbus")
@@ -158,16 +156,8 @@ class Pymodbus:
     def read(self, address: int, count: int) -> list[int]:
         return self._check(self._client.read_holding_registers(address, count=count))
 
-    def read_float(self, address: int, *, low_word_first: bool) -> float:
-        words, kind = self.read(address, 2), self._client.DATATYPE.FLOAT32
-        order = "little" if low_word_first else "big"
-        return self._client.convert_from_registers(words, kind, order)
-
     def write(self, address: int, words: list[int]) -> None:
-        if len(words) == 1:
-            self._check(self._client.write_register(address, words[0]))
-        else:
-            self._check(self._client.write_registers(address, words))
+        self._check(self._client.write_registers(address, words))
 
     def write_and_read(self, at: int, words: list[int], address: int, count: int) -> list[int]:
         return self._check(
@@ -180,10 +170,8 @@ class Pymodbus:
         self._client.close()
 
 
-class PyModbusTcp:
+class PyModbusTcp(Client):
     """pyModbusTCP's client, TCP only."""
-
-    can_write_and_read = True
 
     def __init__(self, programs, where: dict) -> None:
         programs.module("pyModbusTCP")
@@ -200,17 +188,8 @@ class PyModbusTcp:
     def read(self, address: int, count: int) -> list[int]:
         return self._check(self._client.read_holding_registers(address, count))
 
-    def read_float(self, address: int, *, low_word_first: bool) -> float:
-        from pyModbusTCP.utils import decode_ieee, word_list_to_long
-
-        words = self.read(address, 2)
-        return decode_ieee(word_list_to_long(words, big_endian=not low_word_first)[0])
-
     def write(self, address: int, words: list[int]) -> None:
-        if len(words) == 1:
-            self._check(self._client.write_single_register(address, words[0]))
-        else:
-            self._check(self._client.write_multiple_registers(address, words))
+        self._check(self._client.write_multiple_registers(address, words))
 
     def write_and_read(self, at: int, words: list[int], address: int, count: int) -> list[int]:
         return self._check(self._client.write_read_multiple_registers(at, words, address, count))
@@ -219,10 +198,8 @@ class PyModbusTcp:
         self._client.close()
 
 
-class ModbusTk:
+class ModbusTk(Client):
     """modbus-tk's masters."""
-
-    can_write_and_read = True
 
     def __init__(self, programs, where: dict) -> None:
         programs.module("modbus_tk")
@@ -249,17 +226,8 @@ class ModbusTk:
     def read(self, address: int, count: int) -> list[int]:
         return list(self._ask(3, address, quantity_of_x=count))
 
-    def read_float(self, address: int, *, low_word_first: bool) -> float:
-        if not low_word_first:
-            return self._ask(3, address, quantity_of_x=2, data_format=">f")[0]
-        low, high = self._ask(3, address, quantity_of_x=2)
-        return struct.unpack(">f", struct.pack(">HH", high, low))[0]
-
     def write(self, address: int, words: list[int]) -> None:
-        if len(words) == 1:
-            self._ask(6, address, output_value=words[0])
-        else:
-            self._ask(16, address, output_value=words)
+        self._ask(16, address, output_value=words)
 
     def write_and_read(self, at: int, words: list[int], address: int, count: int) -> list[int]:
         more = {"quantity_of_x": count, "output_value": words}
@@ -287,24 +255,14 @@ class Emulated:
 @pytest.fixture
 def emulate() -> Iterator[Callable[[str], Emulated]]:
     """Return a function that starts the emulated device of a profile."""
-    stops: list[Callable[[], None]] = []
+    with ExitStack() as stack:
 
-    def start(profile: str) -> Emulated:
-        clock = ManualClock()
-        emulator = build(EmulatorOptions(profile, noise=False, current_a=0.0), clock)
-        thread = threading.Thread(target=emulator.server.run)
-        thread.start()
+        def start(profile: str) -> Emulated:
+            clock = ManualClock()
+            options = EmulatorOptions(profile, noise=False, current_a=0.0)
+            return Emulated(stack.enter_context(emulated(options, clock)), clock)
 
-        def stop() -> None:
-            emulator.server.stop()
-            thread.join()
-
-        stops.append(stop)
-        return Emulated(emulator, clock)
-
-    yield start
-    for stop in stops:
-        stop()
+        yield start
 
 
 @pytest.fixture
@@ -312,8 +270,8 @@ def connect(programs) -> Iterator[Callable]:
     """Return a function that connects a client to an emulated device."""
     made: list = []
 
-    def to(client: type, emulated: Emulated):
-        made.append(client(programs, emulated.where))
+    def to(client: type, served: Emulated):
+        made.append(client(programs, served.where))
         return made[-1]
 
     yield to
@@ -333,18 +291,22 @@ ON_TCP = pytest.mark.parametrize("kind", [Mbpoll, Libmodbus, Pymodbus, PyModbusT
 ON_SERIAL = pytest.mark.parametrize("kind", [Mbpoll, Libmodbus, Pymodbus, ModbusTk])
 
 
+def signed(raw: int) -> int:
+    return raw - 0x10000 * (raw > 0x7FFF)
+
+
 @ON_TCP
 def test_floats_over_tcp(emulate, connect, kind):
     """A LabJack's DAC0 has 4 A/V about 2.5 V, and AIN0 has 12.5 um/V."""
-    emulated = emulate("labjack_t7")
-    client = connect(kind, emulated)
+    served = emulate("labjack_t7")
+    client = connect(kind, served)
     seen = []
     for volts in (3.75, 1.0):
         client.write(1000, list(struct.unpack(">HH", struct.pack(">f", volts))))
-        assert emulated.rig.current_a == pytest.approx(4.0 * (volts - 2.5))
-        emulated.settle()
+        assert served.rig.current_a == pytest.approx(4.0 * (volts - 2.5))
+        served.settle()
         seen.append(client.read_float(0, low_word_first=False))
-        assert 12.5 * seen[-1] == pytest.approx(emulated.rig.displacement_um, rel=1e-5)
+        assert 12.5 * seen[-1] == pytest.approx(served.rig.displacement_um, rel=1e-5)
         assert client.read_float(1000, low_word_first=False) == volts
     assert seen[0] - seen[1] > 2.0
 
@@ -352,38 +314,38 @@ def test_floats_over_tcp(emulate, connect, kind):
 @ON_TCP
 def test_sixteen_bits_over_tcp(emulate, connect, kind):
     """A WAGO's words are signed, 10 V / 32767; function 23 writes and reads in one transaction."""
-    emulated = emulate("wago_750")
-    client = connect(kind, emulated)
+    served = emulate("wago_750")
+    client = connect(kind, served)
     for raw in (0x2000, 0xE000):
-        current_a = (raw - 0x10000 * (raw > 0x7FFF)) * 10.0 / 32767
+        current_a = signed(raw) * 10.0 / 32767
         if client.can_write_and_read:
             client.write_and_read(0, [raw], 0, 1)
         else:
             client.write(0, [raw])
-        assert emulated.rig.current_a == pytest.approx(current_a)
+        assert served.rig.current_a == pytest.approx(current_a)
         assert client.read(0x200, 1) == [raw]
-        emulated.settle()
+        served.settle()
         (shown,) = client.read(0, 1)
-        shown_um = (shown - 0x10000 * (shown > 0x7FFF)) * 125.0 / 32767
-        assert shown_um == pytest.approx(emulated.rig.displacement_um, abs=0.5 * 125.0 / 32767)
+        shown_um = signed(shown) * 125.0 / 32767
+        assert shown_um == pytest.approx(served.rig.displacement_um, abs=0.5 * 125.0 / 32767)
         assert (shown_um > 5.0) == (raw == 0x2000)
 
 
 @ON_SERIAL
 def test_registers_over_a_serial_line(emulate, connect, module, kind):
     """A module's mA and swapped floats are correct with RTU framing, CRC and unit id."""
-    emulated = emulate(module)
-    client = connect(kind, emulated)
+    served = emulate(module)
+    client = connect(kind, served)
     for raw in (8000, 0x10000 - 12_000):
-        current_a = (raw - 0x10000 * (raw > 0x7FFF)) * 1e-3 * 0.5
+        current_a = signed(raw) * 1e-3 * 0.5
         if client.can_write_and_read:
             client.write_and_read(100, [raw], 200, 2)
         else:
             client.write(100, [raw])
-        assert emulated.rig.current_a == pytest.approx(current_a)
-        emulated.settle()
+        assert served.rig.current_a == pytest.approx(current_a)
+        served.settle()
         volts = client.read_float(200, low_word_first=True)
-        assert 12.5 * volts == pytest.approx(emulated.rig.displacement_um, rel=1e-5)
+        assert 12.5 * volts == pytest.approx(served.rig.displacement_um, rel=1e-5)
         assert abs(volts) > 0.5
         assert client.read(100, 1) == [raw]
 
@@ -391,15 +353,13 @@ def test_registers_over_a_serial_line(emulate, connect, module, kind):
 @ON_TCP
 def test_refusals_are_understood(emulate, connect, kind):
     """Each client reports the device's rejection, and the output does not change."""
-    emulated = emulate("labjack_t7")
-    client = connect(kind, emulated)
-    with pytest.raises(RefusedError, match=re.compile("address|exception_code=2", re.IGNORECASE)):
+    served = emulate("labjack_t7")
+    client = connect(kind, served)
+    with pytest.raises(RefusedError, match=r"(?i)address|exception_code=2"):
         client.read(9000, 2)
-    with pytest.raises(RefusedError, match=re.compile("value|exception_code=3", re.IGNORECASE)):
+    with pytest.raises(RefusedError, match=r"(?i)value|exception_code=3"):
         client.write(1000, list(struct.unpack(">HH", struct.pack(">f", 5.5))))
     if client.can_write_and_read:
-        with pytest.raises(
-            RefusedError, match=re.compile("function|exception_code=1", re.IGNORECASE)
-        ):
+        with pytest.raises(RefusedError, match=r"(?i)function|exception_code=1"):
             client.write_and_read(1000, [0, 0], 0, 2)
-    assert emulated.rig.current_a == 0.0
+    assert served.rig.current_a == 0.0

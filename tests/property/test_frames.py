@@ -21,6 +21,8 @@ from pymodbus.pdu.register_message import (
 
 from hilctl_drivers.ascii.ascii_session import LineFormat, parse_number
 from hilctl_drivers.modbus.pdu import (
+    ReadFrame,
+    WriteFrame,
     feedback_pdu,
     read_pdu,
     reply_data,
@@ -331,7 +333,8 @@ def write_read(rng):
 
 
 def feedback(rng):
-    return feedback_pdu(rng.randrange(65000), rng.randbytes(4), rng.randrange(65000), 2)
+    write = WriteFrame(rng.randrange(65000), rng.randbytes(4))
+    return feedback_pdu(ReadFrame(rng.randrange(65000), 2), write)
 
 
 SUBJECTS = {

@@ -185,7 +185,7 @@ class BoardSingle(BoardDac):
         self, first_sample: int, command: F64, displacement_um: F64, measured: F64
     ) -> None:
         del first_sample, measured
-        found = self._session.exchange(self._chain.outputs(command))
+        found = self._session.exchange(self._chain.output(command))
         if found.values.size != 1:
             raise DeviceError(f"{found.values.size} readings came for one sample")
         self._chain.fill_um(found.values, displacement_um)
@@ -226,7 +226,7 @@ class BoardStream(BoardDac):
         """Queue a block and wait for the readings of the one that it pushes out."""
         del measured
         check_next(first_sample, self._next_sample)
-        found = self._session.stream(first_sample, self._chain.outputs(command))
+        found = self._session.stream(first_sample, self._chain.output(command))
         self._check_answer(found, first_sample)
         self._next_sample += command.size
         if found.values.size:

@@ -1,9 +1,9 @@
 """``modbus_stream``: a DAC that plays blocks from the device's own buffer, over Modbus TCP.
 
-LabJack's T4 and T7 put out one value in each scan of their own clock and read the input just before
-(stream-out and stream-in in one scan list). So that clock is the pace, a block's displacements come
-``fifo_blocks`` exchanges after it, and between two exchanges the buffer holds that many blocks,
-which is how long this machine may stall. The first sample is output once that many are there.
+In each scan of its own clock a LabJack T4 or T7 reads the input and then outputs one value
+(stream-out and stream-in in one scan list). That clock sets the pace. A block's displacements come
+``fifo_blocks`` exchanges after it, and the buffer holds that many blocks between two exchanges,
+which is the longest stall of this machine. The first sample is output once that many are there.
 """
 
 import math
@@ -15,29 +15,28 @@ from typing import ClassVar
 from hilctl.base.device import DeviceInfo, DeviceOptions
 from hilctl.base.errors import DeviceError, InputError
 from hilctl.base.types import F64
-from hilctl_drivers.device import DacDevice, check_fifo, check_next
+from hilctl_drivers.device import check_fifo, check_next
 from hilctl_drivers.labjack.stream import (
     ENABLE,
     VALUES_MAX,
     InputCalibration,
     ModbusFeedback,
-    ReadFrame,
-    WriteFrame,
     u32,
 )
 from hilctl_drivers.labjack.stream_session import StreamSession
 from hilctl_drivers.modbus.config import ModbusEndpoint, ModbusOptions, ModbusSetup
-from hilctl_drivers.modbus.modbus_dac import ModbusPair
+from hilctl_drivers.modbus.modbus_dac import ModbusDevice
 from hilctl_drivers.modbus.modbus_profile import LabJackStreaming, ModbusProfile
 from hilctl_drivers.modbus.modbus_session import ModbusSession
-from hilctl_drivers.modbus.watchdog import Connect, ModbusSafeWrite, ModbusWatchdogDriver
+from hilctl_drivers.modbus.pdu import ReadFrame, WriteFrame
+from hilctl_drivers.modbus.watchdog import Connect, ModbusSafeWrite
 from hilctl_drivers.signal_chain import FifoBlocks
 from hilctl_drivers.transport.links import RefusedError
 from hilctl_drivers.transport.wire_time import RateLimit, WireTime
 
 
 def stream_time(profile: ModbusProfile, block: int) -> WireTime:
-    """Return what a block costs: messages that bring its values, and one that waits for the clock.
+    """Return the time of a block: messages with its values, and one that waits for the clock.
 
     Readings come back in the same messages, so that fetching the last of them is one more.
     """
@@ -54,27 +53,25 @@ class ModbusStreamOptions(ModbusOptions):
 
 @dataclass(frozen=True, slots=True)
 class StreamSetup:
-    """What an experiment's options come to.
+    """An experiment's options, resolved against the profile.
 
     Attributes:
-        base: What they say of the device, streaming or not.
-        streaming: What its profile says of streaming.
-        fifo_blocks: Blocks kept in its buffer.
-        channel: Number of the input, for its calibration.
+        base: Options of the device, streaming or not.
+        streaming: The profile's section on streaming.
+        fifo_blocks: Blocks kept in the device's buffer.
+        target: Address of the output.
+        source: Address of the input.
     """
 
     base: ModbusSetup
     streaming: LabJackStreaming
     fifo_blocks: int
-    channel: int
+    target: int
+    source: int
 
     @classmethod
     def of(cls, options: ModbusStreamOptions) -> "StreamSetup":
-        """Hold options against their profile.
-
-        Raises:
-            InputError: They do not fit together, or the device cannot stream.
-        """
+        """Resolve options, or raise InputError if they do not fit, or the device cannot stream."""
         base = ModbusSetup.of(options)
         profile = base.writer.profile
         streaming = profile.streaming
@@ -89,7 +86,8 @@ class StreamSetup:
             if name not in known:
                 rule = f"{what} must be one that {profile.title} can stream, {', '.join(known)}"
                 raise InputError(f"{rule}, got {name!r}")
-        return cls(base, streaming, options.fifo_blocks, base.writer.address(base.input) // 2)
+        target, source = profile.wire_address(base.output), profile.wire_address(base.input)
+        return cls(base, streaming, options.fifo_blocks, target, source)
 
     @property
     def block_max(self) -> int:
@@ -107,7 +105,7 @@ class StreamSetup:
         return RateLimit.of(wire, most_hz, whose, self.streaming.rate_min_hz)
 
     def info(self) -> DeviceInfo:
-        """Return what the device is and what it accepts."""
+        """Return the description of the device."""
         found = self.base.info()
         rates = self.rates(self.block_max)
         depth = self.streaming.fifo_depth
@@ -129,28 +127,28 @@ class StreamSetup:
 
 
 class StreamSafeWrite(ModbusSafeWrite):
-    """Stops the stream and writes the output in one message; what is queued is dropped."""
+    """Stops the stream and writes the output in one message; queued values are dropped."""
 
     def _put(self, session: ModbusSession, data: bytes) -> None:
         feedback = ModbusFeedback(session.link, self._setup.writer.unit)
-        write = WriteFrame(self._setup.writer.address(self._setup.output), data)
+        write = WriteFrame(self._setup.writer.profile.wire_address(self._setup.output), data)
         # The stream first: it would write over the safe value with its next scan.
         try:
             feedback.call([WriteFrame(ENABLE, u32(0)), write])
         except RefusedError:  # a stream that does not run can't be stopped
             feedback.call([write])
 
-    def _check_held(self, session: ModbusSession, value: float) -> None:
+    def _held(self, session: ModbusSession) -> float:
         output = self._setup.output
         feedback = ModbusFeedback(session.link, self._setup.writer.unit)
-        target = ReadFrame(self._setup.writer.address(output), output.words)
+        target = ReadFrame(self._setup.writer.profile.wire_address(output), output.words)
         running, held = feedback.call([ReadFrame(ENABLE, 2), target])
         if running != u32(0):
             raise DeviceError("the stream was stopped, but still runs")
-        self._check(output.format.decode(held), value)
+        return output.format.decode(held)
 
 
-class ModbusStream(DacDevice):
+class ModbusStream(ModbusDevice):
     """A :class:`~hilctl.base.device.Device` that streams over Modbus TCP."""
 
     Options: ClassVar[type[DeviceOptions]] = ModbusStreamOptions
@@ -164,33 +162,17 @@ class ModbusStream(DacDevice):
     ) -> None:
         """Describe the device; nothing is sent before :meth:`open`.
 
-        Args:
-            options: What the experiment says of it.
-            connect: Makes a session on a new link.
-            sleep: Waits that many s.
-            clock: Monotonic time in s.
-
         Raises:
-            InputError: The profile cannot be used, or options do not go with it.
+            InputError: The profile cannot be used, or the options do not fit it.
         """
-        setup = StreamSetup.of(options)
-        writer = setup.base.writer
-        super().__init__(
-            setup.info(),
-            f"modbus_stream {writer.name} at {writer.place}",
-            f"stream {options.output} and {options.input}",
-            options.output,
-        )
-        self._setup = setup
-        self._connect, self._sleep, self._clock = connect, sleep, clock
-        self._chain = setup.base.chain
-        self._guard = ModbusWatchdogDriver(setup.base)
-        self._session: ModbusSession | None = None
+        self._streaming = setup = StreamSetup.of(options)
+        base, action = setup.base, f"stream {options.output} and {options.input}"
+        super().__init__(base, setup.info(), action, StreamSafeWrite(base, connect), connect)
+        self._sleep, self._clock = sleep, clock
+        self._chain = base.chain
         self._stream: StreamSession | None = None
         self._calibration: InputCalibration | None = None
         self._next_sample = 0
-        self._peer = writer
-        self._safe_write = StreamSafeWrite(setup.base, connect)
 
     @property
     def stream(self) -> StreamSession | None:
@@ -198,53 +180,39 @@ class ModbusStream(DacDevice):
         return self._stream
 
     def _longest_block(self) -> tuple[int, str]:
-        depth = self._setup.streaming.fifo_depth
+        depth = self._streaming.streaming.fifo_depth
         why = f": fifo_blocks + 1 of them must fit into the FIFO, {depth} samples"
-        return self._setup.block_max, why
+        return self._streaming.block_max, why
 
     def _rates(self, block: int) -> RateLimit:
-        return self._setup.rates(block)
+        return self._streaming.rates(block)
 
     def _open(self, sample_rate_hz: float, block: int) -> None:
         """Self-test, init steps, calibration, buffers and clock; see :class:`DacDevice`.
 
         The output does not move before enough blocks have come.
         """
-        setup, base = self._setup, self._setup.base
+        setup = self._streaming
         self._guard.plan(sample_rate_hz / block)
-        self._session = session = self._connect(base.writer)
-        session.link.open()
-        self._peer = base.writer.reached(session.link)
-        session.check_selftest()
-        self._guard.end_trip(session)
-        stream = self._stream_on(session)
-        stream.stop()  # whoever started it: no other setting is taken while it runs
-        session.run(base.writer.profile.init)
-        session.run(setup.streaming.setup)
-        self._calibration = stream.calibration(setup.channel)
-        addresses = base.writer.address(base.output), base.writer.address(base.input)
-        stream.prepare(sample_rate_hz, *addresses)
+        pair = self._connected()
+        stream = self._stream_on(pair.writer)
+        stream.stop()  # also one of another program: a running stream accepts no settings
+        pair.run("init")
+        pair.writer.run(setup.streaming.setup)
+        self._calibration = stream.calibration(setup.source // 2)
+        stream.prepare(sample_rate_hz, setup.target, setup.source)
         check_fifo(block, setup.fifo_blocks, stream.capacity)
-        self._safe_write.try_out(session)
+        self._safe_write.try_out(pair.writer)
         self._stream = stream
         self._next_sample = 0
 
-    def _arm(self) -> None:
-        assert self._session is not None
-        self._guard.arm(self._session)
-
-    def _output(self) -> float | None:
-        assert self._session is not None
-        held = self._session.held(self._setup.base.output)
-        return None if held is None else self._chain.command(held)
-
     def _stream_on(self, session: ModbusSession) -> StreamSession:
-        base = self._setup.base
+        writer = self._setup.writer
         return StreamSession(
-            ModbusFeedback(session.link, base.writer.unit),
-            self._setup.streaming,
-            base.options.timeout_s,
-            base.writer.profile.turnaround_s,
+            ModbusFeedback(session.link, writer.unit),
+            self._streaming.streaming,
+            writer.timeout_s,
+            writer.profile.turnaround_s,
             self._sleep,
             self._clock,
         )
@@ -259,17 +227,17 @@ class ModbusStream(DacDevice):
             raise DeviceError("not open")
         check_next(first_sample, self._next_sample)
         # Queued before the readings are waited for: meanwhile the device must not run dry.
-        stream.feed(self._chain.outputs(command))
+        stream.feed(self._chain.output(command))
         self._next_sample += command.size
         readings = self._readings(stream, command.size)
-        if self._guard.feed_every and self._session is not None:
-            self._guard.feed(self._session)
+        if self._guard.feed_every and self._pair is not None:
+            self._guard.feed(self._pair.writer)
         if readings is not None:
             self._chain.fill_um(readings, displacement_um)
 
     def _readings(self, stream: StreamSession, block: int) -> F64 | None:
         """Return a block's volts, float64[B]; None before the first one is due."""
-        kept = self._setup.fifo_blocks * block
+        kept = self._streaming.fifo_blocks * block
         if self._next_sample < kept:
             return None
         if self._next_sample == kept:
@@ -279,24 +247,16 @@ class ModbusStream(DacDevice):
         return self._calibration.volts(stream.take(block))
 
     def _put_out(self, command: float) -> None:
-        """Stop the stream and put the output at ``command``; what is queued is dropped."""
+        """Stop the stream and set the output to ``command``; queued values are dropped."""
         self._release()
-        value = self._chain.output(command)
-        self._safe_write.attempt(self._peer, value)
-
-    def _look(self) -> tuple[float, float | None]:
-        base = self._setup.base
-        return ModbusPair(base, base.writer.session()).look()
+        self._safe_write.attempt(self._peer, self._chain.output(command))
 
     def _close(self) -> None:
-        session, stream = self._session, self._stream
-        if session is not None and stream is not None:
-            # The stream first: an output that moves must not be without its watchdog.
-            stream.stop()
-            self._guard.disarm(session)
-            session.run(self._setup.base.writer.profile.close)
+        # The stream first: an output that moves must not be without its watchdog.
+        if self._stream is not None:
+            self._stream.stop()
+        super()._close()
 
     def _release(self) -> None:
-        session, self._session, self._stream = self._session, None, None
-        if session is not None:
-            session.link.close()
+        self._stream = None
+        super()._release()

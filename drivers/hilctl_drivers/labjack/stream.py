@@ -1,24 +1,18 @@
 """LabJack's Modbus Feedback, and the registers and messages of a T4's or T7's stream.
 
-Function 76 carries out many reads and writes in one message, in order ("Protocol Details [Direct
-Modbus TCP]"). A frame is ``00 address16 words8`` to read and ``01 address16 words8 data`` to write;
-a reply holds the words of each read. Messages are kept to the 253 bytes that the Modbus
-specification allows.
-
 The stream is read in command-response mode (ljm_constants.json; T-Series Datasheet 3.2.3
 Stream-Out, 3.2.4 Low-Level Stream, 20.0.0 and 20.0.1 calibration constants). A scan reads the input
 and then outputs the next value; stream-out addresses return no data. If ``LOOP_NUM_VALUES`` is 1,
 an output that has no new value repeats its last one.
 
-A read of ``DATA_CR`` gives four words, which are the number of samples in this read, the bytes left
-in the device's buffer, a status and what belongs to it; then that many samples of 16 bits, and
-words of no meaning up to the number that was asked for.
+A read of ``DATA_CR`` returns four words: number of samples, bytes left in the device's buffer,
+status, and its argument. Then follow the samples of 16 bits, and padding up to the requested words.
 """
 
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, Literal, TypeAlias
+from typing import Final, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -27,88 +21,23 @@ from hilctl.base.errors import DeviceError
 from hilctl.base.types import F64
 from hilctl_drivers.modbus.modbus_profile import BYTES_A_SAMPLE
 from hilctl_drivers.modbus.pdu import (
-    FEEDBACK,
+    FRAME_HEAD,
     PDU_MAX,
     TCP_HEAD,
+    FeedbackFrame,
+    ReadFrame,
+    WriteFrame,
+    feedback_pdu,
     reply_data,
     tcp_adu,
     tcp_missing,
     tcp_pdu,
 )
-from hilctl_drivers.transport.links import BadRequestError, Link, MismatchError
-
-FRAME_HEAD: Final = 4
-"""Bytes of a frame before its data."""
-_WORDS_MAX = 255
-_HEAD = struct.Struct(">BHB")
-
-
-@dataclass(frozen=True, slots=True)
-class ReadFrame:
-    """Read ``words`` registers from ``address`` on."""
-
-    address: int
-    words: int
-
-    def encode(self) -> bytes:
-        """Return the frame's bytes."""
-        return _HEAD.pack(0, self.address, _counted(self.words))
-
-    @property
-    def reply_size(self) -> int:
-        """Bytes of the reply that are this frame's."""
-        return 2 * self.words
-
-
-@dataclass(frozen=True, slots=True)
-class WriteFrame:
-    """Write register bytes from ``address`` on; a buffer register takes all."""
-
-    address: int
-    data: bytes
-
-    def encode(self) -> bytes:
-        """Return the frame's bytes."""
-        words, odd = divmod(len(self.data), 2)
-        if odd:
-            raise BadRequestError(f"registers have 2 bytes each, got {len(self.data)} bytes")
-        return _HEAD.pack(1, self.address, _counted(words)) + self.data
-
-    @property
-    def reply_size(self) -> int:
-        """Bytes of the reply that are this frame's."""
-        return 0
-
-
-FeedbackFrame: TypeAlias = ReadFrame | WriteFrame
-
-
-def _counted(words: int) -> int:
-    if not 1 <= words <= _WORDS_MAX:
-        raise BadRequestError(f"a frame has 1 to {_WORDS_MAX} registers, got {words}")
-    return words
-
-
-def frames_pdu(frames: Sequence[FeedbackFrame]) -> bytes:
-    """Return the request for frames, in their order.
-
-    Raises:
-        BadRequest: It or its reply would be longer than a PDU may be, or a frame is too long.
-    """
-    pdu = bytes((FEEDBACK,)) + b"".join(frame.encode() for frame in frames)
-    longest = max(len(pdu), 1 + sum(frame.reply_size for frame in frames))
-    if longest > PDU_MAX:
-        raise BadRequestError(f"a PDU has at most {PDU_MAX} bytes, got {longest}")
-    return pdu
+from hilctl_drivers.transport.links import Link, MismatchError
 
 
 class ModbusFeedback:
-    """A T-series device that is asked by function 76.
-
-    Args:
-        link: Open, or opened before the first call.
-        unit: Its unit id.
-    """
+    """Requests with function 76 to a T-series device."""
 
     def __init__(self, link: Link, unit: int) -> None:
         self._link = link
@@ -116,30 +45,22 @@ class ModbusFeedback:
         self._transaction = 0
 
     def call(self, frames: Sequence[FeedbackFrame]) -> list[bytes]:
-        """Carry frames out in one message; return what each read frame found.
+        """Execute frames in one message; return the bytes of each read frame.
 
         Raises:
-            DeviceError: No answer, not a good one, or a refusal; then the frames before the one
-                that was refused may have been executed.
+            DeviceError: No answer, not a good one, or a refusal of a frame; those before it may
+                have been executed.
         """
         self._transaction = transaction = (self._transaction + 1) & 0xFFFF
         sizes = [frame.reply_size for frame in frames if frame.reply_size]
-        pdu = frames_pdu(frames)
+        pdu = feedback_pdu(*frames)
         request = tcp_adu(transaction, self._unit, pdu)
         reply = self._link.transact(request, tcp_missing, TCP_HEAD + 1 + sum(sizes))
         data = reply_data(pdu, tcp_pdu(reply, transaction, self._unit))
-        found, start = [], 0
-        for size in sizes:
-            found.append(data[start : start + size])
-            start += size
-        return found
+        return list(struct.unpack("".join(f"{size}s" for size in sizes), data))
 
     def read(self, address: int, words: int) -> bytes:
-        """Return registers' bytes.
-
-        Raises:
-            DeviceError: See :meth:`call`.
-        """
+        """Return the bytes of registers."""
         return self.call([ReadFrame(address, words)])[0]
 
 
@@ -192,37 +113,32 @@ STATUS: Final = {
 }
 
 
-def u32(value: int) -> bytes:
-    """Return register bytes of a whole number."""
-    return struct.pack(">I", value)
-
-
-def f32(value: float) -> bytes:
-    """Return register bytes of a float."""
-    return struct.pack(">f", value)
+u32 = struct.Struct(">I").pack
+f32 = struct.Struct(">f").pack
+"""Register bytes of a number."""
 
 
 READ_FRAMES: Final[tuple[FeedbackFrame, ...]] = (
     ReadFrame(DATA_CR, DATA_HEAD.size // 2 + SAMPLES_MAX),
     ReadFrame(OUT_BUFFER_STATUS, _U32_WORDS),
 )
-"""What each message of a run begins with: what was before its own values came."""
+"""First frames of each message of a run: the state before its own values."""
 
 
 def value_frames(values: F64) -> tuple[FeedbackFrame, ...]:
-    """Return what queues float64[n] values, n at most :data:`VALUES_MAX`."""
+    """Return the frames that queue float64[n] values, n at most :data:`VALUES_MAX`."""
     data = values.astype(">f4").tobytes()
     return WriteFrame(OUT_BUFFER_F32, data), WriteFrame(OUT_SET_LOOP, u32(USE_AT_ONCE))
 
 
 @dataclass(frozen=True, slots=True)
 class StreamData:
-    """What a message of a run found.
+    """Readings in a message, and the state of both buffers.
 
     Attributes:
-        raw: uint16[n], readings of the oldest scans that had not been fetched.
-        backlog: Scans that are left in the device.
-        free: Values that the output's buffer has room for.
+        raw: uint16[n], readings of the oldest scans.
+        backlog: Scans left in the device.
+        free: Values that still fit into the output's buffer.
     """
 
     raw: npt.NDArray[np.uint16]
@@ -231,12 +147,7 @@ class StreamData:
 
 
 def stream_data(data: bytes, free: bytes) -> StreamData:
-    """Return what the answers to :data:`READ_FRAMES` say.
-
-    Raises:
-        DeviceError: The device dropped scans, or its stream stopped.
-        Mismatch: More samples than were asked for.
-    """
+    """Return the content of the answers to :data:`READ_FRAMES`, or raise if scans were lost."""
     count, backlog_bytes, status, more = DATA_HEAD.unpack_from(data)
     if status:
         text = STATUS.get(status, "stream status {}")
@@ -251,7 +162,7 @@ def stream_data(data: bytes, free: bytes) -> StreamData:
 
 @dataclass(frozen=True, slots=True)
 class InputCalibration:
-    """How raw readings of one input become volts.
+    """Conversion of raw readings of one input to volts.
 
     Attributes:
         center: Raw reading at ``offset_v``.
@@ -268,15 +179,7 @@ class InputCalibration:
 
     @classmethod
     def decode(cls, form: Literal["two_slopes", "line"], data: bytes) -> "InputCalibration":
-        """Return the constants in internal flash.
-
-        Args:
-            form: As in the profile.
-            data: From :func:`calibration_span` on.
-
-        Raises:
-            DeviceError: They cannot be any.
-        """
+        """Return the constants in flash, or raise DeviceError if they cannot be valid."""
         if form == "two_slopes":
             positive, negative, center, _ = struct.unpack(">4f", data)
             found = cls(center, positive, negative)
@@ -299,11 +202,8 @@ class InputCalibration:
 def calibration_span(
     form: Literal["two_slopes", "line"], address: int, channel: int
 ) -> tuple[int, int]:
-    """Return flash address and bytes of an input's constants.
+    """Return flash address and bytes of an input's constants; all start at ``address``.
 
-    Args:
-        form: As in the profile. ``two_slopes`` are those of the high-speed converter at gain 1.
-        address: Where the constants begin.
-        channel: Number of the input.
+    ``two_slopes`` are those of the high-speed converter at gain 1.
     """
     return (address, 16) if form == "two_slopes" else (address + 8 * channel, 8)

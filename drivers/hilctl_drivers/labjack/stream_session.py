@@ -10,8 +10,9 @@ import numpy.typing as npt
 from hilctl.base.errors import DeviceError
 from hilctl.base.types import F64
 from hilctl_drivers.labjack import stream
-from hilctl_drivers.labjack.stream import FeedbackFrame, ModbusFeedback, WriteFrame, f32, u32
+from hilctl_drivers.labjack.stream import ModbusFeedback, f32, u32
 from hilctl_drivers.modbus.modbus_profile import LabJackStreaming
+from hilctl_drivers.modbus.pdu import FeedbackFrame, WriteFrame
 
 _RATE_TOLERANCE = 1e-4
 _MARGIN_SCANS = 2
@@ -20,18 +21,12 @@ _MARGIN_SCANS = 2
 class StreamSession:
     """One stream of one device: an output played from its buffer, an input read in each scan.
 
-    The count of scans is the clock. A value that was queued as number k is output in scan k, and
-    reading k is taken just before; this holds as long as the output's buffer never runs dry, and
-    that is judged in each message, before the message's own values come.
+    The count of scans is the clock. Value number k is output in scan k, and reading k is taken just
+    before. This holds as long as the output's buffer never runs dry, which each message checks
+    before its own values come. Every error is a ``DeviceError``.
 
-    Args:
-        feedback: How the device is asked.
-        streaming: What its profile says of streaming.
-        timeout_s: Longest wait for scans that are due.
-        turnaround_s: Longest that the device may take from the first to the last frame of a
-            message; scans pass meanwhile.
-        sleep: Waits that many s.
-        clock: Monotonic time in s.
+    ``timeout_s`` is the longest wait for readings that are due, ``turnaround_s`` the longest time
+    from the first to the last frame of a message.
     """
 
     def __init__(
@@ -49,17 +44,14 @@ class StreamSession:
         self._turnaround_s = turnaround_s
         self._sleep = sleep
         self._clock = clock
-        self._capacity = 0
+        self.capacity = 0
+        """Values that the output's empty buffer holds."""
         self._parts: list[npt.NDArray[np.uint16]] = []
         self.running = False
         self._begin(0.0)
 
     def calibration(self, channel: int) -> stream.InputCalibration:
-        """Return how readings of an input become volts; kept in the device's flash.
-
-        Raises:
-            DeviceError: It could not be read, or is none.
-        """
+        """Return the calibration of an input from the device's flash."""
         form = self._streaming.calibration
         address, size = stream.calibration_span(form, self._streaming.calibration_address, channel)
         self._write((stream.FLASH_READ_POINTER, u32(address)))
@@ -67,11 +59,7 @@ class StreamSession:
         return stream.InputCalibration.decode(form, data)
 
     def stop(self) -> None:
-        """Stop the stream, also one of another program; the output holds its value.
-
-        Raises:
-            DeviceError: The device did not confirm.
-        """
+        """Stop the stream, also one of another program; the output holds its value."""
         self.running = False
         if self._read_u32(stream.ENABLE):
             self._write((stream.ENABLE, u32(0)))
@@ -79,13 +67,7 @@ class StreamSession:
     def prepare(self, rate_hz: float, target: int, source: int) -> None:
         """Set buffers, scan list and clock of a stopped stream; nothing moves before :meth:`start`.
 
-        Args:
-            rate_hz: Scan rate.
-            target: Address of the output.
-            source: Address of the input.
-
-        Raises:
-            DeviceError: The device did not take it, or cannot make that rate, to 100 ppm.
+        The device must make the rate to 100 ppm.
         """
         size = u32(self._streaming.buffer_bytes)
         self._write(
@@ -95,7 +77,7 @@ class StreamSession:
             (stream.OUT_LOOP_NUM_VALUES, u32(1)),
             (stream.OUT_ENABLE, u32(1)),
         )
-        self._capacity = self._read_u32(stream.OUT_BUFFER_STATUS)
+        self.capacity = self._read_u32(stream.OUT_BUFFER_STATUS)
         self._write(
             (stream.SCANRATE_HZ, f32(rate_hz)),
             (stream.NUM_ADDRESSES, u32(2)),
@@ -117,23 +99,13 @@ class StreamSession:
         self._queued = self._fetched = self._backlog = self._waiting = 0
         self._parts.clear()
         self.margin = math.ceil(rate_hz * self._turnaround_s) + _MARGIN_SCANS
-        """Scans that may pass within one message: with fewer values left, nobody can say whether
-        the output had one for each."""
-        self.level_min = self._capacity
+        """Scans that may pass within one message: with fewer values left, some may be late."""
+        self.level_min = self.capacity
         """Fewest values that a message found in the output's buffer."""
 
-    @property
-    def capacity(self) -> int:
-        """Values that the output's buffer holds, as the device said of the empty one."""
-        return self._capacity
-
     def start(self) -> None:
-        """Start the clock; the first value is output in the first scan.
-
-        Raises:
-            DeviceError: The device did not take it, or its buffer does not hold what was queued.
-        """
-        held = self._capacity - self._read_u32(stream.OUT_BUFFER_STATUS)
+        """Start the clock; the first value is output in the first scan."""
+        held = self.capacity - self._read_u32(stream.OUT_BUFFER_STATUS)
         if abs(held - self._queued) > _MARGIN_SCANS:
             raise DeviceError(f"{self._queued} values were queued, the device holds {held}")
         self._write((stream.ENABLE, u32(1)))
@@ -142,11 +114,10 @@ class StreamSession:
         self.running = True
 
     def feed(self, values: F64) -> None:
-        """Queue float64[n] values; readings that are there come back on the way.
+        """Queue float64[n] values and fetch the available readings.
 
         Raises:
-            DeviceError: The device did not take them, or what it answers shows that it ran out of
-                values, or that scans are lost.
+            DeviceError: The device refused them, ran out of values, or lost scans.
         """
         for first in range(0, values.size, stream.VALUES_MAX):
             part = values[first : first + stream.VALUES_MAX]
@@ -158,11 +129,7 @@ class StreamSession:
             self._queued += part.size
 
     def take(self, count: int) -> npt.NDArray[np.uint16]:
-        """Return the next ``count`` readings, uint16[count]; wait for the device's clock.
-
-        Raises:
-            DeviceError: They did not come in time, or as for :meth:`feed`.
-        """
+        """Return the next ``count`` readings, uint16[count]; wait for the device's clock."""
         deadline = self._clock() + count / self._rate_hz + self._timeout_s
         while self._waiting < count:
             # No more than one answer's worth, so that the last answer is not many.
@@ -179,21 +146,17 @@ class StreamSession:
         return readings[:count]
 
     def _exchange(self, frames: Sequence[FeedbackFrame]) -> None:
-        """Fetch readings, judge what they say, and write."""
+        """Fetch and check readings, and write."""
         data, free = self._feedback.call([*stream.READ_FRAMES, *frames])
         found = stream.stream_data(data, free)
         self._parts.append(found.raw)
         self._waiting += found.raw.size
         self._fetched += found.raw.size
         self._backlog = found.backlog
-        self._judge(self._capacity - found.free)
+        self._check_level(self.capacity - found.free)
 
-    def _judge(self, held: int) -> None:
-        """Raise where the output's buffer ran dry, or its count is another than ours.
-
-        Args:
-            held: Values in it, as the device says.
-        """
+    def _check_level(self, held: int) -> None:
+        """Raise if the output's buffer ran dry, or holds another number of values than expected."""
         level = self._queued - self._fetched - self._backlog
         self.level_min = min(self.level_min, level)
         if level < self.margin:

@@ -1,7 +1,7 @@
 """Options of a Modbus device, resolved against its profile."""
 
 from dataclasses import dataclass, replace
-from typing import Literal, Self
+from typing import Self
 
 from pydantic import Field, model_validator
 
@@ -20,7 +20,6 @@ from hilctl_drivers.modbus.modbus_session import (
     feed_time,
     read_time,
 )
-from hilctl_drivers.modbus.register_map import Register
 from hilctl_drivers.profile import NamedProfile, check_baud, with_link
 from hilctl_drivers.signal_chain import (
     DacOptions,
@@ -84,11 +83,11 @@ class ModbusEndpoint:
     """A device and its place: TCP, a gateway, or a serial line.
 
     Attributes:
-        name: Its profile's name, as the experiment has it.
-        profile: What it is, with the experiment's line settings in it.
+        name: Its profile's name in the experiment.
+        profile: Its profile, with the experiment's line settings.
         unit: Its unit id.
-        host: Where it is on the network; empty on a serial port.
-        port: TCP port there, or device file of the serial port.
+        host: Host name or address; empty on a serial port.
+        port: TCP port, or device file of the serial port.
         timeout_s: Longest wait for one answer.
     """
 
@@ -103,7 +102,7 @@ class ModbusEndpoint:
     def of(
         cls, options: ModbusOptions | ModbusReaderOptions, profile: ModbusProfile, timeout_s: float
     ) -> "ModbusEndpoint":
-        """Return the device whose place options give."""
+        """Return the device at the place in the options."""
         usual = getattr(profile.link, "port", _TCP_PORT)
         unit = profile.unit_id if options.unit_id is None else options.unit_id
         port = options.serial_port or options.tcp_port or usual
@@ -111,48 +110,41 @@ class ModbusEndpoint:
 
     @property
     def place(self) -> str:
-        """Where it is: ``host:port`` or the serial port."""
+        """``host:port``, or the serial port."""
         return f"{self.host}:{self.port}" if self.host else str(self.port)
 
     @property
     def holds(self) -> tuple[str, ...]:
-        """Its place's names as :attr:`hilctl.base.device.DeviceInfo.holds` has it."""
+        """Names of its place, for :attr:`hilctl.base.device.DeviceInfo.holds`."""
         if self.host:
             return held_address(self.host, int(self.port))
         return held_port(str(self.port))
 
-    def address(self, register: Register) -> int:
-        """Return an address as it stands in a frame to the device."""
-        return self.profile.wire_address(register)
-
-    def link(self) -> Link:
-        """Return a new link to it."""
-        if self.host:
-            return TcpLink(self.host, int(self.port), self.timeout_s)
-        assert isinstance(self.profile.link, ModbusRtuLink)
-        return SerialLink(str(self.port), self.profile.link.settings, self.timeout_s)
-
     def reached(self, link: Link) -> "ModbusEndpoint":
-        """Return this with the address that a link has led to: no name is looked up again."""
+        """Return this with the numeric address of an open link, so no name is looked up again."""
         return replace(self, host=link.peer_host) if isinstance(link, TcpLink) else self
 
     def session(self, link: Link | None = None) -> ModbusSession:
         """Return a session, on a link that it shares with others or on a new one."""
-        framing: Literal["tcp", "rtu"] = "tcp" if self.host else "rtu"
-        return ModbusSession(self.profile, link or self.link(), self.unit, framing=framing)
+        if self.host:
+            link = link or TcpLink(self.host, int(self.port), self.timeout_s)
+            return ModbusSession(self.profile, link, self.unit, framing="tcp")
+        assert isinstance(self.profile.link, ModbusRtuLink)
+        link = link or SerialLink(str(self.port), self.profile.link.settings, self.timeout_s)
+        return ModbusSession(self.profile, link, self.unit, framing="rtu")
 
 
 @dataclass(frozen=True, slots=True)
 class ModbusSetup:
-    """What an experiment's options come to.
+    """An experiment's options, resolved against the profiles.
 
     Attributes:
         options: The options.
         writer: The device that has the output.
-        reader: The device that has the input; the same object where it is the same device.
+        reader: The device that has the input; the same object if it is the same device.
         output: The output in use.
         input: The input in use.
-        chain: What they are wired to.
+        chain: Amplifier and sensor.
     """
 
     options: ModbusOptions
@@ -164,12 +156,7 @@ class ModbusSetup:
 
     @classmethod
     def of(cls, options: ModbusOptions) -> "ModbusSetup":
-        """Resolve options against their profiles.
-
-        Raises:
-            InputError: They do not fit together, a timeout is too short, or the watchdog cannot do
-                what is asked of it.
-        """
+        """Resolve options, or raise InputError if they do not fit their profiles."""
         writer = _writer_of(options)
         reader = _reader_of(options, writer)
         there, here = reader.profile, writer.profile
@@ -208,9 +195,8 @@ class ModbusSetup:
     @property
     def unconfirmed(self) -> str:
         """Why a value that was written cannot be confirmed, as text; empty if it can."""
-        if self.output.readback_register is not None or self.output.function != 6:
-            return ""
-        if self.writer.host:
+        output = self.output
+        if output.readback_register is not None or output.function != 6 or self.writer.host:
             return ""
         # The correct reply equals the request, and is what a line that echoes gives.
         return (
@@ -219,7 +205,7 @@ class ModbusSetup:
         )
 
     def wire(self, one_transaction: bool) -> WireTime:
-        """Return what a sample costs on the wire."""
+        """Return the time of a sample on the wire."""
         profile, name = self.writer.profile, self.options.output
         if not self.reads_elsewhere:
             return exchange_time(profile, name, self.options.input, one_transaction=one_transaction)
@@ -230,11 +216,7 @@ class ModbusSetup:
         return replace(wire, gaps=wire.gaps // 2, gaps_s=0.5 * wire.gaps_s)
 
     def rates(self, one_transaction: bool) -> RateLimit:
-        """Return the sample rates that wire and devices leave.
-
-        Args:
-            one_transaction: Whether a sample is one transaction, not a read and a write.
-        """
+        """Return the sample rates that wire and devices allow."""
         wire = self.wire(one_transaction)
         if self.options.watchdog != "none":
             wire = wire.then(feed_time(self.writer.profile))
@@ -249,16 +231,15 @@ class ModbusSetup:
         details = {**writer.profile.provenance(), "link": writer.profile.link.model_dump_json()}
         details |= options.details()
         if self.reads_elsewhere:
-            description += f"; {reader.profile.title}, unit {reader.unit} at {reader.place}:"
-            description += f" {options.input}"
+            description += f"; {reader.profile.title}, unit {reader.unit} at {reader.place}: "
             details |= reader.profile.provenance("reader_")
         else:
-            description += f", {options.input}"
+            description += ", "
         return self.chain.info(
             "modbus_dac",
             options,
             self.rates(self.may_combine),
-            description=description,
+            description=description + options.input,
             holds=tuple(dict.fromkeys(writer.holds + reader.holds)),
             arm_s=0.0 if options.watchdog == "none" else arm_s(writer.profile, options.output),
             confirms=not self.unconfirmed,
@@ -268,26 +249,16 @@ class ModbusSetup:
 
 
 def _writer_of(options: ModbusOptions) -> ModbusEndpoint:
-    """Return the device that has the output.
-
-    Raises:
-        InputError: The profile does not go with the place.
-    """
     profile = _modbus_profile(options.profile, options.serial_port, "host")
-    given = {"baud": options.baud, "parity": options.parity, "stopbits": options.stopbits}
-    changes = {key: value for key, value in given.items() if value is not None}
-    if changes and not isinstance(profile.link, ModbusRtuLink):
-        raise InputError(f"{', '.join(changes)} must be left out: {profile.title} has no line")
+    changes = {key: getattr(options, key) for key in ("baud", "parity", "stopbits")}
+    given = [key for key, value in changes.items() if value is not None]
+    if given and not isinstance(profile.link, ModbusRtuLink):
+        raise InputError(f"{', '.join(given)} must be left out: {profile.title} has no line")
     return ModbusEndpoint.of(options, with_link(profile, **changes), options.timeout_s)
 
 
 def _reader_of(options: ModbusOptions, writer: ModbusEndpoint) -> ModbusEndpoint:
-    """Return the device that has the input, often the same.
-
-    Raises:
-        InputError: The profile does not go with the place, or two devices of one line have one
-            unit id or no baud in common.
-    """
+    """Return the device that has the input, often the same."""
     given = options.reader
     if given is None:
         return writer

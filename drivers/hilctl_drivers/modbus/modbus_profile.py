@@ -1,7 +1,7 @@
 """Profiles of Modbus devices (TCP and RTU), including streaming."""
 
-from collections.abc import Container, Iterator
-from typing import Annotated, ClassVar, Literal, Self
+from collections.abc import Iterator
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -63,20 +63,6 @@ class LabJackStreaming(StrictModel):
     def rate_max_hz(self) -> float:
         """Highest scan rate with one output and one input in the scan list, Hz."""
         return self.samples_per_s_max / 2.0
-
-    def check_names(self, outputs: Container[str], inputs: Container[str]) -> None:
-        """Refuse names that the profile does not have.
-
-        Raises:
-            ValueError: One of them.
-        """
-        for key, names, known in (
-            ("outputs", self.outputs, outputs),
-            ("inputs", self.inputs, inputs),
-        ):
-            unknown = [name for name in names if name not in known]
-            if unknown:
-                raise ValueError(f"streaming.{key} must be {key} of the profile, got {unknown[0]}")
 
 
 GAP_CHARS = 3.5
@@ -176,10 +162,6 @@ class ModbusWatchdog(Watchdog):
     )
     tripped: TripFlag | Literal["none"] = Field(default="none", description="where a trip shows")
 
-    def protects(self, output: str) -> bool:
-        """Return whether a trip makes an output safe; some devices do so for some outputs only."""
-        return self.on_trip != "safe" or not self.safe or output in self.safe
-
     def steps(self) -> dict[str, tuple[ModbusStep, ...]]:
         """Return all steps by dotted key in the profile."""
         named = {name: getattr(self, name) for name in ("unlock", "arm", "disarm", "feed", "clear")}
@@ -195,14 +177,7 @@ class ModbusWatchdog(Watchdog):
     ) -> tuple[ModbusStep, ...]:
         """Return steps with numbers for ``timeout`` and ``safe``, scaled to the device's units.
 
-        Args:
-            steps: Any of the watchdog's steps.
-            output: The output in use; its scale and offset go with ``safe``.
-            timeout_s: Timeout in s.
-            safe: Safe value in the output's unit.
-
-        Raises:
-            InputError: The timeout is out of range, see :meth:`Watchdog.counts`.
+        ``safe`` is in the unit of the output in use.
         """
         self.counts(timeout_s)
         changes: dict[str, dict[str, float]] = {
@@ -240,8 +215,12 @@ class ModbusProfile(BaseProfile):
     def _channels(self) -> Self:
         if self.exchange != "none" and not (self.outputs and self.inputs):
             raise ValueError("exchange must be none where there are no outputs or no inputs")
-        if self.streaming != "none":
-            self.streaming.check_names(self.outputs, self.inputs)
+        for key in ("outputs", "inputs") if self.streaming != "none" else ():
+            unknown = [
+                name for name in getattr(self.streaming, key) if name not in getattr(self, key)
+            ]
+            if unknown:
+                raise ValueError(f"streaming.{key} must be {key} of the profile, got {unknown[0]}")
         return self
 
     @model_validator(mode="after")
@@ -273,25 +252,24 @@ class ModbusProfile(BaseProfile):
 
     def registers(self) -> Iterator[tuple[str, Register]]:
         """Yield every register with its dotted key."""
-        for group, channels in (("outputs", self.outputs), ("inputs", self.inputs)):
-            for name, channel in channels.items():
-                yield f"{group}.{name}", channel
-                readback = getattr(channel, "readback", None)
-                if isinstance(readback, Register):
-                    yield f"{group}.{name}.readback", readback
-        groups = {"init": self.init, "close": self.close}
-        if self.watchdog != "none":
-            groups |= self.watchdog.steps()
-            if self.watchdog.tripped != "none":
-                yield "watchdog.tripped", self.watchdog.tripped
-        for key, steps in groups.items():
-            for index, step in enumerate(steps):
-                if isinstance(step, Register):
-                    yield f"{key}.{index}", step
-        if self.selftest != "none":
-            yield "selftest", self.selftest
+        return _registers(self)
 
     def wire_address(self, register: Register) -> int:
         """Return the address that goes into the frame, 0 to 65535."""
         base = self.address_base if register.address_base is None else register.address_base
         return wire_address(register, base)
+
+
+def _registers(part: object, key: str = "") -> Iterator[tuple[str, Register]]:
+    """Yield every register in a part of a profile."""
+    if isinstance(part, Register):
+        yield key, part
+    parts: dict[Any, object] = {}
+    if isinstance(part, StrictModel):
+        parts = {name: getattr(part, name) for name in type(part).model_fields}
+    elif isinstance(part, dict):
+        parts = part
+    elif isinstance(part, tuple):
+        parts = dict(enumerate(part))
+    for name, each in parts.items():
+        yield from _registers(each, f"{key}.{name}" if key else name)

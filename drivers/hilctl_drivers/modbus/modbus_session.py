@@ -12,6 +12,8 @@ from hilctl_drivers.modbus.modbus_profile import (
     ModbusRtuLink,
 )
 from hilctl_drivers.modbus.pdu import (
+    ReadFrame,
+    WriteFrame,
     coil_pdu,
     feedback_pdu,
     read_pdu,
@@ -35,16 +37,40 @@ from hilctl_drivers.transport.links import Link
 from hilctl_drivers.transport.wire_time import WireTime
 
 
-class ModbusSession:
-    """A link to one device, asked one thing at a time.
+def read_request(profile: ModbusProfile, register: Register) -> bytes:
+    """Return the PDU that reads a register."""
+    return read_pdu(register.read_function, profile.wire_address(register), register.words)
 
-    Args:
-        profile: What the device is.
-        link: Not yet open.
-        unit: Its unit id.
-        sleep: Waits that many s.
-        framing: Of the link, where it is not the profile's: a gateway takes Modbus TCP to devices
-            on a serial line.
+
+def write_request(profile: ModbusProfile, register: Register, data: bytes = b"") -> bytes:
+    """Return the PDU that writes a register; zeros without ``data``."""
+    address = profile.wire_address(register)
+    data = data or bytes(2 * register.words)
+    if register.type == "bit":
+        return coil_pdu(address, any(data))
+    single = register.words == 1
+    if isinstance(register, ModbusOutput):
+        single = register.function == 6
+    return (write_single_pdu if single else write_pdu)(address, data)
+
+
+def combined_request(
+    profile: ModbusProfile, output: ModbusOutput, sensor: ModbusInput
+) -> bytes | None:
+    """Return the PDU that writes an output and reads an input; None if the device has none."""
+    source, target = profile.wire_address(sensor), profile.wire_address(output)
+    data = bytes(2 * output.words)
+    if profile.exchange == 23:
+        return write_read_pdu(source, sensor.words, target, data)
+    if profile.exchange == 76:
+        return feedback_pdu(ReadFrame(source, sensor.words), WriteFrame(target, data))
+    return None
+
+
+class ModbusSession:
+    """A link to one device, with one request at a time; every error is a ``DeviceError``.
+
+    ``framing`` is that of the link, if it differs from the profile's, as behind a gateway.
     """
 
     def __init__(
@@ -56,21 +82,11 @@ class ModbusSession:
         *,
         framing: Literal["tcp", "rtu"] | None = None,
     ) -> None:
-        self._profile = profile
+        self.profile = profile
+        self.link = link
         self._framing = framing or profile.link.kind
-        self._link = link
         self._unit = unit
         self._sleep = sleep
-
-    @property
-    def link(self) -> Link:
-        """The link."""
-        return self._link
-
-    @property
-    def profile(self) -> ModbusProfile:
-        """What the device is."""
-        return self._profile
 
     def prepare(self, pdu: bytes) -> Transaction:
         """Return a request that can be sent many times."""
@@ -79,64 +95,26 @@ class ModbusSession:
         return RtuTransaction(self._unit, pdu)
 
     def call(self, transaction: Transaction, data: bytes = b"") -> bytes:
-        """Send a prepared request and return the register bytes that were read.
-
-        Args:
-            transaction: The request.
-            data: Register bytes to write.
-
-        Raises:
-            DeviceError: No answer, not a good one, or a refusal.
-        """
+        """Send a prepared request with register bytes to write; return those that were read."""
         request, usual = transaction.request(data), transaction.reply_size
-        return transaction.reply(self._link.transact(request, transaction.missing, usual))
+        return transaction.reply(self.link.transact(request, transaction.missing, usual))
 
     def read_bytes(self, register: Register) -> bytes:
-        """Return what a register holds, as bytes; a bit as one byte, 0 or 1."""
-        address = self._profile.wire_address(register)
-        pdu = read_pdu(register.read_function, address, register.words)
-        data = self.call(self.prepare(pdu))
+        """Return the content of a register as bytes; a bit as one byte, 0 or 1."""
+        data = self.call(self.prepare(read_request(self.profile, register)))
         return bytes([data[0] & 1]) if register.type == "bit" else data
 
     def write_bytes(self, register: Register, data: bytes) -> None:
         """Write what :meth:`read_bytes` returns."""
-        address = self._profile.wire_address(register)
-        if register.type == "bit":
-            pdu = coil_pdu(address, data != b"\0")
-        elif register.words == 1:
-            pdu = write_single_pdu(address, data)
-        else:
-            pdu = write_pdu(address, data)
-        self.call(self.prepare(pdu))
-
-    def put_out(self, output: ModbusOutput, data: bytes) -> None:
-        """Write an output's register bytes.
-
-        Raises:
-            DeviceError: The device does not confirm.
-        """
-        self.call(self.prepare(self.output_pdu(output, data)))
-
-    def output_pdu(self, output: ModbusOutput, data: bytes) -> bytes:
-        """Return the request that writes an output's register bytes."""
-        address = self._profile.wire_address(output)
-        return (write_single_pdu if output.function == 6 else write_pdu)(address, data)
+        self.call(self.prepare(write_request(self.profile, register, data)))
 
     def held(self, output: ModbusOutput) -> float | None:
-        """Return what an output's register holds, in its unit; None if it cannot be read.
-
-        Raises:
-            DeviceError: No answer, not a good one, or a refusal.
-        """
+        """Return the content of an output's register, in its unit; None if it cannot be read."""
         register = output.readback_register
         return None if register is None else register.format.decode(self.read_bytes(register))
 
     def run(self, steps: Sequence[ModbusStep]) -> None:
-        """Execute a profile's steps.
-
-        Raises:
-            DeviceError: One of them failed; the text says which.
-        """
+        """Execute a profile's steps; an error names the step."""
         for step in steps:
             if isinstance(step, WaitStep):
                 self._sleep(step.seconds)
@@ -168,12 +146,8 @@ class ModbusSession:
         )
 
     def check_selftest(self) -> None:
-        """Read the register of known content.
-
-        Raises:
-            DeviceError: It holds something else.
-        """
-        test = self._profile.selftest
+        """Raise DeviceError if the register of known content holds something else."""
+        test = self.profile.selftest
         if test == "none":
             return
         found = self.read_bytes(test)
@@ -185,9 +159,8 @@ class ModbusSession:
             )
 
     def is_set(self, flag: TripFlag) -> bool:
-        """Return whether a flag says yes."""
-        found = self.read_bytes(flag)
-        return bool(int.from_bytes(found, "big") & flag.mask)
+        """Return whether a bit of the flag's mask is set."""
+        return bool(int.from_bytes(self.read_bytes(flag), "big") & flag.mask)
 
 
 def _encoded(register: Register, value: float | str) -> bytes:
@@ -207,28 +180,20 @@ def _named(step: RegisterStep) -> str:
 def exchange_time(
     profile: ModbusProfile, output: str, sensor: str | None, *, one_transaction: bool = True
 ) -> WireTime:
-    """Return what one exchange costs: write an output and read an input.
-
-    Args:
-        profile: The device; see :func:`hilctl_drivers.profile.with_link` for another baud or gap.
-        output: Name of the output.
-        sensor: Name of the input; None to write only.
-        one_transaction: Whether the exchange in one transaction may be used, where there is one.
-
-    Raises:
-        KeyError: No such output or input.
-    """
+    """Return the time to write an output and read an input, by name; None to write only."""
     written = profile.outputs[output]
-    read = None if sensor is None else profile.inputs[sensor]
-    requests = _requests(profile, written, read, one_transaction=one_transaction)
-    settle_s = written.settle_s + (read.settle_s if read else 0.0)
-    return requests_time(profile, requests, settle_s)
+    write = write_request(profile, written)
+    if sensor is None:
+        return _requests_time(profile, [write], written.settle_s)
+    read = profile.inputs[sensor]
+    combined = combined_request(profile, written, read) if one_transaction else None
+    requests = [combined] if combined else [read_request(profile, read), write]
+    return _requests_time(profile, requests, written.settle_s + read.settle_s)
 
 
 def read_time(profile: ModbusProfile, sensor: ModbusInput) -> WireTime:
-    """Return what it costs to read an input."""
-    pdu = read_pdu(sensor.read_function, profile.wire_address(sensor), sensor.words)
-    return requests_time(profile, [pdu], sensor.settle_s)
+    """Return the time to read an input."""
+    return _requests_time(profile, [read_request(profile, sensor)], sensor.settle_s)
 
 
 def feed_time(profile: ModbusProfile) -> WireTime | None:
@@ -240,24 +205,18 @@ def feed_time(profile: ModbusProfile) -> WireTime | None:
 
 
 def arm_s(profile: ModbusProfile, output: str) -> float:
-    """Return the time that arming the device's watchdog takes at most, s; 0 without a watchdog."""
+    """Return the longest time to arm the device's watchdog, s; 0 without a watchdog."""
     watchdog = profile.watchdog
     if watchdog == "none":
         return 0.0
-    wire = _steps_time(profile, (*watchdog.unlock, *watchdog.safe.get(output, ()), *watchdog.arm))
-    return wire.answered_s
+    steps = (*watchdog.unlock, *watchdog.safe.get(output, ()), *watchdog.arm)
+    return _steps_time(profile, steps).answered_s
 
 
-def requests_time(
+def _requests_time(
     profile: ModbusProfile, requests: Sequence[bytes], settle_s: float = 0.0
 ) -> WireTime:
-    """Return what requests cost with their replies, one after the other.
-
-    Args:
-        profile: The device.
-        requests: Their PDUs.
-        settle_s: Time that the terminals take to settle.
-    """
+    """Return the time of request PDUs and their replies, one after the other."""
     what = "+".join(f"FC{pdu[0]:02d}" for pdu in requests)
     turnaround_s = len(requests) * profile.turnaround_s
     link = profile.link
@@ -277,45 +236,20 @@ def requests_time(
     )
 
 
-def _requests(
-    profile: ModbusProfile,
-    output: ModbusOutput,
-    sensor: ModbusInput | None,
-    *,
-    one_transaction: bool,
-) -> list[bytes]:
-    at, data = profile.wire_address(output), bytes(2 * output.words)
-    if sensor is not None:
-        source = profile.wire_address(sensor)
-        if one_transaction and profile.exchange == 23:
-            return [write_read_pdu(source, sensor.words, at, data)]
-        if one_transaction and profile.exchange == 76:
-            return [feedback_pdu(at, data, source, sensor.words)]
-    write = write_single_pdu(at, data) if output.function == 6 else write_pdu(at, data)
-    if sensor is None:
-        return [write]
-    return [read_pdu(sensor.read_function, source, sensor.words), write]
-
-
 def _step_requests(profile: ModbusProfile, step: ModbusStep) -> list[bytes]:
-    """Return the requests of a step, with the longest that it may come to."""
+    """Return the most requests that a step may send."""
     if isinstance(step, WaitStep):
         return []
-    address, data = profile.wire_address(step), bytes(2 * step.words)
-    read = read_pdu(step.read_function, address, step.words)
+    read, write = read_request(profile, step), write_request(profile, step)
     if isinstance(step, ExpectStep):
         return [read]
-    if step.type == "bit":
-        write = coil_pdu(address, True)
-    else:
-        write = (write_single_pdu if step.words == 1 else write_pdu)(address, data)
     if isinstance(step, EnsureStep):
         return [read, write, read]
     return [write, read] if step.verify else [write]
 
 
 def _steps_time(profile: ModbusProfile, steps: Sequence[ModbusStep]) -> WireTime:
-    """Return the longest that steps take; one that writes only a difference counts as a write."""
+    """Return the longest time of steps; a step that may write counts as one that does."""
     requests = [pdu for step in steps for pdu in _step_requests(profile, step)]
     waits_s = [step.seconds for step in steps if isinstance(step, WaitStep)]
-    return requests_time(profile, requests).waiting(waits_s)
+    return _requests_time(profile, requests).waiting(waits_s)

@@ -3,10 +3,15 @@
 Sources: "MODBUS Application Protocol Specification" V1.1b3 (sections 6.1 to 6.17 for the functions,
 7 for exceptions), "MODBUS Messaging on TCP/IP Implementation Guide" V1.0b (3.1.3), "MODBUS over
 Serial Line" V1.02 (2.5.1, CRC in 6.2.2), and for function 76 LabJack's "Protocol Details [Direct
-Modbus TCP]". Addresses are PDU addresses: counted from 0.
+Modbus TCP]". Addresses are PDU addresses: counted from 0. Register data have 2 bytes per register.
+
+Builders raise ``BadRequestError`` for what the specification does not allow: too many or no bits or
+registers, odd data, an address past 65535, an unknown unit, or a PDU over 253 bytes.
 """
 
 import struct
+from dataclasses import dataclass
+from typing import ClassVar, TypeAlias
 
 from hilctl_drivers.transport.crc import Bytes, crc16_modbus
 from hilctl_drivers.transport.links import (
@@ -26,6 +31,10 @@ READ_MAX, WRITE_MAX, WRITE_READ_MAX, BITS_MAX = 125, 123, 121, 2000
 TCP_HEAD = 7
 """Bytes of the MBAP header, unit included."""
 _TCP_SHORTEST = TCP_HEAD + 1
+FRAME_HEAD = 4
+"""Bytes of a feedback frame before its data."""
+_FRAME_MAX = 255
+_frame_head = struct.Struct(">BHB").pack
 _tcp_start = struct.Struct(">HHH").unpack_from
 
 EXCEPTIONS = {
@@ -37,7 +46,7 @@ EXCEPTIONS = {
 
 
 def _check_span(what: str, address: int, count: int, count_max: int) -> None:
-    """Raise BadRequest unless ``count`` things from ``address`` on exist and fit a message."""
+    """Raise unless ``count`` bits or registers from ``address`` on exist and fit a message."""
     if not 1 <= count <= count_max:
         raise BadRequestError(f"{what} count must be 1 to {count_max} in one message, got {count}")
     if not 0 <= address <= 0x10000 - count:
@@ -45,7 +54,7 @@ def _check_span(what: str, address: int, count: int, count_max: int) -> None:
 
 
 def _written(address: int, data: bytes, count_max: int) -> int:
-    """Return how many registers ``data`` is; raise BadRequest where they cannot be written."""
+    """Return the number of registers in ``data``; raise if they cannot be written."""
     if len(data) % 2:
         raise BadRequestError(f"registers have 2 bytes each, got {len(data)} bytes")
     _check_span("written register", address, len(data) // 2, count_max)
@@ -53,93 +62,88 @@ def _written(address: int, data: bytes, count_max: int) -> int:
 
 
 def read_pdu(function: int, address: int, count: int) -> bytes:
-    """Return a request to read bits (functions 1, 2) or registers (3, 4).
-
-    Raises:
-        BadRequest: Another function, or ``address`` and ``count`` are outside the specification's
-            limits: 2000 bits or 125 registers, addresses to 65535.
-    """
-    if function in {READ_COILS, READ_DISCRETE}:
-        _check_span("bit", address, count, BITS_MAX)
-    elif function in {READ_HOLDING, READ_INPUT}:
-        _check_span("register", address, count, READ_MAX)
-    else:
-        raise BadRequestError(f"functions that read are 1, 2, 3 and 4, got {function}")
+    """Return a request to read at most 2000 bits (functions 1, 2) or 125 registers (3, 4)."""
+    bits = function in {READ_COILS, READ_DISCRETE}
+    _check_span("bit" if bits else "register", address, count, BITS_MAX if bits else READ_MAX)
     return struct.pack(">BHH", function, address, count)
 
 
 def write_pdu(address: int, data: bytes) -> bytes:
-    """Return a request to write registers (function 16).
-
-    Args:
-        address: First register.
-        data: Register bytes, 2 each; at most 123 registers.
-
-    Raises:
-        BadRequest: Odd, empty or too much data, or past address 65535.
-    """
+    """Return a request to write at most 123 registers (function 16)."""
     count = _written(address, data, WRITE_MAX)
     return struct.pack(">BHHB", WRITE_REGISTERS, address, count, len(data)) + data
 
 
 def write_single_pdu(address: int, data: bytes) -> bytes:
-    """Return a request to write one register (function 6), ``data`` being its 2 bytes.
-
-    Raises:
-        BadRequest: Not 2 bytes, or no such address.
-    """
+    """Return a request to write one register (function 6)."""
     _written(address, data, 1)
     return struct.pack(">BH", WRITE_REGISTER, address) + data
 
 
 def coil_pdu(address: int, on: bool) -> bytes:
-    """Return a request to switch one coil (function 5).
-
-    Raises:
-        BadRequest: No such address.
-    """
+    """Return a request to switch one coil (function 5)."""
     _check_span("coil", address, 1, 1)
     return struct.pack(">BHH", WRITE_COIL, address, 0xFF00 if on else 0)
 
 
 def write_read_pdu(read_address: int, read_count: int, write_address: int, data: bytes) -> bytes:
-    """Return a request to write registers, then read registers (function 23).
-
-    Args:
-        read_address: First register to read.
-        read_count: Registers to read, at most 125.
-        write_address: First register to write.
-        data: Register bytes to write, 2 each; at most 121 registers.
-
-    Raises:
-        BadRequest: Outside these limits, or past address 65535.
-    """
+    """Return a request to write at most 121 registers, then read at most 125 (function 23)."""
     count = _written(write_address, data, WRITE_READ_MAX)
     _check_span("register", read_address, read_count, READ_MAX)
     head = (WRITE_READ, read_address, read_count, write_address, count, len(data))
     return struct.pack(">BHHHHB", *head) + data
 
 
-def feedback_pdu(write_address: int, data: bytes, read_address: int, read_count: int) -> bytes:
-    """Return a LabJack Modbus Feedback request: one read frame, then one write frame (76).
+@dataclass(frozen=True, slots=True)
+class ReadFrame:
+    """Read ``words`` registers from ``address`` on."""
 
-    Frames are executed in their order, so what is read does not show yet what is written.
+    address: int
+    words: int
 
-    Arguments and errors are as for :func:`write_read_pdu`, with at most 122 registers to write and
-    126 to read: what fits a PDU of 253 bytes.
+    def encode(self) -> bytes:
+        """Return the frame's bytes."""
+        _check_span("register", self.address, self.words, _FRAME_MAX)
+        return _frame_head(0, self.address, self.words)
+
+    @property
+    def reply_size(self) -> int:
+        """Bytes of the reply to this frame."""
+        return 2 * self.words
+
+
+@dataclass(frozen=True, slots=True)
+class WriteFrame:
+    """Write register bytes from ``address`` on; a buffer register takes all."""
+
+    address: int
+    data: bytes
+    reply_size: ClassVar[int] = 0
+
+    def encode(self) -> bytes:
+        """Return the frame's bytes."""
+        count = _written(self.address, self.data, _FRAME_MAX)
+        return _frame_head(1, self.address, count) + self.data
+
+
+FeedbackFrame: TypeAlias = ReadFrame | WriteFrame
+
+
+def feedback_pdu(*frames: FeedbackFrame) -> bytes:
+    """Return a LabJack Modbus Feedback request (76), which executes frames in their order.
+
+    A frame is ``00 address16 words8`` to read and ``01 address16 words8 data`` to write. A reply
+    has the words of each read. Both must fit a PDU of the Modbus specification.
     """
-    count = _written(write_address, data, (PDU_MAX - 9) // 2)
-    _check_span("register", read_address, read_count, (PDU_MAX - 1) // 2)
-    read = struct.pack(">BBHB", FEEDBACK, 0, read_address, read_count)
-    return read + struct.pack(">BHB", 1, write_address, count) + data
+    pdu = bytes((FEEDBACK,)) + b"".join(frame.encode() for frame in frames)
+    longest = max(len(pdu), 1 + sum(frame.reply_size for frame in frames))
+    if longest > PDU_MAX:
+        raise BadRequestError(f"a PDU has at most {PDU_MAX} bytes, got {longest}")
+    return pdu
 
 
 def reply_layout(pdu: bytes) -> tuple[bytes, int]:
-    """Return what a good reply to this request PDU begins with, and how many data bytes follow.
-
-    Raises:
-        BadRequest: A function that is not one of those built here.
-    """
+    """Return the first bytes of a good reply to a request PDU, and the number of data bytes."""
     function = pdu[0]
     if function in {READ_COILS, READ_DISCRETE}:
         size = (int.from_bytes(pdu[3:5], "big") + 7) // 8
@@ -147,15 +151,13 @@ def reply_layout(pdu: bytes) -> tuple[bytes, int]:
         size = 2 * int.from_bytes(pdu[3:5], "big")
     elif function in {WRITE_COIL, WRITE_REGISTER, WRITE_REGISTERS}:
         return pdu[:5], 0
-    elif function == FEEDBACK:
-        return pdu[:1], _feedback_reads(pdu)
     else:
-        raise BadRequestError(f"function {function} is not one of those known here")
+        return pdu[:1], _feedback_reads(pdu)
     return bytes((function, size)), size
 
 
 def _feedback_reads(pdu: bytes) -> int:
-    """Return how many bytes the read frames of a Modbus Feedback request read."""
+    """Return the number of bytes that a Modbus Feedback request reads."""
     size, at = 0, 1
     while at < len(pdu):
         words = 2 * pdu[at + 3]
@@ -166,20 +168,17 @@ def _feedback_reads(pdu: bytes) -> int:
 
 
 def reply_size(pdu: bytes) -> int:
-    """Return how many bytes the PDU of a good reply to this request PDU has."""
+    """Return the number of bytes of a good reply PDU to a request PDU."""
     head, size = reply_layout(pdu)
     return len(head) + size
 
 
 def reply_data(request_pdu: bytes, reply_pdu: bytes) -> bytes:
-    """Check a reply against its request and return what was read.
-
-    Returns:
-        Register bytes, or packed bits (lowest first) for functions 1 and 2; empty for writes.
+    """Check a reply against its request and return the register bytes or packed bits that it reads.
 
     Raises:
-        Refused: An exception reply; ``code`` is the exception code.
-        Mismatch: Another function, byte count, length, or echoed address, count or value.
+        RefusedError: An exception reply; ``code`` is the exception code.
+        MismatchError: Another function, byte count, length, or echoed address, count or value.
     """
     head, size = reply_layout(request_pdu)
     function = request_pdu[0]
@@ -199,14 +198,8 @@ def reply_data(request_pdu: bytes, reply_pdu: bytes) -> bytes:
 
 
 def tcp_adu(transaction: int, unit: int, pdu: bytes) -> bytes:
-    """Return ``pdu`` with its MBAP header.
-
-    Raises:
-        BadRequest: Transaction outside 0 to 65535, unit outside 0 to 255, or a PDU over 253 bytes.
-    """
+    """Return ``pdu`` with its MBAP header, for a unit from 0 to 255."""
     _check_envelope(unit, 0, pdu)
-    if not 0 <= transaction <= 0xFFFF:
-        raise BadRequestError(f"transaction must be 0 to 65535, got {transaction}")
     return struct.pack(">HHHB", transaction, 0, len(pdu) + 1, unit) + pdu
 
 
@@ -214,9 +207,9 @@ def tcp_pdu(adu: Bytes, transaction: int, unit: int) -> bytes:
     """Check the MBAP header of exactly one message and return its PDU.
 
     Raises:
-        Incomplete: More bytes belong to it.
-        Corrupt: Not Modbus, an impossible length, or bytes behind its end.
-        Mismatch: Another transaction or unit.
+        IncompleteError: More bytes belong to it.
+        CorruptError: Not Modbus, an impossible length, or bytes behind its end.
+        MismatchError: Another transaction or unit.
     """
     if len(adu) < TCP_HEAD:
         raise IncompleteError(f"{len(adu)} of at least {TCP_HEAD + 1} bytes")
@@ -235,10 +228,7 @@ def tcp_pdu(adu: Bytes, transaction: int, unit: int) -> bytes:
 
 
 def tcp_missing(received: Bytes) -> int:
-    """Return how many more bytes of a message to wait for; 0 if it is ready to be checked.
-
-    Nonsense is ready to be refused; its length is not worth waiting for.
-    """
+    """Return the number of missing bytes; 0 if the message is complete, or is no Modbus TCP."""
     count = len(received)
     if count < _TCP_SHORTEST:
         return _TCP_SHORTEST - count
@@ -249,12 +239,7 @@ def tcp_missing(received: Bytes) -> int:
 
 
 def rtu_adu(unit: int, pdu: bytes) -> bytes:
-    """Return ``pdu`` with unit and CRC.
-
-    Raises:
-        BadRequest: Unit outside 1 to 255 (0 is broadcast, which nobody answers), or a PDU over
-            253 bytes.
-    """
+    """Return ``pdu`` with CRC and a unit from 1 to 255; 0 is broadcast, which has no answer."""
     _check_envelope(unit, 1, pdu)
     frame = bytes((unit,)) + pdu
     return frame + crc16_modbus(frame).to_bytes(2, "little")
@@ -264,9 +249,9 @@ def rtu_pdu(adu: Bytes, unit: int) -> bytes:
     """Check unit and CRC of exactly one message and return its PDU.
 
     Raises:
-        Incomplete: Fewer than 5 bytes, which no reply has.
-        Corrupt: The CRC is wrong.
-        Mismatch: Another unit.
+        IncompleteError: Fewer than 5 bytes, which no reply has.
+        CorruptError: The CRC is wrong.
+        MismatchError: Another unit.
     """
     if len(adu) < 5:
         raise IncompleteError(f"{len(adu)} of at least 5 bytes")

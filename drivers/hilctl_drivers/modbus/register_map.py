@@ -23,23 +23,27 @@ RegisterType: TypeAlias = Literal["int16", "uint16", "int32", "uint32", "float32
 
 _CODES = {"int16": "h", "uint16": "H", "int32": "i", "uint32": "I", "float32": "f", "float64": "d"}
 _FLOAT32_MAX = struct.unpack(">f", b"\x7f\x7f\xff\xff")[0]
+_RAW_LIMITS: dict[RegisterType, tuple[float, float]] = {
+    "int16": (-(2**15), 2**15 - 1),
+    "uint16": (0, 2**16 - 1),
+    "int32": (-(2**31), 2**31 - 1),
+    "uint32": (0, 2**32 - 1),
+    "float32": (-_FLOAT32_MAX, _FLOAT32_MAX),
+    "float64": (-inf, inf),
+}
 _LETTERS = "ABCDEFGH"
 _Permute: TypeAlias = Callable[[Bytes], tuple[int, ...]]
 
 
 @dataclass(frozen=True)
 class RegisterFormat:
-    """How one value stands in its registers.
+    """Encoding of one value in its registers; what is not valid raises BadRequestError.
 
     Attributes:
         type: Number type of the raw value.
         order: Byte order in ABCD notation; empty for most significant byte first.
-        scale: Value of one raw step, in the channel's unit.
-        offset: Value where raw is 0, in the channel's unit.
-
-    Raises:
-        BadRequest: Unknown type, an order that does not name each byte once, a scale of 0, or a
-            scale or offset that is not finite.
+        scale: Value of one raw step, in the channel's unit; finite and not 0.
+        offset: Value at raw 0, in the channel's unit; finite.
     """
 
     type: RegisterType
@@ -53,13 +57,10 @@ class RegisterFormat:
     _unpack: Callable[[Bytes], tuple[float]] = field(init=False, repr=False, compare=False)
     _to_wire: _Permute | None = field(init=False, repr=False, compare=False)
     _from_wire: _Permute | None = field(init=False, repr=False, compare=False)
-    _whole: bool = field(init=False, repr=False, compare=False)
+    is_integer: bool = field(init=False, repr=False, compare=False)
+    """Whether the raw value is an integer."""
 
     def __post_init__(self) -> None:
-        if self.type not in _CODES:
-            raise BadRequestError(
-                f"unknown register type {self.type!r}; known are {', '.join(_CODES)}"
-            )
         if not (isfinite(self.scale) and isfinite(self.offset) and self.scale):
             raise BadRequestError(
                 f"scale must be finite and not 0 and offset finite, got {self.scale}, {self.offset}"
@@ -73,56 +74,36 @@ class RegisterFormat:
             )
         little = order == natural[::-1]
         plain = little or order == natural
-        to_wire = tuple(natural.index(letter) for letter in order)
-        from_wire = tuple(order.index(letter) for letter in natural)
-        code = ("<" if little else ">") + _CODES[self.type]
-        form = struct.Struct(code)
-        object.__setattr__(self, "size", size)
-        object.__setattr__(self, "_pack", form.pack)
-        object.__setattr__(self, "_unpack", form.unpack)
-        object.__setattr__(self, "_to_wire", None if plain else itemgetter(*to_wire))
-        object.__setattr__(self, "_from_wire", None if plain else itemgetter(*from_wire))
-        object.__setattr__(self, "_whole", self.is_integer)
-        object.__setattr__(self, "order", order)
-
-    @property
-    def count(self) -> int:
-        """Registers of the value."""
-        return self.size // 2
-
-    @property
-    def is_integer(self) -> bool:
-        """Whether the raw value is an integer."""
-        return "int" in self.type
+        form = struct.Struct(("<" if little else ">") + _CODES[self.type])
+        derived = {
+            "size": size,
+            "order": order,
+            "_pack": form.pack,
+            "_unpack": form.unpack,
+            "_to_wire": None if plain else itemgetter(*map(natural.index, order)),
+            "_from_wire": None if plain else itemgetter(*map(order.index, natural)),
+            "is_integer": "int" in self.type,
+        }
+        for name, value in derived.items():
+            object.__setattr__(self, name, value)
 
     @property
     def limits(self) -> tuple[float, float]:
         """Lowest and highest value that the type can hold, in the channel's unit."""
-        bits = 8 * self.size
-        low: float
-        high: float
-        if self.type == "float64":
-            return -inf, inf
-        if self.type == "float32":
-            low, high = -_FLOAT32_MAX, _FLOAT32_MAX
-        elif self.type.startswith("u"):
-            low, high = 0, 2**bits - 1
-        else:
-            low, high = -(2 ** (bits - 1)), 2 ** (bits - 1) - 1
-        ends = (low * self.scale + self.offset, high * self.scale + self.offset)
+        ends = [raw * self.scale + self.offset for raw in _RAW_LIMITS[self.type]]
         return min(ends), max(ends)
 
     def encode(self, value: float) -> bytes:
         """Return ``value`` as register bytes: bytes[size], integers rounded half to even.
 
         Raises:
-            BadRequest: ``value`` is not finite or the type cannot hold it; never clipped.
+            BadRequestError: ``value`` is not finite or the type cannot hold it; never clipped.
         """
         raw = (value - self.offset) / self.scale
         if not isfinite(raw):
             raise BadRequestError(f"{self.type} register can't hold {value}")
         try:
-            data = self._pack(round(raw) if self._whole else raw)
+            data = self._pack(round(raw) if self.is_integer else raw)
         except (struct.error, OverflowError):
             raise BadRequestError(
                 f"{self.type} register holds {self.limits[0]:g} to {self.limits[1]:g}, got {value}"
@@ -130,14 +111,7 @@ class RegisterFormat:
         return data if self._to_wire is None else bytes(self._to_wire(data))
 
     def decode(self, data: Bytes) -> float:
-        """Return the value in register bytes; not a number where the device sent just that.
-
-        Args:
-            data: bytes[size].
-
-        Raises:
-            Mismatch: Too many or too few bytes.
-        """
+        """Return the value in register bytes, bytes[size]; NaN if the device sent it."""
         if len(data) != self.size:
             raise MismatchError(f"{self.type} register has {self.size} bytes, got {len(data)}")
         if self._from_wire is not None:
@@ -189,11 +163,7 @@ class Register(StrictModel):
 
     @property
     def format(self) -> RegisterFormat:
-        """How the value becomes bytes.
-
-        Raises:
-            BadRequest: It is a bit, or order or scale is wrong.
-        """
+        """Encoding of the value; a bit has none and raises BadRequestError."""
         if self.type == "bit":
             raise BadRequestError("a bit has no register format")
         return RegisterFormat(self.type, self.order, self.scale, self.offset)
@@ -201,7 +171,7 @@ class Register(StrictModel):
     @property
     def words(self) -> int:
         """Registers (or bits) that it takes up."""
-        return 1 if self.type == "bit" else self.format.count
+        return 1 if self.type == "bit" else self.format.size // 2
 
     @property
     def read_function(self) -> int:
@@ -229,7 +199,7 @@ class Channel(Register, Range):
             raise ValueError(f"an analogue channel can't be in area {self.area}")
         if self.type.startswith("float") and (self.raw_min, self.raw_max) != (None, None):
             raise ValueError("raw_min and raw_max are for whole-number types")
-        low, high = RegisterFormat(self.format.type).limits
+        low, high = _RAW_LIMITS[self.format.type]
         if not low <= self.raw_limits[0] < self.raw_limits[1] <= high:
             raise ValueError(f"raw_min and raw_max must be ordered and fit into {self.type}")
         low, high = self.representable
@@ -244,7 +214,7 @@ class Channel(Register, Range):
     @property
     def raw_limits(self) -> tuple[float, float]:
         """Lowest and highest raw value in use."""
-        low, high = RegisterFormat(self.format.type).limits
+        low, high = _RAW_LIMITS[self.format.type]
         return (
             low if self.raw_min is None else float(self.raw_min),
             high if self.raw_max is None else float(self.raw_max),
@@ -335,7 +305,7 @@ class TripFlag(Register):
 
 
 def wire_address(register: Register, base: AddressBase) -> int:
-    """Return the address that goes into the frame; out of 0..65535 where there is none.
+    """Return the address in the frame; outside 0 to 65535 if there is none.
 
     With base ``modicon``, holding register 1 is 40001 or 400001, input register 1 is 30001 or
     300001, discrete input 1 is 10001 or 100001 and coil 1 is 1.

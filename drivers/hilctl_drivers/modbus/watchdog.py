@@ -7,7 +7,7 @@ from typing import TypeAlias
 from hilctl.base.errors import DeviceError, UnconfirmedError
 from hilctl_drivers.modbus.config import ModbusEndpoint, ModbusSetup
 from hilctl_drivers.modbus.modbus_profile import ModbusWatchdog
-from hilctl_drivers.modbus.modbus_session import ModbusSession
+from hilctl_drivers.modbus.modbus_session import ModbusSession, write_request
 from hilctl_drivers.modbus.register_map import ModbusStep, RegisterStep
 from hilctl_drivers.transport.links import RefusedError
 from hilctl_drivers.transport.safe_exchange import SafeExchange, check_read_back, try_out
@@ -16,11 +16,7 @@ from hilctl_drivers.transport.wire_time import check_feeds
 
 
 class ModbusWatchdogDriver:
-    """The watchdog, as the experiment wants it.
-
-    Args:
-        setup: What the experiment says of the device.
-    """
+    """The watchdog, as the experiment wants it."""
 
     def __init__(self, setup: ModbusSetup) -> None:
         self._setup = setup
@@ -31,17 +27,10 @@ class ModbusWatchdogDriver:
         """Ticks from one feeding to the next; 0 if exchanges feed it."""
 
     def write_through(self, session: ModbusSession, put: Callable[[], None]) -> None:
-        """Write the output, also where the watchdog has tripped.
+        """Write the output by ``put``, even if the watchdog has tripped.
 
-        Before the trip is cleared, so that no stale command takes effect by that; and after it, for
-        a device that refuses or ignores writes until then.
-
-        Args:
-            session: The device.
-            put: Writes the output.
-
-        Raises:
-            DeviceError: The device does not confirm.
+        Before the trip is cleared, so that no stale command takes effect then; and after it, for a
+        device that refuses or ignores writes until then.
         """
         has = self._has
         if has == "none" or not has.clear:
@@ -72,7 +61,7 @@ class ModbusWatchdogDriver:
                 "'hilctl safe' puts it at the safe value and clears the trip"
             )
         output, data = self._setup.output, self._setup.output.format.encode(value)
-        self.write_through(session, lambda: session.put_out(output, data))
+        self.write_through(session, lambda: session.write_bytes(output, data))
 
     def _tripped(self, session: ModbusSession) -> bool:
         has, readback = self._has, self._setup.output.readback_register
@@ -82,7 +71,7 @@ class ModbusWatchdogDriver:
         if not has.refuses_while_tripped or readback is None:
             return False
         try:  # what it holds already moves nothing
-            session.put_out(self._setup.output, session.read_bytes(readback))
+            session.write_bytes(self._setup.output, session.read_bytes(readback))
         except RefusedError:
             return True
         return False
@@ -105,11 +94,7 @@ class ModbusWatchdogDriver:
         session.run(self._bound(self._has, self._has.clear) or self._has.clear)
 
     def plan(self, ticks_per_s: float) -> None:
-        """Take the rate at which exchanges will come.
-
-        Raises:
-            DeviceError: They come too seldom to feed it.
-        """
+        """Take the rate of exchanges, or raise DeviceError if it is too low to feed it."""
         self._ticks = self.feed_every = 0
         if self._wanted == "none" or self._has == "none":
             return
@@ -118,11 +103,7 @@ class ModbusWatchdogDriver:
             self.feed_every = ticks
 
     def arm(self, session: ModbusSession) -> None:
-        """Set safe value and timeout and start it, if the experiment wants one.
-
-        Raises:
-            DeviceError: A step failed.
-        """
+        """Set safe value and timeout and start it, if the experiment wants one."""
         has = self._has
         if self._wanted == "none" or has == "none":
             return
@@ -133,20 +114,12 @@ class ModbusWatchdogDriver:
         session.run(steps)
 
     def disarm(self, session: ModbusSession) -> None:
-        """Stop it, where the experiment wanted one.
-
-        Raises:
-            DeviceError: A step failed.
-        """
+        """Stop it, if the experiment wants one."""
         if self._has != "none":
             session.run(self._bound(self._has, self._has.disarm))
 
     def feed(self, session: ModbusSession) -> None:
-        """Feed a watchdog that exchanges do not feed; three times in its timeout.
-
-        Raises:
-            DeviceError: A step failed.
-        """
+        """Feed a watchdog that exchanges do not feed, three times per timeout."""
         self._ticks += 1
         if self._ticks % self.feed_every == 0 and self._has != "none":
             session.run(self._bound(self._has, self._has.feed))
@@ -164,12 +137,7 @@ Connect: TypeAlias = Callable[[ModbusEndpoint], ModbusSession]
 
 
 class ModbusSafeWrite:
-    """Writes the output of a device, one attempt a call.
-
-    Args:
-        setup: What the experiment says of the device.
-        connect: Makes a session on a new link.
-    """
+    """Writes the output of a device, one attempt per call."""
 
     def __init__(self, setup: ModbusSetup, connect: Connect) -> None:
         self._setup = setup
@@ -184,13 +152,9 @@ class ModbusSafeWrite:
         """Write the output and have the device confirm it; the link is closed afterwards.
 
         Args:
-            peer: The device; best with an address that no name server must be asked for.
+            peer: The device; best with a numeric address, which needs no name server.
             value: In the output's unit.
             opened: A session on an open serial line; None to open a connection.
-
-        Raises:
-            UnconfirmedError: It was written; the device has no way to confirm it.
-            DeviceError: It was not confirmed.
         """
         if opened is None and self._session is not None:
             opened = self._session  # which knows whether answers are outstanding on the line
@@ -202,7 +166,7 @@ class ModbusSafeWrite:
                 self._session = session
                 self._exchange.attempt(
                     link,
-                    lambda: link.send_now(self._frame(session, value)),
+                    lambda: link.send_now(self._request(session, value)),
                     lambda: self._write(session, value),
                 )
             else:
@@ -213,13 +177,7 @@ class ModbusSafeWrite:
             link.close()
 
     def try_out(self, session: ModbusSession) -> None:
-        """Write what the output holds, with the message that writes the safe value.
-
-        Nothing moves. An output that cannot be read, or is out of range, is left alone.
-
-        Raises:
-            DeviceError: The device refuses the message, or does not answer.
-        """
+        """Write the held value with the message of the safe value, see :func:`try_out`."""
         output, register = self._setup.output, self._setup.output.readback_register
         if register is None:
             return
@@ -233,10 +191,9 @@ class ModbusSafeWrite:
         name = f"{self._setup.options.output}, register {output.address}"
         try_out(output, value, put, f"to {name}")
 
-    def _frame(self, session: ModbusSession, value: float) -> bytes:
-        """Return the request that writes the output."""
+    def _request(self, session: ModbusSession, value: float) -> bytes:
         output = self._setup.output
-        pdu = session.output_pdu(output, output.format.encode(value))
+        pdu = write_request(session.profile, output, output.format.encode(value))
         return session.prepare(pdu).request()
 
     def _write(self, session: ModbusSession, value: float) -> None:
@@ -244,19 +201,15 @@ class ModbusSafeWrite:
         self._guard.write_through(session, lambda: self._put(session, data))
         if self._setup.unconfirmed:
             raise UnconfirmedError(f"the value was sent, but {self._setup.unconfirmed}")
-        self._check_held(session, value)
+        found, output = self._held(session), self._setup.output
+        if found is not None:
+            tolerance = max(output.step, 1e-6 * (output.max - output.min))
+            check_read_back(output, value, found, tolerance)
 
     def _put(self, session: ModbusSession, data: bytes) -> None:
         """Write the output's register bytes once."""
-        session.put_out(self._setup.output, data)
+        session.write_bytes(self._setup.output, data)
 
-    def _check_held(self, session: ModbusSession, value: float) -> None:
-        """Raise unless the output holds the value, if it can be read back."""
-        found = session.held(self._setup.output)
-        if found is not None:
-            self._check(found, value)
-
-    def _check(self, found: float, value: float) -> None:
-        output = self._setup.output
-        tolerance = max(output.step, 1e-6 * (output.max - output.min))
-        check_read_back(output, value, found, tolerance)
+    def _held(self, session: ModbusSession) -> float | None:
+        """Return the content of the output's register; None if it cannot be read."""
+        return session.held(self._setup.output)

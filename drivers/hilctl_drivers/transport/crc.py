@@ -18,20 +18,12 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import TypeAlias
 
-from hilctl_drivers.transport.links import BadRequestError
-
 Bytes: TypeAlias = bytes | bytearray | memoryview
 
 
 @dataclass(frozen=True, slots=True)
 class Crc:
-    """A cyclic redundancy check.
-
-    Attributes:
-        name: Name used in profiles.
-        width: Bits; 0 means no check at all.
-        compute: The function, bytes to CRC.
-    """
+    """A cyclic redundancy check of ``width`` bits; 0 means no check."""
 
     name: str
     width: int
@@ -64,16 +56,11 @@ _MODBUS = _reflected_table(0xA001)
 def crc16_modbus(data: Bytes, start: int = 0xFFFF) -> int:
     """Return the CRC of a Modbus RTU message; sent least significant byte first.
 
-    Over a whole message, its CRC included, it is 0.
-
-    Args:
-        data: What to check.
-        start: CRC of what went before ``data``, so that constant beginnings cost nothing.
+    It is 0 over a message with its CRC. ``start`` is the CRC of the bytes before ``data``.
     """
-    table = _MODBUS
     crc = start
     for byte in data:
-        crc = crc >> 8 ^ table[(crc ^ byte) & 0xFF]
+        crc = crc >> 8 ^ _MODBUS[(crc ^ byte) & 0xFF]
     return crc
 
 
@@ -99,18 +86,6 @@ CRCS: Mapping[str, Crc] = MappingProxyType({crc.name: crc for crc in (
     Crc("none", 0, lambda _data: 0),
 )})  # fmt: skip
 """All CRCs that profiles can name."""
-
-
-def named_crc(name: str) -> Crc:
-    """Return the CRC of that name.
-
-    Raises:
-        BadRequest: There is none.
-    """
-    try:
-        return CRCS[name]
-    except KeyError:
-        raise BadRequestError(f"unknown CRC {name!r}; known are {', '.join(CRCS)}") from None
 
 
 def dcon_checksum(text: Bytes) -> bytes:

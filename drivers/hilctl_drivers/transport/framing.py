@@ -14,14 +14,14 @@ from typing import Generic, Literal, TypeAlias, TypeVar
 
 from cobs import cobs
 
-from hilctl_drivers.transport.crc import Bytes, Crc, named_crc
+from hilctl_drivers.transport.crc import CRCS, Bytes, Crc
 from hilctl_drivers.transport.links import BadRequestError, CorruptError, IncompleteError
 
 Content = TypeVar("Content")
 
 
 class Splitter(ABC, Generic[Content]):
-    """Cuts a stream into messages and finds its way back after damaged bytes."""
+    """Splits a stream into messages and resynchronises after damaged bytes."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()
@@ -29,31 +29,30 @@ class Splitter(ABC, Generic[Content]):
 
     @abstractmethod
     def feed(self, chunk: Bytes) -> list[Content | CorruptError]:
-        """Take what arrived and return the contents that it completed, in order.
+        """Take received bytes and return the contents that they complete, in order.
 
-        Lost stretches are in their places as :class:`CorruptError`, one each, not raised.
+        A lost part of the stream is one :class:`CorruptError` in its place, not raised.
         """
 
     def reset(self) -> None:
-        """Forget what has arrived so far, as after a timeout."""
+        """Forget the received bytes, as after a timeout."""
         self._buffer.clear()
         self._lost = False
 
 
 class DelimitedSplitter(Splitter[Content]):
-    """A :class:`Splitter` for messages that end in bytes which occur nowhere else in them."""
+    """A :class:`Splitter` for messages that end in bytes which occur nowhere else in them.
+
+    Args:
+        parse: Converts a message without its end, or raises CorruptError.
+        end: The bytes that end a message.
+        size_max: Most bytes of a good message without its end; bounds the buffer.
+        skip_empty: Whether to ignore empty messages.
+    """
 
     def __init__(
         self, parse: Callable[[Bytes], Content], end: bytes, size_max: int, *, skip_empty: bool
     ) -> None:
-        """Take what parses a message without its end, or raises Corrupt.
-
-        Args:
-            parse: Bytes without the end to content.
-            end: The bytes that end a message.
-            size_max: Most bytes of a good message without its end; bounds the buffer.
-            skip_empty: Whether ends in a row mean nothing.
-        """
         super().__init__()
         self._parse = parse
         self._end = end
@@ -69,7 +68,10 @@ class DelimitedSplitter(Splitter[Content]):
             if self._lost:
                 self._lost = False
             elif part or not self._skip_empty:
-                out.append(self._parsed(part))
+                try:
+                    out.append(self._parse(part))
+                except CorruptError as error:
+                    out.append(error)
         if len(self._buffer) > self._size_max + len(self._end):
             if not self._lost:
                 out.append(CorruptError(f"no end within {self._size_max} bytes"))
@@ -78,29 +80,21 @@ class DelimitedSplitter(Splitter[Content]):
             del self._buffer[: -len(self._end)]
         return out
 
-    def _parsed(self, part: Bytes) -> Content | CorruptError:
-        try:
-            return self._parse(part)
-        except CorruptError as error:
-            return error
-
 
 class PrefixedSplitter(Splitter[bytes]):
-    """A :class:`Splitter` for frames that say their length at their beginning.
+    """A :class:`Splitter` for frames that begin with their length.
 
-    After a bad frame it tries every byte as a beginning until a frame's check holds.
+    After a bad frame it tries every byte as a beginning until a frame's check passes.
+
+    Args:
+        size_at: Returns the size of the frame at a position of the buffer, 0 if it is not known
+            yet, or raises CorruptError.
+        parse: Returns the payload of a frame, or raises CorruptError.
     """
 
     def __init__(
         self, size_at: Callable[[Bytes, int], int], parse: Callable[[bytes], bytes]
     ) -> None:
-        """Set up.
-
-        Args:
-            size_at: Buffer and position to the size of the frame that begins there; 0 if it
-                cannot be told yet; raises Corrupt where none can begin there.
-            parse: Whole frame to payload; raises Corrupt.
-        """
         super().__init__()
         self._size_at = size_at
         self._parse = parse
@@ -145,11 +139,7 @@ class Framing(ABC):
     payload_max: int = PAYLOAD_MAX
 
     def encode(self, payload: Bytes) -> bytes:
-        """Return the complete frame of a payload.
-
-        Raises:
-            BadRequest: The payload is empty or longer than the framing allows.
-        """
+        """Return the complete frame of a payload of 1 to ``payload_max`` bytes."""
         if not 1 <= len(payload) <= self.payload_max:
             rule = f"payload must have 1 to {self.payload_max} bytes"
             raise BadRequestError(f"{rule}, got {len(payload)}")
@@ -160,8 +150,8 @@ class Framing(ABC):
         """Return the payload of exactly one frame.
 
         Raises:
-            Incomplete: More bytes belong to it.
-            Corrupt: Its CRC or structure is wrong, or bytes follow its end.
+            IncompleteError: More bytes belong to it.
+            CorruptError: Its CRC or structure is wrong, or bytes follow its end.
         """
 
     @abstractmethod
@@ -229,13 +219,10 @@ class CobsFraming(Framing):
 
 @dataclass(frozen=True)
 class LengthFraming(Framing):
-    """Length-prefixed frames, see the module; only a CRC can find the next beginning.
+    """Length-prefixed frames, see the module; they need a CRC to find the next beginning.
 
-    Nothing marks a beginning, so a wrong length makes a stream wait for up to ``payload_max``
-    bytes: set that no higher than the protocol needs, and reset the splitter after a timeout.
-
-    Raises:
-        BadRequest: No check, or ``payload_max`` above what two bytes can hold.
+    A wrong length makes a stream wait for up to ``payload_max`` bytes. Set that no higher than the
+    protocol needs, and reset the splitter after a timeout.
     """
 
     def __post_init__(self) -> None:
@@ -266,7 +253,7 @@ class LengthFraming(Framing):
         return PrefixedSplitter(self._size_at, self._payload)
 
     def _size_at(self, data: Bytes, at: int) -> int:
-        """Return the size of the frame that begins at ``at``, 0 if that cannot be told yet."""
+        """Return the size of the frame that begins at ``at``, 0 if it is not known yet."""
         if len(data) - at < LENGTH_SIZE:
             return 0
         size = data[at] | data[at + 1] << 8
@@ -280,10 +267,6 @@ class LengthFraming(Framing):
 
 
 def binary_framing(kind: FramingKind, crc: str, payload_max: int = PAYLOAD_MAX) -> Framing:
-    """Return a framing by the names that profiles use.
-
-    Raises:
-        BadRequest: Unknown CRC, or length-prefixed frames without one.
-    """
-    check = named_crc(crc)
-    return CobsFraming(check, payload_max) if kind == "cobs" else LengthFraming(check, payload_max)
+    """Return a framing by the names in profiles; length-prefixed frames need a CRC."""
+    framing = CobsFraming if kind == "cobs" else LengthFraming
+    return framing(CRCS[crc], payload_max)

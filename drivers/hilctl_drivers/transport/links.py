@@ -1,19 +1,18 @@
 """Link contract (one request, one reply, within the timeout) and the errors of a link.
 
-Nothing is pipelined and nothing is sent twice. The caller computes from the bytes so far where a
-reply ends; pauses between bytes mean nothing. Texts of errors do not name the device or the action:
-the device that owns the link adds them.
+Nothing is pipelined and nothing is sent twice. The caller computes the end of a reply from its
+bytes, not from pauses. Errors do not name the device or the action: the device adds them.
 
 DeviceError
 |-- NoAnswerError     no complete reply in time
 |-- LostError         the connection is gone
 `-- FrameError        any of the below
-    |-- BadRequest    the request cannot be put on this wire; nothing was sent
-    |-- Incomplete    a good beginning, but more bytes are needed
-    |-- Corrupt       a check or the structure is wrong
-    |-- Mismatch      well formed, but not the answer to this request
-    `-- Refused       the device understood the request and refused it
-        `-- WatchdogTripped   its host watchdog has put the output at its safe value
+    |-- BadRequestError    the request cannot be sent on this link; nothing was sent
+    |-- IncompleteError    a good beginning, but more bytes are needed
+    |-- CorruptError       a check or the structure is wrong
+    |-- MismatchError      well formed, but not the answer to this request
+    `-- RefusedError       the device understood the request and refused it
+        `-- WatchdogTrippedError   its host watchdog has put the output at its safe value
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -25,12 +24,12 @@ from hilctl.base.errors import DeviceError
 from hilctl.base.files import reason
 
 Missing: TypeAlias = Callable[[bytearray], int]
-"""How many more bytes to wait for, at least, after those that have come; 0 if the reply is
-there. It may raise where they cannot be the beginning of one."""
+"""Least number of bytes missing after the received ones; 0 if the reply is complete. It may raise
+if they cannot be the start of a reply."""
 
 
 class NoAnswerError(DeviceError):
-    """Nothing, or not all of a reply, came in time."""
+    """No complete reply came in time."""
 
 
 class LostError(DeviceError):
@@ -38,12 +37,7 @@ class LostError(DeviceError):
 
 
 class Link(Protocol):
-    """A way to send a request and get its reply."""
-
-    @property
-    def name(self) -> str:
-        """Where it leads, for messages: ``host:port`` or the serial port."""
-        ...
+    """A connection to a device."""
 
     def open(self) -> None:
         """Connect.
@@ -59,15 +53,14 @@ class Link(Protocol):
         """Send ``request`` and return the whole reply.
 
         Args:
-            request: What to send.
-            missing: Says how much of the reply is still to come.
-            usual: Size of a good reply, where it is known: ``missing`` is not asked then when just
-                that much has come.
+            request: The bytes to send.
+            missing: Returns how much of the reply is missing.
+            usual: Size of a good reply, or 0: a reply of this size is complete.
 
         Raises:
             NoAnswerError: The reply was not complete in time.
             LostError: The link is not open, or broke.
-            DeviceError: Bytes came that are no reply.
+            DeviceError: The bytes received are no reply.
         """
         ...
 
@@ -88,24 +81,13 @@ def naming(who: str) -> Iterator[None]:
 
 
 def why(error: OSError, remedies: Mapping[int, str] = MappingProxyType({})) -> str:
-    """Return the text of an OS error, for use in a sentence, with a suggested fix.
-
-    Args:
-        error: What was raised.
-        remedies: What to do, by ``errno``.
-    """
+    """Return the text of an OS error, for use in a sentence, with the remedy for its ``errno``."""
     text = reason(error, remedies)
     return text[:1].lower() + text[1:]
 
 
 def cut(got: int, wanted: int, timeout_s: float) -> str:
-    """Return what is wrong with a reply that was not complete in time.
-
-    Args:
-        got: Bytes that have come.
-        wanted: Bytes that were still waited for.
-        timeout_s: Timeout of the exchange, s.
-    """
+    """Return the text on an incomplete reply, from the numbers of bytes received and missing."""
     what = f"only {got} bytes, {wanted} short," if got else "no answer"
     return f"{what} within {timeout_s:g} s"
 
@@ -115,10 +97,9 @@ class FrameError(DeviceError):
 
 
 class BadRequestError(FrameError, ValueError):
-    """What is asked cannot be put on this wire; nothing was sent.
+    """The request cannot be sent on this link, such as too many registers; nothing was sent.
 
-    Example scenarios: more registers than a frame holds, a value that the register's type or the
-    number's field can't hold. Also a ``ValueError``, so that a profile's validation can collect it.
+    It is a ``ValueError`` too, so that a profile's validation can collect it.
     """
 
 
@@ -131,18 +112,14 @@ class CorruptError(FrameError):
 
 
 class MismatchError(FrameError):
-    """A well-formed message, but not the answer to what was asked.
-
-    Example scenarios: another transaction, unit, function, address or length; a late answer to an
-    earlier request.
-    """
+    """A well-formed message, but not the answer to this request, such as a late answer."""
 
 
 class RefusedError(FrameError):
     """The device understood the request and refused it.
 
     Attributes:
-        code: Modbus exception code, SCPI error number or the device's own mark, such as ``E01``.
+        code: Modbus exception code, SCPI error number or the device's own code, such as ``E01``.
     """
 
     def __init__(self, text: str, code: int | str = "") -> None:

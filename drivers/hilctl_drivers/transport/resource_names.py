@@ -1,18 +1,17 @@
 """Exclusive use of a device: exclusive access to a port, and names of locks.
 
-pyserial's lock is heeded only by programs that take one too; a shell, a terminal program or a
-daemon that probes ports does not. The kernel refuses the port to all after TIOCEXCL, except
-to privileged ones. It keeps that as long as *any* descriptor of the port is open, also when the
-process that asked for it was killed. Then the guardian must open the port to make the output safe,
-often without privileges. So it is asked for only if it ends with this process:
+Only programs that use pyserial's lock respect it; a shell or a daemon that probes ports does not.
+After TIOCEXCL the kernel refuses the port to all unprivileged programs. It does so as long as *any*
+descriptor of the port is open, even if this process was killed. Then the guardian must open the
+port to make the output safe, often without privileges. So TIOCEXCL is set only if it ends with this
+process:
 
 - on a real port that no other program has open, as far as this process can see;
 - on a pseudo-terminal, which its far end keeps, only if this process could open it all the same.
 
-Between experiments one device is one lock, as :attr:`hilctl.base.device.DeviceInfo.holds` has it.
-So each place has all the names that another experiment could know it by: a port its path, the file
-that its links lead to and the number that the kernel knows it by, a host its name and its
-addresses.
+Between experiments one device is one lock, see :attr:`hilctl.base.device.DeviceInfo.holds`. So each
+place has all the names that another experiment could use: a port its path, the target of its links
+and its device number, a host its name and its addresses.
 """
 
 import ipaddress
@@ -28,14 +27,9 @@ _PTY_MAJORS = range(136, 144)
 
 
 def refuse_to_others(descriptor: int, path: str) -> bool:
-    """Reject an open port to other programs, where that ends with this process.
+    """Refuse an open port to other programs if that ends with this process; return whether it does.
 
-    Args:
-        descriptor: The port.
-        path: Its device file.
-
-    Returns:
-        Whether they are refused.
+    ``path`` is its device file.
     """
     device = os.fstat(descriptor).st_rdev
     is_pty = os.major(device) in _PTY_MAJORS
@@ -44,7 +38,7 @@ def refuse_to_others(descriptor: int, path: str) -> bool:
     if not _set(descriptor, on=True):
         return False
     if is_pty and not _can_open(path):
-        _set(descriptor, on=False)
+        admit_others(descriptor)
         return False
     return True
 
@@ -55,12 +49,7 @@ def admit_others(descriptor: int) -> None:
 
 
 def others_have(device: int, processes: Path = Path("/proc")) -> bool:
-    """Return whether another process has a device open, as far as this user can see.
-
-    Args:
-        device: Number of the device.
-        processes: Where the kernel shows processes.
-    """
+    """Return whether another process has a device open, as far as this user can see."""
     for folder in processes.glob("[0-9]*/fd"):
         if folder.parent.name == str(os.getpid()):
             continue
@@ -111,9 +100,9 @@ def held_port(path: str) -> tuple[str, ...]:
 
 
 def held_address(host: str, port: int) -> tuple[str, ...]:
-    """Return the names of a TCP port: by host name, and by each address that the name stands for.
+    """Return the names of a TCP port: by host name, and by each of its addresses.
 
-    Where a name server does not answer in time only the name is left.
+    Without an answer of the name server in time, only the host name is left.
     """
     address = _literal(host)
     if address is not None:
@@ -124,7 +113,7 @@ def held_address(host: str, port: int) -> tuple[str, ...]:
 
 
 def _literal(host: str) -> str | None:
-    """Return an address that was written as one, in its shortest form; None for a name."""
+    """Return an address in its shortest form; None for a name."""
     try:
         return str(ipaddress.ip_address(host))
     except ValueError:

@@ -34,12 +34,8 @@ class SafeExchange:
 
         Args:
             link: To the device, open or not; a board that opening resets is not waited for.
-            send: Send the value and await no answer.
-            confirm: Send it, and raise unless the device confirms it.
-
-        Raises:
-            UnconfirmedError: It was sent; the device has no way to confirm it.
-            DeviceError: It was not confirmed.
+            send: Sends the value and awaits no answer.
+            confirm: Sends it, and raises unless the device confirms it.
         """
         try:
             if not link.is_open:
@@ -67,16 +63,8 @@ class SafeExchange:
 def try_out(output: Range, held: float | None, put: Callable[[], None], how: str) -> None:
     """Write what an output holds, with the message that writes the safe value; nothing moves.
 
-    An output that cannot be read, or is out of range, is left alone.
-
-    Args:
-        output: The output.
-        held: What it holds, in its unit; None if that is not known.
-        put: Writes that.
-        how: Register or message, for errors.
-
-    Raises:
-        DeviceError: The device refuses the message, or does not answer.
+    An output that cannot be read (``held`` is None), or is out of range, is left alone. ``how``
+    names register or message in errors.
     """
     if held is None or not output.min <= held <= output.max:
         return

@@ -28,15 +28,11 @@ _QUIET_S = 0.02
 
 @dataclass(frozen=True, slots=True)
 class SerialSettings:
-    """How a serial line is set.
+    """Settings of a serial line.
 
     Attributes:
-        baud: Bits a second.
-        bytesize: Data bits of a character.
-        parity: N, E or O.
-        stopbits: Stop bits.
         gap_s: Silence to keep between a reply and the next request.
-        boot_s: How long the device needs after the port is opened; boards that reset on it.
+        boot_s: Wait after opening the port, for boards that reset then.
         flow: Flow control. With xonxoff, bytes 0x11 and 0x13 are signals and never data.
         dtr: Level to hold DTR at; None to raise it, as opening a port does.
         rts: Level to hold RTS at, likewise.
@@ -56,8 +52,8 @@ class SerialSettings:
 def _open_port(path: str, settings: SerialSettings, timeout_s: float) -> serial.Serial:
     """Open and lock a port with all settings.
 
-    Levels are set before opening: pyserial then applies them as the first thing, so that a level
-    that the system raised by itself stands for microseconds only.
+    Levels are set before opening. pyserial then applies them first, so a level that the system
+    raised lasts for microseconds only.
     """
     port = serial.Serial(
         None,
@@ -86,10 +82,10 @@ def _open_port(path: str, settings: SerialSettings, timeout_s: float) -> serial.
 
 
 def _keep_levels(fd: int) -> None:
-    """Let DTR and RTS stay as they are when the port is closed, or its process killed.
+    """Keep DTR and RTS when the port is closed, or its process killed.
 
-    A level that falls resets some boards, and so would the next one to open the port: with the
-    output at whatever the board boots with, and deaf to the safe value until it has booted.
+    A falling level, and the next opening of the port, reset some boards. Their output is then at
+    the power-up value, and they do not answer to the safe value until they have booted.
     """
     import termios
 
@@ -102,7 +98,7 @@ def _keep_levels(fd: int) -> None:
 
 
 def _counts_waiting(fd: int, waiting: "array.array[int]") -> Callable[[], object]:
-    """Return what fills ``waiting[0]`` with the number of bytes that have come."""
+    """Return a function that stores the number of received bytes in ``waiting[0]``."""
     # Only here: settings can be read and checked on computers that have neither.
     from fcntl import ioctl
     from termios import FIONREAD
@@ -111,15 +107,7 @@ def _counts_waiting(fd: int, waiting: "array.array[int]") -> Callable[[], object
 
 
 class SerialLink:
-    """A serial port that is ours alone.
-
-    Args:
-        port: Device file; ``/dev/serial/by-id/...`` stays the same when ports are renumbered.
-        settings: How the line is set.
-        timeout_s: Longest that one exchange may take.
-        clock: Monotonic time in s.
-        sleep: Waits that many s.
-    """
+    """A serial port with exclusive access."""
 
     def __init__(
         self,
@@ -132,7 +120,8 @@ class SerialLink:
         self._path = port
         self._settings = settings
         self._gap_s = settings.gap_s
-        self._timeout_s = timeout_s
+        self.timeout_s = timeout_s
+        """Longest time of one exchange, s."""
         self._timeout_ms = math.ceil(timeout_s * 1e3)
         self._clock = clock
         self._sleep = sleep
@@ -144,19 +133,6 @@ class SerialLink:
         self._stale = True
         self._exclusive = False
         self._quiet_at = 0.0
-        self.low_latency = False
-        """Whether the driver took the low-latency setting; without it an FTDI adapter holds bytes
-        back for up to 16 ms."""
-
-    @property
-    def name(self) -> str:
-        """The port's device file."""
-        return self._path
-
-    @property
-    def boot_s(self) -> float:
-        """How long the device may need after the port is opened, s."""
-        return self._settings.boot_s
 
     @property
     def is_open(self) -> bool:
@@ -168,22 +144,10 @@ class SerialLink:
         """Whether it is open, and no bytes of an older exchange can still come."""
         return self._port is not None and not self._stale
 
-    @property
-    def timeout_s(self) -> float:
-        """Longest that one exchange may take, s."""
-        return self._timeout_s
-
-    @timeout_s.setter
-    def timeout_s(self, timeout_s: float) -> None:
-        self._timeout_s = timeout_s
-        self._timeout_ms = math.ceil(timeout_s * 1e3)
-        if self._port is not None:
-            self._port.write_timeout = timeout_s
-
     def open(self, *, boot: bool = True) -> None:
         """Open and lock the port, see :meth:`~hilctl_drivers.transport.links.Link.open`.
 
-        What it holds is thrown away.
+        Received bytes are discarded.
 
         Args:
             boot: Whether to wait for a device that opening may have reset. Otherwise a port that
@@ -191,16 +155,13 @@ class SerialLink:
         """
         self.close()
         try:
-            port = _open_port(self._path, self._settings, self._timeout_s)
-        except OSError as error:
-            raise LostError(f"can't be opened: {reason(error, PORT_REMEDIES)}") from None
-        except ValueError as error:
-            raise LostError(f"can't be opened: {error}") from None
-        try:
+            port = _open_port(self._path, self._settings, self.timeout_s)
+        except (OSError, ValueError) as error:
+            text = reason(error, PORT_REMEDIES) if isinstance(error, OSError) else str(error)
+            raise LostError(f"can't be opened: {text}") from None
+        # Otherwise an FTDI adapter holds bytes back for up to 16 ms; ptys and USB CDC refuse it.
+        with contextlib.suppress(OSError, ValueError, NotImplementedError):
             port.set_low_latency_mode(True)
-            self.low_latency = True
-        except (OSError, ValueError, NotImplementedError):  # ptys and USB CDC have no such setting
-            self.low_latency = False
         self._port, self._fd = port, port.fileno()
         self._count_waiting = _counts_waiting(self._fd, self._waiting)
         self._poll = select.poll()
@@ -216,7 +177,7 @@ class SerialLink:
     ) -> bytes | bytearray:
         """Exchange, see :meth:`~hilctl_drivers.transport.links.Link.transact`.
 
-        After a failure the next request waits until the line is quiet and throws away what came:
+        After a failure the next request waits until the line is quiet and discards what came:
         serial protocols do not number their replies, so a late one would pass for the next.
         """
         if self._port is None:
@@ -228,7 +189,7 @@ class SerialLink:
             self._count_waiting()
             if self._waiting[0] or self._gap_s:
                 self._await_gap()
-            deadline = self._clock() + self._timeout_s
+            deadline = self._clock() + self.timeout_s
             # Past pyserial, which takes three times as long; its flush() hangs on ptys and USB CDC.
             try:
                 sent = write(self._fd, request)
@@ -252,11 +213,7 @@ class SerialLink:
     def send_now(self, request: bytes | bytearray) -> None:
         """Send ``request`` whatever is on the line, and await no answer.
 
-        The next exchange throws away what comes meanwhile.
-
-        Raises:
-            NoAnswerError: It could not be sent in time.
-            LostError: The port is not open, or broke.
+        The next exchange discards what comes meanwhile.
         """
         if self._port is None:
             raise LostError("not open")
@@ -275,18 +232,18 @@ class SerialLink:
         self._stale = True
 
     def _failed(self, error: OSError | DeviceError) -> DeviceError:
-        """Return what to raise, and see to it that the next request does not suffer from it."""
+        """Return the error to raise, and protect the next request from late bytes."""
         self._stale = True
         if isinstance(error, OSError) and not isinstance(error, serial.SerialTimeoutException):
             self.close()
             return LostError(f"port lost, unplugged? {why(error)}")
         if isinstance(error, DeviceError):
             return error
-        return NoAnswerError(f"could not send within {self._timeout_s:g} s")
+        return NoAnswerError(f"could not send within {self.timeout_s:g} s")
 
     def _await_gap(self) -> None:
         if self._waiting[0]:
-            raise DeviceError(f"{self._waiting[0]} bytes that nobody asked for")
+            raise DeviceError(f"{self._waiting[0]} bytes that answer no request")
         early_s = self._quiet_at - self._clock()
         if early_s > 0.0:
             self._sleep(early_s)
@@ -295,7 +252,7 @@ class SerialLink:
         while wanted := missing(reply):
             left_s = deadline - self._clock()
             if left_s <= 0.0 or not self._poll.poll(math.ceil(left_s * 1e3)):
-                raise NoAnswerError(cut(len(reply), wanted, self._timeout_s))
+                raise NoAnswerError(cut(len(reply), wanted, self.timeout_s))
             reply += self._read()
         return reply
 
@@ -311,15 +268,9 @@ class SerialLink:
         )
 
     def await_silence(self, quiet_s: float, answer_s: float = 0.0) -> None:
-        """Throw away what comes until nothing has come for that long.
+        """Discard received bytes until the line was silent for ``quiet_s``.
 
-        Args:
-            quiet_s: How long, s.
-            answer_s: Longest wait for the first of it: the answer to what was sent, s.
-
-        Raises:
-            LostError: The port is not open, or broke.
-            DeviceError: The line did not get quiet in time.
+        Before, wait up to ``answer_s`` for the first byte of an answer.
         """
         if self._port is None:
             raise LostError("not open")
@@ -330,21 +281,18 @@ class SerialLink:
             raise self._failed(error) from None
 
     def drain(self, quiet_s: float = _QUIET_S) -> None:
-        """Throw away what comes until nothing has come for a while.
-
-        Args:
-            quiet_s: How long, at least; never less than the line's own gap.
+        """Discard received bytes until the line was silent for ``quiet_s``, or its own gap.
 
         Raises:
             OSError: The port broke.
-            DeviceError: The line did not get quiet in time.
+            DeviceError: The line did not get silent in time.
         """
         quiet_ms = math.ceil(1e3 * max(quiet_s, self._gap_s))
-        deadline = self._clock() + max(self._timeout_s, 10.0 * _QUIET_S)
+        deadline = self._clock() + max(self.timeout_s, 10.0 * _QUIET_S)
         while self._poll.poll(quiet_ms):
             self._read()
             if self._clock() > deadline:
-                raise DeviceError("the line does not get quiet: somebody keeps sending")
+                raise DeviceError("the line does not get quiet: another device keeps sending")
         self._stale = False
 
     def close(self) -> None:

@@ -20,11 +20,7 @@ _CHUNK = 4096
 class TcpLink:
     """A TCP connection without Nagle's delay.
 
-    Args:
-        host: Name or address.
-        port: TCP port.
-        timeout_s: Longest that connecting, or one exchange, may take.
-        clock: Monotonic time in s.
+    ``timeout_s`` is the longest time to connect, and of one exchange.
     """
 
     def __init__(
@@ -35,12 +31,7 @@ class TcpLink:
         self._clock = clock
         self._socket: socket.socket | None = None
         self.peer_host = host
-        """Numeric address of the peer, once it was reached; the host as given before."""
-
-    @property
-    def name(self) -> str:
-        """``host:port``."""
-        return f"{self._address[0]}:{self._address[1]}"
+        """Numeric address of the peer after connecting; before that, ``host``."""
 
     def open(self) -> None:
         """Connect, see :meth:`~hilctl_drivers.transport.links.Link.open`."""

@@ -15,17 +15,11 @@ _FEEDS_A_TIMEOUT = 3.0
 
 @dataclass(frozen=True, slots=True)
 class WireTime:
-    """What an exchange costs.
+    """The duration of an exchange; each part is the sum over all requests.
 
     Attributes:
         what: Requests and line, like ``FC23 at 115200 8N1``.
-        request_s: Characters of all requests.
-        reply_s: Characters of all replies.
-        gaps: Number of gaps.
-        gaps_s: All gaps together.
-        turnaround_s: The device's, all requests together.
-        samples: Samples that one exchange carries.
-        settle_s: Time that output and input take to settle.
+        samples: Samples of one exchange.
     """
 
     what: str
@@ -39,7 +33,7 @@ class WireTime:
 
     @property
     def answered_s(self) -> float:
-        """Time until the last reply is there, s."""
+        """Time until the last reply, s."""
         return self.request_s + self.reply_s + self.gaps_s + self.turnaround_s
 
     @property
@@ -49,26 +43,19 @@ class WireTime:
 
     @property
     def highest_rate_hz(self) -> float:
-        """Highest sample rate that the wire and the device leave."""
+        """Highest sample rate that the wire and the device allow."""
         return self.samples / self.total_s if self.total_s > 0.0 else float("inf")
 
     def then(self, other: "WireTime | None") -> "WireTime":
-        """Return what this and then ``other`` cost, for the samples of this."""
+        """Return the duration of this and then ``other``, for the samples of this."""
         if other is None:
             return self
-        return WireTime(
-            f"{self.what}, then {other.what}",
-            self.request_s + other.request_s,
-            self.reply_s + other.reply_s,
-            self.gaps + other.gaps,
-            self.gaps_s + other.gaps_s,
-            self.turnaround_s + other.turnaround_s,
-            self.samples,
-            self.settle_s + other.settle_s,
-        )
+        parts = ("request_s", "reply_s", "gaps", "gaps_s", "turnaround_s", "settle_s")
+        sums = {name: getattr(self, name) + getattr(other, name) for name in parts}
+        return replace(self, what=f"{self.what}, then {other.what}", **sums)
 
     def named(self, purpose: str) -> "WireTime":
-        """Return this with what it is for."""
+        """Return this with its purpose."""
         return replace(self, what=f"{self.what} {purpose}")
 
     def waiting(self, waits_s: list[float]) -> "WireTime":
@@ -77,29 +64,24 @@ class WireTime:
         return replace(self, gaps=self.gaps + len(waits_s), gaps_s=gaps_s)
 
     def __str__(self) -> str:
-        parts = []
-        if self.request_s > 0.0:
-            parts.append(f"request {self.request_s * 1e3:.2f} ms")
-        if self.reply_s > 0.0:
-            parts.append(f"reply {self.reply_s * 1e3:.2f} ms")
-        if self.gaps_s > 0.0:
-            name = "gap" if self.gaps == 1 else "gaps"
-            parts.append(f"{self.gaps} {name} {self.gaps_s * 1e3:.2f} ms")
-        parts.append(f"turnaround {self.turnaround_s * 1e3:.2f} ms")
-        if self.settle_s > 0.0:
-            parts.append(f"settling {self.settle_s * 1e3:.2f} ms")
-        return f"{self.what}: {', '.join(parts)} -> at most {self.highest_rate_hz:.0f} Hz"
+        durations_s = {
+            "request": self.request_s,
+            "reply": self.reply_s,
+            f"{self.gaps} {'gap' if self.gaps == 1 else 'gaps'}": self.gaps_s,
+            "turnaround": self.turnaround_s,
+            "settling": self.settle_s,
+        }
+        parts = ", ".join(
+            f"{name} {seconds * 1e3:.2f} ms"
+            for name, seconds in durations_s.items()
+            if seconds > 0.0 or name == "turnaround"
+        )
+        return f"{self.what}: {parts} -> at most {self.highest_rate_hz:.0f} Hz"
 
 
 @dataclass(frozen=True, slots=True)
 class RateLimit:
-    """The sample rates that a device can keep.
-
-    Attributes:
-        highest_hz: Highest sample rate.
-        note: Why it is that, as text.
-        lowest_hz: Lowest sample rate; 0 if any above 0 will do.
-    """
+    """The sample rates that a device can keep, and the reason for the highest one."""
 
     highest_hz: float
     note: str
@@ -107,24 +89,13 @@ class RateLimit:
 
     @classmethod
     def of(cls, wire: WireTime, most_hz: float, whose: str, lowest_hz: float = 0.0) -> "RateLimit":
-        """Return the limit of the wire or of the device, whichever is lower.
-
-        Args:
-            wire: Time of an exchange.
-            most_hz: Highest rate of the device itself.
-            whose: Source of that rate.
-            lowest_hz: Lowest sample rate.
-        """
+        """Return the limit of the wire, or that of the device (from ``whose``) if it is lower."""
         if wire.highest_rate_hz <= most_hz:
             return cls(wire.highest_rate_hz, str(wire), lowest_hz)
         return cls(most_hz, f"{whose} says so; the wire alone: {wire}", lowest_hz)
 
     def check(self, rate_hz: float) -> None:
-        """Reject a sample rate outside the limits.
-
-        Raises:
-            DeviceError: What would be possible, and why.
-        """
+        """Raise DeviceError for a sample rate outside the limits."""
         if rate_hz > 0.0 and self.lowest_hz <= rate_hz <= self.highest_hz:
             return
         begin = f"[{self.lowest_hz:g}" if self.lowest_hz else "(0"
@@ -135,11 +106,7 @@ class RateLimit:
 
 
 def check_feeds(timeout_s: float | None, ticks_per_s: float) -> int:
-    """Return how many ticks come in a third of the watchdog's timeout; 0 without a watchdog.
-
-    Raises:
-        DeviceError: Less than one.
-    """
+    """Return the ticks in a third of the watchdog's timeout, at least 1; 0 without a watchdog."""
     if timeout_s is None:
         return 0
     ticks = timeout_s * ticks_per_s / _FEEDS_A_TIMEOUT

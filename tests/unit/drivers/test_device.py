@@ -34,6 +34,9 @@ class NotingDac(DacDevice):
     def _arm(self):
         self._note("arm")
 
+    def _output(self):
+        self._note("output")
+
     def _look(self):
         self._note("look")
         return 1.0, None
@@ -95,7 +98,7 @@ def test_a_rate_beyond_the_device_is_refused_before_it_is_opened():
     assert "open" not in device.calls
 
 
-@pytest.mark.parametrize("step", ["open", "arm", "exchange", "close", "put out"])
+@pytest.mark.parametrize("step", ["open", "arm", "output", "exchange", "close", "put out"])
 def test_after_an_error_nothing_is_held(step):
     """The error names the device and what was done; it must be opened again."""
     device = NotingDac()
@@ -104,6 +107,7 @@ def test_after_an_error_nothing_is_held(step):
     def life():
         device.open(1000.0, 1)
         device.arm()
+        device.output()
         if step == "put out":
             device.make_safe(0.0)
         exchange(device, 0.0)

@@ -13,7 +13,6 @@ from hilctl.base.yaml import dump
 from hilctl_drivers.ascii.ascii_profile import AsciiProfile
 from hilctl_drivers.board.board_profile import FrameProfile
 from hilctl_drivers.modbus.modbus_profile import ModbusProfile
-from hilctl_drivers.modbus.register_map import EnsureStep, RegisterStep
 from hilctl_drivers.profile import (
     FOLDER,
     load_profile,
@@ -232,22 +231,14 @@ class TestRules:
         keys = [line.split(": ")[1] for line in lines(text)]
         assert sorted(keys) == ["link.baud", "outputs.AO.type", "vendor"]
 
-    def test_truth_value_for_base(self) -> None:
-        """A truth value is no address base, though Python takes True for 1."""
-        assert "address_base" in lines(changed("modbus", {"address_base": True}))[0]
-
     @pytest.mark.parametrize(
         ("old", "new", "found"),
         [
             ("unverified: [turnaround_s]", "unverified:\n- turnaround_s\n- outputs.A1",
              "acme.yaml:7: unverified: must name keys that are in this file, got outputs.A1"),
-            ("kind: rtu", "kind: udp",
-             "acme.yaml:6: link.kind: must be one of ascii, frames, rtu, tcp, got 'udp'"),
             ("max: 10.0}\ninputs", "max: 40.0}\ninputs",
              "acme.yaml:12: outputs.AO: min and max must be inside what the register holds, "
              "-32.768 to 32.767 V, got -10 to 40"),
-            ("type: int16", "type: int16, area: input",
-             "acme.yaml:12: outputs.AO: area of an output must be holding, got input"),
             ("address: 0,", "address: 65536,", "acme.yaml:12: outputs.AO.address must be in area "
              "holding with address_base 0, got 65536"),
             ("exchange: none", "exchange: none\nselftest: {address: 1, type: uint16, expect: x}",
@@ -259,16 +250,6 @@ class TestRules:
         assert MODBUS.count(old) == 1
         assert lines(MODBUS.replace(old, new))[0].startswith(found)
 
-    @pytest.mark.parametrize(
-        ("word", "wanted"), [("yes", "yes"), ("no", "no"), ("partly", "partly")]
-    )
-    def test_bare_yes_and_no(self, word: str, wanted: str) -> None:
-        """Verified can be written as a bare yes or no, which YAML 1.2 reads as text."""
-        text = MODBUS.replace("verified: partly", f"verified: {word}")
-        if word == "yes":
-            text = text.replace("unverified: [turnaround_s]\n", "")
-        assert parse_profile(text, "acme.yaml").verified == wanted
-
 
 class TestYaml:
     """What YAML does behind one's back."""
@@ -276,24 +257,13 @@ class TestYaml:
     @pytest.mark.parametrize(
         ("text", "message"),
         [
-            ("a: [", "is not readable YAML"),
             ("[1, 2]", "must hold a mapping"),
-            ("", "must hold a mapping"),
             (MODBUS + "vendor: Other\n", "acme.yaml:16: vendor: stands already at acme.yaml:1"),
             (
                 MODBUS.replace("address: 4", "address: 1:30"),
                 "acme.yaml:14: inputs.AI.address: must be a whole number, got '1:30'",
             ),
-            (
-                MODBUS.replace("[manual]", "[2024-02-31]").replace("fied: partly", "fied: today"),
-                "acme.yaml:4: verified: must be one of 'yes', 'partly' or 'no', got 'today'",
-            ),
-            (
-                MODBUS.replace("[manual]", "&m [manual]") + "notes: *m\n",
-                "acme.yaml:16: is not readable YAML (aliases (*name) are not supported",
-            ),
             ("a: !!python/object:os.system {}", "is not readable YAML"),
-            ("{" * 5000, "is not readable YAML"),
         ],
     )
     def test_refused(self, text: str, message: str) -> None:
@@ -328,16 +298,10 @@ class TestLoading:
         assert all(name in str(error.value) for name in shipped_profiles())
 
     def test_no_file(self, tmp_path: Path) -> None:
-        """A path without a file, a folder and a file that is not text are named."""
-        (tmp_path / "x.yaml").write_bytes(b"\xff\xfe\x00")
-        for path, message in (
-            (tmp_path / "none.yaml", "no such file"),
-            (tmp_path, "is not a file"),
-            (tmp_path / "x.yaml", "not UTF-8"),
-        ):
-            with pytest.raises(InputError, match=message) as error:
-                load_profile(str(path))
-            assert str(error.value).startswith(str(path))
+        """A path without a file is named."""
+        path = tmp_path / "none.yaml"
+        with pytest.raises(InputError, match=f"^{re.escape(str(path))}"):
+            load_profile(str(path))
 
     def test_with_link(self) -> None:
         """A device that was set to another baud is the same device on a faster line."""
@@ -371,64 +335,3 @@ class TestSchema:
         objects = [part for part in schema["$defs"].values() if "properties" in part]
         assert len(objects) > 30
         assert all(part["additionalProperties"] is False for part in objects)
-
-
-class TestWatchdog:
-    """Units of timeouts and what the steps become."""
-
-    @pytest.mark.parametrize(
-        ("name", "timeout_s", "counts"),
-        [
-            ("labjack_t7", 2.0, 2), ("icp_m7024", 10.0, 100), ("icp_m7024_dcon", 0.1, 1),
-            ("icp_m7024_dcon", 25.5, 255), ("wago_750", 0.3, 3), ("beckhoff_bk9000", 0.2, 200),
-            ("beckhoff_bk9000", 65.535, 65535), ("cobs_board", 0.005, 5),
-        ],
-    )  # fmt: skip
-    def test_counts(self, name: str, timeout_s: float, counts: int) -> None:
-        """A timeout becomes the device's own counts."""
-        watchdog = load_profile(name).watchdog
-        assert watchdog != "none"
-        assert watchdog.counts(timeout_s) == counts
-
-    @pytest.mark.parametrize(
-        ("name", "timeout_s", "message"),
-        [
-            ("labjack_t7", 0.5, "must be 1 to 86400, got 0.5"),
-            ("labjack_t7", 1.5, "must be a multiple of 1, got 1.5"),
-            ("icp_m7024", 25.6, "must be 0.1 to 25.5"),
-            ("wago_750", 0.25, "must be a multiple of 0.1"),
-            ("beckhoff_bk9000", float("nan"), "must be 0.001 to 65.535"),
-        ],
-    )
-    def test_refused(self, name: str, timeout_s: float, message: str) -> None:
-        """A timeout that the device can't have is refused, never rounded."""
-        watchdog = load_profile(name).watchdog
-        assert watchdog != "none"
-        with pytest.raises(InputError, match=message):
-            watchdog.counts(timeout_s)
-
-    def test_bound(self) -> None:
-        """Steps get the timeout in the device's unit and the safe value as the output has it."""
-        profile = load_profile("icp_m7024")
-        assert isinstance(profile, ModbusProfile)
-        assert profile.watchdog != "none"
-        output = profile.outputs["AO0"]
-        safe = (EnsureStep(kind="ensure", address=40500, type="int16", value="safe"),)
-        steps = profile.watchdog.bound((*profile.watchdog.arm, *safe), output, 10.0, -10.0)
-        timeout, enable, value = (step for step in steps if isinstance(step, RegisterStep))
-        assert isinstance(timeout.value, float)
-        assert isinstance(value.value, float)
-        assert timeout.format.encode(timeout.value) == (100).to_bytes(2, "big")
-        assert enable == profile.watchdog.arm[1]
-        assert value.format.encode(value.value) == (-32767).to_bytes(2, "big", signed=True)
-        with pytest.raises(InputError, match="multiple"):
-            profile.watchdog.bound(profile.watchdog.arm, output, 0.15, 0.0)
-
-    def test_protects(self) -> None:
-        """The LabJack's watchdog knows its own outputs, not those of a LJTick-DAC."""
-        profile = load_profile("labjack_t7")
-        assert isinstance(profile, ModbusProfile)
-        assert profile.watchdog != "none"
-        assert [profile.watchdog.protects(name) for name in profile.outputs] == [
-            True, True, False, False,
-        ]  # fmt: skip

@@ -7,7 +7,8 @@ import pytest
 
 from hilctl_drivers.emulator.labjack_stream import LabJackInput
 from hilctl_drivers.labjack import stream
-from hilctl_drivers.labjack.stream import ModbusFeedback, ReadFrame, WriteFrame
+from hilctl_drivers.labjack.stream import ModbusFeedback
+from hilctl_drivers.modbus.pdu import ReadFrame, WriteFrame
 from hilctl_drivers.profile import load_profile
 from hilctl_drivers.transport.links import RefusedError
 from tests.fakes import InProcess

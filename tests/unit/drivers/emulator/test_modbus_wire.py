@@ -6,6 +6,8 @@ from hilctl_drivers.emulator.modbus_device import EmulatedModbus
 from hilctl_drivers.emulator.modbus_wire import ModbusWire
 from hilctl_drivers.emulator.rig import Rig, SimulatedWiring, WriteLog
 from hilctl_drivers.modbus.pdu import (
+    ReadFrame,
+    WriteFrame,
     feedback_pdu,
     read_pdu,
     reply_data,
@@ -56,7 +58,7 @@ def test_write_moves_and_read_shows(t7):
 
 def test_feedback_reads_before_the_command_acts(t7):
     """Function 76 writes and reads in one; the reading is of the moment of the write."""
-    pdu = feedback_pdu(1000, FLOAT32.encode(4.0), 0, 2)
+    pdu = feedback_pdu(ReadFrame(0, 2), WriteFrame(1000, FLOAT32.encode(4.0)))
     first = FLOAT32.decode(ask(t7, pdu))
     second = FLOAT32.decode(ask(t7, pdu, 10 * MS))
     assert abs(12.5 * first) < 0.5

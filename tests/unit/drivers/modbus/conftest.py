@@ -1,19 +1,19 @@
-"""Devices on emulated ones: a pair that is served at one rig, and one in this process."""
+"""Devices on emulated ones: served in a thread, and in this process."""
 
-import threading
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from hilctl_drivers.emulator.factory import Emulator, build
+from hilctl_drivers.emulator.factory import Emulator
 from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.modbus.config import ModbusOptions
 from hilctl_drivers.modbus.modbus_dac import ModbusDac
 from hilctl_drivers.profile import shipped_profiles
-from tests.fakes import FaultyLink, InProcess, ManualClock, logged
+from tests.fakes import FaultyLink, InProcess, ManualClock, emulated, logged
 
 MESSAGE_S = 0.001
 TIMEOUT_S = 0.1
@@ -34,8 +34,6 @@ max_rate_hz: 1000.0
 outputs: {}
 inputs:
   IN: {area: input, address: 0, type: int16, scale: 0.001, unit: V, min: -10.0, max: 10.0}
-  OWN: {area: input, address: 1, type: int16, scale: 0.001, unit: V, min: -10.0, max: 10.0,
-        measures: output}
 init:
   - {kind: write, address: 7, type: uint16, value: 1, verify: true, note: take over}
 close:
@@ -44,9 +42,16 @@ watchdog: none
 """
 
 
+def exchange(device, value):
+    """Exchange one sample; return the displacement in um."""
+    displacement_um = np.full(1, np.nan)
+    device.exchange(0, np.array([value]), displacement_um, np.full(1, np.nan))
+    return float(displacement_um[0])
+
+
 @dataclass
-class ServedPair:
-    """Two emulated devices at one rig, and what the one that drives has put out."""
+class Served:
+    """A served device, possibly with a reader, and its log."""
 
     emulator: Emulator
     clock: ManualClock
@@ -56,28 +61,29 @@ class ServedPair:
         options = {**self.emulator.options, "timeout_s": PATIENT_S, **changes}
         return ModbusDac(ModbusOptions.model_validate(options))
 
+    def running(self, rate_hz: float = RATE_HZ, **changes) -> ModbusDac:
+        """Return a device that is open and armed."""
+        device = self.device(**changes)
+        device.open(rate_hz, 1)
+        device.arm()
+        return device
+
     def events(self) -> list[dict]:
         return logged(self.log)
 
 
 @pytest.fixture
-def serve(tmp_path) -> Iterator[Callable[..., ServedPair]]:
-    """Return a function that serves two devices on a clock that stands still."""
-    started: list[tuple[ServedPair, threading.Thread]] = []
+def serve(tmp_path) -> Iterator[Callable[..., Served]]:
+    """Return a function that serves a device on a clock that stands still."""
+    log = tmp_path / "writes.jsonl"
+    with ExitStack() as stack:
 
-    def start(profile: str, reader: str, **options) -> ServedPair:
-        clock, log = ManualClock(0), tmp_path / f"writes{len(started)}.jsonl"
-        emulator = build(EmulatorOptions(profile, reader=reader, log=log, **options), clock)
-        thread = threading.Thread(target=emulator.server.run)
-        thread.start()
-        started.append((ServedPair(emulator, clock, log), thread))
-        return started[-1][0]
+        def start(profile: str, reader: str | None = None, **options) -> Served:
+            clock = ManualClock(0)
+            chosen = EmulatorOptions(profile, reader=reader, log=log, current_a=0.0, **options)
+            return Served(stack.enter_context(emulated(chosen, clock)), clock, log)
 
-    yield start
-    for served, thread in started:
-        served.emulator.server.stop()
-        thread.join()
-        served.emulator.log.close()
+        yield start
 
 
 class DrivenModbus:
@@ -90,7 +96,6 @@ class DrivenModbus:
         )
         self.link, self.time = self.emulated.link, self.emulated.time
         wiring = self.emulated.device.wiring
-        self.peers = []
         self._options = {
             "profile": profile,
             "host": "h",
@@ -107,11 +112,7 @@ class DrivenModbus:
     def another(self, **changes) -> ModbusDac:
         """Return a device on the same emulated one, with other options."""
         options = ModbusOptions.model_validate({**self._options, **changes})
-        return ModbusDac(options, self._connect)
-
-    def _connect(self, peer):
-        self.peers.append(peer)
-        return peer.session(self.link)
+        return ModbusDac(options, lambda peer: peer.session(self.link))
 
     def open(self):
         """Open and arm it, as a run does."""
@@ -119,7 +120,7 @@ class DrivenModbus:
         self.device.arm()
 
     def exchange(self, value):
-        self.device.exchange(0, np.array([value]), np.empty(1), np.empty(1))
+        return exchange(self.device, value)
 
     @property
     def current_a(self):
@@ -146,13 +147,19 @@ def driven(tmp_path):
 
 
 @pytest.fixture
-def write_only(tmp_path):
-    """Return a profile whose output can't be read back, by path."""
-    text = shipped_profiles()["generic_float32"].read_text(encoding="utf-8")
-    path = tmp_path / "write_only.yaml"
-    text = text.replace("OUT: {address: 0,", "OUT: {readback: none, address: 0,")
-    path.write_text(text, encoding="utf-8")
-    return str(path)
+def variant(tmp_path):
+    """Return a function that writes generic_float32 with other texts and returns the path."""
+
+    def of(*changes):
+        text = shipped_profiles()["generic_float32"].read_text(encoding="utf-8")
+        for old, new in changes:
+            assert old in text
+            text = text.replace(old, new)
+        path = tmp_path / "variant.yaml"
+        path.write_text(text, encoding="utf-8")
+        return str(path)
+
+    return of
 
 
 @pytest.fixture

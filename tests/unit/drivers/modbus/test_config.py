@@ -7,7 +7,7 @@ import pytest
 from hilctl.base.errors import InputError
 from hilctl_drivers.modbus.config import ModbusOptions
 from hilctl_drivers.modbus.modbus_dac import ModbusDac
-from tests.unit.drivers.modbus.test_modbus_dac import exchange
+from tests.unit.drivers.modbus.conftest import exchange
 
 PAIR = {
     "profile": "icp_m7024",
@@ -116,8 +116,3 @@ class TestPlaces:
         assert info.details["model"] == "M-7024 (Modbus RTU)"
         assert info.details["reader_model"] == "M-7017 (Modbus RTU)"
         assert "m7000_address_mapping" in info.details["reader_source"]
-
-    def test_an_input_that_measures_the_output_is_no_sensor(self, reader):
-        """What a supply says of itself is not what the sensor says."""
-        with pytest.raises(InputError, match=r"OWN .* own output"):
-            made(reader={"profile": reader, "unit_id": 2}, input="OWN")

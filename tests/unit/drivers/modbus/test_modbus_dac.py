@@ -1,126 +1,37 @@
 """modbus_dac on loopback: what it checks before it opens, how it exchanges, and its watchdog."""
 
-import threading
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from pathlib import Path
-
-import numpy as np
 import pytest
 from pydantic import ValidationError
 
 from hilctl.base.errors import DeviceError, InputError
-from hilctl_drivers.emulator.factory import Emulator, build
-from hilctl_drivers.emulator.options import EmulatorOptions, parse_fault
+from hilctl_drivers.emulator.options import parse_fault
 from hilctl_drivers.modbus.config import ModbusOptions
 from hilctl_drivers.modbus.modbus_dac import ModbusDac
-from hilctl_drivers.profile import load_profile, shipped_profiles
-from tests.fakes import ManualClock, logged
+from tests.unit.drivers.modbus.conftest import exchange
 
 T7 = {
     "profile": "labjack_t7",
+    "host": "h",
     "output": "DAC0",
     "input": "AIN0",
     "amplifier": {"gain_a_per_v": 4.0, "offset_a": -10.0},
     "sensor": {"um_per_v": 12.5},
     "watchdog": "none",
 }
-WAGO = {
-    "profile": "wago_750",
-    "output": "AO0",
-    "input": "AI0",
-    "amplifier": {"gain_a_per_v": 1.0},
-    "sensor": {"um_per_v": 12.5},
-    "watchdog": "none",
-}
-MODULE = """\
-vendor: nobody
-model: an analogue module on a serial line
-source: [this test]
-verified: "yes"
-link: {kind: rtu, baud: 115200}
-address_base: 0
-exchange: 23
-turnaround_s: 0.0
-max_rate_hz: 1000.0
-outputs:
-  OUT: {address: 100, type: float32, unit: V, min: -10.0, max: 10.0}
-inputs:
-  IN: {address: 200, type: float32, unit: V, min: -10.0, max: 10.0}
-watchdog: none
-"""
 READER = {"profile": "adam_6217", "unit_id": 2}
 READS = {"reader": READER, "input": "AI0"}
-RTU = {
-    "output": "OUT",
-    "input": "IN",
-    "amplifier": {"gain_a_per_v": 1.0},
-    "sensor": {"um_per_v": 12.5},
-    "watchdog": "none",
-}
-
-
-@dataclass
-class Served:
-    """An emulator in a thread, with what it logs.
-
-    Attributes:
-        emulator: The emulator.
-        clock: Its time.
-        log: What it put out.
-    """
-
-    emulator: Emulator
-    clock: ManualClock
-    log: Path
-
-    def device(self, options: dict, **changes) -> ModbusDac:
-        host, _, port = self.emulator.address.partition(":")
-        where = {"host": host, "tcp_port": int(port)} if port else {"serial_port": host}
-        given = {**options, "timeout_s": 5.0, **where, **changes}
-        return ModbusDac(ModbusOptions.model_validate(given))
-
-    def events(self) -> list[dict]:
-        return logged(self.log)
 
 
 @pytest.fixture
-def serve(tmp_path) -> Iterator[Callable[..., Served]]:
-    """Return a function that serves an emulated device on a clock that stands still."""
-    started: list[tuple[Served, threading.Thread]] = []
-
-    def start(profile: str, **options) -> Served:
-        clock, log = ManualClock(0), tmp_path / f"writes{len(started)}.jsonl"
-        emulator = build(EmulatorOptions(profile, log=log, **{"current_a": 0.0, **options}), clock)
-        thread = threading.Thread(target=emulator.server.run)
-        thread.start()
-        started.append((Served(emulator, clock, log), thread))
-        return started[-1][0]
-
-    yield start
-    for served, thread in started:
-        served.emulator.server.stop()
-        thread.join()
-        served.emulator.log.close()
-
-
-@pytest.fixture
-def module(tmp_path) -> str:
+def module(variant) -> str:
     """A profile for Modbus RTU, by path."""
-    path = tmp_path / "module.yaml"
-    path.write_text(MODULE, encoding="utf-8")
-    return str(path)
-
-
-def exchange(device: ModbusDac, value: float) -> float:
-    displacement_um = np.full(1, np.nan)
-    device.exchange(0, np.array([value]), displacement_um, np.full(1, np.nan))
-    return float(displacement_um[0])
+    return variant(
+        ("{kind: tcp, port: 502}", "{kind: rtu, baud: 115200}"), ("_s: 0.0005", "_s: 0.0")
+    )
 
 
 def made(**changes) -> ModbusDac:
-    options = ModbusOptions.model_validate({**T7, "host": "h", **changes})
-    return ModbusDac(options)
+    return ModbusDac(ModbusOptions.model_validate({**T7, **changes}))
 
 
 class TestOptions:
@@ -153,47 +64,26 @@ class TestOptions:
     def test_watchdog_must_be_decided(self):
         """Nobody drives without a watchdog by leaving a line out."""
         with pytest.raises(ValidationError, match="watchdog"):
-            ModbusOptions.model_validate(
-                {"host": "h", **{key: T7[key] for key in T7 if key != "watchdog"}}
-            )
+            ModbusOptions.model_validate({key: T7[key] for key in T7 if key != "watchdog"})
 
     @pytest.mark.parametrize(
         ("changes", "words"),
         [
-            ({"output": "DAC9"}, r"output must be one that LabJack T7 has, got 'DAC9' \(it has"),
+            ({"output": "DAC9"}, "output must be one that LabJack T7 has, got 'DAC9'"),
             ({"input": "AIN9"}, "input must be one that LabJack T7 has"),
-            ({"amplifier": None}, "amplifier is required: the output is in V"),
-            ({"amplifier": {"gain_a_per_ma": 1.0}}, "amplifier takes mA, but the output is in V"),
-            ({"sensor": {"um_per_ma": 1.0}}, "sensor gives mA, but the input is in V"),
-            ({"profile": "kepco_bop"}, "is not one of a Modbus device"),
+            ({"amplifier": None}, "amplifier is required"),
+            ({"amplifier": {"gain_a_per_ma": 1.0}}, "amplifier takes mA"),
+            ({"sensor": {"um_per_ma": 1.0}}, "sensor gives mA"),
+            ({"profile": "kepco_bop"}, "kepco_bop"),
             ({"host": None, "serial_port": "/dev/x"}, "is for Modbus tcp: give host"),
-            ({"watchdog": {"timeout_s": 0.5}}, "watchdog timeout_s must be"),
-            ({"watchdog": {"timeout_s": 1.0, "safe_command": 20.0}}, "safe_command must be -10 to"),
             ({"watchdog": {"timeout_s": 1.0}, "output": "TDAC0"}, "does nothing for TDAC0"),
             ({"timeout_s": 1e-4}, "timeout_s must be > 0.001"),
-            ({"baud": 9600, "parity": "E"}, "baud, parity must be left out: LabJack T7 has no"),
+            ({"baud": 9600, "parity": "E"}, "baud, parity must be left out"),
             ({**READS, "input": "AI9"}, "input must be one that Advantech ADAM-6217 has"),
-            (
-                {"reader": {"profile": "adam_6217"}, "input": "AI0"},
-                "both be unit 1 at h:502: give reader.u",
-            ),
-            (
-                {**READS, "reader": {"profile": "kepco_bop"}},
-                "kepco_bop is not one of a Modbus device",
-            ),
+            ({"reader": {"profile": "adam_6217"}, "input": "AI0"}, "both be unit 1 at h:502"),
+            ({**READS, "reader": {"profile": "kepco_bop"}}, "kepco_bop"),
             ({**READS, "output": "AI0", "profile": "adam_6217"}, "output must be one that"),
-            (
-                {**READS, "reader": {**READER, "serial_port": "/dev/r"}},
-                "is for Modbus tcp: give reader.h",
-            ),
-            (
-                {**WAGO, "watchdog": {"timeout_s": 1.0, "safe_command": 3.0}},
-                "puts AO0 at 0 V, which is 0 A here",
-            ),
-            (
-                {**WAGO, "profile": "adam_6024", "watchdog": {"timeout_s": 1.0}},
-                "has no host watchdog: it holds its last output",
-            ),
+            ({**READS, "reader": {**READER, "serial_port": "/dev/r"}}, "tcp: give reader.host"),
         ],
     )
     def test_options_that_do_not_go_with_the_profile(self, changes, words):
@@ -211,12 +101,17 @@ class TestOptions:
 
     def test_rate_is_what_the_wire_leaves(self, module):
         """115200 8N1 with standard gaps: 2.26 ms of characters and 3.5 ms of silence."""
-        options = {**RTU, "profile": module, "serial_port": "/dev/x"}
-        info = ModbusDac(ModbusOptions.model_validate(options)).info
+        options = {
+            "profile": module,
+            "host": None,
+            "serial_port": "/dev/x",
+            "output": "OUT",
+            "input": "IN",
+        }
+        info = made(**options).info
         assert info.max_rate_hz == pytest.approx(174.0, abs=1.0)
         assert "FC23 at 115200 8N1" in info.rate_note
-        slow = ModbusDac(ModbusOptions.model_validate({**options, "baud": 9600})).info
-        assert slow.max_rate_hz == pytest.approx(29.0, abs=1.0)
+        assert made(**options, baud=9600).info.max_rate_hz == pytest.approx(29.0, abs=1.0)
 
     def test_watchdog_is_said_before_it_is_opened(self):
         """Where it would put the output, and why that is another value than the run's."""
@@ -231,30 +126,28 @@ class TestOptions:
         assert "sheet 4" in made(calibration=calibration).info.details["calibration"]
 
 
-def timeout_s(said: str) -> float:
-    """Return a short timeout where it is what ends the exchange, else longer than any stall."""
-    return 1.0 if "within" in said else 20.0
+SILENCE_S = 0.5
+"""A timeout that a test waits for."""
 
 
 class TestExchange:
     """One transaction where it can be."""
 
     @pytest.mark.parametrize(
-        ("options", "without", "one"),
+        ("profile", "without", "one"),
         [
-            (T7, {}, True),
-            (T7, {"lacking": frozenset({76})}, False),
-            (WAGO, {}, True),
-            (WAGO, {"lacking": frozenset({23})}, False),
-            (WAGO, {"mute": frozenset({23})}, False),
-            ({**WAGO, "profile": "icp_et7000"}, {}, False),
+            ("labjack_t7", {}, True),
+            ("labjack_t7", {"lacking": frozenset({76})}, False),
+            ("wago_750", {}, True),
+            ("wago_750", {"lacking": frozenset({23})}, False),
+            ("wago_750", {"mute": frozenset({23})}, False),
+            ("icp_et7000", {}, False),
         ],
     )
-    def test_one_transaction_is_found_out_without_moving(self, serve, options, without, one):
+    def test_one_transaction_is_found_out_without_moving(self, serve, profile, without, one):
         """Refusal and silence both lead to a read and a write; the output stays where it was."""
-        served = serve(options["profile"], **without)
-        device = served.device(options, timeout_s=0.5)
-        device.open(10.0, 1)
+        served = serve(profile, **without)
+        device = served.running(10.0, timeout_s=0.5)
         assert device.one_transaction is one
         assert {event["current_a"] for event in served.events()} <= {0.0}
         exchange(device, 3.0)
@@ -267,8 +160,7 @@ class TestExchange:
     def test_input_is_read_before_the_output_is_written(self, serve, without):
         """In one message or in two: the reading shows nothing yet of the command."""
         served = serve("labjack_t7", **without)
-        device = served.device(T7)
-        device.open(10.0, 1)
+        device = served.running(10.0)
         emulated, order = served.emulator.device, []
         read, write = emulated.read, emulated.write
 
@@ -286,33 +178,27 @@ class TestExchange:
         device.close()
 
     @pytest.mark.parametrize("kind", ["23", "none"])
-    def test_wrong_input_is_found_out_at_opening(self, serve, tmp_path, kind):
+    def test_wrong_input_is_found_out_at_opening(self, serve, variant, kind):
         """An address that the device does not have is refused before anything is written."""
         served = serve("generic_float32")
-        text = shipped_profiles()["generic_float32"].read_text(encoding="utf-8")
-        wrong = tmp_path / "wrong.yaml"
-        text = text.replace("exchange: 23", f"exchange: {kind}")
-        wrong.write_text(text.replace("IN: {address: 2,", "IN: {address: 50,"), encoding="utf-8")
-        device = served.device({**RTU, "profile": str(wrong)})
+        wrong = variant(
+            ("exchange: 23", f"exchange: {kind}"), ("IN: {address: 2,", "IN: {address: 50,")
+        )
         with pytest.raises(DeviceError, match=r"exception 2 .*open"):
-            device.open(10.0, 1)
+            served.device(profile=wrong).open(10.0, 1)
         assert served.events() == []
 
     def test_slower_way_may_be_too_slow(self, serve):
         """A rate that only one transaction could keep is refused where the device lacks it."""
-        served = serve("labjack_t7", lacking=frozenset({76}))
-        device = served.device(T7)
-        device.open(500.0, 1)
+        device = serve("labjack_t7", lacking=frozenset({76})).running(500.0)
         with pytest.raises(DeviceError, match=r"\(0, 500\] Hz \(a read and a write a sample; "):
             device.open(501.0, 1)
 
     def test_output_that_can_not_be_read_is_not_tried(self, serve):
         """A TDAC can't be read back, so trying function 76 on it would move it."""
-        options = {**T7, "output": "TDAC0", "amplifier": {"gain_a_per_v": 1.0}}
         served = serve("labjack_t7", output="TDAC0")
-        device = served.device(options)
+        device = served.running(333.0)
         assert device.info.max_rate_hz == pytest.approx(1e3 / 3)  # 1 ms each and 1 ms to settle
-        device.open(333.0, 1)
         assert not device.one_transaction
         assert served.events() == []
         exchange(device, 1.0)
@@ -321,81 +207,46 @@ class TestExchange:
     def test_over_rtu(self, serve, module):
         """The same over a pty."""
         served = serve(module)
-        device = served.device({**RTU, "profile": module})
-        device.open(100.0, 1)
+        device = served.running()
         assert device.one_transaction
         assert exchange(device, 2.5) == pytest.approx(0.0, abs=0.3)
         device.make_safe(-1.0)
         assert served.events()[-1]["current_a"] == -1.0
 
-    def test_blocks_are_refused(self, serve):
-        """There is no FIFO, so a block is one sample."""
-        served = serve("labjack_t7")
-        device = served.device(T7)
-        with pytest.raises(DeviceError, match="1 sample, got"):
-            device.open(100.0, 2)
-        device.open(100.0, 1)
-        with pytest.raises(DeviceError, match=r"1 sample, .* 2"):
-            device.exchange(0, np.zeros(2), np.zeros(2), np.zeros(2))
-        device.close()
-
-    def test_after_an_error_it_must_be_opened_again(self, serve):
-        """What comes next on a link that failed could belong to what went before."""
-        served = serve("labjack_t7", faults=(parse_fault("exception@1s"),))
-        device = served.device(T7)
-        device.open(100.0, 1)
-        exchange(device, 0.0)
-        served.clock.pass_s(2.0)
-        with pytest.raises(DeviceError, match=r"exception 4 .*AIN0"):
-            exchange(device, 0.0)
-        with pytest.raises(DeviceError, match="not open"):
-            exchange(device, 0.0)
-        device.open(100.0, 1)
-        exchange(device, 0.0)
-        device.close()
-
     @pytest.mark.parametrize(
-        ("fault", "said"),
+        ("link", "fault", "said"),
         [
-            ("silence", "no answer within 1 s"),
-            ("corrupt", "not a Modbus TCP header"),
-            ("cut", "only 6 bytes, 2 short, within 1 s"),
-            ("duplicate", "bytes behind the end of the reply"),
-            ("wrong_id", "transaction must be"),
-            ("reset", "connection lost: connection reset by peer"),
+            ("tcp", "silence", "no answer within"),
+            ("tcp", "corrupt", "not a Modbus TCP header"),
+            ("tcp", "cut", "only 6 bytes, 2 short, within"),
+            ("tcp", "duplicate", "bytes behind the end of the reply"),
+            ("tcp", "wrong_id", "transaction must be"),
+            ("tcp", "reset", "connection lost"),
+            ("tcp", "exception", "exception 4"),
+            ("rtu", "silence", "no answer within"),
+            ("rtu", "corrupt", "CRC of 9 bytes is wrong"),
+            ("rtu", "cut", "short, within"),
+            ("rtu", "duplicate", "CRC of 18 bytes is wrong"),
+            ("rtu", "wrong_id", "unit must be 1, got 2"),
         ],
     )
-    def test_bad_answer_over_tcp_is_told(self, serve, fault, said):
-        """In words, with what was asked; the safe value gets there by a new connection."""
-        served = serve("labjack_t7", faults=(parse_fault(f"{fault}@1s"),))
-        device = served.device(T7, timeout_s=timeout_s(said))
-        self.assert_told(served, device, said)
-
-    @pytest.mark.parametrize(
-        ("fault", "said"),
-        [
-            ("silence", "no answer within 1 s"),
-            ("corrupt", "CRC of 9 bytes is wrong"),
-            ("cut", "short, within 1 s"),
-            ("duplicate", "CRC of 18 bytes is wrong"),
-            ("wrong_id", "unit must be 1, got 2"),
-        ],
-    )
-    def test_bad_answer_over_rtu_is_told(self, serve, module, fault, said):
-        """The same on a serial line."""
-        served = serve(module, faults=(parse_fault(f"{fault}@1s"),))
-        device = served.device({**RTU, "profile": module}, timeout_s=timeout_s(said))
-        self.assert_told(served, device, said)
-
-    @staticmethod
-    def assert_told(served: Served, device: ModbusDac, said: str) -> None:
-        device.open(100.0, 1)
+    def test_bad_answer_is_told(self, serve, module, link, fault, said):
+        """In words, with what was asked; the safe value gets there, and the next run too."""
+        profile = module if link == "rtu" else "labjack_t7"
+        served = serve(profile, faults=(parse_fault(f"{fault}@1s"),))
+        waits = {"timeout_s": SILENCE_S} if "within" in said else {}
+        device = served.running(**waits)
         exchange(device, 1.0)
         served.clock.pass_s(2.0)
-        with pytest.raises(DeviceError, match=said):
+        with pytest.raises(DeviceError, match=rf"{said}.*\(to write"):
+            exchange(device, 1.0)
+        with pytest.raises(DeviceError, match="not open"):
             exchange(device, 1.0)
         device.make_safe(0.0)
         assert served.events()[-1]["current_a"] == pytest.approx(0.0, abs=1e-5)
+        device.open(100.0, 1)
+        exchange(device, 0.0)
+        device.close()
 
     def test_nobody_there(self):
         """A refused connection names the device, where it should be, and what was tried."""
@@ -413,11 +264,10 @@ class TestSteps:
     def test_wrong_device_is_refused(self, serve):
         """A self-test register with words swapped means another byte order than the profile's."""
         served = serve("labjack_t7")
-        memory = served.emulator.device.memory
-        words, _ = memory._readable["holding", 55100]
+        words, _ = served.emulator.device.memory._readable["holding", 55100]
         words.words.reverse()
         with pytest.raises(DeviceError, match=r"self-test register 55100"):
-            served.device(T7).open(100.0, 1)
+            served.device().open(100.0, 1)
         assert served.events() == []
 
     def test_init_is_verified(self, serve):
@@ -427,16 +277,15 @@ class TestSteps:
         kept, _ = memory._writable["holding", 43903]
         memory._writable["holding", 43903] = (type(kept)(kept.register), 0)
         with pytest.raises(DeviceError, match=r"step write"):
-            served.device(T7).open(100.0, 1)
+            served.device().open(100.0, 1)
 
     def test_expectation_is_checked(self, serve):
         """A device in a mode that the profile does not mean is refused."""
         served = serve("icp_et7000")
         words, _ = served.emulator.device.memory._readable["coil", 631]
         words.words[:] = [1]
-        options = {**WAGO, "profile": "icp_et7000"}
         with pytest.raises(DeviceError, match="AI data format"):
-            served.device(options).open(10.0, 1)
+            served.device().open(10.0, 1)
 
 
 class TestWatchdog:
@@ -445,9 +294,7 @@ class TestWatchdog:
     def test_trips_to_the_safe_command(self, serve):
         """A T7 goes to the volts that stand for the safe command, when the time is up."""
         served = serve("labjack_t7")
-        device = served.device(T7, watchdog={"timeout_s": 2.0, "safe_command": 1.0})
-        device.open(100.0, 1)
-        device.arm()
+        device = served.running(watchdog={"timeout_s": 2.0, "safe_command": 1.0})
         exchange(device, 3.0)
         served.clock.pass_s(1.9)
         exchange(device, 3.0)
@@ -463,8 +310,7 @@ class TestWatchdog:
     def test_settings_in_flash_are_written_once(self, serve):
         """What is right already is read and left alone."""
         served = serve("labjack_t7")
-        emulated = served.emulator.device
-        written: list[int] = []
+        emulated, written = served.emulator.device, []
         write = emulated.write
 
         def noting(area: str, address: int, values: list[int]) -> None:
@@ -474,18 +320,13 @@ class TestWatchdog:
         emulated.write = noting
         for watchdog_writes in ([61600, 61640, 61642, 61604, 61600], []):
             written.clear()
-            device = served.device(T7, watchdog={"timeout_s": 2.0})
-            device.open(100.0, 1)
-            device.arm()
-            device.close()
+            served.running(watchdog={"timeout_s": 2.0}).close()
             assert [address for address in written if address > 61000] == watchdog_writes
 
     def test_trip_is_cleared_at_the_next_start(self, serve):
         """A tripped WAGO refuses commands until its watchdog is restarted; opening does that."""
         served = serve("wago_750")
-        device = served.device(WAGO, watchdog={"timeout_s": 0.5})
-        device.open(100.0, 1)
-        device.arm()
+        device = served.running(watchdog={"timeout_s": 0.5})
         exchange(device, 3.0)
         served.clock.pass_s(0.6)
         with pytest.raises(DeviceError, match="exception 4"):
@@ -501,35 +342,11 @@ class TestWatchdog:
         served_events = [event["event"] for event in served.events()]
         assert served_events.count("watchdog") == 2  # both outputs, once: closing disarmed it
 
-    def test_make_safe_clears_a_trip_first(self, serve):
-        """The last resort works on a device that refuses commands."""
-        served = serve("wago_750")
-        device = served.device(WAGO, watchdog={"timeout_s": 0.5})
-        device.open(100.0, 1)
-        device.arm()
-        exchange(device, 3.0)
-        served.clock.pass_s(0.6)
-        with pytest.raises(DeviceError):
-            exchange(device, 3.0)
-        device.make_safe(0.0)
-        assert served.events()[-1]["event"] == "write"
-        assert served.events()[-1]["current_a"] == 0.0
-
     def test_too_slow_a_loop_would_trip_it(self, serve):
         """Fewer than three samples in its time-out are refused at open."""
-        served = serve("labjack_t7")
-        device = served.device(T7, watchdog={"timeout_s": 1.0})
+        device = serve("labjack_t7").device(watchdog={"timeout_s": 1.0})
         with pytest.raises(DeviceError, match="watchdog's timeout"):
             device.open(2.0, 1)
-
-
-def test_every_profile_with_an_input_can_be_driven():
-    """Nothing in the shipped Modbus profiles keeps an experiment from being made of them."""
-    for name, output, sensor in (("labjack_t4", "DAC0", "AIN0"), ("labjack_t8", "DAC0", "AIN0")):
-        profile = load_profile(name)
-        assert made(profile=name, output=output, input=sensor).info.max_rate_hz <= (
-            profile.max_rate_hz
-        )
 
 
 def test_device_as_it_powers_up(driven):
@@ -561,23 +378,9 @@ def test_value_out_of_range_is_returned_as_it_is(driven):
     assert made.device.output() == pytest.approx(17.0)
 
 
-def test_output_that_can_not_be_read_is_not_known(driven, write_only):
+def test_output_that_can_not_be_read_is_not_known(driven, variant):
     """Nothing is guessed."""
-    made = driven(write_only)
+    made = driven(variant(("OUT: {address: 0,", "OUT: {readback: none, address: 0,")))
     made.open()
     made.exchange(3.0)
     assert made.device.output() is None
-
-
-def test_silent_device_must_be_opened_again(driven):
-    """It is asked, or there is no answer."""
-    made = driven()
-    with pytest.raises(DeviceError, match="not open"):
-        made.device.output()
-    made.open()
-    made.link.silent_until_s = 1e9
-    with pytest.raises(DeviceError, match=r"no answer .*output"):
-        made.device.output()
-    made.link.silent_until_s = 0.0
-    with pytest.raises(DeviceError, match="not open"):
-        made.exchange(1.0)

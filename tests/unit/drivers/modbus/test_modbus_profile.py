@@ -1,17 +1,11 @@
 """Profiles of Modbus devices: silence on the line, watchdog steps with numbers, broken rules."""
 
 import pytest
-from pydantic import ValidationError
 
-from hilctl.base.errors import ConfigError
-from hilctl_drivers.modbus.modbus_profile import ModbusOutput, ModbusProfile, ModbusRtuLink
+from hilctl.base.errors import ConfigError, InputError
+from hilctl_drivers.modbus.modbus_profile import ModbusRtuLink
+from hilctl_drivers.modbus.register_map import EnsureStep, RegisterStep
 from hilctl_drivers.profile import load_profile, parse_profile, shipped_profiles
-
-T7 = load_profile("labjack_t7")
-
-
-def changed(**changes):
-    return ModbusProfile.model_validate({**T7.model_dump(), **changes})
 
 
 @pytest.mark.parametrize(
@@ -24,40 +18,18 @@ def test_silence_before_a_frame(baud, silence_s):
     assert ModbusRtuLink(**link, gap_s=0.004).silence_s == 0.004
 
 
-def test_watchdog_steps_get_the_device_s_own_numbers():
-    """The timeout in counts of its unit, the safe value scaled as the output is."""
-    watchdog, output = T7.watchdog, T7.outputs["DAC0"]
-    timeout = next(s for s in watchdog.bound(watchdog.arm, output, 5.0, 1.0) if s.address == 61604)
-    assert (timeout.value, timeout.scale) == (5.0, 1.0)
-    safe = watchdog.bound(watchdog.safe["DAC0"], output, 5.0, 1.25)[-1]
-    assert safe.value == 1.25
-    assert watchdog.protects("DAC0")
-    assert not watchdog.protects("TDAC0")
-
-
-@pytest.mark.parametrize(
-    ("changes", "said"),
-    [
-        ({"outputs": {}, "streaming": "none", "watchdog": "none"}, "exchange must be none"),
-        ({"exchange": 23, "inputs": {"AIN0": {**T7.inputs["AIN0"].model_dump(), "area": "input"}},
-          "streaming": "none"}, "inputs.AIN0.area must be holding: exchange 23"),
-        ({"init": ({"kind": "write", "address": 1, "type": "uint32", "value": "safe"},)},
-         "init: timeout and safe are for watchdog steps"),
-        ({"address_base": "modicon"}, "address must be in area holding with address_base modicon"),
-    ],
-)  # fmt: skip
-def test_what_does_not_go_together_is_refused(changes, said):
-    with pytest.raises(ValidationError, match=said):
-        changed(**changes)
-
-
-def test_an_output_is_a_register_that_its_function_can_write():
-    output = {"address": 1, "type": "float32", "unit": "V", "min": 0.0, "max": 5.0}
-    with pytest.raises(ValidationError, match="must be holding"):
-        ModbusOutput(**output, area="input")
-    with pytest.raises(ValidationError, match=r"function 6 .*float32"):
-        ModbusOutput(**output, function=6)
-    assert ModbusOutput(**output, readback="none").readback_register is None
+def test_watchdog_steps_are_bound_to_numbers():
+    """Steps get the timeout in the device's unit and the safe value as the output has it."""
+    profile = load_profile("icp_m7024")
+    output = profile.outputs["AO0"]
+    safe = (EnsureStep(kind="ensure", address=40500, type="int16", value="safe"),)
+    steps = profile.watchdog.bound((*profile.watchdog.arm, *safe), output, 10.0, -10.0)
+    timeout, enable, value = (step for step in steps if isinstance(step, RegisterStep))
+    assert timeout.format.encode(timeout.value) == (100).to_bytes(2, "big")
+    assert enable == profile.watchdog.arm[1]
+    assert value.format.encode(value.value) == (-32767).to_bytes(2, "big", signed=True)
+    with pytest.raises(InputError, match="multiple"):
+        profile.watchdog.bound(profile.watchdog.arm, output, 0.15, 0.0)
 
 
 @pytest.fixture

@@ -6,7 +6,8 @@ import pytest
 
 from hilctl.base.errors import DeviceError
 from hilctl_drivers.emulator.options import parse_fault
-from hilctl_drivers.modbus.config import ModbusOptions, ModbusSetup
+from hilctl_drivers.modbus.config import ModbusOptions
+from hilctl_drivers.modbus.modbus_dac import ModbusDac
 from hilctl_drivers.modbus.modbus_profile import ModbusProfile
 from hilctl_drivers.modbus.modbus_session import ModbusSession, exchange_time, feed_time
 from hilctl_drivers.modbus.pdu import (
@@ -14,20 +15,17 @@ from hilctl_drivers.modbus.pdu import (
     read_pdu,
     reply_size,
     rtu_adu,
-    write_pdu,
     write_single_pdu,
 )
 from hilctl_drivers.modbus.register_map import EnsureStep, ExpectStep, WriteStep
 from hilctl_drivers.profile import load_profile, parse_profile, with_link
 from hilctl_drivers.profile_base import WaitStep
 from hilctl_drivers.transport.wire_time import WireTime
-from tests.unit.drivers.modbus.test_modbus_dac import exchange
+from tests.unit.drivers.modbus.conftest import exchange
 
 
 class Line:
     """A device over Modbus TCP with coils and registers at any address."""
-
-    name = "line"
 
     def __init__(self):
         self.asked, self.coils, self.registers = [], {}, {}
@@ -108,8 +106,7 @@ class TestReader:
         """The reader is set up before the first sample, and let go of after the last."""
         served = serve("adam_4024", reader)
         state, _ = served.emulator.reader.memory._readable["holding", 7]
-        device = served.device(baud=115200)
-        device.open(5.0, 1)
+        device = served.running(5.0, baud=115200)
         assert state.words == [1]
         exchange(device, 1.0)
         device.close()
@@ -131,18 +128,17 @@ class TestReader:
         """It is read once at opening, before the first write."""
         served = serve("icp_m7024", "icp_m7017", **fault)
         with pytest.raises(DeviceError, match=rf": reader icp_m7017, .*{said}.* \(to open\)"):
-            served.device(timeout_s=2.0).open(5.0, 1)
+            served.device(timeout_s=0.5).open(5.0, 1)
         assert served.events() == []
 
     @pytest.mark.parametrize(
         ("fault", "said", "timeout_s"),
-        [("silence@1s", "no answer", 2.0), ("exception@1s", "exception 4", 20.0)],
+        [("silence@1s", "no answer", 0.5), ("exception@1s", "exception 4", 20.0)],
     )
     def test_errors_name_the_reader(self, serve, fault, said, timeout_s):
         """The message says which device, where, and what was being done; nothing was written."""
         served = serve("icp_m7024", "icp_m7017", faults=(parse_fault(fault),))
-        device = served.device(timeout_s=timeout_s)
-        device.open(5.0, 1)
+        device = served.running(5.0, timeout_s=timeout_s)
         served.clock.pass_s(2.0)
         named = rf"modbus_dac icp_m7024 at .*: reader icp_m7017, unit 2 at .*: .*{said}.* \(to wri"
         with pytest.raises(DeviceError, match=named):
@@ -164,8 +160,7 @@ class TestReader:
         """After an error in the one, neither port is kept for longer than the safe value needs."""
         faults = (parse_fault("silence@1s"),)
         served = serve("icp_m7024", "icp_m7017", reader_line="own", faults=faults)
-        device, other = served.device(timeout_s=2.0), served.device(timeout_s=2.0)
-        device.open(5.0, 1)
+        device, other = served.running(5.0, timeout_s=0.5), served.device()
         with pytest.raises(DeviceError, match="can't be opened"):
             other.open(5.0, 1)
         served.clock.pass_s(2.0)
@@ -198,6 +193,7 @@ turnaround_s: 0.002
 max_rate_hz: 10000.0
 outputs:
   AO: {address: 0, type: float32, unit: V, min: -10.0, max: 10.0}
+  SMALL: {address: 8, type: int16, function: 6, scale: 0.001, unit: V, min: -10.0, max: 10.0}
 inputs:
   AI: {address: 4, type: float32, unit: V, min: -10.0, max: 10.0}
 watchdog:
@@ -213,24 +209,6 @@ watchdog:
     - FEED
 """
 FEED = "{kind: write, address: 101, type: uint16, value: 1}"
-RTU = """\
-vendor: Acme
-model: DAQ-1
-source: [manual]
-verified: partly
-unverified: [turnaround_s]
-link: {kind: rtu, baud: 9600}
-address_base: 0
-exchange: 23
-turnaround_s: 0.0
-max_rate_hz: 10000.0
-outputs:
-  AO: {address: 0, type: float32, unit: V, min: -10.0, max: 10.0}
-  SMALL: {address: 8, type: int16, function: 6, scale: 0.001, unit: V, min: -10.0, max: 10.0}
-inputs:
-  AI: {address: 4, type: float32, unit: V, min: -10.0, max: 10.0}
-watchdog: none
-"""
 LINES = [(9600, "N"), (19200, "E"), (115200, "N"), (921600, "N")]
 TABLE_MS = {
     "FC16": (21.9, 12.0, 1.82, 0.23),
@@ -241,20 +219,21 @@ TABLE_MS = {
 TABLE_HZ = {"gaps": (29.0, 53.0, 174.0, 264.0), "none": (37.0, 67.0, 443.0, 3545.0)}
 
 
+def acme(feed=FEED, link="{kind: rtu, baud: 9600}"):
+    """Return a Modbus device that is fed by these steps."""
+    text = PROFILE.replace("FEED", feed).replace("{kind: rtu, baud: 9600}", link)
+    return parse_profile(text, "acme.yaml")
+
+
 def rtu(baud: int = 115200, parity: str = "N", **link: object) -> ModbusProfile:
-    """Return a Modbus RTU device on a line."""
-    return with_link(parse_profile(RTU, "acme.yaml"), baud=baud, parity=parity, **link)
+    """Return a Modbus RTU device on a line, which exchanges in one transaction in no time."""
+    fast = acme().model_copy(update={"exchange": 23, "turnaround_s": 0.0})
+    return with_link(fast, baud=baud, parity=parity, **link)
 
 
 def wire_s(time: WireTime) -> float:
     """Return the time of the characters alone."""
     return time.request_s + time.reply_s
-
-
-def acme(feed=FEED, link="{kind: rtu, baud: 9600}"):
-    """Return a Modbus device that is fed by these steps."""
-    text = PROFILE.replace("FEED", feed).replace("{kind: rtu, baud: 9600}", link)
-    return parse_profile(text, "acme.yaml")
 
 
 class TestRtu:
@@ -285,18 +264,6 @@ class TestRtu:
         assert gaps.highest_rate_hz == pytest.approx(TABLE_HZ["gaps"][column], rel=0.03)
         assert none.highest_rate_hz == pytest.approx(TABLE_HZ["none"][column], rel=0.03)
 
-    def test_gap(self) -> None:
-        """A gap is 3.5 characters up to 19200 baud, 1.75 ms above, or what the profile says."""
-        for profile, gap_s in (
-            (rtu(9600), 3.5 * 10 / 9600),
-            (rtu(19200, "E"), 3.5 * 11 / 19200),
-            (rtu(38400), 1.75e-3),
-            (rtu(115200, gap_s=0.5e-3), 0.5e-3),
-        ):
-            time = exchange_time(profile, "AO", "AI")
-            assert time.gaps == 2
-            assert time.gaps_s == pytest.approx(2 * gap_s)
-
     def test_two_transactions(self) -> None:
         """Write, then read, has four gaps and the device's turnaround twice."""
         profile = load_profile("icp_m7024")
@@ -305,13 +272,6 @@ class TestRtu:
         assert (one.gaps, two.gaps) == (2, 4)
         assert one.turnaround_s == profile.turnaround_s
         assert str(two).startswith("FC03+FC16 at 115200 8N1: request ")
-
-    def test_real_frames(self) -> None:
-        """The bytes counted are those of the frames that are sent."""
-        pdu = write_pdu(0, bytes(4))
-        time = exchange_time(rtu(9600), "AO", None)
-        assert time.request_s == pytest.approx(len(rtu_adu(1, pdu)) * 10 / 9600)
-        assert time.reply_s == pytest.approx((reply_size(pdu) + 3) * 10 / 9600)
 
     def test_text(self) -> None:
         """The explanation names each part."""
@@ -327,34 +287,24 @@ class TestRtu:
         assert ratio == pytest.approx(11 / 10)
 
 
-class TestTcp:
-    """Modbus TCP: the device's own time."""
+@pytest.mark.parametrize(
+    ("output", "one", "rate_hz", "text"),
+    [
+        ("DAC0", True, 1000.0, "FC76 over TCP: turnaround 1.00 ms -> at most 1000 Hz"),
+        ("DAC0", False, 500.0, "FC03+FC16 over TCP: turnaround 2.00 ms -> at most 500 Hz"),
+        ("TDAC0", False, 1000 / 3, "turnaround 2.00 ms, settling 1.00 ms -> at most 333 Hz"),
+    ],
+)
+def test_time_over_tcp_is_the_device_s_own(output, one, rate_hz, text):
+    """A LabJack T7 takes 1 ms a round trip, and an LJTick-DAC another one to settle."""
+    time = exchange_time(load_profile("labjack_t7"), output, "AIN0", one_transaction=one)
+    assert time.highest_rate_hz == pytest.approx(rate_hz)
+    assert str(time).endswith(text)
 
-    def test_one_transaction(self) -> None:
-        """A LabJack T7 writes and reads in one round trip of 1 ms."""
-        profile = load_profile("labjack_t7")
-        time = exchange_time(profile, "DAC0", "AIN0")
-        assert time.total_s == pytest.approx(1e-3)
-        assert str(time) == "FC76 over TCP: turnaround 1.00 ms -> at most 1000 Hz"
 
-    def test_fallback(self) -> None:
-        """Without the exchange in one transaction it takes two."""
-        profile = load_profile("labjack_t7")
-        time = exchange_time(profile, "DAC0", "AIN0", one_transaction=False)
-        assert time.highest_rate_hz == pytest.approx(500.0)
-
-    def test_settling(self) -> None:
-        """An LJTick-DAC takes a millisecond to settle: its samples can't come any closer."""
-        profile = load_profile("labjack_t7")
-        time = exchange_time(profile, "TDAC0", "AIN0", one_transaction=False)
-        assert time.answered_s == pytest.approx(2e-3)
-        assert time.total_s == pytest.approx(3e-3)
-        assert str(time).endswith("turnaround 2.00 ms, settling 1.00 ms -> at most 333 Hz")
-
-    def test_no_time_at_all(self) -> None:
-        """A device without turnaround on TCP has no limit that can be worked out."""
-        profile = load_profile("labjack_t7").model_copy(update={"turnaround_s": 0.0})
-        assert exchange_time(profile, "DAC0", "AIN0").highest_rate_hz == float("inf")
+def test_a_device_without_turnaround_has_no_limit_over_tcp():
+    profile = load_profile("labjack_t7").model_copy(update={"turnaround_s": 0.0})
+    assert exchange_time(profile, "DAC0", "AIN0").highest_rate_hz == float("inf")
 
 
 def requests_s(*pdus):
@@ -397,20 +347,10 @@ def test_watchdogs_that_exchanges_feed_cost_nothing(name):
     assert feed_time(load_profile(name)) is None
 
 
-def test_a_tick_that_feeds_must_fit():
-    """The rate that is left is that of an exchange and a feeding, one after the other."""
-    profile = acme()
-    exchange = exchange_time(profile, "AO", "AI")
-    both = exchange.then(feed_time(profile))
-    assert both.total_s == pytest.approx(exchange.total_s + requests_s(WRITE))
-    assert (both.gaps, both.samples) == (6, 1)
-    assert str(both).startswith(
-        "FC03+FC16 at 9600 8N1, then FC06 at 9600 8N1 to feed the watchdog: request "
-    )
-
-
-def modbus_rate(path, watchdog):
-    """Return the highest rate and its reason that modbus_dac gives for a profile."""
+def test_modbus_dac_leaves_room_for_feeding(tmp_path):
+    """Only where the experiment uses the watchdog."""
+    path = tmp_path / "acme.yaml"
+    path.write_text(PROFILE.replace("FEED", FEED))
     options = {
         "profile": str(path),
         "serial_port": "/dev/ttyUSB0",
@@ -419,30 +359,21 @@ def modbus_rate(path, watchdog):
         "amplifier": {"gain_a_per_v": 1.0},
         "sensor": {"um_per_v": 10.0},
         "timeout_s": 1.0,
-        "watchdog": watchdog,
     }
-    info = ModbusSetup.of(ModbusOptions.model_validate(options)).info()
-    return info.max_rate_hz, info.rate_note
-
-
-def test_modbus_dac_leaves_room_for_feeding(tmp_path):
-    """Only where the experiment uses the watchdog."""
-    path = tmp_path / "acme.yaml"
-    path.write_text(PROFILE.replace("FEED", FEED))
-    exchange = exchange_time(acme(), "AO", "AI")
-    assert modbus_rate(path, "none")[0] == pytest.approx(exchange.highest_rate_hz)
-    rate_hz, note = modbus_rate(path, {"timeout_s": 1.0})
-    assert rate_hz == pytest.approx(1.0 / (exchange.total_s + requests_s(WRITE)))
-    assert "feed the watchdog" in note
+    exchange_s = exchange_time(acme(), "AO", "AI").total_s
+    for watchdog, feed_s in (("none", 0.0), ({"timeout_s": 1.0}, requests_s(WRITE))):
+        info = ModbusDac(ModbusOptions.model_validate({**options, "watchdog": watchdog})).info
+        assert info.max_rate_hz == pytest.approx(1.0 / (exchange_s + feed_s))
+        assert ("feed the watchdog" in info.rate_note) == (watchdog != "none")
 
 
 @pytest.mark.parametrize(
     ("profile", "reader"),
-    [("labjack_t7", "labjack_t7"), ("adam_6224", "adam_6217"), ("adam_4024", "adam_4117")],
+    [("labjack_t7", None), ("adam_6224", "adam_6217"), ("adam_4024", "adam_4117")],
 )
 def test_input_and_output_are_read(serve, profile, reader):
     """From one device or two; nothing is put out."""
-    served = serve(profile, None if reader == profile else reader)
+    served = serve(profile, reader)
     served.device().make_safe(3.0)
     served.clock.pass_s(0.5)
     before = served.events()
@@ -454,10 +385,8 @@ def test_input_and_output_are_read(serve, profile, reader):
 
 def test_a_command_from_before_a_trip_is_not_taken_for_the_output(serve):
     """The register keeps it; what the terminal is at is another thing."""
-    served = serve("wago_750", None)
-    device = served.device(watchdog={"timeout_s": 0.5})
-    device.open(100.0, 1)
-    device.arm()
+    served = serve("wago_750")
+    device = served.running(watchdog={"timeout_s": 0.5})
     exchange(device, 3.0)
     device._release()
     served.clock.pass_s(0.6)

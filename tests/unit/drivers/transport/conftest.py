@@ -6,13 +6,16 @@ import socket
 import threading
 import tty
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 import pytest
 
+from hilctl_drivers.transport.serial_port import SerialLink, SerialSettings
 from hilctl_drivers.transport.tcp import TcpLink
 
 REPLY = b"0123456789"
 PATIENT_S = 5.0
+QUICK_S = 0.05
 
 
 def missing(received: bytearray) -> int:
@@ -60,6 +63,29 @@ def tcp(port, timeout_s=PATIENT_S):
     link = TcpLink("127.0.0.1", port, timeout_s)
     link.open()
     return link
+
+
+def serial(path, timeout_s=PATIENT_S, **settings):
+    """Return an open link to a line that is silent."""
+    link = SerialLink(path, SerialSettings(**settings), timeout_s)
+    link.open()
+    link.drain()
+    return link
+
+
+@contextmanager
+def answering(master, *replies):
+    """Answer one request for each reply, at the far end of a line."""
+
+    def answer():
+        for reply in replies:
+            os.read(master, 100)
+            os.write(master, reply)
+
+    thread = threading.Thread(target=answer)
+    thread.start()
+    yield
+    thread.join()
 
 
 @pytest.fixture

@@ -9,28 +9,26 @@ import tty
 import pytest
 
 from hilctl.base.errors import DeviceError
-from hilctl_drivers.transport import links
 from hilctl_drivers.transport.links import (
-    BadRequestError,
-    FrameError,
     LostError,
     NoAnswerError,
-    RefusedError,
-    WatchdogTrippedError,
 )
 from hilctl_drivers.transport.serial_port import SerialLink, SerialSettings
 from tests.fakes import received
-from tests.unit.drivers.transport.conftest import PATIENT_S, REPLY, missing, tcp
-
-QUICK_S = 0.05
+from tests.unit.drivers.transport.conftest import (
+    PATIENT_S,
+    QUICK_S,
+    REPLY,
+    answering,
+    missing,
+    serial,
+    tcp,
+)
 
 
 def test_no_reply_wanted_is_not_waited_for(serve, line):
     """A command that is not answered costs no time-out, on either link."""
-    _, name = line
-    wire = SerialLink(name, SerialSettings(), PATIENT_S)
-    wire.open()
-    for link in (tcp(serve(lambda connection: None)), wire):
+    for link in (tcp(serve(lambda connection: None)), serial(line[1])):
         assert link.transact(b"tell", lambda received: 0) == b""
         link.close()
 
@@ -46,16 +44,11 @@ def test_a_known_size_moves_no_deadline(serve, line, sent, words):
         connection.sendall(sent)
 
     master, name = line
-    wire = SerialLink(name, SerialSettings(), 0.3)
-    wire.open()
-    wire.drain()
-    thread = threading.Thread(target=lambda: os.write(master, os.read(master, 100) and sent))
-    thread.start()
-    for link in (tcp(serve(act), 0.3), wire):
-        with pytest.raises(NoAnswerError, match=words):
-            link.transact(b"ask", missing, len(REPLY))
-        link.close()
-    thread.join()
+    with answering(master, sent):
+        for link in (tcp(serve(act), 0.3), serial(name, 0.3)):
+            with pytest.raises(NoAnswerError, match=words):
+                link.transact(b"ask", missing, len(REPLY))
+            link.close()
 
 
 @pytest.mark.parametrize("size", [9, 11, 300])
@@ -74,22 +67,17 @@ def test_a_reply_of_another_size_than_usual_is_asked_about(serve, size):
 
 def test_full_serial_line_times_out(line):
     """Nobody takes what is sent: an error in time, not a hang."""
-    _, name = line
-    link = SerialLink(name, SerialSettings(), QUICK_S)
-    link.open()
-    with pytest.raises(NoAnswerError, match="not send within"):
-        link.transact(bytes(1_000_000), missing)
-    with pytest.raises(NoAnswerError, match="not send within"):
-        link.transact(b"ask", missing)
+    link = serial(line[1], QUICK_S)
+    for request in (bytes(1_000_000), b"ask"):
+        with pytest.raises(NoAnswerError, match="not send within"):
+            link.transact(request, missing)
     link.close()
 
 
 def test_serial_exchanges(line):
     """What is written gets there, and a reply that is waiting in pieces is put together."""
     master, name = line
-    link = SerialLink(name, SerialSettings(115200, 8, "E", 1), PATIENT_S)
-    link.open()
-    link.drain()
+    link = serial(name, baud=115200, parity="E")
 
     def answer():
         assert os.read(master, 100) == b"ask"
@@ -100,16 +88,13 @@ def test_serial_exchanges(line):
     thread.start()
     assert link.transact(b"ask", missing) == REPLY
     thread.join()
-    assert link.low_latency is False  # a pty has no such setting
     link.close()
     link.close()
 
 
 def test_serial_port_is_ours_alone(line):
     """A second one can't have the port, and is told so."""
-    _, name = line
-    first, second = (SerialLink(name, SerialSettings(), QUICK_S) for _ in range(2))
-    first.open()
+    first, second = serial(line[1]), SerialLink(line[1], SerialSettings(), QUICK_S)
     with pytest.raises(LostError, match=r"can't be opened: .*lock"):
         second.open()
     first.close()
@@ -120,8 +105,7 @@ def test_serial_port_is_ours_alone(line):
 def test_serial_late_reply_is_thrown_away(line):
     """After a time-out, what still comes is not taken for the answer to the next request."""
     master, name = line
-    link = SerialLink(name, SerialSettings(), QUICK_S)
-    link.open()
+    link = serial(name, QUICK_S)
     with pytest.raises(NoAnswerError, match=r"no answer within"):
         link.transact(b"one", missing)
     os.write(master, b"late reply")
@@ -134,9 +118,7 @@ def test_serial_late_reply_is_thrown_away(line):
 def test_serial_unasked_bytes_are_refused(line):
     """A doubled reply is noticed before the next request is sent."""
     master, name = line
-    link = SerialLink(name, SerialSettings(), PATIENT_S)
-    link.open()
-    link.drain()
+    link = serial(name)
     os.write(master, REPLY)
     select.select([link._fd], [], [], PATIENT_S)
     with pytest.raises(DeviceError, match="10 bytes that"):
@@ -144,39 +126,32 @@ def test_serial_unasked_bytes_are_refused(line):
     link.close()
 
 
-def test_serial_gap_is_kept():
+def test_serial_gap_is_kept(line):
     """The next request waits until the line has been quiet for the gap."""
+    master, name = line
     now, slept = [10.0], []
 
     def sleep(seconds):
         slept.append(seconds)
         now[0] += seconds
 
-    master, slave = pty.openpty()
-    tty.setraw(slave)
     settings = SerialSettings(9600, gap_s=0.004, boot_s=2.0)
-    link = SerialLink(os.ttyname(slave), settings, 1.0, clock=lambda: now[0], sleep=sleep)
+    link = SerialLink(name, settings, 1.0, clock=lambda: now[0], sleep=sleep)
     link.open()
     assert slept == [2.0]
     link.drain()
-    for _ in range(2):
-        thread = threading.Thread(target=lambda: (os.read(master, 3), os.write(master, REPLY)))
-        thread.start()
-        assert link.transact(b"ask", missing) == REPLY
-        thread.join()
+    with answering(master, REPLY, REPLY):
+        for _ in range(2):
+            assert link.transact(b"ask", missing) == REPLY
     assert slept == [2.0, pytest.approx(0.004)]
     link.close()
-    os.close(slave)
-    os.close(master)
 
 
 def test_serial_unplugged_is_one_line():
     """A port that goes away in mid-exchange is told so, and is closed."""
     master, slave = pty.openpty()
     tty.setraw(slave)
-    link = SerialLink(os.ttyname(slave), SerialSettings(), PATIENT_S)
-    link.open()
-    link.drain()
+    link = serial(os.ttyname(slave))
     os.close(slave)
     thread = threading.Thread(target=lambda: (os.read(master, 3), os.close(master)))
     thread.start()
@@ -205,20 +180,3 @@ def test_serial_chatter_does_not_hang(line):
     with pytest.raises(DeviceError, match="get quiet"):
         link.transact(b"ask", missing)
     link.close()
-
-
-def test_every_frame_error_is_a_device_error():
-    """The loop makes safe on any of them."""
-    found = [e for e in vars(links).values() if isinstance(e, type) and issubclass(e, FrameError)]
-    assert len(found) == 7
-    assert all(issubclass(each, DeviceError) for each in found)
-    assert issubclass(BadRequestError, ValueError)
-
-
-@pytest.mark.parametrize("kind", [RefusedError, WatchdogTrippedError])
-def test_a_refusal_keeps_the_device_s_code(kind):
-    """Callers that can clear a trip catch it as a refusal, too."""
-    error = kind("no", 6)
-    assert (str(error), error.code) == ("no", 6)
-    assert isinstance(error, RefusedError)
-    assert RefusedError("no").code == ""

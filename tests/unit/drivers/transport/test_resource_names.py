@@ -3,10 +3,8 @@
 import array
 import fcntl
 import os
-import pty
 import socket
 import threading
-import tty
 from pathlib import Path
 
 import pytest
@@ -17,19 +15,18 @@ from hilctl_drivers.transport import serial_port as serial_link
 from hilctl_drivers.transport.links import LostError
 from hilctl_drivers.transport.resource_names import held_address, held_port
 from hilctl_drivers.transport.serial_port import SerialLink, SerialSettings
+from tests.unit.drivers.transport.conftest import QUICK_S, serial
 
 TIOCGEXCL = 0x80045440
-TIMEOUT_S = 0.05
 
 
 @pytest.fixture
-def line():
-    """Yield the far end of a pty, a descriptor of the near end and its device file."""
-    master, slave = pty.openpty()
-    tty.setraw(slave)
-    yield master, slave, os.ttyname(slave)
-    os.close(slave)
-    os.close(master)
+def port(line):
+    """Yield a descriptor of a line's near end and its device file."""
+    _, path = line
+    descriptor = os.open(path, os.O_RDWR | os.O_NOCTTY)
+    yield descriptor, path
+    os.close(descriptor)
 
 
 def is_refused(descriptor):
@@ -39,9 +36,9 @@ def is_refused(descriptor):
 
 
 @pytest.mark.parametrize("may_open", [True, False])
-def test_a_pty_is_refused_only_by_who_could_open_it_again(line, monkeypatch, may_open):
+def test_a_pty_is_refused_only_by_who_could_open_it_again(port, monkeypatch, may_open):
     """Its far end keeps what is asked for: a guardian without privileges would be refused too."""
-    _, slave, path = line
+    slave, path = port
     monkeypatch.setattr(resource_names, "_can_open", lambda path: may_open)
     assert resource_names.refuse_to_others(slave, path) is may_open
     assert is_refused(slave) is may_open
@@ -50,9 +47,9 @@ def test_a_pty_is_refused_only_by_who_could_open_it_again(line, monkeypatch, may
 
 
 @pytest.mark.parametrize("others", [True, False])
-def test_a_real_port_is_refused_only_if_no_other_program_has_it(line, monkeypatch, others):
+def test_a_real_port_is_refused_only_if_no_other_program_has_it(port, monkeypatch, others):
     """Its descriptor would keep what is asked for when this process is killed."""
-    _, slave, path = line
+    slave, path = port
     monkeypatch.setattr(resource_names, "_PTY_MAJORS", ())
     monkeypatch.setattr(resource_names, "others_have", lambda device: others)
     assert resource_names.refuse_to_others(slave, path) is not others
@@ -72,11 +69,11 @@ def test_other_processes_are_seen_by_what_they_have_open(tmp_path):
     assert resource_names.others_have(device, tmp_path)
 
 
-def test_a_link_is_exclusive_while_it_is_open(line, monkeypatch):
+def test_a_link_is_exclusive_while_it_is_open(port, monkeypatch):
     """Not one that is opened for the safe value: nothing may outlive a process that is killed."""
-    _, slave, path = line
+    slave, path = port
     monkeypatch.setattr(resource_names, "_can_open", lambda path: True)
-    link = SerialLink(path, SerialSettings(), TIMEOUT_S)
+    link = SerialLink(path, SerialSettings(), QUICK_S)
     for boot in (True, False):
         link.open(boot=boot)
         assert is_refused(slave) is boot
@@ -86,10 +83,8 @@ def test_a_link_is_exclusive_while_it_is_open(line, monkeypatch):
 
 def test_bytes_that_another_program_took_are_no_lost_port(line, monkeypatch):
     """The cause is named, and the port stays open for the safe value."""
-    master, _, path = line
-    link = SerialLink(path, SerialSettings(), TIMEOUT_S)
-    link.open()
-    link.drain()
+    master, path = line
+    link = serial(path, QUICK_S)
     monkeypatch.setattr(serial_link, "read", lambda fd, size: b"")
 
     def missing(got):
@@ -180,15 +175,10 @@ def test_links_to_a_port_are_the_port(tmp_path):
         assert link in held_port(str(tmp_path / name))
 
 
-def test_a_port_is_known_by_its_number_too(monkeypatch):
+def test_a_port_is_known_by_its_number_too(line):
     """So that another file of the same device is the same port."""
-    master, slave = pty.openpty()
-    try:
-        path = os.ttyname(slave)
-        rdev = Path(path).stat().st_rdev
-        number = f"tty:{os.major(rdev)}:{os.minor(rdev)}"
-        assert held_port(path) == (f"serial:{path}", number)
-        assert number in held_port(f"/proc/self/root{path}")
-    finally:
-        os.close(slave)
-        os.close(master)
+    _, path = line
+    rdev = Path(path).stat().st_rdev
+    number = f"tty:{os.major(rdev)}:{os.minor(rdev)}"
+    assert held_port(path) == (f"serial:{path}", number)
+    assert number in held_port(f"/proc/self/root{path}")

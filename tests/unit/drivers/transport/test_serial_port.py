@@ -4,7 +4,6 @@ import fcntl
 import os
 import struct
 import termios
-import threading
 
 import pytest
 
@@ -13,9 +12,8 @@ from hilctl_drivers.profile import load_profile, with_link
 from hilctl_drivers.transport import serial_port as serial_link
 from hilctl_drivers.transport.links import NoAnswerError
 from hilctl_drivers.transport.serial_port import SerialLink, SerialSettings
-from tests.unit.drivers.transport.conftest import PATIENT_S
+from tests.unit.drivers.transport.conftest import QUICK_S, answering, serial
 
-QUICK_S = 0.05
 XOFF, XON = b"\x13", b"\x11"
 
 
@@ -36,17 +34,11 @@ def levels(monkeypatch) -> list[tuple[str, bool]]:
     return asked
 
 
-def opened(name, **settings):
-    link = SerialLink(name, SerialSettings(**settings), QUICK_S)
-    link.open()
-    return link
-
-
 @pytest.mark.parametrize("dtr", [None, True, False])
 @pytest.mark.parametrize("rts", [None, True, False])
 def test_modem_lines_get_their_levels_once(line, levels, dtr, rts):
     """A level that is asked for is set, never the other one first; else opening raises it."""
-    opened(line[1], dtr=dtr, rts=rts).close()
+    serial(line[1], dtr=dtr, rts=rts).close()
     assert levels == [("dtr", dtr is not False), ("rts", rts is not False)]
 
 
@@ -65,8 +57,8 @@ def test_flow_control_is_set_both_ways(line, flow):
     """XON/XOFF is on where it is asked for, and off where a port was left with it."""
     _, name = line
     other = "none" if flow == "xonxoff" else "xonxoff"
-    opened(name, flow=other).close()
-    link = opened(name, flow=flow)
+    serial(name, flow=other).close()
+    link = serial(name, flow=flow)
     wanted = termios.IXON | termios.IXOFF if flow == "xonxoff" else 0
     assert termios.tcgetattr(link._fd)[0] & (termios.IXON | termios.IXOFF) == wanted
     link.close()
@@ -75,7 +67,7 @@ def test_flow_control_is_set_both_ways(line, flow):
 def test_a_device_that_holds_the_line_is_an_error_in_time(line):
     """After XOFF nothing goes out until XON; closing does not wait for it."""
     master, name = line
-    link = opened(name, flow="xonxoff")
+    link = serial(name, QUICK_S, flow="xonxoff")
     os.write(master, XOFF)
     link.drain()  # polling is what takes the XOFF in
     with pytest.raises(NoAnswerError, match="not send within"):
@@ -112,34 +104,19 @@ def test_time_spent_on_sending_is_not_there_for_the_answer(line, monkeypatch):
 def test_without_flow_control_all_bytes_pass(line):
     """0x11 and 0x13 are data on a binary line."""
     master, name = line
-    link = SerialLink(name, SerialSettings(), PATIENT_S)
-    link.open()
-    link.drain()
-    reply = bytes(range(256))
-    thread = threading.Thread(target=lambda: os.write(master, os.read(master, 1) and reply))
-    thread.start()
-    assert link.transact(b"?", lambda got: 256 - len(got), 256) == reply
-    thread.join()
+    link, reply = serial(name), bytes(range(256))
+    with answering(master, reply):
+        assert link.transact(b"?", lambda got: 256 - len(got), 256) == reply
     link.close()
 
 
 def test_long_replies_are_put_together(line):
     """Of known size or not: a reply may be longer than what is read at once."""
     master, name = line
-    link = SerialLink(name, SerialSettings(), PATIENT_S)
-    link.open()
-    reply = bytes(3000)
-
-    def answer():
-        for _ in range(2):
-            os.read(master, 1)
-            os.write(master, reply)
-
-    thread = threading.Thread(target=answer)
-    thread.start()
-    for usual in (0, len(reply)):
-        assert link.transact(b"?", lambda got: len(reply) - len(got), usual) == reply
-    thread.join()
+    link, reply = serial(name), bytes(3000)
+    with answering(master, reply, reply):
+        for usual in (0, len(reply)):
+            assert link.transact(b"?", lambda got: len(reply) - len(got), usual) == reply
     link.close()
 
 
@@ -150,7 +127,6 @@ def test_profiles_say_how_their_line_is_set():
     assert (settings.flow, settings.dtr, settings.rts) == ("xonxoff", True, False)
     settings = load_profile("icp_m7024").link.settings
     assert (settings.flow, settings.dtr, settings.rts) == ("none", None, None)
-    assert load_profile("cobs_board").link.settings.dtr is True
 
 
 @pytest.mark.parametrize("name", ["icp_m7024", "cobs_board"])
@@ -167,17 +143,14 @@ def test_levels_stay_when_the_port_of_a_board_that_boots_is_closed(line):
     def falls(link):
         return bool(termios.tcgetattr(link._fd)[2] & termios.HUPCL)
 
-    plain = opened(line[1])
+    plain = serial(line[1])
     attributes = termios.tcgetattr(plain._fd)
     attributes[2] |= termios.HUPCL  # as ports have it, but not ptys
     termios.tcsetattr(plain._fd, termios.TCSANOW, attributes)
-    plain.timeout_s = 0.2  # sets the port anew
     assert falls(plain)
     plain.close()
     link = SerialLink(line[1], SerialSettings(boot_s=2.0), QUICK_S, sleep=lambda seconds: None)
     link.open()
-    assert not falls(link)
-    link.timeout_s = 0.2
     assert not falls(link)
     link.close()
 
@@ -185,7 +158,7 @@ def test_levels_stay_when_the_port_of_a_board_that_boots_is_closed(line):
 def test_a_value_is_sent_past_a_line_that_never_falls_silent(line):
     """At once and whole, where an exchange would first wait for silence; that comes later."""
     master, name = line
-    link = opened(name)
+    link = serial(name)
     os.write(master, b"chatter" * 20)
     link.send_now(b"safe\r")
     assert os.read(master, 100) == b"safe\r"

@@ -9,9 +9,7 @@ import pytest
 from hilctl.base.errors import DeviceError
 from hilctl_drivers.transport.links import LostError, NoAnswerError
 from hilctl_drivers.transport.tcp import TcpLink
-from tests.unit.drivers.transport.conftest import PATIENT_S, REPLY, missing, tcp
-
-QUICK_S = 0.05
+from tests.unit.drivers.transport.conftest import PATIENT_S, QUICK_S, REPLY, missing, tcp
 
 
 def test_tcp_reply_in_pieces_is_put_together(serve):
@@ -26,13 +24,6 @@ def test_tcp_reply_in_pieces_is_put_together(serve):
     link = tcp(serve(act))
     assert link.transact(b"ask", missing) == REPLY
     link.close()
-    link.close()
-
-
-def test_tcp_turns_nagle_off(serve):
-    """Small requests leave at once."""
-    link = tcp(serve(lambda connection: None))
-    assert link._socket.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
     link.close()
 
 
@@ -72,11 +63,12 @@ def test_tcp_request_that_was_not_answered_is_given_up(serve):
     assert len(seen) == 1
 
 
-def test_tcp_kernel_gives_up_what_is_not_acknowledged(serve):
+def test_tcp_kernel_sends_at_once_and_gives_up_in_time(serve):
     """In one time-out, also where this process dies before."""
     link = tcp(serve(lambda connection: None), QUICK_S)
     found = link._socket.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT)
     assert found == round(QUICK_S * 1e3)
+    assert link._socket.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
     link.close()
 
 
