@@ -45,6 +45,10 @@ class DacDevice(ABC):
         """What the device is and what it accepts."""
         return self._info
 
+    def check_rate(self, sample_rate_hz: float, block: int) -> None:
+        """See :meth:`hilctl.base.device.Device.check_rate`."""
+        self._rates(block).check(sample_rate_hz)
+
     def open(self, sample_rate_hz: float, block: int) -> None:
         """Connect, check that the device is what it should be, and set it up; nothing moves.
 
@@ -55,7 +59,7 @@ class DacDevice(ABC):
         self.close()
         try:
             self._check_block(block)
-            self._rates(block).check(sample_rate_hz)
+            self.check_rate(sample_rate_hz, block)
             self._open(sample_rate_hz, block)
         except DeviceError as error:
             raise self._failed("open", error, self._release) from None

@@ -80,7 +80,7 @@ class DeviceInfo:
 
 REQUIRED = ("info", "open", "exchange", "make_safe", "close")
 """Required members of a device."""
-OPTIONAL = ("output",)
+OPTIONAL = ("output", "check_rate")
 """Optional methods with a default in :class:`Device`."""
 
 
@@ -124,6 +124,13 @@ class Device(Protocol):
     def info(self) -> DeviceInfo:
         """Properties of the device; constant and available before :meth:`open`."""
         ...
+
+    def check_rate(self, sample_rate_hz: float, block: int) -> None:
+        """Reject a rate that the device cannot keep with this block; no I/O. Optional.
+
+        Raises:
+            DeviceError: The rate is too high, or too low.
+        """
 
     def open(self, sample_rate_hz: float, block: int) -> None:
         """Connect, verify the device, and prepare the exchange.

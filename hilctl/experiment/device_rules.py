@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterator
 
 from hilctl.base.device import DeviceInfo
-from hilctl.base.errors import ConfigProblem
+from hilctl.base.errors import ConfigProblem, DeviceError
 from hilctl.experiment.file import Experiment
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.loop.interlocks import InterlockContext, InterlockRequirement, InterlockSettings
@@ -73,6 +73,12 @@ def _pace_problems(loaded: LoadedExperiment) -> Iterator[ConfigProblem]:
         fifo = f"the FIFO of {info.name}, {info.fifo_depth} samples"
         rule = f"must be <= {info.fifo_depth // blocks}: {blocks} blocks must fit into {fifo}"
         yield loaded.problem("block", rule, str(config.block))
+    elif config.sample_rate_hz <= info.max_rate_hz:
+        try:
+            loaded.device.check_rate(config.sample_rate_hz, config.block)
+        except DeviceError as error:
+            rule = f"must allow sample_rate_hz, which a larger block does: {error}"
+            yield loaded.problem("block", rule, str(config.block))
 
 
 def _watchdog_problems(loaded: LoadedExperiment) -> Iterator[ConfigProblem]:

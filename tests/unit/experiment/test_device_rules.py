@@ -9,6 +9,7 @@ import pytest
 
 from hilctl.base.errors import ConfigError
 from hilctl.base.yaml import Document
+from hilctl.experiment import device_rules
 from hilctl.experiment.device_rules import interlock_context, pace_warnings
 from hilctl.experiment.load import load_experiment, resolve
 from hilctl.experiment.preflight import check
@@ -220,6 +221,15 @@ def warned(*settings, **info):
 def test_ticks_of_less_than_a_tenth_of_a_millisecond_are_told(block, told):
     """The demo has 50 kHz."""
     assert bool(warned(f"block={block}")) == told
+
+
+@pytest.mark.parametrize(("block", "problems"), [(58, 1), (580, 0)])
+def test_a_block_too_small_for_the_rate_is_refused(block, problems):
+    """A T7 streams at most 29 kHz with blocks of 58."""
+    stream = Path(__file__).parents[3] / "configs" / "modbus_labjack_t7_stream.yaml"
+    found = load_experiment(stream, ["sample_rate_hz=50000", f"block={block}"])
+    keys = [each.key for each in device_rules._pace_problems(found)]
+    assert keys == ["block"] * problems
 
 
 def test_the_text_says_what_to_do():
