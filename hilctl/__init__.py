@@ -27,7 +27,7 @@ Devices stand in ``hilctl_drivers``, which sees ``base`` and ``kernels`` only.
 
 import os
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 # The matrices here are small: more BLAS threads make a fit many times slower on a busy machine, and
 # the loop's process must not have any. It takes effect where numpy is not imported yet.
