@@ -17,7 +17,7 @@ from contextlib import closing
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.formatting import printable
@@ -183,24 +183,6 @@ def _from_sql(kind: type, value: Any) -> Any:
     return bool(value) if kind is bool and value is not None else value
 
 
-class CatalogueHit(NamedTuple):
-    """A file in a listed folder.
-
-    Attributes:
-        file: The file.
-        path: Its path in the listed folder, as printable text.
-        size_bytes: Its size.
-        mtime_ns: Its modification time, Unix time in ns.
-        problem: Why it cannot be a recording, or empty.
-    """
-
-    file: str
-    path: str
-    size_bytes: int
-    mtime_ns: int
-    problem: str = ""
-
-
 def read_catalogue(folder: Path) -> list[Entry]:
     """Return the entries of all ``.mcap`` files in a folder, at any depth, sorted by path.
 
@@ -214,10 +196,13 @@ def read_catalogue(folder: Path) -> list[Entry]:
     except OSError as error:
         raise InputError(f"{folder}: can't be listed: {error.strerror}") from None
     cache = _cache_file(folder)
-    found = {(each.path, each.size_bytes, each.mtime_ns): each for each in _scan(str(folder), "")}
+    found = {_identity(entry): (file, entry) for file, entry in _scan(folder)}
     cached = _read_cache(cache)
     kept = [entry for entry in cached if found.pop(_identity(entry), None)]
-    new = [_entry(each) for each in found.values()]
+    new = [
+        entry if entry["problem"] else entry_of(file, *_identity(entry))
+        for file, entry in found.values()
+    ]
     finished = [entry for entry in new if entry["state"] == "finished"]
     if finished or len(kept) < len(cached):
         _write_cache(cache, [*kept, *finished])
@@ -270,40 +255,29 @@ def _write_cache(path: Path | None, entries: Sequence[Entry]) -> None:
         _log.warning("cannot write the cache, recordings are read again next time: %s", error)
 
 
-def _entry(found: CatalogueHit) -> Entry:
-    if found.problem:
-        return unreadable(found.path, found.size_bytes, found.mtime_ns, found.problem)
-    return entry_of(Path(found.file), found.path, found.size_bytes, found.mtime_ns)
+def _scan(folder: Path) -> Iterator[tuple[Path, Entry]]:
+    """Yield each possible recording and its entry, with its problem if it cannot be one.
 
-
-def _scan(folder: str, below: str) -> Iterator[CatalogueHit]:
-    """Yield the recordings in a folder; links to folders are not followed, to avoid cycles.
-
-    Args:
-        folder: The folder.
-        below: Its path in the listed folder, with a slash; empty for that folder.
+    Links to folders are not followed, to avoid cycles.
     """
-    try:
-        with os.scandir(folder) as listed:
-            entries = list(listed)
-    except OSError as error:
-        yield CatalogueHit(folder, below, 0, 0, f"can't be listed: {error.strerror}")
-        return
-    for entry in entries:
-        path = below + os.fsencode(entry.name).decode("utf-8", "backslashreplace")
-        if entry.is_dir(follow_symlinks=False):
-            yield from _scan(entry.path, f"{path}/")
-        elif entry.name.endswith(".mcap") and not entry.is_dir():
-            yield _found(entry, path)
+    unlisted: list[OSError] = []
+    for place, _, names in os.walk(folder, onerror=unlisted.append):
+        for file in (Path(place, name) for name in names if name.endswith(".mcap")):
+            path = _printable_path(file, folder)
+            try:
+                status = file.stat()
+            except OSError as error:
+                yield file, unreadable(path, 0, 0, f"can't be read: {error.strerror}")
+                continue
+            problem = "" if stat.S_ISREG(status.st_mode) else "is not a file"
+            yield file, unreadable(path, status.st_size, status.st_mtime_ns, problem)
+    for each in unlisted:
+        file, problem = Path(each.filename), f"can't be listed: {each.strerror}"
+        yield file, unreadable(f"{_printable_path(file, folder)}/", 0, 0, problem)
 
 
-def _found(entry: "os.DirEntry[str]", path: str) -> CatalogueHit:
-    try:
-        status = entry.stat()
-    except OSError as error:
-        return CatalogueHit(entry.path, path, 0, 0, f"can't be read: {error.strerror}")
-    problem = "" if stat.S_ISREG(status.st_mode) else "is not a file"
-    return CatalogueHit(entry.path, path, status.st_size, status.st_mtime_ns, problem)
+def _printable_path(file: Path, folder: Path) -> str:
+    return os.fsencode(file.relative_to(folder)).decode("utf-8", "backslashreplace")
 
 
 def unreadable(path: str, size_bytes: int, mtime_ns: int, problem: str) -> Entry:

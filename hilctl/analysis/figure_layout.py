@@ -3,9 +3,9 @@
 Text has the same size in all widths, so that one figure serves in print and on a page.
 """
 
-import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from textwrap import wrap
 from typing import Any, BinaryIO, Literal, TypeAlias
@@ -83,12 +83,7 @@ class FigureSpec:
 
 @mpl.rc_context(STYLE)
 def drawn(sheet: FigureSpec, width: ColumnWidth = "single") -> Figure:
-    """Draw a figure.
-
-    Args:
-        sheet: The figure.
-        width: One column of a journal, or two.
-    """
+    """Draw a figure for one or two columns of a journal."""
     columns = _columns(sheet, width)
     rows = -(-len(sheet.panels) // columns)
     whole_mm = COLUMN_MM[width]
@@ -114,10 +109,13 @@ def drawn(sheet: FigureSpec, width: ColumnWidth = "single") -> Figure:
             axes.set_xlabel("")
     for number, axes in enumerate(grid.flat[len(sheet.panels) :], len(sheet.panels)):
         axes.set_axis_off()
-        above = grid.flat[number - columns]
-        above.tick_params(labelbottom=True)
-    if sheet.alike:
-        _name_outer(grid, len(sheet.panels))
+        grid.flat[number - columns].tick_params(labelbottom=True)
+    if sheet.alike:  # name the outer axes only
+        for number, axes in enumerate(grid.flat):
+            if number % columns:
+                axes.set_ylabel("")
+            if number + columns < len(sheet.panels):
+                axes.set_xlabel("")
     _legend(figure, [axes for axes in grid.flat if axes.axison], whole_mm)
     if (layout := figure.get_layout_engine()) is not None:
         # Once for all formats, because it takes half the time of a figure.
@@ -139,18 +137,6 @@ def _columns(sheet: FigureSpec, width: ColumnWidth) -> int:
         return 2 if sheet.alike and len(sheet.panels) > 2 else 1
     count = len(sheet.panels)
     return min(2 if count == 4 else count, sheet.most_beside)
-
-
-def _name_outer(grid: Any, panels: int) -> None:
-    """Keep the labels of the outer axes only."""
-    rows, columns = grid.shape
-    for row in range(rows):
-        for column in range(columns):
-            axes = grid[row, column]
-            if column:
-                axes.set_ylabel("")
-            if (row + 1) * columns + column < panels:
-                axes.set_xlabel("")
 
 
 def _legend(figure: Figure, drawn_axes: list[Axes], whole_mm: float) -> None:
@@ -199,18 +185,11 @@ def write_figure(
     written = []
     for chosen in formats:
         path = folder / f"{name}.{chosen}"
-        content = _file(figure, chosen)
-
-        def write(stream: BinaryIO, content: bytes = content) -> None:
-            stream.write(content)
-
-        write_file(path, write, overwrite=overwrite)
+        write_file(path, partial(_write, figure, chosen), overwrite=overwrite)
         written.append(path)
     return written
 
 
 @mpl.rc_context(STYLE)
-def _file(figure: Figure, chosen: str) -> bytes:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format=chosen, dpi=_DPI, metadata=_UNDATED[chosen])
-    return buffer.getvalue()
+def _write(figure: Figure, chosen: str, stream: BinaryIO) -> None:
+    figure.savefig(stream, format=chosen, dpi=_DPI, metadata=_UNDATED[chosen])

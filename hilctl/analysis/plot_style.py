@@ -77,15 +77,9 @@ def pieces(recording: Recording) -> list[tuple[int, int, float]]:
 def draw_over_time(
     axes: Axes, recording: Recording, values: F64, colour: str, label: str, *, outline: bool = False
 ) -> None:
-    """Draw a signal over a whole run: as a line, or where cycles crowd as the band they fill.
+    """Draw a signal over a whole run: as a line, or as a band if its cycles are too narrow.
 
-    Args:
-        axes: Where to draw, time in s.
-        recording: The run.
-        values: float64[n], one a sample.
-        colour: Colour of line and band.
-        label: For the legend.
-        outline: Draw only a band's edges, so that another one can be seen in it.
+    An outline is a dashed line, or the edges of the band, so that another signal can be seen in it.
     """
     index = recording.samples.index
     rate_hz = recording.sample_rate_hz
@@ -124,10 +118,9 @@ def draw_line(
 
 def legend(axes: Axes) -> None:
     """Put a legend above the axes, at the right."""
-    handles, labels = axes.get_legend_handles_labels()
-    if labels:
-        corner = (1.0, 1.0)
-        axes.legend(loc="lower right", bbox_to_anchor=corner, borderaxespad=0.2, ncols=len(handles))
+    handles, _ = axes.get_legend_handles_labels()
+    corner = (1.0, 1.0)
+    axes.legend(loc="lower right", bbox_to_anchor=corner, borderaxespad=0.2, ncols=len(handles))
 
 
 def min_max(t: F64, values: F64, points: int = MAX_POINTS) -> tuple[F64, F64]:
@@ -146,7 +139,8 @@ def min_max(t: F64, values: F64, points: int = MAX_POINTS) -> tuple[F64, F64]:
     """
     if values.size <= points:
         return t, values
-    edges = _edges(values.size, max(1, points // 2))
+    stretches = max(1, points // 2)
+    edges = np.arange(stretches, dtype=np.int64) * values.size // stretches
     low, high = _extremes(values, edges)
     middle = t[(edges + np.append(edges[1:], values.size)) // 2]
     return np.repeat(middle, 2), np.column_stack((low, high)).ravel()
@@ -175,18 +169,8 @@ def band(index: I64, values: F64, period: float) -> tuple[F64, F64, F64]:
 
 
 def shown_as_band(samples: int, period: float, shown: int) -> bool:
-    """Return whether cycles are too narrow for a line.
-
-    Args:
-        samples: Number of samples with this period.
-        period: Samples in one period; 0.0 without one.
-        shown: Samples on the whole time axis.
-    """
+    """Return whether cycles are too narrow for a line, with ``shown`` samples on the time axis."""
     return 0.0 < period < shown * _NARROWEST_CYCLE and samples > 4.0 * period
-
-
-def _edges(size: int, stretches: int) -> I64:
-    return np.arange(stretches, dtype=np.int64) * size // stretches
 
 
 def _extremes(values: F64, edges: I64) -> tuple[F64, F64]:

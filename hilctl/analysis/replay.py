@@ -49,18 +49,9 @@ class PredictedError:
     recorded_peak_percent: float
     recorded_rms_percent: float
 
-    def to_mapping(self) -> dict[str, Any]:
-        """Return the fields as plain values."""
-        return asdict(self)
-
 
 class ErrorPrediction:
-    """Prediction of another model's error from pieces of a run.
-
-    Args:
-        model: The other model.
-        sample_rate_hz: Rate of the run.
-    """
+    """Prediction of another model's error from pieces of a run."""
 
     def __init__(self, model: HysteresisModel, sample_rate_hz: float) -> None:
         self._forward = model.forward(sample_rate_hz)
@@ -167,17 +158,17 @@ class _Running:
     Args:
         first: The first piece, with the facts of the run.
         model: Another model than the recorded one.
-        fades: Returns the events of bypassing and enabling the inverse, of all pieces.
+        find_fades: Returns the events of bypassing and enabling the inverse, of all pieces.
     """
 
     def __init__(
         self,
         first: Recording,
         model: HysteresisModel | None,
-        fades: Callable[[], Sequence[Event]],
+        find_fades: Callable[[], Sequence[Event]],
     ) -> None:
         self._path = first.path
-        self._find_fades = fades
+        self._find_fades = find_fades
         self._fades: Sequence[Event] | None = None
         if model is not None and not first.compensated:
             raise DataError(f"{first.path}: had no compensator: there is no reference to replay")
@@ -205,7 +196,7 @@ class _Running:
         if samples.index.size and not np.isfinite(samples.command).all():
             # The limiter has no others.
             raise DataError(f"{self._path}: /samples: every command must be finite")
-        if self._fades is None and (any(map(_is_fade, piece.events)) or _out(samples).any()):
+        if self._fades is None and (_fades([piece]) or _out(samples).any()):
             self._fades = self._find_fades()
         self._any_start = self._any_start or bool(piece.starts)
         self._starts += piece.starts
@@ -218,11 +209,7 @@ class _Running:
         self._waiting = samples.rows(slice(ready, None)) if self._held_back else None
 
     def result(self) -> ReplayResult:
-        """Return the comparison, after the last piece.
-
-        Raises:
-            DataError: There were no samples to recompute.
-        """
+        """Return the comparison, after the last piece."""
         if self._waiting is not None:
             self._go(self._waiting, self._waiting.index.size)
         if not self._any_start or self._comparison.compared == 0:
@@ -308,9 +295,6 @@ class _Running:
         """Return the share of the inverse in each sample, float64[n], and its linear bypass.
 
         None if the inverse was never bypassed.
-
-        Raises:
-            DataError: An event is missing in a damaged file.
         """
         if self._fades is None:
             return None
@@ -344,13 +328,9 @@ class _Running:
 
     def _skipped_on_ramp(self, samples: Samples, row: int) -> int:
         """Return the number of samples of a ramp that were skipped before a row."""
+        before = self._before
         if row:
-            before: tuple[int, int] | None = (
-                int(samples.index[row - 1]),
-                int(samples.flags[row - 1]),
-            )
-        else:
-            before = self._before
+            before = int(samples.index[row - 1]), int(samples.flags[row - 1])
         flags = int(samples.flags[row])
         if before is None or not flags & before[1] & Flag.RAMP.value:
             return 0
@@ -358,11 +338,7 @@ class _Running:
 
 
 def _fades(pieces: Iterable[Recording]) -> tuple[Event, ...]:
-    return tuple(event for piece in pieces for event in piece.events if _is_fade(event))
-
-
-def _is_fade(event: Event) -> bool:
-    return event.code == INVERSE
+    return tuple(event for piece in pieces for event in piece.events if event.code == INVERSE)
 
 
 def _out(samples: Samples) -> npt.NDArray[np.bool_]:

@@ -36,10 +36,7 @@ def run_rows(report: RunReport) -> list[tuple[str, str]]:
         *([("labels", printable(labels))] if labels else []),
         ("device", f"{printable(report.device) or MISSING}{simulated}"),
         ("ended", f"{reason}{'' if report.complete else ' (NOT complete)'}"),
-        (
-            "samples",
-            f"{report.samples:,} of the waveform, {report.ramp_samples:,} of ramps",
-        ),
+        ("samples", f"{report.samples:,} of the waveform, {report.ramp_samples:,} of ramps"),
         ("missing samples", f"{report.dropped:,}"),
         ("rate, length", f"{report.sample_rate_hz:g} Hz, {quantity(report.duration_s, 's', 4)}"),
         ("loop", f"displacement against {held_against}"),
@@ -69,7 +66,7 @@ def usage_text(usage: ProcessUsage) -> str:
 
 def quality_rows(report: RunReport) -> list[tuple[str, str]]:
     """Return name and value of the metrics."""
-    floor = number(report.noise_floor_percent, "%")
+    floor, noise_um = number(report.noise_floor_percent, "%"), report.sensor_noise_um
     raw = f"{number(report.peak_error_raw_percent, '%')} peak, "
     raw += f"{number(report.rms_error_raw_percent, '%')} rms"
     rows = [
@@ -79,7 +76,7 @@ def quality_rows(report: RunReport) -> list[tuple[str, str]]:
         ("peak error", number(report.peak_error_percent, "%")),
         ("rms error", number(report.rms_error_percent, "%")),
         ("error, not averaged", raw),
-        ("sensor noise", _nanometres(report.sensor_noise_um)),
+        ("sensor noise", MISSING if noise_um is None else f"{number(noise_um, 'um')} rms"),
         ("steady cycles", f"{report.steady_cycles:,}"),
         ("steady samples", f"{report.steady_samples:,}"),
     ]
@@ -119,10 +116,6 @@ def _range(low: float | None, high: float | None, unit: str) -> str:
 
 def _count(value: int | None) -> str:
     return MISSING if value is None else f"{value:,}"
-
-
-def _nanometres(noise_um: float | None) -> str:
-    return MISSING if noise_um is None else f"{number(noise_um, 'um')} rms"
 
 
 def _percentiles(figures: dict[str, float]) -> str:

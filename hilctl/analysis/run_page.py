@@ -36,7 +36,7 @@ def write_html(
 
     Args:
         recording: The run.
-        report: Its figures.
+        report: Its metrics.
         path: File to write.
         before: The same motion without a compensator, for comparison.
 
@@ -119,12 +119,7 @@ def _figures(recording: Recording, report: RunReport, before: Recording | None) 
 
 
 def run_sheets(recording: Recording, report: RunReport) -> list[FigureSpec]:
-    """Return the applicable figures of a run.
-
-    Args:
-        recording: The run.
-        report: Its figures.
-    """
+    """Return the applicable figures of a run."""
     if not _drawable(recording):
         return []
     return [sheet for sheet, _ in _sheets(recording, report, None) if sheet is not None]
@@ -188,18 +183,17 @@ def _rows(recording: Recording) -> Iterator[tuple[str, str]]:
     yield "date", _date(run.get("started", ""))
     for key, value in recording.labels.items():
         yield key, str(value)
-    simulated = " (simulated: no hardware was driven)" if run.get("simulated") == "true" else ""
+    simulated = f" ({report_table.SIMULATED})" if run.get("simulated") == "true" else ""
     yield "device", f"{run.get('device', '')}{simulated}"
     yield "device is", run.get("device_description", "")
-    computer = ", ".join(filter(None, (run.get("host", ""), run.get("kernel", ""))))
-    yield "computer", computer
+    yield "computer", ", ".join(filter(None, (run.get("host", ""), run.get("kernel", ""))))
     yield "hilctl", run.get("hilctl", "")
     segments = recording.segments
     more = f" and {len(segments) - 1} more" if len(segments) > 1 else ""
     yield "waveform", f"{segments[0].label}{more}" if segments else ""
     yield "its settings", _settings(recording)
-    yield "limits", _limits(run.get("limits", ""))
-    yield "overrides", _overrides(run.get(OVERRIDES_FACT, ""))
+    yield "limits", _listed(run.get("limits", ""))
+    yield "overrides", _listed(run.get(OVERRIDES_FACT, ""))
     yield from _model(recording)
 
 
@@ -221,22 +215,15 @@ def _settings(recording: Recording) -> str:
     return ", ".join([*shown, *([f"unit {unit}"] if unit else [])])
 
 
-def _limits(text: str) -> str:
+def _listed(text: str) -> str:
+    """Return the members of a mapping or list in JSON; any other text as it is."""
     try:
-        limits = json.loads(text or "{}")
+        found = json.loads(text)
     except ValueError:
         return text
-    if not isinstance(limits, dict):
-        return text
-    return ", ".join(f"{key} {value}" for key, value in limits.items())
-
-
-def _overrides(text: str) -> str:
-    try:
-        settings = json.loads(text or "[]")
-    except ValueError:
-        return text
-    return ", ".join(map(str, settings)) if isinstance(settings, list) else text
+    if isinstance(found, dict):
+        found = [f"{key} {value}" for key, value in found.items()]
+    return ", ".join(map(str, found)) if isinstance(found, list) else text
 
 
 def _model(recording: Recording) -> Iterator[tuple[str, str]]:

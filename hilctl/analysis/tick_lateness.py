@@ -4,7 +4,6 @@ import numpy as np
 
 from hilctl.analysis.quantiles import MOST_EXACT, Quantiles
 from hilctl.base.errors import DataError
-from hilctl.base.types import I64
 from hilctl.loop.pacer import USUAL_MISSED_SHARE, deadline_misses
 from hilctl.recording.recording import Recording, Ticks
 
@@ -57,16 +56,16 @@ class LatenessBuilder:
     def _end_row(self) -> None:
         if self._of_minute.size:
             counted = {"minute": self._minute, "ticks": self._of_minute.size}
-            self._rows.append({**counted, **_percentiles_us(self._of_minute)})
+            self._rows.append({**counted, **percentiles_us(self._of_minute)})
         self._of_minute = Quantiles()
 
     def late_us(self) -> dict[str, float]:
         """Return the percentiles of lateness, see :func:`percentiles_us`."""
-        return _percentiles_us(self._late)
+        return percentiles_us(self._late)
 
     def exchange_us(self) -> dict[str, float]:
         """Return the percentiles of the duration of exchanges."""
-        return _percentiles_us(self._exchange)
+        return percentiles_us(self._exchange)
 
     def by_minute(self) -> list[dict[str, float]]:
         """Return the lateness of each minute with ticks, after the last tick.
@@ -82,17 +81,8 @@ class LatenessBuilder:
         return self._late.above(0.5 * self._steps.median()) if self._steps.size else None
 
 
-def percentiles_us(times_ns: I64) -> dict[str, float]:
-    """Return ``p50``, ``p90``, ``p99``, ``p99.9`` and ``max`` in us of int64[m] in ns.
-
-    Empty without ticks.
-    """
-    quantiles = Quantiles()
-    quantiles.add(times_ns)
-    return _percentiles_us(quantiles)
-
-
-def _percentiles_us(times_ns: Quantiles) -> dict[str, float]:
+def percentiles_us(times_ns: Quantiles) -> dict[str, float]:
+    """Return ``p50``, ``p90``, ``p99``, ``p99.9`` and ``max`` in us; empty without times."""
     if times_ns.size == 0:
         return {}
     values = [each * 1e-3 for each in times_ns.percentiles(list(_PERCENTILES.values()))]
@@ -108,10 +98,6 @@ def tick_period_ns(ticks: Ticks) -> float | None:
 
 def misses(recording: Recording, ticks: int) -> str:
     """Return a text on the share of skipped ticks; empty if there are none or it is unknown.
-
-    Args:
-        recording: The run.
-        ticks: Ticks that were not skipped.
 
     Raises:
         DataError: A recorded number is invalid.

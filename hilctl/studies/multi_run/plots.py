@@ -24,6 +24,7 @@ from hilctl.studies.multi_run.run_plots import (
     loop_sheets,
     minor_loop_sheet,
     model_sheet,
+    note,
     spread,
     step_sheet,
 )
@@ -44,7 +45,7 @@ from hilctl.studies.multi_run.trend import (
     axis_name,
     trends,
 )
-from hilctl.studies.multi_run.varied_parameter import VariedParameter
+from hilctl.studies.multi_run.varied_parameter import VariedParameter, texts_of
 
 _WIDE_RATIO = 30.0  # of a range that needs a logarithmic axis
 _MANY = 10
@@ -61,7 +62,7 @@ def trend_sheets(series: RunSeries) -> Iterator[FigureSpec]:
 
     Stroke and area are plotted for runs without a compensator: with one, they follow the reference.
     """
-    plain = [run for run in series.done if run.digest is None or run.digest.is_plain_loop]
+    plain = series.plain
     for along in series.dimensions:
         if not along.numeric:
             continue
@@ -106,20 +107,13 @@ def _trend_panels(
 
 
 def draw_trends(axes: Axes, series: RunSeries, found: Sequence[Trend], *, fitted: bool) -> None:
-    """Plot the trends of one metric, one line per combination of the other parameters.
-
-    Args:
-        axes: Axes to plot in.
-        series: The runs.
-        found: The trends.
-        fitted: Whether to plot linear fits.
-    """
+    """Plot the trends of one metric, one line per combination of the other parameters."""
     along, figure = found[0].along, found[0].figure
     found = spread(found, _MOST_LINES)
     others = [each for each in series.dimensions if each is not along]
     apart = (e for e in others if len({t.held.get(e.key) for t in found}) == len(found))
     first = next(apart, None)  # a parameter that distinguishes all lines
-    names = [_held(others, trend) or figure.text for trend in found]
+    names = [texts_of(others, trend.held) or figure.text for trend in found]
     look = _looks(first, found)
     logarithmic = _is_logarithmic(along)
     fitted = fitted and not logarithmic and figure in _FITTED
@@ -133,9 +127,7 @@ def draw_trends(axes: Axes, series: RunSeries, found: Sequence[Trend], *, fitted
     r2 = [trend.r2 for trend in found if trend.r2 is not None]
     if fitted and r2:
         texts = dict.fromkeys(f"{value:.4f}" for value in (min(r2), max(r2)))
-        span = " to ".join(texts)
-        axes.annotate(f"r² = {span}", (0.03, 0.97), xycoords="axes fraction", va="top",
-                      fontsize=7, color=QUIET)  # fmt: skip
+        note(axes, f"r² = {' to '.join(texts)}")
     if logarithmic:
         axes.set_xscale("log")
         axes.xaxis.set_major_formatter("{x:g}")
@@ -161,11 +153,6 @@ def _looks(first: VariedParameter | None, found: Sequence[Trend]) -> list[dict[s
     return [dict(of[trend.held[first.key]]) for trend in found]
 
 
-def _held(others: Sequence[VariedParameter], trend: Trend) -> str:
-    texts = [e.text(trend.held[e.key]) for e in others if trend.held.get(e.key) is not None]
-    return ", ".join(texts)
-
-
 def resonance_sheet(series: RunSeries) -> FigureSpec | None:
     """Return natural frequency and damping against a parameter; None without any."""
     for along in series.dimensions:
@@ -183,9 +170,9 @@ def sensitivity_sheet(series: RunSeries) -> FigureSpec | None:
     Sensitivity is the change of the mean over all other parameters, in percent of the total mean.
     """
     numbers = [each for each in series.dimensions if len(each.values) > 1]
-    plain = [run for run in series.done if run.digest is None or run.digest.is_plain_loop]
-    figures = (STROKE, HYSTERESIS, AREA) if len(plain) > 1 else (HYSTERESIS, PEAK_ERROR, RMS_ERROR)
-    runs = plain if len(plain) > 1 else list(series.done)
+    runs, figures = series.plain, (STROKE, HYSTERESIS, AREA)
+    if len(runs) < 2:
+        runs, figures = series.done, (HYSTERESIS, PEAK_ERROR, RMS_ERROR)
     found = [(figure, _changes(figure, numbers, runs)) for figure in figures]
     panels = tuple(
         Panel(partial(_draw_bars, bars=bars), figure.text, 0.12 + 0.09 * len(bars))
@@ -261,21 +248,20 @@ def _draw_order(axes: Axes, figure: RunFigure, runs: Sequence[SeriesRun]) -> Non
 
 def sheets_of(series: RunSeries) -> list[FigureSpec]:
     """Return all figures that apply, the most important first."""
-    return [sheet for sheet in _sheets(series) if sheet is not None]
-
-
-def _sheets(series: RunSeries) -> Iterator[FigureSpec | None]:
-    yield before_after_sheet(series)
-    yield resonance_sheet(series)
-    yield frequency_sheet(series)
-    yield step_sheet(series)
-    yield from trend_sheets(series)
-    yield from loop_sheets(series)
-    yield minor_loop_sheet(series)
-    yield model_sheet(series)
-    yield error_sheet(series)
-    yield sensitivity_sheet(series)
-    yield order_sheet(series)
+    sheets = (
+        before_after_sheet(series),
+        resonance_sheet(series),
+        frequency_sheet(series),
+        step_sheet(series),
+        *trend_sheets(series),
+        *loop_sheets(series),
+        minor_loop_sheet(series),
+        model_sheet(series),
+        error_sheet(series),
+        sensitivity_sheet(series),
+        order_sheet(series),
+    )
+    return [sheet for sheet in sheets if sheet is not None]
 
 
 def write_sheets(
@@ -335,11 +321,7 @@ def _drawn(
 
 
 def applying_sheets(series: RunSeries) -> list[FigureSpec]:
-    """Return all figures that apply to runs.
-
-    Raises:
-        InputError: No figure applies.
-    """
+    """Return all figures that apply to runs; raise InputError if there are none."""
     sheets = sheets_of(series)
     if not sheets:
         raise InputError(f"{series.name}: no figure applies to the completed runs")

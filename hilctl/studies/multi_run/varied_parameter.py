@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import PurePath
 from typing import Any
@@ -74,6 +74,20 @@ class VariedParameter:
             shown = f"{number:g}" if len(f"{number:g}") <= 6 else significant(number)
             return f"{shown} {unit_text(self.unit)}".rstrip()
         return WITHOUT_COMPENSATOR if self.is_compensator and value == "none" else str(value)
+
+
+def texts_of(parameters: Iterable[VariedParameter], values: Mapping[str, Hashable]) -> str:
+    """Return the values of parameters with their units, separated by commas."""
+    known = [each for each in parameters if values.get(each.key) is not None]
+    return ", ".join(each.text(values[each.key]) for each in known)
+
+
+def rank_of(parameters: Iterable[VariedParameter], values: Mapping[str, Hashable]) -> list[int]:
+    """Return the place of each parameter's value among its values; -1 without one."""
+    return [
+        each.values.index(values[each.key]) if values.get(each.key) in each.values else -1
+        for each in parameters
+    ]
 
 
 def value_at(values: Mapping[str, Any], key: str) -> Hashable:

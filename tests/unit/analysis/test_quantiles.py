@@ -58,11 +58,3 @@ def test_memory_does_not_grow(small):
     assert found._values is None
     assert found.size == 200_000
     assert np.count_nonzero(found._counts) < 120_000
-
-
-def test_of_nothing_there_is_no_largest():
-    found = Quantiles()
-    found.add(np.empty(0))
-    assert found.size == 0
-    with pytest.raises(ValueError, match="no values"):
-        _ = found.largest

@@ -23,15 +23,10 @@ def lateness(ticks: Ticks, minutes: float = 1.0) -> LatenessBuilder:
 
 
 def test_percentiles_are_in_microseconds() -> None:
-    """Of 1 to 1001 us, the percentiles are where they belong, and the maximum is the last."""
-    found = tick_lateness.percentiles_us(1_000 * np.arange(1, 1002, dtype=np.int64))
+    found = lateness(ticks([1_000 * k for k in range(1, 1002)]))
     expected = {"p50": 501.0, "p90": 901.0, "p99": 991.0, "p99.9": 1000.0, "max": 1001.0}
-    assert found == pytest.approx(expected)
-
-
-def test_percentiles_of_nothing_are_empty() -> None:
-    """Without ticks there are no percentiles."""
-    assert tick_lateness.percentiles_us(np.empty(0, dtype=np.int64)) == {}
+    assert found.late_us() == found.exchange_us() == pytest.approx(expected)
+    assert lateness(ticks([])).late_us() == {}
 
 
 def test_late_is_more_than_half_a_period() -> None:
