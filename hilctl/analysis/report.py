@@ -61,11 +61,8 @@ def build_report(
     """Return the builder of a report after the last piece.
 
     The pieces are read again if the evaluated samples turn out to differ from the planned ones.
-
-    Args:
-        pieces: Pieces of the run in order, as a repeatable iterable.
-        observe: Called with the evaluated samples before each reading; returns a function that is
-            called with each piece.
+    ``observe`` is called with the evaluated samples before each reading; it returns a function
+    that is called with each piece.
 
     Raises:
         DataError: There is no piece.

@@ -68,12 +68,7 @@ def judged(segment: Segment, events: Iterable[Event], end: int) -> tuple[int, in
     """Return the evaluated samples of a segment: first, after the last, and whole cycles.
 
     In a truncated segment they are its last whole cycles; in a tuned one they follow the last
-    change.
-
-    Args:
-        segment: The segment.
-        events: Events of the run, in order.
-        end: Index after the last sample of the waveform.
+    change. ``end`` is the index after the last sample of the waveform.
     """
     begin = max(segment.steady_start, _tuned_until(events, segment))
     stop = min(segment.steady_stop, end)

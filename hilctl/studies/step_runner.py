@@ -38,14 +38,7 @@ class RunFunction(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class StudyHost:
-    """Runs, time and observers of a study.
-
-    Attributes:
-        run: Runs one step.
-        now_s: Returns the Unix time in s.
-        sleep_s: Sleeps for a time in s.
-        on_progress: Called with progress from 0 to 1 and a description.
-    """
+    """Runs, time and observers of a study; progress is from 0 to 1, with a description."""
 
     run: RunFunction = paced
     now_s: Callable[[], float] = time.time
@@ -55,10 +48,6 @@ class StudyHost:
 
 class StepRunner:
     """Run steps, wait for the coil to cool, and report progress.
-
-    Args:
-        host: Runs and observes.
-        total_s: Planned time of all steps.
 
     Attributes:
         done_s: Planned time of the steps that are done.
@@ -79,17 +68,7 @@ class StepRunner:
         overwrite: bool,
         heat_a2: float = 0.0,
     ) -> RunResult:
-        """Run one step.
-
-        Args:
-            path: Experiment file.
-            settings: ``key=value`` texts over it.
-            output: Recording to write.
-            text: Description of the step.
-            seconds: Planned time of the step.
-            overwrite: Whether an existing recording may be replaced.
-            heat_a2: Least heat of the coil before the run, in A^2.
-        """
+        """Run one step, which takes ``seconds``, with at least the heat ``heat_a2`` in its coil."""
 
         def on_part(part: float) -> None:
             self.show(text, part * seconds)

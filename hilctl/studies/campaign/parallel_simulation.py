@@ -56,7 +56,6 @@ class FastRun:
     Attributes:
         recording: Its recording as bytes; empty if it was refused.
         code: ``completed``, ``fault`` or ``refused``.
-        reason: Why it ended, in one line.
         harmless: Whether the next step may run.
         digest: Data of its recording; None if it was not completed.
     """

@@ -48,7 +48,6 @@ class CampaignSteps:
     """A campaign file with its steps, not checked yet.
 
     Attributes:
-        config: The file.
         document: The file's YAML with the location of each value.
         experiment: File of the base experiment.
         settings: ``key=value`` texts over it from outside the campaign file.
@@ -77,10 +76,6 @@ class CampaignSteps:
         """Return all ``key=value`` texts of a step, outermost last.
 
         Each run of a simulated device gets its own, reproducible noise.
-
-        Raises:
-            InputError: The base experiment can't be read.
-            ConfigError: A setting is invalid.
         """
         settings = [*self.settings, *step.settings]
         document = load_document(self.experiment, files)

@@ -50,11 +50,6 @@ def locked_folder(
 ) -> Iterator[None]:
     """Create a campaign's folder, and lock it against other campaigns.
 
-    Args:
-        folder: The folder.
-        sleep_s: Sleeps for a time in s.
-        wait_s: Time to wait for the lock.
-
     Raises:
         InputError: The folder can't be created, or another campaign uses it.
     """
@@ -94,10 +89,8 @@ def _locked(held: int) -> bool:
 def await_runs(folder: Path, sleep_s: Callable[[float], None]) -> None:
     """Wait for runs that record to a folder and whose supervisor has died.
 
-    Their loop ends by its safe ramp when it misses the supervisor's heartbeat.
-
-    Raises:
-        InputError: A run does not end.
+    Their loop ends by its safe ramp when it misses the supervisor's heartbeat. Raise InputError if
+    a run does not end.
     """
     waited_s = 0.0
     while living := [run for run in runs() if run.alive and _is_in(run, folder)]:

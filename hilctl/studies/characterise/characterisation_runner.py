@@ -50,16 +50,7 @@ def unit_of(experiment: Path, settings: Sequence[str]) -> CommandUnit:
 
 
 def without_reference(experiment: Path, settings: Sequence[str]) -> list[str]:
-    """Return settings that remove the compensator and everything that needs one.
-
-    Args:
-        experiment: Experiment file.
-        settings: ``key=value`` texts over it.
-
-    Raises:
-        InputError: The file can't be read.
-        ConfigError: The file is not YAML, or a setting is invalid.
-    """
+    """Return settings that remove the compensator and everything that needs one."""
     document = _document(experiment, settings)
     found = ["compensator=none"]
     found += [f"{key}=null" for key in ("feedback", "adaptation") if document.holds((key,))]
@@ -96,7 +87,6 @@ class CharacterisationPlan:
     """Plan of a characterisation, at full amplitude.
 
     Attributes:
-        limits: Its limits.
         steps: Its steps; most polarity and response steps are skipped in the end.
         pauses_s: Time for the coil to cool.
         free_mb: Free disk space.
@@ -216,7 +206,11 @@ class CharacterisationRunner:
             RunError: A step ended by a fault that is no known problem of the rig.
         """
         check_writable(output, overwrite=overwrite)
-        self._make_room()
+        require_room(self._folder, self.plan.megabytes, self.plan.free_mb)
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"{self._folder}: can't be created: {error.strerror}") from None
         result = Characterisation(
             experiment=self._loaded.config.name,
             device=self._loaded.device.info.name,
@@ -226,26 +220,16 @@ class CharacterisationRunner:
             measured=self._measured,
         )
         try:
-            self._run_steps()
+            for number, step in enumerate(STEPS, 1):
+                keys = step.waveform(self.limits, self._measured)
+                if keys is not None:
+                    self._do(number, step, keys)
             return self._with_model(result, output, overwrite=overwrite)
         except RigProblemError as error:
             return replace(self._so_far(result), problem=str(error), problem_code=error.code)
 
     def _so_far(self, result: Characterisation) -> Characterisation:
         return replace(result, steps=tuple(self._rows), measured=self._measured)
-
-    def _make_room(self) -> None:
-        require_room(self._folder, self.plan.megabytes, self.plan.free_mb)
-        try:
-            self._folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(f"{self._folder}: can't be created: {error.strerror}") from None
-
-    def _run_steps(self) -> None:
-        for number, step in enumerate(STEPS, 1):
-            keys = step.waveform(self.limits, self._measured)
-            if keys is not None:
-                self._do(number, step, keys)
 
     def _do(self, number: int, step: CharacterisationStep, keys: Keys) -> None:
         keys, command = within(self.limits, keys)
@@ -265,9 +249,8 @@ class CharacterisationRunner:
         self._coil.ran(heat, min(path.stat().st_mtime, now_s) if kept else now_s)
         self._recordings[step.name] = path
         seconds = command.size / self.limits.sample_rate_hz
-        row = StepRow(
-            step.name, step.purpose, seconds, path.stat().st_size / 1e6, "", str(path), kept
-        )
+        megabytes = path.stat().st_size / 1e6
+        row = StepRow(step.name, step.purpose, seconds, megabytes, "", str(path), kept)
         self._rows.append(row)
         self._measured, text = step.take(recording, self.limits, self._measured)
         self._rows[-1] = replace(row, text=text)
@@ -276,8 +259,8 @@ class CharacterisationRunner:
     def _recorded(
         self, step: CharacterisationStep, settings: list[str], path: Path, seconds: float
     ) -> Recording:
+        text = f"{step.name}: {step.purpose}"
         try:
-            text = f"{step.name}: {step.purpose}"
             result = self._runner.run(
                 self._experiment, settings, path, text, seconds, overwrite=True
             )
@@ -305,8 +288,7 @@ class CharacterisationRunner:
     def _pause_s(self, heat: RunHeat) -> float:
         """Return the time to cool after the steps so far and the device's last run."""
         now_s = self._host.now_s()
-        last_a2 = heat_before(self._loaded, now_s)
-        last = CoolingCoil(self._loaded.config, last_a2, now_s)
+        last = CoolingCoil(self._loaded.config, heat_before(self._loaded, now_s), now_s)
         return max(coil.pause_s(heat, now_s) for coil in (self._coil, last))
 
     def _with_model(

@@ -49,7 +49,6 @@ class SeriesRun:
         number: Its position, from 1.
         is_reference: Whether it is a reference run of a campaign.
         values: Value of each varied key, as a number or short text.
-        figures: Its metrics.
         result: ``completed``, ``planned``, or code and reason.
         recording: Name of its recording, or empty.
         digest: Data of its recording for figures, or None.

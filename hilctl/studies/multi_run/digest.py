@@ -216,19 +216,11 @@ class RunDigest:
     """Data of one run, a few kilobytes for a run of any length.
 
     Attributes:
-        name: Name of the experiment.
-        path: File of the recording.
         started: When it began, ISO 8601.
-        labels: Its labels.
-        device: Name of the device.
-        simulated: Whether the device is simulated.
         code: ``completed``, ``stopped`` or ``fault``; empty if no end was recorded.
         reason: Why it ended.
         values: Its experiment as plain values, nested as in the file.
-        compensated: Whether a compensator was used.
-        command_unit: ``A`` or ``V``.
         waveform: Label of the evaluated segment.
-        figures: Metrics of the run.
         loop: float64[2, m], input and displacement of the evaluated loop, closed; see
             :class:`hilctl.analysis.steady_state.SteadyPart`. Empty without a cycle.
         error_um: float64[2, m], phase in cycles and error in um; empty without a reference.
@@ -266,11 +258,7 @@ class RunDigest:
 
 
 def digest_of(recording: Recording, model: HysteresisModel | None = None) -> RunDigest:
-    """Return the digest of a recording.
-
-    Args:
-        recording: The run.
-        model: Model to compare with the measurement; the recorded one if None.
+    """Return the digest of a recording, compared with a model, the recorded one if None.
 
     Raises:
         DataError: A metadata value is not a number.

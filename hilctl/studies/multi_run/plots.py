@@ -298,7 +298,7 @@ def write_sheets(
         raise InputError(f"{folder}: can't be created: {error.strerror}") from None
     written: dict[Path, str] = {}
     captions = {sheet.name: sheet.caption for sheet in sheets}
-    for name, figure in _drawn(sheets, width, on_done):
+    for name, figure in draw_sheets(sheets, width, on_done):
         on_drawn(name, figure)
         paths = write_figure(figure, folder, name, formats, overwrite=overwrite)
         written |= dict.fromkeys(paths, captions[name])
@@ -306,15 +306,9 @@ def write_sheets(
 
 
 def draw_sheets(
-    sheets: Sequence[FigureSpec], width: ColumnWidth, on_done: OnRead = lambda done, text: None
-) -> dict[str, Figure]:
-    """Return figures by their names; see :func:`write_sheets`."""
-    return dict(_drawn(sheets, width, on_done))
-
-
-def _drawn(
     sheets: Sequence[FigureSpec], width: ColumnWidth, on_done: OnRead
 ) -> Iterator[tuple[str, Figure]]:
+    """Yield the name of each figure and the figure; see :func:`write_sheets`."""
     for number, sheet in enumerate(sheets):
         on_done(number / len(sheets), f"draw {sheet.name}")
         yield sheet.name, drawn(sheet, width)

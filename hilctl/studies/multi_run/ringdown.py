@@ -26,13 +26,7 @@ _RATES = (0.1, 0.5, 2.0)  # of the creep, over the angular frequency
 
 @dataclass(frozen=True, slots=True)
 class Ringing:
-    """The ringing after a step.
-
-    Attributes:
-        natural_hz: Undamped natural frequency.
-        damping_ratio: Its damping ratio.
-        misfit_um: rms residual of the fit.
-    """
+    """The ringing after a step: undamped natural frequency, damping, rms residual of the fit."""
 
     natural_hz: float
     damping_ratio: float

@@ -87,8 +87,6 @@ class Trend:
     """A metric against one varied parameter, with the others constant.
 
     Attributes:
-        figure: The metric.
-        along: The varied parameter.
         held: Value of each other parameter, by its key.
         x: float64[n], values of ``along``, ascending.
         y: float64[n], the metric, averaged over repeats.

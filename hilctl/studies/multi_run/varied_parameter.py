@@ -37,7 +37,6 @@ class VariedParameter:
 
     Attributes:
         key: Dotted key of the experiment.
-        name: Its name.
         unit: Its unit, or empty.
         values: Its values: numbers in ascending order, others in the order of the runs.
     """

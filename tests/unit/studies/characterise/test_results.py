@@ -94,11 +94,6 @@ def test_json_begins_with_the_held_out_error_and_has_no_signals():
     assert mapping["rig_time_s"] == 2.0
 
 
-def test_more_is_known_from_step_to_step():
-    more = FOUND.measured.also(growing=(LOOP, LOOP))
-    assert (len(more.growing), more.rest) == (2, FOUND.measured.rest)
-
-
 MODEL = PpiModel(
     direct=3.0, thresholds=(0.5,), weights=(2.0,), input_range=(-1.0, 1.0)
 )  # fmt: skip

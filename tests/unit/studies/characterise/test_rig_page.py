@@ -71,8 +71,12 @@ DRAWN = replace(LOOP, command=LINE, displacement_um=LINE)
 WHOLE = replace(
     FOUND,
     held_out=(SEEN,),
-    measured=FOUND.measured.also(
-        small=SMALL, growing=(DRAWN,), reversal=None, fast=(DRAWN, replace(DRAWN, amplitude=0.2))
+    measured=replace(
+        FOUND.measured,
+        small=SMALL,
+        growing=(DRAWN,),
+        reversal=None,
+        fast=(DRAWN, replace(DRAWN, amplitude=0.2)),
     ),
 )
 
@@ -90,7 +94,7 @@ def test_the_held_out_error_comes_first():
 def test_what_ended_a_campaign_stands_on_top():
     """The page has the problem first and the earlier measurements."""
     stopped = replace(
-        FOUND, held_out=(), problem="no <reaction>: look", measured=FOUND.measured.also(
+        FOUND, held_out=(), problem="no <reaction>: look", measured=replace(FOUND.measured,
             growing=(), reversal=None
         ),
         steps=(StepRow("rest", "noise & drift", 2.0, 0.1, "0.03 um", "/x/01-rest.mcap"),),
