@@ -98,15 +98,11 @@ def keys_of(entries: Iterable[Entry]) -> list[str]:
 def select(
     entries: Sequence[Entry], where: str = "", sort: str = "started", *, reverse: bool = False
 ) -> list[Entry]:
-    """Return the recordings that match a condition, sorted.
+    """Return the recordings that match a condition, sorted; those without the sort key are last.
 
-    Args:
-        entries: The recordings.
-        where: A condition in the SQL of SQLite on the names of :func:`keys_of`; empty for all. A
-            text may be in double quotes. A key with other characters is in square brackets, such
-            as ``[label.batch no]``.
-        sort: Key to sort by; recordings without it are last.
-        reverse: Largest or newest first.
+    The condition is in the SQL of SQLite on the names of :func:`keys_of`; empty for all. A text may
+    be in double quotes. A key with other characters is in square brackets, such as ``[label.batch
+    no]``.
 
     Raises:
         InputError: The condition is not valid, or a key is unknown.
@@ -288,14 +284,7 @@ def unreadable(path: str, size_bytes: int, mtime_ns: int, problem: str) -> Entry
 
 
 def entry_of(file: Path, path: str, size_bytes: int, mtime_ns: int) -> Entry:
-    """Return the entry of a file, by both its ends.
-
-    Args:
-        file: The file.
-        path: Its name in the catalogue.
-        size_bytes: Its size.
-        mtime_ns: Its modification time, in ns.
-    """
+    """Return the entry of a file by both its ends; ``path`` is its name in the catalogue."""
     # A cached catalogue does not need these imports, which take a second.
     from hilctl.recording.run_summary import read_ends
     from hilctl.recording.validation import labels_of, segments_of

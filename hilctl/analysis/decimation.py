@@ -33,14 +33,9 @@ _Columns = TypeVar("_Columns", Samples, Ticks)
 def overview(pieces: Iterable[Recording]) -> tuple[RunReport, Recording]:
     """Return the report of a recording, and a decimated recording with the same plots.
 
-    Ticks are decimated evenly; the latest one is kept.
-
-    Args:
-        pieces: Pieces of the run in order, as a repeatable iterable: a run that ended early or was
-            tuned is read twice.
-
-    Raises:
-        DataError: As :func:`hilctl.analysis.report.summarize` does.
+    Ticks are decimated evenly; the latest one is kept. The pieces of the run are a repeatable
+    iterable, because a run that ended early or was tuned is read twice. Raise DataError as
+    :func:`hilctl.analysis.report.summarize` does.
     """
     shown: list[_Shown] = []
 

@@ -84,13 +84,7 @@ def write_pieces(
 ) -> int:
     """Write the samples of pieces, and the facts of the last one; return the number of samples.
 
-    Args:
-        pieces: At least one, in order.
-        file: Where to write.
-        table_of: Returns the columns of a piece; :func:`columns` by default.
-
-    Raises:
-        DataError: There is no sample.
+    ``table_of`` returns the columns of a piece; :func:`columns` by default.
     """
     rows = 0
     waiting: deque[Future[None]] = deque()

@@ -44,7 +44,6 @@ class CsvFile:
     """CSV file, without facts."""
 
     def __init__(self, stream: BinaryIO, aside: IO[bytes] | None = None) -> None:
-        del aside
         self._stream = stream
         self._line = ""
 
@@ -96,7 +95,6 @@ class ParquetFile:
     """
 
     def __init__(self, stream: BinaryIO, aside: IO[bytes] | None = None) -> None:
-        del aside
         self._pa = arrow()
         file = self._pa.PythonFile(_RefusedOnce(stream), mode="w")
         self._stream = self._pa.BufferedOutputStream(file, _WRITTEN_BYTES)

@@ -174,10 +174,7 @@ def formats_of(text: str) -> tuple[str, ...]:
 def write_figure(
     figure: Figure, folder: Path, name: str, formats: Sequence[str], *, overwrite: bool
 ) -> list[Path]:
-    """Write a figure atomically in several formats.
-
-    Returns:
-        The files, ``NAME.FORMAT`` in the folder.
+    """Write a figure atomically as ``NAME.FORMAT`` in several formats; return the files.
 
     Raises:
         InputError: A file exists and may not be replaced, or cannot be written.

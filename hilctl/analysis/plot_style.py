@@ -127,15 +127,7 @@ def min_max(t: F64, values: F64, points: int = MAX_POINTS) -> tuple[F64, F64]:
     """Reduce a signal to the lowest and highest value of each of equal intervals.
 
     Every spike is kept. Values that are not finite are omitted; an interval without others is NaN,
-    which breaks the line.
-
-    Args:
-        t: float64[n].
-        values: float64[n].
-        points: Most points to return, >= 2.
-
-    Returns:
-        t and values, float64[m] each, m <= max(points, 2).
+    which breaks the line. Returns t and values, float64[m] each, m <= max(points, 2).
     """
     if values.size <= points:
         return t, values
@@ -149,15 +141,8 @@ def min_max(t: F64, values: F64, points: int = MAX_POINTS) -> tuple[F64, F64]:
 def band(index: I64, values: F64, period: float) -> tuple[F64, F64, F64]:
     """Reduce a periodic signal to its band, on intervals of at least one period.
 
-    Shorter intervals would beat with the period.
-
-    Args:
-        index: int64[n], n > 0, increasing sample indices.
-        values: float64[n].
-        period: Samples in one period, > 0.
-
-    Returns:
-        Sample index of the centre, lowest and highest value of each interval: float64[m] each.
+    Shorter intervals would beat with the period, which is in samples. Returns the sample index of
+    the centre, the lowest and the highest value of each interval: float64[m] each.
     """
     span = int(index[-1] - index[0]) + 1
     stretches = max(1, min(_MAX_BUCKETS, int(span / period)))

@@ -155,10 +155,7 @@ def replay(
 class _Running:
     """Replay of successive pieces, with the state of compensator and limiter.
 
-    Args:
-        first: The first piece, with the facts of the run.
-        model: Another model than the recorded one.
-        find_fades: Returns the events of bypassing and enabling the inverse, of all pieces.
+    ``find_fades`` returns the events of bypassing and enabling the inverse, of all pieces.
     """
 
     def __init__(

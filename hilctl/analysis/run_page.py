@@ -34,11 +34,7 @@ def write_html(
 ) -> None:
     """Write the page of a run; an existing file is replaced.
 
-    Args:
-        recording: The run.
-        report: Its metrics.
-        path: File to write.
-        before: The same motion without a compensator, for comparison.
+    ``before`` is the same motion without a compensator, for comparison.
 
     Raises:
         InputError: It cannot be written.

@@ -17,16 +17,11 @@ _UNKNOWN: tuple[float | None, float | None] = (None, None)
 
 
 class SegmentReportBuilder:
-    """Builder of the metrics of a segment.
+    """Builder of the metrics of a segment from its evaluated samples.
 
     Sums over several pieces differ from those of the whole run in their last digits; the relative
     error of the sensor noise of more than :data:`~hilctl.analysis.quantiles.MOST_EXACT` samples is
     6e-5.
-
-    Args:
-        recording: The run; its samples are not used.
-        segment: The segment.
-        window: Its evaluated samples: first, after the last, whole cycles.
     """
 
     def __init__(

@@ -102,11 +102,6 @@ def planned_fast(campaign: CampaignSteps, folder: Path) -> CampaignPlan:
 def run_fast(plan: CampaignPlan, host: CampaignHost, scheduler: str = "none") -> CampaignResult:
     """Run the remaining steps of a campaign as fast as possible.
 
-    Args:
-        plan: The plan.
-        host: The observers.
-        scheduler: Scheduler of the runs, see :func:`hilctl.identify.parallel.streams`.
-
     Raises:
         InputError: No disk space, the table can't be written, or the scheduler is unreachable.
     """

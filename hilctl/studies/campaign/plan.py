@@ -100,7 +100,6 @@ def planned(
 
     Raises:
         ConfigError: One or more steps are not allowed; all problems are listed.
-        InputError: The base experiment can't be read.
     """
     files, problems = TextFiles(), _Problems(campaign)
     left = {key: list(paths) for key, paths in completed.items()}

@@ -26,7 +26,6 @@ class CampaignStep:
         number: Its position, from 1.
         point: A value for each varied key; empty for a reference run.
         repeat: Number of the repeat or of the reference run, from 1.
-        is_reference: Whether it is a reference run.
         settings: ``key=value`` texts over the base experiment.
     """
 
@@ -94,11 +93,7 @@ class CampaignSteps:
 
 
 def load_campaign(path: Path, settings: Sequence[str] = ()) -> CampaignSteps:
-    """Read a campaign file.
-
-    Args:
-        path: The file.
-        settings: ``key=value`` texts over its base experiment.
+    """Read a campaign file, with ``key=value`` texts over its base experiment.
 
     Raises:
         InputError: It can't be read.
@@ -108,12 +103,7 @@ def load_campaign(path: Path, settings: Sequence[str] = ()) -> CampaignSteps:
 
 
 def campaign_of(document: Document, folder: Path, settings: Sequence[str]) -> CampaignSteps:
-    """Return a campaign and its steps.
-
-    Args:
-        document: The campaign.
-        folder: Folder that the experiment's file name is relative to.
-        settings: ``key=value`` texts over its base experiment.
+    """Return the campaign of a document whose experiment is relative to a folder.
 
     Raises:
         ConfigError: The file is invalid; all problems are listed.

@@ -120,10 +120,10 @@ class CharacterisationHost(StudyHost):
 
 
 class CharacterisationRunner:
-    """Characterise the device of an experiment.
+    """Characterise the device of an experiment; its waveform and compensator are not used.
 
     Args:
-        experiment: Experiment file; its waveform and compensator are not used.
+        experiment: Experiment file.
         settings: ``key=value`` texts over it.
         folder: Folder of the recordings.
         highest_hz: Highest frequency of loops; derived from the sample rate if None.
@@ -194,11 +194,7 @@ class CharacterisationRunner:
                 path.unlink()
 
     def characterise(self, output: Path, *, overwrite: bool = False) -> Characterisation:
-        """Run all steps, then identify and validate the model.
-
-        Args:
-            output: Model file to write.
-            overwrite: Whether an existing file may be replaced.
+        """Run all steps, then identify and validate the model and write it to ``output``.
 
         Raises:
             InputError: A file can't be written, or no disk space; nothing has moved.

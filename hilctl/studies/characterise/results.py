@@ -31,13 +31,11 @@ class Measured:
     """Measurements of the steps so far; None or empty if not measured yet.
 
     Attributes:
-        rest: Noise and drift at rest.
         reaction: First reaction and its polarity.
         small: Small-signal response.
         growing: Loops of growing amplitude.
         slow: Loops at the lowest frequency.
         fast: Loops at several frequencies.
-        reversal: First-order reversal curves.
         biased: Small loops over the whole range.
         crept_percent: Creep in each hold, of the displacement.
         repeated: Change of the largest growing loop at the end.
@@ -90,7 +88,6 @@ class StepRow:
 
     Attributes:
         name: Name of the step and of its recording.
-        purpose: Its purpose.
         seconds: Rig time.
         megabytes: Approximate size of its recording.
         text: Summary of its result; empty before the run.
@@ -112,12 +109,8 @@ class Characterisation:
     """Result of a characterisation.
 
     Attributes:
-        experiment: Name of the experiment.
-        device: Name of the device.
-        unit: Unit of commands.
         band_hz: Lowest and highest frequency of loops.
         steps: The steps, run or kept.
-        measured: Their measurements.
         held_out: Validation errors, the random reference first; empty without a model.
         identification: The model; None if none was identified.
         problem: Problem of the rig with its remedy; empty if all steps were completed.

@@ -81,7 +81,6 @@ def _unevaluated(text: str) -> Evaluate:
 
 
 def _take_rest(recording: Recording, limits: Limits, measured: Measured) -> Evaluated:
-    del limits
     found = rest_noise(recording)
     text = f"noise {found.noise_um:.3g} µm rms, drift {found.drift_um_per_s:+.2g} µm/s"
     return replace(measured, rest=found), text
@@ -221,7 +220,6 @@ def _fast(limits: Limits, measured: Measured) -> Keys:
 
 
 def _take_slow(recording: Recording, limits: Limits, measured: Measured) -> Evaluated:
-    del limits
     loops = all_loops(recording)
     largest = max(loops, key=lambda each: each.amplitude)
     if measured.rest and largest.peak_to_peak_um < _LEAST_MOTION * measured.rest.noise_um:
@@ -235,7 +233,6 @@ def _take_slow(recording: Recording, limits: Limits, measured: Measured) -> Eval
 
 
 def _take_fast(recording: Recording, limits: Limits, measured: Measured) -> Evaluated:
-    del limits
     loops = all_loops(recording)
     fastest = max(loops, key=lambda each: (each.frequency_hz, each.amplitude))
     percent = fastest.hysteresis_percent or 0.0
@@ -245,7 +242,6 @@ def _take_fast(recording: Recording, limits: Limits, measured: Measured) -> Eval
 
 
 def _take_reversal(recording: Recording, limits: Limits, measured: Measured) -> Evaluated:
-    del limits
     found = reversal_curves(recording)
     text = f"{len(found.turns)} curves return to {found.return_percent:.2g} % of their span"
     return replace(measured, reversal=found), text
@@ -259,7 +255,6 @@ def _take_biased(recording: Recording, limits: Limits, measured: Measured) -> Ev
 
 
 def _take_creep(recording: Recording, limits: Limits, measured: Measured) -> Evaluated:
-    del limits
     found = crept_percent(recording)
     crept = " and ".join(f"{percent:+.2g}" for percent in found)
     return replace(measured, crept_percent=found), f"creep {crept} % in {waveforms.CREEP_S:g} s"
@@ -270,7 +265,6 @@ def _again(limits: Limits, measured: Measured) -> Keys:
 
 
 def _take_again(recording: Recording, limits: Limits, measured: Measured) -> Evaluated:
-    del limits
     again = loop_figures(recording, recording.segments[-1])
     found = repeatability(measured.growing[-1], again)
     shape, shift = f"{found.shape_percent:.2g} % in shape", f"{found.shift_percent:.2g} % in offset"

@@ -84,15 +84,10 @@ def sine(
     offset: float | None = None,
     soft: float = 2.0,
 ) -> Keys:
-    """Return a sine with soft ends.
+    """Return a sine with soft ends; its amplitude is lowered to the slew limit.
 
-    Args:
-        limits: Limits of the characterisation.
-        amplitude: Its amplitude, lowered to the slew limit.
-        frequency_hz: Its frequency.
-        cycles: Cycles at full amplitude.
-        offset: Its mean; the centre of the range if None.
-        soft: Cycles of the soft start; the soft end is half as long.
+    It has ``cycles`` at full amplitude about the centre of the range, or another offset. ``soft``
+    is the number of cycles of the soft start; the soft end is half as long.
     """
     keys = {
         "kind": "sine",

@@ -146,10 +146,8 @@ class RunSeries:
 
     Attributes:
         name: Name of the campaign, or of the runs.
-        runs: The runs in order.
         keys: Varied keys.
         missing: Errors of recordings that can't be read.
-        is_campaign: Whether they belong to a campaign.
     """
 
     name: str
@@ -206,12 +204,9 @@ def collect(
     model: HysteresisModel | None = None,
     on_read: OnRead = lambda done, text: None,
 ) -> RunSeries:
-    """Read runs.
+    """Read recordings, or one folder of a campaign or of recordings.
 
-    Args:
-        paths: Recordings, or one folder of a campaign or of recordings.
-        model: Model to compare with the measurements; the recorded ones if None.
-        on_read: Called with the progress.
+    A model is compared with the measurements; the recorded ones if None.
 
     Raises:
         InputError: A folder contains no recordings, or is not the only path.

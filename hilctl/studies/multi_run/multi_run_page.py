@@ -79,10 +79,7 @@ def run_table(
 ) -> tuple[list[str], list[list[str]]]:
     """Return headings and rows of a table of runs, without empty columns.
 
-    Args:
-        series: The runs.
-        most: Most rows.
-        short: Whether to use short headings and omit file names, for a terminal.
+    A short table, for a terminal, has short headings and no file names.
     """
     figures = [each for each in _COLUMNS if each.of(series.runs)]
     headings = ["run", *(each.axis for each in series.dimensions)]

@@ -274,7 +274,7 @@ def write_sheets(
     on_done: OnRead = lambda done, text: None,
     on_drawn: Callable[[str, Figure], None] = lambda name, figure: None,
 ) -> dict[Path, str]:
-    """Write figures; return the files, each with its caption.
+    """Write figures in several formats; return the files, each with its caption.
 
     Args:
         sheets: The figures.

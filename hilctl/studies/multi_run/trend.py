@@ -136,13 +136,9 @@ def trends(
     along: VariedParameter,
     runs: Sequence[SeriesRun] | None = None,
 ) -> list[Trend]:
-    """Return the trends of a metric, one per combination of the other parameters.
+    """Return the trends of a metric along a numeric parameter, one per combination of the others.
 
-    Args:
-        series: The runs.
-        figure: The metric.
-        along: The varied parameter, with numeric values.
-        runs: The runs to use; all completed ones if None.
+    All completed runs are used if ``runs`` is None.
     """
     others = [each for each in series.dimensions if each.key != along.key]
     grouped: dict[tuple[Hashable, ...], dict[float, list[float]]] = defaultdict(

@@ -141,10 +141,8 @@ def dimensions(
 ) -> tuple[VariedParameter, ...]:
     """Return the varied parameters, without keys that depend on others.
 
-    Args:
-        keys: Dotted keys.
-        rows: Value of each key, one mapping per run.
-        unit: Unit of amplitudes, if it is the same in all runs.
+    ``rows`` has the value of each key, one mapping per run; ``unit`` is the unit of amplitudes, if
+    it is the same in all runs.
     """
     columns = {key: [row.get(key) for row in rows] for key in keys}
     varied = [key for key in keys if len(set(columns[key]) - {None}) > 1]
