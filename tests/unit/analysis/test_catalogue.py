@@ -98,7 +98,6 @@ def test_what_has_changed_is_read_again(folder, entries_read, change):
 
 
 def test_what_can_not_be_read_is_listed_and_looked_at_anew(folder):
-    """No file is hidden, whatever it is, and what is missing today may be there tomorrow."""
     whole = (GOLDEN / f"{NAMES[0]}.mcap").read_bytes()
     torn = folder / "torn.mcap"
     torn.write_bytes(whole[:-100])
@@ -331,7 +330,6 @@ def made_entry(tmp_path, run, end):
 
 
 def test_facts_become_values(tmp_path):
-    """Numbers and truth values where facts say so; what is damaged is not known."""
     found = made_entry(tmp_path, RUN, END)
     assert list(found) == list(COLUMNS)
     assert found.pop(LABELS_FACT) == {"sample": "A7", "t": 21.5}
@@ -383,7 +381,6 @@ def test_a_recording_agrees_with_its_report():
     ],
 )
 def test_a_recording_that_nobody_can_read_says_why(tmp_path, change, problem):
-    """It is what every other command says of it."""
     found = made_entry(tmp_path, {**RUN, **change}, END)
     assert found["state"] == "unreadable"
     assert found["problem"].startswith(problem)

@@ -31,7 +31,10 @@ def kinds():
     yield np.where(rng.random(5000) < 0.4, 0.0, 10.0 ** rng.uniform(-300, 300, 5000))
 
 
-@pytest.mark.parametrize("values", [*kinds()])
+VALUES = pytest.mark.parametrize("values", [*kinds()])
+
+
+@VALUES
 def test_what_fits_is_exact(values):
     found = gathered(values)
     assert found.percentiles(PERCENTS) == np.percentile(values, PERCENTS).tolist()
@@ -40,9 +43,8 @@ def test_what_fits_is_exact(values):
     assert found.above(0.5) == np.count_nonzero(values > 0.5)
 
 
-@pytest.mark.parametrize("values", [*kinds()])
+@VALUES
 def test_what_does_not_is_within_its_bin(small, values):
-    """In whichever pieces it comes, the same."""
     found = gathered(values)
     exact = np.percentile(values, PERCENTS, method="lower")
     assert found.percentiles(PERCENTS) == pytest.approx(exact.tolist(), rel=6.2e-5)

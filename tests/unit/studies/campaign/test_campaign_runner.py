@@ -84,7 +84,6 @@ def test_every_step_is_run_and_recorded(run, tmp_path):
 
 
 def test_completed_steps_are_kept_and_nothing_is_overwritten(run, tmp_path):
-    """A new value adds its own runs only."""
     run(Rig())
     before = {each: each.read_bytes() for each in (tmp_path / "runs").glob("*.mcap")}
     rig = Rig()
@@ -243,7 +242,6 @@ def test_the_page_is_written_at_intervals(run, drawn_pages):
 
 
 def test_an_unwritable_page_is_reported(run, monkeypatch):
-    """A failed page is reported and does not end the campaign."""
 
     def fail(series, path):
         raise InputError(f"{path.name}: no space left")

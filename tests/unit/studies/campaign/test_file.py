@@ -41,7 +41,6 @@ B = {"b": ("x", "y")}
     ],
 )
 def test_ranges(text, values):
-    """A range includes both ends; values between them are rounded."""
     assert values_of(text) == values
 
 
@@ -72,13 +71,11 @@ def test_mappings_are_crossed_and_their_keys_go_together():
 
 
 def test_alternating_never_goes_from_one_end_to_the_other():
-    """Neither within a pass nor between passes."""
     assert ran({**A, **B}, "alternating") == ["1x", "1y", "2y", "2x", "3x", "3y"]
     assert ran(A, "alternating", repeat=2) == ["1", "2", "3", "3", "2", "1"]
 
 
 def test_random_is_the_same_for_a_seed():
-    """All points are included."""
     first, again, other = (ran({**A, **B}, "random", seed, 2) for seed in (1, 1, 2))
     assert first == again != other
     assert sorted(first) == sorted(ran({**A, **B}, repeat=2))

@@ -20,7 +20,6 @@ def tables(result):
 
 
 def test_a_campaign_resumes(campaign, tmp_path):
-    """A resumed campaign has the same table; heat and noise do not depend on the order."""
     few = campaign(CAMPAIGN + BUDGET)
     folder = tmp_path / "runs"
     folder.mkdir()

@@ -19,7 +19,6 @@ def test_what_it_takes(campaign, tmp_path):
 
 
 def test_a_step_that_breaks_a_limit_is_refused_before_the_first_run(campaign, tmp_path):
-    """The problem has the value's location in the campaign file and the first step."""
     text = CAMPAIGN.replace("[1.0, 2.0]", "[1.0, -2.0, 5.0]")
     with pytest.raises(ConfigError) as found:
         planned(campaign(text), tmp_path / "runs", {}, 0.0)
@@ -49,7 +48,6 @@ def test_no_experiment(campaign, experiment, tmp_path):
 
 
 def test_the_coil_cools_between_steps(campaign, tmp_path):
-    """Pauses depend on each step and on the initial heat."""
     few = campaign(CAMPAIGN + HOT)
     cold, hot = (planned(few, tmp_path, {}, heat_a2) for heat_a2 in (0.0, 0.48))
     assert cold.steps[0].pause_s == 0.0

@@ -50,7 +50,6 @@ def test_default_folder(campaign):
 
 
 def test_one_campaign_at_a_time(tmp_path):
-    """A second campaign waits briefly for the lock."""
     folder, waits = tmp_path / "runs", []
     with locked_folder(folder, never):
         with (
@@ -76,7 +75,6 @@ def test_a_refusal_leaves_no_folder_that_it_has_made(tmp_path):
 
 
 def test_only_completed_runs_count(recorded, tmp_path):
-    """Truncated recordings and other files do not count."""
     path, key = recorded("a.mcap")
     again, _ = recorded("b.mcap")
     content = path.read_bytes()
@@ -87,7 +85,6 @@ def test_only_completed_runs_count(recorded, tmp_path):
 
 
 def test_truncated_recordings_are_repaired(recorded, tmp_path):
-    """A repaired recording is readable and does not count as completed."""
     path, key = recorded("a.mcap")
     content = path.read_bytes()
     torn = tmp_path / "torn.mcap"
@@ -111,7 +108,6 @@ def test_files_of_runs_that_never_started_are_moved(recorded, tmp_path):
 
 
 def test_special_files_are_ignored(recorded, tmp_path):
-    """Folders, pipes and broken links are ignored."""
     path, key = recorded("a.mcap")
     (tmp_path / "b.mcap").mkdir()
     os.mkfifo(tmp_path / "c.mcap")

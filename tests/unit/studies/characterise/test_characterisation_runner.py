@@ -107,7 +107,6 @@ def test_each_step_is_a_run_with_noise_of_its_own(experiment):
 
 
 def test_completed_steps_are_not_run_again(experiment):
-    """Kept steps give the same measurements."""
     first = run(experiment, Rig())
     rig = Rig()
     again = run(experiment, rig)
@@ -151,7 +150,6 @@ def test_discarding_begins_anew(experiment):
 
 
 def test_a_problem_of_the_rig_is_a_result(experiment):
-    """The result has the earlier measurements."""
     fault = "device.fault={kind: sensor_inverted, at_sample: 0}"
     found = run(experiment, Rig(), fault)
     assert found.problem_code == "wrong_polarity"
@@ -161,7 +159,6 @@ def test_a_problem_of_the_rig_is_a_result(experiment):
 
 
 def test_a_sensor_at_its_end_is_named(experiment):
-    """The fault of the interlock names the step."""
     fault = "device.fault={kind: sensor_nan, at_sample: 3000}"
     with pytest.raises(RunError, match="rest: "):
         run(experiment, Rig(), fault)
@@ -194,7 +191,6 @@ def test_the_coil_is_let_cool(experiment):
 
 
 def test_a_coil_that_has_cooled_since_is_not_waited_for(experiment):
-    """A run an hour ago causes no pause."""
     budget = ["limits.rms_current_a=0.05", "limits.thermal_time_constant_s=20.0"]
     run(experiment, Rig(), *budget)
     (experiment.parent / "runs" / "06-growing-2.mcap").unlink()
@@ -262,7 +258,6 @@ def test_a_broken_experiment_is_refused_at_once(experiment):
 
 @pytest.mark.slow
 def test_fast_runs_wait_for_no_coil(experiment):
-    """Runs without real time have no coil."""
     rig = Rig()
     host = replace(rig.host(), run=unpaced)
     settings = ["limits.rms_current_a=0.05", "limits.thermal_time_constant_s=20.0"]
@@ -287,7 +282,6 @@ limits:
 
 
 def test_settings_that_need_a_reference_are_removed(tmp_path, limits):
-    """A missing model file is no error."""
     path = tmp_path / "compensated.yaml"
     path.write_text(COMPENSATED, encoding="utf-8")
     settings = without_reference(path, [])

@@ -92,7 +92,6 @@ def test_the_held_out_error_comes_first():
 
 
 def test_what_ended_a_campaign_stands_on_top():
-    """The page has the problem first and the earlier measurements."""
     stopped = replace(
         FOUND, held_out=(), problem="no <reaction>: look", measured=replace(FOUND.measured,
             growing=(), reversal=None
@@ -122,7 +121,6 @@ def test_creep_is_a_figure_where_it_was_looked_for():
 
 
 def test_further_modes_of_the_model_are_figures():
-    """Further modes of the model are listed."""
     mode = FurtherMode(
         natural_hz=602.0, damping_ratio=0.024, antiresonance_hz=633.0,
         antiresonance_damping_ratio=0.02,

@@ -66,7 +66,6 @@ def test_a_sound_actuator_goes_through_all_steps(walked, limits):
 
 
 def test_the_stroke_holds_amplitudes_down(walked, limits_with):
-    """The stroke is smaller than the full range."""
     limits = limits_with("limits.stroke_um=[-20.0, 20.0]")
     measured, _ = walked(limits)
     reached = max(each.high_um for each in (*measured.growing, *measured.slow, *measured.fast))
@@ -76,7 +75,6 @@ def test_the_stroke_holds_amplitudes_down(walked, limits_with):
 
 @pytest.mark.slow
 def test_a_faint_reaction_is_asked_for_again(walked, limits):
-    """A response below the noise at 1 % is repeated at larger amplitudes."""
     measured, names = walked(limits, lambda v: 0.2 * v, noise_um=0.15, last="response-2")
     assert names == ["rest", "polarity-1", "polarity-2", "response-1", "response-2"]
     assert measured.small.gain_um == pytest.approx(0.2, rel=0.1)

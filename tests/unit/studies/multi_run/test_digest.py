@@ -77,7 +77,6 @@ def test_minor_loops_at_either_end(figures):
 
 
 def test_a_step_s_ringing(figures):
-    """The ringing after the largest step is evaluated."""
     omega = 2.0 * np.pi * 300.0
     ring = 1.0 - np.exp(-0.1 * omega * TIME) * np.cos(omega * np.sqrt(0.99) * TIME)
     found = figures(

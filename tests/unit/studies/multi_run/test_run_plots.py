@@ -43,7 +43,6 @@ def test_names_have_colours_and_signs_of_their_own():
 
 
 def test_runs_without_a_compensator_look_as_on_the_page_of_a_single_run():
-    """The colour is the same for values and names."""
     kinds = VariedParameter("compensator", "compensator", "", ("none", "a", "b"))
     for found, plain in (
         (looks(kinds, kinds.values), "none"),

@@ -44,7 +44,6 @@ def test_directions(crossed):
 
 
 def test_two_points_have_no_fit_and_repeats_count_once(crossed):
-    """Two points give no linear fit."""
     along = by_name(crossed)["amplitude"]
     found = trends(crossed, AREA, along, [*crossed.runs, *crossed.runs])
     assert len(found) == 3

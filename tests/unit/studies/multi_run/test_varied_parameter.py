@@ -66,7 +66,6 @@ def test_a_value_is_shown_by_what_people_call_it(value, short):
 
 
 def test_experiments_are_compared_key_by_key():
-    """Seeds and names of runs are ignored."""
     one = {"name": "a", "device": {"seed": 1, "load_kg": 0.0}, "compensator": "none",
            "waveform": {"components": ({"amplitude": 1.0}, {"amplitude": 5.0})}}  # fmt: skip
     other = {"name": "b", "device": {"seed": 2, "load_kg": 3.7}, "compensator": {"model": "m.yaml"},
