@@ -56,16 +56,7 @@ def pattern(expected: str) -> re.Pattern[str]:
 
 
 def walk(document: str, folder: Path, environment: dict[str, str]) -> list[str]:
-    """Carry out a document.
-
-    Args:
-        document: Its text.
-        folder: Copy of the repository, in which it is done.
-        environment: All that the shell gets.
-
-    Returns:
-        What is not as it says: one text a step; none where all is.
-    """
+    """Run a document's commands in a copy of the repository; return a text per wrong step."""
     steps = steps_of(document)
     script = "".join(f"echo '{MARK} {i}'\n{step.script}" for i, step in enumerate(steps))
     ended = subprocess.run(

@@ -249,9 +249,8 @@ def test_what_is_unknown_meets_neither_a_condition_nor_its_opposite(where):
     ],
 )
 def test_any_other_condition_is_an_input_error_with_the_keys(where):
-    with pytest.raises(
-        InputError, match=r"frequency_hz, .*label\.sample, .*waveform\.window"
-    ) as error:
+    keys = r"frequency_hz, .*label\.sample, .*waveform\.window"
+    with pytest.raises(InputError, match=keys) as error:
         select([ONE], where)
     assert str(error.value).isprintable()
     assert "--where" in str(error.value)
@@ -276,8 +275,8 @@ def test_a_label_without_recordings_is_a_warning(caplog):
 
 def test_a_folder_that_cannot_be_listed_is_an_input_error(tmp_path):
     (tmp_path / "file").write_text("")
-    for name, problem in (("none", "No such file"), ("file", "Not a directory")):
-        with pytest.raises(InputError, match=f"{name}: .*listed: {problem}"):
+    for name in ("none", "file"):
+        with pytest.raises(InputError, match=f"{name}: .*listed"):
             read_catalogue(tmp_path / name)
     assert len(read_catalogue(tmp_path)) == 0
 

@@ -74,25 +74,17 @@ def test_a_refusal_leaves_no_folder_that_it_has_made(tmp_path):
     assert [each.name for each in tmp_path.iterdir()] == ["mine"]
 
 
-def test_only_completed_runs_count(recorded, tmp_path):
+def test_only_completed_runs_count_and_truncated_ones_are_repaired(recorded, tmp_path):
     path, key = recorded("a.mcap")
     again, _ = recorded("b.mcap")
-    content = path.read_bytes()
-    (tmp_path / "torn.mcap").write_bytes(content[: len(content) // 2])
+    content, torn = path.read_bytes(), tmp_path / "torn.mcap"
+    torn.write_bytes(content[: len(content) // 2])
     (tmp_path / "text.mcap").write_text("no recording")
     assert completed_runs(tmp_path) == {key: [path, again]}
     assert last_started(tmp_path) == again
-
-
-def test_truncated_recordings_are_repaired(recorded, tmp_path):
-    path, key = recorded("a.mcap")
-    content = path.read_bytes()
-    torn = tmp_path / "torn.mcap"
-    torn.write_bytes(content[: len(content) // 2])
-    (tmp_path / "text.mcap").write_text("no recording")
     assert [text.startswith(f"{torn}: ") for text in repair_recordings(tmp_path)] == [True]
     assert repair_recordings(tmp_path) == []
-    assert completed_runs(tmp_path) == {key: [path]}
+    assert completed_runs(tmp_path) == {key: [path, again]}
     assert last_started(tmp_path / "absent") is None
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 
+from hilctl.base.errors import InputError
 from hilctl.studies.campaign.plan import planned
 from hilctl.studies.campaign.table import CampaignRow, write_table
 from hilctl.studies.multi_run.digest import FIGURES, RunFigures
@@ -30,13 +31,8 @@ def test_every_step_is_a_row_whether_it_was_run_or_not(plan):
     paths = write_table(plan, {1: DONE})
     rows = read_back(paths[0])
     assert paths[0].name == "few.csv"
-    assert list(rows[0])[:5] == [
-        "step",
-        "repeat",
-        "reference_run",
-        "waveform.amplitude",
-        "compensator",
-    ]
+    first = ["step", "repeat", "reference_run", "waveform.amplitude", "compensator"]
+    assert list(rows[0])[:5] == first
     assert [name for name in rows[0] if name in FIGURES] == list(FIGURES)
     assert float(rows[0]["peak_to_peak_um"]) == 0.1 + 0.2
     assert rows[0]["loop_area"] == ""
@@ -45,7 +41,7 @@ def test_every_step_is_a_row_whether_it_was_run_or_not(plan):
     assert rows[1]["compensator"] == "none"
 
 
-def test_it_is_replaced_whole(plan, monkeypatch):
+def test_a_full_disk_leaves_the_old_table(plan, monkeypatch):
     path = write_table(plan, {})[0]
     before = path.read_bytes()
 
@@ -53,7 +49,7 @@ def test_it_is_replaced_whole(plan, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", fail)
-    with pytest.raises(Exception, match="No space left"):
+    with pytest.raises(InputError, match="No space left"):
         write_table(plan, {1: DONE})
     assert path.read_bytes() == before
     assert [each.name for each in path.parent.glob(".few*")] == []

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from hilctl.base.errors import DataError, RunError
+from hilctl.base.errors import DataError
 from hilctl.base.segments import Segment
 from hilctl.models.linear_stages import CreepModel
 from hilctl.studies.characterise.response import (
@@ -16,16 +16,6 @@ from hilctl.studies.characterise.response import (
     without_gaps,
 )
 from hilctl.studies.characterise.waveforms import at_rest, rests, sine, small_multisine
-
-
-def test_text_and_remedy_are_one_message():
-    error = RigProblemError("no_reaction", "no motion", "wiring")
-    assert isinstance(error, RunError)
-    assert str(error) == "no motion: wiring"
-    assert error.code == "no_reaction"
-
-
-RNG = np.random.default_rng(4)
 
 
 def test_noise_drift_and_hum_are_told_apart(limits, played):
@@ -72,17 +62,17 @@ def test_noise_alone_is_no_reaction(limits, played, seed):
     assert not found.even
 
 
-def test_a_sensor_that_stands_still_does_not_react(limits, played):
-    assert not reaction(limits, played, lambda v: 0.0 * v + 2.0).clear
-
-
 def test_a_rod_without_bias_reacts_alike_to_both_signs(limits, played):
     assert reaction(limits, played, lambda v: 50.0 * v**2, noise_um=0.001).even
 
 
-def test_drift_is_no_reaction(limits, played):
-    found = reaction(limits, played, lambda v: 5.0 * np.arange(v.size) / v.size, noise_um=0.05)
-    assert not found.clear
+@pytest.mark.parametrize(
+    ("actuator", "noise_um"),
+    [(lambda v: 0.0 * v + 2.0, 0.0), (lambda v: 5.0 * np.arange(v.size) / v.size, 0.05)],
+    ids=["constant", "drift"],
+)
+def test_a_constant_reading_or_drift_is_no_reaction(limits, played, actuator, noise_um):
+    assert not reaction(limits, played, actuator, noise_um=noise_um).clear
 
 
 def test_the_phase_is_that_of_a_delay(limits, played):

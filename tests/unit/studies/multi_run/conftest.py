@@ -1,15 +1,24 @@
 """Synthetic runs of a report."""
 
 from collections.abc import Callable
+from itertools import product
 from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from hilctl.studies.multi_run.collect import RunSeries, SeriesRun
 from hilctl.studies.multi_run.digest import RunDigest, RunFigures
 
 PHASE = np.linspace(0.0, 2.0 * np.pi, 101)
+
+
+def drawn(panel):
+    """Return the axes of a panel."""
+    axes = Figure().subplots()
+    panel.draw(axes)
+    return axes
 
 
 def digest(
@@ -63,12 +72,8 @@ def grown(amplitude: float, hz: float, number: int = 1, **keys: Any) -> SeriesRu
 @pytest.fixture
 def crossed() -> RunSeries:
     """Return runs of two amplitudes by three frequencies."""
-    runs = [
-        grown(amplitude, hz, number)
-        for number, (amplitude, hz) in enumerate(
-            [(a, f) for a in (3.0, 6.0) for f in (10.0, 100.0, 200.0)], 1
-        )
-    ]
+    points = product((3.0, 6.0), (10.0, 100.0, 200.0))
+    runs = [grown(*point, number) for number, point in enumerate(points, 1)]
     return RunSeries("loops", tuple(runs), tuple(runs[0].values), is_campaign=True)
 
 
@@ -83,16 +88,10 @@ def compensated() -> RunSeries:
                 peak_error_percent=None if name == "none" else 1.0,
                 peak_to_peak_um=80.0,
             )
-            runs.append(
-                grown(
-                    6.0,
-                    hz,
-                    len(runs) + 1,
-                    figures=figures,
-                    values={"compensator": name, "waveform.frequency_hz": hz},
-                    digest=digest(compensated=name != "none", lag=0.02, figures=figures),
-                )
-            )
+            values = {"compensator": name, "waveform.frequency_hz": hz}
+            found = digest(compensated=name != "none", lag=0.02, figures=figures)
+            number = len(runs) + 1
+            runs.append(grown(6.0, hz, number, figures=figures, values=values, digest=found))
     return RunSeries("before", tuple(runs), tuple(runs[0].values), is_campaign=True)
 
 

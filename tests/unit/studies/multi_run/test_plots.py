@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 from hilctl.base.errors import InputError
 from hilctl.studies.characterise.response import SmallSignal
@@ -21,12 +20,7 @@ from hilctl.studies.multi_run.plots import (
     trend_sheets,
     write_sheets,
 )
-
-
-def drawn(panel):
-    axes = Figure().subplots()
-    panel.draw(axes)
-    return axes
+from tests.unit.studies.multi_run.conftest import drawn
 
 
 def test_fits_are_drawn_along_frequency_only(crossed):
@@ -89,32 +83,18 @@ def test_resonances_against_what_varied(crossed):
         for run in crossed.runs
     ]
     sheet = resonance_sheet(replace(crossed, runs=tuple(runs)))
-    assert [drawn(panel).get_ylabel() for panel in sheet.panels] == [
-        "natural frequency, Hz",
-        "damping ratio",
-    ]
+    labels = [drawn(panel).get_ylabel() for panel in sheet.panels]
+    assert labels == ["natural frequency, Hz", "damping ratio"]
 
 
 def test_they_are_found_from_what_varied(crossed, compensated):
-    assert [sheet.name for sheet in sheets_of(crossed)] == [
-        "hysteresis_against_frequency",
-        "hysteresis_against_amplitude",
-        "loops_by_frequency",
-        "loops_by_amplitude",
-        "sensitivity",
-    ]
-    assert [sheet.name for sheet in sheets_of(compensated)] == [
-        "before_and_after",
-        "hysteresis_against_frequency",
-        "compensation_against_frequency",
-        "loops_by_frequency",
-        "error_history",
-    ]
-
-
-def test_nothing_run_draws_nothing(crossed):
-    planned = tuple(replace(run, result="planned", digest=None) for run in crossed.runs)
-    assert sheets_of(replace(crossed, runs=planned)) == []
+    for series, names in (
+        (crossed, "hysteresis_against_frequency hysteresis_against_amplitude loops_by_frequency "
+                  "loops_by_amplitude sensitivity"),
+        (compensated, "before_and_after hysteresis_against_frequency "
+                      "compensation_against_frequency loops_by_frequency error_history"),
+    ):  # fmt: skip
+        assert [sheet.name for sheet in sheets_of(series)] == names.split()
 
 
 def series(run):
@@ -144,20 +124,13 @@ def test_magnitude_and_phase_measured_and_fitted(make_run, make_digest):
     assert np.allclose(phase.lines[1].get_ydata()[1], -45.0)
 
 
-def test_runs_without_either_have_none(crossed):
-    assert step_sheet(crossed) is None
-    assert frequency_sheet(crossed) is None
-
-
 @pytest.mark.slow
 def test_each_figure_is_a_file_of_each_format(crossed, tmp_path):
     few = replace(crossed, runs=crossed.runs[:3])
     folder = tmp_path / "figures"
     written = write_sheets(applying_sheets(few), folder, ["svg"], "single", overwrite=False)
-    assert [path.name for path in written] == [
-        "hysteresis_against_frequency.svg",
-        "loops_by_frequency.svg",
-    ]
+    names = ["hysteresis_against_frequency.svg", "loops_by_frequency.svg"]
+    assert [path.name for path in written] == names
     assert all(path.is_file() for path in written)
     assert all(caption.endswith(".") for caption in written.values())
     with pytest.raises(InputError, match="exists already"):
@@ -165,6 +138,7 @@ def test_each_figure_is_a_file_of_each_format(crossed, tmp_path):
 
 
 def test_no_figure_is_refused(crossed):
-    nothing = replace(crossed, runs=())
-    with pytest.raises(InputError, match="no figure applies"):
-        applying_sheets(nothing)
+    planned = tuple(replace(run, result="planned", digest=None) for run in crossed.runs)
+    for runs in ((), planned):
+        with pytest.raises(InputError, match="no figure applies"):
+            applying_sheets(replace(crossed, runs=runs))

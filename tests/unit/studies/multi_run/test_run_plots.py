@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
-from matplotlib.figure import Figure
 
 from hilctl.analysis.plot_style import WITH, WITHOUT
 from hilctl.studies.multi_run.collect import RunSeries
@@ -20,6 +19,7 @@ from hilctl.studies.multi_run.run_plots import (
     spread,
 )
 from hilctl.studies.multi_run.varied_parameter import WITHOUT_COMPENSATOR, VariedParameter
+from tests.unit.studies.multi_run.conftest import drawn
 
 AMPLITUDE = VariedParameter("a", "amplitude", "A", (1.0, 2.0, 3.0))
 
@@ -57,12 +57,6 @@ def test_many_are_spread_with_both_ends():
     assert spread([1, 2], 7) == [1, 2]
 
 
-def drawn(panel):
-    axes = Figure().subplots()
-    panel.draw(axes)
-    return axes
-
-
 def labels(axes):
     return [line.get_label() for line in axes.lines]
 
@@ -92,10 +86,8 @@ def test_before_and_after_of_the_same_settings(compensated):
 
 
 def test_runs_of_one_kind_have_no_before_and_after(crossed):
-    assert before_after_sheet(crossed) is None
-    assert error_sheet(crossed) is None
-    assert model_sheet(crossed) is None
-    assert minor_loop_sheet(crossed) is None
+    for sheet in (before_after_sheet, error_sheet, model_sheet, minor_loop_sheet):
+        assert sheet(crossed) is None
 
 
 def test_errors_of_compensated_runs(compensated):
