@@ -43,8 +43,6 @@ _END: dict[str, type] = {
     **dict.fromkeys(("recorded_samples", "missing_samples", "late_ticks", "skipped_ticks"), int),
     **dict.fromkeys(END_FIGURES, float),
 }
-OPTIONS = ("device", "waveform")
-"""Prefixes of the facts in the column ``options``."""
 COLUMNS: dict[str, type] = {
     "path": str,
     "state": str,
@@ -69,7 +67,7 @@ those of facts in a recording.
 
 _BOOLEANS = {"true": True, "false": False, "True": True, "False": False}
 _MOST_DIGITS = 15
-_OPTION_PREFIXES = tuple(f"{name}." for name in OPTIONS)
+_OPTION_PREFIXES = ("device.", "waveform.")
 _PREFIXES = ("label.", *_OPTION_PREFIXES)
 _SQL_TYPES = {str: "TEXT", int: "INTEGER", bool: "INTEGER", float: "REAL", dict: "TEXT"}
 _CREATE = "CREATE TABLE recordings ({})".format(

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from hilctl.analysis.figure_layout import FigureSpec, Panel
-from hilctl.analysis.plot_style import DISPLACEMENT, MARK, REFERENCE, WITH, WITHOUT
+from hilctl.analysis.plot_style import DISPLACEMENT, MARK, REFERENCE, WITH, WITHOUT, of_range
 from hilctl.analysis.steady_state import SteadyPart, steady_part
 from hilctl.base.formatting import quantity, short_name
 from hilctl.base.types import F64
@@ -117,7 +117,7 @@ def before_and_after(before: Recording, after: Recording) -> FigureSpec | None:
     straight line from corner to corner. None if one of them has no average cycle.
     """
     loops = _worst_loop(before), _worst_loop(after)
-    shown = [_of_range(loop) for loop in loops if loop is not None]
+    shown = [of_range(loop) for loop in loops if loop is not None]
     if len(shown) < 2:
         return None
     styles = (WITHOUT, "without compensator"), (WITH, "with it")
@@ -145,9 +145,3 @@ def _worst_loop(recording: Recording) -> F64 | None:
     return max(
         loops, key=lambda loop: cycle_metrics.peak_hysteresis_percent(*loop) or 0.0, default=None
     )
-
-
-def _of_range(loop: F64) -> F64:
-    low, whole = loop.min(axis=1, keepdims=True), np.ptp(loop, axis=1)[:, None]
-    percent: F64 = 100.0 * (loop - low) / np.where(whole > 0.0, whole, 1.0)
-    return percent

@@ -123,6 +123,13 @@ def legend(axes: Axes) -> None:
     axes.legend(loc="lower right", bbox_to_anchor=corner, borderaxespad=0.2, ncols=len(handles))
 
 
+def of_range(loop: F64) -> F64:
+    """Return the rows of float64[2, n] in percent of their ranges."""
+    low, whole = loop.min(axis=1, keepdims=True), np.ptp(loop, axis=1)[:, None]
+    percent: F64 = 100.0 * (loop - low) / np.where(whole > 0.0, whole, 1.0)
+    return percent
+
+
 def min_max(t: F64, values: F64, points: int = MAX_POINTS) -> tuple[F64, F64]:
     """Reduce a signal to the lowest and highest value of each of equal intervals.
 

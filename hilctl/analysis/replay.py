@@ -37,11 +37,7 @@ _LIMIT_BITS = int(
 class PredictedError:
     """Errors on the samples of the waveform, in percent of their peak-to-peak displacement.
 
-    Attributes:
-        peak_percent: Peak error of the other model.
-        rms_percent: Its root mean square.
-        recorded_peak_percent: Recorded peak error, on the same samples.
-        recorded_rms_percent: Its root mean square.
+    The recorded errors are on the same samples.
     """
 
     peak_percent: float
@@ -96,9 +92,7 @@ class ReplayResult:
         left_out_samples: Samples after damage of the file, with unknown compensator memory.
         identical: Whether every wanted command, command and flag has the same bits.
         first_difference: Index of the first sample that differs, or None.
-        differing_samples: Number of samples that differ.
         largest_difference: Largest magnitude of a difference between commands.
-        rms_difference: Root mean square of the differences.
         command_unit: ``A`` or ``V``.
         command_min: Lowest recomputed command.
         command_max: Highest recomputed command.

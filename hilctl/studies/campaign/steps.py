@@ -14,6 +14,7 @@ from hilctl.base.yaml import Document, Loc, dotted, load_document
 from hilctl.experiment.devices import device_class, known_devices
 from hilctl.experiment.load import LoadedExperiment, named_from, resolve
 from hilctl.studies.campaign.file import MOST_STEPS, CampaignFile, Point, groups_of, points
+from hilctl.studies.step_runner import document_with, setting
 
 _SEEDS = 1_000_000
 
@@ -77,10 +78,7 @@ class CampaignSteps:
         Each run of a simulated device gets its own, reproducible noise.
         """
         settings = [*self.settings, *step.settings]
-        document = load_document(self.experiment, files)
-        for text in settings:
-            document.set(text)
-        device = document.data.get("device")
+        device = document_with(self.experiment, settings, files).data.get("device")
         kind = device.get("kind") if isinstance(device, dict) else None
         if "device.seed" in self.keys or kind not in known_devices():
             return settings
@@ -148,10 +146,9 @@ def _loc_of(config: CampaignFile, key: str) -> Loc:
 
 
 def _steps(config: CampaignFile, found: Sequence[tuple[Point, int]]) -> Iterator[CampaignStep]:
-    common = [f"name={json.dumps(config.name)}", *settings_of(config.set)]
+    common = [setting("name", config.name), *settings_of(config.set)]
     if config.condition is not None:
-        given = config.condition.model_dump(exclude_unset=True)
-        common.append(setting("condition", given))
+        common.append(setting("condition", config.condition.model_dump(exclude_unset=True)))
     reference = config.reference_run
     number = again = 0
     for place, (point, repeat) in enumerate(found):
@@ -173,11 +170,6 @@ def _reference(
 def settings_of(given: Mapping[str, Any]) -> list[str]:
     """Return keys and values as ``key=value`` texts."""
     return [setting(key, value) for key, value in given.items()]
-
-
-def setting(key: str, value: Any) -> str:
-    """Return the ``key=value`` text that sets a key to a plain value."""
-    return f"{key}={json.dumps(value, ensure_ascii=False)}"
 
 
 def key_of(text: str) -> str:

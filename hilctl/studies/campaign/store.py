@@ -9,7 +9,6 @@ from mcap.writer import MCAP0_MAGIC
 
 from hilctl.base.errors import ConfigError, DataError, InputError
 from hilctl.base.private_dirs import HAS_LOCKS, take_lock
-from hilctl.base.yaml import load_document
 from hilctl.experiment.sections import RecordingConfig
 from hilctl.recording.recording_files import is_being_recorded
 from hilctl.recording.recover import recover_recording
@@ -17,6 +16,7 @@ from hilctl.recording.run_summary import read_ends, recordings_in
 from hilctl.run.run_folder import RunFolder, runs
 from hilctl.run.start import RunKey, completed_key
 from hilctl.studies.campaign.steps import CampaignSteps, base_problem, settings_of
+from hilctl.studies.step_runner import document_with
 
 _LONGEST_WAIT_S = 60.0
 _POLL_S = 0.1
@@ -32,9 +32,8 @@ def campaign_folder(campaign: CampaignSteps) -> Path:
     if config.folder is not None:
         return Path(config.folder)
     try:
-        document = load_document(campaign.experiment)
-        for text in (*campaign.settings, *settings_of(config.set)):
-            document.set(text)
+        settings = (*campaign.settings, *settings_of(config.set))
+        document = document_with(campaign.experiment, settings)
     except ConfigError:
         raise
     except InputError as error:

@@ -1,6 +1,5 @@
 """Characterisation runner: one run per step, each planned from the steps before it."""
 
-import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -9,7 +8,6 @@ from pathlib import Path
 from hilctl.base.errors import DataError, InputError, RunError
 from hilctl.base.files import check_writable, write_text
 from hilctl.base.types import F64, CommandUnit
-from hilctl.base.yaml import Document, load_document
 from hilctl.experiment.coil_heat import CoolingCoil, RunHeat
 from hilctl.experiment.device_state import heat_before
 from hilctl.experiment.load import load_experiment
@@ -33,37 +31,27 @@ from hilctl.studies.characterise.waveforms import Keys, at_rest, within
 from hilctl.studies.step_runner import (
     StepRunner,
     StudyHost,
+    document_with,
     free_mb,
     raise_if_stopped,
     require_room,
+    setting,
 )
-
-
-def waveform_setting(keys: Keys) -> str:
-    """Return the ``key=value`` text that sets the waveform of an experiment."""
-    return f"waveform={json.dumps(keys)}"
 
 
 def unit_of(experiment: Path, settings: Sequence[str]) -> CommandUnit:
     """Return the command unit of an experiment."""
-    return "V" if _document(experiment, settings).holds(("limits", "drive_v")) else "A"
+    return "V" if document_with(experiment, settings).holds(("limits", "drive_v")) else "A"
 
 
 def without_reference(experiment: Path, settings: Sequence[str]) -> list[str]:
     """Return settings that remove the compensator and everything that needs one."""
-    document = _document(experiment, settings)
+    document = document_with(experiment, settings)
     found = ["compensator=none"]
     found += [f"{key}=null" for key in ("feedback", "adaptation") if document.holds((key,))]
     return found + [
         f"limits.{key}=null" for key in _tracking_keys() if document.holds(("limits", key))
     ]
-
-
-def _document(experiment: Path, settings: Sequence[str]) -> Document:
-    document = load_document(experiment)
-    for setting in settings:
-        document.set(setting)
-    return document
 
 
 def _tracking_keys() -> Iterator[str]:
@@ -146,15 +134,15 @@ class CharacterisationRunner:
         self._folder = folder
         self._host = host or CharacterisationHost()
         first = {"kind": "hold", "unit": unit_of(experiment, self._settings), "level": 0.0}
-        self._loaded = load_experiment(
-            experiment, [*self._settings, waveform_setting({**first, "duration_s": 1.0})]
-        )
+        hold = setting("waveform", {**first, "duration_s": 1.0})
+        self._loaded = load_experiment(experiment, [*self._settings, hold])
         self.limits = limits_of(self._loaded, highest_hz)
         info = self._loaded.device.info
         if self._host.run is unpaced and not info.simulated:
             raise InputError(f"--fast: {info.name}: only simulated devices run without real time")
         # Reject everything that does not depend on the waveform before anything moves.
-        checked_experiment(experiment, [*self._settings, waveform_setting(at_rest(self.limits))])
+        rest = setting("waveform", at_rest(self.limits))
+        checked_experiment(experiment, [*self._settings, rest])
         self._coil = CoolingCoil(self._loaded.config, 0.0, 0.0)
         self._measured = Measured()
         self._rows: list[StepRow] = []
@@ -308,7 +296,7 @@ class CharacterisationRunner:
 
     def _step_settings(self, number: int, step: CharacterisationStep, keys: Keys) -> list[str]:
         name = f"{self._loaded.config.name}-{step.name}"[-_NAME_LENGTH:].lstrip("._-")
-        settings = [*self._settings, f"name={json.dumps(name)}", waveform_setting(keys)]
+        settings = [*self._settings, setting("name", name), setting("waveform", keys)]
         if self._rows and self._loaded.config.safe.at_start is not None:
             settings.append(f"safe.at_start={self.limits.rest!r}")  # where the previous step ended
         seed = self._loaded.device.Options.model_fields.get("seed")

@@ -275,62 +275,40 @@ def _take_again(recording: Recording, limits: Limits, measured: Measured) -> Eva
     ), f"differs by {shape}, {shift} ({found.shift_um:+.3g} µm)"
 
 
+_Row: TypeAlias = tuple[str, str, Waveform, Evaluate]
+
+
 def _numbered(
     name: str,
     purpose: str,
     parts: tuple[float, ...],
     waveform: Callable[[float], Waveform],
     take: Evaluate,
-) -> list[CharacterisationStep]:
+) -> list[_Row]:
     return [
-        CharacterisationStep(f"{name}-{i}", f"{purpose}, {100.0 * part:g} %", waveform(part), take)
+        (f"{name}-{i}", f"{purpose}, {100.0 * part:g} %", waveform(part), take)
         for i, part in enumerate(parts, 1)
     ]
 
 
-STEPS: tuple[CharacterisationStep, ...] = (
-    CharacterisationStep(
-        "rest", "noise and drift at rest", lambda limits, _: waveforms.at_rest(limits), _take_rest
-    ),
+_ROWS: list[_Row] = [
+    ("rest", "noise and drift at rest", lambda limits, _: waveforms.at_rest(limits), _take_rest),
     *_numbered("polarity", "first reaction, its sign", POLARITY_PARTS, _polarity, _take_polarity),
     *_numbered("response", "small-signal response", SMALL_PARTS, _response, _take_response),
     *_numbered("growing", "loop of growing amplitude", GROWING_PARTS, _growing, _take_growing),
-    CharacterisationStep(
-        "slow-loops", "loops at the lowest frequency", _at_full(waveforms.slow_loops), _take_slow
-    ),
-    CharacterisationStep("fast-loops", "loops at several frequencies", _fast, _take_fast),
-    CharacterisationStep(
-        "reversal-curves",
-        "first-order reversal curves",
-        _at_full(waveforms.reversal_curves),
-        _take_reversal,
-    ),
-    CharacterisationStep(
-        "biased-loops",
-        "small loops over the whole range",
-        _at_full(waveforms.biased_loops),
-        _take_biased,
-    ),
-    CharacterisationStep(
-        "creep", "creep at both ends of the range", _at_full(waveforms.rests), _take_creep
-    ),
-    CharacterisationStep(
-        "small-motions",
-        "small random motions",
-        _at_full(waveforms.small_motions),
-        _unevaluated("for the fit"),
-    ),
-    CharacterisationStep(
-        "training",
-        "random reference for the fit",
-        _random(waveforms.TRAINING_SEED),
-        _unevaluated("for the fit"),
-    ),
-    CharacterisationStep(
-        "held-out",
-        "random reference for the validation",
-        _random(waveforms.HELD_OUT_SEED),
-        _unevaluated("not used in any fit"),
-    ),
-    CharacterisationStep("repeated", "the largest loop again", _again, _take_again),
-)
+    ("slow-loops", "loops at the lowest frequency", _at_full(waveforms.slow_loops), _take_slow),
+    ("fast-loops", "loops at several frequencies", _fast, _take_fast),
+    ("reversal-curves", "first-order reversal curves", _at_full(waveforms.reversal_curves),
+     _take_reversal),
+    ("biased-loops", "small loops over the whole range", _at_full(waveforms.biased_loops),
+     _take_biased),
+    ("creep", "creep at both ends of the range", _at_full(waveforms.rests), _take_creep),
+    ("small-motions", "small random motions", _at_full(waveforms.small_motions),
+     _unevaluated("for the fit")),
+    ("training", "random reference for the fit", _random(waveforms.TRAINING_SEED),
+     _unevaluated("for the fit")),
+    ("held-out", "random reference for the validation", _random(waveforms.HELD_OUT_SEED),
+     _unevaluated("not used in any fit")),
+    ("repeated", "the largest loop again", _again, _take_again),
+]  # fmt: skip
+STEPS = tuple(CharacterisationStep(*row) for row in _ROWS)

@@ -1,6 +1,5 @@
 """HTML page and JSON of many runs."""
 
-import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict
 from pathlib import Path
@@ -8,6 +7,7 @@ from typing import Any
 
 from hilctl.analysis import html
 from hilctl.analysis.html import definitions_of
+from hilctl.analysis.run_metrics import without_infinity
 from hilctl.base.formatting import quantity
 from hilctl.studies.multi_run.collect import RunSeries, SeriesRun
 from hilctl.studies.multi_run.plots import sheets_of
@@ -198,10 +198,6 @@ def series_mapping(series: RunSeries) -> dict[str, Any]:
 
 
 def _run(run: SeriesRun) -> dict[str, Any]:
-    figures = {
-        name: None if isinstance(value, float) and not math.isfinite(value) else value
-        for name, value in asdict(run.figures).items()
-    }
     return {
         "run": run.number,
         "reference_run": run.is_reference,
@@ -210,5 +206,5 @@ def _run(run: SeriesRun) -> dict[str, Any]:
         "recording": run.recording,
         "started": run.digest.started if run.digest else None,
         "model_error_percent": run.digest.model_error_percent if run.digest else None,
-        **figures,
+        **without_infinity(asdict(run.figures)),
     }

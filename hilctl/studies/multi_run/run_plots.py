@@ -10,7 +10,16 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from hilctl.analysis.figure_layout import FigureSpec, Panel
-from hilctl.analysis.plot_style import DISPLACEMENT, ERROR, MARK, QUIET, REFERENCE, WITH, WITHOUT
+from hilctl.analysis.plot_style import (
+    DISPLACEMENT,
+    ERROR,
+    MARK,
+    QUIET,
+    REFERENCE,
+    WITH,
+    WITHOUT,
+    of_range,
+)  # fmt: skip
 from hilctl.base.formatting import quantity, significant
 from hilctl.base.types import C128, F64
 from hilctl.studies.multi_run.collect import RunSeries, SeriesRun
@@ -227,15 +236,8 @@ def _draw_pair(axes: Axes, before: RunDigest, after: Sequence[tuple[str, RunDige
     look = looks(None, [name for name, _ in lines])
     axes.plot([0, 100], [0, 100], color=REFERENCE, linestyle=":", linewidth=0.8)
     for name, digest in lines:
-        loop_input, moved = (_of_range(each) for each in digest.loop)
-        axes.plot(loop_input, moved, **line_of(look[name]), linewidth=0.9, label=name)
+        axes.plot(*of_range(digest.loop), **line_of(look[name]), linewidth=0.9, label=name)
     axes.set(xlabel="input, % of its range", ylabel="displacement, %")
-
-
-def _of_range(values: F64) -> F64:
-    low, whole = float(values.min()), float(np.ptp(values))
-    percent: F64 = 100.0 * (values - low) / whole if whole > 0.0 else values - low
-    return percent
 
 
 def error_sheet(series: RunSeries) -> FigureSpec | None:

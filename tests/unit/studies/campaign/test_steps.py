@@ -1,12 +1,9 @@
 """Steps of a campaign: settings over one experiment."""
 
-import json
-
 import pytest
 
 from hilctl.base.errors import ConfigError
 from hilctl.base.files import TextFiles
-from hilctl.studies.campaign.steps import setting
 from tests.unit.studies.campaign.conftest import CAMPAIGN
 
 
@@ -60,8 +57,3 @@ def test_broken_rules_have_their_place(campaign):
         campaign(text, "waveform.amplitude=2")
     for place in ("5: vary.waveform.frequency_hz", "4: vary.waveform.amplitude", "6: vary.name"):
         assert f"few.yaml:{place}:" in str(found.value)
-
-
-def test_settings_take_any_plain_value():
-    for value in (1e-7, "a: b #", None, True, [1, {"k": "µ"}]):
-        assert json.loads(setting("key", value).removeprefix("key=")) == value

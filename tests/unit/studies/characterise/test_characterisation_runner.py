@@ -14,11 +14,11 @@ from hilctl.studies.characterise.characterisation_runner import (
     CharacterisationHost,
     CharacterisationRunner,
     unit_of,
-    waveform_setting,
     without_reference,
 )
 from hilctl.studies.characterise.steps import STEPS
 from hilctl.studies.characterise.waveforms import biased_loops
+from hilctl.studies.step_runner import setting
 
 FEW = ("rest", "polarity", "growing-1", "growing-2")
 SHORT = tuple(step for step in STEPS if step.name.startswith(FEW))
@@ -272,7 +272,7 @@ def test_settings_that_need_a_reference_are_removed(tmp_path, limits):
     path.write_text(COMPENSATED, encoding="utf-8")
     settings = without_reference(path, [])
     keys = biased_loops(limits, 2.0)
-    loaded = load_experiment(path, [*settings, waveform_setting(keys)])
+    loaded = load_experiment(path, [*settings, setting("waveform", keys)])
     config, limits = loaded.config, loaded.config.limits
     assert loaded.model is config.feedback is config.adaptation is None
     assert limits.tracking_error_um is limits.tracking_s is None
