@@ -325,11 +325,7 @@ def _fit(frequency_hz: F64, response: C128, noise: F64, rate_hz: float) -> tuple
 
 
 def _best(
-    frequency_hz: F64,
-    response: C128,
-    noise: F64,
-    rate_hz: float,
-    tries: list[float] | list[None],
+    frequency_hz: F64, response: C128, noise: F64, rate_hz: float, tries: list[float] | list[None]
 ) -> OptimizeResult:
     """Return the best fit from several starting frequencies; None fits no resonance."""
     doubt = np.hypot(noise, _HYSTERESIS * np.abs(response))

@@ -11,14 +11,7 @@ import pytest
 from mcap.writer import Writer
 
 from hilctl.analysis import catalogue
-from hilctl.analysis.catalogue import (
-    COLUMNS,
-    entry_of,
-    keys_of,
-    read_catalogue,
-    select,
-    unreadable,
-)
+from hilctl.analysis.catalogue import COLUMNS, entry_of, keys_of, read_catalogue, select, unreadable
 from hilctl.analysis.report import summarize
 from hilctl.base.errors import InputError
 from hilctl.recording.metadata_keys import END_FIGURES, HOLDS_FACT, LABELS_FACT, RECORDINGS

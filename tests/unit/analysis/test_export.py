@@ -23,10 +23,7 @@ from hilctl.base.segments import Segment
 from hilctl.recording.reader import read
 from hilctl.recording.recording import Recording, Ticks
 
-NAMES = {
-    "A": ("wanted_a", "current_a", "measured_a"),
-    "V": ("wanted_v", "drive_v", "measured_v"),
-}
+NAMES = {"A": ("wanted_a", "current_a", "measured_a"), "V": ("wanted_v", "drive_v", "measured_v")}
 YAML = "name: prüf-Lauf  # \u03bcm\n"
 
 
@@ -181,8 +178,7 @@ def mat_texts(path: Path) -> dict[str, str]:
 
 
 @pytest.mark.parametrize(
-    ("suffix", "texts_of"),
-    [(".npz", npz_texts), (".parquet", parquet_texts), (".mat", mat_texts)],
+    ("suffix", "texts_of"), [(".npz", npz_texts), (".parquet", parquet_texts), (".mat", mat_texts)]
 )
 def test_the_facts_of_the_run_are_kept(tmp_path: Path, suffix: str, texts_of) -> None:
     export(recording(), tmp_path / f"out{suffix}")

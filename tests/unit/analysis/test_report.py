@@ -163,9 +163,7 @@ class TestWithoutAPeriod:
         reference_um = np.linspace(0.0, 50.0, 2000)
         error_um = 0.1 * np.sin(np.arange(2000) / 100.0)
         recording = make_recording(
-            reference_um + error_um,
-            reference_um=reference_um,
-            segments=[segment(0, 2000, 0.0)],
+            reference_um + error_um, reference_um=reference_um, segments=[segment(0, 2000, 0.0)]
         )
         report = summarize(recording)
         stroke_um = np.ptp(reference_um + error_um)

@@ -11,13 +11,7 @@ from hilctl.base.events import OFFSET, Event
 from hilctl.base.segments import Segment
 from hilctl.models.model_file import load_model
 from hilctl.recording.metadata_keys import HEAT_FACT
-from hilctl.studies.multi_run.digest import (
-    FIGURES,
-    POINTS,
-    RunFigures,
-    digest_of,
-    drift_of,
-)
+from hilctl.studies.multi_run.digest import FIGURES, POINTS, RunFigures, digest_of, drift_of
 
 RATE_HZ = 50_000.0
 TIME = np.arange(10_000) / RATE_HZ
