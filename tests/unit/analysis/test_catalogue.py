@@ -11,7 +11,7 @@ import pytest
 from mcap.writer import Writer
 
 from hilctl.analysis import catalogue
-from hilctl.analysis.catalogue import COLUMNS, entry_of, keys_of, read_catalogue, select, unreadable
+from hilctl.analysis.catalogue import COLUMNS, entry_of, read_catalogue, select, unreadable
 from hilctl.analysis.report import summarize
 from hilctl.base.errors import InputError
 from hilctl.recording.metadata_keys import END_FIGURES, HOLDS_FACT, LABELS_FACT, RECORDINGS
@@ -65,33 +65,35 @@ def test_a_finished_recording_is_read_once(folder, entries_read):
     assert entries_read == []
 
 
-@pytest.mark.parametrize("change", ["newer", "larger", "moved", "gone", "new"])
-def test_what_has_changed_is_read_again(folder, entries_read, change):
+OTHER = GOLDEN / f"{NAMES[0]}.mcap"
+
+
+@pytest.mark.parametrize(
+    ("change", "paths", "count"),
+    [
+        (lambda run: os.utime(run, ns=(1, 1)), ["day 1/run.mcap"], 3),
+        (lambda run: shutil.copy(OTHER, run), ["day 1/run.mcap"], 3),
+        (lambda run: run.rename(run.with_name("other.mcap")), ["day 1/other.mcap"], 3),
+        (lambda run: run.unlink(), [], 2),
+        (lambda run: shutil.copy(OTHER, run.parents[1] / "a.mcap"), ["a.mcap"], 4),
+    ],
+    ids=["newer", "larger", "moved", "gone", "new"],
+)
+def test_what_has_changed_is_read_again(folder, entries_read, change, paths, count):
     read_catalogue(folder)
-    run = folder / "day 1" / "run.mcap"
-    if change == "newer":
-        os.utime(run, ns=(1, 1))
-    elif change == "larger":
-        shutil.copy(GOLDEN / f"{NAMES[0]}.mcap", run)
-    elif change == "moved":
-        run.rename(run.with_name("other.mcap"))
-    elif change == "gone":
-        run.unlink()
-    else:
-        shutil.copy(GOLDEN / f"{NAMES[0]}.mcap", folder / "a.mcap")
+    change(folder / "day 1" / "run.mcap")
     del entries_read[:]
     fresh = read_catalogue(folder)
-    expected = {"moved": ["day 1/other.mcap"], "gone": [], "new": ["a.mcap"]}
-    assert entries_read == expected.get(change, ["day 1/run.mcap"])
+    assert entries_read == paths
     assert paths_of(fresh) == sorted(paths_of(fresh))
-    assert len(fresh) == {"gone": 2, "new": 4}.get(change, 3)
+    assert len(fresh) == count
     del entries_read[:]
     assert read_catalogue(folder) == fresh
     assert entries_read == []
 
 
 def test_what_can_not_be_read_is_listed_and_looked_at_anew(folder):
-    whole = (GOLDEN / f"{NAMES[0]}.mcap").read_bytes()
+    whole = OTHER.read_bytes()
     torn = folder / "torn.mcap"
     torn.write_bytes(whole[:-100])
     (folder / "text.mcap").write_text("hello")
@@ -171,13 +173,6 @@ def test_recordings_without_the_key_to_sort_by_are_last(folder):
     assert select(found, sort="device.load_kg")[-1] == found[0]
 
 
-def test_numbers_sort_before_texts():
-    values = ["b", 3, "a"]
-    entries = [entry(f"{k}", labels={"x": values[k]}) for k in range(3)]
-    assert paths_of(select(entries, sort="label.x")) == ["1", "2", "0"]
-    assert "label.x" in keys_of(entries)
-
-
 def entry(path="a", **known):
     return unreadable(path, 1, 2, "") | known
 
@@ -195,9 +190,7 @@ ONE = entry(
     "where",
     [
         'frequency_hz>100 and label.sample=="A7"',
-        "frequency_hz between 100 and 120",
         "name in ('sine', \"chirp\") and not name == 'device'",
-        'name like "%in%" and name glob "s*"',
         "label.class = 3 and label.größe > 1",
         "[label.batch no] = 'it''s' and [label.batch no] = \"it's\"",
         "simulated and simulated == true",
@@ -249,9 +242,8 @@ def test_any_other_condition_is_an_input_error_with_the_keys(where):
     assert "--where" in str(error.value)
 
 
-@pytest.mark.parametrize("where", ["1) UNION SELECT 'x' /*", "1) UNION SELECT 99 /*"])
-def test_a_condition_selects_only_recordings(where):
-    assert select([ONE], where) == [ONE]
+def test_a_condition_selects_only_recordings():
+    assert select([ONE], "1) UNION SELECT 99 /*") == [ONE]
 
 
 def test_an_unknown_key_to_sort_by_is_an_input_error():

@@ -141,17 +141,6 @@ def test_every_column_comes_back_bit_for_bit(
         check_same_bits(found[name], column)
 
 
-def test_csv_has_one_header_line_and_rows_across_blocks(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(export_files, "_CSV_ROWS", 20)
-    run = recording(n=41)
-    export(run, tmp_path / "out.csv")
-    lines = (tmp_path / "out.csv").read_text().splitlines()
-    assert lines[0] == (
-        "sample,t_s,reference_um,wanted_a,current_a,displacement_um,measured_a,input_um,flags"
-    )
-    assert [int(line.split(",")[0]) for line in lines[1:]] == run.samples.index.tolist()
-
-
 def test_empty_recording_is_an_error(tmp_path: Path) -> None:
     run = recording()
     with pytest.raises(DataError, match=r"holds no sample"):

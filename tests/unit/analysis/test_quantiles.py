@@ -51,12 +51,3 @@ def test_what_does_not_is_within_its_bin(small, values):
     assert found.largest == values.max()
     assert found.median() == found.percentiles([50.0])[0] == gathered(values, 3).median()
     assert found.above(0.4) == np.count_nonzero(values > 0.4)
-
-
-def test_memory_does_not_grow(small):
-    found = Quantiles()
-    for seed in range(200):
-        found.add(np.random.default_rng(seed).normal(size=1000))
-    assert found._values is None
-    assert found.size == 200_000
-    assert np.count_nonzero(found._counts) < 120_000

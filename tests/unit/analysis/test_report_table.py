@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from hilctl.analysis.report import summarize
-from hilctl.analysis.report_table import number, quality_rows, run_rows, segment_table, usage_text
+from hilctl.analysis.report_table import quality_rows, run_rows, segment_table, usage_text
 from hilctl.machine.procfs import ProcessUsage
 from hilctl.recording.reader import read
 
@@ -16,12 +16,6 @@ GOLDEN = Path(__file__).parents[3] / "recordings" / "golden"
 @pytest.fixture
 def report():
     return summarize(read(GOLDEN / "terfenol_compensated.mcap"))
-
-
-def test_numbers_have_four_digits_and_their_unit():
-    assert number(1234.567, "um") == "1.235 mm"
-    assert number(0.0001234) == "0.0001234"
-    assert number(None, "um") == "-"
 
 
 def test_unknown_figures_are_dashes(report):

@@ -28,10 +28,10 @@ def never(seconds):
 @pytest.fixture
 def recorded(campaign, tmp_path):
     """Record the first step of a campaign; return file and fingerprint."""
+    few = campaign()
+    loaded = few.load(few.steps[0], TextFiles())
 
     def make(name):
-        few = campaign()
-        loaded = few.load(few.steps[0], TextFiles())
         run_unpaced(check(loaded), tmp_path / name)
         return tmp_path / name, RunKey.of(loaded)
 
