@@ -215,10 +215,11 @@ class _Running:
         out = np.empty(ready), np.empty(ready), np.zeros(ready, dtype=np.uint32)
         known = np.zeros(ready, dtype=bool)
         self._faded = self._inverse_shares(samples.rows(slice(None, ready)))
+        before = self._before
         for rows, start in self._stretches(samples, ready):
             if start is not None:
-                self._begin(start, first=rows.start == 0 and self._before is None)
-            elif rows.start or not self._follows(samples):
+                self._begin(start, first=rows.start == 0 and before is None)
+            elif rows.start or before is None or int(samples.index[0]) != before[0] + 1:
                 self._known = self._unbegun = False  # the memory is unknown
             if not self._known:
                 continue
@@ -228,9 +229,6 @@ class _Running:
                     self._recompute(samples, part, rows.stop, ready, out)
         self._comparison.add(samples.rows(slice(None, ready)), known, out)
         self._before = int(samples.index[ready - 1]), int(samples.flags[ready - 1])
-
-    def _follows(self, samples: Samples) -> bool:
-        return self._before is not None and int(samples.index[0]) == self._before[0] + 1
 
     def _stretches(
         self, samples: Samples, ready: int

@@ -27,6 +27,7 @@ _FAULT = "fault"
 _WAVEFORM = "waveform."
 _NOT_SHOWN = {"waveform.kind", "waveform.unit"}
 _USUAL = {"0.0", "None", ""}
+_TERMS = ("average cycle", "peak hysteresis", "noise floor", "loop area", "lateness")
 
 
 def write_html(
@@ -46,6 +47,7 @@ def write_html(
 def page(recording: Recording, report: RunReport, before: Recording | None = None) -> str:
     """Return the page of a run as HTML."""
     title = html.text(report.name or "run")
+    error_terms = ("peak and rms error", "harmonics of the error") if report.compensated else ()
     body = [
         f"<h1>{title}</h1>",
         html.paragraph(report.path, "file"),
@@ -62,7 +64,7 @@ def page(recording: Recording, report: RunReport, before: Recording | None = Non
         "</div>",
         *_segments(report),
         *_events(recording.events),
-        html.definitions("What the figures mean", _terms(report)),
+        html.definitions("What the figures mean", definitions_of(*_TERMS, *error_terms)),
         html.details("Experiment", recording.experiment_yaml) if recording.experiment_yaml else "",
         html.details("Model", recording.model_yaml) if recording.model_yaml else "",
     ]
@@ -160,13 +162,6 @@ def _events(events: Sequence[Event]) -> list[str]:
     left_out = len(events) - len(rows)
     note = [html.paragraph(f"The first {left_out} are left out.")] if left_out else []
     return ["<h2>Events</h2>", *note, html.grid(("sample", "level", "code", "text"), rows)]
-
-
-def _terms(report: RunReport) -> list[tuple[str, str]]:
-    errors = ("peak and rms error", "harmonics of the error") if report.compensated else ()
-    return definitions_of(
-        "average cycle", "peak hysteresis", "noise floor", "loop area", "lateness", *errors
-    )
 
 
 def provenance_rows(recording: Recording) -> list[tuple[str, str]]:

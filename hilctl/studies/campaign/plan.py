@@ -6,12 +6,11 @@ from pathlib import Path
 
 from hilctl.base.errors import ConfigError, ConfigProblem, InputError
 from hilctl.base.files import TextFiles
-from hilctl.base.yaml import Loc
 from hilctl.experiment.coil_heat import CoolingCoil, RunHeat
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.experiment.preflight import check
 from hilctl.run.start import RunKey
-from hilctl.studies.campaign.steps import CampaignStep, CampaignSteps, base_problem, key_of
+from hilctl.studies.campaign.steps import CampaignStep, CampaignSteps, base_problem, key_of, locs_of
 from hilctl.studies.step_runner import free_mb, require_room
 
 _MOST_PROBLEMS = 20
@@ -197,13 +196,7 @@ class _Problems:
         if not problem.where.startswith("--set "):
             return problem.where
         key, document = key_of(problem.where.removeprefix("--set ")), self._campaign.document
-        vary = self._campaign.config.vary
-        places: list[Loc]
-        if isinstance(vary, Mapping):
-            places = [("vary", key)]
-        else:
-            places = [("vary", n, key) for n, group in enumerate(vary) if key in group]
-        places += [("set", key), ("reference_run", "set", key), (key,)]
-        if not step.is_reference:
-            places.remove(("reference_run", "set", key))
+        places = [*locs_of(self._campaign.config, key), ("set", key), (key,)]
+        if step.is_reference:
+            places.insert(-1, ("reference_run", "set", key))
         return next((document.where(loc) for loc in places if document.holds(loc)), problem.where)

@@ -119,10 +119,10 @@ def campaign_of(document: Document, folder: Path, settings: Sequence[str]) -> Ca
     fixed = [*config.set, *(key_of(text) for text in settings)]
     problems += [
         ConfigProblem(
-            document.where(_loc_of(config, key)), f"vary.{key}", f"is set to one value by {by}"
+            document.where(locs_of(config, key)[0]), f"vary.{key}", f"is set to one value by {by}"
         )
         for key in keys
-        if (by := next((each for each in fixed if _clash(each, key)), None))
+        if (by := next((each for each in fixed if f"{each}.".startswith(f"{key}.")), None))
     ]
     if config.condition is not None and "condition" in {key.split(".")[0] for key in keys}:
         where = document.where(("condition",))
@@ -135,14 +135,11 @@ def campaign_of(document: Document, folder: Path, settings: Sequence[str]) -> Ca
     return CampaignSteps(config, document, experiment, from_here, keys, steps)
 
 
-def _clash(one: str, other: str) -> bool:
-    return one == other or one.startswith(f"{other}.")
-
-
-def _loc_of(config: CampaignFile, key: str) -> Loc:
+def locs_of(config: CampaignFile, key: str) -> list[Loc]:
+    """Return the locations of a varied key in the campaign file."""
     if isinstance(config.vary, Mapping):
-        return ("vary", key)
-    return ("vary", next(n for n, group in enumerate(config.vary) if key in group), key)
+        return [("vary", key)]
+    return [("vary", number, key) for number, group in enumerate(config.vary) if key in group]
 
 
 def _steps(config: CampaignFile, found: Sequence[tuple[Point, int]]) -> Iterator[CampaignStep]:

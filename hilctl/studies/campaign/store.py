@@ -13,7 +13,7 @@ from hilctl.experiment.sections import RecordingConfig
 from hilctl.recording.recording_files import is_being_recorded
 from hilctl.recording.recover import recover_recording
 from hilctl.recording.run_summary import read_ends, recordings_in
-from hilctl.run.run_folder import RunFolder, runs
+from hilctl.run.run_folder import runs
 from hilctl.run.start import RunKey, completed_key
 from hilctl.studies.campaign.steps import CampaignSteps, base_problem, settings_of
 from hilctl.studies.step_runner import document_with
@@ -91,8 +91,10 @@ def await_runs(folder: Path, sleep_s: Callable[[float], None]) -> None:
     Their loop ends by its safe ramp when it misses the supervisor's heartbeat. Raise InputError if
     a run does not end.
     """
-    waited_s = 0.0
-    while living := [run for run in runs() if run.alive and _is_in(run, folder)]:
+    waited_s, whole = 0.0, folder.resolve()
+    while living := [
+        run for run in runs() if run.alive and Path(run.card.recording).parent == whole
+    ]:
         if living[0].supervised or waited_s > _LONGEST_WAIT_S:
             run = living[0].card
             raise InputError(
@@ -100,10 +102,6 @@ def await_runs(folder: Path, sleep_s: Callable[[float], None]) -> None:
             )
         sleep_s(_POLL_S)
         waited_s += _POLL_S
-
-
-def _is_in(run: RunFolder, folder: Path) -> bool:
-    return Path(run.card.recording).parent == folder.resolve()
 
 
 def repair_recordings(folder: Path) -> list[str]:

@@ -260,10 +260,6 @@ def _take_creep(recording: Recording, limits: Limits, measured: Measured) -> Eva
     return replace(measured, crept_percent=found), f"creep {crept} % in {waveforms.CREEP_S:g} s"
 
 
-def _again(limits: Limits, measured: Measured) -> Keys:
-    return _middle_loop(limits, full_amplitude(limits, measured))
-
-
 def _take_again(recording: Recording, limits: Limits, measured: Measured) -> Evaluated:
     again = loop_figures(recording, recording.segments[-1])
     found = repeatability(measured.growing[-1], again)
@@ -309,6 +305,6 @@ _ROWS: list[_Row] = [
      _unevaluated("for the fit")),
     ("held-out", "random reference for the validation", _random(waveforms.HELD_OUT_SEED),
      _unevaluated("not used in any fit")),
-    ("repeated", "the largest loop again", _again, _take_again),
+    ("repeated", "the largest loop again", _at_full(_middle_loop), _take_again),
 ]  # fmt: skip
 STEPS = tuple(CharacterisationStep(*row) for row in _ROWS)

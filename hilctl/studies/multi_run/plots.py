@@ -79,15 +79,11 @@ def trend_sheets(series: RunSeries) -> Iterator[FigureSpec]:
         if minor:
             caption = f"Peak hysteresis of minor loops against {along.name}."
             yield FigureSpec(f"minor_loops_against_{name}", caption, minor)
-        left = _trend_panels(series, along, _compared(series), None)
+        compared = [HYSTERESIS, PEAK_ERROR, RMS_ERROR, MODEL_ERROR]
+        left = _trend_panels(series, along, compared, None)
         if left and any(run.digest and run.digest.compensated for run in series.done):
             caption = f"Residual errors of compensators and models against {along.name}."
             yield FigureSpec(f"compensation_against_{name}", caption, left)
-
-
-def _compared(series: RunSeries) -> list[RunFigure]:
-    modelled = [MODEL_ERROR] if MODEL_ERROR.of(series.done) else []
-    return [HYSTERESIS, PEAK_ERROR, RMS_ERROR, *modelled]
 
 
 def _trend_panels(

@@ -97,12 +97,8 @@ def loop_sheets(series: RunSeries) -> Iterator[FigureSpec]:
             more = f", {len(panels)} of {len(groups)} shown" if len(panels) < len(groups) else ""
             caption = f"Average steady loops by {along.name}{more}."
             name = f"loops_by_{along.name.replace(' ', '_')}"
-            yield FigureSpec(name, caption, tuple(panels), alike=_alike(groups))
-
-
-def _alike(groups: Sequence[tuple[str, Sequence[Measured]]]) -> bool:
-    """Return whether all loops have the same input, so that their panels can share axes."""
-    return len({_input_axis(digest) for _, runs in groups for _, digest in runs}) == 1
+            inputs = {_input_axis(digest) for _, runs in groups for _, digest in runs}
+            yield FigureSpec(name, caption, tuple(panels), alike=len(inputs) == 1)
 
 
 def _groups(series: RunSeries, along: VariedParameter) -> list[tuple[str, list[Measured]]]:
@@ -252,18 +248,13 @@ def error_sheet(series: RunSeries) -> FigureSpec | None:
         if compensated:
             groups.append((title, compensated))
     groups = groups or [("", runs)]
+    text = (lambda run: along.text(run.values[along.key])) if along else series.text
     panels = tuple(
-        Panel(partial(_draw_error, text=_text_of(series, along), runs=members), title)
+        Panel(partial(_draw_error, text=text, runs=members), title)
         for title, members in spread(groups, _MOST_PANELS)
     )
     caption = "Error over one average cycle: displacement minus reference."
     return FigureSpec("error_history", caption, panels, alike=len(panels) > 1)
-
-
-def _text_of(series: RunSeries, along: VariedParameter | None) -> Callable[[SeriesRun], str]:
-    if along is None:
-        return series.text
-    return lambda run: along.text(run.values[along.key])
 
 
 def _draw_error(axes: Axes, text: Callable[[SeriesRun], str], runs: Sequence[Measured]) -> None:

@@ -189,7 +189,9 @@ _LINEAR = 0.95  # least r2 of a linear trend
 
 def headline(series: RunSeries) -> list[str]:
     """Return sentences on the number of runs, best and worst results, trends and drift."""
-    return [_counted(series), *_results(series), *_trends(series), *_drift(series)]
+    drift = str(series.drift) if series.drift else ""
+    sentences = [_counted(series), *_results(series), *_trends(series)]
+    return [*sentences, f"{drift[0].upper()}{drift[1:]}."] if drift else sentences
 
 
 def _counted(series: RunSeries) -> str:
@@ -302,9 +304,3 @@ def _linear(series: RunSeries, along: VariedParameter) -> Iterator[str]:
         low, high = f"{min(found):.4f}", f"{max(found):.4f}"
         between = low if low == high else f"{low} to {high}"
         yield f"The loop area is linear in {along.name} (r² {between})."
-
-
-def _drift(series: RunSeries) -> Iterator[str]:
-    if series.drift is not None:
-        text = str(series.drift)
-        yield f"{text[0].upper()}{text[1:]}."
