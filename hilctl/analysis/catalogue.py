@@ -16,10 +16,10 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from hilctl.base.errors import DataError, InputError
+from hilctl.base.files import write_text
 from hilctl.base.formatting import printable
 from hilctl.recording.metadata_keys import END_FIGURES, LABELS_FACT
 
@@ -130,13 +130,12 @@ def _refuse_chains(condition: str) -> None:
         raise ValueError("two comparisons need AND between them: x > 10 AND x < 100")
 
 
-def _table(entries: Iterable[Entry], place: str = ":memory:") -> sqlite3.Connection:
+def _table(entries: Iterable[Entry]) -> sqlite3.Connection:
     """Return a new database with one row per recording, in their order."""
-    db = sqlite3.connect(place)
+    db = sqlite3.connect(":memory:")
     db.execute(_CREATE)
     insert = f"INSERT INTO recordings VALUES ({', '.join('?' * len(COLUMNS))})"  # noqa: S608
     db.executemany(insert, ([*map(_to_sql, entry.values())] for entry in entries))
-    db.commit()
     return db
 
 
@@ -169,12 +168,6 @@ def _to_sql(value: Any) -> Any:
         value = json.dumps(value, ensure_ascii=False)
     # A JSON escape in a recording may be half a character, which is not valid UTF-8.
     return value.encode(errors="backslashreplace").decode() if isinstance(value, str) else value
-
-
-def _from_sql(kind: type, value: Any) -> Any:
-    if kind is dict:
-        return json.loads(value)
-    return bool(value) if kind is bool and value is not None else value
 
 
 def read_catalogue(folder: Path) -> list[Entry]:
@@ -215,25 +208,16 @@ def _cache_file(folder: Path) -> Path | None:
     except RuntimeError:
         return None
     key = f"{_CACHE_VERSION} {_CREATE} ".encode() + os.fsencode(folder)
-    return place / "hilctl" / f"recordings-{hashlib.sha256(key).hexdigest()[:32]}.sqlite"
+    return place / "hilctl" / f"recordings-{hashlib.sha256(key).hexdigest()[:32]}.json"
 
 
 def _read_cache(path: Path | None) -> list[Entry]:
     """Return the entries in a cache; none if it is missing or damaged."""
-    if path is None:
-        return []
     try:
-        # Immutable: a cache file is only replaced.
-        with closing(sqlite3.connect(f"{path.as_uri()}?immutable=1", uri=True)) as db:
-            return [
-                {
-                    name: _from_sql(COLUMNS[name], value)
-                    for name, value in zip(COLUMNS, row, strict=True)
-                }
-                for row in db.execute("SELECT * FROM recordings")
-            ]
-    except (sqlite3.Error, ValueError):
+        found: list[Entry] = json.loads(path.read_bytes()) if path else []
+    except (OSError, ValueError):
         return []
+    return found
 
 
 def _write_cache(path: Path | None, entries: Sequence[Entry]) -> None:
@@ -241,11 +225,8 @@ def _write_cache(path: Path | None, entries: Sequence[Entry]) -> None:
         return
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        with TemporaryDirectory(dir=path.parent) as scratch:
-            new = Path(scratch, "new")
-            _table(entries, str(new)).close()
-            new.replace(path)
-    except (OSError, sqlite3.Error) as error:
+        write_text(path, json.dumps(entries), overwrite=True)
+    except (OSError, InputError) as error:
         _log.warning("cannot write the cache, recordings are read again next time: %s", error)
 
 

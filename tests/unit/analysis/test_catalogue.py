@@ -4,7 +4,6 @@ import fcntl
 import json
 import os
 import shutil
-import sqlite3
 from pathlib import Path
 
 import pytest
@@ -120,17 +119,13 @@ def test_what_can_not_be_read_is_listed_and_looked_at_anew(folder):
     assert states_of(read_catalogue(folder))["torn.mcap"] == "finished"
 
 
-@pytest.mark.parametrize("damage", [b"", b"hello", "half", "no table"])
+@pytest.mark.parametrize("damage", [b"", b"\xff", "half"])
 def test_a_damaged_cache_is_rebuilt(folder, entries_read, damage):
     first = read_catalogue(folder)
     (cache,) = (folder.parent / "cache" / "hilctl").iterdir()
     whole = cache.read_bytes()
     assert cache.parent.stat().st_mode & 0o077 == 0
-    if damage == "no table":
-        cache.unlink()
-        sqlite3.connect(cache).close()
-    else:
-        cache.write_bytes(whole[: len(whole) // 2] if damage == "half" else damage)
+    cache.write_bytes(whole[: len(whole) // 2] if damage == "half" else damage)
     del entries_read[:]
     assert read_catalogue(folder) == first
     assert len(entries_read) == 3
