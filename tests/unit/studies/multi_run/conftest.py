@@ -1,6 +1,5 @@
 """Synthetic runs of a report."""
 
-from collections.abc import Callable
 from itertools import product
 from typing import Any
 
@@ -93,15 +92,3 @@ def compensated() -> RunSeries:
             number = len(runs) + 1
             runs.append(grown(6.0, hz, number, figures=figures, values=values, digest=found))
     return RunSeries("before", tuple(runs), tuple(runs[0].values), is_campaign=True)
-
-
-@pytest.fixture
-def make_run() -> Callable[..., SeriesRun]:
-    """Return the builder of runs."""
-    return grown
-
-
-@pytest.fixture
-def make_digest() -> Callable[..., RunDigest]:
-    """Return the builder of digests."""
-    return digest

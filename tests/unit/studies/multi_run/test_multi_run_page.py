@@ -12,6 +12,7 @@ from hilctl.studies.multi_run.multi_run_page import (
     series_page,
     write_series,
 )
+from tests.unit.studies.multi_run.conftest import digest
 
 pytestmark = pytest.mark.usefixtures("undrawn")
 
@@ -46,9 +47,9 @@ def test_the_table_has_a_column_for_what_varied_and_for_what_came_out(crossed):
     assert short == ["run", "frequency, Hz", "amplitude, A", "p-p µm", "hyst. %", "area"]
 
 
-def test_labels_and_simulation_are_said(crossed, make_digest):
-    digest = make_digest(labels={"operator": "Ada"}, simulated=True)
-    runs = tuple(replace(run, digest=digest) for run in crossed.runs)
+def test_labels_and_simulation_are_said(crossed):
+    made = digest(labels={"operator": "Ada"}, simulated=True)
+    runs = tuple(replace(run, digest=made) for run in crossed.runs)
     page = series_page(replace(crossed, runs=runs))
     assert "<th>operator</th><td>Ada</td>" in page
     assert "simulated" in page

@@ -20,7 +20,7 @@ from hilctl.studies.multi_run.plots import (
     trend_sheets,
     write_sheets,
 )
-from tests.unit.studies.multi_run.conftest import drawn
+from tests.unit.studies.multi_run.conftest import digest, drawn, grown
 
 
 def test_fits_are_drawn_along_frequency_only(crossed):
@@ -101,23 +101,23 @@ def series(run):
     return RunSeries("loads", (run,), ("waveform.amplitude",))
 
 
-def test_a_step_with_its_resonance(make_run, make_digest):
+def test_a_step_with_its_resonance():
     t = np.linspace(0.0, 0.01, 50)
     ringing = RunFigures(natural_hz=469.5, damping_ratio=0.12)
-    digest = make_digest(step=np.array((t, np.sin(t))), figures=ringing)
-    run = make_run(1.0, 10.0, digest=digest)
+    made = digest(step=np.array((t, np.sin(t))), figures=ringing)
+    run = grown(1.0, 10.0, digest=made)
     axes = drawn(step_sheet(series(run)).panels[0])
     assert axes.lines[0].get_xdata()[-1] == 10.0
     assert axes.get_xlabel().endswith(", ms")
     assert axes.texts[0].get_text() == "470 Hz, damping ratio 0.120"
 
 
-def test_magnitude_and_phase_measured_and_fitted(make_run, make_digest):
+def test_magnitude_and_phase_measured_and_fitted():
     frequency_hz = np.array([10.0, 100.0, 1000.0])
     answer = 4.0 / (1.0 + 1j * frequency_hz / 100.0)
     small = SmallSignal(frequency_hz, answer, np.full(3, 0.1), 1.0, 4.0, 0.0, 0.0, None, None, 1.0,
                         answer)  # fmt: skip
-    run = make_run(1.0, 10.0, digest=make_digest(response=small))
+    run = grown(1.0, 10.0, digest=digest(response=small))
     magnitude, phase = map(drawn, frequency_sheet(series(run)).panels)
     assert magnitude.get_ylabel() == "magnitude, µm/A"
     assert np.allclose(magnitude.lines[0].get_ydata(), np.abs(answer))

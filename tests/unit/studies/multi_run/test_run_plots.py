@@ -19,7 +19,7 @@ from hilctl.studies.multi_run.run_plots import (
     spread,
 )
 from hilctl.studies.multi_run.varied_parameter import WITHOUT_COMPENSATOR, VariedParameter
-from tests.unit.studies.multi_run.conftest import drawn
+from tests.unit.studies.multi_run.conftest import digest, drawn, grown
 
 AMPLITUDE = VariedParameter("a", "amplitude", "A", (1.0, 2.0, 3.0))
 
@@ -103,19 +103,19 @@ def test_a_run_alone_shows_its_error(compensated):
     assert len(error_sheet(alone).panels) == 1
 
 
-def test_minor_loops_are_marked_within_the_cycle(make_run, make_digest):
+def test_minor_loops_are_marked_within_the_cycle():
     phase = np.linspace(0.0, 2.0 * np.pi, 400)
     wave = 4.0 * np.sin(phase) + 3.0 * np.sin(3.0 * phase)
-    run = make_run(4.0, 20.0, digest=make_digest(loop=np.array((wave, 5.0 * wave))))
+    run = grown(4.0, 20.0, digest=digest(loop=np.array((wave, 5.0 * wave))))
     run = replace(run, figures=replace(run.figures, minor_low_um=26.0))
     sheet = minor_loop_sheet(RunSeries("minor", (run,), tuple(run.values)))
     assert labels(drawn(sheet.panels[0])) == ["cycle", "minor loop", "minor loop"]
 
 
-def test_the_model_s_error_stands_beside_its_loop(make_run, make_digest):
+def test_the_model_s_error_stands_beside_its_loop():
     modelled = np.array(([0.0, 1.0, 0.0], [0.0, 10.0, 0.0], [0.0, 9.0, 0.0]))
-    digest = make_digest(modelled=modelled, model_error_percent=10.0)
-    run = make_run(4.0, 20.0, digest=digest)
+    made = digest(modelled=modelled, model_error_percent=10.0)
+    run = grown(4.0, 20.0, digest=made)
     axes = drawn(model_sheet(RunSeries("m", (run,), ())).panels[0])
     assert labels(axes) == ["measured", "model"]
     assert [text.get_text() for text in axes.texts] == ["error 10.0 %"]
