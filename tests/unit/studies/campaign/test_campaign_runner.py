@@ -1,6 +1,5 @@
 """Campaign runner: completed steps are kept, failed ones marked, faults of the rig end it."""
 
-import time
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -10,7 +9,7 @@ import pytest
 from hilctl.base.errors import DeviceError, InputError
 from hilctl.base.events import Event
 from hilctl.recording.reader import read
-from hilctl.run.start import completed_key, unpaced
+from hilctl.run.start import completed_key
 from hilctl.studies.campaign import campaign_runner
 from hilctl.studies.campaign.campaign_runner import (
     CampaignHost,
@@ -19,40 +18,19 @@ from hilctl.studies.campaign.campaign_runner import (
     run_series,
 )
 from tests.unit.studies.campaign.conftest import CAMPAIGN
+from tests.unit.studies.conftest import StudyRig
 
 BUDGET = "set: {limits.rms_current_a: 0.9, limits.thermal_time_constant_s: 3.0}\n"
 
 
-class Rig:
-    """A simulated rig that records runs and pauses, with an optional failure of one run."""
-
-    def __init__(self, ends_at=99, error=None, **ends):
-        self.ends_at, self.error, self.ends = ends_at, error, ends
-        self.runs, self.rows, self.texts, self.pauses = [], [], [], []
-        self.time_s = time.time()
-
-    def __call__(self, path, settings, output, on_part, *, overwrite, heat_a2):
-        assert not overwrite
-        self.runs.append((output.name, heat_a2))
-        on_part(0.5)
-        if len(self.runs) == self.ends_at and self.error:
-            raise self.error
-        result = unpaced(path, settings, output, overwrite=False, heat_a2=heat_a2)
-        self.time_s += result.samples / 2000.0
-        return replace(result, **self.ends) if len(self.runs) == self.ends_at else result
-
-    def sleep(self, seconds):
-        self.pauses.append(seconds)
-        self.time_s += seconds
+class Rig(StudyRig):
+    rate_hz = 2000.0
 
     @property
     def host(self):
         return CampaignHost(
-            run=self,
-            now_s=lambda: self.time_s,
-            sleep_s=self.sleep,
+            **self.observers,
             on_row=lambda step, row: self.rows.append((step.number, row.code, row.kept)),
-            on_progress=lambda done, text: self.texts.append((done, text)),
         )
 
 
@@ -77,7 +55,7 @@ def test_every_step_is_run_and_recorded(run, tmp_path):
     rig = Rig()
     result = run(rig)
     assert codes(result) == ["completed"] * 4
-    assert [name for name, _ in rig.runs] == [f"few-000{k}.mcap" for k in range(1, 5)]
+    assert rig.names == [f"few-000{k}.mcap" for k in range(1, 5)]
     assert (result.reason, result.stop_signal, result.drift) == ("", 0, None)
     done = [part for part, _ in rig.texts]
     assert done == sorted(done)
@@ -93,7 +71,7 @@ def test_completed_steps_are_kept_and_nothing_is_overwritten(run, tmp_path):
     before = {each: each.read_bytes() for each in (tmp_path / "runs").glob("*.mcap")}
     rig, more = Rig(), CAMPAIGN.replace("[1.0, 2.0]", "[0.5, 1.0, 2.0]")
     result = run(rig, more)
-    assert [name for name, _ in rig.runs] == ["few-0001-2.mcap", "few-0002-2.mcap"]
+    assert rig.names == ["few-0001-2.mcap", "few-0002-2.mcap"]
     assert rig.rows[:4] == [(number, "completed", True) for number in range(3, 7)]
     assert result.count("completed") == 6
     assert all(path.read_bytes() == content for path, content in before.items())
@@ -114,7 +92,7 @@ def test_a_failed_step_is_marked_and_the_campaign_continues(run, monkeypatch):
         lambda path: None if path.name == "few-0002.mcap" else completed_key(path),
     )
     assert codes(run(rig)) == ["completed"] * 4
-    assert [name for name, _ in rig.runs] == ["few-0002-2.mcap"]
+    assert rig.names == ["few-0002-2.mcap"]
 
 
 @pytest.mark.parametrize(
@@ -163,7 +141,7 @@ def test_heat_of_the_coil_carries_over(run, tmp_path):
     assert any("cools" in text for _, text in rig.texts)
     paths = sorted((tmp_path / "runs").glob("*.mcap"))
     heats = [float(read(path).end["coil_heat_a2"]) for path in paths]
-    begins = [heat_a2 for _, heat_a2 in rig.runs]
+    begins = [each.heat_a2 for each in rig.runs]
     assert begins[0] == 0.0
     assert all(0.0 < begin <= left for begin, left in zip(begins[1:], heats, strict=False))
     assert max(heats) <= 0.81
@@ -172,7 +150,7 @@ def test_heat_of_the_coil_carries_over(run, tmp_path):
 def test_cool_down_limits_the_initial_heat(run):
     rig = Rig()
     run(rig, CAMPAIGN + BUDGET + "cool_down: {to_rms_a: 0.05}\n")
-    assert all(heat_a2 <= 0.05**2 * 1.001 for _, heat_a2 in rig.runs)
+    assert all(run.heat_a2 <= 0.05**2 * 1.001 for run in rig.runs)
     assert sum(rig.pauses) > 5.0
 
 

@@ -19,56 +19,15 @@ from hilctl.studies.characterise.characterisation_runner import (
 from hilctl.studies.characterise.steps import STEPS
 from hilctl.studies.characterise.waveforms import biased_loops
 from hilctl.studies.step_runner import setting
+from tests.unit.studies.conftest import StudyRig
 
 FEW = ("rest", "polarity", "growing-1", "growing-2")
 SHORT = tuple(step for step in STEPS if step.name.startswith(FEW))
 
 
-RECORDED = {}
-"""What an experiment with settings came to: the same whichever campaign asks for it."""
-
-
-def recorded(path, settings, output, on_part):
-    """Run an experiment once per module."""
-    asked = path.read_text(encoding="utf-8"), tuple(settings)
-    if asked not in RECORDED:
-        RECORDED[asked] = unpaced(path, settings, output, on_part), output.read_bytes()
-    result, recording = RECORDED[asked]
-    output.write_bytes(recording)
-    return replace(result, path=output)
-
-
-class Rig:
-    """A simulated rig that records runs and pauses, with an optional failure of one run."""
-
-    def __init__(self, ends_at=99, code="completed", stop_signal=0, error=None):
-        self.ends_at, self.code, self.stop_signal = ends_at, code, stop_signal
-        self.error = error
-        self.runs, self.rows, self.texts, self.pauses, self.time_s = [], [], [], [], 0.0
-
-    def __call__(self, path, settings, output, on_part, **_):
-        self.runs.append((output.name, list(settings)))
-        on_part(0.5)
-        if len(self.runs) == self.ends_at and self.error:
-            raise self.error
-        result = recorded(path, settings, output, on_part)
-        self.time_s += result.samples / 5000.0
-        if len(self.runs) == self.ends_at:
-            result = replace(result, code=self.code, stop_signal=self.stop_signal, reason="a test")
-        return result
-
-    def sleep(self, seconds):
-        self.pauses.append(seconds)
-        self.time_s += seconds
-
+class Rig(StudyRig):
     def host(self):
-        return CharacterisationHost(
-            run=self,
-            now_s=lambda: self.time_s,
-            sleep_s=self.sleep,
-            on_step=self.rows.append,
-            on_progress=lambda done, text: self.texts.append((done, text)),
-        )
+        return CharacterisationHost(**self.observers, on_step=self.rows.append)
 
 
 @pytest.fixture(autouse=True)
@@ -99,11 +58,11 @@ def run(experiment, rig, *settings, folder="runs"):
 def test_each_step_is_a_run_with_noise_of_its_own(experiment):
     rig = Rig()
     found = run(experiment, rig)
-    assert [name for name, _ in rig.runs] == [
+    assert rig.names == [
         "01-rest.mcap", "02-polarity-1.mcap", "05-growing-1.mcap",
         "06-growing-2.mcap",
     ]  # fmt: skip
-    assert [settings[-1] for _, settings in rig.runs] == [
+    assert [each.settings[-1] for each in rig.runs] == [
         "device.seed=4", "device.seed=5", "device.seed=8", "device.seed=9",
     ]  # fmt: skip
     assert [row.name for row in rig.rows] == ["rest", "polarity-1", "growing-1", "growing-2"]
@@ -143,7 +102,7 @@ def test_a_step_without_its_recording_is_run_again(experiment, size, settings, n
     path.write_bytes(path.read_bytes()[:size])
     rig = Rig()
     run(experiment, rig, *settings)
-    assert [name for name, _ in rig.runs] == names
+    assert rig.names == names
 
 
 def test_discarding_starts_again(experiment):
@@ -168,7 +127,7 @@ def test_a_sensor_at_its_end_is_named(experiment):
 
 
 def test_a_stopped_step_ends_it(experiment):
-    rig = Rig(ends_at=2, code="stopped", stop_signal=signal.SIGTERM)
+    rig = Rig(2, code="stopped", stop_signal=signal.SIGTERM, reason="a test")
     with pytest.raises(StepStoppedError, match="polarity-1: a test") as caught:
         run(experiment, rig)
     assert caught.value.signal == signal.SIGTERM
@@ -198,7 +157,7 @@ def test_a_coil_that_has_cooled_since_is_not_waited_for(experiment):
     rig = Rig()
     rig.time_s = time.time() + 3600.0
     run(experiment, rig, *BUDGET)
-    assert [name for name, _ in rig.runs] == ["06-growing-2.mcap"]
+    assert rig.names == ["06-growing-2.mcap"]
     assert rig.pauses == []
 
 
@@ -206,7 +165,7 @@ def test_a_coil_that_has_cooled_since_is_not_waited_for(experiment):
 def test_where_the_output_is_given_by_hand_it_is_at_rest_after_the_first_step(experiment):
     rig = Rig()
     run(experiment, rig, "safe={value: 0.0, at_start: 0.5}", "device.output_at_open=null")
-    given = [[each for each in settings if "at_start=" in each] for _, settings in rig.runs]
+    given = [[s for s in each.settings if "at_start=" in s] for each in rig.runs]
     assert given == [[], *([["safe.at_start=0.0"]] * 3)]
 
 
