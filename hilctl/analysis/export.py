@@ -156,8 +156,7 @@ class ExportedAll:
     """Result of the export of a folder.
 
     Attributes:
-        written: Files written.
-        there: Files that existed and were not changed.
+        there: Number of files that existed and were not changed.
         left_out: Reason why a recording was not written, by its path in the folder.
     """
 

@@ -46,10 +46,9 @@ _FEWEST_NAMED = 2  # a single line is named by its axes
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """One pair of axes.
+    """One pair of axes, drawn and labelled by a function.
 
     Attributes:
-        draw: Draws into axes and labels them.
         title: Title, prefixed by a letter if there are several panels.
         height: Share of its width, in a column of its own.
     """
@@ -65,8 +64,6 @@ class FigureSpec:
 
     Attributes:
         name: Name of its file.
-        caption: Caption.
-        panels: The panels.
         alike: Whether panels have the same axes: then a single column has two side by side, and
             only the outer axes have labels.
         stacked: Whether panels share the x axis, one below the other.

@@ -33,11 +33,9 @@ class CampaignRow:
 
     Attributes:
         result: ``planned``, ``completed``, or code and reason.
-        figures: Metrics of its recording.
         recording: Name of its recording in the campaign's folder, or empty.
         code: ``planned``, ``completed``, ``refused``, ``fault`` or ``stopped``.
         kept: Whether it was done already.
-        digest: Data of its recording for figures, or None.
     """
 
     result: str = PLANNED

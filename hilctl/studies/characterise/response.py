@@ -58,7 +58,6 @@ class RestNoise:
     """Sensor signal at rest.
 
     Attributes:
-        mean_um: Mean displacement.
         noise_um: rms about the linear trend.
         span_um: Range of the readings.
         drift_um_per_s: Slope of the linear trend.

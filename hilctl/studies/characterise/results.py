@@ -87,7 +87,6 @@ class StepRow:
     """One step of the plan or the result.
 
     Attributes:
-        name: Name of the step and of its recording.
         seconds: Rig time.
         megabytes: Approximate size of its recording.
         text: Summary of its result; empty before the run.

@@ -51,7 +51,6 @@ class SeriesRun:
         values: Value of each varied key, as a number or short text.
         result: ``completed``, ``planned``, or code and reason.
         recording: Name of its recording, or empty.
-        digest: Data of its recording for figures, or None.
         repeat: Number of the repeat or of the reference run.
     """
 

@@ -164,7 +164,7 @@ class SeriesDrift:
     Attributes:
         runs: Number of completed reference runs.
         peak_to_peak_percent: Change of the peak-to-peak displacement, in percent of it.
-        mean_um: Change of the mean displacement, in um.
+        mean_um: Change of the mean displacement.
         peak_hysteresis_percent: Change of the peak hysteresis, in points of percent.
     """
 

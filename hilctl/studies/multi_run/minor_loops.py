@@ -23,7 +23,6 @@ class MinorLoop:
     Attributes:
         middle: Mid-range of its input, in the input's unit.
         span: Peak-to-peak input.
-        peak_to_peak_um: Peak-to-peak displacement.
         peak_hysteresis_percent: Largest distance between its branches, of its peak-to-peak.
     """
 

@@ -22,7 +22,6 @@ class RunFigure:
 
     Attributes:
         name: Its column in the table.
-        text: Its name.
         unit: Its unit; ``%`` or as in :func:`hilctl.base.formatting.quantity`.
         short: Short heading.
         value: Returns it for a run, or None.
