@@ -284,16 +284,10 @@ RUN = {
     ),
 }  # fmt: skip
 END = {
-    "code": "completed",
-    "output_safe": "false",
-    "recorded_samples": "290",
-    "missing_samples": "10",
-    "late_ticks": "-1",
-    "skipped_ticks": "3",
-    "peak_error_percent": "0.5",
-    "loop_area": "inf",
-    "rms_error_percent": "x",
-}
+    "code": "completed", "output_safe": "false", "recorded_samples": "290",
+    "missing_samples": "10", "late_ticks": "-1", "skipped_ticks": "3",
+    "peak_error_percent": "0.5", "loop_area": "inf", "rms_error_percent": "x",
+}  # fmt: skip
 
 
 def made_entry(tmp_path, run, end):
@@ -313,32 +307,16 @@ def test_facts_become_values(tmp_path):
     assert list(found) == list(COLUMNS)
     assert found.pop(LABELS_FACT) == {"sample": "A7", "t": 21.5}
     assert found.pop("options") == {
-        "device.load_kg": 3.7,
-        "device.serial": "0012",
-        "device.noise": True,
-        "device.nan": "NaN",
-        "device.list": "[1]",
-        "waveform.kind": "sine",
-    }
+        "device.load_kg": 3.7, "device.serial": "0012", "device.noise": True,
+        "device.nan": "NaN", "device.list": "[1]", "waveform.kind": "sine",
+    }  # fmt: skip
     assert {name: value for name, value in found.items() if value is not None} == {
-        "path": "sub/a.mcap",
-        "size_bytes": 7,
-        "mtime_ns": 8,
-        "state": "finished",
-        "name": "made",
-        "device": "dac",
-        "simulated": True,
-        "sample_rate_hz": 1000.0,
-        "waveform": "sine 0 and 2 more",
-        "frequency_hz": 250.0,
-        "duration_s": 0.3,
-        "code": "completed",
-        "output_safe": False,
-        "recorded_samples": 290,
-        "missing_samples": 10,
-        "skipped_ticks": 3,
-        "peak_error_percent": 0.5,
-    }
+        "path": "sub/a.mcap", "size_bytes": 7, "mtime_ns": 8, "state": "finished",
+        "name": "made", "device": "dac", "simulated": True, "sample_rate_hz": 1000.0,
+        "waveform": "sine 0 and 2 more", "frequency_hz": 250.0, "duration_s": 0.3,
+        "code": "completed", "output_safe": False, "recorded_samples": 290,
+        "missing_samples": 10, "skipped_ticks": 3, "peak_error_percent": 0.5,
+    }  # fmt: skip
     for name, value in found.items():
         assert value is None or type(value) is COLUMNS[name]
 

@@ -40,46 +40,29 @@ def recording(unit: str = "A", *, measured: bool = True, n: int = 2000) -> Recor
     index = np.arange(n, dtype=np.int64)
     index[n // 2 :] += 500
     samples = Samples(
-        index=index,
-        reference_um=column(),
-        wanted=column(),
-        command=column(),
-        measured=column() if measured else np.empty(0),
-        displacement_um=column(),
-        input_um=column(),
-        flags=rng.integers(0, 2**32, n, dtype=np.uint32),
-    )
+        index=index, reference_um=column(), wanted=column(), command=column(),
+        measured=column() if measured else np.empty(0), displacement_um=column(),
+        input_um=column(), flags=rng.integers(0, 2**32, n, dtype=np.uint32),
+    )  # fmt: skip
     return Recording(
-        path=Path("folder/run.mcap"),
-        run={"name": "test", "device": "serial_dac"},
-        end={"reason": "done"},
-        sample_rate_hz=50_000.0,
-        command_unit=unit,
-        compensated=True,
-        segments=(Segment("sine", 0, n, 0, n, 1000.0 / 3.0),),
-        samples=samples,
-        dropped=500,
-        ticks=Ticks(*(np.empty(0, dtype=np.int64),) * 4),
-        events=(),
-        experiment_yaml=YAML,
+        path=Path("folder/run.mcap"), run={"name": "test", "device": "serial_dac"},
+        end={"reason": "done"}, sample_rate_hz=50_000.0, command_unit=unit, compensated=True,
+        segments=(Segment("sine", 0, n, 0, n, 1000.0 / 3.0),), samples=samples, dropped=500,
+        ticks=Ticks(*(np.empty(0, dtype=np.int64),) * 4), events=(), experiment_yaml=YAML,
         model_yaml="",
-    )
+    )  # fmt: skip
 
 
 def expected(run: Recording) -> dict[str, np.ndarray]:
     """Return every column under the name it must have, in the order it must have."""
     wanted, command, measured = NAMES[run.command_unit]
+    samples = run.samples
     table = {
-        "sample": run.samples.index,
-        "t_s": run.samples.index / 50_000.0,
-        "reference_um": run.samples.reference_um,
-        wanted: run.samples.wanted,
-        command: run.samples.command,
-        "displacement_um": run.samples.displacement_um,
-        measured: run.samples.measured,
-        "input_um": run.samples.input_um,
-        "flags": run.samples.flags,
-    }
+        "sample": samples.index, "t_s": samples.index / 50_000.0,
+        "reference_um": samples.reference_um, wanted: samples.wanted, command: samples.command,
+        "displacement_um": samples.displacement_um, measured: samples.measured,
+        "input_um": samples.input_um, "flags": samples.flags,
+    }  # fmt: skip
     return {name: values for name, values in table.items() if values.size}
 
 

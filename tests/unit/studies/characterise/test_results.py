@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilctl.base.errors import DataError
 from hilctl.base.segments import Segment
 from hilctl.identify.data.records import History, SteadyLoop
 from hilctl.identify.fit_api import FitRequest
@@ -139,19 +138,6 @@ def test_the_floor_is_what_noise_makes(run):
 
 def test_commands_that_the_model_was_not_found_on_are_not_judged(run):
     assert validate(MODEL, run(reach=1.5), 0.0, "x").time_s.size < 1000
-
-
-def test_missing_samples_are_refused(make_recording, run):
-    whole = run()
-    short = make_recording(
-        whole.samples.displacement_um[100:],
-        command=whole.samples.command[100:],
-        segments=whole.segments,
-        index=np.arange(100, 2000),
-        sample_rate_hz=RATE_HZ,
-    )
-    with pytest.raises(DataError, match="missing"):
-        validate(MODEL, short, 0.0, "x")
 
 
 def test_the_kind_is_chosen_on_whole_histories_of_what_may_be_fitted(run, monkeypatch):

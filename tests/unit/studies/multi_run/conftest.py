@@ -1,5 +1,6 @@
 """Synthetic runs of a report."""
 
+from dataclasses import replace
 from itertools import product
 from typing import Any
 
@@ -20,31 +21,18 @@ def drawn(panel):
     return axes
 
 
-def digest(
-    *, compensated: bool = False, lag: float = 0.2, values: Any = None, **keys: Any
-) -> RunDigest:
+def digest(*, compensated: bool = False, lag: float = 0.2, **keys: Any) -> RunDigest:
     """Return the digest of a sine of 40 um that lags."""
     moved = 40.0 * np.sin(PHASE - lag)
     wave = (40.0 if compensated else 6.0) * np.sin(PHASE)
     error_um = np.array((PHASE / (2.0 * np.pi), moved - wave)) if compensated else np.empty((2, 0))
-    given = {
-        "name": "rig",
-        "path": "run.mcap",
-        "started": "2026-11-22T10:00:00+00:00",
-        "labels": {},
-        "device": "serial_dac",
-        "simulated": False,
-        "code": "completed",
-        "reason": "waveform completed",
-        "values": values or {"waveform": {"unit": "A"}},
-        "compensated": compensated,
-        "command_unit": "A",
-        "waveform": "sine",
-        "figures": RunFigures(),
-        "loop": np.array((wave, moved)),
-        "error_um": error_um,
-    }
-    return RunDigest(**given | keys)
+    made = RunDigest(
+        name="rig", path="run.mcap", started="2026-11-22T10:00:00+00:00", labels={},
+        device="serial_dac", simulated=False, code="completed", reason="waveform completed",
+        values={"waveform": {"unit": "A"}}, compensated=compensated, command_unit="A",
+        waveform="sine", figures=RunFigures(), loop=np.array((wave, moved)), error_um=error_um,
+    )  # fmt: skip
+    return replace(made, **keys)
 
 
 def grown(amplitude: float, hz: float, number: int = 1, **keys: Any) -> SeriesRun:
@@ -56,16 +44,9 @@ def grown(amplitude: float, hz: float, number: int = 1, **keys: Any) -> SeriesRu
         low_um=-6.0 * amplitude,
         high_um=4.0 * amplitude,
     )
-    given = {
-        "number": number,
-        "is_reference": False,
-        "values": {"waveform.amplitude": amplitude, "waveform.frequency_hz": hz},
-        "figures": figures,
-        "result": "completed",
-        "recording": f"run-{number}.mcap",
-        "digest": digest(),
-    }
-    return SeriesRun(**given | keys)
+    values = {"waveform.amplitude": amplitude, "waveform.frequency_hz": hz}
+    made = SeriesRun(number, False, values, figures, "completed", f"run-{number}.mcap", digest())
+    return replace(made, **keys)
 
 
 @pytest.fixture
