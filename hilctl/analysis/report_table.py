@@ -7,19 +7,6 @@ from hilctl.machine.procfs import ProcessUsage
 
 SIMULATED = "simulated: no hardware was driven"
 
-_SEGMENT_HEADINGS = (
-    "segment",
-    "start s",
-    "freq. Hz",
-    "cycles",
-    "p-p µm",
-    "peak hyst. %",
-    "floor %",
-    "peak err. %",
-    "rms err. %",
-    "loop area",
-)
-
 
 def number(value: float | None, unit: str = "") -> str:
     """Return a number with four significant digits and its unit; a dash if None."""
@@ -85,29 +72,25 @@ def quality_rows(report: RunReport) -> list[tuple[str, str]]:
 
 def segment_table(report: RunReport) -> tuple[list[str], list[list[str]]]:
     """Return headings and rows of all segments, without empty columns."""
-    columns = zip(*(_segment_cells(segment) for segment in report.segments), strict=True)
-    filled = [
-        (heading, column)
-        for heading, column in zip(_SEGMENT_HEADINGS, columns, strict=False)
-        if set(column) != {MISSING}
-    ]
-    rows = zip(*(column for _, column in filled), strict=True)
-    return [heading for heading, _ in filled], [list(row) for row in rows]
+    rows = [_segment_row(segment) for segment in report.segments]
+    filled = [name for name in rows[0] if {row[name] for row in rows} != {MISSING}] if rows else []
+    return filled, [[row[name] for name in filled] for row in rows]
 
 
-def _segment_cells(segment: SegmentReport) -> list[str]:
-    return [
-        printable(segment.label),
-        f"{segment.start_s:g}",
-        MISSING if segment.frequency_hz is None else f"{segment.frequency_hz:g}",
-        str(segment.steady_cycles),
-        number(segment.peak_to_peak_um),
-        number(segment.peak_hysteresis_percent),
-        number(segment.noise_floor_percent),
-        number(segment.peak_error_percent),
-        number(segment.rms_error_percent),
-        number(segment.loop_area),
-    ]
+def _segment_row(segment: SegmentReport) -> dict[str, str]:
+    hz = segment.frequency_hz
+    return {
+        "segment": printable(segment.label),
+        "start s": f"{segment.start_s:g}",
+        "freq. Hz": MISSING if hz is None else f"{hz:g}",
+        "cycles": str(segment.steady_cycles),
+        "p-p µm": number(segment.peak_to_peak_um),
+        "peak hyst. %": number(segment.peak_hysteresis_percent),
+        "floor %": number(segment.noise_floor_percent),
+        "peak err. %": number(segment.peak_error_percent),
+        "rms err. %": number(segment.rms_error_percent),
+        "loop area": number(segment.loop_area),
+    }
 
 
 def _range(low: float | None, high: float | None, unit: str) -> str:
