@@ -293,11 +293,10 @@ def write_sheets(
     except OSError as error:
         raise InputError(f"{folder}: can't be created: {error.strerror}") from None
     written: dict[Path, str] = {}
-    captions = {sheet.name: sheet.caption for sheet in sheets}
-    for name, figure in draw_sheets(sheets, width, on_done):
+    for sheet, (name, figure) in zip(sheets, draw_sheets(sheets, width, on_done), strict=True):
         on_drawn(name, figure)
         paths = write_figure(figure, folder, name, formats, overwrite=overwrite)
-        written |= dict.fromkeys(paths, captions[name])
+        written |= dict.fromkeys(paths, sheet.caption)
     return written
 
 

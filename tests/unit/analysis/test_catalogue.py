@@ -1,4 +1,4 @@
-"""All recordings in a folder: none hidden, each read once, and found by what is known of it."""
+"""Catalogue: all recordings of a folder are listed, read once, and selected by conditions."""
 
 import fcntl
 import json

@@ -1,4 +1,4 @@
-"""What plots show of a recording that is too long: its spikes, and what is judged of all of it."""
+"""Decimation of long recordings: spikes and evaluated samples are kept."""
 
 from dataclasses import replace
 
@@ -59,7 +59,7 @@ class Parts:
 
 @pytest.fixture
 def small(monkeypatch):
-    """Let every recording be too long."""
+    """Decimate recordings of any length."""
     monkeypatch.setattr(module, "MOST_SAMPLES", 20_000)
     monkeypatch.setattr(module, "_STRETCHES", 1500)
     monkeypatch.setattr(module, "_LAST_SAMPLES", 8_000)

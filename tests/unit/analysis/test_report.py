@@ -1,4 +1,4 @@
-"""From recordings to figures: what is judged, what is None, what counts as what."""
+"""Report of a recording: evaluated samples, metrics, and metrics that are not available."""
 
 import json
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""The page: everything in it, nothing fetched, nothing taken for markup."""
+"""Page of a run: complete, self-contained, and without markup from texts."""
 
 import re
 from dataclasses import replace
@@ -20,7 +20,7 @@ NASTY = """<script>alert("x")</script>&amp;<img src=x onerror='y'>"""
 
 
 class Page(HTMLParser):
-    """What a browser would make of the page: tags, what they refer to, and visible text."""
+    """Tags, references and visible text of a page, as in a browser."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
