@@ -61,7 +61,7 @@ def gather_all(docs: Path) -> None:
     _write(generated / "commands.md", commands_page())
     _write(generated / "api_names.md", api_page())
     _write(generated / "api_returned.md", returned_page())
-    terms = "\n".join(f"**{term}**\n: {meaning}\n" for term, meaning in DEFINITIONS)
+    terms = "\n".join(f"**{term}**\n: {meaning}\n" for term, meaning in DEFINITIONS.items())
     _write(generated / "definitions.md", terms)
 
 

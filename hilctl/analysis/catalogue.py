@@ -16,10 +16,10 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from hilctl.base.errors import DataError, InputError
+from hilctl.base.files import write_text
 from hilctl.base.formatting import printable
 from hilctl.recording.metadata_keys import END_FIGURES, LABELS_FACT
 
@@ -43,8 +43,6 @@ _END: dict[str, type] = {
     **dict.fromkeys(("recorded_samples", "missing_samples", "late_ticks", "skipped_ticks"), int),
     **dict.fromkeys(END_FIGURES, float),
 }
-OPTIONS = ("device", "waveform")
-"""Prefixes of the facts in the column ``options``."""
 COLUMNS: dict[str, type] = {
     "path": str,
     "state": str,
@@ -69,7 +67,7 @@ those of facts in a recording.
 
 _BOOLEANS = {"true": True, "false": False, "True": True, "False": False}
 _MOST_DIGITS = 15
-_OPTION_PREFIXES = tuple(f"{name}." for name in OPTIONS)
+_OPTION_PREFIXES = ("device.", "waveform.")
 _PREFIXES = ("label.", *_OPTION_PREFIXES)
 _SQL_TYPES = {str: "TEXT", int: "INTEGER", bool: "INTEGER", float: "REAL", dict: "TEXT"}
 _CREATE = "CREATE TABLE recordings ({})".format(
@@ -98,15 +96,11 @@ def keys_of(entries: Iterable[Entry]) -> list[str]:
 def select(
     entries: Sequence[Entry], where: str = "", sort: str = "started", *, reverse: bool = False
 ) -> list[Entry]:
-    """Return the recordings that match a condition, sorted.
+    """Return the recordings that match a condition, sorted; those without the sort key are last.
 
-    Args:
-        entries: The recordings.
-        where: A condition in the SQL of SQLite on the names of :func:`keys_of`; empty for all. A
-            text may be in double quotes. A key with other characters is in square brackets, such
-            as ``[label.batch no]``.
-        sort: Key to sort by; recordings without it are last.
-        reverse: Largest or newest first.
+    The condition is in the SQL of SQLite on the names of :func:`keys_of`; empty for all. A text may
+    be in double quotes. A key with other characters is in square brackets, such as ``[label.batch
+    no]``.
 
     Raises:
         InputError: The condition is not valid, or a key is unknown.
@@ -136,13 +130,12 @@ def _refuse_chains(condition: str) -> None:
         raise ValueError("two comparisons need AND between them: x > 10 AND x < 100")
 
 
-def _table(entries: Iterable[Entry], place: str = ":memory:") -> sqlite3.Connection:
+def _table(entries: Iterable[Entry]) -> sqlite3.Connection:
     """Return a new database with one row per recording, in their order."""
-    db = sqlite3.connect(place)
+    db = sqlite3.connect(":memory:")
     db.execute(_CREATE)
     insert = f"INSERT INTO recordings VALUES ({', '.join('?' * len(COLUMNS))})"  # noqa: S608
     db.executemany(insert, ([*map(_to_sql, entry.values())] for entry in entries))
-    db.commit()
     return db
 
 
@@ -177,30 +170,6 @@ def _to_sql(value: Any) -> Any:
     return value.encode(errors="backslashreplace").decode() if isinstance(value, str) else value
 
 
-def _from_sql(kind: type, value: Any) -> Any:
-    if kind is dict:
-        return json.loads(value)
-    return bool(value) if kind is bool and value is not None else value
-
-
-class CatalogueHit(NamedTuple):
-    """A file in a listed folder.
-
-    Attributes:
-        file: The file.
-        path: Its path in the listed folder, as printable text.
-        size_bytes: Its size.
-        mtime_ns: Its modification time, Unix time in ns.
-        problem: Why it cannot be a recording, or empty.
-    """
-
-    file: str
-    path: str
-    size_bytes: int
-    mtime_ns: int
-    problem: str = ""
-
-
 def read_catalogue(folder: Path) -> list[Entry]:
     """Return the entries of all ``.mcap`` files in a folder, at any depth, sorted by path.
 
@@ -214,10 +183,13 @@ def read_catalogue(folder: Path) -> list[Entry]:
     except OSError as error:
         raise InputError(f"{folder}: can't be listed: {error.strerror}") from None
     cache = _cache_file(folder)
-    found = {(each.path, each.size_bytes, each.mtime_ns): each for each in _scan(str(folder), "")}
+    found = {_identity(entry): (file, entry) for file, entry in _scan(folder)}
     cached = _read_cache(cache)
     kept = [entry for entry in cached if found.pop(_identity(entry), None)]
-    new = [_entry(each) for each in found.values()]
+    new = [
+        entry if entry["problem"] else entry_of(file, *_identity(entry))
+        for file, entry in found.values()
+    ]
     finished = [entry for entry in new if entry["state"] == "finished"]
     if finished or len(kept) < len(cached):
         _write_cache(cache, [*kept, *finished])
@@ -236,25 +208,16 @@ def _cache_file(folder: Path) -> Path | None:
     except RuntimeError:
         return None
     key = f"{_CACHE_VERSION} {_CREATE} ".encode() + os.fsencode(folder)
-    return place / "hilctl" / f"recordings-{hashlib.sha256(key).hexdigest()[:32]}.sqlite"
+    return place / "hilctl" / f"recordings-{hashlib.sha256(key).hexdigest()[:32]}.json"
 
 
 def _read_cache(path: Path | None) -> list[Entry]:
     """Return the entries in a cache; none if it is missing or damaged."""
-    if path is None:
-        return []
     try:
-        # Immutable: a cache file is only replaced.
-        with closing(sqlite3.connect(f"{path.as_uri()}?immutable=1", uri=True)) as db:
-            return [
-                {
-                    name: _from_sql(COLUMNS[name], value)
-                    for name, value in zip(COLUMNS, row, strict=True)
-                }
-                for row in db.execute("SELECT * FROM recordings")
-            ]
-    except (sqlite3.Error, ValueError):
+        found: list[Entry] = json.loads(path.read_bytes()) if path else []
+    except (OSError, ValueError):
         return []
+    return found
 
 
 def _write_cache(path: Path | None, entries: Sequence[Entry]) -> None:
@@ -262,48 +225,34 @@ def _write_cache(path: Path | None, entries: Sequence[Entry]) -> None:
         return
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        with TemporaryDirectory(dir=path.parent) as scratch:
-            new = Path(scratch, "new")
-            _table(entries, str(new)).close()
-            new.replace(path)
-    except (OSError, sqlite3.Error) as error:
+        write_text(path, json.dumps(entries), overwrite=True)
+    except (OSError, InputError) as error:
         _log.warning("cannot write the cache, recordings are read again next time: %s", error)
 
 
-def _entry(found: CatalogueHit) -> Entry:
-    if found.problem:
-        return unreadable(found.path, found.size_bytes, found.mtime_ns, found.problem)
-    return entry_of(Path(found.file), found.path, found.size_bytes, found.mtime_ns)
+def _scan(folder: Path) -> Iterator[tuple[Path, Entry]]:
+    """Yield each possible recording and its entry, with its problem if it cannot be one.
 
-
-def _scan(folder: str, below: str) -> Iterator[CatalogueHit]:
-    """Yield the recordings in a folder; links to folders are not followed, to avoid cycles.
-
-    Args:
-        folder: The folder.
-        below: Its path in the listed folder, with a slash; empty for that folder.
+    Links to folders are not followed, to avoid cycles.
     """
-    try:
-        with os.scandir(folder) as listed:
-            entries = list(listed)
-    except OSError as error:
-        yield CatalogueHit(folder, below, 0, 0, f"can't be listed: {error.strerror}")
-        return
-    for entry in entries:
-        path = below + os.fsencode(entry.name).decode("utf-8", "backslashreplace")
-        if entry.is_dir(follow_symlinks=False):
-            yield from _scan(entry.path, f"{path}/")
-        elif entry.name.endswith(".mcap") and not entry.is_dir():
-            yield _found(entry, path)
+    unlisted: list[OSError] = []
+    for place, _, names in os.walk(folder, onerror=unlisted.append):
+        for file in (Path(place, name) for name in names if name.endswith(".mcap")):
+            path = _printable_path(file, folder)
+            try:
+                status = file.stat()
+            except OSError as error:
+                yield file, unreadable(path, 0, 0, f"can't be read: {error.strerror}")
+                continue
+            problem = "" if stat.S_ISREG(status.st_mode) else "is not a file"
+            yield file, unreadable(path, status.st_size, status.st_mtime_ns, problem)
+    for each in unlisted:
+        file, problem = Path(each.filename), f"can't be listed: {each.strerror}"
+        yield file, unreadable(f"{_printable_path(file, folder)}/", 0, 0, problem)
 
 
-def _found(entry: "os.DirEntry[str]", path: str) -> CatalogueHit:
-    try:
-        status = entry.stat()
-    except OSError as error:
-        return CatalogueHit(entry.path, path, 0, 0, f"can't be read: {error.strerror}")
-    problem = "" if stat.S_ISREG(status.st_mode) else "is not a file"
-    return CatalogueHit(entry.path, path, status.st_size, status.st_mtime_ns, problem)
+def _printable_path(file: Path, folder: Path) -> str:
+    return os.fsencode(file.relative_to(folder)).decode("utf-8", "backslashreplace")
 
 
 def unreadable(path: str, size_bytes: int, mtime_ns: int, problem: str) -> Entry:
@@ -314,14 +263,7 @@ def unreadable(path: str, size_bytes: int, mtime_ns: int, problem: str) -> Entry
 
 
 def entry_of(file: Path, path: str, size_bytes: int, mtime_ns: int) -> Entry:
-    """Return the entry of a file, by both its ends.
-
-    Args:
-        file: The file.
-        path: Its name in the catalogue.
-        size_bytes: Its size.
-        mtime_ns: Its modification time, in ns.
-    """
+    """Return the entry of a file by both its ends; ``path`` is its name in the catalogue."""
     # A cached catalogue does not need these imports, which take a second.
     from hilctl.recording.run_summary import read_ends
     from hilctl.recording.validation import labels_of, segments_of

@@ -7,15 +7,16 @@ highest displacement, reference, command and error, and each segment its last ev
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields, replace
+from typing import TypeVar
 
 import numpy as np
 
 from hilctl.analysis.report import Windows, build_report
 from hilctl.analysis.run_metrics import RunReport
-from hilctl.analysis.steady_state import Overview, SteadyPart, trusted
+from hilctl.analysis.steady_state import Overview, SteadyPart, loop_signals, trusted
 from hilctl.base.events import Event
 from hilctl.base.samples import Samples
-from hilctl.base.types import F64, I64
+from hilctl.base.types import I64
 from hilctl.recording.recording import Recording, Ticks
 from hilctl.signals.cycle_metrics import MeanCycle
 
@@ -26,18 +27,15 @@ _STRETCHES = 2**16  # a plot has 4000 points
 _LAST_SAMPLES = 2**18  # all segments together
 _MOST_TICKS = 2**20
 
+_Columns = TypeVar("_Columns", Samples, Ticks)
+
 
 def overview(pieces: Iterable[Recording]) -> tuple[RunReport, Recording]:
     """Return the report of a recording, and a decimated recording with the same plots.
 
-    Ticks are decimated evenly; the latest one is kept.
-
-    Args:
-        pieces: Pieces of the run in order, as a repeatable iterable: a run that ended early or was
-            tuned is read twice.
-
-    Raises:
-        DataError: As :func:`hilctl.analysis.report.summarize` does.
+    Ticks are decimated evenly; the latest one is kept. The pieces of the run are a repeatable
+    iterable, because a run that ended early or was tuned is read twice. Raise DataError as
+    :func:`hilctl.analysis.report.summarize` does.
     """
     shown: list[_Shown] = []
 
@@ -50,11 +48,7 @@ def overview(pieces: Iterable[Recording]) -> tuple[RunReport, Recording]:
 
 
 class _Shown:
-    """Builder of the recording for plots.
-
-    Args:
-        windows: Evaluated samples of each segment.
-    """
+    """Builder of the recording for plots."""
 
     def __init__(self, windows: Windows) -> None:
         self._windows = windows
@@ -83,22 +77,17 @@ def _joined(pieces: list[Recording]) -> Recording:
         return pieces[0]
     return replace(
         pieces[-1],
-        samples=_samples_of([piece.samples for piece in pieces]),
-        ticks=_ticks_of([piece.ticks for piece in pieces]),
+        samples=_together([piece.samples for piece in pieces]),
+        ticks=_together([piece.ticks for piece in pieces]),
         events=tuple(event for piece in pieces for event in piece.events),
         starts=tuple(start for piece in pieces for start in piece.starts),
     )
 
 
-def _samples_of(parts: list[Samples]) -> Samples:
-    filled = [part for part in parts if part.index.size] or parts[:1]
-    names = [each.name for each in fields(Samples)]
-    return Samples(**{name: np.concatenate([getattr(p, name) for p in filled]) for name in names})
-
-
-def _ticks_of(parts: list[Ticks]) -> Ticks:
-    names = [each.name for each in fields(Ticks)]
-    return Ticks(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in names})
+def _together(parts: Sequence[_Columns]) -> _Columns:
+    names = [each.name for each in fields(parts[0])]
+    columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    return type(parts[0])(**columns)
 
 
 class _Thinned:
@@ -125,13 +114,13 @@ class _Thinned:
         for part in self._parts:
             part.add(piece)
         rows = _extreme_rows(piece.samples, self._per_stretch)
-        self._shown.append(_rows_of(piece.samples, rows))
+        self._shown.append(piece.samples.rows(rows))
         self._size += rows.size
         if self._size > MOST_SAMPLES:  # longer than planned
             self._per_stretch *= 4
-            together = _samples_of(self._shown)
+            together = _together(self._shown)
             rows = _extreme_rows(together, 32)
-            self._shown, self._size = [_rows_of(together, rows)], rows.size
+            self._shown, self._size = [together.rows(rows)], rows.size
 
     def recording(self, cycles: Sequence[MeanCycle | None]) -> Overview:
         assert self._last is not None
@@ -139,9 +128,10 @@ class _Thinned:
             segment: part.steady_part(cycle)
             for (segment, _), part, cycle in zip(self._windows, self._parts, cycles, strict=True)
         }
-        samples = _with(_samples_of(self._shown), [part.last_samples() for part in self._parts])
+        samples = _together([*self._shown, *(part.last_samples() for part in self._parts)])
+        _, rows = np.unique(samples.index, return_index=True)
         named = {each.name: getattr(self._last, each.name) for each in fields(Recording)}
-        named |= {"samples": samples, "ticks": self._ticks.ticks()}
+        named |= {"samples": samples.rows(rows), "ticks": self._ticks.ticks()}
         named |= {"events": tuple(self._events), "starts": ()}
         return Overview(**named, windows=dict(self._windows), parts=parts)
 
@@ -162,25 +152,8 @@ def _extreme_rows(samples: Samples, per_stretch: int) -> I64:
     return np.unique(np.concatenate(rows))
 
 
-def _with(samples: Samples, more: list[Samples]) -> Samples:
-    """Return the union of samples, in order."""
-    together = _samples_of([samples, *more])
-    _, rows = np.unique(together.index, return_index=True)
-    return _rows_of(together, rows)
-
-
-def _rows_of(samples: Samples, rows: I64) -> Samples:
-    values = {each.name: getattr(samples, each.name) for each in fields(Samples)}
-    return Samples(**{name: each[rows] if each.size else each for name, each in values.items()})
-
-
 class _Part:
-    """Last steady samples of a segment.
-
-    Args:
-        window: Its evaluated samples: first, after the last, whole cycles.
-        most: Most samples to keep.
-    """
+    """Last ``most`` steady samples of a segment."""
 
     def __init__(self, window: tuple[int, int, int], most: int) -> None:
         self._start, self._stop, self._cycles = window
@@ -201,22 +174,14 @@ class _Part:
         while self._size - self._kept[0].index.size >= self._most > 0:
             self._size -= self._kept.popleft().index.size
 
-    def _loop(self, samples: Samples) -> F64:
-        loop_input = samples.reference_um if self._compensated else samples.command
-        return np.array((loop_input, samples.displacement_um))
-
     def last_samples(self) -> Samples:
-        return _samples_of(list(self._kept)).rows(slice(-self._most, None))
+        return _together(self._kept).rows(slice(-self._most, None))
 
     def steady_part(self, cycle: MeanCycle | None) -> SteadyPart:
         """Return the steady part with the average cycle of all its samples, if it has one."""
         samples = self.last_samples()
-        if cycle is None:
-            loop = self._loop(samples)
-            return SteadyPart(samples, 0, None, loop[:, np.isfinite(loop).all(axis=0)])
-        if not cycle.whole:
-            return SteadyPart(samples, self._cycles, None, np.empty((2, 0)))
-        return SteadyPart(samples, self._cycles, cycle, cycle.signals)
+        signals = loop_signals(samples, compensated=self._compensated)
+        return SteadyPart.of(samples, self._cycles, cycle, signals)
 
 
 class _SampledTicks:
@@ -239,20 +204,15 @@ class _SampledTicks:
             self._latest = latest
         if sum(each.late_ns.size for each in self._kept) > _MOST_TICKS:
             self._every *= 2
-            together = _ticks_of(self._kept)
+            together = _together(self._kept)
             self._kept = [_rows(together, np.arange(0, together.late_ns.size, 2))]
 
     def ticks(self) -> Ticks:
         if self._latest is None:
             return Ticks(*(np.empty(0, dtype=np.int64),) * 4)
-        together = _ticks_of(self._kept)
-        if self._latest.first_sample[0] in together.first_sample:
-            return together
-        place = int(np.searchsorted(together.first_sample, self._latest.first_sample[0]))
-        return _ticks_of([
-            _rows(together, np.arange(place)), self._latest,
-            _rows(together, np.arange(place, together.late_ns.size)),
-        ])  # fmt: skip
+        together = _together([*self._kept, self._latest])
+        _, rows = np.unique(together.first_sample, return_index=True)
+        return _rows(together, rows)
 
 
 def _rows(ticks: Ticks, rows: I64) -> Ticks:

@@ -82,28 +82,23 @@ def write_pieces(
     file: ColumnFile,
     table_of: Callable[[Recording], Columns] | None = None,
 ) -> int:
-    """Write the samples of pieces, and the facts of the last one.
+    """Write the samples of pieces, and the facts of the last one; return the number of samples.
 
-    Args:
-        pieces: At least one, in order.
-        file: Where to write.
-        table_of: Returns the columns of a piece; :func:`columns` by default.
-
-    Returns:
-        Number of samples written.
-
-    Raises:
-        DataError: There is no sample.
+    ``table_of`` returns the columns of a piece; :func:`columns` by default.
     """
     rows = 0
     waiting: deque[Future[None]] = deque()
+
+    def add(piece: Recording) -> None:
+        file.add((table_of or columns)(piece))
+
     # Reading and compressing run in parallel, because both release the interpreter lock.
     with ThreadPoolExecutor(1, thread_name_prefix="export") as worker:
         for piece in pieces:
             if piece.samples.index.size:
                 if len(waiting) == _MOST_WAITING:
                     waiting.popleft().result()
-                waiting.append(worker.submit(_add, file, piece, table_of or columns))
+                waiting.append(worker.submit(add, piece))
                 rows += piece.samples.index.size
         for each in waiting:
             each.result()
@@ -111,10 +106,6 @@ def write_pieces(
         raise DataError(f"{piece.path}: holds no sample")
     file.finish(facts(piece))
     return rows
-
-
-def _add(file: ColumnFile, piece: Recording, table_of: Callable[[Recording], Columns]) -> None:
-    file.add(table_of(piece))
 
 
 def columns(recording: Recording) -> Columns:
@@ -154,11 +145,7 @@ def facts(recording: Recording) -> Facts:
 
 
 def write_parquet(stream: BinaryIO, table: Columns, facts: Facts) -> None:
-    """Write columns of NumPy or Arrow, with facts as metadata.
-
-    Raises:
-        InputError: pyarrow is missing.
-    """
+    """Write columns of NumPy or Arrow, with facts as metadata."""
     file = ParquetFile(stream)
     file.add(table)
     file.finish(facts)
@@ -169,8 +156,7 @@ class ExportedAll:
     """Result of the export of a folder.
 
     Attributes:
-        written: Files written.
-        there: Files that existed and were not changed.
+        there: Number of files that existed and were not changed.
         left_out: Reason why a recording was not written, by its path in the folder.
     """
 

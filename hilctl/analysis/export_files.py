@@ -32,33 +32,18 @@ class ColumnFile(Protocol):
     """A file being written."""
 
     def add(self, columns: Columns) -> None:
-        """Write more rows; the columns are those of the first call.
-
-        Raises:
-            OSError: The disk rejects them.
-            InputError: The format cannot hold them.
-        """
+        """Write more rows; raise InputError if the format cannot hold them."""
         ...
 
     def finish(self, facts: Facts) -> None:
-        """Write the remaining rows and the facts.
-
-        Raises:
-            OSError: The disk rejects them.
-        """
+        """Write the remaining rows and the facts."""
         ...
 
 
 class CsvFile:
-    """CSV file, without facts.
-
-    Args:
-        stream: Output.
-        aside: Unused.
-    """
+    """CSV file, without facts."""
 
     def __init__(self, stream: BinaryIO, aside: IO[bytes] | None = None) -> None:
-        del aside
         self._stream = stream
         self._line = ""
 
@@ -80,8 +65,7 @@ class CsvFile:
 class _RefusedOnce:
     """Output of Arrow that raises only once, because Arrow repeats failed writes and prints errors.
 
-    Args:
-        stream: Output; it stays open.
+    The stream stays open.
     """
 
     def __init__(self, stream: BinaryIO) -> None:
@@ -108,17 +92,9 @@ class ParquetFile:
     """Parquet file with row groups of one or two million rows, and facts as schema metadata.
 
     Columns may be of NumPy or Arrow.
-
-    Args:
-        stream: Output.
-        aside: Unused.
-
-    Raises:
-        InputError: pyarrow is missing.
     """
 
     def __init__(self, stream: BinaryIO, aside: IO[bytes] | None = None) -> None:
-        del aside
         self._pa = arrow()
         file = self._pa.PythonFile(_RefusedOnce(stream), mode="w")
         self._stream = self._pa.BufferedOutputStream(file, _WRITTEN_BYTES)
@@ -137,7 +113,11 @@ class ParquetFile:
         A search for nulls in NumPy numbers, which have none, takes a third of the writing time.
         """
         table = self._pa.table(dict(columns))
-        fields = [each.with_nullable(not _is_full(columns[each.name])) for each in table.schema]
+        fields = []
+        for each in table.schema:
+            values = columns[each.name]
+            full = isinstance(values, np.ndarray) and values.dtype.kind in "iuf"
+            fields.append(each.with_nullable(not full))
         return self._pa.Table.from_arrays(table.columns, schema=self._pa.schema(fields))
 
     def finish(self, facts: Facts) -> None:
@@ -186,81 +166,53 @@ class ParquetFile:
         )
 
 
-def _is_full(values: Any) -> bool:
-    """Return whether a column has NumPy numbers, and thus no nulls."""
-    return isinstance(values, np.ndarray) and values.dtype.kind in "iuf"
+class _StoredColumns:
+    """Columns in a temporary file, one piece after the other."""
 
-
-class _Aside:
-    """Temporary file of columns, one piece after the other."""
-
-    def __init__(self, file: IO[bytes]) -> None:
-        self._file = file
+    def __init__(self, stream: BinaryIO, aside: IO[bytes]) -> None:
+        self._stream, self._aside = stream, aside
         self._parts: dict[str, list[tuple[int, int]]] = {}
-        self.kinds: dict[str, np.dtype[Any]] = {}
-        self.rows = 0
+        self._kinds: dict[str, np.dtype[Any]] = {}
+        self._rows = 0
 
     def add(self, columns: Columns) -> None:
         for name, values in columns.items():
-            self.kinds[name] = values.dtype
-            self._parts.setdefault(name, []).append((self._file.tell(), values.nbytes))
-            self._file.write(np.ascontiguousarray(values).data)
-        self.rows += next(iter(columns.values())).size
+            self._kinds[name] = values.dtype
+            self._parts.setdefault(name, []).append((self._aside.tell(), values.nbytes))
+            self._aside.write(np.ascontiguousarray(values).data)
+        self._rows += next(iter(columns.values())).size
 
-    def copy(self, name: str, target: IO[bytes]) -> None:
+    def _copy(self, name: str, target: IO[bytes]) -> None:
         """Write a column."""
         for start, size in self._parts[name]:
-            self._file.seek(start)
-            target.write(self._file.read(size))
+            self._aside.seek(start)
+            target.write(self._aside.read(size))
 
 
-class NpzFile:
-    """NumPy archive of columns, and of facts as texts.
-
-    Args:
-        stream: Output.
-        aside: Empty temporary file.
-    """
-
-    def __init__(self, stream: BinaryIO, aside: IO[bytes]) -> None:
-        self._stream = stream
-        self._aside = _Aside(aside)
-
-    def add(self, columns: Columns) -> None:
-        """Store rows."""
-        self._aside.add(columns)
+class NpzFile(_StoredColumns):
+    """NumPy archive of columns, and of facts as texts."""
 
     def finish(self, facts: Facts) -> None:
         """Write the archive."""
         with zipfile.ZipFile(self._stream, "w") as archive:
-            for name, kind in self._aside.kinds.items():
+            for name, kind in self._kinds.items():
                 with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
                     descr = np.lib.format.dtype_to_descr(kind)
-                    shape = (self._aside.rows,)
-                    head = {"descr": descr, "fortran_order": False, "shape": shape}
+                    head = {"descr": descr, "fortran_order": False, "shape": (self._rows,)}
                     np.lib.format.write_array_header_1_0(entry, head)
-                    self._aside.copy(name, entry)
+                    self._copy(name, entry)
             for name, text in facts.items():
                 with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
                     np.lib.format.write_array(entry, np.array(text), allow_pickle=False)
 
 
-class MatFile:
-    """MATLAB 5 file of column vectors, and of facts as texts.
-
-    Args:
-        stream: Output.
-        aside: Empty temporary file.
-    """
-
-    def __init__(self, stream: BinaryIO, aside: IO[bytes]) -> None:
-        self._stream = stream
-        self._aside = _Aside(aside)
+class MatFile(_StoredColumns):
+    """MATLAB 5 file of column vectors, and of facts as texts."""
 
     def add(self, columns: Columns) -> None:
         """Store rows."""
-        self._aside.add(columns)
-        if 8 * self._aside.rows > _LARGEST_MAT_BYTES:
+        super().add(columns)
+        if 8 * self._rows > _LARGEST_MAT_BYTES:
             most = _LARGEST_MAT_BYTES // 8
             raise InputError(
                 f".mat holds at most {most} samples: export a stretch (--from, --to) or .parquet"
@@ -269,11 +221,10 @@ class MatFile:
     def finish(self, facts: Facts) -> None:
         """Write the file as SciPy does, which needs twice the memory of each column."""
         self._stream.write(_saved({})[:_MAT_HEADER_BYTES])
-        for name, kind in self._aside.kinds.items():
-            size = kind.itemsize * self._aside.rows
-            self._stream.write(_mat_head(name, kind, self._aside.rows))
-            self._aside.copy(name, self._stream)
-            self._stream.write(bytes(-size % 8))
+        for name, kind in self._kinds.items():
+            self._stream.write(_mat_head(name, kind, self._rows))
+            self._copy(name, self._stream)
+            self._stream.write(bytes(-kind.itemsize * self._rows % 8))
         self._stream.write(_saved(facts)[_MAT_HEADER_BYTES:])
 
 

@@ -3,9 +3,9 @@
 Text has the same size in all widths, so that one figure serves in print and on a page.
 """
 
-import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from textwrap import wrap
 from typing import Any, BinaryIO, Literal, TypeAlias
@@ -46,10 +46,9 @@ _FEWEST_NAMED = 2  # a single line is named by its axes
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """One pair of axes.
+    """One pair of axes, drawn and labelled by a function.
 
     Attributes:
-        draw: Draws into axes and labels them.
         title: Title, prefixed by a letter if there are several panels.
         height: Share of its width, in a column of its own.
     """
@@ -65,8 +64,6 @@ class FigureSpec:
 
     Attributes:
         name: Name of its file.
-        caption: Caption.
-        panels: The panels.
         alike: Whether panels have the same axes: then a single column has two side by side, and
             only the outer axes have labels.
         stacked: Whether panels share the x axis, one below the other.
@@ -83,12 +80,7 @@ class FigureSpec:
 
 @mpl.rc_context(STYLE)
 def drawn(sheet: FigureSpec, width: ColumnWidth = "single") -> Figure:
-    """Draw a figure.
-
-    Args:
-        sheet: The figure.
-        width: One column of a journal, or two.
-    """
+    """Draw a figure for one or two columns of a journal."""
     columns = _columns(sheet, width)
     rows = -(-len(sheet.panels) // columns)
     whole_mm = COLUMN_MM[width]
@@ -114,10 +106,13 @@ def drawn(sheet: FigureSpec, width: ColumnWidth = "single") -> Figure:
             axes.set_xlabel("")
     for number, axes in enumerate(grid.flat[len(sheet.panels) :], len(sheet.panels)):
         axes.set_axis_off()
-        above = grid.flat[number - columns]
-        above.tick_params(labelbottom=True)
-    if sheet.alike:
-        _name_outer(grid, len(sheet.panels))
+        grid.flat[number - columns].tick_params(labelbottom=True)
+    if sheet.alike:  # name the outer axes only
+        for number, axes in enumerate(grid.flat):
+            if number % columns:
+                axes.set_ylabel("")
+            if number + columns < len(sheet.panels):
+                axes.set_xlabel("")
     _legend(figure, [axes for axes in grid.flat if axes.axison], whole_mm)
     if (layout := figure.get_layout_engine()) is not None:
         # Once for all formats, because it takes half the time of a figure.
@@ -139,18 +134,6 @@ def _columns(sheet: FigureSpec, width: ColumnWidth) -> int:
         return 2 if sheet.alike and len(sheet.panels) > 2 else 1
     count = len(sheet.panels)
     return min(2 if count == 4 else count, sheet.most_beside)
-
-
-def _name_outer(grid: Any, panels: int) -> None:
-    """Keep the labels of the outer axes only."""
-    rows, columns = grid.shape
-    for row in range(rows):
-        for column in range(columns):
-            axes = grid[row, column]
-            if column:
-                axes.set_ylabel("")
-            if (row + 1) * columns + column < panels:
-                axes.set_xlabel("")
 
 
 def _legend(figure: Figure, drawn_axes: list[Axes], whole_mm: float) -> None:
@@ -188,10 +171,7 @@ def formats_of(text: str) -> tuple[str, ...]:
 def write_figure(
     figure: Figure, folder: Path, name: str, formats: Sequence[str], *, overwrite: bool
 ) -> list[Path]:
-    """Write a figure atomically in several formats.
-
-    Returns:
-        The files, ``NAME.FORMAT`` in the folder.
+    """Write a figure atomically as ``NAME.FORMAT`` in several formats; return the files.
 
     Raises:
         InputError: A file exists and may not be replaced, or cannot be written.
@@ -199,18 +179,11 @@ def write_figure(
     written = []
     for chosen in formats:
         path = folder / f"{name}.{chosen}"
-        content = _file(figure, chosen)
-
-        def write(stream: BinaryIO, content: bytes = content) -> None:
-            stream.write(content)
-
-        write_file(path, write, overwrite=overwrite)
+        write_file(path, partial(_write, figure, chosen), overwrite=overwrite)
         written.append(path)
     return written
 
 
 @mpl.rc_context(STYLE)
-def _file(figure: Figure, chosen: str) -> bytes:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format=chosen, dpi=_DPI, metadata=_UNDATED[chosen])
-    return buffer.getvalue()
+def _write(figure: Figure, chosen: str, stream: BinaryIO) -> None:
+    figure.savefig(stream, format=chosen, dpi=_DPI, metadata=_UNDATED[chosen])

@@ -151,45 +151,36 @@ def definitions(heading: str, terms: Sequence[tuple[str, str]]) -> str:
     return f"<h2>{text(heading)}</h2><dl>{body}</dl>"
 
 
-DEFINITIONS: tuple[tuple[str, str], ...] = (
-    (
-        "average cycle",
-        "Mean of all whole steady cycles on bins of phase; basis of every figure that is not raw.",
+DEFINITIONS = {
+    "average cycle": (
+        "Mean of all whole steady cycles on bins of phase; basis of every figure that is not raw."
     ),
-    (
-        "peak hysteresis",
+    "peak hysteresis": (
         "Largest difference of displacement between a rising and a falling branch at one input, "
         "over the peak-to-peak displacement. The input is the reference with a compensator, "
-        "otherwise the command.",
+        "otherwise the command."
     ),
-    ("noise floor", "Peak hysteresis that sensor noise alone would cause."),
-    ("loop area", "Area enclosed by displacement against input."),
-    (
-        "peak and rms error",
+    "noise floor": "Peak hysteresis that sensor noise alone would cause.",
+    "loop area": "Area enclosed by displacement against input.",
+    "peak and rms error": (
         "Displacement less reference, offset included: largest magnitude, and root mean square, "
-        "over the peak-to-peak displacement.",
+        "over the peak-to-peak displacement."
     ),
-    (
-        "asymmetry",
-        "Difference of the highest and the lowest displacement from rest, over the peak-to-peak.",
+    "asymmetry": (
+        "Difference of the highest and the lowest displacement from rest, over the peak-to-peak."
     ),
-    (
-        "model error",
+    "model error": (
         "Largest difference of the measured displacement and that of the model, over the "
-        "peak-to-peak displacement.",
+        "peak-to-peak displacement."
     ),
-    (
-        "harmonics of the error",
-        "Amplitudes of the error's steady part at multiples of the waveform's frequency.",
+    "harmonics of the error": (
+        "Amplitudes of the error's steady part at multiples of the waveform's frequency."
     ),
-    ("r²", "Share of the variance explained by a linear fit."),
-    (
-        "lateness",
-        "Time from a tick's deadline to its wake-up; 99 % of the ticks are within p99.",
-    ),
-)
+    "r²": "Share of the variance explained by a linear fit.",
+    "lateness": "Time from a tick's deadline to its wake-up; 99 % of the ticks are within p99.",
+}
 
 
 def definitions_of(*terms: str) -> list[tuple[str, str]]:
     """Return terms and definitions, in order."""
-    return [each for each in DEFINITIONS if each[0] in terms]
+    return [each for each in DEFINITIONS.items() if each[0] in terms]

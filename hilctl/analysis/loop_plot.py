@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from hilctl.analysis.figure_layout import FigureSpec, Panel
-from hilctl.analysis.plot_style import DISPLACEMENT, MARK, REFERENCE, WITH, WITHOUT
+from hilctl.analysis.plot_style import DISPLACEMENT, MARK, REFERENCE, WITH, WITHOUT, of_range
 from hilctl.analysis.steady_state import SteadyPart, steady_part
 from hilctl.base.formatting import quantity, short_name
 from hilctl.base.types import F64
@@ -18,21 +18,14 @@ from hilctl.signals import cycle_metrics
 _LONGEST_PATH = 5_000
 _MOST_LABELS = 12
 _SQUARE = 0.85
-_DISPLACEMENT_AXIS = "displacement, µm"
 
 
 def hysteresis_loop(recording: Recording, focus: int = 0) -> FigureSpec | None:
     """Return displacement against the loop's input, one average cycle per segment.
 
     The second panel shows the deviation from the ideal line of a compensated run, otherwise from a
-    linear fit. Loops without a period are drawn as measured.
-
-    Args:
-        recording: The run.
-        focus: Number of the segment whose peak hysteresis is marked.
-
-    Returns:
-        None if no segment has steady samples.
+    linear fit. Loops without a period are drawn as measured. The peak hysteresis of segment
+    ``focus`` is marked. None if no segment has steady samples.
     """
     parts = [steady_part(recording, segment) for segment in recording.segments]
     everything = np.concatenate([np.empty((2, 0)), *map(_loop, parts)], axis=1)
@@ -91,11 +84,8 @@ def _draw(
     if focus < len(parts):
         _mark_gap(axes, parts[focus], taken_off)
     unit = "µm" if recording.compensated else recording.command_unit
-    left = "less line" if taken_off.any() else ""
-    axes.set(
-        xlabel=f"{_input_name(recording)}, {unit}",
-        ylabel=f"displacement {left}, µm" if left else _DISPLACEMENT_AXIS,
-    )
+    left = " less line" if taken_off.any() else ""
+    axes.set(xlabel=f"{_input_name(recording)}, {unit}", ylabel=f"displacement{left}, µm")
 
 
 def _colours(loops: int) -> list[object]:
@@ -124,24 +114,16 @@ def before_and_after(before: Recording, after: Recording) -> FigureSpec | None:
     """Return the loops of one motion without and with a compensator, and the errors of both.
 
     Each is shown over its own range, because command and reference have different units; ideal is a
-    straight line from corner to corner.
-
-    Args:
-        before: The run without a compensator.
-        after: The run with a compensator.
-
-    Returns:
-        None if one of them has no average cycle.
+    straight line from corner to corner. None if one of them has no average cycle.
     """
-    loops = [_worst_loop(before), _worst_loop(after)]
-    if any(loop is None for loop in loops):
+    loops = _worst_loop(before), _worst_loop(after)
+    shown = [of_range(loop) for loop in loops if loop is not None]
+    if len(shown) < 2:
         return None
-    shown = [_of_range(loop) for loop in loops if loop is not None]
+    styles = (WITHOUT, "without compensator"), (WITH, "with it")
 
     def draw(axes: Axes, off_line: float) -> None:
-        for (x, y), colour, label in zip(
-            shown, (WITHOUT, WITH), ("without compensator", "with it"), strict=True
-        ):
+        for (x, y), (colour, label) in zip(shown, styles, strict=True):
             axes.plot(x, y - off_line * x, color=colour, linewidth=1.0, label=label)
         straight = [0.0, 100.0 * (1.0 - off_line)]
         axes.plot([0.0, 100.0], straight, color=REFERENCE, linestyle=":", linewidth=0.8)
@@ -163,9 +145,3 @@ def _worst_loop(recording: Recording) -> F64 | None:
     return max(
         loops, key=lambda loop: cycle_metrics.peak_hysteresis_percent(*loop) or 0.0, default=None
     )
-
-
-def _of_range(loop: F64) -> F64:
-    low, whole = loop.min(axis=1, keepdims=True), np.ptp(loop, axis=1)[:, None]
-    percent: F64 = 100.0 * (loop - low) / np.where(whole > 0.0, whole, 1.0)
-    return percent

@@ -77,15 +77,9 @@ def pieces(recording: Recording) -> list[tuple[int, int, float]]:
 def draw_over_time(
     axes: Axes, recording: Recording, values: F64, colour: str, label: str, *, outline: bool = False
 ) -> None:
-    """Draw a signal over a whole run: as a line, or where cycles crowd as the band they fill.
+    """Draw a signal over a whole run: as a line, or as a band if its cycles are too narrow.
 
-    Args:
-        axes: Where to draw, time in s.
-        recording: The run.
-        values: float64[n], one a sample.
-        colour: Colour of line and band.
-        label: For the legend.
-        outline: Draw only a band's edges, so that another one can be seen in it.
+    An outline is a dashed line, or the edges of the band, so that another signal can be seen in it.
     """
     index = recording.samples.index
     rate_hz = recording.sample_rate_hz
@@ -124,29 +118,28 @@ def draw_line(
 
 def legend(axes: Axes) -> None:
     """Put a legend above the axes, at the right."""
-    handles, labels = axes.get_legend_handles_labels()
-    if labels:
-        corner = (1.0, 1.0)
-        axes.legend(loc="lower right", bbox_to_anchor=corner, borderaxespad=0.2, ncols=len(handles))
+    handles, _ = axes.get_legend_handles_labels()
+    corner = (1.0, 1.0)
+    axes.legend(loc="lower right", bbox_to_anchor=corner, borderaxespad=0.2, ncols=len(handles))
+
+
+def of_range(loop: F64) -> F64:
+    """Return the rows of float64[2, n] in percent of their ranges."""
+    low, whole = loop.min(axis=1, keepdims=True), np.ptp(loop, axis=1)[:, None]
+    percent: F64 = 100.0 * (loop - low) / np.where(whole > 0.0, whole, 1.0)
+    return percent
 
 
 def min_max(t: F64, values: F64, points: int = MAX_POINTS) -> tuple[F64, F64]:
     """Reduce a signal to the lowest and highest value of each of equal intervals.
 
     Every spike is kept. Values that are not finite are omitted; an interval without others is NaN,
-    which breaks the line.
-
-    Args:
-        t: float64[n].
-        values: float64[n].
-        points: Most points to return, >= 2.
-
-    Returns:
-        t and values, float64[m] each, m <= max(points, 2).
+    which breaks the line. Returns t and values, float64[m] each, m <= max(points, 2).
     """
     if values.size <= points:
         return t, values
-    edges = _edges(values.size, max(1, points // 2))
+    stretches = max(1, points // 2)
+    edges = np.arange(stretches, dtype=np.int64) * values.size // stretches
     low, high = _extremes(values, edges)
     middle = t[(edges + np.append(edges[1:], values.size)) // 2]
     return np.repeat(middle, 2), np.column_stack((low, high)).ravel()
@@ -155,15 +148,8 @@ def min_max(t: F64, values: F64, points: int = MAX_POINTS) -> tuple[F64, F64]:
 def band(index: I64, values: F64, period: float) -> tuple[F64, F64, F64]:
     """Reduce a periodic signal to its band, on intervals of at least one period.
 
-    Shorter intervals would beat with the period.
-
-    Args:
-        index: int64[n], n > 0, increasing sample indices.
-        values: float64[n].
-        period: Samples in one period, > 0.
-
-    Returns:
-        Sample index of the centre, lowest and highest value of each interval: float64[m] each.
+    Shorter intervals would beat with the period, which is in samples. Returns the sample index of
+    the centre, the lowest and the highest value of each interval: float64[m] each.
     """
     span = int(index[-1] - index[0]) + 1
     stretches = max(1, min(_MAX_BUCKETS, int(span / period)))
@@ -175,18 +161,8 @@ def band(index: I64, values: F64, period: float) -> tuple[F64, F64, F64]:
 
 
 def shown_as_band(samples: int, period: float, shown: int) -> bool:
-    """Return whether cycles are too narrow for a line.
-
-    Args:
-        samples: Number of samples with this period.
-        period: Samples in one period; 0.0 without one.
-        shown: Samples on the whole time axis.
-    """
+    """Return whether cycles are too narrow for a line, with ``shown`` samples on the time axis."""
     return 0.0 < period < shown * _NARROWEST_CYCLE and samples > 4.0 * period
-
-
-def _edges(size: int, stretches: int) -> I64:
-    return np.arange(stretches, dtype=np.int64) * size // stretches
 
 
 def _extremes(values: F64, edges: I64) -> tuple[F64, F64]:

@@ -22,6 +22,7 @@ from hilctl.analysis.plot_style import (
     draw_line,
     draw_over_time,
 )
+from hilctl.analysis.quantiles import Quantiles
 from hilctl.analysis.steady_state import SteadyPart, steady_part, steady_samples
 from hilctl.base.formatting import quantity, short_name
 from hilctl.base.samples import Samples
@@ -32,6 +33,12 @@ from hilctl.signals.cycle_metrics import MAX_BINS, fold
 
 MOST_HARMONICS = 20
 _MOST_SAMPLES = 2**20
+_ZOOM_CYCLES = 2
+_BINS = 80
+_SPREAD_BINS = 200
+_SPECTRUM_POINTS = 800
+_DECADES = 5.0  # of amplitude that a spectrum shows
+_LOW = 0.5
 _LARGEST_UM = 1e100  # larger readings have no spectrum
 _WIDEST_GAP = 0.02  # share of samples that may be missing
 
@@ -45,25 +52,16 @@ class ErrorSpectrum:
         amplitude_um: float64[k], amplitude of a sine there, Hann window.
         harmonics_um: float64[h], amplitude at 1, 2, ... times the waveform's frequency; empty
             without a period.
-        constant_um: Mean error.
     """
 
     frequency_hz: F64
     amplitude_um: F64
     harmonics_um: F64
-    constant_um: float
 
 
 def error_spectrum(recording: Recording, segment: Segment, index: I64, error_um: F64
                    ) -> ErrorSpectrum | None:  # fmt: skip
-    """Return the spectrum of an error; None with too few finite values.
-
-    Args:
-        recording: The run.
-        segment: The segment of the samples.
-        index: int64[n], increasing sample indices.
-        error_um: float64[n].
-    """
+    """Return the spectrum of an error at sample indices; None with too few finite values."""
     finite = np.isfinite(error_um)
     if np.count_nonzero(finite) < 2 * MOST_HARMONICS:
         return None
@@ -73,12 +71,11 @@ def error_spectrum(recording: Recording, segment: Segment, index: I64, error_um:
         return None
     even = np.interp(np.arange(index[0], index[-1] + 1), index, error_um)
     window = np.hanning(span + 1)[:-1]
-    mean_um = float(even.mean())
-    wave = np.fft.rfft((even - mean_um) * window)
+    wave = np.fft.rfft((even - even.mean()) * window)
     size = np.asarray(np.abs(wave), dtype=np.float64) * (2.0 / float(window.sum()))
     frequency_hz: F64 = np.arange(float(size.size)) * (recording.sample_rate_hz / span)
     harmonics_um = _harmonics(index - segment.start, error_um, segment.period)
-    return ErrorSpectrum(frequency_hz[1:], size[1:], harmonics_um, mean_um)
+    return ErrorSpectrum(frequency_hz[1:], size[1:], harmonics_um)
 
 
 def _harmonics(index: I64, error_um: F64, period: float) -> F64:
@@ -96,26 +93,13 @@ def _harmonics(index: I64, error_um: F64, period: float) -> F64:
 
 
 def thinned(spectrum: ErrorSpectrum, points: int) -> tuple[F64, F64]:
-    """Return frequency and largest amplitude of intervals of equal ratio.
-
-    Args:
-        spectrum: The spectrum.
-        points: Most intervals.
-    """
+    """Return frequency and largest amplitude of at most ``points`` intervals of equal ratio."""
     x, y = spectrum.frequency_hz, spectrum.amplitude_um
     if x.size <= points:
         return x, y
     edges = np.unique(np.searchsorted(x, np.geomspace(x[0], x[-1], points)))
     middle = x[np.minimum((edges + np.append(edges[1:], x.size)) // 2, x.size - 1)]
     return middle, np.maximum.reduceat(y, edges)
-
-
-_ZOOM_CYCLES = 2
-_BINS = 80
-_SPREAD_BINS = 200
-_SPECTRUM_POINTS = 800
-_DECADES = 5.0  # of amplitude that a spectrum shows
-_LOW = 0.5
 
 
 def time_history(recording: Recording) -> FigureSpec | None:
@@ -192,11 +176,7 @@ def _mark_judged(axes: Axes, recording: Recording) -> None:
 
 
 def error(recording: Recording, focus: int = 0) -> FigureSpec | None:
-    """Return displacement less reference, over the run and over one cycle.
-
-    Returns:
-        None if no sample has a reference.
-    """
+    """Return displacement less reference, over the run and over one cycle; None without any."""
     error_um = recording.samples.displacement_um - recording.samples.reference_um
     if not recording.compensated or not np.isfinite(error_um).any():
         return None
@@ -280,11 +260,7 @@ def _draw_harmonics(axes: Axes, found: ErrorSpectrum) -> None:
 
 
 def lateness(recording: Recording) -> FigureSpec | None:
-    """Return histograms of the lateness of ticks and the duration of exchanges.
-
-    Returns:
-        None without ticks, or if the run was not in real time.
-    """
+    """Return histograms of lateness and exchanges; None without ticks in real time."""
     if recording.ticks.late_ns.size == 0 or recording.run.get("paced") == "false":
         return None
     caption = "Lateness of ticks, and duration of exchanges with the device."
@@ -299,7 +275,9 @@ def _draw_lateness(axes: Axes, recording: Recording) -> None:
     bins = np.geomspace(float(everything.min()), highest, _BINS).tolist()
     axes.hist(late_us, bins, color=DISPLACEMENT, alpha=0.6, label="lateness")
     axes.hist(exchange_us, bins, histtype="step", color=COMMAND, label="exchange")
-    marks = tick_lateness.percentiles_us(ticks.late_ns)
+    quantiles = Quantiles()
+    quantiles.add(ticks.late_ns)
+    marks = tick_lateness.percentiles_us(quantiles)
     for name in ("p50", "p99", "max"):
         _mark(axes, max(marks[name], 1.0), f"{name} {quantity(marks[name], 'us')}")
     period_ns = tick_lateness.tick_period_ns(ticks)

@@ -1,5 +1,6 @@
 """Percentiles in bounded memory: exact up to two million values, otherwise from bins."""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -17,11 +18,16 @@ _MIDDLE = 2 ** (63 - _SHIFT)
 
 
 class Quantiles:
-    """Distribution of values."""
+    """Distribution of values.
+
+    Attributes:
+        size: Number of values.
+        largest: The largest one; -inf without any.
+    """
 
     def __init__(self) -> None:
         self.size = 0
-        self._largest: Any = None
+        self.largest = -math.inf
         self._values: list[Any] | None = []
         self._counts = np.empty(0, dtype=np.int64)
 
@@ -30,8 +36,7 @@ class Quantiles:
         if values.size == 0:
             return
         self.size += values.size
-        largest = values.max()
-        self._largest = largest if self._largest is None else max(self._largest, largest)
+        self.largest = max(self.largest, float(values.max()))
         if self._values is None:
             self._count(values)
         else:
@@ -48,17 +53,6 @@ class Quantiles:
         bits = np.ascontiguousarray(values, dtype=np.float64).view(np.int64)
         keys, counts = np.unique(_ordered(bits) >> _SHIFT, return_counts=True)
         self._counts[keys + _MIDDLE] += counts
-
-    @property
-    def largest(self) -> float:
-        """The largest value.
-
-        Raises:
-            ValueError: There are no values.
-        """
-        if self._largest is None:
-            raise ValueError("the largest of no values")
-        return float(self._largest)
 
     def percentiles(self, percents: Sequence[float]) -> list[float]:
         """Return percentiles as :func:`numpy.percentile`, of at least one value."""

@@ -37,11 +37,7 @@ _LIMIT_BITS = int(
 class PredictedError:
     """Errors on the samples of the waveform, in percent of their peak-to-peak displacement.
 
-    Attributes:
-        peak_percent: Peak error of the other model.
-        rms_percent: Its root mean square.
-        recorded_peak_percent: Recorded peak error, on the same samples.
-        recorded_rms_percent: Its root mean square.
+    The recorded errors are on the same samples.
     """
 
     peak_percent: float
@@ -49,18 +45,9 @@ class PredictedError:
     recorded_peak_percent: float
     recorded_rms_percent: float
 
-    def to_mapping(self) -> dict[str, Any]:
-        """Return the fields as plain values."""
-        return asdict(self)
-
 
 class ErrorPrediction:
-    """Prediction of another model's error from pieces of a run.
-
-    Args:
-        model: The other model.
-        sample_rate_hz: Rate of the run.
-    """
+    """Prediction of another model's error from pieces of a run."""
 
     def __init__(self, model: HysteresisModel, sample_rate_hz: float) -> None:
         self._forward = model.forward(sample_rate_hz)
@@ -105,9 +92,7 @@ class ReplayResult:
         left_out_samples: Samples after damage of the file, with unknown compensator memory.
         identical: Whether every wanted command, command and flag has the same bits.
         first_difference: Index of the first sample that differs, or None.
-        differing_samples: Number of samples that differ.
         largest_difference: Largest magnitude of a difference between commands.
-        rms_difference: Root mean square of the differences.
         command_unit: ``A`` or ``V``.
         command_min: Lowest recomputed command.
         command_max: Highest recomputed command.
@@ -164,20 +149,17 @@ def replay(
 class _Running:
     """Replay of successive pieces, with the state of compensator and limiter.
 
-    Args:
-        first: The first piece, with the facts of the run.
-        model: Another model than the recorded one.
-        fades: Returns the events of bypassing and enabling the inverse, of all pieces.
+    ``find_fades`` returns the events of bypassing and enabling the inverse, of all pieces.
     """
 
     def __init__(
         self,
         first: Recording,
         model: HysteresisModel | None,
-        fades: Callable[[], Sequence[Event]],
+        find_fades: Callable[[], Sequence[Event]],
     ) -> None:
         self._path = first.path
-        self._find_fades = fades
+        self._find_fades = find_fades
         self._fades: Sequence[Event] | None = None
         if model is not None and not first.compensated:
             raise DataError(f"{first.path}: had no compensator: there is no reference to replay")
@@ -205,7 +187,7 @@ class _Running:
         if samples.index.size and not np.isfinite(samples.command).all():
             # The limiter has no others.
             raise DataError(f"{self._path}: /samples: every command must be finite")
-        if self._fades is None and (any(map(_is_fade, piece.events)) or _out(samples).any()):
+        if self._fades is None and (_fades([piece]) or _out(samples).any()):
             self._fades = self._find_fades()
         self._any_start = self._any_start or bool(piece.starts)
         self._starts += piece.starts
@@ -218,11 +200,7 @@ class _Running:
         self._waiting = samples.rows(slice(ready, None)) if self._held_back else None
 
     def result(self) -> ReplayResult:
-        """Return the comparison, after the last piece.
-
-        Raises:
-            DataError: There were no samples to recompute.
-        """
+        """Return the comparison, after the last piece."""
         if self._waiting is not None:
             self._go(self._waiting, self._waiting.index.size)
         if not self._any_start or self._comparison.compared == 0:
@@ -237,10 +215,11 @@ class _Running:
         out = np.empty(ready), np.empty(ready), np.zeros(ready, dtype=np.uint32)
         known = np.zeros(ready, dtype=bool)
         self._faded = self._inverse_shares(samples.rows(slice(None, ready)))
+        before = self._before
         for rows, start in self._stretches(samples, ready):
             if start is not None:
-                self._begin(start, first=rows.start == 0 and self._before is None)
-            elif rows.start or not self._follows(samples):
+                self._begin(start, first=rows.start == 0 and before is None)
+            elif rows.start or before is None or int(samples.index[0]) != before[0] + 1:
                 self._known = self._unbegun = False  # the memory is unknown
             if not self._known:
                 continue
@@ -250,9 +229,6 @@ class _Running:
                     self._recompute(samples, part, rows.stop, ready, out)
         self._comparison.add(samples.rows(slice(None, ready)), known, out)
         self._before = int(samples.index[ready - 1]), int(samples.flags[ready - 1])
-
-    def _follows(self, samples: Samples) -> bool:
-        return self._before is not None and int(samples.index[0]) == self._before[0] + 1
 
     def _stretches(
         self, samples: Samples, ready: int
@@ -308,9 +284,6 @@ class _Running:
         """Return the share of the inverse in each sample, float64[n], and its linear bypass.
 
         None if the inverse was never bypassed.
-
-        Raises:
-            DataError: An event is missing in a damaged file.
         """
         if self._fades is None:
             return None
@@ -344,13 +317,9 @@ class _Running:
 
     def _skipped_on_ramp(self, samples: Samples, row: int) -> int:
         """Return the number of samples of a ramp that were skipped before a row."""
+        before = self._before
         if row:
-            before: tuple[int, int] | None = (
-                int(samples.index[row - 1]),
-                int(samples.flags[row - 1]),
-            )
-        else:
-            before = self._before
+            before = int(samples.index[row - 1]), int(samples.flags[row - 1])
         flags = int(samples.flags[row])
         if before is None or not flags & before[1] & Flag.RAMP.value:
             return 0
@@ -358,11 +327,7 @@ class _Running:
 
 
 def _fades(pieces: Iterable[Recording]) -> tuple[Event, ...]:
-    return tuple(event for piece in pieces for event in piece.events if _is_fade(event))
-
-
-def _is_fade(event: Event) -> bool:
-    return event.code == INVERSE
+    return tuple(event for piece in pieces for event in piece.events if event.code == INVERSE)
 
 
 def _out(samples: Samples) -> npt.NDArray[np.bool_]:

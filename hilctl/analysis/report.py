@@ -11,7 +11,7 @@ from pydantic import TypeAdapter, ValidationError
 from hilctl.analysis import tick_lateness
 from hilctl.analysis.run_metrics import RunReport, SegmentReport
 from hilctl.analysis.segment_metrics import SegmentReportBuilder
-from hilctl.analysis.steady_state import judged, waveform_end
+from hilctl.analysis.steady_state import judged
 from hilctl.base.errors import DataError
 from hilctl.base.events import ADAPTED, CHANGES, MARK, Event
 from hilctl.base.samples import LAST_SAMPLE, NO_WAVEFORM, Flag, Samples
@@ -61,11 +61,8 @@ def build_report(
     """Return the builder of a report after the last piece.
 
     The pieces are read again if the evaluated samples turn out to differ from the planned ones.
-
-    Args:
-        pieces: Pieces of the run in order, as a repeatable iterable.
-        observe: Called with the evaluated samples before each reading; returns a function that is
-            called with each piece.
+    ``observe`` is called with the evaluated samples before each reading; it returns a function
+    that is called with each piece.
 
     Raises:
         DataError: There is no piece.
@@ -88,19 +85,9 @@ def build_report(
         windows = right
 
 
-def _windows(recording: Recording, events: Iterable[Event], end: int) -> Windows:
+def _windows(recording: Recording, events: Sequence[Event], end: int) -> Windows:
     """Return the segments with their evaluated samples."""
-    known = list(events)
-    return [(each, judged(each, known, end)) for each in recording.segments]
-
-
-def judge(recording: Recording, segment: Segment) -> SegmentReport:
-    """Return the metrics of one segment; None for those that are not available."""
-    window = judged(segment, recording.events, waveform_end(recording.samples))
-    gathering = SegmentReportBuilder(recording, segment, window)
-    with np.errstate(over="ignore", invalid="ignore"):
-        gathering.add(recording.samples)
-    return gathering.report()
+    return [(each, judged(each, events, end)) for each in recording.segments]
 
 
 _KEPT = {*CHANGES, ADAPTED, MARK}
@@ -108,12 +95,7 @@ _KEPT = {*CHANGES, ADAPTED, MARK}
 
 
 class RunReportBuilder:
-    """Builder of a report from pieces of a run.
-
-    Args:
-        first: The first piece.
-        windows: Evaluated samples; as planned if None.
-    """
+    """Builder of a report from pieces of a run; planned windows are evaluated if None."""
 
     def __init__(self, first: Recording, windows: Windows | None) -> None:
         self.windows = windows if windows is not None else _windows(first, (), LAST_SAMPLE)
@@ -164,12 +146,13 @@ class RunReportBuilder:
     def report(self) -> RunReport:
         """Return the report, after the last piece."""
         segments = tuple(segment.report() for segment in self._segments)
+        adapted = [event.values for event in self._events if event.code == ADAPTED]
         return RunReport(
             **_identity(self._last),
             **self._counted(),
             **_worst(segments),
             **self._timing(),
-            adapted=self._adapted(),
+            adapted=dict(adapted[-1]) if adapted else {},
             marks=tuple(
                 (event.sample / self._last.sample_rate_hz, event.text)
                 for event in self._events
@@ -196,19 +179,15 @@ class RunReportBuilder:
             "displacement_max_um": self._displacement_um.high,
         }
 
-    def _adapted(self) -> dict[str, float]:
-        found = [event.values for event in self._events if event.code == ADAPTED]
-        return dict(found[-1]) if found else {}
-
     def _timing(self) -> dict[str, Any]:
         ticks, last = self._ticks, self._last
         return {
-            "deadline_misses": tick_lateness.misses(last, ticks.ticks),
+            "deadline_misses": tick_lateness.misses(last, ticks.late_ns.size),
             "skipped_ticks": tick_lateness.counter(last, "skipped_ticks", None),
             "late_ticks": tick_lateness.counter(last, "late_ticks", ticks.late_ticks()),
-            "lateness_us": ticks.late_us(),
+            "lateness_us": tick_lateness.percentiles_us(ticks.late_ns),
             "lateness_by_minute": ticks.by_minute(),
-            "exchange_us": ticks.exchange_us(),
+            "exchange_us": tick_lateness.percentiles_us(ticks.exchange_ns),
             "processes": processes_of(last),
         }
 
@@ -278,11 +257,7 @@ _USAGE_LIMIT = 2**63
 
 
 def processes_of(recording: Recording) -> dict[str, ProcessUsage]:
-    """Return the resource usage of ``loop`` and ``supervisor``; empty if it is not recorded.
-
-    Raises:
-        DataError: The recorded text is invalid.
-    """
+    """Return the resource usage of ``loop`` and ``supervisor``; empty if it is not recorded."""
     where = f"{recording.path}: hilctl.end: {USAGE_FACT}"
     try:
         found = _PROCESSES.validate_json(recording.end.get(USAGE_FACT, "{}"))

@@ -7,19 +7,6 @@ from hilctl.machine.procfs import ProcessUsage
 
 SIMULATED = "simulated: no hardware was driven"
 
-_SEGMENT_HEADINGS = (
-    "segment",
-    "start s",
-    "freq. Hz",
-    "cycles",
-    "p-p µm",
-    "peak hyst. %",
-    "floor %",
-    "peak err. %",
-    "rms err. %",
-    "loop area",
-)
-
 
 def number(value: float | None, unit: str = "") -> str:
     """Return a number with four significant digits and its unit; a dash if None."""
@@ -36,10 +23,7 @@ def run_rows(report: RunReport) -> list[tuple[str, str]]:
         *([("labels", printable(labels))] if labels else []),
         ("device", f"{printable(report.device) or MISSING}{simulated}"),
         ("ended", f"{reason}{'' if report.complete else ' (NOT complete)'}"),
-        (
-            "samples",
-            f"{report.samples:,} of the waveform, {report.ramp_samples:,} of ramps",
-        ),
+        ("samples", f"{report.samples:,} of the waveform, {report.ramp_samples:,} of ramps"),
         ("missing samples", f"{report.dropped:,}"),
         ("rate, length", f"{report.sample_rate_hz:g} Hz, {quantity(report.duration_s, 's', 4)}"),
         ("loop", f"displacement against {held_against}"),
@@ -69,7 +53,7 @@ def usage_text(usage: ProcessUsage) -> str:
 
 def quality_rows(report: RunReport) -> list[tuple[str, str]]:
     """Return name and value of the metrics."""
-    floor = number(report.noise_floor_percent, "%")
+    floor, noise_um = number(report.noise_floor_percent, "%"), report.sensor_noise_um
     raw = f"{number(report.peak_error_raw_percent, '%')} peak, "
     raw += f"{number(report.rms_error_raw_percent, '%')} rms"
     rows = [
@@ -79,7 +63,7 @@ def quality_rows(report: RunReport) -> list[tuple[str, str]]:
         ("peak error", number(report.peak_error_percent, "%")),
         ("rms error", number(report.rms_error_percent, "%")),
         ("error, not averaged", raw),
-        ("sensor noise", _nanometres(report.sensor_noise_um)),
+        ("sensor noise", MISSING if noise_um is None else f"{number(noise_um, 'um')} rms"),
         ("steady cycles", f"{report.steady_cycles:,}"),
         ("steady samples", f"{report.steady_samples:,}"),
     ]
@@ -88,29 +72,25 @@ def quality_rows(report: RunReport) -> list[tuple[str, str]]:
 
 def segment_table(report: RunReport) -> tuple[list[str], list[list[str]]]:
     """Return headings and rows of all segments, without empty columns."""
-    columns = zip(*(_segment_cells(segment) for segment in report.segments), strict=True)
-    filled = [
-        (heading, column)
-        for heading, column in zip(_SEGMENT_HEADINGS, columns, strict=False)
-        if set(column) != {MISSING}
-    ]
-    rows = zip(*(column for _, column in filled), strict=True)
-    return [heading for heading, _ in filled], [list(row) for row in rows]
+    rows = [_segment_row(segment) for segment in report.segments]
+    filled = [name for name in rows[0] if {row[name] for row in rows} != {MISSING}] if rows else []
+    return filled, [[row[name] for name in filled] for row in rows]
 
 
-def _segment_cells(segment: SegmentReport) -> list[str]:
-    return [
-        printable(segment.label),
-        f"{segment.start_s:g}",
-        MISSING if segment.frequency_hz is None else f"{segment.frequency_hz:g}",
-        str(segment.steady_cycles),
-        number(segment.peak_to_peak_um),
-        number(segment.peak_hysteresis_percent),
-        number(segment.noise_floor_percent),
-        number(segment.peak_error_percent),
-        number(segment.rms_error_percent),
-        number(segment.loop_area),
-    ]
+def _segment_row(segment: SegmentReport) -> dict[str, str]:
+    hz = segment.frequency_hz
+    return {
+        "segment": printable(segment.label),
+        "start s": f"{segment.start_s:g}",
+        "freq. Hz": MISSING if hz is None else f"{hz:g}",
+        "cycles": str(segment.steady_cycles),
+        "p-p µm": number(segment.peak_to_peak_um),
+        "peak hyst. %": number(segment.peak_hysteresis_percent),
+        "floor %": number(segment.noise_floor_percent),
+        "peak err. %": number(segment.peak_error_percent),
+        "rms err. %": number(segment.rms_error_percent),
+        "loop area": number(segment.loop_area),
+    }
 
 
 def _range(low: float | None, high: float | None, unit: str) -> str:
@@ -119,10 +99,6 @@ def _range(low: float | None, high: float | None, unit: str) -> str:
 
 def _count(value: int | None) -> str:
     return MISSING if value is None else f"{value:,}"
-
-
-def _nanometres(noise_um: float | None) -> str:
-    return MISSING if noise_um is None else f"{number(noise_um, 'um')} rms"
 
 
 def _percentiles(figures: dict[str, float]) -> str:

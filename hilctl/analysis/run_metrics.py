@@ -76,10 +76,6 @@ class RunReport(RunMetrics):
 
     Attributes:
         path: File that was read.
-        name: Name of the experiment.
-        labels: Labels of the run.
-        device: Name of the device.
-        simulated: Whether the device is simulated.
         reason: Why the run ended, or that the recording is truncated.
         complete: Whether its end is recorded, and its last sample is recorded or counted as
             dropped.
@@ -88,30 +84,22 @@ class RunReport(RunMetrics):
         recorded_samples: Both.
         dropped: Samples that were exchanged or due and are missing.
         skipped_ticks: Ticks skipped because one was too late; None if not recorded.
-        sample_rate_hz: Samples per second.
-        duration_s: Duration of the waveform.
-        compensated: Whether a compensator was used.
-        command_unit: ``A`` or ``V``.
-        loop_area_unit: Unit of ``loop_area``.
-        command_min: Lowest command, in ``command_unit``.
-        command_max: Highest command.
-        displacement_min_um: Lowest measured displacement.
-        displacement_max_um: Highest measured displacement.
-        limited_samples: Samples of the waveform that the limiter changed.
-        sensor_invalid_samples: Samples of the waveform with an invalid displacement.
         deadline_misses: Text with the share of skipped ticks and its evaluation; empty if there are
             none or it is unknown.
+        duration_s: Duration of the waveform.
+        command_unit: ``A`` or ``V``, of ``command_min`` and ``command_max``.
+        limited_samples: Samples of the waveform that the limiter changed.
+        sensor_invalid_samples: Samples of the waveform with an invalid displacement.
         late_ticks: Late ticks counted by the run; if not recorded, ticks later than half a tick
             period. None if neither is known.
         lateness_us: ``p50``, ``p90``, ``p99``, ``p99.9`` and ``max`` of the lateness of ticks;
             empty without ticks.
         lateness_by_minute: The same of each minute, with ``minute`` from 0 and its ``ticks``.
+        exchange_us: The same for the duration of exchanges with the device.
         adapted: Final parameters of the adaptation, see :data:`hilctl.base.events.ADAPTED`; empty
             without adaptation.
         processes: Resource usage of ``loop`` and ``supervisor``; empty if not recorded.
         marks: Time since the start of the run, in s, and text of each mark.
-        exchange_us: The same for the duration of exchanges with the device.
-        segments: Metrics of each segment.
     """
 
     path: str
@@ -149,15 +137,16 @@ class RunReport(RunMetrics):
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values for JSON; numbers that are not finite become None."""
-        mapping: dict[str, Any] = _plain(asdict(self))
+        mapping: dict[str, Any] = without_infinity(asdict(self))
         return mapping
 
 
-def _plain(value: Any) -> Any:
+def without_infinity(value: Any) -> Any:
+    """Return plain values with None for numbers that JSON does not have."""
     if isinstance(value, dict):
-        return {key: _plain(inner) for key, inner in value.items()}
+        return {key: without_infinity(inner) for key, inner in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(inner) for inner in value]
+        return [without_infinity(inner) for inner in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value

@@ -27,6 +27,7 @@ _FAULT = "fault"
 _WAVEFORM = "waveform."
 _NOT_SHOWN = {"waveform.kind", "waveform.unit"}
 _USUAL = {"0.0", "None", ""}
+_TERMS = ("average cycle", "peak hysteresis", "noise floor", "loop area", "lateness")
 
 
 def write_html(
@@ -34,11 +35,7 @@ def write_html(
 ) -> None:
     """Write the page of a run; an existing file is replaced.
 
-    Args:
-        recording: The run.
-        report: Its figures.
-        path: File to write.
-        before: The same motion without a compensator, for comparison.
+    ``before`` is the same motion without a compensator, for comparison.
 
     Raises:
         InputError: It cannot be written.
@@ -50,6 +47,7 @@ def write_html(
 def page(recording: Recording, report: RunReport, before: Recording | None = None) -> str:
     """Return the page of a run as HTML."""
     title = html.text(report.name or "run")
+    error_terms = ("peak and rms error", "harmonics of the error") if report.compensated else ()
     body = [
         f"<h1>{title}</h1>",
         html.paragraph(report.path, "file"),
@@ -66,7 +64,7 @@ def page(recording: Recording, report: RunReport, before: Recording | None = Non
         "</div>",
         *_segments(report),
         *_events(recording.events),
-        html.definitions("What the figures mean", _terms(report)),
+        html.definitions("What the figures mean", definitions_of(*_TERMS, *error_terms)),
         html.details("Experiment", recording.experiment_yaml) if recording.experiment_yaml else "",
         html.details("Model", recording.model_yaml) if recording.model_yaml else "",
     ]
@@ -119,12 +117,7 @@ def _figures(recording: Recording, report: RunReport, before: Recording | None) 
 
 
 def run_sheets(recording: Recording, report: RunReport) -> list[FigureSpec]:
-    """Return the applicable figures of a run.
-
-    Args:
-        recording: The run.
-        report: Its figures.
-    """
+    """Return the applicable figures of a run."""
     if not _drawable(recording):
         return []
     return [sheet for sheet, _ in _sheets(recording, report, None) if sheet is not None]
@@ -171,13 +164,6 @@ def _events(events: Sequence[Event]) -> list[str]:
     return ["<h2>Events</h2>", *note, html.grid(("sample", "level", "code", "text"), rows)]
 
 
-def _terms(report: RunReport) -> list[tuple[str, str]]:
-    errors = ("peak and rms error", "harmonics of the error") if report.compensated else ()
-    return definitions_of(
-        "average cycle", "peak hysteresis", "noise floor", "loop area", "lateness", *errors
-    )
-
-
 def provenance_rows(recording: Recording) -> list[tuple[str, str]]:
     """Return name and value of the origin of a run: date, labels, device, waveform, model."""
     return [(name, printable(value)) for name, value in _rows(recording) if value]
@@ -188,18 +174,17 @@ def _rows(recording: Recording) -> Iterator[tuple[str, str]]:
     yield "date", _date(run.get("started", ""))
     for key, value in recording.labels.items():
         yield key, str(value)
-    simulated = " (simulated: no hardware was driven)" if run.get("simulated") == "true" else ""
+    simulated = f" ({report_table.SIMULATED})" if run.get("simulated") == "true" else ""
     yield "device", f"{run.get('device', '')}{simulated}"
     yield "device is", run.get("device_description", "")
-    computer = ", ".join(filter(None, (run.get("host", ""), run.get("kernel", ""))))
-    yield "computer", computer
+    yield "computer", ", ".join(filter(None, (run.get("host", ""), run.get("kernel", ""))))
     yield "hilctl", run.get("hilctl", "")
     segments = recording.segments
     more = f" and {len(segments) - 1} more" if len(segments) > 1 else ""
     yield "waveform", f"{segments[0].label}{more}" if segments else ""
     yield "its settings", _settings(recording)
-    yield "limits", _limits(run.get("limits", ""))
-    yield "overrides", _overrides(run.get(OVERRIDES_FACT, ""))
+    yield "limits", _listed(run.get("limits", ""))
+    yield "overrides", _listed(run.get(OVERRIDES_FACT, ""))
     yield from _model(recording)
 
 
@@ -221,22 +206,15 @@ def _settings(recording: Recording) -> str:
     return ", ".join([*shown, *([f"unit {unit}"] if unit else [])])
 
 
-def _limits(text: str) -> str:
+def _listed(text: str) -> str:
+    """Return the members of a mapping or list in JSON; any other text as it is."""
     try:
-        limits = json.loads(text or "{}")
+        found = json.loads(text)
     except ValueError:
         return text
-    if not isinstance(limits, dict):
-        return text
-    return ", ".join(f"{key} {value}" for key, value in limits.items())
-
-
-def _overrides(text: str) -> str:
-    try:
-        settings = json.loads(text or "[]")
-    except ValueError:
-        return text
-    return ", ".join(map(str, settings)) if isinstance(settings, list) else text
+    if isinstance(found, dict):
+        found = [f"{key} {value}" for key, value in found.items()]
+    return ", ".join(map(str, found)) if isinstance(found, list) else text
 
 
 def _model(recording: Recording) -> Iterator[tuple[str, str]]:

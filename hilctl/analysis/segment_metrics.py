@@ -6,25 +6,22 @@ import numpy as np
 
 from hilctl.analysis.quantiles import Quantiles
 from hilctl.analysis.run_metrics import SegmentReport
-from hilctl.analysis.steady_state import trusted
+from hilctl.analysis.steady_state import loop_signals, trusted
 from hilctl.base.samples import Samples
 from hilctl.base.segments import Segment
 from hilctl.base.types import F64, I64
 from hilctl.recording.recording import Recording
 from hilctl.signals import cycle_metrics
 
+_UNKNOWN: tuple[float | None, float | None] = (None, None)
+
 
 class SegmentReportBuilder:
-    """Builder of the metrics of a segment.
+    """Builder of the metrics of a segment from its evaluated samples.
 
     Sums over several pieces differ from those of the whole run in their last digits; the relative
     error of the sensor noise of more than :data:`~hilctl.analysis.quantiles.MOST_EXACT` samples is
     6e-5.
-
-    Args:
-        recording: The run; its samples are not used.
-        segment: The segment.
-        window: Its evaluated samples: first, after the last, whole cycles.
     """
 
     def __init__(
@@ -51,25 +48,19 @@ class SegmentReportBuilder:
         if part.index.size == 0:
             return
         self._steady += part.index.size
-        output = part.displacement_um
-        loop_input = part.reference_um if self._compensated else part.command
+        signals = loop_signals(part, compensated=self._compensated)
         if self._folding:
-            self._folding.add(part.index - segment.start, np.array((loop_input, output)))
+            self._folding.add(part.index - segment.start, signals)
         else:
-            self._loop(loop_input, output)
+            self._loop(*signals)
         if self._compensated:
-            self._raw.add(output - loop_input)
-        if self._has_noise:
-            self._noise.add(part.index, output)
+            self._raw.add(signals[1] - signals[0])
+        if segment.period <= 0.0 or segment.period >= cycle_metrics.SHORTEST_PERIOD:
+            self._noise.add(part.index, part.displacement_um)
 
     def cycle(self) -> cycle_metrics.MeanCycle | None:
         """Return the average cycle of the loop's input and output; None without a period."""
         return self._folding.fold() if self._folding else None
-
-    @property
-    def _has_noise(self) -> bool:
-        period = self._segment.period
-        return period <= 0.0 or period >= cycle_metrics.SHORTEST_PERIOD
 
     def _loop(self, loop_input: F64, output: F64) -> None:
         """Add a loop without a period."""
@@ -85,25 +76,24 @@ class SegmentReportBuilder:
     def report(self) -> SegmentReport:
         """Return the metrics; None for those that are not available."""
         cycle = self.cycle()
-        stroke_um = noise_um = hysteresis = area = floor = None
-        peak_rms: tuple[float | None, float | None] = (None, None)
-        raw = peak_rms
+        noise_um = self._noise.rms_um()
+        stroke_um = hysteresis = area = floor = None
+        errors = raw = _UNKNOWN
         if cycle is not None and cycle.whole:
             loop_input, output = cycle.signals
             stroke_um = cycle_metrics.peak_to_peak(output)
-            peak_rms = cycle_metrics.peak_and_rms_percent(output - loop_input, stroke_um)
+            errors = cycle_metrics.peak_and_rms_percent(output - loop_input, stroke_um)
             hysteresis = cycle_metrics.peak_hysteresis_percent(loop_input, output)
             area = cycle_metrics.loop_area(loop_input, output)
+            if noise_um is not None:
+                floor = cycle_metrics.noise_floor_percent(noise_um, cycle.counts, stroke_um)
         elif cycle is None and self._averaged.count:
             stroke_um = self._highest_um - self._lowest_um
-            peak_rms = self._averaged.percent(stroke_um)
-        if stroke_um is not None:
+            errors = self._averaged.percent(stroke_um)
+        if not self._compensated:
+            errors = _UNKNOWN
+        elif stroke_um is not None:
             raw = self._raw.percent(stroke_um)
-        noise_um = self._noise.rms_um()
-        if hysteresis is not None or area is not None:
-            assert cycle is not None
-            if noise_um is not None and stroke_um is not None:
-                floor = cycle_metrics.noise_floor_percent(noise_um, cycle.counts, stroke_um)
         period = self._segment.period
         return SegmentReport(
             label=self._segment.label,
@@ -113,10 +103,10 @@ class SegmentReportBuilder:
             steady_cycles=self._cycles,
             steady_samples=self._steady,
             peak_to_peak_um=stroke_um,
-            peak_error_percent=peak_rms[0] if self._compensated else None,
-            rms_error_percent=peak_rms[1] if self._compensated else None,
-            peak_error_raw_percent=raw[0] if self._compensated else None,
-            rms_error_raw_percent=raw[1] if self._compensated else None,
+            peak_error_percent=errors[0],
+            rms_error_percent=errors[1],
+            peak_error_raw_percent=raw[0],
+            rms_error_raw_percent=raw[1],
             peak_hysteresis_percent=hysteresis,
             loop_area=area,
             sensor_noise_um=noise_um,
@@ -142,11 +132,10 @@ class _Errors:
     def percent(self, whole_um: float) -> tuple[float | None, float | None]:
         """Return peak and root mean square in percent; None without errors."""
         if not self.count:
-            return None, None
-        rms_um = math.sqrt(self._squares_um2 / self.count)
-        return cycle_metrics.percent(self._peak_um, whole_um), cycle_metrics.percent(
-            rms_um, whole_um
-        )
+            return _UNKNOWN
+        errors_um = self._peak_um, math.sqrt(self._squares_um2 / self.count)
+        peak, rms = (cycle_metrics.percent(each, whole_um) for each in errors_um)
+        return peak, rms
 
 
 class _Noise:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
 
@@ -32,6 +33,15 @@ class SteadyPart:
     cycle: MeanCycle | None
     loop: F64
 
+    @classmethod
+    def of(cls, samples: Samples, cycles: int, cycle: MeanCycle | None, signals: F64) -> Self:
+        """Return the part of samples with their average cycle, if the waveform has a period."""
+        if cycle is None:
+            return cls(samples, cycles, None, signals[:, np.isfinite(signals).all(axis=0)])
+        if not cycle.whole:
+            return cls(samples, cycles, None, np.empty((2, 0)))
+        return cls(samples, cycles, cycle, cycle.signals)
+
 
 @dataclass(frozen=True, slots=True)
 class Overview(Recording):
@@ -58,12 +68,7 @@ def judged(segment: Segment, events: Iterable[Event], end: int) -> tuple[int, in
     """Return the evaluated samples of a segment: first, after the last, and whole cycles.
 
     In a truncated segment they are its last whole cycles; in a tuned one they follow the last
-    change.
-
-    Args:
-        segment: The segment.
-        events: Events of the run, in order.
-        end: Index after the last sample of the waveform.
+    change. ``end`` is the index after the last sample of the waveform.
     """
     begin = max(segment.steady_start, _tuned_until(events, segment))
     stop = min(segment.steady_stop, end)
@@ -104,11 +109,12 @@ def steady_part(recording: Recording, segment: Segment) -> SteadyPart:
     if isinstance(recording, Overview):
         return recording.parts[segment]
     samples, cycles = steady_samples(recording, segment)
-    loop_input = samples.reference_um if recording.compensated else samples.command
-    signals = np.array((loop_input, samples.displacement_um))
-    if cycles == 0:
-        return SteadyPart(samples, 0, None, signals[:, np.isfinite(signals).all(axis=0)])
-    cycle = fold(samples.index - segment.start, segment.period, signals)
-    if not cycle.whole:
-        return SteadyPart(samples, cycles, None, np.empty((2, 0)))
-    return SteadyPart(samples, cycles, cycle, cycle.signals)
+    signals = loop_signals(samples, compensated=recording.compensated)
+    cycle = fold(samples.index - segment.start, segment.period, signals) if cycles else None
+    return SteadyPart.of(samples, cycles, cycle, signals)
+
+
+def loop_signals(samples: Samples, *, compensated: bool) -> F64:
+    """Return the loop's input and displacement: float64[2, n]."""
+    loop_input = samples.reference_um if compensated else samples.command
+    return np.array((loop_input, samples.displacement_um))

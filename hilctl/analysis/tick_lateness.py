@@ -4,7 +4,6 @@ import numpy as np
 
 from hilctl.analysis.quantiles import MOST_EXACT, Quantiles
 from hilctl.base.errors import DataError
-from hilctl.base.types import I64
 from hilctl.loop.pacer import USUAL_MISSED_SHARE, deadline_misses
 from hilctl.recording.recording import Recording, Ticks
 
@@ -20,26 +19,25 @@ class LatenessBuilder:
 
     Args:
         minutes: Planned duration of the run; beyond a day, several minutes share a row.
+
+    Attributes:
+        late_ns: Lateness of the ticks so far.
+        exchange_ns: Durations of their exchanges.
     """
 
     def __init__(self, minutes: float) -> None:
         self._together = 1 + int(minutes) // MOST_ROWS
-        self._late, self._exchange, self._steps = Quantiles(), Quantiles(), Quantiles()
+        self.late_ns, self.exchange_ns, self._steps = Quantiles(), Quantiles(), Quantiles()
         self._before: int | None = None
         self._rows: list[dict[str, float]] = []
         self._minute, self._of_minute = 0, Quantiles()
-
-    @property
-    def ticks(self) -> int:
-        """Ticks so far."""
-        return self._late.size
 
     def add(self, ticks: Ticks) -> None:
         """Add the next ticks."""
         if ticks.late_ns.size == 0:
             return
-        self._late.add(ticks.late_ns)
-        self._exchange.add(ticks.exchange_ns)
+        self.late_ns.add(ticks.late_ns)
+        self.exchange_ns.add(ticks.exchange_ns)
         if self._steps.size < MOST_EXACT:  # enough for the median
             before = np.array([] if self._before is None else [self._before], dtype=np.int64)
             due_ns = np.concatenate((before, ticks.deadline_ns))
@@ -57,16 +55,8 @@ class LatenessBuilder:
     def _end_row(self) -> None:
         if self._of_minute.size:
             counted = {"minute": self._minute, "ticks": self._of_minute.size}
-            self._rows.append({**counted, **_percentiles_us(self._of_minute)})
+            self._rows.append({**counted, **percentiles_us(self._of_minute)})
         self._of_minute = Quantiles()
-
-    def late_us(self) -> dict[str, float]:
-        """Return the percentiles of lateness, see :func:`percentiles_us`."""
-        return _percentiles_us(self._late)
-
-    def exchange_us(self) -> dict[str, float]:
-        """Return the percentiles of the duration of exchanges."""
-        return _percentiles_us(self._exchange)
 
     def by_minute(self) -> list[dict[str, float]]:
         """Return the lateness of each minute with ticks, after the last tick.
@@ -79,20 +69,11 @@ class LatenessBuilder:
 
     def late_ticks(self) -> int | None:
         """Count ticks that woke more than half a tick period late; None with fewer than two."""
-        return self._late.above(0.5 * self._steps.median()) if self._steps.size else None
+        return self.late_ns.above(0.5 * self._steps.median()) if self._steps.size else None
 
 
-def percentiles_us(times_ns: I64) -> dict[str, float]:
-    """Return ``p50``, ``p90``, ``p99``, ``p99.9`` and ``max`` in us of int64[m] in ns.
-
-    Empty without ticks.
-    """
-    quantiles = Quantiles()
-    quantiles.add(times_ns)
-    return _percentiles_us(quantiles)
-
-
-def _percentiles_us(times_ns: Quantiles) -> dict[str, float]:
+def percentiles_us(times_ns: Quantiles) -> dict[str, float]:
+    """Return ``p50``, ``p90``, ``p99``, ``p99.9`` and ``max`` in us; empty without times."""
     if times_ns.size == 0:
         return {}
     values = [each * 1e-3 for each in times_ns.percentiles(list(_PERCENTILES.values()))]
@@ -108,10 +89,6 @@ def tick_period_ns(ticks: Ticks) -> float | None:
 
 def misses(recording: Recording, ticks: int) -> str:
     """Return a text on the share of skipped ticks; empty if there are none or it is unknown.
-
-    Args:
-        recording: The run.
-        ticks: Ticks that were not skipped.
 
     Raises:
         DataError: A recorded number is invalid.

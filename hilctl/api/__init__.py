@@ -20,14 +20,7 @@ if TYPE_CHECKING:
     from hilctl.api.campaigns import campaign, characterise, learn
     from hilctl.api.connection import RunConnection, connect
     from hilctl.api.models import compare, identify, refine
-    from hilctl.api.recordings import (
-        RecordedRun,
-        SampleTable,
-        export,
-        list_runs,
-        read,
-        summarize,
-    )
+    from hilctl.api.recordings import RecordedRun, SampleTable, export, list_runs, read, summarize
     from hilctl.api.reports import figures, replay, report_page, report_runs
     from hilctl.api.runs import WrittenExperiment, check, init, load, run
 

@@ -87,7 +87,6 @@ def report_runs(
 def _series(
     runs: Paths, model: PathLike | None, on_progress: Callable[[float, str], None]
 ) -> RunSeries:
-
     finish_dead_runs()
     known = None if model is None else load_model(Path(model))
     return collect(paths_of(runs), known, on_progress)
@@ -143,7 +142,7 @@ def figures(
     chosen = formats_of(formats)
     sheets = _sheets(paths_of(runs), model, on_progress)
     if output is None:
-        drawn = draw_sheets(sheets, width, on_progress)
+        drawn = dict(draw_sheets(sheets, width, on_progress))
     else:
         drawn = {}
         written = write_sheets(
@@ -158,10 +157,8 @@ def figures(
 def _sheets(
     runs: list[Path], model: PathLike | None, on_progress: Callable[[float, str], None]
 ) -> list[FigureSpec]:
-
     if len(runs) > 1 or runs[0].is_dir() or model is not None:
         return applying_sheets(_series(runs, model, on_progress))
-
     summary, shown = overview(stream_of(runs[0]))
     if not (found := run_sheets(shown, summary)):
         raise InputError(f"{runs[0]}: no data to plot")

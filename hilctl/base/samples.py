@@ -152,7 +152,7 @@ class Samples:
         """Return the columns by name, in order."""
         return {name: getattr(self, name) for name in COLUMNS}
 
-    def rows(self, chosen: slice | npt.NDArray[np.bool_]) -> Self:
+    def rows(self, chosen: slice | npt.NDArray[np.bool_] | I64) -> Self:
         """Return some rows of all that is there."""
         columns = {
             name: values[chosen] if values.size else values

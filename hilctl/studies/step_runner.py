@@ -4,50 +4,29 @@ The recordings are the checkpoint: a step is done if a completed recording of it
 A killed study loses one run and resumes with the same command.
 """
 
+import json
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
+from typing import Any
 
 from hilctl.base.errors import InputError
+from hilctl.base.files import TextFiles
+from hilctl.base.yaml import Document, load_document
 from hilctl.run.result import RunResult
-from hilctl.run.start import OnPart, StepStoppedError, paced
+from hilctl.run.start import StepStoppedError, paced
 
 _SPARE = 1.2
 _WAIT_SHOWN_S = 1.0
 
 
-class RunFunction(Protocol):
-    """Run an experiment file with settings into a recording."""
-
-    def __call__(
-        self,
-        path: Path,
-        settings: list[str],
-        output: Path,
-        on_part: OnPart,
-        *,
-        overwrite: bool,
-        heat_a2: float,
-    ) -> RunResult:
-        """See :func:`hilctl.run.start.paced`."""
-        ...
-
-
 @dataclass(frozen=True, slots=True)
 class StudyHost:
-    """Runs, time and observers of a study.
+    """Runs, time and observers of a study; progress is from 0 to 1, with a description."""
 
-    Attributes:
-        run: Runs one step.
-        now_s: Returns the Unix time in s.
-        sleep_s: Sleeps for a time in s.
-        on_progress: Called with progress from 0 to 1 and a description.
-    """
-
-    run: RunFunction = paced
+    run: Callable[..., RunResult] = paced
     now_s: Callable[[], float] = time.time
     sleep_s: Callable[[float], None] = time.sleep
     on_progress: Callable[[float, str], None] = field(default=lambda done, text: None)
@@ -55,10 +34,6 @@ class StudyHost:
 
 class StepRunner:
     """Run steps, wait for the coil to cool, and report progress.
-
-    Args:
-        host: Runs and observes.
-        total_s: Planned time of all steps.
 
     Attributes:
         done_s: Planned time of the steps that are done.
@@ -79,17 +54,7 @@ class StepRunner:
         overwrite: bool,
         heat_a2: float = 0.0,
     ) -> RunResult:
-        """Run one step.
-
-        Args:
-            path: Experiment file.
-            settings: ``key=value`` texts over it.
-            output: Recording to write.
-            text: Description of the step.
-            seconds: Planned time of the step.
-            overwrite: Whether an existing recording may be replaced.
-            heat_a2: Least heat of the coil before the run, in A^2.
-        """
+        """Run one step, which takes ``seconds``, with at least the heat ``heat_a2`` in its coil."""
 
         def on_part(part: float) -> None:
             self.show(text, part * seconds)
@@ -110,6 +75,19 @@ class StepRunner:
         left_s = round(self._total_s - done_s)
         left = f"{left_s // 3600}:{left_s // 60 % 60:02d}:{left_s % 60:02d} left"
         self._host.on_progress(done_s / self._total_s, f"{text}; {left}")
+
+
+def document_with(path: Path, settings: Iterable[str], files: TextFiles | None = None) -> Document:
+    """Return an experiment file with ``key=value`` texts over it."""
+    document = load_document(path, files)
+    for text in settings:
+        document.set(text)
+    return document
+
+
+def setting(key: str, value: Any) -> str:
+    """Return the ``key=value`` text that sets a key to a plain value."""
+    return f"{key}={json.dumps(value, ensure_ascii=False)}"
 
 
 def raise_if_stopped(name: str, result: RunResult) -> None:

@@ -93,6 +93,5 @@ def test_commands_and_their_options_are_there(path):
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_is_in_some_document(name):
-    """Somebody who reads the documents hears of it, and not only in the reference."""
     text = "\n".join(path.read_text(encoding="utf-8") for path in DOCUMENTS)
     assert re.search(rf"`?hilctl {name}\b", text)

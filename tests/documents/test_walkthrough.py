@@ -56,7 +56,6 @@ def test_tutorial(copy):
 
 
 def test_what_is_printed_is_held_against_what_is_said(tmp_path):
-    """A wrong figure, a line that is missing, and a command that fails are each found."""
     right = "```sh\nprintf 'a 1\\nb 2\\nc 3\\n'\n```\nsays\n```text\na ...\n...\nc 3\n```\n"
     assert walk(right, tmp_path, {"PATH": os.environ["PATH"]}) == []
     for broken in ("c 4", "c 3\nd"):

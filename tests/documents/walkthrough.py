@@ -1,9 +1,8 @@
-"""Carry out the commands of a document, in order, and hold what they print against what it says.
+"""Run the commands of a document in order, and compare their output with the document.
 
-``python -m tests.documents.walkthrough README.md docs/tutorial.md`` does so as a newcomer does: in
-a new clone, with nothing installed and an empty environment. Blocks of ``sh`` and ``python`` are
-carried out; a block of ``text`` after one says what it prints, with ``...`` for what may be
-anything, a line by itself for any lines.
+``python -m tests.documents.walkthrough README.md docs/tutorial.md`` uses a new clone with nothing
+installed and an empty environment. Blocks of ``sh`` and ``python`` are run; a block of ``text``
+after one is its output, with ``...`` for any text, in a line of its own for any lines.
 """
 
 import os
@@ -19,12 +18,12 @@ ROOT = Path(__file__).parents[2]
 FENCED = re.compile(r"^```(sh|python|text)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 MARK = "=== step"
 NOT_HERE = ("make test", "make docs")
-"""Lines that are left out: they take long, and CI runs them by themselves."""
+"""Lines that are omitted, because they take long and CI runs them separately."""
 
 
 @dataclass
 class Step:
-    """Commands of a document, and what they are said to print; empty where nothing is said."""
+    """Commands of a document, and their expected output, if any."""
 
     script: str
     expected: str = ""
@@ -45,7 +44,7 @@ def steps_of(document: str) -> list[Step]:
 
 
 def pattern(expected: str) -> re.Pattern[str]:
-    """Return what an expected text stands for: lines one after another, in which ``...`` may be."""
+    """Return the pattern of an expected output, with ``...`` for any text or lines."""
     lines = []
     for line in expected.splitlines():
         if line.strip() == "...":
@@ -56,16 +55,7 @@ def pattern(expected: str) -> re.Pattern[str]:
 
 
 def walk(document: str, folder: Path, environment: dict[str, str]) -> list[str]:
-    """Carry out a document.
-
-    Args:
-        document: Its text.
-        folder: Copy of the repository, in which it is done.
-        environment: All that the shell gets.
-
-    Returns:
-        What is not as it says: one text a step; none where all is.
-    """
+    """Run a document's commands in a copy of the repository; return a text per wrong step."""
     steps = steps_of(document)
     script = "".join(f"echo '{MARK} {i}'\n{step.script}" for i, step in enumerate(steps))
     ended = subprocess.run(

@@ -23,7 +23,7 @@ from hilctl.studies.campaign.store import (
     new_recording,
     repair_recordings,
 )
-from hilctl.studies.campaign.table import CampaignRow, entry_of, write_table
+from hilctl.studies.campaign.table import CampaignRow, entry_of, ordered, write_table
 from hilctl.studies.multi_run.collect import COMPLETED, series_of
 from hilctl.studies.multi_run.digest import SeriesDrift, digest_of, drift_of
 from hilctl.studies.multi_run.multi_run_page import write_series
@@ -54,7 +54,6 @@ class CampaignResult:
     """Result of a campaign.
 
     Attributes:
-        plan: The plan.
         rows: Outcome of each step, by its number.
         tables: Files of the table.
         reason: Why it ended before its last step; otherwise empty.
@@ -72,7 +71,7 @@ class CampaignResult:
     @property
     def ordered(self) -> list[tuple[CampaignStep, CampaignRow]]:
         """All steps in order, each with its row."""
-        return _ordered(self.plan, self.rows)
+        return ordered(self.plan, self.rows)
 
     @property
     def drift(self) -> SeriesDrift | None:
@@ -85,21 +84,11 @@ class CampaignResult:
         return sum(row.code == code for _, row in self.ordered)
 
 
-def _ordered(
-    plan: CampaignPlan, rows: dict[int, CampaignRow]
-) -> list[tuple[CampaignStep, CampaignRow]]:
-    return [(each.step, rows.get(each.step.number, CampaignRow())) for each in plan.steps]
-
-
 class Campaign:
     """State of a running campaign: its rows, table and page.
 
     The table is written after every step. Drawing the page takes seconds: it is written at the end,
     and between steps while that takes a small part of the time.
-
-    Args:
-        plan: The plan.
-        host: The observers.
     """
 
     def __init__(self, plan: CampaignPlan, host: CampaignHost) -> None:
@@ -115,13 +104,13 @@ class Campaign:
         for each in self.plan.steps:
             if each.kept is not None:
                 self.add(each, replace(measured(read(each.kept)), kept=True), write=False)
-        self._write()
+        self.tables = write_table(self.plan, self.rows)
 
     def add(self, each: PlannedStep, row: CampaignRow, *, write: bool = True) -> None:
         """Add the row of a step and rewrite the table."""
         self.rows[each.step.number] = row
         if write:
-            self._write()
+            self.tables = write_table(self.plan, self.rows)
             if self._host.now_s() >= self._next_page_s:
                 self._write_page()
         self._host.on_row(each.step, row)
@@ -135,7 +124,7 @@ class Campaign:
     def _write_page(self) -> None:
         start_s, name = self._host.now_s(), self.plan.campaign.config.name
         path = self.plan.folder / f"{name}.html"
-        runs = [entry_of(*each) for each in _ordered(self.plan, self.rows)]
+        runs = [entry_of(*each) for each in ordered(self.plan, self.rows)]
         try:
             write_series(series_of(name, runs), path)
         except InputError as error:  # recordings and table hold everything that is on it
@@ -144,15 +133,6 @@ class Campaign:
         self._page = path
         now_s = self._host.now_s()
         self._next_page_s = now_s + max(_FIRST_PAGE_S, _PAGE_SHARE * (now_s - start_s))
-
-    def _write(self) -> None:
-        config = self.plan.campaign.config
-        facts = {
-            "campaign": config.name,
-            "description": config.description,
-            "experiment": str(self.plan.campaign.experiment),
-        }
-        self.tables = write_table(self.plan, self.rows, facts)
 
 
 def measured(recording: Recording) -> CampaignRow:
@@ -194,7 +174,7 @@ def planned_in_real_time(campaign: CampaignSteps, folder: Path, now_s: float) ->
 
 
 def _heat_a2(each: PlannedStep, last: Path | None, now_s: float) -> float:
-    """Return the heat of the coil after the device's last run, or the last run of the campaign.
+    """Return the heat of the coil after the last run of the device or the campaign, in A^2.
 
     A simulated device has no history of its own; within a campaign it counts as one rig.
     """
@@ -229,12 +209,7 @@ def run_series(plan: CampaignPlan, host: CampaignHost) -> CampaignResult:
 
 
 class _Steps:
-    """Steps of a campaign in real time.
-
-    Args:
-        state: Rows, table and page.
-        host: Runs and observers.
-    """
+    """Steps of a campaign in real time."""
 
     def __init__(self, state: Campaign, host: CampaignHost) -> None:
         self._state, self._host, self._plan = state, host, state.plan
@@ -242,12 +217,7 @@ class _Steps:
         self._runner = StepRunner(host, self._plan.seconds + self._plan.pauses_s)
 
     def run(self, each: PlannedStep) -> None:
-        """Run a step when the coil is cool enough.
-
-        Raises:
-            StepStoppedError: The user stopped it.
-            RunError: Fault of device, rig or disk: no further step may run.
-        """
+        """Run a step when the coil is cool enough; raise RunError if no further step may run."""
         heat_a2 = self._cool(each)
         campaign, text = self._plan.campaign, each.step.text
         output = new_recording(self._plan.folder, campaign.config.name, each.step.number)

@@ -118,8 +118,7 @@ def groups_of(
 ) -> tuple[list[list[Point]], list[Broken]]:
     """Return the groups to cross, each a list of points, and the broken rules.
 
-    Args:
-        vary: A mapping whose keys are crossed, or mappings whose keys vary together.
+    The keys of one mapping are crossed; the keys of each of several mappings vary together.
     """
     single = isinstance(vary, Mapping)
     written: list[tuple[Loc, Mapping[str, Any]]] = (
@@ -162,11 +161,7 @@ def points(
 ) -> list[tuple[Point, int]]:
     """Return every point in its order, with the number of its repeat, from 1.
 
-    Args:
-        groups: Groups to cross; the last varies fastest.
-        order: See :class:`CampaignFile`.
-        seed: Seed of the random order.
-        repeat: Number of runs per point.
+    The last of the crossed groups varies fastest.
     """
     alternating = order == "alternating"
     row: list[Point] = [{}]

@@ -56,7 +56,6 @@ class FastRun:
     Attributes:
         recording: Its recording as bytes; empty if it was refused.
         code: ``completed``, ``fault`` or ``refused``.
-        reason: Why it ended, in one line.
         harmless: Whether the next step may run.
         digest: Data of its recording; None if it was not completed.
     """
@@ -102,11 +101,6 @@ def planned_fast(campaign: CampaignSteps, folder: Path) -> CampaignPlan:
 
 def run_fast(plan: CampaignPlan, host: CampaignHost, scheduler: str = "none") -> CampaignResult:
     """Run the remaining steps of a campaign as fast as possible.
-
-    Args:
-        plan: The plan.
-        host: The observers.
-        scheduler: Scheduler of the runs, see :func:`hilctl.identify.parallel.streams`.
 
     Raises:
         InputError: No disk space, the table can't be written, or the scheduler is unreachable.

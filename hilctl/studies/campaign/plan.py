@@ -1,17 +1,16 @@
 """Plan of a campaign: every step is checked against device, model and limits in advance."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from hilctl.base.errors import ConfigError, ConfigProblem, InputError
 from hilctl.base.files import TextFiles
-from hilctl.base.yaml import Loc
 from hilctl.experiment.coil_heat import CoolingCoil, RunHeat
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.experiment.preflight import check
 from hilctl.run.start import RunKey
-from hilctl.studies.campaign.steps import CampaignStep, CampaignSteps, base_problem, key_of
+from hilctl.studies.campaign.steps import CampaignStep, CampaignSteps, base_problem, key_of, locs_of
 from hilctl.studies.step_runner import free_mb, require_room
 
 _MOST_PROBLEMS = 20
@@ -24,8 +23,6 @@ class PlannedStep:
     """A step to run, or done already.
 
     Attributes:
-        step: The step.
-        loaded: Its experiment.
         settings: All ``key=value`` texts over the base experiment.
         key: Fingerprint of its experiment in a recording.
         kept: Its recording, if it is done already.
@@ -53,14 +50,7 @@ class PlannedStep:
 
 @dataclass(frozen=True, slots=True)
 class CampaignPlan:
-    """Plan of a campaign.
-
-    Attributes:
-        campaign: The campaign.
-        folder: Folder of its recordings and its table.
-        steps: Its steps in order.
-        free_mb: Free disk space.
-    """
+    """Plan of a campaign, with its steps in order and the free disk space."""
 
     campaign: CampaignSteps
     folder: Path
@@ -97,7 +87,6 @@ def planned(
     folder: Path,
     completed: Mapping[RunKey, Sequence[Path]],
     heat_a2: float | None = None,
-    on_part: Callable[[float], None] = lambda part: None,
 ) -> CampaignPlan:
     """Check and plan the remaining steps.
 
@@ -107,34 +96,28 @@ def planned(
         completed: Completed recordings, in their order.
         heat_a2: Heat of the coil before the first step, in A^2; None for steps without real time,
             where kept steps heat the coil as well.
-        on_part: Called with progress from 0 to 1.
 
     Raises:
         ConfigError: One or more steps are not allowed; all problems are listed.
-        InputError: The base experiment can't be read.
     """
     files, problems = TextFiles(), _Problems(campaign)
     left = {key: list(paths) for key, paths in completed.items()}
     known: dict[tuple[str, ...], PlannedStep] = {}
     steps: list[PlannedStep] = []
-    for number, step in enumerate(campaign.steps):
-        on_part(number / len(campaign.steps))
+    for step in campaign.steps:
         try:
             each = _loaded(campaign, step, files)
             kept = left.get(each.key)
             each = replace(each, kept=kept.pop(0) if kept else None)
             # Steps that differ in noise only are checked once; kept steps are not checked again.
-            if each.kept is None or (heat_a2 is None and _has_budget(each)):
+            budget_s = each.loaded.config.limits.thermal_time_constant_s
+            if each.kept is None or (heat_a2 is None and budget_s is not None):
                 each = _checked(each, known, folder)
             steps.append(each)
         except ConfigError as error:
             problems.add(step, error.problems)
     problems.refuse()
     return CampaignPlan(campaign, folder, _cooling(campaign, steps, heat_a2), free_mb(folder))
-
-
-def _has_budget(each: PlannedStep) -> bool:
-    return each.loaded.config.limits.thermal_time_constant_s is not None
 
 
 def _loaded(campaign: CampaignSteps, step: CampaignStep, files: TextFiles) -> PlannedStep:
@@ -181,11 +164,7 @@ def _cooling(
 
 
 class _Problems:
-    """Problems of many steps, each listed once with its location in the campaign file.
-
-    Args:
-        campaign: The campaign.
-    """
+    """Problems of many steps, each listed once with its location in the campaign file."""
 
     def __init__(self, campaign: CampaignSteps) -> None:
         self._campaign = campaign
@@ -217,13 +196,7 @@ class _Problems:
         if not problem.where.startswith("--set "):
             return problem.where
         key, document = key_of(problem.where.removeprefix("--set ")), self._campaign.document
-        vary = self._campaign.config.vary
-        places: list[Loc]
-        if isinstance(vary, Mapping):
-            places = [("vary", key)]
-        else:
-            places = [("vary", n, key) for n, group in enumerate(vary) if key in group]
-        places += [("set", key), ("reference_run", "set", key), (key,)]
-        if not step.is_reference:
-            places.remove(("reference_run", "set", key))
+        places = [*locs_of(self._campaign.config, key), ("set", key), (key,)]
+        if step.is_reference:
+            places.insert(-1, ("reference_run", "set", key))
         return next((document.where(loc) for loc in places if document.holds(loc)), problem.where)

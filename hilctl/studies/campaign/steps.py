@@ -14,6 +14,7 @@ from hilctl.base.yaml import Document, Loc, dotted, load_document
 from hilctl.experiment.devices import device_class, known_devices
 from hilctl.experiment.load import LoadedExperiment, named_from, resolve
 from hilctl.studies.campaign.file import MOST_STEPS, CampaignFile, Point, groups_of, points
+from hilctl.studies.step_runner import document_with, setting
 
 _SEEDS = 1_000_000
 
@@ -26,7 +27,6 @@ class CampaignStep:
         number: Its position, from 1.
         point: A value for each varied key; empty for a reference run.
         repeat: Number of the repeat or of the reference run, from 1.
-        is_reference: Whether it is a reference run.
         settings: ``key=value`` texts over the base experiment.
     """
 
@@ -48,7 +48,6 @@ class CampaignSteps:
     """A campaign file with its steps, not checked yet.
 
     Attributes:
-        config: The file.
         document: The file's YAML with the location of each value.
         experiment: File of the base experiment.
         settings: ``key=value`` texts over it from outside the campaign file.
@@ -77,16 +76,9 @@ class CampaignSteps:
         """Return all ``key=value`` texts of a step, outermost last.
 
         Each run of a simulated device gets its own, reproducible noise.
-
-        Raises:
-            InputError: The base experiment can't be read.
-            ConfigError: A setting is invalid.
         """
         settings = [*self.settings, *step.settings]
-        document = load_document(self.experiment, files)
-        for text in settings:
-            document.set(text)
-        device = document.data.get("device")
+        device = document_with(self.experiment, settings, files).data.get("device")
         kind = device.get("kind") if isinstance(device, dict) else None
         if "device.seed" in self.keys or kind not in known_devices():
             return settings
@@ -99,11 +91,7 @@ class CampaignSteps:
 
 
 def load_campaign(path: Path, settings: Sequence[str] = ()) -> CampaignSteps:
-    """Read a campaign file.
-
-    Args:
-        path: The file.
-        settings: ``key=value`` texts over its base experiment.
+    """Read a campaign file, with ``key=value`` texts over its base experiment.
 
     Raises:
         InputError: It can't be read.
@@ -113,12 +101,7 @@ def load_campaign(path: Path, settings: Sequence[str] = ()) -> CampaignSteps:
 
 
 def campaign_of(document: Document, folder: Path, settings: Sequence[str]) -> CampaignSteps:
-    """Return a campaign and its steps.
-
-    Args:
-        document: The campaign.
-        folder: Folder that the experiment's file name is relative to.
-        settings: ``key=value`` texts over its base experiment.
+    """Return the campaign of a document whose experiment is relative to a folder.
 
     Raises:
         ConfigError: The file is invalid; all problems are listed.
@@ -136,10 +119,10 @@ def campaign_of(document: Document, folder: Path, settings: Sequence[str]) -> Ca
     fixed = [*config.set, *(key_of(text) for text in settings)]
     problems += [
         ConfigProblem(
-            document.where(_loc_of(config, key)), f"vary.{key}", f"is set to one value by {by}"
+            document.where(locs_of(config, key)[0]), f"vary.{key}", f"is set to one value by {by}"
         )
         for key in keys
-        if (by := next((each for each in fixed if _clash(each, key)), None))
+        if (by := next((each for each in fixed if f"{each}.".startswith(f"{key}.")), None))
     ]
     if config.condition is not None and "condition" in {key.split(".")[0] for key in keys}:
         where = document.where(("condition",))
@@ -152,21 +135,17 @@ def campaign_of(document: Document, folder: Path, settings: Sequence[str]) -> Ca
     return CampaignSteps(config, document, experiment, from_here, keys, steps)
 
 
-def _clash(one: str, other: str) -> bool:
-    return one == other or one.startswith(f"{other}.")
-
-
-def _loc_of(config: CampaignFile, key: str) -> Loc:
+def locs_of(config: CampaignFile, key: str) -> list[Loc]:
+    """Return the locations of a varied key in the campaign file."""
     if isinstance(config.vary, Mapping):
-        return ("vary", key)
-    return ("vary", next(n for n, group in enumerate(config.vary) if key in group), key)
+        return [("vary", key)]
+    return [("vary", number, key) for number, group in enumerate(config.vary) if key in group]
 
 
 def _steps(config: CampaignFile, found: Sequence[tuple[Point, int]]) -> Iterator[CampaignStep]:
-    common = [f"name={json.dumps(config.name)}", *settings_of(config.set)]
+    common = [setting("name", config.name), *settings_of(config.set)]
     if config.condition is not None:
-        given = config.condition.model_dump(exclude_unset=True)
-        common.append(setting("condition", given))
+        common.append(setting("condition", config.condition.model_dump(exclude_unset=True)))
     reference = config.reference_run
     number = again = 0
     for place, (point, repeat) in enumerate(found):
@@ -188,11 +167,6 @@ def _reference(
 def settings_of(given: Mapping[str, Any]) -> list[str]:
     """Return keys and values as ``key=value`` texts."""
     return [setting(key, value) for key, value in given.items()]
-
-
-def setting(key: str, value: Any) -> str:
-    """Return the ``key=value`` text that sets a key to a plain value."""
-    return f"{key}={json.dumps(value, ensure_ascii=False)}"
 
 
 def key_of(text: str) -> str:

@@ -9,14 +9,14 @@ from mcap.writer import MCAP0_MAGIC
 
 from hilctl.base.errors import ConfigError, DataError, InputError
 from hilctl.base.private_dirs import HAS_LOCKS, take_lock
-from hilctl.base.yaml import load_document
 from hilctl.experiment.sections import RecordingConfig
 from hilctl.recording.recording_files import is_being_recorded
 from hilctl.recording.recover import recover_recording
 from hilctl.recording.run_summary import read_ends, recordings_in
-from hilctl.run.run_folder import RunFolder, runs
+from hilctl.run.run_folder import runs
 from hilctl.run.start import RunKey, completed_key
 from hilctl.studies.campaign.steps import CampaignSteps, base_problem, settings_of
+from hilctl.studies.step_runner import document_with
 
 _LONGEST_WAIT_S = 60.0
 _POLL_S = 0.1
@@ -32,9 +32,8 @@ def campaign_folder(campaign: CampaignSteps) -> Path:
     if config.folder is not None:
         return Path(config.folder)
     try:
-        document = load_document(campaign.experiment)
-        for text in (*campaign.settings, *settings_of(config.set)):
-            document.set(text)
+        settings = (*campaign.settings, *settings_of(config.set))
+        document = document_with(campaign.experiment, settings)
     except ConfigError:
         raise
     except InputError as error:
@@ -49,11 +48,6 @@ def locked_folder(
     folder: Path, sleep_s: Callable[[float], None], wait_s: float = 5.0
 ) -> Iterator[None]:
     """Create a campaign's folder, and lock it against other campaigns.
-
-    Args:
-        folder: The folder.
-        sleep_s: Sleeps for a time in s.
-        wait_s: Time to wait for the lock.
 
     Raises:
         InputError: The folder can't be created, or another campaign uses it.
@@ -94,13 +88,13 @@ def _locked(held: int) -> bool:
 def await_runs(folder: Path, sleep_s: Callable[[float], None]) -> None:
     """Wait for runs that record to a folder and whose supervisor has died.
 
-    Their loop ends by its safe ramp when it misses the supervisor's heartbeat.
-
-    Raises:
-        InputError: A run does not end.
+    Their loop ends by its safe ramp when it misses the supervisor's heartbeat. Raise InputError if
+    a run does not end.
     """
-    waited_s = 0.0
-    while living := [run for run in runs() if run.alive and _is_in(run, folder)]:
+    waited_s, whole = 0.0, folder.resolve()
+    while living := [
+        run for run in runs() if run.alive and Path(run.card.recording).parent == whole
+    ]:
         if living[0].supervised or waited_s > _LONGEST_WAIT_S:
             run = living[0].card
             raise InputError(
@@ -108,10 +102,6 @@ def await_runs(folder: Path, sleep_s: Callable[[float], None]) -> None:
             )
         sleep_s(_POLL_S)
         waited_s += _POLL_S
-
-
-def _is_in(run: RunFolder, folder: Path) -> bool:
-    return Path(run.card.recording).parent == folder.resolve()
 
 
 def repair_recordings(folder: Path) -> list[str]:

@@ -5,9 +5,10 @@ import io
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from hilctl.analysis.export import write_parquet
 from hilctl.base.files import write_file, write_text
@@ -32,11 +33,9 @@ class CampaignRow:
 
     Attributes:
         result: ``planned``, ``completed``, or code and reason.
-        figures: Metrics of its recording.
         recording: Name of its recording in the campaign's folder, or empty.
         code: ``planned``, ``completed``, ``refused``, ``fault`` or ``stopped``.
         kept: Whether it was done already.
-        digest: Data of its recording for figures, or None.
     """
 
     result: str = PLANNED
@@ -50,12 +49,7 @@ class CampaignRow:
 def columns_of(
     keys: Sequence[str], rows: Sequence[tuple[CampaignStep, CampaignRow]]
 ) -> dict[str, list[Any]]:
-    """Return the columns of the table, each with one value per step, or None.
-
-    Args:
-        keys: The varied keys.
-        rows: The steps in order, each with its outcome.
-    """
+    """Return the columns of the table, each with one value per step, or None."""
     columns: dict[str, list[Any]] = {
         STEP: [step.number for step, _ in rows],
         REPEAT: [step.repeat for step, _ in rows],
@@ -82,33 +76,28 @@ def _one_type(values: list[Any]) -> list[Any]:
     ]
 
 
-def write_table(
-    plan: CampaignPlan, rows: Mapping[int, CampaignRow], facts: Mapping[str, str]
-) -> list[Path]:
+def ordered(
+    plan: CampaignPlan, rows: Mapping[int, CampaignRow]
+) -> list[tuple[CampaignStep, CampaignRow]]:
+    """Return all steps in order, each with its row."""
+    return [(each.step, rows.get(each.step.number, CampaignRow())) for each in plan.steps]
+
+
+def write_table(plan: CampaignPlan, rows: Mapping[int, CampaignRow]) -> list[Path]:
     """Write the table atomically as CSV and, if pyarrow is installed, as Parquet.
-
-    Args:
-        plan: The campaign's plan.
-        rows: Outcomes by step number.
-        facts: Metadata of the Parquet file.
-
-    Returns:
-        The files.
 
     Raises:
         InputError: A file can't be written.
     """
-    known = [(each.step, rows.get(each.step.number, CampaignRow())) for each in plan.steps]
-    table = columns_of(plan.campaign.keys, known)
-    path = plan.folder / f"{plan.campaign.config.name}.csv"
+    table = columns_of(plan.campaign.keys, ordered(plan, rows))
+    config, experiment = plan.campaign.config, str(plan.campaign.experiment)
+    facts = {"campaign": config.name, "description": config.description, "experiment": experiment}
+    path = plan.folder / f"{config.name}.csv"
     write_text(path, csv_text(table), overwrite=True)
     written = [path]
     if find_spec("pyarrow") is not None:
-
-        def write(stream: BinaryIO) -> None:
-            write_parquet(stream, table, facts)
-
         written.append(path.with_suffix(".parquet"))
+        write = partial(write_parquet, table=table, facts=facts)
         write_file(written[-1], write, overwrite=True)
     return written
 

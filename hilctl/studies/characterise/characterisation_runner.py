@@ -1,6 +1,5 @@
 """Characterisation runner: one run per step, each planned from the steps before it."""
 
-import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -9,7 +8,6 @@ from pathlib import Path
 from hilctl.base.errors import DataError, InputError, RunError
 from hilctl.base.files import check_writable, write_text
 from hilctl.base.types import F64, CommandUnit
-from hilctl.base.yaml import Document, load_document
 from hilctl.experiment.coil_heat import CoolingCoil, RunHeat
 from hilctl.experiment.device_state import heat_before
 from hilctl.experiment.load import load_experiment
@@ -33,46 +31,27 @@ from hilctl.studies.characterise.waveforms import Keys, at_rest, within
 from hilctl.studies.step_runner import (
     StepRunner,
     StudyHost,
+    document_with,
     free_mb,
     raise_if_stopped,
     require_room,
+    setting,
 )
-
-
-def waveform_setting(keys: Keys) -> str:
-    """Return the ``key=value`` text that sets the waveform of an experiment."""
-    return f"waveform={json.dumps(keys)}"
 
 
 def unit_of(experiment: Path, settings: Sequence[str]) -> CommandUnit:
     """Return the command unit of an experiment."""
-    return "V" if _document(experiment, settings).holds(("limits", "drive_v")) else "A"
+    return "V" if document_with(experiment, settings).holds(("limits", "drive_v")) else "A"
 
 
 def without_reference(experiment: Path, settings: Sequence[str]) -> list[str]:
-    """Return settings that remove the compensator and everything that needs one.
-
-    Args:
-        experiment: Experiment file.
-        settings: ``key=value`` texts over it.
-
-    Raises:
-        InputError: The file can't be read.
-        ConfigError: The file is not YAML, or a setting is invalid.
-    """
-    document = _document(experiment, settings)
+    """Return settings that remove the compensator and everything that needs one."""
+    document = document_with(experiment, settings)
     found = ["compensator=none"]
     found += [f"{key}=null" for key in ("feedback", "adaptation") if document.holds((key,))]
     return found + [
         f"limits.{key}=null" for key in _tracking_keys() if document.holds(("limits", key))
     ]
-
-
-def _document(experiment: Path, settings: Sequence[str]) -> Document:
-    document = load_document(experiment)
-    for setting in settings:
-        document.set(setting)
-    return document
 
 
 def _tracking_keys() -> Iterator[str]:
@@ -96,7 +75,6 @@ class CharacterisationPlan:
     """Plan of a characterisation, at full amplitude.
 
     Attributes:
-        limits: Its limits.
         steps: Its steps; most polarity and response steps are skipped in the end.
         pauses_s: Time for the coil to cool.
         free_mb: Free disk space.
@@ -130,10 +108,10 @@ class CharacterisationHost(StudyHost):
 
 
 class CharacterisationRunner:
-    """Characterise the device of an experiment.
+    """Characterise the device of an experiment; its waveform and compensator are not used.
 
     Args:
-        experiment: Experiment file; its waveform and compensator are not used.
+        experiment: Experiment file.
         settings: ``key=value`` texts over it.
         folder: Folder of the recordings.
         highest_hz: Highest frequency of loops; derived from the sample rate if None.
@@ -156,15 +134,15 @@ class CharacterisationRunner:
         self._folder = folder
         self._host = host or CharacterisationHost()
         first = {"kind": "hold", "unit": unit_of(experiment, self._settings), "level": 0.0}
-        self._loaded = load_experiment(
-            experiment, [*self._settings, waveform_setting({**first, "duration_s": 1.0})]
-        )
+        hold = setting("waveform", {**first, "duration_s": 1.0})
+        self._loaded = load_experiment(experiment, [*self._settings, hold])
         self.limits = limits_of(self._loaded, highest_hz)
         info = self._loaded.device.info
         if self._host.run is unpaced and not info.simulated:
             raise InputError(f"--fast: {info.name}: only simulated devices run without real time")
         # Reject everything that does not depend on the waveform before anything moves.
-        checked_experiment(experiment, [*self._settings, waveform_setting(at_rest(self.limits))])
+        rest = setting("waveform", at_rest(self.limits))
+        checked_experiment(experiment, [*self._settings, rest])
         self._coil = CoolingCoil(self._loaded.config, 0.0, 0.0)
         self._measured = Measured()
         self._rows: list[StepRow] = []
@@ -204,11 +182,7 @@ class CharacterisationRunner:
                 path.unlink()
 
     def characterise(self, output: Path, *, overwrite: bool = False) -> Characterisation:
-        """Run all steps, then identify and validate the model.
-
-        Args:
-            output: Model file to write.
-            overwrite: Whether an existing file may be replaced.
+        """Run all steps, then identify and validate the model and write it to ``output``.
 
         Raises:
             InputError: A file can't be written, or no disk space; nothing has moved.
@@ -216,7 +190,11 @@ class CharacterisationRunner:
             RunError: A step ended by a fault that is no known problem of the rig.
         """
         check_writable(output, overwrite=overwrite)
-        self._make_room()
+        require_room(self._folder, self.plan.megabytes, self.plan.free_mb)
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"{self._folder}: can't be created: {error.strerror}") from None
         result = Characterisation(
             experiment=self._loaded.config.name,
             device=self._loaded.device.info.name,
@@ -226,26 +204,16 @@ class CharacterisationRunner:
             measured=self._measured,
         )
         try:
-            self._run_steps()
+            for number, step in enumerate(STEPS, 1):
+                keys = step.waveform(self.limits, self._measured)
+                if keys is not None:
+                    self._do(number, step, keys)
             return self._with_model(result, output, overwrite=overwrite)
         except RigProblemError as error:
             return replace(self._so_far(result), problem=str(error), problem_code=error.code)
 
     def _so_far(self, result: Characterisation) -> Characterisation:
         return replace(result, steps=tuple(self._rows), measured=self._measured)
-
-    def _make_room(self) -> None:
-        require_room(self._folder, self.plan.megabytes, self.plan.free_mb)
-        try:
-            self._folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(f"{self._folder}: can't be created: {error.strerror}") from None
-
-    def _run_steps(self) -> None:
-        for number, step in enumerate(STEPS, 1):
-            keys = step.waveform(self.limits, self._measured)
-            if keys is not None:
-                self._do(number, step, keys)
 
     def _do(self, number: int, step: CharacterisationStep, keys: Keys) -> None:
         keys, command = within(self.limits, keys)
@@ -265,9 +233,8 @@ class CharacterisationRunner:
         self._coil.ran(heat, min(path.stat().st_mtime, now_s) if kept else now_s)
         self._recordings[step.name] = path
         seconds = command.size / self.limits.sample_rate_hz
-        row = StepRow(
-            step.name, step.purpose, seconds, path.stat().st_size / 1e6, "", str(path), kept
-        )
+        megabytes = path.stat().st_size / 1e6
+        row = StepRow(step.name, step.purpose, seconds, megabytes, "", str(path), kept)
         self._rows.append(row)
         self._measured, text = step.take(recording, self.limits, self._measured)
         self._rows[-1] = replace(row, text=text)
@@ -276,8 +243,8 @@ class CharacterisationRunner:
     def _recorded(
         self, step: CharacterisationStep, settings: list[str], path: Path, seconds: float
     ) -> Recording:
+        text = f"{step.name}: {step.purpose}"
         try:
-            text = f"{step.name}: {step.purpose}"
             result = self._runner.run(
                 self._experiment, settings, path, text, seconds, overwrite=True
             )
@@ -305,8 +272,7 @@ class CharacterisationRunner:
     def _pause_s(self, heat: RunHeat) -> float:
         """Return the time to cool after the steps so far and the device's last run."""
         now_s = self._host.now_s()
-        last_a2 = heat_before(self._loaded, now_s)
-        last = CoolingCoil(self._loaded.config, last_a2, now_s)
+        last = CoolingCoil(self._loaded.config, heat_before(self._loaded, now_s), now_s)
         return max(coil.pause_s(heat, now_s) for coil in (self._coil, last))
 
     def _with_model(
@@ -330,7 +296,7 @@ class CharacterisationRunner:
 
     def _step_settings(self, number: int, step: CharacterisationStep, keys: Keys) -> list[str]:
         name = f"{self._loaded.config.name}-{step.name}"[-_NAME_LENGTH:].lstrip("._-")
-        settings = [*self._settings, f"name={json.dumps(name)}", waveform_setting(keys)]
+        settings = [*self._settings, setting("name", name), setting("waveform", keys)]
         if self._rows and self._loaded.config.safe.at_start is not None:
             settings.append(f"safe.at_start={self.limits.rest!r}")  # where the previous step ended
         seed = self._loaded.device.Options.model_fields.get("seed")

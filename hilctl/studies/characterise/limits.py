@@ -24,16 +24,14 @@ _OF_HEAT = 0.9
 
 @dataclass(frozen=True, slots=True)
 class CharacterisationLimits:
-    """Limits of a characterisation.
+    """Limits of a characterisation, in the command's unit.
 
     Attributes:
         loaded: The experiment.
-        unit: Unit of commands.
         low: Lowest command.
         high: Highest command.
         rest: Safe value, where each run starts and ends.
         stroke_um: Allowed range of displacement.
-        sample_rate_hz: Samples per second.
         lowest_hz: Lowest frequency of loops.
         highest_hz: Highest frequency of loops.
     """
@@ -88,10 +86,9 @@ class CharacterisationLimits:
         return math.pi * travel / (2.0 * _OF_SLEW_TO_START * self.loaded.config.limits.slew_per_s)
 
     def scale(self, values: F64) -> float:
-        """Return the factor, at most 1, that keeps a command within slew and heat with a margin.
+        """Return the factor, at most 1, that keeps all commands of a run within slew and heat.
 
-        Args:
-            values: float64[n], every command of a run.
+        It leaves a margin to both limits.
         """
         config = self.loaded.config
         figures = CommandFigures(config, self.rest, self.rest**2)
@@ -108,12 +105,8 @@ class CharacterisationLimits:
 def limits_of(loaded: LoadedExperiment, highest_hz: float | None = None) -> CharacterisationLimits:
     """Return the limits of a characterisation.
 
-    Args:
-        loaded: The experiment.
-        highest_hz: Highest frequency of loops; derived from the sample rate if None.
-
-    Raises:
-        InputError: That frequency has too few samples per cycle.
+    The highest frequency of loops is derived from the sample rate if None. Raise InputError if it
+    has too few samples per cycle.
     """
     config = loaded.config
     rate_hz = config.sample_rate_hz

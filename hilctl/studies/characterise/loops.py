@@ -34,7 +34,6 @@ class LoopFigures:
         label: Label of the segment.
         amplitude: Half the peak-to-peak command.
         bias: Mid-range of the command.
-        frequency_hz: Cycles per second.
         low_um: Lowest displacement of the average cycle.
         high_um: Highest.
         hysteresis_percent: Peak hysteresis; None if the loop has no two branches.
@@ -66,12 +65,7 @@ class LoopFigures:
 
 
 def loop_figures(recording: Recording, segment: Segment) -> LoopFigures:
-    """Evaluate the steady cycles of a segment.
-
-    Raises:
-        RigProblemError: The sensor is saturated.
-        DataError: The segment has no whole steady cycle.
-    """
+    """Evaluate the steady cycles of a segment; raise DataError without a whole one."""
     part = steady_part(recording, segment)
     if part.cycle is None:
         raise DataError(f"{recording.path}: {segment.label}: no whole steady cycle")
@@ -124,18 +118,10 @@ def _refuse_saturated(displacement_um: F64, label: str) -> None:
 def next_amplitude(
     loops: Sequence[LoopFigures], wanted: float, stroke_um: tuple[float, float]
 ) -> float | None:
-    """Return the amplitude of the next growing loop.
+    """Return the amplitude of the next growing loop: the wanted one, lowered to the stroke.
 
-    In most actuators displacement grows faster than the command. The exponent is estimated from
-    the last two loops.
-
-    Args:
-        loops: The loops so far, in increasing order.
-        wanted: Wanted amplitude.
-        stroke_um: Allowed range of displacement.
-
-    Returns:
-        The wanted amplitude, lowered to the stroke; None if it is hardly larger than the last.
+    In most actuators displacement grows faster than the command. The exponent is estimated from the
+    last two loops. None if the amplitude is hardly larger than the last one.
     """
     if not loops:
         return wanted

@@ -32,16 +32,7 @@ ProblemCode: TypeAlias = Literal[
 
 
 class RigProblemError(RunError):
-    """A problem of the rig that prevents its characterisation.
-
-    Args:
-        code: Code of the problem.
-        text: The observation.
-        remedy: The remedy.
-
-    Attributes:
-        code: Code of the problem.
-    """
+    """A problem of the rig that prevents its characterisation: code, observation and remedy."""
 
     def __init__(self, code: ProblemCode, text: str, remedy: str) -> None:
         super().__init__(f"{text}: {remedy}")
@@ -53,6 +44,13 @@ _EVEN = 2.0
 _FEWEST_CYCLES = 4
 _MEAN_S = 0.1
 _LONG = 10  # times that: shortest hold for creep
+_MOST_MISSING = 0.01  # share of samples
+_FEWEST_LINES = 8
+_USABLE = 0.3  # largest relative noise of a line that is fitted
+_HYSTERESIS = 0.03  # of a line, that no linear response explains
+_WORTH = 0.5  # of the misfit that a resonance must explain
+_MOST_DAMPING = 0.8
+_LOG_LOW = math.log(1e-9)
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +58,6 @@ class RestNoise:
     """Sensor signal at rest.
 
     Attributes:
-        mean_um: Mean displacement.
         noise_um: rms about the linear trend.
         span_um: Range of the readings.
         drift_um_per_s: Slope of the linear trend.
@@ -77,11 +74,7 @@ class RestNoise:
 
 
 def rest_noise(recording: Recording) -> RestNoise:
-    """Evaluate a recording at constant command.
-
-    Raises:
-        RigProblemError: More than 10 % of the readings are not numbers.
-    """
+    """Evaluate a recording at constant command; at least 90 % of its readings are numbers."""
     segment = recording.segments[0]
     displacement_um = recording.samples.part(segment.start, segment.stop).displacement_um
     good = np.isfinite(displacement_um)
@@ -132,8 +125,7 @@ class StepResponseCheck:
     """Response of the displacement to a sine.
 
     Attributes:
-        frequency_hz: Its frequency.
-        amplitude: Its amplitude, in the command's unit.
+        amplitude: Amplitude of the sine, in the command's unit.
         gain_um: Gain in um per command unit; negative if the displacement falls as the command
             rises.
         angle_deg: Phase lag of the displacement, from -180 to 180.
@@ -170,16 +162,14 @@ def sine_reaction(recording: Recording) -> StepResponseCheck:
     command = coefficients(since, segment.period, samples.command, 2)
     each = _each_cycle(since, segment.period, samples.displacement_um, max(cycles, 1))
     mean = each.mean(axis=0)
-    error = float(np.std(np.abs(each[:, 1] - mean[1]))) if len(each) < _FEWEST_CYCLES else 0.0
-    if len(each) >= _FEWEST_CYCLES:
-        scatter = np.sqrt(np.mean(np.abs(each[:, 1] - mean[1]) ** 2))
-        error = float(scatter / math.sqrt(len(each) - 1))
+    off = np.abs(each[:, 1] - mean[1])
+    few = len(each) < _FEWEST_CYCLES
+    error = float(np.std(off) if few else np.sqrt(np.mean(off**2) / (len(each) - 1)))
     answer = mean[1] / command[1]
-    size = abs(answer)
     return StepResponseCheck(
         frequency_hz=recording.sample_rate_hz / segment.period,
         amplitude=2.0 * abs(command[1]),
-        gain_um=float(math.copysign(size, answer.real)),
+        gain_um=float(math.copysign(abs(answer), answer.real)),
         angle_deg=-math.degrees(np.angle(answer)),
         doubt_um=error / abs(command[1]),
         second_um=2.0 * float(abs(mean[2])),
@@ -192,8 +182,7 @@ def _each_cycle(since: I64, period: float, values: F64, cycles: int) -> np.ndarr
     good = np.isfinite(values)
     since, values = since[good], values[good]
     number = np.floor((since - since[-1] - 0.5) / period).astype(np.int64) + cycles
-    rows = [number == k for k in range(cycles)]
-    rows = [row for row in rows if row.any()]
+    rows = [row for k in range(cycles) if (row := number == k).any()]
     if len(rows) > 1:  # a line through the samples would remove part of the sine
         means = [float(values[row].mean()) for row in rows]
         slope = np.polynomial.polynomial.polyfit(np.arange(len(rows)), means, 1)[1]
@@ -201,44 +190,24 @@ def _each_cycle(since: I64, period: float, values: F64, cycles: int) -> np.ndarr
     return np.array([coefficients(since[r], period, values[r], 2) for r in rows])
 
 
-MOST_MISSING = 0.01
-"""Largest share of samples that may be missing."""
-
-
 def without_gaps(recording: Recording, start: int, stop: int) -> tuple[F64, F64]:
-    """Return every command and displacement between two samples, with gaps filled.
+    """Return every command and displacement in [start, stop), with gaps filled.
 
-    Args:
-        recording: A run.
-        start: Index of the first sample.
-        stop: Index after the last.
-
-    Returns:
-        Command, held over gaps, and displacement in um, interpolated linearly over gaps:
-        float64[stop - start] each.
+    The command is held, and the displacement in um interpolated: float64[stop - start] each.
 
     Raises:
-        DataError: More than 1 % of them are missing or have no displacement.
+        DataError: More than 1 % of the samples are missing or have no displacement.
     """
     samples = recording.samples.part(start, stop)
     wanted = np.arange(start, stop)
     good = np.isfinite(samples.displacement_um)
     missing = wanted.size - np.count_nonzero(good)
-    if missing > MOST_MISSING * wanted.size:
+    if missing > _MOST_MISSING * wanted.size:
         rule = f"{missing} of {wanted.size} samples are missing or have no displacement"
         raise DataError(f"{recording.path}: {rule}: check late ticks and the sensor")
     last = np.maximum(np.searchsorted(samples.index, wanted, side="right") - 1, 0)
     displacement_um = np.interp(wanted, samples.index[good], samples.displacement_um[good])
     return np.ascontiguousarray(samples.command[last]), displacement_um
-
-
-_FEWEST_LINES = 8
-_USABLE = 0.3  # largest relative noise of a line that is fitted
-_HYSTERESIS = 0.03  # of a line, that no linear response explains
-_WORTH = 0.5  # of the misfit that a resonance must explain
-_MOST_DAMPING = 0.8
-
-_LOG_LOW = math.log(1e-9)
 
 
 @dataclass(frozen=True, slots=True)
@@ -280,8 +249,7 @@ class SmallSignal:
 def small_signal(recording: Recording) -> SmallSignal:
     """Evaluate a recording of one multisine whose period is a whole number of samples.
 
-    Raises:
-        RigProblemError: Too few lines are above the noise.
+    Raise RigProblemError if too few lines are above the noise.
     """
     frequency_hz, response, noise, amplitude = _lines(recording)
     usable = noise < _USABLE * np.abs(response)
@@ -319,7 +287,7 @@ def _lines(recording: Recording) -> tuple[F64, C128, F64, float]:
         command, moved = without_gaps(recording, stop - periods * period, stop)
     except DataError as error:
         raise RigProblemError("no_reading", str(error), "then run it again") from None
-    shape = (periods, period)
+    shape = periods, period
     # Drift between periods: a line through the samples would remove low frequencies.
     means = moved.reshape(shape).mean(axis=1)
     slope = np.polynomial.polynomial.polyfit(np.arange(periods), means, 1)[1]
@@ -330,13 +298,8 @@ def _lines(recording: Recording) -> tuple[F64, C128, F64, float]:
     strong[0] = False
     k = np.flatnonzero(strong)
     scatter = np.sqrt(np.mean(np.abs(each - each.mean(axis=0)) ** 2, axis=0) / (periods - 1))
-    size = np.abs(wanted[k])
-    return (
-        k * recording.sample_rate_hz / period,
-        each.mean(axis=0)[k] / wanted[k],
-        scatter[k] / size,
-        0.5 * float(np.ptp(command)),
-    )
+    response, noise = each.mean(axis=0)[k] / wanted[k], scatter[k] / np.abs(wanted[k])
+    return k * recording.sample_rate_hz / period, response, noise, 0.5 * float(np.ptp(command))
 
 
 def _response(x: F64, frequency_hz: F64, *, resonant: bool) -> C128:
@@ -361,11 +324,7 @@ def _fit(frequency_hz: F64, response: C128, noise: F64, rate_hz: float) -> tuple
 
 
 def _best(
-    frequency_hz: F64,
-    response: C128,
-    noise: F64,
-    rate_hz: float,
-    tries: list[float] | list[None],
+    frequency_hz: F64, response: C128, noise: F64, rate_hz: float, tries: list[float] | list[None]
 ) -> OptimizeResult:
     """Return the best fit from several starting frequencies; None fits no resonance."""
     doubt = np.hypot(noise, _HYSTERESIS * np.abs(response))

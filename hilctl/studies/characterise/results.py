@@ -1,17 +1,15 @@
 """Results of a characterisation: measurements, model, and validation."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any, Self, TypeAlias
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from hilctl.base.segments import Segment
 from hilctl.base.types import F64
 from hilctl.identify.data.records import History
-from hilctl.identify.fit_api import FitRequest, OnProgress, ignore_progress
+from hilctl.identify.fit_api import FitRequest
 from hilctl.identify.model_quality import GOOD_PERCENT, MOST_PERCENT, Grade, Verdict
 from hilctl.identify.parallel import parallel_map, workers
 from hilctl.identify.pipeline import Identification, identify_records, settings_from
@@ -33,13 +31,11 @@ class Measured:
     """Measurements of the steps so far; None or empty if not measured yet.
 
     Attributes:
-        rest: Noise and drift at rest.
         reaction: First reaction and its polarity.
         small: Small-signal response.
         growing: Loops of growing amplitude.
         slow: Loops at the lowest frequency.
         fast: Loops at several frequencies.
-        reversal: First-order reversal curves.
         biased: Small loops over the whole range.
         crept_percent: Creep in each hold, of the displacement.
         repeated: Change of the largest growing loop at the end.
@@ -55,10 +51,6 @@ class Measured:
     biased: tuple[LoopFigures, ...] = ()
     crept_percent: tuple[float, ...] = ()
     repeated: Repeatability | None = None
-
-    def also(self, **found: Any) -> Self:
-        """Return a copy with more measurements."""
-        return replace(self, **found)
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values without signals."""
@@ -95,8 +87,6 @@ class StepRow:
     """One step of the plan or the result.
 
     Attributes:
-        name: Name of the step and of its recording.
-        purpose: Its purpose.
         seconds: Rig time.
         megabytes: Approximate size of its recording.
         text: Summary of its result; empty before the run.
@@ -118,12 +108,8 @@ class Characterisation:
     """Result of a characterisation.
 
     Attributes:
-        experiment: Name of the experiment.
-        device: Name of the device.
-        unit: Unit of commands.
         band_hz: Lowest and highest frequency of loops.
         steps: The steps, run or kept.
-        measured: Their measurements.
         held_out: Validation errors, the random reference first; empty without a model.
         identification: The model; None if none was identified.
         problem: Problem of the rig with its remedy; empty if all steps were completed.
@@ -202,8 +188,6 @@ def _is_signal(value: Any) -> bool:
     )
 
 
-Mask: TypeAlias = npt.NDArray[np.bool_]
-
 _SLACK = 0.01
 
 FITTED = ("slow-loops", "fast-loops", "creep", "small-motions", "training")
@@ -218,28 +202,24 @@ VALIDATED: Mapping[str, str] = {
 """Steps for validation only, with their labels, the most important first."""
 
 
-def identified(
-    recordings: Mapping[str, Path], progress: OnProgress = ignore_progress
-) -> Identification:
+def identified(recordings: Mapping[str, Path]) -> Identification:
     """Select the kind of model and identify it from complete histories.
 
     Small loops depend on the history of the actuator, which steady loops do not contain.
 
-    Args:
-        recordings: The steps' recordings by name.
-        progress: Called with a description of the progress.
-
     Raises:
-        InputError: No model can be identified from them.
+        InputError: No model can be identified from the recordings.
     """
     fitted = parallel_map(read, [p for name, p in recordings.items() if name in FITTED])
-    source = [recording.path.name for recording in fitted]
-    histories = [_history(recording) for recording in fitted]
-    unit = fitted[0].command_unit
-    settings = settings_from("auto", [])
     with workers("threads") as run:
         return identify_records(
-            FitRequest(histories, settings, unit, source=source, run=run, progress=progress)
+            FitRequest(
+                [_history(recording) for recording in fitted],
+                settings_from("auto", []),
+                fitted[0].command_unit,
+                source=[recording.path.name for recording in fitted],
+                run=run,
+            )
         )
 
 
@@ -263,25 +243,22 @@ def validated(
 def validate(
     model: HysteresisModel, recording: Recording, noise_um: float, label: str
 ) -> ValidationReference:
-    """Validate a model on a recording.
+    """Validate a model on a recording that starts with a conditioning cycle.
 
     The model runs through the complete recording. The waveforms after the first are evaluated at
     full amplitude, within the input range of the model.
-
-    Args:
-        model: The model.
-        recording: A run that starts with a conditioning cycle.
-        noise_um: rms noise of a single reading.
-        label: Name of the reference.
-
-    Raises:
-        DataError: Too many samples are missing.
     """
     parts = recording.segments[1:]
     stop = parts[-1].steady_stop
     command, measured_um = without_gaps(recording, 0, stop)
     modelled_um = model.forward(recording.sample_rate_hz).process(command)
-    good = _in_range(command, model) & _steady(parts, stop)
+    low, high = model.input_range or (-np.inf, np.inf)
+    slack = _SLACK * (high - low) if np.isfinite(high - low) else 0.0
+    good = (command >= low - slack) & (command <= high + slack)
+    steady = np.zeros(stop, dtype=np.bool_)
+    for part in parts:
+        steady[part.steady_start : part.steady_stop] = True
+    good &= steady
     error_um = modelled_um[good] - measured_um[good]
     whole_um = max(float(np.ptp(measured_um[good])), 1e-12)
     floor_um = noise_um * cycle_metrics.expected_maximum(error_um.size)
@@ -295,18 +272,3 @@ def validate(
         measured_um=measured_um[good],
         modelled_um=modelled_um[good],
     )
-
-
-def _in_range(command: F64, model: HysteresisModel) -> Mask:
-    """Return which commands are in the model's input range, if it has one: bool[n]."""
-    low, high = model.input_range or (-np.inf, np.inf)
-    slack = _SLACK * (high - low) if np.isfinite(high - low) else 0.0
-    return (command >= low - slack) & (command <= high + slack)
-
-
-def _steady(parts: Sequence[Segment], stop: int) -> Mask:
-    """Return which samples belong to a waveform at full amplitude: bool[stop]."""
-    found = np.zeros(stop, dtype=np.bool_)
-    for part in parts:
-        found[part.steady_start : part.steady_stop] = True
-    return found

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -43,15 +44,8 @@ def response_figure(small: SmallSignal, band_hz: tuple[float, float], unit: str)
     figure = Figure(figsize=(_WIDTH, 4.6))
     upper, lower = figure.subplots(2, 1, sharex=True)
     measured, fitted = small.response, small.fitted
-    upper.errorbar(
-        small.frequency_hz,
-        np.abs(measured),
-        yerr=small.noise,
-        fmt=".",
-        color=DISPLACEMENT,
-        markersize=3,
-        label="measured",
-    )
+    dots: dict[str, Any] = {"fmt": ".", "color": DISPLACEMENT, "markersize": 3}
+    upper.errorbar(small.frequency_hz, np.abs(measured), small.noise, **dots, label="measured")
     upper.loglog(small.frequency_hz, np.abs(fitted), color=REFERENCE, label="fitted")
     upper.set(ylabel=f"µm/{unit}", title="Small-signal response")
     for signal, style, colour in ((measured, ".", DISPLACEMENT), (fitted, "-", REFERENCE)):
@@ -77,10 +71,9 @@ def measured_loops_figure(groups: Sequence[tuple[str, Sequence[LoopFigures]]], u
     rows = -(-len(drawn) // columns)
     figure = Figure(figsize=(_WIDTH, 4.2 * rows))
     panels = figure.subplots(rows, columns, squeeze=False)
-    for axes in panels.flat:
+    for axes in panels.flat[len(drawn) :]:
         axes.set_visible(False)
     for axes, (title, loops) in zip(panels.flat, drawn, strict=False):
-        axes.set_visible(True)
         _loops(axes, loops, unit)
         axes.set(title=title, xlabel=f"command, {unit}", ylabel="displacement, µm")
     return figure
@@ -116,9 +109,7 @@ def reversal_figure(found: ReversalCurves, unit: str) -> Figure:
 def held_out_figure(found: ValidationReference, *, close: bool) -> Figure:
     """Plot measured and modelled displacement over time, and the error.
 
-    Args:
-        found: The reference and the model's output.
-        close: Whether to plot displacements about the largest error only.
+    A close figure has the displacements about the largest error only.
     """
     figure = Figure(figsize=(_WIDTH, 4.6))
     upper, lower = figure.subplots(2, 1, height_ratios=[2.0, 1.0])
@@ -154,12 +145,10 @@ HELD_OUT_HEADINGS = ("validation", "peak %", "rms %", "mean %", "noise floor %")
 
 def held_out_rows(found: Characterisation) -> list[tuple[str, ...]]:
     """Return one row per validation reference, for :data:`HELD_OUT_HEADINGS`."""
-    return [(each.label, *_percents(each)) for each in found.held_out]
-
-
-def _percents(each: ValidationReference) -> Iterator[str]:
-    for value in (each.peak_percent, each.rms_percent, each.mean_percent, each.floor_percent):
-        yield f"{value:.3g}"
+    names = ("peak_percent", "rms_percent", "mean_percent", "floor_percent")
+    return [
+        (each.label, *(f"{getattr(each, name):.3g}" for name in names)) for each in found.held_out
+    ]
 
 
 def figure_rows(found: Characterisation) -> Iterator[tuple[str, str]]:
@@ -176,10 +165,8 @@ def _measured_rows(measured: Measured, unit: str) -> Iterator[tuple[str, str]]:
     per = f"um/{unit}"
     if (rest := measured.rest) is not None:
         yield "noise at rest", f"{quantity(rest.noise_um, 'um')} rms"
-        yield (
-            "strongest spectral line",
-            f"{quantity(rest.line_um, 'um', 2)} at {quantity(rest.line_hz, 'Hz', 4)}",
-        )
+        line = f"{quantity(rest.line_um, 'um', 2)} at {quantity(rest.line_hz, 'Hz', 4)}"
+        yield "strongest spectral line", line
         yield "drift at rest", quantity(rest.drift_um_per_s, "um/s", 2)
     if (reaction := measured.reaction) is not None:
         sign = "rises" if reaction.gain_um > 0.0 else "falls"
@@ -191,10 +178,8 @@ def _measured_rows(measured: Measured, unit: str) -> Iterator[tuple[str, str]]:
         yield "delay", quantity(small.delay_s, "s")
         yield "lag", quantity(small.lag_s, "s")
         resonance = "none"
-        if small.natural_hz is not None:
-            resonance = (
-                f"{quantity(small.natural_hz, 'Hz', 4)}, damping ratio {small.damping_ratio:.2g}"
-            )
+        if (hz := small.natural_hz) is not None:
+            resonance = f"{quantity(hz, 'Hz', 4)}, damping ratio {small.damping_ratio:.2g}"
         yield "resonance", resonance
         yield "residual of that fit", f"{small.misfit_percent:.2g} % rms of the gain"
     if measured.growing:
@@ -202,10 +187,8 @@ def _measured_rows(measured: Measured, unit: str) -> Iterator[tuple[str, str]]:
         low_high = f"{significant(largest.low_um, 4)} to {significant(largest.high_um, 4)} µm"
         yield "largest amplitude", f"{largest.amplitude:.4g} {unit}, {low_high}"
     if (curves := measured.reversal) is not None:
-        yield (
-            "return-point error",
-            f"{quantity(curves.return_um, 'um', 2)}, {curves.return_percent:.2g} %",
-        )
+        return_um = quantity(curves.return_um, "um", 2)
+        yield "return-point error", f"{return_um}, {curves.return_percent:.2g} %"
     if measured.crept_percent:
         crept = " and ".join(f"{percent:+.2g} %" for percent in measured.crept_percent)
         yield "creep in holds", f"{crept} in {CREEP_S:g} s"
@@ -226,17 +209,21 @@ def write_characterisation(found: Characterisation, path: Path) -> None:
 def characterisation_page(found: Characterisation) -> str:
     """Return the page as HTML."""
     title = f"{found.experiment}: {found.device}"
-    body = [f"<h1>{html.text(title)}</h1>"]
-    if found.problem:
-        body.append(html.paragraph(found.problem, "note"))
-    body += [*_held_out(found), "<h2>Measured</h2>"]
-    body.append(html.grid(("quantity", "value"), figure_rows(found)))
-    body += [*_drawn(found), *_model(found), "<h2>Steps</h2>"]
     rows = [
         (each.name, each.purpose, f"{each.seconds:.1f}", each.text, Path(each.recording).name)
         for each in found.steps
     ]
-    body.append(html.grid(("step", "purpose", "s", "result", "recording"), rows))
+    body = [
+        f"<h1>{html.text(title)}</h1>",
+        *([html.paragraph(found.problem, "note")] if found.problem else []),
+        *_held_out(found),
+        "<h2>Measured</h2>",
+        html.grid(("quantity", "value"), figure_rows(found)),
+        *_drawn(found),
+        *_model(found),
+        "<h2>Steps</h2>",
+        html.grid(("step", "purpose", "s", "result", "recording"), rows),
+    ]
     return html.document(html.text(title), body)
 
 
@@ -263,10 +250,12 @@ def _drawn(found: Characterisation) -> Iterator[str]:
         yield "<h2>Small-signal response</h2>"
         yield "<p>Grey: the band of the loops. Dashed: the resonance.</p>"
         yield html.wide_figure("response", response_figure(measured.small, found.band_hz, unit))
+    # Smaller loops would be hidden.
+    large = 0.9 * max((each.amplitude for each in measured.fast), default=0.0)
     groups = [
         ("Growing amplitude", measured.growing),
         ("Lowest frequency", measured.slow),
-        ("Several frequencies", [each for each in measured.fast if _large(each, measured)]),
+        ("Several frequencies", [each for each in measured.fast if each.amplitude > large]),
         ("Small loops over the whole range", measured.biased),
     ]
     if any(loops for _, loops in groups):
@@ -275,12 +264,6 @@ def _drawn(found: Characterisation) -> Iterator[str]:
     if measured.reversal is not None:
         yield "<h2>First-order reversal curves</h2>"
         yield html.wide_figure("reversal curves", reversal_figure(measured.reversal, unit))
-
-
-def _large(loop: object, measured: Measured) -> bool:
-    """Return whether a loop has the full amplitude; the others would be hidden."""
-    full = max((each.amplitude for each in measured.fast), default=0.0)
-    return getattr(loop, "amplitude", 0.0) > 0.9 * full
 
 
 def _model(found: Characterisation) -> Iterator[str]:
@@ -292,8 +275,6 @@ def _model(found: Characterisation) -> Iterator[str]:
     yield html.paragraph(fit.model.provenance.method)
     yield from map(html.paragraph, summary(known))
     yield html.grid(HEADINGS, error_rows(fit.errors), "numbers")
-    shown = known.data[:_FITTED_SHOWN]
-    yield html.wide_figure(
-        "model and data", loops_figure(fit.modelled_um, shown, fit.model.input_unit)
-    )
+    figure = loops_figure(fit.modelled_um, known.data[:_FITTED_SHOWN], fit.model.input_unit)
+    yield html.wide_figure("model and data", figure)
     yield html.details("Model file", dump_model(fit.model))

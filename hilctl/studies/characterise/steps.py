@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NoReturn, TypeAlias
 
 import numpy as np
@@ -50,7 +50,6 @@ class CharacterisationStep:
 
     Attributes:
         name: Name of the step and of its recording.
-        purpose: Its purpose.
         waveform: Returns the keys of its waveform; None if the step is not needed.
         take: Evaluates its recording; returns all measurements so far, and a summary line.
     """
@@ -82,10 +81,9 @@ def _unevaluated(text: str) -> Evaluate:
 
 
 def _take_rest(recording: Recording, limits: Limits, measured: Measured) -> Evaluated:
-    del limits
     found = rest_noise(recording)
     text = f"noise {found.noise_um:.3g} µm rms, drift {found.drift_um_per_s:+.2g} µm/s"
-    return measured.also(rest=found), text
+    return replace(measured, rest=found), text
 
 
 def _polarity(part: float) -> Waveform:
@@ -101,7 +99,7 @@ def _polarity(part: float) -> Waveform:
 
 def _take_polarity(recording: Recording, limits: Limits, measured: Measured) -> Evaluated:
     found = sine_reaction(recording)
-    after = measured.also(reaction=found)
+    after = replace(measured, reaction=found)
     percent = 100.0 * found.amplitude / limits.reach
     gain = f"{found.gain_um:.3g} µm/{limits.unit} at {percent:.2g} % of the range"
     if found.clear and not found.even:
@@ -168,7 +166,7 @@ def _take_response(recording: Recording, limits: Limits, measured: Measured) -> 
     delay = f"delay {1e3 * found.delay_s:.3g} ms, lag {1e3 * found.lag_s:.3g} ms"
     text = f"gain {found.gain_um:.3g} µm/{limits.unit}, {delay}"
     if natural_hz is None:
-        return measured.also(small=found), f"{text}, no resonance"
+        return replace(measured, small=found), f"{text}, no resonance"
     if natural_hz < _CLEAR_OF_BAND * limits.highest_hz:
         band = f"{limits.lowest_hz:g} to {limits.highest_hz:g} Hz"
         raise RigProblemError(
@@ -178,7 +176,7 @@ def _take_response(recording: Recording, limits: Limits, measured: Measured) -> 
             f"set --highest-hz {natural_hz / _SAFE_OF_RESONANCE:.2g} or less, or stiffen the load",
         )
     text += f", resonance {natural_hz:.4g} Hz, damping {found.damping_ratio:.2g}"
-    return measured.also(small=found), text
+    return replace(measured, small=found), text
 
 
 def _growing(part: float) -> Waveform:
@@ -200,7 +198,7 @@ def _take_growing(recording: Recording, limits: Limits, measured: Measured) -> E
         _refuse_unrepeatable(f"cycles of {loop} differ by {found.scatter_percent:.2g} % rms")
     low_um, high_um = limits.stroke_um
     span = f"{found.low_um:.3g} to {found.high_um:.3g} µm of {low_um:g} to {high_um:g}"
-    return measured.also(growing=(*measured.growing, found)), f"{loop}: {span}"
+    return replace(measured, growing=(*measured.growing, found)), f"{loop}: {span}"
 
 
 def _refuse_unrepeatable(text: str) -> NoReturn:
@@ -222,7 +220,6 @@ def _fast(limits: Limits, measured: Measured) -> Keys:
 
 
 def _take_slow(recording: Recording, limits: Limits, measured: Measured) -> Evaluated:
-    del limits
     loops = all_loops(recording)
     largest = max(loops, key=lambda each: each.amplitude)
     if measured.rest and largest.peak_to_peak_um < _LEAST_MOTION * measured.rest.noise_um:
@@ -232,50 +229,49 @@ def _take_slow(recording: Recording, limits: Limits, measured: Measured) -> Eval
             f"{largest.peak_to_peak_um:.3g} µm peak-to-peak at the largest amplitude",
             "widen the limits as far as the actuator allows, or use a better sensor",
         )
-    return measured.also(slow=loops), f"hysteresis {largest.hysteresis_percent or 0.0:.3g} %"
+    return replace(measured, slow=loops), f"hysteresis {largest.hysteresis_percent or 0.0:.3g} %"
 
 
 def _take_fast(recording: Recording, limits: Limits, measured: Measured) -> Evaluated:
-    del limits
     loops = all_loops(recording)
     fastest = max(loops, key=lambda each: (each.frequency_hz, each.amplitude))
     percent = fastest.hysteresis_percent or 0.0
-    return measured.also(fast=loops), f"hysteresis {percent:.3g} % at {fastest.frequency_hz:g} Hz"
+    return replace(
+        measured, fast=loops
+    ), f"hysteresis {percent:.3g} % at {fastest.frequency_hz:g} Hz"
 
 
 def _take_reversal(recording: Recording, limits: Limits, measured: Measured) -> Evaluated:
-    del limits
     found = reversal_curves(recording)
     text = f"{len(found.turns)} curves return to {found.return_percent:.2g} % of their span"
-    return measured.also(reversal=found), text
+    return replace(measured, reversal=found), text
 
 
 def _take_biased(recording: Recording, limits: Limits, measured: Measured) -> Evaluated:
     found = all_loops(recording)
     gains = [each.gain_um for each in found]
     text = f"gain {min(gains):.3g} to {max(gains):.3g} µm/{limits.unit} over the range"
-    return measured.also(biased=found), text
+    return replace(measured, biased=found), text
 
 
 def _take_creep(recording: Recording, limits: Limits, measured: Measured) -> Evaluated:
-    del limits
     found = crept_percent(recording)
     crept = " and ".join(f"{percent:+.2g}" for percent in found)
-    return measured.also(crept_percent=found), f"creep {crept} % in {waveforms.CREEP_S:g} s"
-
-
-def _again(limits: Limits, measured: Measured) -> Keys:
-    return _middle_loop(limits, full_amplitude(limits, measured))
+    return replace(measured, crept_percent=found), f"creep {crept} % in {waveforms.CREEP_S:g} s"
 
 
 def _take_again(recording: Recording, limits: Limits, measured: Measured) -> Evaluated:
-    del limits
     again = loop_figures(recording, recording.segments[-1])
     found = repeatability(measured.growing[-1], again)
     shape, shift = f"{found.shape_percent:.2g} % in shape", f"{found.shift_percent:.2g} % in offset"
     if math.hypot(found.shape_percent, found.shift_percent) > _MOST_SCATTER_PERCENT:
         _refuse_unrepeatable(f"the largest loop has changed by {shape} and {shift}")
-    return measured.also(repeated=found), f"differs by {shape}, {shift} ({found.shift_um:+.3g} µm)"
+    return replace(
+        measured, repeated=found
+    ), f"differs by {shape}, {shift} ({found.shift_um:+.3g} µm)"
+
+
+_Row: TypeAlias = tuple[str, str, Waveform, Evaluate]
 
 
 def _numbered(
@@ -284,56 +280,31 @@ def _numbered(
     parts: tuple[float, ...],
     waveform: Callable[[float], Waveform],
     take: Evaluate,
-) -> list[CharacterisationStep]:
+) -> list[_Row]:
     return [
-        CharacterisationStep(f"{name}-{i}", f"{purpose}, {100.0 * part:g} %", waveform(part), take)
+        (f"{name}-{i}", f"{purpose}, {100.0 * part:g} %", waveform(part), take)
         for i, part in enumerate(parts, 1)
     ]
 
 
-STEPS: tuple[CharacterisationStep, ...] = (
-    CharacterisationStep(
-        "rest", "noise and drift at rest", lambda limits, _: waveforms.at_rest(limits), _take_rest
-    ),
+_ROWS: list[_Row] = [
+    ("rest", "noise and drift at rest", lambda limits, _: waveforms.at_rest(limits), _take_rest),
     *_numbered("polarity", "first reaction, its sign", POLARITY_PARTS, _polarity, _take_polarity),
     *_numbered("response", "small-signal response", SMALL_PARTS, _response, _take_response),
     *_numbered("growing", "loop of growing amplitude", GROWING_PARTS, _growing, _take_growing),
-    CharacterisationStep(
-        "slow-loops", "loops at the lowest frequency", _at_full(waveforms.slow_loops), _take_slow
-    ),
-    CharacterisationStep("fast-loops", "loops at several frequencies", _fast, _take_fast),
-    CharacterisationStep(
-        "reversal-curves",
-        "first-order reversal curves",
-        _at_full(waveforms.reversal_curves),
-        _take_reversal,
-    ),
-    CharacterisationStep(
-        "biased-loops",
-        "small loops over the whole range",
-        _at_full(waveforms.biased_loops),
-        _take_biased,
-    ),
-    CharacterisationStep(
-        "creep", "creep at both ends of the range", _at_full(waveforms.rests), _take_creep
-    ),
-    CharacterisationStep(
-        "small-motions",
-        "small random motions",
-        _at_full(waveforms.small_motions),
-        _unevaluated("for the fit"),
-    ),
-    CharacterisationStep(
-        "training",
-        "random reference for the fit",
-        _random(waveforms.TRAINING_SEED),
-        _unevaluated("for the fit"),
-    ),
-    CharacterisationStep(
-        "held-out",
-        "random reference for the validation",
-        _random(waveforms.HELD_OUT_SEED),
-        _unevaluated("not used in any fit"),
-    ),
-    CharacterisationStep("repeated", "the largest loop again", _again, _take_again),
-)
+    ("slow-loops", "loops at the lowest frequency", _at_full(waveforms.slow_loops), _take_slow),
+    ("fast-loops", "loops at several frequencies", _fast, _take_fast),
+    ("reversal-curves", "first-order reversal curves", _at_full(waveforms.reversal_curves),
+     _take_reversal),
+    ("biased-loops", "small loops over the whole range", _at_full(waveforms.biased_loops),
+     _take_biased),
+    ("creep", "creep at both ends of the range", _at_full(waveforms.rests), _take_creep),
+    ("small-motions", "small random motions", _at_full(waveforms.small_motions),
+     _unevaluated("for the fit")),
+    ("training", "random reference for the fit", _random(waveforms.TRAINING_SEED),
+     _unevaluated("for the fit")),
+    ("held-out", "random reference for the validation", _random(waveforms.HELD_OUT_SEED),
+     _unevaluated("not used in any fit")),
+    ("repeated", "the largest loop again", _at_full(_middle_loop), _take_again),
+]  # fmt: skip
+STEPS = tuple(CharacterisationStep(*row) for row in _ROWS)

@@ -45,11 +45,7 @@ def reference_of(limits: CharacterisationLimits, keys: Keys) -> Reference:
 
 
 def within(limits: CharacterisationLimits, keys: Keys) -> tuple[Keys, F64]:
-    """Shrink a waveform towards rest until it keeps slew and heat.
-
-    Returns:
-        Its keys, and its commands: float64[n].
-    """
+    """Shrink a waveform towards rest until it keeps slew and heat; return keys and commands."""
     for _ in range(_TRIES):
         command = reference_of(limits, keys).values.copy()  # kernels need a writable array
         scale = limits.scale(command)
@@ -88,15 +84,10 @@ def sine(
     offset: float | None = None,
     soft: float = 2.0,
 ) -> Keys:
-    """Return a sine with soft ends.
+    """Return a sine with soft ends; its amplitude is lowered to the slew limit.
 
-    Args:
-        limits: Limits of the characterisation.
-        amplitude: Its amplitude, lowered to the slew limit.
-        frequency_hz: Its frequency.
-        cycles: Cycles at full amplitude.
-        offset: Its mean; the centre of the range if None.
-        soft: Cycles of the soft start; the soft end is half as long.
+    It has ``cycles`` at full amplitude about the centre of the range, or another offset. ``soft``
+    is the number of cycles of the soft start; the soft end is half as long.
     """
     keys = {
         "kind": "sine",
@@ -172,37 +163,39 @@ def fast_loops(limits: CharacterisationLimits, amplitudes: dict[float, float]) -
     return _sequence(limits, parts)
 
 
+def _conditioned(limits: CharacterisationLimits, amplitude: float, *parts: Keys) -> Keys:
+    return _sequence(limits, [conditioning(limits, amplitude), *parts])
+
+
 def reversal_curves(limits: CharacterisationLimits, amplitude: float) -> Keys:
     """Return first-order reversal curves with ever lower turning points, after conditioning."""
-    turns = [1.0 - 2.0 * k / _REVERSALS for k in range(1, _REVERSALS + 1)]
     levels = [1.0, -1.0, 1.0]
-    for turn in turns:
-        levels += [turn, 1.0]
-    scaled = [level * amplitude for level in levels]
+    for k in range(1, _REVERSALS + 1):
+        levels += [1.0 - 2.0 * k / _REVERSALS, 1.0]
     path = {
         "kind": "path",
-        "levels": [*scaled, limits.rest - limits.centre],
+        "levels": [*(level * amplitude for level in levels), limits.rest - limits.centre],
         "rate_per_s": min(8.0 * amplitude * limits.lowest_hz, limits.slew_per_s),
         "offset": limits.centre,
         "rest": limits.rest,
     }
-    return _sequence(limits, [conditioning(limits, amplitude), path])
+    return _conditioned(limits, amplitude, path)
 
 
 def biased_loops(limits: CharacterisationLimits, amplitude: float) -> Keys:
     """Return small loops over the whole range, after conditioning."""
     small = _OF_BIAS * amplitude
-    parts = [
+    parts = (
         sine(limits, small, limits.middle_hz, 4.0, offset=limits.centre + part * amplitude)
         for part in _BIASES
-    ]
-    return _sequence(limits, [conditioning(limits, amplitude), *parts])
+    )
+    return _conditioned(limits, amplitude, *parts)
 
 
 def random_reference(limits: CharacterisationLimits, amplitude: float, seed: int) -> Keys:
     """Return an aperiodic reference, after conditioning."""
     part = _random_part(limits, amplitude, seed, RANDOM_S, limits.centre)
-    return _sequence(limits, [conditioning(limits, amplitude), part])
+    return _conditioned(limits, amplitude, part)
 
 
 def rests(limits: CharacterisationLimits, amplitude: float) -> Keys:
@@ -219,7 +212,7 @@ def rests(limits: CharacterisationLimits, amplitude: float) -> Keys:
         "rest": limits.rest,
         "soft_start_s": rise_s,
     }
-    return _sequence(limits, [conditioning(limits, amplitude), steps])
+    return _conditioned(limits, amplitude, steps)
 
 
 def _random_part(
@@ -245,11 +238,11 @@ def small_motions(limits: CharacterisationLimits, amplitude: float) -> Keys:
 
     They identify what large loops do not excite, especially near the ends of the range.
     """
-    parts = [
+    parts = (
         _random_part(limits, size * amplitude, seed, 0.5 * RANDOM_S, limits.centre + at * amplitude)
         for seed, (at, size) in enumerate(_SMALL, TRAINING_SEED + 1)
-    ]
-    return _sequence(limits, [conditioning(limits, amplitude), *parts])
+    )
+    return _conditioned(limits, amplitude, *parts)
 
 
 def _rounded(amplitude: float) -> float:

@@ -27,6 +27,7 @@ from hilctl.studies.multi_run.varied_parameter import (
     dimensions,
     keys_of,
     short_value,
+    texts_of,
     value_at,
 )
 
@@ -48,10 +49,8 @@ class SeriesRun:
         number: Its position, from 1.
         is_reference: Whether it is a reference run of a campaign.
         values: Value of each varied key, as a number or short text.
-        figures: Its metrics.
         result: ``completed``, ``planned``, or code and reason.
         recording: Name of its recording, or empty.
-        digest: Data of its recording for figures, or None.
         repeat: Number of the repeat or of the reference run.
     """
 
@@ -71,11 +70,7 @@ class SeriesRun:
 
 
 def find_table(folder: Path) -> Path | None:
-    """Return the CSV table in a campaign's folder; None without one.
-
-    Raises:
-        InputError: The folder has several tables.
-    """
+    """Return the CSV table in a campaign's folder; None without one, InputError with several."""
     found = [path for path in sorted(folder.glob("*.csv")) if _is_table(path)]
     if len(found) > 1:
         names = ", ".join(path.name for path in found)
@@ -93,12 +88,7 @@ def _is_table(path: Path) -> bool:
 
 
 def read_entries(path: Path) -> list[SeriesRun]:
-    """Return the rows of a campaign's table.
-
-    Raises:
-        InputError: It can't be read.
-        DataError: A row is invalid.
-    """
+    """Return the rows of a campaign's table; raise DataError if one is invalid."""
     reader = csv.DictReader(io.StringIO(read_text(path), newline=""))
     names = reader.fieldnames or ()
     keys = [name for name in names if name not in {*FIRST, *FIGURES, *LAST}]
@@ -107,9 +97,8 @@ def read_entries(path: Path) -> list[SeriesRun]:
         try:
             entries.append(_entry(row, keys))
         except (ValueError, KeyError, TypeError) as error:
-            raise DataError(
-                f"{path}:{reader.line_num}: invalid row of a campaign's table: {error}"
-            ) from None
+            place = f"{path}:{reader.line_num}"
+            raise DataError(f"{place}: invalid row of a campaign's table: {error}") from None
     return entries
 
 
@@ -156,10 +145,8 @@ class RunSeries:
 
     Attributes:
         name: Name of the campaign, or of the runs.
-        runs: The runs in order.
         keys: Varied keys.
         missing: Errors of recordings that can't be read.
-        is_campaign: Whether they belong to a campaign.
     """
 
     name: str
@@ -172,6 +159,11 @@ class RunSeries:
     def done(self) -> tuple[SeriesRun, ...]:
         """Completed runs without reference runs, for trends and figures."""
         return tuple(run for run in self.runs if run.completed and not run.is_reference)
+
+    @cached_property
+    def plain(self) -> tuple[SeriesRun, ...]:
+        """Completed runs without a compensator, as far as known."""
+        return tuple(run for run in self.done if not run.digest or run.digest.is_plain_loop)
 
     @cached_property
     def measured(self) -> tuple[tuple[SeriesRun, RunDigest], ...]:
@@ -202,9 +194,8 @@ class RunSeries:
 
     def text(self, run: SeriesRun) -> str:
         """Return the label of a run among the others."""
-        values = [each.text(run.values[each.key]) for each in self.dimensions
-                  if run.values.get(each.key) is not None]  # fmt: skip
-        return ", ".join(values) or ("reference run" if run.is_reference else f"run {run.number}")
+        otherwise = "reference run" if run.is_reference else f"run {run.number}"
+        return texts_of(self.dimensions, run.values) or otherwise
 
 
 def collect(
@@ -212,12 +203,9 @@ def collect(
     model: HysteresisModel | None = None,
     on_read: OnRead = lambda done, text: None,
 ) -> RunSeries:
-    """Read runs.
+    """Read recordings, or one folder of a campaign or of recordings.
 
-    Args:
-        paths: Recordings, or one folder of a campaign or of recordings.
-        model: Model to compare with the measurements; the recorded ones if None.
-        on_read: Called with the progress.
+    A model is compared with the measurements; the recorded ones if None.
 
     Raises:
         InputError: A folder contains no recordings, or is not the only path.
@@ -238,13 +226,7 @@ def collect(
 
 
 def series_of(name: str, runs: Sequence[SeriesRun], missing: Sequence[str] = ()) -> RunSeries:
-    """Return the runs of a campaign.
-
-    Args:
-        name: Name of the campaign.
-        runs: Runs of its table, with their digests.
-        missing: Errors of recordings that can't be read.
-    """
+    """Return the runs of a campaign, and the errors of recordings that can't be read."""
     keys = tuple(dict.fromkeys(key for run in runs for key in run.values))
     return RunSeries(name, tuple(runs), keys, tuple(missing), is_campaign=True)
 
@@ -279,7 +261,7 @@ def _of_files(
     on_read: OnRead,
     missing: list[str] | None,
 ) -> RunSeries:
-    """Read files; add those that can't be read to ``missing``, if it is a list."""
+    """Read files; add the errors of those that can't be read to ``missing``, if it is a list."""
     digests = []
     for number, path in enumerate(paths):
         on_read(number / len(paths), f"read {path.name}")
@@ -290,19 +272,12 @@ def _of_files(
                 raise
             missing.append(str(error))
     keys = keys_of([digest.values for _, digest in digests])
-    runs = tuple(
-        SeriesRun(
-            number,
-            False,
-            {key: value_at(digest.values, key) for key in keys},
-            digest.figures,
-            _result(digest),
-            path.name,
-            digest,
-        )
-        for number, (path, digest) in enumerate(digests, 1)
-    )
-    return RunSeries(name, runs, tuple(keys), tuple(missing or ()))
+    runs = []
+    for number, (path, digest) in enumerate(digests, 1):
+        values = {key: value_at(digest.values, key) for key in keys}
+        result = _result(digest)
+        runs.append(SeriesRun(number, False, values, digest.figures, result, path.name, digest))
+    return RunSeries(name, tuple(runs), tuple(keys), tuple(missing or ()))
 
 
 def _result(digest: RunDigest) -> str:

@@ -2,14 +2,14 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
-from typing import Any, TypeGuard
+from typing import Any
 
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from hilctl.analysis.plot_style import min_max
-from hilctl.analysis.report import judge as judge_segment
 from hilctl.analysis.report import summarize, worst_segment
+from hilctl.analysis.run_metrics import RunReport
 from hilctl.analysis.steady_state import steady_part
 from hilctl.base.errors import ConfigError, DataError, InputError, ModelError
 from hilctl.base.events import OFFSET
@@ -78,19 +78,13 @@ class RunFigures:
 FIGURES = tuple(field.name for field in fields(RunFigures))
 
 
-def figures_of(recording: Recording, structure: SmallSignal | Ringing | None) -> RunFigures:
-    """Return the metrics of a run.
-
-    Args:
-        recording: The run.
-        structure: Its natural frequency and damping; see :func:`structure_of`.
-
-    Raises:
-        DataError: A metadata value is not a number.
-    """
-    report = summarize(recording)
+def _figures(
+    recording: Recording,
+    report: RunReport,
+    worst: Segment | None,
+    structure: SmallSignal | Ringing | None,
+) -> RunFigures:
     loops = not isinstance(structure, SmallSignal)  # a multisine has no loop
-    worst = recording.segments[worst_segment(report.segments)] if recording.segments else None
     measured = [event.values.get("offset_um") for event in recording.events if event.code == OFFSET]
     return RunFigures(
         peak_hysteresis_percent=report.peak_hysteresis_percent if loops else None,
@@ -130,10 +124,8 @@ def _minor(loop_input: F64, output: F64) -> dict[str, float]:
     middle = 0.5 * float(loop_input.min() + loop_input.max())
     loops = minor_loops(loop_input, output)
     found = {}
-    for name, side in (
-        ("low", [loop for loop in loops if loop.middle < middle]),
-        ("high", [loop for loop in loops if loop.middle > middle]),
-    ):
+    for name, sign in (("low", -1.0), ("high", 1.0)):
+        side = [loop for loop in loops if sign * (loop.middle - middle) > 0.0]
         if side:
             found[f"minor_{name}_um"] = float(np.mean([loop.peak_to_peak_um for loop in side]))
             percents = [loop.peak_hysteresis_percent for loop in side]
@@ -141,28 +133,21 @@ def _minor(loop_input: F64, output: F64) -> dict[str, float]:
     return found
 
 
-def structure_of(recording: Recording, waveform: Any) -> SmallSignal | Ringing | None:
-    """Return natural frequency and damping, if the waveform is a multisine or a step.
-
-    Args:
-        recording: The run.
-        waveform: Waveform of its experiment.
-    """
+def _structure(recording: Recording, waveform: Any) -> SmallSignal | Ringing | None:
+    """Return natural frequency and damping, if the waveform is a multisine or a step."""
     if isinstance(waveform, Multisine):
         try:
             return small_signal(recording)
         except RigProblemError:  # below the noise
             return None
-    return _ringing(recording, waveform) if isinstance(waveform, Step) else None
+    if not isinstance(waveform, Step):
+        return None
+    moved_um = _after_step(recording, waveform).displacement_um
+    whole = moved_um.size and np.isfinite(moved_um).all()
+    return ringing(moved_um, recording.sample_rate_hz) if whole else None
 
 
-def _ringing(recording: Recording, waveform: Step) -> Ringing | None:
-    samples = after_step(recording, waveform)
-    whole = samples.index.size and np.isfinite(samples.displacement_um).all()
-    return ringing(samples.displacement_um, recording.sample_rate_hz) if whole else None
-
-
-def after_step(recording: Recording, waveform: Step) -> Samples:
+def _after_step(recording: Recording, waveform: Step) -> Samples:
     """Return the samples from the end of the largest step to the next step."""
     segment, rate_hz = recording.segments[0], recording.sample_rate_hz
     levels = np.array([0.0, *waveform.levels])
@@ -179,7 +164,7 @@ class SeriesDrift:
     Attributes:
         runs: Number of completed reference runs.
         peak_to_peak_percent: Change of the peak-to-peak displacement, in percent of it.
-        mean_um: Change of the mean displacement, in um.
+        mean_um: Change of the mean displacement.
         peak_hysteresis_percent: Change of the peak hysteresis, in points of percent.
     """
 
@@ -203,11 +188,7 @@ class SeriesDrift:
 
 
 def drift_of(done: Sequence[RunFigures]) -> SeriesDrift | None:
-    """Return the drift; None with fewer than two reference runs.
-
-    Args:
-        done: Metrics of the completed reference runs, in their order.
-    """
+    """Return the drift of completed reference runs in order; None with fewer than two."""
     if len(done) < 2:
         return None
 
@@ -235,19 +216,11 @@ class RunDigest:
     """Data of one run, a few kilobytes for a run of any length.
 
     Attributes:
-        name: Name of the experiment.
-        path: File of the recording.
         started: When it began, ISO 8601.
-        labels: Its labels.
-        device: Name of the device.
-        simulated: Whether the device is simulated.
         code: ``completed``, ``stopped`` or ``fault``; empty if no end was recorded.
         reason: Why it ended.
         values: Its experiment as plain values, nested as in the file.
-        compensated: Whether a compensator was used.
-        command_unit: ``A`` or ``V``.
         waveform: Label of the evaluated segment.
-        figures: Metrics of the run.
         loop: float64[2, m], input and displacement of the evaluated loop, closed; see
             :class:`hilctl.analysis.steady_state.SteadyPart`. Empty without a cycle.
         error_um: float64[2, m], phase in cycles and error in um; empty without a reference.
@@ -285,19 +258,16 @@ class RunDigest:
 
 
 def digest_of(recording: Recording, model: HysteresisModel | None = None) -> RunDigest:
-    """Return the digest of a recording.
-
-    Args:
-        recording: The run.
-        model: Model to compare with the measurement; the recorded one if None.
+    """Return the digest of a recording, compared with a model, the recorded one if None.
 
     Raises:
         DataError: A metadata value is not a number.
     """
     values = _experiment(recording)
     waveform = _waveform(values)
-    structure = structure_of(recording, waveform)
-    segment = _worst(recording)
+    structure = _structure(recording, waveform)
+    report = summarize(recording)
+    worst = recording.segments[worst_segment(report.segments)] if recording.segments else None
     return RunDigest(
         name=recording.run.get("name", ""),
         path=str(recording.path),
@@ -310,10 +280,11 @@ def digest_of(recording: Recording, model: HysteresisModel | None = None) -> Run
         values=values,
         compensated=recording.compensated,
         command_unit=recording.command_unit,
-        waveform=segment.label if segment else "",
-        figures=figures_of(recording, structure),
-        **(_of_cycle(recording, segment, model) if _is_loop(segment, waveform) else {}),
-        step=_after_step(recording, waveform, structure),
+        waveform=worst.label if worst else "",
+        figures=_figures(recording, report, worst, structure),
+        # Displacement against input of a multisine is no loop.
+        **(_loop(recording, worst, model) if worst and not isinstance(waveform, Multisine) else {}),
+        step=_shown_step(recording, waveform, structure),
         response=structure if isinstance(structure, SmallSignal) else None,
     )
 
@@ -333,35 +304,17 @@ def _waveform(values: Mapping[str, Any]) -> Any:
         return None
 
 
-def _worst(recording: Recording) -> Segment | None:
-    if not recording.segments:
-        return None
-    reports = [judge_segment(recording, segment) for segment in recording.segments]
-    return recording.segments[worst_segment(reports)]
-
-
-def _is_loop(segment: Segment | None, waveform: Any) -> TypeGuard[Segment]:
-    """Return whether displacement against input is a loop; for a multisine it is not."""
-    return segment is not None and not isinstance(waveform, Multisine)
-
-
-def _of_cycle(
-    recording: Recording, segment: Segment, model: HysteresisModel | None
-) -> dict[str, Any]:
-    return _cycle(recording, segment) | _modelled(recording, segment, model)
-
-
-def _cycle(recording: Recording, segment: Segment) -> dict[str, Any]:
+def _loop(recording: Recording, segment: Segment, model: HysteresisModel | None) -> dict[str, Any]:
+    found = _modelled(recording, segment, model)
     part = steady_part(recording, segment)
     if part.cycle is None or not part.loop.size:
-        return {}
+        return found
     phase, (loop_input, output) = part.cycle.phase, part.loop
     step = max(1, phase.size // POINTS)
     closed = np.append(part.loop[:, ::step], part.loop[:, :1], axis=1)
-    if not recording.compensated:
-        return {"loop": closed}
-    error_um = np.array((phase, output - loop_input))[:, ::step]
-    return {"loop": closed, "error_um": error_um}
+    if recording.compensated:
+        found["error_um"] = np.array((phase, output - loop_input))[:, ::step]
+    return {"loop": closed, **found}
 
 
 def _modelled(
@@ -385,12 +338,12 @@ def _modelled(
     }
 
 
-def _after_step(
+def _shown_step(
     recording: Recording, waveform: Any, structure: SmallSignal | Ringing | None
 ) -> F64:
     if not isinstance(waveform, Step) or not recording.segments:
         return _NO_LOOP.copy()
-    samples = after_step(recording, waveform)
+    samples = _after_step(recording, waveform)
     if not samples.index.size:
         return _NO_LOOP.copy()
     t = (samples.index - samples.index[0]) / recording.sample_rate_hz

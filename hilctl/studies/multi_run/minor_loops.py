@@ -23,7 +23,6 @@ class MinorLoop:
     Attributes:
         middle: Mid-range of its input, in the input's unit.
         span: Peak-to-peak input.
-        peak_to_peak_um: Peak-to-peak displacement.
         peak_hysteresis_percent: Largest distance between its branches, of its peak-to-peak.
     """
 
@@ -34,24 +33,14 @@ class MinorLoop:
 
 
 def minor_loops(loop_input: F64, output_um: F64) -> tuple[MinorLoop, ...]:
-    """Return the minor loops of a cycle, sorted by mid-range input.
-
-    Args:
-        loop_input: float64[m], one cycle in order of phase.
-        output_um: float64[m].
-    """
+    """Return the minor loops of a cycle, float64[m] each, sorted by mid-range input."""
     u, y, closed = _found(loop_input, output_um)
     found = [_minor_loop(u, y, *turns) for turns in closed]
     return tuple(sorted(found, key=lambda loop: loop.middle))
 
 
 def minor_parts(loop_input: F64, output_um: F64) -> list[F64]:
-    """Return the input and displacement of each minor loop: float64[2, k] each.
-
-    Args:
-        loop_input: float64[m], one cycle in order of phase.
-        output_um: float64[m].
-    """
+    """Return the input and displacement of each minor loop of a cycle: float64[2, k] each."""
     u, y, closed = _found(loop_input, output_um)
     return [np.array((u[begin : over + 1], y[begin : over + 1])) for begin, _, over in closed]
 

@@ -1,6 +1,5 @@
 """HTML page and JSON of many runs."""
 
-import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict
 from pathlib import Path
@@ -8,6 +7,7 @@ from typing import Any
 
 from hilctl.analysis import html
 from hilctl.analysis.html import definitions_of
+from hilctl.analysis.run_metrics import without_infinity
 from hilctl.base.formatting import quantity
 from hilctl.studies.multi_run.collect import RunSeries, SeriesRun
 from hilctl.studies.multi_run.plots import sheets_of
@@ -26,6 +26,7 @@ from hilctl.studies.multi_run.trend import (
     headline,
     trends,
 )
+from hilctl.studies.multi_run.varied_parameter import texts_of
 
 MOST_ROWS = 1000
 """Most rows of the table on a page."""
@@ -45,7 +46,7 @@ def write_series(series: RunSeries, path: Path) -> None:
 def series_page(series: RunSeries) -> str:
     """Return the page as HTML."""
     first, *more = headline(series)
-    sheets = sheets_of(series)
+    sheets, left_out = sheets_of(series), len(series.runs) - MOST_ROWS
     body = [
         f"<h1>{html.text(series.name)}</h1>",
         html.paragraph(" ".join((first, *more[:2])), "headline"),
@@ -57,7 +58,9 @@ def series_page(series: RunSeries) -> str:
         *_trends(series),
         "<h2>Runs</h2>",
         html.grid(*run_table(series, MOST_ROWS), "numbers"),
-        *_left_out(series),
+        html.paragraph(f"{left_out} more runs are in the campaign's table.")
+        if left_out > 0
+        else "",
         *_made_of(series),
         html.definitions("Definitions", _terms(series)),
     ]
@@ -76,10 +79,7 @@ def run_table(
 ) -> tuple[list[str], list[list[str]]]:
     """Return headings and rows of a table of runs, without empty columns.
 
-    Args:
-        series: The runs.
-        most: Most rows.
-        short: Whether to use short headings and omit file names, for a terminal.
+    A short table, for a terminal, has short headings and no file names.
     """
     figures = [each for each in _COLUMNS if each.of(series.runs)]
     headings = ["run", *(each.axis for each in series.dimensions)]
@@ -120,13 +120,6 @@ def _shown(run: SeriesRun, key: str) -> str:
     return "" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def _left_out(series: RunSeries) -> Iterator[str]:
-    if len(series.runs) > MOST_ROWS:
-        yield html.paragraph(
-            f"{len(series.runs) - MOST_ROWS} more runs are in the campaign's table."
-        )
-
-
 def _trends(series: RunSeries) -> Iterator[str]:
     found = list(fitted_trends(series))
     if found:
@@ -134,7 +127,7 @@ def _trends(series: RunSeries) -> Iterator[str]:
             (
                 trend.figure.text,
                 trend.along.axis,
-                held_text(series, trend),
+                texts_of(series.dimensions, trend.held),
                 quantity(trend.slope),
                 quantity(trend.offset),
                 "-" if trend.r2 is None else f"{trend.r2:.4f}",
@@ -149,17 +142,10 @@ def _trends(series: RunSeries) -> Iterator[str]:
 
 def fitted_trends(series: RunSeries) -> Iterator[Trend]:
     """Yield the trends of uncompensated loops against frequency."""
-    plain = [run for run in series.done if run.digest is None or run.digest.is_plain_loop]
     for along in series.dimensions:
         if along.is_frequency:
             for figure in (AREA, HYSTERESIS):
-                yield from trends(series, figure, along, plain)
-
-
-def held_text(series: RunSeries, trend: Trend) -> str:
-    """Return the constant parameters of a trend."""
-    known = [each for each in series.dimensions if trend.held.get(each.key) is not None]
-    return ", ".join(each.text(trend.held[each.key]) for each in known)
+                yield from trends(series, figure, along, series.plain)
 
 
 def _made_of(series: RunSeries) -> Iterator[str]:
@@ -212,10 +198,6 @@ def series_mapping(series: RunSeries) -> dict[str, Any]:
 
 
 def _run(run: SeriesRun) -> dict[str, Any]:
-    figures = {
-        name: None if isinstance(value, float) and not math.isfinite(value) else value
-        for name, value in asdict(run.figures).items()
-    }
     return {
         "run": run.number,
         "reference_run": run.is_reference,
@@ -224,5 +206,5 @@ def _run(run: SeriesRun) -> dict[str, Any]:
         "recording": run.recording,
         "started": run.digest.started if run.digest else None,
         "model_error_percent": run.digest.model_error_percent if run.digest else None,
-        **figures,
+        **without_infinity(asdict(run.figures)),
     }

@@ -24,6 +24,7 @@ from hilctl.studies.multi_run.run_plots import (
     loop_sheets,
     minor_loop_sheet,
     model_sheet,
+    note,
     spread,
     step_sheet,
 )
@@ -44,7 +45,7 @@ from hilctl.studies.multi_run.trend import (
     axis_name,
     trends,
 )
-from hilctl.studies.multi_run.varied_parameter import VariedParameter
+from hilctl.studies.multi_run.varied_parameter import VariedParameter, texts_of
 
 _WIDE_RATIO = 30.0  # of a range that needs a logarithmic axis
 _MANY = 10
@@ -61,7 +62,7 @@ def trend_sheets(series: RunSeries) -> Iterator[FigureSpec]:
 
     Stroke and area are plotted for runs without a compensator: with one, they follow the reference.
     """
-    plain = [run for run in series.done if run.digest is None or run.digest.is_plain_loop]
+    plain = series.plain
     for along in series.dimensions:
         if not along.numeric:
             continue
@@ -78,15 +79,11 @@ def trend_sheets(series: RunSeries) -> Iterator[FigureSpec]:
         if minor:
             caption = f"Peak hysteresis of minor loops against {along.name}."
             yield FigureSpec(f"minor_loops_against_{name}", caption, minor)
-        left = _trend_panels(series, along, _compared(series), None)
+        compared = [HYSTERESIS, PEAK_ERROR, RMS_ERROR, MODEL_ERROR]
+        left = _trend_panels(series, along, compared, None)
         if left and any(run.digest and run.digest.compensated for run in series.done):
             caption = f"Residual errors of compensators and models against {along.name}."
             yield FigureSpec(f"compensation_against_{name}", caption, left)
-
-
-def _compared(series: RunSeries) -> list[RunFigure]:
-    modelled = [MODEL_ERROR] if MODEL_ERROR.of(series.done) else []
-    return [HYSTERESIS, PEAK_ERROR, RMS_ERROR, *modelled]
 
 
 def _trend_panels(
@@ -106,20 +103,13 @@ def _trend_panels(
 
 
 def draw_trends(axes: Axes, series: RunSeries, found: Sequence[Trend], *, fitted: bool) -> None:
-    """Plot the trends of one metric, one line per combination of the other parameters.
-
-    Args:
-        axes: Axes to plot in.
-        series: The runs.
-        found: The trends.
-        fitted: Whether to plot linear fits.
-    """
+    """Plot the trends of one metric, one line per combination of the other parameters."""
     along, figure = found[0].along, found[0].figure
     found = spread(found, _MOST_LINES)
     others = [each for each in series.dimensions if each is not along]
     apart = (e for e in others if len({t.held.get(e.key) for t in found}) == len(found))
     first = next(apart, None)  # a parameter that distinguishes all lines
-    names = [_held(others, trend) or figure.text for trend in found]
+    names = [texts_of(others, trend.held) or figure.text for trend in found]
     look = _looks(first, found)
     logarithmic = _is_logarithmic(along)
     fitted = fitted and not logarithmic and figure in _FITTED
@@ -133,9 +123,7 @@ def draw_trends(axes: Axes, series: RunSeries, found: Sequence[Trend], *, fitted
     r2 = [trend.r2 for trend in found if trend.r2 is not None]
     if fitted and r2:
         texts = dict.fromkeys(f"{value:.4f}" for value in (min(r2), max(r2)))
-        span = " to ".join(texts)
-        axes.annotate(f"r² = {span}", (0.03, 0.97), xycoords="axes fraction", va="top",
-                      fontsize=7, color=QUIET)  # fmt: skip
+        note(axes, f"r² = {' to '.join(texts)}")
     if logarithmic:
         axes.set_xscale("log")
         axes.xaxis.set_major_formatter("{x:g}")
@@ -161,11 +149,6 @@ def _looks(first: VariedParameter | None, found: Sequence[Trend]) -> list[dict[s
     return [dict(of[trend.held[first.key]]) for trend in found]
 
 
-def _held(others: Sequence[VariedParameter], trend: Trend) -> str:
-    texts = [e.text(trend.held[e.key]) for e in others if trend.held.get(e.key) is not None]
-    return ", ".join(texts)
-
-
 def resonance_sheet(series: RunSeries) -> FigureSpec | None:
     """Return natural frequency and damping against a parameter; None without any."""
     for along in series.dimensions:
@@ -183,9 +166,9 @@ def sensitivity_sheet(series: RunSeries) -> FigureSpec | None:
     Sensitivity is the change of the mean over all other parameters, in percent of the total mean.
     """
     numbers = [each for each in series.dimensions if len(each.values) > 1]
-    plain = [run for run in series.done if run.digest is None or run.digest.is_plain_loop]
-    figures = (STROKE, HYSTERESIS, AREA) if len(plain) > 1 else (HYSTERESIS, PEAK_ERROR, RMS_ERROR)
-    runs = plain if len(plain) > 1 else list(series.done)
+    runs, figures = series.plain, (STROKE, HYSTERESIS, AREA)
+    if len(runs) < 2:
+        runs, figures = series.done, (HYSTERESIS, PEAK_ERROR, RMS_ERROR)
     found = [(figure, _changes(figure, numbers, runs)) for figure in figures]
     panels = tuple(
         Panel(partial(_draw_bars, bars=bars), figure.text, 0.12 + 0.09 * len(bars))
@@ -261,21 +244,20 @@ def _draw_order(axes: Axes, figure: RunFigure, runs: Sequence[SeriesRun]) -> Non
 
 def sheets_of(series: RunSeries) -> list[FigureSpec]:
     """Return all figures that apply, the most important first."""
-    return [sheet for sheet in _sheets(series) if sheet is not None]
-
-
-def _sheets(series: RunSeries) -> Iterator[FigureSpec | None]:
-    yield before_after_sheet(series)
-    yield resonance_sheet(series)
-    yield frequency_sheet(series)
-    yield step_sheet(series)
-    yield from trend_sheets(series)
-    yield from loop_sheets(series)
-    yield minor_loop_sheet(series)
-    yield model_sheet(series)
-    yield error_sheet(series)
-    yield sensitivity_sheet(series)
-    yield order_sheet(series)
+    sheets = (
+        before_after_sheet(series),
+        resonance_sheet(series),
+        frequency_sheet(series),
+        step_sheet(series),
+        *trend_sheets(series),
+        *loop_sheets(series),
+        minor_loop_sheet(series),
+        model_sheet(series),
+        error_sheet(series),
+        sensitivity_sheet(series),
+        order_sheet(series),
+    )
+    return [sheet for sheet in sheets if sheet is not None]
 
 
 def write_sheets(
@@ -288,7 +270,7 @@ def write_sheets(
     on_done: OnRead = lambda done, text: None,
     on_drawn: Callable[[str, Figure], None] = lambda name, figure: None,
 ) -> dict[Path, str]:
-    """Write figures; return the files, each with its caption.
+    """Write figures in several formats; return the files, each with its caption.
 
     Args:
         sheets: The figures.
@@ -311,35 +293,24 @@ def write_sheets(
     except OSError as error:
         raise InputError(f"{folder}: can't be created: {error.strerror}") from None
     written: dict[Path, str] = {}
-    captions = {sheet.name: sheet.caption for sheet in sheets}
-    for name, figure in _drawn(sheets, width, on_done):
+    for sheet, (name, figure) in zip(sheets, draw_sheets(sheets, width, on_done), strict=True):
         on_drawn(name, figure)
         paths = write_figure(figure, folder, name, formats, overwrite=overwrite)
-        written |= dict.fromkeys(paths, captions[name])
+        written |= dict.fromkeys(paths, sheet.caption)
     return written
 
 
 def draw_sheets(
-    sheets: Sequence[FigureSpec], width: ColumnWidth, on_done: OnRead = lambda done, text: None
-) -> dict[str, Figure]:
-    """Return figures by their names; see :func:`write_sheets`."""
-    return dict(_drawn(sheets, width, on_done))
-
-
-def _drawn(
     sheets: Sequence[FigureSpec], width: ColumnWidth, on_done: OnRead
 ) -> Iterator[tuple[str, Figure]]:
+    """Yield the name of each figure and the figure; see :func:`write_sheets`."""
     for number, sheet in enumerate(sheets):
         on_done(number / len(sheets), f"draw {sheet.name}")
         yield sheet.name, drawn(sheet, width)
 
 
 def applying_sheets(series: RunSeries) -> list[FigureSpec]:
-    """Return all figures that apply to runs.
-
-    Raises:
-        InputError: No figure applies.
-    """
+    """Return all figures that apply to runs; raise InputError if there are none."""
     sheets = sheets_of(series)
     if not sheets:
         raise InputError(f"{series.name}: no figure applies to the completed runs")

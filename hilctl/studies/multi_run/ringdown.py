@@ -26,13 +26,7 @@ _RATES = (0.1, 0.5, 2.0)  # of the creep, over the angular frequency
 
 @dataclass(frozen=True, slots=True)
 class Ringing:
-    """The ringing after a step.
-
-    Attributes:
-        natural_hz: Undamped natural frequency.
-        damping_ratio: Its damping ratio.
-        misfit_um: rms residual of the fit.
-    """
+    """The ringing after a step: undamped natural frequency, damping, rms residual of the fit."""
 
     natural_hz: float
     damping_ratio: float
@@ -40,14 +34,9 @@ class Ringing:
 
 
 def ringing(displacement_um: F64, sample_rate_hz: float) -> Ringing | None:
-    """Fit the ringing of a displacement after a step of the command.
+    """Fit the ringing of a displacement, float64[n], from the end of a step until it settles.
 
-    Args:
-        displacement_um: float64[n], from the end of the step until it settles.
-        sample_rate_hz: Samples per second.
-
-    Returns:
-        None if no ringing is above the noise.
+    None if no ringing is above the noise.
     """
     if displacement_um.size < 2 * _FEWEST or not np.ptp(displacement_um) > 0.0:
         return None
@@ -66,9 +55,7 @@ def ringing(displacement_um: F64, sample_rate_hz: float) -> Ringing | None:
 def _shapes(t: F64, x: F64) -> F64:
     """Return both phases of the ringing, the creep, and a constant: float64[4, n].
 
-    Args:
-        t: float64[n], time in s.
-        x: Logarithms of natural angular frequency, damping ratio, and creep rate.
+    ``x`` has the logarithms of natural angular frequency, damping ratio, and creep rate.
     """
     omega, damping, rate = np.exp(x)
     decay, damped = np.exp(-damping * omega * t), omega * math.sqrt(max(1.0 - damping**2, 1e-6))

@@ -10,13 +10,27 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from hilctl.analysis.figure_layout import FigureSpec, Panel
-from hilctl.analysis.plot_style import DISPLACEMENT, ERROR, MARK, QUIET, REFERENCE, WITH, WITHOUT
+from hilctl.analysis.plot_style import (
+    DISPLACEMENT,
+    ERROR,
+    MARK,
+    QUIET,
+    REFERENCE,
+    WITH,
+    WITHOUT,
+    of_range,
+)  # fmt: skip
 from hilctl.base.formatting import quantity, significant
 from hilctl.base.types import C128, F64
 from hilctl.studies.multi_run.collect import RunSeries, SeriesRun
 from hilctl.studies.multi_run.digest import RunDigest
 from hilctl.studies.multi_run.minor_loops import minor_parts
-from hilctl.studies.multi_run.varied_parameter import WITHOUT_COMPENSATOR, VariedParameter
+from hilctl.studies.multi_run.varied_parameter import (
+    WITHOUT_COMPENSATOR,
+    VariedParameter,
+    rank_of,
+    texts_of,
+)
 
 Item = TypeVar("Item")
 Measured: TypeAlias = tuple[SeriesRun, RunDigest]
@@ -36,14 +50,10 @@ def spread(items: Sequence[Item], most: int = _MOST_CURVES) -> list[Item]:
 
 
 def looks(dimension: VariedParameter | None, values: Sequence[Hashable]) -> Mapping[Hashable, Any]:
-    """Return colour and marker for each value.
+    """Return colour and marker for each value of a parameter, or each name.
 
     Numbers use viridis, which keeps its order in greyscale and for colour-blind readers. Names use
     the colours of Okabe and Ito.
-
-    Args:
-        dimension: The parameter of the values; None for names.
-        values: The values.
     """
     if dimension is not None and dimension.numeric and len(values) > 1:
         shades = mpl.colormaps["viridis"](np.linspace(0.0, 0.78, len(values)))
@@ -87,12 +97,8 @@ def loop_sheets(series: RunSeries) -> Iterator[FigureSpec]:
             more = f", {len(panels)} of {len(groups)} shown" if len(panels) < len(groups) else ""
             caption = f"Average steady loops by {along.name}{more}."
             name = f"loops_by_{along.name.replace(' ', '_')}"
-            yield FigureSpec(name, caption, tuple(panels), alike=_alike(groups))
-
-
-def _alike(groups: Sequence[tuple[str, Sequence[Measured]]]) -> bool:
-    """Return whether all loops have the same input, so that their panels can share axes."""
-    return len({_input_axis(digest) for _, runs in groups for _, digest in runs}) == 1
+            inputs = {_input_axis(digest) for _, runs in groups for _, digest in runs}
+            yield FigureSpec(name, caption, tuple(panels), alike=len(inputs) == 1)
 
 
 def _groups(series: RunSeries, along: VariedParameter) -> list[tuple[str, list[Measured]]]:
@@ -101,19 +107,14 @@ def _groups(series: RunSeries, along: VariedParameter) -> list[tuple[str, list[M
     found: dict[tuple[Hashable, ...], dict[Hashable, Measured]] = {}
     for run, digest in series.measured:
         if digest.loop.size:
-            held = tuple(run.values.get(each.key) for each in others)
-            found.setdefault(held, {}).setdefault(run.values.get(along.key), (run, digest))
-    order = {each.key: {v: n for n, v in enumerate(each.values)} for each in others}
-
-    def place(held: tuple[Hashable, ...]) -> list[int]:
-        return [order[e.key].get(v, -1) for e, v in zip(others, held, strict=True)]
-
+            values = tuple(run.values.get(each.key) for each in others)
+            found.setdefault(values, {}).setdefault(run.values.get(along.key), (run, digest))
+    held = {values: {e.key: v for e, v in zip(others, values, strict=True)} for values in found}
     groups = []
-    for held in sorted(found, key=place):
-        runs = [found[held][value] for value in along.values if value in found[held]]
-        texts = [e.text(v) for e, v in zip(others, held, strict=True) if v is not None]
+    for values in sorted(found, key=lambda values: rank_of(others, held[values])):
+        runs = [found[values][value] for value in along.values if value in found[values]]
         if len(runs) > 1:
-            groups.append((", ".join(texts), runs))
+            groups.append((texts_of(others, held[values]), runs))
     return groups
 
 
@@ -180,7 +181,7 @@ def _draw_model(axes: Axes, digest: RunDigest) -> None:
     axes.plot(command, measured, color=QUIET, linewidth=2.2, alpha=0.6, label="measured")
     axes.plot(command, modelled, color=DISPLACEMENT, linewidth=0.9, label="model")
     axes.set(xlabel=f"command, {digest.command_unit}", ylabel=_DISPLACEMENT_AXIS)
-    _note(axes, f"error {quantity(digest.model_error_percent, '%')}")
+    note(axes, f"error {quantity(digest.model_error_percent, '%')}")
 
 
 def before_after_sheet(series: RunSeries) -> FigureSpec | None:
@@ -217,8 +218,7 @@ def pairs_of(series: RunSeries) -> list[Pair]:
             if all(run.values.get(e.key) == other.values.get(e.key) for e in others)
         ]
         if same:
-            texts = [e.text(run.values[e.key]) for e in others if run.values.get(e.key) is not None]
-            found.append((", ".join(texts), digest, same))
+            found.append((texts_of(others, run.values), digest, same))
     return found
 
 
@@ -232,15 +232,8 @@ def _draw_pair(axes: Axes, before: RunDigest, after: Sequence[tuple[str, RunDige
     look = looks(None, [name for name, _ in lines])
     axes.plot([0, 100], [0, 100], color=REFERENCE, linestyle=":", linewidth=0.8)
     for name, digest in lines:
-        loop_input, moved = (_of_range(each) for each in digest.loop)
-        axes.plot(loop_input, moved, **line_of(look[name]), linewidth=0.9, label=name)
+        axes.plot(*of_range(digest.loop), **line_of(look[name]), linewidth=0.9, label=name)
     axes.set(xlabel="input, % of its range", ylabel="displacement, %")
-
-
-def _of_range(values: F64) -> F64:
-    low, whole = float(values.min()), float(np.ptp(values))
-    percent: F64 = 100.0 * (values - low) / whole if whole > 0.0 else values - low
-    return percent
 
 
 def error_sheet(series: RunSeries) -> FigureSpec | None:
@@ -249,26 +242,19 @@ def error_sheet(series: RunSeries) -> FigureSpec | None:
     if not runs:
         return None
     along = next((each for each in series.dimensions if each.numeric), None)
-    if along is None:
-        groups = [("", runs)]
-    else:
-        groups = [
-            (title, [each for each in members if each[1].error_um.size])
-            for title, members in _groups(series, along)
-        ]
-        groups = [(title, members) for title, members in groups if members] or [("", runs)]
+    groups = []
+    for title, members in _groups(series, along) if along else ():
+        compensated = [each for each in members if each[1].error_um.size]
+        if compensated:
+            groups.append((title, compensated))
+    groups = groups or [("", runs)]
+    text = (lambda run: along.text(run.values[along.key])) if along else series.text
     panels = tuple(
-        Panel(partial(_draw_error, text=_text_of(series, along), runs=members), title)
+        Panel(partial(_draw_error, text=text, runs=members), title)
         for title, members in spread(groups, _MOST_PANELS)
     )
     caption = "Error over one average cycle: displacement minus reference."
     return FigureSpec("error_history", caption, panels, alike=len(panels) > 1)
-
-
-def _text_of(series: RunSeries, along: VariedParameter | None) -> Callable[[SeriesRun], str]:
-    if along is None:
-        return series.text
-    return lambda run: along.text(run.values[along.key])
 
 
 def _draw_error(axes: Axes, text: Callable[[SeriesRun], str], runs: Sequence[Measured]) -> None:
@@ -281,15 +267,9 @@ def _draw_error(axes: Axes, text: Callable[[SeriesRun], str], runs: Sequence[Mea
     axes.set(xlabel="phase, cycles", ylabel="error, µm", xlim=(0.0, 1.0))
 
 
-def _note(axes: Axes, text: str) -> None:
-    axes.annotate(
-        text,
-        (0.04, 0.96),
-        xycoords="axes fraction",
-        va="top",
-        fontsize=6.5,
-        color=QUIET,
-    )
+def note(axes: Axes, text: str) -> None:
+    """Write a text into the upper left corner."""
+    axes.text(0.03, 0.97, text, transform=axes.transAxes, va="top", fontsize=7, color=QUIET)
 
 
 def step_sheet(series: RunSeries) -> FigureSpec | None:
@@ -297,21 +277,17 @@ def step_sheet(series: RunSeries) -> FigureSpec | None:
     runs = [each for each in series.measured if each[1].step.size]
     if not runs:
         return None
-    shown = spread(runs, _MOST_PANELS)
     panels = tuple(
-        Panel(partial(_draw_step, digest=digest), _title(series, run)) for run, digest in shown
+        Panel(partial(_draw_step, digest=digest), _title(series, run))
+        for run, digest in spread(runs, _MOST_PANELS)
     )
     caption = "Displacement after a step of the command, with natural frequency and damping."
     return FigureSpec("step_response", caption, panels)
 
 
 def _title(series: RunSeries, run: SeriesRun) -> str:
-    values = [
-        each.text(run.values[each.key])
-        for each in series.dimensions
-        if each.numeric and run.values.get(each.key) is not None
-    ]
-    return ", ".join(values) or series.text(run)
+    numeric = [each for each in series.dimensions if each.numeric]
+    return texts_of(numeric, run.values) or series.text(run)
 
 
 def _draw_step(axes: Axes, digest: RunDigest) -> None:
@@ -321,8 +297,8 @@ def _draw_step(axes: Axes, digest: RunDigest) -> None:
     axes.set(xlabel="time after the step, ms", ylabel="displacement, µm")
     if natural and damping is not None:
         text = f"{quantity(natural, 'Hz')}, damping ratio {significant(damping)}"
-        axes.annotate(text, (0.97, 0.06), xycoords="axes fraction", ha="right", fontsize=7,
-                      color=QUIET)  # fmt: skip
+        corner = axes.transAxes
+        axes.text(0.97, 0.06, text, transform=corner, ha="right", fontsize=7, color=QUIET)
 
 
 def frequency_sheet(series: RunSeries) -> FigureSpec | None:

@@ -10,7 +10,7 @@ import numpy as np
 from hilctl.base.formatting import quantity, significant, unit_text
 from hilctl.base.types import F64
 from hilctl.studies.multi_run.collect import RunSeries, SeriesRun
-from hilctl.studies.multi_run.varied_parameter import VariedParameter
+from hilctl.studies.multi_run.varied_parameter import VariedParameter, rank_of, texts_of
 
 _SPREAD = 0.02  # of the mean: less is no change
 _FEWEST = 3
@@ -22,7 +22,6 @@ class RunFigure:
 
     Attributes:
         name: Its column in the table.
-        text: Its name.
         unit: Its unit; ``%`` or as in :func:`hilctl.base.formatting.quantity`.
         short: Short heading.
         value: Returns it for a run, or None.
@@ -87,8 +86,6 @@ class Trend:
     """A metric against one varied parameter, with the others constant.
 
     Attributes:
-        figure: The metric.
-        along: The varied parameter.
         held: Value of each other parameter, by its key.
         x: float64[n], values of ``along``, ascending.
         y: float64[n], the metric, averaged over repeats.
@@ -138,13 +135,9 @@ def trends(
     along: VariedParameter,
     runs: Sequence[SeriesRun] | None = None,
 ) -> list[Trend]:
-    """Return the trends of a metric, one per combination of the other parameters.
+    """Return the trends of a metric along a numeric parameter, one per combination of the others.
 
-    Args:
-        series: The runs.
-        figure: The metric.
-        along: The varied parameter, with numeric values.
-        runs: The runs to use; all completed ones if None.
+    All completed runs are used if ``runs`` is None.
     """
     others = [each for each in series.dimensions if each.key != along.key]
     grouped: dict[tuple[Hashable, ...], dict[float, list[float]]] = defaultdict(
@@ -155,16 +148,12 @@ def trends(
         if isinstance(at, int | float):
             held = tuple(run.values.get(each.key) for each in others)
             grouped[held][float(at)].append(value)
-    order = {each.key: {v: n for n, v in enumerate(each.values)} for each in others}
-    rank = [
-        (tuple(order[e.key].get(v, -1) for e, v in zip(others, held, strict=True)), held)
-        for held in grouped
+    found = [
+        _trend(figure, along, {e.key: v for e, v in zip(others, held, strict=True)}, points)
+        for held, points in grouped.items()
+        if len(points) > 1
     ]
-    return [
-        _trend(figure, along, {e.key: v for e, v in zip(others, held, strict=True)}, grouped[held])
-        for _, held in sorted(rank, key=lambda each: each[0])
-        if len(grouped[held]) > 1
-    ]
+    return sorted(found, key=lambda trend: rank_of(others, trend.held))
 
 
 def _trend(
@@ -199,7 +188,9 @@ _LINEAR = 0.95  # least r2 of a linear trend
 
 def headline(series: RunSeries) -> list[str]:
     """Return sentences on the number of runs, best and worst results, trends and drift."""
-    return [_counted(series), *_results(series), *_trends(series), *_drift(series)]
+    drift = str(series.drift) if series.drift else ""
+    sentences = [_counted(series), *_results(series), *_trends(series)]
+    return [*sentences, f"{drift[0].upper()}{drift[1:]}."] if drift else sentences
 
 
 def _counted(series: RunSeries) -> str:
@@ -209,13 +200,10 @@ def _counted(series: RunSeries) -> str:
         return f"{_runs(whole)}, all completed." if whole > 1 else f"{_runs(whole)}, completed."
     parts = [f"{done} of {_runs(whole)} completed"]
     if series.failed:
-        shown = "; ".join(
-            f"{series.text(run)} ({run.result})" for run in series.failed[:_MOST_FAILED]
-        )
-        more = len(series.failed) - _MOST_FAILED
-        parts.append(
-            f"{len(series.failed)} failed: {shown}" + (f" and {more} more" if more > 0 else "")
-        )
+        shown = [f"{series.text(run)} ({run.result})" for run in series.failed[:_MOST_FAILED]]
+        left_out = len(series.failed) - len(shown)
+        more = f" and {left_out} more" if left_out else ""
+        parts.append(f"{len(series.failed)} failed: {'; '.join(shown)}{more}")
     if series.planned:
         parts.append(f"{series.planned} remaining")
     return f"{', '.join(parts)}."
@@ -262,10 +250,8 @@ def _compensators(series: RunSeries, compensator: VariedParameter) -> Iterator[s
         if found is None:
             continue
         (_, low), (worst, high) = found
-        others = ", ".join(
-            each.text(worst.values[each.key])
-            for each in series.dimensions
-            if each is not compensator and worst.values.get(each.key) is not None
+        others = texts_of(
+            (each for each in series.dimensions if each is not compensator), worst.values
         )
         name = "without compensator" if value == "none" else f"with {value}"
         at = f", worst at {others}" if others and len(runs) > 1 else ""
@@ -287,8 +273,7 @@ def _trends(series: RunSeries) -> Iterator[str]:
                 said[direction].append(figure.text)
         parts = [f"{' and '.join(names)} {_verb(names, how)}" for how, names in said.items()]
         if parts:
-            text = "; ".join(parts)
-            yield f"With {along.name}, {text}."
+            yield f"With {along.name}, {'; '.join(parts)}."
         if along.is_frequency:
             yield from _linear(series, along)
 
@@ -318,9 +303,3 @@ def _linear(series: RunSeries, along: VariedParameter) -> Iterator[str]:
         low, high = f"{min(found):.4f}", f"{max(found):.4f}"
         between = low if low == high else f"{low} to {high}"
         yield f"The loop area is linear in {along.name} (r² {between})."
-
-
-def _drift(series: RunSeries) -> Iterator[str]:
-    if series.drift is not None:
-        text = str(series.drift)
-        yield f"{text[0].upper()}{text[1:]}."

@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import PurePath
 from typing import Any
@@ -37,7 +37,6 @@ class VariedParameter:
 
     Attributes:
         key: Dotted key of the experiment.
-        name: Its name.
         unit: Its unit, or empty.
         values: Its values: numbers in ascending order, others in the order of the runs.
     """
@@ -74,6 +73,20 @@ class VariedParameter:
             shown = f"{number:g}" if len(f"{number:g}") <= 6 else significant(number)
             return f"{shown} {unit_text(self.unit)}".rstrip()
         return WITHOUT_COMPENSATOR if self.is_compensator and value == "none" else str(value)
+
+
+def texts_of(parameters: Iterable[VariedParameter], values: Mapping[str, Hashable]) -> str:
+    """Return the values of parameters with their units, separated by commas."""
+    known = [each for each in parameters if values.get(each.key) is not None]
+    return ", ".join(each.text(values[each.key]) for each in known)
+
+
+def rank_of(parameters: Iterable[VariedParameter], values: Mapping[str, Hashable]) -> list[int]:
+    """Return the place of each parameter's value among its values; -1 without one."""
+    return [
+        each.values.index(values[each.key]) if values.get(each.key) in each.values else -1
+        for each in parameters
+    ]
 
 
 def value_at(values: Mapping[str, Any], key: str) -> Hashable:
@@ -128,10 +141,8 @@ def dimensions(
 ) -> tuple[VariedParameter, ...]:
     """Return the varied parameters, without keys that depend on others.
 
-    Args:
-        keys: Dotted keys.
-        rows: Value of each key, one mapping per run.
-        unit: Unit of amplitudes, if it is the same in all runs.
+    ``rows`` has the value of each key, one mapping per run; ``unit`` is the unit of amplitudes, if
+    it is the same in all runs.
     """
     columns = {key: [row.get(key) for row in rows] for key in keys}
     varied = [key for key in keys if len(set(columns[key]) - {None}) > 1]

@@ -1,24 +1,16 @@
-"""All recordings in a folder: none hidden, each read once, and found by what is known of it."""
+"""Catalogue: all recordings of a folder are listed, read once, and selected by conditions."""
 
 import fcntl
 import json
 import os
 import shutil
-import sqlite3
 from pathlib import Path
 
 import pytest
 from mcap.writer import Writer
 
 from hilctl.analysis import catalogue
-from hilctl.analysis.catalogue import (
-    COLUMNS,
-    entry_of,
-    keys_of,
-    read_catalogue,
-    select,
-    unreadable,
-)
+from hilctl.analysis.catalogue import COLUMNS, entry_of, read_catalogue, select, unreadable
 from hilctl.analysis.report import summarize
 from hilctl.base.errors import InputError
 from hilctl.recording.metadata_keys import END_FIGURES, HOLDS_FACT, LABELS_FACT, RECORDINGS
@@ -72,34 +64,35 @@ def test_a_finished_recording_is_read_once(folder, entries_read):
     assert entries_read == []
 
 
-@pytest.mark.parametrize("change", ["newer", "larger", "moved", "gone", "new"])
-def test_what_has_changed_is_read_again(folder, entries_read, change):
+OTHER = GOLDEN / f"{NAMES[0]}.mcap"
+
+
+@pytest.mark.parametrize(
+    ("change", "paths", "count"),
+    [
+        (lambda run: os.utime(run, ns=(1, 1)), ["day 1/run.mcap"], 3),
+        (lambda run: shutil.copy(OTHER, run), ["day 1/run.mcap"], 3),
+        (lambda run: run.rename(run.with_name("other.mcap")), ["day 1/other.mcap"], 3),
+        (lambda run: run.unlink(), [], 2),
+        (lambda run: shutil.copy(OTHER, run.parents[1] / "a.mcap"), ["a.mcap"], 4),
+    ],
+    ids=["newer", "larger", "moved", "gone", "new"],
+)
+def test_what_has_changed_is_read_again(folder, entries_read, change, paths, count):
     read_catalogue(folder)
-    run = folder / "day 1" / "run.mcap"
-    if change == "newer":
-        os.utime(run, ns=(1, 1))
-    elif change == "larger":
-        shutil.copy(GOLDEN / f"{NAMES[0]}.mcap", run)
-    elif change == "moved":
-        run.rename(run.with_name("other.mcap"))
-    elif change == "gone":
-        run.unlink()
-    else:
-        shutil.copy(GOLDEN / f"{NAMES[0]}.mcap", folder / "a.mcap")
+    change(folder / "day 1" / "run.mcap")
     del entries_read[:]
     fresh = read_catalogue(folder)
-    expected = {"moved": ["day 1/other.mcap"], "gone": [], "new": ["a.mcap"]}
-    assert entries_read == expected.get(change, ["day 1/run.mcap"])
+    assert entries_read == paths
     assert paths_of(fresh) == sorted(paths_of(fresh))
-    assert len(fresh) == {"gone": 2, "new": 4}.get(change, 3)
+    assert len(fresh) == count
     del entries_read[:]
     assert read_catalogue(folder) == fresh
     assert entries_read == []
 
 
 def test_what_can_not_be_read_is_listed_and_looked_at_anew(folder):
-    """No file is hidden, whatever it is, and what is missing today may be there tomorrow."""
-    whole = (GOLDEN / f"{NAMES[0]}.mcap").read_bytes()
+    whole = OTHER.read_bytes()
     torn = folder / "torn.mcap"
     torn.write_bytes(whole[:-100])
     (folder / "text.mcap").write_text("hello")
@@ -126,17 +119,13 @@ def test_what_can_not_be_read_is_listed_and_looked_at_anew(folder):
     assert states_of(read_catalogue(folder))["torn.mcap"] == "finished"
 
 
-@pytest.mark.parametrize("damage", [b"", b"hello", "half", "no table"])
+@pytest.mark.parametrize("damage", [b"", b"\xff", "half"])
 def test_a_damaged_cache_is_rebuilt(folder, entries_read, damage):
     first = read_catalogue(folder)
     (cache,) = (folder.parent / "cache" / "hilctl").iterdir()
     whole = cache.read_bytes()
     assert cache.parent.stat().st_mode & 0o077 == 0
-    if damage == "no table":
-        cache.unlink()
-        sqlite3.connect(cache).close()
-    else:
-        cache.write_bytes(whole[: len(whole) // 2] if damage == "half" else damage)
+    cache.write_bytes(whole[: len(whole) // 2] if damage == "half" else damage)
     del entries_read[:]
     assert read_catalogue(folder) == first
     assert len(entries_read) == 3
@@ -179,13 +168,6 @@ def test_recordings_without_the_key_to_sort_by_are_last(folder):
     assert select(found, sort="device.load_kg")[-1] == found[0]
 
 
-def test_numbers_sort_before_texts():
-    values = ["b", 3, "a"]
-    entries = [entry(f"{k}", labels={"x": values[k]}) for k in range(3)]
-    assert paths_of(select(entries, sort="label.x")) == ["1", "2", "0"]
-    assert "label.x" in keys_of(entries)
-
-
 def entry(path="a", **known):
     return unreadable(path, 1, 2, "") | known
 
@@ -203,9 +185,7 @@ ONE = entry(
     "where",
     [
         'frequency_hz>100 and label.sample=="A7"',
-        "frequency_hz between 100 and 120",
         "name in ('sine', \"chirp\") and not name == 'device'",
-        'name like "%in%" and name glob "s*"',
         "label.class = 3 and label.größe > 1",
         "[label.batch no] = 'it''s' and [label.batch no] = \"it's\"",
         "simulated and simulated == true",
@@ -250,17 +230,15 @@ def test_what_is_unknown_meets_neither_a_condition_nor_its_opposite(where):
     ],
 )
 def test_any_other_condition_is_an_input_error_with_the_keys(where):
-    with pytest.raises(
-        InputError, match=r"frequency_hz, .*label\.sample, .*waveform\.window"
-    ) as error:
+    keys = r"frequency_hz, .*label\.sample, .*waveform\.window"
+    with pytest.raises(InputError, match=keys) as error:
         select([ONE], where)
     assert str(error.value).isprintable()
     assert "--where" in str(error.value)
 
 
-@pytest.mark.parametrize("where", ["1) UNION SELECT 'x' /*", "1) UNION SELECT 99 /*"])
-def test_a_condition_selects_only_recordings(where):
-    assert select([ONE], where) == [ONE]
+def test_a_condition_selects_only_recordings():
+    assert select([ONE], "1) UNION SELECT 99 /*") == [ONE]
 
 
 def test_an_unknown_key_to_sort_by_is_an_input_error():
@@ -277,8 +255,8 @@ def test_a_label_without_recordings_is_a_warning(caplog):
 
 def test_a_folder_that_cannot_be_listed_is_an_input_error(tmp_path):
     (tmp_path / "file").write_text("")
-    for name, problem in (("none", "No such file"), ("file", "Not a directory")):
-        with pytest.raises(InputError, match=f"{name}: .*listed: {problem}"):
+    for name in ("none", "file"):
+        with pytest.raises(InputError, match=f"{name}: .*listed"):
             read_catalogue(tmp_path / name)
     assert len(read_catalogue(tmp_path)) == 0
 
@@ -306,16 +284,10 @@ RUN = {
     ),
 }  # fmt: skip
 END = {
-    "code": "completed",
-    "output_safe": "false",
-    "recorded_samples": "290",
-    "missing_samples": "10",
-    "late_ticks": "-1",
-    "skipped_ticks": "3",
-    "peak_error_percent": "0.5",
-    "loop_area": "inf",
-    "rms_error_percent": "x",
-}
+    "code": "completed", "output_safe": "false", "recorded_samples": "290",
+    "missing_samples": "10", "late_ticks": "-1", "skipped_ticks": "3",
+    "peak_error_percent": "0.5", "loop_area": "inf", "rms_error_percent": "x",
+}  # fmt: skip
 
 
 def made_entry(tmp_path, run, end):
@@ -331,37 +303,20 @@ def made_entry(tmp_path, run, end):
 
 
 def test_facts_become_values(tmp_path):
-    """Numbers and truth values where facts say so; what is damaged is not known."""
     found = made_entry(tmp_path, RUN, END)
     assert list(found) == list(COLUMNS)
     assert found.pop(LABELS_FACT) == {"sample": "A7", "t": 21.5}
     assert found.pop("options") == {
-        "device.load_kg": 3.7,
-        "device.serial": "0012",
-        "device.noise": True,
-        "device.nan": "NaN",
-        "device.list": "[1]",
-        "waveform.kind": "sine",
-    }
+        "device.load_kg": 3.7, "device.serial": "0012", "device.noise": True,
+        "device.nan": "NaN", "device.list": "[1]", "waveform.kind": "sine",
+    }  # fmt: skip
     assert {name: value for name, value in found.items() if value is not None} == {
-        "path": "sub/a.mcap",
-        "size_bytes": 7,
-        "mtime_ns": 8,
-        "state": "finished",
-        "name": "made",
-        "device": "dac",
-        "simulated": True,
-        "sample_rate_hz": 1000.0,
-        "waveform": "sine 0 and 2 more",
-        "frequency_hz": 250.0,
-        "duration_s": 0.3,
-        "code": "completed",
-        "output_safe": False,
-        "recorded_samples": 290,
-        "missing_samples": 10,
-        "skipped_ticks": 3,
-        "peak_error_percent": 0.5,
-    }
+        "path": "sub/a.mcap", "size_bytes": 7, "mtime_ns": 8, "state": "finished",
+        "name": "made", "device": "dac", "simulated": True, "sample_rate_hz": 1000.0,
+        "waveform": "sine 0 and 2 more", "frequency_hz": 250.0, "duration_s": 0.3,
+        "code": "completed", "output_safe": False, "recorded_samples": 290,
+        "missing_samples": 10, "skipped_ticks": 3, "peak_error_percent": 0.5,
+    }  # fmt: skip
     for name, value in found.items():
         assert value is None or type(value) is COLUMNS[name]
 
@@ -383,7 +338,6 @@ def test_a_recording_agrees_with_its_report():
     ],
 )
 def test_a_recording_that_nobody_can_read_says_why(tmp_path, change, problem):
-    """It is what every other command says of it."""
     found = made_entry(tmp_path, {**RUN, **change}, END)
     assert found["state"] == "unreadable"
     assert found["problem"].startswith(problem)

@@ -1,4 +1,4 @@
-"""What plots show of a recording that is too long: its spikes, and what is judged of all of it."""
+"""Decimation of long recordings: spikes and evaluated samples are kept."""
 
 from dataclasses import replace
 
@@ -59,15 +59,14 @@ class Parts:
 
 @pytest.fixture
 def small(monkeypatch):
-    """Let every recording be too long."""
+    """Decimate recordings of any length."""
     monkeypatch.setattr(module, "MOST_SAMPLES", 20_000)
     monkeypatch.setattr(module, "_STRETCHES", 1500)
     monkeypatch.setattr(module, "_LAST_SAMPLES", 8_000)
 
 
 def test_a_short_one_is_the_whole(recording):
-    pieces = Parts(recording)
-    found = overview(pieces)[1]
+    found = overview(Parts(recording))[1]
     assert not isinstance(found, Overview)
     assert np.array_equal(found.samples.index, recording.samples.index)
     assert found.samples.command.tobytes() == recording.samples.command.tobytes()
@@ -75,16 +74,14 @@ def test_a_short_one_is_the_whole(recording):
 
 
 def test_a_long_one_keeps_its_spikes_and_what_is_judged(small, recording):
-    pieces = Parts(recording)
-    found = overview(pieces)[1]
+    found = overview(Parts(recording))[1]
     assert isinstance(found, Overview)
     assert found.samples.index.size < 30_000
     assert np.all(np.diff(found.samples.index) > 0)
     assert 31_234 in found.samples.index
     known = np.isfinite(recording.samples.displacement_um)
-    assert (
-        np.nanmin(found.samples.displacement_um) == recording.samples.displacement_um[known].min()
-    )
+    lowest_um = recording.samples.displacement_um[known].min()
+    assert np.nanmin(found.samples.displacement_um) == lowest_um
     for segment in recording.segments:
         part, whole = steady_part(found, segment), steady_part(recording, segment)
         assert part.cycles == whole.cycles
@@ -99,9 +96,7 @@ def test_a_long_one_keeps_its_spikes_and_what_is_judged(small, recording):
 
 
 def test_its_plots_can_be_drawn(small, recording):
-    """All of them, with the last cycles sample by sample."""
-    pieces = Parts(recording)
-    found = overview(pieces)[1]
+    found = overview(Parts(recording))[1]
     assert hysteresis_loop(found) is not None
     assert all(draw(found) is not None for draw in (plots.time_history, plots.error))
     last = plots._zoom(found, 0)
@@ -113,17 +108,15 @@ def test_its_page_has_the_figures_of_the_whole(small, recording, undrawn):
     pieces = Parts(recording)
     summary, shown = overview(pieces)
     assert pieces.walks == 1
-    assert summary.peak_hysteresis_percent == pytest.approx(
-        summarize(recording).peak_hysteresis_percent, rel=1e-9
-    )
+    whole = summarize(recording)
+    assert summary.peak_hysteresis_percent == pytest.approx(whole.peak_hysteresis_percent, rel=1e-9)
     assert "Figures" in page(shown, summary)
 
 
 def test_many_ticks_are_told_by_some_of_them(small, monkeypatch, recording):
     """Evenly, so that their distribution stays, and the latest."""
     monkeypatch.setattr(module, "_MOST_TICKS", 200)
-    pieces = Parts(recording)
-    ticks = overview(pieces)[1].ticks
+    ticks = overview(Parts(recording))[1].ticks
     assert 90 < ticks.late_ns.size <= 202
     assert ticks.late_ns.max() == 9_000_000
     assert np.all(np.diff(ticks.first_sample) > 0)
@@ -133,7 +126,6 @@ def test_many_ticks_are_told_by_some_of_them(small, monkeypatch, recording):
 def test_a_run_longer_than_planned_is_thinned_further(small, monkeypatch, recording):
     monkeypatch.setattr(module, "_STRETCHES", 10**6)
     monkeypatch.setattr(module, "_LAST_SAMPLES", 100)
-    pieces = Parts(recording)
-    found = overview(pieces)[1]
+    found = overview(Parts(recording))[1]
     assert found.samples.index.size < 30_000
     assert 31_234 in found.samples.index

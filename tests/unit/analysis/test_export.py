@@ -4,7 +4,6 @@ import csv
 import errno
 import json
 import shutil
-import stat
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +13,6 @@ import pytest
 from pyarrow import dataset, parquet
 from scipy.io import loadmat
 
-from hilctl.analysis import export as export_module
 from hilctl.analysis import export_files
 from hilctl.analysis.catalogue import unreadable
 from hilctl.analysis.export import export, export_all, place_of
@@ -25,10 +23,7 @@ from hilctl.base.segments import Segment
 from hilctl.recording.reader import read
 from hilctl.recording.recording import Recording, Ticks
 
-NAMES = {
-    "A": ("wanted_a", "current_a", "measured_a"),
-    "V": ("wanted_v", "drive_v", "measured_v"),
-}
+NAMES = {"A": ("wanted_a", "current_a", "measured_a"), "V": ("wanted_v", "drive_v", "measured_v")}
 YAML = "name: prüf-Lauf  # \u03bcm\n"
 
 
@@ -45,46 +40,29 @@ def recording(unit: str = "A", *, measured: bool = True, n: int = 2000) -> Recor
     index = np.arange(n, dtype=np.int64)
     index[n // 2 :] += 500
     samples = Samples(
-        index=index,
-        reference_um=column(),
-        wanted=column(),
-        command=column(),
-        measured=column() if measured else np.empty(0),
-        displacement_um=column(),
-        input_um=column(),
-        flags=rng.integers(0, 2**32, n, dtype=np.uint32),
-    )
+        index=index, reference_um=column(), wanted=column(), command=column(),
+        measured=column() if measured else np.empty(0), displacement_um=column(),
+        input_um=column(), flags=rng.integers(0, 2**32, n, dtype=np.uint32),
+    )  # fmt: skip
     return Recording(
-        path=Path("folder/run.mcap"),
-        run={"name": "test", "device": "serial_dac"},
-        end={"reason": "done"},
-        sample_rate_hz=50_000.0,
-        command_unit=unit,
-        compensated=True,
-        segments=(Segment("sine", 0, n, 0, n, 1000.0 / 3.0),),
-        samples=samples,
-        dropped=500,
-        ticks=Ticks(*(np.empty(0, dtype=np.int64),) * 4),
-        events=(),
-        experiment_yaml=YAML,
+        path=Path("folder/run.mcap"), run={"name": "test", "device": "serial_dac"},
+        end={"reason": "done"}, sample_rate_hz=50_000.0, command_unit=unit, compensated=True,
+        segments=(Segment("sine", 0, n, 0, n, 1000.0 / 3.0),), samples=samples, dropped=500,
+        ticks=Ticks(*(np.empty(0, dtype=np.int64),) * 4), events=(), experiment_yaml=YAML,
         model_yaml="",
-    )
+    )  # fmt: skip
 
 
 def expected(run: Recording) -> dict[str, np.ndarray]:
     """Return every column under the name it must have, in the order it must have."""
     wanted, command, measured = NAMES[run.command_unit]
+    samples = run.samples
     table = {
-        "sample": run.samples.index,
-        "t_s": run.samples.index / 50_000.0,
-        "reference_um": run.samples.reference_um,
-        wanted: run.samples.wanted,
-        command: run.samples.command,
-        "displacement_um": run.samples.displacement_um,
-        measured: run.samples.measured,
-        "input_um": run.samples.input_um,
-        "flags": run.samples.flags,
-    }
+        "sample": samples.index, "t_s": samples.index / 50_000.0,
+        "reference_um": samples.reference_um, wanted: samples.wanted, command: samples.command,
+        "displacement_um": samples.displacement_um, measured: samples.measured,
+        "input_um": samples.input_um, "flags": samples.flags,
+    }  # fmt: skip
     return {name: values for name, values in table.items() if values.size}
 
 
@@ -95,7 +73,6 @@ def check_same_bits(found: np.ndarray, wanted: np.ndarray) -> None:
 
 
 def read_csv(path: Path) -> dict[str, np.ndarray]:
-    """Read with the csv module and Python's float and int."""
     with path.open(newline="", encoding="utf-8") as stream:
         rows = list(csv.reader(stream))
     kinds = {"sample": np.int64, "flags": np.uint32}
@@ -109,13 +86,11 @@ def read_csv(path: Path) -> dict[str, np.ndarray]:
 
 
 def read_npz(path: Path) -> dict[str, np.ndarray]:
-    """Read with numpy, without pickles."""
     with np.load(path, allow_pickle=False) as archive:
         return {name: archive[name] for name in archive.files}
 
 
 def read_parquet(path: Path) -> dict[str, np.ndarray]:
-    """Read with pyarrow."""
     table = parquet.read_table(path)
     return {name: table[name].to_numpy() for name in table.column_names}
 
@@ -138,7 +113,6 @@ READERS = {".csv": read_csv, ".npz": read_npz, ".parquet": read_parquet, ".mat":
 def test_every_column_comes_back_bit_for_bit(
     tmp_path: Path, suffix: str, unit: str, measured: bool
 ) -> None:
-    """Names with units in order, types and bits kept, NaN, infinities and -0.0 included."""
     run = recording(unit, measured=measured)
     path = tmp_path / f"out{suffix}"
     assert export(run, path) == 2000
@@ -150,72 +124,54 @@ def test_every_column_comes_back_bit_for_bit(
         check_same_bits(found[name], column)
 
 
-def test_csv_has_one_header_line_and_rows_across_blocks(tmp_path: Path) -> None:
-    """A long table is written in blocks without losing or doubling a row."""
-    run = recording(n=40_001)
-    export(run, tmp_path / "out.csv")
-    lines = (tmp_path / "out.csv").read_text().splitlines()
-    assert lines[0] == (
-        "sample,t_s,reference_um,wanted_a,current_a,displacement_um,measured_a,input_um,flags"
-    )
-    assert [int(line.split(",")[0]) for line in lines[1:]] == run.samples.index.tolist()
-
-
-def check_facts(facts: dict[str, str]) -> None:
-    """Check what is kept beside the columns."""
-    run = json.loads(facts["run"])
-    assert run["name"] == "test"
-    assert run["sample_rate_hz"] == 50_000.0
-    assert run["command_unit"] == "A"
-    assert run["compensated"] is True
-    assert run["recording"] == "run.mcap"
-    assert json.loads(facts["end"]) == {"reason": "done"}
-    assert json.loads(facts["segments"])[0]["period"] == 1000.0 / 3.0
-    assert facts["experiment_yaml"] == YAML
-    assert facts["model_yaml"] == ""
-
-
-def test_npz_keeps_the_facts_of_the_run(tmp_path: Path) -> None:
-    """As text arrays beside the columns."""
-    export(recording(), tmp_path / "out.npz")
-    found = read_npz(tmp_path / "out.npz")
-    check_facts({name: str(value) for name, value in found.items() if value.ndim == 0})
-
-
-def test_parquet_keeps_the_facts_of_the_run(tmp_path: Path) -> None:
-    """In the schema's metadata, under hilctl's name."""
-    export(recording(), tmp_path / "out.parquet")
-    metadata = parquet.read_schema(tmp_path / "out.parquet").metadata
-    ours = {k.decode(): v.decode() for k, v in metadata.items() if k.startswith(b"hilctl.")}
-    check_facts({name.removeprefix("hilctl."): text for name, text in ours.items()})
-
-
-def test_mat_keeps_the_facts_of_the_run_without_structs(tmp_path: Path) -> None:
-    """As texts beside plain column vectors."""
-    export(recording(), tmp_path / "out.mat")
-    found = {k: v for k, v in loadmat(tmp_path / "out.mat").items() if not k.startswith("__")}
-    texts = {k: v[0] if v.size else "" for k, v in found.items() if v.dtype.kind == "U"}
-    check_facts({name: str(text) for name, text in texts.items()})
-    assert all(v.dtype.names is None for v in found.values())
-    assert all(v.shape == (2000, 1) for k, v in found.items() if k not in texts)
-
-
 def test_empty_recording_is_an_error(tmp_path: Path) -> None:
-    """A run without samples has no table."""
     run = recording()
     with pytest.raises(DataError, match=r"holds no sample"):
         export(replace(run, samples=run.samples.part(0, 0)), tmp_path / "out.npz")
 
 
+def npz_texts(path: Path) -> dict[str, str]:
+    return {name: str(value) for name, value in read_npz(path).items() if value.ndim == 0}
+
+
+def parquet_texts(path: Path) -> dict[str, str]:
+    metadata = parquet.read_schema(path).metadata
+    ours = {k.decode(): v.decode() for k, v in metadata.items() if k.startswith(b"hilctl.")}
+    return {name.removeprefix("hilctl."): text for name, text in ours.items()}
+
+
+def mat_texts(path: Path) -> dict[str, str]:
+    """Return the texts beside plain column vectors; there are no structs."""
+    found = {k: v for k, v in loadmat(path).items() if not k.startswith("__")}
+    texts = {k: str(v[0]) if v.size else "" for k, v in found.items() if v.dtype.kind == "U"}
+    assert all(v.dtype.names is None for v in found.values())
+    assert all(v.shape == (2000, 1) for k, v in found.items() if k not in texts)
+    return texts
+
+
+@pytest.mark.parametrize(
+    ("suffix", "texts_of"), [(".npz", npz_texts), (".parquet", parquet_texts), (".mat", mat_texts)]
+)
+def test_the_facts_of_the_run_are_kept(tmp_path: Path, suffix: str, texts_of) -> None:
+    export(recording(), tmp_path / f"out{suffix}")
+    facts = texts_of(tmp_path / f"out{suffix}")
+    expected = {
+        "name": "test", "device": "serial_dac", "sample_rate_hz": 50_000.0, "command_unit": "A",
+        "compensated": True, "recording": "run.mcap",
+    }  # fmt: skip
+    assert json.loads(facts["run"]) == expected
+    assert json.loads(facts["end"]) == {"reason": "done"}
+    assert json.loads(facts["segments"])[0]["period"] == 1000.0 / 3.0
+    assert (facts["experiment_yaml"], facts["model_yaml"]) == (YAML, "")
+
+
 @pytest.mark.parametrize("name", ["out.xlsx", "out", "out.csv.gz"])
 def test_unknown_suffix_names_the_known_ones(tmp_path: Path, name: str) -> None:
-    """The message says what can be written."""
     with pytest.raises(InputError, match=r"\.csv, \.npz, \.parquet"):
         export(recording(), tmp_path / name)
 
 
 def test_existing_file_is_kept_unless_told(tmp_path: Path) -> None:
-    """A file of that name is refused, and replaced only on request."""
     path = tmp_path / "out.CSV"
     path.write_text("precious")
     with pytest.raises(InputError, match=r"out\.CSV: exists already"):
@@ -227,7 +183,6 @@ def test_existing_file_is_kept_unless_told(tmp_path: Path) -> None:
 
 
 def test_full_disk_leaves_the_old_file_and_nothing_else(tmp_path: Path, monkeypatch) -> None:
-    """A write that breaks off half-way is not seen under the file's name."""
 
     def full(file: NpzFile, _facts: dict[str, str]) -> None:
         file._stream.write(b"half of it")
@@ -242,26 +197,13 @@ def test_full_disk_leaves_the_old_file_and_nothing_else(tmp_path: Path, monkeypa
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_folder_that_is_not_there_is_an_input_error(tmp_path: Path) -> None:
-    """The message names the file and the reason."""
-    with pytest.raises(InputError, match=r"out\.npz: .*No such"):
-        export(recording(), tmp_path / "missing" / "out.npz")
-
-
-def test_missing_pyarrow_says_what_to_install(tmp_path: Path, monkeypatch) -> None:
-    """Parquet without pyarrow is refused with the way out, and leaves nothing behind."""
+def test_without_pyarrow_nothing_begins(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(InputError, match=r"pip install 'hilctl\[parquet\]'"):
         export(recording(), tmp_path / "out.parquet")
+    with pytest.raises(InputError, match="pip install"):
+        export_all(GOLDEN, tmp_path / "out", lambda part, path: None)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_file_has_ordinary_permissions(tmp_path: Path) -> None:
-    """Readable as any new file is, not as a private temporary one."""
-    plain = tmp_path / "plain"
-    plain.touch()
-    export(recording(), tmp_path / "out.mat")
-    assert stat.S_IMODE((tmp_path / "out.mat").stat().st_mode) == stat.S_IMODE(plain.stat().st_mode)
 
 
 GOLDEN = Path(__file__).parents[3] / "recordings" / "golden"
@@ -287,7 +229,6 @@ def files(output):
 
 
 def test_one_query_sees_every_sample_of_every_run(folder, tmp_path):
-    """In A and in V, with an input of its own or not: the columns are the same."""
     output = tmp_path / "out"
     assert exported(folder, output) == (3, 0, {})
     found = dataset.dataset(output, partitioning="hive").to_table()
@@ -372,14 +313,3 @@ def test_no_name_is_longer_than_a_file_system_takes():
     long = "\N{GRINNING FACE}" * 100
     entry = unreadable(f"{long}.mcap", 1, 2, "") | {"name": long, "run_id": "\0" * 50}
     assert max(len(part.encode()) for part in place_of(entry).parts) <= 255
-
-
-def test_without_pyarrow_nothing_begins(folder, tmp_path, monkeypatch):
-    def missing():
-        raise InputError("needs pyarrow")
-
-    monkeypatch.setattr(export_module, "arrow", missing)
-    with pytest.raises(InputError, match="needs pyarrow"):
-        exported(folder, tmp_path / "out")
-    assert not (tmp_path / "out").exists()
-    assert export_files.arrow().__name__ == "pyarrow"

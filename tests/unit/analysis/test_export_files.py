@@ -60,7 +60,6 @@ def test_mat_is_what_scipy_writes(tmp_path):
 
 
 def test_mat_says_what_it_can_not_hold(tmp_path, monkeypatch):
-    """Before it is written, and with a way out."""
     monkeypatch.setattr(export_files, "_LARGEST_MAT_BYTES", 8 * 1000)
     with (tmp_path / "x.mat").open("xb") as stream, TemporaryFile() as aside:
         file = MatFile(stream, aside)
@@ -79,7 +78,6 @@ def test_npz_holds_each_array_as_a_whole(tmp_path):
 
 @pytest.mark.parametrize("rows", [1000, 30_000, 10**9])
 def test_parquet_row_groups_fill_up_across_pieces(tmp_path, monkeypatch, rows):
-    """Facts stand in the metadata, whether row groups were written before they were known."""
     monkeypatch.setattr(export_files, "_GROUP_ROWS", rows)
     path = written(ParquetFile, tmp_path / "x.parquet", PARTS)
     file = parquet.ParquetFile(path)
@@ -105,7 +103,6 @@ class Full(io.BytesIO):
 
 @pytest.mark.parametrize("size", [1, 2**21])
 def test_parquet_that_is_refused_is_refused_once(monkeypatch, capfd, size):
-    """Whenever it is written; Arrow, which tries again, has nothing to say of that."""
     monkeypatch.setattr(export_files, "_WRITTEN_BYTES", size)
 
     def refused():
@@ -120,7 +117,6 @@ def test_parquet_that_is_refused_is_refused_once(monkeypatch, capfd, size):
 
 
 def test_parquet_that_is_given_up_leaves_its_stream_alone(capfd):
-    """As where a recording breaks off."""
     stream = io.BytesIO()
     file = ParquetFile(stream)
     file.add(PARTS[0])

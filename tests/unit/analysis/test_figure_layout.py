@@ -31,17 +31,17 @@ def test_a_figure_has_the_width_of_a_column_and_letters_of_one_size(width):
 
 
 @pytest.mark.slow
-def test_panels_stand_abreast_where_there_is_room():
-    def columns(sheet, width):
-        figure = drawn(sheet, width)
-        return figure.axes[0].get_gridspec().ncols
-
-    assert columns(FigureSpec("a", "", panels(3)), "single") == 1
-    assert columns(FigureSpec("a", "", panels(3)), "double") == 3
-    assert columns(FigureSpec("a", "", panels(4)), "double") == 2
-    assert columns(FigureSpec("a", "", panels(6), alike=True), "single") == 2
-    assert columns(FigureSpec("a", "", panels(2), stacked=True), "double") == 1
-    assert columns(FigureSpec("a", "", panels(2), most_beside=1), "double") == 1
+@pytest.mark.parametrize(
+    ("count", "keys", "width", "columns"),
+    [
+        (3, {}, "single", 1), (3, {}, "double", 3), (4, {}, "double", 2),
+        (6, {"alike": True}, "single", 2), (2, {"stacked": True}, "double", 1),
+        (2, {"most_beside": 1}, "double", 1),
+    ],
+)  # fmt: skip
+def test_panels_are_side_by_side_if_there_is_room(count, keys, width, columns):
+    figure = drawn(FigureSpec("a", "", panels(count), **keys), width)
+    assert figure.axes[0].get_gridspec().ncols == columns
 
 
 def test_panels_alike_are_named_at_the_edge_only():
@@ -68,10 +68,8 @@ def test_no_legend_is_wider_than_its_figure():
 
 
 def test_long_titles_are_broken():
-    axes = drawn(FigureSpec("a", "", panels(4, title="with compensator, 250 Hz"), alike=True)).axes[
-        0
-    ]
-    assert "\n" in axes.get_title("left")
+    sheet = FigureSpec("a", "", panels(4, title="with compensator, 250 Hz"), alike=True)
+    assert "\n" in drawn(sheet).axes[0].get_title("left")
 
 
 @pytest.fixture

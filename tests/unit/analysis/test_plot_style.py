@@ -7,7 +7,6 @@ from hilctl.analysis import plot_style
 
 
 def test_short_signal_is_left_alone() -> None:
-    """What fits is drawn sample by sample."""
     t = np.arange(100.0)
     shown_t, shown = plot_style.min_max(t, t**2, 100)
     np.testing.assert_array_equal(shown_t, t)
@@ -16,7 +15,6 @@ def test_short_signal_is_left_alone() -> None:
 
 @pytest.mark.parametrize("size", [4001, 12_345, 1_000_000])
 def test_every_spike_stays_visible(size: int) -> None:
-    """Single samples that stick out either way survive, wherever they are."""
     values = np.zeros(size)
     places = np.linspace(0, size - 1, 7).astype(int)
     values[places] = [5.0, -6.0, 7.0, -8.0, 9.0, -10.0, 11.0]
@@ -28,7 +26,6 @@ def test_every_spike_stays_visible(size: int) -> None:
 
 
 def test_line_breaks_where_nothing_is_finite() -> None:
-    """A single NaN is bridged within its stretch; a long gap breaks the line."""
     values = np.ones(10_000)
     values[50] = np.nan
     values[5000:6000] = np.nan
@@ -39,7 +36,6 @@ def test_line_breaks_where_nothing_is_finite() -> None:
 
 @pytest.mark.parametrize("period", [200.0, 333.3, 1999.0])
 def test_band_of_a_steady_wave_has_straight_edges(period: float) -> None:
-    """Stretches hold at least one period, so that no beat between the two is drawn."""
     index = np.arange(1_000_000, dtype=np.int64)
     middle, low, high = plot_style.band(index, np.sin(2.0 * np.pi * index / period), period)
     assert middle.size <= 600
@@ -49,7 +45,6 @@ def test_band_of_a_steady_wave_has_straight_edges(period: float) -> None:
 
 
 def test_band_follows_the_index_across_gaps() -> None:
-    """Missing samples leave the rest of the band at its own time."""
     index = np.concatenate((np.arange(10_000), np.arange(90_000, 100_000))).astype(np.int64)
     middle, low, high = plot_style.band(index, np.where(index < 50_000, 1.0, 2.0), 1000.0)
     assert np.all(high[middle < 10_000] == 1.0)
@@ -58,7 +53,6 @@ def test_band_follows_the_index_across_gaps() -> None:
 
 
 def test_band_is_for_many_narrow_cycles() -> None:
-    """Few cycles, wide cycles and what does not repeat are drawn as lines."""
     assert plot_style.shown_as_band(100_000, 200.0, 100_000)
     assert not plot_style.shown_as_band(100_000, 1000.0, 100_000)
     assert not plot_style.shown_as_band(700, 200.0, 100_000)

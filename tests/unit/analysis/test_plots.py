@@ -37,13 +37,11 @@ def run(make_recording):
 
 
 def lines(axes) -> dict[str, object]:
-    """Return the lines of axes by label."""
     return {line.get_label(): line for line in axes.get_lines()}
 
 
 class TestTimeHistory:
     def test_few_cycles_are_lines_with_units(self, run) -> None:
-        """Displacement, reference and command are drawn over the whole run, units on the axes."""
         recording = run()
         upper, lower = drawn(plots.time_history(recording)).axes
         assert {"displacement", "reference"} <= set(lines(upper))
@@ -53,7 +51,6 @@ class TestTimeHistory:
         assert lower.get_xlim()[1] >= 4300 / 50_000
 
     def test_many_cycles_are_a_band(self, run) -> None:
-        """Cycles too narrow for a line fill a band of constant height, and beat with nothing."""
         upper = drawn(plots.time_history(run(cycles=400))).axes[0]
         bands = [c for c in upper.collections if isinstance(c, FillBetweenPolyCollection)]
         assert len(bands) == 1
@@ -61,59 +58,37 @@ class TestTimeHistory:
         assert np.abs(np.abs(heights) - 40.0).max() < 0.01
 
     def test_no_line_is_longer_than_a_plot_can_show(self, run) -> None:
-        """Long runs are reduced before they are drawn."""
         recording = replace(run(cycles=100), segments=())
         for sheet in (plots.time_history(recording), plots.error(recording)):
             for axes in drawn(sheet).axes:
                 for line in axes.get_lines():
                     assert line.get_xdata().size <= plot_style.MAX_POINTS
 
-    def test_spike_stays_visible(self, run) -> None:
-        """One odd reading in half a million is drawn."""
-        recording = replace(run(cycles=500), segments=())
-        recording.samples.displacement_um[123_456] = 90.0
-        line = lines(drawn(plots.time_history(recording)).axes[0])["displacement"]
-        assert np.nanmax(line.get_ydata()) == 90.0
-
     def test_last_steady_cycles_stand_beside(self, run) -> None:
-        """The two cycles before the ramp are drawn again by themselves."""
         close = drawn(plots.steady_cycles(run())).axes[0]
         start, stop = close.get_lines()[0].get_xdata()[[0, -1]]
         assert start == pytest.approx(2000 / 50_000)
         assert stop == pytest.approx(3999 / 50_000)
 
-    def test_nothing_recorded_draws_nothing(self, run) -> None:
-        """Without samples there is no history."""
-        recording = run()
-        assert plots.time_history(replace(recording, samples=recording.samples.part(0, 0))) is None
-
 
 class TestHysteresisLoop:
     @pytest.mark.parametrize("compensated", [True, False])
     def test_peak_hysteresis_is_marked_at_its_height(self, run, compensated: bool) -> None:
-        """The mark is 2 B sin(lag) high in both panels, and says its percentage."""
         figure = drawn(loop_plot.hysteresis_loop(run(compensated=compensated)))
         for axes in figure.axes:
+            assert axes.get_xlabel() == ("reference, µm" if compensated else "command, A")
             label = next(name for name in lines(axes) if name.startswith("peak hysteresis"))
             assert label.startswith(f"peak hysteresis {100.0 * np.sin(0.1):.3g} %")
             height = np.ptp(lines(axes)[label].get_ydata())
             assert height == pytest.approx(80.0 * np.sin(0.1), rel=1e-3)
 
     def test_compensated_run_is_held_against_its_reference(self, run) -> None:
-        """What is left beside is the error over the reference, the loop closed."""
         right = drawn(loop_plot.hysteresis_loop(run())).axes[1]
         x, y = right.get_lines()[0].get_data()
-        assert right.get_xlabel() == "reference, µm"
         assert (x[0], y[0]) == (x[-1], y[-1])
         assert np.abs(y).max() == pytest.approx(80.0 * np.sin(0.05), rel=1e-3)
 
-    def test_uncompensated_run_is_held_against_its_command(self, run) -> None:
-        """The axis says command and its unit."""
-        axes = drawn(loop_plot.hysteresis_loop(run(compensated=False))).axes[0]
-        assert axes.get_xlabel() == "command, A"
-
     def test_each_segment_has_its_loop(self, run) -> None:
-        """Segments are told apart by colour and label; the legend leaves out one not reached."""
         recording = run(cycles=9)
         ends = [(3000 * k, 3000 * k + 3000) for k in range(4)]
         parts = [Segment(f"part {k}", *ends[k], *ends[k], PERIOD) for k in range(4)]
@@ -125,7 +100,6 @@ class TestHysteresisLoop:
         assert len({str(line.get_color()) for line in axes.get_lines()[:3]}) == 3
 
     def test_what_does_not_repeat_is_drawn_as_measured(self, run) -> None:
-        """Without a period there is a path and no mark."""
         recording = run()
         once = replace(recording.segments[0], period=0.0)
         axes = drawn(loop_plot.hysteresis_loop(replace(recording, segments=(once,)))).axes[0]
@@ -133,23 +107,14 @@ class TestHysteresisLoop:
         assert not any(name.startswith("peak") for name in lines(axes))
         assert "not averaged" in axes.get_title("left")
 
-    def test_nothing_steady_draws_nothing(self, run) -> None:
-        """A run cut short before its first whole cycle has no loop."""
-        recording = run()
-        assert loop_plot.hysteresis_loop(replace(recording, segments=())) is None
-        short = replace(recording, samples=recording.samples.part(0, 700))
-        assert loop_plot.hysteresis_loop(short) is None
-
 
 class TestError:
     def test_peak_error_is_marked_on_the_average_cycle(self, run) -> None:
-        """Its mark is where displacement less reference is largest."""
         _, phase = drawn(plots.error(run())).axes
         mark = lines(phase)["peak error"]
         assert abs(mark.get_ydata()[0]) == pytest.approx(80.0 * np.sin(0.05), rel=1e-3)
 
     def test_the_band_holds_every_sample_at_its_phase(self, run) -> None:
-        """Its edges lie on the curve of the closed form, as close as a bin is wide."""
         recording = run()
         recording.samples.displacement_um[1250] += 5.0
         axes = drawn(plots.error(recording)).axes[1]
@@ -159,14 +124,9 @@ class TestError:
             40.0 * (np.sin(np.pi / 2 - 0.1) - 1.0) + 5.0, abs=0.02
         )
 
-    def test_run_without_reference_has_none(self, run) -> None:
-        """There is no error to draw in a current run."""
-        assert plots.error(run(compensated=False)) is None
-
 
 class TestLateness:
     def test_every_tick_is_counted(self, run) -> None:
-        """Bars add up to the number of ticks, late, early and extreme ones included."""
         late_ns = np.array([-5_000, 0, 40_000, 41_000, 3_000_000], dtype=np.int64)
         first = 50 * np.arange(5, dtype=np.int64)
         ticks = Ticks(first, 20_000 * first, late_ns, np.full(5, 30_000, dtype=np.int64))
@@ -178,52 +138,44 @@ class TestLateness:
         assert {text.get_text() for text in axes.texts} >= {"p50 40.0 µs", "max 3.00 ms"}
 
     def test_ticks_that_are_all_alike_can_be_drawn(self, run) -> None:
-        """A histogram of one value has a width all the same."""
         same = np.full(5, 30_000, dtype=np.int64)
         ticks = Ticks(same, same, same, same)
         assert drawn(plots.lateness(replace(run(), ticks=ticks))).axes
 
-    def test_no_ticks_draw_nothing(self, run) -> None:
-        """Without ticks there is nothing to count."""
-        assert plots.lateness(replace(run(), ticks=Ticks(*(np.empty(0, np.int64),) * 4))) is None
-
 
 @pytest.mark.slow
 def test_every_figure_can_be_drawn(run) -> None:
-    """Labels with dollar signs and angle brackets are text, not formulas; nothing warns."""
     recording = run()
-    sheets = [
-        plots.time_history(recording),
-        plots.steady_cycles(recording),
-        loop_plot.hysteresis_loop(recording),
-        plots.error(recording),
-        plots.spectrum(recording),
-        plots.lateness(recording),
-    ]
-    for sheet in sheets:
-        assert svg(drawn(sheet)).startswith("<svg ")
+    for sheet_of in (
+        plots.time_history, plots.steady_cycles, loop_plot.hysteresis_loop, plots.error,
+        plots.spectrum, plots.lateness,
+    ):  # fmt: skip
+        assert svg(drawn(sheet_of(recording))).startswith("<svg ")
 
 
 class TestSpectrum:
     def test_harmonics_are_bars_in_nanometres(self, run) -> None:
-        """An error at the waveform's own frequency is the first one."""
         axes = drawn(plots.spectrum(run())).axes[1]
         heights = [bar.get_height() for bar in axes.containers[0]]
         assert heights[0] == pytest.approx(1e3 * 80.0 * np.sin(0.05), rel=1e-3)
         assert max(heights[1:]) < 1.0
         assert axes.get_ylabel() == "amplitude, nm"
 
-    def test_a_run_without_reference_has_none(self, run) -> None:
-        assert plots.spectrum(run(compensated=False)) is None
 
-
-def test_a_run_out_of_real_time_has_no_lateness(run) -> None:
-    """It waited for nobody: its numbers would say nothing."""
-    assert plots.lateness(replace(run(), run={"paced": "false"})) is None
+def test_a_figure_without_data_is_none(run) -> None:
+    """There are no samples, no whole cycle, no reference, no ticks, or no real time."""
+    recording, plain = run(), run(compensated=False)
+    samples = recording.samples
+    ticks = Ticks(*(np.empty(0, np.int64),) * 4)
+    assert plots.time_history(replace(recording, samples=samples.part(0, 0))) is None
+    for more in ({"segments": ()}, {"samples": samples.part(0, 700)}):
+        assert loop_plot.hysteresis_loop(replace(recording, **more)) is None
+    assert plots.error(plain) is plots.spectrum(plain) is None
+    for more in ({"ticks": ticks}, {"run": {"paced": "false"}}):
+        assert plots.lateness(replace(recording, **more)) is None
 
 
 def test_pieces_cover_a_run_without_overlap(run) -> None:
-    """Segments, what lies between them and the safe ramp: every sample in one piece."""
     parts = (Segment("b", 2000, 3000, 2000, 3000, 10.0), Segment("a", 500, 1500, 500, 1500, 20.0))
     found = plot_style.pieces(replace(run(), segments=parts))
     assert found == [
@@ -235,8 +187,8 @@ def test_pieces_cover_a_run_without_overlap(run) -> None:
     ]
 
 
-N, PERIOD_spectrum = 20_000, 500.0
-SEGMENT = Segment("sine", 0, N, 0, N, PERIOD_spectrum)
+N = 20_000
+SEGMENT = Segment("sine", 0, N, 0, N, 500.0)
 
 
 @pytest.fixture
@@ -245,7 +197,7 @@ def recording(make_recording):
 
 
 def waves(index):
-    turns = 2.0 * np.pi * index / PERIOD_spectrum
+    turns = 2.0 * np.pi * index / SEGMENT.period
     return 0.3 + 0.2 * np.sin(turns + 0.4) + 0.05 * np.cos(3.0 * turns)
 
 
@@ -255,7 +207,6 @@ def test_lines_and_harmonics_have_the_amplitudes_of_their_sines(recording):
     at = [int(np.argmin(np.abs(found.frequency_hz - hz))) for hz in (100.0, 300.0, 200.0)]
     assert found.amplitude_um[at] == pytest.approx([0.2, 0.05, 0.0], abs=1e-4)
     assert found.harmonics_um[:3] == pytest.approx([0.2, 0.0, 0.05], abs=1e-4)
-    assert found.constant_um == pytest.approx(0.3, abs=1e-9)
 
 
 def test_single_samples_may_be_missing_but_not_many(recording):
@@ -272,7 +223,7 @@ def test_a_thinned_spectrum_keeps_every_peak():
     frequency_hz = np.arange(1.0, 20_001.0)
     amplitude_um = np.full(20_000, 1e-3)
     amplitude_um[[50, 15_000]] = 1.0
-    spectrum = ErrorSpectrum(frequency_hz, amplitude_um, np.empty(0), 0.0)
+    spectrum = ErrorSpectrum(frequency_hz, amplitude_um, np.empty(0))
     x, y = thinned(spectrum, 300)
     assert x.size == y.size <= 300
     assert np.count_nonzero(y == 1.0) == 2

@@ -31,7 +31,10 @@ def kinds():
     yield np.where(rng.random(5000) < 0.4, 0.0, 10.0 ** rng.uniform(-300, 300, 5000))
 
 
-@pytest.mark.parametrize("values", [*kinds()])
+VALUES = pytest.mark.parametrize("values", [*kinds()])
+
+
+@VALUES
 def test_what_fits_is_exact(values):
     found = gathered(values)
     assert found.percentiles(PERCENTS) == np.percentile(values, PERCENTS).tolist()
@@ -40,29 +43,11 @@ def test_what_fits_is_exact(values):
     assert found.above(0.5) == np.count_nonzero(values > 0.5)
 
 
-@pytest.mark.parametrize("values", [*kinds()])
+@VALUES
 def test_what_does_not_is_within_its_bin(small, values):
-    """In whichever pieces it comes, the same."""
     found = gathered(values)
     exact = np.percentile(values, PERCENTS, method="lower")
     assert found.percentiles(PERCENTS) == pytest.approx(exact.tolist(), rel=6.2e-5)
     assert found.largest == values.max()
     assert found.median() == found.percentiles([50.0])[0] == gathered(values, 3).median()
     assert found.above(0.4) == np.count_nonzero(values > 0.4)
-
-
-def test_memory_does_not_grow(small):
-    found = Quantiles()
-    for seed in range(200):
-        found.add(np.random.default_rng(seed).normal(size=1000))
-    assert found._values is None
-    assert found.size == 200_000
-    assert np.count_nonzero(found._counts) < 120_000
-
-
-def test_of_nothing_there_is_no_largest():
-    found = Quantiles()
-    found.add(np.empty(0))
-    assert found.size == 0
-    with pytest.raises(ValueError, match="no values"):
-        _ = found.largest

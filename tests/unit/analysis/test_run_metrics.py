@@ -15,7 +15,6 @@ GOLDEN = Path(__file__).parents[3] / "recordings" / "golden" / "terfenol_compens
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_what_is_not_finite_becomes_null(value):
-    """JSON has no such numbers: at every depth of a report they become null."""
     report = summarize(read(GOLDEN))
     first = replace(report.segments[0], peak_error_percent=value)
     broken = replace(

@@ -42,7 +42,6 @@ def figures(recording, segment, window, bounds):
 @pytest.mark.parametrize("period", [500.0, 1000.0 / 3.0, 0.0])
 @pytest.mark.parametrize("bounds", [[1], [9_997, 9_998, 10_001], range(0, N, 617), [0, 5, 5, 9]])
 def test_pieces_give_what_the_whole_gives(recording, period, bounds, compensated):
-    """To the rounding of sums; counts and extremes exactly."""
     segment = Segment("sine", 0, N, 500, N - 500, period)
     recording = replace(recording, compensated=compensated)
     window = (1000, N - 500, 37 if period else 0)

@@ -50,7 +50,6 @@ def run(make_recording):
 
 
 def test_only_what_lies_behind_the_last_change_is_judged(run):
-    """The average cycle has the amplitude that was reached, and the figures are that cycle's."""
     recording = run(tuned(510, 0.3, 250), tuned(900, 0.5, 130))
     part = steady_part(recording, recording.segments[0])
     assert part.samples.index[0] == 1200  # of 9 whole cycles from 1030 on, one is left out
@@ -61,13 +60,11 @@ def test_only_what_lies_behind_the_last_change_is_judged(run):
 
 
 def test_change_ends_the_one_before_it(run):
-    """A slow change that another cut short is over."""
     recording = run(tuned(200, 0.3, 100_000), tuned(300, 1.0, 50))
     assert steady_part(recording, recording.segments[0]).samples.index[0] == 500
 
 
 def test_change_that_goes_on_to_the_end_leaves_nothing_to_judge(run):
-    """No figure is better than one of a mixture."""
     recording = run(tuned(300, 0.3, 10 * SAMPLES))
     part = steady_part(recording, recording.segments[0])
     assert (part.samples.index.size, part.cycles, part.cycle) == (0, 0, None)
@@ -82,7 +79,6 @@ def test_change_of_unknown_length_leaves_nothing_to_judge(run):
 
 
 def test_segments_before_a_change_are_judged_as_ever(run):
-    """A change concerns the segment that it falls into, and those behind it."""
     half = SAMPLES // 2
     first = Segment("first", 0, half, 0, half, PERIOD)
     second = first.shifted(half)
@@ -90,9 +86,3 @@ def test_segments_before_a_change_are_judged_as_ever(run):
     parts = [steady_part(recording, each) for each in recording.segments]
     assert [part.cycles for part in parts] == [9, 7]
     assert [np.ptp(part.loop[0]) for part in parts] == pytest.approx([20.0, 10.0], rel=1e-3)
-
-
-def test_untuned_run_loses_nothing(run):
-    """All cycles but the first are judged, as before."""
-    recording = run()
-    assert steady_part(recording, recording.segments[0]).cycles == CYCLES - 1

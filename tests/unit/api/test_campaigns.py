@@ -7,9 +7,15 @@ from hilctl.base.errors import InputError
 from tests.unit.api.test_runs import CONFIGS, SHORT, SINE
 
 
-def test_a_campaign_runs_every_step(tmp_path):
-    file = tmp_path / "two.yaml"
-    file.write_text(f"name: two\nexperiment: {SINE}\nvary:\n  waveform.amplitude: [0.5, 1.0]\n")
+@pytest.fixture
+def file(tmp_path):
+    """A campaign of two amplitudes."""
+    path = tmp_path / "two.yaml"
+    path.write_text(f"name: two\nexperiment: {SINE}\nvary:\n  waveform.amplitude: [0.5, 1.0]\n")
+    return path
+
+
+def test_a_campaign_runs_every_step(file, tmp_path):
     texts = []
     result = api.campaign(
         file, tmp_path / "runs", settings=SHORT, fast=True,
@@ -22,9 +28,7 @@ def test_a_campaign_runs_every_step(tmp_path):
         api.campaign(file, tmp_path / "runs", settings=SHORT, scheduler="processes")
 
 
-def test_a_dry_run_plans_and_writes_nothing(tmp_path):
-    file = tmp_path / "two.yaml"
-    file.write_text(f"name: two\nexperiment: {SINE}\nvary:\n  waveform.amplitude: [0.5, 1.0]\n")
+def test_a_dry_run_plans_and_writes_nothing(file, tmp_path):
     plans = []
     found = api.campaign(
         file, tmp_path / "runs", settings=SHORT, fast=True, dry_run=True, on_plan=plans.append

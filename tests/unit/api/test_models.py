@@ -24,12 +24,9 @@ def table(tmp_path):
 def test_a_model_is_identified_and_written(table, tmp_path):
     output = tmp_path / "model.yaml"
     texts = []
+    settings = {"plays": 6, "table.time_column": "t_s"}
     found = api.identify(
-        str(table),
-        output,
-        model="ppi",
-        settings={"plays": 6, "table.time_column": "t_s"},
-        on_progress=lambda *s: texts.append(s),
+        str(table), output, model="ppi", settings=settings, on_progress=lambda *s: texts.append(s)
     )
     assert found.verdict.grade != "not a model"
     assert load_model(output).kind == "ppi"
@@ -54,12 +51,7 @@ def test_arguments_are_passed_on(monkeypatch):
 
 @pytest.mark.parametrize(
     ("model", "asked", "where"),
-    [
-        ("auto", None, "threads"),
-        ("ppi", None, "none"),
-        ("auto", "none", "none"),
-        ("ppi", "processes", "processes"),
-    ],
+    [("auto", None, "threads"), ("ppi", None, "none"), ("ppi", "processes", "processes")],
 )
 def test_default_scheduler(monkeypatch, model, asked, where):
     monkeypatch.setattr("hilctl.api.models.identify_files", lambda *given, **named: given[4])

@@ -10,8 +10,7 @@ from hilctl.base.errors import ConfigError, InputError
 CONFIGS = Path(__file__).parents[3] / "configs"
 SINE = CONFIGS / "terfenol_sine_6a_uncompensated.yaml"
 SHORT = {
-    "sample_rate_hz": 5000,
-    "block": 10,
+    "sample_rate_hz": 5000, "block": 10,
     "waveform": {
         "kind": "sine", "unit": "A", "amplitude": 1.0, "frequency_hz": 50.0, "duration_s": 0.2,
     },

@@ -28,7 +28,7 @@ __all__ = ["experiment", "limits", "limits_with"]
 def ends(monkeypatch, limits):
     """Replace the characterisation; return its arguments and result."""
     monkeypatch.setattr("hilctl.api.campaigns.finish_dead_runs", lambda: None)
-    measured = FOUND.measured.also(growing=(), reversal=None)
+    measured = replace(FOUND.measured, growing=(), reversal=None)
     asked = {"found": replace(FOUND, measured=measured, held_out=())}
     monkeypatch.setattr(Characterisation, "is_model", property(lambda self: asked["is_model"]))
     asked["is_model"] = True

@@ -1,11 +1,12 @@
 """Cooling, progress and disk space of a study."""
 
+import json
 from pathlib import Path
 
 import pytest
 
 from hilctl.base.errors import InputError
-from hilctl.studies.step_runner import StepRunner, StudyHost, free_mb, require_room
+from hilctl.studies.step_runner import StepRunner, StudyHost, free_mb, require_room, setting
 
 
 def test_the_runner_waits_in_short_sleeps_and_reports_the_time_left():
@@ -18,6 +19,11 @@ def test_the_runner_waits_in_short_sleeps_and_reports_the_time_left():
     assert {done for done, _ in shown} == {0.5}
     assert all(text.startswith("step 3: ") for _, text in shown)
     assert shown[0][1].endswith("0:00:05 left")
+
+
+def test_settings_take_any_plain_value():
+    for value in (1e-7, "a: b #", None, True, [1, {"k": "µ"}]):
+        assert json.loads(setting("key", value).removeprefix("key=")) == value
 
 
 def test_disk_space_needs_a_margin(tmp_path):

@@ -1,57 +1,36 @@
 """Campaign runner: completed steps are kept, failed ones marked, faults of the rig end it."""
 
-import time
 from dataclasses import replace
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from hilctl.base.errors import DeviceError, InputError
 from hilctl.base.events import Event
 from hilctl.recording.reader import read
-from hilctl.run.start import unpaced
+from hilctl.run.start import completed_key
 from hilctl.studies.campaign import campaign_runner
 from hilctl.studies.campaign.campaign_runner import (
     CampaignHost,
     is_harmless,
     planned_in_real_time,
-    prepared,
     run_series,
 )
 from tests.unit.studies.campaign.conftest import CAMPAIGN
+from tests.unit.studies.conftest import StudyRig
 
 BUDGET = "set: {limits.rms_current_a: 0.9, limits.thermal_time_constant_s: 3.0}\n"
 
 
-class Rig:
-    """A simulated rig that records runs and pauses, with an optional failure of one run."""
-
-    def __init__(self, ends_at=99, error=None, **ends):
-        self.ends_at, self.error, self.ends = ends_at, error, ends
-        self.runs, self.rows, self.texts, self.pauses = [], [], [], []
-        self.time_s = time.time()
-
-    def __call__(self, path, settings, output, on_part, *, overwrite, heat_a2):
-        assert not overwrite
-        self.runs.append((output.name, heat_a2))
-        on_part(0.5)
-        if len(self.runs) == self.ends_at and self.error:
-            raise self.error
-        result = unpaced(path, settings, output, overwrite=False, heat_a2=heat_a2)
-        self.time_s += result.samples / 2000.0
-        return replace(result, **self.ends) if len(self.runs) == self.ends_at else result
-
-    def sleep(self, seconds):
-        self.pauses.append(seconds)
-        self.time_s += seconds
+class Rig(StudyRig):
+    rate_hz = 2000.0
 
     @property
     def host(self):
         return CampaignHost(
-            run=self,
-            now_s=lambda: self.time_s,
-            sleep_s=self.sleep,
+            **self.observers,
             on_row=lambda step, row: self.rows.append((step.number, row.code, row.kept)),
-            on_progress=lambda done, text: self.texts.append((done, text)),
         )
 
 
@@ -76,30 +55,28 @@ def test_every_step_is_run_and_recorded(run, tmp_path):
     rig = Rig()
     result = run(rig)
     assert codes(result) == ["completed"] * 4
-    assert [name for name, _ in rig.runs] == [f"few-000{k}.mcap" for k in range(1, 5)]
+    assert rig.names == [f"few-000{k}.mcap" for k in range(1, 5)]
     assert (result.reason, result.stop_signal, result.drift) == ("", 0, None)
+    done = [part for part, _ in rig.texts]
+    assert done == sorted(done)
+    assert 0.0 < done[-1] <= 1.0
+    assert rig.texts[1][1].endswith("0:00:01 left")
     assert all(each.is_file() for each in result.tables)
     suffixes = {path.suffix for path in (tmp_path / "runs").iterdir()}
     assert suffixes == {".mcap", ".csv", ".parquet", ".html"}
 
 
 def test_completed_steps_are_kept_and_nothing_is_overwritten(run, tmp_path):
-    """A new value adds its own runs only."""
     run(Rig())
     before = {each: each.read_bytes() for each in (tmp_path / "runs").glob("*.mcap")}
-    rig = Rig()
-    result = run(rig, CAMPAIGN.replace("[1.0, 2.0]", "[0.5, 1.0, 2.0]"))
-    assert [name for name, _ in rig.runs] == ["few-0001-2.mcap", "few-0002-2.mcap"]
-    assert rig.rows[:4] == [
-        (3, "completed", True),
-        (4, "completed", True),
-        (5, "completed", True),
-        (6, "completed", True),
-    ]
+    rig, more = Rig(), CAMPAIGN.replace("[1.0, 2.0]", "[0.5, 1.0, 2.0]")
+    result = run(rig, more)
+    assert rig.names == ["few-0001-2.mcap", "few-0002-2.mcap"]
+    assert rig.rows[:4] == [(number, "completed", True) for number in range(3, 7)]
     assert result.count("completed") == 6
     assert all(path.read_bytes() == content for path, content in before.items())
     again = Rig()
-    assert run(again, CAMPAIGN.replace("[1.0, 2.0]", "[0.5, 1.0, 2.0]")).count("completed") == 6
+    assert run(again, more).count("completed") == 6
     assert again.runs == []
 
 
@@ -110,36 +87,30 @@ def test_a_failed_step_is_marked_and_the_campaign_continues(run, monkeypatch):
     assert codes(result) == ["completed", "fault", "completed", "completed"]
     assert result.rows[2].result == "fault: late"
     rig = Rig()
-    monkeypatch.setattr("hilctl.studies.campaign.store.completed_key", _but("few-0002.mcap"))
-    assert codes(run(rig)) == ["completed"] * 4
-    assert [name for name, _ in rig.runs] == ["few-0002-2.mcap"]
-
-
-def _but(name):
-    from hilctl.run.start import completed_key
-
-    return lambda path: None if path.name == name else completed_key(path)
-
-
-def test_a_fault_of_device_or_rig_ends_the_campaign(run):
-    result = run(Rig(2, code="fault", reason="stroke"))
-    assert codes(result) == ["completed", "fault", "planned", "planned"]
-    assert result.reason.endswith(": stroke")
-    assert "step 2 (waveform.amplitude=1.0, waveform.frequency_hz=20.0)" in result.reason
-
-
-def test_a_device_that_can_t_be_opened_ends_it_too(run):
-    result = run(Rig(3, error=DeviceError("modbus_dac: no answer")))
-    assert codes(result) == ["completed", "completed", "fault", "planned"]
-    assert "no answer" in result.reason
-
-
-def test_ctrl_c_stops_the_campaign(run):
-    result = run(Rig(3, code="stopped", stop_signal=2, reason="Ctrl-C"))
-    assert (result.stop_signal, codes(result)) == (
-        2,
-        ["completed", "completed", "stopped", "planned"],
+    monkeypatch.setattr(
+        "hilctl.studies.campaign.store.completed_key",
+        lambda path: None if path.name == "few-0002.mcap" else completed_key(path),
     )
+    assert codes(run(rig)) == ["completed"] * 4
+    assert rig.names == ["few-0002-2.mcap"]
+
+
+@pytest.mark.parametrize(
+    ("failure", "codes_of_steps", "reason"),
+    [
+        ({"code": "fault", "reason": "stroke"}, ["fault", "planned"], ": stroke"),
+        ({"error": DeviceError("no answer")}, ["fault", "planned"], ": no answer"),
+        ({"code": "stopped", "stop_signal": 2, "reason": "Ctrl-C"}, ["stopped", "planned"], "C"),
+    ],
+)
+def test_a_fault_of_device_or_rig_or_the_user_ends_the_campaign(
+    run, failure, codes_of_steps, reason
+):
+    result = run(Rig(3, **failure))
+    assert codes(result) == ["completed", "completed", *codes_of_steps]
+    assert result.stop_signal == failure.get("stop_signal", 0)
+    assert result.reason.startswith("step 3 (waveform.amplitude=2.0, waveform.frequency_hz=10.0)")
+    assert result.reason.endswith(reason)
 
 
 @pytest.mark.parametrize(
@@ -153,13 +124,8 @@ def test_ctrl_c_stops_the_campaign(run):
     ],
 )
 def test_harmless_faults(monkeypatch, events, safe, harmless, make_recording):
-    from types import SimpleNamespace
-
-    import numpy as np
-
-    made = make_recording(
-        np.zeros(10), events=tuple(Event(1, "error", code, "") for code in events)
-    )
+    errors = tuple(Event(1, "error", code, "") for code in events)
+    made = make_recording(np.zeros(10), events=errors)
     monkeypatch.setattr(campaign_runner, "read", lambda path: made)
     assert is_harmless(SimpleNamespace(safe=safe, path=None)) is harmless
 
@@ -168,19 +134,14 @@ def test_harmless_faults(monkeypatch, events, safe, harmless, make_recording):
 def test_heat_of_the_coil_carries_over(run, tmp_path):
     """Each run starts with the heat of the previous one after cooling."""
     rig = Rig()
-    result = run(
-        rig,
-        CAMPAIGN.replace("[1.0, 2.0]", "[2.5]").replace("10.0, 20.0", "10.0, 20.0, 30.0")
-        + BUDGET
-        + "repeat: 2\n",
-    )
+    text = CAMPAIGN.replace("[1.0, 2.0]", "[2.5]").replace("10.0, 20.0", "10.0, 20.0, 30.0")
+    result = run(rig, text + BUDGET + "repeat: 2\n")
     assert set(codes(result)) == {"completed"}, result.reason
     assert sum(rig.pauses) > 1.0
     assert any("cools" in text for _, text in rig.texts)
-    heats = [
-        float(read(path).end["coil_heat_a2"]) for path in sorted((tmp_path / "runs").glob("*.mcap"))
-    ]
-    begins = [heat_a2 for _, heat_a2 in rig.runs]
+    paths = sorted((tmp_path / "runs").glob("*.mcap"))
+    heats = [float(read(path).end["coil_heat_a2"]) for path in paths]
+    begins = [each.heat_a2 for each in rig.runs]
     assert begins[0] == 0.0
     assert all(0.0 < begin <= left for begin, left in zip(begins[1:], heats, strict=False))
     assert max(heats) <= 0.81
@@ -189,17 +150,8 @@ def test_heat_of_the_coil_carries_over(run, tmp_path):
 def test_cool_down_limits_the_initial_heat(run):
     rig = Rig()
     run(rig, CAMPAIGN + BUDGET + "cool_down: {to_rms_a: 0.05}\n")
-    assert all(heat_a2 <= 0.05**2 * 1.001 for _, heat_a2 in rig.runs)
+    assert all(run.heat_a2 <= 0.05**2 * 1.001 for run in rig.runs)
     assert sum(rig.pauses) > 5.0
-
-
-def test_progress_says_the_time_left(run):
-    rig = Rig()
-    run(rig)
-    done = [part for part, _ in rig.texts]
-    assert done == sorted(done)
-    assert 0.0 < done[-1] <= 1.0
-    assert rig.texts[1][1].endswith("0:00:01 left")
 
 
 def test_a_changed_experiment_ends_the_campaign(run, experiment):
@@ -213,37 +165,25 @@ def test_a_changed_experiment_ends_the_campaign(run, experiment):
     assert set(codes(result)) == {"planned"}
 
 
-def test_a_folder_is_prepared_for_one(tmp_path):
-    notes = []
-    host = replace(Rig().host, on_note=notes.append)
-    with prepared(tmp_path / "runs", host):
-        assert (tmp_path / "runs").is_dir()
-    assert notes == []
-
-
 @pytest.mark.slow
 def test_the_page_is_written_at_intervals(run, drawn_pages):
     """In the first minute the page is written at the end only, later between steps as well."""
     rig = Rig()
     run(rig)
     assert drawn_pages == [("few.html", 4)]
-    slow = Rig()
-    told = slow.__call__
 
-    def slower(*given, **keys):
-        result = told(*given, **keys)
-        slow.time_s += 50.0
-        return result
+    class Slow(Rig):
+        def __call__(self, *given, **keys):
+            result = super().__call__(*given, **keys)
+            self.time_s += 50.0
+            return result
 
     drawn_pages.clear()
-    host = replace(slow.host, run=slower)
-    assert host.run is slower
-    run(slow, CAMPAIGN.replace("name: few", "name: long"), host)
+    run(Slow(), CAMPAIGN.replace("name: few", "name: long"))
     assert drawn_pages == [("long.html", 2), ("long.html", 4), ("long.html", 4)]
 
 
 def test_an_unwritable_page_is_reported(run, monkeypatch):
-    """A failed page is reported and does not end the campaign."""
 
     def fail(series, path):
         raise InputError(f"{path.name}: no space left")

@@ -20,7 +20,6 @@ def tables(result):
 
 
 def test_a_campaign_resumes(campaign, tmp_path):
-    """A resumed campaign has the same table; heat and noise do not depend on the order."""
     few = campaign(CAMPAIGN + BUDGET)
     folder = tmp_path / "runs"
     folder.mkdir()
@@ -44,8 +43,8 @@ def test_a_dask_cluster_gives_the_same_table(campaign, tmp_path):
 
     few = campaign(CAMPAIGN + BUDGET)
     alone, shared = tmp_path / "alone", tmp_path / "shared"
-    alone.mkdir()
-    shared.mkdir()
+    for folder in (alone, shared):
+        folder.mkdir()
     one = run_fast(planned_fast(few, alone), CampaignHost())
     with LocalCluster(
         n_workers=1, threads_per_worker=1, processes=False, protocol="tcp", dashboard_address=None

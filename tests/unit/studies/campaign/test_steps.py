@@ -1,12 +1,9 @@
 """Steps of a campaign: settings over one experiment."""
 
-import json
-
 import pytest
 
 from hilctl.base.errors import ConfigError
 from hilctl.base.files import TextFiles
-from hilctl.studies.campaign.steps import setting
 from tests.unit.studies.campaign.conftest import CAMPAIGN
 
 
@@ -22,11 +19,8 @@ def test_each_step_is_the_experiment_with_its_values(campaign):
 def test_each_step_has_its_own_noise(campaign):
     """Noise depends on the step only, not on order or number of steps."""
     texts = {}
-    for text in (
-        CAMPAIGN,
-        CAMPAIGN.replace("[1.0, 2.0]", "[2.0, 0.5, 1.0]"),
-        CAMPAIGN + "repeat: 2",
-    ):
+    more = CAMPAIGN.replace("[1.0, 2.0]", "[2.0, 0.5, 1.0]")
+    for text in (CAMPAIGN, more, CAMPAIGN + "repeat: 2"):
         few = campaign(text)
         loaded = [few.load(step, TextFiles()) for step in few.steps]
         assert len({each.config.device["seed"] for each in loaded}) == len(loaded)
@@ -43,18 +37,9 @@ def test_seeds_that_are_varied_are_left_alone(campaign):
 
 def test_reference_runs_come_first_now_and_then_and_last(campaign):
     few = campaign(CAMPAIGN + "reference_run: {every: 2, set: {waveform.amplitude: 3.0}}\n")
-    assert [step.is_reference for step in few.steps] == [
-        True,
-        False,
-        False,
-        True,
-        False,
-        False,
-        True,
-    ]
     assert [step.number for step in few.steps] == [*range(1, 8)]
     references = [step for step in few.steps if step.is_reference]
-    assert [step.repeat for step in references] == [1, 2, 3]
+    assert [(step.number, step.repeat) for step in references] == [(1, 1), (4, 2), (7, 3)]
     amplitudes = {few.load(step, TextFiles()).config.waveform.amplitude for step in references}
     assert amplitudes == {3.0}
 
@@ -70,12 +55,5 @@ def test_broken_rules_have_their_place(campaign):
     text = CAMPAIGN.replace("[10.0, 20.0]", "10:20") + "  name: [x]\nset: {name: y}\n"
     with pytest.raises(ConfigError) as found:
         campaign(text, "waveform.amplitude=2")
-    said = str(found.value)
-    assert "few.yaml:5: vary.waveform.frequency_hz:" in said
-    assert "few.yaml:4: vary.waveform.amplitude:" in said
-    assert "few.yaml:6: vary.name:" in said
-
-
-def test_settings_take_any_plain_value():
-    for value in (1e-7, "a: b #", None, True, [1, {"k": "µ"}]):
-        assert json.loads(setting("key", value).removeprefix("key=")) == value
+    for place in ("5: vary.waveform.frequency_hz", "4: vary.waveform.amplitude", "6: vary.name"):
+        assert f"few.yaml:{place}:" in str(found.value)

@@ -28,10 +28,10 @@ def never(seconds):
 @pytest.fixture
 def recorded(campaign, tmp_path):
     """Record the first step of a campaign; return file and fingerprint."""
+    few = campaign()
+    loaded = few.load(few.steps[0], TextFiles())
 
     def make(name):
-        few = campaign()
-        loaded = few.load(few.steps[0], TextFiles())
         run_unpaced(check(loaded), tmp_path / name)
         return tmp_path / name, RunKey.of(loaded)
 
@@ -50,7 +50,6 @@ def test_default_folder(campaign):
 
 
 def test_one_campaign_at_a_time(tmp_path):
-    """A second campaign waits briefly for the lock."""
     folder, waits = tmp_path / "runs", []
     with locked_folder(folder, never):
         with (
@@ -75,27 +74,17 @@ def test_a_refusal_leaves_no_folder_that_it_has_made(tmp_path):
     assert [each.name for each in tmp_path.iterdir()] == ["mine"]
 
 
-def test_only_completed_runs_count(recorded, tmp_path):
-    """Truncated recordings and other files do not count."""
+def test_only_completed_runs_count_and_truncated_ones_are_repaired(recorded, tmp_path):
     path, key = recorded("a.mcap")
     again, _ = recorded("b.mcap")
-    content = path.read_bytes()
-    (tmp_path / "torn.mcap").write_bytes(content[: len(content) // 2])
+    content, torn = path.read_bytes(), tmp_path / "torn.mcap"
+    torn.write_bytes(content[: len(content) // 2])
     (tmp_path / "text.mcap").write_text("no recording")
     assert completed_runs(tmp_path) == {key: [path, again]}
     assert last_started(tmp_path) == again
-
-
-def test_truncated_recordings_are_repaired(recorded, tmp_path):
-    """A repaired recording is readable and does not count as completed."""
-    path, key = recorded("a.mcap")
-    content = path.read_bytes()
-    torn = tmp_path / "torn.mcap"
-    torn.write_bytes(content[: len(content) // 2])
-    (tmp_path / "text.mcap").write_text("no recording")
     assert [text.startswith(f"{torn}: ") for text in repair_recordings(tmp_path)] == [True]
     assert repair_recordings(tmp_path) == []
-    assert completed_runs(tmp_path) == {key: [path]}
+    assert completed_runs(tmp_path) == {key: [path, again]}
     assert last_started(tmp_path / "absent") is None
 
 
@@ -111,7 +100,6 @@ def test_files_of_runs_that_never_started_are_moved(recorded, tmp_path):
 
 
 def test_special_files_are_ignored(recorded, tmp_path):
-    """Folders, pipes and broken links are ignored."""
     path, key = recorded("a.mcap")
     (tmp_path / "b.mcap").mkdir()
     os.mkfifo(tmp_path / "c.mcap")

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 
+from hilctl.base.errors import InputError
 from hilctl.studies.campaign.plan import planned
 from hilctl.studies.campaign.table import CampaignRow, write_table
 from hilctl.studies.multi_run.digest import FIGURES, RunFigures
@@ -27,16 +28,11 @@ def read_back(path):
 
 def test_every_step_is_a_row_whether_it_was_run_or_not(plan):
     """Numbers read back bit for bit; missing values are empty."""
-    paths = write_table(plan, {1: DONE}, {"campaign": "few"})
+    paths = write_table(plan, {1: DONE})
     rows = read_back(paths[0])
     assert paths[0].name == "few.csv"
-    assert list(rows[0])[:5] == [
-        "step",
-        "repeat",
-        "reference_run",
-        "waveform.amplitude",
-        "compensator",
-    ]
+    first = ["step", "repeat", "reference_run", "waveform.amplitude", "compensator"]
+    assert list(rows[0])[:5] == first
     assert [name for name in rows[0] if name in FIGURES] == list(FIGURES)
     assert float(rows[0]["peak_to_peak_um"]) == 0.1 + 0.2
     assert rows[0]["loop_area"] == ""
@@ -45,25 +41,23 @@ def test_every_step_is_a_row_whether_it_was_run_or_not(plan):
     assert rows[1]["compensator"] == "none"
 
 
-def test_it_is_replaced_whole(plan, monkeypatch):
-    path = write_table(plan, {}, {})[0]
+def test_a_full_disk_leaves_the_old_table(plan, monkeypatch):
+    path = write_table(plan, {})[0]
     before = path.read_bytes()
 
     def fail(*_):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", fail)
-    with pytest.raises(Exception, match="No space left"):
-        write_table(plan, {1: DONE}, {})
+    with pytest.raises(InputError, match="No space left"):
+        write_table(plan, {1: DONE})
     assert path.read_bytes() == before
     assert [each.name for each in path.parent.glob(".few*")] == []
 
 
 def test_parquet_has_the_same_and_its_facts(plan):
     parquet = pytest.importorskip("pyarrow.parquet")
-    csv_path, path = write_table(
-        plan, {1: DONE, 2: replace(DONE, result="fault: x")}, {"campaign": "few"}
-    )
+    csv_path, path = write_table(plan, {1: DONE, 2: replace(DONE, result="fault: x")})
     table = parquet.read_table(path)
     assert table.column("peak_to_peak_um").to_pylist() == [0.1 + 0.2] * 2 + [None] * 2
     assert table.column("waveform.amplitude").to_pylist() == [None, 1.0, 2.0, None]

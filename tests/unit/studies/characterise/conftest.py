@@ -7,8 +7,19 @@ import numpy as np
 import pytest
 
 from hilctl.experiment.load import load_experiment
+from hilctl.kernels.hysteresis import play_sum_shared, rest_memory
 from hilctl.studies.characterise.limits import limits_of
 from hilctl.studies.characterise.waveforms import reference_of, within
+
+
+def plays(command, gain=1.0):
+    """Return the displacement of two play operators, in um."""
+    out = np.empty(command.size)
+    thresholds, weights = np.array([0.3, 1.0]), np.array([4.0, 2.0]) * gain
+    still = np.zeros(command.size)
+    play_sum_shared(command, still, 3.0 * gain, thresholds, weights, rest_memory(2), out)
+    return out
+
 
 EXPERIMENT = """\
 name: rig

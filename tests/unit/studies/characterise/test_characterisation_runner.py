@@ -1,6 +1,5 @@
 """Characterisation runner: skipped and kept steps, problems, pauses."""
 
-import json
 import signal
 import time
 from dataclasses import replace
@@ -15,61 +14,20 @@ from hilctl.studies.characterise.characterisation_runner import (
     CharacterisationHost,
     CharacterisationRunner,
     unit_of,
-    waveform_setting,
     without_reference,
 )
 from hilctl.studies.characterise.steps import STEPS
 from hilctl.studies.characterise.waveforms import biased_loops
+from hilctl.studies.step_runner import setting
+from tests.unit.studies.conftest import StudyRig
 
 FEW = ("rest", "polarity", "growing-1", "growing-2")
 SHORT = tuple(step for step in STEPS if step.name.startswith(FEW))
 
 
-RECORDED = {}
-"""What an experiment with settings came to: the same whichever campaign asks for it."""
-
-
-def recorded(path, settings, output, on_part):
-    """Run an experiment once per module."""
-    asked = path.read_text(encoding="utf-8"), tuple(settings)
-    if asked not in RECORDED:
-        RECORDED[asked] = unpaced(path, settings, output, on_part), output.read_bytes()
-    result, recording = RECORDED[asked]
-    output.write_bytes(recording)
-    return replace(result, path=output)
-
-
-class Rig:
-    """A simulated rig that records runs and pauses, with an optional failure of one run."""
-
-    def __init__(self, ends_at=99, code="completed", stop_signal=0, error=None):
-        self.ends_at, self.code, self.stop_signal = ends_at, code, stop_signal
-        self.error = error
-        self.runs, self.rows, self.texts, self.pauses, self.time_s = [], [], [], [], 0.0
-
-    def __call__(self, path, settings, output, on_part, **_):
-        self.runs.append((output.name, list(settings)))
-        on_part(0.5)
-        if len(self.runs) == self.ends_at and self.error:
-            raise self.error
-        result = recorded(path, settings, output, on_part)
-        self.time_s += result.samples / 5000.0
-        if len(self.runs) == self.ends_at:
-            result = replace(result, code=self.code, stop_signal=self.stop_signal, reason="a test")
-        return result
-
-    def sleep(self, seconds):
-        self.pauses.append(seconds)
-        self.time_s += seconds
-
+class Rig(StudyRig):
     def host(self):
-        return CharacterisationHost(
-            run=self,
-            now_s=lambda: self.time_s,
-            sleep_s=self.sleep,
-            on_step=self.rows.append,
-            on_progress=lambda done, text: self.texts.append((done, text)),
-        )
+        return CharacterisationHost(**self.observers, on_step=self.rows.append)
 
 
 @pytest.fixture(autouse=True)
@@ -82,32 +40,41 @@ def short(monkeypatch):
     )
 
 
-def run(experiment, rig, *settings, folder="runs"):
-    campaign = CharacterisationRunner(
-        experiment, list(settings), experiment.parent / folder, None, rig.host()
+BUDGET = ["limits.rms_current_a=0.05", "limits.thermal_time_constant_s=20.0"]
+
+
+def runner_of(experiment, host, *settings, folder="runs"):
+    return CharacterisationRunner(
+        experiment, list(settings), experiment.parent / folder, None, host
     )
-    return campaign.characterise(experiment.parent / "model.yaml")
+
+
+def run(experiment, rig, *settings, folder="runs"):
+    runner = runner_of(experiment, rig.host(), *settings, folder=folder)
+    return runner.characterise(experiment.parent / "model.yaml")
 
 
 @pytest.mark.slow
 def test_each_step_is_a_run_with_noise_of_its_own(experiment):
     rig = Rig()
     found = run(experiment, rig)
-    assert [name for name, _ in rig.runs] == [
+    assert rig.names == [
         "01-rest.mcap", "02-polarity-1.mcap", "05-growing-1.mcap",
         "06-growing-2.mcap",
     ]  # fmt: skip
-    assert [settings[-1] for _, settings in rig.runs] == [
+    assert [each.settings[-1] for each in rig.runs] == [
         "device.seed=4", "device.seed=5", "device.seed=8", "device.seed=9",
     ]  # fmt: skip
     assert [row.name for row in rig.rows] == ["rest", "polarity-1", "growing-1", "growing-2"]
     assert found.steps == tuple(rig.rows)
     assert "noise 0.035" in rig.rows[0].text
+    done = [part for part, _ in rig.texts]
+    assert done == sorted(done)
+    assert rig.texts[0][1].startswith("rest: ")
     assert found.measured.reaction.gain_um > 3.0
 
 
 def test_completed_steps_are_not_run_again(experiment):
-    """Kept steps give the same measurements."""
     first = run(experiment, Rig())
     rig = Rig()
     again = run(experiment, rig)
@@ -116,42 +83,35 @@ def test_completed_steps_are_not_run_again(experiment):
     assert again.measured.reaction == first.measured.reaction
 
 
-def test_a_step_that_was_cut_short_is_run_again_and_no_other(experiment):
+@pytest.mark.parametrize(
+    ("size", "settings", "names"),
+    [
+        (20_000, [], ["02-polarity-1.mcap"]),
+        (7, [], ["02-polarity-1.mcap"]),
+        pytest.param(
+            None, ["limits.peak_current_a=3.0"],
+            ["01-rest.mcap", "02-polarity-1.mcap", "05-growing-1.mcap", "06-growing-2.mcap"],
+            marks=pytest.mark.slow,
+        ),
+    ],
+    ids=["truncated", "no recording", "another experiment"],
+)  # fmt: skip
+def test_a_step_without_its_recording_is_run_again(experiment, size, settings, names):
     run(experiment, Rig())
     path = experiment.parent / "runs" / "02-polarity-1.mcap"
-    path.write_bytes(path.read_bytes()[:20_000])
+    path.write_bytes(path.read_bytes()[:size])
     rig = Rig()
-    run(experiment, rig)
-    assert [name for name, _ in rig.runs] == ["02-polarity-1.mcap"]
+    run(experiment, rig, *settings)
+    assert rig.names == names
 
 
-def test_a_file_that_is_no_recording_is_run_over(experiment):
-    folder = experiment.parent / "runs"
-    folder.mkdir()
-    (folder / "01-rest.mcap").write_text("nothing")
-    rig = Rig()
-    run(experiment, rig)
-    assert len(rig.runs) == 4
-
-
-@pytest.mark.slow
-def test_recordings_of_another_experiment_do_not_count(experiment):
+def test_discarding_starts_again(experiment):
     run(experiment, Rig())
-    rig = Rig()
-    run(experiment, rig, "limits.peak_current_a=3.0")
-    assert len(rig.runs) == 4
-
-
-def test_discarding_begins_anew(experiment):
-    run(experiment, Rig())
-    rig = Rig()
-    campaign = CharacterisationRunner(experiment, [], experiment.parent / "runs", None, rig.host())
-    campaign.discard()
+    runner_of(experiment, Rig().host()).discard()
     assert not list((experiment.parent / "runs").glob("*.mcap"))
 
 
 def test_a_problem_of_the_rig_is_a_result(experiment):
-    """The result has the earlier measurements."""
     fault = "device.fault={kind: sensor_inverted, at_sample: 0}"
     found = run(experiment, Rig(), fault)
     assert found.problem_code == "wrong_polarity"
@@ -161,14 +121,13 @@ def test_a_problem_of_the_rig_is_a_result(experiment):
 
 
 def test_a_sensor_at_its_end_is_named(experiment):
-    """The fault of the interlock names the step."""
     fault = "device.fault={kind: sensor_nan, at_sample: 3000}"
     with pytest.raises(RunError, match="rest: "):
         run(experiment, Rig(), fault)
 
 
 def test_a_stopped_step_ends_it(experiment):
-    rig = Rig(ends_at=2, code="stopped", stop_signal=signal.SIGTERM)
+    rig = Rig(2, code="stopped", stop_signal=signal.SIGTERM, reason="a test")
     with pytest.raises(StepStoppedError, match="polarity-1: a test") as caught:
         run(experiment, rig)
     assert caught.value.signal == signal.SIGTERM
@@ -185,23 +144,20 @@ def test_a_later_step_that_is_refused_is_no_bad_input(experiment):
 @pytest.mark.slow
 def test_the_coil_is_let_cool(experiment):
     """The second growing loop waits for the heat of the first."""
-    budget = ["limits.rms_current_a=0.05", "limits.thermal_time_constant_s=20.0"]
     rig = Rig()
-    run(experiment, rig, *budget)
+    run(experiment, rig, *BUDGET)
     assert rig.pauses
     assert sum(rig.pauses) < 100.0
     assert any("cools" in text for _, text in rig.texts)
 
 
 def test_a_coil_that_has_cooled_since_is_not_waited_for(experiment):
-    """A run an hour ago causes no pause."""
-    budget = ["limits.rms_current_a=0.05", "limits.thermal_time_constant_s=20.0"]
-    run(experiment, Rig(), *budget)
+    run(experiment, Rig(), *BUDGET)
     (experiment.parent / "runs" / "06-growing-2.mcap").unlink()
     rig = Rig()
     rig.time_s = time.time() + 3600.0
-    run(experiment, rig, *budget)
-    assert [name for name, _ in rig.runs] == ["06-growing-2.mcap"]
+    run(experiment, rig, *BUDGET)
+    assert rig.names == ["06-growing-2.mcap"]
     assert rig.pauses == []
 
 
@@ -209,23 +165,13 @@ def test_a_coil_that_has_cooled_since_is_not_waited_for(experiment):
 def test_where_the_output_is_given_by_hand_it_is_at_rest_after_the_first_step(experiment):
     rig = Rig()
     run(experiment, rig, "safe={value: 0.0, at_start: 0.5}", "device.output_at_open=null")
-    given = [[each for each in settings if "at_start=" in each] for _, settings in rig.runs]
+    given = [[s for s in each.settings if "at_start=" in s] for each in rig.runs]
     assert given == [[], *([["safe.at_start=0.0"]] * 3)]
-
-
-def test_progress_says_the_time_left(experiment):
-    rig = Rig()
-    run(experiment, rig)
-    done = [part for part, _ in rig.texts]
-    assert done == sorted(done)
-    assert rig.texts[0][1].startswith("rest: ")
-    assert rig.texts[0][1].endswith(" left")
 
 
 def test_the_plan_says_steps_time_and_disk(experiment):
     rig = Rig()
-    campaign = CharacterisationRunner(experiment, [], experiment.parent / "runs", None, rig.host())
-    plan = campaign.plan
+    plan = runner_of(experiment, rig.host()).plan
     assert [step.name for step in plan.steps] == [step.name for step in SHORT]
     assert plan.seconds == pytest.approx(sum(step.seconds for step in plan.steps))
     assert plan.megabytes == pytest.approx(plan.seconds * 5000 * 45e-6)
@@ -235,10 +181,10 @@ def test_the_plan_says_steps_time_and_disk(experiment):
 
 def test_a_full_disk_is_said_before_anything_moves(experiment):
     rig = Rig()
-    campaign = CharacterisationRunner(experiment, [], experiment.parent / "runs", None, rig.host())
-    campaign.__dict__["plan"] = replace(campaign.plan, free_mb=0.1)
+    runner = runner_of(experiment, rig.host())
+    runner.__dict__["plan"] = replace(runner.plan, free_mb=0.1)
     with pytest.raises(InputError, match="no room"):
-        campaign.characterise(experiment.parent / "model.yaml")
+        runner.characterise(experiment.parent / "model.yaml")
     assert rig.runs == []
 
 
@@ -250,25 +196,19 @@ def test_a_real_device_keeps_real_time(experiment, monkeypatch):
         SimulatedTerfenol, "info", property(lambda self: replace(info.fget(self), simulated=False))
     )
     with pytest.raises(InputError, match="--fast: simulated_terfenol"):
-        CharacterisationRunner(
-            experiment, [], experiment.parent / "runs", None, CharacterisationHost(run=unpaced)
-        )
+        runner_of(experiment, CharacterisationHost(run=unpaced))
 
 
 def test_a_broken_experiment_is_refused_at_once(experiment):
     with pytest.raises(InputError, match="sample_rate_hz"):
-        CharacterisationRunner(experiment, ["sample_rate_hz=5e5"], experiment.parent / "runs")
+        runner_of(experiment, None, "sample_rate_hz=5e5")
 
 
 @pytest.mark.slow
 def test_fast_runs_wait_for_no_coil(experiment):
-    """Runs without real time have no coil."""
     rig = Rig()
-    host = replace(rig.host(), run=unpaced)
-    settings = ["limits.rms_current_a=0.05", "limits.thermal_time_constant_s=20.0"]
-    CharacterisationRunner(experiment, settings, experiment.parent / "r", None, host).characterise(
-        experiment.parent / "model.yaml"
-    )
+    runner = runner_of(experiment, replace(rig.host(), run=unpaced), *BUDGET)
+    runner.characterise(experiment.parent / "model.yaml")
     assert rig.pauses == []
 
 
@@ -287,18 +227,15 @@ limits:
 
 
 def test_settings_that_need_a_reference_are_removed(tmp_path, limits):
-    """A missing model file is no error."""
     path = tmp_path / "compensated.yaml"
     path.write_text(COMPENSATED, encoding="utf-8")
     settings = without_reference(path, [])
     keys = biased_loops(limits, 2.0)
-    loaded = load_experiment(path, [*settings, waveform_setting(keys)])
-    assert loaded.model is None
-    assert loaded.config.feedback is None
-    assert loaded.config.adaptation is None
-    assert loaded.config.limits.tracking_error_um is None
-    assert loaded.config.limits.tracking_s is None
-    assert loaded.config.limits.frozen_s == 1.0
+    loaded = load_experiment(path, [*settings, setting("waveform", keys)])
+    config, limits = loaded.config, loaded.config.limits
+    assert loaded.model is config.feedback is config.adaptation is None
+    assert limits.tracking_error_um is limits.tracking_s is None
+    assert limits.frozen_s == 1.0
     assert len(loaded.config.waveform.parts) == len(keys["parts"])
 
 
@@ -307,8 +244,3 @@ def test_an_experiment_without_all_that_is_left_as_it_is(experiment):
     assert unit_of(experiment, []) == "A"
     volts = ["limits={drive_v: [0, 1], slew_v_per_s: 1.0, stroke_um: [0, 1]}"]
     assert unit_of(experiment, volts) == "V"
-
-
-def test_the_waveform_is_written_as_json(limits):
-    text = waveform_setting({"kind": "hold", "level": 1e-7})
-    assert json.loads(text.partition("=")[2]) == {"kind": "hold", "level": 1e-7}

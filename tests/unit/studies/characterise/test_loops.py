@@ -7,7 +7,6 @@ import pytest
 
 from hilctl.base.errors import DataError
 from hilctl.base.segments import Segment
-from hilctl.kernels.hysteresis import play_sum_shared, rest_memory
 from hilctl.studies.characterise.loops import (
     LoopFigures,
     all_loops,
@@ -19,15 +18,7 @@ from hilctl.studies.characterise.loops import (
 from hilctl.studies.characterise.response import RigProblemError
 from hilctl.studies.characterise.waveforms import biased_loops, sine
 from hilctl.studies.characterise.waveforms import reversal_curves as reversal_keys
-
-
-def plays(command):
-    """Return the displacement of two play operators, in um."""
-    out = np.empty(command.size)
-    thresholds, weights = np.array([0.3, 1.0]), np.array([4.0, 2.0])
-    still = np.zeros(command.size)
-    play_sum_shared(command, still, 3.0, thresholds, weights, rest_memory(2), out)
-    return out
+from tests.unit.studies.characterise.conftest import plays
 
 
 def loop(limits, played, actuator=plays, amplitude=2.0, noise_um=0.01):
@@ -85,9 +76,18 @@ def grown(*sizes):
     return [replace(LOOP, amplitude=a, low_um=-y, high_um=y) for a, y in sizes]
 
 
-def test_amplitudes_grow_as_wanted_while_there_is_room():
-    assert next_amplitude([], 0.4, (-50.0, 50.0)) == 0.4
-    assert next_amplitude(grown((0.4, 2.0)), 1.0, (-50.0, 50.0)) == 1.0
+@pytest.mark.parametrize(
+    ("loops", "wanted", "chosen"),
+    [
+        ([], 0.4, 0.4),
+        ([(0.4, 2.0)], 1.0, 1.0),
+        ([(1.0, 10.0), (2.0, 46.0)], 4.0, None),
+        ([(2.0, 60.0)], 4.0, None),
+        ([(2.0, 5.0), (2.0, 5.0)], 2.0, None),
+    ],
+)
+def test_amplitudes_grow_while_there_is_room(loops, wanted, chosen):
+    assert next_amplitude(grown(*loops), wanted, (-50.0, 50.0)) == chosen
 
 
 def test_growth_stops_short_of_the_stroke():
@@ -96,12 +96,6 @@ def test_growth_stops_short_of_the_stroke():
     chosen = next_amplitude(loops, 4.0, (-50.0, 50.0))
     assert 2.06 < chosen < 2.2
     assert 10.0 * chosen**2 < 48.0
-
-
-def test_growth_ends_where_it_is_not_worth_a_run():
-    assert next_amplitude(grown((1.0, 10.0), (2.0, 46.0)), 4.0, (-50.0, 50.0)) is None
-    assert next_amplitude(grown((2.0, 60.0)), 4.0, (-50.0, 50.0)) is None
-    assert next_amplitude(grown((2.0, 5.0), (2.0, 5.0)), 2.0, (-50.0, 50.0)) is None
 
 
 def test_an_uneven_stroke_counts_on_its_narrow_side():

@@ -3,19 +3,11 @@
 import numpy as np
 import pytest
 
-from hilctl.kernels.hysteresis import play_sum_shared, rest_memory
 from hilctl.studies.characterise.response import RigProblemError
 from hilctl.studies.characterise.results import Measured
 from hilctl.studies.characterise.steps import STEPS, full_amplitude
-
-
-def plays(command, gain=1.0):
-    """Return the displacement of two play operators, in um."""
-    out = np.empty(command.size)
-    thresholds, weights = np.array([0.3, 1.0]), np.array([4.0, 2.0]) * gain
-    still = np.zeros(command.size)
-    play_sum_shared(command, still, 3.0 * gain, thresholds, weights, rest_memory(2), out)
-    return out
+from tests.unit.studies.characterise.conftest import plays
+from tests.unit.studies.characterise.test_response import resonator
 
 
 @pytest.fixture
@@ -66,7 +58,6 @@ def test_a_sound_actuator_goes_through_all_steps(walked, limits):
 
 
 def test_the_stroke_holds_amplitudes_down(walked, limits_with):
-    """The stroke is smaller than the full range."""
     limits = limits_with("limits.stroke_um=[-20.0, 20.0]")
     measured, _ = walked(limits)
     reached = max(each.high_um for each in (*measured.growing, *measured.slow, *measured.fast))
@@ -76,32 +67,26 @@ def test_the_stroke_holds_amplitudes_down(walked, limits_with):
 
 @pytest.mark.slow
 def test_a_faint_reaction_is_asked_for_again(walked, limits):
-    """A response below the noise at 1 % is repeated at larger amplitudes."""
     measured, names = walked(limits, lambda v: 0.2 * v, noise_um=0.15, last="response-2")
     assert names == ["rest", "polarity-1", "polarity-2", "response-1", "response-2"]
     assert measured.small.gain_um == pytest.approx(0.2, rel=0.1)
 
 
-def test_a_dead_coil(walked, limits):
-    error = problem_of(walked, limits, lambda v: 0.0 * v)
-    assert error.code == "no_reaction"
-    assert "10 % of the range" in str(error)
-    assert "amplifier" in str(error)
-
-
-def test_swapped_wires_stop_it_at_a_hundredth_of_the_range(walked, limits):
-    error = problem_of(walked, limits, lambda v: -plays(v))
-    assert error.code == "wrong_polarity"
-    assert "at 1 %" in str(error)
-
-
-def test_a_rod_without_a_bias(walked, limits):
-    assert problem_of(walked, limits, lambda v: 2.0 * v**2).code == "no_bias"
-
-
-def test_noise_that_hides_everything(walked, limits):
-    error = problem_of(walked, limits, lambda v: 0.01 * v, noise_um=20.0)
-    assert error.code == "noise"
+@pytest.mark.parametrize(
+    ("actuator", "noise_um", "code", "said"),
+    [
+        (lambda v: 0.0 * v, 0.01, "no_reaction", "10 % of the range"),
+        (lambda v: -plays(v), 0.01, "wrong_polarity", "at 1 %"),
+        (lambda v: 2.0 * v**2, 0.01, "no_bias", "--model butterfly"),
+        (lambda v: 0.01 * v, 20.0, "noise", "rms"),
+        (lambda v: np.minimum(plays(v), 12.0), 0.0, "saturated_sensor", "12 µm"),
+    ],
+    ids=["dead coil", "swapped wires", "no bias", "noise", "sensor ends early"],
+)
+def test_problems_of_the_rig(walked, limits, actuator, noise_um, code, said):
+    error = problem_of(walked, limits, actuator, noise_um=noise_um)
+    assert error.code == code
+    assert said in str(error)
 
 
 def test_noise_that_leaves_no_loop(walked, limits):
@@ -112,8 +97,6 @@ def test_noise_that_leaves_no_loop(walked, limits):
 
 @pytest.mark.slow
 def test_a_resonance_in_the_band(walked, limits, limits_with):
-    from tests.unit.studies.characterise.test_response import resonator
-
     structure = resonator(45.0, 0.05)
     error = problem_of(walked, limits, lambda v: 4.0 * structure(v))
     assert error.code == "resonance"
@@ -124,18 +107,12 @@ def test_a_resonance_in_the_band(walked, limits, limits_with):
     assert measured.small.natural_hz == pytest.approx(45.0, rel=0.05)
 
 
-def test_a_sensor_that_ends_early(walked, limits):
-    error = problem_of(walked, limits, lambda v: np.minimum(plays(v), 12.0), noise_um=0.0)
-    assert error.code == "saturated_sensor"
-
-
-@pytest.mark.slow
-def test_an_actuator_that_is_another_at_the_end(walked, limits):
-    error = problem_of(walked, limits, changed={"repeated": lambda v: plays(v, 1.3)})
-    assert error.code == "not_repeatable"
-    assert "in shape" in str(error)
-
-
-def test_a_mounting_that_slips(walked, limits):
-    slipping = {"growing-5": lambda v: plays(v) + 10.0 * (np.arange(v.size) > 0.6 * v.size)}
-    assert problem_of(walked, limits, changed=slipping).code == "not_repeatable"
+@pytest.mark.parametrize(
+    ("step", "actuator"),
+    [
+        pytest.param("repeated", lambda v: plays(v, 1.3), marks=pytest.mark.slow),
+        ("growing-5", lambda v: plays(v) + 10.0 * (np.arange(v.size) > 0.6 * v.size)),
+    ],
+)
+def test_an_actuator_that_changes(walked, limits, step, actuator):
+    assert problem_of(walked, limits, changed={step: actuator}).code == "not_repeatable"

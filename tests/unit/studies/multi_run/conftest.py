@@ -1,10 +1,12 @@
 """Synthetic runs of a report."""
 
-from collections.abc import Callable
+from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from hilctl.studies.multi_run.collect import RunSeries, SeriesRun
 from hilctl.studies.multi_run.digest import RunDigest, RunFigures
@@ -12,31 +14,25 @@ from hilctl.studies.multi_run.digest import RunDigest, RunFigures
 PHASE = np.linspace(0.0, 2.0 * np.pi, 101)
 
 
-def digest(
-    *, compensated: bool = False, lag: float = 0.2, values: Any = None, **keys: Any
-) -> RunDigest:
+def drawn(panel):
+    """Return the axes of a panel."""
+    axes = Figure().subplots()
+    panel.draw(axes)
+    return axes
+
+
+def digest(*, compensated: bool = False, lag: float = 0.2, **keys: Any) -> RunDigest:
     """Return the digest of a sine of 40 um that lags."""
     moved = 40.0 * np.sin(PHASE - lag)
     wave = (40.0 if compensated else 6.0) * np.sin(PHASE)
     error_um = np.array((PHASE / (2.0 * np.pi), moved - wave)) if compensated else np.empty((2, 0))
-    given = {
-        "name": "rig",
-        "path": "run.mcap",
-        "started": "2026-11-22T10:00:00+00:00",
-        "labels": {},
-        "device": "serial_dac",
-        "simulated": False,
-        "code": "completed",
-        "reason": "waveform completed",
-        "values": values or {"waveform": {"unit": "A"}},
-        "compensated": compensated,
-        "command_unit": "A",
-        "waveform": "sine",
-        "figures": RunFigures(),
-        "loop": np.array((wave, moved)),
-        "error_um": error_um,
-    }
-    return RunDigest(**given | keys)
+    made = RunDigest(
+        name="rig", path="run.mcap", started="2026-11-22T10:00:00+00:00", labels={},
+        device="serial_dac", simulated=False, code="completed", reason="waveform completed",
+        values={"waveform": {"unit": "A"}}, compensated=compensated, command_unit="A",
+        waveform="sine", figures=RunFigures(), loop=np.array((wave, moved)), error_um=error_um,
+    )  # fmt: skip
+    return replace(made, **keys)
 
 
 def grown(amplitude: float, hz: float, number: int = 1, **keys: Any) -> SeriesRun:
@@ -48,27 +44,16 @@ def grown(amplitude: float, hz: float, number: int = 1, **keys: Any) -> SeriesRu
         low_um=-6.0 * amplitude,
         high_um=4.0 * amplitude,
     )
-    given = {
-        "number": number,
-        "is_reference": False,
-        "values": {"waveform.amplitude": amplitude, "waveform.frequency_hz": hz},
-        "figures": figures,
-        "result": "completed",
-        "recording": f"run-{number}.mcap",
-        "digest": digest(),
-    }
-    return SeriesRun(**given | keys)
+    values = {"waveform.amplitude": amplitude, "waveform.frequency_hz": hz}
+    made = SeriesRun(number, False, values, figures, "completed", f"run-{number}.mcap", digest())
+    return replace(made, **keys)
 
 
 @pytest.fixture
 def crossed() -> RunSeries:
     """Return runs of two amplitudes by three frequencies."""
-    runs = [
-        grown(amplitude, hz, number)
-        for number, (amplitude, hz) in enumerate(
-            [(a, f) for a in (3.0, 6.0) for f in (10.0, 100.0, 200.0)], 1
-        )
-    ]
+    points = product((3.0, 6.0), (10.0, 100.0, 200.0))
+    runs = [grown(*point, number) for number, point in enumerate(points, 1)]
     return RunSeries("loops", tuple(runs), tuple(runs[0].values), is_campaign=True)
 
 
@@ -83,26 +68,8 @@ def compensated() -> RunSeries:
                 peak_error_percent=None if name == "none" else 1.0,
                 peak_to_peak_um=80.0,
             )
-            runs.append(
-                grown(
-                    6.0,
-                    hz,
-                    len(runs) + 1,
-                    figures=figures,
-                    values={"compensator": name, "waveform.frequency_hz": hz},
-                    digest=digest(compensated=name != "none", lag=0.02, figures=figures),
-                )
-            )
+            values = {"compensator": name, "waveform.frequency_hz": hz}
+            found = digest(compensated=name != "none", lag=0.02, figures=figures)
+            number = len(runs) + 1
+            runs.append(grown(6.0, hz, number, figures=figures, values=values, digest=found))
     return RunSeries("before", tuple(runs), tuple(runs[0].values), is_campaign=True)
-
-
-@pytest.fixture
-def make_run() -> Callable[..., SeriesRun]:
-    """Return the builder of runs."""
-    return grown
-
-
-@pytest.fixture
-def make_digest() -> Callable[..., RunDigest]:
-    """Return the builder of digests."""
-    return digest

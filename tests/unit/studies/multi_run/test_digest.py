@@ -6,51 +6,41 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pydantic import TypeAdapter
 
 from hilctl.base.events import OFFSET, Event
 from hilctl.base.segments import Segment
 from hilctl.models.model_file import load_model
 from hilctl.recording.metadata_keys import HEAT_FACT
-from hilctl.studies.multi_run.digest import (
-    FIGURES,
-    POINTS,
-    RunFigures,
-    digest_of,
-    drift_of,
-    figures_of,
-    structure_of,
-)
-from hilctl.waveforms.spec import AnyWaveform
+from hilctl.studies.multi_run.digest import FIGURES, POINTS, RunFigures, digest_of, drift_of
 
 RATE_HZ = 50_000.0
 TIME = np.arange(10_000) / RATE_HZ
+PERIODIC = Segment("sine", 0, TIME.size, 0, TIME.size, 500.0)
 
 
-def figures(recording, waveform):
-    return figures_of(recording, structure_of(recording, waveform))
+@pytest.fixture
+def figures(make_recording):
+    """Return the metrics of a run with a waveform."""
+
+    def made(moved, waveform, segment=PERIODIC, **more):
+        text = f"waveform: {waveform}\n"
+        return digest_of(
+            make_recording(moved, segments=[segment], experiment_yaml=text, **more)
+        ).figures
+
+    return made
 
 
-def waveform(**keys):
-    return TypeAdapter(AnyWaveform).validate_python(keys)
+SINE = "{kind: sine, unit: A, amplitude: 1.0, frequency_hz: 100.0, duration_s: 0.2}"
 
 
-SINE = waveform(kind="sine", amplitude=1.0, frequency_hz=100.0, duration_s=0.2)
-
-
-def test_a_sine_straight_to_the_coil(make_recording):
-    command = np.sin(2 * np.pi * 100.0 * TIME)
-    moved = 10.0 * np.sin(2 * np.pi * 100.0 * TIME - 0.1) - 2.0
+def test_a_sine_straight_to_the_coil(figures):
     found = figures(
-        make_recording(
-            moved,
-            command=command,
-            segments=[Segment("sine", 0, TIME.size, 0, TIME.size, 500.0)],
-            sample_rate_hz=RATE_HZ,
-            run={HEAT_FACT: "4.0"},
-            end={"skipped_ticks": "3", HEAT_FACT: "9.0"},
-        ),
+        10.0 * np.sin(2 * np.pi * 100.0 * TIME - 0.1) - 2.0,
         SINE,
+        command=np.sin(2 * np.pi * 100.0 * TIME),
+        run={HEAT_FACT: "4.0"},
+        end={"skipped_ticks": "3", HEAT_FACT: "9.0"},
     )
     assert (found.low_um, found.high_um) == pytest.approx((-12.0, 8.0), abs=1e-3)
     assert found.mean_um == pytest.approx(-2.0, abs=1e-6)
@@ -63,53 +53,31 @@ def test_a_sine_straight_to_the_coil(make_recording):
     assert found.natural_hz is None
 
 
-def test_a_compensated_run_has_errors_and_its_offset(make_recording):
+def test_a_compensated_run_has_errors_and_its_offset(figures):
     wanted = 10.0 * np.sin(2 * np.pi * 100.0 * TIME)
     event = Event(0, "info", OFFSET, "", {"offset_um": 0.7})
-    found = figures(
-        make_recording(
-            wanted + 0.2,
-            reference_um=wanted,
-            segments=[Segment("sine", 0, TIME.size, 0, TIME.size, 500.0)],
-            sample_rate_hz=RATE_HZ,
-            events=(event,),
-        ),
-        SINE,
-    )
+    found = figures(wanted + 0.2, SINE, reference_um=wanted, events=(event,))
     assert found.peak_error_percent == pytest.approx(1.0, rel=1e-3)
     assert found.rms_error_percent == pytest.approx(1.0, rel=1e-3)
     assert found.offset_um == 0.7
     assert found.heat_after_a is None
 
 
-def test_minor_loops_at_either_end(make_recording):
+def test_minor_loops_at_either_end(figures):
     command = 4.0 * np.sin(2 * np.pi * 100.0 * TIME) + 3.0 * np.sin(2 * np.pi * 300.0 * TIME)
-    found = figures(
-        make_recording(
-            command + 0.05 * command**2,
-            command=command,
-            segments=[Segment("complex", 0, TIME.size, 0, TIME.size, 500.0)],
-            sample_rate_hz=RATE_HZ,
-        ),
-        waveform(kind="complex_harmonic", components=({"amplitude": 1.0, "frequency_hz": 1.0},),
-                 duration_s=1.0),
-    )  # fmt: skip
+    waveform = "{kind: complex_harmonic, components: [{amplitude: 1, frequency_hz: 1}]}"
+    found = figures(command + 0.05 * command**2, waveform, command=command)
     assert found.minor_high_um > 1.2 * found.minor_low_um > 1.0
 
 
-def test_a_step_s_ringing(make_recording):
-    """The ringing after the largest step is evaluated."""
+def test_a_step_s_ringing(figures):
     omega = 2.0 * np.pi * 300.0
     ring = 1.0 - np.exp(-0.1 * omega * TIME) * np.cos(omega * np.sqrt(0.99) * TIME)
-    moved = np.concatenate([np.zeros(TIME.size), 5.0 * ring])
     found = figures(
-        make_recording(
-            moved,
-            command=np.repeat([0.0, 1.0], TIME.size),
-            segments=[Segment("step", 0, 2 * TIME.size, 0, 2 * TIME.size, 0.0)],
-            sample_rate_hz=RATE_HZ,
-        ),
-        waveform(kind="step", levels=(0.0, 1.0), dwell_s=0.2),
+        np.concatenate([np.zeros(TIME.size), 5.0 * ring]),
+        "{kind: step, unit: A, levels: [0.0, 1.0], dwell_s: 0.2}",
+        Segment("step", 0, 2 * TIME.size, 0, 2 * TIME.size, 0.0),
+        command=np.repeat([0.0, 1.0], TIME.size),
     )
     assert found.natural_hz == pytest.approx(300.0, rel=0.01)
     assert found.damping_ratio == pytest.approx(0.1, rel=0.02)

@@ -16,7 +16,6 @@ def complex_harmonic(first, third):
     ("first", "third", "span"), [(4.0, 3.0, 4.2), (5.0, 2.0, 1.96), (3.0, 4.0, 6.6)]
 )
 def test_one_at_either_end_of_a_complex_harmonic(first, third, span):
-    """Minor loops of a line have no hysteresis."""
     u = complex_harmonic(first, third)
     low, high = minor_loops(u, 2.0 * u)
     assert low.middle == pytest.approx(-high.middle, abs=0.02)

@@ -6,23 +6,20 @@ from dataclasses import replace
 
 import pytest
 
-from hilctl.analysis import html
 from hilctl.studies.multi_run.multi_run_page import (
     run_table,
     series_mapping,
     series_page,
     write_series,
 )
+from tests.unit.studies.multi_run.conftest import digest
+
+pytestmark = pytest.mark.usefixtures("undrawn")
 
 
-@pytest.fixture(autouse=True)
-def undrawn_figures(monkeypatch):
-    monkeypatch.setattr(html, "drawn", lambda sheet: None)
-    monkeypatch.setattr(html, "svg", lambda figure: "<svg></svg>")
-
-
-def test_what_came_out_stands_first(crossed):
-    page = series_page(crossed)
+def test_what_came_out_stands_first(crossed, tmp_path):
+    write_series(crossed, tmp_path / "loops.html")
+    page = (tmp_path / "loops.html").read_text(encoding="utf-8")
     assert page.index("6 runs") < page.index("<svg>")
     assert page.count("<figure") == 5
     assert "Linear fits" in page
@@ -50,20 +47,12 @@ def test_the_table_has_a_column_for_what_varied_and_for_what_came_out(crossed):
     assert short == ["run", "frequency, Hz", "amplitude, A", "p-p µm", "hyst. %", "area"]
 
 
-def test_labels_and_simulation_are_said(crossed, make_digest):
-    digest = make_digest(labels={"operator": "Ada"}, simulated=True)
-    runs = tuple(replace(run, digest=digest) for run in crossed.runs)
+def test_labels_and_simulation_are_said(crossed):
+    made = digest(labels={"operator": "Ada"}, simulated=True)
+    runs = tuple(replace(run, digest=made) for run in crossed.runs)
     page = series_page(replace(crossed, runs=runs))
     assert "<th>operator</th><td>Ada</td>" in page
     assert "simulated" in page
-
-
-def test_it_is_replaced_whole(crossed, tmp_path):
-    path = tmp_path / "loops.html"
-    path.write_text("old")
-    write_series(crossed, path)
-    assert path.read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
-    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_it_is_plain_and_has_runs_trends_and_failures(crossed):
@@ -79,7 +68,5 @@ def test_it_is_plain_and_has_runs_trends_and_failures(crossed):
     assert found["failed"] == [2]
     assert found["runs"][0]["rms_error_percent"] is None
     assert found["runs"][2]["values"]["waveform.frequency_hz"] == 200.0
-    assert {trend["figure"] for trend in found["trends"]} == {
-        "loop_area",
-        "peak_hysteresis_percent",
-    }
+    trends = {trend["figure"] for trend in found["trends"]}
+    assert trends == {"loop_area", "peak_hysteresis_percent"}

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 from hilctl.base.errors import InputError
 from hilctl.studies.characterise.response import SmallSignal
@@ -21,12 +20,7 @@ from hilctl.studies.multi_run.plots import (
     trend_sheets,
     write_sheets,
 )
-
-
-def drawn(panel):
-    axes = Figure().subplots()
-    panel.draw(axes)
-    return axes
+from tests.unit.studies.multi_run.conftest import digest, drawn, grown
 
 
 def test_fits_are_drawn_along_frequency_only(crossed):
@@ -89,64 +83,45 @@ def test_resonances_against_what_varied(crossed):
         for run in crossed.runs
     ]
     sheet = resonance_sheet(replace(crossed, runs=tuple(runs)))
-    assert [drawn(panel).get_ylabel() for panel in sheet.panels] == [
-        "natural frequency, Hz",
-        "damping ratio",
-    ]
+    labels = [drawn(panel).get_ylabel() for panel in sheet.panels]
+    assert labels == ["natural frequency, Hz", "damping ratio"]
 
 
 def test_they_are_found_from_what_varied(crossed, compensated):
-    assert [sheet.name for sheet in sheets_of(crossed)] == [
-        "hysteresis_against_frequency",
-        "hysteresis_against_amplitude",
-        "loops_by_frequency",
-        "loops_by_amplitude",
-        "sensitivity",
-    ]
-    assert [sheet.name for sheet in sheets_of(compensated)] == [
-        "before_and_after",
-        "hysteresis_against_frequency",
-        "compensation_against_frequency",
-        "loops_by_frequency",
-        "error_history",
-    ]
-
-
-def test_nothing_run_draws_nothing(crossed):
-    planned = tuple(replace(run, result="planned", digest=None) for run in crossed.runs)
-    assert sheets_of(replace(crossed, runs=planned)) == []
+    for series, names in (
+        (crossed, "hysteresis_against_frequency hysteresis_against_amplitude loops_by_frequency "
+                  "loops_by_amplitude sensitivity"),
+        (compensated, "before_and_after hysteresis_against_frequency "
+                      "compensation_against_frequency loops_by_frequency error_history"),
+    ):  # fmt: skip
+        assert [sheet.name for sheet in sheets_of(series)] == names.split()
 
 
 def series(run):
     return RunSeries("loads", (run,), ("waveform.amplitude",))
 
 
-def test_a_step_with_its_resonance(make_run, make_digest):
+def test_a_step_with_its_resonance():
     t = np.linspace(0.0, 0.01, 50)
     ringing = RunFigures(natural_hz=469.5, damping_ratio=0.12)
-    digest = make_digest(step=np.array((t, np.sin(t))), figures=ringing)
-    run = make_run(1.0, 10.0, digest=digest)
+    made = digest(step=np.array((t, np.sin(t))), figures=ringing)
+    run = grown(1.0, 10.0, digest=made)
     axes = drawn(step_sheet(series(run)).panels[0])
     assert axes.lines[0].get_xdata()[-1] == 10.0
     assert axes.get_xlabel().endswith(", ms")
     assert axes.texts[0].get_text() == "470 Hz, damping ratio 0.120"
 
 
-def test_magnitude_and_phase_measured_and_fitted(make_run, make_digest):
+def test_magnitude_and_phase_measured_and_fitted():
     frequency_hz = np.array([10.0, 100.0, 1000.0])
     answer = 4.0 / (1.0 + 1j * frequency_hz / 100.0)
     small = SmallSignal(frequency_hz, answer, np.full(3, 0.1), 1.0, 4.0, 0.0, 0.0, None, None, 1.0,
                         answer)  # fmt: skip
-    run = make_run(1.0, 10.0, digest=make_digest(response=small))
+    run = grown(1.0, 10.0, digest=digest(response=small))
     magnitude, phase = map(drawn, frequency_sheet(series(run)).panels)
     assert magnitude.get_ylabel() == "magnitude, µm/A"
     assert np.allclose(magnitude.lines[0].get_ydata(), np.abs(answer))
     assert np.allclose(phase.lines[1].get_ydata()[1], -45.0)
-
-
-def test_runs_without_either_have_none(crossed):
-    assert step_sheet(crossed) is None
-    assert frequency_sheet(crossed) is None
 
 
 @pytest.mark.slow
@@ -154,10 +129,8 @@ def test_each_figure_is_a_file_of_each_format(crossed, tmp_path):
     few = replace(crossed, runs=crossed.runs[:3])
     folder = tmp_path / "figures"
     written = write_sheets(applying_sheets(few), folder, ["svg"], "single", overwrite=False)
-    assert [path.name for path in written] == [
-        "hysteresis_against_frequency.svg",
-        "loops_by_frequency.svg",
-    ]
+    names = ["hysteresis_against_frequency.svg", "loops_by_frequency.svg"]
+    assert [path.name for path in written] == names
     assert all(path.is_file() for path in written)
     assert all(caption.endswith(".") for caption in written.values())
     with pytest.raises(InputError, match="exists already"):
@@ -165,6 +138,7 @@ def test_each_figure_is_a_file_of_each_format(crossed, tmp_path):
 
 
 def test_no_figure_is_refused(crossed):
-    nothing = replace(crossed, runs=())
-    with pytest.raises(InputError, match="no figure applies"):
-        applying_sheets(nothing)
+    planned = tuple(replace(run, result="planned", digest=None) for run in crossed.runs)
+    for runs in ((), planned):
+        with pytest.raises(InputError, match="no figure applies"):
+            applying_sheets(replace(crossed, runs=runs))

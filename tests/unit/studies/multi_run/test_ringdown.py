@@ -21,7 +21,6 @@ def answer(natural_hz, damping, creep_um=1.0, noise_um=0.0):
 @pytest.mark.parametrize("natural_hz", [100.0, 300.0, 2300.0])
 @pytest.mark.parametrize("damping", [0.02, 0.12, 0.4])
 def test_frequency_and_damping_are_found(natural_hz, damping):
-    """The fit is robust against larger creep and sensor noise."""
     found = ringing(answer(natural_hz, damping, 4.0, 0.036), RATE_HZ)
     assert found.natural_hz == pytest.approx(natural_hz, rel=0.03)
     assert found.damping_ratio == pytest.approx(damping, rel=0.1)

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
-from matplotlib.figure import Figure
 
 from hilctl.analysis.plot_style import WITH, WITHOUT
 from hilctl.studies.multi_run.collect import RunSeries
@@ -20,6 +19,7 @@ from hilctl.studies.multi_run.run_plots import (
     spread,
 )
 from hilctl.studies.multi_run.varied_parameter import WITHOUT_COMPENSATOR, VariedParameter
+from tests.unit.studies.multi_run.conftest import digest, drawn, grown
 
 AMPLITUDE = VariedParameter("a", "amplitude", "A", (1.0, 2.0, 3.0))
 
@@ -43,7 +43,6 @@ def test_names_have_colours_and_signs_of_their_own():
 
 
 def test_runs_without_a_compensator_look_as_on_the_page_of_a_single_run():
-    """The colour is the same for values and names."""
     kinds = VariedParameter("compensator", "compensator", "", ("none", "a", "b"))
     for found, plain in (
         (looks(kinds, kinds.values), "none"),
@@ -56,12 +55,6 @@ def test_runs_without_a_compensator_look_as_on_the_page_of_a_single_run():
 def test_many_are_spread_with_both_ends():
     assert spread(list(range(20)), 4) == [0, 6, 13, 19]
     assert spread([1, 2], 7) == [1, 2]
-
-
-def drawn(panel):
-    axes = Figure().subplots()
-    panel.draw(axes)
-    return axes
 
 
 def labels(axes):
@@ -93,10 +86,8 @@ def test_before_and_after_of_the_same_settings(compensated):
 
 
 def test_runs_of_one_kind_have_no_before_and_after(crossed):
-    assert before_after_sheet(crossed) is None
-    assert error_sheet(crossed) is None
-    assert model_sheet(crossed) is None
-    assert minor_loop_sheet(crossed) is None
+    for sheet in (before_after_sheet, error_sheet, model_sheet, minor_loop_sheet):
+        assert sheet(crossed) is None
 
 
 def test_errors_of_compensated_runs(compensated):
@@ -112,19 +103,19 @@ def test_a_run_alone_shows_its_error(compensated):
     assert len(error_sheet(alone).panels) == 1
 
 
-def test_minor_loops_are_marked_within_the_cycle(make_run, make_digest):
+def test_minor_loops_are_marked_within_the_cycle():
     phase = np.linspace(0.0, 2.0 * np.pi, 400)
     wave = 4.0 * np.sin(phase) + 3.0 * np.sin(3.0 * phase)
-    run = make_run(4.0, 20.0, digest=make_digest(loop=np.array((wave, 5.0 * wave))))
+    run = grown(4.0, 20.0, digest=digest(loop=np.array((wave, 5.0 * wave))))
     run = replace(run, figures=replace(run.figures, minor_low_um=26.0))
     sheet = minor_loop_sheet(RunSeries("minor", (run,), tuple(run.values)))
     assert labels(drawn(sheet.panels[0])) == ["cycle", "minor loop", "minor loop"]
 
 
-def test_the_model_s_error_stands_beside_its_loop(make_run, make_digest):
+def test_the_model_s_error_stands_beside_its_loop():
     modelled = np.array(([0.0, 1.0, 0.0], [0.0, 10.0, 0.0], [0.0, 9.0, 0.0]))
-    digest = make_digest(modelled=modelled, model_error_percent=10.0)
-    run = make_run(4.0, 20.0, digest=digest)
+    made = digest(modelled=modelled, model_error_percent=10.0)
+    run = grown(4.0, 20.0, digest=made)
     axes = drawn(model_sheet(RunSeries("m", (run,), ())).panels[0])
     assert labels(axes) == ["measured", "model"]
     assert [text.get_text() for text in axes.texts] == ["error 10.0 %"]

@@ -21,14 +21,9 @@ def by_name(series):
 
 def test_a_line_is_fitted_for_all_values_of_the_others(crossed):
     found = trends(crossed, AREA, by_name(crossed)["frequency"])
-    assert [trend.held for trend in found] == [
-        {"waveform.amplitude": 3.0},
-        {"waveform.amplitude": 6.0},
-    ]
-    assert [(t.slope, t.offset, t.r2) for t in found] == [
-        (pytest.approx(1.5), pytest.approx(60.0), pytest.approx(1.0)),
-        (pytest.approx(3.0), pytest.approx(120.0), pytest.approx(1.0)),
-    ]
+    assert [trend.held for trend in found] == [{"waveform.amplitude": a} for a in (3.0, 6.0)]
+    for trend, expected in zip(found, ((1.5, 60.0, 1.0), (3.0, 120.0, 1.0)), strict=True):
+        assert (trend.slope, trend.offset, trend.r2) == pytest.approx(expected)
     assert {trend.direction for trend in found} == {"rises"}
 
 
@@ -44,7 +39,6 @@ def test_directions(crossed):
 
 
 def test_two_points_have_no_fit_and_repeats_count_once(crossed):
-    """Two points give no linear fit."""
     along = by_name(crossed)["amplitude"]
     found = trends(crossed, AREA, along, [*crossed.runs, *crossed.runs])
     assert len(found) == 3

@@ -1,5 +1,7 @@
 """Varied parameters with names and units."""
 
+from itertools import product
+
 import pytest
 
 from hilctl.studies.multi_run.varied_parameter import dimensions, keys_of, short_value, value_at
@@ -25,13 +27,7 @@ def test_an_amplitude_stays_where_each_run_has_a_frequency_of_its_own():
 
 
 def test_names_have_units():
-    keys = [HZ, A, "device.load_kg", "waveform.components.0.frequency_hz", "x.gap_um", "order"]
-    # A full grid, so that no key depends on another.
-    crossed = [{}]
-    for key in keys:
-        crossed = [row | {key: value} for row in crossed for value in (1.0, 2.0)]
-    found = {each.key: each.axis for each in dimensions(keys, crossed, "A")}
-    assert found == {
+    axes = {
         HZ: "frequency, Hz",
         A: "amplitude, A",
         "device.load_kg": "load, kg",
@@ -39,6 +35,10 @@ def test_names_have_units():
         "x.gap_um": "gap, µm",
         "order": "order",
     }
+    # A full grid, so that no key depends on another.
+    grid = product((1.0, 2.0), repeat=len(axes))
+    rows = [dict(zip(axes, values, strict=True)) for values in grid]
+    assert {each.key: each.axis for each in dimensions([*axes], rows, "A")} == axes
 
 
 def test_numbers_rise_and_names_keep_their_order():
@@ -66,16 +66,12 @@ def test_a_value_is_shown_by_what_people_call_it(value, short):
 
 
 def test_experiments_are_compared_key_by_key():
-    """Seeds and names of runs are ignored."""
     one = {"name": "a", "device": {"seed": 1, "load_kg": 0.0}, "compensator": "none",
            "waveform": {"components": ({"amplitude": 1.0}, {"amplitude": 5.0})}}  # fmt: skip
     other = {"name": "b", "device": {"seed": 2, "load_kg": 3.7}, "compensator": {"model": "m.yaml"},
              "waveform": {"components": ({"amplitude": 1.0}, {"amplitude": 4.0})}}  # fmt: skip
-    assert keys_of([one, other]) == [
-        "device.load_kg",
-        "compensator",
-        "waveform.components.1.amplitude",
-    ]
-    assert value_at(other, "waveform.components.1.amplitude") == 4.0
-    assert value_at(other, "waveform.components.7.amplitude") is None
-    assert value_at(other, "waveform.components.1.amplitude.x") is None
+    amplitude = "waveform.components.1.amplitude"
+    assert keys_of([one, other]) == ["device.load_kg", "compensator", amplitude]
+    assert value_at(other, amplitude) == 4.0
+    for missing in ("waveform.components.7.amplitude", f"{amplitude}.x"):
+        assert value_at(other, missing) is None
