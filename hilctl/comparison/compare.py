@@ -59,14 +59,12 @@ class ComparisonRequest:
     """Request of a comparison.
 
     Attributes:
-        recordings: Recordings with the loops.
         models: Kinds of model, or model files; empty for :data:`COMPARED`.
         experiment: Experiment with device, limits and waveform of the trials; None for device and
             limits of the first recording and a sine over nearly the complete stroke.
         settings: ``key=value`` texts over the experiment.
         frequencies_hz: Frequencies of the trials; None for 10, 100 and 200 Hz with a sine or a
             triangle, and for the unchanged waveform otherwise.
-        points: Points per loop.
     """
 
     recordings: Sequence[Path]
@@ -83,8 +81,6 @@ class ComparedModel:
 
     Attributes:
         name: Name of the kind or of the model file.
-        title: Description.
-        model: The model.
         numbers: Number of identified parameters; None for a model file.
         identify_s: Duration of the identification; None for a model file.
         error: Its evaluation on the loops.
@@ -114,9 +110,7 @@ class Comparison:
     """A comparison and its data.
 
     Attributes:
-        sources: Names of the recordings.
         device: Device of the trials; empty without trials.
-        loops: The measured loops.
         rows: One row per model, in the requested order.
     """
 
@@ -266,16 +260,9 @@ def _recorded(recording: Recording, settings: Sequence[str]) -> LoadedExperiment
 def check_free(
     names: Sequence[str], folder: Path, *, overwrite: bool, inputs: Sequence[Path] = ()
 ) -> None:
-    """Reject a folder that already contains a file of one of these models.
+    """Raise InputError if a folder contains a file of one of these models, unless ``overwrite``.
 
-    Args:
-        names: Names of the models.
-        folder: The folder.
-        overwrite: Whether their files may be replaced.
-        inputs: Input files, which are never replaced.
-
-    Raises:
-        InputError: A file exists and may not be replaced.
+    Input files are never replaced.
     """
     paths = [folder / f"{name}.yaml" for name in names]
     for path in paths:

@@ -38,15 +38,9 @@ _LIMITED = int(Flag.RANGE_LIMITED | Flag.SLEW_LIMITED | Flag.INVALID)
 
 @dataclass(frozen=True, slots=True)
 class InverseTrial:
-    """Metrics of a trial on the mean steady cycle.
+    """Metrics of a trial on the mean steady cycle, as in reports.
 
-    Attributes:
-        label: The waveform.
-        frequency_hz: Its frequency.
-        peak_hysteresis_percent: See :class:`hilctl.analysis.run_metrics.RunMetrics`.
-        peak_error_percent: The same.
-        rms_error_percent: The same.
-        limited_samples: Evaluated samples whose command the limiter changed.
+    ``limited_samples`` counts evaluated samples whose command the limiter changed.
     """
 
     label: str
@@ -191,12 +185,6 @@ def inverse_ns(
 
     The reference is a sine with the loop's stroke and frequency; the shortest of several rounds is
     free of other load.
-
-    Args:
-        model: Any model.
-        loop: Loop with stroke and frequency.
-        sample_rate_hz: Samples per second.
-        clock: Time in s.
     """
     low, high = float(loop.displacement_um.min()), float(loop.displacement_um.max())
     angle = 2.0 * np.pi * loop.frequency_hz / sample_rate_hz * np.arange(TIMED_SAMPLES)

@@ -52,24 +52,16 @@ class FitData:
     """Commands, rates and evaluated displacements of all records.
 
     Attributes:
-        records: The records.
-        unit: Unit of the command.
         target_um: float64[N], measured displacement of all evaluated samples.
         places: For each record, its part of the N samples.
         reach: Half the largest peak-to-peak command; plays with a larger threshold do not move in a
             steady cycle.
         speed: Largest |rate| of the command, in command units per second.
         stroke_um: Largest peak-to-peak displacement of a record.
-        input_range: Lowest and highest command.
         output_range_um: Lowest and highest evaluated displacement.
     """
 
     def __init__(self, records: Records, unit: CommandUnit = "A") -> None:
-        """Prepare records.
-
-        Raises:
-            DataError: There are no records.
-        """
         if not records:
             raise DataError("no records to fit: the list of loops and histories is empty")
         self.records = tuple(records)
@@ -194,14 +186,7 @@ class FitData:
         return x + model.output_offset_um
 
     def stack(self, run: Callable[[F64], F64]) -> F64:
-        """Run a rate-independent function on each command, and stack the evaluated samples.
-
-        Args:
-            run: From a command, float64[n], to float64[n] or float64[n, m].
-
-        Returns:
-            float64[N] or float64[N, m].
-        """
+        """Stack a rate-independent function of each command, float64[N] or float64[N, m]."""
         parts = []
         for record, place in zip(self.records, self.places, strict=True):
             periods = PERIODS if isinstance(record, SteadyLoop) else 1
@@ -238,12 +223,7 @@ class FitRequest:
     """Records to fit, and settings.
 
     Attributes:
-        records: Loops and histories, at least one.
-        settings: Kind of model and all other settings.
-        unit: Unit of the command.
         source: Names of recordings or files, for the provenance.
-        run: Runs independent fits.
-        progress: Progress callback.
         start: Start of the search, see :class:`FitJob`.
         modes: Known further modes of the structure, for kinds that have them.
     """
@@ -263,10 +243,6 @@ class FitJob:
     """Prepared data of one fit, and settings.
 
     Attributes:
-        data: The data.
-        settings: The settings; only those of the kind count.
-        run: Runs independent parts of the fit.
-        progress: Progress callback.
         start: ``end`` of a fit of this kind to other data, or of another size, to continue from;
             ignored if it is of another kind.
     """
@@ -306,13 +282,10 @@ class FoundModel:
     """A model without provenance, and how it was identified.
 
     Attributes:
-        model: The model.
         numbers: Number of fitted numbers.
         parameters: Parameters under their published names, in command units, um and s; empty for
             models that are only a table of weights.
-        starts: Starts of the search.
         standard_errors: Standard errors of the parameters, if known.
-        at_bound: Parameters at a bound.
         end: End of the search, from which another fit can start.
     """
 

@@ -52,17 +52,7 @@ def fit_straight(job: FitJob) -> FoundModel:
 
 
 def weigh(job: FitJob, columns: F64, least: F64, rows: slice = slice(None)) -> tuple[F64, float]:
-    """Fit ``columns w + c`` to the measured displacement, w >= least.
-
-    Args:
-        job: Data and settings of the fit.
-        columns: float64[M, m], of the judged samples that ``rows`` takes.
-        least: float64[m].
-        rows: Samples that are compared.
-
-    Returns:
-        Weights float64[m], and the constant displacement in um.
-    """
+    """Fit ``columns w + c`` to the displacement at ``rows``, w >= least; return w and c."""
     target_um = job.data.target_um[rows]
     return bounded_weights(columns, target_um, np.ones(target_um.size), least, offset=True)
 
@@ -163,11 +153,7 @@ _HIGH = (4.0, 3.0, 4.0, 3.0, 3.0, 0.3, 1.0)
 
 
 class _ShapeSearch:
-    """A shape that is searched, with weights that follow from it.
-
-    Args:
-        job: Data and settings of the fit.
-    """
+    """A shape that is searched, with weights that follow from it."""
 
     def __init__(self, job: FitJob) -> None:
         self.job = job
@@ -191,11 +177,8 @@ class _GeneralisedPlays(_ShapeSearch):
 
     A point holds slope (times the reach) and shift of the rising envelope, the same of the falling
     one, the falling one's height (the rising one's is 1: the weights carry the scale) and its value
-    at 0, and the spacing relative to half the largest swing of z over the number of plays.
-
-    Args:
-        job: Data and settings of the fit.
-        few: Whether to compare some of the samples only; the operators run on all of them.
+    at 0, and the spacing relative to half the largest swing of z over the number of plays. With
+    ``few``, only some samples are compared.
     """
 
     def __init__(self, job: FitJob, *, few: bool) -> None:
@@ -277,12 +260,9 @@ _BOUC_WEN = ("direct", "hysteretic", "beta", "gamma", "exponent", "output_offset
 
 
 class _DifferentialLoop(_ShapeSearch):
-    """The operator z of a Bouc-Wen or Duhem model for given beta, gamma and n.
+    """The operator z of a Bouc-Wen or Duhem model for given beta, gamma and n = 1 or 2.
 
-    Args:
-        job: Data and settings of the fit.
-        exponent: n, 1 or 2.
-        free: Whether gamma is searched; otherwise it is 0.
+    Without ``free``, gamma is 0.
     """
 
     def __init__(self, job: FitJob, exponent: int, *, free: bool) -> None:

@@ -26,12 +26,7 @@ MOVES = 0.1  # of a history's peak-to-peak: least motion of a last part that is 
 
 @dataclass(frozen=True, slots=True)
 class Split:
-    """Records of one fit, and those that it is evaluated on.
-
-    Attributes:
-        fitted: Fitted records.
-        held_out: Held-out records.
-    """
+    """Records of one fit, and held-out ones that it is evaluated on."""
 
     fitted: tuple[Record, ...]
     held_out: tuple[Record, ...]
@@ -42,8 +37,6 @@ class HeldOut:
     """Errors of a model on held-out data.
 
     Attributes:
-        judgement: The errors.
-        records: The data.
         how: Origin of the data, as text.
         end: End of the last fit, from which a fit to all data can start.
     """
@@ -91,16 +84,9 @@ def held_out_error(request: FitRequest) -> HeldOut | None:
 
 
 def held_out_errors(requests: Sequence[FitRequest], run: MapFunction) -> list[HeldOut | None]:
-    """Return errors of each fit on held-out parts of its data.
+    """Return errors of each fit on held-out parts of its data; None if too few data are left.
 
     One start of each search is enough.
-
-    Args:
-        requests: What to fit.
-        run: Runs the fits, which do not depend on each other.
-
-    Returns:
-        For each request its errors; None if too few data are left.
     """
     tasks = [
         _Task(number, fold, replace(
@@ -218,7 +204,6 @@ class CandidateScore:
     Attributes:
         settings: The kind, and settings that differ from its published ones.
         rms_percent: Of the largest peak-to-peak displacement.
-        peak_percent: The same for the largest error.
     """
 
     settings: str
@@ -232,9 +217,7 @@ class OrderScore:
 
     Attributes:
         plays: Play operators; lines, if the model has a Preisach triangle.
-        deadbands_a_side: Deadbands on each side of 0.
         rms_percent: Of all held-out data, in percent of the largest peak-to-peak.
-        peak_percent: The same for the largest error.
     """
 
     plays: int
@@ -245,14 +228,7 @@ class OrderScore:
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """Selected settings, and the errors that they were selected by.
-
-    Attributes:
-        settings: The settings.
-        held_out: Their errors on held-out data; None if nothing was selected.
-        candidates: Errors of each kind that was tried.
-        orders: Errors of each size that was tried.
-    """
+    """Selected settings, their errors on held-out data, and those of everything tried."""
 
     settings: FitSettings
     held_out: HeldOut | None = None
@@ -382,11 +358,7 @@ def choose_lag(
 ) -> int:
     """Return the lag of the displacement, in samples, with the least error.
 
-    Args:
-        load: Loads the data with the displacement shifted by that many samples.
-        settings: Settings of the fit.
-        run: Runs independent fits.
-        progress: Progress callback.
+    ``load`` returns the data with the displacement shifted by that many samples.
     """
     progress(0.0, f"{MOST_LAG + 1} fits for the lag of the displacement")
     lean = settings.model_copy(update={"starts": 1, "peak_goal_percent": None})

@@ -41,11 +41,8 @@ MOST = 3
 class _Spectra:
     """Transfer function from modelled to measured displacement.
 
-    Attributes:
-        frequency_hz: float64[k].
-        transfer: complex128[k].
-        power: float64[k], of the modelled displacement.
-        left: Power of the residual at all frequencies.
+    ``power`` is that of the modelled displacement; ``left`` that of the residual, at all
+    frequencies.
     """
 
     frequency_hz: F64
@@ -62,11 +59,8 @@ def further_modes(
 ) -> tuple[FurtherMode, ...] | None:
     """Return improved modes, with one more if the residual shows it; None if nothing improves.
 
-    Args:
-        records: The records.
-        modelled_um: float64[n] each, modelled displacement of their evaluated samples.
-        known: Further modes of the model.
-        first_hz: Natural frequency of its first mode; None if it has none.
+    ``modelled_um`` holds the evaluated samples of each record; ``first_hz`` is the natural
+    frequency of the model's first mode.
     """
     bare_um = [
         _undone(model_um, known, record.sample_rate_hz)
@@ -135,12 +129,7 @@ def _spectra(
 
 
 def _pieces(signals: F64, rate_hz: float) -> Iterator[C128]:
-    """Yield windowed spectra of segments of signals: complex128[s, m, k].
-
-    Args:
-        signals: float64[s, n].
-        rate_hz: Their sample rate.
-    """
+    """Yield windowed spectra of segments of signals, float64[s, n]: complex128[s, m, k]."""
     together = max(1, int(rate_hz / FASTEST_HZ))
     size = round(SEGMENT_S * rate_hz / together)
     whole = signals[:, : signals.shape[1] // together * together]

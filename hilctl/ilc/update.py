@@ -42,13 +42,7 @@ _WORSE = 1.05
 
 @dataclass(frozen=True, slots=True)
 class IlcIteration:
-    """One run.
-
-    Attributes:
-        correction_um: complex128[K + 1], coefficients of its correction.
-        error: Its error.
-        reach_hz: Bandwidth of its correction.
-    """
+    """One run: coefficients of its correction complex128[K + 1], its error and its bandwidth."""
 
     correction_um: C128
     error: CycleScore

@@ -26,13 +26,10 @@ FULL = 0.5  # minimum peak-to-peak command of the steady part, of the total
 
 
 def similarity(signal: F64) -> F64:
-    """Return the autocorrelation of a signal without its mean.
+    """Return the autocorrelation of a signal without its mean, for lags beyond n / 2: float64[m].
 
     Each lag is normalised by the energy of the two parts it compares, so that 1 is a perfect
     repetition whatever the number of samples.
-
-    Returns:
-        float64[m], for lags from 0 to beyond n / 2, the period of two cycles.
     """
     x = signal - signal.mean()
     n = x.size
@@ -107,12 +104,7 @@ def _refined(command: F64, period: float) -> float:
 def steady_stretch(command: F64, period: float) -> tuple[int, int] | None:
     """Return the longest interval in which a command repeats at full amplitude.
 
-    Args:
-        command: float64[n].
-        period: Samples per period.
-
-    Returns:
-        First sample and end, at least two periods except for rounding; None if there is none.
+    It is at least two periods long, except for rounding; None if there is none.
     """
     span = float(np.ptp(command))
     later = np.arange(command.size - math.ceil(period))
@@ -141,15 +133,6 @@ class CycleMean:
     Samples are averaged in bins around evenly spaced phases, at most one bin per sample of a
     period, so that a period of any length fills all bins. A periodic spline through the means, at
     the mean phase of their samples, gives the points.
-
-    Args:
-        label: Label for errors.
-        period: Samples per period.
-        points: Points of the mean cycle.
-        signals: Number of signals.
-
-    Raises:
-        DataError: The period is too short.
     """
 
     def __init__(self, label: str, period: float, points: int, signals: int) -> None:
@@ -165,12 +148,7 @@ class CycleMean:
         self._sums = np.zeros((signals, bins))
 
     def add(self, phase: F64, values: F64) -> None:
-        """Add samples.
-
-        Args:
-            phase: float64[n], time in periods since the start of the first cycle.
-            values: float64[m, n], signals.
-        """
+        """Add signals, float64[m, n], at times in periods since the start of the first cycle."""
         bins = self._bins
         nearest = np.floor(phase * bins + 0.5)
         index = nearest.astype(np.int64) % bins

@@ -32,9 +32,7 @@ class Grid:
 
     Attributes:
         thresholds: float64[p], of the plays, rising from 0.
-        lengths: float64[d], of the drags.
         lowest: Lower end of the first cell of the effective field.
-        width: Width of a cell.
         cells: Number of cells of a drag, and of splines of a play over the same range, >= 3.
         knots: Pieces of the curve.
     """
@@ -100,10 +98,7 @@ class Weights:
 def table(paths: Sequence[F64], kept: Sequence[I64], grid: Grid) -> F64:
     """Return the output of each operator for each cell: float64[N, lines cells].
 
-    Args:
-        paths: For each record, float64[n], effective field from rest.
-        kept: For each record, int64[N_i], samples that are rows.
-        grid: The operators.
+    Each record has an effective field from rest, float64[n], of which the kept samples are rows.
     """
     plays, cells = grid.thresholds.size, grid.cells
     parts: list[F64] = []
@@ -122,14 +117,7 @@ def table(paths: Sequence[F64], kept: Sequence[I64], grid: Grid) -> F64:
 def outputs(paths: Sequence[F64], kept: Sequence[I64], grid: Grid, slopes: F64) -> tuple[F64, F64]:
     """Return the output of operators with known weights, and its derivatives by thresholds.
 
-    Args:
-        paths: See :func:`table`.
-        kept: See :func:`table`.
-        grid: The operators.
-        slopes: float64[lines, cells].
-
-    Returns:
-        float64[N], and float64[N, p - 1] for all thresholds but the first.
+    See :func:`table`. The derivatives, float64[N, p - 1], are by all thresholds but the first.
     """
     plays = grid.thresholds.size
     drags = replace(grid, thresholds=np.empty(0))
@@ -151,16 +139,11 @@ def outputs(paths: Sequence[F64], kept: Sequence[I64], grid: Grid, slopes: F64) 
 class Equations:
     """Linear least squares of all weights, between operators and inverse curve.
 
-    Args:
-        columns: Result of :func:`table`.
-        y: float64[N], displacement without structure and delay, in um.
-        grid: The operators.
-        least: Smallest slope of the first line, um per command unit.
-        scale: float64[N], square root of each row's weight.
+    ``columns`` is the result of :func:`table`, ``y`` the displacement without structure and delay,
+    ``least`` the smallest slope of the first line, ``scale`` the square root of each row's weight.
     """
 
     def __init__(self, columns: F64, y: F64, grid: Grid, least: float, scale: F64) -> None:
-        """Select columns that move, and place the corners of the curve."""
         self._y, self._grid, self._scale = y, grid, scale
         moved = np.ptp(columns, axis=0)
         self._used = moved > MOVED * float(moved.max())
@@ -209,11 +192,9 @@ class Equations:
     def place(self, errors: F64, changes: F64) -> SearchPoint:
         """Return the sum of squares with derivatives by the changes, by variable projection.
 
-        Free weights compensate each change as far as they can (Kaufman's approximation).
-
-        Args:
-            errors: float64[N], of the operators' output with the weights of :meth:`solve`.
-            changes: float64[N, p], of these errors.
+        Free weights compensate each change as far as they can (Kaufman's approximation). The
+        errors, float64[N], and their changes, float64[N, p], are of outputs with the weights of
+        :meth:`solve`.
         """
         found, _ = self._found
         free = found > self._lows

@@ -51,16 +51,7 @@ HELD = 1e-3  # penalty of the change of a stage, percent of the stroke per step
 
 @dataclass(frozen=True, slots=True)
 class DuhemEnd:
-    """End of a search, from which another search can start.
-
-    Attributes:
-        known: The stages.
-        layout: The table's nodes.
-        logs: float64[2, k, l], logarithms of the slopes.
-        flux: By displacement.
-        offset_um: Displacement at rest.
-        x: The stages in a row.
-    """
+    """End of a search, from which another search can start; ``x`` holds the stages in a row."""
 
     known: Physical
     layout: Layout
@@ -71,14 +62,7 @@ class DuhemEnd:
 
 
 class DuhemSearch:
-    """Search of table and stages.
-
-    Args:
-        data: The records.
-        cells: Cells of y.
-        across: Cells across the band.
-        least: Smallest slope, um per command unit.
-    """
+    """Search of table and stages, with slopes of at least ``least`` um per command unit."""
 
     def __init__(self, data: Prepared, cells: int, across: int, least: float) -> None:
         self._stroke_um = data.stroke_um
@@ -202,10 +186,7 @@ class DuhemSearch:
     def _errors(self, x: F64, logs: F64, slopes: F64 | None = None) -> F64:
         """Return weighted errors in percent of the stroke over the square root of their number.
 
-        Args:
-            x: The stages.
-            logs: float64[2, k, l].
-            slopes: float64[N, 2 k l], filled with the derivatives by the logarithms.
+        Fill in ``slopes``, float64[N, 2 k l], with the derivatives by the logarithms.
         """
         layout = self._layout
         start_um = self._signals.offset_um(x, self._first_um)

@@ -50,13 +50,7 @@ FIRST = _row(Stages(field=0.05, output=0.08, decay=0.005), 0.0, 0.0)
 
 @dataclass(frozen=True, slots=True)
 class Path:
-    """Points of a record, with all turning points.
-
-    Attributes:
-        field: float64[n], w.
-        displacement_um: float64[n], y before structure and delay.
-        motion: Motion of the record at these points.
-    """
+    """Points of a record, with all turning points: w, and y before structure and delay."""
 
     field: F64
     displacement_um: F64
@@ -144,15 +138,7 @@ STEEPEST = 5.0  # logarithm of the largest slope, of the mean
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Nodes of a table.
-
-    Attributes:
-        lowest_um: First node of y.
-        cell_um: Distance of the nodes of y.
-        centre: float64[k], middle of the band at each, in the command's unit.
-        half_width: Of the band.
-        across: Nodes across the band, l.
-    """
+    """Nodes of a table: lowest y and distance, middle of the band at each, and across the band."""
 
     lowest_um: float
     cell_um: float

@@ -39,9 +39,7 @@ class BareSignal:
     """Effective fields and displacements of the records for some stages.
 
     Attributes:
-        fields: For each record, float64[n], effective field.
         y: float64[N], displacement of the rows without structure and delay, in um.
-        scale: float64[N], square root of the weight of each row.
     """
 
     fields: Sequence[F64]
@@ -50,14 +48,7 @@ class BareSignal:
 
 
 class JointRefinement:
-    """Minimisation of a sum of squares over stages and thresholds.
-
-    Args:
-        rows_of: Returns the rows for stages, float64[9].
-        paths: For each record int64[N_i], the samples that are rows.
-        grid: The operators, with the thresholds of the start.
-        least: Smallest slope of the first line, um per command unit.
-    """
+    """Minimisation of a sum of squares over stages and the thresholds of a grid."""
 
     def __init__(
         self, rows_of: Callable[[F64], BareSignal], paths: Sequence[I64], grid: Grid, least: float
@@ -142,9 +133,6 @@ class FieldEnd:
     """End of a search, from which another search can start.
 
     Attributes:
-        known: The stages.
-        grid: The operators.
-        weights: Weights of the operators, and the curve.
         met: The curve that the losses depend on, by displacement with its offset.
         widest: Largest useful threshold, of half the span.
     """
@@ -158,7 +146,7 @@ class FieldEnd:
 
 @dataclass(frozen=True, slots=True)
 class _Descent:
-    """End of a descent: its error and stages, with curve and cells."""
+    """End of a descent."""
 
     error: float
     stages: Stages
@@ -168,13 +156,7 @@ class _Descent:
 
 
 class FieldSearch:
-    """Search of weights and stages of one size of model.
-
-    Args:
-        data: The records.
-        size: The operators.
-        least: Smallest slope of the first line, um per command unit.
-    """
+    """Search of weights and stages of one size of model; ``least`` is in um per command unit."""
 
     def __init__(self, data: Prepared, size: Size, least: float) -> None:
         self._data = data
@@ -388,11 +370,7 @@ def _model(job: FitJob, found: FieldEnd) -> StagedModel:
 
 
 def tabled(splines: F64) -> list[list[float]]:
-    """Return the slopes of splines in FINER cells per piece.
-
-    Args:
-        splines: float64[p, c], weights of the splines of each play.
-    """
+    """Return the slopes of splines with weights float64[p, c], in FINER cells per piece."""
     t = (np.arange(FINER) + 0.5) / FINER
     parts = 0.5 * (1.0 - t) ** 2, 0.5 + t - t**2, 0.5 * t**2
     pieces = splines.shape[1] - 2

@@ -128,11 +128,8 @@ def stages_of(known: Physical, data: Prepared) -> Stages:
 def signals(run: Run, known: Physical, curve: Curve | None, span: float) -> tuple[F64, F64]:
     """Return the effective field and the displacement before structure: float64[n] each.
 
-    Args:
-        run: The record.
-        known: The stages.
-        curve: From displacement to the output of the operators; None for the displacement itself.
-        span: Of the field; the excess loss is linear below a part of it.
+    The excess loss is linear below a part of ``span``. Without a curve, the displacement itself
+    counts as the output of the operators.
     """
     y = run.bare_um(known.delay_s, 2.0 * known.damping_ratio * known.radian_s, known.radian_s**2)
     m = y if curve is None else curve.operators_of(y)

@@ -39,11 +39,8 @@ class SelectedRegularisation:
     """A regularisation, and its errors on held-out runs.
 
     Attributes:
-        strength: Weight of the old model.
         anchor: Weight of the old model on motions of its whole range, of the least.
         own: Whether each run has an offset, creep and drift.
-        before: Errors of the old model on held-out runs.
-        after: Errors of the refined models, each on runs that it was not fitted to.
     """
 
     strength: float
@@ -132,14 +129,7 @@ def parts_of(
 
 
 class Regularisation:
-    """Refinements of a model with any regularisation.
-
-    Args:
-        model: The old model.
-        parts: Records that are fitted or evaluated.
-        splits: Splits of the records.
-        unit: Unit of the command.
-    """
+    """Refinements of a model with any regularisation."""
 
     def __init__(
         self,

@@ -57,10 +57,6 @@ class PlaysProblem:
 
     Search variables: the spacing, relative to the largest one; for an RDPI, the largest growth of
     the thresholds relative to half the peak-to-peak command; for exponential weights, beta n.
-
-    Args:
-        data: The data.
-        settings: The settings.
     """
 
     def __init__(self, data: FitData, settings: FitSettings) -> None:
@@ -220,10 +216,6 @@ class ExponentialProblem:
     beta_0 n; the loss of slope over all deadbands above 0, below 1 so that cumulative slopes stay
     > 0; beta_1 k; d_p (k + 1) over half the stroke; the same three below 0, where the slope gains;
     and the constant displacement, if fitted, over half the stroke.
-
-    Args:
-        data: The data.
-        settings: The settings.
     """
 
     def __init__(self, data: FitData, settings: FitSettings) -> None:

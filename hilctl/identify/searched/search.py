@@ -25,13 +25,7 @@ HELD = 1e-4  # of the space: distance to a bound that counts as at the bound
 
 @dataclass(frozen=True, slots=True)
 class SearchSpace:
-    """Search variables, scaled to about 1.
-
-    Attributes:
-        low: float64[p], lower bounds.
-        high: float64[p], upper bounds.
-        guess: float64[p], rough values from the data, within the bounds.
-    """
+    """Search variables, scaled to about 1: bounds, and rough values from the data, float64[p]."""
 
     low: F64
     high: F64
@@ -70,18 +64,16 @@ class SearchProblem(Protocol):
     def error_um(self, x: F64, scale: F64) -> F64:
         """Return modelled minus measured displacement, and the rows of the prior: float64[N].
 
-        Args:
-            x: float64[p], a point of the space.
-            scale: float64[N], scale of the errors, which linear weights depend on.
+        ``scale`` is that of the errors, which linear weights depend on.
         """
         ...
 
     def slopes_um(self, x: F64, scale: F64) -> F64:
-        """Return the derivatives of the error, float64[N, p]; arguments as for the error."""
+        """Return the derivatives of the error: float64[N, p]."""
         ...
 
     def build(self, x: F64, scale: F64) -> PlayModel:
-        """Return the model at a point of the space; arguments as for :meth:`error_um`."""
+        """Return the model at a point of the space."""
         ...
 
     def parameters(self, x: F64, scale: F64) -> dict[str, float]:
@@ -109,14 +101,6 @@ def search(
     """Minimise the sum of the squared, scaled errors.
 
     Starts are the rough values from the data and the best random points.
-
-    Args:
-        problem: The problem.
-        scale: float64[N], square root of the weight of each sample.
-        stroke_um: Largest peak-to-peak output, for percentages.
-        starts: Number of starts.
-        rng: Source of the random points.
-        progress: Called at each start.
     """
 
     def percent(x: F64) -> float:
@@ -158,14 +142,7 @@ def refine_peak(
 ) -> SearchEnd:
     """Raise the weight of samples with errors beyond a goal, until there are none (Lawson).
 
-    Args:
-        problem: The problem.
-        found: End of least squares.
-        goal_um: Goal of the largest error.
-        progress: Called in each round.
-
-    Returns:
-        The point with the smallest peak error.
+    Return the point with the smallest peak error.
     """
     best, x, scale = found, found.x, found.scale
     samples = slice(scale.size - problem.held)

@@ -50,13 +50,9 @@ class Layers:
     Attributes:
         plays: Number n of plays.
         deadbands: Number k of deadbands on each side.
-        lag: Whether there is a field lag.
         growth: Whether it grows with its distance.
         gamma: Whether thresholds grow with the rate.
-        structure: Whether there is a second-order structure.
-        delay: Whether a transport delay is fitted.
         half_period_s: Half a sample period of the loop; 0.0 to ignore its delay.
-        offset: Whether a constant displacement is fitted.
         midpoint: Whether thresholds are alpha (i - 1/2) instead of alpha i.
     """
 

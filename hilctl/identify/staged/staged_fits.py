@@ -32,21 +32,11 @@ RIDGE = 1e-9
 def standard_errors(
     found: StagedEnd, layers: Layers, places: tuple[slice, ...], *, staged: bool
 ) -> dict[str, float]:
-    """Return the standard error of each parameter.
+    """Return standard errors of free parameters; none for fewer than two records.
 
-    Errors within a record are correlated, so the estimate is clustered by record (sandwich):
-    G^-1 (sum of s s^T) G^-1 with G = J^T J and s = J^T e of each record. Parameters at a bound
-    count as known.
-
-    Args:
-        found: The fit.
-        layers: Parts of the model.
-        places: Samples of each record.
-        staged: Whether the delay is reported.
-
-    Returns:
-        Standard errors by the names of :func:`hilctl.identify.staged.objective.parameters`, without
-        parameters at a bound; none for fewer than two records.
+    Errors within a record are correlated, so the estimate is clustered by record (sandwich): G^-1
+    (sum of s s^T) G^-1 with G = J^T J and s = J^T e of each record. Parameters at a bound count as
+    known.
     """
     if len(places) < 2:
         return {}
@@ -121,14 +111,7 @@ STILL = 0.05  # part of a cell that a play must move through in a record to have
 
 
 def with_triangle(data: StagedFitData, model: StagedModel, lines: int, scale: F64) -> StagedModel:
-    """Replace the hysteresis of a staged model by a fitted Preisach triangle.
-
-    Args:
-        data: The data.
-        model: The stages, fitted with another model of hysteresis.
-        lines: Lines of the triangle, and cells of the longest line.
-        scale: float64[N], square root of the weight of each sample.
-    """
+    """Replace the hysteresis of a staged model by a fitted Preisach triangle."""
     low, high = data.input_range
     thresholds = data.reach / lines * np.arange(lines, dtype=np.float64)
     edges = np.linspace(low, high, lines + 1)

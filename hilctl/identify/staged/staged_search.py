@@ -50,15 +50,7 @@ class WeightedStart:
 def convex_start(
     data: StagedFitData, layers: Layers, before: F64, delay_s: float, scale: F64
 ) -> WeightedStart:
-    """Return a start with all weights for fixed lag, thresholds and delay.
-
-    Args:
-        data: The data.
-        layers: Parts of the model.
-        before: float64[4], see :class:`hilctl.identify.staged.objective.Point`.
-        delay_s: Total delay, including that of a structure.
-        scale: float64[N], square root of the weight of each sample.
-    """
+    """Return a start with all weights for fixed lag, thresholds and total delay."""
     blank = np.zeros(layers.plays)
     lagged = data.lagged(float(before[0]), float(before[1]))
     w, outputs, _ = data.plays(lagged, before, layers.numbers, blank)
@@ -137,13 +129,10 @@ class StagedEnd:
     """End of the search.
 
     Attributes:
-        point: The parameters.
-        errors_um: float64[N], modelled less measured displacement.
         slopes: float64[N, p], their derivatives by ``point.pack()``.
         free: bool[p], parameters that are neither fixed nor at a bound.
         held: bool[p], parameters at a bound.
         scale: float64[N], square root of the weights at the end.
-        starts: All starts.
     """
 
     point: Point
@@ -190,11 +179,6 @@ def find_staged(job: FitJob, data: StagedFitData, layers: Layers) -> StagedEnd:
 
     Starts are a grid of the nonlinear parameters, with linear solutions for all weights. The best
     ones are optimised on few points, and the best of these on all points.
-
-    Args:
-        job: Settings and records.
-        data: The records, prepared.
-        layers: Parts of the model.
 
     Raises:
         DataError: A stage has dynamics, and a record is not a steady cycle, or sample rates
@@ -271,17 +255,7 @@ def _outcome(number: int, task: StagedTask, end: tuple[F64, float]) -> StartOutc
 
 
 def lower_peak(task: StagedTask, x: F64, goal_um: float, progress: OnProgress) -> tuple[F64, F64]:
-    """Reduce the largest error to a goal by Lawson's reweighting.
-
-    Args:
-        task: The fit.
-        x: float64[p], end of least squares.
-        goal_um: Goal of the largest error.
-        progress: Called in each round.
-
-    Returns:
-        The point with the smallest peak error, and its scale.
-    """
+    """Reduce the largest error to a goal by Lawson's reweighting; return point and scale."""
     low, high = bounds(task.data, task.layers, task.point.unpack(x))
     scale, plain = task.scale, np.ones_like(task.scale)
     best = (x, scale)
