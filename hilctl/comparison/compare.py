@@ -239,12 +239,12 @@ def _device(request: ComparisonRequest, recording: Recording, data: FitData) -> 
         waveform = loaded.config.waveform
         if frequencies is None and waveform.kind in ("sine", "triangle"):
             frequencies = FREQUENCIES_HZ
-        return TrialDevice(loaded, waveforms_of(waveform, frequencies), loaded.folder)
+        return TrialDevice(loaded, waveforms_of(waveform, frequencies))
     recorded = _recorded(recording, request.settings)
     if recorded is None:
         return None
     waveforms = waveforms_of(full_stroke(data.loops), frequencies or FREQUENCIES_HZ)
-    return TrialDevice(recorded, waveforms, recorded.folder)
+    return TrialDevice(recorded, waveforms)
 
 
 def _recorded(recording: Recording, settings: Sequence[str]) -> LoadedExperiment | None:
@@ -307,15 +307,9 @@ def save_models(
 
 def headings(comparison: Comparison) -> list[str]:
     """Return the names of the columns."""
-    return ["model", "par.", "fit s", "ns", "peak %", "rms %", *_trial_names(comparison)]
-
-
-def _trial_names(comparison: Comparison) -> list[str]:
-    return [f"{trial.frequency_hz:.4g} Hz" for trial in _most_trials(comparison)]
-
-
-def _most_trials(comparison: Comparison) -> Sequence[InverseTrial]:
-    return max((row.trials for row in comparison.rows), key=len, default=())
+    trials = max((row.trials for row in comparison.rows), key=len, default=())
+    names = [f"{trial.frequency_hz:.4g} Hz" for trial in trials]
+    return ["model", "par.", "fit s", "ns", "peak %", "rms %", *names]
 
 
 def table_rows(comparison: Comparison) -> Iterator[list[str]]:

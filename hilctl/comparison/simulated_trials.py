@@ -6,7 +6,6 @@ A trial is an unpaced run without recording, interlocks and feedback, so only fo
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -95,18 +94,11 @@ def full_stroke(loops: Sequence[SteadyLoop]) -> Sine:
 class TrialDevice:
     """A simulated device with the limits of its experiment, for trials.
 
-    Args:
-        loaded: Device, limits, sample rate and block.
-        waveforms: Waveforms of the trials.
-        folder: Base of relative file names.
-
     Raises:
         InputError: The device is not simulated, or a waveform is invalid or not periodic.
     """
 
-    def __init__(
-        self, loaded: LoadedExperiment, waveforms: Sequence[AnyWaveform], folder: Path
-    ) -> None:
+    def __init__(self, loaded: LoadedExperiment, waveforms: Sequence[AnyWaveform]) -> None:
         info = loaded.device.info
         if not info.simulated:
             raise InputError(
@@ -114,7 +106,7 @@ class TrialDevice:
             )
         self._loaded = loaded
         rate_hz = loaded.config.sample_rate_hz
-        self.references = tuple(build(waveform, rate_hz, folder) for waveform in waveforms)
+        self.references = tuple(build(waveform, rate_hz, loaded.folder) for waveform in waveforms)
         for reference in self.references:
             if reference.unit != "um" or reference.segments[0].period <= 0.0:
                 label = reference.segments[0].label
@@ -125,11 +117,6 @@ class TrialDevice:
         """Description of the device."""
         return self._loaded.device.info.description
 
-    @property
-    def sample_rate_hz(self) -> float:
-        """Samples per second."""
-        return self._loaded.config.sample_rate_hz
-
     def run(self, model: HysteresisModel, reference: Reference) -> list[InverseTrial]:
         """Run the inverse of a model from rest, and evaluate each segment.
 
@@ -138,7 +125,7 @@ class TrialDevice:
             DeviceError: The device rejects a command.
         """
         loaded = replace(self._loaded, model=model)
-        begun = begin(model, self.sample_rate_hz, reference.values)
+        begun = begin(model, reference.sample_rate_hz, reference.values)
         values = (reference.values, begun.input_um[:], begun.state)
         plan = replace(
             assemble(loaded, *values, paced=False),

@@ -39,7 +39,7 @@ SINE = Sine(
 
 
 def device(*waveforms, text=TEXT):
-    return TrialDevice(resolve(Document("stage.yaml", text), CONFIGS), waveforms, CONFIGS)
+    return TrialDevice(resolve(Document("stage.yaml", text), CONFIGS), waveforms)
 
 
 def test_the_stage_follows_through_its_own_model():
@@ -76,7 +76,7 @@ def test_a_real_device_is_refused():
     """Nothing but a simulated device is driven from here."""
     loaded = load_experiment(CONFIGS / "modbus_labjack_t7.yaml")
     with pytest.raises(InputError, match="simulated device"):
-        TrialDevice(loaded, [SINE], CONFIGS)
+        TrialDevice(loaded, [SINE])
 
 
 def test_what_does_not_repeat_is_refused():

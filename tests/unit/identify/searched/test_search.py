@@ -15,7 +15,7 @@ TIME = np.linspace(0.0, 1.0, 200)
 class Curve:
     """Fit x_0 sin(x_1 t) to a signal: a sum of squares with many minima in x_1."""
 
-    space = SearchSpace(np.array([0.0, 1.0]), np.array([10.0, 60.0]), np.array([1.0, 8.0]))
+    space = SearchSpace.of({"x_0": (0.0, 10.0, 1.0), "x_1": (1.0, 60.0, 8.0)})
 
     def __init__(self, target: F64) -> None:
         self.target = target
