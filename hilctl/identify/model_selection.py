@@ -14,7 +14,7 @@ from hilctl.identify.evaluation import Evaluation, judge, judgement_of
 from hilctl.identify.fit_api import FitData, FitRequest, OnProgress, ignore_progress
 from hilctl.identify.fit_model import fit_kind, fit_model
 from hilctl.identify.parallel import MapFunction, serial_map
-from hilctl.identify.settings import FitSettings, IdentifySettings, kinds_of
+from hilctl.identify.settings import FitSettings, IdentifySettings
 
 FEWEST_LOOPS = 4
 FOLDS = 3
@@ -260,7 +260,7 @@ def _choose_kind(request: FitRequest, given: IdentifySettings) -> Selection:
         errors += _candidates(request, given, (PLAIN,))
     if not errors:
         raise DataError("too few data to hold some out and select a model: use --model NAME")
-    best = min(errors, key=_rms_percent)
+    best = min(errors, key=lambda tried: tried.rms_percent)
     near = [each for each in errors if each.rms_percent <= NEAR * best.rms_percent]
     for turn in range(LONGEST if whole else 0):
         chains = [(IN_FULL.get(each.settings.kind, ())[turn:], each) for each in near]
@@ -268,17 +268,21 @@ def _choose_kind(request: FitRequest, given: IdentifySettings) -> Selection:
         starts = [each.held_out.end for _, each in larger]
         found = _candidates(request, given, [more for more, _ in larger], starts)
         errors += found
-        best = min((best, *(x for x in found if x.rms_percent < WORTH * best.rms_percent)),
-                   key=_rms_percent)  # fmt: skip
+        better = [x for x in found if x.rms_percent < WORTH * best.rms_percent]
+        best = min(better, key=lambda tried: tried.rms_percent, default=best)
         near = [best] if best in found else []
     return Selection(best.settings, best.held_out, candidates=tuple(e.candidate for e in errors))
 
 
 def _choose_order(request: FitRequest) -> Selection:
     """Return the smallest size whose error is near the least."""
-    sizes = _sizes(request.settings)
+    settings = request.settings
+    if settings.hysteresis == "preisach":
+        sizes = [settings.model_copy(update={"lines": lines}) for lines in LINES]
+    else:
+        sizes = [settings.model_copy(update={"plays": n, "deadbands": k}) for n, k in ORDERS]
     request.progress(0.0, f"fits of {len(sizes)} sizes with held-out data")
-    errors = _tried(request, [("", settings) for settings in sizes])
+    errors = _tried(request, [("", size) for size in sizes])
     if not errors:
         raise DataError("too few data to hold some out and select the number of plays: set plays=N")
     most = WORTH_SIZE * min(each.rms_percent for each in errors)
@@ -309,10 +313,6 @@ class _Tried:
         return OrderScore(plays, deadbands, self.rms_percent, self.held_out.judgement.peak_percent)
 
 
-def _rms_percent(tried: _Tried) -> float:
-    return tried.rms_percent
-
-
 def _tried(
     request: FitRequest,
     named: Sequence[tuple[str, FitSettings]],
@@ -336,21 +336,13 @@ def _candidates(
     shared: dict[str, Any] = {"whole": given.whole, "table": given.table, "points": given.points}
     names = [", ".join(f"{key} {value}" for key, value in each.items()) for each in candidates]
     request.progress(0.0, "; ".join(names))
-    settings = [IdentifySettings(**each, **shared, **_parts(each, given)) for each in candidates]
+    settings = [IdentifySettings(**each, **shared) for each in candidates]
+    parts = {"creep_stage": given.creep_stage, "modes": given.modes}
+    settings = [
+        each.model_copy(update={name: on for name, on in parts.items() if each.has(name)})
+        for each in settings
+    ]
     return _tried(request, list(zip(names, settings, strict=True)), starts)
-
-
-def _parts(candidate: Mapping[str, Any], given: IdentifySettings) -> dict[str, Any]:
-    """Return the settings of optional parts that a kind has."""
-    fields, kind = IdentifySettings.model_fields, candidate["kind"]
-    has = [name for name in ("creep_stage", "modes") if kind in kinds_of(fields[name])]
-    return {name: getattr(given, name) for name in has}
-
-
-def _sizes(settings: FitSettings) -> list[FitSettings]:
-    if settings.hysteresis == "preisach":
-        return [settings.model_copy(update={"lines": lines}) for lines in LINES]
-    return [settings.model_copy(update={"plays": n, "deadbands": k}) for n, k in ORDERS]
 
 
 def choose_lag(

@@ -233,11 +233,6 @@ class Equations:
         return np.asarray(weight @ rows)
 
 
-def solve(columns: F64, y: F64, grid: Grid, least: float, scale: F64) -> Weights:
-    """Return all weights; see :class:`Equations` for the arguments."""
-    return Equations(columns, y, grid, least, scale).solve()
-
-
 def _segments(y: F64, knots: F64) -> F64:
     """Return the part of y between each two knots; the end parts are unlimited: float64[N, K]."""
     width = np.diff(knots)
@@ -255,14 +250,11 @@ def _prior(
     count = int(used.sum())
     number = np.where(used, np.cumsum(used) - 1, -1).reshape(grid.lines, grid.cells)
     smooth = SMOOTH * min(1.0, SMOOTH_PLAYS / grid.thresholds.size)
-    pairs = [(number[:, :-1], number[:, 1:], smooth)]
     plays = number[1 : grid.thresholds.size]
-    pairs.append((plays[:-1], plays[1:], 0.5 * smooth))
+    pairs = (number[:, :-1], number[:, 1:], smooth), (plays[:-1], plays[1:], 0.5 * smooth)
     width = count + others.size
     out = [weight * longest * differences(a, b, width) for a, b, weight in pairs]
-    ridge = np.zeros((count, width))
-    ridge[:, :count] = RIDGE * longest * np.eye(count)
-    out.append(ridge)
+    out.append(RIDGE * longest * np.eye(count, width))
     # Second differences of the slopes of the curve; that of the anchor follows from the mean.
     full, constant = np.zeros((grid.knots, width)), np.zeros(grid.knots)
     full[others, count + np.arange(others.size)] = 1.0

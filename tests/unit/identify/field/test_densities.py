@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hilctl.base.types import F64
-from hilctl.identify.field.densities import STEEPEST, Curve, Grid, Weights, solve, table
+from hilctl.identify.field.densities import STEEPEST, Curve, Equations, Grid, Weights, table
 
 GRID = Grid(np.array([0.0, 1.0]), np.array([1.5]), -6.0, 3.0, 4, 6)
 SLOPES = np.array([[3.0, 4.0, 4.0, 3.0], [1.0, 2.0, 2.0, 1.0], [2.0, 3.0, 3.0, 2.0]])
@@ -33,7 +33,7 @@ def displacement_um(given: F64) -> F64:
 
 def solved(y: F64, least: float = LEAST) -> Weights:
     """Return the weights for a displacement, each row of the same weight."""
-    return solve(columns(), y, GRID, least, np.ones(y.size))
+    return Equations(columns(), y, GRID, least, np.ones(y.size)).solve()
 
 
 def test_a_curve_goes_through_its_points_and_on_straight() -> None:
@@ -107,7 +107,7 @@ def test_no_slope_of_the_first_line_is_less_than_the_least() -> None:
 def test_a_column_that_does_not_move_has_no_weight() -> None:
     u = np.ascontiguousarray(2.5 * np.sin(np.linspace(0.0, 30.0, 500)))
     given = table([u], [np.arange(u.size)], GRID)
-    found = solve(given, given.sum(axis=1), GRID, LEAST, np.ones(u.size))
+    found = Equations(given, given.sum(axis=1), GRID, LEAST, np.ones(u.size)).solve()
     assert (found.slopes[2, [0, 3]] == 0.0).all()  # cells of the drag that are never reached
     assert (found.slopes[0] >= LEAST).all()
     assert found.slopes[2, 1:3].min() > 0.0
@@ -136,10 +136,10 @@ def test_a_row_counts_by_the_square_of_its_scale() -> None:
     y, given = displacement_um(columns()), columns()
     y[::2] += 0.5
     scale = np.where(np.arange(y.size) % 2, 1.0, 1e-9)
-    freed = solve(given, y, GRID, LEAST, scale)
+    freed = Equations(given, y, GRID, LEAST, scale).solve()
     assert np.mean(freed.errors_um[::2]) == pytest.approx(-0.5, abs=0.05)
     assert np.mean(freed.errors_um[1::2]) == pytest.approx(0.0, abs=0.01)
     twice = np.vstack([given, given]), np.concatenate([y, y])
-    both = solve(*twice, GRID, LEAST, np.concatenate([scale, scale]))
-    heavy = solve(given, y, GRID, LEAST, math.sqrt(2.0) * scale)
+    both = Equations(*twice, GRID, LEAST, np.concatenate([scale, scale])).solve()
+    heavy = Equations(given, y, GRID, LEAST, math.sqrt(2.0) * scale).solve()
     assert both.slopes == pytest.approx(heavy.slopes, rel=1e-6, abs=1e-6)

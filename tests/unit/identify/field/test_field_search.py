@@ -11,7 +11,7 @@ from hilctl.base.types import F64
 from hilctl.identify.data.records import History, SteadyLoop
 from hilctl.identify.evaluation import judge
 from hilctl.identify.field import field_search
-from hilctl.identify.field.densities import Equations, Grid, outputs, solve, table
+from hilctl.identify.field.densities import Equations, Grid, outputs, table
 from hilctl.identify.field.field_search import (
     ROOM,
     ROUNDS,
@@ -141,8 +141,8 @@ def test_a_search_that_goes_on_from_another_of_its_data_ends_no_worse() -> None:
 def test_a_search_ends_within_its_bounds_though_it_starts_beyond() -> None:
     job = laid()
     x = row(HIGH) + 1.0
-    job._learn(row(Stages()), job._chosen())
-    ended, _ = job._polish(x, job._chosen())
+    job._learn(row(Stages()))
+    ended, _ = job._polish(x)
     assert (ended >= row(LOW)).all()
     assert (ended <= row(HIGH)).all()
     assert (ended != x).all()
@@ -156,7 +156,7 @@ def test_a_search_is_never_of_more_operators_than_were_asked_for() -> None:
 def test_the_least_slope_of_the_first_line_holds_throughout_the_search() -> None:
     job = FieldSearch(data(), SIZE, 20.0)
     job._lay(Stages(), SIZE)
-    weights = job._solved(row(Stages()), job._chosen())
+    weights = job._solved(row(Stages()))
     assert weights.slopes[0].min() >= 20.0
 
 
@@ -185,10 +185,9 @@ def test_a_threshold_goes_to_where_the_rods_yield() -> None:
     x, grid = polish.follow(row(Stages()))
     assert grid.thresholds[1] == pytest.approx(TRUE_R, abs=0.02)
     assert x == pytest.approx(row(Stages()))  # nothing follows from them here, so they stay
-    before, after = (
-        np.std(solve(table([path()], KEPT, each), y, each, LEAST, np.ones(y.size)).errors_um)
-        for each in (GRID, grid)
-    )
+    tables = [(table([path()], KEPT, each), y, each) for each in (GRID, grid)]
+    ends = [Equations(*each, LEAST, np.ones(y.size)).solve() for each in tables]
+    before, after = (np.std(end.errors_um) for end in ends)
     assert after < 0.3 * before
 
 
