@@ -57,7 +57,7 @@ class IlcState:
         sample_rate_hz: Samples per second.
         highest_hz: Highest bandwidth.
         next_um: complex128[K + 1], correction for the next run.
-        reach_hz: Its bandwidth.
+        reach_hz: Its bandwidth; 0.0 before the first run.
         gain: Share of the error that the next step removes.
         widening: Factor of the bandwidth after an improvement.
         response: Response of the displacement to a change of the correction.
@@ -68,7 +68,7 @@ class IlcState:
     sample_rate_hz: float
     highest_hz: float
     next_um: C128
-    reach_hz: float
+    reach_hz: float = 0.0
     gain: float = FIRST_GAIN
     widening: float = _WIDEN
     response: Response = field(default_factory=Response)
@@ -84,17 +84,6 @@ class IlcState:
     def closest(self) -> IlcIteration:
         """The run with the smallest rms error, which is less sensitive to noise and corners."""
         return min(self.trials, key=lambda trial: trial.error.rms_um)
-
-
-def begin(sample_rate_hz: float, first_um: C128, highest_hz: float) -> IlcState:
-    """Return the state before the first run.
-
-    Args:
-        sample_rate_hz: Samples per second.
-        first_um: complex128[K + 1], correction of the first run.
-        highest_hz: Highest bandwidth of a correction.
-    """
-    return IlcState(sample_rate_hz, highest_hz, first_um, reach_hz=0.0)
 
 
 def learn(before: IlcState, error: CycleScore) -> IlcState:

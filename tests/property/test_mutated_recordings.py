@@ -38,7 +38,7 @@ from hilctl.base.segments import Segment
 from hilctl.cli.reports import render_report
 from hilctl.experiment.initial_state import initial_state_after
 from hilctl.identify.data.cycles import loops_from_recording
-from hilctl.identify.data.data_files import history_from_recording
+from hilctl.identify.data.data_files import history_from_pieces
 from hilctl.kernels.hysteresis import play_sum
 from hilctl.models.base import HysteresisModel
 from hilctl.models.generalised_pi import GeneralisedModel, PlayEnvelope
@@ -352,7 +352,7 @@ def _pieces(_recording: Recording, path: Path) -> None:
 
 def _identify(recording: Recording, _path: Path) -> None:
     with suppress(HilctlError):
-        history_from_recording(recording)
+        history_from_pieces([recording])
     loops_from_recording(recording)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.files import check_writable, write_text
 from hilctl.base.samples import Flag
-from hilctl.identify.data.data_files import history_from_recording
+from hilctl.identify.data.data_files import history_from_pieces
 from hilctl.identify.data.records import History
 from hilctl.identify.fit_api import FitData, OnProgress, ignore_progress
 from hilctl.identify.fit_model import VERSIONS, error_table, identified_range
@@ -62,7 +62,7 @@ def load_runs(paths: Sequence[Path], model: HysteresisModel) -> list[History]:
 
 
 def _history(recording: Recording, known: Mapping[str, Recording]) -> History:
-    history = history_from_recording(recording)
+    history = history_from_pieces([recording])
     before = recording.run.get("initial_state_run_id", "")
     conditioned = (recording.samples.flags & Flag.CONDITION.value).any()
     if not before or conditioned:

@@ -5,7 +5,7 @@ import pytest
 
 from hilctl.ilc.cycle import CycleScore
 from hilctl.ilc.response import Response
-from hilctl.ilc.update import FIRST_GAIN, IlcState, begin, learn, refused
+from hilctl.ilc.update import FIRST_GAIN, IlcState, learn, refused
 
 RATE_HZ = 50_000.0
 STEP_HZ = 100.0
@@ -52,7 +52,7 @@ class Plant:
 
 
 def begun() -> IlcState:
-    return begin(RATE_HZ, np.zeros(HARMONICS + 1, dtype=complex), 6000.0)
+    return IlcState(RATE_HZ, 6000.0, np.zeros(HARMONICS + 1, dtype=complex))
 
 
 def learned(plant: Plant, cycles: int = 20) -> IlcState:
