@@ -151,11 +151,6 @@ def compare(
 ) -> Comparison:
     """Identify each model on the loops, evaluate it, and try its inverse on the device.
 
-    Args:
-        request: The request.
-        clock: Time in s.
-        progress: Called with the progress and the current step.
-
     Raises:
         InputError: A part of the request is not usable.
     """

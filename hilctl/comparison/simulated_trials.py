@@ -55,10 +55,6 @@ def waveforms_of(
 ) -> list[AnyWaveform]:
     """Return a waveform at each frequency, with the necessary duration.
 
-    Args:
-        waveform: A sine or a triangle, or any other without frequencies.
-        frequencies_hz: The frequencies; None for the unchanged waveform.
-
     Raises:
         InputError: Another waveform with frequencies, or a frequency is not > 0.
     """

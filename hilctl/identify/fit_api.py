@@ -9,7 +9,7 @@ import numpy as np
 
 from hilctl.base.errors import DataError
 from hilctl.base.types import F64, CommandUnit
-from hilctl.identify.data.records import History, Record, Records, SteadyLoop, thinned
+from hilctl.identify.data.records import History, Record, Records, SteadyLoop
 from hilctl.identify.parallel import MapFunction, serial_map
 from hilctl.identify.settings import FitSettings
 from hilctl.identify.staged.fit_data import GAMMA_S, PARAMETERS, SPACING, plays_and_slopes
@@ -19,8 +19,6 @@ from hilctl.models.integrated import ButterflyModel, IntegratedModel
 from hilctl.models.linear_stages import FurtherMode
 from hilctl.models.plays import PlayModel
 
-# Models with a lag need every sample.
-_EVERY_SAMPLE = {"staged", "field", "generalised_duhem"}
 PERIODS = 3
 """Simulated periods of a loop; the last is evaluated, since differential models settle slowly."""
 
@@ -37,15 +35,6 @@ class _Run:
     judged: slice
     place: slice
     loop: bool
-
-
-def search_data(records: Records, kind: str, unit: CommandUnit) -> "FitData":
-    """Return the data of a search; long records are thinned if the kind of model permits it.
-
-    Raises:
-        DataError: There are no records.
-    """
-    return FitData(records if kind in _EVERY_SAMPLE else thinned(records), unit)
 
 
 class FitData:
@@ -104,6 +93,11 @@ class FitData:
             column[place] = part
             columns.append(column)
         return np.hstack(columns)
+
+    def with_creep(self, responses_um: F64) -> F64:
+        """Return responses with the offset and creep of each record that fit best: float64[N]."""
+        own = np.linalg.lstsq(self.creep, self.target_um - responses_um, rcond=None)[0]
+        return responses_um + self.creep @ own
 
     @property
     def loops(self) -> tuple[SteadyLoop, ...]:
@@ -192,10 +186,6 @@ class FitData:
             periods = PERIODS if isinstance(record, SteadyLoop) else 1
             parts.append(run(np.tile(record.command, periods))[place.start - place.stop :])
         return np.concatenate(parts)
-
-    def swing(self, columns: F64) -> F64:
-        """Return the largest peak-to-peak in a record of each column, float64[N, m]: float64[m]."""
-        return np.asarray(np.max([np.ptp(columns[place], axis=0) for place in self.places], axis=0))
 
     def common(self, offset_um: float) -> dict[str, Any]:
         """Return the fields that every model has, by name."""

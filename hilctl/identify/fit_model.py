@@ -13,20 +13,16 @@ import hilctl
 from hilctl.base.types import F64
 from hilctl.experiment.model_validity import ALL, spectrum
 from hilctl.identify.creep_fit import creep_of, without_creep
-from hilctl.identify.data.records import History, Record, SteadyLoop, turning_points
+from hilctl.identify.data.records import History, Record, SteadyLoop, thinned, turning_points
 from hilctl.identify.evaluation import Evaluation, judge
-from hilctl.identify.fit_api import (
-    FitData,
-    FitJob,
-    FitRequest,
-    FoundModel,
-    StartOutcome,
-    search_data,
-)
+from hilctl.identify.fit_api import FitData, FitJob, FitRequest, FoundModel, StartOutcome
 from hilctl.identify.registry import CATALOGUE
 from hilctl.identify.resonances import without_modes
 from hilctl.identify.settings import FitSettings
 from hilctl.models.base import HysteresisModel, IdentifiedRange, Provenance
+
+EVERY_SAMPLE = {"staged", "field", "generalised_duhem"}
+"""Kinds with a lag: for the others, long records are thinned."""
 
 
 def fit_kind(request: FitRequest) -> FoundModel:
@@ -43,13 +39,8 @@ def fit_kind(request: FitRequest) -> FoundModel:
     creep = creep_of(records) if settings.looks_for("creep_stage") else None
     bare = records if creep is None else without_creep(records, creep)
     bare = without_modes(bare, modes) if modes else bare
-    job = FitJob(
-        search_data(bare, settings.kind, unit),
-        settings,
-        request.run,
-        request.progress,
-        request.start,
-    )
+    data = FitData(bare if settings.kind in EVERY_SAMPLE else thinned(bare), unit)
+    job = FitJob(data, settings, request.run, request.progress, request.start)
     found = CATALOGUE[settings.kind].fit(job)
     known, parameters, numbers = dict[str, Any](), dict(found.parameters), found.numbers
     if creep is not None:
@@ -128,13 +119,9 @@ class FittedModel(Evaluation):
     """An identified model, and its errors on the fitted records.
 
     Attributes:
-        model: The model, with its provenance.
         numbers: Number of fitted numbers.
-        starts: Starts of the search.
         parameters: Fitted parameters under their published names, in command units, um and s.
         standard_errors: Standard errors of the parameters, if known.
-        at_bound: Parameters at a bound.
-        elapsed_s: Duration of the fit.
     """
 
     model: HysteresisModel
@@ -203,9 +190,7 @@ def fit_model(request: FitRequest) -> FittedModel:
 
 def _method(settings: FitSettings) -> str:
     """Return the kind of model and the settings that differ from the published ones."""
-    title = CATALOGUE[settings.kind].title
-    changes = settings.changes()
-    return f"{title}; {changes}" if changes else title
+    return "; ".join(filter(None, (CATALOGUE[settings.kind].title, settings.changes())))
 
 
 def _grid_line(record: Record) -> str:

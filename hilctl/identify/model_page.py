@@ -70,13 +70,7 @@ def _drawn(heading: str, judged: Evaluation, data: Sequence[Record], unit: str) 
 
 @mpl.rc_context(STYLE)
 def loops_figure(modelled_um: Sequence[F64], data: Sequence[Record], unit: str) -> Figure:
-    """Draw displacement against command, measured and modelled, and the error below each.
-
-    Args:
-        modelled_um: Modelled displacement of the evaluated samples of each record.
-        data: Loops and histories.
-        unit: Unit of the command.
-    """
+    """Draw displacement against command, measured and modelled, and the error below each."""
     columns = min(COLUMNS, len(data))
     rows = -(-len(data) // columns)
     figure = Figure(figsize=(3.6 * columns, 3.8 * rows))

@@ -38,8 +38,6 @@ class Verdict:
             amplitudes and frequencies.
         within_percent: Largest error in percent of a record's own peak-to-peak displacement, on
             held-out data if there are any.
-        held_out: Whether there are held-out data.
-        reasons: Reasons for ``not a model``.
         notes: Limits of the data, and suggestions.
     """
 

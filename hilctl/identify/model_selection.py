@@ -34,11 +34,9 @@ class Split:
 
 @dataclass(frozen=True, slots=True)
 class HeldOut:
-    """Errors of a model on held-out data.
+    """Errors of a model on held-out data, whose origin ``how`` describes.
 
-    Attributes:
-        how: Origin of the data, as text.
-        end: End of the last fit, from which a fit to all data can start.
+    A fit to all data can start from ``end``.
     """
 
     judgement: Evaluation

@@ -55,10 +55,6 @@ def with_modes(
 
     A missing mode distorts all other parameters, so the model is identified again with each mode
     that is found, and its residual shows the modes more clearly.
-
-    Args:
-        records: Fitted records.
-        identify: Identifies a model of them with known modes.
     """
     best = identify(())
     histories = [record for record in records if isinstance(record, History)]
@@ -83,10 +79,6 @@ class Identification:
     """An identified model, and its errors on held-out data.
 
     Attributes:
-        fit: The fit.
-        data: Fitted records.
-        verdict: Grade of the model.
-        held_out: Errors on held-out data; None if there were none.
         orders: Errors of each number of plays, if it was selected.
         lag_samples: Assumed lag of tables' displacements in samples.
         candidates: Errors of each kind, if it was selected.
@@ -114,10 +106,6 @@ class Identification:
 
 def settings_from(kind: str, texts: Sequence[str]) -> IdentifySettings:
     """Return the settings of a fit: those of the kind, changed by ``key=value`` texts.
-
-    Args:
-        kind: Kind of model; ``auto`` for the one with the least error on held-out data.
-        texts: ``key=value``.
 
     Raises:
         InputError: The kind is unknown, or settings are invalid; all invalid ones are listed.

@@ -117,10 +117,6 @@ class IlcSession:
     def learn(self, cycles: int, on_rows: Callable[[Sequence[IlcRow]], None]) -> IlcResult:
         """Run and learn until the error no longer improves.
 
-        Args:
-            cycles: Most runs after the first.
-            on_rows: Called after each run.
-
         Raises:
             InputError: The first run is rejected; nothing has moved.
             RunError: The first run ended by a fault.

@@ -54,15 +54,12 @@ class IlcState:
     """State of the learning of one waveform.
 
     Attributes:
-        sample_rate_hz: Samples per second.
         highest_hz: Highest bandwidth.
         next_um: complex128[K + 1], correction for the next run.
         reach_hz: Its bandwidth; 0.0 before the first run.
         gain: Share of the error that the next step removes.
         widening: Factor of the bandwidth after an improvement.
         response: Response of the displacement to a change of the correction.
-        trials: Runs so far.
-        done: Reason for the end of learning, or empty.
     """
 
     sample_rate_hz: float

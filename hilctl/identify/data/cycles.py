@@ -158,11 +158,7 @@ class CycleMean:
             self._sums += [np.bincount(index, row, bins) for row in values]
 
     def cycle(self) -> F64:
-        """Return the mean cycle: float64[m, points]; the first point has phase 0.
-
-        Raises:
-            DataError: Samples are missing around a phase, or values can't be averaged.
-        """
+        """Return the mean cycle: float64[m, points]; the first point has phase 0."""
         if not self._count.all():
             missing = int(np.argmin(self._count))
             raise DataError(
@@ -182,18 +178,7 @@ class CycleMean:
 def average_cycle(label: str, phase: F64, values: F64, period: float, points: int) -> F64:
     """Return the mean cycle at points evenly spaced in time, see :class:`CycleMean`.
 
-    Args:
-        label: Label for errors.
-        phase: float64[n], time in periods since the start of the first cycle.
-        values: float64[m, n], signals.
-        period: Samples per period.
-        points: Points of the mean cycle.
-
-    Returns:
-        float64[m, points]; the first point has phase 0.
-
-    Raises:
-        DataError: The period is too short, or samples are missing around a phase.
+    The phase, float64[n], is time in periods since the start of the first cycle.
     """
     mean = CycleMean(label, period, points, len(values))
     mean.add(phase, values)
@@ -213,12 +198,6 @@ def loops_from_pieces(
     """Return the averaged steady cycle of each segment of a recording.
 
     Samples with a displacement that is not finite are ignored.
-
-    Args:
-        pieces: A run with at least one repeating segment, see
-            :class:`hilctl.recording.reader.RecordingStream`.
-        points: Points per loop; published are 200, 300 and 400.
-        labels: Labels of segments to use; all if empty.
 
     Raises:
         DataError: A label is unknown, a segment has no steady cycle, or there is no segment.
@@ -277,10 +256,6 @@ def find_cycles(history: History, points: int = 300) -> SteadyLoop:
 
     The period is that of the command. If there is more than one cycle, the first is ignored,
     because the hysteresis still depends on what came before.
-
-    Args:
-        history: Samples that repeat at full amplitude for at least two cycles.
-        points: Points per loop.
 
     Raises:
         DataError: Nothing repeats.

@@ -50,20 +50,13 @@ def bare_displacement(
 
     ``derivatives``, float64[3, n], holds y, y' and y''; the last sample is repeated.
     """
+    y, slope, bend = derivatives[0], derivatives[1], derivatives[2]
     whole = math.floor(late)
-    part, end = late - whole, derivatives.shape[1] - 1
+    part, end = late - whole, y.size - 1
     for i in range(kept.size):
         here, there = min(kept[i] + whole, end), min(kept[i] + whole + 1, end)
-        a = (
-            derivatives[0, here]
-            + slope_gain * derivatives[1, here]
-            + bend_gain * derivatives[2, here]
-        )
-        b = (
-            derivatives[0, there]
-            + slope_gain * derivatives[1, there]
-            + bend_gain * derivatives[2, there]
-        )
+        a = y[here] + slope_gain * slope[here] + bend_gain * bend[here]
+        b = y[there] + slope_gain * slope[there] + bend_gain * bend[there]
         out[i] = a + part * (b - a)
 
 

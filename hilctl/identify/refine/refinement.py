@@ -91,7 +91,6 @@ class Refinement:
     """A refined model, and its errors.
 
     Attributes:
-        model: The refined model.
         choice: Selected regularisation, with errors before and after on held-out runs.
         reasons: Why it is no better than the old model; empty if it is better.
     """

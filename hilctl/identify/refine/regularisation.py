@@ -210,7 +210,6 @@ class Regularisation:
         data, responses_um = FitData(records, self._unit), np.concatenate(bare)
         how = f"{len(records)} recordings, each held out of one fit"
         if own:
-            mine = np.linalg.lstsq(data.creep, data.target_um - responses_um, rcond=None)[0]
-            responses_um = responses_um + data.creep @ mine
+            responses_um = data.with_creep(responses_um)
             how += ", without an offset and creep per recording"
         return HeldOut(judgement_of(data, responses_um), records, how)
