@@ -341,8 +341,3 @@ def notes(comparison: Comparison) -> list[str]:
     )
     limited = any(trial.limited_samples for row in comparison.rows for trial in row.trials)
     return [*found, "*: the limiter changed evaluated commands"] if limited else found
-
-
-def titles(rows: Sequence[ComparedModel]) -> list[tuple[str, str]]:
-    """Return the name and the description of each model."""
-    return [(row.name, row.title) for row in rows]

@@ -182,10 +182,7 @@ loops of a field may creep."""
 LONGEST = max(map(len, IN_FULL.values()))
 NEAR = 2.0  # times the least error: a small model of the best kind may have it
 WORTH = 0.95  # of the error: a larger model must be below it, since it slows every run
-LOOPS: tuple[Mapping[str, Any], ...] = (
-    {"kind": "staged"},
-    {"kind": "integrated", "offset": True},
-)
+LOOPS: tuple[Mapping[str, Any], ...] = ({"kind": "staged"}, {"kind": "integrated", "offset": True})
 """Candidates for steady loops."""
 ORDERS = ((6, 4), (8, 6), (12, 8), (16, 10), (20, 12), (28, 16))
 """Plays, and deadbands on each side if the model has any."""

@@ -24,7 +24,7 @@ from hilctl.identify.model_selection import (
     held_out_error,
     select,
 )
-from hilctl.identify.parallel import MapFunction, workers
+from hilctl.identify.parallel import workers
 from hilctl.identify.registry import entry
 from hilctl.identify.resonances import WORTH, further_modes
 from hilctl.identify.settings import IdentifySettings
@@ -149,7 +149,11 @@ def identify_files(
     if output is not None:
         check_writable(output, overwrite=overwrite, inputs=[*paths, *validate])
     with workers(scheduler) as run:
-        lag = _lag(paths, settings, run, progress)
+        lag = settings.table.lag_samples
+        if settings.table.find_lag:
+            lag = choose_lag(
+                lambda lag: load_records(paths, settings, lag)[0], settings, run, progress
+            )
         records, recorded = load_records(paths, settings, lag)
         asked = settings.table.unit
         if recorded and asked and recorded != asked:
@@ -202,15 +206,3 @@ def identify_records(request: FitRequest, validate: Sequence[Record] = ()) -> Id
     return Identification(
         fit, records, verdict, held_out, selection.orders, 0, selection.candidates
     )
-
-
-def _lag(
-    paths: Sequence[Path], settings: IdentifySettings, run: MapFunction, progress: OnProgress
-) -> int:
-    if not settings.table.find_lag:
-        return settings.table.lag_samples
-
-    def load(lag: int) -> Sequence[Record]:
-        return load_records(paths, settings, lag)[0]
-
-    return choose_lag(load, settings, run, progress)

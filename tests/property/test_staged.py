@@ -101,9 +101,7 @@ def test_inverse_is_bounded(model, rate_hz, signal):
 
 @given(
     models(
-        structures=st.none(),
-        delays_s=st.integers(0, 9).map(lambda n: n / 5e3),
-        smoothings_s=NONE_S,
+        structures=st.none(), delays_s=st.integers(0, 9).map(lambda n: n / 5e3), smoothings_s=NONE_S
     ),
     SIGNALS,
 )

@@ -103,8 +103,7 @@ def table(paths: Sequence[F64], kept: Sequence[I64], grid: Grid) -> F64:
     plays, cells = grid.thresholds.size, grid.cells
     parts: list[F64] = []
     for path, samples in zip(paths, kept, strict=True):
-        points, rows = np.empty(path.size, dtype=np.int64), np.empty_like(samples)
-        u = path[points[: needed_points(path, samples, points, rows)]]
+        u, rows = _needed(path, samples)
         out = np.empty((rows.size, grid.lines * cells))
         play_columns(u, rows, grid.thresholds, grid.lowest, grid.piece, cells, out)
         for i, length in enumerate(grid.lengths):
@@ -112,6 +111,12 @@ def table(paths: Sequence[F64], kept: Sequence[I64], grid: Grid) -> F64:
             drag_columns(u, rows, length, grid.lowest, grid.width, cells, first, out)
         parts.append(out)
     return np.concatenate(parts)
+
+
+def _needed(path: F64, samples: I64) -> tuple[F64, I64]:
+    """Return the points of a path that operators need, and the place of each row among them."""
+    points, rows = np.empty(path.size, dtype=np.int64), np.empty_like(samples)
+    return path[points[: needed_points(path, samples, points, rows)]], rows
 
 
 def outputs(paths: Sequence[F64], kept: Sequence[I64], grid: Grid, slopes: F64) -> tuple[F64, F64]:
@@ -124,8 +129,7 @@ def outputs(paths: Sequence[F64], kept: Sequence[I64], grid: Grid, slopes: F64) 
     given: list[F64] = []
     changes: list[F64] = []
     for path, samples in zip(paths, kept, strict=True):
-        points, rows = np.empty(path.size, dtype=np.int64), np.empty_like(samples)
-        u = path[points[: needed_points(path, samples, points, rows)]]
+        u, rows = _needed(path, samples)
         total, by = np.empty(rows.size), np.empty((rows.size, plays))
         weights = np.ascontiguousarray(slopes[:plays])
         plays_given(u, rows, grid.thresholds, grid.lowest, grid.piece, weights, total, by)

@@ -248,12 +248,7 @@ class Motion:
 
     @classmethod
     def of(
-        cls,
-        signals: tuple[F64, F64],
-        step_s: F64,
-        judged: int,
-        reach: float,
-        stroke_um: float,
+        cls, signals: tuple[F64, F64], step_s: F64, judged: int, reach: float, stroke_um: float
     ) -> "Motion":
         """Return the motion of a command and a displacement in um, float64[n] each."""
         command, displacement_um = signals

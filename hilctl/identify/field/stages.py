@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 
@@ -133,17 +134,7 @@ def signals(run: Run, known: Physical, curve: Curve | None, span: float) -> tupl
     """
     y = run.bare_um(known.delay_s, 2.0 * known.damping_ratio * known.radian_s, known.radian_s**2)
     m = y if curve is None else curve.operators_of(y)
-    lost = known.losses
-    losses = (
-        lost.field_s,
-        lost.output_s,
-        lost.decay_s,
-        lost.growth,
-        lost.bend,
-        lost.excess,
-        even_excess(span),
-        0.0,
-    )
+    losses: Any = (*known.losses.model_dump().values(), even_excess(span), 0.0)
     w = np.empty_like(y)
     late, command = run.late_command(max(known.lag_s, SHORTEST_S))
     field_left(command, late, run.step_s, m, losses, w)

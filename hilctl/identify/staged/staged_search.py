@@ -32,14 +32,6 @@ KNOTS = 16  # of Lambda^-1
 
 
 @dataclass(frozen=True, slots=True)
-class _Inverse:
-    """Lambda^-1: knots in um, float64[K + 1], and its values there."""
-
-    knots: F64
-    values: F64
-
-
-@dataclass(frozen=True, slots=True)
 class WeightedStart:
     """A point, and the root mean square of Lambda^-1(y) - Pi(v) there in um."""
 
@@ -72,14 +64,14 @@ def convex_start(
     # x = Pi(v) is 0 at rest; the displacement there is the offset.
     x = rises - float(np.interp(middle, knots, rises)) - constant
     error = (left @ found + constant - target) * scale
-    point = _point(data, layers, found[: layers.plays + 1], _Inverse(knots, x))
+    point = _point(data, layers, found[: layers.plays + 1], knots, x)
     point = _placed(data, layers, point, before, delay_s)
     return WeightedStart(point, float(np.sqrt(np.mean(error**2))))
 
 
-def _point(data: StagedFitData, layers: Layers, weights: F64, inverse: _Inverse) -> Point:
-    """Turn Lambda^-1 into Lambda with evenly spaced deadbands and slope 1 around 0."""
-    k, x, knots = layers.deadbands, inverse.values, inverse.knots
+def _point(data: StagedFitData, layers: Layers, weights: F64, knots: F64, x: F64) -> Point:
+    """Turn x = Lambda^-1 at its knots into Lambda, with even deadbands and slope 1 around 0."""
+    k = layers.deadbands
     least = 1e-3 * data.stroke_um
     d_p, d_n = max(float(x[-1]), least) / (k + 1), max(-float(x[0]), least) / (k + 1)
     steps = np.arange(1, k + 2)

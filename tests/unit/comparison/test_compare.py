@@ -16,7 +16,6 @@ from hilctl.comparison.compare import (
     notes,
     save_models,
     table_rows,
-    titles,
 )
 from hilctl.comparison.comparison_page import comparison_page
 from hilctl.identify.registry import CATALOGUE, entry
@@ -160,7 +159,6 @@ def test_a_model_of_a_file_has_dashes_where_nothing_was_found():
         ["duhem", "5", "1.50", "312", "1.25", "0.50", "0.75", "-"],
         ["m.yaml", "-", "-", "312", "1.25", "0.50"],
     ]
-    assert titles(found.rows) == [("duhem", "the duhem"), ("m.yaml", "the m.yaml")]
 
 
 def test_a_trial_that_was_limited_has_a_star_and_a_note():

@@ -84,11 +84,7 @@ def test_one_record_in_other_units_is_named(grid):
 
 @pytest.mark.parametrize(
     ("chosen", "note"),
-    [
-        (slice(0, 1), "--validate"),
-        (slice(0, None, 3), "10 Hz"),
-        (slice(0, 3), "one amplitude"),
-    ],
+    [(slice(0, 1), "--validate"), (slice(0, None, 3), "10 Hz"), (slice(0, 3), "one amplitude")],
 )
 def test_what_a_campaign_can_t_know_is_said_and_nothing_is_good(grid, chosen, note):
     verdict = judged(grid[chosen]).verdict

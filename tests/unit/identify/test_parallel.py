@@ -111,8 +111,5 @@ def test_dask_cluster_finds_the_same(loops: list[SteadyLoop]) -> None:
 
 def test_unknown_schedulers_are_refused() -> None:
     """A scheduler that is neither known nor an address is refused with what there is."""
-    with (
-        pytest.raises(InputError, match=r"'four'"),
-        workers("four"),
-    ):
+    with pytest.raises(InputError, match=r"'four'"), workers("four"):
         pass

@@ -14,7 +14,7 @@ from hilctl.base.errors import ConfigError, InputError
 from hilctl.cli.models import print_identification
 from hilctl.identify import pipeline as subject
 from hilctl.identify.data.records import History, SteadyLoop
-from hilctl.identify.model_page import write_identification
+from hilctl.identify.model_page import identification_page
 from hilctl.identify.model_selection import Selection
 from hilctl.identify.pipeline import TURNS, identify_files, settings_from, with_modes
 from hilctl.identify.resonances import WORTH
@@ -58,7 +58,7 @@ def test_order_and_lag_are_found_and_reported(
 ) -> None:
     """With plays and lag on auto, the model is written, and figures, page and JSON say what was
     chosen."""
-    output, page = tmp_path / "model.yaml", tmp_path / "page.html"
+    output = tmp_path / "model.yaml"
     asked = settings("plays=auto", "table.lag_samples=auto")
     found = identify_files(tables, asked, output, validate=tables[:1], scheduler="threads")
     assert found.lag_samples == 2
@@ -72,8 +72,7 @@ def test_order_and_lag_are_found_and_reported(
     print_identification(found, output)
     shown = capsys.readouterr().out
     assert "lag of the displacements: 2" in shown
-    write_identification(found, page)
-    text = page.read_text()
+    text = identification_page(found)
     assert text.count("<svg") == 2
     assert "sine3.csv" in text
     assert "<script" not in text
@@ -174,8 +173,7 @@ def asked(monkeypatch):
 def test_modes_are_kept_for_as_long_as_data_held_out_are_the_better(asked):
     stiffer = FirstMode(natural_hz=2200.0, damping_ratio=0.1)
     found = with_modes(
-        [RECORD],
-        identifying(Found(1.0, 1.0), Found(0.9, 0.5, first=stiffer), Found(0.1, 0.46)),
+        [RECORD], identifying(Found(1.0, 1.0), Found(0.9, 0.5, first=stiffer), Found(0.1, 0.46))
     )
     assert (found.modes, found.held_out_percent) == ((MODE,), 0.5)
     assert asked == [(0, 2000.0), (1, 2200.0)]

@@ -9,18 +9,8 @@ from hilctl.base.errors import DataError
 from hilctl.base.types import F64
 from hilctl.identify.data.records import History, SteadyLoop
 from hilctl.identify.evaluation import judge
-from hilctl.identify.field.duhem_search import (
-    DuhemSearch,
-    _bounded_step,
-)
-from hilctl.identify.field.duhem_tables import (
-    FIRST,
-    HIGHEST,
-    LOWEST,
-    NAMES,
-    STEPS,
-    laid_over,
-)
+from hilctl.identify.field.duhem_search import DuhemSearch, _bounded_step
+from hilctl.identify.field.duhem_tables import FIRST, HIGHEST, LOWEST, NAMES, STEPS, laid_over
 from hilctl.identify.fit_api import FitRequest
 from hilctl.identify.fit_model import FittedModel, fit_model
 from hilctl.identify.settings import FitSettings

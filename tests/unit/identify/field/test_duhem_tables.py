@@ -5,9 +5,7 @@ import pytest
 
 from hilctl.base.types import F64
 from hilctl.identify.data.records import History
-from hilctl.identify.field.duhem_search import (
-    POINTS,
-)
+from hilctl.identify.field.duhem_search import POINTS
 from hilctl.identify.field.duhem_tables import (
     BENT,
     FIRST,
@@ -17,7 +15,6 @@ from hilctl.identify.field.duhem_tables import (
     MARGIN,
     NAMES,
     POWERS,
-    STAGES,
     STEPS,
     TILTED,
     WIDER,
@@ -144,9 +141,7 @@ def test_the_prior_weighs_bends_more_than_tilts() -> None:
 def test_the_row_is_made_of_the_stages_that_the_field_has() -> None:
     for row, stages in ((LOWEST, LOW), (HIGHEST, HIGH), (STEPS, STEP)):
         assert row.size == len(NAMES)
-        assert dict(zip(NAMES, row, strict=True)) | {
-            name: getattr(stages, name) for name in STAGES
-        } == dict(zip(NAMES, row, strict=True))
+        assert row[:9].tolist() == [getattr(stages, name) for name in NAMES[:9]]
     assert (FIRST >= LOWEST).all()
     assert (FIRST <= HIGHEST).all()
     assert FIRST[NAMES.index("output")] > 0.0  # or the flux would make no difference at first

@@ -27,8 +27,7 @@ SINES = [(2.5, 10.0), (2.5, 100.0), (4.0, 50.0)]
 
 
 @pytest.mark.parametrize(
-    "centre",
-    [*(pytest.param(each, marks=pytest.mark.slow) for each in (0.0, 1.0)), -4.5],
+    "centre", [*(pytest.param(each, marks=pytest.mark.slow) for each in (0.0, 1.0)), -4.5]
 )
 def test_errors_are_small_over_one_wing_or_both(loops_of, centre):
     """Loops over both wings, partly over both, and on the one below 0 are met within 2 %."""
