@@ -62,7 +62,6 @@ def words(values):
 
 @given(st.sampled_from(BINARY), st.binary(min_size=1, max_size=600))
 def test_frames_come_back(kind, payload):
-    """Any payload, in every binary framing."""
     framing = binary_framing(*kind)
     assert framing.decode(framing.encode(payload)) == payload
 
@@ -71,7 +70,6 @@ def test_frames_come_back(kind, payload):
     st.sampled_from(BINARY), st.lists(st.binary(min_size=1, max_size=40), max_size=12), st.data()
 )
 def test_streams_come_back_in_any_pieces(kind, payloads, data):
-    """However the stream is cut, the payloads come out in order and none is lost or made up."""
     framing = binary_framing(*kind)
     stream = b"".join(map(framing.encode, payloads))
     cuts = sorted(data.draw(st.lists(st.integers(0, len(stream)), max_size=20)))
@@ -86,14 +84,12 @@ def test_streams_come_back_in_any_pieces(kind, payloads, data):
     st.text(st.characters(min_codepoint=32, max_codepoint=126), min_size=1, max_size=120),
 )
 def test_lines_come_back(checksum, terminator, text):
-    """Any printable text, its own checksum marks included."""
     line = LineFormat(terminator, checksum)
     assert line.decode(line.encode(text)) == text
 
 
 @given(st.sampled_from(list(NUMPY)), st.data())
 def test_registers_are_those_of_numpy(kind, data):
-    """Raw values in any byte order are numpy's big-endian bytes, permuted."""
     dtype = np.dtype(NUMPY[kind])
     if "int" in kind:
         value = data.draw(st.integers(int(np.iinfo(dtype).min), int(np.iinfo(dtype).max)))
@@ -115,7 +111,6 @@ def test_registers_are_those_of_numpy(kind, data):
     st.floats(0, 1),
 )
 def test_scaled_values_come_back_to_half_a_step(kind, scale, offset, negative, where):
-    """Anywhere between the limits, for either sign of the scale."""
     channel = RegisterFormat(kind, scale=-scale if negative else scale, offset=offset)
     low, high = channel.limits
     value = low + where * (high - low)
@@ -125,7 +120,6 @@ def test_scaled_values_come_back_to_half_a_step(kind, scale, offset, negative, w
 
 @given(ADDRESS, st.integers(1, 125), UNIT, TRANSACTION, st.data())
 def test_reads_as_pymodbus_has_them(address, count, unit, transaction, data):
-    """Request and reply, in both envelopes."""
     pdu = read_pdu(3, address, count)
     theirs = ReadHoldingRegistersRequest(
         dev_id=unit, transaction_id=transaction, address=address, count=count
@@ -140,7 +134,6 @@ def test_reads_as_pymodbus_has_them(address, count, unit, transaction, data):
 
 @given(ADDRESS, WORDS, UNIT, TRANSACTION)
 def test_writes_as_pymodbus_has_them(address, values, unit, transaction):
-    """Request and reply, in both envelopes."""
     pdu = write_pdu(address, words(values))
     names = {"dev_id": unit, "transaction_id": transaction, "address": address}
     assert_same_request(pdu, WriteMultipleRegistersRequest(**names, registers=values))
@@ -152,7 +145,6 @@ def test_writes_as_pymodbus_has_them(address, values, unit, transaction):
 def test_write_reads_as_pymodbus_has_them(
     read_at, count, write_at, values, unit, transaction, data
 ):
-    """Request and reply, in both envelopes."""
     pdu = write_read_pdu(read_at, count, write_at, words(values))
     names = {"dev_id": unit, "transaction_id": transaction}
     theirs = ReadWriteMultipleRegistersRequest(
@@ -441,7 +433,6 @@ def stream_of(name):
 
 @pytest.mark.parametrize("name", ["line", *(" ".join(kind) for kind in BINARY)])
 def test_streams_lose_no_more_than_was_damaged(name):
-    """One damaged message costs itself and at most, where its end is lost, the one behind it."""
     framing, payloads = stream_of(name)
     frames = [framing.encode(payload) for payload in payloads]
     rng = random.Random(f"stream of {name}")

@@ -40,7 +40,6 @@ def comparison():
 
 
 def test_rows_come_as_asked_for(comparison):
-    """One row a model, in that order; a model file was not identified here."""
     assert [row.name for row in comparison.rows] == ["duhem", "straight", "terfenol_omega.yaml"]
     assert [row.numbers for row in comparison.rows] == [4, 2, None]
     assert comparison.rows[2].identify_s is None
@@ -48,14 +47,12 @@ def test_rows_come_as_asked_for(comparison):
 
 
 def test_better_models_compensate_better(comparison):
-    """On its loop: Omega before Duhem before a straight line, modelled and compensated."""
     duhem, straight, omega = comparison.rows
     assert omega.error.peak_percent < duhem.error.peak_percent < straight.error.peak_percent
     assert omega.compensated_percent < duhem.compensated_percent < straight.compensated_percent
 
 
 def test_everything_goes_into_json(comparison):
-    """The mapping is plain, and holds every loop and trial."""
     mapping = json.loads(json.dumps(comparison.to_mapping(), allow_nan=False))
     first = mapping["models"][0]
     assert first["model"]["kind"] == "duhem"
@@ -67,7 +64,6 @@ def test_everything_goes_into_json(comparison):
 @pytest.mark.slow
 @pytest.mark.parametrize("text", ["", "device: {kind: serial_dac, port: /dev/ttyUSB9}"])
 def test_loops_of_a_real_device_are_judged_without_trials(monkeypatch, text):
-    """No device is made, and table, figure and page do without compensated errors."""
     recording = read(GOLDEN)
     run = {**recording.run, "simulated": "false"}
     recording = replace(recording, experiment_yaml=text, run=run)
@@ -81,7 +77,6 @@ def test_loops_of_a_real_device_are_judged_without_trials(monkeypatch, text):
 
 
 def test_a_compensated_recording_gives_device_and_limits():
-    """Its own waveform and compensator, whose file may be elsewhere, are not needed."""
     path = GOLDEN.with_name("terfenol_compensated.mcap")
     judged = compare(
         ComparisonRequest([path], ["straight"], frequencies_hz=[200.0]), SteppingClock(1e-3), ignore
@@ -90,7 +85,6 @@ def test_a_compensated_recording_gives_device_and_limits():
 
 
 def test_progress_rises_to_the_end():
-    """Whoever waits is told what is being done, and how far it is."""
     told = []
     request = ComparisonRequest([GOLDEN], ["straight"], frequencies_hz=[100.0])
     compare(request, SteppingClock(1e-3), lambda done, text: told.append((done, text)))
@@ -101,7 +95,6 @@ def test_progress_rises_to_the_end():
 
 
 def test_unknown_models_are_refused_at_once():
-    """A misspelt name is refused before any file is read, with the nearest one."""
     with pytest.raises(InputError, match="did you mean 'preisach'"):
         compare(ComparisonRequest([Path("nowhere.mcap")], ["presach"]), SteppingClock(1e-3), ignore)
     assert set(COMPARED) <= set(CATALOGUE)
@@ -110,14 +103,12 @@ def test_unknown_models_are_refused_at_once():
 
 
 def test_a_model_of_another_unit_is_refused():
-    """A stage's model in V can't stand beside loops in A."""
     model = ROOT / "configs" / "models" / "piezo_ppi.yaml"
     with pytest.raises(InputError, match="commands in A"):
         compare(ComparisonRequest([GOLDEN], [str(model)]), SteppingClock(1e-3), ignore)
 
 
 def test_saved_models_are_model_files(comparison, tmp_path):
-    """What was found is written with its provenance; what came from a file is not."""
     paths = save_models(comparison, tmp_path / "models", created="2026-01-01", overwrite=False)
     assert [path.name for path in paths] == ["duhem.yaml", "straight.yaml"]
     for path, row in zip(paths, comparison.rows, strict=False):
@@ -149,7 +140,6 @@ def table(*rows, device="a rig"):
 
 
 def test_a_model_of_a_file_has_dashes_where_nothing_was_found():
-    """Columns are those of the model that was tried most often."""
     found = table(
         row("duhem", trial(50.0, 0.75), trial(100.0, None)),
         row("m.yaml", numbers=None, identify_s=None),

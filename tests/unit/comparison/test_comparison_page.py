@@ -28,7 +28,6 @@ def comparison():
 
 @pytest.mark.slow
 def test_the_page_holds_table_and_figure(comparison):
-    """Self-contained, with every model by name."""
     page = comparison_page(comparison)
     assert page.count("<svg") == 1
     assert "http://" not in page
@@ -38,14 +37,12 @@ def test_the_page_holds_table_and_figure(comparison):
 
 
 def test_the_figure_draws_each_model_once(comparison):
-    """A line a model in each error panel, a panel a model below."""
     upper, lower = comparison_figure(comparison).subfigs
     assert [len(axes.lines) for axes in upper.axes] == [3, 3]
     assert sum(bool(axes.lines) for axes in lower.axes) == 3
 
 
 def test_an_existing_page_is_kept(tmp_path):
-    """Unless asked to, the command replaces no file; it says so before anything is read."""
     page = tmp_path / "models.html"
     page.write_text("mine")
     with pytest.raises(InputError, match="--overwrite"):

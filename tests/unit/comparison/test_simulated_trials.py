@@ -43,7 +43,6 @@ def device(*waveforms, text=TEXT):
 
 
 def test_the_stage_follows_through_its_own_model():
-    """The inverse of the model that the stage is compensates it to a fraction of a percent."""
     (trial,) = (rig := device(SINE)).run(piezo_ppi(), rig.references[0])
     assert trial.frequency_hz == pytest.approx(10.0)
     assert trial.peak_error_percent < 1.0
@@ -51,14 +50,12 @@ def test_the_stage_follows_through_its_own_model():
 
 
 def test_a_straight_line_leaves_the_hysteresis():
-    """Without a hysteresis model the stage shows its hysteresis."""
     straight = PpiModel(input_unit="V", direct=0.4, weights=(), thresholds=())
     (trial,) = (rig := device(SINE)).run(straight, rig.references[0])
     assert trial.peak_hysteresis_percent > 5.0
 
 
 def test_trials_start_from_rest():
-    """One trial leaves nothing behind for the next."""
     rig = device(SINE)
     first = rig.run(piezo_ppi(), rig.references[0])
     rig.run(PpiModel(input_unit="V", direct=0.3, weights=(), thresholds=()), rig.references[0])
@@ -66,21 +63,18 @@ def test_trials_start_from_rest():
 
 
 def test_the_limiter_is_between():
-    """Commands beyond the limits never reach the device, and are counted."""
     steep = PpiModel(input_unit="V", direct=0.1, weights=(), thresholds=())
     (trial,) = (rig := device(SINE)).run(steep, rig.references[0])
     assert trial.limited_samples > 100
 
 
 def test_a_real_device_is_refused():
-    """Nothing but a simulated device is driven from here."""
     loaded = load_experiment(CONFIGS / "modbus_labjack_t7.yaml")
     with pytest.raises(InputError, match="simulated device"):
         TrialDevice(loaded, [SINE])
 
 
 def test_what_does_not_repeat_is_refused():
-    """A trial is judged on its average cycle, so there has to be one."""
     chirp = Chirp(
         kind="chirp", unit="um", amplitude=1.0, start_hz=1.0, stop_hz=10.0, duration_s=1.0
     )
@@ -89,7 +83,6 @@ def test_what_does_not_repeat_is_refused():
 
 
 def test_waveforms_take_the_frequencies_asked_for():
-    """Sines and triangles get each frequency, and as long as it takes to judge it."""
     triangle = Triangle(
         kind="triangle", unit="um", amplitude=1.0, frequency_hz=1.0, duration_s=9.0,
         soft_start_s=0.3, soft_end_s=0.2,
@@ -104,7 +97,6 @@ def test_waveforms_take_the_frequencies_asked_for():
 
 
 def test_frequencies_need_a_shape_that_has_one():
-    """Any other waveform runs as it is, and frequencies beside it are refused."""
     chirp = Chirp(
         kind="chirp", unit="um", amplitude=1.0, start_hz=1.0, stop_hz=10.0, duration_s=1.0
     )
@@ -116,7 +108,6 @@ def test_frequencies_need_a_shape_that_has_one():
 
 
 def test_the_stroke_is_that_of_the_widest_loop():
-    """Where no experiment says otherwise a sine covers nearly all of what was measured."""
     wave = np.sin(2.0 * np.pi * np.arange(300) / 300)
     sine = full_stroke(
         [SteadyLoop("sine", a * wave, 3.0 * a * wave + 2.0, 50.0) for a in (2, 6, 4)]
@@ -127,7 +118,6 @@ def test_the_stroke_is_that_of_the_widest_loop():
 
 
 def test_the_shortest_round_counts():
-    """The time of a sample is that of the round that nothing disturbed."""
     ticks = itertools.accumulate([0.0, 9e-3, 0.0, 2e-3, 0.0, 5e-3, 0.0, 4e-3, 0.0, 8e-3])
     command = 6.0 * np.sin(2.0 * np.pi * np.arange(300) / 300)
     loop = SteadyLoop("sine", command, 4.0 * command, 50.0)

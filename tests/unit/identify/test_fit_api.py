@@ -9,7 +9,6 @@ from hilctl.models.plays import PpiModel
 
 
 def test_no_loops_are_refused():
-    """There is nothing to find a model from on an empty list."""
     with pytest.raises(DataError, match="empty"):
         FitData([], "A")
 

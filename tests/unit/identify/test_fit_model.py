@@ -54,7 +54,7 @@ def check(found: FittedModel, peak_percent: float = 0.1) -> None:
     assert all(abs(error.area_error_percent or 0.0) < 1.0 for error in found.errors)
 
 
-def test_published_piezo_ppi_is_found_again(loops_of: Loops) -> None:
+def test_published_piezo_ppi_is_found_again(loops_of):
     """The PPI of the piezo stage comes back from its loop under 30 sin + 40 V (section 3.4.2).
 
     Its tenth threshold is beyond 30 V and never moves in that loop, so the drive is 38 V here.
@@ -70,7 +70,7 @@ def test_published_piezo_ppi_is_found_again(loops_of: Loops) -> None:
     assert found.model.input_range == pytest.approx((2.0, 78.0), abs=1e-3)
 
 
-def test_published_rdpi_is_found_again(loops_of: Loops) -> None:
+def test_published_rdpi_is_found_again(loops_of):
     """The n = 4 RDPI of the magnetostrictive actuator comes back from 1 to 200 Hz (section 5.3)."""
     truth = terfenol_rdpi()
     found = fit("rdpi", loops_of(truth, [(2.3, f) for f in (1.0, 10.0, 50.0, 100.0, 200.0)], 400))
@@ -84,8 +84,7 @@ def test_published_rdpi_is_found_again(loops_of: Loops) -> None:
 
 
 @pytest.mark.parametrize("layout", ["even", "midpoint"])
-def test_rdpi_with_exponential_weights(loops_of: Loops, layout: str) -> None:
-    """Exponential weights on either layout of thresholds come back, constant displacement too."""
+def test_rdpi_with_exponential_weights(loops_of, layout):
     shift = 0.5 if layout == "midpoint" else 0.0
     truth = RdpiModel(
         direct=2.0,
@@ -103,8 +102,7 @@ def test_rdpi_with_exponential_weights(loops_of: Loops, layout: str) -> None:
     assert found.model.output_offset_um == pytest.approx(-3.0, abs=0.02)
 
 
-def test_ppi_with_free_weights_from_a_decaying_history() -> None:
-    """Weights of any shape come back from a decaying history run from its first sample."""
+def test_ppi_with_free_weights_from_a_decaying_history():
     truth = PpiModel(
         input_unit="V",
         direct=1.0,
@@ -123,7 +121,7 @@ def test_ppi_with_free_weights_from_a_decaying_history() -> None:
 
 
 @pytest.mark.slow
-def test_published_parametrisation_of_omega_is_found_again(loops_of: Loops) -> None:
+def test_published_parametrisation_of_omega_is_found_again(loops_of):
     """Eleven parameters of the integrated model come back from the published grid (6.24)."""
     truth = omega()
     found = fit("integrated", loops_of(truth, GRID))
@@ -136,7 +134,7 @@ def test_published_parametrisation_of_omega_is_found_again(loops_of: Loops) -> N
     np.testing.assert_allclose(found.model.deadband(x), truth.deadband(x), atol=0.1)
 
 
-def test_omega_with_free_weights(loops_of: Loops) -> None:
+def test_omega_with_free_weights(loops_of):
     """Free weights describe loops that exponential ones can't, within 0.1 % of the stroke."""
     base = omega()
     weights = np.array(base.weights) * (1.0 + 0.4 * np.cos(np.arange(12)))
@@ -149,8 +147,7 @@ def test_omega_with_free_weights(loops_of: Loops) -> None:
     IntegratedModel.model_validate(free.model.model_dump())
 
 
-def test_same_data_same_model(loops_of: Loops) -> None:
-    """The random starts are the same, so the result is the same bit for bit."""
+def test_same_data_same_model(loops_of):
     loops = loops_of(omega(), GRID[:2] + GRID[5:7])
     first, again = (fit("integrated", loops, starts=2) for _ in range(2))
     assert first.model == again.model
@@ -158,9 +155,7 @@ def test_same_data_same_model(loops_of: Loops) -> None:
 
 
 @pytest.mark.parametrize(("rate_hz", "rest"), [(75_000.0, 0.01), (50_000.0, 0.25)])
-def test_errors_are_those_of_the_run_at_its_own_rate(
-    loops_of: Loops, rate_hz: float, rest: float
-) -> None:
+def test_errors_are_those_of_the_run_at_its_own_rate(loops_of, rate_hz, rest):
     """Loops of 300 points predict what the model does sample by sample in the run.
 
     At 250 Hz a cycle has 300 samples at 75 kHz, which leaves nothing; it has 200 at 50 kHz, whose
@@ -177,16 +172,14 @@ def test_errors_are_those_of_the_run_at_its_own_rate(
     assert judge(omega(), [measured]).peak_percent < rest
 
 
-def test_histories_are_judged_as_models_run_them() -> None:
-    """A history's error is zero to the last bits for the model that made it, rate included."""
+def test_histories_are_judged_as_models_run_them():
     command = 3.0 * np.sin(0.02 * np.arange(2000)) * np.linspace(0.0, 1.0, 2000)
     made = omega().forward(10_000.0).process(command)
     judged = judge(omega(), [History("growing", command, made, 10_000.0, ignore=10)])
     assert judged.peak_percent < 1e-9
 
 
-def test_errors_count_against_own_and_largest_stroke(loops_of: Loops) -> None:
-    """One micrometre weighs more against a small loop's stroke than against the largest."""
+def test_errors_count_against_own_and_largest_stroke(loops_of):
     small, large = loops_of(omega(), [(3.0, 10.0), (6.0, 10.0)])
     shifted = replace(small, displacement_um=small.displacement_um + 1.0)
     judged = judge(omega(), [shifted, large])
@@ -196,7 +189,7 @@ def test_errors_count_against_own_and_largest_stroke(loops_of: Loops) -> None:
     assert [error.peak_to_peak_um for error in judged.errors] == pytest.approx(spans)
 
 
-def test_hysteresis_weights_shift_the_fit_to_wide_loops(loops_of: Loops) -> None:
+def test_hysteresis_weights_shift_the_fit_to_wide_loops(loops_of):
     """Weighted as in (5.14), the loop with most hysteresis is fitted better than unweighted."""
     loops = loops_of(omega(), [(6.0, f) for f in (1.0, 50.0, 250.0)])
     even = fit("rdpi", loops, weight_by="equal")
@@ -205,8 +198,7 @@ def test_hysteresis_weights_shift_the_fit_to_wide_loops(loops_of: Loops) -> None
     assert weighted.errors[0].rms_percent > even.errors[0].rms_percent
 
 
-def test_peak_goal_lowers_the_peak(loops_of: Loops) -> None:
-    """With a goal the peak error falls and the rms rises."""
+def test_peak_goal_lowers_the_peak(loops_of):
     loops = loops_of(omega(), [(6.0, 10.0), (6.0, 150.0)])
     plain = fit("rdpi", loops, weight_by="equal", offset=True)
     goal = 0.9 * plain.peak_percent
@@ -215,7 +207,7 @@ def test_peak_goal_lowers_the_peak(loops_of: Loops) -> None:
     assert refined.rms_percent > plain.rms_percent
 
 
-def test_no_slope_falls_below_the_least(loops_of: Loops) -> None:
+def test_no_slope_falls_below_the_least(loops_of):
     """Loops of pure plays would have a_0 = 0; it stays at the least slope, so it inverts."""
     play = PpiModel(direct=1e-6, weights=(2.0,), thresholds=(0.7,), input_unit="V")
     loops = loops_of(play, [(2.0, 1.0)])
@@ -227,8 +219,7 @@ def test_no_slope_falls_below_the_least(loops_of: Loops) -> None:
     found.model.inverse(1000.0)
 
 
-def test_provenance_and_mapping_say_where_the_model_is_from(loops_of: Loops) -> None:
-    """Model file and JSON hold sources, method, grid, errors, versions, date and time taken."""
+def test_provenance_and_mapping_say_where_the_model_is_from(loops_of):
     parts: list[float] = []
     found = fit_model(
         FitRequest(
@@ -255,8 +246,7 @@ def test_provenance_and_mapping_say_where_the_model_is_from(loops_of: Loops) -> 
     assert parts[-1] == 1.0
 
 
-def test_no_data_are_refused() -> None:
-    """Nothing comes of an empty list."""
+def test_no_data_are_refused():
     with pytest.raises(DataError, match="empty"):
         fit("ppi", [])
 
@@ -352,7 +342,6 @@ def loop(amplitude, frequency_hz, harmonic=0.0):
 
 
 def test_motions_frequencies_and_speed():
-    """The speed is that of the fastest record, the harmonics count."""
     found = identified_range(FitData([loop(1.0, 100.0), loop(6.0, 10.0, harmonic=0.5)]))
     assert found.peak_to_peak_um[0] == pytest.approx(10.0, rel=1e-3)
     assert found.frequency_hz == pytest.approx((10.0, 100.0))
@@ -370,7 +359,6 @@ def test_of_a_history_the_frequencies_of_its_command():
 
 
 def test_of_a_history_the_swings_from_turn_to_turn():
-    """Of large loops and small ones, these are the smallest motion where they are enough of it."""
     time_s = np.arange(20_000) / 1000.0
     wave = np.sin(2.0 * np.pi * 5.0 * time_s)
     for part, wanted_um in ((0.3, 5.0), (0.9, 30.0)):

@@ -119,9 +119,7 @@ def chosen(records: list[Record], *texts: str) -> tuple[FitSettings, tuple[Candi
     return found.settings, found.candidates
 
 
-def test_the_kind_whose_small_model_does_well_is_tried_in_full(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_kind_whose_small_model_does_well_is_tried_in_full(monkeypatch):
     seen = fake(monkeypatch, {**SMALL, "generalised_duhem 12": 1.3})
     found = select(FitRequest([HISTORY], settings_from("auto", [])))
     settings, held_out, errors = found.settings, found.held_out, found.candidates
@@ -136,15 +134,13 @@ def test_the_kind_whose_small_model_does_well_is_tried_in_full(
     assert held_out.end == "end of field 3 32"
 
 
-def test_more_operators_are_taken_only_where_they_are_worth_it(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_more_operators_are_taken_only_where_they_are_worth_it(monkeypatch):
     fake(monkeypatch, {**SMALL, "generalised_duhem 12": 1.3, "field 3 32": 0.99 * 0.3})
     settings, _ = chosen([HISTORY])
     assert (settings.kind, settings.drags) == ("field", 0)
 
 
-def test_a_kind_that_is_near_is_tried_in_full_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_kind_that_is_near_is_tried_in_full_as_well(monkeypatch):
     fake(monkeypatch, {**SMALL, "generalised_duhem 28": 0.25})
     settings, errors = chosen([HISTORY])
     assert settings.kind == "generalised_duhem"
@@ -152,29 +148,27 @@ def test_a_kind_that_is_near_is_tried_in_full_as_well(monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize("plain", [0.8, 5.0])
-def test_a_plain_kind_is_tried_where_no_other_does_well(
-    plain: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_plain_kind_is_tried_where_no_other_does_well(plain, monkeypatch):
     poor = {"field 0 8": 2.0, "generalised_duhem 12": 1.9, "field 0 32": 1.8, "field 3 32": 1.8}
     fake(monkeypatch, {**poor, "generalised_duhem 28": 1.7, "integrated": plain})
     settings, _ = chosen([HISTORY])
     assert settings.kind == ("integrated" if plain < 1.0 else "generalised_duhem")
 
 
-def test_loops_have_candidates_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_loops_have_candidates_of_their_own(monkeypatch):
     fake(monkeypatch, {"staged": 0.1, "integrated": None})
     settings, errors = chosen([LOOP])
     assert settings.kind == "staged"
     assert len(errors) == len(LOOPS) - 1
 
 
-def test_without_anything_held_out_there_is_no_choice(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_anything_held_out_there_is_no_choice(monkeypatch):
     fake(monkeypatch, dict.fromkeys(("field 0 8", "generalised_duhem 12", "integrated")))
     with pytest.raises(DataError, match="--model"):
         chosen([HISTORY])
 
 
-def test_candidates_look_for_the_parts_that_are_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_candidates_look_for_the_parts_that_are_asked_for(monkeypatch):
     given: list[tuple[str, bool, bool]] = []
 
     def held_out_errors(requests: Sequence[FitRequest], run: Any) -> list[None]:
@@ -207,7 +201,7 @@ def loops(loops_of: Loops) -> list[SteadyLoop]:
 
 
 @pytest.mark.slow
-def test_smallest_order_that_is_as_good_is_chosen(loops: list[SteadyLoop]) -> None:
+def test_smallest_order_that_is_as_good_is_chosen(loops):
     """Loops of 6 plays on a noisy sensor are not given 28; every order's error is told."""
     rng = np.random.default_rng(2)
     noisy = [
@@ -227,8 +221,7 @@ def test_smallest_order_that_is_as_good_is_chosen(loops: list[SteadyLoop]) -> No
 
 
 @pytest.mark.slow
-def test_models_without_deadbands_have_none(loops_of: Loops) -> None:
-    """The order of an RDPI is its plays alone."""
+def test_models_without_deadbands_have_none(loops_of):
     data = loops_of(terfenol_rdpi(), [(2.3, f) for f in (1.0, 50.0, 100.0, 200.0)], POINTS)
     settings = FitSettings(kind="rdpi", weight_by="equal", size="auto")
     found = select(FitRequest(data, settings))
@@ -240,8 +233,7 @@ def test_models_without_deadbands_have_none(loops_of: Loops) -> None:
 
 
 @pytest.mark.slow
-def test_lag_of_a_table_is_found() -> None:
-    """A displacement recorded three samples late is seen to lag by three."""
+def test_lag_of_a_table_is_found():
     stage = PpiModel(
         input_unit="V", direct=1.0, weights=(0.5, 0.3, 0.2), thresholds=(0.2, 0.5, 0.9)
     )
@@ -256,8 +248,7 @@ def test_lag_of_a_table_is_found() -> None:
     assert choose_lag(load, settings, serial_map, ignore_progress) == 3
 
 
-def test_creep_and_zero_of_each_history_are_taken_out() -> None:
-    """Two runs whose sensor was set to zero anew, and that creep, give the weights all the same."""
+def test_creep_and_zero_of_each_history_are_taken_out():
     truth = PpiModel(direct=1.0, weights=(0.8, 0.4), thresholds=(0.5, 1.0))
     time = np.arange(2000)
     command = 2.0 * np.sin(2.0 * np.pi * time / 200.0) * np.linspace(0.3, 1.0, 2000)

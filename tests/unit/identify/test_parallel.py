@@ -28,7 +28,7 @@ def loops(loops_of: Loops) -> list[SteadyLoop]:
     return loops_of(omega, GRID)
 
 
-def test_threads_need_no_affinity(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_threads_need_no_affinity(monkeypatch):
     """Only Linux says which CPUs a process may use."""
     monkeypatch.delattr(os, "sched_getaffinity", raising=False)
     _threads.cache_clear()
@@ -37,7 +37,6 @@ def test_threads_need_no_affinity(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_short_parts_run_beside_each_other_and_keep_their_order():
-    """All that a machine's cores take are under way at once; the first error is raised."""
     cores = len(os.sched_getaffinity(0))
     together = threading.Barrier(cores)
 
@@ -77,8 +76,7 @@ def test_fits_that_nobody_waits_for_end():
 
 @pytest.mark.parametrize("scheduler", ["threads", "processes"])
 @pytest.mark.slow
-def test_workers_find_the_same(loops: list[SteadyLoop], scheduler: str) -> None:
-    """Starts followed on other workers end at the same bits."""
+def test_workers_find_the_same(loops, scheduler):
     settings = FitSettings(kind="integrated", weights="free", starts=3)
     alone = fit_model(FitRequest(loops[:4], settings))
     with workers(scheduler) as run:
@@ -92,8 +90,7 @@ def test_workers_find_the_same(loops: list[SteadyLoop], scheduler: str) -> None:
     reason="Dask is not installed: pip install 'hilctl[scale]'",
 )
 @pytest.mark.filterwarnings("ignore")
-def test_dask_cluster_finds_the_same(loops: list[SteadyLoop]) -> None:
-    """The same on a Dask cluster, by its scheduler's address."""
+def test_dask_cluster_finds_the_same(loops):
     from distributed import LocalCluster
 
     settings = FitSettings(kind="integrated", weights="free", starts=3)
@@ -109,7 +106,6 @@ def test_dask_cluster_finds_the_same(loops: list[SteadyLoop]) -> None:
     assert found.model == alone.model
 
 
-def test_unknown_schedulers_are_refused() -> None:
-    """A scheduler that is neither known nor an address is refused with what there is."""
+def test_unknown_schedulers_are_refused():
     with pytest.raises(InputError, match=r"'four'"), workers("four"):
         pass

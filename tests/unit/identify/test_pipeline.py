@@ -53,11 +53,7 @@ def settings(*texts: str) -> IdentifySettings:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
-def test_order_and_lag_are_found_and_reported(
-    tables: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """With plays and lag on auto, the model is written, and figures, page and JSON say what was
-    chosen."""
+def test_order_and_lag_are_found_and_reported(tables, tmp_path, capsys):
     output = tmp_path / "model.yaml"
     asked = settings("plays=auto", "table.lag_samples=auto")
     found = identify_files(tables, asked, output, validate=tables[:1], scheduler="threads")
@@ -80,15 +76,13 @@ def test_order_and_lag_are_found_and_reported(
         identify_files(tables, asked, output)
 
 
-def test_a_unit_that_was_not_recorded_is_refused() -> None:
-    """The recordings know it better."""
+def test_a_unit_that_was_not_recorded_is_refused():
     golden = Path(__file__).parents[3] / "recordings" / "golden" / "terfenol_uncompensated.mcap"
     with pytest.raises(InputError, match="--unit must be A"):
         identify_files([golden], settings_from("straight", ["table.unit=V"]), None)
 
 
-def test_settings_are_checked_together() -> None:
-    """Every broken rule is listed at once, with its key, its value and where it was given."""
+def test_settings_are_checked_together():
     texts = ["plays=0", "weigths=free", "lag=none", "table.rate_hz=fast", "starts=2.5"]
     with pytest.raises(ConfigError) as caught:
         settings_from("ppi", texts)
@@ -102,7 +96,7 @@ def test_settings_are_checked_together() -> None:
 
 
 @pytest.mark.slow
-def test_histories_import_neither_plots_nor_statistics(tables: list[Path]) -> None:
+def test_histories_import_neither_plots_nor_statistics(tables):
     """They would take longer than the fit of a small table, and 80 MB."""
     code = (
         "import sys\nfrom hilctl.cli import main\ntry:\n    main()\nfinally:\n"

@@ -66,7 +66,7 @@ def model_file() -> History:
 
 
 @pytest.fixture(scope="module")
-def test_file() -> History:
+def test_file():
     return read_table(FOLDER / "Test_Vi_Do_Di.dat", TABLE.model_copy(update={"ignore": 600}))
 
 
@@ -77,9 +77,7 @@ def piezo_fit(history: History, **choices: Any) -> FittedModel:
 
 
 @needs_data
-def test_model_and_test_file_within_the_published_baseline(
-    model_file: History, test_file: History
-) -> None:
+def test_model_and_test_file_within_the_published_baseline(model_file, test_file):
     """With the sensor's lag of 2 samples taken out, both files are met within the baselines.
 
     The drift of the first seconds sets the peak on the model file; the goal of 2 % takes it down.
@@ -98,14 +96,7 @@ def test_model_and_test_file_within_the_published_baseline(
 @pytest.mark.parametrize(
     ("lag_samples", "own", "other"), [(0, (2.3, 0.76), (4.6, 1.75)), (1, (2.25, 0.75), (5.1, 1.15))]
 )
-def test_plain_least_squares_at_smaller_lags(
-    model_file: History,
-    test_file: History,
-    lag_samples: int,
-    own: tuple[float, float],
-    other: tuple[float, float],
-) -> None:
-    """Without a goal for the peak, and with less of the lag taken out, errors stay near these."""
+def test_plain_least_squares_at_smaller_lags(model_file, test_file, lag_samples, own, other):
     found = piezo_fit(model_file.without_lag(lag_samples))
     assert (found.peak_percent, found.rms_percent) <= own
     assert found.rms_percent <= own[1]
@@ -115,7 +106,7 @@ def test_plain_least_squares_at_smaller_lags(
 
 
 @needs_data
-def test_published_weights_describe_it_too(model_file: History) -> None:
+def test_published_weights_describe_it_too(model_file):
     """Ten plays with exponential weights (3.25, 3.26) reach 2.8 % peak on the averaged cycle."""
     loop = find_cycles(model_file.without_lag(1))
     assert loop.frequency_hz == pytest.approx(1.0, rel=1e-5)

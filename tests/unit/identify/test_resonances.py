@@ -112,7 +112,6 @@ def late(x_um, samples):
 
 @pytest.mark.parametrize("gain", [0.97, 1.03])
 def test_what_the_next_fit_finds_by_itself_is_no_mode(gain):
-    """A gain, and a delay of a sample, are smooth over all frequencies."""
     record, x_um = measured(noise_um=0.3)
     assert further_modes([record], [gain * late(x_um, 1)], (), FIRST.natural_hz) is None
 

@@ -53,7 +53,6 @@ def recording(period, cycles, error_um, noise_um=0.0, delay=0.0, seed=1) -> Reco
 
 @pytest.mark.parametrize("period", [100.0, 66.66667, 1234.5])
 def test_harmonics_of_the_error_are_found(period):
-    """Amplitude and phase of each, also where a period is no whole number of samples."""
     made = recording(period, 8, lambda t: 0.3 + 0.2 * np.cos(3.0 * t) - 0.1 * np.sin(5.0 * t))
     error = cycle_error(made, made.segments[0], 5000.0)
     expected = np.zeros(error.harmonics_um.size, dtype=complex)
@@ -63,7 +62,6 @@ def test_harmonics_of_the_error_are_found(period):
 
 
 def test_peak_is_that_of_the_average_cycle():
-    """Peak, rms and percent are of the error, over the displacement's peak-to-peak."""
     made = recording(100.0, 8, lambda t: 0.2 * np.cos(4.0 * t))
     error = cycle_error(made, made.segments[0], 5000.0)
     assert error.peak_um == pytest.approx(0.2, rel=1e-3)
@@ -89,7 +87,6 @@ def test_delay_is_found_by_the_phase():
 
 
 def test_missing_samples_do_no_harm():
-    """A gap takes the cycles it is in out of the scatter, and nothing else."""
     made = recording(100.0, 8, lambda t: 0.2 * np.cos(4.0 * t))
     keep = np.ones(made.samples.index.size, dtype=bool)
     keep[330:360] = False
@@ -99,7 +96,6 @@ def test_missing_samples_do_no_harm():
 
 
 def test_one_cycle_is_not_enough():
-    """Without a second one, nothing says what is noise."""
     made = recording(100.0, 1, lambda t: 0.0 * t)
     with pytest.raises(DataError, match="got 1"):
         cycle_error(made, made.segments[0], 5000.0)

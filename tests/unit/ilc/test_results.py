@@ -24,7 +24,6 @@ ROW = row_of(3, SEGMENT, ERROR, STATE, 800.0, Path("run-03.mcap"))
 
 
 def test_a_row_is_in_percent_of_the_peak_to_peak_displacement():
-    """The delay is in samples, whatever the rate."""
     assert (ROW.run, ROW.label, ROW.cycles, ROW.recording) == (3, "sine", 16, "run-03.mcap")
     assert ROW.rms_percent == pytest.approx(1.0)
     assert ROW.error_percent == pytest.approx(4.0)

@@ -43,7 +43,6 @@ def test_a_history_ends_where_the_ramp_begins(recording_of):
 
 
 def test_a_history_that_begins_with_a_ramp_is_refused(recording_of):
-    """It did not begin at rest; no sample is missing from it."""
     recording = recording_of(np.zeros(100), np.zeros(100), [])
     recording.samples.flags[:20] |= Flag.RAMP.value
     with pytest.raises(DataError, match="ramp"):
@@ -52,7 +51,6 @@ def test_a_history_that_begins_with_a_ramp_is_refused(recording_of):
 
 @pytest.mark.parametrize("ramp", [0, 20])
 def test_a_conditioned_history_begins_with_its_cycle(recording_of, ramp):
-    """What made the state belongs to the history, and is not judged; what was before is not."""
     command = np.linspace(0.0, 1.0, 150)
     recording = recording_of(command, 2.0 * command, [])
     recording.samples.flags[:ramp] |= Flag.RAMP.value
@@ -65,7 +63,6 @@ def test_a_conditioned_history_begins_with_its_cycle(recording_of, ramp):
 
 @pytest.mark.parametrize("what", ["begins late", "has a gap", "has no reading"])
 def test_a_history_with_missing_samples_is_refused(recording_of, what):
-    """A model's memory would be another behind the gap."""
     index, displacement_um = np.arange(100), np.zeros(100)
     if what == "begins late":
         index += 1
@@ -84,7 +81,6 @@ def pieces_of(recording, edges):
 
 
 def test_a_history_in_pieces_is_that_of_the_whole(recording_of):
-    """The ramp, its conditioning and the waveform each go over an edge."""
     command = np.linspace(0.0, 1.0, 150)
     recording = recording_of(command, 2.0 * command, [])
     recording.samples.flags[:30] |= Flag.RAMP.value
@@ -119,7 +115,6 @@ def test_tables_have_no_unit_of_their_own(tmp_path):
 
 
 def test_a_loop_is_left_out_by_its_label():
-    """Or by what that begins with; the others are as they were."""
     every, _ = load_records([CURRENT], settings_from("ppi", []), 0)
     first = every[0].label
     chosen = settings_from("ppi", [f"leave_out=[{json.dumps(first)}]"])
@@ -151,8 +146,7 @@ def rows(separator: str, n: int = 40) -> list[str]:
 
 @pytest.mark.parametrize("separator", [",", ";", "\t", "   ", ", "])
 @pytest.mark.parametrize("header", [True, False])
-def test_separators_and_headers(tmp_path: Path, separator: str, header: bool) -> None:
-    """Every separator is recognised, with and without a header."""
+def test_separators_and_headers(tmp_path, separator, header):
     titles = [separator.join(["t", "v", "y"])] if header else []
     path = write(tmp_path, [*titles, *rows(separator)])
     history = table(path, "v" if header else 2, "y" if header else 3, time_column=1)
@@ -162,8 +156,7 @@ def test_separators_and_headers(tmp_path: Path, separator: str, header: bool) ->
     assert history.label == "t.csv"
 
 
-def test_quotes_comments_and_blank_lines(tmp_path: Path) -> None:
-    """Quoted names may hold the separator; comments and blank lines don't count as rows."""
+def test_quotes_comments_and_blank_lines(tmp_path):
     lines = ["# rig 3", "", '"drive, V","displacement"', *[f"{k},{k * k}" for k in range(20)]]
     history = table(
         write(tmp_path, lines),
@@ -178,8 +171,7 @@ def test_quotes_comments_and_blank_lines(tmp_path: Path) -> None:
     assert (history.sample_rate_hz, history.ignore) == (5.0, 1)
 
 
-def test_bad_values_name_file_and_line(tmp_path: Path) -> None:
-    """A text, a NaN and a missing field are reported with their line and column."""
+def test_bad_values_name_file_and_line(tmp_path):
     good = [f"{k} {k}" for k in range(30)]
     number = r"column 2 \(y\): must be a finite number, got"
     for bad, shown in (
@@ -190,8 +182,7 @@ def test_bad_values_name_file_and_line(tmp_path: Path) -> None:
             table(path, "v", "y", rate_hz=1.0)
 
 
-def test_unknown_columns_list_the_known_ones(tmp_path: Path) -> None:
-    """A wrong name or number is answered with what there is."""
+def test_unknown_columns_list_the_known_ones(tmp_path):
     path = write(tmp_path, ["t,v,y", *rows(",")])
     with pytest.raises(DataError, match=r"'volts'.*t, v, y"):
         table(path, "volts", "y", rate_hz=1.0)
@@ -202,8 +193,7 @@ def test_unknown_columns_list_the_known_ones(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("change", ["missing", "doubled", "backwards"])
-def test_uneven_time_is_refused(tmp_path: Path, change: str) -> None:
-    """A missing, doubled or backward time is reported at its line."""
+def test_uneven_time_is_refused(tmp_path, change):
     lines = rows(",")
     if change == "missing":
         del lines[20]
@@ -215,23 +205,21 @@ def test_uneven_time_is_refused(tmp_path: Path, change: str) -> None:
         table(write(tmp_path, lines), 2, 3, time_column=1)
 
 
-def test_a_slow_change_of_rate_is_refused(tmp_path: Path) -> None:
-    """Steps that are each nearly right but add up to another rate are refused."""
+def test_a_slow_change_of_rate_is_refused(tmp_path):
     steps = np.where(np.arange(200) < 100, 0.010, 0.012)
     lines = [f"{t:.6f},{k % 5},{k % 3}" for k, t in enumerate(np.cumsum(steps))]
     with pytest.raises(DataError, match="evenly spaced"):
         table(write(tmp_path, lines), 2, 3, time_column=1)
 
 
-def test_times_rounded_in_the_text_are_fine(tmp_path: Path) -> None:
+def test_times_rounded_in_the_text_are_fine(tmp_path):
     """A 3 kHz time column with 4 decimals has uneven steps and still gives 3 kHz."""
     lines = [f"{k / 3000:.4f},{k % 5},{k % 3}" for k in range(301)]
     history = table(write(tmp_path, lines), 2, 3, time_column=1)
     assert history.sample_rate_hz == pytest.approx(3000.0)
 
 
-def test_rate_or_time_not_both(tmp_path: Path) -> None:
-    """Exactly one of time column and rate is needed."""
+def test_rate_or_time_not_both(tmp_path):
     path = write(tmp_path, rows(","))
     with pytest.raises(DataError, match="neither"):
         table(path, 2, 3)
@@ -239,8 +227,7 @@ def test_rate_or_time_not_both(tmp_path: Path) -> None:
         table(path, 2, 3, time_column=1, rate_hz=100.0)
 
 
-def test_unreadable_and_empty_tables(tmp_path: Path) -> None:
-    """A missing file, a binary one, one without numbers and empty rows are data errors."""
+def test_unreadable_and_empty_tables(tmp_path):
     binary = tmp_path / "b.csv"
     binary.write_bytes(b"\xff\xfe\x00\x80")
     for path, reason in ((tmp_path / "none.csv", "no such file"), (binary, "is not UTF-8 text")):

@@ -76,7 +76,7 @@ def laid(size: Size = SIZE) -> FieldSearch:
 
 
 @pytest.mark.slow
-def test_the_data_are_met_and_what_is_late_in_all_is_found() -> None:
+def test_the_data_are_met_and_what_is_late_in_all_is_found():
     end = found()
     known = end.known
     assert np.std(end.weights.errors_um) < 0.005 * data().stroke_um
@@ -87,7 +87,7 @@ def test_the_data_are_met_and_what_is_late_in_all_is_found() -> None:
     assert (end.weights.slopes[0] >= LEAST).all()
 
 
-def test_the_size_is_what_was_asked_for() -> None:
+def test_the_size_is_what_was_asked_for():
     end = found()
     assert end.weights.slopes.shape == (SIZE.plays + SIZE.drags, SIZE.cells)
     assert end.weights.curve.operators.size == SIZE.knots + 1
@@ -95,7 +95,7 @@ def test_the_size_is_what_was_asked_for() -> None:
     assert end.grid.lengths.size == SIZE.drags
 
 
-def test_units_make_no_difference() -> None:
+def test_units_make_no_difference():
     one, other = found(), found(unit=4.0, um=2.0)
     assert other.known.losses.field_s == pytest.approx(one.known.losses.field_s, rel=1e-3)
     assert other.grid.thresholds == pytest.approx(4.0 * one.grid.thresholds, rel=1e-3)
@@ -103,7 +103,7 @@ def test_units_make_no_difference() -> None:
     assert other.weights.slopes == pytest.approx(0.5 * one.weights.slopes, rel=0.01, abs=0.01)
 
 
-def test_progress_rises_below_1_and_names_each_round() -> None:
+def test_progress_rises_below_1_and_names_each_round():
     seen: list[tuple[float, str]] = []
     FieldSearch(data(), Size(2, 0, 3, 3), LEAST).find(
         Stages(), lambda part, what: seen.append((part, what))
@@ -115,10 +115,7 @@ def test_progress_rises_below_1_and_names_each_round() -> None:
     assert [what for _, what in seen] == rounds * (len(seen) // ROUNDS)
 
 
-def test_of_the_starts_the_one_with_the_least_error_is_followed(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Whatever the order in which they are tried; none of the others leaves anything behind."""
+def test_of_the_starts_the_one_with_the_least_error_is_followed(monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(field_search, "FIRST_LAGS", field_search.FIRST_LAGS[::-1])
         end = found.__wrapped__()
@@ -126,8 +123,7 @@ def test_of_the_starts_the_one_with_the_least_error_is_followed(
     assert np.array_equal(end.weights.slopes, found().weights.slopes)
 
 
-def test_a_search_that_goes_on_from_another_of_its_data_ends_no_worse() -> None:
-    """Of the same size at once where that one ended, of another from its stages."""
+def test_a_search_that_goes_on_from_another_of_its_data_ends_no_worse():
     same = FieldSearch(data(), SIZE, LEAST).go_on(found())
     spread = np.std(found().weights.errors_um)
     assert np.std(same.weights.errors_um) < 1.1 * spread
@@ -138,7 +134,7 @@ def test_a_search_that_goes_on_from_another_of_its_data_ends_no_worse() -> None:
     assert known == pytest.approx([known[0]] * 3, rel=0.2)
 
 
-def test_a_search_ends_within_its_bounds_though_it_starts_beyond() -> None:
+def test_a_search_ends_within_its_bounds_though_it_starts_beyond():
     job = laid()
     x = row(HIGH) + 1.0
     job._learn(row(Stages()))
@@ -148,12 +144,12 @@ def test_a_search_ends_within_its_bounds_though_it_starts_beyond() -> None:
     assert (ended != x).all()
 
 
-def test_a_search_is_never_of_more_operators_than_were_asked_for() -> None:
+def test_a_search_is_never_of_more_operators_than_were_asked_for():
     assert Size(40, 3, 50, 60).coarse == Size(8, 3, 12, 16)
     assert Size(4, 0, 6, 5).coarse == Size(4, 0, 6, 5)
 
 
-def test_the_least_slope_of_the_first_line_holds_throughout_the_search() -> None:
+def test_the_least_slope_of_the_first_line_holds_throughout_the_search():
     job = FieldSearch(data(), SIZE, 20.0)
     job._lay(Stages(), SIZE)
     weights = job._solved(row(Stages()))
@@ -179,7 +175,7 @@ def displacement_um() -> F64:
     return np.asarray(table([path()], KEPT, true) @ np.repeat([3.0, 2.0], 5))
 
 
-def test_a_threshold_goes_to_where_the_rods_yield() -> None:
+def test_a_threshold_goes_to_where_the_rods_yield():
     y = displacement_um()
     polish = JointRefinement(lambda _: BareSignal([path()], y, np.ones(y.size)), KEPT, GRID, LEAST)
     x, grid = polish.follow(row(Stages()))
@@ -191,8 +187,7 @@ def test_a_threshold_goes_to_where_the_rods_yield() -> None:
     assert after < 0.3 * before
 
 
-def test_thresholds_stay_in_order() -> None:
-    """Whatever would be best: none goes halfway to its neighbour."""
+def test_thresholds_stay_in_order():
     y = np.asarray(table([path()], KEPT, GRID)[:, 5:10].sum(axis=1) + 4.0 * np.sign(path()))
     polish = JointRefinement(lambda _: BareSignal([path()], y, np.ones(y.size)), KEPT, GRID, LEAST)
     _, grid = polish.follow(row(Stages()))
@@ -200,8 +195,7 @@ def test_thresholds_stay_in_order() -> None:
     assert (np.abs(grid.thresholds - GRID.thresholds) <= ROOM * 0.7 + 1e-9).all()
 
 
-def test_a_stage_is_found_with_the_weights_free() -> None:
-    """The field's path is larger by what one stage is away from where it should be."""
+def test_a_stage_is_found_with_the_weights_free():
     y, first = displacement_um(), row(Stages())
 
     def rows_of(stages: F64) -> BareSignal:
@@ -216,7 +210,7 @@ def test_a_stage_is_found_with_the_weights_free() -> None:
 
 
 @pytest.mark.parametrize("lengths", [(), (0.6, 1.5)])
-def test_operators_of_known_weights_give_what_their_columns_do(lengths: tuple[float, ...]) -> None:
+def test_operators_of_known_weights_give_what_their_columns_do(lengths):
     grid = replace(GRID, lengths=np.array(lengths))
     slopes = np.random.default_rng(3).uniform(0.5, 2.0, (grid.lines, 5))
     for gain in (1.0, 2.0):  # within the cells, and beyond them
@@ -225,7 +219,7 @@ def test_operators_of_known_weights_give_what_their_columns_do(lengths: tuple[fl
         assert given == pytest.approx(columns @ slopes.ravel(), abs=1e-9)
 
 
-def test_slopes_by_thresholds_are_differences() -> None:
+def test_slopes_by_thresholds_are_differences():
     slopes = np.random.default_rng(3).uniform(0.5, 2.0, (3, 5))
     _, found = outputs([path()], KEPT, GRID, slopes)
     for i in (1, 2):
@@ -239,8 +233,7 @@ def test_slopes_by_thresholds_are_differences() -> None:
         assert np.mean(np.abs(found[:, i - 1] - rise)) < 0.05 * np.mean(np.abs(rise))
 
 
-def test_what_free_weights_take_up_of_a_change_costs_nothing() -> None:
-    """A change along a column of a free weight leaves the sum as it is; another one does not."""
+def test_what_free_weights_take_up_of_a_change_costs_nothing():
     y = displacement_um() + np.random.default_rng(1).normal(0.0, 0.05, 900)
     columns = table([path()], KEPT, GRID)
     equations = Equations(columns, y, GRID, LEAST, np.ones(900))
@@ -278,7 +271,7 @@ def model() -> StagedModel:
 
 
 @pytest.mark.slow
-def test_a_history_that_was_not_fitted_is_met() -> None:
+def test_a_history_that_was_not_fitted_is_met():
     settings = FitSettings(kind="field", plays=6, drags=1, cells=8, knots=6)
     found = fit_model(FitRequest([history(1, 0.01)], settings))
     judged = judge(found.model, [history(2, 0.0)])
@@ -289,7 +282,7 @@ def test_a_history_that_was_not_fitted_is_met() -> None:
 
 
 @pytest.mark.slow
-def test_a_structure_that_a_slow_record_leaves_open_does_not_bend_the_hysteresis() -> None:
+def test_a_structure_that_a_slow_record_leaves_open_does_not_bend_the_hysteresis():
     """The first start ends with one as soft as it may be, and misses the data by 4 % rms."""
     t = np.arange(25_000) / 50e3
     phases = np.random.default_rng(1).uniform(0.0, 6.0, 8)
@@ -301,7 +294,7 @@ def test_a_structure_that_a_slow_record_leaves_open_does_not_bend_the_hysteresis
     assert found.rms_percent < 0.6
 
 
-def test_steady_loops_are_refused() -> None:
+def test_steady_loops_are_refused():
     """They leave so much open that what is found would differ from processor to processor."""
     wave = np.sin(2.0 * np.pi * np.arange(64) / 64)
     loop = SteadyLoop("3 A 10 Hz", 3.0 * wave, 20.0 * wave, 10.0, FAST_HZ)

@@ -51,7 +51,6 @@ def test_error_on_unseen_references_is_far_less_than_half(old, found, amplitude)
 
 @pytest.mark.slow
 def test_small_runs_do_not_spoil_the_large_loop(old):
-    """Runs that move a tenth say nothing of what the whole stroke does."""
     small = [history(OLD, i, amplitude=0.7, noise_um=0.1) for i in range(4)]
     gain = [replace(run, displacement_um=0.97 * run.displacement_um) for run in small]
     found = refine_runs(old, gain)
@@ -62,7 +61,6 @@ def test_small_runs_do_not_spoil_the_large_loop(old):
 @pytest.mark.slow
 @pytest.mark.parametrize("drift_um", [0.0, 1.0])
 def test_creep_of_single_runs_is_not_learned_as_hysteresis(old, drift_um):
-    """Each run creeps by another amount; the model found is as good as without."""
     runs = [
         history(actuator(), i, drift_um=drift_um * (i - 2), amplitude=a)
         for i, a in enumerate((6.5, 6.5, 4.0, 2.0, 5.0))
@@ -82,7 +80,6 @@ def test_an_offset_becomes_the_models_own(old):
 
 @pytest.mark.slow
 def test_a_model_that_was_right_stays_as_it_is(old):
-    """Noise is nothing to learn, and the reason is given."""
     found = refine_runs(old, [history(OLD, i, noise_um=0.05) for i in range(4)])
     assert not found.better
     assert str(found).startswith("no better")
@@ -91,7 +88,6 @@ def test_a_model_that_was_right_stays_as_it_is(old):
 
 @pytest.mark.slow
 def test_refining_what_was_refined_goes_on_from_it(old, runs):
-    """The old operator is what the new one is held to where new runs say nothing."""
     first = refine_runs(old, runs[:3]).model
     again = refine_runs(first, [history(actuator(offset_um=1.0), i, amplitude=3.0)
                                 for i in range(20, 24)])  # fmt: skip
@@ -134,7 +130,6 @@ def test_swapped_wires_are_refused(old, runs):
 
 @pytest.mark.slow
 def test_files_in_a_better_model_file_out(tmp_path):
-    """A shipped model and a recording of it; what is written is what was found."""
     output = tmp_path / "better.yaml"
     found = refine_files(OMEGA, [GOLDEN / "terfenol_compensated.mcap",
                                  GOLDEN / "terfenol_uncompensated.mcap"], output)  # fmt: skip
@@ -174,7 +169,6 @@ def test_a_run_from_rest_is_what_was_put_out_and_what_came():
 
 
 def test_a_run_that_goes_on_has_the_one_before_ahead_of_it():
-    """Not judged; without it, where the actuator stood could not be known."""
     first = read(GOLDEN_runs)
     later = replace(first, run={**first.run, "run_id": "b", "initial_state_run_id": "a"})
     run = _history(later, {"a": first, "b": later})

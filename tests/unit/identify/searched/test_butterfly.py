@@ -52,13 +52,11 @@ def test_magnets_are_found_and_what_is_found_can_be_inverted(loops_of):
 
 
 def test_loops_below_the_turning_point(loops_of):
-    """Displacements that no butterfly reaches are refused."""
     with pytest.raises(DataError, match="turning point"):
         fit(loops_of(KNOWN, SINES), turning_um=100.0)
 
 
 def test_histories_have_no_wings():
-    """The side of a whole history is not known."""
     command = 3.0 * np.sin(0.02 * np.arange(2000))
     with pytest.raises(DataError, match="steady loops"):
         fit([History("growing", command, 5.0 * command, 10_000.0)])

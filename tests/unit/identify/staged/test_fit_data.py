@@ -79,7 +79,6 @@ def test_thinning_keeps_every_sixth_point_and_its_scale():
 
 
 def test_a_lag_keeps_the_mean_and_lowers_the_swing():
-    """The record is a steady cycle: what was before it is the same cycle."""
     data = data_of(loop())
     (after,), (slopes,) = data.lagged(1e-3, 0.0)
     gain = 1.0 / abs(1.0 + 2j * np.pi * FREQUENCY_HZ * 1e-3)
@@ -139,7 +138,6 @@ def played(spacing, gamma_s, turns=2):
 
 
 def test_slopes_of_the_plays():
-    """Weighted with the plays' weights; a kink's own sample may differ."""
     spacing, gamma_s = 0.3, 5e-5
     slopes = played(spacing, gamma_s)[1]
     for column, up, down, step in (
@@ -152,6 +150,5 @@ def test_slopes_of_the_plays():
 
 
 def test_a_second_turn_forgets_the_rest_that_it_came_from():
-    """Plays of a steady cycle end as they began."""
     np.testing.assert_array_equal(played(0.3, 5e-5)[0], played(0.3, 5e-5, turns=3)[0])
     assert not np.array_equal(played(0.3, 5e-5)[0], played(0.3, 5e-5, turns=1)[0])

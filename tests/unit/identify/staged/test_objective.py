@@ -36,10 +36,7 @@ Loops = Callable[..., list[SteadyLoop]]
         (Layers(6, 4, lag=False, gamma=True, structure=False, delay=False), [0.0, 0.0, 0.8, 2e-4]),
     ],
 )
-def test_derivatives_agree_with_differences(
-    data: StagedFitData, layers: Layers, before: list[float]
-) -> None:
-    """Analytic derivatives by every parameter equal central differences."""
+def test_derivatives_agree_with_differences(data, layers, before):
     point = start(data, layers, before, 3e-4 if layers.lag else 0.0)
     point = replace(point, weights=point.weights + 0.1)  # a weight of 0 has no relative step
     x = point.pack()
@@ -55,8 +52,7 @@ def test_derivatives_agree_with_differences(
 
 
 @pytest.mark.parametrize("lag_s", [2e-5, 1e-4, 1e-3])
-def test_a_sampled_loop_has_a_delay_that_is_not_the_model_s(lag_s: float) -> None:
-    """What a sampled lag is late at a low frequency, less the lag's own time constant."""
+def test_a_sampled_loop_has_a_delay_that_is_not_the_model_s(lag_s):
     period_s, low_hz = 1e-3, 0.01
     step = 1j * 2.0 * np.pi * low_hz * period_s
     left = np.exp(-period_s / lag_s)
@@ -65,7 +61,7 @@ def test_a_sampled_loop_has_a_delay_that_is_not_the_model_s(lag_s: float) -> Non
     assert loop_delay_s(0.5 * period_s, lag_s) == pytest.approx(late_s - lag_s, rel=1e-5)
 
 
-def test_the_longest_lag_leaves_half_a_period_and_none_a_whole_one() -> None:
+def test_the_longest_lag_leaves_half_a_period_and_none_a_whole_one():
     assert loop_delay_s(5e-6, 1.0) == pytest.approx(5e-6, rel=1e-4)
     assert loop_delay_s(5e-6, 0.0) == 1e-5
     assert loop_delay_s(0.0, 1e-4) == 0.0
