@@ -7,7 +7,7 @@ from hilctl.base.errors import DataError
 from hilctl.identify.data.records import History, SteadyLoop
 from hilctl.identify.evaluation import hysteresis_weights, judge
 from hilctl.models.linear_stages import FirstMode
-from hilctl.models.plays import PpiModel, RdpiModel
+from hilctl.models.plays import PpiModel
 from hilctl.models.staged import FieldLag, StagedModel
 
 PLAYS = {"direct": 4.0, "weights": (1.0, 2.0), "thresholds": (0.5, 1.5)}
@@ -22,18 +22,6 @@ def test_a_model_meets_its_own_loop(loop_of, frequency_hz):
     assert error.errors[0].peak_to_peak_um == pytest.approx(
         error.modelled_um[0].max() * 2.0, rel=0.01
     )
-
-
-def test_the_rate_is_that_of_the_run():
-    model = RdpiModel(**PLAYS, gamma_s=3e-4)
-    samples = 6.0 * np.sin(2.0 * np.pi * 200.0 * np.arange(750) / RATE_HZ)
-    ran = model.forward(RATE_HZ).process(samples)[500:]
-    command = 6.0 * np.sin(2.0 * np.pi * np.arange(300) / 300)
-    loop = SteadyLoop("sine", command, command, 200.0, RATE_HZ)
-    at = np.arange(300) * (250 / 300)
-    expected = np.interp(at, np.arange(251), np.append(ran, ran[0]))
-    (modelled_um,) = judge(model, [loop]).modelled_um
-    np.testing.assert_allclose(modelled_um, expected, atol=0.1)
 
 
 def test_without_a_rate_each_point_is_a_sample(loop_of):

@@ -1,6 +1,6 @@
 """Choice of kind, size and lag by held-out data."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -25,7 +25,6 @@ from hilctl.identify.model_selection import (
 from hilctl.identify.parallel import serial_map
 from hilctl.identify.pipeline import settings_from
 from hilctl.identify.settings import FitSettings, IdentifySettings
-from hilctl.models.integrated import exponential_integrated
 from hilctl.models.plays import PpiModel
 from tests.published import terfenol_rdpi
 
@@ -91,9 +90,9 @@ SMALL = {"field 0 8": 0.6, "generalised_duhem 12": 0.9, "field 0 32": 0.3, "fiel
 
 def fake(monkeypatch: pytest.MonkeyPatch, errors: dict[str, float | None]) -> list[tuple[str, Any]]:
     """Let fits have errors by kind, drags and size; return the list of them and their starts."""
-    seen: list[tuple[str, Any]] = []
+    seen = []
 
-    def held_out(request: FitRequest) -> HeldOut | None:
+    def held_out(request):
         settings = request.settings
         name = {
             "field": f"field {settings.drags} {settings.plays}",
@@ -186,26 +185,12 @@ def test_candidates_look_for_the_parts_that_are_asked_for(monkeypatch):
     ]
 
 
-Loops = Callable[..., list[SteadyLoop]]
-POINTS = 150
-SINES = [(a, f) for a in (2.0, 3.0, 6.0) for f in (10.0, 100.0, 250.0)]
-
-
-@pytest.fixture
-def loops(loops_of: Loops) -> list[SteadyLoop]:
-    omega = exponential_integrated(
-        alpha=0.9, gamma_s=2e-4, a_0=3.0, alpha_0=1.4, beta_0=0.3, g_0=1.0, alpha_1=0.08,
-        beta_1=0.15, d_p=8.0, alpha_2=0.1, beta_2=0.4, d_n=8.0, plays=6, deadbands_a_side=4,
-    )  # fmt: skip
-    return loops_of(omega, SINES, POINTS)
-
-
 @pytest.mark.slow
 def test_smallest_order_that_is_as_good_is_chosen(loops):
     """Loops of 6 plays on a noisy sensor are not given 28; every order's error is told."""
     rng = np.random.default_rng(2)
     noisy = [
-        replace(loop, displacement_um=loop.displacement_um + rng.normal(0.0, 0.3, POINTS))
+        replace(loop, displacement_um=loop.displacement_um + rng.normal(0.0, 0.3, 150))
         for loop in loops
     ]
     settings = FitSettings(kind="integrated", weights="free", size="auto")
@@ -222,7 +207,7 @@ def test_smallest_order_that_is_as_good_is_chosen(loops):
 
 @pytest.mark.slow
 def test_models_without_deadbands_have_none(loops_of):
-    data = loops_of(terfenol_rdpi(), [(2.3, f) for f in (1.0, 50.0, 100.0, 200.0)], POINTS)
+    data = loops_of(terfenol_rdpi(), [(2.3, f) for f in (1.0, 50.0, 100.0, 200.0)], 150)
     settings = FitSettings(kind="rdpi", weight_by="equal", size="auto")
     found = select(FitRequest(data, settings))
     chosen, errors = found.settings, found.orders

@@ -3,29 +3,14 @@
 import importlib.util
 import os
 import threading
-from collections.abc import Callable
 
 import pytest
 
 from hilctl.base.errors import InputError
-from hilctl.identify.data.records import SteadyLoop
 from hilctl.identify.fit_api import FitRequest
 from hilctl.identify.fit_model import fit_model
 from hilctl.identify.parallel import _threads, parallel_map, workers
 from hilctl.identify.settings import FitSettings
-from hilctl.models.integrated import exponential_integrated
-
-Loops = Callable[..., list[SteadyLoop]]
-GRID = [(a, f) for a in (2.0, 3.0, 6.0) for f in (10.0, 100.0, 250.0)]
-
-
-@pytest.fixture
-def loops(loops_of: Loops) -> list[SteadyLoop]:
-    omega = exponential_integrated(
-        alpha=0.9, gamma_s=2e-4, a_0=3.0, alpha_0=1.4, beta_0=0.3, g_0=1.0, alpha_1=0.08,
-        beta_1=0.15, d_p=8.0, alpha_2=0.1, beta_2=0.4, d_n=8.0, plays=6, deadbands_a_side=4,
-    )  # fmt: skip
-    return loops_of(omega, GRID)
 
 
 def test_threads_need_no_affinity(monkeypatch):

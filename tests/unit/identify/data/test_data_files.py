@@ -144,18 +144,6 @@ def rows(separator: str, n: int = 40) -> list[str]:
     return [separator.join([f"{0.01 * k:.2f}", str(k % 7), str(-2.5 * k)]) for k in range(n)]
 
 
-@pytest.mark.parametrize("separator", [",", ";", "\t", "   ", ", "])
-@pytest.mark.parametrize("header", [True, False])
-def test_separators_and_headers(tmp_path, separator, header):
-    titles = [separator.join(["t", "v", "y"])] if header else []
-    path = write(tmp_path, [*titles, *rows(separator)])
-    history = table(path, "v" if header else 2, "y" if header else 3, time_column=1)
-    np.testing.assert_array_equal(history.command, np.arange(40) % 7)
-    np.testing.assert_array_equal(history.displacement_um, -2.5 * np.arange(40))
-    assert history.sample_rate_hz == pytest.approx(100.0)
-    assert history.label == "t.csv"
-
-
 def test_quotes_comments_and_blank_lines(tmp_path):
     lines = ["# rig 3", "", '"drive, V","displacement"', *[f"{k},{k * k}" for k in range(20)]]
     history = table(
@@ -171,52 +159,14 @@ def test_quotes_comments_and_blank_lines(tmp_path):
     assert (history.sample_rate_hz, history.ignore) == (5.0, 1)
 
 
-def test_bad_values_name_file_and_line(tmp_path):
-    good = [f"{k} {k}" for k in range(30)]
-    number = r"column 2 \(y\): must be a finite number, got"
-    for bad, shown in (
-        ("3 abc", f"{number} 'abc'"), ("3 nan", f"{number} nan"), ("3", "must have 2 columns"),
-    ):  # fmt: skip
-        path = write(tmp_path, ["v y", *good[:10], bad, *good[10:]])
-        with pytest.raises(DataError, match=rf"t\.csv:12: {shown}"):
-            table(path, "v", "y", rate_hz=1.0)
-
-
-def test_unknown_columns_list_the_known_ones(tmp_path):
-    path = write(tmp_path, ["t,v,y", *rows(",")])
-    with pytest.raises(DataError, match=r"'volts'.*t, v, y"):
-        table(path, "volts", "y", rate_hz=1.0)
-    with pytest.raises(DataError, match="column 4"):
-        table(path, 4, "y", rate_hz=1.0)
-    with pytest.raises(DataError, match="column 0"):
-        table(path, 0, "y", rate_hz=1.0)
-
-
-@pytest.mark.parametrize("change", ["missing", "doubled", "backwards"])
-def test_uneven_time_is_refused(tmp_path, change):
-    lines = rows(",")
-    if change == "missing":
-        del lines[20]
-    elif change == "doubled":
-        lines.insert(20, lines[19])
-    else:
-        lines[20] = "0.10,1,1"
-    with pytest.raises(DataError, match=r"t\.csv:21: "):
-        table(write(tmp_path, lines), 2, 3, time_column=1)
-
-
-def test_a_slow_change_of_rate_is_refused(tmp_path):
-    steps = np.where(np.arange(200) < 100, 0.010, 0.012)
-    lines = [f"{t:.6f},{k % 5},{k % 3}" for k, t in enumerate(np.cumsum(steps))]
-    with pytest.raises(DataError, match="evenly spaced"):
-        table(write(tmp_path, lines), 2, 3, time_column=1)
-
-
 def test_times_rounded_in_the_text_are_fine(tmp_path):
     """A 3 kHz time column with 4 decimals has uneven steps and still gives 3 kHz."""
     lines = [f"{k / 3000:.4f},{k % 5},{k % 3}" for k in range(301)]
     history = table(write(tmp_path, lines), 2, 3, time_column=1)
     assert history.sample_rate_hz == pytest.approx(3000.0)
+    assert history.label == "t.csv"
+    with pytest.raises(DataError, match="evenly spaced"):
+        table(write(tmp_path, [*lines[:100], *lines[101:]]), 2, 3, time_column=1)
 
 
 def test_rate_or_time_not_both(tmp_path):

@@ -14,18 +14,16 @@ from hilctl.identify.field.duhem_tables import FIRST, HIGHEST, LOWEST, NAMES, ST
 from hilctl.identify.fit_api import FitRequest
 from hilctl.identify.fit_model import FittedModel, fit_model
 from hilctl.identify.settings import FitSettings
-from hilctl.models.generalised_duhem import GeneralisedDuhemModel
-from hilctl.models.staged import StagedModel
 from tests.unit.identify.field.test_duhem_tables import RATE_HZ, command, data, truth
 
 SETTINGS = FitSettings(kind="generalised_duhem", cells=10, across=8)
 
 
-def ready() -> tuple[DuhemSearch, F64]:
+def ready(unit: float = 1.0, um: float = 1.0) -> tuple[DuhemSearch, F64]:
     """Return a search with a table laid, and its first logarithms."""
-    job = DuhemSearch(data(), 8, 6, 0.05)
+    job = DuhemSearch(data(unit, um), 8, 6, 0.05 * um / unit)
     job._lay(laid_over(job._chosen(FIRST, 0.03, 500), 8, 6))
-    job._first_um = 0.7
+    job._first_um = 0.7 * um
     return job, job._layout.first_logs()
 
 
@@ -88,16 +86,11 @@ def test_a_descent_goes_on_where_the_first_damping_is_too_little(monkeypatch):
 
 
 def test_units_make_no_difference():
-    def ends(unit: float, um: float) -> tuple[F64, F64]:
-        job = DuhemSearch(data(unit, um), 8, 6, 0.05 * um / unit)
-        job._lay(laid_over(job._chosen(FIRST, 0.03, 500), 8, 6))
-        job._first_um = 0.7 * um
-        x, logs = job._descend(FIRST, job._layout.first_logs(), 3, 0.0)
-        return x, logs - np.log(um / unit)
-
-    one, other = ends(1.0, 1.0), ends(4.0, 2.0)
-    assert other[0] == pytest.approx(one[0], abs=1e-4)
-    assert other[1] == pytest.approx(one[1], abs=1e-2)
+    (job, first), (other_job, other_first) = ready(), ready(4.0, 2.0)
+    x, logs = job._descend(FIRST, first, 3, 0.0)
+    other_x, other_logs = other_job._descend(FIRST, other_first, 3, 0.0)
+    assert other_x == pytest.approx(x, abs=1e-4)
+    assert other_logs - np.log(0.5) == pytest.approx(logs, abs=1e-2)
 
 
 def test_progress_rises_below_1():
@@ -148,10 +141,7 @@ def test_the_stages_are_found():
 
 
 def test_the_table_is_of_the_size_that_was_asked_for():
-    model = found().model
-    assert isinstance(model, StagedModel)
-    hysteresis = model.hysteresis
-    assert isinstance(hysteresis, GeneralisedDuhemModel)
+    hysteresis = found().model.hysteresis
     assert len(hysteresis.rising) == len(hysteresis.falling) == SETTINGS.cells + 1
     assert {len(row) for row in hysteresis.rising} == {SETTINGS.across + 1}
     assert found().numbers == 2 * (SETTINGS.cells + 1) * (SETTINGS.across + 1) + 14
@@ -163,8 +153,10 @@ def test_records_begin_at_rest_each():
     assert judge(both.model, [history(2)]).rms_percent < 0.2
 
 
-def test_steady_loops_are_refused():
+@pytest.mark.parametrize("kind", ["field", "generalised_duhem"])
+def test_steady_loops_are_refused(kind):
+    """They leave so much open that what is found would differ from processor to processor."""
     wave = np.sin(2.0 * np.pi * np.arange(64) / 64)
     loop = SteadyLoop("3 A 10 Hz", 3.0 * wave, 20.0 * wave, 10.0, RATE_HZ)
     with pytest.raises(DataError, match="3 A 10 Hz"):
-        fit_model(FitRequest([loop], SETTINGS))
+        fit_model(FitRequest([loop], FitSettings(kind=kind)))

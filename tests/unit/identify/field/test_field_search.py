@@ -6,9 +6,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from hilctl.base.errors import DataError
 from hilctl.base.types import F64
-from hilctl.identify.data.records import History, SteadyLoop
+from hilctl.identify.data.records import History
 from hilctl.identify.evaluation import judge
 from hilctl.identify.field import field_search
 from hilctl.identify.field.densities import Equations, Grid, outputs, table
@@ -292,11 +291,3 @@ def test_a_structure_that_a_slow_record_leaves_open_does_not_bend_the_hysteresis
     TerfenolActuator(TerfenolParameters(), 50e3, seed=3).step(command, y, current_a)
     found = fit_model(FitRequest([History("slow", command, y, 50e3)], FitSettings(kind="field")))
     assert found.rms_percent < 0.6
-
-
-def test_steady_loops_are_refused():
-    """They leave so much open that what is found would differ from processor to processor."""
-    wave = np.sin(2.0 * np.pi * np.arange(64) / 64)
-    loop = SteadyLoop("3 A 10 Hz", 3.0 * wave, 20.0 * wave, 10.0, FAST_HZ)
-    with pytest.raises(DataError, match="3 A 10 Hz"):
-        fit_model(FitRequest([loop], FitSettings(kind="field")))

@@ -8,7 +8,7 @@ import pytest
 
 from hilctl.base.types import F64
 from hilctl.identify.data.records import History
-from hilctl.identify.field.preprocess import LONGEST, OFF, POINTS, Latest, Prepared, Run, smoothed
+from hilctl.identify.field.preprocess import LONGEST, OFF, POINTS, Prepared, Run, smoothed
 
 RATE_HZ = 10_000.0
 
@@ -126,19 +126,6 @@ def test_structure_and_delay_come_off_a_sine(delay_s):
     bare = run.bare_um(delay_s, 2.0 * damping * radian_s, radian_s**2)
     assert bare[:130] == pytest.approx(np.sin(turn * t)[kept][:130], abs=2e-4)
     assert run.bare_um(1.0, 0.0, 0.0) == pytest.approx(went.imag[-1])
-
-
-def test_only_what_was_found_last_is_known():
-    latest: Latest[int] = Latest()
-    asked = []
-
-    def work(key: int) -> int:
-        asked.append(key)
-        return 10 * key
-
-    found = [latest.of(key, lambda key=key: work(key)) for key in (1, 1, 2, 2, 1)]  # type: ignore[misc]
-    assert found == [10, 10, 20, 20, 10]
-    assert asked == [1, 2, 1]
 
 
 def test_what_was_found_last_does_not_stand_for_other_arguments():

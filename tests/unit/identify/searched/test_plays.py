@@ -12,7 +12,7 @@ from hilctl.identify.fit_api import FitData, FitRequest
 from hilctl.identify.fit_model import fit_model
 from hilctl.identify.searched.plays import ExponentialProblem, PlaysProblem
 from hilctl.identify.settings import FitSettings
-from hilctl.models.integrated import exponential_integrated
+from tests.unit.identify.conftest import OMEGA
 
 Loops = Callable[..., list[SteadyLoop]]
 
@@ -20,11 +20,7 @@ Loops = Callable[..., list[SteadyLoop]]
 @pytest.fixture
 def data(loops_of: Loops) -> FitData:
     """Loops that none of the models below fits."""
-    omega = exponential_integrated(
-        alpha=0.33, gamma_s=2.5e-4, a_0=3.0, alpha_0=1.4, beta_0=0.23, g_0=1.0, alpha_1=0.08,
-        beta_1=0.15, d_p=4.0, alpha_2=0.1, beta_2=0.4, d_n=3.0,
-    )  # fmt: skip
-    return FitData(loops_of(omega, [(3.0, 10.0), (6.0, 150.0)]))
+    return FitData(loops_of(OMEGA, [(3.0, 10.0), (6.0, 150.0)]))
 
 
 def differences(run: Callable[[F64], F64], x: F64, step: float) -> F64:

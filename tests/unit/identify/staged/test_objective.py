@@ -1,13 +1,11 @@
 """The sum of squares of the staged model: its derivatives agree with differences."""
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from hilctl.identify.data.records import SteadyLoop
 from hilctl.identify.fit_api import FitData
 from hilctl.identify.staged.fit_data import Linear, StagedFitData
 from hilctl.identify.staged.objective import (
@@ -22,11 +20,9 @@ from hilctl.identify.staged.objective import (
     stages_of,
     structure_of,
 )
-from hilctl.models.integrated import exponential_integrated
 from hilctl.models.linear_stages import FirstMode
 from tests.staged import start
-
-Loops = Callable[..., list[SteadyLoop]]
+from tests.unit.identify.conftest import OMEGA
 
 
 @pytest.mark.parametrize(
@@ -79,10 +75,7 @@ POINT = Point(
 
 @pytest.fixture
 def data(loops_of):
-    omega = exponential_integrated(
-        alpha=0.33, gamma_s=0.0, a_0=3.0, alpha_0=1.4, beta_0=0.23, g_0=1.0, alpha_1=0.08,
-        beta_1=0.15, d_p=4.0, alpha_2=0.1, beta_2=0.4, d_n=3.0,
-    )  # fmt: skip
+    omega = OMEGA.model_copy(update={"gamma_s": 0.0})
     loops = loops_of(omega, [(6.0, 100.0)])
     return StagedFitData(loops, FitData(loops).speeds)
 

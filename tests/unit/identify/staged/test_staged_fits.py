@@ -1,13 +1,11 @@
 """Lag, hysteresis, structure and delay are found again together from their own loops."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from hilctl.identify.data.records import SteadyLoop
 from hilctl.identify.evaluation import judge
 from hilctl.identify.staged.fit_data import SPACING, Linear
 from hilctl.identify.staged.objective import DYNAMIC, Layers, Point
@@ -19,8 +17,6 @@ from hilctl.models.model_file import dump_model, parse_model
 from hilctl.models.staged import FieldLag, StagedModel
 from tests.staged import GRID, fit, truth
 
-Loops = Callable[..., list[SteadyLoop]]
-
 
 def test_all_stages_are_found_again(loops_of):
     made = truth(
@@ -30,9 +26,6 @@ def test_all_stages_are_found_again(loops_of):
     )
     found = fit(loops_of(made, GRID))
     assert found.own_peak_percent < 0.3
-    assert isinstance(found.model, StagedModel)
-    assert found.model.lag is not None
-    assert found.model.structure is not None
     assert found.model.lag.tau_s == pytest.approx(1e-4, rel=0.02)
     assert found.model.lag.growth_per_unit == pytest.approx(0.3, rel=0.05)
     assert found.model.structure.natural_hz == pytest.approx(2300.0, rel=0.05)
@@ -59,8 +52,6 @@ def test_plain_lag_without_structure_and_delay(loops_of):
     found = fit(
         loops_of(truth(lag=FieldLag(tau_s=1e-4)), GRID), lag="plain", structure=False, delay=False
     )
-    assert isinstance(found.model, StagedModel)
-    assert found.model.lag is not None
     assert found.model.lag.tau_s == pytest.approx(1e-4, rel=0.02)
     assert found.model.lag.growth_per_unit == 0.0
     assert found.model.structure is None
@@ -70,7 +61,6 @@ def test_plain_lag_without_structure_and_delay(loops_of):
 
 def test_without_a_lag_thresholds_grow(loops_of):
     found = fit(loops_of(truth(delay_s=4e-5), GRID), lag="none", structure=False)
-    assert isinstance(found.model, StagedModel)
     assert found.model.lag is None
     assert found.model.delay_s == pytest.approx(4e-5, abs=2e-6)
     assert found.parameters["gamma"] < 1e-5
@@ -82,7 +72,6 @@ def test_at_a_low_rate_the_delay_is_that_of_the_sampled_lag(loops_of):
     slow = [(a, f / 10.0) for a, f in GRID]
     made = loops_of(truth(lag=FieldLag(tau_s=1e-4)), slow, rate_hz=1000.0)
     found = fit(made, lag="plain", structure=False)
-    assert isinstance(found.model, StagedModel)
     assert found.model.delay_s < 5e-5
     assert found.own_peak_percent < 1.0
 
@@ -119,7 +108,6 @@ def test_preisach_triangle_is_nearer_between_known_stages(loops_of):
     plays = fit(loops)
     triangle = fit(loops, hysteresis="preisach", lines=16)
     assert triangle.rms_percent < 0.5 * plays.rms_percent
-    assert isinstance(triangle.model, StagedModel)
     assert triangle.model.hysteresis.kind == "preisach"
     assert triangle.standard_errors.keys() <= triangle.parameters.keys() - {"output_offset_um"}
     assert parse_model("x.yaml", dump_model(triangle.model)) == triangle.model
