@@ -8,35 +8,12 @@ from types import SimpleNamespace
 import pytest
 
 from hilctl.base.errors import InputError
-from hilctl.comparison.compare import (
-    COMPARED,
-    ComparisonRequest,
-    compare,
-    headings,
-    notes,
-    save_models,
-    table_rows,
-)
+from hilctl.comparison.compare import COMPARED, headings, notes, save_models, table_rows
 from hilctl.comparison.comparison_page import comparison_page
 from hilctl.identify.registry import CATALOGUE, entry
 from hilctl.models.model_file import load_model
 from hilctl.recording.reader import read
-from tests.fakes import SteppingClock
-
-ROOT = Path(__file__).parents[3]
-GOLDEN = ROOT / "recordings" / "golden" / "terfenol_uncompensated.mcap"
-OMEGA = ROOT / "configs" / "models" / "terfenol_omega.yaml"
-
-
-def ignore(done, text):
-    """Take a progress report."""
-
-
-@pytest.fixture(scope="module")
-def comparison():
-    """Two models of the catalogue and one of a file, tried at 100 Hz."""
-    request = ComparisonRequest([GOLDEN], ["duhem", "straight", str(OMEGA)], frequencies_hz=[100.0])
-    return compare(request, SteppingClock(1e-3), ignore)
+from tests.unit.comparison.conftest import GOLDEN, ROOT, compared
 
 
 def test_rows_come_as_asked_for(comparison):
@@ -68,7 +45,7 @@ def test_loops_of_a_real_device_are_judged_without_trials(monkeypatch, text):
     run = {**recording.run, "simulated": "false"}
     recording = replace(recording, experiment_yaml=text, run=run)
     monkeypatch.setattr("hilctl.comparison.compare.read", lambda path: recording)
-    judged = compare(ComparisonRequest([GOLDEN], ["straight"]), SteppingClock(1e-3), ignore)
+    judged = compared()
     assert judged.rows[0].trials == ()
     assert judged.rows[0].compensated_percent is None
     assert judged.to_mapping()["device"] is None
@@ -78,16 +55,13 @@ def test_loops_of_a_real_device_are_judged_without_trials(monkeypatch, text):
 
 def test_a_compensated_recording_gives_device_and_limits():
     path = GOLDEN.with_name("terfenol_compensated.mcap")
-    judged = compare(
-        ComparisonRequest([path], ["straight"], frequencies_hz=[200.0]), SteppingClock(1e-3), ignore
-    )
+    judged = compared(path, frequencies_hz=[200.0])
     assert judged.rows[0].trials[0].frequency_hz == pytest.approx(200.0)
 
 
 def test_progress_rises_to_the_end():
     told = []
-    request = ComparisonRequest([GOLDEN], ["straight"], frequencies_hz=[100.0])
-    compare(request, SteppingClock(1e-3), lambda done, text: told.append((done, text)))
+    compared(progress=lambda *each: told.append(each), frequencies_hz=[100.0])
     parts = [done for done, _ in told]
     assert parts == sorted(parts)
     assert parts[-1] == 1.0
@@ -96,7 +70,7 @@ def test_progress_rises_to_the_end():
 
 def test_unknown_models_are_refused_at_once():
     with pytest.raises(InputError, match="did you mean 'preisach'"):
-        compare(ComparisonRequest([Path("nowhere.mcap")], ["presach"]), SteppingClock(1e-3), ignore)
+        compared(Path("nowhere.mcap"), ["presach"])
     assert set(COMPARED) <= set(CATALOGUE)
     for name in CATALOGUE:
         assert entry(name)[1].title
@@ -105,7 +79,7 @@ def test_unknown_models_are_refused_at_once():
 def test_a_model_of_another_unit_is_refused():
     model = ROOT / "configs" / "models" / "piezo_ppi.yaml"
     with pytest.raises(InputError, match="commands in A"):
-        compare(ComparisonRequest([GOLDEN], [str(model)]), SteppingClock(1e-3), ignore)
+        compared(models=[str(model)])
 
 
 def test_saved_models_are_model_files(comparison, tmp_path):

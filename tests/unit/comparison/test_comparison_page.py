@@ -6,24 +6,7 @@ import pytest
 
 from hilctl.base.errors import InputError
 from hilctl.cli.models import compare as command
-from hilctl.comparison.compare import ComparisonRequest, compare
 from hilctl.comparison.comparison_page import comparison_figure, comparison_page
-from tests.fakes import SteppingClock
-
-ROOT = Path(__file__).parents[3]
-GOLDEN = ROOT / "recordings" / "golden" / "terfenol_uncompensated.mcap"
-OMEGA = ROOT / "configs" / "models" / "terfenol_omega.yaml"
-
-
-def ignore(done, text):
-    """Take a progress report."""
-
-
-@pytest.fixture(scope="module")
-def comparison():
-    """Two models of the catalogue and one of a file, tried at 100 Hz."""
-    request = ComparisonRequest([GOLDEN], ["duhem", "straight", str(OMEGA)], frequencies_hz=[100.0])
-    return compare(request, SteppingClock(1e-3), ignore)
 
 
 @pytest.mark.slow

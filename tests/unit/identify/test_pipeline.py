@@ -173,19 +173,17 @@ def test_modes_are_kept_for_as_long_as_data_held_out_are_the_better(asked):
     assert asked == [(0, 2000.0), (1, 2200.0)]
 
 
-def test_a_mode_that_helps_only_what_was_fitted_is_left_out(asked):
-    found = with_modes([RECORD], identifying(Found(1.0, 1.0), Found(0.1, WORTH)))
-    assert (found.modes, found.held_out_percent) == ((), 1.0)
-
-
-def test_without_data_held_out_the_fit_itself_judges(asked):
-    found = with_modes([RECORD], identifying(Found(1.0), Found(0.5), Found(0.46)))
-    assert (found.modes, found.rms_percent) == ((MODE,), 0.5)
-
-
-def test_it_ends_after_some_turns(asked):
-    found = with_modes([RECORD], identifying(*[Found(0.5**k) for k in range(20)]))
-    assert len(found.modes) == TURNS == 4
+@pytest.mark.parametrize(
+    ("models", "modes", "rms_percent"),
+    [
+        ([Found(1.0, 1.0), Found(0.1, WORTH)], 0, 1.0),  # it helps only what was fitted
+        ([Found(1.0), Found(0.5), Found(0.46)], 1, 0.5),  # nothing was held out
+        ([Found(0.5**k) for k in range(20)], TURNS, 0.5**TURNS),
+    ],
+)
+def test_modes_that_improve_little_are_left_out(asked, models, modes, rms_percent):
+    found = with_modes([RECORD], identifying(*models))
+    assert (found.modes, found.rms_percent) == ((MODE,) * modes, rms_percent)
 
 
 def test_it_ends_where_no_mode_shows(monkeypatch):

@@ -133,15 +133,16 @@ def test_find_cycles_takes_the_whole_period_of_two_tones():
     assert loop.frequency_hz == pytest.approx(50.0, rel=1e-4)
 
 
-@pytest.mark.parametrize("kind", ["noise", "ramp", "sweep"])
+@pytest.mark.parametrize("kind", ["noise", "ramp", "sweep", "growing"])
 def test_find_cycles_refuses_what_does_not_repeat(kind):
     time = np.arange(3000)
     command = {
         "noise": np.random.default_rng(1).normal(size=3000),
         "ramp": time / 3000.0,
         "sweep": np.sin(2e-5 * time**2),
+        "growing": time * np.sin(2.0 * np.pi * time / 200.0),
     }[kind]
-    with pytest.raises(DataError, match="table: "):
+    with pytest.raises(DataError, match=r"table: .*--whole"):
         find_cycles(History("table", command, command, 100.0))
 
 
@@ -176,12 +177,6 @@ def test_a_soft_start_is_left_out():
     assert stop >= 599
 
 
-def test_what_does_not_repeat_is_refused():
-    growing = sine(50.0, 6) * np.linspace(0.2, 1.0, 300)
-    with pytest.raises(DataError, match="growing: no steady part"):
-        find_period("growing", growing)
-
-
 def test_a_stretch_at_a_small_part_of_the_amplitude_is_none():
     command = np.concatenate((0.01 * sine(50.0, 10), np.linspace(0.0, 1.0, 60)))
     assert steady_stretch(command, 50.0) is None
@@ -199,9 +194,3 @@ def test_few_cycles_with_the_noise_of_a_measured_current_repeat(cycles, noise, p
     found, start, stop = find_period("four", command)
     assert found == pytest.approx(period, rel=0.01)
     assert stop - start >= 1.95 * period
-
-
-def test_what_grows_does_not_repeat_and_what_then_is_said():
-    time = np.arange(2000)
-    with pytest.raises(DataError, match=r"--whole"):
-        find_period("growing", time * np.sin(2.0 * np.pi * time / 200.0))

@@ -71,15 +71,12 @@ def test_units_by_hand():
     data = Prepared([history()])
     data.top_hz, data.reach, data.stroke_um = 50.0 / math.pi, 4.0, 16.0  # unit of time: 0.01 s
     known = physical(STAGES, data)
-    assert known.losses.field_s == pytest.approx(0.3 * 0.01)
-    assert known.losses.output_s == pytest.approx(0.2 * 0.01 * 4.0 / 8.0)
-    assert known.losses.decay_s == pytest.approx(0.1 * 0.01)
-    assert known.losses.growth == pytest.approx(0.4 / 4.0)
-    assert known.losses.bend == pytest.approx(0.5 / 16.0)
-    assert known.losses.excess == pytest.approx(0.06 * 2.0)
-    assert known.radian_s == pytest.approx(0.08 * 0.01)
-    assert known.damping_ratio == 0.9
-    assert known.delay_s == pytest.approx(0.11 * 0.01)
+    losses = FieldLosses(
+        field_s=0.003, output_s=0.001, decay_s=0.001, growth=0.1, bend=0.5 / 16.0, excess=0.12
+    )
+    assert known.losses.model_dump() == pytest.approx(losses.model_dump())
+    linear = known.radian_s, known.damping_ratio, known.delay_s
+    assert linear == pytest.approx((0.0008, 0.9, 0.0011))
     assert row(stages_of(known, data)) == pytest.approx(row(STAGES))
 
 

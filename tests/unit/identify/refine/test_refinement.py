@@ -25,6 +25,7 @@ from tests.unit.identify.refine.conftest import OLD, RATE_HZ, actuator, command,
 
 ROOT = Path(__file__).parents[4]
 GOLDEN = ROOT / "recordings" / "golden"
+COMPENSATED = GOLDEN / "terfenol_compensated.mcap"
 OMEGA = ROOT / "configs" / "models" / "terfenol_omega.yaml"
 
 
@@ -131,8 +132,7 @@ def test_swapped_wires_are_refused(old, runs):
 @pytest.mark.slow
 def test_files_in_a_better_model_file_out(tmp_path):
     output = tmp_path / "better.yaml"
-    found = refine_files(OMEGA, [GOLDEN / "terfenol_compensated.mcap",
-                                 GOLDEN / "terfenol_uncompensated.mcap"], output)  # fmt: skip
+    found = refine_files(OMEGA, [COMPENSATED, GOLDEN / "terfenol_uncompensated.mcap"], output)
     assert output.exists() == found.better
     if found.better:
         assert load_model(output) == found.model
@@ -158,18 +158,14 @@ def test_a_file_that_exists_is_refused_before_anything_is_read(tmp_path):
     assert output.read_text() == "mine"
 
 
-GOLDEN_runs = ROOT / "recordings" / "golden" / "terfenol_compensated.mcap"
-OMEGA_runs = load_model(ROOT / "configs" / "models" / "terfenol_omega.yaml")
-
-
 def test_a_run_from_rest_is_what_was_put_out_and_what_came():
-    (run,), recording = load_runs([GOLDEN_runs], OMEGA_runs), read(GOLDEN_runs)
+    (run,), recording = load_runs([COMPENSATED], load_model(OMEGA)), read(COMPENSATED)
     assert run.ignore == 0
     np.testing.assert_array_equal(run.command, recording.samples.command[: run.command.size])
 
 
 def test_a_run_that_goes_on_has_the_one_before_ahead_of_it():
-    first = read(GOLDEN_runs)
+    first = read(COMPENSATED)
     later = replace(first, run={**first.run, "run_id": "b", "initial_state_run_id": "a"})
     run = _history(later, {"a": first, "b": later})
     still = round(STILL_S * first.sample_rate_hz)
@@ -179,18 +175,18 @@ def test_a_run_that_goes_on_has_the_one_before_ahead_of_it():
 
 
 def test_a_run_that_goes_on_from_one_that_is_not_given_is_refused():
-    first = read(GOLDEN_runs)
+    first = read(COMPENSATED)
     later = replace(first, run={**first.run, "initial_state_run_id": "a"})
     with pytest.raises(DataError, match="that recording"):
         _history(later, {})
 
 
 def test_what_can_not_be_used_is_said(tmp_path):
-    copy = Path(shutil.copy(GOLDEN_runs, tmp_path / "run.mcap"))
+    copy = Path(shutil.copy(COMPENSATED, tmp_path / "run.mcap"))
     with pytest.raises(InputError, match="named twice"):
-        load_runs([copy, copy], OMEGA_runs)
+        load_runs([copy, copy], load_model(OMEGA))
     with pytest.raises(InputError, match="no recordings"):
-        load_runs([], OMEGA_runs)
+        load_runs([], load_model(OMEGA))
     with pytest.raises(DataError, match=r"in A.* V"):
         load_runs([copy], piezo_ppi())
 
