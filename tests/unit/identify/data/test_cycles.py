@@ -13,7 +13,6 @@ from hilctl.identify.data.cycles import (
     find_period,
     loops_from_pieces,
     loops_from_recording,
-    similarity,
     steady_stretch,
 )
 from hilctl.identify.data.records import History
@@ -148,13 +147,6 @@ def test_find_cycles_refuses_what_does_not_repeat(kind):
 
 def sine(period, cycles):
     return np.sin(2.0 * np.pi * np.arange(round(period * cycles)) / period)
-
-
-def test_similarity_is_one_where_a_signal_meets_itself():
-    alike = similarity(sine(50.0, 8) + 3.0)
-    assert alike[0] == pytest.approx(1.0)
-    assert alike[100] == pytest.approx(1.0, abs=1e-9)
-    assert alike[25] == pytest.approx(-1.0, abs=1e-2)
 
 
 @pytest.mark.parametrize("period", [40.0, 73.25, 333.3])

@@ -5,16 +5,7 @@ import pytest
 
 from hilctl.base.types import F64
 from hilctl.identify.field.densities import Grid, table
-from hilctl.identify.field.design_matrix import (
-    LEAST_SWING,
-    Motion,
-    bare_displacement,
-    chosen,
-    corners,
-    needed_points,
-    swings,
-    turning_points,
-)
+from hilctl.identify.field.design_matrix import LEAST_SWING, Motion, chosen, corners, turning_points
 from hilctl.identify.field.field_search import FINER, tabled
 from hilctl.models.effective_field import FieldModel, OutputCurve
 
@@ -63,22 +54,6 @@ def test_turning_points_and_rows_are_enough_of_a_path():
     assert few == pytest.approx(whole, abs=0.02)
 
 
-def test_swings_go_from_turn_to_turn_and_small_ones_are_none():
-    y = np.array([0.0, -0.1, 0.2, 1.0, 0.9, 2.0, 1.9, 0.5, 0.6, -1.0, -0.9, 3.0])
-    out = np.empty(y.size)
-    swings(y, 0.3, out)
-    # From 0 up to 2 at sample 5, down to -1 at sample 9, and up to 3.
-    assert out.tolist() == [2.0] * 5 + [3.0] * 4 + [4.0] * 3
-
-
-def test_points_are_the_rows_and_all_turns():
-    u = np.array([0.0, 1.0, 2.0, 1.5, 1.0, 3.0, 4.0, 5.0, 6.0])
-    points, places = np.empty(9, dtype=np.int64), np.empty(3, dtype=np.int64)
-    count = needed_points(u, np.array([1, 4, 6]), points, places)
-    assert points[:count].tolist() == [0, 1, 2, 4, 6]
-    assert places.tolist() == [1, 3, 4]
-
-
 def test_straight_lines_between_corners_are_near_both_signals():
     x, y = path(), np.cos(np.linspace(0.0, 40.0, 600))
     kept = np.empty(600, dtype=np.int64)
@@ -100,15 +75,6 @@ def test_corners_of_one_signal_alone_are_kept():
     for x, y in ((still, edge), (edge, still)):
         count = corners(x, y, 0.1, 0.1, 1, 1000, kept)
         assert kept[:count].tolist() == [0, 50, 99]
-
-
-def test_what_comes_later_is_taken_between_samples():
-    derivatives = np.array([[0.0, 1.0, 4.0, 9.0], [0.0, 2.0, 4.0, 6.0], [2.0, 2.0, 2.0, 2.0]])
-    out = np.empty(3)
-    bare_displacement(derivatives, np.array([0, 1, 3]), 1.25, 0.5, 0.1, out)
-    whole = derivatives[0] + 0.5 * derivatives[1] + 0.1 * derivatives[2]
-    expected = [0.75 * whole[1] + 0.25 * whole[2], 0.75 * whole[2] + 0.25 * whole[3], whole[3]]
-    assert out == pytest.approx(expected)
 
 
 RATE_HZ = 10_000.0

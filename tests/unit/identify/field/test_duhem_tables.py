@@ -7,7 +7,6 @@ from hilctl.base.types import F64
 from hilctl.identify.data.records import History
 from hilctl.identify.field.duhem_search import POINTS
 from hilctl.identify.field.duhem_tables import (
-    BENT,
     FIRST,
     FLUX,
     HIGHEST,
@@ -16,13 +15,11 @@ from hilctl.identify.field.duhem_tables import (
     NAMES,
     POWERS,
     STEPS,
-    TILTED,
     WIDER,
     Layout,
     Path,
     Signals,
     laid_over,
-    prior,
 )
 from hilctl.identify.field.preprocess import OFF, Prepared
 from hilctl.models.effective_field import FieldLosses
@@ -108,12 +105,6 @@ def test_the_centre_rises_though_loops_are_upright():
     assert (np.diff(here.centre) > 0.0).all()
 
 
-def test_a_first_table_brings_loops_towards_the_edges():
-    rising, falling = layout().first_logs()
-    assert (np.diff(rising, axis=1) > 0.0).all()
-    assert (np.diff(falling, axis=1) < 0.0).all()
-
-
 def test_a_table_moved_to_other_nodes_is_the_same_function():
     coarse, fine = layout(12, 6), layout(20, 10)
     moved = fine.moved(logs_of(coarse), coarse)
@@ -122,18 +113,6 @@ def test_a_table_moved_to_other_nodes_is_the_same_function():
     within = np.abs(fine.offsets[None, :] - shift[:, None]) < coarse.half_width
     expected -= np.array([0.3, -0.2])[:, None, None] * shift[:, None]
     assert moved[:, within] == pytest.approx(expected[:, within], abs=1e-9)
-
-
-def test_the_prior_weighs_bends_more_than_tilts():
-    here = layout()
-    rows = prior(here)
-    assert rows.shape[1] == 2 * here.centre.size * here.across
-    assert rows @ np.full(rows.shape[1], 3.0) == pytest.approx(0.0, abs=1e-12)
-    straight, bent = rows @ logs_of(here).ravel(), rows @ logs_of(here, 0.5).ravel()
-    tilts = TILTED * np.array([0.01 * here.cell_um, 0.3 * 2 * here.half_width / 6])
-    assert np.abs(straight).max() == pytest.approx(max(*tilts, TILTED * 0.02 * here.cell_um))
-    apart = 2.0 * here.half_width / 6
-    assert np.abs(bent).max() == pytest.approx(BENT * 2.0 * 0.5 * apart**2)
 
 
 def test_a_search_begins_within_its_bounds():
@@ -203,13 +182,3 @@ def test_paths_follow_every_stage_but_the_offset(stage):
         assert (after.field != before.field).any() or (
             after.displacement_um != before.displacement_um
         ).any()
-
-
-def test_paths_through_other_points_are_other_paths():
-    signals = Signals(data())
-    signals.choose(FIRST, 0.05)
-    (coarse,) = signals.paths(FIRST)
-    signals.choose(FIRST, 0.01)
-    (fine,) = signals.paths(FIRST)
-    assert fine.field.size > coarse.field.size
-    assert fine.motion.travel.size == fine.field.size

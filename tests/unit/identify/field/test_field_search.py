@@ -232,20 +232,6 @@ def test_slopes_by_thresholds_are_differences():
         assert np.mean(np.abs(found[:, i - 1] - rise)) < 0.05 * np.mean(np.abs(rise))
 
 
-def test_what_free_weights_take_up_of_a_change_costs_nothing():
-    y = displacement_um() + np.random.default_rng(1).normal(0.0, 0.05, 900)
-    columns = table([path()], KEPT, GRID)
-    equations = Equations(columns, y, GRID, LEAST, np.ones(900))
-    weights = equations.solve()
-    here = weights.errors_of(columns @ weights.slopes.ravel(), y)
-    changes = np.stack([columns[:, 2], np.sign(path())], axis=1)
-    place = equations.place(here, changes)
-    total = np.sum((changes - changes.mean(axis=0)) ** 2, axis=0)
-    assert place.normal[0, 0] < 1e-2 * total[0]
-    assert place.normal[1, 1] > 0.05 * total[1]
-    assert place.squares == pytest.approx(equations.solve().squares, rel=0.1)
-
-
 FAST_HZ = 20_000.0
 
 

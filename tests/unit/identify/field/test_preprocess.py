@@ -90,22 +90,6 @@ def test_what_is_left_is_enough_of_both_signals(frequency_hz):
         assert there == pytest.approx(signal[: run.kept[-1]], abs=2.5 * OFF * whole)
 
 
-def test_a_parabola_keeps_its_height_slope_and_bend():
-    y, slope, bend = Prepared([history()]).runs[0].derivatives
-    t, inner = np.arange(y.size) / RATE_HZ, slice(100, -100)
-    assert y[inner] == pytest.approx((7.0 + 40.0 * t - 300.0 * t**2)[inner], abs=1e-9)
-    assert slope[inner] == pytest.approx((40.0 - 600.0 * t)[inner], abs=1e-6)
-    assert bend[inner] == pytest.approx(-600.0, abs=1e-3)
-
-
-def test_noise_is_smoothed():
-    clean = history()
-    noise = np.random.default_rng(1).standard_normal(clean.command.size)
-    noisy = History("noisy", clean.command, clean.displacement_um + noise, RATE_HZ)
-    difference = Prepared([noisy]).runs[0].derivatives - Prepared([clean]).runs[0].derivatives
-    assert np.std(difference[0]) < 0.6
-
-
 @pytest.mark.parametrize("ignore", [0, 1, 20, 21, 1003])
 def test_no_sample_is_judged_that_is_to_be_ignored(ignore):
     run = Prepared([history(ignore=ignore)]).runs[0]
@@ -196,9 +180,3 @@ def test_a_record_with_few_samples_a_cycle_is_left_as_it_is(width):
 @pytest.mark.parametrize("size", [3, 30, 200])
 def test_short_records_are_smoothed_too(size):
     assert smoothed(np.linspace(0.0, 1.0, size), WIDTH, SMOOTHING_RATE_HZ).shape == (3, size)
-
-
-def test_a_constant_stays_one():
-    value, slope, _ = smoothed(np.full(1000, 7.0), WIDTH, SMOOTHING_RATE_HZ)
-    assert value == pytest.approx(7.0)
-    assert slope == pytest.approx(0.0, abs=1e-6)

@@ -1,7 +1,6 @@
 """What the search turns is what the model means: order, units, and a record taken apart."""
 
 import math
-from dataclasses import astuple
 
 import numpy as np
 import pytest
@@ -12,14 +11,12 @@ from hilctl.identify.field.preprocess import Prepared, Run
 from hilctl.identify.field.stages import (
     HIGH,
     LOW,
-    NAMES,
     STEP,
     Physical,
     Stages,
     physical,
     row,
     signals,
-    stages_in,
     stages_of,
 )
 from hilctl.models.effective_field import FieldLosses, FieldModel, OutputCurve
@@ -41,12 +38,6 @@ def plain_run(command: np.ndarray, derivatives: np.ndarray) -> Run:
     steps = np.full(size, 1.0 / RATE_HZ)
     held = np.ascontiguousarray(command)
     return Run(RATE_HZ, np.arange(size), steps, held, held, derivatives, 0)
-
-
-def test_a_row_is_the_stages_in_the_order_of_their_names():
-    assert stages_in(row(STAGES)) == STAGES
-    assert dict(zip(NAMES, row(STAGES), strict=True))["radian"] == STAGES.radian
-    assert tuple(row(STAGES)) == astuple(STAGES)
 
 
 def test_a_search_can_begin_at_the_defaults_and_step_either_way():

@@ -10,7 +10,7 @@ from hilctl.identify.refine.residual_fit import (
     fastest_um_per_s,
 )
 from hilctl.models.integrated import ButterflyModel, DeadbandFunction
-from hilctl.models.refined import LEAST_SLOPE, RefinedModel
+from hilctl.models.refined import LEAST_SLOPE
 from hilctl.models.staged import StagedModel
 from tests.unit.identify.refine.conftest import OLD, RATE_HZ, actuator, history
 
@@ -82,21 +82,6 @@ def test_numbers_that_have_no_inverse_become_less():
     model = remainder.model(numbers)
     assert model.residual.least_slope == pytest.approx(1.1 * LEAST_SLOPE, rel=1e-6)
     assert len(set(np.array(model.residual.slopes)[0].tolist())) == 1
-
-
-def test_old_operator_is_what_anchors_hold_to():
-    runs = [history(actuator(), i, noise_um=0.0) for i in range(2)]
-    first = ResidualFit(OLD, runs, runs)
-    once = first.model(solved(first))
-    again = ResidualFit(once, runs[:1], runs[:1])
-    numbers = np.linalg.solve(
-        again.anchor().normal + again.firm(1e-4, again.anchor()), again.anchor().right
-    )
-    found = again.model(numbers)
-    assert isinstance(found, RefinedModel)
-    change = again.modelled_um(found, 0) - again.modelled_um(once, 0)
-    shown = again.modelled_um(once, 0) - again.modelled_um(OLD, 0)
-    assert np.std(change) < 0.25 * np.std(shown)
 
 
 def test_drift_of_a_run_changes_nothing_where_it_is_its_own():

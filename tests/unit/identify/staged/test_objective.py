@@ -80,10 +80,6 @@ def data(loops_of):
     return StagedFitData(loops, FitData(loops).speeds)
 
 
-def test_structure_is_told_in_hertz_and_damping():
-    assert structure_of(POINT.linear) == pytest.approx((2000.0, 0.15))
-
-
 def test_a_low_pass_keeps_its_time_constant_and_is_a_structure():
     """A sensor of 1 kHz has no mass: whatever the search found for one is too small to matter."""
     low_pass = Linear(0.0, 1.6e-4, 1e-14)
