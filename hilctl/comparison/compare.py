@@ -80,10 +80,8 @@ class ComparedModel:
     """One model of the comparison.
 
     Attributes:
-        name: Name of the kind or of the model file.
         numbers: Number of identified parameters; None for a model file.
         identify_s: Duration of the identification; None for a model file.
-        error: Its evaluation on the loops.
         inverse_ns: Time per sample of its inverse.
         trials: Trials of its inverse; none without a simulated device.
     """
@@ -111,7 +109,6 @@ class Comparison:
 
     Attributes:
         device: Device of the trials; empty without trials.
-        rows: One row per model, in the requested order.
     """
 
     sources: tuple[str, ...]
@@ -149,11 +146,7 @@ def _row_mapping(loops: Sequence[SteadyLoop], row: ComparedModel) -> dict[str, A
 def compare(
     request: ComparisonRequest, clock: Callable[[], float], progress: OnProgress
 ) -> Comparison:
-    """Identify each model on the loops, evaluate it, and try its inverse on the device.
-
-    Raises:
-        InputError: A part of the request is not usable.
-    """
+    """Identify each model on the loops, evaluate it, and try its inverse on the device."""
     names = tuple(request.models) or tuple(COMPARED)
     for name in names:
         if not name.endswith(_FILES):
@@ -270,19 +263,11 @@ def check_free(
 def save_models(
     comparison: Comparison, folder: Path, *, created: str, overwrite: bool
 ) -> tuple[Path, ...]:
-    """Write each identified model to ``folder/NAME.yaml``.
+    """Write each identified model to ``folder/NAME.yaml``, and return the files.
 
-    Args:
-        comparison: The models; those from files are skipped.
-        folder: The folder; created if missing.
-        created: Date and time in ISO 8601, UTC, for the provenance.
-        overwrite: Whether a file of that name may be replaced.
-
-    Returns:
-        The files.
-
-    Raises:
-        InputError: A file exists, and nothing is written; or the folder is not writable.
+    Models from files are skipped; ``created`` is an ISO 8601 date and time in UTC, for the
+    provenance. Raise InputError if a file exists, and write nothing, or if the folder is not
+    writable.
     """
     rows = [row for row in comparison.rows if row.identify_s is not None]
     check_free([row.name for row in rows], folder, overwrite=overwrite)

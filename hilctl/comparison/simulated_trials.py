@@ -114,12 +114,7 @@ class TrialDevice:
         return self._loaded.device.info.description
 
     def run(self, model: HysteresisModel, reference: Reference) -> list[InverseTrial]:
-        """Run the inverse of a model from rest, and evaluate each segment.
-
-        Raises:
-            ModelError: The model has no inverse.
-            DeviceError: The device rejects a command.
-        """
+        """Run the inverse of a model from rest, and evaluate each segment."""
         loaded = replace(self._loaded, model=model)
         begun = begin(model, reference.sample_rate_hz, reference.values)
         values = (reference.values, begun.input_um[:], begun.state)

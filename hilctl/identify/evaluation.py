@@ -165,16 +165,10 @@ def weight_roots(data: Records, weight_by: Literal["equal", "hysteresis"]) -> F6
 
 
 def hysteresis_weights(data: Records) -> F64:
-    """Return the published weight A of each record's squared errors (5.14).
+    """Return the published weight A of each record's squared errors (5.14): float64[records].
 
     The weight is the peak hysteresis of a loop over that of the slowest loop (of the largest one,
-    if several have the lowest frequency).
-
-    Returns:
-        float64[records].
-
-    Raises:
-        DataError: A record is not a loop.
+    if several have the lowest frequency). Raise DataError if a record is not a loop.
     """
     loops = [record for record in data if isinstance(record, SteadyLoop)]
     if len(loops) < len(data):

@@ -149,9 +149,8 @@ class FitData:
     ) -> tuple[F64, F64, F64]:
         """Run plays of thresholds ``spacing numbers_i``, with derivatives.
 
-        Returns:
-            The command float64[N], each play's output float64[N, n], and the derivatives of their
-            weighted sum by spacing and growth, float64[N, 2].
+        Return the command float64[N], each play's output float64[N, n], and the derivatives of
+        their weighted sum by spacing and growth, float64[N, 2].
         """
         size = self.target_um.size
         command, outputs = np.empty(size), np.empty((size, numbers.size))
@@ -232,9 +231,8 @@ class FitRequest:
 class FitJob:
     """Prepared data of one fit, and settings.
 
-    Attributes:
-        start: ``end`` of a fit of this kind to other data, or of another size, to continue from;
-            ignored if it is of another kind.
+    The fit continues from ``start``, the ``end`` of a fit of this kind to other data or of another
+    size.
     """
 
     data: FitData
@@ -257,7 +255,6 @@ class StartOutcome:
         start: ``data`` for rough values from the data, ``random N`` for random values,
             ``weights N`` for the solution of a linear problem.
         first_rms_percent: Weighted error at the start, in percent of the largest peak-to-peak.
-        rms_percent: The same at the end.
         evaluations: Evaluations of the criterion, without those for derivatives.
     """
 

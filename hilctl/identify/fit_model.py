@@ -116,13 +116,7 @@ VERSIONS = {"hilctl": hilctl.__version__, "numpy": np.__version__, "scipy": scip
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FittedModel(Evaluation):
-    """An identified model, and its errors on the fitted records.
-
-    Attributes:
-        numbers: Number of fitted numbers.
-        parameters: Fitted parameters under their published names, in command units, um and s.
-        standard_errors: Standard errors of the parameters, if known.
-    """
+    """An identified model, and its errors on the fitted records; see :class:`FoundModel`."""
 
     model: HysteresisModel
     numbers: int

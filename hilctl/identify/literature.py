@@ -92,11 +92,8 @@ def fit_triangle(
 ) -> tuple[PreisachModel, int]:
     """Return a Preisach model, and the number of its cells that have a density.
 
-    Args:
-        data: The records.
-        centres: float64[N, lines], output of each play.
-        fit: Returns densities and the constant displacement, for columns, lower bounds and table.
-        fields: Further fields of the model.
+    ``centres``, float64[N, lines], is the output of each play. ``fit`` returns densities and the
+    constant displacement, for columns, lower bounds and table.
     """
     lines, (low, high) = centres.shape[1], data.input_range
     edges = np.linspace(low, high, lines + 1)

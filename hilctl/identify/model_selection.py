@@ -194,12 +194,7 @@ MOST_LAG = 8  # samples tried
 
 @dataclass(frozen=True, slots=True)
 class CandidateScore:
-    """Errors of one kind of model on held-out data.
-
-    Attributes:
-        settings: The kind, and settings that differ from its published ones.
-        rms_percent: Of the largest peak-to-peak displacement.
-    """
+    """Errors of one kind of model on held-out data, in percent of the largest stroke."""
 
     settings: str
     rms_percent: float
@@ -208,11 +203,9 @@ class CandidateScore:
 
 @dataclass(frozen=True, slots=True)
 class OrderScore:
-    """Errors of a model of one size on held-out data.
+    """Errors of a model of one size on held-out data, in percent of the largest stroke.
 
-    Attributes:
-        plays: Play operators; lines, if the model has a Preisach triangle.
-        rms_percent: Of all held-out data, in percent of the largest peak-to-peak.
+    ``plays`` counts the lines of a Preisach triangle if the model has one.
     """
 
     plays: int

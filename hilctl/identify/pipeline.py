@@ -81,7 +81,6 @@ class Identification:
     Attributes:
         orders: Errors of each number of plays, if it was selected.
         lag_samples: Assumed lag of tables' displacements in samples.
-        candidates: Errors of each kind, if it was selected.
     """
 
     fit: FittedModel
@@ -170,11 +169,6 @@ def identify_files(
 
 def identify_records(request: FitRequest, validate: Sequence[Record] = ()) -> Identification:
     """Fit a model to records, and evaluate it on held-out data.
-
-    Args:
-        request: Records and settings, which may leave the kind or the number of plays open.
-        validate: Held-out records; if there are none, parts of the fitted records are left out of
-            further fits.
 
     Raises:
         DataError: The data can't be used as asked, or there are none.

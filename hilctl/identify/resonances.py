@@ -39,10 +39,9 @@ MOST = 3
 
 @dataclass(frozen=True, slots=True)
 class _Spectra:
-    """Transfer function from modelled to measured displacement.
+    """Transfer function from modelled to measured displacement, and power of the modelled one.
 
-    ``power`` is that of the modelled displacement; ``left`` that of the residual, at all
-    frequencies.
+    ``left`` is the power of the residual at all frequencies.
     """
 
     frequency_hz: F64
@@ -59,8 +58,7 @@ def further_modes(
 ) -> tuple[FurtherMode, ...] | None:
     """Return improved modes, with one more if the residual shows it; None if nothing improves.
 
-    ``modelled_um`` holds the evaluated samples of each record; ``first_hz`` is the natural
-    frequency of the model's first mode.
+    ``first_hz`` is the natural frequency of the model's first mode.
     """
     bare_um = [
         _undone(model_um, known, record.sample_rate_hz)

@@ -29,7 +29,6 @@ class CycleScore:
         harmonics_um: complex128[K + 1], coefficients c_k of displacement less reference.
         noise_um: float64[K + 1], their standard deviations, from the scatter of the cycles.
         peak_um: Peak error of the average cycle, as in reports.
-        peak_to_peak_um: Peak-to-peak displacement of the average cycle.
         floor_um: Peak error that sensor noise alone would cause.
         strongest_hz: Frequency of the reference's strongest harmonic.
         answer: Displacement over reference at that frequency.

@@ -93,14 +93,8 @@ def correction_setting(file: Path) -> str:
 class IlcSession:
     """Session that learns the correction of every periodic waveform of an experiment.
 
-    Args:
-        experiment: Experiment file; learning continues from its correction, if it has one.
-        settings: ``key=value`` overrides.
-        folder: Folder of the recordings and corrections.
-        run: Function that runs an experiment.
-
-    Raises:
-        InputError: It has no compensator, or no waveform with enough whole steady cycles.
+    Learning continues from the correction of the experiment, if it has one. Raise InputError if it
+    has no compensator, or no waveform with enough whole steady cycles.
     """
 
     def __init__(

@@ -61,12 +61,7 @@ class Response:
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """A change of a correction and its effect.
-
-    Attributes:
-        correction_um: complex128[K + 1], change of the correction.
-        noise_um: float64[K + 1], standard deviation of the change of the error.
-    """
+    """A change of a correction, complex128[K + 1], its effect on the error, and its noise."""
 
     step_hz: float
     correction_um: C128

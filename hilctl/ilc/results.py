@@ -16,7 +16,6 @@ class IlcRow:
 
     Attributes:
         run: Number of the run; 0 is the first, before learning.
-        error_percent: Peak error of the average cycle, in percent of the peak-to-peak.
         floor_percent: Peak error that sensor noise alone would cause.
         delay_samples: Delay between correction and displacement, identified so far.
         natural_hz: Resonance identified so far; None without one.
@@ -39,7 +38,6 @@ class IlcResult:
     """Result of learning.
 
     Attributes:
-        rows: Every run, for each waveform.
         check: Verification run with the best correction, for each waveform; none if stopped.
         stop_signal: Number of the signal that stopped it, or 0.
         fault: Whether a run ended by a fault, or could not be run or evaluated.

@@ -46,12 +46,8 @@ def similarity(signal: F64) -> F64:
 def find_period(label: str, command: F64) -> tuple[float, int, int]:
     """Find the shortest period of a command at full amplitude, and its steady part.
 
-    Returns:
-        Period in samples, not necessarily an integer; first sample and end of the steady part,
-        which is at least two periods long.
-
-    Raises:
-        DataError: It does not repeat.
+    Return the period in samples, and start and end of the steady part, which is at least two
+    periods long. Raise DataError if it does not repeat.
     """
     alike = similarity(command)
     for top in _tops(alike)[:CANDIDATES]:

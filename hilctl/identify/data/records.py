@@ -24,7 +24,6 @@ class SteadyLoop:
         label: Name of the record, such as ``sine 6 A 10 Hz``.
         command: float64[M], command in the device's unit.
         displacement_um: float64[M].
-        frequency_hz: Cycles per second.
         sample_rate_hz: Sample rate of the run that it was averaged from; 0.0 if unknown.
     """
 
@@ -74,10 +73,8 @@ class History:
     before the first evaluated sample.
 
     Attributes:
-        label: Name of the record.
         command: float64[n], command in the device's unit.
         displacement_um: float64[n].
-        sample_rate_hz: Samples per second.
         ignore: Samples at the start that are not evaluated.
     """
 

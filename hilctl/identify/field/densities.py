@@ -31,7 +31,6 @@ class Grid:
     """Thresholds and cells of the operators, in command units.
 
     Attributes:
-        thresholds: float64[p], of the plays, rising from 0.
         lowest: Lower end of the first cell of the effective field.
         cells: Number of cells of a drag, and of splines of a play over the same range, >= 3.
         knots: Pieces of the curve.
@@ -79,7 +78,6 @@ class Weights:
         slopes: float64[lines, cells], um per command unit; for plays, weights of their splines.
         curve: From the output of the operators to displacement, without the offset.
         offset_um: Displacement at rest.
-        errors_um: float64[N], modelled less measured displacement of the rows.
         squares: Weighted sum of squares of the operators' errors and of the prior.
     """
 

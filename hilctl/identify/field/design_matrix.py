@@ -102,10 +102,9 @@ def swings(y: F64, turn: float, out: F64) -> None:
 
 @kernel("int64(float64[::1], int64[::1], int64[::1], int64[::1])", nogil=True)
 def needed_points(u: F64, rows: I64, points: I64, places: I64) -> int:
-    """Find the rows and turns of a path, which are all samples that operators need.
+    """Fill in samples that operators need: rows and turns; return their number.
 
-    Fill in the samples, int64[n], and the index of each row among them, int64[N]; return the number
-    of samples.
+    ``places`` is filled with the index of each row among the samples.
     """
     count = row = 0
     for k in range(u.size):
@@ -238,7 +237,6 @@ class Motion:
     Attributes:
         travel: float64[n], change of the command since the sample before, of its peak-to-peak.
         swing: float64[n], swing of the displacement around a sample, of the stroke.
-        judged: First evaluated sample.
     """
 
     travel: F64
@@ -269,11 +267,7 @@ class Motion:
 
 @dataclass(frozen=True, slots=True)
 class Rows:
-    """The rows of some records.
-
-    Attributes:
-        scale: float64[N], square root of the weight of each row; the mean square is 1.
-    """
+    """Rows of some records; the mean square of ``scale``, the root of each row's weight, is 1."""
 
     samples: tuple[I64, ...]
     scale: F64

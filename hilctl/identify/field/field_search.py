@@ -36,11 +36,7 @@ STAGES = len(NAMES)
 
 @dataclass(frozen=True, slots=True)
 class BareSignal:
-    """Effective fields and displacements of the records for some stages.
-
-    Attributes:
-        y: float64[N], displacement of the rows without structure and delay, in um.
-    """
+    """Fields of the records, and displacements of the rows without structure and delay."""
 
     fields: Sequence[F64]
     y: F64

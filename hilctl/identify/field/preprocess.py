@@ -84,7 +84,6 @@ class Run:
     """One record; callers must not change returned arrays, since they are cached.
 
     Attributes:
-        kept: int64[n], the samples that are kept.
         step_s: float64[n], time since the sample before.
         command: float64[n], at the end of each step.
         mean: float64[n], the command's mean over each step.
@@ -165,11 +164,7 @@ class Prepared:
 
 
 def histories_of(records: Sequence[Record], what: str) -> list[History]:
-    """Return the records if all are histories.
-
-    Raises:
-        DataError: One is a steady loop, which leaves the parameters undetermined.
-    """
+    """Return the records if all are histories; raise DataError otherwise."""
     loops = [record.label for record in records if isinstance(record, SteadyLoop)]
     if loops:
         raise DataError(

@@ -129,8 +129,7 @@ def stages_of(known: Physical, data: Prepared) -> Stages:
 def signals(run: Run, known: Physical, curve: Curve | None, span: float) -> tuple[F64, F64]:
     """Return the effective field and the displacement before structure: float64[n] each.
 
-    The excess loss is linear below a part of ``span``. Without a curve, the displacement itself
-    counts as the output of the operators.
+    The excess loss is linear below a part of ``span``. Without a curve, y itself is its output.
     """
     y = run.bare_um(known.delay_s, 2.0 * known.damping_ratio * known.radian_s, known.radian_s**2)
     m = y if curve is None else curve.operators_of(y)

@@ -37,10 +37,6 @@ def load_runs(paths: Sequence[Path], model: HysteresisModel) -> list[History]:
     The actuator responds to the output command, whatever the model of the run. A run that begins
     in the end state of another has the samples of that run before its own; they are not evaluated.
 
-    Args:
-        paths: Recordings.
-        model: The model, with a command in the unit of the recordings.
-
     Raises:
         InputError: A file is named twice, or there is none.
         DataError: A recording can't be read, has no known initial state, or another unit.
@@ -167,13 +163,6 @@ def refine_runs(
     progress: OnProgress = ignore_progress,
 ) -> Refinement:
     """Refine a model from runs, and evaluate it on held-out runs.
-
-    Args:
-        old: The model.
-        runs: Runs to refine it on.
-        validate: Runs to evaluate it on; if there are none, ``runs`` in turn.
-        source: Name of the model, for the provenance.
-        progress: Progress callback.
 
     Raises:
         InputError: The runs are implausible or too few, or no refined model has an inverse.

@@ -38,9 +38,8 @@ class RegularisationSplit:
 class SelectedRegularisation:
     """A regularisation, and its errors on held-out runs.
 
-    Attributes:
-        anchor: Weight of the old model on motions of its whole range, of the least.
-        own: Whether each run has an offset, creep and drift.
+    With ``own``, each run has an offset, creep and drift. ``anchor`` is the weight of the old model
+    on motions of its whole range, of the least.
     """
 
     strength: float

@@ -167,8 +167,7 @@ class ResidualFit:
     def moments(self, *, own: bool) -> list[NormalEquations]:
         """Return the normal equations of each run.
 
-        With ``own``, an offset, creep and drift per run are eliminated, so that they are not fitted
-        as hysteresis.
+        With ``own``, offset, creep and drift of a run are not fitted as hysteresis.
         """
         return [self._of(x, run, own=own) for x, run in zip(self.x_um, self._runs, strict=True)]
 

@@ -88,8 +88,7 @@ class PlaysProblem:
     def slopes_um(self, x: F64, scale: F64) -> F64:
         """Return the derivatives of the error with compensation by the weights.
 
-        Kaufman's form of variable projection, whose gradient is exact. Weights at a bound are
-        fixed.
+        Kaufman's form of variable projection has an exact gradient. Weights at a bound are fixed.
         """
         columns = self._columns(x)
         found, _ = self._solve(columns, scale)

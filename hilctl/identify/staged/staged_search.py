@@ -123,7 +123,6 @@ class StagedEnd:
     Attributes:
         slopes: float64[N, p], their derivatives by ``point.pack()``.
         free: bool[p], parameters that are neither fixed nor at a bound.
-        held: bool[p], parameters at a bound.
         scale: float64[N], square root of the weights at the end.
     """
 
@@ -170,11 +169,8 @@ def find_staged(job: FitJob, data: StagedFitData, layers: Layers) -> StagedEnd:
     """Minimise the sum of squared, weighted errors over all parameters.
 
     Starts are a grid of the nonlinear parameters, with linear solutions for all weights. The best
-    ones are optimised on few points, and the best of these on all points.
-
-    Raises:
-        DataError: A stage has dynamics, and a record is not a steady cycle, or sample rates
-            differ.
+    ones are optimised on few points, and the best of these on all points. Raise DataError if a
+    stage has dynamics, and a record is not steady or sample rates differ.
     """
     settings, progress = job.settings, job.progress
     scale = weight_roots(job.data.records, settings.weight_by)
