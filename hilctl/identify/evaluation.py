@@ -36,7 +36,7 @@ class LoopScore:
     peak_to_peak_um: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class Evaluation:
     """Errors of a model on all records.
 

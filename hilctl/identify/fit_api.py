@@ -264,7 +264,7 @@ class StartOutcome:
     evaluations: int
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class FoundModel:
     """A model without provenance, and how it was identified.
 

@@ -34,7 +34,8 @@ def parallel_map(function: Callable[[Task], Result], tasks: Iterable[Task], /) -
     For short parts of one fit that spend their time in ``nogil`` kernels and BLAS. A part must not
     call this function itself.
     """
-    if _worker.unwanted.is_set():
+    unwanted = getattr(_worker, "unwanted", None)
+    if unwanted is not None and unwanted.is_set():
         raise _UnwantedError
     return list(_threads().map(function, tasks))
 
@@ -43,14 +44,8 @@ class _UnwantedError(Exception):
     """Cancels a fit whose result is not wanted any more."""
 
 
-class _Worker(threading.local):
-    """Cancellation of the tasks of a thread of :func:`streams`."""
-
-    def __init__(self) -> None:
-        self.unwanted = threading.Event()
-
-
-_worker = _Worker()
+_worker = threading.local()
+"""Has an event ``unwanted`` in threads of :func:`streams`, which cancels their tasks."""
 
 
 @cache

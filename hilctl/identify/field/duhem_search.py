@@ -4,7 +4,6 @@ The inverse maps the measured displacement to the effective field. It has fading
 local error of the table does not affect all later samples.
 """
 
-from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -221,13 +220,10 @@ def _bounded_step(normal: F64, down: F64, damping: float, table: int, x: F64) ->
     """
     damped = normal.copy()
     damped[np.diag_indices_from(damped)] += damping
-    with suppress(LinAlgError):
-        return _step_within(damped, down, table, x)
-    return None
-
-
-def _step_within(damped: F64, down: F64, table: int, x: F64) -> F64:
-    step = np.asarray(cho_solve(cho_factor(damped), down))
+    try:
+        step = np.asarray(cho_solve(cho_factor(damped), down))
+    except LinAlgError:
+        return None
     if step.size == table:
         return step
     wanted = x + step[table:] * STEPS

@@ -170,7 +170,7 @@ def refine_runs(
     if reasons := tuple(data_reasons([*runs, *validate])):
         raise InputError("\n".join(reasons))
     parts, splits = parts_of(runs, validate)
-    choice, refined = Regularisation(old, parts, splits, old.input_unit).best(progress)
+    choice, refined = Regularisation(old, parts, splits).best(progress)
     progress(1.0, "done")
     named = refined.model_copy(update={"provenance": _provenance(old, runs, choice, source)})
     return Refinement(named, choice, tuple(_reasons(choice)))

@@ -6,12 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilctl.base.errors import DataError
-from hilctl.base.types import F64, CommandUnit
 from hilctl.identify.data.records import History
 from hilctl.identify.evaluation import judgement_of
 from hilctl.identify.fit_api import FitData, OnProgress
 from hilctl.identify.model_selection import HeldOut, folds_of
-from hilctl.identify.refine.residual_fit import NormalEquations, ResidualFit
+from hilctl.identify.refine.residual_fit import ResidualFit
 from hilctl.models.base import HysteresisModel
 from hilctl.models.refined import RefinedModel
 
@@ -135,9 +134,8 @@ class Regularisation:
         model: HysteresisModel,
         parts: Sequence[History],
         splits: Sequence[RegularisationSplit],
-        unit: CommandUnit,
     ) -> None:
-        self._parts, self._splits, self._unit = parts, splits, unit
+        self._parts, self._splits, self._unit = parts, splits, model.input_unit
         # All fitted parts; also the end of a single run that is cut in two.
         fitted = {i for split in splits for i in split.fitted}
         cut = parts[-1].label == parts[0].label
@@ -192,12 +190,10 @@ class Regularisation:
         sums = self._anchor.scaled(anchor)
         for i in fitted:
             sums += self._moments[own][i]
-        return self._remainder.model(self._solved(sums, strength))
-
-    def _solved(self, sums: NormalEquations, strength: float) -> F64:
-        firm = self._remainder.firm(strength, sums)
         # The penalty is on the residual operator; the anchor contains the old one.
-        return np.asarray(np.linalg.solve(sums.normal + firm, sums.right), dtype=np.float64)
+        firm = self._remainder.firm(strength, sums)
+        numbers = np.linalg.solve(sums.normal + firm, sums.right)
+        return self._remainder.model(np.asarray(numbers, dtype=np.float64))
 
     def _held_out(
         self, models: Mapping[RegularisationSplit, HysteresisModel], *, own: bool = False
