@@ -87,7 +87,7 @@ def held_out_errors(requests: Sequence[FitRequest], run: MapFunction) -> list[He
     One start of each search is enough.
     """
     tasks = [
-        _Task(number, fold, replace(
+        (number, fold, replace(
             request,
             records=fold.fitted,
             settings=request.settings.model_copy(update={"starts": 1}),
@@ -98,28 +98,20 @@ def held_out_errors(requests: Sequence[FitRequest], run: MapFunction) -> list[He
         for fold in folds_of(request.records)
     ]  # fmt: skip
     done: list[list[tuple[Split, F64, object | None]]] = [[] for _ in requests]
-    for task, found in zip(tasks, run(_fitted, tasks), strict=True):
+    for (number, fold, _), found in zip(tasks, run(_fitted, tasks), strict=True):
         if found is not None:
-            done[task.number].append((task.fold, *found))
+            done[number].append((fold, *found))
     return [_together(*each) for each in zip(requests, done, strict=True)]
 
 
-@dataclass(frozen=True, slots=True)
-class _Task:
-    """One fit of the request of that number, to the fitted records of a fold."""
-
-    number: int
-    fold: Split
-    request: FitRequest
-
-
-def _fitted(task: _Task) -> tuple[F64, object | None] | None:
+def _fitted(task: tuple[int, Split, FitRequest]) -> tuple[F64, object | None] | None:
     """Return the response to the held-out data, and where the search ended."""
+    _, fold, request = task
     try:
-        found = fit_kind(task.request)
+        found = fit_kind(request)
     except DataError:  # too few records for this kind of fit; all of them may be enough
         return None
-    judged = judge(found.model, task.fold.held_out, creep=task.request.settings.creep)
+    judged = judge(found.model, fold.held_out, creep=request.settings.creep)
     return np.concatenate(judged.modelled_um), found.end
 
 

@@ -37,6 +37,9 @@ TEXTS = [
 ]  # fmt: skip
 
 
+EVERY = [*SCALARS, *((text, text) for text in TEXTS)]
+
+
 def same(a: Any, b: Any) -> bool:
     """Return whether values have the same type and the same bits."""
     if isinstance(a, float) and isinstance(b, float):
@@ -44,7 +47,7 @@ def same(a: Any, b: Any) -> bool:
     return type(a) is type(b) and bool(a == b)
 
 
-@pytest.mark.parametrize(("text", "value"), [*SCALARS, *((text, text) for text in TEXTS)])
+@pytest.mark.parametrize(("text", "value"), EVERY)
 def test_scalars_are_those_of_the_core_schema(text, value):
     """Numbers, booleans and nothing as YAML 1.2 has them; quotes make any of them text."""
     data = Document("x.yaml", f"bare: {text}\nlist:\n- {text}\nquoted: '{text}'\n").data
@@ -110,7 +113,7 @@ READERS = [(read_experiment, EXPERIMENT), (read_model, MODEL), (read_profile, PR
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("read", "template"), READERS)
-@pytest.mark.parametrize(("text", "value"), [*SCALARS, *((text, text) for text in TEXTS)])
+@pytest.mark.parametrize(("text", "value"), EVERY)
 def test_every_reader_reads_the_same(read, template, text, value):
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     for place, filler, wanted in (("DESCRIPTION", "1.0", str), ("NUMBER", "words", float)):

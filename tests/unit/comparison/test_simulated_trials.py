@@ -36,10 +36,15 @@ SINE = Sine(
     kind="sine", unit="um", amplitude=10.0, offset=18.0, frequency_hz=10.0, duration_s=0.5,
     soft_start_s=0.1, soft_end_s=0.1,
 )  # fmt: skip
+CHIRP = Chirp(kind="chirp", unit="um", amplitude=1.0, start_hz=1.0, stop_hz=10.0, duration_s=1.0)
 
 
-def device(*waveforms, text=TEXT):
-    return TrialDevice(resolve(Document("stage.yaml", text), CONFIGS), waveforms)
+def device(*waveforms):
+    return TrialDevice(resolve(Document("stage.yaml", TEXT), CONFIGS), waveforms)
+
+
+def line(slope):
+    return PpiModel(input_unit="V", direct=slope, weights=(), thresholds=())
 
 
 def test_the_stage_follows_through_its_own_model():
@@ -50,21 +55,19 @@ def test_the_stage_follows_through_its_own_model():
 
 
 def test_a_straight_line_leaves_the_hysteresis():
-    straight = PpiModel(input_unit="V", direct=0.4, weights=(), thresholds=())
-    (trial,) = (rig := device(SINE)).run(straight, rig.references[0])
+    (trial,) = (rig := device(SINE)).run(line(0.4), rig.references[0])
     assert trial.peak_hysteresis_percent > 5.0
 
 
 def test_trials_start_from_rest():
     rig = device(SINE)
     first = rig.run(piezo_ppi(), rig.references[0])
-    rig.run(PpiModel(input_unit="V", direct=0.3, weights=(), thresholds=()), rig.references[0])
+    rig.run(line(0.3), rig.references[0])
     assert rig.run(piezo_ppi(), rig.references[0]) == first
 
 
 def test_the_limiter_is_between():
-    steep = PpiModel(input_unit="V", direct=0.1, weights=(), thresholds=())
-    (trial,) = (rig := device(SINE)).run(steep, rig.references[0])
+    (trial,) = (rig := device(SINE)).run(line(0.1), rig.references[0])
     assert trial.limited_samples > 100
 
 
@@ -75,11 +78,8 @@ def test_a_real_device_is_refused():
 
 
 def test_what_does_not_repeat_is_refused():
-    chirp = Chirp(
-        kind="chirp", unit="um", amplitude=1.0, start_hz=1.0, stop_hz=10.0, duration_s=1.0
-    )
     with pytest.raises(InputError, match="periodic"):
-        device(chirp)
+        device(CHIRP)
 
 
 def test_waveforms_take_the_frequencies_asked_for():
@@ -97,11 +97,8 @@ def test_waveforms_take_the_frequencies_asked_for():
 
 
 def test_frequencies_need_a_shape_that_has_one():
-    chirp = Chirp(
-        kind="chirp", unit="um", amplitude=1.0, start_hz=1.0, stop_hz=10.0, duration_s=1.0
-    )
     with pytest.raises(InputError, match="--frequencies"):
-        waveforms_of(chirp, [10.0])
+        waveforms_of(CHIRP, [10.0])
     for wrong in (0.0, -1.0, float("nan"), float("inf")):
         with pytest.raises(InputError, match="must be > 0"):
             waveforms_of(SINE, [wrong])

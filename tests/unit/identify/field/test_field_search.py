@@ -31,13 +31,15 @@ from hilctl.models.linear_stages import FirstMode
 from hilctl.models.staged import FieldLag, StagedModel
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 from tests.staged import truth
+from tests.unit.identify.field.test_duhem_tables import RATE_HZ as FAST_HZ
+from tests.unit.identify.field.test_duhem_tables import command
 
 RATE_HZ = 2000.0
 SIZE = Size(4, 1, 6, 5)
 LEAST = 0.05
 
 
-def made(command: F64) -> F64:
+def made(v: F64) -> F64:
     """Return what the known model does: float64[n], in um."""
     hysteresis = FieldModel(
         thresholds=(0.0, 1.0),
@@ -49,15 +51,15 @@ def made(command: F64) -> F64:
         losses=FieldLosses(field_s=5e-4),
     )
     structure = FirstMode(natural_hz=400.0, damping_ratio=0.2)
-    return StagedModel.around(hysteresis, structure=structure).forward(RATE_HZ).process(command)
+    return StagedModel.around(hysteresis, structure=structure).forward(RATE_HZ).process(v)
 
 
 def data(unit: float = 1.0, um: float = 1.0, ignore: int = 50) -> Prepared:
     """Return a history of the known model in other units of the command and the displacement."""
     t, rng = np.arange(700) / RATE_HZ, np.random.default_rng(1)
     wave = sum(np.sin(2.0 * np.pi * f * t + rng.uniform(0, 6)) for f in (7.0, 17.0, 31.0))
-    command = np.ascontiguousarray(6.0 * np.minimum(t / 0.02, 1.0) * wave / np.abs(wave).max())
-    record = History("random", unit * command, um * made(command), RATE_HZ, ignore)
+    v = np.ascontiguousarray(6.0 * np.minimum(t / 0.02, 1.0) * wave / np.abs(wave).max())
+    record = History("random", unit * v, um * made(v), RATE_HZ, ignore)
     return Prepared([record])
 
 
@@ -174,10 +176,15 @@ def displacement_um() -> F64:
     return np.asarray(table([path()], KEPT, true) @ np.repeat([3.0, 2.0], 5))
 
 
+def followed(y: F64) -> tuple[F64, Grid]:
+    """Return stages and operators at the minimum, for a path that no stage changes."""
+    bare = BareSignal([path()], y, np.ones(y.size))
+    return JointRefinement(lambda _: bare, KEPT, GRID, LEAST).follow(row(Stages()))
+
+
 def test_a_threshold_goes_to_where_the_rods_yield():
     y = displacement_um()
-    polish = JointRefinement(lambda _: BareSignal([path()], y, np.ones(y.size)), KEPT, GRID, LEAST)
-    x, grid = polish.follow(row(Stages()))
+    x, grid = followed(y)
     assert grid.thresholds[1] == pytest.approx(TRUE_R, abs=0.02)
     assert x == pytest.approx(row(Stages()))  # nothing follows from them here, so they stay
     tables = [(table([path()], KEPT, each), y, each) for each in (GRID, grid)]
@@ -188,8 +195,7 @@ def test_a_threshold_goes_to_where_the_rods_yield():
 
 def test_thresholds_stay_in_order():
     y = np.asarray(table([path()], KEPT, GRID)[:, 5:10].sum(axis=1) + 4.0 * np.sign(path()))
-    polish = JointRefinement(lambda _: BareSignal([path()], y, np.ones(y.size)), KEPT, GRID, LEAST)
-    _, grid = polish.follow(row(Stages()))
+    _, grid = followed(y)
     assert grid.thresholds[0] == 0.0
     assert (np.abs(grid.thresholds - GRID.thresholds) <= ROOM * 0.7 + 1e-9).all()
 
@@ -232,27 +238,17 @@ def test_slopes_by_thresholds_are_differences():
         assert np.mean(np.abs(found[:, i - 1] - rise)) < 0.05 * np.mean(np.abs(rise))
 
 
-FAST_HZ = 20_000.0
-
-
 def history(seed: int, noise_um: float) -> History:
     """Return what a staged model of plays and deadbands does with a random command."""
-    rng = np.random.default_rng(seed)
-    t = np.arange(round(0.6 * FAST_HZ)) / FAST_HZ
-    sines = [np.sin(2 * np.pi * f * t + rng.uniform(0, 6)) for f in rng.uniform(4.0, 160.0, 12)]
-    wave = np.sum(sines, axis=0)
-    command: F64 = np.ascontiguousarray(6.0 * np.minimum(t / 0.02, 1.0) * wave / np.abs(wave).max())
-    y = model().forward(FAST_HZ).process(command)
-    return History("random", command, y + noise_um * rng.standard_normal(y.size), FAST_HZ)
+    v = np.ascontiguousarray(1.2 * command(seed)[: round(0.6 * FAST_HZ)])
+    noise = noise_um * np.random.default_rng(seed).standard_normal(v.size)
+    return History("random", v, model().forward(FAST_HZ).process(v) + noise, FAST_HZ)
 
 
 def model() -> StagedModel:
     """Return what the data come from."""
-    inner = truth(
-        lag=FieldLag(tau_s=2e-4), structure=FirstMode(natural_hz=1500.0, damping_ratio=0.2)
-    )
-    assert isinstance(inner, StagedModel)
-    return inner
+    structure = FirstMode(natural_hz=1500.0, damping_ratio=0.2)
+    return truth(lag=FieldLag(tau_s=2e-4), structure=structure)
 
 
 @pytest.mark.slow
@@ -272,8 +268,8 @@ def test_a_structure_that_a_slow_record_leaves_open_does_not_bend_the_hysteresis
     t = np.arange(25_000) / 50e3
     phases = np.random.default_rng(1).uniform(0.0, 6.0, 8)
     wave = sum(np.sin(37.0 * k * t + p) for k, p in enumerate(phases, 1))
-    command = np.ascontiguousarray(6.0 * np.clip(t / 0.02, 0.0, 1.0) * wave / np.ptp(wave))
-    y, current_a = np.empty_like(command), np.empty_like(command)
-    TerfenolActuator(TerfenolParameters(), 50e3, seed=3).step(command, y, current_a)
-    found = fit_model(FitRequest([History("slow", command, y, 50e3)], FitSettings(kind="field")))
+    v = np.ascontiguousarray(6.0 * np.clip(t / 0.02, 0.0, 1.0) * wave / np.ptp(wave))
+    y, current_a = np.empty_like(v), np.empty_like(v)
+    TerfenolActuator(TerfenolParameters(), 50e3, seed=3).step(v, y, current_a)
+    found = fit_model(FitRequest([History("slow", v, y, 50e3)], FitSettings(kind="field")))
     assert found.rms_percent < 0.6
