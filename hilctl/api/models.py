@@ -138,9 +138,10 @@ def compare(
     )
     comparison = library.compare(request, time.perf_counter, on_progress)
     if html is not None:
-        from hilctl.comparison.comparison_page import write_comparison  # it imports matplotlib
+        from hilctl.analysis.html import write_page  # it imports matplotlib
+        from hilctl.comparison.comparison_page import comparison_page
 
-        write_comparison(comparison, Path(html))
+        write_page(comparison_page(comparison), Path(html))
     if save is not None:
         created = datetime.now(UTC).isoformat(timespec="seconds")
         library.save_models(comparison, Path(save), created=created, overwrite=overwrite)

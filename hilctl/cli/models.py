@@ -15,7 +15,7 @@ from hilctl.base.files import check_writable
 from hilctl.cli.console import listing, print_rich, progress_bar, table
 from hilctl.cli.options import AsJson, Overwrite, Settings
 from hilctl.cli.output import print_json
-from hilctl.comparison.compare import Comparison, headings, notes, table_rows, titles
+from hilctl.comparison.compare import Comparison, headings, notes, table_rows
 from hilctl.identify.model_selection import OrderScore
 from hilctl.identify.pipeline import Identification
 from hilctl.identify.refine.refinement import Refinement
@@ -146,9 +146,10 @@ def identify(
             on_progress=progress,
         )
     if html is not None:
-        from hilctl.identify.model_page import write_identification  # it imports matplotlib
+        from hilctl.analysis.html import write_page  # it imports matplotlib
+        from hilctl.identify.model_page import identification_page
 
-        write_identification(result, html)
+        write_page(identification_page(result), html)
     refused = result.verdict.grade == "not a model"
     if as_json:
         written = str(output) if output and not refused else None
@@ -186,9 +187,10 @@ def refine(
             model, runs, output, validate=validate or [], overwrite=overwrite, on_progress=progress
         )
     if html is not None:
-        from hilctl.identify.model_page import write_refinement  # it imports matplotlib
+        from hilctl.analysis.html import write_page  # it imports matplotlib
+        from hilctl.identify.model_page import refinement_page
 
-        write_refinement(result, html)
+        write_page(refinement_page(result), html)
     if as_json:
         print_json({"output": str(output) if output and result.better else None,
                     **result.to_mapping()})  # fmt: skip
@@ -303,4 +305,5 @@ def render_comparison(comparison: Comparison) -> RenderableType:
     """Return the tables of a comparison."""
     title = f"models on {', '.join(comparison.sources)}"
     errors = table(title, headings(comparison), table_rows(comparison))
-    return Group(errors, listing("", titles(comparison.rows)), *notes(comparison))
+    titles = [(row.name, row.title) for row in comparison.rows]
+    return Group(errors, listing("", titles), *notes(comparison))

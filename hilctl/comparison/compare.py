@@ -59,14 +59,12 @@ class ComparisonRequest:
     """Request of a comparison.
 
     Attributes:
-        recordings: Recordings with the loops.
         models: Kinds of model, or model files; empty for :data:`COMPARED`.
         experiment: Experiment with device, limits and waveform of the trials; None for device and
             limits of the first recording and a sine over nearly the complete stroke.
         settings: ``key=value`` texts over the experiment.
         frequencies_hz: Frequencies of the trials; None for 10, 100 and 200 Hz with a sine or a
             triangle, and for the unchanged waveform otherwise.
-        points: Points per loop.
     """
 
     recordings: Sequence[Path]
@@ -82,12 +80,8 @@ class ComparedModel:
     """One model of the comparison.
 
     Attributes:
-        name: Name of the kind or of the model file.
-        title: Description.
-        model: The model.
         numbers: Number of identified parameters; None for a model file.
         identify_s: Duration of the identification; None for a model file.
-        error: Its evaluation on the loops.
         inverse_ns: Time per sample of its inverse.
         trials: Trials of its inverse; none without a simulated device.
     """
@@ -114,10 +108,7 @@ class Comparison:
     """A comparison and its data.
 
     Attributes:
-        sources: Names of the recordings.
         device: Device of the trials; empty without trials.
-        loops: The measured loops.
-        rows: One row per model, in the requested order.
     """
 
     sources: tuple[str, ...]
@@ -155,16 +146,7 @@ def _row_mapping(loops: Sequence[SteadyLoop], row: ComparedModel) -> dict[str, A
 def compare(
     request: ComparisonRequest, clock: Callable[[], float], progress: OnProgress
 ) -> Comparison:
-    """Identify each model on the loops, evaluate it, and try its inverse on the device.
-
-    Args:
-        request: The request.
-        clock: Time in s.
-        progress: Called with the progress and the current step.
-
-    Raises:
-        InputError: A part of the request is not usable.
-    """
+    """Identify each model on the loops, evaluate it, and try its inverse on the device."""
     names = tuple(request.models) or tuple(COMPARED)
     for name in names:
         if not name.endswith(_FILES):
@@ -245,12 +227,12 @@ def _device(request: ComparisonRequest, recording: Recording, data: FitData) -> 
         waveform = loaded.config.waveform
         if frequencies is None and waveform.kind in ("sine", "triangle"):
             frequencies = FREQUENCIES_HZ
-        return TrialDevice(loaded, waveforms_of(waveform, frequencies), loaded.folder)
+        return TrialDevice(loaded, waveforms_of(waveform, frequencies))
     recorded = _recorded(recording, request.settings)
     if recorded is None:
         return None
     waveforms = waveforms_of(full_stroke(data.loops), frequencies or FREQUENCIES_HZ)
-    return TrialDevice(recorded, waveforms, recorded.folder)
+    return TrialDevice(recorded, waveforms)
 
 
 def _recorded(recording: Recording, settings: Sequence[str]) -> LoadedExperiment | None:
@@ -266,16 +248,9 @@ def _recorded(recording: Recording, settings: Sequence[str]) -> LoadedExperiment
 def check_free(
     names: Sequence[str], folder: Path, *, overwrite: bool, inputs: Sequence[Path] = ()
 ) -> None:
-    """Reject a folder that already contains a file of one of these models.
+    """Raise InputError if a folder contains a file of one of these models, unless ``overwrite``.
 
-    Args:
-        names: Names of the models.
-        folder: The folder.
-        overwrite: Whether their files may be replaced.
-        inputs: Input files, which are never replaced.
-
-    Raises:
-        InputError: A file exists and may not be replaced.
+    Input files are never replaced.
     """
     paths = [folder / f"{name}.yaml" for name in names]
     for path in paths:
@@ -288,19 +263,11 @@ def check_free(
 def save_models(
     comparison: Comparison, folder: Path, *, created: str, overwrite: bool
 ) -> tuple[Path, ...]:
-    """Write each identified model to ``folder/NAME.yaml``.
+    """Write each identified model to ``folder/NAME.yaml``, and return the files.
 
-    Args:
-        comparison: The models; those from files are skipped.
-        folder: The folder; created if missing.
-        created: Date and time in ISO 8601, UTC, for the provenance.
-        overwrite: Whether a file of that name may be replaced.
-
-    Returns:
-        The files.
-
-    Raises:
-        InputError: A file exists, and nothing is written; or the folder is not writable.
+    Models from files are skipped; ``created`` is an ISO 8601 date and time in UTC, for the
+    provenance. Raise InputError if a file exists, and write nothing, or if the folder is not
+    writable.
     """
     rows = [row for row in comparison.rows if row.identify_s is not None]
     check_free([row.name for row in rows], folder, overwrite=overwrite)
@@ -320,15 +287,9 @@ def save_models(
 
 def headings(comparison: Comparison) -> list[str]:
     """Return the names of the columns."""
-    return ["model", "par.", "fit s", "ns", "peak %", "rms %", *_trial_names(comparison)]
-
-
-def _trial_names(comparison: Comparison) -> list[str]:
-    return [f"{trial.frequency_hz:.4g} Hz" for trial in _most_trials(comparison)]
-
-
-def _most_trials(comparison: Comparison) -> Sequence[InverseTrial]:
-    return max((row.trials for row in comparison.rows), key=len, default=())
+    trials = max((row.trials for row in comparison.rows), key=len, default=())
+    names = [f"{trial.frequency_hz:.4g} Hz" for trial in trials]
+    return ["model", "par.", "fit s", "ns", "peak %", "rms %", *names]
 
 
 def table_rows(comparison: Comparison) -> Iterator[list[str]]:
@@ -365,8 +326,3 @@ def notes(comparison: Comparison) -> list[str]:
     )
     limited = any(trial.limited_samples for row in comparison.rows for trial in row.trials)
     return [*found, "*: the limiter changed evaluated commands"] if limited else found
-
-
-def titles(rows: Sequence[ComparedModel]) -> list[tuple[str, str]]:
-    """Return the name and the description of each model."""
-    return [(row.name, row.title) for row in rows]

@@ -2,17 +2,16 @@
 
 import html
 from collections.abc import Sequence
-from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
-from hilctl.analysis.html import document, grid, wide_figure, write_page
+from hilctl.analysis.html import document, grid, wide_figure
 from hilctl.analysis.plot_style import DISPLACEMENT, QUIET, REFERENCE, STYLE
 from hilctl.base.types import F64
-from hilctl.comparison.compare import ComparedModel, Comparison, headings, notes, table_rows, titles
+from hilctl.comparison.compare import ComparedModel, Comparison, headings, notes, table_rows
 from hilctl.identify.data.records import SteadyLoop
 
 _COLUMNS = 6
@@ -23,15 +22,6 @@ _COLOURS = (
 _STYLES = ("-", "--", ":")
 
 
-def write_comparison(comparison: Comparison, path: Path) -> None:
-    """Write the page, replacing a file of that name.
-
-    Raises:
-        InputError: It cannot be written.
-    """
-    write_page(comparison_page(comparison), path)
-
-
 def comparison_page(comparison: Comparison) -> str:
     """Return the page as HTML."""
     body = [
@@ -39,7 +29,7 @@ def comparison_page(comparison: Comparison) -> str:
         f'<p class="file">{html.escape(", ".join(comparison.sources))}</p>',
         grid(headings(comparison), table_rows(comparison), "numbers"),
         *(f"<p>{html.escape(note)}</p>" for note in notes(comparison)),
-        grid(("model", "description"), titles(comparison.rows)),
+        grid(("model", "description"), [(row.name, row.title) for row in comparison.rows]),
         wide_figure("Errors against frequency, and loops", comparison_figure(comparison)),
     ]
     return document("Comparison of models", body)

@@ -6,7 +6,6 @@ A trial is an unpaced run without recording, interlocks and feedback, so only fo
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -38,15 +37,9 @@ _LIMITED = int(Flag.RANGE_LIMITED | Flag.SLEW_LIMITED | Flag.INVALID)
 
 @dataclass(frozen=True, slots=True)
 class InverseTrial:
-    """Metrics of a trial on the mean steady cycle.
+    """Metrics of a trial on the mean steady cycle, as in reports.
 
-    Attributes:
-        label: The waveform.
-        frequency_hz: Its frequency.
-        peak_hysteresis_percent: See :class:`hilctl.analysis.run_metrics.RunMetrics`.
-        peak_error_percent: The same.
-        rms_error_percent: The same.
-        limited_samples: Evaluated samples whose command the limiter changed.
+    ``limited_samples`` counts evaluated samples whose command the limiter changed.
     """
 
     label: str
@@ -61,10 +54,6 @@ def waveforms_of(
     waveform: AnyWaveform, frequencies_hz: Sequence[float] | None
 ) -> list[AnyWaveform]:
     """Return a waveform at each frequency, with the necessary duration.
-
-    Args:
-        waveform: A sine or a triangle, or any other without frequencies.
-        frequencies_hz: The frequencies; None for the unchanged waveform.
 
     Raises:
         InputError: Another waveform with frequencies, or a frequency is not > 0.
@@ -101,18 +90,11 @@ def full_stroke(loops: Sequence[SteadyLoop]) -> Sine:
 class TrialDevice:
     """A simulated device with the limits of its experiment, for trials.
 
-    Args:
-        loaded: Device, limits, sample rate and block.
-        waveforms: Waveforms of the trials.
-        folder: Base of relative file names.
-
     Raises:
         InputError: The device is not simulated, or a waveform is invalid or not periodic.
     """
 
-    def __init__(
-        self, loaded: LoadedExperiment, waveforms: Sequence[AnyWaveform], folder: Path
-    ) -> None:
+    def __init__(self, loaded: LoadedExperiment, waveforms: Sequence[AnyWaveform]) -> None:
         info = loaded.device.info
         if not info.simulated:
             raise InputError(
@@ -120,7 +102,7 @@ class TrialDevice:
             )
         self._loaded = loaded
         rate_hz = loaded.config.sample_rate_hz
-        self.references = tuple(build(waveform, rate_hz, folder) for waveform in waveforms)
+        self.references = tuple(build(waveform, rate_hz, loaded.folder) for waveform in waveforms)
         for reference in self.references:
             if reference.unit != "um" or reference.segments[0].period <= 0.0:
                 label = reference.segments[0].label
@@ -131,20 +113,10 @@ class TrialDevice:
         """Description of the device."""
         return self._loaded.device.info.description
 
-    @property
-    def sample_rate_hz(self) -> float:
-        """Samples per second."""
-        return self._loaded.config.sample_rate_hz
-
     def run(self, model: HysteresisModel, reference: Reference) -> list[InverseTrial]:
-        """Run the inverse of a model from rest, and evaluate each segment.
-
-        Raises:
-            ModelError: The model has no inverse.
-            DeviceError: The device rejects a command.
-        """
+        """Run the inverse of a model from rest, and evaluate each segment."""
         loaded = replace(self._loaded, model=model)
-        begun = begin(model, self.sample_rate_hz, reference.values)
+        begun = begin(model, reference.sample_rate_hz, reference.values)
         values = (reference.values, begun.input_um[:], begun.state)
         plan = replace(
             assemble(loaded, *values, paced=False),
@@ -191,12 +163,6 @@ def inverse_ns(
 
     The reference is a sine with the loop's stroke and frequency; the shortest of several rounds is
     free of other load.
-
-    Args:
-        model: Any model.
-        loop: Loop with stroke and frequency.
-        sample_rate_hz: Samples per second.
-        clock: Time in s.
     """
     low, high = float(loop.displacement_um.min()), float(loop.displacement_um.max())
     angle = 2.0 * np.pi * loop.frequency_hz / sample_rate_hz * np.arange(TIMED_SAMPLES)

@@ -31,12 +31,7 @@ LEAST = 3e-4  # of the stroke: minimum motion during rests
 
 @dataclass(frozen=True, slots=True)
 class _Rest:
-    """An interval of a history in which the command is constant.
-
-    Attributes:
-        of: Number of the history.
-        edges: int64[m + 1], edges of its averaged parts, in samples.
-    """
+    """An interval of constant command in a history, and edges of its averaged parts."""
 
     of: int
     edges: I64

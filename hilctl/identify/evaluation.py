@@ -24,11 +24,9 @@ class LoopScore:
     """Errors of a model on one record.
 
     Attributes:
-        label: Label of the record.
         peak_percent: Largest displacement error, in percent of the record's own peak-to-peak.
         rms_percent: Root mean square displacement error, in percent of the same.
         area_error_percent: Error of the loop area in percent; None for a history.
-        peak_to_peak_um: The record's peak-to-peak displacement.
     """
 
     label: str
@@ -38,12 +36,11 @@ class LoopScore:
     peak_to_peak_um: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class Evaluation:
     """Errors of a model on all records.
 
     Attributes:
-        errors: Errors on each record.
         modelled_um: Modelled displacement of the evaluated samples of each record, float64[n].
         peak_percent: Largest displacement error in percent of the largest peak-to-peak displacement
             of a record, as publications report it.
@@ -71,20 +68,11 @@ def judge(model: HysteresisModel, data: Records | FitData, *, creep: bool = Fals
     """Return the errors of a model on records.
 
     Loops are compared in their periodic steady state, at the rate of :meth:`SteadyLoop.rate`.
-
-    Args:
-        model: The model.
-        data: The records, prepared or not.
-        creep: Whether to remove an offset per record, and creep per history, from the errors.
-
-    Raises:
-        DataError: There are no records.
     """
     data = data if isinstance(data, FitData) else FitData(data)
     responses_um = _modelled_um(model, data)
     if creep:
-        own = np.linalg.lstsq(data.creep, data.target_um - responses_um, rcond=None)[0]
-        responses_um = responses_um + data.creep @ own
+        responses_um = data.with_creep(responses_um)
     return judgement_of(data, responses_um)
 
 
@@ -167,11 +155,7 @@ def _loop_error(record: Record, response_um: F64, target_um: F64) -> LoopScore:
 
 
 def weight_roots(data: Records, weight_by: Literal["equal", "hysteresis"]) -> F64:
-    """Return the square root of the weight of each evaluated sample: float64[N].
-
-    Raises:
-        DataError: See :func:`hysteresis_weights`.
-    """
+    """Return the square root of the weight of each evaluated sample: float64[N]."""
     sizes = [
         record.command.size - (0 if isinstance(record, SteadyLoop) else record.ignore)
         for record in data
@@ -181,16 +165,10 @@ def weight_roots(data: Records, weight_by: Literal["equal", "hysteresis"]) -> F6
 
 
 def hysteresis_weights(data: Records) -> F64:
-    """Return the published weight A of each record's squared errors (5.14).
+    """Return the published weight A of each record's squared errors (5.14): float64[records].
 
     The weight is the peak hysteresis of a loop over that of the slowest loop (of the largest one,
-    if several have the lowest frequency).
-
-    Returns:
-        float64[records].
-
-    Raises:
-        DataError: A record is not a loop.
+    if several have the lowest frequency). Raise DataError if a record is not a loop.
     """
     loops = [record for record in data if isinstance(record, SteadyLoop)]
     if len(loops) < len(data):

@@ -9,7 +9,7 @@ import numpy as np
 
 from hilctl.base.errors import DataError
 from hilctl.base.types import F64, CommandUnit
-from hilctl.identify.data.records import History, Record, Records, SteadyLoop, thinned
+from hilctl.identify.data.records import History, Record, Records, SteadyLoop
 from hilctl.identify.parallel import MapFunction, serial_map
 from hilctl.identify.settings import FitSettings
 from hilctl.identify.staged.fit_data import GAMMA_S, PARAMETERS, SPACING, plays_and_slopes
@@ -19,8 +19,6 @@ from hilctl.models.integrated import ButterflyModel, IntegratedModel
 from hilctl.models.linear_stages import FurtherMode
 from hilctl.models.plays import PlayModel
 
-# Models with a lag need every sample.
-_EVERY_SAMPLE = {"staged", "field", "generalised_duhem"}
 PERIODS = 3
 """Simulated periods of a loop; the last is evaluated, since differential models settle slowly."""
 
@@ -39,37 +37,20 @@ class _Run:
     loop: bool
 
 
-def search_data(records: Records, kind: str, unit: CommandUnit) -> "FitData":
-    """Return the data of a search; long records are thinned if the kind of model permits it.
-
-    Raises:
-        DataError: There are no records.
-    """
-    return FitData(records if kind in _EVERY_SAMPLE else thinned(records), unit)
-
-
 class FitData:
     """Commands, rates and evaluated displacements of all records.
 
     Attributes:
-        records: The records.
-        unit: Unit of the command.
         target_um: float64[N], measured displacement of all evaluated samples.
         places: For each record, its part of the N samples.
         reach: Half the largest peak-to-peak command; plays with a larger threshold do not move in a
             steady cycle.
         speed: Largest |rate| of the command, in command units per second.
         stroke_um: Largest peak-to-peak displacement of a record.
-        input_range: Lowest and highest command.
         output_range_um: Lowest and highest evaluated displacement.
     """
 
     def __init__(self, records: Records, unit: CommandUnit = "A") -> None:
-        """Prepare records.
-
-        Raises:
-            DataError: There are no records.
-        """
         if not records:
             raise DataError("no records to fit: the list of loops and histories is empty")
         self.records = tuple(records)
@@ -112,6 +93,11 @@ class FitData:
             column[place] = part
             columns.append(column)
         return np.hstack(columns)
+
+    def with_creep(self, responses_um: F64) -> F64:
+        """Return responses with the offset and creep of each record that fit best: float64[N]."""
+        own = np.linalg.lstsq(self.creep, self.target_um - responses_um, rcond=None)[0]
+        return responses_um + self.creep @ own
 
     @property
     def loops(self) -> tuple[SteadyLoop, ...]:
@@ -163,9 +149,8 @@ class FitData:
     ) -> tuple[F64, F64, F64]:
         """Run plays of thresholds ``spacing numbers_i``, with derivatives.
 
-        Returns:
-            The command float64[N], each play's output float64[N, n], and the derivatives of their
-            weighted sum by spacing and growth, float64[N, 2].
+        Return the command float64[N], each play's output float64[N, n], and the derivatives of
+        their weighted sum by spacing and growth, float64[N, 2].
         """
         size = self.target_um.size
         command, outputs = np.empty(size), np.empty((size, numbers.size))
@@ -194,23 +179,12 @@ class FitData:
         return x + model.output_offset_um
 
     def stack(self, run: Callable[[F64], F64]) -> F64:
-        """Run a rate-independent function on each command, and stack the evaluated samples.
-
-        Args:
-            run: From a command, float64[n], to float64[n] or float64[n, m].
-
-        Returns:
-            float64[N] or float64[N, m].
-        """
+        """Stack a rate-independent function of each command, float64[N] or float64[N, m]."""
         parts = []
         for record, place in zip(self.records, self.places, strict=True):
             periods = PERIODS if isinstance(record, SteadyLoop) else 1
             parts.append(run(np.tile(record.command, periods))[place.start - place.stop :])
         return np.concatenate(parts)
-
-    def swing(self, columns: F64) -> F64:
-        """Return the largest peak-to-peak in a record of each column, float64[N, m]: float64[m]."""
-        return np.asarray(np.max([np.ptp(columns[place], axis=0) for place in self.places], axis=0))
 
     def common(self, offset_um: float) -> dict[str, Any]:
         """Return the fields that every model has, by name."""
@@ -238,12 +212,7 @@ class FitRequest:
     """Records to fit, and settings.
 
     Attributes:
-        records: Loops and histories, at least one.
-        settings: Kind of model and all other settings.
-        unit: Unit of the command.
         source: Names of recordings or files, for the provenance.
-        run: Runs independent fits.
-        progress: Progress callback.
         start: Start of the search, see :class:`FitJob`.
         modes: Known further modes of the structure, for kinds that have them.
     """
@@ -262,13 +231,8 @@ class FitRequest:
 class FitJob:
     """Prepared data of one fit, and settings.
 
-    Attributes:
-        data: The data.
-        settings: The settings; only those of the kind count.
-        run: Runs independent parts of the fit.
-        progress: Progress callback.
-        start: ``end`` of a fit of this kind to other data, or of another size, to continue from;
-            ignored if it is of another kind.
+    The fit continues from ``start``, the ``end`` of a fit of this kind to other data or of another
+    size.
     """
 
     data: FitData
@@ -291,7 +255,6 @@ class StartOutcome:
         start: ``data`` for rough values from the data, ``random N`` for random values,
             ``weights N`` for the solution of a linear problem.
         first_rms_percent: Weighted error at the start, in percent of the largest peak-to-peak.
-        rms_percent: The same at the end.
         evaluations: Evaluations of the criterion, without those for derivatives.
     """
 
@@ -301,18 +264,15 @@ class StartOutcome:
     evaluations: int
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class FoundModel:
     """A model without provenance, and how it was identified.
 
     Attributes:
-        model: The model.
         numbers: Number of fitted numbers.
         parameters: Parameters under their published names, in command units, um and s; empty for
             models that are only a table of weights.
-        starts: Starts of the search.
         standard_errors: Standard errors of the parameters, if known.
-        at_bound: Parameters at a bound.
         end: End of the search, from which another fit can start.
     """
 

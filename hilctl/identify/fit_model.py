@@ -1,7 +1,6 @@
 """Fit of a model to records: the model, its errors, its provenance and its identified range."""
 
 import time
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -10,23 +9,17 @@ import scipy
 from scipy.fft import rfft, rfftfreq
 
 import hilctl
-from hilctl.base.types import F64
 from hilctl.experiment.model_validity import ALL, spectrum
 from hilctl.identify.creep_fit import creep_of, without_creep
-from hilctl.identify.data.records import History, Record, SteadyLoop, turning_points
+from hilctl.identify.data.records import History, Record, SteadyLoop, thinned, turning_points
 from hilctl.identify.evaluation import Evaluation, judge
-from hilctl.identify.fit_api import (
-    FitData,
-    FitJob,
-    FitRequest,
-    FoundModel,
-    StartOutcome,
-    search_data,
-)
+from hilctl.identify.fit_api import FitData, FitJob, FitRequest, FoundModel
 from hilctl.identify.registry import CATALOGUE
 from hilctl.identify.resonances import without_modes
-from hilctl.identify.settings import FitSettings
-from hilctl.models.base import HysteresisModel, IdentifiedRange, Provenance
+from hilctl.models.base import IdentifiedRange, Provenance
+
+EVERY_SAMPLE = {"staged", "field", "generalised_duhem"}
+"""Kinds with a lag: for the others, long records are thinned."""
 
 
 def fit_kind(request: FitRequest) -> FoundModel:
@@ -43,13 +36,8 @@ def fit_kind(request: FitRequest) -> FoundModel:
     creep = creep_of(records) if settings.looks_for("creep_stage") else None
     bare = records if creep is None else without_creep(records, creep)
     bare = without_modes(bare, modes) if modes else bare
-    job = FitJob(
-        search_data(bare, settings.kind, unit),
-        settings,
-        request.run,
-        request.progress,
-        request.start,
-    )
+    data = FitData(bare if settings.kind in EVERY_SAMPLE else thinned(bare), unit)
+    job = FitJob(data, settings, request.run, request.progress, request.start)
     found = CATALOGUE[settings.kind].fit(job)
     known, parameters, numbers = dict[str, Any](), dict(found.parameters), found.numbers
     if creep is not None:
@@ -106,43 +94,22 @@ def smallest_um(record: Record) -> float:
 def frequencies_hz(record: Record) -> tuple[float, float]:
     """Return the lowest and the highest frequency of a record's command."""
     command = record.command
-    if isinstance(record, SteadyLoop):
-        return record.frequency_hz, record.frequency_hz * _below(rfft(command - command.mean()))
-    rate_hz = record.sample_rate_hz
     power = np.cumsum(np.abs(rfft(command - command.mean())) ** 2)
+    if isinstance(record, SteadyLoop):
+        harmonics = max(int(np.searchsorted(power, ALL * power[-1])), 1)
+        return record.frequency_hz, record.frequency_hz * harmonics
     first = int(np.searchsorted(power, LEAST * power[-1]))
-    lowest = float(rfftfreq(command.size, 1.0 / rate_hz)[max(first, 1)])
-    return lowest, max(lowest, spectrum(command, rate_hz).highest_hz)
-
-
-def _below(harmonics: F64) -> int:
-    power = np.cumsum(np.abs(harmonics) ** 2)
-    return max(int(np.searchsorted(power, ALL * power[-1])), 1)
+    lowest = float(rfftfreq(command.size, 1.0 / record.sample_rate_hz)[max(first, 1)])
+    return lowest, max(lowest, spectrum(command, record.sample_rate_hz).highest_hz)
 
 
 VERSIONS = {"hilctl": hilctl.__version__, "numpy": np.__version__, "scipy": scipy.__version__}
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FittedModel(Evaluation):
-    """An identified model, and its errors on the fitted records.
+@dataclass(frozen=True, kw_only=True)
+class FittedModel(Evaluation, FoundModel):
+    """An identified model with its provenance, and its errors on the fitted records."""
 
-    Attributes:
-        model: The model, with its provenance.
-        numbers: Number of fitted numbers.
-        starts: Starts of the search.
-        parameters: Fitted parameters under their published names, in command units, um and s.
-        standard_errors: Standard errors of the parameters, if known.
-        at_bound: Parameters at a bound.
-        elapsed_s: Duration of the fit.
-    """
-
-    model: HysteresisModel
-    numbers: int
-    starts: tuple[StartOutcome, ...]
-    parameters: Mapping[str, float]
-    standard_errors: Mapping[str, float]
-    at_bound: tuple[str, ...]
     elapsed_s: float
 
     def to_mapping(self) -> dict[str, Any]:
@@ -152,8 +119,8 @@ class FittedModel(Evaluation):
             **Evaluation.to_mapping(self),
             "starts": [asdict(start) for start in self.starts],
             "numbers": self.numbers,
-            "parameters": dict(self.parameters),
-            "standard_errors": dict(self.standard_errors),
+            "parameters": self.parameters,
+            "standard_errors": self.standard_errors,
             "at_bound": list(self.at_bound),
             "elapsed_s": self.elapsed_s,
         }
@@ -177,7 +144,7 @@ def fit_model(request: FitRequest) -> FittedModel:
     judged = judge(found.model, data, creep=settings.creep)
     provenance = Provenance(
         source=tuple(request.source),
-        method=_method(settings),
+        method="; ".join(filter(None, (CATALOGUE[settings.kind].title, settings.changes()))),
         grid=tuple(map(_grid_line, request.records)),
         parameters=found.parameters,
         errors_percent=error_table(judged),
@@ -185,27 +152,9 @@ def fit_model(request: FitRequest) -> FittedModel:
         versions=VERSIONS,
     )
     request.progress(1.0, "done")
-    return FittedModel(
-        errors=judged.errors,
-        modelled_um=judged.modelled_um,
-        peak_percent=judged.peak_percent,
-        rms_percent=judged.rms_percent,
-        own_peak_percent=judged.own_peak_percent,
-        model=found.model.model_copy(update={"provenance": provenance}),
-        numbers=found.numbers,
-        starts=found.starts,
-        parameters=found.parameters,
-        standard_errors=found.standard_errors,
-        at_bound=found.at_bound,
-        elapsed_s=time.perf_counter() - begin,
-    )
-
-
-def _method(settings: FitSettings) -> str:
-    """Return the kind of model and the settings that differ from the published ones."""
-    title = CATALOGUE[settings.kind].title
-    changes = settings.changes()
-    return f"{title}; {changes}" if changes else title
+    model = found.model.model_copy(update={"provenance": provenance})
+    known = vars(judged) | vars(found) | {"model": model, "end": None}
+    return FittedModel(**known, elapsed_s=time.perf_counter() - begin)
 
 
 def _grid_line(record: Record) -> str:

@@ -21,15 +21,7 @@ def bounded_weights(
 ) -> tuple[F64, float]:
     """Minimise the sum of (scale (columns w + c - target))^2 over w >= least, and c.
 
-    Args:
-        columns: float64[N, m].
-        target: float64[N].
-        scale: float64[N], square root of each sample's weight.
-        least: float64[m], lower bounds.
-        offset: Whether there is a constant c; it is 0 otherwise.
-
-    Returns:
-        The weights float64[m] and the constant.
+    Without ``offset``, c is 0.
     """
     free = np.ones((target.size, int(offset)))
     weights, constant = bounded_and_free(columns, free, target, scale, least)
@@ -42,17 +34,8 @@ def bounded_and_free(
     """Minimise the sum of (scale (columns w + free c - target))^2 over w >= least, and c.
 
     A shift removes the lower bounds, a projection the free columns, and a QR decomposition makes
-    the non-negative least-squares problem square.
-
-    Args:
-        columns: float64[N, m].
-        free: float64[N, f], columns whose weights have any sign.
-        target: float64[N].
-        scale: float64[N], square root of each sample's weight.
-        least: float64[m], lower bounds of w.
-
-    Returns:
-        w, float64[m], and c, float64[f].
+    the non-negative least-squares problem square. Columns are float64[N, m] and float64[N, f],
+    ``scale`` is the square root of each sample's weight. Return w and c.
     """
     rest = target - columns @ least
     table = np.column_stack([columns, rest]) * scale[:, None]
@@ -78,18 +61,8 @@ def smooth_densities(
 
     Loops leave many densities of a triangle undetermined, and least squares alone would turn them
     into spikes. A penalty on differences of neighbours, and a small one on the densities
-    themselves, makes the solution unique.
-
-    Args:
-        columns: float64[N, m].
-        target: float64[N].
-        scale: float64[N], square root of each sample's weight.
-        least: float64[m], lower bounds.
-        table: int64[lines, cells], number of the density of each cell; -1 for none.
-        smoothness: Weight of differences along a line, relative to the longest column.
-
-    Returns:
-        The densities float64[m] and the constant.
+    themselves, makes the solution unique. ``table``, int64[lines, cells], has the number of the
+    density of each cell, -1 for none; ``smoothness`` is relative to the longest column.
     """
     size, samples = columns.shape[1], target.size
     longest = float(np.linalg.norm(columns * scale[:, None], axis=0).max())
@@ -104,10 +77,7 @@ def smooth_densities(
 def differences(first: I64, second: I64, size: int) -> F64:
     """Return rows of the differences of pairs of unknowns, second less first: float64[k, size].
 
-    Args:
-        first: int64, numbers of unknowns; pairs with a negative number are ignored.
-        second: int64, of the same shape.
-        size: Number of unknowns.
+    Pairs with a negative number are ignored.
     """
     both = (first >= 0) & (second >= 0)
     out = np.zeros((int(both.sum()), size))
@@ -135,17 +105,8 @@ def descend(
     """Minimise the sum of squares within bounds (Levenberg-Marquardt).
 
     Columns are scaled to length 1. A parameter whose step would exceed a bound stops there and may
-    leave it in the next step.
-
-    Args:
-        evaluate: Errors and derivatives.
-        x: float64[p], start; parameters with equal bounds are fixed.
-        low: float64[p].
-        high: float64[p].
-        rounds: Maximum number of steps tried.
-
-    Returns:
-        The point, its errors and their derivatives.
+    leave it in the next step; parameters with equal bounds are fixed. Return the point, its errors
+    and their derivatives, after at most ``rounds`` steps.
     """
     free = np.flatnonzero(high > low)
     x = np.clip(x, low, high)
@@ -180,16 +141,10 @@ def _step(errors: F64, slopes: F64, low: F64, high: F64, damping: float) -> F64:
 
 
 def bounded_solution(normal: F64, right: F64, low: F64, high: F64) -> F64:
-    """Minimise x^T A x / 2 - b^T x within bounds, by an active set.
+    """Minimise x^T A x / 2 - b^T x within bounds around 0, by an active set.
 
-    Variables beyond a bound are fixed there and the rest is solved again; then fixed variables
-    that the slope pulls inwards are released one by one.
-
-    Args:
-        normal: float64[p, p], A, positive definite.
-        right: float64[p], b.
-        low: float64[p], <= 0.
-        high: float64[p], >= 0.
+    Variables beyond a bound are fixed there and the rest is solved again; then fixed variables that
+    the slope pulls inwards are released one by one. A is positive definite.
     """
     x = np.zeros(right.size)
     inside = np.ones(right.size, dtype=bool)
@@ -219,13 +174,7 @@ HELD = 1e-6  # of the first sum of squares: penalty of one unit away from the st
 
 @dataclass(frozen=True, slots=True)
 class SearchPoint:
-    """A point of the search.
-
-    Attributes:
-        squares: The sum of squares.
-        slope: float64[p], half its gradient.
-        normal: float64[p, p], half its approximate Hessian.
-    """
+    """A sum of squares, half its gradient float64[p], and half its approximate Hessian."""
 
     squares: float
     slope: F64
@@ -241,15 +190,9 @@ def settle(
 ) -> F64:
     """Return the minimum of a sum of squares (Levenberg-Marquardt).
 
-    A small penalty on the distance from the start makes the result a smooth function of the data,
-    so that rounding differences between processors stay small.
-
-    Args:
-        sum_of: Returns the sum of squares at a point.
-        place_of: Returns the same with derivatives.
-        first: float64[p], start.
-        bounds: float64[p] each, lowest and highest.
-        unit: float64[p], changes that have about the same effect.
+    A small penalty on the distance from the start, in units of about the same effect, makes the
+    result a smooth function of the data, so that rounding differences between processors stay
+    small.
     """
     low, high = bounds
     x = first = np.clip(first, low, high)
@@ -292,15 +235,8 @@ def converged(
     """Return the end of bounded least squares from ``x``, and the number of evaluations.
 
     Numerical derivatives are central differences: one-sided ones have eight digits only, and the
-    rounding, which differs between processors, would grow from step to step.
-
-    Args:
-        errors: Returns float64[N] at a point float64[p].
-        x: float64[p], start.
-        low: float64[p].
-        high: float64[p].
-        evaluations: Maximum number, without those for derivatives.
-        slopes: Returns derivatives float64[N, p]; None for differences.
+    rounding, which differs between processors, would grow from step to step. The maximum of
+    ``evaluations`` does not count those for derivatives.
     """
     margin = 1e-9 * (high - low)
     found = least_squares(

@@ -6,12 +6,15 @@ operators is searched.
 """
 
 import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
 
 import numpy as np
 from scipy.optimize import nnls
 
 from hilctl.base.types import F64, I64
-from hilctl.identify.fit_api import LEAST_SLOPE, FitJob, FoundModel
+from hilctl.identify.fit_api import LEAST_SLOPE, FitData, FitJob, FoundModel
 from hilctl.identify.least_squares import (
     bounded_weights,
     converged,
@@ -19,6 +22,7 @@ from hilctl.identify.least_squares import (
     numbered,
     smooth_densities,
 )
+from hilctl.identify.staged.fit_data import StagedFitData
 from hilctl.identify.staged.objective import segments
 from hilctl.kernels.generalised_play import envelope_outputs
 from hilctl.kernels.hysteresis import rest_memory
@@ -52,17 +56,7 @@ def fit_straight(job: FitJob) -> FoundModel:
 
 
 def weigh(job: FitJob, columns: F64, least: F64, rows: slice = slice(None)) -> tuple[F64, float]:
-    """Fit ``columns w + c`` to the measured displacement, w >= least.
-
-    Args:
-        job: Data and settings of the fit.
-        columns: float64[M, m], of the judged samples that ``rows`` takes.
-        least: float64[m].
-        rows: Samples that are compared.
-
-    Returns:
-        Weights float64[m], and the constant displacement in um.
-    """
+    """Fit ``columns w + c`` to the displacement at ``rows``, w >= least; return w and c."""
     target_um = job.data.target_um[rows]
     return bounded_weights(columns, target_um, np.ones(target_um.size), least, offset=True)
 
@@ -72,33 +66,57 @@ def fit_preisach(job: FitJob) -> FoundModel:
 
     The triangle covers the largest loop; cells that no loop reaches have no weight.
     """
-    data, lines = job.data, job.settings.lines
-    low, high = data.input_range
-    thresholds = data.reach / lines * np.arange(lines, dtype=np.float64)
-    edges = np.linspace(low, high, lines + 1)
-    plays = data.columns(thresholds)[:, 1:]
-    columns = np.concatenate([cells_below(play, edges) for play in plays.T], axis=1)
-    moved = data.swing(columns) > STILL * float(edges[1] - edges[0])
-    least = np.zeros(columns.shape[1])
-    least[:lines] = job.least
-    table = numbered(moved).reshape(lines, lines)
-    slopes = least.copy()
-    slopes[moved], offset_um = _smooth(job, columns[:, moved], least[moved], table)
-    model = PreisachModel(
-        command_span=data.command_span,
-        thresholds=tuple(thresholds.tolist()),
-        lowest=low,
-        cell=float(edges[1] - edges[0]),
-        slopes=tuple(tuple(line) for line in slopes.reshape(lines, lines).tolist()),
-        **data.common(offset_um),
-    )
-    return FoundModel(model, int(moved.sum()) + 1)
+    data = job.data
+    plays = data.columns(triangle_thresholds(data, job.settings.lines))[:, 1:]
+    fields = {"command_span": data.command_span, **data.common(0.0)}
+    model, numbers = fit_triangle(data, plays, partial(_smooth, job), fields)
+    return FoundModel(model, numbers + 1)
 
 
 def _smooth(job: FitJob, columns: F64, least: F64, table: I64) -> tuple[F64, float]:
     target_um = job.data.target_um
     ones = np.ones(target_um.size)
     return smooth_densities(columns, target_um, ones, least, table, SMOOTHNESS)
+
+
+def triangle_thresholds(data: FitData | StagedFitData, lines: int) -> F64:
+    """Return the thresholds of the plays that a triangle's lines follow: float64[lines]."""
+    return data.reach / lines * np.arange(lines, dtype=np.float64)
+
+
+def fit_triangle(
+    data: FitData | StagedFitData,
+    centres: F64,
+    fit: Callable[[F64, F64, I64], tuple[F64, float]],
+    fields: Mapping[str, Any],
+) -> tuple[PreisachModel, int]:
+    """Return a Preisach model, and the number of its cells that have a density.
+
+    ``centres``, float64[N, lines], is the output of each play. ``fit`` returns densities and the
+    constant displacement, for columns, lower bounds and table.
+    """
+    lines, (low, high) = centres.shape[1], data.input_range
+    edges = np.linspace(low, high, lines + 1)
+    cell = float(edges[1] - edges[0])
+    columns = np.concatenate([cells_below(centre, edges) for centre in centres.T], axis=1)
+    moved = largest_swing(columns, data.places) > STILL * cell
+    slopes = np.zeros(columns.shape[1])
+    slopes[:lines] = LEAST_SLOPE * data.gain
+    table = numbered(moved).reshape(lines, lines)
+    slopes[moved], offset_um = fit(columns[:, moved], slopes[moved], table)
+    model = PreisachModel(
+        thresholds=tuple(triangle_thresholds(data, lines).tolist()),
+        lowest=low,
+        cell=cell,
+        slopes=tuple(map(tuple, slopes.reshape(lines, lines).tolist())),
+        **{**fields, "output_offset_um": offset_um},
+    )
+    return model, int(moved.sum())
+
+
+def largest_swing(columns: F64, places: Sequence[slice]) -> F64:
+    """Return the largest peak-to-peak in a record of each column, float64[N, m]: float64[m]."""
+    return np.asarray(np.max([np.ptp(columns[place], axis=0) for place in places], axis=0))
 
 
 def cells_below(centre: F64, edges: F64) -> F64:
@@ -121,7 +139,7 @@ def fit_kp(job: FitJob) -> FoundModel:
     places = low + spacing * np.arange(-1.0, levels - 1.0)
     columns = data.stack(lambda v: _kp_outputs(v, places[row], places[column], spacing))
     least = np.where(row == column, 0.5 * spacing * job.least, 0.0)
-    moved = data.swing(columns) > STILL * 2.0
+    moved = largest_swing(columns, data.places) > STILL * 2.0
     # Operators of one width, side by side, are what a line of the Preisach triangle is.
     table = np.full((levels, levels), -1)
     table[row - column, column] = numbered(moved)
@@ -163,11 +181,7 @@ _HIGH = (4.0, 3.0, 4.0, 3.0, 3.0, 0.3, 1.0)
 
 
 class _ShapeSearch:
-    """A shape that is searched, with weights that follow from it.
-
-    Args:
-        job: Data and settings of the fit.
-    """
+    """A shape that is searched, with weights that follow from it."""
 
     def __init__(self, job: FitJob) -> None:
         self.job = job
@@ -191,11 +205,8 @@ class _GeneralisedPlays(_ShapeSearch):
 
     A point holds slope (times the reach) and shift of the rising envelope, the same of the falling
     one, the falling one's height (the rising one's is 1: the weights carry the scale) and its value
-    at 0, and the spacing relative to half the largest swing of z over the number of plays.
-
-    Args:
-        job: Data and settings of the fit.
-        few: Whether to compare some of the samples only; the operators run on all of them.
+    at 0, and the spacing relative to half the largest swing of z over the number of plays. With
+    ``few``, only some samples are compared.
     """
 
     def __init__(self, job: FitJob, *, few: bool) -> None:
@@ -277,12 +288,9 @@ _BOUC_WEN = ("direct", "hysteretic", "beta", "gamma", "exponent", "output_offset
 
 
 class _DifferentialLoop(_ShapeSearch):
-    """The operator z of a Bouc-Wen or Duhem model for given beta, gamma and n.
+    """The operator z of a Bouc-Wen or Duhem model for given beta, gamma and n = 1 or 2.
 
-    Args:
-        job: Data and settings of the fit.
-        exponent: n, 1 or 2.
-        free: Whether gamma is searched; otherwise it is 0.
+    Without ``free``, gamma is 0.
     """
 
     def __init__(self, job: FitJob, exponent: int, *, free: bool) -> None:
@@ -379,7 +387,6 @@ class _Asymmetric:
 
     def __init__(self, job: FitJob, spacing: float) -> None:
         self.data = data = job.data
-        self.least = LEAST_SLOPE
         self.plays, self.deadbands = job.settings.plays, job.settings.deadbands
         numbers = np.arange(1, self.plays + 1, dtype=np.float64)
         self.thresholds = spacing * data.reach / (self.plays + 0.5) * numbers
@@ -398,14 +405,14 @@ class _Asymmetric:
         up, down = cells[0][:, 1:], cells[1][:, 1:]
         columns = np.column_stack([self._columns, -up, down])
         least = np.zeros(columns.shape[1])
-        least[0] = self.least * self.data.gain
+        least[0] = LEAST_SLOPE * self.data.gain
         least[self.plays + 1 :] = 0.1
         target = cells[0][:, 0] - cells[1][:, 0]
         extra, _ = nnls(columns, target - columns @ least)
         found = np.asarray(extra + least, dtype=np.float64)
         inverse = found[self.plays + 1 :].reshape(2, self.deadbands)
         self.corners = (_corners(self._edges[0], inverse[0]), _corners(self._edges[1], inverse[1]))
-        slopes = np.clip(1.0 / inverse, 2.0 * self.least, 0.5 * _STEEPEST)
+        slopes = np.clip(1.0 / inverse, 2.0 * LEAST_SLOPE, 0.5 * _STEEPEST)
         return np.concatenate([found[: self.plays + 1] / self.data.gain, slopes.ravel(), [0.0]])
 
     def split(self, x: F64) -> tuple[F64, F64, F64, float]:
@@ -479,8 +486,7 @@ def fit_asymmetric(job: FitJob) -> FoundModel:
 def _polished(problem: _Asymmetric, x: F64) -> F64:
     """Return the point of least squared displacement error from ``x`` on."""
     low = np.zeros(x.size)
-    low[0] = problem.least
-    low[problem.plays + 1 : -1] = problem.least
+    low[0] = low[problem.plays + 1 : -1] = LEAST_SLOPE
     low[-1] = -1.0
     high = np.full(x.size, _STEEPEST)
     x, _ = converged(problem.error_um, x, low, high, _EVALUATIONS, problem.slopes_um)

@@ -2,13 +2,12 @@
 
 import html
 from collections.abc import Sequence
-from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from hilctl.analysis.html import document, grid, wide_figure, write_page
+from hilctl.analysis.html import document, grid, wide_figure
 from hilctl.analysis.plot_style import DISPLACEMENT, ERROR, REFERENCE, STYLE
 from hilctl.base.types import F64
 from hilctl.identify.data.records import Record, SteadyLoop
@@ -29,15 +28,6 @@ COLUMNS = 3
 MOST_RECORDS = 36
 MOST_RUNS = 12
 MOST_DRAWN = 20_000  # samples of a history per plot
-
-
-def write_identification(found: Identification, path: Path) -> None:
-    """Write the page, replacing an existing file.
-
-    Raises:
-        InputError: It can't be written.
-    """
-    write_page(identification_page(found), path)
 
 
 def identification_page(found: Identification) -> str:
@@ -70,13 +60,7 @@ def _drawn(heading: str, judged: Evaluation, data: Sequence[Record], unit: str) 
 
 @mpl.rc_context(STYLE)
 def loops_figure(modelled_um: Sequence[F64], data: Sequence[Record], unit: str) -> Figure:
-    """Draw displacement against command, measured and modelled, and the error below each.
-
-    Args:
-        modelled_um: Modelled displacement of the evaluated samples of each record.
-        data: Loops and histories.
-        unit: Unit of the command.
-    """
+    """Draw displacement against command, measured and modelled, and the error below each."""
     columns = min(COLUMNS, len(data))
     rows = -(-len(data) // columns)
     figure = Figure(figsize=(3.6 * columns, 3.8 * rows))
@@ -101,15 +85,6 @@ def loops_figure(modelled_um: Sequence[F64], data: Sequence[Record], unit: str) 
         lower.set_visible(True)
     axes[0, 0].legend(loc="upper left")
     return figure
-
-
-def write_refinement(found: Refinement, path: Path) -> None:
-    """Write the page, replacing an existing file.
-
-    Raises:
-        InputError: It can't be written.
-    """
-    write_page(refinement_page(found), path)
 
 
 def refinement_page(found: Refinement) -> str:

@@ -38,8 +38,6 @@ class Verdict:
             amplitudes and frequencies.
         within_percent: Largest error in percent of a record's own peak-to-peak displacement, on
             held-out data if there are any.
-        held_out: Whether there are held-out data.
-        reasons: Reasons for ``not a model``.
         notes: Limits of the data, and suggestions.
     """
 
@@ -66,14 +64,7 @@ class Verdict:
 def verdict_of(
     fit: FittedModel, records: Sequence[Record], settings: FitSettings, held_out: HeldOut | None
 ) -> Verdict:
-    """Return the grade of a fit.
-
-    Args:
-        fit: The fit.
-        records: Fitted records.
-        settings: Settings of the fit.
-        held_out: Errors on held-out data; None if there are none.
-    """
+    """Return the grade of a fit to records, and on held-out data if there are any."""
     judged = held_out.judgement if held_out else fit
     within = judged.own_peak_percent
     if reasons := tuple(data_reasons(records, even=settings.kind == "butterfly")):
@@ -90,9 +81,7 @@ def verdict_of(
 def data_reasons(records: Sequence[Record], *, even: bool = False) -> Iterator[str]:
     """Yield faults of the data that do not depend on the model.
 
-    Args:
-        records: The data.
-        even: Whether the displacement may rise with commands of both signs (rods without bias).
+    With ``even``, the displacement may rise with commands of both signs (rods without bias).
     """
     moves = [float(np.ptp(record.displacement_um)) for record in records]
     largest = int(np.argmax(moves))

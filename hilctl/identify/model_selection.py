@@ -14,7 +14,7 @@ from hilctl.identify.evaluation import Evaluation, judge, judgement_of
 from hilctl.identify.fit_api import FitData, FitRequest, OnProgress, ignore_progress
 from hilctl.identify.fit_model import fit_kind, fit_model
 from hilctl.identify.parallel import MapFunction, serial_map
-from hilctl.identify.settings import FitSettings, IdentifySettings, kinds_of
+from hilctl.identify.settings import FitSettings, IdentifySettings
 
 FEWEST_LOOPS = 4
 FOLDS = 3
@@ -26,12 +26,7 @@ MOVES = 0.1  # of a history's peak-to-peak: least motion of a last part that is 
 
 @dataclass(frozen=True, slots=True)
 class Split:
-    """Records of one fit, and those that it is evaluated on.
-
-    Attributes:
-        fitted: Fitted records.
-        held_out: Held-out records.
-    """
+    """Records of one fit, and held-out ones that it is evaluated on."""
 
     fitted: tuple[Record, ...]
     held_out: tuple[Record, ...]
@@ -39,13 +34,9 @@ class Split:
 
 @dataclass(frozen=True, slots=True)
 class HeldOut:
-    """Errors of a model on held-out data.
+    """Errors of a model on held-out data, whose origin ``how`` describes.
 
-    Attributes:
-        judgement: The errors.
-        records: The data.
-        how: Origin of the data, as text.
-        end: End of the last fit, from which a fit to all data can start.
+    A fit to all data can start from ``end``.
     """
 
     judgement: Evaluation
@@ -91,19 +82,12 @@ def held_out_error(request: FitRequest) -> HeldOut | None:
 
 
 def held_out_errors(requests: Sequence[FitRequest], run: MapFunction) -> list[HeldOut | None]:
-    """Return errors of each fit on held-out parts of its data.
+    """Return errors of each fit on held-out parts of its data; None if too few data are left.
 
     One start of each search is enough.
-
-    Args:
-        requests: What to fit.
-        run: Runs the fits, which do not depend on each other.
-
-    Returns:
-        For each request its errors; None if too few data are left.
     """
     tasks = [
-        _Task(number, fold, replace(
+        (number, fold, replace(
             request,
             records=fold.fitted,
             settings=request.settings.model_copy(update={"starts": 1}),
@@ -114,28 +98,20 @@ def held_out_errors(requests: Sequence[FitRequest], run: MapFunction) -> list[He
         for fold in folds_of(request.records)
     ]  # fmt: skip
     done: list[list[tuple[Split, F64, object | None]]] = [[] for _ in requests]
-    for task, found in zip(tasks, run(_fitted, tasks), strict=True):
+    for (number, fold, _), found in zip(tasks, run(_fitted, tasks), strict=True):
         if found is not None:
-            done[task.number].append((task.fold, *found))
+            done[number].append((fold, *found))
     return [_together(*each) for each in zip(requests, done, strict=True)]
 
 
-@dataclass(frozen=True, slots=True)
-class _Task:
-    """One fit of the request of that number, to the fitted records of a fold."""
-
-    number: int
-    fold: Split
-    request: FitRequest
-
-
-def _fitted(task: _Task) -> tuple[F64, object | None] | None:
+def _fitted(task: tuple[int, Split, FitRequest]) -> tuple[F64, object | None] | None:
     """Return the response to the held-out data, and where the search ended."""
+    _, fold, request = task
     try:
-        found = fit_kind(task.request)
+        found = fit_kind(request)
     except DataError:  # too few records for this kind of fit; all of them may be enough
         return None
-    judged = judge(found.model, task.fold.held_out, creep=task.request.settings.creep)
+    judged = judge(found.model, fold.held_out, creep=request.settings.creep)
     return np.concatenate(judged.modelled_um), found.end
 
 
@@ -198,10 +174,7 @@ loops of a field may creep."""
 LONGEST = max(map(len, IN_FULL.values()))
 NEAR = 2.0  # times the least error: a small model of the best kind may have it
 WORTH = 0.95  # of the error: a larger model must be below it, since it slows every run
-LOOPS: tuple[Mapping[str, Any], ...] = (
-    {"kind": "staged"},
-    {"kind": "integrated", "offset": True},
-)
+LOOPS: tuple[Mapping[str, Any], ...] = ({"kind": "staged"}, {"kind": "integrated", "offset": True})
 """Candidates for steady loops."""
 ORDERS = ((6, 4), (8, 6), (12, 8), (16, 10), (20, 12), (28, 16))
 """Plays, and deadbands on each side if the model has any."""
@@ -213,13 +186,7 @@ MOST_LAG = 8  # samples tried
 
 @dataclass(frozen=True, slots=True)
 class CandidateScore:
-    """Errors of one kind of model on held-out data.
-
-    Attributes:
-        settings: The kind, and settings that differ from its published ones.
-        rms_percent: Of the largest peak-to-peak displacement.
-        peak_percent: The same for the largest error.
-    """
+    """Errors of one kind of model on held-out data, in percent of the largest stroke."""
 
     settings: str
     rms_percent: float
@@ -228,13 +195,9 @@ class CandidateScore:
 
 @dataclass(frozen=True, slots=True)
 class OrderScore:
-    """Errors of a model of one size on held-out data.
+    """Errors of a model of one size on held-out data, in percent of the largest stroke.
 
-    Attributes:
-        plays: Play operators; lines, if the model has a Preisach triangle.
-        deadbands_a_side: Deadbands on each side of 0.
-        rms_percent: Of all held-out data, in percent of the largest peak-to-peak.
-        peak_percent: The same for the largest error.
+    ``plays`` counts the lines of a Preisach triangle if the model has one.
     """
 
     plays: int
@@ -245,14 +208,7 @@ class OrderScore:
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """Selected settings, and the errors that they were selected by.
-
-    Attributes:
-        settings: The settings.
-        held_out: Their errors on held-out data; None if nothing was selected.
-        candidates: Errors of each kind that was tried.
-        orders: Errors of each size that was tried.
-    """
+    """Selected settings, their errors on held-out data, and those of everything tried."""
 
     settings: FitSettings
     held_out: HeldOut | None = None
@@ -284,7 +240,7 @@ def _choose_kind(request: FitRequest, given: IdentifySettings) -> Selection:
         errors += _candidates(request, given, (PLAIN,))
     if not errors:
         raise DataError("too few data to hold some out and select a model: use --model NAME")
-    best = min(errors, key=_rms_percent)
+    best = min(errors, key=lambda tried: tried.rms_percent)
     near = [each for each in errors if each.rms_percent <= NEAR * best.rms_percent]
     for turn in range(LONGEST if whole else 0):
         chains = [(IN_FULL.get(each.settings.kind, ())[turn:], each) for each in near]
@@ -292,17 +248,21 @@ def _choose_kind(request: FitRequest, given: IdentifySettings) -> Selection:
         starts = [each.held_out.end for _, each in larger]
         found = _candidates(request, given, [more for more, _ in larger], starts)
         errors += found
-        best = min((best, *(x for x in found if x.rms_percent < WORTH * best.rms_percent)),
-                   key=_rms_percent)  # fmt: skip
+        better = [x for x in found if x.rms_percent < WORTH * best.rms_percent]
+        best = min(better, key=lambda tried: tried.rms_percent, default=best)
         near = [best] if best in found else []
     return Selection(best.settings, best.held_out, candidates=tuple(e.candidate for e in errors))
 
 
 def _choose_order(request: FitRequest) -> Selection:
     """Return the smallest size whose error is near the least."""
-    sizes = _sizes(request.settings)
+    settings = request.settings
+    if settings.hysteresis == "preisach":
+        sizes = [settings.model_copy(update={"lines": lines}) for lines in LINES]
+    else:
+        sizes = [settings.model_copy(update={"plays": n, "deadbands": k}) for n, k in ORDERS]
     request.progress(0.0, f"fits of {len(sizes)} sizes with held-out data")
-    errors = _tried(request, [("", settings) for settings in sizes])
+    errors = _tried(request, [("", size) for size in sizes])
     if not errors:
         raise DataError("too few data to hold some out and select the number of plays: set plays=N")
     most = WORTH_SIZE * min(each.rms_percent for each in errors)
@@ -333,10 +293,6 @@ class _Tried:
         return OrderScore(plays, deadbands, self.rms_percent, self.held_out.judgement.peak_percent)
 
 
-def _rms_percent(tried: _Tried) -> float:
-    return tried.rms_percent
-
-
 def _tried(
     request: FitRequest,
     named: Sequence[tuple[str, FitSettings]],
@@ -360,21 +316,13 @@ def _candidates(
     shared: dict[str, Any] = {"whole": given.whole, "table": given.table, "points": given.points}
     names = [", ".join(f"{key} {value}" for key, value in each.items()) for each in candidates]
     request.progress(0.0, "; ".join(names))
-    settings = [IdentifySettings(**each, **shared, **_parts(each, given)) for each in candidates]
+    settings = [IdentifySettings(**each, **shared) for each in candidates]
+    parts = {"creep_stage": given.creep_stage, "modes": given.modes}
+    settings = [
+        each.model_copy(update={name: on for name, on in parts.items() if each.has(name)})
+        for each in settings
+    ]
     return _tried(request, list(zip(names, settings, strict=True)), starts)
-
-
-def _parts(candidate: Mapping[str, Any], given: IdentifySettings) -> dict[str, Any]:
-    """Return the settings of optional parts that a kind has."""
-    fields, kind = IdentifySettings.model_fields, candidate["kind"]
-    has = [name for name in ("creep_stage", "modes") if kind in kinds_of(fields[name])]
-    return {name: getattr(given, name) for name in has}
-
-
-def _sizes(settings: FitSettings) -> list[FitSettings]:
-    if settings.hysteresis == "preisach":
-        return [settings.model_copy(update={"lines": lines}) for lines in LINES]
-    return [settings.model_copy(update={"plays": n, "deadbands": k}) for n, k in ORDERS]
 
 
 def choose_lag(
@@ -382,11 +330,7 @@ def choose_lag(
 ) -> int:
     """Return the lag of the displacement, in samples, with the least error.
 
-    Args:
-        load: Loads the data with the displacement shifted by that many samples.
-        settings: Settings of the fit.
-        run: Runs independent fits.
-        progress: Progress callback.
+    ``load`` returns the data with the displacement shifted by that many samples.
     """
     progress(0.0, f"{MOST_LAG + 1} fits for the lag of the displacement")
     lean = settings.model_copy(update={"starts": 1, "peak_goal_percent": None})

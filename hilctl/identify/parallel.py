@@ -34,7 +34,8 @@ def parallel_map(function: Callable[[Task], Result], tasks: Iterable[Task], /) -
     For short parts of one fit that spend their time in ``nogil`` kernels and BLAS. A part must not
     call this function itself.
     """
-    if _worker.unwanted.is_set():
+    unwanted = getattr(_worker, "unwanted", None)
+    if unwanted is not None and unwanted.is_set():
         raise _UnwantedError
     return list(_threads().map(function, tasks))
 
@@ -43,14 +44,8 @@ class _UnwantedError(Exception):
     """Cancels a fit whose result is not wanted any more."""
 
 
-class _Worker(threading.local):
-    """Cancellation of the tasks of a thread of :func:`streams`."""
-
-    def __init__(self) -> None:
-        self.unwanted = threading.Event()
-
-
-_worker = _Worker()
+_worker = threading.local()
+"""Has an event ``unwanted`` in threads of :func:`streams`, which cancels their tasks."""
 
 
 @cache
@@ -64,15 +59,8 @@ def _threads() -> ThreadPoolExecutor:
 @contextmanager
 def workers(scheduler: str = "none") -> Iterator[MapFunction]:
     """Yield a :data:`MapFunction`; see :func:`streams`."""
-    if scheduler == "none":
-        yield serial_map
-        return
     with streams(scheduler) as stream:
-
-        def run(function: Callable[[Any], Any], tasks: Sequence[Any], /) -> list[Any]:
-            return list(stream(function, tasks))
-
-        yield run
+        yield lambda function, tasks: list(stream(function, tasks))
 
 
 @contextmanager
@@ -88,7 +76,7 @@ def streams(scheduler: str = "none") -> Iterator[StreamFunction]:
         InputError: The scheduler is unknown, can't be reached, or Dask is not installed.
     """
     if scheduler == "none":
-        yield map
+        yield map  # serial
     elif scheduler in SCHEDULERS:
         with _local(scheduler) as executor:
             yield executor.map
@@ -96,9 +84,8 @@ def streams(scheduler: str = "none") -> Iterator[StreamFunction]:
         with _dask(scheduler) as distributed:
             yield distributed
     else:
-        known = ", ".join(SCHEDULERS)
-        raise InputError(f"scheduler must be {known} or an address such as tcp://host:8786: "
-                         f"{scheduler!r}")  # fmt: skip
+        known = f"{', '.join(SCHEDULERS)} or an address such as tcp://host:8786"
+        raise InputError(f"scheduler must be {known}: {scheduler!r}")
 
 
 @contextmanager
@@ -133,8 +120,6 @@ def _dask(address: str) -> Iterator[StreamFunction]:
     except (OSError, ValueError) as error:
         raise InputError(f"no Dask scheduler answers at {address}: {error}") from None
     with client:
-
-        def run(function: Callable[[Any], Any], tasks: Sequence[Any], /) -> Iterator[Any]:
-            return (each.result() for each in client.map(function, list(tasks), pure=False))
-
-        yield run
+        yield lambda function, tasks: (
+            each.result() for each in client.map(function, list(tasks), pure=False)
+        )

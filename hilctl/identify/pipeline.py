@@ -24,7 +24,7 @@ from hilctl.identify.model_selection import (
     held_out_error,
     select,
 )
-from hilctl.identify.parallel import MapFunction, workers
+from hilctl.identify.parallel import workers
 from hilctl.identify.registry import entry
 from hilctl.identify.resonances import WORTH, further_modes
 from hilctl.identify.settings import IdentifySettings
@@ -55,10 +55,6 @@ def with_modes(
 
     A missing mode distorts all other parameters, so the model is identified again with each mode
     that is found, and its residual shows the modes more clearly.
-
-    Args:
-        records: Fitted records.
-        identify: Identifies a model of them with known modes.
     """
     best = identify(())
     histories = [record for record in records if isinstance(record, History)]
@@ -83,13 +79,8 @@ class Identification:
     """An identified model, and its errors on held-out data.
 
     Attributes:
-        fit: The fit.
-        data: Fitted records.
-        verdict: Grade of the model.
-        held_out: Errors on held-out data; None if there were none.
         orders: Errors of each number of plays, if it was selected.
         lag_samples: Assumed lag of tables' displacements in samples.
-        candidates: Errors of each kind, if it was selected.
     """
 
     fit: FittedModel
@@ -114,10 +105,6 @@ class Identification:
 
 def settings_from(kind: str, texts: Sequence[str]) -> IdentifySettings:
     """Return the settings of a fit: those of the kind, changed by ``key=value`` texts.
-
-    Args:
-        kind: Kind of model; ``auto`` for the one with the least error on held-out data.
-        texts: ``key=value``.
 
     Raises:
         InputError: The kind is unknown, or settings are invalid; all invalid ones are listed.
@@ -161,7 +148,11 @@ def identify_files(
     if output is not None:
         check_writable(output, overwrite=overwrite, inputs=[*paths, *validate])
     with workers(scheduler) as run:
-        lag = _lag(paths, settings, run, progress)
+        lag = settings.table.lag_samples
+        if settings.table.find_lag:
+            lag = choose_lag(
+                lambda lag: load_records(paths, settings, lag)[0], settings, run, progress
+            )
         records, recorded = load_records(paths, settings, lag)
         asked = settings.table.unit
         if recorded and asked and recorded != asked:
@@ -178,11 +169,6 @@ def identify_files(
 
 def identify_records(request: FitRequest, validate: Sequence[Record] = ()) -> Identification:
     """Fit a model to records, and evaluate it on held-out data.
-
-    Args:
-        request: Records and settings, which may leave the kind or the number of plays open.
-        validate: Held-out records; if there are none, parts of the fitted records are left out of
-            further fits.
 
     Raises:
         DataError: The data can't be used as asked, or there are none.
@@ -214,15 +200,3 @@ def identify_records(request: FitRequest, validate: Sequence[Record] = ()) -> Id
     return Identification(
         fit, records, verdict, held_out, selection.orders, 0, selection.candidates
     )
-
-
-def _lag(
-    paths: Sequence[Path], settings: IdentifySettings, run: MapFunction, progress: OnProgress
-) -> int:
-    if not settings.table.find_lag:
-        return settings.table.lag_samples
-
-    def load(lag: int) -> Sequence[Record]:
-        return load_records(paths, settings, lag)[0]
-
-    return choose_lag(load, settings, run, progress)

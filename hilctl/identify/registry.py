@@ -30,14 +30,7 @@ STAGES = "steady loops at one sample rate; whole histories without lag, structur
 
 @dataclass(frozen=True, slots=True)
 class CatalogueEntry:
-    """A kind of model.
-
-    Attributes:
-        title: Name and equations.
-        found_by: Method of the fit.
-        data: Records that it takes.
-        fit: The fit.
-    """
+    """A kind of model: its equations, the method of its fit, and the records that it takes."""
 
     title: str
     found_by: str

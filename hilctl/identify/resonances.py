@@ -39,13 +39,9 @@ MOST = 3
 
 @dataclass(frozen=True, slots=True)
 class _Spectra:
-    """Transfer function from modelled to measured displacement.
+    """Transfer function from modelled to measured displacement, and power of the modelled one.
 
-    Attributes:
-        frequency_hz: float64[k].
-        transfer: complex128[k].
-        power: float64[k], of the modelled displacement.
-        left: Power of the residual at all frequencies.
+    ``left`` is the power of the residual at all frequencies.
     """
 
     frequency_hz: F64
@@ -62,11 +58,7 @@ def further_modes(
 ) -> tuple[FurtherMode, ...] | None:
     """Return improved modes, with one more if the residual shows it; None if nothing improves.
 
-    Args:
-        records: The records.
-        modelled_um: float64[n] each, modelled displacement of their evaluated samples.
-        known: Further modes of the model.
-        first_hz: Natural frequency of its first mode; None if it has none.
+    ``first_hz`` is the natural frequency of the model's first mode.
     """
     bare_um = [
         _undone(model_um, known, record.sample_rate_hz)
@@ -90,15 +82,13 @@ def further_modes(
 def without_modes(records: Sequence[Record], modes: Sequence[FurtherMode]) -> tuple[Record, ...]:
     """Return records with modes removed from histories."""
     return tuple(
-        replace(record, displacement_um=_bare_um(record, modes))
+        replace(
+            record, displacement_um=_undone(record.displacement_um, modes, record.sample_rate_hz)
+        )
         if isinstance(record, History)
         else record
         for record in records
     )
-
-
-def _bare_um(history: History, modes: Sequence[FurtherMode]) -> F64:
-    return _undone(history.displacement_um, modes, history.sample_rate_hz)
 
 
 def _undone(y_um: F64, modes: Sequence[FurtherMode], rate_hz: float) -> F64:
@@ -135,12 +125,7 @@ def _spectra(
 
 
 def _pieces(signals: F64, rate_hz: float) -> Iterator[C128]:
-    """Yield windowed spectra of segments of signals: complex128[s, m, k].
-
-    Args:
-        signals: float64[s, n].
-        rate_hz: Their sample rate.
-    """
+    """Yield windowed spectra of segments of signals, float64[s, n]: complex128[s, m, k]."""
     together = max(1, int(rate_hz / FASTEST_HZ))
     size = round(SEGMENT_S * rate_hz / together)
     whole = signals[:, : signals.shape[1] // together * together]
@@ -182,24 +167,18 @@ def _one_more(spectra: _Spectra, x: F64, first_hz: float | None) -> _Pairs | Non
     rest = replace(
         spectra, transfer=spectra.transfer / known, power=spectra.power * np.abs(known) ** 2
     )
-    tried = [_tried(rest, natural_hz, damping) for natural_hz, damping in _grid(spectra, first_hz)]
-    starts = [
-        np.concatenate((x[:-SMOOTH], each.x)) for each in sorted(tried, key=_misfit)[:FOLLOWED]
-    ]
-    ends = [_followed(spectra, start, first_hz) for start in starts]
-    return min(ends, key=_misfit, default=None)
-
-
-def _misfit(pairs: _Pairs) -> float:
-    return pairs.misfit
-
-
-def _grid(spectra: _Spectra, first_hz: float | None) -> list[tuple[float, float]]:
-    """Return natural frequencies and damping ratios of pairs to try."""
     count, dampings = TRIES
     low, high = 4.0 * spectra.frequency_hz[0], 0.8 * spectra.frequency_hz[-1]
-    frequencies = np.geomspace(low, high, count).tolist()
-    return [(hz, damping) for hz in frequencies if _apart(hz, first_hz) for damping in dampings]
+    tried = [
+        _tried(rest, natural_hz, damping)
+        for natural_hz in np.geomspace(low, high, count).tolist()
+        if _apart(natural_hz, first_hz)
+        for damping in dampings
+    ]
+    best = sorted(tried, key=lambda pairs: pairs.misfit)[:FOLLOWED]
+    starts = [np.concatenate((x[:-SMOOTH], pairs.x)) for pairs in best]
+    ends = [_followed(spectra, start, first_hz) for start in starts]
+    return min(ends, key=lambda pairs: pairs.misfit, default=None)
 
 
 def _apart(natural_hz: float, first_hz: float | None) -> bool:

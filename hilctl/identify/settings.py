@@ -23,6 +23,8 @@ Choices: TypeAlias = Mapping[str, Any]
 _PLAIN = ("ppi", "spi", "rdpi")
 _SEARCHED = (*_PLAIN, "integrated")
 _PLAYS = (*_SEARCHED, "staged")
+_TABLES = ("field", "generalised_duhem")
+_STAGES = ("staged", *_TABLES)
 
 _HISTORIES = {"field", "generalised_duhem", "ppi", "spi"}
 
@@ -40,11 +42,10 @@ PUBLISHED: Mapping[str, Choices] = {
 """Defaults of single kinds; sections 3.4.2 (PPI), 5.3 (RDPI), 6.4."""
 
 
-def _of(*kinds: str, default: Any, description: str, **limits: Any) -> Any:
+def _of(kinds: tuple[str, ...], default: Any, description: str, **limits: Any) -> Any:
     """Return a field of these kinds of model; of all kinds if none is named."""
-    return Field(
-        default, description=description, json_schema_extra={"kinds": list(kinds)}, **limits
-    )
+    extra: dict[str, Any] = {"kinds": list(kinds)}
+    return Field(default, description=description, json_schema_extra=extra, **limits)
 
 
 class FitSettings(StrictModel):
@@ -52,122 +53,76 @@ class FitSettings(StrictModel):
 
     kind: FitKind = Field("integrated", description="Kind of model.")
     plays: int = _of(
-        *_PLAYS,
-        "asymmetric",
-        "generalised",
-        "butterfly",
-        "field",
-        default=12,
+        (*_PLAYS, "asymmetric", "generalised", "butterfly", "field"),
+        12,
+        "Play operators n; auto selects the number by held-out loops.",
         ge=1,
         le=200,
-        description="Play operators n; auto selects the number by held-out loops.",
     )
     deadbands: int = _of(
-        "integrated",
-        "staged",
-        "asymmetric",
-        default=8,
+        ("integrated", "staged", "asymmetric"),
+        8,
+        "Deadband operators k on each side of 0, 2 k + 1 in all.",
         ge=1,
         le=100,
-        description="Deadband operators k on each side of 0, 2 k + 1 in all.",
     )
     lines: int = _of(
-        "staged",
-        "preisach",
-        default=28,
+        ("staged", "preisach"),
+        28,
+        "Lines of a Preisach triangle, and cells of the longest line; or auto.",
         ge=2,
         le=100,
-        description="Lines of a Preisach triangle, and cells of the longest line; or auto.",
     )
-    drags: int = _of(
-        "field", default=3, ge=0, le=12, description="Drag operators; their small loops creep."
-    )
+    drags: int = _of(("field",), 3, "Drag operators; their small loops creep.", ge=0, le=12)
     cells: int = _of(
-        "field",
-        "generalised_duhem",
-        default=28,
+        _TABLES,
+        28,
+        "Pieces of each table, along the effective field or the displacement.",
         ge=3,
         le=60,
-        description="Pieces of each table, along the effective field or the displacement.",
     )
     across: int = _of(
-        "generalised_duhem",
-        default=20,
-        ge=2,
-        le=60,
-        description="Cells of a table of slopes across its band.",
+        ("generalised_duhem",), 20, "Cells of a table of slopes across its band.", ge=2, le=60
     )
-    knots: int = _of("field", default=24, ge=2, le=60, description="Pieces of the output curve.")
+    knots: int = _of(("field",), 24, "Pieces of the output curve.", ge=2, le=60)
     size: Literal["given", "auto"] = _of(
-        *_PLAYS,
-        default="given",
-        description="auto selects the number of operators by held-out loops.",
+        _PLAYS, "given", "auto selects the number of operators by held-out loops."
     )
     weights: Literal["exponential", "free"] = _of(
-        *_SEARCHED,
-        default="exponential",
-        description="Weights a e^(-b i) (3.26, 6.19-6.23), or each weight by itself.",
+        _SEARCHED, "exponential", "Weights a e^(-b i) (3.26, 6.19-6.23), or each weight by itself."
     )
     layout: Literal["even", "midpoint"] = _of(
-        *_PLAYS, default="even", description="Thresholds alpha i (3.25, 6.18), or alpha (i - 1/2)."
+        _PLAYS, "even", "Thresholds alpha i (3.25, 6.18), or alpha (i - 1/2)."
     )
     weight_by: Literal["equal", "hysteresis"] = _of(
-        *_PLAYS,
-        default="equal",
-        description="Weight of a loop: 1 (6.24), or its peak hysteresis (5.14).",
+        _PLAYS, "equal", "Weight of a loop: 1 (6.24), or its peak hysteresis (5.14)."
     )
-    offset: bool = _of(
-        *_PLAYS,
-        default=False,
-        description="Fit a constant displacement; published models have none.",
-    )
+    offset: bool = _of(_PLAYS, False, "Fit a constant displacement; published models have none.")
     creep: bool = _of(
-        *_PLAIN,
-        default=False,
-        description="Fit an offset and creep, c + d ln(1 + t / 0.1 s), per record.",
+        _PLAIN, False, "Fit an offset and creep, c + d ln(1 + t / 0.1 s), per record."
     )
-    creep_stage: bool = _of(
-        "staged",
-        "field",
-        "generalised_duhem",
-        default=True,
-        description="Fit creep if histories rest for 0.5 s or longer.",
-    )
-    modes: bool = _of(
-        "staged",
-        "field",
-        "generalised_duhem",
-        default=True,
-        description="Fit further modes of the structure to histories.",
-    )
+    creep_stage: bool = _of(_STAGES, True, "Fit creep if histories rest for 0.5 s or longer.")
+    modes: bool = _of(_STAGES, True, "Fit further modes of the structure to histories.")
     hysteresis: Literal["integrated", "preisach"] = _of(
-        "staged",
-        default="integrated",
-        description="Plays and deadbands, or a Preisach triangle.",
+        ("staged",), "integrated", "Plays and deadbands, or a Preisach triangle."
     )
     lag: Literal["growth", "plain", "none"] = _of(
-        "staged",
-        default="growth",
-        description="Field lag: growing with its distance, constant, or none.",
+        ("staged",), "growth", "Field lag: growing with its distance, constant, or none."
     )
-    structure: bool = _of("staged", default=True, description="Fit a second-order structure.")
-    delay: bool = _of("staged", default=True, description="Fit a transport delay.")
+    structure: bool = _of(("staged",), True, "Fit a second-order structure.")
+    delay: bool = _of(("staged",), True, "Fit a transport delay.")
     turning_um: float | None = _of(
-        "butterfly",
-        default=None,
-        description="Displacement where the wings meet; the lowest one if not set.",
+        ("butterfly",), None, "Displacement where the wings meet; the lowest one if not set."
     )
-    magnets: bool = _of("butterfly", default=True, description="Fit a bias field at zero command.")
-    starts: int = _of(
-        *_PLAYS, default=6, ge=1, le=1000, description="Starting points of the search."
-    )
+    magnets: bool = _of(("butterfly",), True, "Fit a bias field at zero command.")
+    starts: int = _of(_PLAYS, 6, "Starting points of the search.", ge=1, le=1000)
     peak_goal_percent: float | None = _of(
-        *_PLAYS,
-        default=None,
+        _PLAYS,
+        None,
+        "Reweight after the fit until no error is larger; percent of the stroke.",
         gt=0.0,
-        description="Reweight after the fit until no error is larger; percent of the stroke.",
     )
-    points: int = _of(default=300, ge=16, le=100_000, description="Points per loop.")
+    points: int = _of((), 300, "Points per loop.", ge=16, le=100_000)
 
     @model_validator(mode="before")
     @classmethod
@@ -194,9 +149,8 @@ class FitSettings(StrictModel):
     @model_validator(mode="after")
     def _fits(self) -> Self:
         if self.hysteresis == "preisach" and self.lag == "none":
-            raise ValueError(
-                "hysteresis: a Preisach triangle needs a lag, since it has no rate: omit lag=none"
-            )
+            rule = "a Preisach triangle needs a lag, since it has no rate: omit lag=none"
+            raise ValueError(f"hysteresis: {rule}")
         return self
 
     def has(self, name: str) -> bool:
@@ -211,9 +165,8 @@ class FitSettings(StrictModel):
     def changes(self) -> str:
         """Return settings that differ from the published ones, as ``key=value, key=value``."""
         published = type(self)(kind=self.kind).model_dump()
-        return ", ".join(
-            f"{name}={value}" for name, value in _differing(self.model_dump(), published)
-        )
+        changed = _differing(self.model_dump(), published)
+        return ", ".join(f"{name}={value}" for name, value in changed)
 
 
 class TableSettings(StrictModel):

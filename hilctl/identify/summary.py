@@ -77,19 +77,9 @@ def _span(limits: tuple[float, float]) -> str:
 def refinement_rows(found: Refinement) -> list[tuple[str, ...]]:
     """Return one row per held-out run under :data:`REFINEMENT_HEADINGS`."""
     before, after = (held.judgement.errors for held in (found.choice.before, found.choice.after))
-    return [
-        (
-            was.label,
-            *(
-                f"{figure:.3g}"
-                for figure in (
-                    was.peak_to_peak_um,
-                    was.peak_percent,
-                    now.peak_percent,
-                    was.rms_percent,
-                    now.rms_percent,
-                )
-            ),
-        )
-        for was, now in zip(before, after, strict=True)
-    ]
+    rows = []
+    for was, now in zip(before, after, strict=True):
+        figures = [was.peak_to_peak_um, was.peak_percent, now.peak_percent]
+        figures += [was.rms_percent, now.rms_percent]
+        rows.append((was.label, *(f"{figure:.3g}" for figure in figures)))
+    return rows

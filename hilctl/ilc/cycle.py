@@ -28,11 +28,7 @@ class CycleScore:
     Attributes:
         harmonics_um: complex128[K + 1], coefficients c_k of displacement less reference.
         noise_um: float64[K + 1], their standard deviations, from the scatter of the cycles.
-        step_hz: Frequency of the first harmonic.
-        cycles: Averaged cycles.
         peak_um: Peak error of the average cycle, as in reports.
-        rms_um: Its root mean square.
-        peak_to_peak_um: Peak-to-peak displacement of the average cycle.
         floor_um: Peak error that sensor noise alone would cause.
         strongest_hz: Frequency of the reference's strongest harmonic.
         answer: Displacement over reference at that frequency.
@@ -67,11 +63,6 @@ class CycleScore:
 
 def cycle_error(recording: Recording, segment: Segment, highest_hz: float) -> CycleScore:
     """Return the error of the steady cycles of a segment.
-
-    Args:
-        recording: The recording.
-        segment: A segment with a period.
-        highest_hz: Highest frequency of a harmonic.
 
     Raises:
         DataError: It has fewer than two whole steady cycles, or no motion.
@@ -109,16 +100,10 @@ def harmonic_count(period: float, step_hz: float, highest_hz: float) -> int:
 
 
 def coefficients(index: I64, period: float, signal: F64, count: int) -> C128:
-    """Return Fourier coefficients c_0 to c_count of whole cycles of a signal.
+    """Return Fourier coefficients of whole cycles of a signal: complex128[count + 1].
 
-    Args:
-        index: int64[n], sample index; phase 0 at multiples of ``period``.
-        period: Samples in one period.
-        signal: float64[n]; values that are not finite are omitted.
-        count: Highest harmonic.
-
-    Returns:
-        complex128[count + 1], in the signal's unit: a cosine of amplitude 1 has c_k = 0.5.
+    A cosine of amplitude 1 has c_k = 0.5. Phase 0 is at multiples of ``period``; values that are
+    not finite are omitted.
     """
     folded = cycle_metrics.fold(index, period, (signal,), _BINS)
     phase = folded.phase

@@ -25,7 +25,7 @@ from hilctl.experiment.correction import (
 from hilctl.experiment.preflight import CheckedExperiment
 from hilctl.ilc.cycle import cycle_error, harmonic_count
 from hilctl.ilc.results import IlcResult, IlcRow, row_of
-from hilctl.ilc.update import IlcState, begin, learn, refused
+from hilctl.ilc.update import IlcState, learn, refused
 from hilctl.recording.reader import read
 from hilctl.run.result import RunResult
 from hilctl.run.start import StepStoppedError, checked_experiment, paced
@@ -77,7 +77,7 @@ def beginning(checked: CheckedExperiment, segment: Segment) -> IlcState:
         if fits(cycle, checked.reference.values, segment):
             size = min(first.size, cycle.coefficients.size)
             first[:size] = cycle.coefficients[:size]
-    return begin(rate_hz, first, highest_hz)
+    return IlcState(rate_hz, highest_hz, first)
 
 
 Runner: TypeAlias = Callable[[Path, Sequence[str], Path], RunResult]
@@ -93,23 +93,15 @@ def correction_setting(file: Path) -> str:
 class IlcSession:
     """Session that learns the correction of every periodic waveform of an experiment.
 
-    Args:
-        experiment: Experiment file; learning continues from its correction, if it has one.
-        settings: ``key=value`` overrides.
-        folder: Folder of the recordings and corrections.
-        run: Function that runs an experiment.
-
-    Raises:
-        InputError: It has no compensator, or no waveform with enough whole steady cycles.
+    Learning continues from the correction of the experiment, if it has one. Raise InputError if it
+    has no compensator, or no waveform with enough whole steady cycles.
     """
 
     def __init__(
         self, experiment: Path, settings: Sequence[str], folder: Path, run: Runner = paced
     ) -> None:
-        self._experiment = experiment
-        self._settings = list(settings)
-        self._folder = folder
-        self._run = run
+        self._experiment, self._settings = experiment, list(settings)
+        self._folder, self._run = folder, run
         self._checked = checked_experiment(experiment, settings)
         self._segments = repeating(self._checked)
         self._learning = [beginning(self._checked, each) for each in self._segments]
@@ -119,15 +111,14 @@ class IlcSession:
     def learn(self, cycles: int, on_rows: Callable[[Sequence[IlcRow]], None]) -> IlcResult:
         """Run and learn until the error no longer improves.
 
-        Args:
-            cycles: Most runs after the first.
-            on_rows: Called after each run.
-
         Raises:
             InputError: The first run is rejected; nothing has moved.
             RunError: The first run ended by a fault.
         """
-        self._make_folder()
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"{self._folder}: can't be made: {error.strerror}") from None
         reason, stop_signal, fault = "", 0, False
         check: tuple[IlcRow, ...] = ()
         try:
@@ -155,16 +146,12 @@ class IlcSession:
                 self._refusals.append(str(error))
                 self._learning = [refused(each) for each in self._learning]
                 continue
-            on_rows(self._take(number, path))
+            rows = self._judge(number, path, learning=True)
+            self._rows += rows
+            on_rows(rows)
             if all(each.done for each in self._learning):
                 return "; ".join(sorted({each.done for each in self._learning}))
         return f"{cycles} learning cycles are done"
-
-    def _make_folder(self) -> None:
-        try:
-            self._folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(f"{self._folder}: can't be made: {error.strerror}") from None
 
     def _next_run(self, number: int, coefficients: Sequence[C128]) -> Path:
         """Run with a correction, which is kept beside the recording; return that."""
@@ -175,8 +162,7 @@ class IlcSession:
             for segment, each in zip(self._segments, coefficients, strict=True)
         ]
         write_correction(file, self._whole(cycles), overwrite=True)
-        settings = [*self._settings, correction_setting(file)]
-        settings += self._other_noise(number)
+        settings = [*self._settings, correction_setting(file), *self._other_noise(number)]
         result = self._run(self._experiment, settings, self._folder / f"{name}.mcap")
         if result.stop_signal and self._rows:
             raise StepStoppedError(f"run {number}: {result.reason}", result.stop_signal)
@@ -192,11 +178,6 @@ class IlcSession:
             return []
         first = self._checked.loaded.config.device.get("seed", field.default)
         return [f"device.seed={first + number}"]
-
-    def _take(self, number: int, path: Path) -> list[IlcRow]:
-        rows = self._judge(number, path, learning=True)
-        self._rows += rows
-        return rows
 
     def _judge(self, number: int, path: Path, *, learning: bool) -> list[IlcRow]:
         recording = read(path)

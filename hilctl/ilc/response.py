@@ -61,14 +61,7 @@ class Response:
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """A change of a correction and its effect.
-
-    Attributes:
-        step_hz: Frequency of the first harmonic.
-        correction_um: complex128[K + 1], change of the correction.
-        error_um: complex128[K + 1], change of the error.
-        noise_um: float64[K + 1], standard deviation of the change of the error.
-    """
+    """A change of a correction, complex128[K + 1], its effect on the error, and its noise."""
 
     step_hz: float
     correction_um: C128
@@ -92,12 +85,8 @@ def fit(changes: Sequence[Change], first: tuple[float, complex], sample_rate_hz:
     """Fit the response to all changes.
 
     Before the first change, the response to the reference gives an estimate of delay and resonance,
-    beyond the error of the remaining hysteresis.
-
-    Args:
-        changes: Changes and their effects.
-        first: Frequency of the reference's strongest harmonic, and displacement over reference.
-        sample_rate_hz: Samples per second.
+    beyond the error of the remaining hysteresis: ``first`` holds the frequency of the reference's
+    strongest harmonic, and displacement over reference.
     """
     parts = [change.points() for change in changes]
     frequency = np.concatenate([[first[0]], *(part[0] for part in parts)])

@@ -16,15 +16,9 @@ class IlcRow:
 
     Attributes:
         run: Number of the run; 0 is the first, before learning.
-        label: The waveform.
-        error_percent: Peak error of the average cycle, in percent of the peak-to-peak.
-        rms_percent: Its root mean square.
         floor_percent: Peak error that sensor noise alone would cause.
-        cycles: Averaged cycles.
-        reach_hz: Bandwidth of the correction.
         delay_samples: Delay between correction and displacement, identified so far.
         natural_hz: Resonance identified so far; None without one.
-        recording: The run's recording.
     """
 
     run: int
@@ -44,10 +38,7 @@ class IlcResult:
     """Result of learning.
 
     Attributes:
-        correction: The best correction.
-        rows: Every run, for each waveform.
         check: Verification run with the best correction, for each waveform; none if stopped.
-        reason: Reason for the end.
         stop_signal: Number of the signal that stopped it, or 0.
         fault: Whether a run ended by a fault, or could not be run or evaluated.
     """
@@ -79,16 +70,7 @@ class IlcResult:
 def row_of(
     number: int, segment: Segment, error: CycleScore, state: IlcState, reach_hz: float, path: Path
 ) -> IlcRow:
-    """Return the row of a run for one waveform.
-
-    Args:
-        number: Number of the run.
-        segment: The waveform.
-        error: Its error.
-        state: State of learning after the run.
-        reach_hz: Bandwidth of the run's correction.
-        path: The run's recording.
-    """
+    """Return the row of a run for one waveform, with the state of learning after the run."""
     return IlcRow(
         run=number,
         label=segment.label,

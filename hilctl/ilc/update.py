@@ -42,13 +42,7 @@ _WORSE = 1.05
 
 @dataclass(frozen=True, slots=True)
 class IlcIteration:
-    """One run.
-
-    Attributes:
-        correction_um: complex128[K + 1], coefficients of its correction.
-        error: Its error.
-        reach_hz: Bandwidth of its correction.
-    """
+    """One run: coefficients of its correction complex128[K + 1], its error and its bandwidth."""
 
     correction_um: C128
     error: CycleScore
@@ -60,21 +54,18 @@ class IlcState:
     """State of the learning of one waveform.
 
     Attributes:
-        sample_rate_hz: Samples per second.
         highest_hz: Highest bandwidth.
         next_um: complex128[K + 1], correction for the next run.
-        reach_hz: Its bandwidth.
+        reach_hz: Its bandwidth; 0.0 before the first run.
         gain: Share of the error that the next step removes.
         widening: Factor of the bandwidth after an improvement.
         response: Response of the displacement to a change of the correction.
-        trials: Runs so far.
-        done: Reason for the end of learning, or empty.
     """
 
     sample_rate_hz: float
     highest_hz: float
     next_um: C128
-    reach_hz: float
+    reach_hz: float = 0.0
     gain: float = FIRST_GAIN
     widening: float = _WIDEN
     response: Response = field(default_factory=Response)
@@ -90,17 +81,6 @@ class IlcState:
     def closest(self) -> IlcIteration:
         """The run with the smallest rms error, which is less sensitive to noise and corners."""
         return min(self.trials, key=lambda trial: trial.error.rms_um)
-
-
-def begin(sample_rate_hz: float, first_um: C128, highest_hz: float) -> IlcState:
-    """Return the state before the first run.
-
-    Args:
-        sample_rate_hz: Samples per second.
-        first_um: complex128[K + 1], correction of the first run.
-        highest_hz: Highest bandwidth of a correction.
-    """
-    return IlcState(sample_rate_hz, highest_hz, first_um, reach_hz=0.0)
 
 
 def learn(before: IlcState, error: CycleScore) -> IlcState:

@@ -39,7 +39,6 @@ def within(adaptation, operator):
 @given(BOUNDS, st.lists(st.tuples(VALUES, VALUES, st.booleans()), min_size=1, max_size=60))
 @example(AdaptationBounds(0.0, 0.0, 0.0625), [(1e308, 0.0, False), (0.0, 0.0, False)])
 def test_any_displacements(bounds, rows):
-    """Readings of any kind, flagged or not, after any references."""
     adaptation, operator = adapting(bounds)
     for reference, displacement, flagged in rows:
         made = made_block(3)

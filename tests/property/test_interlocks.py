@@ -117,7 +117,6 @@ class Rules:
 
 @given(limits(), ROWS)
 def test_follows_the_stated_rules(settings, rows):
-    """Flags and the first trip are those of the rules; where nothing is flagged nothing trips."""
     trip, flags = judged(settings, rows)
     rules = Rules(settings)
     expected = [int(rules.flags(*row)) for row in rows]
@@ -131,7 +130,6 @@ def test_follows_the_stated_rules(settings, rows):
 
 @given(limits(), ROWS, st.lists(st.integers(0, 60), max_size=6))
 def test_any_cut_gives_the_same_trip(settings, rows, cuts):
-    """Cut into blocks anywhere: the same trip for the same reason, the same flags."""
     assert_same(judged(settings, rows), judged(settings, rows, cuts))
     assert_same(judged(settings, rows), judged(settings, rows, range(len(rows))))
 
@@ -143,7 +141,6 @@ def assert_same(whole, cut):
 
 @given(limits(), ROWS, st.integers(1, 10_000))
 def test_any_reading_after_a_gap_is_judged(settings, rows, gap):
-    """A gap of any length before any samples leaves the memory fit for what follows."""
     finite = [row for row in rows if all(map(math.isfinite, row))]
     if not finite:
         return

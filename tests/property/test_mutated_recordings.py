@@ -38,7 +38,7 @@ from hilctl.base.segments import Segment
 from hilctl.cli.reports import render_report
 from hilctl.experiment.initial_state import initial_state_after
 from hilctl.identify.data.cycles import loops_from_recording
-from hilctl.identify.data.data_files import history_from_recording
+from hilctl.identify.data.data_files import history_from_pieces
 from hilctl.kernels.hysteresis import play_sum
 from hilctl.models.base import HysteresisModel
 from hilctl.models.generalised_pi import GeneralisedModel, PlayEnvelope
@@ -352,7 +352,7 @@ def _pieces(_recording: Recording, path: Path) -> None:
 
 def _identify(recording: Recording, _path: Path) -> None:
     with suppress(HilctlError):
-        history_from_recording(recording)
+        history_from_pieces([recording])
     loops_from_recording(recording)
 
 
@@ -414,7 +414,7 @@ def outcomes(path: Path, commands: Iterable[str] = COMMANDS) -> Iterator[tuple[s
 
 @pytest.mark.slow
 @pytest.mark.parametrize("part", range(4))
-def test_damaged_recordings_are_read_or_rejected(tmp_path: Path, part: int) -> None:
+def test_damaged_recordings_are_read_or_rejected(tmp_path, part):
     path = tmp_path / "damaged.mcap"
     found = []
     for number in range(part, FILES, 4):
@@ -444,7 +444,7 @@ def check_bounds(folder: Path) -> None:
 
 
 @pytest.mark.slow
-def test_kernels_stay_within_their_arrays(tmp_path: Path, request: pytest.FixtureRequest) -> None:
+def test_kernels_stay_within_their_arrays(tmp_path, request):
     """A process and a kernel cache of their own, compiled with bounds checks."""
     cache = request.config.cache.mkdir("kernels-with-bounds-checks")
     checked = {"NUMBA_BOUNDSCHECK": "1", "NUMBA_CACHE_DIR": str(cache)}

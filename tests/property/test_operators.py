@@ -87,7 +87,6 @@ def size_of(*arrays):
 
 @given(models(), signals(), st.data(), st.sampled_from(("forward", "inverse")))
 def test_any_cut_into_blocks_gives_the_same_bits(model, v, data, direction):
-    """One call, single samples or any blocks, empty ones too: the same output and memory."""
     whole = operator_of(model, direction)
     expected = whole.process(v)
     cuts = sorted(data.draw(st.lists(st.integers(0, v.size), max_size=10)))
@@ -100,7 +99,6 @@ def test_any_cut_into_blocks_gives_the_same_bits(model, v, data, direction):
 
 @given(models(), signals(), st.data(), st.sampled_from(("forward", "inverse")))
 def test_a_restored_state_resumes_with_the_same_bits(model, v, data, direction):
-    """A state taken anywhere and given to a new operator goes on as the old one did."""
     cut = data.draw(st.integers(0, v.size))
     first = operator_of(model, direction)
     first.process(v[:cut])
@@ -146,7 +144,6 @@ def test_stops_and_plays_are_one_inverse(parameters, y):
 
 @given(still_models, signals(), signals(), st.floats(0.0, 50.0), st.sampled_from((1.0, -1.0)))
 def test_a_larger_loop_wipes_out_what_went_on_inside(model, first, second, more, side):
-    """Once the input has been to both extremes and back, loops inside leave no trace."""
     outer = size_of(first, second) + more
     run_up = [0.0, -side * outer]
     left = []
@@ -159,7 +156,6 @@ def test_a_larger_loop_wipes_out_what_went_on_inside(model, first, second, more,
 
 @given(still_models, signals(), st.data())
 def test_without_rate_only_the_turning_points_count(model, v, data):
-    """Extra samples on the way from one value to the next, at any rate, change no value."""
     values = v.tolist()
     finer, kept = values[:1], [0]
     for start, end in itertools.pairwise(values):
@@ -176,7 +172,6 @@ def test_without_rate_only_the_turning_points_count(model, v, data):
     hnp.arrays(np.float64, st.integers(1, 60), elements=st.floats(-1e150, 1e150)),
 )
 def test_the_inverse_is_bounded(model, y):
-    """For any finite input the command is finite, and within twice that of no hysteresis."""
     command = model.inverse(SAMPLE_RATE_HZ).process(y)
     x = model.deadband.inverse()(y) if isinstance(model, IntegratedModel) else y
     assert np.all(np.isfinite(command))
@@ -185,7 +180,6 @@ def test_the_inverse_is_bounded(model, y):
 
 @given(models(offset=False), signals())
 def test_plays_lag_and_never_lead(model, v):
-    """A sum of plays lies between the sums that all plays ahead and all plays behind would give."""
     if isinstance(model, IntegratedModel):
         model = RdpiModel(direct=model.direct, weights=model.weights, thresholds=model.thresholds)
     y = model.forward(SAMPLE_RATE_HZ).process(v)
@@ -214,7 +208,6 @@ def test_deadbands_rise(function, values):
 
 @given(models(), signals())
 def test_a_model_survives_its_file(model, v):
-    """Through YAML and back: an equal model, and the same bits out of its operators."""
     back = parse_model("round trip", dump_model(model))
     assert back == model
     for direction in ("forward", "inverse"):

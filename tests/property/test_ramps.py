@@ -76,7 +76,6 @@ class TestStart:
 
     @pytest.mark.parametrize("latency", [0, 3])
     def test_the_ramp_is_recorded_before_the_waveform(self, latency):
-        """Each of its samples, flagged, without a reference; the count goes on in the waveform."""
         device = FakeFifoDevice(latency, 4.0) if latency else FakeDevice(4.0)
         rig = Rig(sine(230), block=10, device=device)
         outcome = rig.run()
@@ -94,7 +93,6 @@ class TestStart:
         assert event.values == {"output": 4.0, "samples": 40.0}
 
     def test_nothing_is_different_where_the_output_is_safe(self):
-        """No ramp, no event, and the first sample is that of the waveform."""
         rig = Rig(sine(230), block=10)
         rig.run()
         assert rig.waveform_at == 0
@@ -111,7 +109,6 @@ class TestStart:
 
     @pytest.mark.parametrize("block", [1, 10])
     def test_a_stop_on_the_way_in_ends_at_the_safe_value(self, block):
-        """By the same slew, and no sample of the waveform is put out."""
         asked = iter([""] * 2 + ["stopped by Ctrl-C"] * 1000)
         device = FakeDevice(4.0)
         rig = Rig(np.full(1000, 2.0), block=block, device=device, stop=lambda: next(asked))
@@ -150,7 +147,6 @@ class TestStart:
 
     @pytest.mark.parametrize("stalled", [0, 1, 25, 29])
     def test_late_ticks_shift_the_schedule(self, stalled):
-        """No sample of the ramp is skipped, and none of the waveform."""
         plain = Rig(sine(300), device=FakeDevice(1.0 + STEP))
         plain.run()
         clock = FakeClock(stall_ns={stalled: 12_000_000})
@@ -233,14 +229,12 @@ class TestByTime:
         assert np.ptp(sent_s[leaving:]) == pytest.approx(2.5, abs=0.5)
 
     def test_the_stall_before_the_ramp_is_not_made_up_for(self):
-        """The first step of a ramp is one step, however long the output had stood still."""
         clock = FakeClock(stall_ns={30: 2_000_000_000})
         rig = Rig(np.full(10_000, 5.0), clock=clock)
         assert "2.000 s late" in rig.run().reason
         assert rig.device.commands[30] == pytest.approx(5.0 - RAMP_STEP)
 
     def test_deadlines_go_on_through_the_ramp_out(self):
-        """They shift on the ramp in only, by each exchange."""
         rig = slow_rig(lambda number: 0.01, sine(100), output=4.0)
         rig.run()
         waited = [
@@ -251,7 +245,6 @@ class TestByTime:
         assert set(waited[40:]) == {400_000_000}
 
     def test_ramps_with_gaps_are_replayed(self):
-        """Bit for bit."""
         golden = read(GOLDEN)
         slower = golden.experiment_yaml.replace("slew_a_per_s: 20000.0", "slew_a_per_s: 2000.0")
         slower = slower.replace("sample_rate_hz: 50000", f"sample_rate_hz: {RATE_HZ:g}")

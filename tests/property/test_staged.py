@@ -70,7 +70,6 @@ def cut_up(operator, signal, sizes):
 
 @given(models(), RATES_HZ, SIGNALS, st.lists(st.integers(1, 20), max_size=8))
 def test_any_cut_gives_the_same_bits_and_every_one_is_finite(model, rate_hz, signal, sizes):
-    """Forwards and backwards, blocks don't matter, and no finite input gives anything else."""
     for direction in (model.forward, model.inverse):
         whole = direction(rate_hz).process(signal.copy())
         assert np.isfinite(whole).all()
@@ -79,7 +78,6 @@ def test_any_cut_gives_the_same_bits_and_every_one_is_finite(model, rate_hz, sig
 
 @given(models(), RATES_HZ, SIGNALS)
 def test_inverse_is_bounded(model, rate_hz, signal):
-    """Commands are within what the stages' largest gains make of the hysteresis' inverse."""
     command = model.inverse(rate_hz).process(signal.copy())
     gain, width = 1.0, model.smoothing_s * rate_hz
     if (structure := model.structure) is not None:
@@ -101,14 +99,11 @@ def test_inverse_is_bounded(model, rate_hz, signal):
 
 @given(
     models(
-        structures=st.none(),
-        delays_s=st.integers(0, 9).map(lambda n: n / 5e3),
-        smoothings_s=NONE_S,
+        structures=st.none(), delays_s=st.integers(0, 9).map(lambda n: n / 5e3), smoothings_s=NONE_S
     ),
     SIGNALS,
 )
 def test_inverse_meets_what_the_lag_can_follow(model, signal):
-    """Without structure or rate the model comes back to any reference, where the lag keeps up."""
     rate_hz = 5e3
     if isinstance(model.hysteresis, RdpiModel):
         still = model.hysteresis.model_copy(update={"gamma_s": 0.0})
@@ -127,5 +122,4 @@ def test_inverse_meets_what_the_lag_can_follow(model, signal):
 
 @given(models())
 def test_files_keep_every_bit(model):
-    """Dumped and read back, a model is equal to itself."""
     assert parse_model("text", dump_model(model)) == model

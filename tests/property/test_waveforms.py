@@ -150,8 +150,7 @@ def check_segments(segments: tuple[Segment, ...], samples: int) -> None:
 
 @given(singles)
 @settings(deadline=None)
-def test_finite_bounded_and_of_the_right_length(w: Keys) -> None:
-    """Samples are finite, within offset and amplitude, and as many as the duration has."""
+def test_finite_bounded_and_of_the_right_length(w):
     reference = made(w)
     values = reference.values
     assert np.isfinite(values).all()
@@ -162,14 +161,13 @@ def test_finite_bounded_and_of_the_right_length(w: Keys) -> None:
 
 @given(singles)
 @settings(deadline=None)
-def test_deterministic(w: Keys) -> None:
-    """The same keys give the same bits."""
+def test_deterministic(w):
     assert made(w).values.tobytes() == made(w).values.tobytes()
 
 
 @given(singles)
 @settings(deadline=None)
-def test_soft_ends_are_zero(w: Keys) -> None:
+def test_soft_ends_are_zero(w):
     """Where there is room for a soft start or end, the waveform begins or ends at 0."""
     reference = made(w)
     segment = reference.segments[0]
@@ -184,8 +182,7 @@ def test_soft_ends_are_zero(w: Keys) -> None:
 
 @given(st.lists(singles, min_size=1, max_size=4), st.integers(1, 3))
 @settings(deadline=None, max_examples=50)
-def test_sequence_is_its_parts(parts: list[Keys], repeat: int) -> None:
-    """A sequence is its parts one after the other, with a segment for each."""
+def test_sequence_is_its_parts(parts, repeat):
     reference = made({"kind": "sequence", "parts": tuple(parts), "repeat": repeat})
     alone = np.concatenate([made(part).values for part in parts] * repeat)
     np.testing.assert_array_equal(reference.values, alone)

@@ -37,6 +37,9 @@ TEXTS = [
 ]  # fmt: skip
 
 
+EVERY = [*SCALARS, *((text, text) for text in TEXTS)]
+
+
 def same(a: Any, b: Any) -> bool:
     """Return whether values have the same type and the same bits."""
     if isinstance(a, float) and isinstance(b, float):
@@ -44,8 +47,8 @@ def same(a: Any, b: Any) -> bool:
     return type(a) is type(b) and bool(a == b)
 
 
-@pytest.mark.parametrize(("text", "value"), [*SCALARS, *((text, text) for text in TEXTS)])
-def test_scalars_are_those_of_the_core_schema(text: str, value: Any) -> None:
+@pytest.mark.parametrize(("text", "value"), EVERY)
+def test_scalars_are_those_of_the_core_schema(text, value):
     """Numbers, booleans and nothing as YAML 1.2 has them; quotes make any of them text."""
     data = Document("x.yaml", f"bare: {text}\nlist:\n- {text}\nquoted: '{text}'\n").data
     assert same(data["bare"], value)
@@ -110,11 +113,8 @@ READERS = [(read_experiment, EXPERIMENT), (read_model, MODEL), (read_profile, PR
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("read", "template"), READERS)
-@pytest.mark.parametrize(("text", "value"), [*SCALARS, *((text, text) for text in TEXTS)])
-def test_every_reader_reads_the_same(
-    read: Callable[[str], tuple[Any, Any]], template: str, text: str, value: Any
-) -> None:
-    """What is text or a number to one reader is so to all; the rest is refused with its line."""
+@pytest.mark.parametrize(("text", "value"), EVERY)
+def test_every_reader_reads_the_same(read, template, text, value):
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     for place, filler, wanted in (("DESCRIPTION", "1.0", str), ("NUMBER", "words", float)):
         other = {"DESCRIPTION": "NUMBER", "NUMBER": "DESCRIPTION"}[place]
@@ -136,10 +136,7 @@ def test_every_reader_reads_the_same(
     ("[" * 40, "nested more than 32"), ('"\\ud800"', "half a character"), ("[1", "expected"),
     ("\x07", "U+0007"),
 ])  # fmt: skip
-def test_every_reader_refuses_the_same(
-    read: Callable[[str], tuple[Any, Any]], template: str, number: str, reason: str
-) -> None:
-    """Aliases, tags and broken YAML are refused by all, with the line and the reason."""
+def test_every_reader_refuses_the_same(read, template, number, reason):
     text = template.replace("NUMBER", number).replace("DESCRIPTION", "words")
     with pytest.raises(ConfigError) as caught:
         read(text)
@@ -151,8 +148,7 @@ def test_every_reader_refuses_the_same(
 
 
 @pytest.mark.parametrize("load", [load_model, lambda path: load_profile(str(path))])
-def test_files_that_can_not_be_read_are_refused_alike(load: Any, tmp_path: Path) -> None:
-    """Models and profiles say the same of a file that is not text."""
+def test_files_that_can_not_be_read_are_refused_alike(load, tmp_path):
     path = tmp_path / "x.yaml"
     path.write_bytes(b"\xff\xfe")
     with pytest.raises(Exception, match=r"x\.yaml: .*UTF-8"):
@@ -188,26 +184,24 @@ def alike(a: Any, b: Any) -> bool:
 
 
 @given(DATA)
-def test_what_is_dumped_reads_back_the_same(data: dict[str, Any]) -> None:
-    """Every text, number and nesting comes back, bit for bit."""
+def test_what_is_dumped_reads_back_the_same(data):
     assert alike(Document("x.yaml", dump(data)).data, data)
 
 
 @given(st.one_of(TEXT, LOOKALIKE, st.floats(allow_nan=False), st.integers(-(2**63), 2**64 - 1)))
-def test_other_programs_read_what_is_dumped(value: Any) -> None:
+def test_other_programs_read_what_is_dumped(value):
     """A reader of YAML 1.1 finds the same scalar: what it would take for another is quoted."""
     assert same(yaml.safe_load(dump({"a": value}))["a"], value)
 
 
-def test_dumped_lists_that_are_one_object_stand_twice() -> None:
+def test_dumped_lists_that_are_one_object_stand_twice():
     """No aliases are written: they would be refused on reading."""
     weights = (0.5, 0.25)
     text = dump({"a": weights, "b": weights, "c": [weights]})
     assert Document("x.yaml", text).data == {"a": weights, "b": weights, "c": (weights,)}
 
 
-def test_dumped_text_is_as_people_write_it() -> None:
-    """Plain words stay bare; what one of the YAMLs reads as something else is quoted."""
+def test_dumped_text_is_as_people_write_it():
     data = {"a": "words", "b": "on", "c": "1e3", "d": "0o10", "e": 1e-05, "f": 1e22, "g": "1:30"}
     assert dump(data) == (
         "a: words\nb: 'on'\nc: '1e3'\nd: '0o10'\ne: 1.0e-05\nf: 1.0e+22\ng: '1:30'\n"
@@ -222,7 +216,7 @@ def test_dumped_text_is_as_people_write_it() -> None:
         ("a: &x [1]\nb: [" + "*x," * 9 + "]", "aliases"),
     ],
 )
-def test_too_much_is_refused_at_once(text: str, rule: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_much_is_refused_at_once(text, rule, monkeypatch):
     monkeypatch.setattr(io, "MAX_VALUES", 500)
     with pytest.raises(ConfigError, match=rule):
         Document("large.yaml", text)
@@ -320,8 +314,7 @@ def refusal(text: str, folder: Path) -> InputError | None:
 @pytest.mark.parametrize(
     "part", [0, *(pytest.param(part, marks=pytest.mark.slow) for part in range(1, PARTS))]
 )
-def test_damaged_experiments_are_refused_in_words(tmp_path: Path, part: int) -> None:
-    """No crash and no hang; what is refused says where, and nothing is written."""
+def test_damaged_experiments_are_refused_in_words(tmp_path, part):
     (tmp_path / "model.yaml").write_text(RDPI_MODEL, encoding="utf-8")
     chance = random.Random(part)
     texts = [mutated(GOOD[number % 2], chance) for number in range(FILES // PARTS)]
@@ -335,8 +328,7 @@ def test_damaged_experiments_are_refused_in_words(tmp_path: Path, part: int) -> 
 
 @pytest.mark.parametrize("files", [FILES // 160, pytest.param(FILES // 40, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", ["adam_4024", "adam_4024_ascii", "cobs_board", "labjack_t7"])
-def test_damaged_profiles_are_refused_in_words(name: str, files: int) -> None:
-    """No crash and no hang; every refusal has a line, a rule, and no word of pydantic's types."""
+def test_damaged_profiles_are_refused_in_words(name, files):
     good = (FOLDER / f"{name}.yaml").read_text(encoding="utf-8")
     chance = random.Random(name)
     problems: list[ConfigProblem] = []

@@ -104,7 +104,7 @@ def test_a_saved_model_runs_like_any_other(models, folder, name):
     recording = read(path)
     assert replay(recording).identical
     loaded = load_experiment(CONFIGS / "terfenol_sine_6a.yaml", settings)
-    device = TrialDevice(loaded, [loaded.config.waveform], CONFIGS)
+    device = TrialDevice(loaded, [loaded.config.waveform])
     (trial,) = device.run(loaded.model, device.references[0])
     report = summarize(recording)
     for figure in ("peak_hysteresis_percent", "peak_error_percent", "rms_error_percent"):

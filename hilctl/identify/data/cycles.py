@@ -26,13 +26,10 @@ FULL = 0.5  # minimum peak-to-peak command of the steady part, of the total
 
 
 def similarity(signal: F64) -> F64:
-    """Return the autocorrelation of a signal without its mean.
+    """Return the autocorrelation of a signal without its mean, for lags beyond n / 2: float64[m].
 
     Each lag is normalised by the energy of the two parts it compares, so that 1 is a perfect
     repetition whatever the number of samples.
-
-    Returns:
-        float64[m], for lags from 0 to beyond n / 2, the period of two cycles.
     """
     x = signal - signal.mean()
     n = x.size
@@ -49,12 +46,8 @@ def similarity(signal: F64) -> F64:
 def find_period(label: str, command: F64) -> tuple[float, int, int]:
     """Find the shortest period of a command at full amplitude, and its steady part.
 
-    Returns:
-        Period in samples, not necessarily an integer; first sample and end of the steady part,
-        which is at least two periods long.
-
-    Raises:
-        DataError: It does not repeat.
+    Return the period in samples, and start and end of the steady part, which is at least two
+    periods long. Raise DataError if it does not repeat.
     """
     alike = similarity(command)
     for top in _tops(alike)[:CANDIDATES]:
@@ -107,12 +100,7 @@ def _refined(command: F64, period: float) -> float:
 def steady_stretch(command: F64, period: float) -> tuple[int, int] | None:
     """Return the longest interval in which a command repeats at full amplitude.
 
-    Args:
-        command: float64[n].
-        period: Samples per period.
-
-    Returns:
-        First sample and end, at least two periods except for rounding; None if there is none.
+    It is at least two periods long, except for rounding; None if there is none.
     """
     span = float(np.ptp(command))
     later = np.arange(command.size - math.ceil(period))
@@ -141,15 +129,6 @@ class CycleMean:
     Samples are averaged in bins around evenly spaced phases, at most one bin per sample of a
     period, so that a period of any length fills all bins. A periodic spline through the means, at
     the mean phase of their samples, gives the points.
-
-    Args:
-        label: Label for errors.
-        period: Samples per period.
-        points: Points of the mean cycle.
-        signals: Number of signals.
-
-    Raises:
-        DataError: The period is too short.
     """
 
     def __init__(self, label: str, period: float, points: int, signals: int) -> None:
@@ -165,12 +144,7 @@ class CycleMean:
         self._sums = np.zeros((signals, bins))
 
     def add(self, phase: F64, values: F64) -> None:
-        """Add samples.
-
-        Args:
-            phase: float64[n], time in periods since the start of the first cycle.
-            values: float64[m, n], signals.
-        """
+        """Add signals, float64[m, n], at times in periods since the start of the first cycle."""
         bins = self._bins
         nearest = np.floor(phase * bins + 0.5)
         index = nearest.astype(np.int64) % bins
@@ -180,11 +154,7 @@ class CycleMean:
             self._sums += [np.bincount(index, row, bins) for row in values]
 
     def cycle(self) -> F64:
-        """Return the mean cycle: float64[m, points]; the first point has phase 0.
-
-        Raises:
-            DataError: Samples are missing around a phase, or values can't be averaged.
-        """
+        """Return the mean cycle: float64[m, points]; the first point has phase 0."""
         if not self._count.all():
             missing = int(np.argmin(self._count))
             raise DataError(
@@ -204,18 +174,7 @@ class CycleMean:
 def average_cycle(label: str, phase: F64, values: F64, period: float, points: int) -> F64:
     """Return the mean cycle at points evenly spaced in time, see :class:`CycleMean`.
 
-    Args:
-        label: Label for errors.
-        phase: float64[n], time in periods since the start of the first cycle.
-        values: float64[m, n], signals.
-        period: Samples per period.
-        points: Points of the mean cycle.
-
-    Returns:
-        float64[m, points]; the first point has phase 0.
-
-    Raises:
-        DataError: The period is too short, or samples are missing around a phase.
+    The phase, float64[n], is time in periods since the start of the first cycle.
     """
     mean = CycleMean(label, period, points, len(values))
     mean.add(phase, values)
@@ -235,12 +194,6 @@ def loops_from_pieces(
     """Return the averaged steady cycle of each segment of a recording.
 
     Samples with a displacement that is not finite are ignored.
-
-    Args:
-        pieces: A run with at least one repeating segment, see
-            :class:`hilctl.recording.reader.RecordingStream`.
-        points: Points per loop; published are 200, 300 and 400.
-        labels: Labels of segments to use; all if empty.
 
     Raises:
         DataError: A label is unknown, a segment has no steady cycle, or there is no segment.
@@ -299,10 +252,6 @@ def find_cycles(history: History, points: int = 300) -> SteadyLoop:
 
     The period is that of the command. If there is more than one cycle, the first is ignored,
     because the hysteresis still depends on what came before.
-
-    Args:
-        history: Samples that repeat at full amplitude for at least two cycles.
-        points: Points per loop.
 
     Raises:
         DataError: Nothing repeats.

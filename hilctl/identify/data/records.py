@@ -24,7 +24,6 @@ class SteadyLoop:
         label: Name of the record, such as ``sine 6 A 10 Hz``.
         command: float64[M], command in the device's unit.
         displacement_um: float64[M].
-        frequency_hz: Cycles per second.
         sample_rate_hz: Sample rate of the run that it was averaged from; 0.0 if unknown.
     """
 
@@ -40,17 +39,14 @@ class SteadyLoop:
             raise DataError(f"{self.label}: frequency_hz must be > 0: {self.frequency_hz!r}")
 
     def rate(self) -> F64:
-        """Return the rate of the command at each point, as in a run at ``sample_rate_hz``.
+        """Return the rate of the command at each point, float64[M], as in a run.
 
         A model uses the backward difference over one sample of a run. So the difference is taken
-        over one sample of the run on a periodic spline, not over points of the loop, which would
-        be late by half a point. If the sample rate is unknown, it is the derivative of the spline.
+        over one sample of the run on a periodic spline, not over points of the loop, which would be
+        late by half a point. If the sample rate is unknown, it is the derivative of the spline.
 
         A run with fewer samples per cycle than points turns its command at other phases: the error
         is 0.2 % of the stroke for 200 samples, and below 0.02 % for 333 and more.
-
-        Returns:
-            float64[M], command units per second.
         """
         points = self.command.size
         time = np.arange(points + 1) / (points * self.frequency_hz)
@@ -61,13 +57,10 @@ class SteadyLoop:
         return np.asarray((self.command - before) * self.sample_rate_hz, dtype=np.float64)
 
     def run(self) -> tuple[F64, F64, int]:
-        """Return two periods to simulate, of which the second is evaluated.
+        """Return two periods to simulate, their rate, and the number of samples not evaluated.
 
         One period from rest brings every play operator to its periodic state, because it clips its
         state to a range.
-
-        Returns:
-            Command float64[2 M], its rate float64[2 M], number of samples that are not evaluated.
         """
         return np.tile(self.command, 2), np.tile(self.rate(), 2), self.command.size
 
@@ -80,10 +73,8 @@ class History:
     before the first evaluated sample.
 
     Attributes:
-        label: Name of the record.
         command: float64[n], command in the device's unit.
         displacement_um: float64[n].
-        sample_rate_hz: Samples per second.
         ignore: Samples at the start that are not evaluated.
     """
 
@@ -112,13 +103,7 @@ class History:
         """Return the history with the displacement taken ``lag_samples`` later.
 
         For sensors or recorders with a delay. The model does not contain this lag, and its
-        compensator does not invert it.
-
-        Args:
-            lag_samples: Whole samples by which the displacement lags the command, >= 0.
-
-        Raises:
-            DataError: It is negative or leaves too few samples.
+        compensator does not invert it. Raise DataError if it is negative or leaves too few samples.
         """
         if lag_samples < 0:
             raise DataError(f"{self.label}: lag_samples must be >= 0: {lag_samples}")
@@ -132,12 +117,7 @@ class History:
         )
 
     def run(self) -> tuple[F64, F64, int]:
-        """Return the samples to simulate.
-
-        Returns:
-            Command float64[n], its rate float64[n] (backward difference; 0 at the first sample),
-            number of samples that are not evaluated.
-        """
+        """Return samples to simulate, their backward difference, and the number not evaluated."""
         rate = np.diff(self.command, prepend=self.command[0]) * self.sample_rate_hz
         return np.ascontiguousarray(self.command), rate, self.ignore
 
@@ -147,12 +127,7 @@ Records: TypeAlias = Sequence[SteadyLoop | History]
 
 
 def check_signals(label: str, command: F64, displacement_um: F64) -> None:
-    """Check that command and displacement can be used.
-
-    Raises:
-        DataError: They differ in length, are too short, contain a value that is not finite, or
-            one of them is constant.
-    """
+    """Raise DataError if signals differ in length, are short, constant or not finite."""
     if command.ndim != 1 or command.shape != displacement_um.shape:
         raise DataError(
             f"{label}: command and displacement_um must have the same length: "
@@ -179,12 +154,7 @@ SEED = 1
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ThinHistory(History):
-    """Some samples of a history.
-
-    Attributes:
-        index: int64[n], their numbers in the whole.
-        rates: float64[n], rate of the command at each, computed from the whole.
-    """
+    """Some samples of a history, with their numbers in the whole and rates computed from it."""
 
     index: I64
     rates: F64

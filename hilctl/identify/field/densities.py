@@ -31,10 +31,7 @@ class Grid:
     """Thresholds and cells of the operators, in command units.
 
     Attributes:
-        thresholds: float64[p], of the plays, rising from 0.
-        lengths: float64[d], of the drags.
         lowest: Lower end of the first cell of the effective field.
-        width: Width of a cell.
         cells: Number of cells of a drag, and of splines of a play over the same range, >= 3.
         knots: Pieces of the curve.
     """
@@ -81,7 +78,6 @@ class Weights:
         slopes: float64[lines, cells], um per command unit; for plays, weights of their splines.
         curve: From the output of the operators to displacement, without the offset.
         offset_um: Displacement at rest.
-        errors_um: float64[N], modelled less measured displacement of the rows.
         squares: Weighted sum of squares of the operators' errors and of the prior.
     """
 
@@ -100,16 +96,12 @@ class Weights:
 def table(paths: Sequence[F64], kept: Sequence[I64], grid: Grid) -> F64:
     """Return the output of each operator for each cell: float64[N, lines cells].
 
-    Args:
-        paths: For each record, float64[n], effective field from rest.
-        kept: For each record, int64[N_i], samples that are rows.
-        grid: The operators.
+    Each record has an effective field from rest, float64[n], of which the kept samples are rows.
     """
     plays, cells = grid.thresholds.size, grid.cells
     parts: list[F64] = []
     for path, samples in zip(paths, kept, strict=True):
-        points, rows = np.empty(path.size, dtype=np.int64), np.empty_like(samples)
-        u = path[points[: needed_points(path, samples, points, rows)]]
+        u, rows = _needed(path, samples)
         out = np.empty((rows.size, grid.lines * cells))
         play_columns(u, rows, grid.thresholds, grid.lowest, grid.piece, cells, out)
         for i, length in enumerate(grid.lengths):
@@ -119,25 +111,23 @@ def table(paths: Sequence[F64], kept: Sequence[I64], grid: Grid) -> F64:
     return np.concatenate(parts)
 
 
+def _needed(path: F64, samples: I64) -> tuple[F64, I64]:
+    """Return the points of a path that operators need, and the place of each row among them."""
+    points, rows = np.empty(path.size, dtype=np.int64), np.empty_like(samples)
+    return path[points[: needed_points(path, samples, points, rows)]], rows
+
+
 def outputs(paths: Sequence[F64], kept: Sequence[I64], grid: Grid, slopes: F64) -> tuple[F64, F64]:
     """Return the output of operators with known weights, and its derivatives by thresholds.
 
-    Args:
-        paths: See :func:`table`.
-        kept: See :func:`table`.
-        grid: The operators.
-        slopes: float64[lines, cells].
-
-    Returns:
-        float64[N], and float64[N, p - 1] for all thresholds but the first.
+    See :func:`table`. The derivatives, float64[N, p - 1], are by all thresholds but the first.
     """
     plays = grid.thresholds.size
     drags = replace(grid, thresholds=np.empty(0))
     given: list[F64] = []
     changes: list[F64] = []
     for path, samples in zip(paths, kept, strict=True):
-        points, rows = np.empty(path.size, dtype=np.int64), np.empty_like(samples)
-        u = path[points[: needed_points(path, samples, points, rows)]]
+        u, rows = _needed(path, samples)
         total, by = np.empty(rows.size), np.empty((rows.size, plays))
         weights = np.ascontiguousarray(slopes[:plays])
         plays_given(u, rows, grid.thresholds, grid.lowest, grid.piece, weights, total, by)
@@ -151,16 +141,11 @@ def outputs(paths: Sequence[F64], kept: Sequence[I64], grid: Grid, slopes: F64) 
 class Equations:
     """Linear least squares of all weights, between operators and inverse curve.
 
-    Args:
-        columns: Result of :func:`table`.
-        y: float64[N], displacement without structure and delay, in um.
-        grid: The operators.
-        least: Smallest slope of the first line, um per command unit.
-        scale: float64[N], square root of each row's weight.
+    ``columns`` is the result of :func:`table`, ``y`` the displacement without structure and delay,
+    ``least`` the smallest slope of the first line, ``scale`` the square root of each row's weight.
     """
 
     def __init__(self, columns: F64, y: F64, grid: Grid, least: float, scale: F64) -> None:
-        """Select columns that move, and place the corners of the curve."""
         self._y, self._grid, self._scale = y, grid, scale
         moved = np.ptp(columns, axis=0)
         self._used = moved > MOVED * float(moved.max())
@@ -209,11 +194,9 @@ class Equations:
     def place(self, errors: F64, changes: F64) -> SearchPoint:
         """Return the sum of squares with derivatives by the changes, by variable projection.
 
-        Free weights compensate each change as far as they can (Kaufman's approximation).
-
-        Args:
-            errors: float64[N], of the operators' output with the weights of :meth:`solve`.
-            changes: float64[N, p], of these errors.
+        Free weights compensate each change as far as they can (Kaufman's approximation). The
+        errors, float64[N], and their changes, float64[N, p], are of outputs with the weights of
+        :meth:`solve`.
         """
         found, _ = self._found
         free = found > self._lows
@@ -252,11 +235,6 @@ class Equations:
         return np.asarray(weight @ rows)
 
 
-def solve(columns: F64, y: F64, grid: Grid, least: float, scale: F64) -> Weights:
-    """Return all weights; see :class:`Equations` for the arguments."""
-    return Equations(columns, y, grid, least, scale).solve()
-
-
 def _segments(y: F64, knots: F64) -> F64:
     """Return the part of y between each two knots; the end parts are unlimited: float64[N, K]."""
     width = np.diff(knots)
@@ -274,14 +252,11 @@ def _prior(
     count = int(used.sum())
     number = np.where(used, np.cumsum(used) - 1, -1).reshape(grid.lines, grid.cells)
     smooth = SMOOTH * min(1.0, SMOOTH_PLAYS / grid.thresholds.size)
-    pairs = [(number[:, :-1], number[:, 1:], smooth)]
     plays = number[1 : grid.thresholds.size]
-    pairs.append((plays[:-1], plays[1:], 0.5 * smooth))
+    pairs = (number[:, :-1], number[:, 1:], smooth), (plays[:-1], plays[1:], 0.5 * smooth)
     width = count + others.size
     out = [weight * longest * differences(a, b, width) for a, b, weight in pairs]
-    ridge = np.zeros((count, width))
-    ridge[:, :count] = RIDGE * longest * np.eye(count)
-    out.append(ridge)
+    out.append(RIDGE * longest * np.eye(count, width))
     # Second differences of the slopes of the curve; that of the anchor follows from the mean.
     full, constant = np.zeros((grid.knots, width)), np.zeros(grid.knots)
     full[others, count + np.arange(others.size)] = 1.0

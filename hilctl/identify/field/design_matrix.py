@@ -12,19 +12,11 @@ from hilctl.kernels.jit import kernel
 
 @kernel("int64(float64[::1], float64[::1], float64, float64, int64, int64, int64[::1])", nogil=True)
 def corners(x: F64, y: F64, off_x: float, off_y: float, thin: int, furthest: int, out: I64) -> int:
-    """Find samples between which straight lines approximate two signals.
+    """Find samples between which straight lines approximate two signals, float64[n] each.
 
-    Args:
-        x: float64[n].
-        y: float64[n].
-        off_x: Maximum deviation from x.
-        off_y: Maximum deviation from y.
-        thin: Minimum samples in a step; steps are multiples of it.
-        furthest: Maximum samples in a step.
-        out: int64[n], filled with samples, from the first to the last multiple.
-
-    Returns:
-        Number of samples.
+    Lines deviate by up to ``off_x`` and ``off_y``. Steps are multiples of ``thin``, up to
+    ``furthest`` samples. Fill in ``out``, int64[n], from the first sample to the last multiple, and
+    return the number of samples.
     """
     out[0] = 0
     first, count = 0, 1
@@ -54,44 +46,25 @@ def corners(x: F64, y: F64, off_x: float, off_y: float, thin: int, furthest: int
 def bare_displacement(
     derivatives: F64, kept: I64, late: float, slope_gain: float, bend_gain: float, out: F64
 ) -> None:
-    """Fill in y + slope_gain y' + bend_gain y'' of later samples.
+    """Fill in y + slope_gain y' + bend_gain y'' ``late`` samples after each one in ``kept``.
 
-    Args:
-        derivatives: float64[3, n], y and its first two derivatives.
-        kept: int64[N], samples to compute.
-        late: Shift in samples, >= 0.
-        slope_gain: In the unit of time of the derivatives.
-        bend_gain: In its square.
-        out: float64[N], filled; the last sample is repeated.
+    ``derivatives``, float64[3, n], holds y, y' and y''; the last sample is repeated.
     """
+    y, slope, bend = derivatives[0], derivatives[1], derivatives[2]
     whole = math.floor(late)
-    part, end = late - whole, derivatives.shape[1] - 1
+    part, end = late - whole, y.size - 1
     for i in range(kept.size):
         here, there = min(kept[i] + whole, end), min(kept[i] + whole + 1, end)
-        a = (
-            derivatives[0, here]
-            + slope_gain * derivatives[1, here]
-            + bend_gain * derivatives[2, here]
-        )
-        b = (
-            derivatives[0, there]
-            + slope_gain * derivatives[1, there]
-            + bend_gain * derivatives[2, there]
-        )
+        a = y[here] + slope_gain * slope[here] + bend_gain * bend[here]
+        b = y[there] + slope_gain * slope[there] + bend_gain * bend[there]
         out[i] = a + part * (b - a)
 
 
 @kernel("int64(float64[::1], float64, int64[::1])")
 def turning_points(u: F64, distance: float, out: I64) -> int:
-    """Find the turns of a path, and samples between them.
+    """Find the turns of a path, and samples between them at most ``distance`` apart.
 
-    Args:
-        u: float64[n], input of the operators.
-        distance: Maximum distance of two samples.
-        out: int64[n], filled with samples, from the first to the last.
-
-    Returns:
-        Number of samples.
+    Fill in ``out``, int64[n], from the first sample to the last, and return the number of samples.
     """
     out[0] = 0
     last, count = u[0], 1
@@ -108,12 +81,9 @@ def turning_points(u: F64, distance: float, out: I64) -> int:
 
 @kernel("void(float64[::1], float64, float64[::1])")
 def swings(y: F64, turn: float, out: F64) -> None:
-    """Compute the swing of a path between the turns around each sample.
+    """Fill in the swing of a path between the turns around each sample: float64[n].
 
-    Args:
-        y: float64[n].
-        turn: Minimum reversal that counts as a turn.
-        out: float64[n], filled with the swings.
+    A reversal is a turn if it exceeds ``turn``.
     """
     first = last = 0  # the last turn, and the furthest sample since
     way = 0.0
@@ -132,16 +102,9 @@ def swings(y: F64, turn: float, out: F64) -> None:
 
 @kernel("int64(float64[::1], int64[::1], int64[::1], int64[::1])", nogil=True)
 def needed_points(u: F64, rows: I64, points: I64, places: I64) -> int:
-    """Find the rows and turns of a path, which are all samples that operators need.
+    """Fill in samples that operators need: rows and turns; return their number.
 
-    Args:
-        u: float64[n].
-        rows: int64[N], rising.
-        points: int64[n], filled with samples.
-        places: int64[N], filled with the index of each row among the samples.
-
-    Returns:
-        Number of samples.
+    ``places`` is filled with the index of each row among the samples.
     """
     count = row = 0
     for k in range(u.size):
@@ -180,12 +143,7 @@ def _add_splines(u: float, lowest: float, width: float, sign: float, out: F64) -
 def _risen(u: float, lowest: float, width: float, s: F64, edges: F64) -> tuple[float, float]:
     """Return the integral of weighted quadratic splines up to u, and their sum there.
 
-    Args:
-        u: Where.
-        lowest: Lower end of the first piece.
-        width: Of a piece.
-        s: float64[c], weights of the splines.
-        edges: float64[c - 1], the integral at the edges of the pieces.
+    The weights are float64[c], and ``edges``, float64[c - 1], are integrals at the edges of pieces.
     """
     pieces = s.size - 2
     place = (u - lowest) / width
@@ -207,14 +165,9 @@ def play_columns(
 ) -> None:
     """Fill in the output of each play from rest, with a quadratic B-spline as its slope.
 
-    Args:
-        u: float64[n], a path from rest with at least its turning points.
-        rows: int64[N], samples of the path that are filled in, rising.
-        thresholds: float64[p].
-        lowest: Start of the first piece of the splines; slopes are constant before it.
-        width: Width of a piece.
-        splines: Number of splines c >= 3, over c - 2 pieces.
-        out: float64[N, m], of which the first p c columns are filled.
+    The path ``u``, float64[n], needs at least its turning points. The c >= 3 splines have c - 2
+    pieces of equal width from ``lowest`` on; slopes are constant beyond. ``out``, float64[N, m], is
+    filled at ``rows`` in the first p c columns.
     """
     rest = np.zeros(splines)
     _add_splines(0.0, lowest, width, -1.0, rest)
@@ -245,17 +198,10 @@ def plays_given(
     total: F64,
     by: F64,
 ) -> None:
-    """Compute the total output of plays with known weights, and its derivatives.
+    """Compute the total output of plays with known weights, float64[p, c], and its derivatives.
 
-    Args:
-        u: See :func:`play_columns`, as for rows, thresholds, lowest and width.
-        rows: See above.
-        thresholds: See above.
-        lowest: See above.
-        width: See above.
-        weights: float64[p, c], of the splines.
-        total: float64[N], filled.
-        by: float64[N, p], filled with the derivatives of the total by each threshold.
+    Fill in ``total``, float64[N], and its derivatives by each threshold, float64[N, p]; see
+    :func:`play_columns` for the others.
     """
     pieces = weights.shape[1] - 2
     edges = np.empty(pieces + 1)
@@ -290,9 +236,7 @@ class Motion:
 
     Attributes:
         travel: float64[n], change of the command since the sample before, of its peak-to-peak.
-        step_s: float64[n], time since the sample before.
         swing: float64[n], swing of the displacement around a sample, of the stroke.
-        judged: First evaluated sample.
     """
 
     travel: F64
@@ -302,22 +246,9 @@ class Motion:
 
     @classmethod
     def of(
-        cls,
-        signals: tuple[F64, F64],
-        step_s: F64,
-        judged: int,
-        reach: float,
-        stroke_um: float,
+        cls, signals: tuple[F64, F64], step_s: F64, judged: int, reach: float, stroke_um: float
     ) -> "Motion":
-        """Return the motion of a command and a displacement.
-
-        Args:
-            signals: Command and displacement in um, float64[n] each.
-            step_s: float64[n].
-            judged: First evaluated sample.
-            reach: Half the command's peak-to-peak.
-            stroke_um: Peak-to-peak displacement.
-        """
+        """Return the motion of a command and a displacement in um, float64[n] each."""
         command, displacement_um = signals
         swing = np.empty(command.size)
         swings(np.ascontiguousarray(displacement_um), TURN * stroke_um, swing)
@@ -336,24 +267,14 @@ class Motion:
 
 @dataclass(frozen=True, slots=True)
 class Rows:
-    """The rows of some records.
-
-    Attributes:
-        samples: For each record, int64[N_i], rising.
-        scale: float64[N], square root of the weight of each row; the mean square is 1.
-    """
+    """Rows of some records; the mean square of ``scale``, the root of each row's weight, is 1."""
 
     samples: tuple[I64, ...]
     scale: F64
 
 
 def chosen(motions: Sequence[Motion], most: int) -> Rows:
-    """Choose rows evenly over swings and over time, weighted by the swing around them.
-
-    Args:
-        motions: Motions of the records.
-        most: Maximum number of rows.
-    """
+    """Choose up to ``most`` rows evenly over swings and time, weighted by the swing around them."""
     swung = [motion.travel / motion.swing for motion in motions]
     passed = [m.step_s * np.minimum(m.travel / AT_REST, 1.0) for m in motions]
     samples, weights = [], []

@@ -4,7 +4,6 @@ The inverse maps the measured displacement to the effective field. It has fading
 local error of the table does not affect all later samples.
 """
 
-from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,16 +50,7 @@ HELD = 1e-3  # penalty of the change of a stage, percent of the stroke per step
 
 @dataclass(frozen=True, slots=True)
 class DuhemEnd:
-    """End of a search, from which another search can start.
-
-    Attributes:
-        known: The stages.
-        layout: The table's nodes.
-        logs: float64[2, k, l], logarithms of the slopes.
-        flux: By displacement.
-        offset_um: Displacement at rest.
-        x: The stages in a row.
-    """
+    """End of a search, from which another search can start; ``x`` holds the stages in a row."""
 
     known: Physical
     layout: Layout
@@ -71,14 +61,7 @@ class DuhemEnd:
 
 
 class DuhemSearch:
-    """Search of table and stages.
-
-    Args:
-        data: The records.
-        cells: Cells of y.
-        across: Cells across the band.
-        least: Smallest slope, um per command unit.
-    """
+    """Search of table and stages, with slopes of at least ``least`` um per command unit."""
 
     def __init__(self, data: Prepared, cells: int, across: int, least: float) -> None:
         self._stroke_um = data.stroke_um
@@ -202,10 +185,7 @@ class DuhemSearch:
     def _errors(self, x: F64, logs: F64, slopes: F64 | None = None) -> F64:
         """Return weighted errors in percent of the stroke over the square root of their number.
 
-        Args:
-            x: The stages.
-            logs: float64[2, k, l].
-            slopes: float64[N, 2 k l], filled with the derivatives by the logarithms.
+        Fill in ``slopes``, float64[N, 2 k l], with the derivatives by the logarithms.
         """
         layout = self._layout
         start_um = self._signals.offset_um(x, self._first_um)
@@ -240,13 +220,10 @@ def _bounded_step(normal: F64, down: F64, damping: float, table: int, x: F64) ->
     """
     damped = normal.copy()
     damped[np.diag_indices_from(damped)] += damping
-    with suppress(LinAlgError):
-        return _step_within(damped, down, table, x)
-    return None
-
-
-def _step_within(damped: F64, down: F64, table: int, x: F64) -> F64:
-    step = np.asarray(cho_solve(cho_factor(damped), down))
+    try:
+        step = np.asarray(cho_solve(cho_factor(damped), down))
+    except LinAlgError:
+        return None
     if step.size == table:
         return step
     wanted = x + step[table:] * STEPS

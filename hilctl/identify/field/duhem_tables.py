@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
@@ -18,14 +18,16 @@ from hilctl.identify.field.stages import (
     Physical,
     Stages,
     physical,
+    row,
     signals,
+    stages_in,
     stages_of,
 )
+from hilctl.identify.field.stages import NAMES as STAGES
 from hilctl.identify.parallel import parallel_map
 from hilctl.kernels.generalised_duhem import Band
 from hilctl.models.generalised_duhem import band_of
 
-STAGES = ("field", "output", "decay", "growth", "bend", "excess", "radian", "damping", "delay")
 POWERS = np.arange(1.0, 5.0)
 FLUX = slice(len(STAGES), len(STAGES) + POWERS.size)
 NAMES = (*STAGES, *(f"flux_{power:g}" for power in POWERS), "offset")
@@ -36,8 +38,7 @@ _FLUX_NODES = 33
 
 
 def _row(stages: Stages, flux: float, offset: float) -> F64:
-    fluxes = np.full(POWERS.size, flux)
-    return np.array([*(getattr(stages, name) for name in STAGES), *fluxes, offset])
+    return np.concatenate((row(stages), np.full(POWERS.size, flux), [offset]))
 
 
 LOWEST = _row(LOW, -_FLUX, -_OFFSET)
@@ -50,13 +51,7 @@ FIRST = _row(Stages(field=0.05, output=0.08, decay=0.005), 0.0, 0.0)
 
 @dataclass(frozen=True, slots=True)
 class Path:
-    """Points of a record, with all turning points.
-
-    Attributes:
-        field: float64[n], w.
-        displacement_um: float64[n], y before structure and delay.
-        motion: Motion of the record at these points.
-    """
+    """Points of a record, with all turning points: w, and y before structure and delay."""
 
     field: F64
     displacement_um: F64
@@ -77,8 +72,7 @@ class Signals:
 
     def known(self, x: F64) -> Physical:
         """Return the stages of a row in physical units."""
-        given = dict(zip(STAGES, x.tolist(), strict=False))
-        return physical(replace(Stages(), **given), self._data)
+        return physical(stages_in(x[: len(STAGES)]), self._data)
 
     def flux(self, x: F64) -> Curve:
         """Return the flux of a row, in um, by displacement."""
@@ -98,8 +92,7 @@ class Signals:
 
     def row_of(self, known: Physical, other: F64) -> F64:
         """Return a row of stages, with flux and offset of another row."""
-        stages = stages_of(known, self._data)
-        return np.array([*(getattr(stages, name) for name in STAGES), *other[len(STAGES) :]])
+        return np.concatenate((row(stages_of(known, self._data)), other[len(STAGES) :]))
 
     def choose(self, x: F64, way: float) -> None:
         """Choose the points of all paths, at most ``way`` of the command's span apart."""
@@ -144,15 +137,7 @@ STEEPEST = 5.0  # logarithm of the largest slope, of the mean
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Nodes of a table.
-
-    Attributes:
-        lowest_um: First node of y.
-        cell_um: Distance of the nodes of y.
-        centre: float64[k], middle of the band at each, in the command's unit.
-        half_width: Of the band.
-        across: Nodes across the band, l.
-    """
+    """Nodes of a table: lowest y and distance, middle of the band at each, and across the band."""
 
     lowest_um: float
     cell_um: float

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hilctl.base.types import F64, I64
-from hilctl.identify.field.densities import Curve, Equations, Grid, Weights, outputs, solve, table
-from hilctl.identify.field.design_matrix import Rows, chosen
+from hilctl.identify.field.densities import Curve, Equations, Grid, Weights, outputs, table
+from hilctl.identify.field.design_matrix import chosen
 from hilctl.identify.field.preprocess import Prepared, histories_of
 from hilctl.identify.field.stages import (
     HIGH,
@@ -36,13 +36,7 @@ STAGES = len(NAMES)
 
 @dataclass(frozen=True, slots=True)
 class BareSignal:
-    """Effective fields and displacements of the records for some stages.
-
-    Attributes:
-        fields: For each record, float64[n], effective field.
-        y: float64[N], displacement of the rows without structure and delay, in um.
-        scale: float64[N], square root of the weight of each row.
-    """
+    """Fields of the records, and displacements of the rows without structure and delay."""
 
     fields: Sequence[F64]
     y: F64
@@ -50,14 +44,7 @@ class BareSignal:
 
 
 class JointRefinement:
-    """Minimisation of a sum of squares over stages and thresholds.
-
-    Args:
-        rows_of: Returns the rows for stages, float64[9].
-        paths: For each record int64[N_i], the samples that are rows.
-        grid: The operators, with the thresholds of the start.
-        least: Smallest slope of the first line, um per command unit.
-    """
+    """Minimisation of a sum of squares over stages and the thresholds of a grid."""
 
     def __init__(
         self, rows_of: Callable[[F64], BareSignal], paths: Sequence[I64], grid: Grid, least: float
@@ -142,9 +129,6 @@ class FieldEnd:
     """End of a search, from which another search can start.
 
     Attributes:
-        known: The stages.
-        grid: The operators.
-        weights: Weights of the operators, and the curve.
         met: The curve that the losses depend on, by displacement with its offset.
         widest: Largest useful threshold, of half the span.
     """
@@ -158,7 +142,7 @@ class FieldEnd:
 
 @dataclass(frozen=True, slots=True)
 class _Descent:
-    """End of a descent: its error and stages, with curve and cells."""
+    """End of a descent."""
 
     error: float
     stages: Stages
@@ -168,18 +152,11 @@ class _Descent:
 
 
 class FieldSearch:
-    """Search of weights and stages of one size of model.
-
-    Args:
-        data: The records.
-        size: The operators.
-        least: Smallest slope of the first line, um per command unit.
-    """
+    """Search of weights and stages of one size of model; ``least`` is in um per command unit."""
 
     def __init__(self, data: Prepared, size: Size, least: float) -> None:
-        self._data = data
-        self._size = size
-        self._least = least
+        self._data, self._size, self._least = data, size, least
+        self._choose(SEARCH_ROWS)
         self._curve: Curve | None = None
         self._grid: Grid | None = None
         self._widest = 1.0
@@ -187,7 +164,7 @@ class FieldSearch:
     def find(self, first: Stages, progress: OnProgress) -> FieldEnd:
         """Return the end of the best start, with all weights."""
         found = self._descended(first, progress, 0.0)
-        if _at_bound(found.stages):
+        if found.stages.radian > NEAR_BOUND * HIGH.radian:
             # Slow records determine the structure poorly: a soft one may replace hysteresis.
             for k, radian in enumerate(STIFFER, start=1):
                 start = replace(first, radian=radian, delay=0.3 * radian)
@@ -205,20 +182,17 @@ class FieldSearch:
         """Return the descent from the best of some starts."""
         coarse = self._size.coarse
         tried = [self._tried(replace(first, field=lag), coarse) for lag in FIRST_LAGS]
-        first = min(tried, key=_error)[1]
-        x = row(first)
+        x = row(min(tried, key=lambda each: each[0])[1])
         self._forget()
         for turn in range(ROUNDS):
             part = (turn + 0.2) / (ROUNDS + 1)
             progress(done + (1.0 - done) * part, f"round {turn + 1} of {ROUNDS}")
-            self._lay(stages_in(x), coarse)
-            self._learn(x, self._chosen())
-            self._lay(stages_in(x), coarse)
-            self._learn(x, self._chosen())
-            x, _ = self._polish(x, self._chosen())
-            self._learn(x, self._chosen())
-        error = float(np.sqrt(np.mean(self._errors(x, self._chosen()) ** 2)))
-        return _Descent(error, stages_in(x), self._curve, self._grid, self._widest)
+            for _ in range(2):
+                self._lay(stages_in(x), coarse)
+                self._learn(x)
+            x, _ = self._polish(x)
+            self._learn(x)
+        return _Descent(self._error(x), stages_in(x), self._curve, self._grid, self._widest)
 
     def _forget(self) -> None:
         self._curve = self._grid = None
@@ -229,34 +203,28 @@ class FieldSearch:
         self._forget()
         for _ in range(2):
             self._lay(stages, size)
-            self._learn(row(stages), self._chosen())
+            self._learn(row(stages))
         self._lay(stages, size)
-        errors = self._errors(row(stages), self._chosen())
-        return float(np.sqrt(np.mean(errors**2))), stages
+        return self._error(row(stages)), stages
 
-    def _polish(self, x: F64, rows: Rows) -> tuple[F64, Grid]:
+    def _polish(self, x: F64) -> tuple[F64, Grid]:
         """Return better stages and thresholds."""
+        samples, grid = self._rows.samples, self._laid()
+        return JointRefinement(self._bare, samples, grid, self._least).follow(x)
 
-        def bare(stages: F64) -> BareSignal:
-            fields, y = self._bare(stages, rows)
-            return BareSignal(fields, y, self._scale(y, rows))
+    def _error(self, x: F64) -> float:
+        """Return the weighted rms error of the displacement, in um."""
+        return float(np.sqrt(np.mean((self._solved(x).errors_um * self._rows.scale) ** 2)))
 
-        return JointRefinement(bare, rows.samples, self._laid(), self._least).follow(x)
+    def _solved(self, x: F64) -> Weights:
+        bare, grid = self._bare(x), self._laid()
+        columns = table(bare.fields, self._rows.samples, grid)
+        return Equations(columns, bare.y, grid, self._least, bare.scale).solve()
 
-    def _errors(self, x: F64, rows: Rows) -> F64:
-        """Return weighted errors of the displacement at rows: float64[N], in um."""
-        return self._solved(x, rows).errors_um * rows.scale
-
-    def _solved(self, x: F64, rows: Rows) -> Weights:
-        fields, y = self._bare(x, rows)
-        grid = self._laid()
-        return solve(table(fields, rows.samples, grid), y, grid, self._least, self._scale(y, rows))
-
-    def _bare(self, x: F64, rows: Rows) -> tuple[list[F64], F64]:
-        """Return fields, and displacements of the rows."""
+    def _bare(self, x: F64) -> BareSignal:
         fields, bare = self._signals(x)
-        y = [b[samples] for b, samples in zip(bare, rows.samples, strict=True)]
-        return fields, np.concatenate(y)
+        y = np.concatenate([b[at] for b, at in zip(bare, self._rows.samples, strict=True)])
+        return BareSignal(fields, y, self._scale(y))
 
     def _signals(self, x: F64) -> tuple[list[F64], list[F64]]:
         known = physical(stages_in(x), self._data)
@@ -265,22 +233,21 @@ class FieldSearch:
         both = parallel_map(lambda run: signals(run, known, curve, span), runs)
         return [u for u, _ in both], [y for _, y in both]
 
-    def _scale(self, y: F64, rows: Rows) -> F64:
+    def _scale(self, y: F64) -> F64:
         """Return factors from errors of operators to weighted errors of displacement."""
         if self._curve is None:
-            return rows.scale
+            return self._rows.scale
         step = 0.01 * self._data.stroke_um
         rise = self._curve.operators_of(y + step) - self._curve.operators_of(y - step)
-        return np.asarray(rows.scale * 2.0 * step / np.maximum(rise, 0.5 * step))
+        return np.asarray(self._rows.scale * 2.0 * step / np.maximum(rise, 0.5 * step))
 
     def _laid(self) -> Grid:
         assert self._grid is not None
         return self._grid
 
-    def _learn(self, x: F64, rows: Rows) -> Weights:
+    def _learn(self, x: F64) -> None:
         """Solve for weights, and update the curve and the largest threshold for the next time."""
-        found = self._solved(x, rows)
-        grid = self._laid()
+        found, grid = self._solved(x), self._laid()
         plays = grid.thresholds.size
         self._curve = self._between(found)
         weights = found.slopes.sum(axis=1)
@@ -289,7 +256,6 @@ class FieldSearch:
         widest = 1.2 * float(grid.thresholds[min(beyond, plays - 1)])
         half = 0.5 * grid.width * grid.cells / (1.0 + 2.0 * MARGIN)
         self._widest = min(1.0, max(widest / half, LEAST_WIDEST))
-        return found
 
     def _between(self, found: Weights) -> Curve:
         """Return the mean of the new and the old curve, since full steps would oscillate."""
@@ -306,43 +272,36 @@ class FieldSearch:
         span = high - low
         lowest, width = low - MARGIN * span, (1.0 + 2.0 * MARGIN) * span / size.cells
         spread = np.arange(size.plays) / size.plays
-        lengths = 0.5 * span * np.array(_lengths(size.drags))
+        lengths = 0.5 * span * _lengths(size.drags)
         self._grid = Grid(
             0.5 * span * self._widest * spread, lengths, lowest, width, size.cells, size.knots
         )
 
-    def _chosen(self, most: int = SEARCH_ROWS) -> Rows:
-        return chosen([run.motion for run in self._data.runs], most)
+    def _choose(self, most: int) -> None:
+        self._rows = chosen([run.motion for run in self._data.runs], most)
 
     def _end(self, x: F64, before: Grid | None) -> FieldEnd:
-        rows = self._chosen(POLISH_ROWS)
+        self._choose(POLISH_ROWS)
         kept = before is not None and before.thresholds.size == self._size.plays
         for _ in range(1 if kept else 2):
             self._lay(stages_in(x), self._size)
             if kept and before is not None:
                 self._grid = replace(self._laid(), thresholds=before.thresholds)
-            self._learn(x, rows)
-        x, self._grid = self._polish(x, rows)
-        self._learn(x, rows)
-        found = self._solved(x, self._chosen(FINAL_ROWS))
+            self._learn(x)
+        x, self._grid = self._polish(x)
+        self._learn(x)
+        self._choose(FINAL_ROWS)
+        found = self._solved(x)
         known = physical(stages_in(x), self._data)
         return FieldEnd(known, self._laid(), found, self._curve, self._widest)
 
 
-def _at_bound(stages: Stages) -> bool:
-    """Return whether the structure is about as soft as its bound."""
-    return stages.radian > NEAR_BOUND * HIGH.radian
-
-
-def _error(tried: tuple[float, Stages]) -> float:
-    return tried[0]
-
-
-def _lengths(count: int) -> tuple[float, ...]:
-    if count <= 1:
-        return (0.15,)[:count]
-    first, last = np.log(LENGTHS[0]), np.log(LENGTHS[-1])
-    return tuple(np.exp(np.linspace(first, last, count)).tolist())
+def _lengths(count: int) -> F64:
+    """Return lengths of drags, of half the span."""
+    if count == 1:
+        return np.array([0.15])
+    first, last = np.log(LENGTHS)
+    return np.exp(np.linspace(first, last, count))
 
 
 FINER = 8  # cells of the model's tables per piece of a spline
@@ -388,11 +347,7 @@ def _model(job: FitJob, found: FieldEnd) -> StagedModel:
 
 
 def tabled(splines: F64) -> list[list[float]]:
-    """Return the slopes of splines in FINER cells per piece.
-
-    Args:
-        splines: float64[p, c], weights of the splines of each play.
-    """
+    """Return the slopes of splines with weights float64[p, c], in FINER cells per piece."""
     t = (np.arange(FINER) + 0.5) / FINER
     parts = 0.5 * (1.0 - t) ** 2, 0.5 + t - t**2, 0.5 * t**2
     pieces = splines.shape[1] - 2

@@ -27,11 +27,6 @@ def smoothed(displacement_um: F64, width: float, rate_hz: float) -> F64:
     path in small and slow loops. So a second, wider window is used, and the difference of both is
     kept as far as it exceeds noise (J. S. Lee, IEEE Trans. Pattern Anal. Mach. Intell. 2 (1980)
     165). The noise follows from the residual of the first window.
-
-    Args:
-        displacement_um: float64[n].
-        width: Of the first smoothing, in samples.
-        rate_hz: Samples a second.
     """
     plain, wide = smoothing_weights(width)[0], smoothing_weights(WIDER * width)[0]
     found = _derivatives(displacement_um, width, rate_hz)
@@ -89,13 +84,10 @@ class Run:
     """One record; callers must not change returned arrays, since they are cached.
 
     Attributes:
-        rate_hz: Sample rate of the record.
-        kept: int64[n], the samples that are kept.
         step_s: float64[n], time since the sample before.
         command: float64[n], at the end of each step.
         mean: float64[n], the command's mean over each step.
         derivatives: float64[3, N], displacement of all samples in um and its derivatives by time.
-        motion: Motion at the samples that are kept.
     """
 
     rate_hz: float
@@ -118,9 +110,6 @@ class Run:
 
         The step of a lag is exact for a straight command if the command is taken at this part: the
         middle of a short step, the end of a step in which the lag settles.
-
-        Args:
-            lag_s: Time constant, > 0.
         """
         return self._late.of(lag_s, lambda: self._late_command(lag_s))
 
@@ -142,24 +131,11 @@ class Run:
 
 
 class Prepared:
-    """All records, prepared.
-
-    Args:
-        records: The records.
-        points: Samples kept of the fastest cycle.
-        command_off: Deviation of straight lines from the command, of its peak-to-peak.
-
-    Attributes:
-        runs: The records.
-        reach: Half the largest peak-to-peak command.
-        stroke_um: Largest peak-to-peak displacement.
-        top_hz: Frequency of a sine as fast as the fastest record.
-    """
+    """All records, prepared; ``top_hz`` is the frequency of a sine as fast as the fastest one."""
 
     def __init__(
         self, records: Sequence[History], points: int = POINTS, command_off: float = COMMAND_OFF
     ) -> None:
-        """Smooth and thin records."""
         self._points, self._command_off = points, command_off
         self.reach = max(0.5 * float(np.ptp(record.command)) for record in records)
         self.stroke_um = max(float(np.ptp(record.displacement_um)) for record in records)
@@ -188,11 +164,7 @@ class Prepared:
 
 
 def histories_of(records: Sequence[Record], what: str) -> list[History]:
-    """Return the records if all are histories.
-
-    Raises:
-        DataError: One is a steady loop, which leaves the parameters undetermined.
-    """
+    """Return the records if all are histories; raise DataError otherwise."""
     loops = [record.label for record in records if isinstance(record, SteadyLoop)]
     if loops:
         raise DataError(

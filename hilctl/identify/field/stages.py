@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 
@@ -128,25 +129,11 @@ def stages_of(known: Physical, data: Prepared) -> Stages:
 def signals(run: Run, known: Physical, curve: Curve | None, span: float) -> tuple[F64, F64]:
     """Return the effective field and the displacement before structure: float64[n] each.
 
-    Args:
-        run: The record.
-        known: The stages.
-        curve: From displacement to the output of the operators; None for the displacement itself.
-        span: Of the field; the excess loss is linear below a part of it.
+    The excess loss is linear below a part of ``span``. Without a curve, y itself is its output.
     """
     y = run.bare_um(known.delay_s, 2.0 * known.damping_ratio * known.radian_s, known.radian_s**2)
     m = y if curve is None else curve.operators_of(y)
-    lost = known.losses
-    losses = (
-        lost.field_s,
-        lost.output_s,
-        lost.decay_s,
-        lost.growth,
-        lost.bend,
-        lost.excess,
-        even_excess(span),
-        0.0,
-    )
+    losses: Any = (*known.losses.model_dump().values(), even_excess(span), 0.0)
     w = np.empty_like(y)
     late, command = run.late_command(max(known.lag_s, SHORTEST_S))
     field_left(command, late, run.step_s, m, losses, w)

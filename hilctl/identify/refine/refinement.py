@@ -11,7 +11,7 @@ import numpy as np
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.files import check_writable, write_text
 from hilctl.base.samples import Flag
-from hilctl.identify.data.data_files import history_from_recording
+from hilctl.identify.data.data_files import history_from_pieces
 from hilctl.identify.data.records import History
 from hilctl.identify.fit_api import FitData, OnProgress, ignore_progress
 from hilctl.identify.fit_model import VERSIONS, error_table, identified_range
@@ -37,10 +37,6 @@ def load_runs(paths: Sequence[Path], model: HysteresisModel) -> list[History]:
     The actuator responds to the output command, whatever the model of the run. A run that begins
     in the end state of another has the samples of that run before its own; they are not evaluated.
 
-    Args:
-        paths: Recordings.
-        model: The model, with a command in the unit of the recordings.
-
     Raises:
         InputError: A file is named twice, or there is none.
         DataError: A recording can't be read, has no known initial state, or another unit.
@@ -62,7 +58,7 @@ def load_runs(paths: Sequence[Path], model: HysteresisModel) -> list[History]:
 
 
 def _history(recording: Recording, known: Mapping[str, Recording]) -> History:
-    history = history_from_recording(recording)
+    history = history_from_pieces([recording])
     before = recording.run.get("initial_state_run_id", "")
     conditioned = (recording.samples.flags & Flag.CONDITION.value).any()
     if not before or conditioned:
@@ -91,7 +87,6 @@ class Refinement:
     """A refined model, and its errors.
 
     Attributes:
-        model: The refined model.
         choice: Selected regularisation, with errors before and after on held-out runs.
         reasons: Why it is no better than the old model; empty if it is better.
     """
@@ -169,20 +164,13 @@ def refine_runs(
 ) -> Refinement:
     """Refine a model from runs, and evaluate it on held-out runs.
 
-    Args:
-        old: The model.
-        runs: Runs to refine it on.
-        validate: Runs to evaluate it on; if there are none, ``runs`` in turn.
-        source: Name of the model, for the provenance.
-        progress: Progress callback.
-
     Raises:
         InputError: The runs are implausible or too few, or no refined model has an inverse.
     """
     if reasons := tuple(data_reasons([*runs, *validate])):
         raise InputError("\n".join(reasons))
     parts, splits = parts_of(runs, validate)
-    choice, refined = Regularisation(old, parts, splits, old.input_unit).best(progress)
+    choice, refined = Regularisation(old, parts, splits).best(progress)
     progress(1.0, "done")
     named = refined.model_copy(update={"provenance": _provenance(old, runs, choice, source)})
     return Refinement(named, choice, tuple(_reasons(choice)))

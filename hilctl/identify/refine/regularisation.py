@@ -6,12 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilctl.base.errors import DataError
-from hilctl.base.types import F64, CommandUnit
 from hilctl.identify.data.records import History
 from hilctl.identify.evaluation import judgement_of
 from hilctl.identify.fit_api import FitData, OnProgress
 from hilctl.identify.model_selection import HeldOut, folds_of
-from hilctl.identify.refine.residual_fit import NormalEquations, ResidualFit
+from hilctl.identify.refine.residual_fit import ResidualFit
 from hilctl.models.base import HysteresisModel
 from hilctl.models.refined import RefinedModel
 
@@ -38,12 +37,8 @@ class RegularisationSplit:
 class SelectedRegularisation:
     """A regularisation, and its errors on held-out runs.
 
-    Attributes:
-        strength: Weight of the old model.
-        anchor: Weight of the old model on motions of its whole range, of the least.
-        own: Whether each run has an offset, creep and drift.
-        before: Errors of the old model on held-out runs.
-        after: Errors of the refined models, each on runs that it was not fitted to.
+    With ``own``, each run has an offset, creep and drift. ``anchor`` is the weight of the old model
+    on motions of its whole range, of the least.
     """
 
     strength: float
@@ -132,23 +127,15 @@ def parts_of(
 
 
 class Regularisation:
-    """Refinements of a model with any regularisation.
-
-    Args:
-        model: The old model.
-        parts: Records that are fitted or evaluated.
-        splits: Splits of the records.
-        unit: Unit of the command.
-    """
+    """Refinements of a model with any regularisation."""
 
     def __init__(
         self,
         model: HysteresisModel,
         parts: Sequence[History],
         splits: Sequence[RegularisationSplit],
-        unit: CommandUnit,
     ) -> None:
-        self._parts, self._splits, self._unit = parts, splits, unit
+        self._parts, self._splits, self._unit = parts, splits, model.input_unit
         # All fitted parts; also the end of a single run that is cut in two.
         fitted = {i for split in splits for i in split.fitted}
         cut = parts[-1].label == parts[0].label
@@ -203,12 +190,10 @@ class Regularisation:
         sums = self._anchor.scaled(anchor)
         for i in fitted:
             sums += self._moments[own][i]
-        return self._remainder.model(self._solved(sums, strength))
-
-    def _solved(self, sums: NormalEquations, strength: float) -> F64:
-        firm = self._remainder.firm(strength, sums)
         # The penalty is on the residual operator; the anchor contains the old one.
-        return np.asarray(np.linalg.solve(sums.normal + firm, sums.right), dtype=np.float64)
+        firm = self._remainder.firm(strength, sums)
+        numbers = np.linalg.solve(sums.normal + firm, sums.right)
+        return self._remainder.model(np.asarray(numbers, dtype=np.float64))
 
     def _held_out(
         self, models: Mapping[RegularisationSplit, HysteresisModel], *, own: bool = False
@@ -220,7 +205,6 @@ class Regularisation:
         data, responses_um = FitData(records, self._unit), np.concatenate(bare)
         how = f"{len(records)} recordings, each held out of one fit"
         if own:
-            mine = np.linalg.lstsq(data.creep, data.target_um - responses_um, rcond=None)[0]
-            responses_um = responses_um + data.creep @ mine
+            responses_um = data.with_creep(responses_um)
             how += ", without an offset and creep per recording"
         return HeldOut(judgement_of(data, responses_um), records, how)

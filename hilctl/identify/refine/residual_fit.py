@@ -120,12 +120,7 @@ OWN = 1e-4  # ridge of offset, creep and drift per run
 
 @dataclass(frozen=True, slots=True)
 class NormalEquations:
-    """Normal equations of a least-squares problem.
-
-    Attributes:
-        normal: float64[m, m], of products of columns.
-        right: float64[m], of columns and the target.
-    """
+    """Normal equations of a least-squares problem: float64[m, m] and float64[m]."""
 
     normal: F64
     right: F64
@@ -141,21 +136,13 @@ class NormalEquations:
 class ResidualFit:
     """Linear fit of a residual operator to the residuals of all runs.
 
-    Attributes:
-        base: The model before any refinement.
-        x_um: For each run, float64[n], displacement of the base relative to rest.
+    The delay follows from the ``fitted`` ones. ``base`` is the model before any refinement, and
+    ``x_um`` is its displacement in each run, relative to rest.
     """
 
     def __init__(
         self, model: HysteresisModel, runs: Sequence[History], fitted: Sequence[History]
     ) -> None:
-        """Simulate the base, and place the cells of the operator over its range.
-
-        Args:
-            model: The old model.
-            runs: Runs that are fitted or evaluated.
-            fitted: Runs that determine the delay.
-        """
         self._old = model
         bare: HysteresisModel = model.base if isinstance(model, RefinedModel) else model
         self.base = delayed_model(bare, fitted)
@@ -180,9 +167,7 @@ class ResidualFit:
     def moments(self, *, own: bool) -> list[NormalEquations]:
         """Return the normal equations of each run.
 
-        Args:
-            own: Whether to eliminate an offset, creep and drift per run, so that they are not
-                fitted as hysteresis.
+        With ``own``, offset, creep and drift of a run are not fitted as hysteresis.
         """
         return [self._of(x, run, own=own) for x, run in zip(self.x_um, self._runs, strict=True)]
 

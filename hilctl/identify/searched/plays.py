@@ -57,48 +57,26 @@ class PlaysProblem:
 
     Search variables: the spacing, relative to the largest one; for an RDPI, the largest growth of
     the thresholds relative to half the peak-to-peak command; for exponential weights, beta n.
-
-    Args:
-        data: The data.
-        settings: The settings.
     """
 
     def __init__(self, data: FitData, settings: FitSettings) -> None:
-        self._data = data
-        self._settings = settings
-        self._rate_dependent = rate_dependent = settings.kind == "rdpi"
+        self._data, self._settings = data, settings
+        self._rate_dependent = settings.kind == "rdpi"
         self._exponential = settings.weights == "exponential"
-        low, high, guess = [0.05], [1.0], [0.8]
-        if rate_dependent:
-            low, high, guess = [*low, 0.0], [*high, 1.0], [*guess, 0.1]
+        space = {"alpha" if self._rate_dependent else "sigma": (0.05, 1.0, 0.8)}
+        if self._rate_dependent:
+            space["gamma"] = (0.0, 1.0, 0.1)
         if self._exponential:
-            low, high, guess = [*low, 0.0], [*high, 40.0], [*guess, 1.5]
+            space["beta_0" if self._rate_dependent else "beta"] = (0.0, 40.0, 1.5)
+        self.space = SearchSpace.of(space)
         size = data.target_um.size
         free = np.ones((size, 1)) if settings.offset else np.empty((size, 0))
         if settings.creep:
             free = data.creep
         self._held = np.empty((0, 2)) if self._exponential else _held(data, settings.plays)
-        rows = len(self._held)
-        self._free = np.vstack([free, np.zeros((rows, free.shape[1]))])
-        self._target = np.append(data.target_um, np.zeros(rows))
-        self._space = SearchSpace(np.array(low), np.array(high), np.array(guess))
-
-    @property
-    def space(self) -> SearchSpace:
-        """The search variables."""
-        return self._space
-
-    @property
-    def searched(self) -> tuple[str, ...]:
-        """Names of the search variables, in the order of the space."""
-        names = ("alpha", "gamma") if self._rate_dependent else ("sigma",)
-        beta = "beta_0" if self._rate_dependent else "beta"
-        return (*names, beta) if self._exponential else names
-
-    @property
-    def held(self) -> int:
-        """Number of rows of the prior."""
-        return len(self._held)
+        self.held = len(self._held)
+        self._free = np.vstack([free, np.zeros((self.held, free.shape[1]))])
+        self._target = np.append(data.target_um, np.zeros(self.held))
 
     def error_um(self, x: F64, scale: F64) -> F64:
         """Return modelled minus measured displacement, see :class:`SearchProblem`."""
@@ -110,8 +88,7 @@ class PlaysProblem:
     def slopes_um(self, x: F64, scale: F64) -> F64:
         """Return the derivatives of the error with compensation by the weights.
 
-        Kaufman's form of variable projection, whose gradient is exact. Weights at a bound are
-        fixed.
+        Kaufman's form of variable projection has an exact gradient. Weights at a bound are fixed.
         """
         columns = self._columns(x)
         found, _ = self._solve(columns, scale)
@@ -126,7 +103,7 @@ class PlaysProblem:
             parts.append((plays @ (-i * weights) / weights.size)[:, None])
         moving = columns[:, found > self._least()]
         basis = qr(np.hstack([moving, self._free]) * scale[:, None], mode="economic")[0]
-        slopes = np.zeros((scale.size, len(self.searched)))
+        slopes = np.zeros((scale.size, x.size))
         samples = slice(self._data.target_um.size)
         slopes[samples] = np.hstack(parts) * scale[samples, None]
         return np.asarray((slopes - basis @ (basis.T @ slopes)) / scale[:, None])
@@ -202,10 +179,6 @@ def fit_plays(job: FitJob) -> FoundModel:
     return searched_fit(PlaysProblem(job.data, job.settings), job)
 
 
-SEARCHED = (
-    "alpha", "gamma", "a_0", "alpha_0", "beta_0", "alpha_1", "beta_1", "d_p", "alpha_2", "beta_2",
-    "d_n", "output_offset_um",
-)  # fmt: skip
 STEEPEST = 5.0  # largest slope of the deadband function, relative to that around 0
 
 
@@ -220,50 +193,33 @@ class ExponentialProblem:
     beta_0 n; the loss of slope over all deadbands above 0, below 1 so that cumulative slopes stay
     > 0; beta_1 k; d_p (k + 1) over half the stroke; the same three below 0, where the slope gains;
     and the constant displacement, if fitted, over half the stroke.
-
-    Args:
-        data: The data.
-        settings: The settings.
     """
 
+    held = 0  # exponential weights are smooth without a prior
+
     def __init__(self, data: FitData, settings: FitSettings) -> None:
-        self._data = data
-        self._settings = settings
+        self._data, self._settings = data, settings
         self._half_stroke = 0.5 * data.stroke_um
         self._limit = spacing_limit(data, settings)
         self._slowest_s = data.reach / data.speed
         self._numbers = numbered(settings)
         self._steps = np.arange(1, settings.deadbands + 1, dtype=np.float64)
-
-    @property
-    def space(self) -> SearchSpace:
-        """The search variables."""
-        rows = [
-            (0.05, 1.0, 0.6),
-            (0.0, 1.0, 0.1),
-            (LEAST_SLOPE, 4.0, 0.5),
-            (0.0, 4.0, 1.2 / self._settings.plays),
-            (0.0, 40.0, 2.0),
-            (0.0, 1.0 - LEAST_SLOPE, 0.5),
-            (0.0, 40.0, 1.0),
-            (0.02, 4.0, 0.8),
-            (0.0, STEEPEST - 1.0, 0.3),
-            (0.0, 40.0, 1.0),
-            (0.02, 4.0, 0.8),
-            *([(-1.0, 1.0, 0.0)] if self._settings.offset else []),
-        ]
-        low, high, guess = np.array(rows).T
-        return SearchSpace(low.copy(), high.copy(), guess.copy())
-
-    @property
-    def searched(self) -> tuple[str, ...]:
-        """Names of the search variables, in the order of the space."""
-        return SEARCHED if self._settings.offset else SEARCHED[:-1]
-
-    @property
-    def held(self) -> int:
-        """No prior: exponential weights are smooth."""
-        return 0
+        space = {
+            "alpha": (0.05, 1.0, 0.6),
+            "gamma": (0.0, 1.0, 0.1),
+            "a_0": (LEAST_SLOPE, 4.0, 0.5),
+            "alpha_0": (0.0, 4.0, 1.2 / settings.plays),
+            "beta_0": (0.0, 40.0, 2.0),
+            "alpha_1": (0.0, 1.0 - LEAST_SLOPE, 0.5),
+            "beta_1": (0.0, 40.0, 1.0),
+            "d_p": (0.02, 4.0, 0.8),
+            "alpha_2": (0.0, STEEPEST - 1.0, 0.3),
+            "beta_2": (0.0, 40.0, 1.0),
+            "d_n": (0.02, 4.0, 0.8),
+        }
+        if settings.offset:
+            space["output_offset_um"] = (-1.0, 1.0, 0.0)
+        self.space = SearchSpace.of(space)
 
     def error_um(self, x: F64, scale: F64) -> F64:
         """Return modelled minus measured displacement, see :class:`SearchProblem`."""

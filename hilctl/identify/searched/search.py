@@ -1,5 +1,6 @@
 """Bounded least squares from several starts, and reweighting for the peak error."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -8,7 +9,7 @@ import numpy as np
 from hilctl.base.types import F64
 from hilctl.identify.evaluation import weight_roots
 from hilctl.identify.fit_api import FitJob, FoundModel, OnProgress, StartOutcome
-from hilctl.identify.least_squares import Mask, converged, first_least
+from hilctl.identify.least_squares import converged, first_least
 from hilctl.models.plays import PlayModel
 
 SEED = 1  # of the random starts
@@ -25,22 +26,23 @@ HELD = 1e-4  # of the space: distance to a bound that counts as at the bound
 
 @dataclass(frozen=True, slots=True)
 class SearchSpace:
-    """Search variables, scaled to about 1.
+    """Search variables, scaled to about 1: bounds, and rough values from the data, float64[p]."""
 
-    Attributes:
-        low: float64[p], lower bounds.
-        high: float64[p], upper bounds.
-        guess: float64[p], rough values from the data, within the bounds.
-    """
-
+    names: tuple[str, ...]
     low: F64
     high: F64
     guess: F64
 
-    def at_bound(self, x: F64) -> Mask:
-        """Return which variables of a point, float64[p], are at a bound: bool[p]."""
+    @classmethod
+    def of(cls, variables: Mapping[str, tuple[float, float, float]]) -> "SearchSpace":
+        """Return the space of variables with lower bound, upper bound and rough value."""
+        return cls(tuple(variables), *np.array(list(variables.values())).T.copy())
+
+    def at_bound(self, x: F64) -> tuple[str, ...]:
+        """Return the names of the variables of a point, float64[p], that are at a bound."""
         near = HELD * (self.high - self.low)
-        return np.asarray((x <= self.low + near) | (x >= self.high - near))
+        held = (x <= self.low + near) | (x >= self.high - near)
+        return tuple(name for name, bound in zip(self.names, held, strict=True) if bound)
 
     def draw(self, rng: np.random.Generator) -> F64:
         """Return a random point, each variable within a factor of 4 of its rough value."""
@@ -50,43 +52,28 @@ class SearchSpace:
 
 
 class SearchProblem(Protocol):
-    """A family of models with its data."""
+    """A family of models with its data.
 
-    @property
-    def space(self) -> SearchSpace:
-        """The search variables."""
-        ...
+    ``held`` is the number of rows of a smoothness prior, after those of the samples.
+    """
 
-    @property
-    def searched(self) -> tuple[str, ...]:
-        """Names of the search variables, in the order of the space."""
-        ...
-
-    @property
-    def held(self) -> int:
-        """Number of rows of a smoothness prior, after those of the samples."""
-        ...
+    space: SearchSpace
+    held: int
 
     def error_um(self, x: F64, scale: F64) -> F64:
         """Return modelled minus measured displacement, and the rows of the prior: float64[N].
 
-        Args:
-            x: float64[p], a point of the space.
-            scale: float64[N], scale of the errors, which linear weights depend on.
+        ``scale`` is that of the errors, which linear weights depend on.
         """
-        ...
 
     def slopes_um(self, x: F64, scale: F64) -> F64:
-        """Return the derivatives of the error, float64[N, p]; arguments as for the error."""
-        ...
+        """Return the derivatives of the error: float64[N, p]."""
 
     def build(self, x: F64, scale: F64) -> PlayModel:
-        """Return the model at a point of the space; arguments as for :meth:`error_um`."""
-        ...
+        """Return the model at a point of the space."""
 
     def parameters(self, x: F64, scale: F64) -> dict[str, float]:
         """Return the parameters at a point under their published names."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,14 +96,6 @@ def search(
     """Minimise the sum of the squared, scaled errors.
 
     Starts are the rough values from the data and the best random points.
-
-    Args:
-        problem: The problem.
-        scale: float64[N], square root of the weight of each sample.
-        stroke_um: Largest peak-to-peak output, for percentages.
-        starts: Number of starts.
-        rng: Source of the random points.
-        progress: Called at each start.
     """
 
     def percent(x: F64) -> float:
@@ -158,14 +137,7 @@ def refine_peak(
 ) -> SearchEnd:
     """Raise the weight of samples with errors beyond a goal, until there are none (Lawson).
 
-    Args:
-        problem: The problem.
-        found: End of least squares.
-        goal_um: Goal of the largest error.
-        progress: Called in each round.
-
-    Returns:
-        The point with the smallest peak error.
+    Return the point with the smallest peak error.
     """
     best, x, scale = found, found.x, found.scale
     samples = slice(scale.size - problem.held)
@@ -199,7 +171,5 @@ def searched_fit(problem: SearchProblem, job: FitJob) -> FoundModel:
         found = refine_peak(problem, found, goal_um, job.progress)
     known = problem.parameters(found.x, found.scale)
     numbers = len(known.keys() - {"g_0"})  # which is 1 by definition
-    at_bound = problem.space.at_bound(found.x)
-    held = tuple(name for name, bound in zip(problem.searched, at_bound, strict=True) if bound)
-    model = problem.build(found.x, found.scale)
+    model, held = problem.build(found.x, found.scale), problem.space.at_bound(found.x)
     return FoundModel(model, numbers, known, found.starts, at_bound=held)

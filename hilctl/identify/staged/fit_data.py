@@ -39,16 +39,8 @@ def lagged(
     """Compute the response of w' = (v - w) / (lag (1 + growth |v - w|)) to a periodic command.
 
     The command is linear between points; each substep is exact for the lag at its middle.
-
-    Args:
-        v: float64[n], one cycle.
-        step_s: Time between its points.
-        lag_s: Time constant for small changes.
-        growth: Relative growth of the lag per unit of v - w.
-        substeps: Steps between two points.
-        settle: Points simulated before the first one, to reach the steady cycle.
-        w: float64[n], filled.
-        dw: float64[n, 4], filled with derivatives by lag and growth; other columns are 0.
+    ``settle`` points are simulated before the first one. Fill in ``w``, and its derivatives by lag
+    and growth in the first columns of ``dw``, float64[n, 4].
     """
     n = v.size
     step = step_s / substeps
@@ -98,18 +90,10 @@ def plays_and_slopes(
 ) -> None:
     """Run plays of thresholds ``spacing numbers_i + gamma speed``, from rest.
 
-    Args:
-        w: float64[n], input.
-        dw: float64[n, 4], its derivatives by the parameters.
-        speed: float64[n], |rate| of the input.
-        spacing: Distance of two thresholds.
-        gamma_s: Growth of the thresholds with the speed.
-        numbers: float64[m], thresholds in units of the spacing.
-        weights: float64[m].
-        turns: Simulated repetitions of the input, of which the last counts; two give the steady
-            cycle, see :meth:`hilctl.identify.data.records.SteadyLoop.run`.
-        out: float64[n, m], filled with each play's output.
-        slopes: float64[n, 4], filled with the derivatives of the weighted sum of the plays.
+    The last of ``turns`` repetitions counts; two give the steady cycle, see
+    :meth:`hilctl.identify.data.records.SteadyLoop.run`. Fill in each play's output, float64[n, m],
+    and the derivatives of their weighted sum by the parameters, float64[n, 4]; ``dw`` holds those
+    of the input.
     """
     held = np.zeros(numbers.size)
     by = np.zeros((numbers.size, 4))
@@ -148,13 +132,7 @@ WITHOUT_STAGES = (
 
 @dataclass(frozen=True, slots=True)
 class Linear:
-    """1 / (1 + c s + q s^2) and a delay; parameters are 0 for missing parts.
-
-    Attributes:
-        delay_s: Transport delay.
-        c_s: 2 zeta / w of a structure.
-        q_s2: 1 / w^2.
-    """
+    """1 / (1 + c s + q s^2), c = 2 zeta / w, q = 1 / w^2, and a delay; 0 for missing parts."""
 
     delay_s: float = 0.0
     c_s: float = 0.0
@@ -194,26 +172,12 @@ class _Run:
 class StagedFitData:
     """Commands and displacements of all records, with evaluated samples in sequence.
 
-    Attributes:
-        target_um: float64[N], measured displacement.
-        places: For each record, its part of the N samples.
-        reach: Half the largest peak-to-peak command.
-        top_speed: Largest |rate| of the command.
-        top_hz: Highest frequency of a loop; for histories, of a sine as fast as they are.
-        stroke_um: Largest peak-to-peak displacement.
-        one_rate: Whether all records are of runs at one sample rate.
-        half_period_s: Half a sample period of the runs; 0.0 if unknown.
-        input_range: Lowest and highest command.
-        output_range_um: Lowest and highest evaluated displacement.
+    See :class:`hilctl.identify.fit_api.FitData` for the attributes; ``top_hz`` is the highest
+    frequency of a loop (for histories, of a sine as fast as they are) and ``half_period_s`` is 0.0
+    if the sample rate is unknown.
     """
 
     def __init__(self, data: Records, speeds: Sequence[F64]) -> None:
-        """Prepare records.
-
-        Args:
-            data: One record or more.
-            speeds: |rate| of each, see :attr:`hilctl.identify.fit_api.FitData.speeds`.
-        """
         runs = [_run(record, speed) for record, speed in zip(data, speeds, strict=True)]
         targets = [r.displacement_um[run.judged] for r, run in zip(data, runs, strict=True)]
         self._keep(runs, np.concatenate(targets))
@@ -233,12 +197,7 @@ class StagedFitData:
         self.output_range_um = (float(self.target_um.min()), float(self.target_um.max()))
 
     def thinned(self, scale: F64, points: int) -> tuple["StagedFitData", F64]:
-        """Return the data with fewer points per loop, and their part of ``scale``, float64[N].
-
-        Args:
-            scale: Square root of the weight of each sample.
-            points: Points per loop, about; histories are kept.
-        """
+        """Return the data with about ``points`` per loop and whole histories, and their scale."""
         kept, runs = np.zeros(scale.size, dtype=bool), []
         for run in self._runs:
             step = max(_size(run.place) // points, 1) if run.s is not None else 1
@@ -277,17 +236,10 @@ class StagedFitData:
     def plays(
         self, lagged: tuple[list[F64], list[F64]], before: F64, numbers: F64, weights: F64
     ) -> tuple[F64, F64, F64]:
-        """Run plays on commands after a lag.
+        """Run plays on commands after a lag, the result of :meth:`lagged`.
 
-        Args:
-            lagged: Result of :meth:`lagged`.
-            before: float64[4], with the spacing of thresholds and gamma in s.
-            numbers: float64[n], thresholds in units of the spacing.
-            weights: float64[n].
-
-        Returns:
-            The lagged command float64[N], each play's output float64[N, n], and the derivatives
-            of the lagged command and of the weighted sum of the plays, float64[2, N, 4].
+        Return the lagged command float64[N], each play's output float64[N, n], and the derivatives
+        of the lagged command and of the weighted sum of the plays, float64[2, N, 4].
         """
         size = self.target_um.size
         inputs, outputs = np.empty(size), np.empty((size, numbers.size))

@@ -48,15 +48,9 @@ class Layers:
     """Parts of the model.
 
     Attributes:
-        plays: Number n of plays.
-        deadbands: Number k of deadbands on each side.
-        lag: Whether there is a field lag.
         growth: Whether it grows with its distance.
         gamma: Whether thresholds grow with the rate.
-        structure: Whether there is a second-order structure.
-        delay: Whether a transport delay is fitted.
         half_period_s: Half a sample period of the loop; 0.0 to ignore its delay.
-        offset: Whether a constant displacement is fitted.
         midpoint: Whether thresholds are alpha (i - 1/2) instead of alpha i.
     """
 
@@ -95,11 +89,8 @@ class Point:
         before: float64[4]: lag in s, its growth, spacing of the thresholds, gamma in s.
         linear: Structure, and delay in addition to that of a sampled loop.
         direct: a_0 in um per command unit.
-        weights: float64[n], a_1 to a_n.
         spacings_um: d_p and d_n, distances of the deadbands above and below 0.
         up: float64[k], slopes of Lambda beyond each deadband above 0; 1 around 0.
-        down: float64[k], the same below 0.
-        offset_um: Constant displacement.
     """
 
     before: F64

@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from hilctl.base.types import F64
+from hilctl.base.types import F64, I64
 from hilctl.identify.evaluation import weight_roots
-from hilctl.identify.fit_api import LEAST_SLOPE, FitJob, FoundModel
-from hilctl.identify.least_squares import numbered, smooth_densities
-from hilctl.identify.literature import cells_below
+from hilctl.identify.fit_api import FitJob, FoundModel
+from hilctl.identify.least_squares import smooth_densities
+from hilctl.identify.literature import fit_triangle, triangle_thresholds
 from hilctl.identify.settings import FitSettings
 from hilctl.identify.staged.fit_data import GAMMA_S, GROWTH, LAG_S, SPACING, StagedFitData
 from hilctl.identify.staged.objective import (
@@ -22,7 +22,6 @@ from hilctl.identify.staged.objective import (
     stages_of,
 )
 from hilctl.identify.staged.staged_search import StagedEnd, find_staged
-from hilctl.models.implicit_models import PreisachModel
 from hilctl.models.staged import StagedModel
 
 DELAY, C_S, Q_S2 = range(SPACING + 2, DYNAMIC)
@@ -32,21 +31,11 @@ RIDGE = 1e-9
 def standard_errors(
     found: StagedEnd, layers: Layers, places: tuple[slice, ...], *, staged: bool
 ) -> dict[str, float]:
-    """Return the standard error of each parameter.
+    """Return standard errors of free parameters; none for fewer than two records.
 
-    Errors within a record are correlated, so the estimate is clustered by record (sandwich):
-    G^-1 (sum of s s^T) G^-1 with G = J^T J and s = J^T e of each record. Parameters at a bound
-    count as known.
-
-    Args:
-        found: The fit.
-        layers: Parts of the model.
-        places: Samples of each record.
-        staged: Whether the delay is reported.
-
-    Returns:
-        Standard errors by the names of :func:`hilctl.identify.staged.objective.parameters`, without
-        parameters at a bound; none for fewer than two records.
+    Errors within a record are correlated, so the estimate is clustered by record (sandwich): G^-1
+    (sum of s s^T) G^-1 with G = J^T J and s = J^T e of each record. Parameters at a bound count as
+    known.
     """
     if len(places) < 2:
         return {}
@@ -117,53 +106,25 @@ def _covariance(found: StagedEnd, places: tuple[slice, ...]) -> F64:
 
 SPARE = 0.1  # margin of the command span, of the range of the data
 SMOOTHNESS = 0.2  # weight of differences between neighbouring densities
-STILL = 0.05  # part of a cell that a play must move through in a record to have a density
 
 
 def with_triangle(data: StagedFitData, model: StagedModel, lines: int, scale: F64) -> StagedModel:
-    """Replace the hysteresis of a staged model by a fitted Preisach triangle.
-
-    Args:
-        data: The data.
-        model: The stages, fitted with another model of hysteresis.
-        lines: Lines of the triangle, and cells of the longest line.
-        scale: float64[N], square root of the weight of each sample.
-    """
+    """Replace the hysteresis of a staged model by a fitted Preisach triangle."""
     low, high = data.input_range
-    thresholds = data.reach / lines * np.arange(lines, dtype=np.float64)
-    edges = np.linspace(low, high, lines + 1)
+    thresholds = triangle_thresholds(data, lines)
     lag = model.lag
     lagged = data.lagged(lag.tau_s if lag else 0.0, lag.growth_per_unit if lag else 0.0)
     spacing = np.array([0.0, 0.0, 1.0, 0.0])
     w, outputs, _ = data.plays(lagged, spacing, thresholds[1:], np.zeros(lines - 1))
-    centres = np.column_stack([w, outputs])
-    columns = np.concatenate([cells_below(centre, edges) for centre in centres.T], axis=1)
-    width = float(edges[1] - edges[0])
-    moved = _largest_swing(columns, data.places) > STILL * width
-    least = np.zeros(columns.shape[1])
-    least[:lines] = LEAST_SLOPE * data.gain
-    seen = data.through(columns[:, moved], stages_of(model, data.half_period_s))
-    table = numbered(moved).reshape(lines, lines)
-    found, offset_um = smooth_densities(
-        seen, data.target_um, scale, least[moved], table, SMOOTHNESS
-    )
-    slopes = least.copy()
-    slopes[moved] = found
+
+    def densities(columns: F64, least: F64, table: I64) -> tuple[F64, float]:
+        seen = data.through(columns, stages_of(model, data.half_period_s))
+        return smooth_densities(seen, data.target_um, scale, least, table, SMOOTHNESS)
+
     spare = SPARE * (high - low)
-    triangle = PreisachModel(
-        command_span=(low - spare, high + spare),
-        thresholds=tuple(thresholds.tolist()),
-        lowest=low,
-        cell=width,
-        slopes=tuple(tuple(line) for line in slopes.reshape(lines, lines).tolist()),
-        output_offset_um=offset_um,
-        input_unit=model.input_unit,
-    )
+    fields = {"command_span": (low - spare, high + spare), "input_unit": model.input_unit}
+    triangle, _ = fit_triangle(data, np.column_stack([w, outputs]), densities, fields)
     return model.model_copy(update={"hysteresis": triangle})
-
-
-def _largest_swing(columns: F64, places: tuple[slice, ...]) -> F64:
-    return np.asarray(np.max([np.ptp(columns[place], axis=0) for place in places], axis=0))
 
 
 def fit_free(job: FitJob) -> FoundModel:

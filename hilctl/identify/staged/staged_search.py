@@ -32,14 +32,6 @@ KNOTS = 16  # of Lambda^-1
 
 
 @dataclass(frozen=True, slots=True)
-class _Inverse:
-    """Lambda^-1: knots in um, float64[K + 1], and its values there."""
-
-    knots: F64
-    values: F64
-
-
-@dataclass(frozen=True, slots=True)
 class WeightedStart:
     """A point, and the root mean square of Lambda^-1(y) - Pi(v) there in um."""
 
@@ -50,15 +42,7 @@ class WeightedStart:
 def convex_start(
     data: StagedFitData, layers: Layers, before: F64, delay_s: float, scale: F64
 ) -> WeightedStart:
-    """Return a start with all weights for fixed lag, thresholds and delay.
-
-    Args:
-        data: The data.
-        layers: Parts of the model.
-        before: float64[4], see :class:`hilctl.identify.staged.objective.Point`.
-        delay_s: Total delay, including that of a structure.
-        scale: float64[N], square root of the weight of each sample.
-    """
+    """Return a start with all weights for fixed lag, thresholds and total delay."""
     blank = np.zeros(layers.plays)
     lagged = data.lagged(float(before[0]), float(before[1]))
     w, outputs, _ = data.plays(lagged, before, layers.numbers, blank)
@@ -80,14 +64,14 @@ def convex_start(
     # x = Pi(v) is 0 at rest; the displacement there is the offset.
     x = rises - float(np.interp(middle, knots, rises)) - constant
     error = (left @ found + constant - target) * scale
-    point = _point(data, layers, found[: layers.plays + 1], _Inverse(knots, x))
+    point = _point(data, layers, found[: layers.plays + 1], knots, x)
     point = _placed(data, layers, point, before, delay_s)
     return WeightedStart(point, float(np.sqrt(np.mean(error**2))))
 
 
-def _point(data: StagedFitData, layers: Layers, weights: F64, inverse: _Inverse) -> Point:
-    """Turn Lambda^-1 into Lambda with evenly spaced deadbands and slope 1 around 0."""
-    k, x, knots = layers.deadbands, inverse.values, inverse.knots
+def _point(data: StagedFitData, layers: Layers, weights: F64, knots: F64, x: F64) -> Point:
+    """Turn x = Lambda^-1 at its knots into Lambda, with even deadbands and slope 1 around 0."""
+    k = layers.deadbands
     least = 1e-3 * data.stroke_um
     d_p, d_n = max(float(x[-1]), least) / (k + 1), max(-float(x[0]), least) / (k + 1)
     steps = np.arange(1, k + 2)
@@ -137,13 +121,9 @@ class StagedEnd:
     """End of the search.
 
     Attributes:
-        point: The parameters.
-        errors_um: float64[N], modelled less measured displacement.
         slopes: float64[N, p], their derivatives by ``point.pack()``.
         free: bool[p], parameters that are neither fixed nor at a bound.
-        held: bool[p], parameters at a bound.
         scale: float64[N], square root of the weights at the end.
-        starts: All starts.
     """
 
     point: Point
@@ -189,16 +169,8 @@ def find_staged(job: FitJob, data: StagedFitData, layers: Layers) -> StagedEnd:
     """Minimise the sum of squared, weighted errors over all parameters.
 
     Starts are a grid of the nonlinear parameters, with linear solutions for all weights. The best
-    ones are optimised on few points, and the best of these on all points.
-
-    Args:
-        job: Settings and records.
-        data: The records, prepared.
-        layers: Parts of the model.
-
-    Raises:
-        DataError: A stage has dynamics, and a record is not a steady cycle, or sample rates
-            differ.
+    ones are optimised on few points, and the best of these on all points. Raise DataError if a
+    stage has dynamics, and a record is not steady or sample rates differ.
     """
     settings, progress = job.settings, job.progress
     scale = weight_roots(job.data.records, settings.weight_by)
@@ -271,17 +243,7 @@ def _outcome(number: int, task: StagedTask, end: tuple[F64, float]) -> StartOutc
 
 
 def lower_peak(task: StagedTask, x: F64, goal_um: float, progress: OnProgress) -> tuple[F64, F64]:
-    """Reduce the largest error to a goal by Lawson's reweighting.
-
-    Args:
-        task: The fit.
-        x: float64[p], end of least squares.
-        goal_um: Goal of the largest error.
-        progress: Called in each round.
-
-    Returns:
-        The point with the smallest peak error, and its scale.
-    """
+    """Reduce the largest error to a goal by Lawson's reweighting; return point and scale."""
     low, high = bounds(task.data, task.layers, task.point.unpack(x))
     scale, plain = task.scale, np.ones_like(task.scale)
     best = (x, scale)

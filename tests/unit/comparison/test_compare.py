@@ -8,40 +8,15 @@ from types import SimpleNamespace
 import pytest
 
 from hilctl.base.errors import InputError
-from hilctl.comparison.compare import (
-    COMPARED,
-    ComparisonRequest,
-    compare,
-    headings,
-    notes,
-    save_models,
-    table_rows,
-    titles,
-)
+from hilctl.comparison.compare import COMPARED, headings, notes, save_models, table_rows
 from hilctl.comparison.comparison_page import comparison_page
 from hilctl.identify.registry import CATALOGUE, entry
 from hilctl.models.model_file import load_model
 from hilctl.recording.reader import read
-from tests.fakes import SteppingClock
-
-ROOT = Path(__file__).parents[3]
-GOLDEN = ROOT / "recordings" / "golden" / "terfenol_uncompensated.mcap"
-OMEGA = ROOT / "configs" / "models" / "terfenol_omega.yaml"
-
-
-def ignore(done, text):
-    """Take a progress report."""
-
-
-@pytest.fixture(scope="module")
-def comparison():
-    """Two models of the catalogue and one of a file, tried at 100 Hz."""
-    request = ComparisonRequest([GOLDEN], ["duhem", "straight", str(OMEGA)], frequencies_hz=[100.0])
-    return compare(request, SteppingClock(1e-3), ignore)
+from tests.unit.comparison.conftest import GOLDEN, ROOT, compared
 
 
 def test_rows_come_as_asked_for(comparison):
-    """One row a model, in that order; a model file was not identified here."""
     assert [row.name for row in comparison.rows] == ["duhem", "straight", "terfenol_omega.yaml"]
     assert [row.numbers for row in comparison.rows] == [4, 2, None]
     assert comparison.rows[2].identify_s is None
@@ -49,14 +24,12 @@ def test_rows_come_as_asked_for(comparison):
 
 
 def test_better_models_compensate_better(comparison):
-    """On its loop: Omega before Duhem before a straight line, modelled and compensated."""
     duhem, straight, omega = comparison.rows
     assert omega.error.peak_percent < duhem.error.peak_percent < straight.error.peak_percent
     assert omega.compensated_percent < duhem.compensated_percent < straight.compensated_percent
 
 
 def test_everything_goes_into_json(comparison):
-    """The mapping is plain, and holds every loop and trial."""
     mapping = json.loads(json.dumps(comparison.to_mapping(), allow_nan=False))
     first = mapping["models"][0]
     assert first["model"]["kind"] == "duhem"
@@ -68,12 +41,11 @@ def test_everything_goes_into_json(comparison):
 @pytest.mark.slow
 @pytest.mark.parametrize("text", ["", "device: {kind: serial_dac, port: /dev/ttyUSB9}"])
 def test_loops_of_a_real_device_are_judged_without_trials(monkeypatch, text):
-    """No device is made, and table, figure and page do without compensated errors."""
     recording = read(GOLDEN)
     run = {**recording.run, "simulated": "false"}
     recording = replace(recording, experiment_yaml=text, run=run)
     monkeypatch.setattr("hilctl.comparison.compare.read", lambda path: recording)
-    judged = compare(ComparisonRequest([GOLDEN], ["straight"]), SteppingClock(1e-3), ignore)
+    judged = compared()
     assert judged.rows[0].trials == ()
     assert judged.rows[0].compensated_percent is None
     assert judged.to_mapping()["device"] is None
@@ -82,19 +54,14 @@ def test_loops_of_a_real_device_are_judged_without_trials(monkeypatch, text):
 
 
 def test_a_compensated_recording_gives_device_and_limits():
-    """Its own waveform and compensator, whose file may be elsewhere, are not needed."""
     path = GOLDEN.with_name("terfenol_compensated.mcap")
-    judged = compare(
-        ComparisonRequest([path], ["straight"], frequencies_hz=[200.0]), SteppingClock(1e-3), ignore
-    )
+    judged = compared(path, frequencies_hz=[200.0])
     assert judged.rows[0].trials[0].frequency_hz == pytest.approx(200.0)
 
 
 def test_progress_rises_to_the_end():
-    """Whoever waits is told what is being done, and how far it is."""
     told = []
-    request = ComparisonRequest([GOLDEN], ["straight"], frequencies_hz=[100.0])
-    compare(request, SteppingClock(1e-3), lambda done, text: told.append((done, text)))
+    compared(progress=lambda *each: told.append(each), frequencies_hz=[100.0])
     parts = [done for done, _ in told]
     assert parts == sorted(parts)
     assert parts[-1] == 1.0
@@ -102,23 +69,20 @@ def test_progress_rises_to_the_end():
 
 
 def test_unknown_models_are_refused_at_once():
-    """A misspelt name is refused before any file is read, with the nearest one."""
     with pytest.raises(InputError, match="did you mean 'preisach'"):
-        compare(ComparisonRequest([Path("nowhere.mcap")], ["presach"]), SteppingClock(1e-3), ignore)
+        compared(Path("nowhere.mcap"), ["presach"])
     assert set(COMPARED) <= set(CATALOGUE)
     for name in CATALOGUE:
         assert entry(name)[1].title
 
 
 def test_a_model_of_another_unit_is_refused():
-    """A stage's model in V can't stand beside loops in A."""
     model = ROOT / "configs" / "models" / "piezo_ppi.yaml"
     with pytest.raises(InputError, match="commands in A"):
-        compare(ComparisonRequest([GOLDEN], [str(model)]), SteppingClock(1e-3), ignore)
+        compared(models=[str(model)])
 
 
 def test_saved_models_are_model_files(comparison, tmp_path):
-    """What was found is written with its provenance; what came from a file is not."""
     paths = save_models(comparison, tmp_path / "models", created="2026-01-01", overwrite=False)
     assert [path.name for path in paths] == ["duhem.yaml", "straight.yaml"]
     for path, row in zip(paths, comparison.rows, strict=False):
@@ -150,7 +114,6 @@ def table(*rows, device="a rig"):
 
 
 def test_a_model_of_a_file_has_dashes_where_nothing_was_found():
-    """Columns are those of the model that was tried most often."""
     found = table(
         row("duhem", trial(50.0, 0.75), trial(100.0, None)),
         row("m.yaml", numbers=None, identify_s=None),
@@ -160,7 +123,6 @@ def test_a_model_of_a_file_has_dashes_where_nothing_was_found():
         ["duhem", "5", "1.50", "312", "1.25", "0.50", "0.75", "-"],
         ["m.yaml", "-", "-", "312", "1.25", "0.50"],
     ]
-    assert titles(found.rows) == [("duhem", "the duhem"), ("m.yaml", "the m.yaml")]
 
 
 def test_a_trial_that_was_limited_has_a_star_and_a_note():

@@ -6,29 +6,11 @@ import pytest
 
 from hilctl.base.errors import InputError
 from hilctl.cli.models import compare as command
-from hilctl.comparison.compare import ComparisonRequest, compare
 from hilctl.comparison.comparison_page import comparison_figure, comparison_page
-from tests.fakes import SteppingClock
-
-ROOT = Path(__file__).parents[3]
-GOLDEN = ROOT / "recordings" / "golden" / "terfenol_uncompensated.mcap"
-OMEGA = ROOT / "configs" / "models" / "terfenol_omega.yaml"
-
-
-def ignore(done, text):
-    """Take a progress report."""
-
-
-@pytest.fixture(scope="module")
-def comparison():
-    """Two models of the catalogue and one of a file, tried at 100 Hz."""
-    request = ComparisonRequest([GOLDEN], ["duhem", "straight", str(OMEGA)], frequencies_hz=[100.0])
-    return compare(request, SteppingClock(1e-3), ignore)
 
 
 @pytest.mark.slow
 def test_the_page_holds_table_and_figure(comparison):
-    """Self-contained, with every model by name."""
     page = comparison_page(comparison)
     assert page.count("<svg") == 1
     assert "http://" not in page
@@ -38,14 +20,12 @@ def test_the_page_holds_table_and_figure(comparison):
 
 
 def test_the_figure_draws_each_model_once(comparison):
-    """A line a model in each error panel, a panel a model below."""
     upper, lower = comparison_figure(comparison).subfigs
     assert [len(axes.lines) for axes in upper.axes] == [3, 3]
     assert sum(bool(axes.lines) for axes in lower.axes) == 3
 
 
 def test_an_existing_page_is_kept(tmp_path):
-    """Unless asked to, the command replaces no file; it says so before anything is read."""
     page = tmp_path / "models.html"
     page.write_text("mine")
     with pytest.raises(InputError, match="--overwrite"):

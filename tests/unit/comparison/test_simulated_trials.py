@@ -36,14 +36,18 @@ SINE = Sine(
     kind="sine", unit="um", amplitude=10.0, offset=18.0, frequency_hz=10.0, duration_s=0.5,
     soft_start_s=0.1, soft_end_s=0.1,
 )  # fmt: skip
+CHIRP = Chirp(kind="chirp", unit="um", amplitude=1.0, start_hz=1.0, stop_hz=10.0, duration_s=1.0)
 
 
-def device(*waveforms, text=TEXT):
-    return TrialDevice(resolve(Document("stage.yaml", text), CONFIGS), waveforms, CONFIGS)
+def device(*waveforms):
+    return TrialDevice(resolve(Document("stage.yaml", TEXT), CONFIGS), waveforms)
+
+
+def line(slope):
+    return PpiModel(input_unit="V", direct=slope, weights=(), thresholds=())
 
 
 def test_the_stage_follows_through_its_own_model():
-    """The inverse of the model that the stage is compensates it to a fraction of a percent."""
     (trial,) = (rig := device(SINE)).run(piezo_ppi(), rig.references[0])
     assert trial.frequency_hz == pytest.approx(10.0)
     assert trial.peak_error_percent < 1.0
@@ -51,45 +55,34 @@ def test_the_stage_follows_through_its_own_model():
 
 
 def test_a_straight_line_leaves_the_hysteresis():
-    """Without a hysteresis model the stage shows its hysteresis."""
-    straight = PpiModel(input_unit="V", direct=0.4, weights=(), thresholds=())
-    (trial,) = (rig := device(SINE)).run(straight, rig.references[0])
+    (trial,) = (rig := device(SINE)).run(line(0.4), rig.references[0])
     assert trial.peak_hysteresis_percent > 5.0
 
 
 def test_trials_start_from_rest():
-    """One trial leaves nothing behind for the next."""
     rig = device(SINE)
     first = rig.run(piezo_ppi(), rig.references[0])
-    rig.run(PpiModel(input_unit="V", direct=0.3, weights=(), thresholds=()), rig.references[0])
+    rig.run(line(0.3), rig.references[0])
     assert rig.run(piezo_ppi(), rig.references[0]) == first
 
 
 def test_the_limiter_is_between():
-    """Commands beyond the limits never reach the device, and are counted."""
-    steep = PpiModel(input_unit="V", direct=0.1, weights=(), thresholds=())
-    (trial,) = (rig := device(SINE)).run(steep, rig.references[0])
+    (trial,) = (rig := device(SINE)).run(line(0.1), rig.references[0])
     assert trial.limited_samples > 100
 
 
 def test_a_real_device_is_refused():
-    """Nothing but a simulated device is driven from here."""
     loaded = load_experiment(CONFIGS / "modbus_labjack_t7.yaml")
     with pytest.raises(InputError, match="simulated device"):
-        TrialDevice(loaded, [SINE], CONFIGS)
+        TrialDevice(loaded, [SINE])
 
 
 def test_what_does_not_repeat_is_refused():
-    """A trial is judged on its average cycle, so there has to be one."""
-    chirp = Chirp(
-        kind="chirp", unit="um", amplitude=1.0, start_hz=1.0, stop_hz=10.0, duration_s=1.0
-    )
     with pytest.raises(InputError, match="periodic"):
-        device(chirp)
+        device(CHIRP)
 
 
 def test_waveforms_take_the_frequencies_asked_for():
-    """Sines and triangles get each frequency, and as long as it takes to judge it."""
     triangle = Triangle(
         kind="triangle", unit="um", amplitude=1.0, frequency_hz=1.0, duration_s=9.0,
         soft_start_s=0.3, soft_end_s=0.2,
@@ -104,19 +97,14 @@ def test_waveforms_take_the_frequencies_asked_for():
 
 
 def test_frequencies_need_a_shape_that_has_one():
-    """Any other waveform runs as it is, and frequencies beside it are refused."""
-    chirp = Chirp(
-        kind="chirp", unit="um", amplitude=1.0, start_hz=1.0, stop_hz=10.0, duration_s=1.0
-    )
     with pytest.raises(InputError, match="--frequencies"):
-        waveforms_of(chirp, [10.0])
+        waveforms_of(CHIRP, [10.0])
     for wrong in (0.0, -1.0, float("nan"), float("inf")):
         with pytest.raises(InputError, match="must be > 0"):
             waveforms_of(SINE, [wrong])
 
 
 def test_the_stroke_is_that_of_the_widest_loop():
-    """Where no experiment says otherwise a sine covers nearly all of what was measured."""
     wave = np.sin(2.0 * np.pi * np.arange(300) / 300)
     sine = full_stroke(
         [SteadyLoop("sine", a * wave, 3.0 * a * wave + 2.0, 50.0) for a in (2, 6, 4)]
@@ -127,7 +115,6 @@ def test_the_stroke_is_that_of_the_widest_loop():
 
 
 def test_the_shortest_round_counts():
-    """The time of a sample is that of the round that nothing disturbed."""
     ticks = itertools.accumulate([0.0, 9e-3, 0.0, 2e-3, 0.0, 5e-3, 0.0, 4e-3, 0.0, 8e-3])
     command = 6.0 * np.sin(2.0 * np.pi * np.arange(300) / 300)
     loop = SteadyLoop("sine", command, 4.0 * command, 50.0)

@@ -1,22 +1,26 @@
 """Loops and recordings made from models whose parameters are known."""
 
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from hilctl.base.samples import Samples
 from hilctl.base.segments import Segment
-from hilctl.base.types import F64, I64
+from hilctl.base.types import F64
 from hilctl.identify.data.cycles import average_cycle
 from hilctl.identify.data.records import SteadyLoop
 from hilctl.identify.fit_api import FitData
 from hilctl.models.base import HysteresisModel
+from hilctl.models.integrated import exponential_integrated
 from hilctl.models.plays import PlayModel
-from hilctl.recording.recording import Recording, Ticks
+from hilctl.recording.recording import Recording
 
 RATE_HZ = 50_000.0
+OMEGA = exponential_integrated(
+    alpha=0.33, gamma_s=2.5e-4, a_0=3.0, alpha_0=1.4, beta_0=0.23, g_0=1.0, alpha_1=0.08,
+    beta_1=0.15, d_p=4.0, alpha_2=0.1, beta_2=0.4, d_n=3.0,
+)  # fmt: skip
+"""An asymmetric, saturating Omega; g_0 = 1, as identification has it."""
 
 
 @pytest.fixture
@@ -48,45 +52,25 @@ def loops_of() -> Callable[..., list[SteadyLoop]]:
 
 
 @pytest.fixture
-def recording_of() -> Callable[..., Recording]:
-    """Return a function that wraps signals and segments into a recording."""
+def recording_of(make_recording) -> Callable[..., Recording]:
+    """Return a function that wraps command, displacement and segments into a recording."""
 
-    def make(
-        command: F64,
-        displacement_um: F64,
-        segments: Sequence[Segment],
-        *,
-        rate_hz: float = RATE_HZ,
-        index: I64 | None = None,
-    ) -> Recording:
-        n = command.size
-        nothing = np.zeros(0, dtype=np.int64)
-        samples = Samples(
-            index=np.arange(n, dtype=np.int64) if index is None else index,
-            reference_um=np.full(n, np.nan),
-            wanted=command,
-            command=command,
-            displacement_um=displacement_um,
-            input_um=np.full(n, np.nan),
-            flags=np.zeros(n, dtype=np.uint32),
-        )
-        return Recording(
-            path=Path("grid.mcap"),
-            run={},
-            end={},
-            sample_rate_hz=rate_hz,
-            command_unit="A",
-            compensated=False,
-            segments=tuple(segments),
-            samples=samples,
-            dropped=0,
-            ticks=Ticks(nothing, nothing, nothing, nothing),
-            events=(),
-            experiment_yaml="",
-            model_yaml="",
+    def make(command: F64, displacement_um: F64, segments: Sequence[Segment], **more) -> Recording:
+        return make_recording(
+            displacement_um, command=command, segments=segments, sample_rate_hz=RATE_HZ, **more
         )
 
     return make
+
+
+@pytest.fixture
+def loops(loops_of) -> list[SteadyLoop]:
+    """Return loops of an Omega of 6 plays and 4 deadbands a side, 150 points each."""
+    omega = exponential_integrated(
+        alpha=0.9, gamma_s=2e-4, a_0=3.0, alpha_0=1.4, beta_0=0.3, g_0=1.0, alpha_1=0.08,
+        beta_1=0.15, d_p=8.0, alpha_2=0.1, beta_2=0.4, d_n=8.0, plays=6, deadbands_a_side=4,
+    )  # fmt: skip
+    return loops_of(omega, [(a, f) for a in (2.0, 3.0, 6.0) for f in (10.0, 100.0, 250.0)], 150)
 
 
 def made_loop(

@@ -46,7 +46,6 @@ def crept(creep, time_s):
 
 @pytest.mark.parametrize(("heat", "drift"), [(0.0, 0.0), (0.06, 0.0), (0.0, 0.5)])
 def test_what_a_step_creeps_by_is_found_whatever_the_time_constants(heat, drift):
-    """Within a tenth at all times that rests show, under heat and drift as well."""
     found = creep_of([history(heat=heat, drift=drift)[0]])
     time_s = np.array([0.1, 0.3, 1.0, 3.0])
     np.testing.assert_allclose(crept(found, time_s), crept(CREEP, time_s), rtol=0.1)
@@ -64,14 +63,12 @@ def test_what_is_left_is_the_displacement_without_creep():
 
 @pytest.mark.parametrize(("heat", "drift"), [(0.0, 0.0), (0.02, 0.0), (0.0, 0.05)])
 def test_nothing_creeps_where_nothing_does(heat, drift):
-    """Neither noise nor heat nor drift is taken for creep."""
     assert creep_of([history(None, heat=heat, drift=drift)[0]]) is None
 
 
 @pytest.mark.parametrize("seed", range(8))
 @pytest.mark.parametrize("each_um", [0.03, 0.3, 3.0])
 def test_slow_wandering_is_not_creep(seed, each_um):
-    """A random walk moves the displacement in rests as far as creep does, or further."""
     record, _ = history(None)
     at = np.arange(record.command.size) / RATE_HZ
     walk = np.cumsum(np.random.default_rng(seed).standard_normal(60))
@@ -81,7 +78,6 @@ def test_slow_wandering_is_not_creep(seed, each_um):
 
 
 def test_much_creep_is_found_as_well_as_little():
-    """What has crept does not creep on, and a third more of displacement says what that matters."""
     much = CreepModel(time_constants_s=CREEP.time_constants_s, shares=(0.12, 0.1, 0.12))
     found = creep_of([history(much)[0]])
     time_s = np.array([0.3, 1.0, 3.0])

@@ -7,7 +7,7 @@ from hilctl.base.errors import DataError
 from hilctl.identify.data.records import History, SteadyLoop
 from hilctl.identify.evaluation import hysteresis_weights, judge
 from hilctl.models.linear_stages import FirstMode
-from hilctl.models.plays import PpiModel, RdpiModel
+from hilctl.models.plays import PpiModel
 from hilctl.models.staged import FieldLag, StagedModel
 
 PLAYS = {"direct": 4.0, "weights": (1.0, 2.0), "thresholds": (0.5, 1.5)}
@@ -17,7 +17,6 @@ RATE_HZ = 50_000.0
 
 @pytest.mark.parametrize("frequency_hz", [1.0, 50.0, 150.0])
 def test_a_model_meets_its_own_loop(loop_of, frequency_hz):
-    """Whole and broken numbers of samples a period alike."""
     error = judge(PPI, [loop_of(PPI, 6.0, frequency_hz)])
     assert error.peak_percent <= 0.1
     assert error.errors[0].peak_to_peak_um == pytest.approx(
@@ -25,21 +24,7 @@ def test_a_model_meets_its_own_loop(loop_of, frequency_hz):
     )
 
 
-def test_the_rate_is_that_of_the_run():
-    """A rate-dependent model is run at the loop's sample rate, as its inverse will be."""
-    model = RdpiModel(**PLAYS, gamma_s=3e-4)
-    samples = 6.0 * np.sin(2.0 * np.pi * 200.0 * np.arange(750) / RATE_HZ)
-    ran = model.forward(RATE_HZ).process(samples)[500:]
-    command = 6.0 * np.sin(2.0 * np.pi * np.arange(300) / 300)
-    loop = SteadyLoop("sine", command, command, 200.0, RATE_HZ)
-    at = np.arange(300) * (250 / 300)
-    expected = np.interp(at, np.arange(251), np.append(ran, ran[0]))
-    (modelled_um,) = judge(model, [loop]).modelled_um
-    np.testing.assert_allclose(modelled_um, expected, atol=0.1)
-
-
 def test_without_a_rate_each_point_is_a_sample(loop_of):
-    """Loops whose run is not known are run point by point."""
     loop = loop_of(PPI, 6.0)
     unknown = SteadyLoop(loop.label, loop.command, loop.displacement_um, loop.frequency_hz)
     (modelled_um,) = judge(PPI, [unknown]).modelled_um
@@ -47,7 +32,6 @@ def test_without_a_rate_each_point_is_a_sample(loop_of):
 
 
 def test_errors_are_of_the_right_stroke(loop_of):
-    """The overall error is of the widest loop, a loop's own is of itself."""
     small, large = loop_of(PPI, 1.0), loop_of(PPI, 6.0)
     raised = SteadyLoop("raised", small.command, small.displacement_um + 1.0, 50.0, RATE_HZ)
     error = judge(PPI, [raised, large])
@@ -80,8 +64,7 @@ def ellipse(lag: float, *, frequency_hz: float = 1.0, amplitude: float = 2.0) ->
     )
 
 
-def test_loops_with_minor_loops_have_a_weight() -> None:
-    """All pairs of branches count, so a command of two tones is weighted like any other."""
+def test_loops_with_minor_loops_have_a_weight():
     command = np.sin(TURN) + 0.5 * np.sin(3.0 * TURN)
     lagging = np.roll(command, 10)
     slow, fast = (
@@ -91,8 +74,7 @@ def test_loops_with_minor_loops_have_a_weight() -> None:
     np.testing.assert_allclose(hysteresis_weights([slow, fast]), [1.0, 0.0], atol=1e-12)
 
 
-def test_weights_are_relative_to_the_slowest_and_largest() -> None:
-    """Weights are the hysteresis over that of the slowest loop, the largest of several."""
+def test_weights_are_relative_to_the_slowest_and_largest():
     fast = ellipse(0.6, frequency_hz=100.0)
     small = ellipse(0.5, amplitude=1.0)
     weights = hysteresis_weights([fast, small, ellipse(0.3)])
@@ -100,8 +82,7 @@ def test_weights_are_relative_to_the_slowest_and_largest() -> None:
     np.testing.assert_allclose(weights, expected, rtol=4e-3)
 
 
-def test_weights_need_loops() -> None:
-    """A whole history has no peak hysteresis to be weighted by."""
+def test_weights_need_loops():
     history = History("decay", np.sin(TURN), np.sin(TURN), 100.0)
     with pytest.raises(DataError, match="weight_by"):
         hysteresis_weights([ellipse(0.3), history])

@@ -2,16 +2,9 @@
 
 import pytest
 
-from hilctl.base.errors import DataError
-from hilctl.identify.fit_api import LEAST_SLOPE, FitData, FitJob
+from hilctl.identify.fit_api import LEAST_SLOPE, FitJob
 from hilctl.identify.settings import FitSettings
 from hilctl.models.plays import PpiModel
-
-
-def test_no_loops_are_refused():
-    """There is nothing to find a model from on an empty list."""
-    with pytest.raises(DataError, match="empty"):
-        FitData([], "A")
 
 
 def test_the_least_slope_is_a_part_of_the_data_s_gain(data_of):

@@ -21,6 +21,7 @@ from hilctl.models.model_file import dump_model, parse_model
 from hilctl.models.plays import PpiModel, RdpiModel
 from hilctl.models.staged import FieldLag, StagedModel
 from tests.published import piezo_ppi, terfenol_rdpi
+from tests.unit.identify.conftest import OMEGA
 
 Loops = Callable[..., list[SteadyLoop]]
 GRID = [(a, f) for a in (3.0, 6.0) for f in (10.0, 50.0, 100.0, 150.0, 250.0)]
@@ -30,31 +31,13 @@ def fit(kind: FitKind, data: Records, unit: CommandUnit = "A", **choices: Any) -
     return fit_model(FitRequest(data, FitSettings(kind=kind, **choices), unit=unit))
 
 
-def omega() -> IntegratedModel:
-    """Return an asymmetric, saturating Omega; g_0 = 1, as identification has it."""
-    return exponential_integrated(
-        alpha=0.33,
-        gamma_s=2.5e-4,
-        a_0=3.0,
-        alpha_0=1.4,
-        beta_0=0.23,
-        g_0=1.0,
-        alpha_1=0.08,
-        beta_1=0.15,
-        d_p=4.0,
-        alpha_2=0.1,
-        beta_2=0.4,
-        d_n=3.0,
-    )
-
-
 def check(found: FittedModel, peak_percent: float = 0.1) -> None:
     assert found.own_peak_percent < peak_percent
     assert found.peak_percent <= found.own_peak_percent * (1.0 + 1e-12)
     assert all(abs(error.area_error_percent or 0.0) < 1.0 for error in found.errors)
 
 
-def test_published_piezo_ppi_is_found_again(loops_of: Loops) -> None:
+def test_published_piezo_ppi_is_found_again(loops_of):
     """The PPI of the piezo stage comes back from its loop under 30 sin + 40 V (section 3.4.2).
 
     Its tenth threshold is beyond 30 V and never moves in that loop, so the drive is 38 V here.
@@ -65,17 +48,15 @@ def test_published_piezo_ppi_is_found_again(loops_of: Loops) -> None:
     expected = {"sigma": 3.548, "alpha": 0.0383, "beta": 0.1206, "p_0": 0.2567}
     for name, value in expected.items():
         assert found.parameters[name] == pytest.approx(value, rel=0.02), name
-    assert isinstance(found.model, PpiModel)
     assert found.model.input_unit == "V"
     assert found.model.input_range == pytest.approx((2.0, 78.0), abs=1e-3)
 
 
-def test_published_rdpi_is_found_again(loops_of: Loops) -> None:
+def test_published_rdpi_is_found_again(loops_of):
     """The n = 4 RDPI of the magnetostrictive actuator comes back from 1 to 200 Hz (section 5.3)."""
     truth = terfenol_rdpi()
     found = fit("rdpi", loops_of(truth, [(2.3, f) for f in (1.0, 10.0, 50.0, 100.0, 200.0)], 400))
     check(found)
-    assert isinstance(found.model, RdpiModel)
     assert found.model.gamma_s == pytest.approx(truth.gamma_s, rel=0.01)
     assert found.model.direct == pytest.approx(truth.direct, rel=0.01)
     np.testing.assert_allclose(found.model.thresholds, truth.thresholds, rtol=0.01)
@@ -84,8 +65,7 @@ def test_published_rdpi_is_found_again(loops_of: Loops) -> None:
 
 
 @pytest.mark.parametrize("layout", ["even", "midpoint"])
-def test_rdpi_with_exponential_weights(loops_of: Loops, layout: str) -> None:
-    """Exponential weights on either layout of thresholds come back, constant displacement too."""
+def test_rdpi_with_exponential_weights(loops_of, layout):
     shift = 0.5 if layout == "midpoint" else 0.0
     truth = RdpiModel(
         direct=2.0,
@@ -103,8 +83,7 @@ def test_rdpi_with_exponential_weights(loops_of: Loops, layout: str) -> None:
     assert found.model.output_offset_um == pytest.approx(-3.0, abs=0.02)
 
 
-def test_ppi_with_free_weights_from_a_decaying_history() -> None:
-    """Weights of any shape come back from a decaying history run from its first sample."""
+def test_ppi_with_free_weights_from_a_decaying_history():
     truth = PpiModel(
         input_unit="V",
         direct=1.0,
@@ -123,24 +102,21 @@ def test_ppi_with_free_weights_from_a_decaying_history() -> None:
 
 
 @pytest.mark.slow
-def test_published_parametrisation_of_omega_is_found_again(loops_of: Loops) -> None:
+def test_published_parametrisation_of_omega_is_found_again(loops_of):
     """Eleven parameters of the integrated model come back from the published grid (6.24)."""
-    truth = omega()
-    found = fit("integrated", loops_of(truth, GRID))
+    found = fit("integrated", loops_of(OMEGA, GRID))
     check(found)
-    assert isinstance(found.model, IntegratedModel)
     expected = {"alpha": 0.33, "gamma": 2.5e-4, "a_0": 3.0, "alpha_0": 1.4, "beta_0": 0.23}
     for name, value in expected.items():
         assert found.parameters[name] == pytest.approx(value, rel=0.05), name
     x = np.linspace(-45.0, 30.0, 50)
-    np.testing.assert_allclose(found.model.deadband(x), truth.deadband(x), atol=0.1)
+    np.testing.assert_allclose(found.model.deadband(x), OMEGA.deadband(x), atol=0.1)
 
 
-def test_omega_with_free_weights(loops_of: Loops) -> None:
+def test_omega_with_free_weights(loops_of):
     """Free weights describe loops that exponential ones can't, within 0.1 % of the stroke."""
-    base = omega()
-    weights = np.array(base.weights) * (1.0 + 0.4 * np.cos(np.arange(12)))
-    truth = base.model_copy(update={"weights": tuple(weights.tolist())})
+    weights = np.array(OMEGA.weights) * (1.0 + 0.4 * np.cos(np.arange(12)))
+    truth = OMEGA.model_copy(update={"weights": tuple(weights.tolist())})
     loops = loops_of(truth, [(3.0, 10.0), (6.0, 10.0), (6.0, 100.0), (6.0, 250.0)])
     published = fit("integrated", loops, starts=2)
     free = fit("integrated", loops, starts=2, weights="free")
@@ -149,65 +125,49 @@ def test_omega_with_free_weights(loops_of: Loops) -> None:
     IntegratedModel.model_validate(free.model.model_dump())
 
 
-def test_same_data_same_model(loops_of: Loops) -> None:
-    """The random starts are the same, so the result is the same bit for bit."""
-    loops = loops_of(omega(), GRID[:2] + GRID[5:7])
+def test_same_data_same_model(loops_of):
+    loops = loops_of(OMEGA, GRID[:2] + GRID[5:7])
     first, again = (fit("integrated", loops, starts=2) for _ in range(2))
     assert first.model == again.model
     assert first.starts == again.starts
 
 
 @pytest.mark.parametrize(("rate_hz", "rest"), [(75_000.0, 0.01), (50_000.0, 0.25)])
-def test_errors_are_those_of_the_run_at_its_own_rate(
-    loops_of: Loops, rate_hz: float, rest: float
-) -> None:
+def test_errors_are_those_of_the_run_at_its_own_rate(loops_of, rate_hz, rest):
     """Loops of 300 points predict what the model does sample by sample in the run.
 
     At 250 Hz a cycle has 300 samples at 75 kHz, which leaves nothing; it has 200 at 50 kHz, whose
     turns lie at other phases, which leaves 0.2 % of the stroke.
     """
-    wrong = omega().model_copy(update={"gamma_s": 4e-4})
-    (measured,) = loops_of(omega(), [(6.0, 250.0)], rate_hz=rate_hz)
+    wrong = OMEGA.model_copy(update={"gamma_s": 4e-4})
+    (measured,) = loops_of(OMEGA, [(6.0, 250.0)], rate_hz=rate_hz)
     (modelled,) = loops_of(wrong, [(6.0, 250.0)], rate_hz=rate_hz)
     judged = judge(wrong, [measured])
     difference = modelled.displacement_um - measured.displacement_um
     expected = 100.0 * np.max(np.abs(difference)) / np.ptp(measured.displacement_um)
     assert expected > 3.0
     assert judged.peak_percent == pytest.approx(expected, abs=rest)
-    assert judge(omega(), [measured]).peak_percent < rest
+    assert judge(OMEGA, [measured]).peak_percent < rest
 
 
-def test_histories_are_judged_as_models_run_them() -> None:
-    """A history's error is zero to the last bits for the model that made it, rate included."""
+def test_histories_are_judged_as_models_run_them():
     command = 3.0 * np.sin(0.02 * np.arange(2000)) * np.linspace(0.0, 1.0, 2000)
-    made = omega().forward(10_000.0).process(command)
-    judged = judge(omega(), [History("growing", command, made, 10_000.0, ignore=10)])
+    made = OMEGA.forward(10_000.0).process(command)
+    judged = judge(OMEGA, [History("growing", command, made, 10_000.0, ignore=10)])
     assert judged.peak_percent < 1e-9
 
 
-def test_errors_count_against_own_and_largest_stroke(loops_of: Loops) -> None:
-    """One micrometre weighs more against a small loop's stroke than against the largest."""
-    small, large = loops_of(omega(), [(3.0, 10.0), (6.0, 10.0)])
-    shifted = replace(small, displacement_um=small.displacement_um + 1.0)
-    judged = judge(omega(), [shifted, large])
-    spans = [float(np.ptp(loop.displacement_um)) for loop in (small, large)]
-    assert judged.own_peak_percent == pytest.approx(100.0 / spans[0], rel=0.02)
-    assert judged.peak_percent == pytest.approx(100.0 / spans[1], rel=0.02)
-    assert [error.peak_to_peak_um for error in judged.errors] == pytest.approx(spans)
-
-
-def test_hysteresis_weights_shift_the_fit_to_wide_loops(loops_of: Loops) -> None:
+def test_hysteresis_weights_shift_the_fit_to_wide_loops(loops_of):
     """Weighted as in (5.14), the loop with most hysteresis is fitted better than unweighted."""
-    loops = loops_of(omega(), [(6.0, f) for f in (1.0, 50.0, 250.0)])
+    loops = loops_of(OMEGA, [(6.0, f) for f in (1.0, 50.0, 250.0)])
     even = fit("rdpi", loops, weight_by="equal")
     weighted = fit("rdpi", loops, weight_by="hysteresis")
     assert weighted.errors[2].rms_percent < even.errors[2].rms_percent
     assert weighted.errors[0].rms_percent > even.errors[0].rms_percent
 
 
-def test_peak_goal_lowers_the_peak(loops_of: Loops) -> None:
-    """With a goal the peak error falls and the rms rises."""
-    loops = loops_of(omega(), [(6.0, 10.0), (6.0, 150.0)])
+def test_peak_goal_lowers_the_peak(loops_of):
+    loops = loops_of(OMEGA, [(6.0, 10.0), (6.0, 150.0)])
     plain = fit("rdpi", loops, weight_by="equal", offset=True)
     goal = 0.9 * plain.peak_percent
     refined = fit("rdpi", loops, weight_by="equal", offset=True, peak_goal_percent=goal)
@@ -215,32 +175,24 @@ def test_peak_goal_lowers_the_peak(loops_of: Loops) -> None:
     assert refined.rms_percent > plain.rms_percent
 
 
-def test_no_slope_falls_below_the_least(loops_of: Loops) -> None:
+def test_no_slope_falls_below_the_least(loops_of):
     """Loops of pure plays would have a_0 = 0; it stays at the least slope, so it inverts."""
     play = PpiModel(direct=1e-6, weights=(2.0,), thresholds=(0.7,), input_unit="V")
     loops = loops_of(play, [(2.0, 1.0)])
     found = fit("ppi", loops, plays=3, weights="free")
-    assert found.model.input_range is not None
     low, high = found.model.input_range
     gain = found.errors[0].peak_to_peak_um / (high - low)
     assert found.model.direct == pytest.approx(LEAST_SLOPE * gain, rel=1e-9)
     found.model.inverse(1000.0)
 
 
-def test_provenance_and_mapping_say_where_the_model_is_from(loops_of: Loops) -> None:
-    """Model file and JSON hold sources, method, grid, errors, versions, date and time taken."""
-    parts: list[float] = []
-    found = fit_model(
-        FitRequest(
-            loops_of(omega(), GRID[:1] + GRID[5:6]),
-            FitSettings(kind="integrated", starts=1),
-            source=["grid.mcap"],
-            progress=lambda done, text: parts.append(done),
-        )
-    )
+def test_provenance_and_mapping_say_where_the_model_is_from(loops_of):
+    loops, parts = loops_of(OMEGA, GRID[:1] + GRID[5:6]), []
+    settings = FitSettings(kind="integrated", starts=1)
+    told = {"source": ["grid.mcap"], "progress": lambda done, text: parts.append(done)}
+    found = fit_model(FitRequest(loops, settings, **told))
     provenance = found.model.provenance
     assert provenance.source == ("grid.mcap",)
-    assert found.model.output_range_um is not None
     low, high = found.model.output_range_um
     assert high - low == pytest.approx(found.errors[1].peak_to_peak_um)
     assert provenance.method == "integrated, Omega: rate, asymmetry (6.18-6.24); starts=1"
@@ -255,8 +207,7 @@ def test_provenance_and_mapping_say_where_the_model_is_from(loops_of: Loops) -> 
     assert parts[-1] == 1.0
 
 
-def test_no_data_are_refused() -> None:
-    """Nothing comes of an empty list."""
+def test_no_data_are_refused():
     with pytest.raises(DataError, match="empty"):
         fit("ppi", [])
 
@@ -266,12 +217,12 @@ MODE = FurtherMode(
     natural_hz=150.0, damping_ratio=0.1, antiresonance_hz=140.0, antiresonance_damping_ratio=0.1
 )
 FIELD = FitSettings(kind="field", plays=8, drags=0, cells=8, knots=8)
-OMEGA = exponential_integrated(
+SMALL_OMEGA = exponential_integrated(
     alpha=0.3, gamma_s=0.0, a_0=1.0, alpha_0=0.2, beta_0=0.3, g_0=6.0, alpha_1=0.3, beta_1=0.1,
     d_p=0.8, alpha_2=0.4, beta_2=0.1, d_n=0.8, plays=6, deadbands_a_side=2,
 )  # fmt: skip
 TRUTH = StagedModel.around(
-    OMEGA,
+    SMALL_OMEGA,
     lag=FieldLag(tau_s=1e-3),
     creep=CreepModel(time_constants_s=(0.11, 1.3, 14.0), shares=(0.015, 0.02, 0.02)),
 )
@@ -321,10 +272,8 @@ def test_known_modes_are_taken_off_the_records_and_put_into_the_model(records):
     (record,) = records
     ringing_um = MODE.forward(RATE_HZ).process(record.displacement_um)
     moved = [replace(record, displacement_um=ringing_um)]
-    bare, with_it = (
-        fit_kind(FitRequest(records, FIELD, "A")),
-        fit_kind(FitRequest(moved, FIELD, "A", modes=[MODE])),
-    )
+    bare = fit_kind(FitRequest(records, FIELD, "A"))
+    with_it = fit_kind(FitRequest(moved, FIELD, "A", modes=[MODE]))
     assert with_it.model.modes == (MODE,)
     assert with_it.model.output_range_um == (ringing_um.min(), ringing_um.max())
     assert with_it.parameters["antiresonance_hz_2"] == MODE.antiresonance_hz
@@ -338,11 +287,6 @@ def test_kinds_without_stages_have_no_creep(records):
     assert not hasattr(model, "creep")
 
 
-def test_no_records_are_refused():
-    with pytest.raises(DataError, match="no records"):
-        fit_kind(FitRequest([], FIELD, "A"))
-
-
 TURN = 2.0 * np.pi * np.arange(300) / 300
 
 
@@ -352,7 +296,6 @@ def loop(amplitude, frequency_hz, harmonic=0.0):
 
 
 def test_motions_frequencies_and_speed():
-    """The speed is that of the fastest record, the harmonics count."""
     found = identified_range(FitData([loop(1.0, 100.0), loop(6.0, 10.0, harmonic=0.5)]))
     assert found.peak_to_peak_um[0] == pytest.approx(10.0, rel=1e-3)
     assert found.frequency_hz == pytest.approx((10.0, 100.0))
@@ -370,7 +313,6 @@ def test_of_a_history_the_frequencies_of_its_command():
 
 
 def test_of_a_history_the_swings_from_turn_to_turn():
-    """Of large loops and small ones, these are the smallest motion where they are enough of it."""
     time_s = np.arange(20_000) / 1000.0
     wave = np.sin(2.0 * np.pi * 5.0 * time_s)
     for part, wanted_um in ((0.3, 5.0), (0.9, 30.0)):

@@ -45,7 +45,6 @@ def test_the_page_fetches_nothing_and_shows_names_as_they_are(page_of):
 
 @pytest.mark.usefixtures("undrawn")
 def test_data_not_fitted_have_errors_and_a_figure_of_their_own(page_of, data_of, monkeypatch):
-    """Of very many, the first are drawn."""
     monkeypatch.setattr(module, "MOST_RECORDS", 2)
     loops = data_of(TRUTH).loops
     page = page_of((loops[0],) * 3)

@@ -1,6 +1,5 @@
 """Choice of kind, size and lag by held-out data."""
 
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -24,8 +23,7 @@ from hilctl.identify.model_selection import (
 )
 from hilctl.identify.parallel import serial_map
 from hilctl.identify.pipeline import settings_from
-from hilctl.identify.settings import FitSettings, IdentifySettings
-from hilctl.models.integrated import exponential_integrated
+from hilctl.identify.settings import FitSettings
 from hilctl.models.plays import PpiModel
 from tests.published import terfenol_rdpi
 
@@ -91,9 +89,9 @@ SMALL = {"field 0 8": 0.6, "generalised_duhem 12": 0.9, "field 0 32": 0.3, "fiel
 
 def fake(monkeypatch: pytest.MonkeyPatch, errors: dict[str, float | None]) -> list[tuple[str, Any]]:
     """Let fits have errors by kind, drags and size; return the list of them and their starts."""
-    seen: list[tuple[str, Any]] = []
+    seen = []
 
-    def held_out(request: FitRequest) -> HeldOut | None:
+    def held_out(request):
         settings = request.settings
         name = {
             "field": f"field {settings.drags} {settings.plays}",
@@ -119,14 +117,10 @@ def chosen(records: list[Record], *texts: str) -> tuple[FitSettings, tuple[Candi
     return found.settings, found.candidates
 
 
-def test_the_kind_whose_small_model_does_well_is_tried_in_full(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_kind_whose_small_model_does_well_is_tried_in_full(monkeypatch):
     seen = fake(monkeypatch, {**SMALL, "generalised_duhem 12": 1.3})
     found = select(FitRequest([HISTORY], settings_from("auto", [])))
     settings, held_out, errors = found.settings, found.held_out, found.candidates
-    assert isinstance(settings, IdentifySettings)
-    assert held_out is not None
     assert (settings.kind, settings.drags, settings.whole) == ("field", 3, True)
     assert held_out.judgement.rms_percent == 0.2
     assert [error.rms_percent for error in errors] == [0.6, 1.3, 0.3, 0.2]
@@ -136,15 +130,13 @@ def test_the_kind_whose_small_model_does_well_is_tried_in_full(
     assert held_out.end == "end of field 3 32"
 
 
-def test_more_operators_are_taken_only_where_they_are_worth_it(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_more_operators_are_taken_only_where_they_are_worth_it(monkeypatch):
     fake(monkeypatch, {**SMALL, "generalised_duhem 12": 1.3, "field 3 32": 0.99 * 0.3})
     settings, _ = chosen([HISTORY])
     assert (settings.kind, settings.drags) == ("field", 0)
 
 
-def test_a_kind_that_is_near_is_tried_in_full_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_kind_that_is_near_is_tried_in_full_as_well(monkeypatch):
     fake(monkeypatch, {**SMALL, "generalised_duhem 28": 0.25})
     settings, errors = chosen([HISTORY])
     assert settings.kind == "generalised_duhem"
@@ -152,32 +144,30 @@ def test_a_kind_that_is_near_is_tried_in_full_as_well(monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize("plain", [0.8, 5.0])
-def test_a_plain_kind_is_tried_where_no_other_does_well(
-    plain: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_plain_kind_is_tried_where_no_other_does_well(plain, monkeypatch):
     poor = {"field 0 8": 2.0, "generalised_duhem 12": 1.9, "field 0 32": 1.8, "field 3 32": 1.8}
     fake(monkeypatch, {**poor, "generalised_duhem 28": 1.7, "integrated": plain})
     settings, _ = chosen([HISTORY])
     assert settings.kind == ("integrated" if plain < 1.0 else "generalised_duhem")
 
 
-def test_loops_have_candidates_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_loops_have_candidates_of_their_own(monkeypatch):
     fake(monkeypatch, {"staged": 0.1, "integrated": None})
     settings, errors = chosen([LOOP])
     assert settings.kind == "staged"
     assert len(errors) == len(LOOPS) - 1
 
 
-def test_without_anything_held_out_there_is_no_choice(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_anything_held_out_there_is_no_choice(monkeypatch):
     fake(monkeypatch, dict.fromkeys(("field 0 8", "generalised_duhem 12", "integrated")))
     with pytest.raises(DataError, match="--model"):
         chosen([HISTORY])
 
 
-def test_candidates_look_for_the_parts_that_are_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    given: list[tuple[str, bool, bool]] = []
+def test_candidates_look_for_the_parts_that_are_asked_for(monkeypatch):
+    given = []
 
-    def held_out_errors(requests: Sequence[FitRequest], run: Any) -> list[None]:
+    def held_out_errors(requests, run):
         asked = [request.settings for request in requests]
         given.extend((each.kind, each.creep_stage, each.modes) for each in asked)
         return [None] * len(requests)
@@ -192,26 +182,12 @@ def test_candidates_look_for_the_parts_that_are_asked_for(monkeypatch: pytest.Mo
     ]
 
 
-Loops = Callable[..., list[SteadyLoop]]
-POINTS = 150
-SINES = [(a, f) for a in (2.0, 3.0, 6.0) for f in (10.0, 100.0, 250.0)]
-
-
-@pytest.fixture
-def loops(loops_of: Loops) -> list[SteadyLoop]:
-    omega = exponential_integrated(
-        alpha=0.9, gamma_s=2e-4, a_0=3.0, alpha_0=1.4, beta_0=0.3, g_0=1.0, alpha_1=0.08,
-        beta_1=0.15, d_p=8.0, alpha_2=0.1, beta_2=0.4, d_n=8.0, plays=6, deadbands_a_side=4,
-    )  # fmt: skip
-    return loops_of(omega, SINES, POINTS)
-
-
 @pytest.mark.slow
-def test_smallest_order_that_is_as_good_is_chosen(loops: list[SteadyLoop]) -> None:
+def test_smallest_order_that_is_as_good_is_chosen(loops):
     """Loops of 6 plays on a noisy sensor are not given 28; every order's error is told."""
     rng = np.random.default_rng(2)
     noisy = [
-        replace(loop, displacement_um=loop.displacement_um + rng.normal(0.0, 0.3, POINTS))
+        replace(loop, displacement_um=loop.displacement_um + rng.normal(0.0, 0.3, 150))
         for loop in loops
     ]
     settings = FitSettings(kind="integrated", weights="free", size="auto")
@@ -227,9 +203,8 @@ def test_smallest_order_that_is_as_good_is_chosen(loops: list[SteadyLoop]) -> No
 
 
 @pytest.mark.slow
-def test_models_without_deadbands_have_none(loops_of: Loops) -> None:
-    """The order of an RDPI is its plays alone."""
-    data = loops_of(terfenol_rdpi(), [(2.3, f) for f in (1.0, 50.0, 100.0, 200.0)], POINTS)
+def test_models_without_deadbands_have_none(loops_of):
+    data = loops_of(terfenol_rdpi(), [(2.3, f) for f in (1.0, 50.0, 100.0, 200.0)], 150)
     settings = FitSettings(kind="rdpi", weight_by="equal", size="auto")
     found = select(FitRequest(data, settings))
     chosen, errors = found.settings, found.orders
@@ -240,8 +215,7 @@ def test_models_without_deadbands_have_none(loops_of: Loops) -> None:
 
 
 @pytest.mark.slow
-def test_lag_of_a_table_is_found() -> None:
-    """A displacement recorded three samples late is seen to lag by three."""
+def test_lag_of_a_table_is_found():
     stage = PpiModel(
         input_unit="V", direct=1.0, weights=(0.5, 0.3, 0.2), thresholds=(0.2, 0.5, 0.9)
     )
@@ -249,15 +223,14 @@ def test_lag_of_a_table_is_found() -> None:
     command = 1.8 + 1.8 * np.sin(2.0 * np.pi * time / 200.0) * np.linspace(0.2, 1.0, 1500)
     late = np.roll(stage.forward(200.0).process(command), 3)
 
-    def load(lag: int) -> Sequence[History]:
+    def load(lag):
         return [History("stage", command, late, 200.0, ignore=10).without_lag(lag)]
 
     settings = FitSettings(kind="ppi", weights="free", offset=True)
     assert choose_lag(load, settings, serial_map, ignore_progress) == 3
 
 
-def test_creep_and_zero_of_each_history_are_taken_out() -> None:
-    """Two runs whose sensor was set to zero anew, and that creep, give the weights all the same."""
+def test_creep_and_zero_of_each_history_are_taken_out():
     truth = PpiModel(direct=1.0, weights=(0.8, 0.4), thresholds=(0.5, 1.0))
     time = np.arange(2000)
     command = 2.0 * np.sin(2.0 * np.pi * time / 200.0) * np.linspace(0.3, 1.0, 2000)
@@ -266,7 +239,7 @@ def test_creep_and_zero_of_each_history_are_taken_out() -> None:
         History(f"run {i}", command, clean + zero + creep * np.log1p(time / 20.0), 200.0, 10)
         for i, (zero, creep) in enumerate([(3.0, 0.2), (-5.0, 0.1)])
     ]
-    choices: dict[str, Any] = {"plays": 4, "weights": "free", "starts": 1}
+    choices = {"plays": 4, "weights": "free", "starts": 1}
     for creep, low, high in ((True, 0.0, 0.02), (False, 5.0, 100.0)):
         settings = FitSettings(kind="ppi", creep=creep, offset=True, **choices)
         found = fit_model(FitRequest(data, settings))

@@ -3,32 +3,17 @@
 import importlib.util
 import os
 import threading
-from collections.abc import Callable
 
 import pytest
 
 from hilctl.base.errors import InputError
-from hilctl.identify.data.records import SteadyLoop
 from hilctl.identify.fit_api import FitRequest
 from hilctl.identify.fit_model import fit_model
 from hilctl.identify.parallel import _threads, parallel_map, workers
 from hilctl.identify.settings import FitSettings
-from hilctl.models.integrated import exponential_integrated
-
-Loops = Callable[..., list[SteadyLoop]]
-GRID = [(a, f) for a in (2.0, 3.0, 6.0) for f in (10.0, 100.0, 250.0)]
 
 
-@pytest.fixture
-def loops(loops_of: Loops) -> list[SteadyLoop]:
-    omega = exponential_integrated(
-        alpha=0.9, gamma_s=2e-4, a_0=3.0, alpha_0=1.4, beta_0=0.3, g_0=1.0, alpha_1=0.08,
-        beta_1=0.15, d_p=8.0, alpha_2=0.1, beta_2=0.4, d_n=8.0, plays=6, deadbands_a_side=4,
-    )  # fmt: skip
-    return loops_of(omega, GRID)
-
-
-def test_threads_need_no_affinity(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_threads_need_no_affinity(monkeypatch):
     """Only Linux says which CPUs a process may use."""
     monkeypatch.delattr(os, "sched_getaffinity", raising=False)
     _threads.cache_clear()
@@ -37,7 +22,6 @@ def test_threads_need_no_affinity(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_short_parts_run_beside_each_other_and_keep_their_order():
-    """All that a machine's cores take are under way at once; the first error is raised."""
     cores = len(os.sched_getaffinity(0))
     together = threading.Barrier(cores)
 
@@ -77,8 +61,7 @@ def test_fits_that_nobody_waits_for_end():
 
 @pytest.mark.parametrize("scheduler", ["threads", "processes"])
 @pytest.mark.slow
-def test_workers_find_the_same(loops: list[SteadyLoop], scheduler: str) -> None:
-    """Starts followed on other workers end at the same bits."""
+def test_workers_find_the_same(loops, scheduler):
     settings = FitSettings(kind="integrated", weights="free", starts=3)
     alone = fit_model(FitRequest(loops[:4], settings))
     with workers(scheduler) as run:
@@ -92,8 +75,7 @@ def test_workers_find_the_same(loops: list[SteadyLoop], scheduler: str) -> None:
     reason="Dask is not installed: pip install 'hilctl[scale]'",
 )
 @pytest.mark.filterwarnings("ignore")
-def test_dask_cluster_finds_the_same(loops: list[SteadyLoop]) -> None:
-    """The same on a Dask cluster, by its scheduler's address."""
+def test_dask_cluster_finds_the_same(loops):
     from distributed import LocalCluster
 
     settings = FitSettings(kind="integrated", weights="free", starts=3)
@@ -109,10 +91,6 @@ def test_dask_cluster_finds_the_same(loops: list[SteadyLoop]) -> None:
     assert found.model == alone.model
 
 
-def test_unknown_schedulers_are_refused() -> None:
-    """A scheduler that is neither known nor an address is refused with what there is."""
-    with (
-        pytest.raises(InputError, match=r"'four'"),
-        workers("four"),
-    ):
+def test_unknown_schedulers_are_refused():
+    with pytest.raises(InputError, match=r"'four'"), workers("four"):
         pass

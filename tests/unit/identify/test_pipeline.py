@@ -14,7 +14,7 @@ from hilctl.base.errors import ConfigError, InputError
 from hilctl.cli.models import print_identification
 from hilctl.identify import pipeline as subject
 from hilctl.identify.data.records import History, SteadyLoop
-from hilctl.identify.model_page import write_identification
+from hilctl.identify.model_page import identification_page
 from hilctl.identify.model_selection import Selection
 from hilctl.identify.pipeline import TURNS, identify_files, settings_from, with_modes
 from hilctl.identify.resonances import WORTH
@@ -53,12 +53,8 @@ def settings(*texts: str) -> IdentifySettings:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
-def test_order_and_lag_are_found_and_reported(
-    tables: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """With plays and lag on auto, the model is written, and figures, page and JSON say what was
-    chosen."""
-    output, page = tmp_path / "model.yaml", tmp_path / "page.html"
+def test_order_and_lag_are_found_and_reported(tables, tmp_path, capsys):
+    output = tmp_path / "model.yaml"
     asked = settings("plays=auto", "table.lag_samples=auto")
     found = identify_files(tables, asked, output, validate=tables[:1], scheduler="threads")
     assert found.lag_samples == 2
@@ -72,8 +68,7 @@ def test_order_and_lag_are_found_and_reported(
     print_identification(found, output)
     shown = capsys.readouterr().out
     assert "lag of the displacements: 2" in shown
-    write_identification(found, page)
-    text = page.read_text()
+    text = identification_page(found)
     assert text.count("<svg") == 2
     assert "sine3.csv" in text
     assert "<script" not in text
@@ -81,15 +76,13 @@ def test_order_and_lag_are_found_and_reported(
         identify_files(tables, asked, output)
 
 
-def test_a_unit_that_was_not_recorded_is_refused() -> None:
-    """The recordings know it better."""
+def test_a_unit_that_was_not_recorded_is_refused():
     golden = Path(__file__).parents[3] / "recordings" / "golden" / "terfenol_uncompensated.mcap"
     with pytest.raises(InputError, match="--unit must be A"):
         identify_files([golden], settings_from("straight", ["table.unit=V"]), None)
 
 
-def test_settings_are_checked_together() -> None:
-    """Every broken rule is listed at once, with its key, its value and where it was given."""
+def test_settings_are_checked_together():
     texts = ["plays=0", "weigths=free", "lag=none", "table.rate_hz=fast", "starts=2.5"]
     with pytest.raises(ConfigError) as caught:
         settings_from("ppi", texts)
@@ -103,7 +96,7 @@ def test_settings_are_checked_together() -> None:
 
 
 @pytest.mark.slow
-def test_histories_import_neither_plots_nor_statistics(tables: list[Path]) -> None:
+def test_histories_import_neither_plots_nor_statistics(tables):
     """They would take longer than the fit of a small table, and 80 MB."""
     code = (
         "import sys\nfrom hilctl.cli import main\ntry:\n    main()\nfinally:\n"
@@ -174,26 +167,23 @@ def asked(monkeypatch):
 def test_modes_are_kept_for_as_long_as_data_held_out_are_the_better(asked):
     stiffer = FirstMode(natural_hz=2200.0, damping_ratio=0.1)
     found = with_modes(
-        [RECORD],
-        identifying(Found(1.0, 1.0), Found(0.9, 0.5, first=stiffer), Found(0.1, 0.46)),
+        [RECORD], identifying(Found(1.0, 1.0), Found(0.9, 0.5, first=stiffer), Found(0.1, 0.46))
     )
     assert (found.modes, found.held_out_percent) == ((MODE,), 0.5)
     assert asked == [(0, 2000.0), (1, 2200.0)]
 
 
-def test_a_mode_that_helps_only_what_was_fitted_is_left_out(asked):
-    found = with_modes([RECORD], identifying(Found(1.0, 1.0), Found(0.1, WORTH)))
-    assert (found.modes, found.held_out_percent) == ((), 1.0)
-
-
-def test_without_data_held_out_the_fit_itself_judges(asked):
-    found = with_modes([RECORD], identifying(Found(1.0), Found(0.5), Found(0.46)))
-    assert (found.modes, found.rms_percent) == ((MODE,), 0.5)
-
-
-def test_it_ends_after_some_turns(asked):
-    found = with_modes([RECORD], identifying(*[Found(0.5**k) for k in range(20)]))
-    assert len(found.modes) == TURNS == 4
+@pytest.mark.parametrize(
+    ("models", "modes", "rms_percent"),
+    [
+        ([Found(1.0, 1.0), Found(0.1, WORTH)], 0, 1.0),  # it helps only what was fitted
+        ([Found(1.0), Found(0.5), Found(0.46)], 1, 0.5),  # nothing was held out
+        ([Found(0.5**k) for k in range(20)], TURNS, 0.5**TURNS),
+    ],
+)
+def test_modes_that_improve_little_are_left_out(asked, models, modes, rms_percent):
+    found = with_modes([RECORD], identifying(*models))
+    assert (found.modes, found.rms_percent) == ((MODE,) * modes, rms_percent)
 
 
 def test_it_ends_where_no_mode_shows(monkeypatch):

@@ -18,19 +18,24 @@ from hilctl.identify.evaluation import judge
 from hilctl.identify.fit_api import FitJob, FitRequest
 from hilctl.identify.fit_model import FittedModel, fit_model
 from hilctl.identify.registry import CATALOGUE, entry
-from hilctl.identify.settings import FitSettings
+from hilctl.identify.settings import FitSettings, TableSettings
 from hilctl.models.plays import PpiModel
 
-QUICK = ["straight", "duhem", "preisach", "krasnoselskii_pokrovskii", "ppi"]
+QUICK = {
+    "straight": "ppi",  # without plays
+    "duhem": "duhem",
+    "preisach": "preisach",
+    "kp": "krasnoselskii_pokrovskii",
+    "ppi": "ppi",
+}
 TRUTH = PpiModel(direct=4.0, weights=(1.0, 2.0), thresholds=(0.5, 1.5))
 
 
-@pytest.mark.parametrize("kind", [kind for kind in CATALOGUE if kind in QUICK])
-def test_what_is_found_is_of_the_kind_that_was_asked_for(data_of, kind):
-    """A straight line is a PPI without plays."""
+@pytest.mark.parametrize(("kind", "model"), QUICK.items())
+def test_what_is_found_is_of_the_kind_that_was_asked_for(data_of, kind, model):
     name, known = entry(kind)
     found = known.fit(FitJob(data_of(TRUTH), FitSettings(kind=name)))
-    assert found.model.kind == ("ppi" if kind == "straight" else kind)
+    assert found.model.kind == model
     assert found.numbers >= 1
 
 
@@ -44,42 +49,35 @@ def test_no_two_kinds_have_one_title():
 
 
 FOLDER = Path(__file__).resolve().parents[5] / "shared" / "data" / "yan9a_DBO"
-START_TRANSIENT = 500  # rows of the model file; the test file settles after 600
 RATE_HZ = 200.0
+TABLE = TableSettings(command_column=1, displacement_column=5, rate_hz=RATE_HZ, ignore=500)
+"""The model file settles after 500 rows, the test file after 600."""
 
-pytestmark = [
-    pytest.mark.data,
-    pytest.mark.skipif(not FOLDER.is_dir(), reason=f"measured piezo data not at {FOLDER}"),
-]
+
+def needs_data(test):
+    """Mark a test that reads the measured data, and skip it if they are absent."""
+    there = pytest.mark.skipif(not FOLDER.is_dir(), reason=f"no measured piezo data at {FOLDER}")
+    return pytest.mark.data(there(test))
 
 
 @pytest.fixture(scope="module")
 def model_file() -> History:
-    path = FOLDER / "Model_Vi_Do.dat"
-    return read_table(path, 1, 5, rate_hz=RATE_HZ, ignore=START_TRANSIENT)
+    return read_table(FOLDER / "Model_Vi_Do.dat", TABLE)
 
 
 @pytest.fixture(scope="module")
-def test_file() -> History:
-    return read_table(FOLDER / "Test_Vi_Do_Di.dat", 1, 5, rate_hz=RATE_HZ, ignore=600)
+def test_file():
+    return read_table(FOLDER / "Test_Vi_Do_Di.dat", TABLE.model_copy(update={"ignore": 600}))
 
 
 def piezo_fit(history: History, **choices: Any) -> FittedModel:
-    settings = FitSettings(
-        kind="ppi",
-        plays=25,
-        weights="free",
-        layout="midpoint",
-        offset=True,
-        starts=2,
-        **choices,
-    )
+    free = {"plays": 25, "weights": "free", "layout": "midpoint", "offset": True, "starts": 2}
+    settings = FitSettings(kind="ppi", **free, **choices)
     return fit_model(FitRequest([history], settings, unit="V"))
 
 
-def test_model_and_test_file_within_the_published_baseline(
-    model_file: History, test_file: History
-) -> None:
+@needs_data
+def test_model_and_test_file_within_the_published_baseline(model_file, test_file):
     """With the sensor's lag of 2 samples taken out, both files are met within the baselines.
 
     The drift of the first seconds sets the peak on the model file; the goal of 2 % takes it down.
@@ -94,17 +92,11 @@ def test_model_and_test_file_within_the_published_baseline(
     assert found.model.direct > 0.0
 
 
+@needs_data
 @pytest.mark.parametrize(
     ("lag_samples", "own", "other"), [(0, (2.3, 0.76), (4.6, 1.75)), (1, (2.25, 0.75), (5.1, 1.15))]
 )
-def test_plain_least_squares_at_smaller_lags(
-    model_file: History,
-    test_file: History,
-    lag_samples: int,
-    own: tuple[float, float],
-    other: tuple[float, float],
-) -> None:
-    """Without a goal for the peak, and with less of the lag taken out, errors stay near these."""
+def test_plain_least_squares_at_smaller_lags(model_file, test_file, lag_samples, own, other):
     found = piezo_fit(model_file.without_lag(lag_samples))
     assert (found.peak_percent, found.rms_percent) <= own
     assert found.rms_percent <= own[1]
@@ -113,7 +105,8 @@ def test_plain_least_squares_at_smaller_lags(
     assert tried.rms_percent <= other[1]
 
 
-def test_published_weights_describe_it_too(model_file: History) -> None:
+@needs_data
+def test_published_weights_describe_it_too(model_file):
     """Ten plays with exponential weights (3.25, 3.26) reach 2.8 % peak on the averaged cycle."""
     loop = find_cycles(model_file.without_lag(1))
     assert loop.frequency_hz == pytest.approx(1.0, rel=1e-5)

@@ -4,15 +4,7 @@ import numpy as np
 import pytest
 
 from hilctl.identify.data.records import History, SteadyLoop
-from hilctl.identify.resonances import (
-    _bounds,
-    _modes,
-    _packed,
-    _Spectra,
-    _stands,
-    further_modes,
-    without_modes,
-)
+from hilctl.identify.resonances import _stands, further_modes, without_modes
 from hilctl.models.linear_stages import FirstMode, FurtherMode
 
 RATE_HZ = 20e3
@@ -112,7 +104,6 @@ def late(x_um, samples):
 
 @pytest.mark.parametrize("gain", [0.97, 1.03])
 def test_what_the_next_fit_finds_by_itself_is_no_mode(gain):
-    """A gain, and a delay of a sample, are smooth over all frequencies."""
     record, x_um = measured(noise_um=0.3)
     assert further_modes([record], [gain * late(x_um, 1)], (), FIRST.natural_hz) is None
 
@@ -137,24 +128,6 @@ def test_a_mode_is_found_beside_a_gain(gain):
 )
 def test_modes_stand_where_they_are_apart_and_can_be_undone(modes, rate_hz, stands):
     assert _stands(modes, FIRST.natural_hz, rate_hz) is stands
-
-
-def test_each_pair_stays_on_its_side_of_the_first_mode():
-    frequency_hz = np.arange(10.0, 5000.0, 10.0)
-    spectra = _Spectra(frequency_hz, np.ones(499, complex), np.ones(499), 1.0)
-    low, high = _bounds(spectra, _packed((LOW, HIGH)), 800.0)
-    hz = np.exp(np.stack((low, high))[:, [0, 4]])
-    np.testing.assert_allclose(hz, [[10.0, 800.0 * 1.4], [800.0 / 1.4, 4990.0]])
-    np.testing.assert_allclose(np.exp(low[[1, 2, 3]]), [2e-3, 0.5, 2e-3])
-    np.testing.assert_allclose(np.exp(high[[1, 2, 3]]), [0.3, 2.0, 0.3])
-    free, _ = _bounds(spectra, _packed((LOW,)), None)
-    assert np.exp(free[0]) == pytest.approx(10.0)
-
-
-def test_modes_and_numbers_are_the_same():
-    assert _packed(()).tolist() == [0.0, 0.0, 0.0]
-    for found, true in zip(_modes(_packed((LOW, HIGH))), (LOW, HIGH), strict=True):
-        assert found.model_dump() == pytest.approx(true.model_dump())
 
 
 def test_a_model_that_leaves_nothing_has_all_modes():

@@ -1,6 +1,6 @@
 """The settings of a fit: defaults of each kind, what belongs to which, and what is reported."""
 
-from typing import Any, get_args
+from typing import get_args
 
 import pytest
 from pydantic import ValidationError
@@ -16,8 +16,7 @@ from hilctl.identify.settings import (
 )
 
 
-def test_every_kind_has_an_entry_and_known_settings() -> None:
-    """Kinds are one list, and no setting or default names another."""
+def test_every_kind_has_an_entry_and_known_settings():
     assert set(CATALOGUE) == set(get_args(FitKind))
     assert set(PUBLISHED) <= set(CATALOGUE)
     for field in FitSettings.model_fields.values():
@@ -26,7 +25,7 @@ def test_every_kind_has_an_entry_and_known_settings() -> None:
         assert FitSettings(kind=kind).changes() == ""
 
 
-def test_published_choices_of_a_kind_are_its_defaults() -> None:
+def test_published_choices_of_a_kind_are_its_defaults():
     """Sections 3.4.2, 5.3 and 6.4."""
     assert FitSettings(kind="ppi").plays == 10
     rdpi = FitSettings(kind="rdpi")
@@ -36,8 +35,7 @@ def test_published_choices_of_a_kind_are_its_defaults() -> None:
     assert FitSettings(kind="rdpi", plays=6).plays == 6
 
 
-def test_staged_models_have_their_stages_unless_left_out() -> None:
-    """Lag, structure and delay by default, and each can be left out."""
+def test_staged_models_have_their_stages_unless_left_out():
     full = FitSettings(kind="staged")
     assert (full.lag, full.structure, full.delay) == ("growth", True, True)
     less = FitSettings(kind="staged", lag="none", structure=False, delay=False)
@@ -58,14 +56,12 @@ def test_staged_models_have_their_stages_unless_left_out() -> None:
         ({"kind": "kp", "plays": "auto"}, "not of kp"),
     ],
 )
-def test_impossible_choices_are_refused(choices: dict[str, Any], reason: str) -> None:
-    """What does not belong to a kind, or is out of range, is refused with the reason."""
+def test_impossible_choices_are_refused(choices, reason):
     with pytest.raises(ValidationError, match=reason):
         FitSettings(**choices)
 
 
-def test_auto_is_a_size_and_a_lag() -> None:
-    """The word stands where a number would."""
+def test_auto_is_a_size_and_a_lag():
     settings = IdentifySettings(kind="ppi", plays="auto", table={"lag_samples": "auto"})  # type: ignore[arg-type]
     assert settings.size == "auto"
     assert settings.plays == 10
@@ -73,15 +69,13 @@ def test_auto_is_a_size_and_a_lag() -> None:
     assert settings.changes() == "size=auto, table.find_lag=true"
 
 
-def test_the_unit_is_that_of_the_recordings() -> None:
-    """Else the one given, else the published one of the kind."""
+def test_the_unit_is_that_of_the_recordings():
     assert IdentifySettings(kind="ppi").unit("A") == "A"
     assert IdentifySettings(kind="ppi").unit(None) == "V"
     assert IdentifySettings(kind="rdpi").unit(None) == "A"
 
 
-def test_rows_have_defaults_limits_and_kinds() -> None:
-    """What --settings prints follows from the fields."""
+def test_rows_have_defaults_limits_and_kinds():
     rows = {name: rest for name, *rest in setting_rows()}
     assert rows["plays"][0].startswith("12, 10 for ppi")
     assert rows["plays"][1] == "1 to 200"

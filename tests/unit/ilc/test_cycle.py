@@ -1,59 +1,35 @@
 """The error of steady cycles: harmonics, noise, delay."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from hilctl.base.errors import DataError
-from hilctl.base.samples import Samples
 from hilctl.base.segments import Segment
 from hilctl.ilc.cycle import coefficients, cycle_error, harmonic_count
-from hilctl.recording.recording import Recording, Ticks
 
 RATE_HZ = 10_000.0
 
 
-def recording(period, cycles, error_um, noise_um=0.0, delay=0.0, seed=1) -> Recording:
-    """A run whose displacement is a late sine with an error that repeats."""
-    n = round(period * (cycles + 1))
-    index = np.arange(n)
-    turns = 2.0 * np.pi * index / period
-    wanted = 10.0 * np.sin(turns)
-    noise = noise_um * np.random.default_rng(seed).standard_normal(n)
-    moved = 10.0 * np.sin(turns - 2.0 * np.pi * delay / period) + error_um(turns) + noise
-    nothing = np.zeros(n)
-    samples = Samples(
-        index=index,
-        reference_um=wanted,
-        wanted=nothing,
-        command=nothing,
-        displacement_um=moved,
-        input_um=wanted,
-        flags=nothing.astype(np.uint32),
-    )
-    none = np.empty(0, dtype=np.int64)
-    return Recording(
-        path=Path("x.mcap"),
-        run={},
-        end={},
-        sample_rate_hz=RATE_HZ,
-        command_unit="A",
-        compensated=True,
-        segments=(Segment("sine", 0, n, 0, n, period),),
-        samples=samples,
-        dropped=0,
-        ticks=Ticks(none, none, none, none),
-        events=(),
-        experiment_yaml="",
-        model_yaml="",
-    )
+@pytest.fixture
+def recording(make_recording):
+    """Return a maker of runs whose displacement is a late sine with an error that repeats."""
+
+    def make(period, cycles, error_um, noise_um=0.0, delay=0.0):
+        n = round(period * (cycles + 1))
+        turns = 2.0 * np.pi * np.arange(n) / period
+        noise = noise_um * np.random.default_rng(1).standard_normal(n)
+        moved = 10.0 * np.sin(turns - 2.0 * np.pi * delay / period) + error_um(turns) + noise
+        segment = Segment("sine", 0, n, 0, n, period)
+        wanted = {"reference_um": 10.0 * np.sin(turns), "segments": [segment]}
+        return make_recording(moved, sample_rate_hz=RATE_HZ, **wanted)
+
+    return make
 
 
 @pytest.mark.parametrize("period", [100.0, 66.66667, 1234.5])
-def test_harmonics_of_the_error_are_found(period):
-    """Amplitude and phase of each, also where a period is no whole number of samples."""
+def test_harmonics_of_the_error_are_found(recording, period):
     made = recording(period, 8, lambda t: 0.3 + 0.2 * np.cos(3.0 * t) - 0.1 * np.sin(5.0 * t))
     error = cycle_error(made, made.segments[0], 5000.0)
     expected = np.zeros(error.harmonics_um.size, dtype=complex)
@@ -62,8 +38,7 @@ def test_harmonics_of_the_error_are_found(period):
     np.testing.assert_allclose(error.harmonics_um[:9], expected[:9], atol=2e-3)
 
 
-def test_peak_is_that_of_the_average_cycle():
-    """Peak, rms and percent are of the error, over the displacement's peak-to-peak."""
+def test_peak_is_that_of_the_average_cycle(recording):
     made = recording(100.0, 8, lambda t: 0.2 * np.cos(4.0 * t))
     error = cycle_error(made, made.segments[0], 5000.0)
     assert error.peak_um == pytest.approx(0.2, rel=1e-3)
@@ -71,7 +46,7 @@ def test_peak_is_that_of_the_average_cycle():
     assert error.percent == pytest.approx(100.0 * 0.2 / error.peak_to_peak_um, rel=1e-3)
 
 
-def test_noise_of_a_harmonic_is_found_from_the_scatter_of_the_cycles():
+def test_noise_of_a_harmonic_is_found_from_the_scatter_of_the_cycles(recording):
     """White noise of 0.1 um over n samples leaves 0.1 / sqrt(n) in each coefficient."""
     made = recording(200.0, 16, lambda t: 0.0 * t, noise_um=0.1)
     error = cycle_error(made, made.segments[0], 5000.0)
@@ -80,7 +55,7 @@ def test_noise_of_a_harmonic_is_found_from_the_scatter_of_the_cycles():
     assert error.floor_um == pytest.approx(error.peak_um, rel=0.4)
 
 
-def test_delay_is_found_by_the_phase():
+def test_delay_is_found_by_the_phase(recording):
     """A displacement 7 samples late."""
     made = recording(200.0, 8, lambda t: 0.0 * t, delay=7.0)
     error = cycle_error(made, made.segments[0], 5000.0)
@@ -88,8 +63,7 @@ def test_delay_is_found_by_the_phase():
     assert error.strongest_hz == pytest.approx(50.0)
 
 
-def test_missing_samples_do_no_harm():
-    """A gap takes the cycles it is in out of the scatter, and nothing else."""
+def test_missing_samples_do_no_harm(recording):
     made = recording(100.0, 8, lambda t: 0.2 * np.cos(4.0 * t))
     keep = np.ones(made.samples.index.size, dtype=bool)
     keep[330:360] = False
@@ -98,8 +72,7 @@ def test_missing_samples_do_no_harm():
     assert abs(error.harmonics_um[4]) == pytest.approx(0.1, rel=1e-3)
 
 
-def test_one_cycle_is_not_enough():
-    """Without a second one, nothing says what is noise."""
+def test_one_cycle_is_not_enough(recording):
     made = recording(100.0, 1, lambda t: 0.0 * t)
     with pytest.raises(DataError, match="got 1"):
         cycle_error(made, made.segments[0], 5000.0)

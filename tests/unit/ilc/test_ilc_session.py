@@ -35,7 +35,6 @@ def learned(folder, runs, cycles=2):
 
 @pytest.mark.slow
 def test_each_run_has_the_next_correction_and_noise_of_its_own(tmp_path):
-    """The correction of a run stands beside its recording; the check is one run more."""
     runs, folder = Runs(), tmp_path / "lab #3: ü"  # of a name that has a meaning in YAML
     found = learned(folder, runs)
     assert len(runs.settings) == 4
@@ -62,7 +61,6 @@ def test_a_fault_is_one_and_leaves_what_was_learned(tmp_path):
 
 
 def test_a_first_run_that_fails_is_an_error(tmp_path):
-    """Nothing has been learned that could stand."""
     with pytest.raises(RunError, match="run 0: "):
         learned(tmp_path, Runs(0))
 
@@ -80,7 +78,6 @@ SINE_repeating = CONFIGS / "terfenol_sine_6a.yaml"
 
 
 def test_a_sine_is_learned_from_nothing():
-    """As far up as an eighth of the sample rate."""
     checked = checked_experiment(SINE_repeating, [])
     (segment,) = repeating(checked)
     state = beginning(checked, segment)

@@ -35,7 +35,6 @@ def test_a_late_first_answer_is_seen():
 
 
 def test_delay_and_resonance_are_found_from_changes():
-    """Changes on both sides of a resonance give it, its damping and the delay back."""
     changes = [change(PLANT, 2500.0, 0.1, 1e-3, seed) for seed in (1, 2)]
     found = fit(changes, (STEP_HZ, complex(PLANT.at(np.array([STEP_HZ]))[0])), RATE_HZ)
     assert found.natural_hz == pytest.approx(1500.0, rel=0.02)
@@ -52,7 +51,6 @@ def test_the_slope_below_a_resonance_already_tells_of_it():
 
 
 def test_changes_within_the_noise_are_not_believed():
-    """A change no larger than the noise leaves the answer as it was."""
     without = fit([], (STEP_HZ, 1.0 + 0.0j), RATE_HZ)
     hidden = fit([change(PLANT, 2500.0, 1e-3, 1e-3, 4)], (STEP_HZ, 1.0 + 0.0j), RATE_HZ)
     frequency = np.array([500.0, 1500.0])
@@ -60,7 +58,6 @@ def test_changes_within_the_noise_are_not_believed():
 
 
 def test_a_strong_neighbour_is_not_taken_for_an_answer():
-    """A harmonic that moved a little beside one that moved a lot says nothing of itself."""
     moved = np.zeros(12, dtype=complex)
     moved[1], moved[2] = 1.0, 0.01
     answer = moved.copy()
@@ -70,6 +67,5 @@ def test_a_strong_neighbour_is_not_taken_for_an_answer():
 
 
 def test_no_resonance_has_no_natural_frequency():
-    """None, not infinity."""
     assert Response().natural_hz is None
     assert PLANT.natural_hz == pytest.approx(1500.0)

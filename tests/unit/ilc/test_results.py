@@ -10,7 +10,7 @@ from hilctl.base.segments import Segment
 from hilctl.experiment.correction import Correction, LearnedCycle
 from hilctl.ilc.cycle import CycleScore
 from hilctl.ilc.results import IlcResult, row_of
-from hilctl.ilc.update import begin
+from hilctl.ilc.update import IlcState
 
 RATE_HZ = 10_000.0
 SEGMENT = Segment("sine", 0, 5000, 0, 5000, 100.0)
@@ -19,12 +19,11 @@ ERROR = CycleScore(
     peak_um=2.0, rms_um=0.5, peak_to_peak_um=50.0, floor_um=0.1, strongest_hz=100.0,
     answer=1.0 + 0.0j,
 )  # fmt: skip
-STATE = begin(RATE_HZ, np.zeros(4, dtype=complex), 1250.0)
+STATE = IlcState(RATE_HZ, 1250.0, np.zeros(4, dtype=complex))
 ROW = row_of(3, SEGMENT, ERROR, STATE, 800.0, Path("run-03.mcap"))
 
 
 def test_a_row_is_in_percent_of_the_peak_to_peak_displacement():
-    """The delay is in samples, whatever the rate."""
     assert (ROW.run, ROW.label, ROW.cycles, ROW.recording) == (3, "sine", 16, "run-03.mcap")
     assert ROW.rms_percent == pytest.approx(1.0)
     assert ROW.error_percent == pytest.approx(4.0)

@@ -5,7 +5,7 @@ import pytest
 
 from hilctl.ilc.cycle import CycleScore
 from hilctl.ilc.response import Response
-from hilctl.ilc.update import FIRST_GAIN, IlcState, begin, learn, refused
+from hilctl.ilc.update import FIRST_GAIN, IlcState, learn, refused
 
 RATE_HZ = 50_000.0
 STEP_HZ = 100.0
@@ -52,7 +52,7 @@ class Plant:
 
 
 def begun() -> IlcState:
-    return begin(RATE_HZ, np.zeros(HARMONICS + 1, dtype=complex), 6000.0)
+    return IlcState(RATE_HZ, 6000.0, np.zeros(HARMONICS + 1, dtype=complex))
 
 
 def learned(plant: Plant, cycles: int = 20) -> IlcState:
@@ -93,7 +93,6 @@ def test_the_error_goes_to_the_noise_floor(response, coupling):
 
 @pytest.mark.slow
 def test_it_stops_at_the_noise_floor():
-    """Once the error is that of the noise, there is nothing to learn."""
     state = learned(Plant(Response()))
     assert "noise floor" in state.done
     assert state.best.error.peak_um <= 1.2 * state.best.error.floor_um
@@ -101,7 +100,6 @@ def test_it_stops_at_the_noise_floor():
 
 
 def test_noise_alone_is_not_learned():
-    """Where the error is noise, the correction stays nearly empty."""
     plant = Plant(Response())
     plant._start[:] = 0.0
     state = learn(begun(), plant.run(begun().next_um))
@@ -118,7 +116,6 @@ def test_the_first_step_reaches_no_further_than_the_phase_is_known():
 
 
 def test_the_reach_grows_while_the_error_falls():
-    """Harmonics beyond the reach are not touched, and the reach moves on."""
     plant = Plant(Response())
     state = learn(begun(), plant.run(begun().next_um))
     beyond = 1.25 * state.reach_hz < FREQUENCY
@@ -129,7 +126,6 @@ def test_the_reach_grows_while_the_error_falls():
 
 @pytest.mark.slow
 def test_it_backs_off_to_the_best_where_the_error_grows():
-    """Half the gain, and the next correction starts from the best one again."""
     plant = Plant(Response())
     state = learn(begun(), plant.run(begun().next_um))
     state = learn(state, plant.run(state.next_um))
@@ -155,7 +151,6 @@ def test_a_plant_that_turns_the_wrong_way_does_not_run_away():
 
 
 def test_a_refused_correction_is_tried_again_with_less():
-    """Half the gain, less reach, from the best so far; before the first run nothing changes."""
     state = learn(begun(), Plant(Response()).run(begun().next_um))
     smaller = refused(state)
     assert smaller.gain == pytest.approx(0.5 * FIRST_GAIN)
@@ -165,7 +160,6 @@ def test_a_refused_correction_is_tried_again_with_less():
 
 
 def test_it_gives_up_where_nothing_helps():
-    """An error that no correction touches ends the learning after some runs."""
     plant = Plant(Response())
     plant._answer = 0.0 * plant._answer
     state = learned(plant)

@@ -10,7 +10,7 @@ from hilctl.models.plays import RdpiModel
 PHASE = 2.0 * np.pi * np.arange(300) / 300
 
 
-def test_rate_is_that_of_a_run_one_sample_apart() -> None:
+def test_rate_is_that_of_a_run_one_sample_apart():
     """A loop's rate equals the backward difference that a 50 kHz run makes, not its own points'."""
     frequency_hz, rate_hz = 250.0, 50_000.0
     loop = SteadyLoop("x", 6.0 * np.sin(PHASE), np.cos(PHASE), frequency_hz, rate_hz)
@@ -20,30 +20,27 @@ def test_rate_is_that_of_a_run_one_sample_apart() -> None:
     np.testing.assert_allclose(loop.rate(), expected, atol=1e-5 * 6.0 * 2 * np.pi * frequency_hz)
 
 
-def test_rate_without_a_run_is_not_late() -> None:
-    """Where the run's rate is unknown, the rate is the derivative at the point itself."""
+def test_rate_without_a_run_is_not_late():
     loop = SteadyLoop("x", np.sin(PHASE), np.cos(PHASE), 10.0)
     expected = 2.0 * np.pi * 10.0 * np.cos(PHASE)
     np.testing.assert_allclose(loop.rate(), expected, atol=1e-5 * 63)
 
 
-def test_run_of_a_loop_judges_the_second_period() -> None:
-    """A loop is run twice and the first period is not judged."""
+def test_run_of_a_loop_judges_the_second_period():
     loop = SteadyLoop("x", np.sin(PHASE), np.cos(PHASE), 10.0)
     command, rate, ignored = loop.run()
     assert (command.size, rate.size, ignored) == (600, 600, 300)
     np.testing.assert_array_equal(command[300:], loop.command)
 
 
-def test_run_of_a_history_takes_rates_as_models_do() -> None:
-    """A history's rate is the backward difference, zero at its first sample."""
+def test_run_of_a_history_takes_rates_as_models_do():
     history = History("x", np.arange(20.0) ** 2, np.arange(20.0), 100.0, ignore=3)
     _, rate, ignored = history.run()
     assert ignored == 3
     np.testing.assert_allclose(rate[:4], [0.0, 100.0, 300.0, 500.0])
 
 
-def test_without_lag_pairs_a_command_with_a_later_displacement() -> None:
+def test_without_lag_pairs_a_command_with_a_later_displacement():
     """Taking out a lag of 2 samples undoes a displacement that came 2 samples late."""
     command = np.sin(0.3 * np.arange(50))
     late = np.concatenate(([0.0, 0.0], command[:-2]))
@@ -53,8 +50,7 @@ def test_without_lag_pairs_a_command_with_a_later_displacement() -> None:
 
 
 @pytest.mark.parametrize("lag", [-1, 49])
-def test_impossible_lags_are_refused(lag: int) -> None:
-    """A negative lag, or one that leaves almost nothing, is a data error."""
+def test_impossible_lags_are_refused(lag):
     with pytest.raises(DataError, match="x: "):
         History("x", np.arange(50.0), np.arange(50.0), 100.0).without_lag(lag)
 
@@ -68,16 +64,12 @@ def test_impossible_lags_are_refused(lag: int) -> None:
         (np.arange(20.0), np.full(20, 3.0), "displacement_um is constant"),
     ],
 )
-def test_unusable_signals_are_refused(
-    command: np.ndarray, displacement_um: np.ndarray, text: str
-) -> None:
-    """Signals that can't be judged are refused with the label and the reason."""
+def test_unusable_signals_are_refused(command, displacement_um, text):
     with pytest.raises(DataError, match=rf"wobble: .*{text}".replace("(", r"\(")):
         History("wobble", command, displacement_um, 100.0)
 
 
-def test_impossible_rates_and_ignored_parts_are_refused() -> None:
-    """Frequency and rate must be positive, and something must be left to judge."""
+def test_impossible_rates_and_ignored_parts_are_refused():
     y = np.arange(20.0)
     with pytest.raises(DataError, match="frequency_hz"):
         SteadyLoop("x", y, y, 0.0)
@@ -100,7 +92,6 @@ def history(samples, frequency_hz=40.0, rate_hz=10_000.0, noise=0.0):
 
 @pytest.mark.parametrize("frequency_hz", [4.0, 40.0])
 def test_a_model_with_memory_ends_where_the_whole_would_take_it(frequency_hz):
-    """Plays run over what is kept give what the whole gave, slow or fast beside the stretches."""
     whole = history(40_000, frequency_hz)
     (few,) = thinned([whole], 800)
     assert few.command.size < 2000

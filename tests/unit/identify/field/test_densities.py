@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hilctl.base.types import F64
-from hilctl.identify.field.densities import STEEPEST, Curve, Grid, Weights, solve, table
+from hilctl.identify.field.densities import STEEPEST, Curve, Equations, Grid, Weights, table
 
 GRID = Grid(np.array([0.0, 1.0]), np.array([1.5]), -6.0, 3.0, 4, 6)
 SLOPES = np.array([[3.0, 4.0, 4.0, 3.0], [1.0, 2.0, 2.0, 1.0], [2.0, 3.0, 3.0, 2.0]])
@@ -33,16 +33,16 @@ def displacement_um(given: F64) -> F64:
 
 def solved(y: F64, least: float = LEAST) -> Weights:
     """Return the weights for a displacement, each row of the same weight."""
-    return solve(columns(), y, GRID, least, np.ones(y.size))
+    return Equations(columns(), y, GRID, least, np.ones(y.size)).solve()
 
 
-def test_a_curve_goes_through_its_points_and_on_straight() -> None:
+def test_a_curve_goes_through_its_points_and_on_straight():
     curve = Curve(np.array([-3.0, 0.0, 8.0]), np.array([-1.0, 0.0, 2.0]))
     y = np.array([-2.0, -1.0, -0.5, 0.0, 1.0, 2.0, 3.0])
     assert curve.operators_of(y).tolist() == [-6.0, -3.0, -1.5, 0.0, 4.0, 8.0, 12.0]
 
 
-def test_plays_and_drags_by_hand_each_record_from_rest() -> None:
+def test_plays_and_drags_by_hand_each_record_from_rest():
     """Up by 1 from rest: the drag is behind by k (1 - exp(-1 / k)); a play of 1 has not moved."""
     up, far = np.array([0.0, 1.0]), np.array([7.0])
     grid = replace(GRID, lengths=np.array([1.5, 0.5]))
@@ -60,7 +60,7 @@ def test_plays_and_drags_by_hand_each_record_from_rest() -> None:
     assert got[2, 8:] == pytest.approx([0.0, 0.0, first, 0.0, 0.0, 0.0, second, 0.0])
 
 
-def test_what_is_found_gives_the_displacement() -> None:
+def test_what_is_found_gives_the_displacement():
     y = displacement_um(columns()) + 5.0
     found = solved(y)
     assert np.std(found.errors_um) < 0.005 * np.ptp(y)
@@ -69,7 +69,7 @@ def test_what_is_found_gives_the_displacement() -> None:
     assert (found.slopes[0] >= LEAST).all()
 
 
-def test_errors_are_modelled_less_measured() -> None:
+def test_errors_are_modelled_less_measured():
     y = displacement_um(columns()) + np.random.default_rng(1).normal(0.0, 0.05, 800)
     found = solved(y)
     m = operators(found.slopes, columns())
@@ -79,7 +79,7 @@ def test_errors_are_modelled_less_measured() -> None:
     assert np.std(found.errors_um) > 0.04
 
 
-def test_the_curve_rises_through_rest_with_a_mean_slope_of_1() -> None:
+def test_the_curve_rises_through_rest_with_a_mean_slope_of_1():
     curve = solved(displacement_um(columns()) + 5.0).curve
     assert curve.operators_of(np.zeros(1)) == pytest.approx(0.0, abs=1e-9)
     assert np.ptp(curve.operators) == pytest.approx(np.ptp(curve.displacement_um))
@@ -88,32 +88,30 @@ def test_the_curve_rises_through_rest_with_a_mean_slope_of_1() -> None:
     assert slopes[0] > slopes[2] < slopes[-1]  # the inverse of what saturates
 
 
-def test_the_curve_is_held_to_a_steepest_slope() -> None:
-    """A displacement in two steps: between them its inverse would be all but flat."""
+def test_the_curve_is_held_to_a_steepest_slope():
     y = 40.0 * np.tanh(operators(SLOPES, columns()) / 5.0)
     curve = solved(np.asarray(y)).curve
     slopes = np.diff(curve.operators) / np.diff(curve.displacement_um)
     assert slopes.min() == pytest.approx(1.0 / STEEPEST)
 
 
-def test_no_slope_of_the_first_line_is_less_than_the_least() -> None:
-    """Of a displacement that only a wide play gives."""
+def test_no_slope_of_the_first_line_is_less_than_the_least():
     given = columns()
     found = solved(given[:, 4:8].sum(axis=1), least=0.4)
     assert found.slopes[0] == pytest.approx(0.4, abs=0.1)
     assert found.slopes[0].min() >= 0.4
 
 
-def test_a_column_that_does_not_move_has_no_weight() -> None:
+def test_a_column_that_does_not_move_has_no_weight():
     u = np.ascontiguousarray(2.5 * np.sin(np.linspace(0.0, 30.0, 500)))
     given = table([u], [np.arange(u.size)], GRID)
-    found = solve(given, given.sum(axis=1), GRID, LEAST, np.ones(u.size))
+    found = Equations(given, given.sum(axis=1), GRID, LEAST, np.ones(u.size)).solve()
     assert (found.slopes[2, [0, 3]] == 0.0).all()  # cells of the drag that are never reached
     assert (found.slopes[0] >= LEAST).all()
     assert found.slopes[2, 1:3].min() > 0.0
 
 
-def test_units_of_the_displacement_make_no_difference() -> None:
+def test_units_of_the_displacement_make_no_difference():
     y = displacement_um(columns()) + 5.0
     one, ten = solved(y), solved(10.0 * y, least=10.0 * LEAST)
     assert ten.slopes == pytest.approx(10.0 * one.slopes, rel=1e-4, abs=1e-6)
@@ -123,7 +121,7 @@ def test_units_of_the_displacement_make_no_difference() -> None:
 
 
 @pytest.mark.parametrize("shift_um", [-20.0, 60.0])
-def test_where_a_sensor_has_its_zero_makes_no_difference(shift_um: float) -> None:
+def test_where_a_sensor_has_its_zero_makes_no_difference(shift_um):
     y = displacement_um(columns())
     one, shifted = solved(y), solved(y + shift_um)
     assert shifted.slopes == pytest.approx(one.slopes, rel=1e-6, abs=1e-6)
@@ -131,15 +129,15 @@ def test_where_a_sensor_has_its_zero_makes_no_difference(shift_um: float) -> Non
     assert shifted.curve.displacement_um == pytest.approx(one.curve.displacement_um, abs=1e-6)
 
 
-def test_a_row_counts_by_the_square_of_its_scale() -> None:
+def test_a_row_counts_by_the_square_of_its_scale():
     """Two rows of weight 1 are one of twice the weight; rows of no weight can't pull."""
     y, given = displacement_um(columns()), columns()
     y[::2] += 0.5
     scale = np.where(np.arange(y.size) % 2, 1.0, 1e-9)
-    freed = solve(given, y, GRID, LEAST, scale)
+    freed = Equations(given, y, GRID, LEAST, scale).solve()
     assert np.mean(freed.errors_um[::2]) == pytest.approx(-0.5, abs=0.05)
     assert np.mean(freed.errors_um[1::2]) == pytest.approx(0.0, abs=0.01)
     twice = np.vstack([given, given]), np.concatenate([y, y])
-    both = solve(*twice, GRID, LEAST, np.concatenate([scale, scale]))
-    heavy = solve(given, y, GRID, LEAST, math.sqrt(2.0) * scale)
+    both = Equations(*twice, GRID, LEAST, np.concatenate([scale, scale])).solve()
+    heavy = Equations(given, y, GRID, LEAST, math.sqrt(2.0) * scale).solve()
     assert both.slopes == pytest.approx(heavy.slopes, rel=1e-6, abs=1e-6)

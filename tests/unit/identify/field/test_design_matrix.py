@@ -5,16 +5,7 @@ import pytest
 
 from hilctl.base.types import F64
 from hilctl.identify.field.densities import Grid, table
-from hilctl.identify.field.design_matrix import (
-    LEAST_SWING,
-    Motion,
-    bare_displacement,
-    chosen,
-    corners,
-    needed_points,
-    swings,
-    turning_points,
-)
+from hilctl.identify.field.design_matrix import LEAST_SWING, Motion, chosen, corners, turning_points
 from hilctl.identify.field.field_search import FINER, tabled
 from hilctl.models.effective_field import FieldModel, OutputCurve
 
@@ -31,7 +22,7 @@ def path() -> np.ndarray:
     return 1.6 * sum(np.sin(2 * np.pi * f * t + rng.uniform(0, 6)) for f in (3.0, 7.0, 11.0)) * t
 
 
-def test_columns_times_slopes_are_the_model() -> None:
+def test_columns_times_slopes_are_the_model():
     u = np.ascontiguousarray(path())
     line = OutputCurve(operators_um=(-1.0, 1.0), displacement_um=(-1.0, 1.0))
     slopes = (*tabled(SLOPES[:3]), *SLOPES[3:].tolist())
@@ -53,7 +44,7 @@ def test_columns_times_slopes_are_the_model() -> None:
     assert given == pytest.approx(modelled, abs=0.02)
 
 
-def test_turning_points_and_rows_are_enough_of_a_path() -> None:
+def test_turning_points_and_rows_are_enough_of_a_path():
     u = np.ascontiguousarray(path())
     kept = np.empty(u.size, dtype=np.int64)
     kept = kept[: turning_points(u, 1.5, kept)].copy()
@@ -63,23 +54,7 @@ def test_turning_points_and_rows_are_enough_of_a_path() -> None:
     assert few == pytest.approx(whole, abs=0.02)
 
 
-def test_swings_go_from_turn_to_turn_and_small_ones_are_none() -> None:
-    y = np.array([0.0, -0.1, 0.2, 1.0, 0.9, 2.0, 1.9, 0.5, 0.6, -1.0, -0.9, 3.0])
-    out = np.empty(y.size)
-    swings(y, 0.3, out)
-    # From 0 up to 2 at sample 5, down to -1 at sample 9, and up to 3.
-    assert out.tolist() == [2.0] * 5 + [3.0] * 4 + [4.0] * 3
-
-
-def test_points_are_the_rows_and_all_turns() -> None:
-    u = np.array([0.0, 1.0, 2.0, 1.5, 1.0, 3.0, 4.0, 5.0, 6.0])
-    points, places = np.empty(9, dtype=np.int64), np.empty(3, dtype=np.int64)
-    count = needed_points(u, np.array([1, 4, 6]), points, places)
-    assert points[:count].tolist() == [0, 1, 2, 4, 6]
-    assert places.tolist() == [1, 3, 4]
-
-
-def test_straight_lines_between_corners_are_near_both_signals() -> None:
+def test_straight_lines_between_corners_are_near_both_signals():
     x, y = path(), np.cos(np.linspace(0.0, 40.0, 600))
     kept = np.empty(600, dtype=np.int64)
     kept = kept[: corners(np.ascontiguousarray(x), y, 0.2, 0.03, 2, 40, kept)].copy()
@@ -94,21 +69,12 @@ def test_straight_lines_between_corners_are_near_both_signals() -> None:
     assert np.abs(np.interp(every, kept, y[kept]) - y[:599]).max() < 2.0 * 0.03
 
 
-def test_corners_of_one_signal_alone_are_kept() -> None:
+def test_corners_of_one_signal_alone_are_kept():
     still, edge = np.zeros(100), np.concatenate([np.zeros(50), np.arange(50.0)])
     kept = np.empty(100, dtype=np.int64)
     for x, y in ((still, edge), (edge, still)):
         count = corners(x, y, 0.1, 0.1, 1, 1000, kept)
         assert kept[:count].tolist() == [0, 50, 99]
-
-
-def test_what_comes_later_is_taken_between_samples() -> None:
-    derivatives = np.array([[0.0, 1.0, 4.0, 9.0], [0.0, 2.0, 4.0, 6.0], [2.0, 2.0, 2.0, 2.0]])
-    out = np.empty(3)
-    bare_displacement(derivatives, np.array([0, 1, 3]), 1.25, 0.5, 0.1, out)
-    whole = derivatives[0] + 0.5 * derivatives[1] + 0.1 * derivatives[2]
-    expected = [0.75 * whole[1] + 0.25 * whole[2], 0.75 * whole[2] + 0.25 * whole[3], whole[3]]
-    assert out == pytest.approx(expected)
 
 
 RATE_HZ = 10_000.0
@@ -135,15 +101,14 @@ def counts(command: F64, most: int, cuts: list[int]) -> tuple[list[int], list[fl
     return [part.size for part in weights], [float(part.sum()) for part in weights]
 
 
-def test_small_loops_weigh_what_their_own_size_makes_of_an_error() -> None:
-    """Of the same time and number of cycles: the square of the inverse of their size."""
+def test_small_loops_weigh_what_their_own_size_makes_of_an_error():
     both = np.concatenate((sine(6.0, 20.0, 1.0), sine(2.0, 20.0, 1.0)))
     (large, small), (one, other) = counts(both, 2000, [10_000])
     assert large == pytest.approx(small, rel=0.05)
     assert other / one == pytest.approx(9.0, rel=0.1)
 
 
-def test_no_swing_weighs_more_than_the_smallest_that_counts() -> None:
+def test_no_swing_weighs_more_than_the_smallest_that_counts():
     tiny = [sine(part * LEAST_SWING * 6.0, 20.0, 1.0) for part in (0.9, 0.3)]
     _, (_, one, other) = counts(
         np.concatenate((sine(6.0, 20.0, 1.0), *tiny)), 3000, [10_000, 20_000]
@@ -151,20 +116,19 @@ def test_no_swing_weighs_more_than_the_smallest_that_counts() -> None:
     assert other < 1.1 * one
 
 
-def test_a_fast_loop_does_not_weigh_by_its_cycles_nor_a_slow_one_by_its_time() -> None:
-    """A hundred cycles in a second and two in two: taken by travel or by time they differ much."""
+def test_a_fast_loop_does_not_weigh_by_its_cycles_nor_a_slow_one_by_its_time():
     both = np.concatenate((sine(6.0, 100.0, 1.0), sine(6.0, 1.0, 2.0)))
     _, (fast, slow) = counts(both, 2000, [10_000])
     assert 0.4 < slow / fast < 2.5
 
 
-def test_a_rest_has_neither_rows_nor_weight() -> None:
+def test_a_rest_has_neither_rows_nor_weight():
     still = np.concatenate((sine(6.0, 20.0, 1.0), np.zeros(100_000)))
     assert counts(still, 1000, [10_000])[0] == [1000 - 1, 0]
 
 
 @pytest.mark.parametrize("judged", [0, 50, 4001])
-def test_rows_are_samples_that_count(judged: int) -> None:
+def test_rows_are_samples_that_count(judged):
     rows = chosen([motion(sine(6.0, 20.0, 1.0), judged), motion(sine(1.0, 10.0, 1.0))], 500)
     first, second = rows.samples
     assert first.min() >= judged
@@ -174,13 +138,13 @@ def test_rows_are_samples_that_count(judged: int) -> None:
     assert np.mean(rows.scale**2) == pytest.approx(1.0)
 
 
-def test_more_rows_are_no_more_weight_for_any_of_them() -> None:
+def test_more_rows_are_no_more_weight_for_any_of_them():
     command = np.concatenate((sine(6.0, 20.0, 1.0), sine(1.0, 5.0, 1.0)))
     few, more = counts(command, 400, [10_000])[1], counts(command, 4000, [10_000])[1]
     assert np.divide(few, sum(few)) == pytest.approx(np.divide(more, sum(more)), abs=0.03)
 
 
-def test_a_thinned_motion_is_the_same_way_and_time() -> None:
+def test_a_thinned_motion_is_the_same_way_and_time():
     whole = motion(sine(6.0, 20.0, 1.0), judged=101)
     kept = np.arange(0, 10_000, 7)
     few = whole.at(kept)

@@ -6,12 +6,11 @@ from functools import cache
 import numpy as np
 import pytest
 
-from hilctl.base.errors import DataError
 from hilctl.base.types import F64
-from hilctl.identify.data.records import History, SteadyLoop
+from hilctl.identify.data.records import History
 from hilctl.identify.evaluation import judge
 from hilctl.identify.field import field_search
-from hilctl.identify.field.densities import Equations, Grid, outputs, solve, table
+from hilctl.identify.field.densities import Equations, Grid, outputs, table
 from hilctl.identify.field.field_search import (
     ROOM,
     ROUNDS,
@@ -32,13 +31,15 @@ from hilctl.models.linear_stages import FirstMode
 from hilctl.models.staged import FieldLag, StagedModel
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 from tests.staged import truth
+from tests.unit.identify.field.test_duhem_tables import RATE_HZ as FAST_HZ
+from tests.unit.identify.field.test_duhem_tables import command
 
 RATE_HZ = 2000.0
 SIZE = Size(4, 1, 6, 5)
 LEAST = 0.05
 
 
-def made(command: F64) -> F64:
+def made(v: F64) -> F64:
     """Return what the known model does: float64[n], in um."""
     hysteresis = FieldModel(
         thresholds=(0.0, 1.0),
@@ -50,15 +51,15 @@ def made(command: F64) -> F64:
         losses=FieldLosses(field_s=5e-4),
     )
     structure = FirstMode(natural_hz=400.0, damping_ratio=0.2)
-    return StagedModel.around(hysteresis, structure=structure).forward(RATE_HZ).process(command)
+    return StagedModel.around(hysteresis, structure=structure).forward(RATE_HZ).process(v)
 
 
 def data(unit: float = 1.0, um: float = 1.0, ignore: int = 50) -> Prepared:
     """Return a history of the known model in other units of the command and the displacement."""
     t, rng = np.arange(700) / RATE_HZ, np.random.default_rng(1)
     wave = sum(np.sin(2.0 * np.pi * f * t + rng.uniform(0, 6)) for f in (7.0, 17.0, 31.0))
-    command = np.ascontiguousarray(6.0 * np.minimum(t / 0.02, 1.0) * wave / np.abs(wave).max())
-    record = History("random", unit * command, um * made(command), RATE_HZ, ignore)
+    v = np.ascontiguousarray(6.0 * np.minimum(t / 0.02, 1.0) * wave / np.abs(wave).max())
+    record = History("random", unit * v, um * made(v), RATE_HZ, ignore)
     return Prepared([record])
 
 
@@ -76,7 +77,7 @@ def laid(size: Size = SIZE) -> FieldSearch:
 
 
 @pytest.mark.slow
-def test_the_data_are_met_and_what_is_late_in_all_is_found() -> None:
+def test_the_data_are_met_and_what_is_late_in_all_is_found():
     end = found()
     known = end.known
     assert np.std(end.weights.errors_um) < 0.005 * data().stroke_um
@@ -87,7 +88,7 @@ def test_the_data_are_met_and_what_is_late_in_all_is_found() -> None:
     assert (end.weights.slopes[0] >= LEAST).all()
 
 
-def test_the_size_is_what_was_asked_for() -> None:
+def test_the_size_is_what_was_asked_for():
     end = found()
     assert end.weights.slopes.shape == (SIZE.plays + SIZE.drags, SIZE.cells)
     assert end.weights.curve.operators.size == SIZE.knots + 1
@@ -95,7 +96,7 @@ def test_the_size_is_what_was_asked_for() -> None:
     assert end.grid.lengths.size == SIZE.drags
 
 
-def test_units_make_no_difference() -> None:
+def test_units_make_no_difference():
     one, other = found(), found(unit=4.0, um=2.0)
     assert other.known.losses.field_s == pytest.approx(one.known.losses.field_s, rel=1e-3)
     assert other.grid.thresholds == pytest.approx(4.0 * one.grid.thresholds, rel=1e-3)
@@ -103,7 +104,7 @@ def test_units_make_no_difference() -> None:
     assert other.weights.slopes == pytest.approx(0.5 * one.weights.slopes, rel=0.01, abs=0.01)
 
 
-def test_progress_rises_below_1_and_names_each_round() -> None:
+def test_progress_rises_below_1_and_names_each_round():
     seen: list[tuple[float, str]] = []
     FieldSearch(data(), Size(2, 0, 3, 3), LEAST).find(
         Stages(), lambda part, what: seen.append((part, what))
@@ -115,10 +116,7 @@ def test_progress_rises_below_1_and_names_each_round() -> None:
     assert [what for _, what in seen] == rounds * (len(seen) // ROUNDS)
 
 
-def test_of_the_starts_the_one_with_the_least_error_is_followed(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Whatever the order in which they are tried; none of the others leaves anything behind."""
+def test_of_the_starts_the_one_with_the_least_error_is_followed(monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(field_search, "FIRST_LAGS", field_search.FIRST_LAGS[::-1])
         end = found.__wrapped__()
@@ -126,8 +124,7 @@ def test_of_the_starts_the_one_with_the_least_error_is_followed(
     assert np.array_equal(end.weights.slopes, found().weights.slopes)
 
 
-def test_a_search_that_goes_on_from_another_of_its_data_ends_no_worse() -> None:
-    """Of the same size at once where that one ended, of another from its stages."""
+def test_a_search_that_goes_on_from_another_of_its_data_ends_no_worse():
     same = FieldSearch(data(), SIZE, LEAST).go_on(found())
     spread = np.std(found().weights.errors_um)
     assert np.std(same.weights.errors_um) < 1.1 * spread
@@ -138,25 +135,25 @@ def test_a_search_that_goes_on_from_another_of_its_data_ends_no_worse() -> None:
     assert known == pytest.approx([known[0]] * 3, rel=0.2)
 
 
-def test_a_search_ends_within_its_bounds_though_it_starts_beyond() -> None:
+def test_a_search_ends_within_its_bounds_though_it_starts_beyond():
     job = laid()
     x = row(HIGH) + 1.0
-    job._learn(row(Stages()), job._chosen())
-    ended, _ = job._polish(x, job._chosen())
+    job._learn(row(Stages()))
+    ended, _ = job._polish(x)
     assert (ended >= row(LOW)).all()
     assert (ended <= row(HIGH)).all()
     assert (ended != x).all()
 
 
-def test_a_search_is_never_of_more_operators_than_were_asked_for() -> None:
+def test_a_search_is_never_of_more_operators_than_were_asked_for():
     assert Size(40, 3, 50, 60).coarse == Size(8, 3, 12, 16)
     assert Size(4, 0, 6, 5).coarse == Size(4, 0, 6, 5)
 
 
-def test_the_least_slope_of_the_first_line_holds_throughout_the_search() -> None:
+def test_the_least_slope_of_the_first_line_holds_throughout_the_search():
     job = FieldSearch(data(), SIZE, 20.0)
     job._lay(Stages(), SIZE)
-    weights = job._solved(row(Stages()), job._chosen())
+    weights = job._solved(row(Stages()))
     assert weights.slopes[0].min() >= 20.0
 
 
@@ -179,30 +176,31 @@ def displacement_um() -> F64:
     return np.asarray(table([path()], KEPT, true) @ np.repeat([3.0, 2.0], 5))
 
 
-def test_a_threshold_goes_to_where_the_rods_yield() -> None:
+def followed(y: F64) -> tuple[F64, Grid]:
+    """Return stages and operators at the minimum, for a path that no stage changes."""
+    bare = BareSignal([path()], y, np.ones(y.size))
+    return JointRefinement(lambda _: bare, KEPT, GRID, LEAST).follow(row(Stages()))
+
+
+def test_a_threshold_goes_to_where_the_rods_yield():
     y = displacement_um()
-    polish = JointRefinement(lambda _: BareSignal([path()], y, np.ones(y.size)), KEPT, GRID, LEAST)
-    x, grid = polish.follow(row(Stages()))
+    x, grid = followed(y)
     assert grid.thresholds[1] == pytest.approx(TRUE_R, abs=0.02)
     assert x == pytest.approx(row(Stages()))  # nothing follows from them here, so they stay
-    before, after = (
-        np.std(solve(table([path()], KEPT, each), y, each, LEAST, np.ones(y.size)).errors_um)
-        for each in (GRID, grid)
-    )
+    tables = [(table([path()], KEPT, each), y, each) for each in (GRID, grid)]
+    ends = [Equations(*each, LEAST, np.ones(y.size)).solve() for each in tables]
+    before, after = (np.std(end.errors_um) for end in ends)
     assert after < 0.3 * before
 
 
-def test_thresholds_stay_in_order() -> None:
-    """Whatever would be best: none goes halfway to its neighbour."""
+def test_thresholds_stay_in_order():
     y = np.asarray(table([path()], KEPT, GRID)[:, 5:10].sum(axis=1) + 4.0 * np.sign(path()))
-    polish = JointRefinement(lambda _: BareSignal([path()], y, np.ones(y.size)), KEPT, GRID, LEAST)
-    _, grid = polish.follow(row(Stages()))
+    _, grid = followed(y)
     assert grid.thresholds[0] == 0.0
     assert (np.abs(grid.thresholds - GRID.thresholds) <= ROOM * 0.7 + 1e-9).all()
 
 
-def test_a_stage_is_found_with_the_weights_free() -> None:
-    """The field's path is larger by what one stage is away from where it should be."""
+def test_a_stage_is_found_with_the_weights_free():
     y, first = displacement_um(), row(Stages())
 
     def rows_of(stages: F64) -> BareSignal:
@@ -217,7 +215,7 @@ def test_a_stage_is_found_with_the_weights_free() -> None:
 
 
 @pytest.mark.parametrize("lengths", [(), (0.6, 1.5)])
-def test_operators_of_known_weights_give_what_their_columns_do(lengths: tuple[float, ...]) -> None:
+def test_operators_of_known_weights_give_what_their_columns_do(lengths):
     grid = replace(GRID, lengths=np.array(lengths))
     slopes = np.random.default_rng(3).uniform(0.5, 2.0, (grid.lines, 5))
     for gain in (1.0, 2.0):  # within the cells, and beyond them
@@ -226,7 +224,7 @@ def test_operators_of_known_weights_give_what_their_columns_do(lengths: tuple[fl
         assert given == pytest.approx(columns @ slopes.ravel(), abs=1e-9)
 
 
-def test_slopes_by_thresholds_are_differences() -> None:
+def test_slopes_by_thresholds_are_differences():
     slopes = np.random.default_rng(3).uniform(0.5, 2.0, (3, 5))
     _, found = outputs([path()], KEPT, GRID, slopes)
     for i in (1, 2):
@@ -240,46 +238,21 @@ def test_slopes_by_thresholds_are_differences() -> None:
         assert np.mean(np.abs(found[:, i - 1] - rise)) < 0.05 * np.mean(np.abs(rise))
 
 
-def test_what_free_weights_take_up_of_a_change_costs_nothing() -> None:
-    """A change along a column of a free weight leaves the sum as it is; another one does not."""
-    y = displacement_um() + np.random.default_rng(1).normal(0.0, 0.05, 900)
-    columns = table([path()], KEPT, GRID)
-    equations = Equations(columns, y, GRID, LEAST, np.ones(900))
-    weights = equations.solve()
-    here = weights.errors_of(columns @ weights.slopes.ravel(), y)
-    changes = np.stack([columns[:, 2], np.sign(path())], axis=1)
-    place = equations.place(here, changes)
-    total = np.sum((changes - changes.mean(axis=0)) ** 2, axis=0)
-    assert place.normal[0, 0] < 1e-2 * total[0]
-    assert place.normal[1, 1] > 0.05 * total[1]
-    assert place.squares == pytest.approx(equations.solve().squares, rel=0.1)
-
-
-FAST_HZ = 20_000.0
-
-
 def history(seed: int, noise_um: float) -> History:
     """Return what a staged model of plays and deadbands does with a random command."""
-    rng = np.random.default_rng(seed)
-    t = np.arange(round(0.6 * FAST_HZ)) / FAST_HZ
-    sines = [np.sin(2 * np.pi * f * t + rng.uniform(0, 6)) for f in rng.uniform(4.0, 160.0, 12)]
-    wave = np.sum(sines, axis=0)
-    command: F64 = np.ascontiguousarray(6.0 * np.minimum(t / 0.02, 1.0) * wave / np.abs(wave).max())
-    y = model().forward(FAST_HZ).process(command)
-    return History("random", command, y + noise_um * rng.standard_normal(y.size), FAST_HZ)
+    v = np.ascontiguousarray(1.2 * command(seed)[: round(0.6 * FAST_HZ)])
+    noise = noise_um * np.random.default_rng(seed).standard_normal(v.size)
+    return History("random", v, model().forward(FAST_HZ).process(v) + noise, FAST_HZ)
 
 
 def model() -> StagedModel:
     """Return what the data come from."""
-    inner = truth(
-        lag=FieldLag(tau_s=2e-4), structure=FirstMode(natural_hz=1500.0, damping_ratio=0.2)
-    )
-    assert isinstance(inner, StagedModel)
-    return inner
+    structure = FirstMode(natural_hz=1500.0, damping_ratio=0.2)
+    return truth(lag=FieldLag(tau_s=2e-4), structure=structure)
 
 
 @pytest.mark.slow
-def test_a_history_that_was_not_fitted_is_met() -> None:
+def test_a_history_that_was_not_fitted_is_met():
     settings = FitSettings(kind="field", plays=6, drags=1, cells=8, knots=6)
     found = fit_model(FitRequest([history(1, 0.01)], settings))
     judged = judge(found.model, [history(2, 0.0)])
@@ -290,21 +263,13 @@ def test_a_history_that_was_not_fitted_is_met() -> None:
 
 
 @pytest.mark.slow
-def test_a_structure_that_a_slow_record_leaves_open_does_not_bend_the_hysteresis() -> None:
+def test_a_structure_that_a_slow_record_leaves_open_does_not_bend_the_hysteresis():
     """The first start ends with one as soft as it may be, and misses the data by 4 % rms."""
     t = np.arange(25_000) / 50e3
     phases = np.random.default_rng(1).uniform(0.0, 6.0, 8)
     wave = sum(np.sin(37.0 * k * t + p) for k, p in enumerate(phases, 1))
-    command = np.ascontiguousarray(6.0 * np.clip(t / 0.02, 0.0, 1.0) * wave / np.ptp(wave))
-    y, current_a = np.empty_like(command), np.empty_like(command)
-    TerfenolActuator(TerfenolParameters(), 50e3, seed=3).step(command, y, current_a)
-    found = fit_model(FitRequest([History("slow", command, y, 50e3)], FitSettings(kind="field")))
+    v = np.ascontiguousarray(6.0 * np.clip(t / 0.02, 0.0, 1.0) * wave / np.ptp(wave))
+    y, current_a = np.empty_like(v), np.empty_like(v)
+    TerfenolActuator(TerfenolParameters(), 50e3, seed=3).step(v, y, current_a)
+    found = fit_model(FitRequest([History("slow", v, y, 50e3)], FitSettings(kind="field")))
     assert found.rms_percent < 0.6
-
-
-def test_steady_loops_are_refused() -> None:
-    """They leave so much open that what is found would differ from processor to processor."""
-    wave = np.sin(2.0 * np.pi * np.arange(64) / 64)
-    loop = SteadyLoop("3 A 10 Hz", 3.0 * wave, 20.0 * wave, 10.0, FAST_HZ)
-    with pytest.raises(DataError, match="3 A 10 Hz"):
-        fit_model(FitRequest([loop], FitSettings(kind="field")))

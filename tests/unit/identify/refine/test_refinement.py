@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hilctl.base.errors import DataError, InputError
-from hilctl.identify.model_page import refinement_page, write_refinement
+from hilctl.identify.model_page import refinement_page
 from hilctl.identify.refine.refinement import (
     STILL_S,
     _history,
@@ -21,17 +21,11 @@ from hilctl.models.model_file import dump_model, load_model
 from hilctl.models.refined import RefinedModel
 from hilctl.recording.reader import read
 from tests.published import piezo_ppi
-from tests.unit.identify.refine.conftest import (
-    OLD,
-    RATE_HZ,
-    actuator,
-    command,
-    five_runs,
-    history,
-)
+from tests.unit.identify.refine.conftest import OLD, RATE_HZ, actuator, command, five_runs, history
 
 ROOT = Path(__file__).parents[4]
 GOLDEN = ROOT / "recordings" / "golden"
+COMPENSATED = GOLDEN / "terfenol_compensated.mcap"
 OMEGA = ROOT / "configs" / "models" / "terfenol_omega.yaml"
 
 
@@ -58,7 +52,6 @@ def test_error_on_unseen_references_is_far_less_than_half(old, found, amplitude)
 
 @pytest.mark.slow
 def test_small_runs_do_not_spoil_the_large_loop(old):
-    """Runs that move a tenth say nothing of what the whole stroke does."""
     small = [history(OLD, i, amplitude=0.7, noise_um=0.1) for i in range(4)]
     gain = [replace(run, displacement_um=0.97 * run.displacement_um) for run in small]
     found = refine_runs(old, gain)
@@ -69,7 +62,6 @@ def test_small_runs_do_not_spoil_the_large_loop(old):
 @pytest.mark.slow
 @pytest.mark.parametrize("drift_um", [0.0, 1.0])
 def test_creep_of_single_runs_is_not_learned_as_hysteresis(old, drift_um):
-    """Each run creeps by another amount; the model found is as good as without."""
     runs = [
         history(actuator(), i, drift_um=drift_um * (i - 2), amplitude=a)
         for i, a in enumerate((6.5, 6.5, 4.0, 2.0, 5.0))
@@ -89,7 +81,6 @@ def test_an_offset_becomes_the_models_own(old):
 
 @pytest.mark.slow
 def test_a_model_that_was_right_stays_as_it_is(old):
-    """Noise is nothing to learn, and the reason is given."""
     found = refine_runs(old, [history(OLD, i, noise_um=0.05) for i in range(4)])
     assert not found.better
     assert str(found).startswith("no better")
@@ -98,7 +89,6 @@ def test_a_model_that_was_right_stays_as_it_is(old):
 
 @pytest.mark.slow
 def test_refining_what_was_refined_goes_on_from_it(old, runs):
-    """The old operator is what the new one is held to where new runs say nothing."""
     first = refine_runs(old, runs[:3]).model
     again = refine_runs(first, [history(actuator(offset_um=1.0), i, amplitude=3.0)
                                 for i in range(20, 24)])  # fmt: skip
@@ -141,10 +131,8 @@ def test_swapped_wires_are_refused(old, runs):
 
 @pytest.mark.slow
 def test_files_in_a_better_model_file_out(tmp_path):
-    """A shipped model and a recording of it; what is written is what was found."""
     output = tmp_path / "better.yaml"
-    found = refine_files(OMEGA, [GOLDEN / "terfenol_compensated.mcap",
-                                 GOLDEN / "terfenol_uncompensated.mcap"], output)  # fmt: skip
+    found = refine_files(OMEGA, [COMPENSATED, GOLDEN / "terfenol_uncompensated.mcap"], output)
     assert output.exists() == found.better
     if found.better:
         assert load_model(output) == found.model
@@ -170,19 +158,14 @@ def test_a_file_that_exists_is_refused_before_anything_is_read(tmp_path):
     assert output.read_text() == "mine"
 
 
-GOLDEN_runs = ROOT / "recordings" / "golden" / "terfenol_compensated.mcap"
-OMEGA_runs = load_model(ROOT / "configs" / "models" / "terfenol_omega.yaml")
-
-
 def test_a_run_from_rest_is_what_was_put_out_and_what_came():
-    (run,), recording = load_runs([GOLDEN_runs], OMEGA_runs), read(GOLDEN_runs)
+    (run,), recording = load_runs([COMPENSATED], load_model(OMEGA)), read(COMPENSATED)
     assert run.ignore == 0
     np.testing.assert_array_equal(run.command, recording.samples.command[: run.command.size])
 
 
 def test_a_run_that_goes_on_has_the_one_before_ahead_of_it():
-    """Not judged; without it, where the actuator stood could not be known."""
-    first = read(GOLDEN_runs)
+    first = read(COMPENSATED)
     later = replace(first, run={**first.run, "run_id": "b", "initial_state_run_id": "a"})
     run = _history(later, {"a": first, "b": later})
     still = round(STILL_S * first.sample_rate_hz)
@@ -192,25 +175,25 @@ def test_a_run_that_goes_on_has_the_one_before_ahead_of_it():
 
 
 def test_a_run_that_goes_on_from_one_that_is_not_given_is_refused():
-    first = read(GOLDEN_runs)
+    first = read(COMPENSATED)
     later = replace(first, run={**first.run, "initial_state_run_id": "a"})
     with pytest.raises(DataError, match="that recording"):
         _history(later, {})
 
 
 def test_what_can_not_be_used_is_said(tmp_path):
-    copy = Path(shutil.copy(GOLDEN_runs, tmp_path / "run.mcap"))
+    copy = Path(shutil.copy(COMPENSATED, tmp_path / "run.mcap"))
     with pytest.raises(InputError, match="named twice"):
-        load_runs([copy, copy], OMEGA_runs)
+        load_runs([copy, copy], load_model(OMEGA))
     with pytest.raises(InputError, match="no recordings"):
-        load_runs([], OMEGA_runs)
+        load_runs([], load_model(OMEGA))
     with pytest.raises(DataError, match=r"in A.* V"):
         load_runs([copy], piezo_ppi())
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
-def test_page_has_verdict_table_figures_and_model(old, runs, tmp_path):
+def test_page_has_verdict_table_figures_and_model(old, runs):
     found = refine_runs(old, runs[:3], source="a<b>.yaml")
     rows = refinement_rows(found)
     assert [row[0] for row in rows] == ["run 0", "run 1", "run 2"]
@@ -220,5 +203,3 @@ def test_page_has_verdict_table_figures_and_model(old, runs, tmp_path):
     assert "<b>" not in page.replace("<body>", "")
     assert page.count("<svg") == 2
     assert "kind: refined" in page
-    write_refinement(found, tmp_path / "page.html")
-    assert (tmp_path / "page.html").read_text() == page

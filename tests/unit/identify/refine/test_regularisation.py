@@ -35,14 +35,12 @@ def held_out(factors):
     ((0.10, 0.01), (0.03, 0.016), False),
 ])  # fmt: skip
 def test_better_in_the_mean_and_nowhere_much_worse(before, after, better):
-    """What one run loses is held against what all gain."""
     choice = SelectedRegularisation(0.1, 1.0, False, held_out(before), held_out(after))
     assert choice.better == better
 
 
 @pytest.mark.parametrize(("factor", "even"), [(1.0, True), (1.1, True), (1.15, False), (0.1, True)])
 def test_one_stretch_that_gets_worse_is_seen(factor, even):
-    """In the last tenth of one run, where all the rest of both gets better by half."""
     before, after = held_out((0.02, 0.02)), held_out((0.01, 0.01))
     modelled = after.judgement.modelled_um[1]
     measured = after.records[1].displacement_um
@@ -93,7 +91,6 @@ def test_no_more_than_half_is_left_for_the_sake_of_a_stretch(error, taken):
     ],
 )
 def test_the_old_model_is_held_to_where_that_costs_nothing(errors, taken):
-    """As much as runs held out allow: they say nothing of what is faster than they are."""
     tried = Tried({(0.1, 1.0): 0.01} | errors)
     choice, whole = tried.best(lambda *_: None)
     assert whole == taken == (choice.strength, choice.anchor)

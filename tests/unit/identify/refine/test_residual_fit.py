@@ -10,7 +10,7 @@ from hilctl.identify.refine.residual_fit import (
     fastest_um_per_s,
 )
 from hilctl.models.integrated import ButterflyModel, DeadbandFunction
-from hilctl.models.refined import LEAST_SLOPE, RefinedModel
+from hilctl.models.refined import LEAST_SLOPE
 from hilctl.models.staged import StagedModel
 from tests.unit.identify.refine.conftest import OLD, RATE_HZ, actuator, history
 
@@ -31,14 +31,12 @@ def test_a_delay_too_long_is_taken_back():
 
 
 def test_a_run_that_only_steps_has_a_speed():
-    """Its window would have no end otherwise."""
     run = history(OLD, 1)
     steps = np.repeat([0.0, 5.0, -5.0], 2000)
     assert fastest_um_per_s([steps], [run]) == pytest.approx(0.1 * run.sample_rate_hz)
 
 
 def test_wider_loops_are_no_delay():
-    """Plays and drags that a model has not are left to the operator."""
     assert delayed_model(OLD, [history(actuator(), i) for i in range(3)]) is OLD
 
 
@@ -69,7 +67,6 @@ def test_what_is_left_is_found():
 
 
 def test_modelled_displacement_is_that_of_the_model():
-    """The base is run once and the operator on top; a run of the whole gives the same bits."""
     runs = [history(actuator(offset_um=2.0), i) for i in range(2)]
     remainder = ResidualFit(OLD, runs, runs)
     model = remainder.model(solved(remainder))
@@ -78,7 +75,6 @@ def test_modelled_displacement_is_that_of_the_model():
 
 
 def test_numbers_that_have_no_inverse_become_less():
-    """By one factor, until the least slope is there."""
     runs = [history(actuator(), i) for i in range(2)]
     remainder = ResidualFit(OLD, runs, runs)
     numbers = np.zeros(remainder.size)
@@ -88,24 +84,7 @@ def test_numbers_that_have_no_inverse_become_less():
     assert len(set(np.array(model.residual.slopes)[0].tolist())) == 1
 
 
-def test_old_operator_is_what_anchors_hold_to():
-    """Without runs that say otherwise, a refined model stays what it was."""
-    runs = [history(actuator(), i, noise_um=0.0) for i in range(2)]
-    first = ResidualFit(OLD, runs, runs)
-    once = first.model(solved(first))
-    again = ResidualFit(once, runs[:1], runs[:1])
-    numbers = np.linalg.solve(
-        again.anchor().normal + again.firm(1e-4, again.anchor()), again.anchor().right
-    )
-    found = again.model(numbers)
-    assert isinstance(found, RefinedModel)
-    change = again.modelled_um(found, 0) - again.modelled_um(once, 0)
-    shown = again.modelled_um(once, 0) - again.modelled_um(OLD, 0)
-    assert np.std(change) < 0.25 * np.std(shown)
-
-
 def test_drift_of_a_run_changes_nothing_where_it_is_its_own():
-    """Whatever a run's constant, creep and line, the sums stay nearly what they were."""
     still, moving = history(actuator(), 1), history(actuator(), 1)
     time_s = np.arange(moving.command.size) / RATE_HZ
     moving.displacement_um[:] += 5.0 + 3.0 * np.log1p(time_s / CREEP_S) - 4.0 * time_s

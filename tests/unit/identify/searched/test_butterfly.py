@@ -27,8 +27,7 @@ SINES = [(2.5, 10.0), (2.5, 100.0), (4.0, 50.0)]
 
 
 @pytest.mark.parametrize(
-    "centre",
-    [*(pytest.param(each, marks=pytest.mark.slow) for each in (0.0, 1.0)), -4.5],
+    "centre", [*(pytest.param(each, marks=pytest.mark.slow) for each in (0.0, 1.0)), -4.5]
 )
 def test_errors_are_small_over_one_wing_or_both(loops_of, centre):
     """Loops over both wings, partly over both, and on the one below 0 are met within 2 %."""
@@ -53,13 +52,11 @@ def test_magnets_are_found_and_what_is_found_can_be_inverted(loops_of):
 
 
 def test_loops_below_the_turning_point(loops_of):
-    """Displacements that no butterfly reaches are refused."""
     with pytest.raises(DataError, match="turning point"):
         fit(loops_of(KNOWN, SINES), turning_um=100.0)
 
 
 def test_histories_have_no_wings():
-    """The side of a whole history is not known."""
     command = 3.0 * np.sin(0.02 * np.arange(2000))
     with pytest.raises(DataError, match="steady loops"):
         fit([History("growing", command, 5.0 * command, 10_000.0)])

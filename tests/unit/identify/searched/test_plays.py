@@ -1,7 +1,6 @@
 """Search problems of play models."""
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from hilctl.identify.fit_api import FitData, FitRequest
 from hilctl.identify.fit_model import fit_model
 from hilctl.identify.searched.plays import ExponentialProblem, PlaysProblem
 from hilctl.identify.settings import FitSettings
-from hilctl.models.integrated import exponential_integrated
+from tests.unit.identify.conftest import OMEGA
 
 Loops = Callable[..., list[SteadyLoop]]
 
@@ -21,11 +20,7 @@ Loops = Callable[..., list[SteadyLoop]]
 @pytest.fixture
 def data(loops_of: Loops) -> FitData:
     """Loops that none of the models below fits."""
-    omega = exponential_integrated(
-        alpha=0.33, gamma_s=2.5e-4, a_0=3.0, alpha_0=1.4, beta_0=0.23, g_0=1.0, alpha_1=0.08,
-        beta_1=0.15, d_p=4.0, alpha_2=0.1, beta_2=0.4, d_n=3.0,
-    )  # fmt: skip
-    return FitData(loops_of(omega, [(3.0, 10.0), (6.0, 150.0)]))
+    return FitData(loops_of(OMEGA, [(3.0, 10.0), (6.0, 150.0)]))
 
 
 def differences(run: Callable[[F64], F64], x: F64, step: float) -> F64:
@@ -35,8 +30,7 @@ def differences(run: Callable[[F64], F64], x: F64, step: float) -> F64:
 
 @pytest.mark.parametrize("kind", ["ppi", "rdpi"])
 @pytest.mark.parametrize("weights", ["free", "exponential"])
-def test_gradient_where_the_weights_follow(data: FitData, kind: Any, weights: Any) -> None:
-    """Slopes lack what the weights make up for, and yet give the gradient of the sum of squares."""
+def test_gradient_where_the_weights_follow(data, kind, weights):
     problem = PlaysProblem(data, FitSettings(kind=kind, weights=weights, plays=6, offset=True))
     x, scale = problem.space.guess, 1.0 + (np.arange(data.target_um.size + problem.held) % 3)
 
@@ -49,7 +43,7 @@ def test_gradient_where_the_weights_follow(data: FitData, kind: Any, weights: An
     np.testing.assert_allclose(gradient, expected, rtol=2e-3, atol=1e-3 * np.abs(expected).max())
 
 
-def test_free_weights_are_one_density_without_spikes(data: FitData) -> None:
+def test_free_weights_are_one_density_without_spikes(data):
     """Neighbours differ by a fifth; least squares alone would let them jump by nine tenths.
 
     The first and the last stand for all plays beyond them.
@@ -61,8 +55,7 @@ def test_free_weights_are_one_density_without_spikes(data: FitData) -> None:
     assert np.abs(np.diff(inner)).max() < 0.25 * inner.max()
 
 
-def test_samples_decide_where_they_can(data: FitData) -> None:
-    """What holds the weights costs the fit next to nothing."""
+def test_samples_decide_where_they_can(data):
     problem = PlaysProblem(data, FitSettings(kind="rdpi", weights="free", plays=20))
     x, scale = problem.space.guess, np.ones(data.target_um.size + problem.held)
     held = problem.error_um(x, scale)[: data.target_um.size]
@@ -73,8 +66,7 @@ def test_samples_decide_where_they_can(data: FitData) -> None:
 
 
 @pytest.mark.parametrize("choices", [{}, {"offset": True, "layout": "midpoint"}])
-def test_slopes_of_the_exponential_problem(data: FitData, choices: dict[str, Any]) -> None:
-    """Each of eleven or twelve parameters; kinks of plays leave a little."""
+def test_slopes_of_the_exponential_problem(data, choices):
     problem = ExponentialProblem(data, FitSettings(kind="integrated", **choices))
     x, ones = 1.1 * problem.space.guess + 0.01, np.ones(data.target_um.size)
     found = problem.slopes_um(x, ones)

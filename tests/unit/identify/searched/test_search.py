@@ -15,7 +15,7 @@ TIME = np.linspace(0.0, 1.0, 200)
 class Curve:
     """Fit x_0 sin(x_1 t) to a signal: a sum of squares with many minima in x_1."""
 
-    space = SearchSpace(np.array([0.0, 1.0]), np.array([10.0, 60.0]), np.array([1.0, 8.0]))
+    space = SearchSpace.of({"x_0": (0.0, 10.0, 1.0), "x_1": (1.0, 60.0, 8.0)})
 
     def __init__(self, target: F64) -> None:
         self.target = target
@@ -41,8 +41,7 @@ def quiet(done: float, text: str) -> None:
 
 
 @pytest.mark.parametrize("offset", [True, False])
-def test_bounded_weights_agree_with_bounded_least_squares(offset: bool) -> None:
-    """Weights equal those of an independent solver with the same bounds and row weights."""
+def test_bounded_weights_agree_with_bounded_least_squares(offset):
     rng = np.random.default_rng(3)
     columns, target = rng.normal(size=(60, 5)), rng.normal(size=60) + 2.0
     scale, least = rng.uniform(0.5, 2.0, 60), np.array([0.1, 0.0, 0.2, 0.0, 0.0])
@@ -55,8 +54,7 @@ def test_bounded_weights_agree_with_bounded_least_squares(offset: bool) -> None:
     assert np.any(weights == least)
 
 
-def test_several_starts_find_what_the_first_misses() -> None:
-    """The rough values end in a side minimum; random starts find the signal, repeatably."""
+def test_several_starts_find_what_the_first_misses():
     problem, scale = Curve(3.0 * np.sin(23.0 * TIME)), np.ones(200)
     lonely = search(problem, scale, 6.0, 1, np.random.default_rng(0), quiet)
     assert lonely.starts[0].rms_percent > 10.0
@@ -70,7 +68,7 @@ def test_several_starts_find_what_the_first_misses() -> None:
     assert all(start.rms_percent <= start.first_rms_percent for start in found[0].starts)
 
 
-def test_progress_rises_and_counts_starts() -> None:
+def test_progress_rises_and_counts_starts():
     """Progress goes up from 0 and names each start."""
     told: list[tuple[float, str]] = []
     search(
@@ -87,8 +85,7 @@ def test_progress_rises_and_counts_starts() -> None:
     assert [text for _, text in told][:3] == [f"start {i} of 3" for i in (1, 2, 3)]
 
 
-def test_refinement_lowers_the_peak_at_the_cost_of_the_rms() -> None:
-    """A bump that least squares leaves is taken down to the goal; the sum of squares grows."""
+def test_refinement_lowers_the_peak_at_the_cost_of_the_rms():
     bump = np.exp(-(((TIME - 0.3) / 0.01) ** 2))
     problem, scale = Curve(3.0 * np.sin(6.0 * TIME) + bump), np.ones(200)
     found = search(problem, scale, 6.0, 3, np.random.default_rng(0), quiet)
@@ -100,8 +97,7 @@ def test_refinement_lowers_the_peak_at_the_cost_of_the_rms() -> None:
     assert np.sum(after**2) > np.sum(before**2)
 
 
-def test_refinement_out_of_reach_keeps_the_best() -> None:
-    """A goal that can't be met gives the smallest peak met on the way, never a larger one."""
+def test_refinement_out_of_reach_keeps_the_best():
     bump = np.exp(-(((TIME - 0.3) / 0.01) ** 2))
     problem, scale = Curve(3.0 * np.sin(6.0 * TIME) + bump), np.ones(200)
     found = search(problem, scale, 6.0, 3, np.random.default_rng(0), quiet)
@@ -110,7 +106,6 @@ def test_refinement_out_of_reach_keeps_the_best() -> None:
     assert np.max(np.abs(problem.error_um(refined.x, refined.scale))) < before
 
 
-def test_the_first_of_equal_ends_is_taken() -> None:
-    """Ends that differ by rounding are one; a better one is better."""
+def test_the_first_of_equal_ends_is_taken():
     assert first_least([2.0, 1.0 + 1e-9, 1.0]) == 1
     assert first_least([2.0, 1.001, 1.0]) == 2

@@ -1,13 +1,11 @@
 """The sum of squares of the staged model: its derivatives agree with differences."""
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from hilctl.identify.data.records import SteadyLoop
 from hilctl.identify.fit_api import FitData
 from hilctl.identify.staged.fit_data import Linear, StagedFitData
 from hilctl.identify.staged.objective import (
@@ -22,11 +20,9 @@ from hilctl.identify.staged.objective import (
     stages_of,
     structure_of,
 )
-from hilctl.models.integrated import exponential_integrated
 from hilctl.models.linear_stages import FirstMode
 from tests.staged import start
-
-Loops = Callable[..., list[SteadyLoop]]
+from tests.unit.identify.conftest import OMEGA
 
 
 @pytest.mark.parametrize(
@@ -36,10 +32,7 @@ Loops = Callable[..., list[SteadyLoop]]
         (Layers(6, 4, lag=False, gamma=True, structure=False, delay=False), [0.0, 0.0, 0.8, 2e-4]),
     ],
 )
-def test_derivatives_agree_with_differences(
-    data: StagedFitData, layers: Layers, before: list[float]
-) -> None:
-    """Analytic derivatives by every parameter equal central differences."""
+def test_derivatives_agree_with_differences(data, layers, before):
     point = start(data, layers, before, 3e-4 if layers.lag else 0.0)
     point = replace(point, weights=point.weights + 0.1)  # a weight of 0 has no relative step
     x = point.pack()
@@ -55,8 +48,7 @@ def test_derivatives_agree_with_differences(
 
 
 @pytest.mark.parametrize("lag_s", [2e-5, 1e-4, 1e-3])
-def test_a_sampled_loop_has_a_delay_that_is_not_the_model_s(lag_s: float) -> None:
-    """What a sampled lag is late at a low frequency, less the lag's own time constant."""
+def test_a_sampled_loop_has_a_delay_that_is_not_the_model_s(lag_s):
     period_s, low_hz = 1e-3, 0.01
     step = 1j * 2.0 * np.pi * low_hz * period_s
     left = np.exp(-period_s / lag_s)
@@ -65,7 +57,7 @@ def test_a_sampled_loop_has_a_delay_that_is_not_the_model_s(lag_s: float) -> Non
     assert loop_delay_s(0.5 * period_s, lag_s) == pytest.approx(late_s - lag_s, rel=1e-5)
 
 
-def test_the_longest_lag_leaves_half_a_period_and_none_a_whole_one() -> None:
+def test_the_longest_lag_leaves_half_a_period_and_none_a_whole_one():
     assert loop_delay_s(5e-6, 1.0) == pytest.approx(5e-6, rel=1e-4)
     assert loop_delay_s(5e-6, 0.0) == 1e-5
     assert loop_delay_s(0.0, 1e-4) == 0.0
@@ -83,16 +75,9 @@ POINT = Point(
 
 @pytest.fixture
 def data(loops_of):
-    omega = exponential_integrated(
-        alpha=0.33, gamma_s=0.0, a_0=3.0, alpha_0=1.4, beta_0=0.23, g_0=1.0, alpha_1=0.08,
-        beta_1=0.15, d_p=4.0, alpha_2=0.1, beta_2=0.4, d_n=3.0,
-    )  # fmt: skip
+    omega = OMEGA.model_copy(update={"gamma_s": 0.0})
     loops = loops_of(omega, [(6.0, 100.0)])
     return StagedFitData(loops, FitData(loops).speeds)
-
-
-def test_structure_is_told_in_hertz_and_damping():
-    assert structure_of(POINT.linear) == pytest.approx((2000.0, 0.15))
 
 
 def test_a_low_pass_keeps_its_time_constant_and_is_a_structure():

@@ -1,13 +1,11 @@
 """Lag, hysteresis, structure and delay are found again together from their own loops."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from hilctl.identify.data.records import SteadyLoop
 from hilctl.identify.evaluation import judge
 from hilctl.identify.staged.fit_data import SPACING, Linear
 from hilctl.identify.staged.objective import DYNAMIC, Layers, Point
@@ -19,11 +17,8 @@ from hilctl.models.model_file import dump_model, parse_model
 from hilctl.models.staged import FieldLag, StagedModel
 from tests.staged import GRID, fit, truth
 
-Loops = Callable[..., list[SteadyLoop]]
 
-
-def test_all_stages_are_found_again(loops_of: Loops) -> None:
-    """Lag and its growth, resonance, damping and delay come back, and the loops with them."""
+def test_all_stages_are_found_again(loops_of):
     made = truth(
         lag=FieldLag(tau_s=1e-4, growth_per_unit=0.3),
         structure=FirstMode(natural_hz=2300.0, damping_ratio=0.15),
@@ -31,9 +26,6 @@ def test_all_stages_are_found_again(loops_of: Loops) -> None:
     )
     found = fit(loops_of(made, GRID))
     assert found.own_peak_percent < 0.3
-    assert isinstance(found.model, StagedModel)
-    assert found.model.lag is not None
-    assert found.model.structure is not None
     assert found.model.lag.tau_s == pytest.approx(1e-4, rel=0.02)
     assert found.model.lag.growth_per_unit == pytest.approx(0.3, rel=0.05)
     assert found.model.structure.natural_hz == pytest.approx(2300.0, rel=0.05)
@@ -45,8 +37,7 @@ def test_all_stages_are_found_again(loops_of: Loops) -> None:
     assert parse_model("x.yaml", dump_model(found.model)) == found.model
 
 
-def test_errors_are_those_of_the_run(loops_of: Loops) -> None:
-    """A staged model judged on loops of its own run, sample by sample, has next to no error."""
+def test_errors_are_those_of_the_run(loops_of):
     made = truth(
         lag=FieldLag(tau_s=1.5e-4, growth_per_unit=0.2),
         structure=FirstMode(natural_hz=2000.0, damping_ratio=0.2),
@@ -57,13 +48,10 @@ def test_errors_are_those_of_the_run(loops_of: Loops) -> None:
     assert judge(rigid, loops_of(rigid, GRID)).own_peak_percent < 0.05
 
 
-def test_plain_lag_without_structure_and_delay(loops_of: Loops) -> None:
-    """Stages that were not asked for are not in the model."""
+def test_plain_lag_without_structure_and_delay(loops_of):
     found = fit(
         loops_of(truth(lag=FieldLag(tau_s=1e-4)), GRID), lag="plain", structure=False, delay=False
     )
-    assert isinstance(found.model, StagedModel)
-    assert found.model.lag is not None
     assert found.model.lag.tau_s == pytest.approx(1e-4, rel=0.02)
     assert found.model.lag.growth_per_unit == 0.0
     assert found.model.structure is None
@@ -71,27 +59,24 @@ def test_plain_lag_without_structure_and_delay(loops_of: Loops) -> None:
     assert found.own_peak_percent < 0.3
 
 
-def test_without_a_lag_thresholds_grow(loops_of: Loops) -> None:
-    """Where there is no lag, the rate acts on the thresholds, as published."""
+def test_without_a_lag_thresholds_grow(loops_of):
     found = fit(loops_of(truth(delay_s=4e-5), GRID), lag="none", structure=False)
-    assert isinstance(found.model, StagedModel)
     assert found.model.lag is None
     assert found.model.delay_s == pytest.approx(4e-5, abs=2e-6)
     assert found.parameters["gamma"] < 1e-5
     assert found.own_peak_percent < 0.3
 
 
-def test_at_a_low_rate_the_delay_is_that_of_the_sampled_lag(loops_of: Loops) -> None:
+def test_at_a_low_rate_the_delay_is_that_of_the_sampled_lag(loops_of):
     """At 1 kHz a lag of 0.1 ms is a whole sample late: half of it is no delay of the actuator."""
     slow = [(a, f / 10.0) for a, f in GRID]
     made = loops_of(truth(lag=FieldLag(tau_s=1e-4)), slow, rate_hz=1000.0)
     found = fit(made, lag="plain", structure=False)
-    assert isinstance(found.model, StagedModel)
     assert found.model.delay_s < 5e-5
     assert found.own_peak_percent < 1.0
 
 
-def test_a_low_pass_behind_the_plant_is_a_structure(loops_of: Loops) -> None:
+def test_a_low_pass_behind_the_plant_is_a_structure(loops_of):
     """That of a sensor, of 1 kHz and first order: no resonance, and no mass to find."""
     loops = []
     for loop in loops_of(truth(lag=FieldLag(tau_s=1e-4)), GRID):
@@ -103,8 +88,7 @@ def test_a_low_pass_behind_the_plant_is_a_structure(loops_of: Loops) -> None:
 
 
 @pytest.mark.slow
-def test_preisach_triangle_is_nearer_between_known_stages(loops_of: Loops) -> None:
-    """A triangle in place of plays and deadbands meets loops whose plays bend one by one."""
+def test_preisach_triangle_is_nearer_between_known_stages(loops_of):
     stages: dict[str, Any] = {
         "lag": FieldLag(tau_s=1e-4, growth_per_unit=0.3),
         "structure": FirstMode(natural_hz=2300.0, damping_ratio=0.15),
@@ -124,7 +108,6 @@ def test_preisach_triangle_is_nearer_between_known_stages(loops_of: Loops) -> No
     plays = fit(loops)
     triangle = fit(loops, hysteresis="preisach", lines=16)
     assert triangle.rms_percent < 0.5 * plays.rms_percent
-    assert isinstance(triangle.model, StagedModel)
     assert triangle.model.hysteresis.kind == "preisach"
     assert triangle.standard_errors.keys() <= triangle.parameters.keys() - {"output_offset_um"}
     assert parse_model("x.yaml", dump_model(triangle.model)) == triangle.model
@@ -174,6 +157,5 @@ def test_one_record_disagrees_with_nobody():
 
 
 def test_what_a_bound_holds_is_named():
-    """Of what is in the model: it has no lag, so there is none to stand anywhere."""
     held = at_bound(ended(0.5, [], bound=[0, SPACING, DYNAMIC + 1]), LAYERS, staged=True)
     assert held == ("alpha", "a_1")

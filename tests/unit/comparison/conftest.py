@@ -1,0 +1,23 @@
+"""A comparison of three models on a tracked recording."""
+
+from pathlib import Path
+
+import pytest
+
+from hilctl.comparison.compare import ComparisonRequest, compare
+from hilctl.identify.fit_api import ignore_progress
+from tests.fakes import SteppingClock
+
+ROOT = Path(__file__).parents[3]
+GOLDEN = ROOT / "recordings" / "golden" / "terfenol_uncompensated.mcap"
+OMEGA = ROOT / "configs" / "models" / "terfenol_omega.yaml"
+
+
+def compared(path=GOLDEN, models=("straight",), progress=ignore_progress, **options):
+    return compare(ComparisonRequest([path], models, **options), SteppingClock(1e-3), progress)
+
+
+@pytest.fixture(scope="package")
+def comparison():
+    """Two models of the catalogue and one of a file, tried at 100 Hz."""
+    return compared(models=["duhem", "straight", str(OMEGA)], frequencies_hz=[100.0])
