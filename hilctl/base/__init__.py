@@ -10,7 +10,9 @@ samples.py     columns and flags of samples, blocks of samples
 events.py      events of a run
 segments.py    segments of a run and their steady cycles
 formatting.py  numbers with units, printable texts, JSON
-csv_table.py   CSV tables
+table.py       columns of numbers by name
+table_file.py  tables of any kind of file
+text_table.py  text tables
 yaml/          strict YAML with the line of every value
 
 A device in another package needs ``Device``, ``DeviceInfo``, ``DeviceOptions``, ``DeviceError`` and

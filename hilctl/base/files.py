@@ -51,7 +51,19 @@ def read_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
     """Return a file's text.
 
     Raises:
-        InputError: The file cannot be read, is too large (checked before reading), or is not UTF-8.
+        InputError: See :func:`read_bytes`; or the file is not UTF-8.
+    """
+    try:
+        return read_bytes(path, max_bytes).decode("utf-8").replace("\r\n", "\n").replace("\r", "\n")
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: is not UTF-8 text") from None
+
+
+def read_bytes(path: Path, max_bytes: int) -> bytes:
+    """Return the content of a file.
+
+    Raises:
+        InputError: The file cannot be read, or is too large (checked before reading).
     """
     try:
         if path.exists() and not path.is_file():
@@ -60,11 +72,9 @@ def read_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
         if size > max_bytes:
             limit = f"{max_bytes / 1e6:.0f} MB"
             raise InputError(f"{path}: has {size / 1e6:.0f} MB, more than the limit of {limit}")
-        return path.read_text(encoding="utf-8")
+        return path.read_bytes()
     except FileNotFoundError:
         raise InputError(no_such_file(path)) from None
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: is not UTF-8 text") from None
     except (OSError, ValueError) as error:
         why = reason(error) if isinstance(error, OSError) else error
         raise InputError(f"{path}: can't be read: {why}") from None

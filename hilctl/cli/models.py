@@ -32,10 +32,19 @@ from hilctl.identify.summary import (
 from hilctl.run.control.client import finish_dead_runs
 
 IdentifyInput = Annotated[
-    list[Path], typer.Argument(metavar="FILE", help="Recordings (MCAP) or text tables.")
+    list[Path],
+    typer.Argument(
+        metavar="FILE", help="Recordings (MCAP) or tables (text, .mat, .npz, .npy, .parquet)."
+    ),
 ]
 TableUnit = Annotated[str | None, typer.Option(help="Unit of the command in a table, A or V.")]
 TableColumn = Annotated[str | None, typer.Option(help="Column of a table: name, or number from 1.")]
+TableScale = Annotated[
+    float | None, typer.Option(help="Factor from a table's column to um, or to the command's unit.")
+]
+SkipRows = Annotated[
+    int | None, typer.Option(min=0, help="Lines at the start of a text table to skip.")
+]
 RateHz = Annotated[float | None, typer.Option(help="Sample rate of a table without a time column.")]
 Whole = Annotated[
     bool, typer.Option("--whole", help="Evaluate complete histories instead of steady cycles.")
@@ -109,6 +118,9 @@ def identify(
     displacement_column: TableColumn = None,
     time_column: TableColumn = None,
     rate_hz: RateHz = None,
+    command_scale: TableScale = None,
+    displacement_scale: TableScale = None,
+    skip_rows: SkipRows = None,
     whole: Whole = False,
     leave_out: LeaveOut = None,
     validate: Validate = None,
@@ -129,6 +141,9 @@ def identify(
         "table.displacement_column": _column(displacement_column),
         "table.time_column": _column(time_column),
         "table.rate_hz": rate_hz,
+        "table.command_scale": command_scale,
+        "table.displacement_scale": displacement_scale,
+        "table.skip_rows": skip_rows,
         "whole": whole or None,
         "leave_out": leave_out or None,
     }

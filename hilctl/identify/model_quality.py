@@ -25,6 +25,8 @@ LIKELY_UM = 500.0
 APART = 30.0  # maximum ratio of the gains of records of one actuator
 ALIKE = 1.2  # ratio of amplitudes or frequencies that count as one
 SLOW = 1.5  # of the lowest frequency: loops whose phase is due to hysteresis, not delay
+SPIKE = 20.0  # ratio of a spike to what 99 % of the samples differ from their neighbours
+SPIKE_STROKE = 0.1  # smallest spike, of the stroke of all other samples
 CONSTANT = 0.5  # part of the mean square error that is a constant
 CLEAR_PERCENT = 0.5
 
@@ -69,7 +71,7 @@ def verdict_of(
     within = judged.own_peak_percent
     if reasons := tuple(data_reasons(records, even=settings.kind == "butterfly")):
         return Verdict("not a model", within, held_out is not None, reasons)
-    reasons = tuple(_fit_reasons(fit, records, held_out))
+    reasons = tuple(_fit_reasons(fit, records, settings, held_out))
     unknown, suggestions = _unknown(records, held_out), _suggestions(fit, records, settings)
     if reasons:
         return Verdict("not a model", within, held_out is not None, reasons, tuple(suggestions))
@@ -117,13 +119,13 @@ def data_reasons(records: Sequence[Record], *, even: bool = False) -> Iterator[s
 
 
 def _fit_reasons(
-    fit: FittedModel, records: Sequence[Record], held_out: HeldOut | None
+    fit: FittedModel, records: Sequence[Record], settings: FitSettings, held_out: HeldOut | None
 ) -> Iterator[str]:
     explained = _explained(fit, records)
     if explained < FOLLOWED:
         yield (
             f"the displacement does not follow the command: the model explains "
-            f"{100.0 * max(explained, 0.0):.0f} % of its variance; {_cause(records)}"
+            f"{100.0 * max(explained, 0.0):.0f} % of its variance; {_cause(records, settings)}"
         )
         return
     unseen = held_out is not None and held_out.judgement.own_peak_percent > MOST_PERCENT
@@ -137,7 +139,10 @@ def _fit_reasons(
         )
 
 
-def _cause(records: Sequence[Record]) -> str:
+def _cause(records: Sequence[Record], settings: FitSettings) -> str:
+    for record in records:
+        if text := _spike(record) or _far_from_zero(record, settings):
+            return f"'{record.label}' {text}"
     middle = [0.5 * (record.command.min() + record.command.max()) for record in records]
     folded = [
         abs(_correlation(np.abs(record.command - centre), record))
@@ -148,6 +153,26 @@ def _cause(records: Sequence[Record]) -> str:
             "it rises with commands of both signs, as rods without bias do: use --model butterfly"
         )
     return "check coil, amplifier, sensor and columns"
+
+
+def _spike(record: Record) -> str:
+    """Return where a few samples differ from both neighbours by more than all others do."""
+    y = record.displacement_um
+    off = np.abs(y[1:-1] - 0.5 * (y[2:] + y[:-2]))
+    at = int(np.argmax(off))
+    others_um = float(np.ptp(np.delete(y, at + 1)))
+    if off[at] <= max(SPIKE * float(np.percentile(off, 99.0)), SPIKE_STROKE * others_um):
+        return ""
+    return f"has a spike of {y[at + 1]:.4g} µm at sample {at + 2}: remove it"
+
+
+def _far_from_zero(record: Record, settings: FitSettings) -> str:
+    """Return that the displacement has a constant that the model lacks, or an empty text."""
+    middle_um = 0.5 * float(record.displacement_um.max() + record.displacement_um.min())
+    if abs(middle_um) < float(np.ptp(record.displacement_um)):
+        return ""
+    hint = "fit it with --set offset=true" if settings.has("offset") else "subtract it"
+    return f"has an offset of {middle_um:.4g} µm, more than its stroke: {hint}"
 
 
 def _unknown(records: Sequence[Record], held_out: HeldOut | None) -> list[str]:

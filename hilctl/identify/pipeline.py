@@ -81,6 +81,7 @@ class Identification:
     Attributes:
         orders: Errors of each number of plays, if it was selected.
         lag_samples: Assumed lag of tables' displacements in samples.
+        understood: Columns and units of each table in words.
     """
 
     fit: FittedModel
@@ -90,6 +91,7 @@ class Identification:
     orders: tuple[OrderScore, ...]
     lag_samples: int
     candidates: tuple[CandidateScore, ...] = ()
+    understood: tuple[str, ...] = ()
 
     def to_mapping(self) -> dict[str, Any]:
         """Return all results as plain mappings, lists and numbers, for JSON."""
@@ -100,6 +102,7 @@ class Identification:
             "orders": [asdict(order) for order in self.orders],
             "candidates": [asdict(candidate) for candidate in self.candidates],
             "lag_samples": self.lag_samples,
+            "tables": list(self.understood),
         }
 
 
@@ -151,20 +154,20 @@ def identify_files(
         lag = settings.table.lag_samples
         if settings.table.find_lag:
             lag = choose_lag(
-                lambda lag: load_records(paths, settings, lag)[0], settings, run, progress
+                lambda lag: load_records(paths, settings, lag).records, settings, run, progress
             )
-        records, recorded = load_records(paths, settings, lag)
+        records, recorded, understood = load_records(paths, settings, lag)
         asked = settings.table.unit
         if recorded and asked and recorded != asked:
-            raise InputError(f"--unit must be {recorded}, that of the recordings: {asked}")
-        others, _ = load_records(validate, settings.model_copy(update={"leave_out": ()}), lag)
+            raise InputError(f"--unit must be {recorded}, that of the files: {asked}")
+        others = load_records(validate, settings.model_copy(update={"leave_out": ()}), lag).records
         source = [path.name for path in paths]
         unit = settings.unit(recorded)
         request = FitRequest(records, settings, unit, source, run, progress)
         found = identify_records(request, others)
     if output is not None and found.verdict.grade != "not a model":
         write_text(output, dump_model(found.fit.model), overwrite=overwrite)
-    return replace(found, lag_samples=lag)
+    return replace(found, lag_samples=lag, understood=tuple(understood))
 
 
 def identify_records(request: FitRequest, validate: Sequence[Record] = ()) -> Identification:

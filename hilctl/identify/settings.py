@@ -183,6 +183,13 @@ class TableSettings(StrictModel):
     rate_hz: float | None = Field(
         None, gt=0.0, description="Samples per second if there is no time column."
     )
+    command_scale: float | None = Field(
+        None, description="Unit of the command per unit of its column."
+    )
+    displacement_scale: float | None = Field(
+        None, description="um per unit of the displacement's column, as um per V of a sensor."
+    )
+    skip_rows: int = Field(0, ge=0, description="Lines at the start of a text table to skip.")
     first_row: int = Field(1, ge=1, description="First data row used, from 1.")
     last_row: int | None = Field(None, ge=1, description="Last data row used; all if not set.")
     ignore: int = Field(

@@ -40,7 +40,7 @@ def summary(found: Identification) -> list[str]:
     ended = f"{fit.numbers} fitted numbers"
     if spread:
         ended = f"{len(spread)} starts ended at rms {min(spread):.3f} to {max(spread):.3f} %"
-    lines = [str(found.verdict), *found.verdict.notes]
+    lines = [str(found.verdict), *found.verdict.notes, *found.understood]
     if held_out is not None:
         lines.append(f"not fitted: {_errors(held_out.judgement)}; {held_out.how}")
     lines += [

@@ -192,13 +192,16 @@ class LevelPath(_Shape):
 
 
 class FileWaveform(_Shape):
-    """Samples from a CSV, NPY or MCAP file: ``offset + scale * value``.
+    """Samples from a table (text, NPY, NPZ, MAT, Parquet) or a recording (MCAP).
+
+    They are ``offset + scale * value``, with the value in the waveform's unit if its column has one
+    of the same kind.
 
     Attributes:
         path: File, relative to the experiment file's folder.
         column: Column by name, or by number counted from 1; for MCAP one of ``reference_um``,
             ``displacement_um``, ``command``, ``wanted``. Not used for a one-column file.
-        file_rate_hz: Sample rate of a file without a time column ``t_s``.
+        file_rate_hz: Sample rate of a file without a time column (``t_s``, or the only one in s).
         first_row: First data row used, counted from 1.
         last_row: Last data row used. Default: the last of the file.
         resample: Method if the file has another sample rate: ``refuse``, ``linear`` interpolation

@@ -1,16 +1,16 @@
-"""Waveforms from CSV, NPY and MCAP files, resampled on request."""
+"""Waveforms from tables and recordings, resampled on request."""
 
 from pathlib import Path
-from tokenize import TokenError
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from hilctl.base.csv_table import MAX_COLUMNS, TextTable, check_rows, column_index
 from hilctl.base.errors import InputError
 from hilctl.base.files import no_such_file, reason
 from hilctl.base.segments import SHORTEST_PERIOD
+from hilctl.base.table import ArrayTable, Table
+from hilctl.base.table_file import open_table
 from hilctl.base.types import F64
 from hilctl.waveforms.shapes import check_length
 from hilctl.waveforms.spec import FileWaveform
@@ -49,7 +49,9 @@ def read_samples(w: FileWaveform, sample_rate_hz: float, folder: Path) -> tuple[
 
 def _file_rate(w: FileWaveform, path: Path, own_rate_hz: float | None) -> float:
     if own_rate_hz is None and w.file_rate_hz is None:
-        raise InputError(f"{path}: has no time column t_s: set file_rate_hz")
+        raise InputError(
+            f"{path}: has no time column (t_s, or the only one in s): set file_rate_hz"
+        )
     if own_rate_hz is not None and w.file_rate_hz is not None:
         difference = abs(own_rate_hz / w.file_rate_hz - 1.0)
         if difference > _RATE_TOLERANCE:
@@ -80,42 +82,46 @@ def _resampled(w: FileWaveform, path: Path, raw: F64, rate_hz: float, sample_rat
 
 
 def _read(w: FileWaveform, path: Path) -> tuple[F64, float | None]:
-    suffix = path.suffix.lower()
-    if suffix not in {".npy", ".mcap"}:
-        return _read_text(w, path)
-    columns, own_rate_hz = _read_mcap(path) if suffix == ".mcap" else (_read_npy(path), None)
-    names = list(columns)
-    values = columns[names[column_index(path, w.column, names)]]
-    check_rows(path, values.size, w.first_row, w.last_row)
-    return _finite(path, values[w.first_row - 1 : w.last_row], w.first_row), own_rate_hz
-
-
-def _read_text(w: FileWaveform, path: Path) -> tuple[F64, float | None]:
-    table = TextTable(path)
-    columns = [table.index(w.column)]
-    has_time = "t_s" in table.names
-    columns += [table.index("t_s")] if has_time else []
-    rows = table.read(columns, w.first_row, w.last_row)
-    _check_count(path, rows.lines.size)
-    return rows.values[0], rows.sample_rate_hz(1, _TIME_TOLERANCE) if has_time else None
-
-
-def _read_npy(path: Path) -> dict[str, npt.NDArray[Any]]:
+    if path.suffix.lower() == ".mcap":
+        columns, own_rate_hz = _read_mcap(path)
+        table: Table = ArrayTable(path, columns)
+    else:
+        table, own_rate_hz = open_table(path), None
+    at, times = table.index(w.column), _time(table)
+    rows = table.read([at, *times], w.first_row, w.last_row)
+    count = rows.lines.size
+    if count < 2:
+        raise InputError(f"{path}: needs at least two rows from first_row to last_row")
     try:
-        # Mapped, not read, so that the size in the header must fit the file. NumPy parses the
-        # header as Python and passes on the errors of the parser.
-        with np.errstate(over="ignore"):
-            table = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (ValueError, OSError, EOFError, OverflowError, TypeError, TokenError):
-        raise InputError(f"{path}: is not a complete NumPy file (.npy) of numbers") from None
-    if not (isinstance(table, np.ndarray) and table.dtype.kind in "fiu" and table.ndim in (1, 2)):
-        raise InputError(f"{path}: must hold a one- or two-dimensional array of numbers")
-    if table.size == 0:
-        raise InputError(f"{path}: holds no data")
-    columns = table.reshape(table.shape[0], -1).T
-    if len(columns) > MAX_COLUMNS:
-        raise InputError(f"{path}: holds {len(columns)} columns, at most {MAX_COLUMNS} are read")
-    return {str(number): column for number, column in enumerate(columns, start=1)}
+        check_length(count)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    if times:
+        own_rate_hz = rows.sample_rate_hz(1, _TIME_TOLERANCE, table.unit(times[0])[1])
+    return rows.values[0] * _factor(w, table, at), own_rate_hz
+
+
+def _time(table: Table) -> list[int]:
+    """Return the index of the time column, if there is one: ``t_s``, or the only one in s."""
+    if "t_s" in table.names:
+        return [table.index("t_s")]
+    found = [each for each in range(len(table.names)) if table.unit(each)[0] == "s"]
+    return found if len(found) == 1 else []
+
+
+def _factor(w: FileWaveform, table: Table, at: int) -> float:
+    """Return the factor from a column's unit to the waveform's."""
+    base, factor = table.unit(at)
+    if table.path.suffix.lower() == ".mcap":  # its references may be in A or V
+        return 1.0
+    if w.unit is None or base in {"", w.unit}:
+        return factor
+    if w.scale == 1.0:
+        raise InputError(
+            f"{table.path}: column {table.names[at]} is in {base}, the waveform in {w.unit}: set "
+            f"scale, in {w.unit} per {base}"
+        )
+    return factor
 
 
 def _read_mcap(path: Path) -> tuple[dict[str, npt.NDArray[Any]], float]:
@@ -127,23 +133,3 @@ def _read_mcap(path: Path) -> tuple[dict[str, npt.NDArray[Any]], float]:
         raise InputError(f"{path}: samples are missing")
     names = ("reference_um", "displacement_um", "command", "wanted")
     return {name: getattr(samples, name) for name in names}, recording.sample_rate_hz
-
-
-def _finite(path: Path, chosen: npt.NDArray[Any], first_row: int) -> F64:
-    """Return the selected rows: float64[n], all finite."""
-    _check_count(path, chosen.size)
-    raw = np.array(chosen, dtype=np.float64)
-    bad = np.flatnonzero(~np.isfinite(raw))
-    if bad.size:
-        row = first_row + int(bad[0])
-        raise InputError(f"{path}: row {row}: value must be finite, got {raw[bad[0]]}")
-    return raw
-
-
-def _check_count(path: Path, count: int) -> None:
-    if count < 2:
-        raise InputError(f"{path}: needs at least two rows from first_row to last_row")
-    try:
-        check_length(count)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None

@@ -3,12 +3,14 @@
 from collections.abc import Iterable, Sequence
 from itertools import chain
 from pathlib import Path
+from typing import NamedTuple, cast, get_args
 
 import numpy as np
 
-from hilctl.base.csv_table import TextTable
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.samples import Flag
+from hilctl.base.table import Column, Table
+from hilctl.base.table_file import open_table
 from hilctl.base.types import F64, CommandUnit
 from hilctl.identify.data.cycles import find_cycles, loops_from_pieces
 from hilctl.identify.data.records import History, Record
@@ -19,37 +21,113 @@ from hilctl.recording.recording import Recording
 UNEVEN = 0.5  # maximum deviation of a time step from the median, due to rounding in text
 
 
-def read_table(path: Path, table: TableSettings) -> History:
-    """Read command and displacement from a text table, see :mod:`hilctl.base.csv_table`.
+class TableRecord(NamedTuple):
+    """A record from a table.
+
+    Attributes:
+        history: The record.
+        unit: Unit of its command; None if the table has none.
+        understood: Columns and units in words.
+    """
+
+    history: History
+    unit: CommandUnit | None
+    understood: str
+
+
+def read_table(path: Path, settings: TableSettings) -> TableRecord:
+    """Read command and displacement from a table, see :func:`hilctl.base.table_file.open_table`.
 
     Raises:
         InputError: The file can't be read.
-        DataError: A column is unknown, a value is not a finite number (names ``file:line``), time
-            steps are uneven, or not exactly one of ``time_column`` and ``rate_hz`` is set.
+        DataError: A column is unknown or has the wrong unit, a value is not a finite number (names
+            ``file:line``), time steps are uneven, or not exactly one of ``time_column`` and
+            ``rate_hz`` is set.
     """
-    if (table.time_column is None) == (table.rate_hz is None):
-        given = "neither" if table.rate_hz is None else "both"
-        raise DataError(f"{path}: set either table.time_column or table.rate_hz (got {given})")
-    wanted = [table.command_column, table.displacement_column]
-    wanted += [] if table.time_column is None else [table.time_column]
-    text = TextTable(path)
-    found = text.read([text.index(column) for column in wanted], table.first_row, table.last_row)
-    command, displacement_um, *_ = found.values
-    rate_hz = table.rate_hz or found.sample_rate_hz(2, UNEVEN)
-    return History(path.name, command.copy(), displacement_um.copy(), rate_hz, table.ignore)
+    table = open_table(path, settings.skip_rows)
+    known = f"its columns are {', '.join(table.names)}"
+    if (settings.time_column is None) == (settings.rate_hz is None):
+        given = "neither" if settings.rate_hz is None else "both"
+        raise DataError(f"{path}: set either --time-column or --rate-hz (got {given}); {known}")
+    command = _column(table, settings.command_column, "--command-column")
+    output = _column(table, settings.displacement_column, "--displacement-column")
+    wanted, unit = [command, output], settings.unit or table.unit(command)[0]
+    if unit not in get_args(CommandUnit):
+        unit = ""
+    command_scale = _scale(table, command, unit, "--command-scale", settings.command_scale)
+    scale = _scale(table, output, "um", "--displacement-scale", settings.displacement_scale)
+    parts = [f"command {_called(table, command, unit)}"]
+    parts += [f"displacement {_called(table, output, 'um')}"]
+    per_s = 1.0
+    if settings.time_column is not None:
+        wanted.append(time := _column(table, settings.time_column, "--time-column"))
+        per_s = _scale(table, time, "s", "--time-column", None)
+        parts.insert(0, f"time {_called(table, time, 's')}")
+    found = table.read(wanted, settings.first_row, settings.last_row)
+    rate_hz = settings.rate_hz or found.sample_rate_hz(2, UNEVEN, per_s)
+    history = History(
+        path.name,
+        found.values[0] * command_scale,
+        found.values[1] * scale,
+        rate_hz,
+        settings.ignore,
+    )
+    size = f"{found.lines.size} rows at {rate_hz:.6g} Hz"
+    understood = f"{path.name}: {', '.join(parts)}; {size}"
+    return TableRecord(history, cast("CommandUnit | None", unit or None), understood)
+
+
+def _column(table: Table, column: Column, option: str) -> int:
+    try:
+        return table.index(column)
+    except DataError as error:
+        raise DataError(f"{error}; choose one with {option}") from None
+
+
+def _scale(table: Table, at: int, unit: str, option: str, given: float | None) -> float:
+    """Return the factor from a column's numbers to a unit.
+
+    Raises:
+        DataError: The column is in another unit, and no scale is given.
+    """
+    base, factor = table.unit(at)
+    if given is not None:
+        return factor * given
+    if base in {"", unit}:
+        return factor
+    rule = f"is in {base}, not in {unit or 'A or V'}: set {option}"
+    if option.endswith("scale"):
+        rule += f", in {unit or 'A or V'} per {base}"
+    raise DataError(f"{table.path}: column {table.names[at]} {rule}")
+
+
+def _called(table: Table, at: int, unit: str) -> str:
+    base, name = table.unit(at)[0], table.bare_name(at)
+    return f"{name} [{base}]" if base else f"{name} [{unit or 'unit unknown'}, assumed]"
 
 
 MOST_WHOLE = 20_000_000
 """Maximum samples of a run that is fitted as a whole: about 100 bytes and 10 us per sample."""
 
 
+class LoadedRecords(NamedTuple):
+    """Records of files.
+
+    Attributes:
+        records: Loops and histories.
+        unit: Command unit of the recordings, or of the tables that have one; None if unknown.
+        understood: Columns and units of each table in words.
+    """
+
+    records: list[Record]
+    unit: CommandUnit | None
+    understood: list[str]
+
+
 def load_records(
     paths: Sequence[Path], settings: IdentifySettings, lag_samples: int
-) -> tuple[list[Record], CommandUnit | None]:
-    """Read recordings (``.mcap``) and text tables, whose displacements lag, as records.
-
-    Returns:
-        Loops and histories, and the command unit of the recordings (None if all are tables).
+) -> LoadedRecords:
+    """Read recordings (``.mcap``) and tables, whose displacements lag, as records.
 
     Raises:
         DataError: A file can't be used.
@@ -57,6 +135,7 @@ def load_records(
     """
     records: list[Record] = []
     known: list[str] = []
+    understood: list[str] = []
     units: set[CommandUnit] = set()
     left_out = settings.leave_out
     for path in paths:
@@ -71,7 +150,10 @@ def load_records(
         if not kept:
             continue
         if first is None:
-            history = read_table(path, settings.table).without_lag(lag_samples)
+            read = read_table(path, settings.table)
+            history = read.history.without_lag(lag_samples)
+            understood.append(read.understood)
+            units |= {read.unit} if read.unit else set()
             records.append(history if settings.whole else find_cycles(history, settings.points))
         elif settings.whole:
             records.append(history_from_pieces(chain([first], pieces)))
@@ -86,7 +168,7 @@ def load_records(
             raise InputError(f"--leave-out {label!r}: unknown label; known are {', '.join(known)}")
     if known and not records:
         raise InputError("--leave-out excludes all records")
-    return records, next(iter(units), None)
+    return LoadedRecords(records, next(iter(units), None), understood)
 
 
 def history_from_pieces(pieces: Iterable[Recording]) -> History:

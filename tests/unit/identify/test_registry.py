@@ -62,12 +62,14 @@ def needs_data(test):
 
 @pytest.fixture(scope="module")
 def model_file() -> History:
-    return read_table(FOLDER / "Model_Vi_Do.dat", TABLE)
+    return read_table(FOLDER / "Model_Vi_Do.dat", TABLE).history
 
 
 @pytest.fixture(scope="module")
 def test_file():
-    return read_table(FOLDER / "Test_Vi_Do_Di.dat", TABLE.model_copy(update={"ignore": 600}))
+    return read_table(
+        FOLDER / "Test_Vi_Do_Di.dat", TABLE.model_copy(update={"ignore": 600})
+    ).history
 
 
 def piezo_fit(history: History, **choices: Any) -> FittedModel:

@@ -19,7 +19,12 @@ def found(held_out=None, lag_samples=0, starts=(), at_bound=(), known=None):
     )  # fmt: skip
     verdict = Verdict("usable", 4.0, held_out=held_out is not None, notes=("one note",))
     return SimpleNamespace(
-        fit=fit, held_out=held_out, lag_samples=lag_samples, verdict=verdict, candidates=()
+        fit=fit,
+        held_out=held_out,
+        lag_samples=lag_samples,
+        verdict=verdict,
+        candidates=(),
+        understood=(),
     )
 
 

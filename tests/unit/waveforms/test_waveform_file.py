@@ -29,7 +29,7 @@ def read(made: Made, tmp_path: Path) -> Read:
     def write_and_read(content: str | bytes, name: str = "w.csv", **keys: Any) -> Reference:
         raw = content.encode() if isinstance(content, str) else content
         (tmp_path / name).write_bytes(raw)
-        return made(RATE_HZ, tmp_path, kind="file", path=name, **keys)
+        return made(RATE_HZ, tmp_path, kind="file", path=name, **{"unit": "um"} | keys)
 
     return write_and_read
 
@@ -286,7 +286,7 @@ class TestNpy:
     @pytest.mark.parametrize("shape", [(0,), (0, 2), (5, 0)])
     def test_empty(self, read: Read, tmp_path: Path, shape: tuple[int, ...]) -> None:
         text = refusal(read, npy(tmp_path, np.empty(shape)), "w.npy", file_rate_hz=RATE_HZ)
-        assert text == "holds no data"
+        assert "array of numbers" in text
 
 
 BLOCK = 20

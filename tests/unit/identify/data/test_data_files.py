@@ -21,10 +21,10 @@ CURRENT, VOLTAGE = GOLDEN / "terfenol_uncompensated.mcap", GOLDEN / "piezo_compe
 
 
 def test_a_recording_gives_loops_or_its_history():
-    loops, unit = load_records([CURRENT], settings_from("rdpi", []), 0)
+    loops, unit, _ = load_records([CURRENT], settings_from("rdpi", []), 0)
     assert unit == "A"
     assert all(isinstance(each, SteadyLoop) for each in loops)
-    (history,), _ = load_records([CURRENT], settings_from("ppi", ["whole=true"]), 0)
+    (history,), *_ = load_records([CURRENT], settings_from("ppi", ["whole=true"]), 0)
     assert isinstance(history, History)
 
 
@@ -107,15 +107,17 @@ def test_tables_have_no_unit_of_their_own(tmp_path):
     path.write_text(f"drive,um\n{rows}\n")
     texts = ["table.command_column=drive", "table.displacement_column=um", "table.rate_hz=200",
              "table.unit=V", "whole=true"]  # fmt: skip
-    (history,), unit = load_records([path], settings_from("ppi", texts), 0)
-    assert unit is None
+    (history,), unit, understood = load_records([path], settings_from("ppi", texts), 0)
+    assert unit == "V"
+    assert understood == ["t.csv: command drive [V, assumed], displacement um [um, assumed]; "
+                          "60 rows at 200 Hz"]  # fmt: skip
     assert history.sample_rate_hz == 200.0
-    (late,), _ = load_records([path], settings_from("ppi", texts), 3)
+    (late,), *_ = load_records([path], settings_from("ppi", texts), 3)
     assert late.command.size == history.command.size - 3
 
 
 def test_a_loop_is_left_out_by_its_label():
-    every, _ = load_records([CURRENT], settings_from("ppi", []), 0)
+    every, *_ = load_records([CURRENT], settings_from("ppi", []), 0)
     first = every[0].label
     chosen = settings_from("ppi", [f"leave_out=[{json.dumps(first)}]"])
     kept = load_records([CURRENT], chosen, 0)[0] if len(every) > 1 else []
@@ -137,7 +139,7 @@ def write(folder: Path, lines: list[str], name: str = "t.csv") -> Path:
 def table(path: Path, command: str | int, displacement: str | int, **options: Any) -> History:
     """Read two columns of a table."""
     columns = {"command_column": command, "displacement_column": displacement}
-    return read_table(path, TableSettings(**columns, **options))
+    return read_table(path, TableSettings(**columns, **options)).history
 
 
 def rows(separator: str, n: int = 40) -> list[str]:
@@ -169,6 +171,28 @@ def test_times_rounded_in_the_text_are_fine(tmp_path):
         table(write(tmp_path, [*lines[:100], *lines[101:]]), 2, 3, time_column=1)
 
 
+def test_units_are_those_of_the_columns(tmp_path):
+    lines = [f"{5 * k},{k},{2 * k},{k / 4}" for k in range(20)]
+    path = write(tmp_path, ["t [ms],drive [mA],gap [nm],monitor [V]", *lines])
+    read = read_table(path, TableSettings(
+        time_column="t", command_column="drive", displacement_column="gap"))  # fmt: skip
+    assert read.unit == "A"
+    assert read.history.sample_rate_hz == pytest.approx(200.0)
+    np.testing.assert_allclose(read.history.command, 1e-3 * np.arange(20))
+    np.testing.assert_allclose(read.history.displacement_um, 2e-3 * np.arange(20))
+    volts = {"command": "drive", "displacement": "monitor", "time_column": 1}
+    scaled = table(path, **volts, displacement_scale=12.5)
+    np.testing.assert_allclose(scaled.displacement_um, 12.5 * np.arange(20) / 4)
+    with pytest.raises(DataError, match=r"monitor .* V.* --displacement-scale"):
+        table(path, **volts)
+    with pytest.raises(DataError, match=r"drive .* A.* --command-scale"):
+        table(path, "drive", "gap", time_column=1, unit="V")
+    with pytest.raises(DataError, match="--time-column"):
+        table(path, "drive", "gap", time_column="monitor")
+    with pytest.raises(DataError, match=r"t \[ms\], drive .*--command-column"):
+        table(path, "current", "gap", time_column=1)
+
+
 def test_rate_or_time_not_both(tmp_path):
     path = write(tmp_path, rows(","))
     with pytest.raises(DataError, match="neither"):
@@ -179,8 +203,8 @@ def test_rate_or_time_not_both(tmp_path):
 
 def test_unreadable_and_empty_tables(tmp_path):
     binary = tmp_path / "b.csv"
-    binary.write_bytes(b"\xff\xfe\x00\x80")
-    for path, reason in ((tmp_path / "none.csv", "no such file"), (binary, "is not UTF-8 text")):
+    binary.write_bytes(b"\x01\x00\x80")
+    for path, reason in ((tmp_path / "none.csv", "no such file"), (binary, "not a text table")):
         with pytest.raises(InputError, match=reason):
             table(path, 1, 2, rate_hz=1.0)
     with pytest.raises(DataError, match="no rows"):
