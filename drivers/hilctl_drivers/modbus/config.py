@@ -1,9 +1,9 @@
 """Options of a Modbus device, resolved against its profile."""
 
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import Annotated, Self, TypeAlias
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from hilctl.base.device import DeviceInfo
 from hilctl.base.errors import InputError
@@ -37,10 +37,22 @@ from hilctl_drivers.transport.wire_time import RateLimit, WireTime
 _TCP_PORT = 502
 
 
+def _without_port(host: str) -> str:
+    name, colon, port = host.rpartition(":")
+    if not host.strip():
+        raise ValueError("must be a name or an address, got an empty text")
+    if colon and ":" not in name and port.isdecimal():
+        raise ValueError(f"must have no port: set host to {name} and tcp_port to {port}")
+    return host
+
+
+HostName: TypeAlias = Annotated[str, AfterValidator(_without_port)]
+
+
 class ModbusReaderOptions(ReaderOptions):
     """The device that has the input, where it is another one."""
 
-    host: str | None = Field(
+    host: HostName | None = Field(
         default=None, description="its name or address; left out where it is on the same connection"
     )
     tcp_port: int | None = Field(
@@ -59,7 +71,7 @@ class ModbusReaderOptions(ReaderOptions):
 class ModbusOptions(DacOptions):
     """Options of ``modbus_dac``."""
 
-    host: str | None = Field(
+    host: HostName | None = Field(
         default=None, description="name or address, for Modbus TCP or a gateway to Modbus RTU"
     )
     tcp_port: int | None = Field(

@@ -24,7 +24,7 @@ from hilctl_drivers.modbus.pdu import (
     tcp_pdu,
 )
 from hilctl_drivers.transport.crc import MODBUS_WORDS, Bytes, crc16_modbus
-from hilctl_drivers.transport.links import BadRequestError, IncompleteError
+from hilctl_drivers.transport.links import BadRequestError, CorruptError, IncompleteError
 
 _RTU_SHORTEST = 5
 
@@ -151,6 +151,11 @@ class RtuTransaction(Transaction):
                     crc = table[crc ^ word]
                 if crc == sent:
                     return cast(bytes, read)
+        if adu[: len(self._last)] == self._last and not self._echo:
+            raise CorruptError(
+                "the request came back before the reply: the adapter echoes, or receives what it "
+                "sends; switch its local echo off"
+            )
         missing = self.missing(adu)
         if missing:
             raise IncompleteError(f"{missing} more bytes belong to the reply")

@@ -9,7 +9,8 @@ import difflib
 import re
 import types
 import typing
-from collections.abc import Callable, Iterable, Iterator, Mapping
+import unicodedata
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Annotated, Any, NamedTuple, TypeAlias
 
 from pydantic import BaseModel, ValidationError
@@ -29,6 +30,7 @@ NUMBERS = {
 
 _COMMA = re.compile(r"([-+]?\d+),(\d+)((?:[eE][-+]?\d+)?)")
 _MICRO = str.maketrans({"\N{MICRO SIGN}": "u", "\N{GREEK SMALL LETTER MU}": "u"})
+_DASHES = {"\N{MINUS SIGN}", "\N{EN DASH}", "\N{EM DASH}"}
 _QUOTED = re.compile(r"'([^']+)'")
 _RULES = {
     "missing": "is required",
@@ -218,7 +220,20 @@ def _hint(detail: ErrorDetails, known: Iterable[str]) -> str:
     return ""
 
 
+def odd_characters(lines: Sequence[str], number: int) -> str:
+    """Return which invisible character a line, or the one before it, has; empty for none."""
+    for at in range(max(0, number - 1), min(number + 1, len(lines))):
+        for mark in lines[at]:
+            if mark != " " and unicodedata.category(mark) in {"Zs", "Cf"}:
+                called = f"U+{ord(mark):04X} ({unicodedata.name(mark, 'without a name')})"
+                return f"line {at + 1} has the invisible character {called}: write a space"
+    return ""
+
+
 def _number_hint(text: str) -> str:
+    if text[:1] in _DASHES:
+        called = f"{unicodedata.name(text[0])} (U+{ord(text[0]):04X})"
+        return f"write the minus of the keyboard instead of {called}"
     if _is_number(text):
         return "remove the quotes"
     if _is_number(point := text.replace(",", ".", 1)):

@@ -26,7 +26,7 @@ from yaml.composer import ComposerError
 
 from hilctl.base.errors import ConfigError, ConfigProblem
 from hilctl.base.files import TextFiles
-from hilctl.base.yaml.errors import NUMBERS, Loc, broken_rules, dotted, readings
+from hilctl.base.yaml.errors import NUMBERS, Loc, broken_rules, dotted, odd_characters, readings
 
 MAX_DEPTH = 32
 """Largest nesting depth; an experiment has about five levels."""
@@ -195,9 +195,10 @@ class Document:
             node = compose(text)
         except yaml.MarkedYAMLError as error:
             where = place(error.problem_mark) if error.problem_mark else f"{name}:1"
-            raise ConfigError(
-                [ConfigProblem(where, "", _UNREADABLE, hint=str(error.problem))]
-            ) from None
+            hint = odd_characters(
+                text.splitlines(), error.problem_mark.line if error.problem_mark else 0
+            ) or str(error.problem)
+            raise ConfigError([ConfigProblem(where, "", _UNREADABLE, hint=hint)]) from None
         if not isinstance(node, yaml.MappingNode):
             rule = "must hold a mapping of keys to values"
             raise ConfigError([ConfigProblem(f"{name}:1", "", rule)])

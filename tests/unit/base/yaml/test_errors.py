@@ -130,6 +130,8 @@ def test_a_decimal_comma_is_told(caplog):
         ("height_um: 1,5,2", "must be a number"),
         ("height_um: 1.5,2", "must be a number"),
         ("height_um: µ", "must be a number"),
+        ("height_um: \N{MINUS SIGN}5.0", "MINUS SIGN"),
+        ("height_um: 1.0\n\N{NO-BREAK SPACE} unit: A\n  cycles: 1", "invisible character U.00A0"),
         ("either: 1,5", "must be a number, or 'safe'"),
         ("span: [1,5, 2]", "must have at most 2 values"),
         ("cycles: 1.5", "must be a whole number"),

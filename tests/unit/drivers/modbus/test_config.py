@@ -28,6 +28,17 @@ def made(**changes) -> ModbusDac:
     return ModbusDac(ModbusOptions.model_validate({**PAIR, **changes}))
 
 
+@pytest.mark.parametrize("host", ["", " ", "10.0.0.7:502", "plc.local:1502"])
+def test_host_is_a_name_without_a_port(host):
+    with pytest.raises(ValueError, match="host"):
+        made(serial_port=None, host=host)
+
+
+@pytest.mark.parametrize("host", ["10.0.0.7", "plc.local", "::1", "fe80::1"])
+def test_names_and_addresses_are_hosts(host):
+    assert ModbusOptions.model_validate({**PAIR, "serial_port": None, "host": host}).host == host
+
+
 class TestPlaces:
     """Where the reader is, and what that costs."""
 

@@ -44,6 +44,20 @@ def test_rate_and_depth_follow_from_the_device_s_own_figures(text):
 
 
 @pytest.mark.parametrize(
+    ("name", "old", "new", "rule"),
+    [
+        ("generic_float32", "OUT: {address: 0,", "OUT: {address: 1,", "registers of .* overlap"),
+        ("icp_m7024", "kind: rtu,", "kind: rtu, bytesize: 7,", "link.bytesize"),
+    ],
+)
+def test_lines_and_registers_that_cannot_work_are_refused(name, old, new, rule):
+    text = shipped_profiles()[name].read_text(encoding="utf-8")
+    assert old in text
+    with pytest.raises(ConfigError, match=rule):
+        parse_profile(text.replace(old, new, 1), "here")
+
+
+@pytest.mark.parametrize(
     ("old", "new", "rule"),
     [
         ("buffer_bytes: 16384", "buffer_bytes: 16000", "buffer_bytes must be a power of 2"),

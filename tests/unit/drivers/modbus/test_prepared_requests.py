@@ -175,6 +175,14 @@ def test_replies_of_another_length_are_refused(wire):
             transaction.reply(good + tail)
 
 
+def test_local_echo_of_an_adapter_is_named():
+    transaction = RtuTransaction(17, read_pdu(4, 0, 2))
+    echo = transaction.request()
+    for received in (echo + b"\x11", echo + rtu_adu(17, b"\4\4" + READ)):
+        with pytest.raises(CorruptError, match="echo"):
+            transaction.reply(received)
+
+
 def test_nonsense_is_not_waited_for():
     """A header that can't be Modbus is refused at once, not after its claimed 60 kB."""
     transaction = TcpTransaction(1, read_pdu(3, 0, 1))
