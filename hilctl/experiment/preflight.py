@@ -257,7 +257,7 @@ def command_problems(loaded: LoadedExperiment, forecast: Forecast) -> list[Confi
     found = []
     excess = max(low - forecast.command_min, forecast.command_max - high)
     if excess > 0.0:
-        key = "limits.drive_v" if unit == "V" else "limits.peak_current_a"
+        key = f"limits.{limits.range_key}"
         hint = f"{excess:.3g} {unit} too much: lower the waveform's amplitude, or raise the limit"
         rule = f"the run must stay within {low:g} to {high:g} {unit}"
         found.append(loaded.problem(key, rule, span, hint))

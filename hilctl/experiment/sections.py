@@ -224,6 +224,8 @@ class Limits(InterlockSettings):
 
     Attributes:
         peak_current_a: Largest magnitude of the coil current, for devices driven in A.
+        drive_a: Lowest and highest coil current, instead of ``peak_current_a``: for supplies of one
+            sign.
         slew_a_per_s: Fastest change of the coil current.
         drive_v: Lowest and highest drive voltage, for devices driven in V.
         slew_v_per_s: Fastest change of the drive voltage.
@@ -231,6 +233,7 @@ class Limits(InterlockSettings):
     """
 
     peak_current_a: Annotated[float, Field(gt=0.0)] | None = None
+    drive_a: Interval | None = None
     slew_a_per_s: Annotated[float, Field(gt=0.0)] | None = None
     drive_v: Interval | None = None
     slew_v_per_s: Annotated[float, Field(gt=0.0)] | None = None
@@ -238,16 +241,25 @@ class Limits(InterlockSettings):
 
     @model_validator(mode="after")
     def _one_unit(self) -> Self:
-        current = (self.peak_current_a, self.slew_a_per_s)
-        voltage = (self.drive_v, self.slew_v_per_s)
-        complete = None not in current or None not in voltage
-        mixed = any(v is not None for v in current) and any(v is not None for v in voltage)
-        if mixed or not complete:
+        names = ("peak_current_a", "drive_a", "slew_a_per_s", "drive_v", "slew_v_per_s")
+        given = {name for name in names if getattr(self, name) is not None}
+        complete = (
+            {"peak_current_a", "slew_a_per_s"},
+            {"drive_a", "slew_a_per_s"},
+            {"drive_v", "slew_v_per_s"},
+        )
+        if given not in complete:
             raise ValueError(
-                "must have either peak_current_a and slew_a_per_s (a device driven in A) or "
-                "drive_v and slew_v_per_s (a device driven in V)"
+                "must have peak_current_a (or drive_a) and slew_a_per_s for a device driven in A, "
+                "or drive_v and slew_v_per_s for a device driven in V"
             )
         return self
+
+    @property
+    def range_key(self) -> str:
+        """Key of the range of the command."""
+        keys = ("drive_v", "drive_a", "peak_current_a")
+        return next(key for key in keys if getattr(self, key) is not None)
 
     @property
     def unit(self) -> CommandUnit:
@@ -257,8 +269,8 @@ class Limits(InterlockSettings):
     @property
     def command_range(self) -> tuple[float, float]:
         """Lowest and highest command, in :attr:`unit`."""
-        if self.drive_v is not None:
-            return self.drive_v
+        if (given := self.drive_v or self.drive_a) is not None:
+            return given
         peak = self.peak_current_a or 0.0
         return -peak, peak
 

@@ -198,18 +198,13 @@ def _limits(
     info: DeviceInfo, low: float, high: float, slew: float
 ) -> tuple[dict[str, Any], dict[str, str]]:
     unit, ends = info.command_unit, f"{info.command_min:g} to {info.command_max:g}"
-    peak, slew_key = ("peak_current_a", "slew_a_per_s")
-    value: Any = min(high, -low)
-    if unit == "A" and value <= 0.0:
-        raise InputError(
-            f"{info.name}: its range, {ends} A, must include 0 A, because limits.peak_current_a "
-            "applies to both signs: set the offset of its amplifier, device.amplifier.offset_a"
-        )
-    if unit == "V":
-        peak, slew_key, value = "drive_v", "slew_v_per_s", [low, high]
+    range_key, slew_key = f"drive_{unit.lower()}", f"slew_{unit.lower()}_per_s"
+    value: Any = [low, high]
+    if unit == "A" and low < 0.0 < high:
+        range_key, value = "peak_current_a", min(high, -low)
     stroke = [_rounded(0.9 * each, 3) for each in (info.sensor_min_um, info.sensor_max_um)]
-    return {peak: value, slew_key: slew, "stroke_um": stroke}, {
-        f"limits.{peak}": f"set: rating of your actuator; range of the device {ends} {unit}",
+    return {range_key: value, slew_key: slew, "stroke_um": stroke}, {
+        f"limits.{range_key}": f"set: rating of your actuator; range of the device {ends} {unit}",
         f"limits.{slew_key}": f"fastest change of the command, {unit}/s",
         "limits.stroke_um": "set: displacements outside end the run with its safe ramp",
     }

@@ -72,9 +72,10 @@ def test_a_peak_current_counts_both_ways_and_a_drive_as_it_is():
 
 @pytest.mark.parametrize("given", [{}, {"peak_current_a": 7.0}, {"slew_v_per_s": 2e4},
                                    {**CURRENT, "drive_v": (0.0, 1.0)},
+                                   {**CURRENT, "drive_a": (0.0, 1.0)},
                                    {**CURRENT, **VOLTAGE}])  # fmt: skip
 def test_incomplete_and_mixed_limits_are_refused(given):
-    with pytest.raises(ValidationError, match="either peak_current_a"):
+    with pytest.raises(ValidationError, match="peak_current_a"):
         Limits(**STROKE, **given)
 
 

@@ -91,7 +91,12 @@ def test_what_can_not_be_started_says_what_can(tmp_path, name, said):
         starting_device(name, tmp_path)
 
 
-def test_a_current_of_one_sign_is_said_to_lack_an_offset(tmp_path):
-    """Not as a limit that must be above -0.0, which nobody has written."""
-    with pytest.raises(InputError, match=r"device\.amplifier\.offset_a"):
-        written(tmp_path, "labjack_t7", ["device.amplifier={gain_a_per_v: 2}"])
+@pytest.mark.parametrize(("name", "settings", "reader", "high"), [
+    ("labjack_t7", ["device.amplifier={gain_a_per_v: 2}"], None, 2.0),
+    ("tdk_lambda_gen", [], "agilent_34970a", 7.6),
+])  # fmt: skip
+def test_a_current_of_one_sign_has_a_range(tmp_path, name, settings, reader, high):
+    """A limit of both signs would leave no current at all."""
+    checked, _, _ = written(tmp_path, name, settings, reader=reader)
+    limits = checked.loaded.config.limits
+    assert limits.drive_a == limits.command_range == (0.0, high)
