@@ -83,9 +83,6 @@ class ReadBudget:
 
     A file of a few kilobytes can ask for gigabytes: highly compressible streams, overlapping
     records, empty messages. What hilctl writes stays far below these limits.
-
-    Args:
-        size: Bytes of the file.
     """
 
     def __init__(self, size: int) -> None:
@@ -178,15 +175,6 @@ def inflate(compression: str, data: bytes, size: int, budget: ReadBudget) -> byt
 
     A decompressor returns whole blocks (zstd: up to 128 KiB), so the last block of a truncated
     stream is lost.
-
-    Args:
-        compression: ``zstd``, ``lz4`` or empty; any other returns nothing.
-        data: The stream, maybe truncated or damaged.
-        size: Bytes expected.
-        budget: Counts the bytes returned.
-
-    Raises:
-        DataError: The file exceeds its budget.
     """
     if not compression:
         return data
@@ -224,7 +212,6 @@ class Contents:
     """The content of a whole chunk.
 
     Attributes:
-        records: Schemas, channels and messages in order.
         indexes: Channel id to the expected bytes of its message index.
         unread: Messages that are left out of ``records``.
     """
@@ -235,13 +222,7 @@ class Contents:
 
 
 def contents(chunk: Chunk, budget: ReadBudget, unread: Collection[int] = ()) -> Contents | None:
-    """Return the content of a chunk, or None if its checksum or a record in it is wrong.
-
-    Args:
-        chunk: A chunk whose own lengths are right.
-        budget: Counts the bytes that are decompressed.
-        unread: Ids of channels whose messages are only counted.
-    """
+    """Return the content of a chunk whose lengths are right, or None if it is damaged."""
     if chunk.uncompressed_size > LARGEST_CHUNK_BYTES:
         return None
     data = inflate(chunk.compression, chunk.data, chunk.uncompressed_size, budget)

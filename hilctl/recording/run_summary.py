@@ -27,12 +27,10 @@ class RunSummary:
     """Facts of a run from both ends of its file.
 
     Attributes:
-        run: Facts of its start.
         end: Facts of its end; empty if the file is not finished.
         state: ``finished``, ``recording`` (a run is writing to it), ``unfinished`` (truncated) or
             ``damaged`` (a checksum of the facts or the index is wrong; unverified facts are
             omitted). Damage between the ends is not detected.
-        problem: The damage, or empty.
     """
 
     run: Mapping[str, str]
@@ -53,18 +51,14 @@ def read_ends(path: Path) -> RunSummary:
         DataError: The file cannot be read, is not an MCAP file, or does not begin with a run.
     """
     try:
-        _check_is_file(path)  # first: opening a pipe waits for its writer
-        with path.open("rb", _BUFFER_BYTES) as stream:
-            return _ends(stream)
+        if stat.S_ISREG(path.stat().st_mode):  # first: opening a pipe waits for its writer
+            with path.open("rb", _BUFFER_BYTES) as stream:
+                return _ends(stream)
     except OSError as error:
         raise DataError(f"{path}: can't be read: {reason(error)}") from None
     except DataError as error:
         raise DataError(f"{path}: {error}") from None
-
-
-def _check_is_file(path: Path) -> None:
-    if not stat.S_ISREG(path.stat().st_mode):
-        raise DataError("is not a file")
+    raise DataError(f"{path}: is not a file")
 
 
 def _ends(stream: BinaryIO) -> RunSummary:

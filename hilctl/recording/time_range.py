@@ -134,16 +134,9 @@ def _first_at_or_after(t_s: float, rate_hz: float) -> int:
 
 
 def places_of(stream: BinaryIO, time_range: TimeRange) -> list[int] | None:
-    """Return the offsets of the records of a time range, in order, from the index of the file.
+    """Return the sorted offsets of the records of a time range; None without a valid index.
 
     These are chunks with its samples, ticks or any events, and all metadata and attachments.
-
-    Args:
-        stream: Open binary file that can seek.
-        time_range: Time range of the run.
-
-    Returns:
-        Offsets; None if the file has no valid index, or no start time.
 
     Raises:
         DataError: A time is not a finite number.

@@ -32,16 +32,7 @@ Answer = Callable[[bytes], Mapping[str, Any]]
 
 
 class ControlServer:
-    """Serve a socket that only its owner may use.
-
-    Args:
-        path: Path of the socket; its folder must be private.
-        answer: Answers requests.
-        request_s: Time in which a request must be complete.
-
-    Raises:
-        RunError: The socket cannot be made.
-    """
+    """Serve a socket that only its owner may use."""
 
     def __init__(self, path: Path, answer: Answer, request_s: float = _REQUEST_S) -> None:
         self._path, self._answer, self._request_s = path, answer, request_s
@@ -138,11 +129,7 @@ class _Handler(socketserver.BaseRequestHandler):
                 self.request.sendall(self._answer(line))
 
     def _read_line(self) -> bytes | None:
-        """Return the request; None if the client has sent nothing.
-
-        Raises:
-            TimeoutError: It is not complete in time.
-        """
+        """Return the request; None if the client has sent nothing."""
         deadline = time.monotonic() + self.server.request_s
         read = bytearray()
         while b"\n" not in read and len(read) <= MAX_BYTES:

@@ -56,14 +56,8 @@ class SampleRing:
     """The ring, for producer, consumer and watchers.
 
     Args:
-        path: File that :meth:`create` made.
         look_only: Map it read-only, for watchers.
         at_once: Map all pages now, for the loop, whose memory may not be locked.
-
-    Attributes:
-        page: Numbers, texts and events before the blocks.
-        slots: Number of slots.
-        block: Samples per block.
 
     Raises:
         ValueError: The file is not a ring, or is damaged.
@@ -103,13 +97,6 @@ class SampleRing:
         cls, path: Path, *, slots: int, block: int, state_size: int, latency_blocks: int = 0
     ) -> Self:
         """Create a ring and allocate its memory.
-
-        Args:
-            path: Its file.
-            slots: Number of slots.
-            block: Samples per block.
-            state_size: Size of the state of each block.
-            latency_blocks: Exchanges from a block's commands to its displacements.
 
         Raises:
             OSError: The memory is not available.
@@ -245,11 +232,7 @@ class SampleRing:
         return passed
 
     def look(self, since: int) -> tuple[BlockBatch, int]:
-        """Copy the complete blocks from number ``since`` on without consuming them.
-
-        Returns:
-            The blocks, and the number after the last one; others were overwritten or damaged.
-        """
+        """Copy the complete blocks from number ``since`` on without consuming them."""
         head = self.page.observe(PageField.HEAD)
         numbers = _numbers(
             max(since, self.page.observe(PageField.CLEANED), head - self.slots), head
@@ -261,11 +244,7 @@ class SampleRing:
         return batch if whole.all() else batch.rows(np.flatnonzero(whole)), max(head, since)
 
     def release(self, keep: int = 0) -> None:
-        """Release consumed blocks to the producer; they are on disk.
-
-        Args:
-            keep: Newest blocks that stay readable for watchers until the next call.
-        """
+        """Release consumed blocks to the producer, except the ``keep`` newest; they are on disk."""
         self.page.release_events()
         until = max(self._released, self._tail - keep)
         # First: watchers must not use a block that is cleaned during their copy.
@@ -283,14 +262,10 @@ class SampleRing:
         self._area.columns[slots, ANSWERS] = np.nan
 
     def unanswered(self, next_sample: int) -> BlockBatch | None:
-        """Return the blocks that were sent and not answered, after the producer has died.
+        """Return the blocks that a dead producer sent and that were not answered, or None.
 
-        Args:
-            next_sample: Index after the last consumed sample.
-
-        Returns:
-            The blocks in order with :attr:`~hilctl.base.samples.Flag.UNANSWERED`, or None. The last
-            one may not have reached the device.
+        They are flagged as unanswered; the last one may not have reached the device.
+        ``next_sample`` is the index after the last consumed sample.
         """
         sent = self.page.observe(PageField.SENT)
         numbers = _numbers(max(self.page.observe(PageField.HEAD), sent - self.slots), sent)
@@ -315,10 +290,7 @@ def _numbers(first: int, stop: int) -> I64:
 
 
 def _whole(heads: I64, number: int) -> npt.NDArray[np.bool_]:
-    """Return which blocks have the numbers from ``number`` on and valid headers.
-
-    A recording with impossible values could not be read again.
-    """
+    """Return which blocks have the numbers from ``number`` on and valid headers."""
     expected = np.arange(number + 1, number + 1 + heads.shape[0])
     first = heads[:, BlockHeader.FIRST_SAMPLE]
     dropped = heads[:, BlockHeader.DROPPED_BEFORE]

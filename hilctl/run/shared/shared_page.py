@@ -133,7 +133,6 @@ class SafeActionResult:
 
     Attributes:
         hung: Whether the loop hung and was killed.
-        output: State of the output.
         error: Why it is not confirmed; may be empty.
         final: Whether no further write follows.
     """
@@ -197,11 +196,7 @@ _USAGE = (
 
 
 class SharedPage:
-    """The page, for all processes.
-
-    Args:
-        memory: Shared memory that begins with the page.
-    """
+    """The page, for all processes."""
 
     def __init__(self, memory: mmap) -> None:
         self._map = memory

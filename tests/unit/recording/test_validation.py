@@ -47,7 +47,7 @@ def crafted(tmp_path, make):
                 topics[record.id] = record.topic
             if isinstance(record, Message):
                 topic = topics[record.channel_id]
-                decoded = schema.message(schema.TOPICS[topic])
+                decoded = schema.message_class(schema.TOPICS[topic])()
                 decoded.ParseFromString(record.data)
                 change(topic, decoded)
                 data, times = decoded.SerializeToString(), (record.log_time, record.publish_time)
