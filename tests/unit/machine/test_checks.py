@@ -35,7 +35,6 @@ def check(function, machine, *arguments):
 
 
 def test_a_good_machine_has_nothing_to_mend(make_machine):
-    """On a real-time kernel with all rights, every check is ok and asks for nothing."""
     found = examine(make_machine(), Realtime(), Path())
     assert {each.level for each in found} == {"ok"}
     assert {each.remedy for each in found} == {""}
@@ -43,7 +42,6 @@ def test_a_good_machine_has_nothing_to_mend(make_machine):
 
 
 def test_every_trouble_has_a_remedy(make_machine):
-    """Each finding that is not ok says what to do, on a machine with nothing right."""
     machine = make_machine(
         {
             "/proc/version": "Linux version 6.1 #1 SMP PREEMPT_DYNAMIC",
@@ -93,7 +91,6 @@ def test_every_trouble_has_a_remedy(make_machine):
     ],
 )
 def test_kernel(make_machine, files, level, said, remedy):
-    """The preemption model is read from wherever the kernel tells it."""
     found = check(checks.preemption, make_machine(files))
     assert found[0] == level
     assert said in found[1]
@@ -112,7 +109,6 @@ def test_kernel(make_machine, files, level, said, remedy):
     ],
 )
 def test_fifo(make_machine, files, level, said):
-    """SCHED_FIFO needs the capability or the limit, and a share of the control group's CPU."""
     found = check(checks.fifo, make_machine(files), Realtime(priority=80))
     assert (found[0], said in found[1]) == (level, True)
 
@@ -142,7 +138,6 @@ def test_locked_memory(make_machine, files, level):
     ],
 )
 def test_throttling(make_machine, files, level, said):
-    """A share of half a CPU or more is enough for a loop that sleeps."""
     found = check(checks.throttling, make_machine(files))
     assert (found[0], said in found[1]) == (level, True)
 
@@ -158,20 +153,17 @@ def test_throttling(make_machine, files, level, said):
     ],
 )
 def test_isolated_cpus(make_machine, files, cpu, level, said):
-    """A CPU of the loop's own is found, and one that is not there is refused."""
     found = check(checks.isolated_cpus, make_machine(files), Realtime(cpu=cpu))
     assert (found[0], said in found[1]) == (level, True)
 
 
 def test_idle_states(make_machine):
-    """Without permission for the file, idle states can't be kept off; without the file, none is."""
     closed = make_machine(closed=("/dev/cpu_dma_latency",))
     assert check(checks.dma_latency, closed)[0] == "warn"
     assert check(checks.dma_latency, make_machine())[0] == "ok"
 
 
 def test_no_file_for_idle_states(tmp_path):
-    """Where the kernel has no such file, there is nothing to hold."""
     found = check(checks.dma_latency, Machine(tmp_path))
     assert (found[0], "manages none" in found[1]) == ("ok", True)
 
@@ -186,7 +178,6 @@ def test_no_file_for_idle_states(tmp_path):
     ],
 )
 def test_governor(make_machine, governors, level):
-    """Every CPU has to stay at full speed, unless the kernel has no say in it."""
     files = {
         f"{CPU}/cpu{n}/cpufreq/scaling_governor": g for n, g in zip((0, 3), governors, strict=True)
     }
@@ -194,13 +185,11 @@ def test_governor(make_machine, governors, level):
 
 
 def test_smt(make_machine):
-    """Threads that share a core are told."""
     assert check(checks.hyperthreads, make_machine())[0] == "ok"
     assert check(checks.hyperthreads, make_machine({f"{CPU}/smt/active": "1"}))[0] == "warn"
 
 
 def test_virtual_machine(make_machine):
-    """A virtual machine is known by its CPU, and named after its product."""
     files = {"/proc/cpuinfo": "flags : hypervisor", "/sys/class/dmi/id/product_name": "KVM"}
     level, said, _ = check(checks.virtual_machine, make_machine(files))
     assert (level, "KVM" in said) == ("warn", True)
@@ -210,13 +199,11 @@ def test_virtual_machine(make_machine):
     ("source", "level", "remedy"), [("tsc", "ok", ""), ("hpet", "warn", "boot with tsc=reliable")]
 )
 def test_clock_source(make_machine, source, level, remedy):
-    """A clock that is slow to read is told, with the quick one where there is one."""
     found = check(checks.clock_source, make_machine({f"{CLOCK}/current_clocksource": source}))
     assert (found[0], found[2]) == (level, remedy)
 
 
 def test_ftdi_latency(make_machine):
-    """An adapter at its default of 16 ms is bad, and named."""
     slow = {"/sys/bus/usb-serial/devices/ttyUSB1/latency_timer": "16"}
     level, said, remedy = check(checks.latency_timers, make_machine(slow))
     assert (level, said) == ("bad", "ttyUSB1 16 ms")
@@ -228,7 +215,6 @@ def test_ftdi_latency(make_machine):
     [((), "ok"), (("ModemManager",), "warn"), (("brltty", "ModemManager"), "warn")],
 )
 def test_serial_daemons(make_machine, active, level):
-    """They open ports by themselves, and take bytes from a run that has one."""
     files = {f"/proc/{number}/comm": name for number, name in enumerate(("sh", *active), start=1)}
     found, said, remedy = check(checks.serial_daemons, make_machine(files))
     assert found == level
@@ -246,13 +232,11 @@ def test_serial_ports(make_machine):
 
 @pytest.mark.parametrize(("free", "level"), [(1 << 20, "bad"), (1 << 40, "ok")])
 def test_disk_space(make_machine, tmp_path, free, level):
-    """Little room for recordings is bad; the folder need not exist yet."""
     folder = tmp_path / "not" / "yet"
     assert check(checks.disk_space, make_machine(free=free), folder)[0] == level
 
 
 def test_disk_space_without_a_working_folder(make_machine, tmp_path, monkeypatch):
-    """It was deleted: relative names lead nowhere, absolute ones still do."""
     (tmp_path / "gone").mkdir()
     monkeypatch.chdir(tmp_path / "gone")
     (tmp_path / "gone").rmdir()
@@ -291,7 +275,6 @@ def login(monkeypatch):
     ],
 )
 def test_what_logind_is_set_to(make_machine, login, files, level):
-    """The newest of its files counts; a warning names the remedy."""
     found = checks.log_out(make_machine({**SYSTEMD, **files}))
     assert found.level == level
     assert bool(found.remedy) == (level == "warn")

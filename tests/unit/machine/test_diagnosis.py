@@ -28,7 +28,6 @@ def text_of(diagnosis):
 
 
 def test_report_has_all_of_it():
-    """People see findings, remedies, steps, figures and the verdict."""
     findings = (Finding("kernel", "warn", "PREEMPT_DYNAMIC [none]", "install another"),)
     shown = text_of(Diagnosis(findings, latency([3000, 5000, 2 * MS])))
     for part in ("PREEMPT_DYNAMIC [none]", "-> install another", "refused", "-> rtprio",
@@ -37,14 +36,12 @@ def test_report_has_all_of_it():
 
 
 def test_verdict_of_a_rate_that_is_kept():
-    """The verdict names the rate and the longest period."""
     kept = Diagnosis((), latency([3000, 5000, 3000]))
     assert kept.verdict == "yes, 1000 Hz is kept: the longest of 3 periods of 1 ms was 1 ms"
     assert kept.to_mapping()["kept"] is True
 
 
 def test_mapping_is_plain():
-    """Programs get numbers and texts only."""
     mapping = Diagnosis((), latency([3000, 5000, 3000])).to_mapping()
     again = json.loads(json.dumps(mapping, allow_nan=False))
     assert again["late_us"]["max"] == 5.0
@@ -52,7 +49,6 @@ def test_mapping_is_plain():
 
 
 def test_an_empty_machine_is_no_error(make_machine, tmp_path):
-    """Where no file can be read, every check still says something."""
     found = examine(Machine(tmp_path / "nothing"), Realtime(), tmp_path)
     assert all(each.text for each in found)
     assert {each.name: each.level for each in found}["SCHED_FIFO"] == "bad"

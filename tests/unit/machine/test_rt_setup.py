@@ -78,7 +78,6 @@ def by_name(steps):
 
 
 def test_every_step_is_taken_in_order():
-    """Where nothing is refused, every step is done, and the process turns real-time last."""
     system = FakeSystem()
     steps = prepare(Realtime(priority=42, cpu=1), system)
     assert [step.name for step in steps] == NAMES
@@ -171,7 +170,6 @@ def test_share_of_the_control_group(files, share):
 
 
 def test_a_run_that_requires_real_time():
-    """SCHED_FIFO and locked memory are required; the text has each remedy. The rest is not."""
     require(prepare(Realtime(), FakeSystem(refuses={"hold_dma_latency", "set_timer_slack"})))
     refused = prepare(Realtime(), FakeSystem(refuses={"set_fifo", "lock_memory"}))
     with pytest.raises(InputError, match="nothing has moved") as raised:
@@ -197,7 +195,6 @@ def test_an_inherited_policy_is_given_up(policy):
 
 @pytest.mark.parametrize("before", [0, 10, -15])
 def test_beside_a_real_time_loop_a_thread_is_favoured_for_a_while(before):
-    """Never less than it was; the loop's own policy decides, which is of another process."""
     system = FakeSystem(policies={7: os.SCHED_FIFO}, nice_now=before)
     with favoured(7, system):
         assert system.nice_now == min(before, -10)
@@ -249,7 +246,6 @@ def real():
 
 
 def test_what_is_said_to_be_done_is_done(real):
-    """In a real process, each step's outcome agrees with what the kernel says."""
     done = {step["name"] for step in real["steps"] if step["outcome"] == "done"}
     assert {"gc", "prefault", "cpu"} <= done
     assert not real["during"]["gc"]
@@ -264,7 +260,6 @@ def test_children_start_ordinary(real):
 
 @pytest.mark.parametrize(("given", "cpu"), [("none", None), (0, 0), (3, 3)])
 def test_cpu_in_the_experiment(given, cpu):
-    """The experiment names a CPU by its number, or none."""
     assert Realtime.model_validate({"cpu": given}).cpu == cpu
 
 
@@ -278,7 +273,6 @@ def test_wrong_settings_are_refused(wrong):
 
 
 def test_command_line_requires_real_time(monkeypatch):
-    """--require-rt is a setting of the experiment, beside those given with --set."""
     from typer.testing import CliRunner
 
     from hilctl.cli.commands import app

@@ -49,7 +49,6 @@ def test_idle_states_are_held_off_as_long_as_the_file_is_open(process, tmp_path,
 
 
 def test_memory_is_counted_in_bytes(process):
-    """An interpreter maps more than a megabyte; the kernel counts in kB."""
     assert process.mapped_bytes() > 1 << 20
     assert process.mapped_bytes() % 1024 == 0
 

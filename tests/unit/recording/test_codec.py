@@ -104,6 +104,5 @@ def test_any_bytes_are_decoded_or_refused(data):
 
 @pytest.mark.parametrize("data", [b"\x2a\x07" + bytes(7), b"\x4a\x01\xff", b"\x10", b"\x0f"])
 def test_damaged_blocks_are_refused(data):
-    """A part of a number, flags that end within one, fields without a value or of no type."""
     with pytest.raises((DecodeError, ValueError)):
         codec.decode_block(data)

@@ -15,7 +15,6 @@ RESULT = RunResult(
 
 
 def test_programs_get_every_figure_of_a_run_too_long_to_report():
-    """All but the two that the exit code and the recording's own report tell."""
     mapping = run_mapping(RESULT, None)
     told = {"a.mcap", "stopped", "by a test", False, "unknown", 90, 10, "2 of 5"}
     assert mapping.pop("adapted") == {}

@@ -111,7 +111,6 @@ def test_nothing_is_moved_on_the_way_out(requests, page, checked):
 
 
 def test_a_mark_is_an_event_at_the_present_sample(requests, page, recording):
-    """Counted from the start of the run, as every event is."""
     page.put(PageField.WAVEFORM_AT, 100)
     answer = asked(requests, command="mark", text="tapped the stage")
     assert answer == {"sample": 600, "text": "tapped the stage"}

@@ -117,7 +117,6 @@ def run(ring, monkeypatch):
 
 
 def test_a_guardian_that_is_awake_does_it(run, page):
-    """The supervisor only waits for it, and touches neither loop nor device."""
     for _ in range(5):
         run.look(ended=True)
     assert (run.log, run.safety.result) == ([], None)
@@ -145,7 +144,6 @@ def test_where_the_guardian_can_not_the_supervisor_does(run, what):
 
 
 def test_a_guardian_that_was_just_done_when_it_was_killed_is_believed(run, page):
-    """Nothing is sent twice."""
     guardian = run.guardians[0]
     guardian.kill = lambda wait_s: page.leave_safe_result(
         SafeActionResult(hung=False, output="confirmed")
@@ -163,7 +161,6 @@ def acting(run, page, **result):
 
 
 def test_a_guardian_that_keeps_trying_is_left_to_it(run, page):
-    """The run ends without it, and says what is not confirmed; nobody else takes the device."""
     acting(run, page, output="unknown", error="no answer")
     run.look(ended=True)
     run.look(ended=True, passed_ms=5_000)
@@ -241,7 +238,6 @@ def test_a_loop_that_said_how_it_ended_is_left_alone(run, page):
 
 
 def test_a_hanging_loop_is_found_here_too(run):
-    """Where the guardian is stopped with it, nobody else does."""
     run.look()
     looks = 0
     while not run.log:
@@ -261,7 +257,6 @@ def test_a_guardian_is_awake_for_50_ms_after_its_heartbeat(run):
 
 
 def test_a_guardian_that_is_done_is_believed_until_the_process_is_gone(run, page):
-    """A loop that it has killed takes a while to be gone."""
     run.look()
     run.guardians[0].phase = GuardianPhase.DONE
     page.leave_safe_result(SafeActionResult(hung=True, output="confirmed"))
@@ -297,7 +292,6 @@ def test_a_lost_guardian_is_said_and_another_one_started(run, page, how):
 
 
 def test_a_guardian_is_lost_after_four_looks_and_more_than_a_second(run, page):
-    """Both: after a standstill of the whole machine the first look finds old heartbeats only."""
     run.look()
     for _ in range(3):
         run.look_alive(page, passed_ms=3_000)
