@@ -35,6 +35,7 @@ from mcap.records import (
     Statistics,
     SummaryOffset,
 )
+from mcap.writer import MCAP0_MAGIC as MAGIC
 
 from hilctl.base.errors import DataError
 
@@ -145,6 +146,18 @@ def records_from(stream: BinaryIO, start: int, stop: int) -> Iterator[McapRecord
         if record is None:
             return
         yield record
+
+
+def footer_of(stream: BinaryIO) -> tuple[int, Footer] | None:
+    """Return the offset of a file's footer, and the footer; None if it or the magic is missing."""
+    footer_at = stream.seek(0, os.SEEK_END) - FOOTER_BYTES - len(MAGIC)
+    if footer_at < 0:
+        return None
+    footer = next(records_from(stream, footer_at, footer_at + FOOTER_BYTES), None)
+    stream.seek(footer_at + FOOTER_BYTES)
+    if not isinstance(footer, Footer) or stream.read() != MAGIC:
+        return None
+    return footer_at, footer
 
 
 def split(data: bytes) -> Iterator[tuple[int, int, McapRecord]]:

@@ -204,15 +204,6 @@ class PendingFile:
         with suppress(OSError):
             self._raw.close()
 
-    @property
-    def closed(self) -> bool:
-        """Whether it is closed."""
-        return self._raw.closed
-
-    def fileno(self) -> int:
-        """Return the file's descriptor."""
-        return self._raw.fileno()
-
     def close(self) -> None:
         """Close the file; pending bytes are dropped."""
         self._raw.close()

@@ -82,10 +82,10 @@ class Job:
     ) -> Self:
         """Return the job of a checked experiment, and write its arrays into the run's folder."""
         loaded, begun = checked.loaded, checked.begun
-        reference = input_um = folder.reference
+        reference = input_um = folder.path / "reference.npy"
         _save(reference, checked.reference.values)
         if begun.input_um is not checked.reference.values:
-            input_um = folder.input_um
+            input_um = folder.path / "input_um.npy"
             _save(input_um, begun.input_um)
         limits = loaded.config.command_limits()
         return cls(

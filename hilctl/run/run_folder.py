@@ -94,16 +94,6 @@ class RunFolder:
         return self._file("ring")
 
     @property
-    def reference(self) -> Path:
-        """File of the reference samples."""
-        return self.path / "reference.npy"
-
-    @property
-    def input_um(self) -> Path:
-        """File of the compensator's input if it differs from the reference."""
-        return self.path / "input_um.npy"
-
-    @property
     def description(self) -> Path:
         """File of the run's description for watchers."""
         return self._file("description.json")

@@ -200,14 +200,9 @@ def request_stop(run: RunFolder) -> bool:
         pass
     except OSError as error:
         raise RunError(f"{run.card.name}: can't be stopped: {error.strerror}") from None
-    return _end_guardian(run)
-
-
-def _end_guardian(run: RunFolder) -> bool:
     if not run.alive:
         return False
-    # A stop must not wait for NumPy.
-    from hilctl.run.processes import signal_guardian
+    from hilctl.run.processes import signal_guardian  # a stop must not wait for NumPy
 
     return signal_guardian(run, signal.SIGTERM)
 

@@ -181,7 +181,7 @@ def test_a_claimed_file_that_is_gone_can_be_given_back(tmp_path):
     claimed = OutputFile(tmp_path / "run.mcap", overwrite=False)
     (tmp_path / "run.mcap").unlink()
     claimed.give_back()
-    assert claimed.stream.closed
+    assert claimed.stream._raw.closed
 
 
 def test_a_file_that_stood_there_stays(tmp_path):
