@@ -7,17 +7,10 @@ import time
 
 import pytest
 
+from tests.faults.conftest import MODULE
+
 AWAY_S = 7.0
 PULLED_AT = 80
-MODULE = {
-    "kind": "modbus_dac",
-    "output": "OUT",
-    "input": "IN",
-    "timeout_s": 0.5,
-    "amplifier": {"gain_a_per_v": 1.0},
-    "sensor": {"um_per_v": 12.5},
-    "watchdog": "none",
-}
 
 
 def hilctl(*words):
@@ -60,7 +53,7 @@ def abandoned(tmp_path, emulate, run, profile):
     """Return a module that was pulled in mid-run, with the result of the run."""
     module = Module(tmp_path, emulate, profile("rtu_module"))
     section = {**MODULE, "profile": profile("rtu_module"), "serial_port": str(module.port)}
-    started = run(section, sample_rate_hz=100)
+    started = run({**section, "timeout_s": 0.5}, sample_rate_hz=100)
     module.result = started.end()
     module.experiment = started.output.with_suffix(".yaml")
     return module

@@ -137,7 +137,6 @@ class TestAmplitude:
             assert (np.diff(chosen["peak_hysteresis_percent"][order]) > 0.0).all()
 
     def test_the_reference_run_shows_no_drift(self, ran):
-        """A simulated rig at rest again has none but its noise."""
         drift = ran("amplitude")[1].drift
         assert drift.runs == 4
         assert abs(drift.peak_to_peak_percent) < 0.1
@@ -270,7 +269,6 @@ timing: {on_misses: warn, late_policy: skip}
 
 @pytest.mark.timeout(600)
 def test_killed_in_real_time_it_loses_one_run_and_goes_on(tmp_path):
-    """What was completed is not run again, and the coil's heat is not forgotten."""
     (tmp_path / "rig.yaml").write_text(RIG)
     (tmp_path / "few.yaml").write_text(FEW)
     runs = tmp_path / "runs"

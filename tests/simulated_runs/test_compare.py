@@ -70,7 +70,6 @@ def test_without_rate_or_deadbands_the_model_error_is_several_times_larger(model
 
 
 def test_every_other_model_is_worse_over_the_band(models):
-    """No rate-independent or symmetric model, however many weights it has, comes near Omega's."""
     others = set(models) - {"integrated", "staged"}
     assert len(others) == 9
     for name in others:
@@ -95,7 +94,6 @@ def test_compensated_the_order_is_the_same(models):
 
 @pytest.mark.parametrize("name", ["preisach", "kp"])
 def test_a_saved_model_runs_like_any_other(models, folder, name):
-    """A run with its inverse ends well, comes to what a trial does, and replays bit for bit."""
     path = folder / f"{name}.mcap"
     settings = [f"compensator.model={folder / name}.yaml", "waveform.frequency_hz=100",
                 "waveform.duration_s=0.5"]  # fmt: skip
@@ -112,7 +110,6 @@ def test_a_saved_model_runs_like_any_other(models, folder, name):
 
 
 def test_the_page_is_written(models, folder):
-    """Table and figure of all models in one file."""
     text = (folder / "models.html").read_text()
     assert all(name in text for name in models)
     assert text.count("<svg") == 1

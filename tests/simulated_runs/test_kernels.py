@@ -49,7 +49,6 @@ print(json.dumps({"late": late, "samples": samples}))
 
 
 def test_none_is_loaded_while_a_loop_runs(tmp_path):
-    """The first call of a kernel reads it from the disk: milliseconds that no tick has."""
     runs = [
         (str(CONFIGS / name), [*settings, f"waveform.duration_s={seconds}"])
         for name, settings, seconds in RUNS
@@ -80,7 +79,6 @@ np.save(path.with_suffix(".npy"), np.array(list(columns.values())))
 
 
 def test_a_run_is_the_same_where_numba_is_told_not_to_compile(tmp_path):
-    """As for a debugger; bit for bit, though then there is no one call for a whole tick."""
     found = []
     for name, told in (("compiled", {}), ("plain", {"NUMBA_DISABLE_JIT": "1"})):
         path = tmp_path / f"{name}.mcap"

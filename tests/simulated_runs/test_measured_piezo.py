@@ -59,7 +59,6 @@ def test_model_meets_its_bounds(found):
 
 
 def test_measured_reference_runs_through_it(found, tmp_path):
-    """The experimenters' own reference, through the inverse, on a stage fitted to other data."""
     _, compensator = found
     stage_path = tmp_path / "stage.yaml"
     test = DATA / "Test_Vi_Do_Di.dat"

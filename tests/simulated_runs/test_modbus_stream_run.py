@@ -47,7 +47,6 @@ def ran(port, path, *more):
 
 
 def test_every_sample_is_put_out_and_answered(port, tmp_path):
-    """At a rate that a busy machine keeps: none is missing, and the loop follows its reference."""
     path = tmp_path / "run.mcap"
     changes = {"device.tcp_port": port, "sample_rate_hz": 10000, "waveform.duration_s": 2.0}
     settings = [word for key, value in changes.items() for word in ("--set", f"{key}={value}")]
@@ -66,7 +65,6 @@ def test_every_sample_is_put_out_and_answered(port, tmp_path):
 
 
 def test_an_integrator_and_history_through_a_fifo(port, tmp_path):
-    """The integrator takes out what the model is off by; the next run begins where it ended."""
     integral = "feedback={kind: integral, bandwidth_hz: 0.012, limit_um: 15.0}"
     before = ("condition={cycles: 3}", "compensator.offset=measured", "device.sensor.offset_um=2.0")
     _, said = ran(port, tmp_path / "a.mcap", *before, integral)

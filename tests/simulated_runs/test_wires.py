@@ -37,13 +37,8 @@ class Wire:
     """One connection to the rig.
 
     Attributes:
-        profile: Shipped profile, or a file that :func:`write_profiles` makes.
         device: The experiment's device section without profile and addresses.
-        rate_hz: Sample rate.
         ports: Keys of the device section that the emulator's addresses go to, in order.
-        words: More words for ``hilctl emulate``.
-        block: Samples per exchange.
-        per_cycle: Samples per cycle of the sine.
     """
 
     profile: str
@@ -157,7 +152,6 @@ def run(path: Path) -> dict[str, Any]:
     [pytest.param(each, marks=pytest.mark.long if each in LIKE_OTHERS else ()) for each in WIRES],
 )
 def test_compensated_run_is_complete(tmp_path, name):
-    """Every sample of the waveform is recorded or counted, and the commands replay bit for bit."""
     wire = WIRES[name]
     write_profiles(tmp_path)
     path = tmp_path / "experiment.yaml"

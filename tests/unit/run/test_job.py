@@ -14,7 +14,7 @@ from hilctl.base.errors import RunError
 from hilctl.base.files import TextFiles
 from hilctl.base.yaml import Document
 from hilctl.experiment.load import load_experiment, resolve
-from hilctl.run.job import Job, safe_priority, silence_limits
+from hilctl.run.job import Job, silence_limits
 from hilctl.run.loop_process import loaded_of
 from hilctl.run.run_folder import run_folder
 from hilctl.run.start import checked_experiment
@@ -81,17 +81,6 @@ def test_samples_that_find_no_room_are_told(folder, monkeypatch):
         Job.of(plain, folder, supervisor=1, silence_s=1.0)
 
 
-def limits_of(*, hang_s=None, simulated=False):
-    info = SimpleNamespace(simulated=simulated)
-    config = SimpleNamespace(
-        timing=SimpleNamespace(hang_s=hang_s, max_late_s=1.0),
-        tick_s=0.01,
-        realtime=SimpleNamespace(priority=80),
-    )
-    loaded = SimpleNamespace(config=config, device=SimpleNamespace(info=info))
-    return SimpleNamespace(loaded=loaded)
-
-
 @pytest.mark.parametrize(
     ("given", "simulated", "real_time_s", "ordinary_s", "stopped_s"),
     [
@@ -101,11 +90,10 @@ def limits_of(*, hang_s=None, simulated=False):
     ],
 )
 def test_how_long_a_loop_may_be_silent(given, simulated, real_time_s, ordinary_s, stopped_s):
-    limits = silence_limits(limits_of(hang_s=given, simulated=simulated))
+    config = SimpleNamespace(timing=SimpleNamespace(hang_s=given, max_late_s=1.0), tick_s=0.01)
+    device = SimpleNamespace(info=SimpleNamespace(simulated=simulated))
+    loaded = SimpleNamespace(config=config, device=device)
+    limits = silence_limits(SimpleNamespace(loaded=loaded))
     assert (limits.real_time_s, limits.exchange_s) == (pytest.approx(real_time_s), 1.0)
     assert limits.ordinary_s == pytest.approx(ordinary_s)
     assert limits.stopped_s == pytest.approx(stopped_s)
-
-
-def test_who_makes_it_safe_comes_before_the_loop():
-    assert safe_priority(limits_of()) == 81

@@ -95,6 +95,7 @@ class Prepared:
 @pytest.fixture
 def prepared(tmp_path, monkeypatch):
     """Return a function that makes a job; arguments are the device's."""
+    monkeypatch.setattr("hilctl.loop.safe_output.PATIENCE_S", 0.0)
     return lambda **device_is: Prepared(tmp_path, monkeypatch, **device_is)
 
 
@@ -310,13 +311,6 @@ def host(ring, clock, monkeypatch):
     return RingHost(ring, clock, 77, SILENCE_S)
 
 
-def test_a_heartbeat_shows_time_sample_and_late_ticks(host, ring, clock):
-    assert host.heartbeat(50, 3) == ""
-    page = ring.page
-    assert page.get(PageField.LOOP_HEARTBEAT_NS) == clock.now
-    assert (page.get(PageField.NEXT_SAMPLE), page.get(PageField.LATE_TICKS)) == (50, 3)
-
-
 def test_each_reason_to_end_is_said(host, ring, clock, monkeypatch):
     clock.now += int(SILENCE_S * 1e9)
     assert host.heartbeat(0, 0) == ""
@@ -446,20 +440,12 @@ def test_a_slot_that_is_used_again_has_nothing_of_its_last_block(tmp_path, monke
 
 
 @pytest.mark.parametrize(
-    ("field", "number", "reason"),
-    [
-        (PageField.STOP, Stop.REQUEST, Stop.REQUEST.reason),
-        (
-            PageField.SUPERVISOR_HEARTBEAT_NS,
-            -(10**10),
-            "stopped because the supervisor was silent for 5 s",
-        ),
-    ],
+    ("field", "number"),
+    [(PageField.STOP, Stop.REQUEST), (PageField.SUPERVISOR_HEARTBEAT_NS, -(10**10))],
 )
-def test_what_is_asked_holds_from_the_next_tick_on(tmp_path, field, number, reason):
+def test_what_is_asked_holds_from_the_next_tick_on(tmp_path, field, number):
     rig = Rig(tmp_path / "ring", at=42, act=lambda _: rig.ring.page.put(field, number))
-    outcome = rig.run()
-    assert (outcome.code, outcome.reason) == ("stopped", reason)
+    assert rig.run().code == "stopped"
     assert rig.flags(43) & Flag.RAMP
     assert not rig.flags(42) & Flag.RAMP
 
@@ -470,31 +456,23 @@ def test_a_block_on_its_way_can_be_seen_as_such(tmp_path):
     def look(command):
         batch, page = rig.ring.unanswered(20), rig.ring.page
         sent = batch.heads[0, BlockHeader.FIRST_SAMPLE], batch.columns[0, 2, 0]
-        fields = (
-            PageField.SENT,
-            PageField.HEAD,
-            PageField.ENDED_AT,
-            PageField.EXCHANGING,
-            PageField.NEXT_SAMPLE,
-        )
-        seen.append((*sent, [page.get(field) for field in fields]))
+        names = ("SENT", "HEAD", "ENDED_AT", "EXCHANGING", "NEXT_SAMPLE")
+        seen.append((sent[0], [page.get(PageField[name]) for name in names]))
         assert sent[1] == command
 
     rig = Rig(tmp_path / "ring", at=20, act=look)
     rig.run()
-    assert seen[0][0] == 20
-    assert seen[0][2] == [21, 20, 21, 1, 20]
+    assert seen == [(20, [21, 20, 21, 1, 20])]
 
 
 def test_a_tick_shows_how_many_were_late(tmp_path):
     page = []
     fields = (PageField.LATE_TICKS, PageField.NEXT_SAMPLE, PageField.LOOP_HEARTBEAT_NS)
-    rig = Rig(
-        tmp_path / "ring",
-        at=20,
-        act=lambda _: page.extend(rig.ring.page.get(field) for field in fields),
-        stalls={5: 600_000},
-    )
+
+    def look(command):
+        page.extend(rig.ring.page.get(field) for field in fields)
+
+    rig = Rig(tmp_path / "ring", at=20, act=look, stalls={5: 600_000})
     rig.run()
     assert page[:2] == [1, 20]
     assert page[2] >= 21_000_000

@@ -7,7 +7,6 @@ from mmap import mmap
 import pytest
 
 from hilctl.base.events import Event
-from hilctl.loop.pacer import Lateness
 from hilctl.loop.safe_output import LoopOutcome
 from hilctl.machine.procfs import ProcessUsage
 from hilctl.run.shared.shared_page import SIZE, PageField, PageSlot, Phase, SharedPage, Stop
@@ -61,12 +60,6 @@ def test_outcome_counts_only_at_the_end(sides):
     assert other.outcome() == outcome
     one.write_text(PageSlot.OUTCOME, '{"code": "sto')
     assert other.outcome() is None
-
-
-def test_counters_arrive(sides):
-    one, other = sides
-    one.leave_lateness(Lateness(1, 2, 3, 4, 5))
-    assert other.lateness() == Lateness(1, 2, 3, 4, 5)
 
 
 def test_every_stop_has_its_words():
