@@ -1,7 +1,7 @@
 """Encoder of ring batches and events as messages of a recording's topics."""
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import repeat
 from typing import NamedTuple, Self
 
@@ -94,14 +94,9 @@ class RecordingLayout:
 
     def to_facts(self) -> dict[str, str]:
         """Return the fields as text, for a recording's metadata."""
+        fields = asdict(self).items()
         return {
-            "sample_rate_hz": repr(self.sample_rate_hz),
-            "command_unit": self.command_unit,
-            "waveform_unit": self.waveform_unit,
-            "measures_command": str(self.measures_command).lower(),
-            "records_input": str(self.records_input).lower(),
-            "scope_rate_hz": repr(self.scope_rate_hz),
-            "start_unix_ns": str(self.start_unix_ns),
+            name: each if isinstance(each, str) else repr(each).lower() for name, each in fields
         }
 
     @classmethod

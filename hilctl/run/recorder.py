@@ -58,13 +58,14 @@ class Recorder:
         self._failed = self._problem = ""
         self.next_sample = self._flushed = 0
         self._checked = checked
-        self._writer: RecordingWriter | None = None
         self._unix_ns = steady_unix_ns()
         self._tail = RecentSamples(_SAMPLES_BEFORE)
         config = checked.loaded.config
         self._heat = CoilHeat(config.limits, config.sample_rate_hz, checked.heat_a2)
-        self._run: RunFacts | None = None
-        self._figures: EndFigures | None = None
+        # Set by `begin`.
+        self._run: RunFacts
+        self._writer: RecordingWriter
+        self._figures: EndFigures
         try:
             self._file = OutputFile(path, overwrite=overwrite, sync=config.recording.sync)
         except FileExistsError:
@@ -93,7 +94,6 @@ class Recorder:
 
     def note_device(self, coil: CoilState | None = None) -> None:
         """Write the device state, with the coil at the end: this run is the device's last one."""
-        assert self._run is not None
         facts, info = self._run.facts, self._checked.loaded.device.info
         path = self.path
         with suppress(OSError):  # the working folder was removed
@@ -113,19 +113,19 @@ class Recorder:
         self.next_sample = int(batch.heads[-1, BlockHeader.FIRST_SAMPLE]) + batch.flags.shape[1]
         self._tail.add(batch)
         self._heat.follow(batch.samples())
-        if self._begun.samples == 0:
+        if self._writer.samples == 0:
             # The file counts samples that are missing before its first one.
             batch.heads[0, BlockHeader.DROPPED_BEFORE] = batch.heads[0, BlockHeader.FIRST_SAMPLE]
-        self._write(partial(self._begun.batch, batch))
-        self._gathered.add(batch.samples())
+        self._write(partial(self._writer.batch, batch))
+        self._figures.add(batch.samples())
 
     def event(self, event: Event) -> None:
         """Write an event with the samples before it."""
         if event.code == ADAPTED:
             self.adapted = event.values
-        self._gathered.event(event)
+        self._figures.event(event)
         led_there = replace(event, before=self._tail.up_to(event.sample))
-        self._write(partial(self._begun.event, led_there))
+        self._write(partial(self._writer.event, led_there))
 
     @property
     def error(self) -> str:
@@ -145,9 +145,9 @@ class Recorder:
         if self._failed:
             return False
         try:
-            self._begun.flush()
+            self._writer.flush()
             # If a later write fails, only these are certain.
-            self._flushed = self._begun.samples
+            self._flushed = self._writer.samples
         except OSError as error:
             self._note_problem(error)
             return False
@@ -155,7 +155,7 @@ class Recorder:
             text = f"write repeated, nothing is lost: {self._problem}"
             sample = max(0, self.next_sample - 1)
             event = Event(sample, "warning", "recording_retried", text, time_ns=self._unix_ns())
-            self._write(partial(self._begun.event, event))
+            self._write(partial(self._writer.event, event))
             self._problem = ""
         return True
 
@@ -172,11 +172,11 @@ class Recorder:
         self.flush()
         level = "info" if end["code"] == "completed" else "error"
         now_ns = self._unix_ns()
-        facts = {**end, **self._gathered.facts(), "ended": iso_time(now_ns)}
+        facts = {**end, **self._figures.facts(), "ended": iso_time(now_ns)}
         facts[HEAT_FACT] = repr(self._heat.heat_a2)
         event = Event(max(0, ended_at - 1), level, "run_ended", end["reason"], time_ns=now_ns)
-        self._write(partial(self._begun.event, event))
-        self._write(partial(self._begun.finish, facts, ended_at))
+        self._write(partial(self._writer.event, event))
+        self._write(partial(self._writer.finish, facts, ended_at))
         until_s = time.monotonic() + patience_s
         while not (closed := self._closed()) and not self._failed and time.monotonic() < until_s:
             time.sleep(_RETRY_S)
@@ -211,22 +211,12 @@ class Recorder:
     @property
     def samples(self) -> int:
         """Samples written; after an error, samples flushed before it."""
-        return self._flushed if self.error else self._begun.samples
+        return self._flushed if self.error else self._writer.samples
 
     @property
     def missing(self) -> int:
         """Missing samples: counted in the recording, or not written yet."""
-        return self.next_sample - self._flushed if self.error else self._begun.missing
-
-    @property
-    def _begun(self) -> RecordingWriter:
-        assert self._writer is not None
-        return self._writer
-
-    @property
-    def _gathered(self) -> EndFigures:
-        assert self._figures is not None
-        return self._figures
+        return self.next_sample - self._flushed if self.error else self._writer.missing
 
     def _write(self, write: Callable[[], None]) -> None:
         if not self._failed:

@@ -16,7 +16,7 @@ acquire order, see :mod:`hilctl.kernels.atomics`.
 import math
 import mmap
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Self
 
@@ -102,11 +102,11 @@ class SampleRing:
             OSError: The memory is not available.
         """
         spare = latency_blocks + 1  # blocks that may be under way in spare slots
-        size = sum(_padded(each) for each in _sizes(slots + spare, block, state_size))
+        _, size = _layout(slots + spare, block, state_size)
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
         try:
             # Allocated now: missing memory must fail here, not during the run.
-            os.posix_fallocate(descriptor, 0, _PAGE_SIZE + size)
+            os.posix_fallocate(descriptor, 0, size)
             with mmap.mmap(descriptor, _PAGE_SIZE) as memory:
                 numbers = memoryview(memory).cast("q")
                 numbers[PageField.SLOTS], numbers[PageField.BLOCK] = slots, block
@@ -121,18 +121,14 @@ class SampleRing:
         return made
 
     def _views(self, state_size: int) -> BlockBatch:
-        count, block = self.slots + self._spare, self.block
-        shapes = _shapes(count, block, state_size)
-        sizes = _sizes(count, block, state_size)
-        if _PAGE_SIZE + sum(map(_padded, sizes)) > len(self._map):
+        layout, size = _layout(self.slots + self._spare, self.block, state_size)
+        if size > len(self._map):
             raise ValueError(f"{self.path}: is shorter than it says")
-        parts: list[Any] = []
-        offset = _PAGE_SIZE
-        for shape, size, dtype in zip(shapes, sizes, _TYPES, strict=True):
-            count = math.prod(shape)
-            parts.append(np.frombuffer(self._map, dtype, count, offset).reshape(shape))
-            offset += _padded(size)
-        return BlockBatch(*parts)
+        arrays: list[Any] = [
+            np.frombuffer(self._map, dtype, math.prod(shape), offset).reshape(shape)
+            for dtype, shape, offset in layout
+        ]
+        return BlockBatch(*arrays)
 
     def prepare_blocks(self) -> None:
         """Create the block objects of the producer before the first tick."""
@@ -196,15 +192,13 @@ class SampleRing:
     def batches(self) -> Iterator[BlockBatch]:
         """Yield the present blocks in batches; see :meth:`pop`."""
         # Not those that arrive meanwhile: on a busy computer it would not end.
-        waiting = min(max(self.page.observe(PageField.HEAD) - self._tail, 0), self.slots)
-        until = self._tail + waiting
+        until = self._tail + self._waiting()
         while (left := until - self._tail) > 0 and (batch := self.pop(left)) is not None:
             yield batch
 
     def pop(self, most: int | None = None) -> BlockBatch | None:
         """Return the next blocks, at most ``most``, or None; they stay until :meth:`release`."""
-        there = min(max(self.page.observe(PageField.HEAD) - self._tail, 0), self.slots)
-        if there == 0:
+        if (there := self._waiting()) == 0:
             return None
         first = self._tail % self.slots
         few = max(1, _BATCH_SAMPLES // self._area.columns.shape[2])
@@ -219,10 +213,13 @@ class SampleRing:
         self._tail += count
         return batch
 
+    def _waiting(self) -> int:
+        """Return the number of answered blocks that were not consumed."""
+        return min(max(self.page.observe(PageField.HEAD) - self._tail, 0), self.slots)
+
     def skip_damaged(self) -> int:
         """Skip damaged blocks after the producer has ended; return their number."""
-        there = min(max(self.page.observe(PageField.HEAD) - self._tail, 0), self.slots)
-        passed = 0
+        there, passed = self._waiting(), 0
         while passed < there:
             slot = (self._tail + passed) % self.slots
             if _whole(self._area.heads[slot : slot + 1], self._tail + passed).all():
@@ -300,23 +297,17 @@ def _whole(heads: I64, number: int) -> npt.NDArray[np.bool_]:
     return whole & furthest.all(axis=1)
 
 
-def _shapes(slots: int, block: int, state_size: int) -> tuple[tuple[int, ...], ...]:
-    """Return the shapes of heads, states, columns and flags."""
-    width = len(COLUMNS)
-    return (slots, len(BlockHeader)), (slots, state_size), (slots, width, block), (slots, block)
-
-
-def _sizes(slots: int, block: int, state_size: int) -> Sequence[int]:
-    """Return the bytes of heads, states, columns and flags."""
-    shapes = _shapes(slots, block, state_size)
-    return [
-        math.prod(shape) * np.dtype(dtype).itemsize
-        for shape, dtype in zip(shapes, _TYPES, strict=True)
-    ]
-
-
-def _padded(size: int) -> int:
-    return -(-size // _LINE) * _LINE
+def _layout(
+    slots: int, block: int, state_size: int
+) -> tuple[list[tuple[Any, tuple[int, ...], int]], int]:
+    """Return type, shape and offset of heads, states, columns and flags, and the file's size."""
+    width, found, end = len(COLUMNS), [], _PAGE_SIZE
+    shapes = (slots, len(BlockHeader)), (slots, state_size), (slots, width, block), (slots, block)
+    for dtype, shape in zip(_TYPES, shapes, strict=True):
+        found.append((dtype, shape, end))
+        size = math.prod(shape) * np.dtype(dtype).itemsize
+        end += -(-size // _LINE) * _LINE  # the next array begins on a cache line
+    return found, end
 
 
 def safe_result_of(run: RunFolder) -> SafeActionResult | None:
