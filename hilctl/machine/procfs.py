@@ -29,14 +29,6 @@ class Finding:
     remedy: str = ""
 
 
-def _writable(path: Path) -> bool:
-    return os.access(path, os.R_OK | os.W_OK)
-
-
-def _free_bytes(path: Path) -> int:
-    return shutil.disk_usage(path).free
-
-
 @dataclass(frozen=True, slots=True)
 class Machine:
     """Files of this machine, or of a folder that looks like one.
@@ -46,8 +38,8 @@ class Machine:
     """
 
     root: Path = Path("/")
-    writable: Callable[[Path], bool] = _writable
-    free_bytes: Callable[[Path], int] = _free_bytes
+    writable: Callable[[Path], bool] = lambda path: os.access(path, os.R_OK | os.W_OK)
+    free_bytes: Callable[[Path], int] = lambda path: shutil.disk_usage(path).free
 
     def path(self, name: str) -> Path:
         """Return an absolute path below the root."""

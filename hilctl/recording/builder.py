@@ -172,12 +172,13 @@ class RecordingBuilder:
     def _piece(self, path: Path, *, last: bool) -> Recording:
         self._facts = self._facts or self._identity()
         unit: CommandUnit = self._facts["command_unit"]
+        gaps = self._sound.next_sample - self.samples
         return Recording(
             path=path,
             **self._facts,
             end=self._end if last else {},
             samples=self._blocks_of(unit),
-            dropped=self._dropped() if last else 0,
+            dropped=max(gaps, count_of(self._end, "missing_samples")) if last else 0,
             ticks=Ticks(**{name: self._ticks.pop(name, np.int64) for name in TICK_COLUMNS}),
             events=tuple(_event(time_ns, each, unit) for time_ns, each in self._events),
             starts=tuple(self._starts),
@@ -207,10 +208,6 @@ class RecordingBuilder:
                 raise DataError(f"/samples: a column is not in all blocks: {names}")
             self._recorded = recorded
         return samples
-
-    def _dropped(self) -> int:
-        gaps = self._sound.next_sample - self.samples
-        return max(gaps, count_of(self._end, "missing_samples"))
 
 
 def _samples(index: I64, flags: U32, unit: CommandUnit, values_of: Callable[[str], F64]) -> Samples:

@@ -263,7 +263,11 @@ def recover_recording(
             lock(stream, shared=True)
             survey = Survey(stream)
             more = list(_not_in_file(extra, survey.next_sample))
-            events = [event for event in events if _is_one(event)]
+            events = [  # from memory: implausible ones are omitted
+                event
+                for event in events
+                if 0 <= event.sample < LAST_SAMPLE and 0 <= event.time_ns <= MAX_UNIX_NS
+            ]
             if not survey.scan.repairable and not more:
                 return _left_alone(path, survey)
             layout = _check(survey, more)
@@ -294,11 +298,6 @@ def recover_recording(
         missing_samples=saved.missing,
         damages=tuple(survey.scan.damages),
     )
-
-
-def _is_one(event: Event) -> bool:
-    """Return whether an event from memory is plausible."""
-    return 0 <= event.sample < LAST_SAMPLE and 0 <= event.time_ns <= MAX_UNIX_NS
 
 
 def _left_alone(path: Path, survey: Survey) -> Recovered:

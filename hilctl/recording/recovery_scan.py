@@ -202,9 +202,14 @@ class RecoveryScan:
             self.budget.message(found.inside.unread)
             return list(found.inside.records)
         if self._data_ended or isinstance(record, DataEnd):
-            if isinstance(record, DataEnd):
-                self._check_data(at, record)
-            self._take_summary(record)
+            self._data_ended = True
+            match record:
+                case DataEnd():
+                    self._check_data(at, record)
+                case Statistics():
+                    self._counted = record.message_count
+                case ChunkIndex():
+                    self._indexed.append(record.chunk_start_offset)
             return []
         if isinstance(record, Header):
             self.header = record
@@ -218,13 +223,6 @@ class RecoveryScan:
         explained = not all(damage.lasting for damage in self.damages)
         if end.data_section_crc and not explained and self._crc != end.data_section_crc:
             self._note(0, at, "data section with a wrong checksum")
-
-    def _take_summary(self, record: McapRecord) -> None:
-        self._data_ended = True
-        if isinstance(record, Statistics):
-            self._counted = record.message_count
-        elif isinstance(record, ChunkIndex):
-            self._indexed.append(record.chunk_start_offset)
 
     def _close(self, start: int, at: int, footer: Footer) -> None:
         """Check the footer from ``start`` and the bytes from ``at`` on."""
