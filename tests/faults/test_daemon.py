@@ -20,6 +20,7 @@ import yaml
 from hilctl.analysis.replay import replay
 from hilctl.recording.reader import read
 from hilctl.run.run_folder import runs
+from tests import commands
 from tests.faults.conftest import T7, simulated, sine
 
 EXPERIMENT = simulated(  # longer than all tests of it take on a busy machine
@@ -29,13 +30,9 @@ EXPERIMENT = simulated(  # longer than all tests of it take on a busy machine
 
 def hilctl(*words, code=0):
     """Run a command; return what it printed as JSON, or its error text where it must fail."""
-    command = [sys.executable, "-m", "hilctl", *map(str, words)]
-    if code == 0:
-        command.append("--json")
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
-    assert done.returncode == code, done.stderr
-    assert "Traceback" not in done.stderr
-    return json.loads(done.stdout) if code == 0 else done.stderr
+    if code:
+        return commands.hilctl(*words, code=code).stderr
+    return json.loads(commands.hilctl(*words, "--json").stdout)
 
 
 def written(folder, **changes):
@@ -310,11 +307,7 @@ def test_a_run_that_is_killed_while_it_starts_leaves_nothing(tmp_path):
         for number in (process.pid, *map(int, children)):
             with suppress(ProcessLookupError):
                 os.kill(number, signal.SIGKILL)
-    words = [sys.executable, "-m", "hilctl", "status"]
-    said = [
-        subprocess.run(words, capture_output=True, text=True, timeout=60).stderr.splitlines()
-        for _ in range(2)
-    ]
+    said = [commands.hilctl("status").stderr.splitlines() for _ in range(2)]
     assert [len(lines) for lines in said] == [1, 0]
     assert found[0].card.name in said[0][0]
     assert not (tmp_path / "run.mcap").exists()

@@ -4,7 +4,6 @@ import json
 import os
 import random
 import signal
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -18,6 +17,7 @@ from hilctl.run.recovery import recover_dead_runs
 from hilctl.run.run_folder import runs
 from hilctl.run.shared.shared_page import SIZE
 from tests.benchmark.other_reader import is_installed
+from tests.commands import ended
 from tests.faults.conftest import StartedRun, simulated, sine
 
 ROOT = Path(__file__).parents[2]
@@ -61,10 +61,7 @@ def test_killed_and_stopped_processes_leave_a_safe_output_and_a_whole_recording(
     words = [sys.executable, "-m", "tests.benchmark.kills", "--count", "1", "--json"]
     words += ["--within-ms", "1500", "--max-step", "2"]  # others may have the machine
     words += ["--action", action, "--targets", targets, "--phase", phase]
-    done = subprocess.run(
-        [*words, "--stall-s", str(stall_s)], cwd=ROOT, capture_output=True, text=True, timeout=250
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
+    done = ended([*words, "--stall-s", str(stall_s)], cwd=ROOT)
     (found,) = json.loads(done.stdout)
     assert (found["phase"], found["lost"], found["reader"]) == (phase, 0, "")
     assert action in found["hit"]
@@ -198,5 +195,5 @@ thread.join()
 run(3)
 print(results, bool(shown), signal.getsignal(signal.SIGUSR1) is own)
 """
-    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    ran = ended([sys.executable, "-c", code])
     assert ran.stdout == "['completed', 'completed', 'completed'] True True\n", ran.stderr

@@ -19,6 +19,7 @@ from hilctl.studies.characterise.characterisation_runner import (
     CharacterisationHost,
     CharacterisationRunner,
 )
+from tests.commands import hilctl
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 RIG = CONFIGS / "terfenol_sine_6a.yaml"
@@ -129,9 +130,6 @@ def test_a_campaign_that_is_killed_loses_one_step(tmp_path):
 
 
 def test_programs_are_told_the_plan(tmp_path):
-    words = ["characterise", str(RIG), "--output", str(tmp_path / "m.yaml"), "--dry-run", "--json"]
-    done = subprocess.run(
-        [sys.executable, "-m", "hilctl", *words], capture_output=True, text=True, check=True
-    )
+    done = hilctl("characterise", RIG, "--output", tmp_path / "m.yaml", "--dry-run", "--json")
     assert json.loads(done.stdout)["rig_time_s"] < 80.0
     assert list(tmp_path.iterdir()) == []

@@ -1,8 +1,6 @@
 """Commands one after the other, as a user types them, and what comes of each."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -10,19 +8,13 @@ import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
+from tests import commands
+
 CONFIGS = Path(__file__).parents[2] / "configs"
 
 
 def hilctl(*arguments, code=0):
-    ended = subprocess.run(
-        [sys.executable, "-m", "hilctl", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        timeout=280,
-    )
-    assert ended.returncode == code, ended.stderr
-    assert "Traceback" not in ended.stderr
-    return ended.stdout
+    return commands.hilctl(*arguments, code=code).stdout
 
 
 @pytest.fixture(scope="module")

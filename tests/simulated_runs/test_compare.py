@@ -1,8 +1,6 @@
 """The comparison that the dissertation makes (section 4.5), on the simulated rig."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -13,6 +11,7 @@ from hilctl.comparison.simulated_trials import TrialDevice
 from hilctl.experiment.load import load_experiment
 from hilctl.recording.reader import read
 from hilctl.run.start import start_run
+from tests.commands import hilctl
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 
@@ -29,24 +28,7 @@ def models(folder):
     loops, page = folder / "loops.mcap", folder / "models.html"
     run = start_run(CONFIGS / "identify_omega_chapter4.yaml", [], loops, False, lambda _: None)
     assert run.code == "completed"
-    ended = subprocess.run(
-        [
-            sys.executable,
-            "-m",
-            "hilctl",
-            "compare",
-            loops,
-            "--html",
-            page,
-            "--save",
-            folder,
-            "--json",
-        ],
-        capture_output=True,
-        text=True,
-        timeout=240,
-    )
-    assert ended.returncode == 0, ended.stderr
+    ended = hilctl("compare", loops, "--html", page, "--save", folder, "--json")
     return {model["name"]: model for model in json.loads(ended.stdout)["models"]}
 
 

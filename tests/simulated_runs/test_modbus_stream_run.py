@@ -2,7 +2,6 @@
 
 import json
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,13 +10,14 @@ import pytest
 from hilctl.analysis.replay import replay
 from hilctl.base.events import OFFSET
 from hilctl.recording.reader import read
+from tests.commands import typed
 
 CONFIG = Path(__file__).parents[2] / "configs" / "modbus_labjack_t7_stream.yaml"
 
 
 def start(*words):
-    command = [sys.executable, "-m", "hilctl", *map(str, words)]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    pipe = subprocess.PIPE
+    return subprocess.Popen(typed(*words), stdout=pipe, stderr=pipe, text=True)
 
 
 @pytest.fixture

@@ -7,7 +7,6 @@ must stay rounding. Each set of kernels runs in a process of its own.
 import ctypes
 import json
 import os
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ from hilctl.identify.fit_api import FitRequest
 from hilctl.identify.fit_model import fit_model
 from hilctl.identify.registry import CATALOGUE, HISTORIES
 from hilctl.identify.settings import FitSettings
+from tests.commands import ended
 from tests.rig import RATE_HZ, driven, steady_loop
 
 TONES = [(a, f) for a in (3.0, 7.0) for f in (10.0, 100.0, 200.0)]
@@ -102,15 +102,11 @@ def models_by() -> dict[str, dict[str, object]]:
 
 def run_with(kernels: str, *options: str) -> dict[str, object]:
     """Run this module in a process of its own that takes these kernels; return what it printed."""
-    done = subprocess.run(
+    done = ended(
         [sys.executable, "-m", "tests.simulated_runs.test_same_model_everywhere", *options],
         cwd=Path(__file__).parents[2],
         env={**os.environ, "OPENBLAS_CORETYPE": kernels, "OPENBLAS_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-        timeout=300,
     )
-    assert done.returncode == 0, done.stderr
     answer: dict[str, object] = json.loads(done.stdout)
     return answer
 

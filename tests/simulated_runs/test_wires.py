@@ -3,7 +3,6 @@
 import json
 import shutil
 import subprocess
-import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ from hilctl.analysis.replay import replay
 from hilctl.recording.reader import read
 from hilctl_drivers.profile import shipped_profiles
 from tests.benchmark.attacked import make_real_time
+from tests.commands import typed
 
 ROOT = Path(__file__).parents[2]
 MODEL = ROOT / "configs" / "models" / "terfenol_omega.yaml"
@@ -71,10 +71,6 @@ LIKE_OTHERS = {"Modbus RTU", "SCPI, measured"}
 """Wires whose parts the others have, each in a run that takes its time."""
 
 
-def hilctl(*words: object) -> list[str]:
-    return [sys.executable, "-m", "hilctl", *map(str, words)]
-
-
 def write_profiles(folder: Path) -> None:
     """Write the profiles that are not shipped: float32 and function 23 over RTU, a DCON reader."""
     rtu = yaml.safe_load(shipped_profiles()["generic_float32"].read_text(encoding="utf-8"))
@@ -86,7 +82,7 @@ def write_profiles(folder: Path) -> None:
 @contextmanager
 def emulated(wire: Wire, folder: Path) -> Iterator[dict[str, Any]]:
     """Emulate a wire's device in a process; yield the device section that reaches it."""
-    command = hilctl("emulate", wire.profile, *wire.words)
+    command = typed("emulate", wire.profile, *wire.words)
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=folder) as process:
         try:
             assert process.stdout is not None
@@ -140,7 +136,7 @@ def write_experiment(path: Path, wire: Wire, device: dict[str, Any]) -> None:
 
 def run(path: Path) -> dict[str, Any]:
     """Run an experiment in processes of its own; return the JSON that it prints."""
-    command = hilctl("run", path, "--output", path.with_suffix(".mcap"), "--json")
+    command = typed("run", path, "--output", path.with_suffix(".mcap"), "--json")
     done = subprocess.run(command, stdout=subprocess.PIPE, text=True, cwd=path.parent)
     assert done.stdout, done.returncode
     found: dict[str, Any] = json.loads(done.stdout)

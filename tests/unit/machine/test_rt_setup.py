@@ -3,7 +3,6 @@
 import errno
 import json
 import os
-import subprocess
 import sys
 from dataclasses import dataclass, field
 
@@ -24,6 +23,7 @@ from hilctl.machine.rt_setup import (
     rt_group_runtime_us,
     step_facts,
 )
+from tests.commands import ended
 
 NAMES = ["gc", "memory", "prefault", "timer_slack", "dma_latency", "cpu", "fifo"]
 
@@ -241,8 +241,7 @@ json.dump({"steps": steps, "during": state(), "child": int(child.stdout)}, sys.s
 @pytest.fixture(scope="module")
 def real():
     """What a process of its own says after the set-up."""
-    ran = subprocess.run([sys.executable, "-c", REAL], capture_output=True, text=True, check=True)
-    return json.loads(ran.stdout)
+    return json.loads(ended([sys.executable, "-c", REAL]).stdout)
 
 
 def test_what_is_said_to_be_done_is_done(real):

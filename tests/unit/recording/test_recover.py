@@ -4,7 +4,6 @@ import io
 import json
 import os
 import struct
-import subprocess
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,6 +20,7 @@ from hilctl.recording.reader import read
 from hilctl.recording.recover import Rewritten, Survey, recover_recording
 from hilctl.recording.recovery_scan import RecoveryScan
 from hilctl.recording.run_summary import read_ends
+from tests.commands import ended
 from tests.unit.recording.conftest import written
 
 PEERS = Path(__file__).parents[2] / "peers"
@@ -367,15 +367,8 @@ def test_other_readers_agree(sound, tmp_path):
             for topic, *_ in messages(stream):
                 counts[topic] = counts.get(topic, 0) + 1
         expected[str(path)] = counts
-    ended = subprocess.run(
-        ["node", PEERS / "read_mcap.mjs", "-"],
-        input="\n".join(expected),
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=True,
-    )
-    found = json.loads(ended.stdout)
+    told = ended(["node", PEERS / "read_mcap.mjs", "-"], input="\n".join(expected))
+    found = json.loads(told.stdout)
     assert {path: each["streamed"]["counts"] for path, each in found.items()} == expected
     for path, each in found.items():
         assert each["streamed"]["done"], path

@@ -4,7 +4,6 @@ import json
 import math
 import os
 import signal
-import subprocess
 import sys
 import time
 from dataclasses import replace
@@ -34,6 +33,7 @@ from hilctl.run.shared import ring as ring_module
 from hilctl.run.shared.ring import SampleRing
 from hilctl.run.shared.shared_page import PageField, PageSlot, Phase, Stop
 from hilctl.run.start import checked_experiment
+from tests.commands import ended
 from tests.fakes import FakeClock, FakeDevice
 from tests.published import terfenol_rdpi
 
@@ -286,8 +286,7 @@ def test_it_has_nothing_that_only_others_need(modules, left_out):
     if "loop_process" in modules:  # numba imports some with its first kernel
         program += "from hilctl.kernels import jit, limit; jit.ensure_compiled(limit.limit_block);"
     program += f"print([name for name in {left_out} if name in sys.modules])"
-    words = [sys.executable, "-P", "-c", program]
-    assert subprocess.run(words, capture_output=True, text=True, check=True).stdout == "[]\n"
+    assert ended([sys.executable, "-P", "-c", program]).stdout == "[]\n"
 
 
 SILENCE_S = 2.0

@@ -155,32 +155,20 @@ def test_what_a_process_has_of_a_removed_folder_is_kept(tmp_path):
                 assert ours
 
 
-def test_finished_run_never_looks_dead(tmp_path, monkeypatch):
-    seen = []
-    remove = shutil.rmtree
+def test_no_run_looks_dead_or_can_be_taken_over_while_its_folder_is_removed(tmp_path, monkeypatch):
+    seen, taken, remove = [], [], shutil.rmtree
 
     def look_then_remove(path, **options):
+        with taken_over(folder) as ours:
+            taken.append(ours)
         seen.append([run.alive for run in runs()])
         remove(path, **options)
 
-    with made(tmp_path):
+    with made(tmp_path) as (folder, _):
         monkeypatch.setattr(shutil, "rmtree", look_then_remove)
     assert seen[0] == []
-    assert all(all(each) for each in seen)
-
-
-def test_lock_is_held_until_the_folder_is_gone(tmp_path, monkeypatch):
-    held = []
-    remove = shutil.rmtree
-
-    def try_then_remove(path, **options):
-        with taken_over(folder) as ours:
-            held.append(ours)
-        remove(path, **options)
-
-    with made(tmp_path) as (folder, _):
-        monkeypatch.setattr(shutil, "rmtree", try_then_remove)
-    assert not any(held)
+    assert all(map(all, seen))
+    assert not any(taken)
 
 
 def test_samples_of_a_dead_process_of_the_same_number_stay(tmp_path):
@@ -198,10 +186,7 @@ def test_folder_that_can_not_be_made_is_one_message(tmp_path, monkeypatch):
     monkeypatch.setattr(
         "pathlib.Path.write_text", Mock(side_effect=OSError(28, "No space left on device"))
     )
-    with (
-        pytest.raises(RunError, match="No space left"),
-        made(tmp_path),
-    ):
+    with pytest.raises(RunError, match="No space left"), made(tmp_path):
         pass
     assert list(base_folder().iterdir()) == []
 
@@ -251,29 +236,29 @@ def test_no_place_at_all_says_what_is_wrong_with_each(places):
 NAME = f"test:{os.getpid()}:"  # locks are the whole machine's, and so is /dev/ttyUSB0
 
 
+def hold(*names):
+    with held_devices(names):
+        pass
+
+
+def refused(*names, match="in use by"):
+    with pytest.raises(InputError, match=match):
+        hold(*names)
+
+
 def test_device_is_held_by_one_run(tmp_path):
     device, other = f"{NAME}tty", f"{NAME}tcp"
     with held_devices((device,)), made(tmp_path) as (folder, _):
         who = f"run {folder.card.experiment} .process {os.getpid()}, recording {tmp_path}/a.mcap"
-        with (
-            pytest.raises(InputError, match=f"{device} is in use by {who}"),
-            held_devices((other, device)),
-        ):
-            pass
-        with held_devices((other,)):
-            pass
-    with held_devices((device, device)):
-        pass
+        refused(other, device, match=f"{device} is in use by {who}")
+        hold(other)  # a run that is refused lets go of what it had
+    hold(device, device)
 
 
 def test_holder_without_a_run_is_named_by_the_kernel():
     name = f"{NAME}{'long' * 50}"
-    with (
-        held_devices((name,)),
-        pytest.raises(InputError, match=f"in use by process {os.getpid()} of "),
-        held_devices((name,)),
-    ):
-        pass
+    with held_devices((name,)):
+        refused(name, match=f"in use by process {os.getpid()} of ")
 
 
 @pytest.mark.parametrize("listening", [True, False])
@@ -295,8 +280,7 @@ def test_another_user_can_not_lock_this_one_out(monkeypatch, caplog, listening):
             (warned,) = caplog.messages
             assert name in warned
             assert (f"process {os.getpid()} of user {2**31 - 1}" in warned) == listening
-            with pytest.raises(InputError, match="in use by another run"), held_devices((name,)):
-                pass
+            refused(name, match="in use by another run")
 
 
 def test_a_device_stays_held_when_the_folder_is_removed():
@@ -304,17 +288,7 @@ def test_a_device_stays_held_when_the_folder_is_removed():
     name = f"{NAME}removed"
     with held_devices((name,)):
         shutil.rmtree(base_folder())
-        with pytest.raises(InputError, match="in use by process"), held_devices((name,)):
-            pass
-
-
-def test_refused_run_lets_go_of_what_it_had():
-    first, second = f"{NAME}a", f"{NAME}b"
-    with held_devices((second,)):
-        with pytest.raises(InputError), held_devices((first, second)):
-            pass
-        with held_devices((first,)):
-            pass
+        refused(name, match="in use by process")
 
 
 def test_lock_lives_as_long_as_a_process_that_inherited_it():
@@ -324,11 +298,9 @@ def test_lock_lives_as_long_as_a_process_that_inherited_it():
         child = subprocess.Popen(
             [sys.executable, "-c", "input()"], stdin=subprocess.PIPE, pass_fds=locks
         )
-    with pytest.raises(InputError, match="in use by"), held_devices((name,)):
-        pass
+    refused(name)
     child.communicate(b"\n", timeout=30)
-    with held_devices((name,)):
-        pass
+    hold(name)
 
 
 @pytest.mark.parametrize("machine", ["x86_64", "aarch64", "riscv64"])
