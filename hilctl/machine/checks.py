@@ -7,7 +7,7 @@ import os
 import re
 from pathlib import Path
 
-from hilctl.machine.procfs import Finding, Machine
+from hilctl.machine.procfs import CAP_IPC_LOCK, Finding, Machine
 from hilctl.machine.rt_setup import (
     ISOLATED,
     LIMITS_FILE,
@@ -20,7 +20,7 @@ from hilctl.machine.rt_setup import (
 )
 from hilctl.machine.syscalls import DMA_LATENCY
 
-_CAP_IPC_LOCK, _CAP_SYS_NICE = 14, 23
+_CAP_SYS_NICE = 23
 _ENOUGH_LOCKED_BYTES = 1 << 30
 _DYNAMIC = "/sys/kernel/debug/sched/preempt"
 _CPU = "/sys/devices/system/cpu"
@@ -74,7 +74,7 @@ def fifo(machine: Machine, settings: Realtime) -> Finding:
 def locked_memory(machine: Machine) -> Finding:
     """Check whether all memory may be locked."""
     limit = machine.limit("Max locked memory")
-    if machine.capable(_CAP_IPC_LOCK):
+    if machine.capable(CAP_IPC_LOCK):
         return Finding("locked memory", "ok", "any amount (CAP_IPC_LOCK)")
     if limit is None or limit >= _ENOUGH_LOCKED_BYTES:
         return Finding(
@@ -224,12 +224,7 @@ def _group_of(path: Path) -> str:
 
 
 def disk_space(machine: Machine, folder: Path) -> Finding:
-    """Check the free space for recordings.
-
-    Args:
-        machine: The machine.
-        folder: Folder of recordings; it need not exist yet.
-    """
+    """Check the free space for recordings; their folder need not exist yet."""
     try:
         place = folder.absolute()
     except FileNotFoundError:

@@ -19,12 +19,7 @@ _EDGES_US = np.concatenate([[0], 2 ** np.arange(17)])
 
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
-    """Result of a diagnosis.
-
-    Attributes:
-        findings: Results of the checks.
-        latency: Measured timer latency.
-    """
+    """Result of a diagnosis."""
 
     findings: tuple[Finding, ...]
     latency: Latency
@@ -71,13 +66,7 @@ def lateness_counts(late_ns: I64) -> dict[int, int]:
 
 
 def examine(machine: Machine, settings: Realtime, folder: Path) -> tuple[Finding, ...]:
-    """Return the results of all checks; nothing is measured, and no device is opened.
-
-    Args:
-        machine: The machine.
-        settings: Real-time settings of the loop.
-        folder: Folder of recordings.
-    """
+    """Return the results of all checks; nothing is measured, and no device is opened."""
     return (
         checks.preemption(machine),
         checks.fifo(machine, settings),
@@ -100,13 +89,7 @@ def examine(machine: Machine, settings: Realtime, folder: Path) -> tuple[Finding
 def machine_facts(
     settings: Realtime | None = None, folder: Path | None = None, machine: Machine | None = None
 ) -> dict[str, str]:
-    """Return the results of all checks as metadata of a recording, such as ``machine.kernel``.
-
-    Args:
-        settings: Real-time settings of the loop; the defaults if None.
-        folder: Folder of the recording; the current one if None.
-        machine: The machine; this one if None.
-    """
+    """Return the results of all checks as metadata of a recording, such as ``machine.kernel``."""
     found = examine(machine or Machine(), settings or Realtime(), folder or Path())
     return {
         f"machine.{each.name.replace(' ', '_').lower()}": f"{each.level}: {each.text}"
@@ -122,13 +105,6 @@ def diagnose(
     on_progress: Callable[[float], None],
 ) -> Diagnosis:
     """Check this machine, and measure the timer latency of a process set up like the loop.
-
-    Args:
-        rate_hz: Ticks per second.
-        settings: Real-time settings of the loop.
-        folder: Folder of recordings.
-        seconds: Length of the measurement.
-        on_progress: See :func:`hilctl.machine.timer_latency.measure`.
 
     Raises:
         InputError: The rate is out of range.

@@ -4,10 +4,12 @@ import os
 import shutil
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Literal, Self, TypeAlias
 
+CAP_IPC_LOCK = 14
+"""Number of the capability to lock memory."""
 _STATM = Path("/proc/self/statm")
 
 Level: TypeAlias = Literal["ok", "warn", "bad"]
@@ -18,10 +20,7 @@ class Finding:
     """Result of one check.
 
     Attributes:
-        name: Name of the check.
         level: ``ok``; ``warn``: worth knowing; ``bad``: prevents real time or a run.
-        text: State that was found.
-        remedy: What to do about it; may be empty.
     """
 
     name: str
@@ -30,27 +29,17 @@ class Finding:
     remedy: str = ""
 
 
-def _writable(path: Path) -> bool:
-    return os.access(path, os.R_OK | os.W_OK)
-
-
-def _free_bytes(path: Path) -> int:
-    return shutil.disk_usage(path).free
-
-
 @dataclass(frozen=True, slots=True)
 class Machine:
     """Files of this machine, or of a folder that looks like one.
 
     Attributes:
         root: Folder that holds ``proc``, ``sys``, ``dev`` and ``etc``.
-        writable: Whether this user may open a file for writing.
-        free_bytes: Free space of the file system that holds a folder.
     """
 
     root: Path = Path("/")
-    writable: Callable[[Path], bool] = _writable
-    free_bytes: Callable[[Path], int] = _free_bytes
+    writable: Callable[[Path], bool] = lambda path: os.access(path, os.R_OK | os.W_OK)
+    free_bytes: Callable[[Path], int] = lambda path: shutil.disk_usage(path).free
 
     def path(self, name: str) -> Path:
         """Return an absolute path below the root."""
@@ -107,15 +96,7 @@ class Machine:
 
 @dataclass(frozen=True, slots=True)
 class ProcessUsage:
-    """Resources used by this process, since its start or another reading.
-
-    Attributes:
-        resident_bytes: Memory in RAM now, shared memory included.
-        cpu_ns: Processor time.
-        minor_faults: Page faults without disk access.
-        major_faults: Page faults with disk access.
-        involuntary_switches: Involuntary context switches.
-    """
+    """Resources used by this process, since its start or another reading."""
 
     resident_bytes: int
     cpu_ns: int
@@ -140,10 +121,5 @@ class ProcessUsage:
 
     def since(self, before: "ProcessUsage") -> "ProcessUsage":
         """Return the difference from an earlier reading; memory is the current value."""
-        return ProcessUsage(
-            self.resident_bytes,
-            self.cpu_ns - before.cpu_ns,
-            self.minor_faults - before.minor_faults,
-            self.major_faults - before.major_faults,
-            self.involuntary_switches - before.involuntary_switches,
-        )
+        pairs = zip(astuple(self)[1:], astuple(before)[1:], strict=True)
+        return ProcessUsage(self.resident_bytes, *(now - then for now, then in pairs))

@@ -63,9 +63,7 @@ class SetUpStep:
 
     Attributes:
         name: ``gc``, ``prefault``, ``memory``, ``timer_slack``, ``dma_latency``, ``cpu``, ``fifo``.
-        outcome: Whether it was done.
         detail: What was set, or why it was refused.
-        remedy: What to do about a refusal; may be empty.
     """
 
     name: str
@@ -135,15 +133,7 @@ _THIS_PROCESS = LinuxProcess()
 
 
 def prepare(settings: Realtime, system: LinuxProcess = _THIS_PROCESS) -> tuple[SetUpStep, ...]:
-    """Take every step that is allowed. Call it last, when all memory is mapped and warm.
-
-    Args:
-        settings: The experiment's.
-        system: The operating system.
-
-    Returns:
-        The steps in order.
-    """
+    """Take every step that is allowed. Call it last, when all memory is mapped and warm."""
     # The heap after the lock, so that its pages stay in RAM. The CPU before the policy, so that
     # other processes keep theirs. SCHED_FIFO last: the other steps take milliseconds.
     return (
@@ -164,11 +154,6 @@ def prepare(settings: Realtime, system: LinuxProcess = _THIS_PROCESS) -> tuple[S
         _pin(settings, system),
         _set_fifo(settings, system),
     )
-
-
-def undo(system: LinuxProcess = _THIS_PROCESS) -> None:
-    """Make this an ordinary process again."""
-    system.undo()
 
 
 def require(steps: Sequence[SetUpStep]) -> None:
@@ -222,10 +207,6 @@ def favoured(loop: int, system: LinuxProcess = _THIS_PROCESS) -> Iterator[None]:
 
     On a busy machine the supervisor must be scheduled in time to set the safe value. Without a
     real-time loop nothing changes: the loop would have to wait for the supervisor.
-
-    Args:
-        loop: Process number of the loop.
-        system: The operating system.
     """
     nice = system.nice()
     with suppress(OSError):  # not allowed, or the loop has ended

@@ -12,10 +12,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from hilctl.machine.procfs import CAP_IPC_LOCK, Machine
+
 DMA_LATENCY = "/dev/cpu_dma_latency"
 
 _STACK_DEPTH = 250
-_CAP_IPC_LOCK = 14
 _PR_SET_TIMERSLACK = 29
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 _M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4
@@ -33,10 +34,6 @@ _descend = ctypes.CFUNCTYPE(None, ctypes.c_int)(_go_down)
 class LinuxProcess:
     """This process, on Linux with glibc."""
 
-    def __init__(self) -> None:
-        self._latency_file: int | None = None
-        self._cpus_before: set[int] | None = None
-
     @cached_property
     def _libc(self) -> ctypes.CDLL:
         return ctypes.CDLL(None, use_errno=True)
@@ -53,22 +50,12 @@ class LinuxProcess:
 
     def lockable_bytes(self) -> int | None:
         """Return how much memory may be locked; None if any amount."""
-        import resource
-
-        limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
-        capable = int(self._status("CapEff"), 16) >> _CAP_IPC_LOCK & 1
-        return None if capable or limit == resource.RLIM_INFINITY else limit
+        machine = Machine()
+        return None if machine.capable(CAP_IPC_LOCK) else machine.limit("Max locked memory")
 
     def mapped_bytes(self) -> int:
         """Return the size of all mapped memory."""
-        return int(self._status("VmSize").removesuffix(" kB")) << 10
-
-    def _status(self, name: str) -> str:
-        for line in self.read("/proc/self/status").splitlines():
-            key, _, value = line.partition(":")
-            if key == name:
-                return value.strip()
-        raise OSError(errno.ENODATA, f"/proc/self/status has no {name}")
+        return int(Machine().status("VmSize").removesuffix(" kB")) << 10
 
     def freeze_gc(self) -> None:
         """Collect garbage once, then disable collection."""
@@ -98,7 +85,7 @@ class LinuxProcess:
         self._call("mlockall", _MCL_CURRENT | _MCL_FUTURE | on_fault)
 
     def set_timer_slack(self, slack_ns: int) -> None:
-        """Set the timer slack; 0 restores the system's value."""
+        """Set the timer slack."""
         self._call("prctl", _PR_SET_TIMERSLACK, slack_ns, 0, 0, 0)
 
     def hold_dma_latency(self, latency_us: int) -> None:
@@ -109,13 +96,10 @@ class LinuxProcess:
         except OSError:
             os.close(descriptor)
             raise
-        self._latency_file = descriptor
 
     def pin(self, cpu: int) -> None:
         """Run on this CPU only."""
-        before = os.sched_getaffinity(0)
         os.sched_setaffinity(0, {cpu})
-        self._cpus_before = before
 
     def set_fifo(self, priority: int) -> None:
         """Use SCHED_FIFO; children and new threads start without it."""
@@ -137,18 +121,3 @@ class LinuxProcess:
     def set_nice(self, nice: int) -> None:
         """Set the nice value of this thread; new threads and processes inherit it."""
         os.setpriority(os.PRIO_PROCESS, 0, nice)
-
-    def undo(self) -> None:
-        """Undo every step that was taken."""
-        # First: the rest takes time, and other processes need the CPU.
-        self.set_ordinary()
-        if self._cpus_before is not None:
-            os.sched_setaffinity(0, self._cpus_before)
-            self._cpus_before = None
-        if self._latency_file is not None:
-            os.close(self._latency_file)
-            self._latency_file = None
-        self.set_timer_slack(0)
-        self._call("munlockall")
-        gc.unfreeze()
-        gc.enable()

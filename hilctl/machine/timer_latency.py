@@ -39,9 +39,7 @@ class Latency:
     """Measured timer latency.
 
     Attributes:
-        rate_hz: Ticks per second.
         late_ns: int64[m], time from each tick's deadline to its wake-up.
-        steps: Real-time set-up of the process.
     """
 
     rate_hz: float
@@ -77,14 +75,7 @@ def measure(
     on_progress: Callable[[float], None] = lambda _: None,
     policy: LatePolicy = "catch_up",
 ) -> Latency:
-    """Measure wake-up lateness in a new process.
-
-    Args:
-        rate_hz: Ticks per second.
-        seconds: Duration.
-        settings: Real-time settings of that process.
-        on_progress: Called a few times per second with the time since the start, in s.
-        policy: Late policy of the pacer; with ``skip`` a stall counts once.
+    """Measure wake-up lateness in a new process; with policy ``skip`` a stall counts once.
 
     Raises:
         InputError: The rate is out of range.

@@ -57,16 +57,7 @@ class ColumnTable:
 
 
 class RecordingBuilder:
-    """Builder of recordings from the records of a file, in order.
-
-    Args:
-        scan: Source of the records; its budget counts kept bytes.
-        stretch: Time range; only blocks and ticks that overlap it are kept.
-
-    Attributes:
-        samples: Samples taken.
-        waiting: Samples taken since the last piece.
-    """
+    """Builder of recordings from the records of a file, in order, cut to a time range."""
 
     def __init__(self, scan: RecoveryScan, stretch: TimeRange | None) -> None:
         self._scan = scan
@@ -90,11 +81,7 @@ class RecordingBuilder:
         self._events: list[tuple[int, Any]] = []
 
     def take(self, record: McapRecord) -> None:
-        """Take a record.
-
-        Raises:
-            DataError: It is invalid, or a fact of the run that follows the first piece.
-        """
+        """Take a record."""
         match record:
             case Message() if self._sound.topic(record.channel_id):
                 self._message(record)
@@ -167,16 +154,7 @@ class RecordingBuilder:
             self._starts.append(ReplayStart(block.tick0, block.state.copy(), previous))
 
     def piece(self, path: Path, *, last: bool = False) -> Recording:
-        """Return everything taken since the last piece.
-
-        Args:
-            path: The file, for error messages.
-            last: Whether it is the last piece, with the end of the run and the number of missing
-                samples.
-
-        Raises:
-            DataError: A fact of the run is missing or damaged, or a column is incomplete.
-        """
+        """Return everything taken since the last piece; the last one has the end of the run."""
         if not self._run:
             lost = "" if self._scan.is_mcap else "is not an MCAP file, or its start is lost: "
             text = f"{path}: {lost}holds no run of hilctl (metadata hilctl.run is missing)"
@@ -194,12 +172,13 @@ class RecordingBuilder:
     def _piece(self, path: Path, *, last: bool) -> Recording:
         self._facts = self._facts or self._identity()
         unit: CommandUnit = self._facts["command_unit"]
+        gaps = self._sound.next_sample - self.samples
         return Recording(
             path=path,
             **self._facts,
             end=self._end if last else {},
             samples=self._blocks_of(unit),
-            dropped=self._dropped() if last else 0,
+            dropped=max(gaps, count_of(self._end, "missing_samples")) if last else 0,
             ticks=Ticks(**{name: self._ticks.pop(name, np.int64) for name in TICK_COLUMNS}),
             events=tuple(_event(time_ns, each, unit) for time_ns, each in self._events),
             starts=tuple(self._starts),
@@ -230,17 +209,9 @@ class RecordingBuilder:
             self._recorded = recorded
         return samples
 
-    def _dropped(self) -> int:
-        gaps = self._sound.next_sample - self.samples
-        return max(gaps, count_of(self._end, "missing_samples"))
-
 
 def _samples(index: I64, flags: U32, unit: CommandUnit, values_of: Callable[[str], F64]) -> Samples:
-    """Return samples from the values of their fields; an omitted column equals another one.
-
-    Raises:
-        DataError: A required column is missing, or has another length.
-    """
+    """Return samples from the values of their fields; an omitted column equals another one."""
     columns: dict[str, F64] = {}
     for name, column in COLUMNS.items():
         field = column.field(unit).name

@@ -30,8 +30,6 @@ class BlockArrays:
     """Content of a ``SampleBlock``; the lengths of its arrays are not checked.
 
     Attributes:
-        tick0: Index of its first sample.
-        n: Number of samples.
         dropped: Samples missing before it.
         flags: uint32[n].
         columns: float64[n] by name of their field; empty ones are omitted.
@@ -49,12 +47,7 @@ class BlockArrays:
 
 
 def encode_block(block: BlockArrays, t_rel: F64) -> bytes:
-    """Return a ``SampleBlock``.
-
-    Args:
-        block: Its content.
-        t_rel: float64[n], time of its samples in s.
-    """
+    """Return a ``SampleBlock``; ``t_rel``, float64[n], is the time of its samples in s."""
     lists = {
         "t_rel": t_rel,
         "state": block.state,
@@ -129,13 +122,7 @@ def decode_ticks(data: bytes) -> Ticks:
 
 
 def encode_scope(samples: I64, flags: U32, columns: Mapping[str, F64]) -> Iterator[bytes]:
-    """Yield a ``Sample`` message per sample.
-
-    Args:
-        samples: int64[n], sample indices.
-        flags: uint32[n].
-        columns: float64[n] by name of their field.
-    """
+    """Yield a ``Sample`` message per sample of the columns, float64[n] by name of their field."""
     rows = zip(*(values.tolist() for values in columns.values()), strict=True)
     for sample, flag, row in zip(samples.tolist(), flags.tolist(), rows, strict=True):
         fields = dict(zip(columns, row, strict=True))

@@ -1,7 +1,7 @@
 """Encoder of ring batches and events as messages of a recording's topics."""
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import repeat
 from typing import NamedTuple, Self
 
@@ -43,9 +43,6 @@ class RecordingLayout:
     """Parameters of the messages; stored among a recording's facts, so that messages can be added.
 
     Attributes:
-        sample_rate_hz: Samples per second.
-        command_unit: ``A`` or ``V``.
-        measures_command: Whether the device measures its command.
         scope_rate_hz: Highest rate of ``/scope``.
         start_unix_ns: Unix time of sample 0 in ns.
         records_input: Whether the compensator's input differs from the reference.
@@ -61,12 +58,7 @@ class RecordingLayout:
     waveform_unit: str = "um"
 
     def __post_init__(self) -> None:
-        """Check rates and clock.
-
-        Raises:
-            InputError: A rate is invalid, or the clock is before 1970 or after 2260, where times
-                in ns exceed 64 bits.
-        """
+        """Check rates and clock; times in ns exceed 64 bits after 2260."""
         if not RATES_HZ[0] <= self.sample_rate_hz <= RATES_HZ[1] or not self.scope_rate_hz > 0.0:
             rates = f"{self.sample_rate_hz!r}, {self.scope_rate_hz!r}"
             raise InputError(f"sample_rate_hz and scope_rate_hz must be rates: {rates}")
@@ -102,14 +94,9 @@ class RecordingLayout:
 
     def to_facts(self) -> dict[str, str]:
         """Return the fields as text, for a recording's metadata."""
+        fields = asdict(self).items()
         return {
-            "sample_rate_hz": repr(self.sample_rate_hz),
-            "command_unit": self.command_unit,
-            "waveform_unit": self.waveform_unit,
-            "measures_command": str(self.measures_command).lower(),
-            "records_input": str(self.records_input).lower(),
-            "scope_rate_hz": repr(self.scope_rate_hz),
-            "start_unix_ns": str(self.start_unix_ns),
+            name: each if isinstance(each, str) else repr(each).lower() for name, each in fields
         }
 
     @classmethod
@@ -135,13 +122,8 @@ class RecordingLayout:
 
 
 def event_message(event: Event, before: Iterable[tuple[RecordedField, F64]] = ()) -> Encoded:
-    """Return the message of one event.
-
-    Args:
-        event: The event, with its time.
-        before: Field and values of each column of the samples before it.
-    """
-    out = schema.message("Event")
+    """Return the message of an event with its time, and of the samples before it by field."""
+    out = schema.message_class("Event")()
     for name in ("sample", "level", "code", "text"):
         setattr(out, name, getattr(event, name))
     out.value_names.extend(event.values.keys())
@@ -155,15 +137,7 @@ def event_message(event: Event, before: Iterable[tuple[RecordedField, F64]] = ()
 
 
 class MessageMaker:
-    """Encoder of one run.
-
-    Args:
-        layout: Parameters of the messages.
-
-    Attributes:
-        samples: Samples encoded so far.
-        missing: Samples missing between them.
-    """
+    """Encoder of one run; counts samples and those missing between them."""
 
     def __init__(self, layout: RecordingLayout) -> None:
         self._layout = layout
@@ -232,11 +206,7 @@ class MessageMaker:
 
 
 class Topics:
-    """Channels of a file: adds messages to their topics and numbers them.
-
-    Args:
-        writer: File to write to.
-    """
+    """Channels of a file: adds messages to their topics and numbers them."""
 
     def __init__(self, writer: Writer) -> None:
         self._writer = writer
@@ -244,13 +214,7 @@ class Topics:
         self._sequence: dict[str, int] = {}
 
     def know(self, topic: str, channel: int, sequence: int) -> None:
-        """Continue an existing channel.
-
-        Args:
-            topic: Its topic.
-            channel: Its id in the file.
-            sequence: Number of its next message.
-        """
+        """Continue a channel of the file, whose next message has the number ``sequence``."""
         self._channels[topic], self._sequence[topic] = channel, sequence
 
     def register(self) -> None:

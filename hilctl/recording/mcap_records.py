@@ -35,6 +35,7 @@ from mcap.records import (
     Statistics,
     SummaryOffset,
 )
+from mcap.writer import MCAP0_MAGIC as MAGIC
 
 from hilctl.base.errors import DataError
 
@@ -83,9 +84,6 @@ class ReadBudget:
 
     A file of a few kilobytes can ask for gigabytes: highly compressible streams, overlapping
     records, empty messages. What hilctl writes stays far below these limits.
-
-    Args:
-        size: Bytes of the file.
     """
 
     def __init__(self, size: int) -> None:
@@ -150,6 +148,18 @@ def records_from(stream: BinaryIO, start: int, stop: int) -> Iterator[McapRecord
         yield record
 
 
+def footer_of(stream: BinaryIO) -> tuple[int, Footer] | None:
+    """Return the offset of a file's footer, and the footer; None if it or the magic is missing."""
+    footer_at = stream.seek(0, os.SEEK_END) - FOOTER_BYTES - len(MAGIC)
+    if footer_at < 0:
+        return None
+    footer = next(records_from(stream, footer_at, footer_at + FOOTER_BYTES), None)
+    stream.seek(footer_at + FOOTER_BYTES)
+    if not isinstance(footer, Footer) or stream.read() != MAGIC:
+        return None
+    return footer_at, footer
+
+
 def split(data: bytes) -> Iterator[tuple[int, int, McapRecord]]:
     """Yield start, end and record of a chunk's content, up to the first invalid record."""
     at = 0
@@ -178,15 +188,6 @@ def inflate(compression: str, data: bytes, size: int, budget: ReadBudget) -> byt
 
     A decompressor returns whole blocks (zstd: up to 128 KiB), so the last block of a truncated
     stream is lost.
-
-    Args:
-        compression: ``zstd``, ``lz4`` or empty; any other returns nothing.
-        data: The stream, maybe truncated or damaged.
-        size: Bytes expected.
-        budget: Counts the bytes returned.
-
-    Raises:
-        DataError: The file exceeds its budget.
     """
     if not compression:
         return data
@@ -224,7 +225,6 @@ class Contents:
     """The content of a whole chunk.
 
     Attributes:
-        records: Schemas, channels and messages in order.
         indexes: Channel id to the expected bytes of its message index.
         unread: Messages that are left out of ``records``.
     """
@@ -235,13 +235,7 @@ class Contents:
 
 
 def contents(chunk: Chunk, budget: ReadBudget, unread: Collection[int] = ()) -> Contents | None:
-    """Return the content of a chunk, or None if its checksum or a record in it is wrong.
-
-    Args:
-        chunk: A chunk whose own lengths are right.
-        budget: Counts the bytes that are decompressed.
-        unread: Ids of channels whose messages are only counted.
-    """
+    """Return the content of a chunk whose lengths are right, or None if it is damaged."""
     if chunk.uncompressed_size > LARGEST_CHUNK_BYTES:
         return None
     data = inflate(chunk.compression, chunk.data, chunk.uncompressed_size, budget)

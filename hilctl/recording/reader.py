@@ -27,10 +27,6 @@ def read(path: Path, stretch: TimeRange | None = None) -> Recording:
     whatever the file contains; time and memory are in proportion to its size, or to that of the
     time range. Of a finished file, only the time range is read and checked.
 
-    Args:
-        path: The recording.
-        stretch: Time range to read; everything if None.
-
     Raises:
         DataError: The file cannot be read, is not a valid recording, or has no sample in the range.
     """
@@ -45,10 +41,6 @@ class RecordingStream:
     events and replay starts. The last one, which may have no samples, also has the end, the number
     of missing samples and the segments cut to the time range. Joined, the pieces are the result of
     :func:`read`.
-
-    Args:
-        path: The recording.
-        stretch: Time range to read; everything if None.
     """
 
     def __init__(self, path: Path, stretch: TimeRange | None = None) -> None:
@@ -97,11 +89,9 @@ def _read(
         raise DataError(f"{path}: {text}") from None
     last = builder.piece(path, last=True)
     if not scan.sound:
-        problem = "is still being recorded" if live else scan.describe()
-        _warn(path, problem, builder.samples, live=live)
+        problem, advice = "is still being recorded", ""
+        if not live:
+            problem = scan.describe()
+            advice = " ('hilctl recover' makes it a whole file again, and keeps this one)"
+        _log.warning("%s: %s; %d samples are read%s", path, problem, builder.samples, advice)
     yield last
-
-
-def _warn(path: Path, problem: str, samples: int, *, live: bool) -> None:
-    advice = "" if live else " ('hilctl recover' makes it a whole file again, and keeps this one)"
-    _log.warning("%s: %s; %d samples are read%s", path, problem, samples, advice)

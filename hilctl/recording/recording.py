@@ -52,22 +52,15 @@ class Recording:
     """One recorded run.
 
     Attributes:
-        path: File it was read from.
         run: Facts from the start of the run (identity, versions, device, units).
         end: Facts from its end (counters, reason); empty if the file is truncated.
-        sample_rate_hz: Samples per second.
-        command_unit: Unit of commands, ``A`` or ``V``.
         compensated: Whether a compensator computed the command from the reference.
-        segments: Segments of the run.
-        samples: All samples.
         dropped: Samples that were exchanged or due but are missing.
         ticks: Timing of every tick.
         events: Events in order.
-        experiment_yaml: The experiment.
         model_yaml: The compensator's model, or empty.
         starts: Possible starts of a replay.
         correction_yaml: The learned correction that was added to the reference, or empty.
-        labels: Labels of the run.
     """
 
     path: Path

@@ -34,14 +34,6 @@ def is_being_recorded(stream: BinaryIO | FileIO) -> bool:
 class Replacement:
     """A new file for the place of an old one; :meth:`close` without :meth:`put` removes it.
 
-    Args:
-        path: The old file; a link is followed.
-        output: Destination of the new file, if it does not replace the old one.
-
-    Attributes:
-        stream: The new file, open for writing.
-        final: Its destination.
-
     Raises:
         FileExistsError: ``output`` exists.
         OSError: The folder cannot be written.

@@ -36,14 +36,10 @@ class Recovered:
     """Result of a recovery.
 
     Attributes:
-        path: The recovered file.
         original: Where the original bytes are kept; None if nothing was written because nothing
             could be repaired.
         reason: Damage and losses, in one line.
-        samples: Samples in the recovered file.
         added_samples: Those of them that were not in the original.
-        missing_samples: Samples known to be missing.
-        damages: Parts of the original that could not be read.
     """
 
     path: Path
@@ -74,23 +70,7 @@ class Recovered:
 
 
 class Survey:
-    """Content and damage of a file.
-
-    Args:
-        stream: The file.
-
-    Attributes:
-        scan: Its damage.
-        run: Facts of the run; empty if lost.
-        end: Facts of its end; empty if lost or never written.
-        end_is_right: Whether their checksum is right.
-        last_time_ns: Unix time of the last message or attachment, in ns.
-        records: Number of valid metadata records and messages.
-
-    Raises:
-        OSError: The file cannot be read.
-        DataError: It exceeds its read budget.
-    """
+    """Content and damage of a file."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self._sound = MessageValidator()
@@ -127,17 +107,7 @@ class Survey:
 
 
 class Rewritten:
-    """The recovered file.
-
-    Args:
-        stream: File to write.
-        survey: Survey of the original.
-
-    Attributes:
-        samples: Samples in it.
-        added: Those of them that are not in the original.
-        missing: Samples known to be missing.
-    """
+    """The recovered file."""
 
     def __init__(self, stream: BinaryIO, survey: Survey) -> None:
         header = survey.scan.header
@@ -214,15 +184,7 @@ class Rewritten:
         self.missing += maker.missing
 
     def finish(self, end: Mapping[str, str] | None, ended_at: int) -> str:
-        """Write an event, the facts of the end, index and footer.
-
-        Args:
-            end: Facts of the end, if the original has none.
-            ended_at: Index after the last sample that was exchanged; 0 if unknown.
-
-        Returns:
-            Damage and losses, in one line.
-        """
+        """Write the end of the run and the index; return damage and losses in one line."""
         own = self._survey.end
         last = self.samples + self.missing - 1
         exchanged = _number(own, "recorded_samples") + _number(own, "missing_samples")
@@ -299,12 +261,16 @@ def recover_recording(
     try:
         with path.open("rb") as stream:
             lock(stream, shared=True)
-            survey = _survey(path, stream)
+            survey = Survey(stream)
             more = list(_not_in_file(extra, survey.next_sample))
-            events = [event for event in events if _is_one(event)]
+            events = [  # from memory: implausible ones are omitted
+                event
+                for event in events
+                if 0 <= event.sample < LAST_SAMPLE and 0 <= event.time_ns <= MAX_UNIX_NS
+            ]
             if not survey.scan.repairable and not more:
                 return _left_alone(path, survey)
-            layout = _check(path, survey, more)
+            layout = _check(survey, more)
             with closing(Replacement(path, output)) as replacement:
                 saved = Rewritten(replacement.stream, survey)
                 saved.copy(RecoveryScan(stream, MessageValidator()).records())
@@ -316,6 +282,8 @@ def recover_recording(
                 kept = replacement.put()
     except FileNotFoundError as error:
         raise DataError(f"{error.filename or path}: no such file or folder") from None
+    except DataError as error:
+        raise DataError(f"{path}: {error}") from None
     except FileExistsError:
         raise InputError(f"{output}: exists already: give another --output") from None
     except OSError as error:
@@ -332,18 +300,6 @@ def recover_recording(
     )
 
 
-def _survey(path: Path, stream: BinaryIO) -> Survey:
-    try:
-        return Survey(stream)
-    except DataError as error:
-        raise DataError(f"{path}: {error}") from None
-
-
-def _is_one(event: Event) -> bool:
-    """Return whether an event from memory is plausible."""
-    return 0 <= event.sample < LAST_SAMPLE and 0 <= event.time_ns <= MAX_UNIX_NS
-
-
 def _left_alone(path: Path, survey: Survey) -> Recovered:
     missing, damages = survey.next_sample - survey.samples, tuple(survey.scan.damages)
     text = "sound: nothing to recover"
@@ -352,16 +308,16 @@ def _left_alone(path: Path, survey: Survey) -> Recovered:
     return Recovered(path, None, text, survey.samples, 0, missing, damages)
 
 
-def _check(path: Path, survey: Survey, more: list[BlockBatch]) -> RecordingLayout | None:
+def _check(survey: Survey, more: list[BlockBatch]) -> RecordingLayout | None:
     """Reject a file with nothing to recover; return the layout of the samples to add, if any."""
     if not survey.records:
-        raise DataError(f"{path}: holds no whole record: there is nothing to recover")
+        raise DataError("holds no whole record: there is nothing to recover")
     if not more:
         return None
     try:
         return RecordingLayout.from_facts(survey.run)
     except DataError as error:
-        raise DataError(f"{path}: samples can't be added: {error}") from None
+        raise DataError(f"samples can't be added: {error}") from None
 
 
 def _not_in_file(extra: Iterable[BlockBatch], next_sample: int) -> Iterator[BlockBatch]:

@@ -48,12 +48,10 @@ class Damage:
 
     Attributes:
         start: Offset of its first byte.
-        size: Bytes.
         what: ``torn chunk``, ``damaged chunk``, ``damaged record``, ``index`` (no data of the run
             is lost), ``zeros``, ``unreadable bytes``, ``message of no channel``, ``data section
             with a wrong checksum`` (in a header or chunk time, if nothing else is damaged),
             ``metadata NAME with a wrong checksum``, or the problem of an invalid message.
-        saved: Messages saved from it.
         lasting: Whether rewriting the file does not repair it.
     """
 
@@ -80,15 +78,9 @@ class RecoveryScan:
     """Scan of a file; its attributes are final when :meth:`records` is exhausted.
 
     Args:
-        stream: Open binary file that can seek.
         sound: Validator whose invalid messages are omitted and noted as damage; None yields all.
 
     Attributes:
-        size: Bytes of the file.
-        budget: Remaining limits of work and memory.
-        is_mcap: Whether the file begins with the MCAP magic.
-        header: The file's header, if it is valid.
-        damages: Damaged parts.
         finished: Whether footer and closing magic exist and the index matches the data.
         unread: Ids of channels whose messages are omitted from now on; the channels must have been
             yielded.
@@ -138,10 +130,6 @@ class RecoveryScan:
         """Yield header, metadata, attachments, schemas, channels and messages in order.
 
         Every message comes after its channel, and every channel after its schema.
-
-        Raises:
-            OSError: The file cannot be read.
-            DataError: It exceeds its read budget.
         """
         at = len(MAGIC)
         if not self.is_mcap:
@@ -161,12 +149,7 @@ class RecoveryScan:
             at = found.end
 
     def records_at(self, places: Iterable[int]) -> Iterator[McapRecord]:
-        """Yield the records at offsets from the index of a finished file.
-
-        Raises:
-            OSError: The file cannot be read.
-            DataError: It exceeds its read budget.
-        """
+        """Yield the records at offsets from the index of a finished file."""
         for at in places:
             self._indexes = {}  # message indexes are not read
             found = self._whole(at)
@@ -219,9 +202,14 @@ class RecoveryScan:
             self.budget.message(found.inside.unread)
             return list(found.inside.records)
         if self._data_ended or isinstance(record, DataEnd):
-            if isinstance(record, DataEnd):
-                self._check_data(at, record)
-            self._take_summary(record)
+            self._data_ended = True
+            match record:
+                case DataEnd():
+                    self._check_data(at, record)
+                case Statistics():
+                    self._counted = record.message_count
+                case ChunkIndex():
+                    self._indexed.append(record.chunk_start_offset)
             return []
         if isinstance(record, Header):
             self.header = record
@@ -235,13 +223,6 @@ class RecoveryScan:
         explained = not all(damage.lasting for damage in self.damages)
         if end.data_section_crc and not explained and self._crc != end.data_section_crc:
             self._note(0, at, "data section with a wrong checksum")
-
-    def _take_summary(self, record: McapRecord) -> None:
-        self._data_ended = True
-        if isinstance(record, Statistics):
-            self._counted = record.message_count
-        elif isinstance(record, ChunkIndex):
-            self._indexed.append(record.chunk_start_offset)
 
     def _close(self, start: int, at: int, footer: Footer) -> None:
         """Check the footer from ``start`` and the bytes from ``at`` on."""

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import BinaryIO
 
 from mcap.opcode import Opcode
-from mcap.records import Footer, Metadata, MetadataIndex, SummaryOffset
+from mcap.records import Metadata, MetadataIndex, SummaryOffset
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
 from hilctl.base.errors import DataError
 from hilctl.base.files import reason
-from hilctl.recording.mcap_records import FOOTER_BYTES, records_from
+from hilctl.recording.mcap_records import footer_of, records_from
 from hilctl.recording.metadata_keys import CHECKSUM_FACT, unsealed
 from hilctl.recording.recording_files import is_being_recorded
 
@@ -27,12 +27,10 @@ class RunSummary:
     """Facts of a run from both ends of its file.
 
     Attributes:
-        run: Facts of its start.
         end: Facts of its end; empty if the file is not finished.
         state: ``finished``, ``recording`` (a run is writing to it), ``unfinished`` (truncated) or
             ``damaged`` (a checksum of the facts or the index is wrong; unverified facts are
             omitted). Damage between the ends is not detected.
-        problem: The damage, or empty.
     """
 
     run: Mapping[str, str]
@@ -53,23 +51,19 @@ def read_ends(path: Path) -> RunSummary:
         DataError: The file cannot be read, is not an MCAP file, or does not begin with a run.
     """
     try:
-        _check_is_file(path)  # first: opening a pipe waits for its writer
-        with path.open("rb", _BUFFER_BYTES) as stream:
-            return _ends(stream)
+        if stat.S_ISREG(path.stat().st_mode):  # first: opening a pipe waits for its writer
+            with path.open("rb", _BUFFER_BYTES) as stream:
+                return _ends(stream)
     except OSError as error:
         raise DataError(f"{path}: can't be read: {reason(error)}") from None
     except DataError as error:
         raise DataError(f"{path}: {error}") from None
-
-
-def _check_is_file(path: Path) -> None:
-    if not stat.S_ISREG(path.stat().st_mode):
-        raise DataError("is not a file")
+    raise DataError(f"{path}: is not a file")
 
 
 def _ends(stream: BinaryIO) -> RunSummary:
     size = stream.seek(0, os.SEEK_END)
-    metadata, end_metadata = _run_metadata(stream, size), _end_metadata(stream, size)
+    metadata, end_metadata = _run_metadata(stream, size), _end_metadata(stream)
     run, right = unsealed("hilctl.run", metadata)
     if not right:
         return RunSummary({}, {}, "damaged", "metadata hilctl.run: its checksum is wrong")
@@ -93,15 +87,11 @@ def _run_metadata(stream: BinaryIO, size: int) -> Mapping[str, str]:
     raise DataError("holds no run of hilctl (metadata hilctl.run is missing)")
 
 
-def _end_metadata(stream: BinaryIO, size: int) -> Mapping[str, str] | None:
+def _end_metadata(stream: BinaryIO) -> Mapping[str, str] | None:
     """Return the facts of the end by footer and index; None if those are missing."""
-    footer_at = size - FOOTER_BYTES - len(MAGIC)
-    stream.seek(max(0, size - len(MAGIC)))
-    if footer_at < 0 or stream.read() != MAGIC:
+    if (place := footer_of(stream)) is None:
         return None
-    footer = next(records_from(stream, footer_at, footer_at + FOOTER_BYTES), None)
-    if not isinstance(footer, Footer):
-        return None
+    footer_at, footer = place
     found: Mapping[str, str] = {}
     # The summary offsets skip the index of chunks, which may be long.
     start = footer.summary_offset_start or footer_at

@@ -82,12 +82,7 @@ _MESSAGES: dict[str, _Fields] = {
 
 @cache
 def file_descriptor(*, lists_as_bytes: bool = False) -> descriptor_pb2.FileDescriptorProto:
-    """Return the descriptor of all messages.
-
-    Args:
-        lists_as_bytes: Declare each list of ``double`` or ``uint32`` as ``bytes``. The wire format
-            is the same, because proto3 packs lists of numbers.
-    """
+    """Return the descriptor of all messages, or of their twins with ``bytes`` for packed lists."""
     file = descriptor_pb2.FileDescriptorProto(name=_FILE, package=_PACKAGE, syntax="proto3")
     for message_name, fields in _MESSAGES.items():
         message = file.message_type.add(name=message_name)
@@ -107,17 +102,7 @@ def descriptor_set() -> bytes:
 
 @cache
 def message_class(name: str, *, lists_as_bytes: bool = False) -> Any:
-    """Return the class of a message, typed Any because its fields exist only at run time.
-
-    Args:
-        name: Name of the message, without the package.
-        lists_as_bytes: Return its twin, see :func:`file_descriptor`.
-    """
+    """Return the class of a message, typed Any because its fields exist only at run time."""
     pool = descriptor_pool.DescriptorPool()
     pool.Add(file_descriptor(lists_as_bytes=lists_as_bytes))
     return message_factory.GetMessageClass(pool.FindMessageTypeByName(f"{_PACKAGE}.{name}"))
-
-
-def message(name: str) -> Any:
-    """Return an empty message."""
-    return message_class(name)()

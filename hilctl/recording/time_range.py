@@ -11,17 +11,15 @@ from mcap.records import (
     AttachmentIndex,
     Channel,
     ChunkIndex,
-    Footer,
     McapRecord,
     Metadata,
     MetadataIndex,
 )
-from mcap.writer import MCAP0_MAGIC as MAGIC
 
 from hilctl.base.errors import DataError
 from hilctl.base.samples import LAST_SAMPLE
 from hilctl.base.segments import Segment
-from hilctl.recording.mcap_records import FOOTER_BYTES, LARGEST_BYTES, records_from
+from hilctl.recording.mcap_records import FOOTER_BYTES, LARGEST_BYTES, footer_of, records_from
 from hilctl.recording.metadata_keys import unsealed
 from hilctl.recording.recording import Recording, Ticks
 from hilctl.recording.validation import RATES_HZ, number_of
@@ -134,16 +132,9 @@ def _first_at_or_after(t_s: float, rate_hz: float) -> int:
 
 
 def places_of(stream: BinaryIO, time_range: TimeRange) -> list[int] | None:
-    """Return the offsets of the records of a time range, in order, from the index of the file.
+    """Return the sorted offsets of the records of a time range; None without a valid index.
 
     These are chunks with its samples, ticks or any events, and all metadata and attachments.
-
-    Args:
-        stream: Open binary file that can seek.
-        time_range: Time range of the run.
-
-    Returns:
-        Offsets; None if the file has no valid index, or no start time.
 
     Raises:
         DataError: A time is not a finite number.
@@ -194,18 +185,13 @@ def _run_facts(stream: BinaryIO, indexes: list[AttachmentIndex | MetadataIndex])
 
 def _summary(stream: BinaryIO) -> list[McapRecord]:
     """Return the records of the index; none if it is damaged, missing or too large."""
-    footer_at = stream.seek(0, 2) - FOOTER_BYTES - len(MAGIC)
-    if footer_at < 0:
+    if (place := footer_of(stream)) is None:
         return []
-    stream.seek(footer_at)
-    tail = stream.read()
-    footer = next(records_from(stream, footer_at, footer_at + FOOTER_BYTES), None)
-    if not isinstance(footer, Footer) or not tail.endswith(MAGIC):
-        return []
+    footer_at, footer = place
     if not 0 < footer.summary_start < footer_at <= footer.summary_start + LARGEST_BYTES:
         return []
     stream.seek(footer.summary_start)
-    checked = stream.read(footer_at - footer.summary_start) + tail[: FOOTER_BYTES - _CRC_BYTES]
+    checked = stream.read(footer_at - footer.summary_start + FOOTER_BYTES - _CRC_BYTES)
     if footer.summary_crc != zlib.crc32(checked):
         return []
     return list(records_from(stream, footer.summary_start, footer_at))

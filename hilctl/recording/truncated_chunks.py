@@ -58,16 +58,7 @@ def tail_kind(stream: BinaryIO, at: int, size: int) -> str:
 
 
 def take_chunk(raw: bytes, budget: ReadBudget, *, last: bool) -> tuple[list[McapRecord], str]:
-    """Return the readable records of an invalid chunk.
-
-    Args:
-        raw: The chunk from its opcode on, up to the next readable record.
-        budget: Counts decompressed bytes.
-        last: Whether the file ends with these bytes.
-
-    Returns:
-        Records, and the kind of damage (see :class:`hilctl.recording.recovery_scan.Damage`).
-    """
+    """Return the readable records of an invalid chunk, and the kind of its damage."""
     chunk = _as_far_as_it_goes(raw)
     if chunk is None:
         return [], "torn chunk" if last else "damaged chunk"

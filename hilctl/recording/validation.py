@@ -6,7 +6,7 @@ omits the message.
 
 import json
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from functools import cache
 from typing import Annotated, Any
 
@@ -55,12 +55,7 @@ _DECODERS: dict[str, Callable[[bytes], Any]] = {
 
 
 def decode(topic: str, data: bytes) -> tuple[Any, str]:
-    """Decode a message of one of hilctl's topics; also return the problem, if any.
-
-    Returns:
-        For ``/samples`` a :class:`~hilctl.recording.codec.BlockArrays`, for ``/ticks``
-        :class:`~hilctl.recording.recording.Ticks`, otherwise a message of the protobuf library.
-    """
+    """Decode a message of one of hilctl's topics; also return the problem, if any."""
     try:
         return _DECODERS[topic](data), ""
     except (DecodeError, ValueError) as error:
@@ -68,12 +63,7 @@ def decode(topic: str, data: bytes) -> tuple[Any, str]:
 
 
 def block_problem(block: BlockArrays, next_sample: int) -> str:
-    """Check samples.
-
-    Args:
-        block: Content of a ``SampleBlock``.
-        next_sample: Index after the last sample before it.
-    """
+    """Check samples that follow the sample before ``next_sample``."""
     if not block.n:
         return "holds no sample"
     if not next_sample <= block.tick0 < LAST_SAMPLE:
@@ -320,17 +310,13 @@ def segments_of(text: str) -> tuple[Segment, ...]:
         where = ".".join(map(str, first["loc"])) or "the text"
         raise ValueError(f"segments: {where}: {first['msg']}") from None
     segments = tuple(Segment(**each.model_dump()) for each in recorded)
-    for problem in _problems(segments):
-        raise ValueError(f"segments: {problem}")
-    return segments
-
-
-def _problems(segments: Iterable[Segment]) -> Iterator[str]:
     end = 0
     for number, each in enumerate(segments):
         places = [end, each.start, each.steady_start, each.steady_stop, each.stop]
         if places != sorted(places):
-            yield f"{number}: its samples must follow those before it and rise: {places}"
+            rule = "its samples must follow those before it and rise"
+            raise ValueError(f"segments: {number}: {rule}: {places}")
         if 0.0 < each.period < SHORTEST_PERIOD:
-            yield f"{number}: a period of {each.period!r} samples can't be"
+            raise ValueError(f"segments: {number}: a period of {each.period!r} samples can't be")
         end = each.stop
+    return segments

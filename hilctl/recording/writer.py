@@ -36,16 +36,7 @@ def mcap_writer(stream: "IO[bytes] | PendingFile") -> Writer:
 
 @dataclass(frozen=True, slots=True)
 class RunFacts:
-    """Description of a run, recorded before its first sample.
-
-    Attributes:
-        facts: Identity, versions, device, units.
-        segments: Segments of the run.
-        experiment_yaml: The experiment.
-        model_yaml: The compensator's model, or empty.
-        layout: Parameters of the messages.
-        correction_yaml: The learned correction that is added to the reference, or empty.
-    """
+    """Description of a run, recorded before its first sample; missing texts are empty."""
 
     facts: Mapping[str, str]
     segments: tuple[Segment, ...]
@@ -56,12 +47,7 @@ class RunFacts:
 
 
 class RecordingWriter:
-    """Writer of one run.
-
-    Args:
-        stream: Open binary file; the writer does not close it.
-        run: Description of the run.
-    """
+    """Writer of one run; it does not close its stream."""
 
     def __init__(self, stream: "IO[bytes] | PendingFile", run: RunFacts) -> None:
         self._writer = mcap_writer(stream)
@@ -76,16 +62,14 @@ class RecordingWriter:
         facts = {**run.facts, **run.layout.to_facts(), "segments": segments}
         self._writer.add_metadata("hilctl.run", sealed("hilctl.run", facts))
         start_unix_ns = run.layout.start_unix_ns
-        self._attach("experiment.yaml", run.experiment_yaml, start_unix_ns)
-        if run.model_yaml:
-            self._attach("model.yaml", run.model_yaml, start_unix_ns)
-        if run.correction_yaml:
-            self._attach("correction.yaml", run.correction_yaml, start_unix_ns)
+        texts = {"experiment.yaml": run.experiment_yaml}
+        texts |= {"model.yaml": run.model_yaml} if run.model_yaml else {}
+        texts |= {"correction.yaml": run.correction_yaml} if run.correction_yaml else {}
+        for name, text in texts.items():
+            times = start_unix_ns, start_unix_ns
+            self._writer.add_attachment(*times, name, "application/yaml", text.encode())
         self._topics.register()
         self._writer.flush()
-
-    def _attach(self, name: str, text: str, time_ns: int) -> None:
-        self._writer.add_attachment(time_ns, time_ns, name, "application/yaml", text.encode())
 
     @property
     def samples(self) -> int:
@@ -102,13 +86,7 @@ class RecordingWriter:
         self._writer.flush()
 
     def finish(self, end: Mapping[str, str], ended_at: int) -> None:
-        """Write the facts of the end, the index and the footer.
-
-        Args:
-            end: Facts of the end.
-            ended_at: Index after the last sample that was exchanged; unrecorded samples before it
-                are missing.
-        """
+        """Write facts of the end, index and footer; samples before ``ended_at`` are missing."""
         self._late_missing = ended_at - self.samples
         counted = {"recorded_samples": str(self.samples), "missing_samples": str(self.missing)}
         self._writer.add_metadata("hilctl.end", sealed("hilctl.end", {**end, **counted}))
@@ -132,10 +110,6 @@ class PendingFile:
 
     :meth:`write` never fails, so an MCAP writer stays consistent. A failed :meth:`flush` loses
     nothing: the next one starts where the last complete one ended.
-
-    Args:
-        raw: Unbuffered file, opened for writing.
-        sync: Whether every flush syncs the disk.
 
     Attributes:
         problem: Error of the last attempt to write; empty if it succeeded.
@@ -163,9 +137,6 @@ class PendingFile:
 
     def flush(self, *, sync: bool = False) -> None:
         """Write all pending bytes.
-
-        Args:
-            sync: Whether to sync the disk.
 
         Raises:
             OSError: The disk rejects them, or the file was deleted, renamed or truncated (ESTALE);
@@ -220,11 +191,7 @@ class PendingFile:
         self._pending, self._pending_bytes = [], 0
 
     def clear(self) -> None:
-        """Empty the file.
-
-        Raises:
-            OSError: It cannot be truncated.
-        """
+        """Empty the file."""
         self._raw.truncate(0)
         self._written = self._synced = 0
         self._drop_pending()
@@ -237,15 +204,6 @@ class PendingFile:
         with suppress(OSError):
             self._raw.close()
 
-    @property
-    def closed(self) -> bool:
-        """Whether it is closed."""
-        return self._raw.closed
-
-    def fileno(self) -> int:
-        """Return the file's descriptor."""
-        return self._raw.fileno()
-
     def close(self) -> None:
         """Close the file; pending bytes are dropped."""
         self._raw.close()
@@ -255,14 +213,6 @@ class OutputFile:
     """A recording's file, claimed before the start, and released if the run never starts.
 
     An existing file keeps its content until :meth:`begin`.
-
-    Args:
-        path: Path of the recording.
-        overwrite: Whether an existing file may be replaced.
-        sync: See :class:`PendingFile`.
-
-    Attributes:
-        stream: The file.
 
     Raises:
         FileExistsError: It exists and ``overwrite`` is False.

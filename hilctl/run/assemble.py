@@ -23,16 +23,7 @@ _ROUNDING = 1e-6  # of the device's range: rounding error of a read-back
 
 
 def starting_output(device: Device, at_start: float | None) -> float:
-    """Return the output of an open device before the run; nothing moves.
-
-    Args:
-        device: Open; its read-back takes precedence.
-        at_start: ``safe.at_start`` of the experiment, for devices without read-back.
-
-    Raises:
-        InputError: Both are missing, or the output is outside the device's range.
-        DeviceError: The device did not answer.
-    """
+    """Return the output of an open device before the run, or raise InputError; nothing moves."""
     info = device.info
     output = device.output()
     if output is None:
@@ -67,15 +58,9 @@ def assemble(
 ) -> LoopPlan:
     """Return the plan of a run, with a warmed-up compensator.
 
-    Args:
-        loaded: The experiment.
-        reference: float64[n], in the waveform's unit.
-        input_um: float64[n], the compensator's input.
-        state: The compensator's state before the first sample; at rest if None.
-        conditioning: Precedes the waveform; may be None.
-        operator: Operator to adapt; may be None.
-        paced: Whether the run keeps real time; otherwise no tick is late.
-        heat_a2: Heat of the coil before it, in A^2.
+    ``reference`` is in the waveform's unit, ``input_um`` is the compensator's input, float64[n]
+    each. ``state`` is the compensator's before the first sample; None: at rest. No tick is late
+    without ``paced``. ``heat_a2`` is the heat of the coil before the run, in A^2.
     """
     config, info = loaded.config, loaded.device.info
     rate_hz = config.sample_rate_hz

@@ -20,13 +20,7 @@ _START_S = 180.0
 
 @dataclass(frozen=True, slots=True)
 class Detached:
-    """A run in the background.
-
-    Attributes:
-        run: Its folder; None if it has ended already, as it should.
-        recording: Its recording.
-        log: Text that it prints.
-    """
+    """A run in the background; ``run`` is None if it has completed already."""
 
     run: RunFolder | None
     recording: Path
@@ -36,13 +30,7 @@ class Detached:
 def start_detached(
     experiment: Path, settings: Sequence[str], output: Path | None, flags: Sequence[str]
 ) -> Detached:
-    """Start a run in the background, and return once its loop is running.
-
-    Args:
-        experiment: Experiment file.
-        settings: ``key=value`` texts that override it.
-        output: Recording to write; a new name in the folder of recordings if None.
-        flags: Further arguments of ``hilctl run``.
+    """Start ``hilctl run`` with these flags in the background; return once its loop is running.
 
     Raises:
         InputError: The experiment is not valid; nothing has moved.

@@ -53,23 +53,10 @@ class Job:
     """One run.
 
     Attributes:
-        experiment: The experiment as YAML, command-line settings included.
-        files: Texts of its files, by absolute path.
-        folder: Folder of relative file names.
-        ring: File of the ring.
-        reference: File of the reference samples.
-        input_um: File of the compensator's input.
-        state: The compensator's state before the first sample; None at rest.
         heat_a2: Heat of the coil before the run, in A^2.
         stands_um: The model's displacement before the first sample; None if no offset is measured.
         adapted: Operator to adapt, see
             :meth:`hilctl.loop.adaptation.DisplacementOperator.to_lists`; None without adaptation.
-        safe_value: The safe value, in the device's command unit.
-        ramp_per_s: Slew rate of the safe ramp.
-        limits: Longest silence of the loop.
-        supervisor: Process number of the supervisor.
-        silence_s: Longest silence of the supervisor.
-        safe_priority: SCHED_FIFO priority of the process that sets the safe value.
     """
 
     experiment: str
@@ -93,16 +80,12 @@ class Job:
     def of(
         cls, checked: "CheckedExperiment", folder: "RunFolder", *, supervisor: int, silence_s: float
     ) -> Self:
-        """Return the job of a checked experiment, and write its arrays into the run's folder.
-
-        Raises:
-            RunError: There is no memory for them.
-        """
+        """Return the job of a checked experiment, and write its arrays into the run's folder."""
         loaded, begun = checked.loaded, checked.begun
-        reference = input_um = folder.reference
+        reference = input_um = folder.path / "reference.npy"
         _save(reference, checked.reference.values)
         if begun.input_um is not checked.reference.values:
-            input_um = folder.input_um
+            input_um = folder.path / "input_um.npy"
             _save(input_um, begun.input_um)
         limits = loaded.config.command_limits()
         return cls(
@@ -125,11 +108,7 @@ class Job:
         )
 
     def write(self, path: Path) -> None:
-        """Write the job as JSON.
-
-        Raises:
-            RunError: There is no memory for it.
-        """
+        """Write the job as JSON."""
         try:
             path.write_text(json.dumps(asdict(self)), encoding="utf-8")
         except OSError as error:
@@ -146,11 +125,7 @@ class Job:
         return Document("experiment", self.experiment)
 
     def device(self) -> Device:
-        """Return the device, not opened; nothing is read from disk.
-
-        Raises:
-            InputError: The device cannot be created.
-        """
+        """Return the device, not opened; nothing is read from disk."""
         made = made_device(self.document(), Path(self.folder), TextFiles(self.files))
         if made is None:
             raise InputError("the experiment has no device")

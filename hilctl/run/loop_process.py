@@ -41,14 +41,7 @@ _TUNE_BEGINS_AT = int(PageField.TUNE_BEGINS_AT)
 
 
 class RingHost:
-    """See :class:`hilctl.loop.plan.Host`.
-
-    Args:
-        ring: Shared with the supervisor.
-        clock: Time.
-        supervisor: The supervisor's process number.
-        silence_s: Longest silence of the supervisor.
-    """
+    """See :class:`hilctl.loop.plan.Host`."""
 
     def __init__(self, ring: SampleRing, clock: Clock, supervisor: int, silence_s: float) -> None:
         ring.prepare_blocks()
@@ -128,11 +121,7 @@ def plan_of(job: Job, loaded: LoadedExperiment) -> LoopPlan:
 
 
 def run_job(job: Job, ring: SampleRing) -> LoopOutcome:
-    """Run a job, from set-up to the closed device.
-
-    Raises:
-        HilctlError: It failed; the output was set to its safe value if anything had moved.
-    """
+    """Run a job, from set-up to the closed device; an error leaves a moved output safe."""
     loaded = loaded_of(job)
     config, device, page = loaded.config, loaded.device, ring.page
     host = RingHost(ring, SystemClock(), job.supervisor, job.silence_s)
@@ -181,11 +170,7 @@ def run_job(job: Job, ring: SampleRing) -> LoopOutcome:
 
 
 def _await_go(page: SharedPage, host: RingHost) -> int:
-    """Wait for the start signal; return the time of the first tick.
-
-    Raises:
-        RunError: The supervisor has died; nothing has moved.
-    """
+    """Wait for the start signal; return the time of the first tick."""
     while not page.observe(PageField.GO):
         if not host.supervised():
             raise RunError("the supervisor died before the start; nothing has moved")

@@ -6,7 +6,7 @@ import math
 import platform
 import sys
 import uuid
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
@@ -46,7 +46,6 @@ from hilctl.signals.cycle_metrics import (
 if TYPE_CHECKING:
     from hilctl.experiment.load import LoadedExperiment
     from hilctl.experiment.preflight import CheckedExperiment
-    from hilctl.waveforms.spec import AnyWaveform
 
 _LEFT_OUT = NO_WAVEFORM | Flag.SENSOR_INVALID
 
@@ -54,14 +53,7 @@ _LEFT_OUT = NO_WAVEFORM | Flag.SENSOR_INVALID
 def run_facts(
     checked: "CheckedExperiment", started: str, model_yaml: str, correction_yaml: str = ""
 ) -> dict[str, str]:
-    """Return identity, versions, device and units as text; rates are in the layout.
-
-    Args:
-        checked: The experiment.
-        started: Time of sample 0, ISO 8601.
-        model_yaml: The compensator's model, or empty.
-        correction_yaml: The learned correction, or empty.
-    """
+    """Return identity, versions, device and units as text; rates are in the layout."""
     loaded = checked.loaded
     config, info = loaded.config, loaded.device.info
     recorded = [column.field(info.command_unit) for column in COLUMNS.values()]
@@ -98,16 +90,13 @@ def run_facts(
         "max_missed_share": repr(config.timing.max_missed_share),
         "units": json.dumps({"t_rel": "s"} | {each.name: each.unit for each in recorded}),
     }
-    facts |= {f"waveform.{key}": text for key, text in _scalars(config.waveform)}
+    facts |= {
+        f"waveform.{key}": str(value)
+        for key, value in config.waveform
+        if isinstance(value, str | int | float)
+    }
     facts |= machine_facts(config.realtime, Path(config.recording.folder))
     return facts | {f"device.{key}": value for key, value in info.details.items()}
-
-
-def _scalars(waveform: "AnyWaveform") -> Iterator[tuple[str, str]]:
-    """Yield the keys of a waveform with a single text or number, and the values as text."""
-    for key, value in waveform:
-        if isinstance(value, str | int | float):
-            yield key, str(value)
 
 
 def experiment_sha256(loaded: "LoadedExperiment") -> str:
@@ -122,13 +111,7 @@ def sha256_of(text: str) -> str:
 
 
 def end_facts(outcome: LoopOutcome, counters: Lateness, lost_events: int = 0) -> dict[str, str]:
-    """Return the outcome of a run and its counters as text.
-
-    Args:
-        outcome: The outcome.
-        counters: Counters of late ticks.
-        lost_events: Events without a free slot.
-    """
+    """Return the outcome of a run and its counters as text."""
     return {
         "code": outcome.code,
         "reason": outcome.reason,
@@ -145,24 +128,13 @@ def end_facts(outcome: LoopOutcome, counters: Lateness, lost_events: int = 0) ->
 
 
 def usage_facts(loop: ProcessUsage | None, supervisor: ProcessUsage) -> dict[str, str]:
-    """Return the resource usage of a run as text.
-
-    Args:
-        loop: Usage of the loop process since the start signal, or None.
-        supervisor: Usage of the supervisor.
-    """
+    """Return the resource usage of a run as text."""
     known = {"loop": loop, "supervisor": supervisor}
     return {USAGE_FACT: json.dumps({name: asdict(each) for name, each in known.items() if each})}
 
 
 class SettingRow(StrictModel):
-    """A key of the experiment.
-
-    Attributes:
-        key: Dotted key.
-        value: Value as text.
-        settable: Whether ``--set`` can change it.
-    """
+    """A dotted key of the experiment; ``--set`` can change it if it is settable."""
 
     key: str
     value: str
@@ -173,15 +145,9 @@ class LimitBounds(StrictModel):
     """Limits of limiter and interlocks; None: no limit.
 
     Attributes:
-        command: Lowest and highest command, in its unit.
-        slew_per_s: Slew rate of the command.
-        stroke_um: Lowest and highest displacement.
-        rms_current_a: Running rms of the coil current.
-        thermal_time_constant_s: Its time constant.
         heat_a2: Heat of the coil before the run, in A^2.
         tracking_error_um: Difference of displacement and reference.
         measured_deviation: Difference of command and measured command.
-        late_s: Lateness of a tick.
     """
 
     command: list[float]
@@ -199,21 +165,8 @@ class RunDescription(StrictModel):
     """Description of a run for watchers.
 
     Attributes:
-        name: Name of the experiment.
-        text: The experiment's description.
-        device: Description of the device.
-        simulated: Whether the device is simulated.
-        sample_rate_hz: Samples per second.
-        block: Samples per tick.
-        command_unit: ``A`` or ``V``.
-        measures_command: Whether the device measures its command.
-        waveform_unit: Unit of the reference.
-        compensator: Kind of the model; empty without one.
-        samples: Samples of the waveform.
         segments: Segments as :meth:`hilctl.base.segments.Segment.to_mapping`, relative to the
             waveform's first sample.
-        limits: Limits of the run.
-        settings: All keys of the experiment.
     """
 
     name: str
@@ -258,11 +211,7 @@ class RunDescription(StrictModel):
         return [Segment.from_mapping(each).shifted(waveform_at) for each in self.segments]
 
     def write(self, path: Path) -> None:
-        """Write the description as JSON.
-
-        Raises:
-            RunError: There is no memory for it.
-        """
+        """Write the description as JSON."""
         try:
             path.write_text(self.model_dump_json(), encoding="utf-8")
         except OSError as error:
@@ -270,12 +219,7 @@ class RunDescription(StrictModel):
 
     @classmethod
     def read(cls, path: Path) -> Self:
-        """Return the description that :meth:`write` wrote.
-
-        Raises:
-            OSError: The file cannot be read.
-            ValueError: It is damaged, or of another version.
-        """
+        """Return the description that :meth:`write` wrote."""
         return cls.model_validate_json(path.read_bytes())
 
 
@@ -300,22 +244,15 @@ def setting_rows(value: Any, key: str = "") -> list[SettingRow]:
     if isinstance(value, dict):
         inner = (setting_rows(each, f"{key}.{name}".strip(".")) for name, each in value.items())
         return [row for rows in inner for row in rows]
-    parts = any(isinstance(each, dict | tuple) for each in value) if _is_sequence(value) else False
-    text = f"{len(value)} entries" if parts else str(list(value) if _is_sequence(value) else value)
+    if not isinstance(value, tuple | list):
+        return [SettingRow(key=key, value=str(value), settable=True)]
+    parts = any(isinstance(each, dict | tuple) for each in value)
+    text = f"{len(value)} entries" if parts else str(list(value))
     return [SettingRow(key=key, value=text, settable=not parts)]
 
 
-def _is_sequence(value: Any) -> bool:
-    return isinstance(value, tuple | list)
-
-
 class EndFigures:
-    """Collect the metrics of a run.
-
-    Args:
-        segments: Its segments in order.
-        compensated: Whether the run has a compensator.
-    """
+    """Collect the metrics of a run."""
 
     def __init__(self, segments: Sequence[Segment], *, compensated: bool) -> None:
         self._segments = list(segments)

@@ -43,10 +43,6 @@ def has_threads() -> bool:
 def run_in_own_process(given: Given, on_progress: Callable[[Progress], None]) -> RunResult:
     """Run an experiment in a separate process; return the result. The run stops with this process.
 
-    Args:
-        given: See :data:`Given`.
-        on_progress: Called with each batch of samples.
-
     Raises:
         HilctlError: Error of the run.
         RunError: Its process ended without a result.

@@ -20,15 +20,8 @@ class Probed:
     """Values read from a device.
 
     Attributes:
-        name: Its registry name.
-        description: Its description.
-        max_rate_hz: Highest sample rate.
-        rate_note: Reason for that rate.
-        safe_note: Delay of the safe value; may be empty.
-        details: Properties of the device.
         displacement_um: Reading of the sensor; None if it is not available without a run.
         output: Output in ``command_unit``; None if unknown.
-        command_unit: Unit of the output.
         faults: Implausible values, each with a possible cause.
     """
 
@@ -87,13 +80,7 @@ def _read(loaded: LoadedExperiment, device: Device) -> tuple[float | None, float
 
 
 def judge(info: DeviceInfo, displacement_um: float | None, output: float | None) -> tuple[str, ...]:
-    """Return descriptions of implausible values.
-
-    Args:
-        info: Properties of the device.
-        displacement_um: Reading of the sensor, um.
-        output: Output in the command's unit.
-    """
+    """Return descriptions of implausible values."""
     found = []
     if displacement_um is not None:
         span = (info.sensor_min_um, info.sensor_max_um)

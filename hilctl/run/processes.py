@@ -28,17 +28,7 @@ _POLL_S = 0.01
 def start_process(
     module: str, *words: str, inherits: Sequence[int], stderr: Any = None
 ) -> "subprocess.Popen[bytes]":
-    """Start a module as a process of the run.
-
-    Args:
-        module: Its dotted name.
-        words: Its arguments.
-        inherits: Descriptors that it keeps open, such as those of locks.
-        stderr: File of its standard error; the supervisor's if None.
-
-    Raises:
-        OSError: It cannot be started.
-    """
+    """Start a module as a process of the run, which keeps the inherited descriptors open."""
     return subprocess.Popen(
         [sys.executable, "-P", "-m", module, *words],  # -P: import nothing from the working folder
         stdin=subprocess.DEVNULL,
@@ -50,11 +40,7 @@ def start_process(
 
 
 class ChildProcess:
-    """A started process of a run.
-
-    Args:
-        process: The process.
-    """
+    """A started process of a run."""
 
     def __init__(self, process: "subprocess.Popen[bytes]") -> None:
         self._process = process
@@ -70,27 +56,14 @@ class ChildProcess:
         return self._process.poll() is not None
 
     def kill(self, wait_s: float = _DEATH_S) -> None:
-        """Kill it; do not wait for a process that is blocked in the kernel.
-
-        Args:
-            wait_s: Longest wait for its end.
-        """
+        """Kill it; do not wait for a process that is blocked in the kernel."""
         self._process.kill()
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(wait_s)
 
 
 class LoopProcess(ChildProcess):
-    """The loop process of one run; see :mod:`hilctl.run.loop_process`.
-
-    Args:
-        folder: The run's folder, with its job.
-        page: Shared with it.
-        inherits: Descriptors of the locks that it holds.
-
-    Raises:
-        RunError: It cannot be started.
-    """
+    """The loop process of one run; see :mod:`hilctl.run.loop_process`."""
 
     def __init__(self, folder: RunFolder, page: SharedPage, inherits: Sequence[int]) -> None:
         self._page = page
@@ -102,9 +75,6 @@ class LoopProcess(ChildProcess):
 
     def await_ready(self, stopped: Callable[[], bool]) -> None:
         """Wait until it is ready for the start signal.
-
-        Args:
-            stopped: Whether a stop has been requested.
 
         Raises:
             InputError: It refuses the job; nothing has moved.
@@ -142,13 +112,7 @@ class GuardianProcess(ChildProcess):
     """The guardian of one run; see :mod:`hilctl.run.safety.guardian`.
 
     Args:
-        folder: The run's folder, with its job and ring.
-        page: Shared with it.
-        inherits: Descriptors of the locks that it holds.
         loop: Process number of the loop to watch; None to act immediately.
-
-    Raises:
-        OSError: It cannot be started.
     """
 
     def __init__(
@@ -195,11 +159,7 @@ class GuardianProcess(ChildProcess):
         return "it died"
 
     def await_acting(self, stopped: Callable[[], bool] = lambda: False) -> bool:
-        """Wait until it drives the device; return False if it does not within 10 s.
-
-        Args:
-            stopped: Whether the user ends the wait.
-        """
+        """Wait until it drives the device; return False if it does not within 10 s."""
         deadline_s = time.monotonic() + _ACT_S
         while not self.ended and time.monotonic() < deadline_s and not stopped():
             if self.phase in {GuardianPhase.ACTING, GuardianPhase.DONE}:
@@ -216,14 +176,7 @@ class GuardianProcess(ChildProcess):
 
 
 class GuardianRelief:
-    """Stop guardians of earlier runs that still drive a device.
-
-    Args:
-        holds: Resources of the device, as :attr:`hilctl.base.device.DeviceInfo.holds`.
-
-    Attributes:
-        runs: The runs whose guardians were stopped.
-    """
+    """Stop guardians of earlier runs that still drive a device."""
 
     def __init__(self, holds: Sequence[str]) -> None:
         self.runs = [
@@ -238,9 +191,6 @@ class GuardianRelief:
         """Start them again, and wait until they act: their outputs are not safe yet.
 
         Commands that follow can then find, stop or relieve them.
-
-        Args:
-            inherits: Descriptors of the devices' locks.
         """
         for run in self.runs:
             try:
@@ -262,13 +212,7 @@ class GuardianRelief:
 
 
 def signal_guardian(run: RunFolder, number: int, wait_s: float = 0.0) -> bool:
-    """Send a signal to the guardian of a run; return whether there was one.
-
-    Args:
-        run: The run.
-        number: The signal.
-        wait_s: Longest wait for its end.
-    """
+    """Send a signal to the guardian of a run; return whether there was one."""
     try:
         guardian = os.pidfd_open(
             SampleRing(run.ring, look_only=True).page.get(PageField.GUARDIAN_PID)

@@ -49,14 +49,6 @@ class Recorder:
     """Record one run into one file.
 
     A failed write stays in memory and is repeated by the next flush.
-
-    Args:
-        checked: The experiment.
-        path: File to record to.
-        overwrite: Whether an existing file may be replaced.
-
-    Raises:
-        InputError: The file exists or cannot be written.
     """
 
     def __init__(self, checked: CheckedExperiment, path: Path, *, overwrite: bool) -> None:
@@ -64,45 +56,32 @@ class Recorder:
         self.adapted: Mapping[str, float] = {}
         """Values of the last event of adaptation."""
         self._failed = self._problem = ""
-        self._next_sample = 0
-        self._flushed = 0
+        self.next_sample = self._flushed = 0
         self._checked = checked
-        self._writer: RecordingWriter | None = None
         self._unix_ns = steady_unix_ns()
         self._tail = RecentSamples(_SAMPLES_BEFORE)
         config = checked.loaded.config
         self._heat = CoilHeat(config.limits, config.sample_rate_hz, checked.heat_a2)
-        self._run: RunFacts | None = None
-        self._figures: EndFigures | None = None
+        # Set by `begin`.
+        self._run: RunFacts
+        self._writer: RecordingWriter
+        self._figures: EndFigures
         try:
             self._file = OutputFile(path, overwrite=overwrite, sync=config.recording.sync)
         except FileExistsError:
             raise already_there(path, "give another --output, or --overwrite") from None
         except OSError as error:
-            raise self._unwritable(error) from None
-
-    def _unwritable(self, error: OSError) -> InputError:
-        return InputError(f"{self.path}: can't be written: {reason(error)}")
+            raise InputError(self._cannot(reason(error))) from None
 
     def begin(self, start_unix_ns: int, set_up: Mapping[str, str], waveform_at: int = 0) -> None:
-        """Write the metadata that precedes the first sample.
-
-        Args:
-            start_unix_ns: Unix time of the first sample.
-            set_up: Real-time set-up of the loop process, see
-                :func:`hilctl.machine.rt_setup.step_facts`.
-            waveform_at: Index of the first sample of the waveform, after the lead-in.
-
-        Raises:
-            InputError: The file cannot be written.
-        """
+        """Write the metadata that precedes the first sample."""
         self._unix_ns = steady_unix_ns()
         try:
             # Before the file is opened for writing, which truncates an existing one.
             self._run = self._facts(start_unix_ns, set_up, waveform_at)
             self._writer = RecordingWriter(self._file.begin(), self._run)
         except OSError as error:
-            raise self._unwritable(error) from None
+            raise InputError(self._cannot(reason(error))) from None
         compensated = self._checked.loaded.model is not None
         self._figures = EndFigures(self._run.segments, compensated=compensated)
         # Before anything moves: the file may have been deleted.
@@ -114,12 +93,7 @@ class Recorder:
         self._file.give_back()
 
     def note_device(self, coil: CoilState | None = None) -> None:
-        """Write the device state: this run is the device's last one.
-
-        Args:
-            coil: Final state of the coil; None during the run.
-        """
-        assert self._run is not None
+        """Write the device state, with the coil at the end: this run is the device's last one."""
         facts, info = self._run.facts, self._checked.loaded.device.info
         path = self.path
         with suppress(OSError):  # the working folder was removed
@@ -136,22 +110,22 @@ class Recorder:
 
     def batch(self, batch: BlockBatch) -> None:
         """Write a batch."""
-        self._next_sample = int(batch.heads[-1, BlockHeader.FIRST_SAMPLE]) + batch.flags.shape[1]
+        self.next_sample = int(batch.heads[-1, BlockHeader.FIRST_SAMPLE]) + batch.flags.shape[1]
         self._tail.add(batch)
         self._heat.follow(batch.samples())
-        if self._begun.samples == 0:
+        if self._writer.samples == 0:
             # The file counts samples that are missing before its first one.
             batch.heads[0, BlockHeader.DROPPED_BEFORE] = batch.heads[0, BlockHeader.FIRST_SAMPLE]
-        self._write(partial(self._begun.batch, batch))
-        self._gathered.add(batch.samples())
+        self._write(partial(self._writer.batch, batch))
+        self._figures.add(batch.samples())
 
     def event(self, event: Event) -> None:
         """Write an event with the samples before it."""
         if event.code == ADAPTED:
             self.adapted = event.values
-        self._gathered.event(event)
+        self._figures.event(event)
         led_there = replace(event, before=self._tail.up_to(event.sample))
-        self._write(partial(self._begun.event, led_there))
+        self._write(partial(self._writer.event, led_there))
 
     @property
     def error(self) -> str:
@@ -167,25 +141,21 @@ class Recorder:
         return f"{self.path}: can't be written: {why}"
 
     def flush(self) -> bool:
-        """Pass all pending data to the kernel.
-
-        Returns:
-            Whether the file contains all of it; otherwise the next flush repeats it.
-        """
+        """Pass all pending data to the kernel; return whether the file contains all of it."""
         if self._failed:
             return False
         try:
-            self._begun.flush()
+            self._writer.flush()
             # If a later write fails, only these are certain.
-            self._flushed = self._begun.samples
+            self._flushed = self._writer.samples
         except OSError as error:
             self._note_problem(error)
             return False
         if self._problem:
             text = f"write repeated, nothing is lost: {self._problem}"
-            sample = max(0, self._next_sample - 1)
+            sample = max(0, self.next_sample - 1)
             event = Event(sample, "warning", "recording_retried", text, time_ns=self._unix_ns())
-            self._write(partial(self._begun.event, event))
+            self._write(partial(self._writer.event, event))
             self._problem = ""
         return True
 
@@ -197,43 +167,31 @@ class Recorder:
     def finish(
         self, end: Mapping[str, str], ended_at: int, patience_s: float = _PATIENCE_S
     ) -> bool:
-        """Write the end of the run, sync the file, and close it.
-
-        Args:
-            end: Metadata of the end, with ``code`` and ``reason``.
-            ended_at: Index after the last sample.
-            patience_s: How long to retry.
-
-        Returns:
-            Whether the recording is complete and on the disk; otherwise the file is as of the last
-            flush.
-        """
-        self._next_sample = max(self._next_sample, ended_at)
+        """Write the end of the run, sync and close the file; return whether it is on the disk."""
+        self.next_sample = max(self.next_sample, ended_at)
         self.flush()
         level = "info" if end["code"] == "completed" else "error"
         now_ns = self._unix_ns()
-        facts = {**end, **self._gathered.facts(), "ended": iso_time(now_ns)}
+        facts = {**end, **self._figures.facts(), "ended": iso_time(now_ns)}
         facts[HEAT_FACT] = repr(self._heat.heat_a2)
         event = Event(max(0, ended_at - 1), level, "run_ended", end["reason"], time_ns=now_ns)
-        self._write(partial(self._begun.event, event))
-        self._write(partial(self._begun.finish, facts, ended_at))
+        self._write(partial(self._writer.event, event))
+        self._write(partial(self._writer.finish, facts, ended_at))
         until_s = time.monotonic() + patience_s
         while not (closed := self._closed()) and not self._failed and time.monotonic() < until_s:
             time.sleep(_RETRY_S)
         if closed:
-            self._note_coil(end, now_ns)
+            limits = self._checked.loaded.config.limits
+            coil = CoilState(
+                ended=datetime.fromtimestamp(now_ns * 1e-9, tz=UTC),
+                output_safe=end.get("output_safe") == "true",
+                heat_a2=self._heat.heat_a2,
+                thermal_time_constant_s=limits.thermal_time_constant_s,
+            )
+            self.note_device(coil)
         else:
             self._file.stream.abandon()
         return closed
-
-    def _note_coil(self, end: Mapping[str, str], now_ns: int) -> None:
-        coil = CoilState(
-            ended=datetime.fromtimestamp(now_ns * 1e-9, tz=UTC),
-            output_safe=end.get("output_safe") == "true",
-            heat_a2=self._heat.heat_a2,
-            thermal_time_constant_s=self._checked.loaded.config.limits.thermal_time_constant_s,
-        )
-        self.note_device(coil)
 
     def _closed(self) -> bool:
         """Close the finished file; return whether it is complete."""
@@ -253,27 +211,12 @@ class Recorder:
     @property
     def samples(self) -> int:
         """Samples written; after an error, samples flushed before it."""
-        return self._flushed if self.error else self._begun.samples
-
-    @property
-    def next_sample(self) -> int:
-        """Index after the last sample written or lost."""
-        return self._next_sample
+        return self._flushed if self.error else self._writer.samples
 
     @property
     def missing(self) -> int:
         """Missing samples: counted in the recording, or not written yet."""
-        return self._next_sample - self._flushed if self.error else self._begun.missing
-
-    @property
-    def _begun(self) -> RecordingWriter:
-        assert self._writer is not None
-        return self._writer
-
-    @property
-    def _gathered(self) -> EndFigures:
-        assert self._figures is not None
-        return self._figures
+        return self.next_sample - self._flushed if self.error else self._writer.missing
 
     def _write(self, write: Callable[[], None]) -> None:
         if not self._failed:
@@ -305,11 +248,7 @@ class Recorder:
 
 
 class RecentSamples:
-    """The last samples of a run.
-
-    Args:
-        samples: Number of samples to record with an event.
-    """
+    """The last samples of a run."""
 
     def __init__(self, samples: int) -> None:
         self._samples = samples
@@ -344,13 +283,7 @@ def iso_time(unix_ns: int) -> str:
 
 
 class RingRecorder:
-    """Thread that consumes the ring until the end of the recording; its only consumer.
-
-    Args:
-        ring: Shared with the loop.
-        recorder: Begun; no other thread writes to it.
-        flush_s: Longest time from a sample to the file.
-    """
+    """Thread that consumes the ring until the end of the recording; its only consumer."""
 
     def __init__(self, ring: SampleRing, recorder: Recorder, flush_s: float) -> None:
         self.recorder = recorder
@@ -377,12 +310,7 @@ class RingRecorder:
         self._events.append(event)
 
     def end(self, outcome: LoopOutcome, *, lost_loop: bool) -> None:
-        """Let the thread drain the ring and close the recording.
-
-        Args:
-            outcome: Outcome of the run.
-            lost_loop: Whether the loop left no outcome, so that sent blocks may be unanswered.
-        """
+        """Let the thread drain the ring and close the recording."""
         self._outcome, self._lost_loop = outcome, lost_loop
         self._ending.set()
 

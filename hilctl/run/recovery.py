@@ -24,10 +24,7 @@ class RecoveredRun:
     """A dead run that another command has finished.
 
     Attributes:
-        name: The run's name.
-        recording: Its recording.
         safe: Whether loop or guardian confirmed the safe value.
-        text: Description of the result.
         kept: Folder of samples that were not recovered; None if all were.
         started: Whether the loop had started; otherwise nothing has moved.
     """

@@ -14,14 +14,9 @@ class RunResult:
     """Result of a run.
 
     Attributes:
-        path: The recording.
         code: ``completed``, ``stopped`` or ``fault``.
-        reason: One line of text.
-        output_state: State of the output.
         stop_signal: Signal that stopped the run, SIGTERM for a requested stop, or 0.
-        samples: Recorded samples.
         missing: Samples that were dropped, skipped or lost.
-        late_ticks: Late ticks.
         deadline_misses: Text of skipped ticks; empty without any.
         adapted: Final values of the adaptation by name, see
             :data:`hilctl.base.events.ADAPTED`; empty without one.
@@ -63,15 +58,7 @@ class RunResult:
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """Progress of a run.
-
-    Attributes:
-        samples: Recorded samples.
-        total: Samples of the waveform.
-        late_ticks: Late ticks so far.
-        compensated: Whether the run has a compensator, so that the reference is a displacement.
-        batch: The newest samples.
-    """
+    """Progress of a run."""
 
     samples: int
     total: int

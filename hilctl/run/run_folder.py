@@ -50,9 +50,6 @@ class RunCard:
 
     Attributes:
         name: Name of its folder, unique among the runs of a user.
-        experiment: Name of the experiment.
-        recording: Absolute path of the recording.
-        supervisor: Process number of the supervisor.
         started: Unix time in s.
         holds: Resources of its device, as :attr:`hilctl.base.device.DeviceInfo.holds`.
     """
@@ -66,11 +63,7 @@ class RunCard:
 
     @classmethod
     def from_json(cls, text: str) -> Self:
-        """Return a card.
-
-        Raises:
-            ValueError: The text is not a card.
-        """
+        """Return a card; a text that is not a card raises ValueError."""
         values = json.loads(text)
         if not isinstance(values, dict):
             raise ValueError("must be an object")  # noqa: TRY004, see Raises
@@ -90,12 +83,7 @@ class RunCard:
 
 @dataclass(frozen=True, slots=True)
 class RunFolder:
-    """The folder of a run.
-
-    Attributes:
-        path: The folder.
-        card: Its card.
-    """
+    """The folder of a run."""
 
     path: Path
     card: RunCard
@@ -104,16 +92,6 @@ class RunFolder:
     def ring(self) -> Path:
         """File of the ring."""
         return self._file("ring")
-
-    @property
-    def reference(self) -> Path:
-        """File of the reference samples."""
-        return self.path / "reference.npy"
-
-    @property
-    def input_um(self) -> Path:
-        """File of the compensator's input if it differs from the reference."""
-        return self.path / "input_um.npy"
 
     @property
     def description(self) -> Path:
@@ -242,14 +220,7 @@ def _warn_once(name: str, text: str) -> None:
 
 
 def _removed_files(process: str = "[0-9]*") -> dict[Path, Path]:
-    """Return removed files of this user that processes still have open.
-
-    Args:
-        process: Pattern of the processes in ``/proc``.
-
-    Returns:
-        The former path of each file, and its path in ``/proc``.
-    """
+    """Return removed files of this user that processes have open, and their paths in ``/proc``."""
     found: dict[Path, Path] = {}
     if not hasattr(os, "geteuid"):  # Windows has no runs
         return found
@@ -290,10 +261,7 @@ def keep_removed() -> None:
 def run_folder(
     experiment: str, recording: Path, started: float, holds: Sequence[str] = ()
 ) -> Iterator[tuple[RunFolder, list[int]]]:
-    """Create a run's folder and hold its locks; remove it at the end unless it is kept.
-
-    Yields:
-        The folder, and descriptors of the locks for loop and guardian.
+    """Provide a run's folder and descriptors of its locks; remove it at the end unless it is kept.
 
     Raises:
         RunError: The folder cannot be created.
@@ -337,15 +305,9 @@ def _new_folder(path: Path) -> Path:
 
 @contextmanager
 def held_devices(holds: Sequence[str]) -> Iterator[list[int]]:
-    """Lock a device's resources against other runs of this user and of root.
+    """Lock a device's resources against other runs of this user and of root; yield the locks.
 
     A run of another user causes only a warning, because its lock could be forged.
-
-    Args:
-        holds: Names, as :attr:`hilctl.base.device.DeviceInfo.holds`.
-
-    Yields:
-        Descriptors of the locks for loop and guardian.
 
     Raises:
         InputError: Another run holds one of them.
@@ -447,11 +409,7 @@ def locked_run(run: RunFolder) -> Iterator[int]:
 
 @contextmanager
 def taken_over(run: RunFolder) -> Iterator[bool]:
-    """Try to lock a dead run.
-
-    Yields:
-        Whether it is locked: not if a process is alive, or another command was first.
-    """
+    """Try to lock a dead run; yield whether it is locked, and not alive or recovered by another."""
     try:
         descriptor = os.open(run.path / _CARD, os.O_RDWR)
     except FileNotFoundError:
@@ -503,11 +461,7 @@ def facts_of(run: RunFolder) -> dict[str, Any]:
 
 
 def require_linux() -> None:
-    """Refuse systems other than Linux.
-
-    Raises:
-        InputError: This is another system.
-    """
+    """Refuse systems other than Linux with an InputError."""
     system = sys.platform
     if system != "linux":
         raise InputError(f"a run needs Linux, this is {system}: {WORKS_ANYWHERE}")

@@ -32,10 +32,8 @@ def checked_experiment(
 ) -> CheckedExperiment:
     """Load an experiment and check it against device, model and limits.
 
-    Args:
-        path: Experiment file.
-        settings: ``key=value`` texts that override it.
-        heat_a2: Minimum heat of the coil, in A^2.
+    ``settings`` are ``key=value`` texts that override the file; ``heat_a2`` is the minimum heat of
+    the coil, in A^2.
 
     Raises:
         InputError: The experiment is not valid; all problems are listed.
@@ -74,14 +72,6 @@ def start_run(
 
     In a program with threads, such as a notebook, it runs in a separate process.
 
-    Args:
-        path: Experiment file.
-        settings: ``key=value`` texts that override it.
-        output: Recording to write; a new name in the folder of recordings if None.
-        overwrite: Whether an existing recording may be replaced.
-        on_progress: Called with each batch of samples.
-        heat_a2: Minimum heat of the coil, in A^2.
-
     Raises:
         InputError: Nothing has moved, and no file is left.
         RunError: The run failed to start; nothing has moved, and no file is left.
@@ -110,15 +100,11 @@ def default_output(name: str, folder: Path, now: time.struct_time) -> Path:
     return candidate
 
 
-def _unseen(part: float) -> None:
-    del part
-
-
 def paced(
     path: Path,
     settings: Sequence[str],
     output: Path,
-    on_part: OnPart = _unseen,
+    on_part: OnPart = lambda _: None,
     *,
     overwrite: bool = True,
     heat_a2: float = 0.0,
@@ -135,7 +121,7 @@ def unpaced(
     path: Path,
     settings: Sequence[str],
     output: Path,
-    on_part: OnPart = _unseen,
+    on_part: OnPart = lambda _: None,
     *,
     overwrite: bool = True,
     heat_a2: float = 0.0,
@@ -147,11 +133,7 @@ def unpaced(
 
 
 class StepStoppedError(RunError):
-    """A run of a study was stopped by a signal; earlier recordings are kept.
-
-    Attributes:
-        signal: Number of the signal.
-    """
+    """A run of a study was stopped by a signal; earlier recordings are kept."""
 
     def __init__(self, text: str, number: int) -> None:
         super().__init__(text)
@@ -160,13 +142,7 @@ class StepStoppedError(RunError):
 
 @dataclass(frozen=True, slots=True)
 class RunKey:
-    """Identity of a run: two runs with one key have the same experiment, model and correction.
-
-    Attributes:
-        experiment: SHA-256 of the experiment.
-        model: SHA-256 of the compensator's model; empty without one.
-        correction: SHA-256 of the learned correction; empty without one.
-    """
+    """SHA-256 of a run's experiment, model and correction; the latter are empty without one."""
 
     experiment: str
     model: str = ""

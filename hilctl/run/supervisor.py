@@ -54,12 +54,7 @@ STOPS = {
 
 
 class SystemdNotifier:
-    """Notify systemd of readiness, watchdog and stop with sd_notify(3).
-
-    Args:
-        environment: Contains ``NOTIFY_SOCKET`` and ``WATCHDOG_USEC``.
-        clock: Monotonic time in s.
-    """
+    """Notify systemd of readiness, watchdog and stop with sd_notify(3)."""
 
     def __init__(
         self,
@@ -91,13 +86,7 @@ class SystemdNotifier:
 
 
 class ProgressThread:
-    """Report progress in a thread, so that a blocked terminal does not delay the run.
-
-    Args:
-        current: Returns the progress; None before the first sample.
-        on_progress: Called with it; may block.
-        on_error: Called with an error of ``on_progress``, which is not called again.
-    """
+    """Report progress in a thread, so that a blocked terminal does not delay the run."""
 
     def __init__(
         self,
@@ -136,13 +125,6 @@ class RunMonitor:
 
     It covers the time from the start signal to the closed recording, performs no file access, and
     never waits for a thread that does.
-
-    Args:
-        checked: The experiment.
-        ring: Its ring.
-        child: Its loop.
-        safety: Monitors guardian and loop.
-        recording: Records from the ring.
     """
 
     def __init__(
@@ -162,11 +144,7 @@ class RunMonitor:
         """Error of the supervisor itself; may be empty."""
 
     def poll(self, stop_signal: int) -> bool:
-        """Write the heartbeat, pass stops on, update safety; return whether the run is active.
-
-        Args:
-            stop_signal: Number of the signal that stops the run, or 0.
-        """
+        """Write the heartbeat, pass stops on, update safety; return whether the run is active."""
         # First: after its end a loop writes nothing more to the page.
         ended = self._child.ended
         now_ns = time.monotonic_ns()
@@ -239,14 +217,7 @@ def _refuse_suspend(number: int, frame: FrameType | None) -> None:
 
 
 class Supervisor:
-    """Run one checked experiment into one recording.
-
-    Args:
-        checked: The experiment.
-        output: File to record to.
-        overwrite: Whether an existing file may be replaced.
-        on_progress: Called in a thread, several times per second.
-    """
+    """Run one checked experiment into one recording."""
 
     def __init__(
         self,
@@ -324,11 +295,7 @@ class Supervisor:
         recording: RingRecorder,
         locks: list[int],
     ) -> tuple[SafetyMonitor, int]:
-        """Wait until loop and guardian are ready, and begin the recording.
-
-        Returns:
-            Monitor of the safe output, and the monotonic time of sample 0 in ns.
-        """
+        """Wait until loop and guardian are ready, and begin the recording."""
         page, checked = ring.page, self._checked
         safety = None
         try:
@@ -367,9 +334,11 @@ class Supervisor:
         written again with a later time; otherwise the first tick would be late.
         """
         set_up, refused = json.loads(page.read_text(PageSlot.SET_UP))
-        self._warn(refused)
+        info = self._checked.loaded.device.info
+        for line in [] if info.simulated else refused:
+            _log.warning("real time refused, ticks may be late: %s", line)
         # The watchdog is armed between the start signal and sample 0.
-        least_ns = _START_DELAY_NS + round(self._checked.loaded.device.info.arm_s * 1e9)
+        least_ns = _START_DELAY_NS + round(info.arm_s * 1e9)
         delay_ns = least_ns
         for _ in range(_START_TRIES):
             began_ns = time.monotonic_ns()
@@ -412,18 +381,6 @@ class Supervisor:
                 started.break_off(error)
             time.sleep(_POLL_S)
 
-    def _warn(self, refused: list[str]) -> None:
-        """Warn of refused real-time steps if the device is real."""
-        if not self._checked.loaded.device.info.simulated:
-            for line in refused:
-                _log.warning("real time refused, ticks may be late: %s", line)
-
-    @property
-    def _silence_s(self) -> float:
-        """Longest silence of the supervisor: until half of the ring is full."""
-        recording = self._config.recording
-        return recording.ring_s / 2.0 if recording.on_failure == "stop" else float("inf")
-
     @contextmanager
     def _signals(self) -> Iterator[None]:
         def note(number: int, frame: FrameType | None) -> None:
@@ -445,7 +402,10 @@ class Supervisor:
 
     def _write_job(self, folder: RunFolder) -> None:
         """Write the job for loop and guardian, and the description for watchers."""
-        job = Job.of(self._checked, folder, supervisor=os.getpid(), silence_s=self._silence_s)
+        recording = self._config.recording
+        # The supervisor may be silent until half of the ring is full.
+        silence_s = recording.ring_s / 2.0 if recording.on_failure == "stop" else float("inf")
+        job = Job.of(self._checked, folder, supervisor=os.getpid(), silence_s=silence_s)
         job.write(folder.job)
         RunDescription.of(self._checked).write(folder.description)
 

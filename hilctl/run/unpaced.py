@@ -46,11 +46,8 @@ class VirtualClock:
 class OfflineHost:
     """A host that collects blocks in the memory of this process; see :class:`~.plan.Host`.
 
-    Args:
-        plan: The plan.
-        on_batch: Called with batches of blocks, which are valid until it returns.
-        on_event: Called with events.
-        stop: Returns the reason to stop, or an empty text.
+    ``on_batch`` gets batches that are valid until it returns. ``stop`` returns the reason to stop,
+    or an empty text.
     """
 
     def __init__(
@@ -120,11 +117,6 @@ class OfflineHost:
 def run_unpaced(checked: CheckedExperiment, output: Path, *, overwrite: bool = False) -> RunResult:
     """Run a checked experiment on its simulated device.
 
-    Args:
-        checked: The experiment.
-        output: Recording to write.
-        overwrite: Whether an existing file may be replaced.
-
     Raises:
         InputError: The device is not simulated, or the recording cannot be written.
     """
@@ -178,10 +170,6 @@ def _run(checked: CheckedExperiment, recorder: Recorder) -> tuple[LoopOutcome, L
 
 def run_in_memory(plan: LoopPlan, device: Device) -> tuple[LoopOutcome, Samples]:
     """Run a plan on a simulated device; return the outcome and the samples.
-
-    Args:
-        plan: The plan, not paced.
-        device: Not open.
 
     Raises:
         DeviceError: The device cannot be opened, or does not support the rate or block.

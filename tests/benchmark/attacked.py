@@ -65,10 +65,7 @@ class AttackedWire:
     """One way to the rig.
 
     Attributes:
-        rate_hz: Sample rate.
-        profile: Text of the device's profile.
         device: The experiment's device section without profile, address and what all have.
-        start_a: Where the output is before a run.
     """
 
     rate_hz: float
@@ -108,15 +105,7 @@ def make_real_time(pid: int) -> None:
 
 
 class AttackedRun:
-    """A ``hilctl run`` on a device that is emulated for it alone.
-
-    Args:
-        folder: A new folder for all of its files.
-        wire: How it reaches the device.
-        timeout_s: How long it waits for an answer.
-        faults: What the device does wrong, as ``hilctl emulate --fault`` takes it.
-        environment: More of the run's environment.
-    """
+    """A ``hilctl run`` on a device that is emulated for it alone."""
 
     def __init__(
         self,
@@ -239,9 +228,6 @@ class DeviceLog:
 
     Attributes:
         times_ns: int64[n], monotonic time of each write.
-        current_a: float64[n], the output from then on.
-        period_s: Time from one sample of the run to the next.
-        start_a: The output before.
     """
 
     times_ns: I64 = field(repr=False)

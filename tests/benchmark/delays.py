@@ -31,9 +31,6 @@ class Trial:
     """What one trial came to.
 
     Attributes:
-        name: Wire and kind.
-        what: The details.
-        said_safe: Whether the run said that the output is safe.
         wrong: Whether it was not at its safe value, then or later.
         late_s: How long after the link's return the output became safe; 0 if it was not down.
     """

@@ -126,11 +126,9 @@ class Figures:
     """What a comparison has found.
 
     Attributes:
-        name: What was timed.
         us: Median exchange of the driver and of the C client, us.
         p99_us: Their 99th percentiles, us.
         ratios: Lower quartile, median and upper quartile of driver to C client.
-        note: How it was taken.
     """
 
     name: str

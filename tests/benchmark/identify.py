@@ -15,7 +15,6 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 from scipy.optimize import least_squares
 
-from hilctl.identify.data.cycles import average_cycle
 from hilctl.identify.data.records import SteadyLoop
 from hilctl.identify.evaluation import Evaluation, judge
 from hilctl.identify.fit_api import FitData, FitRequest
@@ -23,9 +22,8 @@ from hilctl.identify.fit_model import fit_model
 from hilctl.identify.settings import FitSettings
 from hilctl.kernels.hysteresis import deadband_block
 from hilctl.models.integrated import IntegratedModel, exponential_integrated
-from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
+from tests.rig import steady_loop
 
-RATE_HZ = 50_000.0
 PLAYS, DEADBANDS = 12, 8
 NAMES = ("alpha", "gamma_s", "a_0", "alpha_0", "beta_0", "alpha_1", "beta_1", "d_p", "alpha_2",
          "beta_2", "d_n")  # fmt: skip
@@ -36,22 +34,10 @@ HIGH = np.array([0.48, 2e-3, 20.0, 20.0, 3.0, 0.9, 3.0, 15.0, 3.0, 3.0, 15.0])
 EVALUATIONS = 300
 
 
-def measured(amplitude_a: float, frequency_hz: float, points: int, seed: int) -> SteadyLoop:
+def measured(amplitude_a: float, frequency_hz: float, seed: int) -> SteadyLoop:
     """Return the simulated rig's averaged loop under a sine."""
-    period = RATE_HZ / frequency_hz
     cycles = 2 + max(3, round(0.1 * frequency_hz))
-    time_s = np.arange(round(cycles * period)) / RATE_HZ
-    grown = np.clip(time_s * frequency_hz, 0.0, 1.0)
-    command = amplitude_a * grown * np.sin(2.0 * np.pi * frequency_hz * time_s)
-    displacement_um, current_a = np.empty_like(command), np.empty_like(command)
-    actuator = TerfenolActuator(TerfenolParameters(), RATE_HZ, seed=seed)
-    actuator.step(command, displacement_um, current_a)
-    first = round(2 * period)
-    phase = np.arange(command.size - first) / period
-    label = f"{amplitude_a:g} A {frequency_hz:g} Hz"
-    values = np.stack([command[first:], displacement_um[first:]])
-    v, y = average_cycle(label, phase, values, period, points)
-    return SteadyLoop(label, v, y, frequency_hz, RATE_HZ)
+    return steady_loop((amplitude_a, frequency_hz), cycles=cycles, seed=seed)
 
 
 def published(data: list[SteadyLoop], starts: int, seed: int) -> tuple[IntegratedModel, float]:
@@ -112,8 +98,8 @@ def main() -> int:
     parser.add_argument("--min-ratio", type=float, default=20.0)
     options = parser.parse_args()
     grid = [(a, f) for a in (3.0, 6.0) for f in (10.0, 50.0, 100.0, 150.0, 250.0)]
-    data = [measured(a, f, 300, 1) for a, f in grid]
-    others = [measured(5.0, f, 300, 2) for f in (10.0, 100.0, 250.0)]
+    data = [measured(a, f, 1) for a, f in grid]
+    others = [measured(5.0, f, 2) for f in (10.0, 100.0, 250.0)]
     fast(data[:1])  # compiles, or loads what was compiled
     published(data[:1], 1, 1)
     ratios, ok = [], True

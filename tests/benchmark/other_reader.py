@@ -22,13 +22,6 @@ def verdict(path: Path, samples: int) -> str:
     """Return where ``@mcap/core`` differs from what we read.
 
     It reads the file twice, by its index and as a stream, and checks every checksum.
-
-    Args:
-        path: A recording that is closed and whole.
-        samples: What our own reader found in it; ``/scope`` must have that many messages.
-
-    Returns:
-        Empty if it agrees; otherwise what is wrong, or :data:`NOT_INSTALLED`.
     """
     if not is_installed():
         return NOT_INSTALLED

@@ -91,13 +91,7 @@ class Figures:
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """How one reference was followed.
-
-    Attributes:
-        row: The reference.
-        noise: Largest noise of the sensor, in percent of the reference's peak-to-peak.
-        figures: From rest and, if wanted, ``conditioned``.
-    """
+    """How one reference was followed."""
 
     row: Row
     noise: float

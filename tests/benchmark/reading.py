@@ -43,11 +43,7 @@ FLAT = 1.25
 
 
 class Content:
-    """Samples of a run: a soft start, then one second over and over.
-
-    Args:
-        checked: The experiment whose model and limits they are made by.
-    """
+    """Samples of a run: a soft start, then one second over and over."""
 
     def __init__(self, checked: CheckedExperiment) -> None:
         config, model = checked.loaded.config, checked.loaded.model

@@ -25,7 +25,6 @@ class Row:
     """A reference and what is asked of it.
 
     Attributes:
-        name: What it is.
         goal: Largest peak error, percent of its peak-to-peak.
         rms_goal: The same for the rms error; None where only the peak counts.
         reference_um: float64[n], from 0.

@@ -12,6 +12,8 @@ import time
 from pathlib import Path
 from statistics import median
 
+from tests.fakes import loop_of
+
 ROOT = Path(__file__).parents[2]
 _GROWTH_KIB = 1024
 EXPERIMENT = ROOT / "configs" / "terfenol_sine_6a.yaml"
@@ -25,14 +27,6 @@ def rss_kib(pid: int) -> int:
     return 0
 
 
-def loop_of(pid: int) -> int | None:
-    """Return a run's loop process; None where it has ended."""
-    for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
-        if b"hilctl.run.loop_process" in Path(f"/proc/{child}/cmdline").read_bytes():
-            return int(child)
-    return None
-
-
 def watch(run: subprocess.Popen[bytes], path: Path) -> dict[str, list[tuple[float, int]]]:
     """Note the memory of supervisor and loop every second while samples come."""
     seen: dict[str, list[tuple[float, int]]] = {"supervisor": [], "loop": []}
@@ -42,14 +36,11 @@ def watch(run: subprocess.Popen[bytes], path: Path) -> dict[str, list[tuple[floa
         if not path.exists() or path.stat().st_size < 100_000:
             continue
         begun = begun or time.monotonic()
-        loop = loop_of(run.pid)
-        if loop is None:  # it has ended; what comes now is the report
-            return seen
         at = time.monotonic() - begun
         try:
+            seen["loop"].append((at, rss_kib(loop_of(run.pid))))
             seen["supervisor"].append((at, rss_kib(run.pid)))
-            seen["loop"].append((at, rss_kib(loop)))
-        except OSError:
+        except (AssertionError, OSError):  # it has ended; what comes now is the report
             return seen
         print(f"\r{at:6.0f} s, {seen['supervisor'][-1][1]} + {seen['loop'][-1][1]} KiB", end="")
     return seen

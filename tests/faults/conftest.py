@@ -41,17 +41,57 @@ def each_kind(cases, shown):
     ]
 
 
+T7 = {
+    "kind": "modbus_dac",
+    "profile": "labjack_t7",
+    "output": "DAC0",
+    "input": "AIN0",
+    "amplifier": {"gain_a_per_v": 4.0, "offset_a": -10.0},
+    "sensor": {"um_per_v": 12.5},
+    "watchdog": "none",
+}
+"""Device section of a LabJack T7, without its address."""
+MODULE = {
+    "kind": "modbus_dac",
+    "output": "OUT",
+    "input": "IN",
+    "amplifier": {"gain_a_per_v": 1.0},
+    "sensor": {"um_per_v": 12.5},
+    "watchdog": "none",
+}
+"""Device section of the module in ``tests/data``, without its port."""
+
+
+def tcp(address):
+    """Return the keys of an address in a device section."""
+    host, port = address.split(":")
+    return {"host": host, "tcp_port": int(port)}
+
+
+def sine(frequency_hz, duration_s, soft_start_s=0.1):
+    """Return a waveform of 4 A."""
+    shape = {"kind": "sine", "unit": "A", "amplitude": 4.0, "frequency_hz": frequency_hz}
+    return {**shape, "duration_s": duration_s, "soft_start_s": soft_start_s}
+
+
+def simulated(name, sample_rate_hz, waveform, slew_a_per_s=1000.0, **more):
+    """Return an experiment on the simulated rig."""
+    return {
+        "name": name,
+        "device": {"kind": "simulated_terfenol", "seed": 3},
+        "sample_rate_hz": sample_rate_hz,
+        "waveform": waveform,
+        "compensator": "none",
+        "limits": {"peak_current_a": 5.0, "slew_a_per_s": slew_a_per_s, "stroke_um": [-60.0, 60.0]},
+        "safe": {"value": 0.0, "ramp_s": 0.2},
+        **more,
+    }
+
+
 EXPERIMENT = {
     "name": "wire_fault",
     "sample_rate_hz": 500,
-    "waveform": {
-        "kind": "sine",
-        "unit": "A",
-        "amplitude": 4.0,
-        "frequency_hz": 2.0,
-        "duration_s": 30.0,
-        "soft_start_s": 0.1,
-    },
+    "waveform": sine(2.0, 30.0),
     "compensator": "none",
     "limits": {"peak_current_a": 5.0, "slew_a_per_s": 500.0, "stroke_um": [-100.0, 100.0]},
     "safe": {"value": 0.0, "ramp_s": 0.2},
@@ -92,23 +132,43 @@ class Log:
             time.sleep(0.02)
 
 
-class Run:
-    """A ``hilctl run`` in a separate process."""
+class StartedRun:
+    """A ``hilctl run`` in a separate process; ``program`` replaces ``-m hilctl``."""
 
-    def __init__(self, folder: Path, device: dict, name: str = "run", **changes) -> None:
+    def __init__(self, folder: Path, experiment: dict, name="run", program=(), **options) -> None:
         path = folder / f"{name}.yaml"
-        experiment = {**EXPERIMENT, "device": device, **changes}
         path.write_text(yaml.safe_dump(experiment), encoding="utf-8")
         self.output = folder / f"{name}.mcap"
-        command = [sys.executable, "-m", "hilctl", "run", str(path)]
+        command = [sys.executable, *(program or ("-m", "hilctl")), "run", str(path)]
         command += ["--output", str(self.output), "--json"]
         self.process = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options
         )
+
+    def await_size(self, size: int = 100_000) -> None:
+        """Wait until the recording has grown to ``size`` bytes."""
+        deadline = time.monotonic() + 240.0
+        while not (self.output.exists() and self.output.stat().st_size > size):
+            assert self.process.poll() is None, self.process.communicate()
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
 
     def loop_pid(self) -> int:
         """Return the process id of the run's loop process."""
         return loop_of(self.process.pid)
+
+    def ended(self) -> tuple[int, dict]:
+        """Wait for the end; return the exit code and the printed JSON."""
+        out, err = self.process.communicate(timeout=240)
+        assert "Traceback" not in err
+        return self.process.returncode, json.loads(out)
+
+
+class Run(StartedRun):
+    """A run on an emulated device."""
+
+    def __init__(self, folder: Path, device: dict, name: str = "run", **changes) -> None:
+        super().__init__(folder, {**EXPERIMENT, "device": device, **changes}, name)
 
     def kill_all(self, number: int) -> None:
         """Send a signal to supervisor, loop and guardian at once."""
@@ -120,10 +180,9 @@ class Run:
 
     def end(self) -> dict:
         """Wait for the end; return the printed JSON."""
-        out, err = self.process.communicate(timeout=240)
-        assert "Traceback" not in err
-        assert self.process.returncode == 3, err
-        return json.loads(out)
+        code, printed = self.ended()
+        assert code == 3, printed
+        return printed
 
     def refused(self) -> str:
         """Wait until the run is rejected; return its message and assert that it left no file."""
@@ -228,20 +287,8 @@ class Device:
     """An emulated device, with its section of an experiment."""
 
     def __init__(self, emulated: Emulated) -> None:
-        host, port = emulated.address.split(":")
         self.log = emulated.log
-        self.section = {
-            "kind": "modbus_dac",
-            "profile": "labjack_t7",
-            "host": host,
-            "tcp_port": int(port),
-            "output": "DAC0",
-            "input": "AIN0",
-            "timeout_s": 5.0,
-            "amplifier": {"gain_a_per_v": 4.0, "offset_a": -10.0},
-            "sensor": {"um_per_v": 12.5},
-            "watchdog": "none",
-        }
+        self.section = {**T7, **tcp(emulated.address), "timeout_s": 5.0}
 
     def has_not_moved(self) -> bool:
         """Return whether its output is still the power-up value."""

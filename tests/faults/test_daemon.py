@@ -20,42 +20,31 @@ import yaml
 from hilctl.analysis.replay import replay
 from hilctl.recording.reader import read
 from hilctl.run.run_folder import runs
+from tests import commands
+from tests.faults.conftest import T7, simulated, sine
 
-EXPERIMENT = {
-    "name": "background",
-    "device": {"kind": "simulated_terfenol", "seed": 3},
-    "sample_rate_hz": 5000,
-    "block": 25,
-    "waveform": {
-        "kind": "sine",
-        "unit": "A",
-        "amplitude": 4.0,
-        "frequency_hz": 5.0,
-        "duration_s": 600.0,  # longer than all tests of it take on a busy machine
-        "soft_start_s": 0.1,
-    },
-    "compensator": "none",
-    "limits": {"peak_current_a": 5.0, "slew_a_per_s": 1000.0, "stroke_um": [-60.0, 60.0]},
-    "safe": {"value": 0.0, "ramp_s": 0.2},
-}
+EXPERIMENT = simulated(  # longer than all tests of it take on a busy machine
+    "background", 5000, sine(5.0, duration_s=600.0), block=25
+)
 
 
 def hilctl(*words, code=0):
     """Run a command; return what it printed as JSON, or its error text where it must fail."""
-    command = [sys.executable, "-m", "hilctl", *map(str, words)]
-    if code == 0:
-        command.append("--json")
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
-    assert done.returncode == code, done.stderr
-    assert "Traceback" not in done.stderr
-    return json.loads(done.stdout) if code == 0 else done.stderr
+    if code:
+        return commands.hilctl(*words, code=code).stderr
+    return json.loads(commands.hilctl(*words, "--json").stdout)
+
+
+def written(folder, **changes):
+    """Write the experiment with changes; return its path."""
+    path = folder / "experiment.yaml"
+    path.write_text(yaml.safe_dump({**EXPERIMENT, **changes}), encoding="utf-8")
+    return path
 
 
 def start(folder):
     """Start a run in the background; return its recording."""
-    path = folder / "experiment.yaml"
-    path.write_text(yaml.safe_dump(EXPERIMENT), encoding="utf-8")
-    started = hilctl("run", path, "--output", folder / "run.mcap", "--detach")
+    started = hilctl("run", written(folder), "--output", folder / "run.mcap", "--detach")
     return Path(started["recording"])
 
 
@@ -269,8 +258,7 @@ def test_second_run_into_the_same_recording_is_refused(going):
 
 def test_refused_experiment_is_told_at_once(tmp_path):
     """What the foreground would refuse, the background refuses too, and leaves nothing."""
-    path = tmp_path / "experiment.yaml"
-    path.write_text(yaml.safe_dump({**EXPERIMENT, "sample_rate_hz": -1}), encoding="utf-8")
+    path = written(tmp_path, sample_rate_hz=-1)
     text = hilctl("run", path, "--output", tmp_path / "run.mcap", "--detach", code=2)
     assert "sample_rate_hz" in text
     assert sorted(each.name for each in tmp_path.iterdir()) == ["experiment.yaml"]
@@ -289,20 +277,8 @@ def test_a_run_that_does_not_start_is_told_as_in_the_foreground(tmp_path):
     with socket.socket() as closed:
         closed.bind(("127.0.0.1", 0))
         port = closed.getsockname()[1]
-    section = {
-        "kind": "modbus_dac",
-        "profile": "labjack_t7",
-        "host": "127.0.0.1",
-        "tcp_port": port,
-        "output": "DAC0",
-        "input": "AIN0",
-        "amplifier": {"gain_a_per_v": 4.0, "offset_a": -10.0},
-        "sensor": {"um_per_v": 12.5},
-        "watchdog": "none",
-    }
-    path = tmp_path / "experiment.yaml"
-    changes = {"device": section, "sample_rate_hz": 100, "block": 1}
-    path.write_text(yaml.safe_dump({**EXPERIMENT, **changes}), encoding="utf-8")
+    section = {**T7, "host": "127.0.0.1", "tcp_port": port}
+    path = written(tmp_path, device=section, sample_rate_hz=100, block=1)
     words = ["run", path, "--output", tmp_path / "run.mcap"]
     foreground = hilctl(*words, code=3)
     background = hilctl(*words, "--detach", code=3)
@@ -314,18 +290,14 @@ def test_a_run_that_does_not_start_is_told_as_in_the_foreground(tmp_path):
 
 def test_a_short_run_may_be_over_when_detach_returns(tmp_path):
     """It is no failure."""
-    waveform = {**EXPERIMENT["waveform"], "duration_s": 0.2, "soft_start_s": 0.0, "phase_deg": 0.0}
-    path = tmp_path / "experiment.yaml"
-    path.write_text(yaml.safe_dump({**EXPERIMENT, "waveform": waveform}), encoding="utf-8")
+    path = written(tmp_path, waveform=sine(5.0, 0.2, soft_start_s=0.0))
     done = hilctl("run", path, "--output", tmp_path / "run.mcap", "--detach")
     assert done["recording"] == str(tmp_path / "run.mcap")
 
 
 def test_a_run_that_is_killed_while_it_starts_leaves_nothing(tmp_path):
     """The next command says so in a line, and no later one does."""
-    path = tmp_path / "experiment.yaml"
-    path.write_text(yaml.safe_dump(EXPERIMENT), encoding="utf-8")
-    command = [sys.executable, "-m", "hilctl", "run", str(path)]
+    command = [sys.executable, "-m", "hilctl", "run", str(written(tmp_path))]
     with subprocess.Popen([*command, "--output", str(tmp_path / "run.mcap")]) as process:
         deadline = time.monotonic() + 120.0
         while not (found := runs()):
@@ -335,11 +307,7 @@ def test_a_run_that_is_killed_while_it_starts_leaves_nothing(tmp_path):
         for number in (process.pid, *map(int, children)):
             with suppress(ProcessLookupError):
                 os.kill(number, signal.SIGKILL)
-    words = [sys.executable, "-m", "hilctl", "status"]
-    said = [
-        subprocess.run(words, capture_output=True, text=True, timeout=60).stderr.splitlines()
-        for _ in range(2)
-    ]
+    said = [commands.hilctl("status").stderr.splitlines() for _ in range(2)]
     assert [len(lines) for lines in said] == [1, 0]
     assert found[0].card.name in said[0][0]
     assert not (tmp_path / "run.mcap").exists()

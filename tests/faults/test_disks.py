@@ -1,6 +1,5 @@
 """Runs with a full or slow disk, or a wall clock that is set: losses are counted."""
 
-import json
 import os
 import resource
 import subprocess
@@ -10,34 +9,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 
 from hilctl.analysis.replay import replay
 from hilctl.recording.reader import read
 from hilctl.run.control.client import finish_dead_runs
 from hilctl.run.run_folder import runs
+from tests.faults.conftest import StartedRun, simulated, sine
 
 DEMO = Path(__file__).parents[2] / "configs" / "demo.yaml"
 RATE_HZ = 5000
 SECONDS = 4.0
 RAMP_SAMPLES = round(0.2 * RATE_HZ)
-EXPERIMENT = {
-    "name": "disk_fault",
-    "device": {"kind": "simulated_terfenol", "seed": 3},
-    "sample_rate_hz": RATE_HZ,
-    "block": 5,
-    "waveform": {
-        "kind": "sine",
-        "unit": "A",
-        "amplitude": 4.0,
-        "frequency_hz": 5.0,
-        "duration_s": SECONDS,
-        "soft_start_s": 0.1,
-    },
-    "compensator": "none",
-    "limits": {"peak_current_a": 5.0, "slew_a_per_s": 1000.0, "stroke_um": [-60.0, 60.0]},
-    "safe": {"value": 0.0, "ramp_s": 0.2},
-}
+EXPERIMENT = simulated("disk_fault", RATE_HZ, sine(5.0, SECONDS), block=5)
 FAULTY = """
 import os, sys, time
 from io import FileIO
@@ -88,43 +71,24 @@ datetime.datetime = Stepped
 """
 
 
-def start(folder: Path, *, code: str = "", preexec=None, environment=None, **recording):
+def start(folder: Path, *, code: str = "", options=None, **recording) -> StartedRun:
     """Start a run in a separate process; ``code`` replaces ``python -m hilctl``."""
-    path = folder / "experiment.yaml"
     section = {"flush_s": 0.1, "ring_s": 1.0, **recording}
-    path.write_text(yaml.safe_dump({**EXPERIMENT, "recording": section}), encoding="utf-8")
-    program = ["-c", code] if code else ["-m", "hilctl"]
-    words = ["run", str(path), "--output", str(folder / "run.mcap"), "--json"]
-    return subprocess.Popen(
-        [sys.executable, *program, *words],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        preexec_fn=preexec,  # noqa: PLW1509
-        env={**os.environ, **(environment or {})},
-    )
+    program = ("-c", code) if code else ()
+    experiment = {**EXPERIMENT, "recording": section}
+    return StartedRun(folder, experiment, program=program, **(options or {}))
 
 
-def end(process, code: int) -> dict:
+def end(run: StartedRun, code: int) -> dict:
     """Wait for the end; return the printed JSON."""
-    out, err = process.communicate(timeout=240)
-    assert "Traceback" not in err
-    assert process.returncode == code, f"{out}\n{err}"
-    return json.loads(out)
+    returned, printed = run.ended()
+    assert returned == code, printed
+    return printed
 
 
-def await_size(process, output: Path, size: int = 100_000) -> None:
-    """Wait until the recording has grown to ``size`` bytes."""
-    deadline = time.monotonic() + 240.0
-    while not (output.exists() and output.stat().st_size > size):
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
-
-
-def limit_files(process, size: int) -> None:
-    """Limit the size of files that a process writes."""
-    resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
+def limit_files(run: StartedRun, size: int) -> None:
+    """Limit the size of files that a run writes."""
+    resource.prlimit(run.process.pid, resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
 
 
 def assert_whole(recording, printed) -> None:
@@ -148,12 +112,12 @@ def test_one_refused_write_loses_nothing(tmp_path, on_failure):
 
 @pytest.mark.parametrize("on_failure", ["stop", "go_on"])
 def test_disk_that_is_full_for_a_while_loses_nothing(tmp_path, on_failure):
-    process = start(tmp_path, on_failure=on_failure, ring_s=8.0)
-    await_size(process, tmp_path / "run.mcap")
-    limit_files(process, 200_000)
+    run = start(tmp_path, on_failure=on_failure, ring_s=8.0)
+    run.await_size()
+    limit_files(run, 200_000)
     time.sleep(1.0)
-    limit_files(process, resource.RLIM_INFINITY)
-    printed = end(process, 0)
+    limit_files(run, resource.RLIM_INFINITY)
+    printed = end(run, 0)
     assert printed["reason"] == "waveform completed"
     assert_whole(read(tmp_path / "run.mcap"), printed)
 
@@ -163,10 +127,10 @@ def test_disk_that_is_full_for_a_while_loses_nothing(tmp_path, on_failure):
 )
 def test_disk_that_stays_full(tmp_path, on_failure, whole):
     """The run ramps down or continues to its end; the next command completes the recording."""
-    process = start(tmp_path, on_failure=on_failure, ring_s=5.0 if whole else 3.0)
-    await_size(process, tmp_path / "run.mcap")
-    limit_files(process, 200_000)
-    printed = end(process, 3)
+    run = start(tmp_path, on_failure=on_failure, ring_s=5.0 if whole else 3.0)
+    run.await_size()
+    limit_files(run, 200_000)
+    printed = end(run, 3)
     assert printed["code"] == "fault"
     assert printed["output_safe"]
     assert "File too large" in printed["reason"]
@@ -188,8 +152,8 @@ def test_disk_that_stays_full(tmp_path, on_failure, whole):
 
 def test_disk_that_stands_still_longer_than_the_ring_ends_the_run(tmp_path):
     """The loop ramps down before the ring is full: nothing is lost."""
-    process = start(tmp_path, code=stall(2.0), on_failure="stop")
-    printed = end(process, 3)
+    run = start(tmp_path, code=stall(2.0), on_failure="stop")
+    printed = end(run, 3)
     assert "disk stalls" in printed["reason"]
     assert printed["output_safe"]
     recording = read(tmp_path / "run.mcap")
@@ -201,8 +165,8 @@ def test_disk_that_stands_still_longer_than_the_ring_ends_the_run(tmp_path):
 
 def test_run_that_goes_on_counts_what_a_slow_disk_lost(tmp_path):
     """The ring holds one second; the number of lost samples is reported and recorded."""
-    process = start(tmp_path, code=stall(2.5), on_failure="go_on")
-    printed = end(process, 0)
+    run = start(tmp_path, code=stall(2.5), on_failure="go_on")
+    printed = end(run, 0)
     assert printed["reason"] == "waveform completed"
     recording = read(tmp_path / "run.mcap")
     index = recording.samples.index
@@ -230,14 +194,14 @@ def test_wall_clock_that_is_set_changes_nothing(tmp_path):
     clock.write_text("0", encoding="utf-8")
     (tmp_path / "sitecustomize.py").write_text(OTHER_CLOCK, encoding="utf-8")
     path = os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])])
-    environment = {"PYTHONPATH": path, "CLOCK_STEP": str(clock)}
+    environment = {**os.environ, "PYTHONPATH": path, "CLOCK_STEP": str(clock)}
     before_ns = time.time_ns()
-    process = start(tmp_path, environment=environment)
-    await_size(process, output)
+    run = start(tmp_path, options={"env": environment})
+    run.await_size()
     for step_s in (-3600, 7200):
         clock.write_text(str(step_s * 10**9), encoding="utf-8")
         time.sleep(1.0)
-    printed = end(process, 0)
+    printed = end(run, 0)
     assert (printed["reason"], printed["dropped"]) == ("waveform completed", 0)
     recording = read(output)
     assert replay(recording).identical
@@ -254,7 +218,7 @@ def test_memory_that_is_not_to_be_had_is_told(tmp_path):
     def nothing() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, 50_000))
 
-    process = start(tmp_path, preexec=nothing)
+    process = start(tmp_path, options={"preexec_fn": nothing}).process
     _, err = process.communicate(timeout=240)
     assert process.returncode == 3, err
     assert err.count("\n") == 1

@@ -10,19 +10,18 @@ from pathlib import Path
 import pytest
 import yaml
 
+from tests.commands import ended, typed
 from tests.faults.conftest import EXPERIMENT
 
 ROOT = Path(__file__).parents[2]
 TRAPS = ("signal", "json", "numpy", "yaml", "struct", "hilctl", "hilctl_drivers", "mmap", "queue")
 
 
-def run(folder, tmp_path, *settings):
+def run(folder, tmp_path):
     program = Path(sys.executable).parent / "hilctl"
     command = [program, "run", ROOT / "configs" / "demo.yaml", "--json", "--overwrite"]
     command += ["--output", tmp_path / "run.mcap", "--set", "waveform.duration_s=0.5"]
-    return subprocess.run(
-        [*map(str, command), *settings], cwd=folder, capture_output=True, text=True, timeout=120
-    )
+    return ended(command, cwd=folder)
 
 
 @pytest.mark.parametrize("name", ["-a: lab #3 [x] 50 % {y}\n\"ü'"])
@@ -30,9 +29,7 @@ def test_folder_of_any_name(tmp_path, name):
     """A run starts and records in a folder of any name."""
     folder = tmp_path / name
     folder.mkdir()
-    ended = run(folder, folder)
-    assert ended.returncode == 0, ended.stderr
-    assert json.loads(ended.stdout)["code"] == "completed"
+    assert json.loads(run(folder, folder).stdout)["code"] == "completed"
 
 
 def test_modules_of_the_lab_are_never_imported(tmp_path):
@@ -41,17 +38,14 @@ def test_modules_of_the_lab_are_never_imported(tmp_path):
     for name in TRAPS:
         text = f"open({str(sprung)!r}, 'a').write({name!r} + chr(10)); raise SystemExit({name!r})"
         (tmp_path / f"{name}.py").write_text(text)
-    ended = run(tmp_path, tmp_path)
+    run(tmp_path, tmp_path)
     assert not sprung.exists(), sprung.read_text()
-    assert ended.returncode == 0, ended.stderr
 
 
 def test_from_above_the_checkout():
     """Folders with names of packages are not imported."""
     code = "import hilctl, hilctl_drivers; print(hilctl.__version__)"
-    command = [sys.executable, "-c", code]
-    ended = subprocess.run(command, cwd=ROOT.parent, capture_output=True, text=True, timeout=240)
-    assert ended.returncode == 0, ended.stderr
+    ended([sys.executable, "-c", code], cwd=ROOT.parent)
 
 
 GONE = 'mkdir gone; cd gone; rmdir ../gone; exec "$@"'
@@ -70,15 +64,10 @@ def test_working_folder_that_is_gone_before_the_start(tmp_path, experiment, outp
     shutil.copy(ROOT / "configs" / "demo.yaml", tmp_path)
     shutil.copytree(ROOT / "configs" / "models", tmp_path / "models")
     names = [f"{tmp_path}{each}" if each[0] == "/" else each for each in (experiment, output)]
-    command = [sys.executable, "-P", "-m", "hilctl", "run", names[0], "--output", names[1]]
-    command += ["--set", "waveform.duration_s=0.5"]
-    ended = subprocess.run(
-        ["sh", "-c", GONE, "sh", *command],
-        cwd=tmp_path, capture_output=True, text=True, timeout=240,
-    )  # fmt: skip
-    assert ended.returncode == code, ended.stderr
-    assert said in ended.stderr
-    assert len(ended.stderr.splitlines()) == (code != 0)
+    command = typed("run", names[0], "--output", names[1], "--set", "waveform.duration_s=0.5")
+    errors = ended(["sh", "-c", GONE, "sh", *command], code, cwd=tmp_path).stderr
+    assert said in errors
+    assert len(errors.splitlines()) == (code != 0)
     assert (tmp_path / "run.mcap").exists() == (code == 0)
 
 
@@ -88,8 +77,8 @@ def test_folder_that_is_deleted_while_a_run_starts(tmp_path, device, inside):
     (tmp_path / "e.yaml").write_text(yaml.safe_dump({**EXPERIMENT, "device": device.section}))
     lab = tmp_path / "lab"
     lab.mkdir()
-    command = [sys.executable, "-P", "-m", "hilctl", "run", str(tmp_path / "e.yaml")]
-    command += ["--output", "run.mcap" if inside else str(lab / "run.mcap")]
+    output = "run.mcap" if inside else lab / "run.mcap"
+    command = typed("run", tmp_path / "e.yaml", "--output", output)
     with subprocess.Popen(
         command, cwd=lab if inside else tmp_path, stderr=subprocess.PIPE, text=True
     ) as process:

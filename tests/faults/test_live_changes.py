@@ -2,7 +2,6 @@
 
 import itertools
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +12,7 @@ from hilctl import api
 from hilctl.analysis.replay import replay
 from hilctl.base.errors import InputError
 from hilctl.recording.reader import read
+from tests.commands import typed
 from tests.faults.test_daemon import await_state, hilctl, stop_all
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -50,9 +50,7 @@ def test_a_run_is_switched_marked_watched_and_stopped(recording):
     assert "mark" in {event.code for frame in frames for event in frame.events}
     assert np.nanmax(np.abs(frames[-1].high["error"])) > 3.0
     run.set(inverse="in", over_s=0.3)
-    with subprocess.Popen(
-        [sys.executable, "-m", "hilctl", "watch"], stdout=subprocess.PIPE, text=True
-    ) as watching:
+    with subprocess.Popen(typed("watch"), stdout=subprocess.PIPE, text=True) as watching:
         assert "mark: tapped" in "".join(itertools.islice(watching.stdout, 4))
         run.stop()
         *_, last = watching.stdout.read().splitlines()

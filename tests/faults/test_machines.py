@@ -8,6 +8,8 @@ import sys
 import pytest
 import yaml
 
+from tests import commands
+
 EXPERIMENT = {
     "name": "poor",
     "device": {"kind": "simulated_terfenol"},
@@ -177,8 +179,6 @@ def test_a_name_full_of_markup_and_escapes_is_shown_as_it_is(hilctl, tmp_path):
 
 def test_errors_of_programs_name_it_too(tmp_path):
     """With --json the message is plain text in JSON."""
-    command = [sys.executable, "-P", "-m", "hilctl", "report", "\x1b[2J[/x].mcap", "--json"]
-    ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
-    assert ended.returncode == 2
+    ended = commands.hilctl("report", "\x1b[2J[/x].mcap", "--json", code=2, cwd=tmp_path)
     assert json.loads(ended.stdout)["error"].startswith("\x1b[2J[/x].mcap: ")
     assert "\x1b" not in ended.stdout + ended.stderr

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hilctl.base.samples import Flag
-from tests.faults.conftest import each_kind
+from tests.faults.conftest import T7, each_kind, tcp
 
 TIMEOUT_S = 2.0
 WATCHDOG_S = 4.0
@@ -15,15 +15,10 @@ FAULT_AT = 120
 BLOCK = 200
 FIFO_BLOCKS = 12
 STREAM = {"sample_rate_hz": 5000, "block": BLOCK}
-T7 = {
+STREAMING = {
     "kind": "modbus_stream",
-    "profile": "labjack_t7",
-    "output": "DAC0",
-    "input": "AIN0",
     "timeout_s": TIMEOUT_S,
     "fifo_blocks": FIFO_BLOCKS,
-    "amplifier": {"gain_a_per_v": 4.0, "offset_a": -10.0},
-    "sensor": {"um_per_v": 12.5},
     "watchdog": {"timeout_s": WATCHDOG_S},
 }
 FAULTS = {
@@ -35,8 +30,7 @@ FAULTS = {
 
 
 def over_tcp(address):
-    host, port = address.split(":")
-    return {**T7, "host": host, "tcp_port": int(port)}
+    return {**T7, **STREAMING, **tcp(address)}
 
 
 def assert_made_safe(device):

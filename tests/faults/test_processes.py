@@ -4,14 +4,12 @@ import json
 import os
 import random
 import signal
-import subprocess
 import sys
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 
 from hilctl.analysis.replay import replay
 from hilctl.recording.reader import read
@@ -19,54 +17,25 @@ from hilctl.run.recovery import recover_dead_runs
 from hilctl.run.run_folder import runs
 from hilctl.run.shared.shared_page import SIZE
 from tests.benchmark.other_reader import is_installed
-from tests.fakes import loop_of
+from tests.commands import ended
+from tests.faults.conftest import StartedRun, simulated, sine
 
 ROOT = Path(__file__).parents[2]
-EXPERIMENT = {
-    "name": "process_fault",
-    "device": {"kind": "simulated_terfenol", "seed": 3},
-    "sample_rate_hz": 1000,
-    "waveform": {
-        "kind": "sine",
-        "unit": "A",
-        "amplitude": 4.0,
-        "frequency_hz": 5.0,
-        "duration_s": 60.0,
-        "soft_start_s": 0.1,
-    },
-    "compensator": "none",
-    "limits": {"peak_current_a": 5.0, "slew_a_per_s": 1000.0, "stroke_um": [-60.0, 60.0]},
-    "safe": {"value": 0.0, "ramp_s": 0.2},
-    "timing": {"max_late_s": 3.0, "on_misses": "warn"},
-    "recording": {"flush_s": 0.1, "ring_s": 5.0},
-}
+EXPERIMENT = simulated(
+    "process_fault",
+    1000,
+    sine(5.0, 60.0),
+    timing={"max_late_s": 3.0, "on_misses": "warn"},
+    recording={"flush_s": 0.1, "ring_s": 5.0},
+)
 
 
-class Run:
-    """A ``hilctl run`` in a process of its own, once it exchanges samples."""
-
-    def __init__(self, folder, **changes):
-        self.output = folder / "run.mcap"
-        path = folder / "experiment.yaml"
-        path.write_text(yaml.safe_dump({**EXPERIMENT, **changes}), encoding="utf-8")
-        words = ["run", str(path), "--output", str(self.output), "--json"]
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "hilctl", *words],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        deadline = time.monotonic() + 240.0
-        while not (self.output.exists() and self.output.stat().st_size > 20_000):
-            assert self.process.poll() is None, self.process.communicate()
-            assert time.monotonic() < deadline
-            time.sleep(0.02)
-        self.loop = loop_of(self.process.pid)
-
-    def end(self):
-        out, err = self.process.communicate(timeout=240)
-        assert "Traceback" not in err
-        return self.process.returncode, json.loads(out)
+def begun(folder, **changes):
+    """Return a run that exchanges samples."""
+    run = StartedRun(folder, {**EXPERIMENT, **changes})
+    run.await_size(20_000)
+    run.loop = run.loop_pid()
+    return run
 
 
 def contiguous(recording):
@@ -92,10 +61,7 @@ def test_killed_and_stopped_processes_leave_a_safe_output_and_a_whole_recording(
     words = [sys.executable, "-m", "tests.benchmark.kills", "--count", "1", "--json"]
     words += ["--within-ms", "1500", "--max-step", "2"]  # others may have the machine
     words += ["--action", action, "--targets", targets, "--phase", phase]
-    done = subprocess.run(
-        [*words, "--stall-s", str(stall_s)], cwd=ROOT, capture_output=True, text=True, timeout=250
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
+    done = ended([*words, "--stall-s", str(stall_s)], cwd=ROOT)
     (found,) = json.loads(done.stdout)
     assert (found["phase"], found["lost"], found["reader"]) == (phase, 0, "")
     assert action in found["hit"]
@@ -103,9 +69,9 @@ def test_killed_and_stopped_processes_leave_a_safe_output_and_a_whole_recording(
 
 def test_loop_that_hangs_is_killed_and_the_device_made_safe(tmp_path):
     """A loop that is stopped for good ends the run; what it had exchanged is in the file."""
-    run = Run(tmp_path)
+    run = begun(tmp_path)
     os.kill(run.loop, signal.SIGSTOP)
-    returned, printed = run.end()
+    returned, printed = run.ended()
     assert returned == 3
     assert printed["reason"] == "the loop process hung, and was killed"
     assert printed["output_safe"]
@@ -118,13 +84,13 @@ def test_loop_that_hangs_is_killed_and_the_device_made_safe(tmp_path):
 @pytest.mark.parametrize("stopped_s", [0.01, 0.4])
 def test_short_stop_of_the_loop_costs_no_sample(tmp_path, stopped_s):
     """Below the limit the run goes on; a device with a clock of its own is caught up with."""
-    run = Run(tmp_path)
+    run = begun(tmp_path)
     os.kill(run.loop, signal.SIGSTOP)
     time.sleep(stopped_s)
     os.kill(run.loop, signal.SIGCONT)
     time.sleep(0.5)
     run.process.send_signal(signal.SIGINT)
-    returned, _printed = run.end()
+    returned, _printed = run.ended()
     assert returned == 130
     recording = read(run.output)
     assert contiguous(recording)
@@ -135,11 +101,11 @@ def test_short_stop_of_the_loop_costs_no_sample(tmp_path, stopped_s):
 
 def test_stop_beyond_the_limit_ends_the_run(tmp_path):
     """A loop that wakes too late takes the safe ramp, if it was not killed before."""
-    run = Run(tmp_path, timing={"max_late_s": 0.3})
+    run = begun(tmp_path, timing={"max_late_s": 0.3})
     os.kill(run.loop, signal.SIGSTOP)
     time.sleep(0.5)
     os.kill(run.loop, signal.SIGCONT)
-    returned, printed = run.end()
+    returned, printed = run.ended()
     assert returned == 3
     assert "late, more than the limit" in printed["reason"] or "hung" in printed["reason"]
     assert printed["output_safe"]
@@ -147,14 +113,14 @@ def test_stop_beyond_the_limit_ends_the_run(tmp_path):
 
 def test_supervisor_that_falls_silent_ends_the_run(tmp_path):
     """Before the ring is full the loop ramps down by itself; nothing is lost."""
-    run = Run(tmp_path)
+    run = begun(tmp_path)
     os.kill(run.process.pid, signal.SIGSTOP)
     deadline = time.monotonic() + 240.0
     while Path(f"/proc/{run.loop}/stat").read_text().split()[2] != "Z":
         assert time.monotonic() < deadline
         time.sleep(0.05)
     os.kill(run.process.pid, signal.SIGCONT)
-    returned, printed = run.end()
+    returned, printed = run.ended()
     assert returned == 3
     assert printed["reason"] == "stopped because the supervisor was silent for 2.5 s"
     recording = read(run.output)
@@ -166,7 +132,7 @@ def test_supervisor_that_falls_silent_ends_the_run(tmp_path):
 @pytest.mark.parametrize("seed", [1, 2])
 def test_garbage_in_the_ring_is_survived(tmp_path, seed):
     """Whatever is overwritten there, the run comes to an end, and its recording can be read."""
-    run = Run(tmp_path)
+    run = begun(tmp_path)
     (folder,) = runs()
     chance = random.Random(seed)
     with folder.ring.open("r+b") as ring:
@@ -176,7 +142,7 @@ def test_garbage_in_the_ring_is_survived(tmp_path, seed):
             ring.write(chance.randbytes(200))
     time.sleep(0.5)
     run.process.send_signal(signal.SIGINT)
-    returned, printed = run.end()
+    returned, printed = run.ended()
     assert returned in {130, 3}
     assert printed["output_safe"]
     assert read(run.output).end["reason"] == printed["reason"]
@@ -184,7 +150,7 @@ def test_garbage_in_the_ring_is_survived(tmp_path, seed):
 
 def test_both_processes_dead_is_told_and_recovered(tmp_path):
     """Nobody is left to make the output safe: the next command says so, and saves the samples."""
-    run = Run(tmp_path)
+    run = begun(tmp_path)
     os.kill(run.process.pid, signal.SIGSTOP)
     time.sleep(0.3)
     os.kill(run.loop, signal.SIGKILL)
@@ -229,5 +195,5 @@ thread.join()
 run(3)
 print(results, bool(shown), signal.getsignal(signal.SIGUSR1) is own)
 """
-    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    ran = ended([sys.executable, "-c", code])
     assert ran.stdout == "['completed', 'completed', 'completed'] True True\n", ran.stderr

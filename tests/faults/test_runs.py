@@ -1,10 +1,7 @@
 """Whole runs as a user starts them, with things going wrong: one safe ramp, nothing lost."""
 
-import json
 import os
 import signal
-import subprocess
-import sys
 import threading
 import time
 from pathlib import Path
@@ -21,28 +18,13 @@ from hilctl.run.recovery import recover_dead_runs
 from hilctl.run.run_folder import base_folder, runs
 from hilctl.run.start import checked_experiment
 from hilctl.run.supervisor import Supervisor
-from tests.fakes import loop_of
+from tests.faults.conftest import StartedRun, simulated, sine
 
 MODELS = Path(__file__).parents[2] / "configs" / "models"
 
-EXPERIMENT = {
-    "name": "fault_test",
-    "device": {"kind": "simulated_terfenol", "seed": 3},
-    "sample_rate_hz": 20000,
-    "block": 20,
-    "waveform": {
-        "kind": "sine",
-        "unit": "A",
-        "amplitude": 4.0,
-        "frequency_hz": 20.0,
-        "duration_s": 30.0,
-        "soft_start_s": 0.1,
-    },
-    "compensator": "none",
-    "limits": {"peak_current_a": 5.0, "slew_a_per_s": 5000.0, "stroke_um": [-60.0, 60.0]},
-    "safe": {"value": 0.0, "ramp_s": 0.2},
-    "recording": {"flush_s": 0.1},
-}
+EXPERIMENT = simulated(
+    "fault_test", 20000, sine(20.0, 30.0), 5000.0, block=20, recording={"flush_s": 0.1}
+)
 
 
 def experiment(folder, **changes):
@@ -51,45 +33,15 @@ def experiment(folder, **changes):
     return path
 
 
-def short(seconds, **more):
-    return {**EXPERIMENT["waveform"], "duration_s": seconds, **more}
+def short(seconds):
+    return sine(20.0, seconds)
 
 
-class Run:
-    """A ``hilctl run`` in a process of its own."""
-
-    def __init__(self, folder: Path, *, preexec=None, **changes) -> None:
-        self.output = folder / "run.mcap"
-        command = [sys.executable, "-m", "hilctl", "run", str(experiment(folder, **changes))]
-        command += ["--output", str(self.output), "--json"]
-        self.process = subprocess.Popen(
-            command,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            preexec_fn=preexec,  # noqa: PLW1509
-        )
-
-    def await_samples(self, size=100_000) -> None:
-        """Wait until the recording has grown to ``size`` bytes."""
-        deadline = time.monotonic() + 240.0
-        while not (self.output.exists() and self.output.stat().st_size > size):
-            assert self.process.poll() is None, self.process.communicate()
-            assert time.monotonic() < deadline
-            time.sleep(0.02)
-
-    def loop_pid(self) -> int:
-        """Find the loop process among the run's children."""
-        return loop_of(self.process.pid)
-
-    def end(self) -> tuple[int, dict]:
-        """Wait for the end; return the exit code and the JSON it printed."""
-        out, err = self.process.communicate(timeout=240)
-        assert "Traceback" not in err
-        return self.process.returncode, json.loads(out)
+def started(folder, **changes):
+    return StartedRun(folder, {**EXPERIMENT, **changes})
 
 
-def assert_good_way_out(run: Run, *, safe=0.0):
+def assert_good_way_out(run):
     """The recording is complete and contiguous, ends on the ramp at the safe value, replays."""
     recording = read(run.output)
     samples = recording.samples
@@ -97,7 +49,7 @@ def assert_good_way_out(run: Run, *, safe=0.0):
     assert recording.dropped == 0
     assert recording.end["recorded_samples"] == str(samples.index.size)
     assert recording.end["output_safe"] == "true"
-    assert samples.command[-1] == safe
+    assert samples.command[-1] == 0.0
     assert samples.flags[-1] & Flag.RAMP
     steps = np.abs(np.diff(samples.command))
     assert steps.max() <= 5000.0 / 20000 * (1 + 1e-9)
@@ -117,10 +69,10 @@ def assert_good_way_out(run: Run, *, safe=0.0):
 )
 def test_signals_ramp_down(tmp_path, number, code, words):
     """Ctrl-C, SIGTERM and SIGHUP end the run by its ramp and leave a complete recording."""
-    run = Run(tmp_path)
-    run.await_samples()
+    run = started(tmp_path)
+    run.await_size()
     run.process.send_signal(number)
-    returned, printed = run.end()
+    returned, printed = run.ended()
     assert returned == code
     assert printed["code"] == "stopped"
     assert words in printed["reason"]
@@ -131,12 +83,12 @@ def test_signals_ramp_down(tmp_path, number, code, words):
 
 def test_impatience_does_not_skip_the_ramp(tmp_path):
     """Further signals during the ramp change nothing."""
-    run = Run(tmp_path)
-    run.await_samples()
+    run = started(tmp_path)
+    run.await_size()
     for _ in range(5):
         run.process.send_signal(signal.SIGINT)
         time.sleep(0.02)
-    assert run.end()[0] == 130
+    assert run.ended()[0] == 130
     assert_good_way_out(run)
 
 
@@ -150,8 +102,8 @@ def test_impatience_does_not_skip_the_ramp(tmp_path):
 def test_bad_sensor_ramps_down(tmp_path, kind, words):
     """A reading that can't be trusted ends the run by its ramp."""
     device = {**EXPERIMENT["device"], "fault": {"kind": kind, "at_sample": 9000}}
-    run = Run(tmp_path, device=device)
-    returned, printed = run.end()
+    run = started(tmp_path, device=device)
+    returned, printed = run.ended()
     assert returned == 3
     assert printed["code"] == "fault"
     assert words in printed["reason"]
@@ -170,8 +122,8 @@ def test_bad_sensor_ramps_down(tmp_path, kind, words):
 def test_device_that_fails_is_made_safe(tmp_path, kind):
     """When exchanges fail the last resort is used, and every sample before is in the file."""
     device = {**EXPERIMENT["device"], "fault": {"kind": kind, "at_sample": 9000}}
-    run = Run(tmp_path, device=device)
-    returned, printed = run.end()
+    run = started(tmp_path, device=device)
+    returned, printed = run.ended()
     assert returned == 3
     assert "simulated_terfenol" in printed["reason"]
     assert printed["output_safe"] is True
@@ -185,10 +137,10 @@ def test_device_that_fails_is_made_safe(tmp_path, kind):
 
 def test_killed_loop_is_noticed(tmp_path):
     """The supervisor drains the ring, makes the device safe, and closes the recording."""
-    run = Run(tmp_path)
-    run.await_samples()
+    run = started(tmp_path)
+    run.await_size()
     os.kill(run.loop_pid(), signal.SIGKILL)
-    returned, printed = run.end()
+    returned, printed = run.ended()
     assert returned == 3
     assert "the loop process died: killed by SIGKILL" in printed["reason"]
     recording = read(run.output)
@@ -199,8 +151,8 @@ def test_killed_loop_is_noticed(tmp_path):
 
 def test_killed_supervisor_takes_the_loop_along(tmp_path):
     """The loop ramps down and leaves when its supervisor dies; the file can be read."""
-    run = Run(tmp_path)
-    run.await_samples()
+    run = started(tmp_path)
+    run.await_size()
     loop = run.loop_pid()
     run.process.kill()
     run.process.communicate()
@@ -219,8 +171,8 @@ def test_killed_supervisor_takes_the_loop_along(tmp_path):
 
 def test_nothing_stays_in_memory(tmp_path):
     """The ring and the reference are gone after a run."""
-    run = Run(tmp_path, waveform=short(0.5))
-    assert run.end()[0] == 0
+    run = started(tmp_path, waveform=short(0.5))
+    assert run.ended()[0] == 0
     assert list(base_folder().iterdir()) == []
     assert_good_way_out(run)
 

@@ -11,19 +11,12 @@ import numpy as np
 import pytest
 
 from hilctl_drivers.profile import shipped_profiles
-from tests.faults.conftest import PATIENT_DEVICE, PATIENT_TIMING, each_kind
+from tests.faults.conftest import PATIENT_DEVICE, PATIENT_TIMING, each_kind, sine
 
 TIMEOUT_S = 2.0
 WITHOUT_PRIVILEGES = ["setpriv", "--inh-caps=-all", "--bounding-set=-all"]
 WATCHDOG_S = 4.0
-WAVEFORM = {
-    "kind": "sine",
-    "unit": "A",
-    "amplitude": 4.0,
-    "frequency_hz": 1.0,
-    "duration_s": 60.0,
-    "soft_start_s": 0.2,
-}
+WAVEFORM = sine(1.0, 60.0, soft_start_s=0.2)
 GUARDED = {"watchdog": {"timeout_s": WATCHDOG_S}}
 DEVICE = {
     "kind": "serial_dac",

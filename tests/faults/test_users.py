@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from tests.commands import hilctl
 from tests.faults.conftest import EXPERIMENT
 
 # A slow rate for a busy machine, and long enough for a second run.
@@ -114,14 +115,11 @@ def test_a_user_who_only_takes_the_name_keeps_nobody_out(nobody, device, run, tm
         assert squatter.stdout.readline() == "taken\n"
         mine = run(section, **PATIENT)
         device.log.await_events("DAC0", 40, mine.process)
-        words = [sys.executable, "-m", "hilctl", "safe", str(tmp_path / "run.yaml")]
-        refused = subprocess.run(words, capture_output=True, text=True, timeout=240)
-        assert refused.returncode == 2, refused.stderr  # by the run, which has the lock
+        words = ("safe", tmp_path / "run.yaml")
+        hilctl(*words, code=2)  # refused by the run, which has the lock
         mine.process.send_signal(signal.SIGINT)
         _, err = mine.process.communicate(timeout=240)
         assert f"process {squatter.pid} of nobody" in err
-        done = subprocess.run(words, capture_output=True, text=True, timeout=240)
-        assert done.returncode == 0, done.stderr
-        assert "confirmed" in done.stdout
+        assert "confirmed" in hilctl(*words).stdout
     finally:
         squatter.communicate("\n", timeout=60)

@@ -11,7 +11,7 @@ import yaml
 from hilctl.experiment.device_state import DeviceState
 from hilctl.run.start import checked_experiment
 from hilctl.run.supervisor import Supervisor
-from tests.faults.conftest import PATIENT_DEVICE, PATIENT_TIMING, each_kind
+from tests.faults.conftest import MODULE, PATIENT_DEVICE, PATIENT_TIMING, T7, each_kind, tcp
 
 EXPERIMENT = {
     "name": "exchanged",
@@ -23,30 +23,15 @@ EXPERIMENT = {
 TIMEOUT_S = 2.0
 WATCHDOG_S = 4.0
 FAULT_AT = 250
-T7 = {
-    "kind": "modbus_dac",
-    "profile": "labjack_t7",
-    "output": "DAC0",
-    "input": "AIN0",
-    "timeout_s": TIMEOUT_S,
-    "amplifier": {"gain_a_per_v": 4.0, "offset_a": -10.0},
-    "sensor": {"um_per_v": 12.5},
-    "watchdog": {"timeout_s": WATCHDOG_S},
-}
-MODULE = {
-    "kind": "modbus_dac",
-    "output": "OUT",
-    "input": "IN",
-    "timeout_s": TIMEOUT_S,
-    "amplifier": {"gain_a_per_v": 1.0},
-    "sensor": {"um_per_v": 12.5},
-    "watchdog": "none",
-}
+GUARDED = {"timeout_s": TIMEOUT_S, "watchdog": {"timeout_s": WATCHDOG_S}}
 
 
 def over_tcp(address: str) -> dict:
-    host, port = address.split(":")
-    return {**T7, "host": host, "tcp_port": int(port)}
+    return {**T7, **GUARDED, **tcp(address)}
+
+
+def over_rtu(profile: str, port: str) -> dict:
+    return {**MODULE, "timeout_s": TIMEOUT_S, "profile": profile, "serial_port": port}
 
 
 def left() -> DeviceState:
@@ -118,8 +103,7 @@ def test_rtu_fault_ends_the_run(emulate, run, profile, fault, words, state):
     """The same on a serial line, where an unplugged adapter removes its port."""
     module = profile("rtu_module")
     device = emulate(module, "--fault", f"{fault}@120")
-    options = {**MODULE, "profile": module, "serial_port": device.address}
-    started = run(options, sample_rate_hz=150)
+    started = run(over_rtu(module, device.address), sample_rate_hz=150)
     printed = started.end()
     writes = device.log.events("OUT")
     assert printed["output_state"] == state
@@ -181,7 +165,7 @@ def test_profile_exchanged_after_the_check_changes_nothing(emulate, tmp_path, pr
     device = emulate(profile("rtu_module"))
     mine = tmp_path / "mine.yaml"
     mine.write_text(Path(profile("rtu_module")).read_text())
-    section = {**MODULE, "profile": mine.name, "serial_port": device.address}
+    section = over_rtu(mine.name, device.address)
     waveform = {**EXPERIMENT["waveform"], "duration_s": 0.5}
     path = tmp_path / "run.yaml"
     changes = {"sample_rate_hz": 50, "device": section, "waveform": waveform}

@@ -130,7 +130,7 @@ def rewritten(records: list[object], chance: random.Random) -> bytes:
 
 def changed_message(record: Message, topic: str, chance: random.Random) -> Message:
     """Return a message of a topic with one field that is wrong."""
-    decoded = schema.message(schema.TOPICS[topic])
+    decoded = schema.message_class(schema.TOPICS[topic])()
     with suppress(DecodeError):  # its channel was given another topic before
         decoded.ParseFromString(record.data)
     field = chance.choice(decoded.DESCRIPTOR.fields)
@@ -260,7 +260,7 @@ def other_model(path: Path, chance: random.Random) -> bytes:
             times = each.create_time, each.log_time
             records[place] = Attachment(*times, each.name, each.media_type, text.encode())
         if isinstance(each, Message) and topics[each.channel_id] == "/samples":
-            block = schema.message("SampleBlock")
+            block = schema.message_class("SampleBlock")()
             block.ParseFromString(each.data)
             if block.previous_command:
                 values = [chance.choice((*VALUES, chance.uniform(-9, 9))) for _ in range(size)]

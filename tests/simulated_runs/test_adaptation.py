@@ -60,7 +60,6 @@ def test_offset_and_gain_that_have_changed_are_taken_out(run, model, rate):
 
 
 def test_parameters_are_recorded_and_said(run):
-    """In events, in the result and in the report: the same."""
     result, recording = run(STAGED, "waveform.duration_s=1.5", *WRONG, ADAPTATION)
     events = [event for event in recording.events if event.code == ADAPTED]
     assert len(events) == 2
@@ -69,7 +68,6 @@ def test_parameters_are_recorded_and_said(run):
 
 
 def test_an_integrator_keeps_the_offset(run):
-    """Both together: it takes the offset, and adaptation the gain."""
     integral = "feedback={kind: integral, bandwidth_hz: 5.0, limit_um: 10.0}"
     result, recording = run(
         STAGED,
@@ -84,7 +82,6 @@ def test_an_integrator_keeps_the_offset(run):
 
 
 def test_noise_of_the_rest_is_taken(run):
-    """With a condition nothing of the sensor need be known."""
     quick = "condition={cycles: 3, frequency_hz: 20.0}"
     setting = "adaptation={time_constant_s: 0.2}"
     result, recording = run(STAGED, "waveform.duration_s=1.0", *WRONG, quick, setting)
@@ -94,7 +91,6 @@ def test_noise_of_the_rest_is_taken(run):
 
 @pytest.mark.parametrize("kind", ["sensor_inverted", "sensor_frozen"])
 def test_a_broken_sensor_does_no_harm(run, kind):
-    """The parameters stay in their bounds, and the run replays."""
     fault = f"device.fault={{kind: {kind}, at_sample: 20000}}"
     result, recording = run(STAGED, "waveform.duration_s=1.0", fault, ADAPTATION)
     assert result.code == "completed"

@@ -11,8 +11,6 @@ from typer.testing import CliRunner
 from hilctl.analysis.replay import replay
 from hilctl.analysis.report import summarize
 from hilctl.cli.commands import app
-from hilctl.identify.data.cycles import average_cycle
-from hilctl.identify.data.records import SteadyLoop
 from hilctl.identify.evaluation import judge
 from hilctl.identify.fit_api import FitRequest
 from hilctl.identify.fit_model import fit_model
@@ -21,27 +19,16 @@ from hilctl.models.model_file import dump_model, load_model
 from hilctl.recording.reader import read
 from hilctl.run.start import checked_experiment, start_run
 from hilctl.run.unpaced import run_unpaced
-from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
+from hilctl_drivers.simulated.terfenol import TerfenolParameters
+from tests.rig import steady_loop
 
 CONFIG = Path(__file__).parents[2] / "configs" / "terfenol_sine_6a.yaml"
-RATE_HZ = 50_000.0
 BARE = replace(TerfenolParameters(), magnet_field_a_per_m=0.0)
 
 
 def loop(amplitude_a, frequency_hz, bias_a=0.0):
     """Return the averaged steady loop of a sine around a bias current."""
-    time = np.arange(round(6.0 / frequency_hz * RATE_HZ)) / RATE_HZ
-    wave = bias_a + amplitude_a * np.sin(2.0 * np.pi * frequency_hz * time)
-    command = np.minimum(time * frequency_hz, 1.0) * wave
-    displacement_um, current_a = np.empty_like(command), np.empty_like(command)
-    TerfenolActuator(BARE, RATE_HZ, seed=3).step(command, displacement_um, current_a)
-    period = RATE_HZ / frequency_hz
-    first = round(2 * period)
-    phase = np.arange(command.size - first) / period
-    signals = np.stack([command[first:], displacement_um[first:]])
-    label = f"{amplitude_a:g} A {frequency_hz:g} Hz around {bias_a:g} A"
-    v, y = average_cycle(label, phase, signals, period, 300)
-    return SteadyLoop(label, v, y, frequency_hz, RATE_HZ)
+    return steady_loop((amplitude_a, frequency_hz), bias_a=bias_a, parameters=BARE)
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +42,6 @@ def found():
 
 
 def test_displacement_repeats_twice_a_cycle_without_bias():
-    """The rig's loop over both wings is a butterfly: two equal rises, both above rest."""
     y = loop(6.0, 10.0).displacement_um
     assert np.abs(y[:150] - y[150:]).max() < 0.1 * np.ptp(y)
     assert y.min() > -0.2
@@ -70,7 +56,6 @@ def test_the_model_meets_both_wings(found):
 
 
 def test_one_model_holds_for_a_bias_that_it_was_not_found_on(found):
-    """Without magnets a bias is part of the command: one density then depends on it as the rig."""
     others = [
         loop(2.5, frequency_hz, bias_a) for bias_a in (2.5, 4.5) for frequency_hz in (10, 100)
     ]
@@ -78,7 +63,6 @@ def test_one_model_holds_for_a_bias_that_it_was_not_found_on(found):
 
 
 def test_butterflies_are_identified_by_the_command(tmp_path):
-    """From a recording of a rig without magnets, by ``hilctl identify``."""
     sines = [
         {"kind": "sine", "amplitude": a, "offset": b, "frequency_hz": 50.0, "duration_s": 0.3,
          "soft_start_s": 0.1, "soft_end_s": 0.1}

@@ -9,7 +9,6 @@ import os
 import re
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -32,6 +31,7 @@ from hilctl.studies.multi_run.trend import (
     headline,
     trends,
 )
+from tests.commands import ended, typed
 
 CAMPAIGNS = Path(__file__).parents[2] / "configs" / "campaigns"
 
@@ -95,15 +95,6 @@ class TestAmplitude:
     def table(self, ran):
         return ran("amplitude")[0]
 
-    @pytest.mark.parametrize("amplitude", [float(each) for each in range(1, 10)])
-    def test_the_area_is_linear_in_frequency(self, table, amplitude):
-        """4.2.3, figure 4.5 (b): r2 = 0.99; and it grows."""
-        chosen = table.where(amplitude=amplitude)
-        order = np.argsort(chosen[FREQUENCY])
-        frequency, area = chosen[FREQUENCY][order], chosen["loop_area"][order]
-        assert r2(frequency, area) >= 0.99
-        assert (np.diff(area) > 0.0).all()
-
     @pytest.mark.parametrize("amplitude", [3.0, 7.0])
     def test_the_stroke_does_not_depend_on_frequency(self, table, amplitude):
         """Figure 4.5 (a)."""
@@ -129,15 +120,7 @@ class TestAmplitude:
         assert percent[2] == pytest.approx(6.4, abs=5.0)
         assert percent[8] == pytest.approx(17.31, abs=2.0)
 
-    def test_hysteresis_grows_with_frequency_at_every_amplitude(self, table):
-        """Figure 2.9."""
-        for amplitude in range(1, 10):
-            chosen = table.where(amplitude=float(amplitude))
-            order = np.argsort(chosen[FREQUENCY])
-            assert (np.diff(chosen["peak_hysteresis_percent"][order]) > 0.0).all()
-
     def test_the_reference_run_shows_no_drift(self, ran):
-        """A simulated rig at rest again has none but its noise."""
         drift = ran("amplitude")[1].drift
         assert drift.runs == 4
         assert abs(drift.peak_to_peak_percent) < 0.1
@@ -270,13 +253,11 @@ timing: {on_misses: warn, late_policy: skip}
 
 @pytest.mark.timeout(600)
 def test_killed_in_real_time_it_loses_one_run_and_goes_on(tmp_path):
-    """What was completed is not run again, and the coil's heat is not forgotten."""
     (tmp_path / "rig.yaml").write_text(RIG)
     (tmp_path / "few.yaml").write_text(FEW)
     runs = tmp_path / "runs"
-    words = [sys.executable, "-m", "hilctl", "campaign", str(tmp_path / "few.yaml"),
-             "--folder", str(runs)]  # fmt: skip
-    process = subprocess.Popen(words, env=os.environ, stdout=subprocess.DEVNULL)
+    command = typed("campaign", tmp_path / "few.yaml", "--folder", runs)
+    process = subprocess.Popen(command, env=os.environ, stdout=subprocess.DEVNULL)
     second = runs / "few-0002.mcap"
     deadline = time.monotonic() + 240.0
     while not (second.exists() and second.stat().st_size > 3000):
@@ -286,8 +267,7 @@ def test_killed_in_real_time_it_loses_one_run_and_goes_on(tmp_path):
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
     first = (runs / "few-0001.mcap").read_bytes()
-    done = subprocess.run(words, env=os.environ, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
+    ended(command, env=os.environ)
     assert (runs / "few-0001.mcap").read_bytes() == first
     with (runs / "few.csv").open(newline="") as stream:
         rows = list(csv.DictReader(stream))
@@ -349,7 +329,7 @@ class TestFiguresAndTrends:
         load = next(each for each in found.dimensions if each.name == "load")
         assert {line.direction for line in trends(found, NATURAL, load)} == {"falls"}
         assert all(np.ptp(line.y) < 0.1 * line.y.mean() for line in trends(found, DAMPING, load))
-        assert "natural frequency falls" in headline(found)
+        assert any("natural frequency falls" in line for line in headline(found))
 
     def test_hysteresis_before_and_after_stands_in_the_first_line(self, series):
         """Figure 6.13: 18.2 to 49.1 % before, 3.7 % at most after."""

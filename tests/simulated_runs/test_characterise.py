@@ -19,6 +19,7 @@ from hilctl.studies.characterise.characterisation_runner import (
     CharacterisationHost,
     CharacterisationRunner,
 )
+from tests.commands import hilctl
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 RIG = CONFIGS / "terfenol_sine_6a.yaml"
@@ -41,7 +42,6 @@ def characterised(path, settings, folder, output):
     ],
 )
 def test_a_rig_of_any_physics_gets_a_model(tmp_path, physics, within_percent):
-    """On a random reference that no fit saw; so does a sine under another noise."""
     model = tmp_path / "model.yaml"
     other = [] if physics == "terfenol" else [f"device.physics={physics}"]
     found = characterised(RIG, other, tmp_path / "runs", model)
@@ -82,7 +82,6 @@ def test_a_piezo_that_begins_at_0_v_gets_a_model(tmp_path):
     ],
 )
 def test_what_is_wrong_with_a_rig_is_named(tmp_path, setting, code):
-    """Before anything large is tried."""
     quick = ["sample_rate_hz=20000", "block=20"]
     campaign = CharacterisationRunner(
         RIG, [*quick, setting], tmp_path, None, CharacterisationHost(run=unpaced)
@@ -97,7 +96,6 @@ def test_what_is_wrong_with_a_rig_is_named(tmp_path, setting, code):
 
 
 def test_a_campaign_that_is_killed_loses_one_step(tmp_path):
-    """SIGKILL in real time; the same command then goes on, and Ctrl-C ends it by the safe ramp."""
     words = [
         sys.executable, "-m", "hilctl", "characterise", str(RIG), "--output",
         str(tmp_path / "model.yaml"), "--folder", str(tmp_path / "runs"),
@@ -132,9 +130,6 @@ def test_a_campaign_that_is_killed_loses_one_step(tmp_path):
 
 
 def test_programs_are_told_the_plan(tmp_path):
-    words = ["characterise", str(RIG), "--output", str(tmp_path / "m.yaml"), "--dry-run", "--json"]
-    done = subprocess.run(
-        [sys.executable, "-m", "hilctl", *words], capture_output=True, text=True, check=True
-    )
+    done = hilctl("characterise", RIG, "--output", tmp_path / "m.yaml", "--dry-run", "--json")
     assert json.loads(done.stdout)["rig_time_s"] < 80.0
     assert list(tmp_path.iterdir()) == []

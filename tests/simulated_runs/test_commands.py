@@ -1,8 +1,6 @@
 """Commands one after the other, as a user types them, and what comes of each."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -10,19 +8,13 @@ import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
+from tests import commands
+
 CONFIGS = Path(__file__).parents[2] / "configs"
 
 
 def hilctl(*arguments, code=0):
-    ended = subprocess.run(
-        [sys.executable, "-m", "hilctl", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        timeout=280,
-    )
-    assert ended.returncode == code, ended.stderr
-    assert "Traceback" not in ended.stderr
-    return ended.stdout
+    return commands.hilctl(*arguments, code=code).stdout
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +35,6 @@ def run(folder):
 
 
 def test_run_prints_its_result(run):
-    """A run ends with its report; nothing is missing and the output is safe."""
     _, result = run
     assert result["code"] == "completed"
     assert result["output_safe"] is True
@@ -55,7 +46,6 @@ def test_run_prints_its_result(run):
 
 
 def test_report_is_what_run_printed(run):
-    """The report of the file alone has the same figures."""
     path, result = run
     report = json.loads(hilctl("report", path, "--json"))
     for key in ("samples", "dropped", "peak_hysteresis_percent", "peak_to_peak_um", "loop_area",
@@ -64,7 +54,6 @@ def test_report_is_what_run_printed(run):
 
 
 def test_page_is_written_once(run, folder):
-    """The page is self-contained, and an existing one is not replaced unasked."""
     path, _ = run
     page = folder / "run.html"
     hilctl("report", path, "--html", page)
@@ -78,7 +67,6 @@ def test_page_is_written_once(run, folder):
 
 
 def test_replay_is_identical(run):
-    """The recorded reference gives the recorded commands again, bit for bit."""
     path, _ = run
     result = json.loads(hilctl("replay", path, "--json"))
     assert result["identical"] is True
@@ -95,7 +83,6 @@ def test_replay_with_another_model(run):
 
 
 def test_export_agrees_with_an_independent_reader(run, folder):
-    """What is exported is what the stock MCAP reader decodes."""
     path, _ = run
     hilctl("export", path, folder / "run.npz")
     exported = np.load(folder / "run.npz")
@@ -117,12 +104,10 @@ def test_check_moves_nothing(folder):
 
 
 def test_schema_is_current():
-    """The schema beside the experiments is the one that the code prints."""
     assert hilctl("schema") == (CONFIGS / "schema.json").read_text()
 
 
 def test_identify_from_a_recording(folder):
-    """Recorded loops give a model file that a run can use."""
     loops, model = folder / "piezo.mcap", folder / "piezo.yaml"
     hilctl("run", CONFIGS / "identify_piezo.yaml", "--output", loops)
     fit = json.loads(hilctl("identify", loops, "--model", "ppi", "--output", model, "--json"))

@@ -1,8 +1,6 @@
 """The comparison that the dissertation makes (section 4.5), on the simulated rig."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -13,6 +11,7 @@ from hilctl.comparison.simulated_trials import TrialDevice
 from hilctl.experiment.load import load_experiment
 from hilctl.recording.reader import read
 from hilctl.run.start import start_run
+from tests.commands import hilctl
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 
@@ -29,24 +28,7 @@ def models(folder):
     loops, page = folder / "loops.mcap", folder / "models.html"
     run = start_run(CONFIGS / "identify_omega_chapter4.yaml", [], loops, False, lambda _: None)
     assert run.code == "completed"
-    ended = subprocess.run(
-        [
-            sys.executable,
-            "-m",
-            "hilctl",
-            "compare",
-            loops,
-            "--html",
-            page,
-            "--save",
-            folder,
-            "--json",
-        ],
-        capture_output=True,
-        text=True,
-        timeout=240,
-    )
-    assert ended.returncode == 0, ended.stderr
+    ended = hilctl("compare", loops, "--html", page, "--save", folder, "--json")
     return {model["name"]: model for model in json.loads(ended.stdout)["models"]}
 
 
@@ -70,7 +52,6 @@ def test_without_rate_or_deadbands_the_model_error_is_several_times_larger(model
 
 
 def test_every_other_model_is_worse_over_the_band(models):
-    """No rate-independent or symmetric model, however many weights it has, comes near Omega's."""
     others = set(models) - {"integrated", "staged"}
     assert len(others) == 9
     for name in others:
@@ -95,7 +76,6 @@ def test_compensated_the_order_is_the_same(models):
 
 @pytest.mark.parametrize("name", ["preisach", "kp"])
 def test_a_saved_model_runs_like_any_other(models, folder, name):
-    """A run with its inverse ends well, comes to what a trial does, and replays bit for bit."""
     path = folder / f"{name}.mcap"
     settings = [f"compensator.model={folder / name}.yaml", "waveform.frequency_hz=100",
                 "waveform.duration_s=0.5"]  # fmt: skip
@@ -112,7 +92,6 @@ def test_a_saved_model_runs_like_any_other(models, folder, name):
 
 
 def test_the_page_is_written(models, folder):
-    """Table and figure of all models in one file."""
     text = (folder / "models.html").read_text()
     assert all(name in text for name in models)
     assert text.count("<svg") == 1

@@ -29,7 +29,6 @@ def sweep(tmp_path_factory, compiled):
 
 
 def test_nothing_is_lost_at_50_khz(sweep):
-    """Every sample of the waveform is in the file."""
     assert sweep.dropped == 0
     assert sweep.samples == 420_000
 

@@ -34,7 +34,6 @@ def test_each_is_expected_and_listed():
 
 @pytest.mark.parametrize("name", EXPECTED)
 def test_example(name, tmp_path):
-    """From an empty folder, without a display."""
     text, written = EXPECTED[name]
     script = EXAMPLES / f"{name}.py"
     assert len(CELL.findall(script.read_text())) >= 3

@@ -10,7 +10,6 @@ BUDGET = "set: {limits.rms_current_a: 1.3, limits.thermal_time_constant_s: 2.0}\
 
 
 def test_processes_give_the_table_of_one(tmp_path, monkeypatch):
-    """To the last bit, with the heat that goes from run to run and the noise of each."""
     monkeypatch.setattr(
         "hilctl.studies.campaign.campaign_runner.write_series", lambda _series, path: path.touch()
     )

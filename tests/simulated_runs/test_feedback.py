@@ -63,10 +63,6 @@ def rms_error_percent(recording):
     ids=["drift", "strain"],
 )
 def test_what_the_model_does_not_know_is_taken_out(run, model, wrong):
-    """Drift, or a tenth too much gain, matters at most a fifth as much; a replay gives the bits.
-
-    One compensator looks ahead, the other does not.
-    """
     plain, plainly_recorded = run(model, wrong)
     result, recording = run(model, wrong, FEEDBACK)
     assert plain.code == result.code == "completed"
@@ -75,7 +71,6 @@ def test_what_the_model_does_not_know_is_taken_out(run, model, wrong):
 
 
 def test_an_integrator_takes_out_the_offset_of_small_loops(run_blocks):
-    """At a quarter of the stroke most of the error is an offset, which is taken out."""
     quarter = ("waveform.amplitude=10.2", "waveform.offset=0.0", "waveform.duration_s=2.0")
     plain = run_blocks(*quarter, DRIFT)
     recording = run_blocks(*quarter, DRIFT, INTEGRAL)
@@ -86,7 +81,6 @@ def test_an_integrator_takes_out_the_offset_of_small_loops(run_blocks):
 
 
 def test_the_input_is_recorded_with_its_correction(run):
-    """The recorded input is the reference and a correction within its limit; the ramp has none."""
     _, recording = run(OMEGA, DRIFT, FEEDBACK.replace("limit_um: 10.0", "limit_um: 2.0"))
     samples = recording.samples
     ramp = (samples.flags & Flag.RAMP) != 0
@@ -96,7 +90,6 @@ def test_the_input_is_recorded_with_its_correction(run):
 
 
 def test_a_lost_sensor_ends_the_run_by_its_interlock(run):
-    """No command is made of a reading that is not a number: the run leaves by the ramp at once."""
     lost = "device.fault={kind: sensor_nan, at_sample: 1500}"
     result, recording = run(OMEGA, FEEDBACK, lost)
     samples = recording.samples
@@ -111,7 +104,6 @@ def test_a_lost_sensor_ends_the_run_by_its_interlock(run):
     "model", [pytest.param(OMEGA, marks=pytest.mark.long), STAGED], ids=["omega", "staged"]
 )
 def test_a_sensor_of_the_wrong_sign_ends_the_run(run, model):
-    """By the safe ramp, once the correction has grown to its limit; a right one does not."""
     inverted = "device.fault={kind: sensor_inverted, at_sample: 0}"
     result, recording = run(model, FEEDBACK, inverted)
     assert (result.code, result.safe) == ("fault", True)

@@ -4,54 +4,23 @@ No public measured current-to-displacement record of a magnetostrictive actuator
 figures rest on the simulation; those beside them are of the dissertation's own rig.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
 import numpy as np
 import pytest
 
-from hilctl.base.types import F64
-from hilctl.identify.data.cycles import average_cycle
 from hilctl.identify.data.records import SteadyLoop
 from hilctl.identify.evaluation import judge
 from hilctl.identify.fit_api import FitRequest
 from hilctl.identify.fit_model import FittedModel, fit_model
 from hilctl.identify.settings import FitKind, FitSettings
 from hilctl.signals.cycle_metrics import fold, peak_hysteresis_percent
-from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
+from hilctl_drivers.simulated.terfenol import TerfenolParameters
+from tests.rig import RATE_HZ, driven, steady_loop
 
-RATE_HZ = 50_000.0
-Tone = tuple[float, float]
-"""Amplitude in A, frequency in Hz."""
-
-
-def drive(command_a: Callable[[F64], F64], seconds: float, seed: int = 3) -> tuple[F64, F64]:
-    """Return a current and the displacement that the rig gives."""
-    command = np.ascontiguousarray(command_a(np.arange(round(seconds * RATE_HZ)) / RATE_HZ))
-    displacement_um, current_a = np.empty_like(command), np.empty_like(command)
-    actuator = TerfenolActuator(TerfenolParameters(), RATE_HZ, seed=seed)
-    actuator.step(command, displacement_um, current_a)
-    return command, displacement_um
-
-
-@cache
-def measured_loop(*tones: Tone, points: int = 300) -> SteadyLoop:
-    """Return the rig's averaged cycle under a sum of tones; the first is the fundamental."""
-    fundamental_hz = tones[0][1]
-
-    def command_a(time: F64) -> F64:
-        start = np.clip(time * fundamental_hz, 0.0, 1.0)
-        return start * sum(a * np.sin(2.0 * np.pi * f * time) for a, f in tones)
-
-    command, displacement_um = drive(command_a, 6.0 / fundamental_hz)
-    period = RATE_HZ / fundamental_hz
-    first = round(2 * period)
-    phase = np.arange(command.size - first) / period
-    values = np.stack([command[first:], displacement_um[first:]])
-    label = " + ".join(f"{a:g} A {f:g} Hz" for a, f in tones)
-    v, y = average_cycle(label, phase, values, period, points)
-    return SteadyLoop(label, v, y, fundamental_hz, RATE_HZ)
+measured_loop = cache(steady_loop)
 
 
 def sines(
@@ -99,11 +68,9 @@ def test_omega_holds_for_other_inputs() -> None:
 
 def test_omega_at_full_rate_is_as_good_as_on_its_loops() -> None:
     """Run sample by sample at 50 kHz, the model is as near to the rig as the loops said."""
-
-    def command_a(time: F64) -> F64:
-        return np.clip(time * 250.0, 0.0, 1.0) * 6.0 * np.sin(2.0 * np.pi * 250.0 * time)
-
-    command, displacement_um = drive(command_a, 6.0 / 250.0)
+    time = np.arange(round(6.0 / 250.0 * RATE_HZ)) / RATE_HZ
+    command = np.clip(time * 250.0, 0.0, 1.0) * 6.0 * np.sin(2.0 * np.pi * 250.0 * time)
+    displacement_um = driven(command)
     modelled_um = published_omega().model.forward(RATE_HZ).process(command)
     steady = slice(round(2.0 * RATE_HZ / 250.0), None)
     error_um = (modelled_um - displacement_um)[steady]
@@ -148,7 +115,7 @@ def compensated(frequency_hz: float) -> tuple[float, float]:
     inverse = staged().model.inverse(RATE_HZ)
     ahead = np.append(reference_um[inverse.preview :], np.full(inverse.preview, reference_um[-1]))
     command = inverse.process(ahead)
-    _, displacement_um = drive(lambda _: command, time.size / RATE_HZ, seed=11)
+    displacement_um = driven(command, seed=11)
     index = np.arange(time.size)[-round(4 * period) :]
     cycle = fold(index, period, (reference_um[index], displacement_um[index]))
     error = np.max(np.abs(cycle.signals[1] - cycle.signals[0]))

@@ -104,7 +104,6 @@ def test_without_its_events_it_is_not_replayed(switched):
     ],
 )
 def test_what_learns_from_the_error_stands_still_meanwhile(learns, tmp_path, monkeypatch):
-    """The compensator's input repeats while it is out, and its way back is clean."""
     rate_hz, cycle = 10_000, 500
     settings = [f"sample_rate_hz={rate_hz}", "block=10", "waveform.amplitude=15.0", learns]
     settings += ["waveform.frequency_hz=20", "waveform.duration_s=2.5"]

@@ -2,11 +2,12 @@
 
 import json
 import os
-import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
+
+from tests.commands import ended
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 STAGED = "compensator.model=" + str(CONFIGS / "models" / "terfenol_staged_preisach.yaml")
@@ -49,15 +50,12 @@ print(json.dumps({"late": late, "samples": samples}))
 
 
 def test_none_is_loaded_while_a_loop_runs(tmp_path):
-    """The first call of a kernel reads it from the disk: milliseconds that no tick has."""
     runs = [
         (str(CONFIGS / name), [*settings, f"waveform.duration_s={seconds}"])
         for name, settings, seconds in RUNS
     ]
     command = [sys.executable, "-P", "-c", SCRIPT, str(tmp_path), json.dumps(runs)]
-    ended = subprocess.run(command, capture_output=True, text=True, check=False, timeout=240.0)
-    assert ended.returncode == 0, ended.stderr
-    found = json.loads(ended.stdout)
+    found = json.loads(ended(command).stdout)
     assert found["samples"] > 50_000
     assert found["late"] == []
 
@@ -80,14 +78,11 @@ np.save(path.with_suffix(".npy"), np.array(list(columns.values())))
 
 
 def test_a_run_is_the_same_where_numba_is_told_not_to_compile(tmp_path):
-    """As for a debugger; bit for bit, though then there is no one call for a whole tick."""
     found = []
     for name, told in (("compiled", {}), ("plain", {"NUMBA_DISABLE_JIT": "1"})):
         path = tmp_path / f"{name}.mcap"
         command = [sys.executable, "-P", "-c", UNCOMPILED, str(CONFIGS / RUNS[0][0]), str(path)]
-        around = {**os.environ, **told}
-        ended = subprocess.run(command, capture_output=True, text=True, env=around, check=False)
-        assert ended.returncode == 0, ended.stderr
+        ended(command, env={**os.environ, **told})
         found.append(np.load(path.with_suffix(".npy")))
     assert found[0].shape[1] >= 1000
     np.testing.assert_array_equal(*found)

@@ -126,14 +126,12 @@ def staged(tmp_path):
 
 
 def test_a_compensator_that_looks_ahead_is_corrected_too(tmp_path, staged):
-    """What it looks ahead at is the corrected reference, and that is what is recorded."""
     learned = learn(tmp_path / "runs", at(100.0, staged))
     assert learned.check[0].error_percent <= 0.15
     assert replay(read(Path(learned.check[0].recording))).identical
 
 
 def test_a_run_without_real_time_is_the_same_run(tmp_path, staged):
-    """In this process or in the loop's own: the same commands and displacements, bit for bit."""
     settings = at(100.0, staged)
     start_run(SINE, settings, tmp_path / "paced.mcap", False, lambda progress: None)
     run_unpaced(checked_experiment(SINE, settings), tmp_path / "unpaced.mcap")
@@ -145,7 +143,6 @@ def test_a_run_without_real_time_is_the_same_run(tmp_path, staged):
 
 
 def test_a_run_with_a_correction_keeps_it_and_replays(tmp_path):
-    """Run by run through the supervisor; the recording holds the correction and the input."""
     learned = learn(tmp_path, at(100.0), run=paced, cycles=1)
     recording = read(tmp_path / "run-01.mcap")
     assert load_correction(tmp_path / "run-01.yaml").cycles[0].label == "sine 40.8 um 100 Hz"
@@ -157,7 +154,6 @@ def test_a_run_with_a_correction_keeps_it_and_replays(tmp_path):
 
 
 def test_the_command_writes_a_correction_that_a_run_uses(tmp_path):
-    """From the command line: learn, then run longer under other noise."""
     output = tmp_path / "c.yaml"
     flags = [f"--set={setting}" for setting in at(100.0)]
     command = ["learn", str(SINE), "--fast", "--cycles=6", f"--output={output}"]
@@ -174,7 +170,6 @@ def test_the_command_writes_a_correction_that_a_run_uses(tmp_path):
 
 
 def test_a_fault_later_on_keeps_what_was_learned(tmp_path):
-    """The best so far is the result, with the reason; nothing runs after the fault."""
     runs = []
 
     def breaks(path, settings, output):
@@ -191,7 +186,6 @@ def test_a_fault_later_on_keeps_what_was_learned(tmp_path):
 
 
 def test_learning_goes_on_from_a_correction(tmp_path):
-    """An experiment that has one starts where that left off, also through its own file."""
     first = IlcSession(SINE, at(100.0), tmp_path / "a", unpaced).learn(4, lambda rows: None)
     file = tmp_path / "a" / "run-04.yaml"
     settings = at(100.0, f"compensator.correction={file}")
@@ -201,7 +195,6 @@ def test_learning_goes_on_from_a_correction(tmp_path):
 
 
 def test_what_can_not_be_learned_is_refused_before_anything_moves(tmp_path):
-    """No compensator, or too short a run: the message says what is needed."""
     plain = CliRunner().invoke(
         app,
         ["learn", str(CONFIGS / "terfenol_sine_6a_uncompensated.yaml"), "--output", "c.yaml"],

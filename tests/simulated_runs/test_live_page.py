@@ -76,8 +76,6 @@ async def messages(url):
 @pytest.mark.long
 @pytest.mark.parametrize("kill", [False, True])
 def test_a_run_is_seen_and_stopped_by_its_page(tmp_path, kill):
-    """STOP is acknowledged, and holds though the page's server dies at once."""
-
     async def looked():
         with LiveRun(tmp_path) as run:
             seen = messages(await run.url())

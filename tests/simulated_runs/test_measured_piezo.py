@@ -2,8 +2,6 @@
 
 import json
 import shlex
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -11,6 +9,7 @@ import yaml
 
 from hilctl.models.model_file import load_model
 from hilctl.models.plays import PpiModel
+from tests import commands
 
 DATA = Path(__file__).parents[3] / "shared" / "data" / "yan9a_DBO"
 FIT = shlex.split(
@@ -26,14 +25,7 @@ pytestmark = [
 
 
 def hilctl(*arguments):
-    ended = subprocess.run(
-        [sys.executable, "-m", "hilctl", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert ended.returncode == 0, ended.stderr
-    return json.loads(ended.stdout)
+    return json.loads(commands.hilctl(*arguments).stdout)
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +51,6 @@ def test_model_meets_its_bounds(found):
 
 
 def test_measured_reference_runs_through_it(found, tmp_path):
-    """The experimenters' own reference, through the inverse, on a stage fitted to other data."""
     _, compensator = found
     stage_path = tmp_path / "stage.yaml"
     test = DATA / "Test_Vi_Do_Di.dat"

@@ -2,7 +2,6 @@
 
 import json
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,13 +10,14 @@ import pytest
 from hilctl.analysis.replay import replay
 from hilctl.base.events import OFFSET
 from hilctl.recording.reader import read
+from tests.commands import typed
 
 CONFIG = Path(__file__).parents[2] / "configs" / "modbus_labjack_t7_stream.yaml"
 
 
 def start(*words):
-    command = [sys.executable, "-m", "hilctl", *map(str, words)]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    pipe = subprocess.PIPE
+    return subprocess.Popen(typed(*words), stdout=pipe, stderr=pipe, text=True)
 
 
 @pytest.fixture
@@ -47,7 +47,6 @@ def ran(port, path, *more):
 
 
 def test_every_sample_is_put_out_and_answered(port, tmp_path):
-    """At a rate that a busy machine keeps: none is missing, and the loop follows its reference."""
     path = tmp_path / "run.mcap"
     changes = {"device.tcp_port": port, "sample_rate_hz": 10000, "waveform.duration_s": 2.0}
     settings = [word for key, value in changes.items() for word in ("--set", f"{key}={value}")]
@@ -66,7 +65,6 @@ def test_every_sample_is_put_out_and_answered(port, tmp_path):
 
 
 def test_an_integrator_and_history_through_a_fifo(port, tmp_path):
-    """The integrator takes out what the model is off by; the next run begins where it ended."""
     integral = "feedback={kind: integral, bandwidth_hz: 0.012, limit_um: 15.0}"
     before = ("condition={cycles: 3}", "compensator.offset=measured", "device.sensor.offset_um=2.0")
     _, said = ran(port, tmp_path / "a.mcap", *before, integral)

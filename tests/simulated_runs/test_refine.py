@@ -26,7 +26,6 @@ def run(path, model, frequency_hz, amplitude_um, seed):
 
 
 def test_compensated_runs_make_a_model_better_on_another_reference(tmp_path):
-    """Runs at other frequencies and amplitudes; the one judged is not among them, and replays."""
     given = ((20.0, 34.0), (60.0, 30.0), (120.0, 34.0), (150.0, 20.0))
     runs = [
         run(tmp_path / f"{i}.mcap", STAGED, frequency_hz, size, seed=i + 2)

@@ -7,7 +7,6 @@ must stay rounding. Each set of kernels runs in a process of its own.
 import ctypes
 import json
 import os
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -17,16 +16,14 @@ import pytest
 import scipy
 
 from hilctl.base.types import F64
-from hilctl.identify.data.cycles import average_cycle
-from hilctl.identify.data.records import History, SteadyLoop
+from hilctl.identify.data.records import History
 from hilctl.identify.fit_api import FitRequest
 from hilctl.identify.fit_model import fit_model
 from hilctl.identify.registry import CATALOGUE, HISTORIES
 from hilctl.identify.settings import FitSettings
-from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
+from tests.commands import ended
+from tests.rig import RATE_HZ, driven, steady_loop
 
-RATE_HZ = 50_000.0
-POINTS = 64
 TONES = [(a, f) for a in (3.0, 7.0) for f in (10.0, 100.0, 200.0)]
 FITS: dict[str, dict[str, Any]] = {
     **{kind: {"kind": kind} for kind in CATALOGUE if kind != "field"},
@@ -43,24 +40,6 @@ NEEDS = {"Haswell": "avx2", "Zen": "avx2", "SkylakeX": "avx512f"}
 CLOSE = 1e-6  # relative to the largest of the values that belong together
 
 
-def measured(amplitude_a: float, frequency_hz: float) -> SteadyLoop:
-    """Return the rig's averaged cycle under a sine."""
-    time = np.arange(round(5.0 / frequency_hz * RATE_HZ)) / RATE_HZ
-    start = np.clip(time * frequency_hz, 0.0, 1.0)
-    command = start * amplitude_a * np.sin(2.0 * np.pi * frequency_hz * time)
-    displacement_um, current_a = np.empty_like(command), np.empty_like(command)
-    TerfenolActuator(TerfenolParameters(), RATE_HZ, seed=3).step(
-        command, displacement_um, current_a
-    )
-    period = RATE_HZ / frequency_hz
-    first = round(2 * period)
-    phase = np.arange(command.size - first) / period
-    signals = np.stack([command[first:], displacement_um[first:]])
-    v, y = average_cycle("rig", phase, signals, period, POINTS)
-    label = f"{amplitude_a:g} A {frequency_hz:g} Hz"
-    return SteadyLoop(label, v, y, frequency_hz, RATE_HZ)
-
-
 def history() -> History:
     """Return what the rig does with a random command from rest, small parts after large ones."""
     rng = np.random.default_rng(4)
@@ -68,11 +47,7 @@ def history() -> History:
     sines = [np.sin(2 * np.pi * f * time + rng.uniform(0, 6)) for f in rng.uniform(4.0, 200.0, 12)]
     command = np.sum(sines, axis=0) * np.minimum(time / 0.02, 1.0)
     command = np.ascontiguousarray(6.0 * command / np.abs(command).max())
-    displacement_um, current_a = np.empty_like(command), np.empty_like(command)
-    TerfenolActuator(TerfenolParameters(), RATE_HZ, seed=5).step(
-        command, displacement_um, current_a
-    )
-    return History("random", command, displacement_um, RATE_HZ)
+    return History("random", command, driven(command, seed=5), RATE_HZ)
 
 
 def kernels_in_use() -> list[str]:
@@ -92,7 +67,7 @@ def kernels_in_use() -> list[str]:
 
 def fit_all() -> None:
     """Fit every kind and print all models: what the processes of this test do."""
-    loops, whole = [measured(*tone) for tone in TONES], [history()]
+    loops, whole = [steady_loop(tone, points=64, cycles=5) for tone in TONES], [history()]
     models = {}
     for name, choices in FITS.items():
         records = whole if CATALOGUE[choices["kind"]].data == HISTORIES else loops
@@ -126,15 +101,12 @@ def models_by() -> dict[str, dict[str, object]]:
 
 
 def run_with(kernels: str, *options: str) -> dict[str, object]:
-    """Run this file in a process of its own that takes these kernels; return what it printed."""
-    done = subprocess.run(
-        [sys.executable, __file__, *options],
+    """Run this module in a process of its own that takes these kernels; return what it printed."""
+    done = ended(
+        [sys.executable, "-m", "tests.simulated_runs.test_same_model_everywhere", *options],
+        cwd=Path(__file__).parents[2],
         env={**os.environ, "OPENBLAS_CORETYPE": kernels, "OPENBLAS_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-        timeout=300,
     )
-    assert done.returncode == 0, done.stderr
     answer: dict[str, object] = json.loads(done.stdout)
     return answer
 
@@ -144,7 +116,6 @@ def run_with(kernels: str, *options: str) -> dict[str, object]:
 def test_a_model_is_the_same_on_every_processor(
     models_by: dict[str, dict[str, object]], name: str
 ) -> None:
-    """Each parameter, to a millionth of the largest of its kind."""
     if len(models_by) < 2:
         pytest.skip("this processor has one set of kernels only")
     first, *others = models_by.values()

@@ -3,7 +3,6 @@
 import json
 import shutil
 import subprocess
-import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ from hilctl.analysis.replay import replay
 from hilctl.recording.reader import read
 from hilctl_drivers.profile import shipped_profiles
 from tests.benchmark.attacked import make_real_time
+from tests.commands import typed
 
 ROOT = Path(__file__).parents[2]
 MODEL = ROOT / "configs" / "models" / "terfenol_omega.yaml"
@@ -37,13 +37,8 @@ class Wire:
     """One connection to the rig.
 
     Attributes:
-        profile: Shipped profile, or a file that :func:`write_profiles` makes.
         device: The experiment's device section without profile and addresses.
-        rate_hz: Sample rate.
         ports: Keys of the device section that the emulator's addresses go to, in order.
-        words: More words for ``hilctl emulate``.
-        block: Samples per exchange.
-        per_cycle: Samples per cycle of the sine.
     """
 
     profile: str
@@ -76,10 +71,6 @@ LIKE_OTHERS = {"Modbus RTU", "SCPI, measured"}
 """Wires whose parts the others have, each in a run that takes its time."""
 
 
-def hilctl(*words: object) -> list[str]:
-    return [sys.executable, "-m", "hilctl", *map(str, words)]
-
-
 def write_profiles(folder: Path) -> None:
     """Write the profiles that are not shipped: float32 and function 23 over RTU, a DCON reader."""
     rtu = yaml.safe_load(shipped_profiles()["generic_float32"].read_text(encoding="utf-8"))
@@ -91,7 +82,7 @@ def write_profiles(folder: Path) -> None:
 @contextmanager
 def emulated(wire: Wire, folder: Path) -> Iterator[dict[str, Any]]:
     """Emulate a wire's device in a process; yield the device section that reaches it."""
-    command = hilctl("emulate", wire.profile, *wire.words)
+    command = typed("emulate", wire.profile, *wire.words)
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=folder) as process:
         try:
             assert process.stdout is not None
@@ -145,7 +136,7 @@ def write_experiment(path: Path, wire: Wire, device: dict[str, Any]) -> None:
 
 def run(path: Path) -> dict[str, Any]:
     """Run an experiment in processes of its own; return the JSON that it prints."""
-    command = hilctl("run", path, "--output", path.with_suffix(".mcap"), "--json")
+    command = typed("run", path, "--output", path.with_suffix(".mcap"), "--json")
     done = subprocess.run(command, stdout=subprocess.PIPE, text=True, cwd=path.parent)
     assert done.stdout, done.returncode
     found: dict[str, Any] = json.loads(done.stdout)
@@ -157,7 +148,6 @@ def run(path: Path) -> dict[str, Any]:
     [pytest.param(each, marks=pytest.mark.long if each in LIKE_OTHERS else ()) for each in WIRES],
 )
 def test_compensated_run_is_complete(tmp_path, name):
-    """Every sample of the waveform is recorded or counted, and the commands replay bit for bit."""
     wire = WIRES[name]
     write_profiles(tmp_path)
     path = tmp_path / "experiment.yaml"

@@ -31,18 +31,7 @@ _CYCLE = 2000
 
 
 class Changes:
-    """Changes of one run, requested from several threads.
-
-    Args:
-        checked: The experiment.
-        page: Shared with the loop.
-        clock: Monotonic time in s.
-        sleep: Waits for that many s.
-
-    Attributes:
-        gain: Final gain of the last change.
-        offset: Final offset of the last change.
-    """
+    """Changes of one run, requested from several threads; gain and offset are final values."""
 
     def __init__(
         self,
@@ -71,20 +60,7 @@ class Changes:
         over_s: float,
         inverse: InverseState | None = None,
     ) -> dict[str, Any]:
-        """Make a change when the loop has taken the previous one; None: unchanged.
-
-        Args:
-            gain: Factor of the reference.
-            offset: Added to the reference.
-            over_s: Duration of the change.
-            inverse: ``in`` or ``out``.
-
-        Returns:
-            The answer to the request.
-
-        Raises:
-            InputError: The change is refused; nothing has changed.
-        """
+        """Make a change when the loop has taken the previous one; None: unchanged."""
         if gain is None and offset is None and inverse is None:
             raise InputError("set: gain, offset or inverse is required")
         if inverse is not None:
@@ -124,11 +100,7 @@ class Changes:
         over_s: float,
         inverse: InverseState | None,
     ) -> dict[str, Any]:
-        """Write a change to the page; return the answer.
-
-        Raises:
-            InputError: The change is refused; nothing has changed.
-        """
+        """Write a change to the page; return the answer."""
         gain = self.gain if gain is None else gain
         offset = self.offset if offset is None else offset
         share = _SHARES.get(inverse, self._inverse_share)
@@ -166,12 +138,6 @@ def bound_refusal(checked: CheckedExperiment, gain: float, offset: float, *, byp
 
     The whole range of the reference counts, also samples that have passed. Slew and heat are not
     checked: limiter and interlocks enforce them.
-
-    Args:
-        checked: The experiment.
-        gain: Factor of the reference.
-        offset: Added to it.
-        bypassed: Whether the straight line contributes to the command.
     """
     low, high = sorted(gain * end + offset for end in checked.reference.span)
     problems = reference_problems(checked.loaded, checked.reference.unit, low, high)

@@ -57,11 +57,7 @@ def request(command: Command, **values: Any) -> dict[str, Any]:
 
 @contextmanager
 def short_path(path: Path) -> Iterator[str]:
-    """Provide a short path of a socket: the kernel accepts at most 107 bytes.
-
-    Raises:
-        OSError: The folder of the socket cannot be opened.
-    """
+    """Provide a short path of a socket: the kernel accepts at most 107 bytes."""
     folder = os.open(path.parent, os.O_PATH | os.O_DIRECTORY)
     try:
         yield f"/proc/self/fd/{folder}/{path.name}"
@@ -83,17 +79,9 @@ def ask(
     clock: Callable[[], float] = time.monotonic,
     sleep: Callable[[float], None] = time.sleep,
 ) -> dict[str, Any]:
-    """Send a request to a run; repeat it if the connection is dropped.
+    """Send a request to a run; return the answer.
 
-    Args:
-        path: Socket of the run.
-        question: The request; sending it twice must have the effect of one.
-        timeout_s: Longest wait.
-        clock: Monotonic time in s.
-        sleep: Waits for that many s.
-
-    Returns:
-        The answer.
+    If the connection is dropped it is sent again, which must have the effect of one request.
 
     Raises:
         InputError: The run refuses the request.
@@ -146,10 +134,7 @@ def active_runs() -> list[RunFolder]:
 
 
 def find_run(name: str | None) -> RunFolder:
-    """Return a run by name.
-
-    Args:
-        name: Its name or the beginning of it; may be None if there is only one run.
+    """Return a run by its name or the beginning of it; without one, the only run.
 
     Raises:
         InputError: No run or several runs match.
@@ -215,14 +200,9 @@ def request_stop(run: RunFolder) -> bool:
         pass
     except OSError as error:
         raise RunError(f"{run.card.name}: can't be stopped: {error.strerror}") from None
-    return _end_guardian(run)
-
-
-def _end_guardian(run: RunFolder) -> bool:
     if not run.alive:
         return False
-    # A stop must not wait for NumPy.
-    from hilctl.run.processes import signal_guardian
+    from hilctl.run.processes import signal_guardian  # a stop must not wait for NumPy
 
     return signal_guardian(run, signal.SIGTERM)
 
@@ -234,12 +214,6 @@ def stop_runs(
     sleep: Callable[[float], None] = time.sleep,
 ) -> list[dict[str, Any]]:
     """Stop runs by their safe ramps, all at the same time.
-
-    Args:
-        chosen: The runs.
-        wait_s: Longest wait for the end of all.
-        clock: Monotonic time in s.
-        sleep: Waits for that many s.
 
     Returns:
         The card of each run with ``ended``, and ``error``: why the request failed, or empty.
@@ -272,12 +246,7 @@ def set_run(
 ) -> dict[str, Any]:
     """Change gain or offset of a running reference, or bypass its inverse; None: unchanged.
 
-    Args:
-        run: The run.
-        gain: Factor of the reference.
-        offset: Added to it, in the waveform's unit.
-        inverse: ``out`` replaces the inverse by a straight line, ``in`` enables it.
-        over_s: Duration of the change.
+    The inverse ``out`` is replaced by a straight line. The change takes ``over_s``.
 
     Raises:
         InputError: The run refuses the change.

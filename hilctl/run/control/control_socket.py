@@ -13,7 +13,6 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 from hilctl.base.errors import InputError, RunError
@@ -32,16 +31,7 @@ Answer = Callable[[bytes], Mapping[str, Any]]
 
 
 class ControlServer:
-    """Serve a socket that only its owner may use.
-
-    Args:
-        path: Path of the socket; its folder must be private.
-        answer: Answers requests.
-        request_s: Time in which a request must be complete.
-
-    Raises:
-        RunError: The socket cannot be made.
-    """
+    """Serve a socket that only its owner may use."""
 
     def __init__(self, path: Path, answer: Answer, request_s: float = _REQUEST_S) -> None:
         self._path, self._answer, self._request_s = path, answer, request_s
@@ -52,12 +42,7 @@ class ControlServer:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_error: object) -> None:
         self._closing.set()
         if self._thread.ident is not None:
             self._thread.join()
@@ -138,11 +123,7 @@ class _Handler(socketserver.BaseRequestHandler):
                 self.request.sendall(self._answer(line))
 
     def _read_line(self) -> bytes | None:
-        """Return the request; None if the client has sent nothing.
-
-        Raises:
-            TimeoutError: It is not complete in time.
-        """
+        """Return the request; None if the client has sent nothing."""
         deadline = time.monotonic() + self.server.request_s
         read = bytearray()
         while b"\n" not in read and len(read) <= MAX_BYTES:

@@ -28,10 +28,7 @@ class SetRequest(StrictModel):
     """Ramp gain or offset of the reference, or bypass or enable the inverse; None: unchanged.
 
     Attributes:
-        gain: Factor of the reference.
-        offset: Added to the reference, in the waveform's unit.
         inverse: ``out`` replaces the inverse by a straight line, ``in`` enables it.
-        over_s: Duration of the change.
     """
 
     command: Literal["set"]
@@ -48,11 +45,7 @@ def _one_line(text: str) -> str:
 
 
 class MarkRequest(StrictModel):
-    """Set a mark at the present sample.
-
-    Attributes:
-        text: Text of the mark.
-    """
+    """Set a mark at the present sample."""
 
     command: Literal["mark"]
     text: Annotated[str, Field(max_length=MAX_MARK), AfterValidator(_one_line)]
@@ -65,14 +58,7 @@ REQUESTS: TypeAdapter[StatusRequest | SetRequest | MarkRequest] = TypeAdapter(
 
 
 class Requests:
-    """Answer the requests to a run.
-
-    Args:
-        checked: The experiment.
-        folder: The run's folder.
-        page: Shared with the loop.
-        recording: Records events.
-    """
+    """Answer the requests to a run."""
 
     def __init__(
         self,
@@ -91,9 +77,6 @@ class Requests:
         """Return the answer to one line of JSON; a change waits for the previous one.
 
         Several threads may call it.
-
-        Raises:
-            InputError: The request is not valid, or refused; nothing has changed.
         """
         try:
             request = REQUESTS.validate_json(line)

@@ -56,11 +56,6 @@ class HangWatch:
 
     A stall of the whole computer stalls this process too, so silence counts only after several
     polls.
-
-    Args:
-        page: Shared with the loop.
-        limits: Longest silence.
-        is_stopped: Whether the loop's process is stopped.
     """
 
     def __init__(
@@ -74,11 +69,7 @@ class HangWatch:
         self._polls = 0
 
     def hangs(self, now_ns: int) -> bool:
-        """Poll once; return whether the loop has been silent for too long.
-
-        Args:
-            now_ns: Monotonic time.
-        """
+        """Poll once; return whether the loop has been silent for too long."""
         page = self._page
         heartbeat_ns, phase = page.get(PageField.LOOP_HEARTBEAT_NS), page.get(PageField.PHASE)
         watched = phase in {Phase.RUNNING, Phase.CLOSING, Phase.ENDED, Phase.FAILED}
@@ -119,17 +110,12 @@ class SafeAction:
     """Drive a device to its safe value in a thread until the result is final.
 
     Args:
-        page: Shared with the other processes of the run.
         device: Not open; each write opens a connection.
         goal: The safe value and the ramp to it.
-        hung: Whether the loop was killed.
         prepare: Called first in that thread.
 
     Attributes:
         failed: Error of this process, so that another one must try; may be empty.
-
-    Raises:
-        RuntimeError: No thread can be started.
     """
 
     def __init__(
@@ -179,16 +165,7 @@ class SafeAction:
 
 
 class Guardian:
-    """Watch the loop, and set the output to its safe value if the loop died or hangs.
-
-    Args:
-        ring: Shared with loop and supervisor.
-        device: Not open.
-        job: What to guard.
-        pidfd: A pidfd of the loop's process.
-        loop: Its process number.
-        prepare: Called first in the thread that drives the device.
-    """
+    """Watch the loop, and set the output to its safe value if the loop died or hangs."""
 
     def __init__(
         self,
@@ -207,11 +184,7 @@ class Guardian:
         self._death.register(pidfd, select.POLLIN)
 
     def watch(self) -> bool:
-        """Watch until the loop has ended and the output is safe.
-
-        Returns:
-            False if this process cannot drive the device, so that another one must.
-        """
+        """Watch until the output is safe; return False if another process must drive the device."""
         page = self._page
         page.put(PageField.GUARDIAN_HEARTBEAT_NS, time.monotonic_ns())
         # After the heartbeat: an old one would count as silence.
@@ -262,18 +235,7 @@ def act(
     hung: bool,
     prepare: Callable[[], object] = lambda: None,
 ) -> bool:
-    """Drive the device until the result is final, or SIGTERM ends it.
-
-    Args:
-        page: Shared with the supervisor.
-        device: Not open.
-        goal: The safe value and the ramp to it.
-        hung: Whether the loop was killed.
-        prepare: Called first in the thread that drives the device.
-
-    Returns:
-        False if this process cannot drive the device, so that another one must.
-    """
+    """Drive the device until the result is final or SIGTERM; return False if that is impossible."""
     ended_by_user = False
 
     def end(number: int, frame: FrameType | None) -> None:

@@ -32,10 +32,6 @@ class SafeResult:
     """Result of setting the safe value.
 
     Attributes:
-        device: Description of the device.
-        value: The safe value.
-        unit: Its unit, ``A`` or ``V``.
-        output: State of the output.
         error: Why it is not confirmed; may be empty.
         guardian_active: Whether the guardian of an earlier run continues.
     """
@@ -70,12 +66,6 @@ def put_safe(
 
     Only these sections of the file are validated. A guardian of an earlier run that drives the
     device is stopped, and started again if the device does not confirm.
-
-    Args:
-        path: Experiment file.
-        settings: ``key=value`` texts that override it.
-        clock: Monotonic time in s.
-        sleep: Waits that many s.
 
     Raises:
         InputError: The file is not valid, or a run holds the device; nothing was sent.
@@ -142,14 +132,7 @@ def _drive(
     *,
     watches: bool,
 ) -> None:
-    """Write until the state is final, a time limit, or Ctrl-C.
-
-    Args:
-        output: The output.
-        clock: Monotonic time in s.
-        sleep: Waits that many s.
-        watches: Whether to repeat a value that is set until no older command can follow.
-    """
+    """Write until the state is final, a time limit, or Ctrl-C; watched values are repeated."""
     give_up_s = clock() + PATIENCE_S
     try:
         while True:

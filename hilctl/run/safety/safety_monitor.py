@@ -35,12 +35,8 @@ class SafetyMonitor:
     """Ensure a safe output after a loop that died or hangs.
 
     Args:
-        checked: The experiment.
-        ring: Shared with loop and guardian.
-        child: The loop's process.
         start_guardian: Starts a guardian that watches a process, or acts immediately if None; None
             if the run needs no guardian.
-        record_event: Records an event.
     """
 
     def __init__(
@@ -71,11 +67,7 @@ class SafetyMonitor:
         """Which process acted."""
 
     def ready(self) -> bool:
-        """Return whether the guardian watches, if the run needs one.
-
-        Raises:
-            RunError: The guardian failed to start.
-        """
+        """Return whether the guardian watches, if the run needs one."""
         guardian = self._guardian
         if guardian is None or guardian.phase == GuardianPhase.WATCHING:
             return True
@@ -84,12 +76,7 @@ class SafetyMonitor:
         return False
 
     def update(self, now_ns: int, *, ended: bool) -> None:
-        """Check loop and guardian, and act if necessary; never wait for device or guardian.
-
-        Args:
-            now_ns: Monotonic time.
-            ended: Whether the loop's process had ended before.
-        """
+        """Check loop and guardian, and act if necessary; never wait for device or guardian."""
         if self.result is not None:
             return
         if self._in_trouble(now_ns, ended=ended):
@@ -193,14 +180,7 @@ class SafetyMonitor:
         self._record_event(Event(sample, "warning", "guardian_lost", text))
 
     def close(self, stopped: Callable[[], bool] = lambda: False) -> bool:
-        """End the guardian, or leave an unconfirmed output to it.
-
-        Args:
-            stopped: Whether the user ends the attempts of this process.
-
-        Returns:
-            Whether a guardian stays active.
-        """
+        """End the guardian, or leave an unconfirmed output to it; return whether it stays."""
         if self.result is None or self.result.final or self._start_guardian is None:
             if self._guardian is not None:
                 self._guardian.end()

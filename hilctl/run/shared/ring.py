@@ -16,7 +16,7 @@ acquire order, see :mod:`hilctl.kernels.atomics`.
 import math
 import mmap
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Self
 
@@ -56,14 +56,8 @@ class SampleRing:
     """The ring, for producer, consumer and watchers.
 
     Args:
-        path: File that :meth:`create` made.
         look_only: Map it read-only, for watchers.
         at_once: Map all pages now, for the loop, whose memory may not be locked.
-
-    Attributes:
-        page: Numbers, texts and events before the blocks.
-        slots: Number of slots.
-        block: Samples per block.
 
     Raises:
         ValueError: The file is not a ring, or is damaged.
@@ -104,22 +98,15 @@ class SampleRing:
     ) -> Self:
         """Create a ring and allocate its memory.
 
-        Args:
-            path: Its file.
-            slots: Number of slots.
-            block: Samples per block.
-            state_size: Size of the state of each block.
-            latency_blocks: Exchanges from a block's commands to its displacements.
-
         Raises:
             OSError: The memory is not available.
         """
         spare = latency_blocks + 1  # blocks that may be under way in spare slots
-        size = sum(_padded(each) for each in _sizes(slots + spare, block, state_size))
+        _, size = _layout(slots + spare, block, state_size)
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
         try:
             # Allocated now: missing memory must fail here, not during the run.
-            os.posix_fallocate(descriptor, 0, _PAGE_SIZE + size)
+            os.posix_fallocate(descriptor, 0, size)
             with mmap.mmap(descriptor, _PAGE_SIZE) as memory:
                 numbers = memoryview(memory).cast("q")
                 numbers[PageField.SLOTS], numbers[PageField.BLOCK] = slots, block
@@ -134,18 +121,14 @@ class SampleRing:
         return made
 
     def _views(self, state_size: int) -> BlockBatch:
-        count, block = self.slots + self._spare, self.block
-        shapes = _shapes(count, block, state_size)
-        sizes = _sizes(count, block, state_size)
-        if _PAGE_SIZE + sum(map(_padded, sizes)) > len(self._map):
+        layout, size = _layout(self.slots + self._spare, self.block, state_size)
+        if size > len(self._map):
             raise ValueError(f"{self.path}: is shorter than it says")
-        parts: list[Any] = []
-        offset = _PAGE_SIZE
-        for shape, size, dtype in zip(shapes, sizes, _TYPES, strict=True):
-            count = math.prod(shape)
-            parts.append(np.frombuffer(self._map, dtype, count, offset).reshape(shape))
-            offset += _padded(size)
-        return BlockBatch(*parts)
+        arrays: list[Any] = [
+            np.frombuffer(self._map, dtype, math.prod(shape), offset).reshape(shape)
+            for dtype, shape, offset in layout
+        ]
+        return BlockBatch(*arrays)
 
     def prepare_blocks(self) -> None:
         """Create the block objects of the producer before the first tick."""
@@ -209,15 +192,13 @@ class SampleRing:
     def batches(self) -> Iterator[BlockBatch]:
         """Yield the present blocks in batches; see :meth:`pop`."""
         # Not those that arrive meanwhile: on a busy computer it would not end.
-        waiting = min(max(self.page.observe(PageField.HEAD) - self._tail, 0), self.slots)
-        until = self._tail + waiting
+        until = self._tail + self._waiting()
         while (left := until - self._tail) > 0 and (batch := self.pop(left)) is not None:
             yield batch
 
     def pop(self, most: int | None = None) -> BlockBatch | None:
         """Return the next blocks, at most ``most``, or None; they stay until :meth:`release`."""
-        there = min(max(self.page.observe(PageField.HEAD) - self._tail, 0), self.slots)
-        if there == 0:
+        if (there := self._waiting()) == 0:
             return None
         first = self._tail % self.slots
         few = max(1, _BATCH_SAMPLES // self._area.columns.shape[2])
@@ -232,10 +213,13 @@ class SampleRing:
         self._tail += count
         return batch
 
+    def _waiting(self) -> int:
+        """Return the number of answered blocks that were not consumed."""
+        return min(max(self.page.observe(PageField.HEAD) - self._tail, 0), self.slots)
+
     def skip_damaged(self) -> int:
         """Skip damaged blocks after the producer has ended; return their number."""
-        there = min(max(self.page.observe(PageField.HEAD) - self._tail, 0), self.slots)
-        passed = 0
+        there, passed = self._waiting(), 0
         while passed < there:
             slot = (self._tail + passed) % self.slots
             if _whole(self._area.heads[slot : slot + 1], self._tail + passed).all():
@@ -245,11 +229,7 @@ class SampleRing:
         return passed
 
     def look(self, since: int) -> tuple[BlockBatch, int]:
-        """Copy the complete blocks from number ``since`` on without consuming them.
-
-        Returns:
-            The blocks, and the number after the last one; others were overwritten or damaged.
-        """
+        """Copy the complete blocks from number ``since`` on without consuming them."""
         head = self.page.observe(PageField.HEAD)
         numbers = _numbers(
             max(since, self.page.observe(PageField.CLEANED), head - self.slots), head
@@ -261,11 +241,7 @@ class SampleRing:
         return batch if whole.all() else batch.rows(np.flatnonzero(whole)), max(head, since)
 
     def release(self, keep: int = 0) -> None:
-        """Release consumed blocks to the producer; they are on disk.
-
-        Args:
-            keep: Newest blocks that stay readable for watchers until the next call.
-        """
+        """Release consumed blocks to the producer, except the ``keep`` newest; they are on disk."""
         self.page.release_events()
         until = max(self._released, self._tail - keep)
         # First: watchers must not use a block that is cleaned during their copy.
@@ -283,14 +259,10 @@ class SampleRing:
         self._area.columns[slots, ANSWERS] = np.nan
 
     def unanswered(self, next_sample: int) -> BlockBatch | None:
-        """Return the blocks that were sent and not answered, after the producer has died.
+        """Return the blocks that a dead producer sent and that were not answered, or None.
 
-        Args:
-            next_sample: Index after the last consumed sample.
-
-        Returns:
-            The blocks in order with :attr:`~hilctl.base.samples.Flag.UNANSWERED`, or None. The last
-            one may not have reached the device.
+        They are flagged as unanswered; the last one may not have reached the device.
+        ``next_sample`` is the index after the last consumed sample.
         """
         sent = self.page.observe(PageField.SENT)
         numbers = _numbers(max(self.page.observe(PageField.HEAD), sent - self.slots), sent)
@@ -315,10 +287,7 @@ def _numbers(first: int, stop: int) -> I64:
 
 
 def _whole(heads: I64, number: int) -> npt.NDArray[np.bool_]:
-    """Return which blocks have the numbers from ``number`` on and valid headers.
-
-    A recording with impossible values could not be read again.
-    """
+    """Return which blocks have the numbers from ``number`` on and valid headers."""
     expected = np.arange(number + 1, number + 1 + heads.shape[0])
     first = heads[:, BlockHeader.FIRST_SAMPLE]
     dropped = heads[:, BlockHeader.DROPPED_BEFORE]
@@ -328,23 +297,17 @@ def _whole(heads: I64, number: int) -> npt.NDArray[np.bool_]:
     return whole & furthest.all(axis=1)
 
 
-def _shapes(slots: int, block: int, state_size: int) -> tuple[tuple[int, ...], ...]:
-    """Return the shapes of heads, states, columns and flags."""
-    width = len(COLUMNS)
-    return (slots, len(BlockHeader)), (slots, state_size), (slots, width, block), (slots, block)
-
-
-def _sizes(slots: int, block: int, state_size: int) -> Sequence[int]:
-    """Return the bytes of heads, states, columns and flags."""
-    shapes = _shapes(slots, block, state_size)
-    return [
-        math.prod(shape) * np.dtype(dtype).itemsize
-        for shape, dtype in zip(shapes, _TYPES, strict=True)
-    ]
-
-
-def _padded(size: int) -> int:
-    return -(-size // _LINE) * _LINE
+def _layout(
+    slots: int, block: int, state_size: int
+) -> tuple[list[tuple[Any, tuple[int, ...], int]], int]:
+    """Return type, shape and offset of heads, states, columns and flags, and the file's size."""
+    width, found, end = len(COLUMNS), [], _PAGE_SIZE
+    shapes = (slots, len(BlockHeader)), (slots, state_size), (slots, width, block), (slots, block)
+    for dtype, shape in zip(_TYPES, shapes, strict=True):
+        found.append((dtype, shape, end))
+        size = math.prod(shape) * np.dtype(dtype).itemsize
+        end += -(-size // _LINE) * _LINE  # the next array begins on a cache line
+    return found, end
 
 
 def safe_result_of(run: RunFolder) -> SafeActionResult | None:

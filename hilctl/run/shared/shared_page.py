@@ -10,7 +10,7 @@ numbers, and readers accept its text only as complete JSON.
 import json
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict, astuple, dataclass
+from dataclasses import asdict, astuple, dataclass, fields
 from enum import IntEnum
 from functools import cached_property
 from mmap import mmap
@@ -133,7 +133,6 @@ class SafeActionResult:
 
     Attributes:
         hung: Whether the loop hung and was killed.
-        output: State of the output.
         error: Why it is not confirmed; may be empty.
         final: Whether no further write follows.
     """
@@ -186,22 +185,11 @@ _LATENESS = (
 )
 """The fields of :class:`~hilctl.loop.pacer.Lateness`, in its order."""
 
-_USAGE = (
-    PageField.RESIDENT_BYTES,
-    PageField.CPU_NS,
-    PageField.MINOR_FAULTS,
-    PageField.MAJOR_FAULTS,
-    PageField.INVOLUNTARY_SWITCHES,
-)
-"""Where each field of :class:`~hilctl.machine.procfs.ProcessUsage` stands, in its order."""
+_USAGE = tuple(PageField[field.name.upper()] for field in fields(ProcessUsage))
 
 
 class SharedPage:
-    """The page, for all processes.
-
-    Args:
-        memory: Shared memory that begins with the page.
-    """
+    """The page, for all processes."""
 
     def __init__(self, memory: mmap) -> None:
         self._map = memory

@@ -28,14 +28,7 @@ def limits(rtprio: str, memlock: str) -> dict[str, str]:
     return {"/proc/self/limits": text}
 
 
-def check(function, machine, *arguments):
-    """Return level, text and remedy of one check."""
-    found = function(machine, *arguments)
-    return found.level, found.text, found.remedy
-
-
 def test_a_good_machine_has_nothing_to_mend(make_machine):
-    """On a real-time kernel with all rights, every check is ok and asks for nothing."""
     found = examine(make_machine(), Realtime(), Path())
     assert {each.level for each in found} == {"ok"}
     assert {each.remedy for each in found} == {""}
@@ -43,7 +36,6 @@ def test_a_good_machine_has_nothing_to_mend(make_machine):
 
 
 def test_every_trouble_has_a_remedy(make_machine):
-    """Each finding that is not ok says what to do, on a machine with nothing right."""
     machine = make_machine(
         {
             "/proc/version": "Linux version 6.1 #1 SMP PREEMPT_DYNAMIC",
@@ -67,197 +59,116 @@ def test_every_trouble_has_a_remedy(make_machine):
     assert all(each.remedy for each in found)
 
 
-@pytest.mark.parametrize(
-    ("files", "level", "said", "remedy"),
-    [
-        ({}, "ok", "PREEMPT_RT", ""),
-        ({"/sys/kernel/realtime": "1", "/proc/version": "Linux"}, "ok", "PREEMPT_RT", ""),
-        (
-            {
-                "/proc/version": "SMP PREEMPT_DYNAMIC",
-                "/sys/kernel/debug/sched/preempt": "none (voluntary) full",
-            },
-            "warn",
-            "voluntary",
-            "preempt=full",
-        ),
-        (
-            {"/proc/version": "SMP PREEMPT_DYNAMIC", "/proc/cmdline": "quiet preempt=full"},
-            "warn",
-            "full preemption",
-            "PREEMPT_RT",
-        ),
-        ({"/proc/version": "SMP PREEMPT_DYNAMIC"}, "warn", "not readable", "preempt=full"),
-        ({"/proc/version": "SMP PREEMPT"}, "warn", "PREEMPT", "PREEMPT_RT"),
-        ({"/proc/version": "SMP"}, "warn", "no preemption", "PREEMPT_RT"),
-    ],
-)
-def test_kernel(make_machine, files, level, said, remedy):
-    """The preemption model is read from wherever the kernel tells it."""
-    found = check(checks.preemption, make_machine(files))
-    assert found[0] == level
-    assert said in found[1]
-    assert remedy in found[2]
+def fifo(machine):
+    return checks.fifo(machine, Realtime(priority=80))
+
+
+def isolated(cpu):
+    return lambda machine: checks.isolated_cpus(machine, Realtime(cpu=cpu))
+
+
+def governors(*names):
+    paths = [f"{CPU}/cpu{number}/cpufreq/scaling_governor" for number in (0, 3)]
+    return dict(zip(paths, names, strict=True))
+
+
+def daemons(*names):
+    return {f"/proc/{number}/comm": name for number, name in enumerate(("sh", *names), start=1)}
+
+
+DYNAMIC = {"/proc/version": "SMP PREEMPT_DYNAMIC"}
+VOLUNTARY = DYNAMIC | {"/sys/kernel/debug/sched/preempt": "none (voluntary) full"}
+FULL = DYNAMIC | {"/proc/cmdline": "quiet preempt=full"}
+RT_FILE = {"/sys/kernel/realtime": "1", "/proc/version": "Linux"}
+VIRTUAL = {"/proc/cpuinfo": "flags : hypervisor", "/sys/class/dmi/id/product_name": "KVM"}
+SLOW_FTDI = {"/sys/bus/usb-serial/devices/ttyUSB1/latency_timer": "16"}
 
 
 @pytest.mark.parametrize(
-    ("files", "level", "said"),
+    ("check", "files", "level", "said", "remedy"),
     [
-        (limits("98", "0"), "ok", "up to 98"),
-        (limits("unlimited", "0"), "ok", "unlimited"),
-        (limits("79", "0"), "bad", "rtprio limit 79"),
-        (limits("0", "0") | CAPABLE, "ok", "CAP_SYS_NICE"),
-        (CAPABLE | GROUP | {SHARE: "0"}, "bad", "no real-time share"),
-        (CAPABLE | GROUP | {SHARE: "950000"}, "ok", "CAP_SYS_NICE"),
+        (checks.preemption, {}, "ok", "PREEMPT_RT", ""),
+        (checks.preemption, RT_FILE, "ok", "PREEMPT_RT", ""),
+        (checks.preemption, VOLUNTARY, "warn", "voluntary", "preempt=full"),
+        (checks.preemption, FULL, "warn", "full preemption", "PREEMPT_RT"),
+        (checks.preemption, DYNAMIC, "warn", "not readable", "preempt=full"),
+        (checks.preemption, {"/proc/version": "SMP PREEMPT"}, "warn", "PREEMPT", "PREEMPT_RT"),
+        (checks.preemption, {"/proc/version": "SMP"}, "warn", "no preemption", "PREEMPT_RT"),
+        (fifo, limits("98", "0"), "ok", "up to 98", ""),
+        (fifo, limits("unlimited", "0"), "ok", "unlimited", ""),
+        (fifo, limits("79", "0"), "bad", "rtprio limit 79", "rtprio"),
+        (fifo, limits("0", "0") | CAPABLE, "ok", "CAP_SYS_NICE", ""),
+        (fifo, CAPABLE | GROUP | {SHARE: "0"}, "bad", "no real-time share", "rt_runtime_us"),
+        (fifo, CAPABLE | GROUP | {SHARE: "950000"}, "ok", "CAP_SYS_NICE", ""),
+        (checks.locked_memory, limits("0", "unlimited"), "ok", "any amount", ""),
+        (checks.locked_memory, limits("0", str(2 << 30)), "ok", "2048 MB", ""),
+        (checks.locked_memory, limits("0", str(8 << 20)), "bad", "8 MB", "memlock"),
+        (checks.locked_memory, limits("0", str(8 << 20)) | CAPABLE, "ok", "any amount", ""),
+        (checks.throttling, {}, "ok", "950000 of 1000000 us", ""),
+        (checks.throttling, {RT: "-1"}, "ok", "off", ""),
+        (checks.throttling, {RT: None}, "ok", "none", ""),
+        (checks.throttling, {RT: "400000"}, "warn", "400000", "950000"),
+        (checks.throttling, GROUP | {SHARE: "100000"}, "warn", "group 100000 us", "950000"),
+        (isolated(None), {}, "ok", "without scheduler ticks", ""),
+        (isolated(None), {f"{CPU}/nohz_full": "(null)"}, "ok", "nohz_full would", ""),
+        (isolated(None), {f"{CPU}/isolated": ""}, "warn", "none", "isolcpus=3"),
+        (isolated(2), {}, "ok", "3", ""),
+        (isolated(9), {}, "bad", "CPU 9 is not online", "realtime.cpu"),
+        (checks.governor, governors("performance", "performance"), "ok", "performance", ""),
+        (checks.governor, governors("performance", "powersave"), "warn", "powersave", "cpupower"),
+        (checks.governor, governors("schedutil", "schedutil"), "warn", "schedutil", "cpupower"),
+        (checks.governor, governors(None, None), "ok", "none", ""),
+        (checks.hyperthreads, {}, "ok", "off", ""),
+        (checks.hyperthreads, {f"{CPU}/smt/active": "1"}, "warn", "on", "smt/control"),
+        (checks.virtual_machine, VIRTUAL, "warn", "KVM", "machine of their own"),
+        (checks.clock_source, {f"{CLOCK}/current_clocksource": "tsc"}, "ok", "tsc", ""),
+        (checks.clock_source, {f"{CLOCK}/current_clocksource": "hpet"}, "warn", "hpet", "tsc="),
+        (checks.latency_timers, SLOW_FTDI, "bad", "ttyUSB1 16 ms", "latency_timer"),
+        (checks.serial_daemons, daemons(), "ok", "none active", ""),
+        (checks.serial_daemons, daemons("ModemManager"), "warn", "ModemManager", "ModemManager"),
+        (checks.serial_daemons, daemons("brltty", "ModemManager"), "warn", "brltty", "brltty"),
     ],
-)
-def test_fifo(make_machine, files, level, said):
-    """SCHED_FIFO needs the capability or the limit, and a share of the control group's CPU."""
-    found = check(checks.fifo, make_machine(files), Realtime(priority=80))
-    assert (found[0], said in found[1]) == (level, True)
+)  # fmt: skip
+def test_what_a_check_finds(make_machine, check, files, level, said, remedy):
+    found = check(make_machine(files))
+    assert found.level == level
+    assert said in found.text
+    assert remedy in found.remedy
+    assert bool(found.remedy) == (level != "ok")
 
 
 @pytest.mark.parametrize(
-    ("files", "level"),
+    ("check", "path", "level", "remedy"),
     [
-        (limits("0", "unlimited"), "ok"),
-        (limits("0", str(2 << 30)), "ok"),
-        (limits("0", str(8 << 20)), "bad"),
-        (limits("0", str(8 << 20)) | CAPABLE, "ok"),
+        (checks.dma_latency, "/dev/cpu_dma_latency", "warn", "udev"),
+        (checks.serial_ports, "/dev/ttyUSB0", "bad", "usermod"),
     ],
 )
-def test_locked_memory(make_machine, files, level):
-    """Memory may be locked with the capability, or with a limit that is large enough."""
-    assert check(checks.locked_memory, make_machine(files))[0] == level
-
-
-@pytest.mark.parametrize(
-    ("files", "level", "said"),
-    [
-        ({}, "ok", "950000 of 1000000 us"),
-        ({RT: "-1"}, "ok", "off"),
-        ({RT: None}, "ok", "none"),
-        ({RT: "400000"}, "warn", "400000"),
-        (GROUP | {SHARE: "100000"}, "warn", "this control group 100000 us"),
-    ],
-)
-def test_throttling(make_machine, files, level, said):
-    """A share of half a CPU or more is enough for a loop that sleeps."""
-    found = check(checks.throttling, make_machine(files))
-    assert (found[0], said in found[1]) == (level, True)
-
-
-@pytest.mark.parametrize(
-    ("files", "cpu", "level", "said"),
-    [
-        ({}, None, "ok", "without scheduler ticks"),
-        ({f"{CPU}/nohz_full": "(null)"}, None, "ok", "nohz_full would"),
-        ({f"{CPU}/isolated": ""}, None, "warn", "none"),
-        ({}, 2, "ok", "3"),
-        ({}, 9, "bad", "CPU 9 is not online"),
-    ],
-)
-def test_isolated_cpus(make_machine, files, cpu, level, said):
-    """A CPU of the loop's own is found, and one that is not there is refused."""
-    found = check(checks.isolated_cpus, make_machine(files), Realtime(cpu=cpu))
-    assert (found[0], said in found[1]) == (level, True)
-
-
-def test_idle_states(make_machine):
-    """Without permission for the file, idle states can't be kept off; without the file, none is."""
-    closed = make_machine(closed=("/dev/cpu_dma_latency",))
-    assert check(checks.dma_latency, closed)[0] == "warn"
-    assert check(checks.dma_latency, make_machine())[0] == "ok"
+def test_a_device_file_without_permission_is_named(make_machine, check, path, level, remedy):
+    assert check(make_machine()).level == "ok"
+    found = check(make_machine(closed=(path,)))
+    assert found.level == level
+    assert path in found.text
+    assert remedy in found.remedy
 
 
 def test_no_file_for_idle_states(tmp_path):
-    """Where the kernel has no such file, there is nothing to hold."""
-    found = check(checks.dma_latency, Machine(tmp_path))
-    assert (found[0], "manages none" in found[1]) == ("ok", True)
-
-
-@pytest.mark.parametrize(
-    ("governors", "level"),
-    [
-        (["performance", "performance"], "ok"),
-        (["performance", "powersave"], "warn"),
-        (["schedutil", "schedutil"], "warn"),
-        ([None, None], "ok"),
-    ],
-)
-def test_governor(make_machine, governors, level):
-    """Every CPU has to stay at full speed, unless the kernel has no say in it."""
-    files = {
-        f"{CPU}/cpu{n}/cpufreq/scaling_governor": g for n, g in zip((0, 3), governors, strict=True)
-    }
-    assert check(checks.governor, make_machine(files))[0] == level
-
-
-def test_smt(make_machine):
-    """Threads that share a core are told."""
-    assert check(checks.hyperthreads, make_machine())[0] == "ok"
-    assert check(checks.hyperthreads, make_machine({f"{CPU}/smt/active": "1"}))[0] == "warn"
-
-
-def test_virtual_machine(make_machine):
-    """A virtual machine is known by its CPU, and named after its product."""
-    files = {"/proc/cpuinfo": "flags : hypervisor", "/sys/class/dmi/id/product_name": "KVM"}
-    level, said, _ = check(checks.virtual_machine, make_machine(files))
-    assert (level, "KVM" in said) == ("warn", True)
-
-
-@pytest.mark.parametrize(
-    ("source", "level", "remedy"), [("tsc", "ok", ""), ("hpet", "warn", "boot with tsc=reliable")]
-)
-def test_clock_source(make_machine, source, level, remedy):
-    """A clock that is slow to read is told, with the quick one where there is one."""
-    found = check(checks.clock_source, make_machine({f"{CLOCK}/current_clocksource": source}))
-    assert (found[0], found[2]) == (level, remedy)
-
-
-def test_ftdi_latency(make_machine):
-    """An adapter at its default of 16 ms is bad, and named."""
-    slow = {"/sys/bus/usb-serial/devices/ttyUSB1/latency_timer": "16"}
-    level, said, remedy = check(checks.latency_timers, make_machine(slow))
-    assert (level, said) == ("bad", "ttyUSB1 16 ms")
-    assert "latency_timer" in remedy
-
-
-@pytest.mark.parametrize(
-    ("active", "level"),
-    [((), "ok"), (("ModemManager",), "warn"), (("brltty", "ModemManager"), "warn")],
-)
-def test_serial_daemons(make_machine, active, level):
-    """They open ports by themselves, and take bytes from a run that has one."""
-    files = {f"/proc/{number}/comm": name for number, name in enumerate(("sh", *active), start=1)}
-    found, said, remedy = check(checks.serial_daemons, make_machine(files))
-    assert found == level
-    for name in active:
-        assert name in said
-        assert name in remedy
-
-
-def test_serial_ports(make_machine):
-    """A port that this user may not open is bad, and its group named."""
-    level, said, remedy = check(checks.serial_ports, make_machine(closed=("/dev/ttyUSB0",)))
-    assert (level, "/dev/ttyUSB0" in said) == ("bad", True)
-    assert "usermod" in remedy
+    found = checks.dma_latency(Machine(tmp_path))
+    assert (found.level, "manages none" in found.text) == ("ok", True)
 
 
 @pytest.mark.parametrize(("free", "level"), [(1 << 20, "bad"), (1 << 40, "ok")])
 def test_disk_space(make_machine, tmp_path, free, level):
-    """Little room for recordings is bad; the folder need not exist yet."""
     folder = tmp_path / "not" / "yet"
-    assert check(checks.disk_space, make_machine(free=free), folder)[0] == level
+    assert checks.disk_space(make_machine(free=free), folder).level == level
 
 
 def test_disk_space_without_a_working_folder(make_machine, tmp_path, monkeypatch):
-    """It was deleted: relative names lead nowhere, absolute ones still do."""
     (tmp_path / "gone").mkdir()
     monkeypatch.chdir(tmp_path / "gone")
     (tmp_path / "gone").rmdir()
-    assert check(checks.disk_space, make_machine(), Path("recordings"))[0] == "bad"
-    assert check(checks.disk_space, make_machine(free=1 << 40), tmp_path)[0] == "ok"
+    assert checks.disk_space(make_machine(), Path("recordings")).level == "bad"
+    assert checks.disk_space(make_machine(free=1 << 40), tmp_path).level == "ok"
 
 
 SYSTEMD = {
@@ -291,7 +202,6 @@ def login(monkeypatch):
     ],
 )
 def test_what_logind_is_set_to(make_machine, login, files, level):
-    """The newest of its files counts; a warning names the remedy."""
     found = checks.log_out(make_machine({**SYSTEMD, **files}))
     assert found.level == level
     assert bool(found.remedy) == (level == "warn")

@@ -1,6 +1,7 @@
 """The verdict on a machine: every part in the report, plain numbers for JSON."""
 
 import io
+import json
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,7 @@ from rich.console import Console
 
 from hilctl.cli.devices import render_diagnosis
 from hilctl.machine.diagnosis import Diagnosis, examine, machine_facts
-from hilctl.machine.procfs import Finding
+from hilctl.machine.procfs import Finding, Machine
 from hilctl.machine.rt_setup import Realtime, SetUpStep
 from hilctl.machine.timer_latency import Latency
 
@@ -27,7 +28,6 @@ def text_of(diagnosis):
 
 
 def test_report_has_all_of_it():
-    """People see findings, remedies, steps, figures and the verdict."""
     findings = (Finding("kernel", "warn", "PREEMPT_DYNAMIC [none]", "install another"),)
     shown = text_of(Diagnosis(findings, latency([3000, 5000, 2 * MS])))
     for part in ("PREEMPT_DYNAMIC [none]", "-> install another", "refused", "-> rtprio",
@@ -36,16 +36,12 @@ def test_report_has_all_of_it():
 
 
 def test_verdict_of_a_rate_that_is_kept():
-    """The verdict names the rate and the longest period."""
     kept = Diagnosis((), latency([3000, 5000, 3000]))
     assert kept.verdict == "yes, 1000 Hz is kept: the longest of 3 periods of 1 ms was 1 ms"
     assert kept.to_mapping()["kept"] is True
 
 
 def test_mapping_is_plain():
-    """Programs get numbers and texts only."""
-    import json
-
     mapping = Diagnosis((), latency([3000, 5000, 3000])).to_mapping()
     again = json.loads(json.dumps(mapping, allow_nan=False))
     assert again["late_us"]["max"] == 5.0
@@ -53,16 +49,12 @@ def test_mapping_is_plain():
 
 
 def test_an_empty_machine_is_no_error(make_machine, tmp_path):
-    """Where no file can be read, every check still says something."""
-    from hilctl.machine.procfs import Machine
-
     found = examine(Machine(tmp_path / "nothing"), Realtime(), tmp_path)
     assert all(each.text for each in found)
     assert {each.name: each.level for each in found}["SCHED_FIFO"] == "bad"
 
 
 def test_facts_for_a_recording(make_machine):
-    """A recording gets every finding as one line of text, by a name without blanks."""
     facts = machine_facts(Realtime(), Path(), make_machine())
     assert facts["machine.kernel"] == "ok: PREEMPT_RT"
     assert len(facts) == 15

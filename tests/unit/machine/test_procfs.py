@@ -45,7 +45,6 @@ def test_a_number_is_a_whole_file(written, text, number):
 
 
 def test_capabilities_are_bits_of_this_process(written):
-    """CAP_IPC_LOCK is 14, CAP_SYS_NICE 23."""
     machine = written(self__status="Name:\thilctl\nCapEff:\t0000000000004000\n")
     assert machine.status("Name") == "hilctl"
     assert machine.capable(14)
@@ -67,7 +66,6 @@ PAGES = 64
 
 
 def test_pages_and_time_are_counted():
-    """Touching a page for the first time is a fault, and keeps it resident."""
     before = ProcessUsage.now()
     with mmap.mmap(-1, PAGES * mmap.PAGESIZE) as memory:
         memory.madvise(mmap.MADV_NOHUGEPAGE)

@@ -33,14 +33,12 @@ def latency(late_ns, rate_hz=1000.0):
     ],
 )
 def test_no_period_may_be_over_twice_the_nominal_one(late_ns, longest_ns, kept):
-    """The rule is about periods: constant lateness is none, and exactly twice is allowed."""
     found = latency(late_ns)
     assert found.longest_period_ns == longest_ns
     assert found.kept == kept
 
 
 def test_rate_that_would_have_been_kept():
-    """At the rate that is named, the same delays double a period exactly."""
     late_ns = [0, 4 * MS, 2 * MS, 0]
     rate_hz = latency(late_ns).kept_rate_hz
     assert rate_hz == pytest.approx(250.0)
@@ -49,7 +47,6 @@ def test_rate_that_would_have_been_kept():
 
 
 def test_percentiles_are_in_us():
-    """Percentiles of 0 to 1000 us are what they are called."""
     figures = latency(np.arange(1001) * 1000).percentiles_us()
     assert figures == pytest.approx(
         {"p50": 500.0, "p90": 900.0, "p99": 990.0, "p99.9": 999.0, "max": 1000.0}
@@ -57,36 +54,28 @@ def test_percentiles_are_in_us():
 
 
 def test_every_wake_up_is_counted_once():
-    """Bins double in width; those before the first and beyond the last edge count there."""
     late_ns = np.array([-5, 0, 999, 1000, 1999, 2000, 3999, 4000, 10**12])
     counts = lateness_counts(late_ns)
     assert (counts[0], counts[1], counts[2], counts[4]) == (3, 2, 2, 1)
     assert sum(counts.values()) == late_ns.size
+    assert lateness_counts(late_ns[:0]) == {}
 
 
-def test_lateness_of_nothing_is_empty():
-    """No wake-up, no bin."""
-    assert lateness_counts(np.array([], dtype=np.int64)) == {}
-
-
-def test_lateness_is_the_pacers():
-    """Each tick's lateness is kept, and no deadline moves for a late one."""
+@pytest.mark.parametrize(
+    ("policy", "expected"),
+    [
+        ("catch_up", [10, 2_500_000, 1_500_010, 500_020, 10]),
+        ("skip", [10, 2_500_000, 10, 10, 10]),  # a stall counts once, as with cyclictest
+    ],
+)
+def test_lateness_is_the_pacers(policy, expected):
     wanted = [10, 2_500_000, 10, 10, 10]
     clock, late_ns = FakeClock(stall_ns=dict(enumerate(wanted))), np.zeros(5, dtype=np.int64)
-    watch(Pacer(clock, 1e6, "catch_up", LateRules(1e6)), late_ns, clock, lambda: True)
-    assert late_ns.tolist() == [10, 2_500_000, 1_500_010, 500_020, 10]
-
-
-def test_a_stall_counts_once_where_it_is_asked_for():
-    """As cyclictest counts: the ticks that it made late are left out."""
-    wanted = [10, 2_500_000, 10, 10, 10]
-    clock, late_ns = FakeClock(stall_ns=dict(enumerate(wanted))), np.zeros(5, dtype=np.int64)
-    watch(Pacer(clock, 1e6, "skip", LateRules(1e6)), late_ns, clock, lambda: True)
-    assert late_ns.tolist() == [10, 2_500_000, 10, 10, 10]
+    watch(Pacer(clock, 1e6, policy, LateRules(1e6)), late_ns, clock, lambda: True)
+    assert late_ns.tolist() == expected
 
 
 def test_measuring_ends_with_the_parent():
-    """Where nobody waits for the result, measuring stops at the next tick."""
     clock, late_ns = FakeClock(stall_ns=dict(enumerate([7] * 100))), np.zeros(100, dtype=np.int64)
     left = iter([True, True, False])
     watch(Pacer(clock, 1e6, "catch_up", LateRules(1e6)), late_ns, clock, lambda: next(left))
@@ -94,11 +83,7 @@ def test_measuring_ends_with_the_parent():
 
 
 def test_measuring_ends_far_behind():
-    """A rate that can't be kept at all does not hold a CPU for as long as was asked."""
-    clock, late_ns = (
-        FakeClock(stall_ns=dict(enumerate([3_000_000] * 1000))),
-        np.zeros(1000, dtype=np.int64),
-    )
+    clock, late_ns = FakeClock(), np.zeros(1000, dtype=np.int64)
     clock.sleep_until_ns = lambda _: setattr(clock, "now", clock.now + 3_000_000)
     ticks = watch(Pacer(clock, 1e6, "catch_up", LateRules(1e6)), late_ns, clock, lambda: True)
     assert ticks < 300
@@ -113,7 +98,6 @@ def test_rates_beyond_measure_are_refused(rate_hz):
 
 
 def test_measured_in_a_process_of_its_own():
-    """A real measurement has as many ticks as asked for, and says how it was set up."""
     seen = []
     found = measure(500.0, 0.2, Realtime(), seen.append)
     assert found.late_ns.size == 100
@@ -123,14 +107,12 @@ def test_measured_in_a_process_of_its_own():
 
 
 def test_a_process_that_fails_is_told(monkeypatch):
-    """A measurement that can't start is an error, not a result."""
     monkeypatch.setattr(sys, "executable", "/bin/false")
     with pytest.raises(RunError, match="exit code 1"):
         measure(500.0, 0.1, Realtime())
 
 
 def test_a_process_that_hangs_is_ended(monkeypatch, tmp_path):
-    """A measurement that takes far longer than asked is ended."""
     stuck = tmp_path / "stuck"
     stuck.write_text("#!/bin/sh\nexec sleep 60\n")
     stuck.chmod(0o700)
@@ -141,7 +123,6 @@ def test_a_process_that_hangs_is_ended(monkeypatch, tmp_path):
 
 
 def test_command_line(monkeypatch, capsys):
-    """doctor prints one JSON object, and its exit code is the verdict."""
     from typer.testing import CliRunner
 
     from hilctl.cli.commands import app

@@ -12,6 +12,7 @@ from hilctl.base.events import Event
 from hilctl.base.samples import COLUMNS, BlockBatch, BlockHeader, Samples
 from hilctl.base.segments import Segment
 from hilctl.recording.encoder import RecordingLayout
+from hilctl.recording.recording import TICK_COLUMNS
 from hilctl.recording.writer import RecordingWriter, RunFacts
 
 RATE_HZ = 50_000.0
@@ -83,6 +84,36 @@ def make():
         batch=batch, samples=samples, write=write, rate_hz=RATE_HZ, start_ns=START_NS, block=BLOCK,
         segment=SEGMENT, ended=ENDED,
     )  # fmt: skip
+
+
+@pytest.fixture
+def recorded(tmp_path, make):
+    """A finished recording of three batches with a gap before the last."""
+    batches = [
+        make.batch(0, 4),
+        make.batch(200, 30, seed=1),
+        make.batch(1900, 3, dropped=200, seed=2),
+    ]
+    return written(tmp_path / "run.mcap", batches), batches
+
+
+def same_samples(found, expected):
+    """Compare bytes, so that NaN equals NaN and -0.0 does not equal 0.0."""
+    for name in ("index", *COLUMNS, "flags"):
+        one, other = getattr(found, name), getattr(expected, name)
+        assert (one.dtype, one.tobytes()) == (other.dtype, other.tobytes()), name
+
+
+def same_ticks(found, expected):
+    for name in TICK_COLUMNS:
+        assert getattr(found, name).tolist() == getattr(expected, name).tolist(), name
+
+
+def written(path, batches, **options):
+    """Write a recording of batches; return its path."""
+    with path.open("wb") as stream:
+        write(stream, batches, **options)
+    return path
 
 
 def raw(record):

@@ -14,38 +14,38 @@ from hilctl.recording.builder import ColumnTable
 from hilctl.recording.reader import RecordingStream, read
 from hilctl.recording.recording import TICK_COLUMNS
 from hilctl.recording.time_range import TimeRange
+from tests.unit.recording.conftest import written
 
 
 @pytest.fixture
 def recorded(tmp_path, make):
     """A recording of many small chunks with gaps, and two events."""
-    path = tmp_path / "run.mcap"
     batches = [make.batch(300 * i, 4, dropped=100 if i else 0, seed=i) for i in range(12)]
-    with path.open("wb") as stream:
-        make.write(stream, batches, events=[make.ended])
-    return path
+    return written(tmp_path / "run.mcap", batches, events=[make.ended])
+
+
+def assert_joined(pieces, whole):
+    """Assert that the samples and ticks of pieces are those of a whole, bit for bit."""
+    for part, names in (("samples", ("index", *COLUMNS, "flags")), ("ticks", TICK_COLUMNS)):
+        for name in names:
+            joined = np.concatenate([getattr(getattr(each, part), name) for each in pieces])
+            assert joined.tobytes() == getattr(getattr(whole, part), name).tobytes()
+    assert (pieces[-1].dropped, pieces[-1].segments) == (whole.dropped, whole.segments)
 
 
 @pytest.mark.parametrize("size", [1, 700, 10**9])
 @pytest.mark.parametrize("stretch", [None, TimeRange(0.011, 0.05)])
 def test_pieces_are_the_whole(monkeypatch, recorded, size, stretch):
-    """Samples, ticks, starts, events, end and segments, bit for bit."""
     monkeypatch.setattr(reader, "PIECE_SAMPLES", size)
     whole, pieces = read(recorded, stretch), list(RecordingStream(recorded, stretch))
     assert len(pieces) >= 2 or size == 10**9
-    for name in ("index", *COLUMNS, "flags"):
-        joined = np.concatenate([getattr(piece.samples, name) for piece in pieces])
-        assert joined.tobytes() == getattr(whole.samples, name).tobytes()
-    for name in TICK_COLUMNS:
-        joined = np.concatenate([getattr(piece.ticks, name) for piece in pieces])
-        assert joined.tobytes() == getattr(whole.ticks, name).tobytes()
+    assert_joined(pieces, whole)
     starts = [start for piece in pieces for start in piece.starts]
     assert [(s.sample, s.state.tolist()) for s in starts] == [
         (s.sample, s.state.tolist()) for s in whole.starts
     ]
     assert tuple(event for piece in pieces for event in piece.events) == whole.events
-    last = pieces[-1]
-    assert (last.end, last.dropped, last.segments) == (whole.end, whole.dropped, whole.segments)
+    assert pieces[-1].end == whole.end
     assert not any(piece.end or piece.dropped for piece in pieces[:-1])
 
 
@@ -54,17 +54,10 @@ def test_pieces_of_a_stretch_are_cut_from_the_whole(monkeypatch, recorded):
     stretch = TimeRange(0.0123, 0.05)
     cut, pieces = stretch.cut(read(recorded)), list(RecordingStream(recorded, stretch))
     assert cut.samples.index.size > 1000
-    for name in ("index", *COLUMNS, "flags"):
-        joined = np.concatenate([getattr(piece.samples, name) for piece in pieces])
-        assert joined.tobytes() == getattr(cut.samples, name).tobytes()
-    for name in TICK_COLUMNS:
-        joined = np.concatenate([getattr(piece.ticks, name) for piece in pieces])
-        assert joined.tobytes() == getattr(cut.ticks, name).tobytes()
-    assert (pieces[-1].dropped, pieces[-1].segments) == (cut.dropped, cut.segments)
+    assert_joined(pieces, cut)
 
 
 def test_a_walk_that_is_left_leaves_nothing_behind(monkeypatch, recorded):
-    """Neither the thread that reads ahead nor the open file."""
     monkeypatch.setattr(reader, "PIECE_SAMPLES", 1)
     before = threading.active_count()
     opened, streams = Path.open, []
@@ -84,7 +77,6 @@ def test_a_walk_that_is_left_leaves_nothing_behind(monkeypatch, recorded):
 
 
 def test_many_small_blocks_take_no_array_each():
-    """They are joined as they come."""
     table = ColumnTable()
     for number in range(2000):
         table.add({"a": np.array([number])} | ({"b": np.array([number])} if number % 7 else {}))
@@ -100,7 +92,6 @@ def test_a_walk_can_be_repeated(recorded):
 
 
 def test_what_samples_are_can_not_be_said_behind_them(tmp_path, monkeypatch, make):
-    """Of a file that hilctl has not written; it was given out already by what stood before."""
     path = tmp_path / "run.mcap"
     with path.open("wb") as stream:
         writer = make.write(stream, [make.batch(0, 4)], finish=False)
@@ -113,7 +104,6 @@ def test_what_samples_are_can_not_be_said_behind_them(tmp_path, monkeypatch, mak
 
 
 def test_a_column_in_some_blocks_only_is_refused(tmp_path, monkeypatch, make):
-    """Whoever takes pieces finds the same columns in each."""
     path = tmp_path / "run.mcap"
     with path.open("wb") as stream:
         writer = make.write(stream, [make.batch(0, 4)], finish=False, measures=True)

@@ -15,7 +15,7 @@ SCOPE = ["t_rel", *(each.name for each in RECORDED_FIELDS if each.scope)]
 
 
 def block_message(**fields):
-    block = schema.message("SampleBlock")
+    block = schema.message_class("SampleBlock")()
     block.tick0, block.n = 300, 3
     block.flags.extend(fields.pop("flags", [0, 1, 2]))
     for name in ("t_rel", *(field.name for field in RECORDED_FIELDS)):
@@ -55,7 +55,7 @@ def test_a_block_is_that_of_the_published_descriptor(fields):
 
 @given(lists(integers(0, 2**64 - 1)), lists(integers(-(2**63), 2**63 - 1)))
 def test_ticks_are_those_of_the_published_descriptor(first, times):
-    message = schema.message("TickBlock")
+    message = schema.message_class("TickBlock")()
     message.first_sample.extend(first)
     for name in TICK_COLUMNS[1:]:
         getattr(message, name).extend(times)
@@ -104,6 +104,5 @@ def test_any_bytes_are_decoded_or_refused(data):
 
 @pytest.mark.parametrize("data", [b"\x2a\x07" + bytes(7), b"\x4a\x01\xff", b"\x10", b"\x0f"])
 def test_damaged_blocks_are_refused(data):
-    """A part of a number, flags that end within one, fields without a value or of no type."""
     with pytest.raises((DecodeError, ValueError)):
         codec.decode_block(data)

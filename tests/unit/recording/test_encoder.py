@@ -8,34 +8,13 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from hilctl.base.events import Event
-from hilctl.base.samples import COLUMNS, BlockBatch, BlockHeader
+from hilctl.base.samples import BlockBatch, BlockHeader
 from hilctl.recording.encoder import MessageMaker, RecordingLayout
 from hilctl.recording.reader import read
-
-
-def same_samples(found, expected):
-    """Compare bytes, so that NaN equals NaN and -0.0 does not equal 0.0."""
-    for name in ("index", *COLUMNS, "flags"):
-        one, other = getattr(found, name), getattr(expected, name)
-        assert (one.dtype, one.tobytes()) == (other.dtype, other.tobytes()), name
-
-
-@pytest.fixture
-def recorded(tmp_path, make):
-    """A finished recording of three batches with a gap before the last."""
-    batches = [
-        make.batch(0, 4),
-        make.batch(200, 30, seed=1),
-        make.batch(1900, 3, dropped=200, seed=2),
-    ]
-    path = tmp_path / "run.mcap"
-    with path.open("wb") as stream:
-        make.write(stream, batches)
-    return path, batches
+from tests.unit.recording.conftest import same_samples, written
 
 
 def test_blocks_of_one_sample_are_the_same_message(make):
-    """In the ring their columns are not one number after the other."""
     whole = make.batch(0, 1)
     size = whole.flags.shape[1]
     heads = np.repeat(whole.heads, size, axis=0)
@@ -50,7 +29,6 @@ def test_blocks_of_one_sample_are_the_same_message(make):
 
 @pytest.mark.parametrize("unit", ["A", "V"])
 def test_reference_that_is_no_displacement_is_not_recorded(tmp_path, make, unit):
-    """Where the waveform is a command, the columns in um say that there is none."""
     path, one = tmp_path / "run.mcap", make.batch(0, 3)
     trip = Event(20, "error", "late", "text", before=one.samples().part(10, 21))
     with path.open("wb") as stream:
@@ -67,7 +45,6 @@ def test_reference_that_is_no_displacement_is_not_recorded(tmp_path, make, unit)
 
 
 def test_scope_is_on_a_grid_of_its_own(recorded):
-    """Decimated samples are the ones whose index is a multiple of the stride, gap or not."""
     path, _ = recorded
     with path.open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
@@ -76,11 +53,8 @@ def test_scope_is_on_a_grid_of_its_own(recorded):
 
 
 def test_voltage_devices_have_voltage_fields(tmp_path, make):
-    """Volts are recorded in fields that say V, and no ampere field is filled."""
-    path = tmp_path / "run.mcap"
     one = make.batch(0, 2)
-    with path.open("wb") as stream:
-        make.write(stream, [one], unit="V", measures=False, own_input=False)
+    path = written(tmp_path / "run.mcap", [one], unit="V", measures=False, own_input=False)
     with path.open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
         decoded = next(d for *_, d in reader.iter_decoded_messages(topics=["/samples"]))

@@ -15,31 +15,10 @@ from hilctl.base.errors import DataError
 from hilctl.base.events import Event
 from hilctl.base.samples import COLUMNS, BlockHeader
 from hilctl.recording.reader import read
-
-
-def same_samples(found, expected):
-    """Compare bytes, so that NaN equals NaN and -0.0 does not equal 0.0."""
-    for name in ("index", *COLUMNS, "flags"):
-        one, other = getattr(found, name), getattr(expected, name)
-        assert (one.dtype, one.tobytes()) == (other.dtype, other.tobytes()), name
-
-
-@pytest.fixture
-def recorded(tmp_path, make):
-    """A finished recording of three batches with a gap before the last."""
-    batches = [
-        make.batch(0, 4),
-        make.batch(200, 30, seed=1),
-        make.batch(1900, 3, dropped=200, seed=2),
-    ]
-    path = tmp_path / "run.mcap"
-    with path.open("wb") as stream:
-        make.write(stream, batches)
-    return path, batches
+from tests.unit.recording.conftest import same_samples, written
 
 
 def test_everything_comes_back(recorded, make):
-    """Samples, ticks, events, facts, segments and attachments are read back as written."""
     path, batches = recorded
     back = read(path)
     same_samples(back.samples, make.samples(batches))
@@ -62,7 +41,6 @@ def test_everything_comes_back(recorded, make):
 @settings(max_examples=10, deadline=None)
 @given(values=arrays(np.float64, (3, len(COLUMNS), 50), elements=floats()))
 def test_what_is_written_is_read(make, unit, measures, own_input, values):
-    """Bit for bit; what is left out is empty, but for an input that is the reference."""
     one = make.batch(0, 3)
     one.columns[:] = values
     written = one.samples()
@@ -84,15 +62,11 @@ def test_what_is_written_is_read(make, unit, measures, own_input, values):
 
 
 def test_samples_lost_at_the_very_end_are_counted(tmp_path, make):
-    """Where no later block can tell of a loss, the end does."""
-    path = tmp_path / "run.mcap"
-    with path.open("wb") as stream:
-        make.write(stream, [make.batch(0, 4)], ended_at=350)
+    path = written(tmp_path / "run.mcap", [make.batch(0, 4)], ended_at=350)
     assert read(path).dropped == 150
 
 
 def test_cut_short_file_gives_what_it_holds(tmp_path, make):
-    """A file cut anywhere after its start is read as far as it goes, and never wrongly."""
     path = tmp_path / "run.mcap"
     batches = [make.batch(200 * i, 4, seed=i) for i in range(10)]
     stream = io.BytesIO()
@@ -113,7 +87,6 @@ def test_cut_short_file_gives_what_it_holds(tmp_path, make):
 
 @pytest.mark.parametrize("content", [b"", b"hello", bytes(5000), b"\x89MCAP0\r\n", b"\xff" * 99])
 def test_other_files_are_refused(tmp_path, content):
-    """What is not a recording is refused with the file's name."""
     path = tmp_path / "x.mcap"
     path.write_bytes(content)
     with pytest.raises(DataError, match=r"x\.mcap"):

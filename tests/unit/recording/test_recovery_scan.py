@@ -20,32 +20,12 @@ def salvaged(data):
     return scan, list(scan.records())
 
 
-def count(records):
-    return sum(isinstance(record, Message) for record in records)
-
-
 def test_a_sound_file_has_no_damage(data):
     scan, records = salvaged(data)
     assert scan.sound
     assert scan.is_mcap
-    assert count(records) > 4
+    assert sum(isinstance(record, Message) for record in records) > 4
     assert [r.name for r in records if isinstance(r, Metadata)] == ["hilctl.run", "hilctl.end"]
-
-
-def test_a_file_that_ends_early_lacks_end_and_index(data):
-    scan, records = salvaged(data[: len(data) // 2])
-    assert not scan.sound
-    assert 0 < count(records) < count(salvaged(data)[1])
-
-
-def test_a_damaged_stretch_costs_no_record_behind_it(data):
-    """One flipped byte inside the file: facts of the end are still found."""
-    broken = bytearray(data)
-    broken[len(data) // 3] ^= 0x10
-    scan, records = salvaged(bytes(broken))
-    assert not scan.sound
-    assert len(scan.damages) >= 1
-    assert "hilctl.end" in [r.name for r in records if isinstance(r, Metadata)]
 
 
 def test_what_is_no_mcap_file_holds_nothing():

@@ -11,6 +11,7 @@ from mcap.writer import Writer
 from hilctl.base.errors import DataError
 from hilctl.recording.reader import read
 from hilctl.recording.run_summary import read_ends
+from tests.unit.recording.conftest import written
 
 GOLDEN = sorted((Path(__file__).parents[3] / "recordings" / "golden").glob("*.mcap"))
 ONE = GOLDEN[0]
@@ -23,7 +24,6 @@ def test_both_ends_say_what_the_whole_file_says(path):
 
 
 def test_neither_samples_nor_a_long_index_are_read(tmp_path, monkeypatch):
-    """However large a file is, head, tail and three records by way of the index are enough."""
     path = tmp_path / "long.mcap"
     with path.open("wb") as stream:
         writer = Writer(stream, chunk_size=1000)
@@ -53,7 +53,6 @@ def test_neither_samples_nor_a_long_index_are_read(tmp_path, monkeypatch):
 
 
 def test_facts_larger_than_the_head_are_read(tmp_path):
-    """A sequence of thousands of waveforms has as many segments."""
     path = tmp_path / "many.mcap"
     with path.open("wb") as stream:
         writer = Writer(stream)
@@ -83,7 +82,6 @@ def test_a_file_that_a_run_writes_to_says_so(tmp_path):
 
 
 def test_no_damage_of_the_last_bytes_is_taken_for_an_end(tmp_path):
-    """Whatever stands in footer and index: facts are those that were written, or there are none."""
     whole, run = bytearray(ONE.read_bytes()), read(ONE)
     path = tmp_path / "damaged.mcap"
     for back in range(1, 700):
@@ -96,9 +94,7 @@ def test_no_damage_of_the_last_bytes_is_taken_for_an_end(tmp_path):
 
 
 def test_no_flipped_bit_leaves_wrong_facts(tmp_path, make):
-    path = tmp_path / "run.mcap"
-    with path.open("wb") as stream:
-        make.write(stream, [make.batch(0, 4)])
+    path = written(tmp_path / "run.mcap", [make.batch(0, 4)])
     whole, right = path.read_bytes(), read_ends(path)
     head = whole.index(b"model.yaml")
     states = set()
@@ -109,9 +105,9 @@ def test_no_flipped_bit_leaves_wrong_facts(tmp_path, make):
         except DataError:
             continue
         states.add(ends.state)
-        for found, written in ((ends.run, right.run), (ends.end, right.end)):
+        for found, expected in ((ends.run, right.run), (ends.end, right.end)):
             # All of them or none; one more where the name of the checksum itself is hit.
-            assert not found or written.items() <= found.items()
+            assert not found or expected.items() <= found.items()
         assert ends.state != "finished" or (ends.run and ends.end)
     assert states == {"finished", "damaged", "unfinished"}
 

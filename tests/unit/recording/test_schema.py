@@ -7,22 +7,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from hilctl.recording import schema
 
 
-@pytest.fixture
-def recorded(tmp_path, make):
-    """A finished recording of three batches with a gap before the last."""
-    batches = [
-        make.batch(0, 4),
-        make.batch(200, 30, seed=1),
-        make.batch(1900, 3, dropped=200, seed=2),
-    ]
-    path = tmp_path / "run.mcap"
-    with path.open("wb") as stream:
-        make.write(stream, batches)
-    return path, batches
-
-
 def test_field_numbers_stay():
-    """Files that exist are read by these numbers; a new column takes new ones."""
     numbers = {
         message.name: {field.number: field.name for field in message.field}
         for message in schema.file_descriptor().message_type
@@ -43,7 +28,6 @@ def test_field_numbers_stay():
 
 
 def test_independent_reader_agrees(recorded, make):
-    """The stock MCAP reader, indexed and with CRCs, decodes the same by the file's own schema."""
     path, batches = recorded
     counts, samples = {}, []
     with path.open("rb") as stream:

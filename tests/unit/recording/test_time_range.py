@@ -10,13 +10,12 @@ import pytest
 
 from hilctl.analysis.report import summarize
 from hilctl.base.errors import DataError
-from hilctl.base.samples import COLUMNS
 from hilctl.base.segments import Segment
 from hilctl.recording import reader
 from hilctl.recording.mcap_records import ReadBudget
 from hilctl.recording.reader import read
-from hilctl.recording.recording import TICK_COLUMNS
 from hilctl.recording.time_range import TimeRange, places_of
+from tests.unit.recording.conftest import same_samples, same_ticks, written
 
 GOLDEN = Path(__file__).parents[3] / "recordings" / "golden" / "terfenol_compensated.mcap"
 
@@ -34,7 +33,6 @@ GOLDEN = Path(__file__).parents[3] / "recordings" / "golden" / "terfenol_compens
     ],
 )
 def test_it_is_cut_by_the_time_of_the_samples(from_s, to_s, first, last):
-    """From the first time on, before the other; ticks by their first sample."""
     part = read(GOLDEN, TimeRange(from_s, to_s))
     assert (part.samples.index[0], part.samples.index[-1]) == (first, last)
     assert {values.size for values in part.samples.columns().values()} <= {0, last + 1 - first}
@@ -54,7 +52,6 @@ def test_no_sample_between_the_times_is_an_error(from_s, to_s):
 
 
 def test_blocks_elsewhere_are_not_kept(monkeypatch):
-    """The budget counts what stays in memory."""
     kept = []
 
     class Counting(ReadBudget):
@@ -71,7 +68,6 @@ def test_blocks_elsewhere_are_not_kept(monkeypatch):
 
 
 def test_figures_of_a_stretch_are_those_of_its_steady_cycles():
-    """Judged as if the run had been cut there; its counters are of the whole, and left out."""
     whole, part = read(GOLDEN), read(GOLDEN, TimeRange(0.05, 0.0951))
     (one,) = part.segments
     assert (one.start, one.steady_start, one.steady_stop, one.stop) == (0, 2500, 4755, 4755)
@@ -110,14 +106,11 @@ def test_gaps_count_within_it_only():
 @pytest.fixture
 def recorded(tmp_path, make):
     """Forty chunks of 200 samples, 4 ms each, a gap of 20 ms in the middle."""
-    path = tmp_path / "run.mcap"
     batches = [
         make.batch(200 * k + (1000 if k >= 20 else 0), 4, dropped=1000 if k == 20 else 0, seed=k)
         for k in range(40)
     ]
-    with path.open("wb") as stream:
-        make.write(stream, batches, events=[make.ended])
-    return path
+    return written(tmp_path / "run.mcap", batches, events=[make.ended])
 
 
 STRETCHES = [
@@ -129,21 +122,17 @@ STRETCHES = [
 
 @pytest.mark.parametrize("stretch", STRETCHES, ids=str)
 def test_the_index_gives_what_a_walk_gives(monkeypatch, recorded, stretch):
-    """Samples, ticks, starts, events and facts of both ends."""
     found = read(recorded, stretch)
     monkeypatch.setattr(reader, "places_of", lambda stream, stretch: None)
     whole = read(recorded, stretch)
-    for name in ("index", *COLUMNS, "flags"):
-        assert getattr(found.samples, name).tobytes() == getattr(whole.samples, name).tobytes()
-    for name in TICK_COLUMNS:
-        assert getattr(found.ticks, name).tolist() == getattr(whole.ticks, name).tolist()
+    same_samples(found.samples, whole.samples)
+    same_ticks(found.ticks, whole.ticks)
     assert [start.sample for start in found.starts] == [start.sample for start in whole.starts]
     names = ("run", "end", "segments", "events", "dropped", "experiment_yaml", "model_yaml")
     assert all(getattr(found, name) == getattr(whole, name) for name in names)
 
 
 def test_the_rest_is_not_read(recorded):
-    """Of forty chunks, those with the samples, their neighbours, and those with events."""
     with recorded.open("rb") as stream:
         everything = places_of(stream, TimeRange(None, None))
         few = places_of(stream, TimeRange(0.05, 0.0501))

@@ -16,7 +16,6 @@ def torn(data):
 
 
 def test_nonsense_behind_a_message_costs_that_message():
-    """In a torn chunk, the last message counts only where one more begins or the bytes end."""
     two = raw(message(1, b"\x08\x01")) + raw(message(2, b"\x08\x01"))
 
     def saved(behind):
@@ -32,7 +31,6 @@ def test_nonsense_behind_a_message_costs_that_message():
 
 
 def test_a_whole_chunk_with_a_wrong_checksum_gives_nothing():
-    """That the file ends behind it is no reason to believe what is in it."""
     wrong = raw(chunk(raw(message(1, b"\x08\x01")), crc=1))
     assert take_chunk(wrong, ReadBudget(2**20), last=True) == ([], "damaged chunk")
 
@@ -62,7 +60,6 @@ def test_a_sector_of_zeros_ends_a_compressed_stream(make):
 
 
 def test_a_likely_record_is_found_across_windows(monkeypatch):
-    """The search goes on from window to window without missing one on the border."""
     import hilctl.recording.truncated_chunks as module
 
     monkeypatch.setattr(module, "_WINDOW_BYTES", 100)
@@ -74,7 +71,6 @@ def test_a_likely_record_is_found_across_windows(monkeypatch):
 
 
 def test_own_channels_are_those_of_the_writer(make):
-    """Channels taken for lost ones are the very ones that the writer writes."""
     from mcap.reader import SeekingReader
 
     stream = io.BytesIO()

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -30,7 +31,6 @@ def loaded_of(*settings, name="demo.yaml", **info):
     [({}, "slip"), ({"buffered": True}, "catch_up"), ({"latency_blocks": 3}, "follow")],
 )
 def test_the_device_goes_before_the_file_in_what_late_ticks_do(info, policy):
-    """A FIFO sets the pace itself; a buffer has to be filled again."""
     settings = "timing.late_policy=slip"
     loaded = loaded_of(settings, **{"buffered": False, "latency_blocks": 0, **info})
     assert planned(loaded).late_policy == policy
@@ -55,7 +55,6 @@ def test_late_rules_are_in_the_file_s_own_ticks():
     ],
 )
 def test_misses_are_counted_over_ten_seconds_or_the_whole_run(settings, samples, expected):
-    """A thousand ticks a second, of 50 samples each."""
     loaded, values = loaded_of(*settings), np.zeros(samples)
     rules = assemble(loaded, values, values, None).late_rules
     assert (rules.missed_window, rules.max_missed) == expected
@@ -66,7 +65,6 @@ def test_a_run_without_a_pace_misses_nothing():
 
 
 def test_the_compensator_starts_from_the_memory_that_was_given():
-    """Warming up leaves no trace in it."""
     loaded = loaded_of(name="terfenol_sine_6a.yaml")
     rest = planned(loaded).compensator
     state = rest.state()
@@ -113,8 +111,7 @@ def test_a_rounded_end_of_the_range_is_the_end(output):
 
 
 def test_a_device_that_does_not_answer_is_no_refusal():
-    def silent():
-        raise DeviceError("no answer")
-
     with pytest.raises(DeviceError, match="no answer"):
-        starting_output(SimpleNamespace(info=INFO, output=silent), 0.0)
+        starting_output(
+            SimpleNamespace(info=INFO, output=Mock(side_effect=DeviceError("no answer"))), 0.0
+        )

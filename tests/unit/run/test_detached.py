@@ -4,7 +4,6 @@ from hilctl.run.detached import free_log
 
 
 def test_no_log_takes_the_place_of_another_file(tmp_path):
-    """Neither one of another run, nor a user's own, nor a link that leads nowhere."""
     output = tmp_path / "run.mcap"
     assert free_log(output) == tmp_path / "run.log"
     (tmp_path / "run.log").write_text("mine")

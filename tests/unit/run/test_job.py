@@ -5,6 +5,7 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from hilctl.base.errors import RunError
 from hilctl.base.files import TextFiles
 from hilctl.base.yaml import Document
 from hilctl.experiment.load import load_experiment, resolve
-from hilctl.run.job import Job, safe_priority, silence_limits
+from hilctl.run.job import Job, silence_limits
 from hilctl.run.loop_process import loaded_of
 from hilctl.run.run_folder import run_folder
 from hilctl.run.start import checked_experiment
@@ -50,7 +51,6 @@ def test_the_job_is_what_was_checked_even_where_its_files_have_gone(folder, tmp_
 
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.stem)
 def test_an_experiment_goes_through_its_text_unchanged(path):
-    """Each shipped experiment and its model are the same values in the loop process."""
     loaded = load_experiment(path)
     again = resolve(
         Document("experiment", loaded.yaml_text), loaded.folder, files=TextFiles(loaded.files.texts)
@@ -60,7 +60,6 @@ def test_an_experiment_goes_through_its_text_unchanged(path):
 
 
 def test_infinite_numbers_and_states_are_read_back(folder):
-    """A run that goes on without its recorder waits for its supervisor for ever."""
     checked = checked_experiment(CONFIGS / "demo.yaml", ["waveform.duration_s=1.0"])
     job = Job.of(checked, folder, supervisor=1, silence_s=math.inf)
     job = replace(job, state=[0.1, -0.0, 1 / 3], adapted=[[math.inf, 0.1]])
@@ -69,7 +68,6 @@ def test_infinite_numbers_and_states_are_read_back(folder):
 
 
 def test_an_input_that_is_the_reference_is_kept_once(folder):
-    """Without a correction or a preview both are one file; the memory before the run goes along."""
     plain = checked_experiment(CONFIGS / "terfenol_sine_6a_uncompensated.yaml", [])
     job = Job.of(plain, folder, supervisor=1, silence_s=1.0)
     assert (job.reference == job.input_um) == (plain.begun.input_um is plain.reference.values)
@@ -77,26 +75,10 @@ def test_an_input_that_is_the_reference_is_kept_once(folder):
 
 
 def test_samples_that_find_no_room_are_told(folder, monkeypatch):
-    """With what needs less of it: numpy gives no reason of its own."""
-
-    def save(path, values):
-        raise OSError("8000 requested and 512 written")
-
     plain = checked_experiment(CONFIGS / "terfenol_sine_6a_uncompensated.yaml", [])
-    monkeypatch.setattr(np, "save", save)
+    monkeypatch.setattr(np, "save", Mock(side_effect=OSError("8000 requested and 512 written")))
     with pytest.raises(RunError, match=r"8000 requested.*recording\.ring_s"):
         Job.of(plain, folder, supervisor=1, silence_s=1.0)
-
-
-def limits_of(*, hang_s=None, simulated=False):
-    info = SimpleNamespace(simulated=simulated)
-    config = SimpleNamespace(
-        timing=SimpleNamespace(hang_s=hang_s, max_late_s=1.0),
-        tick_s=0.01,
-        realtime=SimpleNamespace(priority=80),
-    )
-    loaded = SimpleNamespace(config=config, device=SimpleNamespace(info=info))
-    return SimpleNamespace(loaded=loaded)
 
 
 @pytest.mark.parametrize(
@@ -108,12 +90,10 @@ def limits_of(*, hang_s=None, simulated=False):
     ],
 )
 def test_how_long_a_loop_may_be_silent(given, simulated, real_time_s, ordinary_s, stopped_s):
-    """Two periods, and what the experiment says; simulated coils can wait."""
-    limits = silence_limits(limits_of(hang_s=given, simulated=simulated))
+    config = SimpleNamespace(timing=SimpleNamespace(hang_s=given, max_late_s=1.0), tick_s=0.01)
+    device = SimpleNamespace(info=SimpleNamespace(simulated=simulated))
+    loaded = SimpleNamespace(config=config, device=device)
+    limits = silence_limits(SimpleNamespace(loaded=loaded))
     assert (limits.real_time_s, limits.exchange_s) == (pytest.approx(real_time_s), 1.0)
     assert limits.ordinary_s == pytest.approx(ordinary_s)
     assert limits.stopped_s == pytest.approx(stopped_s)
-
-
-def test_who_makes_it_safe_comes_before_the_loop():
-    assert safe_priority(limits_of()) == 81

@@ -48,7 +48,6 @@ FACTS = {
 
 
 def test_end_has_every_counter() -> None:
-    """Wherever a run's counters stand, its end says the same of them."""
     assert end_facts(OUTCOME, COUNTERS) == {**FACTS, "lost_events": "0"}
     page = SharedPage(mmap(-1, SIZE))
     page.leave_lateness(COUNTERS)
@@ -56,7 +55,6 @@ def test_end_has_every_counter() -> None:
 
 
 def test_every_column_has_its_unit() -> None:
-    """Under the name that it is recorded by."""
     facts = run_facts(checked_experiment(EXPERIMENT, []), "2000-01-01T00:00:00", "model: x\n")
     units = json.loads(facts["units"])
     assert set(units) == {"t_rel", *(column.field("A").name for column in COLUMNS.values())}
@@ -65,7 +63,6 @@ def test_every_column_has_its_unit() -> None:
 
 
 def test_labels_are_recorded_and_change_no_identity() -> None:
-    """A campaign that goes on with another operator measures nothing twice."""
     plain = checked_experiment(EXPERIMENT, [])
     labelled = checked_experiment(EXPERIMENT, ["labels={sample: A7, t: 21.5}"])
     facts = run_facts(labelled, "2000-01-01T00:00:00", "")
@@ -134,7 +131,6 @@ def reported(recording):
 @pytest.mark.parametrize("segments", [(), TWO, ONCE, FAST, LONG])
 @pytest.mark.parametrize("pieces", [1, 7, 500])
 def test_they_are_those_of_the_report(name, segments, pieces):
-    """However the samples come; a gap, a reading that is none and one not trusted do no harm."""
     recording = read(GOLDEN / f"{name}.mcap")
     samples = recording.samples.rows(recording.samples.index % 1000 > 3)
     samples.displacement_um[40::997] = np.nan
@@ -147,7 +143,6 @@ def test_they_are_those_of_the_report(name, segments, pieces):
 
 
 def test_a_segment_that_was_cut_short_has_none():
-    """Those before it have: of the second, one sample is missing."""
     recording = replace(read(GOLDEN / "terfenol_compensated.mcap"), segments=TWO)
     cut = replace(recording, samples=recording.samples.part(0, TWO[1].steady_stop - 1))
     first = replace(recording, segments=TWO[:1])
@@ -159,7 +154,6 @@ def test_a_segment_that_was_cut_short_has_none():
     ("at", "takes", "counts"), [(50, 50, True), (50, 51, False), (2999, 1, False), (5900, 9, True)]
 )
 def test_a_segment_that_was_tuned_has_none(at, takes, counts):
-    """Where the change ends before its steady part, or begins behind it, the figures count."""
     segments = (Segment("a", 0, 6000, 100, 5000, 500.0),)
     recording = replace(read(GOLDEN / "terfenol_compensated.mcap"), segments=segments)
     change = Event(at, "info", TUNED, "", {"gain": 0.5, "offset": 0.0, "samples": float(takes)})

@@ -54,7 +54,6 @@ def test_process_that_ends_without_a_result_is_a_run_error(answering, code):
 
 
 def test_interrupt_is_passed_on_and_handlers_are_as_before(answering):
-    """To a process that has a session, and so no terminal, of its own."""
     answering("import time\nsignal.signal(2, 0)\nos.kill(os.getppid(), 2)\ntime.sleep(60)")
     before = signal.getsignal(signal.SIGINT)
     with pytest.raises(KeyboardInterrupt):

@@ -41,7 +41,6 @@ INFO = DeviceInfo(
     ],
 )
 def test_what_can_not_be_is_said_with_its_likely_cause(displacement_um, output, faults):
-    """Ends of a range are fine; far beyond it bytes are in the wrong order."""
     found = judge(INFO, displacement_um, output)
     assert len(found) == len(faults)
     for fault, text in zip(found, faults, strict=True):
@@ -105,7 +104,6 @@ def rig(tmp_path):
 
 @pytest.mark.parametrize("profile", ["wago_750", "cobs_board"])
 def test_a_trip_stays_and_no_stale_command_takes_effect(rig, profile):
-    """What was put out before the watchdog tripped is not put out again by looking."""
     probed = rig(profile, watchdog={"timeout_s": 0.5})
     probed.drive(3.0)
     probed.clock.pass_s(1.0)
@@ -132,7 +130,6 @@ def test_reading_and_output_are_those_of_the_rig(rig, profile):
 
 
 def test_a_wrong_word_order_is_found(rig):
-    """A reading that no sensor can give, where a profile takes its words the wrong way round."""
     probed = rig("labjack_t7")
     # 1.6 V, 3fcccccd: with its words the other way round -1.08e8 V.
     probed.emulator.device._rig.displacement_um = 20.0

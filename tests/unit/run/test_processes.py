@@ -4,6 +4,7 @@ import signal
 import subprocess
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 
@@ -50,10 +51,9 @@ def test_the_job_is_given_with_the_locks(started):
 
 
 def test_a_loop_process_that_cannot_be_started_is_an_error_of_the_run(tmp_path, monkeypatch):
-    def start_process(*words, inherits):
-        raise OSError(24, "Too many open files")
-
-    monkeypatch.setattr(module, "start_process", start_process)
+    monkeypatch.setattr(
+        module, "start_process", Mock(side_effect=OSError(24, "Too many open files"))
+    )
     with pytest.raises(RunError, match="Too many open files"):
         LoopProcess(SimpleNamespace(job=Path("job")), None, ())
 
@@ -62,7 +62,6 @@ def test_a_loop_process_that_cannot_be_started_is_an_error_of_the_run(tmp_path, 
     ("phase", "error"), [(Phase.REFUSED, InputError), (Phase.FAILED, RunError)]
 )
 def test_a_loop_that_can_not_start_says_why(started, phase, error):
-    """What the user gave is told from what a device did."""
     child, page = started
     page.write_text(PageSlot.ERROR, "no port")
     page.put(PageField.PHASE, phase)
@@ -86,7 +85,6 @@ def test_a_stop_comes_before_the_start(started):
 
 
 def test_a_loop_that_died_or_broke_says_what_it_can(started):
-    """A loop that broke has left its reason; of one that was killed there is the signal."""
     child, page = started
     child._process.code = 7
     assert child.death() == "the loop process died: exit code 7"
@@ -98,7 +96,6 @@ def test_a_loop_that_died_or_broke_says_what_it_can(started):
 
 
 def test_a_loop_that_the_kernel_keeps_is_not_waited_for(started):
-    """Whoever makes the output safe comes behind it."""
     child, _ = started
 
     def wait(timeout):

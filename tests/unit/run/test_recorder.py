@@ -8,6 +8,7 @@ from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -90,7 +91,6 @@ def test_a_refused_write_loses_neither_samples_nor_events(begun, number):
 
 
 def test_a_disk_that_has_room_again_at_the_very_end_gets_all(begun, monkeypatch):
-    """The last writes are retried until the disk accepts them."""
     made, disk = begun
     made.batch(batch(0, 20))
     made.flush()
@@ -105,7 +105,6 @@ def test_a_disk_that_has_room_again_at_the_very_end_gets_all(begun, monkeypatch)
 
 
 def test_a_disk_that_stays_full_leaves_the_file_as_the_last_flush_did(begun):
-    """Without half a chunk: what is not in it is still in the ring."""
     made, disk = begun
     made.batch(batch(0, 20))
     made.flush()
@@ -122,7 +121,6 @@ def test_a_disk_that_stays_full_leaves_the_file_as_the_last_flush_did(begun):
 
 
 def test_a_recording_counts_as_complete_once_it_is_on_the_disk(begun, monkeypatch):
-    """The whole file, and the folder with its name."""
     made, _ = begun
     synced = []
 
@@ -141,10 +139,7 @@ def test_a_recording_counts_as_complete_once_it_is_on_the_disk(begun, monkeypatc
 def test_a_disk_that_can_not_keep_the_recording_is_an_error(begun, monkeypatch):
     made, _ = begun
 
-    def fsync(descriptor):
-        raise OSError(errno.EIO, os.strerror(errno.EIO))
-
-    monkeypatch.setattr(os, "fsync", fsync)
+    monkeypatch.setattr(os, "fsync", Mock(side_effect=OSError(errno.EIO, os.strerror(errno.EIO))))
     made.batch(batch(0, 20))
     made.flush()
     assert not made.finish(END, 200, patience_s=0.0)
@@ -196,7 +191,6 @@ def test_a_bug_ends_the_recording_as_it_was_flushed(begun):
 
 
 def test_gaps_are_counted_while_all_is_well(begun):
-    """Samples that the ring had no room for are missing, those written are not."""
     made, _ = begun
     made.batch(batch(0, 2))
     made.batch(batch(50, 3, dropped=30))
@@ -205,7 +199,6 @@ def test_gaps_are_counted_while_all_is_well(begun):
 
 
 def test_times_go_on_when_the_wall_clock_is_set(monkeypatch):
-    """Unix time is taken once; from then on the monotonic clock counts."""
     wall_ns, passed_ns = 5 * 10**18, 1000
     monkeypatch.setattr(recorder.time, "time_ns", lambda: wall_ns)
     monkeypatch.setattr(recorder.time, "monotonic_ns", lambda: passed_ns)
@@ -226,7 +219,6 @@ def numbered(first, blocks, block):
 
 @pytest.mark.parametrize("block", [1, 7, 4000])
 def test_last_samples_come_up_to_the_one_asked_for(block):
-    """However they came, the samples before an event are told in order, and no later ones."""
     tail = RecentSamples(50)
     for start in range(0, 40 * block, 4 * block):
         tail.add(numbered(start, 4, block))
@@ -240,7 +232,6 @@ def test_last_samples_come_up_to_the_one_asked_for(block):
 
 
 def test_nothing_comes_before_the_first_sample():
-    """An event before any sample has none to tell."""
     tail = RecentSamples(50)
     assert tail.up_to(10) is None
     tail.add(numbered(100, 1, 5))
@@ -284,7 +275,6 @@ def on_a_disk(checked, tmp_path):
 
 
 def test_a_folder_that_comes_back_gets_the_recording(on_a_disk):
-    """As that of a network drive does."""
     folder = on_a_disk.path.parent
     on_a_disk.begin(10**18, {})
     on_a_disk.batch(batch(0, 20))
@@ -299,7 +289,6 @@ def test_a_folder_that_comes_back_gets_the_recording(on_a_disk):
 
 
 def test_a_recording_that_is_deleted_before_the_start_is_refused(on_a_disk):
-    """Claimed, and gone before anything has moved."""
     shutil.rmtree(on_a_disk.path.parent)
     with pytest.raises(InputError, match="the file was deleted or renamed"):
         on_a_disk.begin(10**18, {})
@@ -373,7 +362,6 @@ def test_room_is_given_back_once_the_file_has_what_stood_there(ring, recording):
 
 
 def test_a_loop_that_is_never_waited_for_keeps_no_sample_from_the_file(ring, recording):
-    """However busy the machine: there is another block each time that one has been recorded."""
     exchange(ring, 1)
     flushed = []
     batch, flush = recording.recorder.batch, recording.recorder.flush
@@ -397,7 +385,6 @@ def test_a_loop_that_is_never_waited_for_keeps_no_sample_from_the_file(ring, rec
 
 
 def test_what_the_disk_refuses_stays_in_the_ring(ring, recording, monkeypatch):
-    """Written once all the same, and given room for as soon as the disk accepts it."""
     now_s = 100.0
     monkeypatch.setattr(recorder.time, "monotonic", lambda: now_s)
     recording._released_s = now_s
@@ -427,7 +414,6 @@ def test_events_of_both_sides_come_after_the_samples(ring, recording):
 
 
 def test_an_event_of_the_loop_never_comes_before_its_samples(ring, recording, monkeypatch):
-    """A block and its event that come while the samples are taken wait for the next time."""
     batches, recorder, went_on = ring.batches, recording.recorder, []
 
     def batches_and_go_on():
@@ -445,7 +431,6 @@ def test_an_event_of_the_loop_never_comes_before_its_samples(ring, recording, mo
 
 
 def test_what_a_dead_loop_had_sent_is_recorded_as_not_answered(ring, recording):
-    """And the samples behind a damaged block come out too."""
     exchange(ring, 4)
     exchange(ring, 2, answered=False)
     ring._area.heads[1, BlockHeader.SEQUENCE] = 77
@@ -485,7 +470,6 @@ def test_the_device_is_told_of_the_run_before_all_else(ring, recording):
 
 
 def test_nobody_waits_for_a_disk_that_stands_still(ring, recording, monkeypatch):
-    """The ring keeps what comes; how long it has been without room is known to the supervisor."""
     now_s = 100.0
     monkeypatch.setattr(recorder.time, "monotonic", lambda: now_s)
     recording.recorder.disk.clear()
@@ -503,7 +487,6 @@ def test_nobody_waits_for_a_disk_that_stands_still(ring, recording, monkeypatch)
 
 
 def test_marks_are_taken_as_long_as_they_will_be_in_the_file(recording):
-    """Not of a run that is over, on a disk that fails, or where too many wait for it."""
     recording.recorder.error = ""
     assert recording.takes_marks
     for _ in range(64):

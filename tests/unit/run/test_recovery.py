@@ -36,7 +36,6 @@ def dead(tmp_path):
 
 
 def test_a_run_that_left_no_ring_is_not_known_to_be_safe(dead):
-    """Its recording is made whole all the same, and the next look finds nothing."""
     recording = dead()
     (orphan,) = recover_dead_runs()
     assert orphan.recording == recording
@@ -48,8 +47,6 @@ def test_a_run_that_left_no_ring_is_not_known_to_be_safe(dead):
 
 
 def test_a_loop_that_ended_by_its_ramp_is_believed(dead):
-    """The page says so, although nobody was left to read it."""
-
     def fill(folder):
         page = SampleRing.create(folder.ring, slots=4, block=1, state_size=1).page
         ended = LoopOutcome("stopped", "stopped because the supervisor died", 0, "confirmed", 0)
@@ -92,7 +89,6 @@ def test_a_living_run_is_left_alone(tmp_path):
 
 
 def test_what_can_not_be_recovered_is_kept(dead):
-    """The samples are nowhere else; once the recording can be had again, they go into it."""
     recording = dead()
     cut = recording.read_bytes()
     recording.unlink()
@@ -114,7 +110,6 @@ def ready(folder):
 
 @pytest.mark.parametrize("fill", [lambda folder: None, ready])
 def test_a_run_that_never_started_is_cleared_away(dead, fill):
-    """Killed while it starts, it leaves a recording that was claimed, or that has a head only."""
     recording = dead(fill)
     recording.write_bytes(b"")
     (orphan,) = recover_dead_runs()
@@ -133,7 +128,6 @@ def test_what_stood_under_the_name_of_a_run_that_never_started_stays(dead):
 
 
 def test_what_can_not_be_recovered_can_be_dismissed(dead, tmp_path):
-    """By the run's name; an active run can't."""
     dead().unlink()
     (orphan,) = recover_dead_runs()
     dismiss(orphan.name)

@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 
@@ -38,7 +39,6 @@ def made(tmp_path, name="sine"):
 
 
 def test_run_is_seen_while_it_lives_and_gone_afterwards(tmp_path):
-    """Others find a run's name, recording and process; in the end nothing is left."""
     with made(tmp_path) as (folder, _):
         (found,) = runs()
         assert found == folder
@@ -62,7 +62,6 @@ def test_a_folder_that_is_kept_is_a_dead_run_to_the_next_command(tmp_path):
 
 
 def test_dead_run_is_taken_over_once(tmp_path):
-    """Of several who want to recover a run, one gets it; a living run nobody."""
     with made(tmp_path) as (folder, _), taken_over(folder) as ours:
         assert not ours
     folder.path.mkdir()
@@ -75,7 +74,6 @@ def test_dead_run_is_taken_over_once(tmp_path):
 
 
 def test_folder_that_others_can_write_is_refused(tmp_path):
-    """Somebody else's folder, or one open to all, is not used."""
     (tmp_path / "runs").mkdir()
     (tmp_path / "runs").chmod(0o777)
     with pytest.raises(RunError, match="must be yours"):
@@ -83,7 +81,6 @@ def test_folder_that_others_can_write_is_refused(tmp_path):
 
 
 def test_half_made_folders_are_passed_over(tmp_path):
-    """A folder without a card, or with a damaged one, is not listed."""
     (base_folder() / "empty").mkdir()
     broken = base_folder() / "broken"
     broken.mkdir()
@@ -111,7 +108,6 @@ GOOD = {"name": "x", "experiment": "x", "recording": "/x.mcap", "supervisor": 7,
     ids=str,
 )
 def test_a_card_with_a_wrong_value_is_passed_over_with_one_warning(tmp_path, caplog, wrong):
-    """The other runs are still found."""
     card = base_folder() / "broken" / "run.json"
     card.parent.mkdir()
     card.write_text(json.dumps({**GOOD, **wrong}))
@@ -145,7 +141,6 @@ def test_run_whose_folder_was_removed_is_found_until_it_ends(tmp_path):
 
 
 def test_what_a_process_has_of_a_removed_folder_is_kept(tmp_path):
-    """The loop outlives its supervisor, and leaves the samples where the next command looks."""
     with made(tmp_path) as (folder, _):
         (folder.path / "ring").write_text("samples")
         with folder.ring.open():
@@ -160,34 +155,20 @@ def test_what_a_process_has_of_a_removed_folder_is_kept(tmp_path):
                 assert ours
 
 
-def test_finished_run_never_looks_dead(tmp_path, monkeypatch):
-    """While its folder is being removed it is either alive or not there: nobody recovers it."""
-    seen = []
-    remove = shutil.rmtree
+def test_no_run_looks_dead_or_can_be_taken_over_while_its_folder_is_removed(tmp_path, monkeypatch):
+    seen, taken, remove = [], [], shutil.rmtree
 
     def look_then_remove(path, **options):
+        with taken_over(folder) as ours:
+            taken.append(ours)
         seen.append([run.alive for run in runs()])
         remove(path, **options)
 
-    with made(tmp_path):
+    with made(tmp_path) as (folder, _):
         monkeypatch.setattr(shutil, "rmtree", look_then_remove)
     assert seen[0] == []
-    assert all(all(each) for each in seen)
-
-
-def test_lock_is_held_until_the_folder_is_gone(tmp_path, monkeypatch):
-    """Somebody who waits for the lock finds nothing to recover behind it."""
-    held = []
-    remove = shutil.rmtree
-
-    def try_then_remove(path, **options):
-        with taken_over(folder) as ours:
-            held.append(ours)
-        remove(path, **options)
-
-    with made(tmp_path) as (folder, _):
-        monkeypatch.setattr(shutil, "rmtree", try_then_remove)
-    assert not any(held)
+    assert all(map(all, seen))
+    assert not any(taken)
 
 
 def test_samples_of_a_dead_process_of_the_same_number_stay(tmp_path):
@@ -202,28 +183,17 @@ def test_samples_of_a_dead_process_of_the_same_number_stay(tmp_path):
 
 
 def test_folder_that_can_not_be_made_is_one_message(tmp_path, monkeypatch):
-    """A full or closed file system is said, and leaves nothing."""
-
-    def full(*_arguments, **_options):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("pathlib.Path.write_text", full)
-    with (
-        pytest.raises(RunError, match="No space left"),
-        made(tmp_path),
-    ):
+    monkeypatch.setattr(
+        "pathlib.Path.write_text", Mock(side_effect=OSError(28, "No space left on device"))
+    )
+    with pytest.raises(RunError, match="No space left"), made(tmp_path):
         pass
     assert list(base_folder().iterdir()) == []
 
 
 def test_no_descriptor_left_is_not_taken_for_a_dead_run(tmp_path, monkeypatch):
-    """A lock that can't be looked at says nothing of who holds it."""
-
-    def none_left(*_arguments):
-        raise OSError(24, "Too many open files")
-
     with made(tmp_path) as (folder, _):
-        monkeypatch.setattr(os, "open", none_left)
+        monkeypatch.setattr(os, "open", Mock(side_effect=OSError(24, "Too many open files")))
         for look in (lambda: folder.alive, lambda: folder.supervised):
             with pytest.raises(OSError, match="Too many"):
                 look()
@@ -240,7 +210,6 @@ def places(tmp_path, monkeypatch):
 
 
 def test_somebody_in_the_first_place_locks_nobody_out(tmp_path, places, monkeypatch):
-    """The second is taken then, and a run there is still found once the first is free again."""
     trap = tmp_path / "trap"
     trap.mkdir(mode=0o700)
     places[0].symlink_to(trap)
@@ -267,36 +236,33 @@ def test_no_place_at_all_says_what_is_wrong_with_each(places):
 NAME = f"test:{os.getpid()}:"  # locks are the whole machine's, and so is /dev/ttyUSB0
 
 
+def hold(*names):
+    with held_devices(names):
+        pass
+
+
+def refused(*names, match="in use by"):
+    with pytest.raises(InputError, match=match):
+        hold(*names)
+
+
 def test_device_is_held_by_one_run(tmp_path):
-    """The second run is refused, and reads who the first is."""
     device, other = f"{NAME}tty", f"{NAME}tcp"
     with held_devices((device,)), made(tmp_path) as (folder, _):
         who = f"run {folder.card.experiment} .process {os.getpid()}, recording {tmp_path}/a.mcap"
-        with (
-            pytest.raises(InputError, match=f"{device} is in use by {who}"),
-            held_devices((other, device)),
-        ):
-            pass
-        with held_devices((other,)):
-            pass
-    with held_devices((device, device)):
-        pass
+        refused(other, device, match=f"{device} is in use by {who}")
+        hold(other)  # a run that is refused lets go of what it had
+    hold(device, device)
 
 
 def test_holder_without_a_run_is_named_by_the_kernel():
-    """A process of somebody else, or one that has no folder yet."""
     name = f"{NAME}{'long' * 50}"
-    with (
-        held_devices((name,)),
-        pytest.raises(InputError, match=f"in use by process {os.getpid()} of "),
-        held_devices((name,)),
-    ):
-        pass
+    with held_devices((name,)):
+        refused(name, match=f"in use by process {os.getpid()} of ")
 
 
 @pytest.mark.parametrize("listening", [True, False])
 def test_another_user_can_not_lock_this_one_out(monkeypatch, caplog, listening):
-    """Anybody can bind the name; it is warned of, and the lock of this user's runs still holds."""
     name = f"{NAME}squatted"
     address = b"\0hilctl/device/" + hashlib.sha256(name.encode()).hexdigest().encode()
     asked = run_folder_module._holder
@@ -314,8 +280,7 @@ def test_another_user_can_not_lock_this_one_out(monkeypatch, caplog, listening):
             (warned,) = caplog.messages
             assert name in warned
             assert (f"process {os.getpid()} of user {2**31 - 1}" in warned) == listening
-            with pytest.raises(InputError, match="in use by another run"), held_devices((name,)):
-                pass
+            refused(name, match="in use by another run")
 
 
 def test_a_device_stays_held_when_the_folder_is_removed():
@@ -323,18 +288,7 @@ def test_a_device_stays_held_when_the_folder_is_removed():
     name = f"{NAME}removed"
     with held_devices((name,)):
         shutil.rmtree(base_folder())
-        with pytest.raises(InputError, match="in use by process"), held_devices((name,)):
-            pass
-
-
-def test_refused_run_lets_go_of_what_it_had():
-    """A run that gets one device and not the other holds neither."""
-    first, second = f"{NAME}a", f"{NAME}b"
-    with held_devices((second,)):
-        with pytest.raises(InputError), held_devices((first, second)):
-            pass
-        with held_devices((first,)):
-            pass
+        refused(name, match="in use by process")
 
 
 def test_lock_lives_as_long_as_a_process_that_inherited_it():
@@ -344,11 +298,9 @@ def test_lock_lives_as_long_as_a_process_that_inherited_it():
         child = subprocess.Popen(
             [sys.executable, "-c", "input()"], stdin=subprocess.PIPE, pass_fds=locks
         )
-    with pytest.raises(InputError, match="in use by"), held_devices((name,)):
-        pass
+    refused(name)
     child.communicate(b"\n", timeout=30)
-    with held_devices((name,)):
-        pass
+    hold(name)
 
 
 @pytest.mark.parametrize("machine", ["x86_64", "aarch64", "riscv64"])

@@ -22,7 +22,6 @@ NOON = time.struct_time((2026, 1, 2, 12, 0, 5, 4, 2, 0))
 
 
 def test_a_name_that_is_taken_gets_a_number(tmp_path):
-    """Also one that a link leads nowhere from: nothing is written through it."""
     assert default_output("sine", tmp_path, NOON) == tmp_path / "sine-20260102-120005.mcap"
     (tmp_path / "sine-20260102-120005.mcap").symlink_to(tmp_path / "nowhere")
     (tmp_path / "sine-20260102-120005-2.mcap").touch()
@@ -65,7 +64,6 @@ def experiment(tmp_path) -> Path:
 
 
 def test_a_recording_is_known_by_what_it_is_of(experiment, tmp_path):
-    """Another value of any key is another run."""
     result = unpaced(experiment, [], tmp_path / "a.mcap")
     assert completed_key(result.path) == RunKey.of(load_experiment(experiment))
     assert completed_key(result.path) != RunKey.of(load_experiment(experiment, ["block=10"]))
@@ -80,7 +78,6 @@ def test_what_was_not_completed_has_no_key(experiment, tmp_path):
 
 
 def test_a_model_counts(experiment):
-    """By what it is, not by the name of its file."""
     loaded = load_experiment(experiment)
     key = RunKey.of(loaded)
     assert (key.model, key.correction) == ("", "")
@@ -89,7 +86,6 @@ def test_a_model_counts(experiment):
 
 
 def test_a_recording_says_the_coil_s_heat_before_and_after(experiment, tmp_path):
-    """As the interlock has it: the run that follows at once begins with it."""
     first = read(unpaced(experiment, BUDGET, tmp_path / "a.mcap").path)
     left = float(first.end["coil_heat_a2"])
     assert float(first.run["coil_heat_a2"]) == 0.0

@@ -10,6 +10,7 @@ import socket
 import threading
 from contextlib import contextmanager
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -227,7 +228,6 @@ def stage(tmp_path, monkeypatch):
 
 
 def test_a_run_is_begun_in_one_order_and_undone_in_the_other(stage):
-    """The start signal comes last: the loop then reads its time and its supervisor's heartbeat."""
     result = stage.run()
     assert stage.log == [*READY, "serving", "progress ended", "safety closed", *UNDONE]
     page = stage.ring.page
@@ -245,25 +245,7 @@ def test_a_run_is_begun_in_one_order_and_undone_in_the_other(stage):
     assert (result.samples, result.missing, result.safe, result.stop_signal) == (95, 5, True, 0)
     ready = ["shown", "READY=1", f"STATUS=recording to {stage.output}"]
     assert stage.said == [*ready, *["alive"] * 3, "STOPPING=1"]
-
-
-def test_a_guardian_of_an_earlier_run_is_relieved_only_by_a_run_that_starts(stage):
-    stage.run()
-    assert stage.resumed == ["discarded"]
-
-
-@pytest.mark.parametrize("what", ["claimed", "await ready", "recording"])
-def test_a_run_that_does_not_start_leaves_the_device_to_the_earlier_guardian(stage, what):
-    stage.fails[what] = InputError("that")
-    with pytest.raises(InputError):
-        stage.run()
-    assert stage.resumed == [["tcp:here"]]
-
-
-def test_the_folder_is_kept_for_a_guardian_that_is_still_active(stage):
-    stage.kept = True
-    assert stage.run().guardian_active
-    assert stage.log.index("folder kept") < stage.log.index("folder removed")
+    assert stage.resumed == ["discarded"]  # the guardian of an earlier run
 
 
 def test_a_guardian_that_does_not_get_ready_is_not_waited_for(stage):
@@ -308,7 +290,6 @@ def test_signals_are_taken_for_as_long_as_anything_is_begun_or_undone(stage):
 
 @pytest.mark.parametrize("number", range(len(READY)))
 def test_whatever_fails_before_the_start_signal_leaves_nothing(stage, number):
-    """No lock, no folder, no file and no loop: and the loop is never told to go."""
     what = READY[number]
     stage.fails[what] = InputError("that")
     with pytest.raises(InputError, match="that"):
@@ -325,6 +306,8 @@ def test_whatever_fails_before_the_start_signal_leaves_nothing(stage, number):
     undo = dict(zip(("favoured", "server", "folder", "devices"), UNDONE, strict=True))
     expected += [undone for begun, undone in undo.items() if READY.index(begun) < number]
     assert stage.log[number + 1 :] == expected
+    locks = ["tcp:here"] if number > READY.index("devices") else []
+    assert stage.resumed == [locks] * (number > 0)  # the guardian of an earlier run
     if stage.ring is not None:
         assert stage.ring.page.get(PageField.GO) == 0
 
@@ -343,23 +326,21 @@ def test_a_signal_before_the_start_is_seen(stage):
 
 
 @pytest.mark.parametrize(
-    ("takes_ms", "delays_ms"),
-    [([24], [50]), ([25], [50, 125]), ([400, 600], [50, 1250]), ([400, 700], [50, 1250, 2150])],
+    ("arm_s", "takes_ms", "delays_ms"),
+    [
+        (0.0, [24], [50]),
+        (0.0, [25], [50, 125]),
+        (0.0, [400, 600], [50, 1250]),
+        (0.0, [400, 700], [50, 1250, 2150]),
+        (0.15, [24], [200]),
+    ],
 )
-def test_a_slow_disk_has_the_start_put_off(stage, takes_ms, delays_ms):
-    """The file is written again where half of the time to the first sample went by meanwhile."""
+def test_a_slow_disk_or_a_watchdog_to_arm_has_the_start_put_off(stage, arm_s, takes_ms, delays_ms):
+    stage.info.arm_s = arm_s
     stage.begin_takes_ns = [each * MS for each in takes_ms]
     stage.run()
     assert [(unix - 10**18 - at) // MS for unix, at in stage.begun] == delays_ms
     assert stage.ring.page.get(PageField.START_NS) == stage.begun[-1][1] + delays_ms[-1] * MS
-
-
-def test_the_first_sample_waits_for_the_watchdog_to_be_armed(stage):
-    """The file says when it is due, so that arming must not make it late."""
-    stage.info.arm_s = 0.15
-    stage.begin_takes_ns = [24 * MS]
-    stage.run()
-    assert [(unix - 10**18 - at) // MS for unix, at in stage.begun] == [200]
 
 
 def test_a_disk_that_takes_too_long_three_times_ends_it(stage):
@@ -385,7 +366,6 @@ def test_what_breaks_afterwards_costs_neither_coil_nor_recording(stage):
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, STOP_SIGNAL])
 def test_the_first_signal_is_the_one_that_stops_it(stage, number):
-    """One that comes later changes nothing; afterwards signals are as they were."""
     stage.outcome = LoopOutcome("stopped", "stopped by someone", 100, "confirmed", 0)
     stage.on_attend[1] = lambda: os.kill(os.getpid(), number)
     stage.on_attend[2] = lambda: os.kill(os.getpid(), signal.SIGTERM)
@@ -399,8 +379,7 @@ def test_the_first_signal_is_the_one_that_stops_it(stage, number):
     assert signal.getsignal(STOP_SIGNAL) == signal.SIG_IGN
 
 
-def test_a_terminal_can_not_suspend_it(stage, caplog):
-    """Ctrl-Z is answered; afterwards signals are as they were."""
+def test_a_terminal_can_not_suspend_it(stage, caplog, monkeypatch):
     numbers = (signal.SIGTSTP, signal.SIGTTIN, signal.SIGTTOU)
     before = [signal.getsignal(number) for number in numbers]
 
@@ -409,11 +388,13 @@ def test_a_terminal_can_not_suspend_it(stage, caplog):
             assert signal.getsignal(number) != signal.SIG_DFL  # it would suspend the test
             os.kill(os.getpid(), number)
 
+    def thread(target, args, daemon):
+        assert daemon
+        return SimpleNamespace(start=lambda: target(*args))
+
+    monkeypatch.setattr(module, "threading", SimpleNamespace(Thread=thread))
     stage.on_attend[1] = press
     result = stage.run()
-    for thread in threading.enumerate():  # it is said by a thread
-        if thread is not threading.current_thread() and thread.daemon:
-            thread.join(5.0)
     assert (result.code, result.stop_signal) == ("completed", 0)
     assert len(caplog.messages) == 1
     assert "Ctrl-Z" in caplog.text
@@ -421,11 +402,7 @@ def test_a_terminal_can_not_suspend_it(stage, caplog):
 
 
 def test_handlers_of_the_program_come_back(stage):
-    """Also that of the signal that stops a run."""
-
-    def own(number, frame):
-        pass
-
+    own = Mock()
     signal.signal(STOP_SIGNAL, own)
     stage.run()
     assert signal.getsignal(STOP_SIGNAL) is own
@@ -440,7 +417,6 @@ def test_handlers_of_the_program_come_back(stage):
     ],
 )
 def test_how_it_ended(stage, changes, code, reason):
-    """Whatever was not as it should be makes it a fault; a stop nobody asked for is one too."""
     for name, value in changes.items():
         setattr(stage, name, value)
     result = stage.run()
@@ -448,12 +424,14 @@ def test_how_it_ended(stage, changes, code, reason):
     assert result.safe == stage.outcome.safe
 
 
-def test_a_folder_whose_ring_holds_what_the_file_lacks_is_kept(stage):
-    stage.recorder.error = "no room"
+@pytest.mark.parametrize(("error", "guarded"), [("no room", False), ("", True)])
+def test_the_folder_is_kept_for_samples_that_the_file_lacks_or_a_guardian(stage, error, guarded):
+    stage.recorder.error, stage.kept = error, guarded
     result = stage.run()
-    assert result.code == "fault"
-    assert "no room" in result.reason
-    assert str(stage.folder.path) in result.reason
+    assert result.guardian_active == guarded
+    assert (result.code == "fault") == bool(error)
+    assert error in result.reason
+    assert (str(stage.folder.path) in result.reason) == bool(error)
     assert stage.log.index("folder kept") < stage.log.index("folder removed")
 
 
@@ -470,10 +448,7 @@ def test_deadline_misses_are_counted_in_ticks(stage, skipped, said):
     lateness = Lateness(late_ticks=2, skipped_ticks=skipped)
     stage.on_attend[1] = lambda: stage.ring.page.leave_lateness(lateness)
     result = stage.run()
-    assert (result.late_ticks, result.deadline_misses) == (
-        stage.ring.page.get(PageField.LATE_TICKS),
-        said,
-    )
+    assert (result.late_ticks, result.deadline_misses) == (2, said)
 
 
 @pytest.mark.parametrize("simulated", [False, True])
@@ -500,10 +475,9 @@ def test_the_ring_holds_what_the_experiment_says(stage, ring_s, slots):
 
 
 def test_memory_that_is_not_to_be_had_is_told(stage, monkeypatch):
-    def create(path, **sizes):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(SampleRing, "create", create)
+    monkeypatch.setattr(
+        SampleRing, "create", Mock(side_effect=OSError(28, "No space left on device"))
+    )
     with pytest.raises(RunError, match=r"No space left on device.*recording\.ring_s"):
         stage.run()
     assert stage.log[-3:] == ["given back", *UNDONE[2:]]
@@ -552,39 +526,31 @@ def test_the_heartbeat_is_written_and_the_loop_looked_at(run, monkeypatch):
     assert run.started.outcome is None
 
 
-def refuse(run):
-    run.recording.recorder.error, run.stalled = "full", 5.1
-
-
-def break_off(run):
-    run.started.break_off(ZeroDivisionError("a bug"))
-
-
 @pytest.mark.parametrize(
-    ("cause", "stop"),
+    ("on_failure", "error", "stalled_s", "stop"),
     [
-        (refuse, Stop.RECORDER_FAILED),
-        (lambda run: setattr(run, "stalled", 5.1), Stop.RECORDER_STALLED),
-        (break_off, Stop.SUPERVISOR_BROKE),
+        ("stop", "full", 5.1, Stop.RECORDER_FAILED),
+        ("stop", "full", 4.9, 0),
+        ("stop", "", 5.1, Stop.RECORDER_STALLED),
+        ("stop", "", 4.9, 0),
+        ("go_on", "full", 60.0, 0),
     ],
 )
-def test_a_stop_is_passed_on(run, cause, stop):
+def test_a_recording_stops_a_run_once_half_of_the_ring_is_full(
+    run, on_failure, error, stalled_s, stop
+):
     run.started.poll(0)
     assert run.page.get(PageField.STOP) == 0
-    cause(run)
+    run.config.recording.on_failure = on_failure
+    run.recording.recorder.error, run.stalled = error, stalled_s
     run.started.poll(0)
     assert run.page.get(PageField.STOP) == stop
-
-
-def test_a_write_that_is_refused_stops_nothing_while_the_ring_has_room(run):
-    run.recording.recorder.error, run.stalled = "full", 4.9
-    run.started.poll(0)
-    assert run.page.get(PageField.STOP) == 0
 
 
 @pytest.mark.parametrize(
     ("number", "stop"),
     [
+        (0, Stop.SUPERVISOR_BROKE),
         (signal.SIGINT, Stop.CTRL_C),
         (signal.SIGTERM, Stop.SIGTERM),
         (signal.SIGHUP, Stop.SIGHUP),
@@ -592,22 +558,9 @@ def test_a_write_that_is_refused_stops_nothing_while_the_ring_has_room(run):
     ],
 )
 def test_a_signal_goes_before_all_else(run, number, stop):
-    break_off(run)
+    run.started.break_off(ZeroDivisionError("a bug"))
     run.started.poll(number)
     assert run.page.get(PageField.STOP) == stop
-
-
-def test_a_run_that_is_to_go_on_goes_on_without_its_recording(run):
-    run.config.recording.on_failure = "go_on"
-    run.recording.recorder.error, run.stalled = "full", 60.0
-    run.started.poll(0)
-    assert run.page.get(PageField.STOP) == 0
-
-
-def test_half_a_ring_is_no_reason_to_stop(run):
-    run.stalled = 4.9
-    run.started.poll(0)
-    assert run.page.get(PageField.STOP) == 0
 
 
 def test_a_loop_that_ended_by_itself_is_believed_once_it_is_gone(run):
@@ -625,13 +578,6 @@ def test_a_loop_that_ended_by_itself_is_believed_once_it_is_gone(run):
     assert run.looks == [False, True]
 
 
-def test_the_recording_is_not_closed_before_the_output_is_safe(run):
-    """A loop that left nothing: somebody is still at it."""
-    run.child.ended = True
-    run.started.poll(0)
-    assert run.ended == []
-
-
 @pytest.mark.parametrize(
     ("result", "by", "words"),
     [
@@ -643,8 +589,10 @@ def test_the_recording_is_not_closed_before_the_output_is_safe(run):
     ],
 )
 def test_who_acted_is_said_and_only_what_was_confirmed(run, result, by, words):
-    run.safety.result, run.safety.by = result, by
     run.child.ended = True
+    run.started.poll(0)
+    assert run.ended == []  # not before the output is safe
+    run.safety.result, run.safety.by = result, by
     run.started.poll(0)
     ((outcome, lost_loop),) = run.ended
     assert (outcome.code, outcome.output) == ("fault", result.output)
@@ -653,7 +601,6 @@ def test_who_acted_is_said_and_only_what_was_confirmed(run, result, by, words):
 
 
 def test_a_loop_that_lost_its_device_keeps_its_account_of_the_end(run):
-    """The guardian went on where it gave up; what the loop recorded is whole."""
     run.page.leave_outcome(LoopOutcome("fault", "no answer", 7, "unknown", 3))
     run.child.ended = True
     run.started.poll(0)
@@ -721,7 +668,6 @@ def test_a_terminal_that_stands_still_is_not_waited_for(monkeypatch):
 
 
 def test_lines_reach_the_service_manager(tmp_path):
-    """What is said comes as one datagram."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(tmp_path / "notify"))
         SystemdNotifier({"NOTIFY_SOCKET": str(tmp_path / "notify")}).say("READY=1", "STATUS=fine")
@@ -729,7 +675,6 @@ def test_lines_reach_the_service_manager(tmp_path):
 
 
 def test_watchdog_is_fed_three_times_in_its_interval(tmp_path):
-    """However often it is called, it says so at a third of the interval."""
     clock = SteppingClock()
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(tmp_path / "notify"))
@@ -749,6 +694,5 @@ def test_watchdog_is_fed_three_times_in_its_interval(tmp_path):
 
 
 def test_nobody_listening_is_no_matter(tmp_path):
-    """A run outside a service, or one whose manager is gone, goes on."""
     SystemdNotifier({}).say("READY=1")
     SystemdNotifier({"NOTIFY_SOCKET": str(tmp_path / "gone"), "WATCHDOG_USEC": "x"}).say("READY=1")

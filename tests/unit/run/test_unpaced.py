@@ -41,7 +41,6 @@ def test_time_passes_in_sleeps_only():
 
 @pytest.mark.parametrize(("pending_bytes", "writes_before"), [(0, 12), (1 << 20, 1)])
 def test_a_refused_write_costs_nothing(tmp_path, monkeypatch, pending_bytes, writes_before):
-    """Whether it is refused during the run or at its end."""
     disks = []
 
     class Refused(PendingFile):
@@ -64,7 +63,6 @@ def test_a_refused_write_costs_nothing(tmp_path, monkeypatch, pending_bytes, wri
 
 @pytest.mark.parametrize("latency", [0, 3])
 def test_every_block_comes_once_and_in_order(latency):
-    """Also those that a FIFO answers later, whose slots are not used again before."""
     firsts, seen = [], []
 
     def take(batch):
@@ -109,7 +107,6 @@ def test_a_whole_run_is_recorded_and_says_that_it_was_not_paced(tmp_path):
 
 @pytest.mark.parametrize("output", [7.0, -9.5])
 def test_a_run_from_elsewhere_ramps_in_and_is_replayed(tmp_path, output):
-    """Inside the limits or not; the waveform is that of a run from the safe value."""
     plain = read(run_unpaced(checked_experiment(UNCOMPENSATED, SHORT), tmp_path / "a.mcap").path)
     checked = checked_experiment(UNCOMPENSATED, [*SHORT, f"device.output_at_open={output}"])
     result = run_unpaced(checked, tmp_path / "b.mcap")
@@ -140,7 +137,6 @@ def test_a_run_from_elsewhere_ramps_in_and_is_replayed(tmp_path, output):
     ],
 )
 def test_a_start_that_is_not_known_or_can_not_be_is_refused(tmp_path, settings, words):
-    """Nothing is exchanged and no file is left."""
     checked = checked_experiment(UNCOMPENSATED, [*SHORT, *settings])
     with pytest.raises(InputError, match=words):
         run_unpaced(checked, tmp_path / "run.mcap")
@@ -165,7 +161,6 @@ def test_real_devices_are_refused_before_a_file_is_made(tmp_path):
 
 
 def test_in_memory_and_in_a_file_it_is_the_same_run(tmp_path):
-    """Every sample, the safe ramp too, bit for bit."""
     checked = checked_experiment(UNCOMPENSATED, SHORT)
     recorded = read(run_unpaced(checked, tmp_path / "run.mcap").path).samples
     loaded, begun = checked.loaded, checked.begun

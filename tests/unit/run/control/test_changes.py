@@ -122,7 +122,6 @@ def test_a_change_reaches_the_loop_whole(changes, page):
 
 
 def test_the_second_of_two_follows_the_first(changes, page, waits):
-    """It is not made before the loop has taken the first."""
     wanted = []
 
     def meanwhile():
@@ -155,7 +154,6 @@ def test_a_refusal_changes_nothing_and_the_next_has_its_turn(changes, page):
     ],
 )
 def test_the_end_of_the_run_refuses_a_change_that_waits(changes, page, waits, number, value, said):
-    """Also if the loop has not taken the one before."""
     change(changes, gain=0.1)
     waits.meanwhile = lambda: page.put(number, value)
     for gain in (0.2, 0.3):
@@ -180,7 +178,6 @@ def test_a_change_that_could_not_begin_is_refused(changes, page):
 
 
 def test_a_queue_that_is_full_takes_no_more(changes, page, waits):
-    """The first is on the page, sixteen wait; each of these begins while the one before waits."""
     refused, made = [], [change(changes, gain=1.0)]
 
     def meanwhile():
@@ -205,7 +202,6 @@ def test_a_change_of_nothing_is_refused(changes):
 
 
 def test_the_inverse_goes_out_and_stays_there_until_it_is_wanted_in(changes, page, experiment):
-    """A change of the gain in between leaves it where it is."""
     line = experiment.forecast.line
     numbers = [PageField.TUNE_INVERSE_SHARE, PageField.TUNE_LINE_SLOPE, PageField.TUNE_LINE_AT_ZERO]
     for at, wanted, share in (
@@ -258,7 +254,6 @@ def test_the_straight_line_is_bounded_while_it_gives_commands():
     ("gain", "offset"), [(1.0, 0.0), (0.3, 5.0), (2.0, 0.0), (-1.5, -3.0), (1.0, 10.0)]
 )
 def test_thecommand_range_is_that_of_a_run_with_the_new_amplitude(model, hz, gain, offset):
-    """To within a few percent: what a history and a rate do to another amplitude is estimated."""
     made = checked(model, 10.0, -10.0, hz)
     low, high = sorted(gain * end + offset for end in made.reference.span)
     after = checked(model, abs(gain) * 10.0, gain * -10.0 + offset, hz)

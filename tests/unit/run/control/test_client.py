@@ -8,6 +8,7 @@ import sys
 import threading
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 
@@ -61,7 +62,6 @@ def answers(monkeypatch):
     ("name", "found"), [("sine", "sine"), ("sine-", "sine-2"), ("tri", "triangle")]
 )
 def test_a_run_is_found_by_its_name_or_the_beginning_of_it(going, name, found):
-    """A whole name goes before the beginning of another."""
     going("sine", "sine-2", "triangle")
     assert find_run(name).card.name == found
 
@@ -78,21 +78,16 @@ def test_what_is_not_one_run_is_refused_with_those_there_are(going):
 
 
 def test_status_is_given_of_runs_that_do_not_answer(answers, monkeypatch):
-    """A supervisor that hangs, one that died before its loop, and a run that is dead."""
     assert status_of(run("a"))["command"] == "status"
     dead, left = run("a", supervised=False, alive=False), run("a", supervised=False)
     assert status_of(dead) == {"name": "a", "state": "dead"}
     assert status_of(left)["state"] == "ramping down without its supervisor"
 
-    def silent(socket, message):
-        raise RunError("no answer")
-
-    monkeypatch.setattr(client, "ask", silent)
+    monkeypatch.setattr(client, "ask", Mock(side_effect=RunError("no answer")))
     assert status_of(run("a")) == {"name": "a", "state": "not answering", "error": "no answer"}
 
 
 def test_all_runs_are_requested_to_stop_before_one_is_waited_for(answers, monkeypatch):
-    """Each says whether it has ended within the time for all, and what kept it from being asked."""
     done, clock = [], SteppingClock()
     chosen = [run("a"), run("b"), run("c"), run("d", alive=False)]
 
@@ -154,7 +149,6 @@ def test_what_is_no_setting_is_refused(text, said):
 
 
 def test_a_dropped_request_is_sent_again(tmp_path):
-    """Until the timeout; a request without an answer has had no effect."""
     path = tmp_path / "socket"
     seen = []
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
@@ -250,10 +244,9 @@ def test_a_supervisor_that_is_gone_is_no_error(process):
 
 
 def test_what_the_kernel_refuses_is_told(process, monkeypatch):
-    def refuse(*_):
-        raise PermissionError(1, "Operation not permitted")
-
-    monkeypatch.setattr(signal, "pidfd_send_signal", refuse)
+    monkeypatch.setattr(
+        signal, "pidfd_send_signal", Mock(side_effect=PermissionError(1, "Operation not permitted"))
+    )
     with pytest.raises(RunError, match="a: can't be stopped: Operation not permitted"):
         request_stop(run_of(process.pid))
 

@@ -6,6 +6,7 @@ import socket
 import stat
 import threading
 from contextlib import ExitStack
+from unittest.mock import Mock
 
 import pytest
 from hypothesis import given, settings
@@ -61,7 +62,6 @@ def exchange(folder, raw):
 
 
 def test_only_its_owner_may_use_it(server, tmp_path):
-    """The mode of the socket is 0600, whatever the umask."""
     assert stat.S_IMODE((tmp_path / "socket").stat().st_mode) == 0o600
 
 
@@ -83,7 +83,6 @@ def test_it_listens_again_after_its_folder_was_removed(tmp_path):
 
 
 def test_request_and_answer_are_one_line_each(server, tmp_path):
-    """A request is answered once its line is complete, and the connection is closed."""
     with connect(tmp_path) as client:
         client.sendall(b"hel")
         client.sendall(b"lo\n")
@@ -151,13 +150,10 @@ def test_an_error_of_one_request_ends_no_other(server, tmp_path, caplog):
 
 
 def test_clients_without_a_thread_cost_no_place(server, tmp_path, monkeypatch, caplog):
-    """The next clients are served as soon as threads can be started again."""
-
-    def start(self):
-        raise RuntimeError("can't start new thread")
-
     with monkeypatch.context() as patch:
-        patch.setattr(threading.Thread, "start", start)
+        patch.setattr(
+            threading.Thread, "start", Mock(side_effect=RuntimeError("can't start new thread"))
+        )
         for _ in range(70):
             with connect(tmp_path) as client:
                 assert answer_of(client) == b""
@@ -181,14 +177,12 @@ def shared(tmp_path_factory):
 @settings(max_examples=200, deadline=None)
 @given(raw=st.binary(max_size=300))
 def test_any_bytes_are_answered_or_dropped(shared, raw):
-    """Nothing that a client sends stops the server."""
     answer = exchange(shared, raw)
     assert answer == b"" or "ok" in json.loads(answer)
     assert json.loads(exchange(shared, b"still there\n"))["ok"]
 
 
 def test_ask_returns_the_answer_or_raises(tmp_path):
-    """Refusals and silence are errors of different kinds."""
     path = tmp_path / "socket"
     with serving(path, lambda line: echo(json.loads(line)["say"].encode())):
         assert ask(path, {"say": "hello"}) == {"heard": "hello"}

@@ -101,17 +101,7 @@ def test_bad_requests_change_nothing(requests, page, line, said):
     assert bytes(page.numbers) == before
 
 
-def test_nothing_is_moved_on_the_way_out(requests, page, checked):
-    page.put(PageField.NEXT_SAMPLE, checked.forecast.samples)
-    with pytest.raises(InputError, match="has ended"):
-        asked(requests, command="set", gain=0.5)
-    page.put(PageField.STOP, Stop.REQUEST)
-    with pytest.raises(InputError, match="safe ramp"):
-        asked(requests, command="set", gain=0.5)
-
-
 def test_a_mark_is_an_event_at_the_present_sample(requests, page, recording):
-    """Counted from the start of the run, as every event is."""
     page.put(PageField.WAVEFORM_AT, 100)
     answer = asked(requests, command="mark", text="tapped the stage")
     assert answer == {"sample": 600, "text": "tapped the stage"}

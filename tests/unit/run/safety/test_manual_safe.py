@@ -1,6 +1,7 @@
 """A device put at its safe value by hand: confirmed, not confirmed, or refused."""
 
 from dataclasses import replace
+from unittest.mock import Mock
 
 import pytest
 import yaml
@@ -70,10 +71,9 @@ def test_an_output_that_is_not_confirmed_is_not_called_safe(amplifier, experimen
 
 
 def test_a_device_without_confirmation_is_sent_the_value(amplifier, experiment, monkeypatch):
-    def make_safe(self, command):
-        raise UnconfirmedError("it does not answer")
-
-    monkeypatch.setattr(Amplifier, "make_safe", make_safe)
+    monkeypatch.setattr(
+        Amplifier, "make_safe", Mock(side_effect=UnconfirmedError("it does not answer"))
+    )
     found = put_safe(experiment, [], amplifier.clock, amplifier.sleep).to_mapping()
     assert (found["output_safe"], found["output_state"]) == (False, "sent")
 
@@ -90,7 +90,6 @@ def test_a_device_that_a_run_holds_is_left_to_it(amplifier, experiment):
 def test_no_room_for_a_lock_is_no_reason_to_leave_current_flowing(
     amplifier, experiment, monkeypatch, tmp_path, caplog
 ):
-    """Any user can fill the place where locks go, or take it."""
     (tmp_path / "runs").write_text("")
     monkeypatch.setenv("HILCTL_RUNS", str(tmp_path / "runs"))
     found = put_safe(experiment, [], amplifier.clock, amplifier.sleep).to_mapping()

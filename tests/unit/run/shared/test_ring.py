@@ -39,7 +39,6 @@ def push(ring, number):
 
 
 def test_blocks_come_out_as_they_went_in(tmp_path):
-    """Heads, states, columns and flags arrive whole and in order in the other process's view."""
     ring = make(tmp_path)
     other = SampleRing(ring.path)
     assert push(ring, 1)
@@ -53,7 +52,6 @@ def test_blocks_come_out_as_they_went_in(tmp_path):
 
 
 def test_full_ring_refuses_and_keeps_what_it_has(tmp_path):
-    """A push into a full ring changes nothing and says so; a release makes room again."""
     ring = make(tmp_path)
     other = SampleRing(ring.path)
     assert [push(ring, n) for n in range(6)] == [True] * 4 + [False] * 2
@@ -84,7 +82,6 @@ def test_a_loop_has_all_of_it_mapped_before_its_first_tick(tmp_path):
 
 
 def test_many_come_out_some_at_a_time(tmp_path, monkeypatch):
-    """In order, round the end of the ring, and no more than there were when it was asked."""
     monkeypatch.setattr(module, "_BATCH_SAMPLES", 2 * BLOCK)
     ring = make(tmp_path, slots=7)
     other = SampleRing(ring.path)
@@ -116,7 +113,6 @@ def test_a_block_comes_out_however_large_it_is(tmp_path, monkeypatch):
 @settings(max_examples=50)
 @given(st.lists(st.booleans(), max_size=200))
 def test_any_order_of_pushes_and_pops(tmp_path_factory, steps):
-    """Whatever the order, blocks come out once each, in order, or were refused."""
     ring = make(tmp_path_factory.mktemp("ring"), slots=3)
     other = SampleRing(ring.path)
     accepted, taken = [], []
@@ -133,7 +129,6 @@ def test_any_order_of_pushes_and_pops(tmp_path_factory, steps):
 
 
 def test_damaged_slot_is_not_taken(tmp_path):
-    """A slot whose number is not the expected one stops the consumer before it."""
     ring = make(tmp_path)
     other = SampleRing(ring.path)
     for number in range(3):
@@ -169,7 +164,6 @@ def test_slot_that_no_recording_may_hold_is_not_taken(tmp_path, field, value):
 
 
 def test_what_was_not_released_is_there_for_the_next_consumer(tmp_path):
-    """A consumer that dies with blocks in its hands leaves them in the ring."""
     ring = make(tmp_path)
     first = SampleRing(ring.path)
     push(ring, 0)
@@ -183,7 +177,6 @@ def test_what_was_not_released_is_there_for_the_next_consumer(tmp_path):
 
 
 def test_blocks_that_were_sent_outlive_their_loop(tmp_path):
-    """They come in order, without those already taken, flagged, with the gap before them."""
     ring = SampleRing.create(
         tmp_path / "ring", slots=4, block=BLOCK, state_size=STATE, latency_blocks=2
     )
@@ -205,7 +198,6 @@ def test_blocks_that_were_sent_outlive_their_loop(tmp_path):
 
 
 def test_block_without_room_lives_in_a_spare_slot(tmp_path):
-    """It touches no block that is kept, nor another one on its way; what was sent is known."""
     ring = SampleRing.create(
         tmp_path / "ring", slots=2, block=BLOCK, state_size=STATE, latency_blocks=1
     )
@@ -220,7 +212,6 @@ def test_block_without_room_lives_in_a_spare_slot(tmp_path):
 
 
 def test_block_that_is_not_due_is_never_seen(tmp_path):
-    """Blocks that only wait for answers take no slot of those that are recorded."""
     ring = make(tmp_path)
     other = SampleRing(ring.path)
     assert not ring.answered(born(ring, 7, due=False))
@@ -233,7 +224,6 @@ def test_block_that_is_not_due_is_never_seen(tmp_path):
 @example(b"\x00\x00\x00\x00\x00\x00\x80\x00\x00\x01", 57)  # numbers 2**63 from each other
 @example(b"\xff" * 7 + b"\x7f", 56)
 def test_damaged_ring_is_survived(tmp_path_factory, garbage, at):
-    """Whatever stands in the memory, the consumer comes to an end, and raises nothing."""
     ring = make(tmp_path_factory.mktemp("ring"), slots=3)
     other = SampleRing(ring.path)
     for number in range(3):
@@ -252,7 +242,6 @@ def test_damaged_ring_is_survived(tmp_path_factory, garbage, at):
 
 
 def test_other_files_are_refused(tmp_path):
-    """A file that is not a ring is not taken for one."""
     path = tmp_path / "zeros"
     path.write_bytes(bytes(100_000))
     with pytest.raises(ValueError, match="is not a hilctl ring"):
@@ -264,7 +253,6 @@ def test_other_files_are_refused(tmp_path):
 )
 @pytest.mark.parametrize("value", [-1, 0, 2**40])
 def test_sizes_that_can_not_be_are_refused(tmp_path, field, value):
-    """A ring that says it is larger than its file, or smaller than anything, is damaged."""
     ring = make(tmp_path)
     ring.page.put(field, value)
     with pytest.raises(ValueError, match=r"is damaged|is shorter than it says"):
@@ -272,7 +260,6 @@ def test_sizes_that_can_not_be_are_refused(tmp_path, field, value):
 
 
 def test_slots_are_handed_out_clean(tmp_path):
-    """Nothing of an earlier lap stays in a slot: no flag, no answer that a device did not give."""
     ring = make(tmp_path, slots=3)
     other = SampleRing(ring.path)
     for number in range(20):
@@ -287,7 +274,6 @@ def test_slots_are_handed_out_clean(tmp_path):
 
 
 def test_who_looks_on_sees_what_stands_there_and_takes_nothing(tmp_path):
-    """Also what was taken and kept; of what was cleaned for the loop, nothing."""
     ring = make(tmp_path, slots=4)
     consumer, seen = SampleRing(ring.path), SampleRing(ring.path, look_only=True)
     for number in range(3):
@@ -325,7 +311,6 @@ def test_a_block_that_is_cleaned_or_damaged_under_the_copy_is_left_out(tmp_path)
 
 
 def test_cursors_are_published_after_what_they_say(tmp_path, monkeypatch):
-    """Whoever observes them reads whole blocks, and writes into clean slots."""
     ring, seen = make(tmp_path), []
 
     def publishing(page):

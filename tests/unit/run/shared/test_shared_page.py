@@ -7,7 +7,6 @@ from mmap import mmap
 import pytest
 
 from hilctl.base.events import Event
-from hilctl.loop.pacer import Lateness
 from hilctl.loop.safe_output import LoopOutcome
 from hilctl.machine.procfs import ProcessUsage
 from hilctl.run.shared.shared_page import SIZE, PageField, PageSlot, Phase, SharedPage, Stop
@@ -21,7 +20,6 @@ def sides():
 
 
 def test_numbers_are_shared(sides):
-    """What one side sets the other reads, whole numbers and others."""
     one, other = sides
     one.put(PageField.STOP, 3)
     one.put_float(PageField.TUNE_GAIN, -0.125)
@@ -29,7 +27,6 @@ def test_numbers_are_shared(sides):
 
 
 def test_each_text_has_a_place_of_its_own(sides):
-    """No text is read in the place of another; one that is too long is cut at a character."""
     one, other = sides
     for place in PageSlot:
         one.write_text(place, f"{place.name}: öffnen")
@@ -40,7 +37,6 @@ def test_each_text_has_a_place_of_its_own(sides):
 
 
 def test_events_come_once_and_are_cut_to_what_fits(sides):
-    """Events keep their order; too many are counted as lost, and long ones are shortened."""
     one, other = sides
     for sample in range(40):
         one.push_event(Event(sample, "error", "test", "ü" * 1000, {"number": 0.5}))
@@ -56,7 +52,6 @@ def test_events_come_once_and_are_cut_to_what_fits(sides):
 
 
 def test_outcome_counts_only_at_the_end(sides):
-    """A text that is not there yet, or damaged, is no outcome."""
     one, other = sides
     outcome = LoopOutcome("stopped", "stopped by a test", 7, "confirmed", 2)
     one.write_text(PageSlot.OUTCOME, json.dumps(asdict(outcome)))
@@ -67,21 +62,12 @@ def test_outcome_counts_only_at_the_end(sides):
     assert other.outcome() is None
 
 
-def test_counters_arrive(sides):
-    """Each one in its place."""
-    one, other = sides
-    one.leave_lateness(Lateness(1, 2, 3, 4, 5))
-    assert other.lateness() == Lateness(1, 2, 3, 4, 5)
-
-
 def test_every_stop_has_its_words():
-    """What the loop says of a stop."""
     assert all(stop.reason.startswith("stopped b") for stop in Stop)
     assert len({stop.reason for stop in Stop}) == len(Stop)
 
 
 def test_values_that_do_not_fit_are_left_out(sides):
-    """The loop does not look for some that do."""
     one, other = sides
     values = {f"weight_{number}": 1.0 / 3.0 for number in range(500)}
     one.push_event(Event(1, "info", "test", "text", values))
@@ -100,7 +86,6 @@ def test_who_looks_on_sees_the_newest_events_and_takes_none(sides):
 
 
 def test_notes_are_seen_by_all_and_the_oldest_give_way(sides):
-    """Whatever their texts; nobody has to take them out."""
     one, other = sides
     for number in range(40):
         one.leave_note(Event(number, "info", "mark", f"{number} " + "x" * 2000))
