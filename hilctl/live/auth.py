@@ -24,12 +24,7 @@ MOST_PENDING = 64
 
 
 class Admission:
-    """Accepts or refuses requests.
-
-    Args:
-        port: Port of the server.
-        token: 32 hexadecimal digits.
-    """
+    """Accepts or refuses requests to a port; the token has 32 hexadecimal digits."""
 
     def __init__(self, port: int, token: str) -> None:
         self._token = token
@@ -37,12 +32,7 @@ class Admission:
         self._origins = {f"http://{host}" for host in self._hosts}
 
     def refusal(self, headers: Headers, *, upgrade: bool) -> tuple[HTTPStatus, str] | None:
-        """Return the reason to refuse a request, or None.
-
-        Args:
-            headers: Headers of the request.
-            upgrade: Whether it requests the live connection rather than a file.
-        """
+        """Return the reason to refuse a request for a file or an upgrade, or None."""
         hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
         if len(hosts) != 1 or hosts[0].lower() not in self._hosts:
             return HTTPStatus.MISDIRECTED_REQUEST, "the host is not loopback"
@@ -66,11 +56,7 @@ class Admission:
 
 
 class PendingConnections:
-    """Connections that are not authenticated yet; the oldest is aborted if there are too many.
-
-    Args:
-        most: Largest number of connections.
-    """
+    """Connections that are not authenticated yet; the oldest is aborted if there are too many."""
 
     def __init__(self, most: int = MOST_PENDING) -> None:
         self._most = most

@@ -252,7 +252,8 @@ def terminal(monkeypatch):
     To be called by the test: pytest replaces the standard streams before each.
     """
     user, ours = pty.openpty()
-    monkeypatch.setenv("TERM", "xterm")
+    for name, value in {"TERM": "xterm", "COLUMNS": "20", "LINES": "5"}.items():
+        monkeypatch.setenv(name, value)  # a small screen, because nothing reads it meanwhile
     monkeypatch.setattr(os, "tcgetpgrp", lambda _: os.getpgrp())
 
     def take():

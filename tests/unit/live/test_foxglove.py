@@ -219,22 +219,21 @@ def first(runs):
 @contextmanager
 def serving(tmp_path):
     """Serve a run that continues until the end; yield the address."""
-    over = threading.Event()
+    end, numbers = threading.Event(), iter(range(10**6))
+
+    def over(_):
+        exchange(ring, [next(numbers)], keep=8)
+        return end.is_set()
+
     with active_run(tmp_path, 64) as (_, ring):
         ring.page.put(PageField.START_NS, time.monotonic_ns())
-        server, numbers = FoxgloveServer(first, port=0), iter(range(10**6))
-
-        def sleep(seconds):
-            exchange(ring, [next(numbers)], keep=8)
-            over.wait(0.002)
-
-        server._sleep = sleep
-        thread = threading.Thread(target=server.run, args=(lambda _: over.is_set(),))
+        server = FoxgloveServer(first, port=0)
+        thread = threading.Thread(target=server.run, args=(over,))
         thread.start()
         try:
             yield server.url
         finally:
-            over.set()
+            end.set()
             thread.join()
 
 
@@ -273,7 +272,8 @@ def decode(channel, data):
     return kind.FromString(data)
 
 
-def test_client_decodes_all_topics_with_the_advertised_schemas(tmp_path):
+def test_client_decodes_all_topics_with_the_advertised_schemas(tmp_path, monkeypatch):
+    monkeypatch.setattr("hilctl.live.foxglove._FRAME_S", 0.002)
     with serving(tmp_path) as url:
         topics = ["/scope", "/scope_low", "/diagnostics"]
         channels, found = asyncio.run(asyncio.wait_for(seen(url, topics, 2), 20.0))
