@@ -16,12 +16,10 @@ from hilctl.cli.output import QUIET, VERBOSE
 
 
 class CommandEntry(NamedTuple):
-    """Module and help of a command.
+    """A command: a function or typer application of its name in a module.
 
-    Attributes:
-        module: Module with a function, or a typer application, of the command's name; ``NAME_`` if
-            the name has another meaning in Python.
-        help: First line of the function's docstring.
+    Its name is ``NAME_`` if NAME has another meaning in Python; ``help`` is the first line of its
+    docstring.
     """
 
     module: str

@@ -12,8 +12,8 @@ from hilctl.cli.campaigns import (
     campaign,
     learn,
     plan_mapping,
+    print_campaign,
     print_plan,
-    print_result,
     print_row,
     sweep,
     sweep_document,
@@ -175,7 +175,7 @@ def test_result_prints_the_drift(tmp_path, capsys):
     found = plan(tmp_path)
     figures = RunFigures(peak_to_peak_um=10.0)
     row = CampaignRow("completed", figures, "a.mcap", "completed")
-    print_result(CampaignResult(found, {1: row, 6: row}, (tmp_path / "few.csv",)))
+    print_campaign(CampaignResult(found, {1: row, 6: row}, (tmp_path / "few.csv",)))
     shown = capsys.readouterr().out
     assert "few: 2 completed, 4 planned" in shown
     assert "drift over 2" in shown

@@ -169,7 +169,7 @@ def test_subprocess_of_the_view_ends_with_the_run(monkeypatch, ignores):
             started.append((command, self))
 
     monkeypatch.setattr(subprocess, "Popen", Started)
-    with module._watched(requested=True):
+    with module._watched():
         assert started[0][1].poll() is None
     ((command, process),) = started
     assert command[-2:] == ["hilctl.cli.live", str(os.getpid())]
