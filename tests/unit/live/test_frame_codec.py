@@ -11,16 +11,15 @@ from hilctl.base.events import Event
 from hilctl.base.segments import Segment
 from hilctl.live.frame_codec import frame_of, frames_of, nearest_window_s
 from hilctl.live.scope import Buckets, Scope, ScopeWindow
-from hilctl.live.traces import ROW, SIGNALS, Traces
+from hilctl.live.traces import ROW, SIGNALS
 from tests.fakes import SteppingClock
+from tests.unit.live.conftest import traces
 
 
 @pytest.fixture
 def scope():
     made = Scope(1000.0, [Segment("sine", 0, 9000, 0, 9000, 50.0)], "reference")
-    values = np.tile(np.arange(600.0), (len(SIGNALS), 1))
-    values[ROW["measured"]] = np.nan
-    made.add(Traces(np.arange(600), values, np.zeros(600, dtype=np.uint32)))
+    made.add(traces(0, **dict.fromkeys(ROW.keys() - {"measured"}, np.arange(600.0))))
     return made
 
 
