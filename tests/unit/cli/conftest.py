@@ -15,9 +15,12 @@ def hilctl(monkeypatch, capsys):
 
     def run(*words):
         monkeypatch.setattr(sys, "argv", ["hilctl", *map(str, words)])
-        with pytest.raises(SystemExit) as ended:
+        code = 0
+        try:
             cli.main()
-        return ended.value.code or 0, *capsys.readouterr()
+        except SystemExit as ended:
+            code = ended.code or 0
+        return code, *capsys.readouterr()
 
     return run
 
