@@ -15,6 +15,7 @@ from hilctl_drivers import contract as CONTRACT  # noqa: N812
 
 UM_PER_A = 10.0
 HIGHEST_A = 5.0
+NOISE = np.random.default_rng()
 REFUSED = next(
     mark.args[1]
     for mark in CONTRACT.test_refuses_what_it_can_not_do.pytestmark
@@ -123,13 +124,6 @@ class OpensOnlyWhenClosed(Ideal):
         if self.is_open:
             raise self.error("is open already")
         super().open(sample_rate_hz, block)
-
-
-class HasAnOffset(Ideal):
-    """A sensor with an offset."""
-
-    def spoil(self, command, displacement_um, measured):
-        displacement_um += 0.3
 
 
 class MovesOnlyInTheEnd(Ideal):
@@ -306,23 +300,6 @@ class PutsOutHalf(Ideal):
         self.current_a *= 0.5
 
 
-class NeverMoves(Ideal):
-    """Returns the reading at rest for every sample."""
-
-    def spoil(self, command, displacement_um, measured):
-        displacement_um[:] = 0.0
-
-
-class ReadsBeyondItsSensor(Ideal):
-    def spoil(self, command, displacement_um, measured):
-        displacement_um += 100.0
-
-
-class ReadsBelowItsSensor(Ideal):
-    def spoil(self, command, displacement_um, measured):
-        displacement_um -= 200.0
-
-
 class MeasuresNothing(Ideal):
     """Claims to measure its current and does not."""
 
@@ -381,13 +358,6 @@ class Late(Ideal):
         self.before_um = found
 
 
-class Early(Ideal):
-    """Reads its sensor after the command takes effect."""
-
-    def spoil(self, command, displacement_um, measured):
-        displacement_um[:] = UM_PER_A * command
-
-
 class EarlyByAFifth(Ideal):
     """Reads its sensor while the command takes effect: 0.5 um of the test step."""
 
@@ -405,16 +375,6 @@ class FillsTheFirstReading(Ideal):
         found = np.empty(command.size)
         super().exchange(first_sample, command, found, measured)
         displacement_um[0] = found[0]
-
-
-class FillsWhatItDoesNotMeasure(Ideal):
-    def spoil(self, command, displacement_um, measured):
-        measured[:] = command
-
-
-class WritesTheCommand(Ideal):
-    def spoil(self, command, displacement_um, measured):
-        command[:] = 0.0
 
 
 class MovesAtOpen(Ideal):
@@ -470,13 +430,6 @@ class TakesHalfAsFastAgain(Ideal):
         super().open(sample_rate_hz / 1.5, block)
 
 
-class ByChance(Ideal):
-    """Adds noise from an unseeded generator."""
-
-    def spoil(self, command, displacement_um, measured):
-        displacement_um += 0.01 * np.random.default_rng().normal(size=command.size)
-
-
 def takes(name, seen):
     """Return a device that checks a changed command against its range."""
     return type(name, (Ideal,), {"refuse": lambda self, command: Ideal.refuse(self, seen(command))})
@@ -487,6 +440,15 @@ def says(**wrong):
     return type(f"Says_{'_'.join(wrong)}", (Ideal,), {"info": replace(Ideal.info, **wrong)})
 
 
+def spoils(name, spoil):
+    """Return a device whose exchange changes command, displacement or measured current."""
+    return type(name, (Ideal,), {"spoil": lambda self, *arrays: spoil(*arrays)})
+
+
+HasAnOffset = spoils("HasAnOffset", lambda command, um, measured: np.add(um, 0.3, um))
+NeverMoves = spoils("NeverMoves", lambda command, um, measured: um.fill(0.0))
+
+
 KEEPS_IT = (
     Ideal, GoesToTheEndsOfItsSensor, DrivesOneWay, KeepsJustThisRate, MovesLittle, CountsItsSamples,
     OpensOnlyWhenClosed, HasAnOffset, MovesOnlyInTheEnd, Sluggish, BeginsAtRest,
@@ -494,8 +456,11 @@ KEEPS_IT = (
 """Each in another way."""
 MUST_FAIL = {
     "exchanges_blocks": (
-        DoesNothing, MovesTooLittle, NeverMoves, ReadsBeyondItsSensor, ReadsBelowItsSensor,
-        MeasuresNothing, NeverFillsReadings, FillsTheFirstReading, FillsWhatItDoesNotMeasure,
+        DoesNothing, MovesTooLittle, NeverMoves, MeasuresNothing, NeverFillsReadings,
+        FillsTheFirstReading,
+        spoils("ReadsBeyondItsSensor", lambda command, um, measured: np.add(um, 100.0, um)),
+        spoils("ReadsBelowItsSensor", lambda command, um, measured: np.add(um, -200.0, um)),
+        spoils("FillsMeasured", lambda command, um, measured: np.copyto(measured, command)),
     ),
     "make_safe_works_open_or_closed": (
         DoesNothing, NeverMadeSafe, SafeOnlyWhileOpen, SafeOnceItWasOpen, SafeUntilItIsClosed,
@@ -514,9 +479,12 @@ MUST_FAIL = {
     ),
     "takes_its_whole_range": (takes("LessThanItsRange", lambda a: a * 1.001),),
     "displacement_is_sampled_before_the_command_acts": (
-        MovesTooLittle, NeverMoves, Late, Early, EarlyByAFifth, NeverFillsReadings,
+        MovesTooLittle, NeverMoves, Late, EarlyByAFifth, NeverFillsReadings,
+        spoils("Early", lambda command, um, measured: np.multiply(command, UM_PER_A, um)),
     ),
-    "does_not_change_the_command": (WritesTheCommand,),
+    "does_not_change_the_command": (
+        spoils("WritesTheCommand", lambda command, um, measured: command.fill(0.0)),
+    ),
     "opening_does_not_move_the_output": (MovesAtOpen, MovesALittleAtOpen, MovesAtClose),
     "use_before_open_and_after_close_is_refused": (OpensOnce, NeedsNoOpening, ClosesOnce),
     "rate_beyond_its_limit_is_refused": (TakesAnyRate, TakesHalfAsFastAgain),
@@ -525,7 +493,9 @@ MUST_FAIL = {
         says(command_min=HIGHEST_A), says(sensor_min_um=100.0), says(max_rate_hz=0.0),
         says(fifo_depth=1), says(details={"serial_number": 17}),
     ),
-    "two_of_a_kind_agree": (ByChance,),
+    "two_of_a_kind_agree": (
+        spoils("ByChance", lambda command, um, measured: np.add(um, 0.01 * NOISE.normal(), um)),
+    ),
 }  # fmt: skip
 """Devices that must fail each check."""
 

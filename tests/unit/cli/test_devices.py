@@ -38,6 +38,9 @@ def test_probe_prints_the_answers_of_a_device(hilctl, json_of):
     _, shown, _ = hilctl("devices", "probe", DEMO)
     assert "simulated_terfenol answers" in shown
     assert "profiles" not in shown
+    code, _, err = hilctl("devices", "probe", "absent.yaml")
+    assert code == 2
+    assert err.startswith("hilctl: absent.yaml")
 
 
 @pytest.mark.parametrize("words", [[], ["--json"]])
