@@ -27,7 +27,7 @@ ELSEWHERE = {
     "serial_dac": "test_serial_devices.py",
     "modbus_stream": "test_modbus_stream.py",
 }
-"""Devices that meet this contract, or the part of it that streams have, in a file of their own."""
+"""Devices that are tested with this contract in another file."""
 SIMULATED = sorted(set(BUILTIN) - {"modbus_dac", *ELSEWHERE})
 PHYSICS = ("domains", "diffusion", "jiles_atherton")
 """What simulated_terfenol is tried with beside its default."""
