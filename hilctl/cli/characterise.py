@@ -11,15 +11,7 @@ from hilctl import api
 from hilctl.api._types import runs_folder
 from hilctl.base.errors import RunError
 from hilctl.cli.console import print_rich, progress_bar, table
-from hilctl.cli.options import (
-    AsJson,
-    DryRun,
-    ExperimentFile,
-    Fast,
-    LabelTexts,
-    Overwrite,
-    Settings,
-)
+from hilctl.cli.options import AsJson, DryRun, ExperimentFile, Fast, LabelTexts, Overwrite, Settings
 from hilctl.cli.output import print_json, print_result
 from hilctl.experiment.sections import label_settings
 from hilctl.run.start import StepStoppedError

@@ -65,7 +65,7 @@ _MODULES = {
     },
     "hilctl.cli.characterise": {
         "characterise": "Measure a connected actuator within its limits, "
-        "then identify and validate a model.",
+        "then identify and validate a model."
     },
     "hilctl.cli.campaigns": {
         "campaign": "Run an experiment with each combination of varied keys "
@@ -79,7 +79,7 @@ _MODULES = {
         "devices": "List devices, shipped profiles and serial ports (opens none).",
     },
     "hilctl_drivers.emulator.emulate_command": {
-        "emulate": "Emulate a device with the simulated rig, until Ctrl-C.",
+        "emulate": "Emulate a device with the simulated rig, until Ctrl-C."
     },
 }
 COMMANDS = {

@@ -23,10 +23,7 @@ SETTLED_NS = 2_000_000
 """What the emulated rig takes to settle, 0.1 ms, many times over: it computes each sample of it."""
 TIMEOUT_S = 5.0
 """A busy machine answers within it."""
-ELSEWHERE = {
-    "serial_dac": "test_serial_devices.py",
-    "modbus_stream": "test_modbus_stream.py",
-}
+ELSEWHERE = {"serial_dac": "test_serial_devices.py", "modbus_stream": "test_modbus_stream.py"}
 """Devices that are tested with this contract in another file."""
 SIMULATED = sorted(set(BUILTIN) - {"modbus_dac", *ELSEWHERE})
 PHYSICS = ("domains", "diffusion", "jiles_atherton")

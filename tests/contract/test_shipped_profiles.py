@@ -10,13 +10,7 @@ from hilctl_drivers.board.board_profile import FrameProfile
 from hilctl_drivers.modbus.modbus_profile import ModbusProfile
 from hilctl_drivers.modbus.pdu import read_pdu, rtu_adu, write_single_pdu
 from hilctl_drivers.modbus.register_map import EnsureStep, RegisterStep
-from hilctl_drivers.profile import (
-    FOLDER,
-    link_kinds,
-    load_profile,
-    profile_class,
-    shipped_profiles,
-)
+from hilctl_drivers.profile import FOLDER, link_kinds, load_profile, profile_class, shipped_profiles
 
 NAMES = (
     "adam_4024", "adam_4024_ascii", "adam_4117", "adam_6024", "adam_6217", "adam_6224",

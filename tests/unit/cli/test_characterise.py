@@ -7,12 +7,7 @@ from pathlib import Path
 import pytest
 
 from hilctl.base.errors import RunError
-from hilctl.cli.characterise import (
-    plan_mapping,
-    print_characterisation,
-    print_plan,
-    print_step,
-)
+from hilctl.cli.characterise import plan_mapping, print_characterisation, print_plan, print_step
 from hilctl.run.start import StepStoppedError, paced, unpaced
 from hilctl.studies.characterise.characterisation_runner import CharacterisationPlan
 from hilctl.studies.characterise.results import Characterisation, StepRow

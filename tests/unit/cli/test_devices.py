@@ -7,12 +7,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from hilctl.cli.devices import (
-    print_described,
-    print_inventory,
-    print_probed,
-    render_diagnosis,
-)
+from hilctl.cli.devices import print_described, print_inventory, print_probed, render_diagnosis
 from hilctl.experiment.devices import DeviceDescription, DeviceOption, Inventory, SerialPort
 from hilctl.machine.diagnosis import Diagnosis
 from hilctl.machine.timer_latency import Latency

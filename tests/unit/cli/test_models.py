@@ -6,14 +6,7 @@ from pathlib import Path
 import pytest
 
 from hilctl.base.errors import InputError
-from hilctl.cli.models import (
-    _column,
-    _numbers,
-    headings,
-    notes,
-    render_comparison,
-    table_rows,
-)
+from hilctl.cli.models import _column, _numbers, headings, notes, render_comparison, table_rows
 from hilctl.comparison.compare import ComparisonRequest, compare
 from hilctl.identify.settings import IdentifySettings
 from hilctl.models.model_file import dump_model, load_model
