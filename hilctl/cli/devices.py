@@ -120,8 +120,7 @@ def _lateness(latency: Latency) -> RenderableType:
         (f"from {edge_us} us", str(count), "#" * round(_BAR * math.log1p(count) / longest))
         for edge_us, count in counts.items()
     ]
-    figures = latency.percentiles_us()
-    line = ", ".join(f"{name} {value:.1f}" for name, value in figures.items())
+    line = ", ".join(f"{name} {value:.1f}" for name, value in latency.percentiles_us().items())
     title = f"wake-up lateness, {latency.rate_hz:g} Hz, {seconds:.3g} s"
     return Group(listing(title, rows), Text(f"{line} us"))
 

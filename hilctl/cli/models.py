@@ -84,9 +84,13 @@ Frequencies = Annotated[
 
 
 def _list_settings(requested: bool) -> None:
-    if requested:
-        print_settings()
-        raise typer.Exit
+    if not requested:
+        return
+    kinds = [(kind, each.title, each.found_by, each.data) for kind, each in CATALOGUE.items()]
+    print_rich(listing("", [("--model", "description", "identified by", "from"), *kinds]))
+    headings = ("--set", "default", "limits", "of", "description")
+    print_rich("", listing("", [headings, *setting_rows()]))
+    raise typer.Exit
 
 
 ListSettings = Annotated[
@@ -276,14 +280,6 @@ def _orders_table(orders: Sequence[OrderScore]) -> Table:
     ]  # fmt: skip
     headings = ("plays", "deadbands per side", "rms %", "peak %")
     return table("errors on validation loops", headings, rows)
-
-
-def print_settings() -> None:
-    """Print all kinds of model and all settings of a fit."""
-    kinds = [(kind, each.title, each.found_by, each.data) for kind, each in CATALOGUE.items()]
-    print_rich(listing("", [("--model", "description", "identified by", "from"), *kinds]))
-    headings = ("--set", "default", "limits", "of", "description")
-    print_rich("", listing("", [headings, *setting_rows()]))
 
 
 def render_comparison(comparison: Comparison) -> RenderableType:

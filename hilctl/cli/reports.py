@@ -132,31 +132,27 @@ def render_series(series: RunSeries) -> Group:
 
 def print_replay(result: ReplayResult, *, other: Path | None) -> None:
     """Print the differences between recomputed and recorded commands."""
-    terminal = console()
-    unit = result.command_unit
+    show, unit = console().print, result.command_unit
     if result.left_out_samples:
-        terminal.print(f"{result.left_out_samples} samples after a gap cannot be replayed")
+        show(f"{result.left_out_samples} samples after a gap cannot be replayed")
     if other is None and result.identical:
-        terminal.print(Text("identical", "green") + f": {result.samples} commands, bit for bit")
+        show(Text("identical", "green") + f": {result.samples} commands, bit for bit")
         return
     if other is None:
-        terminal.print(
-            Text("different", "red") + f": {result.differing_samples} of {result.samples} "
-            f"commands, the first at sample {result.first_difference}"
-        )
+        count = f"{result.differing_samples} of {result.samples} commands"
+        first = f"the first at sample {result.first_difference}"
+        show(Text("different", "red") + f": {count}, {first}")
     else:
-        terminal.print(
-            f"with {other} the command ranges from {result.command_min:.4g} to "
-            f"{result.command_max:.4g} {unit}, {result.limited_samples} samples limited"
-        )
+        span = f"{result.command_min:.4g} to {result.command_max:.4g} {unit}"
+        limited = f"{result.limited_samples} samples limited"
+        show(f"with {other} the command ranges from {span}, {limited}")
     if (error := result.predicted) is not None:
-        terminal.print(
-            f"predicted error: {quantity(error.peak_percent, '%')} peak, "
-            f"{quantity(error.rms_percent, '%')} rms; recorded error of the same samples: "
-            f"{quantity(error.recorded_peak_percent, '%')} peak, "
-            f"{quantity(error.recorded_rms_percent, '%')} rms"
-        )
-    terminal.print(
-        f"largest difference {result.largest_difference:.4g} {unit}, "
-        f"rms {result.rms_difference:.4g} {unit}"
-    )
+        predicted = _errors(error.peak_percent, error.rms_percent)
+        recorded = _errors(error.recorded_peak_percent, error.recorded_rms_percent)
+        show(f"predicted error: {predicted}; recorded error of the same samples: {recorded}")
+    largest, rms = result.largest_difference, result.rms_difference
+    show(f"largest difference {largest:.4g} {unit}, rms {rms:.4g} {unit}")
+
+
+def _errors(peak_percent: float | None, rms_percent: float | None) -> str:
+    return f"{quantity(peak_percent, '%')} peak, {quantity(rms_percent, '%')} rms"

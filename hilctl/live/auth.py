@@ -43,12 +43,9 @@ class Admission:
         return None
 
     def _has_token(self, headers: Headers) -> bool:
+        lines = headers.get_all("Sec-WebSocket-Protocol")
         try:
-            offered = [
-                name
-                for line in headers.get_all("Sec-WebSocket-Protocol")
-                for name in parse_subprotocol(line)
-            ]
+            offered = [name for line in lines for name in parse_subprotocol(line)]
         except InvalidHeader:
             return False
         tokens = [name[len(TOKEN_PREFIX) :] for name in offered if name.startswith(TOKEN_PREFIX)]

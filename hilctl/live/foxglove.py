@@ -254,12 +254,9 @@ def _started(port: int) -> tuple["Context", dict[str, "Channel"], "WebSocketServ
     try:
         # No capabilities: clients can only subscribe.
         server = foxglove.start_server(
-            name="hilctl",
-            host="127.0.0.1",
-            port=port,
-            context=context,
-            message_backlog_size=_BACKLOG,
-        )
+            name="hilctl", host="127.0.0.1", port=port,
+            context=context, message_backlog_size=_BACKLOG,
+        )  # fmt: skip
     except RuntimeError as error:
         raise RunError(f"port {port} of 127.0.0.1: {error}") from None
     return context, channels, server

@@ -70,14 +70,13 @@ def sent(monkeypatch):
             raise InputError("set: too much")
         return wanted
 
-    monkeypatch.setattr(module, "set_run", set_run)
-    monkeypatch.setattr(module, "mark_run", lambda folder, text: asked.append(text) or {"x": 1})
-    monkeypatch.setattr(module, "request_stop", lambda folder: asked.append("stop") or True)
-
-    def thread(target, daemon):
-        return SimpleNamespace(start=target)
-
-    monkeypatch.setattr(module, "threading", SimpleNamespace(Thread=thread))
+    for name, value in {
+        "set_run": set_run,
+        "mark_run": lambda folder, text: asked.append(text) or {"x": 1},
+        "request_stop": lambda folder: asked.append("stop") or True,
+        "threading.Thread": lambda target, daemon: SimpleNamespace(start=target),
+    }.items():
+        monkeypatch.setattr(f"hilctl.cli.live.{name}", value)
     return asked
 
 
@@ -121,10 +120,11 @@ def test_refused_request_is_shown(sent, monkeypatch, capsys):
 def test_slow_change_does_not_delay_a_stop(monkeypatch):
     started = []
     view = View(FakeFeed())
-    thread = SimpleNamespace(
-        Thread=lambda target, daemon: SimpleNamespace(start=lambda: started.append(target))
-    )
-    monkeypatch.setattr(module, "threading", thread)
+
+    def thread(target, daemon):
+        return SimpleNamespace(start=lambda: started.append(target))
+
+    monkeypatch.setattr(module.threading, "Thread", thread)
     monkeypatch.setattr(module, "request_stop", lambda folder: False)
     view.press(b"is")
     assert len(started) == 2

@@ -87,17 +87,10 @@ def test_incompatible_options_are_refused(hilctl, words):
 
 def test_run_mapping():
     assert run_mapping(ENDED, None) == {
-        "recorded_samples": 0,
-        "dropped": 3,
-        "output": "a.mcap",
-        "code": "stopped",
-        "reason": "hilctl stop",
-        "output_safe": True,
-        "output_state": "confirmed",
-        "guardian_active": False,
-        "deadline_misses": "",
-        "adapted": {},
-    }
+        "recorded_samples": 0, "dropped": 3, "output": "a.mcap", "code": "stopped",
+        "reason": "hilctl stop", "output_safe": True, "output_state": "confirmed",
+        "guardian_active": False, "deadline_misses": "", "adapted": {},
+    }  # fmt: skip
 
 
 def test_address_of_the_page_is_printed_with_the_first_samples(capsys):
@@ -188,10 +181,11 @@ def test_noise_floor_is_printed_with_the_hysteresis(lagging):
     assert f"noise floor {report.noise_floor_percent:.4g} %" in line
 
 
-def test_simulated_device_is_marked(lagging):
+def test_simulated_and_incomplete_runs_are_marked(lagging):
     simulated = lagging(run={"name": "x", "device": "my_rig", "simulated": "true"})
     assert "no hardware" in terminal(summarize(simulated))
     assert "no hardware" not in terminal(summarize(lagging()))
+    assert "NOT complete" in terminal(summarize(replace(lagging(), end={})))
 
 
 def test_names_are_not_markup(lagging):
@@ -218,10 +212,6 @@ def test_segments_have_a_table_without_empty_columns(make_recording):
     for shown in ("first", "second", "peak hyst. %"):
         assert shown in text
     assert "err. %" not in text
-
-
-def test_incomplete_run_is_marked(lagging):
-    assert "NOT complete" in terminal(summarize(replace(lagging(), end={})))
 
 
 @pytest.mark.parametrize(("minutes", "shown"), [(20, range(20)), (21, range(1, 21))])

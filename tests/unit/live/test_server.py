@@ -54,13 +54,15 @@ async def answer_to(connection, **message):
             return json.loads(said)
 
 
-async def http(port, request):
-    reader, writer = await asyncio.open_connection("127.0.0.1", port)
-    writer.write(request)
-    answer = await reader.read()
+async def http(server, line, host=None):
+    """Return the status and the answer to a request."""
+    reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
+    host = host or f"127.0.0.1:{server.port}"
+    writer.write(f"{line} HTTP/1.1\r\nHost: {host}\r\n\r\n".encode())
+    answer = (await reader.read()).decode()
     writer.close()
     await writer.wait_closed()
-    return answer
+    return int(answer.split()[1]), answer
 
 
 def test_page_gets_frames_and_status(description, tmp_path):
@@ -135,24 +137,21 @@ def test_unauthenticated_upgrades_are_refused():
                 with pytest.raises(InvalidStatus) as refused:
                     await opened(server, **given)
                 found.append(refused.value.response.status_code)
-            foreign = b"GET / HTTP/1.1\r\nHost: evil.example\r\n\r\n"
-            found.append((await http(server.port, foreign)).split()[1])
-            assert server.url.partition("#")[2] not in (await http(server.port, foreign)).decode()
+            status, answer = await http(server, "GET /", "evil.example")
+            found.append(status)
+            assert server.url.partition("#")[2] not in answer
             async with opened(server) as connection:  # others are still accepted
                 await status_of(connection)
         return found
 
-    assert asyncio.run(refusals()) == [401, 401, 403, b"421"]
+    assert asyncio.run(refusals()) == [401, 401, 403, 421]
 
 
 def test_only_get_requests_of_files_are_served():
     async def answers():
         async with serving() as server:
-            host = f"Host: 127.0.0.1:{server.port}\r\n".encode()
             lines = ("GET /", "GET /?run=x", "GET /live", "POST /", "PUT /live.js", "GET /etc")
-            requests = [f"{line} HTTP/1.1\r\n".encode() + host + b"\r\n" for line in lines]
-            found = [await http(server.port, request) for request in requests]
-            return [int(answer.split()[1]) for answer in found]
+            return [(await http(server, line))[0] for line in lines]
 
     assert asyncio.run(answers()) == [200, 200, 403, 405, 405, 404]
 
