@@ -110,74 +110,45 @@ def refused_everywhere(refused):
     return check
 
 
+SINE = "{kind: sine, unit: A, amplitude: 1.0, frequency_hz: 5.0, duration_s: 0.2}"
 BROKEN = [
-    ("malformed", GOOD.replace("60.0]}", "60.0}"), "x.yaml:7: is not readable YAML"),
-    ("empty", "", "x.yaml:1: must hold a mapping of keys to values"),
-    ("unknown key", GOOD + "limit: {}\n", "x.yaml:8: limit: unknown key (did you mean 'limits'?)"),
-    (
-        "wrong type",
-        GOOD.replace("block: 10", "block: [10]"),
-        "x.yaml:4: block: must be a whole number, got [10]",
-    ),
-    (
-        "number that YAML reads as text",
-        GOOD.replace("sample_rate_hz: 1000", "sample_rate_hz: 1_000"),
-        "x.yaml:3: sample_rate_hz: must be a number, got '1_000' (write a plain number, such as "
-        "1000, 0.5 or 1e-3)",
-    ),
-    (
-        "not a number",
-        GOOD.replace("amplitude: 1.0", "amplitude: .nan"),
-        "x.yaml:5: waveform.amplitude: must be a finite number, got nan",
-    ),
-    (
-        "command beyond the limits",
-        GOOD.replace("amplitude: 1.0", "amplitude: 3.0"),
-        "x.yaml:7: limits.peak_current_a: the run must stay within -2 to 2 A, got -3 to 3 A (1 A "
-        "too much",
-    ),
-    (
-        "frequency above half the rate",
-        GOOD.replace("frequency_hz: 5.0", "frequency_hz: 500.0"),
-        "x.yaml:5: waveform: sine: every frequency must be below half the sample rate, 500 Hz: 500 "
-        "Hz",
-    ),
-    (
-        "reference beyond the model",
-        IN_UM.replace("amplitude: 1.0", "amplitude: 12.5"),
-        "x.yaml:5: waveform: reference must stay within the range that compensator.model was "
-        "identified on, -12 to 12 µm, got -12.5 to 12.5 µm (0.5 µm too far",
-    ),
-    (
-        "unknown device",
-        GOOD.replace("simulated_terfenol", "simulated_terfenal"),
-        "x.yaml:2: device.kind: unknown device 'simulated_terfenal' (did you mean "
-        "'simulated_terfenol'?)",
-    ),
-    (
-        "missing model",
-        IN_UM.replace("model.yaml", "lost.yaml"),
-        "x.yaml:6: compensator.model: lost.yaml: no such file",
-    ),
-    (
-        "missing waveform file",
-        GOOD.replace(
-            "{kind: sine, unit: A, amplitude: 1.0, frequency_hz: 5.0, duration_s: 0.2}",
-            "{kind: file, unit: A, path: lost.csv}",
-        ),
-        "x.yaml:5: waveform: lost.csv: no such file",
-    ),
-]
+    ("malformed", GOOD, "60.0]}", "60.0}", "7: is not readable YAML"),
+    ("empty", GOOD, GOOD, "", "1: must hold a mapping of keys to values"),
+    ("unknown key", GOOD, "limits:", "limit: {}\nlimits:",
+     "7: limit: unknown key (did you mean 'limits'?)"),
+    ("wrong type", GOOD, "block: 10", "block: [10]",
+     "4: block: must be a whole number, got [10]"),
+    ("number that YAML reads as text", GOOD, "sample_rate_hz: 1000", "sample_rate_hz: 1_000",
+     "3: sample_rate_hz: must be a number, got '1_000' (write a plain number, such as "
+     "1000, 0.5 or 1e-3)"),
+    ("not a number", GOOD, "amplitude: 1.0", "amplitude: .nan",
+     "5: waveform.amplitude: must be a finite number, got nan"),
+    ("command beyond the limits", GOOD, "amplitude: 1.0", "amplitude: 3.0",
+     "7: limits.peak_current_a: the run must stay within -2 to 2 A, got -3 to 3 A (1 A too much"),
+    ("frequency above half the rate", GOOD, "frequency_hz: 5.0", "frequency_hz: 500.0",
+     "5: waveform: sine: every frequency must be below half the sample rate, 500 Hz: 500 Hz"),
+    ("reference beyond the model", IN_UM, "amplitude: 1.0", "amplitude: 12.5",
+     "5: waveform: reference must stay within the range that compensator.model was "
+     "identified on, -12 to 12 µm, got -12.5 to 12.5 µm (0.5 µm too far"),
+    ("unknown device", GOOD, "simulated_terfenol", "simulated_terfenal",
+     "2: device.kind: unknown device 'simulated_terfenal' (did you mean 'simulated_terfenol'?)"),
+    ("missing model", IN_UM, "model.yaml", "lost.yaml",
+     "6: compensator.model: lost.yaml: no such file"),
+    ("missing waveform file", GOOD, SINE, "{kind: file, unit: A, path: lost.csv}",
+     "5: waveform: lost.csv: no such file"),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(
-    ("text", "message"), [case[1:] for case in BROKEN], ids=[case[0] for case in BROKEN]
+    ("text", "old", "new", "message"),
+    [case[1:] for case in BROKEN],
+    ids=[each[0] for each in BROKEN],
 )
-def test_experiment(refused_everywhere, place, text, message):
+def test_experiment(refused_everywhere, place, text, old, new, message):
     """An invalid experiment is rejected with file, line, key, rule and value."""
-    (place / "x.yaml").write_text(text)
+    (place / "x.yaml").write_text(text.replace(old, new))
     (place / "model.yaml").write_text(MODEL)
-    refused_everywhere(message, "x.yaml")
+    refused_everywhere(f"x.yaml:{message}", "x.yaml")
 
 
 @pytest.mark.parametrize(
@@ -196,13 +167,11 @@ def test_model_that_can_not_be_inverted(refused_everywhere, place, old, new, mes
 
 
 def test_missing_experiment_or_folder(refused_everywhere, place):
-    """A missing experiment is named; a folder is rejected."""
     refused_everywhere("lost.yaml: no such file", "lost.yaml")
     refused_everywhere("is not a file", place)
 
 
 def test_binary_experiment(refused_everywhere, place):
-    """A binary file is rejected."""
     (place / "x.yaml").write_bytes(bytes(range(256)))
     refused_everywhere("x.yaml: is not UTF-8 text", "x.yaml")
 
@@ -300,13 +269,11 @@ def test_recording_to_read(refused, place, words):
 
 
 def test_schema(refused):
-    """An unwritable schema file is rejected."""
     message = "lost/schema.json: can't be written: No such file or directory"
     refused(message, "schema", "--output", "lost/schema.json")
 
 
 def test_unknown_option(hilctl, place):
-    """An unknown option ends with exit code 2."""
     ended = hilctl("run", "--speed", "11")
     assert ended.code == 2
     assert "--speed" in ended.err
