@@ -38,6 +38,7 @@ class Ideal:
     )
 
     um_per_a = UM_PER_A
+    due, openings, was_safe = 0, 0, False
 
     def __init__(self):
         self.current_a, self.is_open = 0.0, False
@@ -45,7 +46,8 @@ class Ideal:
     def open(self, sample_rate_hz, block):
         if sample_rate_hz > self.info.max_rate_hz:
             raise self.error("too fast")
-        self.is_open = True
+        self.is_open, self.was_safe, self.due = True, False, 0
+        self.openings += 1
 
     def error(self, text):
         return DeviceError(f"{self.info.name}: {text}")
@@ -69,6 +71,7 @@ class Ideal:
         for j, value in enumerate(command):
             displacement_um[j] = self.um_per_a * self.current_a
             self.current_a = float(value)
+        self.due += command.size
         self.spoil(command, displacement_um, measured)
 
     def spoil(self, command, displacement_um, measured):
@@ -106,17 +109,10 @@ class MovesLittle(Ideal):
 class CountsItsSamples(Ideal):
     """Rejects a block that does not follow the previous one; the first has number 0."""
 
-    due = 0
-
-    def open(self, sample_rate_hz, block):
-        super().open(sample_rate_hz, block)
-        self.due = 0
-
     def exchange(self, first_sample, command, displacement_um, measured):
         if first_sample != self.due:
             raise self.error("samples are missing")
         super().exchange(first_sample, command, displacement_um, measured)
-        self.due += command.size
 
 
 class OpensOnlyWhenClosed(Ideal):
@@ -150,14 +146,16 @@ class Sluggish(Ideal):
             displacement_um[j] = self.reached_um = 0.95 * self.reached_um + 0.05 * value
 
 
-class BeginsAtRest(Ideal):
-    """Starts at rest at each opening, like a simulated device."""
-
-    info = replace(Ideal.info, name="simulated_piezo")
-
+class MovesAtOpen(Ideal):
     def open(self, sample_rate_hz, block):
         super().open(sample_rate_hz, block)
         self.current_a = 0.0
+
+
+class BeginsAtRest(MovesAtOpen):
+    """Starts at rest at each opening, like a simulated device."""
+
+    info = replace(Ideal.info, name="simulated_piezo")
 
 
 class DoesNothing(Ideal):
@@ -182,22 +180,16 @@ class SafeOnlyWhileOpen(Ideal):
 class SafeOnceItWasOpen(Ideal):
     """make_safe cannot connect before the first opening."""
 
-    was_open = False
-
-    def open(self, sample_rate_hz, block):
-        super().open(sample_rate_hz, block)
-        self.was_open = True
-
     def make_safe(self, command):
-        if self.was_open:
+        if self.openings:
             self.current_a = command
 
 
-class SafeUntilItIsClosed(SafeOnceItWasOpen):
+class SafeUntilItIsClosed(Ideal):
     """make_safe cannot connect after closing."""
 
     def make_safe(self, command):
-        if self.is_open or not self.was_open:
+        if self.is_open or not self.openings:
             self.current_a = command
 
 
@@ -218,12 +210,6 @@ class SafeOnceItIsClosed(Ideal):
 class SafeOnlyOnce(Ideal):
     """Applies the safe value only once per opening."""
 
-    was_safe = False
-
-    def open(self, sample_rate_hz, block):
-        super().open(sample_rate_hz, block)
-        self.was_safe = False
-
     def make_safe(self, command):
         if self.is_open or not self.was_safe:
             self.current_a = command
@@ -239,12 +225,6 @@ class SafeElsewhere(Ideal):
 
 class TakesTheFirstOfARamp(Ideal):
     """Ignores safe values after the first one of a ramp."""
-
-    was_safe = False
-
-    def open(self, sample_rate_hz, block):
-        super().open(sample_rate_hz, block)
-        self.was_safe = False
 
     def make_safe(self, command):
         if not self.was_safe:
@@ -377,12 +357,6 @@ class FillsTheFirstReading(Ideal):
         displacement_um[0] = found[0]
 
 
-class MovesAtOpen(Ideal):
-    def open(self, sample_rate_hz, block):
-        super().open(sample_rate_hz, block)
-        self.current_a = 0.0
-
-
 class MovesALittleAtOpen(Ideal):
     def open(self, sample_rate_hz, block):
         super().open(sample_rate_hz, block)
@@ -401,12 +375,9 @@ class MovesAtClose(Ideal):
 class OpensOnce(Ideal):
     """Reopens without an error and does not work."""
 
-    was_open = False
-
     def open(self, sample_rate_hz, block):
         super().open(sample_rate_hz, block)
-        self.is_open = not self.was_open
-        self.was_open = True
+        self.is_open = self.openings == 1
 
 
 class NeedsNoOpening(Ideal):
