@@ -82,20 +82,9 @@ def compile_something():
     return inner
 
 
-@pytest.fixture
-def terminal(monkeypatch):
-    """Return a function that makes standard error a terminal (pytest replaces it too)."""
-
-    def put():
-        made = Terminal()
-        monkeypatch.setattr("sys.stderr", made)
-        return made
-
-    return put
-
-
-def test_each_kernel_is_named(terminal):
-    shown = terminal()
+def test_each_kernel_is_named(monkeypatch):
+    shown = Terminal()
+    monkeypatch.setattr("sys.stderr", shown)
     with compile_progress():
         pass
     assert shown.getvalue() == ""  # nothing was compiled
@@ -109,12 +98,10 @@ def test_each_kernel_is_named(terminal):
     assert len(shown.getvalue().splitlines()) == 3
 
 
-def test_compilation_is_not_shown_if_quiet_or_without_a_terminal(terminal, monkeypatch, capsys):
+@pytest.mark.parametrize(("quiet", "stream"), [(True, Terminal()), (False, io.StringIO())])
+def test_compilation_is_not_shown_if_quiet_or_without_a_terminal(monkeypatch, quiet, stream):
+    monkeypatch.setattr("sys.stderr", stream)
+    monkeypatch.setattr(Verbosity, "quiet", quiet)
     with compile_progress():
         compile_something()
-    assert capsys.readouterr().err == ""
-    shown = terminal()
-    monkeypatch.setattr(Verbosity, "quiet", True)
-    with compile_progress():
-        compile_something()
-    assert shown.getvalue() == ""
+    assert stream.getvalue() == ""

@@ -71,20 +71,11 @@ def test_mark_joins_its_words(answering, hilctl, json_of):
 
 PATH = "/home/somebody/a/folder/with/a/long/name/recordings/2026-11-21_terfenol_sine_6a.mcap"
 RUNNING = {
-    "name": "terfenol_sine_6a-12345",
-    "state": "running",
-    "recording": PATH,
-    "sample": 625_000,
-    "total_samples": 1_500_000,
-    "sample_rate_hz": 50_000.0,
-    "recorded_samples": 624_500,
-    "missing_samples": 500,
-    "late_ticks": 1234,
-    "gain": 0.5,
-    "offset": -2.0,
-    "inverse": "out",
-    "recording_error": "",
-}
+    "name": "terfenol_sine_6a-12345", "state": "running", "recording": PATH,
+    "sample": 625_000, "total_samples": 1_500_000, "sample_rate_hz": 50_000.0,
+    "recorded_samples": 624_500, "missing_samples": 500, "late_ticks": 1234,
+    "gain": 0.5, "offset": -2.0, "inverse": "out", "recording_error": "",
+}  # fmt: skip
 
 
 @pytest.fixture

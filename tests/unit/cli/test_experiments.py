@@ -109,11 +109,7 @@ def test_init_refuses_wrong_input_and_existing_files(here, hilctl, words, messag
 
 def test_init_asks_in_a_terminal(here, monkeypatch):
     """An empty answer keeps the default."""
-    answers = {
-        "device, profile": "labjack_t7",
-        "name or address": "10.0.0.7",
-        "largest current": "0.4",
-    }
+    answers = {"device,": "labjack_t7", "name or": "10.0.0.7", "largest current": "0.4"}
     asked = []
 
     def prompt(text, **more):

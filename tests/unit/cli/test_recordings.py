@@ -38,12 +38,8 @@ def folder(tmp_path):
 def test_table_has_a_line_per_run_without_control_characters(folder, hilctl):
     _, out, err = hilctl("list", folder)
     lines = out.splitlines()
-    assert [line.split("  ")[0] for line in lines[1:5]] == [
-        "2026-11-21 01:20:46",
-        "2026-11-21 01:20:49",
-        "2026-11-21 01:20:52",
-        "2030-01-01 00:00:00",
-    ]
+    started = [*(f"2026-11-21 01:20:{s}" for s in (46, 49, 52)), "2030-01-01 00:00:00"]
+    assert [line.split("  ")[0] for line in lines[1:5]] == started
     assert lines[4].endswith("labelled.mcap")
     for text in ("fault", "1.235", "12", r"n\x1b[1m", r"sample A7, note \x1b]0;x\x07"):
         assert text in lines[4]

@@ -130,33 +130,19 @@ OTHER = replace(
 )
 
 
-@pytest.fixture
-def shown(monkeypatch, capsys):
-    """Return a function that returns the output for a terminal of 120 columns."""
+@pytest.mark.parametrize(
+    ("result", "other", "texts"),
+    [
+        (SAME, None, ["identical: 900 commands"]),
+        (OTHER, None, ["different: 3 of 900 commands", "sample 12", "largest difference 0.5 A"]),
+        (SAME, "m.yaml", ["m.yaml", "-1.5 to 2.25 A", "7 samples"]),
+        (replace(SAME, left_out_samples=50), None, ["50 samples after a gap", "identical"]),
+    ],
+)
+def test_differences_of_a_replay_are_printed(monkeypatch, capsys, result, other, texts):
+    """A replay with another model is not called identical."""
     monkeypatch.setenv("COLUMNS", "120")
-
-    def of(result, **more):
-        print_replay(result, **{"other": None, **more})
-        return capsys.readouterr().out
-
-    return of
-
-
-def test_identical_replay_is_one_line(shown):
-    assert shown(SAME) == "identical: 900 commands, bit for bit\n"
-
-
-def test_different_commands_are_counted(shown):
-    text = shown(OTHER)
-    assert "3 of 900 commands" in text
-    assert "largest difference 0.5 A" in text
-
-
-def test_replay_with_another_model_is_not_called_identical(shown, tmp_path):
-    text = shown(SAME, other="m.yaml")
-    assert "identical" not in text
-    assert all(value in text for value in ("m.yaml", "-1.5 to 2.25 A", "7 samples"))
-
-
-def test_samples_after_a_gap_are_counted(shown):
-    assert shown(replace(SAME, left_out_samples=50)).startswith("50 samples after a gap")
+    print_replay(result, other=other)
+    shown = capsys.readouterr().out
+    assert [each for each in texts if each not in shown] == []
+    assert ("identical" in shown) == (other is None and result.identical)
