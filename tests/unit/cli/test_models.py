@@ -66,7 +66,7 @@ OMEGA = ROOT / "configs" / "models" / "terfenol_omega.yaml"
 @pytest.fixture(scope="module")
 def comparison():
     """Two models of the catalogue and one of a file, tested at 100 Hz."""
-    request = ComparisonRequest([GOLDEN], ["duhem", "straight", str(OMEGA)], frequencies_hz=[100.0])
+    request = ComparisonRequest([GOLDEN], ["spi", "straight", str(OMEGA)], frequencies_hz=[100.0])
     return compare(request, SteppingClock(1e-3), lambda done, text: None)
 
 
