@@ -27,15 +27,14 @@ HARDWARE = Path(__file__).parent / "hardware"
 SLOW = tuple(Path(__file__).parent / name for name in ("faults", "peers", "simulated_runs"))
 """Folders whose tests are marked ``slow``; ``make test`` leaves them to ``make test-slow``."""
 
-# Containers often forbid to keep bytecode. Each worker, and each command that a test starts, then
-# compiles all modules anew, and that takes longer than the tests.
+# Many containers disable bytecode files. Each worker and each command of a test would compile all
+# modules again, which takes longer than the tests.
 sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
-# Seven thousand tests are collected, and none of them is garbage.
-gc.disable()
+gc.disable()  # until all tests are collected: thousands of objects, and no garbage
 
-# A shared machine stalls now and then, and a failure in CI must come back when it is run again.
+# No deadlines, because a shared machine stalls; in CI every failure must be reproducible.
 settings.register_profile("local", deadline=None, max_examples=40)
 settings.register_profile("ci", settings.get_profile("local"), derandomize=True)
 settings.load_profile("ci" if os.environ.get("CI") else "local")
@@ -52,7 +51,7 @@ def pytest_addoption(parser):
 
 
 def pytest_configure(config):
-    """Compile the kernels once, before xdist starts workers that would each compile them all."""
+    """Compile the kernels once, before xdist starts workers that would compile them all."""
     if getattr(config.option, "dist", "no") == "no" or hasattr(config, "workerinput"):
         return
     for root in (ROOT, ROOT / "drivers"):
@@ -63,40 +62,33 @@ def pytest_configure(config):
 
 
 def pytest_ignore_collect(collection_path, config):
-    """Import nothing of the folders whose tests would all be left out."""
+    """Import no test of a folder whose tests are all deselected."""
     slow = collection_path in SLOW and config.getoption("markexpr") == "not slow"
     hardware = collection_path == HARDWARE and config.getoption("--device") is None
     return True if slow or hardware else None
 
 
-@cache
-def slow(path):
-    """Return whether all tests of a file are slow."""
-    return not set(SLOW).isdisjoint(path.parents)
-
-
 def pytest_collection_modifyitems(config, items):
-    """Mark the slow ones; leave tests on real devices out, unless one is named."""
+    """Mark the slow tests; deselect tests on real devices unless a device is named."""
+    within = cache(lambda path: {*path.parents})
     for item in items:
-        if slow(item.path):
+        if not within(item.path).isdisjoint(SLOW):
             item.add_marker(pytest.mark.slow)
-    if config.getoption("--device") is not None:
-        return
-    hardware = [item for item in items if str(item.path).startswith(f"{HARDWARE}{os.sep}")]
-    if hardware:
+    hardware = [item for item in items if HARDWARE in within(item.path)]
+    if hardware and config.getoption("--device") is None:
         config.hook.pytest_deselected(items=hardware)
         items[:] = [item for item in items if item not in hardware]
 
 
 def pytest_collection_finish():
-    """Keep what was imported out of every search for garbage: it takes 0.2 s and finds none."""
+    """Exclude imported modules from garbage collection, which takes 0.2 s and finds none."""
     gc.collect()
     gc.freeze()
     gc.enable()
 
 
 def pytest_report_collectionfinish(config, items):
-    """Say what a real device is in for, in one line."""
+    """Print in one line what happens to a real device."""
     experiment = config.getoption("--device")
     if experiment is None:
         return "tests/hardware: left out; --device EXPERIMENT.yaml runs it on a real device"
@@ -105,13 +97,13 @@ def pytest_report_collectionfinish(config, items):
 
 @pytest.fixture(scope="session")
 def memory():
-    """A folder in memory of this session's own."""
+    """A folder in memory for this session."""
     with tempfile.TemporaryDirectory(prefix="hilctl-tests-", dir=memory_folder()) as folder:
         yield Path(folder)
 
 
 class LogRecords(logging.Handler):
-    """What was logged, like pytest's own, whose plugin takes as long as a short test."""
+    """Log records, like those of pytest's plugin, which takes as long as a short test."""
 
     def __init__(self):
         super().__init__()
@@ -130,7 +122,7 @@ class LogRecords(logging.Handler):
 
 @pytest.fixture
 def caplog():
-    """What is logged during a test."""
+    """Log records of a test."""
     handler = LogRecords()
     logging.getLogger().addHandler(handler)
     yield handler
@@ -139,23 +131,19 @@ def caplog():
 
 @pytest.fixture(scope="session", autouse=True)
 def read_once():
-    """Read each YAML text, each profile and what is installed once: all that is only read.
-
-    A shipped profile has hundreds of lines, and hundreds of devices are made of each.
-    """
+    """Read each YAML text, each profile and the entry points once; they do not change."""
+    readers = ((io, "compose"), (profile, "parse_profile"), (registry, "entry_points"))
     with pytest.MonkeyPatch.context() as patch:
-        for module, name in (
-            (io, "compose"), (profile, "parse_profile"), (registry, "entry_points"),
-        ):  # fmt: skip
+        for module, name in readers:
             patch.setattr(module, name, lru_cache(maxsize=256)(getattr(module, name)))
         yield
 
 
-# Autouse fixtures come before the others of their scope: what a wider fixture starts, it starts in
-# the folder of its own scope, and neither a user's command nor another test's can end it.
+# Autouse fixtures come before the others of their scope. The runs of a session's or a module's
+# fixtures are in folders of their own, where no other command can end them.
 @pytest.fixture(scope="session", autouse=True)
 def session_runs(memory):
-    """Keep the runs of session fixtures, and what they left, apart from this user's."""
+    """Separate the runs of session fixtures, and their state, from this user's."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("HILCTL_RUNS", str(memory / "session"))
         patch.setenv("XDG_STATE_HOME", str(memory / "session-state"))
@@ -164,7 +152,7 @@ def session_runs(memory):
 
 @pytest.fixture(scope="module", autouse=True)
 def module_runs(session_runs, memory, request):
-    """Keep the runs of a module's fixtures apart from all others; return their folder."""
+    """Separate the runs of a module's fixtures from all others; return their folder."""
     folder = runs_folder(memory, request.node.nodeid)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("HILCTL_RUNS", str(folder))
@@ -174,9 +162,9 @@ def module_runs(session_runs, memory, request):
 
 @pytest.fixture(autouse=True)
 def own_runs(module_runs, memory, monkeypatch, request):
-    """Keep each test's runs, and what they left, apart from other tests' and this user's.
+    """Separate each test's runs, and their state, from those of other tests and this user.
 
-    A guardian that still drives a device when the test is over is ended.
+    A guardian that is still active after the test is killed.
     """
     folder = runs_folder(memory, request.node.nodeid)
     monkeypatch.setenv("HILCTL_RUNS", str(folder))
@@ -187,5 +175,5 @@ def own_runs(module_runs, memory, monkeypatch, request):
 
 
 def runs_folder(memory, nodeid):
-    """Return a short path for each test or module: a socket's path may have 107 characters."""
+    """Return a short path for a test or module (a socket's path has at most 107 characters)."""
     return memory / hashlib.sha256(nodeid.encode()).hexdigest()[:16]

@@ -15,22 +15,18 @@ from pathlib import Path
 
 import numpy as np
 
-from hilctl.base.device import Device
-from hilctl.base.errors import DeviceError, InputError
-from hilctl.base.events import Event
+from hilctl.base.errors import DeviceError
 from hilctl.base.samples import BlockBatch, BlockHeader
 from hilctl.loop.block import Block
 from hilctl.loop.interlocks import InterlockContext, Interlocks, InterlockSettings
-from hilctl.loop.tuning import Tuning
 from hilctl_drivers.emulator.factory import Emulator, build
 from hilctl_drivers.emulator.labjack_stream import attach_stream
 from hilctl_drivers.emulator.modbus_device import EmulatedModbus
 from hilctl_drivers.emulator.modbus_wire import ModbusWire
 from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.emulator.rig import Rig, WriteLog
-from hilctl_drivers.modbus.modbus_profile import ModbusProfile
 from hilctl_drivers.profile import load_profile
-from hilctl_drivers.transport.links import LostError, Missing, NoAnswerError
+from hilctl_drivers.transport.links import LostError, NoAnswerError
 
 
 @dataclass
@@ -169,31 +165,18 @@ class FakeHost:
         block: Samples per block.
         state_size: State values per block.
         full: First samples of blocks that are dropped.
-        stop: Reason to end the run, or empty.
+        stop: Returns the reason to end the run, or an empty text.
         tunings: Changes of the reference, by sample.
-
-    Attributes:
-        heads: Header of each recorded block, a :class:`BlockHeader`.
-        sent: First sample and commands of each pending block.
     """
 
     def __init__(
-        self,
-        clock,
-        block=1,
-        state_size=1,
-        *,
-        full=range(0),
-        stop: Callable[[], str] = lambda: "",
-        tunings: dict[int, Tuning] | None = None,
+        self, clock, block=1, state_size=1, *, full=range(0), stop=lambda: "", tunings=None
     ):
         self.clock, self._shape = clock, (block, state_size)
         self.full, self.stop, self.tunings = full, stop, tunings or {}
         self.heads, self.columns, self.flags, self.states = [], [], [], []
-        self.events: list[Event] = []
-        self.heartbeats: list[int] = []
-        self.sent: list[tuple[int, list[float]]] = []
-        self.safe_writes: list[float] = []
+        self.events, self.heartbeats, self.safe_writes = [], [], []
+        self.sent = []  # first sample and commands of each pending block
         self.closed = False
 
     def claim(self, *, due=True):
@@ -276,46 +259,32 @@ class RigInterlocks:
 
 @dataclass(slots=True)
 class VirtualTime:
-    """A clock that advances on request and by each message.
-
-    Attributes:
-        now_ns: The time.
-    """
+    """A clock in s that advances on request and by each message."""
 
     now_ns: int = 1_000_000_000
 
-    def __call__(self) -> float:
-        """Return the time in s."""
+    def __call__(self):
         return self.now_ns * 1e-9
 
-    def sleep(self, seconds: float) -> None:
-        """Advance the clock."""
+    def sleep(self, seconds):
         self.now_ns += max(0, round(seconds * 1e9))
 
 
 class InProcessLink:
     """A :class:`~hilctl_drivers.transport.links.Link` that passes each request to emulated devices.
 
-    Args:
-        wire: Emulated devices and their framing.
-        time: The clock.
-        message_s: Duration of a request and its reply.
+    A request and its reply take ``message_s``; all requests are kept.
     """
 
-    def __init__(self, wire: ModbusWire, time: VirtualTime, message_s: float = 0.0) -> None:
-        self._wire = wire
-        self._time = time
-        self._message_s = message_s
+    def __init__(self, wire: ModbusWire, time: VirtualTime, message_s=0.0):
+        self._wire, self._time, self._message_s = wire, time, message_s
         self.is_open = False
         self.requests: list[bytes] = []
-        """All requests, oldest first."""
 
-    def open(self) -> None:
-        """See :meth:`~hilctl_drivers.transport.links.Link.open`."""
+    def open(self):
         self.is_open = True
 
-    def transact(self, request: bytes | bytearray, missing: Missing, usual: int = 0) -> bytes:
-        """Exchange, see :meth:`~hilctl_drivers.transport.links.Link.transact`."""
+    def transact(self, request, missing, usual=0):
         del usual
         if not self.is_open:
             raise LostError("not connected")
@@ -331,19 +300,18 @@ class InProcessLink:
             raise NoAnswerError(f"only {len(reply)} bytes" if reply else "no answer")
         return reply
 
-    def spoil(self, reply: bytes) -> bytes:
+    def spoil(self, reply):
         """Return the received reply; override it to inject faults."""
         return reply
 
-    def close(self) -> None:
-        """See :meth:`~hilctl_drivers.transport.links.Link.close`."""
+    def close(self):
         self.is_open = False
 
 
 _READ_FUNCTIONS = (1, 2, 3, 4)
 
 
-def made_safe(device: Device, command: float, attempts: int = 50) -> int:
+def made_safe(device, command, attempts=50):
     """Call make_safe until the device confirms; return the number of attempts."""
     for attempt in range(1, attempts):
         try:
@@ -356,26 +324,18 @@ def made_safe(device: Device, command: float, attempts: int = 50) -> int:
 
 
 class FaultyLink(InProcessLink):
-    """A link that loses or delays requests, over all connections.
-
-    Attributes:
-        timeout_s: Timeout of a lost request.
-        silent_until_s: Time until which requests are lost.
-        late_s: Delay of the next write; None for none.
-        late_if: Selects the delayed request.
-    """
+    """A link that loses requests, or delays the next one that ``late_if`` selects (a write)."""
 
     timeout_s = 0.1
     silent_until_s = 0.0
     late_s: float | None = None
 
-    def __init__(self, wire: ModbusWire, time: VirtualTime, message_s: float = 0.0) -> None:
+    def __init__(self, wire: ModbusWire, time: VirtualTime, message_s=0.0):
         super().__init__(wire, time, message_s)
-        self.late_if: Callable[[bytes], bool] = lambda request: request[7] not in _READ_FUNCTIONS
+        self.late_if = lambda request: request[7] not in _READ_FUNCTIONS
         self._held_back: list[tuple[float, bytes]] = []
 
-    def transact(self, request: bytes | bytearray, missing: Missing, usual: int = 0) -> bytes:
-        """See :meth:`InProcessLink.transact`."""
+    def transact(self, request, missing, usual=0):
         self.deliver()
         if self.late_s is not None and self.late_if(bytes(request)):
             self._held_back.append((self._time() + self.late_s, bytes(request)))
@@ -386,7 +346,7 @@ class FaultyLink(InProcessLink):
         self.close()
         raise NoAnswerError(f"no answer within {self.timeout_s:g} s")
 
-    def deliver(self) -> None:
+    def deliver(self):
         """Execute the due requests without an answer."""
         for due_s, request in self._held_back:
             if due_s <= self._time():
@@ -397,15 +357,7 @@ class FaultyLink(InProcessLink):
 
 @dataclass(frozen=True, slots=True)
 class InProcess:
-    """An emulated device in the caller's process, with virtual time.
-
-    Attributes:
-        device: The device.
-        rig: Its rig.
-        link: Link to it.
-        time: Its clock.
-        log: Its log; close it at the end.
-    """
+    """An emulated device in the caller's process, with virtual time; close its log at the end."""
 
     device: EmulatedModbus
     rig: Rig
@@ -415,31 +367,19 @@ class InProcess:
 
     @classmethod
     def of(
-        cls,
-        profile: str,
-        *,
-        link: type[InProcessLink] = InProcessLink,
-        log: Path | None = None,
-        message_s: float = 0.0,
-        noise: bool = False,
-        current_a: float | None = 0.0,
-    ) -> "InProcess":
-        """Return an emulated device with the profile's first output and input.
+        cls, profile, *, link=InProcessLink, log=None, message_s=0.0, noise=False, current_a=0.0
+    ):
+        """Return an emulated device with the first output and input of a Modbus profile.
 
         Args:
-            profile: Name of a shipped Modbus profile, or a path.
+            profile: Name of a shipped profile, or a path.
             link: Factory of the link.
             log: File for a log of every write.
             message_s: Duration of a request and its reply.
             noise: Whether the sensor has noise.
             current_a: Initial current; the power-up value if None.
-
-        Raises:
-            InputError: The profile is no Modbus profile with an output and an input.
         """
         loaded = load_profile(profile)
-        if not isinstance(loaded, ModbusProfile) or not (loaded.outputs and loaded.inputs):
-            raise InputError(f"{profile}: only Modbus devices that drive and read are emulated so")
         output, sensor = next(iter(loaded.outputs)), next(iter(loaded.inputs))
         time = VirtualTime()
         rig, writes = Rig(time.now_ns, noise=noise), WriteLog(log, 0)
@@ -488,7 +428,7 @@ def received(descriptor: int, size: int, wait_s: float = 5.0) -> bytes:
 
 
 class FailingFile(io.FileIO):
-    """A file with write and sync errors.
+    """A file with write errors.
 
     Attributes:
         room: Free bytes; a write beyond is truncated, and the next one fails.

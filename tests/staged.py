@@ -1,4 +1,4 @@
-"""A known staged model, and the fit and the grid by which tests find it again."""
+"""A known staged model, and the grid and the fit that identify it."""
 
 from typing import Any
 
@@ -19,23 +19,11 @@ GRID = [(a, f) for a in (3.0, 6.0) for f in (2.0, 50.0, 150.0, 250.0, 400.0)]
 
 
 def truth(**stages: Any) -> StagedModel:
-    """Return a known model; its deadbands lie where identification puts them."""
+    """Return a known model; its deadbands are on the grid of identification."""
     omega = exponential_integrated(
-        alpha=0.5,
-        gamma_s=0.0,
-        a_0=3.0,
-        alpha_0=1.4,
-        beta_0=0.3,
-        g_0=1.0,
-        alpha_1=0.08,
-        beta_1=0.15,
-        d_p=6.0,
-        alpha_2=0.1,
-        beta_2=0.4,
-        d_n=6.0,
-        plays=8,
-        deadbands_a_side=5,
-    )
+        alpha=0.5, gamma_s=0.0, a_0=3.0, alpha_0=1.4, beta_0=0.3, g_0=1.0, alpha_1=0.08,
+        beta_1=0.15, d_p=6.0, alpha_2=0.1, beta_2=0.4, d_n=6.0, plays=8, deadbands_a_side=5,
+    )  # fmt: skip
     return StagedModel.around(omega, **stages)
 
 
@@ -46,6 +34,6 @@ def fit(data: list[SteadyLoop], **choices: Any) -> FittedModel:
 
 
 def start(data: StagedFitData, layers: Layers, before: list[float], delay_s: float) -> Point:
-    """Return where the linear problem alone leads."""
+    """Return the start of the search, the solution of the linear problem."""
     scale = np.ones(data.target_um.size)
     return convex_start(data, layers, np.array(before), delay_s, scale).point

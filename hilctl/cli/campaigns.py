@@ -18,16 +18,8 @@ from hilctl.api.campaigns import run_steps
 from hilctl.base.errors import ConfigError, ConfigProblem
 from hilctl.base.yaml import Document
 from hilctl.cli.console import print_rich, progress_bar, table
-from hilctl.cli.options import (
-    AsJson,
-    DryRun,
-    ExperimentFile,
-    Fast,
-    LabelTexts,
-    Overwrite,
-    Settings,
-)
-from hilctl.cli.output import print_json
+from hilctl.cli.options import AsJson, DryRun, ExperimentFile, Fast, LabelTexts, Overwrite, Settings
+from hilctl.cli.output import print_json, print_result
 from hilctl.experiment.sections import label_settings
 from hilctl.ilc.ilc_session import correction_setting
 from hilctl.ilc.results import IlcResult, IlcRow
@@ -154,10 +146,7 @@ def _note(text: str) -> None:
 
 
 def _finish(result: CampaignResult, *, as_json: bool) -> None:
-    if as_json:
-        print_json(result_mapping(result))
-    else:
-        print_result(result)
+    print_result(result_mapping(result), lambda: print_campaign(result), as_json=as_json)
     if result.stop_signal:
         print(f"hilctl: stopped: {result.reason}; {_RESUMES}", file=sys.stderr)
         raise typer.Exit(128 + result.stop_signal)
@@ -194,13 +183,7 @@ def plan_mapping(plan: CampaignPlan) -> dict[str, Any]:
 
 
 def print_plan(plan: CampaignPlan, *, fast: bool, every_step: bool) -> None:
-    """Print the plan of a campaign.
-
-    Args:
-        plan: The plan.
-        fast: Whether the runs are simulated without waiting.
-        every_step: Whether to list each step.
-    """
+    """Print the plan of a campaign, with all of its steps if ``every_step`` is set."""
     if every_step:
         print_rich(_steps(plan))
     kept = len(plan.steps) - len(plan.left)
@@ -245,15 +228,15 @@ def _duration(seconds: float) -> str:
 def print_row(step: CampaignStep, row: CampaignRow) -> None:
     """Print a completed step."""
     values = "  ".join(f"{key}={_shown(value)}" for key, value in step.point.items())
-    figures = row.figures
-    parts = [
-        (figures.peak_to_peak_um, "{:.4g} µm"),
-        (figures.peak_hysteresis_percent, "hysteresis {:.3g} %"),
-        (figures.peak_error_percent, "error {:.3g} %"),
-        (figures.natural_hz, "resonance {:.4g} Hz"),
-    ]
-    values_text = "  ".join(text.format(value) for value, text in parts if value is not None)
-    text = values_text if row.code == COMPLETED else row.result
+    figures, text = row.figures, row.result
+    if row.code == COMPLETED:
+        parts = [
+            (figures.peak_to_peak_um, "{:.4g} µm"),
+            (figures.peak_hysteresis_percent, "hysteresis {:.3g} %"),
+            (figures.peak_error_percent, "error {:.3g} %"),
+            (figures.natural_hz, "resonance {:.4g} Hz"),
+        ]
+        text = "  ".join(form.format(value) for value, form in parts if value is not None)
     kept = "done earlier  " if row.kept else ""
     print(f"{step.number:4d}  {values or 'reference run'}  {kept}{text}", flush=True)
 
@@ -273,7 +256,7 @@ def result_mapping(result: CampaignResult) -> dict[str, Any]:
     }
 
 
-def print_result(result: CampaignResult) -> None:
+def print_campaign(result: CampaignResult) -> None:
     """Print the result of a campaign, its drift and its files."""
     counts = result_mapping(result)["results"]
     done = ", ".join(f"{count} {code}" for code, count in counts.items())
@@ -314,10 +297,8 @@ def learn(
         overwrite=overwrite,
         on_rows=(lambda rows: None) if as_json else _print_iteration,
     )
-    if as_json:
-        print_json({**learned.to_mapping(), "output": str(output), "folder": str(chosen)})
-    else:
-        _print_learned(learned, output, chosen)
+    values = {**learned.to_mapping(), "output": str(output), "folder": str(chosen)}
+    print_result(values, lambda: _print_learned(learned, output, chosen), as_json=as_json)
     if learned.stop_signal:
         raise typer.Exit(128 + signal.Signals(learned.stop_signal))
     if learned.fault:
@@ -338,21 +319,21 @@ def _print_learned(learned: IlcResult, output: Path, folder: Path) -> None:
     headings = (
         "waveform", "start %", "best %", "verified %", "noise floor %", "delay", "resonance",
     )  # fmt: skip
-    rows = []
-    for cycle in learned.correction.cycles:
-        row, check = last[cycle.label], checks.get(cycle.label)
-        rows.append(
-            (
-                cycle.label,
-                f"{cycle.start_percent:.4f}",
-                f"{cycle.error_percent:.4f}",
-                f"{check.error_percent:.4f}" if check else "-",
-                f"{row.floor_percent:.4f}",
-                f"{row.delay_samples:.2f} samples",
-                f"{row.natural_hz:.0f} Hz" if row.natural_hz else "-",
-            )
+    cycles = [
+        (each, last[each.label], checks.get(each.label)) for each in learned.correction.cycles
+    ]
+    rows = [
+        (
+            cycle.label,
+            f"{cycle.start_percent:.4f}",
+            f"{cycle.error_percent:.4f}",
+            f"{check.error_percent:.4f}" if check else "-",
+            f"{row.floor_percent:.4f}",
+            f"{row.delay_samples:.2f} samples",
+            f"{row.natural_hz:.0f} Hz" if row.natural_hz else "-",
         )
+        for cycle, row, check in cycles
+    ]
     print_rich(table(f"learned: {learned.reason}", headings, rows))
     print(f"correction: {output}; runs: {folder}")
-    setting = shlex.quote(correction_setting(output))
-    print(f"  --set {setting}")
+    print(f"  --set {shlex.quote(correction_setting(output))}")

@@ -11,16 +11,8 @@ from hilctl import api
 from hilctl.api._types import runs_folder
 from hilctl.base.errors import RunError
 from hilctl.cli.console import print_rich, progress_bar, table
-from hilctl.cli.options import (
-    AsJson,
-    DryRun,
-    ExperimentFile,
-    Fast,
-    LabelTexts,
-    Overwrite,
-    Settings,
-)
-from hilctl.cli.output import print_json
+from hilctl.cli.options import AsJson, DryRun, ExperimentFile, Fast, LabelTexts, Overwrite, Settings
+from hilctl.cli.output import print_json, print_result
 from hilctl.experiment.sections import label_settings
 from hilctl.run.start import StepStoppedError
 from hilctl.studies.characterise.characterisation_runner import CharacterisationPlan
@@ -56,50 +48,43 @@ def characterise(
         elif dry_run:
             print_json(plan_mapping(plan))
 
-    with progress_bar("characterise", quiet=as_json) as on_progress:
-        result = _characterise(
-            experiment,
-            output,
-            folder=chosen,
-            settings=[*(settings or []), *label_settings(labels or [])],
-            highest_hz=highest_hz,
-            fast=fast,
-            overwrite=overwrite,
-            dry_run=dry_run,
-            on_progress=on_progress,
-            on_plan=on_plan,
-            on_step=(lambda row: None) if as_json else print_step,
-        )
-    if result is not None:
-        _finish(result, output, output.with_suffix(".html"), chosen, as_json=as_json)
-
-
-def _characterise(experiment: Path, output: Path, **options: Any) -> Characterisation | None:
     try:
-        return api.characterise(experiment, output, **options)
+        with progress_bar("characterise", quiet=as_json) as on_progress:
+            result = api.characterise(
+                experiment,
+                output,
+                folder=chosen,
+                settings=[*(settings or []), *label_settings(labels or [])],
+                highest_hz=highest_hz,
+                fast=fast,
+                overwrite=overwrite,
+                dry_run=dry_run,
+                on_progress=on_progress,
+                on_plan=on_plan,
+                on_step=(lambda row: None) if as_json else print_step,
+            )
     except (StepStoppedError, KeyboardInterrupt) as error:
         number = getattr(error, "signal", signal.SIGINT)
         print(f"hilctl: stopped: {error or 'Ctrl-C'}; {_RESUMES}", file=sys.stderr)
         raise typer.Exit(128 + number) from None
     except RunError as error:
         raise RunError(f"{error}; {_RESUMES}") from None
+    if result is not None:
+        _finish(result, output, chosen, as_json=as_json)
 
 
-def _finish(
-    result: Characterisation, output: Path, page: Path, folder: Path, *, as_json: bool
-) -> None:
-    model = output if result.is_model else None
-    if as_json:
-        places = {"output": str(model) if model else None, "page": str(page)}
-        print_json({**result.to_mapping(), **places, "folder": str(folder)})
-    else:
-        print_characterisation(result, model, page)
+def _finish(result: Characterisation, output: Path, folder: Path, *, as_json: bool) -> None:
+    model, page = output if result.is_model else None, output.with_suffix(".html")
+    places = {"output": str(model) if model else None, "page": str(page), "folder": str(folder)}
+    print_result(
+        result.to_mapping() | places,
+        lambda: print_characterisation(result, model, page),
+        as_json=as_json,
+    )
     if result.problem:
         print(f"hilctl: {result.problem}", file=sys.stderr)
-        print(
-            "hilctl: fix this, then use --overwrite to measure again (see the page for results)",
-            file=sys.stderr,
-        )
+        hint = "fix this, then use --overwrite to measure again (see the page for results)"
+        print(f"hilctl: {hint}", file=sys.stderr)
         raise typer.Exit(3)
     if not result.is_model:
         raise typer.Exit(1)
@@ -119,7 +104,7 @@ def plan_mapping(plan: CharacterisationPlan) -> dict[str, Any]:
         "recordings_mb": plan.megabytes,
         "free_mb": plan.free_mb,
         "steps": [
-            {"name": step.name, "purpose": step.purpose, "seconds": step.seconds}
+            {name: getattr(step, name) for name in ("name", "purpose", "seconds")}
             for step in plan.steps
         ],
     }

@@ -16,12 +16,10 @@ from hilctl.cli.output import QUIET, VERBOSE
 
 
 class CommandEntry(NamedTuple):
-    """Module and help of a command.
+    """A command: a function or typer application of its name in a module.
 
-    Attributes:
-        module: Module with a function, or a typer application, of the command's name; ``NAME_`` if
-            the name has another meaning in Python.
-        help: First line of the function's docstring.
+    Its name is ``NAME_`` if NAME has another meaning in Python; ``help`` is the first line of its
+    docstring.
     """
 
     module: str
@@ -67,7 +65,7 @@ _MODULES = {
     },
     "hilctl.cli.characterise": {
         "characterise": "Measure a connected actuator within its limits, "
-        "then identify and validate a model.",
+        "then identify and validate a model."
     },
     "hilctl.cli.campaigns": {
         "campaign": "Run an experiment with each combination of varied keys "
@@ -81,7 +79,7 @@ _MODULES = {
         "devices": "List devices, shipped profiles and serial ports (opens none).",
     },
     "hilctl_drivers.emulator.emulate_command": {
-        "emulate": "Emulate a device with the simulated rig, until Ctrl-C.",
+        "emulate": "Emulate a device with the simulated rig, until Ctrl-C."
     },
 }
 COMMANDS = {

@@ -26,11 +26,8 @@ class SafeConsole(Console):
         """Return the segments to print; only those that move the cursor are not escaped."""
         for segment in super().render(renderable, options):
             text, style, control = segment
-            yield (
-                segment
-                if control or text.isprintable()
-                else Segment(printable(text, lines=True), style)
-            )
+            safe = control or text.isprintable()
+            yield segment if safe else Segment(printable(text, lines=True), style)
 
 
 def console(*, stderr: bool = False) -> Console:
@@ -59,15 +56,7 @@ def table(
     *,
     wrap: bool = False,
 ) -> Table:
-    """Return a table; cells are plain text, never markup.
-
-    Args:
-        title: Title; may be empty.
-        headings: Headings of the columns.
-        rows: Cells.
-        left: Headings of left-aligned columns, in addition to the first.
-        wrap: Wrap long cells.
-    """
+    """Return a table of plain texts, never markup; the first and ``left`` columns align left."""
     made = Table(title=Text(title) if title else None, title_justify="left")
     for number, heading in enumerate(headings):
         justify: JustifyMethod = "left" if number == 0 or heading in left else "right"
@@ -78,13 +67,7 @@ def table(
 
 
 def listing(title: str, rows: Iterable[Sequence[str | Text]], wrap_from: int = 1) -> Table:
-    """Return rows in aligned columns without lines or headings.
-
-    Args:
-        title: Title; may be empty.
-        rows: Cells; plain text or styled.
-        wrap_from: Number of the first column whose long cells wrap.
-    """
+    """Return rows in aligned columns without lines or headings; long cells wrap from a column."""
     made = Table(title=Text(title) if title else None, title_justify="left", box=None)
     made.show_header, made.padding = False, (0, 2, 0, 0)
     for row in rows:
@@ -98,16 +81,12 @@ def listing(title: str, rows: Iterable[Sequence[str | Text]], wrap_from: int = 1
 def progress_bar(name: str, *, quiet: bool) -> Iterator[Callable[[float, str], None]]:
     """Show a progress bar on standard error; yield its update function (fraction done, text)."""
     terminal = console(stderr=True)
-    columns = (
-        BarColumn(bar_width=24),
-        TimeElapsedColumn(),
-        TextColumn("{task.description}", markup=False),
-    )
-    hidden = quiet or not terminal.is_terminal
-    # No refresh thread, because a campaign forks processes while the bar is shown.
+    text = TextColumn("{task.description}", markup=False)
     with Progress(
-        *columns, console=terminal, disable=hidden, transient=True, auto_refresh=False
-    ) as bar:
+        BarColumn(bar_width=24), TimeElapsedColumn(), text,
+        console=terminal, disable=quiet or not terminal.is_terminal, transient=True,
+        auto_refresh=False,  # no thread, because a campaign forks processes meanwhile
+    ) as bar:  # fmt: skip
         task = bar.add_task(name, total=1.0)
         yield lambda done, text: bar.update(task, completed=done, description=text, refresh=True)
 

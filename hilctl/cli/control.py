@@ -10,7 +10,7 @@ import typer
 
 from hilctl.base.errors import InputError
 from hilctl.cli.options import AsJson
-from hilctl.cli.output import print_json
+from hilctl.cli.output import print_result
 from hilctl.run.control.client import (
     active_runs,
     assigned,
@@ -34,10 +34,7 @@ def status(as_json: AsJson = False) -> None:
     """List active runs and their progress."""
     finish_dead_runs()
     statuses = [status_of(each) for each in runs()]
-    if as_json:
-        print_json({"runs": statuses})
-    else:
-        print_status(statuses)
+    print_result({"runs": statuses}, lambda: print_status(statuses), as_json=as_json)
 
 
 def set_(
@@ -55,10 +52,7 @@ def set_(
     """Change the gain or offset of a running reference smoothly, or bypass the inverse."""
     chosen = find_run(run)
     answer = set_run(chosen, **assigned(assignments), over_s=over)
-    if as_json:
-        print_json(answer)
-    else:
-        print_change(chosen.card.name, answer)
+    print_result(answer, lambda: print_change(chosen.card.name, answer), as_json=as_json)
 
 
 def mark(
@@ -69,10 +63,8 @@ def mark(
     """Add a mark to a run's recording at the current sample."""
     chosen = find_run(run)
     answer = mark_run(chosen, " ".join(text))
-    if as_json:
-        print_json(answer)
-    else:
-        print(f"{chosen.card.name}: marked sample {answer['sample']}: {answer['text']}")
+    line = f"{chosen.card.name}: marked sample {answer['sample']}: {answer['text']}"
+    print_result(answer, lambda: print(line), as_json=as_json)
 
 
 def stop(
@@ -87,10 +79,8 @@ def stop(
     if every and run is not None:
         raise InputError("use either --all or --run")
     stopped = stop_runs(active_runs() if every else [find_run(run)], wait)
-    if as_json:
-        print_json({"runs": stopped} if every else stopped[0])
-    else:
-        print_stopped(stopped, wait)
+    values = {"runs": stopped} if every else stopped[0]
+    print_result(values, lambda: print_stopped(stopped, wait), as_json=as_json)
     if not all(each["ended"] for each in stopped):
         raise typer.Exit(_NOT_ENDED)
 
@@ -110,10 +100,9 @@ def _status_lines(run: dict[str, Any]) -> dict[str, str]:
     lines = {}
     if total := run.get("total_samples", 0):
         at_s, total_s = run["sample"] / run["sample_rate_hz"], total / run["sample_rate_hz"]
+        counts = f"{run['recorded_samples']:,} recorded, {run['missing_samples']:,} missing"
         lines["time"] = f"{at_s:.1f} of {total_s:.1f} s"
-        lines["samples"] = (
-            f"{run['recorded_samples']:,} recorded, {run['missing_samples']:,} missing"
-        )
+        lines["samples"] = counts
         lines["late ticks"] = f"{run['late_ticks']:,}"
         lines["reference"] = f"gain {run['gain']:g}, offset {run['offset']:g}"
         if inverse := run["inverse"]:
@@ -128,8 +117,7 @@ def print_change(name: str, answer: dict[str, Any]) -> None:
     """Print the reference and inverse after a change."""
     inverse = f", inverse {answer['inverse']}" if answer["inverse"] else ""
     values = f"gain {answer['gain']:g}, offset {answer['offset']:g}{inverse}"
-    values += f", over {answer['over_s']:g} s"
-    print(f"{name}: {values}")
+    print(f"{name}: {values}, over {answer['over_s']:g} s")
 
 
 def print_stopped(stopped: Sequence[dict[str, Any]], wait_s: float) -> None:

@@ -12,7 +12,7 @@ from rich.text import Text
 from hilctl import api
 from hilctl.cli.console import listing, print_rich, progress_bar
 from hilctl.cli.options import AsJson, ExperimentFile, Settings
-from hilctl.cli.output import print_json
+from hilctl.cli.output import print_result
 from hilctl.experiment.devices import DeviceDescription, Inventory, describe, inventory
 from hilctl.machine.diagnosis import DEFAULT_RATE_HZ, Diagnosis, diagnose, lateness_counts
 from hilctl.machine.rt_setup import Realtime
@@ -24,12 +24,9 @@ from hilctl.run.run_folder import require_linux
 devices_ = typer.Typer(rich_markup_mode=None)
 
 _COLOURS = {
-    "ok": "green",
-    "done": "green",
-    "warn": "yellow",
-    "not asked": "yellow",
-    "bad": "red",
-    "refused": "red",
+    **dict.fromkeys(("ok", "done"), "green"),
+    **dict.fromkeys(("warn", "not asked"), "yellow"),
+    **dict.fromkeys(("bad", "refused"), "red"),
 }
 _BAR = 40
 
@@ -59,10 +56,8 @@ def doctor(
             rate or rate_hz, settings, folder, seconds,
             lambda elapsed_s: show(elapsed_s / seconds, "measuring"),
         )  # fmt: skip
-    if as_json:
-        print_json(diagnosis.to_mapping())
-    else:
-        print_rich(render_diagnosis(diagnosis))
+    values = diagnosis.to_mapping()
+    print_result(values, lambda: print_rich(render_diagnosis(diagnosis)), as_json=as_json)
     if not diagnosis.latency.kept:
         raise typer.Exit(1)
 
@@ -73,10 +68,7 @@ def devices(context: typer.Context, as_json: AsJson = False) -> None:
     if context.invoked_subcommand is not None:
         return
     listed = inventory()
-    if as_json:
-        print_json(listed.to_mapping())
-    else:
-        print_inventory(listed)
+    print_result(listed.to_mapping(), lambda: print_inventory(listed), as_json=as_json)
 
 
 @devices_.command()
@@ -86,10 +78,7 @@ def show(
 ) -> None:
     """Show the options of a device, or the content of a profile."""
     described = describe(name)
-    if as_json:
-        print_json(described.to_mapping())
-    else:
-        print_described(described)
+    print_result(described.to_mapping(), lambda: print_described(described), as_json=as_json)
 
 
 @devices_.command()
@@ -97,10 +86,7 @@ def probe(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson
     """Read an experiment's device and check its answers (nothing moves)."""
     require_linux()
     probed = read_device(experiment, settings or [])
-    if as_json:
-        print_json(probed.to_mapping())
-    else:
-        print_probed(probed)
+    print_result(probed.to_mapping(), lambda: print_probed(probed), as_json=as_json)
     if probed.faults:
         raise typer.Exit(3)
 
@@ -134,8 +120,7 @@ def _lateness(latency: Latency) -> RenderableType:
         (f"from {edge_us} us", str(count), "#" * round(_BAR * math.log1p(count) / longest))
         for edge_us, count in counts.items()
     ]
-    figures = latency.percentiles_us()
-    line = ", ".join(f"{name} {value:.1f}" for name, value in figures.items())
+    line = ", ".join(f"{name} {value:.1f}" for name, value in latency.percentiles_us().items())
     title = f"wake-up lateness, {latency.rate_hz:g} Hz, {seconds:.3g} s"
     return Group(listing(title, rows), Text(f"{line} us"))
 
@@ -180,11 +165,9 @@ def _channel(item: tuple[str, Mapping[str, object]]) -> tuple[str, str]:
 
 def _plain(value: object) -> str:
     """Return a value of a file as one line."""
-    return (
-        ", ".join(map(str, value))
-        if isinstance(value, list | tuple)
-        else " ".join(str(value).split())
-    )
+    if isinstance(value, list | tuple):
+        return ", ".join(map(str, value))
+    return " ".join(str(value).split())
 
 
 def print_probed(probed: Probed) -> None:
@@ -196,10 +179,8 @@ def print_probed(probed: Probed) -> None:
         print(f"safe value: {probed.safe_note}")
     if probed.displacement_um is not None:
         print(f"displacement: {probed.displacement_um:.6g} µm")
-    if probed.output is None:
-        print("output: unknown")
-    else:
-        print(f"output: {probed.output:.6g} {probed.command_unit}")
+    output = probed.output
+    print(f"output: {'unknown' if output is None else f'{output:.6g} {probed.command_unit}'}")
     for key, value in probed.details.items():
         print(f"  {key}: {value}")
     for fault in probed.faults:

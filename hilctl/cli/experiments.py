@@ -14,7 +14,7 @@ from hilctl.base.errors import InputError
 from hilctl.base.files import read_text, write_text
 from hilctl.cli.console import listing, print_rich
 from hilctl.cli.options import AsJson, Settings
-from hilctl.cli.output import print_json
+from hilctl.cli.output import print_json, print_result
 from hilctl.cli.run import run_progress
 from hilctl.experiment.devices import known_devices, shipped_profiles
 from hilctl.experiment.examples import copy_example, examples_folder, shipped_examples
@@ -40,11 +40,9 @@ def examples(
     """List the examples, or copy one with the files it refers to."""
     folder = examples_folder()
     if name is not None:
-        copies = copy_example(name, into, folder)
-        if as_json:
-            print_json({"example": name, "files": [str(path) for path in copies]})
-        else:
-            print("\n".join(map(str, copies)))
+        copies = [str(path) for path in copy_example(name, into, folder)]
+        values = {"example": name, "files": copies}
+        print_result(values, lambda: print("\n".join(copies)), as_json=as_json)
         return
     listed = shipped_examples(folder)
     if as_json:

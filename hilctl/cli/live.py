@@ -23,9 +23,9 @@ from hilctl.base.formatting import printable
 from hilctl.cli.console import console
 from hilctl.cli.options import AsJson
 from hilctl.cli.output import print_json, safe_streams
-from hilctl.live.run_reader import RunReader
+from hilctl.live.run_reader import RunList, RunReader
 from hilctl.live.scope import WINDOWS_S
-from hilctl.live.server_process import RunSelector, SingleRun, serve_foxglove, serve_runs
+from hilctl.live.server_process import SingleRun, serve_foxglove, serve_runs
 from hilctl.live.traces import ROW
 from hilctl.run.control.client import (
     JOB_CONTROL,
@@ -278,11 +278,11 @@ def live(
 
     ended = SingleRun()
 
-    def over(server: RunSelector) -> bool:
+    def over(feeds: RunList) -> bool:
         if first is None:
             return False
         # A run that ended before the server could read it has no feed.
-        return ended(server) or (server.feed(None) is None and not first.alive)
+        return ended(feeds) or (feeds.feed(None) is None and not first.alive)
 
     def on_url(url: str) -> None:
         what = "Foxglove server" if foxglove else "live page"

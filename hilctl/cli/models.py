@@ -14,7 +14,7 @@ from hilctl.base.errors import InputError
 from hilctl.base.files import check_writable
 from hilctl.cli.console import listing, print_rich, progress_bar, table
 from hilctl.cli.options import AsJson, Overwrite, Settings
-from hilctl.cli.output import print_json
+from hilctl.cli.output import print_result
 from hilctl.comparison.compare import Comparison, headings, notes, table_rows
 from hilctl.identify.model_selection import OrderScore
 from hilctl.identify.pipeline import Identification
@@ -93,9 +93,13 @@ Frequencies = Annotated[
 
 
 def _list_settings(requested: bool) -> None:
-    if requested:
-        print_settings()
-        raise typer.Exit
+    if not requested:
+        return
+    kinds = [(kind, each.title, each.found_by, each.data) for kind, each in CATALOGUE.items()]
+    print_rich(listing("", [("--model", "description", "identified by", "from"), *kinds]))
+    headings = ("--set", "default", "limits", "of", "description")
+    print_rich("", listing("", [headings, *setting_rows()]))
+    raise typer.Exit
 
 
 ListSettings = Annotated[
@@ -166,11 +170,8 @@ def identify(
 
         write_page(identification_page(result), html)
     refused = result.verdict.grade == "not a model"
-    if as_json:
-        written = str(output) if output and not refused else None
-        print_json({"output": written, **result.to_mapping()})
-    else:
-        print_identification(result, output)
+    values = {"output": str(output) if output and not refused else None, **result.to_mapping()}
+    print_result(values, lambda: print_identification(result, output), as_json=as_json)
     if refused:
         raise typer.Exit(1)
 
@@ -206,11 +207,9 @@ def refine(
         from hilctl.identify.model_page import refinement_page
 
         write_page(refinement_page(result), html)
-    if as_json:
-        print_json({"output": str(output) if output and result.better else None,
-                    **result.to_mapping()})  # fmt: skip
-    else:
-        print_refinement(result, output)
+    written = str(output) if output and result.better else None
+    values = {"output": written, **result.to_mapping()}
+    print_result(values, lambda: print_refinement(result, output), as_json=as_json)
     if not result.better:
         raise typer.Exit(1)
 
@@ -244,24 +243,21 @@ def compare(
 ) -> None:
     """Identify models of the literature on the same loops and compare them."""
     names = [name for text in models or [] for name in text.split(",") if name]
-    numbers = _numbers(frequencies)
     with progress_bar("compare", quiet=as_json) as on_progress:
         comparison = api.compare(
             files,
             names,
             experiment=experiment,
             settings=settings or [],
-            frequencies_hz=numbers,
+            frequencies_hz=_numbers(frequencies),
             points=points,
             html=html,
             save=save,
             overwrite=overwrite,
             on_progress=on_progress,
         )
-    if as_json:
-        print_json(comparison.to_mapping())
-    else:
-        print_rich(render_comparison(comparison))
+    values = comparison.to_mapping()
+    print_result(values, lambda: print_rich(render_comparison(comparison)), as_json=as_json)
 
 
 def _numbers(text: str | None) -> list[float] | None:
@@ -270,9 +266,8 @@ def _numbers(text: str | None) -> list[float] | None:
     try:
         return [float(part) for part in text.split(",")]
     except ValueError:
-        raise InputError(
-            f"--frequencies must be numbers separated by commas (got {text!r})"
-        ) from None
+        rule = "must be numbers separated by commas"
+        raise InputError(f"--frequencies {rule} (got {text!r})") from None
 
 
 def print_identification(result: Identification, output: Path | None) -> None:
@@ -296,24 +291,12 @@ def print_identification(result: Identification, output: Path | None) -> None:
 
 def _orders_table(orders: Sequence[OrderScore]) -> Table:
     rows = [
-        (
-            str(order.plays),
-            str(order.deadbands_a_side),
-            f"{order.rms_percent:.3f}",
-            f"{order.peak_percent:.2f}",
-        )
-        for order in orders
-    ]
+        (f"{each.plays}", f"{each.deadbands_a_side}",
+         f"{each.rms_percent:.3f}", f"{each.peak_percent:.2f}")
+        for each in orders
+    ]  # fmt: skip
     headings = ("plays", "deadbands per side", "rms %", "peak %")
     return table("errors on validation loops", headings, rows)
-
-
-def print_settings() -> None:
-    """Print all kinds of model and all settings of a fit."""
-    kinds = [(kind, each.title, each.found_by, each.data) for kind, each in CATALOGUE.items()]
-    print_rich(listing("", [("--model", "description", "identified by", "from"), *kinds]))
-    headings = ("--set", "default", "limits", "of", "description")
-    print_rich("", listing("", [headings, *setting_rows()]))
 
 
 def render_comparison(comparison: Comparison) -> RenderableType:

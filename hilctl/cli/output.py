@@ -11,9 +11,9 @@ import logging
 import os
 import sys
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from typing import Any, TextIO
+from typing import Any
 
 from hilctl.base.formatting import finite_json, printable
 
@@ -23,42 +23,29 @@ _READER_CLOSED = {errno.EPIPE, errno.EIO}
 
 
 class Verbosity:
-    """Amount of output.
-
-    Attributes:
-        quiet: Print only warnings, errors and ``--json`` output; no progress.
-        verbose: Print all log records with time and module, and the traceback of an error.
-    """
+    """Amount of output."""
 
     quiet = False
+    """Print only warnings, errors and ``--json`` output; no progress."""
     verbose = False
+    """Print all log records with time and module, and the traceback of an error."""
 
 
 def take_verbosity(words: list[str]) -> None:
-    """Remove both options from the arguments of a command and store them in :class:`Verbosity`.
-
-    Args:
-        words: The arguments, the program's name first; modified in place.
-    """
+    """Move both options from the arguments of a command (modified) to :class:`Verbosity`."""
     ends = words.index("--") if "--" in words else len(words)
     options = words[1:ends]
     Verbosity.quiet, Verbosity.verbose = QUIET in options, VERBOSE in options
-    kept = [word for word in options if word not in {QUIET, VERBOSE}]
-    words[1:ends] = kept
+    words[1:ends] = [word for word in options if word not in {QUIET, VERBOSE}]
 
 
 @contextmanager
 def output_as_requested(*, as_json: bool) -> Iterator[None]:
-    """Set up logging and standard output for the selected verbosity.
-
-    Args:
-        as_json: Whether standard output is JSON for a program; it is never suppressed.
-    """
+    """Set up logging and standard output for the selected verbosity; JSON is never suppressed."""
     handler = logging.StreamHandler()
     detailed = "%(asctime)s %(levelname)s %(name)s: %(message)s"
-    handler.setFormatter(
-        logging.Formatter(detailed if Verbosity.verbose else "hilctl: %(message)s")
-    )
+    form = detailed if Verbosity.verbose else "hilctl: %(message)s"
+    handler.setFormatter(logging.Formatter(form))
     logger = logging.getLogger("hilctl")
     logger.handlers[:] = [handler]
     if Verbosity.verbose:
@@ -81,8 +68,7 @@ def print_traceback() -> None:
 class StandardStream(io.TextIOWrapper):
     """A standard stream that never fails, so that a closed pipe cannot stop a run.
 
-    Attributes:
-        failure: The first error; everything written after it is lost.
+    After the first ``failure`` all output is lost.
     """
 
     def __init__(self, stream: io.TextIOWrapper) -> None:
@@ -121,11 +107,7 @@ class StandardStream(io.TextIOWrapper):
 
 
 class SafeStream(StandardStream):
-    """A standard stream that escapes control characters.
-
-    Attributes:
-        styled: The same stream without escaping, for styled tables.
-    """
+    """A standard stream that escapes control characters; ``styled`` does not, for tables."""
 
     def __init__(self, stream: io.TextIOWrapper) -> None:
         super().__init__(stream)
@@ -148,16 +130,14 @@ class SafeStream(StandardStream):
 def safe_streams(*, acts: bool = False) -> Iterator[None]:
     """Escape control characters on standard output and error.
 
-    Args:
-        acts: Whether the command moves an actuator; a write error then does not change its exit
-            code.
+    A write error does not change the exit code of a command that ``acts`` on an actuator.
 
     Raises:
         SystemExit: Standard output could not be written; the message is on standard error.
     """
     _open_missing()
     before = sys.stdout, sys.stderr
-    streams = _safe(sys.stdout), _safe(sys.stderr)
+    streams = [SafeStream(each) if isinstance(each, io.TextIOWrapper) else each for each in before]
     sys.stdout, sys.stderr = streams
     code: object = 0
     try:
@@ -193,10 +173,14 @@ def _open_missing() -> None:
             setattr(sys, name, os.fdopen(number, "w", encoding="utf-8", closefd=False))
 
 
-def _safe(stream: TextIO) -> TextIO:
-    return SafeStream(stream) if isinstance(stream, io.TextIOWrapper) else stream
-
-
 def print_json(value: dict[str, Any]) -> None:
     """Print one JSON object, with ``null`` for numbers that are not finite."""
     print(finite_json(value, indent=2))
+
+
+def print_result(values: dict[str, Any], show: Callable[[], object], *, as_json: bool) -> None:
+    """Print the values of a result as one JSON object, or ``show`` it."""
+    if as_json:
+        print_json(values)
+    else:
+        show()

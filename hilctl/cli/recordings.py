@@ -17,7 +17,7 @@ from hilctl.base.errors import InputError
 from hilctl.base.formatting import finite_json, printable, short_name
 from hilctl.cli.console import progress_bar
 from hilctl.cli.options import AsJson, FromTime, Overwrite, ToTime
-from hilctl.cli.output import print_json
+from hilctl.cli.output import print_json, print_result
 from hilctl.recording.metadata_keys import LABELS_FACT, RECORDINGS
 from hilctl.recording.recover import recover_recording
 from hilctl.run.control.client import finish_dead_runs
@@ -147,10 +147,8 @@ def export(
         _export_all(recording, output, as_json=as_json)
         return
     rows = api.export(recording, output, from_s=from_s, to_s=to_s, overwrite=overwrite)
-    if as_json:
-        print_json({"output": str(output), "rows": rows})
-    else:
-        print(f"{output}: {rows} samples")
+    values = {"output": str(output), "rows": rows}
+    print_result(values, lambda: print(f"{output}: {rows} samples"), as_json=as_json)
 
 
 def _export_all(folder: Path, output: Path, *, as_json: bool) -> None:
@@ -185,18 +183,13 @@ def recover(
     if (recording is None) == (dismissed is None) or (dismissed is not None and output is not None):
         raise InputError("specify either a RUN to recover or --dismiss NAME alone")
     if dismissed is not None:
-        removed = dismiss(dismissed)
-        if as_json:
-            print_json({"dismissed": str(removed)})
-        else:
-            print(f"{removed}: removed")
+        removed = str(dismiss(dismissed))
+        print_result({"dismissed": removed}, lambda: print(f"{removed}: removed"), as_json=as_json)
         return
     assert recording is not None
     finish_dead_runs()
     recovered = recover_recording(recording, output=output)
-    if as_json:
-        print_json(recovered.to_mapping())
-        return
-    print(f"{recovered.path}: {recovered.reason}")
+    text = f"{recovered.path}: {recovered.reason}"
     if recovered.original:
-        print(f"{recovered.samples} samples; original file: {recovered.original}")
+        text += f"\n{recovered.samples} samples; original file: {recovered.original}"
+    print_result(recovered.to_mapping(), lambda: print(text), as_json=as_json)

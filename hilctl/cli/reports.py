@@ -1,6 +1,5 @@
 """Commands that evaluate recordings: report, figures, replay."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -14,7 +13,7 @@ from hilctl.base.errors import InputError
 from hilctl.base.formatting import printable, quantity
 from hilctl.cli.console import console, print_rich, progress_bar, table
 from hilctl.cli.options import AsJson, FromTime, Overwrite, RecordingFile, ToTime
-from hilctl.cli.output import print_json
+from hilctl.cli.output import print_result
 from hilctl.cli.run import render_report
 from hilctl.run.control.client import finish_dead_runs
 from hilctl.studies.multi_run.collect import RunSeries
@@ -53,7 +52,12 @@ def report(
     if len(runs) > 1 or runs[0].is_dir():
         if from_s is not None or to_s is not None or before is not None:
             raise InputError("--from, --to and --before apply to the report of one recording only")
-        report_series(runs, html, model, overwrite=overwrite, as_json=as_json)
+        with progress_bar("read", quiet=as_json) as on_progress:
+            series = api.report_runs(
+                runs, html, model=model, overwrite=overwrite, on_progress=on_progress
+            )
+        values = series_mapping(series)
+        print_result(values, lambda: print_rich(render_series(series)), as_json=as_json)
         return
     if model is not None:
         raise InputError("--model applies to the report of several recordings only")
@@ -65,10 +69,8 @@ def report(
         summary = api.report_page(
             runs[0], html, before=before, from_s=from_s, to_s=to_s, overwrite=overwrite
         )
-    if as_json:
-        print_json(summary.to_mapping())
-    else:
-        print_rich(render_report(summary))
+    values = summary.to_mapping()
+    print_result(values, lambda: print_rich(render_report(summary)), as_json=as_json)
 
 
 def replay(
@@ -82,10 +84,7 @@ def replay(
     """Recompute commands from the recorded reference and compare them bit for bit."""
     finish_dead_runs()
     result = api.replay(recording, model)
-    if as_json:
-        print_json(result.to_mapping())
-    else:
-        print_replay(result, other=model)
+    print_result(result.to_mapping(), lambda: print_replay(result, other=model), as_json=as_json)
     if model is None and not result.identical:
         raise typer.Exit(1)
 
@@ -115,30 +114,9 @@ def figures(
             runs, folder, formats=formats, width=width, model=model, overwrite=overwrite,
             on_progress=on_progress, on_written=written.__setitem__,
         )  # fmt: skip
-    if as_json:
-        print_json({"figures": {str(path): caption for path, caption in written.items()}})
-        return
-    for path, caption in written.items():
-        print(f"{path}: {caption}")
-
-
-def report_series(
-    runs: Sequence[Path],
-    html: Path | None,
-    model: Path | None,
-    *,
-    overwrite: bool,
-    as_json: bool,
-) -> None:
-    """Report several runs, and write their page if requested."""
-    with progress_bar("read", quiet=as_json) as on_progress:
-        series = api.report_runs(
-            runs, html, model=model, overwrite=overwrite, on_progress=on_progress
-        )
-    if as_json:
-        print_json(series_mapping(series))
-    else:
-        print_rich(render_series(series))
+    captions = {str(path): caption for path, caption in written.items()}
+    lines = "\n".join(f"{path}: {caption}" for path, caption in captions.items())
+    print_result({"figures": captions}, lambda: print(lines), as_json=as_json)
 
 
 def render_series(series: RunSeries) -> Group:
@@ -154,31 +132,27 @@ def render_series(series: RunSeries) -> Group:
 
 def print_replay(result: ReplayResult, *, other: Path | None) -> None:
     """Print the differences between recomputed and recorded commands."""
-    terminal = console()
-    unit = result.command_unit
+    show, unit = console().print, result.command_unit
     if result.left_out_samples:
-        terminal.print(f"{result.left_out_samples} samples after a gap cannot be replayed")
+        show(f"{result.left_out_samples} samples after a gap cannot be replayed")
     if other is None and result.identical:
-        terminal.print(Text("identical", "green") + f": {result.samples} commands, bit for bit")
+        show(Text("identical", "green") + f": {result.samples} commands, bit for bit")
         return
     if other is None:
-        terminal.print(
-            Text("different", "red") + f": {result.differing_samples} of {result.samples} "
-            f"commands, the first at sample {result.first_difference}"
-        )
+        count = f"{result.differing_samples} of {result.samples} commands"
+        first = f"the first at sample {result.first_difference}"
+        show(Text("different", "red") + f": {count}, {first}")
     else:
-        terminal.print(
-            f"with {other} the command ranges from {result.command_min:.4g} to "
-            f"{result.command_max:.4g} {unit}, {result.limited_samples} samples limited"
-        )
+        span = f"{result.command_min:.4g} to {result.command_max:.4g} {unit}"
+        limited = f"{result.limited_samples} samples limited"
+        show(f"with {other} the command ranges from {span}, {limited}")
     if (error := result.predicted) is not None:
-        terminal.print(
-            f"predicted error: {quantity(error.peak_percent, '%')} peak, "
-            f"{quantity(error.rms_percent, '%')} rms; recorded error of the same samples: "
-            f"{quantity(error.recorded_peak_percent, '%')} peak, "
-            f"{quantity(error.recorded_rms_percent, '%')} rms"
-        )
-    terminal.print(
-        f"largest difference {result.largest_difference:.4g} {unit}, "
-        f"rms {result.rms_difference:.4g} {unit}"
-    )
+        predicted = _errors(error.peak_percent, error.rms_percent)
+        recorded = _errors(error.recorded_peak_percent, error.recorded_rms_percent)
+        show(f"predicted error: {predicted}; recorded error of the same samples: {recorded}")
+    largest, rms = result.largest_difference, result.rms_difference
+    show(f"largest difference {largest:.4g} {unit}, rms {rms:.4g} {unit}")
+
+
+def _errors(peak_percent: float | None, rms_percent: float | None) -> str:
+    return f"{quantity(peak_percent, '%')} peak, {quantity(rms_percent, '%')} rms"

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -26,7 +26,7 @@ from hilctl.base.events import adapted_text
 from hilctl.base.formatting import printable, unit_text
 from hilctl.cli.console import compile_progress, console, listing, progress_bar, table
 from hilctl.cli.options import AsJson, ExperimentFile, LabelTexts, Overwrite, Settings
-from hilctl.cli.output import print_json
+from hilctl.cli.output import print_json, print_result
 from hilctl.experiment.preflight import CheckedExperiment
 from hilctl.experiment.sections import label_settings
 from hilctl.live.server_process import served_beside
@@ -83,42 +83,26 @@ def run(
     require_linux()
     # With stty tostop, output of a background job would stop the supervisor.
     signal.signal(signal.SIGTTOU, signal.SIG_IGN)
-    with compile_progress():
-        _run(experiment, output, settings, overwrite, watch=watch, live=live, as_json=as_json)
-
-
-def _run(
-    experiment: Path,
-    output: Path | None,
-    settings: list[str],
-    overwrite: bool,
-    *,
-    watch: bool,
-    live: bool,
-    as_json: bool,
-) -> None:
     finish_dead_runs()
-    quiet = as_json or watch
-    with (
-        _served(requested=live) as addresses,
-        _watched(requested=watch),
-        run_progress(quiet=quiet, addresses=addresses) as on_progress,
-    ):
-        result = api.run(
-            experiment, output, settings=settings, overwrite=overwrite, on_progress=on_progress
-        )
-        if result.stop_signal:  # a second Ctrl-C must not suppress the result
-            signal.signal(result.stop_signal, signal.SIG_IGN)
-    report, unread = None, ""
-    try:
-        report = report_of(result, every=as_json)
-    except HilctlError as error:  # not exit code 2, because the actuator has moved
-        unread = f"hilctl: cannot report the recording: {error}"
-        print(unread, file=sys.stderr)
-    if as_json:
-        print_json(run_mapping(result, report))
-    else:
-        print_run(result, report)
+    report, unread = None, False
+    with compile_progress():
+        with ExitStack() as stack:
+            addresses = [stack.enter_context(served_beside())] if live else []
+            if watch:
+                stack.enter_context(_watched())
+            shown = run_progress(quiet=as_json or watch, addresses=addresses)
+            result = api.run(
+                experiment, output, settings=settings, overwrite=overwrite,
+                on_progress=stack.enter_context(shown),
+            )  # fmt: skip
+            if result.stop_signal:  # a second Ctrl-C must not suppress the result
+                signal.signal(result.stop_signal, signal.SIG_IGN)
+        try:
+            report = report_of(result, every=as_json)
+        except HilctlError as error:  # not exit code 2, because the actuator has moved
+            print(f"hilctl: cannot report the recording: {error}", file=sys.stderr)
+            unread = True
+    print_result(run_mapping(result, report), lambda: print_run(result, report), as_json=as_json)
     if result.code == "fault" or unread or not result.safe:
         raise typer.Exit(3)
     if result.stop_signal:
@@ -126,11 +110,8 @@ def _run(
 
 
 @contextmanager
-def _watched(*, requested: bool) -> Iterator[None]:
+def _watched() -> Iterator[None]:
     """Show the run from a subprocess, so that a blocked terminal cannot delay the run."""
-    if not requested:
-        yield
-        return
     with subprocess.Popen([sys.executable, "-Pm", "hilctl.cli.live", str(os.getpid())]) as process:
         try:
             yield
@@ -139,16 +120,6 @@ def _watched(*, requested: bool) -> Iterator[None]:
             with suppress(subprocess.TimeoutExpired):
                 process.wait(_VIEW_END_S)
             process.kill()
-
-
-@contextmanager
-def _served(*, requested: bool) -> Iterator[list[str]]:
-    """Serve the live page if requested; yield its addresses."""
-    if not requested:
-        yield []
-        return
-    with served_beside() as url:
-        yield [url]
 
 
 def _detach(
@@ -172,30 +143,22 @@ def _detach(
 def check(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson = False) -> None:
     """Check an experiment and show what it would do (nothing moves)."""
     checked = api.check(experiment, settings or [])
-    if as_json:
-        forecast = {"warnings": list(checked.warnings), **checked.forecast.to_mapping()}
-        print_json({"experiment": str(experiment), **forecast})
-    else:
-        print_forecast(checked)
+    forecast = {"warnings": list(checked.warnings), **checked.forecast.to_mapping()}
+    values = {"experiment": str(experiment), **forecast}
+    print_result(values, lambda: print_forecast(checked), as_json=as_json)
 
 
 def safe(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson = False) -> None:
     """Set a device to its safe value (refused while a run uses it)."""
     require_linux()
     put = put_safe(experiment, settings or [])
-    where = f"{put.device}: {describe(put.output, put.error)} ({put.value:g} {put.unit})"
-    if as_json:
-        print_json(put.to_mapping())
-    elif put.output == "confirmed":
-        print(where)
-    else:
-        print(where, file=sys.stderr)
-        if put.guardian_active:
-            print(
-                "The guardian of the last run is still retrying: see hilctl status.",
-                file=sys.stderr,
-            )
-    if put.output != "confirmed":
+    confirmed = put.output == "confirmed"
+    text = f"{put.device}: {describe(put.output, put.error)} ({put.value:g} {put.unit})"
+    if put.guardian_active and not confirmed:
+        text += "\nThe guardian of the last run is still retrying: see hilctl status."
+    stream = sys.stdout if confirmed else sys.stderr
+    print_result(put.to_mapping(), lambda: print(text, file=stream), as_json=as_json)
+    if not confirmed:
         raise typer.Exit(3)
 
 
@@ -203,14 +166,9 @@ def safe(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson 
 def run_progress(
     *, quiet: bool, addresses: Sequence[str] = ()
 ) -> Iterator[Callable[[RunProgress], None]]:
-    """Show a progress line on standard error: samples, error, command, late ticks.
+    """Yield a function that shows the newest samples on standard error, a few times per second.
 
-    Args:
-        quiet: Show nothing.
-        addresses: Addresses of live pages; printed with the first samples.
-
-    Yields:
-        Function that shows the newest samples, a few times per second.
+    The addresses of live pages are printed with the first samples.
     """
     pages, shown_s = list(addresses), 0.0
 
@@ -233,19 +191,12 @@ def _live_text(progress: RunProgress) -> str:
     error_um = displacement_um - newest.reference_um
     shown = progress.compensated and np.isfinite(error_um[-1])
     error = f"error {error_um[-1]:+7.2f} µm  " if shown else ""
-    return (
-        f"{error}x {displacement_um[-1]:+8.2f} µm  command {command[-1]:+7.3f}  "
-        f"late {progress.late_ticks}"
-    )
+    position = f"x {displacement_um[-1]:+8.2f} µm  command {command[-1]:+7.3f}"
+    return f"{error}{position}  late {progress.late_ticks}"
 
 
 def report_of(result: RunResult, *, every: bool) -> RunReport | None:
-    """Return the report of a finished run.
-
-    Args:
-        result: Result of the run.
-        every: Report runs of any length; otherwise none of a very long run.
-    """
+    """Return the report of a finished run; that of a very long one only if ``every`` is set."""
     wanted = every or 0 < result.samples <= _LARGEST_REPORTED
     return api.summarize(result.path) if wanted else None
 
@@ -279,8 +230,7 @@ def print_run(result: RunResult, report: RunReport | None) -> None:
 
 def render_report(report: RunReport) -> Group:
     """Return the tables of a report; the segments have their own if there are several."""
-    title = printable(report.name) or "run"
-    quality = _two_columns(title, quality_rows(report))
+    quality = _two_columns(printable(report.name) or "run", quality_rows(report))
     parts = [quality, _two_columns("", run_rows(report))]
     if len(report.segments) > 1:
         parts.append(_segments(report))
@@ -303,10 +253,8 @@ def _segments(report: RunReport) -> Table:
 
 
 def _minutes(report: RunReport) -> Table:
-    minutes = report.lateness_by_minute
-    title = "lateness per minute, µs"
-    if len(minutes) > _MOST_MINUTES:
-        # --json contains all of them.
+    minutes, title = report.lateness_by_minute, "lateness per minute, µs"
+    if len(minutes) > _MOST_MINUTES:  # --json contains all of them
         title += f": worst {_MOST_MINUTES} of {len(minutes)}"
         worst = sorted(minutes, key=lambda each: -each["max"])[:_MOST_MINUTES]
         minutes = sorted(worst, key=lambda each: each["minute"])
@@ -320,30 +268,27 @@ def _minutes(report: RunReport) -> Table:
 def print_forecast(checked: CheckedExperiment) -> None:
     """Print the forecast of a run and its warnings."""
     forecast, config = checked.forecast, checked.loaded.config
-    unit, reference_unit = forecast.command_unit, checked.reference.unit
-    limits = config.limits
+    unit, limits, info = forecast.command_unit, config.limits, checked.loaded.device.info
     low, high = limits.command_range
+    note = f" ({forecast.rate_note})" if forecast.rate_note else ""
+    before = f", after {forecast.before_s:g} s of conditioning and rest"
+    reference = f"{forecast.reference_min:.4g} to {forecast.reference_max:.4g}"
+    command = f"{forecast.command_min:.4g} to {forecast.command_max:.4g} {unit}"
     rows = {
         "experiment": config.name,
-        "device": checked.loaded.device.info.description,
+        "device": info.description,
         "samples": f"{forecast.samples} at {config.sample_rate_hz:g} Hz, {config.block} per tick",
-        "highest rate": f"{forecast.highest_rate_hz:.6g} Hz"
-        + (f" ({forecast.rate_note})" if forecast.rate_note else ""),
-        "duration": f"{forecast.duration_s:g} s"
-        + (
-            f", after {forecast.before_s:g} s of conditioning and rest" if forecast.before_s else ""
-        ),
-        "reference": f"{forecast.reference_min:.4g} to {forecast.reference_max:.4g} "
-        f"{unit_text(reference_unit)}",
-        "command": f"{forecast.command_min:.4g} to {forecast.command_max:.4g} {unit} "
-        f"(limits {low:g} to {high:g})",
+        "highest rate": f"{forecast.highest_rate_hz:.6g} Hz{note}",
+        "duration": f"{forecast.duration_s:g} s{before if forecast.before_s else ''}",
+        "reference": f"{reference} {unit_text(checked.reference.unit)}",
+        "command": f"{command} (limits {low:g} to {high:g})",
         "slew": f"{forecast.slew_per_s:.4g} {unit}/s (limit {limits.slew_per_s:g})",
         "recording": _recording(forecast.recording_mb),
     }
     if forecast.begins:
         rows["initial state"] = forecast.begins
-    if note := checked.loaded.device.info.safe_note:
-        rows["safe value"] = note
+    if info.safe_note:
+        rows["safe value"] = info.safe_note
     if forecast.heating_rms_a is not None:
         initial = f"initially {forecast.begins_rms_a or 0.0:.3g} A rms"
         maximum = f"{forecast.heating_rms_a:.4g} A rms (limit {limits.rms_current_a:g})"

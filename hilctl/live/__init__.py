@@ -13,11 +13,5 @@ foxglove.py      server for Foxglove and compatible applications
 server_process.py  server processes
 """
 
-PUBLIC = (
-    "frame_codec",
-    "run_reader",
-    "scope",
-    "server_process",
-    "traces",
-)
+PUBLIC = ("frame_codec", "run_reader", "scope", "server_process", "traces")
 """Modules that other rooms import; the others are private."""

@@ -27,22 +27,13 @@ MOST_PENDING = 64
 
 
 class Admission:
-    """Accepts or refuses requests.
-
-    Args:
-        token: 32 hexadecimal digits.
-    """
+    """Accepts or refuses requests; the token has 32 hexadecimal digits."""
 
     def __init__(self, token: str) -> None:
         self._token = token
 
     def refusal(self, headers: Headers, *, upgrade: bool) -> tuple[HTTPStatus, str] | None:
-        """Return the reason to refuse a request, or None.
-
-        Args:
-            headers: Headers of the request.
-            upgrade: Whether it requests the live connection rather than a file.
-        """
+        """Return the reason to refuse a request for a file or an upgrade, or None."""
         hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
         if len(hosts) != 1 or not _LOOPBACK.fullmatch(hosts[0].lower()):
             return HTTPStatus.MISDIRECTED_REQUEST, "the host is not loopback"
@@ -53,12 +44,9 @@ class Admission:
         return None
 
     def _has_token(self, headers: Headers) -> bool:
+        lines = headers.get_all("Sec-WebSocket-Protocol")
         try:
-            offered = [
-                name
-                for line in headers.get_all("Sec-WebSocket-Protocol")
-                for name in parse_subprotocol(line)
-            ]
+            offered = [name for line in lines for name in parse_subprotocol(line)]
         except InvalidHeader:
             return False
         tokens = [name[len(TOKEN_PREFIX) :] for name in offered if name.startswith(TOKEN_PREFIX)]
@@ -66,11 +54,7 @@ class Admission:
 
 
 class PendingConnections:
-    """Connections that are not authenticated yet; the oldest is aborted if there are too many.
-
-    Args:
-        most: Largest number of connections.
-    """
+    """Connections that are not authenticated yet; the oldest is aborted if there are too many."""
 
     def __init__(self, most: int = MOST_PENDING) -> None:
         self._most = most

@@ -52,28 +52,22 @@ MESSAGES = {
 }
 """Protobuf message of each topic, of package ``hilctl``."""
 DIAGNOSTICS = "/diagnostics"
-_PAIR = {"key": {"type": "string"}, "value": {"type": "string"}}
-_STATUS = {
-    "level": {"type": "integer"},
-    "name": {"type": "string"},
-    "message": {"type": "string"},
-    "hardware_id": {"type": "string"},
-    "values": {"type": "array", "items": {"type": "object", "properties": _PAIR}},
-}
-_HEADER = {
-    "stamp": {
-        "type": "object",
-        "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}},
-    },
-    "frame_id": {"type": "string"},
-}
-DIAGNOSTICS_SCHEMA: dict[str, Any] = {
+_TEXT, _WHOLE = {"type": "string"}, {"type": "integer"}
+
+
+def _object(**properties: Any) -> dict[str, Any]:
+    return {"type": "object", "properties": properties}
+
+
+def _list(items: dict[str, Any]) -> dict[str, Any]:
+    return {"type": "array", "items": items}
+
+
+_STAMP, _PAIRS = _object(sec=_WHOLE, nsec=_WHOLE), _list(_object(key=_TEXT, value=_TEXT))
+_STATUS = _object(level=_WHOLE, name=_TEXT, message=_TEXT, hardware_id=_TEXT, values=_PAIRS)
+DIAGNOSTICS_SCHEMA = {
     "title": "diagnostic_msgs/DiagnosticArray",  # name expected by the panels
-    "type": "object",
-    "properties": {
-        "header": {"type": "object", "properties": _HEADER},
-        "status": {"type": "array", "items": {"type": "object", "properties": _STATUS}},
-    },
+    **_object(header=_object(stamp=_STAMP, frame_id=_TEXT), status=_list(_STATUS)),
 }
 """Schema of ``/diagnostics``, which is JSON."""
 _WINDOW_S = 0.5  # buckets of 1/1200 s, similar to /scope of a recording
@@ -87,12 +81,7 @@ _COLUMNS = {
 
 
 class LiveTopics:
-    """The messages of one run.
-
-    Args:
-        feed: Reader of the run.
-        start_unix_ns: Unix time of sample 0.
-    """
+    """The messages of one run, with the Unix time of its sample 0."""
 
     def __init__(self, feed: RunReader, start_unix_ns: int) -> None:
         self._feed, about = feed, feed.description
@@ -110,12 +99,9 @@ class LiveTopics:
         self._rows = {fields[name].name: ROW[signal] for name, signal in _COLUMNS.items()}
 
     def scope(self, wanted: Collection[str] = SCOPE_TOPICS) -> Iterator[Encoded]:
-        """Yield the messages of completed buckets, the oldest first.
+        """Yield the messages of some topics for the completed buckets, the oldest first.
 
         Buckets that were overwritten before the call are omitted.
-
-        Args:
-            wanted: Topics with subscribers.
         """
         first, buckets = self._feed.scope.whole_buckets(_WINDOW_S, self._next_bucket)
         count, width = buckets.first.shape[1], self._feed.scope.bucket_samples(_WINDOW_S)
@@ -151,35 +137,26 @@ def _statuses(status: dict[str, Any]) -> list[dict[str, Any]]:
     late = {f"{name}_us": value for name, value in status["lateness_us"].items()}
     missed = {"missed_samples": status["missed_samples"]}
     state = " ".join(filter(None, (status["state"], status["reason"])))
-    return [
-        _part(run, "run", "error" if failed else "info", state, {key: status[key] for key in keys}),
-        _part(run, "figures", "info", "newest cycles", status["figures"]),
-        _part(run, "lateness", "info", "", {**late, "late_ticks": status["late_ticks"]}),
-        _part(run, "recording", "info", "", {**missed, **(status["disk"] or {})}),
-        *(
-            _part(
-                run,
-                f"limit: {gauge['name']}",
-                gauge["level"],
-                f"{100.0 * gauge['used']:.1f} % used",
-                {"value": gauge["value"], "limit": gauge["limit"], "unit": gauge["unit"]},
-            )
-            for gauge in status["gauges"]
-        ),
+    parts: list[tuple[str, str, str, dict[str, Any]]] = [
+        ("run", "error" if failed else "info", state, {key: status[key] for key in keys}),
+        ("figures", "info", "newest cycles", status["figures"]),
+        ("lateness", "info", "", {**late, "late_ticks": status["late_ticks"]}),
+        ("recording", "info", "", {**missed, **(status["disk"] or {})}),
     ]
-
-
-def _part(
-    run: str, name: str, level: str, message: str, values: dict[str, object]
-) -> dict[str, Any]:
-    pairs = [{"key": key, "value": _text(value)} for key, value in values.items()]
-    return {
-        "level": _LEVELS[level],
-        "name": name,
-        "message": message,
-        "hardware_id": run,
-        "values": pairs,
-    }
+    for gauge in status["gauges"]:
+        values = {key: gauge[key] for key in ("value", "limit", "unit")}
+        used = f"{100.0 * gauge['used']:.1f} % used"
+        parts.append((f"limit: {gauge['name']}", gauge["level"], used, values))
+    return [
+        {
+            "level": _LEVELS[level],
+            "name": name,
+            "message": message,
+            "hardware_id": run,
+            "values": [{"key": key, "value": _text(value)} for key, value in values.items()],
+        }
+        for name, level, message, values in parts
+    ]
 
 
 def _text(value: object) -> str:
@@ -189,32 +166,17 @@ def _text(value: object) -> str:
 
 
 class FoxgloveServer:
-    """Serves the active run.
-
-    Args:
-        chosen: See :class:`hilctl.live.run_reader.RunList`.
-        port: Port to listen on; 0 for any.
-        clock: Monotonic time in s.
-        unix_ns: Unix time in ns.
-        sleep: Sleeps for the given time in s.
+    """Serves the active run on a port, 0 for any.
 
     Raises:
         InputError: The library is not installed.
         RunError: The port is not available.
     """
 
-    def __init__(
-        self,
-        chosen: Callable[[list[RunFolder]], RunFolder | None],
-        port: int = PORT,
-        clock: Callable[[], float] = time.monotonic,
-        unix_ns: Callable[[], int] = time.time_ns,
-        sleep: Callable[[float], None] = time.sleep,
-    ) -> None:
+    def __init__(self, chosen: Callable[[list[RunFolder]], RunFolder | None], port: int) -> None:
         self._feeds = RunList(chosen)
         self._shown: RunReader | None = None
         self._topics: LiveTopics | None = None
-        self._clock, self._unix_ns, self._sleep = clock, unix_ns, sleep
         self._context, self._channels, self._server = _started(port)
 
     @property
@@ -222,49 +184,41 @@ class FoxgloveServer:
         """Address for the applications."""
         return f"ws://127.0.0.1:{self._server.port}"
 
-    def run(self, over: Callable[["FoxgloveServer"], bool]) -> None:
+    def run(self, over: Callable[[RunList], bool]) -> None:
         """Serve until ``over`` returns true."""
         number = 0
         try:
-            while not over(self):
-                began_s = self._clock()
+            while not over(self._feeds):
+                began_s = time.monotonic()
                 self._show(number)
                 number += 1
-                self._sleep(max(_FRAME_S / 4.0, began_s + _FRAME_S - self._clock()))
+                time.sleep(max(_FRAME_S / 4.0, began_s + _FRAME_S - time.monotonic()))
         finally:
             # In a thread: the library waits for clients that do not read.
             stopping = threading.Thread(target=self._server.stop, daemon=True)
             stopping.start()
             stopping.join(_STOP_S)
 
-    def feed(self, name: str | None) -> RunReader | None:
-        """Return the reader of a run, see :meth:`hilctl.live.run_reader.RunList.feed`."""
-        return self._feeds.feed(name)
-
     def _show(self, number: int) -> None:
-        now_s = self._clock()
+        now_s = time.monotonic()
         self._feeds.update(now_s)
-        feed = self.feed(None)
+        feed = self._feeds.feed(None)
         if feed is None:
             return
         feed.poll(now_s)
         if feed is not self._shown and feed.start_ns:
-            start_unix_ns = self._unix_ns() - round(now_s * 1e9) + feed.start_ns
+            start_unix_ns = time.time_ns() - round(now_s * 1e9) + feed.start_ns
             if self._shown is not None:
                 self._server.clear_session()  # discards client data of another run
             self._shown, self._topics = feed, LiveTopics(feed, start_unix_ns)
         if self._topics is None:
             return
         wanted = [topic for topic in SCOPE_TOPICS if self._channels[topic].has_sinks()]
-        for message in self._topics.scope(wanted):
-            self._log(message)
-        for message in self._topics.events():
-            self._log(message)
+        messages = [*self._topics.scope(wanted), *self._topics.events()]
         if number % _STATUS_FRAMES == 0:
-            self._log(self._topics.diagnostics(self._unix_ns()))
-
-    def _log(self, message: Encoded) -> None:
-        self._channels[message.topic].log(message.data, log_time=message.time_ns)
+            messages.append(self._topics.diagnostics(time.time_ns()))
+        for message in messages:
+            self._channels[message.topic].log(message.data, log_time=message.time_ns)
 
 
 @contextmanager
@@ -278,14 +232,7 @@ def _logging_as_before() -> Iterator[None]:
 
 
 def _started(port: int) -> tuple["Context", dict[str, "Channel"], "WebSocketServer"]:
-    """Return the channels by topic, the server, and the context that keeps them alive.
-
-    Without the context, the channels would be removed from the server.
-
-    Raises:
-        InputError: The library is not installed.
-        RunError: The port is not available.
-    """
+    """Return the context, without which the server loses its channels, the channels, the server."""
     try:
         import foxglove
     except ImportError:
@@ -307,12 +254,9 @@ def _started(port: int) -> tuple["Context", dict[str, "Channel"], "WebSocketServ
     try:
         # No capabilities: clients can only subscribe.
         server = foxglove.start_server(
-            name="hilctl",
-            host="127.0.0.1",
-            port=port,
-            context=context,
-            message_backlog_size=_BACKLOG,
-        )
+            name="hilctl", host="127.0.0.1", port=port,
+            context=context, message_backlog_size=_BACKLOG,
+        )  # fmt: skip
     except RuntimeError as error:
         raise RunError(f"port {port} of 127.0.0.1: {error}") from None
     return context, channels, server

@@ -29,27 +29,20 @@ def nearest_window_s(wanted_s: float) -> float:
 
 
 def frame_of(scope: Scope, mode: ScopeMode, window_s: float) -> bytes:
-    """Return the current frame of a page.
+    """Return the current frame of a page; without a cycle, mode ``cycle`` rolls.
 
-    Args:
-        scope: The windows of a run.
-        mode: ``cycle`` is triggered by the waveform's cycle; without a cycle it rolls.
-        window_s: Length of a rolling window, one of :data:`hilctl.live.scope.WINDOWS_S`.
+    The length of a rolling window is one of :data:`hilctl.live.scope.WINDOWS_S`.
     """
-    window = scope.triggered() if mode == "cycle" else None
-    shown: ScopeMode = "roll" if window is None else "cycle"
-    if window is None:
-        window = scope.rolling(window_s)
-    loops = scope.loops()
-    header = json.dumps(
-        {
-            "mode": shown,
-            "n": window.t_s.size,
-            "signals": len(SIGNALS),
-            "loop": loops.shape[1],
-            "cycle": scope.points_a_cycle(),
-        }
-    ).encode()
+    cycles = scope.triggered() if mode == "cycle" else None
+    window, loops = cycles or scope.rolling(window_s), scope.loops()
+    facts = {
+        "mode": "cycle" if cycles else "roll",
+        "n": window.t_s.size,
+        "signals": len(SIGNALS),
+        "loop": loops.shape[1],
+        "cycle": scope.points_a_cycle(),
+    }
+    header = json.dumps(facts).encode()
     header += b" " * (-len(header) % 4)
     parts = (window.t_s, window.buckets.low, window.buckets.high, loops)
     values = np.concatenate([np.ravel(part) for part in parts]).astype("<f4")
@@ -84,12 +77,8 @@ def frames_of(
 ) -> Iterator[RunFrame]:
     """Yield frames of a run until it ends; the last follows its end.
 
-    Args:
-        feed: Reader of the run.
-        every_s: Interval of the frames; a late frame delays the following ones.
-        window_s: Duration that each frame shows; the nearest available window is used.
-        clock: Monotonic time in s.
-        sleep: Sleeps for the given time in s.
+    A late frame delays the following ones. The available window that is nearest to ``window_s`` is
+    used. The clock is monotonic time in s.
     """
     window_s, seen = nearest_window_s(window_s), 0
     while True:

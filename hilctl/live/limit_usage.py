@@ -13,6 +13,7 @@ from hilctl.run.metadata import LimitBounds, RunDescription
 WARNING_USED, ERROR_USED = 0.8, 0.95
 """Used fractions of a limit above which a gauge is a warning or an error."""
 _HOLD_S = 1.0
+_HELD = ("command", "slew", "displacement", "tracking error", "measured - command")
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,11 +21,8 @@ class Gauge:
     """Use of one limit.
 
     Attributes:
-        name: Name to display.
         used: Fraction of the limit in use; more than 1 if it is exceeded.
-        value: Current value.
-        limit: Limit of the value.
-        unit: Unit of both.
+        unit: Unit of ``value`` and ``limit``.
     """
 
     name: str
@@ -42,11 +40,7 @@ class Gauge:
 
 
 class Headroom:
-    """The limits of one run; each gauge holds the peak of the last second.
-
-    Args:
-        description: Description of the run.
-    """
+    """The limits of one run; each gauge holds the peak of the last second."""
 
     def __init__(self, description: RunDescription) -> None:
         self._limits: LimitBounds = description.limits
@@ -54,44 +48,29 @@ class Headroom:
         self._heat_a2 = self._limits.heat_a2
         self._before: F64 | None = None
         self._next_sample = 0
-        self._held: dict[str, list[tuple[int, float, float]]] = {}
+        self._held: dict[str, list[tuple[int, Gauge]]] = {name: [] for name in _HELD}
 
     def add(self, traces: Traces) -> None:
         """Add the next samples."""
         if not traces.index.size:
             return
-        command = traces.values[ROW["command"]]
-        displacement_um = traces.values[ROW["displacement"]]
-        measured = traces.values[ROW["measured"]]
-        limits = self._limits
+        command, measured = traces.values[ROW["command"]], traces.values[ROW["measured"]]
+        limits, unit = self._limits, self._unit
         self._next_sample = int(traces.index[-1]) + 1
-        self._range("command", command, limits.command)
-        self._most("slew", self._slews_per_s(traces.index, command), limits.slew_per_s)
-        self._range("displacement", displacement_um, limits.stroke_um)
-        self._most("tracking error", traces.values[ROW["error"]], limits.tracking_error_um)
-        self._most("measured - command", measured - command, limits.measured_deviation)
+        self._range("command", command, limits.command, unit)
+        slews_per_s = self._slews_per_s(traces.index, command)
+        self._most("slew", slews_per_s, limits.slew_per_s, f"{unit}/s")
+        self._range("displacement", traces.values[ROW["displacement"]], limits.stroke_um, "um")
+        self._most("tracking error", traces.values[ROW["error"]], limits.tracking_error_um, "um")
+        self._most("measured - command", measured - command, limits.measured_deviation, unit)
         if limits.rms_current_a is not None:
             self._warm(np.fmax(np.abs(command), np.abs(measured)))
 
     def gauges(self, late_s: float) -> list[Gauge]:
-        """Return the gauges of the run.
-
-        Args:
-            late_s: Largest wake-up lateness of the newest ticks.
-        """
-        limits, unit = self._limits, self._unit
-        found = []
-        bounds = {
-            "command": (max(map(abs, limits.command)), unit),
-            "slew": (limits.slew_per_s, f"{unit}/s"),
-            "displacement": (max(map(abs, limits.stroke_um)), "um"),
-            "tracking error": (limits.tracking_error_um, "um"),
-            "measured - command": (limits.measured_deviation, unit),
-        }
-        for name, (limit, limit_unit) in bounds.items():
-            if limit is not None and (held := self._held.get(name)):
-                _, used, value = max(held, key=lambda each: each[1])
-                found.append(Gauge(name, used, value, limit, limit_unit))
+        """Return the gauges; ``late_s`` is the largest wake-up lateness of the newest ticks."""
+        limits = self._limits
+        held = [[gauge for _, gauge in each] for each in self._held.values()]
+        found = [max(each, key=lambda gauge: gauge.used) for each in held if each]
         if limits.rms_current_a is not None:
             rms_a = math.sqrt(self._heat_a2)
             used = rms_a / limits.rms_current_a
@@ -99,25 +78,29 @@ class Headroom:
         found.append(Gauge("late tick", late_s / limits.late_s, late_s, limits.late_s, "s"))
         return found
 
-    def _range(self, name: str, values: F64, bounds: list[float]) -> None:
+    def _range(self, name: str, values: F64, bounds: list[float], unit: str) -> None:
         values = values[np.isfinite(values)]
         if values.size:
             middle, half = (bounds[0] + bounds[1]) / 2.0, (bounds[1] - bounds[0]) / 2.0
-            at = int(np.abs(values - middle).argmax())
-            self._hold(name, abs(float(values[at]) - middle) / half, float(values[at]))
+            value = float(values[np.abs(values - middle).argmax()])
+            limit = max(map(abs, bounds))
+            self._hold(Gauge(name, abs(value - middle) / half, value, limit, unit))
 
-    def _most(self, name: str, values: F64, limit: float | None) -> None:
+    def _most(self, name: str, values: F64, limit: float | None, unit: str) -> None:
         values = values[np.isfinite(values)]
         if limit and values.size:
             most = float(np.abs(values).max())
-            self._hold(name, most / limit, most)
+            self._hold(Gauge(name, most / limit, most, limit, unit))
 
-    def _hold(self, name: str, used: float, value: float) -> None:
-        now, kept = self._next_sample, self._held.get(name, [])
-        oldest = now - _HOLD_S * self._rate_hz
+    def _hold(self, gauge: Gauge) -> None:
+        oldest = self._next_sample - _HOLD_S * self._rate_hz
         # A value smaller than a later one can never become the maximum.
-        kept = [each for each in kept if each[0] > oldest and each[1] > used]
-        self._held[name] = [*kept, (now, used, value)]
+        kept = [
+            (at, each)
+            for at, each in self._held[gauge.name]
+            if at > oldest and each.used > gauge.used
+        ]
+        self._held[gauge.name] = [*kept, (self._next_sample, gauge)]
 
     def _slews_per_s(self, index: I64, command: F64) -> F64:
         newest = np.array((index[-1], command[-1]))

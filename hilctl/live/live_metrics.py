@@ -36,12 +36,7 @@ _TICKS = 20_000
 
 
 class RunningFigures:
-    """Running metrics of one run.
-
-    Args:
-        sample_rate_hz: Samples per second.
-        loop_input: Signal on the abscissa of the loop.
-    """
+    """Running metrics of one run; ``loop_input`` is the signal on the abscissa of its loop."""
 
     def __init__(self, sample_rate_hz: float, loop_input: str) -> None:
         self._rate_hz, self._input = sample_rate_hz, ROW[loop_input]
@@ -51,12 +46,7 @@ class RunningFigures:
         """Metrics of the last complete group of cycles by name with unit."""
 
     def add(self, traces: Traces, segment: Segment | None) -> None:
-        """Add the next samples.
-
-        Args:
-            traces: The samples.
-            segment: Segment of the newest sample.
-        """
+        """Add the next samples; ``segment`` is that of the newest."""
         if segment is None:
             return
         if segment is not self._segment:
@@ -84,13 +74,7 @@ class RunningFigures:
 
 
 class _Group:
-    """Consecutive cycles.
-
-    Args:
-        start: First sample.
-        stop: Sample after the last.
-        segment: Segment of the cycles.
-    """
+    """Consecutive cycles of a segment: the samples in [start, stop)."""
 
     def __init__(self, start: int, stop: int, segment: Segment) -> None:
         self.start, self.stop = start, stop
@@ -104,7 +88,8 @@ class _Group:
 
     def add(self, traces: Traces, loop_input: int) -> None:
         """Add samples; one row is the input of the loop."""
-        traces = _trusted(traces)
+        kept = (traces.flags & _LEFT_OUT) == 0
+        traces = Traces(traces.index[kept], traces.values[:, kept], traces.flags[kept])
         if not traces.index.size:
             return
         displacement_um, error_um = traces.values[ROW["displacement"]], traces.values[ROW["error"]]
@@ -138,7 +123,6 @@ class _Group:
         return found
 
     def _of_cycle(self, folding: CycleAverager, noise_um: float | None) -> FigureValues:
-        """Return the metrics of the mean cycle."""
         cycle = folding.fold()
         if not cycle.whole:
             return {}
@@ -151,28 +135,14 @@ class _Group:
         if noise_um is not None:
             found["noise_floor_percent"] = noise_floor_percent(noise_um, cycle.counts, stroke_um)
         if self._errors:
-            found |= _errors_percent(output - loop_input, stroke_um)
+            error_um = output - loop_input
+            found["peak_error_percent"] = percent(peak(error_um), stroke_um)
+            found["rms_error_percent"] = percent(rms(error_um), stroke_um)
         return found
 
 
-def _errors_percent(error_um: F64, stroke_um: float) -> FigureValues:
-    return {
-        "peak_error_percent": percent(peak(error_um), stroke_um),
-        "rms_error_percent": percent(rms(error_um), stroke_um),
-    }
-
-
-def _trusted(traces: Traces) -> Traces:
-    kept = (traces.flags & _LEFT_OUT) == 0
-    return Traces(traces.index[kept], traces.values[:, kept], traces.flags[kept])
-
-
 class LiveErrorSpectrum:
-    """Amplitude spectrum of the newest samples of the error.
-
-    Args:
-        sample_rate_hz: Samples per second.
-    """
+    """Amplitude spectrum of the newest samples of the error."""
 
     def __init__(self, sample_rate_hz: float) -> None:
         self._rate_hz = sample_rate_hz

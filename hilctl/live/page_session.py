@@ -25,13 +25,7 @@ _RATE_HZ, _BURST = 20.0, 40.0
 
 
 class PageView(StrictModel):
-    """Selection of a page.
-
-    Attributes:
-        run: Name of the run; None for the default run of the server.
-        mode: Mode of its scope.
-        window_s: Length of a rolling window.
-    """
+    """Run (None for the server's default), mode and rolling window that a page shows."""
 
     run: str | None = None
     mode: ScopeMode = "cycle"
@@ -39,14 +33,10 @@ class PageView(StrictModel):
 
 
 class PageMessage(StrictModel):
-    """Message of a page.
+    """Message of a page; its number is returned with the answer.
 
-    Attributes:
-        id: Number that is returned with the answer.
-        ask: ``view`` changes the selection, ``stop`` stops the run, ``report`` makes the report of
-            its recording, ``run`` sends a request to the run's control socket.
-        view: New selection, a :class:`PageView`.
-        request: Request to the run.
+    ``view`` changes the :class:`PageView`, ``stop`` stops the run, ``report`` makes the report of
+    its recording, ``run`` sends a request to the run's control socket.
     """
 
     id: int
@@ -61,13 +51,7 @@ def answer_text(message: PageMessage, **values: Any) -> str:
 
 
 class RateLimiter:
-    """Rate limiter with a burst.
-
-    Args:
-        rate_hz: Number per second in the long run.
-        burst: Largest number at one time.
-        clock: Monotonic time in s.
-    """
+    """Rate limiter: ``rate_hz`` in the long run, at most ``burst`` at one time."""
 
     def __init__(self, rate_hz: float, burst: float, clock: Callable[[], float]) -> None:
         self._rate_hz, self._burst, self._clock = rate_hz, burst, clock
@@ -85,16 +69,7 @@ class RateLimiter:
 
 
 class PageSession:
-    """Session of an authenticated page.
-
-    Args:
-        connection: Connection to the page.
-        answer: Executes a request and returns the answer to send.
-        clock: Monotonic time in s.
-
-    Attributes:
-        view: Current selection.
-    """
+    """Session of an authenticated page; ``answer`` executes a request and returns its answer."""
 
     def __init__(
         self,

@@ -8,20 +8,14 @@ import math
 import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from hilctl.base.errors import RunError
 from hilctl.base.events import Event
 from hilctl.live.limit_usage import Gauge, Headroom
-from hilctl.live.live_metrics import (
-    EDGES_US,
-    FigureValues,
-    LatenessCounts,
-    LiveErrorSpectrum,
-    RunningFigures,
-)
+from hilctl.live.live_metrics import EDGES_US, LatenessCounts, LiveErrorSpectrum, RunningFigures
 from hilctl.live.scope import Scope
 from hilctl.live.traces import Traces, traces_of
 from hilctl.run.control.client import active_runs
@@ -35,29 +29,10 @@ _LOOK_S = 0.5  # interval of checks of the run's locks and the disk
 _SEARCH_S = 1.0  # interval of searches for runs
 
 
-@dataclass(frozen=True, slots=True)
-class DiskRoom:
-    """Free space on the disk of the recording.
-
-    Attributes:
-        free_bytes: Free space.
-        recorded_bytes: Size of the recording.
-    """
-
-    free_bytes: int
-    recorded_bytes: int
-
-
 class RunReader:
     """Reader of one active run.
 
-    Args:
-        folder: Folder of the run.
-
     Attributes:
-        description: Description of the run.
-        scope: Its windows and loops.
-        spectrum: Spectrum of its error.
         events: Its newest events, the oldest first.
         missed: Number of samples not read: dropped by the run, or overwritten too early.
         ended: Whether the run has ended and no data can follow.
@@ -83,7 +58,7 @@ class RunReader:
         self._events_seen = 0
         self.missed = 0
         self.ended = False
-        self._disk: DiskRoom | None = None
+        self._disk: dict[str, int] | None = None
         self._next_block, self._next_event = max(0, self._page.observe(PageField.HEAD) - 1), 0
         self._next_sample, self._next_note = -1, 0
         self._looked_s = -math.inf
@@ -94,14 +69,7 @@ class RunReader:
         return "reference" if self.description.waveform_unit == "um" else "command"
 
     def poll(self, now_s: float) -> bool:
-        """Read new data.
-
-        Args:
-            now_s: Monotonic time.
-
-        Returns:
-            Whether there were samples.
-        """
+        """Read new data; return whether there were samples."""
         if now_s - self._looked_s >= _LOOK_S:
             self._looked_s = now_s
             # Checked first: an ended run writes no more data after this.
@@ -160,11 +128,6 @@ class RunReader:
         return Phase(self._page.get(PageField.PHASE)).name.lower()
 
     @property
-    def figures(self) -> FigureValues:
-        """Running metrics by name with unit; empty before the first complete cycle."""
-        return self._figures.newest
-
-    @property
     def inverse(self) -> str | None:
         """State of the inverse after the last change, ``in`` or ``out``; None without one."""
         if not self.description.compensator:
@@ -175,7 +138,7 @@ class RunReader:
     def status(self) -> dict[str, Any]:
         """Return everything except the traces, as plain values for JSON."""
         page, rate_hz = self._page, self.description.sample_rate_hz
-        outcome = page.outcome()
+        outcome, tuned = page.outcome(), page.get(PageField.TUNE_WANTED)
         late = self._lateness.percentiles_us()
         ring_used = (page.get(PageField.HEAD) - page.get(PageField.TAIL)) / self._ring.slots
         gauges = self._headroom.gauges(late.get("max", 0.0) * 1e-6)
@@ -190,11 +153,9 @@ class RunReader:
             "t_s": max(self._next_sample, 0) / rate_hz,
             "total_s": (self.description.samples + max(self._waveform_at, 0)) / rate_hz,
             "segment": self.scope.segment.label if self.scope.segment else "",
-            "figures": self.figures,
-            "gain": page.get_float(PageField.TUNE_GAIN) if page.get(PageField.TUNE_WANTED) else 1.0,
-            "offset": page.get_float(PageField.TUNE_OFFSET)
-            if page.get(PageField.TUNE_WANTED)
-            else 0.0,
+            "figures": self._figures.newest,
+            "gain": page.get_float(PageField.TUNE_GAIN) if tuned else 1.0,
+            "offset": page.get_float(PageField.TUNE_OFFSET) if tuned else 0.0,
             "inverse": self.inverse,
             "missed_samples": self.missed,
             "late_ticks": page.get(PageField.LATE_TICKS),
@@ -203,28 +164,23 @@ class RunReader:
             "lateness_counts": self._lateness.counts.tolist(),
             "gauges": [{**asdict(each), "level": each.level} for each in gauges],
             "ring_used": ring_used,
-            "disk": asdict(self._disk) if self._disk else None,
+            "disk": self._disk,
             "events": [_plain_event(each, rate_hz) for each in self.events],
         }
 
 
 def _plain_event(event: Event, rate_hz: float) -> dict[str, Any]:
-    return {
-        "t_s": event.sample / rate_hz,
-        "level": event.level,
-        "code": event.code,
-        "text": event.text,
-        "values": dict(event.values),
-    }
+    fields = {name: getattr(event, name) for name in ("level", "code", "text")}
+    return {"t_s": event.sample / rate_hz, **fields, "values": dict(event.values)}
 
 
-def _disk_room(recording: Path) -> DiskRoom | None:
-    """Return the disk space for a recording; None if it is unknown."""
+def _disk_room(recording: Path) -> dict[str, int] | None:
+    """Return free space and size of a recording; None if they are unknown."""
     try:
-        disk = os.statvfs(recording.parent)
-        return DiskRoom(disk.f_bavail * disk.f_frsize, recording.stat().st_size)
+        disk, size = os.statvfs(recording.parent), recording.stat().st_size
     except OSError:
         return None
+    return {"free_bytes": disk.f_bavail * disk.f_frsize, "recorded_bytes": size}
 
 
 class RunList:
@@ -232,9 +188,6 @@ class RunList:
 
     Args:
         chosen: Returns the run to show if none is named; None if there is none.
-
-    Attributes:
-        runs: All active runs.
     """
 
     def __init__(self, chosen: Callable[[list[RunFolder]], RunFolder | None]) -> None:
@@ -251,16 +204,13 @@ class RunList:
     def update(self, now_s: float, shown: Iterable[str | None] = ()) -> None:
         """Update the list of active runs once per second; remove ended runs that are not shown.
 
-        Args:
-            now_s: Monotonic time.
-            shown: Names of the runs that are shown; None for the main one.
+        In ``shown``, None is the main run.
         """
         if now_s - self._looked_s < _SEARCH_S:
             return
         self._looked_s, self.runs = now_s, active_runs()
-        kept = {self._main} | {
-            feed.folder.card.name for name in shown if (feed := self.feed(name)) is not None
-        }
+        feeds = [self.feed(name) for name in shown]
+        kept = {self._main, *(feed.folder.card.name for feed in feeds if feed is not None)}
         self._feeds = {
             name: feed for name, feed in self._feeds.items() if not feed.ended or name in kept
         }

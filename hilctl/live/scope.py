@@ -10,10 +10,20 @@ from hilctl.base.segments import Segment
 from hilctl.base.types import F64, I64
 from hilctl.live.traces import ROW, SIGNALS, Traces
 
+WINDOWS_S = (0.02, 0.1, 0.5, 2.0, 10.0, 60.0, 600.0)
+"""Lengths of rolling windows in s."""
+BUCKETS = 600
+"""Buckets per window."""
+CYCLES = 6
+"""Stored cycles of the loop."""
+_CYCLE_BUCKETS = 300
+_LONG_S = 1.0
+_LOOP_S = 2.0
+
 
 @dataclass(frozen=True, slots=True)
 class Buckets:
-    """Consecutive buckets.
+    """Consecutive buckets of samples.
 
     Attributes:
         low: Minimum of each signal, float64[len(SIGNALS), n]; NaN if a bucket has no sample.
@@ -41,9 +51,7 @@ class MinMaxTrace:
         self.origin, self.width, self.keep = origin, width, keep
         self.newest = -1
         """Number of the newest bucket with a sample; -1 before the first."""
-        shape = (len(SIGNALS), keep)
-        self._low, self._high = np.full(shape, np.nan), np.full(shape, np.nan)
-        self._first = np.full(shape, np.nan)
+        self._stored = np.full((3, len(SIGNALS), keep), np.nan)  # low, high, first
 
     def add(self, traces: Traces) -> None:
         """Add the next samples; ignore those before the origin or the newest bucket."""
@@ -56,47 +64,23 @@ class MinMaxTrace:
         numbers, first = numbers[starts], values[:, starts]
         low = np.fmin.reduceat(values, starts, axis=1)
         high = np.fmax.reduceat(values, starts, axis=1)
-        self._clear(int(numbers[-1]))
         if numbers[0] == self.newest:  # it already has samples
-            slot = self.newest % self.keep
-            low[:, 0] = np.fmin(low[:, 0], self._low[:, slot])
-            high[:, 0] = np.fmax(high[:, 0], self._high[:, slot])
-            first[:, 0] = self._first[:, slot]
+            before = self._stored[:, :, self.newest % self.keep]
+            low[:, 0] = np.fmin(low[:, 0], before[0])
+            high[:, 0] = np.fmax(high[:, 0], before[1])
+            first[:, 0] = before[2]
+        newest = int(numbers[-1])
+        passed = np.arange(max(self.newest + 1, newest - self.keep + 1), newest + 1)
+        self._stored[:, :, passed % self.keep] = np.nan
         slots = numbers[-self.keep :] % self.keep
-        self._low[:, slots] = low[:, -self.keep :]
-        self._high[:, slots] = high[:, -self.keep :]
-        self._first[:, slots] = first[:, -self.keep :]
-        self.newest = int(numbers[-1])
-
-    def _clear(self, newest: int) -> None:
-        """Clear the buckets after the newest, up to the new newest."""
-        numbers = np.arange(max(self.newest + 1, newest - self.keep + 1), newest + 1)
-        slots = numbers % self.keep
-        for values in (self._low, self._high, self._first):
-            values[:, slots] = np.nan
+        self._stored[:, :, slots] = np.stack((low, high, first))[:, :, -self.keep :]
+        self.newest = newest
 
     def window(self, begin: int, count: int) -> Buckets:
         """Return buckets from number ``begin``; those that are not stored are empty."""
         numbers: I64 = np.arange(begin, begin + count)
         there = (numbers >= 0) & (numbers <= self.newest) & (numbers > self.newest - self.keep)
-        slots = numbers % self.keep
-        return Buckets(
-            *(
-                np.where(there, values[:, slots], np.nan)
-                for values in (self._low, self._high, self._first)
-            )
-        )
-
-
-WINDOWS_S = (0.02, 0.1, 0.5, 2.0, 10.0, 60.0, 600.0)
-"""Lengths of rolling windows in s."""
-BUCKETS = 600
-"""Buckets per window."""
-CYCLES = 6
-"""Stored cycles of the loop."""
-_CYCLE_BUCKETS = 300
-_LONG_S = 1.0
-_LOOP_S = 2.0
+        return Buckets(*np.where(there, self._stored[:, :, numbers % self.keep], np.nan))
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,6 +116,7 @@ class Scope:
             for window_s in WINDOWS_S
         }
         self._cycles: MinMaxTrace | None = None
+        self._cycle_buckets: float = _CYCLE_BUCKETS
         self.segment: Segment | None = None
         """Segment of the newest sample of the waveform."""
 
@@ -140,9 +125,10 @@ class Scope:
         for trace in self._rolling.values():
             trace.add(traces)
         running = traces.index[(traces.flags & NO_WAVEFORM) == 0]
-        if running.size:
-            self._follow(int(running[-1]))
-        if self._cycles is not None and running.size:
+        if not running.size:
+            return
+        self._follow(int(running[-1]))
+        if self._cycles is not None:
             # Not the soft end: the last steady cycle stays visible.
             stop = running[-1] + 1 if self.segment is None else self.segment.steady_stop
             self._cycles.add(traces.part(running[0], min(running[-1] + 1, stop)))
@@ -152,12 +138,11 @@ class Scope:
         if here is None or here is self.segment:
             return
         self.segment = here
-        if here.period > 0.0:
-            width = max(1.0, here.period / _CYCLE_BUCKETS)
-        else:
-            width = max(1.0, _LOOP_S * self._rate_hz / _CYCLE_BUCKETS)
-        cycle = here.period / width if here.period > 0.0 else _CYCLE_BUCKETS
-        self._cycles = MinMaxTrace(here.start, width, math.ceil((CYCLES + 2) * cycle))
+        samples = here.period if here.period > 0.0 else _LOOP_S * self._rate_hz
+        width = max(1.0, samples / _CYCLE_BUCKETS)
+        self._cycle_buckets = here.period / width if here.period > 0.0 else _CYCLE_BUCKETS
+        keep = math.ceil((CYCLES + 2) * self._cycle_buckets)
+        self._cycles = MinMaxTrace(here.start, width, keep)
 
     def rolling(self, window_s: float) -> ScopeWindow:
         """Return the newest ``window_s``, one of :data:`WINDOWS_S`."""
@@ -167,11 +152,7 @@ class Scope:
         return ScopeWindow(t_s.astype(np.float64), trace.window(trace.newest - count + 1, count))
 
     def whole_buckets(self, window_s: float, since: int) -> tuple[int, Buckets]:
-        """Return the completed buckets of a rolling window.
-
-        Args:
-            window_s: One of :data:`WINDOWS_S`; a bucket is one of its :data:`BUCKETS` parts.
-            since: Number of the first requested bucket.
+        """Return the completed buckets of a rolling window from number ``since``.
 
         Returns:
             Number of the first bucket that is still stored, and the buckets from there on.
@@ -184,41 +165,33 @@ class Scope:
         """Return the number of samples per bucket of a rolling window."""
         return int(self._rolling[window_s].width)
 
-    def triggered(self, cycles: int = 2) -> ScopeWindow | None:
-        """Return the newest complete cycles of the waveform; None before the first.
+    def triggered(self) -> ScopeWindow | None:
+        """Return the two newest complete cycles of the waveform; None before the first two.
 
         A long cycle is shown while it is recorded.
         """
-        trace, segment = self._cycles, self.segment
+        trace, segment, cycle = self._cycles, self.segment, self._cycle_buckets
         if trace is None or segment is None or segment.period <= 0.0:
             return None
-        cycle = segment.period / trace.width
         done = (trace.newest + 1) / cycle
         live = segment.period > _LONG_S * self._rate_hz
-        begin = math.floor(done) - (cycles - 1 if live else cycles)
+        begin = math.floor(done) - (1 if live else 2)
         if begin < 0:
             return None
         first = math.ceil(begin * cycle - 1e-9)
-        count = math.ceil(cycles * cycle)
+        count = math.ceil(2.0 * cycle)
         t_s = (np.arange(first, first + count) - begin * cycle) * (trace.width / self._rate_hz)
         return ScopeWindow(t_s.astype(np.float64), trace.window(first, count))
 
     def loops(self) -> F64:
-        """Return the newest loops: float64[2, n], oldest first.
-
-        Input and displacement of the same sample.
-        """
-        trace, segment = self._cycles, self.segment
-        if trace is None or segment is None:
+        """Return input and displacement of the newest loops: float64[2, n], oldest first."""
+        trace = self._cycles
+        if trace is None:
             return np.empty((2, 0))
-        cycle = segment.period / trace.width if segment.period > 0.0 else _CYCLE_BUCKETS
-        count = min(math.ceil(CYCLES * cycle), trace.newest + 1)
+        count = min(math.ceil(CYCLES * self._cycle_buckets), trace.newest + 1)
         first = trace.window(trace.newest - count + 1, count).first
         return first[[self._input, ROW["displacement"]]]
 
     def points_a_cycle(self) -> int:
         """Return the number of points of :meth:`loops` per cycle."""
-        segment = self.segment
-        if segment is None or segment.period <= 0.0 or self._cycles is None:
-            return _CYCLE_BUCKETS
-        return max(1, round(segment.period / self._cycles.width))
+        return max(1, round(self._cycle_buckets))

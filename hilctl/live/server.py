@@ -58,6 +58,11 @@ _HEADERS = {
     "Cache-Control": "no-store",
     "Connection": "close",
 }
+_FRAME_S = 1.0 / 30.0
+_STATUS_FRAMES = 6  # values that change more often are unreadable
+_MOST_VIEWERS = 16
+_LIVE = "/live"
+_REQUEST_S = 30.0
 
 
 @cache
@@ -84,37 +89,16 @@ def _response(status: HTTPStatus, kind: str, body: bytes, policy: str = _POLICY)
     return Response(status.value, status.phrase, Headers({**_HEADERS, **more}), body)
 
 
-_log = logging.getLogger(__name__)
-
-FRAME_S = 1.0 / 30.0
-_STATUS_FRAMES = 6  # values that change more often are unreadable
-_MOST_VIEWERS = 16
-_LIVE = "/live"
-_REQUEST_S = 30.0
-
-
 class LiveServer:
-    """Serves the page of all runs of this user.
-
-    Args:
-        chosen: Returns the run that a page shows by default; None if there is none.
-        port: Port to listen on; 0 for any.
-        clock: Monotonic time in s.
-
-    Attributes:
-        port: Port that it listens on.
+    """Serves the page of all runs of this user on a port, 0 for any.
 
     Raises:
         RunError: The port is not available.
     """
 
     def __init__(
-        self,
-        chosen: Callable[[list[RunFolder]], RunFolder | None],
-        port: int = 0,
-        clock: Callable[[], float] = time.monotonic,
+        self, chosen: Callable[[list[RunFolder]], RunFolder | None], port: int = 0
     ) -> None:
-        self._clock = clock
         self._sockets = _listeners(port)
         self.port = int(self._sockets[0].getsockname()[1])
         self._token = secrets.token_hex(16)
@@ -129,7 +113,7 @@ class LiveServer:
         """Address of the page; the token is in the fragment, which browsers never send."""
         return f"http://127.0.0.1:{self.port}/#{self._token}"
 
-    async def run(self, over: Callable[["LiveServer"], bool]) -> None:
+    async def run(self, over: Callable[[RunList], bool]) -> None:
         """Serve until ``over`` returns true."""
         settings: dict[str, Any] = {
             "process_request": self._admit,
@@ -147,10 +131,6 @@ class LiveServer:
             for listener in self._sockets:
                 await stack.enter_async_context(serve(self._serve_page, sock=listener, **settings))
             await self._tick(over)
-
-    def feed(self, name: str | None) -> RunReader | None:
-        """Return the reader of a run, see :meth:`hilctl.live.run_reader.RunList.feed`."""
-        return self._feeds.feed(name)
 
     def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
         upgrade = request.path == _LIVE
@@ -170,7 +150,7 @@ class LiveServer:
         return None
 
     async def _serve_page(self, connection: ServerConnection) -> None:
-        viewer = PageSession(connection, self._answer, self._clock)
+        viewer = PageSession(connection, self._answer)
         self._viewers.add(viewer)
         try:
             await viewer.serve()
@@ -179,13 +159,12 @@ class LiveServer:
 
     async def _answer(self, viewer: PageSession, message: PageMessage) -> str:
         try:
-            answer = await self._executed(viewer, message)
+            return answer_text(message, **await self._executed(viewer, message))
         except HilctlError as error:
-            answer = {"ok": False, "error": str(error)}
-        return answer_text(message, **answer)
+            return answer_text(message, ok=False, error=str(error))
 
     async def _executed(self, viewer: PageSession, message: PageMessage) -> dict[str, Any]:
-        feed = self.feed(viewer.view.run)
+        feed = self._feeds.feed(viewer.view.run)
         if message.ask == "view":
             return {"ok": True}
         if feed is None:
@@ -196,8 +175,7 @@ class LiveServer:
             return {"ok": requested or not feed.folder.alive, "requested": requested}
         if message.ask == "report":
             return {"ok": True, "path": await self._report(Path(feed.folder.card.recording))}
-        place = feed.folder.socket
-        answer = await asyncio.to_thread(ask, place, message.request, _REQUEST_S)
+        answer = await asyncio.to_thread(ask, feed.folder.socket, message.request, _REQUEST_S)
         return {"ok": True, **answer}
 
     async def _report(self, recording: Path) -> str:
@@ -219,25 +197,24 @@ class LiveServer:
             self._reports[path] = page.read_bytes()
         return path
 
-    async def _tick(self, over: Callable[["LiveServer"], bool]) -> None:
-        number, due_s = 0, self._clock()
-        while not over(self):
+    async def _tick(self, over: Callable[[RunList], bool]) -> None:
+        number, due_s = 0, time.monotonic()
+        while not over(self._feeds):
             self._show(number)
-            number, due_s = number + 1, due_s + FRAME_S
-            now_s = self._clock()
+            now_s = time.monotonic()
             # Skip frames if there was no time.
-            due_s = max(due_s, now_s + FRAME_S / 4.0)
+            number, due_s = number + 1, max(due_s + _FRAME_S, now_s + _FRAME_S / 4.0)
             await asyncio.sleep(due_s - now_s)
 
     def _show(self, number: int) -> None:
-        now_s = self._clock()
+        now_s = time.monotonic()
         self._feeds.update(now_s, [each.view.run for each in self._viewers])
-        self.feed(None)  # read from the first sample, even without a page
+        self._feeds.feed(None)  # read from the first sample, even without a page
         for feed in self._feeds:
             feed.poll(now_s)
         frames: dict[tuple[str, str, float], bytes] = {}
         for viewer in [each for each in self._viewers if each.ready]:
-            shown, view = self.feed(viewer.view.run), viewer.view
+            shown, view = self._feeds.feed(viewer.view.run), viewer.view
             status = [] if number % _STATUS_FRAMES else [self._status(shown)]
             if shown is None:
                 viewer.offer(*status)
@@ -248,16 +225,16 @@ class LiveServer:
             viewer.offer(*status, frames[key])
 
     def _status(self, feed: RunReader | None) -> str:
-        runs = [
-            {"name": run.card.name, "experiment": run.card.experiment} for run in self._feeds.runs
-        ]
+        cards = [run.card for run in self._feeds.runs]
+        runs = [{"name": card.name, "experiment": card.experiment} for card in cards]
         state: dict[str, Any] = {"kind": "status", "runs": runs}
         if feed is not None:
             hz, um = feed.spectrum.points()
-            state |= feed.status()
-            state["spectrum"] = {"hz": hz.tolist(), "um": um.tolist()}
-            state["description"] = feed.description.model_dump()
-            state["signals"] = [[each.name, each.label, each.unit] for each in SIGNALS]
+            state |= feed.status() | {
+                "spectrum": {"hz": hz.tolist(), "um": um.tolist()},
+                "description": feed.description.model_dump(),
+                "signals": [[each.name, each.label, each.unit] for each in SIGNALS],
+            }
         return finite_json(state)
 
 
@@ -271,7 +248,7 @@ def _our_protocol(
 
 def _quiet() -> logging.Logger:
     """Return a log that discards messages on invalid requests."""
-    log = _log.getChild("requests")
+    log = logging.getLogger(f"{__name__}.requests")
     log.propagate = False
     log.addHandler(logging.NullHandler())
     return log

@@ -13,11 +13,10 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from typing import Protocol
 
 from hilctl.base.errors import RunError
 from hilctl.live.foxglove import PORT, FoxgloveServer
-from hilctl.live.run_reader import RunReader
+from hilctl.live.run_reader import RunList
 from hilctl.live.server import LiveServer
 from hilctl.machine.rt_setup import be_ordinary
 from hilctl.run.run_folder import RunFolder
@@ -27,28 +26,16 @@ _LAST_S = 1.5
 _START_S = 30.0
 
 
-class RunSelector(Protocol):
-    """A server whose end depends on its runs."""
-
-    def feed(self, name: str | None) -> RunReader | None:
-        """Return the reader of a run; None for the default run."""
-        ...
-
-
 class SingleRun:
-    """Returns whether a server has ended: some time after its run, so that pages show the end.
-
-    Args:
-        clock: Monotonic time in s.
-    """
+    """Returns whether a server has ended: some time after its run, so that pages show the end."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self._ended_s: float | None = None
 
-    def __call__(self, server: RunSelector) -> bool:
-        """Return whether the server has ended."""
-        feed = server.feed(None)
+    def __call__(self, feeds: RunList) -> bool:
+        """Return whether the server of these runs has ended."""
+        feed = feeds.feed(None)
         if feed is None or not feed.ended:
             self._ended_s = None
         elif self._ended_s is None:
@@ -58,14 +45,14 @@ class SingleRun:
 
 def serve_runs(
     chosen: Callable[[list[RunFolder]], RunFolder | None],
-    over: Callable[[RunSelector], bool],
+    over: Callable[[RunList], bool],
     on_url: Callable[[str], None],
     port: int = 0,
 ) -> None:
-    """Serve the page until it is over.
+    """Serve the page until ``over`` returns true.
 
     Args:
-        chosen: See :class:`hilctl.live.server.LiveServer`.
+        chosen: Returns the run that a page shows by default.
         over: Returns whether to end the server.
         on_url: Called with the address of the page, including its token.
         port: Port to listen on; 0 for any.
@@ -81,17 +68,11 @@ def serve_runs(
 
 def serve_foxglove(
     chosen: Callable[[list[RunFolder]], RunFolder | None],
-    over: Callable[[RunSelector], bool],
+    over: Callable[[RunList], bool],
     on_url: Callable[[str], None],
     port: int | None = None,
 ) -> None:
-    """Serve runs to Foxglove and compatible applications until it is over.
-
-    Args:
-        chosen: See :class:`hilctl.live.run_reader.RunList`.
-        over: Returns whether to end the server.
-        on_url: Called with the address of the server.
-        port: Port to listen on; 0 for any, None for the default port of the applications.
+    """Serve runs to Foxglove like :func:`serve_runs`, on the applications' default port if None.
 
     Raises:
         InputError: The library is not installed.
@@ -111,10 +92,7 @@ def _come_last() -> None:
 
 @contextmanager
 def served_beside() -> Iterator[str]:
-    """Serve the page of the run that this process is about to supervise.
-
-    Yields:
-        Address of the page, including its token.
+    """Serve the page of the run that this process is about to supervise; yield its address.
 
     Raises:
         RunError: The server cannot be started.
@@ -169,9 +147,9 @@ def main() -> None:
     def its_run(runs: list[RunFolder]) -> RunFolder | None:
         return next((run for run in runs if run.card.supervisor == supervisor), None)
 
-    def over(server: RunSelector) -> bool:
-        orphaned = os.getppid() != supervisor and server.feed(None) is None
-        return orphaned or ended(server)
+    def over(feeds: RunList) -> bool:
+        orphaned = os.getppid() != supervisor and feeds.feed(None) is None
+        return orphaned or ended(feeds)
 
     serve_runs(its_run, over, _say)
 

@@ -1,29 +1,21 @@
 """Signals of a run that live views show."""
 
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from typing import Literal
 
 import numpy as np
 
 from hilctl.base.samples import BlockBatch
 from hilctl.base.types import F64, I64, U32
 
-SignalUnit: TypeAlias = Literal["um", "command"]
-
 
 @dataclass(frozen=True, slots=True)
 class Signal:
-    """One signal.
-
-    Attributes:
-        name: Name for programs.
-        label: Name to display.
-        unit: ``um``, or the unit of the run's commands.
-    """
+    """One signal: name for programs, label to display, and ``um`` or the unit of the commands."""
 
     name: str
     label: str
-    unit: SignalUnit
+    unit: Literal["um", "command"]
 
 
 SIGNALS = (
@@ -68,15 +60,9 @@ def traces_of(batch: BlockBatch, waveform_unit: str) -> Traces:
     reference = samples.reference_um
     if waveform_unit != "um":
         reference = np.full_like(reference, np.nan)
+    displacement_um, error_um = samples.displacement_um, samples.displacement_um - reference
     values = np.array(
-        (
-            reference,
-            samples.displacement_um,
-            samples.displacement_um - reference,
-            samples.command,
-            samples.measured,
-            samples.wanted,
-        )
+        (reference, displacement_um, error_um, samples.command, samples.measured, samples.wanted)
     )
     values[~np.isfinite(values)] = np.nan
     return Traces(samples.index, values, samples.flags)

@@ -5,32 +5,26 @@ loopback, one per shipped profile, together with a second profile if one cannot 
 The emulator's time advances with the exchanges, so results do not depend on the machine's speed.
 """
 
-import threading
-from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from importlib import import_module
 from pathlib import Path
 
 import pytest
 
-from hilctl.base.device import Device
 from hilctl.experiment.devices import BUILTIN, device_class, known_devices
 from hilctl_drivers.contract import *  # noqa: F403  the checks, and the fixture driven
 from hilctl_drivers.contract import RATE_HZ, SAMPLES, DrivenDevice, driven_device
-from hilctl_drivers.emulator.factory import build
 from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.modbus.modbus_profile import ModbusProfile
 from hilctl_drivers.profile import load_profile, shipped_profiles
-from tests.fakes import ManualClock
+from tests.fakes import ManualClock, emulated
 
 SETTLED_NS = 2_000_000
 """What the emulated rig takes to settle, 0.1 ms, many times over: it computes each sample of it."""
 TIMEOUT_S = 5.0
 """A busy machine answers within it."""
-ELSEWHERE = {
-    "serial_dac": "test_serial_devices.py",
-    "modbus_stream": "test_modbus_stream.py",
-}
-"""Devices that meet this contract, or the part of it that streams have, in a file of their own."""
+ELSEWHERE = {"serial_dac": "test_serial_devices.py", "modbus_stream": "test_modbus_stream.py"}
+"""Devices that are tested with this contract in another file."""
 SIMULATED = sorted(set(BUILTIN) - {"modbus_dac", *ELSEWHERE})
 PHYSICS = ("domains", "diffusion", "jiles_atherton")
 """What simulated_terfenol is tried with beside its default."""
@@ -45,7 +39,7 @@ MODBUS = (
 """What modbus_dac is tried with; every shipped Modbus profile is among them."""
 
 
-def simulated(kind: str, words: list[str]) -> DrivenDevice:
+def simulated(kind, words):
     chosen = device_class(kind)
     device = chosen(chosen.Options(physics=words[0]) if words else chosen.Options())
     return DrivenDevice(
@@ -53,7 +47,7 @@ def simulated(kind: str, words: list[str]) -> DrivenDevice:
     )
 
 
-def of_another_package(kind: str) -> DrivenDevice:
+def of_another_package(kind):
     """Return an installed third-party simulated device, or the example device."""
     chosen = EXAMPLES[kind]() if kind in EXAMPLES else device_class(kind)
     device = chosen(chosen.Options())
@@ -64,11 +58,10 @@ def of_another_package(kind: str) -> DrivenDevice:
     return driven
 
 
-def _spring() -> type[Device]:
+def _spring():
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(Path(__file__).parents[1] / "data" / "own_device")
-        found: type[Device] = import_module("own_device.spring").Spring
-    return found
+        return import_module("own_device.spring").Spring
 
 
 EXAMPLES = {"spring": _spring}
@@ -94,20 +87,12 @@ watchdog: none
 """
 
 
-def modbus(words: list[str], stack: list[Callable[[], None]]) -> DrivenDevice:
+def modbus(words, stack):
     """Return a modbus_dac connected to an emulator of one or two profiles."""
     clock = ManualClock()
     name, reader, line = [*words, None, None][:3]
-    options = EmulatorOptions(name, reader=reader, reader_line=line, current_a=0.0)
-    emulator = build(options, clock)
-    thread = threading.Thread(target=emulator.server.run)
-    thread.start()
-
-    def stop() -> None:
-        emulator.server.stop()
-        thread.join()
-
-    stack.append(stop)
+    wanted = EmulatorOptions(name, reader=reader, reader_line=line, current_a=0.0)
+    emulator = stack.enter_context(emulated(wanted, clock))
     chosen = device_class("modbus_dac")
     options = _fast({**emulator.options, "timeout_s": TIMEOUT_S})
     if "reader" in options:
@@ -115,7 +100,7 @@ def modbus(words: list[str], stack: list[Callable[[], None]]) -> DrivenDevice:
     device = chosen(chosen.Options.model_validate(options))
     rate_hz = min(RATE_HZ, device.info.max_rate_hz)
 
-    def pass_time() -> None:
+    def pass_time():
         clock.now_ns += min(round(1e9 / rate_hz), SETTLED_NS)
 
     return DrivenDevice(
@@ -123,7 +108,7 @@ def modbus(words: list[str], stack: list[Callable[[], None]]) -> DrivenDevice:
     )
 
 
-def _fast(section: dict) -> dict:
+def _fast(section):
     """Return a section with a fast serial line, if it has one."""
     return {**section, "baud": 115200} if "serial_port" in section else section
 
@@ -137,34 +122,30 @@ CASES = [
 
 
 @pytest.fixture
-def make(tmp_path) -> Iterator[Callable[[str], DrivenDevice]]:
+def make(tmp_path):
     """Return a factory of devices, which are closed afterwards."""
-    benches: list[DrivenDevice] = []
-    stack: list[Callable[[], None]] = []
+    with ExitStack() as stack:
 
-    def of(case: str) -> DrivenDevice:
-        kind, *words = case.split()
-        if words == ["rtu"]:
-            path = tmp_path / "rtu.yaml"
-            path.write_text(RTU_PROFILE, encoding="utf-8")
-            words = [str(path)]
-        if kind == "modbus_dac":
-            benches.append(modbus(words, stack))
-        elif kind in OTHERS:
-            benches.append(of_another_package(kind))
-        else:
-            benches.append(simulated(kind, words))
-        return benches[-1]
+        def of(case):
+            kind, *words = case.split()
+            if words == ["rtu"]:
+                path = tmp_path / "rtu.yaml"
+                path.write_text(RTU_PROFILE, encoding="utf-8")
+                words = [str(path)]
+            if kind == "modbus_dac":
+                driven = modbus(words, stack)
+            elif kind in OTHERS:
+                driven = of_another_package(kind)
+            else:
+                driven = simulated(kind, words)
+            stack.callback(driven.device.close)
+            return driven
 
-    yield of
-    for driven in benches:
-        driven.device.close()
-    for stop in stack:
-        stop()
+        yield of
 
 
 @pytest.fixture(params=CASES)
-def case(request) -> str:
+def case(request):
     """A device by its registry name, with a profile if it needs one."""
     return request.param
 

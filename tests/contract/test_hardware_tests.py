@@ -1,18 +1,15 @@
 """The tests in tests/hardware, run on an emulated device, move it as documented."""
 
 import itertools
-import json
 import os
 import subprocess
 import sys
-import threading
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from hilctl_drivers.emulator.factory import Emulator, build
 from hilctl_drivers.emulator.options import EmulatorOptions, parse_fault
+from tests.fakes import emulated, logged
 
 ROOT = Path(__file__).parents[2]
 GIVE_UP_S = 120.0
@@ -42,55 +39,43 @@ safe: {{value: 0.0, ramp_s: 0.25}}
 """
 
 
-class HardwareTestRun:
-    """An emulated device and the result of the hardware tests."""
-
-    def __init__(self, emulator: Emulator, folder: Path) -> None:
-        self._port = emulator.address.rpartition(":")[2]
-        self._folder = folder
-
-    def run(self, sensor: str = "AIN0", only: str = "test") -> subprocess.CompletedProcess:
-        """Run the hardware tests in a separate process."""
-        path = self._folder / "experiment.yaml"
-        path.write_text(EXPERIMENT.format(port=self._port, sensor=sensor), encoding="utf-8")
-        command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"]
-        return subprocess.run(
-            [*command, "-k", only, "--device", str(path), str(ROOT / "tests" / "hardware")],
-            cwd=ROOT,
-            env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1"},
-            capture_output=True,
-            text=True,
-            timeout=GIVE_UP_S,
-        )
-
-    def currents_a(self) -> list[float]:
-        """Return every output current."""
-        lines = (self._folder / "writes.jsonl").read_text(encoding="utf-8").splitlines()
-        return [json.loads(line)["current_a"] for line in lines]
+def ran(*options):
+    """Run the hardware tests in a separate process."""
+    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "tests/hardware"]
+    return subprocess.run(
+        [*command, *options],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1"},
+        capture_output=True,
+        text=True,
+        timeout=GIVE_UP_S,
+    )
 
 
 @pytest.fixture
-def suite(tmp_path, request) -> Iterator[HardwareTestRun]:
-    """Hardware tests on an emulated device; the parameter is its fault."""
-    fault = getattr(request, "param", None)
-    faults = (parse_fault(fault),) if fault else ()
-    options = EmulatorOptions("labjack_t7", log=tmp_path / "writes.jsonl", faults=faults)
-    emulator = build(options)
-    thread = threading.Thread(target=emulator.server.run)
-    thread.start()
-    yield HardwareTestRun(emulator, tmp_path)
-    emulator.server.stop()
-    thread.join()
-    emulator.log.close()
+def suite(tmp_path):
+    """Return a function that runs hardware tests on an emulated device.
+
+    It returns the result, and every output current.
+    """
+
+    def run(sensor="AIN0", only="test", faults=()):
+        log, path = tmp_path / "writes.jsonl", tmp_path / "experiment.yaml"
+        with emulated(EmulatorOptions("labjack_t7", log=log, faults=faults)) as emulator:
+            port = emulator.address.rpartition(":")[2]
+            path.write_text(EXPERIMENT.format(port=port, sensor=sensor), encoding="utf-8")
+            done = ran("-q", "-k", only, "--device", str(path))
+        return done, [each["current_a"] for each in logged(log)]
+
+    return run
 
 
 @pytest.mark.slow
 def test_keeps_to_a_tenth_of_the_limits(suite):
     """All tests pass with at most 10 % of the peak current; ramps are slow except for one step."""
-    done = suite.run()
+    done, currents_a = suite()
     assert done.returncode == 0, done.stdout
     assert "9 passed" in done.stdout
-    currents_a = suite.currents_a()
     assert currents_a[0] == pytest.approx(POWER_UP_A)
     # The device powers up far from the safe value and ramps from there.
     arrived = next(index for index, each in enumerate(currents_a) if each >= 0.0)
@@ -103,14 +88,12 @@ def test_keeps_to_a_tenth_of_the_limits(suite):
     assert steps_a[-2] <= PEAK_A / RAMP_S / RATE_HZ * 1.001
 
 
-@pytest.mark.parametrize("suite", ["exception@250"], indirect=True)
 @pytest.mark.slow
 def test_failure_ends_at_the_safe_value(suite):
     """A device that fails during a move fails its test and ends at the safe value."""
-    done = suite.run(only="small_move")
+    done, currents_a = suite(only="small_move", faults=(parse_fault("exception@250"),))
     assert done.returncode == 1
     assert "exception 4" in done.stdout
-    currents_a = suite.currents_a()
     assert 0.0 < max(currents_a) <= TENTH_A * 1.001
     assert currents_a[-1] == 0.0
 
@@ -118,17 +101,16 @@ def test_failure_ends_at_the_safe_value(suite):
 @pytest.mark.slow
 def test_sensor_that_shows_nothing_is_found(suite):
     """With the sensor on another input the tests fail with a hint."""
-    done = suite.run(sensor="AIN1", only="small_move")
+    done, currents_a = suite(sensor="AIN1", only="small_move")
     assert done.returncode == 1
     assert "nothing moved" in done.stdout
-    assert suite.currents_a()[-1] == 0.0
+    assert currents_a[-1] == 0.0
 
 
 @pytest.mark.slow
 def test_without_a_device_nothing_is_run():
     """Without --device the hardware tests are skipped, with a line on how to run them."""
-    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "tests/hardware"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=GIVE_UP_S)
+    done = ran()
     assert done.returncode == pytest.ExitCode.NO_TESTS_COLLECTED
     assert done.stdout.count("--device EXPERIMENT.yaml") == 1
     assert "9 deselected" in done.stdout

@@ -8,6 +8,8 @@ import pytest
 
 from hilctl.base.errors import DeviceError
 from hilctl.experiment.devices import device_class
+from hilctl_drivers.contract import *  # noqa: F403  the checks, and the fixture driven
+from hilctl_drivers.contract import DrivenDevice
 from hilctl_drivers.modbus.modbus_profile import ModbusProfile
 from hilctl_drivers.profile import load_profile, shipped_profiles
 from tests.fakes import InProcess
@@ -15,15 +17,15 @@ from tests.fakes import InProcess
 RATE_HZ = 10_000.0
 BLOCK = 50
 FIFO_BLOCKS = 3
+LATE = FIFO_BLOCKS * BLOCK
 STREAMING = ("labjack_t4", "labjack_t7")
 """The shipped profiles that stream over Modbus."""
 
 
-class DrivenStream:
+class DrivenStream(DrivenDevice):
     """A closed device and its emulation."""
 
     def __init__(self, profile):
-        self.profile = profile
         self.emulated = InProcess.of(profile, message_s=0.0002)
         wiring = self.emulated.device.wiring
         chosen = device_class("modbus_stream")
@@ -37,37 +39,46 @@ class DrivenStream:
             "watchdog": "none",
             "fifo_blocks": FIFO_BLOCKS,
         }
-        self.device = chosen(
+        device = chosen(
             chosen.Options.model_validate(options),
             connect=lambda peer: peer.session(self.emulated.link),
             sleep=self.emulated.time.sleep,
             clock=self.emulated.time,
         )
-        info = self.device.info
-        self.middle = 0.5 * (info.command_max + max(0.0, info.command_min))
+        super().__init__(device, BLOCK, RATE_HZ, lambda: self.current_a, name="modbus_stream")
 
-    def open(self):
-        self.device.open(RATE_HZ, BLOCK)
-        self.device.arm()
+    @property
+    def current_a(self):
+        return self.emulated.rig.current_a
 
-    def exchange(self, first, command):
-        """Exchange any number of samples, a block at a time."""
-        command = np.asarray(command, dtype=np.float64)
-        displacement_um, measured = np.full(command.size, np.nan), np.full(command.size, np.nan)
-        for start in range(0, command.size, BLOCK):
-            part = slice(start, start + BLOCK)
-            self.device.exchange(
-                first + start, command[part], displacement_um[part], measured[part]
-            )
-        return displacement_um, measured
+    def exchange(self, command):
+        """Exchange whole blocks, holding the last command until all answers have arrived."""
+        size = len(command)
+        sent = np.concatenate((command, np.full(-size % BLOCK + LATE, command[-1])))
+        before = sent.copy()
+        answers = super().exchange(sent)
+        assert np.array_equal(sent, before)
+        return tuple(values[LATE : LATE + size] for values in answers)
+
+
+@pytest.fixture
+def make():
+    """Return a factory of devices, which are closed afterwards."""
+    made = []
+
+    def of(profile):
+        made.append(DrivenStream(profile))
+        return made[-1]
+
+    yield of
+    for each in made:
+        each.device.close()
 
 
 @pytest.fixture(params=STREAMING)
-def driven(request):
-    """A device with an emulator of each profile."""
-    made = DrivenStream(request.param)
-    yield made
-    made.device.close()
+def case(request):
+    """A profile."""
+    return request.param
 
 
 def test_no_streaming_profile_is_left_out():
@@ -80,17 +91,13 @@ def test_no_streaming_profile_is_left_out():
     } == set(STREAMING)
 
 
-def test_says_what_it_is_before_it_is_opened(driven):
-    """The device info is complete without a connection."""
+def test_info_of_a_stream(driven):
+    """The device info names the FIFO and the port without a connection."""
     info = driven.device.info
-    assert info.name == "modbus_stream"
     assert info.buffered
     assert info.fifo_depth > 0
     assert info.latency_blocks == FIFO_BLOCKS
     assert info.holds == ("tcp:127.0.0.1:502",)
-    assert info.command_min < info.command_max
-    assert info.sensor_min_um < info.sensor_max_um
-    assert all(isinstance(text, str) for text in info.details.values())
     assert driven.emulated.link.requests == []
 
 
@@ -98,122 +105,45 @@ def test_displacements_come_that_many_blocks_later(driven):
     """The first exchanges leave their arrays unchanged; then each sample has its displacement."""
     driven.open()
     n, info = 10 * BLOCK, driven.device.info
-    displacement_um, measured = driven.exchange(0, np.linspace(0.0, driven.middle, n))
-    late = FIFO_BLOCKS * BLOCK
-    assert np.isnan(displacement_um[:late]).all()
-    assert np.isfinite(displacement_um[late:]).all()
-    assert (displacement_um[late:] >= info.sensor_min_um).all()
-    assert (displacement_um[late:] <= info.sensor_max_um).all()
+    displacement_um, measured = DrivenDevice.exchange(driven, np.linspace(0.0, driven.middle, n))
+    assert np.isnan(displacement_um[:LATE]).all()
+    assert np.isfinite(displacement_um[LATE:]).all()
+    assert (displacement_um[LATE:] >= info.sensor_min_um).all()
+    assert (displacement_um[LATE:] <= info.sensor_max_um).all()
     assert np.isnan(measured).all()
-
-
-def test_displacement_is_sampled_before_the_command_acts(driven):
-    """The sample of a step still shows the initial displacement; a later one does not."""
-    driven.open()
-    command = np.zeros(10 * BLOCK)
-    command[2 * BLOCK :] = driven.middle
-    found = driven.exchange(0, command)[0][FIFO_BLOCKS * BLOCK :]
-    assert abs(found[2 * BLOCK]) < 0.5
-    assert found[2 * BLOCK + 20] > 1.0
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, "above", "below"])
-def test_refuses_what_it_can_not_do(driven, bad):
-    """A block with a non-finite or out-of-range value is rejected, and no part of it is sent."""
-    driven.open()
-    info = driven.device.info
-    value = {"above": info.command_max * 1.001 + 1e-6, "below": info.command_min * 1.001 - 1e-6}
-    command = np.full(BLOCK, driven.middle)
-    command[BLOCK // 2] = value.get(bad, bad) if isinstance(bad, str) else bad
-    with pytest.raises(DeviceError, match=info.name):
-        driven.exchange(0, command)
-    after, _ = driven.exchange(0, np.zeros(6 * BLOCK))
-    assert np.abs(after[FIFO_BLOCKS * BLOCK :]).max() < 0.5
-
-
-def test_takes_its_whole_range_and_leaves_the_command_alone(driven):
-    """Both ends of the stated range are accepted, and the array is not written."""
-    driven.open()
-    info = driven.device.info
-    command = np.linspace(info.command_min, info.command_max, 4 * BLOCK)
-    before = command.copy()
-    driven.exchange(0, command)
-    assert np.array_equal(command, before)
-
-
-def test_use_before_open_and_after_close_is_refused(driven):
-    """Exchange needs an open device; closing twice is fine, and opening again too."""
-    with pytest.raises(DeviceError):
-        driven.exchange(0, np.zeros(BLOCK))
-    driven.open()
-    driven.device.close()
-    driven.device.close()
-    with pytest.raises(DeviceError):
-        driven.exchange(0, np.zeros(BLOCK))
-    driven.open()
-    driven.exchange(0, np.zeros(5 * BLOCK))
 
 
 def test_a_block_of_another_size_is_refused(driven):
     """The block size is fixed at open."""
     driven.open()
     with pytest.raises(DeviceError, match="50 samples"):
-        driven.exchange(0, np.zeros(BLOCK - 1))
+        DrivenDevice.exchange(driven, np.zeros(BLOCK - 1))
 
 
-def test_opening_does_not_move_the_output(driven):
-    """The output persists through closing and opening."""
+def test_the_output_persists_exactly_and_is_read_back(driven):
+    """Through closing and opening."""
     driven.open()
-    driven.exchange(0, np.full(10 * BLOCK, driven.middle))
-    held = driven.emulated.rig.current_a
+    driven.exchange(np.full(10 * BLOCK, driven.middle))
+    held = driven.current_a
     driven.device.close()
     driven.open()
     driven.emulated.time.sleep(1.0)
-    assert driven.emulated.rig.current_a == held != 0.0
-
-
-def test_rate_beyond_its_limit_is_refused(driven):
-    """An excessive sample rate is rejected at open."""
-    with pytest.raises(DeviceError):
-        driven.device.open(driven.device.info.max_rate_hz * 1.01, BLOCK)
-
-
-def test_make_safe_works_open_or_closed(driven):
-    """make_safe needs no open connection, and queued samples are not output after it."""
-    rig, safe = driven.emulated.rig, 0.5 * driven.middle
-    driven.device.make_safe(safe)
-    assert rig.current_a == pytest.approx(safe, abs=1e-6)
-    driven.open()
-    driven.exchange(0, np.full(6 * BLOCK, driven.middle))
-    assert rig.current_a == pytest.approx(driven.middle, abs=1e-6)
-    driven.device.make_safe(safe)
-    assert rig.current_a == pytest.approx(safe, abs=1e-6)
-    driven.emulated.time.sleep(1.0)
-    driven.emulated.device.tick(driven.emulated.time.now_ns)
-    driven.device.close()
-    assert rig.current_a == pytest.approx(safe, abs=1e-6)
-    driven.device.make_safe(0.0)
-    assert rig.current_a == pytest.approx(0.0, abs=1e-6)
-
-
-def test_says_what_it_puts_out(driven):
-    """An opened device reports its output."""
-    with pytest.raises(DeviceError):
-        driven.device.output()
-    driven.open()
-    driven.exchange(0, np.full(10 * BLOCK, driven.middle))
-    driven.device.close()
-    driven.open()
-    assert driven.emulated.rig.current_a == pytest.approx(driven.middle, abs=1e-6)
+    assert driven.current_a == held == pytest.approx(driven.middle, abs=1e-6)
     assert driven.device.output() == pytest.approx(driven.middle, abs=1e-6)
 
 
-def test_two_of_a_kind_agree(driven):
-    """Two devices with the same options return the same bits."""
-    other = DrivenStream(driven.profile)
-    command = np.linspace(0.0, driven.middle, 8 * BLOCK)
-    results = []
-    for each in (driven, other):
-        each.open()
-        results.append(each.exchange(0, command)[0])
-    assert np.array_equal(*results, equal_nan=True)
+def test_queued_samples_are_not_output_after_make_safe(driven):
+    safe = 0.5 * driven.middle
+    driven.device.make_safe(safe)
+    assert driven.current_a == pytest.approx(safe, abs=1e-6)
+    driven.open()
+    DrivenDevice.exchange(driven, np.full(6 * BLOCK, driven.middle))
+    assert driven.current_a == pytest.approx(driven.middle, abs=1e-6)
+    driven.device.make_safe(safe)
+    assert driven.current_a == pytest.approx(safe, abs=1e-6)
+    driven.emulated.time.sleep(1.0)
+    driven.emulated.device.tick(driven.emulated.time.now_ns)
+    driven.device.close()
+    assert driven.current_a == pytest.approx(safe, abs=1e-6)
+    driven.device.make_safe(0.0)
+    assert driven.current_a == pytest.approx(0.0, abs=1e-6)

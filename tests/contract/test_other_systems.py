@@ -19,7 +19,7 @@ SYSTEMS = ["win32", "darwin"] if sys.platform == "linux" else [sys.platform]
 """Linux imitates the others; those are themselves."""
 
 
-def on(system: str, commands: list[list[str]], folder: Path) -> tuple[list[int | str], str]:
+def on(system, commands, folder):
     """Run commands as on another system; return their exit codes and standard error."""
     done = subprocess.run(
         [sys.executable, "-P", OTHER_SYSTEM, system],
@@ -37,7 +37,7 @@ def on(system: str, commands: list[list[str]], folder: Path) -> tuple[list[int |
 
 @pytest.mark.slow
 @pytest.mark.parametrize("system", SYSTEMS)
-def test_the_offline_half_works(tmp_path: Path, system: str) -> None:
+def test_the_offline_half_works(tmp_path, system):
     runs, torn = tmp_path / "runs", tmp_path / "torn.mcap"
     runs.mkdir()
     shutil.copy(UNCOMPENSATED, runs)
@@ -77,7 +77,7 @@ def test_the_offline_half_works(tmp_path: Path, system: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("system", SYSTEMS)
-def test_the_online_half_says_what_it_needs(tmp_path: Path, system: str) -> None:
+def test_the_online_half_says_what_it_needs(tmp_path, system):
     """Commands that need Linux end with one line and exit code 2 or 3."""
     demo = str(CONFIGS / "demo.yaml")
     commands = [["run", demo], ["demo"], ["doctor"], ["live"], ["safe", demo],

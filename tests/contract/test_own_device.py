@@ -1,6 +1,7 @@
 """A third-party device package: installed, listed and run with public names only."""
 
 import ast
+import configparser
 import importlib
 import json
 import os
@@ -31,7 +32,7 @@ EXPERIMENT = {
 
 
 @pytest.fixture
-def installed(tmp_path) -> dict[str, str]:
+def installed(tmp_path):
     """The environment of an installation of the package.
 
     The files are written from the package's project file, because building it needs a network.
@@ -43,22 +44,21 @@ def installed(tmp_path) -> dict[str, str]:
     (site / "own_device").symlink_to(SOURCE / "own_device")
     name, version = project["name"], project["version"]
     (facts / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
-    lines = [
-        f"[{group}]\n" + "".join(f"{key} = {value}\n" for key, value in points.items())
-        for group, points in project["entry-points"].items()
-    ]
-    (facts / "entry_points.txt").write_text("\n".join(lines))
+    points = configparser.ConfigParser()
+    points.read_dict(project["entry-points"])
+    with (facts / "entry_points.txt").open("w") as file:
+        points.write(file)
     before = os.environ.get("PYTHONPATH", "")
     return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, (str(site), before)))}
 
 
-def hilctl(environment: dict[str, str], *words: object) -> subprocess.CompletedProcess[str]:
+def hilctl(environment, *words):
     """Run a command of hilctl to its end."""
     command = [sys.executable, "-m", "hilctl", *map(str, words)]
     return subprocess.run(command, capture_output=True, text=True, env=environment)
 
 
-def experiment(folder: Path, **device: object) -> Path:
+def experiment(folder, **device):
     """Write an experiment with the device."""
     path = folder / "own.yaml"
     changed = {**EXPERIMENT, "device": {**EXPERIMENT["device"], **device}}
@@ -67,15 +67,10 @@ def experiment(folder: Path, **device: object) -> Path:
 
 
 @pytest.mark.slow
-def test_is_listed(installed):
-    """The device is listed by the name of its entry point."""
+def test_is_listed_and_in_the_schema(installed):
+    """By the name of its entry point, with its options."""
     devices = json.loads(hilctl(installed, "devices", "--json").stdout)["devices"]
     assert devices["spring"] == "own_device.spring:Spring"
-
-
-@pytest.mark.slow
-def test_is_in_the_schema(installed):
-    """The schema contains its options."""
     schema = json.loads(hilctl(installed, "schema").stdout)
     assert "um_per_a" in schema["$defs"]["device_spring"]["properties"]
 

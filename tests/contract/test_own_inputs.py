@@ -5,14 +5,25 @@ from pathlib import Path
 
 import pytest
 
-from tests.contract.test_bad_input import GOOD, IN_UM, MODEL, check_refused, contents, hilctl, place
+from tests.contract.test_bad_input import (
+    GOOD,
+    IN_UM,
+    MODEL,
+    SINE,
+    check_refused,
+    contents,
+    hilctl,
+    place,
+)
 
 __all__ = ["hilctl", "place"]
 
 GOLDEN = Path(__file__).parents[2] / "recordings" / "golden"
-FILE = GOOD.replace(
-    "{kind: sine, unit: A, amplitude: 1.0, frequency_hz: 5.0, duration_s: 0.2}",
-    "{kind: file, unit: A, path: wave.csv, file_rate_hz: 1000}",
+FILE = GOOD.replace(SINE, "{kind: file, unit: A, path: wave.csv, file_rate_hz: 1000}")
+RECORDED = GOOD.replace(
+    SINE,
+    "{kind: file, path: run.mcap, column: command, resample: linear, scale: 0.1, last_row: 5000, "
+    "unit: A}",
 )
 
 
@@ -21,11 +32,6 @@ def files(place):
     """An experiment, a model, tables and recordings of the user's own."""
     shutil.copy(GOLDEN / "terfenol_uncompensated.mcap", place / "run.mcap")
     shutil.copy(GOLDEN / "terfenol_compensated.mcap", place / "other.mcap")
-    recorded = GOOD.replace(
-        "kind: sine",
-        "kind: file, path: run.mcap, column: command, resample: linear, scale: 0.1, last_row: 5000",
-    )
-    recorded = recorded.replace(", amplitude: 1.0, frequency_hz: 5.0, duration_s: 0.2", "")
     for name, text in {
         "x.yaml": GOOD,
         "rdpi.yaml": GOOD,
@@ -33,7 +39,7 @@ def files(place):
         "model.yaml": MODEL,
         "wave.csv": "command\n" + "0.0\n" * 100,
         "file.yaml": FILE,
-        "recorded.yaml": recorded,
+        "recorded.yaml": RECORDED,
         "notes.txt": "a week's notes\n",
         "loops.csv": "t_s,a,um\n0,0,0\n",
     }.items():
@@ -90,7 +96,6 @@ def test_what_is_written_over_was_written_by_the_same_command(hilctl, place, wor
 
 
 def test_an_empty_file_and_a_torn_recording_are_replaced(hilctl, place):
-    """An empty file and a truncated recording are replaced."""
     for text in (b"", b"\x89MCA", (place / "run.mcap").read_bytes()[:5000]):
         (place / "run.mcap").write_bytes(text)
         ended = hilctl("run", "x.yaml", "--output", "run.mcap", "--overwrite")

@@ -10,17 +10,17 @@ import struct
 import termios
 import threading
 import tty
-from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from functools import partial
 
 import numpy as np
 import pytest
 
 from hilctl.base.errors import DeviceError, UnconfirmedError
-from hilctl_drivers.modbus.config import ModbusOptions
 from hilctl_drivers.modbus.modbus_dac import ModbusDac
 from hilctl_drivers.modbus.pdu import rtu_adu
 from hilctl_drivers.profile import shipped_profiles
-from hilctl_drivers.serial_dac import SerialDac, SerialOptions
+from hilctl_drivers.serial_dac import SerialDac
 from hilctl_drivers.transport.framing import binary_framing
 
 TIMEOUT_S = 0.15
@@ -69,94 +69,94 @@ LOOSE = 'readback: {ask: "V0?", pattern: "[^0-9]*([0-9.]+).*", example: "1.25000
 ERRORS = 'error_query: {ask: "E?", pattern: "0.*", example: "0,none"}'
 
 
-class Pty:
-    """The device end of a serial line.
+@contextmanager
+def pty_device(answer):
+    """Yield the port of a device; ``answer`` returns the reply to bytes, and the remaining ones."""
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    ended = threading.Event()
 
-    Args:
-        answer: Takes the received bytes; returns the reply and the remaining bytes.
-    """
-
-    def __init__(self, answer: Callable[[bytes], tuple[bytes, bytes]]) -> None:
-        self._master, self._slave = pty.openpty()
-        tty.setraw(self._slave)
-        self.path = os.ttyname(self._slave)
-        self._answer = answer
-        self._ended = False
-        self._thread = threading.Thread(target=self._serve)
-        self._thread.start()
-
-    def _serve(self) -> None:
+    def serve():
         kept = b""
-        while not self._ended:
-            if select.select([self._master], [], [], 0.01)[0]:
-                reply, kept = self._answer(kept + os.read(self._master, 4096))
-                os.write(self._master, reply)
+        while not ended.is_set():
+            if select.select([master], [], [], 0.01)[0]:
+                reply, kept = answer(kept + os.read(master, 4096))
+                os.write(master, reply)
 
-    def close(self) -> None:
-        self._ended = True
-        self._thread.join()
-        os.close(self._slave)
-        os.close(self._master)
+    thread = threading.Thread(target=serve)
+    thread.start()
+    yield os.ttyname(slave)
+    ended.set()
+    thread.join()
+    os.close(slave)
+    os.close(master)
 
 
-def echo(data: bytes) -> tuple[bytes, bytes]:
+def echo(data):
     return data, b""
 
 
-def dead(data: bytes) -> tuple[bytes, bytes]:
+def dead(data):
     return b"", b""
 
 
 @pytest.fixture
-def line() -> Iterator[Callable[[Callable[[bytes], tuple[bytes, bytes]]], str]]:
-    """Return a function that starts a device and returns its port."""
-    made: list[Pty] = []
+def connect(tmp_path):
+    """Return a function that returns a device of a profile, and starts its other end."""
+    with ExitStack() as stack:
 
-    def start(answer):
-        made.append(Pty(answer))
-        return made[-1].path
+        def make(kind, profile, answer, **more):
+            path = tmp_path / "profile.yaml"
+            path.write_text(profile)
+            if answer is not None:
+                more["serial_port"] = stack.enter_context(pty_device(answer))
+            return kind(kind.Options.model_validate({**OPTIONS, "profile": str(path), **more}))
 
-    yield start
-    for each in made:
-        each.close()
+        yield make
 
 
 @pytest.fixture
-def text(tmp_path, line):
+def text(connect):
     """Return a factory of text devices on a scripted line."""
 
     def make(answer, reply, readback="", errors=""):
-        path = tmp_path / "text.yaml"
-        path.write_text(TEXT.format(reply=reply, readback=readback, errors=errors))
-        return SerialDac(SerialOptions.model_validate(_options(path, line(answer))))
+        profile = TEXT.format(reply=reply, readback=readback, errors=errors)
+        return connect(SerialDac, profile, answer)
 
     return make
 
 
 @pytest.fixture
-def registers(tmp_path, line):
+def registers(connect):
     """Return a factory of Modbus RTU devices on a scripted line."""
 
-    def make(answer, function, readback):
-        path = tmp_path / "registers.yaml"
-        path.write_text(REGISTERS.format(function=function, readback=readback))
-        return ModbusDac(ModbusOptions.model_validate(_options(path, line(answer))))
+    def make(answer, function, readback, **more):
+        profile = REGISTERS.format(function=function, readback=readback)
+        return connect(ModbusDac, profile, answer, **more)
 
     return make
 
 
-def _options(path, port, **changes):
-    return {
-        "profile": str(path),
-        "serial_port": port,
-        "output": "OUT",
-        "input": "IN",
-        "amplifier": {"gain_a_per_v": 1.0},
-        "sensor": {"um_per_v": 10.0},
-        "watchdog": "none",
-        "timeout_s": TIMEOUT_S,
-        **changes,
-    }
+@pytest.fixture
+def board(connect):
+    """Return a factory of boards on a scripted line."""
+
+    def make(answer, boot_wait_s=0.0):
+        profile = shipped_profiles()["cobs_board"].read_text()
+        profile = profile.replace("boot_wait_s: 2.0", f"boot_wait_s: {boot_wait_s}")
+        return connect(SerialDac, profile, answer, output="DAC", input="ADC")
+
+    return make
+
+
+OPTIONS = {
+    "output": "OUT",
+    "input": "IN",
+    "amplifier": {"gain_a_per_v": 1.0},
+    "sensor": {"um_per_v": 10.0},
+    "watchdog": "none",
+    "timeout_s": TIMEOUT_S,
+}
 
 
 @pytest.mark.parametrize("answer", [dead, echo])
@@ -197,21 +197,14 @@ def test_registers_on_a_line_that_echoes_are_not_confirmed(registers, answer, fu
     assert isinstance(caught.value, UnconfirmedError) == (unconfirmed and answer is echo)
 
 
-def test_a_reply_to_function_6_is_evidence_over_tcp(tmp_path):
-    path = tmp_path / "registers.yaml"
-    path.write_text(REGISTERS.format(function=6, readback="none"))
-    options = _options(path, None, host="127.0.0.1")
-    assert ModbusDac(ModbusOptions.model_validate(options)).info.safe_note == ""
+def test_a_reply_to_function_6_is_evidence_over_tcp(registers):
+    assert registers(None, 6, "none", host="127.0.0.1").info.safe_note == ""
 
 
 @pytest.mark.parametrize("answer", [dead, echo])
-def test_frames_are_not_confirmed_by_an_echo(tmp_path, line, answer):
-    board = shipped_profiles()["cobs_board"].read_text()
-    path = tmp_path / "board.yaml"
-    path.write_text(board.replace("boot_wait_s: 2.0", "boot_wait_s: 0.0"))
-    options = _options(path, line(answer), output="DAC", input="ADC")
+def test_frames_are_not_confirmed_by_an_echo(board, answer):
     with pytest.raises(DeviceError) as caught:
-        SerialDac(SerialOptions.model_validate(options)).make_safe(SAFE)
+        board(answer).make_safe(SAFE)
     assert not isinstance(caught.value, UnconfirmedError)
 
 
@@ -219,21 +212,20 @@ class LateDevice:
     """A device that delays its first unsafe command until more messages arrive.
 
     Args:
-        split: Takes bytes; returns complete messages and the rest.
-        command: Returns the value that a message sets, or None.
-        answer: Returns the answer to a message.
+        language: Functions that split bytes into messages and the rest, return the value that a
+            message sets, or None, and return the answer to a message.
         waits_for: Number of messages before the late one is executed.
         forgets: Whether those messages are lost.
     """
 
-    def __init__(self, split, command, answer, waits_for, *, forgets):
-        self._split, self._command, self._reply = split, command, answer
+    def __init__(self, language, waits_for, *, forgets):
+        self._split, self._command, self._reply = language
         self._left, self._forgets = waits_for, forgets
-        self._held: list[bytes] = []
+        self._held = []
         self.value = 0.0
         self.is_late = False
 
-    def __call__(self, data: bytes) -> tuple[bytes, bytes]:
+    def __call__(self, data):
         messages, rest = self._split(data)
         sent = b""
         for message in messages:
@@ -246,13 +238,13 @@ class LateDevice:
                 sent += self._execute(message)
         return sent, rest
 
-    def _catch_up(self) -> bytes:
+    def _catch_up(self):
         due = self._held[:1] if self._forgets else self._held
         self._held, self._left, self.is_late = [], 1 << 30, False
         # Lost messages are never executed, and the old command is.
         return b"".join(self._execute(message) for message in due)
 
-    def _execute(self, message: bytes) -> bytes:
+    def _execute(self, message):
         value = self._command(message)
         if value is not None:
             self.value = value
@@ -268,8 +260,8 @@ def set_by_line(message):
     return float(message[2:]) if message.startswith(b"V ") else None
 
 
-def answer_line(message, value):
-    return b"OK\n" if message.startswith(b"V ") else f"{value:.5f}\n".encode()
+def answer_line(message, value, digits=5):
+    return b"OK\n" if message.startswith(b"V ") else f"{value:.{digits}f}\n".encode()
 
 
 def requests(data):
@@ -295,6 +287,10 @@ def answer_request(message, value):
     return rtu_adu(1, message[1:6])
 
 
+LINES = (lines, set_by_line, answer_line)
+REQUESTS = (requests, set_by_request, answer_request)
+
+
 @pytest.mark.parametrize("forgets", [False, True])
 @pytest.mark.parametrize("waits_for", [1, 2, 3, 5, 8])
 @pytest.mark.parametrize("kind", ["OK", "readback", 6, 16])
@@ -303,10 +299,10 @@ def test_the_late_answer_to_an_older_command_confirms_nothing(
 ):
     """A late answer is no confirmation, whether or not the device executes later messages."""
     if isinstance(kind, str):
-        late = LateDevice(lines, set_by_line, answer_line, waits_for, forgets=forgets)
+        late = LateDevice(LINES, waits_for, forgets=forgets)
         device = text(late, OK, READBACK if kind == "readback" else "")
     else:
-        late = LateDevice(requests, set_by_request, answer_request, waits_for, forgets=forgets)
+        late = LateDevice(REQUESTS, waits_for, forgets=forgets)
         device = registers(late, kind, "same")
     device.open(RATE_HZ, 1)
     with pytest.raises(DeviceError):
@@ -327,8 +323,8 @@ def test_the_late_answer_to_an_older_command_confirms_nothing(
 class Refusing:
     """A device that rejects the messages selected by ``refuses`` and counts commands."""
 
-    def __init__(self, split, command, answer, refuse, value=3.0):
-        self._split, self._command, self._reply, self._refuse = split, command, answer, refuse
+    def __init__(self, language, refuse, value=3.0):
+        (self._split, self._command, self._reply), self._refuse = language, refuse
         self.value, self.commands = value, []
 
     def __call__(self, data):
@@ -344,32 +340,21 @@ class Refusing:
         return sent, rest
 
 
-def exception(function):
-    def refuse(message):
-        refused = message[1] == function
-        return rtu_adu(1, bytes([function | 0x80, 1])) if refused else b""
-
-    return refuse
-
-
 @pytest.mark.parametrize("function", [6, 16])
 def test_registers_that_refuse_the_safe_value_are_not_opened(registers, function):
     """The test message uses the present output value, not the safe value."""
-    device = Refusing(requests, set_by_request, answer_request, exception(function))
+    exception = rtu_adu(1, bytes([function | 0x80, 1]))
+    device = Refusing(REQUESTS, lambda message: exception if message[1] == function else b"")
     with pytest.raises(DeviceError, match=rf"OUT, register 0: function {function} refused"):
         registers(device, function, "same").open(RATE_HZ, 1)
     assert device.commands == [3.0]
     assert device.value == 3.0
 
 
-def refuse_line(message):
-    return b"ERR\n" if message.startswith(b"V ") else b""
-
-
 @pytest.mark.parametrize(("value", "tried"), [(3.0, True), (12.0, False)])
 def test_lines_that_refuse_the_safe_value_are_not_opened(text, value, tried):
     """An output outside the command range is left unchanged."""
-    scripted = Refusing(lines, set_by_line, answer_line, refuse_line, value)
+    scripted = Refusing(LINES, lambda line: b"ERR\n" if line.startswith(b"V ") else b"", value)
     device = text(scripted, OK, READBACK)
     if tried:
         with pytest.raises(DeviceError, match=r"V 3\.00000"):
@@ -383,30 +368,24 @@ def test_lines_that_refuse_the_safe_value_are_not_opened(text, value, tried):
 @pytest.mark.parametrize(("value", "commands"), [(1.25, [1.25]), (1.2500049, [])])
 def test_a_value_that_the_command_would_round_is_not_written(text, value, commands):
     """Rounding would move the output by a step."""
-
-    def answer(message, held):
-        return b"OK\n" if message.startswith(b"V ") else f"{held:.7f}\n".encode()
-
-    scripted = Refusing(lines, set_by_line, answer, lambda message: b"", value)
+    language = (lines, set_by_line, partial(answer_line, digits=7))
+    scripted = Refusing(language, lambda message: b"", value)
     device = text(scripted, OK, READBACK)
     device.open(RATE_HZ, 1)
     device.close()
     assert scripted.commands == commands
 
 
-def test_attempts_at_a_silent_board_wait_for_no_boot_and_cause_none(tmp_path, line):
+def test_attempts_at_a_silent_board_wait_for_no_boot_and_cause_none(board):
     """Each attempt opens the port and keeps the control lines that would reset the board."""
-    path = tmp_path / "board.yaml"
-    path.write_text(shipped_profiles()["cobs_board"].read_text())
-    options = _options(path, line(dead), output="DAC", input="ADC")
-    device = SerialDac(SerialOptions.model_validate(options))
+    device = board(dead, boot_wait_s=2.0)
     slept = []
     device._link._sleep = slept.append
     for _ in range(3):
         with pytest.raises(DeviceError, match="no answer"):
             device.make_safe(SAFE)
         assert not device._link.is_open
-        descriptor = os.open(options["serial_port"], os.O_RDWR | os.O_NOCTTY)
+        descriptor = os.open(device.info.holds[0].partition(":")[2], os.O_RDWR | os.O_NOCTTY)
         assert not termios.tcgetattr(descriptor)[2] & termios.HUPCL
         os.close(descriptor)
     assert slept == []
@@ -430,11 +409,6 @@ def refuse_safe(data):
     return sent, rest
 
 
-def test_a_board_that_refuses_safe_is_not_opened(tmp_path, line):
-    board = shipped_profiles()["cobs_board"].read_text()
-    path = tmp_path / "board.yaml"
-    path.write_text(board.replace("boot_wait_s: 2.0", "boot_wait_s: 0.0"))
-    options = _options(path, line(refuse_safe), output="DAC", input="ADC")
-    device = SerialDac(SerialOptions.model_validate(options))
+def test_a_board_that_refuses_safe_is_not_opened(board):
     with pytest.raises(DeviceError, match="by SAFE: refused"):
-        device.open(RATE_HZ, 1)
+        board(refuse_safe).open(RATE_HZ, 1)

@@ -17,7 +17,7 @@ from hilctl_drivers import contract
 from hilctl_drivers.contract import *  # noqa: F403  the checks, and the fixture driven
 from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.profile import load_profile, shipped_profiles
-from tests.fakes import emulated
+from tests.fakes import ManualClock, emulated
 
 SERIAL = (
     "adam_4024_ascii agilent_34970a own", "adam_4024_ascii only_reads same", "agilent_34970a",
@@ -42,7 +42,7 @@ turnaround_s: 0.001
 max_rate_hz: 100.0
 watchdog: none
 """
-SETTLED_NS = 2_000_000
+SETTLED_S = 2e-3
 STREAM_RATE_HZ = 640.0
 BLOCK = 10
 FIFO_BLOCKS = 32  # 500 ms, the longest stall of a busy machine
@@ -55,82 +55,38 @@ def serial_profiles():
     return [name for name, kind in kinds.items() if kind in {"ascii", "frames"}]
 
 
-class EmulatorClock:
-    """The emulator's time: real time for streams, otherwise advanced by exchanges."""
-
-    def __init__(self, *, real):
-        self.now_ns = 1_000_000_000
-        self._real = real
-
-    def __call__(self):
-        return time.monotonic_ns() if self._real else self.now_ns
-
-
-class DrivenSerial:
+class DrivenSerial(contract.DrivenDevice):
     """A serial_dac and its emulation, for the checks.
 
     With a FIFO, the last command is held until all answers have arrived. Without answers, time
     advances only after a command has arrived.
     """
 
-    name = "serial_dac"
-    starts_at_rest = False
-    must_be_at_rest = False
-    reads_back = True
-
-    def __init__(self, device, rate_hz, clock, stands, arrived_a=None):
-        self.device = device
-        self.rate_hz = rate_hz
-        self.block = BLOCK if device.info.latency_blocks else 1
-        self._clock = clock
-        self.stands = stands
-        self._arrived_a = arrived_a
-        self._sent = 0
-
-    def open(self):
-        self.device.open(self.rate_hz, self.block)
-        self.device.arm()
-        self._sent = 0
+    silent = False
 
     def exchange(self, command):
         """Exchange any number of samples, a block at a time."""
-        latency = self.device.info.latency_blocks
+        late = self.device.info.latency_blocks * self.block
         command = np.asarray(command, dtype=np.float64)
-        size = -(-command.size // self.block) * self.block
-        padded = np.concatenate([command, np.full(size - command.size, command[-1])])
-        held = np.full(latency * self.block, command[-1])
-        displacement_um = np.full(padded.size + held.size, np.nan)
-        measured = np.full(padded.size + held.size, np.nan)
-        for start in range(0, padded.size + held.size, self.block):
-            part = slice(start, start + self.block)
-            self._clock.now_ns += min(round(1e9 / self.rate_hz), SETTLED_NS)
-            sent = np.concatenate([padded, held])[part]
-            before = sent.copy()
-            self.device.exchange(self._sent, sent, displacement_um[part], measured[part])
-            assert np.array_equal(sent, before)
-            self._await(float(np.clip(sent[-1], -10.0, 10.0)))  # the rig's amplifier
-            self._sent += self.block
-        answers = displacement_um[held.size :]
-        return answers[: command.size], measured[: command.size]
+        held = np.full(-command.size % self.block + late, command[-1])
+        sent = np.concatenate((command, held)).reshape(-1, self.block)
+        before, answers = sent.copy(), []
+        for block in sent:
+            answers.append(super().exchange(block))
+            if self.silent:
+                self._await(float(np.clip(block[-1], -10.0, 10.0)), 1e-4)  # the rig's amplifier
+        assert np.array_equal(sent, before)
+        displacement_um, measured = np.concatenate(answers, axis=1)
+        return displacement_um[late:][: command.size], measured[: command.size]
 
     def assert_stands(self, command):
         """Wait for the output, because some commands are not answered."""
-        end_s = time.monotonic() + 5.0
-        while abs(self.stands() - command) > contract.STEP:
-            assert time.monotonic() < end_s, f"{command} A does not stand"
+        self._await(command, contract.STEP)
 
-    def _await(self, sent_a):
-        if self._arrived_a is None:
-            return
+    def _await(self, command, tolerance):
         end_s = time.monotonic() + 5.0
-        while abs(self._arrived_a() - sent_a) > 1e-4:
-            assert time.monotonic() < end_s, f"{sent_a} A did not arrive"
-
-    @property
-    def middle(self):
-        """A command well inside the range, different from the resting one."""
-        info = self.device.info
-        return 0.5 * (info.command_max + max(0.0, info.command_min))
+        while abs(self.stands() - command) > tolerance:
+            assert time.monotonic() < end_s, f"{command} A is not output"
 
 
 def wired(case, tmp_path, stack):
@@ -144,7 +100,7 @@ def wired(case, tmp_path, stack):
         reader = str(tmp_path / "only_reads.yaml")
         Path(reader).write_text(ONLY_READS)
     stream = getattr(profile, "exchange", "none") == "stream"
-    clock = EmulatorClock(real=stream)
+    clock = time.monotonic_ns if stream else ManualClock()
     wanted = EmulatorOptions(str(path), reader=reader, reader_line=line)
     emulator = stack.enter_context(emulated(wanted, clock))
     options = {**emulator.options, "timeout_s": 5.0, "fifo_blocks": FIFO_BLOCKS}
@@ -153,13 +109,15 @@ def wired(case, tmp_path, stack):
     stack.callback(device.close)
     rate_hz = STREAM_RATE_HZ if stream else device.info.max_rate_hz
     silent = getattr(profile.outputs[options["output"]], "reply", "") == "none"
-    apart = silent and line == "own"
     rig = emulator.device._rig
 
-    def stands():
-        return rig.current_a
+    def pass_time():
+        if not stream:
+            clock.pass_s(min(1.0 / rate_hz, SETTLED_S))
 
-    made = DrivenSerial(device, rate_hz, clock, stands, stands if apart else None)
+    block = BLOCK if device.info.latency_blocks else 1
+    made = DrivenSerial(device, block, rate_hz, lambda: rig.current_a, pass_time, name="serial_dac")
+    made.silent = silent and line == "own"
     made.must_be_at_rest = name in MUST_BE_AT_REST
     made.reads_back = name != "adam_4024_ascii"  # returns its last command, not its output
     return made

@@ -11,12 +11,8 @@ from hilctl.models.model_file import load_model
 CONFIGS = Path(__file__).parents[2] / "configs"
 EXPERIMENTS = sorted(path.name for path in CONFIGS.glob("*.yaml"))
 MODELS = sorted(path.name for path in (CONFIGS / "models").glob("*.yaml"))
-
-
-def test_there_are_some() -> None:
-    """The lists of the other tests are not empty."""
-    assert EXPERIMENTS
-    assert MODELS
+assert EXPERIMENTS
+assert MODELS
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)

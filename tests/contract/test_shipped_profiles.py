@@ -1,5 +1,7 @@
 """Shipped device profiles agree with the vendors' documents."""
 
+from itertools import chain
+
 import pytest
 
 from hilctl.base.yaml import load_document, loc_of
@@ -8,13 +10,7 @@ from hilctl_drivers.board.board_profile import FrameProfile
 from hilctl_drivers.modbus.modbus_profile import ModbusProfile
 from hilctl_drivers.modbus.pdu import read_pdu, rtu_adu, write_single_pdu
 from hilctl_drivers.modbus.register_map import EnsureStep, RegisterStep
-from hilctl_drivers.profile import (
-    FOLDER,
-    link_kinds,
-    load_profile,
-    profile_class,
-    shipped_profiles,
-)
+from hilctl_drivers.profile import FOLDER, link_kinds, load_profile, profile_class, shipped_profiles
 
 NAMES = (
     "adam_4024", "adam_4024_ascii", "adam_4117", "adam_6024", "adam_6217", "adam_6224",
@@ -108,249 +104,215 @@ EXCHANGES = {
 }  # fmt: skip
 
 
-def modbus(name: str) -> ModbusProfile:
-    """Return a shipped Modbus profile."""
-    profile = load_profile(name)
-    assert isinstance(profile, ModbusProfile)
-    return profile
+@pytest.fixture(scope="module")
+def profiles():
+    return {name: load_profile(name) for name in NAMES}
 
 
-def text_based(name: str) -> AsciiProfile:
-    """Return a shipped text profile."""
-    profile = load_profile(name)
-    assert isinstance(profile, AsciiProfile)
-    return profile
+@pytest.fixture(scope="module")
+def modbus(profiles):
+    return {name: each for name, each in profiles.items() if isinstance(each, ModbusProfile)}
 
 
 @pytest.fixture(params=NAMES)
-def name(request: pytest.FixtureRequest) -> str:
+def name(request):
     """Each shipped profile's name."""
-    found: str = request.param
-    return found
+    return request.param
 
 
-class TestEach:
-    """Every shipped profile."""
-
-    def test_names(self) -> None:
-        """The list of profiles is complete."""
-        assert tuple(shipped_profiles()) == NAMES
-
-    def test_no_two_alike(self) -> None:
-        """No two profiles describe the same device."""
-        titles = [load_profile(name).title for name in NAMES]
-        assert len(set(titles)) == len(titles)
-
-    def test_schema_line(self, name: str) -> None:
-        """The first line refers to the schema."""
-        text = (FOLDER / f"{name}.yaml").read_text(encoding="utf-8")
-        assert text.startswith("# yaml-language-server: $schema=schema.json\n")
-        assert max(map(len, text.splitlines())) <= 120
-
-    def test_round_trip(self, name: str) -> None:
-        """A profile survives writing and reading."""
-        profile = load_profile(name)
-        assert type(profile).model_validate(profile.model_dump()) == profile
-        assert type(profile) in {profile_class(kind) for kind in link_kinds()}
-
-    def test_provenance(self, name: str) -> None:
-        """Documents are named, and each unverified value is in the file and named once."""
-        profile = load_profile(name)
-        document = load_document(FOLDER / f"{name}.yaml")
-        assert profile.verified in {"partly", "no"}
-        assert len(set(profile.unverified)) == len(profile.unverified)
-        assert profile.unverified or profile.verified == "no"
-        assert all(document.holds(loc_of(key)) for key in profile.unverified)
-
-    def test_no_sensor_is_said_so(self, name: str) -> None:
-        """The notes of an output-only device mention a second device for the sensor."""
-        profile = load_profile(name)
-        channels = profile.inputs.values()
-        reads = [getattr(channel, "measures", "terminal") == "terminal" for channel in channels]
-        said = any("sensor must be read by another device" in note for note in profile.notes)
-        assert said is not any(reads)
-
-    def test_no_output_is_said_so(self, name: str) -> None:
-        """The notes of an input-only device name a device for the output."""
-        profile = load_profile(name)
-        said = [note for note in profile.notes if note.startswith("It only reads.")]
-        assert bool(said) is not bool(profile.outputs)
-
-    def test_watchdog(self, name: str) -> None:
-        """Unit, feeding and trip of the watchdog agree with the device."""
-        watchdog = load_profile(name).watchdog
-        if name not in WATCHDOGS:
-            assert watchdog == "none"
-            return
-        assert watchdog != "none"
-        assert WATCHDOGS[name] == (
-            watchdog.unit_s, watchdog.kick, watchdog.on_trip, watchdog.refuses_while_tripped,
-        )  # fmt: skip
-        assert watchdog.counts(watchdog.min_s) >= 1
+def test_names(profiles):
+    """The list of profiles is complete, and no two describe the same device."""
+    assert tuple(shipped_profiles()) == NAMES
+    assert len({profile.title for profile in profiles.values()}) == len(NAMES)
 
 
-class TestModbus:
-    """Modbus registers."""
-
-    @pytest.mark.parametrize(("name", "output", "address", "function", "value", "data"), OUTPUTS)
-    def test_output(
-        self, name: str, output: str, address: int, function: int, value: float, data: str
-    ) -> None:
-        """An output's value goes to the right address, in the right bytes."""
-        profile = modbus(name)
-        channel = profile.outputs[output]
-        assert profile.wire_address(channel) == address
-        assert channel.function == function
-        assert channel.format.encode(value).hex() == data
-        assert channel.limits[0] <= value <= channel.limits[1]
-
-    @pytest.mark.parametrize(("name", "sensor", "address", "function", "data", "value"), INPUTS)
-    def test_input(
-        self, name: str, sensor: str, address: int, function: int, data: str, value: float
-    ) -> None:
-        """An input is read from the right address and understood."""
-        profile = modbus(name)
-        channel = profile.inputs[sensor]
-        assert profile.wire_address(channel) == address
-        assert channel.read_function == function
-        assert channel.format.decode(bytes.fromhex(data)) == pytest.approx(value, abs=1e-9)
-
-    @pytest.mark.parametrize(("name", "key", "area", "address"), SPECIAL)
-    def test_other_registers(self, name: str, key: str, area: str, address: int) -> None:
-        """Addresses of settings, watchdog and self test agree with the documents."""
-        profile = modbus(name)
-        register = dict(profile.registers())[key]
-        assert (register.area, profile.wire_address(register)) == (area, address)
-
-    @pytest.mark.parametrize("name", [name for name in NAMES if name not in EXCHANGES])
-    def test_two_transactions(self, name: str) -> None:
-        """Devices without function 23 use two transactions."""
-        profile = load_profile(name)
-        if isinstance(profile, ModbusProfile):
-            assert profile.exchange == "none"
-
-    @pytest.mark.parametrize(("name", "function"), EXCHANGES.items())
-    def test_one_transaction(self, name: str, function: int) -> None:
-        """Devices with function 23 use one transaction."""
-        assert modbus(name).exchange == function
-
-    def test_waveshare_example(self) -> None:
-        """The vendor's example frame: register 0 set to 1000."""
-        profile = modbus("waveshare_ao_8ch")
-        channel = profile.outputs["AO0"]
-        pdu = write_single_pdu(profile.wire_address(channel), channel.format.encode(1.0))
-        assert rtu_adu(profile.unit_id, pdu).hex(" ") == "01 06 00 00 03 e8 89 74"
-
-    def test_waveshare_input_examples(self) -> None:
-        """The vendor's example frames: all eight inputs and their settings."""
-        profile = modbus("waveshare_ai_8ch")
-        values, settings = profile.inputs["AI0"], dict(profile.registers())["init.0"]
-        frames = [
-            rtu_adu(1, read_pdu(each.read_function, profile.wire_address(each), 8)).hex(" ")
-            for each in (values, settings)
-        ]
-        assert frames == ["01 04 00 00 00 08 f1 cc", "01 03 10 00 00 08 40 cc"]
-
-    def test_every_limit_can_be_written(self) -> None:
-        """Both ends of every output's range fit into its register and its raw limits."""
-        for name in NAMES:
-            profile = load_profile(name)
-            if isinstance(profile, ModbusProfile):
-                for channel in profile.outputs.values():
-                    for value in channel.limits:
-                        data = channel.format.encode(value)
-                        assert channel.format.decode(data) == pytest.approx(value, abs=1e-6)
-                        raw = (channel.format.decode(data) - channel.offset) / channel.scale
-                        low, high = channel.raw_limits
-                        assert low <= round(raw, 6) <= high
-
-    def test_write_only(self) -> None:
-        """A LJTick-DAC can't be read; everything else can, WAGO's outputs 0x0200 further."""
-        labjack, wago = modbus("labjack_t7"), modbus("wago_750")
-        assert labjack.outputs["TDAC0"].readback_register is None
-        assert labjack.outputs["DAC0"].readback_register is labjack.outputs["DAC0"]
-        register = wago.outputs["AO0"].readback_register
-        assert register is not None
-        assert wago.wire_address(register) == 0x0200
-        assert register.format.decode(bytes.fromhex("8001")) == pytest.approx(-10.0)
-
-    def test_resolution(self) -> None:
-        """The resolution includes the bits that the device drops."""
-        assert modbus("wago_750").outputs["AO0"].step == pytest.approx(8 * 10.0 / 32767)
-        assert modbus("adam_4024").outputs["AO0"].step == pytest.approx(20.0 / 4095)
-        assert modbus("labjack_t7").outputs["DAC0"].step == 1.22e-3
-
-    def test_flash_is_not_rewritten(self) -> None:
-        """LabJack keeps its watchdog settings in flash: unchanged values are not written."""
-        for name in ("labjack_t4", "labjack_t7", "labjack_t8"):
-            watchdog = modbus(name).watchdog
-            assert watchdog != "none"
-            steps = (*watchdog.arm, *watchdog.safe["DAC0"], *watchdog.safe["DAC1"])
-            assert all(isinstance(step, EnsureStep) for step in steps)
-            assert not watchdog.disarm
-            first, last = watchdog.unlock[0], watchdog.arm[-1]
-            assert isinstance(first, RegisterStep)
-            assert isinstance(last, RegisterStep)
-            assert (first.address, first.value) == (last.address, 0.0)
-            assert last.value == 1.0
+def test_schema_line(name):
+    """The first line refers to the schema."""
+    text = (FOLDER / f"{name}.yaml").read_text(encoding="utf-8")
+    assert text.startswith("# yaml-language-server: $schema=schema.json\n")
+    assert max(map(len, text.splitlines())) <= 120
 
 
-class TestText:
-    """Text lines."""
-
-    @pytest.mark.parametrize(
-        ("name", "output", "value", "line"),
-        [
-            ("icp_m7024_dcon", "AO2", 5.0, "#012+05.000"),
-            ("icp_m7024_dcon", "AO0", -10.0, "#010-10.000"),
-            ("adam_4024_ascii", "AO1", 2.5, "#01C1+02.500"),
-            ("kepco_bop", "current", -2.5, "CURR -2.500000"),
-            ("kepco_bop", "current", 1e-7, "CURR 0.000000"),
-            ("tdk_lambda_gen", "current", 7.07, "PC 7.070"),
-        ],
-    )
-    def test_write(self, name: str, output: str, value: float, line: str) -> None:
-        """The output line agrees with the manual and has no exponent."""
-        profile = text_based(name)
-        address = 0 if profile.address == "none" else profile.address
-        assert profile.outputs[output].write.format(value=value, address=address) == line
-
-    def test_dcon_watchdog(self) -> None:
-        """The manual's example: ~013164 is 10.0 s for module 01."""
-        profile = text_based("icp_m7024_dcon")
-        assert profile.watchdog != "none"
-        step = profile.watchdog.arm[0]
-        assert isinstance(step, SendStep)
-        line = step.text.format(address=profile.address, timeout=profile.watchdog.counts(10.0))
-        assert line == "~013164"
-
-    def test_kepco_exchange(self) -> None:
-        """One line sets the current and reads it back."""
-        profile = text_based("kepco_bop")
-        assert profile.exchange != "none"
-        assert profile.exchange.write.format(value=1.0) == "CURR 1.000000;:MEAS:CURR?"
-
-    def test_gap(self) -> None:
-        """TDK-Lambda needs 5 ms between commands."""
-        assert text_based("tdk_lambda_gen").link.min_gap_s == 0.005
-
-    def test_no_timeout_in_outputs(self) -> None:
-        """An output line contains the value and the address only."""
-        for name in NAMES:
-            profile = load_profile(name)
-            if isinstance(profile, AsciiProfile):
-                for output in profile.outputs.values():
-                    assert fields_of(output.write) <= {"value", "address"}
+def test_round_trip(profiles, name):
+    """A profile survives writing and reading."""
+    profile = profiles[name]
+    assert type(profile).model_validate(profile.model_dump()) == profile
+    assert type(profile) in {profile_class(kind) for kind in link_kinds()}
 
 
-class TestBoards:
-    """Microcontroller boards."""
+def test_provenance(profiles, name):
+    """Documents are named, and each unverified value is in the file and named once."""
+    profile, document = profiles[name], load_document(FOLDER / f"{name}.yaml")
+    assert profile.verified in {"partly", "no"}
+    assert len(set(profile.unverified)) == len(profile.unverified)
+    assert profile.unverified or profile.verified == "no"
+    assert all(document.holds(loc_of(key)) for key in profile.unverified)
 
-    @pytest.mark.parametrize(("name", "stream"), [("cobs_board", False), ("cobs_board_fifo", True)])
-    def test_board(self, name: str, stream: bool) -> None:
-        """Little-endian float32 volts in COBS frames, single samples or a stream."""
-        profile = load_profile(name)
-        assert isinstance(profile, FrameProfile)
-        assert (profile.exchange == "stream") is stream
-        assert (profile.link.framing, profile.link.crc) == ("cobs", "crc16_ccitt_false")
-        assert profile.outputs["DAC"].format.encode(2.5).hex() == "00002040"
+
+def test_missing_sensor_or_output_is_said_so(profiles, name):
+    """The notes of an output-only or input-only device mention a second device."""
+    profile = profiles[name]
+    channels = profile.inputs.values()
+    reads = any(getattr(channel, "measures", "terminal") == "terminal" for channel in channels)
+    said = any("sensor must be read by another device" in note for note in profile.notes)
+    assert said is not reads
+    only_reads = any(note.startswith("It only reads.") for note in profile.notes)
+    assert only_reads is not bool(profile.outputs)
+
+
+def test_watchdog(profiles, name):
+    """Unit, feeding and trip of the watchdog agree with the device."""
+    watchdog = profiles[name].watchdog
+    if name not in WATCHDOGS:
+        assert watchdog == "none"
+        return
+    assert WATCHDOGS[name] == (
+        watchdog.unit_s, watchdog.kick, watchdog.on_trip, watchdog.refuses_while_tripped,
+    )  # fmt: skip
+    assert watchdog.counts(watchdog.min_s) >= 1
+
+
+@pytest.mark.parametrize(("name", "output", "address", "function", "value", "data"), OUTPUTS)
+def test_modbus_output(modbus, name, output, address, function, value, data):
+    """An output's value goes to the right address, in the right bytes."""
+    channel = modbus[name].outputs[output]
+    assert modbus[name].wire_address(channel) == address
+    assert channel.function == function
+    assert channel.format.encode(value).hex() == data
+    assert channel.limits[0] <= value <= channel.limits[1]
+
+
+@pytest.mark.parametrize(("name", "sensor", "address", "function", "data", "value"), INPUTS)
+def test_modbus_input(modbus, name, sensor, address, function, data, value):
+    """An input is read from the right address and understood."""
+    channel = modbus[name].inputs[sensor]
+    assert modbus[name].wire_address(channel) == address
+    assert channel.read_function == function
+    assert channel.format.decode(bytes.fromhex(data)) == pytest.approx(value, abs=1e-9)
+
+
+@pytest.mark.parametrize(("name", "key", "area", "address"), SPECIAL)
+def test_other_registers(modbus, name, key, area, address):
+    """Addresses of settings, watchdog and self test agree with the documents."""
+    register = dict(modbus[name].registers())[key]
+    assert (register.area, modbus[name].wire_address(register)) == (area, address)
+
+
+def test_transactions(modbus):
+    """Devices with a function that writes and reads use one transaction, the others two."""
+    found = {name: each.exchange for name, each in modbus.items() if each.exchange != "none"}
+    assert found == EXCHANGES
+
+
+def test_waveshare_examples(modbus):
+    """The vendor's frames: output 0 set to 1000, all eight inputs, and their settings."""
+    output, reader = modbus["waveshare_ao_8ch"], modbus["waveshare_ai_8ch"]
+    channel = output.outputs["AO0"]
+    write = write_single_pdu(output.wire_address(channel), channel.format.encode(1.0))
+    values, settings = reader.inputs["AI0"], dict(reader.registers())["init.0"]
+    reads = [
+        read_pdu(each.read_function, reader.wire_address(each), 8) for each in (values, settings)
+    ]
+    assert output.unit_id == 1
+    assert [rtu_adu(1, pdu).hex(" ") for pdu in (write, *reads)] == [
+        "01 06 00 00 03 e8 89 74",
+        "01 04 00 00 00 08 f1 cc",
+        "01 03 10 00 00 08 40 cc",
+    ]
+
+
+def test_every_limit_can_be_written(modbus):
+    """Both ends of every output's range fit into its register and its raw limits."""
+    for channel in chain(*(each.outputs.values() for each in modbus.values())):
+        for value in channel.limits:
+            written = channel.format.decode(channel.format.encode(value))
+            assert written == pytest.approx(value, abs=1e-6)
+            low, high = channel.raw_limits
+            assert low <= round((written - channel.offset) / channel.scale, 6) <= high
+
+
+def test_write_only(modbus):
+    """A LJTick-DAC can't be read; everything else can, WAGO's outputs 0x0200 further."""
+    labjack, wago = modbus["labjack_t7"], modbus["wago_750"]
+    assert labjack.outputs["TDAC0"].readback_register is None
+    assert labjack.outputs["DAC0"].readback_register is labjack.outputs["DAC0"]
+    register = wago.outputs["AO0"].readback_register
+    assert wago.wire_address(register) == 0x0200
+    assert register.format.decode(bytes.fromhex("8001")) == pytest.approx(-10.0)
+
+
+def test_resolution(modbus):
+    """The resolution includes the bits that the device drops."""
+    assert modbus["wago_750"].outputs["AO0"].step == pytest.approx(8 * 10.0 / 32767)
+    assert modbus["adam_4024"].outputs["AO0"].step == pytest.approx(20.0 / 4095)
+    assert modbus["labjack_t7"].outputs["DAC0"].step == 1.22e-3
+
+
+@pytest.mark.parametrize("name", ["labjack_t4", "labjack_t7", "labjack_t8"])
+def test_flash_is_not_rewritten(modbus, name):
+    """LabJack keeps its watchdog settings in flash: unchanged values are not written."""
+    watchdog = modbus[name].watchdog
+    steps = (*watchdog.arm, *watchdog.safe["DAC0"], *watchdog.safe["DAC1"])
+    assert all(isinstance(step, EnsureStep) for step in steps)
+    assert not watchdog.disarm
+    first, last = watchdog.unlock[0], watchdog.arm[-1]
+    assert isinstance(first, RegisterStep)
+    assert isinstance(last, RegisterStep)
+    assert (first.address, first.value) == (last.address, 0.0)
+    assert last.value == 1.0
+
+
+@pytest.mark.parametrize(
+    ("name", "output", "value", "line"),
+    [
+        ("icp_m7024_dcon", "AO2", 5.0, "#012+05.000"),
+        ("icp_m7024_dcon", "AO0", -10.0, "#010-10.000"),
+        ("adam_4024_ascii", "AO1", 2.5, "#01C1+02.500"),
+        ("kepco_bop", "current", -2.5, "CURR -2.500000"),
+        ("kepco_bop", "current", 1e-7, "CURR 0.000000"),
+        ("tdk_lambda_gen", "current", 7.07, "PC 7.070"),
+    ],
+)
+def test_text_output(profiles, name, output, value, line):
+    """The output line agrees with the manual and has no exponent."""
+    profile = profiles[name]
+    address = 0 if profile.address == "none" else profile.address
+    assert profile.outputs[output].write.format(value=value, address=address) == line
+
+
+def test_dcon_watchdog(profiles):
+    """The manual's example: ~013164 is 10.0 s for module 01."""
+    profile = profiles["icp_m7024_dcon"]
+    step = profile.watchdog.arm[0]
+    assert isinstance(step, SendStep)
+    line = step.text.format(address=profile.address, timeout=profile.watchdog.counts(10.0))
+    assert line == "~013164"
+
+
+def test_kepco_exchange(profiles):
+    """One line sets the current and reads it back."""
+    line = profiles["kepco_bop"].exchange.write.format(value=1.0)
+    assert line == "CURR 1.000000;:MEAS:CURR?"
+
+
+def test_gap(profiles):
+    """TDK-Lambda needs 5 ms between commands."""
+    assert profiles["tdk_lambda_gen"].link.min_gap_s == 0.005
+
+
+def test_no_timeout_in_text_outputs(profiles):
+    """An output line contains the value and the address only."""
+    texts = [each for each in profiles.values() if isinstance(each, AsciiProfile)]
+    outputs = [output for each in texts for output in each.outputs.values()]
+    assert outputs
+    assert all(fields_of(output.write) <= {"value", "address"} for output in outputs)
+
+
+@pytest.mark.parametrize(("name", "stream"), [("cobs_board", False), ("cobs_board_fifo", True)])
+def test_board(profiles, name, stream):
+    """Little-endian float32 volts in COBS frames, single samples or a stream."""
+    profile = profiles[name]
+    assert isinstance(profile, FrameProfile)
+    assert (profile.exchange == "stream") is stream
+    assert (profile.link.framing, profile.link.crc) == ("cobs", "crc16_ccitt_false")
+    assert profile.outputs["DAC"].format.encode(2.5).hex() == "00002040"

@@ -5,16 +5,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-import typer
 
-from hilctl.base.errors import InputError, RunError
-from hilctl.cli.characterise import (
-    characterise,
-    plan_mapping,
-    print_characterisation,
-    print_plan,
-    print_step,
-)
+from hilctl.base.errors import RunError
+from hilctl.cli.characterise import plan_mapping, print_characterisation, print_plan, print_step
 from hilctl.run.start import StepStoppedError, paced, unpaced
 from hilctl.studies.characterise.characterisation_runner import CharacterisationPlan
 from hilctl.studies.characterise.results import Characterisation, StepRow
@@ -52,102 +45,92 @@ def ends(monkeypatch, limits):
     return asked
 
 
-def command(tmp_path, **more):
-    """Call the command with its defaults."""
-    wanted = {"folder": None, "settings": None, "highest_hz": None, "fast": True}
-    wanted |= {"dry_run": False, "overwrite": False, "as_json": False, **more}
-    characterise(tmp_path / "rig.yaml", tmp_path / "model.yaml", **wanted)
+@pytest.fixture
+def command(ends, hilctl, tmp_path):
+    """Return a function that runs the command."""
+    words = ("characterise", tmp_path / "rig.yaml", "--output", tmp_path / "model.yaml")
+    return lambda *more: hilctl(*words, *more)
 
 
-def test_plan_and_result_are_printed(ends, tmp_path, capsys):
-    command(tmp_path)
-    shown = capsys.readouterr().out
-    assert all(value in shown for value in ("-4 to 4 A", "-50 to 50 µm", "0.5 to 80 Hz", "2 s"))
-    assert "30.0 nm rms" in shown
+def test_plan_and_result_are_printed(ends, command, tmp_path):
+    code, shown, _ = command("--fast")
+    assert code == 0
+    for value in ("-4 to 4 A", "-50 to 50 µm", "0.5 to 80 Hz", "2 s", "30.0 nm rms"):
+        assert value in shown
     assert (tmp_path / "model.html").is_file()
     assert ends["folder"] == tmp_path / "model-runs"
     assert ends["run"] is unpaced
     assert "discarded" not in ends
 
 
-def test_one_json_object_is_printed(ends, tmp_path, capsys):
-    command(tmp_path, as_json=True, fast=False, highest_hz=20.0)
-    printed = json.loads(capsys.readouterr().out)
+def test_one_json_object_is_printed(ends, command, tmp_path):
+    printed = json.loads(command("--json", "--highest-hz", 20)[1])
     assert printed["page"] == str(tmp_path / "model.html")
     assert printed["output"] == str(tmp_path / "model.yaml")
     assert (ends["run"], ends["highest_hz"]) == (paced, 20.0)
 
 
 @pytest.mark.parametrize("as_json", [False, True])
-def test_dry_run_prints_the_plan_only(ends, tmp_path, capsys, as_json):
-    command(tmp_path, dry_run=True, as_json=as_json)
-    shown = capsys.readouterr().out
+def test_dry_run_prints_the_plan_only(ends, command, tmp_path, as_json):
+    _, shown, _ = command("--dry-run", *["--json"] * as_json)
     assert "ran" not in ends
     assert list(tmp_path.glob("model*")) == []
-    if as_json:
-        assert json.loads(shown)["rig_time_s"] == 2.0
-    else:
-        assert "noise" in shown
+    assert json.loads(shown)["rig_time_s"] == 2.0 if as_json else "noise" in shown
 
 
-def test_problem_of_the_rig_has_exit_code_3(ends, tmp_path, capsys):
+def test_problem_of_the_rig_has_exit_code_3(ends, command, tmp_path):
     """The page has the measured values."""
     ends["found"] = replace(ends["found"], problem="no reaction: look", problem_code="no_reaction")
-    with pytest.raises(typer.Exit) as ended:
-        command(tmp_path)
-    assert ended.value.exit_code == 3
-    assert "no reaction: look" in capsys.readouterr().err
+    code, _, err = command("--fast")
+    assert code == 3
+    assert "no reaction: look" in err
     assert (tmp_path / "model.html").is_file()
 
 
-def test_invalid_model_has_exit_code_1(ends, tmp_path, capsys):
+def test_invalid_model_has_exit_code_1(ends, command):
     ends["is_model"] = False
-    with pytest.raises(typer.Exit) as ended:
-        command(tmp_path, as_json=True)
-    assert ended.value.exit_code == 1
-    assert json.loads(capsys.readouterr().out)["output"] is None
+    code, shown, _ = command("--json")
+    assert (code, json.loads(shown)["output"]) == (1, None)
 
 
 @pytest.mark.parametrize(
     ("error", "code"),
-    [(StepStoppedError("rest: stopped", 15), 143), (KeyboardInterrupt(), 130)],
+    [
+        (StepStoppedError("rest: stopped", 15), 143),
+        (KeyboardInterrupt(), 130),
+        (RunError("slow-loops: the cable was pulled"), 3),
+    ],
 )
-def test_message_of_a_stop_says_how_to_resume(ends, tmp_path, capsys, error, code):
+def test_message_of_a_stop_or_fault_says_how_to_resume(ends, command, error, code):
     ends["error"] = error
-    with pytest.raises(typer.Exit) as ended:
-        command(tmp_path)
-    assert ended.value.exit_code == code
-    assert "resumes" in capsys.readouterr().err
+    ended, _, err = command()
+    assert ended == code
+    assert str(error) in err
+    assert "resumes" in err
 
 
-def test_message_of_a_fault_says_how_to_resume(ends, tmp_path):
-    ends["error"] = RunError("slow-loops: the cable was pulled")
-    with pytest.raises(RunError, match="cable was pulled"):
-        command(tmp_path)
-
-
-def test_existing_model_is_refused(ends, tmp_path):
+def test_existing_model_is_refused(ends, command, tmp_path):
     (tmp_path / "model.yaml").write_text("mine")
-    with pytest.raises(InputError, match="overwrite"):
-        command(tmp_path)
+    code, _, err = command()
+    assert (code, "--overwrite" in err) == (2, True)
     assert "ran" not in ends
-    command(tmp_path, overwrite=True)
+    command("--overwrite")
     assert ends["discarded"]
 
 
-def test_existing_page_is_refused(ends, tmp_path):
+def test_existing_page_is_refused(command, tmp_path):
     """A page of this characterisation (with its recordings) is replaced."""
     (tmp_path / "model.html").write_text("mine")
-    with pytest.raises(InputError, match="overwrite"):
-        command(tmp_path)
+    code, _, err = command()
+    assert (code, "--overwrite" in err) == (2, True)
     (tmp_path / "model-runs").mkdir()
     (tmp_path / "model-runs" / "01-rest.mcap").touch()
-    command(tmp_path)
+    assert command()[0] == 0
 
 
-def test_model_must_not_have_the_name_of_its_page(ends, tmp_path):
-    with pytest.raises(InputError, match="page"):
-        characterise(tmp_path / "rig.yaml", tmp_path / "model.html")
+def test_model_must_not_have_the_name_of_its_page(command, tmp_path):
+    code, _, err = command("--output", tmp_path / "model.html")
+    assert (code, "page" in err) == (2, True)
 
 
 def test_plan_prints_cooling_with_a_thermal_limit(limits_with, capsys):

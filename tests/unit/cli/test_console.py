@@ -82,42 +82,26 @@ def compile_something():
     return inner
 
 
-@pytest.fixture
-def at_terminal(monkeypatch):
-    """Return a function that replaces standard error by a terminal (pytest replaces it too)."""
-
-    def put():
-        made = Terminal()
-        monkeypatch.setattr("sys.stderr", made)
-        return made
-
-    return put
-
-
-def test_each_kernel_is_named(at_terminal):
-    terminal = at_terminal()
+def test_each_kernel_is_named(monkeypatch):
+    shown = Terminal()
+    monkeypatch.setattr("sys.stderr", shown)
     with compile_progress():
         pass
-    assert terminal.getvalue() == ""  # nothing was compiled
+    assert shown.getvalue() == ""  # nothing was compiled
     with compile_progress():
         compile_something()
         compile_something()
-    lines = terminal.getvalue().splitlines()
+    lines = shown.getvalue().splitlines()
     assert "once" in lines[0]
     assert lines[1:] == ["  inner", "  inner"]
     compile_something()
-    assert len(terminal.getvalue().splitlines()) == 3
+    assert len(shown.getvalue().splitlines()) == 3
 
 
-def test_compilation_is_not_shown_without_a_terminal(capsys):
+@pytest.mark.parametrize(("quiet", "stream"), [(True, Terminal()), (False, io.StringIO())])
+def test_compilation_is_not_shown_if_quiet_or_without_a_terminal(monkeypatch, quiet, stream):
+    monkeypatch.setattr("sys.stderr", stream)
+    monkeypatch.setattr(Verbosity, "quiet", quiet)
     with compile_progress():
         compile_something()
-    assert capsys.readouterr().err == ""
-
-
-def test_quiet_hides_compilation(at_terminal, monkeypatch):
-    terminal = at_terminal()
-    monkeypatch.setattr(Verbosity, "quiet", True)
-    with compile_progress():
-        compile_something()
-    assert terminal.getvalue() == ""
+    assert stream.getvalue() == ""

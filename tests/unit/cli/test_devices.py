@@ -1,21 +1,13 @@
 """Commands on this computer and its devices: doctor, devices."""
 
 import io
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 from rich.console import Console
-from typer.testing import CliRunner
 
-from hilctl.cli.devices import (
-    devices_,
-    print_described,
-    print_inventory,
-    print_probed,
-    render_diagnosis,
-)
+from hilctl.cli.devices import print_described, print_inventory, print_probed, render_diagnosis
 from hilctl.experiment.devices import DeviceDescription, DeviceOption, Inventory, SerialPort
 from hilctl.machine.diagnosis import Diagnosis
 from hilctl.machine.timer_latency import Latency
@@ -24,48 +16,34 @@ from hilctl.run.probe import Probed
 DEMO = Path(__file__).parents[3] / "configs" / "demo.yaml"
 
 
-@pytest.fixture
-def devices():
-    """Return a function that runs `hilctl devices` and returns its output."""
-
-    def run(*words):
-        ended = CliRunner().invoke(devices_, list(map(str, words)))
-        assert ended.exit_code == 0, ended.output
-        return ended.stdout
-
-    return run
-
-
-def test_devices_are_listed(devices):
-    listed = json.loads(devices("--json"))
+def test_devices_are_listed(hilctl, json_of):
+    _, listed = json_of("devices")
     assert "simulated_terfenol" in listed["devices"]
     assert "labjack_t7" in listed["profiles"]
-    shown = devices()
+    code, shown, _ = hilctl("devices")
+    assert code == 0
     assert "simulated_terfenol" in shown
     assert "labjack_t7" in shown
 
 
-def test_probe_prints_the_answers_of_a_device(devices):
-    probed = json.loads(devices("probe", DEMO, "--json"))
-    assert probed["name"] == "simulated_terfenol"
+def test_probe_prints_the_answers_of_a_device(hilctl, json_of):
+    code, probed = json_of("devices", "probe", DEMO)
+    assert (code, probed["name"]) == (0, "simulated_terfenol")
     assert probed["max_rate_hz"] > 0.0
-    shown = devices("probe", DEMO)
+    _, shown, _ = hilctl("devices", "probe", DEMO)
     assert "simulated_terfenol answers" in shown
     assert "profiles" not in shown
+    code, _, err = hilctl("devices", "probe", "absent.yaml")
+    assert code == 2
+    assert err.startswith("hilctl: absent.yaml")
 
 
-def test_implausible_answer_has_exit_code_3(monkeypatch):
-    wrong = Probed("rig", "a device", 1.0, "", "", {}, 2.8e20, None, "A", ("too far",))
-    monkeypatch.setattr("hilctl.cli.devices.read_device", lambda path, settings: wrong)
-    for words in ([], ["--json"]):
-        ended = CliRunner().invoke(devices_, ["probe", str(DEMO), *words])
-        assert ended.exit_code == 3
-        assert "too far" in ended.stdout
-
-
-@pytest.fixture(autouse=True)
-def wide(monkeypatch):
-    monkeypatch.setenv("COLUMNS", "150")
+@pytest.mark.parametrize("words", [[], ["--json"]])
+def test_implausible_answer_has_exit_code_3(monkeypatch, hilctl, words):
+    monkeypatch.setattr("hilctl.cli.devices.read_device", lambda path, settings: PROBED)
+    code, shown, _ = hilctl("devices", "probe", DEMO, *words)
+    assert code == 3
+    assert "too far" in shown
 
 
 def test_bars_are_logarithmic():

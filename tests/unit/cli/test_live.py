@@ -1,6 +1,5 @@
 """Live views of runs: ``hilctl watch`` without a run, ``hilctl live`` without its server."""
 
-import json
 import os
 import pty
 import select
@@ -12,12 +11,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from rich.text import Text
-from typer.testing import CliRunner
 
 from hilctl.base.errors import InputError, RunError
 from hilctl.base.events import Event
 from hilctl.cli import live as module
-from hilctl.cli.commands import app
 from hilctl.cli.console import print_rich
 from hilctl.cli.live import View, print_lines
 from hilctl.live.scope import WINDOWS_S, Buckets, ScopeWindow
@@ -29,35 +26,27 @@ class FakeFeed:
     """A run that ends after some polls."""
 
     def __init__(self, polls=10**9, inverse="in"):
-        self.folder, self.inverse, self.loop_input, self.state = (
-            "folder",
-            inverse,
-            "reference",
-            "running",
-        )
-        self.ended, self._polls = False, polls
+        self.folder, self.inverse, self.loop_input = "folder", inverse, "reference"
+        self.state, self.ended, self._polls = "running", False, polls
         self.description = SimpleNamespace(command_unit="A", sample_rate_hz=1000.0)
         self.events = [Event(1000 * k, "info", "mark", f"tap {k}") for k in range(5)]
         t_s = np.linspace(0.0, 0.02, 300)
-        values = np.tile(40.0 * np.sin(628.0 * t_s), (len(SIGNALS), 1))
-        window = ScopeWindow(t_s, Buckets(values, values, values))
-        self.scope = SimpleNamespace(
-            triggered=lambda: window, rolling=lambda s: window, loops=lambda: values[:2]
-        )
+        self.show(t_s, np.tile(40.0 * np.sin(628.0 * t_s), (len(SIGNALS), 1)))
         self.values = {
-            "run": "demo-7",
-            "state": "running",
-            "reason": "",
-            "t_s": 12.34,
-            "total_s": 30.0,
-            "inverse": inverse,
-            "gain": 0.7,
-            "offset": -2.0,
+            "run": "demo-7", "state": "running", "reason": "", "t_s": 12.34, "total_s": 30.0,
+            "inverse": inverse, "gain": 0.7, "offset": -2.0,
             "figures": {"peak_hysteresis_percent": 29.6, "rms_error_percent": None},
-            "lateness_us": {"p50": 3.0, "p99": 21.0, "max": 40.0},
-            "late_ticks": 9,
+            "lateness_us": {"p50": 3.0, "p99": 21.0, "max": 40.0}, "late_ticks": 9,
             "gauges": [{"name": "command", "used": 0.84}],
-        }
+        }  # fmt: skip
+
+    def show(self, t_s, values):
+        """Replace the signals, which have no loop if there are fewer than 100 samples."""
+        window = ScopeWindow(t_s, Buckets(values, values, values))
+        loops = values[:2] if t_s.size > 100 else np.empty((2, 0))
+        self.scope = SimpleNamespace(
+            triggered=lambda: window, rolling=lambda s: window, loops=lambda: loops
+        )
 
     def status(self):
         return self.values
@@ -81,14 +70,13 @@ def sent(monkeypatch):
             raise InputError("set: too much")
         return wanted
 
-    monkeypatch.setattr(module, "set_run", set_run)
-    monkeypatch.setattr(module, "mark_run", lambda folder, text: asked.append(text) or {"x": 1})
-    monkeypatch.setattr(module, "request_stop", lambda folder: asked.append("stop") or True)
-
-    def thread(target, daemon):
-        return SimpleNamespace(start=target)
-
-    monkeypatch.setattr(module, "threading", SimpleNamespace(Thread=thread))
+    for name, value in {
+        "set_run": set_run,
+        "mark_run": lambda folder, text: asked.append(text) or {"x": 1},
+        "request_stop": lambda folder: asked.append("stop") or True,
+        "threading.Thread": lambda target, daemon: SimpleNamespace(start=target),
+    }.items():
+        monkeypatch.setattr(f"hilctl.cli.live.{name}", value)
     return asked
 
 
@@ -132,10 +120,11 @@ def test_refused_request_is_shown(sent, monkeypatch, capsys):
 def test_slow_change_does_not_delay_a_stop(monkeypatch):
     started = []
     view = View(FakeFeed())
-    thread = SimpleNamespace(
-        Thread=lambda target, daemon: SimpleNamespace(start=lambda: started.append(target))
-    )
-    monkeypatch.setattr(module, "threading", thread)
+
+    def thread(target, daemon):
+        return SimpleNamespace(start=lambda: started.append(target))
+
+    monkeypatch.setattr(module.threading, "Thread", thread)
     monkeypatch.setattr(module, "request_stop", lambda folder: False)
     view.press(b"is")
     assert len(started) == 2
@@ -194,18 +183,15 @@ def test_screen_fits_the_terminal(size):
 
 def test_the_screen_has_state_limits_figures_and_the_newest_events(capsys):
     text = shown(View(FakeFeed()), capsys)
-    for value in ("demo-7", "running", "12.3/30.0 s", "gain 0.7", "offset -2", "29.60 %", "84 %"):
-        assert value in text
-    for value in ("late ticks 9", "21 us", "3.000 s  mark: tap 3", "tap 4"):
+    values = "demo-7|running|12.3/30.0 s|gain 0.7|offset -2|29.60 %|84 %|late ticks 9|21 us"
+    for value in (*values.split("|"), "3.000 s  mark: tap 3", "tap 4"):
         assert value in text
     assert "tap 1" not in text
 
 
 def test_empty_signal_has_no_curve(capsys):
     feed = FakeFeed()
-    nothing = np.full((len(SIGNALS), 3), np.nan)
-    empty = ScopeWindow(np.arange(3.0), Buckets(nothing, nothing, nothing))
-    feed.scope.triggered, feed.scope.loops = lambda: empty, lambda: np.empty((2, 0))
+    feed.show(np.arange(3.0), np.full((len(SIGNALS), 3), np.nan))
     assert not any(0x2800 < ord(each) < 0x2900 for each in shown(View(feed), capsys))
 
 
@@ -213,12 +199,9 @@ def test_a_missing_reference_does_not_change_the_scale(capsys):
     feed = FakeFeed()
     values = np.full((len(SIGNALS), 3), np.nan)
     values[1] = 100.0, 110.0, 120.0
-    window = ScopeWindow(np.arange(3.0), Buckets(values, values, values))
-    feed.scope.triggered, feed.scope.loops = lambda: window, lambda: np.empty((2, 0))
+    feed.show(np.arange(3.0), values)
     text = shown(View(feed), capsys)
-    assert "120┤" in text
-    assert "100┤" in text
-    assert "newest cycles, axis in s" in text
+    assert all(each in text for each in ("120┤", "100┤", "newest cycles, axis in s"))
 
 
 def test_control_characters_are_escaped(monkeypatch, capsys):
@@ -239,9 +222,8 @@ def test_lines_show_each_event_once_and_the_state(monkeypatch, capsys):
     monkeypatch.setattr(module.time, "sleep", lambda s: None)
     print_lines(FakeFeed(polls=15))
     lines = capsys.readouterr().out.splitlines()
-    assert [line for line in lines if "mark" in line] == [
-        f"{k}.000 s  mark: tap {k}" for k in range(5)
-    ]
+    marks = [f"{k}.000 s  mark: tap {k}" for k in range(5)]
+    assert [line for line in lines if "mark" in line] == marks
     assert sum(line.startswith("12.3 s  running  hyst. 29.60 %") for line in lines) == 2
 
 
@@ -292,7 +274,7 @@ def test_terminal_is_restored_on_every_exit(terminal, monkeypatch, way_out):
     text = ""
     while not text.endswith("\x1b[?1049l"):  # the kernel passes it on in parts
         assert select.select([user], [], [], 5.0)[0]
-        text += os.read(user, 1000).decode()
+        text += os.read(user, 1000).decode(errors="replace")
     assert text.startswith("\x1b[?1049h")
     assert text.rindex("\x1b[?25l") < text.rindex("\x1b[?25h")
     assert termios.tcgetattr(sys.stdin.fileno()) == before
@@ -312,17 +294,24 @@ def test_lines_are_printed_in_the_background_and_without_a_terminal(terminal, mo
 
 @pytest.fixture
 def run(monkeypatch):
-    """A run that is over, shown without a terminal."""
+    """A run that is over, shown without a terminal by the subprocess of its supervisor 7."""
     made = SimpleNamespace(card=SimpleNamespace(name="demo-7", supervisor=7))
     made.description = SimpleNamespace(exists=lambda: True)
     made.feed = FakeFeed()
     made.feed.ended, made.feed.state = True, "stopped"
     made.feed.values["reason"] = "by hand"
-    monkeypatch.setattr(module, "find_run", lambda name: made)
-    monkeypatch.setattr(module, "RunReader", lambda folder: made.feed)
-    monkeypatch.setattr(module, "print_lines", lambda feed: None)
-    monkeypatch.setattr(module.signal, "signal", lambda *given: None)
-    monkeypatch.setattr(module, "_has_keys", lambda: False)
+    for name, value in {
+        "find_run": lambda name: made,
+        "runs": lambda: [made],
+        "RunReader": lambda folder: made.feed,
+        "print_lines": lambda feed: None,
+        "signal.signal": lambda *given: None,
+        "_has_keys": lambda: False,
+        "os.getppid": lambda: 7,
+        "time.sleep": lambda s: None,
+        "sys.argv": ["watch", "7"],
+    }.items():
+        monkeypatch.setattr(f"hilctl.cli.live.{name}", value)
     return made
 
 
@@ -344,9 +333,6 @@ def test_subprocess_shows_the_run_of_its_parent(run, monkeypatch, capsys):
     other = SimpleNamespace(card=SimpleNamespace(name="x", supervisor=8))
     found = iter([[], [other], [other, run]])
     monkeypatch.setattr(module, "runs", lambda: next(found))
-    monkeypatch.setattr(module.os, "getppid", lambda: 7)
-    monkeypatch.setattr(module.time, "sleep", lambda s: None)
-    monkeypatch.setattr(sys, "argv", ["watch", "7"])
     module.main()
     monkeypatch.setattr(module.os, "getppid", lambda: 1)
     module.main()
@@ -358,69 +344,59 @@ def test_run_that_ended_before_it_was_read_is_one_message(run, monkeypatch, caps
         raise RunError("demo-7: gone")
 
     monkeypatch.setattr(module, "RunReader", refuse)
-    monkeypatch.setattr(module, "runs", lambda: [run])
-    monkeypatch.setattr(module.os, "getppid", lambda: 7)
-    monkeypatch.setattr(module.time, "sleep", lambda s: None)
-    monkeypatch.setattr(sys, "argv", ["watch", "7"])
     module.main()
     assert capsys.readouterr().err == "hilctl: demo-7: gone\n"
 
 
 @pytest.fixture
 def served(monkeypatch):
-    """Replace the server; return its arguments."""
+    """Replace the servers; return their arguments."""
     given = {}
 
-    def serve_runs(chosen, over, on_url, port):
-        given.update(chosen=chosen, over=over, port=port)
-        on_url("http://127.0.0.1:5/#x")
+    def server(url):
+        def serve(chosen, over, on_url, port):
+            given.update(chosen=chosen, over=over, port=port)
+            on_url(url)
 
-    monkeypatch.setattr("hilctl.cli.live.serve_runs", serve_runs)
+        return serve
+
+    monkeypatch.setattr(module, "serve_runs", server("http://127.0.0.1:5/#x"))
+    monkeypatch.setattr(module, "serve_foxglove", server("ws://127.0.0.1:5"))
     return given
 
 
-def test_address_is_printed(served):
-    said = CliRunner().invoke(app, ["live", "--port", "5"])
-    assert said.output == "live page: http://127.0.0.1:5/#x\n"
+def test_address_is_printed(served, hilctl, json_of):
+    assert hilctl("live", "--port", "5")[1] == "live page: http://127.0.0.1:5/#x\n"
     assert served["port"] == 5
     assert served["chosen"]([]) is None
     assert served["chosen"](["a", "b"]) == "a"
     assert not served["over"](None)
-    assert json.loads(CliRunner().invoke(app, ["live", "--json"]).output)["url"].endswith("/#x")
+    assert json_of("live")[1] == {"url": "http://127.0.0.1:5/#x"}
 
 
-def test_foxglove_has_a_default_port(monkeypatch):
-    ports = []
-
-    def serve_foxglove(chosen, over, on_url, port):
-        ports.append(port)
-        on_url("ws://127.0.0.1:5")
-
-    monkeypatch.setattr("hilctl.cli.live.serve_foxglove", serve_foxglove)
-    said = CliRunner().invoke(app, ["live", "--foxglove"])
-    assert said.output == "Foxglove server: ws://127.0.0.1:5\n"
-    CliRunner().invoke(app, ["live", "--foxglove", "--port", "0"])
-    assert ports == [None, 0]
+@pytest.mark.parametrize(("words", "port"), [([], None), (["--port", "0"], 0)])
+def test_foxglove_has_a_default_port(served, hilctl, words, port):
+    assert hilctl("live", "--foxglove", *words)[1] == "Foxglove server: ws://127.0.0.1:5\n"
+    assert served["port"] == port
 
 
-def test_run_is_found_by_the_beginning_of_its_name(served, tmp_path):
+def test_run_is_found_by_the_beginning_of_its_name(served, hilctl, tmp_path):
     with run_folder("demo", tmp_path / "a.mcap", 1.0) as (folder, _):
-        assert CliRunner().invoke(app, ["live", "de"]).exit_code == 0
+        assert hilctl("live", "de")[0] == 0
         assert served["chosen"]([]) == folder
 
 
-def test_unknown_run_is_refused(served, tmp_path):
-    said = CliRunner().invoke(app, ["live", "x"])
-    assert isinstance(said.exception, InputError)
+def test_unknown_run_is_refused(served, hilctl, tmp_path):
+    assert hilctl("live", "x")[0] == 2
     with run_folder("demo", tmp_path / "a.mcap", 1.0):
-        said = CliRunner().invoke(app, ["live", "x"])
-    assert "'x'" in str(said.exception)
+        code, _, err = hilctl("live", "x")
+    assert (code, "'x'" in err) == (2, True)
     assert not served
 
 
-def test_server_ends_if_its_run_ended_before_it_was_read(served, tmp_path):
+def test_server_ends_if_its_run_ended_before_it_was_read(served, hilctl, tmp_path):
     nothing = SimpleNamespace(feed=lambda name: None)
     with run_folder("demo", tmp_path / "a.mcap", 1.0) as (folder, _):
-        CliRunner().invoke(app, ["live", folder.card.name])
+        hilctl("live", folder.card.name)
         assert not served["over"](nothing)
     assert served["over"](nothing)

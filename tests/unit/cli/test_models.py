@@ -4,19 +4,9 @@ import json
 from pathlib import Path
 
 import pytest
-import typer
 
 from hilctl.base.errors import InputError
-from hilctl.cli.models import (
-    _column,
-    _numbers,
-    headings,
-    notes,
-    print_settings,
-    refine,
-    render_comparison,
-    table_rows,
-)
+from hilctl.cli.models import _column, _numbers, headings, notes, render_comparison, table_rows
 from hilctl.comparison.compare import ComparisonRequest, compare
 from hilctl.identify.settings import IdentifySettings
 from hilctl.models.model_file import dump_model, load_model
@@ -24,26 +14,33 @@ from tests.fakes import SteppingClock
 from tests.unit.identify.refine.conftest import OLD, actuator, history
 
 
-def test_every_setting_is_listed(capsys: pytest.CaptureFixture[str]) -> None:
-    print_settings()
-    shown = {*capsys.readouterr().out.split()}
+def test_every_setting_is_listed(hilctl):
+    shown = {*hilctl("identify", "--settings")[1].split()}
     assert {*IdentifySettings.model_fields.keys() - {"table"}, "table.rate_hz"} <= shown
 
 
-def given(monkeypatch, tmp_path, truth):
-    """Replace the runs to load; return model file, paths and output."""
-    runs = [history(truth, i, noise_um=0.05) for i in range(4)]
-    monkeypatch.setattr("hilctl.identify.refine.refinement.load_runs", lambda paths, model: runs)
+@pytest.fixture
+def refined(monkeypatch, tmp_path, hilctl):
+    """Return a function that refines a model with runs of another, and the new model's file."""
     (tmp_path / "old.yaml").write_text(dump_model(OLD))
-    return tmp_path / "old.yaml", [Path(f"{i}.mcap") for i in range(4)], tmp_path / "better.yaml"
+    output = tmp_path / "better.yaml"
+
+    def refine(truth, *options):
+        runs = [history(truth, i, noise_um=0.05) for i in range(4)]
+        loaded = "hilctl.identify.refine.refinement.load_runs"
+        monkeypatch.setattr(loaded, lambda paths, model: runs)
+        names = [f"{i}.mcap" for i in range(4)]
+        return hilctl("refine", tmp_path / "old.yaml", *names, "--output", output, *options)
+
+    return refine, output
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
-def test_better_model_is_written(monkeypatch, tmp_path, capsys):
-    model, runs, output = given(monkeypatch, tmp_path, actuator())
-    refine(model, runs, output, html=tmp_path / "page.html", as_json=True)
-    printed = json.loads(capsys.readouterr().out)
+def test_better_model_is_written(refined, tmp_path):
+    refine, output = refined
+    _, shown, _ = refine(actuator(), "--html", tmp_path / "page.html", "--json")
+    printed = json.loads(shown)
     assert printed["output"] == str(output)
     assert printed["better"]
     assert printed["ratio"] < 0.5
@@ -52,35 +49,25 @@ def test_better_model_is_written(monkeypatch, tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_no_better_model_has_exit_code_1(monkeypatch, tmp_path, capsys):
-    model, runs, output = given(monkeypatch, tmp_path, OLD)
-    with pytest.raises(typer.Exit) as ended:
-        refine(model, runs, output)
-    assert ended.value.exit_code == 1
+def test_no_better_model_has_exit_code_1(refined):
+    refine, output = refined
+    code, shown, _ = refine(OLD)
+    assert code == 1
     assert not output.exists()
-    printed = capsys.readouterr().out
-    assert "no better" in printed
-    assert "not written" in printed
+    assert "no better" in shown
+    assert "not written" in shown
 
 
 ROOT = Path(__file__).parents[3]
-
-
 GOLDEN = ROOT / "recordings" / "golden" / "terfenol_uncompensated.mcap"
-
-
 OMEGA = ROOT / "configs" / "models" / "terfenol_omega.yaml"
-
-
-def ignore(done, text):
-    """Ignore progress."""
 
 
 @pytest.fixture(scope="module")
 def comparison():
     """Two models of the catalogue and one of a file, tested at 100 Hz."""
-    request = ComparisonRequest([GOLDEN], ["duhem", "straight", str(OMEGA)], frequencies_hz=[100.0])
-    return compare(request, SteppingClock(1e-3), ignore)
+    request = ComparisonRequest([GOLDEN], ["spi", "straight", str(OMEGA)], frequencies_hz=[100.0])
+    return compare(request, SteppingClock(1e-3), lambda done, text: None)
 
 
 def test_table_has_a_column_per_trial(comparison):

@@ -7,16 +7,9 @@ from pathlib import Path
 import pytest
 from mcap.writer import Writer
 
-from hilctl.base.errors import InputError
-from hilctl.cli.commands import load
-from hilctl.cli.recordings import recover
 from hilctl.run.run_folder import base_folder
 
 GOLDEN = Path(__file__).parents[3] / "recordings" / "golden"
-
-
-def list_recordings(words):
-    return load("list")(words, standalone_mode=False)
 
 
 @pytest.fixture(autouse=True)
@@ -42,16 +35,11 @@ def folder(tmp_path):
     return made
 
 
-def test_table_has_a_line_per_run_without_control_characters(folder, capsys):
-    list_recordings([str(folder)])
-    out, err = capsys.readouterr()
+def test_table_has_a_line_per_run_without_control_characters(folder, hilctl):
+    _, out, err = hilctl("list", folder)
     lines = out.splitlines()
-    assert [line.split("  ")[0] for line in lines[1:5]] == [
-        "2026-11-21 01:20:46",
-        "2026-11-21 01:20:49",
-        "2026-11-21 01:20:52",
-        "2030-01-01 00:00:00",
-    ]
+    started = [*(f"2026-11-21 01:20:{s}" for s in (46, 49, 52)), "2030-01-01 00:00:00"]
+    assert [line.split("  ")[0] for line in lines[1:5]] == started
     assert lines[4].endswith("labelled.mcap")
     for text in ("fault", "1.235", "12", r"n\x1b[1m", r"sample A7, note \x1b]0;x\x07"):
         assert text in lines[4]
@@ -61,61 +49,54 @@ def test_table_has_a_line_per_run_without_control_characters(folder, capsys):
     assert all(each.isprintable() for each in (*lines, *err.splitlines()))
 
 
-def test_columns_are_aligned(folder, capsys):
-    list_recordings([str(folder)])
-    lines = capsys.readouterr().out.splitlines()[:-1]
+def test_columns_are_aligned(folder, hilctl):
+    lines = hilctl("list", folder)[1].splitlines()[:-1]
     for heading in ("name", "result", "labels", "recording"):
         column = lines[0].index(f" {heading}")
         assert all(line[column] == " " and line[column + 1] != " " for line in lines)
 
 
-def test_json_has_all_keys(folder, capsys):
-    list_recordings([str(folder), "--json", "--where", "label.sample == 'A7'"])
-    found = json.loads(capsys.readouterr().out)
+def test_json_has_all_keys(folder, json_of):
+    _, found = json_of("list", folder, "--where", "label.sample == 'A7'")
     assert (found["folder"], found["of"]) == (str(folder), 5)
     (run,) = found["recordings"]
     assert run["labels"] == {"sample": "A7", "note": "\x1b]0;x\x07"}
     assert (run["code"], run["peak_error_percent"], run["run_id"]) == ("fault", 1.23456, None)
-    list_recordings([str(folder), "--json", "--where", "label.sample == 'A8'"])
-    assert json.loads(capsys.readouterr().out)["recordings"] == []
+    assert json_of("list", folder, "--where", "label.sample == 'A8'")[1]["recordings"] == []
 
 
-def test_rows_are_selected_and_sorted(folder, capsys):
+def test_rows_are_selected_and_sorted(folder, hilctl):
     words = ["--where", "frequency_hz BETWEEN 1 AND 1e6", "--sort", "size_bytes", "--reverse"]
-    list_recordings([str(folder), *words])
-    lines = capsys.readouterr().out.splitlines()
+    lines = hilctl("list", folder, *words)[1].splitlines()
     names = [line.split()[-1] for line in lines[1:-1]]
     assert names == sorted(names, key=lambda name: -(folder / name).stat().st_size)
     assert lines[-1] == "3 of 5 recordings"
-    with pytest.raises(InputError, match="siez"):
-        list_recordings([str(folder), "--sort", "siez"])
+    code, _, err = hilctl("list", folder, "--sort", "siez")
+    assert (code, "siez" in err) == (2, True)
 
 
-def test_keys_are_printed_one_per_line(folder, capsys):
-    list_recordings([str(folder), "--keys"])
-    keys = capsys.readouterr().out.splitlines()
+def test_keys_are_printed_one_per_line(folder, hilctl):
+    keys = hilctl("list", folder, "--keys")[1].splitlines()
     assert {"frequency_hz", "label.sample", "device.load_kg", "peak_hysteresis_percent"} <= {*keys}
 
 
-def test_default_folder_is_recordings(tmp_path, monkeypatch, capsys):
+def test_default_folder_is_recordings(tmp_path, monkeypatch, hilctl):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(InputError, match="recordings"):
-        list_recordings([])
+    code, _, err = hilctl("list")
+    assert (code, "recordings" in err) == (2, True)
     (tmp_path / "recordings").mkdir()
-    list_recordings([])
-    assert capsys.readouterr().out == "0 of 0 recordings\n"
+    assert hilctl("list")[1] == "0 of 0 recordings\n"
 
 
-def test_damaged_run_is_dismissed_by_name(capsys):
+def test_damaged_run_is_dismissed_by_name(hilctl):
     folder = base_folder() / "sine-7"
     folder.mkdir()
     (folder / "run.json").write_text('{"started": "x"}')
-    recover(dismissed="sine-7")
-    assert str(folder) in capsys.readouterr().out
+    assert str(folder) in hilctl("recover", "--dismiss", "sine-7")[1]
     assert not folder.exists()
 
 
-@pytest.mark.parametrize("given", [{}, {"recording": "a", "dismissed": "b"}])
-def test_recover_needs_either_run_or_name(given):
-    with pytest.raises(InputError, match="--dismiss NAME alone"):
-        recover(**given)
+@pytest.mark.parametrize("words", [[], ["a", "--dismiss", "b"]])
+def test_recover_needs_either_run_or_name(hilctl, words):
+    code, _, err = hilctl("recover", *words)
+    assert (code, "--dismiss" in err) == (2, True)

@@ -11,117 +11,86 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import typer
 from rich.console import Console
 
 from hilctl.analysis.report import summarize
-from hilctl.analysis.run_metrics import RunReport
-from hilctl.base.errors import InputError
 from hilctl.base.segments import Segment
-from hilctl.base.types import F64
 from hilctl.cli import run as module
-from hilctl.cli.run import (
-    check,
-    print_run,
-    render_report,
-    report_of,
-    run,
-    run_mapping,
-    run_progress,
-    safe,
-)
+from hilctl.cli.run import print_run, render_report, report_of, run_mapping, run_progress
 from hilctl.run.result import RunResult
 from hilctl.run.safety.manual_safe import SafeResult
 
 DEMO = Path(__file__).parents[3] / "configs" / "demo.yaml"
+ENDED = RunResult(Path("a.mcap"), "stopped", "hilctl stop", "confirmed", 15, 0, 3, 2)
 
 
 @pytest.fixture
-def ended(monkeypatch):
-    """Return a function that sets the result of a run and returns the arguments of its start."""
-    started = []
+def started(monkeypatch):
+    """Replace runs; return the arguments of their start, and the fields of their result."""
+    asked, ends = [], {"code": "completed", "stop_signal": 0}
 
-    def so(code, stop_signal=0):
-        def start_run(experiment, settings, output, overwrite, on_progress):
-            started.append((experiment, settings, output, overwrite))
-            return RunResult(Path("no.mcap"), code, "because", "confirmed", stop_signal, 0, 0, 0)
+    def start_run(experiment, settings, output, overwrite, on_progress):
+        asked.append((experiment, settings, output, overwrite))
+        return replace(ENDED, **ends)
 
-        monkeypatch.setattr("hilctl.api.runs.start_run", start_run)
-        monkeypatch.setattr("hilctl.cli.run.report_of", lambda result, *, every: None)
-        return started
-
-    return so
+    monkeypatch.setattr("hilctl.api.runs.start_run", start_run)
+    monkeypatch.setattr(module, "report_of", lambda result, *, every: None)
+    return asked, ends
 
 
 @pytest.mark.parametrize(
     ("code", "stop_signal", "exit_code"), [("fault", 0, 3), ("stopped", signal.SIGTERM, 143)]
 )
-def test_exit_code_of_an_incomplete_run(ended, code, stop_signal, exit_code):
+def test_exit_code_of_an_incomplete_run(started, hilctl, code, stop_signal, exit_code):
+    started[1].update(code=code, stop_signal=stop_signal)
     before = signal.getsignal(signal.SIGTERM)
-    ended(code, stop_signal)
     try:
-        with pytest.raises(typer.Exit) as left:
-            run(DEMO, as_json=True)
+        assert hilctl("run", DEMO)[0] == exit_code
     finally:
         signal.signal(signal.SIGTERM, before)
-    assert left.value.exit_code == exit_code
 
 
-def test_require_rt_is_the_last_setting(ended, capsys):
-    started = ended("completed")
-    run(DEMO, settings=["block=25"], require_rt=True, as_json=True)
-    assert started == [(DEMO, ["block=25", "realtime.require=true"], None, False)]
-    assert json.loads(capsys.readouterr().out)["code"] == "completed"
+def test_require_rt_is_the_last_setting(started, json_of):
+    _, result = json_of("run", DEMO, "--require-rt", "--set", "block=25")
+    assert started[0] == [(DEMO, ["block=25", "realtime.require=true"], None, False)]
+    assert result["code"] == "completed"
 
 
-def test_check_prints_the_forecast(capsys):
-    check(DEMO, ["waveform.duration_s=1.0"], as_json=True)
-    printed = json.loads(capsys.readouterr().out)
+def test_check_prints_the_forecast(json_of):
+    _, printed = json_of("check", DEMO, "--set", "waveform.duration_s=1.0")
     assert printed["experiment"] == str(DEMO)
     assert printed["samples"] == 50_000
 
 
 @pytest.mark.parametrize("as_json", [True, False])
-def test_unconfirmed_safe_value_has_exit_code_3(monkeypatch, capsys, as_json):
+def test_unconfirmed_safe_value_has_exit_code_3(monkeypatch, hilctl, as_json):
     put = SafeResult("a device", 0.0, "A", "unknown", "no answer")
-    monkeypatch.setattr("hilctl.cli.run.put_safe", lambda path, settings: put)
-    with pytest.raises(typer.Exit) as left:
-        safe(DEMO, as_json=as_json)
-    assert left.value.exit_code == 3
-    out, err = capsys.readouterr()
+    monkeypatch.setattr(module, "put_safe", lambda path, settings: put)
+    code, out, err = hilctl("safe", DEMO, *["--json"] * as_json)
+    assert code == 3
     assert "no answer" in (out if as_json else err)
     assert not as_json or json.loads(out)["output_safe"] is False
 
 
-def test_confirmed_safe_value_is_printed(monkeypatch, capsys):
+def test_confirmed_safe_value_is_printed(monkeypatch, hilctl):
     put = SafeResult("a device", 0.25, "A", "confirmed", "")
-    monkeypatch.setattr("hilctl.cli.run.put_safe", lambda path, settings: put)
-    safe(DEMO)
-    assert "0.25 A" in capsys.readouterr().out
+    monkeypatch.setattr(module, "put_safe", lambda path, settings: put)
+    assert "0.25 A" in hilctl("safe", DEMO)[1]
 
 
-def test_detach_excludes_live():
+@pytest.mark.parametrize("words", [["--detach", "--live"], ["--watch", "--json"]])
+def test_incompatible_options_are_refused(hilctl, words):
     """The log of a background run must not contain the token of the page."""
-    with pytest.raises(InputError, match="hilctl live"):
-        run(DEMO, detach=True, live=True)
-
-
-ENDED = RunResult(Path("a.mcap"), "stopped", "hilctl stop", "confirmed", 15, 0, 3, 2)
+    code, _, err = hilctl("run", DEMO, *words)
+    assert (code, words[1] in err) == (2, True)
 
 
 def test_run_mapping():
     assert run_mapping(ENDED, None) == {
-        "recorded_samples": 0,
-        "dropped": 3,
-        "output": "a.mcap",
-        "code": "stopped",
-        "reason": "hilctl stop",
-        "output_safe": True,
-        "output_state": "confirmed",
-        "guardian_active": False,
-        "deadline_misses": "",
-        "adapted": {},
-    }
+        "recorded_samples": 0, "dropped": 3, "output": "a.mcap", "code": "stopped",
+        "reason": "hilctl stop", "output_safe": True, "output_state": "confirmed",
+        "guardian_active": False, "deadline_misses": "", "adapted": {},
+    }  # fmt: skip
 
 
 def test_address_of_the_page_is_printed_with_the_first_samples(capsys):
@@ -138,10 +107,8 @@ def test_run_without_samples_has_no_report():
 
 @pytest.mark.parametrize("safe", [True, False])
 def test_unsafe_output_is_printed(capsys, safe):
-    result = RunResult(
-        Path("a.mcap"), "fault", "lost", "confirmed" if safe else "unknown", 0, 0, 0, 0
-    )
-    print_run(result, None)
+    state = "confirmed" if safe else "unknown"
+    print_run(replace(ENDED, code="fault", reason="lost", output_state=state), None)
     shown = capsys.readouterr().out
     assert "fault: lost" in shown
     assert "no samples" in shown
@@ -150,9 +117,7 @@ def test_unsafe_output_is_printed(capsys, safe):
 
 def test_adaptation_is_printed_without_a_report(capsys):
     adapted = {"offset_um": 1.25, "gain": 1.02, "weight_1": -0.005}
-    print_run(
-        RunResult(Path("a.mcap"), "completed", "", "confirmed", 0, 9, 0, 0, adapted=adapted), None
-    )
+    print_run(replace(ENDED, samples=9, adapted=adapted), None)
     assert "offset +1.25 µm, gain 1.0200" in capsys.readouterr().out
 
 
@@ -169,7 +134,7 @@ def test_subprocess_of_the_view_ends_with_the_run(monkeypatch, ignores):
             started.append((command, self))
 
     monkeypatch.setattr(subprocess, "Popen", Started)
-    with module._watched(requested=True):
+    with module._watched():
         assert started[0][1].poll() is None
     ((command, process),) = started
     assert command[-2:] == ["hilctl.cli.live", str(os.getpid())]
@@ -179,12 +144,12 @@ def test_subprocess_of_the_view_ends_with_the_run(monkeypatch, ignores):
 LAG = 0.05
 
 
-def wave(period: float, cycles: int, lag: float = 0.0) -> F64:
+def wave(period, cycles, lag=0.0):
     """Return whole cycles of a sine in um."""
     return 40.0 * np.sin(2.0 * np.pi * np.arange(period * cycles) / period - lag)
 
 
-def segment(start: int, samples: int, period: float, label: str = "sine") -> Segment:
+def segment(start, samples, period, label="sine"):
     """Return a segment without soft start or end."""
     return Segment(label, start, start + samples, start, start + samples, period)
 
@@ -200,14 +165,14 @@ def lagging(make_recording):
     return make
 
 
-def terminal(report: RunReport) -> str:
+def terminal(report):
     """Return what a terminal of 120 columns shows."""
     console = Console(width=120, file=io.StringIO(), record=True)
     console.print(render_report(report))
     return console.export_text()
 
 
-def test_noise_floor_is_printed_with_the_hysteresis(lagging) -> None:
+def test_noise_floor_is_printed_with_the_hysteresis(lagging):
     recording = lagging()
     recording.samples.displacement_um[:] += np.random.default_rng(2).normal(0.0, 0.03, 5000)
     report = summarize(recording)
@@ -216,13 +181,14 @@ def test_noise_floor_is_printed_with_the_hysteresis(lagging) -> None:
     assert f"noise floor {report.noise_floor_percent:.4g} %" in line
 
 
-def test_simulated_device_is_marked(lagging) -> None:
+def test_simulated_and_incomplete_runs_are_marked(lagging):
     simulated = lagging(run={"name": "x", "device": "my_rig", "simulated": "true"})
     assert "no hardware" in terminal(summarize(simulated))
     assert "no hardware" not in terminal(summarize(lagging()))
+    assert "NOT complete" in terminal(summarize(replace(lagging(), end={})))
 
 
-def test_names_are_not_markup(lagging) -> None:
+def test_names_are_not_markup(lagging):
     parts = [segment(0, 2000, 1000.0, "[red]a[/red]"), segment(2000, 3000, 1000.0, "[b]")]
     run = {"name": "[bold]name", "device": "[dac]"}
     text = terminal(summarize(lagging(run=run, segments=parts)))
@@ -230,7 +196,7 @@ def test_names_are_not_markup(lagging) -> None:
         assert shown in text
 
 
-def test_uncompensated_run_shows_no_errors(make_recording) -> None:
+def test_uncompensated_run_shows_no_errors(make_recording):
     """Rows without a value are omitted."""
     recording = make_recording(wave(1000.0, 3), segments=[segment(0, 3000, 1000.0)])
     text = terminal(summarize(recording))
@@ -238,7 +204,7 @@ def test_uncompensated_run_shows_no_errors(make_recording) -> None:
     assert "nothing compensated" in text
 
 
-def test_segments_have_a_table_without_empty_columns(make_recording) -> None:
+def test_segments_have_a_table_without_empty_columns(make_recording):
     """Columns without a value are omitted."""
     parts = [segment(0, 3000, 1000.0, "first"), segment(3000, 3000, 1000.0, "second")]
     recording = make_recording(wave(1000.0, 6, LAG), command=wave(1000.0, 6), segments=parts)
@@ -248,12 +214,8 @@ def test_segments_have_a_table_without_empty_columns(make_recording) -> None:
     assert "err. %" not in text
 
 
-def test_incomplete_run_is_marked(lagging) -> None:
-    assert "NOT complete" in terminal(summarize(replace(lagging(), end={})))
-
-
 @pytest.mark.parametrize(("minutes", "shown"), [(20, range(20)), (21, range(1, 21))])
-def test_worst_minutes_are_shown(lagging, minutes, shown) -> None:
+def test_worst_minutes_are_shown(lagging, minutes, shown):
     """In chronological order."""
     late = {"p50": 80.0, "p90": 90.0, "p99": 95.0, "p99.9": 99.0}
     rows = [{"minute": k, "ticks": 60_000, **late, "max": 100.0 + k} for k in range(minutes)]

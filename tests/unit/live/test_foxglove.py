@@ -11,17 +11,14 @@ import threading
 import time
 import xml.etree.ElementTree as ET
 from contextlib import contextmanager
-from pathlib import Path
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from websockets.asyncio.client import connect
 
 from hilctl.base.errors import InputError, RunError
 from hilctl.base.events import Event
-from hilctl.base.samples import BlockHeader
 from hilctl.live.foxglove import (
     DIAGNOSTICS,
     DIAGNOSTICS_SCHEMA,
@@ -31,48 +28,23 @@ from hilctl.live.foxglove import (
 )
 from hilctl.live.run_reader import RunReader
 from hilctl.recording.schema import TOPICS, message_class
-from hilctl.run.metadata import RunDescription
-from hilctl.run.run_folder import run_folder
-from hilctl.run.shared.ring import SampleRing
-from hilctl.run.shared.shared_page import PageField, Phase
-from hilctl.run.start import checked_experiment
+from hilctl.run.shared.shared_page import PageField
+from tests.unit.live.conftest import CONFIGS, active_run, exchange, first
 
-CONFIGS = Path(__file__).parents[3] / "configs"
-BLOCK = 50
 START_NS = 1_700_000_000_000_000_000
 
 
-@contextmanager
-def active_run(place, slots):
-    """Yield the folder and the ring of a run at 50 kHz, so that a bucket is 42 samples."""
-    with run_folder("demo", place / "a.mcap", 12.0) as (folder, _):
-        RunDescription.of(checked_experiment(CONFIGS / "demo.yaml", [])).write(folder.description)
-        ring = SampleRing.create(folder.ring, slots=slots, block=BLOCK, state_size=1)
-        ring.page.put(PageField.PHASE, Phase.RUNNING)
-        yield folder, ring
-
-
 @pytest.fixture
-def run(tmp_path):
-    with active_run(tmp_path, 512) as made:
-        yield made
+def run(description, tmp_path):
+    """Return a function that exchanges blocks, the reader of the run, and its messages."""
+    with active_run(description, tmp_path, 512) as (folder, ring):
+        feed = RunReader(folder)
 
+        def after(now_s, blocks, **more):
+            exchange(ring, blocks, keep=500, **more)
+            feed.poll(now_s)
 
-def exchange(ring, blocks, spike=None, keep=500):
-    for number in blocks:
-        block = ring.claim()
-        index = number * BLOCK + np.arange(BLOCK)
-        block.head[BlockHeader.FIRST_SAMPLE] = index[0]
-        block.flags[:] = 0
-        block.reference[:] = block.input_um[:] = index
-        block.command[:] = block.wanted[:] = index / 10.0
-        ring.sending(block)
-        block.displacement_um[:] = index
-        if number == spike:
-            block.displacement_um[7] += 1e6
-        ring.answered(block)
-        while ring.pop() is not None:
-            ring.release(keep=keep)
+        yield ring, LiveTopics(feed, START_NS), after
 
 
 def decoded(messages):
@@ -85,12 +57,10 @@ def decoded(messages):
 
 
 def test_the_scope_has_each_bucket_once_and_every_spike(run):
-    folder, ring = run
-    feed = RunReader(folder)
-    topics, seen = LiveTopics(feed, START_NS), []
-    for blocks in (range(20), range(20, 21), range(21, 80)):
-        exchange(ring, blocks, spike=33)
-        feed.poll(1.0)
+    _, topics, after = run
+    seen = []
+    for blocks in (range(20), range(20, 34), range(34, 80)):
+        after(1.0, blocks, spike_um=1e6 if 33 in blocks else 0.0)
         seen += topics.scope()
     found = decoded(seen)
     first = found["/scope"]
@@ -106,28 +76,20 @@ def test_the_scope_has_each_bucket_once_and_every_spike(run):
 
 
 def test_overwritten_buckets_are_omitted(run):
-    folder, ring = run
-    feed = RunReader(folder)
-    topics = LiveTopics(feed, START_NS)
-    exchange(ring, range(400))
-    feed.poll(1.0)
-    newest = decoded(topics.scope())["/scope"]
-    assert newest[-1][1].sample == 42 * (400 * 50 // 42 - 1)
-    exchange(ring, range(400, 500))
-    feed.poll(1.1)
-    exchange(ring, range(500, 900))
-    feed.poll(1.2)
+    _, topics, after = run
+    after(1.0, range(400))
+    assert decoded(topics.scope())["/scope"][-1][1].sample == 42 * (400 * 50 // 42 - 1)
+    after(1.1, range(400, 500))
+    after(1.2, range(500, 900))
     newest = decoded(topics.scope(["/scope"]))["/scope"]
     assert len(newest) < 600
     assert newest[-1][1].sample == 42 * (900 * 50 // 42 - 1)
 
 
 def test_events_are_those_of_the_recording(run):
-    folder, ring = run
-    feed = RunReader(folder)
-    topics = LiveTopics(feed, START_NS)
+    ring, topics, after = run
     ring.page.push_event(Event(5000, "warning", "late", "a tick", {"late_s": 0.5}))
-    feed.poll(1.0)
+    after(1.0, [])
     (time_ns, event), *more = decoded(topics.events())["/events"]
     assert not more
     assert (time_ns, event.sample) == (START_NS + 100_000_000, 5000)
@@ -137,11 +99,9 @@ def test_events_are_those_of_the_recording(run):
 
 
 def test_diagnostics_have_the_form_expected_by_panels(run):
-    folder, ring = run
-    feed = RunReader(folder)
-    exchange(ring, range(100))
-    feed.poll(1.0)
-    topic, time_ns, data = LiveTopics(feed, START_NS).diagnostics(12_000_000_034)
+    _, topics, after = run
+    after(1.0, range(100))
+    topic, time_ns, data = topics.diagnostics(12_000_000_034)
     said = json.loads(data)
     assert (topic, time_ns) == (DIAGNOSTICS, 12_000_000_034)
     assert said["header"]["stamp"] == {"sec": 12, "nsec": 34}
@@ -179,7 +139,8 @@ def test_foxglove_layout_names_existing_fields():
 def test_plotjuggler_layout_names_existing_fields():
     tree = ET.parse(CONFIGS / "layouts" / "plotjuggler.xml")
     made = {snippet.get("name") for snippet in tree.iter("snippet")}
-    names = {text for snippet in tree.iter("snippet") for text in sources(snippet)}
+    sources = [each for snippet in tree.iter("snippet") for each in snippet.iter()]
+    names = {each.text for each in sources if re.fullmatch("linked_source|v[0-9]+", each.tag)}
     for curve in tree.iter("curve"):
         pair = [curve.get("curve_x"), curve.get("curve_y")]
         names.update(pair if all(pair) else [curve.get("name")])
@@ -188,11 +149,6 @@ def test_plotjuggler_layout_names_existing_fields():
         assert field in fields_of(f"/{topic}")
         assert f"/{topic}" in TOPICS  # the layout opens a recording too
     assert len(names) > 6
-
-
-def sources(snippet):
-    """Return the sources of a computed series."""
-    return [each.text for each in snippet.iter() if re.fullmatch("linked_source|v[0-9]+", each.tag)]
 
 
 def test_log_settings_are_restored():
@@ -206,41 +162,36 @@ def test_server_stops_with_clients_that_do_not_read(monkeypatch):
     monkeypatch.setattr("hilctl.live.foxglove._STOP_S", 0.01)
     server, go_on = FoxgloveServer(first, port=0), threading.Event()
     library, server._server = server._server, SimpleNamespace(stop=lambda: go_on.wait(60.0))
-    server.run(lambda server: True)
-    assert not go_on.is_set()
+    server.run(lambda _: True)
     go_on.set()
     library.stop()
 
 
-def first(runs):
-    return runs[0] if runs else None
-
-
 @contextmanager
-def serving(tmp_path):
+def serving(description, tmp_path):
     """Serve a run that continues until the end; yield the address."""
-    over = threading.Event()
-    with active_run(tmp_path, 64) as (_, ring):
+    end, numbers = threading.Event(), iter(range(10**6))
+
+    def over(_):
+        exchange(ring, [next(numbers)], keep=8)
+        return end.is_set()
+
+    with active_run(description, tmp_path, 64) as (_, ring):
         ring.page.put(PageField.START_NS, time.monotonic_ns())
-        server, numbers = FoxgloveServer(first, port=0), iter(range(10**6))
-
-        def sleep(seconds):
-            exchange(ring, [next(numbers)], keep=8)
-            over.wait(0.002)
-
-        server._sleep = sleep
-        thread = threading.Thread(target=server.run, args=(lambda _: over.is_set(),))
+        server = FoxgloveServer(first, port=0)
+        thread = threading.Thread(target=server.run, args=(over,))
         thread.start()
         try:
             yield server.url
         finally:
-            over.set()
+            end.set()
             thread.join()
 
 
 async def seen(url, topics, wanted):
     """Return the channels by topic, and messages of some topics."""
-    async with connect(url, subprotocols=["foxglove.sdk.v1"], proxy=None) as connection:
+    settings = {"subprotocols": ["foxglove.sdk.v1"], "proxy": None, "close_timeout": 0.2}
+    async with connect(url, **settings) as connection:
         channels, found = {}, {topic: [] for topic in topics}
         async for raw in connection:
             if isinstance(raw, str):
@@ -273,8 +224,9 @@ def decode(channel, data):
     return kind.FromString(data)
 
 
-def test_client_decodes_all_topics_with_the_advertised_schemas(tmp_path):
-    with serving(tmp_path) as url:
+def test_client_decodes_all_topics(description, tmp_path, monkeypatch):
+    monkeypatch.setattr("hilctl.live.foxglove._FRAME_S", 0.002)
+    with serving(description, tmp_path) as url:
         topics = ["/scope", "/scope_low", "/diagnostics"]
         channels, found = asyncio.run(asyncio.wait_for(seen(url, topics, 2), 20.0))
     assert set(channels) == {"/scope", "/scope_low", "/scope_high", "/events", "/diagnostics"}
@@ -287,10 +239,8 @@ def test_client_decodes_all_topics_with_the_advertised_schemas(tmp_path):
         assert message.displacement_um == message.sample
     assert decode(channels["/events"], b"").DESCRIPTOR.full_name == "hilctl.Event"
     diagnostics = channels["/diagnostics"]
-    assert (diagnostics["encoding"], diagnostics["schemaName"]) == (
-        "json",
-        "diagnostic_msgs/DiagnosticArray",
-    )
+    assert diagnostics["encoding"] == "json"
+    assert diagnostics["schemaName"] == "diagnostic_msgs/DiagnosticArray"
     shown = json.loads(diagnostics["schema"])["properties"]
     assert json.loads(found["/diagnostics"][0][1]).keys() == shown.keys()
 

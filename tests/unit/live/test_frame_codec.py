@@ -11,16 +11,15 @@ from hilctl.base.events import Event
 from hilctl.base.segments import Segment
 from hilctl.live.frame_codec import frame_of, frames_of, nearest_window_s
 from hilctl.live.scope import Buckets, Scope, ScopeWindow
-from hilctl.live.traces import ROW, SIGNALS, Traces
+from hilctl.live.traces import ROW, SIGNALS
 from tests.fakes import SteppingClock
+from tests.unit.live.conftest import traces
 
 
 @pytest.fixture
 def scope():
     made = Scope(1000.0, [Segment("sine", 0, 9000, 0, 9000, 50.0)], "reference")
-    values = np.tile(np.arange(600.0), (len(SIGNALS), 1))
-    values[ROW["measured"]] = np.nan
-    made.add(Traces(np.arange(600), values, np.zeros(600, dtype=np.uint32)))
+    made.add(traces(0, **dict.fromkeys(ROW.keys() - {"measured"}, np.arange(600.0))))
     return made
 
 
@@ -52,11 +51,8 @@ def test_frame_without_a_cycle_rolls(scope):
     assert decoded(frame_of(empty, "cycle", 0.1))[0]["mode"] == "roll"
 
 
-@pytest.mark.parametrize(
-    ("wanted_s", "given_s"), [(2.0, 2.0), (1e9, 600.0), (1e-9, 0.02), (3, 2.0)]
-)
-def test_nearest_window(wanted_s, given_s):
-    assert nearest_window_s(wanted_s) == given_s
+def test_nearest_window():
+    assert [nearest_window_s(wanted_s) for wanted_s in (2, 1e9, 1e-9, 3)] == [2, 600, 0.02, 2]
 
 
 @pytest.fixture
@@ -75,11 +71,11 @@ def feed():
         return ScopeWindow(np.array([-2.0, -1.0, 0.0]), Buckets(values, values + 1.0, values))
 
     made.poll, made.scope = poll, SimpleNamespace(rolling=rolling)
-    made.status = lambda: {"t_s": looked[-1]}
-    made.events_since = lambda seen: (
-        [Event(k, "info", "mark", "") for k in range(seen, len(looked))],
-        len(looked),
-    )
+
+    def events_since(seen):
+        return [Event(k, "info", "mark", "") for k in range(seen, len(looked))], len(looked)
+
+    made.status, made.events_since = lambda: {"t_s": looked[-1]}, events_since
     return made
 
 

@@ -1,35 +1,22 @@
 """Use of each limit."""
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from hilctl.live.limit_usage import Gauge, Headroom
-from hilctl.live.traces import ROW, SIGNALS, Traces
 from hilctl.run.metadata import RunDescription
 from hilctl.run.start import checked_experiment
+from tests.unit.live.conftest import CONFIGS, traces
 
-DEMO = Path(__file__).parents[3] / "configs" / "demo.yaml"
+LIMITS = {"rms_current_a": 5, "thermal_time_constant_s": 10, "tracking_error_um": 8}
 
 
 @pytest.fixture(scope="module")
 def description():
-    more = (
-        "limits.rms_current_a=5",
-        "limits.thermal_time_constant_s=10",
-        "limits.tracking_error_um=8",
-    )
-    return RunDescription.of(checked_experiment(DEMO, more))
-
-
-def traces(start, **rows):
-    size = len(next(iter(rows.values())))
-    values = np.full((len(SIGNALS), size), np.nan)
-    for name, row in rows.items():
-        values[ROW[name]] = row
-    return Traces(np.arange(start, start + size), values, np.zeros(size, dtype=np.uint32))
+    settings = [f"limits.{key}={value}" for key, value in LIMITS.items()]
+    return RunDescription.of(checked_experiment(CONFIGS / "demo.yaml", settings))
 
 
 def used(headroom, late_s=0.0):

@@ -6,26 +6,24 @@ import pytest
 from hilctl.base.samples import BlockBatch, BlockHeader, Flag
 from hilctl.base.segments import Segment
 from hilctl.live.live_metrics import EDGES_US, LatenessCounts, LiveErrorSpectrum, RunningFigures
-from hilctl.live.traces import ROW, SIGNALS, Traces
+from hilctl.live.traces import ROW
 from hilctl.signals.cycle_metrics import peak_hysteresis_percent
+from tests.unit.live.conftest import traces
 
 RATE, PERIOD = 1000.0, 100.0
 SEGMENT = Segment("sine", 30, 100_000, 30, 100_000, PERIOD)
 
 
-def loop(start, stop, lag=0.2, flags=0):
-    index = np.arange(start, stop)
-    phase = 2 * np.pi * (index - 30) / PERIOD
-    values = np.zeros((len(SIGNALS), index.size))
-    values[ROW["reference"]] = 10.0 * np.sin(phase)
-    values[ROW["displacement"]] = 10.0 * np.sin(phase - lag)
-    values[ROW["error"]] = values[ROW["displacement"]] - values[ROW["reference"]]
-    return Traces(index, values, np.full(index.size, flags, dtype=np.uint32))
+def loop(start, stop, lag=0.2):
+    phase = 2 * np.pi * (np.arange(start, stop) - 30) / PERIOD
+    reference, displacement = 10.0 * np.sin(phase), 10.0 * np.sin(phase - lag)
+    error = displacement - reference
+    return traces(start, reference=reference, displacement=displacement, error=error)
 
 
-def added(figures, traces, segment=SEGMENT, part=37):
-    for at in range(0, traces.index.size, part):
-        figures.add(traces.rows(slice(at, at + part)), segment)
+def added(figures, samples, segment=SEGMENT, part=37):
+    for at in range(0, samples.index.size, part):
+        figures.add(samples.rows(slice(at, at + part)), segment)
     return figures
 
 
@@ -49,11 +47,10 @@ def test_metrics_are_of_the_newest_complete_cycles():
 
 
 def test_invalid_samples_are_omitted():
-    traces = loop(30, 1200)
-    traces.values[ROW["displacement"], 300] = 1e6
-    traces.values[ROW["error"], 300] = 1e6
-    traces.flags[300] = int(Flag.SENSOR_INVALID)
-    assert added(RunningFigures(RATE, "reference"), traces).newest["peak_error_um"] < 3.0
+    samples = loop(30, 1200)
+    samples.values[[ROW["displacement"], ROW["error"]], 300] = 1e6
+    samples.flags[300] = int(Flag.SENSOR_INVALID)
+    assert added(RunningFigures(RATE, "reference"), samples).newest["peak_error_um"] < 3.0
 
 
 def test_metrics_without_a_period():
@@ -82,17 +79,10 @@ def test_each_tick_is_counted_once():
     assert counts.percentiles_us()["max"] == 9e6
 
 
-def error(error_um, start=0):
-    values = np.zeros((len(SIGNALS), error_um.size))
-    values[ROW["error"]] = error_um
-    index = np.arange(start, start + error_um.size)
-    return Traces(index, values, np.zeros(error_um.size, dtype=np.uint32))
-
-
 def test_line_of_a_sine_in_the_spectrum():
     spectrum = LiveErrorSpectrum(50000.0)
     t_s = np.arange(16384) / 50000.0
-    spectrum.add(error(5.0 + 0.3 * np.sin(2 * np.pi * 1000.0 * t_s)))
+    spectrum.add(traces(0, error=5.0 + 0.3 * np.sin(2 * np.pi * 1000.0 * t_s)))
     hz, um = spectrum.points()
     assert um.max() == pytest.approx(0.3, rel=0.1)
     assert hz[um.argmax()] == pytest.approx(1000.0, rel=0.05)
@@ -101,7 +91,7 @@ def test_line_of_a_sine_in_the_spectrum():
 def test_gap_clears_the_spectrum():
     spectrum = LiveErrorSpectrum(1000.0)
     assert spectrum.points()[0].size == 0
-    spectrum.add(error(np.zeros(300)))
+    spectrum.add(traces(0, error=np.zeros(300)))
     assert spectrum.points()[0].size > 0
-    spectrum.add(error(np.array([np.nan, 1.0])))
+    spectrum.add(traces(300, error=[np.nan, 1.0]))
     assert spectrum.points()[0].size == 0

@@ -2,17 +2,12 @@
 
 import asyncio
 import json
+from unittest.mock import Mock
 
 import pytest
 
 from hilctl.live.page_session import SLOW_S, PageSession, PageView, RateLimiter
-
-
-class Transport:
-    aborted = False
-
-    def abort(self):
-        self.aborted = True
+from tests.fakes import SteppingClock
 
 
 class Connection:
@@ -20,7 +15,7 @@ class Connection:
 
     def __init__(self, *messages):
         self.messages, self.sent, self.closed = list(messages), [], None
-        self.transport = Transport()
+        self.transport = Mock()
         self.free = asyncio.Event()
         self.free.set()
 
@@ -46,28 +41,29 @@ def message(**fields):
     return json.dumps({"id": 1, "ask": "view"} | fields)
 
 
-def test_messages_are_answered_and_change_the_view():
-    async def exchanged():
-        view = {"run": "a", "mode": "roll", "window_s": 10.0}
-        connection = Connection(message(view=view), message(id=2, ask="stop"))
-        viewer = PageSession(connection, answer)
-        await viewer.serve()
-        return viewer.view, connection.sent
+def served(*messages):
+    """Return a session that has received messages at one time, and its connection."""
 
-    assert asyncio.run(exchanged()) == (
-        PageView(run="a", mode="roll", window_s=10.0),
-        ["1 view", "2 stop"],
-    )
+    async def exchanged():
+        connection = Connection(*messages)
+        viewer = PageSession(connection, answer, clock=lambda: 0.0)
+        await viewer.serve()
+        return viewer, connection
+
+    return asyncio.run(exchanged())
+
+
+def test_messages_are_answered_and_change_the_view():
+    view = {"run": "a", "mode": "roll", "window_s": 10.0}
+    viewer, connection = served(message(view=view), message(id=2, ask="stop"))
+    assert viewer.view == PageView(**view)
+    assert connection.sent == ["1 view", "2 stop"]
 
 
 def test_invalid_message_ends_the_connection():
-    async def closed(raw):
-        connection = Connection(raw, message(id=2))
-        await PageSession(connection, answer).serve()
-        return connection.closed[0], connection.sent
-
     for raw in ("", "{}", b"\xff\x00", message(ask="format"), message(more=1), message(id="1")):
-        assert asyncio.run(closed(raw)) == (1008, [])
+        _, connection = served(raw, message(id=2))
+        assert (connection.closed[0], connection.sent) == (1008, [])
 
 
 BAD_TIMES = ("0", "-0.0", "-1", "1e-320", "1e308", "NaN", "Infinity", "1e999", "true", '"2"', "[]")
@@ -75,15 +71,9 @@ BAD_TIMES = ("0", "-0.0", "-1", "1e-320", "1e308", "NaN", "Infinity", "1e999", "
 
 @pytest.mark.parametrize("value", [*BAD_TIMES, "null", "1" + "0" * 400])
 def test_invalid_window_is_refused_without_effect(value):
-    async def exchanged():
-        raw = f'{{"id": 5, "ask": "view", "view": {{"window_s": {value}}}}}'
-        connection = Connection(raw, message(id=6, ask="stop"))
-        viewer = PageSession(connection, answer)
-        await viewer.serve()
-        return viewer.view, connection
-
-    view, connection = asyncio.run(exchanged())
-    assert view == PageView()
+    raw = f'{{"id": 5, "ask": "view", "view": {{"window_s": {value}}}}}'
+    viewer, connection = served(raw, message(id=6, ask="stop"))
+    assert viewer.view == PageView()
     assert connection.closed is None
     refused = json.loads(connection.sent[0])
     assert (refused["kind"], refused["id"], refused["ok"]) == ("answer", 5, False)
@@ -92,29 +82,23 @@ def test_invalid_window_is_refused_without_effect(value):
 
 
 def test_too_many_messages_end_the_connection():
-    async def flooded():
-        connection = Connection(*[message()] * 500)
-        await PageSession(connection, answer, clock=lambda: 0.0).serve()
-        return connection
-
-    connection = asyncio.run(flooded())
+    _, connection = served(*[message()] * 500)
     assert connection.closed == (1008, "too many messages")
     assert len(connection.sent) == 40
 
 
 def test_rate_limiter_refills():
-    now = [0.0]
-    allowance = RateLimiter(2.0, 3.0, lambda: now[0])
-    assert [allowance.take() for _ in range(4)] == [True, True, True, False]
-    now[0] = 1.0
-    assert [allowance.take() for _ in range(3)] == [True, True, False]
+    clock = SteppingClock()
+    limiter = RateLimiter(2.0, 3.0, clock)
+    assert [limiter.take() for _ in range(4)] == [True, True, True, False]
+    clock.now = 1.0
+    assert [limiter.take() for _ in range(3)] == [True, True, False]
 
 
 def test_slow_page_gets_the_newest_frame_and_is_disconnected():
     async def slow():
-        now = [0.0]
-        connection = Connection()
-        viewer = PageSession(connection, answer, clock=lambda: now[0])
+        clock, connection = SteppingClock(), Connection()
+        viewer = PageSession(connection, answer, clock)
         connection.free.clear()
         viewer.offer("status", b"old")
         await asyncio.sleep(0)
@@ -125,12 +109,12 @@ def test_slow_page_gets_the_newest_frame_and_is_disconnected():
         assert connection.sent == ["status", b"old"]
         connection.free.clear()
         viewer.offer(b"new")
-        now[0] = SLOW_S - 0.1
+        clock.now = SLOW_S - 0.1
         assert not viewer.ready
-        assert not connection.transport.aborted
-        now[0] = SLOW_S + 0.1
+        assert not connection.transport.abort.called
+        clock.now = SLOW_S + 0.1
         assert not viewer.ready
-        assert connection.transport.aborted
+        assert connection.transport.abort.called
         connection.free.set()
         await asyncio.sleep(0.01)
 

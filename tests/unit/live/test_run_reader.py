@@ -1,63 +1,31 @@
 """Readers of active runs."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from hilctl.base.errors import RunError
 from hilctl.base.events import Event
-from hilctl.base.samples import BlockHeader
 from hilctl.live.run_reader import RunList, RunReader
 from hilctl.live.traces import ROW
 from hilctl.loop.safe_output import LoopOutcome
-from hilctl.run.metadata import RunDescription
 from hilctl.run.run_folder import run_folder
-from hilctl.run.shared.ring import SampleRing
-from hilctl.run.shared.shared_page import PageField, Phase, Stop
-from hilctl.run.start import checked_experiment
-
-DEMO = Path(__file__).parents[3] / "configs" / "demo.yaml"
-BLOCK = 50
-
-
-@pytest.fixture(scope="module")
-def description():
-    return RunDescription.of(checked_experiment(DEMO, []))
+from hilctl.run.shared.shared_page import PageField, Stop
+from tests.unit.live.conftest import BLOCK, active_run, begun, exchange, first
 
 
 @pytest.fixture
 def run(description, tmp_path):
-    """Folder and ring of an active run."""
-    with run_folder("demo", tmp_path / "a.mcap", 12.0) as (folder, _):
-        description.write(folder.description)
-        ring = SampleRing.create(folder.ring, slots=128, block=BLOCK, state_size=1)
+    """An active run: its reader and its ring."""
+    with active_run(description, tmp_path, 128) as (folder, ring):
         ring.page.put(PageField.WAVEFORM_AT, 100)
-        ring.page.put(PageField.PHASE, Phase.RUNNING)
-        yield folder, ring
-
-
-def exchange(ring, blocks, spike=None):
-    for number in blocks:
-        block = ring.claim()
-        index = number * BLOCK + np.arange(BLOCK)
-        block.head[BlockHeader.FIRST_SAMPLE] = index[0]
-        block.head[BlockHeader.LATE_NS] = 20_000
-        block.flags[:] = 0
-        block.reference[:] = block.input_um[:] = 40.0 * np.sin(2 * np.pi * (index - 100) / 1000.0)
-        block.command[:] = block.wanted[:] = block.reference / 10.0
-        ring.sending(block)
-        block.displacement_um[:] = block.reference
-        if number == spike:
-            block.displacement_um[7] += 9.0
-        ring.answered(block)
+        yield RunReader(folder), ring
 
 
 def test_samples_are_read_without_consuming_them(run):
-    folder, ring = run
-    feed = RunReader(folder)
-    exchange(ring, range(80), spike=71)
+    feed, ring = run
+    exchange(ring, range(80), spike_um=9.0)
     assert feed.poll(1.0)
     assert not feed.poll(1.03)
     assert ring.page.get(PageField.TAIL) == 0
@@ -68,8 +36,7 @@ def test_samples_are_read_without_consuming_them(run):
 
 
 def test_overwritten_samples_are_counted(run):
-    folder, ring = run
-    feed = RunReader(folder)
+    feed, ring = run
     exchange(ring, range(2))
     feed.poll(1.0)
     exchange(ring, range(2, 60))
@@ -80,22 +47,17 @@ def test_overwritten_samples_are_counted(run):
 
 
 def test_events_are_read_once_in_order(run):
-    folder, ring = run
-    feed = RunReader(folder)
+    feed, ring = run
     for number in range(40):
         ring.page.push_event(Event(number, "info", f"e{number}", ""))
     ring.page.leave_note(Event(50, "info", "mark", "tapped"))
     feed.poll(1.0)
     feed.poll(1.1)
-    assert [event.code for event in feed.events] == [
-        *(f"e{number}" for number in range(32)),
-        "mark",
-    ]
+    assert [event.code for event in feed.events] == [*(f"e{n}" for n in range(32)), "mark"]
 
 
 def test_status_is_json(run):
-    folder, ring = run
-    feed = RunReader(folder)
+    feed, ring = run
     exchange(ring, range(100))
     feed.poll(1.0)
     status = json.loads(json.dumps(feed.status(), allow_nan=False))
@@ -110,10 +72,7 @@ def test_status_is_json(run):
 
 
 def test_end_of_a_run_keeps_its_data(description, tmp_path):
-    with run_folder("demo", tmp_path / "a.mcap", 12.0) as (folder, _):
-        description.write(folder.description)
-        ring = SampleRing.create(folder.ring, slots=16, block=BLOCK, state_size=1)
-        ring.page.put(PageField.PHASE, Phase.RUNNING)
+    with active_run(description, tmp_path) as (folder, ring):
         feed = RunReader(folder)
         exchange(ring, range(3))
         feed.poll(1.0)
@@ -129,8 +88,7 @@ def test_unreadable_run_is_an_error(tmp_path):
 
 
 def test_state_of_the_inverse(run):
-    folder, ring = run
-    feed = RunReader(folder)
+    feed, ring = run
     assert feed.inverse == "in"
     ring.page.put(PageField.TUNE_WANTED, 1)
     assert feed.status()["inverse"] == "out"
@@ -141,8 +99,7 @@ def test_state_of_the_inverse(run):
 
 
 def test_events_since(run):
-    folder, ring = run
-    feed, seen = RunReader(folder), 0
+    (feed, ring), seen = run, 0
     for number in range(100):
         ring.page.leave_note(Event(number, "info", "mark", ""))
         feed.poll(float(number))
@@ -151,15 +108,6 @@ def test_events_since(run):
     assert seen == 100
     assert [event.sample for event in feed.events_since(10)[0]] == list(range(40, 100))
     assert feed.events_since(100) == ([], 100)
-
-
-def first(runs):
-    return runs[0] if runs else None
-
-
-def begun(folder, description):
-    description.write(folder.description)
-    SampleRing.create(folder.ring, slots=16, block=50, state_size=1)
 
 
 def test_run_is_listed_until_it_has_ended_and_is_not_shown(description, tmp_path):

@@ -6,17 +6,16 @@ import pytest
 from hilctl.base.samples import Flag
 from hilctl.base.segments import Segment
 from hilctl.live.scope import BUCKETS, WINDOWS_S, MinMaxTrace, Scope
-from hilctl.live.traces import ROW, SIGNALS, Traces
+from hilctl.live.traces import ROW
+from tests.unit.live.conftest import traces
 
 RATE = 1000.0
 
 
 def waves(start, stop, period, flags=0):
-    index = np.arange(start, stop)
-    values = np.zeros((len(SIGNALS), index.size))
-    values[ROW["reference"]] = np.sin(2 * np.pi * (index - 100) / period)
-    values[ROW["displacement"]] = np.cos(2 * np.pi * (index - 100) / period)
-    return Traces(index, values, np.full(index.size, flags, dtype=np.uint32))
+    phase = 2 * np.pi * (np.arange(start, stop) - 100) / period
+    error = np.zeros(phase.size)
+    return traces(start, flags, reference=np.sin(phase), displacement=np.cos(phase), error=error)
 
 
 def segment(period, stop=100_000):
@@ -50,9 +49,9 @@ def test_long_cycle_is_shown_while_recorded():
 @pytest.mark.parametrize("window_s", WINDOWS_S)
 def test_rolling_window_has_every_spike(window_s):
     scope = Scope(RATE, [segment(50.0)], "reference")
-    traces = waves(100, 8000, 50.0)
-    traces.values[ROW["error"], -9] = 30.0
-    scope.add(traces)
+    samples = waves(100, 8000, 50.0)
+    samples.values[ROW["error"], -9] = 30.0
+    scope.add(samples)
     window = scope.rolling(window_s)
     assert window.t_s[-1] == 0.0
     assert window.t_s.size <= BUCKETS
@@ -97,25 +96,16 @@ def test_nothing_is_shown_before_the_first_sample():
     assert np.isnan(scope.rolling(0.5).buckets.low).all()
 
 
-def traces(start, values, step=1):
-    values = np.asarray(values, dtype=float)
-    index = np.arange(start, start + step * values.size, step)
-    rows = np.tile(values, (len(SIGNALS), 1))
-    return Traces(index, rows, np.zeros(values.size, dtype=np.uint32))
-
-
 @pytest.mark.parametrize("width", [1, 3, 7.5])
 def test_buckets_do_not_depend_on_chunk_size(width):
     rng = np.random.default_rng(3)
     values = rng.standard_normal(400)
     values[137] = 50.0
     whole, parts = MinMaxTrace(5, width, 500), MinMaxTrace(5, width, 500)
-    whole.add(traces(5, values))
-    at = 0
-    while at < 400:
-        size = int(rng.integers(1, 40))
-        parts.add(traces(5 + at, values[at : at + size]))
-        at += size
+    whole.add(traces(5, reference=values))
+    for part in np.split(np.arange(400), np.cumsum(rng.integers(1, 40, size=19))):
+        if part.size:
+            parts.add(traces(5 + part[0], reference=values[part]))
     count = whole.newest + 1
     one, other = whole.window(0, count), parts.window(0, count)
     numbers = np.floor(np.arange(400) / width).astype(int)
@@ -123,24 +113,24 @@ def test_buckets_do_not_depend_on_chunk_size(width):
         mine = values[numbers == bucket]
         found = (one.low[0, bucket], one.high[0, bucket], one.first[0, bucket])
         assert found == (mine.min(), mine.max(), mine[0])
-    assert one.high.max() == 50.0
+    assert one.high[0].max() == 50.0
     for name in ("low", "high", "first"):
-        assert np.array_equal(getattr(one, name), getattr(other, name))
+        assert np.array_equal(getattr(one, name), getattr(other, name), equal_nan=True)
 
 
 def test_gaps_and_overwritten_buckets_are_empty():
     envelope = MinMaxTrace(0, 2, 4)
-    envelope.add(traces(0, [1.0, 2.0, 3.0, 4.0]))
-    envelope.add(traces(8, [5.0]))
+    envelope.add(traces(0, reference=[1.0, 2.0, 3.0, 4.0]))
+    envelope.add(traces(8, reference=[5.0]))
     found = envelope.window(0, 6).low[0]
     assert np.isnan(found).tolist() == [True, False, True, True, False, True]
-    envelope.add(traces(1000, [6.0]))
+    envelope.add(traces(1000, reference=[6.0]))
     assert np.isnan(envelope.window(497, 4).low[0]).tolist() == [True, True, True, False]
 
 
 def test_missing_value_does_not_hide_others():
     envelope = MinMaxTrace(0, 3, 4)
-    envelope.add(traces(0, [np.nan, 2.0, 7.0, np.nan, np.nan, np.nan]))
+    envelope.add(traces(0, reference=[np.nan, 2.0, 7.0, np.nan, np.nan, np.nan]))
     found = envelope.window(0, 2)
     assert (found.low[0, 0], found.high[0, 0]) == (2.0, 7.0)
     assert np.isnan(found.low[0, 1])
@@ -148,7 +138,7 @@ def test_missing_value_does_not_hide_others():
 
 def test_samples_before_the_origin_are_ignored():
     envelope = MinMaxTrace(10, 1, 4)
-    envelope.add(traces(7, [1.0, 2.0]))
+    envelope.add(traces(7, reference=[1.0, 2.0]))
     assert envelope.newest == -1
-    envelope.add(traces(9, [3.0, 4.0]))
+    envelope.add(traces(9, reference=[3.0, 4.0]))
     assert envelope.window(0, 1).low[0].tolist() == [4.0]

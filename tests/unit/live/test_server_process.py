@@ -11,32 +11,24 @@ import pytest
 from hilctl.base.errors import RunError
 from hilctl.live import server_process
 from hilctl.live.server_process import SingleRun, served_beside
+from tests.fakes import SteppingClock
 
 
-def server(feed):
+def runs(feed):
     return SimpleNamespace(feed=lambda name: feed)
 
 
-def test_server_ends_some_time_after_its_run():
-    now = [0.0]
-    over = SingleRun(lambda: now[0])
-    assert not over(server(None))
-    assert not over(server(SimpleNamespace(ended=False)))
-    ended = server(SimpleNamespace(ended=True))
+def test_server_ends_some_time_after_its_last_run():
+    clock = SteppingClock()
+    over = SingleRun(clock)
+    ended, active = (runs(SimpleNamespace(ended=value)) for value in (True, False))
+    assert not any(over(each) for each in (runs(None), active, ended, active))
+    clock.now = 5.0
     assert not over(ended)
-    now[0] = 1.4
+    clock.now = 6.4
     assert not over(ended)
-    now[0] = 1.6
+    clock.now = 6.6
     assert over(ended)
-
-
-def test_another_run_keeps_the_server_active():
-    now = [0.0]
-    over = SingleRun(lambda: now[0])
-    over(server(SimpleNamespace(ended=True)))
-    over(server(SimpleNamespace(ended=False)))
-    now[0] = 5.0
-    assert not over(server(SimpleNamespace(ended=True)))
 
 
 @pytest.fixture
