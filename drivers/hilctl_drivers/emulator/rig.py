@@ -1,41 +1,45 @@
 """The rig of an emulated device: in real time or by a sample clock, wiring, watchdog, and log."""
 
 import json
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import IO, Any, TypeAlias
+from typing import IO, Any, TypeAlias, TypeVar
 
 import numpy as np
 
 from hilctl.base.errors import InputError
 from hilctl.base.files import reason
 from hilctl.base.types import F64
-from hilctl_drivers.profile_base import Range
+from hilctl_drivers.profile_base import BaseProfile, Range
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 
 RATE_HZ = 10_000.0
 SETTLED_S = 1.0  # the slowest part of the rig has a time constant of 0.1 ms
 _CHUNK = 1000
+Numbers = TypeVar("Numbers", float, F64)
+
+
+def _rated(*, noise: bool) -> TerfenolParameters:
+    rated = TerfenolParameters()
+    return rated if noise else replace(rated, sensor_noise_um=0.0)
 
 
 class Rig:
     """The actuator with its amplifier and sensor, in real time.
 
-    Whoever asks gives the time. The rig has then held its output since the last change, and its
+    The caller gives the time. The rig has then held its output since the last change, and its
     sensor shows the last sample of its own clock: readings are one to two of its periods old.
 
     Args:
-        now_ns: Time at which it stands still and at 0 A.
+        now_ns: Time at which it is at rest and at 0 A.
         noise: Whether the sensor has noise.
-        seed: Seed of that noise.
     """
 
-    def __init__(self, now_ns: int, *, noise: bool = True, seed: int = 1) -> None:
-        rated = TerfenolParameters()
-        parameters = rated if noise else replace(rated, sensor_noise_um=0.0)
-        self._plant = TerfenolActuator(parameters, RATE_HZ, seed=seed)
+    def __init__(self, now_ns: int, *, noise: bool = True) -> None:
+        self._plant = TerfenolActuator(_rated(noise=noise), RATE_HZ)
         self._held = np.zeros(_CHUNK)
         self._read = np.zeros((2, _CHUNK))
         self._origin_ns = now_ns
@@ -54,12 +58,7 @@ class Rig:
             self._step(min(_CHUNK, due - self._samples))
 
     def put_out(self, current_a: float, now_ns: int) -> None:
-        """Change the output, after :meth:`advance`.
-
-        Args:
-            current_a: What the amplifier is asked for; beyond its range it gives what it can.
-            now_ns: When.
-        """
+        """Change the output; the amplifier saturates at its range."""
         self.advance(now_ns)
         limit_a = TerfenolParameters().dac_range_a
         self.current_a = min(max(current_a, -limit_a), limit_a)
@@ -87,9 +86,13 @@ class SimulatedWiring:
     sensor_um: float
     offset_um: float
 
-    def current_a(self, value: float) -> float:
+    def current_a(self, value: Numbers) -> Numbers:
         """Return the coil current for an output value."""
-        return self.gain_a * value + self.offset_a
+        return value * self.gain_a + self.offset_a
+
+    def output(self, current_a: float) -> float:
+        """Return the output value for a coil current."""
+        return (current_a - self.offset_a) / self.gain_a
 
     def at_terminal(self, displacement_um: F64 | float, channel: Range) -> F64:
         """Return the sensor's signal, clipped to the input's range as by an ADC."""
@@ -104,10 +107,8 @@ class SimulatedWiring:
         An output in A drives the coil itself.
         """
         rig = TerfenolParameters()
-        gain_a, offset_a = _spread(output, rig.dac_range_a)
-        if output.unit == "A":
-            gain_a, offset_a = 1.0, 0.0
-        return cls(gain_a, offset_a, *_spread(sensor, rig.sensor_range_um))
+        amplifier = (1.0, 0.0) if output.unit == "A" else _spread(output, rig.dac_range_a)
+        return cls(*amplifier, *_spread(sensor, rig.sensor_range_um))
 
 
 def _spread(channel: Range, reach: float) -> tuple[float, float]:
@@ -165,13 +166,7 @@ class WriteLog:
                 raise InputError(f"{path}: can't be written: {reason(error)}") from None
 
     def event(self, now_ns: int, event: str, **more: Any) -> None:
-        """Write one line.
-
-        Args:
-            now_ns: Monotonic time.
-            event: What happened.
-            more: Plain values.
-        """
+        """Write one line; ``now_ns`` is monotonic time, ``more`` are plain values."""
         if self._file is None:
             return
         unix_s = (now_ns + self._offset_ns) * 1e-9
@@ -185,6 +180,74 @@ class WriteLog:
             self._file = None
 
 
+class EmulatedDevice(ABC):
+    """A device at the rig: its time, its watchdog timer, and what it outputs.
+
+    Args:
+        profile: Its profile.
+        rig: The rig; several devices may share it.
+        log: Log of the outputs.
+        wiring: Amplifier and sensor between.
+        output: Output that drives the rig; None if another device does.
+    """
+
+    profile: BaseProfile
+
+    def __init__(
+        self,
+        profile: BaseProfile,
+        rig: Rig,
+        log: WriteLog,
+        wiring: SimulatedWiring,
+        output: str | None,
+    ) -> None:
+        self.profile = profile
+        self.wiring = wiring
+        self._rig, self._log, self._output = rig, log, output
+        self._timer = WatchdogTimer()
+        self._now_ns = 0
+
+    @property
+    def tripped(self) -> bool:
+        """Whether the host watchdog has tripped."""
+        return self._timer.tripped
+
+    def tick(self, now_ns: int) -> None:
+        """Advance the time; the watchdog may trip on the way."""
+        due_ns = self._timer.trip(now_ns)
+        if due_ns is not None:
+            self._trip(due_ns)
+        self._now_ns = max(self._now_ns, now_ns)
+        self._advance()
+
+    @abstractmethod
+    def _trip(self, due_ns: int) -> None:
+        """Do what the watchdog does to the outputs."""
+
+    def _advance(self) -> None:
+        self._rig.advance(self._now_ns)
+
+    def _set_terminal(self, name: str, value: float, event: str, now_ns: int) -> None:
+        """Log an output's new value, and drive the rig if it is wired to it."""
+        more: dict[str, float] = {}
+        if name == self._output:
+            self._rig.put_out(self.wiring.current_a(value), now_ns)
+            more["current_a"] = self._rig.current_a
+        unit = self.profile.outputs[name].unit
+        self._log.event(now_ns, event, output=name, value=value, unit=unit, **more)
+
+    def _log_played(self, first: int, current_a: F64, now_ns: int) -> float:
+        """Log a block that a FIFO has output; return its last value in the output's unit."""
+        assert self._output is not None
+        last_a = float(current_a[-1])
+        value, unit = self.wiring.output(last_a), self.profile.outputs[self._output].unit
+        self._log.event(
+            now_ns, "played", output=self._output, first=first, samples=current_a.size,
+            value=value, unit=unit, current_a=last_a,
+        )  # fmt: skip
+        return value
+
+
 _SETTLED_S = 0.1
 
 Played: TypeAlias = Callable[[int, F64, F64, int], None]
@@ -196,14 +259,19 @@ class SampleFifo:
 
     Args:
         noise: Whether the sensor has noise.
-        repeats: Whether a period that finds nothing queued counts as one that put the last value
-            out again, with a reading. Else the output is held, and nothing is read.
-        on_played: Called with each stretch that was output.
+        repeats: Whether the last value is output again, with a reading, in a period that finds
+            nothing queued. Otherwise the output is held, and nothing is read.
+        on_played: Called with each block that was output.
+
+    Attributes:
+        current_a: The output.
+        level: Values that are queued.
+        played: Values output since the rate was set.
+        underruns: Periods since then that found nothing queued.
     """
 
     def __init__(self, *, noise: bool, repeats: bool, on_played: Played) -> None:
-        rated = TerfenolParameters()
-        self._parameters = rated if noise else replace(rated, sensor_noise_um=0.0)
+        self._parameters = _rated(noise=noise)
         self._repeats = repeats
         self._on_played = on_played
         self._plant: TerfenolActuator | None = None
@@ -213,12 +281,7 @@ class SampleFifo:
         self._queue: deque[F64] = deque()
         self._periods = 0
         self.current_a = 0.0
-        self.level = 0
-        """Values that are queued."""
-        self.played = 0
-        """Values put out since the rate was set."""
-        self.underruns = 0
-        """Periods since then that found nothing queued."""
+        self.level = self.played = self.underruns = 0
 
     @property
     def running(self) -> bool:

@@ -17,9 +17,9 @@ class EmulatedReply:
 
     Attributes:
         data: The reply; None if there is none, or it is not known yet.
-        due_ns: When it is sent; 0 for at once.
-        make: What makes it when it is due.
-        wrong_id: What turns it into one in another's name, for a fault.
+        due_ns: When it is sent; 0 for immediately.
+        make: Returns the reply at the time when it is due.
+        wrong_id: Returns the reply in another's name, for a fault.
     """
 
     data: bytes | None
@@ -29,14 +29,14 @@ class EmulatedReply:
 
 
 class EmulatedWire(Protocol):
-    """Devices that share a line, or a port, and how they are spoken to."""
+    """Devices that share a line or a port, and their protocol."""
 
     def tick(self, now_ns: int) -> None:
         """Advance the time for all devices."""
         ...
 
     def requests(self, received: bytearray) -> Iterator[bytes]:
-        """Yield complete requests, and take them out of what was received."""
+        """Yield complete requests, and remove them from the received bytes."""
         ...
 
     def answer(self, request: bytes, now_ns: int) -> EmulatedReply | None:
@@ -44,7 +44,7 @@ class EmulatedWire(Protocol):
         ...
 
     def refusal(self, request: bytes) -> EmulatedReply | None:
-        """Return an answer that says no."""
+        """Return an answer that refuses the request."""
         ...
 
     def encode(self, data: bytes) -> bytes:
@@ -52,7 +52,7 @@ class EmulatedWire(Protocol):
         ...
 
     def corrupt_at(self, framed: bytes) -> int:
-        """Return the byte of a framed reply whose damage no receiver may miss."""
+        """Return the byte of a framed reply whose damage must be detected."""
         ...
 
 
@@ -68,7 +68,7 @@ class SerialDevice(Protocol):
         ...
 
     def refusal(self, message: bytes) -> EmulatedReply | None:
-        """Return an answer that says no."""
+        """Return an answer that refuses the request."""
         ...
 
     def wrong_id(self, reply: bytes) -> bytes:
@@ -77,12 +77,7 @@ class SerialDevice(Protocol):
 
 
 class EmulatedLine:
-    """Devices on a serial line.
-
-    Args:
-        profile: What the line carries: lines of text, or binary frames.
-        devices: What is on it; the first that a message is for answers.
-    """
+    """Devices on a serial line with the profile's framing; the addressed one answers."""
 
     def __init__(
         self, profile: AsciiProfile | FrameProfile, devices: Sequence[SerialDevice]
@@ -91,6 +86,7 @@ class EmulatedLine:
         self._splitter: Splitter[str] | Splitter[bytes]
         self._encode: Callable[[bytes], bytes]
         link = profile.link
+        self._is_text = not isinstance(link, FramesLink)
         if isinstance(link, FramesLink):
             framing = binary_framing(link.framing, link.crc, link.payload_max)
             self._splitter, self._encode = framing.splitter(), framing.encode
@@ -98,7 +94,6 @@ class EmulatedLine:
             self._splitter = LineFormat(link.terminator.encode(), link.checksum).splitter()
             replies = LineFormat(link.reply_terminator.encode(), link.checksum)
             self._encode = lambda message: replies.encode(message.decode())
-        self._is_text = not isinstance(link, FramesLink)
 
     def tick(self, now_ns: int) -> None:
         """Advance the time for all devices."""
@@ -106,7 +101,7 @@ class EmulatedLine:
             device.tick(now_ns)
 
     def requests(self, received: bytearray) -> Iterator[bytes]:
-        """Yield the good messages; the splitter keeps what is not complete."""
+        """Yield the good messages; the splitter keeps an incomplete one."""
         data = bytes(received)
         received.clear()
         for each in self._splitter.feed(data):

@@ -20,19 +20,15 @@ from hilctl_drivers.modbus.pdu import (
 from hilctl_drivers.modbus.register_map import RegisterFormat
 from hilctl_drivers.profile import load_profile
 from hilctl_drivers.transport.links import RefusedError
+from tests.unit.drivers.emulator.conftest import MS, emulated_modbus
 
 FLOAT32 = RegisterFormat("float32")
-MS = 1_000_000
-
-
-def device_of(name: str, output: str, sensor: str) -> EmulatedModbus:
-    return EmulatedModbus(load_profile(name), Rig(0), WriteLog(None, 0), output, sensor)
 
 
 @pytest.fixture
 def t7() -> ModbusWire:
     """An emulated T7 behind Modbus TCP."""
-    return ModbusWire("tcp", device_of("labjack_t7", "DAC0", "AIN0"))
+    return ModbusWire("tcp", {1: emulated_modbus("labjack_t7", "DAC0", "AIN0")})
 
 
 def requests(wire: ModbusWire, received: bytes) -> list[bytes]:
@@ -65,7 +61,7 @@ def test_feedback_reads_before_the_command_acts(t7):
 
 def test_coupler_reads_elsewhere_than_it_writes():
     """On a WAGO register 0 is written as output and read as input; 0x200 reads it back."""
-    wire = ModbusWire("tcp", device_of("wago_750", "AO0", "AI0"))
+    wire = ModbusWire("tcp", {1: emulated_modbus("wago_750", "AO0", "AI0")})
     raw = (8000).to_bytes(2, "big")
     assert abs(int.from_bytes(ask(wire, write_read_pdu(0, 1, 0, raw)), "big", signed=True)) < 90
     assert ask(wire, read_pdu(3, 0x200, 1)) == raw
@@ -108,7 +104,7 @@ def test_requests_in_one_segment_are_all_answered(t7):
 
 def test_rtu_ignores_others_and_rubbish():
     """Another unit's request and a spoilt one get no reply."""
-    wire = ModbusWire("rtu", device_of("wago_750", "AO0", "AI0"))
+    wire = ModbusWire("rtu", {1: emulated_modbus("wago_750", "AO0", "AI0")})
     pdu = read_pdu(3, 0x200, 1)
     good = rtu_adu(1, pdu)
     (request,) = requests(wire, good)
@@ -137,15 +133,13 @@ def test_units_share_a_line_and_a_rig():
     assert requests(wire, rtu_adu(3, read_pdu(3, 0, 1))) == []
 
 
-def test_gateway_says_that_a_unit_is_not_there():
+def test_gateway_says_that_a_unit_is_not_there(t7):
     """Over TCP a unit that nobody has is exception 11; one device alone takes any unit."""
-    device = device_of("labjack_t7", "DAC0", "AIN0")
+    device = emulated_modbus("labjack_t7", "DAC0", "AIN0")
     pdu = read_pdu(3, 1000, 2)
-    wire = ModbusWire("tcp", {1: device, 2: device_of("labjack_t7", "DAC0", "AIN0")})
+    wire = ModbusWire("tcp", {1: device, 2: device})
     (request,) = requests(wire, tcp_adu(7, 3, pdu))
     with pytest.raises(RefusedError) as refusal:
         reply_data(pdu, tcp_pdu(wire.answer(request, 0).data, 7, 3))
     assert refusal.value.code == 11
-    alone = ModbusWire("tcp", device)
-    (request,) = requests(alone, tcp_adu(7, 3, pdu))
-    assert len(reply_data(pdu, tcp_pdu(alone.answer(request, 0).data, 7, 3))) == 4
+    assert len(reply_data(pdu, tcp_pdu(t7.answer(request, 0).data, 7, 3))) == 4
