@@ -320,11 +320,7 @@ class EmulatorServer:
         self._listeners.clear()
 
     def _reply(
-        self,
-        connection: _Connection,
-        answer: EmulatedReply,
-        fault: WireFault | None,
-        now_ns: int,
+        self, connection: _Connection, answer: EmulatedReply, fault: WireFault | None, now_ns: int
     ) -> None:
         if connection not in self._connections:
             return

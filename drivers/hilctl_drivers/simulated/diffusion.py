@@ -192,17 +192,9 @@ def _follow(
 ) -> None:
     """Do ``Rods.follow``.
 
-    Args:
-        halves_a: See ``Rods.follow``.
-        free_um: See ``Rods.follow``.
-        state: float64[3, n]: H, M and the last change of H in each shell; updated.
-        pinned: float64[m, n], see ``magnetise``; updated.
-        cells: See ``magnetise``.
-        conductance: float64[2, n], see ``DiffusionParameters.conductances``.
-        areas: float64[n], each shell's share of the cross-section.
-        coil: Coil factor in 1/m and bias field in A/m.
-        curve: See ``magnetise``.
-        strain_um: Displacement at saturation.
+    ``state`` is float64[3, n], H, M and the last change of H in each shell; updated. ``areas`` is
+    float64[n], each shell's share of the cross-section; ``coil`` the coil's factor in 1/m and bias
+    field in A/m; ``strain_um`` the displacement at saturation. See ``magnetise`` and ``_correct``.
     """
     factor, bias = coil
     n = areas.size
@@ -238,36 +230,28 @@ class Diffusion(Rods):
     """Shells of pinned cells; at rest the bias field is everywhere and no cell is strained."""
 
     def __init__(self, parameters: DiffusionParameters, coil: Coil) -> None:
-        """Take the constants; the rods are nowhere before :meth:`rest`."""
-        self._coil = (coil.factor_per_m, coil.bias_a_per_m)
+        self._bias = coil.bias_a_per_m
         self._curve = (parameters.saturation_a_per_m, parameters.knee_a_per_m)
         self._strain_um = 1.5e6 * parameters.saturation_strain * ROD_LENGTH_M
-        self._cells = parameters.cell_table()
-        self._conductance = parameters.conductances(coil.step_s)
-        self._areas = parameters.areas()
         self._state = np.zeros((3, parameters.shells))
         self._pinned = np.zeros((parameters.cells, parameters.shells))
+        super().__init__(
+            _follow,
+            self._state,
+            self._pinned,
+            parameters.cell_table(),
+            parameters.conductances(coil.step_s),
+            parameters.areas(),
+            (coil.factor_per_m, coil.bias_a_per_m),
+            self._curve,
+            self._strain_um,
+        )
 
     def rest(self) -> float:
         """Put every cell of every shell at the bias field."""
         saturation, knee = self._curve
-        bias = self._coil[1]
+        bias = self._bias
         self._pinned[:] = bias
         share = bias / (knee + abs(bias))
         self._state[:] = [[bias], [saturation * share], [0.0]]
         return self._strain_um * share * share
-
-    def follow(self, halves_a: F64, free_um: F64) -> None:
-        """Advance step by step."""
-        _follow(
-            halves_a,
-            free_um,
-            self._state,
-            self._pinned,
-            self._cells,
-            self._conductance,
-            self._areas,
-            self._coil,
-            self._curve,
-            self._strain_um,
-        )

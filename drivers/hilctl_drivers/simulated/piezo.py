@@ -66,7 +66,7 @@ def _run(
     plays: F64,
     constants: tuple[float, float, float, float, float, float],
 ) -> None:
-    """Read the sensor, put out the command and advance one sample period; for every sample.
+    """Read the sensor, output the command and advance one sample period; for every sample.
 
     Args:
         command: float64[n], drive in V.
@@ -75,7 +75,7 @@ def _run(
         drive_v: float64[n], filled with the drive at the instant of each reading.
         state: float64[2]: drive in V, sensor output in um; updated.
         plays: float64[3, m]: threshold, weight and output of each play operator; updated.
-        constants: Weight of the drive itself, what is left of the sensor's error after a sample
+        constants: Weight of the drive itself, remaining part of the sensor's error after a sample
             period, one DAC code in V, one ADC code in um, the sensor's range in um, the position
             at rest in um.
     """
@@ -101,13 +101,7 @@ class PiezoActuator(Plant):
     """The stage with its sensor; commands and drive in V."""
 
     def __init__(self, parameters: PiezoParameters, sample_rate_hz: float, seed: int = 1) -> None:
-        """Build the stage at rest: at its offset at 0 V, never driven before.
-
-        Args:
-            parameters: Physical constants.
-            sample_rate_hz: Samples a second, > 0.
-            seed: Seed of the sensor noise.
-        """
+        """Build the stage at rest: at its offset at 0 V, never driven before."""
         super().__init__(parameters.sensor_noise_um, seed)
         thresholds = np.array(parameters.thresholds_v, dtype=np.float64)
         weights = np.array(parameters.weights_um_per_v, dtype=np.float64)
@@ -129,11 +123,5 @@ class PiezoActuator(Plant):
 
     def _advance(self, command: F64, noise_um: F64, displacement_um: F64, measured: F64) -> None:
         _run(
-            command,
-            noise_um,
-            displacement_um,
-            measured,
-            self._state,
-            self._plays,
-            self._constants,
+            command, noise_um, displacement_um, measured, self._state, self._plays, self._constants
         )

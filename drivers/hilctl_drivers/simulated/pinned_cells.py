@@ -132,13 +132,8 @@ def _follow(
 ) -> None:
     """Do ``Rods.follow``.
 
-    Args:
-        halves_a: See ``Rods.follow``.
-        free_um: See ``Rods.follow``.
-        state: float64[1], field in the rods; updated.
-        cells: See ``free_displacement``; updated.
-        coil: Coil factor in 1/m, bias field in A/m, step in s, lag in s, its growth in m/A.
-        material: See ``free_displacement``.
+    ``state`` is float64[1], the field in the rods, updated; ``coil`` its factor in 1/m, bias field
+    in A/m, step in s, lag in s and growth of the lag in m/A. See ``free_displacement``.
     """
     factor, bias, step, lag, growth = coil
     field = state[0]
@@ -157,15 +152,9 @@ class PinnedCells(Rods):
     """Cells with dry friction behind one lag of the field."""
 
     def __init__(self, parameters: PinnedCellsParameters, coil: Coil) -> None:
-        """Take the constants; the rods are nowhere before :meth:`rest`."""
-        self._bias = coil.bias_a_per_m
-        self._coil = (
-            coil.factor_per_m,
-            coil.bias_a_per_m,
-            coil.step_s,
-            parameters.lag_s,
-            parameters.lag_growth_m_per_a,
-        )
+        bias = coil.bias_a_per_m
+        lag = parameters.lag_s, parameters.lag_growth_m_per_a
+        self._bias = bias
         self._curve = (
             parameters.langevin_field_a_per_m,
             parameters.strain_um,
@@ -173,6 +162,8 @@ class PinnedCells(Rods):
         )
         self._cells = parameters.table()
         self._state = np.zeros(1)
+        constants = (coil.factor_per_m, bias, coil.step_s, *lag)
+        super().__init__(_follow, self._state, self._cells, constants, self._curve)
         ensure_compiled(_follow)
 
     def rest(self) -> float:
@@ -180,7 +171,3 @@ class PinnedCells(Rods):
         self._state[0] = self._bias
         self._cells[2] = self._bias
         return free_displacement(self._cells, self._bias, self._curve)
-
-    def follow(self, halves_a: F64, free_um: F64) -> None:
-        """Advance step by step."""
-        _follow(halves_a, free_um, self._state, self._cells, self._coil, self._curve)

@@ -144,8 +144,7 @@ class TerfenolParameters:
 def _motion(parameters: TerfenolParameters, load_kg: float, step_s: float) -> F64:
     """Return float64[m - 2, m], the exact step of structure and sensor for ``respond``.
 
-    Velocities are kept in um per radian of their natural frequency, so that the matrix is well
-    scaled.
+    Velocities are in um per radian of their natural frequency: the matrix is then well scaled.
     """
     omega = math.sqrt(parameters.stiffness_n_per_m / (parameters.moving_mass_kg + load_kg))
     modes = [(omega, parameters.damping_ratio, 1.0)]
@@ -216,23 +215,23 @@ class TerfenolActuator(Plant):
 
         Args:
             parameters: Physical constants.
-            sample_rate_hz: Samples a second, > 0.
+            sample_rate_hz: Samples per second, > 0.
             load_kg: Mass added to the moving mass, >= 0.
             bias_a: Constant current beside the command; the displacement is zero there.
             seed: Seed of the sensor noise.
         """
-        super().__init__(parameters.sensor_noise_um, seed)
         # The margin keeps rounding from adding a step where the period is a multiple of it.
         self._substeps = math.ceil(1.0 / (sample_rate_hz * parameters.step_max_s) - 1e-9)
+        # At a low rate one sample period has many steps: a chunk is then fewer samples.
+        chunk = max(1, CHUNK // self._substeps)
+        super().__init__(parameters.sensor_noise_um, seed, chunk)
         step_s = 1.0 / (sample_rate_hz * self._substeps)
         self._amplifier = _amplifier(parameters, step_s)
         ensure_compiled(amplify, respond)
         bias = parameters.magnet_field_a_per_m + parameters.coil_factor_per_m * bias_a
         self._rods = parameters.rods.rods(Coil(parameters.coil_factor_per_m, bias, step_s))
-        self._sensor = (
-            parameters.sensor_range_um / parameters.dac_codes,
-            parameters.sensor_range_um,
-        )
+        range_um = parameters.sensor_range_um
+        self._sensor = (range_um / parameters.dac_codes, range_um)
         self._drift = (parameters.drift_um, 1.0 / (parameters.drift_s * sample_rate_hz))
         self._samples = 0
         self._creep = _creep(parameters.creep, step_s)
@@ -250,10 +249,8 @@ class TerfenolActuator(Plant):
         self._motion = _motion(parameters, load_kg, step_s)
         self._mechanics = np.zeros(self._motion.shape[1])
         self._current = np.zeros(1)
-        # At a low rate one sample period has many steps: a part is then fewer samples.
-        self._part = max(1, CHUNK // self._substeps)
-        self._halves = np.empty(2 * self._part * self._substeps + 1)
-        self._free = np.empty(self._part * self._substeps)
+        self._halves = np.empty(2 * chunk * self._substeps + 1)
+        self._free = np.empty(chunk * self._substeps)
         self._parts = self._halves, self._free
         self.warm_up()
 
@@ -266,33 +263,25 @@ class TerfenolActuator(Plant):
         self._samples = 0
 
     def _advance(self, command: F64, noise_um: F64, displacement_um: F64, measured: F64) -> None:
-        whole, per_sample = self._drift
-        if whole:
-            past = np.arange(self._samples, self._samples + command.size)
-            noise_um -= whole * np.expm1(-past * per_sample)  # the sensor takes no notice of it
-        self._samples += command.size
-        if command.size <= self._part:
-            self._move(command, noise_um, displacement_um, measured)
-            return
-        for start in range(0, command.size, self._part):
-            part = slice(start, start + self._part)
-            self._move(command[part], noise_um[part], displacement_um[part], measured[part])
-
-    def _move(self, command: F64, noise_um: F64, displacement_um: F64, measured: F64) -> None:
         """Pass some samples through amplifier, rods and structure, one after the other.
 
         The rods do not act back on the amplifier, nor the structure on the rods; so each may take
-        all the steps at once.
+        all the steps together. The structure is not affected by drift and thermal growth.
         """
+        drift_um, per_sample = self._drift
+        if drift_um:
+            past = np.arange(self._samples, self._samples + command.size)
+            noise_um -= drift_um * np.expm1(-past * per_sample)
+        self._samples += command.size
         steps = command.size * self._substeps
         halves, free = self._parts
-        if free.size != steps:  # the views are kept: one block is as long as the next
+        if free.size != steps:  # the views are kept: blocks usually have one length
             self._parts = halves, free = self._halves[: 2 * steps + 1], self._free[:steps]
         amplify(command, measured, halves, self._current, self._amplifier, self._substeps)
         self._rods.follow(halves, free)
         if self._creep.size:
             creep(free, self._creep, self._rest_um)
-        if self._thermal is not None:  # the sensor takes no notice of it
+        if self._thermal is not None:
             warm(halves, noise_um, self._warmth, self._thermal, self._substeps)
         respond(
             free,
