@@ -134,23 +134,15 @@ class SerialDac(DacDevice):
     """A :class:`~hilctl_drivers.device.DacDevice` on a serial line.
 
     ``SerialDac(options)`` makes the subclass that the profile names as its driver.
-
-    Attributes:
-        block_max: Most samples of one exchange.
-        fifo_depth: Samples that its FIFO holds; 0 without a FIFO.
-        measures: Whether exchanges fill ``measured``.
-        longest_message_s: Longest delay of the safe value by an exchange under way.
-        arm_s: Longest time to arm the watchdog.
-        unconfirmed: Why a written value cannot be confirmed; empty if it can.
     """
 
     Options: ClassVar[type[DeviceOptions]] = SerialOptions
-    block_max = 1
-    fifo_depth = 0
-    measures = False
-    longest_message_s = 0.0
-    arm_s = 0.0
-    unconfirmed = ""
+    block_max = 1  # samples of one exchange
+    fifo_depth = 0  # samples; 0 without a FIFO
+    measures = False  # whether exchanges fill ``measured``
+    longest_message_s = 0.0  # longest delay of the safe value by a running exchange
+    arm_s = 0.0  # longest time to arm the watchdog
+    unconfirmed = ""  # why a written value cannot be confirmed; empty if it can
 
     def __new__(cls, options: SerialOptions) -> "SerialDac":
         """Return an instance of the profile's driver."""

@@ -53,17 +53,11 @@ def _is_text(text: str) -> bool:
 
 @dataclass(frozen=True)
 class LineFormat:
-    """Format of one line: ``text | checksum | terminator``.
-
-    Attributes:
-        terminator: Bytes that end a line: control characters.
-        checksum: ``none``, ``dcon`` (two hex digits) or ``gen`` (``$`` and two hex digits).
-        size_max: Most bytes of a line without its terminator.
-    """
+    """Format of one line: ``text | checksum | terminator``."""
 
     terminator: bytes = b"\r"
-    checksum: Literal["none", "dcon", "gen"] = "none"
-    size_max: int = 255
+    checksum: Literal["none", "dcon", "gen"] = "none"  # two hex digits, for gen after a $
+    size_max: int = 255  # bytes without the terminator
 
     def encode(self, text: str) -> bytes:
         """Return a line.

@@ -105,19 +105,12 @@ class BoardFacts:
 
 @dataclass(frozen=True, slots=True)
 class Readings:
-    """Reply to EXCHANGE or STREAM.
+    """Reply to EXCHANGE or STREAM."""
 
-    Attributes:
-        first: Sample that the first value belongs to; 0 for an EXCHANGE.
-        values: float64[n] in the input's unit.
-        fifo_level: Samples queued.
-        underruns: Sample periods without a queued sample since the clock started.
-    """
-
-    first: int
-    values: F64
-    fifo_level: int
-    underruns: int
+    first: int  # sample that the first value belongs to; 0 for an EXCHANGE
+    values: F64  # float64[n] in the input's unit
+    fifo_level: int  # samples queued
+    underruns: int  # sample periods without a queued sample since the clock started
 
 
 @dataclass(frozen=True, slots=True)

@@ -34,17 +34,10 @@ _HERE = ("127.0.0.1", "::1", "localhost")
 
 @dataclass(frozen=True, slots=True)
 class WiredExperiment:
-    """An experiment whose device is to be emulated.
-
-    Attributes:
-        path: Its file.
-        section: Its device section, as in the file.
-        wiring: Its amplifier and sensor.
-        options: What to emulate.
-    """
+    """An experiment whose device is to be emulated."""
 
     path: Path
-    section: Mapping[str, Any]
+    section: Mapping[str, Any]  # its device section, as in the file
     wiring: SimulatedWiring
     options: EmulatorOptions
 
@@ -228,17 +221,11 @@ def emulate(
 
 @dataclass(frozen=True, slots=True)
 class ListenAddress:
-    """Address of an emulated device.
-
-    Attributes:
-        profile: Its profile.
-        address: ``host:port`` or device file.
-        unit_id: Its unit id if another Modbus device is served beside it.
-    """
+    """Address of an emulated device."""
 
     profile: str
-    address: str
-    unit_id: int | None = None
+    address: str  # host:port or device file
+    unit_id: int | None = None  # if another Modbus device is served beside it
 
 
 def _say(

@@ -39,29 +39,17 @@ class _Port(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Emulator:
-    """A server that is ready to run.
-
-    Attributes:
-        server: Run it.
-        log: Close it at the end.
-        device: The device that drives the rig.
-        reader: The device that shows the displacement, often the same.
-        wires: The served wires: one, or the reader's too.
-        address: ``host:port``, or the pty's device file.
-        reader_address: The reader's.
-        reader_unit_id: Its unit id there; None if it is no Modbus device.
-        options: Address and wiring, as in an experiment's device section.
-    """
+    """A server that is ready to run; its log is to be closed at the end."""
 
     server: EmulatorServer
     log: WriteLog
-    device: AnyDevice
-    reader: AnyDevice
-    wires: tuple[EmulatedWire, ...]
-    address: str
+    device: AnyDevice  # drives the rig
+    reader: AnyDevice  # shows the displacement, often the same
+    wires: tuple[EmulatedWire, ...]  # one, or the reader's too
+    address: str  # host:port, or the pty's device file
     reader_address: str
-    reader_unit_id: int | None
-    options: dict[str, Any]
+    reader_unit_id: int | None  # None if it is no Modbus device
+    options: dict[str, Any]  # address and wiring, as in an experiment's device section
 
 
 def build(options: EmulatorOptions, clock_ns: Callable[[], int] = time.monotonic_ns) -> Emulator:

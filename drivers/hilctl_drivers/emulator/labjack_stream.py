@@ -80,18 +80,9 @@ class LabJackInput:
 
 
 class LabJackStream:
-    """The registers.
+    """The registers; a stream starts from the current of the rig.
 
-    Args:
-        profile: The device.
-        streaming: Its streaming capabilities.
-        output: Output that drives the rig.
-        sensor: Input that shows the displacement.
-        wiring: Amplifier and sensor between.
-        rig: The rig; a stream starts from its current.
-        noise: Whether the sensor has noise.
-        on_played: Called with the first value's number, float64[n] currents in A, and the time of
-            the last.
+    ``on_played`` gets the first value's number, float64[n] currents in A, and the time of the last.
     """
 
     def __init__(

@@ -101,22 +101,9 @@ def _hit(trigger: Target | None, target: Words) -> bool:
 class EmulatedModbus(EmulatedDevice):
     """The device: its registers, and the effects of writing them.
 
-    It powers up as the profile says; otherwise with the rig at 0 A. Two devices can share a rig:
-    one drives it, the other shows its displacement.
-
-    Args:
-        profile: Its profile.
-        rig: The rig.
-        log: Log of the outputs.
-        output: Output that drives the rig; None if another device does.
-        sensor: Input that shows the displacement; None if another device does.
-        wiring: Amplifier and sensor between.
-        current_a: Current at the start, as if its power-up value had been set so.
-        noise: Whether the sensor has noise when streaming.
-
-    Attributes:
-        memory: The registers.
-        overlay: Registers of a stream, before all others; None if these channels do not stream.
+    It powers up as the profile says, or at ``current_a``; otherwise with the rig at 0 A. Two
+    devices can share a rig: one drives it, the other shows its displacement. ``noise`` is that of
+    the sensor when streaming.
     """
 
     profile: ModbusProfile
@@ -143,7 +130,7 @@ class EmulatedModbus(EmulatedDevice):
         self._watchdog = None if watchdog == "none" else EmulatedWatchdog(watchdog, self._steps)
         if self._watchdog is not None:
             self._timer = self._watchdog
-        self.overlay: LabJackStream | None = None
+        self.overlay: LabJackStream | None = None  # registers of a stream, before all others
         if streaming != "none" and output in streaming.outputs and sensor in streaming.inputs:
             self.overlay = LabJackStream(
                 profile, streaming, output, sensor, wiring, rig, noise=noise, on_played=self._played

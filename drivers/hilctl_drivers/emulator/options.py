@@ -22,21 +22,16 @@ DELAY_S = 1.0
 class WireFault:
     """One fault.
 
-    Attributes:
-        kind: ``silence`` ignores the request; ``delay`` answers late; ``late`` executes it late,
-            after other requests; ``exception`` refuses it; ``corrupt`` changes a byte of the reply;
-            ``cut`` truncates it; ``duplicate`` sends it twice; ``wrong_id`` answers in another's
-            name; ``reset`` breaks the connection; ``unplug`` is permanent silence on every
-            connection.
-        at_count: Transaction that has it, counted from 1; or None.
-        at_s: Time since the start; the next transaction has it. Or None.
-        delay_s: Delay of ``delay`` and ``late``.
+    ``silence`` ignores the request; ``delay`` answers late; ``late`` executes it late, after other
+    requests; ``exception`` refuses it; ``corrupt`` changes a byte of the reply; ``cut`` truncates
+    it; ``duplicate`` sends it twice; ``wrong_id`` answers in another's name; ``reset`` breaks the
+    connection; ``unplug`` is permanent silence on every connection.
     """
 
     kind: FaultKind
-    at_count: int | None = None
-    at_s: float | None = None
-    delay_s: float = DELAY_S
+    at_count: int | None = None  # transaction that has it, counted from 1
+    at_s: float | None = None  # time since the start; the next transaction has it
+    delay_s: float = DELAY_S  # of delay and late
 
 
 def parse_fault(text: str) -> WireFault:
@@ -96,51 +91,30 @@ ReaderLine: TypeAlias = Literal["same", "own"]
 
 @dataclass(frozen=True)
 class EmulatorOptions:
-    """What to emulate.
-
-    Attributes:
-        profile: Name of a shipped profile, or path of one.
-        link: ``tcp``, or ``rtu`` on a pty; the profile's own if None. Modbus only.
-        host: Address to listen on.
-        port: TCP port to listen on; 0 for a free one.
-        log: File for a log of every write, one JSON object a line.
-        faults: Faults to inject.
-        output: Output that drives the rig; the profile's first if None.
-        sensor: Input that shows the displacement; the first that a sensor can be wired to.
-        reader: Profile of the device that has that input, if it is another one.
-        reader_line: Whether it shares the line or connection (``same``) or has its ``own``; if
-            None, Modbus RTU devices share it.
-        reader_unit_id: Its unit id; if None its profile's, or the next on the same line. Modbus
-            only.
-        reader_port: TCP port of its own; 0 for a free one. Modbus only.
-        lacking: Modbus functions that are refused with exception 1.
-        mute: Modbus functions that are never answered.
-        wiring: Amplifier and sensor; spread over the channels' ranges if None.
-        noise: Whether the sensor has noise.
-        current_a: Current at the start, as if the device's power-up value had been set so; as
-            shipped if None. Modbus only.
+    """What to emulate; link, current, functions and the reader's unit and port are for Modbus only.
 
     Raises:
-        InputError: ``link`` or ``reader_line`` is none of these words.
+        InputError: ``link`` or ``reader_line`` is none of its words.
     """
 
-    profile: str
-    link: LinkKind | None = None
-    host: str = "127.0.0.1"
-    port: int = 0
-    log: Path | None = None
+    profile: str  # name of a shipped profile, or path of one
+    link: LinkKind | None = None  # tcp, or rtu on a pty; the profile's own if None
+    host: str = "127.0.0.1"  # address to listen on
+    port: int = 0  # TCP port to listen on; 0 for a free one
+    log: Path | None = None  # file for a log of every write, one JSON object per line
     faults: tuple[WireFault, ...] = ()
-    output: str | None = None
-    sensor: str | None = None
-    reader: str | None = None
+    output: str | None = None  # drives the rig; the profile's first if None
+    sensor: str | None = None  # shows the displacement; the first possible input if None
+    reader: str | None = None  # profile of the device with that input, if it is another one
+    # On the same line or connection, or on its own; if None, Modbus RTU devices share a line.
     reader_line: ReaderLine | None = None
-    reader_unit_id: int | None = None
-    reader_port: int = 0
-    lacking: frozenset[int] = frozenset()
-    mute: frozenset[int] = frozenset()
-    wiring: SimulatedWiring | None = None
+    reader_unit_id: int | None = None  # if None its profile's, or the next on the same line
+    reader_port: int = 0  # TCP port of its own; 0 for a free one
+    lacking: frozenset[int] = frozenset()  # functions that are refused with exception 1
+    mute: frozenset[int] = frozenset()  # functions that are never answered
+    wiring: SimulatedWiring | None = None  # spread over the channels' ranges if None
     noise: bool = True
-    current_a: float | None = None
+    current_a: float | None = None  # initial current, as if it was the power-up value
 
     def __post_init__(self) -> None:
         for name, words in (("link", LinkKind), ("reader_line", ReaderLine)):

@@ -2,7 +2,6 @@
 
 import json
 from abc import ABC, abstractmethod
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -72,19 +71,12 @@ class Rig:
 
 @dataclass(frozen=True, slots=True)
 class SimulatedWiring:
-    """Amplifier and sensor between the device's terminals and the rig.
+    """Amplifier and sensor between the device's terminals and the rig."""
 
-    Attributes:
-        gain_a: Amplifier, A for one unit of the output.
-        offset_a: Current at 0 of the output.
-        sensor_um: Sensor, um for one unit of the input.
-        offset_um: Displacement at 0 of the input.
-    """
-
-    gain_a: float
-    offset_a: float
-    sensor_um: float
-    offset_um: float
+    gain_a: float  # per unit of the output
+    offset_a: float  # at 0 of the output
+    sensor_um: float  # per unit of the input
+    offset_um: float  # at 0 of the input
 
     def current_a(self, value: Numbers) -> Numbers:
         """Return the coil current for an output value."""
@@ -262,12 +254,6 @@ class SampleFifo:
         repeats: Whether the last value is output again, with a reading, in a period that finds
             nothing queued. Otherwise the output is held, and nothing is read.
         on_played: Called with each block that was output.
-
-    Attributes:
-        current_a: The output.
-        level: Values that are queued.
-        played: Values output since the rate was set.
-        underruns: Periods since then that found nothing queued.
     """
 
     def __init__(self, *, noise: bool, repeats: bool, on_played: Played) -> None:
@@ -278,14 +264,16 @@ class SampleFifo:
         self._plant_rate_hz = 0.0
         self._rate_hz = 0.0
         self._start_ns: int | None = None
-        self._queue: deque[F64] = deque()
+        self._queued = np.empty(0)
         self._periods = 0
         self.current_a = 0.0
-        self.level = self.played = self.underruns = 0
+        self.level = 0  # values that are queued
+        self.played = 0  # values output since the rate was set
+        self.underruns = 0  # periods since then that found nothing queued
 
     @property
     def running(self) -> bool:
-        """Whether a rate is set; it may not have been started yet."""
+        """Whether a rate is set, started or not."""
         return self._rate_hz > 0.0
 
     @property
@@ -294,7 +282,7 @@ class SampleFifo:
         return self._start_ns is not None
 
     def set_rate(self, rate_hz: float) -> None:
-        """Count from 0, at another rate; :meth:`start` begins. What is queued stays."""
+        """Stop, and count from 0 at another rate after :meth:`start`; queued values stay."""
         if self._plant is None or self._plant_rate_hz != rate_hz:
             self._plant = TerfenolActuator(self._parameters, rate_hz)
             self._plant_rate_hz = rate_hz
@@ -315,12 +303,12 @@ class SampleFifo:
 
     def clear(self) -> None:
         """Forget what is queued."""
-        self._queue.clear()
+        self._queued = np.empty(0)
         self.level = 0
 
     def queue(self, current_a: F64) -> None:
         """Queue float64[n], in A."""
-        self._queue.append(current_a)
+        self._queued = np.concatenate([self._queued, current_a])
         self.level += current_a.size
 
     def due_ns(self, values: int) -> int | None:
@@ -337,7 +325,8 @@ class SampleFifo:
         if due <= 0:
             return
         self._periods += due
-        values = self._next(due)
+        values, self._queued = np.split(self._queued, [due])
+        self.level -= values.size
         missed = due - values.size
         self.underruns += missed
         played = due if self._repeats else values.size
@@ -349,16 +338,3 @@ class SampleFifo:
         if played:
             self._on_played(self.played, command[:played], displacement_um[:played], now_ns)
             self.played += played
-
-    def _next(self, count: int) -> F64:
-        """Take at most ``count`` values from the queue."""
-        parts, wanted = [np.empty(0)], count
-        while wanted and self._queue:
-            block = self._queue.popleft()
-            if block.size > wanted:
-                self._queue.appendleft(block[wanted:])
-                block = block[:wanted]
-            parts.append(block)
-            wanted -= block.size
-        self.level -= count - wanted
-        return np.concatenate(parts)

@@ -27,22 +27,14 @@ _CHUNK = 65536
 
 
 class _Connection(ABC):
-    """A host's connection to a wire.
-
-    Attributes:
-        wire: The wire.
-        faulty: Whether the server's faults happen here.
-        received: Received bytes that are not a complete request yet.
-        received_ns: Time of the last of them.
-        unsent: Bytes that wait for room, as in a USB device's buffer.
-    """
+    """A host's connection to a wire."""
 
     def __init__(self, wire: EmulatedWire, *, faulty: bool = True) -> None:
         self.wire = wire
-        self.faulty = faulty
-        self.received = bytearray()
+        self.faulty = faulty  # whether the server's faults happen here
+        self.received = bytearray()  # no complete request yet
         self.received_ns = 0
-        self.unsent = bytearray()
+        self.unsent = bytearray()  # waits for room, as in a USB device's buffer
 
     @abstractmethod
     def fileno(self) -> int:

@@ -13,19 +13,12 @@ from hilctl_drivers.transport.links import CorruptError
 
 @dataclass(frozen=True, slots=True)
 class EmulatedReply:
-    """A reply, before its framing.
+    """A reply, before its framing."""
 
-    Attributes:
-        data: The reply; None if there is none, or it is not known yet.
-        due_ns: When it is sent; 0 for immediately.
-        make: Returns the reply at the time when it is due.
-        wrong_id: Returns the reply in another's name, for a fault.
-    """
-
-    data: bytes | None
-    due_ns: int = 0
-    make: Callable[[int], bytes] | None = None
-    wrong_id: Callable[[bytes], bytes] | None = None
+    data: bytes | None  # None if there is no reply, or it is not known yet
+    due_ns: int = 0  # when it is sent; 0 for immediately
+    make: Callable[[int], bytes] | None = None  # returns the reply when it is due
+    wrong_id: Callable[[bytes], bytes] | None = None  # returns it in another's name, for a fault
 
 
 class EmulatedWire(Protocol):

@@ -34,6 +34,10 @@ from hilctl_drivers.simulated.terfenol import (
 FIFO_DEPTH = 4096
 MAX_RATE_HZ = 200e3
 _SETTLING_S = 0.1
+_LOST = {
+    "no_answer": "no answer in time (injected fault)",
+    "refused": "the block was refused (injected fault)",
+}
 
 
 class SimulatedFault(StrictModel):
@@ -126,16 +130,16 @@ class SimulatedDevice(DacDevice):
         if first_sample < self._next_sample:
             rule = f"first sample must be >= {self._next_sample}, which is next"
             raise DeviceError(f"{rule}, got {first_sample}")
-        fault = self._fault
-        if fault is not None:
-            self._fail_exchange(fault, first_sample + command.size)
+        fault, end_sample = self._fault, first_sample + command.size
+        if fault is not None and fault.kind in _LOST and end_sample > fault.at_sample:
+            raise DeviceError(_LOST[fault.kind])
         if first_sample > self._next_sample:
             self._plant.hold(first_sample - self._next_sample, self._last_command)
         self._plant.step(command, displacement_um, measured)
         if fault is not None:
             self._spoil(fault, first_sample, displacement_um)
             self._last_reading_um = displacement_um.item(-1)
-        self._next_sample = first_sample + command.size
+        self._next_sample = end_sample
         self._last_command = command.item(-1)
 
     def _put_out(self, command: float) -> None:
@@ -157,15 +161,6 @@ class SimulatedDevice(DacDevice):
         sizes = {command.size, displacement_um.size, measured.size}
         if not self._block or len(sizes) > 1 or not 1 <= command.size <= self._block:
             super()._check_sizes(command, displacement_um, measured)
-
-    def _fail_exchange(self, fault: SimulatedFault, end_sample: int) -> None:
-        """Raise the error of an injected connection fault in a block that ends here."""
-        if end_sample <= fault.at_sample:
-            return
-        if fault.kind == "no_answer":
-            raise DeviceError("no answer in time (injected fault)")
-        if fault.kind == "refused":
-            raise DeviceError("the block was refused (injected fault)")
 
     def _spoil(self, fault: SimulatedFault, first_sample: int, displacement_um: F64) -> None:
         """Put an injected sensor fault on the readings it has reached."""

@@ -44,26 +44,16 @@ class DiffusionParameters(RodParameters):
 
     Saturation, strain and resistivity are of the size given for Terfenol-D; knee and pinning were
     set for the published strokes and widths.
-
-    Attributes:
-        saturation_a_per_m: M_s.
-        knee_a_per_m: b, the field of half the saturation.
-        pinning_max_a_per_m: Pinning field of the hardest cell; the others are evenly spaced to 0.
-        cells: Number of cells in each shell.
-        free_fraction: Weight of the cell that is not pinned; the others share the rest alike.
-        saturation_strain: lambda_s.
-        resistivity_ohm_m: rho.
-        shells: Number of shells, equally thick.
     """
 
-    saturation_a_per_m: float = 7.65e5
-    knee_a_per_m: float = 27e3
-    pinning_max_a_per_m: float = 9e3
-    cells: int = 8
-    free_fraction: float = 0.3
-    saturation_strain: float = 1.005e-3
-    resistivity_ohm_m: float = 0.6e-6
-    shells: int = 8
+    saturation_a_per_m: float = 7.65e5  # M_s
+    knee_a_per_m: float = 27e3  # b, the field of half the saturation
+    pinning_max_a_per_m: float = 9e3  # of the hardest cell; the others are evenly spaced to 0
+    cells: int = 8  # number of cells in each shell
+    free_fraction: float = 0.3  # weight of the cell that is not pinned; the others share the rest
+    saturation_strain: float = 1.005e-3  # lambda_s
+    resistivity_ohm_m: float = 0.6e-6  # rho
+    shells: int = 8  # number of shells, equally thick
 
     def rods(self, coil: Coil) -> Rods:
         """Return such rods in a coil."""

@@ -64,28 +64,17 @@ class DomainsParameters(RodParameters):
     Magnetostriction, saturation and anisotropy are of the size given for Terfenol-D (K is the
     curvature 4/3 |K_1| about <111>, with K_1 = -60 kJ/m^3); stress, spread and pinning were set for
     the published strokes and widths.
-
-    Attributes:
-        saturation_a_per_m: M_s.
-        anisotropy_j_per_m3: K.
-        strain_100: lambda_100.
-        strain_111: lambda_111.
-        stress_pa: sigma, negative in compression.
-        spread_j_per_m3: Omega.
-        pinning_j_per_m3: k_p.
-        reversibility: c.
-        resistivity_ohm_m: rho.
     """
 
-    saturation_a_per_m: float = 7.65e5
-    anisotropy_j_per_m3: float = 80e3
-    strain_100: float = 90e-6
-    strain_111: float = 1640e-6
-    stress_pa: float = -22e6
-    spread_j_per_m3: float = 16e3
-    pinning_j_per_m3: float = 11e3
-    reversibility: float = 0.1
-    resistivity_ohm_m: float = 0.6e-6
+    saturation_a_per_m: float = 7.65e5  # M_s
+    anisotropy_j_per_m3: float = 80e3  # K
+    strain_100: float = 90e-6  # lambda_100
+    strain_111: float = 1640e-6  # lambda_111
+    stress_pa: float = -22e6  # sigma, negative in compression
+    spread_j_per_m3: float = 16e3  # Omega
+    pinning_j_per_m3: float = 11e3  # k_p
+    reversibility: float = 0.1  # c
+    resistivity_ohm_m: float = 0.6e-6  # rho
 
     def rods(self, coil: Coil) -> Rods:
         """Return such rods in a coil."""

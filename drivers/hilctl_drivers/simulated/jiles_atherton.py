@@ -52,28 +52,17 @@ class JilesAthertonParameters(RodParameters):
     All are of the size that Calkins et al. and Dapino et al. give for Terfenol-D; pinning was set
     for the published width. The stress is that of a washer that shears the curve enough for the
     bias of this actuator to lie in the middle of its slope.
-
-    Attributes:
-        saturation_a_per_m: M_s.
-        shape_a_per_m: a.
-        pinning_a_per_m: k.
-        reversibility: c.
-        coupling: alpha.
-        saturation_strain: lambda_s.
-        stress_pa: sigma_0, negative in compression.
-        resistivity_ohm_m: rho.
-        wall_field_a_per_m: V_0, which scales the loss of walls in motion.
     """
 
-    saturation_a_per_m: float = 7.65e5
-    shape_a_per_m: float = 7012.0
-    pinning_a_per_m: float = 5000.0
-    reversibility: float = 0.18
-    coupling: float = 0.045
-    saturation_strain: float = 1.005e-3
-    stress_pa: float = -22e6
-    resistivity_ohm_m: float = 0.6e-6
-    wall_field_a_per_m: float = 100.0
+    saturation_a_per_m: float = 7.65e5  # M_s
+    shape_a_per_m: float = 7012.0  # a
+    pinning_a_per_m: float = 5000.0  # k
+    reversibility: float = 0.18  # c
+    coupling: float = 0.045  # alpha
+    saturation_strain: float = 1.005e-3  # lambda_s
+    stress_pa: float = -22e6  # sigma_0, negative in compression
+    resistivity_ohm_m: float = 0.6e-6  # rho
+    wall_field_a_per_m: float = 100.0  # V_0, which scales the loss of walls in motion
 
     @property
     def effective_coupling(self) -> float:

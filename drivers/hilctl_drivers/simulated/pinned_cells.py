@@ -20,29 +20,17 @@ from hilctl_drivers.simulated.actuator_base import Coil, RodParameters, Rods
 
 @dataclass(frozen=True, slots=True)
 class PinnedCellsParameters(RodParameters):
-    """Constants of lag, cells and strain.
+    """Constants of lag, cells and strain."""
 
-    Attributes:
-        lag_s: Time constant of the field inside the rods, for small changes.
-        lag_growth_m_per_a: Relative growth of that time constant per A/m the field is behind.
-        langevin_field_a_per_m: Field scale of the anhysteretic curve.
-        pinning_max_a_per_m: Pinning field of the hardest cell; the others are evenly spaced to 0.
-        cells: Number of cells.
-        free_fraction: Weight of the cell that is not pinned.
-        weight_decay: Exponent of the fall of the other weights towards the hardest cell.
-        strain_um: Displacement scale of the even polynomial in the magnetisation.
-        strain_quartic: Weight of its fourth-order term beside the second-order one.
-    """
-
-    lag_s: float = 9.57e-5
-    lag_growth_m_per_a: float = 5.66e-5
-    langevin_field_a_per_m: float = 27.1e3
-    pinning_max_a_per_m: float = 28.7e3
-    cells: int = 10
-    free_fraction: float = 0.455
-    weight_decay: float = 2.72
-    strain_um: float = 352.4
-    strain_quartic: float = -0.689
+    lag_s: float = 9.57e-5  # time constant of the field inside the rods, for small changes
+    lag_growth_m_per_a: float = 5.66e-5  # its relative growth per A/m that the field lags behind
+    langevin_field_a_per_m: float = 27.1e3  # field scale of the anhysteretic curve
+    pinning_max_a_per_m: float = 28.7e3  # of the hardest cell; the others are evenly spaced to 0
+    cells: int = 10  # number of cells
+    free_fraction: float = 0.455  # weight of the cell that is not pinned
+    weight_decay: float = 2.72  # exponent of the fall of the other weights to the hardest cell
+    strain_um: float = 352.4  # scale of the even polynomial in the magnetisation
+    strain_quartic: float = -0.689  # weight of its fourth-order term beside the second-order one
 
     def rods(self, coil: Coil) -> Rods:
         """Return pinned cells in a coil."""

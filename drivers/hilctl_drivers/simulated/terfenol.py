@@ -95,50 +95,27 @@ class TerfenolParameters:
     The rated values are those of sections 3.3.1 and 3.4.4 (chapter 2) of the dissertation: coil
     factor, permanent-magnet field, stiffness, damping ratio, moving mass, sensor bandwidth, noise
     and range. Converters and amplifier bandwidth are not published; plausible ones are assumed.
-
-    Attributes:
-        dac_range_a: Current at either end of the DAC's range.
-        dac_codes: Codes on either side of zero (DAC and ADCs).
-        amplifier_bandwidth_hz: Corner of the first-order current loop.
-        coil_factor_per_m: Field of one ampere, k_o in H = k_o I + H_PM.
-        magnet_field_a_per_m: Field of the permanent magnets, H_PM; 0 if there are none: the
-            displacement is then even in the current.
-        stiffness_n_per_m: Stiffness of the rods.
-        damping_ratio: Damping of the structure, measured without a load and kept with any: the
-            guides of a load add friction of their own.
-        moving_mass_kg: Rods, head and nut.
-        sensor_bandwidth_hz: Corner of the first-order sensor.
-        sensor_noise_um: Noise of each reading, rms.
-        sensor_range_um: Reading at either end of the sensor's range.
-        drift_um: Displacement that slow growth of the rods comes to, beside all the rest.
-        drift_s: Time constant of that growth.
-        step_max_s: Longest internal time step.
-        rods: Physics of the rods.
-        creep: Creep of the rods.
-        thermal: Growth with their temperature.
-        second_mode: A mode of the structure beside the first.
-        amplifier: Limit of the amplifier's voltage.
     """
 
-    dac_range_a: float = 10.0
-    dac_codes: int = 32767
-    amplifier_bandwidth_hz: float = 10e3
-    coil_factor_per_m: float = 5.09e3
-    magnet_field_a_per_m: float = 44.1e3
-    stiffness_n_per_m: float = 33.597e6
-    damping_ratio: float = 0.12
-    moving_mass_kg: float = 0.162
-    sensor_bandwidth_hz: float = 15e3
-    sensor_noise_um: float = 0.03553
-    sensor_range_um: float = 125.0
-    drift_um: float = 0.0
-    drift_s: float = 1.0
-    step_max_s: float = 10e-6
-    rods: RodParameters = field(default_factory=PinnedCellsParameters)
-    creep: CreepEffect | None = None
-    thermal: Thermal | None = None
-    second_mode: SecondMode | None = None
-    amplifier: VoltageLimit | None = None
+    dac_range_a: float = 10.0  # current at either end of the DAC's range
+    dac_codes: int = 32767  # codes on either side of zero (DAC and ADCs)
+    amplifier_bandwidth_hz: float = 10e3  # corner of the first-order current loop
+    coil_factor_per_m: float = 5.09e3  # field of one ampere, k_o in H = k_o I + H_PM
+    magnet_field_a_per_m: float = 44.1e3  # of the permanent magnets, H_PM; 0 without magnets
+    stiffness_n_per_m: float = 33.597e6  # stiffness of the rods
+    damping_ratio: float = 0.12  # of the structure; the same with a load, whose guides add friction
+    moving_mass_kg: float = 0.162  # rods, head and nut
+    sensor_bandwidth_hz: float = 15e3  # corner of the first-order sensor
+    sensor_noise_um: float = 0.03553  # noise of each reading, rms
+    sensor_range_um: float = 125.0  # reading at either end of the sensor's range
+    drift_um: float = 0.0  # final displacement of a slow growth of the rods
+    drift_s: float = 1.0  # time constant of that growth
+    step_max_s: float = 10e-6  # longest internal time step
+    rods: RodParameters = field(default_factory=PinnedCellsParameters)  # physics of the rods
+    creep: CreepEffect | None = None  # creep of the rods
+    thermal: Thermal | None = None  # growth with their temperature
+    second_mode: SecondMode | None = None  # a mode of the structure beside the first
+    amplifier: VoltageLimit | None = None  # limit of the amplifier's voltage
 
 
 def _motion(parameters: TerfenolParameters, load_kg: float, step_s: float) -> F64:
