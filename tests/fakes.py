@@ -26,7 +26,7 @@ from hilctl_drivers.emulator.factory import Emulator, build
 from hilctl_drivers.emulator.modbus_device import EmulatedModbus
 from hilctl_drivers.emulator.modbus_wire import ModbusWire
 from hilctl_drivers.emulator.options import EmulatorOptions
-from hilctl_drivers.emulator.rig import Rig, SimulatedWiring, WriteLog
+from hilctl_drivers.emulator.rig import Bench, Rig, SimulatedWiring, WriteLog
 from hilctl_drivers.modbus.modbus_profile import ModbusProfile
 from hilctl_drivers.profile import load_profile
 from hilctl_drivers.transport.links import LostError, Missing, NoAnswerError
@@ -448,7 +448,8 @@ class InProcess:
         time = VirtualTime()
         rig, writes = Rig(time.now_ns, noise=noise), WriteLog(log, 0)
         wiring = SimulatedWiring.spread(loaded.outputs[output], loaded.inputs[sensor])
-        device = EmulatedModbus(loaded, rig, writes, output, sensor, wiring, current_a, noise=noise)
+        bench = Bench(rig, wiring, writes)
+        device = EmulatedModbus(loaded, bench, output, sensor, current_a, noise=noise)
         wire = ModbusWire("tcp", {loaded.unit_id: device})
         return cls(device, rig, link(wire, time, message_s), time, writes)
 

@@ -126,11 +126,7 @@ def parse_number(text: str) -> float:
 class AsciiSession:
     """A link to one device, which answers each line before the next is sent.
 
-    Args:
-        profile: The device.
-        link: Not yet open; several devices may share it.
-        address: The device's address, for ``{address}``; as shipped if None.
-        sleep: Waits a number of s.
+    Several devices may share a link. The address is as shipped if it is None.
     """
 
     def __init__(
@@ -208,13 +204,6 @@ class AsciiSession:
         """Ask for a number."""
         return parse_number(self.query(self.text(query.ask), query.pattern)[1])
 
-    def command(self, text: str, reply: Reply | str) -> None:
-        """Send a line that is answered as ``reply`` says, or not at all."""
-        if isinstance(reply, Reply):
-            self.ask(text, reply.pattern)
-        else:
-            self.send(text)
-
     def run(self, steps: Sequence[AsciiStep], **values: float) -> None:
         """Execute a profile's steps, with ``values`` for ``timeout`` and ``safe``.
 
@@ -260,18 +249,21 @@ class AsciiSession:
         if isinstance(step, WaitStep):
             self._sleep(step.seconds)
         elif isinstance(step, SendStep):
-            self.command(self.text(step.text, **values), step.reply)
+            text = self.text(step.text, **values)
+            if step.reply == "none":
+                self.send(text)
+            else:
+                self.ask(text, step.reply.pattern)
         elif isinstance(step, AskStep):
             self.ask(self.text(step.ask, **values), step.pattern)
         else:
-            self._check_number(step, values)
-
-    def _check_number(self, step: NumberStep, values: dict[str, float]) -> None:
-        wanted = values["safe"] if step.value == "safe" else step.value
-        found = self.number(step)
-        if not abs(found - wanted) <= step.tolerance:
-            rule = f"{self.text(step.ask)} must say {wanted:g} within {step.tolerance:g}"
-            raise DeviceError(f"{rule}, got {found:g}")
+            wanted, found = (
+                values["safe"] if step.value == "safe" else step.value,
+                self.number(step),
+            )
+            if not abs(found - wanted) <= step.tolerance:
+                rule = f"{self.text(step.ask)} must say {wanted:g} within {step.tolerance:g}"
+                raise DeviceError(f"{rule}, got {found:g}")
 
     def _check_trouble(self, text: str, reply: str) -> None:
         if self._refusal != "none" and self._refusal.match(reply):
@@ -306,13 +298,7 @@ _Line: TypeAlias = tuple[str, str | None]
 
 
 def exchange_time(profile: AsciiProfile, output: str, sensor: str | None) -> WireTime:
-    """Return the time to set an output, with the longest value, and to ask for an input.
-
-    Args:
-        profile: The device; see :func:`hilctl_drivers.profile.with_link` for another baud.
-        output: Name of the output.
-        sensor: Name of the input; None to write only.
-    """
+    """Return the time to set an output, with the longest value, and to ask for an input, if any."""
     channel, combined = profile.outputs[output], profile.exchange
 
     def longest(template: str) -> str:

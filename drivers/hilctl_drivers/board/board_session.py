@@ -123,12 +123,7 @@ class BoardState:
 
 
 class BoardSession:
-    """A link to one board, which answers each message before the next is sent.
-
-    Args:
-        profile: The board.
-        link: Not yet open.
-    """
+    """A link to one board, which answers each message before the next is sent."""
 
     def __init__(self, profile: FrameProfile, link: Link) -> None:
         framing = profile.link.framing

@@ -10,7 +10,7 @@ from hilctl_drivers.board import frames as board
 from hilctl_drivers.board.board_profile import FrameProfile, FrameStreaming
 from hilctl_drivers.board.board_session import BoardValues
 from hilctl_drivers.board.frames import Status
-from hilctl_drivers.emulator.rig import EmulatedDevice, Rig, SampleFifo, SimulatedWiring, WriteLog
+from hilctl_drivers.emulator.rig import Bench, EmulatedDevice, SampleFifo
 from hilctl_drivers.emulator.wire import EmulatedReply
 
 _GOOD = b"\0"
@@ -27,17 +27,9 @@ class EmulatedBoard(EmulatedDevice):
 
     profile: FrameProfile
 
-    def __init__(
-        self,
-        profile: FrameProfile,
-        rig: Rig,
-        log: WriteLog,
-        wiring: SimulatedWiring,
-        *,
-        noise: bool,
-    ) -> None:
+    def __init__(self, profile: FrameProfile, bench: Bench, *, noise: bool) -> None:
         self._name, self._range = next(iter(profile.outputs.items()))
-        super().__init__(profile, rig, log, wiring, self._name)
+        super().__init__(profile, bench, self._name)
         self._outputs = BoardValues(self._range)
         self._sensor = next(iter(profile.inputs.values()))
         self._inputs = BoardValues(self._sensor)
@@ -63,8 +55,8 @@ class EmulatedBoard(EmulatedDevice):
             self._kinds[board.STATE] = self._state
         low, high = self._range.limits
         # The power-up value is 0 at the terminal, not at the coil.
-        self.fifo.current_a = wiring.current_a(min(max(0.0, low), high))
-        rig.put_out(self.fifo.current_a, 0)
+        self.fifo.current_a = self.wiring.current_a(min(max(0.0, low), high))
+        self._rig.put_out(self.fifo.current_a, 0)
 
     def _trip(self, due_ns: int) -> None:
         self.fifo.advance(due_ns)

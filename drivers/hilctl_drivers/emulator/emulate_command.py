@@ -66,11 +66,7 @@ def is_experiment(name: str) -> bool:
 def wired_experiment(path: Path, port: int = 0, host: str | None = None) -> WiredExperiment:
     """Return what to emulate for an experiment file.
 
-    Args:
-        path: The file.
-        port: TCP port to listen on; if 0 that of the experiment, or a free one if users may not
-            listen there.
-        host: Address to listen on; this machine's own if None.
+    Port 0 stands for that of the experiment, or for a free one if users may not listen there.
 
     Raises:
         InputError: The file cannot be read, names no device with a profile, or drives with voltage.

@@ -16,7 +16,7 @@ from hilctl_drivers.emulator.board_device import EmulatedBoard
 from hilctl_drivers.emulator.modbus_device import EmulatedModbus
 from hilctl_drivers.emulator.modbus_wire import ModbusWire
 from hilctl_drivers.emulator.options import EmulatorOptions
-from hilctl_drivers.emulator.rig import Rig, SimulatedWiring, WriteLog
+from hilctl_drivers.emulator.rig import Bench, Rig, SimulatedWiring, WriteLog
 from hilctl_drivers.emulator.server import EmulatorServer
 from hilctl_drivers.emulator.text_device import EmulatedText
 from hilctl_drivers.emulator.wire import EmulatedLine, EmulatedWire
@@ -53,11 +53,7 @@ class Emulator:
 
 
 def build(options: EmulatorOptions, clock_ns: Callable[[], int] = time.monotonic_ns) -> Emulator:
-    """Return an emulator whose ports are open.
-
-    Args:
-        options: What to emulate.
-        clock_ns: Time of the rig, of watchdogs, sample clocks and faults.
+    """Return an emulator whose ports are open; all its clocks are ``clock_ns``.
 
     Raises:
         InputError: There is no such profile, it has no such channels, an option or a fault does not
@@ -66,10 +62,10 @@ def build(options: EmulatorOptions, clock_ns: Callable[[], int] = time.monotonic
     """
     plan = _plan(options)
     now_ns = clock_ns()
-    rig = Rig(now_ns, noise=options.noise)
     log = WriteLog(options.log, time.time_ns() - now_ns)
     server = EmulatorServer(options.faults, clock_ns)
-    device, reader, ports = plan.devices(rig, log)
+    bench = Bench(Rig(now_ns, noise=options.noise), plan.wiring, log)
+    device, reader, ports = plan.devices(bench)
     try:
         addresses = [_opened(server, port, options.host) for port in ports]
     except InputError:
@@ -133,7 +129,7 @@ class _Plan(Generic[ProfileT]):
         self._sensor = _chosen("input to show a displacement at", options.sensor, sensors, reader)
         self._output_range = profile.outputs[self._output]
         self._sensor_range = reader.inputs[self._sensor]
-        self._wiring = options.wiring or SimulatedWiring.spread(
+        self.wiring = options.wiring or SimulatedWiring.spread(
             self._output_range, self._sensor_range
         )
         self._apart = reader is not profile
@@ -145,7 +141,7 @@ class _Plan(Generic[ProfileT]):
 
     def channels(self) -> dict[str, Any]:
         """Return the part of a device section with profile, channels and wiring."""
-        wiring = self._wiring
+        wiring = self.wiring
         made: dict[str, Any] = {
             "profile": self._options.profile,
             "output": self._output,
@@ -197,16 +193,16 @@ class _ModbusPlan(_Plan[ModbusProfile]):
             raise InputError(f"reader_unit_id must not be {wanted}, that of {profile.title}")
         return reader.unit_id + (reader.unit_id == profile.unit_id) if wanted is None else wanted
 
-    def devices(self, rig: Rig, log: WriteLog) -> tuple[AnyDevice, AnyDevice, list[_Port]]:
+    def devices(self, bench: Bench) -> tuple[AnyDevice, AnyDevice, list[_Port]]:
         """Return the devices that drive and show the rig, and where they are served."""
         options, output, sensor = self._options, self._output, self._sensor
         reads_itself = self._reader is self._profile
         device = reader = EmulatedModbus(
-            self._profile, rig, log, output, sensor if reads_itself else None, self._wiring,
-            options.current_a, noise=options.noise,
+            self._profile, bench, output, sensor if reads_itself else None, options.current_a,
+            noise=options.noise,
         )  # fmt: skip
         if not reads_itself:
-            reader = EmulatedModbus(self._reader, rig, log, None, sensor, self._wiring)
+            reader = EmulatedModbus(self._reader, bench, None, sensor)
         assert self.reader_unit_id is not None
         own, other = {self._profile.unit_id: device}, {self.reader_unit_id: reader}
         served = [(own, 0), (other, 1)] if self._apart else [(other | own, 0)]
@@ -229,18 +225,18 @@ class _SerialPlan(_Plan[AsciiProfile | FrameProfile]):
         self._refuse_resets()
         self._apart &= options.reader_line != "same"
 
-    def devices(self, rig: Rig, log: WriteLog) -> tuple[AnyDevice, AnyDevice, list[_Port]]:
+    def devices(self, bench: Bench) -> tuple[AnyDevice, AnyDevice, list[_Port]]:
         """Return the devices that drive and show the rig, and where they are served."""
-        profile, reader, wiring = self._profile, self._reader, self._wiring
+        profile, reader = self._profile, self._reader
         if isinstance(profile, FrameProfile):
-            board = EmulatedBoard(profile, rig, log, wiring, noise=self._options.noise)
+            board = EmulatedBoard(profile, bench, noise=self._options.noise)
             return board, board, [_Port(EmulatedLine(profile, [board]))]
         assert isinstance(reader, AsciiProfile)
         if reader is profile:
-            text = EmulatedText(profile, rig, log, wiring, self._output, self._sensor)
+            text = EmulatedText(profile, bench, self._output, self._sensor)
             return text, text, [_Port(EmulatedLine(profile, [text]))]
-        drives = EmulatedText(profile, rig, log, wiring, self._output, None)
-        reads = EmulatedText(reader, rig, log, wiring, None, self._sensor)
+        drives = EmulatedText(profile, bench, self._output, None)
+        reads = EmulatedText(reader, bench, None, self._sensor)
         if not self._apart:
             return drives, reads, [_Port(EmulatedLine(profile, [drives, reads]))]
         ports = [_Port(EmulatedLine(profile, [drives]))]

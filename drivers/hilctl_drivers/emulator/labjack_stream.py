@@ -11,7 +11,7 @@ import numpy as np
 
 from hilctl.base.types import F64
 from hilctl_drivers.emulator.registers import RejectedRequest
-from hilctl_drivers.emulator.rig import Rig, SampleFifo, SimulatedWiring
+from hilctl_drivers.emulator.rig import Bench, SampleFifo
 from hilctl_drivers.labjack import stream
 from hilctl_drivers.modbus.modbus_profile import BYTES_A_SAMPLE, LabJackStreaming, ModbusProfile
 from hilctl_drivers.modbus.register_map import RegisterStep
@@ -91,13 +91,12 @@ class LabJackStream:
         streaming: LabJackStreaming,
         output: str,
         sensor: str,
-        wiring: SimulatedWiring,
-        rig: Rig,
+        bench: Bench,
         *,
         noise: bool,
         on_played: Callable[[int, F64, int], None],
     ) -> None:
-        self._streaming, self._wiring, self._rig = streaming, wiring, rig
+        self._streaming, self._wiring, self._rig = streaming, bench.wiring, bench.rig
         self._limits = profile.outputs[output].limits
         self._target = profile.wire_address(profile.outputs[output])
         self._sensor = profile.inputs[sensor]

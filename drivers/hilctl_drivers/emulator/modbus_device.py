@@ -5,13 +5,7 @@ from collections.abc import Sequence
 from hilctl.base.types import F64
 from hilctl_drivers.emulator.labjack_stream import LabJackStream
 from hilctl_drivers.emulator.registers import RegisterMap, RejectedRequest, Words
-from hilctl_drivers.emulator.rig import (
-    EmulatedDevice,
-    Rig,
-    SimulatedWiring,
-    WatchdogTimer,
-    WriteLog,
-)
+from hilctl_drivers.emulator.rig import Bench, EmulatedDevice, WatchdogTimer
 from hilctl_drivers.modbus.modbus_profile import ModbusProfile, ModbusWatchdog
 from hilctl_drivers.modbus.register_map import EnsureStep, ModbusStep, RegisterStep, WriteStep
 
@@ -23,11 +17,8 @@ class EmulatedWatchdog(WatchdogTimer):
     """Trips when the host has been silent for the timeout.
 
     It is armed by the last of the profile's arm steps and disarmed by the last of the disarm steps,
-    as they are written; so it starts as a new device would, disarmed.
-
-    Args:
-        profile: The profile's watchdog.
-        words: Value of each step, by its ``id``.
+    as they are written; so it starts as a new device would, disarmed. ``words`` has the value of
+    each step, by its ``id``.
     """
 
     def __init__(self, profile: ModbusWatchdog, words: dict[int, Words]) -> None:
@@ -111,16 +102,14 @@ class EmulatedModbus(EmulatedDevice):
     def __init__(
         self,
         profile: ModbusProfile,
-        rig: Rig,
-        log: WriteLog,
+        bench: Bench,
         output: str | None,
         sensor: str | None,
-        wiring: SimulatedWiring,
         current_a: float | None = None,
         *,
         noise: bool = True,
     ) -> None:
-        super().__init__(profile, rig, log, wiring, output)
+        super().__init__(profile, bench, output)
         self._sensor = sensor
         registers = RegisterMap(profile)
         self.memory = registers.memory
@@ -133,7 +122,7 @@ class EmulatedModbus(EmulatedDevice):
         self.overlay: LabJackStream | None = None  # registers of a stream, before all others
         if streaming != "none" and output in streaming.outputs and sensor in streaming.inputs:
             self.overlay = LabJackStream(
-                profile, streaming, output, sensor, wiring, rig, noise=noise, on_played=self._played
+                profile, streaming, output, sensor, bench, noise=noise, on_played=self._played
             )
         self._power_up(current_a)
 

@@ -27,14 +27,10 @@ def _rated(*, noise: bool) -> TerfenolParameters:
 
 
 class Rig:
-    """The actuator with its amplifier and sensor, in real time.
+    """The actuator with its amplifier and sensor, in real time, from rest at 0 A at ``now_ns``.
 
     The caller gives the time. The rig has then held its output since the last change, and its
     sensor shows the last sample of its own clock: readings are one to two of its periods old.
-
-    Args:
-        now_ns: Time at which it is at rest and at 0 A.
-        noise: Whether the sensor has noise.
     """
 
     def __init__(self, now_ns: int, *, noise: bool = True) -> None:
@@ -134,11 +130,11 @@ _BEGIN = b'{"event": '
 
 
 class WriteLog:
-    """One JSON object a line, on disk as soon as it happened.
+    """One JSON object per line, on disk immediately; an older log is replaced.
 
     Args:
-        path: File to write; an older log is replaced. None keeps no log.
-        unix_offset_ns: What to add to the monotonic clock to get Unix time.
+        path: File to write; None for no log.
+        unix_offset_ns: Unix time less the monotonic clock.
 
     Raises:
         InputError: The file cannot be written.
@@ -172,30 +168,27 @@ class WriteLog:
             self._file = None
 
 
-class EmulatedDevice(ABC):
-    """A device at the rig: its time, its watchdog timer, and what it outputs.
+@dataclass(frozen=True, slots=True)
+class Bench:
+    """A rig, the wiring to it, and the log of what is output; devices may share it."""
 
-    Args:
-        profile: Its profile.
-        rig: The rig; several devices may share it.
-        log: Log of the outputs.
-        wiring: Amplifier and sensor between.
-        output: Output that drives the rig; None if another device does.
+    rig: Rig
+    wiring: SimulatedWiring
+    log: WriteLog
+
+
+class EmulatedDevice(ABC):
+    """A device on a bench: its time, its watchdog timer, and its outputs.
+
+    ``output`` is the one that drives the rig, None if another device does.
     """
 
     profile: BaseProfile
 
-    def __init__(
-        self,
-        profile: BaseProfile,
-        rig: Rig,
-        log: WriteLog,
-        wiring: SimulatedWiring,
-        output: str | None,
-    ) -> None:
+    def __init__(self, profile: BaseProfile, bench: Bench, output: str | None) -> None:
         self.profile = profile
-        self.wiring = wiring
-        self._rig, self._log, self._output = rig, log, output
+        self.wiring, self._rig, self._log = bench.wiring, bench.rig, bench.log
+        self._output = output
         self._timer = WatchdogTimer()
         self._now_ns = 0
 

@@ -120,13 +120,12 @@ class _PtyConnection(_Connection):
 
 
 class _Scheduled(NamedTuple):
-    """Something to do when it is due; a newer request on its connection may supersede it."""
+    """An action and its time; the next request on ``superseded_by`` cancels it."""
 
     due_ns: int
     number: int
-    connection: _Connection
     action: Callable[[int], None]
-    superseded: bool
+    superseded_by: _Connection | None
 
 
 _TICK_S = 0.005
@@ -241,25 +240,15 @@ class EmulatorServer:
                 return
 
     def _schedule(
-        self,
-        due_ns: int,
-        connection: _Connection,
-        action: Callable[[int], None],
-        *,
-        superseded: bool,
+        self, due_ns: int, action: Callable[[int], None], superseded_by: _Connection | None = None
     ) -> None:
         self._count += 1
-        entry = _Scheduled(due_ns, self._count, connection, action, superseded)
-        heapq.heappush(self._scheduled, entry)
+        heapq.heappush(self._scheduled, _Scheduled(due_ns, self._count, action, superseded_by))
 
     def _answer(self, connection: _Connection, request: bytes) -> None:
         now_ns = self._clock_ns()
         # A new request means that the host has given up on answers that are still to come.
-        self._scheduled = [
-            each
-            for each in self._scheduled
-            if each.connection is not connection or not each.superseded
-        ]
+        self._scheduled = [e for e in self._scheduled if e.superseded_by is not connection]
         heapq.heapify(self._scheduled)
         fault = None
         if connection.faulty:
@@ -280,7 +269,7 @@ class EmulatorServer:
         due_ns = max(answer.due_ns, now_ns) + delay_ns
         reply = partial(self._reply, connection, answer, fault)
         if due_ns > now_ns:
-            self._schedule(due_ns, connection, reply, superseded=fault is None)
+            self._schedule(due_ns, reply, connection if fault is None else None)
         else:
             reply(now_ns)
 
@@ -288,8 +277,7 @@ class EmulatorServer:
         """Keep the request from the device, for good or until later."""
         if fault.kind == "late":
             due_ns = self._clock_ns() + round(fault.delay_s * 1e9)
-            execute = partial(self._execute, connection, request, None)
-            self._schedule(due_ns, connection, execute, superseded=False)
+            self._schedule(due_ns, partial(self._execute, connection, request, None))
         elif fault.kind == "unplug":
             self._unplug()
         elif fault.kind == "reset":

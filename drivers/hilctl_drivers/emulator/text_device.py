@@ -12,7 +12,7 @@ from hilctl_drivers.ascii.ascii_profile import (
     Reply,
     SendStep,
 )
-from hilctl_drivers.emulator.rig import EmulatedDevice, Rig, SimulatedWiring, WriteLog
+from hilctl_drivers.emulator.rig import Bench, EmulatedDevice
 from hilctl_drivers.emulator.wire import EmulatedReply
 
 _NUMBER = r"[-+]?[0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?"
@@ -71,29 +71,23 @@ class EmulatedText(EmulatedDevice):
     profile: AsciiProfile
 
     def __init__(
-        self,
-        profile: AsciiProfile,
-        rig: Rig,
-        log: WriteLog,
-        wiring: SimulatedWiring,
-        output: str | None,
-        sensor: str | None,
+        self, profile: AsciiProfile, bench: Bench, output: str | None, sensor: str | None
     ) -> None:
-        super().__init__(profile, rig, log, wiring, output)
+        super().__init__(profile, bench, output)
         self._sensor = sensor
-        self._address = profile.address if isinstance(profile.address, int) else 0
+        self._address = profile.unit
         # The power-up value is 0 at the terminal, not at the coil.
         self._values = {
             name: min(max(0.0, each.min), each.max) for name, each in profile.outputs.items()
         }
         self._commands = dict(self._values)
-        rest = wiring.output(0.0)
+        rest = self.wiring.output(0.0)
         self._safe = {
             name: min(max(rest if name == output else 0.0, each.min), each.max)
             for name, each in profile.outputs.items()
         }
         if output is not None:
-            rig.put_out(wiring.current_a(self._values[output]), 0)
+            self._rig.put_out(self.wiring.current_a(self._values[output]), 0)
         self._errors: list[str] = []
 
     def answer(self, message: bytes, now_ns: int) -> EmulatedReply | None:

@@ -2,9 +2,9 @@
 
 Amplifier, rods, structure and sensor are chained as in the rig of the dissertation "Modeling and
 Compensation of Rate-Dependent Asymmetric Hysteresis Nonlinearities of Magnetostrictive Actuators",
-Concordia, sections 3.3 and 3.4 of its chapter 2. What goes on in the rods is one physics of several
-(``plant.Rods``). The first is near to what a compensator inverts: pinned magnetisation after a
-non-linear lag of the field, where that has plays of the current. The others have nothing of it.
+Concordia, sections 3.3 and 3.4 of its chapter 2. The rods have one of several physics (``Rods``).
+The first is near to what a compensator inverts: pinned magnetisation after a non-linear lag of the
+field, where that has plays of the current. The others have nothing of it.
 """
 
 import math
@@ -190,12 +190,8 @@ class TerfenolActuator(Plant):
     ) -> None:
         """Build the actuator at rest.
 
-        Args:
-            parameters: Physical constants.
-            sample_rate_hz: Samples per second, > 0.
-            load_kg: Mass added to the moving mass, >= 0.
-            bias_a: Constant current beside the command; the displacement is zero there.
-            seed: Seed of the sensor noise.
+        ``load_kg`` is added to the moving mass, and ``bias_a`` to each command; the displacement
+        is zero at the bias.
         """
         # The margin keeps rounding from adding a step where the period is a multiple of it.
         self._substeps = math.ceil(1.0 / (sample_rate_hz * parameters.step_max_s) - 1e-9)

@@ -4,7 +4,7 @@ import pytest
 
 from hilctl_drivers.emulator.modbus_device import EmulatedModbus
 from hilctl_drivers.emulator.modbus_wire import ModbusWire
-from hilctl_drivers.emulator.rig import Rig, SimulatedWiring, WriteLog
+from hilctl_drivers.emulator.rig import Bench, Rig, SimulatedWiring, WriteLog
 from hilctl_drivers.modbus.pdu import (
     feedback_pdu,
     read_pdu,
@@ -115,9 +115,9 @@ def test_rtu_ignores_others_and_rubbish():
 
 def test_units_share_a_line_and_a_rig():
     """One unit drives, the other shows; neither has the other's registers."""
-    rig, log, wiring = Rig(0), WriteLog(None, 0), SimulatedWiring(1.0, 0.0, 12.5, 0.0)
-    drives = EmulatedModbus(load_profile("adam_4024"), rig, log, "AO0", None, wiring)
-    reads = EmulatedModbus(load_profile("adam_4117"), rig, log, None, "AI2", wiring)
+    bench = Bench(Rig(0), SimulatedWiring(1.0, 0.0, 12.5, 0.0), WriteLog(None, 0))
+    drives = EmulatedModbus(load_profile("adam_4024"), bench, "AO0", None)
+    reads = EmulatedModbus(load_profile("adam_4117"), bench, None, "AI2")
     wire = ModbusWire("rtu", {1: drives, 2: reads})
 
     def transact(unit: int, pdu: bytes, now_ns: int) -> bytes:
@@ -126,8 +126,10 @@ def test_units_share_a_line_and_a_rig():
 
     transact(1, write_single_pdu(0, (4095).to_bytes(2, "big")), 0)
     raw = int.from_bytes(transact(2, read_pdu(3, 2, 1), 10 * MS), "big")
-    assert 12.5 * (raw * 20.0 / 65535.0 - 10.0) == pytest.approx(rig.displacement_um, abs=0.01)
-    assert rig.displacement_um > 40.0
+    assert 12.5 * (raw * 20.0 / 65535.0 - 10.0) == pytest.approx(
+        bench.rig.displacement_um, abs=0.01
+    )
+    assert bench.rig.displacement_um > 40.0
     with pytest.raises(RefusedError):
         transact(2, write_single_pdu(0, bytes(2)), 10 * MS)
     assert requests(wire, rtu_adu(3, read_pdu(3, 0, 1))) == []
