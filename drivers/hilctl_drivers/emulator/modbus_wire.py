@@ -114,13 +114,8 @@ class ModbusWire:
     """Devices behind Modbus TCP or RTU: requests from bytes, and replies to bytes.
 
     A device alone on a TCP connection answers to any unit id, as such devices do; on a line, or
-    behind a gateway with others, only to its own.
-
-    Args:
-        kind: ``tcp`` or ``rtu``.
-        devices: Devices by unit id.
-        lacking: Functions that the devices are to refuse as unknown, with exception 1.
-        mute: Functions that are never answered, as some devices do with those they do not know.
+    behind a gateway with others, only to its own. It refuses functions in ``lacking`` as unknown,
+    with exception 1, and never answers those in ``mute``, as some devices do.
     """
 
     def __init__(

@@ -51,12 +51,9 @@ class Plant(ABC):
     """
 
     def __init__(self, noise_um: float, seed: int, chunk: int = CHUNK) -> None:
-        """Create the noise; the subclass calls :meth:`warm_up` once it is complete.
+        """Create the noise, rms; the subclass calls :meth:`warm_up` once it is complete.
 
-        Args:
-            noise_um: Noise of each reading, rms.
-            seed: Seed of that noise.
-            chunk: Most samples of one call of the kernels, at most ``CHUNK``.
+        ``chunk`` limits the samples of one call of the kernels, at most ``CHUNK``.
         """
         self._noise = SensorNoise(noise_um, seed)
         self._chunk = chunk
@@ -130,9 +127,7 @@ class Coil:
 class Rods(ABC):
     """Rods in a coil: current in, displacement without structure or load out.
 
-    Args:
-        kernel: Does :meth:`follow`, with the arguments of that first.
-        arguments: State and constants, the kernel's further arguments.
+    The kernel does :meth:`follow`; after the arguments of that it gets its state and constants.
     """
 
     def __init__(self, kernel: Callable[..., object], *arguments: object) -> None:

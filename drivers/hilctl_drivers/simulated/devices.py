@@ -78,13 +78,7 @@ class SimulatedDevice(DacDevice):
         parameters: TerfenolParameters | PiezoParameters,
         **info: Any,
     ) -> None:
-        """Describe the device; nothing is simulated before :meth:`open`.
-
-        Args:
-            options: Its options.
-            parameters: The actuator, kept with each recording together with the options.
-            info: Name, description, unit and range of the command.
-        """
+        """Describe the device; a recording keeps parameters and options as its details."""
         plain = asdict(parameters)
         details = plain | plain.pop("rods", {}) | options.model_dump()
         described = DeviceInfo(

@@ -140,9 +140,8 @@ class PinnedCells(Rods):
     """Cells with dry friction behind one lag of the field."""
 
     def __init__(self, parameters: PinnedCellsParameters, coil: Coil) -> None:
-        bias = coil.bias_a_per_m
+        self._bias = bias = coil.bias_a_per_m
         lag = parameters.lag_s, parameters.lag_growth_m_per_a
-        self._bias = bias
         self._curve = (
             parameters.langevin_field_a_per_m,
             parameters.strain_um,
