@@ -35,16 +35,6 @@ def test_independent_client_agrees(served):
         assert client.read_holding_registers(9999, count=1).exception_code == 2
 
 
-def test_pipelined_requests_are_answered_in_order(served):
-    """Two requests in one segment get two replies."""
-    host, port = served("labjack_t7").split(":")
-    pdu = read_pdu(3, 1000, 2)
-    with socket.create_connection((host, int(port)), 5.0) as link:
-        link.sendall(tcp_adu(1, 1, pdu) + tcp_adu(2, 1, pdu))
-        got = received(link.fileno(), 26)
-    assert (got[:2], got[13:15]) == (b"\x00\x01", b"\x00\x02")
-
-
 def test_log_tells_time_and_value(served, tmp_path):
     """Each write is one JSON object with both clocks, on disk at once."""
     path = tmp_path / "log.jsonl"

@@ -9,8 +9,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hilctl.base.types import F64
-from hilctl_drivers.simulated.actuator_base import CHUNK, Coil, SensorNoise
+from hilctl_drivers.simulated.actuator_base import (
+    CHUNK,
+    VACUUM_PERMEABILITY,
+    Coil,
+    RodParameters,
+    SensorNoise,
+)
 from hilctl_drivers.simulated.devices import PHYSICS, Physics
+from hilctl_drivers.simulated.domains import DomainsParameters
+from hilctl_drivers.simulated.jiles_atherton import JilesAthertonParameters
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 
 RATED = TerfenolParameters()
@@ -110,14 +118,12 @@ class TestPublishedRanges:
     def test_stroke(self, physics: Physics) -> None:
         """A 6 A sine of 1 Hz moves it by 60 to 100 um (published: 83.1)."""
         stroke_um = np.ptp(loop(physics, 6.0, 1.0)[1])
-        print(f"{physics}: {stroke_um:.1f} um")
         assert 60.0 <= stroke_um <= 100.0
 
     @rigs
     def test_hysteresis_grows_with_the_frequency(self, physics: Physics) -> None:
         """10 to 25 % at 1 Hz, 35 to 50 % at 250 Hz (published: 18.2 and 49.1)."""
         figures = [hysteresis_percent(*loop(physics, 6.0, hz)) for hz in (1.0, 50.0, 100.0, 250.0)]
-        print(physics, " ".join(f"{figure:.1f}" for figure in figures))
         assert figures == sorted(figures)
         assert 10.0 <= figures[0] <= 25.0
         assert 35.0 <= figures[-1] <= 50.0
@@ -218,3 +224,67 @@ def test_rods_rest_where_the_bias_has_been_for_long(physics: Physics) -> None:
     rest_um, free_um = rods.rest(), np.empty(10_000)
     rods.follow(np.zeros(20_001), free_um)
     np.testing.assert_allclose(free_um, rest_um, rtol=0.0, atol=1e-9)
+
+
+# Next to no losses: what is left does not know how fast the field goes.
+STILL = {
+    "domains": DomainsParameters(resistivity_ohm_m=1e3),
+    "jiles_atherton": JilesAthertonParameters(resistivity_ohm_m=1e3),
+}
+anhysteretic = pytest.mark.parametrize("rods", STILL.values(), ids=STILL)
+
+
+def magnetisation(rods: RodParameters, field: F64) -> F64:
+    """M at the end of each step from one field to the next, from the anhysteretic at the first."""
+    model = rods.rods(Coil(1.0, float(field[0]), 1e-5))
+    model.rest()
+    found = np.empty(field.size - 1)
+    for k in range(found.size):
+        ends = np.array([field[k], 0.5 * (field[k] + field[k + 1]), field[k + 1]]) - field[0]
+        model.follow(ends, np.empty(1))
+        state = model._state
+        found[k] = state[1] if state.ndim == 1 else state[2, 1] - state[2, 0]
+    return found
+
+
+@anhysteretic
+def test_decaying_field_ends_on_the_anhysteretic(rods: RodParameters) -> None:
+    """From far off it, a field that swings ever less leads back to it."""
+    decay = np.linspace(1.0, 0.0, 30_001)
+    field = 30e3 + 60e3 * decay * np.cos(2.0 * np.pi * np.arange(decay.size) / 400.0)
+    found = magnetisation(rods, np.concatenate([np.linspace(0.0, 90e3, 2000), field]))
+    rest = magnetisation(rods, np.full(2, 30e3))[0]
+    assert abs(found[1998] - rest) > 0.2 * rods.saturation_a_per_m
+    assert found[-1] == pytest.approx(rest, rel=0.02)
+
+
+@anhysteretic
+def test_minor_loop_does_not_close(rods: RodParameters) -> None:
+    """A small cycle on the rising branch ends elsewhere than it began, less so each time."""
+    up = np.linspace(13e3, 44e3, 1500)
+    dip = 44e3 - 5e3 * (1.0 - np.cos(2.0 * np.pi * np.arange(1, 401) / 400.0))
+    found = magnetisation(rods, np.concatenate([up, dip, dip, dip]))
+    tops = found[[1498, 1898, 2298, 2698]]
+    span = np.ptp(found[1498:1898])
+    assert tops[1] - tops[0] > 0.05 * span
+    assert 0.01 * span < tops[2] - tops[1] < tops[1] - tops[0]
+
+
+@anhysteretic
+def test_major_loop_closes(rods: RodParameters) -> None:
+    """Between the same ends each cycle is the one before, once the first quarter is forgotten."""
+    field = 90e3 * np.sin(2.0 * np.pi * np.arange(12_001) / 4000)
+    found = magnetisation(rods, field)
+    np.testing.assert_allclose(found[-4000:], found[-8000:-4000], atol=0.001 * 7.65e5)
+
+
+@pytest.mark.parametrize("rods", [*STILL.values(), DomainsParameters(), JilesAthertonParameters()])
+@pytest.mark.parametrize(("low", "high"), [(13e3, 75e3), (40e3, 48e3), (-90e3, 90e3)])
+def test_loops_take_energy(rods: RodParameters, low: float, high: float) -> None:
+    """The area of a steady loop of applied field and magnetisation is what it turns to heat."""
+    phase = 2.0 * np.pi * np.arange(16_001) / 2000
+    field = 0.5 * (low + high) + 0.5 * (high - low) * np.sin(phase)
+    found = magnetisation(rods, field)
+    rising = np.diff(np.append(found[-2001], found[-2000:]))
+    middle = 0.5 * (field[-2001:-1] + field[-2000:])
+    assert VACUUM_PERMEABILITY * float(rising @ middle) > 0.0
