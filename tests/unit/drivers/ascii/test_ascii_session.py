@@ -125,8 +125,6 @@ def wire_s(time: WireTime) -> float:
 
 
 class TestText:
-    """Lines of text."""
-
     def test_dcon(self) -> None:
         """#010+05.000 and > with their carriage returns are 14 characters."""
         profile = load_profile("icp_m7024_dcon")

@@ -235,8 +235,6 @@ def test_a_run_that_loses_the_board_leaves_by_the_one_way_out(board, fault):
 
 
 class TestBoards:
-    """Binary frames."""
-
     def test_serial(self) -> None:
         """On a real serial line each byte counts, COBS overhead and CRC too."""
         profile = with_link(load_profile("cobs_board"), usb=False)

@@ -44,8 +44,6 @@ def test_noise_is_that_of_one_draw(parts: list[int]) -> None:
 
 
 class TestBlocks:
-    """Blocks, seeds and held samples."""
-
     COMMAND_A = 6.0 * np.sin(np.arange(6000) / 30.0)
 
     @settings(max_examples=30, deadline=None)
@@ -137,8 +135,6 @@ class TestPublishedRanges:
 
 
 class TestOneState:
-    """Nothing but what came before decides what comes."""
-
     COMMAND_A = np.random.default_rng(5).uniform(-7.0, 7.0, 60).repeat(50)
 
     @rigs
@@ -191,8 +187,6 @@ class TestOneState:
 
 
 class TestVaried:
-    """Factors on rods of any physics."""
-
     @rigs
     def test_strain_scales_the_displacement(self, physics: Physics) -> None:
         """And nothing else: the loop is the same, larger."""

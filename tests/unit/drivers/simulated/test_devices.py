@@ -47,8 +47,6 @@ def wave(n: int) -> F64:
 
 
 class TestVariedRig:
-    """Actuators that differ from the rated one."""
-
     @pytest.mark.parametrize(
         ("name", "attribute", "power"),
         [
@@ -152,8 +150,6 @@ def test_wrong_sizes(sizes: tuple[int, int, int]) -> None:
 
 
 class TestSampleCount:
-    """The sample index is the time."""
-
     def test_skipped_samples_hold_the_last_command(self) -> None:
         """A jump of the index equals sending the last command over and over."""
         command = wave(2 * BLOCK)
