@@ -19,7 +19,7 @@ from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.emulator.rig import Bench, Rig, SimulatedWiring, WriteLog
 from hilctl_drivers.emulator.server import EmulatorServer
 from hilctl_drivers.emulator.text_device import EmulatedText
-from hilctl_drivers.emulator.wire import EmulatedLine, EmulatedWire
+from hilctl_drivers.emulator.wire import EmulatedLine, EmulatedWire, SerialProfile
 from hilctl_drivers.modbus.modbus_profile import ModbusProfile
 from hilctl_drivers.profile import load_profile
 from hilctl_drivers.profile_base import BaseProfile
@@ -214,12 +214,9 @@ class _ModbusPlan(_Plan[ModbusProfile]):
         return _Port(wire, (options.port, options.reader_port)[which] if link == "tcp" else None)
 
 
-class _SerialPlan(_Plan[AsciiProfile | FrameProfile]):
+class _SerialPlan(_Plan[SerialProfile]):
     def __init__(
-        self,
-        options: EmulatorOptions,
-        profile: AsciiProfile | FrameProfile,
-        reader: AsciiProfile | FrameProfile,
+        self, options: EmulatorOptions, profile: SerialProfile, reader: SerialProfile
     ) -> None:
         super().__init__(options, profile, reader)
         self._refuse_resets()

@@ -84,7 +84,7 @@ class _TcpConnection(_Connection):
 
 
 class _PtyConnection(_Connection):
-    """_Connection to the program at the other end of a pty; there is nothing to reset."""
+    """Connection to the program at the other end of a pty; there is nothing to reset."""
 
     def __init__(self, wire: EmulatedWire, *, faulty: bool) -> None:
         super().__init__(wire, faulty=faulty)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Protocol, TypeAlias
 
 from hilctl_drivers.ascii.ascii_profile import AsciiProfile
 from hilctl_drivers.ascii.ascii_session import LineFormat
@@ -19,6 +19,9 @@ class EmulatedReply:
     due_ns: int = 0  # when it is sent; 0 for immediately
     make: Callable[[int], bytes] | None = None  # returns the reply when it is due
     wrong_id: Callable[[bytes], bytes] | None = None  # returns it in another's name, for a fault
+
+
+SerialProfile: TypeAlias = AsciiProfile | FrameProfile
 
 
 class EmulatedWire(Protocol):
@@ -72,9 +75,7 @@ class SerialDevice(Protocol):
 class EmulatedLine:
     """Devices on a serial line with the profile's framing; the addressed one answers."""
 
-    def __init__(
-        self, profile: AsciiProfile | FrameProfile, devices: Sequence[SerialDevice]
-    ) -> None:
+    def __init__(self, profile: SerialProfile, devices: Sequence[SerialDevice]) -> None:
         self.devices = devices
         self._splitter: Splitter[str] | Splitter[bytes]
         self._encode: Callable[[bytes], bytes]
