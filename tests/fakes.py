@@ -20,11 +20,10 @@ from hilctl.base.samples import BlockBatch, BlockHeader
 from hilctl.loop.block import Block
 from hilctl.loop.interlocks import InterlockContext, Interlocks, InterlockSettings
 from hilctl_drivers.emulator.factory import Emulator, build
-from hilctl_drivers.emulator.labjack_stream import attach_stream
 from hilctl_drivers.emulator.modbus_device import EmulatedModbus
 from hilctl_drivers.emulator.modbus_wire import ModbusWire
 from hilctl_drivers.emulator.options import EmulatorOptions
-from hilctl_drivers.emulator.rig import Rig, WriteLog
+from hilctl_drivers.emulator.rig import Bench, Rig, SimulatedWiring, WriteLog
 from hilctl_drivers.profile import load_profile
 from hilctl_drivers.transport.links import LostError, NoAnswerError
 
@@ -383,9 +382,11 @@ class InProcess:
         output, sensor = next(iter(loaded.outputs)), next(iter(loaded.inputs))
         time = VirtualTime()
         rig, writes = Rig(time.now_ns, noise=noise), WriteLog(log, 0)
-        device = EmulatedModbus(loaded, rig, writes, output, sensor, current_a=current_a)
-        attach_stream(device, rig, writes, output, sensor, noise=noise)
-        return cls(device, rig, link(ModbusWire("tcp", device), time, message_s), time, writes)
+        wiring = SimulatedWiring.spread(loaded.outputs[output], loaded.inputs[sensor])
+        bench = Bench(rig, wiring, writes)
+        device = EmulatedModbus(loaded, bench, output, sensor, current_a, noise=noise)
+        wire = ModbusWire("tcp", {loaded.unit_id: device})
+        return cls(device, rig, link(wire, time, message_s), time, writes)
 
 
 @contextmanager

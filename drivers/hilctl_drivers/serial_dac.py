@@ -45,13 +45,8 @@ class SerialOptions(DacOptions):
 class SerialSetup:
     """An experiment's options, resolved against the profiles.
 
-    Attributes:
-        options: The options.
-        profile: The profile, with the experiment's line settings.
-        reader: Profile of the device that has the input; ``profile`` itself if it has.
-        output: The output in use.
-        input: The input in use.
-        chain: Amplifier and sensor.
+    ``profile`` has the experiment's line settings; ``reader`` is the profile of the device that has
+    the input, often the same.
     """
 
     options: SerialOptions
@@ -63,17 +58,9 @@ class SerialSetup:
 
     @classmethod
     def of(cls, options: SerialOptions) -> "SerialSetup":
-        """Resolve options against their profiles.
-
-        Raises:
-            InputError: They do not fit together.
-        """
-        profile = with_link(
-            _serial_profile(options.profile),
-            baud=options.baud,
-            parity=options.parity,
-            stopbits=options.stopbits,
-        )
+        """Resolve options against their profiles; raise InputError if they do not fit."""
+        changes = {name: getattr(options, name) for name in _LINE}
+        profile = with_link(_serial_profile(options.profile), **changes)
         reader = _reader(options, profile)
         output = channel("output", options.output, profile.outputs, profile.title)
         sensor_input = channel("input", options.input, reader.inputs, reader.title)
@@ -94,23 +81,19 @@ class SerialSetup:
     @property
     def holds(self) -> tuple[str, ...]:
         """Ports in use, for :attr:`hilctl.base.device.DeviceInfo.holds`."""
-        reader = self.options.reader
-        ports = (self.options.serial_port, reader.serial_port if reader else None)
-        held = [name for port in ports if port is not None for name in held_port(port)]
-        return tuple(dict.fromkeys(held))
+        ports = [self.options.serial_port]
+        if self.options.reader is not None and self.options.reader.serial_port is not None:
+            ports.append(self.options.reader.serial_port)
+        return tuple(dict.fromkeys(name for port in ports for name in held_port(port)))
 
     def details(self) -> dict[str, str]:
-        """Return the facts to keep with a recording, as text."""
-        found = {**self.profile.provenance(), "link": self.profile.link.model_dump_json()}
-        found |= self.options.details()
-        return found | (self.reader.provenance("reader_") if self.reads_elsewhere else {})
+        """Return the metadata of a recording."""
+        reader = self.reader.provenance("reader_") if self.reads_elsewhere else {}
+        link = {"link": self.profile.link.model_dump_json()}
+        return self.profile.provenance() | link | self.options.details() | reader
 
     def link(self, extra_s: float = 0.0) -> SerialLink:
-        """Return a new link to the device.
-
-        Args:
-            extra_s: Added to the timeout, for answers that take that long by design.
-        """
+        """Return a new link to the device; ``extra_s`` is added to the timeout of each answer."""
         timeout_s = self.options.timeout_s + extra_s
         return SerialLink(self.options.serial_port, _line(self.profile).settings, timeout_s)
 
@@ -135,10 +118,7 @@ def _serial_profile(named: NamedProfile) -> BaseProfile:
 
 
 def _reader(options: SerialOptions, profile: BaseProfile) -> BaseProfile:
-    """Return the profile of the device that has the input, often the same.
-
-    On a shared line it gets the line settings of the other device.
-    """
+    """Return the profile of the device that has the input; on a shared line, with its settings."""
     given = options.reader
     if given is None:
         return profile
@@ -155,30 +135,18 @@ class SerialDac(DacDevice):
     """A :class:`~hilctl_drivers.device.DacDevice` on a serial line.
 
     ``SerialDac(options)`` makes the subclass that the profile names as its driver.
-
-    Attributes:
-        block_max: Most samples of one exchange.
-        fifo_depth: Samples that its FIFO holds; 0 without a FIFO.
-        measures: Whether exchanges fill ``measured``.
-        longest_message_s: Longest delay of the safe value by an exchange under way.
-        arm_s: Longest time to arm the watchdog.
-        unconfirmed: Why a written value cannot be confirmed; empty if it can.
     """
 
     Options: ClassVar[type[DeviceOptions]] = SerialOptions
-    block_max = 1
-    fifo_depth = 0
-    measures = False
-    longest_message_s = 0.0
-    arm_s = 0.0
-    unconfirmed = ""
+    block_max = 1  # samples of one exchange
+    fifo_depth = 0  # samples; 0 without a FIFO
+    measures = False  # whether exchanges fill ``measured``
+    longest_message_s = 0.0  # longest delay of the safe value by a running exchange
+    arm_s = 0.0  # longest time to arm the watchdog
+    unconfirmed = ""  # why a written value cannot be confirmed; empty if it can
 
     def __new__(cls, options: SerialOptions) -> "SerialDac":
-        """Return an instance of the profile's driver.
-
-        Raises:
-            InputError: The profile is for another kind of device.
-        """
+        """Return an instance of the profile's driver."""
         driver = _serial_profile(options.profile).driver
         made: SerialDac = object.__new__(resolve_name(driver) if cls is SerialDac else cls)
         return made
@@ -199,11 +167,7 @@ class SerialDac(DacDevice):
 
     @abstractmethod
     def _prepare(self) -> None:
-        """Check the options against the protocol and set the attributes of the class.
-
-        Raises:
-            InputError: The protocol does not support an option.
-        """
+        """Set the attributes of the class; raise InputError if an option is not supported."""
 
     def _describe(self) -> DeviceInfo:
         setup, options, streams = self._setup, self._setup.options, self.fifo_depth > 0
@@ -232,11 +196,9 @@ class SerialDac(DacDevice):
         if self.longest_message_s <= _PROMPT_S:
             return ""
         timeout_s = self._setup.options.watchdog_timeout_s
-        behind = (
-            "no watchdog of the device stands behind it"
-            if timeout_s is None
-            else f"the device's watchdog acts after {timeout_s:g} s"
-        )
+        behind = "no watchdog of the device stands behind it"
+        if timeout_s is not None:
+            behind = f"the device's watchdog acts after {timeout_s:g} s"
         return f"a message takes up to {self.longest_message_s:.2g} s on this line; {behind}"
 
     def _longest_block(self) -> tuple[int, str]:

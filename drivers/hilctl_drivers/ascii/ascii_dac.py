@@ -33,32 +33,26 @@ class AsciiDac(SerialDac):
         setup = self._setup
         assert isinstance(setup.profile, AsciiProfile)
         assert isinstance(setup.output, AsciiOutput)
+        options, reader = setup.options, setup.options.reader
         self._profile = setup.profile
         self._reader_profile = _reader_profile(setup, setup.profile)
         assert isinstance(setup.input, AsciiInput)
         self._target, self._input = setup.output, setup.input
-        self._measure = _measuring_input(setup.profile, setup.options.measure, setup.output)
+        self._measure = _measuring_input(setup.profile, options.measure, setup.output)
         self.measures = self._measure is not None
-        self._address = _address(setup.options.unit_id, self._profile)
-        reader = setup.options.reader
-        self._reader_address = _address(reader.unit_id if reader else None, self._reader_profile)
-        self._writer = AsciiSession(self._profile, self._link, self._address)
+        self._writer = self._reader = AsciiSession(self._profile, self._link, options.unit_id)
         self._reader_link = setup.reader_link(self._link)
-        self._reader, self._reader_name = self._writer, ""
+        self._reader_name = ""
         if reader is not None:
-            where = reader.serial_port or f"unit {self._reader_address}"
+            self._reader = AsciiSession(self._reader_profile, self._reader_link, reader.unit_id)
+            where = reader.serial_port or f"unit {self._reader.address}"
             self._reader_name = f"reader {self._reader_profile.title} at {where}"
-        if setup.reads_elsewhere:
-            self._reader = AsciiSession(
-                self._reader_profile, self._reader_link, self._reader_address
-            )
-        self._feed_every = 0
-        self._ticks = 0
+        self._feed_every = self._ticks = 0
         # Half duplex: what was asked last is answered before the safe value can go out.
-        write = exchange_time(self._profile, setup.options.output, None)
+        write = exchange_time(self._profile, options.output, None)
         self.longest_message_s = self._sample_time().answered_s + write.answered_s
         self.unconfirmed = self._unconfirmed()
-        self.arm_s = arm_s(self._profile, setup.options.output)
+        self.arm_s = arm_s(self._profile, options.output)
 
     def _rates(self, block: int) -> RateLimit:
         del block
@@ -67,18 +61,14 @@ class AsciiDac(SerialDac):
         return RateLimit.of(self._sample_time(), slowest.max_rate_hz, whose)
 
     def _sample_time(self) -> WireTime:
-        """Return what a sample costs on the wire."""
+        """Return the time of a sample on the wire."""
         options, profile, reader = self._setup.options, self._profile, self._reader_profile
-        if self._setup.reads_elsewhere:
-            wire = exchange_time(profile, options.output, None)
-            wire = wire.then(
-                query_time(reader, self._input, self._reader_address, f"to {reader.title}")
-            )
-        else:
-            wire = exchange_time(profile, options.output, options.input)
+        reads_itself = not self._setup.reads_elsewhere
+        wire = exchange_time(profile, options.output, options.input if reads_itself else None)
+        if not reads_itself:
+            wire = wire.then(query_time(reader, self._input, f"to {reader.title}"))
         if self._measure is not None:
-            what = f"to measure {options.measure}"
-            wire = wire.then(query_time(profile, self._measure, self._address, what))
+            wire = wire.then(query_time(profile, self._measure, f"to measure {options.measure}"))
         if options.watchdog != "none":
             wire = wire.then(feed_time(profile))
         return wire
@@ -86,24 +76,22 @@ class AsciiDac(SerialDac):
     def _open(self, sample_rate_hz: float, block: int) -> None:
         del block
         feed_every = check_feeds(self._setup.options.watchdog_timeout_s, sample_rate_hz)
-        self._open_links()
-        writer, watchdog = self._writer, self._profile.watchdog
-        writer.check_selftest()
+        watchdog = self._profile.watchdog
+        self._connect()
         # A device that has tripped refuses the steps that follow.
         self._clear_trip()
-        writer.run(self._profile.init)
+        self._writer.run(self._profile.init)
         if self._setup.reads_elsewhere:
             with naming(self._reader_name):
-                self._reader.check_selftest()
                 self._reader.run(self._reader_profile.init)
         self._try_out_safe_value()
         strict = watchdog != "none" and watchdog.kick == "strict"
         self._feed_every = feed_every if strict else 0
-        writer.check_errors()  # after all steps: commands without a reply leave theirs there
+        self._writer.check_errors()  # after all steps: those without a reply leave theirs there
         self._ticks = 0
 
     def _arm(self) -> None:
-        if self._profile.watchdog != "none" and self._setup.options.watchdog != "none":
+        if self._setup.options.watchdog != "none":
             # The safe value before the timeout: once it counts, it must know where to go.
             self._run("safe")
             self._run("arm")
@@ -142,11 +130,7 @@ class AsciiDac(SerialDac):
         return self._writer.number(readback)
 
     def _look(self) -> tuple[float, float | None]:
-        self._open_links()
-        self._writer.check_selftest()
-        if self._setup.reads_elsewhere:
-            with naming(self._reader_name):
-                self._reader.check_selftest()
+        self._connect()
         displacement_um = self._chain.displacement_um(_value(self._input, self._read()))
         return displacement_um, self._as_command(self._measured_output())
 
@@ -154,7 +138,7 @@ class AsciiDac(SerialDac):
         return None if value is None else self._chain.command(value)
 
     def _close(self) -> None:
-        if self._profile.watchdog != "none" and self._setup.options.watchdog != "none":
+        if self._setup.options.watchdog != "none":
             # First: nothing feeds it any more, and it would trip while the close steps run.
             self._run("disarm")
         self._writer.run(self._profile.close)
@@ -171,11 +155,15 @@ class AsciiDac(SerialDac):
             return False
         return (combined.output, combined.input) == (options.output, options.input)
 
-    def _open_links(self) -> None:
+    def _connect(self) -> None:
+        """Open the links and check the devices."""
         self._link.open()
-        if self._reader_link is not self._link:
+        self._writer.check_selftest()
+        if self._setup.reads_elsewhere:
             with naming(self._reader_name):
-                self._reader_link.open()
+                if self._reader_link is not self._link:
+                    self._reader_link.open()
+                self._reader.check_selftest()
 
     def _read(self) -> float:
         with naming(self._reader_name):
@@ -225,7 +213,7 @@ class AsciiDac(SerialDac):
     def _try_out_safe_value(self) -> None:
         """Set the output to what it holds, with the command of the safe value; nothing moves.
 
-        An output that cannot be read is left alone, as is a value that the command would round.
+        An output that cannot be read is left alone, and so is a value that the command would round.
         """
         value = self._held()
         if value is None:
@@ -257,9 +245,9 @@ class AsciiDac(SerialDac):
         watchdog = self._profile.watchdog
         if watchdog == "none" or not self._writer.tripped():
             return
-        safe = self._setup.chain.output(self._setup.options.safe_command)
-        # Before where it is taken, and after in any case: a device that goes back to its last
-        # command when the trip ends must not put that out, or not for longer than one line takes.
+        safe = self._chain.output(self._setup.options.safe_command)
+        # Before if it is accepted, and after in any case: a device that goes back to its last
+        # command when the trip ends must not output that, or not for longer than one line takes.
         if not watchdog.refuses_while_tripped:
             self._write(safe)
         self._run("clear")
@@ -267,24 +255,19 @@ class AsciiDac(SerialDac):
 
     def _run(self, name: str) -> None:
         """Run the watchdog's steps of that name."""
-        watchdog = self._profile.watchdog
-        if watchdog == "none":
-            return
+        watchdog, options = self._profile.watchdog, self._setup.options
+        assert watchdog != "none"
         steps = getattr(watchdog, name)
         if name == "safe":
-            steps = steps.get(self._setup.options.output, ())
-        options = self._setup.options
-        timeout_s = options.watchdog_timeout_s
-        counts = watchdog.counts(watchdog.min_s if timeout_s is None else timeout_s)
-        safe = self._setup.chain.output(options.safe_command)
+            steps = steps.get(options.output, ())
+        counts = watchdog.counts(options.watchdog_timeout_s or watchdog.min_s)
+        safe = self._chain.output(options.safe_command)
         self._writer.run(steps, timeout=counts, safe=safe)
 
     def _feed(self) -> None:
-        """Feed a watchdog that exchanges do not feed; three times in its timeout."""
-        if not self._feed_every:
-            return
+        """Feed a watchdog that exchanges do not feed, three times in its timeout."""
         self._ticks += 1
-        if self._ticks % self._feed_every == 0:
+        if self._feed_every and self._ticks % self._feed_every == 0:
             self._run("feed")
 
 
@@ -296,19 +279,8 @@ def _value(source: AsciiInput, number: float) -> float:
     return number * source.scale + source.offset
 
 
-def _address(wanted: int | None, profile: AsciiProfile) -> int:
-    """Return a device's address on a shared line; 0 if there is none."""
-    if wanted is not None:
-        return wanted
-    return 0 if profile.address == "none" else profile.address
-
-
 def _reader_profile(setup: SerialSetup, profile: AsciiProfile) -> AsciiProfile:
-    """Return the profile of the device that has the input, often the same.
-
-    Raises:
-        InputError: It speaks no lines of text, or cannot share the other's line.
-    """
+    """Return the reader's profile; raise InputError if it cannot share the other's line."""
     reader, options = setup.reader, setup.options.reader
     if not isinstance(reader, AsciiProfile):
         raise InputError("reader is for devices that speak lines of text, both of them")
@@ -322,16 +294,7 @@ def _reader_profile(setup: SerialSetup, profile: AsciiProfile) -> AsciiProfile:
 
 
 def _measuring_input(profile: AsciiProfile, name: str | None, output: Range) -> AsciiInput | None:
-    """Return the input that measures the output itself; None if none is wanted.
-
-    Args:
-        profile: The device's profile.
-        name: Name of the input, or None.
-        output: The output in use.
-
-    Raises:
-        InputError: There is no such input, or it measures something else.
-    """
+    """Return the input of that name, which must measure the output itself; None without a name."""
     if name is None:
         return None
     measuring = {key: each for key, each in profile.inputs.items() if each.measures == "output"}

@@ -80,10 +80,14 @@ class Reply(StrictModel):
     example: str = Field(description="a reply as in the manual; pattern must match it")
 
     @model_validator(mode="after")
-    def _matches(self) -> Self:
-        if not re.fullmatch(self.pattern, self.example, re.ASCII):
+    def _fits(self) -> Self:
+        if self.match(self.example) is None:
             raise ValueError(f"pattern {self.pattern!r} must match the example {self.example!r}")
         return self
+
+    def match(self, text: str) -> re.Match[str] | None:
+        """Return the match of a whole reply."""
+        return re.fullmatch(self.pattern, text, re.ASCII)
 
 
 class NumberReply(Reply):
@@ -91,7 +95,7 @@ class NumberReply(Reply):
 
     @model_validator(mode="after")
     def _has_number(self) -> Self:
-        match = re.fullmatch(self.pattern, self.example, re.ASCII)
+        match = self.match(self.example)
         if match is None or match.re.groups != 1:
             raise ValueError(f"pattern {self.pattern!r} must have one group, around the number")
         try:
@@ -188,14 +192,8 @@ class ErrorReply(Reply):
     meaning: Annotated[str, StringConstraints(min_length=1)]
 
 
-class ErrorQuery(Reply):
-    """A query for errors that commands left behind; the pattern means none."""
-
-    ask: LineTemplate
-
-
-class Tripped(Reply):
-    """A question whose reply matches where the watchdog has tripped."""
+class Check(Reply):
+    """A question that is answered by yes, a reply that matches, or no."""
 
     ask: LineTemplate
 
@@ -208,7 +206,9 @@ class AsciiWatchdog(Watchdog):
     feed: tuple[AsciiStep, ...] = ()
     clear: tuple[AsciiStep, ...] = ()
     safe: dict[Name, tuple[AsciiStep, ...]] = Field(default={})
-    tripped: Tripped | Literal["none"] = "none"
+    tripped: Check | Literal["none"] = Field(
+        default="none", description="asks whether the watchdog has tripped"
+    )
     refusal: Reply | Literal["none"] = Field(
         default="none", description="reply to a command that is ignored because of a trip"
     )
@@ -231,11 +231,15 @@ class AsciiProfile(BaseProfile):
     inputs: dict[Name, AsciiInput]
     exchange: AsciiExchange | Literal["none"]
     errors: tuple[ErrorReply, ...] = Field(default=(), description="replies that mean trouble")
-    error_query: ErrorQuery | Literal["none"] = "none"
+    error_query: Check | Literal["none"] = Field(
+        default="none", description="asks whether no command has left an error behind"
+    )
     init: tuple[AsciiStep, ...] = ()
     close: tuple[AsciiStep, ...] = ()
     watchdog: AsciiWatchdog | Literal["none"]
-    selftest: ErrorQuery | Literal["none"] = "none"
+    selftest: Check | Literal["none"] = Field(
+        default="none", description="asks whether it is this device"
+    )
 
     @model_validator(mode="after")
     def _exchange_channels(self) -> Self:
@@ -253,11 +257,16 @@ class AsciiProfile(BaseProfile):
             if output.reply == "none":
                 continue
             for error in self.errors:
-                if re.fullmatch(error.pattern, output.reply.example, re.ASCII):
+                if error.match(output.reply.example):
                     raise ValueError(
                         f"errors: {error.pattern!r} matches the good reply of outputs.{name}"
                     )
         return self
+
+    @property
+    def unit(self) -> int:
+        """The address as shipped; 0 if it has none."""
+        return 0 if self.address == "none" else self.address
 
     @property
     def driver(self) -> str:

@@ -17,6 +17,7 @@ from hilctl_drivers.ascii.ascii_profile import (
     AsciiStep,
     AsciiWatchdog,
     AskStep,
+    Check,
     NumberStep,
     Query,
     Reply,
@@ -37,14 +38,13 @@ from hilctl_drivers.transport.links import (
 )
 from hilctl_drivers.transport.wire_time import WireTime
 
-ChecksumKind: TypeAlias = Literal["none", "dcon", "gen"]
-
 _SCPI_INFINITY = 9.9e37
 """SCPI-1999 sends this for infinity and 9.91e37 for not a number."""
 
 _CHECKSUMS = {"none": lambda _text: b"", "dcon": dcon_checksum, "gen": gen_checksum}
-_CHECKSUM_SIZES = {"none": 0, "dcon": 2, "gen": 3}
+_CHECKSUM_CHARS = {"none": 0, "dcon": 2, "gen": 3}
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,4})?", re.ASCII)
+_ADDRESSED = re.compile(r"[!?]([0-9A-F]{2})")
 
 
 def _is_text(text: str) -> bool:
@@ -53,33 +53,17 @@ def _is_text(text: str) -> bool:
 
 @dataclass(frozen=True)
 class LineFormat:
-    """How one line stands on the wire: ``text | checksum | terminator``.
-
-    Attributes:
-        terminator: Bytes that end a line: control characters.
-        checksum: ``none``, ``dcon`` (two hex digits) or ``gen`` (``$`` and two hex digits).
-        size_max: Most bytes of a line without its terminator.
-
-    Raises:
-        BadRequest: Unknown checksum, or a terminator that could be part of the text.
-    """
+    """Format of one line: ``text | checksum | terminator``."""
 
     terminator: bytes = b"\r"
-    checksum: ChecksumKind = "none"
-    size_max: int = 255
-
-    def __post_init__(self) -> None:
-        if self.checksum not in _CHECKSUMS:
-            known = ", ".join(_CHECKSUMS)
-            raise BadRequestError(f"unknown line checksum {self.checksum!r}; known are {known}")
-        if not self.terminator or any(32 <= byte < 127 for byte in self.terminator):
-            raise BadRequestError(f"terminator must be control characters, got {self.terminator!r}")
+    checksum: Literal["none", "dcon", "gen"] = "none"  # two hex digits, for gen after a $
+    size_max: int = 255  # bytes without the terminator
 
     def encode(self, text: str) -> bytes:
         """Return a line.
 
         Raises:
-            BadRequest: Empty, too long, or more than printable ASCII.
+            BadRequestError: Empty, too long, or more than printable ASCII.
         """
         if not text or not _is_text(text):
             raise BadRequestError(f"a line must be printable ASCII, got {text!r}")
@@ -95,8 +79,8 @@ class LineFormat:
         """Return the text of exactly one line.
 
         Raises:
-            Incomplete: The terminator has not come yet.
-            Corrupt: Wrong checksum, too long, more than printable ASCII, or bytes behind the end.
+            IncompleteError: The terminator has not come yet.
+            CorruptError: Wrong checksum, too long, not printable ASCII, or bytes behind the end.
         """
         data = bytes(line)
         end = data.find(self.terminator)
@@ -117,7 +101,7 @@ class LineFormat:
         text = body.decode("latin-1")
         if not _is_text(text):
             raise CorruptError(f"a line must be printable ASCII, got {body!r}")
-        split = max(0, len(body) - _CHECKSUM_SIZES[self.checksum])
+        split = max(0, len(body) - _CHECKSUM_CHARS[self.checksum])
         want = _CHECKSUMS[self.checksum](body[:split])
         if body[split:] != want:
             raise CorruptError(f"checksum of {text!r} must be {want.decode()}")
@@ -125,10 +109,10 @@ class LineFormat:
 
 
 def parse_number(text: str) -> float:
-    """Return the number in a text that is exactly one number; blanks around it are fine.
+    """Return the number in a text that is exactly one number; blanks around it are allowed.
 
     Raises:
-        Corrupt: Anything else, or SCPI's marks for infinity and not a number.
+        CorruptError: Anything else, or SCPI's marks for infinity and not a number.
     """
     body = text.strip(" ")
     if not _NUMBER.fullmatch(body):
@@ -139,24 +123,17 @@ def parse_number(text: str) -> float:
     return value
 
 
-_ADDRESSED = re.compile(r"[!?]([0-9A-F]{2})")
-
-
 class AsciiSession:
-    """A link to one device, asked one thing at a time.
+    """A link to one device, which answers each line before the next is sent.
 
-    Args:
-        profile: What the device is.
-        link: Not yet open; several devices may share it.
-        address: The device's address, for ``{address}``.
-        sleep: Waits that many s.
+    Several devices may share a link. The address is as shipped if it is None.
     """
 
     def __init__(
         self,
         profile: AsciiProfile,
         link: Link,
-        address: int,
+        address: int | None = None,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         line = profile.link
@@ -164,20 +141,16 @@ class AsciiSession:
         self._profile = profile
         self._lines = LineFormat(line.terminator.encode(), line.checksum, size)
         self._replies = LineFormat(line.reply_terminator.encode(), line.checksum)
-        self._expected_lines = 2 if line.echo else 1
-        self._address = address
+        self._echoes = line.echo
+        self.address = profile.unit if address is None else address
         self._sleep = sleep
-        self._watch = (
-            None
-            if profile.watchdog == "none" or profile.watchdog.refusal == "none"
-            else re.compile(profile.watchdog.refusal.pattern, re.ASCII)
-        )
-        self._errors = [(re.compile(e.pattern, re.ASCII), e.meaning) for e in profile.errors]
+        watchdog = profile.watchdog
+        self._refusal = "none" if watchdog == "none" else watchdog.refusal
         self.link = link
 
     def text(self, template: str, **values: float) -> str:
         """Return a template with its fields filled in."""
-        return template.format(address=self._address, **values)
+        return template.format(address=self.address, **values)
 
     def line(self, text: str) -> bytes:
         """Return a line in the form sent on the wire."""
@@ -185,28 +158,27 @@ class AsciiSession:
 
     def send(self, text: str) -> None:
         """Send a line that is not answered."""
-        if self._expected_lines == 2:
-            self._check_echo(text, self.link.transact(self._lines.encode(text), self._missing(1)))
+        request = self._lines.encode(text)
+        if self._echoes:
+            self._check_echo(text, self.link.transact(request, self._missing(1)))
         else:
-            self.link.transact(self._lines.encode(text), lambda got: 0)
+            self.link.transact(request, lambda got: 0)
 
     def ask(self, text: str, pattern: str) -> re.Match[str]:
         """Send a line and return its reply, matched whole.
 
         Raises:
-            WatchdogTripped: The command was ignored because of a trip.
-            Refused: The reply is one of the profile's errors.
-            Mismatch: It is no answer to this.
+            WatchdogTrippedError: The command was ignored because of a trip.
+            RefusedError: The reply is one of the profile's errors.
+            MismatchError: It is no answer to this.
             DeviceError: No answer, or a damaged one.
         """
         request = self._lines.encode(text)
         try:
-            data: bytes | bytearray = self.link.transact(
-                request, self._missing(self._expected_lines)
-            )
+            data: bytes | bytearray = self.link.transact(request, self._missing(1 + self._echoes))
         except NoAnswerError as error:
             raise NoAnswerError(f"{text}: {error}") from None
-        if self._expected_lines == 2:
+        if self._echoes:
             data = self._check_echo(text, data)
         reply = self._replies.decode(data)
         self._check_trouble(text, reply)
@@ -216,11 +188,9 @@ class AsciiSession:
         return found
 
     def query(self, text: str, pattern: str) -> re.Match[str]:
-        """Ask a question, see :meth:`ask`; a reply that repeats it is no answer.
+        """Ask a question, see :meth:`ask`; a reply that repeats it is a MismatchError.
 
-        Raises:
-            Mismatch: The line echoes, and perhaps nothing is connected.
-            DeviceError: As for :meth:`ask`.
+        The line then echoes, and perhaps nothing is connected.
         """
         found = self.ask(text, pattern)
         if found.string == text:
@@ -234,22 +204,11 @@ class AsciiSession:
         """Ask for a number."""
         return parse_number(self.query(self.text(query.ask), query.pattern)[1])
 
-    def command(self, text: str, reply: Reply | str) -> None:
-        """Send a line that is answered as ``reply`` says, or not at all."""
-        if isinstance(reply, Reply):
-            self.ask(text, reply.pattern)
-        else:
-            self.send(text)
-
     def run(self, steps: Sequence[AsciiStep], **values: float) -> None:
-        """Execute a profile's steps.
-
-        Args:
-            steps: The steps.
-            values: What ``timeout`` and ``safe`` stand for.
+        """Execute a profile's steps, with ``values`` for ``timeout`` and ``safe``.
 
         Raises:
-            DeviceError: One of them failed; the text says which.
+            DeviceError: One of them failed; the message has its note.
         """
         for step in steps:
             try:
@@ -259,67 +218,62 @@ class AsciiSession:
                 raise DeviceError(f"{error}{f' ({note})' if note else ''}") from None
 
     def check_errors(self) -> None:
-        """Ask for errors that commands without an answer have left behind.
-
-        Raises:
-            Refused: There is one.
-        """
+        """Ask for errors that commands without an answer have left; raise RefusedError for one."""
         query = self._profile.error_query
-        if query == "none":
-            return
-        text = self.text(query.ask)
-        reply = self.query(text, ".*")[0]
-        if not re.fullmatch(query.pattern, reply, re.ASCII):
-            raise RefusedError(f"{text} says {reply}", reply)
+        if query != "none":
+            text, reply = self._ask(query)
+            if not query.match(reply):
+                raise RefusedError(f"{text} says {reply}", reply)
 
     def check_selftest(self) -> None:
-        """Ask the device what it is.
-
-        Raises:
-            DeviceError: It is another one.
-        """
+        """Run the self-test; raise DeviceError if it is another device."""
         test = self._profile.selftest
-        if test == "none":
-            return
-        text = self.text(test.ask)
-        reply = self.query(text, ".*")[0]
-        if not re.fullmatch(test.pattern, reply, re.ASCII):
-            raise DeviceError(f"{text} must be answered like {test.example!r}, got {reply!r}")
+        if test != "none":
+            text, reply = self._ask(test)
+            if not test.match(reply):
+                raise DeviceError(f"{text} must be answered like {test.example!r}, got {reply!r}")
 
     def tripped(self) -> bool:
-        """Return whether the host watchdog says that it has tripped; no if it cannot say."""
+        """Return whether the host watchdog has tripped; False if it cannot be asked."""
         watchdog = self._profile.watchdog
         if watchdog == "none" or watchdog.tripped == "none":
             return False
-        reply = self.query(self.text(watchdog.tripped.ask), ".*")[0]
-        return re.fullmatch(watchdog.tripped.pattern, reply, re.ASCII) is not None
+        return watchdog.tripped.match(self._ask(watchdog.tripped)[1]) is not None
+
+    def _ask(self, check: Check) -> tuple[str, str]:
+        """Return a question and whatever is answered."""
+        text = self.text(check.ask)
+        return text, self.query(text, ".*")[0]
 
     def _step(self, step: AsciiStep, values: dict[str, float]) -> None:
         if isinstance(step, WaitStep):
             self._sleep(step.seconds)
         elif isinstance(step, SendStep):
-            self.command(self.text(step.text, **values), step.reply)
+            text = self.text(step.text, **values)
+            if step.reply == "none":
+                self.send(text)
+            else:
+                self.ask(text, step.reply.pattern)
         elif isinstance(step, AskStep):
             self.ask(self.text(step.ask, **values), step.pattern)
         else:
-            self._check_number(step, values)
-
-    def _check_number(self, step: NumberStep, values: dict[str, float]) -> None:
-        wanted = values["safe"] if step.value == "safe" else step.value
-        found = self.number(step)
-        if not abs(found - wanted) <= step.tolerance:
-            rule = f"{self.text(step.ask)} must say {wanted:g} within {step.tolerance:g}"
-            raise DeviceError(f"{rule}, got {found:g}")
+            wanted, found = (
+                values["safe"] if step.value == "safe" else step.value,
+                self.number(step),
+            )
+            if not abs(found - wanted) <= step.tolerance:
+                rule = f"{self.text(step.ask)} must say {wanted:g} within {step.tolerance:g}"
+                raise DeviceError(f"{rule}, got {found:g}")
 
     def _check_trouble(self, text: str, reply: str) -> None:
-        if self._watch is not None and self._watch.fullmatch(reply):
+        if self._refusal != "none" and self._refusal.match(reply):
             said = "ignored, the host watchdog has tripped: output is at its safe value"
             raise WatchdogTrippedError(f"{text}: {said}", reply)
-        for pattern, meaning in self._errors:
-            if pattern.fullmatch(reply):
-                raise RefusedError(f"{text}: {meaning} ({reply})", reply)
+        for error in self._profile.errors:
+            if error.match(reply):
+                raise RefusedError(f"{text}: {error.meaning} ({reply})", reply)
         who = _ADDRESSED.match(reply)
-        if who and text[1:3] == f"{self._address:02X}" and who[1] != text[1:3]:
+        if who and text[1:3] == f"{self.address:02X}" and who[1] != text[1:3]:
             raise MismatchError(f"{text}: answered by address {who[1]}: {reply!r}")
 
     def _missing(self, lines: int) -> Callable[[bytearray], int]:
@@ -339,54 +293,30 @@ class AsciiSession:
         return rest
 
 
-Line: TypeAlias = tuple[str, str | None]
-"""What is sent, and an example of its reply; None if it is not answered."""
-
-_CHECKSUM_CHARS = {"none": 0, "dcon": 2, "gen": 3}
+_Line: TypeAlias = tuple[str, str | None]
+"""A sent line, and an example of its reply; None if it is not answered."""
 
 
 def exchange_time(profile: AsciiProfile, output: str, sensor: str | None) -> WireTime:
-    """Return what one exchange costs: set an output, with the longest value, and ask for an input.
-
-    Args:
-        profile: The device; see :func:`hilctl_drivers.profile.with_link` for another baud.
-        output: Name of the output.
-        sensor: Name of the input; None to write only.
-
-    Raises:
-        KeyError: No such output or input.
-    """
-    channel = profile.outputs[output]
-    address = 0 if profile.address == "none" else profile.address
+    """Return the time to set an output, with the longest value, and to ask for an input, if any."""
+    channel, combined = profile.outputs[output], profile.exchange
 
     def longest(template: str) -> str:
-        texts = (template.format(value=v, address=address) for v in channel.limits)
+        texts = (template.format(value=v, address=profile.unit) for v in channel.limits)
         return max(texts, key=len)
 
     settle_s = channel.settle_s + (profile.inputs[sensor].settle_s if sensor else 0.0)
-    combined = profile.exchange
-    pair = (output, sensor)
-    if combined != "none" and (combined.output, combined.input) == pair:
-        return lines_time(profile, [(longest(combined.write), combined.example)], settle_s)
-    answer = None if channel.reply == "none" else channel.reply.example
-    lines: list[Line] = [(longest(channel.write), answer)]
+    if combined != "none" and (combined.output, combined.input) == (output, sensor):
+        return _lines_time(profile, [(longest(combined.write), combined.example)], settle_s)
+    lines = [(longest(channel.write), _example(channel.reply))]
     if sensor is not None:
-        source = profile.inputs[sensor]
-        lines.append((source.ask.format(address=address), source.example))
-    return lines_time(profile, lines, settle_s)
+        lines.append(_question(profile, profile.inputs[sensor]))
+    return _lines_time(profile, lines, settle_s)
 
 
-def query_time(profile: AsciiProfile, query: AsciiInput, address: int, what: str) -> WireTime:
-    """Return what a question costs that stands beside the exchange.
-
-    Args:
-        profile: The device that is asked, with the settings of the line that it stands on.
-        query: The input that is asked for.
-        address: The device's address.
-        what: What it is for, as text.
-    """
-    lines = [(query.ask.format(address=address), query.example)]
-    return lines_time(profile, lines, query.settle_s).named(what)
+def query_time(profile: AsciiProfile, query: AsciiInput, purpose: str) -> WireTime:
+    """Return the time of a question besides the exchange, named by its purpose."""
+    return _lines_time(profile, [_question(profile, query)], query.settle_s).named(purpose)
 
 
 def feed_time(profile: AsciiProfile) -> WireTime | None:
@@ -394,24 +324,30 @@ def feed_time(profile: AsciiProfile) -> WireTime | None:
     watchdog = profile.watchdog
     if watchdog == "none" or watchdog.kick != "strict":
         return None
-    return _steps_time(profile, watchdog.feed).named("to feed the watchdog")
+    return _steps_time(profile, watchdog, watchdog.feed).named("to feed the watchdog")
 
 
 def arm_s(profile: AsciiProfile, output: str) -> float:
-    """Return the time that arming the device's watchdog takes at most, s; 0 without a watchdog."""
-    watchdog = profile.watchdog
+    """Return the longest time to arm the device's watchdog, s; 0 without a watchdog."""
+    watchdog, query = profile.watchdog, profile.error_query
     if watchdog == "none":
         return 0.0
-    wire = _steps_time(profile, (*watchdog.safe.get(output, ()), *watchdog.arm))
-    if profile.error_query != "none":
-        wire = wire.then(
-            lines_time(profile, [(profile.error_query.ask, profile.error_query.example)])
-        )
+    wire = _steps_time(profile, watchdog, (*watchdog.safe.get(output, ()), *watchdog.arm))
+    if query != "none":
+        wire = wire.then(_lines_time(profile, [(query.ask, query.example)]))
     return wire.answered_s
 
 
-def lines_time(profile: AsciiProfile, lines: Sequence[Line], settle_s: float = 0.0) -> WireTime:
-    """Return what lines cost with their replies, one after the other."""
+def _example(reply: Reply | Literal["none"]) -> str | None:
+    return None if reply == "none" else reply.example
+
+
+def _question(profile: AsciiProfile, query: Query) -> _Line:
+    return query.ask.format(address=profile.unit), query.example
+
+
+def _lines_time(profile: AsciiProfile, lines: Sequence[_Line], settle_s: float = 0.0) -> WireTime:
+    """Return the time of lines with their replies, one after the other."""
     link = profile.link
     check = _CHECKSUM_CHARS[link.checksum]
     sent = sum(len(line) + check + len(link.terminator) for line, _ in lines)
@@ -428,25 +364,16 @@ def lines_time(profile: AsciiProfile, lines: Sequence[Line], settle_s: float = 0
     )
 
 
-def _step_lines(profile: AsciiProfile, watchdog: AsciiWatchdog, step: AsciiStep) -> list[Line]:
-    """Return the lines of a step, none or one."""
-    if isinstance(step, WaitStep):
-        return []
-    values = {
-        "address": 0 if profile.address == "none" else profile.address,
-        "timeout": int(watchdog.max_s / watchdog.unit_s),
-        "safe": 0.0,
-    }
-    if isinstance(step, AskStep | NumberStep):
-        return [(step.ask.format(**values), step.example)]
-    reply = None if step.reply == "none" else step.reply.example
-    return [(step.text.format(**values), reply)]
-
-
-def _steps_time(profile: AsciiProfile, steps: Sequence[AsciiStep]) -> WireTime:
-    """Return the time that steps take."""
-    watchdog = profile.watchdog
-    assert watchdog != "none"
-    lines = [line for step in steps for line in _step_lines(profile, watchdog, step)]
+def _steps_time(
+    profile: AsciiProfile, watchdog: AsciiWatchdog, steps: Sequence[AsciiStep]
+) -> WireTime:
+    timeout = int(watchdog.max_s / watchdog.unit_s)
+    values = {"address": profile.unit, "timeout": timeout, "safe": 0.0}
+    lines: list[_Line] = []
+    for step in steps:
+        if isinstance(step, AskStep | NumberStep):
+            lines.append((step.ask.format(**values), step.example))
+        elif isinstance(step, SendStep):
+            lines.append((step.text.format(**values), _example(step.reply)))
     waits_s = [step.seconds for step in steps if isinstance(step, WaitStep)]
-    return lines_time(profile, lines).waiting(waits_s)
+    return _lines_time(profile, lines).waiting(waits_s)

@@ -6,62 +6,38 @@ put out, and gives back the readings of those. So its clock is the pace; a block
 is how long this machine may stall. The first sample is output once that many are there.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from hilctl.base.errors import DeviceError, InputError
 from hilctl.base.types import F64
 from hilctl_drivers.board import frames as board
-from hilctl_drivers.board.board_profile import FrameProfile, FramesLink
+from hilctl_drivers.board.board_profile import FrameProfile
 from hilctl_drivers.board.board_session import BoardFacts, BoardSession, Readings
-from hilctl_drivers.board.frames import WATCHDOG_REPLY, WATCHDOG_REQUEST, exchange_sizes
+from hilctl_drivers.board.frames import exchange_sizes, watchdog_sizes
 from hilctl_drivers.device import check_fifo, check_next
 from hilctl_drivers.serial_dac import SerialDac
 from hilctl_drivers.transport.framing import binary_framing
 from hilctl_drivers.transport.links import WatchdogTrippedError
 from hilctl_drivers.transport.safe_exchange import try_out
-from hilctl_drivers.transport.serial_port import SerialLink
 from hilctl_drivers.transport.wire_time import RateLimit, WireTime, check_feeds
 
 _USB_BITS_PER_S = {True: 19 * 64 * 8e3, False: 13 * 512 * 8 * 8e3}
 """Bulk payload of full-speed (1 ms) and high-speed (125 us) frames (USB 2.0, tables 5-9, 5-10)."""
+_FIRST_MAX = 2**32
 
 
 def exchange_time(profile: FrameProfile, block: int = 1) -> WireTime:
-    """Return what a block costs.
+    """Return the time of an exchange of ``block`` samples, more than one for a stream only.
 
-    Args:
-        profile: The board; see :func:`hilctl_drivers.profile.with_link` for another line.
-        block: Samples in an exchange; more than one only for boards that stream. Those settle while
-            the next messages pass, so a sample period is no shorter than :func:`settle_s`.
+    Outputs of a stream settle while the next messages pass.
     """
-    link = profile.link
     stream = profile.exchange == "stream"
-    size = next(iter(profile.outputs.values())).format.size
-    request, reply = exchange_sizes(block, size, stream=stream)
-    framing = binary_framing(link.framing, link.crc, link.payload_max)
-    what = f"{block} {'sample' if block == 1 else 'samples'} in {link.framing} frames"
-    byte_s, gaps, gaps_s, line = _line(link)
-    return WireTime(
-        f"{what} {line}",
-        framing.wire_size(request) * byte_s,
-        framing.wire_size(reply) * byte_s,
-        gaps,
-        gaps_s,
-        profile.turnaround_s,
-        block,
-        0.0 if stream else settle_s(profile),
-    )
-
-
-def arm_s(profile: FrameProfile) -> float:
-    """Return the time that a WATCHDOG message and its reply take, s."""
-    link = profile.link
-    size = next(iter(profile.outputs.values())).format.size
-    framing = binary_framing(link.framing, link.crc, link.payload_max)
-    sent = framing.wire_size(WATCHDOG_REQUEST.size + size)
-    received = framing.wire_size(WATCHDOG_REPLY.size)
-    byte_s, _, gaps_s, _ = _line(link)
-    return (sent + received) * byte_s + gaps_s + profile.turnaround_s
+    wire = _wire_time(profile, exchange_sizes(block, _value_bytes(profile), stream=stream))
+    what = f"{block} {'sample' if block == 1 else 'samples'} in {profile.link.framing} frames"
+    settle = 0.0 if stream else settle_s(profile)
+    return replace(wire, what=f"{what} {wire.what}", samples=block, settle_s=settle)
 
 
 def settle_s(profile: FrameProfile) -> float:
@@ -70,17 +46,21 @@ def settle_s(profile: FrameProfile) -> float:
     return sum(channel.settle_s for channel in channels)
 
 
-def _line(link: FramesLink) -> tuple[float, int, float, str]:
-    """Return time of a byte, number and time of gaps, and the line as text."""
-    if not link.usb:
-        return link.char_s, 0, 0.0, f"at {link.format}"
-    full_speed = link.usb_frame_s >= 1e-3
-    byte_s = 8.0 / _USB_BITS_PER_S[full_speed]
-    speed = "full" if full_speed else "high"
-    return byte_s, 1, link.usb_frame_s, f"over {speed}-speed USB"
+def _value_bytes(profile: FrameProfile) -> int:
+    return next(iter(profile.outputs.values())).format.size
 
 
-_FIRST_MAX = 2**32
+def _wire_time(profile: FrameProfile, sizes: tuple[int, int]) -> WireTime:
+    """Return the time of a message and its reply, with the line as text."""
+    link = profile.link
+    byte_s, gaps, gaps_s, line = link.char_s, 0, 0.0, f"at {link.format}"
+    if link.usb:
+        full_speed = link.usb_frame_s >= 1e-3
+        byte_s, gaps, gaps_s = 8.0 / _USB_BITS_PER_S[full_speed], 1, link.usb_frame_s
+        line = f"over {'full' if full_speed else 'high'}-speed USB"
+    framing = binary_framing(link.framing, link.crc, link.payload_max)
+    request_s, reply_s = (framing.wire_size(size) * byte_s for size in sizes)
+    return WireTime(line, request_s, reply_s, gaps, gaps_s, profile.turnaround_s)
 
 
 class BoardDac(SerialDac):
@@ -95,13 +75,14 @@ class BoardDac(SerialDac):
         self._profile = profile
         self._session = BoardSession(profile, self._link)
         self._safe = setup.chain.output(setup.options.safe_command)
-        self.arm_s = arm_s(profile)
+        self.arm_s = _wire_time(profile, watchdog_sizes(_value_bytes(profile))).answered_s
 
     def _rates(self, block: int) -> RateLimit:
         most_hz, whose = self._profile.max_rate_hz, f"the profile of {self._profile.title}"
-        if settle_s(self._profile) * most_hz > 1.0:
-            most_hz = 1.0 / settle_s(self._profile)
-            whose = f"settling {1e3 / most_hz:.2f} ms: {whose}"
+        settling_s = settle_s(self._profile)
+        if settling_s * most_hz > 1.0:
+            most_hz = 1.0 / settling_s
+            whose = f"settling {1e3 * settling_s:.2f} ms: {whose}"
         streaming = self._profile.streaming
         lowest_hz = 0.0 if streaming == "none" else streaming.rate_min_hz
         return RateLimit.of(exchange_time(self._profile, block), most_hz, whose, lowest_hz)
@@ -111,11 +92,12 @@ class BoardDac(SerialDac):
         return None if state is None else self._chain.command(state.output)
 
     def _look(self) -> tuple[float, float | None]:
-        facts = self._connect(self._setup.link())
+        facts = self._connect()
         state = self._session.state()
         if state is None:
-            who = facts.name or "the board"
-            raise DeviceError(f"{who} speaks version 1 of the protocol: no message only reads")
+            raise DeviceError(
+                f"{facts.name} speaks version 1 of the protocol: no message only reads"
+            )
         return self._chain.displacement_um(state.reading), self._chain.command(state.output)
 
     def _send(self, value: float) -> None:
@@ -131,23 +113,23 @@ class BoardDac(SerialDac):
         if state is not None:
             self._check_read_back(value, state.output)
 
-    def _connect(self, link: SerialLink) -> BoardFacts:
+    def _connect(self, extra_s: float = 0.0) -> BoardFacts:
         """Connect and check that it is a board that this profile describes."""
-        self._link, self._session = link, BoardSession(self._profile, link)
-        link.open()
+        self._link = self._setup.link(extra_s)
+        self._session = BoardSession(self._profile, self._link)
+        self._link.open()
         facts = self._session.facts()
         if facts.version not in board.VERSIONS:
             known = " or ".join(str(each) for each in board.VERSIONS)
             raise DeviceError(
-                f"{facts.name or 'the board'} speaks version {facts.version} of the protocol, "
-                f"not {known}"
+                f"{facts.name} speaks version {facts.version} of the protocol, not {known}"
             )
         low, high = self._setup.output.limits
         slack = 1e-6 * (high - low)
         if low < facts.low - slack or high > facts.high + slack:
             raise DeviceError(
-                f"{facts.name or 'the board'} puts out {facts.low:g} to {facts.high:g}, the "
-                f"profile says {low:g} to {high:g}"
+                f"{facts.name} puts out {facts.low:g} to {facts.high:g}, "
+                f"the profile says {low:g} to {high:g}"
             )
         return facts
 
@@ -178,7 +160,7 @@ class BoardSingle(BoardDac):
     def _open(self, sample_rate_hz: float, block: int) -> None:
         del block
         check_feeds(self._setup.options.watchdog_timeout_s, sample_rate_hz)
-        self._connect(self._setup.link())
+        self._connect()
         self._try_out_safe_value()
 
     def _exchange(
@@ -211,7 +193,7 @@ class BoardStream(BoardDac):
     def _open(self, sample_rate_hz: float, block: int) -> None:
         check_fifo(block, self._latency_blocks, self.fifo_depth)
         check_feeds(self._setup.options.watchdog_timeout_s, sample_rate_hz / block)
-        facts = self._connect(self._setup.link(extra_s=block / sample_rate_hz))
+        facts = self._connect(extra_s=block / sample_rate_hz)
         self._check_board(facts, sample_rate_hz, block)
         self._try_out_safe_value()  # before the clock, which SAFE stops
         prefill = self._latency_blocks * block

@@ -52,31 +52,26 @@ CLOCK: Final = 0x15
 STATE: Final = 0x16
 
 HEAD = Struct("<BB")
-"""type, seq."""
-EXCHANGE_REQUEST = Struct("<BBH")
-"""type, seq, n; values follow."""
-EXCHANGE_REPLY = Struct("<BBBH")
-"""type, seq, status, n; values and :data:`FIFO_TAIL` follow."""
-STREAM_REQUEST = Struct("<BBIH")
-"""type, seq, first, n; values follow."""
-STREAM_REPLY = Struct("<BBBIH")
-"""type, seq, status, first, n; values and :data:`FIFO_TAIL` follow."""
+"""Of a request: type, seq. Its fields follow, then its values."""
+REPLY_HEAD = Struct("<BBB")
+"""Of a reply: type, seq, status. It ends there if the request was refused."""
+
+EXCHANGE_FIELDS = Struct("<H")
+"""n, both ways; after the values of a reply comes :data:`FIFO_TAIL`."""
+STREAM_FIELDS = Struct("<IH")
+"""first, n, both ways; after the values of a reply comes :data:`FIFO_TAIL`."""
 FIFO_TAIL = Struct("<HH")
 """fifo_level, underruns."""
-WATCHDOG_REQUEST = Struct("<BBI")
-"""type, seq, timeout_ms; the safe value follows."""
-WATCHDOG_REPLY = Struct("<BBBI")
-"""type, seq, status, timeout_ms."""
-STATUS_REPLY = Struct("<BBB")
-"""type, seq, status: reply to SAFE, and to anything that is refused."""
-INFO_REPLY = Struct("<BBBBHHfff")
-"""type, seq, status, version, fifo_depth, block_max, rate_max_hz, min, max; the name follows."""
-CLOCK_REQUEST = Struct("<BBfH")
-"""type, seq, rate_hz, prefill."""
-CLOCK_REPLY = Struct("<BBBf")
-"""type, seq, status, rate_hz."""
-STATE_REPLY = Struct("<BBBB")
-"""type, seq, status, :class:`StateFlag`; the output's value and a reading follow."""
+WATCHDOG_FIELDS = Struct("<I")
+"""timeout_ms, both ways; the safe value follows in a request."""
+INFO_REPLY = Struct("<BHHfff")
+"""version, fifo_depth, block_max, rate_max_hz, min, max; the name follows."""
+CLOCK_REQUEST = Struct("<fH")
+"""rate_hz, prefill."""
+CLOCK_REPLY = Struct("<f")
+"""rate_hz."""
+STATE_REPLY = Struct("<B")
+""":class:`StateFlag`; the output's value and a reading follow."""
 
 
 class Status(IntFlag):
@@ -103,8 +98,10 @@ class StateFlag(IntFlag):
 
 def exchange_sizes(samples: int, value_bytes: int, *, stream: bool) -> tuple[int, int]:
     """Return payload bytes of an EXCHANGE or STREAM request and of its reply."""
-    request, reply = (
-        (STREAM_REQUEST, STREAM_REPLY) if stream else (EXCHANGE_REQUEST, EXCHANGE_REPLY)
-    )
-    values = samples * value_bytes
-    return request.size + values, reply.size + values + FIFO_TAIL.size
+    body = (STREAM_FIELDS if stream else EXCHANGE_FIELDS).size + samples * value_bytes
+    return HEAD.size + body, REPLY_HEAD.size + body + FIFO_TAIL.size
+
+
+def watchdog_sizes(value_bytes: int) -> tuple[int, int]:
+    """Return payload bytes of a WATCHDOG request and of its reply."""
+    return HEAD.size + WATCHDOG_FIELDS.size + value_bytes, REPLY_HEAD.size + WATCHDOG_FIELDS.size

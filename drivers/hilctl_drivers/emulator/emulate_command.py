@@ -5,6 +5,7 @@ import shlex
 import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any, cast
@@ -33,60 +34,29 @@ _HERE = ("127.0.0.1", "::1", "localhost")
 
 @dataclass(frozen=True, slots=True)
 class WiredExperiment:
-    """An experiment whose device is to be emulated.
-
-    Attributes:
-        path: Its file.
-        section: Its device section, as it stands there.
-        options: What to emulate.
-    """
+    """An experiment whose device is to be emulated."""
 
     path: Path
-    section: Mapping[str, Any]
+    section: Mapping[str, Any]  # its device section, as in the file
+    wiring: SimulatedWiring
     options: EmulatorOptions
 
     def words(self, emulator: Emulator) -> list[str]:
-        """Return the words behind ``hilctl`` that run it on an emulator.
-
-        That may be elsewhere than the experiment says.
-        """
+        """Return the arguments of ``hilctl`` that run it on an emulator, at any address."""
         places: dict[str, Any] = {
             key: emulator.options[key]
             for key in ("host", "tcp_port", "serial_port", "reader")
             if key in emulator.options
         }
-        own = self.section.get("unit_id")
-        unit = getattr(emulator.device, "profile", None)
-        if own is not None and isinstance(unit, ModbusProfile) and own != unit.unit_id:
-            places["unit_id"] = unit.unit_id
+        own, profile = self.section.get("unit_id"), emulator.device.profile
+        if own is not None and isinstance(profile, ModbusProfile) and own != profile.unit_id:
+            places["unit_id"] = profile.unit_id
         settings = [f"device.{key}={value}" for key, value in _differing(places, self.section)]
         return ["run", str(self.path), *(word for each in settings for word in ("--set", each))]
 
-    def wiring(self) -> list[str]:
-        """Return what is wired to what, a line each, for people."""
-        wiring = self._wiring()
-        return [
-            f"{self.options.output}: current = {wiring.gain_a:g} A x output {wiring.offset_a:+g} A",
-            f"{self.options.sensor}: displacement = {wiring.sensor_um:g} µm x input "
-            f"{wiring.offset_um:+g} µm",
-        ]
-
-    def wiring_mapping(self) -> dict[str, Any]:
-        """Return what is wired to what, for programs.
-
-        The current is ``gain_a`` x output + ``offset_a``; the displacement ``sensor_um`` x input +
-        ``offset_um``.
-        """
-        ends = {"output": self.options.output, "input": self.options.sensor}
-        return {**ends, **asdict(self._wiring())}
-
-    def _wiring(self) -> SimulatedWiring:
-        assert self.options.wiring is not None
-        return self.options.wiring
-
 
 def is_experiment(name: str) -> bool:
-    """Return whether a name is that of an experiment file, not of a profile."""
+    """Return whether a name is that of an experiment file."""
     path = Path(name)
     if path.suffix not in {".yaml", ".yml"} or not path.is_file():
         return False
@@ -94,13 +64,9 @@ def is_experiment(name: str) -> bool:
 
 
 def wired_experiment(path: Path, port: int = 0, host: str | None = None) -> WiredExperiment:
-    """Return what to emulate for an experiment.
+    """Return what to emulate for an experiment file.
 
-    Args:
-        path: Its file.
-        port: TCP port to listen on; where 0 that of the experiment, if a user may listen on it, or
-            else a free one.
-        host: Address to listen on; this machine's own where None.
+    Port 0 stands for that of the experiment, or for a free one if users may not listen there.
 
     Raises:
         InputError: The file cannot be read, names no device with a profile, or drives with voltage.
@@ -112,8 +78,7 @@ def wired_experiment(path: Path, port: int = 0, host: str | None = None) -> Wire
         rule = "must name a profile: what has none is not behind a wire, and needs no emulator"
         raise ConfigError([ConfigProblem(document.where(("device",)), "device.profile", rule)])
     options = _validated(document, load_profile(name, files, path.parent), path.parent, files)
-    wiring = _wiring(options)
-    reader = options.reader
+    wiring, reader = _wiring(options), options.reader
     made = EmulatorOptions(
         profile=_found(options.profile, path.parent),
         link=None if not hasattr(options, "host") else "rtu" if options.host is None else "tcp",
@@ -127,7 +92,7 @@ def wired_experiment(path: Path, port: int = 0, host: str | None = None) -> Wire
         reader_port=_port(reader),
         wiring=wiring,
     )
-    return WiredExperiment(path, section, made)
+    return WiredExperiment(path, section, wiring, made)
 
 
 def _validated(document: Document, profile: object, folder: Path, files: TextFiles) -> DacOptions:
@@ -138,13 +103,13 @@ def _validated(document: Document, profile: object, folder: Path, files: TextFil
 
 
 def _found(named: NamedProfile, folder: Path) -> str:
-    """Return a profile's name as it is found from here."""
+    """Return a profile's name, with the experiment's folder if it is a path."""
     path = Path(named.name)
     return str(folder / path) if path.suffix or len(path.parts) > 1 else named.name
 
 
 def _port(options: DacOptions | ReaderOptions | None) -> int:
-    """Return the TCP port that options name, if one can listen there; else 0, for a free one."""
+    """Return the TCP port of options if users may listen there; otherwise 0, for a free one."""
     given = getattr(options, "tcp_port", None) or 0
     return given if getattr(options, "host", None) in _HERE and given >= _UNPRIVILEGED else 0
 
@@ -218,7 +183,6 @@ def emulate(
     ] = False,
 ) -> None:
     """Emulate a device with the simulated rig, until Ctrl-C."""
-    say = _say_json if as_json else _say
     faults = tuple(parse_fault(text) for text in fault or ())
     if is_experiment(profile):
         own = {"--link": link, "--output": output, "--sensor": sensor, "--reader": reader,
@@ -229,7 +193,7 @@ def emulate(
         options = replace(wired.options, log=log, faults=faults, current_a=current_a)
         if reader_port:
             options = replace(options, reader_port=reader_port)
-        serve(options, lambda places, emulator: say(places, emulator, wired))
+        serve(options, partial(_say, as_json=as_json, wired=wired))
         return
     if reader is None and sensor is not None and ":" in sensor:
         reader, _, sensor = sensor.rpartition(":")
@@ -248,56 +212,55 @@ def emulate(
         reader_port=reader_port,
         current_a=current_a,
     )
-    serve(options, say)
+    serve(options, partial(_say, as_json=as_json))
 
 
 @dataclass(frozen=True, slots=True)
 class ListenAddress:
-    """Where an emulated device answers.
-
-    Attributes:
-        profile: Its profile.
-        address: ``host:port`` or device file.
-        unit_id: Its unit id, where another Modbus device is served beside it.
-    """
+    """Address of an emulated device."""
 
     profile: str
-    address: str
-    unit_id: int | None = None
+    address: str  # host:port or device file
+    unit_id: int | None = None  # if another Modbus device is served beside it
 
 
 def _say(
-    places: Sequence[ListenAddress], emulator: Emulator, wired: WiredExperiment | None = None
+    places: Sequence[ListenAddress],
+    emulator: Emulator,
+    *,
+    as_json: bool,
+    wired: WiredExperiment | None = None,
 ) -> None:
+    if as_json:
+        typer.echo(finite_json(_report(places, emulator, wired)))
+        return
     for each in places:
         unit = f", unit {each.unit_id}" if each.unit_id is not None else ""
         typer.echo(f"{each.profile} answers at {each.address}{unit}")
     if wired is not None:
-        typer.echo("\n".join([*wired.wiring(), f"hilctl {shlex.join(wired.words(emulator))}"]))
+        wiring, options = wired.wiring, wired.options
+        current = f"{wiring.gain_a:g} A x output {wiring.offset_a:+g} A"
+        displacement = f"{wiring.sensor_um:g} µm x input {wiring.offset_um:+g} µm"
+        typer.echo(f"{options.output}: current = {current}")
+        typer.echo(f"{options.sensor}: displacement = {displacement}")
+        typer.echo(f"hilctl {shlex.join(wired.words(emulator))}")
 
 
-def _say_json(
-    places: Sequence[ListenAddress], emulator: Emulator, wired: WiredExperiment | None = None
-) -> None:
-    said: dict[str, Any] = {"devices": [asdict(each) for each in places]}
+def _report(
+    places: Sequence[ListenAddress], emulator: Emulator, wired: WiredExperiment | None
+) -> dict[str, Any]:
+    report: dict[str, Any] = {"devices": [asdict(each) for each in places]}
     if wired is not None:
-        said["wiring"] = wired.wiring_mapping()
-        said["arguments"] = wired.words(emulator)
-    typer.echo(finite_json(said))
+        terminals = {"output": wired.options.output, "input": wired.options.sensor}
+        report["wiring"] = terminals | asdict(wired.wiring)
+        report["arguments"] = wired.words(emulator)
+    return report
 
 
 def serve(
     options: EmulatorOptions, on_ready: Callable[[Sequence[ListenAddress], Emulator], None]
 ) -> None:
-    """Serve an emulator until SIGINT or SIGTERM.
-
-    Args:
-        options: What to emulate.
-        on_ready: Called with where its devices answer, and itself, once they do.
-
-    Raises:
-        InputError: See :func:`~hilctl_drivers.emulator.factory.build`.
-    """
+    """Serve an emulator until SIGINT or SIGTERM; call ``on_ready`` once its devices answer."""
     emulator = build(options)
 
     def stop(number: int, frame: FrameType | None) -> None:

@@ -5,39 +5,32 @@ or each has a port of its own.
 """
 
 import time
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, Generic, NamedTuple, TypeAlias, TypeVar
 
 from hilctl.base.errors import InputError
 from hilctl_drivers.ascii.ascii_profile import AsciiProfile
 from hilctl_drivers.board.board_profile import FrameProfile
 from hilctl_drivers.emulator.board_device import EmulatedBoard
-from hilctl_drivers.emulator.labjack_stream import attach_stream
 from hilctl_drivers.emulator.modbus_device import EmulatedModbus
 from hilctl_drivers.emulator.modbus_wire import ModbusWire
 from hilctl_drivers.emulator.options import EmulatorOptions
-from hilctl_drivers.emulator.rig import Rig, SimulatedWiring, WriteLog
+from hilctl_drivers.emulator.rig import Bench, Rig, SimulatedWiring, WriteLog
 from hilctl_drivers.emulator.server import EmulatorServer
 from hilctl_drivers.emulator.text_device import EmulatedText
-from hilctl_drivers.emulator.wire import EmulatedLine, EmulatedWire
+from hilctl_drivers.emulator.wire import EmulatedLine, EmulatedWire, SerialProfile
 from hilctl_drivers.modbus.modbus_profile import ModbusProfile
 from hilctl_drivers.profile import load_profile
 from hilctl_drivers.profile_base import BaseProfile
 
+ProfileT = TypeVar("ProfileT", bound=BaseProfile)
 AnyDevice: TypeAlias = EmulatedModbus | EmulatedText | EmulatedBoard
 _SUFFIX = {"V": "v", "mA": "ma", "A": "a"}
 
 
-class Port(NamedTuple):
-    """Where a wire is to be served.
-
-    Attributes:
-        wire: The devices on it.
-        tcp_port: TCP port, 0 for a free one; None for a pty.
-        faulty: Whether faults happen there.
-    """
+class _Port(NamedTuple):
+    """A wire and its TCP port, 0 for a free one; None for a pty."""
 
     wire: EmulatedWire
     tcp_port: int | None = None
@@ -46,48 +39,33 @@ class Port(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Emulator:
-    """A server that is ready to run.
-
-    Attributes:
-        server: Run it.
-        log: Close it at the end.
-        device: What drives the rig.
-        reader: What shows the displacement; ``device`` where it does so itself.
-        wires: What is served: one, or the reader's too.
-        address: ``host:port``, or the pty's device file.
-        reader_address: Where the reader is.
-        reader_unit_id: Its unit id there; None if it is no Modbus device.
-        options: What the driver needs to know, as in an experiment's device section.
-    """
+    """A server that is ready to run; its log is to be closed at the end."""
 
     server: EmulatorServer
     log: WriteLog
-    device: AnyDevice
-    reader: AnyDevice
-    wires: tuple[EmulatedWire, ...]
-    address: str
+    device: AnyDevice  # drives the rig
+    reader: AnyDevice  # shows the displacement, often the same
+    wires: tuple[EmulatedWire, ...]  # one, or the reader's too
+    address: str  # host:port, or the pty's device file
     reader_address: str
-    reader_unit_id: int | None
-    options: dict[str, Any]
+    reader_unit_id: int | None  # None if it is no Modbus device
+    options: dict[str, Any]  # address and wiring, as in an experiment's device section
 
 
 def build(options: EmulatorOptions, clock_ns: Callable[[], int] = time.monotonic_ns) -> Emulator:
-    """Put an emulator together; its ports are open when this returns.
-
-    Args:
-        options: What to emulate.
-        clock_ns: Time of the rig, of watchdogs, sample clocks and faults.
+    """Return an emulator whose ports are open; all its clocks are ``clock_ns``.
 
     Raises:
         InputError: There is no such profile, it has no such channels, an option or a fault does not
-            go with it, the log cannot be written, a port is taken, or two devices have one unit id.
+            go with it, the log cannot be written, a port is in use, or two devices have one unit
+            id.
     """
     plan = _plan(options)
     now_ns = clock_ns()
-    rig = Rig(now_ns, noise=options.noise)
     log = WriteLog(options.log, time.time_ns() - now_ns)
     server = EmulatorServer(options.faults, clock_ns)
-    device, reader, ports = plan.devices(rig, log)
+    bench = Bench(Rig(now_ns, noise=options.noise), plan.wiring, log)
+    device, reader, ports = plan.devices(bench)
     try:
         addresses = [_opened(server, port, options.host) for port in ports]
     except InputError:
@@ -107,14 +85,14 @@ def build(options: EmulatorOptions, clock_ns: Callable[[], int] = time.monotonic
     )
 
 
-def _opened(server: EmulatorServer, port: Port, host: str) -> str:
+def _opened(server: EmulatorServer, port: _Port, host: str) -> str:
     if port.tcp_port is None:
         return server.open_pty(port.wire, faulty=port.faulty)
     return server.listen_tcp(port.wire, host, port.tcp_port)
 
 
-def _plan(options: EmulatorOptions) -> "_Plan":
-    """Return what options come to; nothing is opened or written."""
+def _plan(options: EmulatorOptions) -> "_ModbusPlan | _SerialPlan":
+    """Check the options against the profiles; nothing is opened or written."""
     profile = load_profile(options.profile)
     reader = profile if options.reader is None else load_profile(options.reader)
     if isinstance(profile, ModbusProfile):
@@ -128,19 +106,19 @@ def _plan(options: EmulatorOptions) -> "_Plan":
     if isinstance(profile, FrameProfile):
         if reader is not profile:
             raise InputError(f"{profile.title} reads its own sensor: it takes no reader")
-        return _BoardPlan(options, profile)
+        return _SerialPlan(options, profile, profile)
     if not (isinstance(profile, AsciiProfile) and isinstance(reader, AsciiProfile)):
         raise InputError(f"{options.reader}: only text profiles read for {profile.title}")
-    return _TextPlan(options, profile, reader)
+    return _SerialPlan(options, profile, reader)
 
 
-class _Plan(ABC):
-    """Profiles and channels that options come to, and the wiring between them."""
+class _Plan(Generic[ProfileT]):
+    """The profiles and channels of options, and the wiring between them."""
 
     reader_unit_id: int | None = None
 
-    def __init__(self, options: EmulatorOptions, profile: BaseProfile, reader: BaseProfile) -> None:
-        self._options = options
+    def __init__(self, options: EmulatorOptions, profile: ProfileT, reader: ProfileT) -> None:
+        self._options, self._profile, self._reader = options, profile, reader
         sensors = [
             name
             for name, each in reader.inputs.items()
@@ -151,26 +129,19 @@ class _Plan(ABC):
         self._sensor = _chosen("input to show a displacement at", options.sensor, sensors, reader)
         self._output_range = profile.outputs[self._output]
         self._sensor_range = reader.inputs[self._sensor]
-        self._wiring = options.wiring or SimulatedWiring.spread(
+        self.wiring = options.wiring or SimulatedWiring.spread(
             self._output_range, self._sensor_range
         )
         self._apart = reader is not profile
+        """Whether the reader is on a wire of its own."""
 
     def _refuse_resets(self) -> None:
         if any(fault.kind == "reset" for fault in self._options.faults):
             raise InputError("fault reset is for tcp: a serial line has no connection to break")
 
-    @abstractmethod
-    def devices(self, rig: Rig, log: WriteLog) -> tuple[AnyDevice, AnyDevice, list[Port]]:
-        """Return what drives the rig, what shows it, and where they are to be served."""
-
-    @abstractmethod
-    def places(self, addresses: list[str]) -> dict[str, Any]:
-        """Return the part of a device section that says where the devices are."""
-
     def channels(self) -> dict[str, Any]:
-        """Return the part of a device section that says what is wired to what."""
-        wiring = self._wiring
+        """Return the part of a device section with profile, channels and wiring."""
+        wiring = self.wiring
         made: dict[str, Any] = {
             "profile": self._options.profile,
             "output": self._output,
@@ -186,13 +157,26 @@ class _Plan(ABC):
             made["amplifier"] = {**gain, "offset_a": wiring.offset_a}
         return made
 
+    def places(self, addresses: list[str]) -> dict[str, Any]:
+        """Return the part of a device section with the addresses of the devices."""
+        made = _place(addresses[0])
+        if self._reader is not self._profile:
+            unit = {} if self.reader_unit_id is None else {"unit_id": self.reader_unit_id}
+            place = _place(addresses[1]) if self._apart else {}
+            made["reader"] = {"profile": self._options.reader, **unit, **place}
+        return made
 
-class _ModbusPlan(_Plan):
+
+def _place(address: str) -> dict[str, Any]:
+    host, _, port = address.rpartition(":")
+    return {"host": host, "tcp_port": int(port)} if host else {"serial_port": address}
+
+
+class _ModbusPlan(_Plan[ModbusProfile]):
     def __init__(
         self, options: EmulatorOptions, profile: ModbusProfile, reader: ModbusProfile
     ) -> None:
         super().__init__(options, profile, reader)
-        self._profile, self._reader = profile, reader
         self._links = (options.link or profile.link.kind, options.link or reader.link.kind)
         line = options.reader_line or ("own" if reader.link.kind == "tcp" else "same")
         self._apart &= line == "own" or self._links[0] != self._links[1]
@@ -209,90 +193,51 @@ class _ModbusPlan(_Plan):
             raise InputError(f"reader_unit_id must not be {wanted}, that of {profile.title}")
         return reader.unit_id + (reader.unit_id == profile.unit_id) if wanted is None else wanted
 
-    def devices(self, rig: Rig, log: WriteLog) -> tuple[AnyDevice, AnyDevice, list[Port]]:
-        profile, output, sensor, wiring = self._profile, self._output, self._sensor, self._wiring
-        start_a = self._options.current_a
-        if self._reader is profile:
-            device = reader = EmulatedModbus(profile, rig, log, output, sensor, wiring, start_a)
-            attach_stream(device, rig, log, output, sensor, noise=self._options.noise)
-        else:
-            device = EmulatedModbus(profile, rig, log, output, None, wiring, start_a)
-            reader = EmulatedModbus(self._reader, rig, log, None, sensor, wiring)
-        unit, reader_unit = profile.unit_id, self.reader_unit_id
-        assert reader_unit is not None
-        ports = [(0, {unit: device}), (1, {reader_unit: reader})]
-        if not self._apart:
-            ports = [(0, {reader_unit: reader, unit: device})]
-        return device, reader, [self._port(which, devices) for which, devices in ports]
+    def devices(self, bench: Bench) -> tuple[AnyDevice, AnyDevice, list[_Port]]:
+        """Return the devices that drive and show the rig, and where they are served."""
+        options, output, sensor = self._options, self._output, self._sensor
+        reads_itself = self._reader is self._profile
+        device = reader = EmulatedModbus(
+            self._profile, bench, output, sensor if reads_itself else None, options.current_a,
+            noise=options.noise,
+        )  # fmt: skip
+        if not reads_itself:
+            reader = EmulatedModbus(self._reader, bench, None, sensor)
+        assert self.reader_unit_id is not None
+        own, other = {self._profile.unit_id: device}, {self.reader_unit_id: reader}
+        served = [(own, 0), (other, 1)] if self._apart else [(other | own, 0)]
+        return device, reader, [self._port(which, devices) for devices, which in served]
 
-    def _port(self, which: int, devices: dict[int, EmulatedModbus]) -> Port:
+    def _port(self, which: int, devices: dict[int, EmulatedModbus]) -> _Port:
         options, link = self._options, self._links[which]
         wire = ModbusWire(link, devices, options.lacking, options.mute)
-        return Port(wire, (options.port, options.reader_port)[which] if link == "tcp" else None)
-
-    def places(self, addresses: list[str]) -> dict[str, Any]:
-        made = _modbus_place(addresses[0])
-        if self._reader is not self._profile:
-            reader = {"profile": self._options.reader, "unit_id": self.reader_unit_id}
-            made["reader"] = reader | (_modbus_place(addresses[1]) if self._apart else {})
-        return made
+        return _Port(wire, (options.port, options.reader_port)[which] if link == "tcp" else None)
 
 
-def _modbus_place(address: str) -> dict[str, Any]:
-    host, _, port = address.rpartition(":")
-    return {"host": host, "tcp_port": int(port)} if host else {"serial_port": address}
-
-
-class _TextPlan(_Plan):
+class _SerialPlan(_Plan[SerialProfile]):
     def __init__(
-        self, options: EmulatorOptions, profile: AsciiProfile, reader: AsciiProfile
+        self, options: EmulatorOptions, profile: SerialProfile, reader: SerialProfile
     ) -> None:
         super().__init__(options, profile, reader)
         self._refuse_resets()
-        self._profile, self._reader = profile, reader
         self._apart &= options.reader_line != "same"
 
-    def devices(self, rig: Rig, log: WriteLog) -> tuple[AnyDevice, AnyDevice, list[Port]]:
-        if self._reader is self._profile:
-            device = reader = self._device(self._profile, rig, log, self._output, self._sensor)
-        else:
-            device = self._device(self._profile, rig, log, self._output, None)
-            reader = self._device(self._reader, rig, log, None, self._sensor)
-        first = [device] if self._apart or reader is device else [device, reader]
-        ports = [Port(EmulatedLine(self._profile, first))]
-        if self._apart:
-            ports.append(Port(EmulatedLine(self._reader, [reader]), faulty=False))
-        return device, reader, ports
-
-    def _device(
-        self, profile: AsciiProfile, rig: Rig, log: WriteLog, output: str | None, sensor: str | None
-    ) -> EmulatedText:
-        address = profile.address if isinstance(profile.address, int) else 0
-        return EmulatedText(
-            profile, rig, log, self._wiring, output=output, sensor=sensor, address=address
-        )
-
-    def places(self, addresses: list[str]) -> dict[str, Any]:
-        made: dict[str, Any] = {"serial_port": addresses[0]}
-        if self._options.reader is not None:
-            place = {"serial_port": addresses[1]} if self._apart else {}
-            made["reader"] = {"profile": self._options.reader, **place}
-        return made
-
-
-class _BoardPlan(_Plan):
-    def __init__(self, options: EmulatorOptions, profile: FrameProfile) -> None:
-        super().__init__(options, profile, profile)
-        self._refuse_resets()
-        self._profile = profile
-
-    def devices(self, rig: Rig, log: WriteLog) -> tuple[AnyDevice, AnyDevice, list[Port]]:
-        noise = self._options.noise
-        board = EmulatedBoard(self._profile, rig, log, self._wiring, noise=noise)
-        return board, board, [Port(EmulatedLine(self._profile, [board]))]
-
-    def places(self, addresses: list[str]) -> dict[str, Any]:
-        return {"serial_port": addresses[0]}
+    def devices(self, bench: Bench) -> tuple[AnyDevice, AnyDevice, list[_Port]]:
+        """Return the devices that drive and show the rig, and where they are served."""
+        profile, reader = self._profile, self._reader
+        if isinstance(profile, FrameProfile):
+            board = EmulatedBoard(profile, bench, noise=self._options.noise)
+            return board, board, [_Port(EmulatedLine(profile, [board]))]
+        assert isinstance(reader, AsciiProfile)
+        if reader is profile:
+            text = EmulatedText(profile, bench, self._output, self._sensor)
+            return text, text, [_Port(EmulatedLine(profile, [text]))]
+        drives = EmulatedText(profile, bench, self._output, None)
+        reads = EmulatedText(reader, bench, None, self._sensor)
+        if not self._apart:
+            return drives, reads, [_Port(EmulatedLine(profile, [drives, reads]))]
+        ports = [_Port(EmulatedLine(profile, [drives]))]
+        return drives, reads, [*ports, _Port(EmulatedLine(reader, [reads]), faulty=False)]
 
 
 def _chosen(what: str, name: str | None, names: list[str], profile: BaseProfile) -> str:

@@ -10,13 +10,15 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from hilctl.base.types import F64
-from hilctl_drivers.emulator.modbus_device import EmulatedModbus, RejectedRequest
-from hilctl_drivers.emulator.rig import Rig, SampleFifo, WriteLog
+from hilctl_drivers.emulator.registers import RejectedRequest
+from hilctl_drivers.emulator.rig import Bench, SampleFifo
 from hilctl_drivers.labjack import stream
 from hilctl_drivers.modbus.modbus_profile import BYTES_A_SAMPLE, LabJackStreaming, ModbusProfile
 from hilctl_drivers.modbus.register_map import RegisterStep
 
 _DROPPING, _DROPPED = 2940, 2941
+_VALUE_EXCEPTION, _FAILURE_EXCEPTION = 3, 4
+_PERIOD_NS, _PERIODS_MAX = 100, 65_536
 _LIMIT = 0xFFFF
 _NOMINAL: dict[str, tuple[float, ...]] = {
     "two_slopes": (0.000315805780, -0.000315805800, 33523.0, -10.586956522),
@@ -26,16 +28,12 @@ _NOMINAL: dict[str, tuple[float, ...]] = {
 
 
 class LabJackInput:
-    """Readings between the scans that made them and the messages that fetch them.
-
-    Args:
-        streaming: What the profile says.
-    """
+    """Buffer of readings between the scans and the messages that fetch them."""
 
     def __init__(self, streaming: LabJackStreaming) -> None:
         numbers = _NOMINAL[streaming.calibration]
         self.flash = struct.pack(f">{len(numbers)}f", *numbers)
-        """What stands in flash where the calibration constants begin."""
+        """Contents of the flash from the calibration constants on."""
         _, size = stream.calibration_span(streaming.calibration, 0, 0)
         self._made = stream.InputCalibration.decode(streaming.calibration, self.flash[:size])
         self._readings: list[int] = []
@@ -81,24 +79,10 @@ class LabJackInput:
         return whole
 
 
-_VALUE_EXCEPTION, _FAILURE_EXCEPTION = 3, 4
-_PERIOD_NS, _PERIODS_MAX = 100, 65_536
-
-
 class LabJackStream:
-    """The registers.
+    """The registers; a stream starts from the current of the rig.
 
-    Args:
-        profile: What the device is.
-        streaming: What it can stream.
-        output: Output that drives the rig.
-        sensor: Input that shows the displacement.
-        current_a: From the output's value to the rig's current.
-        volts: From displacements in um to volts at the input.
-        on_played: Called with the first value's number, float64[n] currents in A, and the time of
-            the last.
-        standing_a: Returns the rig's current in A, from which a stream starts.
-        noise: Whether the sensor has noise.
+    ``on_played`` gets the first value's number, float64[n] currents in A, and the time of the last.
     """
 
     def __init__(
@@ -107,25 +91,21 @@ class LabJackStream:
         streaming: LabJackStreaming,
         output: str,
         sensor: str,
+        bench: Bench,
         *,
-        current_a: Callable[[F64], F64],
-        volts: Callable[[F64], F64],
-        on_played: Callable[[int, F64, int], None],
-        standing_a: Callable[[], float],
         noise: bool,
+        on_played: Callable[[int, F64, int], None],
     ) -> None:
-        self._streaming = streaming
+        self._streaming, self._wiring, self._rig = streaming, bench.wiring, bench.rig
         self._limits = profile.outputs[output].limits
         self._target = profile.wire_address(profile.outputs[output])
-        self._source = profile.wire_address(profile.inputs[sensor])
+        self._sensor = profile.inputs[sensor]
+        self._source = profile.wire_address(self._sensor)
         self._analog = {profile.wire_address(each) for each in profile.inputs.values()}
-        self._current_a = current_a
-        self._volts = volts
         self.fifo = SampleFifo(noise=noise, repeats=True, on_played=self._played)
         self._on_played = on_played
-        self._standing_a = standing_a
         self.input = LabJackInput(streaming)
-        self._words = {address: [0, 0] for address in _plain(profile, streaming)}
+        self._words = {address: bytes(4) for address in _plain(profile, streaming)}
         self._pending: list[F64] = []
         self._writes: dict[int, Callable[[bytes], None]] = {
             stream.SCANRATE_HZ: self._set_rate,
@@ -142,16 +122,11 @@ class LabJackStream:
         }
         self._now_ns = 0
 
-    @property
-    def running(self) -> bool:
-        """Whether it streams."""
-        return self.fifo.running
-
     def has(self, address: int) -> bool:
         """Return whether an address is the stream's business; inputs are while it runs."""
         known = address in self._words or address in self._reads or address in self._writes
         scanned = stream.SCANLIST_ADDRESS <= address < stream.SCANLIST_ADDRESS + 256
-        return known or scanned or (self.running and address in self._analog)
+        return known or scanned or (self.fifo.running and address in self._analog)
 
     def tick(self, now_ns: int) -> None:
         """Advance the time."""
@@ -160,7 +135,7 @@ class LabJackStream:
 
     def _played(self, first: int, current_a: F64, displacement_um: F64, now_ns: int) -> None:
         self._on_played(first, current_a, now_ns)
-        self.input.keep(self._volts(displacement_um))
+        self.input.keep(self._wiring.at_terminal(displacement_um, self._sensor))
 
     def stop(self, now_ns: int) -> None:
         """Stop streaming at a time that may be past; the output holds its value."""
@@ -168,36 +143,21 @@ class LabJackStream:
         self.fifo.stop()
 
     def read(self, address: int, count: int) -> list[int]:
-        """Return register words.
-
-        Raises:
-            Declined: Not readable, or not now.
-        """
-        if address in self._reads:
-            data = self._reads[address](count)
-        elif address in self._words:
-            data = struct.pack(">2H", *self._words[address])
-        else:
-            raise RejectedRequest(_FAILURE_EXCEPTION)
-        if len(data) != 2 * count:
-            raise RejectedRequest(_VALUE_EXCEPTION)
+        """Return register words; raise RejectedRequest if they are not readable, or not now."""
+        _require(address in self._reads or address in self._words, _FAILURE_EXCEPTION)
+        data = self._reads[address](count) if address in self._reads else self._words[address]
+        _require(len(data) == 2 * count, _VALUE_EXCEPTION)
         return list(struct.unpack(f">{count}H", data))
 
     def write(self, address: int, values: Sequence[int]) -> None:
-        """Write register words.
-
-        Raises:
-            Declined: Not writable, or not this, or not now.
-        """
+        """Write register words; raise RejectedRequest for an address, a value or a moment."""
         data = struct.pack(f">{len(values)}H", *values)
         if address in self._writes:
             self._writes[address](data)
             return
-        for start in range(0, len(values), 2):
-            if address + start not in self._words:
-                raise RejectedRequest(_VALUE_EXCEPTION)
-        for start in range(0, len(values), 2):
-            self._words[address + start] = list(values[start : start + 2])
+        pairs = {address + k // 2: data[k : k + 4] for k in range(0, len(data), 4)}
+        _require(pairs.keys() <= self._words.keys(), _VALUE_EXCEPTION)
+        self._words.update(pairs)
 
     @property
     def _capacity(self) -> int:
@@ -208,28 +168,25 @@ class LabJackStream:
         return self.fifo.level + sum(part.size for part in self._pending)
 
     def _number(self, address: int) -> int:
-        high, low = self._words[address]
-        return high << 16 | low
+        return int.from_bytes(self._words[address], "big")
 
     def _set_rate(self, data: bytes) -> None:
         """Keep the rate that the clock can make (description of STREAM_SCANRATE_HZ)."""
         (rate_hz,) = struct.unpack(">f", data)
-        if not 0.0 < rate_hz <= self._streaming.samples_per_s_max:
-            raise RejectedRequest(_VALUE_EXCEPTION)
+        _require(0.0 < rate_hz <= self._streaming.samples_per_s_max, _VALUE_EXCEPTION)
         unit_ns = _PERIOD_NS
         while round(1e9 / rate_hz / unit_ns) > _PERIODS_MAX:
             unit_ns *= 10
         real_hz = 1e9 / (unit_ns * round(1e9 / rate_hz / unit_ns))
-        self._words[stream.SCANRATE_HZ] = list(struct.unpack(">2H", stream.f32(real_hz)))
+        self._words[stream.SCANRATE_HZ] = stream.f32(real_hz)
 
     def _enable_output(self, data: bytes) -> None:
-        self._words[stream.OUT_ENABLE] = list(struct.unpack(">2H", data))
+        self._words[stream.OUT_ENABLE] = data
         size = self._number(stream.OUT_ALLOCATE_BYTES)
         allowed = 32 <= size <= self._streaming.buffer_bytes and not size & (size - 1)
-        if self._number(stream.OUT_ENABLE) and (
-            not allowed or self._number(stream.OUT_TARGET) != self._target
-        ):
-            raise RejectedRequest(_FAILURE_EXCEPTION)
+        if self._number(stream.OUT_ENABLE):
+            targeted = self._number(stream.OUT_TARGET) == self._target
+            _require(allowed and targeted, _FAILURE_EXCEPTION)
         self.fifo.clear()
         self._pending.clear()
 
@@ -237,58 +194,48 @@ class LabJackStream:
         values = np.frombuffer(data, ">f4").astype(np.float64)
         low, high = self._limits
         slack = 1e-6 * (high - low)
-        if not ((values >= low - slack) & (values <= high + slack)).all():
-            raise RejectedRequest(_VALUE_EXCEPTION)
-        enabled = self._number(stream.OUT_ENABLE)
-        if not enabled or self._held + values.size > self._capacity:
-            raise RejectedRequest(_FAILURE_EXCEPTION)
+        good = (values >= low - slack) & (values <= high + slack)
+        _require(bool(good.all()), _VALUE_EXCEPTION)
+        fits = self._held + values.size <= self._capacity
+        _require(fits and self._number(stream.OUT_ENABLE) != 0, _FAILURE_EXCEPTION)
         self._pending.append(values)
 
     def _use_values(self, data: bytes) -> None:
-        if data != stream.u32(stream.USE_AT_ONCE):
-            raise RejectedRequest(_VALUE_EXCEPTION)
+        _require(data == stream.u32(stream.USE_AT_ONCE), _VALUE_EXCEPTION)
         for values in self._pending:
-            self.fifo.queue(self._current_a(values))
+            self.fifo.queue(self._wiring.current_a(values))
         self._pending.clear()
 
     def _enable(self, data: bytes) -> None:
-        if data == stream.u32(0):
-            if not self.running:
-                raise RejectedRequest(_FAILURE_EXCEPTION)
+        starts = data != stream.u32(0)
+        _require(starts != self.fifo.running, _FAILURE_EXCEPTION)
+        if not starts:
             self.fifo.stop()
             return
-        addresses = [self._number(stream.SCANLIST_ADDRESS + 2 * k) for k in range(2)]
-        settings = (self._number(stream.NUM_ADDRESSES), self._number(stream.AUTO_TARGET))
-        wanted = (2, stream.COMMAND_RESPONSE)
-        scanned = [self._source, stream.STREAM_OUT0]
-        rate_hz = self._rate_hz
-        if (
-            self.running
-            or addresses != scanned
-            or settings != wanted
-            or not 0.0 < rate_hz <= self._streaming.rate_max_hz
-        ):
-            raise RejectedRequest(_FAILURE_EXCEPTION)
+        found = [self._number(stream.SCANLIST_ADDRESS + 2 * k) for k in range(2)]
+        found += [self._number(stream.NUM_ADDRESSES), self._number(stream.AUTO_TARGET)]
+        wanted = [self._source, stream.STREAM_OUT0, 2, stream.COMMAND_RESPONSE]
+        (rate_hz,) = struct.unpack(">f", self._words[stream.SCANRATE_HZ])
+        allowed = 0.0 < rate_hz <= self._streaming.rate_max_hz
+        _require(allowed and found == wanted, _FAILURE_EXCEPTION)
         self.input.start(self._number(stream.BUFFER_SIZE_BYTES))
-        self.fifo.current_a = self._standing_a()
+        self.fifo.current_a = self._rig.current_a
         self.fifo.set_rate(rate_hz)
         self.fifo.start(self._now_ns)
 
-    @property
-    def _rate_hz(self) -> float:
-        data = struct.pack(">2H", *self._words[stream.SCANRATE_HZ])
-        return float(struct.unpack(">f", data)[0])
-
     def _data(self, count: int) -> bytes:
-        if not self.running:
-            raise RejectedRequest(_FAILURE_EXCEPTION)
+        _require(self.fifo.running, _FAILURE_EXCEPTION)
         return self.input.fetch(count)
 
     def _read_flash(self, count: int) -> bytes:
         start = self._number(stream.FLASH_READ_POINTER) - self._streaming.calibration_address
-        if start < 0:
-            raise RejectedRequest(_VALUE_EXCEPTION)
+        _require(start >= 0, _VALUE_EXCEPTION)
         return self.input.flash[start : start + 2 * count]
+
+
+def _require(good: bool, exception: int) -> None:
+    if not good:
+        raise RejectedRequest(exception)
 
 
 def _plain(profile: ModbusProfile, streaming: LabJackStreaming) -> set[int]:
@@ -304,46 +251,3 @@ def _plain(profile: ModbusProfile, streaming: LabJackStreaming) -> set[int]:
         profile.wire_address(step) for step in streaming.setup if isinstance(step, RegisterStep)
     }
     return settings | scanned | steps
-
-
-def attach_stream(
-    device: EmulatedModbus, rig: Rig, log: WriteLog, output: str, sensor: str, *, noise: bool
-) -> None:
-    """Give an emulated device its stream, where its profile has one for these channels.
-
-    Args:
-        device: Which.
-        rig: What it stands at.
-        log: Where what is output goes.
-        output: Output that drives the rig.
-        sensor: Input that shows the displacement.
-        noise: Whether the sensor has noise.
-    """
-    profile, wiring = device.profile, device.wiring
-    streaming = profile.streaming
-    if streaming == "none" or output not in streaming.outputs or sensor not in streaming.inputs:
-        return
-    channel, terminal = profile.outputs[output], profile.inputs[sensor]
-    words, _ = device.memory.targets(
-        channel.area, profile.wire_address(channel), [0] * channel.words
-    )[0]
-
-    def played(first: int, current_a: F64, now_ns: int) -> None:
-        words.value = value = (float(current_a[-1]) - wiring.offset_a) / wiring.gain_a
-        rig.put_out(float(current_a[-1]), now_ns)
-        log.event(
-            now_ns, "played", output=output, first=first, samples=current_a.size, value=value,
-            unit=channel.unit, current_a=float(current_a[-1]),
-        )  # fmt: skip
-
-    device.overlay = LabJackStream(
-        profile,
-        streaming,
-        output,
-        sensor,
-        current_a=lambda values: values * wiring.gain_a + wiring.offset_a,
-        volts=lambda um: np.clip((um - wiring.offset_um) / wiring.sensor_um, *terminal.limits),
-        on_played=played,
-        standing_a=lambda: rig.current_a,
-        noise=noise,
-    )

@@ -1,11 +1,11 @@
 """An emulated Modbus device: a profile's registers in front of the simulated rig."""
 
 from collections.abc import Sequence
-from typing import Protocol
 
-from hilctl.base.errors import InputError
-from hilctl_drivers.emulator.registers import NoSuchRegister, RegisterMap, Words
-from hilctl_drivers.emulator.rig import Rig, SimulatedWiring, WatchdogTimer, WriteLog
+from hilctl.base.types import F64
+from hilctl_drivers.emulator.labjack_stream import LabJackStream
+from hilctl_drivers.emulator.registers import RegisterMap, RejectedRequest, Words
+from hilctl_drivers.emulator.rig import Bench, EmulatedDevice, WatchdogTimer
 from hilctl_drivers.modbus.modbus_profile import ModbusProfile, ModbusWatchdog
 from hilctl_drivers.modbus.register_map import EnsureStep, ModbusStep, RegisterStep, WriteStep
 
@@ -17,11 +17,8 @@ class EmulatedWatchdog(WatchdogTimer):
     """Trips when the host has been silent for the timeout.
 
     It is armed by the last of the profile's arm steps and disarmed by the last of the disarm steps,
-    as they are written; so it starts as a new device would, disarmed.
-
-    Args:
-        profile: What the profile says of it.
-        words: Looks up the value that a step writes.
+    as they are written; so it starts as a new device would, disarmed. ``words`` has the value of
+    each step, by its ``id``.
     """
 
     def __init__(self, profile: ModbusWatchdog, words: dict[int, Words]) -> None:
@@ -38,7 +35,7 @@ class EmulatedWatchdog(WatchdogTimer):
 
     @property
     def timeout_s(self) -> float:
-        """What the timeout register says, in s; the profile's shortest where it has none."""
+        """Value of the timeout register, s; the profile's shortest if it has none."""
         if self._timeout is None:
             return self._profile.min_s
         register = self._timeout.register
@@ -92,99 +89,41 @@ def _hit(trigger: Target | None, target: Words) -> bool:
     return any(target.words) if trigger[1] is None else target.words == trigger[1]
 
 
-class RejectedRequest(Exception):  # noqa: N818  a reply, not a mistake
-    """The device refuses a request.
+class EmulatedModbus(EmulatedDevice):
+    """The device: its registers, and the effects of writing them.
 
-    Attributes:
-        code: Modbus exception code.
+    It powers up as the profile says, or at ``current_a``; otherwise with the rig at 0 A. Two
+    devices can share a rig: one drives it, the other shows its displacement. ``noise`` is that of
+    the sensor when streaming.
     """
 
-    def __init__(self, code: int) -> None:
-        super().__init__(f"exception {code}")
-        self.code = code
-
-
-class Overlay(Protocol):
-    """Registers that do more than hold a value: buffers, switches, a clock."""
-
-    def has(self, address: int) -> bool:
-        """Return whether a request that begins at this address is for it, just now."""
-        ...
-
-    def read(self, address: int, count: int) -> list[int]:
-        """Return register words; raise ``RejectedRequest`` where they cannot be read."""
-        ...
-
-    def write(self, address: int, values: Sequence[int]) -> None:
-        """Write register words; raise ``RejectedRequest`` where they cannot be written."""
-        ...
-
-    def tick(self, now_ns: int) -> None:
-        """Advance the time."""
-        ...
-
-    def stop(self, now_ns: int) -> None:
-        """Leave the outputs alone from now on."""
-        ...
-
-
-def _check_channels(profile: ModbusProfile, output: str | None, sensor: str | None) -> None:
-    outputs, inputs = profile.outputs, profile.inputs
-    if output in {None, *outputs} and sensor in {None, *inputs}:
-        return
-    names = f"outputs {', '.join(outputs) or 'none'}; inputs {', '.join(inputs) or 'none'}"
-    wanted = " and ".join(name for name in (output, sensor) if name is not None)
-    raise InputError(f"{profile.title} has no {wanted}: {names}")
-
-
-class EmulatedModbus:
-    """The device: what its registers hold, and what writing them does.
-
-    It powers up as the profile says; where that says nothing, with the rig at 0 A.
-    Two devices can stand at one rig: one drives it, the other shows its displacement.
-
-    Args:
-        profile: What it is.
-        rig: What it stands at.
-        log: Where writes go.
-        output: Output that drives the rig; None if another device does.
-        sensor: Input that shows the displacement; None if another device does.
-        wiring: Amplifier and sensor between; spread over the channels' ranges where None.
-        current_a: Current at the start, as if its power-up value had been set so.
-
-    Raises:
-        InputError: It has no such output or input.
-    """
+    profile: ModbusProfile
 
     def __init__(
         self,
         profile: ModbusProfile,
-        rig: Rig,
-        log: WriteLog,
+        bench: Bench,
         output: str | None,
         sensor: str | None,
-        wiring: SimulatedWiring | None = None,
         current_a: float | None = None,
+        *,
+        noise: bool = True,
     ) -> None:
-        self.profile = profile
-        self._rig = rig
-        self._log = log
-        self._output, self._sensor = output, sensor
-        _check_channels(profile, output, sensor)
+        super().__init__(profile, bench, output)
+        self._sensor = sensor
         registers = RegisterMap(profile)
         self.memory = registers.memory
         self._steps = registers.steps
         self._outputs, self._inputs = registers.outputs, registers.inputs
-        if wiring is None:
-            assert output is not None, "a device that only reads needs its wiring"
-            assert sensor is not None, "a device that only drives needs its wiring"
-            wiring = SimulatedWiring.spread(profile.outputs[output], profile.inputs[sensor])
-        self.wiring = wiring
-        watchdog = profile.watchdog
+        watchdog, streaming = profile.watchdog, profile.streaming
         self._watchdog = None if watchdog == "none" else EmulatedWatchdog(watchdog, self._steps)
-        self._now_ns = 0
-        self.overlay: Overlay | None = None
-        """Registers that do more than hold a value, before all others."""
+        if self._watchdog is not None:
+            self._timer = self._watchdog
+        self.overlay: LabJackStream | None = None  # registers of a stream, before all others
+        if streaming != "none" and output in streaming.outputs and sensor in streaming.inputs:
+            self.overlay = LabJackStream(
+                profile, streaming, output, sensor, bench, noise=noise, on_played=self._played
+            )
         self._power_up(current_a)
 
     def _power_up(self, current_a: float | None) -> None:
@@ -192,20 +131,20 @@ class EmulatedModbus:
             value = self.profile.outputs[name].power_up
             if name == self._output:
                 if value is None or current_a is not None:
-                    value = ((current_a or 0.0) - self.wiring.offset_a) / self.wiring.gain_a
+                    value = self.wiring.output(current_a or 0.0)
                 self._rig.put_out(self.wiring.current_a(value), 0)
             if value is not None:
                 words.value = value
 
-    def tick(self, now_ns: int) -> None:
-        """Advance the time; the watchdog may trip on the way."""
-        due_ns = self._watchdog.trip(now_ns) if self._watchdog else None
-        if due_ns is not None:
-            self._trip(due_ns)
-        self._now_ns = max(self._now_ns, now_ns)
+    def _advance(self) -> None:
         if self.overlay is not None:
             self.overlay.tick(self._now_ns)
-        self._rig.advance(self._now_ns)
+        super()._advance()
+
+    def _played(self, first: int, current_a: F64, now_ns: int) -> None:
+        assert self._output is not None
+        self._rig.put_out(float(current_a[-1]), now_ns)
+        self._outputs[self._output].value = self._log_played(first, current_a, now_ns)
 
     def request(self, now_ns: int) -> None:
         """Note that a request has come; before it is executed."""
@@ -214,33 +153,23 @@ class EmulatedModbus:
             self._watchdog.request(self._now_ns)
 
     def read(self, areas: Sequence[str], address: int, count: int) -> list[int]:
-        """Return register words.
-
-        Raises:
-            Declined: Not all exist.
-        """
+        """Return register words; raise RejectedRequest if not all exist."""
         if self.overlay is not None and self.overlay.has(address):
             return self.overlay.read(address, count)
         self._measure()
-        try:
-            return self.memory.read(areas, address, count)
-        except NoSuchRegister:
-            raise RejectedRequest(2) from None
+        return self.memory.read(areas, address, count)
 
     def write(self, area: str, address: int, values: Sequence[int]) -> None:
         """Write register words; all or none.
 
         Raises:
-            Declined: Not all can be written, a value is beyond its channel's range, or the
+            RejectedRequest: Not all can be written, a value is out of its channel's range, or the
                 watchdog has tripped and the device wants that cleared first.
         """
         if self.overlay is not None and self.overlay.has(address):
             self.overlay.write(address, values)
             return
-        try:
-            targets = self.memory.targets(area, address, values)
-        except NoSuchRegister:
-            raise RejectedRequest(2) from None
+        targets = self.memory.targets(area, address, values)
         before = [list(words.words) for words, _ in targets]
         for words, wanted in targets:
             words.words[:] = wanted
@@ -278,11 +207,6 @@ class EmulatedModbus:
                 self._put_out(name, "write", self._now_ns)
 
     @property
-    def tripped(self) -> bool:
-        """Whether the host watchdog has tripped."""
-        return self._watchdog is not None and self._watchdog.tripped
-
-    @property
     def _holds_trip(self) -> bool:
         """Whether a trip is kept until a step clears it, and registers keep their commands."""
         return self.profile.watchdog != "none" and bool(self.profile.watchdog.clear)
@@ -290,8 +214,8 @@ class EmulatedModbus:
     def _resume(self) -> None:
         """Output what the registers hold, as a device may once its trip is cleared.
 
-        No document says so of the shipped ones; those that refuse commands until then wait here for
-        the next one.
+        No document describes it for the shipped ones. A device that refuses commands until then
+        waits for the next command.
         """
         watchdog = self.profile.watchdog
         if watchdog != "none" and not watchdog.refuses_while_tripped:
@@ -299,15 +223,7 @@ class EmulatedModbus:
                 self._put_out(name, "cleared", self._now_ns)
 
     def _put_out(self, name: str, event: str, now_ns: int) -> None:
-        self._put_value(name, self._outputs[name].value, event, now_ns)
-
-    def _put_value(self, name: str, value: float, event: str, now_ns: int) -> None:
-        more: dict[str, float] = {}
-        if name == self._output:
-            self._rig.put_out(self.wiring.current_a(value), now_ns)
-            more["current_a"] = self._rig.current_a
-        unit = self.profile.outputs[name].unit
-        self._log.event(now_ns, event, output=name, value=value, unit=unit, **more)
+        self._set_terminal(name, self._outputs[name].value, event, now_ns)
 
     def _trip(self, due_ns: int) -> None:
         watchdog = self.profile.watchdog
@@ -323,7 +239,7 @@ class EmulatedModbus:
                 continue
             if not self._holds_trip:
                 words.value = value
-            self._put_value(name, value, "watchdog", due_ns)
+            self._set_terminal(name, value, "watchdog", due_ns)
 
     def _safe_value(self, name: str, steps: tuple[ModbusStep, ...]) -> float | None:
         """Return what the safe-value register holds; None if it was not switched on."""

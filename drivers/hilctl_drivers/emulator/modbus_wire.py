@@ -1,9 +1,8 @@
 """Modbus side of an emulated device: framing and messages of pymodbus.
 
-The only module that imports pymodbus. It is used on this side because the driver has framing of its
-own: a mistake in either then shows. Its server is not used: it loses the second of two requests in
-one segment, and has no way to cut, double or reset what it sends. Its serial client sleeps for
-milliseconds in each transaction.
+The only module that imports pymodbus. The driver has framing of its own, so a mistake in either
+shows. Its server is not used: it loses the second of two requests in one segment, and cannot inject
+faults into replies.
 """
 
 import struct
@@ -15,7 +14,8 @@ from pymodbus.exceptions import ModbusException
 from pymodbus.framer import FramerRTU, FramerSocket
 from pymodbus.pdu import DecodePDU, ExceptionResponse, ModbusPDU
 
-from hilctl_drivers.emulator.modbus_device import EmulatedModbus, RejectedRequest
+from hilctl_drivers.emulator.modbus_device import EmulatedModbus
+from hilctl_drivers.emulator.registers import RejectedRequest
 from hilctl_drivers.emulator.wire import EmulatedReply
 
 LinkKind: TypeAlias = Literal["tcp", "rtu"]
@@ -73,7 +73,7 @@ class FeedbackPdu(ModbusPDU):
 
 
 class _Context:
-    """What pymodbus's messages act on: a device's registers."""
+    """A device's registers for pymodbus's messages."""
 
     def __init__(self, device: EmulatedModbus) -> None:
         self._device = device
@@ -83,12 +83,11 @@ class _Context:
     ) -> list[int] | ExcCodes:
         try:
             if function in {5, 6}:  # read back for the echo
-                return self._device.memory.written(
-                    "coil" if function == 5 else "holding", address, count
-                )
+                area = "coil" if function == 5 else "holding"
+                return self._device.memory.written(area, address, count)
             return self._device.read(_AREAS[function], address, count)
-        except RejectedRequest as declined:
-            return ExcCodes(declined.code)
+        except RejectedRequest as rejected:
+            return ExcCodes(rejected.code)
 
     async def async_setValues(  # noqa: N802  pymodbus calls it by this name
         self, device_id: int, function: int, address: int, values: Sequence[int]
@@ -96,8 +95,8 @@ class _Context:
         area = "coil" if function in {5, 15} else "holding"
         try:
             self._device.write(area, address, [int(value) for value in values])
-        except RejectedRequest as declined:
-            return ExcCodes(declined.code)
+        except RejectedRequest as rejected:
+            return ExcCodes(rejected.code)
         return None
 
 
@@ -112,28 +111,21 @@ def _finish(call: Coroutine[Any, Any, ModbusPDU]) -> ModbusPDU:
 
 
 class ModbusWire:
-    """Requests out of bytes, and replies back into bytes.
+    """Devices behind Modbus TCP or RTU: requests from bytes, and replies to bytes.
 
-    Alone on a connection a device answers to any unit id, as such devices do; on a line, or behind
-    a gateway with others, only to its own.
-
-    Args:
-        kind: ``tcp`` or ``rtu``.
-        devices: What carries requests out: one, or several by unit id.
-        lacking: Functions that the devices are to refuse as unknown, with exception 1.
-        mute: Functions that are never answered, as some devices do with those they do not know.
+    A device alone on a TCP connection answers to any unit id, as such devices do; on a line, or
+    behind a gateway with others, only to its own. It refuses functions in ``lacking`` as unknown,
+    with exception 1, and never answers those in ``mute``, as some devices do.
     """
 
     def __init__(
         self,
         kind: LinkKind,
-        devices: EmulatedModbus | Mapping[int, EmulatedModbus],
+        devices: Mapping[int, EmulatedModbus],
         lacking: frozenset[int] = frozenset(),
         mute: frozenset[int] = frozenset(),
     ) -> None:
         self._kind = kind
-        if isinstance(devices, EmulatedModbus):
-            devices = {devices.profile.unit_id: devices}
         self._devices = dict(devices)
         self._any_unit = kind == "tcp" and len(devices) == 1
         self._decoder = DecodePDU(is_server=True)
@@ -151,9 +143,9 @@ class ModbusWire:
         return next(iter(self._devices.values())) if self._any_unit else self._devices.get(unit)
 
     def requests(self, received: bytearray) -> Iterator[bytes]:
-        """Yield complete requests, with their envelope's ids before them, and take them out.
+        """Yield complete requests after their envelope's ids, and remove them.
 
-        Those that are for nobody here are taken out and not yielded.
+        Requests for other devices are removed and not yielded.
         """
         while received:
             used, unit, transaction, pdu = self._framer.decode(bytes(received))
@@ -164,7 +156,7 @@ class ModbusWire:
                 yield struct.pack(">HB", transaction, unit) + pdu
 
     def answer(self, request: bytes, now_ns: int) -> EmulatedReply | None:
-        """Execute a request of :meth:`requests`; None if it is never answered."""
+        """Execute a request; None if it is never answered."""
         if request[3] in self._mute:
             return None
         return self._answered(self._reply(request, now_ns), request)
@@ -189,15 +181,15 @@ class ModbusWire:
             return ExceptionResponse(function, ExcCodes.ILLEGAL_VALUE)
 
     def refusal(self, request: bytes) -> EmulatedReply:
-        """Return the exception reply of a device that fails to carry a request out."""
+        """Return the exception reply of a device that fails."""
         return self._answered(ExceptionResponse(request[3], ExcCodes.DEVICE_FAILURE), request)
 
     def encode(self, data: bytes) -> bytes:
-        """Return a reply as it is: pymodbus made it with its envelope."""
+        """Return a reply, which has its envelope already."""
         return data
 
     def corrupt_at(self, framed: bytes) -> int:
-        """Return the byte of a reply whose damage no receiver may miss."""
+        """Return the byte of a reply whose damage must be detected."""
         del framed
         return _CORRUPT_AT
 

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, TypeAlias, cast, get_args
 
@@ -11,17 +11,9 @@ from hilctl_drivers.emulator.modbus_wire import LinkKind
 from hilctl_drivers.emulator.rig import SimulatedWiring
 
 FaultKind: TypeAlias = Literal[
-    "silence",
-    "delay",
-    "late",
-    "exception",
-    "corrupt",
-    "cut",
-    "duplicate",
-    "wrong_id",
-    "reset",
+    "silence", "delay", "late", "exception", "corrupt", "cut", "duplicate", "wrong_id", "reset",
     "unplug",
-]
+]  # fmt: skip
 KINDS: tuple[FaultKind, ...] = get_args(FaultKind)
 DELAY_S = 1.0
 
@@ -30,21 +22,16 @@ DELAY_S = 1.0
 class WireFault:
     """One fault.
 
-    Attributes:
-        kind: ``silence`` ignores the request; ``delay`` answers late; ``late`` executes it late,
-            after other requests; ``exception`` refuses it; ``corrupt`` spoils a byte of
-            the reply; ``cut`` leaves out its end; ``duplicate`` sends it twice; ``wrong_id``
-            answers in another's name; ``reset`` breaks the connection instead; ``unplug`` is
-            silence for good, for every connection.
-        at_count: Transaction that has it, counted from 1; or None.
-        at_s: Time since the start; the next transaction has it. Or None.
-        delay_s: How late, for ``delay`` and ``late``.
+    ``silence`` ignores the request; ``delay`` answers late; ``late`` executes it late, after other
+    requests; ``exception`` refuses it; ``corrupt`` changes a byte of the reply; ``cut`` truncates
+    it; ``duplicate`` sends it twice; ``wrong_id`` answers in another's name; ``reset`` breaks the
+    connection; ``unplug`` is permanent silence on every connection.
     """
 
     kind: FaultKind
-    at_count: int | None = None
-    at_s: float | None = None
-    delay_s: float = DELAY_S
+    at_count: int | None = None  # transaction that has it, counted from 1
+    at_s: float | None = None  # time since the start; the next transaction has it
+    delay_s: float = DELAY_S  # of delay and late
 
 
 def parse_fault(text: str) -> WireFault:
@@ -61,35 +48,26 @@ def parse_fault(text: str) -> WireFault:
         raise InputError(f"fault must be one of {', '.join(KINDS)}, got {kind!r}")
     if delay is not None and kind not in {"delay", "late"}:
         raise InputError(f"only delay and late take a time before the @, got {text!r}")
-    late_s = float(delay) if delay else DELAY_S
+    fault = WireFault(cast("FaultKind", kind), delay_s=float(delay or DELAY_S))
     if seconds:
-        return WireFault(cast("FaultKind", kind), at_s=float(at), delay_s=late_s)
+        return replace(fault, at_s=float(at))
     if "." in at or int(at) < 1:
         raise InputError(f"the count after @ must be a whole number from 1, got {text!r}")
-    return WireFault(cast("FaultKind", kind), at_count=int(at), delay_s=late_s)
+    return replace(fault, at_count=int(at))
 
 
 class FaultPlan:
-    """Says of each transaction what goes wrong with it.
-
-    Args:
-        faults: What to do; each happens once, but ``unplug`` stays.
-    """
+    """The faults of each transaction; each happens once."""
 
     def __init__(self, faults: Sequence[WireFault]) -> None:
         self._due = list(faults)
-        self.count = 0
-        """Transactions so far."""
+        self._count = 0
 
     def next(self, elapsed_s: float) -> WireFault | None:
-        """Count a transaction and return its fault, if it has one.
-
-        Args:
-            elapsed_s: Time since the start.
-        """
-        self.count += 1
+        """Count a transaction, ``elapsed_s`` since the start; return its fault, if it has one."""
+        self._count += 1
         for fault in self._due:
-            counted = fault.at_count is not None and self.count >= fault.at_count
+            counted = fault.at_count is not None and self._count >= fault.at_count
             timed = fault.at_s is not None and elapsed_s >= fault.at_s
             if counted or timed:
                 self._due.remove(fault)
@@ -98,13 +76,7 @@ class FaultPlan:
 
 
 def spoil(kind: FaultKind, reply: bytes, corrupt_at: int) -> bytes:
-    """Return a reply with a fault on its bytes; kinds that do not change bytes leave it as it is.
-
-    Args:
-        kind: The fault.
-        reply: The good reply.
-        corrupt_at: Index of the byte that ``corrupt`` changes.
-    """
+    """Return a reply with a fault, ``corrupt`` at the given byte; some kinds change no bytes."""
     if kind == "corrupt":
         return reply[:corrupt_at] + bytes([reply[corrupt_at] ^ 0x10]) + reply[corrupt_at + 1 :]
     if kind == "cut":
@@ -119,51 +91,30 @@ ReaderLine: TypeAlias = Literal["same", "own"]
 
 @dataclass(frozen=True)
 class EmulatorOptions:
-    """What to emulate.
-
-    Attributes:
-        profile: Name of a shipped profile, or path of one.
-        link: ``tcp``, or ``rtu`` on a pty; the profile's own where None. Modbus only.
-        host: Address to listen on.
-        port: TCP port to listen on; 0 takes a free one.
-        log: File for a log of every write, one JSON object a line.
-        faults: What goes wrong.
-        output: Output that drives the rig; the profile's first where None.
-        sensor: Input that shows the displacement; the first that a sensor can be wired to.
-        reader: Profile of the device that has that input, where it is another one.
-        reader_line: Whether it is on the ``same`` line or connection, or has its ``own``; the same
-            for a Modbus RTU device where None, else its own.
-        reader_unit_id: Its unit id; its profile's, or the next on the same line, where None. Modbus
-            only.
-        reader_port: TCP port of its own; 0 takes a free one. Modbus only.
-        lacking: Modbus functions that are refused with exception 1.
-        mute: Modbus functions that are never answered.
-        wiring: Amplifier and sensor; spread over the channels' ranges where None.
-        noise: Whether the sensor has noise.
-        current_a: Current at the start, as if the device's power-up value had been set so; as it is
-            shipped where None. Modbus only.
+    """What to emulate; link, current, functions and the reader's unit and port are for Modbus only.
 
     Raises:
-        InputError: ``link`` or ``reader_line`` is none of these words.
+        InputError: ``link`` or ``reader_line`` is none of its words.
     """
 
-    profile: str
-    link: LinkKind | None = None
-    host: str = "127.0.0.1"
-    port: int = 0
-    log: Path | None = None
+    profile: str  # name of a shipped profile, or path of one
+    link: LinkKind | None = None  # tcp, or rtu on a pty; the profile's own if None
+    host: str = "127.0.0.1"  # address to listen on
+    port: int = 0  # TCP port to listen on; 0 for a free one
+    log: Path | None = None  # file for a log of every write, one JSON object per line
     faults: tuple[WireFault, ...] = ()
-    output: str | None = None
-    sensor: str | None = None
-    reader: str | None = None
+    output: str | None = None  # drives the rig; the profile's first if None
+    sensor: str | None = None  # shows the displacement; the first possible input if None
+    reader: str | None = None  # profile of the device with that input, if it is another one
+    # On the same line or connection, or on its own; if None, Modbus RTU devices share a line.
     reader_line: ReaderLine | None = None
-    reader_unit_id: int | None = None
-    reader_port: int = 0
-    lacking: frozenset[int] = frozenset()
-    mute: frozenset[int] = frozenset()
-    wiring: SimulatedWiring | None = None
+    reader_unit_id: int | None = None  # if None its profile's, or the next on the same line
+    reader_port: int = 0  # TCP port of its own; 0 for a free one
+    lacking: frozenset[int] = frozenset()  # functions that are refused with exception 1
+    mute: frozenset[int] = frozenset()  # functions that are never answered
+    wiring: SimulatedWiring | None = None  # spread over the channels' ranges if None
     noise: bool = True
-    current_a: float | None = None
+    current_a: float | None = None  # initial current, as if it was the power-up value
 
     def __post_init__(self) -> None:
         for name, words in (("link", LinkKind), ("reader_line", ReaderLine)):

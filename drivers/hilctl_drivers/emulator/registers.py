@@ -2,6 +2,7 @@
 
 import struct
 from collections.abc import Sequence
+from typing import TypeAlias
 
 from hilctl_drivers.modbus.modbus_profile import ModbusOutput, ModbusProfile
 from hilctl_drivers.modbus.register_map import (
@@ -12,20 +13,19 @@ from hilctl_drivers.modbus.register_map import (
     RegisterStep,
 )
 
-Key = tuple[str, int]
-"""Area and wire address."""
+_NO_SUCH_ADDRESS = 2
 
 
-class NoSuchRegister(LookupError):  # noqa: N818  a condition of the protocol, not a mistake
-    """The device has nothing at this address."""
+class RejectedRequest(Exception):  # noqa: N818  a reply, not a mistake
+    """The device refuses a request with a Modbus exception ``code``."""
+
+    def __init__(self, code: int) -> None:
+        super().__init__(f"exception {code}")
+        self.code = code
 
 
 class Words:
-    """The words of one value, shared by all addresses that show it.
-
-    Args:
-        register: How the value is written.
-    """
+    """The words of one value, shared by all addresses that show it."""
 
     def __init__(self, register: Register) -> None:
         self.register = register
@@ -55,28 +55,22 @@ class Words:
         self.words[:] = self.encoded(value)
 
 
+_Map: TypeAlias = dict[tuple[str, int], tuple[Words, int]]
+"""From area and wire address to a value and the index of its word there."""
+
+
 class RegisterBank:
     """Addresses in two maps, because couplers read at one address what they do not write there."""
 
     def __init__(self) -> None:
-        self._readable: dict[Key, tuple[Words, int]] = {}
-        self._writable: dict[Key, tuple[Words, int]] = {}
+        self._readable: _Map = {}
+        self._writable: _Map = {}
 
     def place(
         self, words: Words, area: str, address: int, *, read: bool = True, write: bool = True
     ) -> Words:
-        """Put a value at an address, unless there is one; return what stands there.
-
-        Args:
-            words: The value.
-            area: coil, discrete, input or holding.
-            address: EmulatedWire address of its first word.
-            read: Whether it can be read there.
-            write: Whether it can be written there.
-        """
-        maps = [
-            each for each, wanted in ((self._readable, read), (self._writable, write)) if wanted
-        ]
+        """Put a value at a wire address, unless there is one already; return the value there."""
+        maps = [self._readable] * read + [self._writable] * write
         there = next((each[area, address] for each in maps if (area, address) in each), None)
         found = words if there is None else there[0]
         for each in maps:
@@ -85,59 +79,48 @@ class RegisterBank:
         return found
 
     def read(self, areas: Sequence[str], address: int, count: int) -> list[int]:
-        """Return words as they are read, each from the first area that has it.
-
-        Raises:
-            NoSuchRegister: None of them has.
-        """
-        return self._values(self._readable, areas, address, count)
+        """Return words as they are read, each from the first area that has it."""
+        found = (_find(self._readable, areas, address + k) for k in range(count))
+        return [words.words[k] for words, k in found]
 
     def written(self, area: str, address: int, count: int) -> list[int]:
         """Return words as they were last written."""
-        return self._values(self._writable, [area], address, count)
+        found = (_find(self._writable, [area], address + k) for k in range(count))
+        return [words.words[k] for words, k in found]
 
     def targets(
         self, area: str, address: int, values: Sequence[int]
     ) -> list[tuple[Words, list[int]]]:
-        """Return which values a write would change, and to which words.
-
-        Raises:
-            NoSuchRegister: An address is not there, or only a part of a value would be written.
-        """
+        """Return which values a write would change, and to which words; no part of a value."""
         found: list[tuple[Words, list[int]]] = []
         position = 0
         while position < len(values):
-            words, k = self._find(self._writable, [area], address + position)
+            words, k = _find(self._writable, [area], address + position)
             size = len(words.words)
             if k or position + size > len(values):
-                raise NoSuchRegister
+                raise RejectedRequest(_NO_SUCH_ADDRESS)
             found.append((words, list(values[position : position + size])))
             position += size
         return found
 
-    def _values(
-        self, where: dict[Key, tuple[Words, int]], areas: Sequence[str], address: int, count: int
-    ) -> list[int]:
-        found = (self._find(where, areas, address + k) for k in range(count))
-        return [words.words[k] for words, k in found]
 
-    @staticmethod
-    def _find(
-        where: dict[Key, tuple[Words, int]], areas: Sequence[str], address: int
-    ) -> tuple[Words, int]:
-        for area in areas:
-            if (area, address) in where:
-                return where[area, address]
-        raise NoSuchRegister
+def _find(places: _Map, areas: Sequence[str], address: int) -> tuple[Words, int]:
+    for area in areas:
+        if (area, address) in places:
+            return places[area, address]
+    raise RejectedRequest(_NO_SUCH_ADDRESS)
 
 
 class RegisterMap:
     """All registers that a profile names: channels, settings, watchdog and self-test.
 
-    What a profile expects to find is there from the start.
+    Values that the profile expects are there from the start.
 
-    Args:
-        profile: What the device is.
+    Attributes:
+        memory: The registers.
+        outputs: Value of each output.
+        inputs: Value of each input.
+        steps: Value of each step and of the trip flag, by its ``id``.
     """
 
     def __init__(self, profile: ModbusProfile) -> None:
@@ -148,7 +131,6 @@ class RegisterMap:
             name: self._place(each, read=True, write=False) for name, each in profile.inputs.items()
         }
         self.steps: dict[int, Words] = {}
-        """Value that a step, or the trip flag, stands for; by ``id``."""
         self._place_rest()
 
     def _areas(self, register: Register) -> tuple[str, ...]:

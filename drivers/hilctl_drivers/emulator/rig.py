@@ -1,41 +1,40 @@
 """The rig of an emulated device: in real time or by a sample clock, wiring, watchdog, and log."""
 
 import json
-from collections import deque
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import IO, Any, TypeAlias
+from typing import IO, Any, TypeAlias, TypeVar
 
 import numpy as np
 
 from hilctl.base.errors import InputError
 from hilctl.base.files import reason
 from hilctl.base.types import F64
-from hilctl_drivers.profile_base import Range
+from hilctl_drivers.profile_base import BaseProfile, Range
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 
 RATE_HZ = 10_000.0
 SETTLED_S = 1.0  # the slowest part of the rig has a time constant of 0.1 ms
 _CHUNK = 1000
+Numbers = TypeVar("Numbers", float, F64)
+
+
+def _rated(*, noise: bool) -> TerfenolParameters:
+    rated = TerfenolParameters()
+    return rated if noise else replace(rated, sensor_noise_um=0.0)
 
 
 class Rig:
-    """The actuator with its amplifier and sensor, in real time.
+    """The actuator with its amplifier and sensor, in real time, from rest at 0 A at ``now_ns``.
 
-    Whoever asks gives the time. The rig has then held its output since the last change, and its
+    The caller gives the time. The rig has then held its output since the last change, and its
     sensor shows the last sample of its own clock: readings are one to two of its periods old.
-
-    Args:
-        now_ns: Time at which it stands still and at 0 A.
-        noise: Whether the sensor has noise.
-        seed: Seed of that noise.
     """
 
-    def __init__(self, now_ns: int, *, noise: bool = True, seed: int = 1) -> None:
-        rated = TerfenolParameters()
-        parameters = rated if noise else replace(rated, sensor_noise_um=0.0)
-        self._plant = TerfenolActuator(parameters, RATE_HZ, seed=seed)
+    def __init__(self, now_ns: int, *, noise: bool = True) -> None:
+        self._plant = TerfenolActuator(_rated(noise=noise), RATE_HZ)
         self._held = np.zeros(_CHUNK)
         self._read = np.zeros((2, _CHUNK))
         self._origin_ns = now_ns
@@ -54,12 +53,7 @@ class Rig:
             self._step(min(_CHUNK, due - self._samples))
 
     def put_out(self, current_a: float, now_ns: int) -> None:
-        """Change the output, after :meth:`advance`.
-
-        Args:
-            current_a: What the amplifier is asked for; beyond its range it gives what it can.
-            now_ns: When.
-        """
+        """Change the output; the amplifier saturates at its range."""
         self.advance(now_ns)
         limit_a = TerfenolParameters().dac_range_a
         self.current_a = min(max(current_a, -limit_a), limit_a)
@@ -73,23 +67,20 @@ class Rig:
 
 @dataclass(frozen=True, slots=True)
 class SimulatedWiring:
-    """Amplifier and sensor between the device's terminals and the rig.
+    """Amplifier and sensor between the device's terminals and the rig."""
 
-    Attributes:
-        gain_a: Amplifier, A for one unit of the output.
-        offset_a: Current at 0 of the output.
-        sensor_um: Sensor, um for one unit of the input.
-        offset_um: Displacement at 0 of the input.
-    """
+    gain_a: float  # per unit of the output
+    offset_a: float  # at 0 of the output
+    sensor_um: float  # per unit of the input
+    offset_um: float  # at 0 of the input
 
-    gain_a: float
-    offset_a: float
-    sensor_um: float
-    offset_um: float
-
-    def current_a(self, value: float) -> float:
+    def current_a(self, value: Numbers) -> Numbers:
         """Return the coil current for an output value."""
-        return self.gain_a * value + self.offset_a
+        return value * self.gain_a + self.offset_a
+
+    def output(self, current_a: float) -> float:
+        """Return the output value for a coil current."""
+        return (current_a - self.offset_a) / self.gain_a
 
     def at_terminal(self, displacement_um: F64 | float, channel: Range) -> F64:
         """Return the sensor's signal, clipped to the input's range as by an ADC."""
@@ -104,10 +95,8 @@ class SimulatedWiring:
         An output in A drives the coil itself.
         """
         rig = TerfenolParameters()
-        gain_a, offset_a = _spread(output, rig.dac_range_a)
-        if output.unit == "A":
-            gain_a, offset_a = 1.0, 0.0
-        return cls(gain_a, offset_a, *_spread(sensor, rig.sensor_range_um))
+        amplifier = (1.0, 0.0) if output.unit == "A" else _spread(output, rig.dac_range_a)
+        return cls(*amplifier, *_spread(sensor, rig.sensor_range_um))
 
 
 def _spread(channel: Range, reach: float) -> tuple[float, float]:
@@ -141,11 +130,11 @@ _BEGIN = b'{"event": '
 
 
 class WriteLog:
-    """One JSON object a line, on disk as soon as it happened.
+    """One JSON object per line, on disk immediately; an older log is replaced.
 
     Args:
-        path: File to write; an older log is replaced. None keeps no log.
-        unix_offset_ns: What to add to the monotonic clock to get Unix time.
+        path: File to write; None for no log.
+        unix_offset_ns: Unix time less the monotonic clock.
 
     Raises:
         InputError: The file cannot be written.
@@ -165,13 +154,7 @@ class WriteLog:
                 raise InputError(f"{path}: can't be written: {reason(error)}") from None
 
     def event(self, now_ns: int, event: str, **more: Any) -> None:
-        """Write one line.
-
-        Args:
-            now_ns: Monotonic time.
-            event: What happened.
-            more: Plain values.
-        """
+        """Write one line; ``now_ns`` is monotonic time, ``more`` are plain values."""
         if self._file is None:
             return
         unix_s = (now_ns + self._offset_ns) * 1e-9
@@ -185,6 +168,71 @@ class WriteLog:
             self._file = None
 
 
+@dataclass(frozen=True, slots=True)
+class Bench:
+    """A rig, the wiring to it, and the log of what is output; devices may share it."""
+
+    rig: Rig
+    wiring: SimulatedWiring
+    log: WriteLog
+
+
+class EmulatedDevice(ABC):
+    """A device on a bench: its time, its watchdog timer, and its outputs.
+
+    ``output`` is the one that drives the rig, None if another device does.
+    """
+
+    profile: BaseProfile
+
+    def __init__(self, profile: BaseProfile, bench: Bench, output: str | None) -> None:
+        self.profile = profile
+        self.wiring, self._rig, self._log = bench.wiring, bench.rig, bench.log
+        self._output = output
+        self._timer = WatchdogTimer()
+        self._now_ns = 0
+
+    @property
+    def tripped(self) -> bool:
+        """Whether the host watchdog has tripped."""
+        return self._timer.tripped
+
+    def tick(self, now_ns: int) -> None:
+        """Advance the time; the watchdog may trip on the way."""
+        due_ns = self._timer.trip(now_ns)
+        if due_ns is not None:
+            self._trip(due_ns)
+        self._now_ns = max(self._now_ns, now_ns)
+        self._advance()
+
+    @abstractmethod
+    def _trip(self, due_ns: int) -> None:
+        """Do what the watchdog does to the outputs."""
+
+    def _advance(self) -> None:
+        self._rig.advance(self._now_ns)
+
+    def _set_terminal(self, name: str, value: float, event: str, now_ns: int) -> None:
+        """Log an output's new value, and drive the rig if it is wired to it."""
+        more: dict[str, float] = {}
+        if name == self._output:
+            self._rig.put_out(self.wiring.current_a(value), now_ns)
+            more["current_a"] = self._rig.current_a
+        unit = self.profile.outputs[name].unit
+        self._log.event(now_ns, event, output=name, value=value, unit=unit, **more)
+
+    def _log_played(self, first: int, current_a: F64, now_ns: int) -> float:
+        """Log a block that a FIFO has output; return its last value in the output's unit."""
+        assert self._output is not None
+        last_a = float(current_a[-1])
+        value, unit = self.wiring.output(last_a), self.profile.outputs[self._output].unit
+        self._log.event(
+            now_ns, "played", output=self._output, first=first, samples=current_a.size,
+            value=value, unit=unit, current_a=last_a,
+        )  # fmt: skip
+        return value
+
+
 _SETTLED_S = 0.1
 
 Played: TypeAlias = Callable[[int, F64, F64, int], None]
@@ -196,33 +244,29 @@ class SampleFifo:
 
     Args:
         noise: Whether the sensor has noise.
-        repeats: Whether a period that finds nothing queued counts as one that put the last value
-            out again, with a reading. Else the output is held, and nothing is read.
-        on_played: Called with each stretch that was output.
+        repeats: Whether the last value is output again, with a reading, in a period that finds
+            nothing queued. Otherwise the output is held, and nothing is read.
+        on_played: Called with each block that was output.
     """
 
     def __init__(self, *, noise: bool, repeats: bool, on_played: Played) -> None:
-        rated = TerfenolParameters()
-        self._parameters = rated if noise else replace(rated, sensor_noise_um=0.0)
+        self._parameters = _rated(noise=noise)
         self._repeats = repeats
         self._on_played = on_played
         self._plant: TerfenolActuator | None = None
         self._plant_rate_hz = 0.0
         self._rate_hz = 0.0
         self._start_ns: int | None = None
-        self._queue: deque[F64] = deque()
+        self._queued = np.empty(0)
         self._periods = 0
         self.current_a = 0.0
-        self.level = 0
-        """Values that are queued."""
-        self.played = 0
-        """Values put out since the rate was set."""
-        self.underruns = 0
-        """Periods since then that found nothing queued."""
+        self.level = 0  # values that are queued
+        self.played = 0  # values output since the rate was set
+        self.underruns = 0  # periods since then that found nothing queued
 
     @property
     def running(self) -> bool:
-        """Whether a rate is set; it may not have been started yet."""
+        """Whether a rate is set, started or not."""
         return self._rate_hz > 0.0
 
     @property
@@ -231,7 +275,7 @@ class SampleFifo:
         return self._start_ns is not None
 
     def set_rate(self, rate_hz: float) -> None:
-        """Count from 0, at another rate; :meth:`start` begins. What is queued stays."""
+        """Stop, and count from 0 at another rate after :meth:`start`; queued values stay."""
         if self._plant is None or self._plant_rate_hz != rate_hz:
             self._plant = TerfenolActuator(self._parameters, rate_hz)
             self._plant_rate_hz = rate_hz
@@ -252,12 +296,12 @@ class SampleFifo:
 
     def clear(self) -> None:
         """Forget what is queued."""
-        self._queue.clear()
+        self._queued = np.empty(0)
         self.level = 0
 
     def queue(self, current_a: F64) -> None:
         """Queue float64[n], in A."""
-        self._queue.append(current_a)
+        self._queued = np.concatenate([self._queued, current_a])
         self.level += current_a.size
 
     def due_ns(self, values: int) -> int | None:
@@ -274,7 +318,8 @@ class SampleFifo:
         if due <= 0:
             return
         self._periods += due
-        values = self._next(due)
+        values, self._queued = np.split(self._queued, [due])
+        self.level -= values.size
         missed = due - values.size
         self.underruns += missed
         played = due if self._repeats else values.size
@@ -286,16 +331,3 @@ class SampleFifo:
         if played:
             self._on_played(self.played, command[:played], displacement_um[:played], now_ns)
             self.played += played
-
-    def _next(self, count: int) -> F64:
-        """Take at most ``count`` values from the queue."""
-        parts, wanted = [np.empty(0)], count
-        while wanted and self._queue:
-            block = self._queue.popleft()
-            if block.size > wanted:
-                self._queue.appendleft(block[wanted:])
-                block = block[:wanted]
-            parts.append(block)
-            wanted -= block.size
-        self.level -= count - wanted
-        return np.concatenate(parts)

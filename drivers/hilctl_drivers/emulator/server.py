@@ -15,6 +15,8 @@ import tty
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import partial
+from typing import NamedTuple
 
 from hilctl.base.errors import InputError
 from hilctl.base.files import ADDRESS_REMEDIES, reason
@@ -24,91 +26,65 @@ from hilctl_drivers.emulator.wire import EmulatedReply, EmulatedWire
 _CHUNK = 65536
 
 
-class Connection(ABC):
-    """A host's way to a wire.
+class _Connection(ABC):
+    """A host's connection to a wire."""
 
-    Args:
-        wire: What it asks.
-        faulty: Whether the server's faults happen here.
-    """
-
-    def __init__(self, wire: EmulatedWire, *, faulty: bool) -> None:
+    def __init__(self, wire: EmulatedWire, *, faulty: bool = True) -> None:
         self.wire = wire
-        self.faulty = faulty
-        self.received = bytearray()
-        """What has come and is not a complete request yet."""
+        self.faulty = faulty  # whether the server's faults happen here
+        self.received = bytearray()  # no complete request yet
         self.received_ns = 0
-        """When the last of it came."""
-        self.unsent = bytearray()
-        """What waits for room, as in a USB device's buffer."""
+        self.unsent = bytearray()  # waits for room, as in a USB device's buffer
 
     @abstractmethod
     def fileno(self) -> int:
-        """What to wait for."""
+        """Descriptor to wait for."""
 
     @abstractmethod
     def read(self) -> bytes | None:
-        """Return what came; None if the host has gone."""
+        """Return the received bytes; None if the host has closed the connection."""
 
     @abstractmethod
     def send(self, data: bytes) -> None:
-        """Send, as far as there is room; the rest with the next call."""
+        """Send as much as there is room for; the rest with the next call."""
 
-    @abstractmethod
-    def unplug(self) -> None:
-        """Fall silent for good; to be closed all the same."""
+    def unplug(self) -> None:  # noqa: B027  a pulled network cable closes nothing
+        """Be silent for good; :meth:`close` is still called."""
 
     @abstractmethod
     def close(self, *, reset: bool = False) -> None:
-        """Hang up, or break the connection."""
+        """Close the connection, or break it."""
 
 
-class TcpConnection(Connection):
-    """A connection over TCP.
-
-    Args:
-        connection: Accepted.
-        wire: What it asks.
-    """
+class _TcpConnection(_Connection):
+    """An accepted connection."""
 
     def __init__(self, connection: socket.socket, wire: EmulatedWire) -> None:
-        super().__init__(wire, faulty=True)
+        super().__init__(wire)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._connection = connection
 
     def fileno(self) -> int:
-        """See :meth:`Connection.fileno`."""
         return self._connection.fileno()
 
     def read(self) -> bytes | None:
-        """See :meth:`Connection.read`."""
         with suppress(OSError):  # a host that died is as good as one that hung up
             return self._connection.recv(_CHUNK) or None
         return None
 
     def send(self, data: bytes) -> None:
-        """See :meth:`Connection.send`."""
         with suppress(OSError):
             self._connection.sendall(data)
 
-    def unplug(self) -> None:
-        """See :meth:`Connection.unplug`; a pulled network cable closes no connection."""
-
     def close(self, *, reset: bool = False) -> None:
-        """See :meth:`Connection.close`."""
         if reset:
             linger = struct.pack("ii", 1, 0)
             self._connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, linger)
         self._connection.close()
 
 
-class PtyConnection(Connection):
-    """Connection to the program at the other end of a pty.
-
-    Args:
-        wire: What it asks.
-        faulty: Whether the server's faults happen here.
-    """
+class _PtyConnection(_Connection):
+    """Connection to the program at the other end of a pty; there is nothing to reset."""
 
     def __init__(self, wire: EmulatedWire, *, faulty: bool) -> None:
         super().__init__(wire, faulty=faulty)
@@ -119,34 +95,37 @@ class PtyConnection(Connection):
         self.name = os.ttyname(self._slave)
 
     def fileno(self) -> int:
-        """See :meth:`Connection.fileno`."""
         return self._master
 
     def read(self) -> bytes | None:
-        """See :meth:`Connection.read`."""
         with suppress(BlockingIOError):
             return os.read(self._master, _CHUNK)
         return b""
 
     def send(self, data: bytes) -> None:
-        """See :meth:`Connection.send`."""
         self.unsent += data
         with suppress(BlockingIOError):
             while self.unsent:
                 del self.unsent[: os.write(self._master, self.unsent)]
 
     def unplug(self) -> None:
-        """See :meth:`Connection.unplug`; a pulled adapter takes its port along."""
-        os.close(self._master)
+        os.close(self._master)  # a pulled adapter takes its port along
         self._master = -1
 
     def close(self, *, reset: bool = False) -> None:
-        """See :meth:`Connection.close`; a pty has nothing to break."""
-        del reset
         if self._master >= 0:
             os.close(self._master)
         # Last: until then no other pty gets its name, which a host may still be trying.
         os.close(self._slave)
+
+
+class _Scheduled(NamedTuple):
+    """An action and its time; the next request on ``superseded_by`` cancels it."""
+
+    due_ns: int
+    number: int
+    action: Callable[[int], None]
+    superseded_by: _Connection | None
 
 
 _TICK_S = 0.005
@@ -154,12 +133,7 @@ _STALE_NS = 1_000_000_000  # a busy machine may pass on in parts what was writte
 
 
 class EmulatorServer:
-    """Answers requests until it is stopped.
-
-    Args:
-        faults: What goes wrong.
-        clock_ns: Monotonic time.
-    """
+    """Answers requests until it is stopped."""
 
     def __init__(
         self, faults: Sequence[WireFault] = (), clock_ns: Callable[[], int] = time.monotonic_ns
@@ -170,18 +144,17 @@ class EmulatorServer:
         self._selector = selectors.DefaultSelector()
         self._wires: list[EmulatedWire] = []
         self._listeners: dict[socket.socket, EmulatedWire] = {}
-        self._connections: list[Connection] = []
-        self._unplugged: list[Connection | socket.socket] = []
-        self._late: list[tuple[int, int, Connection, EmulatedReply, WireFault | None]] = []
-        self._undone: list[tuple[int, int, Connection, bytes]] = []
+        self._connections: list[_Connection] = []
+        self._unplugged: list[_Connection | socket.socket] = []
+        self._scheduled: list[_Scheduled] = []
         self._count = 0
         self._stopping = False
 
     def listen_tcp(self, wire: EmulatedWire, host: str, port: int) -> str:
-        """Listen; return ``host:port``, which is a free one where port 0 is asked for.
+        """Listen, at a free port if 0 is asked for; return ``host:port``.
 
         Raises:
-            InputError: The port is in use or not ours to have.
+            InputError: The port is in use or not permitted.
         """
         try:
             listener = socket.create_server((host, port))
@@ -195,7 +168,7 @@ class EmulatorServer:
 
     def open_pty(self, wire: EmulatedWire, *, faulty: bool = True) -> str:
         """Open a pty and return the device file of its other end."""
-        connection = PtyConnection(wire, faulty=faulty)
+        connection = _PtyConnection(wire, faulty=faulty)
         self._wires.append(wire)
         self._add(connection)
         return connection.name
@@ -208,8 +181,8 @@ class EmulatorServer:
             now_ns = self._clock_ns()
             for wire in self._wires:
                 wire.tick(now_ns)
-            self._carry_out_due(now_ns)
-            self._send_due(now_ns)
+            while self._scheduled and self._scheduled[0].due_ns <= now_ns:
+                heapq.heappop(self._scheduled).action(now_ns)
         self.close()
 
     def stop(self) -> None:
@@ -226,33 +199,32 @@ class EmulatorServer:
         self._selector.close()
 
     def _pause_s(self) -> float:
-        due_ns = [each[0][0] for each in (self._late, self._undone) if each]
-        if not due_ns:
+        if not self._scheduled:
             return _TICK_S
-        return min(_TICK_S, max(0.0, (min(due_ns) - self._clock_ns()) * 1e-9))
+        return min(_TICK_S, max(0.0, (self._scheduled[0].due_ns - self._clock_ns()) * 1e-9))
 
     def _serve(self, source: object, events: int) -> None:
         if source in self._listeners:
             assert isinstance(source, socket.socket)
-            self._add(TcpConnection(source.accept()[0], self._listeners[source]))
+            self._add(_TcpConnection(source.accept()[0], self._listeners[source]))
         elif source in self._connections:  # otherwise it was closed since
-            assert isinstance(source, Connection)
+            assert isinstance(source, _Connection)
             if events & selectors.EVENT_WRITE:
                 self._selector.modify(source, selectors.EVENT_READ)
                 self._send(source, b"")
             if events & selectors.EVENT_READ:
                 self._receive(source)
 
-    def _add(self, connection: Connection) -> None:
+    def _add(self, connection: _Connection) -> None:
         self._connections.append(connection)
         self._selector.register(connection, selectors.EVENT_READ)
 
-    def _drop(self, connection: Connection, *, reset: bool = False) -> None:
+    def _drop(self, connection: _Connection, *, reset: bool = False) -> None:
         self._connections.remove(connection)
         self._selector.unregister(connection)
         connection.close(reset=reset)
 
-    def _receive(self, connection: Connection) -> None:
+    def _receive(self, connection: _Connection) -> None:
         data = connection.read()
         if data is None:
             self._drop(connection)
@@ -267,35 +239,45 @@ class EmulatorServer:
             if connection not in self._connections:
                 return
 
-    def _answer(self, connection: Connection, request: bytes) -> None:
+    def _schedule(
+        self, due_ns: int, action: Callable[[int], None], superseded_by: _Connection | None = None
+    ) -> None:
+        self._count += 1
+        heapq.heappush(self._scheduled, _Scheduled(due_ns, self._count, action, superseded_by))
+
+    def _answer(self, connection: _Connection, request: bytes) -> None:
         now_ns = self._clock_ns()
-        if self._late:
-            # A new request means that the host has given up on answers that are still to come.
-            self._late = [each for each in self._late if each[2] is not connection or each[4]]
-            heapq.heapify(self._late)
+        # A new request means that the host has given up on answers that are still to come.
+        self._scheduled = [e for e in self._scheduled if e.superseded_by is not connection]
+        heapq.heapify(self._scheduled)
         fault = None
         if connection.faulty:
             fault = self._plan.next((now_ns - self._start_ns) * 1e-9)
         if fault is not None and fault.kind in {"silence", "unplug", "reset", "exception", "late"}:
             self._keep_back(fault, connection, request)
-            return
+        else:
+            self._execute(connection, request, fault, now_ns)
+
+    def _execute(
+        self, connection: _Connection, request: bytes, fault: WireFault | None, now_ns: int
+    ) -> None:
+        """Execute a request, though its host may have gone; reply now or when it is due."""
         answer = connection.wire.answer(request, now_ns)
         if answer is None:
             return
         delay_ns = round(fault.delay_s * 1e9) if fault is not None and fault.kind == "delay" else 0
         due_ns = max(answer.due_ns, now_ns) + delay_ns
+        reply = partial(self._reply, connection, answer, fault)
         if due_ns > now_ns:
-            self._count += 1
-            heapq.heappush(self._late, (due_ns, self._count, connection, answer, fault))
+            self._schedule(due_ns, reply, connection if fault is None else None)
         else:
-            self._reply(connection, answer, fault, now_ns)
+            reply(now_ns)
 
-    def _keep_back(self, fault: WireFault, connection: Connection, request: bytes) -> None:
-        """Do what a fault says that keeps the request from the device, for good or for now."""
+    def _keep_back(self, fault: WireFault, connection: _Connection, request: bytes) -> None:
+        """Keep the request from the device, for good or until later."""
         if fault.kind == "late":
-            self._count += 1
             due_ns = self._clock_ns() + round(fault.delay_s * 1e9)
-            heapq.heappush(self._undone, (due_ns, self._count, connection, request))
+            self._schedule(due_ns, partial(self._execute, connection, request, None))
         elif fault.kind == "unplug":
             self._unplug()
         elif fault.kind == "reset":
@@ -317,23 +299,11 @@ class EmulatorServer:
         self._unplugged += self._listeners
         self._listeners.clear()
 
-    def _carry_out_due(self, now_ns: int) -> None:
-        """Execute what was put off, though its host may have gone since."""
-        while self._undone and self._undone[0][0] <= now_ns:
-            _, _, connection, request = heapq.heappop(self._undone)
-            answer = connection.wire.answer(request, now_ns)
-            if answer is not None and connection in self._connections:
-                self._reply(connection, answer, None, now_ns)
-
-    def _send_due(self, now_ns: int) -> None:
-        while self._late and self._late[0][0] <= now_ns:
-            _, _, connection, answer, fault = heapq.heappop(self._late)
-            if connection in self._connections:
-                self._reply(connection, answer, fault, now_ns)
-
     def _reply(
-        self, connection: Connection, answer: EmulatedReply, fault: WireFault | None, now_ns: int
+        self, connection: _Connection, answer: EmulatedReply, fault: WireFault | None, now_ns: int
     ) -> None:
+        if connection not in self._connections:
+            return
         data = answer.make(now_ns) if answer.make is not None else answer.data
         if data is None:
             return
@@ -344,7 +314,7 @@ class EmulatorServer:
             framed = spoil(fault.kind, framed, connection.wire.corrupt_at(framed))
         self._send(connection, framed)
 
-    def _send(self, connection: Connection, data: bytes) -> None:
+    def _send(self, connection: _Connection, data: bytes) -> None:
         connection.send(data)
         if connection.unsent:
             self._selector.modify(connection, selectors.EVENT_READ | selectors.EVENT_WRITE)

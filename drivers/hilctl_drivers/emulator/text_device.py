@@ -12,7 +12,7 @@ from hilctl_drivers.ascii.ascii_profile import (
     Reply,
     SendStep,
 )
-from hilctl_drivers.emulator.rig import Rig, SimulatedWiring, WatchdogTimer, WriteLog
+from hilctl_drivers.emulator.rig import Bench, EmulatedDevice
 from hilctl_drivers.emulator.wire import EmulatedReply
 
 _NUMBER = r"[-+]?[0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?"
@@ -22,12 +22,7 @@ _REFUSED = '-200,"Execution error"'
 
 
 class TemplateMatcher:
-    """A template as the device that receives it.
-
-    Args:
-        text: The template.
-        address: The device's address.
-    """
+    """Reads the fields of lines that were made with a template, sent to ``address``."""
 
     def __init__(self, text: str, address: int) -> None:
         self._bases: dict[str, int] = {}
@@ -70,115 +65,70 @@ def in_style(example: str, pattern: str, value: float) -> str:
     return example[:start] + number + example[stop:]
 
 
-class EmulatedText:
-    """The device.
+class EmulatedText(EmulatedDevice):
+    """The device; ``sensor`` is the input that shows the displacement, None for none."""
 
-    Args:
-        profile: What it is.
-        rig: What it drives, or what its sensor stands on.
-        log: Where what it outputs goes.
-        wiring: Amplifier and sensor between.
-        output: Output that drives the rig; None if another device does.
-        sensor: Input that shows the displacement; None if another device does.
-        address: Its address.
-    """
+    profile: AsciiProfile
 
     def __init__(
-        self,
-        profile: AsciiProfile,
-        rig: Rig,
-        log: WriteLog,
-        wiring: SimulatedWiring,
-        *,
-        output: str | None,
-        sensor: str | None,
-        address: int,
+        self, profile: AsciiProfile, bench: Bench, output: str | None, sensor: str | None
     ) -> None:
-        self._profile = profile
-        self._rig = rig
-        self._log = log
-        self._wiring = wiring
-        self._output, self._sensor = output, sensor
-        self._address = address
+        super().__init__(profile, bench, output)
+        self._sensor = sensor
+        self._address = profile.unit
         # The power-up value is 0 at the terminal, not at the coil.
         self._values = {
             name: min(max(0.0, each.min), each.max) for name, each in profile.outputs.items()
         }
         self._commands = dict(self._values)
-        rest = -wiring.offset_a / wiring.gain_a
+        rest = self.wiring.output(0.0)
         self._safe = {
             name: min(max(rest if name == output else 0.0, each.min), each.max)
             for name, each in profile.outputs.items()
         }
         if output is not None:
-            rig.put_out(wiring.current_a(self._values[output]), 0)
+            self._rig.put_out(self.wiring.current_a(self._values[output]), 0)
         self._errors: list[str] = []
-        self._timer = WatchdogTimer()
-        self._now_ns = 0
-
-    @property
-    def tripped(self) -> bool:
-        """Whether the host watchdog has tripped."""
-        return self._timer.tripped
-
-    def tick(self, now_ns: int) -> None:
-        """Advance the time; the watchdog may trip on the way."""
-        due_ns = self._timer.trip(now_ns)
-        if due_ns is not None:
-            self._trip(due_ns)
-        self._now_ns = max(self._now_ns, now_ns)
-        self._rig.advance(self._now_ns)
 
     def answer(self, message: bytes, now_ns: int) -> EmulatedReply | None:
         """Execute a line; None if it is for another address."""
         self.tick(now_ns)
         text = message.decode("ascii", "replace")
-        watchdog = self._profile.watchdog
+        watchdog = self.profile.watchdog
         if watchdog != "none" and watchdog.kick == "any":
             self._timer.fed_ns = self._now_ns
         for part in (self._outputs, self._inputs, self._watchdog, self._questions, self._steps):
             found = part(text)
             if found is not None:
-                return self._reply(found)
-        if self._is_for_another(text):
-            return None
-        return self._unknown()
+                return EmulatedReply(found.encode() or None)
+        return None if self._is_for_another(text) else self._rejection(_UNDEFINED)
 
-    def refusal(self, message: bytes) -> EmulatedReply | None:
-        """Return an answer that says no."""
+    def refusal(self, message: bytes) -> EmulatedReply:
+        """Return an answer that refuses the message."""
         del message
-        if self._profile.errors:
-            return self._reply(self._profile.errors[-1].example)
-        self._errors.append(_REFUSED)
+        return self._rejection(_REFUSED)
+
+    def _rejection(self, error: str) -> EmulatedReply:
+        """Return the profile's last error reply; without one, keep the error to be asked for."""
+        if self.profile.errors:
+            return EmulatedReply(self.profile.errors[-1].example.encode() or None)
+        self._errors.append(error)
         return EmulatedReply(None)
 
     def wrong_id(self, reply: bytes) -> bytes:
-        """Return a reply in another's name; where none is in it, one to something else."""
+        """Return a reply from another address, or to another question if it has no address."""
         own = f"{self._address:02X}".encode()
         if len(reply) >= 3 and reply[1:3] == own:
             return reply[:1] + f"{self._address ^ 3:02X}".encode() + reply[3:]
         return b"ANOTHER," + reply
 
-    def _reply(self, text: str) -> EmulatedReply:
-        """Return a reply; an example's address becomes our own."""
-        shipped = self._profile.address
-        if isinstance(shipped, int) and text[:1] in {"!", "?"} and text[1:3] == f"{shipped:02X}":
-            text = f"{text[:1]}{self._address:02X}{text[3:]}"
-        return EmulatedReply(text.encode() if text else None)
-
     def _is_for_another(self, text: str) -> bool:
-        if self._profile.address == "none" or not re.match(r"[#$~%@][0-9A-F]{2}", text):
+        if self.profile.address == "none" or not re.match(r"[#$~%@][0-9A-F]{2}", text):
             return False
         return text[1:3] != f"{self._address:02X}"
 
-    def _unknown(self) -> EmulatedReply:
-        if self._profile.errors:
-            return self._reply(self._profile.errors[-1].example)
-        self._errors.append(_UNDEFINED)
-        return EmulatedReply(None)
-
     def _outputs(self, text: str) -> str | None:
-        for name, output in self._profile.outputs.items():
+        for name, output in self.profile.outputs.items():
             fields = TemplateMatcher(output.write, self._address).match(text)
             if fields is not None:
                 reply = "" if output.reply == "none" else output.reply.example
@@ -187,26 +137,26 @@ class EmulatedText:
             if readback != "none" and self._matches(readback.ask, text):
                 said = self._values if readback.of == "output" else self._commands
                 return in_style(readback.example, readback.pattern, said[name])
-        combined = self._profile.exchange
+        combined = self.profile.exchange
         if combined == "none":
             return None
         fields = TemplateMatcher(combined.write, self._address).match(text)
         if fields is None:
             return None
-        source = self._profile.inputs[combined.input]
+        source = self.profile.inputs[combined.input]
         reading = self._reading(combined.input, source)
         reply = in_style(combined.example, combined.pattern, reading)
         return self._set(combined.output, fields["value"], reply)
 
     def _set(self, name: str, value: float, reply: str) -> str:
-        watchdog, output = self._profile.watchdog, self._profile.outputs[name]
+        watchdog, output = self.profile.watchdog, self.profile.outputs[name]
         if self.tripped and watchdog != "none" and watchdog.refuses_while_tripped:
             return "" if watchdog.refusal == "none" else watchdog.refusal.example
         if watchdog != "none" and watchdog.kick == "write":
             self._timer.fed_ns = self._now_ns
         if not output.min <= value <= output.max:
-            if self._profile.errors:
-                return self._profile.errors[0].example
+            if self.profile.errors:
+                return self.profile.errors[0].example
             self._errors.append(_OUT_OF_RANGE)
             return reply
         self._commands[name] = value
@@ -214,25 +164,23 @@ class EmulatedText:
         return reply
 
     def _inputs(self, text: str) -> str | None:
-        for name, source in self._profile.inputs.items():
+        for name, source in self.profile.inputs.items():
             if self._matches(source.ask, text):
                 return in_style(source.example, source.pattern, self._reading(name, source))
         return None
 
     def _reading(self, name: str, source: AsciiInput) -> float:
         if source.measures == "output":
-            value = next(iter(self._values.values())) if self._output is None else (
-                self._values[self._output]
-            )  # fmt: skip
+            value = self._values[self._output or next(iter(self._values))]
         elif name == self._sensor:
-            value = float(self._wiring.at_terminal(self._rig.displacement_um, source))
+            value = float(self.wiring.at_terminal(self._rig.displacement_um, source))
         else:
             value = 0.0
         value = min(max(value, source.min), source.max)
         return (value - source.offset) / source.scale
 
     def _watchdog(self, text: str) -> str | None:
-        watchdog = self._profile.watchdog
+        watchdog = self.profile.watchdog
         if watchdog == "none":
             return None
         if watchdog.tripped != "none" and self._matches(watchdog.tripped.ask, text):
@@ -252,7 +200,7 @@ class EmulatedText:
         return None
 
     def _switch(self, name: str, template: str, text: str) -> None:
-        watchdog = self._profile.watchdog
+        watchdog = self.profile.watchdog
         assert watchdog != "none"
         self._timer.fed_ns = self._now_ns
         if name == "arm":
@@ -265,15 +213,15 @@ class EmulatedText:
             self._timer.tripped = False
 
     def _questions(self, text: str) -> str | None:
-        query = self._profile.error_query
+        query = self.profile.error_query
         if query != "none" and self._matches(query.ask, text):
             return self._errors.pop(0) if self._errors else query.example
-        test = self._profile.selftest
+        test = self.profile.selftest
         return test.example if test != "none" and self._matches(test.ask, text) else None
 
     def _steps(self, text: str) -> str | None:
-        watchdog = self._profile.watchdog
-        steps: tuple[AsciiStep, ...] = (*self._profile.init, *self._profile.close)
+        watchdog = self.profile.watchdog
+        steps: tuple[AsciiStep, ...] = (*self.profile.init, *self.profile.close)
         if watchdog != "none":
             steps += tuple(step for each in watchdog.safe.values() for step in each)
         for step in steps:
@@ -288,15 +236,10 @@ class EmulatedText:
 
     def _put_out(self, name: str, value: float, event: str, now_ns: int) -> None:
         self._values[name] = value
-        more: dict[str, float] = {}
-        if name == self._output:
-            self._rig.put_out(self._wiring.current_a(value), now_ns)
-            more["current_a"] = self._rig.current_a
-        unit = self._profile.outputs[name].unit
-        self._log.event(now_ns, event, output=name, value=value, unit=unit, **more)
+        self._set_terminal(name, value, event, now_ns)
 
     def _trip(self, due_ns: int) -> None:
-        watchdog = self._profile.watchdog
+        watchdog = self.profile.watchdog
         assert watchdog != "none"
         at_zero = watchdog.on_trip in {"zero", "reset"}
         for name, value in self._values.items():

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Protocol, TypeAlias
 
 from hilctl_drivers.ascii.ascii_profile import AsciiProfile
 from hilctl_drivers.ascii.ascii_session import LineFormat
@@ -13,30 +13,26 @@ from hilctl_drivers.transport.links import CorruptError
 
 @dataclass(frozen=True, slots=True)
 class EmulatedReply:
-    """A reply, before its framing.
+    """A reply, before its framing."""
 
-    Attributes:
-        data: The reply; None if there is none, or it is not known yet.
-        due_ns: When it is sent; 0 for at once.
-        make: What makes it when it is due.
-        wrong_id: What turns it into one in another's name, for a fault.
-    """
+    data: bytes | None  # None if there is no reply, or it is not known yet
+    due_ns: int = 0  # when it is sent; 0 for immediately
+    make: Callable[[int], bytes] | None = None  # returns the reply when it is due
+    wrong_id: Callable[[bytes], bytes] | None = None  # returns it in another's name, for a fault
 
-    data: bytes | None
-    due_ns: int = 0
-    make: Callable[[int], bytes] | None = None
-    wrong_id: Callable[[bytes], bytes] | None = None
+
+SerialProfile: TypeAlias = AsciiProfile | FrameProfile
 
 
 class EmulatedWire(Protocol):
-    """Devices that share a line, or a port, and how they are spoken to."""
+    """Devices that share a line or a port, and their protocol."""
 
     def tick(self, now_ns: int) -> None:
         """Advance the time for all devices."""
         ...
 
     def requests(self, received: bytearray) -> Iterator[bytes]:
-        """Yield complete requests, and take them out of what was received."""
+        """Yield complete requests, and remove them from the received bytes."""
         ...
 
     def answer(self, request: bytes, now_ns: int) -> EmulatedReply | None:
@@ -44,7 +40,7 @@ class EmulatedWire(Protocol):
         ...
 
     def refusal(self, request: bytes) -> EmulatedReply | None:
-        """Return an answer that says no."""
+        """Return an answer that refuses the request."""
         ...
 
     def encode(self, data: bytes) -> bytes:
@@ -52,7 +48,7 @@ class EmulatedWire(Protocol):
         ...
 
     def corrupt_at(self, framed: bytes) -> int:
-        """Return the byte of a framed reply whose damage no receiver may miss."""
+        """Return the byte of a framed reply whose damage must be detected."""
         ...
 
 
@@ -68,7 +64,7 @@ class SerialDevice(Protocol):
         ...
 
     def refusal(self, message: bytes) -> EmulatedReply | None:
-        """Return an answer that says no."""
+        """Return an answer that refuses the request."""
         ...
 
     def wrong_id(self, reply: bytes) -> bytes:
@@ -77,20 +73,14 @@ class SerialDevice(Protocol):
 
 
 class EmulatedLine:
-    """Devices on a serial line.
+    """Devices on a serial line with the profile's framing; the addressed one answers."""
 
-    Args:
-        profile: What the line carries: lines of text, or binary frames.
-        devices: What is on it; the first that a message is for answers.
-    """
-
-    def __init__(
-        self, profile: AsciiProfile | FrameProfile, devices: Sequence[SerialDevice]
-    ) -> None:
+    def __init__(self, profile: SerialProfile, devices: Sequence[SerialDevice]) -> None:
         self.devices = devices
         self._splitter: Splitter[str] | Splitter[bytes]
         self._encode: Callable[[bytes], bytes]
         link = profile.link
+        self._is_text = not isinstance(link, FramesLink)
         if isinstance(link, FramesLink):
             framing = binary_framing(link.framing, link.crc, link.payload_max)
             self._splitter, self._encode = framing.splitter(), framing.encode
@@ -98,7 +88,6 @@ class EmulatedLine:
             self._splitter = LineFormat(link.terminator.encode(), link.checksum).splitter()
             replies = LineFormat(link.reply_terminator.encode(), link.checksum)
             self._encode = lambda message: replies.encode(message.decode())
-        self._is_text = not isinstance(link, FramesLink)
 
     def tick(self, now_ns: int) -> None:
         """Advance the time for all devices."""
@@ -106,7 +95,7 @@ class EmulatedLine:
             device.tick(now_ns)
 
     def requests(self, received: bytearray) -> Iterator[bytes]:
-        """Yield the good messages; the splitter keeps what is not complete."""
+        """Yield the good messages; the splitter keeps an incomplete one."""
         data = bytes(received)
         received.clear()
         for each in self._splitter.feed(data):

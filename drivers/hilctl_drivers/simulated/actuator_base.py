@@ -1,23 +1,19 @@
 """Base classes of simulated actuators and of models of magnetostrictive rods."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from hilctl.base.types import F64
 
-CHUNK = 4096  # samples a kernel call; bounds the scratch memory
+CHUNK = 4096  # samples per kernel call; bounds the scratch memory
 _DRAWN = 256
 
 
 class SensorNoise:
-    """Noise of a sensor's readings, the same however it is divided into parts.
-
-    Args:
-        std_um: Its standard deviation.
-        seed: What it begins with.
-    """
+    """Noise of a sensor's readings, the same however it is divided into blocks."""
 
     def __init__(self, std_um: float, seed: int) -> None:
         self._std_um, self._seed = std_um, seed
@@ -25,19 +21,19 @@ class SensorNoise:
         self.reset()
 
     def reset(self) -> None:
-        """Begin anew."""
+        """Start again with the first value."""
         self._generator = np.random.Generator(np.random.PCG64(self._seed))
         self._at = self._stop = 0
 
     def draw(self, samples: int) -> F64:
-        """Return the noise of the next samples, at most ``CHUNK``: the caller's until it draws."""
+        """Return the noise of the next samples, at most ``CHUNK``; valid until the next call."""
         if self._at + samples > self._stop:
             self._draw_more(samples)
         at, self._at = self._at, self._at + samples
         return self._values[at : self._at]
 
     def _draw_more(self, samples: int) -> None:
-        # Some hundreds at once: a call for every short block takes longer than the drawing.
+        # Some hundreds together: a call for every short block takes longer than the drawing.
         left = self._stop - self._at
         self._values[:left] = self._values[self._at : self._stop]
         self._at, self._stop = 0, max(samples, _DRAWN)
@@ -50,19 +46,18 @@ class Plant(ABC):
     """A simulated actuator with its amplifier and sensor, advanced sample by sample.
 
     A reading is taken at the instant its command is output and cannot show that command's effect;
-    the DAC then holds the command for one sample period. Blocks may be cut anywhere: the readings
-    are the same bit for bit, noise included.
+    the DAC then holds the command for one sample period. The readings are the same bit for bit
+    wherever blocks are cut, noise included.
     """
 
-    def __init__(self, noise_um: float, seed: int) -> None:
-        """Remember the sensor's noise; the subclass calls :meth:`warm_up` once it is complete.
+    def __init__(self, noise_um: float, seed: int, chunk: int = CHUNK) -> None:
+        """Create the noise, rms; the subclass calls :meth:`warm_up` once it is complete.
 
-        Args:
-            noise_um: Noise of each reading, rms.
-            seed: Seed of that noise.
+        ``chunk`` limits the samples of one call of the kernels, at most ``CHUNK``.
         """
         self._noise = SensorNoise(noise_um, seed)
-        self._arrays = np.empty((3, CHUNK))
+        self._chunk = chunk
+        self._arrays = np.empty((3, chunk))
         self._block = tuple(self._arrays)
 
     def reset(self) -> None:
@@ -74,27 +69,26 @@ class Plant(ABC):
         """Output a block of commands and read the sensors before each.
 
         Args:
-            command: float64[n], finite and within the DAC's range: the caller checks, nothing is
-                clipped here.
-            displacement_um: float64[n], filled with readings of the displacement from rest.
-            measured: float64[n], filled with the command as it had come about at each reading.
+            command: float64[n], finite and within the DAC's range; not checked here.
+            displacement_um: float64[n], filled with the displacement from rest.
+            measured: float64[n], filled with the command as it was at each reading.
         """
         samples = command.size
-        if samples > CHUNK:
-            for start in range(0, samples, CHUNK):
-                part = slice(start, start + CHUNK)
+        if samples > self._chunk:
+            for start in range(0, samples, self._chunk):
+                part = slice(start, start + self._chunk)
                 self.step(command[part], displacement_um[part], measured[part])
             return
-        # Copies: whatever callers have, what is compiled gets arrays of its one kind.
+        # Copies: kernels take contiguous arrays only.
         held, read_um, read = self._block
-        if held.size != samples:  # the views are kept: one block is as long as the next
+        if held.size != samples:  # the views are kept: blocks usually have one length
             self._block = held, read_um, read = tuple(self._arrays[:, :samples])
         held[:] = command
         self._advance(held, self._noise.draw(samples), read_um, read)
         displacement_um[:], measured[:] = read_um, read
 
     def warm_up(self) -> None:
-        """Go on by one sample and back to rest, so that nothing is compiled or loaded later."""
+        """Advance by one sample and go back to rest, so that everything is compiled."""
         self.reset()
         self.hold(1, 0.0)
         self.reset()
@@ -123,13 +117,7 @@ VACUUM_PERMEABILITY = 1.25663706212e-6
 
 @dataclass(frozen=True, slots=True)
 class Coil:
-    """The field at the rods' surface, ``factor_per_m * current + bias_a_per_m``, and its steps.
-
-    Attributes:
-        factor_per_m: Field of one ampere.
-        bias_a_per_m: Field without a command.
-        step_s: Length of a step.
-    """
+    """The field at the surface, ``factor_per_m * current + bias_a_per_m``, in steps."""
 
     factor_per_m: float
     bias_a_per_m: float
@@ -137,13 +125,18 @@ class Coil:
 
 
 class Rods(ABC):
-    """Rods in a coil: current in, displacement without structure or load out."""
+    """Rods in a coil: current in, displacement without structure or load out.
+
+    The kernel does :meth:`follow`; after the arguments of that it gets its state and constants.
+    """
+
+    def __init__(self, kernel: Callable[..., object], *arguments: object) -> None:
+        self._kernel, self._arguments = kernel, arguments
 
     @abstractmethod
     def rest(self) -> float:
         """Go to the state in which only the bias has ever been there; return its displacement."""
 
-    @abstractmethod
     def follow(self, halves_a: F64, free_um: F64) -> None:
         """Advance step by step.
 
@@ -152,6 +145,7 @@ class Rods(ABC):
                 and the end of each.
             free_um: float64[n], filled with the free displacement at the end of each step.
         """
+        self._kernel(halves_a, free_um, *self._arguments)
 
 
 class RodParameters(ABC):
@@ -161,7 +155,7 @@ class RodParameters(ABC):
 
     @abstractmethod
     def rods(self, coil: Coil) -> Rods:
-        """Return such rods in a coil; they are to be put to rest before anything else."""
+        """Return such rods in a coil; :meth:`Rods.rest` comes before anything else."""
 
     @abstractmethod
     def varied(self, lag: float, pinning: float, strain: float) -> "RodParameters":

@@ -1,8 +1,8 @@
 """Simulated rigs as devices: ``simulated_terfenol`` and ``simulated_piezo``.
 
-They step on sample count, so a run needs no real time: time passes only in an exchange, one sample
-period per command. From outside that is a device with a sample clock and a FIFO of its own, so they
-call themselves buffered.
+Time passes only in an exchange, one sample period per command, so a run needs no real time. From
+outside that is a device with a sample clock and a FIFO of its own, so they are described as
+buffered.
 """
 
 from abc import abstractmethod
@@ -34,10 +34,14 @@ from hilctl_drivers.simulated.terfenol import (
 FIFO_DEPTH = 4096
 MAX_RATE_HZ = 200e3
 _SETTLING_S = 0.1
+_LOST = {
+    "no_answer": "no answer in time (injected fault)",
+    "refused": "the block was refused (injected fault)",
+}
 
 
 class SimulatedFault(StrictModel):
-    """A fault to inject, for trying what a run does about it. It stays once it has come."""
+    """A fault to inject, permanent from its sample on, to try the reaction of a run."""
 
     kind: Literal[
         "sensor_nan", "sensor_frozen", "sensor_jump", "sensor_inverted", "no_answer", "refused"
@@ -68,9 +72,27 @@ class SimulatedDevice(DacDevice):
 
     Options: ClassVar[type[DeviceOptions]] = SimulatedOptions
 
-    def __init__(self, info: DeviceInfo, options: SimulatedOptions) -> None:
-        """Take what the subclass says of itself, and the options that all share."""
-        super().__init__(info, info.name, "exchange a block", "the output")
+    def __init__(
+        self,
+        options: SimulatedOptions,
+        parameters: TerfenolParameters | PiezoParameters,
+        **info: Any,
+    ) -> None:
+        """Describe the device; a recording keeps parameters and options as its details."""
+        plain = asdict(parameters)
+        details = plain | plain.pop("rods", {}) | options.model_dump()
+        described = DeviceInfo(
+            sensor_min_um=-parameters.sensor_range_um,
+            sensor_max_um=parameters.sensor_range_um,
+            max_rate_hz=MAX_RATE_HZ,
+            buffered=True,
+            fifo_depth=FIFO_DEPTH,
+            measures_command=True,
+            simulated=True,
+            details={name: str(value) for name, value in details.items()},
+            **info,
+        )
+        super().__init__(described, described.name, "exchange a block", "the output")
         self._fault = options.fault
         self._output_at_open = options.output_at_open
         self._plant: Plant | None = None
@@ -98,21 +120,20 @@ class SimulatedDevice(DacDevice):
         self, first_sample: int, command: F64, displacement_um: F64, measured: F64
     ) -> None:
         """Let a period pass for each command; samples skipped before it pass too, output held."""
-        if self._plant is None:
-            raise DeviceError("not open")
+        assert self._plant is not None
         if first_sample < self._next_sample:
             rule = f"first sample must be >= {self._next_sample}, which is next"
             raise DeviceError(f"{rule}, got {first_sample}")
-        fault = self._fault
-        if fault is not None:
-            self._fail_exchange(fault, first_sample + command.size)
+        fault, end_sample = self._fault, first_sample + command.size
+        if fault is not None and fault.kind in _LOST and end_sample > fault.at_sample:
+            raise DeviceError(_LOST[fault.kind])
         if first_sample > self._next_sample:
             self._plant.hold(first_sample - self._next_sample, self._last_command)
         self._plant.step(command, displacement_um, measured)
         if fault is not None:
             self._spoil(fault, first_sample, displacement_um)
             self._last_reading_um = displacement_um.item(-1)
-        self._next_sample = first_sample + command.size
+        self._next_sample = end_sample
         self._last_command = command.item(-1)
 
     def _put_out(self, command: float) -> None:
@@ -134,15 +155,6 @@ class SimulatedDevice(DacDevice):
         sizes = {command.size, displacement_um.size, measured.size}
         if not self._block or len(sizes) > 1 or not 1 <= command.size <= self._block:
             super()._check_sizes(command, displacement_um, measured)
-
-    def _fail_exchange(self, fault: SimulatedFault, end_sample: int) -> None:
-        """Raise what an injected fault of the connection raises in a block that ends here."""
-        if end_sample <= fault.at_sample:
-            return
-        if fault.kind == "no_answer":
-            raise DeviceError("no answer in time (injected fault)")
-        if fault.kind == "refused":
-            raise DeviceError("the block was refused (injected fault)")
 
     def _spoil(self, fault: SimulatedFault, first_sample: int, displacement_um: F64) -> None:
         """Put an injected sensor fault on the readings it has reached."""
@@ -266,14 +278,14 @@ class TerfenolOptions(SimulatedOptions):
             second_mode=self.second_mode,
             amplifier=self.amplifier,
         )
-        parameters = self.vary.of(rated)
+        changes: dict[str, Any] = {}
         if not self.noise:
-            parameters = replace(parameters, sensor_noise_um=0.0)
+            changes["sensor_noise_um"] = 0.0
         if not self.magnet:
-            parameters = replace(parameters, magnet_field_a_per_m=0.0)
+            changes["magnet_field_a_per_m"] = 0.0
         if self.drift is not None:
-            parameters = replace(parameters, drift_um=self.drift.um, drift_s=self.drift.tau_s)
-        return parameters
+            changes |= {"drift_um": self.drift.um, "drift_s": self.drift.tau_s}
+        return replace(self.vary.of(rated), **changes)
 
 
 class PiezoStage(DeviceOptions):
@@ -307,44 +319,24 @@ class PiezoOptions(SimulatedOptions):
     )
 
 
-def _details(parameters: dict[str, Any], options: SimulatedOptions) -> dict[str, str]:
-    """Return physical parameters and options as text, to be kept with a recording."""
-    everything = parameters | parameters.pop("rods", {}) | options.model_dump()
-    return {name: str(value) for name, value in everything.items()}
-
-
-_COMMON: dict[str, Any] = {
-    "max_rate_hz": MAX_RATE_HZ,
-    "buffered": True,
-    "fifo_depth": FIFO_DEPTH,
-    "measures_command": True,
-    "simulated": True,
-}
-
-
 class SimulatedTerfenol(SimulatedDevice):
     """The Terfenol-D actuator of :mod:`hilctl_drivers.simulated.terfenol`; commands in A."""
 
     Options: ClassVar[type[DeviceOptions]] = TerfenolOptions
 
     def __init__(self, options: TerfenolOptions) -> None:
-        """Describe the device; nothing is simulated before :meth:`open`."""
         self._options = options
         self._parameters = options.parameters()
-        range_um = self._parameters.sensor_range_um
         command_min, command_max = options.command_range_a
-        info = DeviceInfo(
+        super().__init__(
+            options,
+            self._parameters,
             name="simulated_terfenol",
             description="simulated Terfenol-D actuator, linear amplifier and capacitive sensor",
             command_unit="A",
             command_min=command_min,
             command_max=command_max,
-            sensor_min_um=-range_um,
-            sensor_max_um=range_um,
-            details=_details(asdict(self._parameters), options),
-            **_COMMON,
         )
-        super().__init__(info, options)
 
     def _build(self, sample_rate_hz: float) -> Plant:
         options = self._options
@@ -359,24 +351,20 @@ class SimulatedPiezo(SimulatedDevice):
     Options: ClassVar[type[DeviceOptions]] = PiezoOptions
 
     def __init__(self, options: PiezoOptions) -> None:
-        """Describe the device; nothing is simulated before :meth:`open`."""
         self._seed = options.seed
         noise_um = options.sensor_noise_um if options.noise else 0.0
         stage = options.stage.model_dump() if options.stage else {}
         self._parameters = PiezoParameters(sensor_noise_um=noise_um, **stage)
-        info = DeviceInfo(
+        drive_max_v = self._parameters.drive_max_v
+        super().__init__(
+            options,
+            self._parameters,
             name="simulated_piezo",
-            description=f"simulated piezo stage, 0..{self._parameters.drive_max_v:g} V drive and "
-            "capacitive sensor",
+            description=f"simulated piezo stage, 0..{drive_max_v:g} V drive and capacitive sensor",
             command_unit="V",
             command_min=0.0,
-            command_max=self._parameters.drive_max_v,
-            sensor_min_um=-self._parameters.sensor_range_um,
-            sensor_max_um=self._parameters.sensor_range_um,
-            details=_details(asdict(self._parameters), options),
-            **_COMMON,
+            command_max=drive_max_v,
         )
-        super().__init__(info, options)
 
     def _build(self, sample_rate_hz: float) -> Plant:
         return PiezoActuator(self._parameters, sample_rate_hz, self._seed)

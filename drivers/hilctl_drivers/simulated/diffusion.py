@@ -44,26 +44,16 @@ class DiffusionParameters(RodParameters):
 
     Saturation, strain and resistivity are of the size given for Terfenol-D; knee and pinning were
     set for the published strokes and widths.
-
-    Attributes:
-        saturation_a_per_m: M_s.
-        knee_a_per_m: b, the field of half the saturation.
-        pinning_max_a_per_m: Pinning field of the hardest cell; the others are evenly spaced to 0.
-        cells: Number of cells in each shell.
-        free_fraction: Weight of the cell that is not pinned; the others share the rest alike.
-        saturation_strain: lambda_s.
-        resistivity_ohm_m: rho.
-        shells: Number of shells, equally thick.
     """
 
-    saturation_a_per_m: float = 7.65e5
-    knee_a_per_m: float = 27e3
-    pinning_max_a_per_m: float = 9e3
-    cells: int = 8
-    free_fraction: float = 0.3
-    saturation_strain: float = 1.005e-3
-    resistivity_ohm_m: float = 0.6e-6
-    shells: int = 8
+    saturation_a_per_m: float = 7.65e5  # M_s
+    knee_a_per_m: float = 27e3  # b, the field of half the saturation
+    pinning_max_a_per_m: float = 9e3  # of the hardest cell; the others are evenly spaced to 0
+    cells: int = 8  # number of cells in each shell
+    free_fraction: float = 0.3  # weight of the cell that is not pinned; the others share the rest
+    saturation_strain: float = 1.005e-3  # lambda_s
+    resistivity_ohm_m: float = 0.6e-6  # rho
+    shells: int = 8  # number of shells, equally thick
 
     def rods(self, coil: Coil) -> Rods:
         """Return such rods in a coil."""
@@ -192,17 +182,9 @@ def _follow(
 ) -> None:
     """Do ``Rods.follow``.
 
-    Args:
-        halves_a: See ``Rods.follow``.
-        free_um: See ``Rods.follow``.
-        state: float64[3, n]: H, M and the last change of H in each shell; updated.
-        pinned: float64[m, n], see ``magnetise``; updated.
-        cells: See ``magnetise``.
-        conductance: float64[2, n], see ``DiffusionParameters.conductances``.
-        areas: float64[n], each shell's share of the cross-section.
-        coil: Coil factor in 1/m and bias field in A/m.
-        curve: See ``magnetise``.
-        strain_um: Displacement at saturation.
+    ``state`` is float64[3, n], H, M and the last change of H in each shell; updated. ``areas`` is
+    float64[n], each shell's share of the cross-section; ``coil`` the coil's factor in 1/m and bias
+    field in A/m; ``strain_um`` the displacement at saturation. See ``magnetise`` and ``_correct``.
     """
     factor, bias = coil
     n = areas.size
@@ -238,36 +220,28 @@ class Diffusion(Rods):
     """Shells of pinned cells; at rest the bias field is everywhere and no cell is strained."""
 
     def __init__(self, parameters: DiffusionParameters, coil: Coil) -> None:
-        """Take the constants; the rods are nowhere before :meth:`rest`."""
-        self._coil = (coil.factor_per_m, coil.bias_a_per_m)
+        self._bias = coil.bias_a_per_m
         self._curve = (parameters.saturation_a_per_m, parameters.knee_a_per_m)
         self._strain_um = 1.5e6 * parameters.saturation_strain * ROD_LENGTH_M
-        self._cells = parameters.cell_table()
-        self._conductance = parameters.conductances(coil.step_s)
-        self._areas = parameters.areas()
         self._state = np.zeros((3, parameters.shells))
         self._pinned = np.zeros((parameters.cells, parameters.shells))
+        super().__init__(
+            _follow,
+            self._state,
+            self._pinned,
+            parameters.cell_table(),
+            parameters.conductances(coil.step_s),
+            parameters.areas(),
+            (coil.factor_per_m, coil.bias_a_per_m),
+            self._curve,
+            self._strain_um,
+        )
 
     def rest(self) -> float:
         """Put every cell of every shell at the bias field."""
         saturation, knee = self._curve
-        bias = self._coil[1]
+        bias = self._bias
         self._pinned[:] = bias
         share = bias / (knee + abs(bias))
         self._state[:] = [[bias], [saturation * share], [0.0]]
         return self._strain_um * share * share
-
-    def follow(self, halves_a: F64, free_um: F64) -> None:
-        """Advance step by step."""
-        _follow(
-            halves_a,
-            free_um,
-            self._state,
-            self._pinned,
-            self._cells,
-            self._conductance,
-            self._areas,
-            self._coil,
-            self._curve,
-            self._strain_um,
-        )

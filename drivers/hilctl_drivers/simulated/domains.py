@@ -64,28 +64,17 @@ class DomainsParameters(RodParameters):
     Magnetostriction, saturation and anisotropy are of the size given for Terfenol-D (K is the
     curvature 4/3 |K_1| about <111>, with K_1 = -60 kJ/m^3); stress, spread and pinning were set for
     the published strokes and widths.
-
-    Attributes:
-        saturation_a_per_m: M_s.
-        anisotropy_j_per_m3: K.
-        strain_100: lambda_100.
-        strain_111: lambda_111.
-        stress_pa: sigma, negative in compression.
-        spread_j_per_m3: Omega.
-        pinning_j_per_m3: k_p.
-        reversibility: c.
-        resistivity_ohm_m: rho.
     """
 
-    saturation_a_per_m: float = 7.65e5
-    anisotropy_j_per_m3: float = 80e3
-    strain_100: float = 90e-6
-    strain_111: float = 1640e-6
-    stress_pa: float = -22e6
-    spread_j_per_m3: float = 16e3
-    pinning_j_per_m3: float = 11e3
-    reversibility: float = 0.1
-    resistivity_ohm_m: float = 0.6e-6
+    saturation_a_per_m: float = 7.65e5  # M_s
+    anisotropy_j_per_m3: float = 80e3  # K
+    strain_100: float = 90e-6  # lambda_100
+    strain_111: float = 1640e-6  # lambda_111
+    stress_pa: float = -22e6  # sigma, negative in compression
+    spread_j_per_m3: float = 16e3  # Omega
+    pinning_j_per_m3: float = 11e3  # k_p
+    reversibility: float = 0.1  # c
+    resistivity_ohm_m: float = 0.6e-6  # rho
 
     def rods(self, coil: Coil) -> Rods:
         """Return such rods in a coil."""
@@ -151,8 +140,8 @@ def equilibrium(field: float, table: F64, energies: Energies, work: F64) -> None
         field: Field in the rods.
         table: float64[11, n], see ``DomainsParameters.table``.
         energies: K, mu_0 M_s, sigma, Omega, k_p, c.
-        work: float64[8, n], rows 0 to 5 filled: f_an (of one of the kind), m.u, m.Q m, and what
-            they grow by with the field.
+        work: float64[8, n], rows 0 to 5 filled: f_an (of one of the kind), m.u, m.Q m, and their
+            slopes with the field.
     """
     stiffness, zeeman, stress, spread, _, _ = energies
     total = 0.0
@@ -208,8 +197,7 @@ def magnetise(
         state: float64[3, n]: ``[0, :]`` f_an and ``[1, :]`` f_irr before it, ``[2, 0]`` the field.
         table: See ``equilibrium``.
         energies: See ``equilibrium``.
-        work: See ``equilibrium``; filled for the end of the change, row 6 with f_irr and row 7 with
-            what it grows by with the field.
+        work: See ``equilibrium``, for the end of the change; row 6 is f_irr, row 7 its slope.
     """
     _, zeeman, _, _, pinning, reversible = energies
     equilibrium(state[2, 0] + change, table, energies, work)
@@ -247,16 +235,9 @@ def _follow(
 ) -> None:
     """Do ``Rods.follow``.
 
-    Args:
-        halves_a: See ``Rods.follow``.
-        free_um: See ``Rods.follow``.
-        state: float64[3, n], see ``magnetise``; ``[2, 1]`` is H + M by the flux that came in,
-            ``[2, 2]`` the last change of the field; updated.
-        table: See ``equilibrium``.
-        coil: Coil factor in 1/m, bias field in A/m, step and time constant of the eddy currents
-            where M does not change, in s, and M_s.
-        energies: See ``equilibrium``.
-        length_um: Length of the rods.
+    ``state`` is float64[3, n], see ``magnetise``; ``[2, 1]`` is H + M by the flux that came in,
+    ``[2, 2]`` the last change of the field; updated. ``coil`` is its factor in 1/m, bias field in
+    A/m, step and time constant of the eddy currents at constant M, in s, and M_s.
     """
     factor, bias, step, eddy, saturation = coil
     pace = step / eddy
@@ -291,10 +272,9 @@ class Domains(Rods):
     """Domains of eight orientations; at rest their fractions are Boltzmann's, at the bias field."""
 
     def __init__(self, parameters: DomainsParameters, coil: Coil) -> None:
-        """Take the constants; the rods are nowhere before :meth:`rest`."""
         saturation = parameters.saturation_a_per_m
         eddy = VACUUM_PERMEABILITY * ROD_RADIUS_M**2 / (8.0 * parameters.resistivity_ohm_m)
-        self._coil = (coil.factor_per_m, coil.bias_a_per_m, coil.step_s, eddy, saturation)
+        self._bias, self._saturation = coil.bias_a_per_m, saturation
         self._energies = (
             parameters.anisotropy_j_per_m3,
             VACUUM_PERMEABILITY * saturation,
@@ -305,25 +285,17 @@ class Domains(Rods):
         )
         self._table = parameters.table()
         self._state = np.zeros((3, self._table.shape[1]))
+        constants = (coil.factor_per_m, coil.bias_a_per_m, coil.step_s, eddy, saturation)
+        super().__init__(
+            _follow, self._state, self._table, constants, self._energies, 1e6 * ROD_LENGTH_M
+        )
 
     def rest(self) -> float:
         """Go to the anhysteretic state at the bias field."""
-        bias, saturation = self._coil[1], self._coil[4]
+        bias, saturation = self._bias, self._saturation
         work = np.empty((8, self._table.shape[1]))
         equilibrium(bias, self._table, self._energies, work)
         fractions = self._table[0] * work[0]
         self._state[:2] = work[0]
         self._state[2, :3] = bias, bias + saturation * (fractions @ work[1]), 0.0
         return float(1e6 * ROD_LENGTH_M * (fractions @ work[2]))
-
-    def follow(self, halves_a: F64, free_um: F64) -> None:
-        """Advance step by step."""
-        _follow(
-            halves_a,
-            free_um,
-            self._state,
-            self._table,
-            self._coil,
-            self._energies,
-            1e6 * ROD_LENGTH_M,
-        )

@@ -52,28 +52,17 @@ class JilesAthertonParameters(RodParameters):
     All are of the size that Calkins et al. and Dapino et al. give for Terfenol-D; pinning was set
     for the published width. The stress is that of a washer that shears the curve enough for the
     bias of this actuator to lie in the middle of its slope.
-
-    Attributes:
-        saturation_a_per_m: M_s.
-        shape_a_per_m: a.
-        pinning_a_per_m: k.
-        reversibility: c.
-        coupling: alpha.
-        saturation_strain: lambda_s.
-        stress_pa: sigma_0, negative in compression.
-        resistivity_ohm_m: rho.
-        wall_field_a_per_m: V_0, which scales the loss of walls in motion.
     """
 
-    saturation_a_per_m: float = 7.65e5
-    shape_a_per_m: float = 7012.0
-    pinning_a_per_m: float = 5000.0
-    reversibility: float = 0.18
-    coupling: float = 0.045
-    saturation_strain: float = 1.005e-3
-    stress_pa: float = -22e6
-    resistivity_ohm_m: float = 0.6e-6
-    wall_field_a_per_m: float = 100.0
+    saturation_a_per_m: float = 7.65e5  # M_s
+    shape_a_per_m: float = 7012.0  # a
+    pinning_a_per_m: float = 5000.0  # k
+    reversibility: float = 0.18  # c
+    coupling: float = 0.045  # alpha
+    saturation_strain: float = 1.005e-3  # lambda_s
+    stress_pa: float = -22e6  # sigma_0, negative in compression
+    resistivity_ohm_m: float = 0.6e-6  # rho
+    wall_field_a_per_m: float = 100.0  # V_0, which scales the loss of walls in motion
 
     @property
     def effective_coupling(self) -> float:
@@ -119,12 +108,7 @@ def langevin(x: float) -> tuple[float, float]:
 
 
 @kernel("float64(float64, float64, float64, UniTuple(float64, 5))")
-def susceptibility(
-    field: float,
-    magnetisation: float,
-    sign: float,
-    material: Material,
-) -> float:
+def susceptibility(field: float, magnetisation: float, sign: float, material: Material) -> float:
     """Return dM/dH of the published equations.
 
     Args:
@@ -145,15 +129,11 @@ def susceptibility(
 
 @kernel("float64(float64, float64, float64, UniTuple(float64, 2))")
 def _advance(behind: float, chi: float, step: float, losses: tuple[float, float]) -> float:
-    """Return how far H goes in a step: implicit midpoint of the loss equation.
+    """Return the change of H in a step, in s: implicit midpoint of the loss equation.
 
     With q^2 = |dH|: (e chi / step + 1/2) q^2 + x (chi / step)^(1/2) q = |H_applied - H|.
-
-    Args:
-        behind: Applied field at the middle of the step less H at its start.
-        chi: dM/dH.
-        step: In s.
-        losses: Coefficients e and x.
+    ``behind`` is the applied field at the middle of the step less H at its start, ``losses`` e
+    and x.
     """
     eddy, wall = losses
     rate = chi / step
@@ -178,14 +158,9 @@ def _follow(
 ) -> None:
     """Do ``Rods.follow``.
 
-    Args:
-        halves_a: See ``Rods.follow``.
-        free_um: See ``Rods.follow``.
-        state: float64[2]: H and M in A/m; updated.
-        coil: Coil factor in 1/m, bias field in A/m, step in s.
-        material: See ``susceptibility``.
-        losses: See ``_advance``.
-        strain_um: Displacement at saturation.
+    ``state`` is float64[2], H and M in A/m, updated; ``coil`` its factor in 1/m, bias field in A/m
+    and step in s; ``strain_um`` the displacement at saturation. See ``susceptibility`` and
+    ``_advance``.
     """
     factor, bias, step = coil
     field = state[0]
@@ -210,8 +185,7 @@ class JilesAtherton(Rods):
     """Jiles-Atherton rods; at rest they are on their anhysteretic curve, as after demagnetising."""
 
     def __init__(self, parameters: JilesAthertonParameters, coil: Coil) -> None:
-        """Take the constants; the rods are nowhere before :meth:`rest`."""
-        self._coil = (coil.factor_per_m, coil.bias_a_per_m, coil.step_s)
+        self._bias = coil.bias_a_per_m
         self._material = (
             parameters.saturation_a_per_m,
             parameters.shape_a_per_m,
@@ -219,14 +193,17 @@ class JilesAtherton(Rods):
             parameters.reversibility,
             parameters.effective_coupling,
         )
-        self._losses = parameters.losses
         self._strain_um = 1.5e6 * parameters.saturation_strain * ROD_LENGTH_M
         self._state = np.zeros(2)
+        constants = (coil.factor_per_m, coil.bias_a_per_m, coil.step_s)
+        super().__init__(
+            _follow, self._state, constants, self._material, parameters.losses, self._strain_um
+        )
 
     def rest(self) -> float:
         """Go to the anhysteretic magnetisation at the bias field."""
         saturation, shape, _, _, coupling = self._material
-        field = self._coil[1]
+        field = self._bias
         magnetisation = 0.0
         for _ in range(100):  # Newton: M - M_s L is monotone where alpha' M_s < 3 a
             value, slope = langevin((field + coupling * magnetisation) / shape)
@@ -234,15 +211,3 @@ class JilesAtherton(Rods):
             magnetisation -= excess / (1.0 - coupling * saturation * slope / shape)
         self._state[:] = field, magnetisation
         return self._strain_um * (magnetisation / saturation) ** 2
-
-    def follow(self, halves_a: F64, free_um: F64) -> None:
-        """Advance step by step."""
-        _follow(
-            halves_a,
-            free_um,
-            self._state,
-            self._coil,
-            self._material,
-            self._losses,
-            self._strain_um,
-        )

@@ -27,30 +27,19 @@ class PiezoParameters:
     hence the range. The loops were identified over 10..70 V; above some 88 V the model leaves the
     sensor's range and the reading stays at its end. Bandwidth and noise are typical of such a
     sensor, not published.
-
-    Attributes:
-        drive_max_v: Top of the drive, whose bottom is 0 V.
-        slope_um_per_v: Weight p_0 of the drive itself.
-        thresholds_v: r_i = sigma i of the play operators.
-        weights_um_per_v: p_i = alpha exp(-beta i).
-        offset_um: Position at rest.
-        dac_codes: Codes above 0 V.
-        adc_codes: Codes on either side of zero.
-        sensor_range_um: Reading at either end of the sensor's range.
-        sensor_bandwidth_hz: Corner of the first-order sensor.
-        sensor_noise_um: Noise of each reading, rms.
     """
 
-    drive_max_v: float = 100.0
-    slope_um_per_v: float = 0.2567
+    drive_max_v: float = 100.0  # top of the drive, whose bottom is 0 V
+    slope_um_per_v: float = 0.2567  # weight p_0 of the drive itself
+    # Play operators: r_i = sigma i and p_i = alpha exp(-beta i)
     thresholds_v: tuple[float, ...] = tuple(3.548 * i for i in _INDEX)
     weights_um_per_v: tuple[float, ...] = tuple(0.0383 * math.exp(-0.1206 * i) for i in _INDEX)
-    offset_um: float = 0.0
-    dac_codes: int = 65535
-    adc_codes: int = 32767
-    sensor_range_um: float = 38.0
-    sensor_bandwidth_hz: float = 10e3
-    sensor_noise_um: float = 1e-3
+    offset_um: float = 0.0  # position at rest
+    dac_codes: int = 65535  # codes above 0 V
+    adc_codes: int = 32767  # codes on either side of zero
+    sensor_range_um: float = 38.0  # reading at either end of the sensor's range
+    sensor_bandwidth_hz: float = 10e3  # corner of the first-order sensor
+    sensor_noise_um: float = 1e-3  # noise of each reading, rms
 
 
 @kernel(
@@ -66,7 +55,7 @@ def _run(
     plays: F64,
     constants: tuple[float, float, float, float, float, float],
 ) -> None:
-    """Read the sensor, put out the command and advance one sample period; for every sample.
+    """Read the sensor, output the command and advance one sample period; for every sample.
 
     Args:
         command: float64[n], drive in V.
@@ -75,7 +64,7 @@ def _run(
         drive_v: float64[n], filled with the drive at the instant of each reading.
         state: float64[2]: drive in V, sensor output in um; updated.
         plays: float64[3, m]: threshold, weight and output of each play operator; updated.
-        constants: Weight of the drive itself, what is left of the sensor's error after a sample
+        constants: Weight of the drive itself, remaining part of the sensor's error after a sample
             period, one DAC code in V, one ADC code in um, the sensor's range in um, the position
             at rest in um.
     """
@@ -101,13 +90,7 @@ class PiezoActuator(Plant):
     """The stage with its sensor; commands and drive in V."""
 
     def __init__(self, parameters: PiezoParameters, sample_rate_hz: float, seed: int = 1) -> None:
-        """Build the stage at rest: at its offset at 0 V, never driven before.
-
-        Args:
-            parameters: Physical constants.
-            sample_rate_hz: Samples a second, > 0.
-            seed: Seed of the sensor noise.
-        """
+        """Build the stage at rest: at its offset at 0 V, never driven before."""
         super().__init__(parameters.sensor_noise_um, seed)
         thresholds = np.array(parameters.thresholds_v, dtype=np.float64)
         weights = np.array(parameters.weights_um_per_v, dtype=np.float64)
@@ -129,11 +112,5 @@ class PiezoActuator(Plant):
 
     def _advance(self, command: F64, noise_um: F64, displacement_um: F64, measured: F64) -> None:
         _run(
-            command,
-            noise_um,
-            displacement_um,
-            measured,
-            self._state,
-            self._plays,
-            self._constants,
+            command, noise_um, displacement_um, measured, self._state, self._plays, self._constants
         )

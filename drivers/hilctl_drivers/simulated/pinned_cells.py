@@ -20,29 +20,17 @@ from hilctl_drivers.simulated.actuator_base import Coil, RodParameters, Rods
 
 @dataclass(frozen=True, slots=True)
 class PinnedCellsParameters(RodParameters):
-    """Constants of lag, cells and strain.
+    """Constants of lag, cells and strain."""
 
-    Attributes:
-        lag_s: Time constant of the field inside the rods, for small changes.
-        lag_growth_m_per_a: Relative growth of that time constant per A/m the field is behind.
-        langevin_field_a_per_m: Field scale of the anhysteretic curve.
-        pinning_max_a_per_m: Pinning field of the hardest cell; the others are evenly spaced to 0.
-        cells: Number of cells.
-        free_fraction: Weight of the cell that is not pinned.
-        weight_decay: Exponent of the fall of the other weights towards the hardest cell.
-        strain_um: Displacement scale of the even polynomial in the magnetisation.
-        strain_quartic: Weight of its fourth-order term beside the second-order one.
-    """
-
-    lag_s: float = 9.57e-5
-    lag_growth_m_per_a: float = 5.66e-5
-    langevin_field_a_per_m: float = 27.1e3
-    pinning_max_a_per_m: float = 28.7e3
-    cells: int = 10
-    free_fraction: float = 0.455
-    weight_decay: float = 2.72
-    strain_um: float = 352.4
-    strain_quartic: float = -0.689
+    lag_s: float = 9.57e-5  # time constant of the field inside the rods, for small changes
+    lag_growth_m_per_a: float = 5.66e-5  # its relative growth per A/m that the field lags behind
+    langevin_field_a_per_m: float = 27.1e3  # field scale of the anhysteretic curve
+    pinning_max_a_per_m: float = 28.7e3  # of the hardest cell; the others are evenly spaced to 0
+    cells: int = 10  # number of cells
+    free_fraction: float = 0.455  # weight of the cell that is not pinned
+    weight_decay: float = 2.72  # exponent of the fall of the other weights to the hardest cell
+    strain_um: float = 352.4  # scale of the even polynomial in the magnetisation
+    strain_quartic: float = -0.689  # weight of its fourth-order term beside the second-order one
 
     def rods(self, coil: Coil) -> Rods:
         """Return pinned cells in a coil."""
@@ -132,13 +120,8 @@ def _follow(
 ) -> None:
     """Do ``Rods.follow``.
 
-    Args:
-        halves_a: See ``Rods.follow``.
-        free_um: See ``Rods.follow``.
-        state: float64[1], field in the rods; updated.
-        cells: See ``free_displacement``; updated.
-        coil: Coil factor in 1/m, bias field in A/m, step in s, lag in s, its growth in m/A.
-        material: See ``free_displacement``.
+    ``state`` is float64[1], the field in the rods, updated; ``coil`` its factor in 1/m, bias field
+    in A/m, step in s, lag in s and growth of the lag in m/A. See ``free_displacement``.
     """
     factor, bias, step, lag, growth = coil
     field = state[0]
@@ -157,15 +140,8 @@ class PinnedCells(Rods):
     """Cells with dry friction behind one lag of the field."""
 
     def __init__(self, parameters: PinnedCellsParameters, coil: Coil) -> None:
-        """Take the constants; the rods are nowhere before :meth:`rest`."""
-        self._bias = coil.bias_a_per_m
-        self._coil = (
-            coil.factor_per_m,
-            coil.bias_a_per_m,
-            coil.step_s,
-            parameters.lag_s,
-            parameters.lag_growth_m_per_a,
-        )
+        self._bias = bias = coil.bias_a_per_m
+        lag = parameters.lag_s, parameters.lag_growth_m_per_a
         self._curve = (
             parameters.langevin_field_a_per_m,
             parameters.strain_um,
@@ -173,6 +149,8 @@ class PinnedCells(Rods):
         )
         self._cells = parameters.table()
         self._state = np.zeros(1)
+        constants = (coil.factor_per_m, bias, coil.step_s, *lag)
+        super().__init__(_follow, self._state, self._cells, constants, self._curve)
         ensure_compiled(_follow)
 
     def rest(self) -> float:
@@ -180,7 +158,3 @@ class PinnedCells(Rods):
         self._state[0] = self._bias
         self._cells[2] = self._bias
         return free_displacement(self._cells, self._bias, self._curve)
-
-    def follow(self, halves_a: F64, free_um: F64) -> None:
-        """Advance step by step."""
-        _follow(halves_a, free_um, self._state, self._cells, self._coil, self._curve)

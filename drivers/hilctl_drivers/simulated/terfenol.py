@@ -2,9 +2,9 @@
 
 Amplifier, rods, structure and sensor are chained as in the rig of the dissertation "Modeling and
 Compensation of Rate-Dependent Asymmetric Hysteresis Nonlinearities of Magnetostrictive Actuators",
-Concordia, sections 3.3 and 3.4 of its chapter 2. What goes on in the rods is one physics of several
-(``plant.Rods``). The first is near to what a compensator inverts: pinned magnetisation after a
-non-linear lag of the field, where that has plays of the current. The others have nothing of it.
+Concordia, sections 3.3 and 3.4 of its chapter 2. The rods have one of several physics (``Rods``).
+The first is near to what a compensator inverts: pinned magnetisation after a non-linear lag of the
+field, where that has plays of the current. The others have nothing of it.
 """
 
 import math
@@ -95,57 +95,33 @@ class TerfenolParameters:
     The rated values are those of sections 3.3.1 and 3.4.4 (chapter 2) of the dissertation: coil
     factor, permanent-magnet field, stiffness, damping ratio, moving mass, sensor bandwidth, noise
     and range. Converters and amplifier bandwidth are not published; plausible ones are assumed.
-
-    Attributes:
-        dac_range_a: Current at either end of the DAC's range.
-        dac_codes: Codes on either side of zero (DAC and ADCs).
-        amplifier_bandwidth_hz: Corner of the first-order current loop.
-        coil_factor_per_m: Field of one ampere, k_o in H = k_o I + H_PM.
-        magnet_field_a_per_m: Field of the permanent magnets, H_PM; 0 if there are none: the
-            displacement is then even in the current.
-        stiffness_n_per_m: Stiffness of the rods.
-        damping_ratio: Damping of the structure, measured without a load and kept with any: the
-            guides of a load add friction of their own.
-        moving_mass_kg: Rods, head and nut.
-        sensor_bandwidth_hz: Corner of the first-order sensor.
-        sensor_noise_um: Noise of each reading, rms.
-        sensor_range_um: Reading at either end of the sensor's range.
-        drift_um: Displacement that slow growth of the rods comes to, beside all the rest.
-        drift_s: Time constant of that growth.
-        step_max_s: Longest internal time step.
-        rods: Physics of the rods.
-        creep: Creep of the rods.
-        thermal: Growth with their temperature.
-        second_mode: A mode of the structure beside the first.
-        amplifier: Limit of the amplifier's voltage.
     """
 
-    dac_range_a: float = 10.0
-    dac_codes: int = 32767
-    amplifier_bandwidth_hz: float = 10e3
-    coil_factor_per_m: float = 5.09e3
-    magnet_field_a_per_m: float = 44.1e3
-    stiffness_n_per_m: float = 33.597e6
-    damping_ratio: float = 0.12
-    moving_mass_kg: float = 0.162
-    sensor_bandwidth_hz: float = 15e3
-    sensor_noise_um: float = 0.03553
-    sensor_range_um: float = 125.0
-    drift_um: float = 0.0
-    drift_s: float = 1.0
-    step_max_s: float = 10e-6
-    rods: RodParameters = field(default_factory=PinnedCellsParameters)
-    creep: CreepEffect | None = None
-    thermal: Thermal | None = None
-    second_mode: SecondMode | None = None
-    amplifier: VoltageLimit | None = None
+    dac_range_a: float = 10.0  # current at either end of the DAC's range
+    dac_codes: int = 32767  # codes on either side of zero (DAC and ADCs)
+    amplifier_bandwidth_hz: float = 10e3  # corner of the first-order current loop
+    coil_factor_per_m: float = 5.09e3  # field of one ampere, k_o in H = k_o I + H_PM
+    magnet_field_a_per_m: float = 44.1e3  # of the permanent magnets, H_PM; 0 without magnets
+    stiffness_n_per_m: float = 33.597e6  # stiffness of the rods
+    damping_ratio: float = 0.12  # of the structure; the same with a load, whose guides add friction
+    moving_mass_kg: float = 0.162  # rods, head and nut
+    sensor_bandwidth_hz: float = 15e3  # corner of the first-order sensor
+    sensor_noise_um: float = 0.03553  # noise of each reading, rms
+    sensor_range_um: float = 125.0  # reading at either end of the sensor's range
+    drift_um: float = 0.0  # final displacement of a slow growth of the rods
+    drift_s: float = 1.0  # time constant of that growth
+    step_max_s: float = 10e-6  # longest internal time step
+    rods: RodParameters = field(default_factory=PinnedCellsParameters)  # physics of the rods
+    creep: CreepEffect | None = None  # creep of the rods
+    thermal: Thermal | None = None  # growth with their temperature
+    second_mode: SecondMode | None = None  # a mode of the structure beside the first
+    amplifier: VoltageLimit | None = None  # limit of the amplifier's voltage
 
 
 def _motion(parameters: TerfenolParameters, load_kg: float, step_s: float) -> F64:
     """Return float64[m - 2, m], the exact step of structure and sensor for ``respond``.
 
-    Velocities are kept in um per radian of their natural frequency, so that the matrix is well
-    scaled.
+    Velocities are in um per radian of their natural frequency: the matrix is then well scaled.
     """
     omega = math.sqrt(parameters.stiffness_n_per_m / (parameters.moving_mass_kg + load_kg))
     modes = [(omega, parameters.damping_ratio, 1.0)]
@@ -214,25 +190,21 @@ class TerfenolActuator(Plant):
     ) -> None:
         """Build the actuator at rest.
 
-        Args:
-            parameters: Physical constants.
-            sample_rate_hz: Samples a second, > 0.
-            load_kg: Mass added to the moving mass, >= 0.
-            bias_a: Constant current beside the command; the displacement is zero there.
-            seed: Seed of the sensor noise.
+        ``load_kg`` is added to the moving mass, and ``bias_a`` to each command; the displacement
+        is zero at the bias.
         """
-        super().__init__(parameters.sensor_noise_um, seed)
         # The margin keeps rounding from adding a step where the period is a multiple of it.
         self._substeps = math.ceil(1.0 / (sample_rate_hz * parameters.step_max_s) - 1e-9)
+        # At a low rate one sample period has many steps: a chunk is then fewer samples.
+        chunk = max(1, CHUNK // self._substeps)
+        super().__init__(parameters.sensor_noise_um, seed, chunk)
         step_s = 1.0 / (sample_rate_hz * self._substeps)
         self._amplifier = _amplifier(parameters, step_s)
         ensure_compiled(amplify, respond)
         bias = parameters.magnet_field_a_per_m + parameters.coil_factor_per_m * bias_a
         self._rods = parameters.rods.rods(Coil(parameters.coil_factor_per_m, bias, step_s))
-        self._sensor = (
-            parameters.sensor_range_um / parameters.dac_codes,
-            parameters.sensor_range_um,
-        )
+        range_um = parameters.sensor_range_um
+        self._sensor = (range_um / parameters.dac_codes, range_um)
         self._drift = (parameters.drift_um, 1.0 / (parameters.drift_s * sample_rate_hz))
         self._samples = 0
         self._creep = _creep(parameters.creep, step_s)
@@ -250,10 +222,8 @@ class TerfenolActuator(Plant):
         self._motion = _motion(parameters, load_kg, step_s)
         self._mechanics = np.zeros(self._motion.shape[1])
         self._current = np.zeros(1)
-        # At a low rate one sample period has many steps: a part is then fewer samples.
-        self._part = max(1, CHUNK // self._substeps)
-        self._halves = np.empty(2 * self._part * self._substeps + 1)
-        self._free = np.empty(self._part * self._substeps)
+        self._halves = np.empty(2 * chunk * self._substeps + 1)
+        self._free = np.empty(chunk * self._substeps)
         self._parts = self._halves, self._free
         self.warm_up()
 
@@ -266,33 +236,25 @@ class TerfenolActuator(Plant):
         self._samples = 0
 
     def _advance(self, command: F64, noise_um: F64, displacement_um: F64, measured: F64) -> None:
-        whole, per_sample = self._drift
-        if whole:
-            past = np.arange(self._samples, self._samples + command.size)
-            noise_um -= whole * np.expm1(-past * per_sample)  # the sensor takes no notice of it
-        self._samples += command.size
-        if command.size <= self._part:
-            self._move(command, noise_um, displacement_um, measured)
-            return
-        for start in range(0, command.size, self._part):
-            part = slice(start, start + self._part)
-            self._move(command[part], noise_um[part], displacement_um[part], measured[part])
-
-    def _move(self, command: F64, noise_um: F64, displacement_um: F64, measured: F64) -> None:
         """Pass some samples through amplifier, rods and structure, one after the other.
 
         The rods do not act back on the amplifier, nor the structure on the rods; so each may take
-        all the steps at once.
+        all the steps together. The structure is not affected by drift and thermal growth.
         """
+        drift_um, per_sample = self._drift
+        if drift_um:
+            past = np.arange(self._samples, self._samples + command.size)
+            noise_um -= drift_um * np.expm1(-past * per_sample)
+        self._samples += command.size
         steps = command.size * self._substeps
         halves, free = self._parts
-        if free.size != steps:  # the views are kept: one block is as long as the next
+        if free.size != steps:  # the views are kept: blocks usually have one length
             self._parts = halves, free = self._halves[: 2 * steps + 1], self._free[:steps]
         amplify(command, measured, halves, self._current, self._amplifier, self._substeps)
         self._rods.follow(halves, free)
         if self._creep.size:
             creep(free, self._creep, self._rest_um)
-        if self._thermal is not None:  # the sensor takes no notice of it
+        if self._thermal is not None:
             warm(halves, noise_um, self._warmth, self._thermal, self._substeps)
         respond(
             free,

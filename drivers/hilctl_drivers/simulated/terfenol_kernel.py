@@ -16,14 +16,14 @@ Amplification: TypeAlias = tuple[float, float, float, float, float, float]
 
 @kernel("float64(float64, float64, float64, UniTuple(float64, 2))")
 def _toward(start: float, target: float, left: float, limit: tuple[float, float]) -> float:
-    """Return the current after some time: to the target by first order, as far as voltage goes.
+    """Return the current in A after some time: to the target by first order, within the voltage.
 
     Args:
-        start: Current in A before.
-        target: Current in A that is wanted.
-        left: What is then left of the error, had the amplifier all voltages.
-        limit: What is then left of a current that nothing drives, and the current in A that the
-            largest voltage holds, infinite if there is no limit.
+        start: Current before.
+        target: Requested current.
+        left: Remaining part of the error with unlimited voltage.
+        limit: Remaining part of a current that nothing drives, and the current that the largest
+            voltage holds.
     """
     decay, most = limit
     free = target + left * (start - target)
@@ -34,12 +34,7 @@ def _toward(start: float, target: float, left: float, limit: tuple[float, float]
 
 @kernel("void(float64[::1], float64[::1], float64[::1], float64[::1], UniTuple(float64, 6), int64)")
 def amplify(
-    command: F64,
-    current_a: F64,
-    halves_a: F64,
-    state: F64,
-    amplifier: Amplification,
-    substeps: int,
+    command: F64, current_a: F64, halves_a: F64, state: F64, amplifier: Amplification, substeps: int
 ) -> None:
     """Output commands and let the current follow.
 
@@ -49,8 +44,8 @@ def amplify(
         halves_a: float64[2 n substeps + 1], filled with the current at the start, then at the
             middle and the end of each step.
         state: float64[1], current in A; updated.
-        amplifier: What is left after half a step and after a step of the current's error, then of a
-            current that nothing drives; the current in A that the largest voltage holds; one DAC
+        amplifier: Remaining part after half a step and after a step of the current's error, then of
+            a current that nothing drives; the current in A that the largest voltage holds; one DAC
             code in A.
         substeps: Steps in a sample period.
     """
@@ -72,13 +67,10 @@ def amplify(
 
 @kernel("void(float64[::1], float64[:, ::1], float64)")
 def creep(free_um: F64, elements: F64, rest_um: float) -> None:
-    """Add what creeps to the free displacement.
+    """Add the creep to the free displacement, float64[n] at the end of each step.
 
-    Args:
-        free_um: float64[n], at the end of each step; changed.
-        elements: float64[3, m]: share, what is reached in a step, and displacement that each
-            element stands at, from rest; the last is updated.
-        rest_um: Free displacement at rest.
+    ``elements`` is float64[3, m]: share, part reached in a step, and displacement from rest of each
+    element; the last is updated.
     """
     for k in range(free_um.size):
         moved = free_um[k] - rest_um
@@ -95,13 +87,13 @@ def warm(
     thermal: tuple[float, float, float, float, float],
     substeps: int,
 ) -> None:
-    """Add what the rods have grown by at the instant of each sample, and warm them.
+    """Add the thermal growth of the rods at the instant of each sample, and warm them.
 
     Args:
         halves_a: float64[2 n substeps + 1], see ``amplify``.
         growth_um: float64[n], added to.
         state: float64[1], rise in K by the coil; updated.
-        thermal: Steady rise in K/A^2, what of it is reached in a step, growth in um/K, temperature
+        thermal: Steady rise in K/A^2, part reached in a step, growth in um/K, temperature
             of the room in K, bias in A.
         substeps: Steps in a sample period.
     """

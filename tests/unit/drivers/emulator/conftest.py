@@ -6,11 +6,22 @@ from contextlib import ExitStack
 import pytest
 
 from hilctl_drivers.emulator.factory import build
+from hilctl_drivers.emulator.modbus_device import EmulatedModbus
 from hilctl_drivers.emulator.options import EmulatorOptions
+from hilctl_drivers.emulator.rig import Bench, Rig, SimulatedWiring, WriteLog
+from hilctl_drivers.profile import load_profile
 from tests.fakes import emulated, logged
 
 MS = 1_000_000
 START_NS = 10_000_000_000
+
+
+def emulated_modbus(name, output, sensor, current_a=None):
+    """Return an emulated Modbus device that drives and shows a rig of its own."""
+    profile = load_profile(name)
+    wiring = SimulatedWiring.spread(profile.outputs[output], profile.inputs[sensor])
+    bench = Bench(Rig(0), wiring, WriteLog(None, 0))
+    return EmulatedModbus(profile, bench, output, sensor, current_a)
 
 
 class Emulated:

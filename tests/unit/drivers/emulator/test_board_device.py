@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 
 from hilctl_drivers.profile import shipped_profiles
-
-MS = 1_000_000
-START_NS = 10_000_000_000
+from tests.unit.drivers.emulator.conftest import MS, START_NS
 
 
 class TestBoard:

@@ -2,29 +2,10 @@
 
 import pytest
 
-from hilctl.base.errors import InputError
-from hilctl_drivers.emulator.modbus_device import EmulatedModbus, EmulatedWatchdog, RejectedRequest
-from hilctl_drivers.emulator.registers import RegisterMap
-from hilctl_drivers.emulator.rig import Rig, WriteLog
+from hilctl_drivers.emulator.modbus_device import EmulatedWatchdog
+from hilctl_drivers.emulator.registers import RegisterMap, RejectedRequest
 from hilctl_drivers.profile import load_profile
-
-
-def device_of(name: str, output: str, sensor: str, **more: float) -> EmulatedModbus:
-    return EmulatedModbus(load_profile(name), Rig(0), WriteLog(None, 0), output, sensor, **more)
-
-
-def test_unknown_channels_are_refused():
-    """The message says which there are."""
-    with pytest.raises(InputError, match=r"DAC9 .* outputs DAC0,"):
-        device_of("labjack_t7", "DAC9", "AIN0")
-
-
-def test_decline_carries_the_code():
-    """What a device declines becomes that exception reply."""
-    device = device_of("labjack_t7", "DAC0", "AIN0")
-    with pytest.raises(RejectedRequest) as declined:
-        device.read(["holding"], 9999, 1)
-    assert declined.value.code == 2
+from tests.unit.drivers.emulator.conftest import emulated_modbus
 
 
 @pytest.mark.parametrize(
@@ -39,14 +20,14 @@ def test_decline_carries_the_code():
 )
 def test_powers_up_as_its_profile_says(name, output, sensor, more, current_a, value):
     """Where that says nothing, or the power-up value was set, as if it had been set so."""
-    device = device_of(name, output, sensor, **more)
+    device = emulated_modbus(name, output, sensor, **more)
     assert device._rig.current_a == pytest.approx(current_a, abs=5e-3)
     assert device._outputs[output].value == pytest.approx(value, abs=2e-3)
 
 
-def test_trip_that_a_step_clears_keeps_the_command(tmp_path):
+def test_trip_that_a_step_clears_keeps_the_command():
     """The terminal is at the safe value and the register is not; a new command ends that."""
-    device = device_of("wago_750", "AO0", "AI0")
+    device = emulated_modbus("wago_750", "AO0", "AI0")
     device.write("holding", 0, [16384])
     device._watchdog.armed = device._watchdog.tripped = True
     device._trip(0)
@@ -99,21 +80,17 @@ def test_it_is_off_until_its_last_step_is_written():
     assert registers.watchdog.due_ns == 13 * S
 
 
-def test_any_request_feeds_it(armed):
+def test_any_request_feeds_it_and_ends_a_trip(armed):
+    """This device has no step that clears one."""
     armed.watchdog.request(12 * S)
     assert armed.watchdog.due_ns == 15 * S
-
-
-def test_a_write_of_zero_disarms_it(armed):
-    armed.write(61600, 0, 11 * S)
-    assert not armed.watchdog.armed
-    assert armed.watchdog.due_ns is None
-
-
-def test_a_trip_is_over_with_the_next_request(armed):
-    """This device has no step that clears one."""
     armed.watchdog.tripped = True
     assert armed.watchdog.due_ns is None
     armed.watchdog.request(20 * S)
     assert not armed.watchdog.tripped
     assert armed.watchdog.due_ns == 23 * S
+
+
+def test_a_write_of_zero_disarms_it(armed):
+    armed.write(61600, 0, 11 * S)
+    assert armed.watchdog.due_ns is None

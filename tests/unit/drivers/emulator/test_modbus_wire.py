@@ -4,7 +4,7 @@ import pytest
 
 from hilctl_drivers.emulator.modbus_device import EmulatedModbus
 from hilctl_drivers.emulator.modbus_wire import ModbusWire
-from hilctl_drivers.emulator.rig import Rig, SimulatedWiring, WriteLog
+from hilctl_drivers.emulator.rig import Bench, Rig, SimulatedWiring, WriteLog
 from hilctl_drivers.modbus.pdu import (
     ReadFrame,
     WriteFrame,
@@ -22,19 +22,15 @@ from hilctl_drivers.modbus.pdu import (
 from hilctl_drivers.modbus.register_map import RegisterFormat
 from hilctl_drivers.profile import load_profile
 from hilctl_drivers.transport.links import RefusedError
+from tests.unit.drivers.emulator.conftest import MS, emulated_modbus
 
 FLOAT32 = RegisterFormat("float32")
-MS = 1_000_000
-
-
-def device_of(name: str, output: str, sensor: str) -> EmulatedModbus:
-    return EmulatedModbus(load_profile(name), Rig(0), WriteLog(None, 0), output, sensor)
 
 
 @pytest.fixture
 def t7() -> ModbusWire:
     """An emulated T7 behind Modbus TCP."""
-    return ModbusWire("tcp", device_of("labjack_t7", "DAC0", "AIN0"))
+    return ModbusWire("tcp", {1: emulated_modbus("labjack_t7", "DAC0", "AIN0")})
 
 
 def requests(wire: ModbusWire, received: bytes) -> list[bytes]:
@@ -67,7 +63,7 @@ def test_feedback_reads_before_the_command_acts(t7):
 
 def test_coupler_reads_elsewhere_than_it_writes():
     """On a WAGO register 0 is written as output and read as input; 0x200 reads it back."""
-    wire = ModbusWire("tcp", device_of("wago_750", "AO0", "AI0"))
+    wire = ModbusWire("tcp", {1: emulated_modbus("wago_750", "AO0", "AI0")})
     raw = (8000).to_bytes(2, "big")
     assert abs(int.from_bytes(ask(wire, write_read_pdu(0, 1, 0, raw)), "big", signed=True)) < 90
     assert ask(wire, read_pdu(3, 0x200, 1)) == raw
@@ -110,7 +106,7 @@ def test_requests_in_one_segment_are_all_answered(t7):
 
 def test_rtu_ignores_others_and_rubbish():
     """Another unit's request and a spoilt one get no reply."""
-    wire = ModbusWire("rtu", device_of("wago_750", "AO0", "AI0"))
+    wire = ModbusWire("rtu", {1: emulated_modbus("wago_750", "AO0", "AI0")})
     pdu = read_pdu(3, 0x200, 1)
     good = rtu_adu(1, pdu)
     (request,) = requests(wire, good)
@@ -121,9 +117,9 @@ def test_rtu_ignores_others_and_rubbish():
 
 def test_units_share_a_line_and_a_rig():
     """One unit drives, the other shows; neither has the other's registers."""
-    rig, log, wiring = Rig(0), WriteLog(None, 0), SimulatedWiring(1.0, 0.0, 12.5, 0.0)
-    drives = EmulatedModbus(load_profile("adam_4024"), rig, log, "AO0", None, wiring)
-    reads = EmulatedModbus(load_profile("adam_4117"), rig, log, None, "AI2", wiring)
+    bench = Bench(Rig(0), SimulatedWiring(1.0, 0.0, 12.5, 0.0), WriteLog(None, 0))
+    drives = EmulatedModbus(load_profile("adam_4024"), bench, "AO0", None)
+    reads = EmulatedModbus(load_profile("adam_4117"), bench, None, "AI2")
     wire = ModbusWire("rtu", {1: drives, 2: reads})
 
     def transact(unit: int, pdu: bytes, now_ns: int) -> bytes:
@@ -132,22 +128,22 @@ def test_units_share_a_line_and_a_rig():
 
     transact(1, write_single_pdu(0, (4095).to_bytes(2, "big")), 0)
     raw = int.from_bytes(transact(2, read_pdu(3, 2, 1), 10 * MS), "big")
-    assert 12.5 * (raw * 20.0 / 65535.0 - 10.0) == pytest.approx(rig.displacement_um, abs=0.01)
-    assert rig.displacement_um > 40.0
+    assert 12.5 * (raw * 20.0 / 65535.0 - 10.0) == pytest.approx(
+        bench.rig.displacement_um, abs=0.01
+    )
+    assert bench.rig.displacement_um > 40.0
     with pytest.raises(RefusedError):
         transact(2, write_single_pdu(0, bytes(2)), 10 * MS)
     assert requests(wire, rtu_adu(3, read_pdu(3, 0, 1))) == []
 
 
-def test_gateway_says_that_a_unit_is_not_there():
+def test_gateway_says_that_a_unit_is_not_there(t7):
     """Over TCP a unit that nobody has is exception 11; one device alone takes any unit."""
-    device = device_of("labjack_t7", "DAC0", "AIN0")
+    device = emulated_modbus("labjack_t7", "DAC0", "AIN0")
     pdu = read_pdu(3, 1000, 2)
-    wire = ModbusWire("tcp", {1: device, 2: device_of("labjack_t7", "DAC0", "AIN0")})
+    wire = ModbusWire("tcp", {1: device, 2: device})
     (request,) = requests(wire, tcp_adu(7, 3, pdu))
     with pytest.raises(RefusedError) as refusal:
         reply_data(pdu, tcp_pdu(wire.answer(request, 0).data, 7, 3))
     assert refusal.value.code == 11
-    alone = ModbusWire("tcp", device)
-    (request,) = requests(alone, tcp_adu(7, 3, pdu))
-    assert len(reply_data(pdu, tcp_pdu(alone.answer(request, 0).data, 7, 3))) == 4
+    assert len(reply_data(pdu, tcp_pdu(t7.answer(request, 0).data, 7, 3))) == 4

@@ -9,7 +9,6 @@ from hilctl_drivers.emulator.options import (
     FaultPlan,
     WireFault,
     parse_fault,
-    spoil,
 )
 
 
@@ -59,13 +58,3 @@ def test_each_happens_once_when_it_is_due():
     assert [fault.kind if fault else None for fault in seen] == [
         None, "cut", None, "reset", None,
     ]  # fmt: skip
-    assert plan.count == 5
-
-
-def test_bytes_are_spoilt_as_said():
-    """One byte changed, half left out, all sent twice."""
-    reply = bytes(range(8))
-    assert spoil("corrupt", reply, 3) == bytes([0, 1, 2, 3 ^ 0x10, 4, 5, 6, 7])
-    assert spoil("cut", reply, 3) == reply[:4]
-    assert spoil("duplicate", reply, 3) == reply + reply
-    assert spoil("delay", reply, 3) == reply

@@ -2,7 +2,7 @@
 
 import pytest
 
-from hilctl_drivers.emulator.registers import NoSuchRegister, RegisterBank, RegisterMap, Words
+from hilctl_drivers.emulator.registers import RegisterBank, RegisterMap, RejectedRequest, Words
 from hilctl_drivers.modbus.register_map import Register
 from hilctl_drivers.profile import load_profile
 
@@ -35,15 +35,15 @@ def test_all_of_a_value_is_written_or_nothing(bank):
     target.words[:] = words
     assert bank.read(["holding"], 10, 2) == bank.written("holding", 10, 2) == [1, 2]
     for address, values in ((10, [1]), (11, [1]), (10, [1, 2, 3])):
-        with pytest.raises(NoSuchRegister):
+        with pytest.raises(RejectedRequest):
             bank.targets("holding", address, values)
 
 
 def test_what_is_read_only_is_not_there_for_writes(bank):
     assert bank.read(["holding", "input"], 20, 2) == [0, 0]
-    with pytest.raises(NoSuchRegister):
+    with pytest.raises(RejectedRequest):
         bank.targets("input", 20, [1, 2])
-    with pytest.raises(NoSuchRegister):
+    with pytest.raises(RejectedRequest):
         bank.read(["holding"], 20, 1)
 
 
@@ -62,5 +62,5 @@ def test_a_profile_s_registers_are_all_there():
     assert found.memory.read(["holding"], 1000, 2) == [0x4020, 0]
     assert found.memory.read(["holding"], 55100, 2) == [0x0011, 0x2233]
     assert {id(step) for step in profile.init} <= found.steps.keys()
-    with pytest.raises(NoSuchRegister):
+    with pytest.raises(RejectedRequest):
         found.memory.targets("holding", 0, [0, 0])

@@ -5,8 +5,7 @@ import pytest
 
 from hilctl_drivers.emulator.rig import RATE_HZ, Rig, SampleFifo
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
-
-MS = 1_000_000
+from tests.unit.drivers.emulator.conftest import MS
 
 
 def test_is_the_actuator_on_its_own_clock():

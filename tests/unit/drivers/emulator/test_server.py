@@ -12,13 +12,9 @@ import pytest
 from pymodbus.client import ModbusTcpClient
 
 from hilctl_drivers.emulator.options import parse_fault
-from hilctl_drivers.emulator.server import EmulatorServer, PtyConnection, TcpConnection
+from hilctl_drivers.emulator.server import EmulatorServer
 from hilctl_drivers.emulator.wire import EmulatedReply
-from hilctl_drivers.modbus.pdu import (
-    read_pdu,
-    tcp_adu,
-    write_pdu,
-)
+from hilctl_drivers.modbus.pdu import read_pdu, tcp_adu, write_pdu
 from hilctl_drivers.modbus.register_map import RegisterFormat
 from tests.fakes import logged, received
 
@@ -37,18 +33,6 @@ def test_independent_client_agrees(served):
         test = client.read_input_registers(55100, count=2).registers
         assert test == [0x0011, 0x2233]
         assert client.read_holding_registers(9999, count=1).exception_code == 2
-
-
-def test_pipelined_requests_are_answered_in_order(served):
-    """Two requests in one segment get two replies."""
-    host, port = served("labjack_t7").split(":")
-    pdu = read_pdu(3, 1000, 2)
-    with socket.create_connection((host, int(port)), 5.0) as link:
-        link.sendall(tcp_adu(1, 1, pdu) + tcp_adu(2, 1, pdu))
-        got = b""
-        while len(got) < 26:
-            got += link.recv(100)
-    assert (got[:2], got[13:15]) == (b"\x00\x01", b"\x00\x02")
 
 
 def test_log_tells_time_and_value(served, tmp_path):
@@ -156,11 +140,7 @@ def test_what_the_host_does_not_read_waits_for_room(serving):
     server = serving(EchoWire(size=100_000), EchoWire())
     os.write(server.ports[0], b"ab")
     assert server.ask(b"c", which=1) == b"c"
-    got = b""
-    while len(got) < 200_000:
-        assert select.select([server.ports[0]], [], [], 5.0)[0]
-        got += os.read(server.ports[0], 65536)
-    assert got == 100_000 * b"a" + 100_000 * b"b"
+    assert received(server.ports[0], 200_000) == 100_000 * b"a" + 100_000 * b"b"
 
 
 def test_late_request_is_carried_out_after_its_host_has_gone(served, tmp_path):
@@ -182,80 +162,32 @@ def test_late_request_is_carried_out_after_its_host_has_gone(served, tmp_path):
     assert written == [2.0, 3.0]
 
 
-@pytest.fixture
-def tcp():
-    """Both ends of a connection over TCP."""
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        host = socket.create_connection(server.getsockname(), 5.0)
-        connection = TcpConnection(server.accept()[0], None)
-        yield host, connection
-        host.close()
-        connection.close()
-
-
-def test_tcp_hands_on_what_comes_and_tells_the_end(tcp):
-    host, connection = tcp
-    host.sendall(b"ask")
-    assert connection.read() == b"ask"
-    connection.send(b"answer")
-    assert host.recv(100) == b"answer"
-    host.close()
-    assert connection.read() is None
-
-
-def test_a_reset_is_not_a_hang_up(tcp):
+def test_a_reset_is_not_a_hang_up(served):
     """The host sees a connection that broke, not one that was closed in order."""
-    host, connection = tcp
-    connection.close(reset=True)
-    with pytest.raises(ConnectionResetError):
-        host.recv(100)
+    host, port = served("labjack_t7", faults=(parse_fault("reset@1"),)).split(":")
+    with socket.create_connection((host, int(port)), 5.0) as link:
+        link.sendall(tcp_adu(1, 1, read_pdu(3, 1000, 2)))
+        with pytest.raises(ConnectionResetError):
+            link.recv(100)
 
 
-@pytest.fixture
-def pty():
-    connection = PtyConnection(None, faulty=False)
-    host = os.open(connection.name, os.O_RDWR | os.O_NOCTTY)
-    yield host, connection
-    os.close(host)
-    connection.close()
-
-
-def test_a_pty_waits_without_blocking_and_passes_all_bytes(pty):
+def test_a_pty_passes_all_bytes(serving):
     """Raw: no byte is a line end, a flow control or a signal."""
-    host, connection = pty
-    assert connection.read() == b""
+    server = serving(EchoWire())
     every = bytes(range(256))
-    os.write(host, every)
-    got = b""
-    while len(got) < len(every) and select.select([connection], [], [], 5.0)[0]:
-        got += connection.read()
-    assert got == every
-    connection.send(every)
-    assert received(host, 256) == every
+    os.write(server.ports[0], every)
+    assert received(server.ports[0], 256) == every
 
 
-def test_what_a_host_does_not_read_waits(pty):
-    """A full line blocks nobody; the rest goes with the next call."""
-    host, connection = pty
-    sent = os.urandom(1 << 20)
-    connection.send(sent)
-    assert 0 < len(connection.unsent) < len(sent)
-    got = b""
-    while len(got) < len(sent):
-        got += os.read(host, 1 << 16)
-        connection.send(b"")
-    assert got == sent
-    assert connection.unsent == b""
-
-
-def test_nobody_else_gets_the_name_of_an_unplugged_line():
-    """A host that tries it again must not reach another device."""
-    pulled = PtyConnection(None, faulty=True)
-    pulled.unplug()
-    other = PtyConnection(None, faulty=True)
-    try:
-        assert not Path(pulled.name).exists()
-        assert other.name != pulled.name
-    finally:
-        pulled.close()
-        other.close()
+def test_no_other_device_gets_the_name_of_an_unplugged_line(serving):
+    """A host that opens it again must not reach another device."""
+    server = serving(EchoWire(), faults=["unplug@1"])
+    name = os.ttyname(server.ports[0])
+    os.write(server.ports[0], b"a")
+    select.select([server.ports[0]], [], [], 5.0)
+    assert os.read(server.ports[0], 10) == b""
+    master, slave = os.openpty()
+    assert not Path(name).exists()
+    assert os.ttyname(slave) != name
+    os.close(master)
+    os.close(slave)

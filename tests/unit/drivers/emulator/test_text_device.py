@@ -5,10 +5,7 @@ from pathlib import Path
 import pytest
 
 from hilctl_drivers.emulator.text_device import TemplateMatcher, in_style
-
-MS = 1_000_000
-START_NS = 10_000_000_000
-
+from tests.unit.drivers.emulator.conftest import MS, START_NS
 
 DCON = (Path(__file__).parents[3] / "data" / "dcon_module.yaml").read_text()
 

@@ -9,8 +9,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hilctl.base.types import F64
-from hilctl_drivers.simulated.actuator_base import CHUNK, Coil, SensorNoise
+from hilctl_drivers.simulated.actuator_base import (
+    CHUNK,
+    VACUUM_PERMEABILITY,
+    Coil,
+    RodParameters,
+    SensorNoise,
+)
 from hilctl_drivers.simulated.devices import PHYSICS, Physics
+from hilctl_drivers.simulated.domains import DomainsParameters
+from hilctl_drivers.simulated.jiles_atherton import JilesAthertonParameters
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 
 RATED = TerfenolParameters()
@@ -36,8 +44,6 @@ def test_noise_is_that_of_one_draw(parts: list[int]) -> None:
 
 
 class TestBlocks:
-    """Blocks, seeds and held samples."""
-
     COMMAND_A = 6.0 * np.sin(np.arange(6000) / 30.0)
 
     @settings(max_examples=30, deadline=None)
@@ -49,13 +55,6 @@ class TestBlocks:
         parts = [run(actuator, part) for part in np.split(self.COMMAND_A, sorted(cuts))]
         np.testing.assert_array_equal(np.concatenate(parts), whole)
 
-    def test_sample_by_sample(self) -> None:
-        """Blocks of one give the same bits as one block."""
-        whole = run(TerfenolActuator(RATED, RATE_HZ), self.COMMAND_A[:500])
-        actuator = TerfenolActuator(RATED, RATE_HZ)
-        parts = [run(actuator, self.COMMAND_A[k : k + 1]) for k in range(500)]
-        np.testing.assert_array_equal(np.concatenate(parts), whole)
-
     def test_seed_decides_the_noise(self) -> None:
         """Equal seeds give equal readings, others do not."""
         one, same, other = (
@@ -64,13 +63,6 @@ class TestBlocks:
         np.testing.assert_array_equal(one, same)
         assert not np.array_equal(one, other)
 
-    def test_reset_starts_over(self) -> None:
-        """After a reset the actuator gives the same readings as a new one."""
-        actuator = TerfenolActuator(RATED, RATE_HZ)
-        first = run(actuator, self.COMMAND_A)
-        actuator.reset()
-        np.testing.assert_array_equal(run(actuator, self.COMMAND_A), first)
-
     def test_hold_is_a_constant_command(self) -> None:
         """Holding equals sending the same command that many times, over any length."""
         sent, held = TerfenolActuator(RATED, RATE_HZ), TerfenolActuator(RATED, RATE_HZ)
@@ -78,14 +70,7 @@ class TestBlocks:
         held.hold(10_000, 2.5)
         np.testing.assert_array_equal(run(held, self.COMMAND_A), run(sent, self.COMMAND_A))
 
-    def test_command_is_left_alone(self) -> None:
-        """A read-only command is good enough."""
-        command_a = self.COMMAND_A.copy()
-        command_a.setflags(write=False)
-        run(TerfenolActuator(RATED, RATE_HZ), command_a)
 
-
-NEW = [name for name in PHYSICS if name != "pinned_cells"]
 rigs = pytest.mark.parametrize("physics", PHYSICS)
 
 
@@ -112,12 +97,15 @@ def loop(
 
 
 def hysteresis_percent(command_a: F64, displacement_um: F64) -> float:
-    """Largest gap between the branches at one command, per peak-to-peak."""
-    half = command_a.size // 2
-    levels = np.linspace(command_a[0], command_a[half], 1001)
-    up_um = np.interp(levels, command_a[: half + 1], displacement_um[: half + 1])
-    back = np.append(np.arange(half, command_a.size), 0)[::-1]
-    gap_um = np.interp(levels, command_a[back], displacement_um[back]) - up_um
+    """Largest gap between descending and ascending branch at one command, per peak-to-peak."""
+    start = -int(np.argmin(command_a))
+    command_a, displacement_um = np.roll(command_a, start), np.roll(displacement_um, start)
+    turn = int(np.argmax(command_a))
+    levels = np.linspace(command_a[0], command_a[turn], 1001)
+    ascending = np.interp(levels, command_a[: turn + 1], displacement_um[: turn + 1])
+    back_a = np.append(command_a[turn:], command_a[0])[::-1]
+    back_um = np.append(displacement_um[turn:], displacement_um[0])[::-1]
+    gap_um = np.interp(levels, back_a, back_um) - ascending
     return float(100.0 * gap_um.max() / np.ptp(displacement_um))
 
 
@@ -128,14 +116,12 @@ class TestPublishedRanges:
     def test_stroke(self, physics: Physics) -> None:
         """A 6 A sine of 1 Hz moves it by 60 to 100 um (published: 83.1)."""
         stroke_um = np.ptp(loop(physics, 6.0, 1.0)[1])
-        print(f"{physics}: {stroke_um:.1f} um")
         assert 60.0 <= stroke_um <= 100.0
 
     @rigs
     def test_hysteresis_grows_with_the_frequency(self, physics: Physics) -> None:
         """10 to 25 % at 1 Hz, 35 to 50 % at 250 Hz (published: 18.2 and 49.1)."""
         figures = [hysteresis_percent(*loop(physics, 6.0, hz)) for hz in (1.0, 50.0, 100.0, 250.0)]
-        print(physics, " ".join(f"{figure:.1f}" for figure in figures))
         assert figures == sorted(figures)
         assert 10.0 <= figures[0] <= 25.0
         assert 35.0 <= figures[-1] <= 50.0
@@ -149,17 +135,7 @@ class TestPublishedRanges:
 
 
 class TestOneState:
-    """Nothing but what came before decides what comes."""
-
     COMMAND_A = np.random.default_rng(5).uniform(-7.0, 7.0, 60).repeat(50)
-
-    @rigs
-    def test_cut_does_not_matter(self, physics: Physics) -> None:
-        """Readings are the same bit for bit wherever the blocks are cut."""
-        whole = run(TerfenolActuator(parameters(physics), RATE_HZ), self.COMMAND_A)
-        actuator = TerfenolActuator(parameters(physics), RATE_HZ)
-        parts = [run(actuator, part) for part in np.split(self.COMMAND_A, [1, 2, 50, 777, 2990])]
-        np.testing.assert_array_equal(np.concatenate(parts), whole)
 
     @rigs
     def test_cut_does_not_matter_at_a_low_rate(self, physics: Physics) -> None:
@@ -169,14 +145,6 @@ class TestOneState:
         actuator = TerfenolActuator(parameters(physics), 10.0)
         parts = [run(actuator, command_a[k : k + 1]) for k in range(command_a.size)]
         np.testing.assert_array_equal(np.concatenate(parts), whole)
-
-    @rigs
-    def test_reset_starts_over(self, physics: Physics) -> None:
-        """After a reset it is as new."""
-        actuator = TerfenolActuator(parameters(physics), RATE_HZ)
-        first = run(actuator, self.COMMAND_A)
-        actuator.reset()
-        np.testing.assert_array_equal(run(actuator, self.COMMAND_A), first)
 
     @rigs
     @pytest.mark.parametrize("bias_a", [0.0, -3.96, 5.89])
@@ -194,19 +162,20 @@ class TestOneState:
         other = run(TerfenolActuator(turned, RATE_HZ), -self.COMMAND_A)
         np.testing.assert_allclose(one, other, atol=0.004)
 
-    @pytest.mark.parametrize("physics", NEW)
+    @rigs
     @pytest.mark.parametrize(("rate_hz", "frequency_hz"), [(50e3, 250.0), (500.0, 25.0)])
     def test_integration_has_converged(
         self, physics: Physics, rate_hz: float, frequency_hz: float
     ) -> None:
-        """A tenth of the internal step moves no reading by more than 50 nm."""
+        """A tenth of the internal step moves no reading by more than 50 nm; the default 10 nm."""
         rated = parameters(physics)
         n = round(3 * rate_hz / frequency_hz)
         command_a = 6.0 * np.sin(2.0 * np.pi * frequency_hz * np.arange(n) / rate_hz)
         fine = replace(rated, step_max_s=rated.step_max_s / 10.0)
         coarse_um = run(TerfenolActuator(rated, rate_hz), command_a)
         fine_um = run(TerfenolActuator(fine, rate_hz), command_a)
-        assert np.abs(coarse_um - fine_um).max() < 0.050
+        limit_um = 0.010 if physics == "pinned_cells" else 0.050
+        assert np.abs(coarse_um - fine_um).max() < limit_um
 
     @rigs
     def test_comes_to_rest_after_a_step(self, physics: Physics) -> None:
@@ -218,8 +187,6 @@ class TestOneState:
 
 
 class TestVaried:
-    """Factors on rods of any physics."""
-
     @rigs
     def test_strain_scales_the_displacement(self, physics: Physics) -> None:
         """And nothing else: the loop is the same, larger."""
@@ -251,3 +218,67 @@ def test_rods_rest_where_the_bias_has_been_for_long(physics: Physics) -> None:
     rest_um, free_um = rods.rest(), np.empty(10_000)
     rods.follow(np.zeros(20_001), free_um)
     np.testing.assert_allclose(free_um, rest_um, rtol=0.0, atol=1e-9)
+
+
+# Next to no losses: what is left does not know how fast the field goes.
+STILL = {
+    "domains": DomainsParameters(resistivity_ohm_m=1e3),
+    "jiles_atherton": JilesAthertonParameters(resistivity_ohm_m=1e3),
+}
+anhysteretic = pytest.mark.parametrize("rods", STILL.values(), ids=STILL)
+
+
+def magnetisation(rods: RodParameters, field: F64) -> F64:
+    """M at the end of each step from one field to the next, from the anhysteretic at the first."""
+    model = rods.rods(Coil(1.0, float(field[0]), 1e-5))
+    model.rest()
+    found = np.empty(field.size - 1)
+    for k in range(found.size):
+        ends = np.array([field[k], 0.5 * (field[k] + field[k + 1]), field[k + 1]]) - field[0]
+        model.follow(ends, np.empty(1))
+        state = model._state
+        found[k] = state[1] if state.ndim == 1 else state[2, 1] - state[2, 0]
+    return found
+
+
+@anhysteretic
+def test_decaying_field_ends_on_the_anhysteretic(rods: RodParameters) -> None:
+    """From far off it, a field that swings ever less leads back to it."""
+    decay = np.linspace(1.0, 0.0, 30_001)
+    field = 30e3 + 60e3 * decay * np.cos(2.0 * np.pi * np.arange(decay.size) / 400.0)
+    found = magnetisation(rods, np.concatenate([np.linspace(0.0, 90e3, 2000), field]))
+    rest = magnetisation(rods, np.full(2, 30e3))[0]
+    assert abs(found[1998] - rest) > 0.2 * rods.saturation_a_per_m
+    assert found[-1] == pytest.approx(rest, rel=0.02)
+
+
+@anhysteretic
+def test_minor_loop_does_not_close(rods: RodParameters) -> None:
+    """A small cycle on the rising branch ends elsewhere than it began, less so each time."""
+    up = np.linspace(13e3, 44e3, 1500)
+    dip = 44e3 - 5e3 * (1.0 - np.cos(2.0 * np.pi * np.arange(1, 401) / 400.0))
+    found = magnetisation(rods, np.concatenate([up, dip, dip, dip]))
+    tops = found[[1498, 1898, 2298, 2698]]
+    span = np.ptp(found[1498:1898])
+    assert tops[1] - tops[0] > 0.05 * span
+    assert 0.01 * span < tops[2] - tops[1] < tops[1] - tops[0]
+
+
+@anhysteretic
+def test_major_loop_closes(rods: RodParameters) -> None:
+    """Between the same ends each cycle is the one before, once the first quarter is forgotten."""
+    field = 90e3 * np.sin(2.0 * np.pi * np.arange(12_001) / 4000)
+    found = magnetisation(rods, field)
+    np.testing.assert_allclose(found[-4000:], found[-8000:-4000], atol=0.001 * 7.65e5)
+
+
+@pytest.mark.parametrize("rods", [*STILL.values(), DomainsParameters(), JilesAthertonParameters()])
+@pytest.mark.parametrize(("low", "high"), [(13e3, 75e3), (40e3, 48e3), (-90e3, 90e3)])
+def test_loops_take_energy(rods: RodParameters, low: float, high: float) -> None:
+    """The area of a steady loop of applied field and magnetisation is what it turns to heat."""
+    phase = 2.0 * np.pi * np.arange(16_001) / 2000
+    field = 0.5 * (low + high) + 0.5 * (high - low) * np.sin(phase)
+    found = magnetisation(rods, field)
+    rising = np.diff(np.append(found[-2001], found[-2000:]))
+    middle = 0.5 * (field[-2001:-1] + field[-2000:])
+    assert VACUUM_PERMEABILITY * float(rising @ middle) > 0.0

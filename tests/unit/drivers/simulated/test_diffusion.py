@@ -166,11 +166,3 @@ def test_is_its_differential_equation() -> None:
         before = np.clip(before, field - pinning[:, None], field + pinning[:, None])
         solved[k] = field
     assert np.abs(found - solved).max() < 0.002 * 60e3
-
-
-def test_varied_lag_is_conductivity() -> None:
-    """A lag times 1.2 is a rod that conducts 1.2 times as well."""
-    varied = RATED.varied(1.2, 0.9, 1.1)
-    assert varied.resistivity_ohm_m == pytest.approx(0.5e-6)
-    assert varied.pinning_max_a_per_m == pytest.approx(0.9 * RATED.pinning_max_a_per_m)
-    assert varied.saturation_strain == pytest.approx(1.1 * RATED.saturation_strain)

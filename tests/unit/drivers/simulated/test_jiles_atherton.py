@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from hilctl.base.types import F64
-from hilctl_drivers.simulated.actuator_base import VACUUM_PERMEABILITY, Coil
+from hilctl_drivers.simulated.actuator_base import Coil
 from hilctl_drivers.simulated.jiles_atherton import (
     JilesAtherton,
     JilesAthertonParameters,
@@ -18,8 +18,6 @@ from hilctl_drivers.simulated.jiles_atherton import (
 )
 
 RATED = JilesAthertonParameters()
-# Next to no loss: what is left does not know how fast the field goes.
-STILL = replace(RATED, resistivity_ohm_m=1e3)
 STEP_S = 1e-5
 
 
@@ -36,26 +34,6 @@ def anhysteretic(field: float, rods: JilesAthertonParameters = RATED) -> float:
         return magnetisation - saturation * langevin_by_formula(inner)
 
     return float(brentq(excess, -saturation, saturation, xtol=1e-6))
-
-
-def magnetisation(rods: JilesAthertonParameters, field: F64) -> F64:
-    """M at the end of each step from one field to the next, from the anhysteretic at the first."""
-    model = JilesAtherton(rods, Coil(1.0, 0.0, STEP_S))
-    model.rest()
-    model._state[:] = field[0], anhysteretic(float(field[0]), rods)
-    found = np.empty(field.size - 1)
-    for k in range(found.size):
-        ends = np.array([field[k], 0.5 * (field[k] + field[k + 1]), field[k + 1]])
-        model.follow(ends, np.empty(1))
-        found[k] = model._state[1]
-    return found
-
-
-def swing(low: float, high: float, n: int, cycles: int) -> F64:
-    """From the middle, a sine between two fields."""
-    phase = 2.0 * np.pi * np.arange(n * cycles + 1) / n
-    field: F64 = 0.5 * (low + high) + 0.5 * (high - low) * np.sin(phase)
-    return field
 
 
 @pytest.mark.parametrize("x", [-300.0, -0.5, -0.051, -0.049, 1e-4, 0.05, 3.0, 500.0])
@@ -86,15 +64,6 @@ def test_rests_on_the_anhysteretic(bias: float) -> None:
         assert rest_um == pytest.approx(full_um, rel=0.01)
 
 
-def test_decaying_field_ends_on_the_anhysteretic() -> None:
-    """From far off it, a field that swings ever less leads back to it."""
-    decay = np.linspace(1.0, 0.0, 40_001)
-    field = 30e3 + 60e3 * decay * np.cos(2.0 * np.pi * np.arange(decay.size) / 400.0)
-    found = magnetisation(STILL, np.concatenate([np.linspace(0.0, 90e3, 2000), field]))
-    assert abs(found[1998] - anhysteretic(30e3)) > 0.2 * RATED.saturation_a_per_m
-    assert found[-1] == pytest.approx(anhysteretic(30e3), rel=0.02)
-
-
 def test_susceptibility_is_never_negative() -> None:
     """Wherever M stands, a field that grows does not make it fall: the one guard there is."""
     material = JilesAtherton(RATED, Coil(1.0, 0.0, STEP_S))._material
@@ -102,35 +71,6 @@ def test_susceptibility_is_never_negative() -> None:
         for start in np.linspace(-7e5, 7e5, 15):
             assert susceptibility(field, start, 1.0, material) > 0.0
             assert susceptibility(field, start, -1.0, material) > 0.0
-
-
-def test_major_loop_closes() -> None:
-    """Between the same ends each cycle is the one before, once the first quarter is forgotten."""
-    found = magnetisation(STILL, swing(-90e3, 90e3, 4000, 3))
-    np.testing.assert_allclose(found[-4000:], found[-8000:-4000], atol=0.001 * 7.65e5)
-
-
-def test_minor_loop_does_not_close() -> None:
-    """A small cycle on the rising branch ends elsewhere than it began, and again the next time."""
-    up = np.linspace(13e3, 44e3, 1500)
-    dip = 44e3 - 5e3 * (1.0 - np.cos(2.0 * np.pi * np.arange(1, 401) / 400.0))
-    found = magnetisation(STILL, np.concatenate([up, dip, dip, dip]))
-    tops = found[[1498, 1898, 2298, 2698]]
-    span = np.ptp(found[1498:1898])
-    assert tops[1] - tops[0] > 0.1 * span
-    assert tops[2] - tops[1] > 0.01 * span
-    assert abs(tops[2] - tops[1]) < abs(tops[1] - tops[0])
-
-
-@pytest.mark.parametrize("rods", [STILL, RATED], ids=["static", "with losses"])
-@pytest.mark.parametrize(("low", "high"), [(13e3, 75e3), (40e3, 48e3), (-90e3, 90e3)])
-def test_loops_take_energy(rods: JilesAthertonParameters, low: float, high: float) -> None:
-    """The area of a steady loop of applied field and magnetisation is what it turns to heat."""
-    field = swing(low, high, 2000, 8)
-    found = magnetisation(rods, field)
-    rising = np.diff(np.append(found[-2001], found[-2000:]))
-    middle = 0.5 * (field[-2001:-1] + field[-2000:])
-    assert VACUUM_PERMEABILITY * float(rising @ middle) > 0.0
 
 
 def test_losses_are_the_published_ones() -> None:
