@@ -265,7 +265,7 @@ def _writer_of(options: ModbusOptions) -> ModbusEndpoint:
     changes = {key: getattr(options, key) for key in ("baud", "parity", "stopbits")}
     given = [key for key, value in changes.items() if value is not None]
     if given and not isinstance(profile.link, ModbusRtuLink):
-        raise InputError(f"{', '.join(given)} must be left out: {profile.title} has no line")
+        raise InputError(f"{', '.join(given)} must be omitted: {profile.title} has no line")
     return ModbusEndpoint.of(options, with_link(profile, **changes), options.timeout_s)
 
 
