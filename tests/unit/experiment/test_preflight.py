@@ -72,6 +72,8 @@ class DescribedDevice:
 
     open = output = exchange = make_safe = refuse
 
+    def check_rate(self, sample_rate_hz: float, block: int) -> None: ...
+
     def close(self) -> None: ...
 
 

@@ -50,6 +50,9 @@ LOOKING_AHEAD = StagedModel.around(RDPI, lag=FieldLag(tau_s=2e-3))
 class DescribedDevice:
     info = INFO
 
+    def check_rate(self, sample_rate_hz, block):
+        pass
+
 
 def checked(model=None, amplitude=4.0, offset=0.0, hz=10.0, peak_a=7.0, limits=""):
     text = TEXT.replace("WAVEFORM", SINE).replace("UNIT", "A" if model is None else "um")
