@@ -125,6 +125,7 @@ def _table(part: dict[str, Any]) -> str:
     rows = ["| key | value | default | meaning |", "|---|---|---|---|"]
     for key, value in part["properties"].items():
         meaning = value.get("description") or said.get(key, "")
+        meaning = meaning or ("selects this section" if key == "kind" else "")
         default = "*required*" if key in part.get("required", ()) else _default(value)
         rows.append(f"| `{key}` | {_values(value)} | {default} | {_plain(meaning)} |")
     return "\n".join(rows) + "\n"
