@@ -150,7 +150,9 @@ def _values(value: dict[str, Any]) -> str:
     if "const" in value:
         return f"`{value['const']}`"
     if "enum" in value:
-        return ", ".join(f"`{each}`" for each in value["enum"])
+        return ", ".join(
+            f"`{str(each).encode('unicode_escape').decode()}`" for each in value["enum"]
+        )
     for choice in ("anyOf", "oneOf"):
         if choice in value:
             found = [_values(each) for each in value[choice] if each.get("type") != "null"]

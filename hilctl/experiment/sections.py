@@ -149,7 +149,7 @@ class _AnyFeedback(StrictModel):
         " bandwidth, Hz; default: that of the model's structure",
     )
     damping_ratio: float | None = Field(
-        default=None, gt=0.0, le=2.0, description="damping ratio of that resonance"
+        default=None, gt=0.0, le=2.0, description="damping ratio at resonance_hz"
     )
 
 
@@ -198,7 +198,7 @@ class AdaptationConfig(StrictModel):
         weight: Largest weight of each play after the model, relative to the identified gain.
         noise_um: Standard deviation of the sensor's noise, for the dead zone. Default: that of the
             rest before the waveform (``condition`` or ``compensator.offset: measured``).
-        sensor_delay_s: See ``feedback``.
+        sensor_delay_s: Delay of the sensor and its line beyond the model's.
     """
 
     time_constant_s: Annotated[float, Field(gt=0.0, le=3600.0)] = 1.0

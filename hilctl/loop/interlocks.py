@@ -99,7 +99,7 @@ class InterlockSettings(StrictModel):
         )
     )
     deviation_s: Annotated[_NotNegative | None, InterlockRequirement(key="measured_deviation")] = (
-        Field(default=None, description="time for which it may be larger, s; default: 0")
+        Field(default=None, description="time for which the deviation may be larger, s; default: 0")
     )
 
     @property

@@ -146,7 +146,7 @@ class Register(StrictModel):
         description="byte order on the wire (A is the most significant): ABCD, CDAB, BADC, DCBA;"
         " default: most significant first",
     )
-    scale: float = Field(default=1.0, description="value of one raw step")
+    scale: float = Field(default=1.0, description="value = raw * scale + offset")
     offset: float = Field(default=0.0, description="value at raw 0")
 
     @model_validator(mode="after")
