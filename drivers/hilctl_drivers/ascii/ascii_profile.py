@@ -58,14 +58,16 @@ class AsciiLink(SerialLineSettings):
     """Lines of text: SCPI, DCON and the like."""
 
     kind: Literal["ascii"]
-    terminator: Literal["\r", "\n", "\r\n"] = Field(description="end of what is sent")
-    reply_terminator: Literal["\r", "\n", "\r\n"] = Field(description="end of what comes back")
+    terminator: Literal["\r", "\n", "\r\n"] = Field(description="end of a sent line")
+    reply_terminator: Literal["\r", "\n", "\r\n"] = Field(description="end of a reply")
     checksum: Literal["none", "dcon", "gen"] = Field(
         default="none", description="dcon: two hex digits; gen: $ and two hex digits"
     )
     echo: bool = Field(default=False, description="whether the device repeats what is sent")
     min_gap_s: float = Field(default=0.0, ge=0.0, description="silence between commands, s")
-    max_line_chars: int | None = Field(default=None, ge=1, description="longest line it takes")
+    max_line_chars: int | None = Field(
+        default=None, ge=1, description="longest line that it accepts"
+    )
 
     @property
     def silence_s(self) -> float:
@@ -74,7 +76,7 @@ class AsciiLink(SerialLineSettings):
 
 
 class Reply(StrictModel):
-    """What a good reply looks like."""
+    """Form of a good reply."""
 
     pattern: Pattern = Field(description="regular expression for a whole reply, no terminator")
     example: str = Field(description="a reply as in the manual; pattern must match it")
@@ -106,18 +108,18 @@ class NumberReply(Reply):
 
 
 class Query(NumberReply):
-    """A question that is answered by a number."""
+    """A query with a number as its reply."""
 
-    ask: LineTemplate
+    ask: LineTemplate = Field(description="line that is sent")
 
 
 class Readback(Query):
-    """What an output is asked for."""
+    """Query of an output."""
 
     of: Literal["command", "output"] = Field(
         default="command",
-        description="what it says: the last command, whatever the watchdog has put out since; or"
-        " what the output is at",
+        description="command: the last command, even after a trip of the watchdog; output: the"
+        " present output",
     )
 
 
@@ -125,9 +127,11 @@ class AsciiOutput(Range):
     """An output set by a line of text."""
 
     write: LineTemplate = Field(description="sets it, with {value} in unit")
-    reply: Reply | Literal["none"] = Field(description="what a good answer looks like, or none")
+    reply: Reply | Literal["none"] = Field(
+        description="form of a good reply; none if there is none"
+    )
     readback: Readback | Literal["none"] = Field(
-        default="none", description="asks for what was set, to confirm the safe value"
+        default="none", description="query of the applied value, to confirm the safe value"
     )
 
     @model_validator(mode="after")
@@ -138,7 +142,12 @@ class AsciiOutput(Range):
 
 
 class AsciiInput(Range, Query):
-    """An input asked for by a line of text; value = number * scale + offset."""
+    """An input that is read with a line of text; value = number * scale + offset.
+
+    Attributes:
+        scale: Factor of the number.
+        offset: Added to the scaled number.
+    """
 
     scale: float = 1.0
     offset: float = 0.0
@@ -148,7 +157,13 @@ class AsciiInput(Range, Query):
 
 
 class AsciiExchange(NumberReply):
-    """One line that sets an output and asks for an input."""
+    """One line that sets an output and reads an input.
+
+    Attributes:
+        output: Name of the output.
+        input: Name of the input.
+        write: Line that is sent, with {value} in the unit of the output.
+    """
 
     output: Name
     input: Name
@@ -156,7 +171,13 @@ class AsciiExchange(NumberReply):
 
 
 class SendStep(StrictModel):
-    """Send a line."""
+    """Send a line.
+
+    Attributes:
+        text: The line.
+        reply: Form of a good reply; none if there is none.
+        note: Purpose of the step.
+    """
 
     kind: Literal["send"]
     text: LineTemplate
@@ -165,7 +186,12 @@ class SendStep(StrictModel):
 
 
 class AskStep(Reply):
-    """Ask, and refuse to go on where the reply does not match."""
+    """Send a query, and stop if the reply does not match.
+
+    Attributes:
+        ask: Line that is sent.
+        note: Purpose of the step.
+    """
 
     kind: Literal["ask"]
     ask: LineTemplate
@@ -173,7 +199,13 @@ class AskStep(Reply):
 
 
 class NumberStep(Query):
-    """Ask for a number, and refuse to go on where it is not near ``value``."""
+    """Query a number, and stop if it is not near ``value``.
+
+    Attributes:
+        value: Expected number, or ``safe`` for the safe value.
+        tolerance: Largest difference.
+        note: Purpose of the step.
+    """
 
     kind: Literal["number"]
     value: float | Literal["safe"]
@@ -187,19 +219,35 @@ AsciiStep: TypeAlias = Annotated[
 
 
 class ErrorReply(Reply):
-    """A reply that means trouble, whatever was sent."""
+    """A reply that reports an error, whatever was sent.
+
+    Attributes:
+        meaning: Meaning of the error, in messages.
+    """
 
     meaning: Annotated[str, StringConstraints(min_length=1)]
 
 
 class Check(Reply):
-    """A question that is answered by yes, a reply that matches, or no."""
+    """A query whose reply matches, or not.
+
+    Attributes:
+        ask: Line that is sent.
+    """
 
     ask: LineTemplate
 
 
 class AsciiWatchdog(Watchdog):
-    """A host watchdog set by lines of text; {timeout} is in counts, {safe} in the output's unit."""
+    """A host watchdog set by lines of text; {timeout} is in counts, {safe} in the output's unit.
+
+    Attributes:
+        arm: Steps that arm it.
+        disarm: Steps that disarm it.
+        feed: Steps that feed it between exchanges.
+        clear: Steps that clear a trip.
+        safe: Steps that set the safe value of each output.
+    """
 
     arm: tuple[AsciiStep, ...] = Field(min_length=1)
     disarm: tuple[AsciiStep, ...] = ()
@@ -207,7 +255,7 @@ class AsciiWatchdog(Watchdog):
     clear: tuple[AsciiStep, ...] = ()
     safe: dict[Name, tuple[AsciiStep, ...]] = Field(default={})
     tripped: Check | Literal["none"] = Field(
-        default="none", description="asks whether the watchdog has tripped"
+        default="none", description="query whether the watchdog has tripped"
     )
     refusal: Reply | Literal["none"] = Field(
         default="none", description="reply to a command that is ignored because of a trip"
@@ -221,7 +269,17 @@ class AsciiWatchdog(Watchdog):
 
 
 class AsciiProfile(BaseProfile):
-    """A device that speaks lines of text."""
+    """A device with a text protocol.
+
+    Attributes:
+        link: Serial line.
+        outputs: Outputs by name.
+        inputs: Inputs by name.
+        exchange: One line that writes and reads; none if there is none.
+        init: Steps after the device is identified.
+        close: Steps before the port is closed.
+        watchdog: Host watchdog; none if it has none.
+    """
 
     DEVICE: ClassVar[str] = "serial_dac"
 
@@ -230,15 +288,15 @@ class AsciiProfile(BaseProfile):
     outputs: dict[Name, AsciiOutput]
     inputs: dict[Name, AsciiInput]
     exchange: AsciiExchange | Literal["none"]
-    errors: tuple[ErrorReply, ...] = Field(default=(), description="replies that mean trouble")
+    errors: tuple[ErrorReply, ...] = Field(default=(), description="replies that report an error")
     error_query: Check | Literal["none"] = Field(
-        default="none", description="asks whether no command has left an error behind"
+        default="none", description="query whether an earlier command has left an error"
     )
     init: tuple[AsciiStep, ...] = ()
     close: tuple[AsciiStep, ...] = ()
     watchdog: AsciiWatchdog | Literal["none"]
     selftest: Check | Literal["none"] = Field(
-        default="none", description="asks whether it is this device"
+        default="none", description="query that identifies the device"
     )
 
     @model_validator(mode="after")

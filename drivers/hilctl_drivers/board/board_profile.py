@@ -70,16 +70,24 @@ class FrameWatchdog(Watchdog):
 
 
 class FrameProfile(BaseProfile):
-    """A board that speaks binary frames."""
+    """A board with binary frames.
+
+    Attributes:
+        link: Serial line and framing.
+        streaming: FIFO and sample clock; none if it has none.
+        outputs: The output by name.
+        inputs: The input by name; none if another device reads the sensor.
+        watchdog: Host watchdog; none if it has none.
+    """
 
     DEVICE: ClassVar[str] = "serial_dac"
 
     link: FramesLink
     protocol: Literal["hilctl-1", "hilctl-2"] = Field(
-        description="messages, as in drivers/README.md; 2 has one that asks what is put out"
+        description="messages, as in drivers/README.md; 2 can report the output"
     )
     exchange: Literal["single", "stream"] = Field(
-        description="single: one sample a message; stream: blocks through a FIFO"
+        description="single: one sample per message; stream: blocks through a FIFO"
     )
     streaming: FrameStreaming | Literal["none"] = "none"
     outputs: dict[Name, FrameChannel] = Field(min_length=1, max_length=1)

@@ -85,7 +85,7 @@ class ModbusRtuLink(BinaryLineSettings):
     """Modbus RTU."""
 
     kind: Literal["rtu"]
-    bytesize: Literal[8] = 8
+    bytesize: Literal[8] = Field(default=8, description="data bits per character")
     gap_s: float | None = Field(
         default=None,
         ge=0.0,
