@@ -7,7 +7,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from hilctl.base.types import F64
-from hilctl.identify.data.records import Record, SteadyLoop
+from hilctl.identify.data.records import Record, SteadyLoop, turning_points
 from hilctl.identify.fit_model import FittedModel
 from hilctl.identify.model_selection import HeldOut
 from hilctl.identify.settings import FitSettings
@@ -72,7 +72,10 @@ def verdict_of(
     if reasons := tuple(data_reasons(records, even=settings.kind == "butterfly")):
         return Verdict("not a model", within, held_out is not None, reasons)
     reasons = tuple(_fit_reasons(fit, records, settings, held_out))
-    unknown, suggestions = _unknown(records, held_out), _suggestions(fit, records, settings)
+    unknown, suggestions = (
+        _unknown(records, settings, held_out),
+        _suggestions(fit, records, settings),
+    )
     if reasons:
         return Verdict("not a model", within, held_out is not None, reasons, tuple(suggestions))
     # Held-out loops of one amplitude or frequency say nothing about others.
@@ -175,29 +178,54 @@ def _far_from_zero(record: Record, settings: FitSettings) -> str:
     return f"has an offset of {middle_um:.4g} µm, more than its stroke: {hint}"
 
 
-def _unknown(records: Sequence[Record], held_out: HeldOut | None) -> list[str]:
+def _unknown(
+    records: Sequence[Record], settings: FitSettings, held_out: HeldOut | None
+) -> list[str]:
     """Return notes on the limits of the data."""
     found = []
-    loops = [record for record in records if isinstance(record, SteadyLoop)]
-    if len(loops) == len(records):
-        turns = [loop.frequency_hz for loop in loops]
-        if max(turns) < ALIKE * min(turns):
-            found.append(
-                f"all loops are at {turns[0]:.3g} Hz, so the influence of the rate is unknown: add "
-                "loops at other frequencies"
-            )
-        moves = [float(np.ptp(loop.command)) for loop in loops]
-        if max(moves) < ALIKE * min(moves):
-            found.append(
-                "all loops have one amplitude, so smaller loops are unknown: add loops at other "
-                "amplitudes"
-            )
+    if all(isinstance(record, SteadyLoop) for record in records):
+        found += _one_frequency(records)
+    histories = not any(isinstance(record, SteadyLoop) for record in records)
+    moves = np.concatenate([_swings(record)[1] for record in records])
+    # The plays of a PPI follow a whole history up to its largest swing, so they fix smaller ones.
+    if _alike(moves) and not (histories and settings.kind == "ppi"):
+        found.append(
+            "all loops have one amplitude, so smaller loops are unknown: add loops at other "
+            "amplitudes"
+        )
     if held_out is None:
         found.append(
             "no data were held out: use four loops or more at several amplitudes and frequencies, "
             "or other files with --validate"
         )
     return found
+
+
+def _one_frequency(records: Sequence[Record]) -> list[str]:
+    frequencies_hz = np.concatenate([_swings(record)[0] for record in records])
+    if not _alike(frequencies_hz):
+        return []
+    return [
+        f"all loops are at {np.median(frequencies_hz):.3g} Hz, so the influence of the rate is "
+        "unknown: add loops at other frequencies"
+    ]
+
+
+def _alike(values: F64) -> bool:
+    """Return whether values are one value, apart from a tenth of them at each end."""
+    low, high = np.percentile(values, (10.0, 90.0), method="nearest")
+    return bool(high < ALIKE * low)
+
+
+def _swings(record: Record) -> tuple[F64, F64]:
+    """Return frequency and size of the swings of a command, from turn to turn: float64[n] each."""
+    command = record.command
+    if isinstance(record, SteadyLoop):
+        return np.array([record.frequency_hz]), np.array([np.ptp(command)])
+    turns = turning_points(command)
+    times, moves = np.diff(turns), np.abs(np.diff(command[turns]))
+    inner = slice(1, -1) if times.size > 2 else slice(None)  # the first and the last are cut
+    return 0.5 * record.sample_rate_hz / times[inner], moves[inner]
 
 
 def _suggestions(
@@ -213,6 +241,8 @@ def _suggestions(
         hint = ": fit it with --set offset=true" if offset else ""
         share = f"{-constant:.3g} µm, {shown:.1f} % of the stroke"
         yield f"most of the error is a constant, {share}{hint}"
+    if not all(isinstance(record, SteadyLoop) for record in records):
+        yield from _one_frequency(records)
     if stroke_um > LIKELY_UM:
         yield f"a stroke of {stroke_um:.3g} µm is large. Is the displacement in um?"
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hilctl.identify import model_quality
 from hilctl.identify.data.records import History
 from hilctl.identify.fit_api import FitRequest
 from hilctl.identify.pipeline import identify_records
@@ -114,3 +115,23 @@ def test_the_figures_are_plain_values(grid):
     mapping = judged(grid[:1]).to_mapping()["verdict"]
     assert mapping["grade"] == "usable"
     assert mapping["text"].startswith("fit error")
+
+
+@pytest.mark.parametrize(
+    ("command", "one_amplitude", "one_frequency"),
+    [
+        (lambda t: np.sin(20.0 * np.pi * t), True, True),
+        (lambda t: np.sin(20.0 * np.pi * t) * (1.0 + t), False, True),
+        (lambda t: np.sin(20.0 * np.pi * t * (1.0 + t)), True, False),
+        (lambda t: np.sin(20.0 * np.pi * t) + 0.5 * np.sin(47.0 * np.pi * t), False, False),
+    ],
+)
+def test_a_history_of_one_amplitude_or_frequency_tells_nothing_of_others(
+    command, one_amplitude, one_frequency
+):
+    t = np.arange(4000) / 2000.0
+    noise = 0.0005 * np.random.default_rng(3).standard_normal(t.size)
+    history = History("h", command(t) + noise, command(t), 2000.0)
+    unknown = model_quality._unknown([history], FitSettings(kind="field"), object())
+    assert ["one amplitude" in text for text in unknown] == [True] * one_amplitude
+    assert len(model_quality._one_frequency([history])) == one_frequency
