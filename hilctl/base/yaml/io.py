@@ -225,6 +225,8 @@ class Document:
     def set(self, assignment: str) -> None:
         """Apply one ``dotted.key=value`` from the command line; the value is YAML.
 
+        A section that is ``none`` becomes a mapping.
+
         Raises:
             ConfigError: It has another form, a part of the key is not a mapping, or the value has
                 a duplicate key.
@@ -244,8 +246,8 @@ class Document:
         for part in parts:
             if isinstance(data, tuple) and part in map(str, range(len(data))):
                 loc, data = (*loc, int(part)), data[int(part)]
-            elif isinstance(data, dict):
-                loc, data = (*loc, part), data.get(part, {})
+            elif isinstance(data, dict) or data == "none":
+                loc, data = (*loc, part), {} if data == "none" else data.get(part, {})
             else:
                 rule = "there is no such key to set"
                 raise ConfigError([ConfigProblem(where, dotted((*loc, part)), rule)])
@@ -343,4 +345,5 @@ def _replaced(data: Any, loc: Loc, value: Any) -> Any:
     head, rest = loc[0], loc[1:]
     if isinstance(data, tuple) and isinstance(head, int):
         return (*data[:head], _replaced(data[head], rest, value), *data[head + 1 :])
-    return {**data, head: _replaced(data.get(head, {}), rest, value)}
+    before = {} if data == "none" else data
+    return {**before, head: _replaced(before.get(head, {}), rest, value)}

@@ -279,6 +279,13 @@ def test_set_changes_one_place(assignment, loc, value):
     assert {key: changed_document.data[key] for key in others} == others
 
 
+def test_a_section_that_is_none_becomes_a_mapping():
+    document = Document("x.yaml", "a: none\nb: 1.0")
+    document.set("a.kind=integral")
+    document.set("a.gain=2.0")
+    assert document.data == {"a": {"kind": "integral", "gain": 2.0}, "b": 1.0}
+
+
 def test_settings_add_up():
     one = document()
     one.set("limits={peak_a: 1.0}")
