@@ -9,12 +9,22 @@
 
 The names in ``__all__``, their arguments, and the fields of their results are stable: a name is
 deprecated for one minor version before it is removed, and new arguments have defaults. Everything
-else in hilctl may change. Errors are :class:`hilctl.base.errors.HilctlError`; an ``InputError``
-means that nothing has moved and nothing was written.
+else in hilctl may change. Each error is a ``HilctlError``; an ``InputError`` means that nothing has
+moved, and that no file was written.
 """
 
 from importlib import import_module
 from typing import TYPE_CHECKING
+
+from hilctl.base.errors import (
+    ConfigError,
+    DataError,
+    DeviceError,
+    HilctlError,
+    InputError,
+    ModelError,
+    RunError,
+)
 
 if TYPE_CHECKING:
     from hilctl.api.campaigns import campaign, characterise, learn
@@ -25,8 +35,15 @@ if TYPE_CHECKING:
     from hilctl.api.runs import WrittenExperiment, check, init, load, run
 
 __all__ = [
+    "ConfigError",
+    "DataError",
+    "DeviceError",
+    "HilctlError",
+    "InputError",
+    "ModelError",
     "RecordedRun",
     "RunConnection",
+    "RunError",
     "SampleTable",
     "WrittenExperiment",
     "campaign",
@@ -49,6 +66,12 @@ __all__ = [
     "run",
     "summarize",
 ]
+
+
+def __dir__() -> list[str]:
+    """Return the public names, for completion."""
+    return __all__
+
 
 if not TYPE_CHECKING:
     _OTHERS = {

@@ -113,7 +113,7 @@ ListSettings = Annotated[
 
 def identify(
     files: IdentifyInput,
-    model: Annotated[str, typer.Option(help="Kind of model, or auto.")] = "integrated",
+    model: Annotated[str, typer.Option(help="Kind of model, or auto.")] = "auto",
     output: Annotated[Path | None, typer.Option(help="Model file to write.")] = None,
     settings: FitTexts = None,
     list_settings: ListSettings = False,
