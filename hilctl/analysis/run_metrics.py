@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from hilctl.base.formatting import shown_briefly
 from hilctl.base.types import CommandUnit
 from hilctl.machine.procfs import ProcessUsage
 from hilctl.recording.metadata_keys import LabelValue
@@ -66,6 +67,7 @@ class SegmentReport(RunMetrics):
     samples: int
 
 
+@shown_briefly
 @dataclass(frozen=True, slots=True)
 class RunReport(RunMetrics):
     """Metrics of a run.

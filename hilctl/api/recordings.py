@@ -107,6 +107,9 @@ class RecordedRun:
 
     recording: Recording
 
+    def __repr__(self) -> str:
+        return f"<{self.path}: {self.table!r}>"
+
     @property
     def path(self) -> Path:
         """File of the recording."""

@@ -2,8 +2,11 @@
 
 import json
 import math
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sized
+from dataclasses import fields
+from html import escape
+from pathlib import PurePath
+from typing import Any, TypeVar
 
 _DIGITS = 3
 _SCALES: dict[str, tuple[tuple[float, str], ...]] = {
@@ -97,3 +100,43 @@ def _finite(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_finite(each) for each in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+_LONGEST = 60
+Shown = TypeVar("Shown", bound=type)
+
+
+def shown_briefly(kind: Shown) -> Shown:
+    """Show the objects of a dataclass in one line, and as a table in a notebook.
+
+    Arrays and nested objects are named by type and size.
+    """
+
+    def text(self: Any) -> str:
+        return f"{kind.__name__}({', '.join(f'{key}={value}' for key, value in _rows(self))})"
+
+    def table(self: Any) -> str:
+        rows = (f"<tr><th>{key}</th><td>{escape(value)}</td></tr>" for key, value in _rows(self))
+        return f"<table><caption>{kind.__name__}</caption>{''.join(rows)}</table>"
+
+    changed: Any = kind
+    changed.__repr__, changed._repr_html_ = text, table
+    return kind
+
+
+def _rows(shown: Any) -> list[tuple[str, str]]:
+    return [(each.name, _brief(getattr(shown, each.name))) for each in fields(shown)]
+
+
+def _brief(value: object) -> str:
+    if value is None or isinstance(value, bool | int):
+        return str(value)
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, str | PurePath):
+        text = repr(str(value))
+        return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 4]}...'"
+    kind = type(value).__name__
+    if shape := getattr(value, "shape", None):
+        return f"<{kind} {list(shape)}>"
+    return f"<{kind} of {len(value)}>" if isinstance(value, Sized) else f"<{kind}>"

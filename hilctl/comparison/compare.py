@@ -7,6 +7,7 @@ from typing import Any
 
 from hilctl.base.errors import InputError
 from hilctl.base.files import already_there, check_no_input, write_text
+from hilctl.base.formatting import shown_briefly
 from hilctl.base.yaml import Document
 from hilctl.comparison.simulated_trials import (
     InverseTrial,
@@ -103,6 +104,7 @@ class ComparedModel:
         return max(known) if known else None
 
 
+@shown_briefly
 @dataclass(frozen=True, slots=True)
 class Comparison:
     """A comparison and its data.

@@ -10,6 +10,7 @@ from typing import TypeVar
 from hilctl.base.device import Device
 from hilctl.base.errors import ConfigError, ConfigProblem, InputError
 from hilctl.base.files import TextFiles
+from hilctl.base.formatting import shown_briefly
 from hilctl.base.yaml import Document, dump, load_document
 from hilctl.experiment.correction import Correction, load_correction
 from hilctl.experiment.devices import made_device
@@ -23,6 +24,7 @@ FILE_KEYS = {"compensator.model", "compensator.correction", "compensator.initial
 """Keys of an experiment that name files, relative to its own folder."""
 
 
+@shown_briefly
 @dataclass(frozen=True, slots=True)
 class LoadedExperiment:
     """An experiment with everything that its file refers to.

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hilctl.base.errors import ConfigError, ConfigProblem, DataError, InputError, ModelError
+from hilctl.base.formatting import shown_briefly
 from hilctl.base.types import F64
 from hilctl.experiment.adaptation_bounds import (
     adaptation_problems,
@@ -48,6 +49,7 @@ STILL_S = 0.1
 """Time after which the stages of any actuator are at rest."""
 
 
+@shown_briefly
 @dataclass(frozen=True, slots=True)
 class CheckedExperiment:
     """An experiment that is ready to run.

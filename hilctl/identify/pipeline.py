@@ -8,6 +8,7 @@ from typing import Any
 
 from hilctl.base.errors import InputError
 from hilctl.base.files import check_writable, write_text
+from hilctl.base.formatting import shown_briefly
 from hilctl.base.yaml import Document
 from hilctl.identify.data.data_files import load_records
 from hilctl.identify.data.records import History, Record
@@ -74,6 +75,7 @@ def with_modes(
     return best
 
 
+@shown_briefly
 @dataclass(frozen=True, slots=True)
 class Identification:
     """An identified model, and its errors on held-out data.

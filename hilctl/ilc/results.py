@@ -4,6 +4,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from hilctl.base.formatting import shown_briefly
 from hilctl.base.segments import Segment
 from hilctl.experiment.correction import Correction
 from hilctl.ilc.cycle import CycleScore
@@ -33,6 +34,7 @@ class IlcRow:
     recording: str
 
 
+@shown_briefly
 @dataclass(frozen=True, slots=True)
 class IlcResult:
     """Result of learning.

@@ -5,10 +5,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from hilctl.base.formatting import shown_briefly
 from hilctl.base.samples import BlockBatch
 from hilctl.loop.safe_output import OutputState
 
 
+@shown_briefly
 @dataclass(frozen=True, slots=True)
 class RunResult:
     """Result of a run.

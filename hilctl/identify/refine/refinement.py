@@ -10,6 +10,7 @@ import numpy as np
 
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.files import check_writable, write_text
+from hilctl.base.formatting import shown_briefly
 from hilctl.base.samples import Flag
 from hilctl.identify.data.data_files import history_from_pieces
 from hilctl.identify.data.records import History
@@ -82,6 +83,7 @@ def _history(recording: Recording, known: Mapping[str, Recording]) -> History:
     )
 
 
+@shown_briefly
 @dataclass(frozen=True, slots=True)
 class Refinement:
     """A refined model, and its errors.

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from hilctl.base.errors import ConfigError, DataError, InputError, RunError
+from hilctl.base.formatting import shown_briefly
 from hilctl.experiment.coil_heat import CoolingCoil
 from hilctl.experiment.device_state import heat_after, heat_before
 from hilctl.recording.reader import read
@@ -49,6 +50,7 @@ class CampaignHost(StudyHost):
     on_note: Callable[[str], None] = field(default=lambda text: None)
 
 
+@shown_briefly
 @dataclass(frozen=True, slots=True)
 class CampaignResult:
     """Result of a campaign.

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from hilctl.base.formatting import shown_briefly
 from hilctl.base.types import F64
 from hilctl.identify.data.records import History
 from hilctl.identify.fit_api import FitRequest
@@ -103,6 +104,7 @@ class StepRow:
     kept: bool = False
 
 
+@shown_briefly
 @dataclass(frozen=True, slots=True)
 class Characterisation:
     """Result of a characterisation.

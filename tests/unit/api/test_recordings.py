@@ -35,6 +35,7 @@ def test_a_table_has_named_columns_with_units(file):
     assert sizes == {table.rows} == {run.recording.samples.index.size}
     np.testing.assert_array_equal(table["displacement_um"], run.recording.samples.displacement_um)
     assert "displacement_um [um]" in repr(table)
+    assert repr(run) == f"<{run.path}: {table!r}>"
     assert (run.labels, run.path) == ({"sample": "A7"}, file)
     assert run.facts["code"] == "completed"
 

@@ -2,7 +2,9 @@
 
 import json
 import math
+from dataclasses import dataclass
 
+import numpy as np
 import pytest
 
 from hilctl.base.formatting import (
@@ -11,6 +13,7 @@ from hilctl.base.formatting import (
     printable,
     quantity,
     short_name,
+    shown_briefly,
     significant,
     unit_text,
 )
@@ -93,3 +96,18 @@ def test_what_is_not_finite_is_null(bad: float) -> None:
     text = finite_json({"x": bad, "y": [bad, 1.0], "z": {"deep": (bad, "inf")}})
     found = json.loads(text, parse_constant=refuse)
     assert found == {"x": None, "y": [None, 1.0], "z": {"deep": [None, "inf"]}}
+
+
+def test_results_are_shown_in_one_line_and_as_a_table():
+    @shown_briefly
+    @dataclass
+    class Result:
+        name: str
+        error_um: float
+        values: object
+        parts: tuple
+
+    shown = Result("a<b", 1.23456789, np.zeros((3, 2)), (1, 2))
+    expected = "Result(name='a<b', error_um=1.23457, values=<ndarray [3, 2]>, parts=<tuple of 2>)"
+    assert repr(shown) == expected
+    assert "<th>name</th><td>&#x27;a&lt;b&#x27;</td>" in shown._repr_html_()
