@@ -47,6 +47,8 @@ figure { margin: 0 0 1.2rem; break-inside: avoid; }
 figure svg { display: block; width: 100%; height: auto; max-width: 30rem; }
 .alone svg { max-width: none; }
 figcaption { color: var(--quiet); font-size: .85rem; max-width: 30rem; }
+figcaption::before { counter-increment: figure; content: "Figure " counter(figure) ". ";
+  font-weight: 600; }
 table { border-collapse: collapse; margin: .3rem 0; }
 th, td { text-align: left; vertical-align: top; padding: .2rem .9rem .2rem 0;
   border-bottom: 1px solid var(--line); }
@@ -65,7 +67,7 @@ dt { font-weight: 600; } dd { margin: 0 0 .4rem 1rem; }
 _HEAD = """<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{title}</title><style>{css}</style></head><body>"""
+<title>{title}</title><style>{css}</style></head><body><main>"""
 
 
 def write_page(page: str, path: Path) -> None:
@@ -79,7 +81,7 @@ def write_page(page: str, path: Path) -> None:
 
 def document(title: str, body: Iterable[str]) -> str:
     """Return a page; title and body are HTML."""
-    return "\n".join((_HEAD.format(title=title, css=_CSS), *body, "</body></html>\n"))
+    return "\n".join((_HEAD.format(title=title, css=_CSS), *body, "</main></body></html>\n"))
 
 
 def text(plain: str, *, lines: bool = False) -> str:
@@ -105,13 +107,15 @@ def grid(headings: Iterable[str], cells: Iterable[Iterable[str]], css: str = "")
     head = "".join(f"<th>{text(heading)}</th>" for heading in headings)
     lines = ("".join(f"<td>{text(cell)}</td>" for cell in row) for row in cells)
     body = "\n".join(f"<tr>{line}</tr>" for line in lines)
-    return f'<div class="wide"><table class="{css}"><tr>{head}</tr>\n{body}</table></div>'
+    return (
+        f'<div class="wide" tabindex="0"><table class="{css}"><tr>{head}</tr>\n{body}</table></div>'
+    )
 
 
 def figures(sheets: Iterable[FigureSpec]) -> str:
     """Return figures with captions, side by side if there is room."""
     blocks = "\n".join(
-        f'<figure role="img" aria-label="{text(sheet.caption)}">{svg(drawn(sheet))}'
+        f"<figure>{svg(drawn(sheet), text(sheet.caption))}"
         f"<figcaption>{text(sheet.caption)}</figcaption></figure>"
         for sheet in sheets
     )
@@ -120,12 +124,14 @@ def figures(sheets: Iterable[FigureSpec]) -> str:
 
 def wide_figure(alternative: str, figure: Figure) -> str:
     """Return a figure of its own size, limited by the page; the alternative text is HTML."""
-    inner = f'style="max-width: {figure.get_figwidth():g}in">{svg(figure)}'
-    return f'<figure class="alone" role="img" aria-label="{alternative}" {inner}</figure>\n'
+    inner = f'style="max-width: {figure.get_figwidth():g}in">{svg(figure, alternative)}'
+    return f'<figure class="alone" {inner}</figure>\n'
 
 
-def svg(figure: Figure) -> str:
+def svg(figure: Figure, alternative: str) -> str:
     """Return a figure as an SVG element of any width, with text as text.
+
+    ``alternative`` is its alternative text as HTML.
 
     Ids of groups are removed because figures share a page, and so are URLs and invisible digits.
     """
@@ -134,7 +140,8 @@ def svg(figure: Figure) -> str:
         figure.savefig(buffer, format="svg", transparent=True, metadata=UNDATED_SVG)
     text = buffer.getvalue()
     text = _METADATA.sub("", text[text.index("<svg") :])
-    text = _SIZE.sub(r'<svg viewBox="\1" aria-hidden="true">', text, count=1)
+    named = f'role="img" aria-label="{alternative}"'
+    text = _SIZE.sub(lambda found: f'<svg viewBox="{found[1]}" {named}>', text, count=1)
     text = _GROUP.sub("<g", text).replace("xlink:href=", "href=")
     return _PATH.sub(lambda found: _DIGITS.sub(r"\1", found[0]), text)
 

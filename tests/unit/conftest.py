@@ -20,7 +20,7 @@ MakeRecording = Callable[..., Recording]
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave all figures white, for tests of something else: to draw one takes half a second."""
     monkeypatch.setattr(html, "drawn", lambda sheet: None)
-    monkeypatch.setattr(html, "svg", lambda figure: "<svg></svg>")
+    monkeypatch.setattr(html, "svg", lambda figure, text: f'<svg aria-label="{text}"></svg>')
 
 
 def _ticks(samples: int, block: int, rate_hz: float) -> Ticks:

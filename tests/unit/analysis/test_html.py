@@ -38,7 +38,7 @@ def test_a_page_is_readable_in_the_dark_on_paper_and_on_a_phone():
     page = html.document("t", ["<p>x</p>"])
     for needed in ("prefers-color-scheme: dark", "@media print", 'name="viewport"'):
         assert needed in page
-    assert page.endswith("<p>x</p>\n</body></html>\n")
+    assert page.endswith("<p>x</p>\n</main></body></html>\n")
 
 
 def test_terms_are_found_in_the_order_of_the_list():
@@ -54,7 +54,7 @@ def figure():
 
 
 def test_a_page_s_figure_has_texts_of_any_width_and_no_address(figure):
-    text = html.svg(figure)
+    text = html.svg(figure, "loop")
     root = ET.fromstring(text)
     assert root.attrib["viewBox"].startswith("0 0 ")
     assert "width" not in root.attrib
@@ -66,4 +66,4 @@ def test_a_page_s_figure_has_texts_of_any_width_and_no_address(figure):
 
 
 def test_the_same_figure_has_the_same_bytes(figure):
-    assert html.svg(figure) == html.svg(figure)
+    assert html.svg(figure, "loop") == html.svg(figure, "loop")

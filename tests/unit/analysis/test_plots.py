@@ -150,7 +150,7 @@ def test_every_figure_can_be_drawn(run) -> None:
         plots.time_history, plots.steady_cycles, loop_plot.hysteresis_loop, plots.error,
         plots.spectrum, plots.lateness,
     ):  # fmt: skip
-        assert svg(drawn(sheet_of(recording))).startswith("<svg ")
+        assert svg(drawn(sheet_of(recording)), "").startswith("<svg ")
 
 
 class TestSpectrum:

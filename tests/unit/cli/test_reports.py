@@ -90,7 +90,7 @@ def test_several_runs_are_one_object_or_a_table(hilctl, json_of):
 
 def test_folder_is_one_page(tmp_path, monkeypatch, hilctl):
     monkeypatch.setattr(html, "drawn", lambda sheet: None)
-    monkeypatch.setattr(html, "svg", lambda figure: "<svg></svg>")
+    monkeypatch.setattr(html, "svg", lambda figure, text: f'<svg aria-label="{text}"></svg>')
     words = ("report", GOLDEN, "--html", tmp_path / "page.html")
     assert "all completed" in hilctl(*words)[1]
     assert "runs, all completed" in (tmp_path / "page.html").read_text(encoding="utf-8")
