@@ -25,10 +25,8 @@ _READER_CLOSED = {errno.EPIPE, errno.EIO}
 class Verbosity:
     """Amount of output."""
 
-    quiet = False
-    """Print only warnings, errors and ``--json`` output; no progress."""
-    verbose = False
-    """Print all log records with time and module, and the traceback of an error."""
+    quiet = False  # print only warnings, errors and ``--json`` output; no progress
+    verbose = False  # print all log records with time and module, and the traceback of an error
 
 
 def take_verbosity(words: list[str]) -> None:

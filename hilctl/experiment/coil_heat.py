@@ -86,17 +86,11 @@ class CoilHeat:
 
 @dataclass(frozen=True, slots=True)
 class RunHeat:
-    """Effect of a run on the heat of the coil, for any initial heat.
+    """Effect of a run on the heat of the coil, for any initial heat."""
 
-    Attributes:
-        seconds: Duration of the run.
-        alone_a2: Final heat of an initially cold coil, in A^2.
-        hottest_a2: Highest initial heat within the budget, in A^2; infinite without a budget.
-    """
-
-    seconds: float = 0.0
-    alone_a2: float = 0.0
-    hottest_a2: float = math.inf
+    seconds: float = 0.0  # duration of the run
+    alone_a2: float = 0.0  # final heat of an initially cold coil, in A^2
+    hottest_a2: float = math.inf  # highest initial heat within the budget; infinite without one
 
     def then(self, command: F64, limits: Limits, sample_rate_hz: float) -> "RunHeat":
         """Return the effect including the next commands: float64[n], in A."""

@@ -23,8 +23,7 @@ from hilctl.models.base import HysteresisModel
 from hilctl.models.model_file import dump_model
 from hilctl.waveforms.build import Reference
 
-PHASES = 64
-"""Points of a cycle that identify a waveform."""
+PHASES = 64  # points of a cycle that identify a waveform
 
 _GRID = 1 << 16  # the highest harmonic of 2048 loses 0.5 % of its amplitude between points
 _TOLERANCE = 1e-3

@@ -102,13 +102,9 @@ def shipped_profiles() -> dict[str, str]:
 
 @dataclass(frozen=True, slots=True)
 class SerialPort:
-    """A serial port of this machine.
+    """A serial port of this machine."""
 
-    Attributes:
-        path: Device file; ``/dev/serial/by-id/...`` if it exists, which survives replugging.
-    """
-
-    path: str
+    path: str  # device file; ``/dev/serial/by-id/...`` if it exists, which survives replugging
     description: str
 
 
@@ -139,31 +135,21 @@ def inventory() -> Inventory:
 
 @dataclass(frozen=True, slots=True)
 class DeviceOption:
-    """A key of a device's section.
-
-    Attributes:
-        default: Default value as text; None if the key is required.
-    """
+    """A key of a device's section."""
 
     name: str
-    default: str | None
+    default: str | None  # default value as text; None if the key is required
     description: str
 
 
 @dataclass(frozen=True, slots=True)
 class DeviceDescription:
-    """A device or a profile, described without opening it.
-
-    Attributes:
-        place: Class of the device, or file of the profile.
-        options: Keys of the device's section; empty for a profile.
-        profile: Content of the profile; empty for a device.
-    """
+    """A device or a profile, described without opening it."""
 
     name: str
-    place: str
-    options: tuple[DeviceOption, ...]
-    profile: dict[str, Any]
+    place: str  # class of the device, or file of the profile
+    options: tuple[DeviceOption, ...]  # keys of the device's section; empty for a profile
+    profile: dict[str, Any]  # content of the profile; empty for a device
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the fields as plain values."""

@@ -18,13 +18,9 @@ _LAYOUTS = {".json": "Foxglove and Lichtblick", ".xml": "PlotJuggler"}
 
 @dataclass(frozen=True, slots=True)
 class Example:
-    """A shipped file.
+    """A shipped file."""
 
-    Attributes:
-        name: Path of its copy without suffix.
-    """
-
-    name: str
+    name: str  # path of its copy without suffix
     description: str
     path: Path
 

@@ -25,29 +25,19 @@ FAST = 1.25  # of the largest speed
 
 @dataclass(frozen=True, slots=True)
 class Spectrum:
-    """Frequencies of a signal.
+    """Frequencies of a signal."""
 
-    Attributes:
-        main_hz: Half of the power lies below it; maximum over all windows.
-        highest_hz: 99.9 % of the power lies below it; maximum over all windows.
-    """
-
-    main_hz: float
-    highest_hz: float
+    main_hz: float  # half of the power lies below it; maximum over all windows
+    highest_hz: float  # 99.9 % of the power lies below it; maximum over all windows
     resolution_hz: float
 
 
 @dataclass(frozen=True, slots=True)
 class RangeFindings:
-    """Deviations of a reference from the motions a model was identified on.
+    """Deviations of a reference from the motions a model was identified on."""
 
-    Attributes:
-        refused: Reasons to reject the run.
-        warnings: Reasons why the model error is unknown.
-    """
-
-    refused: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
+    refused: tuple[str, ...] = ()  # reasons to reject the run
+    warnings: tuple[str, ...] = ()  # reasons why the model error is unknown
 
 
 def spectrum(

@@ -44,8 +44,7 @@ from hilctl.waveforms.build import Reference, build
 _log = logging.getLogger(__name__)
 
 _MANY = 50_000_000  # samples, which take some seconds
-STILL_S = 0.1
-"""Time after which the stages of any actuator are at rest."""
+STILL_S = 0.1  # time after which the stages of any actuator are at rest
 
 
 @dataclass(frozen=True, slots=True)

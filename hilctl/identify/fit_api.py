@@ -196,8 +196,7 @@ class FitData:
         }
 
 
-LEAST_SLOPE = 0.01
-"""Smallest slope that a model may have, of the mean slope of the data."""
+LEAST_SLOPE = 0.01  # smallest slope that a model may have, of the mean slope of the data
 
 OnProgress: TypeAlias = Callable[[float, str], None]
 """Progress callback: completed part (0 to 1) and current step."""
@@ -209,22 +208,16 @@ def ignore_progress(done: float, text: str) -> None:
 
 @dataclass(frozen=True, slots=True)
 class FitRequest:
-    """Records to fit, and settings.
-
-    Attributes:
-        source: Names of recordings or files, for the provenance.
-        start: Start of the search, see :class:`FitJob`.
-        modes: Known further modes of the structure, for kinds that have them.
-    """
+    """Records to fit, and settings."""
 
     records: Sequence[Record]
     settings: FitSettings
     unit: CommandUnit = "A"
-    source: Sequence[str] = ()
+    source: Sequence[str] = ()  # names of recordings or files, for the provenance
     run: MapFunction = serial_map
     progress: OnProgress = ignore_progress
-    start: object | None = None
-    modes: Sequence[FurtherMode] = ()
+    start: object | None = None  # start of the search, see :class:`FitJob`
+    modes: Sequence[FurtherMode] = ()  # known further modes, for kinds that have them
 
 
 @dataclass(frozen=True, slots=True)
@@ -249,19 +242,12 @@ class FitJob:
 
 @dataclass(frozen=True, slots=True)
 class StartOutcome:
-    """One start of a search.
+    """One start of a search."""
 
-    Attributes:
-        start: ``data`` for rough values from the data, ``random N`` for random values,
-            ``weights N`` for the solution of a linear problem.
-        first_rms_percent: Weighted error at the start, in percent of the largest peak-to-peak.
-        evaluations: Evaluations of the criterion, without those for derivatives.
-    """
-
-    start: str
-    first_rms_percent: float
+    start: str  # ``data``, ``random N``, or ``weights N`` for a linear solution
+    first_rms_percent: float  # weighted error at the start, in percent of the largest peak-to-peak
     rms_percent: float
-    evaluations: int
+    evaluations: int  # evaluations of the criterion, without those for derivatives
 
 
 @dataclass(frozen=True)

@@ -178,8 +178,7 @@ LOOPS: tuple[Mapping[str, Any], ...] = ({"kind": "staged"}, {"kind": "integrated
 """Candidates for steady loops."""
 ORDERS = ((6, 4), (8, 6), (12, 8), (16, 10), (20, 12), (28, 16))
 """Plays, and deadbands on each side if the model has any."""
-LINES = (8, 12, 16, 20, 28, 36)
-"""Lines of a Preisach triangle, instead of :data:`ORDERS`."""
+LINES = (8, 12, 16, 20, 28, 36)  # lines of a Preisach triangle, instead of :data:`ORDERS`
 WORTH_SIZE = 1.03  # a larger model must lower the error by more than 3 %
 MOST_LAG = 8  # samples tried
 

@@ -41,8 +41,7 @@ _PATIENCE_S = 5.0
 _RETRY_S = 0.05
 _POLL_S = 0.05
 _MOST_WAITING = 64
-_KEPT = 8
-"""1/8 of the ring stays readable for watchers."""
+_KEPT = 8  # 1/8 of the ring stays readable for watchers
 
 
 class Recorder:

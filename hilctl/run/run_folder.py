@@ -46,20 +46,14 @@ _BACKLOG = 1000  # connections that query the holder of a device; never accepted
 
 @dataclass(frozen=True, slots=True)
 class RunCard:
-    """Identity of a run, for other commands.
+    """Identity of a run, for other commands."""
 
-    Attributes:
-        name: Name of its folder, unique among the runs of a user.
-        started: Unix time in s.
-        holds: Resources of its device, as :attr:`hilctl.base.device.DeviceInfo.holds`.
-    """
-
-    name: str
+    name: str  # name of its folder, unique among the runs of a user
     experiment: str
     recording: str
     supervisor: int
-    started: float
-    holds: tuple[str, ...] = ()
+    started: float  # unix time in s
+    holds: tuple[str, ...] = ()  # resources of its device, as DeviceInfo.holds
 
     @classmethod
     def from_json(cls, text: str) -> Self:

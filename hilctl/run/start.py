@@ -23,8 +23,7 @@ from hilctl.run.unpaced import run_unpaced
 
 _log = logging.getLogger(__name__)
 
-OnPart: TypeAlias = Callable[[float], None]
-"""Called with the completed part of a run, 0 to 1."""
+OnPart: TypeAlias = Callable[[float], None]  # called with the completed part of a run, 0 to 1
 
 
 def checked_experiment(

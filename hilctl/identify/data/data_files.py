@@ -22,17 +22,11 @@ UNEVEN = 0.5  # maximum deviation of a time step from the median, due to roundin
 
 
 class TableRecord(NamedTuple):
-    """A record from a table.
+    """A record from a table."""
 
-    Attributes:
-        history: The record.
-        unit: Unit of its command; None if the table has none.
-        understood: Columns and units in words.
-    """
-
-    history: History
-    unit: CommandUnit | None
-    understood: str
+    history: History  # the record
+    unit: CommandUnit | None  # unit of its command; None if the table has none
+    understood: str  # columns and units in words
 
 
 def read_table(path: Path, settings: TableSettings) -> TableRecord:
@@ -111,17 +105,11 @@ MOST_WHOLE = 20_000_000
 
 
 class LoadedRecords(NamedTuple):
-    """Records of files.
+    """Records of files."""
 
-    Attributes:
-        records: Loops and histories.
-        unit: Command unit of the recordings, or of the tables that have one; None if unknown.
-        understood: Columns and units of each table in words.
-    """
-
-    records: list[Record]
-    unit: CommandUnit | None
-    understood: list[str]
+    records: list[Record]  # loops and histories
+    unit: CommandUnit | None  # command unit; None if the tables do not have one
+    understood: list[str]  # columns and units of each table in words
 
 
 def load_records(

@@ -19,19 +19,13 @@ class SteadyLoop:
     """One steady cycle, averaged over several and resampled evenly in time.
 
     Published numbers of points are 200 (chapter 4), 400 (5.14) and 300 (6.24).
-
-    Attributes:
-        label: Name of the record, such as ``sine 6 A 10 Hz``.
-        command: float64[M], command in the device's unit.
-        displacement_um: float64[M].
-        sample_rate_hz: Sample rate of the run that it was averaged from; 0.0 if unknown.
     """
 
-    label: str
-    command: F64
-    displacement_um: F64
+    label: str  # name of the record, such as ``sine 6 A 10 Hz``
+    command: F64  # float64[M], command in the device's unit
+    displacement_um: F64  # float64[M]
     frequency_hz: float
-    sample_rate_hz: float = 0.0
+    sample_rate_hz: float = 0.0  # sample rate of the run that it was averaged from; 0.0 if unknown
 
     def __post_init__(self) -> None:
         check_signals(self.label, self.command, self.displacement_um)
@@ -71,18 +65,13 @@ class History:
 
     The hysteresis starts at the first sample, which must be the start of the motion or far enough
     before the first evaluated sample.
-
-    Attributes:
-        command: float64[n], command in the device's unit.
-        displacement_um: float64[n].
-        ignore: Samples at the start that are not evaluated.
     """
 
     label: str
-    command: F64
-    displacement_um: F64
+    command: F64  # float64[n], command in the device's unit
+    displacement_um: F64  # float64[n]
     sample_rate_hz: float
-    ignore: int = 0
+    ignore: int = 0  # samples at the start that are not evaluated
 
     def __post_init__(self) -> None:
         check_signals(self.label, self.command, self.displacement_um)

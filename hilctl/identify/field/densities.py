@@ -28,20 +28,14 @@ MOVED = 1e-3  # of the largest motion: columns that move less are ignored
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Thresholds and cells of the operators, in command units.
-
-    Attributes:
-        lowest: Lower end of the first cell of the effective field.
-        cells: Number of cells of a drag, and of splines of a play over the same range, >= 3.
-        knots: Pieces of the curve.
-    """
+    """Thresholds and cells of the operators, in command units."""
 
     thresholds: F64
     lengths: F64
-    lowest: float
+    lowest: float  # lower end of the first cell of the effective field
     width: float
-    cells: int
-    knots: int
+    cells: int  # number of cells of a drag, and of splines of a play over the same range, >= 3
+    knots: int  # pieces of the curve
 
     @property
     def lines(self) -> int:
@@ -72,20 +66,13 @@ class Curve:
 
 @dataclass(frozen=True, slots=True)
 class Weights:
-    """Fitted densities and curve.
+    """Fitted densities and curve."""
 
-    Attributes:
-        slopes: float64[lines, cells], um per command unit; for plays, weights of their splines.
-        curve: From the output of the operators to displacement, without the offset.
-        offset_um: Displacement at rest.
-        squares: Weighted sum of squares of the operators' errors and of the prior.
-    """
-
-    slopes: F64
-    curve: Curve
-    offset_um: float
+    slopes: F64  # float64[lines, cells], um per command unit; for plays, weights of their splines
+    curve: Curve  # from the output of the operators to displacement, without the offset
+    offset_um: float  # displacement at rest
     errors_um: F64
-    squares: float = 0.0
+    squares: float = 0.0  # weighted sum of squares of the operators' errors and of the prior
 
     def errors_of(self, given: F64, y: F64) -> F64:
         """Return the errors of outputs of the operators at any rows: float64[N]."""

@@ -232,16 +232,11 @@ REPEATED = 0.5  # exponent by which the density of rows reduces their weight
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """Motion of a record.
+    """Motion of a record."""
 
-    Attributes:
-        travel: float64[n], change of the command since the sample before, of its peak-to-peak.
-        swing: float64[n], swing of the displacement around a sample, of the stroke.
-    """
-
-    travel: F64
+    travel: F64  # float64[n], change of the command since the sample before, of its peak-to-peak
     step_s: F64
-    swing: F64
+    swing: F64  # float64[n], swing of the displacement around a sample, of the stroke
     judged: int
 
     @classmethod

@@ -126,18 +126,13 @@ class Size:
 
 @dataclass(frozen=True, slots=True)
 class FieldEnd:
-    """End of a search, from which another search can start.
-
-    Attributes:
-        met: The curve that the losses depend on, by displacement with its offset.
-        widest: Largest useful threshold, of half the span.
-    """
+    """End of a search, from which another search can start."""
 
     known: Physical
     grid: Grid
     weights: Weights
-    met: Curve | None
-    widest: float
+    met: Curve | None  # the curve that the losses depend on, by displacement with its offset
+    widest: float  # largest useful threshold, of half the span
 
 
 @dataclass(frozen=True, slots=True)

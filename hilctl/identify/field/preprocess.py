@@ -81,21 +81,14 @@ class Latest(Generic[_Found]):
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """One record; callers must not change returned arrays, since they are cached.
-
-    Attributes:
-        step_s: float64[n], time since the sample before.
-        command: float64[n], at the end of each step.
-        mean: float64[n], the command's mean over each step.
-        derivatives: float64[3, N], displacement of all samples in um and its derivatives by time.
-    """
+    """One record; callers must not change returned arrays, since they are cached."""
 
     rate_hz: float
     kept: I64
-    step_s: F64
-    command: F64
-    mean: F64
-    derivatives: F64
+    step_s: F64  # float64[n], time since the sample before
+    command: F64  # float64[n], at the end of each step
+    mean: F64  # float64[n], the command's mean over each step
+    derivatives: F64  # float64[3, N], displacement of all samples in um and its derivatives by time
     motion: Motion
     _late: Latest[tuple[F64, F64]] = field(default_factory=Latest, init=False, repr=False)
     _bare: Latest[F64] = field(default_factory=Latest, init=False, repr=False)

@@ -45,25 +45,18 @@ def loop_delay_slope(half_period_s: float, lag_s: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Layers:
-    """Parts of the model.
-
-    Attributes:
-        growth: Whether it grows with its distance.
-        gamma: Whether thresholds grow with the rate.
-        half_period_s: Half a sample period of the loop; 0.0 to ignore its delay.
-        midpoint: Whether thresholds are alpha (i - 1/2) instead of alpha i.
-    """
+    """Parts of the model."""
 
     plays: int
     deadbands: int
     lag: bool = True
-    growth: bool = True
-    gamma: bool = False
+    growth: bool = True  # whether it grows with its distance
+    gamma: bool = False  # whether thresholds grow with the rate
     structure: bool = True
     delay: bool = True
-    half_period_s: float = 0.0
+    half_period_s: float = 0.0  # half a sample period of the loop; 0.0 to ignore its delay
     offset: bool = True
-    midpoint: bool = False
+    midpoint: bool = False  # whether thresholds are alpha (i - 1/2) instead of alpha i
 
     @property
     def numbers(self) -> F64:
@@ -83,22 +76,14 @@ class Layers:
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """Parameters of the layers, in their own units.
+    """Parameters of the layers, in their own units."""
 
-    Attributes:
-        before: float64[4]: lag in s, its growth, spacing of the thresholds, gamma in s.
-        linear: Structure, and delay in addition to that of a sampled loop.
-        direct: a_0 in um per command unit.
-        spacings_um: d_p and d_n, distances of the deadbands above and below 0.
-        up: float64[k], slopes of Lambda beyond each deadband above 0; 1 around 0.
-    """
-
-    before: F64
-    linear: Linear
-    direct: float
+    before: F64  # float64[4]: lag in s, its growth, spacing of the thresholds, gamma in s
+    linear: Linear  # structure, and delay in addition to that of a sampled loop
+    direct: float  # a_0 in um per command unit
     weights: F64
-    spacings_um: tuple[float, float]
-    up: F64
+    spacings_um: tuple[float, float]  # d_p and d_n, distances of the deadbands above and below 0
+    up: F64  # float64[k], slopes of Lambda beyond each deadband above 0; 1 around 0
     down: F64
     offset_um: float
 

@@ -21,17 +21,13 @@ from hilctl.run.run_folder import RunFolder, facts_of, runs
 
 _log = logging.getLogger(__name__)
 
-VERSION = 1
-"""Version of the protocol; it changes with the meaning of a message, not with a new key."""
-VERSION_KEY = "protocol"
-"""Key of the version in every answer."""
+VERSION = 1  # version of the protocol; it changes with the meaning of a message, not with a new key
+VERSION_KEY = "protocol"  # key of the version in every answer
 Command: TypeAlias = Literal["status", "set", "mark"]
 InverseState: TypeAlias = Literal["in", "out"]
 
-MAX_BYTES = 4096
-"""Longest request in bytes."""
-MAX_MARK = 200
-"""Longest mark in characters."""
+MAX_BYTES = 4096  # longest request in bytes
+MAX_MARK = 200  # longest mark in characters
 
 # Windows lacks these signals; it has no runs, but imports this module.
 STOP_SIGNAL: signal.Signals = getattr(signal, "SIGUSR1", signal.SIGTERM)

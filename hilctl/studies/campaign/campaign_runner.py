@@ -51,22 +51,14 @@ class CampaignHost(StudyHost):
 
 @dataclass(frozen=True, slots=True)
 class CampaignResult:
-    """Result of a campaign.
-
-    Attributes:
-        rows: Outcome of each step, by its number.
-        tables: Files of the table.
-        reason: Why it ended before its last step; otherwise empty.
-        stop_signal: Number of the signal that stopped it, or 0.
-        page: Its page; None if it could not be written.
-    """
+    """Result of a campaign."""
 
     plan: CampaignPlan
-    rows: dict[int, CampaignRow]
-    tables: tuple[Path, ...]
-    reason: str = ""
-    stop_signal: int = 0
-    page: Path | None = None
+    rows: dict[int, CampaignRow]  # outcome of each step, by its number
+    tables: tuple[Path, ...]  # files of the table
+    reason: str = ""  # why it ended before its last step; otherwise empty
+    stop_signal: int = 0  # number of the signal that stopped it, or 0
+    page: Path | None = None  # its page; None if it could not be written
 
     @property
     def ordered(self) -> list[tuple[CampaignStep, CampaignRow]]:

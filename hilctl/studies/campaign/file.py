@@ -74,10 +74,8 @@ class CampaignFile(StrictModel):
     folder: str | None = None
 
 
-Point: TypeAlias = Mapping[str, Any]
-"""A value for each varied key."""
-Broken: TypeAlias = tuple[Loc, str, str, str]
-"""A broken rule: location, rule, value and hint."""
+Point: TypeAlias = Mapping[str, Any]  # A value for each varied key
+Broken: TypeAlias = tuple[Loc, str, str, str]  # A broken rule: location, rule, value and hint
 
 MOST_STEPS = 10_000
 

@@ -72,18 +72,12 @@ _NAME_LENGTH = 80
 
 @dataclass(frozen=True, slots=True)
 class CharacterisationPlan:
-    """Plan of a characterisation, at full amplitude.
-
-    Attributes:
-        steps: Its steps; most polarity and response steps are skipped in the end.
-        pauses_s: Time for the coil to cool.
-        free_mb: Free disk space.
-    """
+    """Plan of a characterisation, at full amplitude."""
 
     limits: CharacterisationLimits
-    steps: tuple[StepRow, ...]
-    pauses_s: float
-    free_mb: float
+    steps: tuple[StepRow, ...]  # its steps; most polarity and response steps are skipped in the end
+    pauses_s: float  # time for the coil to cool
+    free_mb: float  # free disk space
 
     @property
     def seconds(self) -> float:
@@ -98,13 +92,9 @@ class CharacterisationPlan:
 
 @dataclass(frozen=True, slots=True)
 class CharacterisationHost(StudyHost):
-    """Runs, time and observers of a characterisation.
+    """Runs, time and observers of a characterisation."""
 
-    Attributes:
-        on_step: Called with each finished step.
-    """
-
-    on_step: Callable[[StepRow], None] = field(default=lambda row: None)
+    on_step: Callable[[StepRow], None] = field(default=lambda row: None)  # after each step
 
 
 class CharacterisationRunner:

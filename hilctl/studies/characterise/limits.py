@@ -24,27 +24,17 @@ _OF_HEAT = 0.9
 
 @dataclass(frozen=True, slots=True)
 class CharacterisationLimits:
-    """Limits of a characterisation, in the command's unit.
+    """Limits of a characterisation, in the command's unit."""
 
-    Attributes:
-        loaded: The experiment.
-        low: Lowest command.
-        high: Highest command.
-        rest: Safe value, where each run starts and ends.
-        stroke_um: Allowed range of displacement.
-        lowest_hz: Lowest frequency of loops.
-        highest_hz: Highest frequency of loops.
-    """
-
-    loaded: LoadedExperiment
+    loaded: LoadedExperiment  # the experiment
     unit: CommandUnit
-    low: float
-    high: float
-    rest: float
-    stroke_um: tuple[float, float]
+    low: float  # lowest command
+    high: float  # highest command
+    rest: float  # safe value, where each run starts and ends
+    stroke_um: tuple[float, float]  # allowed range of displacement
     sample_rate_hz: float
-    lowest_hz: float
-    highest_hz: float
+    lowest_hz: float  # lowest frequency of loops
+    highest_hz: float  # highest frequency of loops
 
     @property
     def centre(self) -> float:

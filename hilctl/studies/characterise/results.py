@@ -28,29 +28,18 @@ from hilctl.studies.characterise.response import (
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """Measurements of the steps so far; None or empty if not measured yet.
-
-    Attributes:
-        reaction: First reaction and its polarity.
-        small: Small-signal response.
-        growing: Loops of growing amplitude.
-        slow: Loops at the lowest frequency.
-        fast: Loops at several frequencies.
-        biased: Small loops over the whole range.
-        crept_percent: Creep in each hold, of the displacement.
-        repeated: Change of the largest growing loop at the end.
-    """
+    """Measurements of the steps so far; None or empty if not measured yet."""
 
     rest: RestNoise | None = None
-    reaction: StepResponseCheck | None = None
-    small: SmallSignal | None = None
-    growing: tuple[LoopFigures, ...] = ()
-    slow: tuple[LoopFigures, ...] = ()
-    fast: tuple[LoopFigures, ...] = ()
+    reaction: StepResponseCheck | None = None  # first reaction and its polarity
+    small: SmallSignal | None = None  # small-signal response
+    growing: tuple[LoopFigures, ...] = ()  # loops of growing amplitude
+    slow: tuple[LoopFigures, ...] = ()  # loops at the lowest frequency
+    fast: tuple[LoopFigures, ...] = ()  # loops at several frequencies
     reversal: ReversalCurves | None = None
-    biased: tuple[LoopFigures, ...] = ()
-    crept_percent: tuple[float, ...] = ()
-    repeated: Repeatability | None = None
+    biased: tuple[LoopFigures, ...] = ()  # small loops over the whole range
+    crept_percent: tuple[float, ...] = ()  # creep in each hold, of the displacement
+    repeated: Repeatability | None = None  # change of the largest growing loop at the end
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values without signals."""
@@ -59,27 +48,16 @@ class Measured:
 
 @dataclass(frozen=True, slots=True)
 class ValidationReference:
-    """Error of the model on a reference that was not used in any fit.
+    """Error of the model on a reference that was not used in any fit."""
 
-    Attributes:
-        label: Name of the reference.
-        peak_percent: Largest error, in percent of the displacement's peak-to-peak.
-        rms_percent: Its root mean square.
-        mean_percent: Its mean.
-        floor_percent: Largest error expected from sensor noise alone.
-        time_s: float64[n], time of the evaluated samples.
-        measured_um: float64[n], their displacement.
-        modelled_um: float64[n], the model's.
-    """
-
-    label: str
-    peak_percent: float
-    rms_percent: float
-    mean_percent: float
-    floor_percent: float
-    time_s: F64
-    measured_um: F64
-    modelled_um: F64
+    label: str  # name of the reference
+    peak_percent: float  # largest error, in percent of the displacement's peak-to-peak
+    rms_percent: float  # its root mean square
+    mean_percent: float  # its mean
+    floor_percent: float  # largest error expected from sensor noise alone
+    time_s: F64  # float64[n], time of the evaluated samples
+    measured_um: F64  # float64[n], their displacement
+    modelled_um: F64  # float64[n], the model's
 
 
 @dataclass(frozen=True, slots=True)

@@ -159,19 +159,12 @@ def _after_step(recording: Recording, waveform: Step) -> Samples:
 
 @dataclass(frozen=True, slots=True)
 class SeriesDrift:
-    """Largest change of the reference runs from the first of them, with its sign.
+    """Largest change of the reference runs from the first of them, with its sign."""
 
-    Attributes:
-        runs: Number of completed reference runs.
-        peak_to_peak_percent: Change of the peak-to-peak displacement, in percent of it.
-        mean_um: Change of the mean displacement.
-        peak_hysteresis_percent: Change of the peak hysteresis, in points of percent.
-    """
-
-    runs: int
-    peak_to_peak_percent: float | None
-    mean_um: float | None
-    peak_hysteresis_percent: float | None
+    runs: int  # number of completed reference runs
+    peak_to_peak_percent: float | None  # change of the peak-to-peak displacement, in percent of it
+    mean_um: float | None  # change of the mean displacement
+    peak_hysteresis_percent: float | None  # change of the peak hysteresis, in points of percent
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the fields as plain values."""
@@ -203,8 +196,7 @@ def drift_of(done: Sequence[RunFigures]) -> SeriesDrift | None:
     return SeriesDrift(len(done), percent, largest("mean_um"), largest("peak_hysteresis_percent"))
 
 
-POINTS = 300
-"""Points per loop."""
+POINTS = 300  # points per loop
 
 _STEP_POINTS = 800
 _STEP_CYCLES = 12.0  # of the ringing

@@ -18,18 +18,12 @@ _FEWEST = 8
 
 @dataclass(frozen=True, slots=True)
 class MinorLoop:
-    """One minor loop.
+    """One minor loop."""
 
-    Attributes:
-        middle: Mid-range of its input, in the input's unit.
-        span: Peak-to-peak input.
-        peak_hysteresis_percent: Largest distance between its branches, of its peak-to-peak.
-    """
-
-    middle: float
-    span: float
+    middle: float  # mid-range of its input, in the input's unit
+    span: float  # peak-to-peak input
     peak_to_peak_um: float
-    peak_hysteresis_percent: float
+    peak_hysteresis_percent: float  # largest distance between its branches, of its peak-to-peak
 
 
 def minor_loops(loop_input: F64, output_um: F64) -> tuple[MinorLoop, ...]:

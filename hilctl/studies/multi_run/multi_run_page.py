@@ -28,8 +28,7 @@ from hilctl.studies.multi_run.trend import (
 )
 from hilctl.studies.multi_run.varied_parameter import texts_of
 
-MOST_ROWS = 1000
-"""Most rows of the table on a page."""
+MOST_ROWS = 1000  # most rows of the table on a page
 
 _COLUMNS = (STROKE, HYSTERESIS, AREA, PEAK_ERROR, RMS_ERROR, MODEL_ERROR, NATURAL, DAMPING)
 

@@ -38,8 +38,7 @@ Measured: TypeAlias = tuple[SeriesRun, RunDigest]
 _SIGNS = ("o", "s", "^", "D", "v", "P", "X", "<", ">")
 _LINES = ("-", "--", "-.", ":")
 _NAMED = (WITH, WITHOUT, ERROR, MARK, "#E69F00", "#56B4E9", REFERENCE, QUIET)
-_MOST_CURVES = 7
-"""Most distinguishable curves."""
+_MOST_CURVES = 7  # most distinguishable curves
 
 
 def spread(items: Sequence[Item], most: int = _MOST_CURVES) -> list[Item]:

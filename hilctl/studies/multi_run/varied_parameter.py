@@ -26,25 +26,18 @@ _FIRST = (*_CHOICES, "frequency_hz", "amplitude", "bias_a", "load_kg")
 """Last parts of keys, in order of importance."""
 _UNITS = ("a", "v", "um", "hz", "s", "kg", "ohm", "k", "ms", "us")
 _UNIT_NAMES = {"a": "A", "v": "V", "hz": "Hz", "k": "K", "ohm": "ohm"}
-WITHOUT_COMPENSATOR = "without compensator"
-"""Label of runs without a compensator."""
+WITHOUT_COMPENSATOR = "without compensator"  # label of runs without a compensator
 _COMPONENT = re.compile(r"\.components\.(\d+)\.")
 
 
 @dataclass(frozen=True, slots=True)
 class VariedParameter:
-    """One varied parameter.
+    """One varied parameter."""
 
-    Attributes:
-        key: Dotted key of the experiment.
-        unit: Its unit, or empty.
-        values: Its values: numbers in ascending order, others in the order of the runs.
-    """
-
-    key: str
+    key: str  # dotted key of the experiment
     name: str
-    unit: str
-    values: tuple[Hashable, ...]
+    unit: str  # its unit, or empty
+    values: tuple[Hashable, ...]  # numbers in ascending order, others in the order of the runs
 
     @property
     def numeric(self) -> bool:
