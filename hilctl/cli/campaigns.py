@@ -86,11 +86,7 @@ def sweep(
 
 
 def sweep_document(experiment: Path, vary: Sequence[str], repeat: int) -> Document:
-    """Return the campaign file that is equivalent to ``--vary`` options.
-
-    Raises:
-        ConfigError: An option does not have the form ``KEY=VALUES``, or a key is repeated.
-    """
+    """Return the campaign of ``--vary`` options; raise ConfigError if one is not KEY=VALUES."""
     lines = [
         f"name: {json.dumps(f'{experiment.stem[:70]}-sweep')}",
         f"experiment: {json.dumps(str(experiment))}",

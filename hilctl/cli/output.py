@@ -64,10 +64,7 @@ def print_traceback() -> None:
 
 
 class StandardStream(io.TextIOWrapper):
-    """A standard stream that never fails, so that a closed pipe cannot stop a run.
-
-    After the first ``failure`` all output is lost.
-    """
+    """A standard stream that never fails; all output after the first ``failure`` is lost."""
 
     def __init__(self, stream: io.TextIOWrapper) -> None:
         # Characters outside the locale's encoding are escaped. This layer does not buffer, so that
@@ -156,11 +153,8 @@ def safe_streams(*, acts: bool = False) -> Iterator[None]:
 
 
 def _open_missing() -> None:
-    """Open the null device for each closed descriptor from 0 to 2.
-
-    Otherwise the next file that is opened, such as a recording, gets one of these numbers and
-    receives what processes write to their standard error.
-    """
+    """Open the null device for each closed descriptor from 0 to 2."""
+    # Otherwise the next file, such as a recording, would get standard error's number.
     for number in range(3):
         try:
             os.fstat(number)

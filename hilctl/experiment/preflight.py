@@ -170,10 +170,7 @@ def _start(
 def _state_before(
     loaded: LoadedExperiment, conditioned: F64, now_s: float, problems: list[ConfigProblem]
 ) -> tuple[InitialState | None, str]:
-    """Return the actuator's state before the waveform (None at rest) and its origin in words.
-
-    ``problems`` gets an entry if the state is unknown.
-    """
+    """Return the actuator's state before the waveform (None at rest) and its origin in words."""
     config, model = loaded.config, loaded.model
     if model is None or config.compensator is None:
         return None, ""
@@ -197,10 +194,8 @@ def _state_before(
 def _start_problems(
     loaded: LoadedExperiment, begun: CompensatorStart, forecast: Forecast
 ) -> list[ConfigProblem]:
-    """Return that the reference begins too far from the actuator's rest position.
-
-    A higher slew limit would be the wrong remedy: it would pass the step on to the coil.
-    """
+    """Return that the reference begins too far from the actuator's rest position."""
+    # A higher slew limit would be the wrong remedy: it would pass the step on to the coil.
     model, config, rate_hz = loaded.model, loaded.config, loaded.config.sample_rate_hz
     if model is None or not config.limits.slew_per_s < forecast.slew_per_s < math.inf:
         return []

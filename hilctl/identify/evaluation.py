@@ -51,10 +51,7 @@ class Evaluation:
 
 
 def judge(model: HysteresisModel, data: Records | FitData, *, creep: bool = False) -> Evaluation:
-    """Return the errors of a model on records.
-
-    Loops are compared in their periodic steady state, at the rate of :meth:`SteadyLoop.rate`.
-    """
+    """Return the errors of a model on records; loops are in their periodic steady state."""
     data = data if isinstance(data, FitData) else FitData(data)
     responses_um = _modelled_um(model, data)
     if creep:
@@ -102,11 +99,8 @@ def _record_um(model: HysteresisModel, record: Record, speed: F64) -> F64:
 
 
 def _sampled_cycle_um(model: HysteresisModel, loop: SteadyLoop) -> F64:
-    """Return the steady response to a loop's command, simulated sample by sample: float64[M].
-
-    A fit models dynamic stages in continuous time. At a low sample rate the difference to a run
-    is the larger part of the error.
-    """
+    """Return the steady response to a loop, simulated sample by sample: float64[M]."""
+    # At a low sample rate the difference to continuous time is the larger part of the error.
     points = loop.command.size
     turns = np.arange(points + 1) / points
     command = CubicSpline(turns, np.append(loop.command, loop.command[0]), bc_type="periodic")

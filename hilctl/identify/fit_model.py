@@ -23,14 +23,7 @@ EVERY_SAMPLE = {"staged", "field", "generalised_duhem"}
 
 
 def fit_kind(request: FitRequest) -> FoundModel:
-    """Fit a kind of model.
-
-    Creep that shows during rests, and known modes, are removed from the records first and become
-    parts of the model.
-
-    Raises:
-        DataError: The data can't be used as asked, or there are none.
-    """
+    """Fit a kind of model to records without creep and known modes, which become its parts."""
     records, settings, unit = request.records, request.settings, request.unit
     modes = request.modes if settings.looks_for("modes") else ()
     creep = creep_of(records) if settings.looks_for("creep_stage") else None

@@ -228,11 +228,8 @@ def select(request: FitRequest) -> Selection:
 
 
 def _choose_kind(request: FitRequest, given: IdentifySettings) -> Selection:
-    """Return the kind with the least error.
-
-    For histories, small models select the kinds to try at full size: a wrong kind has several times
-    the error of the right one at any size.
-    """
+    """Return the kind with the least error."""
+    # Small models select the kinds to try at full size: a wrong kind is far off at any size.
     whole = any(isinstance(record, History) for record in request.records)
     errors = _candidates(request, given, WHOLE if whole else LOOPS)
     if whole and not any(each.rms_percent < WELL_PERCENT for each in errors):

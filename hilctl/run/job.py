@@ -146,10 +146,7 @@ def silence_limits(checked: "CheckedExperiment") -> SilenceLimits:
 
 
 def safe_priority(checked: "CheckedExperiment") -> int:
-    """Return the SCHED_FIFO priority of the process that sets the safe value.
-
-    It is above the loop's, so that a busy loop cannot delay that process.
-    """
+    """Return the SCHED_FIFO priority of the process that sets the safe value, above the loop's."""
     return checked.loaded.config.realtime.priority + 1
 
 

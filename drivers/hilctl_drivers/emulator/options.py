@@ -35,11 +35,7 @@ class WireFault:
 
 
 def parse_fault(text: str) -> WireFault:
-    """Read ``KIND@COUNT`` or ``KIND@SECONDSs``; ``delay:`` and ``late:SECONDS@...`` say how late.
-
-    Raises:
-        InputError: It is none of these.
-    """
+    """Read ``KIND@COUNT`` or ``KIND@SECONDSs``; ``delay:`` and ``late:SECONDS@`` take a time."""
     found = re.fullmatch(r"([a-z_]+)(?::(\d+(?:\.\d+)?))?@(\d+(?:\.\d+)?)(s?)", text)
     if found is None:
         raise InputError(f"fault must be KIND@COUNT or KIND@SECONDSs, got {text!r}")

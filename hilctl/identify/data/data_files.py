@@ -79,11 +79,7 @@ def _column(table: Table, column: Column, option: str) -> int:
 
 
 def _scale(table: Table, at: int, unit: str, option: str, given: float | None) -> float:
-    """Return the factor from a column's numbers to a unit.
-
-    Raises:
-        DataError: The column is in another unit, and no scale is given.
-    """
+    """Return the factor from a column's numbers to a unit; raise DataError if it is unknown."""
     base, factor = table.unit(at)
     if given is not None:
         return factor * given
@@ -115,12 +111,7 @@ class LoadedRecords(NamedTuple):
 def load_records(
     paths: Sequence[Path], settings: IdentifySettings, lag_samples: int
 ) -> LoadedRecords:
-    """Read recordings (``.mcap``) and tables, whose displacements lag, as records.
-
-    Raises:
-        DataError: A file can't be used.
-        InputError: Commands in A and in V are mixed, or ``leave_out`` names none or all.
-    """
+    """Read recordings (``.mcap``) and tables, whose displacements lag, as records."""
     records: list[Record] = []
     known: list[str] = []
     understood: list[str] = []

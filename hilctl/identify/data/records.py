@@ -173,10 +173,8 @@ def thinned(records: Sequence[Record], most: int = MOST_SAMPLES) -> tuple[Record
 
 
 def turning_points(command: F64) -> I64:
-    """Return where a command turns by more than :data:`SMALLEST_TURN`.
-
-    A play of that width follows the command up to each turn.
-    """
+    """Return where a command turns by more than :data:`SMALLEST_TURN`."""
+    # A play of that width follows the command up to each turn.
     threshold = np.array([0.5 * SMALLEST_TURN * np.ptp(command)])
     followed = np.empty((command.size, 1))
     command = np.ascontiguousarray(command)

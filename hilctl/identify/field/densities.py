@@ -81,10 +81,7 @@ class Weights:
 
 
 def table(paths: Sequence[F64], kept: Sequence[I64], grid: Grid) -> F64:
-    """Return the output of each operator for each cell: float64[N, lines cells].
-
-    Each record has an effective field from rest, float64[n], of which the kept samples are rows.
-    """
+    """Return each operator's output per cell at the kept samples: float64[N, lines cells]."""
     plays, cells = grid.thresholds.size, grid.cells
     parts: list[F64] = []
     for path, samples in zip(paths, kept, strict=True):
@@ -105,10 +102,7 @@ def _needed(path: F64, samples: I64) -> tuple[F64, I64]:
 
 
 def outputs(paths: Sequence[F64], kept: Sequence[I64], grid: Grid, slopes: F64) -> tuple[F64, F64]:
-    """Return the output of operators with known weights, and its derivatives by thresholds.
-
-    See :func:`table`. The derivatives, float64[N, p - 1], are by all thresholds but the first.
-    """
+    """Return the output of weighted operators and its slopes by thresholds: float64[N, p - 1]."""
     plays = grid.thresholds.size
     drags = replace(grid, thresholds=np.empty(0))
     given: list[F64] = []
@@ -179,12 +173,8 @@ class Equations:
         return Weights(lines, curve, offset_um, errors, squares)
 
     def place(self, errors: F64, changes: F64) -> SearchPoint:
-        """Return the sum of squares with derivatives by the changes, by variable projection.
-
-        Free weights compensate each change as far as they can (Kaufman's approximation). The
-        errors, float64[N], and their changes, float64[N, p], are of outputs with the weights of
-        :meth:`solve`.
-        """
+        """Return the sum of squares with derivatives by the changes (Kaufman's approximation)."""
+        # errors float64[N] and changes float64[N, p] are of outputs with the weights of solve().
         found, _ = self._found
         free = found > self._lows
         means = self._means(self._left[:, free])
@@ -201,10 +191,8 @@ class Equations:
 
     @cached_property
     def _found(self) -> tuple[F64, float]:
-        """Minimise |scale (left w + c - target)|^2 + |prior w - wanted|^2 over w >= lows, and c.
-
-        By normal equations, which are fast, and well conditioned because of the prior.
-        """
+        """Minimise |scale (left w + c - target)|^2 + |prior w - wanted|^2 over w >= lows, and c."""
+        # By normal equations, which are fast, and well conditioned because of the prior.
         means, mean = self._means(self._left), float(self._means(self._target))
         left = (self._left - means) * self._scale[:, None]
         right = (self._target - mean - (self._left - means) @ self._lows) * self._scale

@@ -303,11 +303,7 @@ FINER = 8  # cells of the model's tables per piece of a spline
 
 
 def fit_field(job: FitJob) -> FoundModel:
-    """Fit plays and drags of a field, losses, structure and delay.
-
-    Raises:
-        DataError: A record is a steady loop: loops leave curve and losses undetermined.
-    """
+    """Fit plays and drags of a field, losses, structure and delay; raise DataError for loops."""
     settings = job.settings
     data = Prepared(histories_of(job.data.records, "an effective field"))
     size = Size(settings.plays, settings.drags, settings.cells, settings.knots)

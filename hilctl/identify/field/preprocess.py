@@ -99,11 +99,8 @@ class Run:
         return self.kept / self.rate_hz
 
     def late_command(self, lag_s: float) -> tuple[F64, F64]:
-        """Return at which part of each step to take its command, and the command: float64[n] each.
-
-        The step of a lag is exact for a straight command if the command is taken at this part: the
-        middle of a short step, the end of a step in which the lag settles.
-        """
+        """Return the part of each step at which to take its command, and the command."""
+        # So a lag's step is exact: the middle of a short one, the end of one that settles.
         return self._late.of(lag_s, lambda: self._late_command(lag_s))
 
     def _late_command(self, lag_s: float) -> tuple[F64, F64]:

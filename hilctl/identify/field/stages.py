@@ -115,10 +115,8 @@ def stages_of(known: Physical, data: Prepared) -> Stages:
 
 
 def signals(run: Run, known: Physical, curve: Curve | None, span: float) -> tuple[F64, F64]:
-    """Return the effective field and the displacement before structure: float64[n] each.
-
-    The excess loss is linear below a part of ``span``. Without a curve, y itself is its output.
-    """
+    """Return effective field and displacement before structure, float64[n] each."""
+    # The excess loss is linear below a part of the span. Without a curve, y is its output.
     y = run.bare_um(known.delay_s, 2.0 * known.damping_ratio * known.radian_s, known.radian_s**2)
     m = y if curve is None else curve.operators_of(y)
     losses: Any = (*known.losses.model_dump().values(), even_excess(span), 0.0)

@@ -32,15 +32,7 @@ STILL_S = 1.0  # between a run and the one that began where it ended
 
 
 def load_runs(paths: Sequence[Path], model: HysteresisModel) -> list[History]:
-    """Read runs, compensated or not, each from rest.
-
-    The actuator responds to the output command, whatever the model of the run. A run that begins
-    in the end state of another has the samples of that run before its own; they are not evaluated.
-
-    Raises:
-        InputError: A file is named twice, or there is none.
-        DataError: A recording can't be read, has no known initial state, or another unit.
-    """
+    """Read runs, each from rest, or after the run that it continues, which is not evaluated."""
     if not paths:
         raise InputError("no recordings to refine the model: name at least one")
     twice = {path for path in paths if list(paths).count(path) > 1}
@@ -162,11 +154,7 @@ def refine_runs(
     source: str = "",
     progress: OnProgress = ignore_progress,
 ) -> Refinement:
-    """Refine a model from runs, and evaluate it on held-out runs.
-
-    Raises:
-        InputError: The runs are implausible or too few, or no refined model has an inverse.
-    """
+    """Refine a model from runs, and evaluate it on held-out runs."""
     if reasons := tuple(data_reasons([*runs, *validate])):
         raise InputError("\n".join(reasons))
     parts, splits = parts_of(runs, validate)

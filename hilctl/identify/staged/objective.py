@@ -1,7 +1,4 @@
-"""The staged model as one sum of squares with analytic derivatives.
-
-Lag -> plays -> deadbands -> structure -> delay; all parameters in one row of numbers.
-"""
+"""The staged model (lag, plays, deadbands, structure, delay) as one sum of squares."""
 
 import math
 from dataclasses import dataclass, replace
@@ -245,10 +242,7 @@ def staged_model(
 
 
 def structure_of(linear: Linear) -> tuple[float, float]:
-    """Return natural frequency in Hz and damping ratio.
-
-    A first-order low-pass, such as a sensor, has no damping ratio: it gets a negligible mass.
-    """
+    """Return natural frequency in Hz and damping ratio; a low-pass gets a negligible mass."""
     least_s = 0.5 * linear.c_s / HIGHEST_DAMPING
     radian_s = max(math.sqrt(linear.q_s2), least_s * (1.0 + 1e-9))
     return 1.0 / (2.0 * math.pi * radian_s), linear.c_s / (2.0 * radian_s)

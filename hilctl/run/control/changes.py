@@ -131,11 +131,8 @@ class Changes:
 
 
 def bound_refusal(checked: CheckedExperiment, gain: float, offset: float, *, bypassed: bool) -> str:
-    """Return why a reference with this gain and offset would exceed the limits, or an empty text.
-
-    The whole range of the reference counts, also samples that have passed. Slew and heat are not
-    checked: limiter and interlocks enforce them.
-    """
+    """Return why a changed reference would exceed the limits, or an empty text."""
+    # The whole range counts; limiter and interlocks enforce slew and heat.
     low, high = sorted(gain * end + offset for end in checked.reference.span)
     problems = reference_problems(checked.loaded, checked.reference.unit, low, high)
     commands = [*command_range(checked, low, high, gain)]

@@ -316,10 +316,7 @@ class SharedPage:
         self.publish(PageField.EVENT_HEAD, head + 1)
 
     def look_at_events(self, since: int) -> tuple[list[Event], int]:
-        """Return the events from number ``since`` on without consuming them, and the next number.
-
-        Events that were overwritten meanwhile are missing.
-        """
+        """Return the events from ``since`` on that are still there, and the next number."""
         return self._look(PageField.EVENT_HEAD, _EVENTS_AT, _EVENT_SLOTS, since)
 
     def leave_note(self, event: Event) -> None:
@@ -375,10 +372,7 @@ class SharedPage:
 
 
 def _packed(event: Event) -> str:
-    """Return an event as JSON that fits into a slot.
-
-    A long text is truncated; values that do not fit are omitted.
-    """
+    """Return an event as JSON that fits into a slot: long text is cut, long values omitted."""
     room = _EVENT_BYTES - 8
     facts, text = asdict(event), event.text[:room]
     if len(json.dumps({**facts, "text": ""})) > room:

@@ -135,11 +135,7 @@ def measured(recording: Recording) -> CampaignRow:
 
 @contextmanager
 def prepared(folder: Path, host: CampaignHost) -> Iterator[None]:
-    """Lock a campaign's folder, and repair recordings of crashed runs in it.
-
-    Raises:
-        InputError: Another campaign or a run writes to it.
-    """
+    """Lock a campaign's folder, unless another writes to it, and repair recordings."""
     with locked_folder(folder, host.sleep_s):
         await_runs(folder, host.sleep_s)
         for orphan in recover_dead_runs():
@@ -150,12 +146,7 @@ def prepared(folder: Path, host: CampaignHost) -> Iterator[None]:
 
 
 def planned_in_real_time(campaign: CampaignSteps, folder: Path, now_s: float) -> CampaignPlan:
-    """Return the plan of a campaign in real time.
-
-    Raises:
-        ConfigError: One or more steps are not allowed.
-        InputError: The base experiment can't be read.
-    """
+    """Return the plan of a campaign in real time; raise ConfigError if a step is not allowed."""
     completed = completed_runs(folder) if folder.is_dir() else {}
     last = last_started(folder) if folder.is_dir() else None
     plan = planned(campaign, folder, completed, 0.0)
@@ -166,10 +157,8 @@ def planned_in_real_time(campaign: CampaignSteps, folder: Path, now_s: float) ->
 
 
 def _heat_a2(each: PlannedStep, last: Path | None, now_s: float) -> float:
-    """Return the heat of the coil after the last run of the device or the campaign, in A^2.
-
-    A simulated device has no history of its own; within a campaign it counts as one rig.
-    """
+    """Return the heat that the last run of the device or the campaign left in the coil, in A^2."""
+    # A simulated device has no history of its own; within a campaign it counts as one rig.
     config, info = each.loaded.config, each.loaded.device.info
     heat_a2 = heat_before(each.loaded, now_s)
     if config.limits.thermal_time_constant_s is None or not info.simulated or last is None:

@@ -70,12 +70,7 @@ def run_task(task: FastTask) -> FastRun:
 
 
 def planned_fast(campaign: CampaignSteps, folder: Path) -> CampaignPlan:
-    """Return the plan of a campaign without real time.
-
-    Raises:
-        ConfigError: One or more steps are not allowed.
-        InputError: A device is not simulated.
-    """
+    """Return the plan of a campaign without real time; raise InputError for a real device."""
     plan = planned(campaign, folder, completed_runs(folder) if folder.is_dir() else {})
     for each in plan.steps:
         info = each.loaded.device.info
@@ -86,11 +81,7 @@ def planned_fast(campaign: CampaignSteps, folder: Path) -> CampaignPlan:
 
 
 def run_fast(plan: CampaignPlan, host: CampaignHost, scheduler: str = "none") -> CampaignResult:
-    """Run the remaining steps of a campaign as fast as possible.
-
-    Raises:
-        InputError: No disk space, the table can't be written, or the scheduler is unreachable.
-    """
+    """Run the remaining steps as fast as possible; raise InputError if the disk has no space."""
     plan.require_room()
     left = plan.left
     with streams(scheduler) as stream:

@@ -63,20 +63,13 @@ class CampaignSteps:
     steps: tuple[CampaignStep, ...]
 
     def load(self, step: CampaignStep, files: TextFiles) -> LoadedExperiment:
-        """Return the experiment of a step.
-
-        Raises:
-            InputError: The experiment, or a file it uses, can't be read.
-            ConfigError: The experiment is invalid.
-        """
+        """Return the experiment of a step; raise InputError if it can't be read or is invalid."""
         document = load_document(self.experiment, files)
         return resolve(document, self.experiment.parent, self.settings_for(step, files), files)
 
     def settings_for(self, step: CampaignStep, files: TextFiles) -> list[str]:
-        """Return all ``key=value`` texts of a step, outermost last.
-
-        Each run of a simulated device gets its own, reproducible noise.
-        """
+        """Return all ``key=value`` texts of a step, outermost last."""
+        # Each run of a simulated device gets its own, reproducible noise.
         settings = [*self.settings, *step.settings]
         device = document_with(self.experiment, settings, files).data.get("device")
         kind = device.get("kind") if isinstance(device, dict) else None
@@ -101,11 +94,7 @@ def load_campaign(path: Path, settings: Sequence[str] = ()) -> CampaignSteps:
 
 
 def campaign_of(document: Document, folder: Path, settings: Sequence[str]) -> CampaignSteps:
-    """Return the campaign of a document whose experiment is relative to a folder.
-
-    Raises:
-        ConfigError: The file is invalid; all problems are listed.
-    """
+    """Return a document's campaign, relative to a folder; raise ConfigError with all problems."""
     config = document.validate(CampaignFile)
     groups, broken = groups_of(config.vary)
     keys = tuple(dict.fromkeys(key for group in groups for key in group[0]))

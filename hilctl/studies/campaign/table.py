@@ -84,11 +84,7 @@ def ordered(
 
 
 def write_table(plan: CampaignPlan, rows: Mapping[int, CampaignRow]) -> list[Path]:
-    """Write the table atomically as CSV and, if pyarrow is installed, as Parquet.
-
-    Raises:
-        InputError: A file can't be written.
-    """
+    """Write the table atomically as CSV and, if pyarrow is installed, as Parquet."""
     table = columns_of(plan.campaign.keys, ordered(plan, rows))
     config, experiment = plan.campaign.config, str(plan.campaign.experiment)
     facts = {"campaign": config.name, "description": config.description, "experiment": experiment}

@@ -76,10 +76,7 @@ class CharacterisationLimits:
         return math.pi * travel / (2.0 * _OF_SLEW_TO_START * self.loaded.config.limits.slew_per_s)
 
     def scale(self, values: F64) -> float:
-        """Return the factor, at most 1, that keeps all commands of a run within slew and heat.
-
-        It leaves a margin to both limits.
-        """
+        """Return the factor, <= 1, that keeps commands within slew and heat with a margin."""
         config = self.loaded.config
         figures = CommandFigures(config, self.rest, self.rest**2)
         figures.add(values)
@@ -93,11 +90,7 @@ class CharacterisationLimits:
 
 
 def limits_of(loaded: LoadedExperiment, highest_hz: float | None = None) -> CharacterisationLimits:
-    """Return the limits of a characterisation.
-
-    The highest frequency of loops is derived from the sample rate if None. Raise InputError if it
-    has too few samples per cycle.
-    """
+    """Return the limits; ``highest_hz`` follows from the sample rate if None."""
     config = loaded.config
     rate_hz = config.sample_rate_hz
     most_hz = rate_hz / _FEWEST_SAMPLES

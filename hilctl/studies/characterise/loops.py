@@ -106,11 +106,8 @@ def _refuse_saturated(displacement_um: F64, label: str) -> None:
 def next_amplitude(
     loops: Sequence[LoopFigures], wanted: float, stroke_um: tuple[float, float]
 ) -> float | None:
-    """Return the amplitude of the next growing loop: the wanted one, lowered to the stroke.
-
-    In most actuators displacement grows faster than the command. The exponent is estimated from the
-    last two loops. None if the amplitude is hardly larger than the last one.
-    """
+    """Return the wanted amplitude, lowered to the stroke; None if it is hardly a change."""
+    # Displacement grows faster than the command: the last two loops give the exponent.
     if not loops:
         return wanted
     last = loops[-1]

@@ -1,8 +1,4 @@
-"""Noise at rest, first reaction and small-signal response; problems of the rig.
-
-The small-signal response is measured with a multisine of small amplitude. The scatter between its
-periods is the noise of each line. A gain, a delay, a lag and a resonance are fitted to it.
-"""
+"""Noise at rest, first reaction and small-signal response; problems of the rig."""
 
 import math
 from dataclasses import dataclass
@@ -90,10 +86,7 @@ def rest_noise(recording: Recording) -> RestNoise:
 
 
 def crept_percent(recording: Recording) -> tuple[float, ...]:
-    """Return the creep in each long hold, in percent of the displacement from the start.
-
-    Creep counts from 0.1 s after the preceding motion. Holds at the initial command are omitted.
-    """
+    """Return the creep from 0.1 s on in each long hold off the initial command, in percent."""
     segment = recording.segments[-1]
     samples = recording.samples.part(segment.start, segment.stop)
     command, part = samples.command, round(_MEAN_S * recording.sample_rate_hz)
@@ -215,10 +208,7 @@ class SmallSignal:
 
 
 def small_signal(recording: Recording) -> SmallSignal:
-    """Evaluate a recording of one multisine whose period is a whole number of samples.
-
-    Raise RigProblemError if too few lines are above the noise.
-    """
+    """Evaluate one multisine; raise RigProblemError if too few lines are above the noise."""
     frequency_hz, response, noise, amplitude = _lines(recording)
     usable = noise < _USABLE * np.abs(response)
     if np.count_nonzero(usable) < _FEWEST_LINES:

@@ -107,11 +107,8 @@ class Characterisation:
 
     @property
     def verdict(self) -> Verdict | None:
-        """Verdict on the model; None without one.
-
-        A rejection by the identification is final. Otherwise the error on the random reference
-        decides: it resembles a run more closely than held-out loops.
-        """
+        """Verdict on the model; None without one."""
+        # The random reference resembles a run more closely than held-out loops.
         if self.identification is None or not self.held_out:
             return None
         known, first = self.identification.verdict, self.held_out[0]
@@ -181,13 +178,8 @@ VALIDATED: Mapping[str, str] = {
 
 
 def identified(recordings: Mapping[str, Path]) -> Identification:
-    """Select the kind of model and identify it from complete histories.
-
-    Small loops depend on the history of the actuator, which steady loops do not contain.
-
-    Raises:
-        InputError: No model can be identified from the recordings.
-    """
+    """Identify a model from complete histories; raise InputError if none can be identified."""
+    # Small loops depend on the history of the actuator, which steady loops do not contain.
     fitted = parallel_map(read, [p for name, p in recordings.items() if name in FITTED])
     with workers("threads") as run:
         return identify_records(
@@ -221,11 +213,7 @@ def validated(
 def validate(
     model: HysteresisModel, recording: Recording, noise_um: float, label: str
 ) -> ValidationReference:
-    """Validate a model on a recording that starts with a conditioning cycle.
-
-    The model runs through the complete recording. The waveforms after the first are evaluated at
-    full amplitude, within the input range of the model.
-    """
+    """Validate a model on a recording that starts with a conditioning cycle."""
     parts = recording.segments[1:]
     stop = parts[-1].steady_stop
     command, measured_um = without_gaps(recording, 0, stop)

@@ -250,11 +250,7 @@ class RunDigest:
 
 
 def digest_of(recording: Recording, model: HysteresisModel | None = None) -> RunDigest:
-    """Return the digest of a recording, compared with a model, the recorded one if None.
-
-    Raises:
-        DataError: A metadata value is not a number.
-    """
+    """Return the digest of a recording, compared with a model, the recorded one if None."""
     values = _experiment(recording)
     waveform = _waveform(values)
     structure = _structure(recording, waveform)

@@ -64,10 +64,7 @@ def _turns(u: F64, least: float) -> list[int]:
 
 
 def _closed(u: F64, turns: list[int]) -> list[tuple[int, int, int]]:
-    """Return the start, turning point and end of each minor loop.
-
-    The cycle starts and ends at its highest input, so that all minor loops are closed.
-    """
+    """Return start, turning point and end of each minor loop of a cycle from its highest input."""
     found = []
     stack: list[int] = []
     for turn in turns:

@@ -34,11 +34,7 @@ _COLUMNS = (STROKE, HYSTERESIS, AREA, PEAK_ERROR, RMS_ERROR, MODEL_ERROR, NATURA
 
 
 def write_series(series: RunSeries, path: Path) -> None:
-    """Write the page atomically, replacing an existing file.
-
-    Raises:
-        InputError: The file can't be written.
-    """
+    """Write the page atomically, replacing an existing file."""
     html.write_page(series_page(series), path)
 
 
@@ -76,10 +72,7 @@ def _simulated(series: RunSeries) -> Iterator[str]:
 def run_table(
     series: RunSeries, most: int, *, short: bool = False
 ) -> tuple[list[str], list[list[str]]]:
-    """Return headings and rows of a table of runs, without empty columns.
-
-    A short table, for a terminal, has short headings and no file names.
-    """
+    """Return headings and rows of a table without empty columns; a short one fits a terminal."""
     figures = [each for each in _COLUMNS if each.of(series.runs)]
     headings = ["run", *(each.axis for each in series.dimensions)]
     headings += [each.short if short else axis_name(series, each) for each in figures]

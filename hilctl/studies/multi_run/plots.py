@@ -58,10 +58,8 @@ _MOST_BARS = 12
 
 
 def trend_sheets(series: RunSeries) -> Iterator[FigureSpec]:
-    """Yield metrics against each numeric parameter, with linear fits against frequency.
-
-    Stroke and area are plotted for runs without a compensator: with one, they follow the reference.
-    """
+    """Yield metrics against each numeric parameter, with linear fits against frequency."""
+    # With a compensator, stroke and area follow the reference.
     plain = series.plain
     for along in series.dimensions:
         if not along.numeric:

@@ -49,11 +49,8 @@ def spread(items: Sequence[Item], most: int = _MOST_CURVES) -> list[Item]:
 
 
 def looks(dimension: VariedParameter | None, values: Sequence[Hashable]) -> Mapping[Hashable, Any]:
-    """Return colour and marker for each value of a parameter, or each name.
-
-    Numbers use viridis, which keeps its order in greyscale and for colour-blind readers. Names use
-    the colours of Okabe and Ito.
-    """
+    """Return colour and marker for each value of a parameter, or each name."""
+    # viridis keeps its order in greyscale; names use the colours of Okabe and Ito.
     if dimension is not None and dimension.numeric and len(values) > 1:
         shades = mpl.colormaps["viridis"](np.linspace(0.0, 0.78, len(values)))
         colours = [mpl.colors.to_hex(shade) for shade in shades]
@@ -184,11 +181,8 @@ def _draw_model(axes: Axes, digest: RunDigest) -> None:
 
 
 def before_after_sheet(series: RunSeries) -> FigureSpec | None:
-    """Return loops without and with each compensator, normalised to their range; None without both.
-
-    Command and reference have different units. A perfect compensator gives a straight line from
-    corner to corner.
-    """
+    """Return loops without and with each compensator, normalised to their range, or None."""
+    # A perfect compensator gives a straight line from corner to corner.
     pairs = pairs_of(series)
     if not pairs:
         return None

@@ -119,10 +119,7 @@ def trends(
     along: VariedParameter,
     runs: Sequence[SeriesRun] | None = None,
 ) -> list[Trend]:
-    """Return the trends of a metric along a numeric parameter, one per combination of the others.
-
-    All completed runs are used if ``runs`` is None.
-    """
+    """Return a metric's trends along a parameter, one per combination of the others."""
     others = [each for each in series.dimensions if each.key != along.key]
     grouped: dict[tuple[Hashable, ...], dict[float, list[float]]] = defaultdict(
         lambda: defaultdict(list)

@@ -132,11 +132,7 @@ def _leaves(value: Any, at: str) -> Iterator[str]:
 def dimensions(
     keys: Sequence[str], rows: Sequence[Mapping[str, Hashable]], unit: str = ""
 ) -> tuple[VariedParameter, ...]:
-    """Return the varied parameters, without keys that depend on others.
-
-    ``rows`` has the value of each key, one mapping per run; ``unit`` is the unit of amplitudes, if
-    it is the same in all runs.
-    """
+    """Return the varied parameters of rows of values, without keys that depend on others."""
     columns = {key: [row.get(key) for row in rows] for key in keys}
     varied = [key for key in keys if len(set(columns[key]) - {None}) > 1]
     kept: list[str] = []
@@ -152,11 +148,8 @@ def _rank(key: str) -> int:
 
 
 def _follows(columns: Mapping[str, list[Hashable]], key: str, other: str) -> bool:
-    """Return whether a key depends on another one: it has one value for each of the other's.
-
-    An important key with fewer values is independent: three runs at three frequencies may have two
-    amplitudes.
-    """
+    """Return whether a key depends on another one: it has one value for each of the other's."""
+    # An important key with fewer values is independent: three frequencies, two amplitudes.
     pairs = set(zip(columns[other], columns[key], strict=True))
     values = len(set(columns[other]))
     if len(pairs) != values:
