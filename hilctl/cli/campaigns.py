@@ -5,7 +5,7 @@ import shlex
 import signal
 import sys
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -247,7 +247,7 @@ def result_mapping(result: CampaignResult) -> dict[str, Any]:
         "page": str(result.page) if result.page else None,
         "steps": len(codes),
         "results": {code: codes.count(code) for code in sorted(set(codes))},
-        "drift": result.drift.to_mapping() if result.drift else None,
+        "drift": asdict(result.drift) if result.drift else None,
         "reason": result.reason,
     }
 

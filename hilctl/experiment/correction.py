@@ -31,25 +31,16 @@ _SAME_PERIOD = 1e-6
 
 
 class LearnedCycle(StrictModel):
-    """One period of a correction: ``sum cosine_k cos(k phi) + sine_k sin(k phi)``.
+    """One period of a correction: ``sum cosine_k cos(k phi) + sine_k sin(k phi)``."""
 
-    Attributes:
-        label: The waveform in words.
-        period_samples: Its period; phase 0 is at the waveform's first sample.
-        reference_um: The reference at 64 even phases.
-        cosine_um: Coefficients of k = 0, 1, ...
-        sine_um: Coefficients of the same k; 0 for k = 0.
-        start_percent: Peak error before learning, in percent of the peak-to-peak displacement.
-        error_percent: Peak error with this correction.
-    """
-
-    label: str
-    period_samples: Annotated[float, Field(gt=0.0)]
+    label: str  # the waveform in words
+    period_samples: Annotated[float, Field(gt=0.0)]  # phase 0 is at the waveform's first sample
+    # the reference at 64 even phases
     reference_um: Annotated[tuple[float, ...], Field(min_length=PHASES, max_length=PHASES)]
-    cosine_um: Annotated[tuple[float, ...], Field(min_length=1)]
-    sine_um: tuple[float, ...]
-    start_percent: float | None = None
-    error_percent: float | None = None
+    cosine_um: Annotated[tuple[float, ...], Field(min_length=1)]  # coefficients of k = 0, 1, ..
+    sine_um: tuple[float, ...]  # coefficients of the same k; 0 for k = 0
+    start_percent: float | None = None  # peak error before learning, of the peak-to-peak
+    error_percent: float | None = None  # peak error with this correction
 
     @model_validator(mode="after")
     def _same_length(self) -> "LearnedCycle":
@@ -92,18 +83,12 @@ class LearnedCycle(StrictModel):
 
 
 class Correction(StrictModel):
-    """Learned cycles with their origin.
-
-    Attributes:
-        sample_rate_hz: Samples per second.
-        model_sha256: Digest of the compensator's model.
-        cycles: One per waveform.
-        provenance: Experiment, runs, identified delay, versions.
-    """
+    """Learned cycles with their origin."""
 
     sample_rate_hz: Annotated[float, Field(gt=0.0)]
-    model_sha256: str
-    cycles: Annotated[tuple[LearnedCycle, ...], Field(min_length=1)]
+    model_sha256: str  # digest of the compensator's model
+    cycles: Annotated[tuple[LearnedCycle, ...], Field(min_length=1)]  # one per waveform
+    # experiment, runs, identified delay, versions
     provenance: Mapping[str, str] = Field(default_factory=dict)
 
     def added(self, reference: Reference, model: HysteresisModel | None) -> F64:

@@ -252,20 +252,13 @@ class StartOutcome:
 
 @dataclass(frozen=True)
 class FoundModel:
-    """A model without provenance, and how it was identified.
-
-    Attributes:
-        numbers: Number of fitted numbers.
-        parameters: Parameters under their published names, in command units, um and s; empty for
-            models that are only a table of weights.
-        standard_errors: Standard errors of the parameters, if known.
-        end: End of the search, from which another fit can start.
-    """
+    """A model without provenance, and how it was identified."""
 
     model: HysteresisModel
     numbers: int
+    # by published name, in command units, um and s; empty for tables
     parameters: dict[str, float] = field(default_factory=dict)
     starts: tuple[StartOutcome, ...] = ()
-    standard_errors: dict[str, float] = field(default_factory=dict)
+    standard_errors: dict[str, float] = field(default_factory=dict)  # of the parameters, if known
     at_bound: tuple[str, ...] = ()
-    end: object | None = None
+    end: object | None = None  # end of the search, from which another fit can start

@@ -135,16 +135,11 @@ def _pieces(signals: F64, rate_hz: float) -> Iterator[C128]:
 
 @dataclass(frozen=True, slots=True)
 class _Pairs:
-    """Pairs of resonance and antiresonance, and a smooth part.
+    """Pairs of resonance and antiresonance, and a smooth part."""
 
-    Attributes:
-        x: float64[4 m + 3], per pair the logarithms of natural frequency, damping ratio, ratio of
-            the antiresonance's frequency to it, and its damping ratio; then gain, slope, bend.
-        misfit: Residual of the transfer function, in power.
-    """
-
+    # float64[4 m + 3]: logarithms of each pair's frequency, damping, ratio, damping; smooth part
     x: F64
-    misfit: float
+    misfit: float  # residual of the transfer function, in power
 
 
 def _left(spectra: _Spectra, before: _Pairs, now: _Pairs) -> float:

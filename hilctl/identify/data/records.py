@@ -1,7 +1,7 @@
 """Records that models are fitted to: steady loops and time histories."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -97,12 +97,10 @@ class History:
         if lag_samples < 0:
             raise DataError(f"{self.label}: lag_samples must be >= 0: {lag_samples}")
         end = self.command.size - lag_samples
-        return History(
-            self.label,
-            np.ascontiguousarray(self.command[: max(end, 0)]),
-            np.ascontiguousarray(self.displacement_um[lag_samples:]),
-            self.sample_rate_hz,
-            self.ignore,
+        return replace(
+            self,
+            command=np.ascontiguousarray(self.command[: max(end, 0)]),
+            displacement_um=np.ascontiguousarray(self.displacement_um[lag_samples:]),
         )
 
     def run(self) -> tuple[F64, F64, int]:

@@ -1,7 +1,7 @@
 """Refinement of a model by recordings: a better model, or reasons why there is none."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -65,13 +65,9 @@ def _history(recording: Recording, known: Mapping[str, Recording]) -> History:
     still = round(STILL_S * recording.sample_rate_hz)
     command = np.concatenate((first.command, np.full(still, last), history.command))
     ahead = np.zeros(command.size - history.command.size)  # not evaluated
-    return History(
-        history.label,
-        command,
-        np.concatenate((ahead, history.displacement_um)),
-        history.sample_rate_hz,
-        ahead.size + history.ignore,
-    )
+    displacement_um = np.concatenate((ahead, history.displacement_um))
+    ignore = ahead.size + history.ignore
+    return replace(history, command=command, displacement_um=displacement_um, ignore=ignore)
 
 
 @dataclass(frozen=True, slots=True)

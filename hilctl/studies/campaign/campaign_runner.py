@@ -38,27 +38,31 @@ _PAGE_SHARE = 30.0  # pause before the page is written again, over the time to w
 
 @dataclass(frozen=True, slots=True)
 class CampaignHost(StudyHost):
-    """Runs, time and observers of a campaign.
+    """Runs, time and observers of a campaign."""
 
-    Attributes:
-        on_row: Called with each finished step and its row.
-        on_note: Called with a line about each repaired recording.
-    """
-
+    # called after each step
     on_row: Callable[[CampaignStep, CampaignRow], None] = field(default=lambda step, row: None)
-    on_note: Callable[[str], None] = field(default=lambda text: None)
+    on_note: Callable[[str], None] = field(default=lambda text: None)  # per repaired file
 
 
 @dataclass(frozen=True, slots=True)
 class CampaignResult:
-    """Result of a campaign."""
+    """Result of a campaign.
+
+    Attributes:
+        rows: Outcome of each step, by its number.
+        tables: Files of the table.
+        reason: Why it ended before its last step; otherwise empty.
+        stop_signal: Number of the signal that stopped it, or 0.
+        page: Its page; None if it could not be written.
+    """
 
     plan: CampaignPlan
-    rows: dict[int, CampaignRow]  # outcome of each step, by its number
-    tables: tuple[Path, ...]  # files of the table
-    reason: str = ""  # why it ended before its last step; otherwise empty
-    stop_signal: int = 0  # number of the signal that stopped it, or 0
-    page: Path | None = None  # its page; None if it could not be written
+    rows: dict[int, CampaignRow]
+    tables: tuple[Path, ...]
+    reason: str = ""
+    stop_signal: int = 0
+    page: Path | None = None
 
     @property
     def ordered(self) -> list[tuple[CampaignStep, CampaignRow]]:

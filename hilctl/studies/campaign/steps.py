@@ -21,20 +21,13 @@ _SEEDS = 1_000_000
 
 @dataclass(frozen=True, slots=True)
 class CampaignStep:
-    """One run of a campaign.
+    """One run of a campaign."""
 
-    Attributes:
-        number: Its position, from 1.
-        point: A value for each varied key; empty for a reference run.
-        repeat: Number of the repeat or of the reference run, from 1.
-        settings: ``key=value`` texts over the base experiment.
-    """
-
-    number: int
-    point: Point
-    repeat: int
+    number: int  # its position, from 1
+    point: Point  # a value for each varied key; empty for a reference run
+    repeat: int  # number of the repeat or of the reference run, from 1
     is_reference: bool
-    settings: tuple[str, ...]
+    settings: tuple[str, ...]  # ``key=value`` texts over the base experiment
 
     @property
     def text(self) -> str:
@@ -45,22 +38,14 @@ class CampaignStep:
 
 @dataclass(frozen=True, slots=True)
 class CampaignSteps:
-    """A campaign file with its steps, not checked yet.
-
-    Attributes:
-        document: The file's YAML with the location of each value.
-        experiment: File of the base experiment.
-        settings: ``key=value`` texts over it from outside the campaign file.
-        keys: The varied keys.
-        steps: The steps in order.
-    """
+    """A campaign file with its steps, not checked yet."""
 
     config: CampaignFile
-    document: Document
-    experiment: Path
-    settings: tuple[str, ...]
-    keys: tuple[str, ...]
-    steps: tuple[CampaignStep, ...]
+    document: Document  # the file's YAML with the location of each value
+    experiment: Path  # file of the base experiment
+    settings: tuple[str, ...]  # ``key=value`` texts over it from outside the campaign file
+    keys: tuple[str, ...]  # the varied keys
+    steps: tuple[CampaignStep, ...]  # the steps in order
 
     def load(self, step: CampaignStep, files: TextFiles) -> LoadedExperiment:
         """Return the experiment of a step; raise InputError if it can't be read or is invalid."""

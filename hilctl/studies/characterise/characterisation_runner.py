@@ -6,7 +6,7 @@ from functools import cached_property
 from pathlib import Path
 
 from hilctl.base.errors import DataError, InputError, RunError
-from hilctl.base.files import check_writable, write_text
+from hilctl.base.files import check_writable, make_folder, write_text
 from hilctl.base.types import F64, CommandUnit
 from hilctl.experiment.coil_heat import CoolingCoil, RunHeat
 from hilctl.experiment.device_state import heat_before
@@ -181,10 +181,7 @@ class CharacterisationRunner:
         """
         check_writable(output, overwrite=overwrite)
         require_room(self._folder, self.plan.megabytes, self.plan.free_mb)
-        try:
-            self._folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(f"{self._folder}: can't be created: {error.strerror}") from None
+        make_folder(self._folder)
         result = Characterisation(
             experiment=self._loaded.config.name,
             device=self._loaded.device.info.name,

@@ -62,23 +62,15 @@ class ValidationReference:
 
 @dataclass(frozen=True, slots=True)
 class StepRow:
-    """One step of the plan or the result.
-
-    Attributes:
-        seconds: Rig time.
-        megabytes: Approximate size of its recording.
-        text: Summary of its result; empty before the run.
-        recording: Its recording; empty if it was not run.
-        kept: Whether the recording existed already.
-    """
+    """One step of the plan or the result."""
 
     name: str
     purpose: str
-    seconds: float
-    megabytes: float
-    text: str = ""
-    recording: str = ""
-    kept: bool = False
+    seconds: float  # rig time
+    megabytes: float  # approximate size of its recording
+    text: str = ""  # summary of its result; empty before the run
+    recording: str = ""  # its recording; empty if it was not run
+    kept: bool = False  # whether the recording existed already
 
 
 @dataclass(frozen=True, slots=True)

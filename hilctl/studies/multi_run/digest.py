@@ -1,7 +1,7 @@
 """Metrics of one run, and its data for figures; drift of reference runs."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -31,48 +31,27 @@ from hilctl.waveforms.spec import AnyWaveform, Multisine, Step
 
 @dataclass(frozen=True, slots=True)
 class RunFigures:
-    """Metrics of one run; None for those that do not apply.
+    """Metrics of one run; None for those that do not apply."""
 
-    Attributes:
-        peak_hysteresis_percent: Peak hysteresis, of the segment with the largest.
-        peak_error_percent: Largest error (displacement minus reference), of the peak-to-peak.
-        rms_error_percent: rms error, of the peak-to-peak.
-        loop_area: Area of the loop, in um times the unit of its input.
-        peak_to_peak_um: Peak-to-peak displacement.
-        low_um: Lowest displacement of the average cycle.
-        high_um: Highest displacement of the average cycle.
-        mean_um: Mean displacement of the average cycle.
-        offset_um: Offset measured at rest and subtracted.
-        minor_low_um: Peak-to-peak displacement of the minor loops at the lowest input.
-        minor_high_um: The same of those at the highest input.
-        minor_low_percent: Peak hysteresis of the minor loops at the lowest input, of their own
-            peak-to-peak.
-        minor_high_percent: The same of those at the highest input.
-        natural_hz: Natural frequency, from the ringing after a step or a multisine's response.
-        damping_ratio: Its damping ratio.
-        deadline_misses: Skipped ticks.
-        heat_before_a: Running rms of the coil current before the run, in A.
-        heat_after_a: The same after the run.
-    """
-
-    peak_hysteresis_percent: float | None = None
+    peak_hysteresis_percent: float | None = None  # peak hysteresis, of the segment with the largest
+    # largest displacement minus reference, of the peak-to-peak
     peak_error_percent: float | None = None
-    rms_error_percent: float | None = None
-    loop_area: float | None = None
+    rms_error_percent: float | None = None  # rms error, of the peak-to-peak
+    loop_area: float | None = None  # area of the loop, in um times the unit of its input
     peak_to_peak_um: float | None = None
-    low_um: float | None = None
-    high_um: float | None = None
-    mean_um: float | None = None
-    offset_um: float | None = None
-    minor_low_um: float | None = None
-    minor_high_um: float | None = None
-    minor_low_percent: float | None = None
-    minor_high_percent: float | None = None
-    natural_hz: float | None = None
+    low_um: float | None = None  # lowest displacement of the average cycle
+    high_um: float | None = None  # highest displacement of the average cycle
+    mean_um: float | None = None  # mean displacement of the average cycle
+    offset_um: float | None = None  # offset measured at rest and subtracted
+    minor_low_um: float | None = None  # peak-to-peak of the minor loops at the lowest input
+    minor_high_um: float | None = None  # the same of those at the highest input
+    minor_low_percent: float | None = None  # their peak hysteresis, of their own peak-to-peak
+    minor_high_percent: float | None = None  # the same of those at the highest input
+    natural_hz: float | None = None  # from the ringing after a step, or a multisine's response
     damping_ratio: float | None = None
-    deadline_misses: int | None = None
-    heat_before_a: float | None = None
-    heat_after_a: float | None = None
+    deadline_misses: int | None = None  # skipped ticks
+    heat_before_a: float | None = None  # running rms of the coil current before the run, in A
+    heat_after_a: float | None = None  # the same after the run
 
 
 FIGURES = tuple(field.name for field in fields(RunFigures))
@@ -166,10 +145,6 @@ class SeriesDrift:
     mean_um: float | None  # change of the mean displacement
     peak_hysteresis_percent: float | None  # change of the peak hysteresis, in points of percent
 
-    def to_mapping(self) -> dict[str, Any]:
-        """Return the fields as plain values."""
-        return asdict(self)
-
     def __str__(self) -> str:
         parts = [
             (self.peak_to_peak_percent, "{:+.3g} % in peak-to-peak"),
@@ -205,43 +180,31 @@ _NO_LOOP = np.empty((2, 0))
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunDigest:
-    """Data of one run, a few kilobytes for a run of any length.
-
-    Attributes:
-        started: When it began, ISO 8601.
-        code: ``completed``, ``stopped`` or ``fault``; empty if no end was recorded.
-        reason: Why it ended.
-        values: Its experiment as plain values, nested as in the file.
-        waveform: Label of the evaluated segment.
-        loop: float64[2, m], input and displacement of the evaluated loop, closed; see
-            :class:`hilctl.analysis.steady_state.SteadyPart`. Empty without a cycle.
-        error_um: float64[2, m], phase in cycles and error in um; empty without a reference.
-        modelled: float64[3, m], command, measured and modelled displacement over one cycle; empty
-            without a model.
-        model_error_percent: Largest model error, of the peak-to-peak; None without a model.
-        step: float64[2, k], time in s and displacement in um after the largest step, or empty.
-        response: Small-signal response, or None.
-    """
+    """Data of one run, a few kilobytes for a run of any length."""
 
     name: str
     path: str
-    started: str
+    started: str  # when it began, ISO 8601
     labels: Mapping[str, LabelValue]
     device: str
     simulated: bool
-    code: str
-    reason: str
-    values: Mapping[str, Any]
+    code: str  # ``completed``, ``stopped`` or ``fault``; empty if no end was recorded
+    reason: str  # why it ended
+    values: Mapping[str, Any]  # its experiment as plain values, nested as in the file
     compensated: bool
     command_unit: str
-    waveform: str
+    waveform: str  # label of the evaluated segment
     figures: RunFigures
+    # float64[2, m], input and displacement, closed; empty without a cycle
     loop: F64 = field(default_factory=_NO_LOOP.copy)
+    # float64[2, m], phase in cycles and error in um, or empty
     error_um: F64 = field(default_factory=_NO_LOOP.copy)
+    # float64[3, m], command, measured and modelled um over a cycle, or empty
     modelled: F64 = field(default_factory=lambda: np.empty((3, 0)))
-    model_error_percent: float | None = None
+    model_error_percent: float | None = None  # largest, of the peak-to-peak; None without a model
+    # float64[2, k], time in s and um after the largest step, or empty
     step: F64 = field(default_factory=_NO_LOOP.copy)
-    response: SmallSignal | None = None
+    response: SmallSignal | None = None  # small-signal response, or None
 
     @property
     def is_plain_loop(self) -> bool:

@@ -185,7 +185,7 @@ def series_mapping(series: RunSeries) -> dict[str, Any]:
         "failed": [run.number for run in series.failed],
         "not_read": list(series.missing),
         "trends": [trend.to_mapping() for trend in fitted_trends(series)],
-        "drift": series.drift.to_mapping() if series.drift else None,
+        "drift": asdict(series.drift) if series.drift else None,
     }
 
 

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from hilctl.analysis.figure_layout import ColumnWidth, FigureSpec, Panel, drawn, write_figure
 from hilctl.analysis.plot_style import COMMAND, DISPLACEMENT, ERROR, MARK, QUIET
 from hilctl.base.errors import InputError
-from hilctl.base.files import already_there
+from hilctl.base.files import already_there, make_folder
 from hilctl.base.formatting import unit_text
 from hilctl.studies.multi_run.collect import OnRead, RunSeries, SeriesRun
 from hilctl.studies.multi_run.run_plots import (
@@ -286,10 +286,7 @@ def write_sheets(
     taken = [path for path in names if path.exists()]
     if taken and not overwrite:
         raise already_there(taken[0], "give another --output, or --overwrite")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder}: can't be created: {error.strerror}") from None
+    make_folder(folder)
     written: dict[Path, str] = {}
     for sheet, (name, figure) in zip(sheets, draw_sheets(sheets, width, on_done), strict=True):
         on_drawn(name, figure)
