@@ -41,19 +41,12 @@ class RangeFindings:
 
 
 def spectrum(
-    values: F64,
+    values: F64,  # float64[n]
     sample_rate_hz: float,
-    least_move: float = 0.0,
-    told: tuple[slice, ...] | None = None,
+    least_move: float = 0.0,  # peak-to-peak value below which a window is ignored
+    told: tuple[slice, ...] | None = None,  # representative parts; None for the whole signal
 ) -> Spectrum:
-    """Return the frequencies of a signal, window after window.
-
-    Args:
-        values: float64[n].
-        sample_rate_hz: Samples per second.
-        least_move: Peak-to-peak value below which a window is ignored.
-        told: Representative parts; None for the whole signal.
-    """
+    """Return the frequencies of a signal, window after window."""
     size = min(max(round(WINDOW_S * sample_rate_hz), FEWEST_SAMPLES), values.size)
     step_hz = sample_rate_hz / size
     main = highest = 0

@@ -51,13 +51,9 @@ LIMITS_ASKED = {
 def starting_device(
     name: str, folder: Path, unit: CommandUnit = "A", reader: str | None = None
 ) -> TemplateDevice:
-    """Return the device of a new experiment.
+    """Return the device of an experiment in ``folder``: a device, profile or path of a profile.
 
-    Args:
-        name: Device, shipped profile, or path of a profile.
-        folder: Folder of the experiment, base of the profile's path.
-        unit: Unit that drives the actuator, if an amplifier follows the output.
-        reader: Profile of the device that reads the sensor, if it is another one.
+    ``unit`` drives the actuator behind an amplifier; ``reader`` is a profile with the sensor.
 
     Raises:
         InputError: The name is unknown, or the device cannot drive an actuator by itself.

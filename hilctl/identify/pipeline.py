@@ -123,27 +123,16 @@ def settings_from(kind: str, texts: Sequence[str]) -> IdentifySettings:
 
 
 def identify_files(
-    paths: Sequence[Path],
+    paths: Sequence[Path],  # recordings and text tables
     settings: IdentifySettings,
-    output: Path | None,
-    validate: Sequence[Path] = (),
-    scheduler: str = "none",
+    output: Path | None,  # model file to write
+    validate: Sequence[Path] = (),  # if there are none, parts of the others
+    scheduler: str = "none",  # see :func:`hilctl.identify.parallel.workers`
     *,
     overwrite: bool = False,
     progress: OnProgress = ignore_progress,
 ) -> Identification:
-    """Fit a model to files, evaluate it on held-out data, and write it.
-
-    A model with the grade "not a model" is not written.
-
-    Args:
-        paths: Recordings and text tables.
-        settings: Settings of the fit.
-        output: Model file to write; None for none.
-        validate: Files to evaluate the model on; if there are none, parts of the others.
-        scheduler: Where independent fits run, see :func:`hilctl.identify.parallel.workers`.
-        overwrite: Whether a model file of that name may be replaced.
-        progress: Called with what is being done.
+    """Fit a model to files, evaluate it on held-out data, and write it unless it is "not a model".
 
     Raises:
         InputError: A file or a setting can't be used; nothing is written.

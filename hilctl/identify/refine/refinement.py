@@ -112,22 +112,14 @@ class Refinement:
 
 def refine_files(
     model: Path,
-    paths: Sequence[Path],
-    output: Path | None,
-    validate: Sequence[Path] = (),
+    paths: Sequence[Path],  # recordings of runs, compensated or not
+    output: Path | None,  # model file to write
+    validate: Sequence[Path] = (),  # if there are none, those of ``paths`` in turn
     *,
     overwrite: bool = False,
     progress: OnProgress = ignore_progress,
 ) -> Refinement:
     """Refine a model from recordings, and write it if it is better.
-
-    Args:
-        model: Model file.
-        paths: Recordings of runs, compensated or not.
-        output: Model file to write; None for none.
-        validate: Recordings to evaluate on; if there are none, those of ``paths`` in turn.
-        overwrite: Whether a model file of that name may be replaced.
-        progress: Progress callback.
 
     Raises:
         InputError: A file can't be used; nothing is written.

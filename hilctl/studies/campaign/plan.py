@@ -78,17 +78,10 @@ def planned(
     completed: Mapping[RunKey, Sequence[Path]],
     heat_a2: float | None = None,
 ) -> CampaignPlan:
-    """Check and plan the remaining steps.
+    """Check and plan the remaining steps; raise ConfigError with all problems.
 
-    Args:
-        campaign: The campaign.
-        folder: Folder of the recordings.
-        completed: Completed recordings, in their order.
-        heat_a2: Heat of the coil before the first step, in A^2; None for steps without real time,
-            where kept steps heat the coil as well.
-
-    Raises:
-        ConfigError: One or more steps are not allowed; all problems are listed.
+    ``heat_a2`` is the heat of the coil before the first step, in A^2; None for steps without real
+    time, where kept steps heat the coil as well.
     """
     files, problems = TextFiles(), _Problems(campaign)
     left = {key: list(paths) for key, paths in completed.items()}

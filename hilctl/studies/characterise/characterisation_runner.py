@@ -100,13 +100,6 @@ class CharacterisationHost(StudyHost):
 class CharacterisationRunner:
     """Characterise the device of an experiment; its waveform and compensator are not used.
 
-    Args:
-        experiment: Experiment file.
-        settings: ``key=value`` texts over it.
-        folder: Folder of the recordings.
-        highest_hz: Highest frequency of loops; derived from the sample rate if None.
-        host: Runs and observers.
-
     Raises:
         InputError: The experiment is invalid, or a real device is to run without real time.
     """
@@ -116,7 +109,7 @@ class CharacterisationRunner:
         experiment: Path,
         settings: Sequence[str],
         folder: Path,
-        highest_hz: float | None = None,
+        highest_hz: float | None = None,  # of loops; derived from the sample rate if None
         host: CharacterisationHost | None = None,
     ) -> None:
         self._experiment = experiment

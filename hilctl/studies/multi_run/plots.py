@@ -261,7 +261,7 @@ def sheets_of(series: RunSeries) -> list[FigureSpec]:
 def write_sheets(
     sheets: Sequence[FigureSpec],
     folder: Path,
-    formats: Sequence[str],
+    formats: Sequence[str],  # see :data:`hilctl.analysis.figure_layout.FORMATS`
     width: ColumnWidth,
     *,
     overwrite: bool,
@@ -269,15 +269,6 @@ def write_sheets(
     on_drawn: Callable[[str, Figure], None] = lambda name, figure: None,
 ) -> dict[Path, str]:
     """Write figures in several formats; return the files, each with its caption.
-
-    Args:
-        sheets: The figures.
-        folder: Folder of the files; created if missing.
-        formats: See :data:`hilctl.analysis.figure_layout.FORMATS`.
-        width: One or two columns of a journal.
-        overwrite: Whether existing files may be replaced.
-        on_done: Called with the progress.
-        on_drawn: Called with each name and figure.
 
     Raises:
         InputError: A file exists or can't be written.
