@@ -111,11 +111,8 @@ class RunHeat:
     def repeated(
         self, alone_a2: float, samples: int, times: int, limits: Limits, sample_rate_hz: float
     ) -> "RunHeat":
-        """Return the effect including more repeats of the last cycle, begun at ``alone_a2``.
-
-        The highest initial heat is set by the first cycle or by the last one, which is still to be
-        added, because the margin changes monotonically from one cycle to the next.
-        """
+        """Return the effect including more repeats of the last cycle, begun at ``alone_a2``."""
+        # The margin is monotonic: the first cycle or the last, still to be added, sets the highest.
         seconds = self.seconds + times * samples / sample_rate_hz
         tau_s = limits.thermal_time_constant_s
         if tau_s is None:
@@ -125,11 +122,7 @@ class RunHeat:
 
 
 class CoolingCoil:
-    """Heat of a coil through runs and pauses; constant without a thermal budget.
-
-    Args:
-        heat_a2: Heat at ``now_s``, in A^2; at least that of the safe value.
-    """
+    """Heat of a coil through runs and pauses; constant without a thermal budget."""
 
     def __init__(self, config: Experiment, heat_a2: float, now_s: float) -> None:
         self._tau_s = config.limits.thermal_time_constant_s

@@ -30,10 +30,8 @@ def measures_offset(config: Experiment) -> bool:
 def conditioning_of(
     loaded: LoadedExperiment, stands_um: float | None = None
 ) -> Conditioning | None:
-    """Return the conditioning before the waveform, or None.
-
-    ``stands_um`` is the model displacement at its end, or None if no offset is measured.
-    """
+    """Return the conditioning before the waveform, or None."""
+    # stands_um: the model displacement at its end, or None if no offset is measured.
     config, condition = loaded.config, loaded.config.condition
     if condition is None and not measures_offset(config):
         return None

@@ -140,10 +140,7 @@ def evaluate(coefficients: C128, points: int) -> F64:
 
 
 def signature(values: F64, segment: Segment) -> F64 | None:
-    """Return one steady period of a reference, float64[n], at 64 even phases: float64[64].
-
-    None without a complete period at full amplitude.
-    """
+    """Return a steady period of a reference at 64 even phases, float64[64]; None without one."""
     if segment.period <= 0.0:
         return None
     before = np.ceil((segment.steady_start - segment.start) / segment.period - 1e-9)
@@ -187,12 +184,7 @@ def model_sha256(model: HysteresisModel | None) -> str:
 
 
 def load_correction(path: Path, files: TextFiles | None = None) -> Correction:
-    """Read a correction file.
-
-    Raises:
-        InputError: The file can't be read.
-        ConfigError: It breaks a rule; all problems are listed.
-    """
+    """Read a correction file; raise InputError if it can't be read or breaks a rule."""
     return load_document(path, files).validate(CorrectionFile).correction
 
 
@@ -203,9 +195,5 @@ def dump_correction(correction: Correction) -> str:
 
 
 def write_correction(path: Path, correction: Correction, *, overwrite: bool) -> None:
-    """Write a correction file atomically.
-
-    Raises:
-        InputError: It exists and may not be replaced, or can't be written.
-    """
+    """Write a correction file atomically; raise InputError if that is not possible."""
     write_text(path, dump_correction(correction), overwrite=overwrite)

@@ -97,11 +97,7 @@ def copy_example(name: str, into: Path, folder: Path) -> tuple[Path, ...]:
 
 
 def copy_schema(into: Path) -> Path:
-    """Copy the JSON schema of experiments into a folder that has none.
-
-    Raises:
-        InputError: It cannot be written.
-    """
+    """Copy the JSON schema of experiments into a folder that has none."""
     copy = into / _SCHEMA
     if not copy.exists():
         write_text(copy, read_text(examples_folder() / _SCHEMA), overwrite=False)

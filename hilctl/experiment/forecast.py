@@ -166,10 +166,7 @@ def simulate_commands(
 
 
 def whole_cycle(period: float, samples: int) -> int:
-    """Return the shortest whole cycle worth comparing, in samples; 0 if there is none.
-
-    Fewer than four cycles in the samples of the periodic part are not worth it.
-    """
+    """Return the shortest whole cycle, at most a quarter of the samples; 0 if there is none."""
     for periods in range(1, _MOST_PERIODS + 1):
         length = periods * period
         if length > LONG or 4 * length > samples:

@@ -44,10 +44,7 @@ class InitialState:
     run_id: str  # the run of those commands; empty for the present one
 
     def lead_in(self, input_um: F64, samples: int) -> F64:
-        """Return the compensator's input, float64[n], led in from the actuator's displacement.
-
-        The lead-in of ``samples`` is cut off at the end of the input.
-        """
+        """Return the input, float64[n], led in over ``samples`` from the displacement."""
         away_um = self.stands_um - float(input_um[0])
         led = input_um.copy()
         part = np.arange(min(samples, input_um.size)) / samples

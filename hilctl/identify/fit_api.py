@@ -79,10 +79,7 @@ class FitData:
 
     @cached_property
     def creep(self) -> F64:
-        """Columns of offset and creep per record, float64[N, f].
-
-        A constant per record, and the usual law of creep ln(1 + t / 0.1 s) per history.
-        """
+        """Columns of a constant per record and ln(1 + t / 0.1 s) per history, float64[N, f]."""
         columns: list[F64] = []
         for record, place in zip(self.records, self.places, strict=True):
             part = np.ones((place.stop - place.start, 1))
@@ -222,11 +219,7 @@ class FitRequest:
 
 @dataclass(frozen=True, slots=True)
 class FitJob:
-    """Prepared data of one fit, and settings.
-
-    The fit continues from ``start``, the ``end`` of a fit of this kind to other data or of another
-    size.
-    """
+    """Prepared data and settings of a fit that continues from ``start``, another fit's end."""
 
     data: FitData
     settings: FitSettings

@@ -69,11 +69,8 @@ def identified_range(data: FitData) -> IdentifiedRange:
 
 
 def smallest_um(record: Record) -> float:
-    """Return the peak-to-peak displacement of a loop, or of a history's smaller swings.
-
-    Swings are those between turns of the command; a tenth of the total path is in smaller swings,
-    which excludes noise and the end of decaying cycles.
-    """
+    """Return the peak-to-peak of a loop, or of a history's smaller swings."""
+    # A tenth of the path is in smaller ones: noise, and the end of decaying cycles.
     if isinstance(record, History):
         at = turning_points(record.command)
         swings_um = np.sort(np.abs(np.diff(record.displacement_um[at])))

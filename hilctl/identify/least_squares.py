@@ -72,10 +72,7 @@ def smooth_densities(
 
 
 def differences(first: I64, second: I64, size: int) -> F64:
-    """Return rows of the differences of pairs of unknowns, second less first: float64[k, size].
-
-    Pairs with a negative number are ignored.
-    """
+    """Return rows of the differences of numbered pairs >= 0: float64[k, size]."""
     both = (first >= 0) & (second >= 0)
     out = np.zeros((int(both.sum()), size))
     rows = np.arange(len(out))

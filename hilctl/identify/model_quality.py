@@ -73,10 +73,7 @@ def verdict_of(
 
 
 def data_reasons(records: Sequence[Record], *, even: bool = False) -> Iterator[str]:
-    """Yield faults of the data that do not depend on the model.
-
-    With ``even``, the displacement may rise with commands of both signs (rods without bias).
-    """
+    """Yield faults of the data; an ``even`` displacement may rise with both signs."""
     moves = [float(np.ptp(record.displacement_um)) for record in records]
     largest = int(np.argmax(moves))
     if moves[largest] > MOST_UM:

@@ -34,10 +34,7 @@ class Split:
 
 @dataclass(frozen=True, slots=True)
 class HeldOut:
-    """Errors of a model on held-out data, whose origin ``how`` describes.
-
-    A fit to all data can start from ``end``.
-    """
+    """Errors on held-out data, whose origin is ``how``; a fit to all can start from ``end``."""
 
     judgement: Evaluation
     records: tuple[Record, ...]
@@ -82,10 +79,7 @@ def held_out_error(request: FitRequest) -> HeldOut | None:
 
 
 def held_out_errors(requests: Sequence[FitRequest], run: MapFunction) -> list[HeldOut | None]:
-    """Return errors of each fit on held-out parts of its data; None if too few data are left.
-
-    One start of each search is enough.
-    """
+    """Return the errors of one start of each fit on held-out data; None if too few are left."""
     tasks = [
         (number, fold, replace(
             request,
@@ -194,10 +188,7 @@ class CandidateScore:
 
 @dataclass(frozen=True, slots=True)
 class OrderScore:
-    """Errors of a model of one size on held-out data, in percent of the largest stroke.
-
-    ``plays`` counts the lines of a Preisach triangle if the model has one.
-    """
+    """Errors of one size on held-out data, of the stroke; ``plays`` may count lines."""
 
     plays: int
     deadbands_a_side: int
@@ -216,11 +207,7 @@ class Selection:
 
 
 def select(request: FitRequest) -> Selection:
-    """Select kind or size by errors on held-out data, as far as the settings leave them open.
-
-    Raises:
-        DataError: There are too few data to leave some out.
-    """
+    """Select the open kind or size by held-out errors; raise DataError if data are too few."""
     settings = request.settings
     if isinstance(settings, IdentifySettings) and settings.auto:
         return _choose_kind(request, settings)
@@ -324,10 +311,7 @@ def _candidates(
 def choose_lag(
     load: Callable[[int], Records], settings: FitSettings, run: MapFunction, progress: OnProgress
 ) -> int:
-    """Return the lag of the displacement, in samples, with the least error.
-
-    ``load`` returns the data with the displacement shifted by that many samples.
-    """
+    """Return the lag with the least error; ``load`` returns data shifted by that many samples."""
     progress(0.0, f"{MOST_LAG + 1} fits for the lag of the displacement")
     lean = settings.model_copy(update={"starts": 1, "peak_goal_percent": None})
     requests = [FitRequest(tuple(load(lag)), lean) for lag in range(MOST_LAG + 1)]

@@ -107,11 +107,7 @@ class Identification:
 
 
 def settings_from(kind: str, texts: Sequence[str]) -> IdentifySettings:
-    """Return the settings of a fit: those of the kind, changed by ``key=value`` texts.
-
-    Raises:
-        InputError: The kind is unknown, or settings are invalid; all invalid ones are listed.
-    """
+    """Return the settings of a kind, changed by texts; raise InputError with all problems."""
     if kind == "auto":
         document = Document("hilctl identify", "kind: field\nauto: true")
     else:
@@ -160,11 +156,7 @@ def identify_files(
 
 
 def identify_records(request: FitRequest, validate: Sequence[Record] = ()) -> Identification:
-    """Fit a model to records, and evaluate it on held-out data.
-
-    Raises:
-        DataError: The data can't be used as asked, or there are none.
-    """
+    """Fit a model to records, and evaluate it; raise DataError if they can't be used."""
     records = request.records
 
     def found(modes: Sequence[FurtherMode]) -> Found:

@@ -34,15 +34,8 @@ class Probed:
 
 
 def probe(path: Path, settings: list[str]) -> Probed:
-    """Read an experiment's device under its lock.
-
-    A device that supports it is only read: no set-up steps are sent, and a tripped watchdog stays
-    tripped. Others, and simulated ones, are opened and closed.
-
-    Raises:
-        InputError: The experiment is not valid, or a run holds the device.
-        DeviceError: The device cannot be reached, or is another one.
-    """
+    """Read a device under its lock, or open and close it; raise InputError if a run holds it."""
+    # Reading sends no set-up steps, and a tripped watchdog stays tripped.
     loaded = load_experiment(path, settings)
     info = loaded.device.info
     with held_devices(info.holds):

@@ -87,11 +87,7 @@ ReaderLine: TypeAlias = Literal["same", "own"]
 
 @dataclass(frozen=True)
 class EmulatorOptions:
-    """What to emulate; link, current, functions and the reader's unit and port are for Modbus only.
-
-    Raises:
-        InputError: ``link`` or ``reader_line`` is none of its words.
-    """
+    """What to emulate; link, current, functions, and reader unit and port: Modbus only."""
 
     profile: str  # name of a shipped profile, or path of one
     link: LinkKind | None = None  # tcp, or rtu on a pty; the profile's own if None

@@ -51,11 +51,8 @@ class SteadyLoop:
         return np.asarray((self.command - before) * self.sample_rate_hz, dtype=np.float64)
 
     def run(self) -> tuple[F64, F64, int]:
-        """Return two periods to simulate, their rate, and the number of samples not evaluated.
-
-        One period from rest brings every play operator to its periodic state, because it clips its
-        state to a range.
-        """
+        """Return two periods to simulate, their rate, and the number of samples not evaluated."""
+        # One period from rest brings every play to its periodic state: it clips to a range.
         return np.tile(self.command, 2), np.tile(self.rate(), 2), self.command.size
 
 
@@ -89,11 +86,7 @@ class History:
         return np.asarray(np.arange(self.command.size) / self.sample_rate_hz, dtype=np.float64)
 
     def without_lag(self, lag_samples: int) -> "History":
-        """Return the history with the displacement taken ``lag_samples`` later.
-
-        For sensors or recorders with a delay. The model does not contain this lag, and its
-        compensator does not invert it. Raise DataError if it is negative or leaves too few samples.
-        """
+        """Return the history with the displacement taken later, by a lag outside the model."""
         if lag_samples < 0:
             raise DataError(f"{self.label}: lag_samples must be >= 0: {lag_samples}")
         end = self.command.size - lag_samples

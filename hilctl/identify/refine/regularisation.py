@@ -35,11 +35,7 @@ class RegularisationSplit:
 
 @dataclass(frozen=True, slots=True)
 class SelectedRegularisation:
-    """A regularisation, and its errors on held-out runs.
-
-    With ``own``, each run has an offset, creep and drift. ``anchor`` is the weight of the old model
-    on motions of its whole range, of the least.
-    """
+    """A regularisation, perhaps with each run's ``own`` drift, and its held-out errors."""
 
     strength: float
     anchor: float

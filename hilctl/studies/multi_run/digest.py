@@ -31,27 +31,48 @@ from hilctl.waveforms.spec import AnyWaveform, Multisine, Step
 
 @dataclass(frozen=True, slots=True)
 class RunFigures:
-    """Metrics of one run; None for those that do not apply."""
+    """Metrics of one run; None for those that do not apply.
 
-    peak_hysteresis_percent: float | None = None  # peak hysteresis, of the segment with the largest
-    # largest displacement minus reference, of the peak-to-peak
+    Attributes:
+        peak_hysteresis_percent: Peak hysteresis, of the segment with the largest.
+        peak_error_percent: Largest error (displacement minus reference), of the peak-to-peak.
+        rms_error_percent: rms error, of the peak-to-peak.
+        loop_area: Area of the loop, in um times the unit of its input.
+        peak_to_peak_um: Peak-to-peak displacement.
+        low_um: Lowest displacement of the average cycle.
+        high_um: Highest displacement of the average cycle.
+        mean_um: Mean displacement of the average cycle.
+        offset_um: Offset measured at rest and subtracted.
+        minor_low_um: Peak-to-peak displacement of the minor loops at the lowest input.
+        minor_high_um: The same of those at the highest input.
+        minor_low_percent: Peak hysteresis of the minor loops at the lowest input, of their own
+            peak-to-peak.
+        minor_high_percent: The same of those at the highest input.
+        natural_hz: Natural frequency, from the ringing after a step or a multisine's response.
+        damping_ratio: Its damping ratio.
+        deadline_misses: Skipped ticks.
+        heat_before_a: Running rms of the coil current before the run, in A.
+        heat_after_a: The same after the run.
+    """
+
+    peak_hysteresis_percent: float | None = None
     peak_error_percent: float | None = None
-    rms_error_percent: float | None = None  # rms error, of the peak-to-peak
-    loop_area: float | None = None  # area of the loop, in um times the unit of its input
+    rms_error_percent: float | None = None
+    loop_area: float | None = None
     peak_to_peak_um: float | None = None
-    low_um: float | None = None  # lowest displacement of the average cycle
-    high_um: float | None = None  # highest displacement of the average cycle
-    mean_um: float | None = None  # mean displacement of the average cycle
-    offset_um: float | None = None  # offset measured at rest and subtracted
-    minor_low_um: float | None = None  # peak-to-peak of the minor loops at the lowest input
-    minor_high_um: float | None = None  # the same of those at the highest input
-    minor_low_percent: float | None = None  # their peak hysteresis, of their own peak-to-peak
-    minor_high_percent: float | None = None  # the same of those at the highest input
-    natural_hz: float | None = None  # from the ringing after a step, or a multisine's response
+    low_um: float | None = None
+    high_um: float | None = None
+    mean_um: float | None = None
+    offset_um: float | None = None
+    minor_low_um: float | None = None
+    minor_high_um: float | None = None
+    minor_low_percent: float | None = None
+    minor_high_percent: float | None = None
+    natural_hz: float | None = None
     damping_ratio: float | None = None
-    deadline_misses: int | None = None  # skipped ticks
-    heat_before_a: float | None = None  # running rms of the coil current before the run, in A
-    heat_after_a: float | None = None  # the same after the run
+    deadline_misses: int | None = None
+    heat_before_a: float | None = None
+    heat_after_a: float | None = None
 
 
 FIGURES = tuple(field.name for field in fields(RunFigures))
