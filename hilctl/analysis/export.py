@@ -20,7 +20,7 @@ import numpy as np
 from hilctl.analysis.catalogue import Entry, read_catalogue
 from hilctl.analysis.export_files import FORMATS, ColumnFile, Columns, Facts, ParquetFile, arrow
 from hilctl.base.errors import DataError, InputError
-from hilctl.base.files import check_writable, write_file
+from hilctl.base.files import check_writable, make_folder, write_file
 from hilctl.base.samples import COLUMNS, RECORDED_FIELDS
 from hilctl.recording.reader import RecordingStream
 from hilctl.recording.recording import Recording
@@ -203,10 +203,7 @@ def export_all(
 
 
 def _export_one(source: Path, target: Path, path: str, done: ExportedAll) -> None:
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{target.parent}: can't be made: {error.strerror}") from None
+    make_folder(target.parent)
     try:
         write_file(
             target,

@@ -277,6 +277,14 @@ def reason(error: OSError, remedies: Mapping[int, str] = REMEDIES) -> str:
     return f"{text} ({remedy})" if remedy else text
 
 
+def make_folder(path: Path) -> None:
+    """Create a folder and its parents where missing; raise InputError if that fails."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot create {path}: {reason(error)}") from None
+
+
 def no_such_file(path: Path) -> str:
     """Return the message for a missing file, with the closest existing name."""
     if not path.parent.is_dir():

@@ -5,7 +5,7 @@ import shlex
 import signal
 import sys
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -86,11 +86,7 @@ def sweep(
 
 
 def sweep_document(experiment: Path, vary: Sequence[str], repeat: int) -> Document:
-    """Return the campaign file that is equivalent to ``--vary`` options.
-
-    Raises:
-        ConfigError: An option does not have the form ``KEY=VALUES``, or a key is repeated.
-    """
+    """Return the campaign of ``--vary`` options; raise ConfigError if one is not KEY=VALUES."""
     lines = [
         f"name: {json.dumps(f'{experiment.stem[:70]}-sweep')}",
         f"experiment: {json.dumps(str(experiment))}",
@@ -251,7 +247,7 @@ def result_mapping(result: CampaignResult) -> dict[str, Any]:
         "page": str(result.page) if result.page else None,
         "steps": len(codes),
         "results": {code: codes.count(code) for code in sorted(set(codes))},
-        "drift": result.drift.to_mapping() if result.drift else None,
+        "drift": asdict(result.drift) if result.drift else None,
         "reason": result.reason,
     }
 

@@ -111,12 +111,8 @@ class CommandTable(TyperGroup):
         return name, line and load(line.name or ""), rest
 
     def invoke(self, ctx: Any) -> Any:
-        """Run the command.
-
-        Raises:
-            RunError: Data ended unexpectedly. typer would report an ``EOFError`` as Ctrl-D at a
-                prompt, but prompts raise ``typer.Abort``.
-        """
+        """Run the command; data that ended unexpectedly raise RunError."""
+        # typer would report an EOFError as Ctrl-D, but prompts raise typer.Abort.
         try:
             return super().invoke(ctx)
         except EOFError as error:
@@ -124,11 +120,7 @@ class CommandTable(TyperGroup):
 
 
 def load(name: str) -> Any:
-    """Return a command of the table.
-
-    Raises:
-        InputError: It cannot be imported because a part of the installation is missing.
-    """
+    """Return a command; raise InputError if a part of the installation is missing."""
     module = COMMANDS[name].module
     try:
         found = import_module(module)

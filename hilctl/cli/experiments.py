@@ -3,6 +3,7 @@
 import shlex
 import sys
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -46,7 +47,7 @@ def examples(
         return
     listed = shipped_examples(folder)
     if as_json:
-        print_json({"examples": [example.to_mapping() for example in listed]})
+        print_json({"examples": [{**asdict(each), "path": str(each.path)} for each in listed]})
         return
     print_rich(listing("", [(example.name, example.description) for example in listed]))
     print("\nhilctl examples NAME copies an example and its files into this folder")

@@ -25,10 +25,8 @@ _READER_CLOSED = {errno.EPIPE, errno.EIO}
 class Verbosity:
     """Amount of output."""
 
-    quiet = False
-    """Print only warnings, errors and ``--json`` output; no progress."""
-    verbose = False
-    """Print all log records with time and module, and the traceback of an error."""
+    quiet = False  # print only warnings, errors and ``--json`` output; no progress
+    verbose = False  # print all log records with time and module, and the traceback of an error
 
 
 def take_verbosity(words: list[str]) -> None:
@@ -66,10 +64,7 @@ def print_traceback() -> None:
 
 
 class StandardStream(io.TextIOWrapper):
-    """A standard stream that never fails, so that a closed pipe cannot stop a run.
-
-    After the first ``failure`` all output is lost.
-    """
+    """A standard stream that never fails; all output after the first ``failure`` is lost."""
 
     def __init__(self, stream: io.TextIOWrapper) -> None:
         # Characters outside the locale's encoding are escaped. This layer does not buffer, so that
@@ -158,11 +153,8 @@ def safe_streams(*, acts: bool = False) -> Iterator[None]:
 
 
 def _open_missing() -> None:
-    """Open the null device for each closed descriptor from 0 to 2.
-
-    Otherwise the next file that is opened, such as a recording, gets one of these numbers and
-    receives what processes write to their standard error.
-    """
+    """Open the null device for each closed descriptor from 0 to 2."""
+    # Otherwise the next file, such as a recording, would get standard error's number.
     for number in range(3):
         try:
             os.fstat(number)

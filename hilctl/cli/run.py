@@ -166,10 +166,7 @@ def safe(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson 
 def run_progress(
     *, quiet: bool, addresses: Sequence[str] = ()
 ) -> Iterator[Callable[[RunProgress], None]]:
-    """Yield a function that shows the newest samples on standard error, a few times per second.
-
-    The addresses of live pages are printed with the first samples.
-    """
+    """Yield a function that shows the newest samples on standard error, a few per second."""
     pages, shown_s = list(addresses), 0.0
 
     def update(progress: RunProgress) -> None:

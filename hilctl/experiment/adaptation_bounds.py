@@ -22,11 +22,8 @@ the phase margin above 60 degrees."""
 
 
 def adaptation_bounds(config: Experiment) -> AdaptationBounds:
-    """Return the bounds of the adapted parameters; all 0 without adaptation.
-
-    Feedback already removes the offset. A learned correction already contains the effect of gain
-    and weights, and is valid for the unchanged model only.
-    """
+    """Return the bounds of the adapted parameters; all 0 without adaptation."""
+    # Feedback removes the offset; a correction contains gain and weights of one model.
     wanted, compensator = config.adaptation, config.compensator
     if wanted is None or compensator is None:
         return AdaptationBounds(0.0, 0.0, 0.0)

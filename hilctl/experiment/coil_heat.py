@@ -86,17 +86,11 @@ class CoilHeat:
 
 @dataclass(frozen=True, slots=True)
 class RunHeat:
-    """Effect of a run on the heat of the coil, for any initial heat.
+    """Effect of a run on the heat of the coil, for any initial heat."""
 
-    Attributes:
-        seconds: Duration of the run.
-        alone_a2: Final heat of an initially cold coil, in A^2.
-        hottest_a2: Highest initial heat within the budget, in A^2; infinite without a budget.
-    """
-
-    seconds: float = 0.0
-    alone_a2: float = 0.0
-    hottest_a2: float = math.inf
+    seconds: float = 0.0  # duration of the run
+    alone_a2: float = 0.0  # final heat of an initially cold coil, in A^2
+    hottest_a2: float = math.inf  # highest initial heat within the budget; infinite without one
 
     def then(self, command: F64, limits: Limits, sample_rate_hz: float) -> "RunHeat":
         """Return the effect including the next commands: float64[n], in A."""
@@ -117,11 +111,8 @@ class RunHeat:
     def repeated(
         self, alone_a2: float, samples: int, times: int, limits: Limits, sample_rate_hz: float
     ) -> "RunHeat":
-        """Return the effect including more repeats of the last cycle, begun at ``alone_a2``.
-
-        The highest initial heat is set by the first cycle or by the last one, which is still to be
-        added, because the margin changes monotonically from one cycle to the next.
-        """
+        """Return the effect including more repeats of the last cycle, begun at ``alone_a2``."""
+        # The margin is monotonic: the first cycle or the last, still to be added, sets the highest.
         seconds = self.seconds + times * samples / sample_rate_hz
         tau_s = limits.thermal_time_constant_s
         if tau_s is None:
@@ -131,11 +122,7 @@ class RunHeat:
 
 
 class CoolingCoil:
-    """Heat of a coil through runs and pauses; constant without a thermal budget.
-
-    Args:
-        heat_a2: Heat at ``now_s``, in A^2; at least that of the safe value.
-    """
+    """Heat of a coil through runs and pauses; constant without a thermal budget."""
 
     def __init__(self, config: Experiment, heat_a2: float, now_s: float) -> None:
         self._tau_s = config.limits.thermal_time_constant_s

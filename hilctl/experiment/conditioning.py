@@ -16,8 +16,7 @@ from hilctl.experiment.load import LoadedExperiment
 from hilctl.experiment.sections import REST_S
 from hilctl.loop.lead_in import Conditioning
 
-OFFSET_SHARE = 0.25
-"""Largest measured offset that is corrected, as a share of the stroke limits."""
+OFFSET_SHARE = 0.25  # largest measured offset that is corrected, as a share of the stroke limits
 _HIGHEST_HZ = 10.0  # slow enough for fields to penetrate a rod
 _FEWEST_SAMPLES = 20  # a shorter cycle misses its own peaks
 _SLEW_SHARE = 0.5  # of the slew limit, by default
@@ -31,10 +30,8 @@ def measures_offset(config: Experiment) -> bool:
 def conditioning_of(
     loaded: LoadedExperiment, stands_um: float | None = None
 ) -> Conditioning | None:
-    """Return the conditioning before the waveform, or None.
-
-    ``stands_um`` is the model displacement at its end, or None if no offset is measured.
-    """
+    """Return the conditioning before the waveform, or None."""
+    # stands_um: the model displacement at its end, or None if no offset is measured.
     config, condition = loaded.config, loaded.config.condition
     if condition is None and not measures_offset(config):
         return None

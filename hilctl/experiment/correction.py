@@ -23,8 +23,7 @@ from hilctl.models.base import HysteresisModel
 from hilctl.models.model_file import dump_model
 from hilctl.waveforms.build import Reference
 
-PHASES = 64
-"""Points of a cycle that identify a waveform."""
+PHASES = 64  # points of a cycle that identify a waveform
 
 _GRID = 1 << 16  # the highest harmonic of 2048 loses 0.5 % of its amplitude between points
 _TOLERANCE = 1e-3
@@ -32,25 +31,16 @@ _SAME_PERIOD = 1e-6
 
 
 class LearnedCycle(StrictModel):
-    """One period of a correction: ``sum cosine_k cos(k phi) + sine_k sin(k phi)``.
+    """One period of a correction: ``sum cosine_k cos(k phi) + sine_k sin(k phi)``."""
 
-    Attributes:
-        label: The waveform in words.
-        period_samples: Its period; phase 0 is at the waveform's first sample.
-        reference_um: The reference at 64 even phases.
-        cosine_um: Coefficients of k = 0, 1, ...
-        sine_um: Coefficients of the same k; 0 for k = 0.
-        start_percent: Peak error before learning, in percent of the peak-to-peak displacement.
-        error_percent: Peak error with this correction.
-    """
-
-    label: str
-    period_samples: Annotated[float, Field(gt=0.0)]
+    label: str  # the waveform in words
+    period_samples: Annotated[float, Field(gt=0.0)]  # phase 0 is at the waveform's first sample
+    # the reference at 64 even phases
     reference_um: Annotated[tuple[float, ...], Field(min_length=PHASES, max_length=PHASES)]
-    cosine_um: Annotated[tuple[float, ...], Field(min_length=1)]
-    sine_um: tuple[float, ...]
-    start_percent: float | None = None
-    error_percent: float | None = None
+    cosine_um: Annotated[tuple[float, ...], Field(min_length=1)]  # coefficients of k = 0, 1, ..
+    sine_um: tuple[float, ...]  # coefficients of the same k; 0 for k = 0
+    start_percent: float | None = None  # peak error before learning, of the peak-to-peak
+    error_percent: float | None = None  # peak error with this correction
 
     @model_validator(mode="after")
     def _same_length(self) -> "LearnedCycle":
@@ -93,18 +83,12 @@ class LearnedCycle(StrictModel):
 
 
 class Correction(StrictModel):
-    """Learned cycles with their origin.
-
-    Attributes:
-        sample_rate_hz: Samples per second.
-        model_sha256: Digest of the compensator's model.
-        cycles: One per waveform.
-        provenance: Experiment, runs, identified delay, versions.
-    """
+    """Learned cycles with their origin."""
 
     sample_rate_hz: Annotated[float, Field(gt=0.0)]
-    model_sha256: str
-    cycles: Annotated[tuple[LearnedCycle, ...], Field(min_length=1)]
+    model_sha256: str  # digest of the compensator's model
+    cycles: Annotated[tuple[LearnedCycle, ...], Field(min_length=1)]  # one per waveform
+    # experiment, runs, identified delay, versions
     provenance: Mapping[str, str] = Field(default_factory=dict)
 
     def added(self, reference: Reference, model: HysteresisModel | None) -> F64:
@@ -156,10 +140,7 @@ def evaluate(coefficients: C128, points: int) -> F64:
 
 
 def signature(values: F64, segment: Segment) -> F64 | None:
-    """Return one steady period of a reference, float64[n], at 64 even phases: float64[64].
-
-    None without a complete period at full amplitude.
-    """
+    """Return a steady period of a reference at 64 even phases, float64[64]; None without one."""
     if segment.period <= 0.0:
         return None
     before = np.ceil((segment.steady_start - segment.start) / segment.period - 1e-9)
@@ -203,12 +184,7 @@ def model_sha256(model: HysteresisModel | None) -> str:
 
 
 def load_correction(path: Path, files: TextFiles | None = None) -> Correction:
-    """Read a correction file.
-
-    Raises:
-        InputError: The file can't be read.
-        ConfigError: It breaks a rule; all problems are listed.
-    """
+    """Read a correction file; raise InputError if it can't be read or breaks a rule."""
     return load_document(path, files).validate(CorrectionFile).correction
 
 
@@ -219,9 +195,5 @@ def dump_correction(correction: Correction) -> str:
 
 
 def write_correction(path: Path, correction: Correction, *, overwrite: bool) -> None:
-    """Write a correction file atomically.
-
-    Raises:
-        InputError: It exists and may not be replaced, or can't be written.
-    """
+    """Write a correction file atomically; raise InputError if that is not possible."""
     write_text(path, dump_correction(correction), overwrite=overwrite)

@@ -30,37 +30,22 @@ _log = logging.getLogger(__name__)
 
 
 class CoilState(StrictModel):
-    """State of the coil after a run.
+    """State of the coil after a run."""
 
-    Attributes:
-        ended: End of the run.
-        output_safe: Whether the device confirmed its safe value.
-        heat_a2: Running mean square of its current, in A^2.
-        thermal_time_constant_s: Time constant of that mean; None if the run had none.
-    """
-
-    ended: datetime
-    output_safe: bool
-    heat_a2: Annotated[float, Field(ge=0.0)]
-    thermal_time_constant_s: float | None
+    ended: datetime  # end of the run
+    output_safe: bool  # whether the device confirmed its safe value
+    heat_a2: Annotated[float, Field(ge=0.0)]  # running mean square of its current, in A^2
+    thermal_time_constant_s: float | None  # None without a thermal budget
 
 
 class DeviceState(StrictModel):
-    """The last run of a device.
+    """The last run of a device."""
 
-    Attributes:
-        holds: Resources of the device, see :attr:`hilctl.base.device.DeviceInfo.holds`.
-        run_id: The run.
-        recording: Absolute path of its recording; its commands determine the actuator's state.
-        started: Due time of its first sample.
-        coil: Final state of the coil; None until the run has ended.
-    """
-
-    holds: list[str]
+    holds: list[str]  # resources of the device, see DeviceInfo.holds
     run_id: str
-    recording: str
-    started: datetime
-    coil: CoilState | None = None
+    recording: str  # absolute path; its commands determine the actuator's state
+    started: datetime  # due time of its first sample
+    coil: CoilState | None = None  # final state of the coil; None until the run has ended
 
 
 def read_device_state(holds: Sequence[str]) -> DeviceState | None:

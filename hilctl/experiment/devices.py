@@ -38,12 +38,7 @@ def known_devices() -> dict[str, str]:
 
 
 def device_class(kind: str) -> type[Device]:
-    """Return the class of a device.
-
-    Raises:
-        InputError: The device is unknown, its module cannot be imported, or its class has no
-            options.
-    """
+    """Return the class of a device; raise InputError if it is unknown or cannot be loaded."""
     known = known_devices()
     if kind not in known:
         raise InputError(f"unknown device '{kind}' ({did_you_mean(kind, list(known))})")
@@ -57,11 +52,7 @@ def device_class(kind: str) -> type[Device]:
 
 
 def made_device(document: Document, folder: Path, files: TextFiles) -> Device | None:
-    """Return the device of an experiment, not opened; None without a device section.
-
-    Raises:
-        ConfigError: Rules are broken; the error lists every one of them.
-    """
+    """Return an experiment's device, not opened; None without one; raise ConfigError if invalid."""
     given = document.data.get("device")
     if not isinstance(given, dict):
         return None
@@ -87,11 +78,7 @@ def made_device(document: Document, folder: Path, files: TextFiles) -> Device | 
 
 
 def shipped_profiles() -> dict[str, str]:
-    """Return the name and the file of every shipped profile.
-
-    Raises:
-        InputError: The drivers are not installed.
-    """
+    """Return name and file of every shipped profile; raise InputError without drivers."""
     module_name, _, name = SHIPPED_PROFILES.partition(":")
     try:
         shipped = cast("Callable[[], dict[str, Path]]", getattr(import_module(module_name), name))
@@ -102,13 +89,9 @@ def shipped_profiles() -> dict[str, str]:
 
 @dataclass(frozen=True, slots=True)
 class SerialPort:
-    """A serial port of this machine.
+    """A serial port of this machine."""
 
-    Attributes:
-        path: Device file; ``/dev/serial/by-id/...`` if it exists, which survives replugging.
-    """
-
-    path: str
+    path: str  # device file; ``/dev/serial/by-id/...`` if it exists, which survives replugging
     description: str
 
 
@@ -139,31 +122,21 @@ def inventory() -> Inventory:
 
 @dataclass(frozen=True, slots=True)
 class DeviceOption:
-    """A key of a device's section.
-
-    Attributes:
-        default: Default value as text; None if the key is required.
-    """
+    """A key of a device's section."""
 
     name: str
-    default: str | None
+    default: str | None  # default value as text; None if the key is required
     description: str
 
 
 @dataclass(frozen=True, slots=True)
 class DeviceDescription:
-    """A device or a profile, described without opening it.
-
-    Attributes:
-        place: Class of the device, or file of the profile.
-        options: Keys of the device's section; empty for a profile.
-        profile: Content of the profile; empty for a device.
-    """
+    """A device or a profile, described without opening it."""
 
     name: str
-    place: str
-    options: tuple[DeviceOption, ...]
-    profile: dict[str, Any]
+    place: str  # class of the device, or file of the profile
+    options: tuple[DeviceOption, ...]  # keys of the device's section; empty for a profile
+    profile: dict[str, Any]  # content of the profile; empty for a device
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the fields as plain values."""
@@ -171,11 +144,7 @@ class DeviceDescription:
 
 
 def describe(name: str) -> DeviceDescription:
-    """Describe a device or a shipped profile without opening it.
-
-    Raises:
-        InputError: The name is unknown, or the device cannot be loaded.
-    """
+    """Describe a device or shipped profile, not opened; raise InputError if it is unknown."""
     kinds, profiles = known_devices(), shipped_profiles()
     if name in profiles:
         path = Path(profiles[name])

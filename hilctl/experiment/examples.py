@@ -1,12 +1,12 @@
 """Shipped examples and copies of them: experiments, campaigns, models, layouts, profiles."""
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from hilctl.base.errors import InputError
-from hilctl.base.files import read_text, write_text
+from hilctl.base.files import make_folder, read_text, write_text
 from hilctl.base.yaml import did_you_mean, load_document
 from hilctl.experiment.devices import shipped_profiles
 
@@ -18,13 +18,9 @@ _LAYOUTS = {".json": "Foxglove and Lichtblick", ".xml": "PlotJuggler"}
 
 @dataclass(frozen=True, slots=True)
 class Example:
-    """A shipped file.
+    """A shipped file."""
 
-    Attributes:
-        name: Path of its copy without suffix.
-    """
-
-    name: str
+    name: str  # path of its copy without suffix
     description: str
     path: Path
 
@@ -32,10 +28,6 @@ class Example:
     def copy(self) -> Path:
         """Path of its copy in the folder of copies."""
         return Path(self.name + self.path.suffix)
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Return the fields as plain values."""
-        return {**asdict(self), "path": str(self.path)}
 
 
 def examples_folder() -> Path:
@@ -98,21 +90,14 @@ def copy_example(name: str, into: Path, folder: Path) -> tuple[Path, ...]:
         if copy.exists() and read_text(copy) != text:
             raise InputError(f"{copy}: exists already and differs: use another folder, --into")
     for copy, text in texts.items():
-        try:
-            copy.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(f"{copy.parent}: cannot be created: {error.strerror}") from None
+        make_folder(copy.parent)
         if not copy.exists():
             write_text(copy, text, overwrite=False)
     return tuple(texts)
 
 
 def copy_schema(into: Path) -> Path:
-    """Copy the JSON schema of experiments into a folder that has none.
-
-    Raises:
-        InputError: It cannot be written.
-    """
+    """Copy the JSON schema of experiments into a folder that has none."""
     copy = into / _SCHEMA
     if not copy.exists():
         write_text(copy, read_text(examples_folder() / _SCHEMA), overwrite=False)

@@ -37,10 +37,7 @@ _HIGHEST_RATE_HZ = 1e6
 def make_feedback(
     config: Experiment, compensator: Compensator, latency_blocks: int = 0
 ) -> Controller | None:
-    """Return the feedback controller of a run, or None.
-
-    ``latency_blocks`` counts the exchanges from a block's commands to its displacements.
-    """
+    """Return the controller of a run, or None; answers take ``latency_blocks`` exchanges."""
     wanted = config.feedback
     if wanted is None:
         return None
@@ -55,10 +52,8 @@ def make_feedback(
 
 
 def delays(sensor_delay_s: float, rate_hz: float, preview: int) -> tuple[int, int]:
-    """Return the samples from the reference, and from the input, to the resulting displacement.
-
-    ``preview`` is the number of samples by which the input runs ahead of the commands.
-    """
+    """Return the samples from the reference, and from the input, to the displacement."""
+    # preview: samples by which the input runs ahead of the commands.
     due_after = round(sensor_delay_s * rate_hz) + (0 if preview else 1)
     return due_after, due_after + preview
 
@@ -199,11 +194,8 @@ def _resonance(
 
 
 def gains_for(bandwidth_hz: float, rate_hz: float) -> Gains:
-    """Return the gains whose open loop crosses 1 at ``bandwidth_hz``, below half the rate.
-
-    An actuator with a gain of 1 and a delay needs no proportional part: the integral alone crosses
-    1 at ``ki / (2 pi)``.
-    """
+    """Return the gains whose open loop crosses 1 at ``bandwidth_hz``, below half the rate."""
+    # On a gain of 1 with a delay the integral alone crosses 1 at ki / (2 pi).
     return Gains(0.0, 2.0 * rate_hz * math.sin(math.pi * bandwidth_hz / rate_hz))
 
 

@@ -26,49 +26,32 @@ _BYTES_OF_INPUT = 8.0
 _MOST_PERIODS = 1024
 _LEAST_CYCLE = 65_536
 """Least samples of a compared cycle; comparing shorter ones one by one would be slow."""
-_WHOLE = 1e-3
-"""Largest deviation of the skipped part from a whole number of samples, in samples."""
-_SAME = 1e-3
-"""Largest deviation of the last cycle from the computed one, relative to its span."""
+_WHOLE = 1e-3  # largest deviation of the skipped part from a whole number of samples, in samples
+_SAME = 1e-3  # largest deviation of the last cycle from the computed one, relative to its span
 
 
 @dataclass(frozen=True, slots=True)
 class Forecast:
-    """The commands of a run in numbers.
-
-    Attributes:
-        before_s: Time of the conditioning before the waveform.
-        begins: Initial state of the compensator in words; empty without a compensator.
-        reference_min: Lowest reference, in the waveform's unit.
-        slew_per_s: Fastest change of the command.
-        heat: Effect on the heat of the coil, whatever the heat before.
-        begins_rms_a: Initial running rms of the coil current, left by the last run of the device;
-            None without a thermal budget.
-        heating_rms_a: Highest running rms of the coil current; None without a budget.
-        budget_used_s: Time after which the thermal budget is exceeded; None if it never is.
-        recording_mb: Approximate size of the recording.
-        rate_note: Reason for the highest rate; may be empty.
-        line: Replacement of the inverse while it is bypassed; None if there is none.
-    """
+    """The commands of a run in numbers."""
 
     samples: int
     duration_s: float
-    before_s: float
-    begins: str
-    reference_min: float
+    before_s: float  # time of the conditioning before the waveform
+    begins: str  # initial state of the compensator in words; empty without a compensator
+    reference_min: float  # lowest reference, in the waveform's unit
     reference_max: float
     command_unit: str
     command_min: float
     command_max: float
-    slew_per_s: float
-    heat: RunHeat
-    begins_rms_a: float | None
-    heating_rms_a: float | None
-    budget_used_s: float | None
-    recording_mb: float
+    slew_per_s: float  # fastest change of the command
+    heat: RunHeat  # effect on the heat of the coil, whatever the heat before
+    begins_rms_a: float | None  # running rms after the last run; None without a thermal budget
+    heating_rms_a: float | None  # highest running rms of the coil current; None without a budget
+    budget_used_s: float | None  # time at which the thermal budget is exceeded, if it is
+    recording_mb: float  # approximate size of the recording
     highest_rate_hz: float
-    rate_note: str
-    line: LinearBypass | None
+    rate_note: str  # reason for the highest rate; may be empty
+    line: LinearBypass | None  # replacement of a bypassed inverse; None if there is none
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the fields for the user as plain values."""
@@ -183,10 +166,7 @@ def simulate_commands(
 
 
 def whole_cycle(period: float, samples: int) -> int:
-    """Return the shortest whole cycle worth comparing, in samples; 0 if there is none.
-
-    Fewer than four cycles in the samples of the periodic part are not worth it.
-    """
+    """Return the shortest whole cycle, at most a quarter of the samples; 0 if there is none."""
     for periods in range(1, _MOST_PERIODS + 1):
         length = periods * period
         if length > LONG or 4 * length > samples:

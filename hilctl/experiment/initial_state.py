@@ -24,47 +24,27 @@ _STILL_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class CompensatorStart:
-    """Input and initial state of the compensator of a run.
+    """Input and initial state of the compensator of a run."""
 
-    Attributes:
-        input_um: float64[n], its input; the reference itself if nothing is added.
-        preview: Samples by which its input runs ahead of the commands.
-        state_size: Numbers in its memory.
-        state: float64[state_size], its memory before the first sample; None at rest.
-        begins: Origin of the initial state in words.
-        run_id: The run that left this memory; empty if none did.
-        stands_um: Model displacement before the first sample, if the sensor's offset is measured;
-            otherwise None.
-    """
-
-    input_um: F64
-    preview: int
-    state_size: int
-    state: F64 | None = None
-    begins: str = "at rest"
-    run_id: str = ""
-    stands_um: float | None = None
+    input_um: F64  # float64[n], its input; the reference itself if nothing is added
+    preview: int  # samples by which its input runs ahead of the commands
+    state_size: int  # numbers in its memory
+    state: F64 | None = None  # float64[state_size], before the first sample; None at rest
+    begins: str = "at rest"  # origin of the initial state in words
+    run_id: str = ""  # the run that left this memory; empty if none did
+    stands_um: float | None = None  # modelled before the first sample, to measure the offset
 
 
 @dataclass(frozen=True, slots=True)
 class InitialState:
-    """State of the actuator after earlier commands.
+    """State of the actuator after earlier commands."""
 
-    Attributes:
-        state: float64[state_size], the compensator's memory.
-        stands_um: Displacement by the model.
-        run_id: The run of those commands; empty for the present one.
-    """
-
-    state: F64
-    stands_um: float
-    run_id: str
+    state: F64  # float64[state_size], the compensator's memory
+    stands_um: float  # displacement by the model
+    run_id: str  # the run of those commands; empty for the present one
 
     def lead_in(self, input_um: F64, samples: int) -> F64:
-        """Return the compensator's input, float64[n], led in from the actuator's displacement.
-
-        The lead-in of ``samples`` is cut off at the end of the input.
-        """
+        """Return the input, float64[n], led in over ``samples`` from the displacement."""
         away_um = self.stands_um - float(input_um[0])
         led = input_um.copy()
         part = np.arange(min(samples, input_um.size)) / samples

@@ -78,11 +78,7 @@ def input_files(document: Document, path: Path) -> list[Path]:
 
 
 def inputs_of(path: Path, settings: Sequence[str] = ()) -> list[Path]:
-    """Return the files that a run of an experiment file reads, see :func:`load_experiment`.
-
-    Raises:
-        InputError: The file can't be read, or a setting can't be used.
-    """
+    """Return the files that a run of an experiment reads; raise InputError if it can't be read."""
     document = load_document(path)
     for setting in settings:
         document.set(named_from(path.parent, setting))

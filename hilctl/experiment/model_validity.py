@@ -25,45 +25,28 @@ FAST = 1.25  # of the largest speed
 
 @dataclass(frozen=True, slots=True)
 class Spectrum:
-    """Frequencies of a signal.
+    """Frequencies of a signal."""
 
-    Attributes:
-        main_hz: Half of the power lies below it; maximum over all windows.
-        highest_hz: 99.9 % of the power lies below it; maximum over all windows.
-    """
-
-    main_hz: float
-    highest_hz: float
+    main_hz: float  # half of the power lies below it; maximum over all windows
+    highest_hz: float  # 99.9 % of the power lies below it; maximum over all windows
     resolution_hz: float
 
 
 @dataclass(frozen=True, slots=True)
 class RangeFindings:
-    """Deviations of a reference from the motions a model was identified on.
+    """Deviations of a reference from the motions a model was identified on."""
 
-    Attributes:
-        refused: Reasons to reject the run.
-        warnings: Reasons why the model error is unknown.
-    """
-
-    refused: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
+    refused: tuple[str, ...] = ()  # reasons to reject the run
+    warnings: tuple[str, ...] = ()  # reasons why the model error is unknown
 
 
 def spectrum(
-    values: F64,
+    values: F64,  # float64[n]
     sample_rate_hz: float,
-    least_move: float = 0.0,
-    told: tuple[slice, ...] | None = None,
+    least_move: float = 0.0,  # peak-to-peak value below which a window is ignored
+    told: tuple[slice, ...] | None = None,  # representative parts; None for the whole signal
 ) -> Spectrum:
-    """Return the frequencies of a signal, window after window.
-
-    Args:
-        values: float64[n].
-        sample_rate_hz: Samples per second.
-        least_move: Peak-to-peak value below which a window is ignored.
-        told: Representative parts; None for the whole signal.
-    """
+    """Return the frequencies of a signal, window after window."""
     size = min(max(round(WINDOW_S * sample_rate_hz), FEWEST_SAMPLES), values.size)
     step_hz = sample_rate_hz / size
     main = highest = 0

@@ -45,8 +45,7 @@ from hilctl.waveforms.build import Reference, build
 _log = logging.getLogger(__name__)
 
 _MANY = 50_000_000  # samples, which take some seconds
-STILL_S = 0.1
-"""Time after which the stages of any actuator are at rest."""
+STILL_S = 0.1  # time after which the stages of any actuator are at rest
 
 
 @shown_briefly
@@ -173,10 +172,7 @@ def _start(
 def _state_before(
     loaded: LoadedExperiment, conditioned: F64, now_s: float, problems: list[ConfigProblem]
 ) -> tuple[InitialState | None, str]:
-    """Return the actuator's state before the waveform (None at rest) and its origin in words.
-
-    ``problems`` gets an entry if the state is unknown.
-    """
+    """Return the actuator's state before the waveform (None at rest) and its origin in words."""
     config, model = loaded.config, loaded.model
     if model is None or config.compensator is None:
         return None, ""
@@ -200,10 +196,8 @@ def _state_before(
 def _start_problems(
     loaded: LoadedExperiment, begun: CompensatorStart, forecast: Forecast
 ) -> list[ConfigProblem]:
-    """Return that the reference begins too far from the actuator's rest position.
-
-    A higher slew limit would be the wrong remedy: it would pass the step on to the coil.
-    """
+    """Return that the reference begins too far from the actuator's rest position."""
+    # A higher slew limit would be the wrong remedy: it would pass the step on to the coil.
     model, config, rate_hz = loaded.model, loaded.config, loaded.config.sample_rate_hz
     if model is None or not config.limits.slew_per_s < forecast.slew_per_s < math.inf:
         return []

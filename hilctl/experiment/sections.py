@@ -109,8 +109,7 @@ class RecordingConfig(StrictModel):
         return self
 
 
-REST_S = 0.1
-"""Default rest before the waveform."""
+REST_S = 0.1  # default rest before the waveform
 
 
 class Condition(StrictModel):

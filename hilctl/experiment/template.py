@@ -31,22 +31,14 @@ _BLOCK_S = 0.01
 
 @dataclass(frozen=True, slots=True)
 class TemplateDevice:
-    """Device of a new experiment.
+    """Device of a new experiment."""
 
-    Attributes:
-        name: Requested name, without folder and suffix.
-        section: Its section of the experiment, ``kind`` first.
-        remarks: Comments on values, by dotted key of the experiment.
-        asked: Dotted keys to ask the user for, each with the question.
-        notes: Notes to read before wiring.
-    """
-
-    name: str
+    name: str  # requested name, without folder and suffix
     title: str
-    section: Mapping[str, Any]
-    remarks: Mapping[str, str]
-    asked: Mapping[str, str]
-    notes: Sequence[str]
+    section: Mapping[str, Any]  # its section of the experiment, ``kind`` first
+    remarks: Mapping[str, str]  # comments on values, by dotted key of the experiment
+    asked: Mapping[str, str]  # dotted keys to ask the user for, each with the question
+    notes: Sequence[str]  # notes to read before wiring
 
 
 LIMITS_ASKED = {
@@ -59,13 +51,9 @@ LIMITS_ASKED = {
 def starting_device(
     name: str, folder: Path, unit: CommandUnit = "A", reader: str | None = None
 ) -> TemplateDevice:
-    """Return the device of a new experiment.
+    """Return the device of an experiment in ``folder``: a device, profile or path of a profile.
 
-    Args:
-        name: Device, shipped profile, or path of a profile.
-        folder: Folder of the experiment, base of the profile's path.
-        unit: Unit that drives the actuator, if an amplifier follows the output.
-        reader: Profile of the device that reads the sensor, if it is another one.
+    ``unit`` drives the actuator behind an amplifier; ``reader`` is a profile with the sensor.
 
     Raises:
         InputError: The name is unknown, or the device cannot drive an actuator by itself.

@@ -105,10 +105,7 @@ def _bare_um(history: History, creep: CreepModel | None) -> F64:
 
 
 class _LeastSquares:
-    """Least-squares fit of the shares of given time constants to the motion during rests.
-
-    Heat (the integral of the squared command) and drift (time) are fitted beside them.
-    """
+    """Least-squares fit of shares of given time constants, with heat and drift beside them."""
 
     def __init__(self, histories: Sequence[History], rests: Sequence[_Rest]) -> None:
         self._histories, self._rests = histories, rests

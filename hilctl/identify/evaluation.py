@@ -21,38 +21,24 @@ from hilctl.signals.cycle_metrics import loop_area, peak_hysteresis_percent
 
 @dataclass(frozen=True, slots=True)
 class LoopScore:
-    """Errors of a model on one record.
-
-    Attributes:
-        peak_percent: Largest displacement error, in percent of the record's own peak-to-peak.
-        rms_percent: Root mean square displacement error, in percent of the same.
-        area_error_percent: Error of the loop area in percent; None for a history.
-    """
+    """Errors of a model on one record."""
 
     label: str
-    peak_percent: float
-    rms_percent: float
-    area_error_percent: float | None
+    peak_percent: float  # largest displacement error, in percent of the record's own peak-to-peak
+    rms_percent: float  # root mean square displacement error, in percent of the same
+    area_error_percent: float | None  # error of the loop area in percent; None for a history
     peak_to_peak_um: float
 
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:
-    """Errors of a model on all records.
-
-    Attributes:
-        modelled_um: Modelled displacement of the evaluated samples of each record, float64[n].
-        peak_percent: Largest displacement error in percent of the largest peak-to-peak displacement
-            of a record, as publications report it.
-        rms_percent: Root mean square displacement error, in percent of the same.
-        own_peak_percent: Largest ``peak_percent`` of single records.
-    """
+    """Errors of a model on all records."""
 
     errors: tuple[LoopScore, ...]
-    modelled_um: tuple[F64, ...]
-    peak_percent: float
-    rms_percent: float
-    own_peak_percent: float
+    modelled_um: tuple[F64, ...]  # of the evaluated samples of each record, float64[n]
+    peak_percent: float  # largest error, of the largest peak-to-peak of a record
+    rms_percent: float  # root mean square displacement error, in percent of the same
+    own_peak_percent: float  # largest ``peak_percent`` of single records
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the errors as plain mappings, lists and numbers, for JSON."""
@@ -65,10 +51,7 @@ class Evaluation:
 
 
 def judge(model: HysteresisModel, data: Records | FitData, *, creep: bool = False) -> Evaluation:
-    """Return the errors of a model on records.
-
-    Loops are compared in their periodic steady state, at the rate of :meth:`SteadyLoop.rate`.
-    """
+    """Return the errors of a model on records; loops are in their periodic steady state."""
     data = data if isinstance(data, FitData) else FitData(data)
     responses_um = _modelled_um(model, data)
     if creep:
@@ -116,11 +99,8 @@ def _record_um(model: HysteresisModel, record: Record, speed: F64) -> F64:
 
 
 def _sampled_cycle_um(model: HysteresisModel, loop: SteadyLoop) -> F64:
-    """Return the steady response to a loop's command, simulated sample by sample: float64[M].
-
-    A fit models dynamic stages in continuous time. At a low sample rate the difference to a run
-    is the larger part of the error.
-    """
+    """Return the steady response to a loop, simulated sample by sample: float64[M]."""
+    # At a low sample rate the difference to continuous time is the larger part of the error.
     points = loop.command.size
     turns = np.arange(points + 1) / points
     command = CubicSpline(turns, np.append(loop.command, loop.command[0]), bc_type="periodic")

@@ -79,10 +79,7 @@ class FitData:
 
     @cached_property
     def creep(self) -> F64:
-        """Columns of offset and creep per record, float64[N, f].
-
-        A constant per record, and the usual law of creep ln(1 + t / 0.1 s) per history.
-        """
+        """Columns of a constant per record and ln(1 + t / 0.1 s) per history, float64[N, f]."""
         columns: list[F64] = []
         for record, place in zip(self.records, self.places, strict=True):
             part = np.ones((place.stop - place.start, 1))
@@ -196,8 +193,7 @@ class FitData:
         }
 
 
-LEAST_SLOPE = 0.01
-"""Smallest slope that a model may have, of the mean slope of the data."""
+LEAST_SLOPE = 0.01  # smallest slope that a model may have, of the mean slope of the data
 
 OnProgress: TypeAlias = Callable[[float, str], None]
 """Progress callback: completed part (0 to 1) and current step."""
@@ -209,31 +205,21 @@ def ignore_progress(done: float, text: str) -> None:
 
 @dataclass(frozen=True, slots=True)
 class FitRequest:
-    """Records to fit, and settings.
-
-    Attributes:
-        source: Names of recordings or files, for the provenance.
-        start: Start of the search, see :class:`FitJob`.
-        modes: Known further modes of the structure, for kinds that have them.
-    """
+    """Records to fit, and settings."""
 
     records: Sequence[Record]
     settings: FitSettings
     unit: CommandUnit = "A"
-    source: Sequence[str] = ()
+    source: Sequence[str] = ()  # names of recordings or files, for the provenance
     run: MapFunction = serial_map
     progress: OnProgress = ignore_progress
-    start: object | None = None
-    modes: Sequence[FurtherMode] = ()
+    start: object | None = None  # start of the search, see :class:`FitJob`
+    modes: Sequence[FurtherMode] = ()  # known further modes, for kinds that have them
 
 
 @dataclass(frozen=True, slots=True)
 class FitJob:
-    """Prepared data of one fit, and settings.
-
-    The fit continues from ``start``, the ``end`` of a fit of this kind to other data or of another
-    size.
-    """
+    """Prepared data and settings of a fit that continues from ``start``, another fit's end."""
 
     data: FitData
     settings: FitSettings
@@ -249,37 +235,23 @@ class FitJob:
 
 @dataclass(frozen=True, slots=True)
 class StartOutcome:
-    """One start of a search.
+    """One start of a search."""
 
-    Attributes:
-        start: ``data`` for rough values from the data, ``random N`` for random values,
-            ``weights N`` for the solution of a linear problem.
-        first_rms_percent: Weighted error at the start, in percent of the largest peak-to-peak.
-        evaluations: Evaluations of the criterion, without those for derivatives.
-    """
-
-    start: str
-    first_rms_percent: float
+    start: str  # ``data``, ``random N``, or ``weights N`` for a linear solution
+    first_rms_percent: float  # weighted error at the start, in percent of the largest peak-to-peak
     rms_percent: float
-    evaluations: int
+    evaluations: int  # evaluations of the criterion, without those for derivatives
 
 
 @dataclass(frozen=True)
 class FoundModel:
-    """A model without provenance, and how it was identified.
-
-    Attributes:
-        numbers: Number of fitted numbers.
-        parameters: Parameters under their published names, in command units, um and s; empty for
-            models that are only a table of weights.
-        standard_errors: Standard errors of the parameters, if known.
-        end: End of the search, from which another fit can start.
-    """
+    """A model without provenance, and how it was identified."""
 
     model: HysteresisModel
     numbers: int
+    # by published name, in command units, um and s; empty for tables
     parameters: dict[str, float] = field(default_factory=dict)
     starts: tuple[StartOutcome, ...] = ()
-    standard_errors: dict[str, float] = field(default_factory=dict)
+    standard_errors: dict[str, float] = field(default_factory=dict)  # of the parameters, if known
     at_bound: tuple[str, ...] = ()
-    end: object | None = None
+    end: object | None = None  # end of the search, from which another fit can start

@@ -23,14 +23,7 @@ EVERY_SAMPLE = {"staged", "field", "generalised_duhem"}
 
 
 def fit_kind(request: FitRequest) -> FoundModel:
-    """Fit a kind of model.
-
-    Creep that shows during rests, and known modes, are removed from the records first and become
-    parts of the model.
-
-    Raises:
-        DataError: The data can't be used as asked, or there are none.
-    """
+    """Fit a kind of model to records without creep and known modes, which become its parts."""
     records, settings, unit = request.records, request.settings, request.unit
     modes = request.modes if settings.looks_for("modes") else ()
     creep = creep_of(records) if settings.looks_for("creep_stage") else None
@@ -76,11 +69,8 @@ def identified_range(data: FitData) -> IdentifiedRange:
 
 
 def smallest_um(record: Record) -> float:
-    """Return the peak-to-peak displacement of a loop, or of a history's smaller swings.
-
-    Swings are those between turns of the command; a tenth of the total path is in smaller swings,
-    which excludes noise and the end of decaying cycles.
-    """
+    """Return the peak-to-peak of a loop, or of a history's smaller swings."""
+    # A tenth of the path is in smaller ones: noise, and the end of decaying cycles.
     if isinstance(record, History):
         at = turning_points(record.command)
         swings_um = np.sort(np.abs(np.diff(record.displacement_um[at])))

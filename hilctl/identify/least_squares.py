@@ -19,10 +19,7 @@ RIDGE = 1e-3  # weight of the densities themselves, relative to the longest colu
 def bounded_weights(
     columns: F64, target: F64, scale: F64, least: F64, *, offset: bool
 ) -> tuple[F64, float]:
-    """Minimise the sum of (scale (columns w + c - target))^2 over w >= least, and c.
-
-    Without ``offset``, c is 0.
-    """
+    """Minimise the sum of (scale (columns w + c - target))^2 over w >= least, and c."""
     free = np.ones((target.size, int(offset)))
     weights, constant = bounded_and_free(columns, free, target, scale, least)
     return weights, float(constant.sum())
@@ -75,10 +72,7 @@ def smooth_densities(
 
 
 def differences(first: I64, second: I64, size: int) -> F64:
-    """Return rows of the differences of pairs of unknowns, second less first: float64[k, size].
-
-    Pairs with a negative number are ignored.
-    """
+    """Return rows of the differences of numbered pairs >= 0: float64[k, size]."""
     both = (first >= 0) & (second >= 0)
     out = np.zeros((int(both.sum()), size))
     rows = np.arange(len(out))
@@ -141,11 +135,8 @@ def _step(errors: F64, slopes: F64, low: F64, high: F64, damping: float) -> F64:
 
 
 def bounded_solution(normal: F64, right: F64, low: F64, high: F64) -> F64:
-    """Minimise x^T A x / 2 - b^T x within bounds around 0, by an active set.
-
-    Variables beyond a bound are fixed there and the rest is solved again; then fixed variables that
-    the slope pulls inwards are released one by one. A is positive definite.
-    """
+    """Minimise x^T A x / 2 - b^T x within bounds around 0, A positive definite."""
+    # Active set: what exceeds a bound is fixed; what the slope pulls inwards is released.
     x = np.zeros(right.size)
     inside = np.ones(right.size, dtype=bool)
     for _ in range(3 * right.size):
@@ -188,12 +179,8 @@ def settle(
     bounds: tuple[F64, F64],
     unit: F64,
 ) -> F64:
-    """Return the minimum of a sum of squares (Levenberg-Marquardt).
-
-    A small penalty on the distance from the start, in units of about the same effect, makes the
-    result a smooth function of the data, so that rounding differences between processors stay
-    small.
-    """
+    """Return the minimum of a sum of squares near the start (Levenberg-Marquardt)."""
+    # A penalty on the distance, in units of about the same effect, keeps rounding small.
     low, high = bounds
     x = first = np.clip(first, low, high)
     place, damping = place_of(x), 1e-3
@@ -251,8 +238,6 @@ def converged(
 
 
 def first_least(values: Sequence[float]) -> int:
-    """Return the index of the first value that equals the least except for rounding.
-
-    Starts that end at one minimum differ in the last digits, which depend on the processor.
-    """
+    """Return the index of the first value that equals the least except for rounding."""
+    # Starts that end at one minimum differ in the last digits.
     return int(np.argmax(np.array(values) <= min(values) * (1.0 + SAME)))

@@ -62,10 +62,7 @@ def weigh(job: FitJob, columns: F64, least: F64, rows: slice = slice(None)) -> t
 
 
 def fit_preisach(job: FitJob) -> FoundModel:
-    """Fit the densities of the Preisach triangle, each >= 0 (1.2).
-
-    The triangle covers the largest loop; cells that no loop reaches have no weight.
-    """
+    """Fit the densities >= 0 of a Preisach triangle (1.2) over the largest loop."""
     data = job.data
     plays = data.columns(triangle_thresholds(data, job.settings.lines))[:, 1:]
     fields = {"command_span": data.command_span, **data.common(0.0)}
@@ -90,11 +87,8 @@ def fit_triangle(
     fit: Callable[[F64, F64, I64], tuple[F64, float]],
     fields: Mapping[str, Any],
 ) -> tuple[PreisachModel, int]:
-    """Return a Preisach model, and the number of its cells that have a density.
-
-    ``centres``, float64[N, lines], is the output of each play. ``fit`` returns densities and the
-    constant displacement, for columns, lower bounds and table.
-    """
+    """Return a Preisach model, and how many of its cells have a density."""
+    # centres: float64[N, lines]. fit(columns, lower bounds, table) returns densities and offset.
     lines, (low, high) = centres.shape[1], data.input_range
     edges = np.linspace(low, high, lines + 1)
     cell = float(edges[1] - edges[0])
@@ -127,11 +121,8 @@ def cells_below(centre: F64, edges: F64) -> F64:
 
 
 def fit_kp(job: FitJob) -> FoundModel:
-    """Fit the weights of the Krasnosel'skii-Pokrovskii grid, each >= 0 (1.5).
-
-    The grid has one level beyond the measured range on either side, because the model does not move
-    beyond its grid; weights on the diagonal are continued there.
-    """
+    """Fit the weights >= 0 of the Krasnosel'skii-Pokrovskii grid (1.5)."""
+    # One level more on either side: the model does not move beyond its grid.
     data, levels = job.data, LEVELS
     low, high = data.input_range
     spacing = (high - low) / (levels - 2)
@@ -288,10 +279,7 @@ _BOUC_WEN = ("direct", "hysteretic", "beta", "gamma", "exponent", "output_offset
 
 
 class _DifferentialLoop(_ShapeSearch):
-    """The operator z of a Bouc-Wen or Duhem model for given beta, gamma and n = 1 or 2.
-
-    Without ``free``, gamma is 0.
-    """
+    """The operator z of a Bouc-Wen or Duhem model for beta, n = 1 or 2, and gamma if ``free``."""
 
     def __init__(self, job: FitJob, exponent: int, *, free: bool) -> None:
         super().__init__(job)

@@ -1,13 +1,12 @@
 """HTML pages of an identified or a refined model, with plots of model and data."""
 
-import html
 from collections.abc import Sequence
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from hilctl.analysis.html import document, grid, wide_figure
+from hilctl.analysis import html
 from hilctl.analysis.plot_style import DISPLACEMENT, ERROR, REFERENCE, STYLE
 from hilctl.base.types import F64
 from hilctl.identify.data.records import Record, SteadyLoop
@@ -35,27 +34,26 @@ def identification_page(found: Identification) -> str:
     fit = found.fit
     unit = fit.model.input_unit
     title = f"Identified from {', '.join(fit.model.provenance.source)}"
-    body = [
-        f"<h1>{html.escape(title)}</h1>",
-        f"<p>{html.escape(fit.model.provenance.method)}</p>",
-        *(f"<p>{html.escape(line)}</p>" for line in summary(found)),
-    ]
+    lines = fit.model.provenance.method, *summary(found)
+    body = [f"<h1>{html.text(title)}</h1>", *map(html.paragraph, lines)]
     if (held_out := found.held_out) is not None:
         body += ["<h2>Errors on data not fitted</h2>"]
-        body += [grid(HEADINGS, error_rows(held_out.judgement.errors), "numbers")]
+        body += [html.grid(HEADINGS, error_rows(held_out.judgement.errors), "numbers")]
         body += _drawn("Model and data not fitted", held_out.judgement, held_out.records, unit)
-    body += ["<h2>Errors on data fitted</h2>", grid(HEADINGS, error_rows(fit.errors), "numbers")]
+    body += [
+        "<h2>Errors on data fitted</h2>",
+        html.grid(HEADINGS, error_rows(fit.errors), "numbers"),
+    ]
     body += _drawn("Model and data", fit, found.data, unit)
-    body += ["<h2>Parameters</h2>", grid(("name", "value"), parameter_texts(fit), "numbers")]
-    body += [f"<details><summary>Model</summary><pre>{html.escape(dump_model(fit.model))}</pre>"]
-    return document(html.escape(title), [*body, "</details>"])
+    body += ["<h2>Parameters</h2>", html.grid(("name", "value"), parameter_texts(fit), "numbers")]
+    return html.document(html.text(title), [*body, html.details("Model", dump_model(fit.model))])
 
 
 def _drawn(heading: str, judged: Evaluation, data: Sequence[Record], unit: str) -> list[str]:
     shown = data[:MOST_RECORDS]
     left_out = [f"<p>The first {len(shown)} of {len(data)}.</p>"] if len(shown) < len(data) else []
     figure = loops_figure(judged.modelled_um, shown, unit)
-    return [f"<h2>{heading}</h2>", *left_out, wide_figure(heading, figure)]
+    return [f"<h2>{heading}</h2>", *left_out, html.wide_figure(heading, figure)]
 
 
 @mpl.rc_context(STYLE)
@@ -91,17 +89,16 @@ def refinement_page(found: Refinement) -> str:
     """Return the page as HTML."""
     after = found.choice.after
     shown = after.records[:MOST_RUNS]
-    title = html.escape(f"Refined: {', '.join(found.model.provenance.source)}")
+    title = html.text(f"Refined: {', '.join(found.model.provenance.source)}")
     body = [
         f"<h1>{title}</h1>",
-        f"<p>{html.escape(str(found))}</p>",
-        f"<p>{html.escape(after.how)}</p>",
+        html.paragraph(str(found)),
+        html.paragraph(after.how),
         "<h2>Errors on runs not fitted</h2>",
-        grid(REFINEMENT_HEADINGS, refinement_rows(found), "numbers"),
+        html.grid(REFINEMENT_HEADINGS, refinement_rows(found), "numbers"),
     ]
     for heading, held in (("Before", found.choice.before), ("After", after)):
         modelled = held.judgement.modelled_um[:MOST_RUNS]
         figure = loops_figure(modelled, shown, found.model.input_unit)
-        body += [f"<h2>{heading}</h2>", wide_figure(heading, figure)]
-    body += [f"<details><summary>Model</summary><pre>{html.escape(dump_model(found.model))}</pre>"]
-    return document(title, [*body, "</details>"])
+        body += [f"<h2>{heading}</h2>", html.wide_figure(heading, figure)]
+    return html.document(title, [*body, html.details("Model", dump_model(found.model))])

@@ -33,21 +33,13 @@ CLEAR_PERCENT = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Grade of a model.
+    """Grade of a model."""
 
-    Attributes:
-        grade: ``not a model`` if it must not be used; ``good`` only with held-out data of several
-            amplitudes and frequencies.
-        within_percent: Largest error in percent of a record's own peak-to-peak displacement, on
-            held-out data if there are any.
-        notes: Limits of the data, and suggestions.
-    """
-
-    grade: Grade
-    within_percent: float
+    grade: Grade  # ``not a model`` if it must not be used; ``good`` needs held-out data
+    within_percent: float  # largest, of a record's own peak-to-peak; held-out data if any
     held_out: bool
     reasons: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # limits of the data, and suggestions
 
     def __str__(self) -> str:
         if self.reasons:
@@ -84,10 +76,7 @@ def verdict_of(
 
 
 def data_reasons(records: Sequence[Record], *, even: bool = False) -> Iterator[str]:
-    """Yield faults of the data that do not depend on the model.
-
-    With ``even``, the displacement may rise with commands of both signs (rods without bias).
-    """
+    """Yield faults of the data; an ``even`` displacement may rise with both signs."""
     moves = [float(np.ptp(record.displacement_um)) for record in records]
     largest = int(np.argmax(moves))
     if moves[largest] > MOST_UM:

@@ -34,10 +34,7 @@ class Split:
 
 @dataclass(frozen=True, slots=True)
 class HeldOut:
-    """Errors of a model on held-out data, whose origin ``how`` describes.
-
-    A fit to all data can start from ``end``.
-    """
+    """Errors on held-out data, whose origin is ``how``; a fit to all can start from ``end``."""
 
     judgement: Evaluation
     records: tuple[Record, ...]
@@ -82,10 +79,7 @@ def held_out_error(request: FitRequest) -> HeldOut | None:
 
 
 def held_out_errors(requests: Sequence[FitRequest], run: MapFunction) -> list[HeldOut | None]:
-    """Return errors of each fit on held-out parts of its data; None if too few data are left.
-
-    One start of each search is enough.
-    """
+    """Return the errors of one start of each fit on held-out data; None if too few are left."""
     tasks = [
         (number, fold, replace(
             request,
@@ -178,8 +172,7 @@ LOOPS: tuple[Mapping[str, Any], ...] = ({"kind": "staged"}, {"kind": "integrated
 """Candidates for steady loops."""
 ORDERS = ((6, 4), (8, 6), (12, 8), (16, 10), (20, 12), (28, 16))
 """Plays, and deadbands on each side if the model has any."""
-LINES = (8, 12, 16, 20, 28, 36)
-"""Lines of a Preisach triangle, instead of :data:`ORDERS`."""
+LINES = (8, 12, 16, 20, 28, 36)  # lines of a Preisach triangle, instead of :data:`ORDERS`
 WORTH_SIZE = 1.03  # a larger model must lower the error by more than 3 %
 MOST_LAG = 8  # samples tried
 
@@ -195,10 +188,7 @@ class CandidateScore:
 
 @dataclass(frozen=True, slots=True)
 class OrderScore:
-    """Errors of a model of one size on held-out data, in percent of the largest stroke.
-
-    ``plays`` counts the lines of a Preisach triangle if the model has one.
-    """
+    """Errors of one size on held-out data, of the stroke; ``plays`` may count lines."""
 
     plays: int
     deadbands_a_side: int
@@ -217,11 +207,7 @@ class Selection:
 
 
 def select(request: FitRequest) -> Selection:
-    """Select kind or size by errors on held-out data, as far as the settings leave them open.
-
-    Raises:
-        DataError: There are too few data to leave some out.
-    """
+    """Select the open kind or size by held-out errors; raise DataError if data are too few."""
     settings = request.settings
     if isinstance(settings, IdentifySettings) and settings.auto:
         return _choose_kind(request, settings)
@@ -229,11 +215,8 @@ def select(request: FitRequest) -> Selection:
 
 
 def _choose_kind(request: FitRequest, given: IdentifySettings) -> Selection:
-    """Return the kind with the least error.
-
-    For histories, small models select the kinds to try at full size: a wrong kind has several times
-    the error of the right one at any size.
-    """
+    """Return the kind with the least error."""
+    # Small models select the kinds to try at full size: a wrong kind is far off at any size.
     whole = any(isinstance(record, History) for record in request.records)
     errors = _candidates(request, given, WHOLE if whole else LOOPS)
     if whole and not any(each.rms_percent < WELL_PERCENT for each in errors):
@@ -328,10 +311,7 @@ def _candidates(
 def choose_lag(
     load: Callable[[int], Records], settings: FitSettings, run: MapFunction, progress: OnProgress
 ) -> int:
-    """Return the lag of the displacement, in samples, with the least error.
-
-    ``load`` returns the data with the displacement shifted by that many samples.
-    """
+    """Return the lag with the least error; ``load`` returns data shifted by that many samples."""
     progress(0.0, f"{MOST_LAG + 1} fits for the lag of the displacement")
     lean = settings.model_copy(update={"starts": 1, "peak_goal_percent": None})
     requests = [FitRequest(tuple(load(lag)), lean) for lag in range(MOST_LAG + 1)]

@@ -109,11 +109,7 @@ class Identification:
 
 
 def settings_from(kind: str, texts: Sequence[str]) -> IdentifySettings:
-    """Return the settings of a fit: those of the kind, changed by ``key=value`` texts.
-
-    Raises:
-        InputError: The kind is unknown, or settings are invalid; all invalid ones are listed.
-    """
+    """Return the settings of a kind, changed by texts; raise InputError with all problems."""
     if kind == "auto":
         document = Document("hilctl identify", "kind: field\nauto: true")
     else:
@@ -125,27 +121,16 @@ def settings_from(kind: str, texts: Sequence[str]) -> IdentifySettings:
 
 
 def identify_files(
-    paths: Sequence[Path],
+    paths: Sequence[Path],  # recordings and text tables
     settings: IdentifySettings,
-    output: Path | None,
-    validate: Sequence[Path] = (),
-    scheduler: str = "none",
+    output: Path | None,  # model file to write
+    validate: Sequence[Path] = (),  # if there are none, parts of the others
+    scheduler: str = "none",  # see :func:`hilctl.identify.parallel.workers`
     *,
     overwrite: bool = False,
     progress: OnProgress = ignore_progress,
 ) -> Identification:
-    """Fit a model to files, evaluate it on held-out data, and write it.
-
-    A model with the grade "not a model" is not written.
-
-    Args:
-        paths: Recordings and text tables.
-        settings: Settings of the fit.
-        output: Model file to write; None for none.
-        validate: Files to evaluate the model on; if there are none, parts of the others.
-        scheduler: Where independent fits run, see :func:`hilctl.identify.parallel.workers`.
-        overwrite: Whether a model file of that name may be replaced.
-        progress: Called with what is being done.
+    """Fit a model to files, evaluate it on held-out data, and write it unless it is "not a model".
 
     Raises:
         InputError: A file or a setting can't be used; nothing is written.
@@ -173,11 +158,7 @@ def identify_files(
 
 
 def identify_records(request: FitRequest, validate: Sequence[Record] = ()) -> Identification:
-    """Fit a model to records, and evaluate it on held-out data.
-
-    Raises:
-        DataError: The data can't be used as asked, or there are none.
-    """
+    """Fit a model to records, and evaluate it; raise DataError if they can't be used."""
     records = request.records
 
     def found(modes: Sequence[FurtherMode]) -> Found:

@@ -86,11 +86,7 @@ CATALOGUE: Mapping[FitKind, CatalogueEntry] = {
 
 
 def entry(name: str) -> tuple[FitKind, CatalogueEntry]:
-    """Return a kind of model and its entry.
-
-    Raises:
-        InputError: The name is unknown.
-    """
+    """Return a kind of model and its entry; raise InputError if it is unknown."""
     for kind, known in CATALOGUE.items():
         if kind == name:
             return kind, known

@@ -39,10 +39,7 @@ MOST = 3
 
 @dataclass(frozen=True, slots=True)
 class _Spectra:
-    """Transfer function from modelled to measured displacement, and power of the modelled one.
-
-    ``left`` is the power of the residual at all frequencies.
-    """
+    """Transfer function from modelled to measured um, its power, and that of the residual."""
 
     frequency_hz: F64
     transfer: C128
@@ -56,10 +53,7 @@ def further_modes(
     known: Sequence[FurtherMode],
     first_hz: float | None,
 ) -> tuple[FurtherMode, ...] | None:
-    """Return improved modes, with one more if the residual shows it; None if nothing improves.
-
-    ``first_hz`` is the natural frequency of the model's first mode.
-    """
+    """Return improved modes, with one more if the residual shows it; None if nothing improves."""
     bare_um = [
         _undone(model_um, known, record.sample_rate_hz)
         for model_um, record in zip(modelled_um, records, strict=True)
@@ -141,23 +135,15 @@ def _pieces(signals: F64, rate_hz: float) -> Iterator[C128]:
 
 @dataclass(frozen=True, slots=True)
 class _Pairs:
-    """Pairs of resonance and antiresonance, and a smooth part.
+    """Pairs of resonance and antiresonance, and a smooth part."""
 
-    Attributes:
-        x: float64[4 m + 3], per pair the logarithms of natural frequency, damping ratio, ratio of
-            the antiresonance's frequency to it, and its damping ratio; then gain, slope, bend.
-        misfit: Residual of the transfer function, in power.
-    """
-
+    # float64[4 m + 3]: logarithms of each pair's frequency, damping, ratio, damping; smooth part
     x: F64
-    misfit: float
+    misfit: float  # residual of the transfer function, in power
 
 
 def _left(spectra: _Spectra, before: _Pairs, now: _Pairs) -> float:
-    """Return the remaining part of a model's error, in power.
-
-    Improvements by the smooth part do not count, since the next fit makes them without pairs.
-    """
+    """Return the remaining part of a model's error, in power, except the smooth part."""
     return 1.0 - (before.misfit - now.misfit) / spectra.left
 
 

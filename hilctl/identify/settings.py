@@ -219,10 +219,7 @@ class IdentifySettings(FitSettings):
     @model_validator(mode="before")
     @classmethod
     def _histories(cls, given: Any) -> Any:
-        """Select whole histories for kinds whose small loops depend on earlier large ones.
-
-        Also for kinds without rate, whose range must include the state of rest.
-        """
+        """Select whole histories for kinds that need the state of rest or large loops."""
         if isinstance(given, dict) and given.get("kind") in _HISTORIES:
             return {"whole": True, **given}
         return given

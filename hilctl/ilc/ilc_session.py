@@ -11,7 +11,8 @@ from typing import TypeAlias
 import numpy as np
 
 from hilctl import __version__
-from hilctl.base.errors import ConfigError, ConfigProblem, HilctlError, InputError, RunError
+from hilctl.base.errors import ConfigError, ConfigProblem, HilctlError, RunError
+from hilctl.base.files import make_folder
 from hilctl.base.segments import Segment
 from hilctl.base.types import C128
 from hilctl.experiment.correction import (
@@ -115,10 +116,7 @@ class IlcSession:
             InputError: The first run is rejected; nothing has moved.
             RunError: The first run ended by a fault.
         """
-        try:
-            self._folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(f"{self._folder}: can't be made: {error.strerror}") from None
+        make_folder(self._folder)
         reason, stop_signal, fault = "", 0, False
         check: tuple[IlcRow, ...] = ()
         try:

@@ -21,18 +21,7 @@ control/         requests to a supervisor: client, socket, validation, changes
 """
 
 PUBLIC = (
-    "assemble",
-    "control.client",
-    "detached",
-    "metadata",
-    "probe",
-    "recovery",
-    "result",
-    "run_folder",
-    "safety.manual_safe",
-    "shared.ring",
-    "shared.shared_page",
-    "start",
-    "unpaced",
-)
+    "assemble", "control.client", "detached", "metadata", "probe", "recovery", "result",
+    "run_folder", "safety.manual_safe", "shared.ring", "shared.shared_page", "start", "unpaced",
+)  # fmt: skip
 """Modules that other rooms import; the others are private."""

@@ -30,12 +30,7 @@ class Detached:
 def start_detached(
     experiment: Path, settings: Sequence[str], output: Path | None, flags: Sequence[str]
 ) -> Detached:
-    """Start ``hilctl run`` with these flags in the background; return once its loop is running.
-
-    Raises:
-        InputError: The experiment is not valid; nothing has moved.
-        RunError: The run did not start, or failed.
-    """
+    """Start ``hilctl run`` in the background; return once its loop runs, or raise its error."""
     require_linux()
     checked = checked_experiment(experiment, settings)
     output = output_of(checked, output)

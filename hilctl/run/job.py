@@ -33,31 +33,17 @@ _STOPPED_S = 0.02
 
 @dataclass(frozen=True, slots=True)
 class SilenceLimits:
-    """Longest silence of the loop before it counts as hung.
+    """Longest silence of the loop before it counts as hung."""
 
-    Attributes:
-        real_time_s: With real-time priority.
-        ordinary_s: Without real-time priority, on a busy computer.
-        exchange_s: Added while it waits for the device.
-        stopped_s: While its process is stopped, such as by SIGSTOP.
-    """
-
-    real_time_s: float
-    ordinary_s: float
-    exchange_s: float
-    stopped_s: float
+    real_time_s: float  # with real-time priority
+    ordinary_s: float  # without real-time priority, on a busy computer
+    exchange_s: float  # added while it waits for the device
+    stopped_s: float  # while its process is stopped, such as by SIGSTOP
 
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """One run.
-
-    Attributes:
-        heat_a2: Heat of the coil before the run, in A^2.
-        stands_um: The model's displacement before the first sample; None if no offset is measured.
-        adapted: Operator to adapt, see
-            :meth:`hilctl.loop.adaptation.DisplacementOperator.to_lists`; None without adaptation.
-    """
+    """One run."""
 
     experiment: str
     files: Mapping[str, str]
@@ -66,9 +52,9 @@ class Job:
     reference: str
     input_um: str
     state: list[float] | None
-    heat_a2: float
-    stands_um: float | None
-    adapted: list[Any] | None
+    heat_a2: float  # heat of the coil before the run, in A^2
+    stands_um: float | None  # modelled before the first sample; None if no offset is measured
+    adapted: list[Any] | None  # see DisplacementOperator.to_lists; None without adaptation
     safe_value: float
     ramp_per_s: float
     limits: SilenceLimits
@@ -160,10 +146,7 @@ def silence_limits(checked: "CheckedExperiment") -> SilenceLimits:
 
 
 def safe_priority(checked: "CheckedExperiment") -> int:
-    """Return the SCHED_FIFO priority of the process that sets the safe value.
-
-    It is above the loop's, so that a busy loop cannot delay that process.
-    """
+    """Return the SCHED_FIFO priority of the process that sets the safe value, above the loop's."""
     return checked.loaded.config.realtime.priority + 1
 
 

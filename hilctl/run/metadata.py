@@ -142,32 +142,21 @@ class SettingRow(StrictModel):
 
 
 class LimitBounds(StrictModel):
-    """Limits of limiter and interlocks; None: no limit.
-
-    Attributes:
-        heat_a2: Heat of the coil before the run, in A^2.
-        tracking_error_um: Difference of displacement and reference.
-        measured_deviation: Difference of command and measured command.
-    """
+    """Limits of limiter and interlocks; None: no limit."""
 
     command: list[float]
     slew_per_s: float
     stroke_um: list[float]
     rms_current_a: float | None
     thermal_time_constant_s: float | None
-    heat_a2: float
-    tracking_error_um: float | None
-    measured_deviation: float | None
+    heat_a2: float  # heat of the coil before the run, in A^2
+    tracking_error_um: float | None  # difference of displacement and reference
+    measured_deviation: float | None  # difference of command and measured command
     late_s: float
 
 
 class RunDescription(StrictModel):
-    """Description of a run for watchers.
-
-    Attributes:
-        segments: Segments as :meth:`hilctl.base.segments.Segment.to_mapping`, relative to the
-            waveform's first sample.
-    """
+    """Description of a run for watchers."""
 
     name: str
     text: str
@@ -180,7 +169,7 @@ class RunDescription(StrictModel):
     waveform_unit: str
     compensator: str
     samples: int
-    segments: list[dict[str, Any]]
+    segments: list[dict[str, Any]]  # as Segment.to_mapping, from the waveform's first sample
     limits: LimitBounds
     settings: list[SettingRow]
 

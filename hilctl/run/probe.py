@@ -9,21 +9,13 @@ from hilctl.base.device import Device, DeviceInfo, ReadableDevice
 from hilctl.experiment.load import LoadedExperiment, load_experiment
 from hilctl.run.run_folder import held_devices
 
-_ABSURD = 100.0
-"""A value this many ranges outside is not a signal: its bytes are decoded wrongly."""
-_TINY = 1e-18
-"""A value this close to 0, relative to the range, is decoded wrongly as well."""
+_ABSURD = 100.0  # A value this many ranges outside is not a signal: its bytes are decoded wrongly
+_TINY = 1e-18  # A value this close to 0, relative to the range, is decoded wrongly as well
 
 
 @dataclass(frozen=True, slots=True)
 class Probed:
-    """Values read from a device.
-
-    Attributes:
-        displacement_um: Reading of the sensor; None if it is not available without a run.
-        output: Output in ``command_unit``; None if unknown.
-        faults: Implausible values, each with a possible cause.
-    """
+    """Values read from a device."""
 
     name: str
     description: str
@@ -31,10 +23,10 @@ class Probed:
     rate_note: str
     safe_note: str
     details: dict[str, str]
-    displacement_um: float | None
-    output: float | None
+    displacement_um: float | None  # None if the sensor is not available without a run
+    output: float | None  # output in ``command_unit``; None if unknown
     command_unit: str
-    faults: tuple[str, ...]
+    faults: tuple[str, ...]  # implausible values, each with a possible cause
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the fields as plain values."""
@@ -42,15 +34,8 @@ class Probed:
 
 
 def probe(path: Path, settings: list[str]) -> Probed:
-    """Read an experiment's device under its lock.
-
-    A device that supports it is only read: no set-up steps are sent, and a tripped watchdog stays
-    tripped. Others, and simulated ones, are opened and closed.
-
-    Raises:
-        InputError: The experiment is not valid, or a run holds the device.
-        DeviceError: The device cannot be reached, or is another one.
-    """
+    """Read a device under its lock, or open and close it; raise InputError if a run holds it."""
+    # Reading sends no set-up steps, and a tripped watchdog stays tripped.
     loaded = load_experiment(path, settings)
     info = loaded.device.info
     with held_devices(info.holds):

@@ -74,12 +74,7 @@ class LoopProcess(ChildProcess):
         super().__init__(process)
 
     def await_ready(self, stopped: Callable[[], bool]) -> None:
-        """Wait until it is ready for the start signal.
-
-        Raises:
-            InputError: It refuses the job; nothing has moved.
-            RunError: It failed; nothing has moved.
-        """
+        """Wait until it is ready; raise InputError or RunError otherwise: nothing has moved."""
         page = self._page
         deadline = time.monotonic() + _READY_TIMEOUT_S
         while page.observe(PageField.PHASE) == Phase.STARTING and not self.ended:

@@ -41,15 +41,11 @@ _PATIENCE_S = 5.0
 _RETRY_S = 0.05
 _POLL_S = 0.05
 _MOST_WAITING = 64
-_KEPT = 8
-"""1/8 of the ring stays readable for watchers."""
+_KEPT = 8  # 1/8 of the ring stays readable for watchers
 
 
 class Recorder:
-    """Record one run into one file.
-
-    A failed write stays in memory and is repeated by the next flush.
-    """
+    """Record one run into one file; the next flush repeats a failed write."""
 
     def __init__(self, checked: CheckedExperiment, path: Path, *, overwrite: bool) -> None:
         self.path = path

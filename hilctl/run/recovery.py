@@ -21,20 +21,14 @@ from hilctl.run.shared.shared_page import PageField, PageSlot, Phase
 
 @dataclass(frozen=True, slots=True)
 class RecoveredRun:
-    """A dead run that another command has finished.
-
-    Attributes:
-        safe: Whether loop or guardian confirmed the safe value.
-        kept: Folder of samples that were not recovered; None if all were.
-        started: Whether the loop had started; otherwise nothing has moved.
-    """
+    """A dead run that another command has finished."""
 
     name: str
     recording: Path
-    safe: bool
+    safe: bool  # whether loop or guardian confirmed the safe value
     text: str
-    kept: Path | None = None
-    started: bool = True
+    kept: Path | None = None  # folder of samples that were not recovered; None if all were
+    started: bool = True  # whether the loop had started; otherwise nothing has moved
 
 
 def recover_dead_runs() -> list[RecoveredRun]:

@@ -46,20 +46,14 @@ _BACKLOG = 1000  # connections that query the holder of a device; never accepted
 
 @dataclass(frozen=True, slots=True)
 class RunCard:
-    """Identity of a run, for other commands.
+    """Identity of a run, for other commands."""
 
-    Attributes:
-        name: Name of its folder, unique among the runs of a user.
-        started: Unix time in s.
-        holds: Resources of its device, as :attr:`hilctl.base.device.DeviceInfo.holds`.
-    """
-
-    name: str
+    name: str  # name of its folder, unique among the runs of a user
     experiment: str
     recording: str
     supervisor: int
-    started: float
-    holds: tuple[str, ...] = ()
+    started: float  # unix time in s
+    holds: tuple[str, ...] = ()  # resources of its device, as DeviceInfo.holds
 
     @classmethod
     def from_json(cls, text: str) -> Self:
@@ -150,11 +144,7 @@ class RunFolder:
 
 
 def base_folder() -> Path:
-    """Return the parent of this user's run folders; ``HILCTL_RUNS`` overrides it.
-
-    Raises:
-        RunError: No folder is usable and private to this user.
-    """
+    """Return the private parent of this user's run folders; ``HILCTL_RUNS`` overrides it."""
     return _base_folders(make=True)[0]
 
 
@@ -190,11 +180,7 @@ def _is_own(path: Path) -> bool:
 
 
 def runs() -> list[RunFolder]:
-    """Return all runs of this user, oldest first, dead ones included.
-
-    Raises:
-        RunError: The parent of the run folders is not private to this user.
-    """
+    """Return all runs of this user, oldest first, dead ones included."""
     cards: dict[Path, Path] = {}
     for base in _base_folders(make=False):
         cards |= {each / _CARD: each / _CARD for each in base.resolve().iterdir()}
@@ -241,10 +227,8 @@ def _removed_files(process: str = "[0-9]*") -> dict[Path, Path]:
 
 
 def keep_removed() -> None:
-    """Restore the folder of a run from the files that this process has open, if it was removed.
-
-    A process that outlives its supervisor calls this: the next command recovers the samples.
-    """
+    """Restore a removed run folder from the files that this process has open."""
+    # A process that outlives its supervisor calls this: the next command recovers the samples.
     own = _removed_files("self")
     for card, opened in own.items():
         folder = card.parent
@@ -261,11 +245,7 @@ def keep_removed() -> None:
 def run_folder(
     experiment: str, recording: Path, started: float, holds: Sequence[str] = ()
 ) -> Iterator[tuple[RunFolder, list[int]]]:
-    """Provide a run's folder and descriptors of its locks; remove it at the end unless it is kept.
-
-    Raises:
-        RunError: The folder cannot be created.
-    """
+    """Provide a run's folder and descriptors of its locks; remove it at the end unless kept."""
     base, number = base_folder(), os.getpid()
     recorded = str(recording.resolve())  # fails if the working folder was removed
     with ExitStack() as stack:
@@ -398,11 +378,7 @@ def _locked(path: Path) -> Iterator[int]:
 
 @contextmanager
 def locked_run(run: RunFolder) -> Iterator[int]:
-    """Lock a run whose processes have ended; yield the descriptor.
-
-    Raises:
-        BlockingIOError: One of them is alive.
-    """
+    """Lock a dead run and yield the descriptor; raise BlockingIOError if it is alive."""
     with _locked(run.path / _CARD) as descriptor:
         yield descriptor
 
@@ -428,11 +404,7 @@ def taken_over(run: RunFolder) -> Iterator[bool]:
 
 
 def dismiss(name: str) -> Path:
-    """Remove the folder of a dead run with its samples; return the folder.
-
-    Raises:
-        InputError: No run has that name, or the run is alive.
-    """
+    """Remove the folder of a dead run with its samples; raise InputError if it is alive."""
     found = [each for base in _base_folders(make=False) for each in base.iterdir()]
     for folder in found:
         if folder.name == name and folder.name != _DEVICES:

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Self, TypeAlias
 
-from hilctl.base.errors import DataError, InputError, RunError
-from hilctl.base.files import check_no_input, reason
+from hilctl.base.errors import DataError, RunError
+from hilctl.base.files import check_no_input, make_folder
 from hilctl.experiment.correction import dump_correction
 from hilctl.experiment.load import LoadedExperiment, input_files, load_experiment
 from hilctl.experiment.preflight import CheckedExperiment, check
@@ -23,8 +23,7 @@ from hilctl.run.unpaced import run_unpaced
 
 _log = logging.getLogger(__name__)
 
-OnPart: TypeAlias = Callable[[float], None]
-"""Called with the completed part of a run, 0 to 1."""
+OnPart: TypeAlias = Callable[[float], None]  # called with the completed part of a run, 0 to 1
 
 
 def checked_experiment(
@@ -53,10 +52,7 @@ def output_of(checked: CheckedExperiment, output: Path | None) -> Path:
         check_no_input(output, input_files(loaded.document, loaded.folder / "experiment"))
         return output
     folder = Path(checked.loaded.config.recording.folder)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot create {folder}: {reason(error)}") from None
+    make_folder(folder)
     return default_output(checked.loaded.config.name, folder, time.localtime())
 
 

@@ -44,11 +44,7 @@ class VirtualClock:
 
 
 class OfflineHost:
-    """A host that collects blocks in the memory of this process; see :class:`~.plan.Host`.
-
-    ``on_batch`` gets batches that are valid until it returns. ``stop`` returns the reason to stop,
-    or an empty text.
-    """
+    """A host that collects blocks in this process; a batch is valid until ``on_batch`` returns."""
 
     def __init__(
         self,
@@ -115,11 +111,7 @@ class OfflineHost:
 
 
 def run_unpaced(checked: CheckedExperiment, output: Path, *, overwrite: bool = False) -> RunResult:
-    """Run a checked experiment on its simulated device.
-
-    Raises:
-        InputError: The device is not simulated, or the recording cannot be written.
-    """
+    """Run a checked experiment on its simulated device; raise InputError for a real one."""
     info = checked.loaded.device.info
     if not info.simulated:
         raise InputError(f"{info.name}: only a simulated device can run without real time")
@@ -169,11 +161,7 @@ def _run(checked: CheckedExperiment, recorder: Recorder) -> tuple[LoopOutcome, L
 
 
 def run_in_memory(plan: LoopPlan, device: Device) -> tuple[LoopOutcome, Samples]:
-    """Run a plan on a simulated device; return the outcome and the samples.
-
-    Raises:
-        DeviceError: The device cannot be opened, or does not support the rate or block.
-    """
+    """Run a plan on a simulated device; return the outcome and the samples."""
     parts: list[Samples] = []
     host = OfflineHost(plan, on_batch=lambda batch: parts.append(batch.samples(slice(None))))
     loop, _ = _opened(plan, device, host, None)

@@ -7,18 +7,9 @@ multi_run/      reports of many runs
 """
 
 PUBLIC = (
-    "campaign.campaign_runner",
-    "campaign.parallel_simulation",
-    "campaign.plan",
-    "campaign.steps",
-    "campaign.store",
-    "campaign.table",
-    "characterise.characterisation_runner",
-    "characterise.results",
-    "characterise.rig_page",
-    "multi_run.collect",
-    "multi_run.multi_run_page",
-    "multi_run.plots",
-    "multi_run.trend",
-)
+    "campaign.campaign_runner", "campaign.parallel_simulation", "campaign.plan",
+    "campaign.steps", "campaign.store", "campaign.table",
+    "characterise.characterisation_runner", "characterise.results", "characterise.rig_page",
+    "multi_run.collect", "multi_run.multi_run_page", "multi_run.plots", "multi_run.trend",
+)  # fmt: skip
 """Modules that other rooms import; the others are private."""

@@ -33,11 +33,7 @@ class StudyHost:
 
 
 class StepRunner:
-    """Run steps, wait for the coil to cool, and report progress.
-
-    Attributes:
-        done_s: Planned time of the steps that are done.
-    """
+    """Run steps, wait for the coil to cool, and report progress from the planned times."""
 
     def __init__(self, host: StudyHost, total_s: float) -> None:
         self._host, self._total_s = host, max(total_s, 1e-9)

@@ -64,13 +64,8 @@ def is_experiment(name: str) -> bool:
 
 
 def wired_experiment(path: Path, port: int = 0, host: str | None = None) -> WiredExperiment:
-    """Return what to emulate for an experiment file.
-
-    Port 0 stands for that of the experiment, or for a free one if users may not listen there.
-
-    Raises:
-        InputError: The file cannot be read, names no device with a profile, or drives with voltage.
-    """
+    """Return what to emulate for an experiment; raise InputError if it has no profile."""
+    # Port 0 stands for that of the experiment, or for a free one if users may not listen there.
     document, files = load_document(path), TextFiles()
     section = document.data.get("device")
     name = section.get("profile") if isinstance(section, dict) else None

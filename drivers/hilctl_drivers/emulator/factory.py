@@ -53,13 +53,7 @@ class Emulator:
 
 
 def build(options: EmulatorOptions, clock_ns: Callable[[], int] = time.monotonic_ns) -> Emulator:
-    """Return an emulator whose ports are open; all its clocks are ``clock_ns``.
-
-    Raises:
-        InputError: There is no such profile, it has no such channels, an option or a fault does not
-            go with it, the log cannot be written, a port is in use, or two devices have one unit
-            id.
-    """
+    """Return an emulator with open ports and one clock; raise InputError for wrong options."""
     plan = _plan(options)
     now_ns = clock_ns()
     log = WriteLog(options.log, time.time_ns() - now_ns)

@@ -80,10 +80,7 @@ class LabJackInput:
 
 
 class LabJackStream:
-    """The registers; a stream starts from the current of the rig.
-
-    ``on_played`` gets the first value's number, float64[n] currents in A, and the time of the last.
-    """
+    """The registers; ``on_played`` gets the first number, currents in A, and the last time."""
 
     def __init__(
         self,

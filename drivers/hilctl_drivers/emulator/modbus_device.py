@@ -160,12 +160,7 @@ class EmulatedModbus(EmulatedDevice):
         return self.memory.read(areas, address, count)
 
     def write(self, area: str, address: int, values: Sequence[int]) -> None:
-        """Write register words; all or none.
-
-        Raises:
-            RejectedRequest: Not all can be written, a value is out of its channel's range, or the
-                watchdog has tripped and the device wants that cleared first.
-        """
+        """Write all register words, or raise RejectedRequest and write none."""
         if self.overlay is not None and self.overlay.has(address):
             self.overlay.write(address, values)
             return
@@ -212,11 +207,8 @@ class EmulatedModbus(EmulatedDevice):
         return self.profile.watchdog != "none" and bool(self.profile.watchdog.clear)
 
     def _resume(self) -> None:
-        """Output what the registers hold, as a device may once its trip is cleared.
-
-        No document describes it for the shipped ones. A device that refuses commands until then
-        waits for the next command.
-        """
+        """Output what the registers hold, as a device may once its trip is cleared."""
+        # A device that refuses commands until then waits for the next command.
         watchdog = self.profile.watchdog
         if watchdog != "none" and not watchdog.refuses_while_tripped:
             for name in self._outputs:

@@ -143,10 +143,7 @@ class ModbusWire:
         return next(iter(self._devices.values())) if self._any_unit else self._devices.get(unit)
 
     def requests(self, received: bytearray) -> Iterator[bytes]:
-        """Yield complete requests after their envelope's ids, and remove them.
-
-        Requests for other devices are removed and not yielded.
-        """
+        """Yield complete requests, and remove them and those for other devices."""
         while received:
             used, unit, transaction, pdu = self._framer.decode(bytes(received))
             if not used:

@@ -35,11 +35,7 @@ class WireFault:
 
 
 def parse_fault(text: str) -> WireFault:
-    """Read ``KIND@COUNT`` or ``KIND@SECONDSs``; ``delay:`` and ``late:SECONDS@...`` say how late.
-
-    Raises:
-        InputError: It is none of these.
-    """
+    """Read ``KIND@COUNT`` or ``KIND@SECONDSs``; ``delay:`` and ``late:SECONDS@`` take a time."""
     found = re.fullmatch(r"([a-z_]+)(?::(\d+(?:\.\d+)?))?@(\d+(?:\.\d+)?)(s?)", text)
     if found is None:
         raise InputError(f"fault must be KIND@COUNT or KIND@SECONDSs, got {text!r}")
@@ -91,11 +87,7 @@ ReaderLine: TypeAlias = Literal["same", "own"]
 
 @dataclass(frozen=True)
 class EmulatorOptions:
-    """What to emulate; link, current, functions and the reader's unit and port are for Modbus only.
-
-    Raises:
-        InputError: ``link`` or ``reader_line`` is none of its words.
-    """
+    """What to emulate; link, current, functions, and reader unit and port: Modbus only."""
 
     profile: str  # name of a shipped profile, or path of one
     link: LinkKind | None = None  # tcp, or rtu on a pty; the profile's own if None

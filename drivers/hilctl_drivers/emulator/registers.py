@@ -112,16 +112,7 @@ def _find(places: _Map, areas: Sequence[str], address: int) -> tuple[Words, int]
 
 
 class RegisterMap:
-    """All registers that a profile names: channels, settings, watchdog and self-test.
-
-    Values that the profile expects are there from the start.
-
-    Attributes:
-        memory: The registers.
-        outputs: Value of each output.
-        inputs: Value of each input.
-        steps: Value of each step and of the trip flag, by its ``id``.
-    """
+    """Registers that a profile names, with the values it expects; ``steps`` is by their ``id``."""
 
     def __init__(self, profile: ModbusProfile) -> None:
         self._profile = profile
@@ -134,10 +125,7 @@ class RegisterMap:
         self._place_rest()
 
     def _areas(self, register: Register) -> tuple[str, ...]:
-        """Return the areas in which a register is seen.
-
-        LabJack makes no difference between functions 3 and 4, and function 23 reads inputs too.
-        """
+        """Return the areas of a register: LabJack does not tell functions 3 and 4 apart."""
         if register.area in {"coil", "discrete"} or self._profile.exchange == "none":
             return (register.area,)
         return ("holding", "input")

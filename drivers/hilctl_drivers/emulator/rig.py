@@ -90,10 +90,7 @@ class SimulatedWiring:
 
     @classmethod
     def spread(cls, output: Range, sensor: Range) -> "SimulatedWiring":
-        """Return a wiring that spreads the rig's ranges over those of the two channels.
-
-        An output in A drives the coil itself.
-        """
+        """Spread the rig's ranges over those of two channels; an output in A drives the coil."""
         rig = TerfenolParameters()
         amplifier = (1.0, 0.0) if output.unit == "A" else _spread(output, rig.dac_range_a)
         return cls(*amplifier, *_spread(sensor, rig.sensor_range_um))
@@ -130,15 +127,7 @@ _BEGIN = b'{"event": '
 
 
 class WriteLog:
-    """One JSON object per line, on disk immediately; an older log is replaced.
-
-    Args:
-        path: File to write; None for no log.
-        unix_offset_ns: Unix time less the monotonic clock.
-
-    Raises:
-        InputError: The file cannot be written.
-    """
+    """One JSON object per line, on disk immediately; replaces an older log, if ``path`` is set."""
 
     def __init__(self, path: Path | None, unix_offset_ns: int) -> None:
         self._offset_ns = unix_offset_ns
@@ -178,10 +167,7 @@ class Bench:
 
 
 class EmulatedDevice(ABC):
-    """A device on a bench: its time, its watchdog timer, and its outputs.
-
-    ``output`` is the one that drives the rig, None if another device does.
-    """
+    """A device on a bench; ``output`` drives the rig, None if another device does."""
 
     profile: BaseProfile
 
@@ -240,14 +226,7 @@ Played: TypeAlias = Callable[[int, F64, F64, int], None]
 
 
 class SampleFifo:
-    """FIFO that outputs one queued value per period to the simulated rig.
-
-    Args:
-        noise: Whether the sensor has noise.
-        repeats: Whether the last value is output again, with a reading, in a period that finds
-            nothing queued. Otherwise the output is held, and nothing is read.
-        on_played: Called with each block that was output.
-    """
+    """FIFO that outputs one value per period; a period without one holds or ``repeats`` it."""
 
     def __init__(self, *, noise: bool, repeats: bool, on_played: Played) -> None:
         self._parameters = _rated(noise=noise)

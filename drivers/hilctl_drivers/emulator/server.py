@@ -151,11 +151,7 @@ class EmulatorServer:
         self._stopping = False
 
     def listen_tcp(self, wire: EmulatedWire, host: str, port: int) -> str:
-        """Listen, at a free port if 0 is asked for; return ``host:port``.
-
-        Raises:
-            InputError: The port is in use or not permitted.
-        """
+        """Listen at a port, or a free one if 0; raise InputError if it is in use."""
         try:
             listener = socket.create_server((host, port))
         except OSError as error:

@@ -51,10 +51,7 @@ class Plant(ABC):
     """
 
     def __init__(self, noise_um: float, seed: int, chunk: int = CHUNK) -> None:
-        """Create the noise, rms; the subclass calls :meth:`warm_up` once it is complete.
-
-        ``chunk`` limits the samples of one call of the kernels, at most ``CHUNK``.
-        """
+        """Create the noise, rms; a kernel call takes up to ``chunk`` samples, at most ``CHUNK``."""
         self._noise = SensorNoise(noise_um, seed)
         self._chunk = chunk
         self._arrays = np.empty((3, chunk))

@@ -75,11 +75,8 @@ class DiffusionParameters(RodParameters):
         return np.stack([np.linspace(0.0, self.pinning_max_a_per_m, self.cells), shares])
 
     def conductances(self, step_s: float) -> F64:
-        """Return float64[2, shells], what of H's differences to its neighbours a shell takes.
-
-        Half a step of ``d(H + M)/dt = in (H_inner - H) + out (H_outer - H)``, row 0 ``in`` and row
-        1 ``out``; the outermost shell's neighbour is the surface, half a shell away.
-        """
+        """Return float64[2, shells]: half a step's flow from the inner and outer neighbour."""
+        # The outermost shell's neighbour is the surface, half a shell away.
         width = ROD_RADIUS_M / self.shells
         inner = np.arange(self.shells) * width
         middle = inner + 0.5 * width

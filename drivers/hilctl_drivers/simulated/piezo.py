@@ -47,27 +47,17 @@ class PiezoParameters:
     " UniTuple(float64, 6))"
 )
 def _run(
-    command: F64,
-    noise_um: F64,
-    displacement_um: F64,
-    drive_v: F64,
-    state: F64,
-    plays: F64,
+    command: F64,  # float64[n], drive in V
+    noise_um: F64,  # float64[n], of each reading
+    displacement_um: F64,  # float64[n], filled with the sensor's readings
+    drive_v: F64,  # float64[n], filled with the drive at the instant of each reading
+    state: F64,  # float64[2]: drive in V, sensor output in um; updated
+    plays: F64,  # float64[3, m]: threshold, weight and output of each play operator; updated
     constants: tuple[float, float, float, float, float, float],
 ) -> None:
-    """Read the sensor, output the command and advance one sample period; for every sample.
-
-    Args:
-        command: float64[n], drive in V.
-        noise_um: float64[n], noise of each reading in um.
-        displacement_um: float64[n], filled with the sensor's readings.
-        drive_v: float64[n], filled with the drive at the instant of each reading.
-        state: float64[2]: drive in V, sensor output in um; updated.
-        plays: float64[3, m]: threshold, weight and output of each play operator; updated.
-        constants: Weight of the drive itself, remaining part of the sensor's error after a sample
-            period, one DAC code in V, one ADC code in um, the sensor's range in um, the position
-            at rest in um.
-    """
+    """Read the sensor, output the command and advance one sample period; for every sample."""
+    # Weight of the drive, remaining part of the sensor's error after a sample period, a DAC code in
+    # V, an ADC code in um, the sensor's range and the position at rest in um.
     slope, left, dac_code, adc_code, sensor_range, offset = constants
     drive = state[0]
     sensor = state[1]

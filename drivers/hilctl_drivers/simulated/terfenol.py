@@ -119,10 +119,8 @@ class TerfenolParameters:
 
 
 def _motion(parameters: TerfenolParameters, load_kg: float, step_s: float) -> F64:
-    """Return float64[m - 2, m], the exact step of structure and sensor for ``respond``.
-
-    Velocities are in um per radian of their natural frequency: the matrix is then well scaled.
-    """
+    """Return float64[m - 2, m], the exact step of structure and sensor for ``respond``."""
+    # Velocities are in um per radian of their natural frequency: then it is well scaled.
     omega = math.sqrt(parameters.stiffness_n_per_m / (parameters.moving_mass_kg + load_kg))
     modes = [(omega, parameters.damping_ratio, 1.0)]
     second = parameters.second_mode

@@ -18,12 +18,8 @@ Amplification: TypeAlias = tuple[float, float, float, float, float, float]
 def _toward(start: float, target: float, left: float, limit: tuple[float, float]) -> float:
     """Return the current in A after some time: to the target by first order, within the voltage.
 
-    Args:
-        start: Current before.
-        target: Requested current.
-        left: Remaining part of the error with unlimited voltage.
-        limit: Remaining part of a current that nothing drives, and the current that the largest
-            voltage holds.
+    ``left`` is the remaining part of the error with unlimited voltage, ``limit`` that of a current
+    that nothing drives, and the current that the largest voltage holds.
     """
     decay, most = limit
     free = target + left * (start - target)
@@ -81,22 +77,14 @@ def creep(free_um: F64, elements: F64, rest_um: float) -> None:
 
 @kernel("void(float64[::1], float64[::1], float64[::1], UniTuple(float64, 5), int64)")
 def warm(
-    halves_a: F64,
-    growth_um: F64,
-    state: F64,
+    halves_a: F64,  # float64[2 n substeps + 1], see ``amplify``
+    growth_um: F64,  # float64[n], added to
+    state: F64,  # float64[1], rise in K by the coil; updated
     thermal: tuple[float, float, float, float, float],
-    substeps: int,
+    substeps: int,  # in a sample period
 ) -> None:
-    """Add the thermal growth of the rods at the instant of each sample, and warm them.
-
-    Args:
-        halves_a: float64[2 n substeps + 1], see ``amplify``.
-        growth_um: float64[n], added to.
-        state: float64[1], rise in K by the coil; updated.
-        thermal: Steady rise in K/A^2, part reached in a step, growth in um/K, temperature
-            of the room in K, bias in A.
-        substeps: Steps in a sample period.
-    """
+    """Add the thermal growth of the rods at the instant of each sample, and warm them."""
+    # Steady rise in K/A^2, part reached in a step, growth in um/K, room in K, bias in A.
     rise, reached, growth, room, bias = thermal
     warmth = state[0]
     for j in range(growth_um.size):
@@ -112,28 +100,18 @@ def warm(
     " UniTuple(float64, 2), int64)"
 )
 def respond(
-    free_um: F64,
-    noise_um: F64,
-    displacement_um: F64,
-    mechanics: F64,
-    motion: F64,
-    rest_um: float,
-    sensor: tuple[float, float],
-    substeps: int,
+    free_um: F64,  # float64[n substeps], displacement of the rods at the end of each step
+    noise_um: F64,  # float64[n], of each reading
+    displacement_um: F64,  # float64[n], filled with the sensor's readings
+    mechanics: F64,  # float64[m], updated
+    motion: F64,  # float64[m - 2, m], exact step for a free displacement that changes linearly
+    rest_um: float,  # free displacement at rest
+    sensor: tuple[float, float],  # one ADC code and the range, in um
+    substeps: int,  # in a sample period
 ) -> None:
-    """Read the sensor, then let structure and sensor follow the rods; for every sample.
-
-    Args:
-        free_um: float64[n substeps], free displacement of the rods at the end of each step.
-        noise_um: float64[n], noise of each reading.
-        displacement_um: float64[n], filled with the sensor's readings.
-        mechanics: float64[m]: position and velocity of each mode, sensor output, free displacement
-            from rest before and after the last step; updated.
-        motion: float64[m - 2, m], the exact step for a free displacement that changes linearly.
-        rest_um: Free displacement at rest.
-        sensor: One ADC code and the range, in um.
-        substeps: Steps in a sample period.
-    """
+    """Read the sensor, then let structure and sensor follow the rods; for every sample."""
+    # mechanics: position and velocity of each mode, sensor output, free displacement from rest
+    # before and after the last step.
     adc_code, sensor_range = sensor
     size = mechanics.size
     moved = np.empty(size - 2)

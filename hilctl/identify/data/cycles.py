@@ -98,10 +98,7 @@ def _refined(command: F64, period: float) -> float:
 
 
 def steady_stretch(command: F64, period: float) -> tuple[int, int] | None:
-    """Return the longest interval in which a command repeats at full amplitude.
-
-    It is at least two periods long, except for rounding; None if there is none.
-    """
+    """Return the longest part of two periods in which a command repeats fully, or None."""
     span = float(np.ptp(command))
     later = np.arange(command.size - math.ceil(period))
     again = np.interp(later + period, np.arange(command.size), command)
@@ -172,10 +169,7 @@ class CycleMean:
 
 
 def average_cycle(label: str, phase: F64, values: F64, period: float, points: int) -> F64:
-    """Return the mean cycle at points evenly spaced in time, see :class:`CycleMean`.
-
-    The phase, float64[n], is time in periods since the start of the first cycle.
-    """
+    """Return the mean cycle of a phase, float64[n] in periods, see :class:`CycleMean`."""
     mean = CycleMean(label, period, points, len(values))
     mean.add(phase, values)
     return mean.cycle()
@@ -191,13 +185,7 @@ def loops_from_recording(
 def loops_from_pieces(
     pieces: Iterable[Recording], points: int = 300, labels: Collection[str] = ()
 ) -> tuple[SteadyLoop, ...]:
-    """Return the averaged steady cycle of each segment of a recording.
-
-    Samples with a displacement that is not finite are ignored.
-
-    Raises:
-        DataError: A label is unknown, a segment has no steady cycle, or there is no segment.
-    """
+    """Return the averaged cycle of each segment; raise DataError if one is not steady."""
     found: list[_SegmentMean] | None = None
     for piece in pieces:
         if found is None:
@@ -248,14 +236,8 @@ class _SegmentMean:
 
 
 def find_cycles(history: History, points: int = 300) -> SteadyLoop:
-    """Find the steady periodic part of a history and return its averaged cycle.
-
-    The period is that of the command. If there is more than one cycle, the first is ignored,
-    because the hysteresis still depends on what came before.
-
-    Raises:
-        DataError: Nothing repeats.
-    """
+    """Return the averaged cycle of a history's periodic part; raise DataError without one."""
+    # The first cycle is ignored, because its hysteresis depends on what came before.
     command = history.command[history.ignore :]
     displacement_um = history.displacement_um[history.ignore :]
     period, start, stop = find_period(history.label, command)

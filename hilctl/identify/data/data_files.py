@@ -22,17 +22,11 @@ UNEVEN = 0.5  # maximum deviation of a time step from the median, due to roundin
 
 
 class TableRecord(NamedTuple):
-    """A record from a table.
+    """A record from a table."""
 
-    Attributes:
-        history: The record.
-        unit: Unit of its command; None if the table has none.
-        understood: Columns and units in words.
-    """
-
-    history: History
-    unit: CommandUnit | None
-    understood: str
+    history: History  # the record
+    unit: CommandUnit | None  # unit of its command; None if the table has none
+    understood: str  # columns and units in words
 
 
 def read_table(path: Path, settings: TableSettings) -> TableRecord:
@@ -85,11 +79,7 @@ def _column(table: Table, column: Column, option: str) -> int:
 
 
 def _scale(table: Table, at: int, unit: str, option: str, given: float | None) -> float:
-    """Return the factor from a column's numbers to a unit.
-
-    Raises:
-        DataError: The column is in another unit, and no scale is given.
-    """
+    """Return the factor from a column's numbers to a unit; raise DataError if it is unknown."""
     base, factor = table.unit(at)
     if given is not None:
         return factor * given
@@ -111,28 +101,17 @@ MOST_WHOLE = 20_000_000
 
 
 class LoadedRecords(NamedTuple):
-    """Records of files.
+    """Records of files."""
 
-    Attributes:
-        records: Loops and histories.
-        unit: Command unit of the recordings, or of the tables that have one; None if unknown.
-        understood: Columns and units of each table in words.
-    """
-
-    records: list[Record]
-    unit: CommandUnit | None
-    understood: list[str]
+    records: list[Record]  # loops and histories
+    unit: CommandUnit | None  # command unit; None if the tables do not have one
+    understood: list[str]  # columns and units of each table in words
 
 
 def load_records(
     paths: Sequence[Path], settings: IdentifySettings, lag_samples: int
 ) -> LoadedRecords:
-    """Read recordings (``.mcap``) and tables, whose displacements lag, as records.
-
-    Raises:
-        DataError: A file can't be used.
-        InputError: Commands in A and in V are mixed, or ``leave_out`` names none or all.
-    """
+    """Read recordings (``.mcap``) and tables, whose displacements lag, as records."""
     records: list[Record] = []
     known: list[str] = []
     understood: list[str] = []

@@ -1,7 +1,7 @@
 """Records that models are fitted to: steady loops and time histories."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -19,19 +19,13 @@ class SteadyLoop:
     """One steady cycle, averaged over several and resampled evenly in time.
 
     Published numbers of points are 200 (chapter 4), 400 (5.14) and 300 (6.24).
-
-    Attributes:
-        label: Name of the record, such as ``sine 6 A 10 Hz``.
-        command: float64[M], command in the device's unit.
-        displacement_um: float64[M].
-        sample_rate_hz: Sample rate of the run that it was averaged from; 0.0 if unknown.
     """
 
-    label: str
-    command: F64
-    displacement_um: F64
+    label: str  # name of the record, such as ``sine 6 A 10 Hz``
+    command: F64  # float64[M], command in the device's unit
+    displacement_um: F64  # float64[M]
     frequency_hz: float
-    sample_rate_hz: float = 0.0
+    sample_rate_hz: float = 0.0  # sample rate of the run that it was averaged from; 0.0 if unknown
 
     def __post_init__(self) -> None:
         check_signals(self.label, self.command, self.displacement_um)
@@ -57,11 +51,8 @@ class SteadyLoop:
         return np.asarray((self.command - before) * self.sample_rate_hz, dtype=np.float64)
 
     def run(self) -> tuple[F64, F64, int]:
-        """Return two periods to simulate, their rate, and the number of samples not evaluated.
-
-        One period from rest brings every play operator to its periodic state, because it clips its
-        state to a range.
-        """
+        """Return two periods to simulate, their rate, and the number of samples not evaluated."""
+        # One period from rest brings every play to its periodic state: it clips to a range.
         return np.tile(self.command, 2), np.tile(self.rate(), 2), self.command.size
 
 
@@ -71,18 +62,13 @@ class History:
 
     The hysteresis starts at the first sample, which must be the start of the motion or far enough
     before the first evaluated sample.
-
-    Attributes:
-        command: float64[n], command in the device's unit.
-        displacement_um: float64[n].
-        ignore: Samples at the start that are not evaluated.
     """
 
     label: str
-    command: F64
-    displacement_um: F64
+    command: F64  # float64[n], command in the device's unit
+    displacement_um: F64  # float64[n]
     sample_rate_hz: float
-    ignore: int = 0
+    ignore: int = 0  # samples at the start that are not evaluated
 
     def __post_init__(self) -> None:
         check_signals(self.label, self.command, self.displacement_um)
@@ -100,20 +86,14 @@ class History:
         return np.asarray(np.arange(self.command.size) / self.sample_rate_hz, dtype=np.float64)
 
     def without_lag(self, lag_samples: int) -> "History":
-        """Return the history with the displacement taken ``lag_samples`` later.
-
-        For sensors or recorders with a delay. The model does not contain this lag, and its
-        compensator does not invert it. Raise DataError if it is negative or leaves too few samples.
-        """
+        """Return the history with the displacement taken later, by a lag outside the model."""
         if lag_samples < 0:
             raise DataError(f"{self.label}: lag_samples must be >= 0: {lag_samples}")
         end = self.command.size - lag_samples
-        return History(
-            self.label,
-            np.ascontiguousarray(self.command[: max(end, 0)]),
-            np.ascontiguousarray(self.displacement_um[lag_samples:]),
-            self.sample_rate_hz,
-            self.ignore,
+        return replace(
+            self,
+            command=np.ascontiguousarray(self.command[: max(end, 0)]),
+            displacement_um=np.ascontiguousarray(self.displacement_um[lag_samples:]),
         )
 
     def run(self) -> tuple[F64, F64, int]:
@@ -184,10 +164,8 @@ def thinned(records: Sequence[Record], most: int = MOST_SAMPLES) -> tuple[Record
 
 
 def turning_points(command: F64) -> I64:
-    """Return where a command turns by more than :data:`SMALLEST_TURN`.
-
-    A play of that width follows the command up to each turn.
-    """
+    """Return where a command turns by more than :data:`SMALLEST_TURN`."""
+    # A play of that width follows the command up to each turn.
     threshold = np.array([0.5 * SMALLEST_TURN * np.ptp(command)])
     followed = np.empty((command.size, 1))
     command = np.ascontiguousarray(command)

@@ -28,20 +28,14 @@ MOVED = 1e-3  # of the largest motion: columns that move less are ignored
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Thresholds and cells of the operators, in command units.
-
-    Attributes:
-        lowest: Lower end of the first cell of the effective field.
-        cells: Number of cells of a drag, and of splines of a play over the same range, >= 3.
-        knots: Pieces of the curve.
-    """
+    """Thresholds and cells of the operators, in command units."""
 
     thresholds: F64
     lengths: F64
-    lowest: float
+    lowest: float  # lower end of the first cell of the effective field
     width: float
-    cells: int
-    knots: int
+    cells: int  # number of cells of a drag, and of splines of a play over the same range, >= 3
+    knots: int  # pieces of the curve
 
     @property
     def lines(self) -> int:
@@ -72,20 +66,13 @@ class Curve:
 
 @dataclass(frozen=True, slots=True)
 class Weights:
-    """Fitted densities and curve.
+    """Fitted densities and curve."""
 
-    Attributes:
-        slopes: float64[lines, cells], um per command unit; for plays, weights of their splines.
-        curve: From the output of the operators to displacement, without the offset.
-        offset_um: Displacement at rest.
-        squares: Weighted sum of squares of the operators' errors and of the prior.
-    """
-
-    slopes: F64
-    curve: Curve
-    offset_um: float
+    slopes: F64  # float64[lines, cells], um per command unit; for plays, weights of their splines
+    curve: Curve  # from the output of the operators to displacement, without the offset
+    offset_um: float  # displacement at rest
     errors_um: F64
-    squares: float = 0.0
+    squares: float = 0.0  # weighted sum of squares of the operators' errors and of the prior
 
     def errors_of(self, given: F64, y: F64) -> F64:
         """Return the errors of outputs of the operators at any rows: float64[N]."""
@@ -94,10 +81,7 @@ class Weights:
 
 
 def table(paths: Sequence[F64], kept: Sequence[I64], grid: Grid) -> F64:
-    """Return the output of each operator for each cell: float64[N, lines cells].
-
-    Each record has an effective field from rest, float64[n], of which the kept samples are rows.
-    """
+    """Return each operator's output per cell at the kept samples: float64[N, lines cells]."""
     plays, cells = grid.thresholds.size, grid.cells
     parts: list[F64] = []
     for path, samples in zip(paths, kept, strict=True):
@@ -118,10 +102,7 @@ def _needed(path: F64, samples: I64) -> tuple[F64, I64]:
 
 
 def outputs(paths: Sequence[F64], kept: Sequence[I64], grid: Grid, slopes: F64) -> tuple[F64, F64]:
-    """Return the output of operators with known weights, and its derivatives by thresholds.
-
-    See :func:`table`. The derivatives, float64[N, p - 1], are by all thresholds but the first.
-    """
+    """Return the output of weighted operators and its slopes by thresholds: float64[N, p - 1]."""
     plays = grid.thresholds.size
     drags = replace(grid, thresholds=np.empty(0))
     given: list[F64] = []
@@ -192,12 +173,8 @@ class Equations:
         return Weights(lines, curve, offset_um, errors, squares)
 
     def place(self, errors: F64, changes: F64) -> SearchPoint:
-        """Return the sum of squares with derivatives by the changes, by variable projection.
-
-        Free weights compensate each change as far as they can (Kaufman's approximation). The
-        errors, float64[N], and their changes, float64[N, p], are of outputs with the weights of
-        :meth:`solve`.
-        """
+        """Return the sum of squares with derivatives by the changes (Kaufman's approximation)."""
+        # errors float64[N] and changes float64[N, p] are of outputs with the weights of solve().
         found, _ = self._found
         free = found > self._lows
         means = self._means(self._left[:, free])
@@ -214,10 +191,8 @@ class Equations:
 
     @cached_property
     def _found(self) -> tuple[F64, float]:
-        """Minimise |scale (left w + c - target)|^2 + |prior w - wanted|^2 over w >= lows, and c.
-
-        By normal equations, which are fast, and well conditioned because of the prior.
-        """
+        """Minimise |scale (left w + c - target)|^2 + |prior w - wanted|^2 over w >= lows, and c."""
+        # By normal equations, which are fast, and well conditioned because of the prior.
         means, mean = self._means(self._left), float(self._means(self._target))
         left = (self._left - means) * self._scale[:, None]
         right = (self._target - mean - (self._left - means) @ self._lows) * self._scale

@@ -46,10 +46,8 @@ def corners(x: F64, y: F64, off_x: float, off_y: float, thin: int, furthest: int
 def bare_displacement(
     derivatives: F64, kept: I64, late: float, slope_gain: float, bend_gain: float, out: F64
 ) -> None:
-    """Fill in y + slope_gain y' + bend_gain y'' ``late`` samples after each one in ``kept``.
-
-    ``derivatives``, float64[3, n], holds y, y' and y''; the last sample is repeated.
-    """
+    """Fill in y + slope_gain y' + bend_gain y'' ``late`` samples after each of ``kept``."""
+    # derivatives: float64[3, n], y, y' and y''; the last sample is repeated.
     y, slope, bend = derivatives[0], derivatives[1], derivatives[2]
     whole = math.floor(late)
     part, end = late - whole, y.size - 1
@@ -62,10 +60,7 @@ def bare_displacement(
 
 @kernel("int64(float64[::1], float64, int64[::1])")
 def turning_points(u: F64, distance: float, out: I64) -> int:
-    """Find the turns of a path, and samples between them at most ``distance`` apart.
-
-    Fill in ``out``, int64[n], from the first sample to the last, and return the number of samples.
-    """
+    """Fill in turns of a path, and samples at most ``distance`` apart; return their number."""
     out[0] = 0
     last, count = u[0], 1
     for k in range(1, u.size):
@@ -81,10 +76,7 @@ def turning_points(u: F64, distance: float, out: I64) -> int:
 
 @kernel("void(float64[::1], float64, float64[::1])")
 def swings(y: F64, turn: float, out: F64) -> None:
-    """Fill in the swing of a path between the turns around each sample: float64[n].
-
-    A reversal is a turn if it exceeds ``turn``.
-    """
+    """Fill in the swing between turns of more than ``turn`` around each sample: float64[n]."""
     first = last = 0  # the last turn, and the furthest sample since
     way = 0.0
     for k in range(y.size):
@@ -102,10 +94,7 @@ def swings(y: F64, turn: float, out: F64) -> None:
 
 @kernel("int64(float64[::1], int64[::1], int64[::1], int64[::1])", nogil=True)
 def needed_points(u: F64, rows: I64, points: I64, places: I64) -> int:
-    """Fill in samples that operators need: rows and turns; return their number.
-
-    ``places`` is filled with the index of each row among the samples.
-    """
+    """Fill in rows and turns, and the place of each row among them; return their number."""
     count = row = 0
     for k in range(u.size):
         if row == rows.size:
@@ -141,10 +130,8 @@ def _add_splines(u: float, lowest: float, width: float, sign: float, out: F64) -
 
 @kernel("UniTuple(float64, 2)(float64, float64, float64, float64[::1], float64[::1])")
 def _risen(u: float, lowest: float, width: float, s: F64, edges: F64) -> tuple[float, float]:
-    """Return the integral of weighted quadratic splines up to u, and their sum there.
-
-    The weights are float64[c], and ``edges``, float64[c - 1], are integrals at the edges of pieces.
-    """
+    """Return the integral of splines with weights s up to u, and their sum there."""
+    # edges: float64[c - 1], integrals at the edges of pieces.
     pieces = s.size - 2
     place = (u - lowest) / width
     j = int(min(max(math.floor(place), 0.0), pieces - 1.0))
@@ -232,16 +219,11 @@ REPEATED = 0.5  # exponent by which the density of rows reduces their weight
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """Motion of a record.
+    """Motion of a record."""
 
-    Attributes:
-        travel: float64[n], change of the command since the sample before, of its peak-to-peak.
-        swing: float64[n], swing of the displacement around a sample, of the stroke.
-    """
-
-    travel: F64
+    travel: F64  # float64[n], change of the command since the sample before, of its peak-to-peak
     step_s: F64
-    swing: F64
+    swing: F64  # float64[n], swing of the displacement around a sample, of the stroke
     judged: int
 
     @classmethod

@@ -183,10 +183,8 @@ class DuhemSearch:
         return normal, down
 
     def _errors(self, x: F64, logs: F64, slopes: F64 | None = None) -> F64:
-        """Return weighted errors in percent of the stroke over the square root of their number.
-
-        Fill in ``slopes``, float64[N, 2 k l], with the derivatives by the logarithms.
-        """
+        """Return weighted errors in percent of the stroke over the root of their number."""
+        # slopes: float64[N, 2 k l], filled with the derivatives by the logarithms.
         layout = self._layout
         start_um = self._signals.offset_um(x, self._first_um)
         flux = np.arange(layout.centre.size, dtype=np.float64)  # not used by the inverse
@@ -214,10 +212,8 @@ class DuhemSearch:
 
 
 def _bounded_step(normal: F64, down: F64, damping: float, table: int, x: F64) -> F64 | None:
-    """Return the step of damped normal equations, with stages limited to their bounds.
-
-    None if the damping is too small: rounding of large errors may exceed the prior.
-    """
+    """Return the step of damped equations, with stages limited to their bounds, or None."""
+    # None if the damping is too small: rounding of large errors may exceed the prior.
     damped = normal.copy()
     damped[np.diag_indices_from(damped)] += damping
     try:
@@ -242,11 +238,7 @@ POINTS = 45  # samples kept of the fastest cycle
 
 
 def fit_generalised_duhem(job: FitJob) -> FoundModel:
-    """Fit a table of slopes, losses, structure and delay.
-
-    Raises:
-        DataError: A record is a steady loop: slopes inside the band follow from the path to loops.
-    """
+    """Fit a table of slopes, losses, structure and delay; raise DataError for loops."""
     data = Prepared(histories_of(job.data.records, "a table of slopes"), POINTS, OFF)
     settings = job.settings
     search = DuhemSearch(data, settings.cells, settings.across, job.least)

@@ -126,18 +126,13 @@ class Size:
 
 @dataclass(frozen=True, slots=True)
 class FieldEnd:
-    """End of a search, from which another search can start.
-
-    Attributes:
-        met: The curve that the losses depend on, by displacement with its offset.
-        widest: Largest useful threshold, of half the span.
-    """
+    """End of a search, from which another search can start."""
 
     known: Physical
     grid: Grid
     weights: Weights
-    met: Curve | None
-    widest: float
+    met: Curve | None  # the curve that the losses depend on, by displacement with its offset
+    widest: float  # largest useful threshold, of half the span
 
 
 @dataclass(frozen=True, slots=True)
@@ -308,11 +303,7 @@ FINER = 8  # cells of the model's tables per piece of a spline
 
 
 def fit_field(job: FitJob) -> FoundModel:
-    """Fit plays and drags of a field, losses, structure and delay.
-
-    Raises:
-        DataError: A record is a steady loop: loops leave curve and losses undetermined.
-    """
+    """Fit plays and drags of a field, losses, structure and delay; raise DataError for loops."""
     settings = job.settings
     data = Prepared(histories_of(job.data.records, "an effective field"))
     size = Size(settings.plays, settings.drags, settings.cells, settings.knots)

@@ -81,21 +81,14 @@ class Latest(Generic[_Found]):
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """One record; callers must not change returned arrays, since they are cached.
-
-    Attributes:
-        step_s: float64[n], time since the sample before.
-        command: float64[n], at the end of each step.
-        mean: float64[n], the command's mean over each step.
-        derivatives: float64[3, N], displacement of all samples in um and its derivatives by time.
-    """
+    """One record; callers must not change returned arrays, since they are cached."""
 
     rate_hz: float
     kept: I64
-    step_s: F64
-    command: F64
-    mean: F64
-    derivatives: F64
+    step_s: F64  # float64[n], time since the sample before
+    command: F64  # float64[n], at the end of each step
+    mean: F64  # float64[n], the command's mean over each step
+    derivatives: F64  # float64[3, N], displacement of all samples in um and its derivatives by time
     motion: Motion
     _late: Latest[tuple[F64, F64]] = field(default_factory=Latest, init=False, repr=False)
     _bare: Latest[F64] = field(default_factory=Latest, init=False, repr=False)
@@ -106,11 +99,8 @@ class Run:
         return self.kept / self.rate_hz
 
     def late_command(self, lag_s: float) -> tuple[F64, F64]:
-        """Return at which part of each step to take its command, and the command: float64[n] each.
-
-        The step of a lag is exact for a straight command if the command is taken at this part: the
-        middle of a short step, the end of a step in which the lag settles.
-        """
+        """Return the part of each step at which to take its command, and the command."""
+        # So a lag's step is exact: the middle of a short one, the end of one that settles.
         return self._late.of(lag_s, lambda: self._late_command(lag_s))
 
     def _late_command(self, lag_s: float) -> tuple[F64, F64]:

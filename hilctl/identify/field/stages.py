@@ -16,29 +16,17 @@ from hilctl.models.linear_stages import FirstMode
 
 @dataclass(frozen=True, slots=True)
 class Stages:
-    """All parameters but the weights; times per 1 / (2 pi top_hz), commands per reach.
+    """All parameters but the weights; times per 1 / (2 pi top_hz), commands per reach."""
 
-    Attributes:
-        field: Constant lag of the field.
-        output: Loss proportional to the slope of the hysteresis, at its mean slope.
-        decay: Delay of the losses.
-        growth: Linear growth of the losses with themselves.
-        bend: Quadratic growth.
-        excess: Loss that grows with the square root.
-        radian: 1 / w of the structure.
-        damping: Its damping ratio.
-        delay: Transport delay.
-    """
-
-    field: float = 0.1
-    output: float = 0.02
-    decay: float = 0.01
-    growth: float = 0.1
-    bend: float = 0.1
-    excess: float = 0.01
-    radian: float = 0.1
-    damping: float = 0.2
-    delay: float = 0.03
+    field: float = 0.1  # constant lag of the field
+    output: float = 0.02  # loss proportional to the slope of the hysteresis, at its mean slope
+    decay: float = 0.01  # delay of the losses
+    growth: float = 0.1  # linear growth of the losses with themselves
+    bend: float = 0.1  # quadratic growth
+    excess: float = 0.01  # loss that grows with the square root
+    radian: float = 0.1  # 1 / w of the structure
+    damping: float = 0.2  # its damping ratio
+    delay: float = 0.03  # transport delay
 
 
 SHORTEST_S = 1e-9  # of lags
@@ -127,10 +115,8 @@ def stages_of(known: Physical, data: Prepared) -> Stages:
 
 
 def signals(run: Run, known: Physical, curve: Curve | None, span: float) -> tuple[F64, F64]:
-    """Return the effective field and the displacement before structure: float64[n] each.
-
-    The excess loss is linear below a part of ``span``. Without a curve, y itself is its output.
-    """
+    """Return effective field and displacement before structure, float64[n] each."""
+    # The excess loss is linear below a part of the span. Without a curve, y is its output.
     y = run.bare_um(known.delay_s, 2.0 * known.damping_ratio * known.radian_s, known.radian_s**2)
     m = y if curve is None else curve.operators_of(y)
     losses: Any = (*known.losses.model_dump().values(), even_excess(span), 0.0)

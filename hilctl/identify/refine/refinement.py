@@ -1,7 +1,7 @@
 """Refinement of a model by recordings: a better model, or reasons why there is none."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -33,15 +33,7 @@ STILL_S = 1.0  # between a run and the one that began where it ended
 
 
 def load_runs(paths: Sequence[Path], model: HysteresisModel) -> list[History]:
-    """Read runs, compensated or not, each from rest.
-
-    The actuator responds to the output command, whatever the model of the run. A run that begins
-    in the end state of another has the samples of that run before its own; they are not evaluated.
-
-    Raises:
-        InputError: A file is named twice, or there is none.
-        DataError: A recording can't be read, has no known initial state, or another unit.
-    """
+    """Read runs, each from rest, or after the run that it continues, which is not evaluated."""
     if not paths:
         raise InputError("no recordings to refine the model: name at least one")
     twice = {path for path in paths if list(paths).count(path) > 1}
@@ -74,13 +66,9 @@ def _history(recording: Recording, known: Mapping[str, Recording]) -> History:
     still = round(STILL_S * recording.sample_rate_hz)
     command = np.concatenate((first.command, np.full(still, last), history.command))
     ahead = np.zeros(command.size - history.command.size)  # not evaluated
-    return History(
-        history.label,
-        command,
-        np.concatenate((ahead, history.displacement_um)),
-        history.sample_rate_hz,
-        ahead.size + history.ignore,
-    )
+    displacement_um = np.concatenate((ahead, history.displacement_um))
+    ignore = ahead.size + history.ignore
+    return replace(history, command=command, displacement_um=displacement_um, ignore=ignore)
 
 
 @shown_briefly
@@ -126,22 +114,14 @@ class Refinement:
 
 def refine_files(
     model: Path,
-    paths: Sequence[Path],
-    output: Path | None,
-    validate: Sequence[Path] = (),
+    paths: Sequence[Path],  # recordings of runs, compensated or not
+    output: Path | None,  # model file to write
+    validate: Sequence[Path] = (),  # if there are none, those of ``paths`` in turn
     *,
     overwrite: bool = False,
     progress: OnProgress = ignore_progress,
 ) -> Refinement:
     """Refine a model from recordings, and write it if it is better.
-
-    Args:
-        model: Model file.
-        paths: Recordings of runs, compensated or not.
-        output: Model file to write; None for none.
-        validate: Recordings to evaluate on; if there are none, those of ``paths`` in turn.
-        overwrite: Whether a model file of that name may be replaced.
-        progress: Progress callback.
 
     Raises:
         InputError: A file can't be used; nothing is written.
@@ -164,11 +144,7 @@ def refine_runs(
     source: str = "",
     progress: OnProgress = ignore_progress,
 ) -> Refinement:
-    """Refine a model from runs, and evaluate it on held-out runs.
-
-    Raises:
-        InputError: The runs are implausible or too few, or no refined model has an inverse.
-    """
+    """Refine a model from runs, and evaluate it on held-out runs."""
     if reasons := tuple(data_reasons([*runs, *validate])):
         raise InputError("\n".join(reasons))
     parts, splits = parts_of(runs, validate)

@@ -35,11 +35,7 @@ class RegularisationSplit:
 
 @dataclass(frozen=True, slots=True)
 class SelectedRegularisation:
-    """A regularisation, and its errors on held-out runs.
-
-    With ``own``, each run has an offset, creep and drift. ``anchor`` is the weight of the old model
-    on motions of its whole range, of the least.
-    """
+    """A regularisation, perhaps with each run's ``own`` drift, and its held-out errors."""
 
     strength: float
     anchor: float
@@ -49,20 +45,14 @@ class SelectedRegularisation:
 
     @property
     def worse(self) -> tuple[str, ...]:
-        """Labels of held-out runs that lose more than a part of the mean gain.
-
-        A small loss is allowed, since the final model is fitted to all runs.
-        """
+        """Labels of held-out runs that lose more than a part of the mean gain."""
         most = 1.0 + LOSS * max(1.0 - self.ratio, 0.0)
         pairs = zip(self.after.judgement.errors, self.before.judgement.errors, strict=True)
         return tuple(now.label for now, was in pairs if now.rms_percent > most * was.rms_percent)
 
     @property
     def even(self) -> bool:
-        """Whether no part of a run is much worse.
-
-        Small motions are parts of larger runs, whose total error does not show their loss.
-        """
+        """Whether no part of a run is much worse, such as its small motions."""
         worst = 1.0
         sides = zip(
             self.before.judgement.modelled_um, self.after.judgement.modelled_um, strict=True
@@ -101,14 +91,8 @@ class SelectedRegularisation:
 def parts_of(
     runs: Sequence[History], validate: Sequence[History]
 ) -> tuple[tuple[History, ...], tuple[RegularisationSplit, ...]]:
-    """Return the parts that are fitted or evaluated, and their splits.
-
-    Of several runs each is held out once; of one, its last part. Runs to validate are held out
-    instead, if there are any.
-
-    Raises:
-        DataError: There are too few data.
-    """
+    """Return the parts to fit or evaluate, and their splits; raise DataError if too few."""
+    # Of several runs each is held out once; of one, its last part.
     every = tuple(range(len(runs)))
     if validate:
         others = tuple(range(len(runs), len(runs) + len(validate)))
@@ -147,10 +131,7 @@ class Regularisation:
         self._before = {own: self._held_out(old, own=own) for own in (False, True)}
 
     def best(self, progress: OnProgress) -> tuple[SelectedRegularisation, RefinedModel]:
-        """Return the best regularisation, and its model of all runs.
-
-        The best one may be worse than the old model.
-        """
+        """Return the best regularisation, perhaps worse than the old model, and its model."""
         found: list[tuple[SelectedRegularisation, RefinedModel, float]] = []
         ways = [(strength, own) for own in (False, True) for strength in STRENGTHS]
         for i, (strength, own) in enumerate(ways):

@@ -27,11 +27,8 @@ MOST = 0.25  # of a cycle of the fastest sine: maximum delay
 
 
 def delayed_model(model: HysteresisModel, runs: Sequence[History]) -> HysteresisModel:
-    """Return the model with the transport delay of the runs; unchanged if it can't have one.
-
-    At one frequency, errors of the loop width look like a delay. So drags, a gain and an offset
-    are fitted beside it.
-    """
+    """Return the model with the transport delay of the runs; unchanged if it can't have one."""
+    # Drags, gain and offset beside it: at one frequency, loop widths look like a delay.
     staged = _staged(model)
     if staged is None:
         return model
@@ -134,11 +131,7 @@ class NormalEquations:
 
 
 class ResidualFit:
-    """Linear fit of a residual operator to the residuals of all runs.
-
-    The delay follows from the ``fitted`` ones. ``base`` is the model before any refinement, and
-    ``x_um`` is its displacement in each run, relative to rest.
-    """
+    """Linear fit of a residual operator to all runs; the delay is that of ``fitted`` ones."""
 
     def __init__(
         self, model: HysteresisModel, runs: Sequence[History], fitted: Sequence[History]
@@ -165,17 +158,11 @@ class ResidualFit:
         return PLAYS * CELLS + (2 * DRAGS + 1) * (CELLS + 1) + 1
 
     def moments(self, *, own: bool) -> list[NormalEquations]:
-        """Return the normal equations of each run.
-
-        With ``own``, offset, creep and drift of a run are not fitted as hysteresis.
-        """
+        """Return each run's normal equations, with ``own`` less its offset, creep and drift."""
         return [self._of(x, run, own=own) for x, run in zip(self.x_um, self._runs, strict=True)]
 
     def anchor(self) -> NormalEquations:
-        """Return the normal equations of the old model on motions of its whole range.
-
-        They keep the old model for motions that the runs do not have.
-        """
+        """Return the equations of the old model on its whole range, which the runs may lack."""
         total = NormalEquations(np.zeros((self.size, self.size)), np.zeros(self.size))
         rate_hz = 1.0 / self._window_s  # one sample per window, so that rates are those of runs
         for x in self._motions():

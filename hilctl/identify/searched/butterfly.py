@@ -26,11 +26,7 @@ _ROUNDS = 4
 
 
 def fit_butterfly(job: FitJob) -> FoundModel:
-    """Fit a butterfly model; the command includes the bias current.
-
-    Raises:
-        DataError: A record is not a steady loop, or all displacements are below the turning point.
-    """
+    """Fit a butterfly model; raise DataError for histories, or a turning point too high."""
     problem = _Problem(job)
     data = job.data
     limit = data.reach / (job.settings.plays + 0.5)
@@ -80,10 +76,8 @@ class _Problem:
         self.bias_limit = np.inf if settings.magnets else _NONE
 
     def solve(self, spacing: float, growth_s: float) -> tuple[F64, float]:
-        """Return bias, weights a_0 to a_n and slopes of S^-1, and the rms error in um.
-
-        Rows are weighted by the slope of S, so that errors of the displacement are minimised.
-        """
+        """Return bias, a_0 to a_n and slopes of S^-1, and the rms error in um."""
+        # Rows are weighted by the slope of S, so that errors of the displacement are minimised.
         columns = self.data.columns(spacing * self.plays, growth_s)
         n, k = columns.shape[1], self.inner.shape[1]
         inner = -self.side[:, None] * self.inner

@@ -19,10 +19,7 @@ RIDGE = 1e-4  # weight of the weights themselves
 
 
 def spacing_limit(data: FitData, settings: FitSettings) -> float:
-    """Return the largest threshold spacing at which every play moves in a full cycle.
-
-    A play with a larger threshold moves in the first cycle only.
-    """
+    """Return the largest threshold spacing at which every play moves in a full cycle."""
     shift = 0.5 if settings.layout == "even" else 0.0
     return data.reach / (settings.plays + shift)
 
@@ -34,11 +31,8 @@ def numbered(settings: FitSettings) -> F64:
 
 
 def _held(data: FitData, plays: int) -> F64:
-    """Return the rows of the smoothness prior of free weights: float64[m, n + 1].
-
-    The factor n^1.5 makes it independent of the number of plays. The first play also represents
-    all narrower ones and the last all wider ones, so neither is compared with its neighbour.
-    """
+    """Return the rows of the smoothness prior of free weights: float64[m, n + 1]."""
+    # First and last play stand for all narrower and wider ones: no neighbours.
     longest = float(np.linalg.norm(data.columns(np.empty(0))))
     between = SMOOTHNESS * plays**1.5 * np.diff(np.eye(plays), axis=0)[1:-1]
     weights = np.vstack([between, RIDGE * np.eye(plays)])
@@ -86,10 +80,7 @@ class PlaysProblem:
         return np.asarray(columns @ weights + (beside - self._target), dtype=np.float64)
 
     def slopes_um(self, x: F64, scale: F64) -> F64:
-        """Return the derivatives of the error with compensation by the weights.
-
-        Kaufman's form of variable projection has an exact gradient. Weights at a bound are fixed.
-        """
+        """Return the derivatives of the error with compensation by the weights (Kaufman's form)."""
         columns = self._columns(x)
         found, _ = self._solve(columns, scale)
         weights = found[1] * self._decay(x) if self._exponential else found[1:]

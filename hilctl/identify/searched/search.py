@@ -52,19 +52,13 @@ class SearchSpace:
 
 
 class SearchProblem(Protocol):
-    """A family of models with its data.
-
-    ``held`` is the number of rows of a smoothness prior, after those of the samples.
-    """
+    """A family of models; ``held`` counts the rows of a smoothness prior after the samples."""
 
     space: SearchSpace
     held: int
 
     def error_um(self, x: F64, scale: F64) -> F64:
-        """Return modelled minus measured displacement, and the rows of the prior: float64[N].
-
-        ``scale`` is that of the errors, which linear weights depend on.
-        """
+        """Return the errors of samples and prior, float64[N]; weights depend on ``scale``."""
 
     def slopes_um(self, x: F64, scale: F64) -> F64:
         """Return the derivatives of the error: float64[N, p]."""
@@ -93,10 +87,7 @@ def search(
     rng: np.random.Generator,
     progress: OnProgress,
 ) -> SearchEnd:
-    """Minimise the sum of the squared, scaled errors.
-
-    Starts are the rough values from the data and the best random points.
-    """
+    """Minimise the sum of squared, scaled errors from rough values and the best random points."""
 
     def percent(x: F64) -> float:
         errors = problem.error_um(x, scale) * scale
@@ -135,10 +126,7 @@ def polished(problem: SearchProblem, x: F64, scale: F64, evaluations: int) -> tu
 def refine_peak(
     problem: SearchProblem, found: SearchEnd, goal_um: float, progress: OnProgress
 ) -> SearchEnd:
-    """Raise the weight of samples with errors beyond a goal, until there are none (Lawson).
-
-    Return the point with the smallest peak error.
-    """
+    """Return the point of least peak error; samples beyond a goal gain weight (Lawson)."""
     best, x, scale = found, found.x, found.scale
     samples = slice(scale.size - problem.held)
     errors_um = np.abs(problem.error_um(x, scale)[samples])

@@ -236,11 +236,8 @@ class StagedFitData:
     def plays(
         self, lagged: tuple[list[F64], list[F64]], before: F64, numbers: F64, weights: F64
     ) -> tuple[F64, F64, F64]:
-        """Run plays on commands after a lag, the result of :meth:`lagged`.
-
-        Return the lagged command float64[N], each play's output float64[N, n], and the derivatives
-        of the lagged command and of the weighted sum of the plays, float64[2, N, 4].
-        """
+        """Run plays on the result of :meth:`lagged`."""
+        # Returns input float64[N], outputs float64[N, n], slopes of input and sum float64[2, N, 4].
         size = self.target_um.size
         inputs, outputs = np.empty(size), np.empty((size, numbers.size))
         slopes = np.empty((2, size, PARAMETERS))

@@ -1,7 +1,4 @@
-"""The staged model as one sum of squares with analytic derivatives.
-
-Lag -> plays -> deadbands -> structure -> delay; all parameters in one row of numbers.
-"""
+"""The staged model (lag, plays, deadbands, structure, delay) as one sum of squares."""
 
 import math
 from dataclasses import dataclass, replace
@@ -45,25 +42,18 @@ def loop_delay_slope(half_period_s: float, lag_s: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Layers:
-    """Parts of the model.
-
-    Attributes:
-        growth: Whether it grows with its distance.
-        gamma: Whether thresholds grow with the rate.
-        half_period_s: Half a sample period of the loop; 0.0 to ignore its delay.
-        midpoint: Whether thresholds are alpha (i - 1/2) instead of alpha i.
-    """
+    """Parts of the model."""
 
     plays: int
     deadbands: int
     lag: bool = True
-    growth: bool = True
-    gamma: bool = False
+    growth: bool = True  # whether it grows with its distance
+    gamma: bool = False  # whether thresholds grow with the rate
     structure: bool = True
     delay: bool = True
-    half_period_s: float = 0.0
+    half_period_s: float = 0.0  # half a sample period of the loop; 0.0 to ignore its delay
     offset: bool = True
-    midpoint: bool = False
+    midpoint: bool = False  # whether thresholds are alpha (i - 1/2) instead of alpha i
 
     @property
     def numbers(self) -> F64:
@@ -83,22 +73,14 @@ class Layers:
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """Parameters of the layers, in their own units.
+    """Parameters of the layers, in their own units."""
 
-    Attributes:
-        before: float64[4]: lag in s, its growth, spacing of the thresholds, gamma in s.
-        linear: Structure, and delay in addition to that of a sampled loop.
-        direct: a_0 in um per command unit.
-        spacings_um: d_p and d_n, distances of the deadbands above and below 0.
-        up: float64[k], slopes of Lambda beyond each deadband above 0; 1 around 0.
-    """
-
-    before: F64
-    linear: Linear
-    direct: float
+    before: F64  # float64[4]: lag in s, its growth, spacing of the thresholds, gamma in s
+    linear: Linear  # structure, and delay in addition to that of a sampled loop
+    direct: float  # a_0 in um per command unit
     weights: F64
-    spacings_um: tuple[float, float]
-    up: F64
+    spacings_um: tuple[float, float]  # d_p and d_n, distances of the deadbands above and below 0
+    up: F64  # float64[k], slopes of Lambda beyond each deadband above 0; 1 around 0
     down: F64
     offset_um: float
 
@@ -260,10 +242,7 @@ def staged_model(
 
 
 def structure_of(linear: Linear) -> tuple[float, float]:
-    """Return natural frequency in Hz and damping ratio.
-
-    A first-order low-pass, such as a sensor, has no damping ratio: it gets a negligible mass.
-    """
+    """Return natural frequency in Hz and damping ratio; a low-pass gets a negligible mass."""
     least_s = 0.5 * linear.c_s / HIGHEST_DAMPING
     radian_s = max(math.sqrt(linear.q_s2), least_s * (1.0 + 1e-9))
     return 1.0 / (2.0 * math.pi * radian_s), linear.c_s / (2.0 * radian_s)

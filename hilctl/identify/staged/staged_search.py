@@ -118,20 +118,14 @@ PEAK_STEPS = 3
 
 @dataclass(frozen=True, slots=True)
 class StagedEnd:
-    """End of the search.
-
-    Attributes:
-        slopes: float64[N, p], their derivatives by ``point.pack()``.
-        free: bool[p], parameters that are neither fixed nor at a bound.
-        scale: float64[N], square root of the weights at the end.
-    """
+    """End of the search."""
 
     point: Point
     errors_um: F64
-    slopes: F64
-    free: np.ndarray[tuple[int], np.dtype[np.bool_]]
+    slopes: F64  # float64[N, p], their derivatives by ``point.pack()``
+    free: np.ndarray[tuple[int], np.dtype[np.bool_]]  # bool[p], neither fixed nor at a bound
     held: np.ndarray[tuple[int], np.dtype[np.bool_]]
-    scale: F64
+    scale: F64  # float64[N], square root of the weights at the end
     starts: tuple[StartOutcome, ...]
 
 

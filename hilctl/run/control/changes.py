@@ -21,13 +21,10 @@ from hilctl.run.shared.shared_page import PageField, SharedPage
 
 _SHARES: dict[str | None, float] = {"in": 1.0, "out": 0.0}
 _MOST_WAITING = 16
-_WAIT_S = 20.0
-"""Longest wait for the previous change; a client waits longer for its answer."""
+_WAIT_S = 20.0  # longest wait for the previous change; a client waits longer for its answer
 _POLL_S = 0.005
-_LEAD_S = 0.05
-"""Time from the answer to the first sample of a change."""
-_CYCLE = 2000
-"""Samples per cycle of the sine from which the command range is computed."""
+_LEAD_S = 0.05  # time from the answer to the first sample of a change
+_CYCLE = 2000  # samples per cycle of the sine from which the command range is computed
 
 
 class Changes:
@@ -134,11 +131,8 @@ class Changes:
 
 
 def bound_refusal(checked: CheckedExperiment, gain: float, offset: float, *, bypassed: bool) -> str:
-    """Return why a reference with this gain and offset would exceed the limits, or an empty text.
-
-    The whole range of the reference counts, also samples that have passed. Slew and heat are not
-    checked: limiter and interlocks enforce them.
-    """
+    """Return why a changed reference would exceed the limits, or an empty text."""
+    # The whole range counts; limiter and interlocks enforce slew and heat.
     low, high = sorted(gain * end + offset for end in checked.reference.span)
     problems = reference_problems(checked.loaded, checked.reference.unit, low, high)
     commands = [*command_range(checked, low, high, gain)]

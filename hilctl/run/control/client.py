@@ -21,17 +21,13 @@ from hilctl.run.run_folder import RunFolder, facts_of, runs
 
 _log = logging.getLogger(__name__)
 
-VERSION = 1
-"""Version of the protocol; it changes with the meaning of a message, not with a new key."""
-VERSION_KEY = "protocol"
-"""Key of the version in every answer."""
+VERSION = 1  # version of the protocol; it changes with the meaning of a message, not with a new key
+VERSION_KEY = "protocol"  # key of the version in every answer
 Command: TypeAlias = Literal["status", "set", "mark"]
 InverseState: TypeAlias = Literal["in", "out"]
 
-MAX_BYTES = 4096
-"""Longest request in bytes."""
-MAX_MARK = 200
-"""Longest mark in characters."""
+MAX_BYTES = 4096  # longest request in bytes
+MAX_MARK = 200  # longest mark in characters
 
 # Windows lacks these signals; it has no runs, but imports this module.
 STOP_SIGNAL: signal.Signals = getattr(signal, "SIGUSR1", signal.SIGTERM)
@@ -134,11 +130,7 @@ def active_runs() -> list[RunFolder]:
 
 
 def find_run(name: str | None) -> RunFolder:
-    """Return a run by its name or the beginning of it; without one, the only run.
-
-    Raises:
-        InputError: No run or several runs match.
-    """
+    """Return a run by a unique beginning of its name, or the only run; raise InputError if none."""
     active = active_runs()
     if name:  # a guardian is only chosen by name
         active += [run for run in runs() if not run.supervised and _guardian_status(run)]
@@ -257,21 +249,12 @@ def set_run(
 
 
 def mark_run(run: RunFolder, text: str) -> dict[str, Any]:
-    """Set a mark at the present sample of a run.
-
-    Raises:
-        InputError: The run refuses the mark.
-        RunError: It does not answer.
-    """
+    """Set a mark at the present sample of a run; raise InputError if the run refuses it."""
     return ask(run.socket, request("mark", text=text))
 
 
 def assigned(assignments: Sequence[str]) -> dict[str, Any]:
-    """Return the arguments of :func:`set_run` from texts such as ``gain=0.5`` or ``inverse=out``.
-
-    Raises:
-        InputError: The parameter or its value is not valid.
-    """
+    """Return the arguments of :func:`set_run` from texts; raise InputError for invalid ones."""
     wanted: dict[str, Any] = {}
     for text in assignments:
         key, equals, value = text.partition("=")

@@ -25,11 +25,7 @@ class StatusRequest(StrictModel):
 
 
 class SetRequest(StrictModel):
-    """Ramp gain or offset of the reference, or bypass or enable the inverse; None: unchanged.
-
-    Attributes:
-        inverse: ``out`` replaces the inverse by a straight line, ``in`` enables it.
-    """
+    """Ramp gain or offset, or replace the inverse by a line (``out``); None: unchanged."""
 
     command: Literal["set"]
     gain: Annotated[float, Field(ge=-1e6, le=1e6)] | None = None
@@ -74,10 +70,7 @@ class Requests:
         self._changes = Changes(checked, page)
 
     def answer(self, line: bytes) -> Mapping[str, Any]:
-        """Return the answer to one line of JSON; a change waits for the previous one.
-
-        Several threads may call it.
-        """
+        """Answer one line of JSON, from any thread; a change waits for the previous one."""
         try:
             request = REQUESTS.validate_json(line)
         except ValidationError as error:

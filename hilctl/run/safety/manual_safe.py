@@ -29,19 +29,14 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class SafeResult:
-    """Result of setting the safe value.
-
-    Attributes:
-        error: Why it is not confirmed; may be empty.
-        guardian_active: Whether the guardian of an earlier run continues.
-    """
+    """Result of setting the safe value."""
 
     device: str
     value: float
     unit: str
     output: OutputState
-    error: str
-    guardian_active: bool = False
+    error: str  # why it is not confirmed; may be empty
+    guardian_active: bool = False  # whether the guardian of an earlier run continues
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the fields as plain values."""

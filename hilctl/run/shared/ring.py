@@ -96,11 +96,7 @@ class SampleRing:
     def create(
         cls, path: Path, *, slots: int, block: int, state_size: int, latency_blocks: int = 0
     ) -> Self:
-        """Create a ring and allocate its memory.
-
-        Raises:
-            OSError: The memory is not available.
-        """
+        """Create a ring and allocate its memory; raise OSError if there is none."""
         spare = latency_blocks + 1  # blocks that may be under way in spare slots
         _, size = _layout(slots + spare, block, state_size)
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
@@ -153,11 +149,8 @@ class SampleRing:
         return block
 
     def last_command(self) -> float | None:
-        """Return the last command of the device, or None if its block was in a spare slot.
-
-        With a FIFO it is the end of the first unanswered block. Before the first block it is the
-        output at the start of the loop.
-        """
+        """Return the device's last command, or None if its block was in a spare slot."""
+        # With a FIFO it is the end of the first unanswered block.
         sent, head = self.page.get(PageField.SENT), self.page.get(PageField.HEAD)
         if self.page.get(PageField.ENDED_AT) == 0:
             return self.page.get_float(PageField.OUTPUT_AT_START)
@@ -259,11 +252,8 @@ class SampleRing:
         self._area.columns[slots, ANSWERS] = np.nan
 
     def unanswered(self, next_sample: int) -> BlockBatch | None:
-        """Return the blocks that a dead producer sent and that were not answered, or None.
-
-        They are flagged as unanswered; the last one may not have reached the device.
-        ``next_sample`` is the index after the last consumed sample.
-        """
+        """Return the blocks that a dead producer sent without an answer, or None."""
+        # They are flagged as unanswered; the last one may not have reached the device.
         sent = self.page.observe(PageField.SENT)
         numbers = _numbers(max(self.page.observe(PageField.HEAD), sent - self.slots), sent)
         slots: I64 = numbers % self.slots

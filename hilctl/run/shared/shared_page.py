@@ -33,21 +33,16 @@ _READS = 3
 class PageSlot(IntEnum):
     """Texts of loop and guardian for the supervisor."""
 
-    SET_UP = 0
-    """Real-time set-up of the loop: JSON of all steps, and of refused required steps."""
-    OUTCOME = 1
-    """Outcome of the run: JSON of :class:`hilctl.loop.safe_output.LoopOutcome`."""
-    ERROR = 2
-    """Why the loop failed."""
-    GUARDIAN = 3
-    """Result of the guardian: JSON of :class:`SafeActionResult`, or why it failed."""
+    SET_UP = 0  # real-time set-up of the loop: JSON of all steps, and of refused required steps
+    OUTCOME = 1  # outcome of the run: JSON of :class:`hilctl.loop.safe_output.LoopOutcome`
+    ERROR = 2  # why the loop failed
+    GUARDIAN = 3  # result of the guardian: JSON of :class:`SafeActionResult`, or why it failed
 
 
 _EVENTS_AT = _PAGE + len(PageSlot) * _TEXT_BYTES
 _NOTES_AT = _EVENTS_AT + _EVENT_SLOTS * _EVENT_BYTES
 _NOTE_SLOTS = 32
-SIZE = _NOTES_AT + _NOTE_SLOTS * _EVENT_BYTES
-"""Size of the page in bytes."""
+SIZE = _NOTES_AT + _NOTE_SLOTS * _EVENT_BYTES  # size of the page in bytes
 
 
 class PageField(IntEnum):
@@ -129,18 +124,12 @@ class GuardianPhase(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class SafeActionResult:
-    """Result of setting the safe value in place of the loop.
+    """Result of setting the safe value in place of the loop."""
 
-    Attributes:
-        hung: Whether the loop hung and was killed.
-        error: Why it is not confirmed; may be empty.
-        final: Whether no further write follows.
-    """
-
-    hung: bool
+    hung: bool  # whether the loop hung and was killed
     output: OutputState
-    error: str = ""
-    final: bool = True
+    error: str = ""  # why it is not confirmed; may be empty
+    final: bool = True  # whether no further write follows
 
     @property
     def confirmed(self) -> bool:
@@ -327,10 +316,7 @@ class SharedPage:
         self.publish(PageField.EVENT_HEAD, head + 1)
 
     def look_at_events(self, since: int) -> tuple[list[Event], int]:
-        """Return the events from number ``since`` on without consuming them, and the next number.
-
-        Events that were overwritten meanwhile are missing.
-        """
+        """Return the events from ``since`` on that are still there, and the next number."""
         return self._look(PageField.EVENT_HEAD, _EVENTS_AT, _EVENT_SLOTS, since)
 
     def leave_note(self, event: Event) -> None:
@@ -386,10 +372,7 @@ class SharedPage:
 
 
 def _packed(event: Event) -> str:
-    """Return an event as JSON that fits into a slot.
-
-    A long text is truncated; values that do not fit are omitted.
-    """
+    """Return an event as JSON that fits into a slot: long text is cut, long values omitted."""
     room = _EVENT_BYTES - 8
     facts, text = asdict(event), event.text[:room]
     if len(json.dumps({**facts, "text": ""})) > room:

@@ -39,15 +39,11 @@ _PAGE_SHARE = 30.0  # pause before the page is written again, over the time to w
 
 @dataclass(frozen=True, slots=True)
 class CampaignHost(StudyHost):
-    """Runs, time and observers of a campaign.
+    """Runs, time and observers of a campaign."""
 
-    Attributes:
-        on_row: Called with each finished step and its row.
-        on_note: Called with a line about each repaired recording.
-    """
-
+    # called after each step
     on_row: Callable[[CampaignStep, CampaignRow], None] = field(default=lambda step, row: None)
-    on_note: Callable[[str], None] = field(default=lambda text: None)
+    on_note: Callable[[str], None] = field(default=lambda text: None)  # per repaired file
 
 
 @shown_briefly
@@ -145,11 +141,7 @@ def measured(recording: Recording) -> CampaignRow:
 
 @contextmanager
 def prepared(folder: Path, host: CampaignHost) -> Iterator[None]:
-    """Lock a campaign's folder, and repair recordings of crashed runs in it.
-
-    Raises:
-        InputError: Another campaign or a run writes to it.
-    """
+    """Lock a campaign's folder, unless another writes to it, and repair recordings."""
     with locked_folder(folder, host.sleep_s):
         await_runs(folder, host.sleep_s)
         for orphan in recover_dead_runs():
@@ -160,12 +152,7 @@ def prepared(folder: Path, host: CampaignHost) -> Iterator[None]:
 
 
 def planned_in_real_time(campaign: CampaignSteps, folder: Path, now_s: float) -> CampaignPlan:
-    """Return the plan of a campaign in real time.
-
-    Raises:
-        ConfigError: One or more steps are not allowed.
-        InputError: The base experiment can't be read.
-    """
+    """Return the plan of a campaign in real time; raise ConfigError if a step is not allowed."""
     completed = completed_runs(folder) if folder.is_dir() else {}
     last = last_started(folder) if folder.is_dir() else None
     plan = planned(campaign, folder, completed, 0.0)
@@ -176,10 +163,8 @@ def planned_in_real_time(campaign: CampaignSteps, folder: Path, now_s: float) ->
 
 
 def _heat_a2(each: PlannedStep, last: Path | None, now_s: float) -> float:
-    """Return the heat of the coil after the last run of the device or the campaign, in A^2.
-
-    A simulated device has no history of its own; within a campaign it counts as one rig.
-    """
+    """Return the heat that the last run of the device or the campaign left in the coil, in A^2."""
+    # A simulated device has no history of its own; within a campaign it counts as one rig.
     config, info = each.loaded.config, each.loaded.device.info
     heat_a2 = heat_before(each.loaded, now_s)
     if config.limits.thermal_time_constant_s is None or not info.simulated or last is None:

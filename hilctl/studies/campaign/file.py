@@ -74,10 +74,8 @@ class CampaignFile(StrictModel):
     folder: str | None = None
 
 
-Point: TypeAlias = Mapping[str, Any]
-"""A value for each varied key."""
-Broken: TypeAlias = tuple[Loc, str, str, str]
-"""A broken rule: location, rule, value and hint."""
+Point: TypeAlias = Mapping[str, Any]  # A value for each varied key
+Broken: TypeAlias = tuple[Loc, str, str, str]  # A broken rule: location, rule, value and hint
 
 MOST_STEPS = 10_000
 
@@ -87,11 +85,7 @@ _DIGITS = 6  # of a value within a range
 
 
 def values_of(given: Any) -> tuple[Any, ...]:
-    """Return the values of a key: those of a list, or of a range ``first:last:count[log|lin]``.
-
-    Raises:
-        ValueError: It is neither; the text states the rule.
-    """
+    """Return the values of a list or a range; raise ValueError with the rule otherwise."""
     if isinstance(given, tuple):
         if not given:
             raise ValueError("must have at least one value")
@@ -116,10 +110,7 @@ def _rounded(values: Iterable[float]) -> tuple[float, ...]:
 def groups_of(
     vary: Mapping[str, Any] | Sequence[Mapping[str, Any]],
 ) -> tuple[list[list[Point]], list[Broken]]:
-    """Return the groups to cross, each a list of points, and the broken rules.
-
-    The keys of one mapping are crossed; the keys of each of several mappings vary together.
-    """
+    """Return the groups to cross, each a list of points, and the broken rules."""
     single = isinstance(vary, Mapping)
     written: list[tuple[Loc, Mapping[str, Any]]] = (
         [((), {key: given}) for key, given in vary.items()]
@@ -159,10 +150,7 @@ def groups_of(
 def points(
     groups: Sequence[Sequence[Point]], order: RunOrder, seed: int, repeat: int
 ) -> list[tuple[Point, int]]:
-    """Return every point in its order, with the number of its repeat, from 1.
-
-    The last of the crossed groups varies fastest.
-    """
+    """Return every point in order, the last group fastest, with its repeat from 1."""
     alternating = order == "alternating"
     row: list[Point] = [{}]
     for group in groups:

@@ -34,37 +34,23 @@ from hilctl.studies.multi_run.digest import RunDigest, RunFigures, digest_of
 
 @dataclass(frozen=True, slots=True)
 class FastTask:
-    """Input of one run.
+    """Input of one run."""
 
-    Attributes:
-        experiment: The experiment as YAML.
-        files: Texts of the files it uses, by absolute path.
-        folder: Folder that its file names are relative to.
-        heat_a2: Heat of the coil before it, in A^2.
-    """
-
-    experiment: str
-    files: Mapping[str, str]
-    folder: str
-    heat_a2: float
+    experiment: str  # the experiment as YAML
+    files: Mapping[str, str]  # texts of the files it uses, by absolute path
+    folder: str  # folder that its file names are relative to
+    heat_a2: float  # heat of the coil before it, in A^2
 
 
 @dataclass(frozen=True, slots=True)
 class FastRun:
-    """Outcome of one run.
+    """Outcome of one run."""
 
-    Attributes:
-        recording: Its recording as bytes; empty if it was refused.
-        code: ``completed``, ``fault`` or ``refused``.
-        harmless: Whether the next step may run.
-        digest: Data of its recording; None if it was not completed.
-    """
-
-    recording: bytes
-    code: str
+    recording: bytes  # its recording as bytes; empty if it was refused
+    code: str  # ``completed``, ``fault`` or ``refused``
     reason: str
-    harmless: bool
-    digest: RunDigest | None = None
+    harmless: bool  # whether the next step may run
+    digest: RunDigest | None = None  # data of its recording; None if it was not completed
 
 
 def run_task(task: FastTask) -> FastRun:
@@ -84,12 +70,7 @@ def run_task(task: FastTask) -> FastRun:
 
 
 def planned_fast(campaign: CampaignSteps, folder: Path) -> CampaignPlan:
-    """Return the plan of a campaign without real time.
-
-    Raises:
-        ConfigError: One or more steps are not allowed.
-        InputError: A device is not simulated.
-    """
+    """Return the plan of a campaign without real time; raise InputError for a real device."""
     plan = planned(campaign, folder, completed_runs(folder) if folder.is_dir() else {})
     for each in plan.steps:
         info = each.loaded.device.info
@@ -100,11 +81,7 @@ def planned_fast(campaign: CampaignSteps, folder: Path) -> CampaignPlan:
 
 
 def run_fast(plan: CampaignPlan, host: CampaignHost, scheduler: str = "none") -> CampaignResult:
-    """Run the remaining steps of a campaign as fast as possible.
-
-    Raises:
-        InputError: No disk space, the table can't be written, or the scheduler is unreachable.
-    """
+    """Run the remaining steps as fast as possible; raise InputError if the disk has no space."""
     plan.require_room()
     left = plan.left
     with streams(scheduler) as stream:

@@ -20,27 +20,17 @@ _NO_HEAT = RunHeat()
 
 @dataclass(frozen=True, slots=True)
 class PlannedStep:
-    """A step to run, or done already.
-
-    Attributes:
-        settings: All ``key=value`` texts over the base experiment.
-        key: Fingerprint of its experiment in a recording.
-        kept: Its recording, if it is done already.
-        heat: Heat of its current in the coil.
-        megabytes: Approximate size of its recording.
-        heat_a2: Heat of the coil before it, in A^2, if all steps run without interruption.
-        pause_s: Time for the coil to cool before it.
-    """
+    """A step to run, or done already."""
 
     step: CampaignStep
     loaded: LoadedExperiment
-    settings: tuple[str, ...]
-    key: RunKey
-    kept: Path | None = None
-    heat: RunHeat = _NO_HEAT
-    megabytes: float = 0.0
-    heat_a2: float = 0.0
-    pause_s: float = 0.0
+    settings: tuple[str, ...]  # all ``key=value`` texts over the base experiment
+    key: RunKey  # fingerprint of its experiment in a recording
+    kept: Path | None = None  # its recording, if it is done already
+    heat: RunHeat = _NO_HEAT  # heat of its current in the coil
+    megabytes: float = 0.0  # approximate size of its recording
+    heat_a2: float = 0.0  # heat of the coil before it, in A^2, if no step is interrupted
+    pause_s: float = 0.0  # time for the coil to cool before it
 
     @property
     def seconds(self) -> float:
@@ -88,17 +78,10 @@ def planned(
     completed: Mapping[RunKey, Sequence[Path]],
     heat_a2: float | None = None,
 ) -> CampaignPlan:
-    """Check and plan the remaining steps.
+    """Check and plan the remaining steps; raise ConfigError with all problems.
 
-    Args:
-        campaign: The campaign.
-        folder: Folder of the recordings.
-        completed: Completed recordings, in their order.
-        heat_a2: Heat of the coil before the first step, in A^2; None for steps without real time,
-            where kept steps heat the coil as well.
-
-    Raises:
-        ConfigError: One or more steps are not allowed; all problems are listed.
+    ``heat_a2`` is the heat of the coil before the first step, in A^2; None for steps without real
+    time, where kept steps heat the coil as well.
     """
     files, problems = TextFiles(), _Problems(campaign)
     left = {key: list(paths) for key, paths in completed.items()}

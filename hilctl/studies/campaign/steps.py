@@ -21,20 +21,13 @@ _SEEDS = 1_000_000
 
 @dataclass(frozen=True, slots=True)
 class CampaignStep:
-    """One run of a campaign.
+    """One run of a campaign."""
 
-    Attributes:
-        number: Its position, from 1.
-        point: A value for each varied key; empty for a reference run.
-        repeat: Number of the repeat or of the reference run, from 1.
-        settings: ``key=value`` texts over the base experiment.
-    """
-
-    number: int
-    point: Point
-    repeat: int
+    number: int  # its position, from 1
+    point: Point  # a value for each varied key; empty for a reference run
+    repeat: int  # number of the repeat or of the reference run, from 1
     is_reference: bool
-    settings: tuple[str, ...]
+    settings: tuple[str, ...]  # ``key=value`` texts over the base experiment
 
     @property
     def text(self) -> str:
@@ -45,38 +38,23 @@ class CampaignStep:
 
 @dataclass(frozen=True, slots=True)
 class CampaignSteps:
-    """A campaign file with its steps, not checked yet.
-
-    Attributes:
-        document: The file's YAML with the location of each value.
-        experiment: File of the base experiment.
-        settings: ``key=value`` texts over it from outside the campaign file.
-        keys: The varied keys.
-        steps: The steps in order.
-    """
+    """A campaign file with its steps, not checked yet."""
 
     config: CampaignFile
-    document: Document
-    experiment: Path
-    settings: tuple[str, ...]
-    keys: tuple[str, ...]
-    steps: tuple[CampaignStep, ...]
+    document: Document  # the file's YAML with the location of each value
+    experiment: Path  # file of the base experiment
+    settings: tuple[str, ...]  # ``key=value`` texts over it from outside the campaign file
+    keys: tuple[str, ...]  # the varied keys
+    steps: tuple[CampaignStep, ...]  # the steps in order
 
     def load(self, step: CampaignStep, files: TextFiles) -> LoadedExperiment:
-        """Return the experiment of a step.
-
-        Raises:
-            InputError: The experiment, or a file it uses, can't be read.
-            ConfigError: The experiment is invalid.
-        """
+        """Return the experiment of a step; raise InputError if it can't be read or is invalid."""
         document = load_document(self.experiment, files)
         return resolve(document, self.experiment.parent, self.settings_for(step, files), files)
 
     def settings_for(self, step: CampaignStep, files: TextFiles) -> list[str]:
-        """Return all ``key=value`` texts of a step, outermost last.
-
-        Each run of a simulated device gets its own, reproducible noise.
-        """
+        """Return all ``key=value`` texts of a step, outermost last."""
+        # Each run of a simulated device gets its own, reproducible noise.
         settings = [*self.settings, *step.settings]
         device = document_with(self.experiment, settings, files).data.get("device")
         kind = device.get("kind") if isinstance(device, dict) else None
@@ -101,11 +79,7 @@ def load_campaign(path: Path, settings: Sequence[str] = ()) -> CampaignSteps:
 
 
 def campaign_of(document: Document, folder: Path, settings: Sequence[str]) -> CampaignSteps:
-    """Return the campaign of a document whose experiment is relative to a folder.
-
-    Raises:
-        ConfigError: The file is invalid; all problems are listed.
-    """
+    """Return a document's campaign, relative to a folder; raise ConfigError with all problems."""
     config = document.validate(CampaignFile)
     groups, broken = groups_of(config.vary)
     keys = tuple(dict.fromkeys(key for group in groups for key in group[0]))

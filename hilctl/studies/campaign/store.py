@@ -23,11 +23,7 @@ _POLL_S = 0.1
 
 
 def campaign_folder(campaign: CampaignSteps) -> Path:
-    """Return the default folder of a campaign: from its file, or named after it.
-
-    Raises:
-        ConfigError: The base experiment can't be read or is invalid.
-    """
+    """Return the folder from the campaign's file, or one named after the campaign."""
     config = campaign.config
     if config.folder is not None:
         return Path(config.folder)
@@ -47,11 +43,7 @@ def campaign_folder(campaign: CampaignSteps) -> Path:
 def locked_folder(
     folder: Path, sleep_s: Callable[[float], None], wait_s: float = 5.0
 ) -> Iterator[None]:
-    """Create a campaign's folder, and lock it against other campaigns.
-
-    Raises:
-        InputError: The folder can't be created, or another campaign uses it.
-    """
+    """Create and lock a campaign's folder; raise InputError if another campaign uses it."""
     made = [each for each in (folder, *folder.parents) if not each.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)

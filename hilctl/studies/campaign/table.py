@@ -29,20 +29,13 @@ from hilctl.studies.multi_run.varied_parameter import short_value
 
 @dataclass(frozen=True, slots=True)
 class CampaignRow:
-    """Outcome of a step.
+    """Outcome of a step."""
 
-    Attributes:
-        result: ``planned``, ``completed``, or code and reason.
-        recording: Name of its recording in the campaign's folder, or empty.
-        code: ``planned``, ``completed``, ``refused``, ``fault`` or ``stopped``.
-        kept: Whether it was done already.
-    """
-
-    result: str = PLANNED
+    result: str = PLANNED  # ``planned``, ``completed``, or code and reason
     figures: RunFigures = RunFigures()  # noqa: RUF009  frozen
-    recording: str = ""
-    code: str = PLANNED
-    kept: bool = False
+    recording: str = ""  # name of its recording in the campaign's folder, or empty
+    code: str = PLANNED  # ``planned``, ``completed``, ``refused``, ``fault`` or ``stopped``
+    kept: bool = False  # whether it was done already
     digest: RunDigest | None = field(default=None, compare=False, repr=False)
 
 
@@ -84,11 +77,7 @@ def ordered(
 
 
 def write_table(plan: CampaignPlan, rows: Mapping[int, CampaignRow]) -> list[Path]:
-    """Write the table atomically as CSV and, if pyarrow is installed, as Parquet.
-
-    Raises:
-        InputError: A file can't be written.
-    """
+    """Write the table atomically as CSV and, if pyarrow is installed, as Parquet."""
     table = columns_of(plan.campaign.keys, ordered(plan, rows))
     config, experiment = plan.campaign.config, str(plan.campaign.experiment)
     facts = {"campaign": config.name, "description": config.description, "experiment": experiment}

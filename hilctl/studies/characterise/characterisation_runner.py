@@ -6,7 +6,7 @@ from functools import cached_property
 from pathlib import Path
 
 from hilctl.base.errors import DataError, InputError, RunError
-from hilctl.base.files import check_writable, write_text
+from hilctl.base.files import check_writable, make_folder, write_text
 from hilctl.base.types import F64, CommandUnit
 from hilctl.experiment.coil_heat import CoolingCoil, RunHeat
 from hilctl.experiment.device_state import heat_before
@@ -72,18 +72,12 @@ _NAME_LENGTH = 80
 
 @dataclass(frozen=True, slots=True)
 class CharacterisationPlan:
-    """Plan of a characterisation, at full amplitude.
-
-    Attributes:
-        steps: Its steps; most polarity and response steps are skipped in the end.
-        pauses_s: Time for the coil to cool.
-        free_mb: Free disk space.
-    """
+    """Plan of a characterisation, at full amplitude."""
 
     limits: CharacterisationLimits
-    steps: tuple[StepRow, ...]
-    pauses_s: float
-    free_mb: float
+    steps: tuple[StepRow, ...]  # its steps; most polarity and response steps are skipped in the end
+    pauses_s: float  # time for the coil to cool
+    free_mb: float  # free disk space
 
     @property
     def seconds(self) -> float:
@@ -98,24 +92,13 @@ class CharacterisationPlan:
 
 @dataclass(frozen=True, slots=True)
 class CharacterisationHost(StudyHost):
-    """Runs, time and observers of a characterisation.
+    """Runs, time and observers of a characterisation."""
 
-    Attributes:
-        on_step: Called with each finished step.
-    """
-
-    on_step: Callable[[StepRow], None] = field(default=lambda row: None)
+    on_step: Callable[[StepRow], None] = field(default=lambda row: None)  # after each step
 
 
 class CharacterisationRunner:
     """Characterise the device of an experiment; its waveform and compensator are not used.
-
-    Args:
-        experiment: Experiment file.
-        settings: ``key=value`` texts over it.
-        folder: Folder of the recordings.
-        highest_hz: Highest frequency of loops; derived from the sample rate if None.
-        host: Runs and observers.
 
     Raises:
         InputError: The experiment is invalid, or a real device is to run without real time.
@@ -126,7 +109,7 @@ class CharacterisationRunner:
         experiment: Path,
         settings: Sequence[str],
         folder: Path,
-        highest_hz: float | None = None,
+        highest_hz: float | None = None,  # of loops; derived from the sample rate if None
         host: CharacterisationHost | None = None,
     ) -> None:
         self._experiment = experiment
@@ -191,10 +174,7 @@ class CharacterisationRunner:
         """
         check_writable(output, overwrite=overwrite)
         require_room(self._folder, self.plan.megabytes, self.plan.free_mb)
-        try:
-            self._folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(f"{self._folder}: can't be created: {error.strerror}") from None
+        make_folder(self._folder)
         result = Characterisation(
             experiment=self._loaded.config.name,
             device=self._loaded.device.info.name,

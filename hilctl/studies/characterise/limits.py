@@ -24,27 +24,17 @@ _OF_HEAT = 0.9
 
 @dataclass(frozen=True, slots=True)
 class CharacterisationLimits:
-    """Limits of a characterisation, in the command's unit.
+    """Limits of a characterisation, in the command's unit."""
 
-    Attributes:
-        loaded: The experiment.
-        low: Lowest command.
-        high: Highest command.
-        rest: Safe value, where each run starts and ends.
-        stroke_um: Allowed range of displacement.
-        lowest_hz: Lowest frequency of loops.
-        highest_hz: Highest frequency of loops.
-    """
-
-    loaded: LoadedExperiment
+    loaded: LoadedExperiment  # the experiment
     unit: CommandUnit
-    low: float
-    high: float
-    rest: float
-    stroke_um: tuple[float, float]
+    low: float  # lowest command
+    high: float  # highest command
+    rest: float  # safe value, where each run starts and ends
+    stroke_um: tuple[float, float]  # allowed range of displacement
     sample_rate_hz: float
-    lowest_hz: float
-    highest_hz: float
+    lowest_hz: float  # lowest frequency of loops
+    highest_hz: float  # highest frequency of loops
 
     @property
     def centre(self) -> float:
@@ -86,10 +76,7 @@ class CharacterisationLimits:
         return math.pi * travel / (2.0 * _OF_SLEW_TO_START * self.loaded.config.limits.slew_per_s)
 
     def scale(self, values: F64) -> float:
-        """Return the factor, at most 1, that keeps all commands of a run within slew and heat.
-
-        It leaves a margin to both limits.
-        """
+        """Return the factor, <= 1, that keeps commands within slew and heat with a margin."""
         config = self.loaded.config
         figures = CommandFigures(config, self.rest, self.rest**2)
         figures.add(values)
@@ -103,11 +90,7 @@ class CharacterisationLimits:
 
 
 def limits_of(loaded: LoadedExperiment, highest_hz: float | None = None) -> CharacterisationLimits:
-    """Return the limits of a characterisation.
-
-    The highest frequency of loops is derived from the sample rate if None. Raise InputError if it
-    has too few samples per cycle.
-    """
+    """Return the limits; ``highest_hz`` follows from the sample rate if None."""
     config = loaded.config
     rate_hz = config.sample_rate_hz
     most_hz = rate_hz / _FEWEST_SAMPLES

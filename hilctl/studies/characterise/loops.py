@@ -28,30 +28,18 @@ _SHAPE_HARMONICS = 12
 
 @dataclass(frozen=True, slots=True)
 class LoopFigures:
-    """One steady loop.
+    """One steady loop."""
 
-    Attributes:
-        label: Label of the segment.
-        amplitude: Half the peak-to-peak command.
-        bias: Mid-range of the command.
-        low_um: Lowest displacement of the average cycle.
-        high_um: Highest.
-        hysteresis_percent: Peak hysteresis; None if the loop has no two branches.
-        scatter_percent: rms difference of cycles beyond noise, of the peak-to-peak.
-        command: float64[m], the average cycle's command.
-        displacement_um: float64[m], its displacement.
-    """
-
-    label: str
-    amplitude: float
-    bias: float
+    label: str  # label of the segment
+    amplitude: float  # half the peak-to-peak command
+    bias: float  # mid-range of the command
     frequency_hz: float
-    low_um: float
-    high_um: float
-    hysteresis_percent: float | None
-    scatter_percent: float
-    command: F64
-    displacement_um: F64
+    low_um: float  # lowest displacement of the average cycle
+    high_um: float  # highest
+    hysteresis_percent: float | None  # peak hysteresis; None if the loop has no two branches
+    scatter_percent: float  # rms difference of cycles beyond noise, of the peak-to-peak
+    command: F64  # float64[m], the average cycle's command
+    displacement_um: F64  # float64[m], its displacement
 
     @property
     def peak_to_peak_um(self) -> float:
@@ -118,11 +106,8 @@ def _refuse_saturated(displacement_um: F64, label: str) -> None:
 def next_amplitude(
     loops: Sequence[LoopFigures], wanted: float, stroke_um: tuple[float, float]
 ) -> float | None:
-    """Return the amplitude of the next growing loop: the wanted one, lowered to the stroke.
-
-    In most actuators displacement grows faster than the command. The exponent is estimated from the
-    last two loops. None if the amplitude is hardly larger than the last one.
-    """
+    """Return the wanted amplitude, lowered to the stroke; None if it is hardly a change."""
+    # Displacement grows faster than the command: the last two loops give the exponent.
     if not loops:
         return wanted
     last = loops[-1]
@@ -145,17 +130,11 @@ def next_amplitude(
 
 @dataclass(frozen=True, slots=True)
 class Repeatability:
-    """Change of a loop that is measured twice.
+    """Change of a loop that is measured twice."""
 
-    Attributes:
-        shape_percent: Largest difference without the means, of the peak-to-peak.
-        shift_um: Change of the mean.
-        shift_percent: The same, of the peak-to-peak.
-    """
-
-    shape_percent: float
-    shift_um: float
-    shift_percent: float
+    shape_percent: float  # largest difference without the means, of the peak-to-peak
+    shift_um: float  # change of the mean
+    shift_percent: float  # the same, of the peak-to-peak
 
 
 def repeatability(first: LoopFigures, again: LoopFigures) -> Repeatability:
@@ -176,20 +155,12 @@ def repeatability(first: LoopFigures, again: LoopFigures) -> Repeatability:
 
 @dataclass(frozen=True, slots=True)
 class ReversalCurves:
-    """First-order reversal curves.
+    """First-order reversal curves."""
 
-    Attributes:
-        turns: Commands of the turning points, the highest first.
-        curves: Command and displacement of each, float64[2, n], from its turn up to the top.
-        return_um: rms difference of displacement at the top between curves; zero with
-            return-point memory.
-        return_percent: The same, of the span of the curves.
-    """
-
-    turns: tuple[float, ...]
-    curves: tuple[F64, ...]
-    return_um: float
-    return_percent: float
+    turns: tuple[float, ...]  # commands of the turning points, the highest first
+    curves: tuple[F64, ...]  # command and displacement from the turn to the top, float64[2, n]
+    return_um: float  # rms difference at the top between curves
+    return_percent: float  # the same, of the span of the curves
 
 
 def reversal_curves(recording: Recording) -> ReversalCurves:

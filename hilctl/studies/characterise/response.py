@@ -1,8 +1,4 @@
-"""Noise at rest, first reaction and small-signal response; problems of the rig.
-
-The small-signal response is measured with a multisine of small amplitude. The scatter between its
-periods is the noise of each line. A gain, a delay, a lag and a resonance are fitted to it.
-"""
+"""Noise at rest, first reaction and small-signal response; problems of the rig."""
 
 import math
 from dataclasses import dataclass
@@ -55,22 +51,14 @@ _LOG_LOW = math.log(1e-9)
 
 @dataclass(frozen=True, slots=True)
 class RestNoise:
-    """Sensor signal at rest.
-
-    Attributes:
-        noise_um: rms about the linear trend.
-        span_um: Range of the readings.
-        drift_um_per_s: Slope of the linear trend.
-        line_hz: Frequency of the strongest spectral line.
-        line_um: Its amplitude.
-    """
+    """Sensor signal at rest."""
 
     mean_um: float
-    noise_um: float
-    span_um: float
-    drift_um_per_s: float
-    line_hz: float
-    line_um: float
+    noise_um: float  # rms about the linear trend
+    span_um: float  # range of the readings
+    drift_um_per_s: float  # slope of the linear trend
+    line_hz: float  # frequency of the strongest spectral line
+    line_um: float  # its amplitude
 
 
 def rest_noise(recording: Recording) -> RestNoise:
@@ -98,10 +86,7 @@ def rest_noise(recording: Recording) -> RestNoise:
 
 
 def crept_percent(recording: Recording) -> tuple[float, ...]:
-    """Return the creep in each long hold, in percent of the displacement from the start.
-
-    Creep counts from 0.1 s after the preceding motion. Holds at the initial command are omitted.
-    """
+    """Return the creep from 0.1 s on in each long hold off the initial command, in percent."""
     segment = recording.segments[-1]
     samples = recording.samples.part(segment.start, segment.stop)
     command, part = samples.command, round(_MEAN_S * recording.sample_rate_hz)
@@ -122,25 +107,15 @@ def crept_percent(recording: Recording) -> tuple[float, ...]:
 
 @dataclass(frozen=True, slots=True)
 class StepResponseCheck:
-    """Response of the displacement to a sine.
-
-    Attributes:
-        amplitude: Amplitude of the sine, in the command's unit.
-        gain_um: Gain in um per command unit; negative if the displacement falls as the command
-            rises.
-        angle_deg: Phase lag of the displacement, from -180 to 180.
-        doubt_um: Standard error of the gain, in the same unit.
-        second_um: Amplitude at twice the frequency, in um.
-        motion_um: Amplitude at the frequency, in um.
-    """
+    """Response of the displacement to a sine."""
 
     frequency_hz: float
-    amplitude: float
-    gain_um: float
-    angle_deg: float
-    doubt_um: float
-    second_um: float
-    motion_um: float
+    amplitude: float  # amplitude of the sine, in the command's unit
+    gain_um: float  # per command unit; negative if the displacement falls as the command rises
+    angle_deg: float  # phase lag of the displacement, from -180 to 180
+    doubt_um: float  # standard error of the gain, in the same unit
+    second_um: float  # amplitude at twice the frequency, in um
+    motion_um: float  # amplitude at the frequency, in um
 
     @property
     def clear(self) -> bool:
@@ -212,33 +187,19 @@ def without_gaps(recording: Recording, start: int, stop: int) -> tuple[F64, F64]
 
 @dataclass(frozen=True, slots=True)
 class SmallSignal:
-    """Small-signal response.
+    """Small-signal response."""
 
-    Attributes:
-        frequency_hz: float64[k], the lines.
-        response: complex128[k], displacement over command, um per command unit.
-        noise: float64[k], standard deviation of each.
-        amplitude: Peak of the multisine.
-        gain_um: Gain at low frequencies, um per command unit.
-        delay_s: Transport delay, including the half sample of the output's hold.
-        lag_s: Time constant of a first-order lag; 0 for none.
-        natural_hz: Natural frequency; None without a resonance.
-        damping_ratio: Its damping ratio; None without a resonance.
-        misfit_percent: rms residual of the fit, of the gain.
-        fitted: complex128[k], the fitted response.
-    """
-
-    frequency_hz: F64
-    response: C128
-    noise: F64
-    amplitude: float
-    gain_um: float
-    delay_s: float
-    lag_s: float
-    natural_hz: float | None
-    damping_ratio: float | None
-    misfit_percent: float
-    fitted: C128
+    frequency_hz: F64  # float64[k], the lines
+    response: C128  # complex128[k], displacement over command, um per command unit
+    noise: F64  # float64[k], standard deviation of each
+    amplitude: float  # peak of the multisine
+    gain_um: float  # gain at low frequencies, um per command unit
+    delay_s: float  # transport delay, including the half sample of the output's hold
+    lag_s: float  # time constant of a first-order lag; 0 for none
+    natural_hz: float | None  # natural frequency; None without a resonance
+    damping_ratio: float | None  # its damping ratio; None without a resonance
+    misfit_percent: float  # rms residual of the fit, of the gain
+    fitted: C128  # complex128[k], the fitted response
 
     def size_at(self, frequency_hz: float) -> float:
         """Return the fitted magnitude at a frequency, over that at the lowest line."""
@@ -247,10 +208,7 @@ class SmallSignal:
 
 
 def small_signal(recording: Recording) -> SmallSignal:
-    """Evaluate a recording of one multisine whose period is a whole number of samples.
-
-    Raise RigProblemError if too few lines are above the noise.
-    """
+    """Evaluate one multisine; raise RigProblemError if too few lines are above the noise."""
     frequency_hz, response, noise, amplitude = _lines(recording)
     usable = noise < _USABLE * np.abs(response)
     if np.count_nonzero(usable) < _FEWEST_LINES:

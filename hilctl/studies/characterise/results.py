@@ -29,29 +29,18 @@ from hilctl.studies.characterise.response import (
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """Measurements of the steps so far; None or empty if not measured yet.
-
-    Attributes:
-        reaction: First reaction and its polarity.
-        small: Small-signal response.
-        growing: Loops of growing amplitude.
-        slow: Loops at the lowest frequency.
-        fast: Loops at several frequencies.
-        biased: Small loops over the whole range.
-        crept_percent: Creep in each hold, of the displacement.
-        repeated: Change of the largest growing loop at the end.
-    """
+    """Measurements of the steps so far; None or empty if not measured yet."""
 
     rest: RestNoise | None = None
-    reaction: StepResponseCheck | None = None
-    small: SmallSignal | None = None
-    growing: tuple[LoopFigures, ...] = ()
-    slow: tuple[LoopFigures, ...] = ()
-    fast: tuple[LoopFigures, ...] = ()
+    reaction: StepResponseCheck | None = None  # first reaction and its polarity
+    small: SmallSignal | None = None  # small-signal response
+    growing: tuple[LoopFigures, ...] = ()  # loops of growing amplitude
+    slow: tuple[LoopFigures, ...] = ()  # loops at the lowest frequency
+    fast: tuple[LoopFigures, ...] = ()  # loops at several frequencies
     reversal: ReversalCurves | None = None
-    biased: tuple[LoopFigures, ...] = ()
-    crept_percent: tuple[float, ...] = ()
-    repeated: Repeatability | None = None
+    biased: tuple[LoopFigures, ...] = ()  # small loops over the whole range
+    crept_percent: tuple[float, ...] = ()  # creep in each hold, of the displacement
+    repeated: Repeatability | None = None  # change of the largest growing loop at the end
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values without signals."""
@@ -60,48 +49,29 @@ class Measured:
 
 @dataclass(frozen=True, slots=True)
 class ValidationReference:
-    """Error of the model on a reference that was not used in any fit.
+    """Error of the model on a reference that was not used in any fit."""
 
-    Attributes:
-        label: Name of the reference.
-        peak_percent: Largest error, in percent of the displacement's peak-to-peak.
-        rms_percent: Its root mean square.
-        mean_percent: Its mean.
-        floor_percent: Largest error expected from sensor noise alone.
-        time_s: float64[n], time of the evaluated samples.
-        measured_um: float64[n], their displacement.
-        modelled_um: float64[n], the model's.
-    """
-
-    label: str
-    peak_percent: float
-    rms_percent: float
-    mean_percent: float
-    floor_percent: float
-    time_s: F64
-    measured_um: F64
-    modelled_um: F64
+    label: str  # name of the reference
+    peak_percent: float  # largest error, in percent of the displacement's peak-to-peak
+    rms_percent: float  # its root mean square
+    mean_percent: float  # its mean
+    floor_percent: float  # largest error expected from sensor noise alone
+    time_s: F64  # float64[n], time of the evaluated samples
+    measured_um: F64  # float64[n], their displacement
+    modelled_um: F64  # float64[n], the model's
 
 
 @dataclass(frozen=True, slots=True)
 class StepRow:
-    """One step of the plan or the result.
-
-    Attributes:
-        seconds: Rig time.
-        megabytes: Approximate size of its recording.
-        text: Summary of its result; empty before the run.
-        recording: Its recording; empty if it was not run.
-        kept: Whether the recording existed already.
-    """
+    """One step of the plan or the result."""
 
     name: str
     purpose: str
-    seconds: float
-    megabytes: float
-    text: str = ""
-    recording: str = ""
-    kept: bool = False
+    seconds: float  # rig time
+    megabytes: float  # approximate size of its recording
+    text: str = ""  # summary of its result; empty before the run
+    recording: str = ""  # its recording; empty if it was not run
+    kept: bool = False  # whether the recording existed already
 
 
 @shown_briefly
@@ -131,11 +101,8 @@ class Characterisation:
 
     @property
     def verdict(self) -> Verdict | None:
-        """Verdict on the model; None without one.
-
-        A rejection by the identification is final. Otherwise the error on the random reference
-        decides: it resembles a run more closely than held-out loops.
-        """
+        """Verdict on the model; None without one."""
+        # The random reference resembles a run more closely than held-out loops.
         if self.identification is None or not self.held_out:
             return None
         known, first = self.identification.verdict, self.held_out[0]
@@ -205,13 +172,8 @@ VALIDATED: Mapping[str, str] = {
 
 
 def identified(recordings: Mapping[str, Path]) -> Identification:
-    """Select the kind of model and identify it from complete histories.
-
-    Small loops depend on the history of the actuator, which steady loops do not contain.
-
-    Raises:
-        InputError: No model can be identified from the recordings.
-    """
+    """Identify a model from complete histories; raise InputError if none can be identified."""
+    # Small loops depend on the history of the actuator, which steady loops do not contain.
     fitted = parallel_map(read, [p for name, p in recordings.items() if name in FITTED])
     with workers("threads") as run:
         return identify_records(
@@ -245,11 +207,7 @@ def validated(
 def validate(
     model: HysteresisModel, recording: Recording, noise_um: float, label: str
 ) -> ValidationReference:
-    """Validate a model on a recording that starts with a conditioning cycle.
-
-    The model runs through the complete recording. The waveforms after the first are evaluated at
-    full amplitude, within the input range of the model.
-    """
+    """Validate a model on a recording that starts with a conditioning cycle."""
     parts = recording.segments[1:]
     stop = parts[-1].steady_stop
     command, measured_um = without_gaps(recording, 0, stop)

@@ -107,10 +107,7 @@ def reversal_figure(found: ReversalCurves, unit: str) -> Figure:
 
 @mpl.rc_context(STYLE)
 def held_out_figure(found: ValidationReference, *, close: bool) -> Figure:
-    """Plot measured and modelled displacement over time, and the error.
-
-    A close figure has the displacements about the largest error only.
-    """
+    """Plot displacements and error over time; a close figure shows the largest error only."""
     figure = Figure(figsize=(_WIDTH, 4.6))
     upper, lower = figure.subplots(2, 1, height_ratios=[2.0, 1.0])
     time_s, measured_um, modelled_um = _with_gaps(found)
@@ -198,11 +195,7 @@ def _measured_rows(measured: Measured, unit: str) -> Iterator[tuple[str, str]]:
 
 
 def write_characterisation(found: Characterisation, path: Path) -> None:
-    """Write the page, replacing an existing file.
-
-    Raises:
-        InputError: The file can't be written.
-    """
+    """Write the page, replacing an existing file."""
     html.write_page(characterisation_page(found), path)
 
 

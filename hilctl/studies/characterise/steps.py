@@ -46,18 +46,12 @@ Evaluate: TypeAlias = Callable[[Recording, Limits, Measured], Evaluated]
 
 @dataclass(frozen=True, slots=True)
 class CharacterisationStep:
-    """One run.
+    """One run."""
 
-    Attributes:
-        name: Name of the step and of its recording.
-        waveform: Returns the keys of its waveform; None if the step is not needed.
-        take: Evaluates its recording; returns all measurements so far, and a summary line.
-    """
-
-    name: str
+    name: str  # name of the step and of its recording
     purpose: str
-    waveform: Waveform
-    take: Evaluate
+    waveform: Waveform  # returns the keys of its waveform; None if the step is not needed
+    take: Evaluate  # evaluates its recording; returns all measurements so far, and a summary line
 
 
 def full_amplitude(limits: Limits, measured: Measured) -> float:

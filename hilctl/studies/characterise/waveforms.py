@@ -1,7 +1,4 @@
-"""Waveforms of the steps, as keys of an experiment.
-
-Every part starts and ends at rest, so that parts may be in any order.
-"""
+"""Waveforms of the steps, as keys of an experiment; every part starts and ends at rest."""
 
 import json
 import math
@@ -84,11 +81,8 @@ def sine(
     offset: float | None = None,
     soft: float = 2.0,
 ) -> Keys:
-    """Return a sine with soft ends; its amplitude is lowered to the slew limit.
-
-    It has ``cycles`` at full amplitude about the centre of the range, or another offset. ``soft``
-    is the number of cycles of the soft start; the soft end is half as long.
-    """
+    """Return a sine with soft ends; its amplitude is lowered to the slew limit."""
+    # ``soft`` cycles precede the ``cycles`` of full amplitude; the soft end is half as long.
     keys = {
         "kind": "sine",
         "unit": limits.unit,
@@ -234,10 +228,8 @@ def _random_part(
 
 
 def small_motions(limits: CharacterisationLimits, amplitude: float) -> Keys:
-    """Return small aperiodic motions of two sizes over the whole range, after conditioning.
-
-    They identify what large loops do not excite, especially near the ends of the range.
-    """
+    """Return small aperiodic motions of two sizes over the whole range, after conditioning."""
+    # They identify what large loops do not excite, especially near the ends of the range.
     parts = (
         _random_part(limits, size * amplitude, seed, 0.5 * RANDOM_S, limits.centre + at * amplitude)
         for seed, (at, size) in enumerate(_SMALL, TRAINING_SEED + 1)

@@ -32,36 +32,25 @@ from hilctl.studies.multi_run.varied_parameter import (
 )
 
 STEP, REPEAT, REFERENCE = "step", "repeat", "reference_run"
-FIRST = (STEP, REPEAT, REFERENCE)
-"""Columns before the varied keys."""
+FIRST = (STEP, REPEAT, REFERENCE)  # columns before the varied keys
 RESULT, RECORDING = "result", "recording"
-LAST = (RESULT, RECORDING)
-"""Columns after the metrics."""
+LAST = (RESULT, RECORDING)  # columns after the metrics
 COMPLETED = "completed"
 PLANNED = "planned"
 
 
 @dataclass(frozen=True, slots=True)
 class SeriesRun:
-    """One run of several.
+    """One run of several."""
 
-    Attributes:
-        number: Its position, from 1.
-        is_reference: Whether it is a reference run of a campaign.
-        values: Value of each varied key, as a number or short text.
-        result: ``completed``, ``planned``, or code and reason.
-        recording: Name of its recording, or empty.
-        repeat: Number of the repeat or of the reference run.
-    """
-
-    number: int
-    is_reference: bool
-    values: Mapping[str, Hashable]
+    number: int  # its position, from 1
+    is_reference: bool  # whether it is a reference run of a campaign
+    values: Mapping[str, Hashable]  # value of each varied key, as a number or short text
     figures: RunFigures
-    result: str
-    recording: str
+    result: str  # ``completed``, ``planned``, or code and reason
+    recording: str  # name of its recording, or empty
     digest: RunDigest | None = None
-    repeat: int = 1
+    repeat: int = 1  # number of the repeat or of the reference run
 
     @property
     def completed(self) -> bool:
@@ -132,11 +121,9 @@ def plain_value(text: str) -> Any:
         return text
 
 
-OnRead = Callable[[float, str], None]
-"""Called with progress from 0 to 1 and a description."""
+OnRead = Callable[[float, str], None]  # called with progress from 0 to 1 and a description
 
-MOST_BYTES = 512 << 20
-"""Largest recording to read; it takes about eight times as much memory."""
+MOST_BYTES = 512 << 20  # largest recording to read; it takes about eight times as much memory
 
 
 @dataclass(frozen=True)

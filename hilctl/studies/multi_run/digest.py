@@ -1,7 +1,7 @@
 """Metrics of one run, and its data for figures; drift of reference runs."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -159,23 +159,12 @@ def _after_step(recording: Recording, waveform: Step) -> Samples:
 
 @dataclass(frozen=True, slots=True)
 class SeriesDrift:
-    """Largest change of the reference runs from the first of them, with its sign.
+    """Largest change of the reference runs from the first of them, with its sign."""
 
-    Attributes:
-        runs: Number of completed reference runs.
-        peak_to_peak_percent: Change of the peak-to-peak displacement, in percent of it.
-        mean_um: Change of the mean displacement.
-        peak_hysteresis_percent: Change of the peak hysteresis, in points of percent.
-    """
-
-    runs: int
-    peak_to_peak_percent: float | None
-    mean_um: float | None
-    peak_hysteresis_percent: float | None
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Return the fields as plain values."""
-        return asdict(self)
+    runs: int  # number of completed reference runs
+    peak_to_peak_percent: float | None  # change of the peak-to-peak displacement, in percent of it
+    mean_um: float | None  # change of the mean displacement
+    peak_hysteresis_percent: float | None  # change of the peak hysteresis, in points of percent
 
     def __str__(self) -> str:
         parts = [
@@ -203,8 +192,7 @@ def drift_of(done: Sequence[RunFigures]) -> SeriesDrift | None:
     return SeriesDrift(len(done), percent, largest("mean_um"), largest("peak_hysteresis_percent"))
 
 
-POINTS = 300
-"""Points per loop."""
+POINTS = 300  # points per loop
 
 _STEP_POINTS = 800
 _STEP_CYCLES = 12.0  # of the ringing
@@ -213,43 +201,31 @@ _NO_LOOP = np.empty((2, 0))
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunDigest:
-    """Data of one run, a few kilobytes for a run of any length.
-
-    Attributes:
-        started: When it began, ISO 8601.
-        code: ``completed``, ``stopped`` or ``fault``; empty if no end was recorded.
-        reason: Why it ended.
-        values: Its experiment as plain values, nested as in the file.
-        waveform: Label of the evaluated segment.
-        loop: float64[2, m], input and displacement of the evaluated loop, closed; see
-            :class:`hilctl.analysis.steady_state.SteadyPart`. Empty without a cycle.
-        error_um: float64[2, m], phase in cycles and error in um; empty without a reference.
-        modelled: float64[3, m], command, measured and modelled displacement over one cycle; empty
-            without a model.
-        model_error_percent: Largest model error, of the peak-to-peak; None without a model.
-        step: float64[2, k], time in s and displacement in um after the largest step, or empty.
-        response: Small-signal response, or None.
-    """
+    """Data of one run, a few kilobytes for a run of any length."""
 
     name: str
     path: str
-    started: str
+    started: str  # when it began, ISO 8601
     labels: Mapping[str, LabelValue]
     device: str
     simulated: bool
-    code: str
-    reason: str
-    values: Mapping[str, Any]
+    code: str  # ``completed``, ``stopped`` or ``fault``; empty if no end was recorded
+    reason: str  # why it ended
+    values: Mapping[str, Any]  # its experiment as plain values, nested as in the file
     compensated: bool
     command_unit: str
-    waveform: str
+    waveform: str  # label of the evaluated segment
     figures: RunFigures
+    # float64[2, m], input and displacement, closed; empty without a cycle
     loop: F64 = field(default_factory=_NO_LOOP.copy)
+    # float64[2, m], phase in cycles and error in um, or empty
     error_um: F64 = field(default_factory=_NO_LOOP.copy)
+    # float64[3, m], command, measured and modelled um over a cycle, or empty
     modelled: F64 = field(default_factory=lambda: np.empty((3, 0)))
-    model_error_percent: float | None = None
+    model_error_percent: float | None = None  # largest, of the peak-to-peak; None without a model
+    # float64[2, k], time in s and um after the largest step, or empty
     step: F64 = field(default_factory=_NO_LOOP.copy)
-    response: SmallSignal | None = None
+    response: SmallSignal | None = None  # small-signal response, or None
 
     @property
     def is_plain_loop(self) -> bool:
@@ -258,11 +234,7 @@ class RunDigest:
 
 
 def digest_of(recording: Recording, model: HysteresisModel | None = None) -> RunDigest:
-    """Return the digest of a recording, compared with a model, the recorded one if None.
-
-    Raises:
-        DataError: A metadata value is not a number.
-    """
+    """Return the digest of a recording, compared with a model, the recorded one if None."""
     values = _experiment(recording)
     waveform = _waveform(values)
     structure = _structure(recording, waveform)

@@ -18,18 +18,12 @@ _FEWEST = 8
 
 @dataclass(frozen=True, slots=True)
 class MinorLoop:
-    """One minor loop.
+    """One minor loop."""
 
-    Attributes:
-        middle: Mid-range of its input, in the input's unit.
-        span: Peak-to-peak input.
-        peak_hysteresis_percent: Largest distance between its branches, of its peak-to-peak.
-    """
-
-    middle: float
-    span: float
+    middle: float  # mid-range of its input, in the input's unit
+    span: float  # peak-to-peak input
     peak_to_peak_um: float
-    peak_hysteresis_percent: float
+    peak_hysteresis_percent: float  # largest distance between its branches, of its peak-to-peak
 
 
 def minor_loops(loop_input: F64, output_um: F64) -> tuple[MinorLoop, ...]:
@@ -70,10 +64,7 @@ def _turns(u: F64, least: float) -> list[int]:
 
 
 def _closed(u: F64, turns: list[int]) -> list[tuple[int, int, int]]:
-    """Return the start, turning point and end of each minor loop.
-
-    The cycle starts and ends at its highest input, so that all minor loops are closed.
-    """
+    """Return start, turning point and end of each minor loop of a cycle from its highest input."""
     found = []
     stack: list[int] = []
     for turn in turns:

@@ -28,18 +28,13 @@ from hilctl.studies.multi_run.trend import (
 )
 from hilctl.studies.multi_run.varied_parameter import texts_of
 
-MOST_ROWS = 1000
-"""Most rows of the table on a page."""
+MOST_ROWS = 1000  # most rows of the table on a page
 
 _COLUMNS = (STROKE, HYSTERESIS, AREA, PEAK_ERROR, RMS_ERROR, MODEL_ERROR, NATURAL, DAMPING)
 
 
 def write_series(series: RunSeries, path: Path) -> None:
-    """Write the page atomically, replacing an existing file.
-
-    Raises:
-        InputError: The file can't be written.
-    """
+    """Write the page atomically, replacing an existing file."""
     html.write_page(series_page(series), path)
 
 
@@ -77,10 +72,7 @@ def _simulated(series: RunSeries) -> Iterator[str]:
 def run_table(
     series: RunSeries, most: int, *, short: bool = False
 ) -> tuple[list[str], list[list[str]]]:
-    """Return headings and rows of a table of runs, without empty columns.
-
-    A short table, for a terminal, has short headings and no file names.
-    """
+    """Return headings and rows of a table without empty columns; a short one fits a terminal."""
     figures = [each for each in _COLUMNS if each.of(series.runs)]
     headings = ["run", *(each.axis for each in series.dimensions)]
     headings += [each.short if short else axis_name(series, each) for each in figures]
@@ -193,7 +185,7 @@ def series_mapping(series: RunSeries) -> dict[str, Any]:
         "failed": [run.number for run in series.failed],
         "not_read": list(series.missing),
         "trends": [trend.to_mapping() for trend in fitted_trends(series)],
-        "drift": series.drift.to_mapping() if series.drift else None,
+        "drift": asdict(series.drift) if series.drift else None,
     }
 
 

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from hilctl.analysis.figure_layout import ColumnWidth, FigureSpec, Panel, drawn, write_figure
 from hilctl.analysis.plot_style import COMMAND, DISPLACEMENT, ERROR, MARK, QUIET
 from hilctl.base.errors import InputError
-from hilctl.base.files import already_there
+from hilctl.base.files import already_there, make_folder
 from hilctl.base.formatting import unit_text
 from hilctl.studies.multi_run.collect import OnRead, RunSeries, SeriesRun
 from hilctl.studies.multi_run.run_plots import (
@@ -58,10 +58,8 @@ _MOST_BARS = 12
 
 
 def trend_sheets(series: RunSeries) -> Iterator[FigureSpec]:
-    """Yield metrics against each numeric parameter, with linear fits against frequency.
-
-    Stroke and area are plotted for runs without a compensator: with one, they follow the reference.
-    """
+    """Yield metrics against each numeric parameter, with linear fits against frequency."""
+    # With a compensator, stroke and area follow the reference.
     plain = series.plain
     for along in series.dimensions:
         if not along.numeric:
@@ -263,7 +261,7 @@ def sheets_of(series: RunSeries) -> list[FigureSpec]:
 def write_sheets(
     sheets: Sequence[FigureSpec],
     folder: Path,
-    formats: Sequence[str],
+    formats: Sequence[str],  # see :data:`hilctl.analysis.figure_layout.FORMATS`
     width: ColumnWidth,
     *,
     overwrite: bool,
@@ -272,15 +270,6 @@ def write_sheets(
 ) -> dict[Path, str]:
     """Write figures in several formats; return the files, each with its caption.
 
-    Args:
-        sheets: The figures.
-        folder: Folder of the files; created if missing.
-        formats: See :data:`hilctl.analysis.figure_layout.FORMATS`.
-        width: One or two columns of a journal.
-        overwrite: Whether existing files may be replaced.
-        on_done: Called with the progress.
-        on_drawn: Called with each name and figure.
-
     Raises:
         InputError: A file exists or can't be written.
     """
@@ -288,10 +277,7 @@ def write_sheets(
     taken = [path for path in names if path.exists()]
     if taken and not overwrite:
         raise already_there(taken[0], "give another --output, or --overwrite")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder}: can't be created: {error.strerror}") from None
+    make_folder(folder)
     written: dict[Path, str] = {}
     for sheet, (name, figure) in zip(sheets, draw_sheets(sheets, width, on_done), strict=True):
         on_drawn(name, figure)

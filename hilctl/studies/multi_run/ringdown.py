@@ -34,10 +34,7 @@ class Ringing:
 
 
 def ringing(displacement_um: F64, sample_rate_hz: float) -> Ringing | None:
-    """Fit the ringing of a displacement, float64[n], from the end of a step until it settles.
-
-    None if no ringing is above the noise.
-    """
+    """Fit the ringing of a displacement, float64[n], after a step; None if there is none."""
     if displacement_um.size < 2 * _FEWEST or not np.ptp(displacement_um) > 0.0:
         return None
     lowest_hz = _LOWEST_CYCLES * sample_rate_hz / displacement_um.size
@@ -53,10 +50,8 @@ def ringing(displacement_um: F64, sample_rate_hz: float) -> Ringing | None:
 
 
 def _shapes(t: F64, x: F64) -> F64:
-    """Return both phases of the ringing, the creep, and a constant: float64[4, n].
-
-    ``x`` has the logarithms of natural angular frequency, damping ratio, and creep rate.
-    """
+    """Return both phases of the ringing, the creep, and a constant: float64[4, n]."""
+    # x: logarithms of natural angular frequency, damping ratio, and creep rate.
     omega, damping, rate = np.exp(x)
     decay, damped = np.exp(-damping * omega * t), omega * math.sqrt(max(1.0 - damping**2, 1e-6))
     ring = decay * np.cos(damped * t), decay * np.sin(damped * t)

@@ -38,8 +38,7 @@ Measured: TypeAlias = tuple[SeriesRun, RunDigest]
 _SIGNS = ("o", "s", "^", "D", "v", "P", "X", "<", ">")
 _LINES = ("-", "--", "-.", ":")
 _NAMED = (WITH, WITHOUT, ERROR, MARK, "#E69F00", "#56B4E9", REFERENCE, QUIET)
-_MOST_CURVES = 7
-"""Most distinguishable curves."""
+_MOST_CURVES = 7  # most distinguishable curves
 
 
 def spread(items: Sequence[Item], most: int = _MOST_CURVES) -> list[Item]:
@@ -50,11 +49,8 @@ def spread(items: Sequence[Item], most: int = _MOST_CURVES) -> list[Item]:
 
 
 def looks(dimension: VariedParameter | None, values: Sequence[Hashable]) -> Mapping[Hashable, Any]:
-    """Return colour and marker for each value of a parameter, or each name.
-
-    Numbers use viridis, which keeps its order in greyscale and for colour-blind readers. Names use
-    the colours of Okabe and Ito.
-    """
+    """Return colour and marker for each value of a parameter, or each name."""
+    # viridis keeps its order in greyscale; names use the colours of Okabe and Ito.
     if dimension is not None and dimension.numeric and len(values) > 1:
         shades = mpl.colormaps["viridis"](np.linspace(0.0, 0.78, len(values)))
         colours = [mpl.colors.to_hex(shade) for shade in shades]
@@ -140,22 +136,20 @@ def minor_loop_sheet(series: RunSeries) -> FigureSpec | None:
         for run, digest in series.measured
         if digest.loop.size and (run.figures.minor_low_um or run.figures.minor_high_um)
     ]
-    if not runs:
-        return None
-    panels, more = _panels(series, runs, _draw_minor)
-    caption = f"Minor loops, at reversals of the input within the cycle{more}."
-    return FigureSpec("minor_loops", caption, panels, alike=True)
+    caption = "Minor loops, at reversals of the input within the cycle"
+    return _run_sheet("minor_loops", caption, series, runs, _draw_minor)
 
 
-def _panels(
-    series: RunSeries, runs: Sequence[Measured], draw: Callable[..., None]
-) -> tuple[tuple[Panel, ...], str]:
-    """Return one panel per run, of a selection of many runs, and a note on the selection."""
+def _run_sheet(
+    name: str, caption: str, series: RunSeries, runs: Sequence[Measured], draw: Callable[..., None]
+) -> FigureSpec | None:
+    """Return a figure with one panel per run, of a selection of many runs; None without runs."""
     panels = tuple(
         Panel(partial(draw, digest=digest), series.text(run), _SQUARE)
         for run, digest in spread(runs, _MOST_PANELS)
     )
-    return panels, f"; {len(panels)} of {len(runs)} runs" if len(panels) < len(runs) else ""
+    more = f"; {len(panels)} of {len(runs)} runs" if len(panels) < len(runs) else ""
+    return FigureSpec(name, f"{caption}{more}.", panels, alike=True) if panels else None
 
 
 def _draw_minor(axes: Axes, digest: RunDigest) -> None:
@@ -169,11 +163,8 @@ def _draw_minor(axes: Axes, digest: RunDigest) -> None:
 def model_sheet(series: RunSeries) -> FigureSpec | None:
     """Return measured and modelled loops; None without models."""
     runs = [each for each in series.measured if each[1].modelled.size]
-    if not runs:
-        return None
-    panels, more = _panels(series, runs, _draw_model)
-    caption = f"Measured and modelled loops{more}."
-    return FigureSpec("model_against_measured", caption, panels, alike=True)
+    caption = "Measured and modelled loops"
+    return _run_sheet("model_against_measured", caption, series, runs, _draw_model)
 
 
 def _draw_model(axes: Axes, digest: RunDigest) -> None:
@@ -185,11 +176,8 @@ def _draw_model(axes: Axes, digest: RunDigest) -> None:
 
 
 def before_after_sheet(series: RunSeries) -> FigureSpec | None:
-    """Return loops without and with each compensator, normalised to their range; None without both.
-
-    Command and reference have different units. A perfect compensator gives a straight line from
-    corner to corner.
-    """
+    """Return loops without and with each compensator, normalised to their range, or None."""
+    # A perfect compensator gives a straight line from corner to corner.
     pairs = pairs_of(series)
     if not pairs:
         return None

@@ -18,20 +18,13 @@ _FEWEST = 3
 
 @dataclass(frozen=True, slots=True)
 class RunFigure:
-    """A metric to compare among runs.
+    """A metric to compare among runs."""
 
-    Attributes:
-        name: Its column in the table.
-        unit: Its unit; ``%`` or as in :func:`hilctl.base.formatting.quantity`.
-        short: Short heading.
-        value: Returns it for a run, or None.
-    """
-
-    name: str
+    name: str  # its column in the table
     text: str
-    unit: str
-    short: str
-    value: Callable[[SeriesRun], float | None]
+    unit: str  # its unit; ``%`` or as in :func:`hilctl.base.formatting.quantity`
+    short: str  # short heading
+    value: Callable[[SeriesRun], float | None]  # returns it for a run, or None
 
     def of(self, runs: Sequence[SeriesRun]) -> list[tuple[SeriesRun, float]]:
         """Return the runs that have a value, each with the value."""
@@ -83,25 +76,16 @@ ASYMMETRY = RunFigure("asymmetry_percent", "asymmetry", "%", "asym. %", _asymmet
 
 @dataclass(frozen=True, slots=True)
 class Trend:
-    """A metric against one varied parameter, with the others constant.
-
-    Attributes:
-        held: Value of each other parameter, by its key.
-        x: float64[n], values of ``along``, ascending.
-        y: float64[n], the metric, averaged over repeats.
-        slope: Slope of the linear fit; None with fewer than three points.
-        offset: Offset of the linear fit.
-        r2: Coefficient of determination; None like ``slope``.
-    """
+    """A metric against one varied parameter, with the others constant."""
 
     figure: RunFigure
     along: VariedParameter
-    held: Mapping[str, Hashable]
-    x: F64
-    y: F64
-    slope: float | None = None
-    offset: float | None = None
-    r2: float | None = None
+    held: Mapping[str, Hashable]  # value of each other parameter, by its key
+    x: F64  # float64[n], values of ``along``, ascending
+    y: F64  # float64[n], the metric, averaged over repeats
+    slope: float | None = None  # slope of the linear fit; None with fewer than three points
+    offset: float | None = None  # offset of the linear fit
+    r2: float | None = None  # coefficient of determination; None like ``slope``
 
     @property
     def direction(self) -> str:
@@ -135,10 +119,7 @@ def trends(
     along: VariedParameter,
     runs: Sequence[SeriesRun] | None = None,
 ) -> list[Trend]:
-    """Return the trends of a metric along a numeric parameter, one per combination of the others.
-
-    All completed runs are used if ``runs`` is None.
-    """
+    """Return a metric's trends along a parameter, one per combination of the others."""
     others = [each for each in series.dimensions if each.key != along.key]
     grouped: dict[tuple[Hashable, ...], dict[float, list[float]]] = defaultdict(
         lambda: defaultdict(list)

@@ -26,25 +26,18 @@ _FIRST = (*_CHOICES, "frequency_hz", "amplitude", "bias_a", "load_kg")
 """Last parts of keys, in order of importance."""
 _UNITS = ("a", "v", "um", "hz", "s", "kg", "ohm", "k", "ms", "us")
 _UNIT_NAMES = {"a": "A", "v": "V", "hz": "Hz", "k": "K", "ohm": "ohm"}
-WITHOUT_COMPENSATOR = "without compensator"
-"""Label of runs without a compensator."""
+WITHOUT_COMPENSATOR = "without compensator"  # label of runs without a compensator
 _COMPONENT = re.compile(r"\.components\.(\d+)\.")
 
 
 @dataclass(frozen=True, slots=True)
 class VariedParameter:
-    """One varied parameter.
+    """One varied parameter."""
 
-    Attributes:
-        key: Dotted key of the experiment.
-        unit: Its unit, or empty.
-        values: Its values: numbers in ascending order, others in the order of the runs.
-    """
-
-    key: str
+    key: str  # dotted key of the experiment
     name: str
-    unit: str
-    values: tuple[Hashable, ...]
+    unit: str  # its unit, or empty
+    values: tuple[Hashable, ...]  # numbers in ascending order, others in the order of the runs
 
     @property
     def numeric(self) -> bool:
@@ -139,11 +132,7 @@ def _leaves(value: Any, at: str) -> Iterator[str]:
 def dimensions(
     keys: Sequence[str], rows: Sequence[Mapping[str, Hashable]], unit: str = ""
 ) -> tuple[VariedParameter, ...]:
-    """Return the varied parameters, without keys that depend on others.
-
-    ``rows`` has the value of each key, one mapping per run; ``unit`` is the unit of amplitudes, if
-    it is the same in all runs.
-    """
+    """Return the varied parameters of rows of values, without keys that depend on others."""
     columns = {key: [row.get(key) for row in rows] for key in keys}
     varied = [key for key in keys if len(set(columns[key]) - {None}) > 1]
     kept: list[str] = []
@@ -159,11 +148,8 @@ def _rank(key: str) -> int:
 
 
 def _follows(columns: Mapping[str, list[Hashable]], key: str, other: str) -> bool:
-    """Return whether a key depends on another one: it has one value for each of the other's.
-
-    An important key with fewer values is independent: three runs at three frequencies may have two
-    amplitudes.
-    """
+    """Return whether a key depends on another one: it has one value for each of the other's."""
+    # An important key with fewer values is independent: three frequencies, two amplitudes.
     pairs = set(zip(columns[other], columns[key], strict=True))
     values = len(set(columns[other]))
     if len(pairs) != values:

@@ -68,7 +68,7 @@ def test_a_first_run_that_fails_is_an_error(tmp_path):
 def test_a_folder_that_can_not_be_made_is_said_before_a_run(tmp_path):
     (tmp_path / "file").touch()
     runs = Runs()
-    with pytest.raises(InputError, match="can't be made"):
+    with pytest.raises(InputError, match="cannot create"):
         learned(tmp_path / "file" / "runs", runs)
     assert runs.settings == []
 
