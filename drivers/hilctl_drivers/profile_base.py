@@ -38,12 +38,10 @@ class SerialLineSettings(LinkSettings):
         description="xonxoff: bytes 0x13 and 0x11 pause and resume the data, for lines of text",
     )
     dtr: bool | None = Field(
-        default=None,
-        description="level of DTR; if omitted, raised when the port is opened",
+        default=None, description="level of DTR; if omitted, raised when the port is opened"
     )
     rts: bool | None = Field(
-        default=None,
-        description="level of RTS; if omitted, raised when the port is opened",
+        default=None, description="level of RTS; if omitted, raised when the port is opened"
     )
 
     @property
@@ -96,9 +94,7 @@ class Range(StrictModel):
     max: float = Field(description="highest value of the output or input, in unit")
     resolution: float | None = Field(default=None, gt=0.0, description="smallest step, in unit")
     settle_s: float = Field(
-        default=0.0,
-        ge=0.0,
-        description="settling time, s; lengthens the sample period",
+        default=0.0, ge=0.0, description="settling time, s; lengthens the sample period"
     )
 
     @model_validator(mode="after")

@@ -111,8 +111,7 @@ class WatchdogOptions(StrictModel):
         default=0.0, description="command after a trip, in the command's unit"
     )
     reason: str = Field(
-        default="",
-        description="reason for a safe_command other than the experiment's safe value",
+        default="", description="reason for a safe_command other than the experiment's safe value"
     )
 
 

@@ -97,11 +97,7 @@ def check(
         ConfigError: The run is rejected; all reasons are listed, each with its amount.
     """
     config = loaded.config
-    problems = [
-        *device_problems(loaded),
-        *interlock_problems(loaded),
-        *condition_problems(loaded),
-    ]
+    problems = [*device_problems(loaded), *interlock_problems(loaded), *condition_problems(loaded)]
     try:
         reference = build(config.waveform, config.sample_rate_hz, loaded.folder)
     except InputError as error:

@@ -213,11 +213,7 @@ class Interlocks:
                 memory[run] += samples
 
     def _trip(
-        self,
-        sample: int,
-        bits: int,
-        sent: tuple[float, float, float],
-        seen: tuple[float, float],
+        self, sample: int, bits: int, sent: tuple[float, float, float], seen: tuple[float, float]
     ) -> Trip:
         """Return the trip; of several, a cause before its consequence.
 

@@ -100,13 +100,7 @@ class Limiter:
 
     def _apply(self, wanted: F64, max_step: float, command: F64, flags: U32) -> int:
         first_invalid = self._limit_block(
-            wanted,
-            self.last,
-            *self._range,
-            max_step,
-            *_BITS,
-            command,
-            flags,
+            wanted, self.last, *self._range, max_step, *_BITS, command, flags
         )
         if command.size:
             self.last = command.item(-1)

@@ -276,13 +276,7 @@ class Loop:
         return self._limiter.limit(block.wanted, block.command, block.flags)
 
     def _follow(
-        self,
-        block: Block,
-        reference: F64,
-        input_um: F64,
-        wanted: F64,
-        command: F64,
-        flags: U32,
+        self, block: Block, reference: F64, input_um: F64, wanted: F64, command: F64, flags: U32
     ) -> int:
         """Fill samples of the waveform; return the first one that is not finite, or -1."""
         tuner = self._tuner

@@ -7,12 +7,5 @@ timer_latency.py  wake-up lateness, measured in a separate process with the loop
 diagnosis.py      all checks, the verdict, and metadata for a recording
 """
 
-PUBLIC = (
-    "checks",
-    "diagnosis",
-    "procfs",
-    "rt_setup",
-    "syscalls",
-    "timer_latency",
-)
+PUBLIC = ("checks", "diagnosis", "procfs", "rt_setup", "syscalls", "timer_latency")
 """Modules that other rooms import; the others are private."""

@@ -50,8 +50,7 @@ class Realtime(StrictModel):
     cpu: Annotated[
         Annotated[int, Field(ge=0)] | None,
         BeforeValidator(
-            _none_or_number,
-            json_schema_input_type=Literal["none"] | Annotated[int, Field(ge=0)],
+            _none_or_number, json_schema_input_type=Literal["none"] | Annotated[int, Field(ge=0)]
         ),
     ] = None
     require: bool = False

@@ -7,14 +7,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields, replace
 from typing import BinaryIO
 
-from mcap.records import (
-    AttachmentIndex,
-    Channel,
-    ChunkIndex,
-    McapRecord,
-    Metadata,
-    MetadataIndex,
-)
+from mcap.records import AttachmentIndex, Channel, ChunkIndex, McapRecord, Metadata, MetadataIndex
 
 from hilctl.base.errors import DataError
 from hilctl.base.samples import LAST_SAMPLE

@@ -16,13 +16,7 @@ from hilctl.base.device import DeviceInfo, DeviceOptions
 from hilctl.base.errors import DeviceError, InputError
 from hilctl.base.types import F64
 from hilctl_drivers.device import check_fifo, check_next
-from hilctl_drivers.labjack.stream import (
-    ENABLE,
-    VALUES_MAX,
-    InputCalibration,
-    ModbusFeedback,
-    u32,
-)
+from hilctl_drivers.labjack.stream import ENABLE, VALUES_MAX, InputCalibration, ModbusFeedback, u32
 from hilctl_drivers.labjack.stream_session import StreamSession
 from hilctl_drivers.modbus.config import ModbusEndpoint, ModbusOptions, ModbusSetup
 from hilctl_drivers.modbus.modbus_dac import ModbusDevice

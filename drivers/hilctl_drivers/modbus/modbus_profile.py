@@ -178,11 +178,7 @@ class ModbusWatchdog(Watchdog):
         return {f"watchdog.{name}": steps for name, steps in named.items()}
 
     def bound(
-        self,
-        steps: tuple[ModbusStep, ...],
-        output: ModbusOutput,
-        timeout_s: float,
-        safe: float,
+        self, steps: tuple[ModbusStep, ...], output: ModbusOutput, timeout_s: float, safe: float
     ) -> tuple[ModbusStep, ...]:
         """Return steps with numbers for ``timeout`` and ``safe``, scaled to the device's units.
 

@@ -91,11 +91,7 @@ class Changes:
         return ""
 
     def _make(
-        self,
-        gain: float | None,
-        offset: float | None,
-        over_s: float,
-        inverse: InverseState | None,
+        self, gain: float | None, offset: float | None, over_s: float, inverse: InverseState | None
     ) -> dict[str, Any]:
         """Write a change to the page; return the answer."""
         gain = self.gain if gain is None else gain

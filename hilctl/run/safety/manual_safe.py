@@ -121,11 +121,7 @@ def _locks(stack: ExitStack, holds: Sequence[str]) -> list[int]:
 
 
 def _drive(
-    output: SafeOutput,
-    clock: Callable[[], float],
-    sleep: Callable[[float], None],
-    *,
-    watches: bool,
+    output: SafeOutput, clock: Callable[[], float], sleep: Callable[[float], None], *, watches: bool
 ) -> None:
     """Write until the state is final, a time limit, or Ctrl-C; watched values are repeated."""
     give_up_s = clock() + PATIENCE_S
