@@ -26,8 +26,8 @@ _SAMPLES = {"value": 0.0, "safe": 0.0, "address": 1, "timeout": 1}
 
 
 def _check_template(text: str) -> str:
-    for _, field, _, conversion in Formatter().parse(text):
-        if field is not None and (field not in _SAMPLES or conversion):
+    for _, field, form, conversion in Formatter().parse(text):
+        if field is not None and (field not in _SAMPLES or conversion or "{" in (form or "")):
             known = ", ".join(f"{{{name}}}" for name in _SAMPLES)
             raise ValueError(f"fields must be of {known}")
     if not text.format(**_SAMPLES).isprintable() or not text.isascii():
