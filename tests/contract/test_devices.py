@@ -151,14 +151,12 @@ def case(request):
 
 
 def test_no_device_is_left_out():
-    """Each registered device is tested here or in a named file."""
     assert {case.split()[0] for case in CASES} | set(ELSEWHERE) == {*BUILTIN, *OTHERS}
     folder = Path(__file__).parent
     assert [name for name in ELSEWHERE.values() if not (folder / name).exists()] == []
 
 
 def test_no_modbus_profile_is_left_out():
-    """Each shipped Modbus profile is tested with its emulation, input-only profiles as readers."""
     shipped = {name: load_profile(name) for name in shipped_profiles()}
     kept = {name: each for name, each in shipped.items() if isinstance(each, ModbusProfile)}
     pairs = [words.split()[:2] for words in MODBUS if words != "rtu"]

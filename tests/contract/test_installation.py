@@ -15,7 +15,6 @@ print(json.dumps([hilctl.__version__, *(spec and spec.origin for spec in found)]
 
 
 def test_clone_beside_a_script_does_not_hide_the_package(tmp_path: Path) -> None:
-    """A namespace folder does not shadow the package."""
     (tmp_path / "hilctl" / "hilctl").mkdir(parents=True)
     script = tmp_path / "analysis.py"
     script.write_text(SCRIPT, encoding="utf-8")
@@ -24,7 +23,6 @@ def test_clone_beside_a_script_does_not_hide_the_package(tmp_path: Path) -> None
 
 
 def test_packages_of_a_script_come_before_those_of_the_clone(tmp_path: Path) -> None:
-    """A script's own packages shadow those of the clone, such as ``tests``."""
     (tmp_path / "tests").mkdir()
     (tmp_path / "tests" / "__init__.py").touch()
     own = tmp_path / "tests" / "own.py"

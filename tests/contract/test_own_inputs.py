@@ -78,7 +78,6 @@ def files(place):
     ],
 )
 def test_an_output_is_no_input(hilctl, place, words):
-    """An input is not overwritten even with --overwrite."""
     (place / "linked.mcap").symlink_to("run.mcap")
     (place / "run.csv").symlink_to("run.mcap")
     before = contents(place)

@@ -164,7 +164,6 @@ def test_opening_does_not_move_the_output(driven, case):
 
 
 def test_no_serial_profile_is_left_out():
-    """Each shipped serial profile is tested with its emulation."""
     drives = {case.split()[0] for case in SERIAL}
     reads = {word for case in SERIAL for word in case.split()[1:2]}
     assert drives | (reads - {"only_reads"}) == set(serial_profiles())

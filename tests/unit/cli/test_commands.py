@@ -35,7 +35,6 @@ def test_missing_command_is_an_input_error(module, monkeypatch):
 
 
 def test_similar_command_is_suggested():
-    """Commands are suggested without being imported."""
     ended = in_a_process(MAIN, "stauts")
     assert "'status'" in ended.stderr
 

@@ -196,16 +196,12 @@ BROKEN: list[tuple[str, dict[str, Any], str]] = [
 
 
 class TestRules:
-    """What a profile must keep to."""
-
     @pytest.mark.parametrize("base", TEXTS)
     def test_unbroken(self, base: str) -> None:
-        """The profiles that the broken ones are made from are good."""
         parse_profile(changed(base, {}), "acme.yaml")
 
     @pytest.mark.parametrize(("base", "changes", "message"), BROKEN)
     def test_broken(self, base: str, changes: dict[str, Any], message: str) -> None:
-        """Each broken rule gives one line with file, key and rule."""
         found = lines(changed(base, changes))
         assert len(found) == 1, found
         assert re.match(r"acme\.yaml:\d+: ", found[0])
@@ -214,19 +210,16 @@ class TestRules:
     @pytest.mark.parametrize("base", ["modbus", "ascii"])
     @pytest.mark.parametrize("group", ["outputs", "inputs"])
     def test_one_of_them_is_enough(self, base: str, group: str) -> None:
-        """A device may only drive, or only read beside another one that drives."""
         profile = parse_profile(changed(base, {group: {}}), "acme.yaml")
         assert not getattr(profile, group)
 
     def test_board_with_integers(self) -> None:
-        """A board may send whole numbers, where its range fits into them."""
         changes = {"outputs.DAC.type": "int16", "outputs.DAC.order": "BA"}
         profile = parse_profile(changed("board", changes), "acme.yaml")
         assert isinstance(profile, FrameProfile)
         assert profile.outputs["DAC"].format.size == 2
 
     def test_all_at_once(self) -> None:
-        """Several broken rules are reported together."""
         text = changed("modbus", {"vendor": None, "link.baud": 1, AO + "type": "int8"})
         keys = [line.split(": ")[1] for line in lines(text)]
         assert sorted(keys) == ["link.baud", "outputs.AO.type", "vendor"]
@@ -246,14 +239,11 @@ class TestRules:
         ],
     )  # fmt: skip
     def test_lines(self, old: str, new: str, found: str) -> None:
-        """Each problem has the line of the value that it is about, whoever found it."""
         assert MODBUS.count(old) == 1
         assert lines(MODBUS.replace(old, new))[0].startswith(found)
 
 
 class TestYaml:
-    """What YAML does behind one's back."""
-
     @pytest.mark.parametrize(
         ("text", "message"),
         [
@@ -267,7 +257,6 @@ class TestYaml:
         ],
     )
     def test_refused(self, text: str, message: str) -> None:
-        """What looks like one thing and is another is refused, in one line."""
         found = lines(text)
         assert message in found[0]
         assert len(found) == 1
@@ -281,16 +270,12 @@ class TestYaml:
 
 
 class TestLoading:
-    """Names and paths."""
-
     def test_by_path(self, tmp_path: Path) -> None:
-        """A user's own profile is given by path."""
         path = tmp_path / "mine.yaml"
         path.write_text(MODBUS, encoding="utf-8")
         assert load_profile(str(path)).title == "Acme DAQ-1"
 
     def test_unknown_name(self) -> None:
-        """An unknown name is answered with the nearest, or with all that are shipped."""
         with pytest.raises(InputError, match=r"'labjack'.* 'labjack_t"):
             load_profile("labjack")
         with pytest.raises(InputError, match="'zzz' is shipped") as error:
@@ -298,13 +283,11 @@ class TestLoading:
         assert all(name in str(error.value) for name in shipped_profiles())
 
     def test_no_file(self, tmp_path: Path) -> None:
-        """A path without a file is named."""
         path = tmp_path / "none.yaml"
         with pytest.raises(InputError, match=f"^{re.escape(str(path))}"):
             load_profile(str(path))
 
     def test_with_link(self) -> None:
-        """A device that was set to another baud is the same device on a faster line."""
         profile = parse_profile(MODBUS, "acme.yaml")
         faster = with_link(profile, baud=115200, parity="E")
         assert isinstance(faster, ModbusProfile)
@@ -317,17 +300,13 @@ class TestLoading:
 
 
 class TestSchema:
-    """The schema that editors read."""
-
     def test_file_is_up_to_date(self) -> None:
-        """profiles/schema.json is what the code says."""
         path = FOLDER / "schema.json"
         assert path.read_text(encoding="utf-8") == profile_schema_text(), (
             "write hilctl_drivers.profile.profile_schema_text() to profiles/schema.json"
         )
 
     def test_covers_all_kinds(self) -> None:
-        """Each kind of profile is a choice, and unknown keys are refused everywhere."""
         schema = json.loads(profile_schema_text())
         names = [choice["$ref"].rsplit("/", 1)[1] for choice in schema["oneOf"]]
         kinds = (AsciiProfile, FrameProfile, ModbusProfile)

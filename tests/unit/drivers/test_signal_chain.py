@@ -51,7 +51,6 @@ def watchdog(**changes: Any) -> AsciiWatchdog:
     ],
 )
 def test_watchdog_that_does_not_do_what_is_asked_is_refused(has, wanted, words):
-    """The same rules for lines of text as for Modbus: it must act, on this output, as wanted."""
     with pytest.raises(InputError, match=words):
         asked(has, **wanted)
 
@@ -63,7 +62,6 @@ def test_watchdog_that_does_is_taken(has):
 
 
 def test_channels_are_found_by_name():
-    """An unknown name lists those that there are; none is said where there are none."""
     assert channel("input", "A", {"A": VOLTS}, "Acme") is VOLTS
     two = {"A": VOLTS, "B": VOLTS}
     with pytest.raises(InputError, match=r"'C' .*A, B"):
@@ -73,7 +71,6 @@ def test_channels_are_found_by_name():
 
 
 def test_input_of_its_own_output_is_no_sensor():
-    """A supply's own meter can't be the displacement sensor."""
     supply = load_profile("kepco_bop")
     with pytest.raises(InputError, match="as reader"):
         channel("input", "current", supply.inputs, supply.title)

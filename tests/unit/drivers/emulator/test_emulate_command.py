@@ -36,7 +36,6 @@ CONFIGS = Path(__file__).parents[4] / "configs"
     ],
 )
 def test_it_says_where_both_answer(profile, reader, options, places):
-    """Each with its place, and its unit id where there is one; a signal ends it."""
     told: list[ListenAddress] = []
 
     def on_ready(places: Sequence[ListenAddress], emulator: Emulator) -> None:
@@ -62,7 +61,6 @@ def ended_at_once(monkeypatch):
 
 
 def test_a_program_reads_where_and_how(ended_at_once):
-    """One line: places, wiring, and the arguments of a run there; people read the same in words."""
     path = str(CONFIGS / "serial_scpi_kepco.yaml")
     (line,) = CliRunner().invoke(app, ["emulate", path, "--json"]).stdout.splitlines()
     said = json.loads(line)
@@ -98,7 +96,6 @@ def test_a_profile_alone_has_no_wiring_to_tell(ended_at_once):
     ],
 )
 def test_options_become_the_emulator(words, tmp_path, monkeypatch):
-    """What is not given has the default of :class:`EmulatorOptions`; a reader has two spellings."""
     asked = []
     monkeypatch.setattr(
         "hilctl_drivers.emulator.emulate_command.serve", lambda *of: asked.append(of[0])

@@ -104,7 +104,6 @@ EXAMPLES = [
 
 @pytest.mark.parametrize(("pdu", "request_hex", "reply_hex", "data_hex"), EXAMPLES)
 def test_published_examples(pdu, request_hex, reply_hex, data_hex):
-    """Request bytes, the reply's size and what is read from it."""
     assert pdu == H(request_hex)
     assert reply_size(pdu) == len(H(reply_hex))
     assert reply_data(pdu, H(reply_hex)) == H(data_hex)
@@ -150,7 +149,6 @@ SAME = [
 
 @pytest.mark.parametrize(("pdu", "theirs"), SAME)
 def test_requests_are_those_of_pymodbus(pdu, theirs):
-    """Same PDU and both envelopes; pymodbus's server side reads them back alike."""
     theirs.dev_id, theirs.transaction_id = 17, 513
     assert tcp_adu(513, 17, pdu) == FramerSocket(DecodePDU(True)).buildFrame(theirs)
     assert rtu_adu(17, pdu) == FramerRTU(DecodePDU(True)).buildFrame(theirs)
@@ -175,7 +173,6 @@ def test_requests_are_those_of_pymodbus(pdu, theirs):
     ],
 )  # fmt: skip
 def test_replies_of_pymodbus_are_read(pdu, theirs, data):
-    """In both envelopes."""
     theirs.dev_id, theirs.transaction_id = 17, 513
     tcp = FramerSocket(DecodePDU(False)).buildFrame(theirs)
     rtu = FramerRTU(DecodePDU(False)).buildFrame(theirs)
@@ -253,7 +250,6 @@ def test_what_the_specification_does_not_allow_is_not_built(build, arguments):
     ],
 )
 def test_the_largest_of_each_fits(pdu):
-    """What the limits allow fits a message, asked and answered."""
     assert len(pdu) <= 253
     assert reply_size(pdu) <= 253
     assert rtu_pdu(rtu_adu(247, pdu), 247) == tcp_pdu(tcp_adu(65535, 0, pdu), 65535, 0) == pdu
@@ -285,7 +281,6 @@ def test_the_largest_of_each_fits(pdu):
     ],
 )
 def test_answers_to_something_else_are_mismatches(pdu, reply):
-    """Function, byte count, length, and everything that a write echoes."""
     with pytest.raises(MismatchError):
         reply_data(pdu, H(reply))
 
@@ -307,13 +302,11 @@ GOOD = H("0102 0000 0005 11 03 02 0005")
     ],
 )
 def test_tcp_headers_of_something_else(adu, error, rule):
-    """Another transaction or unit, no Modbus, and lengths that don't fit."""
     with pytest.raises(error, match=rule):
         tcp_pdu(adu, 258, 17)
 
 
 def test_beginnings_of_frames_are_incomplete():
-    """As far as the envelope can tell."""
     assert tcp_pdu(GOOD, 258, 17) == H("03 02 0005")
     for cut in range(len(GOOD)):
         with pytest.raises(IncompleteError):
@@ -325,7 +318,6 @@ def test_beginnings_of_frames_are_incomplete():
 
 
 def test_rtu_checks_crc_before_unit():
-    """A flipped unit is corruption; a good frame of another unit is a mismatch."""
     frame = rtu_adu(2, H("03 02 0005"))
     with pytest.raises(MismatchError, match=r"unit .*1, got 2"):
         rtu_pdu(frame, 1)

@@ -56,7 +56,6 @@ class TestBlocks:
         np.testing.assert_array_equal(np.concatenate(parts), whole)
 
     def test_seed_decides_the_noise(self) -> None:
-        """Equal seeds give equal readings, others do not."""
         one, same, other = (
             run(TerfenolActuator(RATED, RATE_HZ, seed=seed), self.COMMAND_A) for seed in (3, 3, 4)
         )
@@ -110,8 +109,6 @@ def hysteresis_percent(command_a: F64, displacement_um: F64) -> float:
 
 
 class TestPublishedRanges:
-    """Near the figures of the dissertation's actuator, of which each is a variety."""
-
     @rigs
     def test_stroke(self, physics: Physics) -> None:
         """A 6 A sine of 1 Hz moves it by 60 to 100 um (published: 83.1)."""

@@ -110,7 +110,6 @@ def test_open_starts_at_rest(closed: SimulatedDevice) -> None:
 
 @pytest.mark.parametrize("block", [0, 4097])
 def test_open_refuses_block(closed: SimulatedDevice, block: int) -> None:
-    """A block that does not fit the FIFO is refused."""
     with pytest.raises(DeviceError, match=r"block.*4096"):
         closed.open(RATE_HZ, block)
 
@@ -144,7 +143,6 @@ def test_a_refused_block_is_not_noticed_by_the_plant(value: float) -> None:
 
 @pytest.mark.parametrize("sizes", [(0, 0, 0), (51, 51, 51), (50, 49, 50), (50, 50, 51)])
 def test_wrong_sizes(sizes: tuple[int, int, int]) -> None:
-    """Blocks that are empty, too long or of unequal length are refused; shorter ones are not."""
     with pytest.raises(DeviceError, match="50 samples"):
         terfenol().exchange(0, *(np.zeros(size) for size in sizes))
 
@@ -182,8 +180,6 @@ class TestSampleCount:
 
 
 class TestFaults:
-    """Injected faults: from their sample on, and not before."""
-
     AT = 130  # inside the third block
 
     @pytest.mark.parametrize("kind", ["sensor_nan", "sensor_frozen", "sensor_jump"])

@@ -38,7 +38,6 @@ class TestPiezo:
         assert gap_um / np.ptp(displacement_um) == pytest.approx(0.16, abs=0.03)
 
     def test_noise(self) -> None:
-        """At rest it reads noise of the asked size."""
         piezo = opened(SimulatedPiezo(PiezoOptions(sensor_noise_um=0.05)), 4000)
         assert send(piezo, 0, np.zeros(4000)).std() == pytest.approx(0.05, rel=0.05)
 

@@ -49,7 +49,6 @@ def test_crc_has_its_catalogued_check_value(name):
 
 @pytest.mark.parametrize("name", CATALOGUE)
 def test_fast_function_is_the_one_the_parameters_say(name):
-    """Table, zlib and binascii agree with division bit by bit, on any length and buffer."""
     crc = CRCS[name]
     rng = random.Random(1)
     for size in range(70):
@@ -61,7 +60,6 @@ def test_fast_function_is_the_one_the_parameters_say(name):
 
 
 def test_every_named_crc_is_checked_here():
-    """No CRC can be named that these tests leave out; "none" is the empty check."""
     assert set(CRCS) == {*CATALOGUE, "none"}
     none = CRCS["none"]
     assert (none.size, none.of(b"123456789")) == (0, b"")
@@ -75,7 +73,6 @@ def test_modbus_crc_of_a_published_frame():
 
 
 def test_modbus_crc_goes_on_from_a_known_beginning():
-    """CRC of a beginning, then of the rest, is the CRC of the whole."""
     data = random.Random(2).randbytes(40)
     for cut in range(41):
         assert crc16_modbus(data[cut:], crc16_modbus(data[:cut])) == crc16_modbus(data)
@@ -136,7 +133,6 @@ def test_bursts_up_to_this_many_bits_are_always_seen(name, bits):
 
 
 def test_modbus_crc_two_bytes_at_a_time_is_the_same():
-    """The loop's faster form agrees with the plain one, from any start."""
     source = random.Random(5)
     for _ in range(500):
         data, start = source.randbytes(2 * source.randrange(20)), source.randrange(0x10000)

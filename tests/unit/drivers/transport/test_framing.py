@@ -86,7 +86,6 @@ def test_payloads_of_any_size_come_back(framing, size):
 
 @ALL
 def test_a_beginning_is_incomplete_and_a_tail_is_corrupt(framing):
-    """Every proper beginning asks for more; bytes behind the end are not dropped silently."""
     frame = framing.encode(b"\x01\x00\x02\x03")
     for cut in range(len(frame)):
         with pytest.raises(IncompleteError):
@@ -97,7 +96,6 @@ def test_a_beginning_is_incomplete_and_a_tail_is_corrupt(framing):
 
 
 def test_cobs_size_on_the_wire_is_the_largest_there_is():
-    """A payload without a zero takes all of it; a frame may be awaited up to there, no further."""
     framing = CobsFraming(CRCS["none"], payload_max=8)
     assert len(framing.encode(b"\xff" * 8)) == framing.wire_size(8) == 10
     with pytest.raises(IncompleteError, match=r"^9 bytes without"):
@@ -132,7 +130,6 @@ def test_corrupt_frames_are_told_in_words(framing, frame, text):
 @ALL
 @pytest.mark.parametrize("size", [0, 4097])
 def test_payloads_that_do_not_fit_are_refused(framing, size):
-    """Neither an empty payload nor one past the limit is sent."""
     with pytest.raises(BadRequestError, match=f"got {size}$"):
         framing.encode(bytes(size))
 
@@ -153,13 +150,11 @@ def test_framings_that_cannot_be_are_refused(kind, crc, size, text):
 
 @pytest.mark.parametrize("size", [1, 65535])
 def test_length_frames_of_the_extreme_sizes(size):
-    """The limit of a payload may be as small as one byte and as large as two bytes can say."""
     framing = LengthFraming(CRCS["crc32"], size)
     assert framing.decode(framing.encode(bytes(size))) == bytes(size)
 
 
 def test_limits_hold_for_what_is_received():
-    """A good frame of a larger payload than agreed is refused, as is one without payload."""
     for crc in ("crc16_modbus", "crc32"):
         check = CRCS[crc]
         large = CobsFraming(check).encode(bytes(9))
@@ -180,7 +175,6 @@ def test_zeros_are_no_frame():
 
 @EACH
 def test_each_wrong_crc_bit_is_seen(framing):
-    """Flipping any one bit under the check is refused."""
     crc, payload = framing.crc, b"\x01\x00\x02\x7f"
     if isinstance(framing, CobsFraming):
         good = payload + crc.of(payload)
@@ -198,7 +192,6 @@ def test_each_wrong_crc_bit_is_seen(framing):
 
 @ALL
 def test_stream_in_any_pieces(framing):
-    """Byte by byte, in odd pieces or at once: the same payloads in the same order."""
     rng = random.Random(4)
     payloads = [rng.randbytes(rng.randint(1, 40)) for _ in range(50)]
     stream = b"".join(map(framing.encode, payloads))
@@ -245,7 +238,6 @@ def test_cobs_stream_drops_what_never_ends():
 
 @ALL
 def test_stream_takes_the_largest_frame_byte_by_byte(framing):
-    """The longest frame there can be is not yet too long."""
     framing = type(framing)(framing.crc, payload_max=40)
     for payload in (b"\xff" * 40, bytes(40)):
         splitter = framing.splitter()
@@ -255,7 +247,6 @@ def test_stream_takes_the_largest_frame_byte_by_byte(framing):
 
 @EACH
 def test_stream_reports_each_lost_stretch(framing):
-    """Two damaged frames with good ones around them are two reports, in their places."""
     framing = type(framing)(framing.crc, payload_max=8)
     good, bad = framing.encode(b"\x01\x02\x03"), bytearray(framing.encode(b"\x01\x02\x03"))
     bad[3] ^= 0x40
@@ -272,7 +263,6 @@ def test_cobs_stream_ignores_00_in_a_row():
 
 @EACH
 def test_reset_forgets_that_the_way_was_lost(framing):
-    """Rubbish and half a frame before a reset neither hide a report nor cost a frame."""
     framing = type(framing)(framing.crc, payload_max=16)
     rubbish = b"\xff" * 64
     splitter = framing.splitter()
