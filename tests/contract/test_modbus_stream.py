@@ -27,18 +27,8 @@ class DrivenStream(DrivenDevice):
 
     def __init__(self, profile):
         self.emulated = InProcess.of(profile, message_s=0.0002)
-        wiring = self.emulated.device.wiring
         chosen = device_class("modbus_stream")
-        options = {
-            "profile": profile,
-            "host": "127.0.0.1",
-            "output": next(iter(self.emulated.device.profile.outputs)),
-            "input": next(iter(self.emulated.device.profile.inputs)),
-            "amplifier": {"gain_a_per_v": wiring.gain_a, "offset_a": wiring.offset_a},
-            "sensor": {"um_per_v": wiring.sensor_um, "offset_um": wiring.offset_um},
-            "watchdog": "none",
-            "fifo_blocks": FIFO_BLOCKS,
-        }
+        options = {**self.emulated.options, "profile": profile, "fifo_blocks": FIFO_BLOCKS}
         device = chosen(
             chosen.Options.model_validate(options),
             connect=lambda peer: peer.session(self.emulated.link),

@@ -94,6 +94,7 @@ def test_what_is_written_over_was_written_by_the_same_command(hilctl, place, wor
     assert contents(place) == before
 
 
+@pytest.mark.slow
 def test_an_empty_file_and_a_torn_recording_are_replaced(hilctl, place):
     for text in (b"", b"\x89MCA", (place / "run.mcap").read_bytes()[:5000]):
         (place / "run.mcap").write_bytes(text)

@@ -41,7 +41,7 @@ def test_similar_command_is_suggested():
 
 @pytest.mark.parametrize("name", ["check", "report"])
 def test_eof_error_is_not_reported_as_ctrl_d(hilctl, monkeypatch, name):
-    def ended() -> None:
+    def ended():
         raise EOFError("ran out")
 
     monkeypatch.setattr("hilctl.cli.reports.report", ended)

@@ -82,7 +82,7 @@ def shown(monkeypatch, capsys):
     """Return a function that returns the lines for a terminal of 80 columns."""
     monkeypatch.setenv("COLUMNS", "80")
 
-    def of(*found: dict) -> list[str]:
+    def of(*found):
         print_status(list(found))
         return capsys.readouterr().out.splitlines()
 

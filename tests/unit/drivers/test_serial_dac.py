@@ -16,6 +16,8 @@ from tests.unit.drivers.conftest import TIMEOUT_S
 DCON = (Path(__file__).parents[2] / "data" / "dcon_module.yaml").read_text()
 KINDS = ["dcon", "scpi", "cobs", "length"]
 PATIENT_S = 20.0
+SILENCE_S = 0.5
+"""A timeout that a test waits for."""
 
 
 @pytest.fixture
@@ -199,7 +201,7 @@ def test_the_output_is_measured_where_that_is_asked_for(rig, profile, current_a)
 
 
 def test_a_reader_that_fails_is_named(rig):
-    bench = rig("kepco_bop", reader="agilent_34970a", own_line=True, timeout_s=TIMEOUT_S)
+    bench = rig("kepco_bop", reader="agilent_34970a", own_line=True, timeout_s=SILENCE_S)
     bench.open()
     bench.exchange(0.0)
     bench.emulator.wires[1].devices = []
@@ -208,6 +210,7 @@ def test_a_reader_that_fails_is_named(rig):
         exchange_until_it_fails(bench, 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("fault", ["silence", "corrupt", "duplicate", "wrong_id"])
 def test_a_bad_answer_to_the_safe_value_confirms_nothing(rig, kind, fault):
@@ -220,6 +223,7 @@ def test_a_bad_answer_to_the_safe_value_confirms_nothing(rig, kind, fault):
     assert bench.current_a() == pytest.approx(0.0, abs=2e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_device_that_was_deaf_is_made_safe_when_it_comes_back(rig, kind):
     bench = rig(kind, faults=[f"silence@{n}" for n in range(20, 25)], timeout_s=0.3)
@@ -254,7 +258,7 @@ def test_making_safe_waits_for_no_board_to_boot(rig):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_line_that_never_falls_silent_gets_the_safe_value(rig, kind):
-    bench = rig(kind, timeout_s=TIMEOUT_S)
+    bench = rig(kind, timeout_s=SILENCE_S)
     bench.open()
     bench.exchange(2.0)
     link = bench.device._link

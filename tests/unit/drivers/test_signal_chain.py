@@ -1,19 +1,17 @@
 """Watchdogs that can't do what is asked of them, and channels that can't be wired so."""
 
-from typing import Any
-
 import pytest
 
 from hilctl.base.errors import InputError
 from hilctl_drivers.ascii.ascii_profile import AsciiWatchdog
 from hilctl_drivers.profile import load_profile
-from hilctl_drivers.profile_base import Range, Watchdog
+from hilctl_drivers.profile_base import Range
 from hilctl_drivers.signal_chain import DacOptions, SignalChain, channel, check_watchdog
 
 VOLTS = Range(unit="V", min=-10.0, max=10.0)
 
 
-def asked(has: Watchdog | str, offset_a: float = 0.0, **wanted: float) -> None:
+def asked(has, offset_a=0.0, **wanted):
     """Hold a wanted watchdog against what a device has, on output B."""
     options = DacOptions.model_validate(
         {
@@ -29,7 +27,7 @@ def asked(has: Watchdog | str, offset_a: float = 0.0, **wanted: float) -> None:
     check_watchdog("Acme", options, VOLTS, chain, has)
 
 
-def watchdog(**changes: Any) -> AsciiWatchdog:
+def watchdog(**changes):
     arm = ({"kind": "send", "text": "W{timeout}"},)
     data = {
         "unit_s": 0.1, "min_s": 0.1, "max_s": 10.0, "kick": "any", "on_trip": "safe",

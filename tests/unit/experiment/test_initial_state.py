@@ -1,7 +1,6 @@
 """What a run before left behind: the compensator that begins with it meets its model exactly."""
 
 from datetime import datetime
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -32,7 +31,7 @@ NOW_S = datetime.fromisoformat("2026-01-01T00:01:00+00:00").timestamp()
 COMMAND = 4.0 * np.sin(np.pi * np.arange(1000) / 999.0)
 
 
-def record(path: Path, command, *, first=0, flags=0, facts=None, **made) -> Path:
+def record(path, command, *, first=0, flags=0, facts=None, **made):
     """Write a run of these commands without a compensator."""
     blocks = command.size // BLOCK
     batch = BlockBatch.empty(blocks, BLOCK, 1)
@@ -45,8 +44,8 @@ def record(path: Path, command, *, first=0, flags=0, facts=None, **made) -> Path
 
 
 def write_recording(
-    path: Path, batch, rate_hz=RATE_HZ, *, whole=True, facts=None, end=None, measured=False
-) -> Path:
+    path, batch, rate_hz=RATE_HZ, *, whole=True, facts=None, end=None, measured=False
+):
     """Write blocks of a run without a compensator."""
     run = RunFacts(
         facts={"compensator": "none", **(facts or {})},

@@ -22,7 +22,6 @@ from hilctl_drivers.transport.links import (
     RefusedError,
     WatchdogTrippedError,
 )
-from hilctl_drivers.transport.wire_time import WireTime
 
 DCON = load_profile(str(Path(__file__).parents[3] / "data" / "dcon_module.yaml"))
 PLAIN = DCON.model_copy(update={"link": DCON.link.model_copy(update={"checksum": "none"})})
@@ -119,13 +118,13 @@ def test_an_echo_must_be_what_was_sent():
         session(b"#030\r>\r", profile=profile).ask("#020", ">")
 
 
-def wire_s(time: WireTime) -> float:
+def wire_s(time):
     """Return the time of the characters alone."""
     return time.request_s + time.reply_s
 
 
 class TestText:
-    def test_dcon(self) -> None:
+    def test_dcon(self):
         """#010+05.000 and > with their carriage returns are 14 characters."""
         profile = load_profile("icp_m7024_dcon")
         time = exchange_time(profile, "AO0", None)
@@ -134,14 +133,14 @@ class TestText:
             pytest.approx(18 * 10 / 9600)
         )
 
-    def test_gap(self) -> None:
+    def test_gap(self):
         """TDK-Lambda's 5 ms come once a line."""
         time = exchange_time(load_profile("tdk_lambda_gen"), "current", "current")
         assert (time.gaps, time.gaps_s) == (2, 0.01)
         assert time.request_s == pytest.approx((13 + 7) * 10 / 9600)  # PC 38.000$XX, MC?$XX
         assert time.reply_s == pytest.approx((6 + 10) * 10 / 9600)  # OK$XX, 05.003$XX
 
-    def test_one_line(self) -> None:
+    def test_one_line(self):
         profile = load_profile("kepco_bop")
         one = exchange_time(profile, "current", "current")
         apart = profile.model_copy(update={"exchange": "none"})

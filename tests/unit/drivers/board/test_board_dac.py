@@ -225,7 +225,7 @@ def test_a_run_that_loses_the_board_leaves_by_the_one_way_out(board, fault):
 
 
 class TestBoards:
-    def test_serial(self) -> None:
+    def test_serial(self):
         profile = with_link(load_profile("cobs_board"), usb=False)
         framing = binary_framing("cobs", "crc16_ccitt_false")
         request, reply = 1 + 1 + 2 + 4, 1 + 1 + 1 + 2 + 4 + 2 + 2
@@ -234,14 +234,14 @@ class TestBoards:
         assert time.reply_s == pytest.approx(framing.wire_size(reply) * 10 / 115200)
         assert time.gaps_s == 0.0
 
-    def test_usb(self) -> None:
+    def test_usb(self):
         slow = load_profile("cobs_board")
         fast = with_link(slow, usb_frame_s=125e-6)
         assert exchange_time(slow).gaps_s == 1e-3
         assert exchange_time(fast).gaps_s == 125e-6
         assert exchange_time(with_link(slow, baud=9600)) == (exchange_time(slow))
 
-    def test_block(self) -> None:
+    def test_block(self):
         profile = load_profile("cobs_board_fifo")
         one, many = (exchange_time(profile, block) for block in (1, 100))
         assert many.samples == 100

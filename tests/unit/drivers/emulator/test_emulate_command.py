@@ -3,7 +3,6 @@
 import json
 import re
 import signal
-from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -17,7 +16,7 @@ from hilctl_drivers.emulator.emulate_command import (
     serve,
     wired_experiment,
 )
-from hilctl_drivers.emulator.factory import Emulator, build
+from hilctl_drivers.emulator.factory import build
 from hilctl_drivers.emulator.options import EmulatorOptions, parse_fault
 from hilctl_drivers.emulator.rig import SimulatedWiring
 from hilctl_drivers.emulator.server import EmulatorServer
@@ -38,7 +37,7 @@ CONFIGS = Path(__file__).parents[4] / "configs"
 def test_it_says_where_both_answer(profile, reader, options, places):
     told: list[ListenAddress] = []
 
-    def on_ready(places: Sequence[ListenAddress], emulator: Emulator) -> None:
+    def on_ready(places, emulator):
         told.extend(places)
         signal.raise_signal(signal.SIGTERM)
 
@@ -53,7 +52,7 @@ def ended_at_once(monkeypatch):
     """Let a signal end each emulator as soon as it answers."""
     run = EmulatorServer.run
 
-    def run_shortly(server: EmulatorServer) -> None:
+    def run_shortly(server):
         signal.raise_signal(signal.SIGTERM)
         run(server)
 

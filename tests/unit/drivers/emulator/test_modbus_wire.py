@@ -28,16 +28,16 @@ FLOAT32 = RegisterFormat("float32")
 
 
 @pytest.fixture
-def t7() -> ModbusWire:
+def t7():
     """An emulated T7 behind Modbus TCP."""
     return ModbusWire("tcp", {1: emulated_modbus("labjack_t7", "DAC0", "AIN0")})
 
 
-def requests(wire: ModbusWire, received: bytes) -> list[bytes]:
+def requests(wire, received):
     return list(wire.requests(bytearray(received)))
 
 
-def ask(wire: ModbusWire, pdu: bytes, now_ns: int = 0) -> bytes:
+def ask(wire, pdu, now_ns=0):
     """Send a request over TCP framing and return the checked reply's data."""
     (request,) = requests(wire, tcp_adu(7, 1, pdu))
     return reply_data(pdu, tcp_pdu(wire.answer(request, now_ns).data, 7, 1))
@@ -118,7 +118,7 @@ def test_units_share_a_line_and_a_rig():
     reads = EmulatedModbus(load_profile("adam_4117"), bench, None, "AI2")
     wire = ModbusWire("rtu", {1: drives, 2: reads})
 
-    def transact(unit: int, pdu: bytes, now_ns: int) -> bytes:
+    def transact(unit, pdu, now_ns):
         (request,) = requests(wire, rtu_adu(unit, pdu))
         return reply_data(pdu, rtu_pdu(wire.answer(request, now_ns).data, unit))
 

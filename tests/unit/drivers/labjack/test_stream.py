@@ -9,11 +9,7 @@ from hilctl.base.errors import DeviceError
 from hilctl_drivers.labjack import stream
 from hilctl_drivers.labjack.stream import ModbusFeedback
 from hilctl_drivers.modbus.pdu import ReadFrame, WriteFrame, feedback_pdu
-from hilctl_drivers.transport.links import (
-    BadRequestError,
-    MismatchError,
-    RefusedError,
-)
+from hilctl_drivers.transport.links import BadRequestError, MismatchError, RefusedError
 
 DOCUMENTED = {
     "SCANRATE_HZ": 4002, "NUM_ADDRESSES": 4004, "SETTLING_US": 4008, "RESOLUTION_INDEX": 4010,

@@ -24,7 +24,7 @@ SETTLE_S = 0.01
 """Of an M-7024's output."""
 
 
-def made(**changes) -> ModbusDac:
+def made(**changes):
     return ModbusDac(ModbusOptions.model_validate({**PAIR, **changes}))
 
 

@@ -23,14 +23,14 @@ READS = {"reader": READER, "input": "AI0"}
 
 
 @pytest.fixture
-def module(variant) -> str:
+def module(variant):
     """A profile for Modbus RTU, by path."""
     return variant(
         ("{kind: tcp, port: 502}", "{kind: rtu, baud: 115200}"), ("_s: 0.0005", "_s: 0.0")
     )
 
 
-def made(**changes) -> ModbusDac:
+def made(**changes):
     return ModbusDac(ModbusOptions.model_validate({**T7, **changes}))
 
 
@@ -152,11 +152,11 @@ class TestExchange:
         emulated, order = served.emulator.device, []
         read, write = emulated.read, emulated.write
 
-        def reading(areas: tuple[str, ...], address: int, count: int) -> list[int]:
+        def reading(areas, address, count):
             order.append(("read", address))
             return read(areas, address, count)
 
-        def writing(area: str, address: int, values: list[int]) -> None:
+        def writing(area, address, values):
             order.append(("write", address))
             write(area, address, values)
 
@@ -289,7 +289,7 @@ class TestWatchdog:
         emulated, written = served.emulator.device, []
         write = emulated.write
 
-        def noting(area: str, address: int, values: list[int]) -> None:
+        def noting(area, address, values):
             written.append(address)
             write(area, address, values)
 

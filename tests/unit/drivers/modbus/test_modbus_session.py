@@ -8,19 +8,11 @@ from hilctl.base.errors import DeviceError
 from hilctl_drivers.emulator.options import parse_fault
 from hilctl_drivers.modbus.config import ModbusOptions
 from hilctl_drivers.modbus.modbus_dac import ModbusDac
-from hilctl_drivers.modbus.modbus_profile import ModbusProfile
 from hilctl_drivers.modbus.modbus_session import ModbusSession, exchange_time, feed_time
-from hilctl_drivers.modbus.pdu import (
-    coil_pdu,
-    read_pdu,
-    reply_size,
-    rtu_adu,
-    write_single_pdu,
-)
+from hilctl_drivers.modbus.pdu import coil_pdu, read_pdu, reply_size, rtu_adu, write_single_pdu
 from hilctl_drivers.modbus.register_map import EnsureStep, ExpectStep, WriteStep
 from hilctl_drivers.profile import load_profile, parse_profile, with_link
 from hilctl_drivers.profile_base import WaitStep
-from hilctl_drivers.transport.wire_time import WireTime
 from tests.unit.drivers.modbus.conftest import exchange
 
 
@@ -212,13 +204,13 @@ def acme(feed=FEED, link="{kind: rtu, baud: 9600}"):
     return parse_profile(text, "acme.yaml")
 
 
-def rtu(baud: int = 115200, parity: str = "N", **link: object) -> ModbusProfile:
+def rtu(baud=115200, parity="N", **link):
     """Return a Modbus RTU device on a line, which exchanges in one transaction in no time."""
     fast = acme().model_copy(update={"exchange": 23, "turnaround_s": 0.0})
     return with_link(fast, baud=baud, parity=parity, **link)
 
 
-def wire_s(time: WireTime) -> float:
+def wire_s(time):
     """Return the time of the characters alone."""
     return time.request_s + time.reply_s
 
@@ -227,7 +219,7 @@ class TestRtu:
     """Modbus RTU, against a table worked out by hand: two float32 registers each way."""
 
     @pytest.mark.parametrize("column", range(4))
-    def test_characters(self, column: int) -> None:
+    def test_characters(self, column):
         profile = rtu(*LINES[column])
         both = exchange_time(profile, "AO", "AI", one_transaction=False)
         write = exchange_time(profile, "AO", None)
@@ -242,14 +234,14 @@ class TestRtu:
             assert found[function] * 1e3 == pytest.approx(row[column], rel=0.03), function
 
     @pytest.mark.parametrize("column", range(4))
-    def test_rate(self, column: int) -> None:
+    def test_rate(self, column):
         baud, parity = LINES[column]
         gaps = exchange_time(rtu(baud, parity), "AO", "AI")
         none = exchange_time(rtu(baud, parity, gap_s=0.0), "AO", "AI")
         assert gaps.highest_rate_hz == pytest.approx(TABLE_HZ["gaps"][column], rel=0.03)
         assert none.highest_rate_hz == pytest.approx(TABLE_HZ["none"][column], rel=0.03)
 
-    def test_two_transactions(self) -> None:
+    def test_two_transactions(self):
         profile = load_profile("icp_m7024")
         one = exchange_time(profile, "AO0", None)
         two = exchange_time(rtu(), "AO", "AI", one_transaction=False)
@@ -257,13 +249,13 @@ class TestRtu:
         assert one.turnaround_s == profile.turnaround_s
         assert str(two).startswith("FC03+FC16 at 115200 8N1: request ")
 
-    def test_text(self) -> None:
+    def test_text(self):
         assert str(exchange_time(rtu(), "AO", "AI")) == (
             "FC23 at 115200 8N1: request 1.48 ms, reply 0.78 ms, 2 gaps 3.50 ms,"
             " turnaround 0.00 ms -> at most 174 Hz"
         )
 
-    def test_stop_bits(self) -> None:
+    def test_stop_bits(self):
         one, two = rtu(gap_s=0.0), rtu(gap_s=0.0, stopbits=2)
         ratio = exchange_time(two, "AO", "AI").total_s / exchange_time(one, "AO", "AI").total_s
         assert ratio == pytest.approx(11 / 10)

@@ -6,12 +6,7 @@ import struct
 
 import pytest
 
-from hilctl_drivers.modbus.register_map import (
-    Channel,
-    Register,
-    RegisterFormat,
-    wire_address,
-)
+from hilctl_drivers.modbus.register_map import Channel, Register, RegisterFormat, wire_address
 from hilctl_drivers.transport.links import BadRequestError, FrameError, MismatchError
 
 CODES = {"int16": "h", "uint16": "H", "int32": "i", "uint32": "I", "float32": "f", "float64": "d"}

@@ -9,10 +9,7 @@ import tty
 import pytest
 
 from hilctl.base.errors import DeviceError
-from hilctl_drivers.transport.links import (
-    LostError,
-    NoAnswerError,
-)
+from hilctl_drivers.transport.links import LostError, NoAnswerError
 from hilctl_drivers.transport.serial_port import SerialLink, SerialSettings
 from tests.fakes import received
 from tests.unit.drivers.transport.conftest import (

@@ -18,7 +18,7 @@ XOFF, XON = b"\x13", b"\x11"
 
 
 @pytest.fixture
-def levels(monkeypatch) -> list[tuple[str, bool]]:
+def levels(monkeypatch):
     """Return a list of what the kernel is asked for: a modem line and its level."""
     names = {termios.TIOCM_DTR: "dtr", termios.TIOCM_RTS: "rts"}
     real, asked = fcntl.ioctl, []
