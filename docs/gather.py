@@ -125,6 +125,7 @@ def _table(part: dict[str, Any]) -> str:
     rows = ["| key | value | default | meaning |", "|---|---|---|---|"]
     for key, value in part["properties"].items():
         meaning = value.get("description") or said.get(key, "")
+        meaning = meaning or ("selects this section" if key == "kind" else "")
         default = "*required*" if key in part.get("required", ()) else _default(value)
         rows.append(f"| `{key}` | {_values(value)} | {default} | {_plain(meaning)} |")
     return "\n".join(rows) + "\n"
@@ -149,7 +150,9 @@ def _values(value: dict[str, Any]) -> str:
     if "const" in value:
         return f"`{value['const']}`"
     if "enum" in value:
-        return ", ".join(f"`{each}`" for each in value["enum"])
+        return ", ".join(
+            f"`{str(each).encode('unicode_escape').decode()}`" for each in value["enum"]
+        )
     for choice in ("anyOf", "oneOf"):
         if choice in value:
             found = [_values(each) for each in value[choice] if each.get("type") != "null"]

@@ -193,7 +193,7 @@ class DacDevice(ABC):
 
     @abstractmethod
     def _put_out(self, command: float) -> None:
-        """Attempt once to put out a command in range, open or not; :meth:`_release` follows."""
+        """Try once to apply a command in range, open or not; :meth:`_release` follows."""
 
     @abstractmethod
     def _close(self) -> None:

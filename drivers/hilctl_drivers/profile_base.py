@@ -12,37 +12,38 @@ from hilctl_drivers.transport.serial_port import SerialSettings
 
 
 class LinkSettings(StrictModel):
-    """What all links have: a kind, which tells the protocol."""
+    """Settings of every link; ``kind`` selects the protocol."""
 
     kind: str
 
 
 class SerialLineSettings(LinkSettings):
-    """What all serial lines have."""
+    """Settings of every serial line."""
 
-    baud: int = Field(ge=300, le=12_000_000, description="as shipped; the experiment may change it")
+    baud: int = Field(
+        ge=300, le=12_000_000, description="baud as shipped; the experiment may change it"
+    )
     bauds: tuple[int, ...] = Field(
         default=(),
-        description="others that the device can be set to, no others may be asked for; left out:"
-        " nobody knows",
+        description="other bauds that the device supports; if omitted, any baud is accepted",
     )
-    bytesize: Literal[7, 8] = 8
-    parity: Literal["N", "E", "O"] = "N"
-    stopbits: Literal[1, 2] = 1
+    bytesize: Literal[7, 8] = Field(default=8, description="data bits per character")
+    parity: Literal["N", "E", "O"] = Field(default="N", description="none, even or odd parity")
+    stopbits: Literal[1, 2] = Field(default=1, description="stop bits per character")
     boot_wait_s: float = Field(
-        default=0.0, ge=0.0, le=30.0, description="silence after opening the port, s"
+        default=0.0, ge=0.0, le=30.0, description="wait after opening the port, s"
     )
     flow: Literal["none", "xonxoff"] = Field(
         default="none",
-        description="xonxoff: bytes 0x11 and 0x13 hold the line and let it go, for lines of text",
+        description="xonxoff: bytes 0x13 and 0x11 pause and resume the data, for lines of text",
     )
     dtr: bool | None = Field(
         default=None,
-        description="level to hold DTR at; left out: raised, as opening the port does",
+        description="level of DTR; if omitted, raised when the port is opened",
     )
     rts: bool | None = Field(
         default=None,
-        description="level to hold RTS at; left out: raised, as opening the port does",
+        description="level of RTS; if omitted, raised when the port is opened",
     )
 
     @property
@@ -76,9 +77,7 @@ class BinaryLineSettings(SerialLineSettings):
     @model_validator(mode="after")
     def _all_bytes_pass(self) -> Self:
         if self.flow != "none":
-            raise ValueError(
-                f"flow must be none where bytes 0x11 and 0x13 are data, got {self.flow}"
-            )
+            raise ValueError(f"flow must be none if bytes 0x11 and 0x13 are data, got {self.flow}")
         return self
 
 
@@ -87,19 +86,19 @@ Name: TypeAlias = Annotated[str, StringConstraints(pattern=r"^[A-Za-z][A-Za-z0-9
 
 
 class Range(StrictModel):
-    """What a channel means at the terminals.
+    """Range of a channel at its terminals.
 
-    ``min`` and ``max`` are what the device outputs or takes in, not what its register could hold.
+    ``min`` and ``max`` are the limits of the output or input, not those of its register.
     """
 
-    unit: Literal["V", "A", "mA"] = Field(description="unit of min, max and of the value")
-    min: float = Field(description="lowest value that the device puts out or reads, in unit")
-    max: float = Field(description="highest value that the device puts out or reads, in unit")
+    unit: Literal["V", "A", "mA"] = Field(description="unit of the value, min and max")
+    min: float = Field(description="lowest value of the output or input, in unit")
+    max: float = Field(description="highest value of the output or input, in unit")
     resolution: float | None = Field(default=None, gt=0.0, description="smallest step, in unit")
     settle_s: float = Field(
         default=0.0,
         ge=0.0,
-        description="time it takes to settle, s; a sample period is longer by that",
+        description="settling time, s; lengthens the sample period",
     )
 
     @model_validator(mode="after")
@@ -115,18 +114,18 @@ class Range(StrictModel):
 
 
 class Watchdog(StrictModel):
-    """The device's own host watchdog: what it does when this machine falls silent."""
+    """The device's own host watchdog, which trips if the host stops sending."""
 
-    unit_s: float = Field(gt=0.0, description="one count of the device's timeout, s")
-    min_s: float = Field(gt=0.0, description="shortest timeout it takes, s")
-    max_s: float = Field(gt=0.0, description="longest timeout it takes, s")
+    unit_s: float = Field(gt=0.0, description="duration of one count of the timeout, s")
+    min_s: float = Field(gt=0.0, description="shortest accepted timeout, s")
+    max_s: float = Field(gt=0.0, description="longest accepted timeout, s")
     kick: Literal["any", "write", "strict"] = Field(
-        description="what feeds it: any request, a write, or only the feed steps"
+        description="requests that feed it: any, write, or only the feed steps (strict)"
     )
     on_trip: Literal["safe", "zero", "hold", "reset", "unknown"] = Field(
-        description="what the outputs do: go to the safe value, to 0, stay, or the device restarts"
+        description="outputs after a trip: safe value, zero, held, or reset of the device"
     )
-    refuses_while_tripped: bool = Field(description="whether it refuses commands until cleared")
+    refuses_while_tripped: bool = Field(description="whether a trip blocks commands until cleared")
 
     @model_validator(mode="after")
     def _span(self) -> Self:
@@ -151,36 +150,40 @@ class Watchdog(StrictModel):
 
 
 class WaitStep(StrictModel):
-    """Let the device settle."""
+    """Wait for the device to settle."""
 
     kind: Literal["wait"]
-    seconds: float = Field(gt=0.0, le=60.0, description="how long, s")
-    note: str = ""
+    seconds: float = Field(gt=0.0, le=60.0, description="duration, s")
+    note: str = Field(default="", description="comment")
 
 
 class BaseProfile(StrictModel):
-    """What every profile says of a device, whatever it speaks.
+    """Keys of every profile, for any protocol.
 
-    Subclasses narrow ``link``, ``outputs``, ``inputs`` and ``watchdog`` to their protocol's.
+    Subclasses narrow ``link``, ``outputs``, ``inputs`` and ``watchdog`` to their protocol.
 
     Attributes:
-        DEVICE: The kind of device in an experiment that such profiles are for.
+        DEVICE: Device kind of an experiment that uses such a profile.
     """
 
     DEVICE: ClassVar[str]
 
-    vendor: Text
+    vendor: Text = Field(description="manufacturer")
     model: Text = Field(description="model, as ordered")
-    source: tuple[Text, ...] = Field(min_length=1, description="documents this was taken from")
+    source: tuple[Text, ...] = Field(
+        min_length=1, description="documents that the profile is based on"
+    )
     verified: Literal["yes", "partly", "no"] = Field(
-        description="whether the source was seen to say all, some or none of this"
+        description="whether the source confirms all, some or none of the values"
     )
     unverified: tuple[Text, ...] = Field(
-        default=(), description="dotted keys of this file that no document was seen for"
+        default=(), description="dotted keys of this file that no document confirms"
     )
-    notes: tuple[Text, ...] = Field(default=(), description="what a user must know before wiring")
-    turnaround_s: float = Field(ge=0.0, le=1.0, description="request received to reply begun, s")
-    max_rate_hz: float = Field(gt=0.0, description="highest sample rate that makes sense, Hz")
+    notes: tuple[Text, ...] = Field(default=(), description="what to know before wiring")
+    turnaround_s: float = Field(
+        ge=0.0, le=1.0, description="time from request to start of reply, s"
+    )
+    max_rate_hz: float = Field(gt=0.0, description="highest useful sample rate, Hz")
     link: LinkSettings
     outputs: Mapping[Name, Range]
     inputs: Mapping[Name, Range]
@@ -200,7 +203,7 @@ class BaseProfile(StrictModel):
         if not self.outputs and not self.inputs:
             raise ValueError("must have outputs or inputs, or both")
         if self.watchdog != "none" and not self.outputs:
-            raise ValueError("watchdog must be none where there are no outputs to make safe")
+            raise ValueError("watchdog must be none if there are no outputs")
         return self
 
     @property

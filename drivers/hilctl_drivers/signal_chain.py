@@ -19,7 +19,7 @@ from hilctl_drivers.profile import ProfileName
 from hilctl_drivers.profile_base import Range, Watchdog
 from hilctl_drivers.transport.wire_time import RateLimit
 
-PROFILE = "name of a shipped profile, or path of your own, from the experiment's folder"
+PROFILE = "name of a shipped profile, or path of your own relative to the experiment's folder"
 
 _Channel = TypeVar("_Channel", bound=Range)
 _Value = TypeVar("_Value", float, F64)
@@ -27,14 +27,14 @@ _GAINS = ("gain_a_per_v", "gain_a_per_ma", "gain_v_per_v", "gain_v_per_ma")
 
 
 class Amplifier(StrictModel):
-    """The power amplifier after the output; one of the gains."""
+    """The power amplifier at the output; set one gain."""
 
-    gain_a_per_v: float | None = Field(default=None, description="coil current of one volt")
-    gain_a_per_ma: float | None = Field(default=None, description="coil current of one milliampere")
-    gain_v_per_v: float | None = Field(default=None, description="drive voltage of one volt")
-    gain_v_per_ma: float | None = Field(default=None, description="drive voltage of one mA")
-    offset_a: float = Field(default=0.0, description="coil current at 0 of the output")
-    offset_v: float = Field(default=0.0, description="drive voltage at 0 of the output")
+    gain_a_per_v: float | None = Field(default=None, description="coil current per volt, A/V")
+    gain_a_per_ma: float | None = Field(default=None, description="coil current per mA, A/mA")
+    gain_v_per_v: float | None = Field(default=None, description="drive voltage per volt, V/V")
+    gain_v_per_ma: float | None = Field(default=None, description="drive voltage per mA, V/mA")
+    offset_a: float = Field(default=0.0, description="coil current at output 0, A")
+    offset_v: float = Field(default=0.0, description="drive voltage at output 0, V")
 
     @model_validator(mode="after")
     def _one_gain(self) -> Self:
@@ -71,11 +71,11 @@ class Amplifier(StrictModel):
 
 
 class Sensor(StrictModel):
-    """The displacement sensor before the input; one of the sensitivities."""
+    """The displacement sensor at the input; set one sensitivity."""
 
-    um_per_v: float | None = Field(default=None, description="displacement of one volt, um")
-    um_per_ma: float | None = Field(default=None, description="displacement of one mA, um")
-    offset_um: float = Field(default=0.0, description="displacement at 0 of the input, um")
+    um_per_v: float | None = Field(default=None, description="displacement per volt, um/V")
+    um_per_ma: float | None = Field(default=None, description="displacement per mA, um/mA")
+    offset_um: float = Field(default=0.0, description="displacement at input 0, um")
 
     @model_validator(mode="after")
     def _one_sensitivity(self) -> Self:
@@ -96,38 +96,38 @@ class Sensor(StrictModel):
 
 
 class Calibration(StrictModel):
-    """When and by whom gain and sensitivity were found; kept with each recording."""
+    """Calibration of gain and sensitivity; kept with each recording."""
 
-    date: str = Field(description="day of the calibration")
-    by: str = Field(description="who did it")
-    reference: str = Field(description="against what, or where it is written down")
+    date: str = Field(description="date of the calibration")
+    by: str = Field(description="person who calibrated")
+    reference: str = Field(description="reference standard, or document")
 
 
 class WatchdogOptions(StrictModel):
-    """What the device does by itself when this machine falls silent."""
+    """The device's own watchdog, which trips if the host stops sending."""
 
-    timeout_s: float = Field(gt=0.0, description="silence after which it acts, s")
+    timeout_s: float = Field(gt=0.0, description="silence before a trip, s")
     safe_command: float = Field(
-        default=0.0, description="where it puts the output, in the command's unit"
+        default=0.0, description="command after a trip, in the command's unit"
     )
     reason: str = Field(
         default="",
-        description="why safe_command is not the experiment's safe value, where it isn't",
+        description="reason for a safe_command other than the experiment's safe value",
     )
 
 
 class ReaderOptions(StrictModel):
-    """The device that has the input, where it is another one."""
+    """The device with the input, if it is another one."""
 
     profile: ProfileName = Field(description=PROFILE)
     serial_port: str | None = Field(
-        default=None, description="its device file; left out where it is on the same line"
+        default=None, description="device file; omitted if on the same line"
     )
     unit_id: int | None = Field(
-        default=None, ge=0, le=255, description="its address on a shared line; else its profile's"
+        default=None, ge=0, le=255, description="address on a shared line; default: the profile's"
     )
     baud: int | None = Field(
-        default=None, ge=300, description="of its own line; else its profile's"
+        default=None, ge=300, description="baud of its own line; default: the profile's"
     )
 
     @model_validator(mode="after")
@@ -142,40 +142,42 @@ FifoBlocks: TypeAlias = Annotated[
     Field(
         ge=1,
         le=1024,
-        description="blocks kept in the FIFO of a device that streams: what a stall of this machine"
-        " may last, and by how much displacements come later",
+        description="blocks kept in the FIFO of a streaming device: the longest stall of the host,"
+        " and the delay of the displacements",
     ),
 ]
 
 
 class DacOptions(DeviceOptions):
-    """Options of every DAC that has a profile."""
+    """Options of every DAC with a profile."""
 
     profile: ProfileName = Field(description=PROFILE)
     serial_port: str | None = Field(
-        default=None, description="device file; best under /dev/serial/by-id"
+        default=None, description="device file, preferably under /dev/serial/by-id"
     )
-    baud: int | None = Field(default=None, ge=300, description="else the profile's")
-    parity: Literal["N", "E", "O"] | None = Field(default=None, description="else the profile's")
-    stopbits: Literal[1, 2] | None = Field(default=None, description="else the profile's")
+    baud: int | None = Field(default=None, ge=300, description="default: the profile's")
+    parity: Literal["N", "E", "O"] | None = Field(
+        default=None, description="default: the profile's"
+    )
+    stopbits: Literal[1, 2] | None = Field(default=None, description="default: the profile's")
     unit_id: int | None = Field(
-        default=None, ge=0, le=255, description="address on a shared line; else the profile's"
+        default=None, ge=0, le=255, description="address on a shared line; default: the profile's"
     )
     output: str = Field(description="output that drives the actuator")
-    input: str = Field(description="input that the displacement sensor is wired to")
+    input: str = Field(description="input of the displacement sensor")
     reader: ReaderOptions | None = Field(
-        default=None, description="the device that has the input, where it is another one"
+        default=None, description="device with the input, if it is another one"
     )
     timeout_s: float = Field(
-        default=0.1, gt=0.0, le=60.0, description="longest wait for one answer, s"
+        default=0.1, gt=0.0, le=60.0, description="longest wait for a reply, s"
     )
     amplifier: Amplifier | None = Field(
-        default=None, description="left out only where the output is in A and drives the coil"
+        default=None, description="omitted only if the output is in A and drives the coil"
     )
-    sensor: Sensor
-    calibration: Calibration | None = None
+    sensor: Sensor = Field(description="displacement sensor")
+    calibration: Calibration | None = Field(default=None, description="last calibration")
     watchdog: WatchdogOptions | Literal["none"] = Field(
-        description="the device's own; none says that you know it would hold its last output"
+        description="the device's own; none if the device may hold its last output"
     )
 
     @property

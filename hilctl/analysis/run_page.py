@@ -160,7 +160,7 @@ def _events(events: Sequence[Event]) -> list[str]:
         return []
     rows = [(str(e.sample), e.level, e.code, e.text) for e in events[-_MOST_EVENTS:]]
     left_out = len(events) - len(rows)
-    note = [html.paragraph(f"The first {left_out} are left out.")] if left_out else []
+    note = [html.paragraph(f"The first {left_out} are omitted.")] if left_out else []
     return ["<h2>Events</h2>", *note, html.grid(("sample", "level", "code", "text"), rows)]
 
 

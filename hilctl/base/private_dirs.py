@@ -59,7 +59,9 @@ def private_folder(path: Path, *, make: bool = True) -> Path:
     finally:
         os.close(descriptor)
     if found.st_uid != os.geteuid() or found.st_mode & 0o022:
-        raise PermissionError(errno.EPERM, "must be yours, and writable by nobody else", str(path))
+        raise PermissionError(
+            errno.EPERM, "must be yours, and not writable by other users", str(path)
+        )
     return path
 
 

@@ -35,9 +35,9 @@ class Safe(StrictModel):
 
     Attributes:
         value: Command of the safe state, in the device's unit.
-        ramp_s: Duration of the ramp from the largest allowed command.
-        at_start: Output before the run in the device's unit, for a device that cannot report it:
-            the run ramps from there to the safe value before its waveform.
+        ramp_s: Duration of the safe ramp from the largest allowed command.
+        at_start: Output before the run in the device's unit, for a device that cannot report it.
+            The run ramps from there to the safe value before its waveform.
     """
 
     value: float = 0.0
@@ -51,7 +51,7 @@ class CompensatorConfig(StrictModel):
     Attributes:
         model: Model file, relative to the experiment file's folder.
         correction: Correction file of ``hilctl learn`` for this waveform, relative to the same
-            folder; None for no correction.
+            folder. Default: none.
         initial_state: Initial state without a condition: ``last`` for the state after the last run
             of this device, ``rest``, or the recording of an earlier run, relative to the same
             folder. A lead-in of ``safe.ramp_s`` connects it to the reference.
@@ -72,15 +72,15 @@ class Experiment(StrictModel):
     Attributes:
         name: Short name, part of the recording's file name.
         description: Purpose in words.
-        labels: Labels to find the run by, such as operator, sample or temperature.
+        labels: Labels for searches of runs, such as operator, sample or temperature.
         device: ``kind`` and the device's own options.
         sample_rate_hz: Samples per second.
         block: Samples exchanged in one tick; more than 1 needs a device with a FIFO.
         waveform: The reference.
-        compensator: ``none``, read as None, or the model to invert.
-        condition: Cycle before the waveform that erases the history of the actuator, or None.
-        feedback: Controller around the compensator, or None.
-        adaptation: Adaptation of the compensator's model during the run, or None.
+        compensator: ``none``, or the model to invert.
+        condition: Cycle before the waveform that erases the history of the actuator. Default: none.
+        feedback: Controller around the compensator. Default: none.
+        adaptation: Adaptation of the compensator's model during the run. Default: none.
         limits: Limits of the run.
         safe: The safe value, and the safe ramp to it.
         timing: Policy for late ticks.

@@ -41,9 +41,7 @@ def _interval(value: Any) -> Any:
 Name = Annotated[
     str, AfterValidator(_name), WithJsonSchema({"type": "string", "pattern": f"^{_NAME}$"})
 ]
-Interval = Annotated[
-    tuple[float, float], BeforeValidator(_interval), Field(description="lowest, highest")
-]
+Interval = Annotated[tuple[float, float], BeforeValidator(_interval)]
 
 
 class Timing(StrictModel):
@@ -122,7 +120,8 @@ class Condition(StrictModel):
         amplitude_a: Amplitude of the first cycle, for devices driven in A, cut off at the limits.
             Default: up to the limits.
         amplitude_v: The same for devices driven in V.
-        frequency_hz: Default: 10 Hz, or less if the slew limit or the sample rate requires it.
+        frequency_hz: Frequency. Default: 10 Hz, or less if the slew limit or the sample rate
+            requires it.
         cycles: Number of cycles.
         decay: Ratio of the amplitudes of consecutive cycles; 1 for a linear decay.
         rest_s: Rest at the safe value after it; its second half gives the mean displacement.
@@ -137,20 +136,21 @@ class Condition(StrictModel):
 
 
 class _AnyFeedback(StrictModel):
-    """Keys of every kind of feedback.
+    """Keys of every kind of feedback."""
 
-    Attributes:
-        limit_um: Largest correction of the compensator's input, either sign.
-        sensor_delay_s: Delay of the sensor and its line that is not in the model.
-        resonance_hz: Lowest natural frequency of the actuator with its load; the bandwidth must be
-            well below it. Default: that of the model's structure.
-        damping_ratio: Damping of that resonance.
-    """
-
-    limit_um: Annotated[float, Field(gt=0.0)]
-    sensor_delay_s: Annotated[float, Field(ge=0.0)] = 0.0
-    resonance_hz: Annotated[float, Field(gt=0.0)] | None = None
-    damping_ratio: Annotated[float, Field(gt=0.0, le=2.0)] | None = None
+    limit_um: float = Field(gt=0.0, description="largest correction of the compensator's input, um")
+    sensor_delay_s: float = Field(
+        default=0.0, ge=0.0, description="delay of the sensor and its line beyond the model's, s"
+    )
+    resonance_hz: float | None = Field(
+        default=None,
+        gt=0.0,
+        description="lowest natural frequency of the actuator with its load, well above the"
+        " bandwidth, Hz; default: that of the model's structure",
+    )
+    damping_ratio: float | None = Field(
+        default=None, gt=0.0, le=2.0, description="damping ratio at resonance_hz"
+    )
 
 
 class PiFeedbackConfig(_AnyFeedback):
@@ -176,7 +176,7 @@ class PiFeedbackConfig(_AnyFeedback):
 
 
 class IntegralFeedbackConfig(_AnyFeedback):
-    """An integrator of the mean error of each block, for every device: see loop/feedback.py.
+    """An integrator of the mean error of each block, for every device (loop/feedback.py).
 
     Attributes:
         bandwidth_hz: Frequency below which offset, creep and drift are corrected; a step
@@ -188,17 +188,17 @@ class IntegralFeedbackConfig(_AnyFeedback):
 
 
 class AdaptationConfig(StrictModel):
-    """Slow adaptation of the compensator's model by the tracking error: see loop/adaptation.py.
+    """Slow adaptation of the compensator's model by the tracking error (loop/adaptation.py).
 
     Attributes:
         time_constant_s: Time in which the model error decays to 1/e.
         offset_um: Largest adapted offset. Default: a tenth of ``limits.stroke_um``, or 0 with
             feedback, which corrects the offset itself.
         gain: Largest change of the gain, relative to the identified one.
-        weight: Largest weight of each of the plays after the model, in the same way.
+        weight: Largest weight of each play after the model, relative to the identified gain.
         noise_um: Standard deviation of the sensor's noise, for the dead zone. Default: that of the
             rest before the waveform (``condition`` or ``compensator.offset: measured``).
-        sensor_delay_s: See ``feedback``.
+        sensor_delay_s: Delay of the sensor and its line beyond the model's.
     """
 
     time_constant_s: Annotated[float, Field(gt=0.0, le=3600.0)] = 1.0
@@ -220,16 +220,17 @@ FeedbackConfig: TypeAlias = Annotated[
 
 
 class Limits(InterlockSettings):
-    """Limits of the run for the limiter, which is last before the device, and the interlocks.
+    """Limits of the run, for the limiter (the last block before the device) and the interlocks.
 
     Attributes:
-        peak_current_a: Largest magnitude of the coil current, for devices driven in A.
-        drive_a: Lowest and highest coil current, instead of ``peak_current_a``: for supplies of one
-            sign.
-        slew_a_per_s: Fastest change of the coil current.
-        drive_v: Lowest and highest drive voltage, for devices driven in V.
-        slew_v_per_s: Fastest change of the drive voltage.
-        stroke_um: Range of measured displacements; outside, the run ends with its safe ramp.
+        peak_current_a: Largest magnitude of the coil current, A, for devices driven in A.
+        drive_a: Lowest and highest coil current, A, instead of ``peak_current_a``: for supplies of
+            one sign.
+        slew_a_per_s: Fastest change of the coil current, A/s.
+        drive_v: Lowest and highest drive voltage, V, for devices driven in V.
+        slew_v_per_s: Fastest change of the drive voltage, V/s.
+        stroke_um: Lowest and highest measured displacement, um; outside, the run ends with its safe
+            ramp.
     """
 
     peak_current_a: Annotated[float, Field(gt=0.0)] | None = None

@@ -18,7 +18,7 @@ class InterlockFlag(IntFlag):
     SENSOR_FROZEN = 64
     """The displacement had not changed for too long while the command moved."""
     DEVIATION = 128
-    """The measured command was too far from the one put out for too long, or was lost."""
+    """The measured command was too far from the applied one for too long, or was lost."""
     THERMAL = 256
     """The thermal budget of the coil was used up."""
     TRACKING_ERROR = 512

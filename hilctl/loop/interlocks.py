@@ -66,39 +66,40 @@ class InterlockSettings(StrictModel):
         _Positive | None, InterlockRequirement("A", "thermal_time_constant_s")
     ] = Field(
         default=None,
-        description="largest running rms of the coil current, commanded or measured, A; a run"
-        " begins with what the last run of its device has left of the coil's heat",
+        description="largest running rms of the coil current, commanded or measured, A; includes"
+        " the coil's heat from the last run of the device",
     )
     thermal_time_constant_s: Annotated[
         _Positive | None, InterlockRequirement("A", "rms_current_a")
-    ] = Field(default=None, description="time constant of the coil's heating, s")
+    ] = Field(default=None, description="thermal time constant of the coil, s")
     tracking_error_um: Annotated[_Positive | None, InterlockRequirement(reference_um=True)] = Field(
         default=None, description="largest |reference - displacement| of a compensated run, um"
     )
     tracking_s: Annotated[_NotNegative | None, InterlockRequirement(key="tracking_error_um")] = (
-        Field(default=None, description="time for which it may be larger, s; 0 where not given")
+        Field(default=None, description="time for which the error may be larger, s; default: 0")
     )
     frozen_s: _Positive | None = Field(
         default=None,
-        description="time for which the displacement may stay the same after the command has moved"
+        description="time for which the displacement may stay constant after the command has moved"
         " by 2 % of its range, s",
     )
     frozen_um: Annotated[_NotNegative | None, InterlockRequirement(key="frozen_s")] = Field(
         default=None,
-        description="largest change of the displacement that counts as none, um; 0 where not given",
+        description="largest change of the displacement that counts as constant, um; default: 0",
     )
     measured_deviation_a: Annotated[_Positive | None, InterlockRequirement("A", measured=True)] = (
         Field(
-            default=None, description="largest distance of the measured current from the command, A"
+            default=None,
+            description="largest deviation of the measured current from the command, A",
         )
     )
     measured_deviation_v: Annotated[_Positive | None, InterlockRequirement("V", measured=True)] = (
         Field(
-            default=None, description="largest distance of the measured drive from the command, V"
+            default=None, description="largest deviation of the measured drive from the command, V"
         )
     )
     deviation_s: Annotated[_NotNegative | None, InterlockRequirement(key="measured_deviation")] = (
-        Field(default=None, description="time for which it may be larger, s; 0 where not given")
+        Field(default=None, description="time for which the deviation may be larger, s; default: 0")
     )
 
     @property

@@ -43,7 +43,7 @@ _DESCRIPTIONS: dict[OutputState, str] = {
     "confirmed": "the output is at its safe value, confirmed by the device",
     "set": "the safe value is set, but not yet confirmed to hold: "
     "an older command that was never answered may still be executed",
-    "sent": "the safe value was sent, but could not be confirmed by this device",
+    "sent": "the safe value was sent, but could not be confirmed: this device cannot report it",
     "unknown": "the safe value could not be confirmed",
 }
 

@@ -41,8 +41,8 @@ class Realtime(StrictModel):
     """Real-time settings of the loop process.
 
     Attributes:
-        priority: Its SCHED_FIFO priority.
-        cpu: CPU that it runs on; ``none``: the first isolated one, otherwise any.
+        priority: SCHED_FIFO priority of the loop process.
+        cpu: CPU of the loop process; ``none`` for the first isolated one, otherwise any.
         require: Whether to refuse a run without SCHED_FIFO and locked memory.
     """
 

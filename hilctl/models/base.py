@@ -228,7 +228,7 @@ class HysteresisModel(CheckedModel, ABC):
         """Number of operators with memory."""
 
     def to_mapping(self) -> dict[str, Any]:
-        """Return the parameters as plain mappings, lists and numbers, defaults left out."""
+        """Return the parameters as plain mappings, lists and numbers, defaults omitted."""
         return self.model_dump(mode="json", exclude_defaults=True, exclude_none=True)
 
 

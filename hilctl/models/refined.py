@@ -263,5 +263,5 @@ class RefinedModel(HysteresisModel):
         )
 
     def to_mapping(self) -> dict[str, Any]:
-        """Return the parameters as plain mappings, lists and numbers, defaults left out."""
+        """Return the parameters as plain mappings, lists and numbers, defaults omitted."""
         return super().to_mapping() | {"base": {"kind": self.base.kind, **self.base.to_mapping()}}

@@ -179,7 +179,7 @@ class StagedModel(HysteresisModel):
         return whole, part if part > _WHOLE else 0.0
 
     def to_mapping(self) -> dict[str, Any]:
-        """Return the parameters as plain mappings, lists and numbers, defaults left out."""
+        """Return the parameters as plain mappings, lists and numbers, defaults omitted."""
         mapping = super().to_mapping()
         kind = self.hysteresis.kind
         return mapping | {"hysteresis": {"kind": kind, **self.hysteresis.to_mapping()}}

@@ -226,7 +226,7 @@ class Contents:
 
     Attributes:
         indexes: Channel id to the expected bytes of its message index.
-        unread: Messages that are left out of ``records``.
+        unread: Messages omitted from ``records``.
     """
 
     records: tuple[McapRecord, ...]

@@ -9,9 +9,14 @@ from typing import Annotated, Any, Literal, TypeAlias
 
 from hilctl.base.strict import AfterValidator, Field, StrictModel, ValidationInfo, field_validator
 
+UNIT = "unit of every amplitude, offset and level"
 WaveformUnit: TypeAlias = Literal["um", "A", "V"]
 Positive: TypeAlias = Annotated[float, Field(gt=0.0)]
 NotNegative: TypeAlias = Annotated[float, Field(ge=0.0)]
+Amplitude: TypeAlias = Annotated[Positive, Field(description="amplitude, in unit")]
+Frequency: TypeAlias = Annotated[Positive, Field(description="frequency, Hz")]
+Phase: TypeAlias = Annotated[float, Field(description="phase at the start, degrees")]
+Duration: TypeAlias = Annotated[Positive, Field(description="duration, s")]
 
 MAX_SINES = 10_000
 """Largest number of sines in a multisine."""
@@ -30,91 +35,100 @@ def _not_below_first(last_hz: float, info: ValidationInfo) -> float:
     return last_hz
 
 
-LastFrequency: TypeAlias = Annotated[Positive, AfterValidator(_not_below_first)]
+FirstFrequency: TypeAlias = Annotated[Positive, Field(description="lowest frequency, Hz")]
+LastFrequency: TypeAlias = Annotated[
+    Positive, AfterValidator(_not_below_first), Field(description="highest frequency, Hz")
+]
 NotEmpty = AfterValidator(_not_empty)
 AtLeastOne = Field(json_schema_extra={"minItems": 1})
 
 
 class _Shape(StrictModel):
-    """Keys of every kind of waveform.
+    """Keys of every kind of waveform."""
 
-    Attributes:
-        unit: Unit of every amplitude, offset and level.
-        offset: Constant added to the waveform.
-        rest: Value before a soft start and after a soft end.
-        soft_start_s: Duration of the fade from ``rest``, offset included.
-        soft_end_s: Duration of the fade back. Both are part of the waveform's duration.
-    """
-
-    unit: WaveformUnit | None = Field(default=None, description="um, A or V")
-    offset: float = 0.0
-    rest: float = 0.0
-    soft_start_s: NotNegative = 0.0
-    soft_end_s: NotNegative = 0.0
+    unit: WaveformUnit | None = Field(default=None, description=UNIT)
+    offset: float = Field(default=0.0, description="constant added to the waveform, in unit")
+    rest: float = Field(
+        default=0.0, description="value before a soft start and after a soft end, in unit"
+    )
+    soft_start_s: NotNegative = Field(
+        default=0.0,
+        description="duration of the fade from rest, offset included, s; part of the waveform's"
+        " duration",
+    )
+    soft_end_s: NotNegative = Field(
+        default=0.0, description="duration of the fade to rest, s; part of the waveform's duration"
+    )
 
 
 class Sine(_Shape):
     """``offset + amplitude sin(2 pi frequency t + phase)``."""
 
     kind: Literal["sine"]
-    amplitude: Positive
-    frequency_hz: Positive
-    phase_deg: float = 0.0
-    duration_s: Positive
+    amplitude: Amplitude
+    frequency_hz: Frequency
+    phase_deg: Phase = 0.0
+    duration_s: Duration
 
 
 class Triangle(_Shape):
     """A triangle that starts at its offset and rises."""
 
     kind: Literal["triangle"]
-    amplitude: Positive
-    frequency_hz: Positive
-    duration_s: Positive
+    amplitude: Amplitude
+    frequency_hz: Frequency
+    duration_s: Duration
 
 
 class Harmonic(StrictModel):
     """One component of a complex harmonic."""
 
-    amplitude: Positive
-    frequency_hz: Positive
-    phase_deg: float = 0.0
+    amplitude: Amplitude
+    frequency_hz: Frequency
+    phase_deg: Phase = 0.0
 
 
 class ComplexHarmonic(_Shape):
-    """A sum of sines of any amplitudes, frequencies and phases."""
+    """A sum of sines with any amplitudes, frequencies and phases."""
 
     kind: Literal["complex_harmonic"]
-    components: Annotated[tuple[Harmonic, ...], NotEmpty, AtLeastOne]
-    duration_s: Positive
+    components: Annotated[tuple[Harmonic, ...], NotEmpty, AtLeastOne] = Field(
+        description="sines to add"
+    )
+    duration_s: Duration
 
 
 class GrowingOrDecaying(_Shape):
-    """A sine whose amplitude grows from 0, or decays to 0, in proportion to time."""
+    """A sine whose amplitude grows from 0, or decays to 0, linearly with time."""
 
     kind: Literal["growing", "decaying"]
-    amplitude: Positive
-    frequency_hz: Positive
-    duration_s: Positive
+    amplitude: Amplitude
+    frequency_hz: Frequency
+    duration_s: Duration
 
 
 class Chirp(_Shape):
     """A sine whose frequency changes from ``start_hz`` to ``stop_hz``."""
 
     kind: Literal["chirp"]
-    amplitude: Positive
-    start_hz: Positive
-    stop_hz: Positive
-    spacing: Literal["linear", "logarithmic"] = "linear"
-    duration_s: Positive
+    amplitude: Amplitude
+    start_hz: Positive = Field(description="first frequency, Hz")
+    stop_hz: Positive = Field(description="last frequency, Hz")
+    spacing: Literal["linear", "logarithmic"] = Field(
+        default="linear", description="change of the frequency with time"
+    )
+    duration_s: Duration
 
 
 class Step(_Shape):
     """Consecutive constant levels, each reached in ``rise_s``."""
 
     kind: Literal["step"]
-    levels: Annotated[tuple[float, ...], NotEmpty, AtLeastOne]
-    dwell_s: Positive
-    rise_s: NotNegative = 0.0
+    levels: Annotated[tuple[float, ...], NotEmpty, AtLeastOne] = Field(
+        description="levels without offset, in unit"
+    )
+    dwell_s: Positive = Field(description="duration of each level with its rise, s")
+    rise_s: NotNegative = Field(default=0.0, description="duration of each rise, s")
 
     @field_validator("rise_s")
     @classmethod
@@ -129,19 +143,19 @@ class Hold(_Shape):
     """One level."""
 
     kind: Literal["hold"]
-    level: float
-    duration_s: Positive
+    level: float = Field(description="level without offset, in unit")
+    duration_s: Duration
 
 
 class Multisine(_Shape):
     """Equal sines at evenly spaced frequencies, Schroeder phases, scaled to a peak amplitude."""
 
     kind: Literal["multisine"]
-    amplitude: Positive
-    first_hz: Positive
+    amplitude: Amplitude
+    first_hz: FirstFrequency
     last_hz: LastFrequency
-    step_hz: Positive
-    duration_s: Positive
+    step_hz: Positive = Field(description="spacing of the frequencies, Hz")
+    duration_s: Duration
 
     @field_validator("step_hz")
     @classmethod
@@ -162,11 +176,11 @@ class RandomSines(_Shape):
     """
 
     kind: Literal["random"]
-    amplitude: Positive
-    first_hz: Positive
+    amplitude: Amplitude
+    first_hz: FirstFrequency
     last_hz: LastFrequency
     seed: Annotated[int, Field(ge=0)] = 1
-    duration_s: Positive
+    duration_s: Duration
 
     @field_validator("duration_s")
     @classmethod
@@ -179,7 +193,7 @@ class RandomSines(_Shape):
 
 
 class LevelPath(_Shape):
-    """Straight lines from level to level, all at one rate; begins at ``rest``.
+    """Straight lines from level to level at one rate, beginning at ``rest``.
 
     Attributes:
         levels: End points of the lines, without offset.
@@ -204,6 +218,7 @@ class FileWaveform(_Shape):
         file_rate_hz: Sample rate of a file without a time column (``t_s``, or the only one in s).
         first_row: First data row used, counted from 1.
         last_row: Last data row used. Default: the last of the file.
+        scale: Factor of the values.
         resample: Method if the file has another sample rate: ``refuse``, ``linear`` interpolation
             or a ``cubic`` spline.
         period_s: Period of a periodic waveform, for metrics of steady cycles.
@@ -256,9 +271,11 @@ class Sequence(StrictModel):
     """Consecutive waveforms with a common unit."""
 
     kind: Literal["sequence"]
-    unit: WaveformUnit | None = Field(default=None, description="um, A or V")
-    parts: Annotated[tuple[SinglePart, ...], NotEmpty, AtLeastOne]
-    repeat: Annotated[int, Field(ge=1, le=10_000)] = 1
+    unit: WaveformUnit | None = Field(default=None, description=UNIT)
+    parts: Annotated[tuple[SinglePart, ...], NotEmpty, AtLeastOne] = Field(
+        description="waveforms in order"
+    )
+    repeat: int = Field(default=1, ge=1, le=10_000, description="number of times they are played")
 
     @field_validator("parts")
     @classmethod

@@ -110,7 +110,9 @@ def connect(tmp_path):
             path.write_text(profile)
             if answer is not None:
                 more["serial_port"] = stack.enter_context(pty_device(answer))
-            return kind(kind.Options.model_validate({**OPTIONS, "profile": str(path), **more}))
+            device = kind(kind.Options.model_validate({**OPTIONS, "profile": str(path), **more}))
+            stack.callback(device.close)  # a port that stays open may lock the next one
+            return device
 
         yield make
 

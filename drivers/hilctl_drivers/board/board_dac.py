@@ -1,9 +1,9 @@
 """``serial_dac`` for microcontroller boards: single samples, or blocks through the board's FIFO.
 
-A board with a FIFO answers a block when all but ``prefill`` of the samples queued so far have been
-put out, and gives back the readings of those. So its clock is the pace; a block's readings come
-``fifo_blocks`` exchanges after it; and between two exchanges the FIFO holds that many blocks, which
-is how long this machine may stall. The first sample is output once that many are there.
+A board with a FIFO answers a block when it has output all but ``prefill`` of the queued samples,
+and returns their readings. Its clock therefore sets the pace, and the readings of a block come
+``fifo_blocks`` exchanges after it. Between two exchanges the FIFO holds that many blocks: so long
+may this machine stall. The board outputs the first sample when that many blocks are queued.
 """
 
 from dataclasses import replace
@@ -234,7 +234,7 @@ class BoardStream(BoardDac):
         if found.underruns:
             played = first_sample - self._latency_blocks * self._samples
             raise DeviceError(
-                f"underrun: the board had nothing to put out for {found.underruns} sample periods, "
+                f"underrun: the FIFO of the board was empty for {found.underruns} sample periods, "
                 f"about sample {max(0, played)}; its FIFO kept {self._latency_blocks} blocks of "
                 f"{self._samples}: this machine or the line was slower than that"
             )

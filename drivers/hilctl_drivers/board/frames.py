@@ -23,7 +23,7 @@ Each message is the payload of one binary frame, least significant byte first th
 A value is a float32 in volts unless the profile's channel has another type. The board samples its
 input when it outputs a command, so ``first`` of a STREAM reply numbers the command that each
 reading belongs to; a reply carries all readings since the last one. The sample clock starts when
-``prefill`` samples are queued. With nothing left to put out the board holds the last value, and
+``prefill`` samples are queued. When the FIFO is empty, the board holds the last value, and
 counts that in ``underruns``. A refused message changes nothing.
 
 A STREAM reply is held back until sample ``queued - prefill - 1`` is out, with ``queued`` the

@@ -78,7 +78,7 @@ class StreamSetup:
         if streaming == "none":
             raise InputError(f"{profile.title} can't stream: take kind: modbus_dac, and block: 1")
         if base.reads_elsewhere:
-            raise InputError("reader must be left out: input and output are in one scan list")
+            raise InputError("reader must be omitted: input and output are in one scan list")
         for what, name, known in (
             ("output", options.output, streaming.outputs),
             ("input", options.input, streaming.inputs),

@@ -176,5 +176,5 @@ class StreamSession:
 
 def _shortage(level: int) -> str:
     if level < 0:
-        return f"the device had nothing new to put out for {-level} sample periods"
-    return f"only {level} values were left, too few to be sure that each was put out in time"
+        return f"the buffer of the device was empty for {-level} sample periods"
+    return f"only {level} values were left, too few to be sure that each was output in time"

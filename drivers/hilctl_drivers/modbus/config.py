@@ -50,13 +50,13 @@ HostName: TypeAlias = Annotated[str, AfterValidator(_without_port)]
 
 
 class ModbusReaderOptions(ReaderOptions):
-    """The device that has the input, where it is another one."""
+    """The device with the input, if it is another one."""
 
     host: HostName | None = Field(
-        default=None, description="its name or address; left out where it is on the same connection"
+        default=None, description="host name or address; omitted if on the same connection"
     )
     tcp_port: int | None = Field(
-        default=None, ge=1, le=65535, description="its TCP port; else the usual"
+        default=None, ge=1, le=65535, description="TCP port; default: the profile's, or 502"
     )
 
     @model_validator(mode="after")
@@ -72,13 +72,13 @@ class ModbusOptions(DacOptions):
     """Options of ``modbus_dac``."""
 
     host: HostName | None = Field(
-        default=None, description="name or address, for Modbus TCP or a gateway to Modbus RTU"
+        default=None, description="host name or address, for Modbus TCP or a gateway to Modbus RTU"
     )
     tcp_port: int | None = Field(
-        default=None, ge=1, le=65535, description="TCP port; else the usual"
+        default=None, ge=1, le=65535, description="TCP port; default: the profile's, or 502"
     )
     reader: ModbusReaderOptions | None = Field(
-        default=None, description="the device that has the input, where it is another one"
+        default=None, description="device with the input, if it is another one"
     )
 
     @model_validator(mode="after")
@@ -265,7 +265,7 @@ def _writer_of(options: ModbusOptions) -> ModbusEndpoint:
     changes = {key: getattr(options, key) for key in ("baud", "parity", "stopbits")}
     given = [key for key, value in changes.items() if value is not None]
     if given and not isinstance(profile.link, ModbusRtuLink):
-        raise InputError(f"{', '.join(given)} must be left out: {profile.title} has no line")
+        raise InputError(f"{', '.join(given)} must be omitted: {profile.title} has no line")
     return ModbusEndpoint.of(options, with_link(profile, **changes), options.timeout_s)
 
 

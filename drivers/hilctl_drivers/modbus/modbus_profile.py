@@ -30,24 +30,26 @@ BYTES_A_SAMPLE = 2
 
 
 class LabJackStreaming(StrictModel):
-    """Stream-out and stream-in of LabJack's T series, in one scan list."""
+    """Stream-out and stream-in of LabJack T-series devices, in one scan list."""
 
     kind: Literal["labjack"]
-    outputs: tuple[Name, ...] = Field(min_length=1, description="outputs that it can play")
-    inputs: tuple[Name, ...] = Field(min_length=1, description="inputs that it can scan")
+    outputs: tuple[Name, ...] = Field(min_length=1, description="outputs that can stream")
+    inputs: tuple[Name, ...] = Field(min_length=1, description="inputs that can stream")
     buffer_bytes: int = Field(
-        ge=32, le=32_768, description="buffer of the output, 2 bytes a sample; a power of 2"
+        ge=32, le=32_768, description="size of the output buffer (2 bytes per sample); a power of 2"
     )
     samples_per_s_max: float = Field(
-        gt=0.0, description="fastest sampling, over all addresses of the scan list together"
+        gt=0.0, description="highest sampling rate, for all addresses of the scan list together"
     )
-    rate_min_hz: float = Field(gt=0.0, description="lowest scan rate in use, Hz")
+    rate_min_hz: float = Field(gt=0.0, description="lowest scan rate, Hz")
     calibration: Literal["two_slopes", "line"] = Field(
-        description="how raw readings become volts: by one slope on each side of a centre that all"
-        " inputs share, or by a slope and an offset for each input"
+        description="conversion of raw readings to volts: two_slopes (one on each side of a centre,"
+        " for all inputs) or line (slope and offset per input)"
     )
-    calibration_address: int = Field(ge=0, description="of these constants in internal flash")
-    setup: tuple[ModbusStep, ...] = Field(default=(), description="steps before streaming is set")
+    calibration_address: int = Field(ge=0, description="flash address of these constants")
+    setup: tuple[ModbusStep, ...] = Field(
+        default=(), description="steps before streaming is set up"
+    )
 
     @model_validator(mode="after")
     def _whole_power(self) -> Self:
@@ -76,7 +78,7 @@ class ModbusTcpLink(LinkSettings):
     """Modbus TCP."""
 
     kind: Literal["tcp"]
-    port: int = Field(default=502, ge=1, le=65535)
+    port: int = Field(default=502, ge=1, le=65535, description="TCP port")
 
 
 class ModbusRtuLink(BinaryLineSettings):
@@ -87,7 +89,7 @@ class ModbusRtuLink(BinaryLineSettings):
     gap_s: float | None = Field(
         default=None,
         ge=0.0,
-        description="silence before each frame, s; left out: 3.5 characters, 1.75 ms above 19200",
+        description="silence before each frame, s; default: 3.5 characters, 1.75 ms above 19200",
     )
 
     @property
@@ -101,14 +103,14 @@ class ModbusRtuLink(BinaryLineSettings):
 class ModbusOutput(Channel):
     """An analogue output."""
 
-    function: Literal[6, 16] = Field(default=16, description="Modbus function that writes it")
+    function: Literal[6, 16] = Field(default=16, description="Modbus function of a write")
     readback: Register | Literal["same", "none"] = Field(
         default="same",
-        description="where the value can be read again: another register, same, or none where"
-        " reading is refused; scale and offset are the output's",
+        description="register to read the value back: another one, same, or none if it cannot be"
+        " read; scale and offset are the output's",
     )
     power_up: float | None = Field(
-        default=None, description="what it puts out after power-up, in unit; left out: not known"
+        default=None, description="output after power-up, in unit; omitted if unknown"
     )
 
     @model_validator(mode="after")
@@ -136,8 +138,7 @@ class ModbusInput(Channel):
 
     measures: Literal["terminal", "output"] = Field(
         default="terminal",
-        description="terminal: what is wired to it, such as a sensor; output: the device's own"
-        " output measured",
+        description="measured quantity: the signal at the terminal, or the device's own output",
     )
 
     @model_validator(mode="after")
@@ -150,19 +151,25 @@ class ModbusInput(Channel):
 class ModbusWatchdog(Watchdog):
     """A host watchdog set and read through registers."""
 
-    arm: tuple[ModbusStep, ...] = Field(min_length=1, description="steps that set and start it")
+    arm: tuple[ModbusStep, ...] = Field(
+        min_length=1, description="steps that set and start the watchdog"
+    )
     unlock: tuple[ModbusStep, ...] = Field(
         default=(),
-        description="steps that come before safe and arm, but only where an ensure step of theirs"
-        " finds something to change",
+        description="steps before safe and arm, run only if an ensure step in those has a register"
+        " to change",
     )
-    disarm: tuple[ModbusStep, ...] = Field(default=(), description="steps that stop it")
-    feed: tuple[ModbusStep, ...] = Field(default=(), description="steps that feed a strict one")
+    disarm: tuple[ModbusStep, ...] = Field(default=(), description="steps that stop the watchdog")
+    feed: tuple[ModbusStep, ...] = Field(
+        default=(), description="steps that feed a strict watchdog"
+    )
     clear: tuple[ModbusStep, ...] = Field(default=(), description="steps that clear a trip")
     safe: dict[Name, tuple[ModbusStep, ...]] = Field(
-        default={}, description="steps that set an output's safe value, by output"
+        default={}, description="steps that set the safe value, per output"
     )
-    tripped: TripFlag | Literal["none"] = Field(default="none", description="where a trip shows")
+    tripped: TripFlag | Literal["none"] = Field(
+        default="none", description="register that shows a trip"
+    )
 
     def steps(self) -> dict[str, tuple[ModbusStep, ...]]:
         """Return all steps by dotted key in the profile."""
@@ -195,28 +202,34 @@ class ModbusWatchdog(Watchdog):
 
 
 class ModbusProfile(BaseProfile):
-    """A device that speaks Modbus."""
+    """A Modbus device."""
 
     DEVICE: ClassVar[str] = "modbus_dac"
 
-    link: Annotated[ModbusTcpLink | ModbusRtuLink, Field(discriminator="kind")]
-    unit_id: int = Field(default=1, ge=0, le=255, description="as shipped")
-    address_base: AddressBase = Field(description="see a register's address_base")
+    link: Annotated[ModbusTcpLink | ModbusRtuLink, Field(discriminator="kind")] = Field(
+        description="connection to the device"
+    )
+    unit_id: int = Field(default=1, ge=0, le=255, description="unit id as shipped")
+    address_base: AddressBase = Field(description="address_base of registers without their own")
     exchange: Literal[23, 76, "none"] = Field(
         description="function that writes the output and reads the input in one transaction"
     )
-    outputs: dict[Name, ModbusOutput]
-    inputs: dict[Name, ModbusInput]
+    outputs: dict[Name, ModbusOutput] = Field(description="analogue outputs by name")
+    inputs: dict[Name, ModbusInput] = Field(description="analogue inputs by name")
     init: tuple[ModbusStep, ...] = Field(default=(), description="steps after connecting")
     close: tuple[ModbusStep, ...] = Field(default=(), description="steps before disconnecting")
-    watchdog: ModbusWatchdog | Literal["none"]
-    selftest: ModbusSelftest | Literal["none"] = "none"
-    streaming: LabJackStreaming | Literal["none"] = "none"
+    watchdog: ModbusWatchdog | Literal["none"] = Field(description="the device's own, or none")
+    selftest: ModbusSelftest | Literal["none"] = Field(
+        default="none", description="register that identifies the device"
+    )
+    streaming: LabJackStreaming | Literal["none"] = Field(
+        default="none", description="streaming that the device supports"
+    )
 
     @model_validator(mode="after")
     def _channels(self) -> Self:
         if self.exchange != "none" and not (self.outputs and self.inputs):
-            raise ValueError("exchange must be none where there are no outputs or no inputs")
+            raise ValueError("exchange must be none if there are no outputs or no inputs")
         for key in ("outputs", "inputs") if self.streaming != "none" else ():
             unknown = [
                 name for name in getattr(self.streaming, key) if name not in getattr(self, key)

@@ -128,26 +128,26 @@ _MODICON: dict[Area, int] = {"coil": 0, "discrete": 1, "input": 3, "holding": 4}
 
 
 class Register(StrictModel):
-    """A value in a Modbus device: where it stands and how it is written in bytes.
+    """Address and encoding of a value in a Modbus device.
 
     Value = raw * scale + offset.
     """
 
-    area: Area = Field(default="holding", description="what is read or written")
-    address: int = Field(ge=0, description="as the vendor's document has it, see address_base")
+    area: Area = Field(default="holding", description="Modbus table of the value")
+    address: int = Field(ge=0, description="address as in the vendor's document, see address_base")
     address_base: AddressBase | None = Field(
         default=None,
-        description="0 or 1: number of the first register; modicon: 40001, 30001, 10001 or 1 by"
-        " area; left out: the profile's",
+        description="address of the first register: 0, 1, or modicon for 40001, 30001, 10001 or 1"
+        " by area; default: the profile's",
     )
-    type: Literal["bit", RegisterType] = Field(description="how the raw value is stored")
+    type: Literal["bit", RegisterType] = Field(description="number type of the raw value")
     order: str = Field(
         default="",
-        description="bytes on the wire, A the most significant: ABCD, CDAB, BADC, DCBA; left out:"
-        " most significant first",
+        description="byte order on the wire (A is the most significant): ABCD, CDAB, BADC, DCBA;"
+        " default: most significant first",
     )
     scale: float = Field(default=1.0, description="value = raw * scale + offset")
-    offset: float = Field(default=0.0, description="value = raw * scale + offset")
+    offset: float = Field(default=0.0, description="value at raw 0")
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -185,12 +185,12 @@ class Register(StrictModel):
 
 
 class Channel(Register, Range):
-    """A register that stands for a terminal."""
+    """A register of an analogue input or output."""
 
     raw_min: int | None = Field(default=None, description="lowest raw value in use")
     raw_max: int | None = Field(default=None, description="highest raw value in use")
     ignored_low_bits: int = Field(
-        default=0, ge=0, le=15, description="low bits of the raw value that the device drops"
+        default=0, ge=0, le=15, description="low bits of the raw value that the device ignores"
     )
 
     @model_validator(mode="after")
@@ -236,9 +236,9 @@ class Channel(Register, Range):
 
 
 class ModbusSelftest(Register):
-    """A register of known content: finds a wrong address base, word order or device."""
+    """A register with a known value, to detect a wrong address base, word order or device."""
 
-    expect: float = Field(description="what it must hold")
+    expect: float = Field(description="expected value")
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
@@ -251,11 +251,11 @@ class ModbusSelftest(Register):
 class RegisterStep(Register):
     """A step on one register.
 
-    ``timeout`` and ``safe`` stand for what the experiment says of the watchdog.
+    ``timeout`` and ``safe`` are the watchdog settings of the experiment.
     """
 
-    value: StepValue = Field(description="a number, or timeout or safe in watchdog steps")
-    note: str = ""
+    value: StepValue = Field(description="number, or timeout or safe in watchdog steps")
+    note: str = Field(default="", description="comment, part of error messages")
 
     @model_validator(mode="after")
     def _value_fits(self) -> Self:
@@ -266,23 +266,23 @@ class RegisterStep(Register):
 
 
 class WriteStep(RegisterStep):
-    """Write a register, and read it again where ``verify`` is set."""
+    """Write a register, and read it back if ``verify`` is set."""
 
     kind: Literal["write"]
-    verify: bool = False
+    verify: bool = Field(default=False, description="whether to read the register back")
 
 
 class EnsureStep(RegisterStep):
-    """Read a register; write it only where it differs, then read it again.
+    """Read a register; write it only if it differs, then read it back.
 
-    For settings in flash that must not be rewritten at each run.
+    For settings in flash that must not be rewritten in each run.
     """
 
     kind: Literal["ensure"]
 
 
 class ExpectStep(RegisterStep):
-    """Read a register and refuse to go on where it differs; writes nothing."""
+    """Read a register and fail if it differs; write nothing."""
 
     kind: Literal["expect"]
 
@@ -293,9 +293,9 @@ ModbusStep: TypeAlias = Annotated[
 
 
 class TripFlag(Register):
-    """A register that says yes if any bit of ``mask`` is set."""
+    """A register that shows a trip if any bit of ``mask`` is set."""
 
-    mask: int = Field(ge=1, le=0xFFFFFFFF, description="bits of the raw value that say yes")
+    mask: int = Field(ge=1, le=0xFFFFFFFF, description="bits of the raw value that show a trip")
 
     @model_validator(mode="after")
     def _fits(self) -> Self:

@@ -151,7 +151,7 @@ class SimulatedDevice(DacDevice):
         """Return a plant at rest."""
 
     def _check_sizes(self, command: F64, displacement_um: F64, measured: F64) -> None:
-        """Take shorter blocks too: where a run's last one is cut, time goes on as it did."""
+        """Accept shorter blocks too: the last one of a run may be cut."""
         sizes = {command.size, displacement_um.size, measured.size}
         if not self._block or len(sizes) > 1 or not 1 <= command.size <= self._block:
             super()._check_sizes(command, displacement_um, measured)

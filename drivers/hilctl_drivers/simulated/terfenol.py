@@ -80,7 +80,7 @@ class SecondMode(DeviceOptions):
 class VoltageLimit(DeviceOptions):
     """An amplifier whose voltage is limited: no current changes faster than that drives it.
 
-    The voltages that rods in motion induce are left out.
+    The voltages that moving rods induce are omitted.
     """
 
     voltage_max_v: float = Field(gt=0.0, le=1e3, description="largest voltage either way, V")

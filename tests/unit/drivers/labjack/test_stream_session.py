@@ -130,7 +130,7 @@ def test_the_margin_is_rounded_up(scene):
         (3, None),
         (2, "only 2 values were left"),
         (0, "only 0 "),
-        (-1, "nothing new to put out for 1 sample"),
+        (-1, "empty for 1 sample"),
     ],
 )
 def test_fewer_values_than_the_margin_are_an_underrun(scene, held, said):

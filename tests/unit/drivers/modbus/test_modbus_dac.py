@@ -74,7 +74,7 @@ class TestOptions:
             ({"host": None, "serial_port": "/dev/x"}, "is for Modbus tcp: give host"),
             ({"watchdog": {"timeout_s": 1.0}, "output": "TDAC0"}, "does nothing for TDAC0"),
             ({"timeout_s": 1e-4}, "timeout_s must be > 0.001"),
-            ({"baud": 9600, "parity": "E"}, "baud, parity must be left out"),
+            ({"baud": 9600, "parity": "E"}, "baud, parity must be omitted"),
             ({**READS, "input": "AI9"}, "input must be one that Advantech ADAM-6217 has"),
             ({"reader": {"profile": "adam_6217"}, "input": "AI0"}, "both be unit 1 at h:502"),
             ({**READS, "reader": {"profile": "kepco_bop"}}, "kepco_bop"),

@@ -126,7 +126,7 @@ def test_profiles_say_how_their_line_is_set():
 
 @pytest.mark.parametrize("name", ["icp_m7024", "cobs_board"])
 def test_binary_lines_refuse_flow_control(name):
-    rule = "flow must be none where bytes 0x11 and 0x13 are data, got xonxoff"
+    rule = "flow must be none if bytes 0x11 and 0x13 are data, got xonxoff"
     with pytest.raises(InputError, match=rule):
         with_link(load_profile(name), flow="xonxoff")
 
