@@ -290,11 +290,11 @@ def answer_request(message, value):
 
 LINES = (lines, set_by_line, answer_line)
 REQUESTS = (requests, set_by_request, answer_request)
-LONGER = [pytest.param(count, marks=pytest.mark.slow) for count in (5, 8)]
+LONGER = [pytest.param(count, marks=pytest.mark.slow) for count in (3, 5, 8)]
 
 
 @pytest.mark.parametrize("forgets", [False, True])
-@pytest.mark.parametrize("waits_for", [1, 2, 3, *LONGER])
+@pytest.mark.parametrize("waits_for", [1, 2, *LONGER])
 @pytest.mark.parametrize("kind", ["OK", "readback", 6, 16])
 def test_the_late_answer_to_an_older_command_confirms_nothing(
     text, registers, kind, waits_for, forgets

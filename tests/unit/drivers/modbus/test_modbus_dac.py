@@ -7,17 +7,10 @@ from hilctl.base.errors import DeviceError, InputError
 from hilctl_drivers.emulator.options import parse_fault
 from hilctl_drivers.modbus.config import ModbusOptions
 from hilctl_drivers.modbus.modbus_dac import ModbusDac
+from tests.fakes import T7_OPTIONS
 from tests.unit.drivers.modbus.conftest import exchange
 
-T7 = {
-    "profile": "labjack_t7",
-    "host": "h",
-    "output": "DAC0",
-    "input": "AIN0",
-    "amplifier": {"gain_a_per_v": 4.0, "offset_a": -10.0},
-    "sensor": {"um_per_v": 12.5},
-    "watchdog": "none",
-}
+T7 = {**T7_OPTIONS, "host": "h"}
 READER = {"profile": "adam_6217", "unit_id": 2}
 READS = {"reader": READER, "input": "AI0"}
 
