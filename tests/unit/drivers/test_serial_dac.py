@@ -162,19 +162,6 @@ def test_a_trip_of_an_earlier_run_ends_at_the_safe_value(rig, profiles, readback
     assert bench.exchange(1.0) < 45.0
 
 
-@pytest.mark.parametrize("own_line", [True, False])
-def test_the_sensor_may_stand_on_another_device(rig, profiles, tmp_path, own_line):
-    path = tmp_path / "reader.yaml"
-    path.write_text(DCON.replace("checksum: dcon", "checksum: none"))
-    bench = rig("icp_m7024_dcon", reader=str(path), own_line=own_line, baud=115200)
-    bench.device.open(50.0, 1)
-    assert abs(bench.exchange(0.0)) < 1.0
-    bench.exchange(5.0)
-    bench.pass_s(0.5)
-    assert 20.0 < bench.exchange(5.0) < 45.0
-    assert bench.device.info.max_rate_hz < 200.0
-
-
 def test_scpi_supply_is_set_up_and_checked(rig):
     bench = rig("kepco_bop", reader="agilent_34970a", own_line=True)
     bench.open()
@@ -244,16 +231,6 @@ def test_safe_is_said_only_of_what_was_read_back(rig, kind):
     device._put_out = lambda *args: None
     with pytest.raises(DeviceError):
         bench.device.make_safe(0.0)
-
-
-def test_making_safe_waits_for_no_board_to_boot(rig):
-    """The value goes out as soon as the port is open; one that boots gets it again later."""
-    bench = rig("cobs_board")
-    slept = []
-    bench.device._link._sleep = slept.append
-    bench.device.make_safe(1.0)
-    assert bench.current_a() == 1.0
-    assert slept == []
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -183,14 +183,6 @@ class TestExchange:
         exchange(device, 1.0)
         device.close()
 
-    def test_over_rtu(self, serve, module):
-        served = serve(module)
-        device = served.running()
-        assert device.one_transaction
-        assert exchange(device, 2.5) == pytest.approx(0.0, abs=0.3)
-        device.make_safe(-1.0)
-        assert served.events()[-1]["current_a"] == -1.0
-
     @pytest.mark.parametrize(
         ("link", "fault", "said"),
         [

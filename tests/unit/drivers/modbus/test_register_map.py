@@ -1,15 +1,11 @@
-"""Register bytes: vendors' own examples, every byte order, and what does not fit."""
+"""Register bytes: vendors' own examples, the ends of each range, and what does not fit."""
 
-import itertools
 import math
-import struct
 
 import pytest
 
 from hilctl_drivers.modbus.register_map import Channel, Register, RegisterFormat, wire_address
 from hilctl_drivers.transport.links import BadRequestError, FrameError, MismatchError
-
-CODES = {"int16": "h", "uint16": "H", "int32": "i", "uint32": "I", "float32": "f", "float64": "d"}
 
 
 def test_labjack_word_order_self_test():
@@ -46,34 +42,6 @@ def test_offset_binary_of_a_bipolar_range():
     assert channel.encode(10.0) == b"\xff\xff"
     assert channel.limits == pytest.approx((-10.0, 10.0))
     assert channel.encode(channel.offset + 0x8000 * channel.scale) == b"\x80\0"
-
-
-@pytest.mark.parametrize("kind", ["int32", "uint32", "float32"])
-@pytest.mark.parametrize("order", ["".join(p) for p in itertools.permutations("ABCD")])
-def test_every_order_of_four_bytes_travels_as_written(kind, order):
-    value = 123456789.0 if kind != "float32" else 1.2345678e7
-    big = struct.pack(">" + CODES[kind], value if kind == "float32" else int(value))
-    wire = RegisterFormat(kind, order).encode(value)
-    assert wire == bytes(big["ABCD".index(letter)] for letter in order)
-    assert RegisterFormat(kind, order).decode(wire) == value
-
-
-@pytest.mark.parametrize(
-    "order", ["ABCDEFGH", "HGFEDCBA", "GHEFCDAB", "BADCFEHG", "EFGHABCD", "CABDHEFG"]
-)
-def test_orders_of_eight_bytes_travel_as_written(order):
-    big = struct.pack(">d", math.pi)
-    wire = RegisterFormat("float64", order).encode(math.pi)
-    assert wire == bytes(big["ABCDEFGH".index(letter)] for letter in order)
-    assert RegisterFormat("float64", order).decode(wire) == math.pi
-
-
-@pytest.mark.parametrize("order", ["AB", "BA"])
-def test_orders_of_one_register(order):
-    """A 16-bit value can have its bytes swapped."""
-    assert RegisterFormat("int16", order).encode(-2) == (
-        b"\xff\xfe" if order == "AB" else b"\xfe\xff"
-    )
 
 
 @pytest.mark.parametrize(
@@ -113,7 +81,7 @@ def test_float32_refuses_what_only_a_double_holds():
         channel.encode(3.5e38)
 
 
-@pytest.mark.parametrize("kind", CODES)
+@pytest.mark.parametrize("kind", ["int16", "uint16", "int32", "uint32", "float32", "float64"])
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_nothing_that_is_not_a_number_is_sent(kind, value):
     with pytest.raises(BadRequestError, match="can't hold"):
