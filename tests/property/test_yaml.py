@@ -1,4 +1,4 @@
-"""YAML files: scalars of the core schema in every reader; damaged experiments and profiles."""
+"""YAML files: scalars of the core schema in every reader; damaged files."""
 
 import math
 import random
@@ -17,8 +17,9 @@ from hilctl.base.errors import ConfigError, ConfigProblem, InputError
 from hilctl.base.yaml import Document, dump, io
 from hilctl.experiment.load import resolve
 from hilctl.experiment.preflight import check
-from hilctl.models.model_file import load_model, parse_model
+from hilctl.models.model_file import dump_model, load_model, parse_model
 from hilctl_drivers.profile import FOLDER, load_profile, parse_profile
+from tests.unit.models.test_model_file import OMEGA
 
 INF, NAN = math.inf, math.nan
 
@@ -267,15 +268,23 @@ compensator: {model: model.yaml}
 limits: {peak_current_a: 2.0, slew_a_per_s: 500.0, stroke_um: [-75.0, 60.0]}
 """,
 )
+MODELS = (RDPI_MODEL, dump_model(OMEGA))
 PIECES = (
     "null", "~", "true", "on", "1e3", "1.0e+3", "-1", "0", ".nan", ".inf", "-.inf", "1e999", "''",
     "[]", "{}", "[1, 2]", "*x", "&x 1", "!!python/object:os.system {}", "!!binary aGk=", "<<: *a",
     "? : x", "'", '"', "\t", "\n", "  ", ": ", "- ", "#", "\x00", "\ufeff", "é", "0x1F",
     "2026-11-21", "99999999999999999999", "9" * 400, "none", "...", "---", "%YAML 9.9", "|", ">",
 )  # fmt: skip
+NASTY = (
+    *PIECES, "!!int ", "!!set ", "!<tag:yaml.org,2002:int> ", "<<: ", "? [1]\n", ",", "%YAML 1.1\n",
+    "\x85", "\u2028", "\ud800", '"\\U99999999"', '"\\ud800"', '"\\x00"', "0x" + "f" * 5000,
+    "9" * 5000, "2024-13-99", "0b_", "1:30", "5.0e-324", "1.0e+308", "[" * 3000, "{a: " * 3000,
+    "- " * 500, "kind: [1]\n", "kind: {a: 1}\n", "kind: ppi\n", "model: &m\n  x: *m\n", "1: 2\n",
+    "[a]: 2\n", "{a: b}: 2\n",
+)  # fmt: skip
 
 
-def mutated(text: str, chance: random.Random) -> str:
+def mutated(text: str, chance: random.Random, pieces: tuple[str, ...] = PIECES) -> str:
     """Return a text with one to four pieces cut, doubled, swapped, or put in."""
     for _ in range(chance.randint(1, 4)):
         a, b = sorted(chance.randrange(len(text) + 1) for _ in range(2))
@@ -287,7 +296,7 @@ def mutated(text: str, chance: random.Random) -> str:
         elif how == 1:
             text = text[:b] + text[a:]
         elif how == 2:
-            text = text[:a] + chance.choice(PIECES) + text[b:]
+            text = text[:a] + chance.choice(pieces) + text[b:]
         elif how == 3:
             i, j = (chance.randrange(len(lines)) for _ in range(2))
             lines[i], lines[j] = lines[j], lines[i]
@@ -295,7 +304,7 @@ def mutated(text: str, chance: random.Random) -> str:
         elif how == 4:
             i = chance.randrange(len(lines))
             key, colon, _ = lines[i].partition(":")
-            lines[i] = f"{key}{colon} {chance.choice(PIECES)}"
+            lines[i] = f"{key}{colon} {chance.choice(pieces)}"
             text = "\n".join(lines)
         else:
             text = text[:a] + chr(chance.randrange(1, 256)) + text[a + 1 :]
@@ -342,3 +351,18 @@ def test_damaged_profiles_are_refused_in_words(name, files):
         assert re.fullmatch(r"profile\.yaml:\d+", problem.where), problem
         assert problem.rule
         assert not re.search(r"function-|literal\[|tagged-union", problem.key), problem
+
+
+@pytest.mark.parametrize("files", [200, pytest.param(2_000, marks=pytest.mark.slow)])
+def test_damaged_models_are_refused_in_words(files):
+    refusals = []
+    for seed in range(files):
+        chance = random.Random(seed)
+        text = mutated(chance.choice(MODELS), chance, NASTY)
+        try:
+            parse_model("m.yaml", text)
+        except InputError as error:
+            refusals.append(str(error))
+    assert len(refusals) > 0.5 * files
+    assert all(text.startswith("m.yaml") for text in refusals)
+    assert "\n".join(refusals).encode("utf-8")

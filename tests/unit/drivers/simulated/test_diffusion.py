@@ -7,7 +7,6 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.special import jv
 
-from hilctl.base.types import F64
 from hilctl_drivers.simulated.actuator_base import ROD_RADIUS_M, VACUUM_PERMEABILITY, Coil
 from hilctl_drivers.simulated.diffusion import Diffusion, DiffusionParameters, magnetise
 
@@ -38,8 +37,7 @@ def shells(rods, halves_a_per_m, bias=0.0):
 
 def sine(amplitude, frequency_hz, cycles):
     n = round(cycles / (frequency_hz * STEP_S))
-    halves: F64 = amplitude * np.sin(np.pi * frequency_hz * STEP_S * np.arange(2 * n + 1))
-    return halves
+    return amplitude * np.sin(np.pi * frequency_hz * STEP_S * np.arange(2 * n + 1))
 
 
 def phasor(signal, frequency_hz):
@@ -47,8 +45,7 @@ def phasor(signal, frequency_hz):
     n = round(1.0 / (frequency_hz * STEP_S))
     time = STEP_S * np.arange(signal.shape[0] - n + 1, signal.shape[0] + 1)
     turn = np.exp(-2j * np.pi * frequency_hz * time)
-    found: F64 = 2j / n * (signal[-n:].T @ turn)
-    return found
+    return 2j / n * (signal[-n:].T @ turn)
 
 
 @pytest.mark.parametrize("frequency_hz", [50.0, 250.0, 1000.0])
@@ -154,8 +151,7 @@ def test_is_its_differential_equation():
         beyond = np.abs(field - before) >= pinning[:, None]
         cell = np.clip(before, field - pinning[:, None], field + pinning[:, None])
         part = shares[:, None] * 7.65e5 * 27e3 / (27e3 + np.abs(cell)) ** 2
-        result: F64 = into / (1.0 + np.sum(np.where(beyond, part, 0.0), axis=0))
-        return result
+        return into / (1.0 + np.sum(np.where(beyond, part, 0.0), axis=0))
 
     found, _ = shells(rods, halves, 44.1e3)
     field, before = np.full(4, 44.1e3), np.full((4, 4), 44.1e3)
