@@ -19,6 +19,8 @@ from hilctl.experiment.load import resolve
 from hilctl.experiment.preflight import check
 from hilctl.models.model_file import dump_model, load_model, parse_model
 from hilctl_drivers.profile import FOLDER, load_profile, parse_profile
+from tests.contract.test_bad_input import MODEL as MODEL_TEXT
+from tests.unit.experiment.test_file import MINIMAL
 from tests.unit.models.test_model_file import OMEGA
 
 INF, NAN = math.inf, math.nan
@@ -57,17 +59,14 @@ def test_scalars_are_those_of_the_core_schema(text, value):
     assert data["quoted"] == text
 
 
-EXPERIMENT = """\
-name: tiny
-device: {kind: simulated_terfenol}
-sample_rate_hz: 1000
-waveform: {kind: hold, unit: A, level: 1.0, duration_s: 1.0}
-compensator: none
-limits: {peak_current_a: 2.0, slew_a_per_s: 5000.0, stroke_um: [-75.0, 60.0]}
+EXPERIMENT = (
+    MINIMAL
+    + """\
 description: DESCRIPTION
 safe:
   ramp_s: NUMBER
 """
+)
 MODEL = """\
 model:
   kind: rdpi
@@ -225,14 +224,6 @@ def test_too_much_is_refused_at_once(text, rule, monkeypatch):
 
 FILES = 10_000
 PARTS = 32
-RDPI_MODEL = """\
-model:
-  kind: rdpi
-  direct: 2.7
-  weights: [2.3, 0.4]
-  thresholds: [0.3, 0.6]
-  output_range_um: [-12.0, 12.0]
-"""
 GOOD = (
     """\
 name: tiny
@@ -268,7 +259,7 @@ compensator: {model: model.yaml}
 limits: {peak_current_a: 2.0, slew_a_per_s: 500.0, stroke_um: [-75.0, 60.0]}
 """,
 )
-MODELS = (RDPI_MODEL, dump_model(OMEGA))
+MODELS = (MODEL_TEXT, dump_model(OMEGA))
 PIECES = (
     "null", "~", "true", "on", "1e3", "1.0e+3", "-1", "0", ".nan", ".inf", "-.inf", "1e999", "''",
     "[]", "{}", "[1, 2]", "*x", "&x 1", "!!python/object:os.system {}", "!!binary aGk=", "<<: *a",
@@ -324,7 +315,7 @@ def refusal(text: str, folder: Path) -> InputError | None:
     "part", [0, *(pytest.param(part, marks=pytest.mark.slow) for part in range(1, PARTS))]
 )
 def test_damaged_experiments_are_refused_in_words(tmp_path, part):
-    (tmp_path / "model.yaml").write_text(RDPI_MODEL, encoding="utf-8")
+    (tmp_path / "model.yaml").write_text(MODEL_TEXT, encoding="utf-8")
     chance = random.Random(part)
     texts = [mutated(GOOD[number % 2], chance) for number in range(FILES // PARTS)]
     refusals = [error for text in texts if (error := refusal(text, tmp_path)) is not None]
