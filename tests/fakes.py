@@ -12,9 +12,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 
+from hilctl.base.device import DeviceInfo, DeviceOptions
 from hilctl.base.errors import DeviceError
 from hilctl.base.samples import BlockBatch, BlockHeader
 from hilctl.loop.block import Block
@@ -26,6 +28,16 @@ from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.emulator.rig import Bench, Rig, SimulatedWiring, WriteLog
 from hilctl_drivers.profile import load_profile
 from hilctl_drivers.transport.links import LostError, NoAnswerError
+
+T7_OPTIONS = {
+    "profile": "labjack_t7",
+    "output": "DAC0",
+    "input": "AIN0",
+    "amplifier": {"gain_a_per_v": 4.0, "offset_a": -10.0},
+    "sensor": {"um_per_v": 12.5},
+    "watchdog": "none",
+}
+"""Options of a LabJack T7, without its address."""
 
 
 @dataclass
@@ -87,6 +99,29 @@ class FakeInfo:
     simulated: bool = False
     confirms: bool = True
     arm_s: float = 0.0
+
+
+DESCRIBED = DeviceInfo(
+    name="fake", description="a device that does nothing", command_unit="A", command_min=-8.0,
+    command_max=8.0, sensor_min_um=-100.0, sensor_max_um=100.0, max_rate_hz=20e3,
+)  # fmt: skip
+
+
+@dataclass
+class DescribedDevice:
+    """A device that may not be opened or moved."""
+
+    Options: ClassVar = DeviceOptions
+    info: DeviceInfo = DESCRIBED
+
+    def refuse(self, *_):
+        raise AssertionError("opened or moved")
+
+    open = output = exchange = make_safe = refuse
+
+    def check_rate(self, sample_rate_hz, block): ...
+
+    def close(self): ...
 
 
 @dataclass
@@ -387,6 +422,19 @@ class InProcess:
         device = EmulatedModbus(loaded, bench, output, sensor, current_a, noise=noise)
         wire = ModbusWire("tcp", {loaded.unit_id: device})
         return cls(device, rig, link(wire, time, message_s), time, writes)
+
+    @property
+    def options(self):
+        """The options of a device that drives this one without a watchdog."""
+        wiring, profile = self.device.wiring, self.device.profile
+        return {
+            "host": "127.0.0.1",
+            "output": next(iter(profile.outputs)),
+            "input": next(iter(profile.inputs)),
+            "amplifier": {"gain_a_per_v": wiring.gain_a, "offset_a": wiring.offset_a},
+            "sensor": {"um_per_v": wiring.sensor_um, "offset_um": wiring.offset_um},
+            "watchdog": "none",
+        }
 
 
 @contextmanager

@@ -501,7 +501,6 @@ def failures(kind):
 
 @pytest.mark.parametrize("kind", KEEPS_IT)
 def test_a_device_that_keeps_the_contract_fails_nothing(kind):
-    """The base device passes, so a failure comes from the broken rule."""
     assert failures(kind) == set()
 
 
@@ -511,6 +510,5 @@ def test_a_device_that_breaks_the_contract_is_found_out(kind):
 
 
 def test_each_check_finds_somebody_out():
-    """Every check fails for at least one device."""
     checks = {name.removeprefix("test_") for name in vars(CONTRACT) if name.startswith("test_")}
     assert {name for name in checks if not name.endswith("_left_out")} == MUST_FAIL.keys()

@@ -145,7 +145,6 @@ BROKEN = [
     ids=[each[0] for each in BROKEN],
 )
 def test_experiment(refused_everywhere, place, text, old, new, message):
-    """An invalid experiment is rejected with file, line, key, rule and value."""
     (place / "x.yaml").write_text(text.replace(old, new))
     (place / "model.yaml").write_text(MODEL)
     refused_everywhere(f"x.yaml:{message}", "x.yaml")
@@ -160,7 +159,6 @@ def test_experiment(refused_everywhere, place, text, old, new, message):
     ],
 )
 def test_model_that_can_not_be_inverted(refused_everywhere, place, old, new, message):
-    """A model without an inverse is rejected with its file, condition and index."""
     (place / "x.yaml").write_text(IN_UM)
     (place / "model.yaml").write_text(MODEL.replace(old, new))
     refused_everywhere(f"model.yaml:1: model: {message}", "x.yaml")
@@ -186,13 +184,11 @@ def test_binary_experiment(refused_everywhere, place):
     ],
 )
 def test_setting(refused_everywhere, place, setting, message):
-    """An invalid setting is rejected with its option."""
     (place / "x.yaml").write_text(GOOD)
     refused_everywhere(f"--set {setting}: {message}", "x.yaml", "--set", setting)
 
 
 def test_every_problem_is_told(hilctl, place):
-    """Each problem is one line, and one item in JSON."""
     bad = GOOD.replace("block: 10", "block: 0.5").replace("unit: A", "unit: mA")
     (place / "x.yaml").write_text(bad)
     before = contents(place)
@@ -228,7 +224,6 @@ def outputs(place):
     ],
 )
 def test_unwritable_recording(refused, output, message, overwrite):
-    """A recording that can't be created, or a folder, is rejected before anything moves."""
     refused(message, "run", "x.yaml", "--output", output, *overwrite)
 
 
@@ -241,20 +236,17 @@ def test_unwritable_recording(refused, output, message, overwrite):
     ],
 )
 def test_existing_recording_is_kept(refused, words, message):
-    """Without --overwrite; with it if the experiment is invalid."""
     refused(message, "run", "x.yaml", "--output", "run.mcap", *words)
 
 
 @pytest.mark.usefixtures("outputs")
 def test_folder_for_recordings(refused):
-    """A recording folder that can't be created is rejected."""
     setting = "recording.folder=regular/runs"
     refused("cannot create regular/runs", "run", "x.yaml", "--set", setting)
 
 
 @pytest.mark.parametrize("words", ["report {}", "replay {}", "export {} out.csv"])
 def test_recording_to_read(refused, place, words):
-    """A missing or invalid recording is rejected by name."""
     (place / "folder.mcap").mkdir()
     (place / "text.mcap").write_text("no recording")
     folder = "can't be read: Is a directory"
@@ -298,7 +290,6 @@ def test_unknown_option(hilctl, place):
     ids=["malformed", "not a number, for programs", "unwritable"],
 )  # fmt: skip
 def test_process(tmp_path, text, words, message):
-    """A rejection in a separate process is a message and an exit code only."""
     (tmp_path / "x.yaml").write_text(text)
     before = contents(tmp_path)
     command = [sys.executable, "-m", "hilctl", "run", "x.yaml", *words]

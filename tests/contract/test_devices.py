@@ -68,23 +68,8 @@ EXAMPLES = {"spring": _spring}
 OTHERS = sorted({*EXAMPLES, *known_devices()} - set(BUILTIN))
 
 
-RTU_PROFILE = """\
-vendor: nobody
-model: an analogue module on a serial line, which no shipped profile with an input is
-source: [this test]
-verified: "yes"
-link: {kind: rtu, baud: 115200}
-unit_id: 3
-address_base: 0
-exchange: 23
-turnaround_s: 0.0
-max_rate_hz: 1000.0
-outputs:
-  OUT: {address: 100, type: int16, scale: 0.001, unit: mA, min: -20.0, max: 20.0}
-inputs:
-  IN: {address: 200, type: float32, order: CDAB, unit: V, min: -10.0, max: 10.0}
-watchdog: none
-"""
+MODULE = str(Path(__file__).parents[1] / "data" / "milliampere_module.yaml")
+"""A device with an input on a serial line, which no shipped profile is."""
 
 
 def modbus(words, stack):
@@ -122,16 +107,14 @@ CASES = [
 
 
 @pytest.fixture
-def make(tmp_path):
+def make():
     """Return a factory of devices, which are closed afterwards."""
     with ExitStack() as stack:
 
         def of(case):
             kind, *words = case.split()
             if words == ["rtu"]:
-                path = tmp_path / "rtu.yaml"
-                path.write_text(RTU_PROFILE, encoding="utf-8")
-                words = [str(path)]
+                words = [MODULE]
             if kind == "modbus_dac":
                 driven = modbus(words, stack)
             elif kind in OTHERS:
@@ -151,14 +134,12 @@ def case(request):
 
 
 def test_no_device_is_left_out():
-    """Each registered device is tested here or in a named file."""
     assert {case.split()[0] for case in CASES} | set(ELSEWHERE) == {*BUILTIN, *OTHERS}
     folder = Path(__file__).parent
     assert [name for name in ELSEWHERE.values() if not (folder / name).exists()] == []
 
 
 def test_no_modbus_profile_is_left_out():
-    """Each shipped Modbus profile is tested with its emulation, input-only profiles as readers."""
     shipped = {name: load_profile(name) for name in shipped_profiles()}
     kept = {name: each for name, each in shipped.items() if isinstance(each, ModbusProfile)}
     pairs = [words.split()[:2] for words in MODBUS if words != "rtu"]

@@ -90,7 +90,6 @@ def test_keeps_to_a_tenth_of_the_limits(suite):
 
 @pytest.mark.slow
 def test_failure_ends_at_the_safe_value(suite):
-    """A device that fails during a move fails its test and ends at the safe value."""
     done, currents_a = suite(only="small_move", faults=(parse_fault("exception@250"),))
     assert done.returncode == 1
     assert "exception 4" in done.stdout
@@ -100,7 +99,6 @@ def test_failure_ends_at_the_safe_value(suite):
 
 @pytest.mark.slow
 def test_sensor_that_shows_nothing_is_found(suite):
-    """With the sensor on another input the tests fail with a hint."""
     done, currents_a = suite(sensor="AIN1", only="small_move")
     assert done.returncode == 1
     assert "nothing moved" in done.stdout
@@ -109,7 +107,6 @@ def test_sensor_that_shows_nothing_is_found(suite):
 
 @pytest.mark.slow
 def test_without_a_device_nothing_is_run():
-    """Without --device the hardware tests are skipped, with a line on how to run them."""
     done = ran()
     assert done.returncode == pytest.ExitCode.NO_TESTS_COLLECTED
     assert done.stdout.count("--device EXPERIMENT.yaml") == 1

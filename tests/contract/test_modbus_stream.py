@@ -27,18 +27,8 @@ class DrivenStream(DrivenDevice):
 
     def __init__(self, profile):
         self.emulated = InProcess.of(profile, message_s=0.0002)
-        wiring = self.emulated.device.wiring
         chosen = device_class("modbus_stream")
-        options = {
-            "profile": profile,
-            "host": "127.0.0.1",
-            "output": next(iter(self.emulated.device.profile.outputs)),
-            "input": next(iter(self.emulated.device.profile.inputs)),
-            "amplifier": {"gain_a_per_v": wiring.gain_a, "offset_a": wiring.offset_a},
-            "sensor": {"um_per_v": wiring.sensor_um, "offset_um": wiring.offset_um},
-            "watchdog": "none",
-            "fifo_blocks": FIFO_BLOCKS,
-        }
+        options = {**self.emulated.options, "profile": profile, "fifo_blocks": FIFO_BLOCKS}
         device = chosen(
             chosen.Options.model_validate(options),
             connect=lambda peer: peer.session(self.emulated.link),
@@ -82,7 +72,6 @@ def case(request):
 
 
 def test_no_streaming_profile_is_left_out():
-    """Each shipped profile that streams over Modbus is tested with its emulation."""
     shipped = {name: load_profile(name) for name in shipped_profiles()}
     assert {
         name
@@ -92,7 +81,6 @@ def test_no_streaming_profile_is_left_out():
 
 
 def test_info_of_a_stream(driven):
-    """The device info names the FIFO and the port without a connection."""
     info = driven.device.info
     assert info.buffered
     assert info.fifo_depth > 0
@@ -102,7 +90,6 @@ def test_info_of_a_stream(driven):
 
 
 def test_displacements_come_that_many_blocks_later(driven):
-    """The first exchanges leave their arrays unchanged; then each sample has its displacement."""
     driven.open()
     n, info = 10 * BLOCK, driven.device.info
     displacement_um, measured = DrivenDevice.exchange(driven, np.linspace(0.0, driven.middle, n))
@@ -114,14 +101,12 @@ def test_displacements_come_that_many_blocks_later(driven):
 
 
 def test_a_block_of_another_size_is_refused(driven):
-    """The block size is fixed at open."""
     driven.open()
     with pytest.raises(DeviceError, match="50 samples"):
         DrivenDevice.exchange(driven, np.zeros(BLOCK - 1))
 
 
 def test_the_output_persists_exactly_and_is_read_back(driven):
-    """Through closing and opening."""
     driven.open()
     driven.exchange(np.full(10 * BLOCK, driven.middle))
     held = driven.current_a

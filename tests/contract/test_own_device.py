@@ -68,7 +68,6 @@ def experiment(folder, **device):
 
 @pytest.mark.slow
 def test_is_listed_and_in_the_schema(installed):
-    """By the name of its entry point, with its options."""
     devices = json.loads(hilctl(installed, "devices", "--json").stdout)["devices"]
     assert devices["spring"] == "own_device.spring:Spring"
     schema = json.loads(hilctl(installed, "schema").stdout)
@@ -77,7 +76,6 @@ def test_is_listed_and_in_the_schema(installed):
 
 @pytest.mark.slow
 def test_is_run(installed, tmp_path):
-    """A run with all processes is recorded and replayed."""
     output = tmp_path / "own.mcap"
     done = hilctl(installed, "run", experiment(tmp_path), "--output", output, "--json")
     assert done.returncode == 0, done.stderr
@@ -91,7 +89,6 @@ def test_is_run(installed, tmp_path):
 @pytest.mark.slow
 @pytest.mark.long
 def test_is_characterised(installed, tmp_path):
-    """A characterisation finds a model of the spring."""
     model = tmp_path / "model.yaml"
     words = ("characterise", experiment(tmp_path), "--output", model, "--fast", "--json")
     done = hilctl(installed, *words, "--set", "compensator={model: model.yaml}")
@@ -105,7 +102,6 @@ def test_is_characterised(installed, tmp_path):
 
 @pytest.mark.slow
 def test_its_options_are_checked_like_any_other(installed, tmp_path):
-    """Invalid options are rejected with file and line."""
     done = hilctl(installed, "check", experiment(tmp_path, um_per_a=-1.0, um_per_b=2.0))
     assert done.returncode == 2
     mistake, unknown = (
@@ -118,7 +114,6 @@ def test_its_options_are_checked_like_any_other(installed, tmp_path):
 
 
 def test_it_needs_the_public_names_only():
-    """The example imports public names of hilctl only."""
     found = set()
     for path in (SOURCE / "own_device").glob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
@@ -130,7 +125,6 @@ def test_it_needs_the_public_names_only():
 
 
 def test_make_safe_moves_the_spring(monkeypatch):
-    """Sensor and reported output agree after make_safe, open or closed."""
     monkeypatch.syspath_prepend(SOURCE)
     spring = importlib.import_module("own_device.spring")
     device = spring.Spring(spring.SpringOptions(um_per_a=20.0))

@@ -78,7 +78,6 @@ def files(place):
     ],
 )
 def test_an_output_is_no_input(hilctl, place, words):
-    """An input is not overwritten even with --overwrite."""
     (place / "linked.mcap").symlink_to("run.mcap")
     (place / "run.csv").symlink_to("run.mcap")
     before = contents(place)
@@ -95,6 +94,7 @@ def test_what_is_written_over_was_written_by_the_same_command(hilctl, place, wor
     assert contents(place) == before
 
 
+@pytest.mark.slow
 def test_an_empty_file_and_a_torn_recording_are_replaced(hilctl, place):
     for text in (b"", b"\x89MCA", (place / "run.mcap").read_bytes()[:5000]):
         (place / "run.mcap").write_bytes(text)

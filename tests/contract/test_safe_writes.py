@@ -164,7 +164,6 @@ OPTIONS = {
 @pytest.mark.parametrize("answer", [dead, echo])
 @pytest.mark.parametrize("reply", ["none", REPEATS])
 def test_lines_without_evidence_are_sent_and_not_confirmed(text, answer, reply):
-    """The error names a value that was sent and not confirmed."""
     device = text(answer, reply)
     assert "cannot confirm" in device.info.safe_note
     unconfirmed = reply == "none" or answer is echo
@@ -291,15 +290,15 @@ def answer_request(message, value):
 
 LINES = (lines, set_by_line, answer_line)
 REQUESTS = (requests, set_by_request, answer_request)
+LONGER = [pytest.param(count, marks=pytest.mark.slow) for count in (3, 5, 8)]
 
 
 @pytest.mark.parametrize("forgets", [False, True])
-@pytest.mark.parametrize("waits_for", [1, 2, 3, 5, 8])
+@pytest.mark.parametrize("waits_for", [1, 2, *LONGER])
 @pytest.mark.parametrize("kind", ["OK", "readback", 6, 16])
 def test_the_late_answer_to_an_older_command_confirms_nothing(
     text, registers, kind, waits_for, forgets
 ):
-    """A late answer is no confirmation, whether or not the device executes later messages."""
     if isinstance(kind, str):
         late = LateDevice(LINES, waits_for, forgets=forgets)
         device = text(late, OK, READBACK if kind == "readback" else "")
@@ -355,7 +354,6 @@ def test_registers_that_refuse_the_safe_value_are_not_opened(registers, function
 
 @pytest.mark.parametrize(("value", "tried"), [(3.0, True), (12.0, False)])
 def test_lines_that_refuse_the_safe_value_are_not_opened(text, value, tried):
-    """An output outside the command range is left unchanged."""
     scripted = Refusing(LINES, lambda line: b"ERR\n" if line.startswith(b"V ") else b"", value)
     device = text(scripted, OK, READBACK)
     if tried:

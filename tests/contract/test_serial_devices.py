@@ -43,6 +43,8 @@ max_rate_hz: 100.0
 watchdog: none
 """
 SETTLED_S = 2e-3
+TIMEOUT_S = 2.0
+"""A busy machine answers within it; a device without numbered answers is silent for as long."""
 STREAM_RATE_HZ = 640.0
 BLOCK = 10
 FIFO_BLOCKS = 32  # 500 ms, the longest stall of a busy machine
@@ -103,7 +105,7 @@ def wired(case, tmp_path, stack):
     clock = time.monotonic_ns if stream else ManualClock()
     wanted = EmulatorOptions(str(path), reader=reader, reader_line=line)
     emulator = stack.enter_context(emulated(wanted, clock))
-    options = {**emulator.options, "timeout_s": 5.0, "fifo_blocks": FIFO_BLOCKS}
+    options = {**emulator.options, "timeout_s": TIMEOUT_S, "fifo_blocks": FIFO_BLOCKS}
     chosen = device_class("serial_dac")
     device = chosen(chosen.Options.model_validate(options))
     stack.callback(device.close)
@@ -164,7 +166,6 @@ def test_opening_does_not_move_the_output(driven, case):
 
 
 def test_no_serial_profile_is_left_out():
-    """Each shipped serial profile is tested with its emulation."""
     drives = {case.split()[0] for case in SERIAL}
     reads = {word for case in SERIAL for word in case.split()[1:2]}
     assert drives | (reads - {"only_reads"}) == set(serial_profiles())

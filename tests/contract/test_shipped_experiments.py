@@ -16,8 +16,7 @@ assert MODELS
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
-def test_experiment(name: str) -> None:
-    """Each experiment is ready to run and refers to its schema."""
+def test_experiment(name):
     path = CONFIGS / name
     first = path.read_text(encoding="utf-8").splitlines()[0]
     assert first == "# yaml-language-server: $schema=schema.json"
@@ -27,8 +26,7 @@ def test_experiment(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_model(name: str) -> None:
-    """Each model loads and can be inverted."""
+def test_model(name):
     model = load_model(CONFIGS / "models" / name)
     assert model.inverse(50e3).state().size > model.operators
     assert model.output_range_um is not None

@@ -121,27 +121,23 @@ def name(request):
 
 
 def test_names(profiles):
-    """The list of profiles is complete, and no two describe the same device."""
     assert tuple(shipped_profiles()) == NAMES
     assert len({profile.title for profile in profiles.values()}) == len(NAMES)
 
 
 def test_schema_line(name):
-    """The first line refers to the schema."""
     text = (FOLDER / f"{name}.yaml").read_text(encoding="utf-8")
     assert text.startswith("# yaml-language-server: $schema=schema.json\n")
     assert max(map(len, text.splitlines())) <= 120
 
 
 def test_round_trip(profiles, name):
-    """A profile survives writing and reading."""
     profile = profiles[name]
     assert type(profile).model_validate(profile.model_dump()) == profile
     assert type(profile) in {profile_class(kind) for kind in link_kinds()}
 
 
 def test_provenance(profiles, name):
-    """Documents are named, and each unverified value is in the file and named once."""
     profile, document = profiles[name], load_document(FOLDER / f"{name}.yaml")
     assert profile.verified in {"partly", "no"}
     assert len(set(profile.unverified)) == len(profile.unverified)
@@ -150,7 +146,6 @@ def test_provenance(profiles, name):
 
 
 def test_missing_sensor_or_output_is_said_so(profiles, name):
-    """The notes of an output-only or input-only device mention a second device."""
     profile = profiles[name]
     channels = profile.inputs.values()
     reads = any(getattr(channel, "measures", "terminal") == "terminal" for channel in channels)
@@ -161,7 +156,6 @@ def test_missing_sensor_or_output_is_said_so(profiles, name):
 
 
 def test_watchdog(profiles, name):
-    """Unit, feeding and trip of the watchdog agree with the device."""
     watchdog = profiles[name].watchdog
     if name not in WATCHDOGS:
         assert watchdog == "none"
@@ -174,7 +168,6 @@ def test_watchdog(profiles, name):
 
 @pytest.mark.parametrize(("name", "output", "address", "function", "value", "data"), OUTPUTS)
 def test_modbus_output(modbus, name, output, address, function, value, data):
-    """An output's value goes to the right address, in the right bytes."""
     channel = modbus[name].outputs[output]
     assert modbus[name].wire_address(channel) == address
     assert channel.function == function
@@ -184,7 +177,6 @@ def test_modbus_output(modbus, name, output, address, function, value, data):
 
 @pytest.mark.parametrize(("name", "sensor", "address", "function", "data", "value"), INPUTS)
 def test_modbus_input(modbus, name, sensor, address, function, data, value):
-    """An input is read from the right address and understood."""
     channel = modbus[name].inputs[sensor]
     assert modbus[name].wire_address(channel) == address
     assert channel.read_function == function
@@ -193,7 +185,6 @@ def test_modbus_input(modbus, name, sensor, address, function, data, value):
 
 @pytest.mark.parametrize(("name", "key", "area", "address"), SPECIAL)
 def test_other_registers(modbus, name, key, area, address):
-    """Addresses of settings, watchdog and self test agree with the documents."""
     register = dict(modbus[name].registers())[key]
     assert (register.area, modbus[name].wire_address(register)) == (area, address)
 
@@ -222,7 +213,6 @@ def test_waveshare_examples(modbus):
 
 
 def test_every_limit_can_be_written(modbus):
-    """Both ends of every output's range fit into its register and its raw limits."""
     for channel in chain(*(each.outputs.values() for each in modbus.values())):
         for value in channel.limits:
             written = channel.format.decode(channel.format.encode(value))
@@ -290,7 +280,6 @@ def test_dcon_watchdog(profiles):
 
 
 def test_kepco_exchange(profiles):
-    """One line sets the current and reads it back."""
     line = profiles["kepco_bop"].exchange.write.format(value=1.0)
     assert line == "CURR 1.000000;:MEAS:CURR?"
 
@@ -301,7 +290,6 @@ def test_gap(profiles):
 
 
 def test_no_timeout_in_text_outputs(profiles):
-    """An output line contains the value and the address only."""
     texts = [each for each in profiles.values() if isinstance(each, AsciiProfile)]
     outputs = [output for each in texts for output in each.outputs.values()]
     assert outputs

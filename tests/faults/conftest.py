@@ -20,7 +20,7 @@ import yaml
 
 from hilctl.analysis.replay import replay
 from hilctl.recording.reader import read
-from tests.fakes import logged, loop_of
+from tests.fakes import T7_OPTIONS, logged, loop_of
 
 PROFILES = Path(__file__).parents[1] / "data"
 
@@ -41,15 +41,7 @@ def each_kind(cases, shown):
     ]
 
 
-T7 = {
-    "kind": "modbus_dac",
-    "profile": "labjack_t7",
-    "output": "DAC0",
-    "input": "AIN0",
-    "amplifier": {"gain_a_per_v": 4.0, "offset_a": -10.0},
-    "sensor": {"um_per_v": 12.5},
-    "watchdog": "none",
-}
+T7 = {"kind": "modbus_dac", **T7_OPTIONS}
 """Device section of a LabJack T7, without its address."""
 MODULE = {
     "kind": "modbus_dac",

@@ -10,6 +10,7 @@ import struct
 import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from pathlib import Path
 
 import pytest
 
@@ -18,22 +19,6 @@ from hilctl_drivers.emulator.options import EmulatorOptions
 from tests.fakes import ManualClock, emulated
 
 BAUD = 115_200
-RTU_PROFILE = """\
-vendor: nobody
-model: an analogue module on a serial line
-source: [tests/peers]
-verified: "yes"
-link: {kind: rtu, baud: 115200}
-address_base: 0
-exchange: 23
-turnaround_s: 0.0
-max_rate_hz: 1000.0
-outputs:
-  OUT: {address: 100, type: int16, scale: 0.001, unit: mA, min: -20.0, max: 20.0}
-inputs:
-  IN: {address: 200, type: float32, order: CDAB, unit: V, min: -10.0, max: 10.0}
-watchdog: none
-"""
 
 
 class RefusedError(Exception):
@@ -279,14 +264,7 @@ def connect(programs) -> Iterator[Callable]:
         client.close()
 
 
-@pytest.fixture
-def module(tmp_path) -> str:
-    """Path of a profile for a serial line."""
-    path = tmp_path / "module.yaml"
-    path.write_text(RTU_PROFILE, encoding="utf-8")
-    return str(path)
-
-
+MODULE = str(Path(__file__).parents[1] / "data" / "milliampere_module.yaml")
 ON_TCP = pytest.mark.parametrize("kind", [Mbpoll, Libmodbus, Pymodbus, PyModbusTcp, ModbusTk])
 ON_SERIAL = pytest.mark.parametrize("kind", [Mbpoll, Libmodbus, Pymodbus, ModbusTk])
 
@@ -332,9 +310,9 @@ def test_sixteen_bits_over_tcp(emulate, connect, kind):
 
 
 @ON_SERIAL
-def test_registers_over_a_serial_line(emulate, connect, module, kind):
+def test_registers_over_a_serial_line(emulate, connect, kind):
     """A module's mA and swapped floats are correct with RTU framing, CRC and unit id."""
-    served = emulate(module)
+    served = emulate(MODULE)
     client = connect(kind, served)
     for raw in (8000, 0x10000 - 12_000):
         current_a = signed(raw) * 1e-3 * 0.5

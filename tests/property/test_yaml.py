@@ -1,4 +1,4 @@
-"""YAML files: scalars of the core schema in every reader; damaged experiments and profiles."""
+"""YAML files: scalars of the core schema in every reader; damaged files."""
 
 import math
 import random
@@ -17,8 +17,11 @@ from hilctl.base.errors import ConfigError, ConfigProblem, InputError
 from hilctl.base.yaml import Document, dump, io
 from hilctl.experiment.load import resolve
 from hilctl.experiment.preflight import check
-from hilctl.models.model_file import load_model, parse_model
+from hilctl.models.model_file import dump_model, load_model, parse_model
 from hilctl_drivers.profile import FOLDER, load_profile, parse_profile
+from tests.contract.test_bad_input import MODEL as MODEL_TEXT
+from tests.unit.experiment.test_file import MINIMAL
+from tests.unit.models.test_model_file import OMEGA
 
 INF, NAN = math.inf, math.nan
 
@@ -56,17 +59,14 @@ def test_scalars_are_those_of_the_core_schema(text, value):
     assert data["quoted"] == text
 
 
-EXPERIMENT = """\
-name: tiny
-device: {kind: simulated_terfenol}
-sample_rate_hz: 1000
-waveform: {kind: hold, unit: A, level: 1.0, duration_s: 1.0}
-compensator: none
-limits: {peak_current_a: 2.0, slew_a_per_s: 5000.0, stroke_um: [-75.0, 60.0]}
+EXPERIMENT = (
+    MINIMAL
+    + """\
 description: DESCRIPTION
 safe:
   ramp_s: NUMBER
 """
+)
 MODEL = """\
 model:
   kind: rdpi
@@ -224,14 +224,6 @@ def test_too_much_is_refused_at_once(text, rule, monkeypatch):
 
 FILES = 10_000
 PARTS = 32
-RDPI_MODEL = """\
-model:
-  kind: rdpi
-  direct: 2.7
-  weights: [2.3, 0.4]
-  thresholds: [0.3, 0.6]
-  output_range_um: [-12.0, 12.0]
-"""
 GOOD = (
     """\
 name: tiny
@@ -267,15 +259,23 @@ compensator: {model: model.yaml}
 limits: {peak_current_a: 2.0, slew_a_per_s: 500.0, stroke_um: [-75.0, 60.0]}
 """,
 )
+MODELS = (MODEL_TEXT, dump_model(OMEGA))
 PIECES = (
     "null", "~", "true", "on", "1e3", "1.0e+3", "-1", "0", ".nan", ".inf", "-.inf", "1e999", "''",
     "[]", "{}", "[1, 2]", "*x", "&x 1", "!!python/object:os.system {}", "!!binary aGk=", "<<: *a",
     "? : x", "'", '"', "\t", "\n", "  ", ": ", "- ", "#", "\x00", "\ufeff", "é", "0x1F",
     "2026-11-21", "99999999999999999999", "9" * 400, "none", "...", "---", "%YAML 9.9", "|", ">",
 )  # fmt: skip
+NASTY = (
+    *PIECES, "!!int ", "!!set ", "!<tag:yaml.org,2002:int> ", "<<: ", "? [1]\n", ",", "%YAML 1.1\n",
+    "\x85", "\u2028", "\ud800", '"\\U99999999"', '"\\ud800"', '"\\x00"', "0x" + "f" * 5000,
+    "9" * 5000, "2024-13-99", "0b_", "1:30", "5.0e-324", "1.0e+308", "[" * 3000, "{a: " * 3000,
+    "- " * 500, "kind: [1]\n", "kind: {a: 1}\n", "kind: ppi\n", "model: &m\n  x: *m\n", "1: 2\n",
+    "[a]: 2\n", "{a: b}: 2\n",
+)  # fmt: skip
 
 
-def mutated(text: str, chance: random.Random) -> str:
+def mutated(text: str, chance: random.Random, pieces: tuple[str, ...] = PIECES) -> str:
     """Return a text with one to four pieces cut, doubled, swapped, or put in."""
     for _ in range(chance.randint(1, 4)):
         a, b = sorted(chance.randrange(len(text) + 1) for _ in range(2))
@@ -287,7 +287,7 @@ def mutated(text: str, chance: random.Random) -> str:
         elif how == 1:
             text = text[:b] + text[a:]
         elif how == 2:
-            text = text[:a] + chance.choice(PIECES) + text[b:]
+            text = text[:a] + chance.choice(pieces) + text[b:]
         elif how == 3:
             i, j = (chance.randrange(len(lines)) for _ in range(2))
             lines[i], lines[j] = lines[j], lines[i]
@@ -295,7 +295,7 @@ def mutated(text: str, chance: random.Random) -> str:
         elif how == 4:
             i = chance.randrange(len(lines))
             key, colon, _ = lines[i].partition(":")
-            lines[i] = f"{key}{colon} {chance.choice(PIECES)}"
+            lines[i] = f"{key}{colon} {chance.choice(pieces)}"
             text = "\n".join(lines)
         else:
             text = text[:a] + chr(chance.randrange(1, 256)) + text[a + 1 :]
@@ -315,7 +315,7 @@ def refusal(text: str, folder: Path) -> InputError | None:
     "part", [0, *(pytest.param(part, marks=pytest.mark.slow) for part in range(1, PARTS))]
 )
 def test_damaged_experiments_are_refused_in_words(tmp_path, part):
-    (tmp_path / "model.yaml").write_text(RDPI_MODEL, encoding="utf-8")
+    (tmp_path / "model.yaml").write_text(MODEL_TEXT, encoding="utf-8")
     chance = random.Random(part)
     texts = [mutated(GOOD[number % 2], chance) for number in range(FILES // PARTS)]
     refusals = [error for text in texts if (error := refusal(text, tmp_path)) is not None]
@@ -342,3 +342,18 @@ def test_damaged_profiles_are_refused_in_words(name, files):
         assert re.fullmatch(r"profile\.yaml:\d+", problem.where), problem
         assert problem.rule
         assert not re.search(r"function-|literal\[|tagged-union", problem.key), problem
+
+
+@pytest.mark.parametrize("files", [200, pytest.param(2_000, marks=pytest.mark.slow)])
+def test_damaged_models_are_refused_in_words(files):
+    refusals = []
+    for seed in range(files):
+        chance = random.Random(seed)
+        text = mutated(chance.choice(MODELS), chance, NASTY)
+        try:
+            parse_model("m.yaml", text)
+        except InputError as error:
+            refusals.append(str(error))
+    assert len(refusals) > 0.5 * files
+    assert all(text.startswith("m.yaml") for text in refusals)
+    assert "\n".join(refusals).encode("utf-8")

@@ -66,8 +66,6 @@ def test_fault_has_exit_code_3(hilctl, words, tmp_path):
 
 
 def test_stop_has_the_exit_code_of_its_signal(hilctl, words, monkeypatch):
-    """During a run, and between two runs."""
-
     def stopped(plan, host):
         return CampaignResult(plan, {}, (), "step 1: Ctrl-C", 2)
 
@@ -186,13 +184,11 @@ def test_learn_prints_one_json_object(learn, tmp_path):
 
 @pytest.mark.parametrize(("how", "code"), [({"stop_signal": 2}, 130), ({"fault": True}, 3)])
 def test_exit_code_of_learn(learn, tmp_path, how, code):
-    """The correction is written in every case."""
     assert learn(**how)[0] == code
     assert (tmp_path / "correction.yaml").is_file()
 
 
 def test_learn_refuses_existing_files(learn, tmp_path):
-    """An existing correction, or a folder with runs."""
     (tmp_path / "correction-runs").mkdir()
     (tmp_path / "correction-runs" / "run-00.mcap").touch()
     code, _, err = learn()

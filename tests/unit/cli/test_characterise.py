@@ -79,7 +79,6 @@ def test_dry_run_prints_the_plan_only(ends, command, tmp_path, as_json):
 
 
 def test_problem_of_the_rig_has_exit_code_3(ends, command, tmp_path):
-    """The page has the measured values."""
     ends["found"] = replace(ends["found"], problem="no reaction: look", problem_code="no_reaction")
     code, _, err = command("--fast")
     assert code == 3

@@ -35,14 +35,13 @@ def test_missing_command_is_an_input_error(module, monkeypatch):
 
 
 def test_similar_command_is_suggested():
-    """Commands are suggested without being imported."""
     ended = in_a_process(MAIN, "stauts")
     assert "'status'" in ended.stderr
 
 
 @pytest.mark.parametrize("name", ["check", "report"])
 def test_eof_error_is_not_reported_as_ctrl_d(hilctl, monkeypatch, name):
-    def ended() -> None:
+    def ended():
         raise EOFError("ran out")
 
     monkeypatch.setattr("hilctl.cli.reports.report", ended)

@@ -20,7 +20,6 @@ class Terminal(io.StringIO):
 
 @pytest.mark.parametrize(("quiet", "stream"), [(True, Terminal()), (False, io.StringIO())])
 def test_no_progress_without_a_terminal(monkeypatch, quiet, stream):
-    """With JSON output, or if standard error is a file."""
     monkeypatch.setattr("sys.stderr", stream)
     with progress_bar("identify", quiet=quiet) as report:
         report(0.5, "half")
@@ -54,7 +53,6 @@ def printed(monkeypatch, capsys):
 
 
 def test_markup_is_not_interpreted(printed):
-    """File names and labels may look like markup or emoji names."""
     table = Table("[/x]", title="[red]a[/]")
     table.add_row(":smile: [/b]")
     text = printed(table)
@@ -62,7 +60,6 @@ def test_markup_is_not_interpreted(printed):
 
 
 def test_styles_are_kept_and_control_characters_escaped(printed):
-    """Plain text, styled text, cells and titles."""
     hostile = "a\x1b[2Jb"
     table = Table(hostile, title=Text(hostile))
     table.add_row(Text(hostile, "green"))

@@ -33,7 +33,6 @@ def test_stop_timeout_has_exit_code_3(answering, hilctl):
 
 
 def test_stop_all_reports_each_run(answering, hilctl, json_of):
-    """A run that stays active is a failure; no run is not."""
     chosen = []
 
     def stop_runs(runs, wait_s):
@@ -83,7 +82,7 @@ def shown(monkeypatch, capsys):
     """Return a function that returns the lines for a terminal of 80 columns."""
     monkeypatch.setenv("COLUMNS", "80")
 
-    def of(*found: dict) -> list[str]:
+    def of(*found):
         print_status(list(found))
         return capsys.readouterr().out.splitlines()
 
@@ -91,7 +90,6 @@ def shown(monkeypatch, capsys):
 
 
 def test_status_of_one_run(shown):
-    """Each value is on a line with its name; no line is wrapped."""
     assert shown(RUNNING) == [
         "terfenol_sine_6a-12345  running",
         "  time       12.5 of 30.0 s",
@@ -104,7 +102,6 @@ def test_status_of_one_run(shown):
 
 
 def test_status_of_several_runs_has_their_errors(shown):
-    """Of the recording, and of a run that does not answer."""
     silent = {"name": "other[1]", "state": "not answering", "recording": PATH, "error": "timed out"}
     lines = shown({**RUNNING, "recording_error": "full"}, silent)
     assert lines[0] == "terfenol_sine_6a-12345  running"

@@ -47,7 +47,6 @@ def test_implausible_answer_has_exit_code_3(monkeypatch, hilctl, words):
 
 
 def test_bars_are_logarithmic():
-    """One late tick among thousands has a visible bar."""
     late_ns = np.array([1500] * 9_999 + [70_000], dtype=np.int64)
     console = Console(file=io.StringIO(), width=120)
     console.print(render_diagnosis(Diagnosis((), Latency(1000.0, late_ns, ()))))

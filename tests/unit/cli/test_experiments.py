@@ -108,7 +108,6 @@ def test_init_refuses_wrong_input_and_existing_files(here, hilctl, words, messag
 
 
 def test_init_asks_in_a_terminal(here, monkeypatch):
-    """An empty answer keeps the default."""
     answers = {"device,": "labjack_t7", "name or": "10.0.0.7", "largest current": "0.4"}
     asked = []
 

@@ -329,7 +329,6 @@ def test_final_state_is_printed(run, monkeypatch, capsys):
 
 
 def test_subprocess_shows_the_run_of_its_parent(run, monkeypatch, capsys):
-    """It waits until that run exists; without a parent it ends."""
     other = SimpleNamespace(card=SimpleNamespace(name="x", supervisor=8))
     found = iter([[], [other], [other, run]])
     monkeypatch.setattr(module, "runs", lambda: next(found))

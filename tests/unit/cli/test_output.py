@@ -29,7 +29,6 @@ SHOWN = r"a\x1b]0;title\x07b\x9b2Jc\rd\x7fe\u202ef"
 
 
 def test_escaped_and_styled_text_stay_in_order():
-    """Characters outside the encoding are escaped too."""
     target = io.BytesIO()
     below = io.TextIOWrapper(target, encoding="ascii")
     stream = SafeStream(below)
@@ -41,7 +40,6 @@ def test_escaped_and_styled_text_stay_in_order():
 
 
 def test_closed_pipe_is_no_error():
-    """The first error is kept, and later output is discarded."""
     reading, writing = os.pipe()
     os.close(reading)
     with os.fdopen(writing, "w") as below:
@@ -67,7 +65,6 @@ PRINTING = "from hilctl.cli.output import safe_streams\nwith safe_streams():\n  
     ("acts", "code", "exit_code"), [(False, 0, 3), (False, 2, 2), (True, 0, 0), (True, 130, 130)]
 )
 def test_lost_output_changes_success_of_commands_that_do_not_act(acts, code, exit_code):
-    """For example on a full disk."""
     printing = PRINTING.replace("safe_streams()", f"safe_streams(acts={acts})")
     ended = in_a_process(f"{printing}\n    raise SystemExit({code})", "> /dev/full")
     assert ended.returncode == exit_code

@@ -140,7 +140,6 @@ OTHER = replace(
     ],
 )
 def test_differences_of_a_replay_are_printed(monkeypatch, capsys, result, other, texts):
-    """A replay with another model is not called identical."""
     monkeypatch.setenv("COLUMNS", "120")
     print_replay(result, other=other)
     shown = capsys.readouterr().out

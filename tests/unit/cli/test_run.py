@@ -197,7 +197,6 @@ def test_names_are_not_markup(lagging):
 
 
 def test_uncompensated_run_shows_no_errors(make_recording):
-    """Rows without a value are omitted."""
     recording = make_recording(wave(1000.0, 3), segments=[segment(0, 3000, 1000.0)])
     text = terminal(summarize(recording))
     assert "error" not in text
@@ -205,7 +204,6 @@ def test_uncompensated_run_shows_no_errors(make_recording):
 
 
 def test_segments_have_a_table_without_empty_columns(make_recording):
-    """Columns without a value are omitted."""
     parts = [segment(0, 3000, 1000.0, "first"), segment(3000, 3000, 1000.0, "second")]
     recording = make_recording(wave(1000.0, 6, LAG), command=wave(1000.0, 6), segments=parts)
     text = terminal(summarize(recording))
@@ -216,7 +214,6 @@ def test_segments_have_a_table_without_empty_columns(make_recording):
 
 @pytest.mark.parametrize(("minutes", "shown"), [(20, range(20)), (21, range(1, 21))])
 def test_worst_minutes_are_shown(lagging, minutes, shown):
-    """In chronological order."""
     late = {"p50": 80.0, "p90": 90.0, "p99": 95.0, "p99.9": 99.0}
     rows = [{"minute": k, "ticks": 60_000, **late, "max": 100.0 + k} for k in range(minutes)]
     text = terminal(replace(summarize(lagging()), lateness_by_minute=rows))

@@ -63,7 +63,6 @@ def exchange(device, *command):
 @pytest.mark.parametrize("longest", [1, 3, 64, 65])
 @pytest.mark.parametrize("bad", [2.0001, -2.0001, np.nan, np.inf, -np.inf])
 def test_a_command_out_of_range_is_refused_and_not_sent(longest, bad, place):
-    """Never clipped, in short blocks and in long ones; the device stays open for the ramp."""
     device = NotingDac(longest)
     device.open(1000.0, longest)
     command = [0.0] * longest
@@ -100,7 +99,6 @@ def test_a_rate_beyond_the_device_is_refused_before_it_is_opened():
 
 @pytest.mark.parametrize("step", ["open", "arm", "output", "exchange", "close", "put out"])
 def test_after_an_error_nothing_is_held(step):
-    """The error names the device and what was done; it must be opened again."""
     device = NotingDac()
     device.broken = step
 
@@ -129,7 +127,6 @@ def test_closing_twice_says_goodbye_once():
 
 
 def test_looking_is_for_a_device_that_is_closed():
-    """It lets go whatever comes of it; open, it is left alone."""
     device = NotingDac()
     assert device.look() == (1.0, None)
     device.broken = "look"
@@ -144,8 +141,6 @@ def test_looking_is_for_a_device_that_is_closed():
 
 @pytest.mark.parametrize("error", [DeviceError, UnconfirmedError])
 def test_what_cannot_be_confirmed_is_told_from_what_failed(error):
-    """The caller repeats an attempt that failed, and not one that nothing can confirm."""
-
     class Sent(NotingDac):
         def _put_out(self, command):
             raise error("sent")

@@ -2,7 +2,6 @@
 
 import json
 import re
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -60,7 +59,7 @@ BOARD = (FOLDER / "cobs_board_fifo.yaml").read_text(encoding="utf-8")
 TEXTS = {"modbus": MODBUS, "ascii": ASCII, "board": BOARD}
 
 
-def changed(base: str, changes: dict[str, Any]) -> str:
+def changed(base, changes):
     """Return a profile's text with other values at dotted keys; None takes a key out."""
     data = yaml.safe_load(TEXTS[base])
     for key, value in changes.items():
@@ -75,7 +74,7 @@ def changed(base: str, changes: dict[str, Any]) -> str:
     return dump(data)
 
 
-def lines(text: str) -> list[str]:
+def lines(text):
     """Return the messages about a text."""
     with pytest.raises(ConfigError) as caught:
         parse_profile(text, "acme.yaml")
@@ -196,16 +195,12 @@ BROKEN: list[tuple[str, dict[str, Any], str]] = [
 
 
 class TestRules:
-    """What a profile must keep to."""
-
     @pytest.mark.parametrize("base", TEXTS)
-    def test_unbroken(self, base: str) -> None:
-        """The profiles that the broken ones are made from are good."""
+    def test_unbroken(self, base):
         parse_profile(changed(base, {}), "acme.yaml")
 
     @pytest.mark.parametrize(("base", "changes", "message"), BROKEN)
-    def test_broken(self, base: str, changes: dict[str, Any], message: str) -> None:
-        """Each broken rule gives one line with file, key and rule."""
+    def test_broken(self, base, changes, message):
         found = lines(changed(base, changes))
         assert len(found) == 1, found
         assert re.match(r"acme\.yaml:\d+: ", found[0])
@@ -213,20 +208,17 @@ class TestRules:
 
     @pytest.mark.parametrize("base", ["modbus", "ascii"])
     @pytest.mark.parametrize("group", ["outputs", "inputs"])
-    def test_one_of_them_is_enough(self, base: str, group: str) -> None:
-        """A device may only drive, or only read beside another one that drives."""
+    def test_one_of_them_is_enough(self, base, group):
         profile = parse_profile(changed(base, {group: {}}), "acme.yaml")
         assert not getattr(profile, group)
 
-    def test_board_with_integers(self) -> None:
-        """A board may send whole numbers, where its range fits into them."""
+    def test_board_with_integers(self):
         changes = {"outputs.DAC.type": "int16", "outputs.DAC.order": "BA"}
         profile = parse_profile(changed("board", changes), "acme.yaml")
         assert isinstance(profile, FrameProfile)
         assert profile.outputs["DAC"].format.size == 2
 
-    def test_all_at_once(self) -> None:
-        """Several broken rules are reported together."""
+    def test_all_at_once(self):
         text = changed("modbus", {"vendor": None, "link.baud": 1, AO + "type": "int8"})
         keys = [line.split(": ")[1] for line in lines(text)]
         assert sorted(keys) == ["link.baud", "outputs.AO.type", "vendor"]
@@ -245,15 +237,12 @@ class TestRules:
              "acme.yaml:9: selftest.expect: must be a number, got 'x'"),
         ],
     )  # fmt: skip
-    def test_lines(self, old: str, new: str, found: str) -> None:
-        """Each problem has the line of the value that it is about, whoever found it."""
+    def test_lines(self, old, new, found):
         assert MODBUS.count(old) == 1
         assert lines(MODBUS.replace(old, new))[0].startswith(found)
 
 
 class TestYaml:
-    """What YAML does behind one's back."""
-
     @pytest.mark.parametrize(
         ("text", "message"),
         [
@@ -266,14 +255,13 @@ class TestYaml:
             ("a: !!python/object:os.system {}", "is not readable YAML"),
         ],
     )
-    def test_refused(self, text: str, message: str) -> None:
-        """What looks like one thing and is another is refused, in one line."""
+    def test_refused(self, text, message):
         found = lines(text)
         assert message in found[0]
         assert len(found) == 1
 
     @pytest.mark.parametrize(("written", "address"), [("0x0200", 512), ("00257", 257)])
-    def test_addresses(self, written: str, address: int) -> None:
+    def test_addresses(self, written, address):
         """Addresses can be written as manuals have them."""
         profile = parse_profile(MODBUS.replace("address: 4", f"address: {written}"), "acme.yaml")
         assert isinstance(profile, ModbusProfile)
@@ -281,30 +269,24 @@ class TestYaml:
 
 
 class TestLoading:
-    """Names and paths."""
-
-    def test_by_path(self, tmp_path: Path) -> None:
-        """A user's own profile is given by path."""
+    def test_by_path(self, tmp_path):
         path = tmp_path / "mine.yaml"
         path.write_text(MODBUS, encoding="utf-8")
         assert load_profile(str(path)).title == "Acme DAQ-1"
 
-    def test_unknown_name(self) -> None:
-        """An unknown name is answered with the nearest, or with all that are shipped."""
+    def test_unknown_name(self):
         with pytest.raises(InputError, match=r"'labjack'.* 'labjack_t"):
             load_profile("labjack")
         with pytest.raises(InputError, match="'zzz' is shipped") as error:
             load_profile("zzz")
         assert all(name in str(error.value) for name in shipped_profiles())
 
-    def test_no_file(self, tmp_path: Path) -> None:
-        """A path without a file is named."""
+    def test_no_file(self, tmp_path):
         path = tmp_path / "none.yaml"
         with pytest.raises(InputError, match=f"^{re.escape(str(path))}"):
             load_profile(str(path))
 
-    def test_with_link(self) -> None:
-        """A device that was set to another baud is the same device on a faster line."""
+    def test_with_link(self):
         profile = parse_profile(MODBUS, "acme.yaml")
         faster = with_link(profile, baud=115200, parity="E")
         assert isinstance(faster, ModbusProfile)
@@ -317,17 +299,13 @@ class TestLoading:
 
 
 class TestSchema:
-    """The schema that editors read."""
-
-    def test_file_is_up_to_date(self) -> None:
-        """profiles/schema.json is what the code says."""
+    def test_file_is_up_to_date(self):
         path = FOLDER / "schema.json"
         assert path.read_text(encoding="utf-8") == profile_schema_text(), (
             "write hilctl_drivers.profile.profile_schema_text() to profiles/schema.json"
         )
 
-    def test_covers_all_kinds(self) -> None:
-        """Each kind of profile is a choice, and unknown keys are refused everywhere."""
+    def test_covers_all_kinds(self):
         schema = json.loads(profile_schema_text())
         names = [choice["$ref"].rsplit("/", 1)[1] for choice in schema["oneOf"]]
         kinds = (AsciiProfile, FrameProfile, ModbusProfile)

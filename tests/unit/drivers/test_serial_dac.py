@@ -16,6 +16,8 @@ from tests.unit.drivers.conftest import TIMEOUT_S
 DCON = (Path(__file__).parents[2] / "data" / "dcon_module.yaml").read_text()
 KINDS = ["dcon", "scpi", "cobs", "length"]
 PATIENT_S = 20.0
+SILENCE_S = 0.5
+"""A timeout that a test waits for."""
 
 
 @pytest.fixture
@@ -49,7 +51,6 @@ def await_current(bench, current_a):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_command_arrives_and_a_reading_comes_back(rig, kind):
-    """Through amplifier and sensor, the coil carries what was asked and the rig is seen to move."""
     bench = rig(kind)
     bench.open()
     assert abs(bench.exchange(0.0)) < 1.0
@@ -81,7 +82,6 @@ def exchange_until_it_fails(bench, command=2.0):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_bad_answer_is_an_error_and_the_output_can_still_be_made_safe(rig, kind, fault):
-    """No wrong reading is taken; the next request is not confused by what is left on the line."""
     late = f":{1.5 * TIMEOUT_S}" if fault == "delay" else ""
     bench = rig(kind, faults=[f"{fault}{late}@30"], timeout_s=TIMEOUT_S)
     bench.open()
@@ -96,7 +96,6 @@ def test_a_bad_answer_is_an_error_and_the_output_can_still_be_made_safe(rig, kin
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_an_unplugged_port_is_an_error_everywhere(rig, kind):
-    """Exchange and make_safe say so within the time-out, and nothing hangs."""
     bench = rig(kind, faults=["unplug@30"])
     bench.open()
     with pytest.raises(DeviceError, match="unplugged"):
@@ -108,7 +107,6 @@ def test_an_unplugged_port_is_an_error_everywhere(rig, kind):
 
 @pytest.mark.parametrize("kind", ["dcon", "cobs"])
 def test_a_silent_host_is_noticed_by_the_device(rig, kind):
-    """The device's own watchdog puts the output at the safe value, and then refuses commands."""
     bench = rig(kind, watchdog={"timeout_s": 20.0, "safe_command": 0.0})
     bench.open()
     for _ in range(10):
@@ -124,7 +122,6 @@ def test_a_silent_host_is_noticed_by_the_device(rig, kind):
 @pytest.mark.slow  # it is fed by this machine's clock, and would trip where that runs ahead
 @pytest.mark.parametrize("kind", ["dcon", "cobs"])
 def test_exchanges_feed_the_watchdog_and_close_disarms_it(rig, kind):
-    """Through several of its timeouts nothing trips, nor after closing."""
     bench = rig(kind, watchdog={"timeout_s": 2.0, "safe_command": 0.0})
     bench.open()
     for _ in range(60):
@@ -165,22 +162,7 @@ def test_a_trip_of_an_earlier_run_ends_at_the_safe_value(rig, profiles, readback
     assert bench.exchange(1.0) < 45.0
 
 
-@pytest.mark.parametrize("own_line", [True, False])
-def test_the_sensor_may_stand_on_another_device(rig, profiles, tmp_path, own_line):
-    """On a line of its own, or on the same one at another address."""
-    path = tmp_path / "reader.yaml"
-    path.write_text(DCON.replace("checksum: dcon", "checksum: none"))
-    bench = rig("icp_m7024_dcon", reader=str(path), own_line=own_line, baud=115200)
-    bench.device.open(50.0, 1)
-    assert abs(bench.exchange(0.0)) < 1.0
-    bench.exchange(5.0)
-    bench.pass_s(0.5)
-    assert 20.0 < bench.exchange(5.0) < 45.0
-    assert bench.device.info.max_rate_hz < 200.0
-
-
 def test_scpi_supply_is_set_up_and_checked(rig):
-    """A Kepco BOP is put in current mode, and an error that it keeps is found on the way out."""
     bench = rig("kepco_bop", reader="agilent_34970a", own_line=True)
     bench.open()
     bench.exchange(2.5)
@@ -192,7 +174,6 @@ def test_scpi_supply_is_set_up_and_checked(rig):
 
 @pytest.mark.parametrize(("profile", "current_a"), [("kepco_bop", 2.5), ("tdk_lambda_gen", 3.0)])
 def test_the_output_is_measured_where_that_is_asked_for(rig, profile, current_a):
-    """What MEAS:CURR? or MC? says stands beside the command, and costs a part of the rate."""
     quick = rig(profile, reader="agilent_34970a", own_line=True).device.info
     bench = rig(profile, reader="agilent_34970a", own_line=True, measure="current")
     info = bench.device.info
@@ -207,8 +188,7 @@ def test_the_output_is_measured_where_that_is_asked_for(rig, profile, current_a)
 
 
 def test_a_reader_that_fails_is_named(rig):
-    """Which of the two devices did not answer is said."""
-    bench = rig("kepco_bop", reader="agilent_34970a", own_line=True, timeout_s=TIMEOUT_S)
+    bench = rig("kepco_bop", reader="agilent_34970a", own_line=True, timeout_s=SILENCE_S)
     bench.open()
     bench.exchange(0.0)
     bench.emulator.wires[1].devices = []
@@ -217,10 +197,10 @@ def test_a_reader_that_fails_is_named(rig):
         exchange_until_it_fails(bench, 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("fault", ["silence", "corrupt", "duplicate", "wrong_id"])
 def test_a_bad_answer_to_the_safe_value_confirms_nothing(rig, kind, fault):
-    """The attempt that got it fails; a later one does not."""
     message = {"dcon": 15, "scpi": 15, "cobs": 10, "length": 10}[kind]
     bench = rig(kind, faults=[f"{fault}@{message}"], timeout_s=TIMEOUT_S)
     bench.open()
@@ -230,9 +210,9 @@ def test_a_bad_answer_to_the_safe_value_confirms_nothing(rig, kind, fault):
     assert bench.current_a() == pytest.approx(0.0, abs=2e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_device_that_was_deaf_is_made_safe_when_it_comes_back(rig, kind):
-    """Each message of some time is lost: the safe value is sent until one gets through."""
     bench = rig(kind, faults=[f"silence@{n}" for n in range(20, 25)], timeout_s=0.3)
     bench.open()
     with pytest.raises(DeviceError, match="no answer"):
@@ -243,7 +223,6 @@ def test_a_device_that_was_deaf_is_made_safe_when_it_comes_back(rig, kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_safe_is_said_only_of_what_was_read_back(rig, kind):
-    """A device that acknowledges and holds another value is not taken for safe."""
     bench = rig(kind)
     bench.open()
     bench.exchange(2.0)
@@ -254,20 +233,9 @@ def test_safe_is_said_only_of_what_was_read_back(rig, kind):
         bench.device.make_safe(0.0)
 
 
-def test_making_safe_waits_for_no_board_to_boot(rig):
-    """The value goes out as soon as the port is open; one that boots gets it again later."""
-    bench = rig("cobs_board")
-    slept = []
-    bench.device._link._sleep = slept.append
-    bench.device.make_safe(1.0)
-    assert bench.current_a() == 1.0
-    assert slept == []
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_line_that_never_falls_silent_gets_the_safe_value(rig, kind):
-    """It is put out; that it stands can't be known as long as the answers drown."""
-    bench = rig(kind, timeout_s=TIMEOUT_S)
+    bench = rig(kind, timeout_s=SILENCE_S)
     bench.open()
     bench.exchange(2.0)
     link = bench.device._link
@@ -323,7 +291,6 @@ def test_looking_changes_nothing(rig, kind):
 
 
 def test_another_device_is_noticed_at_open(rig, tmp_path):
-    """A self-test that is answered by something else ends the opening."""
     path = tmp_path / "other.yaml"
     path.write_text(DCON.replace("{2}7.*", "{2}9.*").replace("!027024", "!029024"))
     bench = rig("dcon", profile=str(path))
@@ -332,7 +299,6 @@ def test_another_device_is_noticed_at_open(rig, tmp_path):
 
 
 def test_nobody_there_is_said(rig):
-    """A port that does not exist, and one that somebody else holds."""
     bench = rig("dcon")
     away = SerialDac(
         SerialOptions.model_validate({**bench.emulator.options, "serial_port": "/dev/ttyNOWHERE"})
@@ -361,14 +327,12 @@ def test_nobody_there_is_said(rig):
     ],
 )
 def test_options_that_do_not_go_together_are_refused(profiles, changes, text):
-    """Before anything is opened."""
     dcon = {**TWO_LINES, "profile": profiles["dcon"], "input": "AI0", "reader": None}
     with pytest.raises(InputError, match=text):
         SerialDac(SerialOptions.model_validate({**dcon, **changes}))
 
 
 def test_a_line_too_slow_for_the_safe_value_is_said():
-    """With what stands behind it; not a word on a line that is fast enough."""
     slow = {"baud": 1200, "watchdog": {"timeout_s": 2.0}}
 
     def note(**changes):

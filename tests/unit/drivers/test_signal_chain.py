@@ -1,19 +1,17 @@
 """Watchdogs that can't do what is asked of them, and channels that can't be wired so."""
 
-from typing import Any
-
 import pytest
 
 from hilctl.base.errors import InputError
 from hilctl_drivers.ascii.ascii_profile import AsciiWatchdog
 from hilctl_drivers.profile import load_profile
-from hilctl_drivers.profile_base import Range, Watchdog
+from hilctl_drivers.profile_base import Range
 from hilctl_drivers.signal_chain import DacOptions, SignalChain, channel, check_watchdog
 
 VOLTS = Range(unit="V", min=-10.0, max=10.0)
 
 
-def asked(has: Watchdog | str, offset_a: float = 0.0, **wanted: float) -> None:
+def asked(has, offset_a=0.0, **wanted):
     """Hold a wanted watchdog against what a device has, on output B."""
     options = DacOptions.model_validate(
         {
@@ -29,7 +27,7 @@ def asked(has: Watchdog | str, offset_a: float = 0.0, **wanted: float) -> None:
     check_watchdog("Acme", options, VOLTS, chain, has)
 
 
-def watchdog(**changes: Any) -> AsciiWatchdog:
+def watchdog(**changes):
     arm = ({"kind": "send", "text": "W{timeout}"},)
     data = {
         "unit_s": 0.1, "min_s": 0.1, "max_s": 10.0, "kick": "any", "on_trip": "safe",
@@ -51,7 +49,6 @@ def watchdog(**changes: Any) -> AsciiWatchdog:
     ],
 )
 def test_watchdog_that_does_not_do_what_is_asked_is_refused(has, wanted, words):
-    """The same rules for lines of text as for Modbus: it must act, on this output, as wanted."""
     with pytest.raises(InputError, match=words):
         asked(has, **wanted)
 
@@ -63,7 +60,6 @@ def test_watchdog_that_does_is_taken(has):
 
 
 def test_channels_are_found_by_name():
-    """An unknown name lists those that there are; none is said where there are none."""
     assert channel("input", "A", {"A": VOLTS}, "Acme") is VOLTS
     two = {"A": VOLTS, "B": VOLTS}
     with pytest.raises(InputError, match=r"'C' .*A, B"):
@@ -73,7 +69,6 @@ def test_channels_are_found_by_name():
 
 
 def test_input_of_its_own_output_is_no_sensor():
-    """A supply's own meter can't be the displacement sensor."""
     supply = load_profile("kepco_bop")
     with pytest.raises(InputError, match="as reader"):
         channel("input", "current", supply.inputs, supply.title)

@@ -8,24 +8,12 @@ import pytest
 from hilctl.base.samples import Flag, Samples
 from hilctl.experiment.coil_heat import CoilHeat, CoolingCoil, RunHeat, cooled
 from hilctl.experiment.load import load_experiment
+from tests.unit.studies.characterise.conftest import experiment
 
-EXPERIMENT = """\
-name: rig
-device: {kind: simulated_terfenol, seed: 3}
-sample_rate_hz: 5000
-waveform: {kind: hold, unit: A, level: 0.0, duration_s: 1.0}
-compensator: none
-limits: {peak_current_a: 4.0, slew_a_per_s: 5000.0, stroke_um: [-50.0, 50.0]}
-"""
+__all__ = ["experiment"]
+
 RATE_HZ = 5000.0
 BUDGET = ["limits.rms_current_a=1.0", "limits.thermal_time_constant_s=10.0"]
-
-
-@pytest.fixture
-def experiment(tmp_path):
-    path = tmp_path / "rig.yaml"
-    path.write_text(EXPERIMENT, encoding="utf-8")
-    return path
 
 
 @pytest.fixture

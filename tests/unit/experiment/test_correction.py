@@ -15,7 +15,7 @@ from hilctl.experiment.correction import (
     model_sha256,
     signature,
 )
-from hilctl.waveforms.build import Reference, build
+from hilctl.waveforms.build import build
 from hilctl.waveforms.spec import Sequence, Sine
 from tests.published import terfenol_rdpi
 
@@ -30,11 +30,11 @@ def sine(frequency_hz=150.0, amplitude=10.0, soft_s=0.1, **more):
     )  # fmt: skip
 
 
-def reference(waveform, tmp_path) -> Reference:
+def reference(waveform, tmp_path):
     return build(waveform, RATE_HZ, tmp_path)
 
 
-def correction_for(made: Reference, segment: Segment, model=None) -> Correction:
+def correction_for(made, segment, model=None):
     wanted = signature(made.values, segment)
     cycle = LearnedCycle.from_coefficients(segment.label, segment.period, wanted, COEFFICIENTS)
     return Correction(
@@ -42,7 +42,7 @@ def correction_for(made: Reference, segment: Segment, model=None) -> Correction:
     )
 
 
-def correction_of(correction: Correction, made: Reference, model=None):
+def correction_of(correction, made, model=None):
     """Return what is added to a reference."""
     return correction.added(made, model)[:] - made.values[:]
 

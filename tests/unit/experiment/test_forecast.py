@@ -9,17 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hilctl.base.types import F64
 from hilctl.experiment import forecast as command_simulation
-from hilctl.experiment.forecast import (
-    Forecast,
-    LineEnds,
-    fade_refusal,
-    simulate_commands,
-)
+from hilctl.experiment.forecast import LineEnds, fade_refusal, simulate_commands
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.tuning import LinearBypass
-from hilctl.models.base import HysteresisModel
 from hilctl.models.model_file import load_model
 from hilctl.models.staged import FieldLag, StagedModel
 from hilctl.waveforms import shapes
@@ -31,7 +24,7 @@ MODEL = Path(__file__).parents[3] / "configs" / "models" / "terfenol_rdpi.yaml"
 
 
 class TestForecast:
-    def test_without_a_compensator(self) -> None:
+    def test_without_a_compensator(self):
         result = checked(CURRENT, "safe.value=-0.5")
         values = 0.5 + 6.0 * np.sin(2.0 * np.pi * 10.0 * np.arange(10_000) / 10e3)
         forecast = result.forecast
@@ -44,7 +37,7 @@ class TestForecast:
         assert forecast.slew_per_s == pytest.approx(1.0 * 10e3)  # from -0.5 to 0.5 in one sample
         assert forecast.recording_mb == pytest.approx(10_000 * 45.0 / 1e6)
 
-    def test_with_a_compensator(self) -> None:
+    def test_with_a_compensator(self):
         model = terfenol_rdpi()
         result = checked(DISPLACEMENT, model=model)
         command = model.inverse(10e3).process(result.reference.values)
@@ -57,20 +50,20 @@ class TestForecast:
             result.reference.values.max(),
         )
 
-    def test_safe_value_counts(self) -> None:
+    def test_safe_value_counts(self):
         settings = ("waveform.amplitude=1.0", "safe.value=-2.0", "limits.slew_a_per_s=25000.0")
         forecast = checked(CURRENT, *settings).forecast
         assert forecast.command_min == -2.0
         assert forecast.command_max == pytest.approx(1.5, abs=1e-4)
 
     @pytest.mark.parametrize("chunk", [1, 7, 1000, 9999, 10_000, 10_001])
-    def test_chunks_change_nothing(self, monkeypatch: pytest.MonkeyPatch, chunk: int) -> None:
+    def test_chunks_change_nothing(self, monkeypatch, chunk):
         model = terfenol_rdpi()
         whole = checked(DISPLACEMENT, model=model).forecast
         monkeypatch.setattr("hilctl.experiment.forecast.CHUNK", chunk)
         assert checked(DISPLACEMENT, model=model).forecast == whole
 
-    def test_what_is_fed_ahead_is_what_is_forecast(self) -> None:
+    def test_what_is_fed_ahead_is_what_is_forecast(self):
         model = StagedModel.around(terfenol_rdpi(), lag=FieldLag(tau_s=2e-4), delay_s=3e-4)
         result = checked(DISPLACEMENT, model=model)
         values = result.reference.values
@@ -105,20 +98,20 @@ MODELS = {"rdpi": terfenol_rdpi(), "staged": load_model(MODEL.parent / "terfenol
 class Counter:
     """Figures that count what they are given."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.samples = self.passed = 0
 
-    def add(self, reference: F64, command: F64) -> None:
+    def add(self, reference, command):
         self.samples += command.size
 
-    def mark(self) -> None:
+    def mark(self):
         pass
 
-    def skip(self, samples: int, times: int) -> None:
+    def skip(self, samples, times):
         self.passed += samples * times
 
 
-def forecast(name: str, model: HysteresisModel, monkeypatch: pytest.MonkeyPatch) -> Forecast:
+def forecast(name, model, monkeypatch):
     """Return what is forecast of a run that does not fit in memory."""
     monkeypatch.setattr(shapes, "LONG", 100_000)
     monkeypatch.setattr(command_simulation, "LONG", 100_000)
@@ -128,9 +121,7 @@ def forecast(name: str, model: HysteresisModel, monkeypatch: pytest.MonkeyPatch)
 
 @pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
 @pytest.mark.parametrize("name", LONG)
-def test_it_is_that_of_the_whole(
-    name: str, model: HysteresisModel, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_it_is_that_of_the_whole(name, model, monkeypatch):
     whole = asdict(checked(DISPLACEMENT, *LONG[name], *BUDGET, model=model).forecast)
     found = asdict(forecast(name, model, monkeypatch))
     plain: dict[str, Any] = {}
@@ -143,12 +134,12 @@ def test_it_is_that_of_the_whole(
         assert found[key] == expected, key
 
 
-def gone_through(period: float, n: int, command_of: Any = None) -> Counter:
+def gone_through(period, n, command_of=None):
     """Return what came of a run without a compensator, of a reference that should repeat."""
     counted = Counter()
     reference = command_of or (lambda t: np.sin(2.0 * np.pi * t / period))
 
-    def part(start: int, stop: int) -> F64:
+    def part(start, stop):
         return np.asarray(reference(np.arange(start, stop, dtype=np.float64)))
 
     repeats = (RepeatedPart(1000, n - 1000, period),)
@@ -156,20 +147,20 @@ def gone_through(period: float, n: int, command_of: Any = None) -> Counter:
     return counted
 
 
-def test_a_cycle_that_came_out_the_same_is_the_last_to_be_worked_out() -> None:
+def test_a_cycle_that_came_out_the_same_is_the_last_to_be_worked_out():
     counted = gone_through(500.0, 5_000_000)
     assert counted.samples + counted.passed == 5_000_000
     assert counted.samples < 300_000
 
 
 @pytest.mark.parametrize("drift", [1e-6, 1e-9, 1e-10])
-def test_what_drifts_is_worked_out(drift: float) -> None:
+def test_what_drifts_is_worked_out(drift):
     counted = gone_through(500.0, 5_000_000, lambda t: np.sin(np.pi * t / 250.0) + drift * t)
     assert counted.samples + counted.passed == 5_000_000
     assert counted.passed * drift < 1.01e-3 * 2.0
 
 
-def test_what_is_not_finite_is_worked_out() -> None:
+def test_what_is_not_finite_is_worked_out():
     counted = gone_through(500.0, 1_000_000, lambda t: np.where(t > 10, np.nan, t))
     assert (counted.samples, counted.passed) == (1_000_000, 0)
 

@@ -1,7 +1,6 @@
 """What a run before left behind: the compensator that begins with it meets its model exactly."""
 
 from datetime import datetime
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,19 +8,15 @@ import pytest
 from hilctl.base.errors import DataError
 from hilctl.base.samples import COLUMNS, BlockBatch, BlockHeader, Flag
 from hilctl.experiment.initial_state import InitialState, initial_state_after, left_by
-from hilctl.models.integrated import exponential_integrated
 from hilctl.models.linear_stages import CreepModel
 from hilctl.models.staged import FieldLag, StagedModel
 from hilctl.recording.encoder import RecordingLayout
 from hilctl.recording.writer import RecordingWriter, RunFacts
 from tests.published import piezo_ppi
+from tests.unit.models.test_staged import OMEGA
 
 RATE_HZ = 10_000.0
 BLOCK = 50
-OMEGA = exponential_integrated(
-    alpha=0.3, gamma_s=0.0, a_0=1.0, alpha_0=0.2, beta_0=0.3, g_0=6.0, alpha_1=0.3, beta_1=0.1,
-    d_p=0.8, alpha_2=0.4, beta_2=0.1, d_n=0.8, plays=6, deadbands_a_side=2,
-)  # fmt: skip
 STAGED = StagedModel.around(
     OMEGA, lag=FieldLag(tau_s=2e-4, growth_per_unit=0.2), delay_s=2.0 / RATE_HZ
 )
@@ -32,7 +27,7 @@ NOW_S = datetime.fromisoformat("2026-01-01T00:01:00+00:00").timestamp()
 COMMAND = 4.0 * np.sin(np.pi * np.arange(1000) / 999.0)
 
 
-def record(path: Path, command, *, first=0, flags=0, facts=None, **made) -> Path:
+def record(path, command, *, first=0, flags=0, facts=None, **made):
     """Write a run of these commands without a compensator."""
     blocks = command.size // BLOCK
     batch = BlockBatch.empty(blocks, BLOCK, 1)
@@ -45,8 +40,8 @@ def record(path: Path, command, *, first=0, flags=0, facts=None, **made) -> Path
 
 
 def write_recording(
-    path: Path, batch, rate_hz=RATE_HZ, *, whole=True, facts=None, end=None, measured=False
-) -> Path:
+    path, batch, rate_hz=RATE_HZ, *, whole=True, facts=None, end=None, measured=False
+):
     """Write blocks of a run without a compensator."""
     run = RunFacts(
         facts={"compensator": "none", **(facts or {})},

@@ -10,7 +10,7 @@ from hilctl.base.files import TextFiles
 from hilctl.base.yaml import Document
 from hilctl.experiment.load import load_experiment, resolve
 
-PROFILE = Path(__file__).parents[2] / "data" / "rtu_module.yaml"
+PROFILE = (Path(__file__).parents[2] / "data" / "rtu_module.yaml").read_text(encoding="utf-8")
 DEVICE = {
     "kind": "modbus_dac",
     "profile": "mine/module.yaml",
@@ -35,7 +35,7 @@ EXPERIMENT = {
 def written(tmp_path):
     """Return a function that writes an experiment, and a profile below its folder."""
 
-    def write(text: str = PROFILE.read_text(encoding="utf-8"), **device: object) -> Path:
+    def write(text=PROFILE, **device):
         (tmp_path / "mine").mkdir()
         (tmp_path / "mine" / "module.yaml").write_text(text, encoding="utf-8")
         path = tmp_path / "experiment.yaml"
@@ -57,7 +57,7 @@ def test_a_file_of_a_setting_is_looked_for_in_the_working_folder_first(
 ):
     path, shell = written(), tmp_path / "shell"
     shell.mkdir()
-    (shell / "own.yaml").write_text(PROFILE.read_text(encoding="utf-8"), encoding="utf-8")
+    (shell / "own.yaml").write_text(PROFILE, encoding="utf-8")
     monkeypatch.chdir(shell)
     found = load_experiment(path, ["device.profile=own.yaml"]).device.info.details["profile"]
     assert found == "shell/own.yaml"
@@ -81,7 +81,7 @@ def test_profiles_are_carried_with_the_experiment(written, tmp_path):
 
 
 def test_all_problems_come_together(written):
-    text = PROFILE.read_text(encoding="utf-8").replace("max_rate_hz: 1000.0", "max_rate_hz: -1.0")
+    text = PROFILE.replace("max_rate_hz: 1000.0", "max_rate_hz: -1.0")
     path = written(text, timeout_s=-3.0)
     with pytest.raises(ConfigError) as caught:
         load_experiment(path)

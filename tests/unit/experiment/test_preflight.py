@@ -3,26 +3,24 @@
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import pytest
 from pydantic import ConfigDict
 
-from hilctl.base.device import DeviceInfo, DeviceOptions
-from hilctl.base.errors import ConfigError, ConfigProblem, DataError
-from hilctl.base.segments import Segment
-from hilctl.base.types import F64
+from hilctl.base.errors import ConfigError, DataError
 from hilctl.base.yaml import Document
 from hilctl.experiment import preflight as module
 from hilctl.experiment.coil_heat import RunHeat
 from hilctl.experiment.correction import Correction, LearnedCycle, model_sha256, signature
 from hilctl.experiment.file import CompensatorConfig
 from hilctl.experiment.initial_state import InitialState
-from hilctl.experiment.load import LoadedExperiment, resolve
-from hilctl.experiment.preflight import CheckedExperiment, check, command_problems
+from hilctl.experiment.load import resolve
+from hilctl.experiment.preflight import check, command_problems
 from hilctl.models.base import HysteresisModel, IdentifiedRange, Operator, Provenance
 from hilctl.models.plays import RdpiModel
+from tests.fakes import DESCRIBED, DescribedDevice
 from tests.published import piezo_ppi, terfenol_rdpi
 
 CURRENT = """\
@@ -47,34 +45,6 @@ waveform:
 compensator: {model: model.yaml}
 limits: {peak_current_a: 7.0, slew_a_per_s: 20000.0, stroke_um: [-75.0, 60.0]}
 """
-INFO = DeviceInfo(
-    name="fake",
-    description="a device that does nothing",
-    command_unit="A",
-    command_min=-8.0,
-    command_max=8.0,
-    sensor_min_um=-100.0,
-    sensor_max_um=100.0,
-    max_rate_hz=20e3,
-)
-
-
-class DescribedDevice:
-    """A device that may not be opened or moved."""
-
-    Options: ClassVar[type[DeviceOptions]] = DeviceOptions
-
-    def __init__(self, info: DeviceInfo) -> None:
-        self.info = info
-
-    def refuse(self, *_: object) -> None:
-        raise AssertionError("opened or moved")
-
-    open = output = exchange = make_safe = refuse
-
-    def check_rate(self, sample_rate_hz: float, block: int) -> None: ...
-
-    def close(self) -> None: ...
 
 
 class BrokenModel(HysteresisModel):
@@ -85,18 +55,18 @@ class BrokenModel(HysteresisModel):
     at: int
 
     @property
-    def operators(self) -> int:
+    def operators(self):
         """Return 1: the memory counts samples."""
         return 1
 
-    def forward(self, sample_rate_hz: float) -> Operator:
+    def forward(self, sample_rate_hz):
         """Refuse: only the inverse is run."""
         raise AssertionError("forward")
 
-    def inverse(self, sample_rate_hz: float) -> Operator:
+    def inverse(self, sample_rate_hz):
         """Return the operator with the fault."""
 
-        def run(x: F64, memory: F64, out: F64) -> None:
+        def run(x, memory, out):
             out[:] = 0.0
             first = int(memory[0])
             if first <= self.at < first + x.size:
@@ -106,13 +76,11 @@ class BrokenModel(HysteresisModel):
         return Operator(run, self.operators)
 
 
-def loaded(
-    text: str, *settings: str, model: HysteresisModel | None = None, **info: Any
-) -> LoadedExperiment:
+def loaded(text, *settings, model=None, **info):
     """Read an experiment and put a fake device and a model in."""
     without_model = text.replace("{model: model.yaml}", "none").replace("unit: um", "unit: A")
     made = resolve(Document("x.yaml", text if model is None else without_model), Path(), settings)
-    device = DescribedDevice(replace(INFO, **info))
+    device = DescribedDevice(replace(DESCRIBED, **info))
     if model is None:
         return replace(made, device=device)
     waveform = made.config.waveform.model_copy(update={"unit": "um"})
@@ -120,11 +88,11 @@ def loaded(
     return replace(made, config=config, device=device, model=model)
 
 
-def checked(text: str, *settings: str, **given: Any) -> CheckedExperiment:
+def checked(text, *settings, **given):
     return check(loaded(text, *settings, **given))
 
 
-def refusals(text: str, *settings: str, **given: Any) -> list[ConfigProblem]:
+def refusals(text, *settings, **given):
     """Return the problems; each names the line of its key."""
     with pytest.raises(ConfigError) as caught:
         checked(text, *settings, **given)
@@ -136,18 +104,18 @@ def refusals(text: str, *settings: str, **given: Any) -> list[ConfigProblem]:
     return caught.value.problems
 
 
-def told(found: list[ConfigProblem]) -> list[tuple[str, str]]:
+def told(found):
     """Return keys and values."""
     return [(problem.key, problem.value) for problem in found]
 
 
-def refused(made: LoadedExperiment) -> list[ConfigProblem]:
+def refused(made):
     with pytest.raises(ConfigError) as caught:
         check(made)
     return list(caught.value.problems)
 
 
-def compensated(made: LoadedExperiment, **keys: Any) -> LoadedExperiment:
+def compensated(made, **keys):
     """Return an experiment with other keys of its compensator."""
     compensator = CompensatorConfig(model="model.yaml", **keys)
     config = made.config.model_copy(update={"compensator": compensator})
@@ -155,11 +123,11 @@ def compensated(made: LoadedExperiment, **keys: Any) -> LoadedExperiment:
 
 
 @pytest.mark.parametrize("at_start", [-8.0, 8.0])
-def test_a_start_within_the_device_s_range_is_taken(at_start: float) -> None:
+def test_a_start_within_the_device_s_range_is_taken(at_start):
     assert checked(CURRENT, f"safe.at_start={at_start}").loaded.config.safe.at_start == at_start
 
 
-def test_a_start_that_the_device_can_not_hold_is_refused() -> None:
+def test_a_start_that_the_device_can_not_hold_is_refused():
     assert told(refusals(CURRENT, "safe.at_start=8.5")) == [("safe.at_start", "8.5")]
 
 
@@ -171,9 +139,7 @@ class TestReference:
             ("[-75.0, 60.0]", (-12.0, 9.75), "-12 to 9.75 µm", "0.25 µm"),
         ],
     )
-    def test_outside_the_stroke_or_the_model(
-        self, stroke: str, known: tuple[float, float] | None, rule: str, hint: str
-    ) -> None:
+    def test_outside_the_stroke_or_the_model(self, stroke, known, rule, hint):
         """The amount is part of the problem; a reference that just fits passes."""
         settings = ["waveform.soft_start_s=0.0", f"limits.stroke_um={stroke}"]
         model = terfenol_rdpi().model_copy(update={"output_range_um": known})
@@ -183,7 +149,7 @@ class TestReference:
         assert found.hint.startswith(hint)
         checked(DISPLACEMENT, *settings, "waveform.amplitude=9.5", model=model)
 
-    def test_outside_both(self) -> None:
+    def test_outside_both(self):
         model = terfenol_rdpi().model_copy(update={"output_range_um": (-12.0, 12.0)})
         found = refusals(DISPLACEMENT, "waveform.amplitude=80.0", model=model)
         keys = [problem.key for problem in found]
@@ -192,12 +158,12 @@ class TestReference:
             assert f"{span} µm" in problem.rule
             assert problem.hint.startswith(f"{excess} µm")
 
-    def test_a_current_is_no_displacement(self) -> None:
+    def test_a_current_is_no_displacement(self):
         checked(CURRENT, "limits.stroke_um=[-1.0, 1.0]")
 
 
 class TestCommand:
-    def test_peak(self) -> None:
+    def test_peak(self):
         (found,) = refusals(CURRENT, "limits.peak_current_a=6.25")
         assert told([found]) == [("limits.peak_current_a", "-5.5 to 6.5 A")]
         assert "-6.25 to 6.25 A" in found.rule
@@ -211,17 +177,17 @@ class TestCommand:
             ("limits.slew_a_per_s=4000.0", ("limits.slew_a_per_s", "5000")),  # the first step
         ],
     )
-    def test_lowest_command_and_first_step(self, setting: str, problem: tuple[str, str]) -> None:
+    def test_lowest_command_and_first_step(self, setting, problem):
         assert told(refusals(CURRENT, setting)) == [problem]
 
-    def test_slew(self) -> None:
+    def test_slew(self):
         (found,) = refusals(CURRENT, "waveform.soft_start_s=0.1", "limits.slew_a_per_s=150.0")
         assert told([found]) == [("limits.slew_a_per_s", "377.004")]
         assert "150 A/s" in found.rule
         assert found.hint.startswith("2.51 times")
         checked(CURRENT, "waveform.soft_start_s=0.1", "limits.slew_a_per_s=377.01")
 
-    def test_voltage(self) -> None:
+    def test_voltage(self):
         text = (
             CURRENT.replace("unit: A", "unit: V")
             .replace("peak_current_a: 7.0", "drive_v: [0.0, 5.0]")
@@ -232,19 +198,19 @@ class TestCommand:
         assert found[0].value == "-5.5 to 6.5 V"
         assert "100 V/s" in found[1].rule
 
-    def test_model_that_can_not_be_inverted(self) -> None:
+    def test_model_that_can_not_be_inverted(self):
         model = RdpiModel(direct=1e-310, weights=(1.0, 1.0), thresholds=(0.3, 0.6))
         found = refusals(DISPLACEMENT, "block=5", model=model)
         assert [problem.key for problem in found] == ["block", "compensator.model"]
 
     @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
     @pytest.mark.parametrize("at", [0, 1, 1500])
-    def test_not_a_number(self, monkeypatch: pytest.MonkeyPatch, bad: float, at: int) -> None:
+    def test_not_a_number(self, monkeypatch, bad, at):
         monkeypatch.setattr("hilctl.experiment.forecast.CHUNK", 1000)
         found = refusals(DISPLACEMENT, model=BrokenModel(bad=bad, at=at))
         assert [problem.key for problem in found] == ["compensator.model"]
 
-    def test_very_large_numbers(self) -> None:
+    def test_very_large_numbers(self):
         found = refusals(CURRENT, "waveform.amplitude=1.0e+308", "waveform.offset=0.0")
         keys = ["limits.peak_current_a", "limits.slew_a_per_s"]
         assert [problem.key for problem in found] == keys
@@ -254,7 +220,7 @@ class TestCommand:
 class TestBudget:
     BUDGET: ClassVar = ("limits.rms_current_a=4.0", "limits.thermal_time_constant_s=20.0")
 
-    def hint(self, begins_rms_a: float | None, hottest_a2: float, safe: float = 0.0) -> str:
+    def hint(self, begins_rms_a, hottest_a2, safe=0.0):
         made = loaded(CURRENT, *self.BUDGET, f"safe.value={safe}")
         forecast = replace(
             checked(CURRENT).forecast, heating_rms_a=4.5, budget_used_s=1.5, before_s=1.5,
@@ -269,9 +235,7 @@ class TestBudget:
         ("begins_rms_a", "hottest_a2", "safe", "wait_s"),
         [(3.0, 4.0, 0.0, 16), (2.02, 4.0, 0.0, 0), (3.5, 10.0, 3.0, 24)],
     )
-    def test_heat_of_the_last_run_is_waited_for(
-        self, begins_rms_a: float, hottest_a2: float, safe: float, wait_s: int
-    ) -> None:
+    def test_heat_of_the_last_run_is_waited_for(self, begins_rms_a, hottest_a2, safe, wait_s):
         """20 s times ln(9 / 4), ln(4.08 / 4), and ln(3.25 / 1) above what the safe value makes."""
         hint = self.hint(begins_rms_a, hottest_a2, safe)
         assert f"{begins_rms_a:.3g} A" in hint
@@ -281,9 +245,7 @@ class TestBudget:
         ("begins_rms_a", "hottest_a2", "safe"),
         [(1.0, 4.0, 0.0), (3.0, 4.0, 2.0), (3.5, 8.0, 3.0), (None, 0.5, 0.0)],
     )
-    def test_no_wait_helps_a_run_that_makes_the_heat_itself(
-        self, begins_rms_a: float | None, hottest_a2: float, safe: float
-    ) -> None:
+    def test_no_wait_helps_a_run_that_makes_the_heat_itself(self, begins_rms_a, hottest_a2, safe):
         hint = self.hint(begins_rms_a, hottest_a2, safe)
         assert hint.startswith("0.5 A")
         assert "after 1.5 s" in hint
@@ -323,9 +285,7 @@ class TestDevice:
             ),
         ],
     )
-    def test_beyond_the_device(
-        self, given: Any, problem: tuple[str, str], rule: str, allowed: Any
-    ) -> None:
+    def test_beyond_the_device(self, given, problem, rule, allowed):
         info, *settings = given
         (found,) = refusals(CURRENT, *settings, **info)
         assert (found.key, found.value) == problem
@@ -333,13 +293,13 @@ class TestDevice:
         info, *settings = allowed
         checked(CURRENT, *settings, **info)
 
-    def test_model_of_another_device(self) -> None:
+    def test_model_of_another_device(self):
         found = refusals(DISPLACEMENT, "limits.peak_current_a=8.0", model=piezo_ppi())
         assert ("compensator.model", "V") in told(found)
 
 
 class TestAllAtOnce:
-    def test_device_reference_and_command(self) -> None:
+    def test_device_reference_and_command(self):
         found = refusals(
             DISPLACEMENT,
             "block=5",
@@ -357,7 +317,7 @@ class TestAllAtOnce:
             "limits.slew_a_per_s",
         ]
 
-    def test_device_and_a_waveform_that_can_not_be_built(self) -> None:
+    def test_device_and_a_waveform_that_can_not_be_built(self):
         found = refusals(CURRENT, "block=5", "waveform.frequency_hz=6000.0")
         assert [problem.key for problem in found] == ["block", "waveform"]
 
@@ -377,9 +337,7 @@ class TestWatchdog:
             (7.5, "holds a load", 0.0, "7.5"),
         ],
     )
-    def test_safe_value_or_a_reason(
-        self, command: float, reason: str, safe: float, value: str
-    ) -> None:
+    def test_safe_value_or_a_reason(self, command, reason, safe, value):
         """A value outside the limits is rejected with any reason."""
         watched = {"watchdog_command": command, "watchdog_reason": reason}
         made = loaded(CURRENT, f"safe={{value: {safe}}}", **watched)
@@ -392,7 +350,7 @@ class TestWatchdog:
         ("timeout_s", "arm_s", "rejected"),
         [(0.1, 0.0, False), (0.1, 0.0999, True), (0.00031, 0.0, False), (0.00029, 0.0, True)],
     )
-    def test_a_time_that_the_start_cannot_keep_is_refused(self, timeout_s, arm_s, rejected) -> None:
+    def test_a_time_that_the_start_cannot_keep_is_refused(self, timeout_s, arm_s, rejected):
         """Three ticks of 0.1 ms, and what arming takes on the line."""
         watched = {"watchdog_command": 0.0, "watchdog_timeout_s": timeout_s, "arm_s": arm_s}
         made = loaded(CURRENT, **watched)
@@ -402,7 +360,7 @@ class TestWatchdog:
             assert [each.key for each in refused(made)] == ["device.watchdog.timeout_s"]
 
 
-def within(frequency_hz: float) -> HysteresisModel:
+def within(frequency_hz):
     """Return a model that was identified at that frequency alone."""
     known = IdentifiedRange(
         peak_to_peak_um=(20.0, 20.0),
@@ -412,14 +370,14 @@ def within(frequency_hz: float) -> HysteresisModel:
     return terfenol_rdpi().model_copy(update={"provenance": Provenance(identified_range=known)})
 
 
-def test_a_reference_beyond_what_the_model_was_identified_on_is_warned_or_refused() -> None:
+def test_a_reference_beyond_what_the_model_was_identified_on_is_warned_or_refused():
     assert check(loaded(DISPLACEMENT, model=within(10.0))).warnings == ()
     assert "repeats at 10 Hz" in check(loaded(DISPLACEMENT, model=within(30.0))).warnings[0]
     (problem,) = refused(loaded(DISPLACEMENT, "waveform.frequency_hz=60", model=within(10.0)))
     assert (problem.key, "60 Hz" in problem.rule) == ("waveform", True)
 
 
-def test_a_reference_that_begins_beside_the_rest_position_is_moved_not_hurried() -> None:
+def test_a_reference_that_begins_beside_the_rest_position_is_moved_not_hurried():
     """At 0 A the actuator rests at 24.5 um: from 0 um the first command would be a step."""
     moved = terfenol_rdpi().model_copy(update={"output_offset_um": 24.5})
     (problem,) = refused(loaded(DISPLACEMENT, "waveform.offset=0", model=moved))
@@ -434,22 +392,22 @@ class Offset(HysteresisModel):
     """Commands are 3 A above the reference, and rest comes slowly: a um more with each sample."""
 
     @property
-    def operators(self) -> int:
+    def operators(self):
         """Return 1: a number that is added to the commands."""
         return 1
 
-    def forward(self, sample_rate_hz: float) -> Operator:
+    def forward(self, sample_rate_hz):
         """Return an operator that counts."""
 
-        def run(x: F64, memory: F64, out: F64) -> None:
+        def run(x, memory, out):
             out[:] = np.arange(x.size)
 
         return Operator(run, self.operators)
 
-    def inverse(self, sample_rate_hz: float) -> Operator:
+    def inverse(self, sample_rate_hz):
         """Return the operator that adds."""
 
-        def run(x: F64, memory: F64, out: F64) -> None:
+        def run(x, memory, out):
             out[:] = x + 3.0 + memory[0]
 
         return Operator(run, self.operators)
@@ -459,7 +417,7 @@ FAST = ("limits.slew_a_per_s=400.0", "waveform.frequency_hz=20.0", "waveform.amp
 
 
 @pytest.mark.parametrize(("rate_hz", "rests_um"), [(10_000.0, 999), (40.0, 3), (2.0, 0)])
-def test_where_it_rests_is_said_once_all_stages_do(rate_hz: float, rests_um: int) -> None:
+def test_where_it_rests_is_said_once_all_stages_do(rate_hz, rests_um):
     slow = (f"sample_rate_hz={rate_hz}", "limits.slew_a_per_s=1.0", "waveform.frequency_hz=0.01")
     (found,) = refusals(DISPLACEMENT, *slow, "waveform.amplitude=1.0", model=Offset())
     assert (found.key, found.value) == ("waveform", "0 µm")
@@ -467,28 +425,26 @@ def test_where_it_rests_is_said_once_all_stages_do(rate_hz: float, rests_um: int
     assert "3 A" in found.hint
 
 
-def test_at_the_safe_value_there_is_no_step() -> None:
+def test_at_the_safe_value_there_is_no_step():
     (found,) = refusals(DISPLACEMENT, *FAST, "safe.value=3.0", model=Offset())
     assert found.key == "limits.slew_a_per_s"
 
 
-def test_the_first_command_is_that_of_the_state_it_begins_with(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_first_command_is_that_of_the_state_it_begins_with(monkeypatch):
     there = InitialState(np.array([-3.0, 0.0]), 0.0, "before")
     monkeypatch.setattr(module, "left_by_last_run", lambda *_: (there, "as left"))
     made = compensated(loaded(DISPLACEMENT, *FAST, model=Offset()), initial_state="last")
     assert [problem.key for problem in refused(made)] == ["limits.slew_a_per_s"]
 
 
-def test_the_input_is_recorded_where_it_may_move() -> None:
+def test_the_input_is_recorded_where_it_may_move():
     plain = checked(DISPLACEMENT, model=terfenol_rdpi())
     for name in ("feedback", "adaptation"):
         config = plain.loaded.config.model_copy(update={name: object()})
         assert replace(plain, loaded=replace(plain.loaded, config=config)).records_input
 
 
-def test_the_coil_is_cold_unless_something_says_otherwise(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_coil_is_cold_unless_something_says_otherwise(monkeypatch):
     assert checked(CURRENT).heat_a2 == 0.0
     monkeypatch.setattr(module, "heat_before", lambda loaded, now_s: now_s)
     monkeypatch.setattr(module, "time", SimpleNamespace(time=lambda: 7.0))
@@ -498,8 +454,8 @@ def test_the_coil_is_cold_unless_something_says_otherwise(monkeypatch: pytest.Mo
     assert check(made, heat_a2=9.0, now_s=5.0).heat_a2 == 9.0
 
 
-def test_a_run_before_that_says_nothing_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(path: Path, *_: object) -> InitialState:
+def test_a_run_before_that_says_nothing_is_a_problem(monkeypatch):
+    def refuse(path, *_):
         raise DataError(f"{path}: nothing there")
 
     monkeypatch.setattr(module, "initial_state_after", refuse)
@@ -509,7 +465,7 @@ def test_a_run_before_that_says_nothing_is_a_problem(monkeypatch: pytest.MonkeyP
     assert problem.rule == "before.mcap: nothing there"
 
 
-def test_a_faster_change_further_on_is_what_is_told() -> None:
+def test_a_faster_change_further_on_is_what_is_told():
     moved = terfenol_rdpi().model_copy(update={"output_offset_um": 24.5})
     holds = ", ".join(f"{{kind: hold, level: {um}, duration_s: 0.2}}" for um in (22.0, 18.0))
     steps = f"waveform={{kind: sequence, unit: A, parts: [{holds}]}}"
@@ -520,7 +476,7 @@ def test_a_faster_change_further_on_is_what_is_told() -> None:
     assert found.key == "limits.slew_a_per_s"
 
 
-def learned(made: CheckedExperiment, waveform: Segment) -> Correction:
+def learned(made, waveform):
     """Return a correction for one segment of an experiment that was checked without."""
     wanted = signature(made.reference.values, waveform)
     coefficients = np.array([0.0, 0.2 - 0.1j, 0.0, 0.05j])
@@ -532,7 +488,7 @@ def learned(made: CheckedExperiment, waveform: Segment) -> Correction:
     )
 
 
-def test_what_was_learned_is_added_to_the_compensator_s_input() -> None:
+def test_what_was_learned_is_added_to_the_compensator_s_input():
     plain = checked(DISPLACEMENT, model=terfenol_rdpi())
     assert not plain.records_input
     assert plain.begun.input_um is plain.reference.values
@@ -546,7 +502,7 @@ def test_what_was_learned_is_added_to_the_compensator_s_input() -> None:
     assert 0.1 < np.abs(added).max() < 1.0
 
 
-def test_what_was_learned_on_another_motion_is_refused() -> None:
+def test_what_was_learned_on_another_motion_is_refused():
     plain = checked(DISPLACEMENT, model=terfenol_rdpi())
     faster = checked(DISPLACEMENT, "waveform.frequency_hz=20", model=terfenol_rdpi())
     correction = learned(plain, plain.reference.segments[0])
@@ -555,9 +511,7 @@ def test_what_was_learned_on_another_motion_is_refused() -> None:
     assert "hilctl learn" in problem.hint
 
 
-def test_work_that_takes_long_is_told(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_work_that_takes_long_is_told(monkeypatch, caplog):
     longer = "waveform.duration_s=300.0"
     reference = checked(DISPLACEMENT, longer, model=terfenol_rdpi()).reference
     samples = sum(part.stop - part.start for part in reference.telling)
@@ -572,9 +526,7 @@ def test_work_that_takes_long_is_told(
     assert f"{samples * 1e-6:.3g} million samples" in record.getMessage()
 
 
-def test_a_rest_before_the_waveform_does_not_make_the_last_run_forgotten(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_rest_before_the_waveform_does_not_make_the_last_run_forgotten(monkeypatch):
     model = terfenol_rdpi()
     there = InitialState(model.inverse(10_000.0).state(), 0.0, "before")
     monkeypatch.setattr(module, "left_by_last_run", lambda *_: (there, "as left"))

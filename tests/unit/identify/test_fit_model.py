@@ -15,13 +15,14 @@ from hilctl.identify.evaluation import judge
 from hilctl.identify.fit_api import LEAST_SLOPE, FitData, FitRequest
 from hilctl.identify.fit_model import FittedModel, fit_kind, fit_model, identified_range
 from hilctl.identify.settings import FitKind, FitSettings
-from hilctl.models.integrated import IntegratedModel, even_thresholds, exponential_integrated
+from hilctl.models.integrated import IntegratedModel, even_thresholds
 from hilctl.models.linear_stages import CreepModel, FurtherMode
 from hilctl.models.model_file import dump_model, parse_model
 from hilctl.models.plays import PpiModel, RdpiModel
 from hilctl.models.staged import FieldLag, StagedModel
 from tests.published import piezo_ppi, terfenol_rdpi
 from tests.unit.identify.conftest import OMEGA
+from tests.unit.models.test_staged import OMEGA as SMALL_OMEGA
 
 Loops = Callable[..., list[SteadyLoop]]
 GRID = [(a, f) for a in (3.0, 6.0) for f in (10.0, 50.0, 100.0, 150.0, 250.0)]
@@ -217,10 +218,6 @@ MODE = FurtherMode(
     natural_hz=150.0, damping_ratio=0.1, antiresonance_hz=140.0, antiresonance_damping_ratio=0.1
 )
 FIELD = FitSettings(kind="field", plays=8, drags=0, cells=8, knots=8)
-SMALL_OMEGA = exponential_integrated(
-    alpha=0.3, gamma_s=0.0, a_0=1.0, alpha_0=0.2, beta_0=0.3, g_0=6.0, alpha_1=0.3, beta_1=0.1,
-    d_p=0.8, alpha_2=0.4, beta_2=0.1, d_n=0.8, plays=6, deadbands_a_side=2,
-)  # fmt: skip
 TRUTH = StagedModel.around(
     SMALL_OMEGA,
     lag=FieldLag(tau_s=1e-3),

@@ -20,25 +20,16 @@ from hilctl.models.linear_stages import FirstMode
 from hilctl.models.plays import PpiModel
 from hilctl.models.staged import FieldLag, StagedModel
 from tests.fakes import FakeFifoDevice, made_block
+from tests.unit.experiment.test_preflight import DISPLACEMENT
 from tests.unit.loop.test_loop import Rig
 
 RATE_HZ = 5000.0
-EXPERIMENT = """\
-name: feedback
-device: {kind: simulated_terfenol}
-sample_rate_hz: 5000
-block: 1
-waveform:
-  kind: sine
-  unit: um
-  amplitude: 10.0
-  frequency_hz: 10.0
-  duration_s: 0.5
-  soft_start_s: 0.1
-compensator: {model: model.yaml}
-limits: {peak_current_a: 7.0, slew_a_per_s: 20000.0, stroke_um: [-75.0, 60.0]}
+EXPERIMENT = (
+    DISPLACEMENT.replace("sample_rate_hz: 10000", "sample_rate_hz: 5000")
+    + """\
 feedback: {limit_um: 5.0, bandwidth_hz: 50.0, resonance_hz: 2300.0, damping_ratio: 0.12}
 """
+)
 
 
 def plant(feedback, samples=2000, *, gain=1.0, offset_um=0.0, reference=None, hold_back=math.inf):

@@ -10,7 +10,7 @@ from tests.fakes import FakeClock
 PERIOD_NS = 1_000_000
 
 
-def pacer(clock: FakeClock, policy: str = "skip") -> Pacer:
+def pacer(clock, policy="skip"):
     made = Pacer(clock, PERIOD_NS, policy, LateRules(0.5 * PERIOD_NS))  # type: ignore[arg-type]
     made.begin(10_000)
     return made

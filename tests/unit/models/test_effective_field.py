@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from hilctl.base.types import F64
 from hilctl.models.effective_field import FieldLosses, FieldModel, OutputCurve
 
 RATE_HZ = 50_000.0
@@ -14,7 +13,7 @@ CURVE = OutputCurve(operators_um=(-60.0, 0.0, 60.0), displacement_um=(-50.0, 0.0
 LOSSES = FieldLosses(field_s=1e-4, output_s=2e-6, decay_s=3e-5, growth=0.1, bend=0.02, excess=0.05)
 
 
-def field_model(**changes: Any) -> FieldModel:
+def field_model(**changes):
     """Return a small model with everything in it."""
     slopes = ((4.0, 5.0, 4.0), (1.0, 1.0, 0.0), (2.0, 3.0, 2.0))
     given: dict[str, Any] = {
@@ -30,7 +29,7 @@ def field_model(**changes: Any) -> FieldModel:
     return FieldModel(**(given | changes))
 
 
-def reference_um(seed: int) -> F64:
+def reference_um(seed):
     """Return a smooth, aperiodic reference from rest: float64[n]."""
     t = np.arange(4000) / RATE_HZ
     rng = np.random.default_rng(seed)
@@ -39,7 +38,7 @@ def reference_um(seed: int) -> F64:
 
 
 @pytest.mark.parametrize("coupling", [-0.03, 0.0, 0.03])
-def test_inverse_undoes_the_model(coupling: float) -> None:
+def test_inverse_undoes_the_model(coupling):
     model = field_model(coupling=coupling)
     wanted_um = reference_um(1)
     command = model.inverse(RATE_HZ).process(wanted_um)
@@ -47,7 +46,7 @@ def test_inverse_undoes_the_model(coupling: float) -> None:
     assert np.ptp(command) > 5.0
 
 
-def test_small_biased_loops_creep_by_drags_and_close_by_plays() -> None:
+def test_small_biased_loops_creep_by_drags_and_close_by_plays():
     loop = [*np.linspace(5.0, 4.0), *np.linspace(4.0, 5.0)]
     turns = np.concatenate([np.linspace(0.0, 5.0), np.tile(loop, 8)])
     no_losses = {"losses": FieldLosses(), "coupling": 0.0}
@@ -59,8 +58,8 @@ def test_small_biased_loops_creep_by_drags_and_close_by_plays() -> None:
     assert moved[1] > 0.1
 
 
-def test_a_loop_is_the_narrower_the_slower_it_is() -> None:
-    def width_um(frequency_hz: float) -> float:
+def test_a_loop_is_the_narrower_the_slower_it_is():
+    def width_um(frequency_hz):
         t = np.arange(round(2 * RATE_HZ / frequency_hz)) / RATE_HZ
         v = 5.0 * np.sin(2 * np.pi * frequency_hz * t)
         half = v.size // 2
@@ -83,12 +82,12 @@ def test_a_loop_is_the_narrower_the_slower_it_is() -> None:
         ({"slopes": ((1.0, 1.0), (1.0,), (1.0, 1.0))}, "the same cells"),
     ],
 )
-def test_conditions(changes: dict[str, Any], words: str) -> None:
+def test_conditions(changes, words):
     with pytest.raises(ValidationError, match=words):
         field_model(**changes)
 
 
-def test_a_curve_must_rise() -> None:
+def test_a_curve_must_rise():
     with pytest.raises(ValidationError, match="displacement_um must rise"):
         OutputCurve(operators_um=(0.0, 1.0), displacement_um=(0.0, 0.0))
     with pytest.raises(ValidationError, match="two at least"):

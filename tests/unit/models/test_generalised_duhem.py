@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from hilctl.models.effective_field import FieldLosses, FieldModel
+from hilctl.models.effective_field import FieldLosses
 from hilctl.models.generalised_duhem import GeneralisedDuhemModel
 from hilctl.models.linear_stages import FirstMode
 from hilctl.models.model_file import dump_model, parse_model
@@ -17,7 +17,7 @@ RATE_HZ = 50_000.0
 ACROSS = np.linspace(-1.0, 1.0, 5)
 
 
-def duhem_model(**changes: Any) -> GeneralisedDuhemModel:
+def duhem_model(**changes):
     """Return a small model with everything in it."""
     middle = np.array([3.0, 6.0, 7.0, 6.0, 4.0])
     rising = middle[:, None] * np.exp(0.7 * ACROSS)
@@ -35,19 +35,19 @@ def duhem_model(**changes: Any) -> GeneralisedDuhemModel:
     return GeneralisedDuhemModel(**(given | changes))
 
 
-def test_inverse_undoes_the_model() -> None:
+def test_inverse_undoes_the_model():
     wanted_um = 0.7 + reference_um(1)
     command = duhem_model().inverse(RATE_HZ).process(wanted_um)
     assert duhem_model().forward(RATE_HZ).process(command) == pytest.approx(wanted_um, abs=1e-7)
     assert np.ptp(command) > 2.0
 
 
-def test_rest_is_no_command_at_the_offset() -> None:
+def test_rest_is_no_command_at_the_offset():
     assert duhem_model().inverse(RATE_HZ).process(np.array([0.7])) == pytest.approx(0.0, abs=1e-12)
     assert duhem_model().forward(RATE_HZ).process(np.zeros(3)) == pytest.approx(0.7, abs=1e-9)
 
 
-def test_small_biased_loops_creep_down_from_the_falling_branch() -> None:
+def test_small_biased_loops_creep_down_from_the_falling_branch():
     loop = [*np.linspace(1.0, 1.2), *np.linspace(1.2, 1.0)]
     turns = np.concatenate([np.linspace(0.0, 4.0), np.linspace(4.0, 1.0), np.tile(loop, 6)])
     out = duhem_model(losses=FieldLosses()).forward(RATE_HZ).process(turns)
@@ -57,8 +57,8 @@ def test_small_biased_loops_creep_down_from_the_falling_branch() -> None:
     assert ends[0] - ends[-1] > 0.5
 
 
-def test_a_loop_is_the_wider_the_faster_it_is() -> None:
-    def area(frequency_hz: float) -> float:
+def test_a_loop_is_the_wider_the_faster_it_is():
+    def area(frequency_hz):
         t = np.arange(round(2 * RATE_HZ / frequency_hz)) / RATE_HZ
         v = 4.0 * np.sin(2 * np.pi * frequency_hz * t)
         half = v.size // 2
@@ -73,7 +73,7 @@ of_rods = pytest.mark.parametrize("model", RODS.values(), ids=RODS)
 
 
 @of_rods
-def test_any_cut_into_blocks_gives_the_same_bits(model: FieldModel) -> None:
+def test_any_cut_into_blocks_gives_the_same_bits(model):
     wanted_um = reference_um(2)
     for operator in (model.inverse, model.forward):
         whole = operator(RATE_HZ).process(wanted_um)
@@ -84,7 +84,7 @@ def test_any_cut_into_blocks_gives_the_same_bits(model: FieldModel) -> None:
 
 @of_rods
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_what_is_no_number_leaves_no_trace_and_a_state_goes_on(model: FieldModel, bad: float):
+def test_what_is_no_number_leaves_no_trace_and_a_state_goes_on(model, bad):
     wanted_um = reference_um(3)
     inverse, other = model.inverse(RATE_HZ), model.inverse(RATE_HZ)
     first = inverse.process(wanted_um[:100].copy())
@@ -97,7 +97,7 @@ def test_what_is_no_number_leaves_no_trace_and_a_state_goes_on(model: FieldModel
 
 
 @of_rods
-def test_every_finite_reference_gives_a_finite_command(model: FieldModel) -> None:
+def test_every_finite_reference_gives_a_finite_command(model):
     wild_um = np.array([0.0, 1e3, -1e3, 1e9, -1e9, 0.0, 1e-9])
     inverse = model.inverse(RATE_HZ)
     assert np.isfinite(inverse.process(wild_um)).all()
@@ -106,7 +106,7 @@ def test_every_finite_reference_gives_a_finite_command(model: FieldModel) -> Non
 
 
 @of_rods
-def test_between_stages_and_through_a_file(model: FieldModel) -> None:
+def test_between_stages_and_through_a_file(model):
     structure = FirstMode(natural_hz=2300.0, damping_ratio=0.12)
     staged = StagedModel.around(model, structure=structure, delay_s=3e-5)
     back = parse_model("model", dump_model(staged))
@@ -134,6 +134,6 @@ ROWS = ((1.0, 2.0),) * 5
         ({"half_width": 0.1}, "half_width must be at least"),
     ],
 )
-def test_conditions(changes: dict[str, Any], words: str) -> None:
+def test_conditions(changes, words):
     with pytest.raises(ValidationError, match=words):
         duhem_model(**changes)

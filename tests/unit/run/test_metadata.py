@@ -47,14 +47,14 @@ FACTS = {
 }
 
 
-def test_end_has_every_counter() -> None:
+def test_end_has_every_counter():
     assert end_facts(OUTCOME, COUNTERS) == {**FACTS, "lost_events": "0"}
     page = SharedPage(mmap(-1, SIZE))
     page.leave_lateness(COUNTERS)
     assert end_facts(OUTCOME, page.lateness(), 6) == {**FACTS, "lost_events": "6"}
 
 
-def test_every_column_has_its_unit() -> None:
+def test_every_column_has_its_unit():
     facts = run_facts(checked_experiment(EXPERIMENT, []), "2000-01-01T00:00:00", "model: x\n")
     units = json.loads(facts["units"])
     assert set(units) == {"t_rel", *(column.field("A").name for column in COLUMNS.values())}
@@ -62,7 +62,7 @@ def test_every_column_has_its_unit() -> None:
     assert len(facts["model_sha256"]) == 64
 
 
-def test_labels_are_recorded_and_change_no_identity() -> None:
+def test_labels_are_recorded_and_change_no_identity():
     plain = checked_experiment(EXPERIMENT, [])
     labelled = checked_experiment(EXPERIMENT, ["labels={sample: A7, t: 21.5}"])
     facts = run_facts(labelled, "2000-01-01T00:00:00", "")

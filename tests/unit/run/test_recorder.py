@@ -34,7 +34,7 @@ BLOCK = 10
 END = {"code": "completed", "reason": "waveform completed"}
 
 
-def batch(first: int, blocks: int, dropped: int = 0) -> BlockBatch:
+def batch(first, blocks, dropped=0):
     """Return blocks that follow one another, the first behind a gap of ``dropped`` samples."""
     made = BlockBatch.empty(blocks, BLOCK, 3)
     made.heads[:, BlockHeader.FIRST_SAMPLE] = first + BLOCK * np.arange(blocks)

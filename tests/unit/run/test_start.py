@@ -16,6 +16,9 @@ from hilctl.run.start import (
     output_of,
     unpaced,
 )
+from tests.unit.studies.campaign.conftest import experiment
+
+__all__ = ["experiment"]
 
 DEMO = Path(__file__).parents[3] / "configs" / "demo.yaml"
 NOON = time.struct_time((2026, 1, 2, 12, 0, 5, 4, 2, 0))
@@ -44,23 +47,7 @@ def test_a_folder_that_can_not_be_made_is_said(tmp_path):
         output_of(checked, None)
 
 
-EXPERIMENT = """\
-name: rig
-device: {kind: simulated_terfenol, seed: 3}
-sample_rate_hz: 2000
-block: 20
-waveform: {kind: sine, unit: A, amplitude: 2.0, frequency_hz: 20.0, duration_s: 0.4}
-compensator: none
-limits: {peak_current_a: 4.0, slew_a_per_s: 5000.0, stroke_um: [-50.0, 50.0]}
-"""
 BUDGET = ["limits.rms_current_a=2.0", "limits.thermal_time_constant_s=1.0"]
-
-
-@pytest.fixture
-def experiment(tmp_path) -> Path:
-    path = tmp_path / "rig.yaml"
-    path.write_text(EXPERIMENT, encoding="utf-8")
-    return path
 
 
 def test_a_recording_is_known_by_what_it_is_of(experiment, tmp_path):

@@ -118,8 +118,7 @@ class Neighbours:
                 start=lambda: self.said.append("shown"), end=lambda: self.note("progress ended")
             ),
             "SystemdNotifier": lambda: SimpleNamespace(
-                say=lambda *lines: self.said.extend(lines),
-                alive=lambda: self.said.append("alive"),
+                say=lambda *lines: self.said.extend(lines), alive=lambda: self.said.append("alive")
             ),
         }.items():
             patch.setattr(module, name, double)

@@ -25,7 +25,6 @@ def device(**options):
 
 
 def test_a_reader_that_speaks_otherwise_needs_a_line_of_its_own(tmp_path):
-    """Same terminators, same checksum, same bits."""
     text = Path(DCON).read_text().replace("checksum: dcon", "checksum: none")
     (tmp_path / "plain.yaml").write_text(text)
     reader = {"profile": str(tmp_path / "plain.yaml"), "unit_id": 3}
@@ -47,7 +46,6 @@ def test_what_measures_the_output_is_an_input_that_says_so():
 
 
 def test_a_strict_watchdog_slows_the_loop():
-    """Feeding takes a line of its own, which costs its characters and gap; the note says so."""
     bare, fed = device().info, device(watchdog={"timeout_s": 1.0}).info
     feed_s = feed_time(load_profile(DCON)).total_s
     assert 1.0 / fed.max_rate_hz - 1.0 / bare.max_rate_hz == pytest.approx(feed_s)

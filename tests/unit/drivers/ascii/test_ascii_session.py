@@ -22,7 +22,6 @@ from hilctl_drivers.transport.links import (
     RefusedError,
     WatchdogTrippedError,
 )
-from hilctl_drivers.transport.wire_time import WireTime
 
 DCON = load_profile(str(Path(__file__).parents[3] / "data" / "dcon_module.yaml"))
 PLAIN = DCON.model_copy(update={"link": DCON.link.model_copy(update={"checksum": "none"})})
@@ -119,13 +118,13 @@ def test_an_echo_must_be_what_was_sent():
         session(b"#030\r>\r", profile=profile).ask("#020", ">")
 
 
-def wire_s(time: WireTime) -> float:
+def wire_s(time):
     """Return the time of the characters alone."""
     return time.request_s + time.reply_s
 
 
 class TestText:
-    def test_dcon(self) -> None:
+    def test_dcon(self):
         """#010+05.000 and > with their carriage returns are 14 characters."""
         profile = load_profile("icp_m7024_dcon")
         time = exchange_time(profile, "AO0", None)
@@ -134,15 +133,14 @@ class TestText:
             pytest.approx(18 * 10 / 9600)
         )
 
-    def test_gap(self) -> None:
+    def test_gap(self):
         """TDK-Lambda's 5 ms come once a line."""
         time = exchange_time(load_profile("tdk_lambda_gen"), "current", "current")
         assert (time.gaps, time.gaps_s) == (2, 0.01)
         assert time.request_s == pytest.approx((13 + 7) * 10 / 9600)  # PC 38.000$XX, MC?$XX
         assert time.reply_s == pytest.approx((6 + 10) * 10 / 9600)  # OK$XX, 05.003$XX
 
-    def test_one_line(self) -> None:
-        """A line that sets and asks saves the second one."""
+    def test_one_line(self):
         profile = load_profile("kepco_bop")
         one = exchange_time(profile, "current", "current")
         apart = profile.model_copy(update={"exchange": "none"})
@@ -156,12 +154,10 @@ class TestText:
 
 @pytest.mark.parametrize("name", ["kepco_bop", "tdk_lambda_gen"])
 def test_devices_without_a_strict_watchdog_cost_nothing(name):
-    """Exchanges feed it, or there is none."""
     assert feed_time(load_profile(name)) is None
 
 
 def test_an_unanswered_line_costs_its_characters():
-    """DCON's ~** is heard by all modules on the line and answered by none."""
     time = feed_time(load_profile("icp_m7024_dcon"))
     assert time.total_s == time.request_s == pytest.approx(len("~**\r") * 10 / 9600)
 
@@ -215,7 +211,6 @@ def test_numbers_of_all_three_forms(text, value):
      "\u0661", "1e99999", "9.9E37", "-9.9e37", "9.91E37", "1e400"],
 )  # fmt: skip
 def test_what_is_not_exactly_one_number_is_corrupt(text):
-    """Two numbers, units, Python's own spellings and SCPI's marks for no number."""
     with pytest.raises(CorruptError):
         parse_number(text)
 
@@ -223,7 +218,6 @@ def test_what_is_not_exactly_one_number_is_corrupt(text):
 @ALL
 @pytest.mark.parametrize("text", ["", "a\r", "\n", "a\tb", "µm", "a\0", "\x7f"])
 def test_only_printable_lines_are_sent(line, text):
-    """Control characters could end the line early; others have no ASCII code."""
     with pytest.raises(BadRequestError, match="printable ASCII"):
         line.encode(text)
 
@@ -244,7 +238,6 @@ def test_long_lines_are_refused_both_ways():
 
 @ALL
 def test_beginnings_and_tails_of_lines(line):
-    """A line without its end is incomplete; anything behind its end is corrupt."""
     whole = line.encode("OK")
     for cut in range(len(whole)):
         with pytest.raises(IncompleteError):
@@ -256,7 +249,6 @@ def test_beginnings_and_tails_of_lines(line):
 
 @pytest.mark.parametrize("body", [b"\xb0", b"a\tb", b"\x7f", b"\x11OK", b"OK\r"])
 def test_what_is_not_text_is_corrupt(body):
-    """Flow control, eighth bits and a terminator of another kind."""
     with pytest.raises(CorruptError, match="printable ASCII"):
         SCPI.decode(body + b"\n")
 
@@ -268,7 +260,6 @@ def test_what_is_not_text_is_corrupt(body):
      (GEN, b"OK\r"), (GEN, b"OK$9B\r"), (GEN, b"OK9A\r"), (GEN, b"$9\r")],
 )  # fmt: skip
 def test_wrong_or_missing_checksums_are_corrupt(line, wire):
-    """One off, in small letters, cut or not there at all."""
     with pytest.raises(CorruptError, match="checksum"):
         line.decode(wire)
 
@@ -281,5 +272,4 @@ def test_stream_of_lines_finds_an_end_cut_in_two_by_noise():
 
 
 def test_stream_of_lines_passes_on_empty_lines():
-    """An empty line is an answer, if a strange one."""
     assert PLAIN_LINE.splitter().feed(b"\rOK\r\r") == ["", "OK", ""]

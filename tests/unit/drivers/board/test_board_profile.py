@@ -15,7 +15,6 @@ def test_a_board_with_a_fifo_streams(name, driver):
 
 
 def test_range_is_inside_the_type():
-    """Half a code more is rounded to the last one; a whole code more is refused."""
     dac = {"type": "int16", "unit": "V", "scale": 0.001, "min": -32.768}
     assert FrameChannel(**dac, max=32.7674).format.size == 2
     with pytest.raises(ValidationError, match="int16 holds"):

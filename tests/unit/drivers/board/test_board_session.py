@@ -65,7 +65,6 @@ def test_an_exchange_byte_by_byte(board):
 
 
 def test_messages_are_numbered_through_255(board):
-    """So that an answer to an older message is noticed."""
     board.link.make = answer()
     for _ in range(257):
         board.put_out(0.0)
@@ -97,7 +96,6 @@ def test_a_reply_with_fewer_values_than_it_says_is_refused(board):
 
 
 def test_a_setting_that_the_board_took_otherwise_is_an_error(board):
-    """Watchdogs to the millisecond, clocks within a ten-thousandth."""
     board.link.make = answer(body=struct.pack("<I", 60))
     with pytest.raises(DeviceError, match=r"50 ms, .* 60"):
         board.set_watchdog(0.05, 0.0)
@@ -126,7 +124,6 @@ def test_mixed_byte_orders_are_refused():
 
 
 def test_a_name_brings_no_escape_characters_to_the_terminal(board):
-    """They are shown as what they are; so are bytes that are no ASCII."""
     head = struct.pack("<BHHfff", 2, 0, 1, 1000.0, -10.0, 10.0)
     board.link.make = answer(body=head + b"board \x1b[2J\r\n\xe9 1")
     assert board.facts().name == r"board \x1b[2J\r\n\xe9 1"
@@ -143,7 +140,6 @@ def test_a_state_byte_by_byte(board):
 
 
 def test_a_board_of_version_1_knows_no_state(board):
-    """Another refusal is not taken for that."""
     board.link.make = answer(status=0x04)
     assert board.state() is None
     board.link.make = answer(status=0x01)

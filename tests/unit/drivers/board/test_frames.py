@@ -13,7 +13,6 @@ from hilctl_drivers.board.frames import exchange_sizes, watchdog_sizes
     [(1, 4, False, (8, 13)), (1, 2, False, (6, 11)), (100, 4, True, (408, 413))],
 )
 def test_sizes_of_an_exchange(samples, size, stream, expected):
-    """Head, values, and in the reply the tail of the queue."""
     assert exchange_sizes(samples, size, stream=stream) == expected
 
 

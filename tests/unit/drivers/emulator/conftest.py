@@ -1,6 +1,5 @@
 """Emulators that all tests here share."""
 
-from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 
 import pytest
@@ -68,11 +67,11 @@ def emulate(tmp_path):
 
 
 @pytest.fixture
-def served() -> Iterator[Callable[..., str]]:
+def served():
     """Serve emulators in threads; yield a function that starts one and returns its address."""
     with ExitStack() as running:
 
-        def start(profile: str, **options) -> str:
+        def start(profile, **options):
             return running.enter_context(emulated(EmulatorOptions(profile, **options))).address
 
         yield start

@@ -11,7 +11,6 @@ from tests.unit.drivers.emulator.conftest import MS, START_NS
 
 class TestBoard:
     def test_single_samples_byte_by_byte(self, emulate):
-        """EXCHANGE: the reading is taken before the value is put out."""
         board = emulate("cobs_board")
         ask = b"\x10\x07\x01\x00" + struct.pack("<f", 5.0)
         reply = board.ask(ask)
@@ -34,13 +33,11 @@ class TestBoard:
         ],
     )
     def test_bad_messages_change_nothing(self, emulate, message, status):
-        """They are answered with the status that says why."""
         board = emulate("cobs_board")
         assert board.ask(message) == bytes([message[0] | 0x80, message[1], status])
         assert board.writes() == []
 
     def test_watchdog_trips_refuses_and_is_cleared(self, emulate):
-        """Silence puts the output at the safe value; values are refused until it is set again."""
         board = emulate("cobs_board")
         arm = b"\x12\x01" + struct.pack("<If", 50, -1.0)
         assert board.ask(arm) == b"\x92\x01\x00" + struct.pack("<I", 50)
@@ -55,7 +52,6 @@ class TestBoard:
         assert board.ask(b"\x13\x03" + struct.pack("<f", 0.0)) == b"\x93\x03\x00"
 
     def test_stream_answers_once_the_block_is_out(self, emulate):
-        """The clock starts with the prefill; each answer has the readings of what it pushed out."""
         board = emulate("cobs_board_fifo")
         rate_hz, block, blocks = 10_000.0, 100, 3
         clock = b"\x15\x01" + struct.pack("<fH", rate_hz, blocks * block)
@@ -75,7 +71,6 @@ class TestBoard:
         assert sum(w["samples"] for w in played) == 7 * block
 
     def test_stream_says_what_does_not_fit(self, emulate):
-        """A lost block, a full FIFO, and a block before the clock is set are refused."""
         board = emulate("cobs_board_fifo")
 
         def block(first, n=500):
@@ -91,7 +86,6 @@ class TestBoard:
         assert board.ask(block(8000)) == b"\x91\x02\x08"
 
     def test_underruns_are_counted_and_the_output_holds(self, emulate):
-        """With nothing queued the last value stays, and each period is counted."""
         board = emulate("cobs_board_fifo")
         board.ask(b"\x15\x01" + struct.pack("<fH", 10_000.0, 100))
         values = np.full(100, 2.0, dtype="<f4").tobytes()
@@ -118,7 +112,6 @@ class TestBoard:
         assert len(board.writes()) == len(before) + 1  # the watchdog's own
 
     def test_state_after_a_stream_is_where_it_stopped(self, emulate):
-        """Output and reading are those of the last value that was put out."""
         board = emulate("cobs_board_fifo")
         board.ask(b"\x15\x01" + struct.pack("<fH", 10_000.0, 100))
         values = np.full(100, 4.0, dtype="<f4").tobytes()

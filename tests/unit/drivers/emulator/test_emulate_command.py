@@ -3,7 +3,6 @@
 import json
 import re
 import signal
-from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -17,7 +16,7 @@ from hilctl_drivers.emulator.emulate_command import (
     serve,
     wired_experiment,
 )
-from hilctl_drivers.emulator.factory import Emulator, build
+from hilctl_drivers.emulator.factory import build
 from hilctl_drivers.emulator.options import EmulatorOptions, parse_fault
 from hilctl_drivers.emulator.rig import SimulatedWiring
 from hilctl_drivers.emulator.server import EmulatorServer
@@ -36,10 +35,9 @@ CONFIGS = Path(__file__).parents[4] / "configs"
     ],
 )
 def test_it_says_where_both_answer(profile, reader, options, places):
-    """Each with its place, and its unit id where there is one; a signal ends it."""
     told: list[ListenAddress] = []
 
-    def on_ready(places: Sequence[ListenAddress], emulator: Emulator) -> None:
+    def on_ready(places, emulator):
         told.extend(places)
         signal.raise_signal(signal.SIGTERM)
 
@@ -54,7 +52,7 @@ def ended_at_once(monkeypatch):
     """Let a signal end each emulator as soon as it answers."""
     run = EmulatorServer.run
 
-    def run_shortly(server: EmulatorServer) -> None:
+    def run_shortly(server):
         signal.raise_signal(signal.SIGTERM)
         run(server)
 
@@ -62,7 +60,6 @@ def ended_at_once(monkeypatch):
 
 
 def test_a_program_reads_where_and_how(ended_at_once):
-    """One line: places, wiring, and the arguments of a run there; people read the same in words."""
     path = str(CONFIGS / "serial_scpi_kepco.yaml")
     (line,) = CliRunner().invoke(app, ["emulate", path, "--json"]).stdout.splitlines()
     said = json.loads(line)
@@ -98,7 +95,6 @@ def test_a_profile_alone_has_no_wiring_to_tell(ended_at_once):
     ],
 )
 def test_options_become_the_emulator(words, tmp_path, monkeypatch):
-    """What is not given has the default of :class:`EmulatorOptions`; a reader has two spellings."""
     asked = []
     monkeypatch.setattr(
         "hilctl_drivers.emulator.emulate_command.serve", lambda *of: asked.append(of[0])

@@ -7,7 +7,6 @@ from hilctl_drivers.emulator.options import WireFault
 
 
 def test_port_in_use_is_one_line(served):
-    """The message says which port, and nothing is left open."""
     address = served("labjack_t7")
     with pytest.raises(InputError, match=f"can't listen on {address}"):
         served("labjack_t7", port=int(address.split(":")[1]))
@@ -33,19 +32,16 @@ def test_port_in_use_is_one_line(served):
     ],
 )
 def test_what_can_not_be_emulated_is_refused(served, profile, options, words):
-    """Half a set-up, channels that are not there, one unit id twice, faults of another link."""
     with pytest.raises(InputError, match=words):
         served(profile, **options)
 
 
 def test_second_port_in_use_leaves_nothing_open(served):
-    """What was opened before the refusal is let go of."""
     port = int(served("labjack_t7").split(":")[1])
     with pytest.raises(InputError, match=f"listen on 127.0.0.1:{port}"):
         served("adam_6224", reader="adam_6217", reader_port=port)
 
 
 def test_log_that_can_not_be_written_is_refused(served, tmp_path):
-    """A folder that is not there is told before anything is served."""
     with pytest.raises(InputError, match="can't be written"):
         served("labjack_t7", log=tmp_path / "none" / "log.jsonl")

@@ -68,14 +68,12 @@ def device():
     [(50_000.0, 50_000.0), (7_000.0, 1e7 / 1429), (48_000.0, 1e7 / 208), (100.0, 100.0)],
 )
 def test_the_scan_rate_is_rounded_to_periods_of_100_ns(device, wanted_hz, made_hz):
-    """Reading the register gives the rate that the clock makes."""
     device.write(4002, f32(wanted_hz))
     (found,) = struct.unpack(">f", u32(device.read(4002)))
     assert found == pytest.approx(made_hz, rel=1e-6)
 
 
 def test_values_are_put_out_one_a_scan_and_the_last_is_repeated(device):
-    """The buffer empties at the scan rate; with nothing new the output stays."""
     device.set_up()
     assert device.read(4080) == 128
     device.play(2.5, 3.0, 3.5)
@@ -91,7 +89,6 @@ def test_values_are_put_out_one_a_scan_and_the_last_is_repeated(device):
 
 
 def test_values_wait_for_set_loop(device):
-    """What was written but not taken into use fills the buffer and is not put out."""
     device.set_up()
     device.write(4400, f32(5.0))
     device.write(4990, u32(1))
@@ -101,7 +98,6 @@ def test_values_wait_for_set_loop(device):
 
 
 def test_readings_are_fetched_oldest_first(device):
-    """As many as were asked for; the rest is told as bytes."""
     device.set_up()
     device.play(2.5)
     device.write(4990, u32(1))
@@ -140,14 +136,12 @@ def test_a_full_buffer_drops_scans_until_it_is_emptied(device):
     ],
 )
 def test_what_it_can_not_do_is_refused(device, what, code):
-    """With the exception that says whether the value or the moment is wrong."""
     with pytest.raises(RefusedError) as refused:
         what(device)
     assert refused.value.code == code
 
 
 def test_calibration_constants_are_read_by_pointer(device):
-    """The pointer is written, and the buffer register read."""
     device.write(61810, u32(0x3C4000))
     data = device._feedback.call([ReadFrame(61812, 8)])[0]
     assert struct.unpack(">4f", data) == pytest.approx(
@@ -156,7 +150,6 @@ def test_calibration_constants_are_read_by_pointer(device):
 
 
 def test_a_trip_of_the_watchdog_ends_the_stream(device):
-    """The safe value stands; what was queued is not put out any more."""
     for address, data in ((61640, u32(1)), (61642, f32(1.0)), (61604, u32(1)), (61600, u32(1))):
         device.write(address, data)
     device.set_up()
@@ -173,7 +166,6 @@ def streaming(request):
 
 
 def test_raw_values_become_the_volts_that_made_them(streaming):
-    """By the calibration in the flash that the driver reads; none looks like a missing one."""
     source = LabJackInput(streaming)
     source.start(1024)
     volts = np.linspace(-9.5, 9.5, 20)

@@ -19,14 +19,12 @@ from tests.unit.drivers.emulator.conftest import emulated_modbus
     ],
 )
 def test_powers_up_as_its_profile_says(name, output, sensor, more, current_a, value):
-    """Where that says nothing, or the power-up value was set, as if it had been set so."""
     device = emulated_modbus(name, output, sensor, **more)
     assert device._rig.current_a == pytest.approx(current_a, abs=5e-3)
     assert device._outputs[output].value == pytest.approx(value, abs=2e-3)
 
 
 def test_trip_that_a_step_clears_keeps_the_command():
-    """The terminal is at the safe value and the register is not; a new command ends that."""
     device = emulated_modbus("wago_750", "AO0", "AI0")
     device.write("holding", 0, [16384])
     device._watchdog.armed = device._watchdog.tripped = True
@@ -81,7 +79,6 @@ def test_it_is_off_until_its_last_step_is_written():
 
 
 def test_any_request_feeds_it_and_ends_a_trip(armed):
-    """This device has no step that clears one."""
     armed.watchdog.request(12 * S)
     assert armed.watchdog.due_ns == 15 * S
     armed.watchdog.tripped = True

@@ -28,16 +28,16 @@ FLOAT32 = RegisterFormat("float32")
 
 
 @pytest.fixture
-def t7() -> ModbusWire:
+def t7():
     """An emulated T7 behind Modbus TCP."""
     return ModbusWire("tcp", {1: emulated_modbus("labjack_t7", "DAC0", "AIN0")})
 
 
-def requests(wire: ModbusWire, received: bytes) -> list[bytes]:
+def requests(wire, received):
     return list(wire.requests(bytearray(received)))
 
 
-def ask(wire: ModbusWire, pdu: bytes, now_ns: int = 0) -> bytes:
+def ask(wire, pdu, now_ns=0):
     """Send a request over TCP framing and return the checked reply's data."""
     (request,) = requests(wire, tcp_adu(7, 1, pdu))
     return reply_data(pdu, tcp_pdu(wire.answer(request, now_ns).data, 7, 1))
@@ -86,7 +86,6 @@ def test_coupler_reads_elsewhere_than_it_writes():
     ],
 )
 def test_refusals_change_nothing(t7, pdu, code):
-    """Wrong addresses, parts of values, values out of range, unknown functions."""
     ask(t7, write_pdu(1000, FLOAT32.encode(2.0)))
     with pytest.raises(RefusedError) as refusal:
         ask(t7, pdu)
@@ -95,7 +94,6 @@ def test_refusals_change_nothing(t7, pdu, code):
 
 
 def test_requests_in_one_segment_are_all_answered(t7):
-    """The second of two is not lost, and half of one waits for the rest."""
     pdu = read_pdu(3, 1000, 2)
     both = tcp_adu(1, 1, pdu) + tcp_adu(2, 1, pdu)
     received = bytearray(both + both[:5])
@@ -105,7 +103,6 @@ def test_requests_in_one_segment_are_all_answered(t7):
 
 
 def test_rtu_ignores_others_and_rubbish():
-    """Another unit's request and a spoilt one get no reply."""
     wire = ModbusWire("rtu", {1: emulated_modbus("wago_750", "AO0", "AI0")})
     pdu = read_pdu(3, 0x200, 1)
     good = rtu_adu(1, pdu)
@@ -116,13 +113,12 @@ def test_rtu_ignores_others_and_rubbish():
 
 
 def test_units_share_a_line_and_a_rig():
-    """One unit drives, the other shows; neither has the other's registers."""
     bench = Bench(Rig(0), SimulatedWiring(1.0, 0.0, 12.5, 0.0), WriteLog(None, 0))
     drives = EmulatedModbus(load_profile("adam_4024"), bench, "AO0", None)
     reads = EmulatedModbus(load_profile("adam_4117"), bench, None, "AI2")
     wire = ModbusWire("rtu", {1: drives, 2: reads})
 
-    def transact(unit: int, pdu: bytes, now_ns: int) -> bytes:
+    def transact(unit, pdu, now_ns):
         (request,) = requests(wire, rtu_adu(unit, pdu))
         return reply_data(pdu, rtu_pdu(wire.answer(request, now_ns).data, unit))
 

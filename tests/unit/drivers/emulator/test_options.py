@@ -20,14 +20,12 @@ from hilctl_drivers.emulator.options import (
     ],
 )
 def test_words_that_mean_nothing_are_refused(options, words):
-    """The message lists those that do."""
     with pytest.raises(InputError, match=words):
         EmulatorOptions("wago_750", **options)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_texts_are_read(kind):
-    """A count, a time, and how late."""
     assert parse_fault(f"{kind}@12") == WireFault(kind, at_count=12)
     assert parse_fault(f"{kind}@2.5s") == WireFault(kind, at_s=2.5)
     if kind in {"delay", "late"}:
@@ -46,13 +44,11 @@ def test_texts_are_read(kind):
     ],
 )
 def test_nonsense_is_refused(text, words):
-    """The message says how to write it."""
     with pytest.raises(InputError, match=words):
         parse_fault(text)
 
 
 def test_each_happens_once_when_it_is_due():
-    """By count or by time, whichever comes."""
     plan = FaultPlan([parse_fault("cut@2"), parse_fault("reset@1s")])
     seen = [plan.next(elapsed_s) for elapsed_s in (0.0, 0.5, 0.9, 1.0, 2.0)]
     assert [fault.kind if fault else None for fault in seen] == [

@@ -29,7 +29,6 @@ def bank():
 
 
 def test_all_of_a_value_is_written_or_nothing(bank):
-    """Half a float is no value."""
     ((target, words),) = bank.targets("holding", 10, [1, 2])
     assert words == [1, 2]
     target.words[:] = words
@@ -48,14 +47,12 @@ def test_what_is_read_only_is_not_there_for_writes(bank):
 
 
 def test_one_place_holds_one_value():
-    """A second register at an address shares the words of the first."""
     bank = RegisterBank()
     first = bank.place(Words(FLOAT), "holding", 10)
     assert bank.place(Words(FLOAT), "holding", 10) is first
 
 
 def test_a_profile_s_registers_are_all_there():
-    """Channels, the self-test's content, and each step's register by the step."""
     profile = load_profile("labjack_t7")
     found = RegisterMap(profile)
     found.outputs["DAC0"].value = 2.5

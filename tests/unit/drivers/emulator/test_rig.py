@@ -9,7 +9,6 @@ from tests.unit.drivers.emulator.conftest import MS
 
 
 def test_is_the_actuator_on_its_own_clock():
-    """Asked at odd times, it shows the samples of an undisturbed run, noise included."""
     rig = Rig(5 * MS)
     rig.put_out(3.0, 5 * MS)
     shown = []
@@ -25,7 +24,6 @@ def test_is_the_actuator_on_its_own_clock():
 
 
 def test_time_does_not_go_back():
-    """Being asked twice for the same moment changes nothing."""
     rig = Rig(0)
     rig.put_out(2.0, MS)
     rig.advance(2 * MS)
@@ -36,7 +34,6 @@ def test_time_does_not_go_back():
 
 
 def test_long_silence_costs_no_more_than_settling():
-    """After hours the rig has settled, and is not simulated through all of them."""
     rig = Rig(0, noise=False)
     rig.put_out(2.0, 0)
     rig.advance(24 * 3600 * 1000 * MS)
@@ -46,7 +43,6 @@ def test_long_silence_costs_no_more_than_settling():
 
 
 def test_amplifier_saturates():
-    """Beyond its range the amplifier gives what it can, as amplifiers do."""
     rig = Rig(0)
     rig.put_out(50.0, 0)
     assert rig.current_a == 10.0
@@ -69,7 +65,6 @@ class Record:
 
 @pytest.mark.parametrize("repeats", [True, False])
 def test_each_value_is_put_out_once(repeats):
-    """Whatever the stretches, values and readings come in order, none missing and none twice."""
     record = Record(repeats=repeats)
     commands = np.linspace(0.0, 3.0, 60)
     for part in np.array_split(commands, 7):
@@ -85,7 +80,6 @@ def test_each_value_is_put_out_once(repeats):
 
 
 def test_without_new_values_the_last_is_repeated_and_read():
-    """As a T-series device does: each period counts."""
     record = Record(repeats=True)
     record.fifo.queue(np.array([1.0, 2.0]))
     record.fifo.advance(5 * MS)
@@ -95,7 +89,6 @@ def test_without_new_values_the_last_is_repeated_and_read():
 
 
 def test_without_new_values_the_output_is_held_and_not_read():
-    """As a board does: the next value is the next number, later by the periods lost."""
     record = Record(repeats=False)
     record.fifo.queue(np.array([1.0, 2.0]))
     record.fifo.advance(5 * MS)

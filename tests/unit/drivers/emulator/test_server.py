@@ -36,7 +36,6 @@ def test_independent_client_agrees(served):
 
 
 def test_log_tells_time_and_value(served, tmp_path):
-    """Each write is one JSON object with both clocks, on disk at once."""
     path = tmp_path / "log.jsonl"
     host, port = served("labjack_t7", log=path).split(":")
     with ModbusTcpClient(host, port=int(port), retries=0) as client:
@@ -112,13 +111,11 @@ def serving():
 
 
 def test_faults_happen_on_the_first_line_only(serving):
-    """The other line counts no requests and knows no faults."""
     server = serving(EchoWire(), EchoWire(), faults=["exception@2"])
     assert [server.ask(b"a", which) for which in (1, 0, 1, 0, 0)] == [b"a", b"a", b"a", b"!", b"a"]
 
 
 def test_an_unplugged_line_is_gone_and_the_other_stays(serving):
-    """A pulled adapter takes its port along."""
     server = serving(EchoWire(), EchoWire(), faults=["unplug@1"])
     os.write(server.ports[0], b"a")
     select.select([server.ports[0]], [], [], 5.0)
@@ -127,7 +124,6 @@ def test_an_unplugged_line_is_gone_and_the_other_stays(serving):
 
 
 def test_a_late_answer_is_given_up_with_the_next_request(serving):
-    """Nothing comes before its time, and only the newest comes."""
     server = serving(EchoWire(late=True))
     os.write(server.ports[0], b"ab")
     while (got := server.ask(b"", timeout_s=0.0)) is None:
@@ -136,7 +132,6 @@ def test_a_late_answer_is_given_up_with_the_next_request(serving):
 
 
 def test_what_the_host_does_not_read_waits_for_room(serving):
-    """A full line stops nothing, and loses nothing."""
     server = serving(EchoWire(size=100_000), EchoWire())
     os.write(server.ports[0], b"ab")
     assert server.ask(b"c", which=1) == b"c"
@@ -144,7 +139,6 @@ def test_what_the_host_does_not_read_waits_for_room(serving):
 
 
 def test_late_request_is_carried_out_after_its_host_has_gone(served, tmp_path):
-    """Another connection was answered meanwhile; what comes last stands."""
     path = tmp_path / "log.jsonl"
     faults = (parse_fault("late:0.2@1"),)
     host, port = served("labjack_t7", log=path, faults=faults, current_a=0.0).split(":")
@@ -163,7 +157,6 @@ def test_late_request_is_carried_out_after_its_host_has_gone(served, tmp_path):
 
 
 def test_a_reset_is_not_a_hang_up(served):
-    """The host sees a connection that broke, not one that was closed in order."""
     host, port = served("labjack_t7", faults=(parse_fault("reset@1"),)).split(":")
     with socket.create_connection((host, int(port)), 5.0) as link:
         link.sendall(tcp_adu(1, 1, read_pdu(3, 1000, 2)))
@@ -172,7 +165,6 @@ def test_a_reset_is_not_a_hang_up(served):
 
 
 def test_a_pty_passes_all_bytes(serving):
-    """Raw: no byte is a line end, a flow control or a signal."""
     server = serving(EchoWire())
     every = bytes(range(256))
     os.write(server.ports[0], every)

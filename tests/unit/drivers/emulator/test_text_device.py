@@ -20,7 +20,6 @@ def dcon(emulate, tmp_path):
 
 class TestTemplates:
     def test_a_template_is_read_backwards(self):
-        """Numbers in any form that the field can have, hexadecimal ones by their format."""
         assert TemplateMatcher("#{address:02X}0{value:+07.3f}", 1).match("#010-05.250") == {
             "value": -5.25
         }
@@ -49,7 +48,6 @@ class TestTemplates:
 
 class TestDcon:
     def test_output_moves_the_rig_and_the_input_shows_it(self, dcon):
-        """A write is acknowledged and logged in A; the input shows the displacement in V."""
         assert dcon.ask(b"#020") == b">+00.000"
         assert dcon.ask(b"#020+05.000") == b">"
         reading = dcon.ask(b"#020", after_ms=500)
@@ -59,14 +57,12 @@ class TestDcon:
         assert (write["event"], write["value"], write["current_a"]) == ("write", 5.0, 5.0)
 
     def test_out_of_range_and_unknown_are_said(self, dcon):
-        """``?`` for a value that is out of range, ``?AA`` for a command that it does not have."""
         assert dcon.ask(b"#020+10.001") == b"?"
         assert dcon.ask(b"$02Z") == b"?02"
         assert dcon.ask(b"#030+05.000") is None
         assert dcon.writes() == []
 
     def test_checksum_is_looked_at(self, dcon):
-        """A line with a wrong checksum is ignored, as a module does."""
         wire = dcon.emulator.wires[0]
         good = b"#020+05.000"
         check = b"%02X" % (sum(good) & 0xFF)
@@ -85,7 +81,6 @@ class TestHostWatchdog:
         return made
 
     def test_silence_puts_the_output_at_its_safe_value(self, module):
-        """It trips when due, says so, and ignores commands with ``!`` until it is cleared."""
         assert module.ask(b"#010+04.000", after_ms=499) == b">"
         assert module.ask(b"~010", after_ms=2) == b"!0104"
         assert module.ask(b"#010+01.000") == b"!"
@@ -97,7 +92,6 @@ class TestHostWatchdog:
         assert module.ask(b"#010+01.000") == b">"
 
     def test_only_the_host_ok_feeds_it(self, module):
-        """``~**`` is not answered and keeps it quiet; commands do not."""
         for _ in range(5):
             assert module.ask(b"~**", after_ms=400) is None
             assert module.ask(b"~010") == b"!0100"
@@ -129,7 +123,6 @@ class TestScpi:
         assert supply.ask(b"CURR?") == b"3.000000E+00"
 
     def test_the_voltmeter_sees_what_the_supply_does(self, supply):
-        """Both lines stand on one rig."""
         voltmeter = supply.emulator.reader
         supply.ask(b"CURR 5")
         answer = voltmeter.answer(b"READ?", START_NS + 500 * MS)
@@ -137,7 +130,6 @@ class TestScpi:
 
 
 def test_gen_refuses_with_its_codes(emulate):
-    """TDK-Lambda GEN: ``OK`` to what it takes, ``C..`` or ``E..`` to what it does not."""
     supply = emulate("tdk_lambda_gen", reader="agilent_34970a")
     assert supply.ask(b"ADR 06") == b"OK"
     assert supply.ask(b"PC 5.000") == b"OK"

@@ -13,7 +13,6 @@ from tests.fakes import emulated
 
 
 def test_the_examples_for_firmware_are_right():
-    """Every payload in the protocol's description becomes the frame beside it."""
     readme = Path(__file__).parents[4] / "drivers" / "README.md"
     rows = re.findall(r"\| `((?:[0-9a-f]{2} ?)+)` \| `((?:[0-9a-f]{2} ?)+)` \|", readme.read_text())
     framing = binary_framing("cobs", "crc16_ccitt_false")
@@ -23,7 +22,6 @@ def test_the_examples_for_firmware_are_right():
 
 
 def test_frames_go_over_the_pty(tmp_path):
-    """INFO in COBS with its CRC, written out here, is answered in COBS with its CRC."""
     with emulated(EmulatorOptions("cobs_board")) as emulator:
         payload = b"\x14\x2a"
         crc = 0xFFFF

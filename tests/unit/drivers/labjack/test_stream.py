@@ -9,11 +9,7 @@ from hilctl.base.errors import DeviceError
 from hilctl_drivers.labjack import stream
 from hilctl_drivers.labjack.stream import ModbusFeedback
 from hilctl_drivers.modbus.pdu import ReadFrame, WriteFrame, feedback_pdu
-from hilctl_drivers.transport.links import (
-    BadRequestError,
-    MismatchError,
-    RefusedError,
-)
+from hilctl_drivers.transport.links import BadRequestError, MismatchError, RefusedError
 
 DOCUMENTED = {
     "SCANRATE_HZ": 4002, "NUM_ADDRESSES": 4004, "SETTLING_US": 4008, "RESOLUTION_INDEX": 4010,
@@ -31,7 +27,6 @@ def words(*values):
 
 
 def test_addresses_are_the_documented_ones():
-    """Each constant has the address of LabJack's table."""
     assert {name: getattr(stream, name) for name in DOCUMENTED} == DOCUMENTED
 
 
@@ -52,7 +47,6 @@ def test_a_message_is_as_long_as_it_may_be():
 
 
 def test_data_tell_readings_backlog_and_room():
-    """The first word counts samples, the second the bytes that are left."""
     data = words(3, 40, 0, 0, 100, 200, 300) + bytes(20)
     found = stream.stream_data(data, stream.u32(8000))
     assert found.raw.tolist() == [100, 200, 300]
@@ -78,7 +72,6 @@ def test_a_stream_that_lost_something_is_an_error_in_words(head, text):
 
 
 def test_more_samples_than_asked_for_are_no_answer():
-    """A count that the message can't hold is not believed."""
     with pytest.raises(MismatchError, match=r"121 samples .* 120"):
         stream.stream_data(words(121, 0, 0, 0) + bytes(240), stream.u32(0))
 
@@ -142,7 +135,6 @@ def answered(pdu, transaction=None, unit=1):
 
 
 def test_the_whole_message_is_modbus_tcp():
-    """Transaction ids count up; the length covers unit and PDU."""
     link = answered(bytes.fromhex("4c 3f800000"))
     feedback = ModbusFeedback(link, 1)
     assert feedback.read(0, 2) == bytes.fromhex("3f800000")
@@ -152,7 +144,6 @@ def test_the_whole_message_is_modbus_tcp():
 
 
 def test_each_read_frame_gets_its_words():
-    """A reply is cut where the frames say, and writes take nothing from it."""
     link = answered(bytes.fromhex("4c 0011 22334455"))
     frames = [ReadFrame(55110, 1), WriteFrame(1000, bytes(4)), ReadFrame(55120, 2)]
     assert ModbusFeedback(link, 1).call(frames) == [
@@ -171,7 +162,6 @@ def test_each_read_frame_gets_its_words():
     ],
 )
 def test_what_no_message_holds_is_refused(frames, text):
-    """Neither request nor reply may be longer than a PDU, and nothing is sent then."""
     link = answered(b"")
     with pytest.raises(BadRequestError, match=text):
         ModbusFeedback(link, 1).call(frames)
@@ -193,6 +183,5 @@ def test_what_no_message_holds_is_refused(frames, text):
     ],
 )
 def test_an_answer_to_something_else_is_an_error(link, error, text):
-    """Refusals keep the exception code; nothing of another answer is believed."""
     with pytest.raises(error, match=text):
         ModbusFeedback(link, 1).read(0, 2)

@@ -74,7 +74,6 @@ def scene():
 
 
 def test_readings_are_waited_for_by_the_device_s_clock(scene):
-    """As long as the scans that are still due take; then one message fetches them."""
     made = scene((10, 0, 90), (20, 5, 65), (5, 4, 61), (10, 0, 55))
     made.session.start()
     assert made.session.take(10).tolist() == list(range(10))
@@ -107,7 +106,6 @@ def test_more_than_one_answer_holds_is_fetched_in_parts(scene):
 
 
 def test_a_late_device_is_waited_for_and_a_standing_one_is_not(scene):
-    """The time-out comes on top of when the readings are due."""
     late = scene(*[(0, 0, 100)] * 10, (10, 0, 90))
     late.session.start()
     assert late.session.take(10).size == 10
@@ -136,7 +134,6 @@ def test_the_margin_is_rounded_up(scene):
     ],
 )
 def test_fewer_values_than_the_margin_are_an_underrun(scene, held, said):
-    """Three are enough, at a scan a message and two more."""
     made = scene((30 - held, 0, held), queued=30)
     made.session.start()
     if said is None:
@@ -179,7 +176,6 @@ def test_a_stream_that_does_not_run_is_an_error(scene):
 
 
 def test_readings_of_the_stream_before_are_forgotten(scene):
-    """What was fetched with them, and not asked for, is of other values."""
     made = scene((50, 0, 50), (10, 0, 90))
     made.session.start()
     made.session.take(10)
@@ -192,7 +188,6 @@ def test_readings_of_the_stream_before_are_forgotten(scene):
 
 
 def test_readings_come_with_values_that_are_fed_while_it_runs(scene):
-    """And count before those: the level is judged as it was when the message came."""
     made = scene((60, 0, 40), (0, 0, 40 + 58))
     made.session.start()
     made.session.feed(np.zeros(stream.VALUES_MAX + 2))
@@ -225,7 +220,6 @@ def test_a_stream_is_set_up_by_its_registers(scene):
 
 
 def test_a_stream_is_started_and_stopped_by_one_register(scene):
-    """It is stopped only where it runs."""
     made = scene()
     made.device.written.clear()
     made.session.start()

@@ -1,6 +1,5 @@
 """Devices on emulated ones: served in a thread, and in this process."""
 
-from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -57,28 +56,28 @@ class Served:
     clock: ManualClock
     log: Path
 
-    def device(self, **changes) -> ModbusDac:
+    def device(self, **changes):
         options = {**self.emulator.options, "timeout_s": PATIENT_S, **changes}
         return ModbusDac(ModbusOptions.model_validate(options))
 
-    def running(self, rate_hz: float = RATE_HZ, **changes) -> ModbusDac:
+    def running(self, rate_hz=RATE_HZ, **changes):
         """Return a device that is open and armed."""
         device = self.device(**changes)
         device.open(rate_hz, 1)
         device.arm()
         return device
 
-    def events(self) -> list[dict]:
+    def events(self):
         return logged(self.log)
 
 
 @pytest.fixture
-def serve(tmp_path) -> Iterator[Callable[..., Served]]:
+def serve(tmp_path):
     """Return a function that serves a device on a clock that stands still."""
     log = tmp_path / "writes.jsonl"
     with ExitStack() as stack:
 
-        def start(profile: str, reader: str | None = None, **options) -> Served:
+        def start(profile, reader=None, **options):
             clock = ManualClock(0)
             chosen = EmulatorOptions(profile, reader=reader, log=log, current_a=0.0, **options)
             return Served(stack.enter_context(emulated(chosen, clock)), clock, log)
@@ -95,21 +94,12 @@ class DrivenModbus:
             profile, link=link, log=self._log, message_s=MESSAGE_S, current_a=current_a
         )
         self.link, self.time = self.emulated.link, self.emulated.time
-        wiring = self.emulated.device.wiring
         self._options = {
-            "profile": profile,
-            "host": "h",
-            "output": next(iter(self.emulated.device.profile.outputs)),
-            "input": next(iter(self.emulated.device.profile.inputs)),
-            "amplifier": {"gain_a_per_v": wiring.gain_a, "offset_a": wiring.offset_a},
-            "sensor": {"um_per_v": wiring.sensor_um, "offset_um": wiring.offset_um},
-            "watchdog": "none",
-            "timeout_s": TIMEOUT_S,
-            **changes,
-        }
+            **self.emulated.options, "profile": profile, "timeout_s": TIMEOUT_S, **changes,
+        }  # fmt: skip
         self.device = self.another()
 
-    def another(self, **changes) -> ModbusDac:
+    def another(self, **changes):
         """Return a device on the same emulated one, with other options."""
         options = ModbusOptions.model_validate({**self._options, **changes})
         return ModbusDac(options, lambda peer: peer.session(self.link))
@@ -163,7 +153,7 @@ def variant(tmp_path):
 
 
 @pytest.fixture
-def reader(tmp_path) -> str:
+def reader(tmp_path):
     """A profile with init and close steps and nothing to drive, by path."""
     path = tmp_path / "reader.yaml"
     path.write_text(READER, encoding="utf-8")

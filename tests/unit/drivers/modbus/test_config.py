@@ -24,7 +24,7 @@ SETTLE_S = 0.01
 """Of an M-7024's output."""
 
 
-def made(**changes) -> ModbusDac:
+def made(**changes):
     return ModbusDac(ModbusOptions.model_validate({**PAIR, **changes}))
 
 
@@ -40,8 +40,6 @@ def test_names_and_addresses_are_hosts(host):
 
 
 class TestPlaces:
-    """Where the reader is, and what that costs."""
-
     @pytest.mark.parametrize(
         ("profile", "reader", "options", "places"),
         [
@@ -55,7 +53,6 @@ class TestPlaces:
         ],
     )
     def test_one_drives_and_the_other_reads(self, serve, profile, reader, options, places):
-        """On one line, through one gateway, at two addresses, and on two kinds of wire."""
         served = serve(profile, reader, **options)
         device = served.device()
         held = [name for name in device.info.holds if not name.startswith("tty:")]
@@ -76,19 +73,16 @@ class TestPlaces:
         assert "FC04 at 9600 8N1, then FC06 at 9600 8N1" in info.rate_note
 
     def test_baud_of_a_shared_line_is_that_of_both(self):
-        """The reader's own profile has another."""
         assert made(baud=115200).info.rate_note.startswith(
             "FC04 at 115200 8N1, then FC06 at 115200"
         )
 
     def test_slower_device_limits_a_faster_wire(self):
-        """Where the wire could do more, the note says whose limit it is."""
         pair = {"profile": "adam_4024", "reader": {"profile": "adam_4117", "unit_id": 2}}
         slow = made(**pair, baud=115200).info
         assert slow.rate_note.startswith("profile adam_4024 says so; the wire alone: FC03 at 1152")
 
     def test_baud_that_nobody_can_be_set_to_is_refused(self, tmp_path, reader):
-        """Both must keep the baud of their line; where a profile knows none, any will do."""
         known = tmp_path / "known.yaml"
         known.write_text(
             Path(reader).read_text().replace("baud: 115200", "baud: 115200, bauds: [57600]")
@@ -100,7 +94,6 @@ class TestPlaces:
             made(baud=14400)
 
     def test_two_lines_are_silent_at_the_same_time(self):
-        """With a line each, only the silence before the two replies counts."""
         info = made(reader={**READS, "serial_port": "/dev/y"}).info
         total_s = 31 * 10 / 9600 + 2 * 3.5 * 10 / 9600 + 2 * 0.002 + SETTLE_S
         assert info.max_rate_hz == pytest.approx(1.0 / total_s)
@@ -108,7 +101,6 @@ class TestPlaces:
         assert faster.rate_note.startswith("FC04 at 115200 8N1, then FC06 at 9600 8N1")
 
     def test_a_place_named_twice_is_one_line(self, tmp_path):
-        """Two names of one port are one port; a reader there needs a unit id of its own."""
         (tmp_path / "port").touch()
         (tmp_path / "by-id").symlink_to(tmp_path / "port")
         ours = {"serial_port": str(tmp_path / "port")}
@@ -118,7 +110,6 @@ class TestPlaces:
             made(**ours, reader={**theirs, "unit_id": 1})
 
     def test_what_it_is_is_kept(self):
-        """Description and details name both devices, and where the reader's registers are from."""
         info = made().info
         assert info.description == (
             "ICP DAS M-7024 (Modbus RTU) at /dev/x: AO0; ICP DAS M-7017 (Modbus RTU), unit 2 at "

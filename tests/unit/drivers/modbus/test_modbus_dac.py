@@ -7,36 +7,27 @@ from hilctl.base.errors import DeviceError, InputError
 from hilctl_drivers.emulator.options import parse_fault
 from hilctl_drivers.modbus.config import ModbusOptions
 from hilctl_drivers.modbus.modbus_dac import ModbusDac
+from tests.fakes import T7_OPTIONS
 from tests.unit.drivers.modbus.conftest import exchange
 
-T7 = {
-    "profile": "labjack_t7",
-    "host": "h",
-    "output": "DAC0",
-    "input": "AIN0",
-    "amplifier": {"gain_a_per_v": 4.0, "offset_a": -10.0},
-    "sensor": {"um_per_v": 12.5},
-    "watchdog": "none",
-}
+T7 = {**T7_OPTIONS, "host": "h"}
 READER = {"profile": "adam_6217", "unit_id": 2}
 READS = {"reader": READER, "input": "AI0"}
 
 
 @pytest.fixture
-def module(variant) -> str:
+def module(variant):
     """A profile for Modbus RTU, by path."""
     return variant(
         ("{kind: tcp, port: 502}", "{kind: rtu, baud: 115200}"), ("_s: 0.0005", "_s: 0.0")
     )
 
 
-def made(**changes) -> ModbusDac:
+def made(**changes):
     return ModbusDac(ModbusOptions.model_validate({**T7, **changes}))
 
 
 class TestOptions:
-    """What is refused before anything is sent."""
-
     @pytest.mark.parametrize(
         ("changes", "words"),
         [
@@ -57,12 +48,10 @@ class TestOptions:
         ],
     )
     def test_options_that_contradict_themselves(self, changes, words):
-        """Rules inside the options are told as such."""
         with pytest.raises(ValidationError, match=words):
             made(**changes)
 
     def test_watchdog_must_be_decided(self):
-        """Nobody drives without a watchdog by leaving a line out."""
         with pytest.raises(ValidationError, match="watchdog"):
             ModbusOptions.model_validate({key: T7[key] for key in T7 if key != "watchdog"})
 
@@ -87,12 +76,10 @@ class TestOptions:
         ],
     )
     def test_options_that_do_not_go_with_the_profile(self, changes, words):
-        """Names, units, links and the watchdog are held against the profile."""
         with pytest.raises(InputError, match=words):
             made(**changes)
 
     def test_range_is_that_of_the_terminals_through_the_chain(self):
-        """Commands in A and displacements in um follow from volts, gains and offsets."""
         info = made().info
         assert (info.command_min, info.command_max, info.command_unit) == (-10.0, 10.0, "A")
         assert (info.sensor_min_um, info.sensor_max_um) == (-125.0, 125.0)
@@ -114,14 +101,12 @@ class TestOptions:
         assert made(**options, baud=9600).info.max_rate_hz == pytest.approx(29.0, abs=1.0)
 
     def test_watchdog_is_said_before_it_is_opened(self):
-        """Where it would put the output, and why that is another value than the run's."""
         wanted = {"timeout_s": 1.0, "safe_command": 1.5, "reason": "holds a load"}
         info = made(watchdog=wanted).info
         assert (info.watchdog_command, info.watchdog_reason) == (1.5, "holds a load")
         assert made().info.watchdog_command is None
 
     def test_calibration_is_kept(self):
-        """Who calibrated what goes with every recording."""
         calibration = {"date": "2026-01-01", "by": "N. N.", "reference": "sheet 4"}
         assert "sheet 4" in made(calibration=calibration).info.details["calibration"]
 
@@ -131,8 +116,6 @@ SILENCE_S = 0.5
 
 
 class TestExchange:
-    """One transaction where it can be."""
-
     @pytest.mark.parametrize(
         ("profile", "without", "one"),
         [
@@ -145,7 +128,6 @@ class TestExchange:
         ],
     )
     def test_one_transaction_is_found_out_without_moving(self, serve, profile, without, one):
-        """Refusal and silence both lead to a read and a write; the output stays where it was."""
         served = serve(profile, **without)
         device = served.running(10.0, timeout_s=0.5)
         assert device.one_transaction is one
@@ -158,17 +140,16 @@ class TestExchange:
 
     @pytest.mark.parametrize("without", [{}, {"lacking": frozenset({76})}])
     def test_input_is_read_before_the_output_is_written(self, serve, without):
-        """In one message or in two: the reading shows nothing yet of the command."""
         served = serve("labjack_t7", **without)
         device = served.running(10.0)
         emulated, order = served.emulator.device, []
         read, write = emulated.read, emulated.write
 
-        def reading(areas: tuple[str, ...], address: int, count: int) -> list[int]:
+        def reading(areas, address, count):
             order.append(("read", address))
             return read(areas, address, count)
 
-        def writing(area: str, address: int, values: list[int]) -> None:
+        def writing(area, address, values):
             order.append(("write", address))
             write(area, address, values)
 
@@ -179,7 +160,6 @@ class TestExchange:
 
     @pytest.mark.parametrize("kind", ["23", "none"])
     def test_wrong_input_is_found_out_at_opening(self, serve, variant, kind):
-        """An address that the device does not have is refused before anything is written."""
         served = serve("generic_float32")
         wrong = variant(
             ("exchange: 23", f"exchange: {kind}"), ("IN: {address: 2,", "IN: {address: 50,")
@@ -189,7 +169,6 @@ class TestExchange:
         assert served.events() == []
 
     def test_slower_way_may_be_too_slow(self, serve):
-        """A rate that only one transaction could keep is refused where the device lacks it."""
         device = serve("labjack_t7", lacking=frozenset({76})).running(500.0)
         with pytest.raises(DeviceError, match=r"\(0, 500\] Hz \(a read and a write a sample; "):
             device.open(501.0, 1)
@@ -203,15 +182,6 @@ class TestExchange:
         assert served.events() == []
         exchange(device, 1.0)
         device.close()
-
-    def test_over_rtu(self, serve, module):
-        """The same over a pty."""
-        served = serve(module)
-        device = served.running()
-        assert device.one_transaction
-        assert exchange(device, 2.5) == pytest.approx(0.0, abs=0.3)
-        device.make_safe(-1.0)
-        assert served.events()[-1]["current_a"] == -1.0
 
     @pytest.mark.parametrize(
         ("link", "fault", "said"),
@@ -231,7 +201,6 @@ class TestExchange:
         ],
     )
     def test_bad_answer_is_told(self, serve, module, link, fault, said):
-        """In words, with what was asked; the safe value gets there, and the next run too."""
         profile = module if link == "rtu" else "labjack_t7"
         served = serve(profile, faults=(parse_fault(f"{fault}@1s"),))
         waits = {"timeout_s": SILENCE_S} if "within" in said else {}
@@ -249,7 +218,6 @@ class TestExchange:
         device.close()
 
     def test_nobody_there(self):
-        """A refused connection names the device, where it should be, and what was tried."""
         device = made(host="127.0.0.1", tcp_port=1)
         words = r"modbus_dac labjack_t7 at 127\.0\.0\.1:1: can't connect: .* \(to open\)"
         with pytest.raises(DeviceError, match=words):
@@ -259,8 +227,6 @@ class TestExchange:
 
 
 class TestSteps:
-    """Self-test and init steps."""
-
     def test_wrong_device_is_refused(self, serve):
         """A self-test register with words swapped means another byte order than the profile's."""
         served = serve("labjack_t7")
@@ -271,7 +237,6 @@ class TestSteps:
         assert served.events() == []
 
     def test_init_is_verified(self, serve):
-        """A setting that does not stick is an error that names the step."""
         served = serve("labjack_t7")
         memory = served.emulator.device.memory
         kept, _ = memory._writable["holding", 43903]
@@ -280,7 +245,6 @@ class TestSteps:
             served.device().open(100.0, 1)
 
     def test_expectation_is_checked(self, serve):
-        """A device in a mode that the profile does not mean is refused."""
         served = serve("icp_et7000")
         words, _ = served.emulator.device.memory._readable["coil", 631]
         words.words[:] = [1]
@@ -289,8 +253,6 @@ class TestSteps:
 
 
 class TestWatchdog:
-    """The device's own, armed and cleared by the profile's steps."""
-
     def test_trips_to_the_safe_command(self, serve):
         """A T7 goes to the volts that stand for the safe command, when the time is up."""
         served = serve("labjack_t7")
@@ -308,12 +270,11 @@ class TestWatchdog:
         device.close()
 
     def test_settings_in_flash_are_written_once(self, serve):
-        """What is right already is read and left alone."""
         served = serve("labjack_t7")
         emulated, written = served.emulator.device, []
         write = emulated.write
 
-        def noting(area: str, address: int, values: list[int]) -> None:
+        def noting(area, address, values):
             written.append(address)
             write(area, address, values)
 
@@ -343,7 +304,6 @@ class TestWatchdog:
         assert served_events.count("watchdog") == 2  # both outputs, once: closing disarmed it
 
     def test_too_slow_a_loop_would_trip_it(self, serve):
-        """Fewer than three samples in its time-out are refused at open."""
         device = serve("labjack_t7").device(watchdog={"timeout_s": 1.0})
         with pytest.raises(DeviceError, match="watchdog's timeout"):
             device.open(2.0, 1)
@@ -359,7 +319,6 @@ def test_device_as_it_powers_up(driven):
 
 @pytest.mark.parametrize("profile", ["labjack_t7", "wago_750", "adam_6024", "generic_float32"])
 def test_output_of_the_run_before(driven, profile):
-    """It stays between connections, and is read from the register that the profile names."""
     made = driven(profile)
     made.device.open(5.0, 1)
     made.exchange(3.0)
@@ -371,7 +330,6 @@ def test_output_of_the_run_before(driven, profile):
 
 
 def test_value_out_of_range_is_returned_as_it_is(driven):
-    """It is for the run to refuse it."""
     made = driven()
     made.open()
     made.emulated.device._outputs["OUT"].value = 17.0
@@ -379,7 +337,6 @@ def test_value_out_of_range_is_returned_as_it_is(driven):
 
 
 def test_output_that_can_not_be_read_is_not_known(driven, variant):
-    """Nothing is guessed."""
     made = driven(variant(("OUT: {address: 0,", "OUT: {readback: none, address: 0,")))
     made.open()
     made.exchange(3.0)

@@ -19,7 +19,6 @@ def test_silence_before_a_frame(baud, silence_s):
 
 
 def test_watchdog_steps_are_bound_to_numbers():
-    """Steps get the timeout in the device's unit and the safe value as the output has it."""
     profile = load_profile("icp_m7024")
     output = profile.outputs["AO0"]
     safe = (EnsureStep(kind="ensure", address=40500, type="int16", value="safe"),)
@@ -38,7 +37,6 @@ def text():
 
 
 def test_rate_and_depth_follow_from_the_device_s_own_figures(text):
-    """Two channels share the sample rate; a sample takes two bytes."""
     streaming = parse_profile(text, "here").streaming
     assert (streaming.fifo_depth, streaming.rate_max_hz) == (8192, 50_000.0)
 
@@ -69,7 +67,6 @@ def test_lines_and_registers_that_cannot_work_are_refused(name, old, new, rule):
     ],
 )
 def test_rules_are_told(text, old, new, rule):
-    """Each broken rule names its key."""
     assert old in text
     with pytest.raises(ConfigError, match=rule):
         parse_profile(text.replace(old, new), "here")

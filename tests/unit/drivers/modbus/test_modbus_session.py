@@ -8,19 +8,11 @@ from hilctl.base.errors import DeviceError
 from hilctl_drivers.emulator.options import parse_fault
 from hilctl_drivers.modbus.config import ModbusOptions
 from hilctl_drivers.modbus.modbus_dac import ModbusDac
-from hilctl_drivers.modbus.modbus_profile import ModbusProfile
 from hilctl_drivers.modbus.modbus_session import ModbusSession, exchange_time, feed_time
-from hilctl_drivers.modbus.pdu import (
-    coil_pdu,
-    read_pdu,
-    reply_size,
-    rtu_adu,
-    write_single_pdu,
-)
+from hilctl_drivers.modbus.pdu import coil_pdu, read_pdu, reply_size, rtu_adu, write_single_pdu
 from hilctl_drivers.modbus.register_map import EnsureStep, ExpectStep, WriteStep
 from hilctl_drivers.profile import load_profile, parse_profile, with_link
 from hilctl_drivers.profile_base import WaitStep
-from hilctl_drivers.transport.wire_time import WireTime
 from tests.unit.drivers.modbus.conftest import exchange
 
 
@@ -51,8 +43,6 @@ class Line:
 
 
 class TestSteps:
-    """Steps of a profile over a link whose framing is another than the profile's."""
-
     @pytest.fixture
     def session(self, reader):
         self.line, self.slept_s = Line(), []
@@ -60,7 +50,6 @@ class TestSteps:
         return ModbusSession(profile, self.line, 9, self.slept_s.append, framing="tcp")
 
     def test_each_kind_of_register_has_its_function(self, session):
-        """Devices that know one function only are common: a single word goes by the simple one."""
         one = {"kind": "write", "address": 7, "type": "uint16", "value": 3.0}
         two = {"kind": "write", "address": 8, "type": "float32", "value": 1.5}
         session.run([WriteStep(**one), WriteStep(**two)])
@@ -90,10 +79,7 @@ class TestSteps:
 
 
 class TestReader:
-    """What is done with the reader itself."""
-
     def test_self_test_comes_before_anything_moves(self, serve):
-        """Another module at the reader's unit id is found out, and named."""
         served = serve("adam_4024", "adam_4117")
         words, _ = served.emulator.reader.memory._readable["holding", 210]
         words.words[:] = [0x4018]
@@ -103,7 +89,6 @@ class TestReader:
         assert served.events() == []
 
     def test_init_and_close_steps_are_carried_out(self, serve, reader):
-        """The reader is set up before the first sample, and let go of after the last."""
         served = serve("adam_4024", reader)
         state, _ = served.emulator.reader.memory._readable["holding", 7]
         device = served.running(5.0, baud=115200)
@@ -113,7 +98,6 @@ class TestReader:
         assert state.words == [2]
 
     def test_expectations_are_checked(self, serve):
-        """An input that is set to another range than the profile's is refused."""
         served = serve("waveshare_ao_8ch", "waveshare_ai_8ch")
         words, _ = served.emulator.reader.memory._readable["holding", 0x1000]
         words.words[:] = [3]
@@ -125,7 +109,6 @@ class TestReader:
         [({"mute": frozenset({4})}, "no answer"), ({"lacking": frozenset({4})}, "exception 1")],
     )
     def test_input_that_can_not_be_read_moves_nothing(self, serve, fault, said):
-        """It is read once at opening, before the first write."""
         served = serve("icp_m7024", "icp_m7017", **fault)
         with pytest.raises(DeviceError, match=rf": reader icp_m7017, .*{said}.* \(to open\)"):
             served.device(timeout_s=0.5).open(5.0, 1)
@@ -136,7 +119,6 @@ class TestReader:
         [("silence@1s", "no answer", 0.5), ("exception@1s", "exception 4", 20.0)],
     )
     def test_errors_name_the_reader(self, serve, fault, said, timeout_s):
-        """The message says which device, where, and what was being done; nothing was written."""
         served = serve("icp_m7024", "icp_m7017", faults=(parse_fault(fault),))
         device = served.running(5.0, timeout_s=timeout_s)
         served.clock.pass_s(2.0)
@@ -150,14 +132,12 @@ class TestReader:
         assert served.events()[-1]["current_a"] == pytest.approx(0.0, abs=1e-3)
 
     def test_errors_of_the_one_that_drives_are_not_the_readers(self, serve):
-        """A write that is refused is told of the device itself, at opening."""
         served = serve("icp_m7024", "icp_m7017", lacking=frozenset({6}))
         with pytest.raises(DeviceError, match=r"function 6 .*exception 1") as refused:
             served.device().open(5.0, 1)
         assert "reader" not in str(refused.value)
 
     def test_both_lines_are_let_go_of(self, serve):
-        """After an error in the one, neither port is kept for longer than the safe value needs."""
         faults = (parse_fault("silence@1s"),)
         served = serve("icp_m7024", "icp_m7017", reader_line="own", faults=faults)
         device, other = served.running(5.0, timeout_s=0.5), served.device()
@@ -171,7 +151,6 @@ class TestReader:
         other.close()
 
     def test_no_reader_there_moves_nothing(self, serve):
-        """A reader that can't be reached is told at opening, by its own address."""
         served = serve("adam_6224", "adam_6217")
         said = r"reader adam_6217, unit 1 at 127\.0\.0\.1:1: can't connect: .* \(to open\)"
         with pytest.raises(DeviceError, match=said):
@@ -225,13 +204,13 @@ def acme(feed=FEED, link="{kind: rtu, baud: 9600}"):
     return parse_profile(text, "acme.yaml")
 
 
-def rtu(baud: int = 115200, parity: str = "N", **link: object) -> ModbusProfile:
+def rtu(baud=115200, parity="N", **link):
     """Return a Modbus RTU device on a line, which exchanges in one transaction in no time."""
     fast = acme().model_copy(update={"exchange": 23, "turnaround_s": 0.0})
     return with_link(fast, baud=baud, parity=parity, **link)
 
 
-def wire_s(time: WireTime) -> float:
+def wire_s(time):
     """Return the time of the characters alone."""
     return time.request_s + time.reply_s
 
@@ -240,8 +219,7 @@ class TestRtu:
     """Modbus RTU, against a table worked out by hand: two float32 registers each way."""
 
     @pytest.mark.parametrize("column", range(4))
-    def test_characters(self, column: int) -> None:
-        """Characters of each function take what baud and character format say."""
+    def test_characters(self, column):
         profile = rtu(*LINES[column])
         both = exchange_time(profile, "AO", "AI", one_transaction=False)
         write = exchange_time(profile, "AO", None)
@@ -256,16 +234,14 @@ class TestRtu:
             assert found[function] * 1e3 == pytest.approx(row[column], rel=0.03), function
 
     @pytest.mark.parametrize("column", range(4))
-    def test_rate(self, column: int) -> None:
-        """The highest rate with the standard's gaps, and with none."""
+    def test_rate(self, column):
         baud, parity = LINES[column]
         gaps = exchange_time(rtu(baud, parity), "AO", "AI")
         none = exchange_time(rtu(baud, parity, gap_s=0.0), "AO", "AI")
         assert gaps.highest_rate_hz == pytest.approx(TABLE_HZ["gaps"][column], rel=0.03)
         assert none.highest_rate_hz == pytest.approx(TABLE_HZ["none"][column], rel=0.03)
 
-    def test_two_transactions(self) -> None:
-        """Write, then read, has four gaps and the device's turnaround twice."""
+    def test_two_transactions(self):
         profile = load_profile("icp_m7024")
         one = exchange_time(profile, "AO0", None)
         two = exchange_time(rtu(), "AO", "AI", one_transaction=False)
@@ -273,15 +249,13 @@ class TestRtu:
         assert one.turnaround_s == profile.turnaround_s
         assert str(two).startswith("FC03+FC16 at 115200 8N1: request ")
 
-    def test_text(self) -> None:
-        """The explanation names each part."""
+    def test_text(self):
         assert str(exchange_time(rtu(), "AO", "AI")) == (
             "FC23 at 115200 8N1: request 1.48 ms, reply 0.78 ms, 2 gaps 3.50 ms,"
             " turnaround 0.00 ms -> at most 174 Hz"
         )
 
-    def test_stop_bits(self) -> None:
-        """A second stop bit is one more bit a character."""
+    def test_stop_bits(self):
         one, two = rtu(gap_s=0.0), rtu(gap_s=0.0, stopbits=2)
         ratio = exchange_time(two, "AO", "AI").total_s / exchange_time(one, "AO", "AI").total_s
         assert ratio == pytest.approx(11 / 10)
@@ -332,23 +306,19 @@ READ, WRITE = read_pdu(3, 101, 1), write_single_pdu(101, bytes(2))
     ],
 )
 def test_each_kind_of_step_counts_with_all_that_it_may_send(feed, seconds):
-    """A step that writes only what differs counts as if it did."""
     assert feed_time(acme(feed)).total_s == pytest.approx(seconds)
 
 
 def test_over_tcp_the_turnaround_counts():
-    """There are no characters to wait for, but the device takes its time."""
     assert feed_time(acme(link="{kind: tcp}")).total_s == pytest.approx(0.002)
 
 
 @pytest.mark.parametrize("name", ["labjack_t7", "wago_750", "adam_6024"])
 def test_watchdogs_that_exchanges_feed_cost_nothing(name):
-    """Nor do devices without one."""
     assert feed_time(load_profile(name)) is None
 
 
 def test_modbus_dac_leaves_room_for_feeding(tmp_path):
-    """Only where the experiment uses the watchdog."""
     path = tmp_path / "acme.yaml"
     path.write_text(PROFILE.replace("FEED", FEED))
     options = {
@@ -372,7 +342,6 @@ def test_modbus_dac_leaves_room_for_feeding(tmp_path):
     [("labjack_t7", None), ("adam_6224", "adam_6217"), ("adam_4024", "adam_4117")],
 )
 def test_input_and_output_are_read(serve, profile, reader):
-    """From one device or two; nothing is put out."""
     served = serve(profile, reader)
     served.device().make_safe(3.0)
     served.clock.pass_s(0.5)
@@ -384,7 +353,6 @@ def test_input_and_output_are_read(serve, profile, reader):
 
 
 def test_a_command_from_before_a_trip_is_not_taken_for_the_output(serve):
-    """The register keeps it; what the terminal is at is another thing."""
     served = serve("wago_750")
     device = served.running(watchdog={"timeout_s": 0.5})
     exchange(device, 3.0)

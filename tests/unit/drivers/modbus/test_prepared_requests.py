@@ -62,7 +62,6 @@ def prepared(case, wire):
 @ALL
 @BOTH
 def test_requests_are_those_of_the_plain_functions(case, wire):
-    """With the first data, with new data, and again with the last."""
     transaction, _, (build, size, _, _) = prepared(case, wire)
     plain = (
         (lambda n, pdu: tcp_adu(n, 17, pdu)) if wire == "tcp" else (lambda _, pdu: rtu_adu(17, pdu))
@@ -76,7 +75,6 @@ def test_requests_are_those_of_the_plain_functions(case, wire):
 @ALL
 @BOTH
 def test_good_replies_are_read(case, wire):
-    """Whatever buffer they are in, and as long as announced."""
     transaction, wrap, (build, size, reply, read) = prepared(case, wire)
     for data in (OLD[:size], NEW[:size]):
         adu = wrap(transaction.request(data), reply(data))
@@ -90,7 +88,6 @@ def test_good_replies_are_read(case, wire):
 @ALL
 @BOTH
 def test_how_much_to_wait_for(case, wire):
-    """Never nothing, never more than there is, however the reply is cut."""
     transaction, wrap, (_, size, reply, _) = prepared(case, wire)
     request = bytes(transaction.request(NEW[:size]))
     refusal = wrap(request, bytes((reply(NEW[:size])[0] | 0x80, 2)))
@@ -163,7 +160,6 @@ def test_data_of_another_size_is_refused_and_changes_nothing(case, wire):
 
 @BOTH
 def test_replies_of_another_length_are_refused(wire):
-    """One register too few or too many, two replies in one, and a reply with a tail."""
     transaction, wrap, _ = prepared("read", wire)
     request = bytes(transaction.request())
     good = wrap(request, H("04 04 40200000"))

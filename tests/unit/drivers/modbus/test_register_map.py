@@ -1,20 +1,11 @@
-"""Register bytes: vendors' own examples, every byte order, and what does not fit."""
+"""Register bytes: vendors' own examples, the ends of each range, and what does not fit."""
 
-import itertools
 import math
-import struct
 
 import pytest
 
-from hilctl_drivers.modbus.register_map import (
-    Channel,
-    Register,
-    RegisterFormat,
-    wire_address,
-)
+from hilctl_drivers.modbus.register_map import Channel, Register, RegisterFormat, wire_address
 from hilctl_drivers.transport.links import BadRequestError, FrameError, MismatchError
-
-CODES = {"int16": "h", "uint16": "H", "int32": "i", "uint32": "I", "float32": "f", "float64": "d"}
 
 
 def test_labjack_word_order_self_test():
@@ -53,36 +44,6 @@ def test_offset_binary_of_a_bipolar_range():
     assert channel.encode(channel.offset + 0x8000 * channel.scale) == b"\x80\0"
 
 
-@pytest.mark.parametrize("kind", ["int32", "uint32", "float32"])
-@pytest.mark.parametrize("order", ["".join(p) for p in itertools.permutations("ABCD")])
-def test_every_order_of_four_bytes_travels_as_written(kind, order):
-    """The letters name bytes from the most significant one, in the order of travel."""
-    value = 123456789.0 if kind != "float32" else 1.2345678e7
-    big = struct.pack(">" + CODES[kind], value if kind == "float32" else int(value))
-    wire = RegisterFormat(kind, order).encode(value)
-    assert wire == bytes(big["ABCD".index(letter)] for letter in order)
-    assert RegisterFormat(kind, order).decode(wire) == value
-
-
-@pytest.mark.parametrize(
-    "order", ["ABCDEFGH", "HGFEDCBA", "GHEFCDAB", "BADCFEHG", "EFGHABCD", "CABDHEFG"]
-)
-def test_orders_of_eight_bytes_travel_as_written(order):
-    """Double precision in word-swapped, byte-swapped and odd orders."""
-    big = struct.pack(">d", math.pi)
-    wire = RegisterFormat("float64", order).encode(math.pi)
-    assert wire == bytes(big["ABCDEFGH".index(letter)] for letter in order)
-    assert RegisterFormat("float64", order).decode(wire) == math.pi
-
-
-@pytest.mark.parametrize("order", ["AB", "BA"])
-def test_orders_of_one_register(order):
-    """A 16-bit value can have its bytes swapped."""
-    assert RegisterFormat("int16", order).encode(-2) == (
-        b"\xff\xfe" if order == "AB" else b"\xfe\xff"
-    )
-
-
 @pytest.mark.parametrize(
     ("kind", "low", "high"),
     [
@@ -93,7 +54,6 @@ def test_orders_of_one_register(order):
     ],
 )
 def test_integers_reach_their_ends_and_no_further(kind, low, high):
-    """Both ends are held; one step past them is refused, not wrapped or clipped."""
     channel = RegisterFormat(kind)
     assert channel.limits == (low, high)
     assert [channel.decode(channel.encode(v)) for v in (low, high)] == [low, high]
@@ -121,22 +81,19 @@ def test_float32_refuses_what_only_a_double_holds():
         channel.encode(3.5e38)
 
 
-@pytest.mark.parametrize("kind", CODES)
+@pytest.mark.parametrize("kind", ["int16", "uint16", "int32", "uint32", "float32", "float64"])
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_nothing_that_is_not_a_number_is_sent(kind, value):
-    """Infinities and not a number are refused for every type."""
     with pytest.raises(BadRequestError, match="can't hold"):
         RegisterFormat(kind).encode(value)
 
 
 def test_scaling_past_the_doubles_is_refused():
-    """A finite value whose raw value overflows is refused as well."""
     with pytest.raises(BadRequestError, match="can't hold"):
         RegisterFormat("float64", scale=1e-300).encode(1e300)
 
 
 def test_negative_scale_turns_the_limits_round():
-    """Limits are lowest first whatever the sign of the scale."""
     assert RegisterFormat("int16", scale=-2.0, offset=1.0).limits == (-65533.0, 65537.0)
 
 
@@ -147,7 +104,6 @@ def test_a_device_that_sends_not_a_number_is_not_hidden():
 
 @pytest.mark.parametrize("size", [0, 1, 3, 5, 8])
 def test_decoding_wants_exactly_its_bytes(size):
-    """Too few or too many bytes are an error, with and without a byte order."""
     for order in ("", "CDAB", "DCBA"):
         with pytest.raises(MismatchError, match=r"float32 .*4 bytes"):
             RegisterFormat("float32", order).decode(bytes(size))
@@ -166,7 +122,6 @@ def test_decoding_wants_exactly_its_bytes(size):
     ],
 )
 def test_formats_that_make_no_sense_are_refused(arguments, rule):
-    """The message names the rule; it is a ValueError too, for a profile's validation."""
     with pytest.raises(BadRequestError, match=rule) as caught:
         RegisterFormat(*arguments)
     assert isinstance(caught.value, FrameError)
@@ -174,7 +129,6 @@ def test_formats_that_make_no_sense_are_refused(arguments, rule):
 
 
 def test_size_and_order_left_out():
-    """Size, register count and the order in full are there to be read."""
     channel = RegisterFormat("float64")
     assert (channel.size, channel.order) == (8, "ABCDEFGH")
     assert not channel.is_integer

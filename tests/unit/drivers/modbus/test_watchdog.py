@@ -71,10 +71,7 @@ def trip(made, current_a):
 
 
 class TestWatchdog:
-    """The watchdog belongs to the device that drives."""
-
     def test_writes_feed_it(self, serve):
-        """Samples keep it quiet, though every second request is for the reader; silence trips."""
         served = serve("icp_m7024", "icp_m7017")
         device = served.running(5.0, watchdog={"timeout_s": 1.0})
         for _ in range(6):
@@ -88,7 +85,6 @@ class TestWatchdog:
 
     @pytest.mark.parametrize("profile", ["wago_750", "beckhoff_bk9000"])
     def test_it_does_not_count_while_a_run_waits_to_start(self, driven, profile):
-        """Opening leaves it disarmed, however long the start signal takes."""
         made = driven(profile, watchdog=TRIPPED)
         made.device.open(100.0, 1)
         made.time.sleep(60.0)
@@ -100,7 +96,6 @@ class TestWatchdog:
             made.exchange(1.0)
 
     def test_a_device_that_cannot_be_armed_is_let_go(self, driven):
-        """No exchange may follow."""
         made = driven("wago_750", watchdog=TRIPPED)
         with pytest.raises(DeviceError, match=r"not open .*watchdog"):
             made.device.arm()
@@ -114,8 +109,6 @@ class TestWatchdog:
 
 
 class TestTrip:
-    """A device that an earlier run has left tripped."""
-
     @pytest.mark.parametrize(
         "profile", ["wago_750", "beckhoff_bk9000", "soft", "soft refuses", "soft zero"]
     )
@@ -137,7 +130,6 @@ class TestTrip:
         assert not made.emulated.device.tripped
 
     def test_the_output_stays_where_the_earlier_run_wanted_it(self, driven, soft):
-        """The device's own safe value counts, whatever the next experiment says."""
         made = driven(soft(), watchdog={**TRIPPED, "safe_command": 1.0})
         trip(made, 3.0)
         before = len(made.writes())
@@ -148,7 +140,6 @@ class TestTrip:
         assert since == pytest.approx(len(since) * [1.0])
 
     def test_what_was_held_is_held_on(self, driven, soft):
-        """Where a trip leaves the output, so does opening."""
         made = driven(soft(on_trip="hold", safe=""))
         has = made.emulated.device
         made.open()
@@ -173,7 +164,6 @@ class TestTrip:
 
     @pytest.mark.parametrize("refuses", ["true", "false"])
     def test_last_write_comes_before_and_after_the_trip_is_cleared(self, driven, soft, refuses):
-        """The stale command never takes effect, whether the device obeys meanwhile or not."""
         made = driven(soft(refuses=refuses), watchdog=TRIPPED)
         trip(made, 3.0)
         before = len(made.writes())
@@ -185,7 +175,6 @@ class TestTrip:
 
 
 def test_safe_value_is_sent_first(driven):
-    """The first message is the write; the other one reads it back."""
     made = driven()
     made.open()
     made.exchange(3.0)
@@ -202,7 +191,6 @@ def test_safe_value_is_sent_first(driven):
 
 @pytest.mark.parametrize("was_open", [True, False])
 def test_each_safe_value_costs_two_messages(driven, was_open):
-    """Whether an older command may come is the caller's affair."""
     made = driven()
     if was_open:
         made.open()
@@ -217,7 +205,6 @@ def test_each_safe_value_costs_two_messages(driven, was_open):
 
 
 def test_a_silent_device_is_tried_once(driven):
-    """Within its time-out, without a word on what the output is at."""
     made = driven()
     made.link.silent_until_s = 1e9
     before_s = made.time()
@@ -231,7 +218,6 @@ def test_a_silent_device_is_tried_once(driven):
 
 @pytest.mark.parametrize("late_s", [0.11, 0.3, 0.8])
 def test_a_value_that_is_written_over_is_not_confirmed(driven, late_s):
-    """An older command is executed between the write and its confirmation."""
     made = driven()
     made.open()
     made.link.late_s = late_s
@@ -265,7 +251,6 @@ def test_a_step_of_the_output_is_no_other_value(driven):
 
 
 def test_no_name_is_looked_up_for_it():
-    """The address is that which was reached at opening."""
     with emulated(EmulatorOptions("generic_float32")) as served:
         hosts = []
 
@@ -284,7 +269,6 @@ def test_no_name_is_looked_up_for_it():
 
 @pytest.mark.parametrize("silence_s", [0.6, 3.0])
 def test_device_that_was_silent_is_made_safe_when_it_is_back(driven, silence_s):
-    """By the caller's attempts, each on a new connection."""
     made = driven()
     made.open()
     made.exchange(3.0)

@@ -8,15 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hilctl.base.types import F64
-from hilctl_drivers.simulated.actuator_base import (
-    CHUNK,
-    VACUUM_PERMEABILITY,
-    Coil,
-    RodParameters,
-    SensorNoise,
-)
-from hilctl_drivers.simulated.devices import PHYSICS, Physics
+from hilctl_drivers.simulated.actuator_base import CHUNK, VACUUM_PERMEABILITY, Coil, SensorNoise
+from hilctl_drivers.simulated.devices import PHYSICS
 from hilctl_drivers.simulated.domains import DomainsParameters
 from hilctl_drivers.simulated.jiles_atherton import JilesAthertonParameters
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
@@ -25,7 +18,7 @@ RATED = TerfenolParameters()
 RATE_HZ = 50e3
 
 
-def run(actuator: TerfenolActuator, command_a: F64) -> F64:
+def run(actuator, command_a):
     displacement_um = np.empty_like(command_a)
     actuator.step(command_a, displacement_um, np.empty_like(command_a))
     return displacement_um
@@ -33,7 +26,7 @@ def run(actuator: TerfenolActuator, command_a: F64) -> F64:
 
 @settings(max_examples=50, deadline=None)
 @given(parts=st.lists(st.integers(0, CHUNK), max_size=20))
-def test_noise_is_that_of_one_draw(parts: list[int]) -> None:
+def test_noise_is_that_of_one_draw(parts):
     """However it is divided; and once more from the start after a reset."""
     noise = SensorNoise(0.5, 7)
     expected = 0.5 * np.random.Generator(np.random.PCG64(7)).standard_normal(sum(parts))
@@ -48,22 +41,21 @@ class TestBlocks:
 
     @settings(max_examples=30, deadline=None)
     @given(cuts=st.lists(st.integers(0, 6000), max_size=12))
-    def test_cut_does_not_matter(self, cuts: list[int]) -> None:
+    def test_cut_does_not_matter(self, cuts):
         """Readings are the same bit for bit wherever the blocks are cut."""
         whole = run(TerfenolActuator(RATED, RATE_HZ), self.COMMAND_A)
         actuator = TerfenolActuator(RATED, RATE_HZ)
         parts = [run(actuator, part) for part in np.split(self.COMMAND_A, sorted(cuts))]
         np.testing.assert_array_equal(np.concatenate(parts), whole)
 
-    def test_seed_decides_the_noise(self) -> None:
-        """Equal seeds give equal readings, others do not."""
+    def test_seed_decides_the_noise(self):
         one, same, other = (
             run(TerfenolActuator(RATED, RATE_HZ, seed=seed), self.COMMAND_A) for seed in (3, 3, 4)
         )
         np.testing.assert_array_equal(one, same)
         assert not np.array_equal(one, other)
 
-    def test_hold_is_a_constant_command(self) -> None:
+    def test_hold_is_a_constant_command(self):
         """Holding equals sending the same command that many times, over any length."""
         sent, held = TerfenolActuator(RATED, RATE_HZ), TerfenolActuator(RATED, RATE_HZ)
         run(sent, np.full(10_000, 2.5))
@@ -74,19 +66,14 @@ class TestBlocks:
 rigs = pytest.mark.parametrize("physics", PHYSICS)
 
 
-def parameters(physics: Physics, **vary: float) -> TerfenolParameters:
+def parameters(physics, **vary):
     factors = {"lag": 1.0, "pinning": 1.0, "strain": 1.0} | vary
     rods = PHYSICS[physics]().varied(**factors)
     return TerfenolParameters(sensor_noise_um=0.0, rods=rods)
 
 
 @cache
-def loop(
-    physics: Physics,
-    amplitude_a: float,
-    frequency_hz: float,
-    vary: tuple[str, float] = ("lag", 1.0),
-) -> tuple[F64, F64]:
+def loop(physics, amplitude_a, frequency_hz, vary=("lag", 1.0)):
     """Command in A and displacement in um, the last cycle of a sine, from its minimum."""
     rate_hz = RATE_HZ if frequency_hz > 10.0 else 2500.0
     n = round(rate_hz / frequency_hz)
@@ -96,7 +83,7 @@ def loop(
     return command_a[-n:], whole_um[-n:]
 
 
-def hysteresis_percent(command_a: F64, displacement_um: F64) -> float:
+def hysteresis_percent(command_a, displacement_um):
     """Largest gap between descending and ascending branch at one command, per peak-to-peak."""
     start = -int(np.argmin(command_a))
     command_a, displacement_um = np.roll(command_a, start), np.roll(displacement_um, start)
@@ -110,16 +97,14 @@ def hysteresis_percent(command_a: F64, displacement_um: F64) -> float:
 
 
 class TestPublishedRanges:
-    """Near the figures of the dissertation's actuator, of which each is a variety."""
-
     @rigs
-    def test_stroke(self, physics: Physics) -> None:
+    def test_stroke(self, physics):
         """A 6 A sine of 1 Hz moves it by 60 to 100 um (published: 83.1)."""
         stroke_um = np.ptp(loop(physics, 6.0, 1.0)[1])
         assert 60.0 <= stroke_um <= 100.0
 
     @rigs
-    def test_hysteresis_grows_with_the_frequency(self, physics: Physics) -> None:
+    def test_hysteresis_grows_with_the_frequency(self, physics):
         """10 to 25 % at 1 Hz, 35 to 50 % at 250 Hz (published: 18.2 and 49.1)."""
         figures = [hysteresis_percent(*loop(physics, 6.0, hz)) for hz in (1.0, 50.0, 100.0, 250.0)]
         assert figures == sorted(figures)
@@ -127,7 +112,7 @@ class TestPublishedRanges:
         assert 35.0 <= figures[-1] <= 50.0
 
     @rigs
-    def test_monotone_inside_7_a(self, physics: Physics) -> None:
+    def test_monotone_inside_7_a(self, physics):
         """Biased rods: more current is more displacement, on both branches (to an ADC code)."""
         command_a, displacement_um = loop(physics, 7.0, 1.0)
         moves = np.diff(displacement_um) * np.sign(np.diff(command_a))
@@ -138,7 +123,7 @@ class TestOneState:
     COMMAND_A = np.random.default_rng(5).uniform(-7.0, 7.0, 60).repeat(50)
 
     @rigs
-    def test_cut_does_not_matter_at_a_low_rate(self, physics: Physics) -> None:
+    def test_cut_does_not_matter_at_a_low_rate(self, physics):
         """Nor where a sample period has more steps than a kernel call takes."""
         command_a = self.COMMAND_A[::600]
         whole = run(TerfenolActuator(parameters(physics), 10.0), command_a)
@@ -148,13 +133,13 @@ class TestOneState:
 
     @rigs
     @pytest.mark.parametrize("bias_a", [0.0, -3.96, 5.89])
-    def test_rest_is_zero(self, physics: Physics, bias_a: float) -> None:
+    def test_rest_is_zero(self, physics, bias_a):
         """With no command the displacement is 0, whatever the bias."""
         actuator = TerfenolActuator(parameters(physics), RATE_HZ, bias_a=bias_a)
         assert not run(actuator, np.zeros(500)).any()
 
     @rigs
-    def test_opposite_magnets_mirror_the_current(self, physics: Physics) -> None:
+    def test_opposite_magnets_mirror_the_current(self, physics):
         """Magnetostriction does not know the sign of the field."""
         rated = parameters(physics)
         turned = replace(rated, magnet_field_a_per_m=-rated.magnet_field_a_per_m)
@@ -164,9 +149,7 @@ class TestOneState:
 
     @rigs
     @pytest.mark.parametrize(("rate_hz", "frequency_hz"), [(50e3, 250.0), (500.0, 25.0)])
-    def test_integration_has_converged(
-        self, physics: Physics, rate_hz: float, frequency_hz: float
-    ) -> None:
+    def test_integration_has_converged(self, physics, rate_hz, frequency_hz):
         """A tenth of the internal step moves no reading by more than 50 nm; the default 10 nm."""
         rated = parameters(physics)
         n = round(3 * rate_hz / frequency_hz)
@@ -178,7 +161,7 @@ class TestOneState:
         assert np.abs(coarse_um - fine_um).max() < limit_um
 
     @rigs
-    def test_comes_to_rest_after_a_step(self, physics: Physics) -> None:
+    def test_comes_to_rest_after_a_step(self, physics):
         """Held long enough, no current leaves anything moving."""
         actuator = TerfenolActuator(parameters(physics), RATE_HZ)
         held_um = run(actuator, np.repeat([5.0, -2.0], 10_000))
@@ -188,13 +171,13 @@ class TestOneState:
 
 class TestVaried:
     @rigs
-    def test_strain_scales_the_displacement(self, physics: Physics) -> None:
+    def test_strain_scales_the_displacement(self, physics):
         """And nothing else: the loop is the same, larger."""
         rated, varied = loop(physics, 6.0, 100.0), loop(physics, 6.0, 100.0, ("strain", 1.1))
         np.testing.assert_allclose(varied[1], 1.1 * rated[1], atol=0.01)
 
     @rigs
-    def test_lag_widens_fast_loops_only(self, physics: Physics) -> None:
+    def test_lag_widens_fast_loops_only(self, physics):
         """A longer lag shows at 250 Hz, not at 1 Hz."""
         slow, fast = (
             hysteresis_percent(*loop(physics, 6.0, hz, ("lag", 1.2)))
@@ -205,14 +188,14 @@ class TestVaried:
         assert fast > 1.0
 
     @rigs
-    def test_pinning_widens_slow_loops(self, physics: Physics) -> None:
+    def test_pinning_widens_slow_loops(self, physics):
         """More pinning is more hysteresis where nothing lags."""
         rated = hysteresis_percent(*loop(physics, 6.0, 1.0))
         assert hysteresis_percent(*loop(physics, 6.0, 1.0, ("pinning", 1.2))) > 1.02 * rated
 
 
 @rigs
-def test_rods_rest_where_the_bias_has_been_for_long(physics: Physics) -> None:
+def test_rods_rest_where_the_bias_has_been_for_long(physics):
     """Without a change of the current nothing moves, not in ten thousand steps."""
     rods = PHYSICS[physics]().rods(Coil(5.09e3, 44.1e3, 1e-5))
     rest_um, free_um = rods.rest(), np.empty(10_000)
@@ -228,7 +211,7 @@ STILL = {
 anhysteretic = pytest.mark.parametrize("rods", STILL.values(), ids=STILL)
 
 
-def magnetisation(rods: RodParameters, field: F64) -> F64:
+def magnetisation(rods, field):
     """M at the end of each step from one field to the next, from the anhysteretic at the first."""
     model = rods.rods(Coil(1.0, float(field[0]), 1e-5))
     model.rest()
@@ -242,7 +225,7 @@ def magnetisation(rods: RodParameters, field: F64) -> F64:
 
 
 @anhysteretic
-def test_decaying_field_ends_on_the_anhysteretic(rods: RodParameters) -> None:
+def test_decaying_field_ends_on_the_anhysteretic(rods):
     """From far off it, a field that swings ever less leads back to it."""
     decay = np.linspace(1.0, 0.0, 30_001)
     field = 30e3 + 60e3 * decay * np.cos(2.0 * np.pi * np.arange(decay.size) / 400.0)
@@ -253,7 +236,7 @@ def test_decaying_field_ends_on_the_anhysteretic(rods: RodParameters) -> None:
 
 
 @anhysteretic
-def test_minor_loop_does_not_close(rods: RodParameters) -> None:
+def test_minor_loop_does_not_close(rods):
     """A small cycle on the rising branch ends elsewhere than it began, less so each time."""
     up = np.linspace(13e3, 44e3, 1500)
     dip = 44e3 - 5e3 * (1.0 - np.cos(2.0 * np.pi * np.arange(1, 401) / 400.0))
@@ -265,7 +248,7 @@ def test_minor_loop_does_not_close(rods: RodParameters) -> None:
 
 
 @anhysteretic
-def test_major_loop_closes(rods: RodParameters) -> None:
+def test_major_loop_closes(rods):
     """Between the same ends each cycle is the one before, once the first quarter is forgotten."""
     field = 90e3 * np.sin(2.0 * np.pi * np.arange(12_001) / 4000)
     found = magnetisation(rods, field)
@@ -274,7 +257,7 @@ def test_major_loop_closes(rods: RodParameters) -> None:
 
 @pytest.mark.parametrize("rods", [*STILL.values(), DomainsParameters(), JilesAthertonParameters()])
 @pytest.mark.parametrize(("low", "high"), [(13e3, 75e3), (40e3, 48e3), (-90e3, 90e3)])
-def test_loops_take_energy(rods: RodParameters, low: float, high: float) -> None:
+def test_loops_take_energy(rods, low, high):
     """The area of a steady loop of applied field and magnetisation is what it turns to heat."""
     phase = 2.0 * np.pi * np.arange(16_001) / 2000
     field = 0.5 * (low + high) + 0.5 * (high - low) * np.sin(phase)

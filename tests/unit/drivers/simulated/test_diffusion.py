@@ -7,7 +7,6 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.special import jv
 
-from hilctl.base.types import F64
 from hilctl_drivers.simulated.actuator_base import ROD_RADIUS_M, VACUUM_PERMEABILITY, Coil
 from hilctl_drivers.simulated.diffusion import Diffusion, DiffusionParameters, magnetise
 
@@ -25,7 +24,7 @@ LINEAR = replace(
 )
 
 
-def shells(rods: DiffusionParameters, halves_a_per_m: F64, bias: float = 0.0) -> tuple[F64, F64]:
+def shells(rods, halves_a_per_m, bias=0.0):
     """H and M of each shell after each step; the field at the surface is given, and the bias."""
     model = Diffusion(rods, Coil(1.0, bias, STEP_S))
     model.rest()
@@ -36,26 +35,24 @@ def shells(rods: DiffusionParameters, halves_a_per_m: F64, bias: float = 0.0) ->
     return found[:, 0], found[:, 1]
 
 
-def sine(amplitude: float, frequency_hz: float, cycles: float) -> F64:
+def sine(amplitude, frequency_hz, cycles):
     n = round(cycles / (frequency_hz * STEP_S))
-    halves: F64 = amplitude * np.sin(np.pi * frequency_hz * STEP_S * np.arange(2 * n + 1))
-    return halves
+    return amplitude * np.sin(np.pi * frequency_hz * STEP_S * np.arange(2 * n + 1))
 
 
-def phasor(signal: F64, frequency_hz: float) -> F64:
+def phasor(signal, frequency_hz):
     """Complex amplitude of the last cycle, of the sine that began with the first step."""
     n = round(1.0 / (frequency_hz * STEP_S))
     time = STEP_S * np.arange(signal.shape[0] - n + 1, signal.shape[0] + 1)
     turn = np.exp(-2j * np.pi * frequency_hz * time)
-    found: F64 = 2j / n * (signal[-n:].T @ turn)
-    return found
+    return 2j / n * (signal[-n:].T @ turn)
 
 
 @pytest.mark.parametrize("frequency_hz", [50.0, 250.0, 1000.0])
 class TestLinearRod:
     """Where mu is constant the field is known: H_s J_0(kr) / J_0(kR), k^2 = -j w mu / rho."""
 
-    def test_skin_effect(self, frequency_hz: float) -> None:
+    def test_skin_effect(self, frequency_hz):
         """Each shell has the field of the Bessel function at its middle, amplitude and phase."""
         field, _ = shells(LINEAR, sine(1000.0, frequency_hz, 12.0))
         omega = 2.0 * np.pi * frequency_hz
@@ -64,7 +61,7 @@ class TestLinearRod:
         expected = 1000.0 * jv(0, k * radius) / jv(0, k * ROD_RADIUS_M)
         np.testing.assert_allclose(phasor(field, frequency_hz), expected, atol=4.0)
 
-    def test_mean_of_few_shells(self, frequency_hz: float) -> None:
+    def test_mean_of_few_shells(self, frequency_hz):
         """Eight shells give the mean over the section within 1 %: 2 J_1(kR) / (kR J_0(kR))."""
         few = replace(LINEAR, shells=8)
         field, _ = shells(few, sine(1000.0, frequency_hz, 12.0))
@@ -75,7 +72,7 @@ class TestLinearRod:
         assert abs(mean - 2000.0 * jv(1, kr) / (kr * jv(0, kr))) < 0.01 * abs(mean)
 
 
-def test_flux_is_kept() -> None:
+def test_flux_is_kept():
     """What comes in through the surface is what H + M grow by, cells and all."""
     halves = sine(30e3, 250.0, 1.3)
     field, magnetised = shells(RATED, halves, 44.1e3)
@@ -89,7 +86,7 @@ def test_flux_is_kept() -> None:
     assert grown == pytest.approx(through, rel=1e-9)
 
 
-def test_slow_field_is_the_same_everywhere() -> None:
+def test_slow_field_is_the_same_everywhere():
     """At 0.5 Hz there is no skin effect."""
     n = 200_000
     model = Diffusion(RATED, Coil(5.09e3, 44.1e3, STEP_S))
@@ -98,7 +95,7 @@ def test_slow_field_is_the_same_everywhere() -> None:
     assert np.ptp(model._state[0]) < 100.0
 
 
-def test_cells_hold_until_the_field_is_beyond_their_pinning() -> None:
+def test_cells_hold_until_the_field_is_beyond_their_pinning():
     """A shell's M follows cells that rest inside their pinning field, and so does its slope."""
     cells = np.array([[0.0, 1000.0], [0.25, 0.75]])
     pinned = np.array([[5000.0, 5000.0], [5000.0, 5000.0]])
@@ -114,7 +111,7 @@ def test_cells_hold_until_the_field_is_beyond_their_pinning() -> None:
 
 
 @pytest.mark.parametrize(("frequency_hz", "closes"), [(2.0, True), (250.0, False)])
-def test_minor_loops_close_only_where_the_field_has_time(frequency_hz: float, closes: bool) -> None:
+def test_minor_loops_close_only_where_the_field_has_time(frequency_hz, closes):
     """Friction remembers where a slow field turned; a fast one is elsewhere in each shell."""
     n = round(1.0 / (frequency_hz * STEP_S))
     up = np.linspace(0.0, 10e3, 2 * n + 1)
@@ -127,7 +124,7 @@ def test_minor_loops_close_only_where_the_field_has_time(frequency_hz: float, cl
 
 @pytest.mark.parametrize("frequency_hz", [20.0, 250.0])
 @pytest.mark.parametrize("amplitude", [2e3, 30e3])
-def test_loops_take_energy(frequency_hz: float, amplitude: float) -> None:
+def test_loops_take_energy(frequency_hz, amplitude):
     """The area of a steady loop of applied field and mean flux is what it turns to heat."""
     halves = sine(amplitude, frequency_hz, 4.0)
     field, magnetised = shells(RATED, halves, 44.1e3)
@@ -137,7 +134,7 @@ def test_loops_take_energy(frequency_hz: float, amplitude: float) -> None:
 
 
 @pytest.mark.slow
-def test_is_its_differential_equation() -> None:
+def test_is_its_differential_equation():
     """Another solver of the same shells, written down anew, agrees within 0.2 %, loops and all."""
     rods = replace(RATED, shells=4, cells=4)
     halves = sine(30e3, 200.0, 0.9)
@@ -146,7 +143,7 @@ def test_is_its_differential_equation() -> None:
     middles = faces[:-1] + 0.5 * width
     pinning, shares = rods.cell_table()
 
-    def rates(time_s: float, field: F64, before: F64) -> F64:
+    def rates(time_s, field, before):
         surface = 44.1e3 + 30e3 * np.sin(2.0 * np.pi * 200.0 * time_s)
         slope = np.append(np.diff(field) / width, (surface - field[-1]) / (0.5 * width))
         flux = np.insert(faces[1:] * slope, 0, 0.0)
@@ -154,8 +151,7 @@ def test_is_its_differential_equation() -> None:
         beyond = np.abs(field - before) >= pinning[:, None]
         cell = np.clip(before, field - pinning[:, None], field + pinning[:, None])
         part = shares[:, None] * 7.65e5 * 27e3 / (27e3 + np.abs(cell)) ** 2
-        result: F64 = into / (1.0 + np.sum(np.where(beyond, part, 0.0), axis=0))
-        return result
+        return into / (1.0 + np.sum(np.where(beyond, part, 0.0), axis=0))
 
     found, _ = shells(rods, halves, 44.1e3)
     field, before = np.full(4, 44.1e3), np.full((4, 4), 44.1e3)

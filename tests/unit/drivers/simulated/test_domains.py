@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from hilctl.base.types import F64
 from hilctl_drivers.simulated.actuator_base import ROD_LENGTH_M, VACUUM_PERMEABILITY, Coil
 from hilctl_drivers.simulated.domains import (
     KIND_SIZES,
@@ -25,7 +24,7 @@ AXIS = np.array([1.0, 1.0, 2.0]) / math.sqrt(6.0)
 ZEEMAN = VACUUM_PERMEABILITY * RATED.saturation_a_per_m
 
 
-def strain(m: F64) -> float:
+def strain(m):
     """Magnetostriction along the rod of a domain magnetised along the unit vector m."""
     one = 1.5 * RATED.strain_100 * (np.sum(AXIS**2 * m**2) - 1.0 / 3.0)
     pairs = [(0, 1), (0, 2), (1, 2)]
@@ -33,12 +32,12 @@ def strain(m: F64) -> float:
     return float(one + other)
 
 
-def energy(m: F64, easy: F64, field: float) -> float:
+def energy(m, easy, field):
     stiff = 0.5 * RATED.anisotropy_j_per_m3 * np.sum((m - easy) ** 2)
     return float(stiff - ZEEMAN * field * (m @ AXIS) - RATED.stress_pa * strain(m))
 
 
-def all_eight(field: float) -> tuple[F64, F64, F64]:
+def all_eight(field):
     """Fractions, m.u and strain of each <111> direction, from the published closed form."""
     form = np.empty((3, 3))
     for i, j in product(range(3), repeat=2):
@@ -57,7 +56,7 @@ def all_eight(field: float) -> tuple[F64, F64, F64]:
     return fractions / fractions.sum(), np.array(along), np.array(strains)
 
 
-def at_rest(field: float, rods: DomainsParameters = RATED) -> tuple[float, float]:
+def at_rest(field, rods=RATED):
     """M / M_s and displacement in um of the anhysteretic state."""
     model = Domains(rods, Coil(1.0, field, STEP_S))
     rest_um = model.rest()
@@ -65,7 +64,7 @@ def at_rest(field: float, rods: DomainsParameters = RATED) -> tuple[float, float
 
 
 @pytest.mark.parametrize("field", [-40e3, 0.0, 13e3, 44.1e3, 95e3])
-def test_six_kinds_are_all_eight(field: float) -> None:
+def test_six_kinds_are_all_eight(field):
     """Magnetisation and strain are those of eight orientations, each for itself."""
     assert sum(KIND_SIZES) == 8
     assert len(ORIENTATIONS) == len(KIND_SIZES)
@@ -77,7 +76,7 @@ def test_six_kinds_are_all_eight(field: float) -> None:
 
 
 @pytest.mark.parametrize("field", [-5e3, 0.0, 5e3])
-def test_closed_form_is_where_the_energy_is_least(field: float) -> None:
+def test_closed_form_is_where_the_energy_is_least(field):
     """To first order: a tenth of field and stress moves moments by a tenth, within a hundredth."""
     weak = replace(RATED, stress_pa=0.1 * RATED.stress_pa)
     work = np.empty((8, 6))
@@ -85,7 +84,7 @@ def test_closed_form_is_where_the_energy_is_least(field: float) -> None:
     for kind, direction in enumerate(ORIENTATIONS):
         easy = np.array(direction) / math.sqrt(3.0)
 
-        def of(x: F64, easy: F64 = easy) -> float:
+        def of(x, easy=easy):
             m = x / np.linalg.norm(x)
             return (energy(m, easy, field) + 0.9 * RATED.stress_pa * strain(m)) / 1e4
 
@@ -93,7 +92,7 @@ def test_closed_form_is_where_the_energy_is_least(field: float) -> None:
         assert work[1, kind] == pytest.approx(best @ AXIS / np.linalg.norm(best), abs=0.01)
 
 
-def test_limits_of_the_anhysteretic() -> None:
+def test_limits_of_the_anhysteretic():
     """Without a field nothing points anywhere; odd M, even strain; saturation is along u."""
     assert at_rest(0.0)[0] == pytest.approx(0.0, abs=1e-12)
     assert at_rest(30e3)[0] == pytest.approx(-at_rest(-30e3)[0], abs=1e-9)
@@ -106,7 +105,7 @@ def test_limits_of_the_anhysteretic() -> None:
     assert rest_um == pytest.approx(full_um, rel=0.05)
 
 
-def test_compression_turns_domains_across() -> None:
+def test_compression_turns_domains_across():
     """More prestress: less strain at rest, and more of it to be had by a field."""
     pressed = replace(RATED, stress_pa=1.5 * RATED.stress_pa)
     assert at_rest(0.0, pressed)[1] < at_rest(0.0)[1] - 3.0
@@ -115,7 +114,7 @@ def test_compression_turns_domains_across() -> None:
 
 
 @pytest.mark.parametrize("change", [-300.0, 300.0, 2000.0])
-def test_slopes_are_difference_quotients(change: float) -> None:
+def test_slopes_are_difference_quotients(change):
     """What Newton's method goes by is what a small change does."""
     model = Domains(RATED, Coil(1.0, 44.1e3, STEP_S))
     model.rest()
@@ -131,7 +130,7 @@ def test_slopes_are_difference_quotients(change: float) -> None:
         np.testing.assert_allclose(works[1][slope], quotient, rtol=1e-4, atol=1e-13)
 
 
-def test_fractions_stay_fractions() -> None:
+def test_fractions_stay_fractions():
     """However it is driven, they are between 0 and 1, and 1 in all."""
     model = Domains(RATED, Coil(5.09e3, 44.1e3, STEP_S))
     model.rest()
@@ -143,7 +142,7 @@ def test_fractions_stay_fractions() -> None:
             assert fractions @ KIND_SIZES == pytest.approx(1.0, abs=1e-9)
 
 
-def test_flux_is_kept() -> None:
+def test_flux_is_kept():
     """H + M by the flux that came in is what fields and fractions come to, after any motion."""
     model = Domains(RATED, Coil(5.09e3, 44.1e3, STEP_S))
     model.rest()

@@ -8,7 +8,6 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from hilctl.base.types import F64
 from hilctl_drivers.simulated.actuator_base import Coil
 from hilctl_drivers.simulated.jiles_atherton import (
     JilesAtherton,
@@ -21,15 +20,15 @@ RATED = JilesAthertonParameters()
 STEP_S = 1e-5
 
 
-def langevin_by_formula(x: float) -> float:
+def langevin_by_formula(x):
     return 1.0 / math.tanh(x) - 1.0 / x if abs(x) > 1e-3 else x / 3.0
 
 
-def anhysteretic(field: float, rods: JilesAthertonParameters = RATED) -> float:
+def anhysteretic(field, rods=RATED):
     """M of L((H + alpha' M) / a) by bisection."""
     saturation, shape = rods.saturation_a_per_m, rods.shape_a_per_m
 
-    def excess(magnetisation: float) -> float:
+    def excess(magnetisation):
         inner = (field + rods.effective_coupling * magnetisation) / shape
         return magnetisation - saturation * langevin_by_formula(inner)
 
@@ -37,7 +36,7 @@ def anhysteretic(field: float, rods: JilesAthertonParameters = RATED) -> float:
 
 
 @pytest.mark.parametrize("x", [-300.0, -0.5, -0.051, -0.049, 1e-4, 0.05, 3.0, 500.0])
-def test_langevin(x: float) -> None:
+def test_langevin(x):
     """The function is its formula and the slope its difference quotient, series and all."""
     value, slope = langevin(x)
     assert value == pytest.approx(langevin_by_formula(x), rel=1e-8)
@@ -45,7 +44,7 @@ def test_langevin(x: float) -> None:
     assert slope == pytest.approx(quotient, abs=1e-8)
 
 
-def test_coupling_has_the_stress_in_it() -> None:
+def test_coupling_has_the_stress_in_it():
     """Compression works against the field: alpha' is negative, and the anhysteretic sheared."""
     stress = 9.0 * 1.005e-3 * -22e6 / (2.0 * 4e-7 * math.pi * 7.65e5**2)
     assert RATED.effective_coupling == pytest.approx(0.045 + stress, rel=1e-6)
@@ -53,7 +52,7 @@ def test_coupling_has_the_stress_in_it() -> None:
 
 
 @pytest.mark.parametrize("bias", [0.0, 13e3, 44.1e3, 90e3, 1e7])
-def test_rests_on_the_anhysteretic(bias: float) -> None:
+def test_rests_on_the_anhysteretic(bias):
     """Which at high fields is saturation."""
     model = JilesAtherton(RATED, Coil(1.0, bias, STEP_S))
     rest_um = model.rest()
@@ -64,7 +63,7 @@ def test_rests_on_the_anhysteretic(bias: float) -> None:
         assert rest_um == pytest.approx(full_um, rel=0.01)
 
 
-def test_susceptibility_is_never_negative() -> None:
+def test_susceptibility_is_never_negative():
     """Wherever M stands, a field that grows does not make it fall: the one guard there is."""
     material = JilesAtherton(RATED, Coil(1.0, 0.0, STEP_S))._material
     for field in np.linspace(-90e3, 90e3, 19):
@@ -73,7 +72,7 @@ def test_susceptibility_is_never_negative() -> None:
             assert susceptibility(field, start, -1.0, material) > 0.0
 
 
-def test_losses_are_the_published_ones() -> None:
+def test_losses_are_the_published_ones():
     """Where M ramps steadily, the field is behind by e dM/dt + x (dM/dt)^(1/2)."""
     rate = 3e8
     eddy, wall = RATED.losses
@@ -95,16 +94,16 @@ def test_losses_are_the_published_ones() -> None:
 
 
 @pytest.mark.parametrize("frequency_hz", [100.0, 250.0])
-def test_is_its_differential_equation(frequency_hz: float) -> None:
+def test_is_its_differential_equation(frequency_hz):
     """Another solver of the published equations, written down anew, agrees within 0.2 %."""
     eddy, wall = RATED.losses
     saturation, shape, c = 7.65e5, 7012.0, 0.18
     alpha = RATED.effective_coupling
 
-    def applied(time_s: float) -> float:
+    def applied(time_s):
         return 44.1e3 + 5.09e3 * 6.0 * math.sin(2.0 * math.pi * frequency_hz * time_s)
 
-    def rates(time_s: float, state: F64) -> list[float]:
+    def rates(time_s, state):
         field, magnetised = state
         behind = applied(time_s) - field
         if behind == 0.0:

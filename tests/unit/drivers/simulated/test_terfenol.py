@@ -11,7 +11,6 @@ import pytest
 from pydantic import ValidationError
 from scipy.signal import StateSpace, lsim
 
-from hilctl.base.types import F64
 from hilctl_drivers.simulated.devices import PHYSICS, SimulatedTerfenol, TerfenolOptions
 from hilctl_drivers.simulated.pinned_cells import PinnedCellsParameters
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
@@ -23,11 +22,7 @@ RATE_HZ = 50e3
 
 
 @cache
-def last_cycle(
-    harmonics: tuple[tuple[int, float], ...],
-    frequency_hz: float,
-    bias_a: float = 0.0,
-) -> tuple[F64, F64]:
+def last_cycle(harmonics, frequency_hz, bias_a=0.0):
     """Command in A and displacement in um of the last cycle of sum of a sin(k w t)."""
     # A slow loop changes little in a sample, and the internal step is the same at any rate.
     rate_hz = RATE_HZ if frequency_hz > 10.0 else 2500.0
@@ -39,25 +34,25 @@ def last_cycle(
     return command_a[-n:], displacement_um[-n:]
 
 
-def sine(amplitude_a: float, frequency_hz: float, bias_a: float = 0.0) -> tuple[F64, F64]:
+def sine(amplitude_a, frequency_hz, bias_a=0.0):
     return last_cycle(((1, amplitude_a),), frequency_hz, bias_a)
 
 
-def stroke_um(amplitude_a: float, frequency_hz: float) -> float:
+def stroke_um(amplitude_a, frequency_hz):
     return float(np.ptp(sine(amplitude_a, frequency_hz)[1]))
 
 
-def hysteresis(amplitude_a: float, frequency_hz: float) -> float:
+def hysteresis(amplitude_a, frequency_hz):
     return hysteresis_percent(*sine(amplitude_a, frequency_hz))
 
 
-def asymmetry_percent(amplitude_a: float) -> float:
+def asymmetry_percent(amplitude_a):
     _, displacement_um = sine(amplitude_a, 10.0)
     difference_um = -displacement_um.min() - displacement_um.max()
     return float(100.0 * difference_um / np.ptp(displacement_um))
 
 
-def minor_loop_um(first_a: float, third_a: float, frequency_hz: float, side: int) -> float:
+def minor_loop_um(first_a, third_a, frequency_hz, side):
     """Peak-to-peak displacement of the minor loop at the input's maximum (1) or minimum (-1)."""
     command_a, displacement_um = last_cycle(((1, first_a), (3, third_a)), frequency_hz)
     rising = np.diff(np.append(command_a, command_a[0])) > 0.0
@@ -99,15 +94,13 @@ class TestPublishedFigures:
     @pytest.mark.parametrize(
         ("name", "published", "tolerance", "figure"), PUBLISHED, ids=[row[0] for row in PUBLISHED]
     )
-    def test_figure(
-        self, name: str, published: float, tolerance: float, figure: Callable[[], float]
-    ) -> None:
+    def test_figure(self, name, published, tolerance, figure):
         """The actuator shows the published figure."""
         simulated = figure()
         print(f"{name}: {simulated:.2f}, published {published:g}")
         assert simulated == pytest.approx(published, abs=tolerance)
 
-    def test_loop_area_is_linear_in_frequency(self) -> None:
+    def test_loop_area_is_linear_in_frequency(self):
         """At 6 A the area of the loop grows in proportion to the frequency, r^2 >= 0.99."""
         frequencies_hz = [10.0, 50.0, 100.0, 150.0, 200.0, 250.0]
         areas = []
@@ -118,7 +111,7 @@ class TestPublishedFigures:
         assert np.corrcoef(frequencies_hz, areas)[0, 1] ** 2 >= 0.99
         assert areas == sorted(areas)
 
-    def test_more_bias_gives_less_stroke_and_area(self) -> None:
+    def test_more_bias_gives_less_stroke_and_area(self):
         """From 30 to 60 kA/m of bias field, stroke and loop area of a 3 A sine fall."""
         strokes, areas = [], []
         for bias_field in (30e3, 45e3, 60e3):
@@ -130,7 +123,7 @@ class TestPublishedFigures:
         assert areas == sorted(areas, reverse=True)
 
     @pytest.mark.parametrize("load_kg", [0.0, 3.7, 9.2, 14.7])
-    def test_load_lowers_the_resonance(self, load_kg: float) -> None:
+    def test_load_lowers_the_resonance(self, load_kg):
         """A 0.1 A step rings at sqrt(stiffness / (moving mass + load))."""
         mass_kg = RATED.moving_mass_kg + load_kg
         damped = np.sqrt(RATED.stiffness_n_per_m / mass_kg * (1.0 - RATED.damping_ratio**2))
@@ -144,7 +137,7 @@ class TestPublishedFigures:
         assert np.pi / half_period_s == pytest.approx(damped, rel=0.02)
 
 
-def test_noise_is_the_sensors() -> None:
+def test_noise_is_the_sensors():
     """The reading at rest has the published noise and no mean."""
     displacement_um = run(TerfenolActuator(RATED, RATE_HZ), np.zeros(50_000))
     assert displacement_um.std() == pytest.approx(0.03553, rel=0.02)
@@ -152,7 +145,7 @@ def test_noise_is_the_sensors() -> None:
 
 
 class TestTiming:
-    def test_reading_comes_before_the_command(self) -> None:
+    def test_reading_comes_before_the_command(self):
         """The first reading can't show the first command, neither as current nor as motion."""
         displacement_um, current_a = np.empty(50), np.empty(50)
         TerfenolActuator(QUIET, RATE_HZ).step(np.full(50, 2.0), displacement_um, current_a)
@@ -161,7 +154,7 @@ class TestTiming:
         assert current_a[1] == pytest.approx(2.0 * (1.0 - np.exp(-2e4 * np.pi * 20e-6)), abs=1e-3)
         assert displacement_um[-1] > 1.0
 
-    def test_sensor_stops_at_its_range(self) -> None:
+    def test_sensor_stops_at_its_range(self):
         """A displacement beyond +-10 V of sensor output reads as the end of the range."""
         strong = replace(QUIET, rods=replace(PinnedCellsParameters(), strain_um=1500.0))
         displacement_um = run(TerfenolActuator(strong, RATE_HZ), np.repeat([-9.0, 9.0], 1000))
@@ -177,16 +170,16 @@ EVERYTHING = {
 }
 
 
-def options(**given: object) -> TerfenolOptions:
+def options(**given):
     return TerfenolOptions.model_validate({"noise": False, **given})
 
 
-def actuator(rate_hz: float = RATE_HZ, **given: object) -> TerfenolActuator:
+def actuator(rate_hz=RATE_HZ, **given):
     of = options(**given)
     return TerfenolActuator(of.parameters(), rate_hz, of.load_kg, of.bias_a)
 
 
-def run_both(rig: TerfenolActuator, command_a: F64) -> tuple[F64, F64]:
+def run_both(rig, command_a):
     """Displacement in um and current in A."""
     displacement_um, current_a = np.empty((2, command_a.size))
     rig.step(command_a, displacement_um, current_a)
@@ -194,7 +187,7 @@ def run_both(rig: TerfenolActuator, command_a: F64) -> tuple[F64, F64]:
 
 
 @pytest.mark.parametrize("physics", PHYSICS)
-def test_cut_does_not_matter(physics: str) -> None:
+def test_cut_does_not_matter(physics):
     """With everything at once, readings are the same bit for bit wherever blocks are cut."""
     command_a = np.random.default_rng(7).uniform(-7.0, 7.0, 60).repeat(50)
     whole = run_both(actuator(physics=physics, **EVERYTHING), command_a)[0]
@@ -205,7 +198,7 @@ def test_cut_does_not_matter(physics: str) -> None:
     np.testing.assert_array_equal(run_both(rig, command_a)[0], whole)
 
 
-def test_details_hold_what_was_asked_for() -> None:
+def test_details_hold_what_was_asked_for():
     """A recording says what rig it was."""
     details = SimulatedTerfenol(options(physics="diffusion", **EVERYTHING)).info.details
     assert details["physics"] == "diffusion"
@@ -216,7 +209,7 @@ def test_details_hold_what_was_asked_for() -> None:
 
 
 class TestCreep:
-    def test_grows_with_the_logarithm_of_time(self) -> None:
+    def test_grows_with_the_logarithm_of_time(self):
         """After a step, each decade of time adds about the same; in the end it is the share."""
         option = {"share": 0.04, "time_constants_s": (0.003, 0.03, 0.3, 3.0)}
         crept, plain = (
@@ -227,7 +220,7 @@ class TestCreep:
         np.testing.assert_allclose(np.diff(share)[:2], 0.01, rtol=0.2)
         assert share[-1] == pytest.approx(0.04, rel=0.02)
 
-    def test_is_its_own_transfer_function(self) -> None:
+    def test_is_its_own_transfer_function(self):
         """The elements are first-order lags of what moves without them."""
         command_a = np.random.default_rng(2).uniform(-5.0, 5.0, 30).repeat(100)
         option = {"share": 0.2, "time_constants_s": (0.005, 0.05)}
@@ -239,19 +232,19 @@ class TestCreep:
         np.testing.assert_allclose(crept, lsim(filtered, plain, time_s)[1], atol=0.05)
 
     @pytest.mark.parametrize("times", [(), (0.0,), (1.0,) * 9])
-    def test_refuses(self, times: tuple[float, ...]) -> None:
+    def test_refuses(self, times):
         with pytest.raises(ValidationError, match="time_constants_s"):
             options(creep={"share": 0.1, "time_constants_s": times})
 
 
 class TestThermal:
-    def test_room_moves_the_rest_position(self) -> None:
+    def test_room_moves_the_rest_position(self):
         """From the first reading, without any motion of the structure."""
         thermal = {"rise_k_per_a2": 0.0, "tau_s": 1.0, "growth_um_per_k": 0.5, "ambient_k": -10.0}
         reading = run_both(actuator(thermal=thermal), np.zeros(100))[0]
         np.testing.assert_allclose(reading, -5.0, atol=0.002)
 
-    def test_coil_warms_by_its_square(self) -> None:
+    def test_coil_warms_by_its_square(self):
         """A sine and a steady current of its effective value warm alike, by their time constant."""
         thermal = {"rise_k_per_a2": 0.5, "tau_s": 0.5, "growth_um_per_k": 1.0}
         time_s = np.arange(2000) / 1000.0
@@ -265,7 +258,7 @@ class TestThermal:
         np.testing.assert_allclose(grown[1], expected, atol=0.02)
         np.testing.assert_allclose(grown[0], expected, atol=0.05)
 
-    def test_bias_warms_too(self) -> None:
+    def test_bias_warms_too(self):
         """A coil that carries the bias warms at rest."""
         thermal = {"rise_k_per_a2": 0.5, "tau_s": 0.1, "growth_um_per_k": 1.0}
         reading = run_both(actuator(1000.0, thermal=thermal, bias_a=-2.0), np.zeros(1000))[0]
@@ -273,7 +266,7 @@ class TestThermal:
 
 
 class TestSecondMode:
-    def test_static_displacement_stays(self) -> None:
+    def test_static_displacement_stays(self):
         """The second mode's share is taken from the first."""
         mode = {"frequency_hz": 900.0, "damping_ratio": 0.05, "share": 0.1}
         held = [
@@ -282,7 +275,7 @@ class TestSecondMode:
         ]
         assert held[1] == pytest.approx(held[0], abs=0.004)
 
-    def test_rings_at_its_own_frequency(self) -> None:
+    def test_rings_at_its_own_frequency(self):
         """What a step leaves of two modes less the first alone is the second's decay."""
         mode = {"frequency_hz": 700.0, "damping_ratio": 0.02, "share": 0.3}
         rods = replace(PinnedCellsParameters(), lag_s=1e-6)
@@ -302,7 +295,7 @@ class TestSecondMode:
 class TestVoltageLimit:
     LIMIT: ClassVar = {"voltage_max_v": 60.0, "resistance_ohm": 4.0, "inductance_h": 5e-3}
 
-    def test_step_rises_as_the_voltage_drives_it(self) -> None:
+    def test_step_rises_as_the_voltage_drives_it(self):
         """A large step follows V / R (1 - exp(-R t / L)) until it is nearly there, then settles."""
         current_a = run_both(actuator(amplifier=self.LIMIT), np.full(200, 9.0))[1]
         time_s = np.arange(200) / RATE_HZ
@@ -312,7 +305,7 @@ class TestVoltageLimit:
         assert current_a.max() <= 9.0002
         assert current_a[-1] == pytest.approx(9.0, abs=4e-4)
 
-    def test_small_signals_do_not_notice(self) -> None:
+    def test_small_signals_do_not_notice(self):
         """Where the voltage suffices the current is the unlimited one, bit for bit."""
         command_a = 0.5 * np.sin(np.arange(2000) / 40.0)
         for one, other in zip(
@@ -323,7 +316,7 @@ class TestVoltageLimit:
             np.testing.assert_array_equal(one, other)
 
     @pytest.mark.parametrize("rate_hz", [5e3, 50e3, 200e3])
-    def test_rate_does_not_matter(self, rate_hz: float) -> None:
+    def test_rate_does_not_matter(self, rate_hz):
         """The same moment after a step, the same current, at any sample rate."""
         n = round(1e-3 * rate_hz)
         current_a = run_both(actuator(rate_hz, amplifier=self.LIMIT), np.full(n + 1, 9.0))[1]

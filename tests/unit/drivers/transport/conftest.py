@@ -5,7 +5,6 @@ import pty
 import socket
 import threading
 import tty
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import pytest
@@ -18,14 +17,14 @@ PATIENT_S = 5.0
 QUICK_S = 0.05
 
 
-def missing(received: bytearray) -> int:
+def missing(received):
     return max(0, len(REPLY) - len(received))
 
 
 class Peer:
     """A TCP server that does one thing with its first connection, in a thread of its own."""
 
-    def __init__(self, act: Callable[[socket.socket], None]) -> None:
+    def __init__(self, act):
         self.server = socket.create_server(("127.0.0.1", 0))
         self.port = self.server.getsockname()[1]
         self._act = act
@@ -33,24 +32,24 @@ class Peer:
         self.thread = threading.Thread(target=self._run)
         self.thread.start()
 
-    def _run(self) -> None:
+    def _run(self):
         connection, _ = self.server.accept()
         with connection:
             self._act(connection)
             self.done.wait(10.0)
 
-    def stop(self) -> None:
+    def stop(self):
         self.done.set()
         self.thread.join()
         self.server.close()
 
 
 @pytest.fixture
-def serve() -> Iterator[Callable[[Callable[[socket.socket], None]], int]]:
+def serve():
     """Return a function that starts a peer and returns its port."""
     peers = []
 
-    def start(act: Callable[[socket.socket], None]) -> int:
+    def start(act):
         peers.append(Peer(act))
         return peers[-1].port
 
@@ -89,7 +88,7 @@ def answering(master, *replies):
 
 
 @pytest.fixture
-def line() -> Iterator[tuple[int, str]]:
+def line():
     """Yield the far end of a pty and the device file of the near end."""
     master, slave = pty.openpty()
     tty.setraw(slave)

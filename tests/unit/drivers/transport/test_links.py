@@ -9,10 +9,7 @@ import tty
 import pytest
 
 from hilctl.base.errors import DeviceError
-from hilctl_drivers.transport.links import (
-    LostError,
-    NoAnswerError,
-)
+from hilctl_drivers.transport.links import LostError, NoAnswerError
 from hilctl_drivers.transport.serial_port import SerialLink, SerialSettings
 from tests.fakes import received
 from tests.unit.drivers.transport.conftest import (
@@ -27,7 +24,6 @@ from tests.unit.drivers.transport.conftest import (
 
 
 def test_no_reply_wanted_is_not_waited_for(serve, line):
-    """A command that is not answered costs no time-out, on either link."""
     for link in (tcp(serve(lambda connection: None)), serial(line[1])):
         assert link.transact(b"tell", lambda received: 0) == b""
         link.close()
@@ -37,8 +33,6 @@ def test_no_reply_wanted_is_not_waited_for(serve, line):
     ("sent", "words"), [(b"", "no answer within 0.3 s"), (b"0123", "only 4 bytes, 6 short")]
 )
 def test_a_known_size_moves_no_deadline(serve, line, sent, words):
-    """Silence and cut replies end in time too where the size of a good reply is known."""
-
     def act(connection):
         connection.recv(100)
         connection.sendall(sent)
@@ -53,7 +47,6 @@ def test_a_known_size_moves_no_deadline(serve, line, sent, words):
 
 @pytest.mark.parametrize("size", [9, 11, 300])
 def test_a_reply_of_another_size_than_usual_is_asked_about(serve, size):
-    """Shorter, longer, and longer than what is read at once: what comes is what is returned."""
     sent = bytes(size)
 
     def act(connection):
@@ -66,7 +59,6 @@ def test_a_reply_of_another_size_than_usual_is_asked_about(serve, size):
 
 
 def test_full_serial_line_times_out(line):
-    """Nobody takes what is sent: an error in time, not a hang."""
     link = serial(line[1], QUICK_S)
     for request in (bytes(1_000_000), b"ask"):
         with pytest.raises(NoAnswerError, match="not send within"):
@@ -75,7 +67,6 @@ def test_full_serial_line_times_out(line):
 
 
 def test_serial_exchanges(line):
-    """What is written gets there, and a reply that is waiting in pieces is put together."""
     master, name = line
     link = serial(name, baud=115200, parity="E")
 
@@ -93,7 +84,6 @@ def test_serial_exchanges(line):
 
 
 def test_serial_port_is_ours_alone(line):
-    """A second one can't have the port, and is told so."""
     first, second = serial(line[1]), SerialLink(line[1], SerialSettings(), QUICK_S)
     with pytest.raises(LostError, match=r"can't be opened: .*lock"):
         second.open()
@@ -103,7 +93,6 @@ def test_serial_port_is_ours_alone(line):
 
 
 def test_serial_late_reply_is_thrown_away(line):
-    """After a time-out, what still comes is not taken for the answer to the next request."""
     master, name = line
     link = serial(name, QUICK_S)
     with pytest.raises(NoAnswerError, match=r"no answer within"):
@@ -116,7 +105,6 @@ def test_serial_late_reply_is_thrown_away(line):
 
 
 def test_serial_unasked_bytes_are_refused(line):
-    """A doubled reply is noticed before the next request is sent."""
     master, name = line
     link = serial(name)
     os.write(master, REPLY)
@@ -127,7 +115,6 @@ def test_serial_unasked_bytes_are_refused(line):
 
 
 def test_serial_gap_is_kept(line):
-    """The next request waits until the line has been quiet for the gap."""
     master, name = line
     now, slept = [10.0], []
 
@@ -148,7 +135,6 @@ def test_serial_gap_is_kept(line):
 
 
 def test_serial_unplugged_is_one_line():
-    """A port that goes away in mid-exchange is told so, and is closed."""
     master, slave = pty.openpty()
     tty.setraw(slave)
     link = serial(os.ttyname(slave))
@@ -163,14 +149,12 @@ def test_serial_unplugged_is_one_line():
 
 
 def test_serial_missing_port_is_one_line():
-    """A port that is not there is a device error with the system's own words."""
     link = SerialLink("/dev/no_such_port", SerialSettings(), QUICK_S)
     with pytest.raises(LostError, match="No such file"):
         link.open()
 
 
 def test_serial_chatter_does_not_hang(line):
-    """A line that never gets quiet is an error within bounds."""
     _, name = line
     times = iter(range(1000))
     link = SerialLink(name, SerialSettings(), 1.0, clock=lambda: float(next(times)))

@@ -82,7 +82,6 @@ def test_a_link_is_exclusive_while_it_is_open(port, monkeypatch):
 
 
 def test_bytes_that_another_program_took_are_no_lost_port(line, monkeypatch):
-    """The cause is named, and the port stays open for the safe value."""
     master, path = line
     link = serial(path, QUICK_S)
     monkeypatch.setattr(serial_link, "read", lambda fd, size: b"")
@@ -131,7 +130,6 @@ def names(monkeypatch):
     ],
 )
 def test_an_address_has_one_name_however_it_is_written(monkeypatch, host, name):
-    """Without anybody being asked."""
     monkeypatch.setattr(socket, "getaddrinfo", lambda *args, **kwargs: 1 / 0)
     assert held_address(host, 502) == (name,)
 
@@ -147,7 +145,6 @@ def test_a_host_is_held_by_its_name_and_all_of_its_addresses(names):
 
 
 def test_a_name_server_that_is_silent_is_not_waited_for(names, monkeypatch):
-    """The name is held all the same; a second question does not wait again."""
     answered = threading.Event()
     asked = []
 
@@ -165,7 +162,6 @@ def test_a_name_server_that_is_silent_is_not_waited_for(names, monkeypatch):
 
 
 def test_links_to_a_port_are_the_port(tmp_path):
-    """As those under /dev/serial/by-id; also one that leads to nothing yet, or is gone."""
     (tmp_path / "ttyUSB0").touch()
     for name, target in (("usb-adapter", "ttyUSB0"), ("gone", "ttyUSB1")):
         (tmp_path / name).symlink_to(target)
@@ -176,7 +172,6 @@ def test_links_to_a_port_are_the_port(tmp_path):
 
 
 def test_a_port_is_known_by_its_number_too(line):
-    """So that another file of the same device is the same port."""
     _, path = line
     rdev = Path(path).stat().st_rdev
     number = f"tty:{os.major(rdev)}:{os.minor(rdev)}"

@@ -92,7 +92,6 @@ def test_the_value_is_sent_before_anything_is_awaited(is_open, before):
 
 
 def test_an_attempt_repeats_nothing():
-    """It is bounded by time-outs: two answers and a silence."""
     line = LineOfText(is_in_step=False)
     line.busy_until_s = 1e9
     start_s = line.time()
@@ -107,7 +106,6 @@ def test_an_attempt_repeats_nothing():
 @pytest.mark.parametrize("late_s", [0.11, 0.15, 0.2, 0.25, 0.3, 0.5, 1.0, 2.37, 10.0])
 @pytest.mark.parametrize("shift_s", [0.0, 0.01, 0.02, 0.04, 0.06])
 def test_the_answer_to_an_older_command_confirms_nothing(late_s, shift_s, forgets):
-    """However late it comes: what is confirmed is the output."""
     line, exchange = LineOfText(forgets=forgets), SafeExchange()
     line.busy_until_s = line.time() + late_s + shift_s
     line.command(4.5)

@@ -18,7 +18,7 @@ XOFF, XON = b"\x13", b"\x11"
 
 
 @pytest.fixture
-def levels(monkeypatch) -> list[tuple[str, bool]]:
+def levels(monkeypatch):
     """Return a list of what the kernel is asked for: a modem line and its level."""
     names = {termios.TIOCM_DTR: "dtr", termios.TIOCM_RTS: "rts"}
     real, asked = fcntl.ioctl, []
@@ -54,7 +54,6 @@ def test_modem_lines_are_set_before_the_board_starts(line, levels):
 
 @pytest.mark.parametrize("flow", ["none", "xonxoff"])
 def test_flow_control_is_set_both_ways(line, flow):
-    """XON/XOFF is on where it is asked for, and off where a port was left with it."""
     _, name = line
     other = "none" if flow == "xonxoff" else "xonxoff"
     serial(name, flow=other).close()
@@ -65,7 +64,6 @@ def test_flow_control_is_set_both_ways(line, flow):
 
 
 def test_a_device_that_holds_the_line_is_an_error_in_time(line):
-    """After XOFF nothing goes out until XON; closing does not wait for it."""
     master, name = line
     link = serial(name, QUICK_S, flow="xonxoff")
     os.write(master, XOFF)
@@ -83,7 +81,6 @@ def test_a_device_that_holds_the_line_is_an_error_in_time(line):
 
 
 def test_time_spent_on_sending_is_not_there_for_the_answer(line, monkeypatch):
-    """One time-out is for both."""
     now = [0.0]
     link = SerialLink(line[1], SerialSettings(), 1.0, clock=lambda: now[0])
     link.open()
@@ -111,7 +108,6 @@ def test_without_flow_control_all_bytes_pass(line):
 
 
 def test_long_replies_are_put_together(line):
-    """Of known size or not: a reply may be longer than what is read at once."""
     master, name = line
     link, reply = serial(name), bytes(3000)
     with answering(master, reply, reply):
@@ -121,7 +117,6 @@ def test_long_replies_are_put_together(line):
 
 
 def test_profiles_say_how_their_line_is_set():
-    """Levels and flow control get from the profile to the port."""
     profile = with_link(load_profile("kepco_bop"), flow="xonxoff", dtr=True, rts=False)
     settings = profile.link.settings
     assert (settings.flow, settings.dtr, settings.rts) == ("xonxoff", True, False)
@@ -131,7 +126,6 @@ def test_profiles_say_how_their_line_is_set():
 
 @pytest.mark.parametrize("name", ["icp_m7024", "cobs_board"])
 def test_binary_lines_refuse_flow_control(name):
-    """Two byte values would be lost, and the rest of the frame with them."""
     rule = "flow must be none if bytes 0x11 and 0x13 are data, got xonxoff"
     with pytest.raises(InputError, match=rule):
         with_link(load_profile(name), flow="xonxoff")
@@ -156,7 +150,6 @@ def test_levels_stay_when_the_port_of_a_board_that_boots_is_closed(line):
 
 
 def test_a_value_is_sent_past_a_line_that_never_falls_silent(line):
-    """At once and whole, where an exchange would first wait for silence; that comes later."""
     master, name = line
     link = serial(name)
     os.write(master, b"chatter" * 20)

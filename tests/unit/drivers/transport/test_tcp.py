@@ -13,8 +13,6 @@ from tests.unit.drivers.transport.conftest import PATIENT_S, QUICK_S, REPLY, mis
 
 
 def test_tcp_reply_in_pieces_is_put_together(serve):
-    """A reply may come in any number of segments."""
-
     def act(connection):
         connection.recv(100)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -31,8 +29,6 @@ def test_tcp_reply_in_pieces_is_put_together(serve):
     ("sent", "words"), [(b"", "no answer within 0.05 s"), (b"0123", "only 4 bytes, 6 short")]
 )
 def test_tcp_silence_ends_at_the_deadline(serve, sent, words):
-    """No reply, or a part of one, is an error in time, and the connection is given up."""
-
     def act(connection):
         connection.recv(100)
         connection.sendall(sent)
@@ -64,7 +60,6 @@ def test_tcp_request_that_was_not_answered_is_given_up(serve):
 
 
 def test_tcp_kernel_sends_at_once_and_gives_up_in_time(serve):
-    """In one time-out, also where this process dies before."""
     link = tcp(serve(lambda connection: None), QUICK_S)
     found = link._socket.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT)
     assert found == round(QUICK_S * 1e3)
@@ -73,7 +68,6 @@ def test_tcp_kernel_sends_at_once_and_gives_up_in_time(serve):
 
 
 def test_tcp_address_of_the_peer_is_known_once_it_was_reached(serve):
-    """Then nobody need look a name up again."""
     link = TcpLink("localhost", serve(lambda connection: None), PATIENT_S)
     assert link.peer_host == "localhost"
     link.open()
@@ -82,7 +76,6 @@ def test_tcp_address_of_the_peer_is_known_once_it_was_reached(serve):
 
 
 def test_tcp_trickle_does_not_move_the_deadline():
-    """A byte now and then does not keep an exchange alive: time is injected and runs out."""
     ours, theirs = socket.socketpair()
     theirs.sendall(b"012")
     times = iter([0.0, 1.1])
@@ -94,8 +87,6 @@ def test_tcp_trickle_does_not_move_the_deadline():
 
 
 def test_tcp_reset_closing_and_refusal_are_told_apart(serve):
-    """Each way to lose a peer has words of its own."""
-
     def reset(connection):
         connection.recv(100)
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
@@ -114,7 +105,6 @@ def test_tcp_reset_closing_and_refusal_are_told_apart(serve):
 
 
 def test_tcp_unknown_host_is_one_line():
-    """A name that can't be looked up is a device error, not a traceback."""
     with pytest.raises(LostError, match="can't connect"):
         TcpLink("host.invalid", 502, QUICK_S).open()
 

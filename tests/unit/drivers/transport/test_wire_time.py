@@ -7,10 +7,7 @@ from hilctl_drivers.transport.wire_time import RateLimit, WireTime, check_feeds
 
 
 class TestSum:
-    """Exchanges one after the other."""
-
-    def test_then(self) -> None:
-        """All parts add up, for the samples of the first."""
+    def test_then(self):
         first = WireTime("A", 1.0, 2.0, 1, 3.0, 4.0, samples=10)
         both = first.then(WireTime("B", 0.1, 0.2, 2, 0.3, 0.4, settle_s=5.0))
         assert both.what == "A, then B"
@@ -22,12 +19,9 @@ class TestSum:
 
 
 class TestLimits:
-    """Which sample rates are left, and who says so."""
-
     SLOW = WireTime("A", 0.0, 0.0, 0, 0.0, 0.1)
 
-    def test_the_slower_of_wire_and_device_counts(self) -> None:
-        """The note tells which it is."""
+    def test_the_slower_of_wire_and_device_counts(self):
         wire = RateLimit.of(self.SLOW, 50.0, "its profile")
         assert (wire.highest_hz, wire.note) == (pytest.approx(10.0), str(self.SLOW))
         device = RateLimit.of(self.SLOW, 5.0, "its profile")
@@ -43,8 +37,7 @@ class TestLimits:
             (RateLimit(10.0, "", 2.0), 1.9, r"in \[2, 10\] Hz, got 1.9"),
         ],
     )
-    def test_others_are_refused(self, limit, rate_hz, words) -> None:
-        """With what would be possible."""
+    def test_others_are_refused(self, limit, rate_hz, words):
         with pytest.raises(DeviceError, match=words):
             limit.check(rate_hz)
         limit.check(limit.highest_hz)
@@ -52,7 +45,6 @@ class TestLimits:
 
 
 def test_watchdogs_are_fed_three_times_in_their_timeout():
-    """Ticks that come too seldom can't do that."""
     assert check_feeds(None, 1.0) == 0
     assert check_feeds(1.0, 30.0) == 10
     assert check_feeds(1.0, 3.0) == 1

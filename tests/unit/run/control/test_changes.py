@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from hilctl.base.device import DeviceInfo
 from hilctl.base.errors import InputError
 from hilctl.base.yaml import Document
 from hilctl.experiment.load import resolve
@@ -15,7 +14,7 @@ from hilctl.models.staged import FieldLag, StagedModel
 from hilctl.run.control import client
 from hilctl.run.control.changes import Changes, bound_refusal, command_range
 from hilctl.run.shared.shared_page import SIZE, PageField, SharedPage, Stop
-from tests.fakes import SteppingClock
+from tests.fakes import DESCRIBED, DescribedDevice, SteppingClock
 from tests.published import terfenol_rdpi
 
 RATE_HZ, BLOCK, SAMPLES = 10_000.0, 10, 20_000
@@ -30,28 +29,9 @@ limits: {peak_current_a: PEAK, slew_a_per_s: 1.0e+6, stroke_um: [-75.0, 60.0]}
 """
 SINE = """{kind: sine, unit: UNIT, amplitude: AMPLITUDE, offset: OFFSET, frequency_hz: HZ,
   duration_s: 2.0, soft_start_s: 0.5}"""
-INFO = DeviceInfo(
-    name="fake",
-    description="a device that does nothing",
-    command_unit="A",
-    command_min=-8.0,
-    command_max=8.0,
-    sensor_min_um=-100.0,
-    sensor_max_um=100.0,
-    max_rate_hz=20e3,
-    buffered=True,
-    fifo_depth=1000,
-)
 MODEL = str(Path(__file__).parents[4] / "configs" / "models" / "terfenol_rdpi.yaml")
 RDPI = terfenol_rdpi()
 LOOKING_AHEAD = StagedModel.around(RDPI, lag=FieldLag(tau_s=2e-3))
-
-
-class DescribedDevice:
-    info = INFO
-
-    def check_rate(self, sample_rate_hz, block):
-        pass
 
 
 def checked(model=None, amplitude=4.0, offset=0.0, hz=10.0, peak_a=7.0, limits=""):
@@ -61,7 +41,8 @@ def checked(model=None, amplitude=4.0, offset=0.0, hz=10.0, peak_a=7.0, limits="
     text = text.replace("COMPENSATOR", "none" if model is None else f"{{model: {MODEL}}}")
     text = text.replace("stroke_um", limits + "stroke_um") + f"block: {BLOCK}\n"
     loaded = resolve(Document("x.yaml", text), Path())
-    return check(replace(loaded, device=DescribedDevice(), model=model))
+    info = replace(DESCRIBED, buffered=True, fifo_depth=1000)
+    return check(replace(loaded, device=DescribedDevice(info), model=model))
 
 
 @pytest.fixture(scope="module")
@@ -151,10 +132,7 @@ def test_a_refusal_changes_nothing_and_the_next_has_its_turn(changes, page):
 
 @pytest.mark.parametrize(
     ("number", "value", "said"),
-    [
-        (PageField.STOP, Stop.CTRL_C, "safe ramp"),
-        (PageField.NEXT_SAMPLE, SAMPLES, "has ended"),
-    ],
+    [(PageField.STOP, Stop.CTRL_C, "safe ramp"), (PageField.NEXT_SAMPLE, SAMPLES, "has ended")],
 )
 def test_the_end_of_the_run_refuses_a_change_that_waits(changes, page, waits, number, value, said):
     change(changes, gain=0.1)
