@@ -51,11 +51,7 @@ EXPERIMENT: dict[str, Any] = {
     "timing": {"on_misses": "warn"},  # a busy machine must not be quicker than the attack
     "recording": {"ring_s": 60.0, "flush_s": 0.5},
 }
-_DEVICE = {
-    "sensor": {"um_per_v": 12.5},
-    "amplifier": {"gain_a_per_v": 1.0},
-    "watchdog": "none",
-}
+_DEVICE = {"sensor": {"um_per_v": 12.5}, "amplifier": {"gain_a_per_v": 1.0}, "watchdog": "none"}
 _MODBUS = {"kind": "modbus_dac", "output": "OUT", "input": "IN"}
 _DATA = Path(__file__).parents[1] / "data"
 

@@ -13,12 +13,7 @@ from hilctl.run.start import checked_experiment, start_run
 from hilctl.run.unpaced import run_unpaced
 
 CONFIG = Path(__file__).parents[2] / "configs" / "terfenol_sine_6a.yaml"
-BASE = (
-    "sample_rate_hz=5000",
-    "block=1",
-    "waveform.frequency_hz=5.0",
-    "waveform.duration_s=1.0",
-)
+BASE = ("sample_rate_hz=5000", "block=1", "waveform.frequency_hz=5.0", "waveform.duration_s=1.0")
 OMEGA = "compensator.model=models/terfenol_omega.yaml"
 STAGED = "compensator.model=models/terfenol_staged.yaml"
 FEEDBACK = (

@@ -196,8 +196,7 @@ def test_learning_goes_on_from_a_correction(tmp_path):
 
 def test_what_can_not_be_learned_is_refused_before_anything_moves(tmp_path):
     plain = CliRunner().invoke(
-        app,
-        ["learn", str(CONFIGS / "terfenol_sine_6a_uncompensated.yaml"), "--output", "c.yaml"],
+        app, ["learn", str(CONFIGS / "terfenol_sine_6a_uncompensated.yaml"), "--output", "c.yaml"]
     )
     assert "compensator: " in str(plain.exception)
     short = ["learn", str(SINE), "--set=waveform.duration_s=0.5", "--output", "c.yaml"]

@@ -121,11 +121,7 @@ def test_four_plays_straighten_minor_loops(run):
 @pytest.mark.parametrize("frequency_hz", [1.0, 50.0, 100.0, 150.0, 200.0])
 def test_half_the_current_is_compensated_too(run, frequency_hz):
     """Chapter 6 at 3 A: the shipped Omega leaves at most 3.7 % up to 200 Hz."""
-    settings = [
-        "waveform.amplitude=18.4",
-        "waveform.offset=-1.9",
-        *small(frequency_hz)[2:],
-    ]
+    settings = ["waveform.amplitude=18.4", "waveform.offset=-1.9", *small(frequency_hz)[2:]]
     (segment,) = summarize(run(SINE, *settings)).segments
     assert segment.peak_to_peak_um > 36.0
     assert segment.peak_hysteresis_percent <= 3.7

@@ -134,8 +134,7 @@ def test_the_experiments_cpu_goes_before_the_first_isolated_one(isolated, cpu, p
 
 
 @pytest.mark.parametrize(
-    ("runtime", "said"),
-    [("950000", "at most 950000 of 1000000 us"), ("-1", "no throttling")],
+    ("runtime", "said"), [("950000", "at most 950000 of 1000000 us"), ("-1", "no throttling")]
 )
 def test_throttling_is_reported(runtime, said):
     files = {RT_RUNTIME: f"{runtime}\n", RT_PERIOD: "1000000\n"}

@@ -255,8 +255,7 @@ def test_what_hilctl_does_not_write_but_could_mean():
 
 
 @pytest.mark.parametrize(
-    "text",
-    ["3", "{}", "[3]", "[[]]", "[" * 100_000 + "]" * 100_000, json.dumps([GOOD, GOOD])],
+    "text", ["3", "{}", "[3]", "[[]]", "[" * 100_000 + "]" * 100_000, json.dumps([GOOD, GOOD])]
 )
 def test_texts_that_list_no_segments(text):
     with pytest.raises(ValueError, match="segments: "):

@@ -126,12 +126,7 @@ def test_the_margin_is_rounded_up(scene):
 
 @pytest.mark.parametrize(
     ("held", "said"),
-    [
-        (3, None),
-        (2, "only 2 values were left"),
-        (0, "only 0 "),
-        (-1, "empty for 1 sample"),
-    ],
+    [(3, None), (2, "only 2 values were left"), (0, "only 0 "), (-1, "empty for 1 sample")],
 )
 def test_fewer_values_than_the_margin_are_an_underrun(scene, held, said):
     made = scene((30 - held, 0, held), queued=30)

@@ -5,11 +5,7 @@ import random
 import numpy as np
 import pytest
 
-from hilctl_drivers.transport.crc import (
-    CRCS,
-    MODBUS_WORDS,
-    crc16_modbus,
-)
+from hilctl_drivers.transport.crc import CRCS, MODBUS_WORDS, crc16_modbus
 
 # Width, polynomial, initial value, reflection in and out, final XOR, and CRC of "123456789", from
 # the "Catalogue of parametrised CRC algorithms".

@@ -14,11 +14,7 @@ from hilctl_drivers.transport.framing import (
     LengthFraming,
     binary_framing,
 )
-from hilctl_drivers.transport.links import (
-    BadRequestError,
-    CorruptError,
-    IncompleteError,
-)
+from hilctl_drivers.transport.links import BadRequestError, CorruptError, IncompleteError
 
 KINDS = [
     (kind, crc) for kind in ("cobs", "length") for crc in CRCS if (kind, crc) != ("length", "none")
