@@ -306,6 +306,7 @@ class Supervisor:
             # Started after the loop, because it watches the loop's process.
             self._await_guardian(safety)
             start_ns = self._begin(recording.recorder, page)
+            self._raise_if_stopped()
             # Before threads are started, so that they inherit it.
             stack.enter_context(favoured(child.pid))
             recording.start()
@@ -318,11 +319,14 @@ class Supervisor:
             raise
         return safety, start_ns
 
+    def _raise_if_stopped(self) -> None:
+        if self._stop_signal:
+            raise RunError("stopped before the start; nothing has moved")
+
     def _await_guardian(self, safety: SafetyMonitor) -> None:
         deadline_s = time.monotonic() + _GUARDIAN_READY_S
         while not safety.ready():
-            if self._stop_signal:
-                raise RunError("stopped before the start; nothing has moved")
+            self._raise_if_stopped()
             if time.monotonic() > deadline_s:
                 raise RunError(f"the guardian was not ready within {_GUARDIAN_READY_S:g} s")
             time.sleep(_POLL_S)

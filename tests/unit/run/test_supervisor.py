@@ -177,6 +177,8 @@ class Neighbours:
         self.begun.append((start_unix_ns, self.time.now_ns))
         self.time.now_ns += self.begin_takes_ns.pop(0) if self.begin_takes_ns else 0
         self.note("begin")
+        if "signal while it begins" in self.fails:
+            os.kill(os.getpid(), signal.SIGTERM)
 
     def ring_recorder(self, ring, recorder, flush_s):
         self.ring = ring
@@ -322,6 +324,15 @@ def test_a_signal_before_the_start_is_seen(stage):
     stage.fails["await ready"] = RunError("stopped before the start")
     with pytest.raises(RunError, match="stopped before the start"):
         stage.run()
+
+
+def test_a_signal_just_before_the_start_signal_is_seen(stage):
+    stage.fails["signal while it begins"] = True
+    with pytest.raises(RunError, match="stopped before the start"):
+        stage.run()
+    assert "recording" not in stage.log
+    assert {"child killed", "safety closed", "given back"} <= set(stage.log)
+    assert stage.ring.page.get(PageField.GO) == 0
 
 
 @pytest.mark.parametrize(
