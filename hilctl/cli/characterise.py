@@ -99,6 +99,8 @@ def plan_mapping(plan: CharacterisationPlan) -> dict[str, Any]:
         "command_range": [limits.low, limits.high],
         "stroke_um": list(limits.stroke_um),
         "band_hz": [limits.lowest_hz, limits.highest_hz],
+        "largest_amplitude": limits.reach,
+        "note": limits.note,
         "rig_time_s": plan.seconds,
         "pauses_s": plan.pauses_s,
         "recordings_mb": plan.megabytes,
@@ -118,7 +120,12 @@ def print_plan(plan: CharacterisationPlan, folder: Path) -> None:
     print_rich(table(title, ("step", "purpose", "s"), rows, left={"purpose"}))
     low_um, high_um = limits.stroke_um
     within = f"{limits.low:g} to {limits.high:g} {limits.unit}, {low_um:g} to {high_um:g} µm"
-    print(f"within {within}; loops at {limits.lowest_hz:g} to {limits.highest_hz:g} Hz")
+    print(
+        f"within {within}; loops at {limits.lowest_hz:g} to {limits.highest_hz:g} Hz, up to "
+        f"{limits.reach:.3g} {limits.unit} about {limits.centre:g} {limits.unit}"
+    )
+    if limits.note:
+        print(limits.note)
     heat = "no thermal limit is set"
     if limits.loaded.config.limits.rms_current_a is not None:
         heat = f"{plan.pauses_s:.0f} s for the coil to cool"

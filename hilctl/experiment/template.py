@@ -24,6 +24,10 @@ from hilctl.experiment.preflight import check
 STARTING_SECTION = "hilctl_drivers.template:starting_section"
 _SCHEMA_LINE = "# yaml-language-server: $schema=schema.json"
 _SHARE = 0.2
+_SLEW_MARGIN = 1.2
+_SAMPLES_PER_CYCLE = 125.0  # in the shortest cycle of loops
+_FEWER = 40.0  # with slow devices, so that a characterisation takes minutes
+_SLOW_TOP_HZ = 80.0
 _RATES_HZ = tuple(digit * 10.0**power for power in range(-2, 5) for digit in (1, 2, 5))
 _PACED_HZ, _BUFFERED_HZ = 1e3, 1e4
 _BLOCK_S = 0.01
@@ -155,11 +159,12 @@ def _first_values(info: DeviceInfo) -> tuple[dict[str, Any], dict[str, str]]:
     remarks["waveform.soft_start_s"] = "the first cycle grows, the last one fades"
     data["compensator"] = "none"
     remarks["compensator"] = "or {model: model.yaml}, once there is one"
-    slew = _rounded(math.pi * frequency_hz * (high - low), 2)
+    # Of loops over the whole range, with a margin; the starter sine and the ramp are slower.
+    slew = round_hz(_SLEW_MARGIN * math.pi * highest_loop_hz(rate_hz) * (high - low))
     data["limits"], of_limits = _limits(info, low, high, slew)
     data["safe"] = {
         "value": 0.0 if low <= 0.0 <= high else low,
-        "ramp_s": _rounded((high - low) / slew, 1),
+        "ramp_s": _rounded(1.0 / (math.pi * frequency_hz), 1),
     }
     remarks["safe.value"] = f"{info.command_unit} at which nothing can happen; every run ends there"
     remarks["safe.ramp_s"] = "from the limit to there"
@@ -196,6 +201,17 @@ def _limits(
         f"limits.{slew_key}": f"fastest change of the command, {unit}/s",
         "limits.stroke_um": "set: displacements outside end the run with its safe ramp",
     }
+
+
+def highest_loop_hz(rate_hz: float) -> float:
+    """Return the highest frequency of loops at a sample rate; fewer samples if it is low."""
+    slow_hz = min(rate_hz / _FEWER, _SLOW_TOP_HZ)
+    return round_hz(max(rate_hz / _SAMPLES_PER_CYCLE, slow_hz))
+
+
+def round_hz(value: float) -> float:
+    """Return a frequency rounded to two digits."""
+    return float(f"{value:.2g}")
 
 
 def _below(limit: float) -> float:

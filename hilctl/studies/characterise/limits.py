@@ -7,16 +7,16 @@ from hilctl.base.errors import InputError
 from hilctl.base.types import F64, CommandUnit
 from hilctl.experiment.forecast import CommandFigures
 from hilctl.experiment.load import LoadedExperiment
+from hilctl.experiment.template import highest_loop_hz, round_hz
 
-_SAMPLES_PER_CYCLE = 125.0  # in the shortest cycle of loops
-_FEWER = 40.0  # with slow devices, so that a characterisation takes minutes
-_SLOW_TOP_HZ = 80.0
 _DECADES = 400.0  # highest over lowest frequency
 _SLOWEST_HZ = 0.5  # slower loops take minutes and show creep
 _NARROWEST = 4.0
 _FEWEST_SAMPLES = 25.0
 _OF_RANGE = 0.95
 _OF_SLEW = 0.85
+_LEAST_PART = 0.25  # of the full amplitude, of the fastest loops: then the band is lowered
+_FEW_SLOW = 0.9  # of the band: a slew limit below it is worth a note
 _OF_SLEW_TO_START = 0.13
 _NEARLY = 0.99
 _OF_HEAT = 0.9
@@ -35,6 +35,7 @@ class CharacterisationLimits:
     sample_rate_hz: float
     lowest_hz: float  # lowest frequency of loops
     highest_hz: float  # highest frequency of loops
+    note: str = ""  # what limits the band, and what to set
 
     @property
     def centre(self) -> float:
@@ -90,16 +91,29 @@ class CharacterisationLimits:
 
 
 def limits_of(loaded: LoadedExperiment, highest_hz: float | None = None) -> CharacterisationLimits:
-    """Return the limits; ``highest_hz`` follows from the sample rate if None."""
+    """Return the limits; ``highest_hz`` follows from sample rate and slew limit if None.
+
+    Loops are made slower before they are made smaller than a quarter of the full amplitude.
+    """
     config = loaded.config
     rate_hz = config.sample_rate_hz
     most_hz = rate_hz / _FEWEST_SAMPLES
     if highest_hz is not None and not 0.0 < highest_hz <= most_hz:
         rule = f"must be above 0 and at most {most_hz:g} Hz, {_FEWEST_SAMPLES:g} samples per cycle"
         raise InputError(f"--highest-hz {rule} (got {highest_hz:g})")
-    slow_hz = min(rate_hz / _FEWER, _SLOW_TOP_HZ)
-    top_hz = highest_hz or round_hz(max(rate_hz / _SAMPLES_PER_CYCLE, slow_hz))
     low, high = config.limits.command_range
+    slew = config.limits.slew_per_s
+    turn = math.pi * _OF_RANGE * (high - low) / _OF_SLEW  # slew of a full loop at 1 Hz
+    band_hz = highest_loop_hz(rate_hz)
+    top_hz = highest_hz or min(band_hz, round_hz(slew / turn / _LEAST_PART))
+    note = ""
+    if slew < _FEW_SLOW * turn * (highest_hz or band_hz):
+        key = f"limits.slew_{config.limits.unit.lower()}_per_s"
+        wanted_hz = highest_hz or band_hz
+        note = (
+            f"{key} allows loops of full amplitude up to {slew / turn:.2g} Hz: set "
+            f"{round_hz(turn * wanted_hz):g} for {wanted_hz:g} Hz"
+        )
     return CharacterisationLimits(
         loaded=loaded,
         unit=config.limits.unit,
@@ -110,9 +124,5 @@ def limits_of(loaded: LoadedExperiment, highest_hz: float | None = None) -> Char
         sample_rate_hz=rate_hz,
         lowest_hz=min(max(round_hz(top_hz / _DECADES), _SLOWEST_HZ), top_hz / _NARROWEST),
         highest_hz=top_hz,
+        note=note,
     )
-
-
-def round_hz(value: float) -> float:
-    """Return a frequency rounded to two digits."""
-    return float(f"{value:.2g}")

@@ -8,7 +8,8 @@ from typing import Any, TypeAlias
 from pydantic import TypeAdapter
 
 from hilctl.base.types import F64
-from hilctl.studies.characterise.limits import CharacterisationLimits, round_hz
+from hilctl.experiment.template import round_hz
+from hilctl.studies.characterise.limits import CharacterisationLimits
 from hilctl.waveforms.build import Reference, build
 from hilctl.waveforms.spec import AnyWaveform
 

@@ -17,6 +17,16 @@ def test_the_band_follows_from_the_sample_rate(limits_with, rate_hz, lowest_hz, 
     assert found.lowest_hz < found.middle_hz < found.highest_hz
 
 
+def test_a_low_slew_limit_makes_loops_slower_before_smaller(limits_with):
+    """A full loop is possible at the lowest frequency, and a quarter of it at the highest."""
+    found = limits_with("limits.slew_a_per_s=40.0")
+    assert found.highest_hz < 25.0
+    assert found.by_slew(found.reach, found.lowest_hz) == found.reach
+    assert found.by_slew(found.reach, found.highest_hz) > 0.2 * found.reach
+    assert "limits.slew_a_per_s" in found.note
+    assert not limits_with("limits.slew_a_per_s=1e6").note
+
+
 def test_the_highest_frequency_may_be_asked_for(limits_with):
     assert limits_with(highest_hz=20.0).highest_hz == 20.0
     with pytest.raises(InputError, match=r"--highest-hz .*200 Hz"):
