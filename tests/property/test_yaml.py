@@ -354,6 +354,6 @@ def test_damaged_models_are_refused_in_words(files):
             parse_model("m.yaml", text)
         except InputError as error:
             refusals.append(str(error))
-    assert len(refusals) > 0.5 * files
+    assert len(refusals) > 0.75 * files
     assert all(text.startswith("m.yaml") for text in refusals)
     assert "\n".join(refusals).encode("utf-8")

@@ -243,7 +243,8 @@ def test_minor_loop_does_not_close(rods):
     found = magnetisation(rods, np.concatenate([up, dip, dip, dip]))
     tops = found[[1498, 1898, 2298, 2698]]
     span = np.ptp(found[1498:1898])
-    assert tops[1] - tops[0] > 0.05 * span
+    least = 0.1 if isinstance(rods, JilesAthertonParameters) else 0.05
+    assert tops[1] - tops[0] > least * span
     assert 0.01 * span < tops[2] - tops[1] < tops[1] - tops[0]
 
 

@@ -305,6 +305,17 @@ class TestVoltageLimit:
         assert current_a.max() <= 9.0002
         assert current_a[-1] == pytest.approx(9.0, abs=4e-4)
 
+    def test_falls_faster_than_it_rises(self):
+        """The resistance adds to the voltage on the way back."""
+        command_a = np.repeat([9.0, 0.0], 200)
+        current_a = run_both(actuator(amplifier=self.LIMIT), command_a)[1]
+        assert 9.0 - current_a[210] > 1.5 * current_a[10]
+
+    def test_weak_amplifier_never_gets_there(self):
+        weak = self.LIMIT | {"voltage_max_v": 12.0}
+        current_a = run_both(actuator(amplifier=weak), np.full(2000, -9.0))[1]
+        assert current_a[-1] == pytest.approx(-3.0, abs=4e-4)
+
     def test_small_signals_do_not_notice(self):
         """Where the voltage suffices the current is the unlimited one, bit for bit."""
         command_a = 0.5 * np.sin(np.arange(2000) / 40.0)
