@@ -33,7 +33,8 @@ _CSS = """
   figure svg { filter: invert(0.93) hue-rotate(180deg); }
 }
 body { font: 15px/1.45 system-ui, "DejaVu Sans", sans-serif; color: var(--ink);
-  background: var(--paper); max-width: 1160px; margin: 0 auto; padding: 1.2rem; }
+  background: var(--paper); max-width: 1160px; margin: 0 auto; padding: 1.2rem;
+  counter-reset: figure; }
 h1 { font-size: 1.5rem; margin: 0 0 .2rem; overflow-wrap: anywhere; }
 h2 { font-size: 1.1rem; margin: 1.8rem 0 .5rem; border-bottom: 1px solid var(--line); }
 .file { color: var(--quiet); margin: 0 0 1rem; overflow-wrap: anywhere; }
