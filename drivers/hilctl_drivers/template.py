@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 from hilctl.base.errors import InputError
-from hilctl.base.files import TextFiles
 from hilctl.base.types import CommandUnit
 from hilctl_drivers.profile import load_profile
 from hilctl_drivers.profile_base import BaseProfile, Range, Watchdog
@@ -32,6 +31,7 @@ class StartingSection:
         values: The section, ``kind`` first.
         remarks: Comment behind a value, by dotted key of the section.
         asked: Question to the user, by dotted key of a value that depends on the rig.
+        choices: Names of the channels, for each key that has several.
         notes: Notes of the profile on wiring.
     """
 
@@ -39,11 +39,15 @@ class StartingSection:
     values: dict[str, Any]
     remarks: dict[str, str] = field(default_factory=dict)
     asked: dict[str, str] = field(default_factory=dict)
+    choices: dict[str, tuple[str, ...]] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
 
 def starting_section(
-    name_or_path: str, unit: CommandUnit, reader_name: str | None, files: TextFiles | None = None
+    name_or_path: str,
+    unit: CommandUnit,
+    reader_name: str | None,
+    channels: Mapping[str, str] | None = None,
 ) -> StartingSection:
     """Return the device section of a first experiment with a profile.
 
@@ -51,37 +55,36 @@ def starting_section(
         name_or_path: Name of a shipped profile, or path of one.
         unit: Unit of the command; an output in A drives the actuator itself.
         reader_name: Profile of the device that has the sensor, if it is another one.
-        files: Reads profiles; from the disk if None.
+        channels: Names of the ``output`` and the ``input``; default: the first ones.
 
     Raises:
         InputError: There is no such profile, no output, or no input for a sensor.
     """
-    profile = load_profile(name_or_path, files)
-    reader = profile if reader_name is None else load_profile(reader_name, files)
-    output_name, output = _first("output", profile.outputs, profile)
+    profile = load_profile(name_or_path)
+    reader = profile if reader_name is None else load_profile(reader_name)
     inputs = {
         key: each
         for key, each in reader.inputs.items()
         if getattr(each, "measures", "terminal") == "terminal"
     }
-    input_name, sensor_input = _first("input", inputs, reader)
+    channels = channels or {}
+    _refuse_missing("output", profile.outputs, profile)
+    _refuse_missing("input", inputs, reader)
     made = StartingSection(profile.title, {"kind": profile.DEVICE}, notes=profile.notes)
     _add(made, "profile", name_or_path)
     _place(made, "", profile)
-    _add(made, "output", output_name, f"{_span(output)}; it has {', '.join(profile.outputs)}")
+    output = _chosen(made, "output", profile.outputs, channels)
     if reader_name is not None:
         made.values["reader"] = _reader(made, reader_name, profile, reader)
     of = "of the reader, " if reader_name is not None else ""
-    _add(made, "input", input_name, f"{of}{_span(sensor_input)}; it has {', '.join(inputs)}")
+    sensor_input = _chosen(made, "input", inputs, channels, of)
     _amplifier(made, output, unit)
     _sensor(made, sensor_input)
     _watchdog(made, profile.watchdog)
     return made
 
 
-def _first(
-    what: str, channels: Mapping[str, _Channel], profile: BaseProfile
-) -> tuple[str, _Channel]:
+def _refuse_missing(what: str, channels: Mapping[str, Range], profile: BaseProfile) -> None:
     if not channels and what == "output":
         raise InputError(
             f"{profile.title} has no output: it reads the sensor for another device; name that, "
@@ -92,11 +95,26 @@ def _first(
             f"{profile.title} has no input for a displacement sensor: name the profile of what "
             "reads it with --reader"
         )
-    return next(iter(channels.items()))
 
 
-def _span(channel: Range) -> str:
-    return f"{channel.min:g} to {channel.max:g} {channel.unit}"
+def _chosen(
+    made: StartingSection,
+    key: str,
+    known: Mapping[str, _Channel],
+    channels: Mapping[str, str],
+    of: str = "",
+) -> _Channel:
+    """Add the output or input, the first one by default, and return it."""
+    names = tuple(known)
+    name = channels.get(key, names[0])
+    if name not in known:
+        raise InputError(f"device.{key} must be one of {', '.join(names)} (got {name!r})")
+    channel = known[name]
+    span = f"{channel.min:g} to {channel.max:g} {channel.unit}"
+    _add(made, key, name, f"{of}{span}; it has {', '.join(names)}")
+    if len(names) > 1:
+        made.choices[key] = names
+    return channel
 
 
 def _add(made: StartingSection, key: str, value: object, remark: str = "") -> None:

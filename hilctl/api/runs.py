@@ -59,7 +59,7 @@ def init(
     """
     path, texts = path_or_none(output) or default_path(device), texts_of(settings)
     refuse_existing(path)
-    begun = starting_device(device, path.parent, unit, reader)
+    begun = starting_device(device, path.parent, unit, reader, texts)
     text, info = starting_experiment(begun, path, texts)
     write_text(path, text, overwrite=False)
     left = {key: asked for key, asked in begun.asked.items() if not is_set(key, texts)}

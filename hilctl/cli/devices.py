@@ -13,7 +13,13 @@ from hilctl import api
 from hilctl.cli.console import listing, print_rich, progress_bar
 from hilctl.cli.options import AsJson, ExperimentFile, Settings
 from hilctl.cli.output import print_result
-from hilctl.experiment.devices import DeviceDescription, Inventory, describe, inventory
+from hilctl.experiment.devices import (
+    DeviceDescription,
+    Inventory,
+    describe,
+    inventory,
+    profile_summaries,
+)
 from hilctl.machine.diagnosis import DEFAULT_RATE_HZ, Diagnosis, diagnose, lateness_counts
 from hilctl.machine.rt_setup import Realtime
 from hilctl.machine.timer_latency import Latency
@@ -73,7 +79,9 @@ def devices(context: typer.Context, as_json: AsJson = False) -> None:
 
 @devices_.command()
 def show(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Device or shipped profile.")],
+    name: Annotated[
+        str, typer.Argument(metavar="NAME", help="Device, shipped profile, or path of a profile.")
+    ],
     as_json: AsJson = False,
 ) -> None:
     """Show the options of a device, or the content of a profile."""
@@ -130,7 +138,7 @@ def print_inventory(listed: Inventory) -> None:
     ports = [(port.path, port.description) for port in listed.serial_ports]
     print_rich(
         listing("devices", sorted(listed.devices.items())),
-        listing("profiles", [(name,) for name in listed.profiles]),
+        listing("profiles", profile_summaries()),
         listing("serial ports", ports) if ports else Text("no serial port found"),
     )
 

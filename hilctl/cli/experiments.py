@@ -2,25 +2,32 @@
 
 import shlex
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, cast
 
 import typer
 
 from hilctl import api
 from hilctl.api.runs import default_path, is_set, refuse_existing
-from hilctl.base.errors import InputError
+from hilctl.base.errors import ConfigError, InputError
 from hilctl.base.files import read_text, write_text
+from hilctl.base.types import CommandUnit
+from hilctl.base.yaml import Document
 from hilctl.cli.console import listing, print_rich
 from hilctl.cli.options import AsJson, Settings
 from hilctl.cli.output import print_json, print_result
 from hilctl.cli.run import run_progress
-from hilctl.experiment.devices import known_devices, shipped_profiles
+from hilctl.experiment.devices import describe, is_path, known_devices, profile_summaries
 from hilctl.experiment.examples import copy_example, examples_folder, shipped_examples
 from hilctl.experiment.file import schema_text
-from hilctl.experiment.template import LIMITS_ASKED, starting_device
+from hilctl.experiment.template import (
+    LIMITS_ASKED,
+    TemplateDevice,
+    starting_device,
+    starting_experiment,
+)
 from hilctl.run.control.client import finish_dead_runs
 from hilctl.run.run_folder import require_linux
 
@@ -114,8 +121,9 @@ def init(
         Path | None, typer.Option(help="Experiment to write; default: DEVICE.yaml.")
     ] = None,
     unit: Annotated[
-        Literal["A", "V"], typer.Option(help="Unit of the drive: current or voltage.")
-    ] = "A",
+        Literal["A", "V"] | None,
+        typer.Option(help="Unit of the drive: current (default) or voltage."),
+    ] = None,
     reader: Annotated[
         str | None, typer.Option(help="Profile of the device that reads the sensor, if separate.")
     ] = None,
@@ -124,14 +132,18 @@ def init(
 ) -> None:
     """Write a first experiment for a device (asks questions in a terminal)."""
     asks = sys.stdin.isatty() and sys.stdout.isatty() and not as_json
-    name = device or _chosen_device(asks=asks)
+    if device is None and not asks:
+        names = ", ".join(row[0] for row in _device_rows())
+        raise InputError(f"DEVICE is missing: specify a device or a profile, such as {names}")
+    if device is None:
+        print_rich(listing("", _device_rows()))
+    name = device or _asked_device("device", _device_rows(), describe)
     path = output or default_path(name)
     refuse_existing(path)  # before any question is asked
     chosen = list(settings or [])
     if asks:
-        begun = starting_device(name, path.parent, unit, reader)
-        chosen += _answers({**begun.asked, **LIMITS_ASKED[unit]}, begun.section, chosen)
-    written = api.init(name, path, unit=unit, reader=reader, settings=chosen)
+        unit, reader = _answers(name, path, unit, reader, chosen)
+    written = api.init(name, path, unit=unit or "A", reader=reader, settings=chosen)
     left = {} if asks else written.to_be_set
     if as_json:
         print_json({"experiment": str(path), "device": written.device.name,
@@ -143,38 +155,110 @@ def init(
     print(f"  hilctl check {shlex.quote(str(path))}")
 
 
-def _chosen_device(*, asks: bool) -> str:
-    names = [name for name in known_devices() if name.startswith("simulated_")]
-    names += shipped_profiles()
-    if not asks:
-        raise InputError(
-            f"DEVICE is missing: specify a device or a profile, such as {', '.join(names)}"
-        )
-    print("\n".join(f"  {name}" for name in names))
-    return str(typer.prompt("device, profile, or path of a profile"))
+def _device_rows(what: str = "output") -> list[tuple[str, ...]]:
+    """Return the simulated devices and the shipped profiles that have outputs or inputs."""
+    simulated = (name for name in known_devices() if name.startswith("simulated_"))
+    rows: list[tuple[str, ...]] = [(name, "", "output input", "simulated") for name in simulated]
+    return [row for row in [*rows, *profile_summaries()] if what in row[2]]
+
+
+def _asked_device(
+    question: str,
+    rows: Sequence[tuple[str, ...]],
+    accept: Callable[[str], object],
+    default: str | None = None,
+) -> str:
+    """Ask for the name of a device, a part of its row, or the path of a profile."""
+
+    def named(answer: str) -> str:
+        exact = is_path(answer) or answer in {default, *(row[0] for row in rows)}
+        found = [row for row in rows if answer.lower() in " ".join(row).lower()]
+        if not exact and len(found) != 1:
+            print_rich(listing("", found or rows))
+            raise typer.BadParameter(f"{len(found)} devices match '{answer}'")
+        name = answer if exact else found[0][0]
+        _ask_again_unless(lambda: accept(name))
+        return name
+
+    text = f"{question} (name or part of it, or path of a profile)"
+    return str(typer.prompt(text, default=default, value_proc=named))
+
+
+def _asked_one_of(question: str, names: Sequence[str]) -> str:
+    def named(answer: str) -> str:
+        found = [name for name in names if name.lower() == answer.strip().lower()]
+        if not found:
+            raise typer.BadParameter(f"must be one of {', '.join(names)} (got {answer!r})")
+        return found[0]
+
+    text = f"{question} ({', '.join(names)})"
+    return str(typer.prompt(text, default=names[0], value_proc=named))
+
+
+def _ask_again_unless(attempt: Callable[[], object], pending: Sequence[str] = ()) -> None:
+    """Make a prompt ask again if an attempt fails, except for keys that are ``pending``."""
+    try:
+        attempt()
+    except InputError as error:
+        texts = [str(error)]
+        if isinstance(error, ConfigError):  # the file that they locate is not written yet
+            texts = [str(each).removeprefix(f"{each.where}: ") for each in error.problems
+                     if each.key not in pending]  # fmt: skip
+        if texts:
+            raise typer.BadParameter("\n".join(texts)) from None
 
 
 def _answers(
-    questions: Mapping[str, str], section: Mapping[str, object], settings: list[str]
-) -> list[str]:
-    """Ask for the values of the rig; an empty answer keeps the default."""
-    answers = []
-    for key, question in questions.items():
-        if is_set(key, settings):
-            continue
-        default = _default(section, key.split(".")[1:])
-        suffix = f" [{default}]" if default else " [Enter: a fifth of the device's range]"
-        answer = typer.prompt(question + suffix, default="", show_default=False)
-        if answer.strip():
-            answers.append(f"{key}={answer.strip()}")
-    return answers
+    name: str, path: Path, unit: CommandUnit | None, reader: str | None, chosen: list[str]
+) -> tuple[CommandUnit | None, str | None]:
+    """Ask for what depends on the rig, extend the settings ``chosen``; return unit and reader."""
+
+    def begun(reader: str | None) -> TemplateDevice:
+        return starting_device(name, path.parent, unit or "A", reader, chosen)
+
+    if reader is None and (is_path(name) or name not in known_devices()):
+        own = "the same device"
+        answer = _asked_device(
+            "device that reads the sensor", _device_rows("input"),
+            lambda each: begun(None if each == own else each), own,
+        )  # fmt: skip
+        reader = None if answer == own else answer
+    for key, names in begun(reader).choices.items():
+        if not is_set(key, chosen):
+            chosen.append(f"{key}={_asked_one_of(key.partition('.')[2], names)}")
+    if unit is None and "amplifier" in begun(reader).section:
+        unit = cast(CommandUnit, _asked_one_of("current or voltage of the actuator", ("A", "V")))
+    device = begun(reader)
+    _ask(device, path, device.asked, {"device": device.section}, chosen)
+    drafted = Document(str(path), starting_experiment(device, path, chosen)[0]).data
+    limits = {f"limits.{key}": text for key, text in LIMITS_ASKED.items()
+              if key in drafted["limits"]}  # fmt: skip
+    _ask(device, path, limits, drafted, chosen)
+    return unit, reader
 
 
-def _default(section: Mapping[str, object], parts: list[str]) -> str:
-    value: object = section
-    for part in parts:
-        value = value.get(part) if isinstance(value, Mapping) else None
-    return "" if value is None else str(value)
+def _ask(
+    device: TemplateDevice,
+    path: Path,
+    questions: Mapping[str, str],
+    defaults: Mapping[str, object],
+    chosen: list[str],
+) -> None:
+    """Ask for values by dotted key; the complete experiment is checked after each answer."""
+    keys = [key for key in questions if not is_set(key, chosen)]
+    for number, key in enumerate(keys, 1):
+
+        def checked(answer: str, key: str = key, number: int = number) -> str:
+            settings = [*chosen, f"{key}={answer.strip()}"]
+            _ask_again_unless(lambda: starting_experiment(device, path, settings), keys[number:])
+            return settings[-1]
+
+        default: object = defaults
+        for part in key.split("."):
+            default = default.get(part) if isinstance(default, Mapping) else None
+        default = list(default) if isinstance(default, tuple) else default
+        text = None if default is None else str(default)
+        chosen.append(typer.prompt(questions[key], default=text, value_proc=checked))
 
 
 def schema(

@@ -13,7 +13,8 @@ from dataclasses import asdict, dataclass
 from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any, cast
+from pkgutil import resolve_name
+from typing import Any, NamedTuple, cast
 
 from hilctl.base.device import Device, complete
 from hilctl.base.errors import ConfigError, ConfigProblem, InputError
@@ -29,6 +30,14 @@ BUILTIN: dict[str, str] = {
 }
 GROUP = "hilctl.devices"
 SHIPPED_PROFILES = "hilctl_drivers.profile:shipped_profiles"
+LOAD_PROFILE = "hilctl_drivers.profile:load_profile"
+_PROTOCOLS = {
+    "tcp": "Modbus TCP",
+    "rtu": "Modbus RTU",
+    "ascii": "lines of text",
+    "frames": "binary frames",
+}
+"""Names of protocols by ``link.kind`` of a profile."""
 
 
 def known_devices() -> dict[str, str]:
@@ -85,6 +94,37 @@ def shipped_profiles() -> dict[str, str]:
     except (ImportError, AttributeError) as error:
         raise InputError(f"cannot list the shipped profiles: {error}") from error
     return {profile: str(path) for profile, path in sorted(shipped().items())}
+
+
+def is_path(name: str) -> bool:
+    """Return whether the name of a profile is the path of a file."""
+    return Path(name).suffix != "" or "/" in name
+
+
+class ProfileSummary(NamedTuple):
+    """A shipped profile in words."""
+
+    name: str
+    device: str  # vendor and model
+    channels: str  # number and unit of outputs and inputs
+    protocol: str
+
+
+def profile_summaries() -> tuple[ProfileSummary, ...]:
+    """Return the shipped profiles in words."""
+    return tuple(_summary(name, path) for name, path in shipped_profiles().items())
+
+
+def _summary(name: str, path: str) -> ProfileSummary:
+    data = load_document(Path(path)).data
+    channels = []
+    for what in ("output", "input"):
+        if known := data.get(f"{what}s", {}).values():
+            units = "/".join(sorted({each["unit"] for each in known}))
+            channels.append(f"{len(known)} {units} {what}{'s' if len(known) > 1 else ''}")
+    kind = data["link"]["kind"]
+    title = f"{data['vendor']} {data['model']}"
+    return ProfileSummary(name, title, ", ".join(channels), _PROTOCOLS.get(kind, kind))
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,10 +184,15 @@ class DeviceDescription:
 
 
 def describe(name: str) -> DeviceDescription:
-    """Describe a device or shipped profile, not opened; raise InputError if it is unknown."""
+    """Describe a device, shipped profile or file of a profile, not opened.
+
+    Raises:
+        InputError: The name is unknown, or the profile is invalid.
+    """
     kinds, profiles = known_devices(), shipped_profiles()
-    if name in profiles:
-        path = Path(profiles[name])
+    if name in profiles or is_path(name):
+        path = Path(profiles.get(name, name))
+        resolve_name(LOAD_PROFILE)(str(path))  # refuses an invalid profile
         return DeviceDescription(name, str(path), (), load_document(path).data)
     if name not in kinds:
         hint = did_you_mean(name, [*kinds, *profiles])

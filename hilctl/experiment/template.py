@@ -17,11 +17,18 @@ from hilctl.base.errors import ConfigError, ConfigProblem, InputError
 from hilctl.base.files import TextFiles
 from hilctl.base.types import CommandUnit
 from hilctl.base.yaml import Document, commented, did_you_mean, dump
-from hilctl.experiment.devices import describe, known_devices, made_device, shipped_profiles
+from hilctl.experiment.devices import (
+    describe,
+    is_path,
+    known_devices,
+    made_device,
+    shipped_profiles,
+)
 from hilctl.experiment.load import resolve
 from hilctl.experiment.preflight import check
 
 STARTING_SECTION = "hilctl_drivers.template:starting_section"
+_CHANNELS = ("output", "input")
 _SCHEMA_LINE = "# yaml-language-server: $schema=schema.json"
 _SHARE = 0.2
 _SLEW_MARGIN = 1.2
@@ -42,22 +49,29 @@ class TemplateDevice:
     section: Mapping[str, Any]  # its section of the experiment, ``kind`` first
     remarks: Mapping[str, str]  # comments on values, by dotted key of the experiment
     asked: Mapping[str, str]  # dotted keys to ask the user for, each with the question
+    choices: Mapping[str, Sequence[str]]  # possible values, for dotted keys that have several
     notes: Sequence[str]  # notes to read before wiring
 
 
 LIMITS_ASKED = {
-    "A": {"limits.peak_current_a": "largest current of the first runs, A"},
-    "V": {"limits.drive_v": "lowest and highest voltage of the first runs, [low, high]"},
+    "peak_current_a": "largest current of the first runs, A",
+    "drive_a": "lowest and highest current of the first runs, A, as [low, high]",
+    "drive_v": "lowest and highest voltage of the first runs, V, as [low, high]",
 }
-"""Questions about limits, by the unit of the command."""
+"""Questions about the range of the command, by its key under ``limits``."""
 
 
 def starting_device(
-    name: str, folder: Path, unit: CommandUnit = "A", reader: str | None = None
+    name: str,
+    folder: Path,
+    unit: CommandUnit = "A",
+    reader: str | None = None,
+    settings: Sequence[str] = (),
 ) -> TemplateDevice:
     """Return the device of an experiment in ``folder``: a device, profile or path of a profile.
 
-    ``unit`` drives the actuator behind an amplifier; ``reader`` is a profile with the sensor.
+    ``unit`` drives the actuator behind an amplifier; ``reader`` is a profile with the sensor;
+    ``settings`` may choose output and input.
 
     Raises:
         InputError: The name is unknown, or the device cannot drive an actuator by itself.
@@ -68,22 +82,25 @@ def starting_device(
             raise InputError(f"--reader is for profiles: {name} reads its own sensor")
         needed = {o.name: o.description for o in describe(name).options if o.default is None}
         asked = {f"device.{key}": text or key for key, text in needed.items()}
-        return TemplateDevice(name, name, {"kind": name}, {}, asked, ())
+        return TemplateDevice(name, name, {"kind": name}, {}, asked, {}, ())
     if name in kinds:
         raise InputError(f"{name} takes a profile: hilctl init PROFILE ({', '.join(profiles)})")
-    own = Path(name).suffix != "" or os.sep in name
+    own = is_path(name)
     if name not in profiles and not own:
         hint = did_you_mean(name, [*kinds, *profiles])
         raise InputError(f"there is no device or profile '{name}' ({hint})")
     module, _, function = STARTING_SECTION.partition(":")
-    made = getattr(import_module(module), function)(name, unit, reader)
+    given = dict(each.strip().split("=", 1) for each in settings if "=" in each)
+    channels = {key: given[f"device.{key}"] for key in _CHANNELS if f"device.{key}" in given}
+    made = getattr(import_module(module), function)(name, unit, reader, channels)
     section = dict(made.values)
     if own:
         section["profile"] = os.path.relpath(name, folder)
-    prefixed = ({f"device.{key}": text for key, text in each.items()}
-                for each in (made.remarks, made.asked))  # fmt: skip
-    remarks, asked = prefixed
-    return TemplateDevice(Path(name).stem, made.title, section, remarks, asked, made.notes)
+    remarks, asked, choices = (
+        {f"device.{key}": text for key, text in each.items()}
+        for each in (made.remarks, made.asked, made.choices)
+    )
+    return TemplateDevice(Path(name).stem, made.title, section, remarks, asked, choices, made.notes)
 
 
 def starting_experiment(
@@ -99,12 +116,13 @@ def starting_experiment(
     files = TextFiles()
     named = {"name": path.stem, "device": dict(device.section)}
     document = Document(str(path), dump(named))
-    of_device = [each for each in settings if each.lstrip().startswith("device.")]
-    _set(document, of_device)
+    first = [each for each in settings if each.lstrip().startswith(("device.", "limits."))]
+    _set(document, first)
     made = made_device(document, path.parent, files)
     assert made is not None
-    data, remarks = _first_values(made.info)
-    whole = Document(str(path), dump({**document.data, **data}))
+    data, remarks = _first_values(made.info, document.data.get("limits"))
+    known = {key: document.data[key] for key in named}
+    whole = Document(str(path), dump({**known, **data}))
     _set(whole, settings)
     head = _head(device, path)
     text = head + commented(whole.data, {**remarks, **device.remarks})
@@ -143,11 +161,11 @@ def _head(device: TemplateDevice, path: Path) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _first_values(info: DeviceInfo) -> tuple[dict[str, Any], dict[str, str]]:
-    """Return all keys except those of the device, and their comments."""
+def _first_values(info: DeviceInfo, limits: object) -> tuple[dict[str, Any], dict[str, str]]:
+    """Return all keys except those of the device, and their comments; ``limits`` may be set."""
     rate_hz = _below(min(info.max_rate_hz, _BUFFERED_HZ if info.buffered else _PACED_HZ))
     frequency_hz = _below(min(rate_hz / 100.0, 1.0))
-    low, high = (_rounded(_SHARE * each, 2) for each in (info.command_min, info.command_max))
+    low, high = _range_of(limits, info)
     data: dict[str, Any] = {"sample_rate_hz": rate_hz}
     remarks = {"sample_rate_hz": f"at most {info.max_rate_hz:g}"}
     if info.buffered:
@@ -169,6 +187,19 @@ def _first_values(info: DeviceInfo) -> tuple[dict[str, Any], dict[str, str]]:
     remarks["safe.value"] = f"{info.command_unit} at which nothing can happen; every run ends there"
     remarks["safe.ramp_s"] = "from the limit to there"
     return data, {**remarks, **of_limits}
+
+
+def _range_of(limits: object, info: DeviceInfo) -> tuple[float, float]:
+    """Return the range that the limits set, or a share of the device's."""
+    match limits:
+        case {"peak_current_a": int() | float() as high} if high > 0.0:
+            return -high, high
+        case {"drive_a": (int() | float() as low, int() | float() as high)} | {
+            "drive_v": (int() | float() as low, int() | float() as high)
+        } if low < high:
+            return low, high  # fmt: skip
+    low, high = (_rounded(_SHARE * each, 2) for each in (info.command_min, info.command_max))
+    return low, high
 
 
 def _sine(unit: CommandUnit, low: float, high: float, frequency_hz: float) -> dict[str, Any]:

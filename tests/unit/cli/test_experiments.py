@@ -1,11 +1,11 @@
 """Commands for a first experiment: demo, examples, init, schema."""
 
+import io
 import signal
 import sys
 from pathlib import Path
 
 import pytest
-import typer
 
 from hilctl.cli.experiments import init
 from hilctl.experiment.file import schema_text
@@ -107,22 +107,44 @@ def test_init_refuses_wrong_input_and_existing_files(here, hilctl, words, messag
     assert [each.read_text() for each in here.iterdir()] == ["mine"]
 
 
-def test_init_asks_in_a_terminal(here, monkeypatch):
-    answers = {"device,": "labjack_t7", "name or": "10.0.0.7", "largest current": "0.4"}
-    asked = []
+class Terminal(io.StringIO):
+    """Scripted answers; a question too many aborts."""
 
-    def prompt(text, **more):
-        asked.append(text)
-        return next((each for key, each in answers.items() if text.startswith(key)), "")
+    def isatty(self):
+        return True
 
-    monkeypatch.setattr(typer, "prompt", prompt)
-    monkeypatch.setattr(sys.stdin, "isatty", lambda: True)
+
+@pytest.mark.parametrize(
+    ("answers", "errors", "chosen"),
+    [
+        (
+            "labjack|t9|labjack_t7||DAC9|dac1||kV|A|10.0.0.7|zero|0|2|-5|||50|0.4",
+            ["3 devices", "0 devices", "'DAC9'", "'kV'", "'zero'", "not 0", "-50 to 50"],
+            {
+                "device": {"host": "10.0.0.7", "output": "DAC1"},
+                "limits": {"peak_current_a": 0.4},
+                "waveform": {"amplitude": 0.2},
+            },
+        ),
+        (
+            "tdk||agilent||/dev/ttyUSB1|||5|[0, 5]",
+            ["--reader", "must be a list"],
+            {"device": {"input": "AI101"}, "limits": {"drive_a": (0, 5)}},
+        ),
+        ("piezo|[0, 50]", [], {"limits": {"drive_v": (0, 50)}}),
+    ],
+)
+def test_init_asks_until_it_is_valid(here, monkeypatch, capsys, answers, errors, chosen):
+    monkeypatch.setattr(sys, "stdin", Terminal(answers.replace("|", "\n") + "\n"))
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
     init()
-    config = load_experiment(here / "labjack_t7.yaml")
-    assert config.document.data["device"]["host"] == "10.0.0.7"
-    assert config.config.limits.peak_current_a == 0.4
-    assert "displacement of one V of the sensor, um [10.0]" in asked
+    assert not sys.stdin.read()
+    shown = capsys.readouterr().out
+    assert [each for each in errors if each not in shown] == []
+    assert shown.count("Error: ") == len(errors)
+    (path,) = here.glob("*.yaml")
+    data = load_experiment(path).document.data
+    assert {key: {name: data[key][name] for name in part} for key, part in chosen.items()} == chosen
 
 
 def test_schema_is_printed_or_written(tmp_path, hilctl):

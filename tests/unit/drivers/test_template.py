@@ -50,6 +50,14 @@ def test_the_sensor_may_be_on_another_device(name, reader, line):
     assert bool(placed) == (line == "own")
 
 
+def test_another_output_and_input_can_be_chosen():
+    section = starting_section("labjack_t7", "A", None, {"output": "TDAC0", "input": "AIN2"})
+    assert (section.values["output"], section.values["input"]) == ("TDAC0", "AIN2")
+    assert section.values["amplifier"]["offset_a"] == 0.0
+    with pytest.raises(InputError, match=r"device\.output must be one of DAC0.*'AO0'"):
+        starting_section("labjack_t7", "A", None, {"output": "AO0"})
+
+
 def test_a_voltage_begins_at_zero():
     section = starting_section("labjack_t7", "V", None)
     assert (made(section).command_unit, made(section).command_min) == ("V", 0.0)

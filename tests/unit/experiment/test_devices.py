@@ -191,6 +191,16 @@ def test_a_profile_is_described_as_it_stands():
     assert found.to_mapping()["options"] == ()
 
 
+def test_own_profile_is_described_and_validated(tmp_path):
+    own = tmp_path / "dac.yaml"
+    text = Path(describe("labjack_t7").place).read_text()
+    own.write_text(text)
+    assert describe(str(own)).profile["model"] == "T7"
+    own.write_text(text.replace("max_rate_hz:", "max_rate:"))
+    with pytest.raises(ConfigError, match="max_rate"):
+        describe(str(own))
+
+
 def test_a_name_that_is_neither_gets_a_hint():
     with pytest.raises(InputError, match=r"'labjak_t7'.*'labjack_t7'"):
         describe("labjak_t7")
