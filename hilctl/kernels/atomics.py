@@ -12,11 +12,11 @@ A number that announces nothing needs none of this: aligned eight bytes are writ
 from collections.abc import Callable
 from typing import Any, TypeAlias, cast
 
-from numba import config, types
+from numba import types
 from numba.extending import intrinsic
 
 from hilctl.base.types import I64
-from hilctl.kernels.jit import kernel
+from hilctl.kernels.jit import DISABLED, kernel
 
 _Typed: TypeAlias = tuple[Any, Callable[..., Any]]
 _BYTES = 8
@@ -55,11 +55,10 @@ def _plain_load(numbers: I64, index: int) -> int:
     return int(numbers[index])
 
 
-_numba: Any = config
 # Without the compiler, as for a debugger, the order is that of the processor.
 _store: Callable[[I64, int, int], None] = _plain_store
 _load: Callable[[I64, int], int] = _plain_load
-if not _numba.DISABLE_JIT:
+if not DISABLED:
     _store, _load = cast("Any", intrinsic(_typed_store)), cast("Any", intrinsic(_typed_load))
 
 

@@ -1,15 +1,28 @@
-"""The decorator of all kernels."""
+"""The decorator of all kernels.
 
+numba is imported at the first use of a kernel, because commands that compute nothing need not wait
+for it.
+"""
+
+import os
 from collections.abc import Callable
 from contextlib import suppress
-from functools import partial, update_wrapper
+from functools import cache, partial, update_wrapper
 from typing import Any, TypeVar, cast
 
-import numba
-from numba.extending import typeof_impl
-
-_CONFIG: Any = numba.config
+DISABLED = os.environ.get("NUMBA_DISABLE_JIT", "0") not in {"", "0"}
+"""Whether kernels are plain Python functions."""
 Function = TypeVar("Function", bound=Callable[..., object])
+
+
+@cache
+def _numba() -> Any:
+    """Import numba, and register the type of a kernel that another kernel calls."""
+    import numba
+    from numba.extending import typeof_impl
+
+    typeof_impl.register(_Kernel)(lambda kernel, _: numba.typeof(kernel.dispatcher))
+    return numba
 
 
 class _Kernel:
@@ -20,7 +33,7 @@ class _Kernel:
     ) -> None:
         update_wrapper(self, function)
         self.py_func = function
-        self._njit = partial(numba.njit, error_model="numpy", **options)
+        self._options = options
         self._signatures = list(signatures)
         self._dispatcher: Any = None
 
@@ -32,26 +45,21 @@ class _Kernel:
         return self._dispatcher
 
     def _compile(self) -> Any:
-        cached = partial(self._njit, cache=True)
+        njit = partial(_numba().njit, error_model="numpy", **self._options)
+        cached = partial(njit, cache=True)
         with suppress(Exception):
             return cached(self._signatures)(self.py_func)
         with suppress(Exception):  # a damaged cache entry can raise any exception
             cached()(self.py_func).recompile()  # discards the entry
             return cached(self._signatures)(self.py_func)
         # No writable folder, a full disk, or a mistake in the kernel.
-        return self._njit(self._signatures)(self.py_func)
+        return njit(self._signatures)(self.py_func)
 
     def __call__(self, *arguments: object) -> object:
         return (self._dispatcher or self.dispatcher)(*arguments)
 
     def __reduce__(self) -> str:
         return self.py_func.__qualname__  # another process imports it
-
-
-@typeof_impl.register(_Kernel)
-def _typeof(kernel: _Kernel, _context: object) -> Any:
-    """Return the type of a kernel that another kernel calls."""
-    return numba.typeof(kernel.dispatcher)
 
 
 def kernel(
@@ -80,7 +88,7 @@ def kernel(
     """
 
     def decorate(function: Function) -> Function:
-        if _CONFIG.DISABLE_JIT:
+        if DISABLED:
             return function
         made = _Kernel(function, signatures, forceinline=inline, nogil=nogil)
         return cast("Function", made)
