@@ -18,7 +18,16 @@ from hilctl.api.campaigns import run_steps
 from hilctl.base.errors import ConfigError, ConfigProblem
 from hilctl.base.yaml import Document
 from hilctl.cli.console import print_rich, progress_bar, table
-from hilctl.cli.options import AsJson, DryRun, ExperimentFile, Fast, LabelTexts, Overwrite, Settings
+from hilctl.cli.options import (
+    AsJson,
+    DryRun,
+    ExperimentFile,
+    Fast,
+    LabelTexts,
+    Overwrite,
+    Settings,
+    experiment_keys,
+)
 from hilctl.cli.output import print_json, print_result
 from hilctl.experiment.sections import label_settings
 from hilctl.ilc.ilc_session import correction_setting
@@ -69,6 +78,7 @@ def sweep(
             "--vary",
             metavar="KEY=VALUES",
             help="KEY=1,2,5 or KEY=first:last:count[log]; several are combined.",
+            autocompletion=experiment_keys,
         ),
     ],
     folder: Folder = None,

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from hilctl.base.errors import InputError
-from hilctl.cli.options import AsJson
+from hilctl.cli.options import AsJson, run_names
 from hilctl.cli.output import print_result
 from hilctl.run.control.client import (
     active_runs,
@@ -26,7 +26,12 @@ from hilctl.run.run_folder import runs
 _NOT_ENDED = 3
 RunName = Annotated[
     str | None,
-    typer.Option("--run", metavar="NAME", help="Name of the run; required if several are active."),
+    typer.Option(
+        "--run",
+        metavar="NAME",
+        help="Name of the run; required if several are active.",
+        autocompletion=run_names,
+    ),
 ]
 
 

@@ -11,7 +11,7 @@ from rich.text import Text
 
 from hilctl import api
 from hilctl.cli.console import listing, print_rich, progress_bar
-from hilctl.cli.options import AsJson, ExperimentFile, Settings
+from hilctl.cli.options import AsJson, ExperimentFile, Settings, device_names
 from hilctl.cli.output import print_result
 from hilctl.experiment.devices import (
     DeviceDescription,
@@ -80,7 +80,12 @@ def devices(context: typer.Context, as_json: AsJson = False) -> None:
 @devices_.command()
 def show(
     name: Annotated[
-        str, typer.Argument(metavar="NAME", help="Device, shipped profile, or path of a profile.")
+        str,
+        typer.Argument(
+            metavar="NAME",
+            help="Device, shipped profile, or path of a profile.",
+            autocompletion=device_names,
+        ),
     ],
     as_json: AsJson = False,
 ) -> None:

@@ -16,7 +16,7 @@ from hilctl.base.files import read_text, write_text
 from hilctl.base.types import CommandUnit
 from hilctl.base.yaml import Document
 from hilctl.cli.console import listing, print_rich
-from hilctl.cli.options import AsJson, Settings
+from hilctl.cli.options import AsJson, Settings, device_names, example_names, profile_names
 from hilctl.cli.output import print_json, print_result
 from hilctl.cli.run import run_progress
 from hilctl.experiment.devices import describe, is_path, known_devices, profile_summaries
@@ -40,7 +40,10 @@ _DEMO_RUNS = (
 
 def examples(
     name: Annotated[
-        str | None, typer.Argument(metavar="NAME", help="Example to copy; default: list all.")
+        str | None,
+        typer.Argument(
+            metavar="NAME", help="Example to copy; default: list all.", autocompletion=example_names
+        ),
     ] = None,
     into: Annotated[Path, typer.Option(help="Folder for the copies.")] = Path(),
     as_json: AsJson = False,
@@ -115,6 +118,7 @@ def init(
         typer.Argument(
             metavar="DEVICE",
             help="Device, shipped profile, or path of a profile (see hilctl devices).",
+            autocompletion=device_names,
         ),
     ] = None,
     output: Annotated[
@@ -125,7 +129,11 @@ def init(
         typer.Option(help="Unit of the drive: current (default) or voltage."),
     ] = None,
     reader: Annotated[
-        str | None, typer.Option(help="Profile of the device that reads the sensor, if separate.")
+        str | None,
+        typer.Option(
+            help="Profile of the device that reads the sensor, if separate.",
+            autocompletion=profile_names,
+        ),
     ] = None,
     settings: Settings = None,
     as_json: AsJson = False,

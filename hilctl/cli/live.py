@@ -21,7 +21,7 @@ from hilctl.base.errors import HilctlError, RunError
 from hilctl.base.events import Event
 from hilctl.base.formatting import printable
 from hilctl.cli.console import console
-from hilctl.cli.options import AsJson
+from hilctl.cli.options import AsJson, run_names
 from hilctl.cli.output import print_json, safe_streams
 from hilctl.live.run_reader import RunList, RunReader
 from hilctl.live.scope import WINDOWS_S
@@ -54,6 +54,7 @@ def watch(
         typer.Argument(
             metavar="RUN",
             help="Run (or the beginning of its name); required if several are active.",
+            autocompletion=run_names,
         ),
     ] = None,
 ) -> None:
@@ -247,7 +248,9 @@ def live(
     name: Annotated[
         str | None,
         typer.Argument(
-            metavar="RUN", help="Run to show first (or the beginning of its name); default: any."
+            metavar="RUN",
+            help="Run to show first (or the beginning of its name); default: any.",
+            autocompletion=run_names,
         ),
     ] = None,
     port: Annotated[

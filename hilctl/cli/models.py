@@ -13,7 +13,7 @@ from hilctl import api
 from hilctl.base.errors import InputError
 from hilctl.base.files import check_writable
 from hilctl.cli.console import listing, print_rich, progress_bar, table
-from hilctl.cli.options import AsJson, Overwrite, Settings
+from hilctl.cli.options import AsJson, Overwrite, Settings, recording_paths
 from hilctl.cli.output import print_result
 from hilctl.comparison.compare import Comparison, headings, notes, table_rows
 from hilctl.identify.model_selection import OrderScore
@@ -31,10 +31,23 @@ from hilctl.identify.summary import (
 )
 from hilctl.run.control.client import finish_dead_runs
 
+
+def _kinds() -> list[tuple[str, str]]:
+    """Return kinds of model, for completion."""
+    return [(kind, each.title) for kind, each in CATALOGUE.items()]
+
+
+def _setting_keys() -> list[tuple[str, str]]:
+    """Return settings of a fit, for completion."""
+    return [(f"{row[0]}=", row[-1]) for row in setting_rows()]
+
+
 IdentifyInput = Annotated[
     list[Path],
     typer.Argument(
-        metavar="FILE", help="Recordings (MCAP) or tables (text, .mat, .npz, .npy, .parquet)."
+        metavar="FILE",
+        help="Recordings (MCAP) or tables (text, .mat, .npz, .npy, .parquet).",
+        autocompletion=recording_paths,
     ),
 ]
 TableUnit = Annotated[str | None, typer.Option(help="Unit of the command in a table, A or V.")]
@@ -57,7 +70,11 @@ LeaveOut = Annotated[
 ]
 Validate = Annotated[
     list[Path] | None,
-    typer.Option(metavar="FILE", help="File to validate the model with; may be repeated."),
+    typer.Option(
+        metavar="FILE",
+        help="File to validate the model with; may be repeated.",
+        autocompletion=recording_paths,
+    ),
 ]
 Scheduler = Annotated[
     str | None,
@@ -68,18 +85,26 @@ Scheduler = Annotated[
 FitTexts = Annotated[
     list[str] | None,
     typer.Option(
-        "--set", metavar="KEY=VALUE", help="Setting of the fit (see --settings); may be repeated."
+        "--set",
+        metavar="KEY=VALUE",
+        help="Setting of the fit (see --settings); may be repeated.",
+        autocompletion=_setting_keys,
     ),
 ]
 ValidateRuns = Annotated[
     list[Path] | None,
-    typer.Option(metavar="RUN", help="Recording to validate the model with; may be repeated."),
+    typer.Option(
+        metavar="RUN",
+        help="Recording to validate the model with; may be repeated.",
+        autocompletion=recording_paths,
+    ),
 ]
 Models = Annotated[
     list[str] | None,
     typer.Option(
         metavar="KIND",
         help="Kinds (separated by commas) or model files; default: all. May be repeated.",
+        autocompletion=_kinds,
     ),
 ]
 TryIn = Annotated[
@@ -113,7 +138,9 @@ ListSettings = Annotated[
 
 def identify(
     files: IdentifyInput,
-    model: Annotated[str, typer.Option(help="Kind of model, or auto.")] = "auto",
+    model: Annotated[
+        str, typer.Option(help="Kind of model, or auto.", autocompletion=_kinds)
+    ] = "auto",
     output: Annotated[Path | None, typer.Option(help="Model file to write.")] = None,
     settings: FitTexts = None,
     list_settings: ListSettings = False,
@@ -184,7 +211,11 @@ def refine(
     model: Annotated[Path, typer.Argument(help="Model file.", metavar="MODEL")],
     runs: Annotated[
         list[Path],
-        typer.Argument(metavar="RUN", help="Recordings (MCAP): compensated, learned, or neither."),
+        typer.Argument(
+            metavar="RUN",
+            help="Recordings (MCAP): compensated, learned, or neither.",
+            autocompletion=recording_paths,
+        ),
     ],
     output: Annotated[Path | None, typer.Option(help="Model file to write.")] = None,
     validate: ValidateRuns = None,
@@ -227,7 +258,10 @@ def print_refinement(result: Refinement, output: Path | None) -> None:
 
 def compare(
     files: Annotated[
-        list[Path], typer.Argument(metavar="RUN", help="Recordings (MCAP) of steady loops.")
+        list[Path],
+        typer.Argument(
+            metavar="RUN", help="Recordings (MCAP) of steady loops.", autocompletion=recording_paths
+        ),
     ],
     models: Models = None,
     experiment: TryIn = None,

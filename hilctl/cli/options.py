@@ -1,18 +1,89 @@
-"""Options that several commands share."""
+"""Options that several commands share, and completions of their values for the shell.
 
+The functions here return possible values of an argument or option, with a description if there is
+one. Their imports are local, because a command needs them for completion only.
+"""
+
+import json
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+
+
+def device_names() -> list[str]:
+    """Return devices and shipped profiles."""
+    from hilctl.experiment.devices import known_devices
+
+    return [*known_devices(), *profile_names()]
+
+
+def profile_names() -> list[str]:
+    """Return shipped profiles."""
+    from hilctl.experiment.devices import shipped_profiles
+
+    return list(shipped_profiles())
+
+
+def example_names() -> list[tuple[str, str]]:
+    """Return shipped examples."""
+    from hilctl.experiment.examples import examples_folder, shipped_examples
+
+    return [(each.name, each.description) for each in shipped_examples(examples_folder())]
+
+
+def run_names() -> list[tuple[str, str]]:
+    """Return runs of this user."""
+    from hilctl.run.run_folder import runs
+
+    return [(each.card.name, each.card.experiment) for each in runs()]
+
+
+def recording_paths() -> list[str]:
+    """Return recordings in the working folder and in the default folder of recordings."""
+    from hilctl.recording.metadata_keys import RECORDINGS
+
+    found = [*Path().glob("*.mcap"), *Path(RECORDINGS).rglob("*.mcap")]
+    return sorted(map(str, found))
+
+
+def experiment_keys() -> list[tuple[str, str]]:
+    """Return the dotted keys of experiments, followed by ``=``."""
+    from hilctl.experiment.examples import schema_file
+
+    schema = json.loads(schema_file().read_text(encoding="utf-8"))
+    return [(f"{key}=", meaning) for key, meaning in dict(_keys(schema, schema["$defs"])).items()]
+
+
+def _keys(node: dict[str, Any], definitions: dict[str, Any], at: str = "") -> Iterator[Any]:
+    """Yield dotted key and description of each value in a part of a JSON schema."""
+    if "$ref" in node:
+        named = definitions[node["$ref"].rpartition("/")[2]]
+        node = {**named, "description": node.get("description", "")}
+    inner = [*node.get("anyOf", []), *node.get("oneOf", [])]
+    for each in inner:
+        yield from _keys({"description": node.get("description", ""), **each}, definitions, at)
+    for name, value in node.get("properties", {}).items():
+        yield from _keys(value, definitions, f"{at}.{name}" if at else name)
+    if at and not inner and "properties" not in node and node.get("type") != "null":
+        yield at, node.get("description", "")
+
 
 ExperimentFile = Annotated[
     Path, typer.Argument(help="Experiment file (YAML).", metavar="EXPERIMENT")
 ]
-RecordingFile = Annotated[Path, typer.Argument(help="Recording (MCAP).", metavar="RUN")]
+RecordingFile = Annotated[
+    Path,
+    typer.Argument(help="Recording (MCAP).", metavar="RUN", autocompletion=recording_paths),
+]
 Settings = Annotated[
     list[str] | None,
     typer.Option(
-        "--set", metavar="KEY=VALUE", help="Override a dotted key of the file; may be repeated."
+        "--set",
+        metavar="KEY=VALUE",
+        help="Override a dotted key of the file; may be repeated.",
+        autocompletion=experiment_keys,
     ),
 ]
 LabelTexts = Annotated[

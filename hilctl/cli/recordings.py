@@ -16,7 +16,7 @@ from hilctl.analysis.export import export_all
 from hilctl.base.errors import InputError
 from hilctl.base.formatting import finite_json, printable, short_name
 from hilctl.cli.console import progress_bar
-from hilctl.cli.options import AsJson, FromTime, Overwrite, ToTime
+from hilctl.cli.options import AsJson, FromTime, Overwrite, ToTime, recording_paths
 from hilctl.cli.output import print_json, print_result
 from hilctl.recording.metadata_keys import LABELS_FACT, RECORDINGS
 from hilctl.recording.recover import recover_recording
@@ -119,7 +119,9 @@ def export(
     recording: Annotated[
         Path,
         typer.Argument(
-            metavar="RUN", help="Recording (MCAP), or a folder of recordings with --all."
+            metavar="RUN",
+            help="Recording (MCAP), or a folder of recordings with --all.",
+            autocompletion=recording_paths,
         ),
     ],
     output: Annotated[
@@ -166,7 +168,8 @@ def _export_all(folder: Path, output: Path, *, as_json: bool) -> None:
 
 def recover(
     recording: Annotated[
-        Path | None, typer.Argument(metavar="RUN", help="Recording (MCAP).")
+        Path | None,
+        typer.Argument(metavar="RUN", help="Recording (MCAP).", autocompletion=recording_paths),
     ] = None,
     output: Annotated[Path | None, typer.Option(help="File to write; RUN stays unchanged.")] = None,
     dismissed: Annotated[

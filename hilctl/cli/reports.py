@@ -12,7 +12,7 @@ from hilctl.analysis.replay import ReplayResult
 from hilctl.base.errors import InputError
 from hilctl.base.formatting import printable, quantity
 from hilctl.cli.console import console, print_rich, progress_bar, table
-from hilctl.cli.options import AsJson, FromTime, Overwrite, RecordingFile, ToTime
+from hilctl.cli.options import AsJson, FromTime, Overwrite, RecordingFile, ToTime, recording_paths
 from hilctl.cli.output import print_result
 from hilctl.cli.run import render_report
 from hilctl.run.control.client import finish_dead_runs
@@ -21,7 +21,12 @@ from hilctl.studies.multi_run.multi_run_page import MOST_ROWS, run_table, series
 from hilctl.studies.multi_run.trend import headline
 
 RunsInput = Annotated[
-    list[Path], typer.Argument(help="Recordings (MCAP), or a campaign folder.", metavar="RUN")
+    list[Path],
+    typer.Argument(
+        help="Recordings (MCAP), or a campaign folder.",
+        metavar="RUN",
+        autocompletion=recording_paths,
+    ),
 ]
 OtherModel = Annotated[
     Path | None,
@@ -39,7 +44,9 @@ def report(
     before: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE", help="Recording of the same motion without compensator, for the page."
+            metavar="FILE",
+            help="Recording of the same motion without compensator, for the page.",
+            autocompletion=recording_paths,
         ),
     ] = None,
     model: OtherModel = None,

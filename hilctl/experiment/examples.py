@@ -96,11 +96,16 @@ def copy_example(name: str, into: Path, folder: Path) -> tuple[Path, ...]:
     return tuple(texts)
 
 
+def schema_file() -> Path:
+    """Return the JSON schema of experiments."""
+    return examples_folder() / _SCHEMA
+
+
 def copy_schema(into: Path) -> Path:
     """Copy the JSON schema of experiments into a folder that has none."""
     copy = into / _SCHEMA
     if not copy.exists():
-        write_text(copy, read_text(examples_folder() / _SCHEMA), overwrite=False)
+        write_text(copy, read_text(schema_file()), overwrite=False)
     return copy
 
 

@@ -24,7 +24,7 @@ from hilctl_drivers.emulator.rig import SimulatedWiring
 from hilctl_drivers.labjack.modbus_stream import ModbusStreamOptions
 from hilctl_drivers.modbus.config import ModbusReaderOptions
 from hilctl_drivers.modbus.modbus_profile import ModbusProfile
-from hilctl_drivers.profile import NamedProfile, load_profile
+from hilctl_drivers.profile import NamedProfile, load_profile, shipped_profiles
 from hilctl_drivers.serial_dac import SerialOptions
 from hilctl_drivers.signal_chain import DacOptions, ReaderOptions
 
@@ -141,6 +141,7 @@ def emulate(
         typer.Argument(
             help="Shipped profile, path of a profile, or an experiment (uses its wiring).",
             metavar="PROFILE|EXPERIMENT",
+            autocompletion=lambda: list(shipped_profiles()),
         ),
     ],
     link: Annotated[str | None, typer.Option(help="tcp or rtu; default: from the profile.")] = None,

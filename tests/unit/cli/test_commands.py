@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 
@@ -52,30 +53,71 @@ def test_eof_error_is_not_reported_as_ctrl_d(hilctl, monkeypatch, name):
     assert "ran out" in stderr
 
 
+def completing(words):
+    """Return the environment in which bash asks for the last of some words."""
+    words = words.split(" ")
+    return {
+        "_HILCTL_COMPLETE": "complete_bash",
+        "COMP_WORDS": " ".join(words),
+        "COMP_CWORD": str(len(words) - 1),
+    }
+
+
 @pytest.mark.parametrize(
     ("words", "some"),
     [
-        ("hilctl report --", {"--html", "--from", "--json", "--help"}),
-        ("hilctl stop --", {"--all", "--wait", "--run"}),
+        ("report --", {"--html", "--from", "--json", "--help"}),
+        ("stop --", {"--all", "--wait", "--run"}),
+        ("stop --run ", {"rig-1"}),
+        ("devices show lab", {"labjack_t7"}),
+        ("init sim", {"simulated_piezo"}),
+        ("init kepco_bop --reader ag", {"agilent_34970a"}),
+        ("emulate wag", {"wago_750"}),
+        ("examples models/", {"models/piezo_ppi"}),
+        ("identify x.mcap --model f", {"field"}),
+        ("identify x.mcap --set table.u", {"table.unit="}),
+        ("report ", {"recordings/day/a.mcap"}),
+        ("run x.yaml --set limits.d", {"limits.drive_a=", "limits.drive_v="}),
+        ("run x.yaml --set waveform.freq", {"waveform.frequency_hz="}),
+        ("check x.yaml --set device.h", {"device.host="}),
+        ("sweep x.yaml --vary samp", {"sample_rate_hz="}),
     ],
 )
-def test_shell_completes_options(words, some):
-    asked = {"_HILCTL_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": "2"}
-    ended = in_a_process(f"import sys; sys.argv[0] = 'hilctl'; {MAIN}", **asked)
-    assert set(ended.stdout.split()) >= some, ended.stderr
+def test_shell_completes_options_and_values(words, some, tmp_path, monkeypatch, hilctl):
+    monkeypatch.chdir(tmp_path)
+    day = tmp_path / "recordings" / "day"
+    day.mkdir(parents=True)
+    (day / "a.mcap").touch()
+    card = SimpleNamespace(name="rig-1", experiment="rig.yaml")
+    monkeypatch.setattr("hilctl.run.run_folder.runs", lambda: [SimpleNamespace(card=card)])
+    for name, value in completing(f"hilctl {words}").items():
+        monkeypatch.setenv(name, value)
+    code, out, err = hilctl()
+    assert code == 0, err
+    assert set(out.split()) >= some
 
 
-@pytest.mark.parametrize("words", [["--help"], ["status"], ["stop", "--all"]])
-def test_help_status_and_stop_import_nothing_heavy(words):
+@pytest.mark.parametrize(
+    ("words", "environment"),
+    [
+        (["--help"], {}),
+        (["status"], {}),
+        (["stop", "--all"], {}),
+        ([], completing("hilctl run x.yaml --set limits.")),
+        ([], completing("hilctl devices show ")),
+    ],
+)
+def test_help_status_stop_and_completion_import_nothing_heavy(words, environment):
     code = """
 import sys
 from hilctl.cli import main
+sys.argv[0] = "hilctl"
 try:
     main()
 finally:
     print([each for each in ("numba", "scipy", "matplotlib") if each in sys.modules])
 """
-    ended = in_a_process(code, *words)
+    ended = in_a_process(code, *words, **environment)
     assert (ended.returncode, ended.stdout.splitlines()[-1]) == (0, "[]"), ended.stderr
 
 
