@@ -149,7 +149,15 @@ def _run(checked: CheckedExperiment, recorder: Recorder) -> tuple[LoopOutcome, L
         """Return why the file cannot be written after a retry, or an empty text."""
         return recorder.error if recorder.error and not recorder.flush() else ""
 
-    host = OfflineHost(plan, on_batch=recorder.batch, on_event=recorder.event, stop=refused)
+    flush_samples = loaded.config.recording.flush_s * plan.sample_rate_hz
+
+    def written(batch: BlockBatch) -> None:
+        """Write a batch; flush as often as a run in real time, so that chunks are alike."""
+        recorder.batch(batch)
+        if recorder.next_sample % flush_samples < batch.flags.size:
+            recorder.flush()
+
+    host = OfflineHost(plan, on_batch=written, on_event=recorder.event, stop=refused)
     try:
         loop, waveform_at = _opened(plan, loaded.device, host, loaded.config.safe.at_start)
         recorder.begin(time.time_ns(), {"paced": "false"}, waveform_at)
