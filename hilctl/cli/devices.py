@@ -161,6 +161,9 @@ def print_described(described: DeviceDescription) -> None:
     for key in ("vendor", "model", "verified", "unverified", "max_rate_hz"):
         if key in profile:
             print(f"{key}: {_plain(profile[key])}")
+    if link := profile.get("link"):
+        known = [f"{key} {link[key]}" for key in ("kind", "baud", "port") if key in link]
+        print(f"link: {', '.join(known)}")
     for key in ("outputs", "inputs"):
         if profile.get(key):
             print_rich(listing(key, map(_channel, profile[key].items())))

@@ -164,9 +164,9 @@ def init(
 
 
 def _device_rows(what: str = "output") -> list[tuple[str, ...]]:
-    """Return the simulated devices and the shipped profiles that have outputs or inputs."""
+    """Return the simulated rigs and the shipped profiles, all with outputs, or with inputs."""
     simulated = (name for name in known_devices() if name.startswith("simulated_"))
-    rows: list[tuple[str, ...]] = [(name, "", "output input", "simulated") for name in simulated]
+    rows: list[tuple[str, ...]] = [(name, "simulated rig", "output", "none") for name in simulated]
     return [row for row in [*rows, *profile_summaries()] if what in row[2]]
 
 
