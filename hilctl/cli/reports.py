@@ -1,7 +1,7 @@
 """Commands that evaluate recordings: report, figures, replay."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 from rich.console import Group
@@ -16,9 +16,9 @@ from hilctl.cli.options import AsJson, FromTime, Overwrite, RecordingFile, ToTim
 from hilctl.cli.output import print_result
 from hilctl.cli.run import render_report
 from hilctl.run.control.client import finish_dead_runs
-from hilctl.studies.multi_run.collect import RunSeries
-from hilctl.studies.multi_run.multi_run_page import MOST_ROWS, run_table, series_mapping
-from hilctl.studies.multi_run.trend import headline
+
+if TYPE_CHECKING:
+    from hilctl.studies.multi_run.collect import RunSeries
 
 RunsInput = Annotated[
     list[Path],
@@ -63,6 +63,8 @@ def report(
             series = api.report_runs(
                 runs, html, model=model, overwrite=overwrite, on_progress=on_progress
             )
+        from hilctl.studies.multi_run.multi_run_page import series_mapping  # matplotlib
+
         values = series_mapping(series)
         print_result(values, lambda: print_rich(render_series(series)), as_json=as_json)
         return
@@ -126,8 +128,11 @@ def figures(
     print_result({"figures": captions}, lambda: print(lines), as_json=as_json)
 
 
-def render_series(series: RunSeries) -> Group:
+def render_series(series: "RunSeries") -> Group:
     """Return the summary of several runs and a table of them."""
+    from hilctl.studies.multi_run.multi_run_page import MOST_ROWS, run_table  # matplotlib
+    from hilctl.studies.multi_run.trend import headline
+
     headings, rows = run_table(series, MOST_ROWS, short=True)
     cells = [[printable(cell) for cell in row] for row in rows]
     runs = table(printable(series.name), headings, cells, left={"result"}, wrap=True)

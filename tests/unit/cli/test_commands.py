@@ -104,7 +104,7 @@ def test_shell_completes_options_and_values(words, some, tmp_path, monkeypatch, 
         (["status"], {}),
         (["stop", "--all"], {}),
         ([], completing("hilctl run x.yaml --set limits.")),
-        ([], completing("hilctl devices show ")),
+        ([], completing("hilctl report ")),
     ],
 )
 def test_help_status_stop_and_completion_import_nothing_heavy(words, environment):
