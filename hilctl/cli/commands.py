@@ -146,7 +146,7 @@ app = typer.Typer(
     add_completion=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # rich takes longer to import than everything else
-    context_settings=HELP_NAMES,
+    context_settings={**HELP_NAMES, "color": False},  # SafeStream would escape typer's colours
 )
 
 

@@ -179,7 +179,8 @@ def _asked_device(
     """Ask for the name of a device, a part of its row, or the path of a profile."""
 
     def named(answer: str) -> str:
-        exact = is_path(answer) or answer in {default, *(row[0] for row in rows)}
+        names = {default, *known_devices(), *(row[0] for row in rows)}
+        exact = is_path(answer) or answer in names
         found = [row for row in rows if answer.lower() in " ".join(row).lower()]
         if not exact and len(found) != 1:
             print_rich(listing("", found or rows))
