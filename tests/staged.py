@@ -10,7 +10,7 @@ from hilctl.identify.fit_model import FittedModel, fit_model
 from hilctl.identify.settings import FitSettings
 from hilctl.identify.staged.fit_data import StagedFitData
 from hilctl.identify.staged.objective import Layers, Point
-from hilctl.identify.staged.staged_search import convex_start
+from hilctl.identify.staged.staged_fits import convex_start
 from hilctl.models.integrated import exponential_integrated
 from hilctl.models.staged import StagedModel
 

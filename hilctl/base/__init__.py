@@ -12,7 +12,6 @@ segments.py    segments of a run and their steady cycles
 formatting.py  numbers with units, printable texts, JSON
 table.py       columns of numbers by name
 table_file.py  tables of any kind of file
-text_table.py  text tables
 yaml/          strict YAML with the line of every value
 
 A device in another package needs ``Device``, ``DeviceInfo``, ``DeviceOptions``, ``DeviceError`` and

@@ -6,7 +6,7 @@ control socket. Killing it does not affect the run.
 run_reader.py    reader of one run's folder; list of active runs
 traces.py        signals that are shown
 scope.py         time windows and hysteresis loops; minimum and maximum per bucket of samples
-live_metrics.py, limit_usage.py  running metrics; use of each limit
+live_metrics.py  running metrics, use of each limit
 frame_codec.py   frames for a page and for programs
 server.py, auth.py, page_session.py  the page on loopback, authentication, session of one page
 foxglove.py      server for Foxglove and compatible applications

@@ -14,8 +14,14 @@ from typing import Any
 
 from hilctl.base.errors import RunError
 from hilctl.base.events import Event
-from hilctl.live.limit_usage import Gauge, Headroom
-from hilctl.live.live_metrics import EDGES_US, LatenessCounts, LiveErrorSpectrum, RunningFigures
+from hilctl.live.live_metrics import (
+    EDGES_US,
+    Gauge,
+    Headroom,
+    LatenessCounts,
+    LiveErrorSpectrum,
+    RunningFigures,
+)
 from hilctl.live.scope import Scope
 from hilctl.live.traces import Traces, traces_of
 from hilctl.run.control.client import active_runs

@@ -20,6 +20,7 @@ from pymodbus.pdu.register_message import (
 )
 
 from hilctl_drivers.ascii.ascii_session import LineFormat, parse_number
+from hilctl_drivers.modbus.modbus_session import RtuTransaction, TcpTransaction
 from hilctl_drivers.modbus.pdu import (
     ReadFrame,
     WriteFrame,
@@ -34,7 +35,6 @@ from hilctl_drivers.modbus.pdu import (
     write_read_pdu,
     write_single_pdu,
 )
-from hilctl_drivers.modbus.prepared_requests import RtuTransaction, TcpTransaction
 from hilctl_drivers.modbus.register_map import RegisterFormat
 from hilctl_drivers.transport.crc import CRCS
 from hilctl_drivers.transport.framing import binary_framing

@@ -4,8 +4,8 @@ modbus_profile.py     profiles, including streaming; register_map.py has registe
 config.py             options of an experiment, resolved against the profiles
 modbus_dac.py         the device
 watchdog.py           host watchdog and safe value
-modbus_session.py     session and exchange times
-pdu.py                messages; prepared_requests.py has those of the tick
+modbus_session.py     session, exchange times, prepared requests
+pdu.py                messages
 """
 
 LINK_KINDS = dict.fromkeys(("tcp", "rtu"), f"{__name__}.modbus_profile:ModbusProfile")

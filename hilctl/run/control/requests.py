@@ -1,21 +1,188 @@
-"""Requests to a running supervisor: status, changes of the reference, marks."""
+"""Requests to a running supervisor: status, changes of the reference, marks.
 
+A change of gain, offset or inverse is checked by a bound on the amplitude. It waits until the loop
+has taken the previous one, so none is overwritten.
+"""
+
+import math
+import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import AfterValidator, Field, TypeAdapter, ValidationError
 
 from hilctl.base.errors import InputError
 from hilctl.base.events import MARK, Event
 from hilctl.base.strict import StrictModel
-from hilctl.experiment.preflight import CheckedExperiment
-from hilctl.run.control.changes import Changes
-from hilctl.run.control.client import MAX_MARK
+from hilctl.experiment.forecast import fade_refusal
+from hilctl.experiment.preflight import CheckedExperiment, command_problems, reference_problems
+from hilctl.loop.compensator import Compensator
+from hilctl.run.control.client import MAX_MARK, InverseState
 from hilctl.run.recorder import RingRecorder
 from hilctl.run.run_folder import RunFolder, facts_of
+from hilctl.run.shared.shared_page import PageField, Phase, SharedPage
 from hilctl.run.shared.shared_page import PageField as Number
-from hilctl.run.shared.shared_page import Phase, SharedPage
+
+_SHARES: dict[str | None, float] = {"in": 1.0, "out": 0.0}
+_MOST_WAITING = 16
+_WAIT_S = 20.0  # longest wait for the previous change; a client waits longer for its answer
+_POLL_S = 0.005
+_LEAD_S = 0.05  # time from the answer to the first sample of a change
+_CYCLE = 2000  # samples per cycle of the sine from which the command range is computed
+
+
+class Changes:
+    """Changes of one run, requested from several threads; gain and offset are final values."""
+
+    def __init__(
+        self,
+        checked: CheckedExperiment,
+        page: SharedPage,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self.gain, self.offset, self._inverse_share = 1.0, 0.0, 1.0
+        self._checked, self._page = checked, page
+        self._clock, self._sleep = clock, sleep
+        self._lock = threading.Lock()
+        self._places = threading.BoundedSemaphore(_MOST_WAITING)
+
+    @property
+    def inverse(self) -> str | None:
+        """Final state of the inverse, ``in`` or ``out``; None without an inverse."""
+        if self._checked.loaded.model is None:
+            return None
+        return "in" if self._inverse_share else "out"
+
+    def make(
+        self,
+        gain: float | None,
+        offset: float | None,
+        over_s: float,
+        inverse: InverseState | None = None,
+    ) -> dict[str, Any]:
+        """Make a change when the loop has taken the previous one; None: unchanged."""
+        if gain is None and offset is None and inverse is None:
+            raise InputError("set: gain, offset or inverse is required")
+        if inverse is not None:
+            checked = self._checked
+            if why := fade_refusal(checked.loaded, checked.forecast.line, inverse):
+                raise InputError(f"set: inverse: {why}")
+        if not self._places.acquire(blocking=False):
+            raise InputError(f"set: {_MOST_WAITING} changes are waiting already: try again")
+        try:
+            until = self._clock() + _WAIT_S
+            while True:
+                with self._lock:
+                    if why := self._too_late():
+                        raise InputError(f"set: {why}")
+                    # The loop must have taken the previous change, which is overwritten.
+                    page = self._page
+                    if page.get(PageField.TUNE_WANTED) == page.observe(PageField.TUNE_TAKEN):
+                        return self._make(gain, offset, over_s, inverse)
+                if self._clock() >= until:
+                    raise InputError("set: the loop has not taken the previous change: try again")
+                self._sleep(_POLL_S)
+        finally:
+            self._places.release()
+
+    def _too_late(self) -> str:
+        """Return why no change is possible, or an empty text."""
+        if self._page.get(PageField.STOP):
+            return "the run is in its safe ramp"
+        if self._page.get(PageField.NEXT_SAMPLE) >= self._checked.forecast.samples:
+            return "the waveform has ended; the run is in its safe ramp"
+        return ""
+
+    def _make(
+        self, gain: float | None, offset: float | None, over_s: float, inverse: InverseState | None
+    ) -> dict[str, Any]:
+        """Write a change to the page; return the answer."""
+        gain = self.gain if gain is None else gain
+        offset = self.offset if offset is None else offset
+        share = _SHARES.get(inverse, self._inverse_share)
+        bypassed = min(share, self._inverse_share) < 1.0
+        if why := bound_refusal(self._checked, gain, offset, bypassed=bypassed):
+            raise InputError(f"set: {why}")
+        page, config = self._page, self._checked.loaded.config
+        lead = max(1, round(_LEAD_S * config.sample_rate_hz))
+        blocks = math.ceil((page.get(PageField.NEXT_SAMPLE) + lead) / config.block) + 1
+        begins_at = blocks * config.block
+        if begins_at >= self._checked.forecast.samples:
+            raise InputError("set: the waveform ends before the change could begin")
+        page.put_float(PageField.TUNE_GAIN, gain)
+        page.put_float(PageField.TUNE_OFFSET, offset)
+        page.put_float(PageField.TUNE_INVERSE_SHARE, share)
+        if line := self._checked.forecast.line:
+            page.put_float(PageField.TUNE_LINE_SLOPE, line.slope)
+            page.put_float(PageField.TUNE_LINE_AT_ZERO, line.at_zero)
+        page.put(PageField.TUNE_SAMPLES, max(1, round(over_s * config.sample_rate_hz)))
+        page.put(PageField.TUNE_BEGINS_AT, begins_at)
+        # Last: the loop reads the numbers above when the count changes.
+        page.publish(PageField.TUNE_WANTED, page.get(PageField.TUNE_WANTED) + 1)
+        self.gain, self.offset, self._inverse_share = gain, offset, share
+        return {
+            "gain": gain,
+            "offset": offset,
+            "inverse": self.inverse,
+            "over_s": over_s,
+            "begins_at_sample": begins_at,
+        }
+
+
+def bound_refusal(checked: CheckedExperiment, gain: float, offset: float, *, bypassed: bool) -> str:
+    """Return why a changed reference would exceed the limits, or an empty text."""
+    # The whole range counts; limiter and interlocks enforce slew and heat.
+    low, high = sorted(gain * end + offset for end in checked.reference.span)
+    problems = reference_problems(checked.loaded, checked.reference.unit, low, high)
+    commands = [*command_range(checked, low, high, gain)]
+    if bypassed and (line := checked.forecast.line):
+        commands += [line.slope * end + line.at_zero for end in (low, high)]
+    bound = replace(
+        checked.forecast,
+        command_min=float(np.min(commands)),  # keeps a NaN, where min() would not
+        command_max=float(np.max(commands)),
+        slew_per_s=0.0,
+        budget_used_s=None,
+    )
+    problems += command_problems(checked.loaded, bound)
+    return "; ".join(f"{problem.rule}, got {problem.value}" for problem in problems)
+
+
+def command_range(
+    checked: CheckedExperiment, low: float, high: float, gain: float
+) -> tuple[float, float]:
+    """Return the lowest and highest command for a reference from ``low`` to ``high``.
+
+    They are those of a sine over this range, plus the difference between the checked run and a sine
+    over the run's range, which is due to rate and history, times the gain.
+    """
+    found = _sine_commands(checked, low, high)
+    line = checked.forecast.line
+    if line is None:  # no model: the commands are the reference; or a constant reference
+        return found
+    # The ends of the line are the lowest and highest command of the checked waveform.
+    known = sorted(line.slope * end + line.at_zero for end in checked.reference.span)
+    sine = _sine_commands(checked, *checked.reference.span)
+    more = [gain * (known[end] - sine[end]) for end in (0, 1)]
+    if gain < 0.0:
+        more.reverse()
+    return found[0] + more[0], found[1] + more[1]
+
+
+def _sine_commands(checked: CheckedExperiment, low: float, high: float) -> tuple[float, float]:
+    """Return the lowest and highest command in the second cycle of a sine from rest."""
+    phase = np.arange(2 * _CYCLE) * (2.0 * np.pi / _CYCLE)
+    values = 0.5 * (low + high) + 0.5 * (high - low) * np.sin(phase)
+    values = np.clip(values, low, high)  # rounding must not leave a limit
+    compensator = Compensator(checked.loaded.model, checked.loaded.config.sample_rate_hz)
+    commands = np.empty_like(values)
+    with np.errstate(over="ignore", invalid="ignore"):  # values that are not finite are refused
+        compensator.process(values, commands)
+    return float(commands[_CYCLE:].min()), float(commands[_CYCLE:].max())
 
 
 class StatusRequest(StrictModel):

@@ -1,11 +1,20 @@
-"""Every whole record of a damaged file, and one line on what is wrong with it."""
+"""Every whole record of a damaged file, and one line on what is wrong with it; cut chunks."""
 
 import io
+import struct
 
 import pytest
 from mcap.records import Message, Metadata
 
-from hilctl.recording.recovery_scan import Damage, RecoveryScan
+from hilctl.recording.mcap_records import ReadBudget
+from hilctl.recording.recovery_scan import (
+    Damage,
+    RecoveryScan,
+    next_likely,
+    own_channels,
+    take_chunk,
+)
+from tests.unit.recording.conftest import chunk, message, raw
 
 
 @pytest.fixture
@@ -52,3 +61,73 @@ def test_damages_are_described_in_one_line(damages, text):
     scan = RecoveryScan(io.BytesIO(b""))
     scan.damages = damages
     assert scan.describe() == text
+
+
+def torn(data):
+    """An uncompressed chunk of which these bytes are there and 200 are not."""
+    return raw(chunk(data + b"\1" * 200))[:-200]
+
+
+def test_nonsense_behind_a_message_costs_that_message():
+    two = raw(message(1, b"\x08\x01")) + raw(message(2, b"\x08\x01"))
+
+    def saved(behind):
+        records, what = take_chunk(torn(two + behind), ReadBudget(2**20), last=True)
+        assert what == "torn chunk"
+        return len(records)
+
+    assert saved(b"") == saved(b"\x05\xf0") == 2
+    assert saved(b"\x05" + struct.pack("<Q", 90) + b"\x99") == 2
+    assert saved(b"\x99") == saved(b"\x99" * 20) == 1
+    assert saved(b"\x05" + struct.pack("<Q", 22) + b"\x99" * 40) == 1
+    assert take_chunk(torn(two), ReadBudget(2**20), last=False) == ([], "damaged chunk")
+
+
+def test_a_whole_chunk_with_a_wrong_checksum_gives_nothing():
+    wrong = raw(chunk(raw(message(1, b"\x08\x01")), crc=1))
+    assert take_chunk(wrong, ReadBudget(2**20), last=True) == ([], "damaged chunk")
+
+
+def test_zeros_at_the_end_cost_the_message_that_they_end():
+    """What ends in zeros may have been something else before the power failed."""
+    two = raw(message(1, b"\x08\x01")) + raw(message(2, b"\x08\x01"))
+    records, _ = take_chunk(torn(two)[:-1] + b"\0", ReadBudget(2**20), last=True)
+    assert records == [message(1, b"\x08\x01")]
+
+
+def test_a_sector_of_zeros_ends_a_compressed_stream(make):
+    """Nothing is taken from behind it: a decompressor may go on over it, with wrong numbers."""
+    stream = io.BytesIO()
+    make.write(stream, [make.batch(0, 90, seed=3)])
+    data = stream.getvalue()
+    start = data.index(b"\x04\0\0\0zstd") - 37
+    whole = data[start : start + 9 + struct.unpack_from("<Q", data, start + 1)[0]]
+    every, what = take_chunk(whole, ReadBudget(2**20), last=True)
+    assert (what, len(every) > 90) == ("index", True)
+    for at in (3000, 100_000, 150_000):
+        holed = whole[:at] + bytes(600) + whole[at + 600 : -5000]
+        records, what = take_chunk(holed, ReadBudget(2**20), last=True)
+        assert what == "torn chunk"
+        assert records == every[: len(records)]
+        assert len(records) > 5 or at < 150_000
+
+
+def test_a_likely_record_is_found_across_windows(monkeypatch):
+    import hilctl.recording.recovery_scan as module
+
+    monkeypatch.setattr(module, "_WINDOW_BYTES", 100)
+    record = raw(Metadata("hilctl.end", {"code": "completed"}))
+    for before in range(60, 140):
+        data = b"\xaa" * before + record + b"\xaa" * 50
+        assert next_likely(io.BytesIO(data), 0, len(data)) == before
+    assert next_likely(io.BytesIO(b"\xaa" * 500), 0, 500) == 500
+
+
+def test_own_channels_are_those_of_the_writer(make):
+    from mcap.reader import SeekingReader
+
+    stream = io.BytesIO()
+    make.write(stream, [make.batch(0, 1)])
+    summary = SeekingReader(io.BytesIO(stream.getvalue())).get_summary()
+    assert {number: pair[1] for number, pair in own_channels().items()} == summary.channels
+    assert {pair[0].id: pair[0] for pair in own_channels().values()} == summary.schemas

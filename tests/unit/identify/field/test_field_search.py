@@ -31,8 +31,8 @@ from hilctl.models.linear_stages import FirstMode
 from hilctl.models.staged import FieldLag, StagedModel
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 from tests.staged import truth
-from tests.unit.identify.field.test_duhem_tables import RATE_HZ as FAST_HZ
-from tests.unit.identify.field.test_duhem_tables import command
+from tests.unit.identify.field.test_duhem_search import RATE_HZ as FAST_HZ
+from tests.unit.identify.field.test_duhem_search import command
 
 RATE_HZ = 2000.0
 SIZE = Size(4, 1, 6, 5)

@@ -1,6 +1,7 @@
-"""What a running supervisor may be asked, and what it refuses; the page is not touched by those."""
+"""Requests to a running supervisor: accepted, queued, refused without touching the page."""
 
 import json
+from dataclasses import replace
 from mmap import mmap
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,17 +11,23 @@ import pytest
 
 from hilctl.base.errors import InputError
 from hilctl.base.events import MARK
+from hilctl.base.yaml import Document
+from hilctl.experiment.load import resolve
+from hilctl.experiment.preflight import check
+from hilctl.models.staged import FieldLag, StagedModel
 from hilctl.run.control import client
-from hilctl.run.control.requests import REQUESTS, Requests
+from hilctl.run.control.requests import REQUESTS, Changes, Requests, bound_refusal, command_range
 from hilctl.run.run_folder import run_folder
 from hilctl.run.shared.shared_page import SIZE, PageField, Phase, SharedPage, Stop
 from hilctl.run.start import checked_experiment
+from tests.fakes import DESCRIBED, DescribedDevice, SteppingClock
+from tests.published import terfenol_rdpi
 
 DEMO = Path(__file__).parents[4] / "configs" / "demo.yaml"
 
 
 @pytest.fixture(scope="module")
-def checked():
+def demo():
     return checked_experiment(DEMO, [])
 
 
@@ -41,9 +48,9 @@ def recording():
 
 
 @pytest.fixture
-def requests(checked, page, recording, tmp_path):
+def requests(demo, page, recording, tmp_path):
     with run_folder("demo", tmp_path / "a.mcap", 12.0) as (folder, _):
-        yield Requests(checked, folder, page, recording)
+        yield Requests(demo, folder, page, recording)
 
 
 def asked(requests, **message):
@@ -129,3 +136,223 @@ def test_the_protocol_names_every_request():
     schema = REQUESTS.json_schema()
     assert {*schema["discriminator"]["mapping"]} == {*get_args(client.Command)}
     assert client.request("set", gain=0.5, offset=None) == {"command": "set", "gain": 0.5}
+
+
+RATE_HZ, BLOCK, SAMPLES = 10_000.0, 10, 20_000
+LEAD = 500 + BLOCK
+TEXT = """\
+name: changed
+device: {kind: simulated_terfenol}
+sample_rate_hz: 10000
+waveform: WAVEFORM
+compensator: COMPENSATOR
+limits: {peak_current_a: PEAK, slew_a_per_s: 1.0e+6, stroke_um: [-75.0, 60.0]}
+"""
+SINE = """{kind: sine, unit: UNIT, amplitude: AMPLITUDE, offset: OFFSET, frequency_hz: HZ,
+  duration_s: 2.0, soft_start_s: 0.5}"""
+MODEL = str(Path(__file__).parents[4] / "configs" / "models" / "terfenol_rdpi.yaml")
+RDPI = terfenol_rdpi()
+LOOKING_AHEAD = StagedModel.around(RDPI, lag=FieldLag(tau_s=2e-3))
+
+
+def experiment_of(model=None, amplitude=4.0, offset=0.0, hz=10.0, peak_a=7.0, limits=""):
+    text = TEXT.replace("WAVEFORM", SINE).replace("UNIT", "A" if model is None else "um")
+    for name, value in {"AMPLITUDE": amplitude, "OFFSET": offset, "HZ": hz, "PEAK": peak_a}.items():
+        text = text.replace(name, str(value))
+    text = text.replace("COMPENSATOR", "none" if model is None else f"{{model: {MODEL}}}")
+    text = text.replace("stroke_um", limits + "stroke_um") + f"block: {BLOCK}\n"
+    loaded = resolve(Document("x.yaml", text), Path())
+    info = replace(DESCRIBED, buffered=True, fifo_depth=1000)
+    return check(replace(loaded, device=DescribedDevice(info), model=model))
+
+
+@pytest.fixture(scope="module")
+def experiment():
+    return experiment_of(RDPI)
+
+
+class Waits:
+    """The time of the changes; each wait calls ``meanwhile``."""
+
+    def __init__(self):
+        self.clock, self.meanwhile = SteppingClock(), lambda: None
+
+    def sleep(self, seconds):
+        self.clock.now += seconds
+        self.meanwhile()
+
+
+@pytest.fixture
+def waits():
+    return Waits()
+
+
+@pytest.fixture
+def changes(experiment, page, waits):
+    return Changes(experiment, page, waits.clock, waits.sleep)
+
+
+def change(changes, gain=None, offset=None, over_s=0.2, inverse=None):
+    return changes.make(gain, offset, over_s, inverse)
+
+
+def take(page, at):
+    """Let the loop take the change on the page, at a sample."""
+    page.put(PageField.NEXT_SAMPLE, at)
+    page.put(PageField.TUNE_TAKEN, page.get(PageField.TUNE_WANTED))
+
+
+def test_a_change_reaches_the_loop_whole(changes, page):
+    assert change(changes, gain=0.5) == {
+        "gain": 0.5,
+        "offset": 0.0,
+        "inverse": "in",
+        "over_s": 0.2,
+        "begins_at_sample": 500 + LEAD,
+    }
+    assert (page.get_float(PageField.TUNE_GAIN), page.get_float(PageField.TUNE_OFFSET)) == (
+        0.5,
+        0.0,
+    )
+    numbers = (PageField.TUNE_SAMPLES, PageField.TUNE_BEGINS_AT, PageField.TUNE_WANTED)
+    assert [page.get(each) for each in numbers] == [2000, 500 + LEAD, 1]
+    assert (changes.gain, changes.offset) == (0.5, 0.0)
+
+
+def test_the_second_of_two_follows_the_first(changes, page, waits):
+    wanted = []
+
+    def meanwhile():
+        wanted.append(page.get(PageField.TUNE_WANTED))
+        if len(wanted) == 3:
+            take(page, 1013)
+
+    change(changes, gain=0.5)
+    waits.meanwhile = meanwhile
+    answer = change(changes, offset=3.0)
+    assert wanted == [1, 1, 1]
+    assert (answer["gain"], answer["offset"]) == (0.5, 3.0)
+    assert answer["begins_at_sample"] == 1020 + LEAD
+    assert page.get(PageField.TUNE_WANTED) == 2
+
+
+def test_a_refusal_changes_nothing_and_the_next_has_its_turn(changes, page):
+    before = bytes(page.numbers)
+    with pytest.raises(InputError, match=r"set: .*limits\.stroke_um"):
+        change(changes, gain=90.0)
+    assert bytes(page.numbers) == before
+    assert change(changes, offset=1.0)["gain"] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("number", "value", "said"),
+    [(PageField.STOP, Stop.CTRL_C, "safe ramp"), (PageField.NEXT_SAMPLE, SAMPLES, "has ended")],
+)
+def test_the_end_of_the_run_refuses_a_change_that_waits(changes, page, waits, number, value, said):
+    change(changes, gain=0.1)
+    waits.meanwhile = lambda: page.put(number, value)
+    for gain in (0.2, 0.3):
+        with pytest.raises(InputError, match=said):
+            change(changes, gain=gain)
+    assert page.get(PageField.TUNE_WANTED) == 1
+
+
+def test_a_loop_that_takes_no_change_is_not_waited_for_without_end(changes, waits):
+    """The client would have given up."""
+    change(changes, gain=0.1)
+    with pytest.raises(InputError, match="previous change"):
+        change(changes, gain=0.2)
+    assert waits.clock.now < client._SET_S
+
+
+def test_a_change_that_could_not_begin_is_refused(changes, page):
+    page.put(PageField.NEXT_SAMPLE, SAMPLES - LEAD)
+    with pytest.raises(InputError, match="before the change could begin"):
+        change(changes, gain=0.5)
+    assert page.get(PageField.TUNE_WANTED) == 0
+
+
+def test_a_queue_that_is_full_takes_no_more(changes, page, waits):
+    refused, made = [], [change(changes, gain=1.0)]
+
+    def meanwhile():
+        if refused:
+            take(page, page.get(PageField.NEXT_SAMPLE))
+            return
+        try:
+            made.append(change(changes, gain=1.0))
+        except InputError as error:
+            refused.append((len(made), str(error)))
+
+    waits.meanwhile = meanwhile
+    made.append(change(changes, gain=1.0))
+    assert len(refused) == 1
+    assert "16 changes are waiting" in refused[0][1]
+    assert len(made) == 17
+
+
+def test_a_change_of_nothing_is_refused(changes):
+    with pytest.raises(InputError, match="gain, offset or inverse is required"):
+        change(changes)
+
+
+def test_the_inverse_goes_out_and_stays_there_until_it_is_wanted_in(changes, page, experiment):
+    line = experiment.forecast.line
+    numbers = [PageField.TUNE_INVERSE_SHARE, PageField.TUNE_LINE_SLOPE, PageField.TUNE_LINE_AT_ZERO]
+    for at, wanted, share in (
+        (2000, {"inverse": "out"}, 0.0),
+        (4000, {"gain": 0.5}, 0.0),
+        (6000, {"inverse": "in"}, 1.0),
+    ):
+        assert change(changes, **wanted)["inverse"] == changes.inverse == ("in" if share else "out")
+        assert [page.get_float(each) for each in numbers] == [share, line.slope, line.at_zero]
+        take(page, at)
+
+
+def test_an_inverse_that_is_not_there_can_not_go_out(page):
+    changes = Changes(experiment_of(), page)
+    with pytest.raises(InputError, match="set: inverse: the experiment has no compensator"):
+        change(changes, inverse="out")
+    assert changes.inverse is None
+    assert page.get(PageField.TUNE_WANTED) == 0
+
+
+@pytest.mark.parametrize(
+    ("gain", "offset", "refused"),
+    [
+        (1.0, 0.0, False),
+        (1.25, 0.0, False),
+        (-1.25, 0.0, False),
+        (1.2501, 0.0, True),
+        (-1.2501, 0.0, True),
+        (1.0, 1.0, False),
+        (1.0, 1.0001, True),
+        (0.0, -5.0, False),
+        (0.0, -5.0001, True),
+        (1e6, 1e6, True),
+    ],
+)
+def test_without_a_model_the_bound_is_exact(gain, offset, refused):
+    made = experiment_of(peak_a=5.0)
+    assert bool(bound_refusal(made, gain, offset, bypassed=False)) == refused
+
+
+def test_the_straight_line_is_bounded_while_it_gives_commands():
+    made = experiment_of(RDPI, 10.0, -10.0, peak_a=5.5)
+    assert bound_refusal(made, 0.3, 30.0, bypassed=False) == ""
+    assert "5.5 A" in bound_refusal(made, 0.3, 30.0, bypassed=True)
+
+
+@pytest.mark.parametrize("model", [RDPI, LOOKING_AHEAD])
+@pytest.mark.parametrize("hz", [2.0, 50.0])
+@pytest.mark.parametrize(
+    ("gain", "offset"), [(1.0, 0.0), (0.3, 5.0), (2.0, 0.0), (-1.5, -3.0), (1.0, 10.0)]
+)
+def test_thecommand_range_is_that_of_a_run_with_the_new_amplitude(model, hz, gain, offset):
+    made = experiment_of(model, 10.0, -10.0, hz)
+    low, high = sorted(gain * end + offset for end in made.reference.span)
+    after = experiment_of(model, abs(gain) * 10.0, gain * -10.0 + offset, hz)
+    line = after.forecast.line
+    known = sorted(line.slope * end + line.at_zero for end in after.reference.span)
+    found = command_range(made, low, high, gain)
+    assert found == pytest.approx(known, abs=0.05 * (known[1] - known[0]))
