@@ -1,17 +1,7 @@
 """Metrics, reports, replays, plots, pages, exports and the catalogue of recordings."""
 
 PUBLIC = (
-    "catalogue",
-    "decimation",
-    "export",
-    "figure_layout",
-    "html",
-    "plot_style",
-    "replay",
-    "report",
-    "report_table",
-    "run_metrics",
-    "run_page",
-    "steady_state",
-)
+    "catalogue", "decimation", "export", "figure_layout", "html", "plot_style", "replay", "report",
+    "report_table", "run_metrics", "run_page", "steady_state",
+)  # fmt: skip
 """Modules that other rooms import; the others are private."""
