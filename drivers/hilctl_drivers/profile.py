@@ -116,11 +116,7 @@ def load_profile(
 
 
 def parse_profile(text: str, where: str) -> BaseProfile:
-    """Return the profile in a YAML text; ``where`` names it in messages.
-
-    Raises:
-        ConfigError: It breaks rules; all are listed.
-    """
+    """Return the profile in a YAML text named ``where``; raise ConfigError with all problems."""
     document = Document(where, text)
     link = document.data.get("link")
     kind = link.get("kind") if isinstance(link, dict) else None

@@ -257,11 +257,7 @@ def _mat_head(name: str, kind: np.dtype[Any], rows: int) -> bytes:
 
 
 def arrow() -> Any:
-    """Return the module pyarrow.
-
-    Raises:
-        InputError: It is not installed.
-    """
+    """Return the module pyarrow; raise InputError if it is not installed."""
     try:
         import pyarrow as pa
     except ImportError:

@@ -155,11 +155,7 @@ def _legend(figure: Figure, drawn_axes: list[Axes], whole_mm: float) -> None:
 
 
 def formats_of(text: str) -> tuple[str, ...]:
-    """Return the formats of a list such as ``svg,pdf``.
-
-    Raises:
-        InputError: A format is unknown.
-    """
+    """Return the formats of a list such as ``svg,pdf``; raise InputError if one is unknown."""
     chosen = tuple(part.strip().lower() for part in text.split(",") if part.strip())
     unknown = [each for each in chosen if each not in FORMATS]
     if unknown or not chosen:

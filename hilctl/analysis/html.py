@@ -72,11 +72,7 @@ _HEAD = """<!DOCTYPE html>
 
 
 def write_page(page: str, path: Path) -> None:
-    """Write a page; an existing file is replaced.
-
-    Raises:
-        InputError: It cannot be written.
-    """
+    """Write a page, also over an existing file; raise InputError if it cannot be written."""
     write_text(path, page, overwrite=True)
 
 

@@ -104,11 +104,7 @@ def misses(recording: Recording, ticks: int) -> str:
 
 
 def counter(recording: Recording, name: str, otherwise: int | None) -> int | None:
-    """Return a counter from the metadata of the end, or a default.
-
-    Raises:
-        DataError: It is not a whole number.
-    """
+    """Return a counter of the end, or a default; raise DataError if it is not a whole number."""
     if name not in recording.end:
         return otherwise
     try:

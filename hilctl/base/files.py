@@ -48,11 +48,7 @@ MAX_TEXT_BYTES = 16 * 1024**2
 
 
 def read_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
-    """Return a file's text.
-
-    Raises:
-        InputError: See :func:`read_bytes`; or the file is not UTF-8.
-    """
+    """Return the text of a UTF-8 file; raise InputError as :func:`read_bytes` does."""
     try:
         return read_bytes(path, max_bytes).decode("utf-8").replace("\r\n", "\n").replace("\r", "\n")
     except UnicodeDecodeError:
@@ -206,11 +202,7 @@ def already_there(path: Path, remedy: str) -> InputError:
 
 
 def write_file(path: Path, write: Callable[[BinaryIO], object], *, overwrite: bool) -> None:
-    """Write a file atomically.
-
-    Raises:
-        InputError: A file of that name exists, or it cannot be written.
-    """
+    """Write a file atomically; raise InputError if it exists or cannot be written."""
     with _written(path, overwrite=overwrite) as file:
         write(file.stream)
         file.commit()

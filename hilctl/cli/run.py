@@ -34,11 +34,11 @@ from hilctl.loop.safe_output import describe
 from hilctl.machine.checks import log_out
 from hilctl.machine.procfs import Machine
 from hilctl.run.control.client import finish_dead_runs
-from hilctl.run.detached import start_detached
 from hilctl.run.result import Progress as RunProgress
 from hilctl.run.result import RunResult
 from hilctl.run.run_folder import facts_of, require_linux
 from hilctl.run.safety.manual_safe import put_safe
+from hilctl.run.start import start_detached
 
 _log = logging.getLogger(__name__)
 

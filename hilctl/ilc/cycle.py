@@ -62,11 +62,7 @@ class CycleScore:
 
 
 def cycle_error(recording: Recording, segment: Segment, highest_hz: float) -> CycleScore:
-    """Return the error of the steady cycles of a segment.
-
-    Raises:
-        DataError: It has fewer than two whole steady cycles, or no motion.
-    """
+    """Return the error of a segment; raise DataError without motion or two whole steady cycles."""
     part = steady_part(recording, segment)
     if part.cycle is None or part.cycles < _FEWEST_CYCLES:
         rule = f"{segment.label}: needs at least {_FEWEST_CYCLES} whole steady cycles"

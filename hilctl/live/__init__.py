@@ -8,7 +8,7 @@ traces.py        signals that are shown
 scope.py         time windows and hysteresis loops; minimum and maximum per bucket of samples
 live_metrics.py  running metrics, use of each limit
 frame_codec.py   frames for a page and for programs
-server.py, auth.py, page_session.py  the page on loopback, authentication, session of one page
+server.py, page_session.py  the page on loopback, with authentication; session of one page
 foxglove.py      server for Foxglove and compatible applications
 server_process.py  server processes
 """

@@ -53,11 +53,7 @@ class Compensator:
         return self._operator.state(out)
 
     def restore(self, state: F64) -> None:
-        """Restore a state that :meth:`state` returned.
-
-        Raises:
-            ModelError: The state belongs to another model.
-        """
+        """Restore a state of :meth:`state`; raise ModelError if it is of another model."""
         if self._operator is not None:
             self._operator.restore(state)
         elif state.size:

@@ -46,11 +46,7 @@ class Machine:
         return self.root / name.lstrip("/")
 
     def read(self, name: str) -> str:
-        """Return the text of a file, such as ``/proc/version``.
-
-        Raises:
-            OSError: It cannot be read.
-        """
+        """Return the text of a file, such as ``/proc/version``; raise OSError if unreadable."""
         return self.path(name).read_text(encoding="utf-8", errors="replace").strip()
 
     def text(self, name: str) -> str | None:

@@ -105,11 +105,7 @@ class Operator:
         return out
 
     def restore(self, state: F64) -> None:
-        """Restore a state from :meth:`state`.
-
-        Raises:
-            ModelError: The state belongs to another model.
-        """
+        """Restore a state of :meth:`state`; raise ModelError if it is of another model."""
         if state.shape != self._memory.shape:
             raise ModelError(
                 f"state must have {self._memory.size} values, as this model's memory has: "
@@ -216,11 +212,7 @@ class HysteresisModel(CheckedModel, ABC):
 
     @abstractmethod
     def inverse(self, sample_rate_hz: float) -> Operator:
-        """Return the operator from displacement in um to command, at rest.
-
-        Raises:
-            ModelError: A condition for the inverse is broken.
-        """
+        """Return the operator from um to command, at rest; raise ModelError if there is none."""
 
     @property
     @abstractmethod

@@ -235,11 +235,7 @@ class FurtherMode(StrictModel):
         return Operator.bound(mode_block, (self._parameters(sample_rate_hz),), 2)
 
     def inverse(self, sample_rate_hz: float) -> Operator:
-        """Return the exact inverse of :meth:`forward`.
-
-        Raises:
-            ModelError: The sample rate is too low: the inverse would be unstable.
-        """
+        """Return the exact inverse; raise ModelError if it is unstable at this sample rate."""
         parameters = self._parameters(sample_rate_hz)
         if not _decay(parameters) < 1.0:
             raise ModelError(

@@ -29,11 +29,7 @@ def load_model(path: Path, files: TextFiles | None = None) -> HysteresisModel:
 
 
 def parse_model(name: str, text: str) -> HysteresisModel:
-    """Read a model from a YAML text, for example a recording's attachment.
-
-    Raises:
-        ConfigError: See :func:`load_model`.
-    """
+    """Read a model from a YAML text; raise ConfigError as :func:`load_model` does."""
     return Document(name, text).validate(ModelFile).model
 
 

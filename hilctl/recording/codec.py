@@ -109,11 +109,7 @@ def encode_ticks(columns: Mapping[str, I64]) -> bytes:
 
 
 def decode_ticks(data: bytes) -> Ticks:
-    """Return the content of a ``TickBlock``; its columns may differ in length.
-
-    Raises:
-        DecodeError: The bytes are not a message.
-    """
+    """Return a ``TickBlock``, with columns of any lengths; raise DecodeError if it is none."""
     message: Any = _TICKS.FromString(data)
     first, *others = (getattr(message, name) for name in TICK_COLUMNS)
     # An index beyond int64 stays too large for any run.

@@ -37,11 +37,7 @@ class TimeRange:
     to_s: float | None = None
 
     def samples(self, sample_rate_hz: float) -> tuple[int, int]:
-        """Return the index of the first sample at ``from_s`` or later, and of that at ``to_s``.
-
-        Raises:
-            DataError: A time is not a finite number.
-        """
+        """Return the first samples at both times or later; raise DataError if one is not finite."""
         start = 0 if self.from_s is None else _first_at_or_after(self.from_s, sample_rate_hz)
         stop = LAST_SAMPLE if self.to_s is None else _first_at_or_after(self.to_s, sample_rate_hz)
         return start, stop

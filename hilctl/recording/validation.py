@@ -224,11 +224,7 @@ class MessageValidator:
 
 
 def labels_of(facts: Mapping[str, str]) -> dict[str, LabelValue]:
-    """Return the labels of a run; none if the fact is missing.
-
-    Raises:
-        ValueError: They are not a JSON object of texts and finite numbers.
-    """
+    """Return the labels of a run, if any; raise ValueError unless texts and finite numbers."""
     text = facts.get(LABELS_FACT, "{}")
     try:
         labels = json.loads(text)
@@ -246,11 +242,7 @@ def _is_label(value: object) -> bool:
 
 
 def number_of(facts: Mapping[str, str], name: str, low: float, high: float) -> float:
-    """Return a number.
-
-    Raises:
-        ValueError: It is missing, not a number, or outside ``low`` to ``high``.
-    """
+    """Return a number; raise ValueError if it is missing or outside ``low`` to ``high``."""
     if name not in facts:
         raise ValueError(f"{name} is missing")
     text = facts[name]
@@ -264,11 +256,7 @@ def number_of(facts: Mapping[str, str], name: str, low: float, high: float) -> f
 
 
 def count_of(facts: Mapping[str, str], name: str) -> int:
-    """Return a count of samples; 0 if it is missing.
-
-    Raises:
-        ValueError: It is not a whole number.
-    """
+    """Return a count of samples, 0 if missing; raise ValueError if it is not a whole number."""
     text = facts.get(name, "0")
     if not (text.isascii() and text.isdecimal() and len(text) <= _MOST_DIGITS):
         raise ValueError(f"{name} must be a whole number, got {short(text)}")

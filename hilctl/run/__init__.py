@@ -1,8 +1,6 @@
 """The processes around one loop: start, shared memory, recording, requests, recovery.
 
 start.py         from an experiment file to a finished run; runs that are steps of a study
-own_process.py   a run in a separate process, for programs with threads
-detached.py      a run in the background
 supervisor.py    starts loop, guardian and recorder, and monitors the run to its end
 processes.py     loop and guardian as child processes
 loop_process.py  the loop process, and its side of the shared memory
@@ -21,7 +19,7 @@ control/         requests to a supervisor: client, socket, validation, changes
 """
 
 PUBLIC = (
-    "assemble", "control.client", "detached", "metadata", "probe", "recovery", "result",
+    "assemble", "control.client", "metadata", "probe", "recovery", "result",
     "run_folder", "safety.manual_safe", "shared.ring", "shared.shared_page", "start", "unpaced",
 )  # fmt: skip
 """Modules that other rooms import; the others are private."""

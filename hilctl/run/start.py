@@ -1,24 +1,37 @@
-"""From an experiment file to a finished run, in real time or not; identity of a run."""
+"""From an experiment file to a finished run: in real time or not, or in another process.
+
+A run in the background is ``hilctl run`` in its own session. A program with threads, such as a
+notebook, runs in a separate process: the supervisor handles signals, which only a main thread may
+do, and starts processes, whose priority other threads must not affect. Progress and result come
+back through a pipe.
+"""
 
 import logging
 import os
+import pickle
+import signal
+import subprocess
+import sys
+import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self, TypeAlias
+from types import FrameType
+from typing import Any, BinaryIO, Self, TypeAlias
 
-from hilctl.base.errors import DataError, RunError
+from hilctl.base.errors import DataError, HilctlError, InputError, RunError
 from hilctl.base.files import check_no_input, make_folder
 from hilctl.experiment.correction import dump_correction
 from hilctl.experiment.load import LoadedExperiment, input_files, load_experiment
 from hilctl.experiment.preflight import CheckedExperiment, check
 from hilctl.models.model_file import dump_model
 from hilctl.recording.run_summary import read_ends
+from hilctl.run.control.client import HANG_UP, ask, request
 from hilctl.run.metadata import experiment_sha256, sha256_of
-from hilctl.run.own_process import has_threads, run_in_own_process
 from hilctl.run.result import Progress, RunResult
-from hilctl.run.run_folder import require_linux
+from hilctl.run.run_folder import RunFolder, require_linux, runs
 from hilctl.run.unpaced import run_unpaced
 
 _log = logging.getLogger(__name__)
@@ -87,13 +100,16 @@ def start_run(
 
 def default_output(name: str, folder: Path, now: time.struct_time) -> Path:
     """Return the default file name of a recording: ``folder/name-date-time.mcap``."""
-    stamp = time.strftime("%Y%m%d-%H%M%S", now)
-    candidate = folder / f"{name}-{stamp}.mcap"
-    number = 2
-    while os.path.lexists(candidate):
-        candidate = folder / f"{name}-{stamp}-{number}.mcap"
+    return unused(folder / f"{name}-{time.strftime('%Y%m%d-%H%M%S', now)}.mcap", "-")
+
+
+def unused(path: Path, mark: str) -> Path:
+    """Return a path, with ``mark`` and a number after its stem if it exists."""
+    found, number = path, 2
+    while os.path.lexists(found):  # also true of a broken link
+        found = path.with_stem(f"{path.stem}{mark}{number}")
         number += 1
-    return candidate
+    return found
 
 
 def paced(
@@ -165,3 +181,183 @@ def completed_key(path: Path) -> RunKey | None:
     except DataError:
         return None
     return RunKey.of_facts(ends.run) if ends.end.get("code") == "completed" else None
+
+
+Given = tuple[Path, Sequence[str], Path | None, bool, float]
+"""Experiment file, settings, recording, whether it may be replaced, and heat of the coil."""
+
+_START = (
+    # Until the supervisor handles signals: nothing has moved.
+    "import signal, sys; signal.signal(signal.SIGINT, signal.SIG_DFL)\n"
+    "from hilctl.run.start import main; main(int(sys.argv[1]))"
+)
+_FORWARDED = (signal.SIGINT, signal.SIGTERM, HANG_UP)
+
+
+def has_threads() -> bool:
+    """Return whether this program has other threads, or the caller is not its main one."""
+    here = threading.current_thread()
+    return threading.active_count() > 1 or here is not threading.main_thread()
+
+
+def run_in_own_process(given: Given, on_progress: Callable[[Progress], None]) -> RunResult:
+    """Run an experiment in a separate process; return the result. The run stops with this process.
+
+    Raises:
+        HilctlError: Error of the run.
+        RunError: Its process ended without a result.
+        KeyboardInterrupt: It was interrupted before anything moved.
+    """
+    read_end, write_end = os.pipe()
+    with os.fdopen(read_end, "rb") as answers:
+        try:
+            process = subprocess.Popen(
+                # -P: import nothing from the working folder.
+                [sys.executable, "-P", "-c", _START, str(write_end)],
+                stdin=subprocess.PIPE,
+                pass_fds=(write_end,),
+                start_new_session=True,  # Ctrl-C is forwarded once
+            )
+        finally:
+            os.close(write_end)
+        with process, _forwarded(process):
+            assert process.stdin is not None
+            with suppress(BrokenPipeError), process.stdin:  # it has ended
+                pickle.dump(given, process.stdin)
+            answer = _answer(answers, on_progress)
+    if isinstance(answer, HilctlError):
+        raise answer
+    if process.returncode == -signal.SIGINT:
+        raise KeyboardInterrupt
+    if answer is None:
+        raise RunError(
+            f"the process of the run ended with code {process.returncode} and without a result: "
+            "check the output, and the recording with hilctl list"
+        )
+    return answer
+
+
+def _answer(
+    answers: BinaryIO, on_progress: Callable[[Progress], None]
+) -> RunResult | HilctlError | None:
+    """Pass progress on until the result arrives; return it, or None without one."""
+    while True:
+        try:
+            answer: Progress | RunResult | HilctlError = pickle.load(answers)  # noqa: S301  our own
+        except (EOFError, pickle.UnpicklingError):
+            return None
+        if not isinstance(answer, Progress):
+            return answer
+        try:
+            on_progress(answer)
+        except Exception:  # noqa: BLE001  an error of the display must not end the run
+            _log.exception("progress is no longer reported")
+            on_progress = lambda _: None  # noqa: E731
+
+
+@contextmanager
+def _forwarded(process: "subprocess.Popen[bytes]") -> Iterator[None]:
+    """Forward stop signals to the process if this is the main thread."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def forward(number: int, frame: FrameType | None) -> None:
+        process.send_signal(number)
+
+    before = {number: signal.signal(number, forward) for number in _FORWARDED}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            if handler is not None:  # None: not set by Python
+                signal.signal(number, handler)
+
+
+def main(descriptor: int) -> None:
+    """Run the job from standard input; write progress and result to a descriptor."""
+    given: Given = pickle.load(sys.stdin.buffer)  # noqa: S301  from the parent process
+    lock = threading.Lock()
+    with os.fdopen(descriptor, "wb") as answers:
+
+        def send(answer: Any) -> None:
+            with lock:
+                pickle.dump(answer, answers)
+                answers.flush()
+
+        def show(progress: Progress) -> None:
+            try:
+                send(progress)
+            except OSError:  # the parent process has ended
+                os.kill(os.getpid(), signal.SIGTERM)
+
+        file, settings, output, overwrite, heat_a2 = given
+        try:
+            send(start_run(file, settings, output, overwrite, show, heat_a2))
+        except HilctlError as error:
+            send(error)
+
+
+_POLL_S = 0.05
+_ANSWER_S = 0.5
+_START_S = 180.0
+
+
+@dataclass(frozen=True, slots=True)
+class Detached:
+    """A run in the background; ``run`` is None if it has completed already."""
+
+    run: RunFolder | None
+    recording: Path
+    log: Path
+
+
+def start_detached(
+    experiment: Path, settings: Sequence[str], output: Path | None, flags: Sequence[str]
+) -> Detached:
+    """Start ``hilctl run`` in the background; return once its loop runs, or raise its error."""
+    require_linux()
+    checked = checked_experiment(experiment, settings)
+    output = output_of(checked, output)
+    log = unused(output.with_suffix(".log"), ".")
+    command = [sys.executable, "-P", "-m", "hilctl", "run", str(experiment), *flags]
+    command += ["--output", str(output)]
+    command += [word for setting in settings for word in ("--set", setting)]
+    try:
+        with log.open("xb") as stream:
+            process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=stream,
+                stderr=stream,
+                start_new_session=True,  # unaffected by Ctrl-C and the end of the terminal
+            )
+    except OSError as error:
+        raise InputError(f"{log}: cannot write: {error.strerror}") from None
+    return Detached(_await_running(process, log), output, log)
+
+
+def _await_running(process: "subprocess.Popen[bytes]", log: Path) -> RunFolder | None:
+    deadline = time.monotonic() + _START_S
+    while process.poll() is None:
+        for run in runs():
+            if run.card.supervisor == process.pid and _has_started(run):
+                return run
+        if time.monotonic() > deadline:
+            process.terminate()
+            raise RunError(f"the run did not start within {_START_S:g} s: see {log}")
+        time.sleep(_POLL_S)
+    if process.returncode == 0:
+        return None
+    said = log.read_text(encoding="utf-8", errors="replace").strip()
+    text = said.replace("hilctl: ", "") or f"the run ended with exit code {process.returncode}"
+    raise InputError(text) if process.returncode == 2 else RunError(text)
+
+
+def _has_started(run: RunFolder) -> bool:
+    try:
+        # The socket exists before the device is open, but answers only after the start.
+        state = ask(run.socket, request("status"), timeout_s=_ANSWER_S)["state"]
+    except HilctlError:
+        return False
+    return state not in {"starting", "ready"}

@@ -21,21 +21,13 @@ _LONGEST_PERIOD = 2**31  # samples; products must fit an integer
 
 
 def sample_count(duration_s: float, sample_rate_hz: float) -> int:
-    """Return the samples of a duration, at least one.
-
-    Raises:
-        InputError: There are more than :data:`MAX_SAMPLES`.
-    """
+    """Return the samples of a duration, at least 1; raise InputError beyond :data:`MAX_SAMPLES`."""
     check_length(duration_s * sample_rate_hz)
     return max(1, round(duration_s * sample_rate_hz))
 
 
 def check_length(samples: float) -> None:
-    """Reject a waveform that is too long.
-
-    Raises:
-        InputError: There are more than :data:`MAX_SAMPLES`.
-    """
+    """Raise InputError if a waveform has more than :data:`MAX_SAMPLES`."""
     if samples > MAX_SAMPLES:
         raise InputError(
             f"has {samples:.10g} samples, more than the {MAX_SAMPLES} that fit in memory: "

@@ -60,11 +60,7 @@ class LineFormat:
     size_max: int = 255  # bytes without the terminator
 
     def encode(self, text: str) -> bytes:
-        """Return a line.
-
-        Raises:
-            BadRequestError: Empty, too long, or more than printable ASCII.
-        """
+        """Return a line; raise BadRequestError unless printable ASCII of good length."""
         if not text or not _is_text(text):
             raise BadRequestError(f"a line must be printable ASCII, got {text!r}")
         body = text.encode("ascii")
@@ -205,11 +201,7 @@ class AsciiSession:
         return parse_number(self.query(self.text(query.ask), query.pattern)[1])
 
     def run(self, steps: Sequence[AsciiStep], **values: float) -> None:
-        """Execute a profile's steps, with ``values`` for ``timeout`` and ``safe``.
-
-        Raises:
-            DeviceError: One of them failed; the message has its note.
-        """
+        """Execute steps with ``timeout`` and ``safe``; raise DeviceError if one fails."""
         for step in steps:
             try:
                 self._step(step, values)

@@ -207,11 +207,7 @@ class BoardSession:
         return Readings(first, self.inputs.decode(rest[:size]), level, underruns)
 
     def set_watchdog(self, timeout_s: float, safe: float) -> None:
-        """Arm the watchdog, which also clears a trip; 0 s disarms it.
-
-        Raises:
-            DeviceError: The board did not accept it.
-        """
+        """Arm the watchdog and clear a trip; 0 s disarms it. Raise DeviceError if refused."""
         timeout_ms = round(timeout_s * 1e3)
         body = board.WATCHDOG_FIELDS.pack(timeout_ms) + self.outputs.encode(np.array([safe]))
         (taken_ms,), _ = self.ask(board.WATCHDOG, body, board.WATCHDOG_FIELDS)

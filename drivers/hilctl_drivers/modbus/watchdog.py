@@ -44,11 +44,7 @@ class ModbusWatchdogDriver:
         put()
 
     def end_trip(self, session: ModbusSession) -> None:
-        """End a trip of an earlier run, with the output where the trip has put it.
-
-        Raises:
-            DeviceError: A step failed, or that value is unknown.
-        """
+        """End a trip with the output unchanged; raise DeviceError if a step fails."""
         if self._has == "none" or not self._has.clear or not self._tripped(session):
             return
         if self._has.on_trip == "hold":

@@ -40,11 +40,7 @@ class Link(Protocol):
     """A connection to a device."""
 
     def open(self) -> None:
-        """Connect.
-
-        Raises:
-            LostError: No device answers, or the port is in use.
-        """
+        """Connect; raise LostError if no device answers, or the port is in use."""
         ...
 
     def transact(

@@ -268,11 +268,7 @@ def write_sheets(
     on_done: OnRead = lambda done, text: None,
     on_drawn: Callable[[str, Figure], None] = lambda name, figure: None,
 ) -> dict[Path, str]:
-    """Write figures in several formats; return the files, each with its caption.
-
-    Raises:
-        InputError: A file exists or can't be written.
-    """
+    """Write figures; return files with captions. Raise InputError if one exists or fails."""
     names = [folder / f"{sheet.name}.{each}" for sheet in sheets for each in formats]
     taken = [path for path in names if path.exists()]
     if taken and not overwrite:

@@ -15,7 +15,6 @@ import pytest
 
 from hilctl.base.errors import InputError, RunError
 from hilctl.run import run_folder as run_folder_module
-from hilctl.run.detached import start_detached
 from hilctl.run.run_folder import (
     base_folder,
     held_devices,
@@ -25,7 +24,7 @@ from hilctl.run.run_folder import (
     runs,
     taken_over,
 )
-from hilctl.run.start import checked_experiment, start_run
+from hilctl.run.start import checked_experiment, start_detached, start_run
 
 
 @pytest.fixture(autouse=True)
