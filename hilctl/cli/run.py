@@ -227,10 +227,12 @@ def print_run(result: RunResult, report: RunReport | None) -> None:
 
 def render_report(report: RunReport) -> Group:
     """Return the tables of a report; the segments have their own if there are several."""
-    quality = _two_columns(printable(report.name) or "run", quality_rows(report))
-    parts = [quality, _two_columns("", run_rows(report))]
-    if len(report.segments) > 1:
-        parts.append(_segments(report))
+    quality, rows, (headings, cells) = quality_rows(report), run_rows(report), segment_table(report)
+    parts = [_two_columns(printable(report.name) or "run", quality), _two_columns("", rows)]
+    if len(cells) > 1:
+        shown = [i for i, heading in enumerate(headings) if heading not in _PAGE_ONLY]
+        cells = [[row[i] for i in shown] for row in cells]
+        parts.append(table("segments, worst first", [headings[i] for i in shown], cells))
     if len(report.lateness_by_minute) > 1:
         parts.append(_minutes(report))
     return Group(*parts)
@@ -240,13 +242,6 @@ def _two_columns(title: str, rows: Sequence[tuple[str, str]]) -> Table:
     made = table(title, ("", ""), rows, left={""}, wrap=True)
     made.show_header, made.columns[0].style, made.columns[0].no_wrap = False, "bold", True
     return made
-
-
-def _segments(report: RunReport) -> Table:
-    headings, rows = segment_table(report)
-    shown = [i for i, heading in enumerate(headings) if heading not in _PAGE_ONLY]
-    cells = [[row[i] for i in shown] for row in rows]
-    return table("segments, worst first", [headings[i] for i in shown], cells)
 
 
 def _minutes(report: RunReport) -> Table:

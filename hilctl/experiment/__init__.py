@@ -8,8 +8,7 @@ device_rules.py   rules between an experiment and its device
 conditioning.py, feedback_checks.py, adaptation_bounds.py  rules and settings by section
 model_validity.py comparison of the reference with the motions the model was identified on
 forecast.py       the commands of a run in numbers
-initial_state.py  initial state of the compensator
-device_state.py   the last run of each device, between runs
+device_state.py   the last run of each device, and the initial state of the compensator
 coil_heat.py      heat of the coil through runs and pauses
 correction.py     correction by iterative learning
 template.py       a first experiment for a device
@@ -18,7 +17,7 @@ examples.py       shipped examples and copies of them
 
 PUBLIC = (
     "adaptation_bounds", "coil_heat", "conditioning", "correction", "device_rules", "device_state",
-    "devices", "examples", "feedback_checks", "file", "forecast", "initial_state", "load",
+    "devices", "examples", "feedback_checks", "file", "forecast", "load",
     "model_validity", "preflight", "sections", "template",
 )  # fmt: skip
 """Modules that other rooms import; the others are private."""

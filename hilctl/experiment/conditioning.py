@@ -77,10 +77,10 @@ def condition_problems(loaded: LoadedExperiment) -> Iterator[ConfigProblem]:
 
 def _room(config: Experiment) -> tuple[float, float]:
     """Return the amplitudes below and above the safe value, in the command's unit."""
-    condition, limits = config.condition, config.command_limits()
+    condition, safe, (low, high) = config.condition, config.safe.value, config.limits.command_range
     assert condition is not None
     given = condition.amplitude_a or condition.amplitude_v or math.inf
-    return min(given, limits.safe - limits.low), min(given, limits.high - limits.safe)
+    return min(given, safe - low), min(given, high - safe)
 
 
 def _highest_hz(config: Experiment) -> float:

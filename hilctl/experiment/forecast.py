@@ -13,8 +13,8 @@ import numpy as np
 
 from hilctl.base.types import CHUNK, F64
 from hilctl.experiment.coil_heat import CoilHeat, RunHeat
+from hilctl.experiment.device_state import CompensatorStart
 from hilctl.experiment.file import Experiment
-from hilctl.experiment.initial_state import CompensatorStart
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.tuning import LinearBypass
@@ -56,12 +56,13 @@ class Forecast:
     recording_mb: float  # approximate size of the recording
     highest_rate_hz: float
     rate_note: str  # reason for the highest rate; may be empty
+    first_command: float  # of the waveform
     line: LinearBypass | None  # replacement of a bypassed inverse; None if there is none
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the fields for the user as plain values."""
         mapping = asdict(self)
-        del mapping["heat"], mapping["line"]  # intermediate results
+        del mapping["heat"], mapping["first_command"], mapping["line"]  # intermediate results
         return mapping
 
 
@@ -118,6 +119,7 @@ def forecast_of(
         recording_mb=_recording_bytes(config, reference, conditioned.size) * 1e-6,
         highest_rate_hz=info.max_rate_hz,
         rate_note=info.rate_note,
+        first_command=figures.first,
         line=None if loaded.model is None else figures.ends.line(),
     )
 
@@ -240,6 +242,7 @@ class _RunFigures:
         self.heat = RunHeat()
         self.ends = LineEnds()
         self._limits, self._rate_hz = config.limits, config.sample_rate_hz
+        self.first = math.nan
         self._marked = 0.0, 0.0
 
     def add_before(self, command: F64) -> None:
@@ -249,6 +252,8 @@ class _RunFigures:
 
     def add(self, reference: F64, command: F64) -> None:
         """Add the next samples: float64[n] each, n > 0."""
+        if math.isnan(self.first):
+            self.first = float(command[0])
         self.add_before(command)
         self.ends.add(reference, command)
 

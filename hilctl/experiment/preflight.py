@@ -25,20 +25,20 @@ from hilctl.experiment.adaptation_bounds import (
 from hilctl.experiment.coil_heat import CoolingCoil
 from hilctl.experiment.conditioning import condition_problems, conditioning_of, measures_offset
 from hilctl.experiment.device_rules import device_problems, interlock_problems, pace_warnings
-from hilctl.experiment.device_state import heat_before, left_by_last_run
-from hilctl.experiment.feedback_checks import feedback_problems
-from hilctl.experiment.forecast import Forecast, forecast_of
-from hilctl.experiment.initial_state import (
+from hilctl.experiment.device_state import (
     CompensatorStart,
     InitialState,
     begin,
+    heat_before,
     initial_state_after,
     left_by,
+    left_by_last_run,
 )
+from hilctl.experiment.feedback_checks import feedback_problems
+from hilctl.experiment.forecast import Forecast, forecast_of
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.experiment.model_validity import RangeFindings, range_findings
 from hilctl.loop.adaptation import DisplacementOperator
-from hilctl.loop.compensator import Compensator
 from hilctl.loop.lead_in import Conditioning
 from hilctl.waveforms.build import Reference, build
 
@@ -197,20 +197,15 @@ def _start_problems(
     model, config, rate_hz = loaded.model, loaded.config, loaded.config.sample_rate_hz
     if model is None or not config.limits.slew_per_s < forecast.slew_per_s < math.inf:
         return []
-    compensator = Compensator(model, rate_hz)
-    if begun.state is not None:
-        compensator.restore(begun.state)
-    first = np.empty(1)
-    compensator.process(np.array(begun.input_um[:1]), first)
-    safe, unit = config.safe.value, config.limits.unit
-    step = abs(float(first[0]) - safe) * rate_hz
+    first, safe, unit = forecast.first_command, config.safe.value, config.limits.unit
+    step = abs(first - safe) * rate_hz
     if not config.limits.slew_per_s < step or not forecast.slew_per_s <= step * (1.0 + 1e-9):
         return []
     still = model.forward(rate_hz).process(np.full(max(round(STILL_S * rate_hz), 1), safe))
     rests_um = float(still[-1])
     rule = f"must begin where the actuator rests at {safe:g} {unit}, {rests_um:.4g} µm by the model"
     hint = (
-        f"its first command would step to {float(first[0]):.4g} {unit}: set waveform.offset, and "
+        f"its first command would step to {first:.4g} {unit}: set waveform.offset, and "
         "leave out the soft start, which begins at 0 µm"
     )
     value = f"{float(begun.input_um[:1][0]):.4g} µm"

@@ -24,7 +24,7 @@ import numpy as np
 
 from hilctl.base.types import F64
 from hilctl.experiment.conditioning import conditioning_of
-from hilctl.experiment.initial_state import InitialState, begin, left_by
+from hilctl.experiment.device_state import InitialState, begin, left_by
 from hilctl.experiment.load import LoadedExperiment, load_experiment
 from hilctl.identify.data.records import History
 from hilctl.identify.fit_api import FitRequest

@@ -36,7 +36,7 @@ from hilctl.analysis.run_page import page
 from hilctl.base.errors import ConfigError, HilctlError
 from hilctl.base.segments import Segment
 from hilctl.cli.reports import render_report
-from hilctl.experiment.initial_state import initial_state_after
+from hilctl.experiment.device_state import initial_state_after
 from hilctl.identify.data.cycles import loops_from_recording
 from hilctl.identify.data.data_files import history_from_pieces
 from hilctl.kernels.hysteresis import play_sum

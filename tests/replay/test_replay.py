@@ -14,7 +14,7 @@ from hilctl.analysis.report import summarize
 from hilctl.base.errors import DataError
 from hilctl.base.events import OFFSET
 from hilctl.base.samples import Flag
-from hilctl.experiment.initial_state import initial_state_after
+from hilctl.experiment.device_state import initial_state_after
 from hilctl.loop.compensator import Compensator
 from hilctl.models.base import HysteresisModel
 from hilctl.models.linear_stages import FirstMode

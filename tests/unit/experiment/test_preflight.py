@@ -14,8 +14,8 @@ from hilctl.base.yaml import Document
 from hilctl.experiment import preflight as module
 from hilctl.experiment.coil_heat import RunHeat
 from hilctl.experiment.correction import Correction, LearnedCycle, model_sha256, signature
+from hilctl.experiment.device_state import InitialState
 from hilctl.experiment.file import CompensatorConfig
-from hilctl.experiment.initial_state import InitialState
 from hilctl.experiment.load import resolve
 from hilctl.experiment.preflight import check, command_problems
 from hilctl.models.base import HysteresisModel, IdentifiedRange, Operator, Provenance

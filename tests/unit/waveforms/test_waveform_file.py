@@ -13,7 +13,7 @@ from hilctl.base.segments import Segment
 from hilctl.base.types import F64
 from hilctl.waveforms import shapes
 from hilctl.waveforms.build import Reference
-from tests.unit.experiment.test_initial_state import write_recording
+from tests.unit.experiment.test_device_state import write_recording
 
 RATE_HZ = 1000.0
 WAVE = np.round(3.0 * np.sin(2.0 * np.pi * 10.0 * np.arange(200) / RATE_HZ), 6)
