@@ -6,7 +6,6 @@ from typing import Any
 
 
 def typed(*words: object) -> list[str]:
-    """Return the words of a command of hilctl."""
     return [sys.executable, "-P", "-m", "hilctl", *map(str, words)]
 
 
@@ -20,5 +19,4 @@ def ended(command: list[str], code: int = 0, **options: Any) -> subprocess.Compl
 
 
 def hilctl(*words: object, code: int = 0, **options: Any) -> subprocess.CompletedProcess[str]:
-    """Run a command of hilctl to its end."""
     return ended(typed(*words), code, **options)

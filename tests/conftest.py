@@ -97,7 +97,6 @@ def pytest_report_collectionfinish(config, items):
 
 @pytest.fixture(scope="session")
 def memory():
-    """A folder in memory for this session."""
     with tempfile.TemporaryDirectory(prefix="hilctl-tests-", dir=memory_folder()) as folder:
         yield Path(folder)
 
@@ -122,7 +121,6 @@ class LogRecords(logging.Handler):
 
 @pytest.fixture
 def caplog():
-    """Log records of a test."""
     handler = LogRecords()
     logging.getLogger().addHandler(handler)
     yield handler

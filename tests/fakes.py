@@ -30,13 +30,10 @@ from hilctl_drivers.profile import load_profile
 from hilctl_drivers.transport.links import LostError, NoAnswerError
 
 T7_OPTIONS = {
-    "profile": "labjack_t7",
-    "output": "DAC0",
-    "input": "AIN0",
-    "amplifier": {"gain_a_per_v": 4.0, "offset_a": -10.0},
-    "sensor": {"um_per_v": 12.5},
+    "profile": "labjack_t7", "output": "DAC0", "input": "AIN0",
+    "amplifier": {"gain_a_per_v": 4.0, "offset_a": -10.0}, "sensor": {"um_per_v": 12.5},
     "watchdog": "none",
-}
+}  # fmt: skip
 """Options of a LabJack T7, without its address."""
 
 
@@ -251,7 +248,6 @@ class FakeHost:
 
 
 def made_block(block=1, state_size=1, fill=np.nan):
-    """Return a new block."""
     area = BlockBatch.empty(1, block, state_size)
     area.columns[:] = fill
     return Block(area.heads[0].data.cast("B").cast("q"), area, 0)
@@ -277,7 +273,6 @@ class RigInterlocks:
     tracking_s: float | None = None
 
     def made(self, sample_rate_hz):
-        """Return the interlocks."""
         return Interlocks(self.context, self.settings, sample_rate_hz)
 
     @property

@@ -200,7 +200,6 @@ class AttackedRun:
         return [each for each in found if each != self.emulator.pid]
 
     def close(self) -> None:
-        """Kill all that is left of it."""
         for each in [*self.processes(), self.emulator.pid]:
             with suppress(ProcessLookupError):
                 os.kill(each, signal.SIGKILL)
@@ -244,7 +243,6 @@ class DeviceLog:
         return np.abs(self.current_a) > _TOLERANCE_A
 
     def at(self, time_ns: int) -> float:
-        """Return the output at a time."""
         before = int(np.searchsorted(self.times_ns, time_ns, side="right"))
         return float(self.current_a[before - 1]) if before else self.start_a
 

@@ -107,7 +107,6 @@ def _said_safe(run: AttackedRun) -> tuple[bool, int]:
 
 
 def print_table(found: list[Trial]) -> None:
-    """Print a line for each wire and kind."""
     print(f"{'trial':<16} runs  said safe  wrongly  latest after the return")
     for name, group in itertools.groupby(sorted(found, key=lambda e: e.name), lambda e: e.name):
         rows = list(group)

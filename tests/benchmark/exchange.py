@@ -194,7 +194,6 @@ def use_fifo() -> str:
 
 
 def over_tcp(folder: Path, server: Path, library: Path, options: argparse.Namespace) -> float:
-    """Compare over TCP on loopback."""
     with serving(server, "tcp") as port:
         ours = driver_batch(folder, "{kind: tcp}", host="127.0.0.1", tcp_port=int(port))
         return compare("TCP", ours, c_batch(library, "client_tcp", int(port)), options)

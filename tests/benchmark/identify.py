@@ -83,7 +83,6 @@ def fast(data: list[SteadyLoop], repeats: int = 10) -> tuple[IntegratedModel, fl
 
 
 def line(name: str, judged: Evaluation, held_out: Evaluation, seconds: float) -> str:
-    """Return one row of the table."""
     return (
         f"{name:<10} {seconds:8.3f} s   peak {judged.peak_percent:5.2f} %  rms "
         f"{judged.rms_percent:6.3f} %   5 A, not fitted: peak {held_out.peak_percent:5.2f} %"

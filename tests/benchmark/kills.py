@@ -193,7 +193,6 @@ def _await_end(run: AttackedRun) -> str:
 
 
 def judged(run: AttackedRun, phase: str, done: tuple[str, int, int | None, float]) -> Attack:
-    """Return what an attack came to."""
     said, hit_ns, due_ns, until_ns = done
     log, samples, reader = run.log(), None, ""
     if due_ns is not None or (run.output.exists() and run.output.stat().st_size):

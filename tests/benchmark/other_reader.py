@@ -14,7 +14,6 @@ LONGEST_S = 120.0
 
 
 def is_installed() -> bool:
-    """Return whether it is there."""
     return shutil.which("node") is not None and (PEERS / "node_modules" / "@mcap" / "core").is_dir()
 
 

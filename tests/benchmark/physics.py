@@ -117,7 +117,6 @@ class Rig:
 
 
 def driven(rig: TerfenolActuator, command: F64) -> F64:
-    """Return the displacement that a rig answers with."""
     displacement_um, measured = np.empty_like(command), np.empty_like(command)
     rig.step(np.ascontiguousarray(command), displacement_um, measured)
     return displacement_um
@@ -189,12 +188,9 @@ def judged(row: Row, drive: Drive, noise_um: F64) -> Figures:
     bare = read - float(np.mean(read))
     to_percent = 100.0 / float(np.ptp(row.reference_um[row.judged]))
     figures = (
-        np.max(np.abs(read)),
-        np.max(np.abs(bare)),
-        np.std(read),
-        np.max(np.abs(error)),
+        np.max(np.abs(read)), np.max(np.abs(bare)), np.std(read), np.max(np.abs(error)),
         np.sqrt(np.mean(error**2)),
-    )
+    )  # fmt: skip
     return Figures(*(to_percent * float(figure) for figure in figures))
 
 
@@ -226,7 +222,6 @@ def cost_us(model: HysteresisModel, reference_um: F64) -> float:
 
 
 def line(result: Result, names: Sequence[str]) -> str:
-    """Return a line of the table."""
     row, rest = result.row, result.figures["from rest"]
     text = f"{row.name:20} {rest.peak:7.2f} {rest.bare:8.2f} {rest.rms:6.3f} {result.noise:6.2f}"
     for name in names:

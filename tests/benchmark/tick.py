@@ -39,7 +39,6 @@ class TimedClock(SystemClock):
     woke: ClassVar[list[int]] = []
 
     def sleep_until_ns(self, deadline_ns: int) -> None:
-        """Sleep, and record it."""
         self.slept.append(time.monotonic_ns())
         super().sleep_until_ns(deadline_ns)
         self.woke.append(time.monotonic_ns())
@@ -48,12 +47,9 @@ class TimedClock(SystemClock):
 def experiment(options: argparse.Namespace, model: Path) -> LoadedExperiment:
     """Return the shipped experiment with a model, one sample per tick."""
     settings = {
-        "sample_rate_hz": float(options.rate),
-        "block": 1,
-        "waveform.frequency_hz": 1.0,
-        "waveform.duration_s": options.ticks / options.rate,
-        "compensator.model": model.resolve(),
-    }
+        "sample_rate_hz": float(options.rate), "block": 1, "waveform.frequency_hz": 1.0,
+        "waveform.duration_s": options.ticks / options.rate, "compensator.model": model.resolve(),
+    }  # fmt: skip
     return load_experiment(EXPERIMENT, [f"{key}={value}" for key, value in settings.items()])
 
 

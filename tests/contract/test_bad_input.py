@@ -59,8 +59,6 @@ def place(tmp_path, monkeypatch):
 
 @pytest.fixture
 def hilctl(monkeypatch, capsys):
-    """Run a command in this process."""
-
     def run(*words):
         monkeypatch.setattr(sys, "argv", ["hilctl", *map(str, words)])
         with pytest.raises(SystemExit) as ended:
@@ -72,7 +70,6 @@ def hilctl(monkeypatch, capsys):
 
 
 def check_refused(ended, message):
-    """Check the properties of every rejection."""
     assert ended.code == 2
     assert "Traceback" not in ended.out + ended.err
     lines = ended.err.splitlines()

@@ -94,16 +94,13 @@ def modbus(words, stack):
 
 
 def _fast(section):
-    """Return a section with a fast serial line, if it has one."""
     return {**section, "baud": 115200} if "serial_port" in section else section
 
 
 CASES = [
-    *SIMULATED,
-    *OTHERS,
-    *(f"simulated_terfenol {words}" for words in PHYSICS),
+    *SIMULATED, *OTHERS, *(f"simulated_terfenol {words}" for words in PHYSICS),
     *(f"modbus_dac {words}" for words in MODBUS),
-]
+]  # fmt: skip
 
 
 @pytest.fixture

@@ -67,7 +67,6 @@ def make():
 
 @pytest.fixture(params=STREAMING)
 def case(request):
-    """A profile."""
     return request.param
 
 

@@ -53,13 +53,11 @@ def installed(tmp_path):
 
 
 def hilctl(environment, *words):
-    """Run a command of hilctl to its end."""
     command = [sys.executable, "-m", "hilctl", *map(str, words)]
     return subprocess.run(command, capture_output=True, text=True, env=environment)
 
 
 def experiment(folder, **device):
-    """Write an experiment with the device."""
     path = folder / "own.yaml"
     changed = {**EXPERIMENT, "device": {**EXPERIMENT["device"], **device}}
     path.write_text(yaml.safe_dump(changed), encoding="utf-8")

@@ -116,7 +116,6 @@ def modbus(profiles):
 
 @pytest.fixture(params=NAMES)
 def name(request):
-    """Each shipped profile's name."""
     return request.param
 
 

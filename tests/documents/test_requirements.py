@@ -10,7 +10,6 @@ PIN = re.compile(r"^([A-Za-z0-9._-]+)==(\S+)(?: ; (.+?))? ?\\$", re.MULTILINE)
 
 
 def pins(name):
-    """Return version by name and marker."""
     found = PIN.findall(FILES[name].read_text(encoding="utf-8"))
     return {(package.lower(), marker): version for package, version, marker in found}
 

@@ -30,7 +30,6 @@ class Step:
 
 
 def steps_of(document: str) -> list[Step]:
-    """Return the blocks of a document in order."""
     steps: list[Step] = []
     for kind, text in FENCED.findall(document):
         if kind == "text":

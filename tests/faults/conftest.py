@@ -44,13 +44,9 @@ def each_kind(cases, shown):
 T7 = {"kind": "modbus_dac", **T7_OPTIONS}
 """Device section of a LabJack T7, without its address."""
 MODULE = {
-    "kind": "modbus_dac",
-    "output": "OUT",
-    "input": "IN",
-    "amplifier": {"gain_a_per_v": 1.0},
-    "sensor": {"um_per_v": 12.5},
-    "watchdog": "none",
-}
+    "kind": "modbus_dac", "output": "OUT", "input": "IN", "amplifier": {"gain_a_per_v": 1.0},
+    "sensor": {"um_per_v": 12.5}, "watchdog": "none",
+}  # fmt: skip
 """Device section of the module in ``tests/data``, without its port."""
 
 
@@ -67,7 +63,6 @@ def sine(frequency_hz, duration_s, soft_start_s=0.1):
 
 
 def simulated(name, sample_rate_hz, waveform, slew_a_per_s=1000.0, **more):
-    """Return an experiment on the simulated rig."""
     return {
         "name": name,
         "device": {"kind": "simulated_terfenol", "seed": 3},
@@ -116,7 +111,6 @@ class Log:
             time.sleep(0.02)
 
     def await_events(self, output: str, count: int, run: subprocess.Popen) -> None:
-        """Wait for a number of events while the run continues."""
         deadline = time.monotonic() + 240.0
         while (seen := len(self.events(output))) < count:
             assert run.poll() is None, f"{seen} of {count}: {run.communicate()}"
@@ -233,7 +227,6 @@ class Emulated:
         return self.addresses[0]
 
     def end(self) -> None:
-        """Stop it, and assert that it ends."""
         self.process.terminate()
         self.process.communicate(timeout=30)
         assert self.process.returncode == 0

@@ -314,7 +314,6 @@ def test_a_run_that_is_killed_while_it_starts_leaves_nothing(tmp_path):
 
 
 def test_without_a_run_there_is_nothing_to_stop():
-    """Stop and set say so."""
     assert "no run is active" in hilctl("stop", code=2)
     assert "no run is active" in hilctl("set", "gain=1", code=2)
 

@@ -87,7 +87,6 @@ def end(run: StartedRun, code: int) -> dict:
 
 
 def limit_files(run: StartedRun, size: int) -> None:
-    """Limit the size of files that a run writes."""
     resource.prlimit(run.process.pid, resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
 
 

@@ -27,7 +27,6 @@ class Shell:
         os.write(self.terminal, text.encode())
 
     def read(self, wait_s=0.0):
-        """Return all that was shown so far."""
         while select.select([self.terminal], [], [], wait_s)[0]:
             try:
                 self.text += os.read(self.terminal, 65536).decode(errors="replace")

@@ -34,7 +34,6 @@ def missing(what: str, remedy: str) -> None:
 
 
 def program(name: str, package: str = "") -> str:
-    """Return the path of a program."""
     found = shutil.which(name)
     if found is None:
         missing(name, DEBIAN.format(package or name))
@@ -62,14 +61,12 @@ class Programs:
         return node
 
     def libmodbus(self) -> str:
-        """Return the name of the libmodbus library."""
         found = ctypes.util.find_library("modbus")
         if found is None:
             missing("libmodbus", DEBIAN.format("libmodbus-dev"))
         return str(found)
 
     def libmodbus_server(self) -> str:
-        """Return the path of a libmodbus server."""
         self.libmodbus()
         if not Path("/usr/include/modbus/modbus.h").exists():
             missing("libmodbus's header", DEBIAN.format("libmodbus-dev"))
@@ -82,7 +79,6 @@ class Programs:
 
 @pytest.fixture(scope="session")
 def programs(tmp_path_factory) -> Programs:
-    """Paths of third-party programs."""
     return Programs(tmp_path_factory.mktemp("programs"))
 
 

@@ -140,7 +140,6 @@ class Served:
             made.close()
 
     def put(self, kind: str, volts: float) -> None:
-        """Set the voltage of an input."""
         with self.client() as client:
             if kind == "INT":
                 words = client.convert_to_registers(
@@ -151,7 +150,6 @@ class Served:
             assert not client.write_registers(INPUT_AT[kind], words).isError()
 
     def get(self, kind: str) -> float:
-        """Return the voltage of an output."""
         with self.client() as client:
             count = 1 if kind == "INT" else 2
             reply = client.read_holding_registers(OUTPUT_AT[kind], count=count)

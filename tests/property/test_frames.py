@@ -150,12 +150,9 @@ def test_write_reads_as_pymodbus_has_them(
     pdu = write_read_pdu(read_at, count, write_at, words(values))
     names = {"dev_id": unit, "transaction_id": transaction}
     theirs = ReadWriteMultipleRegistersRequest(
-        **names,
-        read_address=read_at,
-        read_count=count,
-        write_address=write_at,
+        **names, read_address=read_at, read_count=count, write_address=write_at,
         write_registers=values,
-    )
+    )  # fmt: skip
     assert_same_request(pdu, theirs)
     read = data.draw(st.lists(st.integers(0, 65535), min_size=count, max_size=count))
     assert_reads_reply(
@@ -189,7 +186,6 @@ def assert_reads_reply(pdu, theirs, data):
 
 
 def flip(rng, frame):
-    """Flip one to three bits."""
     bits = rng.sample(range(8 * len(frame)), rng.randint(1, 3))
     number = int.from_bytes(frame, "little")
     for bit in bits:
@@ -212,7 +208,6 @@ def cut(rng, frame):
 
 
 def duplicate(rng, frame):
-    """Repeat a stretch, or all of it."""
     a, b = sorted(rng.sample(range(len(frame) + 1), 2))
     return rng.choice([frame[:b] + frame[a:], frame + frame])
 
@@ -224,7 +219,6 @@ def insert(rng, frame):
 
 
 def swap(rng, frame):
-    """Swap two bytes."""
     a, b = rng.sample(range(len(frame)), 2)
     out = bytearray(frame)
     out[a], out[b] = out[b], out[a]

@@ -20,7 +20,6 @@ TIMES = st.sampled_from([0.0, 0.01, 0.03])
 
 @st.composite
 def limits(draw):
-    """Any interlocks, each on or off."""
     return RigInterlocks(
         stroke_um=(-5.0, 3.5),
         sensor_um=draw(st.sampled_from([(-math.inf, math.inf), (-8.0, 8.0), (-2.0, 3.0)])),

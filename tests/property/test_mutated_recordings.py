@@ -94,7 +94,6 @@ MODELS: tuple[HysteresisModel, ...] = (
 
 
 def records_of(path: Path) -> list[object]:
-    """Return the records of a sound recording."""
     with path.open("rb") as stream:
         return list(RecoveryScan(stream).records())
 
@@ -364,14 +363,9 @@ def _initial_state(recording: Recording, path: Path) -> None:
 
 
 COMMANDS: dict[str, Callable[[Recording, Path], None]] = {
-    "report": _report,
-    "replay": _replay,
-    "pieces": _pieces,
-    "export": _export,
-    "identify": _identify,
-    "initial_state": _initial_state,
-    "html": _html,
-}
+    "report": _report, "replay": _replay, "pieces": _pieces, "export": _export,
+    "identify": _identify, "initial_state": _initial_state, "html": _html,
+}  # fmt: skip
 
 
 def recover(path: Path) -> None:

@@ -49,7 +49,6 @@ def sides(draw, slope, sign):
 
 @st.composite
 def deadbands(draw):
-    """An invertible memoryless function."""
     slope = draw(st.floats(0.1, 10.0))
     up, up_weights = draw(sides(slope, 1.0))
     down, down_weights = draw(sides(slope, -1.0))
@@ -59,7 +58,6 @@ def deadbands(draw):
 
 @st.composite
 def models(draw, *, growth=GROWTH_S, offset=True):
-    """Any admissible model of the three kinds."""
     kind = draw(st.sampled_from((PpiModel, RdpiModel, IntegratedModel)))
     parameters = draw(plays(offset=offset))
     if kind is not PpiModel:

@@ -101,7 +101,6 @@ def read_profile(text: str) -> tuple[Any, Any]:
 
 
 def outcome(read: Callable[[str], Any], text: str) -> Any:
-    """Return what is read, or why it is refused."""
     try:
         return read(text)
     except ConfigError as error:

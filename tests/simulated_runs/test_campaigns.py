@@ -19,18 +19,9 @@ from hilctl.recording.reader import read
 from hilctl.studies.campaign.campaign_runner import CampaignHost
 from hilctl.studies.campaign.parallel_simulation import planned_fast, run_fast
 from hilctl.studies.campaign.steps import load_campaign
+from hilctl.studies.multi_run import trend
 from hilctl.studies.multi_run.collect import collect
 from hilctl.studies.multi_run.plots import sheets_of
-from hilctl.studies.multi_run.trend import (
-    AREA,
-    ASYMMETRY,
-    DAMPING,
-    HYSTERESIS,
-    NATURAL,
-    STROKE,
-    headline,
-    trends,
-)
 from tests.commands import ended, typed
 
 CAMPAIGNS = Path(__file__).parents[2] / "configs" / "campaigns"
@@ -284,7 +275,7 @@ def trends_of(series, figure, name):
     """Trends of what nothing compensated, along a dimension by its name."""
     along = next(each for each in series.dimensions if each.name == name)
     plain = [run for run in series.done if run.digest.is_plain_loop]
-    return trends(series, figure, along, plain)
+    return trend.trends(series, figure, along, plain)
 
 
 class TestFiguresAndTrends:
@@ -306,34 +297,37 @@ class TestFiguresAndTrends:
     def test_area_and_peak_hysteresis_are_linear_in_frequency(self, series, name, along, groups):
         """4.2.3, figures 4.5 (b), 5.5, 6.4: r2 = 0.99, and both grow; the stroke does not."""
         found = series(name)
-        for figure in (AREA, HYSTERESIS):
+        for figure in (trend.AREA, trend.HYSTERESIS):
             lines = trends_of(found, figure, along)
             assert len(lines) == groups
             assert min(line.r2 for line in lines) >= 0.99
             assert {line.direction for line in lines} == {"rises"}
-        strokes = trends_of(found, STROKE, along)
+        strokes = trends_of(found, trend.STROKE, along)
         assert {line.direction for line in strokes} == {"does not change"}
-        assert any(f"linear in {along} (r² " in text for text in headline(found))
+        assert any(f"linear in {along} (r² " in text for text in trend.headline(found))
 
     def test_more_bias_more_saturation(self, series):
         """Figure 4.6: from 35 kA/m on loops lose their symmetry, and the stroke gets less."""
         found = series("bias")
-        for line in trends_of(found, ASYMMETRY, "bias current"):
+        for line in trends_of(found, trend.ASYMMETRY, "bias current"):
             assert (np.diff(line.y[1:]) > 0.0).all()
-        for line in trends_of(found, STROKE, "bias current"):
+        for line in trends_of(found, trend.STROKE, "bias current"):
             assert (np.diff(line.y[1:]) < 0.0).all()
 
     def test_the_natural_frequency_falls_with_the_load_and_the_damping_stays(self, series):
         """Section 3.4.4 of chapter 2; 0.12 without load."""
         found = series("loads")
         load = next(each for each in found.dimensions if each.name == "load")
-        assert {line.direction for line in trends(found, NATURAL, load)} == {"falls"}
-        assert all(np.ptp(line.y) < 0.1 * line.y.mean() for line in trends(found, DAMPING, load))
-        assert any("natural frequency falls" in line for line in headline(found))
+        assert {line.direction for line in trend.trends(found, trend.NATURAL, load)} == {"falls"}
+        assert all(
+            np.ptp(line.y) < 0.1 * line.y.mean()
+            for line in trend.trends(found, trend.DAMPING, load)
+        )
+        assert any("natural frequency falls" in line for line in trend.headline(found))
 
     def test_hysteresis_before_and_after_stands_in_the_first_line(self, series):
         """Figure 6.13: 18.2 to 49.1 % before, 3.7 % at most after."""
-        text = " ".join(headline(series("compensation")))
+        text = " ".join(trend.headline(series("compensation")))
         found = re.search(r"without compensator ([\d.]+) to ([\d.]+) %", text)
         assert [float(each) for each in found.groups()] == pytest.approx([18.2, 49.1], abs=1.0)
         after = re.search(r"with terfenol_staged [\d.]+ to ([\d.]+) %, worst at", text)

@@ -18,7 +18,6 @@ CONFIGS = Path(__file__).parents[2] / "configs"
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Where the loops and the page go."""
     return tmp_path_factory.mktemp("compare")
 
 

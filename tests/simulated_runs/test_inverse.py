@@ -35,7 +35,6 @@ class _Switched(unpaced.OfflineHost):
 
 @pytest.fixture(scope="module")
 def switched(tmp_path_factory):
-    """The recording, and the experiment."""
     settings = ["waveform.frequency_hz=100", "waveform.duration_s=3.0"]
     checked = checked_experiment(DEMO, settings)
     line, samples = checked.forecast.line, round(FADE_S * RATE_HZ)

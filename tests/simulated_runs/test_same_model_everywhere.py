@@ -89,7 +89,6 @@ def numbers(value: object, name: str = "") -> dict[str, F64]:
 
 @pytest.fixture(scope="module")
 def models_by() -> dict[str, dict[str, object]]:
-    """Return all models by the kernels that they were found with."""
     flags = Path("/proc/cpuinfo").read_text()
     found: dict[str, dict[str, object]] = {}
     for kernels in KERNELS:

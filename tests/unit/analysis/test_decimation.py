@@ -59,7 +59,6 @@ class Parts:
 
 @pytest.fixture
 def small(monkeypatch):
-    """Decimate recordings of any length."""
     monkeypatch.setattr(module, "MOST_SAMPLES", 20_000)
     monkeypatch.setattr(module, "_STRETCHES", 1500)
     monkeypatch.setattr(module, "_LAST_SAMPLES", 8_000)

@@ -107,7 +107,6 @@ def test_no_sample_is_replayed_twice():
 
 
 def pieces_of(recording, bounds):
-    """Cut a recording in memory, at any rows."""
     for a, b in pairwise([0, *bounds, recording.samples.index.size]):
         part = recording.samples.rows(slice(a, b))
         index = part.index if part.index.size else np.array([-1])

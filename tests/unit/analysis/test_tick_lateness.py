@@ -9,14 +9,12 @@ from hilctl.recording.recording import Ticks
 
 
 def ticks(late_ns: list[int], period_ns: int = 1_000_000) -> Ticks:
-    """Return ticks of one period with these latenesses."""
     first = np.arange(len(late_ns), dtype=np.int64)
     late = np.array(late_ns, dtype=np.int64)
     return Ticks(first, first * period_ns, late, late)
 
 
 def lateness(ticks: Ticks, minutes: float = 1.0) -> LatenessBuilder:
-    """Return the lateness of all ticks of a run."""
     builder = LatenessBuilder(minutes)
     builder.add(ticks)
     return builder

@@ -9,7 +9,6 @@ from tests.unit.api.test_runs import CONFIGS, SHORT, SINE
 
 @pytest.fixture
 def file(tmp_path):
-    """A campaign of two amplitudes."""
     path = tmp_path / "two.yaml"
     path.write_text(f"name: two\nexperiment: {SINE}\nvary:\n  waveform.amplitude: [0.5, 1.0]\n")
     return path

@@ -7,16 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from hilctl.base.formatting import (
-    MOST_SHOWN,
-    finite_json,
-    printable,
-    quantity,
-    short_name,
-    shown_briefly,
-    significant,
-    unit_text,
-)
+from hilctl.base import formatting
 
 
 @pytest.mark.parametrize(
@@ -38,20 +29,20 @@ from hilctl.base.formatting import (
     ],
 )
 def test_a_quantity_is_read_without_counting_zeros(value, unit, text):
-    assert quantity(value, unit) == text
+    assert formatting.quantity(value, unit) == text
 
 
 def test_digits_are_the_same_whatever_the_size():
-    assert [significant(v) for v in (0.012345, 1.0, 9.996, 12345.0, 1e7, 1e-6)] == [
+    assert [formatting.significant(v) for v in (0.012345, 1.0, 9.996, 12345.0, 1e7, 1e-6)] == [
         "0.0123", "1.00", "10.0", "12300", "1.00e+07", "1.00e-06",
     ]  # fmt: skip
-    assert significant(2291.4, 4) == "2291"
-    assert significant(math.nan) == "nan"
-    assert significant(1.7976931348623157e308) == "1.80e+308"
+    assert formatting.significant(2291.4, 4) == "2291"
+    assert formatting.significant(math.nan) == "nan"
+    assert formatting.significant(1.7976931348623157e308) == "1.80e+308"
 
 
 def test_units_have_their_signs():
-    assert [unit_text(u) for u in ("um/A", "A", "um*V")] == ["µm/A", "A", "µm·V"]
+    assert [formatting.unit_text(u) for u in ("um/A", "A", "um*V")] == ["µm/A", "A", "µm·V"]
 
 
 @pytest.mark.parametrize(
@@ -65,18 +56,18 @@ def test_units_have_their_signs():
     ],
 )
 def test_what_steers_a_terminal_is_written_out(text: str, shown: str) -> None:
-    assert printable(text) == shown
+    assert formatting.printable(text) == shown
 
 
 def test_lines_stay_where_they_are_wanted() -> None:
-    assert printable("a:\n\tb\r", lines=True) == "a:\n\tb\\r"
+    assert formatting.printable("a:\n\tb\r", lines=True) == "a:\n\tb\\r"
 
 
 def test_names_are_short() -> None:
-    assert short_name("x" * MOST_SHOWN) == "x" * MOST_SHOWN
-    for long in ("x" * 10**6, "\x1b" * MOST_SHOWN):
-        assert len(short_name(long)) == MOST_SHOWN
-        assert short_name(long).endswith("...")
+    assert formatting.short_name("x" * formatting.MOST_SHOWN) == "x" * formatting.MOST_SHOWN
+    for long in ("x" * 10**6, "\x1b" * formatting.MOST_SHOWN):
+        assert len(formatting.short_name(long)) == formatting.MOST_SHOWN
+        assert formatting.short_name(long).endswith("...")
 
 
 WHOLE = {"a": [1, 0.5, None, True, "NaN"], "b": {"c": (2.5,)}}
@@ -88,18 +79,18 @@ def refuse(constant: str) -> None:
 
 @pytest.mark.parametrize("indent", [None, 2])
 def test_finite_values_stay_as_they_are(indent: int | None) -> None:
-    assert finite_json(WHOLE, indent) == json.dumps(WHOLE, indent=indent)
+    assert formatting.finite_json(WHOLE, indent) == json.dumps(WHOLE, indent=indent)
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 def test_what_is_not_finite_is_null(bad: float) -> None:
-    text = finite_json({"x": bad, "y": [bad, 1.0], "z": {"deep": (bad, "inf")}})
+    text = formatting.finite_json({"x": bad, "y": [bad, 1.0], "z": {"deep": (bad, "inf")}})
     found = json.loads(text, parse_constant=refuse)
     assert found == {"x": None, "y": [None, 1.0], "z": {"deep": [None, "inf"]}}
 
 
 def test_results_are_shown_in_one_line_and_as_a_table():
-    @shown_briefly
+    @formatting.shown_briefly
     @dataclass
     class Result:
         name: str

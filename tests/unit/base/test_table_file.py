@@ -37,8 +37,6 @@ SEPARATORS = {"comma": ",", "comma and blank": ", ", "semicolon": ";", "tab": "\
 
 @pytest.fixture
 def table(tmp_path: Path):
-    """Make a table of a text."""
-
     def make(text: str | bytes) -> TextTable:
         path = tmp_path / "t.csv"
         path.write_bytes(text.encode() if isinstance(text, str) else text)

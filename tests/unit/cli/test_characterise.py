@@ -47,7 +47,6 @@ def ends(monkeypatch, limits):
 
 @pytest.fixture
 def command(ends, hilctl, tmp_path):
-    """Return a function that runs the command."""
     words = ("characterise", tmp_path / "rig.yaml", "--output", tmp_path / "model.yaml")
     return lambda *more: hilctl(*words, *more)
 

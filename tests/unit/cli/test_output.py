@@ -12,17 +12,9 @@ import pytest
 
 from hilctl import cli
 from hilctl.base.errors import InputError
-from hilctl.cli import ACTING
+from hilctl.cli import ACTING, output
 from hilctl.cli.commands import COMMANDS
 from hilctl.cli.console import console
-from hilctl.cli.output import (
-    SafeStream,
-    StandardStream,
-    Verbosity,
-    print_json,
-    safe_streams,
-    take_verbosity,
-)
 
 HOSTILE = "a\x1b]0;title\x07b\x9b2Jc\rd\x7fe\u202ef"
 SHOWN = r"a\x1b]0;title\x07b\x9b2Jc\rd\x7fe\u202ef"
@@ -31,7 +23,7 @@ SHOWN = r"a\x1b]0;title\x07b\x9b2Jc\rd\x7fe\u202ef"
 def test_escaped_and_styled_text_stay_in_order():
     target = io.BytesIO()
     below = io.TextIOWrapper(target, encoding="ascii")
-    stream = SafeStream(below)
+    stream = output.SafeStream(below)
     print("one\x1b", file=stream)
     stream.styled.write("\x1b[1mtwo\x1b[0m\n")
     print("40 µm", file=stream)
@@ -43,7 +35,7 @@ def test_closed_pipe_is_no_error():
     reading, writing = os.pipe()
     os.close(reading)
     with os.fdopen(writing, "w") as below:
-        stream = StandardStream(below)
+        stream = output.StandardStream(below)
         for _ in range(3):
             assert stream.write("x" * 100_000) == 100_000
             stream.flush()
@@ -53,7 +45,6 @@ def test_closed_pipe_is_no_error():
 
 
 def in_a_process(code, shell):
-    """Run code with a redirection of the shell."""
     command = ["sh", "-c", f'exec "$0" -c "$1" {shell}', sys.executable, code]
     return subprocess.run(command, capture_output=True, text=True, timeout=60)
 
@@ -95,16 +86,16 @@ raise SystemExit(0 if opened > 2 else 1)
 
 def test_streams_are_restored(capsys):
     before = sys.stdout, sys.stderr
-    with safe_streams():
+    with output.safe_streams():
         print(HOSTILE)
     assert (sys.stdout, sys.stderr) == before
     assert capsys.readouterr().out == SHOWN + "\n"
 
 
 def test_json_is_one_object_without_nan(capsys):
-    print_json({"gain": 0.5, "names": ["a"]})
+    output.print_json({"gain": 0.5, "names": ["a"]})
     assert json.loads(capsys.readouterr().out) == {"gain": 0.5, "names": ["a"]}
-    print_json({"gain": float("nan"), "largest": [float("inf")]})
+    output.print_json({"gain": float("nan"), "largest": [float("inf")]})
     assert json.loads(capsys.readouterr().out) == {"gain": None, "largest": [None]}
 
 
@@ -113,7 +104,7 @@ def restored_settings():
     logger = logging.getLogger("hilctl")
     level, handlers = logger.level, logger.handlers[:]
     yield
-    Verbosity.quiet = Verbosity.verbose = False
+    output.Verbosity.quiet = output.Verbosity.verbose = False
     logger.setLevel(level)
     logger.handlers[:] = handlers
 
@@ -130,9 +121,9 @@ def restored_settings():
 )
 def test_options_are_accepted_anywhere(words, left, quiet, verbose):
     given = words.split()
-    take_verbosity(given)
+    output.take_verbosity(given)
     assert given == left.split()
-    assert (Verbosity.quiet, Verbosity.verbose) == (quiet, verbose)
+    assert (output.Verbosity.quiet, output.Verbosity.verbose) == (quiet, verbose)
 
 
 def talks():
@@ -151,7 +142,7 @@ def test_quiet_prints_warnings_only(monkeypatch, hilctl, capsys):
 
 
 def test_quiet_hides_progress():
-    Verbosity.quiet = True
+    output.Verbosity.quiet = True
     assert not console(stderr=True).is_terminal
 
 

@@ -8,14 +8,7 @@ import pytest
 
 from hilctl.base.errors import InputError
 from hilctl.base.yaml import Document
-from hilctl.comparison.simulated_trials import (
-    CYCLES,
-    TIMED_SAMPLES,
-    TrialDevice,
-    full_stroke,
-    inverse_ns,
-    waveforms_of,
-)
+from hilctl.comparison import simulated_trials
 from hilctl.experiment.load import load_experiment, resolve
 from hilctl.identify.data.records import SteadyLoop
 from hilctl.models.plays import PpiModel
@@ -40,7 +33,7 @@ CHIRP = Chirp(kind="chirp", unit="um", amplitude=1.0, start_hz=1.0, stop_hz=10.0
 
 
 def device(*waveforms):
-    return TrialDevice(resolve(Document("stage.yaml", TEXT), CONFIGS), waveforms)
+    return simulated_trials.TrialDevice(resolve(Document("stage.yaml", TEXT), CONFIGS), waveforms)
 
 
 def line(slope):
@@ -74,7 +67,7 @@ def test_the_limiter_is_between():
 def test_a_real_device_is_refused():
     loaded = load_experiment(CONFIGS / "modbus_labjack_t7.yaml")
     with pytest.raises(InputError, match="simulated device"):
-        TrialDevice(loaded, [SINE])
+        simulated_trials.TrialDevice(loaded, [SINE])
 
 
 def test_what_does_not_repeat_is_refused():
@@ -88,25 +81,25 @@ def test_waveforms_take_the_frequencies_asked_for():
         soft_start_s=0.3, soft_end_s=0.2,
     )  # fmt: skip
     for shape in (SINE, triangle):
-        slow, fast = waveforms_of(shape, [1.0, 200.0])
+        slow, fast = simulated_trials.waveforms_of(shape, [1.0, 200.0])
         soft_s = shape.soft_start_s + shape.soft_end_s
         assert (slow.frequency_hz, fast.frequency_hz) == (1.0, 200.0)
-        assert fast.duration_s == pytest.approx(soft_s + CYCLES / 200.0)
+        assert fast.duration_s == pytest.approx(soft_s + simulated_trials.CYCLES / 200.0)
         assert fast.amplitude == shape.amplitude
-    assert waveforms_of(SINE, None) == [SINE]
+    assert simulated_trials.waveforms_of(SINE, None) == [SINE]
 
 
 def test_frequencies_need_a_shape_that_has_one():
     with pytest.raises(InputError, match="--frequencies"):
-        waveforms_of(CHIRP, [10.0])
+        simulated_trials.waveforms_of(CHIRP, [10.0])
     for wrong in (0.0, -1.0, float("nan"), float("inf")):
         with pytest.raises(InputError, match="must be > 0"):
-            waveforms_of(SINE, [wrong])
+            simulated_trials.waveforms_of(SINE, [wrong])
 
 
 def test_the_stroke_is_that_of_the_widest_loop():
     wave = np.sin(2.0 * np.pi * np.arange(300) / 300)
-    sine = full_stroke(
+    sine = simulated_trials.full_stroke(
         [SteadyLoop("sine", a * wave, 3.0 * a * wave + 2.0, 50.0) for a in (2, 6, 4)]
     )
     assert sine.offset == pytest.approx(2.0, abs=1e-2)
@@ -118,5 +111,5 @@ def test_the_shortest_round_counts():
     ticks = itertools.accumulate([0.0, 9e-3, 0.0, 2e-3, 0.0, 5e-3, 0.0, 4e-3, 0.0, 8e-3])
     command = 6.0 * np.sin(2.0 * np.pi * np.arange(300) / 300)
     loop = SteadyLoop("sine", command, 4.0 * command, 50.0)
-    took = inverse_ns(piezo_ppi(), loop, 50_000.0, lambda: next(ticks))
-    assert took == pytest.approx(2e6 / TIMED_SAMPLES)
+    took = simulated_trials.inverse_ns(piezo_ppi(), loop, 50_000.0, lambda: next(ticks))
+    assert took == pytest.approx(2e6 / simulated_trials.TIMED_SAMPLES)

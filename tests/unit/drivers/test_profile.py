@@ -75,7 +75,6 @@ def changed(base, changes):
 
 
 def lines(text):
-    """Return the messages about a text."""
     with pytest.raises(ConfigError) as caught:
         parse_profile(text, "acme.yaml")
     return str(caught.value).splitlines()

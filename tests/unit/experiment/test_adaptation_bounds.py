@@ -24,7 +24,6 @@ INTEGRAL = "feedback={kind: integral, limit_um: 5.0, bandwidth_hz: 1.0}"
 
 @pytest.fixture
 def load(tmp_path):
-    """Load the experiment with settings."""
     (tmp_path / "model.yaml").write_text(MODEL)
     return lambda *settings: resolve(Document("experiment", PLAIN), tmp_path, settings)
 

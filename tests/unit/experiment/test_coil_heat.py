@@ -28,8 +28,6 @@ def coil(config):
 
 @pytest.fixture
 def held(config):
-    """What a current does that is held for a time."""
-
     def make(amps, seconds):
         command = np.full(round(seconds * RATE_HZ), float(amps))
         return RunHeat().then(command, config.limits, RATE_HZ)

@@ -43,7 +43,6 @@ def correction_for(made, segment, model=None):
 
 
 def correction_of(correction, made, model=None):
-    """Return what is added to a reference."""
     return correction.added(made, model)[:] - made.values[:]
 
 

@@ -244,7 +244,6 @@ class Folder:
         (path / "model.yaml").write_text(dump_model(OMEGA))
 
     def loaded(self, *settings, holds=HOLDS):
-        """The experiment on a device that holds this."""
         where = f"recording.folder={self.runs}"
         made = resolve(Document("x.yaml", EXPERIMENT), self.path, [where, *settings])
         info = replace(made.device.info, holds=holds)
@@ -258,7 +257,6 @@ class Folder:
         return path
 
     def begin(self, name, *, holds=HOLDS, coil=None):
-        """Have a run be the last of its device."""
         path = str(self.runs / f"{name}.mcap")
         write_device_state(
             DeviceState(holds=[*holds], run_id=name, recording=path, started=STARTED, coil=coil)

@@ -64,8 +64,6 @@ class BrokenModel(HysteresisModel):
         raise AssertionError("forward")
 
     def inverse(self, sample_rate_hz):
-        """Return the operator with the fault."""
-
         def run(x, memory, out):
             out[:] = 0.0
             first = int(memory[0])
@@ -105,7 +103,6 @@ def refusals(text, *settings, **given):
 
 
 def told(found):
-    """Return keys and values."""
     return [(problem.key, problem.value) for problem in found]
 
 
@@ -116,7 +113,6 @@ def refused(made):
 
 
 def compensated(made, **keys):
-    """Return an experiment with other keys of its compensator."""
     compensator = CompensatorConfig(model="model.yaml", **keys)
     config = made.config.model_copy(update={"compensator": compensator})
     return replace(made, config=config)
@@ -301,21 +297,13 @@ class TestDevice:
 class TestAllAtOnce:
     def test_device_reference_and_command(self):
         found = refusals(
-            DISPLACEMENT,
-            "block=5",
-            "waveform.amplitude=100.0",
-            "limits.slew_a_per_s=1.0",
-            model=terfenol_rdpi(),
-            max_rate_hz=100.0,
-        )
+            DISPLACEMENT, "block=5", "waveform.amplitude=100.0", "limits.slew_a_per_s=1.0",
+            model=terfenol_rdpi(), max_rate_hz=100.0,
+        )  # fmt: skip
         keys = [problem.key for problem in found]
         assert keys == [
-            "sample_rate_hz",
-            "block",
-            "waveform",
-            "limits.peak_current_a",
-            "limits.slew_a_per_s",
-        ]
+            "sample_rate_hz", "block", "waveform", "limits.peak_current_a", "limits.slew_a_per_s",
+        ]  # fmt: skip
 
     def test_device_and_a_waveform_that_can_not_be_built(self):
         found = refusals(CURRENT, "block=5", "waveform.frequency_hz=6000.0")
@@ -397,16 +385,12 @@ class Offset(HysteresisModel):
         return 1
 
     def forward(self, sample_rate_hz):
-        """Return an operator that counts."""
-
         def run(x, memory, out):
             out[:] = np.arange(x.size)
 
         return Operator(run, self.operators)
 
     def inverse(self, sample_rate_hz):
-        """Return the operator that adds."""
-
         def run(x, memory, out):
             out[:] = x + 3.0 + memory[0]
 

@@ -6,20 +6,10 @@ import pytest
 from pydantic import TypeAdapter, ValidationError
 
 from hilctl.base.errors import ConfigError
+from hilctl.experiment import sections
 from hilctl.experiment.load import load_experiment
-from hilctl.experiment.sections import (
-    LONGEST_TEXT,
-    MOST_LABELS,
-    Interval,
-    Labels,
-    Limits,
-    Name,
-    PiFeedbackConfig,
-    RecordingConfig,
-    label_settings,
-)
 
-NAME, INTERVAL = TypeAdapter(Name), TypeAdapter(Interval)
+NAME, INTERVAL = TypeAdapter(sections.Name), TypeAdapter(sections.Interval)
 
 
 @pytest.mark.parametrize("text", ["a", "9.x_y-z", "a" * 80])
@@ -41,22 +31,22 @@ def test_an_interval_is_two_rising_numbers(given):
 
 
 def test_the_ring_bridges_three_flushes():
-    assert RecordingConfig(flush_s=2.0, ring_s=6.0).ring_s == 6.0
+    assert sections.RecordingConfig(flush_s=2.0, ring_s=6.0).ring_s == 6.0
     with pytest.raises(ValidationError, match="flush_s"):
-        RecordingConfig(flush_s=2.0, ring_s=5.9)
+        sections.RecordingConfig(flush_s=2.0, ring_s=5.9)
 
 
 @pytest.mark.parametrize("way", [{"bandwidth_hz": 5.0}, {"ki_per_s": 3.0},
                                  {"ki_per_s": 3.0, "kp": 0.0}])  # fmt: skip
 def test_one_way_of_feedback_is_enough(way):
-    assert PiFeedbackConfig(limit_um=1.0, **way).limit_um == 1.0
+    assert sections.PiFeedbackConfig(limit_um=1.0, **way).limit_um == 1.0
 
 
 @pytest.mark.parametrize("ways", [{}, {"kp": 0.1}, {"bandwidth_hz": 5.0, "ki_per_s": 3.0},
                                   {"bandwidth_hz": 5.0, "kp": 0.1}])  # fmt: skip
 def test_no_way_of_feedback_and_both_are_refused(ways):
     with pytest.raises(ValidationError, match="either bandwidth_hz"):
-        PiFeedbackConfig(limit_um=1.0, **ways)
+        sections.PiFeedbackConfig(limit_um=1.0, **ways)
 
 
 STROKE = {"stroke_um": (-50.0, 50.0)}
@@ -65,7 +55,7 @@ VOLTAGE = {"drive_v": (-20.0, 120.0), "slew_v_per_s": 2e4}
 
 
 def test_a_peak_current_counts_both_ways_and_a_drive_as_it_is():
-    current, voltage = Limits(**STROKE, **CURRENT), Limits(**STROKE, **VOLTAGE)
+    current, voltage = sections.Limits(**STROKE, **CURRENT), sections.Limits(**STROKE, **VOLTAGE)
     assert (current.unit, current.command_range, current.slew_per_s) == ("A", (-7.0, 7.0), 1e4)
     assert (voltage.unit, voltage.command_range, voltage.slew_per_s) == ("V", (-20.0, 120.0), 2e4)
 
@@ -76,15 +66,15 @@ def test_a_peak_current_counts_both_ways_and_a_drive_as_it_is():
                                    {**CURRENT, **VOLTAGE}])  # fmt: skip
 def test_incomplete_and_mixed_limits_are_refused(given):
     with pytest.raises(ValidationError, match="peak_current_a"):
-        Limits(**STROKE, **given)
+        sections.Limits(**STROKE, **given)
 
 
 DEMO = Path(__file__).parents[3] / "configs" / "demo.yaml"
-LABELS = TypeAdapter(Labels)
+LABELS = TypeAdapter(sections.Labels)
 
 
 def test_texts_and_numbers_stay_what_they_are():
-    given = {"sample": "A7", "temperature_c": 21.5, "count": 3, "note": "x" * LONGEST_TEXT}
+    given = {"sample": "A7", "temperature_c": 21.5, "count": 3, "note": "x" * sections.LONGEST_TEXT}
     kept = LABELS.validate_python(given)
     assert kept == given
     assert isinstance(kept["count"], int)
@@ -95,11 +85,11 @@ def test_texts_and_numbers_stay_what_they_are():
     [
         ({"a": True}, "must be text or a number"),
         ({"a": None}, "must be text or a number"),
-        ({"a": "x" * (LONGEST_TEXT + 1)}, "must have at most 500 characters"),
+        ({"a": "x" * (sections.LONGEST_TEXT + 1)}, "must have at most 500 characters"),
         ({"a b": 1}, "a key must be at most 40 letters"),
         ({"9a": 1}, "a key must be at most 40 letters"),
         ({"a" * 41: 1}, "a key must be at most 40 letters"),
-        ({f"a{n}": n for n in range(MOST_LABELS + 1)}, "must be at most 32: there are 33"),
+        ({f"a{n}": n for n in range(sections.MOST_LABELS + 1)}, "must be at most 32: there are 33"),
     ],
 )
 def test_what_is_no_label_is_refused(labels, rule):
@@ -122,17 +112,17 @@ def test_what_is_no_label_is_refused(labels, rule):
     ],
 )
 def test_a_label_of_the_command_line_stands_as_it_was_typed(text, value):
-    labels = load_experiment(DEMO, label_settings([text])).config.labels
+    labels = load_experiment(DEMO, sections.label_settings([text])).config.labels
     assert labels == {text.partition("=")[0]: value}
     assert type(*labels.values()) is type(value)
 
 
 def test_labels_of_the_command_line_join_those_of_the_file():
-    settings = ["labels={sample: A1, operator: Ann}", *label_settings(["sample=A7"])]
+    settings = ["labels={sample: A1, operator: Ann}", *sections.label_settings(["sample=A7"])]
     assert load_experiment(DEMO, settings).config.labels == {"sample": "A7", "operator": "Ann"}
 
 
 def test_all_that_are_none_are_listed():
     with pytest.raises(ConfigError) as refused:
-        label_settings(["sample", "a=1", "a.b=2"])
+        sections.label_settings(["sample", "a=1", "a.b=2"])
     assert [each.where for each in refused.value.problems] == ["--label sample", "--label a.b=2"]

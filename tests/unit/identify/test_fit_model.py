@@ -341,7 +341,6 @@ NOISE_UM = 0.01
 
 
 def command(levels=(5.0, -5.0, 0.0), rest_s=3.0):
-    """A growing sine, then rests."""
     time_s = np.arange(2000) / SLOW_HZ
     parts = [2.5 * time_s * np.sin(2.0 * np.pi * 5.0 * time_s)]
     last = 0.0

@@ -33,7 +33,6 @@ GRID = [(a, f) for a in (2.0, 4.0, 6.0) for f in (10.0, 50.0, 100.0)]
 
 @pytest.fixture
 def grid(loop_of):
-    """Nine loops."""
     return [loop_of(MODEL, a, f) for a, f in GRID]
 
 

@@ -97,20 +97,9 @@ class Step:
         flags = np.zeros(reference.size, dtype=np.uint32) if flags is None else flags
         input_um = reference.copy() if input_um is None else input_um
         return kernel.adapt_block(
-            reference,
-            input_um,
-            reference + error,
-            flags,
-            self.settings,
-            self.table,
-            self.shape,
-            THRESHOLDS,
-            self.due,
-            self.shown,
-            self.places,
-            self.memory,
-            self.state,
-        )
+            reference, input_um, reference + error, flags, self.settings, self.table, self.shape,
+            THRESHOLDS, self.due, self.shown, self.places, self.memory, self.state,
+        )  # fmt: skip
 
     @property
     def values(self):

@@ -70,5 +70,4 @@ def traces(start, flags=0, **rows):
 
 
 def first(runs):
-    """Return the run that a server shows."""
     return runs[0] if runs else None

@@ -116,7 +116,6 @@ def test_diagnostics_have_the_form_expected_by_panels(run):
 
 
 def fields_of(topic):
-    """Return the fields of a topic, live or in a recording."""
     name = {**TOPICS, **MESSAGES}[topic]
     return {field.name for field in message_class(name).DESCRIPTOR.fields}
 
@@ -215,7 +214,6 @@ async def seen(url, topics, wanted):
 
 
 def decode(channel, data):
-    """Decode with the schema of the channel."""
     files = descriptor_pb2.FileDescriptorSet.FromString(base64.b64decode(channel["schema"]))
     pool = descriptor_pool.DescriptorPool()
     for each in files.file:

@@ -7,14 +7,7 @@ import pytest
 
 from hilctl.base.samples import BlockBatch, BlockHeader, Flag
 from hilctl.base.segments import Segment
-from hilctl.live.live_metrics import (
-    EDGES_US,
-    Gauge,
-    Headroom,
-    LatenessCounts,
-    LiveErrorSpectrum,
-    RunningFigures,
-)
+from hilctl.live import live_metrics
 from hilctl.live.traces import ROW
 from hilctl.run.metadata import RunDescription
 from hilctl.run.start import checked_experiment
@@ -39,7 +32,7 @@ def added(figures, samples, segment=SEGMENT, part=37):
 
 
 def test_figures_are_those_of_whole_cycles():
-    figures = added(RunningFigures(RATE, "reference"), loop(30, 1200)).newest
+    figures = added(live_metrics.RunningFigures(RATE, "reference"), loop(30, 1200)).newest
     cycle = loop(30, 130).values
     expected = peak_hysteresis_percent(cycle[ROW["reference"]], cycle[ROW["displacement"]])
     assert figures["peak_hysteresis_percent"] == pytest.approx(expected, rel=1e-6)
@@ -51,7 +44,7 @@ def test_figures_are_those_of_whole_cycles():
 
 
 def test_metrics_are_of_the_newest_complete_cycles():
-    figures = added(RunningFigures(RATE, "reference"), loop(75, 2000, lag=0.4))
+    figures = added(live_metrics.RunningFigures(RATE, "reference"), loop(75, 2000, lag=0.4))
     assert figures.newest["peak_error_um"] == pytest.approx(20 * np.sin(0.2), rel=1e-3)
     added(figures, loop(2000, 4000, lag=0.1))
     assert figures.newest["peak_error_um"] == pytest.approx(20 * np.sin(0.05), rel=1e-3)
@@ -61,37 +54,39 @@ def test_invalid_samples_are_omitted():
     samples = loop(30, 1200)
     samples.values[[ROW["displacement"], ROW["error"]], 300] = 1e6
     samples.flags[300] = int(Flag.SENSOR_INVALID)
-    assert added(RunningFigures(RATE, "reference"), samples).newest["peak_error_um"] < 3.0
+    assert (
+        added(live_metrics.RunningFigures(RATE, "reference"), samples).newest["peak_error_um"] < 3.0
+    )
 
 
 def test_metrics_without_a_period():
     plain = Segment("steps", 0, 100_000, 0, 100_000)
-    figures = added(RunningFigures(RATE, "reference"), loop(0, 1200), plain).newest
+    figures = added(live_metrics.RunningFigures(RATE, "reference"), loop(0, 1200), plain).newest
     assert figures["peak_error_um"] == pytest.approx(20 * np.sin(0.1), rel=1e-3)
     assert "peak_hysteresis_percent" not in figures
 
 
 def test_no_metrics_before_the_first_complete_cycle():
-    figures = RunningFigures(RATE, "reference")
+    figures = live_metrics.RunningFigures(RATE, "reference")
     assert added(figures, loop(30, 90)).newest == {}
     assert added(figures, loop(90, 200), None).newest == {}
 
 
 def test_each_tick_is_counted_once():
-    counts = LatenessCounts()
+    counts = live_metrics.LatenessCounts()
     assert counts.percentiles_us() == {}
     batch = BlockBatch.empty(5, 1, 1)
     batch.heads[:, BlockHeader.LATE_NS] = (-5, 0, 30_000, 30_000, 9_000_000_000)
     counts.add(batch)
     assert counts.counts.sum() == 5
     assert counts.counts[-1] == 1
-    assert counts.counts[np.searchsorted(EDGES_US, 30.0) - 1] == 2
+    assert counts.counts[np.searchsorted(live_metrics.EDGES_US, 30.0) - 1] == 2
     assert counts.percentiles_us()["p50"] == 30.0
     assert counts.percentiles_us()["max"] == 9e6
 
 
 def test_line_of_a_sine_in_the_spectrum():
-    spectrum = LiveErrorSpectrum(50000.0)
+    spectrum = live_metrics.LiveErrorSpectrum(50000.0)
     t_s = np.arange(16384) / 50000.0
     spectrum.add(traces(0, error=5.0 + 0.3 * np.sin(2 * np.pi * 1000.0 * t_s)))
     hz, um = spectrum.points()
@@ -100,7 +95,7 @@ def test_line_of_a_sine_in_the_spectrum():
 
 
 def test_gap_clears_the_spectrum():
-    spectrum = LiveErrorSpectrum(1000.0)
+    spectrum = live_metrics.LiveErrorSpectrum(1000.0)
     assert spectrum.points()[0].size == 0
     spectrum.add(traces(0, error=np.zeros(300)))
     assert spectrum.points()[0].size > 0
@@ -122,7 +117,7 @@ def used(headroom, late_s=0.0):
 
 
 def test_use_of_each_limit(description):
-    headroom = Headroom(description)
+    headroom = live_metrics.Headroom(description)
     headroom.add(traces(0, command=[0.0, 0.1], displacement=[0.0, 26.25], error=[1.0, -4.0]))
     headroom.add(traces(2, command=[0.3], displacement=[0.0], error=[0.0]))
     found = used(headroom, 0.25)
@@ -135,7 +130,7 @@ def test_use_of_each_limit(description):
 
 
 def test_peak_is_held_for_a_second(description):
-    headroom = Headroom(description)
+    headroom = live_metrics.Headroom(description)
     headroom.add(traces(0, command=[7.07]))
     headroom.add(traces(30_000, command=[1.0]))
     assert used(headroom)["command"] == 1.0
@@ -144,7 +139,7 @@ def test_peak_is_held_for_a_second(description):
 
 
 def test_coil_heat_agrees_with_the_interlock(description):
-    headroom = Headroom(description)
+    headroom = live_metrics.Headroom(description)
     for start in range(0, 500_000, 50_000):  # one time constant
         headroom.add(traces(start, command=np.full(50_000, 5.0)))
     assert used(headroom)["coil heat"] == pytest.approx(math.sqrt(1 - math.exp(-1)), rel=1e-6)
@@ -152,4 +147,4 @@ def test_coil_heat_agrees_with_the_interlock(description):
 
 @pytest.mark.parametrize(("part", "level"), [(0.5, "info"), (0.81, "warning"), (0.96, "error")])
 def test_level_of_a_gauge(part, level):
-    assert Gauge("slew", part, part, 1.0, "A/s").level == level
+    assert live_metrics.Gauge("slew", part, part, 1.0, "A/s").level == level

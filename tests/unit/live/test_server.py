@@ -48,11 +48,9 @@ async def serving(chosen=first):
 def opened(server, *, token=None, origin=None, host="127.0.0.1"):
     token = server.url.partition("#")[2] if token is None else token
     return connect(
-        f"ws://{host}:{server.port}/live",
-        origin=origin or f"http://{host}:{server.port}",
-        subprotocols=["hilctl.live.1", f"token.{token}"],
-        proxy=None,
-    )
+        f"ws://{host}:{server.port}/live", origin=origin or f"http://{host}:{server.port}",
+        subprotocols=["hilctl.live.1", f"token.{token}"], proxy=None,
+    )  # fmt: skip
 
 
 async def status_of(connection):
@@ -139,14 +137,9 @@ def test_requests_go_to_the_control_socket(description, tmp_path, monkeypatch):
 def test_report_is_served_to_the_page_that_asked_for_it(description, tmp_path):
     recording = tmp_path / "a.mcap"
     command = [
-        sys.executable,
-        "-m",
-        "hilctl",
-        "run",
-        str(CONFIGS / "demo.yaml"),
-        "--output",
+        sys.executable, "-m", "hilctl", "run", str(CONFIGS / "demo.yaml"), "--output",
         str(recording),
-    ]
+    ]  # fmt: skip
     subprocess.run([*command, "--set", "waveform.duration_s=0.5"], check=True, capture_output=True)
 
     async def run():

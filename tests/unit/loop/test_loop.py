@@ -59,7 +59,6 @@ class Rig:
 
     @property
     def firsts(self):
-        """First sample of each recorded block."""
         return [head[BlockHeader.FIRST_SAMPLE] for head in self.host.heads]
 
     @property
@@ -488,11 +487,9 @@ def test_command_after_skipped_ticks_is_the_one_that_was_due(name, frequency_hz,
 
 def test_skipped_ticks_move_a_tuning_on():
     rig = Rig(
-        np.full(200, 2.0),
-        model=terfenol_rdpi(),
-        tunings={40: Tuning(0.5, 0.0, 40)},
+        np.full(200, 2.0), model=terfenol_rdpi(), tunings={40: Tuning(0.5, 0.0, 40)},
         clock=FakeClock(stall_ns={50: 10_000_000}),
-    )
+    )  # fmt: skip
     rig.run()
     at = rig.firsts.index(60)
     assert rig.host.columns[at][0][0] == pytest.approx(2.0 * (1.0 - 0.5 * 21 / 40))
@@ -521,11 +518,9 @@ def test_skipped_ticks_move_a_fade_on():
     reference = np.linspace(0.0, 20.0, 200)
     out = Tuning(1.0, 0.0, 40, 0, 0.0, LinearBypass(0.1, 0.0))
     rig = Rig(
-        reference,
-        model=terfenol_rdpi(),
-        tunings={40: out},
+        reference, model=terfenol_rdpi(), tunings={40: out},
         clock=FakeClock(stall_ns={50: 10_000_000}),
-    )
+    )  # fmt: skip
     rig.run()
     at = rig.firsts.index(60)
     compensator, inverse = Compensator(terfenol_rdpi(), RATE_HZ), np.empty(61)

@@ -14,7 +14,6 @@ SIGNAL = 3.0 * np.sin(np.arange(500) / 30.0) + 0.4 * np.sin(np.arange(500) / 3.0
 
 @pytest.fixture(params=MODELS)
 def model(request):
-    """One model of each kind."""
     return MODELS[request.param]
 
 

@@ -33,18 +33,15 @@ def batch(first, blocks, *, dropped=0, seed=0):
     heads[:, BlockHeader.LATE_NS] = rng.integers(0, 90_000, blocks)
     heads[:, BlockHeader.EXCHANGE_NS] = rng.integers(0, 50_000, blocks)
     return BlockBatch(
-        heads,
-        rng.normal(size=(blocks, 4)),
-        rng.normal(size=(blocks, len(COLUMNS), BLOCK)),
+        heads, rng.normal(size=(blocks, 4)), rng.normal(size=(blocks, len(COLUMNS), BLOCK)),
         rng.integers(0, 31, (blocks, BLOCK)).astype(np.uint32),
-    )
+    )  # fmt: skip
 
 
 def write(
     stream, batches, *, unit="A", measures=True, own_input=True, waveform_unit="um", events=(),
     finish=True, ended_at=0,
 ):  # fmt: skip
-    """Write a recording, a chunk a batch."""
     facts = RunFacts(
         facts={"compensator": "rdpi"},
         segments=(SEGMENT,),
@@ -73,7 +70,6 @@ def write(
 
 
 def samples(batches):
-    """All samples of batches, in order."""
     return functools.reduce(Samples.followed_by, [each.samples() for each in batches])
 
 

@@ -13,20 +13,12 @@ from hilctl.base.errors import DataError, InputError
 from hilctl.base.events import INVERSE, TUNED, Event
 from hilctl.base.samples import BlockHeader
 from hilctl.base.segments import Segment
-from hilctl.recording import schema
+from hilctl.recording import schema, validation
 from hilctl.recording.encoder import RecordingLayout
 from hilctl.recording.metadata_keys import sealed, unsealed
 from hilctl.recording.reader import read
 from hilctl.recording.recover import recover_recording
 from hilctl.recording.recovery_scan import RecoveryScan
-from hilctl.recording.validation import (
-    LAST_SAMPLE,
-    count_of,
-    labels_of,
-    number_of,
-    segments_of,
-    sound_blocks,
-)
 from tests.unit.recording.conftest import written
 
 NO_SLOPE = {"share": 0.0, "samples": 10.0, "at_zero": 0.0}
@@ -172,10 +164,10 @@ def test_a_topic_with_another_schema_is_refused(crafted, tmp_path):
 
 
 def test_numbers_of_facts():
-    assert number_of({"rate": "2.5"}, "rate", 0.0, 9.0) == 2.5
-    assert count_of({}, "missing_samples") == 0
+    assert validation.number_of({"rate": "2.5"}, "rate", 0.0, 9.0) == 2.5
+    assert validation.count_of({}, "missing_samples") == 0
     with pytest.raises(ValueError, match="rate is missing"):
-        number_of({}, "rate", 0.0, 9.0)
+        validation.number_of({}, "rate", 0.0, 9.0)
 
 
 @pytest.mark.parametrize("seconds", [-1, 9_223_372_036, 2**40])
@@ -211,9 +203,9 @@ def test_what_a_dying_process_left_is_looked_at(tmp_path, make):
     left.heads[0, BlockHeader.FIRST_SAMPLE] = -5
     left.heads[2, BlockHeader.FIRST_SAMPLE] = 2**62
     left.heads[3, BlockHeader.LATE_NS] = -(2**63)
-    assert sound_blocks(left).tolist() == [False, True, False, False]
+    assert validation.sound_blocks(left).tolist() == [False, True, False, False]
     events = [Event(-1, "info", "x", "y"), Event(3, "info", "x", "y", time_ns=-9), make.ended]
-    recovered = recover_recording(path, [left], events=events, ended_at=LAST_SAMPLE + 5)
+    recovered = recover_recording(path, [left], events=events, ended_at=validation.LAST_SAMPLE + 5)
     back = read(recovered.path)
     assert back.samples.index.tolist() == [*range(200), *range(250, 300)]
     assert recovered.missing_samples == 50
@@ -225,8 +217,8 @@ def test_what_a_dying_process_left_is_looked_at(tmp_path, make):
 )
 def test_labels_that_are_none_are_refused(text):
     with pytest.raises(ValueError, match="labels must"):
-        labels_of({"labels": text})
-    assert labels_of({}) == {}  # as in older recordings
+        validation.labels_of({"labels": text})
+    assert validation.labels_of({}) == {}  # as in older recordings
 
 
 GOOD = Segment("sine", 0, 100, 10, 90, 20.0).to_mapping()
@@ -241,17 +233,17 @@ GOOD = Segment("sine", 0, 100, 10, 90, 20.0).to_mapping()
     ],
 )  # fmt: skip
 def test_segments_that_can_not_be(change):
-    assert segments_of(json.dumps([GOOD])) == (Segment.from_mapping(GOOD),)
+    assert validation.segments_of(json.dumps([GOOD])) == (Segment.from_mapping(GOOD),)
     with pytest.raises(ValueError, match="segments: "):
-        segments_of(json.dumps([{**GOOD, **change}]))
+        validation.segments_of(json.dumps([{**GOOD, **change}]))
 
 
 def test_what_hilctl_does_not_write_but_could_mean():
     """A period may be left out, or be whole, and a label may hold a tab."""
     odd = {**GOOD, "period": 20, "label": "sine\t"}
-    assert segments_of(json.dumps([odd])) == (Segment("sine\t", 0, 100, 10, 90, 20.0),)
+    assert validation.segments_of(json.dumps([odd])) == (Segment("sine\t", 0, 100, 10, 90, 20.0),)
     del odd["period"]
-    assert segments_of(json.dumps([odd]))[0].period == 0.0
+    assert validation.segments_of(json.dumps([odd]))[0].period == 0.0
 
 
 @pytest.mark.parametrize(
@@ -259,4 +251,4 @@ def test_what_hilctl_does_not_write_but_could_mean():
 )
 def test_texts_that_list_no_segments(text):
     with pytest.raises(ValueError, match="segments: "):
-        segments_of(text)
+        validation.segments_of(text)

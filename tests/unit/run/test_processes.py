@@ -28,7 +28,6 @@ class FakeProcess:
 
 @pytest.fixture
 def started(tmp_path, monkeypatch):
-    """A child that was started, and its page."""
     process = FakeProcess()
 
     def start_process(*words, inherits):

@@ -52,7 +52,6 @@ def checked():
 
 @pytest.fixture
 def begun(checked, monkeypatch, tmp_path):
-    """A recorder that has begun, and the disk that it writes to."""
     disks = []
 
     class Output(OutputFile):

@@ -27,7 +27,6 @@ SHORT = ["waveform.duration_s=0.25", "waveform.frequency_hz=100"]
 
 
 def plan(block, latency_blocks):
-    """What a host asks of a plan."""
     compensator = SimpleNamespace(state_size=0)
     return SimpleNamespace(block=block, latency_blocks=latency_blocks, compensator=compensator)
 

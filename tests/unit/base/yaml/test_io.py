@@ -54,7 +54,6 @@ def document(text=TEXT):
 
 
 def problems(text, **settings):
-    """Return every problem of a text, or of the settings made on it."""
     with pytest.raises(ConfigError) as caught:
         document(text).validate(SetUp, **settings)
     return str(caught.value).split("\n")
@@ -147,11 +146,9 @@ def test_broken_rules_in_words(before, after, problem):
 def test_all_problems_come_together():
     text = changed("bench", "7").replace("6.0", "x").replace("2.5", "-1").replace("4.0", "y")
     assert [line.split(": ")[:2] for line in problems(text)] == [
-        ["bench.yaml:1", "name"],
-        ["bench.yaml:3", "limits.peak_a"],
-        ["bench.yaml:7", "parts.0.radius_um"],
-        ["bench.yaml:9", "parts.1.side_um"],
-    ]
+        ["bench.yaml:1", "name"], ["bench.yaml:3", "limits.peak_a"],
+        ["bench.yaml:7", "parts.0.radius_um"], ["bench.yaml:9", "parts.1.side_um"],
+    ]  # fmt: skip
 
 
 def test_part_of_a_document():

@@ -13,15 +13,7 @@ from hilctl_drivers.ascii.ascii_session import (
     parse_number,
 )
 from hilctl_drivers.profile import load_profile, with_link
-from hilctl_drivers.transport.links import (
-    BadRequestError,
-    CorruptError,
-    IncompleteError,
-    MismatchError,
-    NoAnswerError,
-    RefusedError,
-    WatchdogTrippedError,
-)
+from hilctl_drivers.transport import links
 
 DCON = load_profile(str(Path(__file__).parents[3] / "data" / "dcon_module.yaml"))
 PLAIN = DCON.model_copy(update={"link": DCON.link.model_copy(update={"checksum": "none"})})
@@ -40,7 +32,7 @@ class ScriptedLink:
             return b""
         reply = self.replies.pop(0)
         if reply is None:
-            raise NoAnswerError("no answer within 0.1 s")
+            raise links.NoAnswerError("no answer within 0.1 s")
         return reply
 
 
@@ -58,12 +50,12 @@ def test_a_value_is_put_in_and_a_number_comes_out():
 @pytest.mark.parametrize(
     ("reply", "error", "said"),
     [
-        (b"?\r", RefusedError, r"#020: out of range \(\?\)"),
-        (b"?02\r", RefusedError, "invalid command"),
-        (b"!\r", WatchdogTrippedError, "ignored, the host watchdog has tripped"),
-        (b"ok\r", MismatchError, "not an answer to this: 'ok'"),
-        (b">>\r", MismatchError, "not an answer to this"),
-        (None, NoAnswerError, "#020: no answer within 0.1 s"),
+        (b"?\r", links.RefusedError, r"#020: out of range \(\?\)"),
+        (b"?02\r", links.RefusedError, "invalid command"),
+        (b"!\r", links.WatchdogTrippedError, "ignored, the host watchdog has tripped"),
+        (b"ok\r", links.MismatchError, "not an answer to this: 'ok'"),
+        (b">>\r", links.MismatchError, "not an answer to this"),
+        (None, links.NoAnswerError, "#020: no answer within 0.1 s"),
     ],
 )
 def test_trouble_is_told_with_what_was_asked(reply, error, said):
@@ -72,7 +64,7 @@ def test_trouble_is_told_with_what_was_asked(reply, error, said):
 
 
 def test_another_address_answers_for_nobody():
-    with pytest.raises(MismatchError, match="address 03"):
+    with pytest.raises(links.MismatchError, match="address 03"):
         session(b"!037024\r").ask("$02M", "![0-9A-F]{2}.*")
 
 
@@ -81,7 +73,7 @@ def test_a_line_is_waited_for_to_its_end_but_not_for_ever():
     asked.ask("#020", ">")
     missing = asked.link.missing
     assert (missing(bytearray(b">")), missing(bytearray(b">\r"))) == (1, 0)
-    with pytest.raises(CorruptError, match="no end of"):
+    with pytest.raises(links.CorruptError, match="no end of"):
         missing(bytearray(1 << 16))
 
 
@@ -114,12 +106,11 @@ def test_an_echo_must_be_what_was_sent():
     link = PLAIN.link.model_copy(update={"echo": True})
     profile = PLAIN.model_copy(update={"link": link})
     session(b"#020\r>\r", profile=profile).ask("#020", ">")
-    with pytest.raises(CorruptError, match="b'#030'"):
+    with pytest.raises(links.CorruptError, match="b'#030'"):
         session(b"#030\r>\r", profile=profile).ask("#020", ">")
 
 
 def wire_s(time):
-    """Return the time of the characters alone."""
     return time.request_s + time.reply_s
 
 
@@ -211,28 +202,28 @@ def test_numbers_of_all_three_forms(text, value):
      "\u0661", "1e99999", "9.9E37", "-9.9e37", "9.91E37", "1e400"],
 )  # fmt: skip
 def test_what_is_not_exactly_one_number_is_corrupt(text):
-    with pytest.raises(CorruptError):
+    with pytest.raises(links.CorruptError):
         parse_number(text)
 
 
 @ALL
 @pytest.mark.parametrize("text", ["", "a\r", "\n", "a\tb", "µm", "a\0", "\x7f"])
 def test_only_printable_lines_are_sent(line, text):
-    with pytest.raises(BadRequestError, match="printable ASCII"):
+    with pytest.raises(links.BadRequestError, match="printable ASCII"):
         line.encode(text)
 
 
 def test_long_lines_are_refused_both_ways():
     """Kepco takes 127 characters; a receiver never waits for more than a line can have."""
     assert len(SCPI.encode("x" * 127)) == 128
-    with pytest.raises(BadRequestError, match="127 bytes, got 128"):
+    with pytest.raises(links.BadRequestError, match="127 bytes, got 128"):
         SCPI.encode("x" * 128)
-    with pytest.raises(CorruptError, match="127 bytes, got 128"):
+    with pytest.raises(links.CorruptError, match="127 bytes, got 128"):
         SCPI.decode(b"x" * 128 + b"\n")
-    with pytest.raises(CorruptError, match="one line"):
+    with pytest.raises(links.CorruptError, match="one line"):
         SCPI.decode(b"x" * 128)
     assert DCON_LINE.size_max == 255
-    with pytest.raises(BadRequestError, match="got 256"):
+    with pytest.raises(links.BadRequestError, match="got 256"):
         DCON_LINE.encode("x" * 254)
 
 
@@ -240,16 +231,16 @@ def test_long_lines_are_refused_both_ways():
 def test_beginnings_and_tails_of_lines(line):
     whole = line.encode("OK")
     for cut in range(len(whole)):
-        with pytest.raises(IncompleteError):
+        with pytest.raises(links.IncompleteError):
             line.decode(whole[:cut])
     for tail in (b"x", whole, line.terminator):
-        with pytest.raises(CorruptError, match="one line"):
+        with pytest.raises(links.CorruptError, match="one line"):
             line.decode(whole + tail)
 
 
 @pytest.mark.parametrize("body", [b"\xb0", b"a\tb", b"\x7f", b"\x11OK", b"OK\r"])
 def test_what_is_not_text_is_corrupt(body):
-    with pytest.raises(CorruptError, match="printable ASCII"):
+    with pytest.raises(links.CorruptError, match="printable ASCII"):
         SCPI.decode(body + b"\n")
 
 
@@ -260,7 +251,7 @@ def test_what_is_not_text_is_corrupt(body):
      (GEN, b"OK\r"), (GEN, b"OK$9B\r"), (GEN, b"OK9A\r"), (GEN, b"$9\r")],
 )  # fmt: skip
 def test_wrong_or_missing_checksums_are_corrupt(line, wire):
-    with pytest.raises(CorruptError, match="checksum"):
+    with pytest.raises(links.CorruptError, match="checksum"):
         line.decode(wire)
 
 

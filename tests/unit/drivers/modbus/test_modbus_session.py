@@ -31,14 +31,7 @@ from hilctl_drivers.modbus.pdu import (
 from hilctl_drivers.modbus.register_map import EnsureStep, ExpectStep, WriteStep
 from hilctl_drivers.profile import load_profile, parse_profile, with_link
 from hilctl_drivers.profile_base import WaitStep
-from hilctl_drivers.transport.links import (
-    BadRequestError,
-    CorruptError,
-    FrameError,
-    IncompleteError,
-    MismatchError,
-    RefusedError,
-)
+from hilctl_drivers.transport import links
 from tests.unit.drivers.modbus.conftest import exchange
 
 
@@ -237,7 +230,6 @@ def rtu(baud=115200, parity="N", **link):
 
 
 def wire_s(time):
-    """Return the time of the characters alone."""
     return time.request_s + time.reply_s
 
 
@@ -251,11 +243,9 @@ class TestRtu:
         write = exchange_time(profile, "AO", None)
         small = exchange_time(profile, "SMALL", None)
         found = {
-            "FC16": wire_s(write),
-            "FC06": wire_s(small),
-            "FC03": wire_s(both) - wire_s(write),
+            "FC16": wire_s(write), "FC06": wire_s(small), "FC03": wire_s(both) - wire_s(write),
             "FC23": wire_s(exchange_time(profile, "AO", "AI")),
-        }
+        }  # fmt: skip
         for function, row in TABLE_MS.items():
             assert found[function] * 1e3 == pytest.approx(row[column], rel=0.03), function
 
@@ -348,14 +338,9 @@ def test_modbus_dac_leaves_room_for_feeding(tmp_path):
     path = tmp_path / "acme.yaml"
     path.write_text(PROFILE.replace("FEED", FEED))
     options = {
-        "profile": str(path),
-        "serial_port": "/dev/ttyUSB0",
-        "output": "AO",
-        "input": "AI",
-        "amplifier": {"gain_a_per_v": 1.0},
-        "sensor": {"um_per_v": 10.0},
-        "timeout_s": 1.0,
-    }
+        "profile": str(path), "serial_port": "/dev/ttyUSB0", "output": "AO", "input": "AI",
+        "amplifier": {"gain_a_per_v": 1.0}, "sensor": {"um_per_v": 10.0}, "timeout_s": 1.0,
+    }  # fmt: skip
     exchange_s = exchange_time(acme(), "AO", "AI").total_s
     for watchdog, feed_s in (("none", 0.0), ({"timeout_s": 1.0}, requests_s(WRITE))):
         info = ModbusDac(ModbusOptions.model_validate({**options, "watchdog": watchdog})).info
@@ -462,10 +447,10 @@ def test_how_much_to_wait_for(case, wire):
     for adu in (wrap(request, reply(NEW[:size])), refusal):
         for cut in range(len(adu)):
             assert 1 <= transaction.missing(adu[:cut]) <= len(adu) - cut
-            with pytest.raises(IncompleteError):
+            with pytest.raises(links.IncompleteError):
                 transaction.reply(adu[:cut])
         assert transaction.missing(adu) == 0
-    with pytest.raises(RefusedError) as caught:
+    with pytest.raises(links.RefusedError) as caught:
         transaction.reply(refusal)
     assert caught.value.code == 2
 
@@ -480,7 +465,7 @@ def test_each_flipped_bit_outside_the_data_is_seen(case, wire):
     for bit in range(8 * data_from):
         bad = bytearray(good)
         bad[bit // 8] ^= 1 << bit % 8
-        with pytest.raises(FrameError):
+        with pytest.raises(links.FrameError):
             transaction.reply(bad)
     assert transaction.reply(good) == read
 
@@ -491,7 +476,7 @@ def test_late_replies_are_not_taken_for_the_next(case):
     transaction, wrap, (_, size, reply, _) = prepared(case, "tcp")
     late = wrap(transaction.request(NEW[:size]), reply(NEW[:size]))
     transaction.request(NEW[:size])
-    with pytest.raises(MismatchError, match=r"transaction .*2, got 1"):
+    with pytest.raises(links.MismatchError, match=r"transaction .*2, got 1"):
         transaction.reply(late)
 
 
@@ -501,7 +486,7 @@ def test_single_write_must_echo_this_value():
         transaction.request(b"ab")
         request = bytes(transaction.request(b"cd"))
         assert transaction.reply(wrap(request, H("06 0007") + b"cd")) == b""
-        with pytest.raises(MismatchError, match="must begin with"):
+        with pytest.raises(links.MismatchError, match="must begin with"):
             transaction.reply(wrap(request, H("06 0007") + b"ab"))
 
 
@@ -520,7 +505,9 @@ def test_data_of_another_size_is_refused_and_changes_nothing(case, wire):
     transaction, _, (_, size, _, _) = prepared(case, wire)
     before = bytes(transaction.request())
     for data in (b"a", b"abc", b"abcdef"):
-        with pytest.raises(BadRequestError, match=f"prepared for {size} bytes, got {len(data)}"):
+        with pytest.raises(
+            links.BadRequestError, match=f"prepared for {size} bytes, got {len(data)}"
+        ):
             transaction.request(data)
     after = bytes(transaction.request())
     assert (after if wire == "rtu" else after[2:]) == (before if wire == "rtu" else before[2:])
@@ -532,10 +519,10 @@ def test_replies_of_another_length_are_refused(wire):
     request = bytes(transaction.request())
     good = wrap(request, H("04 04 40200000"))
     for pdu in (H("04 02 4020"), H("04 06 402000000000")):
-        with pytest.raises((MismatchError, IncompleteError)):
+        with pytest.raises((links.MismatchError, links.IncompleteError)):
             transaction.reply(wrap(request, pdu))
     for tail in (b"\0", b"\0\0", b"\x55", good):
-        with pytest.raises((CorruptError, MismatchError)):
+        with pytest.raises((links.CorruptError, links.MismatchError)):
             transaction.reply(good + tail)
 
 
@@ -543,7 +530,7 @@ def test_local_echo_of_an_adapter_is_named():
     transaction = RtuTransaction(17, read_pdu(4, 0, 2))
     echo = transaction.request()
     for received in (echo + b"\x11", echo + rtu_adu(17, b"\4\4" + REPLY)):
-        with pytest.raises(CorruptError, match="echo"):
+        with pytest.raises(links.CorruptError, match="echo"):
             transaction.reply(received)
 
 
@@ -557,7 +544,7 @@ def test_nonsense_is_not_waited_for():
         "0001 0100 0090 01 03 02",
     ):
         assert transaction.missing(H(nonsense)) == 0
-        with pytest.raises(CorruptError):
+        with pytest.raises(links.CorruptError):
             transaction.reply(H(nonsense))
 
 
@@ -570,5 +557,5 @@ def test_bits_of_an_odd_number_of_bytes_are_read(function):
     assert transaction.reply(rtu_adu(17, reply)) == H("A5 5A 01")
     bad = bytearray(rtu_adu(17, reply))
     bad[3] ^= 1
-    with pytest.raises(CorruptError):
+    with pytest.raises(links.CorruptError):
         transaction.reply(bad)

@@ -8,17 +8,10 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
+from hilctl_drivers.simulated import domains
 from hilctl_drivers.simulated.actuator_base import ROD_LENGTH_M, VACUUM_PERMEABILITY, Coil
-from hilctl_drivers.simulated.domains import (
-    KIND_SIZES,
-    ORIENTATIONS,
-    Domains,
-    DomainsParameters,
-    equilibrium,
-    magnetise,
-)
 
-RATED = DomainsParameters()
+RATED = domains.DomainsParameters()
 STEP_S = 1e-5
 AXIS = np.array([1.0, 1.0, 2.0]) / math.sqrt(6.0)
 ZEEMAN = VACUUM_PERMEABILITY * RATED.saturation_a_per_m
@@ -58,7 +51,7 @@ def all_eight(field):
 
 def at_rest(field, rods=RATED):
     """M / M_s and displacement in um of the anhysteretic state."""
-    model = Domains(rods, Coil(1.0, field, STEP_S))
+    model = domains.Domains(rods, Coil(1.0, field, STEP_S))
     rest_um = model.rest()
     return float((model._state[2, 1] - field) / rods.saturation_a_per_m), rest_um
 
@@ -66,8 +59,8 @@ def at_rest(field, rods=RATED):
 @pytest.mark.parametrize("field", [-40e3, 0.0, 13e3, 44.1e3, 95e3])
 def test_six_kinds_are_all_eight(field):
     """Magnetisation and strain are those of eight orientations, each for itself."""
-    assert sum(KIND_SIZES) == 8
-    assert len(ORIENTATIONS) == len(KIND_SIZES)
+    assert sum(domains.KIND_SIZES) == 8
+    assert len(domains.ORIENTATIONS) == len(domains.KIND_SIZES)
     fractions, along, strains = all_eight(field)
     magnetised, rest_um = at_rest(field)
     assert magnetised == pytest.approx(fractions @ along, abs=1e-9)
@@ -80,8 +73,10 @@ def test_closed_form_is_where_the_energy_is_least(field):
     """To first order: a tenth of field and stress moves moments by a tenth, within a hundredth."""
     weak = replace(RATED, stress_pa=0.1 * RATED.stress_pa)
     work = np.empty((8, 6))
-    equilibrium(field, weak.table(), Domains(weak, Coil(1.0, 0.0, STEP_S))._energies, work)
-    for kind, direction in enumerate(ORIENTATIONS):
+    domains.equilibrium(
+        field, weak.table(), domains.Domains(weak, Coil(1.0, 0.0, STEP_S))._energies, work
+    )
+    for kind, direction in enumerate(domains.ORIENTATIONS):
         easy = np.array(direction) / math.sqrt(3.0)
 
         def of(x, easy=easy):
@@ -116,12 +111,12 @@ def test_compression_turns_domains_across():
 @pytest.mark.parametrize("change", [-300.0, 300.0, 2000.0])
 def test_slopes_are_difference_quotients(change):
     """What Newton's method goes by is what a small change does."""
-    model = Domains(RATED, Coil(1.0, 44.1e3, STEP_S))
+    model = domains.Domains(RATED, Coil(1.0, 44.1e3, STEP_S))
     model.rest()
     model.follow(np.linspace(0.0, math.copysign(9e3, change), 801), np.empty(400))
     works = [np.empty((8, 6)) for _ in range(3)]
     found = [
-        magnetise(change + step, model._state, model._table, model._energies, work)
+        domains.magnetise(change + step, model._state, model._table, model._energies, work)
         for step, work in zip((-0.1, 0.0, 0.1), works, strict=True)
     ]
     assert found[1][1] == pytest.approx((found[2][0] - found[0][0]) / 0.2, rel=1e-6)
@@ -132,24 +127,24 @@ def test_slopes_are_difference_quotients(change):
 
 def test_fractions_stay_fractions():
     """However it is driven, they are between 0 and 1, and 1 in all."""
-    model = Domains(RATED, Coil(5.09e3, 44.1e3, STEP_S))
+    model = domains.Domains(RATED, Coil(5.09e3, 44.1e3, STEP_S))
     model.rest()
     current_a = np.random.default_rng(3).uniform(-10.0, 10.0, 200).repeat(20)
     for part in np.split(current_a, 200):
         model.follow(np.append(part, part[-1]).repeat(1)[:21], np.empty(10))
         for fractions in model._state[:2]:
             assert fractions.min() >= 0.0
-            assert fractions @ KIND_SIZES == pytest.approx(1.0, abs=1e-9)
+            assert fractions @ domains.KIND_SIZES == pytest.approx(1.0, abs=1e-9)
 
 
 def test_flux_is_kept():
     """H + M by the flux that came in is what fields and fractions come to, after any motion."""
-    model = Domains(RATED, Coil(5.09e3, 44.1e3, STEP_S))
+    model = domains.Domains(RATED, Coil(5.09e3, 44.1e3, STEP_S))
     model.rest()
     n = 4000
     model.follow(7.0 * np.sin(2.0 * np.pi * np.arange(2 * n + 1) / 400.0), np.empty(n))
     work = np.empty((8, 6))
-    equilibrium(model._state[2, 0], model._table, model._energies, work)
+    domains.equilibrium(model._state[2, 0], model._table, model._energies, work)
     fractions = 0.1 * model._state[0] + 0.9 * model._state[1]
     by_fractions = 7.65e5 * float((model._table[0] * fractions) @ work[1]) + model._state[2, 0]
     assert model._state[2, 1] == pytest.approx(by_fractions, abs=0.1)

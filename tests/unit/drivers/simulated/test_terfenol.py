@@ -12,19 +12,12 @@ import pytest
 from pydantic import ValidationError
 from scipy.signal import StateSpace, lsim
 
+from hilctl_drivers.simulated import terfenol
 from hilctl_drivers.simulated.devices import PHYSICS, SimulatedTerfenol, TerfenolOptions
 from hilctl_drivers.simulated.pinned_cells import PinnedCellsParameters
-from hilctl_drivers.simulated.terfenol import (
-    TerfenolActuator,
-    TerfenolParameters,
-    amplify,
-    creep,
-    respond,
-    warm,
-)
 from tests.unit.drivers.simulated.test_actuator_base import hysteresis_percent, run
 
-RATED = TerfenolParameters()
+RATED = terfenol.TerfenolParameters()
 QUIET = replace(RATED, sensor_noise_um=0.0)
 RATE_HZ = 50e3
 
@@ -38,7 +31,7 @@ def last_cycle(harmonics, frequency_hz, bias_a=0.0):
     cycles = 2 if frequency_hz < 50.0 else 8
     phase = 2.0 * np.pi * np.arange(n * cycles) / n
     command_a = np.sum([a * np.sin(k * phase) for k, a in harmonics], axis=0)
-    displacement_um = run(TerfenolActuator(QUIET, rate_hz, bias_a=bias_a), command_a)
+    displacement_um = run(terfenol.TerfenolActuator(QUIET, rate_hz, bias_a=bias_a), command_a)
     return command_a[-n:], displacement_um[-n:]
 
 
@@ -103,7 +96,6 @@ class TestPublishedFigures:
         ("name", "published", "tolerance", "figure"), PUBLISHED, ids=[row[0] for row in PUBLISHED]
     )
     def test_figure(self, name, published, tolerance, figure):
-        """The actuator shows the published figure."""
         simulated = figure()
         print(f"{name}: {simulated:.2f}, published {published:g}")
         assert simulated == pytest.approx(published, abs=tolerance)
@@ -138,7 +130,7 @@ class TestPublishedFigures:
         # Far less lag than rated, and no current loop to speak of: the ringing stands alone.
         rods = replace(PinnedCellsParameters(), lag_s=1e-5)
         brisk = replace(QUIET, rods=rods, amplifier_bandwidth_hz=50e3, dac_codes=2**30)
-        ringing = run(TerfenolActuator(brisk, 200e3, load_kg), np.full(20_000, 0.1))
+        ringing = run(terfenol.TerfenolActuator(brisk, 200e3, load_kg), np.full(20_000, 0.1))
         ringing -= ringing[-1]
         crossings = np.flatnonzero(np.diff(np.sign(ringing)))[:5]
         half_period_s = np.diff(crossings).mean() / 200e3
@@ -147,7 +139,7 @@ class TestPublishedFigures:
 
 def test_noise_is_the_sensors():
     """The reading at rest has the published noise and no mean."""
-    displacement_um = run(TerfenolActuator(RATED, RATE_HZ), np.zeros(50_000))
+    displacement_um = run(terfenol.TerfenolActuator(RATED, RATE_HZ), np.zeros(50_000))
     assert displacement_um.std() == pytest.approx(0.03553, rel=0.02)
     assert abs(displacement_um.mean()) < 0.001
 
@@ -156,7 +148,7 @@ class TestTiming:
     def test_reading_comes_before_the_command(self):
         """The first reading can't show the first command, neither as current nor as motion."""
         displacement_um, current_a = np.empty(50), np.empty(50)
-        TerfenolActuator(QUIET, RATE_HZ).step(np.full(50, 2.0), displacement_um, current_a)
+        terfenol.TerfenolActuator(QUIET, RATE_HZ).step(np.full(50, 2.0), displacement_um, current_a)
         assert displacement_um[0] == 0.0
         assert current_a[0] == 0.0
         assert current_a[1] == pytest.approx(2.0 * (1.0 - np.exp(-2e4 * np.pi * 20e-6)), abs=1e-3)
@@ -165,7 +157,9 @@ class TestTiming:
     def test_sensor_stops_at_its_range(self):
         """A displacement beyond +-10 V of sensor output reads as the end of the range."""
         strong = replace(QUIET, rods=replace(PinnedCellsParameters(), strain_um=1500.0))
-        displacement_um = run(TerfenolActuator(strong, RATE_HZ), np.repeat([-9.0, 9.0], 1000))
+        displacement_um = run(
+            terfenol.TerfenolActuator(strong, RATE_HZ), np.repeat([-9.0, 9.0], 1000)
+        )
         assert displacement_um.min() == -125.0
         assert displacement_um.max() == 125.0
 
@@ -184,11 +178,10 @@ def options(**given):
 
 def actuator(rate_hz=RATE_HZ, **given):
     of = options(**given)
-    return TerfenolActuator(of.parameters(), rate_hz, of.load_kg, of.bias_a)
+    return terfenol.TerfenolActuator(of.parameters(), rate_hz, of.load_kg, of.bias_a)
 
 
 def run_both(rig, command_a):
-    """Displacement in um and current in A."""
     displacement_um, current_a = np.empty((2, command_a.size))
     rig.step(command_a, displacement_um, current_a)
     return displacement_um, current_a
@@ -290,7 +283,7 @@ class TestSecondMode:
         brisk = replace(
             options(second_mode=mode).parameters(), rods=rods, dac_codes=2**30, damping_ratio=0.9
         )
-        ringing = run_both(TerfenolActuator(brisk, 200e3), np.full(40_000, 0.2))[0]
+        ringing = run_both(terfenol.TerfenolActuator(brisk, 200e3), np.full(40_000, 0.2))[0]
         ringing = ringing[400:] - ringing[-1]
         crossings = np.flatnonzero(np.diff(np.sign(ringing)))[:9]
         half_period_s = np.diff(crossings).mean() / 200e3
@@ -351,7 +344,7 @@ def amplified(command, left=0.5, decay=0.9, most=NO_LIMIT, substeps=2):
     command = np.asarray(command, dtype=float)
     read, halves = np.empty(command.size), np.empty(2 * command.size * substeps + 1)
     factors = (math.sqrt(left), left, math.sqrt(decay), decay, most, CODE_A)
-    amplify(command, read, halves, np.zeros(1), factors, substeps)
+    terfenol.amplify(command, read, halves, np.zeros(1), factors, substeps)
     return read, halves
 
 
@@ -382,17 +375,17 @@ def test_creep_comes_to_its_share_of_the_displacement():
     """Each element by its own time constant, and each block goes on where the last one ended."""
     elements = np.array([[0.1, 0.2], [0.5, 0.001], [0.0, 0.0]])
     free = np.full(3, 12.0)
-    creep(free, elements, 2.0)
+    terfenol.creep(free, elements, 2.0)
     assert free == pytest.approx(12.0 + 1.0 * (1.0 - 0.5 ** np.arange(1, 4)), abs=0.01)
     longer = np.full(30_000, 12.0)
-    creep(longer, elements, 2.0)
+    terfenol.creep(longer, elements, 2.0)
     assert longer[-1] == pytest.approx(12.0 + 10.0 * (0.1 + 0.2))
 
 
 def test_rods_warm_with_the_square_of_the_current():
     """They stand where the room puts them at first, and end at the steady rise."""
     halves, growth, state = np.full(2 * 20_000 + 1, 2.0), np.zeros(10_000), np.zeros(1)
-    warm(halves, growth, state, (0.5, 0.01, 3.0, -4.0, 1.0), 2)
+    terfenol.warm(halves, growth, state, (0.5, 0.01, 3.0, -4.0, 1.0), 2)
     assert growth[0] == pytest.approx(3.0 * -4.0)
     assert growth[-1] == pytest.approx(3.0 * (-4.0 + 0.5 * 3.0**2))
     assert state[0] == pytest.approx(4.5)
@@ -402,5 +395,5 @@ def test_a_reading_shows_what_was_before_its_step_and_ends_at_the_range():
     """A structure that follows at once: the reading is the displacement one sample before."""
     motion = np.array([[0.0, 0, 0, 0, 1.0], [0.0] * 5, [0.0, 0, 0, 0, 1.0]])
     free, shown = np.array([3.0, 5.04, 99.0, 0.0]), np.empty(4)
-    respond(free, np.zeros(4), shown, np.zeros(5), motion, 1.0, (0.1, 50.0), 1)
+    terfenol.respond(free, np.zeros(4), shown, np.zeros(5), motion, 1.0, (0.1, 50.0), 1)
     assert shown == pytest.approx([0.0, 2.0, 4.0, 50.0])

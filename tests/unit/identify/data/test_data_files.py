@@ -137,7 +137,6 @@ def write(folder: Path, lines: list[str], name: str = "t.csv") -> Path:
 
 
 def table(path: Path, command: str | int, displacement: str | int, **options: Any) -> History:
-    """Read two columns of a table."""
     columns = {"command_column": command, "displacement_column": displacement}
     return read_table(path, TableSettings(**columns, **options)).history
 
@@ -149,14 +148,9 @@ def rows(separator: str, n: int = 40) -> list[str]:
 def test_quotes_comments_and_blank_lines(tmp_path):
     lines = ["# rig 3", "", '"drive, V","displacement"', *[f"{k},{k * k}" for k in range(20)]]
     history = table(
-        write(tmp_path, lines),
-        "drive, V",
-        "displacement",
-        rate_hz=5.0,
-        first_row=3,
-        last_row=19,
+        write(tmp_path, lines), "drive, V", "displacement", rate_hz=5.0, first_row=3, last_row=19,
         ignore=1,
-    )
+    )  # fmt: skip
     np.testing.assert_array_equal(history.command, np.arange(2, 19))
     assert (history.sample_rate_hz, history.ignore) == (5.0, 1)
 

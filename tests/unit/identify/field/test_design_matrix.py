@@ -81,7 +81,6 @@ RATE_HZ = 10_000.0
 
 
 def sine(amplitude: float, frequency_hz: float, seconds: float) -> F64:
-    """Return a sine of whole cycles."""
     return amplitude * np.sin(
         2.0 * np.pi * frequency_hz * np.arange(round(seconds * RATE_HZ)) / RATE_HZ
     )

@@ -49,7 +49,6 @@ def command(seed: int) -> F64:
 
 
 def truth() -> StagedModel:
-    """Return what the data come from."""
     hysteresis = duhem_model(losses=FieldLosses(field_s=1e-4, output_s=5e-6))
     structure = FirstMode(natural_hz=1500.0, damping_ratio=0.2)
     return StagedModel.around(hysteresis, structure=structure, delay_s=5e-5)
@@ -298,7 +297,6 @@ def history(seed: int, noise_um: float = 0.0, samples: int | None = None) -> His
 
 @cache
 def found() -> FittedModel:
-    """Return what is identified."""
     return fit_model(FitRequest([history(1, 0.01)], SETTINGS))
 
 

@@ -65,7 +65,6 @@ def data(unit: float = 1.0, um: float = 1.0, ignore: int = 50) -> Prepared:
 
 @cache
 def found(unit: float = 1.0, um: float = 1.0) -> FieldEnd:
-    """Return what the search ends with."""
     return FieldSearch(data(unit, um), SIZE, LEAST * um / unit).find(Stages(), lambda *_: None)
 
 
@@ -246,7 +245,6 @@ def history(seed: int, noise_um: float) -> History:
 
 
 def model() -> StagedModel:
-    """Return what the data come from."""
     structure = FirstMode(natural_hz=1500.0, damping_ratio=0.2)
     return truth(lag=FieldLag(tau_s=2e-4), structure=structure)
 

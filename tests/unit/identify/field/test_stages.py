@@ -6,23 +6,13 @@ import numpy as np
 import pytest
 
 from hilctl.identify.data.records import History
+from hilctl.identify.field import stages
 from hilctl.identify.field.densities import Curve
 from hilctl.identify.field.preprocess import Prepared, Run
-from hilctl.identify.field.stages import (
-    HIGH,
-    LOW,
-    STEP,
-    Physical,
-    Stages,
-    physical,
-    row,
-    signals,
-    stages_of,
-)
 from hilctl.models.effective_field import FieldLosses, FieldModel, OutputCurve
 
 RATE_HZ = 20_000.0
-STAGES = Stages(0.3, 0.2, 0.1, 0.4, 0.5, 0.06, 0.08, 0.9, 0.11)
+STAGES = stages.Stages(0.3, 0.2, 0.1, 0.4, 0.5, 0.06, 0.08, 0.9, 0.11)
 TIME_S = np.arange(2000) / RATE_HZ
 COMMAND = 4.0 * np.sin(2.0 * np.pi * 50.0 * TIME_S) + np.sin(2.0 * np.pi * 230.0 * TIME_S)
 
@@ -41,47 +31,47 @@ def plain_run(command: np.ndarray, derivatives: np.ndarray) -> Run:
 
 
 def test_a_search_can_begin_at_the_defaults_and_step_either_way():
-    low, high, step = row(LOW), row(HIGH), row(STEP)
-    assert (low <= row(Stages())).all()
-    assert (row(Stages()) <= high).all()
+    low, high, step = stages.row(stages.LOW), stages.row(stages.HIGH), stages.row(stages.STEP)
+    assert (low <= stages.row(stages.Stages())).all()
+    assert (stages.row(stages.Stages()) <= high).all()
     assert (step > 0.0).all()
     assert (2.0 * step <= high - low).all()
     assert (low >= 0.0).all()
     # Without inertia or damping there is no structure: natural_hz is worked out as 1 / radian.
-    assert LOW.radian > 0.0
-    assert LOW.damping > 0.0
+    assert stages.LOW.radian > 0.0
+    assert stages.LOW.damping > 0.0
 
 
-@pytest.mark.parametrize("bound", [LOW, HIGH])
+@pytest.mark.parametrize("bound", [stages.LOW, stages.HIGH])
 def test_a_model_takes_every_bound(bound):
-    known = physical(bound, Prepared([history()]))
+    known = stages.physical(bound, Prepared([history()]))
     assert FieldLosses(**known.losses.model_dump()) == known.losses
 
 
 def test_units_by_hand():
     data = Prepared([history()])
     data.top_hz, data.reach, data.stroke_um = 50.0 / math.pi, 4.0, 16.0  # unit of time: 0.01 s
-    known = physical(STAGES, data)
+    known = stages.physical(STAGES, data)
     losses = FieldLosses(
         field_s=0.003, output_s=0.001, decay_s=0.001, growth=0.1, bend=0.5 / 16.0, excess=0.12
     )
     assert known.losses.model_dump() == pytest.approx(losses.model_dump())
     linear = known.radian_s, known.damping_ratio, known.delay_s
     assert linear == pytest.approx((0.0008, 0.9, 0.0011))
-    assert row(stages_of(known, data)) == pytest.approx(row(STAGES))
+    assert stages.row(stages.stages_of(known, data)) == pytest.approx(stages.row(STAGES))
 
 
 def test_stages_of_other_records_lie_within_the_bounds():
-    known = physical(HIGH, Prepared([history()]))
+    known = stages.physical(stages.HIGH, Prepared([history()]))
     faster = Prepared([history(rate=5.0)])
-    assert stages_of(known, faster).radian == HIGH.radian
+    assert stages.stages_of(known, faster).radian == stages.HIGH.radian
 
 
 @pytest.mark.parametrize("units", [(3.0, 1.0, 1.0), (1.0, 0.2, 1.0), (1.0, 1.0, 5.0)])
 def test_the_same_stages_mean_the_same_in_any_units(units):
     def worked_out(record: History) -> tuple[np.ndarray, np.ndarray]:
         data = Prepared([record])
-        return signals(data.runs[0], physical(STAGES, data), None, 2.0 * data.reach)
+        return stages.signals(data.runs[0], stages.physical(STAGES, data), None, 2.0 * data.reach)
 
     u, y = worked_out(history())
     other_u, other_y = worked_out(history(*units))
@@ -106,8 +96,8 @@ def test_of_a_model_s_record_the_field_is_the_model_s(decay_s):
     )  # fmt: skip
     y_um = model.forward(RATE_HZ).process(COMMAND)
     run = plain_run(COMMAND, np.stack([y_um, np.zeros_like(y_um), np.zeros_like(y_um)]))
-    known = Physical(losses, 1e-4, 0.3, 0.0, 1.0)
-    u, bare_um = signals(run, known, Curve(operators, displacement_um), 20.0)
+    known = stages.Physical(losses, 1e-4, 0.3, 0.0, 1.0)
+    u, bare_um = stages.signals(run, known, Curve(operators, displacement_um), 20.0)
     np.testing.assert_array_equal(bare_um, y_um)
     np.testing.assert_allclose(2.0 * u, np.interp(y_um, displacement_um, operators), atol=1e-4)
 
@@ -117,8 +107,8 @@ def test_structure_and_delay_are_taken_off_the_displacement():
     w, r, d, late = 2.0 * np.pi * 200.0, 3e-4, 0.4, 7
     sine, cosine = np.sin(w * TIME_S), np.cos(w * TIME_S)
     run = plain_run(np.zeros_like(sine), np.stack([sine, w * cosine, -(w**2) * sine]))
-    known = Physical(FieldLosses(), r, d, late / RATE_HZ, 1.0)
-    u, y = signals(run, known, None, 20.0)
+    known = stages.Physical(FieldLosses(), r, d, late / RATE_HZ, 1.0)
+    u, y = stages.signals(run, known, None, 20.0)
     before = (1.0 - (r * w) ** 2) * sine + 2.0 * d * r * w * cosine
     np.testing.assert_allclose(y[:-late], before[late:], atol=1e-9)
     np.testing.assert_allclose(u, 0.0, atol=1e-9)

@@ -12,18 +12,7 @@ from hilctl.identify.evaluation import judgement_of
 from hilctl.identify.fit_api import FitData
 from hilctl.identify.model_page import refinement_page
 from hilctl.identify.model_selection import HeldOut
-from hilctl.identify.refine.refinement import (
-    STILL_S,
-    STRENGTHS,
-    Regularisation,
-    RegularisationSplit,
-    SelectedRegularisation,
-    _history,
-    load_runs,
-    parts_of,
-    refine_files,
-    refine_runs,
-)
+from hilctl.identify.refine import refinement
 from hilctl.identify.summary import REFINEMENT_HEADINGS, refinement_rows
 from hilctl.models.model_file import dump_model, load_model
 from hilctl.models.refined import RefinedModel
@@ -47,7 +36,7 @@ def missed_percent(model, truth, v):
 @pytest.fixture(scope="module")
 def found():
     """Return what five runs make of the old model."""
-    return refine_runs(OLD, five_runs(), source="old.yaml")
+    return refinement.refine_runs(OLD, five_runs(), source="old.yaml")
 
 
 @pytest.mark.slow
@@ -62,7 +51,7 @@ def test_error_on_unseen_references_is_far_less_than_half(old, found, amplitude)
 def test_small_runs_do_not_spoil_the_large_loop(old):
     small = [history(OLD, i, amplitude=0.7, noise_um=0.1) for i in range(4)]
     gain = [replace(run, displacement_um=0.97 * run.displacement_um) for run in small]
-    found = refine_runs(old, gain)
+    found = refinement.refine_runs(old, gain)
     large = command(77, 6.5)
     assert missed_percent(found.model, OLD, large) < 0.5
 
@@ -74,7 +63,7 @@ def test_creep_of_single_runs_is_not_learned_as_hysteresis(old, drift_um):
         history(actuator(), i, drift_um=drift_um * (i - 2), amplitude=a)
         for i, a in enumerate((6.5, 6.5, 4.0, 2.0, 5.0))
     ]
-    found = refine_runs(old, runs)
+    found = refinement.refine_runs(old, runs)
     v = command(77, 5.0)
     assert found.choice.own == (drift_um > 0.0)
     assert missed_percent(found.model, actuator(), v) < 0.4 * missed_percent(old, actuator(), v)
@@ -83,13 +72,13 @@ def test_creep_of_single_runs_is_not_learned_as_hysteresis(old, drift_um):
 @pytest.mark.slow
 def test_an_offset_becomes_the_models_own(old):
     runs = [history(actuator(offset_um=4.0), i) for i in range(4)]
-    found = refine_runs(old, runs)
+    found = refinement.refine_runs(old, runs)
     assert found.model.output_offset_um == pytest.approx(4.0, abs=0.3)
 
 
 @pytest.mark.slow
 def test_a_model_that_was_right_stays_as_it_is(old):
-    found = refine_runs(old, [history(OLD, i, noise_um=0.05) for i in range(4)])
+    found = refinement.refine_runs(old, [history(OLD, i, noise_um=0.05) for i in range(4)])
     assert not found.better
     assert str(found).startswith("no better")
     assert "noise" in found.reasons[0]
@@ -97,8 +86,8 @@ def test_a_model_that_was_right_stays_as_it_is(old):
 
 @pytest.mark.slow
 def test_refining_what_was_refined_goes_on_from_it(old, runs):
-    first = refine_runs(old, runs[:3]).model
-    again = refine_runs(first, [history(actuator(offset_um=1.0), i, amplitude=3.0)
+    first = refinement.refine_runs(old, runs[:3]).model
+    again = refinement.refine_runs(first, [history(actuator(offset_um=1.0), i, amplitude=3.0)
                                 for i in range(20, 24)])  # fmt: skip
     assert again.better
     assert isinstance(again.model.base, type(old))
@@ -109,7 +98,7 @@ def test_refining_what_was_refined_goes_on_from_it(old, runs):
 
 @pytest.mark.slow
 def test_one_run_is_judged_by_its_end(old):
-    found = refine_runs(old, [history(actuator(), 1, seconds=2.0)])
+    found = refinement.refine_runs(old, [history(actuator(), 1, seconds=2.0)])
     assert found.better
     assert len(found.choice.after.records) == 1
     assert found.choice.after.records[0].ignore > 10_000
@@ -117,7 +106,7 @@ def test_one_run_is_judged_by_its_end(old):
 
 @pytest.mark.slow
 def test_validation_runs_are_judged_and_not_fitted(old, runs):
-    found = refine_runs(old, runs[:3], runs[3:])
+    found = refinement.refine_runs(old, runs[:3], runs[3:])
     assert [record.label for record in found.choice.after.records] == ["run 3", "run 4"]
     assert "run 3" not in found.model.provenance.source
 
@@ -134,13 +123,15 @@ def test_provenance_says_what_it_was_refined_on(found):
 def test_swapped_wires_are_refused(old, runs):
     turned = [replace(run, displacement_um=-run.displacement_um) for run in runs]
     with pytest.raises(InputError, match="swap the wires"):
-        refine_runs(old, turned)
+        refinement.refine_runs(old, turned)
 
 
 @pytest.mark.slow
 def test_files_in_a_better_model_file_out(tmp_path):
     output = tmp_path / "better.yaml"
-    found = refine_files(OMEGA, [COMPENSATED, GOLDEN / "terfenol_uncompensated.mcap"], output)
+    found = refinement.refine_files(
+        OMEGA, [COMPENSATED, GOLDEN / "terfenol_uncompensated.mcap"], output
+    )
     assert output.exists() == found.better
     if found.better:
         assert load_model(output) == found.model
@@ -153,7 +144,7 @@ def test_nothing_is_written_where_it_is_no_better(tmp_path, monkeypatch, old):
     model.write_text(dump_model(old))
     right = [history(OLD, i, noise_um=0.05) for i in range(4)]
     monkeypatch.setattr("hilctl.identify.refine.refinement.load_runs", lambda paths, model: right)
-    found = refine_files(model, [Path("a.mcap")] * 4, output)
+    found = refinement.refine_files(model, [Path("a.mcap")] * 4, output)
     assert not found.better
     assert not output.exists()
 
@@ -162,12 +153,12 @@ def test_a_file_that_exists_is_refused_before_anything_is_read(tmp_path):
     output = tmp_path / "better.yaml"
     output.write_text("mine")
     with pytest.raises(InputError, match=r"better\.yaml"):
-        refine_files(tmp_path / "none.yaml", [], output)
+        refinement.refine_files(tmp_path / "none.yaml", [], output)
     assert output.read_text() == "mine"
 
 
 def test_a_run_from_rest_is_what_was_put_out_and_what_came():
-    (run,), recording = load_runs([COMPENSATED], load_model(OMEGA)), read(COMPENSATED)
+    (run,), recording = refinement.load_runs([COMPENSATED], load_model(OMEGA)), read(COMPENSATED)
     assert run.ignore == 0
     np.testing.assert_array_equal(run.command, recording.samples.command[: run.command.size])
 
@@ -175,8 +166,8 @@ def test_a_run_from_rest_is_what_was_put_out_and_what_came():
 def test_a_run_that_goes_on_has_the_one_before_ahead_of_it():
     first = read(COMPENSATED)
     later = replace(first, run={**first.run, "run_id": "b", "initial_state_run_id": "a"})
-    run = _history(later, {"a": first, "b": later})
-    still = round(STILL_S * first.sample_rate_hz)
+    run = refinement._history(later, {"a": first, "b": later})
+    still = round(refinement.STILL_S * first.sample_rate_hz)
     assert run.ignore == first.samples.index.size + still
     np.testing.assert_array_equal(run.command[: first.samples.index.size], first.samples.command)
     assert (run.command[run.ignore - still : run.ignore] == first.samples.command[-1]).all()
@@ -186,23 +177,23 @@ def test_a_run_that_goes_on_from_one_that_is_not_given_is_refused():
     first = read(COMPENSATED)
     later = replace(first, run={**first.run, "initial_state_run_id": "a"})
     with pytest.raises(DataError, match="that recording"):
-        _history(later, {})
+        refinement._history(later, {})
 
 
 def test_what_can_not_be_used_is_said(tmp_path):
     copy = Path(shutil.copy(COMPENSATED, tmp_path / "run.mcap"))
     with pytest.raises(InputError, match="named twice"):
-        load_runs([copy, copy], load_model(OMEGA))
+        refinement.load_runs([copy, copy], load_model(OMEGA))
     with pytest.raises(InputError, match="no recordings"):
-        load_runs([], load_model(OMEGA))
+        refinement.load_runs([], load_model(OMEGA))
     with pytest.raises(DataError, match=r"in A.* V"):
-        load_runs([copy], piezo_ppi())
+        refinement.load_runs([copy], piezo_ppi())
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_page_has_verdict_table_figures_and_model(old, runs):
-    found = refine_runs(old, runs[:3], source="a<b>.yaml")
+    found = refinement.refine_runs(old, runs[:3], source="a<b>.yaml")
     rows = refinement_rows(found)
     assert [row[0] for row in rows] == ["run 0", "run 1", "run 2"]
     assert all(len(row) == len(REFINEMENT_HEADINGS) for row in rows)
@@ -214,7 +205,6 @@ def test_page_has_verdict_table_figures_and_model(old, runs):
 
 
 def held_out(factors):
-    """Errors of so much of each run."""
     runs = tuple(history(OLD, i) for i in range(len(factors)))
     data = FitData(runs)
     modelled = np.concatenate([(1.0 + f) * run.displacement_um
@@ -229,7 +219,7 @@ def held_out(factors):
     ((0.10, 0.01), (0.03, 0.016), False),
 ])  # fmt: skip
 def test_better_in_the_mean_and_nowhere_much_worse(before, after, better):
-    choice = SelectedRegularisation(0.1, 1.0, False, held_out(before), held_out(after))
+    choice = refinement.SelectedRegularisation(0.1, 1.0, False, held_out(before), held_out(after))
     assert choice.better == better
 
 
@@ -240,12 +230,12 @@ def test_one_stretch_that_gets_worse_is_seen(factor, even):
     measured = after.records[1].displacement_um
     last = -(modelled.size // 10)
     modelled[last:] = (1.0 + factor * 0.02) * measured[last:]
-    choice = SelectedRegularisation(0.1, 1.0, False, before, after)
+    choice = refinement.SelectedRegularisation(0.1, 1.0, False, before, after)
     assert choice.better
     assert choice.even == even
 
 
-class Tried(Regularisation):
+class Tried(refinement.Regularisation):
     """Ways whose errors on runs held out are told, by strength and anchor."""
 
     def __init__(self, errors):
@@ -253,12 +243,12 @@ class Tried(Regularisation):
 
     def _tried(self, strength, anchor, *, own):
         error = self.errors.get((strength, anchor), 0.02)
-        kind = self.kinds.get(strength, SelectedRegularisation)
+        kind = self.kinds.get(strength, refinement.SelectedRegularisation)
         choice = kind(strength, anchor, own, held_out((0.02, 0.02)), held_out((error, error)))
         return choice, (strength, anchor), 100.0 * error
 
 
-class Uneven(SelectedRegularisation):
+class Uneven(refinement.SelectedRegularisation):
     """A way that makes a stretch worse."""
 
     @property
@@ -281,7 +271,7 @@ def test_no_more_than_half_is_left_for_the_sake_of_a_stretch(error, taken):
         ({(0.1, 10.0): 0.0101, (0.1, 100.0): 0.0101}, (0.1, 100.0)),
         ({(0.1, 10.0): 0.01, (0.1, 100.0): 0.0103}, (0.1, 10.0)),
         ({(0.1, 10.0): 0.0103, (0.1, 100.0): 0.02}, (0.1, 1.0)),
-        ({(0.1, 1.0): 0.02, (0.3, 10.0): 0.01}, (STRENGTHS[0], 1.0)),
+        ({(0.1, 1.0): 0.02, (0.3, 10.0): 0.01}, (refinement.STRENGTHS[0], 1.0)),
     ],
 )
 def test_the_old_model_is_held_to_where_that_costs_nothing(errors, taken):
@@ -292,23 +282,23 @@ def test_the_old_model_is_held_to_where_that_costs_nothing(errors, taken):
 
 def test_each_of_several_runs_is_judged_by_what_the_others_say():
     runs = [history(OLD, i) for i in range(3)]
-    parts, splits = parts_of(runs, ())
+    parts, splits = refinement.parts_of(runs, ())
     assert parts == tuple(runs)
     assert splits == (
-        RegularisationSplit((1, 2), (0,)),
-        RegularisationSplit((0, 2), (1,)),
-        RegularisationSplit((0, 1), (2,)),
+        refinement.RegularisationSplit((1, 2), (0,)),
+        refinement.RegularisationSplit((0, 2), (1,)),
+        refinement.RegularisationSplit((0, 1), (2,)),
     )
 
 
 def test_others_to_validate_with_are_never_fitted():
     runs = [history(OLD, i) for i in range(3)]
-    _, splits = parts_of(runs[:2], runs[2:])
-    assert splits == (RegularisationSplit((0, 1), (2,)),)
+    _, splits = refinement.parts_of(runs[:2], runs[2:])
+    assert splits == (refinement.RegularisationSplit((0, 1), (2,)),)
 
 
 def test_a_run_too_short_to_be_cut_is_refused():
     run = history(OLD, 1)
     short = replace(run, command=run.command[:20], displacement_um=run.displacement_um[:20])
     with pytest.raises(DataError, match="more recordings"):
-        parts_of([short], ())
+        refinement.parts_of([short], ())

@@ -45,7 +45,6 @@ JOB_LIMITS = SilenceLimits(1.0, 1.0, 1.0, 1.0)
 
 
 def job_of(experiment, *, ring="", limits=JOB_LIMITS):
-    """Return a job with what a guardian needs of it."""
     return Job(
         experiment=experiment, files={}, folder="", ring=ring, reference="", input_um="",
         state=None, heat_a2=0.0, stands_um=None, adapted=None, safe_value=0.25, ramp_per_s=50.0,

@@ -40,7 +40,6 @@ class Amplifier(SimulatedTerfenol):
 
 @pytest.fixture
 def amplifier(monkeypatch):
-    """The class of every device."""
     monkeypatch.setattr("hilctl.experiment.devices.device_class", lambda kind: Amplifier)
     Amplifier.asked, Amplifier.error = [], ""
     return Amplifier

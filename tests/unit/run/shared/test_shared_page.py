@@ -14,7 +14,6 @@ from hilctl.run.shared.shared_page import SIZE, PageField, PageSlot, Phase, Shar
 
 @pytest.fixture
 def sides():
-    """The page, seen from both sides."""
     memory = mmap(-1, SIZE)
     return SharedPage(memory), SharedPage(memory)
 

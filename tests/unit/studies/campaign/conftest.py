@@ -39,7 +39,6 @@ def drawn_pages(monkeypatch) -> list[tuple[str, int]]:
 
 @pytest.fixture
 def experiment(tmp_path) -> Path:
-    """Return an experiment file."""
     path = tmp_path / "rig.yaml"
     path.write_text(EXPERIMENT, encoding="utf-8")
     return path

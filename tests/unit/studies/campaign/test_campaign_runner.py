@@ -36,8 +36,6 @@ class Rig(StudyRig):
 
 @pytest.fixture
 def run(campaign, tmp_path):
-    """Run a campaign on a rig."""
-
     def go(rig, text=CAMPAIGN, host=None):
         folder = tmp_path / "runs"
         folder.mkdir(exist_ok=True)

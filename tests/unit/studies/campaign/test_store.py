@@ -9,15 +9,7 @@ from hilctl.base.files import TextFiles
 from hilctl.experiment.preflight import check
 from hilctl.run.start import RunKey
 from hilctl.run.unpaced import run_unpaced
-from hilctl.studies.campaign.store import (
-    await_runs,
-    campaign_folder,
-    completed_runs,
-    last_started,
-    locked_folder,
-    new_recording,
-    repair_recordings,
-)
+from hilctl.studies.campaign import store
 from tests.unit.studies.campaign.conftest import CAMPAIGN
 
 
@@ -39,29 +31,32 @@ def recorded(campaign, tmp_path):
 
 
 def test_default_folder(campaign):
-    assert str(campaign_folder(campaign())) == "recordings/few"
-    assert str(campaign_folder(campaign(CAMPAIGN, "recording.folder=/lab"))) == "/lab/few"
-    assert str(campaign_folder(campaign(CAMPAIGN + "set: {recording: {folder: day}}"))) == "day/few"
-    assert str(campaign_folder(campaign(CAMPAIGN + "folder: /there"))) == "/there"
+    assert str(store.campaign_folder(campaign())) == "recordings/few"
+    assert str(store.campaign_folder(campaign(CAMPAIGN, "recording.folder=/lab"))) == "/lab/few"
+    assert (
+        str(store.campaign_folder(campaign(CAMPAIGN + "set: {recording: {folder: day}}")))
+        == "day/few"
+    )
+    assert str(store.campaign_folder(campaign(CAMPAIGN + "folder: /there"))) == "/there"
     few = campaign()
     few.experiment.unlink()
     with pytest.raises(ConfigError, match=r"few.yaml:2: experiment: "):
-        campaign_folder(few)
+        store.campaign_folder(few)
 
 
 def test_one_campaign_at_a_time(tmp_path):
     folder, waits = tmp_path / "runs", []
-    with locked_folder(folder, never):
+    with store.locked_folder(folder, never):
         with (
             pytest.raises(InputError, match="another campaign"),
-            locked_folder(folder, waits.append),
+            store.locked_folder(folder, waits.append),
         ):
             pass
         assert 3.0 < sum(waits) < 10.0
-    with locked_folder(folder, never):
+    with store.locked_folder(folder, never):
         pass
     (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="created"), locked_folder(tmp_path / "file", never):
+    with pytest.raises(InputError, match="created"), store.locked_folder(tmp_path / "file", never):
         pass
 
 
@@ -69,7 +64,7 @@ def test_a_refusal_leaves_no_folder_that_it_has_made(tmp_path):
     """A rejected campaign removes its new folders only."""
     (tmp_path / "mine").mkdir()
     for name in ("mine", "new/deep"):
-        with pytest.raises(InputError, match="wrong"), locked_folder(tmp_path / name, never):
+        with pytest.raises(InputError, match="wrong"), store.locked_folder(tmp_path / name, never):
             raise InputError("wrong")
     assert [each.name for each in tmp_path.iterdir()] == ["mine"]
 
@@ -80,12 +75,12 @@ def test_only_completed_runs_count_and_truncated_ones_are_repaired(recorded, tmp
     content, torn = path.read_bytes(), tmp_path / "torn.mcap"
     torn.write_bytes(content[: len(content) // 2])
     (tmp_path / "text.mcap").write_text("no recording")
-    assert completed_runs(tmp_path) == {key: [path, again]}
-    assert last_started(tmp_path) == again
-    assert [text.startswith(f"{torn}: ") for text in repair_recordings(tmp_path)] == [True]
-    assert repair_recordings(tmp_path) == []
-    assert completed_runs(tmp_path) == {key: [path, again]}
-    assert last_started(tmp_path / "absent") is None
+    assert store.completed_runs(tmp_path) == {key: [path, again]}
+    assert store.last_started(tmp_path) == again
+    assert [text.startswith(f"{torn}: ") for text in store.repair_recordings(tmp_path)] == [True]
+    assert store.repair_recordings(tmp_path) == []
+    assert store.completed_runs(tmp_path) == {key: [path, again]}
+    assert store.last_started(tmp_path / "absent") is None
 
 
 def test_files_of_runs_that_never_started_are_moved(recorded, tmp_path):
@@ -94,7 +89,7 @@ def test_files_of_runs_that_never_started_are_moved(recorded, tmp_path):
     (tmp_path / "empty.mcap").touch()
     (tmp_path / "head.mcap").write_bytes(path.read_bytes()[:20])
     (tmp_path / "text.mcap").write_text("no recording")
-    assert len(repair_recordings(tmp_path)) == 2
+    assert len(store.repair_recordings(tmp_path)) == 2
     left = {each.name for each in tmp_path.iterdir() if each.suffix != ".yaml"}
     assert left == {"a.mcap", "head.mcap.torn", "text.mcap"}
 
@@ -105,16 +100,16 @@ def test_special_files_are_ignored(recorded, tmp_path):
     os.mkfifo(tmp_path / "c.mcap")
     (tmp_path / "d.mcap").symlink_to("nowhere")
     (tmp_path / "e.mcap").symlink_to("b.mcap")
-    assert repair_recordings(tmp_path) == []
-    assert completed_runs(tmp_path) == {key: [path]}
-    assert last_started(tmp_path) == path
+    assert store.repair_recordings(tmp_path) == []
+    assert store.completed_runs(tmp_path) == {key: [path]}
+    assert store.last_started(tmp_path) == path
 
 
 def test_names_are_never_taken_twice(tmp_path):
-    first = new_recording(tmp_path, "few", 7)
+    first = store.new_recording(tmp_path, "few", 7)
     assert first.name == "few-0007.mcap"
     first.symlink_to("nowhere")
-    assert new_recording(tmp_path, "few", 7).name == "few-0007-2.mcap"
+    assert store.new_recording(tmp_path, "few", 7).name == "few-0007-2.mcap"
 
 
 def test_a_run_that_records_there_is_waited_for(tmp_path, monkeypatch):
@@ -131,9 +126,9 @@ def test_a_run_that_records_there_is_waited_for(tmp_path, monkeypatch):
         Run.alive = len(waits) < 3
 
     monkeypatch.setattr("hilctl.studies.campaign.store.runs", lambda: [Run])
-    await_runs(tmp_path / "other", never)
-    await_runs(tmp_path, wait)
+    store.await_runs(tmp_path / "other", never)
+    store.await_runs(tmp_path, wait)
     assert len(waits) == 3
     Run.alive = Run.supervised = True
     with pytest.raises(InputError, match="a-1"):
-        await_runs(tmp_path, never)
+        store.await_runs(tmp_path, never)

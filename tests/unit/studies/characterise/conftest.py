@@ -34,7 +34,6 @@ limits: {peak_current_a: 4.0, slew_a_per_s: 5000.0, stroke_um: [-50.0, 50.0]}
 
 @pytest.fixture
 def experiment(tmp_path) -> Path:
-    """Return an experiment file."""
     path = tmp_path / "rig.yaml"
     path.write_text(EXPERIMENT, encoding="utf-8")
     return path
@@ -42,8 +41,6 @@ def experiment(tmp_path) -> Path:
 
 @pytest.fixture
 def limits_with(experiment) -> Callable[..., object]:
-    """Return the limits of the experiment with settings over it."""
-
     def make(*settings, highest_hz=None):
         return limits_of(load_experiment(experiment, settings), highest_hz)
 
@@ -65,10 +62,8 @@ def played(make_recording):
         command = reference.values.copy()
         noise = noise_um * np.random.default_rng(seed).standard_normal(command.size)
         return make_recording(
-            actuator(command) + noise,
-            command=command,
-            segments=reference.segments,
+            actuator(command) + noise, command=command, segments=reference.segments,
             sample_rate_hz=limits.sample_rate_hz,
-        )
+        )  # fmt: skip
 
     return play

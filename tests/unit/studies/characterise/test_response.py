@@ -76,7 +76,6 @@ def test_a_constant_reading_or_drift_is_no_reaction(limits, played, actuator, no
 
 
 def test_the_phase_is_that_of_a_delay(limits, played):
-    """A delay of ten samples."""
     found = reaction(limits, played, lambda v: 4.0 * np.roll(v, 10))
     assert found.angle_deg == pytest.approx(360.0 * found.frequency_hz * 10 / 5000.0, rel=0.05)
 

@@ -7,18 +7,10 @@ import pytest
 
 from hilctl.models.linear_stages import FurtherMode
 from hilctl.models.staged import StagedModel
+from hilctl.studies.characterise import rig_page
 from hilctl.studies.characterise.loops import ReversalCurves
 from hilctl.studies.characterise.response import SmallSignal
 from hilctl.studies.characterise.results import Measured, StepRow
-from hilctl.studies.characterise.rig_page import (
-    characterisation_page,
-    figure_rows,
-    held_out_figure,
-    measured_loops_figure,
-    response_figure,
-    reversal_figure,
-    write_characterisation,
-)
 from tests.published import piezo_ppi
 from tests.unit.studies.characterise.test_results import FOUND, LOOP, UNSEEN, identification
 
@@ -30,16 +22,18 @@ SMALL = SmallSignal(
 
 
 def test_the_response_shows_band_and_resonance():
-    upper, lower = response_figure(SMALL, (1.0, 50.0), "A").axes
+    upper, lower = rig_page.response_figure(SMALL, (1.0, 50.0), "A").axes
     assert upper.get_ylabel() == "µm/A"
     assert any(np.allclose(line.get_xdata(), 700.0) for line in upper.lines)
     np.testing.assert_allclose(lower.lines[1].get_ydata()[-1], np.degrees(-np.arctan(1000 / 300)))
-    assert len(response_figure(replace(SMALL, natural_hz=None), (1.0, 50.0), "A").axes) == 2
+    assert (
+        len(rig_page.response_figure(replace(SMALL, natural_hz=None), (1.0, 50.0), "A").axes) == 2
+    )
 
 
 def test_groups_without_loops_get_no_panel():
     loop = replace(LOOP, command=np.arange(4.0), displacement_um=np.arange(4.0))
-    figure = measured_loops_figure(
+    figure = rig_page.measured_loops_figure(
         [("growing", [loop] * 20), ("slow", []), ("biased", [loop])], "A"
     )
     shown = [axes.get_title(loc="left") for axes in figure.axes if axes.get_visible()]
@@ -50,7 +44,7 @@ def test_groups_without_loops_get_no_panel():
 def test_reversal_curves_are_drawn_against_the_outer_one():
     line = np.linspace(-1.0, 1.0, 50)
     curves = (np.array((line, 2.0 * line)), np.array((line[25:], 2.0 * line[25:] + 0.5)))
-    _, right = reversal_figure(ReversalCurves((-1.0, 0.0), curves, 0.0, 0.0), "A").axes
+    _, right = rig_page.reversal_figure(ReversalCurves((-1.0, 0.0), curves, 0.0, 0.0), "A").axes
     np.testing.assert_allclose(right.lines[0].get_ydata(), 0.0, atol=1e-12)
     np.testing.assert_allclose(right.lines[1].get_ydata(), 0.5)
 
@@ -58,10 +52,10 @@ def test_reversal_curves_are_drawn_against_the_outer_one():
 def test_what_was_not_judged_is_a_gap():
     time_s = np.concatenate((np.arange(100), np.arange(300, 400))) / 1000.0
     found = replace(UNSEEN, time_s=time_s, measured_um=time_s, modelled_um=time_s + 0.5)
-    upper, lower = held_out_figure(found, close=False).axes
+    upper, lower = rig_page.held_out_figure(found, close=False).axes
     assert np.isnan(lower.lines[0].get_ydata()).sum() == 1
     assert upper.lines[0].get_xdata().size == 201
-    close, _ = held_out_figure(found, close=True).axes
+    close, _ = rig_page.held_out_figure(found, close=True).axes
     assert close.lines[0].get_xdata().size < 50
 
 
@@ -83,7 +77,7 @@ WHOLE = replace(
 
 @pytest.mark.slow
 def test_the_held_out_error_comes_first():
-    page = characterisation_page(replace(WHOLE, identification=identification()))
+    page = rig_page.characterisation_page(replace(WHOLE, identification=identification()))
     assert page.index("Validation errors") < page.index("<h2>Measured")
     assert "Verdict: good: within 1.50 %" in page
     assert "a note" in page
@@ -98,7 +92,7 @@ def test_the_problem_is_at_the_top(tmp_path):
         ),
         steps=(StepRow("rest", "noise & drift", 2.0, 0.1, "0.03 um", "/x/01-rest.mcap"),),
     )  # fmt: skip
-    write_characterisation(stopped, tmp_path / "model.html")
+    rig_page.write_characterisation(stopped, tmp_path / "model.html")
     page = (tmp_path / "model.html").read_text(encoding="utf-8")
     for said in ("no &lt;reaction&gt;", "30.0 nm rms", "noise &amp; drift", "01-rest.mcap"):
         assert said in page
@@ -106,9 +100,9 @@ def test_the_problem_is_at_the_top(tmp_path):
 
 
 def test_creep_is_a_figure_where_it_was_looked_for():
-    rows = dict(figure_rows(replace(FOUND, measured=Measured(crept_percent=(2.44, -3.1)))))
+    rows = dict(rig_page.figure_rows(replace(FOUND, measured=Measured(crept_percent=(2.44, -3.1)))))
     assert rows["creep in holds"] == "+2.4 % and -3.1 % in 4 s"
-    assert "creep in holds" not in dict(figure_rows(replace(FOUND, measured=Measured())))
+    assert "creep in holds" not in dict(rig_page.figure_rows(replace(FOUND, measured=Measured())))
 
 
 def test_further_modes_of_the_model_are_figures():
@@ -117,10 +111,10 @@ def test_further_modes_of_the_model_are_figures():
         antiresonance_damping_ratio=0.02,
     )  # fmt: skip
     known = identification()
-    plain = dict(figure_rows(replace(FOUND, identification=known)))
+    plain = dict(rig_page.figure_rows(replace(FOUND, identification=known)))
     assert "further mode of the model" not in plain
     model = StagedModel.around(piezo_ppi(), modes=(mode,))
     ringing = replace(known, fit=replace(known.fit, model=model))
-    rows = dict(figure_rows(replace(FOUND, identification=ringing)))
+    rows = dict(rig_page.figure_rows(replace(FOUND, identification=ringing)))
     row = rows["further mode of the model"]
     assert all(value in row for value in ("602.0 Hz", "0.024", "633.0 Hz"))

@@ -51,7 +51,6 @@ def test_the_multisine_has_whole_periods(limits):
 
 
 def test_the_largest_of_the_slow_loops_comes_first(limits):
-    """The largest loop makes the others repeatable."""
     amplitudes = [part["amplitude"] for part in w.slow_loops(limits, 2.0)["parts"]]
     assert amplitudes == [2.0, 1.5, 1.0, 0.5]
 

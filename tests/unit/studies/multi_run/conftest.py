@@ -15,7 +15,6 @@ PHASE = np.linspace(0.0, 2.0 * np.pi, 101)
 
 
 def drawn(panel):
-    """Return the axes of a panel."""
     axes = Figure().subplots()
     panel.draw(axes)
     return axes
@@ -38,12 +37,9 @@ def digest(*, compensated: bool = False, lag: float = 0.2, **keys: Any) -> RunDi
 def grown(amplitude: float, hz: float, number: int = 1, **keys: Any) -> SeriesRun:
     """Return a run whose area is linear in frequency and whose stroke is in amplitude."""
     figures = RunFigures(
-        peak_to_peak_um=10.0 * amplitude,
-        loop_area=amplitude * (20.0 + 0.5 * hz),
-        peak_hysteresis_percent=10.0 + 0.1 * hz,
-        low_um=-6.0 * amplitude,
-        high_um=4.0 * amplitude,
-    )
+        peak_to_peak_um=10.0 * amplitude, loop_area=amplitude * (20.0 + 0.5 * hz),
+        peak_hysteresis_percent=10.0 + 0.1 * hz, low_um=-6.0 * amplitude, high_um=4.0 * amplitude,
+    )  # fmt: skip
     values = {"waveform.amplitude": amplitude, "waveform.frequency_hz": hz}
     made = SeriesRun(number, False, values, figures, "completed", f"run-{number}.mcap", digest())
     return replace(made, **keys)

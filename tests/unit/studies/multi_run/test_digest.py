@@ -11,14 +11,7 @@ from hilctl.base.events import OFFSET, Event
 from hilctl.base.segments import Segment
 from hilctl.models.model_file import load_model
 from hilctl.recording.metadata_keys import HEAT_FACT
-from hilctl.studies.multi_run.digest import (
-    FIGURES,
-    POINTS,
-    RunFigures,
-    digest_of,
-    drift_of,
-    ringing,
-)
+from hilctl.studies.multi_run import digest
 
 RATE_HZ = 50_000.0
 TIME = np.arange(10_000) / RATE_HZ
@@ -31,7 +24,7 @@ def figures(make_recording):
 
     def made(moved, waveform, segment=PERIODIC, **more):
         text = f"waveform: {waveform}\n"
-        return digest_of(
+        return digest.digest_of(
             make_recording(moved, segments=[segment], experiment_yaml=text, **more)
         ).figures
 
@@ -43,12 +36,10 @@ SINE = "{kind: sine, unit: A, amplitude: 1.0, frequency_hz: 100.0, duration_s: 0
 
 def test_a_sine_straight_to_the_coil(figures):
     found = figures(
-        10.0 * np.sin(2 * np.pi * 100.0 * TIME - 0.1) - 2.0,
-        SINE,
-        command=np.sin(2 * np.pi * 100.0 * TIME),
-        run={HEAT_FACT: "4.0"},
+        10.0 * np.sin(2 * np.pi * 100.0 * TIME - 0.1) - 2.0, SINE,
+        command=np.sin(2 * np.pi * 100.0 * TIME), run={HEAT_FACT: "4.0"},
         end={"skipped_ticks": "3", HEAT_FACT: "9.0"},
-    )
+    )  # fmt: skip
     assert (found.low_um, found.high_um) == pytest.approx((-12.0, 8.0), abs=1e-3)
     assert found.mean_um == pytest.approx(-2.0, abs=1e-6)
     assert found.peak_to_peak_um == pytest.approx(20.0, abs=1e-3)
@@ -91,26 +82,26 @@ def test_a_step_s_ringing(figures):
 
 
 def test_every_figure_has_its_meaning():
-    meanings = inspect.getdoc(RunFigures) or ""  # indented as the interpreter keeps it
-    assert all(f"\n    {name}: " in meanings for name in FIGURES)
+    meanings = inspect.getdoc(digest.RunFigures) or ""  # indented as the interpreter keeps it
+    assert all(f"\n    {name}: " in meanings for name in digest.FIGURES)
 
 
 def reference(peak_to_peak_um, mean_um):
-    return RunFigures(
+    return digest.RunFigures(
         peak_to_peak_um=peak_to_peak_um, mean_um=mean_um, peak_hysteresis_percent=10.0
     )
 
 
 def test_the_largest_change_counts_with_its_sign():
-    found = drift_of([reference(50.0, 1.0), reference(49.0, 1.2), reference(50.5, 0.5)])
+    found = digest.drift_of([reference(50.0, 1.0), reference(49.0, 1.2), reference(50.5, 0.5)])
     assert (found.runs, found.peak_to_peak_percent, found.mean_um) == (3, -2.0, -0.5)
     assert all(text in str(found) for text in ("3 reference runs", "-2 %", "-0.5 µm", "+0"))
 
 
 def test_one_run_says_nothing():
-    assert drift_of([reference(50.0, 1.0)]) is None
-    assert "nothing to compare" not in str(drift_of([reference(50.0, 1.0)] * 2))
-    assert drift_of([reference(None, None)] * 2).peak_to_peak_percent is None
+    assert digest.drift_of([reference(50.0, 1.0)]) is None
+    assert "nothing to compare" not in str(digest.drift_of([reference(50.0, 1.0)] * 2))
+    assert digest.drift_of([reference(None, None)] * 2).peak_to_peak_percent is None
 
 
 ROOT = Path(__file__).parents[4]
@@ -127,8 +118,8 @@ SINE_YAML = (
 def test_a_loop_of_any_length_is_a_few_kilobytes(make_recording):
     recording = make_recording(40.0 * WAVE, command=6.0 * WAVE, segments=[SEGMENT],
                                experiment_yaml=SINE_YAML)  # fmt: skip
-    found = digest_of(recording)
-    assert found.loop.shape[1] <= 2 * POINTS
+    found = digest.digest_of(recording)
+    assert found.loop.shape[1] <= 2 * digest.POINTS
     assert np.array_equal(found.loop[:, 0], found.loop[:, -1])
     assert found.is_plain_loop
     assert found.values["waveform"]["amplitude"] == 6.0
@@ -138,7 +129,7 @@ def test_a_loop_of_any_length_is_a_few_kilobytes(make_recording):
 
 def test_a_compensated_run_has_its_error(make_recording):
     wanted = 40.0 * WAVE
-    found = digest_of(make_recording(wanted + 0.5, reference_um=wanted, segments=[SEGMENT]))
+    found = digest.digest_of(make_recording(wanted + 0.5, reference_um=wanted, segments=[SEGMENT]))
     assert np.allclose(found.error_um[1], 0.5)
     assert not found.is_plain_loop
 
@@ -148,11 +139,11 @@ def test_a_model_is_held_against_what_was_measured(make_recording):
     command = 5.0 * WAVE
     moved = model.forward(50_000.0).process(np.tile(command, 2))[N:]
     recording = make_recording(moved, command=command, segments=[SEGMENT])
-    found = digest_of(recording, model)
+    found = digest.digest_of(recording, model)
     assert found.modelled.shape[0] == 3
     assert found.model_error_percent < 0.5
-    assert digest_of(recording).model_error_percent is None
-    attached = digest_of(replace(recording, model_yaml=MODEL.read_text()))
+    assert digest.digest_of(recording).model_error_percent is None
+    attached = digest.digest_of(replace(recording, model_yaml=MODEL.read_text()))
     assert attached.model_error_percent == found.model_error_percent
 
 
@@ -162,13 +153,13 @@ def test_many_sines_at_once_are_no_loop(make_recording):
         "step_hz: 10.0, duration_s: 0.4}\n"
     )
     recording = make_recording(WAVE, command=WAVE, segments=[SEGMENT], experiment_yaml=text)
-    assert digest_of(recording).loop.size == 0
+    assert digest.digest_of(recording).loop.size == 0
 
 
 def test_a_damaged_experiment_takes_only_its_settings_away(make_recording):
     recording = make_recording(40.0 * WAVE, command=WAVE, segments=[SEGMENT],
                                experiment_yaml="[broken")  # fmt: skip
-    found = digest_of(recording)
+    found = digest.digest_of(recording)
     assert found.values == {}
     assert found.figures.peak_to_peak_um == pytest.approx(80.0, rel=1e-3)
 
@@ -188,7 +179,7 @@ def answer(natural_hz, damping, creep_um=1.0, noise_um=0.0):
 @pytest.mark.parametrize("natural_hz", [100.0, 300.0, 2300.0])
 @pytest.mark.parametrize("damping", [0.02, 0.12, 0.4])
 def test_frequency_and_damping_are_found(natural_hz, damping):
-    found = ringing(answer(natural_hz, damping, 4.0, 0.036), RATE_HZ)
+    found = digest.ringing(answer(natural_hz, damping, 4.0, 0.036), RATE_HZ)
     assert found.natural_hz == pytest.approx(natural_hz, rel=0.03)
     assert found.damping_ratio == pytest.approx(damping, rel=0.1)
     assert found.misfit_um < 0.1
@@ -197,7 +188,7 @@ def test_frequency_and_damping_are_found(natural_hz, damping):
 def test_where_nothing_rings_there_is_none():
     creep = 7.0 - 3.0 * np.exp(-T / 2e-3)
     noise = 0.036 * np.random.default_rng(4).standard_normal(T.size)
-    assert ringing(creep + noise, RATE_HZ) is None
-    assert ringing(noise, RATE_HZ) is None
-    assert ringing(np.zeros(1000), RATE_HZ) is None
-    assert ringing(np.ones(10), RATE_HZ) is None
+    assert digest.ringing(creep + noise, RATE_HZ) is None
+    assert digest.ringing(noise, RATE_HZ) is None
+    assert digest.ringing(np.zeros(1000), RATE_HZ) is None
+    assert digest.ringing(np.ones(10), RATE_HZ) is None

@@ -7,24 +7,14 @@ import pytest
 
 from hilctl.base.errors import InputError
 from hilctl.studies.characterise.response import SmallSignal
+from hilctl.studies.multi_run import plots
 from hilctl.studies.multi_run.collect import RunSeries
 from hilctl.studies.multi_run.digest import RunFigures
-from hilctl.studies.multi_run.plots import (
-    applying_sheets,
-    frequency_sheet,
-    order_sheet,
-    resonance_sheet,
-    sensitivity_sheet,
-    sheets_of,
-    step_sheet,
-    trend_sheets,
-    write_sheets,
-)
 from tests.unit.studies.multi_run.conftest import digest, drawn, grown
 
 
 def test_fits_are_drawn_along_frequency_only(crossed):
-    sheets = {sheet.name: sheet for sheet in trend_sheets(crossed)}
+    sheets = {sheet.name: sheet for sheet in plots.trend_sheets(crossed)}
     assert list(sheets) == ["hysteresis_against_frequency", "hysteresis_against_amplitude"]
     stroke, area, hysteresis = map(drawn, sheets["hysteresis_against_frequency"].panels)
     assert area.get_ylabel() == "loop area, µm·A"
@@ -38,14 +28,14 @@ def test_fits_are_drawn_along_frequency_only(crossed):
 
 
 def test_points_are_never_cut_by_the_edge(crossed):
-    sheet = next(iter(trend_sheets(crossed)))
+    sheet = next(iter(plots.trend_sheets(crossed)))
     axes = drawn(sheet.panels[0])
     assert axes.get_ylim()[0] == 0.0
     assert axes.get_ylim()[1] > 60.0
 
 
 def test_what_compensators_leave_is_a_figure_of_its_own(compensated):
-    sheets = {sheet.name: sheet for sheet in trend_sheets(compensated)}
+    sheets = {sheet.name: sheet for sheet in plots.trend_sheets(compensated)}
     assert list(sheets) == ["hysteresis_against_frequency", "compensation_against_frequency"]
     lines = drawn(sheets["compensation_against_frequency"].panels[0]).lines
     assert [line.get_label() for line in lines] == ["without compensator", "omega"]
@@ -55,7 +45,7 @@ def test_what_compensators_leave_is_a_figure_of_its_own(compensated):
 
 
 def test_sensitivity_is_the_change_over_the_range(crossed):
-    sheet = sensitivity_sheet(crossed)
+    sheet = plots.sensitivity_sheet(crossed)
     axes = drawn(sheet.panels[0])
     sizes = {
         label.get_text().split("\n")[0]: bar.get_width()
@@ -64,25 +54,25 @@ def test_sensitivity_is_the_change_over_the_range(crossed):
     assert sizes["amplitude"] == pytest.approx(100.0 * 30.0 / 45.0)
     assert sizes["frequency"] == pytest.approx(0.0)
     one = RunSeries("one", crossed.runs[:3], crossed.keys)
-    assert sensitivity_sheet(one) is None
+    assert plots.sensitivity_sheet(one) is None
 
 
 def test_reference_runs_are_marked_in_order(crossed):
-    assert order_sheet(crossed) is None
+    assert plots.order_sheet(crossed) is None
     runs = [replace(run, is_reference=run.number in {1, 6}) for run in crossed.runs]
-    sheet = order_sheet(replace(crossed, runs=tuple(runs)))
+    sheet = plots.order_sheet(replace(crossed, runs=tuple(runs)))
     axes = drawn(sheet.panels[0])
     assert [line.get_label() for line in axes.lines[:2]] == ["runs", "reference runs"]
     assert axes.lines[1].get_xdata().tolist() == [1, 6]
 
 
 def test_resonances_against_what_varied(crossed):
-    assert resonance_sheet(crossed) is None
+    assert plots.resonance_sheet(crossed) is None
     runs = [
         replace(run, figures=replace(run.figures, natural_hz=2300.0, damping_ratio=0.12))
         for run in crossed.runs
     ]
-    sheet = resonance_sheet(replace(crossed, runs=tuple(runs)))
+    sheet = plots.resonance_sheet(replace(crossed, runs=tuple(runs)))
     labels = [drawn(panel).get_ylabel() for panel in sheet.panels]
     assert labels == ["natural frequency, Hz", "damping ratio"]
 
@@ -94,7 +84,7 @@ def test_they_are_found_from_what_varied(crossed, compensated):
         (compensated, "before_and_after hysteresis_against_frequency "
                       "compensation_against_frequency loops_by_frequency error_history"),
     ):  # fmt: skip
-        assert [sheet.name for sheet in sheets_of(series)] == names.split()
+        assert [sheet.name for sheet in plots.sheets_of(series)] == names.split()
 
 
 def series(run):
@@ -106,7 +96,7 @@ def test_a_step_with_its_resonance():
     ringing = RunFigures(natural_hz=469.5, damping_ratio=0.12)
     made = digest(step=np.array((t, np.sin(t))), figures=ringing)
     run = grown(1.0, 10.0, digest=made)
-    axes = drawn(step_sheet(series(run)).panels[0])
+    axes = drawn(plots.step_sheet(series(run)).panels[0])
     assert axes.lines[0].get_xdata()[-1] == 10.0
     assert axes.get_xlabel().endswith(", ms")
     assert axes.texts[0].get_text() == "470 Hz, damping ratio 0.120"
@@ -118,7 +108,7 @@ def test_magnitude_and_phase_measured_and_fitted():
     small = SmallSignal(frequency_hz, answer, np.full(3, 0.1), 1.0, 4.0, 0.0, 0.0, None, None, 1.0,
                         answer)  # fmt: skip
     run = grown(1.0, 10.0, digest=digest(response=small))
-    magnitude, phase = map(drawn, frequency_sheet(series(run)).panels)
+    magnitude, phase = map(drawn, plots.frequency_sheet(series(run)).panels)
     assert magnitude.get_ylabel() == "magnitude, µm/A"
     assert np.allclose(magnitude.lines[0].get_ydata(), np.abs(answer))
     assert np.allclose(phase.lines[1].get_ydata()[1], -45.0)
@@ -128,17 +118,19 @@ def test_magnitude_and_phase_measured_and_fitted():
 def test_each_figure_is_a_file_of_each_format(crossed, tmp_path):
     few = replace(crossed, runs=crossed.runs[:3])
     folder = tmp_path / "figures"
-    written = write_sheets(applying_sheets(few), folder, ["svg"], "single", overwrite=False)
+    written = plots.write_sheets(
+        plots.applying_sheets(few), folder, ["svg"], "single", overwrite=False
+    )
     names = ["hysteresis_against_frequency.svg", "loops_by_frequency.svg"]
     assert [path.name for path in written] == names
     assert all(path.is_file() for path in written)
     assert all(caption.endswith(".") for caption in written.values())
     with pytest.raises(InputError, match="exists already"):
-        write_sheets(applying_sheets(few), folder, ["svg"], "single", overwrite=False)
+        plots.write_sheets(plots.applying_sheets(few), folder, ["svg"], "single", overwrite=False)
 
 
 def test_no_figure_is_refused(crossed):
     planned = tuple(replace(run, result="planned", digest=None) for run in crossed.runs)
     for runs in ((), planned):
         with pytest.raises(InputError, match="no figure applies"):
-            applying_sheets(replace(crossed, runs=runs))
+            plots.applying_sheets(replace(crossed, runs=runs))
