@@ -147,14 +147,11 @@ def test_experiment(refused_everywhere, place, text, old, new, message):
     refused_everywhere(f"x.yaml:{message}", "x.yaml")
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ("[2.3, 0.4]", "[2.3, -0.4]", "a_2 must be >= 0 for the inverse to exist: -0.4"),
-        ("direct: 2.7", "direct: 0", "a_0 must be > 0 for the inverse"),
-        ("[0.3, 0.6]", "[0.6, 0.3]", "r must rise from 0"),
-    ],
-)
+@pytest.mark.parametrize(("old", "new", "message"), [
+    ("[2.3, 0.4]", "[2.3, -0.4]", "a_2 must be >= 0 for the inverse to exist: -0.4"),
+    ("direct: 2.7", "direct: 0", "a_0 must be > 0 for the inverse"),
+    ("[0.3, 0.6]", "[0.6, 0.3]", "r must rise from 0"),
+])  # fmt: skip
 def test_model_that_can_not_be_inverted(refused_everywhere, place, old, new, message):
     (place / "x.yaml").write_text(IN_UM)
     (place / "model.yaml").write_text(MODEL.replace(old, new))
@@ -171,15 +168,12 @@ def test_binary_experiment(refused_everywhere, place):
     refused_everywhere("x.yaml: is not UTF-8 text", "x.yaml")
 
 
-@pytest.mark.parametrize(
-    ("setting", "message"),
-    [
-        ("block=x", "block: must be a whole number, got 'x'"),
-        ("blok=1", "blok: unknown key (did you mean 'block'?)"),
-        ("block", "must be dotted.key=value"),
-        ("block=[", "block: is not readable YAML, got '['"),
-    ],
-)
+@pytest.mark.parametrize(("setting", "message"), [
+    ("block=x", "block: must be a whole number, got 'x'"),
+    ("blok=1", "blok: unknown key (did you mean 'block'?)"),
+    ("block", "must be dotted.key=value"),
+    ("block=[", "block: is not readable YAML, got '['"),
+])  # fmt: skip
 def test_setting(refused_everywhere, place, setting, message):
     (place / "x.yaml").write_text(GOOD)
     refused_everywhere(f"--set {setting}: {message}", "x.yaml", "--set", setting)
@@ -211,27 +205,21 @@ def outputs(place):
 
 @pytest.mark.usefixtures("outputs")
 @pytest.mark.parametrize("overwrite", [(), ("--overwrite",)])
-@pytest.mark.parametrize(
-    ("output", "message"),
-    [
-        ("lost/run.mcap", "lost/run.mcap: can't be written: No such file or directory"),
-        ("regular/run.mcap", "regular/run.mcap: can't be written: Not a directory"),
-        ("x" * 300, "can't be written: File name too long"),
-        ("runs", "runs: "),
-    ],
-)
+@pytest.mark.parametrize(("output", "message"), [
+    ("lost/run.mcap", "lost/run.mcap: can't be written: No such file or directory"),
+    ("regular/run.mcap", "regular/run.mcap: can't be written: Not a directory"),
+    ("x" * 300, "can't be written: File name too long"),
+    ("runs", "runs: "),
+])  # fmt: skip
 def test_unwritable_recording(refused, output, message, overwrite):
     refused(message, "run", "x.yaml", "--output", output, *overwrite)
 
 
 @pytest.mark.usefixtures("outputs")
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ((), "run.mcap: exists already: give another --output, or --overwrite"),
-        (("--overwrite", "--set", "block=0"), "--set block=0: block: must be >= 1, got 0"),
-    ],
-)
+@pytest.mark.parametrize(("words", "message"), [
+    ((), "run.mcap: exists already: give another --output, or --overwrite"),
+    (("--overwrite", "--set", "block=0"), "--set block=0: block: must be >= 1, got 0"),
+])  # fmt: skip
 def test_existing_recording_is_kept(refused, words, message):
     refused(message, "run", "x.yaml", "--output", "run.mcap", *words)
 

@@ -251,17 +251,14 @@ def test_flash_is_not_rewritten(modbus, name):
     assert last.value == 1.0
 
 
-@pytest.mark.parametrize(
-    ("name", "output", "value", "line"),
-    [
-        ("icp_m7024_dcon", "AO2", 5.0, "#012+05.000"),
-        ("icp_m7024_dcon", "AO0", -10.0, "#010-10.000"),
-        ("adam_4024_ascii", "AO1", 2.5, "#01C1+02.500"),
-        ("kepco_bop", "current", -2.5, "CURR -2.500000"),
-        ("kepco_bop", "current", 1e-7, "CURR 0.000000"),
-        ("tdk_lambda_gen", "current", 7.07, "PC 7.070"),
-    ],
-)
+@pytest.mark.parametrize(("name", "output", "value", "line"), [
+    ("icp_m7024_dcon", "AO2", 5.0, "#012+05.000"),
+    ("icp_m7024_dcon", "AO0", -10.0, "#010-10.000"),
+    ("adam_4024_ascii", "AO1", 2.5, "#01C1+02.500"),
+    ("kepco_bop", "current", -2.5, "CURR -2.500000"),
+    ("kepco_bop", "current", 1e-7, "CURR 0.000000"),
+    ("tdk_lambda_gen", "current", 7.07, "PC 7.070"),
+])  # fmt: skip
 def test_text_output(profiles, name, output, value, line):
     """The output line agrees with the manual and has no exponent."""
     profile = profiles[name]

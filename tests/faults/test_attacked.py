@@ -43,14 +43,11 @@ def test_a_ramp_takes_no_time_beyond_itself(tmp_path):
     assert found.largest_step(0) < 1.0
 
 
-@pytest.mark.parametrize(
-    ("currents_a", "beyond_s"),
-    [
-        ([1.0] * 100 + ramp(1.0), 0.2),
-        ([1.0, 0.0] + [1.0] * 98 + ramp(1.0), 0.2),
-        ([1.0] * 100, math.inf),
-    ],
-)
+@pytest.mark.parametrize(("currents_a", "beyond_s"), [
+    ([1.0] * 100 + ramp(1.0), 0.2),
+    ([1.0, 0.0] + [1.0] * 98 + ramp(1.0), 0.2),
+    ([1.0] * 100, math.inf),
+])  # fmt: skip
 def test_what_comes_late_or_moves_again_is_seen(tmp_path, currents_a, beyond_s):
     """The output must stay at the safe value."""
     assert log(tmp_path, currents_a).beyond_ramp_s(0) == pytest.approx(beyond_s, abs=3 * PERIOD_S)
@@ -63,17 +60,14 @@ def test_a_jump_is_seen(tmp_path, before):
     assert found.largest_step(0) == pytest.approx(4.0 / (RAMP_A_PER_S * (2 * PERIOD_S + 0.01)))
 
 
-@pytest.mark.parametrize(
-    ("commands", "unanswered", "lost"),
-    [
-        ([3.0, 2.0, 1.0], 0, 0),
-        ([3.0, 2.0], 0, 1),
-        ([2.0, 1.0], 0, 0),
-        ([3.0, 2.0, 1.0, 0.5], 1, 0),
-        ([3.0, 2.0, 1.0, 0.5], 0, 1),
-        ([3.0, 1.0], 0, 3),
-    ],
-)
+@pytest.mark.parametrize(("commands", "unanswered", "lost"), [
+    ([3.0, 2.0, 1.0], 0, 0),
+    ([3.0, 2.0], 0, 1),
+    ([2.0, 1.0], 0, 0),
+    ([3.0, 2.0, 1.0, 0.5], 1, 0),
+    ([3.0, 2.0, 1.0, 0.5], 0, 1),
+    ([3.0, 1.0], 0, 3),
+])  # fmt: skip
 def test_writes_that_are_not_recorded_are_counted(tmp_path, commands, unanswered, lost):
     """Opening may repeat the present output, and the last write is the safe value."""
     found = log(tmp_path, [3.0, 2.0, 1.0, 0.0])
@@ -89,16 +83,13 @@ def test_without_a_recording_all_that_moved_is_lost(tmp_path):
 GOOD = {"lost": 0, "beyond_ramp_s": 0.1, "largest_step": 0.9, "reader": "", "hit": "kill loop"}
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"lost": 1},
-        {"beyond_ramp_s": 0.3},
-        {"largest_step": 1.1},
-        {"reader": other_reader.NOT_INSTALLED},
-        {"hit": f"kill loop{STAYS}"},
-    ],
-)
+@pytest.mark.parametrize("change", [
+    {"lost": 1},
+    {"beyond_ramp_s": 0.3},
+    {"largest_step": 1.1},
+    {"reader": other_reader.NOT_INSTALLED},
+    {"hit": f"kill loop{STAYS}"},
+])  # fmt: skip
 def test_each_of_them_is_a_violation(change):
     assert Attack(phase="run", **GOOD).is_good(0.2, 1.0)
     assert not Attack(phase="run", **{**GOOD, **change}).is_good(0.2, 1.0)

@@ -51,14 +51,11 @@ def test_from_above_the_checkout():
 GONE = 'mkdir gone; cd gone; rmdir ../gone; exec "$@"'
 
 
-@pytest.mark.parametrize(
-    ("experiment", "output", "code", "said"),
-    [
-        ("demo.yaml", "/run.mcap", 3, "the working folder has been deleted: change"),
-        ("/demo.yaml", "run.mcap", 2, "run.mcap: can't be written: No such file or directory"),
-        pytest.param("/demo.yaml", "/run.mcap", 0, "", marks=pytest.mark.long),
-    ],
-)
+@pytest.mark.parametrize(("experiment", "output", "code", "said"), [
+    ("demo.yaml", "/run.mcap", 3, "the working folder has been deleted: change"),
+    ("/demo.yaml", "run.mcap", 2, "run.mcap: can't be written: No such file or directory"),
+    pytest.param("/demo.yaml", "/run.mcap", 0, "", marks=pytest.mark.long),
+])  # fmt: skip
 def test_working_folder_that_is_gone_before_the_start(tmp_path, experiment, output, code, said):
     """Relative paths are rejected with one message; a run without relative paths completes."""
     shutil.copy(ROOT / "configs" / "demo.yaml", tmp_path)

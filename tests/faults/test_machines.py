@@ -41,19 +41,15 @@ def hilctl(tmp_path):
     return run
 
 
-@pytest.mark.parametrize(
-    ("shell", "environment"),
-    [
-        ('ulimit -n 32; "$@"', {}),
-        ('umask 077; "$@"', {}),
-        ('umask 0; "$@"', {}),
-        ('unset HOME TERM; "$@"', {}),
-        ('"$@" | head -c 1', {}),
-        ('"$@" >&- 2>&- <&-', {}),
-        ('"$@"', {"COLUMNS": "1", "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}),
-    ],
-    ids=["32 files", "umask 077", "umask 0", "no home", "head", "closed", "no locale"],
-)
+@pytest.mark.parametrize(("shell", "environment"), [
+    ('ulimit -n 32; "$@"', {}),
+    ('umask 077; "$@"', {}),
+    ('umask 0; "$@"', {}),
+    ('unset HOME TERM; "$@"', {}),
+    ('"$@" | head -c 1', {}),
+    ('"$@" >&- 2>&- <&-', {}),
+    ('"$@"', {"COLUMNS": "1", "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}),
+], ids=["32 files", "umask 077", "umask 0", "no home", "head", "closed", "no locale"])  # fmt: skip
 def test_runs_with_little(hilctl, tmp_path, shell, environment):
     """A run completes with few file descriptors, no terminal and no reader."""
     ended = hilctl(shell, **environment)
@@ -126,15 +122,12 @@ def test_a_full_disk_at_the_start_is_one_message(hilctl, own_mounts, tmp_path, b
     assert device.has_not_moved()
 
 
-@pytest.mark.parametrize(
-    ("what", "second"),
-    [
-        ("mkdir -m 777", False),
-        ("ln -s $PWD/mine", False),
-        ("mkfifo", False),
-        ("ln -s $PWD/mine", True),
-    ],
-)
+@pytest.mark.parametrize(("what", "second"), [
+    ("mkdir -m 777", False),
+    ("ln -s $PWD/mine", False),
+    ("mkfifo", False),
+    ("ln -s $PWD/mine", True),
+])  # fmt: skip
 def test_what_another_user_has_put_in_the_way(hilctl, own_mounts, tmp_path, nobody, what, second):
     """Files of another user are neither used nor followed; the run avoids or names them."""
     (tmp_path / "mine").mkdir(mode=0o700)

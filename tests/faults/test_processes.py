@@ -39,16 +39,13 @@ def contiguous(recording):
     return np.array_equal(recording.samples.index, np.arange(recording.samples.index.size))
 
 
-@pytest.mark.parametrize(
-    ("action", "targets", "phase", "stall_s"),
-    [
-        pytest.param("kill", "loop", "run", 3.0, marks=pytest.mark.long),
-        ("kill", "supervisor", "run", 0.0),
-        ("kill", "loop+supervisor", "set", 3.0),
-        pytest.param("stop", "loop+supervisor", "ramp out", 0.0, marks=pytest.mark.long),
-        ("stop", "loop+guardian", "condition", 0.0),
-    ],
-)
+@pytest.mark.parametrize(("action", "targets", "phase", "stall_s"), [
+    pytest.param("kill", "loop", "run", 3.0, marks=pytest.mark.long),
+    ("kill", "supervisor", "run", 0.0),
+    ("kill", "loop+supervisor", "set", 3.0),
+    pytest.param("stop", "loop+supervisor", "ramp out", 0.0, marks=pytest.mark.long),
+    ("stop", "loop+guardian", "condition", 0.0),
+])  # fmt: skip
 def test_killed_and_stopped_processes_leave_a_safe_output_and_a_whole_recording(
     action, targets, phase, stall_s
 ):

@@ -59,14 +59,11 @@ def assert_good_way_out(run):
     return recording
 
 
-@pytest.mark.parametrize(
-    ("number", "code", "words"),
-    [
-        (signal.SIGINT, 130, "stopped by Ctrl-C"),
-        (signal.SIGTERM, 143, "stopped by SIGTERM"),
-        (signal.SIGHUP, 129, "stopped by SIGHUP"),
-    ],
-)
+@pytest.mark.parametrize(("number", "code", "words"), [
+    (signal.SIGINT, 130, "stopped by Ctrl-C"),
+    (signal.SIGTERM, 143, "stopped by SIGTERM"),
+    (signal.SIGHUP, 129, "stopped by SIGHUP"),
+])  # fmt: skip
 def test_signals_ramp_down(tmp_path, number, code, words):
     """Ctrl-C, SIGTERM and SIGHUP end the run by its ramp and leave a complete recording."""
     run = started(tmp_path)

@@ -88,17 +88,13 @@ def test_pulled_cable_leaves_it_to_the_watchdog(emulate, run):
     started.assert_put_out(writes)
 
 
-@pytest.mark.parametrize(
-    ("fault", "words", "state"),
-    [
-        ("silence", "no answer", "set"),
-        pytest.param(
-            "exception", "function 23 refused with exception 4", "set", marks=pytest.mark.long
-        ),
-        ("corrupt", "CRC of 9 bytes is wrong", "set"),
-        ("unplug", "port lost, unplugged?", "unknown"),
-    ],
-)
+@pytest.mark.parametrize(("fault", "words", "state"), [
+    ("silence", "no answer", "set"),
+    pytest.param(
+        "exception", "function 23 refused with exception 4", "set", marks=pytest.mark.long),
+    ("corrupt", "CRC of 9 bytes is wrong", "set"),
+    ("unplug", "port lost, unplugged?", "unknown"),
+])  # fmt: skip
 def test_rtu_fault_ends_the_run(emulate, run, profile, fault, words, state):
     """The same on a serial line, where an unplugged adapter removes its port."""
     module = profile("rtu_module")

@@ -207,14 +207,11 @@ def test_dumped_text_is_as_people_write_it():
     )
 
 
-@pytest.mark.parametrize(
-    ("text", "rule"),
-    [
-        ("a: " + "x" * 3_000_000, "3000003 characters, more than the 2000000 that are read"),
-        ("a: [" + "1," * 600 + "]", "more than the 500 values that are read"),
-        ("a: &x [1]\nb: [" + "*x," * 9 + "]", "aliases"),
-    ],
-)
+@pytest.mark.parametrize(("text", "rule"), [
+    ("a: " + "x" * 3_000_000, "3000003 characters, more than the 2000000 that are read"),
+    ("a: [" + "1," * 600 + "]", "more than the 500 values that are read"),
+    ("a: &x [1]\nb: [" + "*x," * 9 + "]", "aliases"),
+])  # fmt: skip
 def test_too_much_is_refused_at_once(text, rule, monkeypatch):
     monkeypatch.setattr(io, "MAX_VALUES", 500)
     with pytest.raises(ConfigError, match=rule):

@@ -31,15 +31,11 @@ def run(tmp_path):
     return run
 
 
-@pytest.mark.parametrize(
-    ("model", "rate"),
-    [
-        (STAGED, ("sample_rate_hz=50000", "block=50")),
-        pytest.param(STAGED, ("sample_rate_hz=10000", "block=1"), marks=pytest.mark.long),
-        (OMEGA, ("sample_rate_hz=10000", "block=1")),
-    ],
-    ids=["staged-50", "staged-1", "omega-1"],
-)
+@pytest.mark.parametrize(("model", "rate"), [
+    (STAGED, ("sample_rate_hz=50000", "block=50")),
+    pytest.param(STAGED, ("sample_rate_hz=10000", "block=1"), marks=pytest.mark.long),
+    (OMEGA, ("sample_rate_hz=10000", "block=1")),
+], ids=["staged-50", "staged-1", "omega-1"])  # fmt: skip
 def test_offset_and_gain_that_have_changed_are_taken_out(run, model, rate):
     """An actuator that moved by 5 um and shows 6 % more: as good as before, and replayed."""
     length = "waveform.duration_s=2.5"

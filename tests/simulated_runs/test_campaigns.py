@@ -285,15 +285,12 @@ class TestFiguresAndTrends:
     def series(self, ran):
         return lambda name: collect([ran(name)[1].tables[0].parent])
 
-    @pytest.mark.parametrize(
-        ("name", "along", "groups"),
-        [
-            ("amplitude", "frequency", 9),
-            ("bias", "frequency", 6),
-            ("waveforms", "frequency of sine 1", 3),
-            ("compensation", "frequency", 1),
-        ],
-    )
+    @pytest.mark.parametrize(("name", "along", "groups"), [
+        ("amplitude", "frequency", 9),
+        ("bias", "frequency", 6),
+        ("waveforms", "frequency of sine 1", 3),
+        ("compensation", "frequency", 1),
+    ])  # fmt: skip
     def test_area_and_peak_hysteresis_are_linear_in_frequency(self, series, name, along, groups):
         """4.2.3, figures 4.5 (b), 5.5, 6.4: r2 = 0.99, and both grow; the stroke does not."""
         found = series(name)

@@ -33,14 +33,11 @@ def characterised(path, settings, folder, output):
     return campaign.characterise(output)
 
 
-@pytest.mark.parametrize(
-    ("physics", "within_percent"),
-    [
-        pytest.param("terfenol", 2.0, marks=pytest.mark.long),
-        pytest.param("diffusion", 2.5, marks=pytest.mark.long),
-        pytest.param("jiles_atherton", 8.0, marks=pytest.mark.long),
-    ],
-)
+@pytest.mark.parametrize(("physics", "within_percent"), [
+    pytest.param("terfenol", 2.0, marks=pytest.mark.long),
+    pytest.param("diffusion", 2.5, marks=pytest.mark.long),
+    pytest.param("jiles_atherton", 8.0, marks=pytest.mark.long),
+])  # fmt: skip
 def test_a_rig_of_any_physics_gets_a_model(tmp_path, physics, within_percent):
     model = tmp_path / "model.yaml"
     other = [] if physics == "terfenol" else [f"device.physics={physics}"]
@@ -67,20 +64,14 @@ def test_a_piezo_that_begins_at_0_v_gets_a_model(tmp_path):
     assert 30.0 < max(loop.high_um for loop in found.measured.growing) < 38.0
 
 
-@pytest.mark.parametrize(
-    ("setting", "code"),
-    [
-        pytest.param("device.vary={strain: 0.5, resonance: 0.5}", "", marks=pytest.mark.long),
-        ("device.fault={kind: sensor_frozen, at_sample: 0}", "no_reaction"),
-        pytest.param(
-            "device.fault={kind: sensor_inverted, at_sample: 0}",
-            "wrong_polarity",
-            marks=pytest.mark.long,
-        ),
-        ("device.magnet=false", "no_bias"),
-        ("device.load_kg=90.0", "resonance"),
-    ],
-)
+@pytest.mark.parametrize(("setting", "code"), [
+    pytest.param("device.vary={strain: 0.5, resonance: 0.5}", "", marks=pytest.mark.long),
+    ("device.fault={kind: sensor_frozen, at_sample: 0}", "no_reaction"),
+    pytest.param("device.fault={kind: sensor_inverted, at_sample: 0}", "wrong_polarity",
+        marks=pytest.mark.long),
+    ("device.magnet=false", "no_bias"),
+    ("device.load_kg=90.0", "resonance"),
+])  # fmt: skip
 def test_what_is_wrong_with_a_rig_is_named(tmp_path, setting, code):
     quick = ["sample_rate_hz=20000", "block=20"]
     campaign = CharacterisationRunner(

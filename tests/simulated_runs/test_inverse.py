@@ -95,13 +95,10 @@ def test_without_its_events_it_is_not_replayed(switched):
             replay(replace(recording, events=events))
 
 
-@pytest.mark.parametrize(
-    "learns",
-    [
-        "feedback={kind: integral, limit_um: 5.0, bandwidth_hz: 2.0}",
-        "adaptation={time_constant_s: 0.3, noise_um: 0.03}",
-    ],
-)
+@pytest.mark.parametrize("learns", [
+    "feedback={kind: integral, limit_um: 5.0, bandwidth_hz: 2.0}",
+    "adaptation={time_constant_s: 0.3, noise_um: 0.03}",
+])  # fmt: skip
 def test_what_learns_from_the_error_stands_still_meanwhile(learns, tmp_path, monkeypatch):
     rate_hz, cycle = 10_000, 500
     settings = [f"sample_rate_hz={rate_hz}", "block=10", "waveform.amplitude=15.0", learns]

@@ -39,14 +39,11 @@ def errors(learned):
     return [row.error_percent for row in learned.rows]
 
 
-@pytest.mark.parametrize(
-    "frequency_hz",
-    [
-        pytest.param(10.0, marks=pytest.mark.long),
-        100.0,
-        pytest.param(250.0, marks=pytest.mark.long),
-    ],
-)
+@pytest.mark.parametrize("frequency_hz", [
+    pytest.param(10.0, marks=pytest.mark.long),
+    100.0,
+    pytest.param(250.0, marks=pytest.mark.long),
+])  # fmt: skip
 def test_full_stroke_is_learned_to_the_noise(tmp_path, frequency_hz):
     """Within 20 runs 0.15 % of the stroke, under noise not seen before, and never above the start.
 

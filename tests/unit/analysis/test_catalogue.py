@@ -67,17 +67,13 @@ def test_a_finished_recording_is_read_once(folder, entries_read):
 OTHER = GOLDEN / f"{NAMES[0]}.mcap"
 
 
-@pytest.mark.parametrize(
-    ("change", "paths", "count"),
-    [
-        (lambda run: os.utime(run, ns=(1, 1)), ["day 1/run.mcap"], 3),
-        (lambda run: shutil.copy(OTHER, run), ["day 1/run.mcap"], 3),
-        (lambda run: run.rename(run.with_name("other.mcap")), ["day 1/other.mcap"], 3),
-        (lambda run: run.unlink(), [], 2),
-        (lambda run: shutil.copy(OTHER, run.parents[1] / "a.mcap"), ["a.mcap"], 4),
-    ],
-    ids=["newer", "larger", "moved", "gone", "new"],
-)
+@pytest.mark.parametrize(("change", "paths", "count"), [
+    (lambda run: os.utime(run, ns=(1, 1)), ["day 1/run.mcap"], 3),
+    (lambda run: shutil.copy(OTHER, run), ["day 1/run.mcap"], 3),
+    (lambda run: run.rename(run.with_name("other.mcap")), ["day 1/other.mcap"], 3),
+    (lambda run: run.unlink(), [], 2),
+    (lambda run: shutil.copy(OTHER, run.parents[1] / "a.mcap"), ["a.mcap"], 4),
+], ids=["newer", "larger", "moved", "gone", "new"])  # fmt: skip
 def test_what_has_changed_is_read_again(folder, entries_read, change, paths, count):
     read_catalogue(folder)
     change(folder / "day 1" / "run.mcap")
@@ -145,18 +141,15 @@ def test_a_cache_that_cannot_be_written_is_a_warning(folder, monkeypatch, caplog
     assert len(caplog.records) == 1
 
 
-@pytest.mark.parametrize(
-    ("where", "days"),
-    [
-        ("", [1, 2, 0]),
-        ("frequency_hz > 50", [1, 2]),
-        ("frequency_hz > 50 AND compensator == 'none'", [2]),
-        ("device.load_kg == 0", [1, 2]),
-        ("label.sample == 'A7'", []),
-        ("label.sample is null", [1, 2, 0]),
-        ("peak_error_percent > 0", []),
-    ],
-)
+@pytest.mark.parametrize(("where", "days"), [
+    ("", [1, 2, 0]),
+    ("frequency_hz > 50", [1, 2]),
+    ("frequency_hz > 50 AND compensator == 'none'", [2]),
+    ("device.load_kg == 0", [1, 2]),
+    ("label.sample == 'A7'", []),
+    ("label.sample is null", [1, 2, 0]),
+    ("peak_error_percent > 0", []),
+])  # fmt: skip
 def test_recordings_are_selected_in_the_order_of_their_start(folder, where, days):
     assert paths_of(select(read_catalogue(folder), where)) == [f"day {k}/run.mcap" for k in days]
 
@@ -181,20 +174,17 @@ ONE = entry(
 )
 
 
-@pytest.mark.parametrize(
-    "where",
-    [
-        'frequency_hz>100 and label.sample=="A7"',
-        "name in ('sine', \"chirp\") and not name == 'device'",
-        "label.class = 3 and label.größe > 1",
-        "[label.batch no] = 'it''s' and [label.batch no] = \"it's\"",
-        "simulated and simulated == true",
-        "reason is null and name is not null",
-        "device.link.host == 'rig' and waveform.window",
-        "name != 'label.sample' -- a comment",
-        "lower(label.sample) || 'x' = 'a7x'",
-    ],
-)
+@pytest.mark.parametrize("where", [
+    'frequency_hz>100 and label.sample=="A7"',
+    "name in ('sine', \"chirp\") and not name == 'device'",
+    "label.class = 3 and label.größe > 1",
+    "[label.batch no] = 'it''s' and [label.batch no] = \"it's\"",
+    "simulated and simulated == true",
+    "reason is null and name is not null",
+    "device.link.host == 'rig' and waveform.window",
+    "name != 'label.sample' -- a comment",
+    "lower(label.sample) || 'x' = 'a7x'",
+])  # fmt: skip
 def test_a_condition_is_a_condition_in_sql(where):
     assert select([ONE], where) == [ONE]
     assert select([ONE], f"not ({where}\n)") == []
@@ -206,29 +196,26 @@ def test_what_is_unknown_meets_neither_a_condition_nor_its_opposite(where):
     assert select([ONE], f"not ({where})") == []
 
 
-@pytest.mark.parametrize(
-    "where",
-    [
-        "freqency_hz > 1",
-        "10 < frequency_hz < 100",
-        "10<=frequency_hz<100",
-        "name == None",
-        "foo.bar > 1",
-        "name > > 3",
-        "name = ?",
-        "(" * 500,
-        "\0",
-        "\udcff",
-        "\x1b[2J(",
-        "1; DROP TABLE recordings",
-        "1; ATTACH 'x' AS y",
-        "EXISTS (SELECT 1 FROM sqlite_master)",
-        "EXISTS (SELECT 1 FROM pragma_table_info('recordings'))",
-        "(WITH RECURSIVE a(x) AS (SELECT 1 UNION SELECT x + 1 FROM a) SELECT max(x) FROM a)",
-        "load_extension('x')",
-        "1) UNION SELECT * FROM recordings",
-    ],
-)
+@pytest.mark.parametrize("where", [
+    "freqency_hz > 1",
+    "10 < frequency_hz < 100",
+    "10<=frequency_hz<100",
+    "name == None",
+    "foo.bar > 1",
+    "name > > 3",
+    "name = ?",
+    "(" * 500,
+    "\0",
+    "\udcff",
+    "\x1b[2J(",
+    "1; DROP TABLE recordings",
+    "1; ATTACH 'x' AS y",
+    "EXISTS (SELECT 1 FROM sqlite_master)",
+    "EXISTS (SELECT 1 FROM pragma_table_info('recordings'))",
+    "(WITH RECURSIVE a(x) AS (SELECT 1 UNION SELECT x + 1 FROM a) SELECT max(x) FROM a)",
+    "load_extension('x')",
+    "1) UNION SELECT * FROM recordings",
+])  # fmt: skip
 def test_any_other_condition_is_an_input_error_with_the_keys(where):
     keys = r"frequency_hz, .*label\.sample, .*waveform\.window"
     with pytest.raises(InputError, match=keys) as error:
@@ -330,13 +317,10 @@ def test_a_recording_agrees_with_its_report():
     assert set(END_FIGURES) <= report.keys()
 
 
-@pytest.mark.parametrize(
-    ("change", "problem"),
-    [
-        ({LABELS_FACT: "3"}, "metadata hilctl.run: labels must be texts and numbers by name"),
-        ({"segments": "[{}]"}, "metadata hilctl.run: segments: 0.label: Field required"),
-    ],
-)
+@pytest.mark.parametrize(("change", "problem"), [
+    ({LABELS_FACT: "3"}, "metadata hilctl.run: labels must be texts and numbers by name"),
+    ({"segments": "[{}]"}, "metadata hilctl.run: segments: 0.label: Field required"),
+])  # fmt: skip
 def test_a_recording_that_nobody_can_read_says_why(tmp_path, change, problem):
     found = made_entry(tmp_path, {**RUN, **change}, END)
     assert found["state"] == "unreadable"

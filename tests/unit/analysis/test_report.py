@@ -411,16 +411,13 @@ def test_of_an_old_recording_nothing_is_known():
     assert processes_of(with_end({})) == {}
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "none",
-        "[]",
-        '{"loop": {"resident_bytes": 1}}',
-        usage_facts(LOOP, SUPERVISOR)[USAGE_FACT].replace("98000000", "-1"),
-        usage_facts(LOOP, SUPERVISOR)[USAGE_FACT].replace("98000000", "1" + "0" * 400),
-    ],
-)
+@pytest.mark.parametrize("text", [
+    "none",
+    "[]",
+    '{"loop": {"resident_bytes": 1}}',
+    usage_facts(LOOP, SUPERVISOR)[USAGE_FACT].replace("98000000", "-1"),
+    usage_facts(LOOP, SUPERVISOR)[USAGE_FACT].replace("98000000", "1" + "0" * 400),
+])  # fmt: skip
 def test_what_is_damaged_is_refused_with_its_place(text):
     with pytest.raises(DataError, match=r"run\.mcap: hilctl\.end: processes: "):
         processes_of(with_end({USAGE_FACT: text}))

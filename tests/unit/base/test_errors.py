@@ -6,20 +6,12 @@ from hilctl.base import errors
 from hilctl.base.errors import ConfigError, ConfigProblem, DeviceError, HilctlError, InputError
 
 
-@pytest.mark.parametrize(
-    ("problem", "text"),
-    [
-        (
-            ConfigProblem("a.yaml:3", "limits.slew", "must be > 0"),
-            "a.yaml:3: limits.slew: must be > 0",
-        ),
-        (ConfigProblem("a.yaml", "", "is empty"), "a.yaml: is empty"),
-        (
-            ConfigProblem("a.yaml:3", "x", "must be > 0", "-1", "in A"),
-            "a.yaml:3: x: must be > 0, got -1 (in A)",
-        ),
-    ],
-)
+@pytest.mark.parametrize(("problem", "text"), [
+    (ConfigProblem("a.yaml:3", "limits.slew", "must be > 0"), "a.yaml:3: limits.slew: must be > 0"),
+    (ConfigProblem("a.yaml", "", "is empty"), "a.yaml: is empty"),
+    (ConfigProblem("a.yaml:3", "x", "must be > 0", "-1", "in A"),
+     "a.yaml:3: x: must be > 0, got -1 (in A)"),
+])  # fmt: skip
 def test_a_problem_has_place_key_rule_value_and_hint(problem, text):
     assert str(problem) == text
 

@@ -51,14 +51,11 @@ def test_nothing_else_is_read_where_texts_are_given(tmp_path):
         TextFiles({}).read(path)
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda path: None, "no such file"),
-        (lambda path: path.mkdir(), "is not a file"),
-        (lambda path: path.write_bytes(b"\xff\xfe\x00"), "is not UTF-8 text"),
-    ],
-)
+@pytest.mark.parametrize(("make", "message"), [
+    (lambda path: None, "no such file"),
+    (lambda path: path.mkdir(), "is not a file"),
+    (lambda path: path.write_bytes(b"\xff\xfe\x00"), "is not UTF-8 text"),
+])  # fmt: skip
 def test_unreadable_files_are_told(tmp_path, make, message):
     path = tmp_path / "thing"
     make(path)

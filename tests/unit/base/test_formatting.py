@@ -10,24 +10,21 @@ import pytest
 from hilctl.base import formatting
 
 
-@pytest.mark.parametrize(
-    ("value", "unit", "text"),
-    [
-        (39910.0, "us", "39.9 ms"),
-        (999.96, "us", "1.00 ms"),
-        (0.03553, "um", "35.5 nm"),
-        (83.2149, "um", "83.2 µm"),
-        (12.0, "%", "12.0 %"),
-        (223.609, "um*um", "224 µm²"),
-        (223.609, "um*A", "224 µm·A"),
-        (2291.4, "Hz", "2290 Hz"),
-        (-0.5, "s", "-500 ms"),
-        (5400.0, "s", "1.50 h"),
-        (0.0, "um", "0 µm"),
-        (1.5e-12, "um", "1.50e-09 nm"),
-        (None, "um", "-"),
-    ],
-)
+@pytest.mark.parametrize(("value", "unit", "text"), [
+    (39910.0, "us", "39.9 ms"),
+    (999.96, "us", "1.00 ms"),
+    (0.03553, "um", "35.5 nm"),
+    (83.2149, "um", "83.2 µm"),
+    (12.0, "%", "12.0 %"),
+    (223.609, "um*um", "224 µm²"),
+    (223.609, "um*A", "224 µm·A"),
+    (2291.4, "Hz", "2290 Hz"),
+    (-0.5, "s", "-500 ms"),
+    (5400.0, "s", "1.50 h"),
+    (0.0, "um", "0 µm"),
+    (1.5e-12, "um", "1.50e-09 nm"),
+    (None, "um", "-"),
+])  # fmt: skip
 def test_a_quantity_is_read_without_counting_zeros(value, unit, text):
     assert formatting.quantity(value, unit) == text
 
@@ -45,16 +42,13 @@ def test_units_have_their_signs():
     assert [formatting.unit_text(u) for u in ("um/A", "A", "um*V")] == ["µm/A", "A", "µm·V"]
 
 
-@pytest.mark.parametrize(
-    ("text", "shown"),
-    [
-        ("sine 6 A 10 Hz, µm ü", "sine 6 A 10 Hz, µm ü"),
-        ("\x1b[31mred\x07", "\\x1b[31mred\\x07"),
-        ("a\r\nb", "a\\r\\nb"),
-        ("\u202egnp.exe", "\\u202egnp.exe"),
-        ("\x9b2Jc\rd\x7fe", "\\x9b2Jc\\rd\\x7fe"),
-    ],
-)
+@pytest.mark.parametrize(("text", "shown"), [
+    ("sine 6 A 10 Hz, µm ü", "sine 6 A 10 Hz, µm ü"),
+    ("\x1b[31mred\x07", "\\x1b[31mred\\x07"),
+    ("a\r\nb", "a\\r\\nb"),
+    ("\u202egnp.exe", "\\u202egnp.exe"),
+    ("\x9b2Jc\rd\x7fe", "\\x9b2Jc\\rd\\x7fe"),
+])  # fmt: skip
 def test_what_steers_a_terminal_is_written_out(text: str, shown: str) -> None:
     assert formatting.printable(text) == shown
 

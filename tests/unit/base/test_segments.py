@@ -11,27 +11,24 @@ def segment(steady_start: int, steady_stop: int, period: float) -> Segment:
     return Segment("sine", 0, steady_stop + 50, steady_start, steady_stop, period)
 
 
-@pytest.mark.parametrize(
-    ("steady_start", "steady_stop", "period", "expected"),
-    [
-        pytest.param(0, 1000, 100.0, (100, 1000, 9), id="the first cycle is left out"),
-        pytest.param(250, 1000, 100.0, (400, 1000, 6), id="what is no whole cycle goes first"),
-        pytest.param(0, 200, 100.0, (100, 200, 1), id="of two cycles the last"),
-        pytest.param(0, 199, 100.0, (99, 199, 1), id="almost two cycles are one"),
-        pytest.param(0, 100, 100.0, (0, 100, 1), id="one cycle alone is taken"),
-        pytest.param(30, 170, 100.0, (70, 170, 1), id="one and a part: the last whole one"),
-        pytest.param(0, 99, 100.0, (99, 99, 0), id="less than a cycle: none"),
-        pytest.param(500, 500, 100.0, (500, 500, 0), id="no steady part: none"),
-        pytest.param(0, 1000, 1000.0 / 3.0, (333, 1000, 2), id="a third of 1000, three times"),
-        pytest.param(0, 1000, 333.25, (334, 1000, 2), id="a period with a fraction, rounded once"),
-        pytest.param(0, 250, 62.5, (62, 250, 3), id="half samples"),
-        pytest.param(0, 7, 2.75, (4, 7, 1), id="short periods with a fraction"),
-        pytest.param(0, 1000, 0.0, (0, 1000, 0), id="no period: all of the steady part"),
-        pytest.param(200, 900, 0.0, (200, 900, 0), id="no period, soft ends"),
-        pytest.param(0, 1_500_000, 50e3 / 30.0, (1667, 1_500_000, 899), id="30 Hz for 30 s"),
-        pytest.param(0, 100, 1e300, (100, 100, 0), id="a period without end"),
-    ],
-)
+@pytest.mark.parametrize(("steady_start", "steady_stop", "period", "expected"), [
+    pytest.param(0, 1000, 100.0, (100, 1000, 9), id="the first cycle is left out"),
+    pytest.param(250, 1000, 100.0, (400, 1000, 6), id="what is no whole cycle goes first"),
+    pytest.param(0, 200, 100.0, (100, 200, 1), id="of two cycles the last"),
+    pytest.param(0, 199, 100.0, (99, 199, 1), id="almost two cycles are one"),
+    pytest.param(0, 100, 100.0, (0, 100, 1), id="one cycle alone is taken"),
+    pytest.param(30, 170, 100.0, (70, 170, 1), id="one and a part: the last whole one"),
+    pytest.param(0, 99, 100.0, (99, 99, 0), id="less than a cycle: none"),
+    pytest.param(500, 500, 100.0, (500, 500, 0), id="no steady part: none"),
+    pytest.param(0, 1000, 1000.0 / 3.0, (333, 1000, 2), id="a third of 1000, three times"),
+    pytest.param(0, 1000, 333.25, (334, 1000, 2), id="a period with a fraction, rounded once"),
+    pytest.param(0, 250, 62.5, (62, 250, 3), id="half samples"),
+    pytest.param(0, 7, 2.75, (4, 7, 1), id="short periods with a fraction"),
+    pytest.param(0, 1000, 0.0, (0, 1000, 0), id="no period: all of the steady part"),
+    pytest.param(200, 900, 0.0, (200, 900, 0), id="no period, soft ends"),
+    pytest.param(0, 1_500_000, 50e3 / 30.0, (1667, 1_500_000, 899), id="30 Hz for 30 s"),
+    pytest.param(0, 100, 1e300, (100, 100, 0), id="a period without end"),
+])  # fmt: skip
 def test_steady_cycles(
     steady_start: int, steady_stop: int, period: float, expected: tuple[int, int, int]
 ) -> None:

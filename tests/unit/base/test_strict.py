@@ -11,18 +11,15 @@ class Gain(StrictModel):
     plays: int = 1
 
 
-@pytest.mark.parametrize(
-    "given",
-    [
-        {"gain": "1.0"},
-        {"gain": True},
-        {"gain": float("nan")},
-        {"gain": float("inf")},
-        {"gain": 1.0, "plays": 2.0},
-        {"gain": 1.0, "gian": 1.0},
-        {},
-    ],
-)
+@pytest.mark.parametrize("given", [
+    {"gain": "1.0"},
+    {"gain": True},
+    {"gain": float("nan")},
+    {"gain": float("inf")},
+    {"gain": 1.0, "plays": 2.0},
+    {"gain": 1.0, "gian": 1.0},
+    {},
+])  # fmt: skip
 def test_what_is_not_exactly_right_is_refused(given):
     with pytest.raises(ValidationError):
         Gain.model_validate(given)

@@ -63,26 +63,23 @@ def completing(words):
     }
 
 
-@pytest.mark.parametrize(
-    ("words", "some"),
-    [
-        ("report --", {"--html", "--from", "--json", "--help"}),
-        ("stop --", {"--all", "--wait", "--run"}),
-        ("stop --run ", {"rig-1"}),
-        ("devices show lab", {"labjack_t7"}),
-        ("init sim", {"simulated_piezo"}),
-        ("init kepco_bop --reader ag", {"agilent_34970a"}),
-        ("emulate wag", {"wago_750"}),
-        ("examples models/", {"models/piezo_ppi"}),
-        ("identify x.mcap --model f", {"field"}),
-        ("identify x.mcap --set table.u", {"table.unit="}),
-        ("report ", {"recordings/day/a.mcap"}),
-        ("run x.yaml --set limits.d", {"limits.drive_a=", "limits.drive_v="}),
-        ("run x.yaml --set waveform.freq", {"waveform.frequency_hz="}),
-        ("check x.yaml --set device.h", {"device.host="}),
-        ("sweep x.yaml --vary samp", {"sample_rate_hz="}),
-    ],
-)
+@pytest.mark.parametrize(("words", "some"), [
+    ("report --", {"--html", "--from", "--json", "--help"}),
+    ("stop --", {"--all", "--wait", "--run"}),
+    ("stop --run ", {"rig-1"}),
+    ("devices show lab", {"labjack_t7"}),
+    ("init sim", {"simulated_piezo"}),
+    ("init kepco_bop --reader ag", {"agilent_34970a"}),
+    ("emulate wag", {"wago_750"}),
+    ("examples models/", {"models/piezo_ppi"}),
+    ("identify x.mcap --model f", {"field"}),
+    ("identify x.mcap --set table.u", {"table.unit="}),
+    ("report ", {"recordings/day/a.mcap"}),
+    ("run x.yaml --set limits.d", {"limits.drive_a=", "limits.drive_v="}),
+    ("run x.yaml --set waveform.freq", {"waveform.frequency_hz="}),
+    ("check x.yaml --set device.h", {"device.host="}),
+    ("sweep x.yaml --vary samp", {"sample_rate_hz="}),
+])  # fmt: skip
 def test_shell_completes_options_and_values(words, some, tmp_path, monkeypatch, hilctl):
     monkeypatch.chdir(tmp_path)
     day = tmp_path / "recordings" / "day"
@@ -97,16 +94,13 @@ def test_shell_completes_options_and_values(words, some, tmp_path, monkeypatch, 
     assert set(out.split()) >= some
 
 
-@pytest.mark.parametrize(
-    ("words", "environment"),
-    [
-        (["--help"], {}),
-        (["status"], {}),
-        (["stop", "--all"], {}),
-        ([], completing("hilctl run x.yaml --set limits.")),
-        ([], completing("hilctl report ")),
-    ],
-)
+@pytest.mark.parametrize(("words", "environment"), [
+    (["--help"], {}),
+    (["status"], {}),
+    (["stop", "--all"], {}),
+    ([], completing("hilctl run x.yaml --set limits.")),
+    ([], completing("hilctl report ")),
+])  # fmt: skip
 def test_help_status_stop_and_completion_import_nothing_heavy(words, environment):
     code = """
 import sys

@@ -92,14 +92,11 @@ def test_init_prints_one_json_object(here, json_of):
     assert found["to_be_set"] == []
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["simulated_piezo"], "exists"),
-        (["simulated_terfenol", "--set", "limits.peak_current_a=50"], "-50 to 50"),
-        ([], "labjack_t7"),
-    ],
-)
+@pytest.mark.parametrize(("words", "message"), [
+    (["simulated_piezo"], "exists"),
+    (["simulated_terfenol", "--set", "limits.peak_current_a=50"], "-50 to 50"),
+    ([], "labjack_t7"),
+])  # fmt: skip
 def test_init_refuses_wrong_input_and_existing_files(here, hilctl, words, message):
     (here / "simulated_piezo.yaml").write_text("mine")
     code, _, err = hilctl("init", *words)
@@ -114,26 +111,15 @@ class Terminal(io.StringIO):
         return True
 
 
-@pytest.mark.parametrize(
-    ("answers", "errors", "chosen"),
-    [
-        (
-            "labjack|t9|labjack_t7||DAC9|dac1||kV|A|10.0.0.7|zero|0|2|-5|||50|0.4",
-            ["3 devices", "0 devices", "'DAC9'", "'kV'", "'zero'", "not 0", "-50 to 50"],
-            {
-                "device": {"host": "10.0.0.7", "output": "DAC1"},
-                "limits": {"peak_current_a": 0.4},
-                "waveform": {"amplitude": 0.2},
-            },
-        ),
-        (
-            "tdk||agilent||/dev/ttyUSB1|||5|[0, 5]",
-            ["--reader", "must be a list"],
-            {"device": {"input": "AI101"}, "limits": {"drive_a": (0, 5)}},
-        ),
-        ("piezo|[0, 50]", [], {"limits": {"drive_v": (0, 50)}}),
-    ],
-)
+@pytest.mark.parametrize(("answers", "errors", "chosen"), [
+    ("labjack|t9|labjack_t7||DAC9|dac1||kV|A|10.0.0.7|zero|0|2|-5|||50|0.4",
+     ["3 devices", "0 devices", "'DAC9'", "'kV'", "'zero'", "not 0", "-50 to 50"], {
+     "device": {"host": "10.0.0.7", "output": "DAC1"}, "limits": {"peak_current_a": 0.4},
+     "waveform": {"amplitude": 0.2}, }),
+    ("tdk||agilent||/dev/ttyUSB1|||5|[0, 5]", ["--reader", "must be a list"],
+     {"device": {"input": "AI101"}, "limits": {"drive_a": (0, 5)}}),
+    ("piezo|[0, 50]", [], {"limits": {"drive_v": (0, 50)}}),
+])  # fmt: skip
 def test_init_asks_until_it_is_valid(here, monkeypatch, capsys, answers, errors, chosen):
     monkeypatch.setattr(sys, "stdin", Terminal(answers.replace("|", "\n") + "\n"))
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)

@@ -85,16 +85,13 @@ def shown(view, capsys, width=80, height=24):
     return capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    ("key", "inverse", "wanted"),
-    [
-        (b"i", "in", {"inverse": "out", "over_s": 0.5}),
-        (b"i", "out", {"inverse": "in", "over_s": 0.5}),
-        (b"+", "in", {"gain": 0.8, "over_s": 0.5}),
-        (b"-", "in", {"gain": 0.6, "over_s": 0.5}),
-        (b"s", "in", "stop"),
-    ],
-)
+@pytest.mark.parametrize(("key", "inverse", "wanted"), [
+    (b"i", "in", {"inverse": "out", "over_s": 0.5}),
+    (b"i", "out", {"inverse": "in", "over_s": 0.5}),
+    (b"+", "in", {"gain": 0.8, "over_s": 0.5}),
+    (b"-", "in", {"gain": 0.6, "over_s": 0.5}),
+    (b"s", "in", "stop"),
+])  # fmt: skip
 def test_key_sends_one_request(sent, key, inverse, wanted):
     view = View(FakeFeed(inverse=inverse))
     view.press(key)

@@ -109,16 +109,13 @@ def restored_settings():
     logger.handlers[:] = handlers
 
 
-@pytest.mark.parametrize(
-    ("words", "left", "quiet", "verbose"),
-    [
-        ("hilctl run x.yaml", "hilctl run x.yaml", False, False),
-        ("hilctl --quiet run x.yaml", "hilctl run x.yaml", True, False),
-        ("hilctl run x.yaml --verbose --quiet", "hilctl run x.yaml", True, True),
-        ("hilctl run -- --quiet", "hilctl run -- --quiet", False, False),
-        ("--quiet run", "--quiet run", False, False),
-    ],
-)
+@pytest.mark.parametrize(("words", "left", "quiet", "verbose"), [
+    ("hilctl run x.yaml", "hilctl run x.yaml", False, False),
+    ("hilctl --quiet run x.yaml", "hilctl run x.yaml", True, False),
+    ("hilctl run x.yaml --verbose --quiet", "hilctl run x.yaml", True, True),
+    ("hilctl run -- --quiet", "hilctl run -- --quiet", False, False),
+    ("--quiet run", "--quiet run", False, False),
+])  # fmt: skip
 def test_options_are_accepted_anywhere(words, left, quiet, verbose):
     given = words.split()
     output.take_verbosity(given)

@@ -63,17 +63,14 @@ def test_options_and_arguments_in_any_order(recording, tmp_path, hilctl, json_of
     assert json_of("export", recording, out, "--overwrite")[0] == 0
 
 
-@pytest.mark.parametrize(
-    ("words", "option"),
-    [
-        ("report {} --before {}", "--html"),
-        ("report {} --model model.yaml", "--model"),
-        ("report {} {} --from 1", "--from"),
-        ("report {} {} --to 1", "--to"),
-        ("report {} {} --before {}", "--before"),
-        ("figures {} --format gif", "--format"),
-    ],
-)
+@pytest.mark.parametrize(("words", "option"), [
+    ("report {} --before {}", "--html"),
+    ("report {} --model model.yaml", "--model"),
+    ("report {} {} --from 1", "--from"),
+    ("report {} {} --to 1", "--to"),
+    ("report {} {} --before {}", "--before"),
+    ("figures {} --format gif", "--format"),
+])  # fmt: skip
 def test_wrong_options_are_refused(hilctl, words, option):
     code, _, err = hilctl(*(str(RUN) if word == "{}" else word for word in words.split()))
     assert (code, option in err) == (2, True)
@@ -130,15 +127,12 @@ OTHER = replace(
 )
 
 
-@pytest.mark.parametrize(
-    ("result", "other", "texts"),
-    [
-        (SAME, None, ["identical: 900 commands"]),
-        (OTHER, None, ["different: 3 of 900 commands", "sample 12", "largest difference 0.5 A"]),
-        (SAME, "m.yaml", ["m.yaml", "-1.5 to 2.25 A", "7 samples"]),
-        (replace(SAME, left_out_samples=50), None, ["50 samples after a gap", "identical"]),
-    ],
-)
+@pytest.mark.parametrize(("result", "other", "texts"), [
+    (SAME, None, ["identical: 900 commands"]),
+    (OTHER, None, ["different: 3 of 900 commands", "sample 12", "largest difference 0.5 A"]),
+    (SAME, "m.yaml", ["m.yaml", "-1.5 to 2.25 A", "7 samples"]),
+    (replace(SAME, left_out_samples=50), None, ["50 samples after a gap", "identical"]),
+])  # fmt: skip
 def test_differences_of_a_replay_are_printed(monkeypatch, capsys, result, other, texts):
     monkeypatch.setenv("COLUMNS", "120")
     print_replay(result, other=other)

@@ -242,18 +242,13 @@ class TestRules:
 
 
 class TestYaml:
-    @pytest.mark.parametrize(
-        ("text", "message"),
-        [
-            ("[1, 2]", "must hold a mapping"),
-            (MODBUS + "vendor: Other\n", "acme.yaml:16: vendor: stands already at acme.yaml:1"),
-            (
-                MODBUS.replace("address: 4", "address: 1:30"),
-                "acme.yaml:14: inputs.AI.address: must be a whole number, got '1:30'",
-            ),
-            ("a: !!python/object:os.system {}", "is not readable YAML"),
-        ],
-    )
+    @pytest.mark.parametrize(("text", "message"), [
+        ("[1, 2]", "must hold a mapping"),
+        (MODBUS + "vendor: Other\n", "acme.yaml:16: vendor: stands already at acme.yaml:1"),
+        (MODBUS.replace("address: 4", "address: 1:30"),
+         "acme.yaml:14: inputs.AI.address: must be a whole number, got '1:30'"),
+        ("a: !!python/object:os.system {}", "is not readable YAML"),
+    ])  # fmt: skip
     def test_refused(self, text, message):
         found = lines(text)
         assert message in found[0]

@@ -17,15 +17,12 @@ def test_a_timeout_is_a_whole_number_of_counts(timeout_s, counts):
     assert WATCHDOG.counts(timeout_s) == counts
 
 
-@pytest.mark.parametrize(
-    ("timeout_s", "said"),
-    [
-        (0.05, "0.1 to 25.5"),
-        (26.0, "0.1 to 25.5"),
-        (float("nan"), "0.1 to"),
-        (0.25, "multiple of 0.1"),
-    ],
-)
+@pytest.mark.parametrize(("timeout_s", "said"), [
+    (0.05, "0.1 to 25.5"),
+    (26.0, "0.1 to 25.5"),
+    (float("nan"), "0.1 to"),
+    (0.25, "multiple of 0.1"),
+])  # fmt: skip
 def test_other_timeouts_are_refused_not_rounded(timeout_s, said):
     """A watchdog that trips later than was asked is no watchdog."""
     with pytest.raises(InputError, match=said):

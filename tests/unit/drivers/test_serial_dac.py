@@ -311,21 +311,18 @@ def test_nobody_there_is_said(rig):
         second.open(20.0, 1)
 
 
-@pytest.mark.parametrize(
-    ("changes", "text"),
-    [
-        ({"output": "AO9"}, "output must be one that nobody DCON"),
-        ({"input": "AI9"}, "input must be one that nobody DCON"),
-        ({"profile": "labjack_t7"}, "one for kind: modbus_dac"),
-        ({"profile": "kepco_bop", "output": "current", "input": "current"}, "as reader"),
-        ({"measure": "AI0"}, "measure must be an input of nobody .* measures its own output"),
-        ({"profile": "cobs_board", "output": "DAC", "input": "ADC", "measure": "ADC"}, "lines of"),
-        ({"watchdog": {"timeout_s": 100.0}}, "timeout_s must be 0.1 to 25.5"),
-        ({"watchdog": {"timeout_s": 1.0, "safe_command": 11.0}}, "safe_command must be -10 to 10"),
-        ({"sensor": {"um_per_ma": 1.0}}, "the input is in V"),
-        ({"reader": {"profile": "agilent_34970a"}, "input": "AI101"}, "can't share the line"),
-    ],
-)
+@pytest.mark.parametrize(("changes", "text"), [
+    ({"output": "AO9"}, "output must be one that nobody DCON"),
+    ({"input": "AI9"}, "input must be one that nobody DCON"),
+    ({"profile": "labjack_t7"}, "one for kind: modbus_dac"),
+    ({"profile": "kepco_bop", "output": "current", "input": "current"}, "as reader"),
+    ({"measure": "AI0"}, "measure must be an input of nobody .* measures its own output"),
+    ({"profile": "cobs_board", "output": "DAC", "input": "ADC", "measure": "ADC"}, "lines of"),
+    ({"watchdog": {"timeout_s": 100.0}}, "timeout_s must be 0.1 to 25.5"),
+    ({"watchdog": {"timeout_s": 1.0, "safe_command": 11.0}}, "safe_command must be -10 to 10"),
+    ({"sensor": {"um_per_ma": 1.0}}, "the input is in V"),
+    ({"reader": {"profile": "agilent_34970a"}, "input": "AI101"}, "can't share the line"),
+])  # fmt: skip
 def test_options_that_do_not_go_together_are_refused(profiles, changes, text):
     dcon = {**TWO_LINES, "profile": profiles["dcon"], "input": "AI0", "reader": None}
     with pytest.raises(InputError, match=text):

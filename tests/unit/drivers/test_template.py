@@ -35,14 +35,11 @@ def test_a_device_can_be_made_of_it(name):
         assert value is not None
 
 
-@pytest.mark.parametrize(
-    ("name", "reader", "line"),
-    [
-        ("kepco_bop", "agilent_34970a", "own"),
-        ("adam_6224", "adam_6217", "own"),
-        ("icp_m7024", "icp_m7017", "same"),
-    ],
-)
+@pytest.mark.parametrize(("name", "reader", "line"), [
+    ("kepco_bop", "agilent_34970a", "own"),
+    ("adam_6224", "adam_6217", "own"),
+    ("icp_m7024", "icp_m7017", "same"),
+])  # fmt: skip
 def test_the_sensor_may_be_on_another_device(name, reader, line):
     section = starting_section(name, "A", reader)
     made(section)

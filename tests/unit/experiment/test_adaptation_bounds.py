@@ -44,22 +44,15 @@ def test_a_good_one_is_taken(load):
     assert made.parameters["offset_um"] == 0.0
 
 
-@pytest.mark.parametrize(
-    ("settings", "rule"),
-    [
-        (("adaptation={}",), "adaptation.noise_um"),
-        (
-            ("adaptation={noise_um: 0.03, time_constant_s: 0.001}",),
-            "adaptation.time_constant_s: must be >= 0.015 s, by the delay of the loop",
-        ),
-        (("adaptation={noise_um: 0.03, gain: 0.5}",), "adaptation.gain: "),
-        (("adaptation={noise_um: 0.03, offset_um: 1}", INTEGRAL), "must be 0 with feedback"),
-        (
-            (NOISE, "compensator=none", "waveform.unit=A", "waveform.amplitude=1.0"),
-            "adaptation: needs a compensator",
-        ),
-    ],
-)
+@pytest.mark.parametrize(("settings", "rule"), [
+    (("adaptation={}",), "adaptation.noise_um"),
+    (("adaptation={noise_um: 0.03, time_constant_s: 0.001}",),
+     "adaptation.time_constant_s: must be >= 0.015 s, by the delay of the loop"),
+    (("adaptation={noise_um: 0.03, gain: 0.5}",), "adaptation.gain: "),
+    (("adaptation={noise_um: 0.03, offset_um: 1}", INTEGRAL), "must be 0 with feedback"),
+    ((NOISE, "compensator=none", "waveform.unit=A", "waveform.amplitude=1.0"),
+     "adaptation: needs a compensator"),
+])  # fmt: skip
 def test_what_it_can_not_have(load, settings, rule):
     with pytest.raises(ConfigError) as caught:
         check(load(*settings))

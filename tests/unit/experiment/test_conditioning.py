@@ -147,15 +147,12 @@ class TestCheck:
         with pytest.raises(ConfigError, match="condition's amplitude"):
             check(loaded(*heat))
 
-    @pytest.mark.parametrize(
-        ("setting", "rule"),
-        [
-            ("condition.amplitude_a=6.1", r"condition.amplitude_a: must be <= 6 A"),
-            ("condition.amplitude_v=1.0", r"condition: must have amplitude_a: limits are in A"),
-            ("condition.frequency_hz=531.0", r"condition.frequency_hz: must be <= 500 Hz"),
-            ("condition={frequency_hz: 90.0, amplitude_a: 6.0}", r"must be <= 79.58 Hz"),
-        ],
-    )
+    @pytest.mark.parametrize(("setting", "rule"), [
+        ("condition.amplitude_a=6.1", r"condition.amplitude_a: must be <= 6 A"),
+        ("condition.amplitude_v=1.0", r"condition: must have amplitude_a: limits are in A"),
+        ("condition.frequency_hz=531.0", r"condition.frequency_hz: must be <= 500 Hz"),
+        ("condition={frequency_hz: 90.0, amplitude_a: 6.0}", r"must be <= 79.58 Hz"),
+    ])  # fmt: skip
     def test_what_it_can_t_be(self, setting, rule):
         slew = "limits.slew_a_per_s=3000.0" if "90.0" in setting else "name=x"
         with pytest.raises(ConfigError, match=rule):

@@ -92,24 +92,18 @@ class TestContext:
 
 
 class TestConsistency:
-    @pytest.mark.parametrize(
-        ("text", "settings", "word"),
-        [
-            (CURRENT, ["tracking_error_um=2.0"], "compensator"),
-            (CURRENT, ["rms_current_a=4.0"], "limits.thermal_time_constant_s"),
-            (CURRENT, ["thermal_time_constant_s=4.0"], "limits.rms_current_a"),
-            (CURRENT, ["tracking_s=0.1"], "limits.tracking_error_um"),
-            (CURRENT, ["frozen_um=0.1"], "limits.frozen_s"),
-            (CURRENT, ["deviation_s=0.1"], "limits.measured_deviation_a"),
-            (VOLTAGE, ["deviation_s=0.1"], "limits.measured_deviation_v"),
-            (CURRENT, ["measured_deviation_v=1.0"], "in V"),
-            (
-                VOLTAGE,
-                ["rms_current_a=1.0", "thermal_time_constant_s=1.0", "measured_deviation_a=1.0"],
-                "in A",
-            ),
-        ],
-    )
+    @pytest.mark.parametrize(("text", "settings", "word"), [
+        (CURRENT, ["tracking_error_um=2.0"], "compensator"),
+        (CURRENT, ["rms_current_a=4.0"], "limits.thermal_time_constant_s"),
+        (CURRENT, ["thermal_time_constant_s=4.0"], "limits.rms_current_a"),
+        (CURRENT, ["tracking_s=0.1"], "limits.tracking_error_um"),
+        (CURRENT, ["frozen_um=0.1"], "limits.frozen_s"),
+        (CURRENT, ["deviation_s=0.1"], "limits.measured_deviation_a"),
+        (VOLTAGE, ["deviation_s=0.1"], "limits.measured_deviation_v"),
+        (CURRENT, ["measured_deviation_v=1.0"], "in V"),
+        (VOLTAGE, ["rms_current_a=1.0", "thermal_time_constant_s=1.0", "measured_deviation_a=1.0"],
+         "in A"),
+    ])  # fmt: skip
     def test_refused_by_key(self, text, settings, word):
         found = refusals(text, *(f"limits.{setting}" for setting in settings))
         keys = [f"limits.{setting.partition('=')[0]}" for setting in settings]

@@ -282,14 +282,11 @@ def test_the_last_run_of_this_device_is_taken(folder):
     assert words == f"where {path} left the actuator"
 
 
-@pytest.mark.parametrize(
-    ("made", "why"),
-    [
-        ({"whole": False}, "incomplete"),
-        ({"first": 50}, "incomplete"),
-        ({"end": {"output_safe": "false"}}, "safe value"),
-    ],
-)
+@pytest.mark.parametrize(("made", "why"), [
+    ({"whole": False}, "incomplete"),
+    ({"first": 50}, "incomplete"),
+    ({"end": {"output_safe": "false"}}, "safe value"),
+])  # fmt: skip
 def test_no_older_one_stands_in_for_the_last(folder, made, why):
     folder.record("old")
     folder.record("new", **made)
@@ -335,14 +332,11 @@ class TestCheck:
         assert begun.input_um[0] == pytest.approx(left.stands_um)
         assert check(folder.loaded()).forecast.begins == words
 
-    @pytest.mark.parametrize(
-        ("setting", "words"),
-        [
-            ("compensator.initial_state=rest", "at rest"),
-            ("condition={cycles: 2}", "where its condition leaves the actuator"),
-            ("compensator.initial_state=old.mcap", "where old.mcap left the actuator"),
-        ],
-    )
+    @pytest.mark.parametrize(("setting", "words"), [
+        ("compensator.initial_state=rest", "at rest"),
+        ("condition={cycles: 2}", "where its condition leaves the actuator"),
+        ("compensator.initial_state=old.mcap", "where old.mcap left the actuator"),
+    ])  # fmt: skip
     def test_switched_off_or_over(self, folder, setting, words):
         folder.record("new")
         record(folder.path / "old.mcap", 0.5 * COMMAND)

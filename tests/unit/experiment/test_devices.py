@@ -125,14 +125,11 @@ def test_entry_point(devices_package):
     assert registry.device_class("my_amplifier") is Amplifier
 
 
-@pytest.mark.parametrize(
-    ("kind", "hint"),
-    [
-        ("simulated_terfanol", "did you mean 'simulated_terfenol'?"),
-        ("my_amplifyer", "did you mean 'my_amplifier'?"),
-        ("qqqq", "known: "),
-    ],
-)
+@pytest.mark.parametrize(("kind", "hint"), [
+    ("simulated_terfanol", "did you mean 'simulated_terfenol'?"),
+    ("my_amplifyer", "did you mean 'my_amplifier'?"),
+    ("qqqq", "known: "),
+])  # fmt: skip
 def test_unknown_device(devices_package, kind, hint):
     """The nearest known name is suggested, or all of them are listed in order."""
     if hint == "known: ":
@@ -142,15 +139,12 @@ def test_unknown_device(devices_package, kind, hint):
     assert str(caught.value) == f"unknown device '{kind}' ({hint})"
 
 
-@pytest.mark.parametrize(
-    ("kind", "reason"),
-    [
-        ("no_module", "No module named 'my_lost_package'"),
-        ("no_class", "no attribute 'Amplifyer'"),
-        ("no_options", "no attribute 'Options'"),
-        ("no_colon", ""),
-    ],
-)
+@pytest.mark.parametrize(("kind", "reason"), [
+    ("no_module", "No module named 'my_lost_package'"),
+    ("no_class", "no attribute 'Amplifyer'"),
+    ("no_options", "no attribute 'Options'"),
+    ("no_colon", ""),
+])  # fmt: skip
 def test_device_that_can_not_be_loaded(devices_package, kind, reason):
     with pytest.raises(InputError) as caught:
         registry.device_class(kind)

@@ -32,15 +32,12 @@ def test_each_says_what_it_is_for():
     assert paths == (files - {CONFIGS / "schema.json"}) | profiles
 
 
-@pytest.mark.parametrize(
-    ("name", "files"),
-    [
-        ("layouts/foxglove", ["layouts/foxglove.json"]),
-        ("hilctl@", ["hilctl@.service"]),
-        ("layouts/plotjuggler", ["layouts/plotjuggler.xml"]),
-        ("profiles/labjack_t7", ["profiles/labjack_t7.yaml", "profiles/schema.json"]),
-    ],
-)
+@pytest.mark.parametrize(("name", "files"), [
+    ("layouts/foxglove", ["layouts/foxglove.json"]),
+    ("hilctl@", ["hilctl@.service"]),
+    ("layouts/plotjuggler", ["layouts/plotjuggler.xml"]),
+    ("profiles/labjack_t7", ["profiles/labjack_t7.yaml", "profiles/schema.json"]),
+])  # fmt: skip
 def test_layouts_and_profiles_are_copied_too(tmp_path, name, files):
     assert copy_example(name, tmp_path, CONFIGS) == tuple(tmp_path / file for file in files)
     if name.startswith("profiles"):

@@ -84,15 +84,12 @@ class TestExperiment:
         checked = check(resolve(Document("e", EXPERIMENT), tmp_path, ["block=50", self.INTEGRAL]))
         assert checked.records_input
 
-    @pytest.mark.parametrize(
-        ("settings", "model", "rule"),
-        [
-            (("block=50", "{b: 3.2}"), MODEL, "must be <= 3.121 Hz"),
-            (("block=1", "{b: 5.1}"), MODEL, "must be <= 5 Hz"),
-            (("block=1", "{b: 13.0}"), STAGED.replace("0.12", "0.04"), "must be <= 12 Hz"),
-            (("block=1", "{b: 1.0, sensor_delay_s: 0.1}"), MODEL, "must be <= 0.317 Hz"),
-        ],
-    )
+    @pytest.mark.parametrize(("settings", "model", "rule"), [
+        (("block=50", "{b: 3.2}"), MODEL, "must be <= 3.121 Hz"),
+        (("block=1", "{b: 5.1}"), MODEL, "must be <= 5 Hz"),
+        (("block=1", "{b: 13.0}"), STAGED.replace("0.12", "0.04"), "must be <= 12 Hz"),
+        (("block=1", "{b: 1.0, sensor_delay_s: 0.1}"), MODEL, "must be <= 0.317 Hz"),
+    ])  # fmt: skip
     def test_integral_too_fast(self, tmp_path, settings, model, rule):
         keys = settings[1].replace("b:", "bandwidth_hz:")
         chosen = f"feedback={{kind: integral, limit_um: 5.0, {keys[1:]}"

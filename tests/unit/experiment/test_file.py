@@ -315,17 +315,14 @@ class TestSet:
         parts = config.waveform.model_dump()["parts"]
         assert [part["level"] for part in parts] == [1.0, 3.0]
 
-    @pytest.mark.parametrize(
-        ("setting", "key"),
-        [
-            ("block=2.5", "block"),
-            ("limits.stroke_um.0=x", "limits.stroke_um.0"),
-            ("waveform.freq_hz=3.0", "waveform.freq_hz"),
-            ("device.seeds=3", "device.seeds"),
-            ("safe.value=99", "safe.value"),
-            ("limits.stroke_um.2=5", "limits.stroke_um.2"),
-        ],
-    )
+    @pytest.mark.parametrize(("setting", "key"), [
+        ("block=2.5", "block"),
+        ("limits.stroke_um.0=x", "limits.stroke_um.0"),
+        ("waveform.freq_hz=3.0", "waveform.freq_hz"),
+        ("device.seeds=3", "device.seeds"),
+        ("safe.value=99", "safe.value"),
+        ("limits.stroke_um.2=5", "limits.stroke_um.2"),
+    ])  # fmt: skip
     def test_broken(self, folder, setting, key):
         assert problems(FULL, folder, (setting,)) == [(f"--set {setting}", key)]
 
@@ -365,15 +362,12 @@ class TestModel:
         found = problems(changed("model: model.yaml", f"model: {name}"), folder)
         assert found == [(f"x.yaml:{LINES['model']}", "compensator.model")]
 
-    @pytest.mark.parametrize(
-        ("old", "new", "line", "key"),
-        [
-            ("direct: 2.7", "direct: 0.0", 1, "model"),
-            ("[0.3, 0.6, 0.9]", "[0.3, 0.6]", 5, "model"),
-            ("gamma_s: 0.0003", "gamma_s: -0.1", 7, "model.gamma_s"),
-            ("weights: [2.3, 0.1, 0.4]", "weights: [2.3, 0.1, 0.4", 6, ""),
-        ],
-    )
+    @pytest.mark.parametrize(("old", "new", "line", "key"), [
+        ("direct: 2.7", "direct: 0.0", 1, "model"),
+        ("[0.3, 0.6, 0.9]", "[0.3, 0.6]", 5, "model"),
+        ("gamma_s: 0.0003", "gamma_s: -0.1", 7, "model.gamma_s"),
+        ("weights: [2.3, 0.1, 0.4]", "weights: [2.3, 0.1, 0.4", 6, ""),
+    ])  # fmt: skip
     def test_broken(self, folder, old, new, line, key):
         path = folder / "model.yaml"
         path.write_text(changed(old, new, MODEL))

@@ -86,14 +86,11 @@ def test_all_problems_come_together(written):
     assert places["device.timeout_s"].startswith(f"{path}:")
 
 
-@pytest.mark.parametrize(
-    ("name", "rule"),
-    [
-        ("labjack_t9", "no profile 'labjack_t9' is shipped"),
-        ("mine/none.yaml", "mine/none.yaml: no such file"),
-        (7, "must be text"),
-    ],
-)
+@pytest.mark.parametrize(("name", "rule"), [
+    ("labjack_t9", "no profile 'labjack_t9' is shipped"),
+    ("mine/none.yaml", "mine/none.yaml: no such file"),
+    (7, "must be text"),
+])  # fmt: skip
 def test_profiles_that_can_not_be_had_are_told_by_their_line(written, name, rule):
     path = written(profile=name, reader={"profile": name})
     with pytest.raises(ConfigError) as caught:

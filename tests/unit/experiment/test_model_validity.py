@@ -43,14 +43,11 @@ def test_a_corner_is_warned_not_refused():
     assert "frequencies up to" in found.warnings[0]
 
 
-@pytest.mark.parametrize(
-    ("values", "frequency_hz", "text"),
-    [
-        (sine(50.0, 4.0), 50.0, "moves by 8 µm peak-to-peak"),
-        (sine(2.0, 40.0), 2.0, "repeats at 2 Hz"),
-        (sine(50.0, 40.0) + np.where(np.arange(10_000) > 5003, 8.0, 0.0), 0.0, "µm/s"),
-    ],
-)
+@pytest.mark.parametrize(("values", "frequency_hz", "text"), [
+    (sine(50.0, 4.0), 50.0, "moves by 8 µm peak-to-peak"),
+    (sine(2.0, 40.0), 2.0, "repeats at 2 Hz"),
+    (sine(50.0, 40.0) + np.where(np.arange(10_000) > 5003, 8.0, 0.0), 0.0, "µm/s"),
+])  # fmt: skip
 def test_smaller_slower_and_faster_motions_are_warned(values, frequency_hz, text):
     found = findings(values, frequency_hz)
     assert any(text in each for each in found.warnings)

@@ -128,13 +128,10 @@ def test_a_start_that_the_device_can_not_hold_is_refused():
 
 
 class TestReference:
-    @pytest.mark.parametrize(
-        ("stroke", "known", "rule", "hint"),
-        [
-            ("[-9.5, 60.0]", None, "-9.5 to 60 µm", "0.5 µm"),
-            ("[-75.0, 60.0]", (-12.0, 9.75), "-12 to 9.75 µm", "0.25 µm"),
-        ],
-    )
+    @pytest.mark.parametrize(("stroke", "known", "rule", "hint"), [
+        ("[-9.5, 60.0]", None, "-9.5 to 60 µm", "0.5 µm"),
+        ("[-75.0, 60.0]", (-12.0, 9.75), "-12 to 9.75 µm", "0.25 µm"),
+    ])  # fmt: skip
     def test_outside_the_stroke_or_the_model(self, stroke, known, rule, hint):
         """The amount is part of the problem; a reference that just fits passes."""
         settings = ["waveform.soft_start_s=0.0", f"limits.stroke_um={stroke}"]
@@ -166,13 +163,10 @@ class TestCommand:
         assert found.hint.startswith("0.25 A")
         checked(CURRENT, "limits.peak_current_a=6.5")
 
-    @pytest.mark.parametrize(
-        ("setting", "problem"),
-        [
-            ("waveform.offset=-2.0", ("limits.peak_current_a", "-8 to 4 A")),
-            ("limits.slew_a_per_s=4000.0", ("limits.slew_a_per_s", "5000")),  # the first step
-        ],
-    )
+    @pytest.mark.parametrize(("setting", "problem"), [
+        ("waveform.offset=-2.0", ("limits.peak_current_a", "-8 to 4 A")),
+        ("limits.slew_a_per_s=4000.0", ("limits.slew_a_per_s", "5000")),  # the first step
+    ])  # fmt: skip
     def test_lowest_command_and_first_step(self, setting, problem):
         assert told(refusals(CURRENT, setting)) == [problem]
 
@@ -252,35 +246,20 @@ class TestDevice:
     KEPT: ClassVar = {**FIFO, "latency_blocks": 7}
     WIDE: ClassVar = "limits.stroke_um=[-100.0, 100.0]"
 
-    @pytest.mark.parametrize(
-        ("given", "problem", "rule", "allowed"),
-        [
-            (({"command_max": 6.9},), ("limits", "-7 to 7"), "", ({"command_max": 7.0},)),
-            (({"command_min": -6.9},), ("limits", "-7 to 7"), "", ({"command_min": -7.0},)),
-            (({"command_unit": "V"},), ("limits", "A"), "in V", ({},)),
-            (
-                ({"max_rate_hz": 9999.0},),
-                ("sample_rate_hz", "10000.0"),
-                "<= 9999",
-                ({"max_rate_hz": 10_000.0},),
-            ),
-            (({}, "block=2"), ("block", "2"), "", (FIFO, "block=2")),
-            ((FIFO, "block=33"), ("block", "33"), "<= 32", (FIFO, "block=32")),
-            ((KEPT, "block=9"), ("block", "9"), "<= 8", (KEPT, "block=8")),
-            (
-                ({}, "limits.stroke_um=[-100.5, 60.0]"),
-                ("limits.stroke_um", "-100.5 to 60"),
-                "-100 to 100 µm",
-                ({}, WIDE),
-            ),
-            (
-                ({}, "limits.stroke_um=[-75.0, 100.5]"),
-                ("limits.stroke_um", "-75 to 100.5"),
-                "-100 to 100 µm",
-                ({}, WIDE),
-            ),
-        ],
-    )
+    @pytest.mark.parametrize(("given", "problem", "rule", "allowed"), [
+        (({"command_max": 6.9},), ("limits", "-7 to 7"), "", ({"command_max": 7.0},)),
+        (({"command_min": -6.9},), ("limits", "-7 to 7"), "", ({"command_min": -7.0},)),
+        (({"command_unit": "V"},), ("limits", "A"), "in V", ({},)),
+        (({"max_rate_hz": 9999.0},), ("sample_rate_hz", "10000.0"), "<= 9999",
+         ({"max_rate_hz": 10_000.0},)),
+        (({}, "block=2"), ("block", "2"), "", (FIFO, "block=2")),
+        ((FIFO, "block=33"), ("block", "33"), "<= 32", (FIFO, "block=32")),
+        ((KEPT, "block=9"), ("block", "9"), "<= 8", (KEPT, "block=8")),
+        (({}, "limits.stroke_um=[-100.5, 60.0]"), ("limits.stroke_um", "-100.5 to 60"),
+         "-100 to 100 µm", ({}, WIDE)),
+        (({}, "limits.stroke_um=[-75.0, 100.5]"), ("limits.stroke_um", "-75 to 100.5"),
+         "-100 to 100 µm", ({}, WIDE)),
+    ])  # fmt: skip
     def test_beyond_the_device(self, given, problem, rule, allowed):
         info, *settings = given
         (found,) = refusals(CURRENT, *settings, **info)
@@ -311,20 +290,17 @@ class TestAllAtOnce:
 
 
 class TestWatchdog:
-    @pytest.mark.parametrize(
-        ("command", "reason", "safe", "value"),
-        [
-            (0.0, "", 0.0, ""),
-            (1e-10, "", 0.0, ""),
-            (1.5, "", 1.5, ""),
-            (1.5, "holds a load", 0.0, ""),
-            (7.0, "at the limit", 0.0, ""),
-            (-7.0, "at the limit", 0.0, ""),
-            (1.5, "", 0.0, "1.5"),
-            (1e-6, "", 0.0, "1e-06"),
-            (7.5, "holds a load", 0.0, "7.5"),
-        ],
-    )
+    @pytest.mark.parametrize(("command", "reason", "safe", "value"), [
+        (0.0, "", 0.0, ""),
+        (1e-10, "", 0.0, ""),
+        (1.5, "", 1.5, ""),
+        (1.5, "holds a load", 0.0, ""),
+        (7.0, "at the limit", 0.0, ""),
+        (-7.0, "at the limit", 0.0, ""),
+        (1.5, "", 0.0, "1.5"),
+        (1e-6, "", 0.0, "1e-06"),
+        (7.5, "holds a load", 0.0, "7.5"),
+    ])  # fmt: skip
     def test_safe_value_or_a_reason(self, command, reason, safe, value):
         """A value outside the limits is rejected with any reason."""
         watched = {"watchdog_command": command, "watchdog_reason": reason}

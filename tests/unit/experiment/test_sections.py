@@ -80,37 +80,31 @@ def test_texts_and_numbers_stay_what_they_are():
     assert isinstance(kept["count"], int)
 
 
-@pytest.mark.parametrize(
-    ("labels", "rule"),
-    [
-        ({"a": True}, "must be text or a number"),
-        ({"a": None}, "must be text or a number"),
-        ({"a": "x" * (sections.LONGEST_TEXT + 1)}, "must have at most 500 characters"),
-        ({"a b": 1}, "a key must be at most 40 letters"),
-        ({"9a": 1}, "a key must be at most 40 letters"),
-        ({"a" * 41: 1}, "a key must be at most 40 letters"),
-        ({f"a{n}": n for n in range(sections.MOST_LABELS + 1)}, "must be at most 32: there are 33"),
-    ],
-)
+@pytest.mark.parametrize(("labels", "rule"), [
+    ({"a": True}, "must be text or a number"),
+    ({"a": None}, "must be text or a number"),
+    ({"a": "x" * (sections.LONGEST_TEXT + 1)}, "must have at most 500 characters"),
+    ({"a b": 1}, "a key must be at most 40 letters"),
+    ({"9a": 1}, "a key must be at most 40 letters"),
+    ({"a" * 41: 1}, "a key must be at most 40 letters"),
+    ({f"a{n}": n for n in range(sections.MOST_LABELS + 1)}, "must be at most 32: there are 33"),
+])  # fmt: skip
 def test_what_is_no_label_is_refused(labels, rule):
     with pytest.raises(ValidationError, match=rule):
         LABELS.validate_python(labels)
 
 
-@pytest.mark.parametrize(
-    ("text", "value"),
-    [
-        ("sample=A7", "A7"),
-        ("serial=0012", "0012"),  # a number would lose its zeros
-        ("t=-21.5", -21.5),
-        ("n=3", 3),
-        ("x=1e3", 1000.0),
-        ("note=a: [b], \"c\" = 'd' #e", "a: [b], \"c\" = 'd' #e"),
-        ("empty=", ""),
-        ("lines=a\nb\u202e\x1b", "a\nb\u202e\x1b"),
-        ("flag=true", "true"),
-    ],
-)
+@pytest.mark.parametrize(("text", "value"), [
+    ("sample=A7", "A7"),
+    ("serial=0012", "0012"),  # a number would lose its zeros
+    ("t=-21.5", -21.5),
+    ("n=3", 3),
+    ("x=1e3", 1000.0),
+    ("note=a: [b], \"c\" = 'd' #e", "a: [b], \"c\" = 'd' #e"),
+    ("empty=", ""),
+    ("lines=a\nb\u202e\x1b", "a\nb\u202e\x1b"),
+    ("flag=true", "true"),
+])  # fmt: skip
 def test_a_label_of_the_command_line_stands_as_it_was_typed(text, value):
     labels = load_experiment(DEMO, sections.label_settings([text])).config.labels
     assert labels == {text.partition("=")[0]: value}

@@ -18,17 +18,14 @@ def written(tmp_path, name, settings=(), **more):
     return check(load_experiment(path)), info, text
 
 
-@pytest.mark.parametrize(
-    ("name", "more"),
-    [
-        ("simulated_terfenol", {}),
-        ("simulated_piezo", {}),
-        ("labjack_t7", {}),
-        ("cobs_board_fifo", {}),
-        ("kepco_bop", {"reader": "agilent_34970a"}),
-        ("wago_750", {"unit": "V"}),
-    ],
-)
+@pytest.mark.parametrize(("name", "more"), [
+    ("simulated_terfenol", {}),
+    ("simulated_piezo", {}),
+    ("labjack_t7", {}),
+    ("cobs_board_fifo", {}),
+    ("kepco_bop", {"reader": "agilent_34970a"}),
+    ("wago_750", {"unit": "V"}),
+])  # fmt: skip
 def test_it_may_start_and_is_small(tmp_path, name, more):
     checked, info, _ = written(tmp_path, name, **more)
     low, high = checked.loaded.config.limits.command_range
@@ -78,14 +75,11 @@ def test_all_broken_settings_are_told_at_once(tmp_path):
     assert len(error.value.problems) == 2
 
 
-@pytest.mark.parametrize(
-    ("name", "said"),
-    [
-        ("labjack_t77", "did you mean 'labjack_t7'"),
-        ("modbus_dac", "takes a profile"),
-        ("absent.yaml", "absent.yaml"),
-    ],
-)
+@pytest.mark.parametrize(("name", "said"), [
+    ("labjack_t77", "did you mean 'labjack_t7'"),
+    ("modbus_dac", "takes a profile"),
+    ("absent.yaml", "absent.yaml"),
+])  # fmt: skip
 def test_what_can_not_be_started_says_what_can(tmp_path, name, said):
     with pytest.raises(InputError, match=said):
         starting_device(name, tmp_path)

@@ -83,13 +83,10 @@ def test_a_model_of_its_own_kind_is_found_again(data_of, fit, truth, peak_percen
     assert np.max(np.abs(back - y)[400:]) <= 1e-3 * data.stroke_um
 
 
-@pytest.mark.parametrize(
-    "fit",
-    [
-        *(fit_straight, fit_preisach, fit_kp, fit_bouc_wen, fit_duhem, fit_asymmetric),
-        pytest.param(fit_generalised, marks=SLOW),
-    ],
-)
+@pytest.mark.parametrize("fit", [
+    *(fit_straight, fit_preisach, fit_kp, fit_bouc_wen, fit_duhem, fit_asymmetric),
+    pytest.param(fit_generalised, marks=SLOW),
+])  # fmt: skip
 def test_commands_may_all_lie_on_one_side(fit):
     """A drive of 10 to 90 V, as a piezo stage has it, is no special case."""
     angle = 2.0 * np.pi * np.arange(300) / 300

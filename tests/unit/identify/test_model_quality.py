@@ -55,15 +55,12 @@ def dead(y):
     return np.random.default_rng(y.size).normal(0.0, 0.05, y.size)
 
 
-@pytest.mark.parametrize(
-    ("change", "reason"),
-    [
-        (dead, "explains 0 %"),
-        (lambda y: 1000.0 * y, "in nm"),
-        (lambda y: -y, "swap the wires"),
-        (np.abs, "--model butterfly"),
-    ],
-)
+@pytest.mark.parametrize(("change", "reason"), [
+    (dead, "explains 0 %"),
+    (lambda y: 1000.0 * y, "in nm"),
+    (lambda y: -y, "swap the wires"),
+    (np.abs, "--model butterfly"),
+])  # fmt: skip
 def test_data_that_are_no_actuator_s_are_refused_with_the_reason(grid, change, reason):
     verdict = judged(changed(grid, change)).verdict
     assert verdict.grade == "not a model"
@@ -116,15 +113,12 @@ def test_the_figures_are_plain_values(grid):
     assert mapping["text"].startswith("fit error")
 
 
-@pytest.mark.parametrize(
-    ("command", "one_amplitude", "one_frequency"),
-    [
-        (lambda t: np.sin(20.0 * np.pi * t), True, True),
-        (lambda t: np.sin(20.0 * np.pi * t) * (1.0 + t), False, True),
-        (lambda t: np.sin(20.0 * np.pi * t * (1.0 + t)), True, False),
-        (lambda t: np.sin(20.0 * np.pi * t) + 0.5 * np.sin(47.0 * np.pi * t), False, False),
-    ],
-)
+@pytest.mark.parametrize(("command", "one_amplitude", "one_frequency"), [
+    (lambda t: np.sin(20.0 * np.pi * t), True, True),
+    (lambda t: np.sin(20.0 * np.pi * t) * (1.0 + t), False, True),
+    (lambda t: np.sin(20.0 * np.pi * t * (1.0 + t)), True, False),
+    (lambda t: np.sin(20.0 * np.pi * t) + 0.5 * np.sin(47.0 * np.pi * t), False, False),
+])  # fmt: skip
 def test_a_history_of_one_amplitude_or_frequency_tells_nothing_of_others(
     command, one_amplitude, one_frequency
 ):

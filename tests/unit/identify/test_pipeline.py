@@ -173,14 +173,11 @@ def test_modes_are_kept_for_as_long_as_data_held_out_are_the_better(asked):
     assert asked == [(0, 2000.0), (1, 2200.0)]
 
 
-@pytest.mark.parametrize(
-    ("models", "modes", "rms_percent"),
-    [
-        ([Found(1.0, 1.0), Found(0.1, WORTH)], 0, 1.0),  # it helps only what was fitted
-        ([Found(1.0), Found(0.5), Found(0.46)], 1, 0.5),  # nothing was held out
-        ([Found(0.5**k) for k in range(20)], TURNS, 0.5**TURNS),
-    ],
-)
+@pytest.mark.parametrize(("models", "modes", "rms_percent"), [
+    ([Found(1.0, 1.0), Found(0.1, WORTH)], 0, 1.0),  # it helps only what was fitted
+    ([Found(1.0), Found(0.5), Found(0.46)], 1, 0.5),  # nothing was held out
+    ([Found(0.5**k) for k in range(20)], TURNS, 0.5**TURNS),
+])  # fmt: skip
 def test_modes_that_improve_little_are_left_out(asked, models, modes, rms_percent):
     found = with_modes([RECORD], identifying(*models))
     assert (found.modes, found.rms_percent) == ((MODE,) * modes, rms_percent)
@@ -198,14 +195,11 @@ def test_a_model_without_a_structure_has_no_first_mode(asked):
     assert asked == [(0, None)]
 
 
-@pytest.mark.parametrize(
-    ("records", "settings"),
-    [
-        ([RECORD], FitSettings(kind="field", modes=False)),
-        ([RECORD], FitSettings(kind="ppi")),
-        ([RECORD, SteadyLoop("l", TIME, TIME, 10.0)], FIELD),
-    ],
-)
+@pytest.mark.parametrize(("records", "settings"), [
+    ([RECORD], FitSettings(kind="field", modes=False)),
+    ([RECORD], FitSettings(kind="ppi")),
+    ([RECORD, SteadyLoop("l", TIME, TIME, 10.0)], FIELD),
+])  # fmt: skip
 def test_nothing_is_looked_for_where_it_is_not_asked_for_or_can_not_be(records, settings, asked):
     assert with_modes(records, identifying(Found(1.0, settings=settings))).modes == ()
     assert not asked

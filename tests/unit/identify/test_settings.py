@@ -42,20 +42,17 @@ def test_staged_models_have_their_stages_unless_left_out():
     assert less.changes() == "lag=none, structure=false, delay=false"
 
 
-@pytest.mark.parametrize(
-    ("choices", "reason"),
-    [
-        ({"kind": "integrated", "lag": "plain"}, "not of integrated"),
-        ({"kind": "ppi", "deadbands": 8}, "not of ppi"),
-        ({"kind": "integrated", "deadbands": 0}, "greater than or equal to 1"),
-        ({"kind": "staged", "weights": "exponential"}, "not of staged"),
-        ({"kind": "staged", "creep": True}, "not of staged"),
-        ({"kind": "staged", "hysteresis": "preisach", "lag": "none"}, "needs a lag"),
-        ({"kind": "ppi", "peak_goal_percent": -1.0}, "greater than 0"),
-        ({"kind": "integrated", "plays": "auto", "deadbands": 4}, "deadbands"),
-        ({"kind": "kp", "plays": "auto"}, "not of kp"),
-    ],
-)
+@pytest.mark.parametrize(("choices", "reason"), [
+    ({"kind": "integrated", "lag": "plain"}, "not of integrated"),
+    ({"kind": "ppi", "deadbands": 8}, "not of ppi"),
+    ({"kind": "integrated", "deadbands": 0}, "greater than or equal to 1"),
+    ({"kind": "staged", "weights": "exponential"}, "not of staged"),
+    ({"kind": "staged", "creep": True}, "not of staged"),
+    ({"kind": "staged", "hysteresis": "preisach", "lag": "none"}, "needs a lag"),
+    ({"kind": "ppi", "peak_goal_percent": -1.0}, "greater than 0"),
+    ({"kind": "integrated", "plays": "auto", "deadbands": 4}, "deadbands"),
+    ({"kind": "kp", "plays": "auto"}, "not of kp"),
+])  # fmt: skip
 def test_impossible_choices_are_refused(choices, reason):
     with pytest.raises(ValidationError, match=reason):
         FitSettings(**choices)

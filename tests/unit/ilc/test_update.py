@@ -62,19 +62,13 @@ def peaks(state: IlcState) -> list[float]:
     return [trial.error.peak_um for trial in state.trials]
 
 
-@pytest.mark.parametrize(
-    "response",
-    [
-        pytest.param(Response(), id="exact", marks=pytest.mark.slow),
-        pytest.param(Response(0.8, 5.0 / RATE_HZ), id="late", marks=pytest.mark.slow),
-        pytest.param(RESONANT, id="resonant"),
-        pytest.param(
-            Response(1.1, 3.0 / RATE_HZ, 1.0 / (2.0 * np.pi * 480.0) ** 2, 0.12),
-            id="loaded",
-            marks=pytest.mark.slow,
-        ),
-    ],
-)
+@pytest.mark.parametrize("response", [
+    pytest.param(Response(), id="exact", marks=pytest.mark.slow),
+    pytest.param(Response(0.8, 5.0 / RATE_HZ), id="late", marks=pytest.mark.slow),
+    pytest.param(RESONANT, id="resonant"),
+    pytest.param(Response(1.1, 3.0 / RATE_HZ, 1.0 / (2.0 * np.pi * 480.0) ** 2, 0.12), id="loaded",
+        marks=pytest.mark.slow),
+])  # fmt: skip
 @pytest.mark.parametrize(
     "coupling", [pytest.param(0.0, marks=[pytest.mark.slow, pytest.mark.long]), 0.15]
 )

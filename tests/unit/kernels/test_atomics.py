@@ -39,13 +39,10 @@ def test_a_mapping_that_cannot_be_written_is_refused(page):
         publish(page[1], 7, 1)
 
 
-@pytest.mark.parametrize(
-    ("kernel", "operations"),
-    [
-        (publish, [("store atomic", "release"), ("fence", "seq_cst")]),
-        (observe, [("fence", "acquire"), ("load atomic", "acquire")]),
-    ],
-)
+@pytest.mark.parametrize(("kernel", "operations"), [
+    (publish, [("store atomic", "release"), ("fence", "seq_cst")]),
+    (observe, [("fence", "acquire"), ("load atomic", "acquire")]),
+])  # fmt: skip
 def test_what_the_processor_is_asked_for(kernel, operations):
     compiled = numba.njit(SIGNATURES[kernel], error_model="numpy")(kernel.py_func)
     (text,) = compiled.inspect_llvm().values()

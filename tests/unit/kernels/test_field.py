@@ -157,18 +157,15 @@ def test_a_drag_goes_on_above_its_cell_and_waits_after_a_turn():
 
 
 @pytest.mark.parametrize("length", [0.3, 2.0])
-@pytest.mark.parametrize(
-    ("held", "last", "u"),
-    [
-        (0.2, 1.4, 2.1),
-        (0.2, 0.0, 5.0),
-        (1.3, 1.1, 2.9),
-        (0.9, 2.5, 0.4),
-        (1.5, 6.0, -3.0),
-        (0.4, 2.2, 1.7),
-        (0.7, -3.0, 0.9),
-    ],
-)
+@pytest.mark.parametrize(("held", "last", "u"), [
+    (0.2, 1.4, 2.1),
+    (0.2, 0.0, 5.0),
+    (1.3, 1.1, 2.9),
+    (0.9, 2.5, 0.4),
+    (1.5, 6.0, -3.0),
+    (0.4, 2.2, 1.7),
+    (0.7, -3.0, 0.9),
+])  # fmt: skip
 def test_a_drag_is_its_differential_equation(held, last, u, length):
     """ds/d|u| = (s_u - s) / k where that is the way u goes, else 0; here in steps of 1e-3."""
     low, width, count = 1.0, 1.5, round(abs(u - last) / 1e-3)

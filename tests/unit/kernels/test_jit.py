@@ -159,16 +159,12 @@ def test_compiled_with_a_full_disk(cache, monkeypatch):
 
 
 @pytest.mark.parametrize("suffix", ["nbi", "nbc"])
-@pytest.mark.parametrize(
-    "damage",
-    [
-        lambda whole: b"",
-        lambda whole: whole[: len(whole) // 2],
-        lambda whole: bytes(len(whole)),
-        lambda whole: np.random.default_rng(4).bytes(len(whole)),
-    ],
-    ids=["emptied", "halved", "zeroed", "random"],
-)
+@pytest.mark.parametrize("damage", [
+    lambda whole: b"",
+    lambda whole: whole[: len(whole) // 2],
+    lambda whole: bytes(len(whole)),
+    lambda whole: np.random.default_rng(4).bytes(len(whole)),
+], ids=["emptied", "halved", "zeroed", "random"])  # fmt: skip
 def test_damaged_cache_file_is_replaced(cache, suffix, damage):
     stats_of_first_call()
     (file,) = cache.rglob(f"*.{suffix}")

@@ -341,19 +341,16 @@ def blocks_with(feedback, noise):
 
 
 class TestFrozen:
-    @pytest.mark.parametrize(
-        "flag",
-        [
-            Flag.RAMP,
-            Flag.SENSOR_INVALID,
-            Flag.UNANSWERED,
-            Flag.AFTER_SKIPPED,
-            Flag.INVALID,
-            Flag.INVERSE_OUT,
-            64,
-            512,
-        ],
-    )
+    @pytest.mark.parametrize("flag", [
+        Flag.RAMP,
+        Flag.SENSOR_INVALID,
+        Flag.UNANSWERED,
+        Flag.AFTER_SKIPPED,
+        Flag.INVALID,
+        Flag.INVERSE_OUT,
+        64,
+        512,
+    ])  # fmt: skip
     def test_ramps_gaps_and_interlocks(self, flag):
         feedback = integral()
         assert blocks(feedback, 20, offset_um=3.0, flags=int(flag)).tolist() == [0.0] * 20 * BLOCK

@@ -43,15 +43,12 @@ def trips(limits, n, **columns):
     return trip, bench
 
 
-@pytest.mark.parametrize(
-    "columns",
-    [
-        {"command": 2.0},
-        {"command": 2.0, "measured": 1e9},
-        {"command": 1e6},
-        {"reference": 1e9, "displacement": 1.0},
-    ],
-)
+@pytest.mark.parametrize("columns", [
+    {"command": 2.0},
+    {"command": 2.0, "measured": 1e9},
+    {"command": 1e6},
+    {"reference": 1e9, "displacement": 1.0},
+])  # fmt: skip
 def test_interlocks_are_off_without_a_limit(columns):
     assert trips(STROKE, 1000, **columns)[0] is None
 
@@ -364,14 +361,11 @@ class TestGaps:
         trip = bench.feed(100, first=2041, command=3.0)
         assert trip.sample - 2041 == trips(THERMAL, 100, command=3.0)[0].sample
 
-    @pytest.mark.parametrize(
-        ("limits", "columns"),
-        [
-            (FROZEN, {"command": np.full(100, 9.0)}),
-            (DEVIATION, {"command": np.zeros(100), "measured": np.full(100, 9.0)}),
-            (TRACKING, {"reference": np.full(100, 9.0)}),
-        ],
-    )
+    @pytest.mark.parametrize(("limits", "columns"), [
+        (FROZEN, {"command": np.full(100, 9.0)}),
+        (DEVIATION, {"command": np.zeros(100), "measured": np.full(100, 9.0)}),
+        (TRACKING, {"reference": np.full(100, 9.0)}),
+    ])  # fmt: skip
     def test_conditions_last_over_a_gap(self, limits, columns):
         bench = Fed(limits)
         bench.feed(1, command=0.0, measured=0.0)
@@ -405,14 +399,11 @@ class TestTimes:
         assert warming(3600.0, 200e3) == pytest.approx(1.0 / (3600.0 * 200e3), rel=1e-8)
 
 
-@pytest.mark.parametrize(
-    ("field", "value", "text"),
-    [
-        ("frozen_travel", 0.0, "frozen_travel must be > 0: 0.0"),
-        ("stroke_um", (1.0, 1.0), "stroke_um must be lowest and highest: 1.0, 1.0"),
-        ("sensor_um", (2.0, 1.0), "sensor_um must be lowest and highest: 2.0, 1.0"),
-    ],
-)
+@pytest.mark.parametrize(("field", "value", "text"), [
+    ("frozen_travel", 0.0, "frozen_travel must be > 0: 0.0"),
+    ("stroke_um", (1.0, 1.0), "stroke_um must be lowest and highest: 1.0, 1.0"),
+    ("sensor_um", (2.0, 1.0), "sensor_um must be lowest and highest: 2.0, 1.0"),
+])  # fmt: skip
 def test_rig_that_means_nothing_is_refused(field, value, text):
     with pytest.raises(InputError) as caught:
         replace(STROKE, **{field: value}).made(RATE_HZ)

@@ -122,16 +122,13 @@ def test_a_block_of_no_samples_changes_nothing():
 FIELDS = {"low": -2.0, "high": 3.0, "slew_per_s": 100.0, "safe": 0.5, "ramp_per_s": 50.0}
 
 
-@pytest.mark.parametrize(
-    ("rule", "key", "values"),
-    [
-        ("finite and rising", "low", [4.0, 3.0, -np.inf, np.nan]),
-        ("finite and rising", "high", [np.inf]),
-        ("safe value", "safe", [3.1, -2.1, np.nan]),
-        ("slew limit", "ramp_per_s", [0.0, 101.0]),
-        ("slew limit", "slew_per_s", [np.inf]),
-    ],
-)
+@pytest.mark.parametrize(("rule", "key", "values"), [
+    ("finite and rising", "low", [4.0, 3.0, -np.inf, np.nan]),
+    ("finite and rising", "high", [np.inf]),
+    ("safe value", "safe", [3.1, -2.1, np.nan]),
+    ("slew limit", "ramp_per_s", [0.0, 101.0]),
+    ("slew limit", "slew_per_s", [np.inf]),
+])  # fmt: skip
 def test_limits_that_mean_nothing_are_refused(rule, key, values):
     """The error names the values that break the rule."""
     for value in values:

@@ -165,15 +165,12 @@ class TestMisses:
         assert bool(self.stalled(stalls, ticks=10, grace_ticks=grace_ticks)[0]) == ends
 
 
-@pytest.mark.parametrize(
-    ("skipped", "due", "text"),
-    [
-        (0, 3003, ""),
-        (30, 3000, "deadline misses 30 of 3000 (1 %)"),
-        (944, 3003, "deadline misses 944 of 3003 (31 %): timing not kept"),
-        (3, 0, "deadline misses 3 of 0 (3e+02 %): timing not kept"),
-    ],
-)
+@pytest.mark.parametrize(("skipped", "due", "text"), [
+    (0, 3003, ""),
+    (30, 3000, "deadline misses 30 of 3000 (1 %)"),
+    (944, 3003, "deadline misses 944 of 3003 (31 %): timing not kept"),
+    (3, 0, "deadline misses 3 of 0 (3e+02 %): timing not kept"),
+])  # fmt: skip
 def test_misses_in_words(skipped, due, text):
     assert deadline_misses(skipped, due, 0.01) == text
 

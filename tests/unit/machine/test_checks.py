@@ -137,13 +137,10 @@ def test_what_a_check_finds(make_machine, check, files, level, said, remedy):
     assert bool(found.remedy) == (level != "ok")
 
 
-@pytest.mark.parametrize(
-    ("check", "path", "level", "remedy"),
-    [
-        (checks.dma_latency, "/dev/cpu_dma_latency", "warn", "udev"),
-        (checks.serial_ports, "/dev/ttyUSB0", "bad", "usermod"),
-    ],
-)
+@pytest.mark.parametrize(("check", "path", "level", "remedy"), [
+    (checks.dma_latency, "/dev/cpu_dma_latency", "warn", "udev"),
+    (checks.serial_ports, "/dev/ttyUSB0", "bad", "usermod"),
+])  # fmt: skip
 def test_a_device_file_without_permission_is_named(make_machine, check, path, level, remedy):
     assert check(make_machine()).level == "ok"
     found = check(make_machine(closed=(path,)))
@@ -183,24 +180,21 @@ def login(monkeypatch):
     monkeypatch.setattr(pwd, "getpwuid", lambda _: SimpleNamespace(pw_name="lab"))
 
 
-@pytest.mark.parametrize(
-    ("files", "level"),
-    [
-        ({}, "warn"),
-        ({CONF: "[Login]\n#RemoveIPC=no\n"}, "warn"),
-        ({CONF: "[Login]\nRemoveIPC=no"}, "ok"),
-        ({CONF: "[Login]\n RemoveIPC = false \nKillUserProcesses=no"}, "ok"),
-        ({CONF: "RemoveIPC=no", f"{CONF}.d/z.conf": "RemoveIPC=yes"}, "warn"),
-        ({"/usr/lib/systemd/logind.conf.d/a.conf": "RemoveIPC=no"}, "ok"),
-        ({"/usr/lib/systemd/logind.conf.d/a.conf": "RemoveIPC=no", f"{CONF}.d/a.conf": ""}, "warn"),
-        ({"/var/lib/systemd/linger/lab": ""}, "ok"),
-        ({"/var/lib/systemd/linger/other": ""}, "warn"),
-        ({CONF: "RemoveIPC=no\nKillUserProcesses=yes"}, "warn"),
-        ({"/proc/self/status": "Uid:\t0\t0\t0\t0"}, "ok"),
-        ({"/proc/self/status": "Uid:\t998\t998\t998\t998"}, "ok"),
-        ({"/run/systemd/system/x": None}, "ok"),
-    ],
-)
+@pytest.mark.parametrize(("files", "level"), [
+    ({}, "warn"),
+    ({CONF: "[Login]\n#RemoveIPC=no\n"}, "warn"),
+    ({CONF: "[Login]\nRemoveIPC=no"}, "ok"),
+    ({CONF: "[Login]\n RemoveIPC = false \nKillUserProcesses=no"}, "ok"),
+    ({CONF: "RemoveIPC=no", f"{CONF}.d/z.conf": "RemoveIPC=yes"}, "warn"),
+    ({"/usr/lib/systemd/logind.conf.d/a.conf": "RemoveIPC=no"}, "ok"),
+    ({"/usr/lib/systemd/logind.conf.d/a.conf": "RemoveIPC=no", f"{CONF}.d/a.conf": ""}, "warn"),
+    ({"/var/lib/systemd/linger/lab": ""}, "ok"),
+    ({"/var/lib/systemd/linger/other": ""}, "warn"),
+    ({CONF: "RemoveIPC=no\nKillUserProcesses=yes"}, "warn"),
+    ({"/proc/self/status": "Uid:\t0\t0\t0\t0"}, "ok"),
+    ({"/proc/self/status": "Uid:\t998\t998\t998\t998"}, "ok"),
+    ({"/run/systemd/system/x": None}, "ok"),
+])  # fmt: skip
 def test_what_logind_is_set_to(make_machine, login, files, level):
     found = checks.log_out(make_machine({**SYSTEMD, **files}))
     assert found.level == level

@@ -94,16 +94,13 @@ def test_every_step_is_taken_in_order():
     ]
 
 
-@pytest.mark.parametrize(
-    ("refused", "name", "remedy"),
-    [
-        ("lock_memory", "memory", "memlock"),
-        ("set_timer_slack", "timer_slack", ""),
-        ("hold_dma_latency", "dma_latency", "udev"),
-        ("pin", "cpu", "realtime.cpu"),
-        ("set_fifo", "fifo", "rtprio"),
-    ],
-)
+@pytest.mark.parametrize(("refused", "name", "remedy"), [
+    ("lock_memory", "memory", "memlock"),
+    ("set_timer_slack", "timer_slack", ""),
+    ("hold_dma_latency", "dma_latency", "udev"),
+    ("pin", "cpu", "realtime.cpu"),
+    ("set_fifo", "fifo", "rtprio"),
+])  # fmt: skip
 def test_a_refusal_has_a_remedy_and_stops_no_other_step(refused, name, remedy):
     steps = by_name(prepare(Realtime(cpu=0), FakeSystem(refuses={refused})))
     assert steps[name].outcome == "refused"
@@ -150,20 +147,12 @@ def test_a_control_group_without_share_is_named():
     assert "cpu.rt_runtime_us" in by_name(prepare(Realtime(), system))["fifo"].remedy
 
 
-@pytest.mark.parametrize(
-    ("files", "share"),
-    [
-        ({}, None),
-        ({"/proc/self/cgroup": "0::/user.slice\n"}, None),
-        (
-            {
-                "/proc/self/cgroup": "4:cpu,cpuacct:/\n",
-                "/sys/fs/cgroup/cpu,cpuacct/cpu.rt_runtime_us": "950000\n",
-            },
-            950000,
-        ),
-    ],
-)
+@pytest.mark.parametrize(("files", "share"), [
+    ({}, None),
+    ({"/proc/self/cgroup": "0::/user.slice\n"}, None),
+    ({"/proc/self/cgroup": "4:cpu,cpuacct:/\n",
+     "/sys/fs/cgroup/cpu,cpuacct/cpu.rt_runtime_us": "950000\n", }, 950000),
+])  # fmt: skip
 def test_share_of_the_control_group(files, share):
     assert rt_group_runtime_us(FakeSystem(files=files).read) == share
 

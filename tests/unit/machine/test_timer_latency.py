@@ -22,16 +22,13 @@ def latency(late_ns, rate_hz=1000.0):
     return Latency(rate_hz, np.array(late_ns, dtype=np.int64), STEPS)
 
 
-@pytest.mark.parametrize(
-    ("late_ns", "longest_ns", "kept"),
-    [
-        ([0, 0, 0], 1 * MS, True),
-        ([0, 1 * MS, 0], 2 * MS, True),
-        ([0, 1 * MS + 1, 0], 2 * MS + 1, False),
-        ([5 * MS, 5 * MS, 5 * MS], 1 * MS, True),
-        ([3 * MS, 0, 0], 1 * MS, True),
-    ],
-)
+@pytest.mark.parametrize(("late_ns", "longest_ns", "kept"), [
+    ([0, 0, 0], 1 * MS, True),
+    ([0, 1 * MS, 0], 2 * MS, True),
+    ([0, 1 * MS + 1, 0], 2 * MS + 1, False),
+    ([5 * MS, 5 * MS, 5 * MS], 1 * MS, True),
+    ([3 * MS, 0, 0], 1 * MS, True),
+])  # fmt: skip
 def test_no_period_may_be_over_twice_the_nominal_one(late_ns, longest_ns, kept):
     found = latency(late_ns)
     assert found.longest_period_ns == longest_ns
@@ -61,13 +58,10 @@ def test_every_wake_up_is_counted_once():
     assert lateness_counts(late_ns[:0]) == {}
 
 
-@pytest.mark.parametrize(
-    ("policy", "expected"),
-    [
-        ("catch_up", [10, 2_500_000, 1_500_010, 500_020, 10]),
-        ("skip", [10, 2_500_000, 10, 10, 10]),  # a stall counts once, as with cyclictest
-    ],
-)
+@pytest.mark.parametrize(("policy", "expected"), [
+    ("catch_up", [10, 2_500_000, 1_500_010, 500_020, 10]),
+    ("skip", [10, 2_500_000, 10, 10, 10]),  # a stall counts once, as with cyclictest
+])  # fmt: skip
 def test_lateness_is_the_pacers(policy, expected):
     wanted = [10, 2_500_000, 10, 10, 10]
     clock, late_ns = FakeClock(stall_ns=dict(enumerate(wanted))), np.zeros(5, dtype=np.int64)

@@ -69,19 +69,16 @@ def test_a_loop_is_the_narrower_the_slower_it_is():
     assert width_um(200.0) > 1.5 * width_um(5.0)
 
 
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"thresholds": (1.0, 2.0)}, "first threshold must be 0"),
-        ({"thresholds": (0.0, 0.0)}, "thresholds must rise"),
-        ({"lengths": (0.0,)}, "lengths must be > 0"),
-        ({"lengths": ()}, "per threshold and per length"),
-        ({"cell": 0.0}, "cell must be > 0"),
-        ({"slopes": ((1.0, 0.0), (1.0, 1.0), (1.0, 1.0))}, "first line must be > 0"),
-        ({"slopes": ((1.0, 1.0), (-1.0, 1.0), (1.0, 1.0))}, "slopes must be >= 0"),
-        ({"slopes": ((1.0, 1.0), (1.0,), (1.0, 1.0))}, "the same cells"),
-    ],
-)
+@pytest.mark.parametrize(("changes", "words"), [
+    ({"thresholds": (1.0, 2.0)}, "first threshold must be 0"),
+    ({"thresholds": (0.0, 0.0)}, "thresholds must rise"),
+    ({"lengths": (0.0,)}, "lengths must be > 0"),
+    ({"lengths": ()}, "per threshold and per length"),
+    ({"cell": 0.0}, "cell must be > 0"),
+    ({"slopes": ((1.0, 0.0), (1.0, 1.0), (1.0, 1.0))}, "first line must be > 0"),
+    ({"slopes": ((1.0, 1.0), (-1.0, 1.0), (1.0, 1.0))}, "slopes must be >= 0"),
+    ({"slopes": ((1.0, 1.0), (1.0,), (1.0, 1.0))}, "the same cells"),
+])  # fmt: skip
 def test_conditions(changes, words):
     with pytest.raises(ValidationError, match=words):
         field_model(**changes)

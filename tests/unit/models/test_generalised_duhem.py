@@ -120,20 +120,17 @@ def test_between_stages_and_through_a_file(model):
 ROWS = ((1.0, 2.0),) * 5
 
 
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"cell_um": 0.0}, "cell_um must be > 0"),
-        ({"centre": (-6.5, -2.4, -2.4, 1.9, 5.4)}, "centre must rise"),
-        ({"flux": (-6.5, -2.4, -2.4, 1.9, 5.4)}, "flux must rise"),
-        ({"flux": (-6.5, 5.4)}, "flux needs as many values"),
-        ({"rising": ROWS[:4], "falling": ROWS}, "rising needs a row for each value of centre"),
-        ({"rising": ROWS, "falling": ((1.0, 2.0, 3.0),) * 5}, "all of one length"),
-        ({"rising": ((1.0, 0.0),) * 5, "falling": ROWS}, "rising must be > 0"),
-        ({"rising": ROWS, "falling": ((1.0, -1.0),) * 5}, "falling must be > 0"),
-        ({"half_width": 0.1}, "half_width must be at least"),
-    ],
-)
+@pytest.mark.parametrize(("changes", "words"), [
+    ({"cell_um": 0.0}, "cell_um must be > 0"),
+    ({"centre": (-6.5, -2.4, -2.4, 1.9, 5.4)}, "centre must rise"),
+    ({"flux": (-6.5, -2.4, -2.4, 1.9, 5.4)}, "flux must rise"),
+    ({"flux": (-6.5, 5.4)}, "flux needs as many values"),
+    ({"rising": ROWS[:4], "falling": ROWS}, "rising needs a row for each value of centre"),
+    ({"rising": ROWS, "falling": ((1.0, 2.0, 3.0),) * 5}, "all of one length"),
+    ({"rising": ((1.0, 0.0),) * 5, "falling": ROWS}, "rising must be > 0"),
+    ({"rising": ROWS, "falling": ((1.0, -1.0),) * 5}, "falling must be > 0"),
+    ({"half_width": 0.1}, "half_width must be at least"),
+])  # fmt: skip
 def test_conditions(changes, words):
     with pytest.raises(ValidationError, match=words):
         duhem_model(**changes)

@@ -27,18 +27,15 @@ def block_message(**fields):
     return block
 
 
-@pytest.mark.parametrize(
-    "fields",
-    [
-        {},
-        {"flags": [0, 127, 128]},
-        {"flags": [2**32 - 1, 2**17, 3]},
-        {"flags": []},
-        {"tick0": 0, "dropped": 2**40},
-        {"tick0": 2**62, "state": [1.0, 2.0], "previous_command": [0.5]},
-        {"measured_a": [], "input_um": [1.0]},
-    ],
-)
+@pytest.mark.parametrize("fields", [
+    {},
+    {"flags": [0, 127, 128]},
+    {"flags": [2**32 - 1, 2**17, 3]},
+    {"flags": []},
+    {"tick0": 0, "dropped": 2**40},
+    {"tick0": 2**62, "state": [1.0, 2.0], "previous_command": [0.5]},
+    {"measured_a": [], "input_um": [1.0]},
+])  # fmt: skip
 def test_a_block_is_that_of_the_published_descriptor(fields):
     message = block_message(**fields)
     data = message.SerializeToString()

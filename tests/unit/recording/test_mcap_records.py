@@ -51,15 +51,12 @@ def test_unknown_compression_gives_nothing():
     assert inflate("brotli", b"abc", 10, ReadBudget(3)) == b""
 
 
-@pytest.mark.parametrize(
-    ("count", "within", "beyond"),
-    [
-        ("read", 50 * 10**6, 200 * 10**6),
-        ("expand", 50 * 10**6, 200 * 10**6),
-        ("keep", 50 * 10**6, 200 * 10**6),
-        ("message", 100_000, 100_000),
-    ],
-)
+@pytest.mark.parametrize(("count", "within", "beyond"), [
+    ("read", 50 * 10**6, 200 * 10**6),
+    ("expand", 50 * 10**6, 200 * 10**6),
+    ("keep", 50 * 10**6, 200 * 10**6),
+    ("message", 100_000, 100_000),
+])  # fmt: skip
 def test_work_and_memory_are_bounded_by_the_size(count, within, beyond):
     budget = ReadBudget(10**6)
     getattr(budget, count)(within)

@@ -405,14 +405,11 @@ def test_a_survey_counts_what_is_whole(torn):
 FAULT = {"code": "fault", "reason": "x"}
 
 
-@pytest.mark.parametrize(
-    ("finish", "missing", "code", "words"),
-    [
-        ({}, 0, "recovered", "last unflushed interval"),
-        ({"end": FAULT, "ended_at": 450}, 50, "fault", "50 samples known"),
-        ({"ended_at": 400}, 0, "recovered", "no sample is lost"),
-    ],
-)
+@pytest.mark.parametrize(("finish", "missing", "code", "words"), [
+    ({}, 0, "recovered", "last unflushed interval"),
+    ({"end": FAULT, "ended_at": 450}, 50, "fault", "50 samples known"),
+    ({"ended_at": 400}, 0, "recovered", "no sample is lost"),
+])  # fmt: skip
 def test_what_is_missing_or_not_known_is_said(torn, finish, missing, code, words):
     saved, reason, end = resaved(Survey(torn), **finish)
     assert words in reason

@@ -43,20 +43,14 @@ def test_what_is_no_mcap_file_holds_nothing():
     assert records == []
 
 
-@pytest.mark.parametrize(
-    ("damages", "text"),
-    [
-        ([], "its end and index are missing"),
-        ([Damage(9, 5, "index")], "its index is damaged or cut"),
-        ([Damage(9, 5, "damaged record")], "damaged record at byte 9 (5 bytes)"),
-        (
-            [Damage(9, 5, "damaged chunk", 3)] * 4,
-            "damaged chunk at byte 9 (5 bytes, 3 messages of it saved without a checksum), "
-            "damaged chunk at byte 9 (5 bytes, 3 messages of it saved without a checksum) "
-            "and 2 more",
-        ),
-    ],
-)
+@pytest.mark.parametrize(("damages", "text"), [
+    ([], "its end and index are missing"),
+    ([Damage(9, 5, "index")], "its index is damaged or cut"),
+    ([Damage(9, 5, "damaged record")], "damaged record at byte 9 (5 bytes)"),
+    ([Damage(9, 5, "damaged chunk", 3)] * 4,
+     "damaged chunk at byte 9 (5 bytes, 3 messages of it saved without a checksum), "
+     "damaged chunk at byte 9 (5 bytes, 3 messages of it saved without a checksum) " "and 2 more"),
+])  # fmt: skip
 def test_damages_are_described_in_one_line(damages, text):
     scan = RecoveryScan(io.BytesIO(b""))
     scan.damages = damages

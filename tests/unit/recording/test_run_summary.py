@@ -112,15 +112,12 @@ def test_no_flipped_bit_leaves_wrong_facts(tmp_path, make):
     assert states == {"finished", "damaged", "unfinished"}
 
 
-@pytest.mark.parametrize(
-    ("content", "problem"),
-    [
-        (b"", "is not an MCAP file"),
-        (b"hello", "is not an MCAP file"),
-        (ONE.read_bytes()[:30], "holds no run of hilctl"),
-        (ONE.read_bytes()[:200], "holds no run of hilctl"),
-    ],
-)
+@pytest.mark.parametrize(("content", "problem"), [
+    (b"", "is not an MCAP file"),
+    (b"hello", "is not an MCAP file"),
+    (ONE.read_bytes()[:30], "holds no run of hilctl"),
+    (ONE.read_bytes()[:200], "holds no run of hilctl"),
+])  # fmt: skip
 def test_what_is_no_recording_is_refused(tmp_path, content, problem):
     path = tmp_path / "other.mcap"
     path.write_bytes(content)

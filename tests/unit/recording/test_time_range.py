@@ -20,18 +20,15 @@ from tests.unit.recording.conftest import same_samples, same_ticks, written
 GOLDEN = Path(__file__).parents[3] / "recordings" / "golden" / "terfenol_compensated.mcap"
 
 
-@pytest.mark.parametrize(
-    ("from_s", "to_s", "first", "last"),
-    [
-        (None, None, 0, 6149),
-        (0.01, None, 500, 6149),
-        (None, 0.01, 0, 499),
-        (0.00101, 0.00201, 51, 100),
-        (0.03, 99.0, 1500, 6149),
-        (-5.0, 1 / 50_000, 0, 0),
-        (-1e308, 1e308, 0, 6149),
-    ],
-)
+@pytest.mark.parametrize(("from_s", "to_s", "first", "last"), [
+    (None, None, 0, 6149),
+    (0.01, None, 500, 6149),
+    (None, 0.01, 0, 499),
+    (0.00101, 0.00201, 51, 100),
+    (0.03, 99.0, 1500, 6149),
+    (-5.0, 1 / 50_000, 0, 0),
+    (-1e308, 1e308, 0, 6149),
+])  # fmt: skip
 def test_it_is_cut_by_the_time_of_the_samples(from_s, to_s, first, last):
     part = read(GOLDEN, TimeRange(from_s, to_s))
     assert (part.samples.index[0], part.samples.index[-1]) == (first, last)

@@ -124,17 +124,14 @@ def test_messages_that_hilctl_can_not_have_written(crafted, tmp_path, change, pr
     assert read(recovered.path).samples.index.size == recovered.samples
 
 
-@pytest.mark.parametrize(
-    ("facts", "problem"),
-    [
-        ({"sample_rate_hz": "nan"}, "sample_rate_hz must be a number from"),
-        ({"sample_rate_hz": "1e999"}, "sample_rate_hz must be a number from"),
-        ({"sample_rate_hz": "-5" + "0" * 5000}, "sample_rate_hz must be a number from"),
-        ({"command_unit": "\x1b[31m"}, r"command_unit must be A or V, got '\\x1b\[31m'"),
-        ({"command_unit": "V"}, "0 values of wanted_v for 400 samples"),
-        ({"segments": "[" * 50_000}, "segments|nested"),
-    ],
-)
+@pytest.mark.parametrize(("facts", "problem"), [
+    ({"sample_rate_hz": "nan"}, "sample_rate_hz must be a number from"),
+    ({"sample_rate_hz": "1e999"}, "sample_rate_hz must be a number from"),
+    ({"sample_rate_hz": "-5" + "0" * 5000}, "sample_rate_hz must be a number from"),
+    ({"command_unit": "\x1b[31m"}, r"command_unit must be A or V, got '\\x1b\[31m'"),
+    ({"command_unit": "V"}, "0 values of wanted_v for 400 samples"),
+    ({"segments": "[" * 50_000}, "segments|nested"),
+])  # fmt: skip
 def test_facts_that_are_none(crafted, facts, problem):
     path = crafted(lambda where, data: data.update(facts) if where == "hilctl.run" else None)
     with pytest.raises(DataError, match=problem):

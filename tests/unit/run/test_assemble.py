@@ -45,15 +45,12 @@ def test_late_rules_are_in_the_file_s_own_ticks():
     assert asked.max_consecutive_late == 7
 
 
-@pytest.mark.parametrize(
-    ("settings", "samples", "expected"),
-    [
-        ([], 10**6, (10_000, 100.0)),
-        ([], 50 * 300, (300, 3.0)),
-        (["timing.max_missed_share=0.2"], 10**6, (10_000, 2000.0)),
-        (["timing.on_misses=warn"], 10**6, (10_000, np.inf)),
-    ],
-)
+@pytest.mark.parametrize(("settings", "samples", "expected"), [
+    ([], 10**6, (10_000, 100.0)),
+    ([], 50 * 300, (300, 3.0)),
+    (["timing.max_missed_share=0.2"], 10**6, (10_000, 2000.0)),
+    (["timing.on_misses=warn"], 10**6, (10_000, np.inf)),
+])  # fmt: skip
 def test_misses_are_counted_over_ten_seconds_or_the_whole_run(settings, samples, expected):
     loaded, values = loaded_of(*settings), np.zeros(samples)
     rules = assemble(loaded, values, values, None).late_rules

@@ -81,14 +81,11 @@ def test_samples_that_find_no_room_are_told(folder, monkeypatch):
         Job.of(plain, folder, supervisor=1, silence_s=1.0)
 
 
-@pytest.mark.parametrize(
-    ("given", "simulated", "real_time_s", "ordinary_s", "stopped_s"),
-    [
-        (None, False, 0.1, 1.02, 0.04),
-        (0.5, False, 0.52, 0.52, 0.04),
-        (None, True, 1.52, 1.52, 1.52),
-    ],
-)
+@pytest.mark.parametrize(("given", "simulated", "real_time_s", "ordinary_s", "stopped_s"), [
+    (None, False, 0.1, 1.02, 0.04),
+    (0.5, False, 0.52, 0.52, 0.04),
+    (None, True, 1.52, 1.52, 1.52),
+])  # fmt: skip
 def test_how_long_a_loop_may_be_silent(given, simulated, real_time_s, ordinary_s, stopped_s):
     config = SimpleNamespace(timing=SimpleNamespace(hang_s=given, max_late_s=1.0), tick_s=0.01)
     device = SimpleNamespace(info=SimpleNamespace(simulated=simulated))

@@ -231,16 +231,13 @@ def test_it_leaves_what_the_run_took_of_the_machine(prepared, monkeypatch):
     assert made.page.usage() == ProcessUsage(60, 9, 3, 1, 4).since(ProcessUsage(50, 7, 1, 1, 1))
 
 
-@pytest.mark.parametrize(
-    ("raised", "code", "phase", "text"),
-    [
-        (None, 0, Phase.ENDED, ""),
-        (InputError("no such output"), 1, Phase.REFUSED, "no such output"),
-        (DeviceError("no answer"), 1, Phase.FAILED, "no answer"),
-        (RunError("then that"), 1, Phase.FAILED, "then that"),
-        (KeyError("a bug"), 1, Phase.FAILED, "the loop broke: KeyError: 'a bug'"),
-    ],
-)
+@pytest.mark.parametrize(("raised", "code", "phase", "text"), [
+    (None, 0, Phase.ENDED, ""),
+    (InputError("no such output"), 1, Phase.REFUSED, "no such output"),
+    (DeviceError("no answer"), 1, Phase.FAILED, "no answer"),
+    (RunError("then that"), 1, Phase.FAILED, "then that"),
+    (KeyError("a bug"), 1, Phase.FAILED, "the loop broke: KeyError: 'a bug'"),
+])  # fmt: skip
 def test_all_that_it_has_to_say_is_in_the_page(prepared, monkeypatch, raised, code, phase, text):
     """The supervisor tells by the phase what is there: an outcome, a refusal, or a fault.
 
@@ -271,16 +268,12 @@ OF_OTHERS = ("scipy.special", "mcap", "google.protobuf", "rich", "typer")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("modules", "left_out"),
-    [
-        ("hilctl.run.loop_process, hilctl_drivers.modbus.modbus_dac", BULKY + OF_OTHERS),
-        ("hilctl.run.loop_process, hilctl_drivers.simulated.devices", BULKY + OF_OTHERS[1:]),
-        ("hilctl.cli.run", BULKY),
-        ("hilctl.run.control.client", (*BULKY, *OF_OTHERS, "numpy", "pydantic")),
-    ],
-    ids=["loop", "simulated loop", "supervisor", "client"],
-)
+@pytest.mark.parametrize(("modules", "left_out"), [
+    ("hilctl.run.loop_process, hilctl_drivers.modbus.modbus_dac", BULKY + OF_OTHERS),
+    ("hilctl.run.loop_process, hilctl_drivers.simulated.devices", BULKY + OF_OTHERS[1:]),
+    ("hilctl.cli.run", BULKY),
+    ("hilctl.run.control.client", (*BULKY, *OF_OTHERS, "numpy", "pydantic")),
+], ids=["loop", "simulated loop", "supervisor", "client"])  # fmt: skip
 def test_it_has_nothing_that_only_others_need(modules, left_out):
     program = f"import sys, {modules};"
     if "loop_process" in modules:  # numba imports some with its first kernel

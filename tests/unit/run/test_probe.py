@@ -25,21 +25,18 @@ INFO = DeviceInfo(
 )  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("displacement_um", "output", "faults"),
-    [
-        (3.0, 0.0, []),
-        (None, None, []),
-        (-125.1, 10.01, []),
-        (2.8e20, 0.0, ["displacement must be -125 to 125 um, .* got 2.8e.20 um .*order .ABCD, CD"]),
-        (math.nan, 0.0, ["displacement .* got nan um .*order"]),
-        (150.0, 0.0, ["displacement .* got 150 um .compare scale, offset and range"]),
-        (3.0, -math.inf, ["output must be -10 to 10 A, .* got -inf A .*order"]),
-        (1e-30, 0.0, ["displacement must be 0 or more .* got 1e-30 um .*order"]),
-        (1e-14, -1e-15, []),
-        (-200.0, 12.0, ["displacement", "output .* got 12 A .compare scale"]),
-    ],
-)
+@pytest.mark.parametrize(("displacement_um", "output", "faults"), [
+    (3.0, 0.0, []),
+    (None, None, []),
+    (-125.1, 10.01, []),
+    (2.8e20, 0.0, ["displacement must be -125 to 125 um, .* got 2.8e.20 um .*order .ABCD, CD"]),
+    (math.nan, 0.0, ["displacement .* got nan um .*order"]),
+    (150.0, 0.0, ["displacement .* got 150 um .compare scale, offset and range"]),
+    (3.0, -math.inf, ["output must be -10 to 10 A, .* got -inf A .*order"]),
+    (1e-30, 0.0, ["displacement must be 0 or more .* got 1e-30 um .*order"]),
+    (1e-14, -1e-15, []),
+    (-200.0, 12.0, ["displacement", "output .* got 12 A .compare scale"]),
+])  # fmt: skip
 def test_what_can_not_be_is_said_with_its_likely_cause(displacement_um, output, faults):
     found = judge(INFO, displacement_um, output)
     assert len(found) == len(faults)

@@ -238,15 +238,11 @@ def test_nothing_comes_before_the_first_sample():
     assert tail.up_to(102).index.tolist() == [100, 101, 102]
 
 
-@pytest.mark.parametrize(
-    ("take", "why"),
-    [
-        (Path.unlink, "deleted or renamed"),
-        (lambda path: path.rename(path.with_name("moved.mcap")), "deleted or renamed"),
-        (lambda path: os.truncate(path, 100), "truncated"),
-    ],
-    ids=["deleted", "renamed", "truncated"],
-)
+@pytest.mark.parametrize(("take", "why"), [
+    (Path.unlink, "deleted or renamed"),
+    (lambda path: path.rename(path.with_name("moved.mcap")), "deleted or renamed"),
+    (lambda path: os.truncate(path, 100), "truncated"),
+], ids=["deleted", "renamed", "truncated"])  # fmt: skip
 def test_if_the_recording_is_gone_the_run_is_a_fault_and_nothing_is_written(
     checked, tmp_path, take, why
 ):

@@ -328,16 +328,13 @@ def test_a_signal_just_before_the_start_signal_is_seen(stage):
     assert stage.ring.page.get(PageField.GO) == 0
 
 
-@pytest.mark.parametrize(
-    ("arm_s", "takes_ms", "delays_ms"),
-    [
-        (0.0, [24], [50]),
-        (0.0, [25], [50, 125]),
-        (0.0, [400, 600], [50, 1250]),
-        (0.0, [400, 700], [50, 1250, 2150]),
-        (0.15, [24], [200]),
-    ],
-)
+@pytest.mark.parametrize(("arm_s", "takes_ms", "delays_ms"), [
+    (0.0, [24], [50]),
+    (0.0, [25], [50, 125]),
+    (0.0, [400, 600], [50, 1250]),
+    (0.0, [400, 700], [50, 1250, 2150]),
+    (0.15, [24], [200]),
+])  # fmt: skip
 def test_a_slow_disk_or_a_watchdog_to_arm_has_the_start_put_off(stage, arm_s, takes_ms, delays_ms):
     stage.info.arm_s = arm_s
     stage.begin_takes_ns = [each * MS for each in takes_ms]
@@ -411,14 +408,11 @@ def test_handlers_of_the_program_come_back(stage):
     assert signal.getsignal(STOP_SIGNAL) is own
 
 
-@pytest.mark.parametrize(
-    ("changes", "code", "reason"),
-    [
-        ({"broke": "a bug"}, "fault", "waveform completed; the supervisor broke: a bug"),
-        ({"outcome": LoopOutcome("stopped", "gone", 1, "confirmed", 0)}, "fault", "gone"),
-        ({"outcome": LoopOutcome("fault", "late", 1, "unknown", 0)}, "fault", "late"),
-    ],
-)
+@pytest.mark.parametrize(("changes", "code", "reason"), [
+    ({"broke": "a bug"}, "fault", "waveform completed; the supervisor broke: a bug"),
+    ({"outcome": LoopOutcome("stopped", "gone", 1, "confirmed", 0)}, "fault", "gone"),
+    ({"outcome": LoopOutcome("fault", "late", 1, "unknown", 0)}, "fault", "late"),
+])  # fmt: skip
 def test_how_it_ended(stage, changes, code, reason):
     for name, value in changes.items():
         setattr(stage, name, value)
@@ -438,14 +432,11 @@ def test_the_folder_is_kept_for_samples_that_the_file_lacks_or_a_guardian(stage,
     assert stage.log.index("folder kept") < stage.log.index("folder removed")
 
 
-@pytest.mark.parametrize(
-    ("skipped", "said"),
-    [
-        (0, ""),
-        (1, "deadline misses 1 of 20 (5 %): timing not kept"),
-        (20, "deadline misses 20 of 20 (1e+02 %): timing not kept"),
-    ],
-)
+@pytest.mark.parametrize(("skipped", "said"), [
+    (0, ""),
+    (1, "deadline misses 1 of 20 (5 %): timing not kept"),
+    (20, "deadline misses 20 of 20 (1e+02 %): timing not kept"),
+])  # fmt: skip
 def test_deadline_misses_are_counted_in_ticks(stage, skipped, said):
     """A hundred samples are twenty ticks of five."""
     lateness = Lateness(late_ticks=2, skipped_ticks=skipped)
@@ -529,16 +520,13 @@ def test_the_heartbeat_is_written_and_the_loop_looked_at(run, monkeypatch):
     assert run.started.outcome is None
 
 
-@pytest.mark.parametrize(
-    ("on_failure", "error", "stalled_s", "stop"),
-    [
-        ("stop", "full", 5.1, Stop.RECORDER_FAILED),
-        ("stop", "full", 4.9, 0),
-        ("stop", "", 5.1, Stop.RECORDER_STALLED),
-        ("stop", "", 4.9, 0),
-        ("go_on", "full", 60.0, 0),
-    ],
-)
+@pytest.mark.parametrize(("on_failure", "error", "stalled_s", "stop"), [
+    ("stop", "full", 5.1, Stop.RECORDER_FAILED),
+    ("stop", "full", 4.9, 0),
+    ("stop", "", 5.1, Stop.RECORDER_STALLED),
+    ("stop", "", 4.9, 0),
+    ("go_on", "full", 60.0, 0),
+])  # fmt: skip
 def test_a_recording_stops_a_run_once_half_of_the_ring_is_full(
     run, on_failure, error, stalled_s, stop
 ):
@@ -550,16 +538,13 @@ def test_a_recording_stops_a_run_once_half_of_the_ring_is_full(
     assert run.page.get(PageField.STOP) == stop
 
 
-@pytest.mark.parametrize(
-    ("number", "stop"),
-    [
-        (0, Stop.SUPERVISOR_BROKE),
-        (signal.SIGINT, Stop.CTRL_C),
-        (signal.SIGTERM, Stop.SIGTERM),
-        (signal.SIGHUP, Stop.SIGHUP),
-        (STOP_SIGNAL, Stop.REQUEST),
-    ],
-)
+@pytest.mark.parametrize(("number", "stop"), [
+    (0, Stop.SUPERVISOR_BROKE),
+    (signal.SIGINT, Stop.CTRL_C),
+    (signal.SIGTERM, Stop.SIGTERM),
+    (signal.SIGHUP, Stop.SIGHUP),
+    (STOP_SIGNAL, Stop.REQUEST),
+])  # fmt: skip
 def test_a_signal_goes_before_all_else(run, number, stop):
     run.started.break_off(ZeroDivisionError("a bug"))
     run.started.poll(number)
@@ -581,16 +566,13 @@ def test_a_loop_that_ended_by_itself_is_believed_once_it_is_gone(run):
     assert run.looks == [False, True]
 
 
-@pytest.mark.parametrize(
-    ("result", "by", "words"),
-    [
-        (SafeActionResult(False, "confirmed"), "supervisor", ["of this"]),
-        (SafeActionResult(True, "confirmed"), "supervisor", ["hung"]),
-        (SafeActionResult(True, "confirmed"), "guardian", ["hung", "the guardian set"]),
-        (SafeActionResult(False, "unknown", "no answer"), "guardian", ["of this", "no answer"]),
-        (SafeActionResult(False, "set", final=False), "guardian", ["not yet confirmed"]),
-    ],
-)
+@pytest.mark.parametrize(("result", "by", "words"), [
+    (SafeActionResult(False, "confirmed"), "supervisor", ["of this"]),
+    (SafeActionResult(True, "confirmed"), "supervisor", ["hung"]),
+    (SafeActionResult(True, "confirmed"), "guardian", ["hung", "the guardian set"]),
+    (SafeActionResult(False, "unknown", "no answer"), "guardian", ["of this", "no answer"]),
+    (SafeActionResult(False, "set", final=False), "guardian", ["not yet confirmed"]),
+])  # fmt: skip
 def test_who_acted_is_said_and_only_what_was_confirmed(run, result, by, words):
     run.child.ended = True
     run.started.poll(0)

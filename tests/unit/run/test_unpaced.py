@@ -128,13 +128,10 @@ def test_a_run_from_elsewhere_ramps_in_and_is_replayed(tmp_path, output):
     assert after.peak_hysteresis_percent == pytest.approx(before.peak_hysteresis_percent, rel=0.1)
 
 
-@pytest.mark.parametrize(
-    ("settings", "words"),
-    [
-        (["device.output_at_open=null"], "safe.at_start is required"),
-        (["device.output_at_open=30.0"], "output is 30 A"),
-    ],
-)
+@pytest.mark.parametrize(("settings", "words"), [
+    (["device.output_at_open=null"], "safe.at_start is required"),
+    (["device.output_at_open=30.0"], "output is 30 A"),
+])  # fmt: skip
 def test_a_start_that_is_not_known_or_can_not_be_is_refused(tmp_path, settings, words):
     checked = checked_experiment(UNCOMPENSATED, [*SHORT, *settings])
     with pytest.raises(InputError, match=words):
@@ -188,21 +185,18 @@ def test_the_end_of_a_recording_says_what_came_out(tmp_path, name):
 CURRENT = "waveform={kind: %s, unit: A, amplitude: 3.0, duration_s: 1.0, %s}"
 
 
-@pytest.mark.parametrize(
-    ("name", "settings"),
-    [
-        ("demo", ["waveform.duration_s=1"]),
-        ("terfenol_sine_6a", ["waveform.duration_s=1"]),
-        ("terfenol_sine_6a", ["sample_rate_hz=10000", "block=10", "waveform.frequency_hz=37"]),
-        ("terfenol_sine_6a", ["sample_rate_hz=2000", "block=1", "waveform.frequency_hz=20"]),
-        ("piezo_sine", []),
-        ("piezo_complex", ["waveform.duration_s=2"]),
-        ("terfenol_sine_6a_uncompensated", []),
-        ("terfenol_sine_6a_uncompensated", [CURRENT % ("random", "first_hz: 1, last_hz: 99")]),
-        ("terfenol_sine_6a_uncompensated", [CURRENT % ("triangle", "frequency_hz: 10")]),
-        ("terfenol_sine_6a_uncompensated", ["sample_rate_hz=50000", "block=5"]),
-    ],
-)
+@pytest.mark.parametrize(("name", "settings"), [
+    ("demo", ["waveform.duration_s=1"]),
+    ("terfenol_sine_6a", ["waveform.duration_s=1"]),
+    ("terfenol_sine_6a", ["sample_rate_hz=10000", "block=10", "waveform.frequency_hz=37"]),
+    ("terfenol_sine_6a", ["sample_rate_hz=2000", "block=1", "waveform.frequency_hz=20"]),
+    ("piezo_sine", []),
+    ("piezo_complex", ["waveform.duration_s=2"]),
+    ("terfenol_sine_6a_uncompensated", []),
+    ("terfenol_sine_6a_uncompensated", [CURRENT % ("random", "first_hz: 1, last_hz: 99")]),
+    ("terfenol_sine_6a_uncompensated", [CURRENT % ("triangle", "frequency_hz: 10")]),
+    ("terfenol_sine_6a_uncompensated", ["sample_rate_hz=50000", "block=5"]),
+])  # fmt: skip
 def test_size_of_the_recording_is_forecast(tmp_path, name, settings):
     checked = checked_experiment(UNCOMPENSATED.with_name(f"{name}.yaml"), settings)
     result = run_unpaced(checked, tmp_path / "run.mcap")

@@ -211,24 +211,16 @@ SOFT = {"soft_start_s": 0.31, "soft_end_s": 0.17, "rest": -0.5, "offset": 0.25}
 WAVES: list[dict[str, Any]] = [
     {"kind": "sine", "amplitude": 6.0, "frequency_hz": 7.3, "duration_s": 4.0},
     {"kind": "triangle", "amplitude": 6.0, "frequency_hz": 7.3, "duration_s": 4.0},
-    {
-        "kind": "complex_harmonic",
-        "components": (
-            {"amplitude": 1.0, "frequency_hz": 3.0},
-            {"amplitude": 2.0, "frequency_hz": 4.0, "phase_deg": 20.0},
-        ),
-        "duration_s": 4.0,
-    },
+    {"kind": "complex_harmonic", "components": ({"amplitude": 1.0, "frequency_hz": 3.0},
+     {"amplitude": 2.0, "frequency_hz": 4.0, "phase_deg": 20.0}, ), "duration_s": 4.0},
     {"kind": "growing", "amplitude": 6.0, "frequency_hz": 7.3, "duration_s": 4.0},
     {"kind": "chirp", "amplitude": 6.0, "start_hz": 1.0, "stop_hz": 90.0, "duration_s": 4.0},
     {"kind": "step", "levels": (1.0, -2.0, 3.0), "dwell_s": 1.3, "rise_s": 0.1},
     {"kind": "hold", "level": 2.0, "duration_s": 4.0},
     {"kind": "path", "levels": (5.0, -2.0, 3.0), "rate_per_s": 4.0},
     {"kind": "random", "amplitude": 6.0, "first_hz": 2, "last_hz": 90, "duration_s": 4.0},
-    {
-        "kind": "multisine", "amplitude": 6.0, "first_hz": 5.0, "last_hz": 90.0, "step_hz": 5.0,
-        "duration_s": 4.0,
-    },
+    {"kind": "multisine", "amplitude": 6.0, "first_hz": 5.0, "last_hz": 90.0, "step_hz": 5.0,
+     "duration_s": 4.0},
 ]  # fmt: skip
 
 

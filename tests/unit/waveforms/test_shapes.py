@@ -246,36 +246,30 @@ class TestEnvelope:
         np.testing.assert_allclose(values[:, 25], 7.0 * envelope, rtol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("duration_s", "rate_hz", "samples"),
-    [
-        (30.0, 50e3, 1_500_000),
-        (0.29, 100.0, 29),
-        (2.3, 50e3, 115_000),
-        (1.1, 10.0, 11),
-        (1.0 / 3.0, 3.0, 1),
-        (0.00149, 1000.0, 1),
-        (1e-9, 50e3, 1),
-    ],
-)
+@pytest.mark.parametrize(("duration_s", "rate_hz", "samples"), [
+    (30.0, 50e3, 1_500_000),
+    (0.29, 100.0, 29),
+    (2.3, 50e3, 115_000),
+    (1.1, 10.0, 11),
+    (1.0 / 3.0, 3.0, 1),
+    (0.00149, 1000.0, 1),
+    (1e-9, 50e3, 1),
+])  # fmt: skip
 def test_sample_count(duration_s: float, rate_hz: float, samples: int) -> None:
     assert sample_count(duration_s, rate_hz) == samples
 
 
-@pytest.mark.parametrize(
-    ("frequencies_hz", "period_s"),
-    [
-        ([10.0], 0.1),
-        ([20.0, 60.0], 0.05),
-        ([0.1, 0.3], 10.0),
-        ([2.5, 1.25], 0.8),
-        ([0.7, 1.1], 10.0),
-        ([1.0, 1.5, 0.25], 4.0),
-        ([33.3, 66.6], 1.0 / 33.3),
-        ([50.0, 50.0], 0.02),
-        ([1e-7, 1.0], 1e7),
-    ],
-)
+@pytest.mark.parametrize(("frequencies_hz", "period_s"), [
+    ([10.0], 0.1),
+    ([20.0, 60.0], 0.05),
+    ([0.1, 0.3], 10.0),
+    ([2.5, 1.25], 0.8),
+    ([0.7, 1.1], 10.0),
+    ([1.0, 1.5, 0.25], 4.0),
+    ([33.3, 66.6], 1.0 / 33.3),
+    ([50.0, 50.0], 0.02),
+    ([1e-7, 1.0], 1e7),
+])  # fmt: skip
 def test_common_period(frequencies_hz: list[float], period_s: float) -> None:
     assert common_period_s(frequencies_hz) == pytest.approx(period_s, rel=1e-15)
     assert common_period_s(frequencies_hz[::-1]) == pytest.approx(period_s, rel=1e-15)

@@ -30,29 +30,26 @@ MULTISINE = "kind: multisine, unit: A, amplitude: 1, duration_s: 1"
 RANDOM = "kind: random, unit: A, amplitude: 1.0"
 
 
-@pytest.mark.parametrize(
-    ("section", "line", "key"),
-    [
-        ("unit: A, kind: sinus, duration_s: 1.0", 6, ".kind"),
-        ("unit: A, duration_s: 1.0", 4, ""),
-        ("kind: hold, level: 1.0, duration_s: 1.0", 4, ".unit"),
-        ("kind: hold, level: 1.0, duration_s: 1.0, unit: V", 8, ".unit"),
-        ("kind: step, unit: A, levels: [1], dwell_s: 1, rise_s: 2", 9, ".rise_s"),
-        ("kind: step, unit: A, levels: [], dwell_s: 1", 7, ".levels"),
-        ("kind: step, unit: A, levels: [a, 2.0], dwell_s: 1", 7, ".levels.0"),
-        ("kind: step, unit: A, levels: [a], dwell_s: 1", 7, ".levels.0"),
-        ("kind: path, unit: A, levels: [], rate_per_s: 2.0", 7, ".levels"),
-        ("kind: sequence, unit: A, parts: []", 7, ".parts"),
-        ("kind: sequence, unit: A, parts: [{kind: sequence, parts: []}]", 7, ".parts.0.kind"),
-        ("kind: complex_harmonic, unit: A, components: [], duration_s: 1", 7, ".components"),
-        (f"{MULTISINE}, first_hz: 5, last_hz: 4, step_hz: 1", 10, ".last_hz"),
-        (f"{MULTISINE}, first_hz: 0.5, last_hz: 400, step_hz: 0.01", 11, ".step_hz"),
-        (f"{MULTISINE}, first_hz: 0.5, last_hz: 400, step_hz: 1.0e-320", 11, ".step_hz"),
-        # In half a second there is no whole cycle between 1 and 1.5 Hz.
-        (f"{RANDOM}, first_hz: 1.0, last_hz: 1.5, duration_s: 0.5", 10, ".duration_s"),
-        ("kind: file, unit: A, path: w.csv, first_row: 5, last_row: 4", 9, ".last_row"),
-    ],
-)
+@pytest.mark.parametrize(("section", "line", "key"), [
+    ("unit: A, kind: sinus, duration_s: 1.0", 6, ".kind"),
+    ("unit: A, duration_s: 1.0", 4, ""),
+    ("kind: hold, level: 1.0, duration_s: 1.0", 4, ".unit"),
+    ("kind: hold, level: 1.0, duration_s: 1.0, unit: V", 8, ".unit"),
+    ("kind: step, unit: A, levels: [1], dwell_s: 1, rise_s: 2", 9, ".rise_s"),
+    ("kind: step, unit: A, levels: [], dwell_s: 1", 7, ".levels"),
+    ("kind: step, unit: A, levels: [a, 2.0], dwell_s: 1", 7, ".levels.0"),
+    ("kind: step, unit: A, levels: [a], dwell_s: 1", 7, ".levels.0"),
+    ("kind: path, unit: A, levels: [], rate_per_s: 2.0", 7, ".levels"),
+    ("kind: sequence, unit: A, parts: []", 7, ".parts"),
+    ("kind: sequence, unit: A, parts: [{kind: sequence, parts: []}]", 7, ".parts.0.kind"),
+    ("kind: complex_harmonic, unit: A, components: [], duration_s: 1", 7, ".components"),
+    (f"{MULTISINE}, first_hz: 5, last_hz: 4, step_hz: 1", 10, ".last_hz"),
+    (f"{MULTISINE}, first_hz: 0.5, last_hz: 400, step_hz: 0.01", 11, ".step_hz"),
+    (f"{MULTISINE}, first_hz: 0.5, last_hz: 400, step_hz: 1.0e-320", 11, ".step_hz"),
+    # In half a second there is no whole cycle between 1 and 1.5 Hz.
+    (f"{RANDOM}, first_hz: 1.0, last_hz: 1.5, duration_s: 0.5", 10, ".duration_s"),
+    ("kind: file, unit: A, path: w.csv, first_row: 5, last_row: 4", 9, ".last_row"),
+])  # fmt: skip
 def test_broken_rules(section: str, line: int, key: str) -> None:
     """Each key is in a line of its own, the first in line 5."""
     lines = re.sub(r", (?=\w+: )(?![^{]*})", "\n  ", section)

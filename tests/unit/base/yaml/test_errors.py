@@ -91,22 +91,19 @@ def read(text, **more):
     return document, document.validate(Whole, **more).wave
 
 
-@pytest.mark.parametrize(
-    ("text", "key", "value"),
-    [
-        ("height_um: 1,5", "height_um", 1.5),
-        ("height_um: -0,125", "height_um", -0.125),
-        ("height_um: 12,5e-3", "height_um", 0.0125),
-        ("height_um: 1e3", "height_um", 1000.0),
-        ("cycles: 1e3", "cycles", 1000),
-        ("unit: µm", "unit", "um"),
-        ("unit: μm", "unit", "um"),
-        ("height_µm: 2.0", "height_um", 2.0),
-        ("span: ['1,5', 2]", "span", (1.5, 2.0)),
-        ("name: 1,5", "name", "1,5"),
-        ("name: µm", "name", "µm"),
-    ],
-)
+@pytest.mark.parametrize(("text", "key", "value"), [
+    ("height_um: 1,5", "height_um", 1.5),
+    ("height_um: -0,125", "height_um", -0.125),
+    ("height_um: 12,5e-3", "height_um", 0.0125),
+    ("height_um: 1e3", "height_um", 1000.0),
+    ("cycles: 1e3", "cycles", 1000),
+    ("unit: µm", "unit", "um"),
+    ("unit: μm", "unit", "um"),
+    ("height_µm: 2.0", "height_um", 2.0),
+    ("span: ['1,5', 2]", "span", (1.5, 2.0)),
+    ("name: 1,5", "name", "1,5"),
+    ("name: µm", "name", "µm"),
+])  # fmt: skip
 def test_it_is_read_in_the_one_way_there_is(text, key, value):
     document, wave = read(f"wave:\n  {text}")
     assert getattr(wave, key) == value
@@ -122,25 +119,22 @@ def test_a_decimal_comma_is_told(caplog):
     assert caplog.messages == ["x.yaml:3: wave.height_um: '1,5' is read as 1.5"]
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("height_um: 1,500", "1.500 or 1500?"),
-        ("height_um: 12,345", "12.345 or 12345?"),
-        ("height_um: 1,5,2", "must be a number"),
-        ("height_um: 1.5,2", "must be a number"),
-        ("height_um: µ", "must be a number"),
-        ("height_um: \N{MINUS SIGN}5.0", "MINUS SIGN"),
-        ("height_um: 1.0\n\N{NO-BREAK SPACE} unit: A\n  cycles: 1", "invisible character U.00A0"),
-        ("either: 1,5", "must be a number, or 'safe'"),
-        ("span: [1,5, 2]", "must have at most 2 values"),
-        ("cycles: 1.5", "must be a whole number"),
-        ("cycles: 1e300", "must be a whole number"),
-        ("unit: µA", "must be one of 'um' or 'A', got 'µA'"),
-        ("{height_um: 1.0, height_µm: 2.0}", "height_µm: stands already at x.yaml:2"),
-        ("hight_µm: 2.0", r"unknown key \(did you mean 'height_um'\?\)"),
-    ],
-)
+@pytest.mark.parametrize(("text", "said"), [
+    ("height_um: 1,500", "1.500 or 1500?"),
+    ("height_um: 12,345", "12.345 or 12345?"),
+    ("height_um: 1,5,2", "must be a number"),
+    ("height_um: 1.5,2", "must be a number"),
+    ("height_um: µ", "must be a number"),
+    ("height_um: \N{MINUS SIGN}5.0", "MINUS SIGN"),
+    ("height_um: 1.0\n\N{NO-BREAK SPACE} unit: A\n  cycles: 1", "invisible character U.00A0"),
+    ("either: 1,5", "must be a number, or 'safe'"),
+    ("span: [1,5, 2]", "must have at most 2 values"),
+    ("cycles: 1.5", "must be a whole number"),
+    ("cycles: 1e300", "must be a whole number"),
+    ("unit: µA", "must be one of 'um' or 'A', got 'µA'"),
+    ("{height_um: 1.0, height_µm: 2.0}", "height_µm: stands already at x.yaml:2"),
+    ("hight_µm: 2.0", r"unknown key \(did you mean 'height_um'\?\)"),
+])  # fmt: skip
 def test_what_can_not_be_decided_is_refused(text, said):
     with pytest.raises(ConfigError, match=said):
         read(f"wave:\n  {text}")

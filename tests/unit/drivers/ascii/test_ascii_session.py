@@ -47,17 +47,14 @@ def test_a_value_is_put_in_and_a_number_comes_out():
     assert asked.link.sent == [b"#020\r"]
 
 
-@pytest.mark.parametrize(
-    ("reply", "error", "said"),
-    [
-        (b"?\r", links.RefusedError, r"#020: out of range \(\?\)"),
-        (b"?02\r", links.RefusedError, "invalid command"),
-        (b"!\r", links.WatchdogTrippedError, "ignored, the host watchdog has tripped"),
-        (b"ok\r", links.MismatchError, "not an answer to this: 'ok'"),
-        (b">>\r", links.MismatchError, "not an answer to this"),
-        (None, links.NoAnswerError, "#020: no answer within 0.1 s"),
-    ],
-)
+@pytest.mark.parametrize(("reply", "error", "said"), [
+    (b"?\r", links.RefusedError, r"#020: out of range \(\?\)"),
+    (b"?02\r", links.RefusedError, "invalid command"),
+    (b"!\r", links.WatchdogTrippedError, "ignored, the host watchdog has tripped"),
+    (b"ok\r", links.MismatchError, "not an answer to this: 'ok'"),
+    (b">>\r", links.MismatchError, "not an answer to this"),
+    (None, links.NoAnswerError, "#020: no answer within 0.1 s"),
+])  # fmt: skip
 def test_trouble_is_told_with_what_was_asked(reply, error, said):
     with pytest.raises(error, match=said):
         session(reply).ask("#020", ">")
@@ -169,18 +166,15 @@ ALL = pytest.mark.parametrize(
 )
 
 
-@pytest.mark.parametrize(
-    ("line", "text", "wire"),
-    [
-        # ICP DAS, "Checksum Calculation"
-        (DCON_LINE, "$012", b"$012B7\r"),
-        (DCON_LINE, "!01200600", b"!01200600AA\r"),
-        # TDK-Lambda Genesys 4.9.4
-        (GEN, "STT?", b"STT?$3A\r"),
-        (GEN, "STAT?", b"STAT?$7B\r"),
-        (SCPI, "MEAS:CURR?", b"MEAS:CURR?\n"),
-    ],
-)
+@pytest.mark.parametrize(("line", "text", "wire"), [
+    # ICP DAS, "Checksum Calculation"
+    (DCON_LINE, "$012", b"$012B7\r"),
+    (DCON_LINE, "!01200600", b"!01200600AA\r"),
+    # TDK-Lambda Genesys 4.9.4
+    (GEN, "STT?", b"STT?$3A\r"),
+    (GEN, "STAT?", b"STAT?$7B\r"),
+    (SCPI, "MEAS:CURR?", b"MEAS:CURR?\n"),
+])  # fmt: skip
 def test_lines_as_in_the_manuals(line, text, wire):
     assert line.encode(text) == wire
     assert line.decode(bytearray(wire)) == text

@@ -105,17 +105,14 @@ def test_an_underrun_is_told_with_its_length(board):
     assert driven.events()[-1]["event"] == "safe"
 
 
-@pytest.mark.parametrize(
-    ("fault", "text"),
-    [
-        ("silence", f"no answer within {TIMEOUT_S + 0.04:g} s"),
-        ("corrupt", "crc16_ccitt_false|not a COBS frame|behind the final"),
-        ("cut", f"within {TIMEOUT_S + 0.04:g} s"),
-        ("duplicate", "bytes"),
-        ("wrong_id", "reply 91 to message"),
-        ("exception", "refused by the board"),
-    ],
-)
+@pytest.mark.parametrize(("fault", "text"), [
+    ("silence", f"no answer within {TIMEOUT_S + 0.04:g} s"),
+    ("corrupt", "crc16_ccitt_false|not a COBS frame|behind the final"),
+    ("cut", f"within {TIMEOUT_S + 0.04:g} s"),
+    ("duplicate", "bytes"),
+    ("wrong_id", "reply 91 to message"),
+    ("exception", "refused by the board"),
+])  # fmt: skip
 def test_a_bad_answer_is_an_error_and_the_output_can_still_be_made_safe(board, fault, text):
     driven = board(faults=[f"{fault}@15"], fifo_blocks=15)
     driven.open()
@@ -148,16 +145,13 @@ def test_samples_follow_one_another(board):
         hold(driven, 1.0, 1)
 
 
-@pytest.mark.parametrize(
-    ("rate_hz", "block", "options", "text"),
-    [
-        (RATE_HZ, 513, {}, "block must be 1 to 512 samples, got 513"),
-        (RATE_HZ, 500, {"fifo_blocks": 16}, "must fit into the FIFO, 8192 .*at most 15 with this"),
-        (50.0, 10, {}, r"sample rate must be in \[100, .*got 50"),
-        (200_000.0, 500, {}, r"sample rate must be in \[100, 100000\] Hz"),
-        (RATE_HZ, 500, {"watchdog": {"timeout_s": 0.1}}, "3 exchanges must come within"),
-    ],
-)
+@pytest.mark.parametrize(("rate_hz", "block", "options", "text"), [
+    (RATE_HZ, 513, {}, "block must be 1 to 512 samples, got 513"),
+    (RATE_HZ, 500, {"fifo_blocks": 16}, "must fit into the FIFO, 8192 .*at most 15 with this"),
+    (50.0, 10, {}, r"sample rate must be in \[100, .*got 50"),
+    (200_000.0, 500, {}, r"sample rate must be in \[100, 100000\] Hz"),
+    (RATE_HZ, 500, {"watchdog": {"timeout_s": 0.1}}, "3 exchanges must come within"),
+])  # fmt: skip
 def test_what_the_fifo_can_not_do_is_refused_at_open(board, rate_hz, block, options, text):
     driven = board(**options)
     with pytest.raises(DeviceError, match=text):

@@ -71,18 +71,15 @@ def test_messages_are_numbered_through_255(board):
     assert [asked[1] for asked in board.link.asked[-3:]] == [255, 0, 1]
 
 
-@pytest.mark.parametrize(
-    ("reply", "error", "said"),
-    [
-        (answer(seq=9), MismatchError, "reply 93 to message 9"),
-        (answer(kind=0x90), MismatchError, "asked was 13 in message 1"),
-        (answer(status=0x01), WatchdogTrippedError, "the watchdog has tripped"),
-        (answer(status=0x03), WatchdogTrippedError, "the watchdog has tripped"),
-        (answer(status=0x02), RefusedError, "a value is out of range"),
-        (answer(status=0x40), RefusedError, "status 40"),
-        (lambda asked: b"\x93", MismatchError, "reply of 1 bytes"),
-    ],
-)
+@pytest.mark.parametrize(("reply", "error", "said"), [
+    (answer(seq=9), MismatchError, "reply 93 to message 9"),
+    (answer(kind=0x90), MismatchError, "asked was 13 in message 1"),
+    (answer(status=0x01), WatchdogTrippedError, "the watchdog has tripped"),
+    (answer(status=0x03), WatchdogTrippedError, "the watchdog has tripped"),
+    (answer(status=0x02), RefusedError, "a value is out of range"),
+    (answer(status=0x40), RefusedError, "status 40"),
+    (lambda asked: b"\x93", MismatchError, "reply of 1 bytes"),
+])  # fmt: skip
 def test_what_is_no_good_answer_is_not_believed(board, reply, error, said):
     board.link.make = reply
     with pytest.raises(error, match=said):

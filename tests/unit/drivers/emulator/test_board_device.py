@@ -20,18 +20,15 @@ class TestBoard:
         assert 2.0 < reading < 3.5
         assert [w["value"] for w in board.writes()] == [5.0, 5.0]
 
-    @pytest.mark.parametrize(
-        ("message", "status"),
-        [
-            (b"\x10\x01\x01\x00" + struct.pack("<f", 10.5), 0x02),
-            (b"\x10\x01\x01\x00" + struct.pack("<f", float("nan")), 0x02),
-            (b"\x10\x01\x02\x00" + struct.pack("<f", 1.0), 0x04),
-            (b"\x10\x01\x01\x00" + b"\0\0\0", 0x04),
-            (b"\x10\x01", 0x04),
-            (b"\x77\x01", 0x04),
-            (b"\x11\x01" + struct.pack("<IHf", 0, 1, 0.0), 0x04),
-        ],
-    )
+    @pytest.mark.parametrize(("message", "status"), [
+        (b"\x10\x01\x01\x00" + struct.pack("<f", 10.5), 0x02),
+        (b"\x10\x01\x01\x00" + struct.pack("<f", float("nan")), 0x02),
+        (b"\x10\x01\x02\x00" + struct.pack("<f", 1.0), 0x04),
+        (b"\x10\x01\x01\x00" + b"\0\0\0", 0x04),
+        (b"\x10\x01", 0x04),
+        (b"\x77\x01", 0x04),
+        (b"\x11\x01" + struct.pack("<IHf", 0, 1, 0.0), 0x04),
+    ])  # fmt: skip
     def test_bad_messages_change_nothing(self, emulate, message, status):
         board = emulate("cobs_board")
         assert board.ask(message) == bytes([message[0] | 0x80, message[1], status])

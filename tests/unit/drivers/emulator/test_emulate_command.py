@@ -25,15 +25,12 @@ from hilctl_drivers.profile import FOLDER
 CONFIGS = Path(__file__).parents[4] / "configs"
 
 
-@pytest.mark.parametrize(
-    ("profile", "reader", "options", "places"),
-    [
-        ("adam_4024", "adam_4117", {}, r"(/dev/pts/\d+) unit 1 \1 unit 2"),
-        ("adam_4024", "adam_4117", {"reader_unit_id": 7}, r"(/dev/\S+) unit 1 \1 unit 7"),
-        ("adam_6224", "adam_6217", {}, r"127.0.0.1:(\d+) unit 1 127.0.0.1:(?!\1)\d+ unit 1"),
-        ("kepco_bop", "agilent_34970a", {}, r"(/dev/pts/\d+) (?!\1)/dev/pts/\d+"),
-    ],
-)
+@pytest.mark.parametrize(("profile", "reader", "options", "places"), [
+    ("adam_4024", "adam_4117", {}, r"(/dev/pts/\d+) unit 1 \1 unit 2"),
+    ("adam_4024", "adam_4117", {"reader_unit_id": 7}, r"(/dev/\S+) unit 1 \1 unit 7"),
+    ("adam_6224", "adam_6217", {}, r"127.0.0.1:(\d+) unit 1 127.0.0.1:(?!\1)\d+ unit 1"),
+    ("kepco_bop", "agilent_34970a", {}, r"(/dev/pts/\d+) (?!\1)/dev/pts/\d+"),
+])  # fmt: skip
 def test_it_says_where_both_answer(profile, reader, options, places):
     told: list[ListenAddress] = []
 
@@ -87,13 +84,10 @@ def test_a_profile_alone_has_no_wiring_to_tell(ended_at_once):
     assert said["devices"][0]["unit_id"] is None
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["kepco_bop", "--reader", "agilent_34970a", "--sensor", "AI102"],
-        ["kepco_bop", "--sensor", "agilent_34970a:AI102"],
-    ],
-)
+@pytest.mark.parametrize("words", [
+    ["kepco_bop", "--reader", "agilent_34970a", "--sensor", "AI102"],
+    ["kepco_bop", "--sensor", "agilent_34970a:AI102"],
+])  # fmt: skip
 def test_options_become_the_emulator(words, tmp_path, monkeypatch):
     asked = []
     monkeypatch.setattr(

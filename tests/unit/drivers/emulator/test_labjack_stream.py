@@ -120,21 +120,18 @@ def test_a_full_buffer_drops_scans_until_it_is_emptied(device):
     assert device.data(60)[2] == 0
 
 
-@pytest.mark.parametrize(
-    ("what", "code"),
-    [
-        (lambda d: d.write(4990, u32(0)), 4),  # it does not stream
-        (lambda d: d.data(4), 4),
-        (lambda d: (d.set_up(settings={4100: 2}), d.write(4990, u32(1))), 4),  # another input
-        (lambda d: (d.set_up(settings={4016: 1}), d.write(4990, u32(1))), 4),  # to port 702
-        (lambda d: (d.set_up(rate_hz=60_000.0), d.write(4990, u32(1))), 4),  # too fast for two
-        (lambda d: d.set_up(settings={4050: 300}), 4),  # no power of 2
-        (lambda d: (d.set_up(), d.play(*[2.5] * 40), d.play(*[2.5] * 40), d.play(*[2.5] * 49)), 4),
-        (lambda d: (d.set_up(), d.play(5.1)), 3),
-        (lambda d: d.write(4400, f32(1.0)), 4),  # nothing allocated
-        (lambda d: (d.set_up(), d.write(4990, u32(1)), d.read(0)), 4),  # AIN0 while it streams
-    ],
-)
+@pytest.mark.parametrize(("what", "code"), [
+    (lambda d: d.write(4990, u32(0)), 4),  # it does not stream
+    (lambda d: d.data(4), 4),
+    (lambda d: (d.set_up(settings={4100: 2}), d.write(4990, u32(1))), 4),  # another input
+    (lambda d: (d.set_up(settings={4016: 1}), d.write(4990, u32(1))), 4),  # to port 702
+    (lambda d: (d.set_up(rate_hz=60_000.0), d.write(4990, u32(1))), 4),  # too fast for two
+    (lambda d: d.set_up(settings={4050: 300}), 4),  # no power of 2
+    (lambda d: (d.set_up(), d.play(*[2.5] * 40), d.play(*[2.5] * 40), d.play(*[2.5] * 49)), 4),
+    (lambda d: (d.set_up(), d.play(5.1)), 3),
+    (lambda d: d.write(4400, f32(1.0)), 4),  # nothing allocated
+    (lambda d: (d.set_up(), d.write(4990, u32(1)), d.read(0)), 4),  # AIN0 while it streams
+])  # fmt: skip
 def test_what_it_can_not_do_is_refused(device, what, code):
     with pytest.raises(RefusedError) as refused:
         what(device)

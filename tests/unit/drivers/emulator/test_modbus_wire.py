@@ -71,20 +71,17 @@ def test_coupler_reads_elsewhere_than_it_writes():
     assert ask(wire, read_pdu(3, 0, 1), 10 * MS) != raw
 
 
-@pytest.mark.parametrize(
-    ("pdu", "code"),
-    [
-        (read_pdu(3, 12345, 1), 2),
-        (read_pdu(3, 0, 9), 2),
-        (write_pdu(0, FLOAT32.encode(1.0)), 2),
-        (write_pdu(1000, b"\x00\x00"), 2),
-        (write_pdu(1000, FLOAT32.encode(5.1)), 3),
-        (write_pdu(1000, FLOAT32.encode(-0.1)), 3),
-        (write_pdu(1000, b"\x7f\xc0\x00\x00"), 3),
-        (write_pdu(1000, FLOAT32.encode(1.0) + FLOAT32.encode(9.0)), 3),
-        (write_read_pdu(0, 2, 1000, FLOAT32.encode(1.0)), 1),
-    ],
-)
+@pytest.mark.parametrize(("pdu", "code"), [
+    (read_pdu(3, 12345, 1), 2),
+    (read_pdu(3, 0, 9), 2),
+    (write_pdu(0, FLOAT32.encode(1.0)), 2),
+    (write_pdu(1000, b"\x00\x00"), 2),
+    (write_pdu(1000, FLOAT32.encode(5.1)), 3),
+    (write_pdu(1000, FLOAT32.encode(-0.1)), 3),
+    (write_pdu(1000, b"\x7f\xc0\x00\x00"), 3),
+    (write_pdu(1000, FLOAT32.encode(1.0) + FLOAT32.encode(9.0)), 3),
+    (write_read_pdu(0, 2, 1000, FLOAT32.encode(1.0)), 1),
+])  # fmt: skip
 def test_refusals_change_nothing(t7, pdu, code):
     ask(t7, write_pdu(1000, FLOAT32.encode(2.0)))
     with pytest.raises(RefusedError) as refusal:

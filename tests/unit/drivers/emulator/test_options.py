@@ -12,13 +12,10 @@ from hilctl_drivers.emulator.options import (
 )
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"link": "pigeon"}, "link must be one of tcp, rtu, got 'pigeon'"),
-        ({"reader_line": "other"}, "reader_line must be one of same, own, got 'other'"),
-    ],
-)
+@pytest.mark.parametrize(("options", "words"), [
+    ({"link": "pigeon"}, "link must be one of tcp, rtu, got 'pigeon'"),
+    ({"reader_line": "other"}, "reader_line must be one of same, own, got 'other'"),
+])  # fmt: skip
 def test_words_that_mean_nothing_are_refused(options, words):
     with pytest.raises(InputError, match=words):
         EmulatorOptions("wago_750", **options)
@@ -32,17 +29,14 @@ def test_texts_are_read(kind):
         assert parse_fault(f"{kind}:0.3@1") == WireFault(kind, at_count=1, delay_s=0.3)
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("silence", "KIND@COUNT"),
-        ("noise@1", "must be one of silence"),
-        ("reset:2@1", "only delay and late"),
-        ("reset@0", "whole number from 1"),
-        ("reset@1.5", "whole number from 1"),
-        ("", "KIND@COUNT"),
-    ],
-)
+@pytest.mark.parametrize(("text", "words"), [
+    ("silence", "KIND@COUNT"),
+    ("noise@1", "must be one of silence"),
+    ("reset:2@1", "only delay and late"),
+    ("reset@0", "whole number from 1"),
+    ("reset@1.5", "whole number from 1"),
+    ("", "KIND@COUNT"),
+])  # fmt: skip
 def test_nonsense_is_refused(text, words):
     with pytest.raises(InputError, match=words):
         parse_fault(text)

@@ -32,15 +32,12 @@ class TestTemplates:
         for other in ("#020-05.250", "#010-05.250 ", "#010", "#011+05.000x"):
             assert TemplateMatcher("#{address:02X}0{value:+07.3f}", 1).match(other) is None
 
-    @pytest.mark.parametrize(
-        ("example", "pattern", "value", "reply"),
-        [
-            ("!01+05.000", "![0-9A-F]{2}([+-][0-9]+\\.[0-9]+)", -1.5, "!01-01.500"),
-            ("05.003", "([0-9]+\\.[0-9]+)", 12.3456, "12.346"),
-            ("2.71E1", "(.*)", -0.00125, "-1.250000E-03"),
-            ("+2.61920000E+00", "(.*)", 1.5, "+1.500000E+00"),
-        ],
-    )
+    @pytest.mark.parametrize(("example", "pattern", "value", "reply"), [
+        ("!01+05.000", "![0-9A-F]{2}([+-][0-9]+\\.[0-9]+)", -1.5, "!01-01.500"),
+        ("05.003", "([0-9]+\\.[0-9]+)", 12.3456, "12.346"),
+        ("2.71E1", "(.*)", -0.00125, "-1.250000E-03"),
+        ("+2.61920000E+00", "(.*)", 1.5, "+1.500000E+00"),
+    ])  # fmt: skip
     def test_a_reply_looks_like_the_example(self, example, pattern, value, reply):
         """Sign, digits and exponent are as in the vendor's example."""
         assert in_style(example, pattern, value) == reply

@@ -213,17 +213,14 @@ class Spoiled(InProcessLink):
         self.change = lambda reply: reply
 
 
-@pytest.mark.parametrize(
-    ("change", "text"),
-    [
-        (lambda r: r[:-1], "only 259 bytes"),
-        (lambda r: r + b"\0", "1 bytes behind the end"),
-        (lambda r: b"\x55" + r[1:], "transaction must be"),
-        (lambda r: r[:3] + b"\1" + r[4:], "not a Modbus TCP header"),
-        (lambda r: r[:5] + b"\3" + r[6:7] + PATTERN, r"exception 4 \(device failure\)"),
-        (lambda r: r[:12] + b"\x0b\x7c" + r[14:], "it drops scans"),
-    ],
-)
+@pytest.mark.parametrize(("change", "text"), [
+    (lambda r: r[:-1], "only 259 bytes"),
+    (lambda r: r + b"\0", "1 bytes behind the end"),
+    (lambda r: b"\x55" + r[1:], "transaction must be"),
+    (lambda r: r[:3] + b"\1" + r[4:], "not a Modbus TCP header"),
+    (lambda r: r[:5] + b"\3" + r[6:7] + PATTERN, r"exception 4 \(device failure\)"),
+    (lambda r: r[:12] + b"\x0b\x7c" + r[14:], "it drops scans"),
+])  # fmt: skip
 def test_a_bad_answer_is_an_error_and_the_output_can_still_be_made_safe(driven, change, text):
     made = driven(link=Spoiled)
     made.open()
@@ -272,18 +269,15 @@ def test_samples_follow_one_another(driven):
         made.hold(1.0, 1)
 
 
-@pytest.mark.parametrize(
-    ("rate_hz", "block", "changes", "text"),
-    [
-        (RATE_HZ, 1366, {}, "block must be 1 to 1365.*8192 samples, got 1366"),
-        (RATE_HZ, 0, {}, "block must be 1 to 1365"),
-        (50.0, 10, {}, r"sample rate must be in \[100, .*got 50"),
-        (50_001.0, 580, {}, r"sample rate must be in \[100, 50000\] Hz .*580 samples in"),
-        (40_000.0, 58, {}, r"in \[100, 29000\] Hz .*58 samples in 2 messages.*turnaround 2.00 ms"),
-        (7_000.0, 100, {}, "scan rate was set to 7000 Hz, the device makes 6997.9"),
-        (100.0, 100, {"watchdog": {"timeout_s": 2.0}}, "3 exchanges must come within"),
-    ],
-)
+@pytest.mark.parametrize(("rate_hz", "block", "changes", "text"), [
+    (RATE_HZ, 1366, {}, "block must be 1 to 1365.*8192 samples, got 1366"),
+    (RATE_HZ, 0, {}, "block must be 1 to 1365"),
+    (50.0, 10, {}, r"sample rate must be in \[100, .*got 50"),
+    (50_001.0, 580, {}, r"sample rate must be in \[100, 50000\] Hz .*580 samples in"),
+    (40_000.0, 58, {}, r"in \[100, 29000\] Hz .*58 samples in 2 messages.*turnaround 2.00 ms"),
+    (7_000.0, 100, {}, "scan rate was set to 7000 Hz, the device makes 6997.9"),
+    (100.0, 100, {"watchdog": {"timeout_s": 2.0}}, "3 exchanges must come within"),
+])  # fmt: skip
 def test_what_the_device_can_not_do_is_refused_at_open(driven, rate_hz, block, changes, text):
     made = driven(**changes)
     with pytest.raises(DeviceError, match=text):
@@ -392,14 +386,11 @@ def test_safe_is_a_stopped_stream_and_an_output_that_holds(
         safe_write._write(SimpleNamespace(link=None), 1.0)
 
 
-@pytest.mark.parametrize(
-    ("changes", "text"),
-    [
-        ({"profile": "labjack_t8"}, "LabJack T8 can't stream: take kind: modbus_dac"),
-        ({"output": "TDAC0"}, "output must be one that LabJack T7 can stream, DAC0, DAC1"),
-        ({"reader": {"profile": "labjack_t4", "host": "10.0.0.9"}}, "reader must be omitted"),
-    ],
-)
+@pytest.mark.parametrize(("changes", "text"), [
+    ({"profile": "labjack_t8"}, "LabJack T8 can't stream: take kind: modbus_dac"),
+    ({"output": "TDAC0"}, "output must be one that LabJack T7 can stream, DAC0, DAC1"),
+    ({"reader": {"profile": "labjack_t4", "host": "10.0.0.9"}}, "reader must be omitted"),
+])  # fmt: skip
 def test_options_that_do_not_stream_are_refused(changes, text):
     with pytest.raises(InputError, match=text):
         ModbusStream(options(**changes))
@@ -630,13 +621,10 @@ def test_a_stream_is_started_and_stopped_by_one_register(scene):
     assert len(made.device.written) == 2
 
 
-@pytest.mark.parametrize(
-    ("name", "form", "address", "constants"),
-    [
-        ("labjack_t7", "two_slopes", 0x3C4000, struct.pack(">4f", 3e-4, -3e-4, 33523.0, 0.0)),
-        ("labjack_t4", "line", 0x3C4010, struct.pack(">2f", 4e-5, -0.1)),
-    ],
-)
+@pytest.mark.parametrize(("name", "form", "address", "constants"), [
+    ("labjack_t7", "two_slopes", 0x3C4000, struct.pack(">4f", 3e-4, -3e-4, 33523.0, 0.0)),
+    ("labjack_t4", "line", 0x3C4010, struct.pack(">2f", 4e-5, -0.1)),
+])  # fmt: skip
 def test_calibration_is_read_from_flash(name, form, address, constants):
     """The pointer is set first; of input 2, whose constants may be its own."""
     asked = []

@@ -53,18 +53,15 @@ def test_data_tell_readings_backlog_and_room():
     assert (found.backlog, found.free) == (20, 8000)
 
 
-@pytest.mark.parametrize(
-    ("head", "text"),
-    [
-        ((0, 0, 2940, 0), "full: it drops scans"),
-        ((1, 0, 2941, 77, 0xFFFF), "77 scans were dropped"),
-        ((0, 0, 2942, 0), "scans overlap"),
-        ((0, 0, 2943, 0), "more scans were dropped than it can count"),
-        ((0, 0, 2944, 0), "stopped after a number of scans"),
-        ((0, 0, 2605, 0), "stream status 2605"),
-        ((2, 0, 0, 0, 5, 0xFFFF), "scans are missing"),
-    ],
-)
+@pytest.mark.parametrize(("head", "text"), [
+    ((0, 0, 2940, 0), "full: it drops scans"),
+    ((1, 0, 2941, 77, 0xFFFF), "77 scans were dropped"),
+    ((0, 0, 2942, 0), "scans overlap"),
+    ((0, 0, 2943, 0), "more scans were dropped than it can count"),
+    ((0, 0, 2944, 0), "stopped after a number of scans"),
+    ((0, 0, 2605, 0), "stream status 2605"),
+    ((2, 0, 0, 0, 5, 0xFFFF), "scans are missing"),
+])  # fmt: skip
 def test_a_stream_that_lost_something_is_an_error_in_words(head, text):
     """Every status but 0 ends the stream, and so does the mark of a dropped scan."""
     with pytest.raises(DeviceError, match=text):
@@ -152,15 +149,12 @@ def test_each_read_frame_gets_its_words():
     ]
 
 
-@pytest.mark.parametrize(
-    ("frames", "text"),
-    [
-        ([ReadFrame(0, 0)], "must be 1 to 255 .*got 0"),
-        ([WriteFrame(0, b"123")], "2 bytes each, got 3"),
-        ([WriteFrame(4400, bytes(250))], "253 bytes, got 255"),
-        ([ReadFrame(0, 127)], "253 bytes, got 255"),
-    ],
-)
+@pytest.mark.parametrize(("frames", "text"), [
+    ([ReadFrame(0, 0)], "must be 1 to 255 .*got 0"),
+    ([WriteFrame(0, b"123")], "2 bytes each, got 3"),
+    ([WriteFrame(4400, bytes(250))], "253 bytes, got 255"),
+    ([ReadFrame(0, 127)], "253 bytes, got 255"),
+])  # fmt: skip
 def test_what_no_message_holds_is_refused(frames, text):
     link = answered(b"")
     with pytest.raises(BadRequestError, match=text):
@@ -168,20 +162,13 @@ def test_what_no_message_holds_is_refused(frames, text):
     assert link.request == b""
 
 
-@pytest.mark.parametrize(
-    ("link", "error", "text"),
-    [
-        (answered(bytes.fromhex("cc 02")), RefusedError, "exception 2 .illegal data address"),
-        (answered(bytes.fromhex("03 02 0000")), MismatchError, "answered with 3"),
-        (answered(bytes.fromhex("4c 0000")), MismatchError, "must have 5 bytes, got 3"),
-        (
-            answered(bytes.fromhex("4c 00000000"), transaction=9),
-            MismatchError,
-            "transaction must be 1",
-        ),
-        (answered(bytes.fromhex("4c 00000000"), unit=2), MismatchError, "unit must be 1, got 2"),
-    ],
-)
+@pytest.mark.parametrize(("link", "error", "text"), [
+    (answered(bytes.fromhex("cc 02")), RefusedError, "exception 2 .illegal data address"),
+    (answered(bytes.fromhex("03 02 0000")), MismatchError, "answered with 3"),
+    (answered(bytes.fromhex("4c 0000")), MismatchError, "must have 5 bytes, got 3"),
+    (answered(bytes.fromhex("4c 00000000"), transaction=9), MismatchError, "transaction must be 1"),
+    (answered(bytes.fromhex("4c 00000000"), unit=2), MismatchError, "unit must be 1, got 2"),
+])  # fmt: skip
 def test_an_answer_to_something_else_is_an_error(link, error, text):
     with pytest.raises(error, match=text):
         ModbusFeedback(link, 1).read(0, 2)

@@ -35,18 +35,15 @@ def test_names_and_addresses_are_hosts(host):
 
 
 class TestPlaces:
-    @pytest.mark.parametrize(
-        ("profile", "reader", "options", "places"),
-        [
-            ("adam_4024", "adam_4117", {}, 1),
-            ("adam_4024", "adam_4117", {"reader_line": "own"}, 2),
-            ("adam_4024", "adam_4117", {"link": "tcp"}, 1),
-            ("adam_6224", "adam_6217", {}, 2),
-            ("adam_6224", "adam_6217", {"reader_line": "same", "reader_unit_id": 9}, 1),
-            ("adam_4024", "adam_6217", {}, 2),
-            ("adam_6224", "adam_4117", {}, 2),
-        ],
-    )
+    @pytest.mark.parametrize(("profile", "reader", "options", "places"), [
+        ("adam_4024", "adam_4117", {}, 1),
+        ("adam_4024", "adam_4117", {"reader_line": "own"}, 2),
+        ("adam_4024", "adam_4117", {"link": "tcp"}, 1),
+        ("adam_6224", "adam_6217", {}, 2),
+        ("adam_6224", "adam_6217", {"reader_line": "same", "reader_unit_id": 9}, 1),
+        ("adam_4024", "adam_6217", {}, 2),
+        ("adam_6224", "adam_4117", {}, 2),
+    ])  # fmt: skip
     def test_one_drives_and_the_other_reads(self, serve, profile, reader, options, places):
         served = serve(profile, reader, **options)
         device = served.device()

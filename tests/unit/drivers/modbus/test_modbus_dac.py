@@ -28,25 +28,22 @@ def made(**changes):
 
 
 class TestOptions:
-    @pytest.mark.parametrize(
-        ("changes", "words"),
-        [
-            ({"serial_port": "/dev/x"}, "either host or serial_port"),
-            ({"host": None}, "either host or serial_port"),
-            ({"host": None, "serial_port": "/dev/x", "tcp_port": 502}, "tcp_port goes with host"),
-            ({"reader": {"unit_id": 2}}, "Field required"),
-            ({"reader": {**READER, "host": "r", "serial_port": "/dev/r"}}, "one of host and"),
-            ({"reader": {**READER, "tcp_port": 502}}, "tcp_port goes with host"),
-            ({"reader": {**READER, "baud": 9600}}, "baud goes with serial_port"),
-            ({"profile": "nothing"}, "no profile 'nothing' is shipped"),
-            ({"reader": {"profile": "nothing"}}, "no profile 'nothing' is shipped"),
-            ({"profile": 7}, "valid string"),
-            ({"amplifier": {"offset_a": 1.0}}, "must have one of gain_a_per_v"),
-            ({"amplifier": {"gain_a_per_v": 1.0, "gain_v_per_v": 1.0}}, "must have one of"),
-            ({"amplifier": {"gain_v_per_v": 1.0, "offset_a": 1.0}}, "offset must be in the unit"),
-            ({"sensor": {"offset_um": 1.0}}, "must have one of um_per_v"),
-        ],
-    )
+    @pytest.mark.parametrize(("changes", "words"), [
+        ({"serial_port": "/dev/x"}, "either host or serial_port"),
+        ({"host": None}, "either host or serial_port"),
+        ({"host": None, "serial_port": "/dev/x", "tcp_port": 502}, "tcp_port goes with host"),
+        ({"reader": {"unit_id": 2}}, "Field required"),
+        ({"reader": {**READER, "host": "r", "serial_port": "/dev/r"}}, "one of host and"),
+        ({"reader": {**READER, "tcp_port": 502}}, "tcp_port goes with host"),
+        ({"reader": {**READER, "baud": 9600}}, "baud goes with serial_port"),
+        ({"profile": "nothing"}, "no profile 'nothing' is shipped"),
+        ({"reader": {"profile": "nothing"}}, "no profile 'nothing' is shipped"),
+        ({"profile": 7}, "valid string"),
+        ({"amplifier": {"offset_a": 1.0}}, "must have one of gain_a_per_v"),
+        ({"amplifier": {"gain_a_per_v": 1.0, "gain_v_per_v": 1.0}}, "must have one of"),
+        ({"amplifier": {"gain_v_per_v": 1.0, "offset_a": 1.0}}, "offset must be in the unit"),
+        ({"sensor": {"offset_um": 1.0}}, "must have one of um_per_v"),
+    ])  # fmt: skip
     def test_options_that_contradict_themselves(self, changes, words):
         with pytest.raises(ValidationError, match=words):
             made(**changes)
@@ -55,26 +52,23 @@ class TestOptions:
         with pytest.raises(ValidationError, match="watchdog"):
             ModbusOptions.model_validate({key: T7[key] for key in T7 if key != "watchdog"})
 
-    @pytest.mark.parametrize(
-        ("changes", "words"),
-        [
-            ({"output": "DAC9"}, "output must be one that LabJack T7 has, got 'DAC9'"),
-            ({"input": "AIN9"}, "input must be one that LabJack T7 has"),
-            ({"amplifier": None}, "amplifier is required"),
-            ({"amplifier": {"gain_a_per_ma": 1.0}}, "amplifier takes mA"),
-            ({"sensor": {"um_per_ma": 1.0}}, "sensor gives mA"),
-            ({"profile": "kepco_bop"}, "kepco_bop"),
-            ({"host": None, "serial_port": "/dev/x"}, "is for Modbus tcp: give host"),
-            ({"watchdog": {"timeout_s": 1.0}, "output": "TDAC0"}, "does nothing for TDAC0"),
-            ({"timeout_s": 1e-4}, "timeout_s must be > 0.001"),
-            ({"baud": 9600, "parity": "E"}, "baud, parity must be omitted"),
-            ({**READS, "input": "AI9"}, "input must be one that Advantech ADAM-6217 has"),
-            ({"reader": {"profile": "adam_6217"}, "input": "AI0"}, "both be unit 1 at h:502"),
-            ({**READS, "reader": {"profile": "kepco_bop"}}, "kepco_bop"),
-            ({**READS, "output": "AI0", "profile": "adam_6217"}, "output must be one that"),
-            ({**READS, "reader": {**READER, "serial_port": "/dev/r"}}, "tcp: give reader.host"),
-        ],
-    )
+    @pytest.mark.parametrize(("changes", "words"), [
+        ({"output": "DAC9"}, "output must be one that LabJack T7 has, got 'DAC9'"),
+        ({"input": "AIN9"}, "input must be one that LabJack T7 has"),
+        ({"amplifier": None}, "amplifier is required"),
+        ({"amplifier": {"gain_a_per_ma": 1.0}}, "amplifier takes mA"),
+        ({"sensor": {"um_per_ma": 1.0}}, "sensor gives mA"),
+        ({"profile": "kepco_bop"}, "kepco_bop"),
+        ({"host": None, "serial_port": "/dev/x"}, "is for Modbus tcp: give host"),
+        ({"watchdog": {"timeout_s": 1.0}, "output": "TDAC0"}, "does nothing for TDAC0"),
+        ({"timeout_s": 1e-4}, "timeout_s must be > 0.001"),
+        ({"baud": 9600, "parity": "E"}, "baud, parity must be omitted"),
+        ({**READS, "input": "AI9"}, "input must be one that Advantech ADAM-6217 has"),
+        ({"reader": {"profile": "adam_6217"}, "input": "AI0"}, "both be unit 1 at h:502"),
+        ({**READS, "reader": {"profile": "kepco_bop"}}, "kepco_bop"),
+        ({**READS, "output": "AI0", "profile": "adam_6217"}, "output must be one that"),
+        ({**READS, "reader": {**READER, "serial_port": "/dev/r"}}, "tcp: give reader.host"),
+    ])  # fmt: skip
     def test_options_that_do_not_go_with_the_profile(self, changes, words):
         with pytest.raises(InputError, match=words):
             made(**changes)
@@ -113,17 +107,14 @@ SILENCE_S = 0.5
 
 
 class TestExchange:
-    @pytest.mark.parametrize(
-        ("profile", "without", "one"),
-        [
-            ("labjack_t7", {}, True),
-            ("labjack_t7", {"lacking": frozenset({76})}, False),
-            ("wago_750", {}, True),
-            ("wago_750", {"lacking": frozenset({23})}, False),
-            ("wago_750", {"mute": frozenset({23})}, False),
-            ("icp_et7000", {}, False),
-        ],
-    )
+    @pytest.mark.parametrize(("profile", "without", "one"), [
+        ("labjack_t7", {}, True),
+        ("labjack_t7", {"lacking": frozenset({76})}, False),
+        ("wago_750", {}, True),
+        ("wago_750", {"lacking": frozenset({23})}, False),
+        ("wago_750", {"mute": frozenset({23})}, False),
+        ("icp_et7000", {}, False),
+    ])  # fmt: skip
     def test_one_transaction_is_found_out_without_moving(self, serve, profile, without, one):
         served = serve(profile, **without)
         device = served.running(10.0, timeout_s=0.5)
@@ -180,23 +171,20 @@ class TestExchange:
         exchange(device, 1.0)
         device.close()
 
-    @pytest.mark.parametrize(
-        ("link", "fault", "said"),
-        [
-            ("tcp", "silence", "no answer within"),
-            ("tcp", "corrupt", "not a Modbus TCP header"),
-            ("tcp", "cut", "only 6 bytes, 2 short, within"),
-            ("tcp", "duplicate", "bytes behind the end of the reply"),
-            ("tcp", "wrong_id", "transaction must be"),
-            ("tcp", "reset", "connection lost"),
-            ("tcp", "exception", "exception 4"),
-            ("rtu", "silence", "no answer within"),
-            ("rtu", "corrupt", "CRC of 9 bytes is wrong"),
-            ("rtu", "cut", "short, within"),
-            ("rtu", "duplicate", "CRC of 18 bytes is wrong"),
-            ("rtu", "wrong_id", "unit must be 1, got 2"),
-        ],
-    )
+    @pytest.mark.parametrize(("link", "fault", "said"), [
+        ("tcp", "silence", "no answer within"),
+        ("tcp", "corrupt", "not a Modbus TCP header"),
+        ("tcp", "cut", "only 6 bytes, 2 short, within"),
+        ("tcp", "duplicate", "bytes behind the end of the reply"),
+        ("tcp", "wrong_id", "transaction must be"),
+        ("tcp", "reset", "connection lost"),
+        ("tcp", "exception", "exception 4"),
+        ("rtu", "silence", "no answer within"),
+        ("rtu", "corrupt", "CRC of 9 bytes is wrong"),
+        ("rtu", "cut", "short, within"),
+        ("rtu", "duplicate", "CRC of 18 bytes is wrong"),
+        ("rtu", "wrong_id", "unit must be 1, got 2"),
+    ])  # fmt: skip
     def test_bad_answer_is_told(self, serve, module, link, fault, said):
         profile = module if link == "rtu" else "labjack_t7"
         served = serve(profile, faults=(parse_fault(f"{fault}@1s"),))

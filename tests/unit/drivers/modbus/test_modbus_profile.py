@@ -41,13 +41,10 @@ def test_rate_and_depth_follow_from_the_device_s_own_figures(text):
     assert (streaming.fifo_depth, streaming.rate_max_hz) == (8192, 50_000.0)
 
 
-@pytest.mark.parametrize(
-    ("name", "old", "new", "rule"),
-    [
-        ("generic_float32", "OUT: {address: 0,", "OUT: {address: 1,", "registers of .* overlap"),
-        ("icp_m7024", "kind: rtu,", "kind: rtu, bytesize: 7,", "link.bytesize"),
-    ],
-)
+@pytest.mark.parametrize(("name", "old", "new", "rule"), [
+    ("generic_float32", "OUT: {address: 0,", "OUT: {address: 1,", "registers of .* overlap"),
+    ("icp_m7024", "kind: rtu,", "kind: rtu, bytesize: 7,", "link.bytesize"),
+])  # fmt: skip
 def test_lines_and_registers_that_cannot_work_are_refused(name, old, new, rule):
     text = shipped_profiles()[name].read_text(encoding="utf-8")
     assert old in text
@@ -55,17 +52,14 @@ def test_lines_and_registers_that_cannot_work_are_refused(name, old, new, rule):
         parse_profile(text.replace(old, new, 1), "here")
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "rule"),
-    [
-        ("buffer_bytes: 16384", "buffer_bytes: 16000", "buffer_bytes must be a power of 2"),
-        ("buffer_bytes: 16384", "buffer_bytes: 16", "buffer_bytes"),
-        ("outputs: [DAC0, DAC1]", "outputs: [DAC0, DAC7]", "streaming.outputs must be outputs"),
-        ("inputs: [AIN0, ", "inputs: [AIN9, ", "streaming.inputs must be inputs"),
-        ("kind: labjack\n", "kind: other\n", "kind"),
-        ("calibration: two_slopes", "calibration: none", "calibration"),
-    ],
-)
+@pytest.mark.parametrize(("old", "new", "rule"), [
+    ("buffer_bytes: 16384", "buffer_bytes: 16000", "buffer_bytes must be a power of 2"),
+    ("buffer_bytes: 16384", "buffer_bytes: 16", "buffer_bytes"),
+    ("outputs: [DAC0, DAC1]", "outputs: [DAC0, DAC7]", "streaming.outputs must be outputs"),
+    ("inputs: [AIN0, ", "inputs: [AIN9, ", "streaming.inputs must be inputs"),
+    ("kind: labjack\n", "kind: other\n", "kind"),
+    ("calibration: two_slopes", "calibration: none", "calibration"),
+])  # fmt: skip
 def test_rules_are_told(text, old, new, rule):
     assert old in text
     with pytest.raises(ConfigError, match=rule):

@@ -277,14 +277,11 @@ class TestRtu:
         assert ratio == pytest.approx(11 / 10)
 
 
-@pytest.mark.parametrize(
-    ("output", "one", "rate_hz", "text"),
-    [
-        ("DAC0", True, 1000.0, "FC76 over TCP: turnaround 1.00 ms -> at most 1000 Hz"),
-        ("DAC0", False, 500.0, "FC03+FC16 over TCP: turnaround 2.00 ms -> at most 500 Hz"),
-        ("TDAC0", False, 1000 / 3, "turnaround 2.00 ms, settling 1.00 ms -> at most 333 Hz"),
-    ],
-)
+@pytest.mark.parametrize(("output", "one", "rate_hz", "text"), [
+    ("DAC0", True, 1000.0, "FC76 over TCP: turnaround 1.00 ms -> at most 1000 Hz"),
+    ("DAC0", False, 500.0, "FC03+FC16 over TCP: turnaround 2.00 ms -> at most 500 Hz"),
+    ("TDAC0", False, 1000 / 3, "turnaround 2.00 ms, settling 1.00 ms -> at most 333 Hz"),
+])  # fmt: skip
 def test_time_over_tcp_is_the_device_s_own(output, one, rate_hz, text):
     """A LabJack T7 takes 1 ms a round trip, and an LJTick-DAC another one to settle."""
     time = exchange_time(load_profile("labjack_t7"), output, "AIN0", one_transaction=one)
@@ -306,21 +303,15 @@ def requests_s(*pdus):
 READ, WRITE = read_pdu(3, 101, 1), write_single_pdu(101, bytes(2))
 
 
-@pytest.mark.parametrize(
-    ("feed", "seconds"),
-    [
-        (FEED, requests_s(WRITE)),
-        (FEED.replace("}", ", verify: true}"), requests_s(WRITE, READ)),
-        (FEED.replace("write", "ensure"), requests_s(READ, WRITE, READ)),
-        (FEED.replace("write", "expect"), requests_s(READ)),
-        ("{kind: wait, seconds: 0.25}", 0.25),
-        (f"{FEED}\n    - {{kind: wait, seconds: 0.25}}", requests_s(WRITE) + 0.25),
-        (
-            "{kind: write, area: coil, address: 7, type: bit, value: 1}",
-            requests_s(coil_pdu(7, True)),
-        ),
-    ],
-)
+@pytest.mark.parametrize(("feed", "seconds"), [
+    (FEED, requests_s(WRITE)),
+    (FEED.replace("}", ", verify: true}"), requests_s(WRITE, READ)),
+    (FEED.replace("write", "ensure"), requests_s(READ, WRITE, READ)),
+    (FEED.replace("write", "expect"), requests_s(READ)),
+    ("{kind: wait, seconds: 0.25}", 0.25),
+    (f"{FEED}\n    - {{kind: wait, seconds: 0.25}}", requests_s(WRITE) + 0.25),
+    ("{kind: write, area: coil, address: 7, type: bit, value: 1}", requests_s(coil_pdu(7, True))),
+])  # fmt: skip
 def test_each_kind_of_step_counts_with_all_that_it_may_send(feed, seconds):
     assert feed_time(acme(feed)).total_s == pytest.approx(seconds)
 

@@ -52,44 +52,23 @@ EXAMPLES = [
     pytest.param(read_pdu(1, 0x13, 19), "01 0013 0013", "01 03 CD6B05", "CD6B05", id="6.1"),
     pytest.param(read_pdu(2, 0xC4, 22), "02 00C4 0016", "02 03 ACDB35", "ACDB35", id="6.2"),
     pytest.param(
-        read_pdu(3, 0x6B, 3), "03 006B 0003", "03 06 022B 0000 0064", "022B00000064", id="6.3"
-    ),
+        read_pdu(3, 0x6B, 3), "03 006B 0003", "03 06 022B 0000 0064", "022B00000064", id="6.3"),
     pytest.param(read_pdu(4, 8, 1), "04 0008 0001", "04 02 000A", "000A", id="6.4"),
     pytest.param(coil_pdu(0xAC, True), "05 00AC FF00", "05 00AC FF00", "", id="6.5"),
     pytest.param(write_single_pdu(1, H("0003")), "06 0001 0003", "06 0001 0003", "", id="6.6"),
     pytest.param(
-        write_pdu(1, H("000A0102")), "10 0001 0002 04 000A 0102", "10 0001 0002", "", id="6.12"
-    ),
-    pytest.param(
-        write_read_pdu(3, 6, 14, H("00FF00FF00FF")),
-        "17 0003 0006 000E 0003 06 00FF 00FF 00FF",
-        "17 0C 00FE 0ACD 0001 0003 000D 00FF",
-        "00FE0ACD00010003000D00FF",
-        id="6.17",
-    ),
+        write_pdu(1, H("000A0102")), "10 0001 0002 04 000A 0102", "10 0001 0002", "", id="6.12"),
+    pytest.param(write_read_pdu(3, 6, 14, H("00FF00FF00FF")),
+        "17 0003 0006 000E 0003 06 00FF 00FF 00FF", "17 0C 00FE 0ACD 0001 0003 000D 00FF",
+        "00FE0ACD00010003000D00FF", id="6.17"),
     # Beijer GN-9289 manual 8.2.10.
-    pytest.param(
-        write_read_pdu(0x800, 2, 0x800, H("11223344")),
-        "17 0800 0002 0800 0002 04 1122 3344",
-        "17 04 1122 3344",
-        "11223344",
-        id="GN-9289",
-    ),
+    pytest.param(write_read_pdu(0x800, 2, 0x800, H("11223344")),
+        "17 0800 0002 0800 0002 04 1122 3344", "17 04 1122 3344", "11223344", id="GN-9289"),
     # LabJack's frames: write "01 addr16 nregs data", read "00 addr16 nregs"; the reply is data.
-    pytest.param(
-        read_and_write(1000, H("40200000"), 0, 2),
-        "4C 00 0000 02 01 03E8 02 40200000",
-        "4C 3F800000",
-        "3F800000",
-        id="LabJack MBFB",
-    ),
-    pytest.param(
-        read_and_write(3, H("12345678"), 1, 1),
-        "4C 00 0001 01 01 0003 02 12345678",
-        "4C 9ABC",
-        "9ABC",
-        id="LabJack MBFB, other sizes",
-    ),
+    pytest.param(read_and_write(1000, H("40200000"), 0, 2), "4C 00 0000 02 01 03E8 02 40200000",
+        "4C 3F800000", "3F800000", id="LabJack MBFB"),
+    pytest.param(read_and_write(3, H("12345678"), 1, 1), "4C 00 0001 01 01 0003 02 12345678",
+        "4C 9ABC", "9ABC", id="LabJack MBFB, other sizes"),
 ]  # fmt: skip
 
 
@@ -100,15 +79,12 @@ def test_published_examples(pdu, request_hex, reply_hex, data_hex):
     assert reply_data(pdu, H(reply_hex)) == H(data_hex)
 
 
-@pytest.mark.parametrize(
-    ("pdu", "wire"),
-    [
-        (write_single_pdu(0, (1000).to_bytes(2, "big")), "01 06 00 00 03 E8 89 74"),
-        (read_pdu(3, 0x6B, 3), "01 03 00 6B 00 03 74 17"),
-        (H("03 06 02 2B 00 00 00 64"), "01 03 06 02 2B 00 00 00 64 05 7A"),
-        (read_pdu(4, 0, 8), "01 04 00 00 00 08 F1 CC"),
-    ],
-)
+@pytest.mark.parametrize(("pdu", "wire"), [
+    (write_single_pdu(0, (1000).to_bytes(2, "big")), "01 06 00 00 03 E8 89 74"),
+    (read_pdu(3, 0x6B, 3), "01 03 00 6B 00 03 74 17"),
+    (H("03 06 02 2B 00 00 00 64"), "01 03 06 02 2B 00 00 00 64 05 7A"),
+    (read_pdu(4, 0, 8), "01 04 00 00 00 08 F1 CC"),
+])  # fmt: skip
 def test_published_rtu_frames(pdu, wire):
     """Waveshare AO 8CH (1000 to channel 1, reading 8), and a valve manual's read of 3 registers."""
     assert rtu_adu(1, pdu) == H(wire)
@@ -174,92 +150,83 @@ def test_exceptions_are_refusals_with_their_code(code, name):
     assert caught.value.code == code
 
 
-@pytest.mark.parametrize(
-    ("build", "arguments"),
-    [
-        (read_pdu, (3, 0, 126)),
-        (read_pdu, (4, 0, 0)),
-        (read_pdu, (3, 65535, 2)),
-        (read_pdu, (3, -1, 1)),
-        (read_pdu, (1, 0, 2001)),
-        (read_pdu, (2, 65536, 1)),
-        (write_pdu, (0, bytes(248))),
-        (write_pdu, (0, b"")),
-        (write_pdu, (0, b"abc")),
-        (write_pdu, (65535, FOUR)),
-        (write_single_pdu, (0, FOUR)),
-        (write_single_pdu, (0, b"")),
-        (write_single_pdu, (0, b"a")),
-        (write_single_pdu, (65536, b"ab")),
-        (coil_pdu, (-1, True)),
-        (coil_pdu, (65536, False)),
-        (write_read_pdu, (0, 126, 0, FOUR)),
-        (write_read_pdu, (0, 0, 0, FOUR)),
-        (write_read_pdu, (0, 1, 0, bytes(244))),
-        (write_read_pdu, (0, 1, 0, b"")),
-        (write_read_pdu, (65535, 2, 0, FOUR)),
-        (write_read_pdu, (0, 2, 65535, FOUR)),
-        (read_and_write, (0, bytes(246), 0, 1)),
-        (read_and_write, (0, FOUR, 0, 127)),
-        (read_and_write, (0, b"abc", 0, 2)),
-        (read_and_write, (65535, FOUR, 0, 2)),
-        (read_and_write, (0, FOUR, 65536, 1)),
-        (tcp_adu, (0, 256, FOUR)),
-        (tcp_adu, (0, 1, b"")),
-        (tcp_adu, (0, 1, bytes(254))),
-        (rtu_adu, (0, FOUR)),
-        (rtu_adu, (256, FOUR)),
-        (rtu_adu, (1, bytes(254))),
-    ],
-)
+@pytest.mark.parametrize(("build", "arguments"), [
+    (read_pdu, (3, 0, 126)),
+    (read_pdu, (4, 0, 0)),
+    (read_pdu, (3, 65535, 2)),
+    (read_pdu, (3, -1, 1)),
+    (read_pdu, (1, 0, 2001)),
+    (read_pdu, (2, 65536, 1)),
+    (write_pdu, (0, bytes(248))),
+    (write_pdu, (0, b"")),
+    (write_pdu, (0, b"abc")),
+    (write_pdu, (65535, FOUR)),
+    (write_single_pdu, (0, FOUR)),
+    (write_single_pdu, (0, b"")),
+    (write_single_pdu, (0, b"a")),
+    (write_single_pdu, (65536, b"ab")),
+    (coil_pdu, (-1, True)),
+    (coil_pdu, (65536, False)),
+    (write_read_pdu, (0, 126, 0, FOUR)),
+    (write_read_pdu, (0, 0, 0, FOUR)),
+    (write_read_pdu, (0, 1, 0, bytes(244))),
+    (write_read_pdu, (0, 1, 0, b"")),
+    (write_read_pdu, (65535, 2, 0, FOUR)),
+    (write_read_pdu, (0, 2, 65535, FOUR)),
+    (read_and_write, (0, bytes(246), 0, 1)),
+    (read_and_write, (0, FOUR, 0, 127)),
+    (read_and_write, (0, b"abc", 0, 2)),
+    (read_and_write, (65535, FOUR, 0, 2)),
+    (read_and_write, (0, FOUR, 65536, 1)),
+    (tcp_adu, (0, 256, FOUR)),
+    (tcp_adu, (0, 1, b"")),
+    (tcp_adu, (0, 1, bytes(254))),
+    (rtu_adu, (0, FOUR)),
+    (rtu_adu, (256, FOUR)),
+    (rtu_adu, (1, bytes(254))),
+])  # fmt: skip
 def test_what_the_specification_does_not_allow_is_not_built(build, arguments):
     """Counts, addresses past 65535, odd data, units and transactions."""
     with pytest.raises(BadRequestError):
         build(*arguments)
 
 
-@pytest.mark.parametrize(
-    "pdu",
-    [
-        read_pdu(1, 63536, 2000),
-        read_pdu(3, 65411, 125),
-        write_pdu(65413, bytes(246)),
-        write_read_pdu(65411, 125, 65415, bytes(242)),
-        read_and_write(0, bytes(244), 65410, 126),
-        coil_pdu(65535, True),
-    ],
-)
+@pytest.mark.parametrize("pdu", [
+    read_pdu(1, 63536, 2000),
+    read_pdu(3, 65411, 125),
+    write_pdu(65413, bytes(246)),
+    write_read_pdu(65411, 125, 65415, bytes(242)),
+    read_and_write(0, bytes(244), 65410, 126),
+    coil_pdu(65535, True),
+])  # fmt: skip
 def test_the_largest_of_each_fits(pdu):
     assert len(pdu) <= 253
     assert reply_size(pdu) <= 253
     assert rtu_pdu(rtu_adu(247, pdu), 247) == tcp_pdu(tcp_adu(65535, 0, pdu), 65535, 0) == pdu
 
 
-@pytest.mark.parametrize(
-    ("pdu", "reply"),
-    [
-        (read_pdu(3, 0, 2), "04 04 00000000"),
-        (read_pdu(3, 0, 2), "03 02 0000"),
-        (read_pdu(3, 0, 2), "03 04 000000"),
-        (read_pdu(3, 0, 2), "03 04 0000000000"),
-        (read_pdu(3, 0, 2), "03 03 00000000"),
-        (read_pdu(3, 0, 2), "84 02"),
-        (read_pdu(3, 0, 2), "83"),
-        (read_pdu(3, 0, 2), "83 02 00"),
-        (read_pdu(3, 0, 2), ""),
-        (read_pdu(1, 0, 9), "01 01 00"),
-        (write_pdu(1, FOUR), "10 0002 0002"),
-        (write_pdu(1, FOUR), "10 0001 0001"),
-        (write_pdu(1, FOUR), "10 0001"),
-        (write_single_pdu(1, b"ab"), "06 0001 6163"),
-        (write_single_pdu(1, b"ab"), "06 0002 6162"),
-        (coil_pdu(1, True), "05 0001 0000"),
-        (write_read_pdu(0, 2, 9, FOUR), "17 02 0000"),
-        (write_read_pdu(0, 2, 9, FOUR), "03 04 00000000"),
-        (read_and_write(0, FOUR, 0, 2), "4C 0000"),
-        (read_and_write(0, FOUR, 0, 2), "4C 0000000000"),
-    ],
-)
+@pytest.mark.parametrize(("pdu", "reply"), [
+    (read_pdu(3, 0, 2), "04 04 00000000"),
+    (read_pdu(3, 0, 2), "03 02 0000"),
+    (read_pdu(3, 0, 2), "03 04 000000"),
+    (read_pdu(3, 0, 2), "03 04 0000000000"),
+    (read_pdu(3, 0, 2), "03 03 00000000"),
+    (read_pdu(3, 0, 2), "84 02"),
+    (read_pdu(3, 0, 2), "83"),
+    (read_pdu(3, 0, 2), "83 02 00"),
+    (read_pdu(3, 0, 2), ""),
+    (read_pdu(1, 0, 9), "01 01 00"),
+    (write_pdu(1, FOUR), "10 0002 0002"),
+    (write_pdu(1, FOUR), "10 0001 0001"),
+    (write_pdu(1, FOUR), "10 0001"),
+    (write_single_pdu(1, b"ab"), "06 0001 6163"),
+    (write_single_pdu(1, b"ab"), "06 0002 6162"),
+    (coil_pdu(1, True), "05 0001 0000"),
+    (write_read_pdu(0, 2, 9, FOUR), "17 02 0000"),
+    (write_read_pdu(0, 2, 9, FOUR), "03 04 00000000"),
+    (read_and_write(0, FOUR, 0, 2), "4C 0000"),
+    (read_and_write(0, FOUR, 0, 2), "4C 0000000000"),
+])  # fmt: skip
 def test_answers_to_something_else_are_mismatches(pdu, reply):
     with pytest.raises(MismatchError):
         reply_data(pdu, H(reply))
@@ -268,19 +235,16 @@ def test_answers_to_something_else_are_mismatches(pdu, reply):
 GOOD = H("0102 0000 0005 11 03 02 0005")
 
 
-@pytest.mark.parametrize(
-    ("adu", "error", "rule"),
-    [
-        (H("0103 0000 0005 11 03 02 0005"), MismatchError, "transaction must be 258, got 259"),
-        (H("0102 0000 0005 12 03 02 0005"), MismatchError, "unit must be 17, got 18"),
-        (H("0102 0001 0005 11 03 02 0005"), CorruptError, "not a Modbus TCP header"),
-        (H("0102 0000 0001 11 03 02 0005"), CorruptError, "not a Modbus TCP header"),
-        (H("0102 0000 00FF 11 03 02 0005"), CorruptError, "not a Modbus TCP header"),
-        (H("0102 0000 0006 11 03 02 0005"), IncompleteError, "11 of 12"),
-        (H("0102 0000 0004 11 03 02 0005"), CorruptError, "1 bytes behind"),
-        (GOOD * 2, CorruptError, "11 bytes behind"),
-    ],
-)
+@pytest.mark.parametrize(("adu", "error", "rule"), [
+    (H("0103 0000 0005 11 03 02 0005"), MismatchError, "transaction must be 258, got 259"),
+    (H("0102 0000 0005 12 03 02 0005"), MismatchError, "unit must be 17, got 18"),
+    (H("0102 0001 0005 11 03 02 0005"), CorruptError, "not a Modbus TCP header"),
+    (H("0102 0000 0001 11 03 02 0005"), CorruptError, "not a Modbus TCP header"),
+    (H("0102 0000 00FF 11 03 02 0005"), CorruptError, "not a Modbus TCP header"),
+    (H("0102 0000 0006 11 03 02 0005"), IncompleteError, "11 of 12"),
+    (H("0102 0000 0004 11 03 02 0005"), CorruptError, "1 bytes behind"),
+    (GOOD * 2, CorruptError, "11 bytes behind"),
+])  # fmt: skip
 def test_tcp_headers_of_something_else(adu, error, rule):
     with pytest.raises(error, match=rule):
         tcp_pdu(adu, 258, 17)

@@ -44,15 +44,12 @@ def test_offset_binary_of_a_bipolar_range():
     assert channel.encode(channel.offset + 0x8000 * channel.scale) == b"\x80\0"
 
 
-@pytest.mark.parametrize(
-    ("kind", "low", "high"),
-    [
-        ("int16", -(2**15), 2**15 - 1),
-        ("uint16", 0, 2**16 - 1),
-        ("int32", -(2**31), 2**31 - 1),
-        ("uint32", 0, 2**32 - 1),
-    ],
-)
+@pytest.mark.parametrize(("kind", "low", "high"), [
+    ("int16", -(2**15), 2**15 - 1),
+    ("uint16", 0, 2**16 - 1),
+    ("int32", -(2**31), 2**31 - 1),
+    ("uint32", 0, 2**32 - 1),
+])  # fmt: skip
 def test_integers_reach_their_ends_and_no_further(kind, low, high):
     channel = RegisterFormat(kind)
     assert channel.limits == (low, high)
@@ -109,18 +106,15 @@ def test_decoding_wants_exactly_its_bytes(size):
             RegisterFormat("float32", order).decode(bytes(size))
 
 
-@pytest.mark.parametrize(
-    ("arguments", "rule"),
-    [
-        (("int32", "AB"), "each of ABCD once"),
-        (("int32", "ABCC"), "each of ABCD once"),
-        (("int16", "ABCD"), "each of AB once"),
-        (("int32", "abcd"), "each of ABCD once"),
-        (("int16", "AB", 0.0), "scale"),
-        (("int16", "AB", math.nan), "scale"),
-        (("int16", "AB", 1.0, math.inf), "offset"),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "rule"), [
+    (("int32", "AB"), "each of ABCD once"),
+    (("int32", "ABCC"), "each of ABCD once"),
+    (("int16", "ABCD"), "each of AB once"),
+    (("int32", "abcd"), "each of ABCD once"),
+    (("int16", "AB", 0.0), "scale"),
+    (("int16", "AB", math.nan), "scale"),
+    (("int16", "AB", 1.0, math.inf), "offset"),
+])  # fmt: skip
 def test_formats_that_make_no_sense_are_refused(arguments, rule):
     with pytest.raises(BadRequestError, match=rule) as caught:
         RegisterFormat(*arguments)
@@ -139,21 +133,18 @@ def test_size_and_order_left_out():
 VOLTS = {"address": 1, "unit": "V", "min": -10.0, "max": 10.0}
 
 
-@pytest.mark.parametrize(
-    ("area", "address", "base", "wire"),
-    [
-        ("holding", 0, 0, 0),
-        ("holding", 1, 1, 0),
-        ("holding", 0, 1, -1),
-        ("holding", 40001, "modicon", 0),
-        ("holding", 49999, "modicon", 9998),
-        ("holding", 400001, "modicon", 0),
-        ("holding", 465536, "modicon", 65535),
-        ("holding", 30001, "modicon", -1),
-        ("input", 30011, "modicon", 10),
-        ("coil", 1, "modicon", 0),
-    ],
-)
+@pytest.mark.parametrize(("area", "address", "base", "wire"), [
+    ("holding", 0, 0, 0),
+    ("holding", 1, 1, 0),
+    ("holding", 0, 1, -1),
+    ("holding", 40001, "modicon", 0),
+    ("holding", 49999, "modicon", 9998),
+    ("holding", 400001, "modicon", 0),
+    ("holding", 465536, "modicon", 65535),
+    ("holding", 30001, "modicon", -1),
+    ("input", 30011, "modicon", 10),
+    ("coil", 1, "modicon", 0),
+])  # fmt: skip
 def test_addresses_are_those_of_the_frame(area, address, base, wire):
     """-1 where there is none."""
     kind = "bit" if area == "coil" else "uint16"

@@ -43,16 +43,13 @@ def wave(n):
 
 
 class TestVariedRig:
-    @pytest.mark.parametrize(
-        ("name", "attribute", "power"),
-        [
-            ("lag", "lag_s", 1),
-            ("pinning", "pinning_max_a_per_m", 1),
-            ("strain", "strain_um", 1),
-            ("resonance", "stiffness_n_per_m", 2),
-            ("damping", "damping_ratio", 1),
-        ],
-    )
+    @pytest.mark.parametrize(("name", "attribute", "power"), [
+        ("lag", "lag_s", 1),
+        ("pinning", "pinning_max_a_per_m", 1),
+        ("strain", "strain_um", 1),
+        ("resonance", "stiffness_n_per_m", 2),
+        ("damping", "damping_ratio", 1),
+    ])  # fmt: skip
     def test_factor(self, name, attribute, power):
         """Each factor changes one constant, which is kept with a recording, and the motion."""
         varied = terfenol(noise=False, vary={name: 1.1})

@@ -36,16 +36,13 @@ def payloads_of(split):
     return [None if isinstance(each, CorruptError) else each for each in split]
 
 
-@pytest.mark.parametrize(
-    ("payload", "wire"),
-    [
-        ("00", "01 01 00"),
-        ("00 00", "01 01 01 00"),
-        ("11 22 00 33", "03 11 22 02 33 00"),
-        ("11 22 33 44", "05 11 22 33 44 00"),
-        ("11 00 00 00", "02 11 01 01 01 00"),
-    ],
-)
+@pytest.mark.parametrize(("payload", "wire"), [
+    ("00", "01 01 00"),
+    ("00 00", "01 01 01 00"),
+    ("11 22 00 33", "03 11 22 02 33 00"),
+    ("11 22 33 44", "05 11 22 33 44 00"),
+    ("11 00 00 00", "02 11 01 01 01 00"),
+])  # fmt: skip
 def test_cobs_of_published_examples(payload, wire):
     """Known encodings from the literature on COBS, without a CRC."""
     framing = CobsFraming(CRCS["none"])
@@ -102,20 +99,17 @@ def test_cobs_size_on_the_wire_is_the_largest_there_is():
     assert [str(each) for each in splitter.feed(b"\x01")] == ["no end within 9 bytes"]
 
 
-@pytest.mark.parametrize(
-    ("framing", "frame", "text"),
-    [
-        (COBS, b"\0", "got -2"),
-        (COBS, b"\0\5", "^1 bytes behind"),
-        (COBS, b"\2\1\0\0\0", "^2 bytes behind"),
-        (COBS, b"\5\1\0", "not a COBS frame"),
-        (COBS, b"\4\1\2\3\0", "crc16_modbus of 1 bytes is wrong: 01"),
-        (COBS, b"\x15" + 20 * b"\7" + b"\0", "of 18 bytes is wrong:" + 16 * " 07" + "$"),
-        (LENGTH, b"\1\0\7\0\0", "crc16_modbus of 3 bytes is wrong: 01 00 07"),
-        (LENGTH, LENGTH.encode(b"\7") + b"\0\0", "^2 bytes behind"),
-        (LENGTH, b"\1\x10", "got 4097"),
-    ],
-)
+@pytest.mark.parametrize(("framing", "frame", "text"), [
+    (COBS, b"\0", "got -2"),
+    (COBS, b"\0\5", "^1 bytes behind"),
+    (COBS, b"\2\1\0\0\0", "^2 bytes behind"),
+    (COBS, b"\5\1\0", "not a COBS frame"),
+    (COBS, b"\4\1\2\3\0", "crc16_modbus of 1 bytes is wrong: 01"),
+    (COBS, b"\x15" + 20 * b"\7" + b"\0", "of 18 bytes is wrong:" + 16 * " 07" + "$"),
+    (LENGTH, b"\1\0\7\0\0", "crc16_modbus of 3 bytes is wrong: 01 00 07"),
+    (LENGTH, LENGTH.encode(b"\7") + b"\0\0", "^2 bytes behind"),
+    (LENGTH, b"\1\x10", "got 4097"),
+])  # fmt: skip
 def test_corrupt_frames_are_told_in_words(framing, frame, text):
     """What is wrong with a frame is said, with sizes and at most its first 16 bytes."""
     with pytest.raises(CorruptError, match=text):
@@ -129,14 +123,11 @@ def test_payloads_that_do_not_fit_are_refused(framing, size):
         framing.encode(bytes(size))
 
 
-@pytest.mark.parametrize(
-    ("kind", "crc", "size", "text"),
-    [
-        ("length", "crc32", 0, "payload_max .*got 0$"),
-        ("length", "crc32", 65536, "payload_max .*got 65536$"),
-        ("length", "none", 100, "need a CRC"),
-    ],
-)
+@pytest.mark.parametrize(("kind", "crc", "size", "text"), [
+    ("length", "crc32", 0, "payload_max .*got 0$"),
+    ("length", "crc32", 65536, "payload_max .*got 65536$"),
+    ("length", "none", 100, "need a CRC"),
+])  # fmt: skip
 def test_framings_that_cannot_be_are_refused(kind, crc, size, text):
     """Without a check nothing would tell the beginning of a length-prefixed frame."""
     with pytest.raises(BadRequestError, match=text):

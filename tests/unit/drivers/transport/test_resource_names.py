@@ -113,22 +113,19 @@ def names(monkeypatch):
     resource_names._addresses.cache_clear()
 
 
-@pytest.mark.parametrize(
-    ("host", "name"),
-    [
-        ("10.0.0.5", "tcp:10.0.0.5:502"),
-        ("::ffff:10.0.0.5", "tcp:10.0.0.5:502"),
-        ("::ffff:a00:5", "tcp:10.0.0.5:502"),
-        ("10.5", "tcp:10.0.0.5:502"),
-        ("167772165", "tcp:10.0.0.5:502"),
-        ("127.1", "tcp:127.0.0.1:502"),
-        ("127.0.1.1", "tcp:127.0.0.1:502"),
-        ("0.0.0.0", "tcp:127.0.0.1:502"),
-        ("::1", "tcp:127.0.0.1:502"),
-        ("::ffff:127.0.0.1", "tcp:127.0.0.1:502"),
-        ("fe80:0:0::0001", "tcp:[fe80::1]:502"),
-    ],
-)
+@pytest.mark.parametrize(("host", "name"), [
+    ("10.0.0.5", "tcp:10.0.0.5:502"),
+    ("::ffff:10.0.0.5", "tcp:10.0.0.5:502"),
+    ("::ffff:a00:5", "tcp:10.0.0.5:502"),
+    ("10.5", "tcp:10.0.0.5:502"),
+    ("167772165", "tcp:10.0.0.5:502"),
+    ("127.1", "tcp:127.0.0.1:502"),
+    ("127.0.1.1", "tcp:127.0.0.1:502"),
+    ("0.0.0.0", "tcp:127.0.0.1:502"),
+    ("::1", "tcp:127.0.0.1:502"),
+    ("::ffff:127.0.0.1", "tcp:127.0.0.1:502"),
+    ("fe80:0:0::0001", "tcp:[fe80::1]:502"),
+])  # fmt: skip
 def test_an_address_has_one_name_however_it_is_written(monkeypatch, host, name):
     monkeypatch.setattr(socket, "getaddrinfo", lambda *args, **kwargs: 1 / 0)
     assert held_address(host, 502) == (name,)

@@ -28,15 +28,12 @@ class TestLimits:
         assert device.highest_hz == 5.0
         assert device.note == f"its profile says so; the wire alone: {self.SLOW}"
 
-    @pytest.mark.parametrize(
-        ("limit", "rate_hz", "words"),
-        [
-            (RateLimit(10.0, "why"), 10.1, r"in \(0, 10\] Hz \(why\), got 10.1"),
-            (RateLimit(10.0, ""), 0.0, r"in \(0, 10\] Hz, got 0"),
-            (RateLimit(10.0, ""), float("nan"), "got nan"),
-            (RateLimit(10.0, "", 2.0), 1.9, r"in \[2, 10\] Hz, got 1.9"),
-        ],
-    )
+    @pytest.mark.parametrize(("limit", "rate_hz", "words"), [
+        (RateLimit(10.0, "why"), 10.1, r"in \(0, 10\] Hz \(why\), got 10.1"),
+        (RateLimit(10.0, ""), 0.0, r"in \(0, 10\] Hz, got 0"),
+        (RateLimit(10.0, ""), float("nan"), "got nan"),
+        (RateLimit(10.0, "", 2.0), 1.9, r"in \[2, 10\] Hz, got 1.9"),
+    ])  # fmt: skip
     def test_others_are_refused(self, limit, rate_hz, words):
         with pytest.raises(DeviceError, match=words):
             limit.check(rate_hz)

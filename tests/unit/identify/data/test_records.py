@@ -55,15 +55,12 @@ def test_impossible_lags_are_refused(lag):
         History("x", np.arange(50.0), np.arange(50.0), 100.0).without_lag(lag)
 
 
-@pytest.mark.parametrize(
-    ("command", "displacement_um", "text"),
-    [
-        (np.arange(20.0), np.arange(21.0), "same length"),
-        (np.arange(8.0), np.arange(8.0), "at least 16 samples, has 8"),
-        (np.where(np.arange(20) == 7, np.nan, 1.0), np.arange(20.0), "nan at sample 7"),
-        (np.arange(20.0), np.full(20, 3.0), "displacement_um is constant"),
-    ],
-)
+@pytest.mark.parametrize(("command", "displacement_um", "text"), [
+    (np.arange(20.0), np.arange(21.0), "same length"),
+    (np.arange(8.0), np.arange(8.0), "at least 16 samples, has 8"),
+    (np.where(np.arange(20) == 7, np.nan, 1.0), np.arange(20.0), "nan at sample 7"),
+    (np.arange(20.0), np.full(20, 3.0), "displacement_um is constant"),
+])  # fmt: skip
 def test_unusable_signals_are_refused(command, displacement_um, text):
     with pytest.raises(DataError, match=rf"wobble: .*{text}".replace("(", r"\(")):
         History("wobble", command, displacement_um, 100.0)

@@ -263,17 +263,14 @@ def test_no_more_than_half_is_left_for_the_sake_of_a_stretch(error, taken):
     assert tried.best(lambda *_: None)[0].strength == taken
 
 
-@pytest.mark.parametrize(
-    ("errors", "taken"),
-    [
-        ({}, (0.1, 1.0)),
-        ({(0.1, 10.0): 0.0101}, (0.1, 10.0)),
-        ({(0.1, 10.0): 0.0101, (0.1, 100.0): 0.0101}, (0.1, 100.0)),
-        ({(0.1, 10.0): 0.01, (0.1, 100.0): 0.0103}, (0.1, 10.0)),
-        ({(0.1, 10.0): 0.0103, (0.1, 100.0): 0.02}, (0.1, 1.0)),
-        ({(0.1, 1.0): 0.02, (0.3, 10.0): 0.01}, (refinement.STRENGTHS[0], 1.0)),
-    ],
-)
+@pytest.mark.parametrize(("errors", "taken"), [
+    ({}, (0.1, 1.0)),
+    ({(0.1, 10.0): 0.0101}, (0.1, 10.0)),
+    ({(0.1, 10.0): 0.0101, (0.1, 100.0): 0.0101}, (0.1, 100.0)),
+    ({(0.1, 10.0): 0.01, (0.1, 100.0): 0.0103}, (0.1, 10.0)),
+    ({(0.1, 10.0): 0.0103, (0.1, 100.0): 0.02}, (0.1, 1.0)),
+    ({(0.1, 1.0): 0.02, (0.3, 10.0): 0.01}, (refinement.STRENGTHS[0], 1.0)),
+])  # fmt: skip
 def test_the_old_model_is_held_to_where_that_costs_nothing(errors, taken):
     tried = Tried({(0.1, 1.0): 0.01} | errors)
     choice, whole = tried.best(lambda *_: None)

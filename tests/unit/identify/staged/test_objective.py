@@ -25,13 +25,10 @@ from tests.staged import start
 from tests.unit.identify.conftest import OMEGA
 
 
-@pytest.mark.parametrize(
-    ("layers", "before"),
-    [
-        (Layers(6, 4, half_period_s=1e-4), [1e-4, 0.3, 0.8, 0.0]),
-        (Layers(6, 4, lag=False, gamma=True, structure=False, delay=False), [0.0, 0.0, 0.8, 2e-4]),
-    ],
-)
+@pytest.mark.parametrize(("layers", "before"), [
+    (Layers(6, 4, half_period_s=1e-4), [1e-4, 0.3, 0.8, 0.0]),
+    (Layers(6, 4, lag=False, gamma=True, structure=False, delay=False), [0.0, 0.0, 0.8, 2e-4]),
+])  # fmt: skip
 def test_derivatives_agree_with_differences(data, layers, before):
     point = start(data, layers, before, 3e-4 if layers.lag else 0.0)
     point = replace(point, weights=point.weights + 0.1)  # a weight of 0 has no relative step

@@ -134,15 +134,12 @@ def test_mark_sends_its_text(answers):
     assert answers == [("a.sock", {"command": "mark", "text": "tapped the stage"})]
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("gain", "must be gain=NUMBER, offset=NUMBER or inverse=in.out: 'gain'"),
-        ("rate=1", "must be gain=NUMBER"),
-        ("gain=high", "gain must be a number: 'high'"),
-        ("inverse=0", "inverse must be in or out: '0'"),
-    ],
-)
+@pytest.mark.parametrize(("text", "said"), [
+    ("gain", "must be gain=NUMBER, offset=NUMBER or inverse=in.out: 'gain'"),
+    ("rate=1", "must be gain=NUMBER"),
+    ("gain=high", "gain must be a number: 'high'"),
+    ("inverse=0", "inverse must be in or out: '0'"),
+])  # fmt: skip
 def test_what_is_no_setting_is_refused(text, said):
     with pytest.raises(InputError, match=said):
         assigned(["offset=1", text])

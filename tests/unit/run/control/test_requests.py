@@ -76,31 +76,28 @@ def test_nobody_stops_a_run_by_its_socket(requests):
         asked(requests, command="stop")
 
 
-@pytest.mark.parametrize(
-    ("line", "said"),
-    [
-        (b"{", "message: "),
-        (b'{"command": "fly"}', "message: "),
-        (b'{"command": "set"}', "gain, offset or inverse is required"),
-        (b'{"command": "set", "gain": "1"}', "gain: "),
-        (b'{"command": "set", "gain": 1.0, "over_s": 0.0}', "over_s: "),
-        (b'{"command": "set", "gain": 1.0, "over_s": 1e9}', "over_s: "),
-        (b'{"command": "set", "gain": 1e999}', "finite"),
-        (b'{"command": "set", "gain": NaN}', "finite"),
-        (b'{"command": "set", "offset": -Infinity}', "finite"),
-        (b'{"command": "set", "gain": 1e308}', "gain: "),
-        (b'{"command": "set", "offset": -1e7}', "offset: "),
-        (b'{"command": "set", "gain": 1' + b"0" * 400 + b"}", "gain: "),
-        (b'{"command": "set", "gain": true}', "gain: "),
-        (b'{"command": "set", "gain": 1.0, "over_s": -1.0}', "over_s: "),
-        (b'{"command": "set", "gain": 1.0, "over_s": null}', "over_s: "),
-        (b"[" * 4000, "message: "),
-        (b'{"command": ' + b'{"command": ' * 300, "message: "),
-        (b"null", "message: "),
-        (b"\xff\xfe", "message: "),
-        (b'{"command": "status", "more": 1}', "more: "),
-    ],
-)
+@pytest.mark.parametrize(("line", "said"), [
+    (b"{", "message: "),
+    (b'{"command": "fly"}', "message: "),
+    (b'{"command": "set"}', "gain, offset or inverse is required"),
+    (b'{"command": "set", "gain": "1"}', "gain: "),
+    (b'{"command": "set", "gain": 1.0, "over_s": 0.0}', "over_s: "),
+    (b'{"command": "set", "gain": 1.0, "over_s": 1e9}', "over_s: "),
+    (b'{"command": "set", "gain": 1e999}', "finite"),
+    (b'{"command": "set", "gain": NaN}', "finite"),
+    (b'{"command": "set", "offset": -Infinity}', "finite"),
+    (b'{"command": "set", "gain": 1e308}', "gain: "),
+    (b'{"command": "set", "offset": -1e7}', "offset: "),
+    (b'{"command": "set", "gain": 1' + b"0" * 400 + b"}", "gain: "),
+    (b'{"command": "set", "gain": true}', "gain: "),
+    (b'{"command": "set", "gain": 1.0, "over_s": -1.0}', "over_s: "),
+    (b'{"command": "set", "gain": 1.0, "over_s": null}', "over_s: "),
+    (b"[" * 4000, "message: "),
+    (b'{"command": ' + b'{"command": ' * 300, "message: "),
+    (b"null", "message: "),
+    (b"\xff\xfe", "message: "),
+    (b'{"command": "status", "more": 1}', "more: "),
+])  # fmt: skip
 def test_bad_requests_change_nothing(requests, page, line, said):
     before = bytes(page.numbers)
     with pytest.raises(InputError, match=said):
@@ -314,21 +311,18 @@ def test_an_inverse_that_is_not_there_can_not_go_out(page):
     assert page.get(PageField.TUNE_WANTED) == 0
 
 
-@pytest.mark.parametrize(
-    ("gain", "offset", "refused"),
-    [
-        (1.0, 0.0, False),
-        (1.25, 0.0, False),
-        (-1.25, 0.0, False),
-        (1.2501, 0.0, True),
-        (-1.2501, 0.0, True),
-        (1.0, 1.0, False),
-        (1.0, 1.0001, True),
-        (0.0, -5.0, False),
-        (0.0, -5.0001, True),
-        (1e6, 1e6, True),
-    ],
-)
+@pytest.mark.parametrize(("gain", "offset", "refused"), [
+    (1.0, 0.0, False),
+    (1.25, 0.0, False),
+    (-1.25, 0.0, False),
+    (1.2501, 0.0, True),
+    (-1.2501, 0.0, True),
+    (1.0, 1.0, False),
+    (1.0, 1.0001, True),
+    (0.0, -5.0, False),
+    (0.0, -5.0001, True),
+    (1e6, 1e6, True),
+])  # fmt: skip
 def test_without_a_model_the_bound_is_exact(gain, offset, refused):
     made = experiment_of(peak_a=5.0)
     assert bool(bound_refusal(made, gain, offset, bypassed=False)) == refused

@@ -100,16 +100,12 @@ def gave_up(page, output):
     page.leave_outcome(LoopOutcome("fault", "no answer", 7, output, 0))
 
 
-@pytest.mark.parametrize(
-    "left",
-    [
-        lambda page: None,
-        lambda page: page.put(PageField.PHASE, Phase.FAILED),
-        lambda page: gave_up(page, "unknown"),
-        lambda page: gave_up(page, "set"),
-    ],
-    ids=["died", "broke", "unknown", "set"],
-)
+@pytest.mark.parametrize("left", [
+    lambda page: None,
+    lambda page: page.put(PageField.PHASE, Phase.FAILED),
+    lambda page: gave_up(page, "unknown"),
+    lambda page: gave_up(page, "set"),
+], ids=["died", "broke", "unknown", "set"])  # fmt: skip
 def test_a_loop_without_a_safe_output_is_followed_by_the_safe_value(guarded, left):
     """What it tried itself may not have been confirmed."""
     left(guarded.page)
@@ -291,14 +287,11 @@ def written(tmp_path):
         signal.signal(number, handler)
 
 
-@pytest.mark.parametrize(
-    ("experiment", "said"),
-    [
-        ("device: {kind: gone}", "unknown device 'gone'"),
-        ("name: x", "the experiment has no device"),
-        ("device: {kind: simulated_terfenol}", "not enough memory"),
-    ],
-)
+@pytest.mark.parametrize(("experiment", "said"), [
+    ("device: {kind: gone}", "unknown device 'gone'"),
+    ("name: x", "the experiment has no device"),
+    ("device: {kind: simulated_terfenol}", "not enough memory"),
+])  # fmt: skip
 def test_a_device_that_can_not_be_made_is_said_before_the_start(
     written, monkeypatch, experiment, said
 ):
@@ -391,16 +384,13 @@ SIGSTOP_HITS = [
 """No time-out of a device and no load is an excuse for a loop that is stopped."""
 
 
-@pytest.mark.parametrize(
-    ("numbers", "stopped", "after_s"),
-    [
-        ({}, False, 1.1),
-        ({PageField.REAL_TIME: 0}, False, 1.7),
-        ({PageField.EXCHANGING: 1}, False, 3.1),
-        ({PageField.PHASE: Phase.CLOSING}, False, 31.0),
-        *SIGSTOP_HITS,
-    ],
-)
+@pytest.mark.parametrize(("numbers", "stopped", "after_s"), [
+    ({}, False, 1.1),
+    ({PageField.REAL_TIME: 0}, False, 1.7),
+    ({PageField.EXCHANGING: 1}, False, 3.1),
+    ({PageField.PHASE: Phase.CLOSING}, False, 31.0),
+    *SIGSTOP_HITS,
+])  # fmt: skip
 def test_silence_beyond_the_limit_is_a_hang(watched, numbers, stopped, after_s):
     """A busy machine without real-time priority and a device have more time."""
     for field, value in numbers.items():

@@ -141,17 +141,14 @@ def test_damaged_slot_is_not_taken(tmp_path):
     assert other.skip_damaged() == 0
 
 
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [
-        (BlockHeader.FIRST_SAMPLE, LAST_SAMPLE),
-        (BlockHeader.FIRST_SAMPLE, -1),
-        (BlockHeader.DROPPED_BEFORE, -1),
-        (BlockHeader.DROPPED_BEFORE, 4),
-        (BlockHeader.DEADLINE_NS, LONGEST_NS + 1),
-        (BlockHeader.LATE_NS, -LONGEST_NS - 1),
-    ],
-)
+@pytest.mark.parametrize(("field", "value"), [
+    (BlockHeader.FIRST_SAMPLE, LAST_SAMPLE),
+    (BlockHeader.FIRST_SAMPLE, -1),
+    (BlockHeader.DROPPED_BEFORE, -1),
+    (BlockHeader.DROPPED_BEFORE, 4),
+    (BlockHeader.DEADLINE_NS, LONGEST_NS + 1),
+    (BlockHeader.LATE_NS, -LONGEST_NS - 1),
+])  # fmt: skip
 def test_slot_that_no_recording_may_hold_is_not_taken(tmp_path, field, value):
     """Recorded, it would keep all the rest from being read."""
     ring = make(tmp_path)

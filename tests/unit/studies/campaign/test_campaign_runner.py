@@ -93,14 +93,11 @@ def test_a_failed_step_is_marked_and_the_campaign_continues(run, monkeypatch):
     assert rig.names == ["few-0002-2.mcap"]
 
 
-@pytest.mark.parametrize(
-    ("failure", "codes_of_steps", "reason"),
-    [
-        ({"code": "fault", "reason": "stroke"}, ["fault", "planned"], ": stroke"),
-        ({"error": DeviceError("no answer")}, ["fault", "planned"], ": no answer"),
-        ({"code": "stopped", "stop_signal": 2, "reason": "Ctrl-C"}, ["stopped", "planned"], "C"),
-    ],
-)
+@pytest.mark.parametrize(("failure", "codes_of_steps", "reason"), [
+    ({"code": "fault", "reason": "stroke"}, ["fault", "planned"], ": stroke"),
+    ({"error": DeviceError("no answer")}, ["fault", "planned"], ": no answer"),
+    ({"code": "stopped", "stop_signal": 2, "reason": "Ctrl-C"}, ["stopped", "planned"], "C"),
+])  # fmt: skip
 def test_a_fault_of_device_or_rig_or_the_user_ends_the_campaign(
     run, failure, codes_of_steps, reason
 ):
@@ -111,16 +108,13 @@ def test_a_fault_of_device_or_rig_or_the_user_ends_the_campaign(
     assert result.reason.endswith(reason)
 
 
-@pytest.mark.parametrize(
-    ("events", "safe", "harmless"),
-    [
-        (["late"], True, True),
-        (["late"], False, False),
-        (["late", "stroke"], True, False),
-        (["device_lost"], True, False),
-        ([], True, False),
-    ],
-)
+@pytest.mark.parametrize(("events", "safe", "harmless"), [
+    (["late"], True, True),
+    (["late"], False, False),
+    (["late", "stroke"], True, False),
+    (["device_lost"], True, False),
+    ([], True, False),
+])  # fmt: skip
 def test_harmless_faults(monkeypatch, events, safe, harmless, make_recording):
     errors = tuple(Event(1, "error", code, "") for code in events)
     made = make_recording(np.zeros(10), events=errors)

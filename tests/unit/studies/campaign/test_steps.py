@@ -79,16 +79,13 @@ A = {"a": (1, 2, 3)}
 B = {"b": ("x", "y")}
 
 
-@pytest.mark.parametrize(
-    ("text", "values"),
-    [
-        ("1:9:3", (1.0, 5.0, 9.0)),
-        ("9:1:3lin", (9.0, 5.0, 1.0)),
-        ("1:1e2:3log", (1.0, 10.0, 100.0)),
-        ("1:250:4log", (1.0, 6.29961, 39.685, 250.0)),
-        ("-.5:+.5:2", (-0.5, 0.5)),
-    ],
-)
+@pytest.mark.parametrize(("text", "values"), [
+    ("1:9:3", (1.0, 5.0, 9.0)),
+    ("9:1:3lin", (9.0, 5.0, 1.0)),
+    ("1:1e2:3log", (1.0, 10.0, 100.0)),
+    ("1:250:4log", (1.0, 6.29961, 39.685, 250.0)),
+    ("-.5:+.5:2", (-0.5, 0.5)),
+])  # fmt: skip
 def test_ranges(text, values):
     assert values_of(text) == values
 
@@ -111,15 +108,12 @@ def ran(vary, order="as_written", seed=1, repeat=1):
     return ["".join(map(str, point.values())) for point, _ in points(groups, order, seed, repeat)]
 
 
-@pytest.mark.parametrize(
-    ("vary", "order", "repeat", "points_in_order"),
-    [
-        ({**A, **B}, "as_written", 1, "1x 1y 2x 2y 3x 3y"),
-        (({"a": (1, 2), "c": (7, 8)}, B), "as_written", 1, "17x 17y 28x 28y"),
-        ({**A, **B}, "alternating", 1, "1x 1y 2y 2x 3x 3y"),
-        (A, "alternating", 2, "1 2 3 3 2 1"),
-    ],
-)
+@pytest.mark.parametrize(("vary", "order", "repeat", "points_in_order"), [
+    ({**A, **B}, "as_written", 1, "1x 1y 2x 2y 3x 3y"),
+    (({"a": (1, 2), "c": (7, 8)}, B), "as_written", 1, "17x 17y 28x 28y"),
+    ({**A, **B}, "alternating", 1, "1x 1y 2y 2x 3x 3y"),
+    (A, "alternating", 2, "1 2 3 3 2 1"),
+])  # fmt: skip
 def test_order_of_crossed_keys(vary, order, repeat, points_in_order):
     assert ran(vary, order, repeat=repeat) == points_in_order.split()
 

@@ -76,16 +76,13 @@ def grown(*sizes):
     return [replace(LOOP, amplitude=a, low_um=-y, high_um=y) for a, y in sizes]
 
 
-@pytest.mark.parametrize(
-    ("loops", "wanted", "chosen"),
-    [
-        ([], 0.4, 0.4),
-        ([(0.4, 2.0)], 1.0, 1.0),
-        ([(1.0, 10.0), (2.0, 46.0)], 4.0, None),
-        ([(2.0, 60.0)], 4.0, None),
-        ([(2.0, 5.0), (2.0, 5.0)], 2.0, None),
-    ],
-)
+@pytest.mark.parametrize(("loops", "wanted", "chosen"), [
+    ([], 0.4, 0.4),
+    ([(0.4, 2.0)], 1.0, 1.0),
+    ([(1.0, 10.0), (2.0, 46.0)], 4.0, None),
+    ([(2.0, 60.0)], 4.0, None),
+    ([(2.0, 5.0), (2.0, 5.0)], 2.0, None),
+])  # fmt: skip
 def test_amplitudes_grow_while_there_is_room(loops, wanted, chosen):
     assert next_amplitude(grown(*loops), wanted, (-50.0, 50.0)) == chosen
 

@@ -52,14 +52,11 @@ def identification(grade="usable"):
     return replace(found, verdict=Verdict(grade, 9.0, False, reasons, ("a note",)))
 
 
-@pytest.mark.parametrize(
-    ("peak", "grade", "text"),
-    [
-        (1.5, "good", "good: within 1.50 %"),
-        (5.0, "usable", "usable within 5.00 %"),
-        (30.0, "not a model", "not a model: "),
-    ],
-)
+@pytest.mark.parametrize(("peak", "grade", "text"), [
+    (1.5, "good", "good: within 1.50 %"),
+    (5.0, "usable", "usable within 5.00 %"),
+    (30.0, "not a model", "not a model: "),
+])  # fmt: skip
 def test_the_verdict_is_that_of_the_random_reference(peak, grade, text):
     other = replace(UNSEEN, label="other", peak_percent=90.0)
     unseen = (replace(UNSEEN, peak_percent=peak), other)

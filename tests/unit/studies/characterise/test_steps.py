@@ -72,17 +72,13 @@ def test_a_faint_reaction_is_asked_for_again(walked, limits):
     assert measured.small.gain_um == pytest.approx(0.2, rel=0.1)
 
 
-@pytest.mark.parametrize(
-    ("actuator", "noise_um", "code", "said"),
-    [
-        (lambda v: 0.0 * v, 0.01, "no_reaction", "10 % of the range"),
-        (lambda v: -plays(v), 0.01, "wrong_polarity", "at 1 %"),
-        (lambda v: 2.0 * v**2, 0.01, "no_bias", "--model butterfly"),
-        (lambda v: 0.01 * v, 20.0, "noise", "rms"),
-        (lambda v: np.minimum(plays(v), 12.0), 0.0, "saturated_sensor", "12 µm"),
-    ],
-    ids=["dead coil", "swapped wires", "no bias", "noise", "sensor ends early"],
-)
+@pytest.mark.parametrize(("actuator", "noise_um", "code", "said"), [
+    (lambda v: 0.0 * v, 0.01, "no_reaction", "10 % of the range"),
+    (lambda v: -plays(v), 0.01, "wrong_polarity", "at 1 %"),
+    (lambda v: 2.0 * v**2, 0.01, "no_bias", "--model butterfly"),
+    (lambda v: 0.01 * v, 20.0, "noise", "rms"),
+    (lambda v: np.minimum(plays(v), 12.0), 0.0, "saturated_sensor", "12 µm"),
+], ids=["dead coil", "swapped wires", "no bias", "noise", "sensor ends early"])  # fmt: skip
 def test_problems_of_the_rig(walked, limits, actuator, noise_um, code, said):
     error = problem_of(walked, limits, actuator, noise_um=noise_um)
     assert error.code == code
@@ -107,12 +103,9 @@ def test_a_resonance_in_the_band(walked, limits, limits_with):
     assert measured.small.natural_hz == pytest.approx(45.0, rel=0.05)
 
 
-@pytest.mark.parametrize(
-    ("step", "actuator"),
-    [
-        pytest.param("repeated", lambda v: plays(v, 1.3), marks=pytest.mark.slow),
-        ("growing-5", lambda v: plays(v) + 10.0 * (np.arange(v.size) > 0.6 * v.size)),
-    ],
-)
+@pytest.mark.parametrize(("step", "actuator"), [
+    pytest.param("repeated", lambda v: plays(v, 1.3), marks=pytest.mark.slow),
+    ("growing-5", lambda v: plays(v) + 10.0 * (np.arange(v.size) > 0.6 * v.size)),
+])  # fmt: skip
 def test_an_actuator_that_changes(walked, limits, step, actuator):
     assert problem_of(walked, limits, changed={step: actuator}).code == "not_repeatable"

@@ -50,17 +50,14 @@ def test_numbers_rise_and_names_keep_their_order():
     assert (by[HZ].text(9.0), by[HZ].numeric, by["compensator"].numeric) == ("9 Hz", True, False)
 
 
-@pytest.mark.parametrize(
-    ("value", "short"),
-    [
-        ({"model": "models/omega.yaml"}, "omega"),
-        ({"kind": "complex_harmonic", "unit": "A"}, "complex harmonic"),
-        ([1, 2], "[1, 2]"),
-        (3, 3.0),
-        (True, "True"),
-        (None, None),
-    ],
-)
+@pytest.mark.parametrize(("value", "short"), [
+    ({"model": "models/omega.yaml"}, "omega"),
+    ({"kind": "complex_harmonic", "unit": "A"}, "complex harmonic"),
+    ([1, 2], "[1, 2]"),
+    (3, 3.0),
+    (True, "True"),
+    (None, None),
+])  # fmt: skip
 def test_a_value_is_shown_by_what_people_call_it(value, short):
     assert short_value(value) == short
 
