@@ -79,13 +79,9 @@ def refine(
         InputError: A file is invalid; nothing is written.
     """
     return refine_files(
-        Path(model),
-        paths_of(runs),
-        path_or_none(output),
-        paths_of(validate),
-        overwrite=overwrite,
-        progress=on_progress,
-    )
+        Path(model), paths_of(runs), path_or_none(output), paths_of(validate),
+        overwrite=overwrite, progress=on_progress,
+    )  # fmt: skip
 
 
 def compare(

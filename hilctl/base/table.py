@@ -28,13 +28,8 @@ _SCALES: dict[str, dict[str, float]] = {
 }
 """Units of each base unit, with their factors to it."""
 _WORDS = {
-    "second": "s",
-    "seconds": "s",
-    "volts": "V",
-    "amps": "A",
-    "amperes": "A",
-    "micrometer": "um",
-}
+    "second": "s", "seconds": "s", "volts": "V", "amps": "A", "amperes": "A", "micrometer": "um",
+}  # fmt: skip
 _OTHERS = {"", "-", "%", "hz", "n", "c", "°c", "k", "counts", "count", "bit", "deg", "sequence"}
 
 

@@ -135,15 +135,9 @@ def run_unpaced(checked: CheckedExperiment, output: Path, *, overwrite: bool = F
 def _run(checked: CheckedExperiment, recorder: Recorder) -> tuple[LoopOutcome, Lateness]:
     loaded, begun = checked.loaded, checked.begun
     plan = assemble(
-        loaded,
-        checked.reference.values,
-        begun.input_um,
-        begun.state,
-        checked.conditioning(),
-        operator=checked.operator,
-        paced=False,
-        heat_a2=checked.heat_a2,
-    )
+        loaded, checked.reference.values, begun.input_um, begun.state, checked.conditioning(),
+        operator=checked.operator, paced=False, heat_a2=checked.heat_a2,
+    )  # fmt: skip
 
     def refused() -> str:
         """Return why the file cannot be written after a retry, or an empty text."""

@@ -284,15 +284,9 @@ class StreamSetup:
             "fifo_level": f"{self.fifo_blocks} blocks",
         }
         return replace(
-            found,
-            name="modbus_stream",
-            max_rate_hz=rates.highest_hz,
-            rate_note=rates.note,
-            buffered=True,
-            fifo_depth=depth,
-            latency_blocks=self.fifo_blocks,
-            details=details,
-        )
+            found, name="modbus_stream", max_rate_hz=rates.highest_hz, rate_note=rates.note,
+            buffered=True, fifo_depth=depth, latency_blocks=self.fifo_blocks, details=details,
+        )  # fmt: skip
 
 
 class StreamSafeWrite(ModbusSafeWrite):
@@ -378,13 +372,9 @@ class ModbusStream(ModbusDevice):
     def _stream_on(self, session: ModbusSession) -> StreamSession:
         writer = self._setup.writer
         return StreamSession(
-            ModbusFeedback(session.link, writer.unit),
-            self._streaming.streaming,
-            writer.timeout_s,
-            writer.profile.turnaround_s,
-            self._sleep,
-            self._clock,
-        )
+            ModbusFeedback(session.link, writer.unit), self._streaming.streaming,
+            writer.timeout_s, writer.profile.turnaround_s, self._sleep, self._clock,
+        )  # fmt: skip
 
     def _exchange(
         self, first_sample: int, command: F64, displacement_um: F64, measured: F64
