@@ -157,6 +157,13 @@ class Table(ABC):
         """Return a column's base unit (s, um, A or V; empty if unknown) and its factor to it."""
         return known_unit(self._units[index]) or ("", 1.0)
 
+    def time(self) -> int | None:
+        """Return the index of the time column: ``t_s``, or the only one in s; otherwise None."""
+        if "t_s" in self.names:
+            return self.index("t_s")
+        found = [each for each in range(len(self.names)) if self.unit(each)[0] == "s"]
+        return found[0] if len(found) == 1 else None
+
     @abstractmethod
     def read(
         self, columns: Sequence[int], first_row: int = 1, last_row: int | None = None

@@ -102,7 +102,8 @@ def run(
         except HilctlError as error:  # not exit code 2, because the actuator has moved
             print(f"hilctl: cannot report the recording: {error}", file=sys.stderr)
             unread = True
-    print_result(run_mapping(result, report), lambda: print_run(result, report), as_json=as_json)
+    values = run_mapping(result, report)
+    print_result(values, lambda: print_run(result, report), as_json=as_json)
     if result.code == "fault" or unread or not result.safe:
         raise typer.Exit(3)
     if result.stop_signal:

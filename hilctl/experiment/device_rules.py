@@ -27,10 +27,11 @@ def pace_warnings(config: Experiment, info: DeviceInfo) -> tuple[str, ...]:
 
 
 def device_problems(loaded: LoadedExperiment) -> Iterator[ConfigProblem]:
-    """Yield the settings that the device does not support."""
+    """Yield the settings that the device or an interlock does not support."""
     yield from _range_problems(loaded)
     yield from _pace_problems(loaded)
     yield from _watchdog_problems(loaded)
+    yield from _interlock_problems(loaded)
 
 
 def _range_problems(loaded: LoadedExperiment) -> Iterator[ConfigProblem]:
@@ -115,7 +116,7 @@ def interlock_context(config: Experiment, info: DeviceInfo) -> InterlockContext:
     )
 
 
-def interlock_problems(loaded: LoadedExperiment) -> list[ConfigProblem]:
+def _interlock_problems(loaded: LoadedExperiment) -> list[ConfigProblem]:
     """Return the interlocks whose requirements are not met."""
     limits = loaded.config.limits
     return [

@@ -24,7 +24,7 @@ from hilctl.experiment.adaptation_bounds import (
 )
 from hilctl.experiment.coil_heat import CoolingCoil
 from hilctl.experiment.conditioning import condition_problems, conditioning_of, measures_offset
-from hilctl.experiment.device_rules import device_problems, interlock_problems, pace_warnings
+from hilctl.experiment.device_rules import device_problems, pace_warnings
 from hilctl.experiment.device_state import (
     CompensatorStart,
     InitialState,
@@ -97,7 +97,9 @@ def check(
         ConfigError: The run is rejected; all reasons are listed, each with its amount.
     """
     config = loaded.config
-    problems = [*device_problems(loaded), *interlock_problems(loaded), *condition_problems(loaded)]
+    problems = [*device_problems(loaded), *condition_problems(loaded)]
+    conditioning = conditioning_of(loaded)
+    conditioned = np.empty(0) if conditioning is None else conditioning.command
     try:
         reference = build(config.waveform, config.sample_rate_hz, loaded.folder)
     except InputError as error:
@@ -110,8 +112,6 @@ def check(
     hint = "identify the model on such motions, or keep the waveform within those it was fitted on"
     problems += [loaded.problem("waveform", text, hint=hint) for text in findings.refused]
     try:
-        conditioning = conditioning_of(loaded)
-        conditioned = np.empty(0) if conditioning is None else conditioning.command
         now_s = time.time() if now_s is None else now_s
         begun = _start(loaded, reference, conditioned, now_s, problems)
         heat_a2 = max(heat_a2, heat_before(loaded, now_s))

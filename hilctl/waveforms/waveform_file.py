@@ -87,8 +87,9 @@ def _read(w: FileWaveform, path: Path) -> tuple[F64, float | None]:
         table: Table = ArrayTable(path, columns)
     else:
         table, own_rate_hz = open_table(path), None
-    at, times = table.index(w.column), _time(table)
-    rows = table.read([at, *times], w.first_row, w.last_row)
+    at, time = table.index(w.column), table.time()
+    base, factor = table.unit(at)
+    rows = table.read([at] if time is None else [at, time], w.first_row, w.last_row)
     count = rows.lines.size
     if count < 2:
         raise InputError(f"{path}: needs at least two rows from first_row to last_row")
@@ -96,32 +97,16 @@ def _read(w: FileWaveform, path: Path) -> tuple[F64, float | None]:
         check_length(count)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    if times:
-        own_rate_hz = rows.sample_rate_hz(1, _TIME_TOLERANCE, table.unit(times[0])[1])
-    return rows.values[0] * _factor(w, table, at), own_rate_hz
-
-
-def _time(table: Table) -> list[int]:
-    """Return the index of the time column, if there is one: ``t_s``, or the only one in s."""
-    if "t_s" in table.names:
-        return [table.index("t_s")]
-    found = [each for each in range(len(table.names)) if table.unit(each)[0] == "s"]
-    return found if len(found) == 1 else []
-
-
-def _factor(w: FileWaveform, table: Table, at: int) -> float:
-    """Return the factor from a column's unit to the waveform's."""
-    base, factor = table.unit(at)
-    if table.path.suffix.lower() == ".mcap":  # its references may be in A or V
-        return 1.0
-    if w.unit is None or base in {"", w.unit}:
-        return factor
-    if w.scale == 1.0:
+    if time is not None:
+        own_rate_hz = rows.sample_rate_hz(1, _TIME_TOLERANCE, table.unit(time)[1])
+    if path.suffix.lower() == ".mcap":  # its references may be in A or V
+        factor = 1.0
+    elif w.unit is not None and base not in {"", w.unit} and w.scale == 1.0:
         raise InputError(
-            f"{table.path}: column {table.names[at]} is in {base}, the waveform in {w.unit}: set "
-            f"scale, in {w.unit} per {base}"
+            f"{path}: column {table.names[at]} is in {base}, the waveform in {w.unit}: set scale, "
+            f"in {w.unit} per {base}"
         )
-    return factor
+    return rows.values[0] * factor, own_rate_hz
 
 
 def _read_mcap(path: Path) -> tuple[dict[str, npt.NDArray[Any]], float]:
