@@ -5,7 +5,8 @@ load.py           an experiment with its device, model and correction
 devices.py        devices by name
 preflight.py      the check of an experiment: all rules and the complete commands
 device_rules.py   rules between an experiment and its device
-conditioning.py, feedback_checks.py, adaptation_bounds.py  rules and settings by section
+conditioning.py   rules and commands of the ``condition`` section
+closed_loop.py    rules and settings of the ``feedback`` and ``adaptation`` sections
 model_validity.py comparison of the reference with the motions the model was identified on
 forecast.py       the commands of a run in numbers
 device_state.py   the last run of each device, and the initial state of the compensator
@@ -16,8 +17,8 @@ examples.py       shipped examples and copies of them
 """
 
 PUBLIC = (
-    "adaptation_bounds", "coil_heat", "conditioning", "correction", "device_rules", "device_state",
-    "devices", "examples", "feedback_checks", "file", "forecast", "load",
-    "model_validity", "preflight", "sections", "template",
+    "closed_loop", "coil_heat", "conditioning", "correction", "device_rules", "device_state",
+    "devices", "examples", "file", "forecast", "load", "model_validity", "preflight", "sections",
+    "template",
 )  # fmt: skip
 """Modules that other rooms import; the others are private."""

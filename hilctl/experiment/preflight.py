@@ -15,11 +15,12 @@ import numpy as np
 from hilctl.base.errors import ConfigError, ConfigProblem, DataError, InputError, ModelError
 from hilctl.base.formatting import shown_briefly
 from hilctl.base.types import F64
-from hilctl.experiment.adaptation_bounds import (
+from hilctl.experiment.closed_loop import (
     adaptation_problems,
     adaptation_warnings,
     adapted_operator,
     at_worst,
+    feedback_problems,
     worst_inputs,
 )
 from hilctl.experiment.coil_heat import CoolingCoil
@@ -34,7 +35,6 @@ from hilctl.experiment.device_state import (
     left_by,
     left_by_last_run,
 )
-from hilctl.experiment.feedback_checks import feedback_problems
 from hilctl.experiment.forecast import Forecast, forecast_of
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.experiment.model_validity import RangeFindings, range_findings

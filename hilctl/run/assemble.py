@@ -6,9 +6,8 @@ from dataclasses import replace
 from hilctl.base.device import Device, DeviceInfo
 from hilctl.base.errors import InputError
 from hilctl.base.types import F64
-from hilctl.experiment.adaptation_bounds import make_adaptation
+from hilctl.experiment.closed_loop import make_adaptation, make_feedback
 from hilctl.experiment.device_rules import interlock_context
-from hilctl.experiment.feedback_checks import make_feedback
 from hilctl.experiment.file import Experiment
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.loop.adaptation import DisplacementOperator

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hilctl.base.errors import InputError
 from hilctl.base.samples import Flag
 from hilctl.base.yaml import Document
-from hilctl.experiment.feedback_checks import gains_for, make_feedback
+from hilctl.experiment.closed_loop import gains_for, make_feedback
 from hilctl.experiment.file import Experiment
 from hilctl.experiment.sections import PiFeedbackConfig
 from hilctl.loop.compensator import Compensator

@@ -1,4 +1,4 @@
-"""Feedback gains are checked with the device, its rate and its resonance."""
+"""Feedback gains and adaptation are checked with the device, its rate and its resonance."""
 
 import math
 from dataclasses import replace
@@ -11,15 +11,21 @@ from hypothesis import strategies as st
 
 from hilctl.base.errors import ConfigError, InputError
 from hilctl.base.yaml import Document
-from hilctl.experiment.feedback_checks import (
+from hilctl.experiment.closed_loop import (
+    adaptation_bounds,
+    adapted_operator,
     feedback_problems,
     gains_for,
     highest_bandwidth_hz,
+    make_adaptation,
     margins,
     rate_needed_hz,
+    worst_inputs,
 )
 from hilctl.experiment.load import resolve
 from hilctl.experiment.preflight import check
+from hilctl.loop.adaptation import DisplacementOperator
+from hilctl.loop.compensator import Compensator
 from hilctl.loop.feedback import Feedback, Gains
 from tests.unit.loop.test_feedback import EXPERIMENT, plant
 
@@ -156,3 +162,95 @@ class TestMargins:
     def test_gains_out_of_range(self, kp, ki):
         with pytest.raises(InputError, match="kp must be"):
             Gains(kp, ki)
+
+
+PLAIN = EXPERIMENT.replace("feedback:", "# feedback:")
+NOISE = "adaptation={noise_um: 0.03}"
+INTEGRAL = "feedback={kind: integral, limit_um: 5.0, bandwidth_hz: 1.0}"
+
+
+@pytest.fixture
+def load(tmp_path):
+    (tmp_path / "model.yaml").write_text(MODEL)
+    return lambda *settings: resolve(Document("experiment", PLAIN), tmp_path, settings)
+
+
+def problems(loaded):
+    with pytest.raises(ConfigError) as caught:
+        check(loaded)
+    return str(caught.value)
+
+
+def test_a_good_one_is_taken(load):
+    checked = check(load(NOISE))
+    assert checked.records_input
+    np.testing.assert_array_equal(checked.begun.input_um, checked.reference.values)
+    compensator = Compensator(checked.loaded.model, 5000.0)
+    made = make_adaptation(checked.loaded.config, checked.operator, compensator)
+    assert made is not None
+    assert made.parameters["offset_um"] == 0.0
+
+
+@pytest.mark.parametrize(("settings", "rule"), [
+    (("adaptation={}",), "adaptation.noise_um"),
+    (("adaptation={noise_um: 0.03, time_constant_s: 0.001}",),
+     "adaptation.time_constant_s: must be >= 0.015 s, by the delay of the loop"),
+    (("adaptation={noise_um: 0.03, gain: 0.5}",), "adaptation.gain: "),
+    (("adaptation={noise_um: 0.03, offset_um: 1}", INTEGRAL), "must be 0 with feedback"),
+    ((NOISE, "compensator=none", "waveform.unit=A", "waveform.amplitude=1.0"),
+     "adaptation: needs a compensator"),
+])  # fmt: skip
+def test_what_it_can_not_have(load, settings, rule):
+    with pytest.raises(ConfigError) as caught:
+        check(load(*settings))
+    assert rule in str(caught.value)
+
+
+@pytest.mark.parametrize("rest", ["condition={}", "compensator.offset=measured"])
+def test_a_rest_says_the_noise(load, rest):
+    assert check(load("adaptation={}", rest)).records_input
+
+
+def test_bounds_follow_from_what_else_acts(load):
+    config = load(NOISE).config
+    assert adaptation_bounds(config).array.tolist() == [13.5, 0.1, 0.02, 0.02, 0.02]
+    assert adaptation_bounds(load(NOISE, INTEGRAL).config).offset_um == 0.0
+    assert adaptation_bounds(load(INTEGRAL).config).array.tolist() == [0.0] * 5
+    learned = config.model_copy(
+        update={"compensator": config.compensator.model_copy(update={"correction": "learned.yaml"})}
+    )
+    assert adaptation_bounds(learned).array.tolist() == [13.5, 0.0, 0.0, 0.0, 0.0]
+    both = learned.model_copy(update={"feedback": load(INTEGRAL).config.feedback})
+    assert adapted_operator(both, check(load(NOISE)).reference) is None
+
+
+def test_what_adaptation_can_not_do_is_said(load):
+    assert check(load("adaptation={noise_um: 0.03}")).warnings == ()
+    (text,) = check(load("adaptation={noise_um: 0.03, time_constant_s: 0.09}")).warnings
+    assert "0.09 s" in text
+    nothing = "adaptation={noise_um: 0.03, gain: 0.0, weight: 0.0}"
+    (text,) = check(load(nothing, INTEGRAL)).warnings
+    assert text.startswith("adaptation has no effect")
+
+
+def test_the_limits_hold_with_the_bounds_at_their_worst(load):
+    settings = ("limits.peak_current_a=2.0", "waveform.amplitude=10.0")
+    assert check(load(*settings)).forecast.command_max < 2.0
+    text = problems(load(*settings, "adaptation={noise_um: 0.03, offset_um: 5.0}"))
+    assert "limits.peak_current_a: with adaptation" in text
+    assert "bounds of adaptation" in text
+    check(load(*settings, "adaptation={noise_um: 0.03, offset_um: 0.5, gain: 0.02, weight: 0.0}"))
+
+
+def test_worst_inputs_reach_further_than_any_adaptation(load):
+    config = load("adaptation={noise_um: 0.03, offset_um: 5.0}").config
+    reference = 10.0 * np.sin(np.arange(5000) / 100.0)
+    operator = DisplacementOperator.over(reference, adaptation_bounds(config))
+    high, low = (worst(0, 5000) for worst in worst_inputs(config, operator, reference))
+    assert high[0] == pytest.approx(0.0, abs=0.05)
+    assert high[2000:].max() > 5.0 + 10.0 / 0.9
+    assert low[2000:].min() < -5.0 - 10.0 / 0.9
+    (parts, _) = worst_inputs(config, operator, reference)
+    divided = np.concatenate([parts(start, start + 625) for start in range(0, 5000, 625)])
+    np.testing.assert_allclose(divided, high, rtol=0.0, atol=1e-12)
+    assert not [*worst_inputs(load().config, None, reference)]
