@@ -120,6 +120,7 @@ def check(
         raise ConfigError([*problems, loaded.problem("compensator.model", str(error))]) from None
     problems += feedback_problems(loaded, begun.preview)
     problems += adaptation_problems(loaded, begun.preview)
+    warnings = findings.warnings + adaptation_warnings(config, reference.segments)
     problems += _start_problems(loaded, begun, forecast) or command_problems(loaded, forecast)
     if problems:
         raise ConfigError(problems)
@@ -128,7 +129,6 @@ def check(
         worst = forecast_of(loaded, reference, begun, conditioned, input_um=input_um)
         if found := command_problems(loaded, worst):
             raise ConfigError([at_worst(each) for each in found])
-    warnings = findings.warnings + adaptation_warnings(config, reference.segments)
     warnings += pace_warnings(config, loaded.device.info)
     return CheckedExperiment(loaded, reference, forecast, begun, warnings, heat_a2, operator)
 
