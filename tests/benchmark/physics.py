@@ -265,14 +265,10 @@ def show(rig: Rig, options: argparse.Namespace) -> tuple[dict[str, Any], bool]:
     for text, _ in sums:
         say(f"{rig.physics}, {text}")
     table = {
-        "physics": rig.physics,
-        "options": list(options.options),
-        "model": taken,
-        "fit_s": took_s,
-        "inverse_us": cost,
-        "omega_us": omega,
+        "physics": rig.physics, "options": list(options.options), "model": taken, "fit_s": took_s,
+        "inverse_us": cost, "omega_us": omega,
         "rows": [result.to_mapping() for result in results],
-    }
+    }  # fmt: skip
     return table, all(met for _, met in sums)
 
 

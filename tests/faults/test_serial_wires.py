@@ -159,17 +159,12 @@ def test_silent_reader_is_named(emulate, run):
     sensor = "agilent_34970a:AI101"
     device = emulate("kepco_bop", "--sensor", sensor, lines=2)
     section = {
-        "kind": "serial_dac",
-        "profile": "kepco_bop",
-        "serial_port": device.addresses[0],
-        "output": "current",
-        "input": "AI101",
+        "kind": "serial_dac", "profile": "kepco_bop", "serial_port": device.addresses[0],
+        "output": "current", "input": "AI101",
         "reader": {"profile": "agilent_34970a", "serial_port": device.addresses[1]},
-        "measure": "current",
-        "timeout_s": TIMEOUT_S,
-        "sensor": {"um_per_v": 12.5},
+        "measure": "current", "timeout_s": TIMEOUT_S, "sensor": {"um_per_v": 12.5},
         "watchdog": "none",
-    }
+    }  # fmt: skip
     started = run(section, waveform=WAVEFORM, sample_rate_hz=19)
     device.log.await_events("current", 20, started.process)
     device.process.send_signal(signal.SIGSTOP)

@@ -36,21 +36,15 @@ class Rig:
         )
         late = {"late_after_ns": 0.5e9 * block / RATE_HZ, "max_late_ns": 1e9}
         plan = LoopPlan(
-            reference=reference,
-            input_um=options.get("input_um", reference),
-            block=block,
-            latency_blocks=getattr(self.device, "latency", 0),
-            sample_rate_hz=RATE_HZ,
-            compensator=compensator,
-            limits=options.get("limits", LIMITS),
+            reference=reference, input_um=options.get("input_um", reference), block=block,
+            latency_blocks=getattr(self.device, "latency", 0), sample_rate_hz=RATE_HZ,
+            compensator=compensator, limits=options.get("limits", LIMITS),
             interlocks=InterlockContext(stroke_um=options.get("stroke_um", (-60.0, 60.0))),
             late_policy=options.get("policy", "skip"),
             late_rules=LateRules(**{**late, **options.get("late", {})}),
-            feedback=options.get("feedback"),
-            adaptation=options.get("adaptation"),
-            conditioning=options.get("conditioning"),
-            keep_all=options.get("keep_all", False),
-        )
+            feedback=options.get("feedback"), adaptation=options.get("adaptation"),
+            conditioning=options.get("conditioning"), keep_all=options.get("keep_all", False),
+        )  # fmt: skip
         self.loop = Loop(plan, self.device, self.host)
 
     def run(self):
