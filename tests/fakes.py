@@ -30,10 +30,13 @@ from hilctl_drivers.profile import load_profile
 from hilctl_drivers.transport.links import LostError, NoAnswerError
 
 T7_OPTIONS = {
-    "profile": "labjack_t7", "output": "DAC0", "input": "AIN0",
-    "amplifier": {"gain_a_per_v": 4.0, "offset_a": -10.0}, "sensor": {"um_per_v": 12.5},
+    "profile": "labjack_t7",
+    "output": "DAC0",
+    "input": "AIN0",
+    "amplifier": {"gain_a_per_v": 4.0, "offset_a": -10.0},
+    "sensor": {"um_per_v": 12.5},
     "watchdog": "none",
-}  # fmt: skip
+}
 """Options of a LabJack T7, without its address."""
 
 

@@ -1,7 +1,17 @@
 """Metrics, reports, replays, plots, pages, exports and the catalogue of recordings."""
 
 PUBLIC = (
-    "catalogue", "decimation", "export", "figure_layout", "html", "plot_style", "replay", "report",
-    "report_table", "run_metrics", "run_page", "steady_state",
-)  # fmt: skip
+    "catalogue",
+    "decimation",
+    "export",
+    "figure_layout",
+    "html",
+    "plot_style",
+    "replay",
+    "report",
+    "report_table",
+    "run_metrics",
+    "run_page",
+    "steady_state",
+)
 """Modules that other rooms import; the others are private."""

@@ -157,9 +157,13 @@ class ParquetFile:
         encoded |= dict.fromkeys(counts, "DELTA_BINARY_PACKED")
         repeated = [name for name in schema.names if name not in encoded]
         return parquet.ParquetWriter(
-            self._stream, schema, store_schema=store_schema, use_dictionary=repeated,
-            column_encoding=encoded, write_batch_size=_BATCH_ROWS,
-        )  # fmt: skip
+            self._stream,
+            schema,
+            store_schema=store_schema,
+            use_dictionary=repeated,
+            column_encoding=encoded,
+            write_batch_size=_BATCH_ROWS,
+        )
 
 
 class _StoredColumns:

@@ -25,9 +25,14 @@ from hilctl.signals.cycle_metrics import MeanCycle
 _LIMITED = Flag.RANGE_LIMITED | Flag.SLEW_LIMITED | Flag.INVALID
 
 _WORST = (
-    "peak_hysteresis_percent", "loop_area", "peak_to_peak_um", "peak_error_percent",
-    "rms_error_percent", "peak_error_raw_percent", "rms_error_raw_percent",
-)  # fmt: skip
+    "peak_hysteresis_percent",
+    "loop_area",
+    "peak_to_peak_um",
+    "peak_error_percent",
+    "rms_error_percent",
+    "peak_error_raw_percent",
+    "rms_error_raw_percent",
+)
 
 
 Windows: TypeAlias = list[tuple[Segment, tuple[int, int, int]]]

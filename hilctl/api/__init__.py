@@ -35,12 +35,37 @@ if TYPE_CHECKING:
     from hilctl.api.runs import WrittenExperiment, check, init, load, run
 
 __all__ = [
-    "ConfigError", "DataError", "DeviceError", "HilctlError", "InputError", "ModelError",
-    "RecordedRun", "RunConnection", "RunError", "SampleTable", "WrittenExperiment", "campaign",
-    "characterise", "check", "compare", "connect", "export", "figures", "identify", "init",
-    "learn", "list_runs", "load", "read", "refine", "replay", "report_page", "report_runs", "run",
+    "ConfigError",
+    "DataError",
+    "DeviceError",
+    "HilctlError",
+    "InputError",
+    "ModelError",
+    "RecordedRun",
+    "RunConnection",
+    "RunError",
+    "SampleTable",
+    "WrittenExperiment",
+    "campaign",
+    "characterise",
+    "check",
+    "compare",
+    "connect",
+    "export",
+    "figures",
+    "identify",
+    "init",
+    "learn",
+    "list_runs",
+    "load",
+    "read",
+    "refine",
+    "replay",
+    "report_page",
+    "report_runs",
+    "run",
     "summarize",
-]  # fmt: skip
+]
 
 
 def __dir__() -> list[str]:

@@ -79,9 +79,13 @@ def refine(
         InputError: A file is invalid; nothing is written.
     """
     return refine_files(
-        Path(model), paths_of(runs), path_or_none(output), paths_of(validate),
-        overwrite=overwrite, progress=on_progress,
-    )  # fmt: skip
+        Path(model),
+        paths_of(runs),
+        path_or_none(output),
+        paths_of(validate),
+        overwrite=overwrite,
+        progress=on_progress,
+    )
 
 
 def compare(

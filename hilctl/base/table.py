@@ -28,8 +28,13 @@ _SCALES: dict[str, dict[str, float]] = {
 }
 """Units of each base unit, with their factors to it."""
 _WORDS = {
-    "second": "s", "seconds": "s", "volts": "V", "amps": "A", "amperes": "A", "micrometer": "um",
-}  # fmt: skip
+    "second": "s",
+    "seconds": "s",
+    "volts": "V",
+    "amps": "A",
+    "amperes": "A",
+    "micrometer": "um",
+}
 _OTHERS = {"", "-", "%", "hz", "n", "c", "°c", "k", "counts", "count", "bit", "deg", "sequence"}
 
 

@@ -279,10 +279,17 @@ def compare(
     names = [name for text in models or [] for name in text.split(",") if name]
     with progress_bar("compare", quiet=as_json) as on_progress:
         comparison = api.compare(
-            files, names, experiment=experiment, settings=settings or [],
-            frequencies_hz=_numbers(frequencies), points=points, html=html, save=save,
-            overwrite=overwrite, on_progress=on_progress,
-        )  # fmt: skip
+            files,
+            names,
+            experiment=experiment,
+            settings=settings or [],
+            frequencies_hz=_numbers(frequencies),
+            points=points,
+            html=html,
+            save=save,
+            overwrite=overwrite,
+            on_progress=on_progress,
+        )
     values = comparison.to_mapping()
     print_result(values, lambda: print_rich(render_comparison(comparison)), as_json=as_json)
 

@@ -267,10 +267,20 @@ class Adaptation:
         if self._seen is None or not self._ready:
             return
         kernel.adapt_block(
-            block.reference, block.input_um, block.displacement_um, block.flags, self._settings,
-            self._operator.table, self._operator.shape, self._operator.thresholds, self._due,
-            self._shown, self._places, self._seen, self._state,
-        )  # fmt: skip
+            block.reference,
+            block.input_um,
+            block.displacement_um,
+            block.flags,
+            self._settings,
+            self._operator.table,
+            self._operator.shape,
+            self._operator.thresholds,
+            self._due,
+            self._shown,
+            self._places,
+            self._seen,
+            self._state,
+        )
 
     def event(self, sample: int, *, ended: bool = False) -> Event | None:
         """Return an event with the parameters if they have changed enough or the run has ended."""

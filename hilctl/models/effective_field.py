@@ -53,9 +53,15 @@ class FieldLosses(StrictModel):
         lags = self.decay_s * sample_rate_hz
         left = math.exp(-1.0 / lags) if lags > 0.0 else 0.0
         return (
-            self.field_s * sample_rate_hz, self.output_s * sample_rate_hz, left, self.growth,
-            self.bend, self.excess, even_excess(span), (1.0 - left) * lags,
-        )  # fmt: skip
+            self.field_s * sample_rate_hz,
+            self.output_s * sample_rate_hz,
+            left,
+            self.growth,
+            self.bend,
+            self.excess,
+            even_excess(span),
+            (1.0 - left) * lags,
+        )
 
 
 class OutputCurve(CheckedModel):

@@ -1,7 +1,17 @@
 """MCAP recordings: writing, reading and recovery."""
 
 PUBLIC = (
-    "codec", "encoder", "metadata_keys", "reader", "recording", "recording_files", "recover",
-    "run_summary", "schema", "time_range", "validation", "writer",
-)  # fmt: skip
+    "codec",
+    "encoder",
+    "metadata_keys",
+    "reader",
+    "recording",
+    "recording_files",
+    "recover",
+    "run_summary",
+    "schema",
+    "time_range",
+    "validation",
+    "writer",
+)
 """Modules that other rooms import; the others are private."""

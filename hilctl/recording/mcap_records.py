@@ -63,12 +63,20 @@ _MESSAGE = struct.Struct("<BQHIQQ")  # opcode and length as well
 _MESSAGE_OPCODE = int(Opcode.MESSAGE)  # enumerations compare slowly
 _PIECE_BYTES = 65536
 _KINDS: dict[int, Any] = {
-    Opcode.HEADER: Header, Opcode.FOOTER: Footer, Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel,
-    Opcode.CHUNK: Chunk, Opcode.CHUNK_INDEX: ChunkIndex, Opcode.ATTACHMENT: Attachment,
-    Opcode.ATTACHMENT_INDEX: AttachmentIndex, Opcode.STATISTICS: Statistics,
-    Opcode.METADATA: Metadata, Opcode.METADATA_INDEX: MetadataIndex,
-    Opcode.SUMMARY_OFFSET: SummaryOffset, Opcode.DATA_END: DataEnd,
-}  # fmt: skip
+    Opcode.HEADER: Header,
+    Opcode.FOOTER: Footer,
+    Opcode.SCHEMA: Schema,
+    Opcode.CHANNEL: Channel,
+    Opcode.CHUNK: Chunk,
+    Opcode.CHUNK_INDEX: ChunkIndex,
+    Opcode.ATTACHMENT: Attachment,
+    Opcode.ATTACHMENT_INDEX: AttachmentIndex,
+    Opcode.STATISTICS: Statistics,
+    Opcode.METADATA: Metadata,
+    Opcode.METADATA_INDEX: MetadataIndex,
+    Opcode.SUMMARY_OFFSET: SummaryOffset,
+    Opcode.DATA_END: DataEnd,
+}
 
 
 class ReadBudget:

@@ -135,9 +135,15 @@ def run_unpaced(checked: CheckedExperiment, output: Path, *, overwrite: bool = F
 def _run(checked: CheckedExperiment, recorder: Recorder) -> tuple[LoopOutcome, Lateness]:
     loaded, begun = checked.loaded, checked.begun
     plan = assemble(
-        loaded, checked.reference.values, begun.input_um, begun.state, checked.conditioning(),
-        operator=checked.operator, paced=False, heat_a2=checked.heat_a2,
-    )  # fmt: skip
+        loaded,
+        checked.reference.values,
+        begun.input_um,
+        begun.state,
+        checked.conditioning(),
+        operator=checked.operator,
+        paced=False,
+        heat_a2=checked.heat_a2,
+    )
 
     def refused() -> str:
         """Return why the file cannot be written after a retry, or an empty text."""

@@ -188,9 +188,12 @@ def judged(row: Row, drive: Drive, noise_um: F64) -> Figures:
     bare = read - float(np.mean(read))
     to_percent = 100.0 / float(np.ptp(row.reference_um[row.judged]))
     figures = (
-        np.max(np.abs(read)), np.max(np.abs(bare)), np.std(read), np.max(np.abs(error)),
+        np.max(np.abs(read)),
+        np.max(np.abs(bare)),
+        np.std(read),
+        np.max(np.abs(error)),
         np.sqrt(np.mean(error**2)),
-    )  # fmt: skip
+    )
     return Figures(*(to_percent * float(figure) for figure in figures))
 
 
@@ -265,10 +268,14 @@ def show(rig: Rig, options: argparse.Namespace) -> tuple[dict[str, Any], bool]:
     for text, _ in sums:
         say(f"{rig.physics}, {text}")
     table = {
-        "physics": rig.physics, "options": list(options.options), "model": taken, "fit_s": took_s,
-        "inverse_us": cost, "omega_us": omega,
+        "physics": rig.physics,
+        "options": list(options.options),
+        "model": taken,
+        "fit_s": took_s,
+        "inverse_us": cost,
+        "omega_us": omega,
         "rows": [result.to_mapping() for result in results],
-    }  # fmt: skip
+    }
     return table, all(met for _, met in sums)
 
 

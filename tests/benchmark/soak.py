@@ -82,11 +82,13 @@ def main() -> int:
     print(f"late {late_percent:.3g} %; cores {cores}; resident MB {resident_mb}")
     print(f"memory growth after the first minute: {growth_kib} KiB")
     met = (
-        result["code"] == "completed", result["dropped"] == 0,
-        late_percent <= options.max_late_percent, sum(cores.values()) <= options.max_cores,
+        result["code"] == "completed",
+        result["dropped"] == 0,
+        late_percent <= options.max_late_percent,
+        sum(cores.values()) <= options.max_cores,
         max(resident_mb.values()) <= options.max_mb,
         all(each < _GROWTH_KIB for each in growth_kib.values()),
-    )  # fmt: skip
+    )
     return 0 if all(met) else 1
 
 

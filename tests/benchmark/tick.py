@@ -47,9 +47,12 @@ class TimedClock(SystemClock):
 def experiment(options: argparse.Namespace, model: Path) -> LoadedExperiment:
     """Return the shipped experiment with a model, one sample per tick."""
     settings = {
-        "sample_rate_hz": float(options.rate), "block": 1, "waveform.frequency_hz": 1.0,
-        "waveform.duration_s": options.ticks / options.rate, "compensator.model": model.resolve(),
-    }  # fmt: skip
+        "sample_rate_hz": float(options.rate),
+        "block": 1,
+        "waveform.frequency_hz": 1.0,
+        "waveform.duration_s": options.ticks / options.rate,
+        "compensator.model": model.resolve(),
+    }
     return load_experiment(EXPERIMENT, [f"{key}={value}" for key, value in settings.items()])
 
 

@@ -27,9 +27,15 @@ class Ideal:
     """A spring without mass that keeps the contract; its output persists."""
 
     info = DeviceInfo(
-        name="modbus_dac", description="ideal spring", command_unit="A", command_min=-HIGHEST_A,
-        command_max=HIGHEST_A, sensor_min_um=-100.0, sensor_max_um=100.0, max_rate_hz=20_000.0,
-    )  # fmt: skip
+        name="modbus_dac",
+        description="ideal spring",
+        command_unit="A",
+        command_min=-HIGHEST_A,
+        command_max=HIGHEST_A,
+        sensor_min_um=-100.0,
+        sensor_max_um=100.0,
+        max_rate_hz=20_000.0,
+    )
 
     um_per_a = UM_PER_A
     due, openings, was_safe = 0, 0, False

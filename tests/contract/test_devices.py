@@ -98,9 +98,11 @@ def _fast(section):
 
 
 CASES = [
-    *SIMULATED, *OTHERS, *(f"simulated_terfenol {words}" for words in PHYSICS),
+    *SIMULATED,
+    *OTHERS,
+    *(f"simulated_terfenol {words}" for words in PHYSICS),
     *(f"modbus_dac {words}" for words in MODBUS),
-]  # fmt: skip
+]
 
 
 @pytest.fixture

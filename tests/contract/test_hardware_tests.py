@@ -43,9 +43,13 @@ def ran(*options):
     """Run the hardware tests in a separate process."""
     command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "tests/hardware"]
     return subprocess.run(
-        [*command, *options], cwd=ROOT, env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1"},
-        capture_output=True, text=True, timeout=GIVE_UP_S,
-    )  # fmt: skip
+        [*command, *options],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1"},
+        capture_output=True,
+        text=True,
+        timeout=GIVE_UP_S,
+    )
 
 
 @pytest.fixture

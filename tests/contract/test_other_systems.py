@@ -22,11 +22,15 @@ SYSTEMS = ["win32", "darwin"] if sys.platform == "linux" else [sys.platform]
 def on(system, commands, folder):
     """Run commands as on another system; return their exit codes and standard error."""
     done = subprocess.run(
-        [sys.executable, "-P", OTHER_SYSTEM, system], input=json.dumps(commands),
-        capture_output=True, encoding="utf-8", errors="replace",
+        [sys.executable, "-P", OTHER_SYSTEM, system],
+        input=json.dumps(commands),
+        capture_output=True,
+        encoding="utf-8",
+        errors="replace",
         env={**os.environ, "PYTHONIOENCODING": "cp1252"} if system == "win32" else None,
-        cwd=folder, timeout=280,
-    )  # fmt: skip
+        cwd=folder,
+        timeout=280,
+    )
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout.splitlines()[-1]), done.stderr
 

@@ -152,9 +152,13 @@ def board(connect):
 
 
 OPTIONS = {
-    "output": "OUT", "input": "IN", "amplifier": {"gain_a_per_v": 1.0},
-    "sensor": {"um_per_v": 10.0}, "watchdog": "none", "timeout_s": TIMEOUT_S,
-}  # fmt: skip
+    "output": "OUT",
+    "input": "IN",
+    "amplifier": {"gain_a_per_v": 1.0},
+    "sensor": {"um_per_v": 10.0},
+    "watchdog": "none",
+    "timeout_s": TIMEOUT_S,
+}
 
 
 @pytest.mark.parametrize("answer", [dead, echo])
@@ -396,9 +400,11 @@ def refuse_safe(data):
         kind, seq = payload[0], payload[1]
         info = struct.pack("<BHHfff", 2, 0, 1, 1000.0, -10.0, 10.0)
         bodies = {
-            0x14: b"\0" + info + b"board", 0x16: struct.pack("<BBff", 0, 0, 3.0, 0.0),
-            0x12: b"\0" + payload[2:6], 0x13: b"\x04",
-        }  # fmt: skip
+            0x14: b"\0" + info + b"board",
+            0x16: struct.pack("<BBff", 0, 0, 3.0, 0.0),
+            0x12: b"\0" + payload[2:6],
+            0x13: b"\x04",
+        }
         sent += FRAMES.encode(bytes([kind | 0x80, seq]) + bodies[kind])
     return sent, rest
 

@@ -44,9 +44,13 @@ def each_kind(cases, shown):
 T7 = {"kind": "modbus_dac", **T7_OPTIONS}
 """Device section of a LabJack T7, without its address."""
 MODULE = {
-    "kind": "modbus_dac", "output": "OUT", "input": "IN", "amplifier": {"gain_a_per_v": 1.0},
-    "sensor": {"um_per_v": 12.5}, "watchdog": "none",
-}  # fmt: skip
+    "kind": "modbus_dac",
+    "output": "OUT",
+    "input": "IN",
+    "amplifier": {"gain_a_per_v": 1.0},
+    "sensor": {"um_per_v": 12.5},
+    "watchdog": "none",
+}
 """Device section of the module in ``tests/data``, without its port."""
 
 

@@ -16,9 +16,11 @@ BLOCK = 200
 FIFO_BLOCKS = 12
 STREAM = {"sample_rate_hz": 5000, "block": BLOCK}
 STREAMING = {
-    "kind": "modbus_stream", "timeout_s": TIMEOUT_S, "fifo_blocks": FIFO_BLOCKS,
+    "kind": "modbus_stream",
+    "timeout_s": TIMEOUT_S,
+    "fifo_blocks": FIFO_BLOCKS,
     "watchdog": {"timeout_s": WATCHDOG_S},
-}  # fmt: skip
+}
 FAULTS = {
     "silence": "no answer within 2 s",
     "exception": "function 76 refused with exception 4 (device failure)",

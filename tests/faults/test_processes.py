@@ -22,9 +22,12 @@ from tests.faults.conftest import StartedRun, simulated, sine
 
 ROOT = Path(__file__).parents[2]
 EXPERIMENT = simulated(
-    "process_fault", 1000, sine(5.0, 60.0), timing={"max_late_s": 3.0, "on_misses": "warn"},
+    "process_fault",
+    1000,
+    sine(5.0, 60.0),
+    timing={"max_late_s": 3.0, "on_misses": "warn"},
     recording={"flush_s": 0.1, "ring_s": 5.0},
-)  # fmt: skip
+)
 
 
 def begun(folder, **changes):

@@ -19,9 +19,12 @@ WATCHDOG_S = 4.0
 WAVEFORM = sine(1.0, 60.0, soft_start_s=0.2)
 GUARDED = {"watchdog": {"timeout_s": WATCHDOG_S}}
 DEVICE = {
-    "kind": "serial_dac", "timeout_s": TIMEOUT_S, "amplifier": {"gain_a_per_v": 1.0},
-    "sensor": {"um_per_v": 12.5}, "watchdog": "none",
-}  # fmt: skip
+    "kind": "serial_dac",
+    "timeout_s": TIMEOUT_S,
+    "amplifier": {"gain_a_per_v": 1.0},
+    "sensor": {"um_per_v": 12.5},
+    "watchdog": "none",
+}
 SETUPS = {
     "dcon": ({**GUARDED, "output": "AO0", "input": "AI0"}, {"sample_rate_hz": 100}),
     "scpi": ({"output": "DAC204", "input": "AI101"}, {"sample_rate_hz": 20}),
@@ -66,12 +69,16 @@ def meet(emulate, run, boards):
 
 
 FAULTS = {
-    ("dcon", "silence"): "no answer within 2 s", ("dcon", "corrupt"): "checksum of",
-    ("dcon", "exception"): r"invalid command \(\?02\)", ("scpi", "cut"): "within 2 s",
-    ("cobs", "cut"): "within 2 s", ("cobs", "exception"): "refused by the board",
-    ("fifo", "silence"): "no answer within 2.01 s", ("fifo", "corrupt"): "crc16_ccitt_false|COBS",
+    ("dcon", "silence"): "no answer within 2 s",
+    ("dcon", "corrupt"): "checksum of",
+    ("dcon", "exception"): r"invalid command \(\?02\)",
+    ("scpi", "cut"): "within 2 s",
+    ("cobs", "cut"): "within 2 s",
+    ("cobs", "exception"): "refused by the board",
+    ("fifo", "silence"): "no answer within 2.01 s",
+    ("fifo", "corrupt"): "crc16_ccitt_false|COBS",
     ("fifo", "exception"): "refused by the board",
-}  # fmt: skip
+}
 """Each kind of wire with each way in which a run meets trouble; more of them by themselves, without
 a run, are in ``tests/unit/drivers``."""
 
@@ -159,12 +166,17 @@ def test_silent_reader_is_named(emulate, run):
     sensor = "agilent_34970a:AI101"
     device = emulate("kepco_bop", "--sensor", sensor, lines=2)
     section = {
-        "kind": "serial_dac", "profile": "kepco_bop", "serial_port": device.addresses[0],
-        "output": "current", "input": "AI101",
+        "kind": "serial_dac",
+        "profile": "kepco_bop",
+        "serial_port": device.addresses[0],
+        "output": "current",
+        "input": "AI101",
         "reader": {"profile": "agilent_34970a", "serial_port": device.addresses[1]},
-        "measure": "current", "timeout_s": TIMEOUT_S, "sensor": {"um_per_v": 12.5},
+        "measure": "current",
+        "timeout_s": TIMEOUT_S,
+        "sensor": {"um_per_v": 12.5},
         "watchdog": "none",
-    }  # fmt: skip
+    }
     started = run(section, waveform=WAVEFORM, sample_rate_hz=19)
     device.log.await_events("current", 20, started.process)
     device.process.send_signal(signal.SIGSTOP)

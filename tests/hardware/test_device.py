@@ -52,9 +52,12 @@ class RealDevice:
         further = high if high - self.safe >= self.safe - low else low
         self.target = self.safe + SHARE * (further - self.safe)
         gentle = CommandLimits(
-            low=min(self.safe, self.target), high=max(self.safe, self.target),
-            slew_per_s=limits.ramp_per_s, safe=self.safe, ramp_per_s=limits.ramp_per_s,
-        )  # fmt: skip
+            low=min(self.safe, self.target),
+            high=max(self.safe, self.target),
+            slew_per_s=limits.ramp_per_s,
+            safe=self.safe,
+            ramp_per_s=limits.ramp_per_s,
+        )
         self.limiter = Limiter(gentle, 1.0 / config.sample_rate_hz)
         self.stroke_um = config.limits.stroke_um
         self._at_start = config.safe.at_start

@@ -92,10 +92,16 @@ def test_any_broken_rig(how, at, size, bounds, way):
     device = Broken(latency, how, at, size)
     host = FakeHost(FakeClock(), block, compensator.state_size + 1)
     plan = LoopPlan(
-        reference=REFERENCE, input_um=REFERENCE, block=block, latency_blocks=latency,
-        sample_rate_hz=RATE_HZ, compensator=compensator, limits=LIMITS,
-        interlocks=InterlockContext(stroke_um=(-1e3, 1e3)), adaptation=adaptation,
-    )  # fmt: skip
+        reference=REFERENCE,
+        input_um=REFERENCE,
+        block=block,
+        latency_blocks=latency,
+        sample_rate_hz=RATE_HZ,
+        compensator=compensator,
+        limits=LIMITS,
+        interlocks=InterlockContext(stroke_um=(-1e3, 1e3)),
+        adaptation=adaptation,
+    )
     loop = Loop(plan, device, host)
     loop.begin_at(0.0)
     assert loop.run(0).code == "completed"

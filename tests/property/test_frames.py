@@ -150,9 +150,12 @@ def test_write_reads_as_pymodbus_has_them(
     pdu = write_read_pdu(read_at, count, write_at, words(values))
     names = {"dev_id": unit, "transaction_id": transaction}
     theirs = ReadWriteMultipleRegistersRequest(
-        **names, read_address=read_at, read_count=count, write_address=write_at,
+        **names,
+        read_address=read_at,
+        read_count=count,
+        write_address=write_at,
         write_registers=values,
-    )  # fmt: skip
+    )
     assert_same_request(pdu, theirs)
     read = data.draw(st.lists(st.integers(0, 65535), min_size=count, max_size=count))
     assert_reads_reply(

@@ -363,9 +363,14 @@ def _initial_state(recording: Recording, path: Path) -> None:
 
 
 COMMANDS: dict[str, Callable[[Recording, Path], None]] = {
-    "report": _report, "replay": _replay, "pieces": _pieces, "export": _export,
-    "identify": _identify, "initial_state": _initial_state, "html": _html,
-}  # fmt: skip
+    "report": _report,
+    "replay": _replay,
+    "pieces": _pieces,
+    "export": _export,
+    "identify": _identify,
+    "initial_state": _initial_state,
+    "html": _html,
+}
 
 
 def recover(path: Path) -> None:

@@ -52,9 +52,12 @@ DELAYS_S = st.one_of(st.just(0.0), st.floats(0.0, 2e-3))
 @st.composite
 def models(draw, *, structures=MAYBE_STRUCTURES, delays_s=DELAYS_S, smoothings_s=SMOOTHINGS_S):
     return StagedModel.around(
-        draw(hysteresis()), lag=draw(st.none() | LAGS), structure=draw(structures),
-        delay_s=draw(delays_s), smoothing_s=draw(smoothings_s),
-    )  # fmt: skip
+        draw(hysteresis()),
+        lag=draw(st.none() | LAGS),
+        structure=draw(structures),
+        delay_s=draw(delays_s),
+        smoothing_s=draw(smoothings_s),
+    )
 
 
 def cut_up(operator, signal, sizes):

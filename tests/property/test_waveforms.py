@@ -64,10 +64,14 @@ def multisines(draw: st.DrawFn) -> Keys:
     first_hz = draw(st.floats(0.5, 100.0))
     step_hz = draw(st.floats(0.5, 10.0))
     return {
-        "kind": "multisine", "offset": draw(levels), "amplitude": draw(amplitudes),
-        "first_hz": first_hz, "last_hz": first_hz + step_hz * draw(st.floats(0.0, 39.0)),
-        "step_hz": step_hz, "duration_s": draw(durations_s),
-    }  # fmt: skip
+        "kind": "multisine",
+        "offset": draw(levels),
+        "amplitude": draw(amplitudes),
+        "first_hz": first_hz,
+        "last_hz": first_hz + step_hz * draw(st.floats(0.0, 39.0)),
+        "step_hz": step_hz,
+        "duration_s": draw(durations_s),
+    }
 
 
 @st.composite

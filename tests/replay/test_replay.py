@@ -32,9 +32,11 @@ GOLDEN = sorted((Path(__file__).parents[2] / "recordings" / "golden").glob("*.mc
 
 
 STAGED = StagedModel.around(
-    terfenol_rdpi(), lag=FieldLag(tau_s=1e-4, growth_per_unit=0.3),
-    structure=FirstMode(natural_hz=2200.0, damping_ratio=0.12), delay_s=3e-5,
-)  # fmt: skip
+    terfenol_rdpi(),
+    lag=FieldLag(tau_s=1e-4, growth_per_unit=0.3),
+    structure=FirstMode(natural_hz=2200.0, damping_ratio=0.12),
+    delay_s=3e-5,
+)
 
 
 def unpaced(path: Path, output: Path) -> RunResult:

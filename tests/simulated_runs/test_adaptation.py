@@ -66,9 +66,12 @@ def test_parameters_are_recorded_and_said(run):
 def test_an_integrator_keeps_the_offset(run):
     integral = "feedback={kind: integral, bandwidth_hz: 5.0, limit_um: 10.0}"
     result, recording = run(
-        STAGED, "waveform.duration_s=1.5", "device.drift={um: 5.0, tau_s: 0.1}", ADAPTATION,
+        STAGED,
+        "waveform.duration_s=1.5",
+        "device.drift={um: 5.0, tau_s: 0.1}",
+        ADAPTATION,
         integral,
-    )  # fmt: skip
+    )
     assert result.adapted["offset_um"] == 0.0
     assert abs(result.adapted["gain"] - 1.0) < 0.02
     assert replay(recording).identical

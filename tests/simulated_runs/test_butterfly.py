@@ -89,9 +89,12 @@ def test_compensation_on_a_wing(found, tmp_path):
     """An offset biases the run to one wing: error and hysteresis within the published 3.7 %."""
     (tmp_path / "model.yaml").write_text(dump_model(found.model))
     settings = (
-        "device.magnet=false", f"compensator.model={tmp_path / 'model.yaml'}",
-        "waveform.amplitude=10.0", "waveform.offset=14.0", "waveform.duration_s=0.8",
-    )  # fmt: skip
+        "device.magnet=false",
+        f"compensator.model={tmp_path / 'model.yaml'}",
+        "waveform.amplitude=10.0",
+        "waveform.offset=14.0",
+        "waveform.duration_s=0.8",
+    )
     path = tmp_path / "run.mcap"
     result = start_run(CONFIG, settings, path, False, lambda progress: None)
     recording = read(path)

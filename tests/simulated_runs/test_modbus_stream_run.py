@@ -33,9 +33,11 @@ def port():
 def ran(port, path, *more):
     """Run the experiment on the emulated device; return its result and what it said."""
     rate = (
-        "sample_rate_hz=2500", "waveform.duration_s=3.0", "timing.hang_s=5.0",
+        "sample_rate_hz=2500",
+        "waveform.duration_s=3.0",
+        "timing.hang_s=5.0",
         "device.timeout_s=1.0",
-    )  # fmt: skip
+    )
     changes = [f"device.tcp_port={port}", *rate, *more]
     settings = [word for change in changes for word in ("--set", change)]
     run = start("run", CONFIG, *settings, "--output", path, "--json")

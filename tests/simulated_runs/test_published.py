@@ -104,9 +104,11 @@ def test_four_plays_straighten_minor_loops(run):
         for share, frequency_hz in ((1.0, 50.0), (1.3, 45.0))
     ]
     recording = run(
-        CONFIGS / "terfenol_complex_50_100.yaml", "compensator.model=models/terfenol_rdpi.yaml",
-        f"waveform.components={json.dumps(parts)}", f"waveform.offset={CENTRE_UM}",
-    )  # fmt: skip
+        CONFIGS / "terfenol_complex_50_100.yaml",
+        "compensator.model=models/terfenol_rdpi.yaml",
+        f"waveform.components={json.dumps(parts)}",
+        f"waveform.offset={CENTRE_UM}",
+    )
     (segment,) = summarize(recording).segments
     samples = recording.samples.part(
         recording.segments[0].steady_start, recording.segments[0].steady_stop

@@ -58,17 +58,27 @@ def make_recording() -> MakeRecording:
         wanted_um = np.full(n, np.nan) if reference_um is None else reference_um
         samples = Samples(
             index=np.arange(n, dtype=np.int64) if index is None else index,
-            reference_um=wanted_um, wanted=put_out, command=put_out,
-            displacement_um=displacement_um, input_um=wanted_um, flags=flags,
-        )  # fmt: skip
+            reference_um=wanted_um,
+            wanted=put_out,
+            command=put_out,
+            displacement_um=displacement_um,
+            input_um=wanted_um,
+            flags=flags,
+        )
         return Recording(
             path=Path("run.mcap"),
             run={"name": "test", "device": "serial_dac"} if run is None else run,
             end={"reason": "waveform completed"} if end is None else end,
-            sample_rate_hz=sample_rate_hz, command_unit="A", compensated=reference_um is not None,
-            segments=tuple(segments), samples=samples, dropped=0,
-            ticks=_ticks(n, 50, sample_rate_hz) if ticks is None else ticks, events=events,
-            experiment_yaml=experiment_yaml, model_yaml="",
-        )  # fmt: skip
+            sample_rate_hz=sample_rate_hz,
+            command_unit="A",
+            compensated=reference_um is not None,
+            segments=tuple(segments),
+            samples=samples,
+            dropped=0,
+            ticks=_ticks(n, 50, sample_rate_hz) if ticks is None else ticks,
+            events=events,
+            experiment_yaml=experiment_yaml,
+            model_yaml="",
+        )
 
     return make

@@ -284,9 +284,15 @@ class StreamSetup:
             "fifo_level": f"{self.fifo_blocks} blocks",
         }
         return replace(
-            found, name="modbus_stream", max_rate_hz=rates.highest_hz, rate_note=rates.note,
-            buffered=True, fifo_depth=depth, latency_blocks=self.fifo_blocks, details=details,
-        )  # fmt: skip
+            found,
+            name="modbus_stream",
+            max_rate_hz=rates.highest_hz,
+            rate_note=rates.note,
+            buffered=True,
+            fifo_depth=depth,
+            latency_blocks=self.fifo_blocks,
+            details=details,
+        )
 
 
 class StreamSafeWrite(ModbusSafeWrite):
@@ -372,9 +378,13 @@ class ModbusStream(ModbusDevice):
     def _stream_on(self, session: ModbusSession) -> StreamSession:
         writer = self._setup.writer
         return StreamSession(
-            ModbusFeedback(session.link, writer.unit), self._streaming.streaming,
-            writer.timeout_s, writer.profile.turnaround_s, self._sleep, self._clock,
-        )  # fmt: skip
+            ModbusFeedback(session.link, writer.unit),
+            self._streaming.streaming,
+            writer.timeout_s,
+            writer.profile.turnaround_s,
+            self._sleep,
+            self._clock,
+        )
 
     def _exchange(
         self, first_sample: int, command: F64, displacement_um: F64, measured: F64

@@ -276,10 +276,13 @@ class Domains(Rods):
         eddy = VACUUM_PERMEABILITY * ROD_RADIUS_M**2 / (8.0 * parameters.resistivity_ohm_m)
         self._bias, self._saturation = coil.bias_a_per_m, saturation
         self._energies = (
-            parameters.anisotropy_j_per_m3, VACUUM_PERMEABILITY * saturation,
-            parameters.stress_pa, parameters.spread_j_per_m3, parameters.pinning_j_per_m3,
+            parameters.anisotropy_j_per_m3,
+            VACUUM_PERMEABILITY * saturation,
+            parameters.stress_pa,
+            parameters.spread_j_per_m3,
+            parameters.pinning_j_per_m3,
             parameters.reversibility,
-        )  # fmt: skip
+        )
         self._table = parameters.table()
         self._state = np.zeros((3, self._table.shape[1]))
         constants = (coil.factor_per_m, coil.bias_a_per_m, coil.step_s, eddy, saturation)

@@ -374,6 +374,12 @@ class TerfenolActuator(Plant):
         if self._thermal is not None:
             warm(halves, noise_um, self._warmth, self._thermal, self._substeps)
         respond(
-            free, noise_um, displacement_um, self._mechanics, self._motion, self._rest_um,
-            self._sensor, self._substeps,
-        )  # fmt: skip
+            free,
+            noise_um,
+            displacement_um,
+            self._mechanics,
+            self._motion,
+            self._rest_um,
+            self._sensor,
+            self._substeps,
+        )

@@ -56,9 +56,16 @@ def _open_port(path: str, settings: SerialSettings, timeout_s: float) -> serial.
     raised lasts for microseconds only.
     """
     port = serial.Serial(
-        None, settings.baud, settings.bytesize, settings.parity, settings.stopbits, timeout=0.0,
-        xonxoff=settings.flow == "xonxoff", write_timeout=timeout_s, exclusive=True,
-    )  # fmt: skip
+        None,
+        settings.baud,
+        settings.bytesize,
+        settings.parity,
+        settings.stopbits,
+        timeout=0.0,
+        xonxoff=settings.flow == "xonxoff",
+        write_timeout=timeout_s,
+        exclusive=True,
+    )
     if settings.dtr is not None:
         port.dtr = settings.dtr
     if settings.rts is not None:

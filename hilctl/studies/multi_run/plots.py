@@ -243,10 +243,18 @@ def _draw_order(axes: Axes, figure: RunFigure, runs: Sequence[SeriesRun]) -> Non
 def sheets_of(series: RunSeries) -> list[FigureSpec]:
     """Return all figures that apply, the most important first."""
     sheets = (
-        before_after_sheet(series), resonance_sheet(series), frequency_sheet(series),
-        step_sheet(series), *trend_sheets(series), *loop_sheets(series), minor_loop_sheet(series),
-        model_sheet(series), error_sheet(series), sensitivity_sheet(series), order_sheet(series),
-    )  # fmt: skip
+        before_after_sheet(series),
+        resonance_sheet(series),
+        frequency_sheet(series),
+        step_sheet(series),
+        *trend_sheets(series),
+        *loop_sheets(series),
+        minor_loop_sheet(series),
+        model_sheet(series),
+        error_sheet(series),
+        sensitivity_sheet(series),
+        order_sheet(series),
+    )
     return [sheet for sheet in sheets if sheet is not None]
 
 

@@ -14,10 +14,12 @@ NASTY = "<b onclick='x'>&\x1b"
 
 def test_no_part_takes_a_text_for_markup():
     parts = [
-        html.paragraph(NASTY, "note"), html.rows(NASTY, [(NASTY, NASTY)]),
-        html.grid([NASTY], [[NASTY]]), html.details(NASTY, NASTY),
+        html.paragraph(NASTY, "note"),
+        html.rows(NASTY, [(NASTY, NASTY)]),
+        html.grid([NASTY], [[NASTY]]),
+        html.details(NASTY, NASTY),
         html.definitions(NASTY, [(NASTY, NASTY)]),
-    ]  # fmt: skip
+    ]
     for part in parts:
         assert "<b " not in part
         assert "\x1b" not in part

@@ -26,10 +26,12 @@ def run(make_recording):
         wave = 40.0 * np.sin(phase)
         reference_um = np.where(np.arange(n + 300) < n, wave, np.nan)
         return make_recording(
-            40.0 * np.sin(phase - lag), reference_um=reference_um if compensated else None,
-            command=wave / 7.0, ramp=300,
+            40.0 * np.sin(phase - lag),
+            reference_um=reference_um if compensated else None,
+            command=wave / 7.0,
+            ramp=300,
             segments=[Segment("sine $_x$ <40> um", 0, n, 0, n, PERIOD)],
-        )  # fmt: skip
+        )
 
     return make
 

@@ -292,9 +292,11 @@ class TestWholeRun:
 
     def test_counters_of_the_run_go_before_those_counted_here(self, lagging) -> None:
         ticks = Ticks(
-            np.arange(0, 5000, 50), 1_000_000 * np.arange(100),
-            np.repeat(np.array([100_000, 700_000]), 50), np.full(100, 30_000),
-        )  # fmt: skip
+            np.arange(0, 5000, 50),
+            1_000_000 * np.arange(100),
+            np.repeat(np.array([100_000, 700_000]), 50),
+            np.full(100, 30_000),
+        )
         told = lagging(ticks=ticks, end={"late_ticks": "7", "skipped_ticks": "3"})
         assert summarize(told).late_ticks == 7
         assert summarize(told).skipped_ticks == 3

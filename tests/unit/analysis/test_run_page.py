@@ -181,11 +181,18 @@ def test_what_steers_a_browser_or_a_plot_is_written_out(recording: Recording) ->
 
 MODEL = Path(__file__).parents[3] / "configs" / "models" / "terfenol_omega.yaml"
 RUN = {
-    "started": "2026-11-22T14:40:15.891+00:00", "device": "serial_dac", "simulated": "true",
-    "host": "rig-3", "waveform.kind": "sine", "waveform.unit": "um", "waveform.amplitude": "40.8",
-    "waveform.offset": "0.0", "limits": '{"peak_current_a":7.07}', "compensator": "integrated",
+    "started": "2026-11-22T14:40:15.891+00:00",
+    "device": "serial_dac",
+    "simulated": "true",
+    "host": "rig-3",
+    "waveform.kind": "sine",
+    "waveform.unit": "um",
+    "waveform.amplitude": "40.8",
+    "waveform.offset": "0.0",
+    "limits": '{"peak_current_a":7.07}',
+    "compensator": "integrated",
     OVERRIDES_FACT: '["waveform.amplitude=40.8"]',
-}  # fmt: skip
+}
 
 
 @pytest.fixture

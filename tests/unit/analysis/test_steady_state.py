@@ -40,9 +40,11 @@ def run(make_recording):
         displacement_um = np.concatenate([np.zeros(LAG), reference_um[:-LAG]])
         whole = [Segment("sine", 0, SAMPLES, 0, SAMPLES, PERIOD)]
         return make_recording(
-            displacement_um, reference_um=reference_um, segments=segments or whole,
+            displacement_um,
+            reference_um=reference_um,
+            segments=segments or whole,
             events=tuple(event for event, _ in changes),
-        )  # fmt: skip
+        )
 
     return make
 

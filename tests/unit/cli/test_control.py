@@ -91,10 +91,14 @@ def shown(monkeypatch, capsys):
 
 def test_status_of_one_run(shown):
     assert shown(RUNNING) == [
-        "terfenol_sine_6a-12345  running", "  time       12.5 of 30.0 s",
-        "  samples    624,500 recorded, 500 missing", "  late ticks 1,234",
-        "  reference  gain 0.5, offset -2", "  inverse    out", f"  recording  {PATH}",
-    ]  # fmt: skip
+        "terfenol_sine_6a-12345  running",
+        "  time       12.5 of 30.0 s",
+        "  samples    624,500 recorded, 500 missing",
+        "  late ticks 1,234",
+        "  reference  gain 0.5, offset -2",
+        "  inverse    out",
+        f"  recording  {PATH}",
+    ]
 
 
 def test_status_of_several_runs_has_their_errors(shown):
@@ -102,9 +106,11 @@ def test_status_of_several_runs_has_their_errors(shown):
     lines = shown({**RUNNING, "recording_error": "full"}, silent)
     assert lines[0] == "terfenol_sine_6a-12345  running"
     assert lines[7:] == [
-        "  error      full", "other[1]  not answering", f"  recording  {PATH}",
+        "  error      full",
+        "other[1]  not answering",
+        f"  recording  {PATH}",
         "  error      timed out",
-    ]  # fmt: skip
+    ]
 
 
 @pytest.mark.parametrize(("inverse", "said"), [(None, ""), ("out", ", inverse out")])

@@ -70,9 +70,13 @@ def serial_bench(tmp_path):
                own_line=False, **options):  # fmt: skip
             log, clock = tmp_path / f"log{len(benches)}.jsonl", ShiftedClock()
             wanted = EmulatorOptions(
-                profile, log=log, noise=noise, faults=tuple(map(parse_fault, faults)),
-                reader=reader, reader_line="own" if own_line else "same",
-            )  # fmt: skip
+                profile,
+                log=log,
+                noise=noise,
+                faults=tuple(map(parse_fault, faults)),
+                reader=reader,
+                reader_line="own" if own_line else "same",
+            )
             emulator = stack.enter_context(emulated(wanted, clock))
             benches.append(SerialBench(emulator, log, clock, rate_hz, block, options))
             stack.callback(benches[-1].device._release)

@@ -81,9 +81,11 @@ class TestCycle:
     @example(cycles=2, decay=math.nextafter(1.0, 0.0), slew=100.0, safe=0.0, rate_hz=200.0)
     def test_within_limits_and_to_the_safe_value(self, cycles, decay, slew, safe, rate_hz):
         cycle, made = command_of(
-            f"condition={{cycles: {cycles}, decay: {decay!r}}}", f"limits.slew_a_per_s={slew!r}",
-            f"safe.value={safe!r}", f"sample_rate_hz={rate_hz!r}",
-        )  # fmt: skip
+            f"condition={{cycles: {cycles}, decay: {decay!r}}}",
+            f"limits.slew_a_per_s={slew!r}",
+            f"safe.value={safe!r}",
+            f"sample_rate_hz={rate_hz!r}",
+        )
         limits = loaded(f"safe.value={safe!r}").config.command_limits()
         assert limits.low - 1e-9 <= cycle.min() <= cycle.max() <= limits.high + 1e-9
         assert np.abs(np.diff(cycle, prepend=safe)).max() * rate_hz <= slew

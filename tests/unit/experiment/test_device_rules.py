@@ -119,10 +119,14 @@ class TestConsistency:
     def test_all_of_them_together_are_fine(self):
         text = CURRENT.replace("unit: A", "unit: um")
         settings = (
-            *BUDGET, "limits.tracking_error_um=5.0", "limits.tracking_s=0.1",
-            "limits.frozen_s=0.1", "limits.frozen_um=0.01", "limits.measured_deviation_a=0.5",
+            *BUDGET,
+            "limits.tracking_error_um=5.0",
+            "limits.tracking_s=0.1",
+            "limits.frozen_s=0.1",
+            "limits.frozen_um=0.01",
+            "limits.measured_deviation_a=0.5",
             "limits.deviation_s=0.01",
-        )  # fmt: skip
+        )
         path = Path(__file__).parents[3] / "configs"
         made = resolve(
             Document("x.yaml", text.replace("none", "{model: models/terfenol_omega.yaml}")),

@@ -65,12 +65,17 @@ def write_recording(
     """Write blocks of a run without a compensator."""
     run = RunFacts(
         facts={"compensator": "none", **(facts or {})},
-        segments=(), experiment_yaml="name: made\n", model_yaml="",
+        segments=(),
+        experiment_yaml="name: made\n",
+        model_yaml="",
         layout=RecordingLayout(
-            sample_rate_hz=rate_hz, command_unit="A", measures_command=measured,
-            scope_rate_hz=1000.0, start_unix_ns=1_700_000_000_000_000_000,
+            sample_rate_hz=rate_hz,
+            command_unit="A",
+            measures_command=measured,
+            scope_rate_hz=1000.0,
+            start_unix_ns=1_700_000_000_000_000_000,
         ),
-    )  # fmt: skip
+    )
     with path.open("xb") as stream:
         writer = RecordingWriter(stream, run)
         writer.batch(batch)

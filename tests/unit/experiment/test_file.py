@@ -123,9 +123,16 @@ class TestAccepted:
         config = loaded.config
         assert (config.name, config.sample_rate_hz, config.block) == ("full_example", 50e3, 50)
         assert config.waveform == Sine(
-            kind="sine", unit="um", amplitude=2.5, offset=-1.0, frequency_hz=10.0, phase_deg=90.0,
-            duration_s=2.0, soft_start_s=0.1, soft_end_s=0.2,
-        )  # fmt: skip
+            kind="sine",
+            unit="um",
+            amplitude=2.5,
+            offset=-1.0,
+            frequency_hz=10.0,
+            phase_deg=90.0,
+            duration_s=2.0,
+            soft_start_s=0.1,
+            soft_end_s=0.2,
+        )
         assert config.compensator is not None
         assert config.compensator.model == "model.yaml"
         assert (config.limits.unit, config.limits.command_range) == ("A", (-7.07, 7.07))
@@ -135,9 +142,13 @@ class TestAccepted:
         assert (config.timing.late_after, config.timing.max_late_s) == (0.25, 2.0)
         assert (config.timing.max_consecutive_late, config.timing.grace_s) == (7, 0.5)
         assert config.recording.model_dump() == {
-            "folder": "runs", "flush_s": 0.5, "sync": True, "scope_rate_hz": 500.0,
-            "ring_s": 20.0, "on_failure": "go_on",
-        }  # fmt: skip
+            "folder": "runs",
+            "flush_s": 0.5,
+            "sync": True,
+            "scope_rate_hz": 500.0,
+            "ring_s": 20.0,
+            "on_failure": "go_on",
+        }
         assert config.tick_s == pytest.approx(1e-3)
         assert loaded.device.info.details["seed"] == "3"
         assert loaded.device.info.details["load_kg"] == "3.7"

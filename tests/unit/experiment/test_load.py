@@ -12,10 +12,15 @@ from hilctl.experiment.load import load_experiment, resolve
 
 PROFILE = (Path(__file__).parents[2] / "data" / "rtu_module.yaml").read_text(encoding="utf-8")
 DEVICE = {
-    "kind": "modbus_dac", "profile": "mine/module.yaml", "serial_port": "/dev/ttyNOWHERE",
-    "output": "OUT", "input": "IN", "amplifier": {"gain_a_per_v": 1.0},
-    "sensor": {"um_per_v": 12.5}, "watchdog": "none",
-}  # fmt: skip
+    "kind": "modbus_dac",
+    "profile": "mine/module.yaml",
+    "serial_port": "/dev/ttyNOWHERE",
+    "output": "OUT",
+    "input": "IN",
+    "amplifier": {"gain_a_per_v": 1.0},
+    "sensor": {"um_per_v": 12.5},
+    "watchdog": "none",
+}
 EXPERIMENT = {
     "name": "profiles",
     "sample_rate_hz": 50,

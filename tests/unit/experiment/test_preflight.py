@@ -276,13 +276,21 @@ class TestDevice:
 class TestAllAtOnce:
     def test_device_reference_and_command(self):
         found = refusals(
-            DISPLACEMENT, "block=5", "waveform.amplitude=100.0", "limits.slew_a_per_s=1.0",
-            model=terfenol_rdpi(), max_rate_hz=100.0,
-        )  # fmt: skip
+            DISPLACEMENT,
+            "block=5",
+            "waveform.amplitude=100.0",
+            "limits.slew_a_per_s=1.0",
+            model=terfenol_rdpi(),
+            max_rate_hz=100.0,
+        )
         keys = [problem.key for problem in found]
         assert keys == [
-            "sample_rate_hz", "block", "waveform", "limits.peak_current_a", "limits.slew_a_per_s",
-        ]  # fmt: skip
+            "sample_rate_hz",
+            "block",
+            "waveform",
+            "limits.peak_current_a",
+            "limits.slew_a_per_s",
+        ]
 
     def test_device_and_a_waveform_that_can_not_be_built(self):
         found = refusals(CURRENT, "block=5", "waveform.frequency_hz=6000.0")

@@ -19,9 +19,13 @@ def found(held_out=None, lag_samples=0, starts=(), at_bound=(), known=None):
     )  # fmt: skip
     verdict = Verdict("usable", 4.0, held_out=held_out is not None, notes=("one note",))
     return SimpleNamespace(
-        fit=fit, held_out=held_out, lag_samples=lag_samples, verdict=verdict, candidates=(),
+        fit=fit,
+        held_out=held_out,
+        lag_samples=lag_samples,
+        verdict=verdict,
+        candidates=(),
         understood=(),
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.parametrize(("area", "text"), [(None, "-"), (1.5, "+1.50"), (-0.25, "-0.25")])

@@ -37,12 +37,17 @@ class Plant:
         error[0] = error[0].real
         cycle = np.fft.irfft(np.append(error, np.zeros(1000)) * 2120, 2120)
         return CycleScore(
-            harmonics_um=error, noise_um=np.full(HARMONICS + 1, NOISE_UM), step_hz=STEP_HZ,
-            cycles=16, peak_um=float(np.abs(cycle).max()),
-            rms_um=float(np.sqrt(np.mean(cycle**2))), peak_to_peak_um=100.0,
-            floor_um=4.0 * NOISE_UM * np.sqrt(2.0 * HARMONICS), strongest_hz=STEP_HZ,
+            harmonics_um=error,
+            noise_um=np.full(HARMONICS + 1, NOISE_UM),
+            step_hz=STEP_HZ,
+            cycles=16,
+            peak_um=float(np.abs(cycle).max()),
+            rms_um=float(np.sqrt(np.mean(cycle**2))),
+            peak_to_peak_um=100.0,
+            floor_um=4.0 * NOISE_UM * np.sqrt(2.0 * HARMONICS),
+            strongest_hz=STEP_HZ,
             answer=complex(self._answer[1]),
-        )  # fmt: skip
+        )
 
 
 def begun() -> IlcState:

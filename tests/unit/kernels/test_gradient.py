@@ -97,9 +97,20 @@ class Step:
         flags = np.zeros(reference.size, dtype=np.uint32) if flags is None else flags
         input_um = reference.copy() if input_um is None else input_um
         return kernel.adapt_block(
-            reference, input_um, reference + error, flags, self.settings, self.table, self.shape,
-            THRESHOLDS, self.due, self.shown, self.places, self.memory, self.state,
-        )  # fmt: skip
+            reference,
+            input_um,
+            reference + error,
+            flags,
+            self.settings,
+            self.table,
+            self.shape,
+            THRESHOLDS,
+            self.due,
+            self.shown,
+            self.places,
+            self.memory,
+            self.state,
+        )
 
     @property
     def values(self):

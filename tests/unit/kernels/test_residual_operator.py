@@ -26,9 +26,12 @@ def tables(slopes, lines):
     most = np.abs(values).max(axis=1).sum() + np.abs(lines).max(axis=1).sum()
     grid = np.array([LOW, WIDTH, float(CELLS), 2.0, most + 1e-3])
     return (
-        np.array([0.0, 2.0, 6.0, 15.0]), np.array([4.0, 30.0]), values.ravel(), lines.ravel(),
+        np.array([0.0, 2.0, 6.0, 15.0]),
+        np.array([4.0, 30.0]),
+        values.ravel(),
+        lines.ravel(),
         grid,
-    )  # fmt: skip
+    )
 
 
 def rest():

@@ -48,9 +48,11 @@ async def serving(chosen=first):
 def opened(server, *, token=None, origin=None, host="127.0.0.1"):
     token = server.url.partition("#")[2] if token is None else token
     return connect(
-        f"ws://{host}:{server.port}/live", origin=origin or f"http://{host}:{server.port}",
-        subprotocols=["hilctl.live.1", f"token.{token}"], proxy=None,
-    )  # fmt: skip
+        f"ws://{host}:{server.port}/live",
+        origin=origin or f"http://{host}:{server.port}",
+        subprotocols=["hilctl.live.1", f"token.{token}"],
+        proxy=None,
+    )
 
 
 async def status_of(connection):
@@ -137,9 +139,14 @@ def test_requests_go_to_the_control_socket(description, tmp_path, monkeypatch):
 def test_report_is_served_to_the_page_that_asked_for_it(description, tmp_path):
     recording = tmp_path / "a.mcap"
     command = [
-        sys.executable, "-m", "hilctl", "run", str(CONFIGS / "demo.yaml"), "--output",
+        sys.executable,
+        "-m",
+        "hilctl",
+        "run",
+        str(CONFIGS / "demo.yaml"),
+        "--output",
         str(recording),
-    ]  # fmt: skip
+    ]
     subprocess.run([*command, "--set", "waveform.duration_s=0.5"], check=True, capture_output=True)
 
     async def run():
@@ -306,9 +313,15 @@ def test_a_foreign_host_is_refused(host, upgrade):
 
 @pytest.mark.parametrize(
     "origin",
-    ["http://evil.example", "null", f"https://127.0.0.1:{PORT}", "http://127.0.0.1:1",
-     [], [ORIGIN] * 2],
-)  # fmt: skip
+    [
+        "http://evil.example",
+        "null",
+        f"https://127.0.0.1:{PORT}",
+        "http://127.0.0.1:1",
+        [],
+        [ORIGIN] * 2,
+    ],
+)
 def test_a_foreign_origin_is_refused(origin):
     assert refusal(Host=HOST, Origin=origin, Sec_WebSocket_Protocol=OFFER) == 403
 

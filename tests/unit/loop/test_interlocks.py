@@ -308,9 +308,14 @@ class TestTracking:
 
 
 EVERYTHING = replace(
-    STROKE, frozen_s=0.001, frozen_travel=0.5, measured_deviation_a=0.5, rms_current_a=2.0,
-    thermal_time_constant_s=0.001, tracking_error_um=2.0,
-)  # fmt: skip
+    STROKE,
+    frozen_s=0.001,
+    frozen_travel=0.5,
+    measured_deviation_a=0.5,
+    rms_current_a=2.0,
+    thermal_time_constant_s=0.001,
+    tracking_error_um=2.0,
+)
 
 
 class TestSeveral:

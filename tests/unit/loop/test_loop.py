@@ -36,15 +36,21 @@ class Rig:
         )
         late = {"late_after_ns": 0.5e9 * block / RATE_HZ, "max_late_ns": 1e9}
         plan = LoopPlan(
-            reference=reference, input_um=options.get("input_um", reference), block=block,
-            latency_blocks=getattr(self.device, "latency", 0), sample_rate_hz=RATE_HZ,
-            compensator=compensator, limits=options.get("limits", LIMITS),
+            reference=reference,
+            input_um=options.get("input_um", reference),
+            block=block,
+            latency_blocks=getattr(self.device, "latency", 0),
+            sample_rate_hz=RATE_HZ,
+            compensator=compensator,
+            limits=options.get("limits", LIMITS),
             interlocks=InterlockContext(stroke_um=options.get("stroke_um", (-60.0, 60.0))),
             late_policy=options.get("policy", "skip"),
             late_rules=LateRules(**{**late, **options.get("late", {})}),
-            feedback=options.get("feedback"), adaptation=options.get("adaptation"),
-            conditioning=options.get("conditioning"), keep_all=options.get("keep_all", False),
-        )  # fmt: skip
+            feedback=options.get("feedback"),
+            adaptation=options.get("adaptation"),
+            conditioning=options.get("conditioning"),
+            keep_all=options.get("keep_all", False),
+        )
         self.loop = Loop(plan, self.device, self.host)
 
     def run(self):
@@ -481,9 +487,11 @@ def test_command_after_skipped_ticks_is_the_one_that_was_due(name, frequency_hz,
 
 def test_skipped_ticks_move_a_tuning_on():
     rig = Rig(
-        np.full(200, 2.0), model=terfenol_rdpi(), tunings={40: Tuning(0.5, 0.0, 40)},
+        np.full(200, 2.0),
+        model=terfenol_rdpi(),
+        tunings={40: Tuning(0.5, 0.0, 40)},
         clock=FakeClock(stall_ns={50: 10_000_000}),
-    )  # fmt: skip
+    )
     rig.run()
     at = rig.firsts.index(60)
     assert rig.host.columns[at][0][0] == pytest.approx(2.0 * (1.0 - 0.5 * 21 / 40))
@@ -512,9 +520,11 @@ def test_skipped_ticks_move_a_fade_on():
     reference = np.linspace(0.0, 20.0, 200)
     out = Tuning(1.0, 0.0, 40, 0, 0.0, LinearBypass(0.1, 0.0))
     rig = Rig(
-        reference, model=terfenol_rdpi(), tunings={40: out},
+        reference,
+        model=terfenol_rdpi(),
+        tunings={40: out},
         clock=FakeClock(stall_ns={50: 10_000_000}),
-    )  # fmt: skip
+    )
     rig.run()
     at = rig.firsts.index(60)
     compensator, inverse = Compensator(terfenol_rdpi(), RATE_HZ), np.empty(61)

@@ -17,9 +17,15 @@ def field_model(**changes):
     """Return a small model with everything in it."""
     slopes = ((4.0, 5.0, 4.0), (1.0, 1.0, 0.0), (2.0, 3.0, 2.0))
     given: dict[str, Any] = {
-        "thresholds": (0.0, 1.0), "lengths": (1.5,), "lowest": -9.0, "cell": 6.0,
-        "slopes": slopes, "coupling": -0.03, "curve": CURVE, "losses": LOSSES,
-    }  # fmt: skip
+        "thresholds": (0.0, 1.0),
+        "lengths": (1.5,),
+        "lowest": -9.0,
+        "cell": 6.0,
+        "slopes": slopes,
+        "coupling": -0.03,
+        "curve": CURVE,
+        "losses": LOSSES,
+    }
     return FieldModel(**(given | changes))
 
 

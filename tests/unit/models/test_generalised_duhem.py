@@ -22,12 +22,16 @@ def duhem_model(**changes):
     middle = np.array([3.0, 6.0, 7.0, 6.0, 4.0])
     rising = middle[:, None] * np.exp(0.7 * ACROSS)
     given: dict[str, Any] = {
-        "lowest_um": -50.0, "cell_um": 25.0, "centre": (-6.5, -2.4, -0.2, 1.9, 5.4),
-        "flux": (-60.0, -27.0, 0.0, 24.0, 45.0), "half_width": 1.2,
+        "lowest_um": -50.0,
+        "cell_um": 25.0,
+        "centre": (-6.5, -2.4, -0.2, 1.9, 5.4),
+        "flux": (-60.0, -27.0, 0.0, 24.0, 45.0),
+        "half_width": 1.2,
         "rising": tuple(map(tuple, rising.tolist())),
-        "falling": tuple(map(tuple, rising[:, ::-1].tolist())), "losses": LOSSES,
+        "falling": tuple(map(tuple, rising[:, ::-1].tolist())),
+        "losses": LOSSES,
         "output_offset_um": 0.7,
-    }  # fmt: skip
+    }
     return GeneralisedDuhemModel(**(given | changes))
 
 

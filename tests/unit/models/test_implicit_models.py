@@ -75,27 +75,36 @@ def bouc_wens(draw):
     beta, ratio = draw(st.floats(1e-3, 10.0)), draw(st.floats(-0.9, 1.0))
     hysteretic = draw(st.floats(0.0, 20.0))
     return BoucWenModel(
-        **PLAIN, direct=draw(SLOPE) + 2.0 * hysteretic / (1.0 + ratio), hysteretic=hysteretic,
-        beta=beta, gamma=ratio * beta, exponent=draw(st.sampled_from((1, 2))),
+        **PLAIN,
+        direct=draw(SLOPE) + 2.0 * hysteretic / (1.0 + ratio),
+        hysteretic=hysteretic,
+        beta=beta,
+        gamma=ratio * beta,
+        exponent=draw(st.sampled_from((1, 2))),
         output_offset_um=draw(OFFSET),
-    )  # fmt: skip
+    )
 
 
 @st.composite
 def duhems(draw):
     slope, lag = draw(SLOPE), draw(st.floats(0.0, 20.0))
     return DuhemModel(
-        **PLAIN, a=draw(st.floats(1e-3, 10.0)), b=slope + 2.0 * lag, c=slope + lag,
+        **PLAIN,
+        a=draw(st.floats(1e-3, 10.0)),
+        b=slope + 2.0 * lag,
+        c=slope + lag,
         output_offset_um=draw(OFFSET),
-    )  # fmt: skip
+    )
 
 
 @st.composite
 def envelopes(draw):
     return PlayEnvelope(
-        height=draw(st.floats(0.1, 3.0)), slope=draw(st.floats(0.02, 0.3)),
-        shift=draw(st.floats(-1.0, 1.0)), level=draw(st.floats(-0.5, 0.5)),
-    )  # fmt: skip
+        height=draw(st.floats(0.1, 3.0)),
+        slope=draw(st.floats(0.02, 0.3)),
+        shift=draw(st.floats(-1.0, 1.0)),
+        level=draw(st.floats(-0.5, 0.5)),
+    )
 
 
 @st.composite
@@ -103,10 +112,14 @@ def generaliseds(draw):
     plays = draw(st.integers(0, 6))
     steps = draw(st.lists(st.floats(0.01, 0.5), min_size=plays, max_size=plays))
     return GeneralisedModel(
-        **PLAIN, direct=draw(st.floats(1.0, 50.0)), weights=draw(weights(plays)),
-        thresholds=tuple(np.cumsum(steps).tolist()), rising=draw(envelopes()),
-        falling=draw(envelopes()), output_offset_um=draw(OFFSET),
-    )  # fmt: skip
+        **PLAIN,
+        direct=draw(st.floats(1.0, 50.0)),
+        weights=draw(weights(plays)),
+        thresholds=tuple(np.cumsum(steps).tolist()),
+        rising=draw(envelopes()),
+        falling=draw(envelopes()),
+        output_offset_um=draw(OFFSET),
+    )
 
 
 def signals(low, high):

@@ -186,9 +186,11 @@ def test_conditions_are_named(times_s, shares, message):
 
 FAST_HZ = 50e3
 MODE = {
-    "natural_hz": 900.0, "damping_ratio": 0.04, "antiresonance_hz": 760.0,
+    "natural_hz": 900.0,
+    "damping_ratio": 0.04,
+    "antiresonance_hz": 760.0,
     "antiresonance_damping_ratio": 0.02,
-}  # fmt: skip
+}
 
 
 def answer(operator, frequency_hz):

@@ -13,9 +13,11 @@ from tests.published import piezo_ppi, terfenol_rdpi
 
 RATE_HZ = 50_000.0
 STAGED = StagedModel.around(
-    terfenol_rdpi(), lag=FieldLag(tau_s=1e-4),
-    structure=FirstMode(natural_hz=2200.0, damping_ratio=0.12), delay_s=2.7e-5,
-)  # fmt: skip
+    terfenol_rdpi(),
+    lag=FieldLag(tau_s=1e-4),
+    structure=FirstMode(natural_hz=2200.0, damping_ratio=0.12),
+    delay_s=2.7e-5,
+)
 BASES = {
     "ppi": piezo_ppi(),
     "with an offset": piezo_ppi().model_copy(update={"output_offset_um": 7.0}),

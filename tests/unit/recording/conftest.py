@@ -33,9 +33,11 @@ def batch(first, blocks, *, dropped=0, seed=0):
     heads[:, BlockHeader.LATE_NS] = rng.integers(0, 90_000, blocks)
     heads[:, BlockHeader.EXCHANGE_NS] = rng.integers(0, 50_000, blocks)
     return BlockBatch(
-        heads, rng.normal(size=(blocks, 4)), rng.normal(size=(blocks, len(COLUMNS), BLOCK)),
+        heads,
+        rng.normal(size=(blocks, 4)),
+        rng.normal(size=(blocks, len(COLUMNS), BLOCK)),
         rng.integers(0, 31, (blocks, BLOCK)).astype(np.uint32),
-    )  # fmt: skip
+    )
 
 
 def write(

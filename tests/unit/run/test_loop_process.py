@@ -380,12 +380,16 @@ class Rig:
         compensator.warm_up()
         reference = 14.0 * np.sin(2 * np.pi * 25.0 * np.arange(self.SAMPLES) / 1000.0)
         plan = LoopPlan(
-            reference=reference, input_um=reference, block=block, latency_blocks=0,
-            sample_rate_hz=1000.0, compensator=compensator,
+            reference=reference,
+            input_um=reference,
+            block=block,
+            latency_blocks=0,
+            sample_rate_hz=1000.0,
+            compensator=compensator,
             limits=CommandLimits(-5.0, 5.0, 2000.0, 0.0, 100.0),
             interlocks=InterlockContext(stroke_um=(-60.0, 60.0)),
             late_rules=LateRules(late_after_ns=5e5),
-        )  # fmt: skip
+        )
         size = compensator.state_size + 1
         self.ring = SampleRing.create(folder, slots=self.SLOTS, block=block, state_size=size)
         self.ring.page.put(PageField.SUPERVISOR_HEARTBEAT_NS, 1)

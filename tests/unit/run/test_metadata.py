@@ -34,10 +34,17 @@ EXPERIMENT = Path(__file__).parents[3] / "configs" / "demo.yaml"
 OUTCOME = LoopOutcome("stopped", "asked to", 400, "confirmed", 50)
 COUNTERS = Lateness(late_ticks=1, skipped_ticks=2, worst_ns=3, worst_tick=4, longest_run=5)
 FACTS = {
-    "code": "stopped", "reason": "asked to", "output_safe": "true", "output_state": "confirmed",
-    "late_ticks": "1", "skipped_ticks": "2", "worst_late_ns": "3", "worst_late_tick": "4",
-    "longest_late_run": "5", "dropped_in_ring": "50",
-}  # fmt: skip
+    "code": "stopped",
+    "reason": "asked to",
+    "output_safe": "true",
+    "output_state": "confirmed",
+    "late_ticks": "1",
+    "skipped_ticks": "2",
+    "worst_late_ns": "3",
+    "worst_late_tick": "4",
+    "longest_late_run": "5",
+    "dropped_in_ring": "50",
+}
 
 
 def test_end_has_every_counter():

@@ -91,17 +91,21 @@ def test_half_made_folders_are_passed_over(tmp_path):
 GOOD = {"name": "x", "experiment": "x", "recording": "/x.mcap", "supervisor": 7, "started": 1.5}
 
 
-@pytest.mark.parametrize("wrong", [
-    {"started": "x"},
-    {"started": True},
-    {"started": math.nan},
-    {"started": 10**400},
-    {"supervisor": 0},
-    {"supervisor": 2**40},
-    {"supervisor": 7.5},
-    {"name": None},
-    {"recording": ["/x.mcap"]},
-], ids=str)  # fmt: skip
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"started": "x"},
+        {"started": True},
+        {"started": math.nan},
+        {"started": 10**400},
+        {"supervisor": 0},
+        {"supervisor": 2**40},
+        {"supervisor": 7.5},
+        {"name": None},
+        {"recording": ["/x.mcap"]},
+    ],
+    ids=str,
+)
 def test_a_card_with_a_wrong_value_is_passed_over_with_one_warning(tmp_path, caplog, wrong):
     card = base_folder() / "broken" / "run.json"
     card.parent.mkdir()

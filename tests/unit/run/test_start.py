@@ -149,9 +149,11 @@ def test_interrupt_is_passed_on_and_handlers_are_as_before(answering):
 
 
 def test_display_that_fails_ends_no_run(answering):
-    answering("from hilctl.run.result import Progress\nfrom hilctl.base.errors import InputError\n"
-              "for k in range(9): pickle.dump(Progress(k, 9, 0, True, bytes(100_000)), answers)\n"
-              "pickle.dump(InputError('done'), answers)")  # fmt: skip
+    answering(
+        "from hilctl.run.result import Progress\nfrom hilctl.base.errors import InputError\n"
+        "for k in range(9): pickle.dump(Progress(k, 9, 0, True, bytes(100_000)), answers)\n"
+        "pickle.dump(InputError('done'), answers)"
+    )
     shown = []
 
     def show(progress):

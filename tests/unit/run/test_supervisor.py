@@ -27,9 +27,16 @@ from tests.fakes import SteppingClock
 
 MS = 1_000_000
 STARTED = [
-    "ordinary", "devices", "claimed", "folder", "server", "job.json", "description.json", "child",
+    "ordinary",
+    "devices",
+    "claimed",
+    "folder",
+    "server",
+    "job.json",
+    "description.json",
+    "child",
     "guardian",
-]  # fmt: skip
+]
 READY = [*STARTED, "await ready", "begin", "favoured", "recording"]
 UNDONE = ["ordinary again", "server closed", "folder removed", "devices let go"]
 

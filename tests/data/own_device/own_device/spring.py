@@ -33,11 +33,17 @@ class Spring(Device):
         """Describe the device; nothing is opened yet."""
         self._options = options
         self._info = DeviceInfo(
-            name="spring", description=f"spring of {options.um_per_a:g} um/A", command_unit="A",
-            command_min=-options.current_max_a, command_max=options.current_max_a,
-            sensor_min_um=-RANGE_UM, sensor_max_um=RANGE_UM, max_rate_hz=10_000.0, simulated=True,
+            name="spring",
+            description=f"spring of {options.um_per_a:g} um/A",
+            command_unit="A",
+            command_min=-options.current_max_a,
+            command_max=options.current_max_a,
+            sensor_min_um=-RANGE_UM,
+            sensor_max_um=RANGE_UM,
+            max_rate_hz=10_000.0,
+            simulated=True,
             details={"um_per_a": f"{options.um_per_a:g}"},
-        )  # fmt: skip
+        )
         self._block = 0
         self._step = 0.0
         self._current_a = 0.0

@@ -146,9 +146,11 @@ def test_broken_rules_in_words(before, after, problem):
 def test_all_problems_come_together():
     text = changed("bench", "7").replace("6.0", "x").replace("2.5", "-1").replace("4.0", "y")
     assert [line.split(": ")[:2] for line in problems(text)] == [
-        ["bench.yaml:1", "name"], ["bench.yaml:3", "limits.peak_a"],
-        ["bench.yaml:7", "parts.0.radius_um"], ["bench.yaml:9", "parts.1.side_um"],
-    ]  # fmt: skip
+        ["bench.yaml:1", "name"],
+        ["bench.yaml:3", "limits.peak_a"],
+        ["bench.yaml:7", "parts.0.radius_um"],
+        ["bench.yaml:9", "parts.1.side_um"],
+    ]
 
 
 def test_part_of_a_document():

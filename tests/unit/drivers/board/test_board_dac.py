@@ -165,12 +165,18 @@ def run_loop(driven, n):
     limits = CommandLimits(low=-5.0, high=5.0, slew_per_s=1e5, safe=0.0, ramp_per_s=1e3)
     driven.open()
     plan = LoopPlan(
-        reference=sine(n), input_um=sine(n), block=BLOCK,
-        latency_blocks=driven.device.info.latency_blocks, sample_rate_hz=RATE_HZ,
-        compensator=Compensator(None, RATE_HZ), limits=limits,
-        interlocks=InterlockContext(stroke_um=(-100.0, 100.0)), late_policy="follow",
-        start_policy="follow", ramp_policy="follow",
-    )  # fmt: skip
+        reference=sine(n),
+        input_um=sine(n),
+        block=BLOCK,
+        latency_blocks=driven.device.info.latency_blocks,
+        sample_rate_hz=RATE_HZ,
+        compensator=Compensator(None, RATE_HZ),
+        limits=limits,
+        interlocks=InterlockContext(stroke_um=(-100.0, 100.0)),
+        late_policy="follow",
+        start_policy="follow",
+        ramp_policy="follow",
+    )
     return Loop(plan, driven.device, host).run(host.clock.now_ns()), host
 
 

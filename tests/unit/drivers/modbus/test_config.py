@@ -10,10 +10,15 @@ from hilctl_drivers.modbus.modbus_dac import ModbusDac
 from tests.unit.drivers.modbus.conftest import exchange
 
 PAIR = {
-    "profile": "icp_m7024", "serial_port": "/dev/x", "output": "AO0", "input": "AI0",
-    "reader": {"profile": "icp_m7017", "unit_id": 2}, "amplifier": {"gain_a_per_v": 1.0},
-    "sensor": {"um_per_v": 12.5}, "watchdog": "none",
-}  # fmt: skip
+    "profile": "icp_m7024",
+    "serial_port": "/dev/x",
+    "output": "AO0",
+    "input": "AI0",
+    "reader": {"profile": "icp_m7017", "unit_id": 2},
+    "amplifier": {"gain_a_per_v": 1.0},
+    "sensor": {"um_per_v": 12.5},
+    "watchdog": "none",
+}
 READS = PAIR["reader"]
 SETTLE_S = 0.01
 """Of an M-7024's output."""

@@ -83,9 +83,12 @@ class TestOptions:
     def test_rate_is_what_the_wire_leaves(self, module):
         """115200 8N1 with standard gaps: 2.26 ms of characters and 3.5 ms of silence."""
         options = {
-            "profile": module, "host": None, "serial_port": "/dev/x", "output": "OUT",
+            "profile": module,
+            "host": None,
+            "serial_port": "/dev/x",
+            "output": "OUT",
             "input": "IN",
-        }  # fmt: skip
+        }
         info = made(**options).info
         assert info.max_rate_hz == pytest.approx(174.0, abs=1.0)
         assert "FC23 at 115200 8N1" in info.rate_note

@@ -243,9 +243,11 @@ class TestRtu:
         write = exchange_time(profile, "AO", None)
         small = exchange_time(profile, "SMALL", None)
         found = {
-            "FC16": wire_s(write), "FC06": wire_s(small), "FC03": wire_s(both) - wire_s(write),
+            "FC16": wire_s(write),
+            "FC06": wire_s(small),
+            "FC03": wire_s(both) - wire_s(write),
             "FC23": wire_s(exchange_time(profile, "AO", "AI")),
-        }  # fmt: skip
+        }
         for function, row in TABLE_MS.items():
             assert found[function] * 1e3 == pytest.approx(row[column], rel=0.03), function
 
@@ -329,9 +331,14 @@ def test_modbus_dac_leaves_room_for_feeding(tmp_path):
     path = tmp_path / "acme.yaml"
     path.write_text(PROFILE.replace("FEED", FEED))
     options = {
-        "profile": str(path), "serial_port": "/dev/ttyUSB0", "output": "AO", "input": "AI",
-        "amplifier": {"gain_a_per_v": 1.0}, "sensor": {"um_per_v": 10.0}, "timeout_s": 1.0,
-    }  # fmt: skip
+        "profile": str(path),
+        "serial_port": "/dev/ttyUSB0",
+        "output": "AO",
+        "input": "AI",
+        "amplifier": {"gain_a_per_v": 1.0},
+        "sensor": {"um_per_v": 10.0},
+        "timeout_s": 1.0,
+    }
     exchange_s = exchange_time(acme(), "AO", "AI").total_s
     for watchdog, feed_s in (("none", 0.0), ({"timeout_s": 1.0}, requests_s(WRITE))):
         info = ModbusDac(ModbusOptions.model_validate({**options, "watchdog": watchdog})).info

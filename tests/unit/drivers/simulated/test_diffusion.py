@@ -15,9 +15,13 @@ STEP_S = 1e-5
 PERMEABILITY = 7.0
 # Far below its knee the curve is a line, and one free cell has no hysteresis.
 LINEAR = replace(
-    RATED, saturation_a_per_m=(PERMEABILITY - 1.0) * 1e12, knee_a_per_m=1e12, cells=1,
-    free_fraction=1.0, shells=24,
-)  # fmt: skip
+    RATED,
+    saturation_a_per_m=(PERMEABILITY - 1.0) * 1e12,
+    knee_a_per_m=1e12,
+    cells=1,
+    free_fraction=1.0,
+    shells=24,
+)
 
 
 def shells(rods, halves_a_per_m, bias=0.0):

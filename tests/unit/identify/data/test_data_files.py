@@ -148,9 +148,14 @@ def rows(separator: str, n: int = 40) -> list[str]:
 def test_quotes_comments_and_blank_lines(tmp_path):
     lines = ["# rig 3", "", '"drive, V","displacement"', *[f"{k},{k * k}" for k in range(20)]]
     history = table(
-        write(tmp_path, lines), "drive, V", "displacement", rate_hz=5.0, first_row=3, last_row=19,
+        write(tmp_path, lines),
+        "drive, V",
+        "displacement",
+        rate_hz=5.0,
+        first_row=3,
+        last_row=19,
         ignore=1,
-    )  # fmt: skip
+    )
     np.testing.assert_array_equal(history.command, np.arange(2, 19))
     assert (history.sample_rate_hz, history.ignore) == (5.0, 1)
 

@@ -9,9 +9,13 @@ from hilctl.models.refined import RefinedModel, ResidualOperator
 
 RATE_HZ = 10_000.0
 OLD = RdpiModel(
-    direct=6.0, weights=(1.5, 1.0, 0.5), thresholds=(0.5, 1.5, 3.0), gamma_s=0.0,
-    input_range=(-7.0, 7.0), output_range_um=(-50.0, 50.0),
-)  # fmt: skip
+    direct=6.0,
+    weights=(1.5, 1.0, 0.5),
+    thresholds=(0.5, 1.5, 3.0),
+    gamma_s=0.0,
+    input_range=(-7.0, 7.0),
+    output_range_um=(-50.0, 50.0),
+)
 
 
 def actuator(slope=-0.05, offset_um=0.0, drag_um=0.8):

@@ -201,9 +201,12 @@ def take(page, at):
 
 def test_a_change_reaches_the_loop_whole(changes, page):
     assert change(changes, gain=0.5) == {
-        "gain": 0.5, "offset": 0.0, "inverse": "in", "over_s": 0.2,
+        "gain": 0.5,
+        "offset": 0.0,
+        "inverse": "in",
+        "over_s": 0.2,
         "begins_at_sample": 500 + LEAD,
-    }  # fmt: skip
+    }
     assert (page.get_float(PageField.TUNE_GAIN), page.get_float(PageField.TUNE_OFFSET)) == (
         0.5,
         0.0,

@@ -69,9 +69,12 @@ def test_all_that_is_wrong_is_said_at_once_with_its_line():
         Document("few.yaml", text).validate(CampaignFile)
     said = str(found.value)
     for place in (
-        "few.yaml:6: order:", "few.yaml:7: repeat:", "few.yaml:8: reference_run.evry",
-        "few.yaml:8: reference_run.every", "few.yaml:9: condition.cycles",
-    ):  # fmt: skip
+        "few.yaml:6: order:",
+        "few.yaml:7: repeat:",
+        "few.yaml:8: reference_run.evry",
+        "few.yaml:8: reference_run.every",
+        "few.yaml:9: condition.cycles",
+    ):
         assert place in said
 
 
@@ -93,10 +96,14 @@ def test_ranges(text, values):
 @pytest.mark.parametrize(
     ("given", "rule"),
     [
-        ("1:9", "must be a list"), (3.0, "must be a list"), ("1:9:1", "must have 2 to"),
-        ("0:9:3log", "ends above 0"), ((), "at least one"), ("1:9:10001", "must have 2 to"),
+        ("1:9", "must be a list"),
+        (3.0, "must be a list"),
+        ("1:9:1", "must have 2 to"),
+        ("0:9:3log", "ends above 0"),
+        ((), "at least one"),
+        ("1:9:10001", "must have 2 to"),
     ],
-)  # fmt: skip
+)
 def test_what_is_no_list_of_values_is_refused(given, rule):
     with pytest.raises(ValueError, match=rule):
         values_of(given)

@@ -62,8 +62,10 @@ def played(make_recording):
         command = reference.values.copy()
         noise = noise_um * np.random.default_rng(seed).standard_normal(command.size)
         return make_recording(
-            actuator(command) + noise, command=command, segments=reference.segments,
+            actuator(command) + noise,
+            command=command,
+            segments=reference.segments,
             sample_rate_hz=limits.sample_rate_hz,
-        )  # fmt: skip
+        )
 
     return play

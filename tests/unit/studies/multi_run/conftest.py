@@ -37,9 +37,12 @@ def digest(*, compensated: bool = False, lag: float = 0.2, **keys: Any) -> RunDi
 def grown(amplitude: float, hz: float, number: int = 1, **keys: Any) -> SeriesRun:
     """Return a run whose area is linear in frequency and whose stroke is in amplitude."""
     figures = RunFigures(
-        peak_to_peak_um=10.0 * amplitude, loop_area=amplitude * (20.0 + 0.5 * hz),
-        peak_hysteresis_percent=10.0 + 0.1 * hz, low_um=-6.0 * amplitude, high_um=4.0 * amplitude,
-    )  # fmt: skip
+        peak_to_peak_um=10.0 * amplitude,
+        loop_area=amplitude * (20.0 + 0.5 * hz),
+        peak_hysteresis_percent=10.0 + 0.1 * hz,
+        low_um=-6.0 * amplitude,
+        high_um=4.0 * amplitude,
+    )
     values = {"waveform.amplitude": amplitude, "waveform.frequency_hz": hz}
     made = SeriesRun(number, False, values, figures, "completed", f"run-{number}.mcap", digest())
     return replace(made, **keys)

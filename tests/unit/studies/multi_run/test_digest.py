@@ -36,10 +36,12 @@ SINE = "{kind: sine, unit: A, amplitude: 1.0, frequency_hz: 100.0, duration_s: 0
 
 def test_a_sine_straight_to_the_coil(figures):
     found = figures(
-        10.0 * np.sin(2 * np.pi * 100.0 * TIME - 0.1) - 2.0, SINE,
-        command=np.sin(2 * np.pi * 100.0 * TIME), run={HEAT_FACT: "4.0"},
+        10.0 * np.sin(2 * np.pi * 100.0 * TIME - 0.1) - 2.0,
+        SINE,
+        command=np.sin(2 * np.pi * 100.0 * TIME),
+        run={HEAT_FACT: "4.0"},
         end={"skipped_ticks": "3", HEAT_FACT: "9.0"},
-    )  # fmt: skip
+    )
     assert (found.low_um, found.high_um) == pytest.approx((-12.0, 8.0), abs=1e-3)
     assert found.mean_um == pytest.approx(-2.0, abs=1e-6)
     assert found.peak_to_peak_um == pytest.approx(20.0, abs=1e-3)
