@@ -27,6 +27,7 @@ from hilctl_drivers.emulator.modbus_wire import ModbusWire
 from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.emulator.rig import Bench, Rig, SimulatedWiring, WriteLog
 from hilctl_drivers.profile import load_profile
+from hilctl_drivers.simulated.devices import SimulatedTerfenol, TerfenolOptions
 from hilctl_drivers.transport.links import LostError, NoAnswerError
 
 T7_OPTIONS = {
@@ -414,10 +415,11 @@ class InProcess:
         loaded = load_profile(profile)
         output, sensor = next(iter(loaded.outputs)), next(iter(loaded.inputs))
         time = VirtualTime()
-        rig, writes = Rig(time.now_ns, noise=noise), WriteLog(log, 0)
-        wiring = SimulatedWiring.spread(loaded.outputs[output], loaded.inputs[sensor])
+        actuator = SimulatedTerfenol(TerfenolOptions(noise=noise))
+        rig, writes = Rig(time.now_ns, actuator), WriteLog(log, 0)
+        wiring = SimulatedWiring.spread(loaded.outputs[output], loaded.inputs[sensor], actuator)
         bench = Bench(rig, wiring, writes)
-        device = EmulatedModbus(loaded, bench, output, sensor, current_a, noise=noise)
+        device = EmulatedModbus(loaded, bench, output, sensor, current_a)
         wire = ModbusWire("tcp", {loaded.unit_id: device})
         return cls(device, rig, link(wire, time, message_s), time, writes)
 
@@ -429,8 +431,8 @@ class InProcess:
             "host": "127.0.0.1",
             "output": next(iter(profile.outputs)),
             "input": next(iter(profile.inputs)),
-            "amplifier": {"gain_a_per_v": wiring.gain_a, "offset_a": wiring.offset_a},
-            "sensor": {"um_per_v": wiring.sensor_um, "offset_um": wiring.offset_um},
+            "amplifier": wiring.amplifier.model_dump(),
+            "sensor": wiring.sensor.model_dump(),
             "watchdog": "none",
         }
 

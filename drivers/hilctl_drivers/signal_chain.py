@@ -232,8 +232,8 @@ class SignalChain:
         """Return the output value of a command, or of a block of them."""
         return (command - self._offset) / self._gain
 
-    def command(self, output: float) -> float:
-        """Return the command of an output value."""
+    def command(self, output: _Value) -> _Value:
+        """Return the command of an output value, or of a block of them."""
         return output * self._gain + self._offset
 
     def displacement_um(self, value: float) -> float:

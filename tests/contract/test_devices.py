@@ -17,6 +17,7 @@ from hilctl_drivers.contract import RATE_HZ, SAMPLES, DrivenDevice, driven_devic
 from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.modbus.modbus_profile import ModbusProfile
 from hilctl_drivers.profile import load_profile, shipped_profiles
+from hilctl_drivers.simulated.devices import PiezoOptions, TerfenolOptions
 from tests.fakes import ManualClock, emulated
 
 SETTLED_NS = 2_000_000
@@ -37,6 +38,8 @@ MODBUS = (
     "waveshare_ao_8ch_b waveshare_ai_8ch_b same", "adam_4024 adam_6217 own",
 )  # fmt: skip
 """What modbus_dac is tried with; every shipped Modbus profile is among them."""
+PIEZO = ("generic_float32 V", "labjack_t8 V")
+"""Modbus profiles that drive a piezo too: with both signs, and from 0 V."""
 
 
 def simulated(kind, words):
@@ -75,8 +78,9 @@ MODULE = str(Path(__file__).parents[1] / "data" / "milliampere_module.yaml")
 def modbus(words, stack):
     """Return a modbus_dac connected to an emulator of one or two profiles."""
     clock = ManualClock()
-    name, reader, line = [*words, None, None][:3]
-    wanted = EmulatorOptions(name, reader=reader, reader_line=line, current_a=0.0)
+    actuator = PiezoOptions() if words[-1] == "V" else TerfenolOptions()
+    name, reader, line = [*(word for word in words if word != "V"), None, None][:3]
+    wanted = EmulatorOptions(name, reader=reader, reader_line=line, actuator=actuator, command=0.0)
     emulator = stack.enter_context(emulated(wanted, clock))
     chosen = device_class("modbus_dac")
     options = _fast({**emulator.options, "timeout_s": TIMEOUT_S})
@@ -89,7 +93,7 @@ def modbus(words, stack):
         clock.now_ns += min(round(1e9 / rate_hz), SETTLED_NS)
 
     return DrivenDevice(
-        device, 1, rate_hz, lambda: emulator.device._rig.current_a, pass_time, name="modbus_dac"
+        device, 1, rate_hz, lambda: emulator.device._rig.command, pass_time, name="modbus_dac"
     )
 
 
@@ -101,7 +105,7 @@ CASES = [
     *SIMULATED,
     *OTHERS,
     *(f"simulated_terfenol {words}" for words in PHYSICS),
-    *(f"modbus_dac {words}" for words in MODBUS),
+    *(f"modbus_dac {words}" for words in (*MODBUS, *PIEZO)),
 ]
 
 

@@ -39,7 +39,7 @@ class DrivenStream(DrivenDevice):
 
     @property
     def current_a(self):
-        return self.emulated.rig.current_a
+        return self.emulated.rig.command
 
     def exchange(self, command):
         """Exchange whole blocks, holding the last command until all answers have arrived."""

@@ -17,6 +17,7 @@ from hilctl_drivers import contract
 from hilctl_drivers.contract import *  # noqa: F403  the checks, and the fixture driven
 from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.profile import load_profile, shipped_profiles
+from hilctl_drivers.simulated.devices import PiezoOptions, TerfenolOptions
 from tests.fakes import ManualClock, emulated
 
 SERIAL = (
@@ -25,6 +26,8 @@ SERIAL = (
     "kepco_bop agilent_34970a own", "tdk_lambda_gen agilent_34970a own",
 )  # fmt: skip
 """What serial_dac is tried with: what drives, what reads, and whether they share a line."""
+PIEZO = ("cobs_board V", "icp_m7024_dcon agilent_34970a own V")
+"""Serial devices that drive a piezo too."""
 ONLY_READS = """\
 vendor: nobody
 model: a module on the line of another one, with inputs only
@@ -93,7 +96,8 @@ class DrivenSerial(contract.DrivenDevice):
 
 def wired(case, tmp_path, stack):
     """Return a serial_dac connected to an emulator of one or two profiles."""
-    name, reader, line = [*case.split(), None, None][:3]
+    actuator = PiezoOptions() if case.endswith(" V") else TerfenolOptions()
+    name, reader, line = [*case.removesuffix(" V").split(), None, None][:3]
     profile = load_profile(name)
     path = tmp_path / f"{name}.yaml"
     text = shipped_profiles()[name].read_text()
@@ -103,7 +107,7 @@ def wired(case, tmp_path, stack):
         Path(reader).write_text(ONLY_READS)
     stream = getattr(profile, "exchange", "none") == "stream"
     clock = time.monotonic_ns if stream else ManualClock()
-    wanted = EmulatorOptions(str(path), reader=reader, reader_line=line)
+    wanted = EmulatorOptions(str(path), reader=reader, reader_line=line, actuator=actuator)
     emulator = stack.enter_context(emulated(wanted, clock))
     options = {**emulator.options, "timeout_s": TIMEOUT_S, "fifo_blocks": FIFO_BLOCKS}
     chosen = device_class("serial_dac")
@@ -118,7 +122,7 @@ def wired(case, tmp_path, stack):
             clock.pass_s(min(1.0 / rate_hz, SETTLED_S))
 
     block = BLOCK if device.info.latency_blocks else 1
-    made = DrivenSerial(device, block, rate_hz, lambda: rig.current_a, pass_time, name="serial_dac")
+    made = DrivenSerial(device, block, rate_hz, lambda: rig.command, pass_time, name="serial_dac")
     made.silent = silent and line == "own"
     made.must_be_at_rest = name in MUST_BE_AT_REST
     made.reads_back = name != "adam_4024_ascii"  # returns its last command, not its output
@@ -139,7 +143,7 @@ STREAMS = "cobs_board_fifo"
     params=[
         # The FIFO drains in real time.
         pytest.param(case, marks=pytest.mark.slow) if case == STREAMS else case
-        for case in SERIAL
+        for case in (*SERIAL, *PIEZO)
     ]
 )
 def case(request):

@@ -16,6 +16,7 @@ import pytest
 
 from hilctl_drivers.emulator.factory import Emulator
 from hilctl_drivers.emulator.options import EmulatorOptions
+from hilctl_drivers.simulated.devices import TerfenolOptions
 from tests.fakes import ManualClock, emulated
 
 BAUD = 115_200
@@ -244,7 +245,7 @@ def emulate() -> Iterator[Callable[[str], Emulated]]:
 
         def start(profile: str) -> Emulated:
             clock = ManualClock()
-            options = EmulatorOptions(profile, noise=False, current_a=0.0)
+            options = EmulatorOptions(profile, actuator=TerfenolOptions(noise=False), command=0.0)
             return Emulated(stack.enter_context(emulated(options, clock)), clock)
 
         yield start
@@ -281,7 +282,7 @@ def test_floats_over_tcp(emulate, connect, kind):
     seen = []
     for volts in (3.75, 1.0):
         client.write(1000, list(struct.unpack(">HH", struct.pack(">f", volts))))
-        assert served.rig.current_a == pytest.approx(4.0 * (volts - 2.5))
+        assert served.rig.command == pytest.approx(4.0 * (volts - 2.5))
         served.settle()
         seen.append(client.read_float(0, low_word_first=False))
         assert 12.5 * seen[-1] == pytest.approx(served.rig.displacement_um, rel=1e-5)
@@ -300,7 +301,7 @@ def test_sixteen_bits_over_tcp(emulate, connect, kind):
             client.write_and_read(0, [raw], 0, 1)
         else:
             client.write(0, [raw])
-        assert served.rig.current_a == pytest.approx(current_a)
+        assert served.rig.command == pytest.approx(current_a)
         assert client.read(0x200, 1) == [raw]
         served.settle()
         (shown,) = client.read(0, 1)
@@ -320,7 +321,7 @@ def test_registers_over_a_serial_line(emulate, connect, kind):
             client.write_and_read(100, [raw], 200, 2)
         else:
             client.write(100, [raw])
-        assert served.rig.current_a == pytest.approx(current_a)
+        assert served.rig.command == pytest.approx(current_a)
         served.settle()
         volts = client.read_float(200, low_word_first=True)
         assert 12.5 * volts == pytest.approx(served.rig.displacement_um, rel=1e-5)
@@ -340,4 +341,4 @@ def test_refusals_are_understood(emulate, connect, kind):
     if client.can_write_and_read:
         with pytest.raises(RefusedError, match=r"(?i)function|exception_code=1"):
             client.write_and_read(1000, [0, 0], 0, 2)
-    assert served.rig.current_a == 0.0
+    assert served.rig.command == 0.0

@@ -23,19 +23,18 @@ class _Refuse(Exception):  # noqa: N818  a reply, not a mistake
 
 
 class EmulatedBoard(EmulatedDevice):
-    """The board; with ``noise`` its sensor has noise when streaming."""
+    """The board, with one output and one input."""
 
     profile: FrameProfile
 
-    def __init__(self, profile: FrameProfile, bench: Bench, *, noise: bool) -> None:
+    def __init__(self, profile: FrameProfile, bench: Bench) -> None:
         self._name, self._range = next(iter(profile.outputs.items()))
         super().__init__(profile, bench, self._name)
         self._outputs = BoardValues(self._range)
-        self._sensor = next(iter(profile.inputs.values()))
-        self._inputs = BoardValues(self._sensor)
+        self._inputs = BoardValues(next(iter(profile.inputs.values())))
         streaming = profile.streaming
         self._streaming = streaming if isinstance(streaming, FrameStreaming) else None
-        self.fifo = SampleFifo(noise=noise, repeats=False, on_played=self._played)
+        self.fifo = SampleFifo(self._rig.actuator, repeats=False, on_played=self._played)
         self._prefill = 0
         self._readings = np.empty(0)
         self._played_um = 0.0
@@ -54,9 +53,9 @@ class EmulatedBoard(EmulatedDevice):
         if self._version > 1:
             self._kinds[board.STATE] = self._state
         low, high = self._range.limits
-        # The power-up value is 0 at the terminal, not at the coil.
-        self.fifo.current_a = self.wiring.current_a(min(max(0.0, low), high))
-        self._rig.put_out(self.fifo.current_a, 0)
+        # The power-up value is 0 at the terminal, not at the actuator.
+        self.fifo.command = self.wiring.command(min(max(0.0, low), high))
+        self._rig.put_out(self.fifo.command, 0)
 
     def _trip(self, due_ns: int) -> None:
         self.fifo.advance(due_ns)
@@ -112,7 +111,7 @@ class EmulatedBoard(EmulatedDevice):
             raise _Refuse(Status.BAD_MESSAGE)
         (value,) = self._values(data)
         self._refuse_if_tripped()
-        reading = self._at_terminal(np.array([self._rig.displacement_um]))
+        reading = self.wiring.at_terminal(np.array([self._rig.displacement_um]))
         self._put_out(float(value), "write", self._now_ns)
         return count + self._inputs.encode(reading) + board.FIFO_TAIL.pack(0, 0)
 
@@ -133,7 +132,7 @@ class EmulatedBoard(EmulatedDevice):
             raise _Refuse(Status.WRONG_FIRST)
         if fifo.level + count > streaming.fifo_depth:
             raise _Refuse(Status.FIFO_FULL)
-        fifo.queue(self.wiring.current_a(values))
+        fifo.queue(self.wiring.command(values))
         if not fifo.started and fifo.level >= self._prefill:
             fifo.start(self._now_ns)
         until = max(0, self.queued - self._prefill)
@@ -152,7 +151,7 @@ class EmulatedBoard(EmulatedDevice):
         self._returned += count
         fields = board.STREAM_FIELDS.pack(first & 0xFFFFFFFF, readings.size)
         tail = board.FIFO_TAIL.pack(min(fifo.level, 0xFFFF), min(fifo.underruns, 0xFFFF))
-        return head + _GOOD + fields + self._inputs.encode(self._at_terminal(readings)) + tail
+        return head + _GOOD + fields + self._inputs.encode(self.wiring.at_terminal(readings)) + tail
 
     def _watchdog(self, body: bytes) -> bytes:
         size = board.WATCHDOG_FIELDS.size
@@ -174,7 +173,7 @@ class EmulatedBoard(EmulatedDevice):
     def _stop(self) -> None:
         """Stop streaming and forget all of it; the output holds its value."""
         if self.fifo.started:
-            self._rig.put_out(self.fifo.current_a, self._now_ns)
+            self._rig.put_out(self.fifo.command, self._now_ns)
         self.fifo.stop()
         self.fifo.clear()
         self._readings, self._returned = np.empty(0), 0
@@ -190,9 +189,9 @@ class EmulatedBoard(EmulatedDevice):
     def _state(self, body: bytes) -> bytes:
         if body:
             raise _Refuse(Status.BAD_MESSAGE)
-        output = self._outputs.encode(np.array([self.wiring.output(self.fifo.current_a)]))
+        output = self._outputs.encode(np.array([self.wiring.output(self.fifo.command)]))
         read_um = self._played_um if self.fifo.started else self._rig.displacement_um
-        reading = self._inputs.encode(self._at_terminal(np.array([read_um])))
+        reading = self._inputs.encode(self.wiring.at_terminal(np.array([read_um])))
         return board.STATE_REPLY.pack(board.StateFlag.TRIPPED * self.tripped) + output + reading
 
     def _clock(self, body: bytes) -> bytes:
@@ -210,12 +209,9 @@ class EmulatedBoard(EmulatedDevice):
 
     def _put_out(self, value: float, event: str, now_ns: int) -> None:
         self._set_terminal(self._name, value, event, now_ns)
-        self.fifo.current_a = self.wiring.current_a(value)
+        self.fifo.command = self.wiring.command(value)
 
-    def _played(self, first: int, current_a: F64, displacement_um: F64, now_ns: int) -> None:
+    def _played(self, first: int, command: F64, displacement_um: F64, now_ns: int) -> None:
         self._readings = np.concatenate([self._readings, displacement_um])
         self._played_um = float(displacement_um[-1])
-        self._log_played(first, current_a, now_ns)
-
-    def _at_terminal(self, displacement_um: F64) -> F64:
-        return self.wiring.at_terminal(displacement_um, self._sensor)
+        self._log_played(first, command, now_ns)

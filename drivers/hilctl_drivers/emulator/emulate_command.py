@@ -15,18 +15,20 @@ import typer
 from hilctl.base.errors import ConfigError, ConfigProblem, InputError
 from hilctl.base.files import TextFiles
 from hilctl.base.formatting import finite_json
+from hilctl.base.types import CommandUnit
 from hilctl.base.yaml import Document, load_document
 from hilctl_drivers.emulator.factory import Emulator, build
 from hilctl_drivers.emulator.modbus_device import EmulatedModbus
 from hilctl_drivers.emulator.modbus_wire import LinkKind
 from hilctl_drivers.emulator.options import EmulatorOptions, ReaderLine, parse_fault
-from hilctl_drivers.emulator.rig import SimulatedWiring
+from hilctl_drivers.emulator.rig import ACTUATORS
 from hilctl_drivers.labjack.modbus_stream import ModbusStreamOptions
 from hilctl_drivers.modbus.config import ModbusReaderOptions
 from hilctl_drivers.modbus.modbus_profile import ModbusProfile
 from hilctl_drivers.profile import NamedProfile, load_profile, shipped_profiles
 from hilctl_drivers.serial_dac import SerialOptions
 from hilctl_drivers.signal_chain import DacOptions, ReaderOptions
+from hilctl_drivers.simulated.devices import SimulatedOptions
 
 _UNPRIVILEGED = 1024
 _HERE = ("127.0.0.1", "::1", "localhost")
@@ -38,7 +40,6 @@ class WiredExperiment:
 
     path: Path
     section: Mapping[str, Any]  # its device section, as in the file
-    wiring: SimulatedWiring
     options: EmulatorOptions
 
     def words(self, emulator: Emulator) -> list[str]:
@@ -63,7 +64,9 @@ def is_experiment(name: str) -> bool:
     return "device" in load_document(path).data
 
 
-def wired_experiment(path: Path, port: int = 0, host: str | None = None) -> WiredExperiment:
+def wired_experiment(
+    path: Path, port: int = 0, host: str | None = None, actuator: Sequence[str] = ()
+) -> WiredExperiment:
     """Return what to emulate for an experiment; raise InputError if it has no profile."""
     # Port 0 stands for that of the experiment, or for a free one if users may not listen there.
     document, files = load_document(path), TextFiles()
@@ -73,7 +76,8 @@ def wired_experiment(path: Path, port: int = 0, host: str | None = None) -> Wire
         rule = "must name a profile: what has none is not behind a wire, and needs no emulator"
         raise ConfigError([ConfigProblem(document.where(("device",)), "device.profile", rule)])
     options = _validated(document, load_profile(name, files, path.parent), path.parent, files)
-    wiring, reader = _wiring(options), options.reader
+    reader = options.reader
+    unit = "A" if options.amplifier is None else options.amplifier.command_unit
     made = EmulatorOptions(
         profile=_found(options.profile, path.parent),
         link=None if not hasattr(options, "host") else "rtu" if options.host is None else "tcp",
@@ -85,9 +89,10 @@ def wired_experiment(path: Path, port: int = 0, host: str | None = None) -> Wire
         reader_line=_line(reader),
         reader_unit_id=reader.unit_id if isinstance(reader, ModbusReaderOptions) else None,
         reader_port=_port(reader),
-        wiring=wiring,
+        actuator=_actuator(unit, actuator),
+        wiring=(options.amplifier, options.sensor),
     )
-    return WiredExperiment(path, section, wiring, made)
+    return WiredExperiment(path, section, made)
 
 
 def _validated(document: Document, profile: object, folder: Path, files: TextFiles) -> DacOptions:
@@ -116,12 +121,19 @@ def _line(reader: ReaderOptions | None) -> Any:
     return "own" if apart else "same"
 
 
-def _wiring(options: DacOptions) -> SimulatedWiring:
-    amplifier, sensor = options.amplifier, options.sensor
-    gain, offset = (1.0, 0.0) if amplifier is None else (amplifier.gain, amplifier.offset)
-    if amplifier is not None and amplifier.command_unit != "A":
-        raise InputError("the emulated rig is driven with a current: gain_v_per_... has none")
-    return SimulatedWiring(gain, offset, sensor.um_per_unit, sensor.offset_um)
+def _actuator(unit: CommandUnit, settings: Sequence[str]) -> SimulatedOptions:
+    """Return the options of the simulated actuator that is driven with a unit."""
+    document = Document("--actuator", "{}")
+    for each in settings:
+        document.set(each, "--actuator")
+    of_device = [
+        ConfigProblem(document.where((key,)), key, "acts on simulated devices only")
+        for key in ("fault", "output_at_open")
+        if document.holds((key,))
+    ]
+    if of_device:
+        raise ConfigError(of_device)
+    return document.validate(ACTUATORS[unit][0])
 
 
 def _differing(
@@ -171,8 +183,22 @@ def emulate(
     reader_port: Annotated[
         int, typer.Option(min=0, max=65535, help="The reader's own TCP port; 0 for any free port.")
     ] = EmulatorOptions.reader_port,
-    current_a: Annotated[
-        float | None, typer.Option(help="Initial current, A; default: as after power-up.")
+    unit: Annotated[
+        CommandUnit | None,
+        typer.Option(help="Unit of the drive: current or voltage; default: A."),
+    ] = None,
+    actuator: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="KEY=VALUE",
+            help="Option of the simulated actuator, such as physics=domains; may be repeated.",
+        ),
+    ] = None,
+    command: Annotated[
+        float | None,
+        typer.Option(
+            "--command", "--current-a", help="Initial command, A or V; default: as after power-up."
+        ),
     ] = None,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print one line of JSON when ready.")
@@ -182,11 +208,12 @@ def emulate(
     faults = tuple(parse_fault(text) for text in fault or ())
     if is_experiment(profile):
         own = {"--link": link, "--output": output, "--sensor": sensor, "--reader": reader,
-               "--reader-line": reader_line, "--reader-unit-id": reader_unit_id}  # fmt: skip
+               "--reader-line": reader_line, "--reader-unit-id": reader_unit_id,
+               "--unit": unit}  # fmt: skip
         if given := [name for name, value in own.items() if value is not None]:
             raise InputError(f"{', '.join(given)}: specified by {profile} already")
-        wired = wired_experiment(Path(profile), port, host)
-        options = replace(wired.options, log=log, faults=faults, current_a=current_a)
+        wired = wired_experiment(Path(profile), port, host, actuator or ())
+        options = replace(wired.options, log=log, faults=faults, command=command)
         if reader_port:
             options = replace(options, reader_port=reader_port)
         serve(options, partial(_say, as_json=as_json, wired=wired))
@@ -206,7 +233,8 @@ def emulate(
         reader_line=cast(ReaderLine | None, reader_line),
         reader_unit_id=reader_unit_id,
         reader_port=reader_port,
-        current_a=current_a,
+        actuator=_actuator(unit or "A", actuator or ()),
+        command=command,
     )
     serve(options, partial(_say, as_json=as_json))
 
@@ -233,22 +261,32 @@ def _say(
     for each in places:
         unit = f", unit {each.unit_id}" if each.unit_id is not None else ""
         typer.echo(f"{each.profile} answers at {each.address}{unit}")
+    wiring, info = emulator.device.wiring, emulator.actuator.info
+    gain, offset, um_per_unit, offset_um = wiring.factors
+    unit = wiring.command_unit
+    drive = {"A": "current", "V": "voltage"}[unit]
+    typer.echo(
+        f"{emulator.options['output']}: {drive} = {gain:g} {unit} x output {offset:+g} {unit}"
+    )
+    shown = f"{um_per_unit:g} µm x input {offset_um:+g} µm"
+    typer.echo(f"{emulator.options['input']}: displacement = {shown}")
+    limits = f"{info.command_min:g} to {info.command_max:g} {unit}"
+    typer.echo(f"{info.name}: {limits}, {info.sensor_min_um:g} to {info.sensor_max_um:g} µm")
     if wired is not None:
-        wiring, options = wired.wiring, wired.options
-        current = f"{wiring.gain_a:g} A x output {wiring.offset_a:+g} A"
-        displacement = f"{wiring.sensor_um:g} µm x input {wiring.offset_um:+g} µm"
-        typer.echo(f"{options.output}: current = {current}")
-        typer.echo(f"{options.sensor}: displacement = {displacement}")
         typer.echo(f"hilctl {shlex.join(wired.words(emulator))}")
 
 
 def _report(
     places: Sequence[ListenAddress], emulator: Emulator, wired: WiredExperiment | None
 ) -> dict[str, Any]:
-    report: dict[str, Any] = {"devices": [asdict(each) for each in places]}
+    wiring, suffix = emulator.device.wiring, emulator.device.wiring.command_unit.lower()
+    names = f"gain_{suffix}", f"offset_{suffix}", "sensor_um", "offset_um"
+    terminals = {key: emulator.options[key] for key in ("output", "input")}
+    report = {
+        "devices": [asdict(each) for each in places],
+        "wiring": terminals | dict(zip(names, wiring.factors, strict=True)),
+    }
     if wired is not None:
-        terminals = {"output": wired.options.output, "input": wired.options.sensor}
-        report["wiring"] = terminals | asdict(wired.wiring)
         report["arguments"] = wired.words(emulator)
     return report
 

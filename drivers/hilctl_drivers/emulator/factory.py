@@ -16,17 +16,18 @@ from hilctl_drivers.emulator.board_device import EmulatedBoard
 from hilctl_drivers.emulator.modbus_device import EmulatedModbus
 from hilctl_drivers.emulator.modbus_wire import ModbusWire
 from hilctl_drivers.emulator.options import EmulatorOptions
-from hilctl_drivers.emulator.rig import Bench, Rig, SimulatedWiring, WriteLog
+from hilctl_drivers.emulator.rig import ACTUATORS, Bench, Rig, SimulatedWiring, WriteLog
 from hilctl_drivers.emulator.server import EmulatorServer
 from hilctl_drivers.emulator.text_device import EmulatedText
 from hilctl_drivers.emulator.wire import EmulatedLine, EmulatedWire, SerialProfile
 from hilctl_drivers.modbus.modbus_profile import ModbusProfile
 from hilctl_drivers.profile import load_profile
-from hilctl_drivers.profile_base import BaseProfile
+from hilctl_drivers.profile_base import BaseProfile, Range
+from hilctl_drivers.simulated.devices import PiezoOptions, PiezoStage, SimulatedDevice
 
 ProfileT = TypeVar("ProfileT", bound=BaseProfile)
 AnyDevice: TypeAlias = EmulatedModbus | EmulatedText | EmulatedBoard
-_SUFFIX = {"V": "v", "mA": "ma", "A": "a"}
+_DRIVE_V, _RANGE_UM = 100.0, 50.0  # of a piezo stage if no wiring is given
 
 
 class _Port(NamedTuple):
@@ -45,6 +46,7 @@ class Emulator:
     log: WriteLog
     device: AnyDevice  # drives the rig
     reader: AnyDevice  # shows the displacement, often the same
+    actuator: SimulatedDevice
     wires: tuple[EmulatedWire, ...]  # one, or the reader's too
     address: str  # host:port, or the pty's device file
     reader_address: str
@@ -58,7 +60,7 @@ def build(options: EmulatorOptions, clock_ns: Callable[[], int] = time.monotonic
     now_ns = clock_ns()
     log = WriteLog(options.log, time.time_ns() - now_ns)
     server = EmulatorServer(options.faults, clock_ns)
-    bench = Bench(Rig(now_ns, noise=options.noise), plan.wiring, log)
+    bench = Bench(Rig(now_ns, plan.actuator), plan.wiring, log)
     device, reader, ports = plan.devices(bench)
     try:
         addresses = [_opened(server, port, options.host) for port in ports]
@@ -71,6 +73,7 @@ def build(options: EmulatorOptions, clock_ns: Callable[[], int] = time.monotonic
         log=log,
         device=device,
         reader=reader,
+        actuator=plan.actuator,
         wires=tuple(port.wire for port in ports),
         address=addresses[0],
         reader_address=addresses[-1],
@@ -93,9 +96,9 @@ def _plan(options: EmulatorOptions) -> "_ModbusPlan | _SerialPlan":
         if not isinstance(reader, ModbusProfile):
             raise InputError(f"{options.reader}: only Modbus profiles read for {profile.title}")
         return _ModbusPlan(options, profile, reader)
-    given = (options.link, options.reader_unit_id, options.reader_port, options.current_a)
+    given = (options.link, options.reader_unit_id, options.reader_port, options.command)
     if given != (None, None, 0, None):
-        rule = "link, current and the reader's unit and port are for Modbus profiles"
+        rule = "link, initial command and the reader's unit and port are for Modbus profiles"
         raise InputError(f"{rule}, {options.profile} has a line of its own")
     if isinstance(profile, FrameProfile):
         if reader is not profile:
@@ -121,10 +124,8 @@ class _Plan(Generic[ProfileT]):
         outputs = list(profile.outputs)
         self._output = _chosen("output to drive the rig with", options.output, outputs, profile)
         self._sensor = _chosen("input to show a displacement at", options.sensor, sensors, reader)
-        self._output_range = profile.outputs[self._output]
-        self._sensor_range = reader.inputs[self._sensor]
-        self.wiring = options.wiring or SimulatedWiring.spread(
-            self._output_range, self._sensor_range
+        self.actuator, self.wiring = _rig(
+            options, profile.outputs[self._output], reader.inputs[self._sensor]
         )
         self._apart = reader is not profile
         """Whether the reader is on a wire of its own."""
@@ -135,20 +136,16 @@ class _Plan(Generic[ProfileT]):
 
     def channels(self) -> dict[str, Any]:
         """Return the part of a device section with profile, channels and wiring."""
-        wiring = self.wiring
+        amplifier, sensor = self.wiring.amplifier, self.wiring.sensor
         made: dict[str, Any] = {
             "profile": self._options.profile,
             "output": self._output,
             "input": self._sensor,
-            "sensor": {
-                f"um_per_{_SUFFIX[self._sensor_range.unit]}": wiring.sensor_um,
-                "offset_um": wiring.offset_um,
-            },
+            "sensor": sensor.model_dump(exclude_none=True),
             "watchdog": "none",
         }
-        if self._output_range.unit != "A":
-            gain = {f"gain_a_per_{_SUFFIX[self._output_range.unit]}": wiring.gain_a}
-            made["amplifier"] = {**gain, "offset_a": wiring.offset_a}
+        if amplifier is not None:
+            made["amplifier"] = amplifier.model_dump(exclude_none=True)
         return made
 
     def places(self, addresses: list[str]) -> dict[str, Any]:
@@ -159,6 +156,31 @@ class _Plan(Generic[ProfileT]):
             place = _place(addresses[1]) if self._apart else {}
             made["reader"] = {"profile": self._options.reader, **unit, **place}
         return made
+
+
+def _rig(
+    options: EmulatorOptions, output: Range, sensor_input: Range
+) -> tuple[SimulatedDevice, SimulatedWiring]:
+    """Return the actuator and its wiring to an output and an input; each may follow the other."""
+    actuator, given = options.actuator, options.wiring
+    wiring = None if given is None else SimulatedWiring(output, sensor_input, *given)
+    if isinstance(actuator, PiezoOptions) and actuator.stage is None:
+        if wiring is None:  # 0 V of an output drives with 0 V
+            share = min(0.0, output.min) / max(abs(output.min), abs(output.max))
+            stage = PiezoStage.fitted(share * _DRIVE_V, _DRIVE_V, _RANGE_UM)
+        else:
+            (low_v, high_v), reach_um = wiring.command_range, wiring.displacement_range
+            stage = PiezoStage.fitted(low_v, high_v, max(map(abs, reach_um)))
+        actuator = actuator.model_copy(update={"stage": stage})
+    device = next(make(actuator) for kind, make in ACTUATORS.values() if kind is type(actuator))
+    wiring = wiring or SimulatedWiring.spread(output, sensor_input, device)
+    unit = device.info.command_unit
+    if wiring.command_unit != unit:
+        raise InputError(
+            f"{device.info.name} is driven in {unit}, but the output drives in "
+            f"{wiring.command_unit}: use --unit {wiring.command_unit}"
+        )
+    return device, wiring
 
 
 def _place(address: str) -> dict[str, Any]:
@@ -192,8 +214,7 @@ class _ModbusPlan(_Plan[ModbusProfile]):
         options, output, sensor = self._options, self._output, self._sensor
         reads_itself = self._reader is self._profile
         device = reader = EmulatedModbus(
-            self._profile, bench, output, sensor if reads_itself else None, options.current_a,
-            noise=options.noise,
+            self._profile, bench, output, sensor if reads_itself else None, options.command
         )  # fmt: skip
         if not reads_itself:
             reader = EmulatedModbus(self._reader, bench, None, sensor)
@@ -220,7 +241,7 @@ class _SerialPlan(_Plan[SerialProfile]):
         """Return the devices that drive and show the rig, and where they are served."""
         profile, reader = self._profile, self._reader
         if isinstance(profile, FrameProfile):
-            board = EmulatedBoard(profile, bench, noise=self._options.noise)
+            board = EmulatedBoard(profile, bench)
             return board, board, [_Port(EmulatedLine(profile, [board]))]
         assert isinstance(reader, AsciiProfile)
         if reader is profile:

@@ -80,7 +80,7 @@ class LabJackInput:
 
 
 class LabJackStream:
-    """The registers; ``on_played`` gets the first number, currents in A, and the last time."""
+    """The registers; ``on_played`` gets the first number, the commands, and the last time."""
 
     def __init__(
         self,
@@ -90,16 +90,14 @@ class LabJackStream:
         sensor: str,
         bench: Bench,
         *,
-        noise: bool,
         on_played: Callable[[int, F64, int], None],
     ) -> None:
         self._streaming, self._wiring, self._rig = streaming, bench.wiring, bench.rig
         self._limits = profile.outputs[output].limits
         self._target = profile.wire_address(profile.outputs[output])
-        self._sensor = profile.inputs[sensor]
-        self._source = profile.wire_address(self._sensor)
+        self._source = profile.wire_address(profile.inputs[sensor])
         self._analog = {profile.wire_address(each) for each in profile.inputs.values()}
-        self.fifo = SampleFifo(noise=noise, repeats=True, on_played=self._played)
+        self.fifo = SampleFifo(bench.rig.actuator, repeats=True, on_played=self._played)
         self._on_played = on_played
         self.input = LabJackInput(streaming)
         self._words = {address: bytes(4) for address in _plain(profile, streaming)}
@@ -130,9 +128,9 @@ class LabJackStream:
         self._now_ns = max(self._now_ns, now_ns)
         self.fifo.advance(self._now_ns)
 
-    def _played(self, first: int, current_a: F64, displacement_um: F64, now_ns: int) -> None:
-        self._on_played(first, current_a, now_ns)
-        self.input.keep(self._wiring.at_terminal(displacement_um, self._sensor))
+    def _played(self, first: int, command: F64, displacement_um: F64, now_ns: int) -> None:
+        self._on_played(first, command, now_ns)
+        self.input.keep(self._wiring.at_terminal(displacement_um))
 
     def stop(self, now_ns: int) -> None:
         """Stop streaming at a time that may be past; the output holds its value."""
@@ -200,7 +198,7 @@ class LabJackStream:
     def _use_values(self, data: bytes) -> None:
         _require(data == stream.u32(stream.USE_AT_ONCE), _VALUE_EXCEPTION)
         for values in self._pending:
-            self.fifo.queue(self._wiring.current_a(values))
+            self.fifo.queue(self._wiring.command(values))
         self._pending.clear()
 
     def _enable(self, data: bytes) -> None:
@@ -216,7 +214,7 @@ class LabJackStream:
         allowed = 0.0 < rate_hz <= self._streaming.rate_max_hz
         _require(allowed and found == wanted, _FAILURE_EXCEPTION)
         self.input.start(self._number(stream.BUFFER_SIZE_BYTES))
-        self.fifo.current_a = self._rig.current_a
+        self.fifo.command = self._rig.command
         self.fifo.set_rate(rate_hz)
         self.fifo.start(self._now_ns)
 

@@ -92,9 +92,8 @@ def _hit(trigger: Target | None, target: Words) -> bool:
 class EmulatedModbus(EmulatedDevice):
     """The device: its registers, and the effects of writing them.
 
-    It powers up as the profile says, or at ``current_a``; otherwise with the rig at 0 A. Two
-    devices can share a rig: one drives it, the other shows its displacement. ``noise`` is that of
-    the sensor when streaming.
+    It powers up as the profile says, or at ``command``; otherwise with the rig at 0. Two
+    devices can share a rig: one drives it, the other shows its displacement.
     """
 
     profile: ModbusProfile
@@ -105,9 +104,7 @@ class EmulatedModbus(EmulatedDevice):
         bench: Bench,
         output: str | None,
         sensor: str | None,
-        current_a: float | None = None,
-        *,
-        noise: bool = True,
+        command: float | None = None,
     ) -> None:
         super().__init__(profile, bench, output)
         self._sensor = sensor
@@ -122,17 +119,17 @@ class EmulatedModbus(EmulatedDevice):
         self.overlay: LabJackStream | None = None  # registers of a stream, before all others
         if streaming != "none" and output in streaming.outputs and sensor in streaming.inputs:
             self.overlay = LabJackStream(
-                profile, streaming, output, sensor, bench, noise=noise, on_played=self._played
+                profile, streaming, output, sensor, bench, on_played=self._played
             )
-        self._power_up(current_a)
+        self._power_up(command)
 
-    def _power_up(self, current_a: float | None) -> None:
+    def _power_up(self, command: float | None) -> None:
         for name, words in self._outputs.items():
             value = self.profile.outputs[name].power_up
             if name == self._output:
-                if value is None or current_a is not None:
-                    value = self.wiring.output(current_a or 0.0)
-                self._rig.put_out(self.wiring.current_a(value), 0)
+                if value is None or command is not None:
+                    value = self.wiring.output(command or 0.0)
+                self._rig.put_out(self.wiring.command(value), 0)
             if value is not None:
                 words.value = value
 
@@ -141,10 +138,10 @@ class EmulatedModbus(EmulatedDevice):
             self.overlay.tick(self._now_ns)
         super()._advance()
 
-    def _played(self, first: int, current_a: F64, now_ns: int) -> None:
+    def _played(self, first: int, command: F64, now_ns: int) -> None:
         assert self._output is not None
-        self._rig.put_out(float(current_a[-1]), now_ns)
-        self._outputs[self._output].value = self._log_played(first, current_a, now_ns)
+        self._rig.put_out(float(command[-1]), now_ns)
+        self._outputs[self._output].value = self._log_played(first, command, now_ns)
 
     def request(self, now_ns: int) -> None:
         """Note that a request has come; before it is executed."""
@@ -252,8 +249,7 @@ class EmulatedModbus(EmulatedDevice):
 
     def _measure(self) -> None:
         if self._sensor is not None:
-            channel = self.profile.inputs[self._sensor]
-            value = float(self.wiring.at_terminal(self._rig.displacement_um, channel))
+            value = float(self.wiring.at_terminal(self._rig.displacement_um))
             self._inputs[self._sensor].value = value
         watchdog = self.profile.watchdog
         if watchdog != "none" and watchdog.tripped != "none":

@@ -2,13 +2,14 @@
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, TypeAlias, cast, get_args
 
 from hilctl.base.errors import InputError
 from hilctl_drivers.emulator.modbus_wire import LinkKind
-from hilctl_drivers.emulator.rig import SimulatedWiring
+from hilctl_drivers.signal_chain import Amplifier, Sensor
+from hilctl_drivers.simulated.devices import SimulatedOptions, TerfenolOptions
 
 FaultKind: TypeAlias = Literal[
     "silence", "delay", "late", "exception", "corrupt", "cut", "duplicate", "wrong_id", "reset",
@@ -87,7 +88,7 @@ ReaderLine: TypeAlias = Literal["same", "own"]
 
 @dataclass(frozen=True)
 class EmulatorOptions:
-    """What to emulate; link, current, functions, and reader unit and port: Modbus only."""
+    """What to emulate; link, initial command, functions, and reader unit and port: Modbus only."""
 
     profile: str  # name of a shipped profile, or path of one
     link: LinkKind | None = None  # tcp, or rtu on a pty; the profile's own if None
@@ -104,9 +105,11 @@ class EmulatorOptions:
     reader_port: int = 0  # TCP port of its own; 0 for a free one
     lacking: frozenset[int] = frozenset()  # functions that are refused with exception 1
     mute: frozenset[int] = frozenset()  # functions that are never answered
-    wiring: SimulatedWiring | None = None  # spread over the channels' ranges if None
-    noise: bool = True
-    current_a: float | None = None  # initial current, as if it was the power-up value
+    # Of a piezo without a stage of its own, the published stage is scaled to the wiring.
+    actuator: SimulatedOptions = field(default_factory=TerfenolOptions)
+    # Amplifier and sensor; spread over the channels' ranges if None.
+    wiring: tuple[Amplifier | None, Sensor] | None = None
+    command: float | None = None  # initial command, as if it was the power-up value
 
     def __post_init__(self) -> None:
         for name, words in (("link", LinkKind), ("reader_line", ReaderLine)):

@@ -3,43 +3,55 @@
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, TypeAlias, TypeVar
+from typing import IO, Any, TypeAlias
 
 import numpy as np
 
 from hilctl.base.errors import InputError
 from hilctl.base.files import reason
-from hilctl.base.types import F64
+from hilctl.base.samples import COLUMNS
+from hilctl.base.types import F64, CommandUnit
 from hilctl_drivers.profile_base import BaseProfile, Range
-from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
+from hilctl_drivers.signal_chain import Amplifier, Sensor, SignalChain
+from hilctl_drivers.simulated.actuator_base import Plant
+from hilctl_drivers.simulated.devices import (
+    PiezoOptions,
+    SimulatedDevice,
+    SimulatedOptions,
+    SimulatedPiezo,
+    SimulatedTerfenol,
+    TerfenolOptions,
+)
 
 RATE_HZ = 10_000.0
 SETTLED_S = 1.0  # the slowest part of the rig has a time constant of 0.1 ms
 _CHUNK = 1000
-Numbers = TypeVar("Numbers", float, F64)
-
-
-def _rated(*, noise: bool) -> TerfenolParameters:
-    rated = TerfenolParameters()
-    return rated if noise else replace(rated, sensor_noise_um=0.0)
+ACTUATORS: dict[CommandUnit, tuple[type[SimulatedOptions], Callable[[Any], SimulatedDevice]]] = {
+    "A": (TerfenolOptions, SimulatedTerfenol),
+    "V": (PiezoOptions, SimulatedPiezo),
+}
+"""Options and class of the actuator behind an emulated device, by the unit of its drive."""
+SUFFIX = {"V": "v", "mA": "ma"}
+"""Units of a channel in the keys of amplifier and sensor."""
 
 
 class Rig:
-    """The actuator with its amplifier and sensor, in real time, from rest at 0 A at ``now_ns``.
+    """The actuator with its amplifier and sensor, in real time, from rest at ``now_ns``.
 
     The caller gives the time. The rig has then held its output since the last change, and its
     sensor shows the last sample of its own clock: readings are one to two of its periods old.
     """
 
-    def __init__(self, now_ns: int, *, noise: bool = True) -> None:
-        self._plant = TerfenolActuator(_rated(noise=noise), RATE_HZ)
+    def __init__(self, now_ns: int, actuator: SimulatedDevice) -> None:
+        self.actuator = actuator
+        self._plant = actuator.plant(RATE_HZ)
         self._held = np.zeros(_CHUNK)
         self._read = np.zeros((2, _CHUNK))
         self._origin_ns = now_ns
         self._samples = 0
-        self.current_a = 0.0
+        self.command = 0.0
         self.displacement_um = 0.0
         self._step(1)
 
@@ -52,53 +64,55 @@ class Rig:
         while self._samples < due:
             self._step(min(_CHUNK, due - self._samples))
 
-    def put_out(self, current_a: float, now_ns: int) -> None:
-        """Change the output; the amplifier saturates at its range."""
+    def put_out(self, command: float, now_ns: int) -> None:
+        """Change the output; the amplifier saturates at the actuator's range."""
         self.advance(now_ns)
-        limit_a = TerfenolParameters().dac_range_a
-        self.current_a = min(max(current_a, -limit_a), limit_a)
+        info = self.actuator.info
+        self.command = min(max(command, info.command_min), info.command_max)
 
     def _step(self, count: int) -> None:
-        self._held[:count] = self.current_a
+        self._held[:count] = self.command
         self._plant.step(self._held[:count], self._read[0, :count], self._read[1, :count])
         self.displacement_um = float(self._read[0, count - 1])
         self._samples += count
 
 
-@dataclass(frozen=True, slots=True)
-class SimulatedWiring:
+class SimulatedWiring(SignalChain):
     """Amplifier and sensor between the device's terminals and the rig."""
 
-    gain_a: float  # per unit of the output
-    offset_a: float  # at 0 of the output
-    sensor_um: float  # per unit of the input
-    offset_um: float  # at 0 of the input
+    def __init__(
+        self, output: Range, sensor_input: Range, amplifier: Amplifier | None, sensor: Sensor
+    ) -> None:
+        super().__init__(output, sensor_input, amplifier, sensor)
+        self.amplifier, self.sensor = amplifier, sensor
+        self._input_limits = sensor_input.limits
 
-    def current_a(self, value: Numbers) -> Numbers:
-        """Return the coil current for an output value."""
-        return value * self.gain_a + self.offset_a
-
-    def output(self, current_a: float) -> float:
-        """Return the output value for a coil current."""
-        return (current_a - self.offset_a) / self.gain_a
-
-    def at_terminal(self, displacement_um: F64 | float, channel: Range) -> F64:
+    def at_terminal(self, displacement_um: F64 | float) -> F64:
         """Return the sensor's signal, clipped to the input's range as by an ADC."""
-        signal = (displacement_um - self.offset_um) / self.sensor_um
-        clipped: F64 = np.clip(signal, *channel.limits)
+        *_, um_per_unit, offset_um = self.factors
+        signal = (displacement_um - offset_um) / um_per_unit
+        clipped: F64 = np.clip(signal, *self._input_limits)
         return clipped
 
     @classmethod
-    def spread(cls, output: Range, sensor: Range) -> "SimulatedWiring":
-        """Spread the rig's ranges over those of two channels; an output in A drives the coil."""
-        rig = TerfenolParameters()
-        amplifier = (1.0, 0.0) if output.unit == "A" else _spread(output, rig.dac_range_a)
-        return cls(*amplifier, *_spread(sensor, rig.sensor_range_um))
+    def spread(
+        cls, output: Range, sensor_input: Range, actuator: SimulatedDevice
+    ) -> "SimulatedWiring":
+        """Spread the actuator's ranges over those of two channels; an output in A drives it."""
+        info, amplifier = actuator.info, None
+        if output.unit != "A":
+            unit = info.command_unit.lower()
+            gain, offset = _spread(output, info.command_min, info.command_max)
+            keys = {f"gain_{unit}_per_{SUFFIX[output.unit]}": gain, f"offset_{unit}": offset}
+            amplifier = Amplifier.model_validate(keys)
+        gain, offset = _spread(sensor_input, info.sensor_min_um, info.sensor_max_um)
+        keys = {f"um_per_{SUFFIX[sensor_input.unit]}": gain, "offset_um": offset}
+        return cls(output, sensor_input, amplifier, Sensor.model_validate(keys))
 
 
-def _spread(channel: Range, reach: float) -> tuple[float, float]:
-    gain = 2.0 * reach / (channel.max - channel.min)
-    return gain, -0.5 * gain * (channel.max + channel.min)
+def _spread(channel: Range, low: float, high: float) -> tuple[float, float]:
+    gain = (high - low) / (channel.max - channel.min)
+    return gain, low - gain * channel.min
 
 
 class WatchdogTimer:
@@ -175,6 +189,7 @@ class EmulatedDevice(ABC):
         self.profile = profile
         self.wiring, self._rig, self._log = bench.wiring, bench.rig, bench.log
         self._output = output
+        self._logged = COLUMNS["command"].field(bench.wiring.command_unit).name
         self._timer = WatchdogTimer()
         self._now_ns = 0
 
@@ -202,19 +217,19 @@ class EmulatedDevice(ABC):
         """Log an output's new value, and drive the rig if it is wired to it."""
         more: dict[str, float] = {}
         if name == self._output:
-            self._rig.put_out(self.wiring.current_a(value), now_ns)
-            more["current_a"] = self._rig.current_a
+            self._rig.put_out(self.wiring.command(value), now_ns)
+            more[self._logged] = self._rig.command
         unit = self.profile.outputs[name].unit
         self._log.event(now_ns, event, output=name, value=value, unit=unit, **more)
 
-    def _log_played(self, first: int, current_a: F64, now_ns: int) -> float:
+    def _log_played(self, first: int, command: F64, now_ns: int) -> float:
         """Log a block that a FIFO has output; return its last value in the output's unit."""
         assert self._output is not None
-        last_a = float(current_a[-1])
-        value, unit = self.wiring.output(last_a), self.profile.outputs[self._output].unit
+        last = float(command[-1])
+        value, unit = self.wiring.output(last), self.profile.outputs[self._output].unit
         self._log.event(
-            now_ns, "played", output=self._output, first=first, samples=current_a.size,
-            value=value, unit=unit, current_a=last_a,
+            now_ns, "played", output=self._output, first=first, samples=command.size,
+            value=value, unit=unit, **{self._logged: last},
         )  # fmt: skip
         return value
 
@@ -222,23 +237,23 @@ class EmulatedDevice(ABC):
 _SETTLED_S = 0.1
 
 Played: TypeAlias = Callable[[int, F64, F64, int], None]
-"""First value's number, float64[n] currents in A, float64[n] readings in um, time of the last."""
+"""First value's number, float64[n] commands, float64[n] readings in um, time of the last."""
 
 
 class SampleFifo:
     """FIFO that outputs one value per period; a period without one holds or ``repeats`` it."""
 
-    def __init__(self, *, noise: bool, repeats: bool, on_played: Played) -> None:
-        self._parameters = _rated(noise=noise)
+    def __init__(self, actuator: SimulatedDevice, *, repeats: bool, on_played: Played) -> None:
+        self._actuator = actuator
         self._repeats = repeats
         self._on_played = on_played
-        self._plant: TerfenolActuator | None = None
+        self._plant: Plant | None = None
         self._plant_rate_hz = 0.0
         self._rate_hz = 0.0
         self._start_ns: int | None = None
         self._queued = np.empty(0)
         self._periods = 0
-        self.current_a = 0.0
+        self.command = 0.0
         self.level = 0  # values that are queued
         self.played = 0  # values output since the rate was set
         self.underruns = 0  # periods since then that found nothing queued
@@ -256,10 +271,10 @@ class SampleFifo:
     def set_rate(self, rate_hz: float) -> None:
         """Stop, and count from 0 at another rate after :meth:`start`; queued values stay."""
         if self._plant is None or self._plant_rate_hz != rate_hz:
-            self._plant = TerfenolActuator(self._parameters, rate_hz)
+            self._plant = self._actuator.plant(rate_hz)
             self._plant_rate_hz = rate_hz
         # It compiles the plant too, which would be late once the clock runs.
-        self._plant.hold(round(_SETTLED_S * rate_hz), self.current_a)
+        self._plant.hold(round(_SETTLED_S * rate_hz), self.command)
         self.stop()
         self._rate_hz = rate_hz
         self._periods = self.played = self.underruns = 0
@@ -278,10 +293,10 @@ class SampleFifo:
         self._queued = np.empty(0)
         self.level = 0
 
-    def queue(self, current_a: F64) -> None:
-        """Queue float64[n], in A."""
-        self._queued = np.concatenate([self._queued, current_a])
-        self.level += current_a.size
+    def queue(self, command: F64) -> None:
+        """Queue float64[n]."""
+        self._queued = np.concatenate([self._queued, command])
+        self.level += command.size
 
     def due_ns(self, values: int) -> int | None:
         """Return when that many values will have been output; None before the start."""
@@ -303,8 +318,8 @@ class SampleFifo:
         self.underruns += missed
         played = due if self._repeats else values.size
         if values.size:
-            self.current_a = float(values[-1])
-        command = np.concatenate([values, np.full(missed, self.current_a)])
+            self.command = float(values[-1])
+        command = np.concatenate([values, np.full(missed, self.command)])
         displacement_um, measured = np.empty(due), np.empty(due)
         self._plant.step(command, displacement_um, measured)
         if played:

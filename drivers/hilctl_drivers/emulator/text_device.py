@@ -76,7 +76,7 @@ class EmulatedText(EmulatedDevice):
         super().__init__(profile, bench, output)
         self._sensor = sensor
         self._address = profile.unit
-        # The power-up value is 0 at the terminal, not at the coil.
+        # The power-up value is 0 at the terminal, not at the actuator.
         self._values = {
             name: min(max(0.0, each.min), each.max) for name, each in profile.outputs.items()
         }
@@ -87,7 +87,7 @@ class EmulatedText(EmulatedDevice):
             for name, each in profile.outputs.items()
         }
         if output is not None:
-            self._rig.put_out(self.wiring.current_a(self._values[output]), 0)
+            self._rig.put_out(self.wiring.command(self._values[output]), 0)
         self._errors: list[str] = []
 
     def answer(self, message: bytes, now_ns: int) -> EmulatedReply | None:
@@ -173,7 +173,7 @@ class EmulatedText(EmulatedDevice):
         if source.measures == "output":
             value = self._values[self._output or next(iter(self._values))]
         elif name == self._sensor:
-            value = float(self.wiring.at_terminal(self._rig.displacement_um, source))
+            value = float(self.wiring.at_terminal(self._rig.displacement_um))
         else:
             value = 0.0
         value = min(max(value, source.min), source.max)

@@ -106,7 +106,7 @@ class SimulatedDevice(DacDevice):
     def _open(self, sample_rate_hz: float, block: int) -> None:
         """Put the plant at rest where the output stands, with the sample count at 0."""
         del block
-        self._plant = self._build(sample_rate_hz)
+        self._plant = self.plant(sample_rate_hz)
         self._next_sample = 0
         self._last_command = self._output_at_open or 0.0
         self._last_reading_um = 0.0
@@ -147,7 +147,7 @@ class SimulatedDevice(DacDevice):
         self._plant = None
 
     @abstractmethod
-    def _build(self, sample_rate_hz: float) -> Plant:
+    def plant(self, sample_rate_hz: float) -> Plant:
         """Return a plant at rest."""
 
     def _check_sizes(self, command: F64, displacement_um: F64, measured: F64) -> None:
@@ -291,7 +291,8 @@ class TerfenolOptions(SimulatedOptions):
 class PiezoStage(DeviceOptions):
     """A stage of your own: a sum of play operators, for example one identified from your data."""
 
-    drive_max_v: float = Field(gt=0.0, description="top of the drive, V; its bottom is 0 V")
+    drive_min_v: float = Field(default=0.0, le=0.0, description="bottom of the drive, V")
+    drive_max_v: float = Field(gt=0.0, description="top of the drive, V")
     slope_um_per_v: float = Field(gt=0.0, description="weight p_0 of the drive itself")
     thresholds_v: tuple[float, ...] = Field(description="thresholds r_i of the play operators, V")
     weights_um_per_v: tuple[float, ...] = Field(description="weights p_i of the play operators")
@@ -306,6 +307,23 @@ class PiezoStage(DeviceOptions):
                 f"weights_um_per_v must have one value a threshold: {weights} for {thresholds}"
             )
         return self
+
+    @classmethod
+    def fitted(cls, low_v: float, high_v: float, range_um: float) -> Self:
+        """Return the published stage, scaled to another drive and another range of the sensor.
+
+        The largest voltage of either sign moves it through 80 % of the sensor's range.
+        """
+        rated, top_v = PiezoParameters(), max(abs(low_v), abs(high_v))
+        volts, um = top_v / rated.drive_max_v, 0.7 * range_um / rated.sensor_range_um
+        return cls(
+            drive_min_v=min(0.0, low_v),
+            drive_max_v=top_v,
+            slope_um_per_v=rated.slope_um_per_v * um / volts,
+            thresholds_v=tuple(each * volts for each in rated.thresholds_v),
+            weights_um_per_v=tuple(each * um / volts for each in rated.weights_um_per_v),
+            sensor_range_um=range_um,
+        )
 
 
 class PiezoOptions(SimulatedOptions):
@@ -338,7 +356,8 @@ class SimulatedTerfenol(SimulatedDevice):
             command_max=command_max,
         )
 
-    def _build(self, sample_rate_hz: float) -> Plant:
+    def plant(self, sample_rate_hz: float) -> Plant:
+        """Return the actuator at rest."""
         options = self._options
         return TerfenolActuator(
             self._parameters, sample_rate_hz, options.load_kg, options.bias_a, options.seed
@@ -355,16 +374,18 @@ class SimulatedPiezo(SimulatedDevice):
         noise_um = options.sensor_noise_um if options.noise else 0.0
         stage = options.stage.model_dump() if options.stage else {}
         self._parameters = PiezoParameters(sensor_noise_um=noise_um, **stage)
-        drive_max_v = self._parameters.drive_max_v
+        low_v, high_v = self._parameters.drive_min_v, self._parameters.drive_max_v
+        drive = f"{low_v:g}..{high_v:g} V drive"
         super().__init__(
             options,
             self._parameters,
             name="simulated_piezo",
-            description=f"simulated piezo stage, 0..{drive_max_v:g} V drive and capacitive sensor",
+            description=f"simulated piezo stage, {drive} and capacitive sensor",
             command_unit="V",
-            command_min=0.0,
-            command_max=drive_max_v,
+            command_min=low_v,
+            command_max=high_v,
         )
 
-    def _build(self, sample_rate_hz: float) -> Plant:
+    def plant(self, sample_rate_hz: float) -> Plant:
+        """Return the stage at rest."""
         return PiezoActuator(self._parameters, sample_rate_hz, self._seed)

@@ -29,7 +29,8 @@ class PiezoParameters:
     sensor, not published.
     """
 
-    drive_max_v: float = 100.0  # top of the drive, whose bottom is 0 V
+    drive_min_v: float = 0.0  # bottom of the drive
+    drive_max_v: float = 100.0  # top of the drive
     slope_um_per_v: float = 0.2567  # weight p_0 of the drive itself
     # Play operators: r_i = sigma i and p_i = alpha exp(-beta i)
     thresholds_v: tuple[float, ...] = tuple(3.548 * i for i in _INDEX)

@@ -222,8 +222,8 @@ class Document:
             mapping[key.value] = self._build(value, inner, place)
         return mapping
 
-    def set(self, assignment: str) -> None:
-        """Apply one ``dotted.key=value`` from the command line; the value is YAML.
+    def set(self, assignment: str, option: str = "--set") -> None:
+        """Apply one ``dotted.key=value`` of a command line's option; the value is YAML.
 
         A section that is ``none`` becomes a mapping.
 
@@ -231,7 +231,7 @@ class Document:
             ConfigError: It has another form, a part of the key is not a mapping, or the value has
                 a duplicate key.
         """
-        where = f"--set {assignment}"
+        where = f"{option} {assignment}"
         key, equals, text = assignment.partition("=")
         parts = key.strip().split(".")
         if not equals or not all(parts) or len(parts) > MAX_DEPTH:

@@ -8,6 +8,7 @@ import pytest
 from hilctl_drivers.emulator.options import EmulatorOptions, parse_fault
 from hilctl_drivers.profile import shipped_profiles
 from hilctl_drivers.serial_dac import SerialDac, SerialOptions
+from hilctl_drivers.simulated.devices import TerfenolOptions
 from tests.fakes import ShiftedClock, emulated, logged
 
 TIMEOUT_S = 2.0
@@ -72,7 +73,7 @@ def serial_bench(tmp_path):
             wanted = EmulatorOptions(
                 profile,
                 log=log,
-                noise=noise,
+                actuator=TerfenolOptions(noise=noise),
                 faults=tuple(map(parse_fault, faults)),
                 reader=reader,
                 reader_line="own" if own_line else "same",

@@ -16,6 +16,7 @@ from hilctl.run.probe import judge, probe
 from hilctl.run.run_folder import held_devices
 from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.profile import shipped_profiles
+from hilctl_drivers.simulated.devices import TerfenolOptions
 from tests.fakes import ManualClock, emulated, logged
 
 CONFIGS = Path(__file__).parents[3] / "configs"
@@ -92,7 +93,9 @@ def rig(tmp_path):
             path = tmp_path / "profile.yaml"
             path.write_text(text.replace("boot_wait_s: 2.0", "boot_wait_s: 0.0"), encoding="utf-8")
             clock = ManualClock()
-            wanted = EmulatorOptions(str(path), log=tmp_path / "writes.jsonl", noise=False)
+            wanted = EmulatorOptions(
+                str(path), log=tmp_path / "writes.jsonl", actuator=TerfenolOptions(noise=False)
+            )
             emulator = stack.enter_context(emulated(wanted, clock))
             return ProbedRig(emulator, clock, tmp_path, **device)
 

@@ -9,6 +9,7 @@ from hilctl_drivers.emulator.modbus_device import EmulatedModbus
 from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.emulator.rig import Bench, Rig, SimulatedWiring, WriteLog
 from hilctl_drivers.profile import load_profile
+from hilctl_drivers.simulated.devices import SimulatedTerfenol, TerfenolOptions
 from tests.fakes import emulated, logged
 
 MS = 1_000_000
@@ -18,8 +19,9 @@ START_NS = 10_000_000_000
 def emulated_modbus(name, output, sensor, current_a=None):
     """Return an emulated Modbus device that drives and shows a rig of its own."""
     profile = load_profile(name)
-    wiring = SimulatedWiring.spread(profile.outputs[output], profile.inputs[sensor])
-    bench = Bench(Rig(0), wiring, WriteLog(None, 0))
+    actuator = SimulatedTerfenol(TerfenolOptions())
+    wiring = SimulatedWiring.spread(profile.outputs[output], profile.inputs[sensor], actuator)
+    bench = Bench(Rig(0, actuator), wiring, WriteLog(None, 0))
     return EmulatedModbus(profile, bench, output, sensor, current_a)
 
 
@@ -29,7 +31,9 @@ class Emulated:
     def __init__(self, profile, tmp_path, **wanted):
         self.log = tmp_path / "writes.jsonl"
         self.now_ns = START_NS
-        made = EmulatorOptions(str(profile), log=self.log, noise=False, **wanted)
+        made = EmulatorOptions(
+            str(profile), log=self.log, **{"actuator": TerfenolOptions(noise=False), **wanted}
+        )
         self.emulator = build(made, lambda: self.now_ns)
         self.device = self.emulator.device
 

@@ -89,7 +89,7 @@ class TestBoard:
         board.ask(b"\x11\x02" + struct.pack("<IH", 0, 100) + values)
         reply = board.ask(b"\x11\x02" + struct.pack("<IH", 100, 100) + values, after_ms=15)
         assert struct.unpack("<HH", reply[-4:]) == (100, 50)
-        assert board.device.fifo.current_a == 2.0
+        assert board.device.fifo.command == 2.0
 
     def test_state_is_said_and_not_changed(self, emulate):
         """Tripped or not; as a board powers up, its output is at 0 V."""

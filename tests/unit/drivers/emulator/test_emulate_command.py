@@ -18,7 +18,6 @@ from hilctl_drivers.emulator.emulate_command import (
 )
 from hilctl_drivers.emulator.factory import build
 from hilctl_drivers.emulator.options import EmulatorOptions, parse_fault
-from hilctl_drivers.emulator.rig import SimulatedWiring
 from hilctl_drivers.emulator.server import EmulatorServer
 from hilctl_drivers.profile import FOLDER
 
@@ -78,10 +77,13 @@ def test_a_program_reads_where_and_how(ended_at_once):
     assert shown[-1].startswith(f"hilctl run {path} --set device.serial_port=/dev/pts/")
 
 
-def test_a_profile_alone_has_no_wiring_to_tell(ended_at_once):
-    said = json.loads(CliRunner().invoke(app, ["emulate", "labjack_t7", "--json"]).stdout)
-    assert list(said) == ["devices"]
-    assert said["devices"][0]["unit_id"] is None
+def test_a_profile_alone_is_driven_with_either_unit(ended_at_once):
+    command = ["emulate", "labjack_t7", "--json"]
+    said = json.loads(CliRunner().invoke(app, command).stdout)
+    assert (said["devices"][0]["unit_id"], "arguments" in said) == (None, False)
+    assert (said["wiring"]["gain_a"], said["wiring"]["offset_a"]) == (4.0, -10.0)
+    said = json.loads(CliRunner().invoke(app, [*command, "--unit", "V"]).stdout)
+    assert (said["wiring"]["gain_v"], said["wiring"]["sensor_um"]) == (20.0, 5.0)
 
 
 @pytest.mark.parametrize("words", [
@@ -118,7 +120,8 @@ def test_an_experiment_is_told_from_a_profile(tmp_path):
 
 def test_it_has_the_wiring_of_the_experiment():
     wired = wired_experiment(CONFIGS / "modbus_labjack_t7.yaml")
-    assert wired.options.wiring == SimulatedWiring(4.0, -10.0, 12.5, 0.0)
+    amplifier, sensor = wired.options.wiring
+    assert (amplifier.gain_a_per_v, amplifier.offset_a, sensor.um_per_v) == (4.0, -10.0, 12.5)
     assert (wired.options.port, wired.options.link) == (5020, "tcp")
 
 
@@ -150,9 +153,6 @@ def test_a_port_that_no_user_may_listen_on_is_another_one(tmp_path):
     ("section", "said"),
     [
         ("{kind: simulated_piezo}", "must name a profile"),
-        ("{kind: modbus_dac, profile: labjack_t7, host: h, output: DAC0, input: AIN0,"
-         " amplifier: {gain_v_per_v: 1.0}, sensor: {um_per_v: 1.0}, watchdog: none}",
-         "driven with a current"),
         ("{kind: modbus_dac, profile: labjack_t7, hots: h}", r"x.yaml:1: device.hots: unknown key"),
     ],
 )  # fmt: skip

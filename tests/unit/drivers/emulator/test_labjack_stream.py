@@ -81,10 +81,10 @@ def test_values_are_put_out_one_a_scan_and_the_last_is_repeated(device):
     device.write(4990, u32(1))
     device.wait(0.0021)
     assert device.read(4080) == 127
-    assert device.emulated.rig.current_a == pytest.approx(2.0)
+    assert device.emulated.rig.command == pytest.approx(2.0)
     device.wait(0.010)
     assert device.read(4080) == 128
-    assert device.emulated.rig.current_a == pytest.approx(4.0)
+    assert device.emulated.rig.command == pytest.approx(4.0)
     assert device.data(30)[0] == 12
 
 
@@ -94,7 +94,7 @@ def test_values_wait_for_set_loop(device):
     device.write(4990, u32(1))
     device.wait(0.01)
     assert device.read(4080) == 127
-    assert device.emulated.rig.current_a == pytest.approx(0.0)
+    assert device.emulated.rig.command == pytest.approx(0.0)
 
 
 def test_readings_are_fetched_oldest_first(device):
@@ -154,7 +154,7 @@ def test_a_trip_of_the_watchdog_ends_the_stream(device):
     device.write(4990, u32(1))
     device.wait(5.0)
     assert device.read(4990) == 0
-    assert device.emulated.rig.current_a == pytest.approx(-6.0)
+    assert device.emulated.rig.command == pytest.approx(-6.0)
 
 
 @pytest.fixture(params=["labjack_t7", "labjack_t4"])

@@ -17,7 +17,7 @@ from tests.unit.drivers.emulator.conftest import emulated_modbus
 ])  # fmt: skip
 def test_powers_up_as_its_profile_says(name, output, sensor, more, current_a, value):
     device = emulated_modbus(name, output, sensor, **more)
-    assert device._rig.current_a == pytest.approx(current_a, abs=5e-3)
+    assert device._rig.command == pytest.approx(current_a, abs=5e-3)
     assert device._outputs[output].value == pytest.approx(value, abs=2e-3)
 
 
@@ -26,15 +26,15 @@ def test_trip_that_a_step_clears_keeps_the_command():
     device.write("holding", 0, [16384])
     device._watchdog.armed = device._watchdog.tripped = True
     device._trip(0)
-    assert device._rig.current_a == 0.0
+    assert device._rig.command == 0.0
     assert device._outputs["AO0"].words == [16384]
     with pytest.raises(RejectedRequest):
         device.write("holding", 0, [100])
     device.write("holding", 0x1007, [1])
     assert not device.tripped
-    assert device._rig.current_a == 0.0
+    assert device._rig.command == 0.0
     device.write("holding", 0, [100])
-    assert device._rig.current_a == pytest.approx(100 * 10 / 32767)
+    assert device._rig.command == pytest.approx(100 * 10 / 32767)
 
 
 S = 1_000_000_000

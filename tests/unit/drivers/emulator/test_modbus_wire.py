@@ -21,6 +21,7 @@ from hilctl_drivers.modbus.pdu import (
 )
 from hilctl_drivers.modbus.register_map import RegisterFormat
 from hilctl_drivers.profile import load_profile
+from hilctl_drivers.simulated.devices import SimulatedTerfenol, TerfenolOptions
 from hilctl_drivers.transport.links import RefusedError
 from tests.unit.drivers.emulator.conftest import MS, emulated_modbus
 
@@ -110,9 +111,12 @@ def test_rtu_ignores_others_and_rubbish():
 
 
 def test_units_share_a_line_and_a_rig():
-    bench = Bench(Rig(0), SimulatedWiring(1.0, 0.0, 12.5, 0.0), WriteLog(None, 0))
-    drives = EmulatedModbus(load_profile("adam_4024"), bench, "AO0", None)
-    reads = EmulatedModbus(load_profile("adam_4117"), bench, None, "AI2")
+    profile, reader = load_profile("adam_4024"), load_profile("adam_4117")
+    actuator = SimulatedTerfenol(TerfenolOptions())
+    wiring = SimulatedWiring.spread(profile.outputs["AO0"], reader.inputs["AI2"], actuator)
+    bench = Bench(Rig(0, actuator), wiring, WriteLog(None, 0))
+    drives = EmulatedModbus(profile, bench, "AO0", None)
+    reads = EmulatedModbus(reader, bench, None, "AI2")
     wire = ModbusWire("rtu", {1: drives, 2: reads})
 
     def transact(unit, pdu, now_ns):

@@ -4,12 +4,16 @@ import numpy as np
 import pytest
 
 from hilctl_drivers.emulator.rig import RATE_HZ, Rig, SampleFifo
+from hilctl_drivers.simulated.devices import SimulatedTerfenol, TerfenolOptions
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 from tests.unit.drivers.emulator.conftest import MS
 
+TERFENOL = SimulatedTerfenol(TerfenolOptions())
+QUIET = SimulatedTerfenol(TerfenolOptions(noise=False))
+
 
 def test_is_the_actuator_on_its_own_clock():
-    rig = Rig(5 * MS)
+    rig = Rig(5 * MS, TERFENOL)
     rig.put_out(3.0, 5 * MS)
     shown = []
     for k in range(1, 200):
@@ -24,7 +28,7 @@ def test_is_the_actuator_on_its_own_clock():
 
 
 def test_time_does_not_go_back():
-    rig = Rig(0)
+    rig = Rig(0, TERFENOL)
     rig.put_out(2.0, MS)
     rig.advance(2 * MS)
     before = rig.displacement_um
@@ -34,7 +38,7 @@ def test_time_does_not_go_back():
 
 
 def test_long_silence_costs_no_more_than_settling():
-    rig = Rig(0, noise=False)
+    rig = Rig(0, QUIET)
     rig.put_out(2.0, 0)
     rig.advance(24 * 3600 * 1000 * MS)
     settled = rig.displacement_um
@@ -43,23 +47,23 @@ def test_long_silence_costs_no_more_than_settling():
 
 
 def test_amplifier_saturates():
-    rig = Rig(0)
+    rig = Rig(0, TERFENOL)
     rig.put_out(50.0, 0)
-    assert rig.current_a == 10.0
+    assert rig.command == 10.0
 
 
 class Record:
     """A FIFO at 1 kHz that starts at time 0, and what it put out and read."""
 
     def __init__(self, *, repeats):
-        self.firsts, self.current_a, self.displacement_um = [], [], []
-        self.fifo = SampleFifo(noise=False, repeats=repeats, on_played=self._played)
+        self.firsts, self.commands, self.displacement_um = [], [], []
+        self.fifo = SampleFifo(QUIET, repeats=repeats, on_played=self._played)
         self.fifo.set_rate(1000.0)
         self.fifo.start(0)
 
-    def _played(self, first, current_a, displacement_um, now_ns):
+    def _played(self, first, command, displacement_um, now_ns):
         self.firsts.append(first)
-        self.current_a += current_a.tolist()
+        self.commands += command.tolist()
         self.displacement_um += displacement_um.tolist()
 
 
@@ -73,7 +77,7 @@ def test_each_value_is_put_out_once(repeats):
         record.fifo.advance(now_ms * MS)
         assert record.fifo.level == 60 - now_ms
     assert record.firsts == [0, 3, 4, 11, 30, 31, 59]
-    assert record.current_a == commands.tolist()
+    assert record.commands == commands.tolist()
     assert len(record.displacement_um) == 60
     assert (np.diff(record.displacement_um) > -1e-2).all()
     assert (record.fifo.played, record.fifo.underruns) == (60, 0)
@@ -83,7 +87,7 @@ def test_without_new_values_the_last_is_repeated_and_read():
     record = Record(repeats=True)
     record.fifo.queue(np.array([1.0, 2.0]))
     record.fifo.advance(5 * MS)
-    assert record.current_a == [1.0, 2.0, 2.0, 2.0, 2.0]
+    assert record.commands == [1.0, 2.0, 2.0, 2.0, 2.0]
     assert len(record.displacement_um) == 5
     assert (record.fifo.played, record.fifo.underruns) == (5, 3)
 
@@ -95,7 +99,7 @@ def test_without_new_values_the_output_is_held_and_not_read():
     record.fifo.queue(np.array([3.0]))
     assert record.fifo.due_ns(3) == 6 * MS
     record.fifo.advance(6 * MS)
-    assert record.current_a == [1.0, 2.0, 3.0]
+    assert record.commands == [1.0, 2.0, 3.0]
     assert record.firsts == [0, 2]
     assert (record.fifo.played, record.fifo.underruns) == (3, 3)
 
@@ -107,9 +111,9 @@ def test_a_stop_keeps_the_queue_and_the_output():
     record.fifo.advance(MS)
     record.fifo.stop()
     record.fifo.advance(9 * MS)
-    assert (record.fifo.level, record.fifo.current_a, record.fifo.running) == (1, 1.0, False)
+    assert (record.fifo.level, record.fifo.command, record.fifo.running) == (1, 1.0, False)
     record.fifo.set_rate(2000.0)
     record.fifo.start(10 * MS)
     record.fifo.advance(10 * MS + MS // 2)
     assert record.firsts == [0, 0]
-    assert record.current_a == [1.0, 2.0]
+    assert record.commands == [1.0, 2.0]

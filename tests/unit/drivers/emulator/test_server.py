@@ -141,7 +141,7 @@ def test_what_the_host_does_not_read_waits_for_room(serving):
 def test_late_request_is_carried_out_after_its_host_has_gone(served, tmp_path):
     path = tmp_path / "log.jsonl"
     faults = (parse_fault("late:0.2@1"),)
-    host, port = served("labjack_t7", log=path, faults=faults, current_a=0.0).split(":")
+    host, port = served("labjack_t7", log=path, faults=faults, command=0.0).split(":")
     for value in (3.0, 2.0):
         data = FLOAT32.encode(value)
         with socket.create_connection((host, int(port)), 5.0) as link:

@@ -339,7 +339,7 @@ def test_stream_that_is_started_late_is_stopped_by_the_next_attempt(driven):
     made.device.make_safe(0.0)
     made.time.sleep(60.0)
     made.emulated.device.tick(made.time.now_ns)
-    assert made.emulated.rig.current_a == pytest.approx(0.0, abs=1e-9)
+    assert made.emulated.rig.command == pytest.approx(0.0, abs=1e-9)
     assert not made.clock.running
 
 
@@ -355,7 +355,7 @@ def test_stream_that_was_silent_is_made_safe_when_it_is_back(driven, silence_s):
     made_safe(made.device, 0.0)
     written = [each for each in made.events() if each["event"] == "write"][1:]
     assert 0.0 <= written[0]["monotonic_ns"] * 1e-9 - back_s < 0.2
-    assert made.emulated.rig.current_a == pytest.approx(0.0, abs=1e-9)
+    assert made.emulated.rig.command == pytest.approx(0.0, abs=1e-9)
 
 
 def test_the_watchdog_does_not_count_before_it_is_armed(driven):

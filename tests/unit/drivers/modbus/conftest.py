@@ -79,7 +79,7 @@ def serve(tmp_path):
 
         def start(profile, reader=None, **options):
             clock = ManualClock(0)
-            chosen = EmulatorOptions(profile, reader=reader, log=log, current_a=0.0, **options)
+            chosen = EmulatorOptions(profile, reader=reader, log=log, command=0.0, **options)
             return Served(stack.enter_context(emulated(chosen, clock)), clock, log)
 
         yield start
@@ -116,7 +116,7 @@ class DrivenModbus:
     def current_a(self):
         """What the device puts out, with all delivered that is due."""
         self.link.deliver()
-        return self.emulated.rig.current_a
+        return self.emulated.rig.command
 
     def writes(self):
         return logged(self._log)
