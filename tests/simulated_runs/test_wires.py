@@ -17,7 +17,7 @@ from hilctl.analysis.replay import replay
 from hilctl.recording.reader import read
 from hilctl_drivers.profile import shipped_profiles
 from tests.benchmark.attacked import make_real_time
-from tests.commands import typed
+from tests.commands import hilctl, typed
 
 ROOT = Path(__file__).parents[2]
 MODEL = ROOT / "configs" / "models" / "terfenol_omega.yaml"
@@ -171,3 +171,41 @@ def test_compensated_run_is_complete(tmp_path, name):
         name == "SCPI, measured"
     )
     assert replay(recording).identical
+
+
+PIEZO = {
+    "device.host": "127.0.0.1", "device.timeout_s": 2.0, "device.watchdog": "none",
+    "device.amplifier.gain_v_per_v": 10.0, "device.sensor.um_per_v": 5.0,
+    "sample_rate_hz": 100.0, "limits.drive_v": "[0, 100]", "limits.slew_v_per_s": 1000.0,
+    "limits.stroke_um": "[-5, 48]", "waveform.offset": 40.0, "waveform.amplitude": 40.0,
+    "timing.on_misses": "warn", "timing.max_late_s": 5.0, "timing.hang_s": 5.0,
+}  # fmt: skip
+
+
+@pytest.mark.slow
+def test_a_piezo_is_rehearsed(tmp_path):
+    """From ``init`` to a recording that agrees with the emulated device's log."""
+    path, log, output = (tmp_path / name for name in ("rig.yaml", "log.jsonl", "run.mcap"))
+    settings = [word for pair in PIEZO.items() for word in ("--set", "{}={}".format(*pair))]
+    hilctl("init", "labjack_t8", "--unit", "V", "--output", path, *settings)
+    command = typed("emulate", path, "--log", log, "--json")
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=tmp_path) as process:
+        try:
+            assert process.stdout is not None
+            make_real_time(process.pid)
+            arguments = json.loads(process.stdout.readline())["arguments"]
+            hilctl(*arguments, "--output", output)
+        finally:
+            process.terminate()
+    recording = read(output)
+    assert recording.end["code"] == "completed"
+    command_v, displacement_um = recording.samples.command, recording.samples.displacement_um
+    entries = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()]
+    put_out = np.array([each["drive_v"] for each in entries])
+    # Opening the device may repeat the present output.
+    assert any(
+        np.allclose(put_out[first : first + command_v.size], command_v, atol=2e-3)
+        for first in range(4)
+    )
+    # 80 % of 50 um at 100 V, and less than proportionally at 80 V.
+    assert (command_v.max(), displacement_um.max()) == pytest.approx((80.0, 31.2), abs=0.3)

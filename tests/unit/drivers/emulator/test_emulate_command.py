@@ -125,6 +125,47 @@ def test_it_has_the_wiring_of_the_experiment():
     assert (wired.options.port, wired.options.link) == (5020, "tcp")
 
 
+T8_PIEZO = """\
+device:
+  kind: modbus_dac
+  profile: labjack_t8
+  host: 127.0.0.1
+  output: DAC0
+  input: AIN0
+  amplifier: {gain_v_per_v: 10.0}
+  sensor: {um_per_v: 5.0}
+  watchdog: none
+"""
+
+
+def test_an_experiment_in_volts_has_a_piezo(ended_at_once, tmp_path):
+    path, log = tmp_path / "piezo.yaml", tmp_path / "log.jsonl"
+    path.write_text(T8_PIEZO)
+    command = ["emulate", str(path), "--json", "--actuator", "seed=7", "--current-a", "30"]
+    said = json.loads(CliRunner().invoke(app, [*command, "--log", str(log)]).stdout)
+    assert said["wiring"] == {
+        "output": "DAC0", "input": "AIN0",
+        "gain_v": 10.0, "offset_v": 0.0, "sensor_um": 5.0, "offset_um": 0.0,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("words", "key"),
+    [
+        (["--actuator", "physics=domains"], "physics"),
+        (["--actuator", "fault.kind=refused", "--actuator", "output_at_open=1"], "output_at_open"),
+        (["--actuator", "seed"], "--actuator seed"),
+        (["--unit", "V"], "--unit"),
+    ],
+)
+def test_options_that_do_not_fit_are_refused(tmp_path, words, key):
+    path = tmp_path / "piezo.yaml"
+    path.write_text(T8_PIEZO)
+    ended = CliRunner().invoke(app, ["emulate", str(path), *words])
+    assert ended.exit_code != 0
+    assert key in str(ended.exception)
+
+
 def test_a_reader_has_its_own_place():
     options = wired_experiment(CONFIGS / "modbus_adam_6224.yaml").options
     assert (options.reader, options.reader_line, options.reader_port) == ("adam_6217", "own", 5021)

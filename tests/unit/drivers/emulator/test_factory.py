@@ -4,6 +4,45 @@ import pytest
 
 from hilctl.base.errors import InputError
 from hilctl_drivers.emulator.options import WireFault
+from hilctl_drivers.modbus.modbus_profile import ModbusProfile
+from hilctl_drivers.profile import load_profile, shipped_profiles
+from hilctl_drivers.signal_chain import Amplifier, Sensor
+from hilctl_drivers.simulated.devices import PiezoOptions, TerfenolOptions
+from tests.unit.drivers.emulator.conftest import MS
+
+DRIVING = [name for name in shipped_profiles() if load_profile(name).outputs]
+
+
+@pytest.mark.parametrize("name", DRIVING)
+@pytest.mark.parametrize("actuator", [TerfenolOptions(), PiezoOptions()])
+def test_every_profile_drives_every_actuator(emulate, name, actuator):
+    profile, reader = load_profile(name), None
+    if not any(
+        getattr(each, "measures", "terminal") == "terminal" for each in profile.inputs.values()
+    ):
+        reader = "adam_4117" if isinstance(profile, ModbusProfile) else "agilent_34970a"
+    in_a = next(iter(profile.outputs.values())).unit == "A"
+    if in_a and isinstance(actuator, PiezoOptions):
+        with pytest.raises(InputError, match="use --unit A"):
+            emulate(name, reader=reader, actuator=actuator)
+        return
+    made = emulate(name, reader=reader, actuator=actuator).emulator
+    info, low, high = made.actuator.info, *made.device.wiring.command_range
+    assert (low, high) == pytest.approx((info.command_min, info.command_max))
+
+
+@pytest.mark.parametrize(
+    ("gain", "offset_v", "um_per_v", "low_v", "high_v"),
+    [(15.0, 0.0, 2.0, -1.5, 150.0), (-20.0, 100.0, -4.0, -100.0, 102.0)],
+)
+def test_a_piezo_is_scaled_to_its_wiring(emulate, gain, offset_v, um_per_v, low_v, high_v):
+    wiring = Amplifier(gain_v_per_v=gain, offset_v=offset_v), Sensor(um_per_v=um_per_v)
+    made = emulate("labjack_t8", actuator=PiezoOptions(noise=False), wiring=wiring, command=0.0)
+    info, rig = made.emulator.actuator.info, made.device._rig
+    assert (info.command_min, info.command_max) == (low_v, high_v)
+    rig.put_out(high_v, made.now_ns)
+    rig.advance(made.now_ns + 10 * MS)
+    assert rig.displacement_um == pytest.approx(0.8 * 10.0 * abs(um_per_v), rel=0.01)
 
 
 def test_port_in_use_is_one_line(served):
