@@ -299,7 +299,7 @@ class _DifferentialLoop(_ShapeSearch):
 
         def run(v: F64) -> F64:
             z = np.empty_like(v)
-            implicit_forward(BOUC_WEN, v, (first, NOTHING, NOTHING), rest_memory(1), z)
+            implicit_forward(v, BOUC_WEN, (first, NOTHING, NOTHING), rest_memory(1), z)
             return np.stack([v, steepest * v - z], axis=1)
 
         columns = self.data.stack(run)

@@ -218,6 +218,64 @@ def integrated_inverse(
         memory[thresholds.size] = x
 
 
+@kernel(
+    "void(float64[::1], float64, float64, float64[::1], float64[::1], float64, float64,"
+    " float64[::1], float64[::1], float64[::1], float64[::1], float64[::1], float64[::1])"
+)
+def butterfly_forward(
+    v: F64,
+    rate_gain: float,
+    direct: float,
+    thresholds: F64,
+    weights: F64,
+    bias: float,
+    slope: float,
+    d_up: F64,
+    g_up: F64,
+    d_down: F64,
+    g_down: F64,
+    memory: F64,
+    out: F64,
+) -> None:
+    """Run S(|Pi[v] + bias|): plays, then an even function.
+
+    Args as for :func:`play_sum` and :func:`deadband_value`; ``v`` and ``out`` are float64[n].
+    """
+    play_sum(v, rate_gain, direct, thresholds, weights, memory, out)
+    for k in range(v.size):
+        out[k] = deadband_value(abs(out[k] + bias), slope, d_up, g_up, d_down, g_down)
+
+
+@kernel(
+    "void(float64[::1], float64, float64[::1], float64[::1], float64[::1], float64[::1], float64,"
+    " float64, float64, float64, float64[::1], float64[::1], float64[::1], float64[::1])"
+)
+def butterfly_inverse(
+    y: F64,
+    slope: float,
+    d_up: F64,
+    g_up: F64,
+    d_down: F64,
+    g_down: F64,
+    wing: float,
+    bias: float,
+    rate_gain: float,
+    direct: float,
+    thresholds: F64,
+    weights: F64,
+    memory: F64,
+    out: F64,
+) -> None:
+    """Run the inverse of :func:`butterfly_forward` on one wing, 1.0 or -1.0; y < 0 counts as 0.
+
+    The parameters are those of the inverse operators; ``y`` and ``out`` are float64[n].
+    """
+    for k in range(y.size):
+        above = max(y[k], 0.0)
+        out[k] = deadband_value(above, slope, d_up, g_up, d_down, g_down) * wing - bias
+    play_sum(out, rate_gain, direct, thresholds, weights, memory, out)
+
+
 def rest_memory(operators: int) -> F64:
     """Return the memory of a number of operators at rest: float64[operators + 1]."""
     memory = np.zeros(operators + 1)

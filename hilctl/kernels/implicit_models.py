@@ -143,8 +143,8 @@ def _settle(kind: int, v: float, memory: F64, arrays: Arrays) -> None:
     memory[memory.size - 1] = v
 
 
-@kernel("void(int64, float64[::1], UniTuple(float64[::1], 3), float64[::1], float64[::1])")
-def implicit_forward(kind: int, v: F64, arrays: Arrays, memory: F64, out: F64) -> None:
+@kernel("void(float64[::1], int64, UniTuple(float64[::1], 3), float64[::1], float64[::1])")
+def implicit_forward(v: F64, kind: int, arrays: Arrays, memory: F64, out: F64) -> None:
     """Run a model; see the module's docstring for its number, arrays and memory.
 
     ``v`` is float64[n], the command; ``out`` is float64[n], the displacement in um.
@@ -217,15 +217,15 @@ def _root(
 
 
 @kernel(
-    "void(int64, float64[::1], UniTuple(float64, 2), float64, UniTuple(float64[::1], 3),"
+    "void(float64[::1], int64, UniTuple(float64[::1], 3), UniTuple(float64, 2), float64,"
     " float64[::1], float64[::1])"
 )
 def implicit_inverse(
-    kind: int,
     y: F64,
+    kind: int,
+    arrays: Arrays,
     span: tuple[float, float],
     tolerance: float,
-    arrays: Arrays,
     memory: F64,
     out: F64,
 ) -> None:

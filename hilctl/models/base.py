@@ -12,9 +12,6 @@ from hilctl.base.types import F64, CommandUnit
 from hilctl.kernels.hysteresis import rest_memory
 from hilctl.kernels.jit import compiled
 
-BlockKernel: TypeAlias = Callable[[F64, F64, F64], None]
-"""A kernel with its parameters bound: (input[n], memory, output[n])."""
-
 MAX_OPERATORS = 10_000
 """Largest number of operators of a model: more would take milliseconds per sample."""
 
@@ -28,7 +25,8 @@ class Operator:
     The results have the same bits for any division into blocks.
 
     Args:
-        kernel: Bound kernel, see :data:`BlockKernel`.
+        kernel: Called with input, float64[n], parameters, memory and output, float64[n].
+        parameters: Parameters between input and memory.
         operators: Number of operators with memory.
         input_offset: Added to the input first.
         output_offset: Added to the output last.
@@ -36,7 +34,8 @@ class Operator:
 
     def __init__(
         self,
-        kernel: BlockKernel,
+        kernel: Callable[..., None],
+        parameters: tuple[Any, ...],
         operators: int,
         *,
         input_offset: float = 0.0,
@@ -44,37 +43,13 @@ class Operator:
     ) -> None:
         self.preview = 0
         """Samples by which the input must run ahead of the output; more for some inverses."""
-        self._kernel = kernel
+        self.kernel = kernel
+        self.parameters = parameters
+        self.input_offset = input_offset
+        self.output_offset = output_offset
+        self._process = compiled(kernel)
         self._rest = rest_memory(operators)
         self._memory = self._rest.copy()
-        self._input_offset = input_offset
-        self._output_offset = output_offset
-
-    @classmethod
-    def bound(
-        cls,
-        kernel: Callable[..., None],
-        parameters: tuple[Any, ...],
-        operators: int,
-        *,
-        input_offset: float = 0.0,
-        output_offset: float = 0.0,
-    ) -> "Operator":
-        """Return an operator from a kernel and its parameters.
-
-        Args:
-            kernel: Called with input, parameters, memory and output.
-            parameters: Parameters between input and memory.
-            operators: Number of operators with memory.
-            input_offset: Added to the input first.
-            output_offset: Added to the output last.
-        """
-        process = compiled(kernel)
-
-        def run(block: F64, memory: F64, out: F64) -> None:
-            process(block, *parameters, memory, out)
-
-        return cls(run, operators, input_offset=input_offset, output_offset=output_offset)
 
     def process(self, block: F64, out: F64 | None = None) -> F64:
         """Process one block and update the memory.
@@ -88,13 +63,13 @@ class Operator:
         """
         if out is None:
             out = np.empty_like(block)
-        if self._input_offset != 0.0:
-            block = block + self._input_offset
+        if self.input_offset != 0.0:
+            block = block + self.input_offset
         elif not block.flags.writeable:
             block = block.copy()  # the kernels reject read-only arrays
-        self._kernel(block, self._memory, out)
-        if self._output_offset != 0.0:
-            out += self._output_offset
+        self._process(block, *self.parameters, self._memory, out)
+        if self.output_offset != 0.0:
+            out += self.output_offset
         return out
 
     def state(self, out: F64 | None = None) -> F64:

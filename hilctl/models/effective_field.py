@@ -161,9 +161,9 @@ class FieldModel(HysteresisModel):
     def forward(self, sample_rate_hz: float) -> Operator:
         """Return the operator from command to um, at rest."""
         parameters, size = self._parameters(sample_rate_hz), self._numbers()
-        return Operator.bound(field_forward, parameters, size, output_offset=self.output_offset_um)
+        return Operator(field_forward, parameters, size, output_offset=self.output_offset_um)
 
     def inverse(self, sample_rate_hz: float) -> Operator:
         """Return the operator from um to command, at rest."""
         parameters, size = self._parameters(sample_rate_hz), self._numbers()
-        return Operator.bound(field_inverse, parameters, size, input_offset=-self.output_offset_um)
+        return Operator(field_inverse, parameters, size, input_offset=-self.output_offset_um)

@@ -97,16 +97,12 @@ class GeneralisedDuhemModel(HysteresisModel):
     def forward(self, sample_rate_hz: float) -> Operator:
         """Return the operator from command to um, at rest."""
         parameters = self._band(), self._losses(sample_rate_hz)
-        return Operator.bound(
-            duhem_forward, parameters, _NUMBERS, output_offset=self.output_offset_um
-        )
+        return Operator(duhem_forward, parameters, _NUMBERS, output_offset=self.output_offset_um)
 
     def inverse(self, sample_rate_hz: float) -> Operator:
         """Return the operator from um to command, at rest."""
         parameters = self._band(), self._losses(sample_rate_hz)
-        return Operator.bound(
-            duhem_inverse, parameters, _NUMBERS, input_offset=-self.output_offset_um
-        )
+        return Operator(duhem_inverse, parameters, _NUMBERS, input_offset=-self.output_offset_um)
 
 
 def band_of(slopes: F64, lines: F64, lowest_um: float, cell_um: float, half_width: float) -> Band:

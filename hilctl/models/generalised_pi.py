@@ -80,7 +80,7 @@ class GeneralisedModel(BoundedInputModel):
         del sample_rate_hz
         plays = self.direct, np.array(self.thresholds), np.array(self.weights)
         parameters = (self.rising.array(), self.falling.array(), *plays)
-        return Operator.bound(
+        return Operator(
             envelope_forward, parameters, self.operators, output_offset=self.output_offset_um
         )
 
@@ -92,6 +92,6 @@ class GeneralisedModel(BoundedInputModel):
         )
         envelopes = self.rising.array(), self.falling.array(), *self.command_span
         parameters = (*envelopes, direct, thresholds, weights)
-        return Operator.bound(
+        return Operator(
             envelope_inverse, parameters, self.operators, input_offset=-self.output_offset_um
         )

@@ -65,22 +65,17 @@ class ImplicitModel(BoundedInputModel):
     def forward(self, sample_rate_hz: float) -> Operator:
         """Return the operator from command to um, at rest; independent of the rate."""
         del sample_rate_hz
-        kind, arrays = self.packed()
-
-        def run(v: F64, memory: F64, out: F64) -> None:
-            implicit_forward(kind, v, arrays, memory, out)
-
-        return Operator(run, self.operators, output_offset=self.output_offset_um)
+        return Operator(
+            implicit_forward, self.packed(), self.operators, output_offset=self.output_offset_um
+        )
 
     def inverse(self, sample_rate_hz: float) -> Operator:
         """Return the operator from um to command, at rest."""
         del sample_rate_hz
-        (kind, arrays), span = self.packed(), self.command_span
-
-        def run(y: F64, memory: F64, out: F64) -> None:
-            implicit_inverse(kind, y, span, TOLERANCE_UM, arrays, memory, out)
-
-        return Operator(run, self.operators, input_offset=-self.output_offset_um)
+        parameters = (*self.packed(), self.command_span, TOLERANCE_UM)
+        return Operator(
+            implicit_inverse, parameters, self.operators, input_offset=-self.output_offset_um
+        )
 
 
 NOTHING = np.zeros(1)

@@ -10,10 +10,11 @@ from hilctl.base.errors import ModelError
 from hilctl.base.strict import CheckedModel, ValidationError
 from hilctl.base.types import F64
 from hilctl.kernels.hysteresis import (
+    butterfly_forward,
+    butterfly_inverse,
     deadband_block,
     integrated_forward,
     integrated_inverse,
-    play_sum,
 )
 from hilctl.models.base import Operator, Thresholds, Weights, length_problems, threshold_problems
 from hilctl.models.plays import RateDependentPlays
@@ -120,7 +121,7 @@ class IntegratedModel(RateDependentPlays):
         rate_gain = self.threshold_growth_s * sample_rate_hz
         plays = (rate_gain, self.direct, np.array(self.thresholds), np.array(self.weights))
         parameters = (*plays, *self.deadband.arrays())
-        return Operator.bound(
+        return Operator(
             integrated_forward, parameters, self.operators, output_offset=self.output_offset_um
         )
 
@@ -129,7 +130,7 @@ class IntegratedModel(RateDependentPlays):
         direct, weights, thresholds = self.inverse_parameters()
         rate_gain = self.inverse_rate_gain(sample_rate_hz)
         parameters = (*self.deadband.inverse().arrays(), rate_gain, direct, thresholds, weights)
-        return Operator.bound(
+        return Operator(
             integrated_inverse, parameters, self.operators, input_offset=-self.output_offset_um
         )
 
@@ -215,15 +216,10 @@ class ButterflyModel(RateDependentPlays):
         """Return the operator from command to um, at rest."""
         weights, thresholds = np.array(self.weights), np.array(self.thresholds)
         rate_gain, direct = self.threshold_growth_s * sample_rate_hz, self.direct
-        shape, bias = self.shape.arrays(), self.bias
-
-        def run(v: F64, memory: F64, out: F64) -> None:
-            play_sum(v, rate_gain, direct, thresholds, weights, memory, out)
-            out += bias
-            np.abs(out, out=out)
-            deadband_block(out, *shape, out)
-
-        return Operator(run, self.operators, output_offset=self.output_offset_um)
+        parameters = (rate_gain, direct, thresholds, weights, self.bias, *self.shape.arrays())
+        return Operator(
+            butterfly_forward, parameters, self.operators, output_offset=self.output_offset_um
+        )
 
     def inverse(self, sample_rate_hz: float) -> Operator:
         """Return the operator from um to command, at rest, on one wing of the butterfly.
@@ -243,13 +239,6 @@ class ButterflyModel(RateDependentPlays):
             )
         direct, weights, thresholds = self.inverse_parameters()
         rate_gain = self.inverse_rate_gain(sample_rate_hz)
-        shape, wing, bias = self.shape.inverse().arrays(), self.wing, self.bias
-
-        def run(y: F64, memory: F64, out: F64) -> None:
-            np.maximum(y, 0.0, out=out)
-            deadband_block(out, *shape, out)
-            out *= wing
-            out -= bias
-            play_sum(out, rate_gain, direct, thresholds, weights, memory, out)
-
-        return Operator(run, self.operators, input_offset=-turning_um)
+        shape = self.shape.inverse().arrays()
+        parameters = (*shape, self.wing, self.bias, rate_gain, direct, thresholds, weights)
+        return Operator(butterfly_inverse, parameters, self.operators, input_offset=-turning_um)

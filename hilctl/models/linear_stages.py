@@ -41,40 +41,40 @@ class Chain(Operator):
     ) -> None:
         rest = np.concatenate([stage.state() for stage in stages])
         super().__init__(
-            self._run, rest.size - 1, input_offset=input_offset, output_offset=output_offset
+            self._run, (), rest.size - 1, input_offset=input_offset, output_offset=output_offset
         )
         self.preview = preview
         self._rest = rest
-        self._stages = tuple(stages)
+        self.stages = tuple(stages)
         self.keep_in(self._memory)
 
     def keep_in(self, memory: F64) -> None:
         """Move the memory, including that of each stage, into a given array."""
         super().keep_in(memory)
         start = 0
-        for stage in self._stages:
+        for stage in self.stages:
             stop = start + stage.state().size
             stage.keep_in(memory[start:stop])
             start = stop
 
     def stand(self, seconds: float) -> None:
         """Let time pass at constant input."""
-        for stage in self._stages:
+        for stage in self.stages:
             stage.stand(seconds)
 
     def _run(self, block: F64, memory: F64, out: F64) -> None:
-        for stage in self._stages:
+        for stage in self.stages:
             block = stage.process(block, out)
 
 
 def delayed(samples: int) -> Operator:
     """Return an operator that delays a signal by a number of samples, >= 1."""
-    return Operator(delay_block, samples)
+    return Operator(delay_block, (), samples)
 
 
 def between(part: float) -> Operator:
     """Return an operator that interpolates: ``part`` of the way from the previous sample."""
-    return Operator.bound(between_block, (part,), 0)
+    return Operator(between_block, (part,), 0)
 
 
 def smoothing_weights(
@@ -148,11 +148,8 @@ class _CreepOperator(Operator):
         self, creep: CreepModel, kernel: Callable[..., None], sample_rate_hz: float, rest_um: float
     ) -> None:
         parameters = np.concatenate(creep.over(1.0 / sample_rate_hz))
-
-        def run(block: F64, memory: F64, out: F64) -> None:
-            kernel(block, parameters, memory, out)
-
-        super().__init__(run, len(creep.shares), input_offset=-rest_um, output_offset=rest_um)
+        size = len(creep.shares)
+        super().__init__(kernel, (parameters,), size, input_offset=-rest_um, output_offset=rest_um)
         self._creep = creep
 
     def stand(self, seconds: float) -> None:
@@ -178,7 +175,7 @@ class FirstMode(StrictModel):
 
     def forward(self, sample_rate_hz: float) -> Operator:
         """Return the structure, exact for an x that changes linearly between samples."""
-        return Operator.bound(structure_block, (self.motion(sample_rate_hz),), 2)
+        return Operator(structure_block, (self.motion(sample_rate_hz),), 2)
 
     @property
     def radian_s(self) -> float:
@@ -232,7 +229,7 @@ class FurtherMode(StrictModel):
         Raises:
             ModelError: A frequency is too low for the sample rate.
         """
-        return Operator.bound(mode_block, (self._parameters(sample_rate_hz),), 2)
+        return Operator(mode_block, (self._parameters(sample_rate_hz),), 2)
 
     def inverse(self, sample_rate_hz: float) -> Operator:
         """Return the exact inverse; raise ModelError if it is unstable at this sample rate."""
@@ -243,7 +240,7 @@ class FurtherMode(StrictModel):
                 f"{self.antiresonance_hz:g} Hz has no inverse at {sample_rate_hz:g} samples per "
                 "second: use a higher rate, or remove the mode"
             )
-        return Operator.bound(unmode_block, (parameters,), 2)
+        return Operator(unmode_block, (parameters,), 2)
 
     def response(self, frequency_hz: F64) -> C128:
         """Return the frequency response: complex128[n]."""

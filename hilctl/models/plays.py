@@ -85,13 +85,13 @@ class PlayModel(HysteresisModel):
         """Return the operator from command to um, at rest."""
         rate_gain = self.threshold_growth_s * sample_rate_hz
         plays = (rate_gain, self.direct, np.array(self.thresholds), np.array(self.weights))
-        return Operator.bound(play_sum, plays, self.operators, output_offset=self.output_offset_um)
+        return Operator(play_sum, plays, self.operators, output_offset=self.output_offset_um)
 
     def inverse(self, sample_rate_hz: float) -> Operator:
         """Return the operator from um to command, at rest."""
         direct, weights, thresholds = self.inverse_parameters()
         plays = (self.inverse_rate_gain(sample_rate_hz), direct, thresholds, weights)
-        return Operator.bound(play_sum, plays, self.operators, input_offset=-self.output_offset_um)
+        return Operator(play_sum, plays, self.operators, input_offset=-self.output_offset_um)
 
 
 class PpiModel(PlayModel):
@@ -152,4 +152,4 @@ class SpiModel(PlayModel):
         del sample_rate_hz
         direct, weights, thresholds = self.stop_parameters()
         stops = (direct, thresholds, weights)
-        return Operator.bound(stop_sum, stops, weights.size, input_offset=-self.output_offset_um)
+        return Operator(stop_sum, stops, weights.size, input_offset=-self.output_offset_um)

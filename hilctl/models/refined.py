@@ -157,9 +157,7 @@ class ResidualOperator(CheckedModel):
     ) -> Operator:
         tables, window = self.tables(sample_rate_hz)
         numbers = self.operators + window + 2
-        return Operator.bound(
-            kernel, (tables,), numbers, input_offset=-rest_um, output_offset=rest_um
-        )
+        return Operator(kernel, (tables,), numbers, input_offset=-rest_um, output_offset=rest_um)
 
     def tables(self, sample_rate_hz: float) -> tuple[Tables, int]:
         """Return the tables of the kernels, and the window in samples."""

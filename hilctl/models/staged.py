@@ -65,12 +65,12 @@ class FieldLag(StrictModel):
     def forward(self, sample_rate_hz: float) -> Operator:
         """Return the lag, exact for piecewise constant commands, with a delay of one sample."""
         periods = 1.0 / (sample_rate_hz * self.tau_s)
-        return Operator.bound(lag_block, (periods, self.growth_per_unit), 1)
+        return Operator(lag_block, (periods, self.growth_per_unit), 1)
 
     def inverse(self, sample_rate_hz: float) -> Operator:
         """Return the lead, exact within the speed of the lag, with a preview of one sample."""
         periods = 1.0 / (sample_rate_hz * self.tau_s)
-        lead = Operator.bound(lead_block, (periods, self.growth_per_unit), 1)
+        lead = Operator(lead_block, (periods, self.growth_per_unit), 1)
         lead.preview = 1
         return lead
 
@@ -167,7 +167,7 @@ class StagedModel(HysteresisModel):
         radian = radian_s * sample_rate_hz
         width = max(self.smoothing_s * sample_rate_hz, radian)
         weights, ahead = smoothing_weights(width, 2.0 * damping * radian, radian**2)
-        inverse = Operator.bound(weigh_block, (weights,), weights.size - 1)
+        inverse = Operator(weigh_block, (weights,), weights.size - 1)
         inverse.preview = ahead
         return inverse
 

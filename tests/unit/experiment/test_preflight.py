@@ -71,7 +71,7 @@ class BrokenModel(HysteresisModel):
                 out[self.at - first] = self.bad
             memory[0] += x.size
 
-        return Operator(run, self.operators)
+        return Operator(run, (), self.operators)
 
 
 def loaded(text, *settings, model=None, **info):
@@ -372,13 +372,13 @@ class Offset(HysteresisModel):
         def run(x, memory, out):
             out[:] = np.arange(x.size)
 
-        return Operator(run, self.operators)
+        return Operator(run, (), self.operators)
 
     def inverse(self, sample_rate_hz):
         def run(x, memory, out):
             out[:] = x + 3.0 + memory[0]
 
-        return Operator(run, self.operators)
+        return Operator(run, (), self.operators)
 
 
 FAST = ("limits.slew_a_per_s=400.0", "waveform.frequency_hz=20.0", "waveform.amplitude=3.5")
