@@ -5,7 +5,6 @@ sampling of its period, together with the cycle it was learned for; it is reject
 waveform, sample rate or model.
 """
 
-import hashlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
@@ -20,7 +19,7 @@ from hilctl.base.strict import Field, StrictModel, model_validator
 from hilctl.base.types import C128, CHUNK, F64, I64
 from hilctl.base.yaml import dump, load_document
 from hilctl.models.base import HysteresisModel
-from hilctl.models.model_file import dump_model
+from hilctl.models.model_file import model_sha256
 from hilctl.waveforms.build import Reference
 
 PHASES = 64  # points of a cycle that identify a waveform
@@ -176,11 +175,6 @@ def envelope(segment: Segment, index: I64) -> F64:
 
 def _alike(a: float, b: float) -> bool:
     return abs(a - b) <= _SAME_PERIOD * abs(b)
-
-
-def model_sha256(model: HysteresisModel | None) -> str:
-    """Return the digest of a compensator's model; empty without one."""
-    return hashlib.sha256(dump_model(model).encode()).hexdigest() if model else ""
 
 
 def load_correction(path: Path, files: TextFiles | None = None) -> Correction:

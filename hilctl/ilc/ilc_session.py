@@ -19,7 +19,6 @@ from hilctl.experiment.correction import (
     Correction,
     LearnedCycle,
     fits,
-    model_sha256,
     signature,
     write_correction,
 )
@@ -27,6 +26,7 @@ from hilctl.experiment.preflight import CheckedExperiment
 from hilctl.ilc.cycle import cycle_error, harmonic_count
 from hilctl.ilc.results import IlcResult, IlcRow, row_of
 from hilctl.ilc.update import IlcState, learn, refused
+from hilctl.models.model_file import model_sha256
 from hilctl.recording.reader import read
 from hilctl.run.result import RunResult
 from hilctl.run.start import StepStoppedError, checked_experiment, paced

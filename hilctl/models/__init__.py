@@ -10,4 +10,6 @@ linear_stages.py  chains, delays, smoothing, structure, creep
 staged.py         hysteresis between linear stages
 refined.py        a model and its identified residual
 model_file.py     model files
+model_export.py   models as one C or MATLAB function
+kernel_translation.py  kernels in C and MATLAB
 """

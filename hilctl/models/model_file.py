@@ -1,5 +1,6 @@
 """Read and write model files."""
 
+import hashlib
 from pathlib import Path
 from typing import Annotated, TypeAlias
 
@@ -37,3 +38,8 @@ def dump_model(model: HysteresisModel) -> str:
     """Return a model as YAML; reading it back gives the same model, bit for bit."""
     mapping = {"model": {"kind": getattr(model, "kind"), **model.to_mapping()}}  # noqa: B009
     return dump(mapping)
+
+
+def model_sha256(model: HysteresisModel | None) -> str:
+    """Return the digest of a model as its file would be; empty without a model."""
+    return hashlib.sha256(dump_model(model).encode()).hexdigest() if model else ""

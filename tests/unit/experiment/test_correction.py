@@ -12,9 +12,9 @@ from hilctl.experiment.correction import (
     envelope,
     evaluate,
     load_correction,
-    model_sha256,
     signature,
 )
+from hilctl.models.model_file import model_sha256
 from hilctl.waveforms.build import build
 from hilctl.waveforms.spec import Sequence, Sine
 from tests.published import terfenol_rdpi

@@ -13,12 +13,13 @@ from hilctl.base.errors import ConfigError, DataError
 from hilctl.base.yaml import Document
 from hilctl.experiment import preflight as module
 from hilctl.experiment.coil_heat import RunHeat
-from hilctl.experiment.correction import Correction, LearnedCycle, model_sha256, signature
+from hilctl.experiment.correction import Correction, LearnedCycle, signature
 from hilctl.experiment.device_state import InitialState
 from hilctl.experiment.file import CompensatorConfig
 from hilctl.experiment.load import resolve
 from hilctl.experiment.preflight import check, command_problems
 from hilctl.models.base import HysteresisModel, IdentifiedRange, Operator, Provenance
+from hilctl.models.model_file import model_sha256
 from hilctl.models.plays import RdpiModel
 from tests.fakes import DESCRIBED, DescribedDevice
 from tests.published import piezo_ppi, terfenol_rdpi

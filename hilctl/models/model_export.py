@@ -1,0 +1,235 @@
+"""Export the inverse of a model, or the model, as one function in a C or MATLAB file."""
+
+import re
+import textwrap
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hilctl import __version__
+from hilctl.base.errors import InputError
+from hilctl.models.base import HysteresisModel, Operator
+from hilctl.models.kernel_translation import MatlabTranslator, Translator
+from hilctl.models.linear_stages import Chain
+from hilctl.models.model_file import model_sha256
+
+_LONGEST_NAME = 48
+_WIDTH = 96
+
+
+def export_text(
+    model: HysteresisModel, output: Path, sample_rate_hz: float, *, forward: bool = False
+) -> str:
+    """Return the text of a file with a function of its name, whose state is an array.
+
+    Args:
+        model: The model.
+        output: Name of the file; ``.c`` or ``.m`` selects the language.
+        sample_rate_hz: Samples per second.
+        forward: Export the model instead of its inverse.
+
+    Raises:
+        InputError: The name of the file or the sample rate is invalid.
+        ModelError: The model has no inverse at this sample rate.
+    """
+    form = {".c": _CFile, ".m": _MatlabFile}.get(output.suffix)
+    problems = []
+    if form is None:
+        problems.append("must end in .c or .m")
+    if not re.fullmatch(rf"[A-Za-z]\w{{0,{_LONGEST_NAME - 1}}}", output.stem, re.ASCII):
+        problems.append(
+            f"must have a name of letters, digits and underscores, {_LONGEST_NAME} at most, the "
+            "first a letter, because the function has that name"
+        )
+    if not 0.0 < sample_rate_hz < np.inf:
+        problems.append(f"the sample rate must be > 0 Hz: {sample_rate_hz!r}")
+    if problems or form is None:
+        raise InputError(f"{output}: {'; '.join(problems)}")
+    operator = model.forward(sample_rate_hz) if forward else model.inverse(sample_rate_hz)
+    names = f"command_{model.input_unit.lower()}", "displacement_um"
+    source, target = names if forward else ("reference_um", names[0])
+    facts = _facts(model, operator, sample_rate_hz, forward=forward)
+    return form(output.stem, source, target).text(operator, list(facts))
+
+
+def _facts(
+    model: HysteresisModel, operator: Operator, sample_rate_hz: float, *, forward: bool
+) -> Iterator[str]:
+    """Yield the lines of the comment that both languages have in common."""
+    unit, known = model.input_unit, model.provenance.identified_range
+    units = f"command in {unit} to displacement in um"
+    if not forward:
+        units = f"displacement in um to command in {unit}"
+    yield f"{'Model' if forward else 'Inverse'} of hysteresis: {units}."
+    yield ""
+    yield f"model:        {getattr(model, 'kind')}, sha256 {model_sha256(model)}"  # noqa: B009
+    yield f"sample rate:  {sample_rate_hz:g} Hz; valid for no other rate"
+    for name, limits, of in (
+        ("displacement", model.output_range_um, "um"),
+        ("command", model.input_range, unit),
+    ):
+        text = f"{limits[0]:g} to {limits[1]:g} {of}" if limits else "range unknown"
+        yield f"{name + ':':13} {text}"
+    if known is not None:
+        spans = (known.peak_to_peak_um, "um peak to peak"), (known.frequency_hz, "Hz")
+        texts = [f"{low:g} to {high:g} {of}" for (low, high), of in spans]
+        yield f"identified:   {', '.join(texts)}, up to {known.speed_um_per_s:g} um/s"
+    if operator.preview:
+        lead = f"{operator.preview} samples"
+        yield f"preview:      {lead}; the command is that of the reference {lead} before"
+    yield f"written by:   hilctl {__version__}"
+    yield ""
+    if not forward:
+        yield "The command is not limited. Limit it to the range and the slew of the actuator."
+
+
+def _steps(operator: Operator) -> Iterator[Operator | float]:
+    """Yield the offsets and the operators of an operator, in the order of their use."""
+    if operator.input_offset:
+        yield operator.input_offset
+    if isinstance(operator, Chain):
+        for stage in operator.stages:
+            yield from _steps(stage)
+    else:
+        yield operator
+    if operator.output_offset:
+        yield operator.output_offset
+
+
+class _CFile:
+    """A C file with the function ``name``, and ``name_reset`` for its memory."""
+
+    def __init__(self, name: str, source: str, target: str) -> None:
+        self.name, self.source, self.target = name, source, target
+        self.translator: Translator = self._translator()
+        self.constants: list[str] = []
+        self.lines: list[str] = []
+
+    _translator = Translator
+
+    def text(self, operator: Operator, facts: list[str]) -> str:
+        """Return the file."""
+        at = 0
+        for step in _steps(operator):
+            if isinstance(step, Operator):
+                size = step.state().size
+                kernel = self.translator.add(step.kernel)
+                *types, _, _ = kernel.arguments.values()
+                values = zip(step.parameters, types[1:], strict=True)
+                self._call(kernel.name, [self._argument(*each) for each in values], at, size)
+                at += size
+            else:
+                self._add(self.translator.literal(step))
+        return self._assembled(operator, facts)
+
+    def _argument(self, value: Any, kind: Any) -> str:
+        if isinstance(value, np.ndarray):
+            self.constants.append(self._constant(f"c{len(self.constants) + 1}", value))
+            return self._array(f"c{len(self.constants)}", value.shape)
+        if isinstance(value, tuple):
+            items = [self._argument(*each) for each in zip(value, kind, strict=True)]
+            return self.translator.tuple_of(items, kind)
+        return self.translator.literal(kind(value))
+
+    def _numbers(self, values: np.ndarray[Any, Any]) -> str:
+        """Return numbers separated by commas, in lines."""
+        texts = [self.translator.literal(float(value)) for value in values.ravel(order=self._order)]
+        return "\n".join(textwrap.wrap(", ".join(texts), _WIDTH))
+
+    _order: Any = "C"
+
+    def _constant(self, name: str, values: np.ndarray[Any, Any]) -> str:
+        numbers = self._numbers(values) or "0.0"
+        return f"static const double {name}[] = {{\n{numbers}\n}};"
+
+    def _array(self, name: str, shape: tuple[int, ...]) -> str:
+        sizes = ", ".join(map(str, (*shape, 1, 1)[:3]))
+        return f"(array){{(double *){name}, {sizes}}}"
+
+    def _add(self, offset: str) -> None:
+        self.lines.append(
+            f"for (k = 0; k < n; k++) {self.target}[k] = {self.target}[k] + {offset};"
+        )
+
+    def _call(self, kernel: str, arguments: list[str], at: int, size: int) -> None:
+        memory = f"(array){{memory + {at}, {size}, 1, 1}}"
+        inner = ",\n        ".join(["signal", *arguments, memory, "signal"])
+        self.lines.append(f"{kernel}({inner});")
+
+    def _assembled(self, operator: Operator, facts: list[str]) -> str:
+        name, size = self.name, operator.state().size
+        signals = f"const double *{self.source}, double *{self.target}"
+        head = [
+            *facts,
+            "Compile with -ffp-contract=off for the same results as in hilctl.",
+            "",
+            f"    double memory[{size}];",
+            f"    {name}_reset(memory);    at rest",
+            f"    {name}(memory, {self.source}, {self.target}, n);    n samples, for each block",
+        ]
+        structures = [
+            f"typedef struct {{ {members} }} {kind};"
+            for kind, members in self.translator.structures.items()
+        ]
+        return "\n".join([
+            "/*", *(f" * {line}".rstrip() for line in head), " */", "",
+            "#include <math.h>", "",
+            "typedef struct { double *at; int n0, n1, n2; } array;", *structures, "",
+            *self.constants, "",
+            *(f"{each}\n" for each in self.translator.functions.values()),
+            f"void {name}_reset(double *memory)", "{",
+            f"    static const double rest[] = {{\n{self._numbers(operator.state())}\n}};",
+            "    int k;", f"    for (k = 0; k < {size}; k++) memory[k] = rest[k];", "}", "",
+            f"void {name}(double *memory, {signals}, int n)", "{",
+            f"    const array signal = {{{self.target}, n, 1, 1}};", "    int k;",
+            f"    for (k = 0; k < n; k++) {self.target}[k] = {self.source}[k];",
+            *(f"    {line}" for line in self.lines), "}", "",
+        ])  # fmt: skip
+
+
+class _MatlabFile(_CFile):
+    """A MATLAB file with the function ``name``."""
+
+    _translator = MatlabTranslator
+    _order = "F"
+
+    def _constant(self, name: str, values: np.ndarray[Any, Any]) -> str:
+        sizes = values.shape if values.ndim > 1 else (1, values.size)
+        return f"    {name} = reshape({self._list(values)}, {list(sizes)});"
+
+    def _list(self, values: np.ndarray[Any, Any]) -> str:
+        return f"[{self._numbers(values)}]".replace("\n", " ...\n")
+
+    def _array(self, name: str, shape: tuple[int, ...]) -> str:
+        del shape
+        return name
+
+    def _add(self, offset: str) -> None:
+        self.lines.append(f"{self.target} = {self.target} + {offset};")
+
+    def _call(self, kernel: str, arguments: list[str], at: int, size: int) -> None:
+        part = f"memory({at + 1}:{at + size})"
+        inner = ", ".join([self.target, *arguments, part, self.target])
+        self.lines.append(f"[{part}, {self.target}] = {kernel}({inner});")
+
+    def _assembled(self, operator: Operator, facts: list[str]) -> str:
+        call = f"[{self.target}, memory] = {self.name}({self.source}"
+        head = [
+            f"{self.name.upper()} {facts[0]}",
+            *facts[1:],
+            "",
+            f"    {call});            from rest",
+            f"    {call}, memory);    continued",
+        ]
+        return "\n".join([
+            f"function {call}, memory)", *(f"% {line}".rstrip() for line in head),
+            "    if nargin < 2",
+            f"        memory = {self._list(operator.state())};",
+            "    end",
+            *self.constants,
+            f"    {self.target} = {self.source};",
+            *(f"    {line}" for line in self.lines), "end", "",
+            *(f"{each}\n" for each in self.translator.functions.values()),
+        ])  # fmt: skip

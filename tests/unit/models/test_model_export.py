@@ -1,0 +1,136 @@
+"""Exported C and MATLAB functions compute what the kernels compute."""
+
+import ctypes
+import shutil
+import subprocess
+from typing import get_args
+
+import numpy as np
+import pytest
+
+from hilctl.models.generalised_pi import GeneralisedModel, PlayEnvelope
+from hilctl.models.model_export import export_text
+from hilctl.models.model_file import AnyModel
+from hilctl.models.plays import SpiModel
+from hilctl.models.refined import RefinedModel
+from hilctl.models.staged import AnyHysteresis, StagedModel
+from tests.published import piezo_ppi, terfenol_rdpi
+from tests.unit.models.test_effective_field import field_model
+from tests.unit.models.test_generalised_duhem import duhem_model
+from tests.unit.models.test_implicit_models import BOUC_WEN, DUHEM, KP, PLAIN, PREISACH
+from tests.unit.models.test_integrated import butterfly
+from tests.unit.models.test_refined import residual
+from tests.unit.models.test_staged import OMEGA, STAGES
+
+RATE_HZ = 50_000.0
+FORMS = {
+    "ppi": piezo_ppi().model_copy(update={"output_offset_um": 2.0}),
+    "spi": SpiModel(**piezo_ppi().model_dump(exclude={"kind"})),
+    "rdpi": terfenol_rdpi(),
+    "integrated": OMEGA.model_copy(update={"gamma_s": 2e-5}),
+    "butterfly": butterfly(gamma_s=2e-5),
+    "generalised": GeneralisedModel(
+        **PLAIN, direct=20.0, weights=(5.0, 3.0), thresholds=(0.1, 0.4),
+        rising=PlayEnvelope(slope=0.15, shift=0.2, level=-0.2),
+        falling=PlayEnvelope(height=1.1, slope=0.14, shift=0.2, level=-0.1),
+    ),
+    "preisach": PREISACH,
+    "krasnoselskii_pokrovskii": KP,
+    "bouc_wen": BOUC_WEN,
+    "duhem": DUHEM,
+    "staged": StagedModel.around(OMEGA, **STAGES["all"]),
+    "field": StagedModel.around(field_model()),
+    "generalised_duhem": StagedModel.around(duhem_model()),
+    "refined": RefinedModel.of(terfenol_rdpi(), residual(), 0.4),
+}  # fmt: skip
+FORMS["linear lag"] = StagedModel.around(OMEGA, **STAGES["linear lag"])
+FORMS["exponent 2"] = BOUC_WEN.model_copy(update={"exponent": 2})
+
+
+def kinds_of(union):
+    """Return the kinds of all models of a union."""
+    return {
+        each.model_fields["kind"].default
+        for part in get_args(get_args(union)[0])
+        for each in (get_args(part) or (part,))
+    }
+
+
+def test_every_kind_is_covered():
+    assert kinds_of(AnyModel) | kinds_of(AnyHysteresis) <= FORMS.keys()
+
+
+def signal(forward, samples):
+    """Return an input with jumps, turns and values that are no number: float64[n]."""
+    rng = np.random.default_rng(5)
+    path = np.cumsum(rng.normal(size=samples))
+    path *= (5.0 if forward else 15.0) / np.abs(path).max()
+    path += 0.0 if forward else 10.0
+    path[samples // 3] += 1.0
+    path[samples // 2] = np.nan
+    return path
+
+
+def expected(model, forward, samples=400):
+    """Return an input, the output of the kernels, and the state after it."""
+    operator = model.forward(RATE_HZ) if forward else model.inverse(RATE_HZ)
+    given = signal(forward, samples)
+    return given, operator.process(given.copy()), operator.state()
+
+
+DIRECTIONS = pytest.mark.parametrize("forward", [False, True], ids=["inverse", "forward"])
+
+
+@pytest.mark.skipif(not shutil.which("gcc"), reason="gcc is not installed")
+@DIRECTIONS
+@pytest.mark.parametrize("name", FORMS)
+def test_c_function_is_equal_in_two_blocks(name, forward, tmp_path):
+    model = FORMS[name]
+    file, library = tmp_path / "compensate.c", tmp_path / "compensate.so"
+    file.write_text(export_text(model, file, RATE_HZ, forward=forward), encoding="utf-8")
+    options = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-O2", "-ffp-contract=off"]
+    subprocess.run(
+        ["gcc", *options, "-shared", "-fPIC", "-o", library, file, "-lm"], check=True, timeout=60
+    )
+    code = ctypes.CDLL(str(library))
+    given, wanted, state = expected(model, forward)
+    memory, out = np.empty(state.size), np.empty(given.size)
+    code.compensate_reset(_at(memory))
+    for part in (slice(0, 151), slice(151, None)):
+        code.compensate(_at(memory), _at(given[part]), _at(out[part]), given[part].size)
+    np.testing.assert_allclose(out, wanted, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(memory, state, rtol=1e-12, atol=1e-12)
+
+
+def _at(values):
+    return values.ctypes.data_as(ctypes.c_void_p)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not shutil.which("octave-cli"), reason="octave-cli is not installed")
+def test_matlab_function_is_equal_in_two_blocks(tmp_path):
+    script, cases = ["format long;"], {}
+    for i, (name, model) in enumerate(FORMS.items()):
+        for forward in (False, True):
+            made = f"m{i}_{forward}".lower()
+            file = tmp_path / f"{made}.m"
+            file.write_text(export_text(model, file, RATE_HZ, forward=forward), encoding="utf-8")
+            given, *cases[name, forward] = expected(model, forward, samples=120)
+            np.savetxt(tmp_path / f"{made}.txt", given, fmt="%.17g")
+            script += [
+                f"x = load('{made}.txt');",
+                f"[first, memory] = {made}(x(1:51));",
+                f"[second, memory] = {made}(x(52:end), memory);",
+                "fprintf('%.17g ', [first; second]); fprintf('\\n');",
+                "fprintf('%.17g ', memory); fprintf('\\n');",
+            ]
+    (tmp_path / "script.m").write_text("\n".join(script), encoding="utf-8")
+    run = subprocess.run(
+        ["octave-cli", "--no-init-file", "script.m"], cwd=tmp_path, capture_output=True, text=True,
+        timeout=280,
+    )  # fmt: skip
+    assert run.returncode == 0, run.stderr
+    rows = [np.array(line.split(), dtype=float) for line in run.stdout.splitlines()]
+    for case, (out, memory) in zip(cases, zip(rows[::2], rows[1::2], strict=True), strict=True):
+        for found, wanted in zip((out, memory), cases[case], strict=True):
+            np.testing.assert_allclose(found, wanted, 1e-12, 1e-12, err_msg=str(case))
