@@ -29,10 +29,11 @@ from hilctl.base.errors import (
 if TYPE_CHECKING:
     from hilctl.api.campaigns import campaign, characterise, learn
     from hilctl.api.connection import RunConnection, connect
-    from hilctl.api.models import compare, identify, refine
-    from hilctl.api.recordings import RecordedRun, SampleTable, export, list_runs, read, summarize
+    from hilctl.api.models import LoadedModel, compare, export_model, identify, load_model, refine
+    from hilctl.api.recordings import RecordedRun, export, list_runs, read, summarize
     from hilctl.api.reports import figures, replay, report_page, report_runs
     from hilctl.api.runs import WrittenExperiment, check, init, load, run
+    from hilctl.api.tables import RunTable, SampleTable
 
 __all__ = [
     "ConfigError",
@@ -40,10 +41,12 @@ __all__ = [
     "DeviceError",
     "HilctlError",
     "InputError",
+    "LoadedModel",
     "ModelError",
     "RecordedRun",
     "RunConnection",
     "RunError",
+    "RunTable",
     "SampleTable",
     "WrittenExperiment",
     "campaign",
@@ -52,12 +55,14 @@ __all__ = [
     "compare",
     "connect",
     "export",
+    "export_model",
     "figures",
     "identify",
     "init",
     "learn",
     "list_runs",
     "load",
+    "load_model",
     "read",
     "refine",
     "replay",
@@ -77,9 +82,17 @@ if not TYPE_CHECKING:
     _OTHERS = {
         "campaigns": {"campaign", "characterise", "learn"},
         "connection": {"RunConnection", "connect"},
-        "models": {"compare", "identify", "refine"},
+        "models": {
+            "LoadedModel",
+            "compare",
+            "export_model",
+            "identify",
+            "load_model",
+            "refine",
+        },
         "reports": {"figures", "replay", "report_page", "report_runs"},
         "runs": {"WrittenExperiment", "check", "init", "load", "run"},
+        "tables": {"RunTable", "SampleTable"},
     }
 
     def __getattr__(name):

@@ -1,17 +1,24 @@
-"""Identify, refine and compare models."""
+"""Identify, refine, compare, load and export models."""
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import cached_property
 from pathlib import Path
 
 from hilctl.api._types import PathLike, Paths, Settings, path_or_none, paths_of, texts_of
-from hilctl.base.files import check_writable
+from hilctl.base.files import check_no_input, check_writable, write_text
+from hilctl.base.formatting import shown_briefly
+from hilctl.base.types import CommandUnit
 from hilctl.comparison import compare as library
 from hilctl.comparison.compare import Comparison
 from hilctl.experiment.load import inputs_of
 from hilctl.identify.pipeline import Identification, identify_files, settings_from
 from hilctl.identify.refine.refinement import Refinement, refine_files
+from hilctl.models.base import HysteresisModel, IdentifiedRange, Operator
+from hilctl.models.model_export import check_rate, export_text
+from hilctl.models.model_file import load_model as read_model
 from hilctl.run.control.client import finish_dead_runs
 
 
@@ -54,6 +61,98 @@ def identify(
         overwrite=overwrite,
         progress=on_progress,
     )
+
+
+@shown_briefly
+@dataclass(frozen=True)
+class LoadedModel:
+    """A model at a sample rate.
+
+    ``forward`` and ``inverse`` are streaming operators (:class:`hilctl.models.base.Operator`): a
+    call processes the next block of a signal, ``state()`` and ``restore()`` copy the state, and
+    ``reset()`` starts again from rest. The output of ``inverse`` is that of the reference
+    ``inverse.preview`` samples before.
+
+    Attributes:
+        model: Parameters and provenance; ``model.to_mapping()`` returns them as plain values.
+        sample_rate_hz: Samples per second.
+        input_unit: Unit of the command, A or V.
+        input_range: Lowest and highest command the model was identified on; None if unknown.
+        output_range_um: Lowest and highest displacement.
+        identified_range: Amplitudes, frequencies and speed of the data.
+    """
+
+    model: HysteresisModel
+    sample_rate_hz: float
+    input_unit: CommandUnit
+    input_range: tuple[float, float] | None
+    output_range_um: tuple[float, float] | None
+    identified_range: IdentifiedRange | None
+
+    @cached_property
+    def forward(self) -> Operator:
+        """Operator from command to displacement in um."""
+        return self.model.forward(self.sample_rate_hz)
+
+    @cached_property
+    def inverse(self) -> Operator:
+        """Operator from displacement in um to command.
+
+        Raises:
+            ModelError: The model has no inverse at this sample rate.
+        """
+        return self.model.inverse(self.sample_rate_hz)
+
+
+def load_model(path: PathLike, sample_rate_hz: float) -> LoadedModel:
+    """Read a model file.
+
+    Args:
+        path: Model file.
+        sample_rate_hz: Samples per second of the signals.
+
+    Raises:
+        InputError: The file cannot be read, or the sample rate is not > 0.
+        ConfigError: It breaks a rule or has no inverse; all problems are listed.
+    """
+    check_rate(sample_rate_hz)
+    model = read_model(Path(path))
+    return LoadedModel(
+        model=model,
+        sample_rate_hz=sample_rate_hz,
+        input_unit=model.input_unit,
+        input_range=model.input_range,
+        output_range_um=model.output_range_um,
+        identified_range=model.provenance.identified_range,
+    )
+
+
+def export_model(
+    model: PathLike,
+    output: PathLike,
+    sample_rate_hz: float,
+    *,
+    forward: bool = False,
+    overwrite: bool = False,
+) -> None:
+    """Write the inverse of a model as one C or MATLAB function without dependencies.
+
+    Args:
+        model: Model file.
+        output: File to write, ``.c`` or ``.m``; the function has its name.
+        sample_rate_hz: Samples per second of the signals.
+        forward: Write the model instead of its inverse.
+        overwrite: Replace an existing file.
+
+    Raises:
+        InputError: A file cannot be read or written, or the name or the rate is invalid.
+        ConfigError: The model breaks a rule; all problems are listed.
+        ModelError: The model has no inverse at this sample rate.
+    """
+    file = Path(output)
+    check_no_input(file, [Path(model)])
+    text = export_text(read_model(Path(model)), file, sample_rate_hz, forward=forward)
+    write_text(file, text, overwrite=overwrite)
 
 
 def refine(

@@ -1,12 +1,10 @@
 """Read, evaluate, list and export recordings."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from importlib import import_module
 from pathlib import Path
-from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from hilctl.analysis.catalogue import read_catalogue, select
 from hilctl.analysis.export import columns, units
@@ -14,86 +12,13 @@ from hilctl.analysis.export import export as write
 from hilctl.analysis.report import summarize as judge
 from hilctl.analysis.run_metrics import RunReport
 from hilctl.api._types import PathLike
+from hilctl.api.tables import RunTable, SampleTable
 from hilctl.base.errors import InputError
 from hilctl.recording.reader import RecordingStream
 from hilctl.recording.reader import read as read_file
 from hilctl.recording.recording import Recording
 from hilctl.recording.time_range import TimeRange
 from hilctl.run.control.client import finish_dead_runs
-
-if TYPE_CHECKING:
-    import numpy.typing as npt
-    import pyarrow as pa
-
-
-class SampleTable(Mapping[str, "npt.NDArray[Any]"]):
-    """Samples as named columns of equal length; ``table["displacement_um"]`` is an array.
-
-    Args:
-        columns: The columns.
-        units: Units by column name.
-    """
-
-    def __init__(self, columns: Mapping[str, "npt.NDArray[Any]"], units: Mapping[str, str]) -> None:
-        self._columns = dict(columns)
-        self.units = dict(units)
-
-    def __getitem__(self, name: str) -> "npt.NDArray[Any]":
-        return self._columns[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._columns)
-
-    def __len__(self) -> int:
-        return len(self._columns)
-
-    def __repr__(self) -> str:
-        named = (f"{name} [{self.units[name]}]" if name in self.units else name for name in self)
-        return f"<{self.rows} samples: {', '.join(named)}>"
-
-    @property
-    def rows(self) -> int:
-        """Number of samples."""
-        return len(next(iter(self._columns.values()), ()))
-
-    def to_pandas(self) -> Any:
-        """Return a ``pandas.DataFrame``; units are in its ``attrs``.
-
-        Raises:
-            InputError: pandas is not installed.
-        """
-        frame = _library("pandas").DataFrame(self._columns)
-        frame.attrs["units"] = dict(self.units)
-        return frame
-
-    def to_polars(self) -> Any:
-        """Return a ``polars.DataFrame``.
-
-        Raises:
-            InputError: polars is not installed.
-        """
-        return _library("polars").DataFrame(self._columns)
-
-    def to_arrow(self) -> "pa.Table":
-        """Return a ``pyarrow.Table``; the unit of a column is in its field's metadata.
-
-        Raises:
-            InputError: pyarrow is not installed.
-        """
-        arrow = _library("pyarrow")
-        arrays = [arrow.array(each) for each in self._columns.values()]
-        fields = [
-            arrow.field(name, array.type, metadata={"unit": self.units.get(name, "")})
-            for name, array in zip(self._columns, arrays, strict=True)
-        ]
-        return arrow.Table.from_arrays(arrays, schema=arrow.schema(fields))
-
-
-def _library(name: str) -> ModuleType:
-    try:
-        return import_module(name)
-    except ImportError:
-        raise InputError(f"{name} is not installed: pip install {name}") from None
 
 
 @dataclass(frozen=True)
@@ -208,7 +133,7 @@ def export(
 
 def list_runs(
     folder: PathLike = ".", where: str = "", sort: str = "started", *, reverse: bool = False
-) -> list[dict[str, Any]]:
+) -> RunTable:
     """Return the metadata of all recordings in a folder and its subfolders.
 
     Args:
@@ -220,4 +145,4 @@ def list_runs(
     Raises:
         InputError: The folder cannot be read, the condition is invalid, or a key is unknown.
     """
-    return select(read_catalogue(Path(folder)), where, sort, reverse=reverse)
+    return RunTable(select(read_catalogue(Path(folder)), where, sort, reverse=reverse))

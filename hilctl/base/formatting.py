@@ -103,6 +103,7 @@ def _finite(value: Any) -> Any:
 
 
 _LONGEST = 60
+_FEW = 3
 Shown = TypeVar("Shown", bound=type)
 
 
@@ -136,6 +137,8 @@ def _brief(value: object) -> str:
     if isinstance(value, str | PurePath):
         text = repr(str(value))
         return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 4]}...'"
+    if isinstance(value, tuple) and len(value) <= _FEW and all(isinstance(x, float) for x in value):
+        return f"({', '.join(map(_brief, value))})"
     kind = type(value).__name__
     if shape := getattr(value, "shape", None):
         return f"<{kind} {list(shape)}>"

@@ -18,8 +18,8 @@ from hilctl.cli.output import QUIET, VERBOSE
 class CommandEntry(NamedTuple):
     """A command: a function or typer application of its name in a module.
 
-    Its name is ``NAME_`` if NAME has another meaning in Python; ``help`` is the first line of its
-    docstring.
+    Its name is ``NAME_`` if NAME has another meaning in Python, with ``_`` for ``-``; ``help`` is
+    the first line of its docstring.
     """
 
     module: str
@@ -62,6 +62,7 @@ _MODULES = {
         "identify": "Identify a model's parameters from recordings or measured tables.",
         "refine": "Improve a model from recordings of runs (written only if it is better).",
         "compare": "Identify models of the literature on the same loops and compare them.",
+        "export-model": "Write the inverse of a model as one C or MATLAB function.",
     },
     "hilctl.cli.characterise": {
         "characterise": "Measure a connected actuator within its limits, "
@@ -124,7 +125,8 @@ def load(name: str) -> Any:
     module = COMMANDS[name].module
     try:
         found = import_module(module)
-        command = getattr(found, f"{name}_", None) or getattr(found, name)
+        function = name.replace("-", "_")
+        command = getattr(found, f"{function}_", None) or getattr(found, function)
     except (ImportError, AttributeError) as error:
         if error.name in LINUX_MODULES:
             raise

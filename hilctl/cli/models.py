@@ -1,4 +1,4 @@
-"""Commands that identify models: identify, refine, compare."""
+"""Commands on models: identify, refine, compare, export-model."""
 
 import json
 from collections.abc import Sequence
@@ -254,6 +254,26 @@ def print_refinement(result: Refinement, output: Path | None) -> None:
         print("offset, creep and drift of single runs were not learned")
     if output is not None:
         print(f"model: {output}" if result.better else f"{output}: not written")
+
+
+def export_model(
+    model: Annotated[Path, typer.Argument(help="Model file.", metavar="MODEL")],
+    output: Annotated[
+        Path,
+        typer.Argument(
+            help="File to write (.c or .m); the function has its name.", metavar="OUTPUT"
+        ),
+    ],
+    rate_hz: Annotated[float, typer.Option(help="Sample rate of the signals.")],
+    forward: Annotated[
+        bool, typer.Option("--forward", help="Write the model instead of its inverse.")
+    ] = False,
+    overwrite: Overwrite = False,
+    as_json: AsJson = False,
+) -> None:
+    """Write the inverse of a model as one C or MATLAB function."""
+    api.export_model(model, output, rate_hz, forward=forward, overwrite=overwrite)
+    print_result({"output": str(output)}, lambda: print(f"{output}: written"), as_json=as_json)
 
 
 def compare(

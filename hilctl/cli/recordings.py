@@ -4,41 +4,24 @@ import json
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict
-from functools import cache
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from hilctl import api
 from hilctl.analysis.catalogue import Entry, keys_of, read_catalogue, select
 from hilctl.analysis.export import export_all
+from hilctl.api.tables import RunTable
 from hilctl.base.errors import InputError
-from hilctl.base.formatting import finite_json, printable, short_name
+from hilctl.base.formatting import finite_json, printable
 from hilctl.cli.console import progress_bar
 from hilctl.cli.options import AsJson, FromTime, Overwrite, ToTime, recording_paths
 from hilctl.cli.output import print_json, print_result
-from hilctl.recording.metadata_keys import LABELS_FACT, RECORDINGS
+from hilctl.recording.metadata_keys import RECORDINGS
 from hilctl.recording.recover import recover_recording
 from hilctl.run.control.client import finish_dead_runs
 from hilctl.run.run_folder import dismiss
-
-_MISSING = "-"
-_SHOWN = {
-    "started": "started (UTC)",
-    "name": "name",
-    "waveform": "waveform",
-    "duration_s": "s",
-    "code": "result",
-    "peak_hysteresis_percent": "hyst. %",
-    "peak_error_percent": "error %",
-    "skipped_ticks": "missed",
-    LABELS_FACT: "labels",
-    "path": "recording",
-}
-"""Columns of the table, and their headings."""
-_NUMBERS = {"duration_s", "peak_hysteresis_percent", "peak_error_percent", "skipped_ticks"}
-_TO_SECONDS = len("2000-01-01T00:00:00")
 
 
 def list_(
@@ -62,7 +45,7 @@ def list_(
     if keys:
         print("\n".join(map(printable, keys_of(catalogue))))
         return
-    entries = select(catalogue, where, sort, reverse=reverse)
+    entries = RunTable(select(catalogue, where, sort, reverse=reverse))
     if as_json:
         _print_json(entries, len(catalogue), folder)
     else:
@@ -76,43 +59,15 @@ def _print_json(entries: Sequence[Entry], count: int, folder: Path) -> None:
     print(f'{{{head}, "recordings": [\n{lines}\n]}}')
 
 
-def _print_table(entries: Sequence[Entry], count: int) -> None:
-    columns = [[_cell(name, entry) for entry in entries] for name in _SHOWN]
+def _print_table(entries: RunTable, count: int) -> None:
     if entries:
-        headed = zip(_SHOWN.items(), columns, strict=True)
-        padded = [_padded(name, [heading, *cells]) for (name, heading), cells in headed]
-        print("\n".join(map("  ".join, zip(*padded, strict=True))))
+        print("\n".join(entries.lines()))
     problems = [entry for entry in entries if entry["problem"]]
     for entry in problems:
         where = printable(entry["path"])
         print(f"hilctl: {where}: {printable(entry['problem'])}", file=sys.stderr)
     unreadable = f", {len(problems)} of them unreadable" if problems else ""
     print(f"{len(entries)} of {count} recordings{unreadable}")
-
-
-def _padded(name: str, cells: list[str]) -> list[str]:
-    width = max(map(len, cells))
-    if name in _NUMBERS:
-        return [cell.rjust(width) for cell in cells]
-    return cells if name == "path" else [cell.ljust(width) for cell in cells]
-
-
-def _cell(name: str, entry: Entry) -> str:
-    value = entry[name]
-    if name == "code":  # without a result, show the state of the file
-        return short_name(value or entry["state"])
-    if name == LABELS_FACT:
-        return short_name(", ".join(f"{key} {each}" for key, each in value.items())) or _MISSING
-    if name == "started":
-        return short_name((value or _MISSING)[:_TO_SECONDS].replace("T", " "))
-    return printable(value) if name == "path" else _text(value)
-
-
-@cache
-def _text(value: Any) -> str:
-    if value is None or value == "":
-        return _MISSING
-    return f"{value:.4g}" if isinstance(value, float) else short_name(str(value))
 
 
 def export(

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Annotated, Any, Self, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
 from hilctl.base.errors import ModelError
 from hilctl.base.strict import CheckedModel, Field, StrictModel, field_validator, model_validator
@@ -50,6 +51,22 @@ class Operator:
         self._process = compiled(kernel)
         self._rest = rest_memory(operators)
         self._memory = self._rest.copy()
+
+    def __repr__(self) -> str:
+        return (
+            f"<{type(self).__name__}: preview {self.preview}, state of {self._memory.size} values>"
+        )
+
+    def __call__(self, signal: npt.ArrayLike) -> F64:
+        """Process one block of any numbers, as :meth:`process`.
+
+        Raises:
+            ModelError: It is not a sequence of numbers.
+        """
+        block = np.ascontiguousarray(signal, dtype=np.float64)
+        if block.ndim != 1:
+            raise ModelError(f"the signal must be one sequence of numbers: shape {block.shape}")
+        return self.process(block)
 
     def process(self, block: F64, out: F64 | None = None) -> F64:
         """Process one block and update the memory.

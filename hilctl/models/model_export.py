@@ -43,15 +43,20 @@ def export_text(
             f"must have a name of letters, digits and underscores, {_LONGEST_NAME} at most, the "
             "first a letter, because the function has that name"
         )
-    if not 0.0 < sample_rate_hz < np.inf:
-        problems.append(f"the sample rate must be > 0 Hz: {sample_rate_hz!r}")
     if problems or form is None:
         raise InputError(f"{output}: {'; '.join(problems)}")
+    check_rate(sample_rate_hz)
     operator = model.forward(sample_rate_hz) if forward else model.inverse(sample_rate_hz)
     names = f"command_{model.input_unit.lower()}", "displacement_um"
     source, target = names if forward else ("reference_um", names[0])
     facts = _facts(model, operator, sample_rate_hz, forward=forward)
     return form(output.stem, source, target).text(operator, list(facts))
+
+
+def check_rate(sample_rate_hz: float) -> None:
+    """Raise InputError if a sample rate is not finite and > 0."""
+    if not 0.0 < sample_rate_hz < np.inf:
+        raise InputError(f"the sample rate must be > 0 Hz (got {sample_rate_hz!r})")
 
 
 def _facts(
@@ -165,7 +170,7 @@ class _CFile:
             *facts,
             "Compile with -ffp-contract=off for the same results as in hilctl.",
             "",
-            f"    double memory[{size}];",
+            f"    double memory[{name}_memory];",
             f"    {name}_reset(memory);    at rest",
             f"    {name}(memory, {self.source}, {self.target}, n);    n samples, for each block",
         ]
@@ -176,6 +181,7 @@ class _CFile:
         return "\n".join([
             "/*", *(f" * {line}".rstrip() for line in head), " */", "",
             "#include <math.h>", "",
+            f"enum {{ {name}_memory = {size}, {name}_preview = {operator.preview} }};", "",
             "typedef struct { double *at; int n0, n1, n2; } array;", *structures, "",
             *self.constants, "",
             *(f"{each}\n" for each in self.translator.functions.values()),

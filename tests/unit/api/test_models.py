@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from hilctl import api
-from hilctl.models.model_file import load_model
+from hilctl.base.errors import InputError, ModelError
+from hilctl.models.model_file import dump_model, load_model
 from hilctl.models.plays import PpiModel
 
 
@@ -56,3 +57,43 @@ def test_arguments_are_passed_on(monkeypatch):
 def test_default_scheduler(monkeypatch, model, asked, where):
     monkeypatch.setattr("hilctl.api.models.identify_files", lambda *given, **named: given[4])
     assert api.identify("a.mcap", model=model, scheduler=asked) == where
+
+
+@pytest.fixture
+def model_file(tmp_path):
+    """A model file with ranges."""
+    model = PpiModel(direct=6.0, weights=(2.0, 1.5), thresholds=(0.5, 1.5), input_range=(-4.0, 4.0))
+    file = tmp_path / "model.yaml"
+    file.write_text(dump_model(model), encoding="utf-8")
+    return file
+
+
+def test_a_loaded_model_runs_both_ways_and_continues_from_a_state(model_file):
+    model = api.load_model(str(model_file), 1000.0)
+    reference = np.linspace(0.0, 20.0, 50)
+    command = model.inverse(reference[:30])
+    state = model.inverse.state()
+    rest = model.inverse(reference[30:])
+    np.testing.assert_allclose(model.forward(np.append(command, rest)), reference)
+    model.inverse.restore(state)
+    np.testing.assert_array_equal(model.inverse(list(reference[30:])), rest)
+    assert "input_range=(-4, 4)" in repr(model)
+    assert model.model.to_mapping()["direct"] == 6.0
+    with pytest.raises(ModelError):
+        model.inverse([[1.0, 2.0]])
+
+
+def test_a_model_is_exported_and_an_existing_file_kept(model_file, tmp_path):
+    for name in ("a.c", "a.m"):
+        api.export_model(model_file, tmp_path / name, 1000.0)
+    assert "void a(" in (tmp_path / "a.c").read_text(encoding="utf-8")
+    with pytest.raises(InputError):
+        api.export_model(model_file, tmp_path / "a.c", 1000.0, forward=True)
+    api.export_model(model_file, tmp_path / "a.c", 1000.0, forward=True, overwrite=True)
+    assert "displacement_um" in (tmp_path / "a.c").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("rate_hz", [0.0, -1.0, np.inf, np.nan])
+def test_a_sample_rate_must_be_positive(rate_hz, model_file):
+    with pytest.raises(InputError):
+        api.load_model(model_file, rate_hz)

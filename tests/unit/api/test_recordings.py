@@ -1,20 +1,11 @@
 """Read, evaluate, plot and export recordings from Python."""
 
-import sys
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
 from hilctl import api
-from hilctl.api.recordings import SampleTable
 from hilctl.base.errors import DataError, InputError
 from tests.unit.api.test_runs import SHORT, SINE
-
-TABLE = SampleTable(
-    {"t_s": np.arange(3) / 2.0, "displacement_um": np.ones(3), "flags": np.zeros(3, np.uint32)},
-    {"t_s": "s", "displacement_um": "um"},
-)
 
 
 @pytest.fixture(scope="module")
@@ -77,38 +68,3 @@ def test_dead_runs_are_finished_before_anything_is_read(file, monkeypatch):
     for act in (api.read, api.summarize, api.replay):
         act(file)
     assert len(finished) == 3
-
-
-def test_a_table_is_a_mapping_of_columns():
-    assert (len(TABLE), TABLE.rows) == (3, 3)
-    assert repr(TABLE) == "<3 samples: t_s [s], displacement_um [um], flags>"
-    assert SampleTable({}, {}).rows == 0
-
-
-def test_arrow_tables_have_units():
-    arrow = TABLE.to_arrow()
-    assert arrow.schema.field("displacement_um").metadata == {b"unit": b"um"}
-    assert arrow.column("t_s").to_pylist()[:2] == [0.0, 0.5]
-
-
-@pytest.mark.parametrize("name", ["pandas", "polars"])
-def test_a_table_library_that_is_not_installed(name, monkeypatch):
-    monkeypatch.setitem(sys.modules, name, None)
-    with pytest.raises(InputError, match=f"pip install {name}"):
-        getattr(TABLE, f"to_{name}")()
-    made = SimpleNamespace(DataFrame=lambda columns: SimpleNamespace(columns=columns, attrs={}))
-    monkeypatch.setitem(sys.modules, name, made)
-    assert list(getattr(TABLE, f"to_{name}")().columns) == list(TABLE)
-
-
-@pytest.mark.parametrize("name", ["pandas", "polars"])
-def test_an_installed_table_library(name):
-    pytest.importorskip(name)
-    frame = getattr(TABLE, f"to_{name}")()
-    assert list(frame.columns) == list(TABLE)
-    for column, values in TABLE.items():
-        found = frame[column].to_numpy()
-        np.testing.assert_array_equal(found, values)
-        assert found.dtype == values.dtype
-    if name == "pandas":
-        assert frame.attrs["units"] == TABLE.units

@@ -1,4 +1,4 @@
-"""Commands that identify models: identify, refine, compare."""
+"""Commands on models: identify, refine, compare, export-model."""
 
 import json
 from pathlib import Path
@@ -8,6 +8,7 @@ import pytest
 from hilctl.base.errors import InputError
 from hilctl.cli.models import _column, _numbers, headings, notes, render_comparison, table_rows
 from hilctl.comparison.compare import ComparisonRequest, compare
+from hilctl.experiment.examples import examples_folder
 from hilctl.identify.settings import IdentifySettings
 from hilctl.models.model_file import dump_model, load_model
 from tests.fakes import SteppingClock
@@ -89,3 +90,10 @@ def test_frequencies_are_numbers():
 @pytest.mark.parametrize(("text", "column"), [("3", 3), ("drive", "drive"), (None, None)])
 def test_column_is_a_number_or_a_name(text, column):
     assert _column(text) == column
+
+
+def test_a_model_is_exported(hilctl, json_of, tmp_path):
+    model, output = examples_folder() / "models" / "piezo_ppi.yaml", tmp_path / "piezo.c"
+    assert json_of("export-model", model, output, "--rate-hz", 1e3) == (0, {"output": str(output)})
+    assert "void piezo(" in output.read_text(encoding="utf-8")
+    assert hilctl("export-model", model, output, "--rate-hz", 1e3)[0] == 2

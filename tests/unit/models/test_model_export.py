@@ -3,11 +3,13 @@
 import ctypes
 import shutil
 import subprocess
+from pathlib import Path
 from typing import get_args
 
 import numpy as np
 import pytest
 
+from hilctl.base.errors import InputError
 from hilctl.models.generalised_pi import GeneralisedModel, PlayEnvelope
 from hilctl.models.model_export import export_text
 from hilctl.models.model_file import AnyModel
@@ -134,3 +136,9 @@ def test_matlab_function_is_equal_in_two_blocks(tmp_path):
     for case, (out, memory) in zip(cases, zip(rows[::2], rows[1::2], strict=True), strict=True):
         for found, wanted in zip((out, memory), cases[case], strict=True):
             np.testing.assert_allclose(found, wanted, 1e-12, 1e-12, err_msg=str(case))
+
+
+@pytest.mark.parametrize("name", ["a.txt", "2a.c", "a b.m", "ä.c", f"{'a' * 49}.c"])
+def test_a_name_that_is_no_function_is_refused(name):
+    with pytest.raises(InputError, match=r"\.c or \.m|letter"):
+        export_text(FORMS["ppi"], Path(name), RATE_HZ)
