@@ -109,7 +109,7 @@ class RunTable(list[Entry]):
 
     def _count(self) -> str:
         shown = f" (the first {_MOST_ROWS} are shown)" if len(self) > _MOST_ROWS else ""
-        return f"{len(self)} recordings{shown}"
+        return f"recordings: {len(self)}{shown}"
 
     def _repr_html_(self) -> str:
         def row(cells: Iterable[str], tag: str) -> str:

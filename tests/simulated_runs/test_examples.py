@@ -6,7 +6,9 @@ import subprocess
 import sys
 from pathlib import Path
 
+import nbformat
 import pytest
+from nbclient import NotebookClient
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 # What the text they print must match, figures within what the simulated rig allows, and files.
@@ -22,6 +24,8 @@ EXPECTED = {
     ),
     "matlab_handover": (r"run\.mat: \d+ samples[\s\S]*\nTrue", "handover/run.npz"),
 }  # fmt: skip
+NOTEBOOK = EXAMPLES / "run_to_c.ipynb"
+MOST_LINES = 40
 CELL = re.compile(r"^# %%", re.MULTILINE)
 
 
@@ -30,6 +34,8 @@ def test_each_is_expected_and_listed():
     assert names == set(EXPECTED)
     listed = (EXAMPLES / "README.md").read_text()
     assert all(f"`{name}.py`" in listed for name in names)
+    assert [*EXAMPLES.glob("*.ipynb")] == [NOTEBOOK]
+    assert f"`{NOTEBOOK.name}`" in listed
 
 
 @pytest.mark.parametrize("name", EXPECTED)
@@ -45,3 +51,20 @@ def test_example(name, tmp_path):
     assert ended.returncode == 0, ended.stderr
     assert re.search(text, ended.stdout), ended.stdout
     assert (tmp_path / "examples-out" / written).exists()
+
+
+def shown(output):
+    """Return the text that a reader of a notebook sees of an output."""
+    return output.text if output.output_type == "stream" else output.data["text/plain"]
+
+
+def test_notebook_runs_with_short_outputs(tmp_path):
+    notebook = nbformat.read(NOTEBOOK, as_version=4)
+    cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert not any(cell.outputs for cell in cells)
+    NotebookClient(notebook, timeout=240, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    for cell in cells:
+        for output in cell.outputs:
+            assert output.get("name") != "stderr", output.text
+            assert len(shown(output).splitlines()) <= MOST_LINES
+    assert (tmp_path / "examples-out" / "notebook" / "piezo.c").exists()

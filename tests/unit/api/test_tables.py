@@ -61,12 +61,12 @@ def test_a_long_table_of_recordings_is_shown_in_part():
     table = run_table(50)
     lines = repr(table).splitlines()
     assert len(lines) == 32
-    assert lines[-1].startswith("50 ")
+    assert "50" in lines[-1]
     assert len(table.lines()) == 51
     shown = table._repr_html_()
     assert shown.count("<tr>") == 31
     assert "&lt;A7&gt;" in shown
-    assert repr(run_table(0)).splitlines()[1:] == ["0 recordings"]
+    assert repr(run_table(0)).splitlines()[1:] == ["recordings: 0"]
 
 
 def test_recordings_become_a_data_frame_with_units(monkeypatch):
