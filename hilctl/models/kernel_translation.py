@@ -38,7 +38,7 @@ _RESERVED = re.compile(
 """Names that variables of a translated kernel cannot have."""
 _SIGNS: dict[type[ast.AST], str] = {
     ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/", ast.And: "&&", ast.Or: "||",
-    ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==",
+    ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!=",
 }  # fmt: skip
 _OR, _COMPARISON, _SUM, _PRODUCT, _SIGN, _ATOM = range(6)
 """How tightly expressions bind, in all three languages."""
@@ -79,10 +79,7 @@ def source_of(kernel: Callable[..., Any]) -> KernelSource:
     calls = [each for each in nodes if isinstance(each, ast.Call)]
     called = {each.func.id for each in calls if isinstance(each.func, ast.Name)}
     callees = {name: source_of(names[name]) for name in sorted(called & names.keys())}
-    stored = [each for each in nodes if isinstance(each, ast.Subscript | ast.Name)]
-    changed = {
-        ast.unparse(each).partition("[")[0] for each in stored if isinstance(each.ctx, ast.Store)
-    }
+    changed = _stored(node.body)
     changed.update(each.id for call in calls for each in _changed_by(call, callees))
     private = function.__name__.startswith("_")
     return KernelSource(
@@ -94,6 +91,21 @@ def source_of(kernel: Callable[..., Any]) -> KernelSource:
         changed=tuple(name for name, kind in hints.items() if kind == F64 and name in changed),
         callees=callees,
     )
+
+
+def _stored(statements: Iterable[ast.stmt]) -> set[str]:
+    """Return the names of the variables and arrays that some statements store to."""
+    nodes = (each for statement in statements for each in ast.walk(statement))
+    stored = (each for each in nodes if isinstance(each, ast.Subscript | ast.Name))
+    return {_root(each) for each in stored if isinstance(each.ctx, ast.Store)} - {"_"}
+
+
+def _root(target: ast.expr) -> str:
+    return ast.unparse(target).partition("[")[0]
+
+
+def _names(node: ast.AST) -> list[str]:
+    return [each.id for each in ast.walk(node) if isinstance(each, ast.Name)]
 
 
 def _type_of(hint: Any) -> Type:
@@ -143,7 +155,7 @@ class Translator:
     }
     """Functions that differ from those of the language for NaN or -0."""
     forms: ClassVar = {
-        "int": "(int)({})", "quotient": "{} / {}", "remainder": "{} % {}", "size": "{}.n0",
+        "int": "(int)({})", "FloorDiv": "{} / {}", "Mod": "{} % {}", "size": "{}.n0",
         "shape": "{}.n{}", "item": "{}.f{}", "range": "for ({0} = {1}; {0} < {2}; {0}++)",
         "while": "while ({})", "if": "if ({})",
     }  # fmt: skip
@@ -202,7 +214,7 @@ class Translator:
         """Refuse a statement that uses an array beside a call that changes it."""
         for call in (each for each in ast.walk(node) if isinstance(each, ast.Call)):
             for array in _changed_by(call, self._kernel.callees):
-                if _count(node, array.id) > _count(call, array.id):
+                if _names(node).count(array.id) > _names(call).count(array.id):
                     raise self._error(node)
 
     def _simple(self, node: ast.stmt) -> None:
@@ -237,6 +249,8 @@ class Translator:
                 orelse=[],
             ):
                 low, high = ("0", *(self._value(arg)[0] for arg in args))[-2:]
+                if _stored(node.body) & {name, *_names(node.iter)}:  # C looks again in every pass
+                    raise self._error(node.iter)
                 self._types[name] = int
                 if not re.fullmatch(r"[\w.()]+", high):
                     high = self._temporary(high, int)
@@ -264,9 +278,9 @@ class Translator:
 
     def _unpack(self, targets: Sequence[ast.expr], value: ast.expr) -> None:
         values = self._items(value)
-        roots = [ast.unparse(target).partition("[")[0] for target in targets]
+        roots = [*map(_root, targets)]
         later = value.elts[1:] if isinstance(value, ast.Tuple) else []
-        if any(_count(each, root) for i, each in enumerate(later) for root in roots[: i + 1]):
+        if any({*_names(each)} & {*roots[: i + 1]} for i, each in enumerate(later)):
             values = [(self._temporary(text, kind), kind) for text, kind in values]
         for target, (text, kind) in zip(targets, values, strict=True):
             if ast.unparse(target) != "_":
@@ -327,9 +341,7 @@ class Translator:
                 (a, one), (b, other) = self._operand(left, level), self._operand(right, level + 1)
                 kind = self._joined(node, one, other)
                 if isinstance(op, ast.FloorDiv | ast.Mod) and kind is int:
-                    return self._form(
-                        "remainder" if isinstance(op, ast.Mod) else "quotient", a, b
-                    ), int
+                    return self._form(type(op).__name__, a, b), int
                 if type(op) in _SIGNS and not (isinstance(op, ast.Div) and kind is int):
                     return f"{a} {_SIGNS[type(op)]} {b}", kind
             case ast.UnaryOp(op=ast.USub(), operand=operand):
@@ -340,9 +352,11 @@ class Translator:
             case ast.BoolOp(op=op, values=values):
                 parts = [self._operand(each, _COMPARISON)[0] for each in values]
                 return f" {_SIGNS[type(op)]} ".join(parts), int
-            case ast.Compare(left=left, ops=ops, comparators=others):
+            case ast.Compare(left=left, ops=ops, comparators=others) if _SIGNS.keys() >= {
+                type(op) for op in ops
+            }:
                 texts = [self._operand(each, _SUM)[0] for each in (left, *others)]
-                signs = [_SIGNS.get(type(op), f"{self.negation}=") for op in ops]
+                signs = [_SIGNS[type(op)].replace("!", self.negation) for op in ops]
                 parts = [f"{texts[i]} {sign} {texts[i + 1]}" for i, sign in enumerate(signs)]
                 return (parts[0] if len(parts) == 1 else f"({' && '.join(parts)})"), int
         raise self._error(node)
@@ -370,11 +384,13 @@ class Translator:
 
     def _attribute(self, node: ast.expr, value: ast.expr, attribute: str) -> Value:
         module = self._kernel.function.__globals__.get(ast.unparse(value))
-        if isinstance(module, ModuleType):  # math.inf
-            return self._number(getattr(module, attribute))
-        if attribute != "size":
+        number = getattr(module, attribute, None)  # math.inf
+        if isinstance(module, ModuleType) and isinstance(number, float):
+            return self._number(number)
+        text, kind = self._value(value)
+        if kind != F64 or attribute != "size":
             raise self._error(node)
-        return self._form("size", self._value(value)[0]), int
+        return self._form("size", text), int
 
     def _subscript(self, node: ast.expr, value: ast.expr, index: ast.expr) -> Value:
         match value, index:
@@ -494,11 +510,6 @@ class Translator:
         self._write(f"{self._value(node)[0]};")
 
 
-def _count(node: ast.AST, name: str) -> int:
-    """Return how often a syntax tree has a name."""
-    return sum(isinstance(each, ast.Name) and each.id == name for each in ast.walk(node))
-
-
 class MatlabTranslator(Translator):
     """Translates kernels to MATLAB, in the subset that Octave has too."""
 
@@ -515,7 +526,7 @@ class MatlabTranslator(Translator):
     }
     first: ClassVar = 1
     forms: ClassVar = {
-        "int": "fix({})", "quotient": "floor({} / {})", "remainder": "mod({}, {})",
+        "int": "fix({})", "FloorDiv": "floor({} / {})", "Mod": "mod({}, {})",
         "size": "numel({})", "shape": "size({}, {})", "item": "{}{{{}}}",
         "range": "for {} = {}:{} - 1", "while": "while {}", "if": "if {}",
     }  # fmt: skip

@@ -59,6 +59,18 @@ def logarithm(x: float) -> float:
     return math.log10(x)
 
 
+def moving_end(n: int) -> float:
+    x = 0.0
+    for _ in range(n):
+        n = n - 1
+        x = x + 1.0
+    return x
+
+
+def contained(x: float) -> float:
+    return 1.0 if x in (1.0, 2.0) else x
+
+
 @BOTH
 @pytest.mark.parametrize(
     ("kernel", "code"),
@@ -72,6 +84,8 @@ def logarithm(x: float) -> float:
         (divided, "i / j"),
         (two_types, "a"),
         (logarithm, "math.log10(x)"),
+        (moving_end, "range(n)"),
+        (contained, "x in (1.0, 2.0)"),
     ],
 )
 def test_unknown_syntax_is_named_with_file_and_line(translator, kernel, code):
