@@ -29,13 +29,13 @@ Value: TypeAlias = tuple[str, Type]
 """Translated expression and its type."""
 
 _MATH = re.compile("atan|atanh|copysign|exp|expm1|floor|log|log1p|sqrt|tan|tanh")
-_RESERVED = re.compile(
-    rf"{_MATH.pattern}|abs|auto|break|case|catch|char|const|continue|default|do|double|else|elseif|"
-    "end|enum|extern|fabs|false|fix|float|for|function|global|goto|if|inline|int|long|max_|min_|mod|"
+RESERVED = re.compile(
+    rf"{_MATH.pattern}|abs|array|auto|break|case|catch|char|const|continue|default|do|double|else|elseif|"
+    "end|enum|extern|fabs|false|fix|float|for|function|global|goto|if|inline|int|long|main|max_|min_|mod|"
     "numel|otherwise|persistent|register|return|short|signed|size|sizeof|static|struct|switch|true|"
     "try|typedef|union|unsigned|void|volatile|while"
 )
-"""Names that variables of a translated kernel cannot have."""
+"""Names that neither a variable of a translated kernel nor an exported function can have."""
 _SIGNS: dict[type[ast.AST], str] = {
     ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/", ast.And: "&&", ast.Or: "||",
     ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!=",
@@ -433,7 +433,7 @@ class Translator:
 
     def _named(self, name: str) -> str:
         name = "count" if name == "_" else name
-        return f"{name}_" if _RESERVED.fullmatch(name) else name
+        return f"{name}_" if RESERVED.fullmatch(name) else name
 
     def _new_name(self) -> str:
         self._temporaries += 1

@@ -11,7 +11,7 @@ import numpy as np
 from hilctl import __version__
 from hilctl.base.errors import InputError
 from hilctl.models.base import HysteresisModel, Operator
-from hilctl.models.kernel_translation import MatlabTranslator, Translator
+from hilctl.models.kernel_translation import RESERVED, MatlabTranslator, Translator
 from hilctl.models.linear_stages import Chain
 from hilctl.models.model_file import model_sha256
 
@@ -50,7 +50,11 @@ def export_text(
     names = f"command_{model.input_unit.lower()}", "displacement_um"
     source, target = names if forward else ("reference_um", names[0])
     facts = _facts(model, operator, sample_rate_hz, forward=forward)
-    return form(output.stem, source, target).text(operator, list(facts))
+    file = form(output.stem, source, target)
+    text = file.text(operator, list(facts))
+    if RESERVED.fullmatch(output.stem) or output.stem in file.translator.functions:
+        raise InputError(f"{output}: the code uses the name {output.stem}: give another name")
+    return text
 
 
 def check_rate(sample_rate_hz: float) -> None:

@@ -145,7 +145,9 @@ def test_matlab_function_is_equal_in_two_blocks(tmp_path):
             np.testing.assert_allclose(found, wanted, 1e-12, 1e-12, err_msg=str(case))
 
 
-@pytest.mark.parametrize("name", ["a.txt", "2a.c", "a b.m", "ä.c", f"{'a' * 49}.c"])
+@pytest.mark.parametrize(
+    "name", ["a.txt", "2a.c", "a b.m", "ä.c", f"{'a' * 49}.c", "play_sum.c", "end.m", "double.c"]
+)
 def test_a_name_that_is_no_function_is_refused(name):
-    with pytest.raises(InputError, match=r"\.c or \.m|letter"):
+    with pytest.raises(InputError, match=r"\.c or \.m|letter|another"):
         export_text(FORMS["ppi"], Path(name), RATE_HZ)
