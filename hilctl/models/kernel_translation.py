@@ -30,10 +30,10 @@ Value: TypeAlias = tuple[str, Type]
 
 _MATH = re.compile("atan|atanh|copysign|exp|expm1|floor|log|log1p|sqrt|tan|tanh")
 RESERVED = re.compile(
-    rf"{_MATH.pattern}|abs|array|auto|break|case|catch|char|const|continue|default|do|double|else|elseif|"
-    "end|enum|extern|fabs|false|fix|float|for|function|global|goto|if|inline|int|long|main|max_|min_|mod|"
-    "numel|otherwise|persistent|register|return|short|signed|size|sizeof|static|struct|switch|true|"
-    "try|typedef|union|unsigned|void|volatile|while"
+    rf"{_MATH.pattern}|abs|array|auto|break|case|catch|char|const|continue|default|do|double|else|"
+    "elseif|end|enum|extern|fabs|false|fix|float|for|function|global|goto|if|inline|int|long|main|"
+    "max_|min_|mod|numel|otherwise|persistent|register|return|short|signed|size|sizeof|static|"
+    "struct|switch|true|try|typedef|union|unsigned|void|volatile|while"
 )
 """Names that neither a variable of a translated kernel nor an exported function can have."""
 _SIGNS: dict[type[ast.AST], str] = {
@@ -155,9 +155,10 @@ class Translator:
     }
     """Functions that differ from those of the language for NaN or -0."""
     forms: ClassVar = {
-        "int": "(int)({})", "FloorDiv": "{} / {}", "Mod": "{} % {}", "size": "{}.n0",
-        "shape": "{}.n{}", "item": "{}.f{}", "range": "for ({0} = {1}; {0} < {2}; {0}++)",
-        "while": "while ({})", "if": "if ({})",
+        "int": "(int)({})", "abs": "fabs({})", "FloorDiv": "{} / {}", "Mod": "{} % {}",
+        "size": "{}.n0", "shape": "{}.n{}", "item": "{}.f{}", "tuple": "({0}){{{1}}}",
+        "range": "for ({0} = {1}; {0} < {2}; {0}++)", "while": "while ({})", "if": "if ({})",
+        "new": "const {} {} = {};", "return": "return {};",
     }  # fmt: skip
 
     def __init__(self) -> None:
@@ -202,13 +203,15 @@ class Translator:
 
     # Statements
 
-    def _statements(self, nodes: Sequence[ast.stmt]) -> None:
+    def _statements(self, nodes: Sequence[ast.stmt], deeper: int = 0) -> None:
+        self._depth += deeper
         for node in nodes:
             if isinstance(node, ast.If | ast.While | ast.For):
                 self._compound(node)
             else:
                 self._check_order(node)
                 self._simple(node)
+        self._depth -= deeper
 
     def _check_order(self, node: ast.stmt) -> None:
         """Refuse a statement that uses an array beside a call that changes it."""
@@ -227,14 +230,14 @@ class Translator:
                     self._store(target, text, kind)
             case ast.AugAssign(target=target, op=op, value=value):
                 self._store(target, *self._value(ast.BinOp(target, op, value)))
-            case ast.Return(value=None):
-                self._return()
             case ast.Return(value=ast.expr() as value):
-                self._return(self._value(value, self._kernel.returns)[0])
+                text, _ = self._value(value, self._kernel.returns)
+                self._write(self._form("return", text))
             case ast.Expr(value=ast.Constant(value=str())):
                 pass  # the docstring
             case ast.Expr(value=ast.Call() as call):
-                self._call_alone(call)
+                if text := self._value(call)[0]:
+                    self._write(f"{text};")
             case ast.Break():
                 self._write("break;")
             case _:
@@ -264,17 +267,11 @@ class Translator:
                 self._write(self._form("if", self._value(test)[0]) + start)
             case _:
                 raise self._error(node)
-        self._indented(lambda: self._statements(node.body))
+        self._statements(node.body, 1)
         if node.orelse:
             self._write(between)
-            self._indented(lambda: self._statements(node.orelse))
+            self._statements(node.orelse, 1)
         self._write(end)
-
-    def _indented(self, write: Callable[[], Any]) -> Any:
-        self._depth += 1
-        result = write()
-        self._depth -= 1
-        return result
 
     def _unpack(self, targets: Sequence[ast.expr], value: ast.expr) -> None:
         values = self._items(value)
@@ -418,7 +415,7 @@ class Translator:
                 if _MATH.fullmatch(name):
                     return self._math(name, *(self._value(arg)[0] for arg in args)), float
             case ast.Call(func=ast.Name(id="abs"), args=[arg]):
-                return self._math("fabs", self._value(arg)[0]), float
+                return self._form("abs", self._value(arg)[0]), float
             case ast.Call(func=ast.Name(id="int"), args=[arg]):
                 text, kind = self._value(arg)
                 return (text if kind is int else self._form("int", text)), int
@@ -474,18 +471,15 @@ class Translator:
         lines = [f"    {kind} {', '.join(sorted(local[kind]))};" for kind in sorted(local)]
         return [head, "{", *lines, *self._lines, "}"]
 
-    def _return(self, text: str = "") -> None:
-        self._write(f"return {text};" if text else "return;")
-
     def _temporary(self, text: str, kind: Type) -> str:
         """Store a value in a new variable, and return its name."""
         name = self._new_name()
-        self._write(f"const {self.type_name(kind)} {name} = {text};")
+        self._write(self._form("new", self.type_name(kind), name, text))
         return name
 
     def tuple_of(self, items: Sequence[str], kind: Type) -> str:
         """Return a tuple."""
-        return f"({self.type_name(kind)}){{{', '.join(items)}}}"
+        return self._form("tuple", self.type_name(kind), ", ".join(items))
 
     def _element(self, array: str, places: Sequence[str]) -> str:
         place = places[0]
@@ -506,9 +500,6 @@ class Translator:
         del node
         return f"{callee.name}({', '.join(args)})"
 
-    def _call_alone(self, node: ast.Call) -> None:
-        self._write(f"{self._value(node)[0]};")
-
 
 class MatlabTranslator(Translator):
     """Translates kernels to MATLAB, in the subset that Octave has too."""
@@ -526,9 +517,10 @@ class MatlabTranslator(Translator):
     }
     first: ClassVar = 1
     forms: ClassVar = {
-        "int": "fix({})", "FloorDiv": "floor({} / {})", "Mod": "mod({}, {})",
-        "size": "numel({})", "shape": "size({}, {})", "item": "{}{{{}}}",
+        "int": "fix({})", "abs": "abs({})", "FloorDiv": "floor({} / {})", "Mod": "mod({}, {})",
+        "size": "numel({})", "shape": "size({}, {})", "item": "{}{{{}}}", "tuple": "{{{1}}}",
         "range": "for {} = {}:{} - 1", "while": "while {}", "if": "if {}",
+        "new": "{1} = {2};", "return": "result_ = {}; return;",
     }  # fmt: skip
 
     def literal(self, value: float) -> str:
@@ -544,41 +536,19 @@ class MatlabTranslator(Translator):
     def _all_named(self, names: Iterable[str]) -> list[str]:
         return [self._named(name) for name in names]
 
-    def _return(self, text: str = "") -> None:
-        if text:
-            self._write(f"result_ = {text};")
-        self._write("return;")
-
-    def _temporary(self, text: str, kind: Type = None) -> str:
-        del kind
-        name = self._new_name()
-        self._write(f"{name} = {text};")
-        return name
-
-    def tuple_of(self, items: Sequence[str], kind: Type) -> str:
-        """Return a tuple."""
-        del kind
-        return f"{{{', '.join(items)}}}"
-
     def _element(self, array: str, places: Sequence[str]) -> str:
         counted = [str(int(each) + 1) if each.isdecimal() else f"{each} + 1" for each in places]
         return f"{array}({', '.join(counted)})"
 
-    def _math(self, name: str, *args: str) -> str:
-        return super()._math("abs" if name == "fabs" else name, *args)
-
     def _choice(self, test: str, body: ast.expr, other: ast.expr) -> Value:
         name, types = self._new_name(), []
-
-        def write(node: ast.expr) -> None:
+        for line, node in ((self._form("if", test), body), ("else", other)):
+            self._write(line)
+            self._depth += 1
             text, kind = self._value(node)
             self._write(f"{name} = {text};")
+            self._depth -= 1
             types.append(kind)
-
-        self._write(self._form("if", test))
-        self._indented(lambda: write(body))
-        self._write("else")
-        self._indented(lambda: write(other))
         self._write("end")
         return name, self._joined(body, *types)
 
@@ -587,10 +557,7 @@ class MatlabTranslator(Translator):
         changed = self._all_named(each.id for each in _changed_by(node, self._kernel.callees))
         if not changed and not isinstance(callee.returns, tuple):
             return text
-        name = self._new_name()
-        results = changed if callee.returns is None else [name, *changed]
+        name = "" if callee.returns is None else self._new_name()
+        results = [name, *changed] if name else changed
         self._write(f"[{', '.join(results)}] = {text};")
         return name
-
-    def _call_alone(self, node: ast.Call) -> None:
-        self._value(node)
