@@ -108,17 +108,18 @@ Shown = TypeVar("Shown", bound=type)
 
 
 def shown_briefly(kind: Shown) -> Shown:
-    """Show the objects of a dataclass in one line, and as a table in a notebook.
+    """Show the objects of a dataclass or a pydantic model in one line, in a notebook as a table.
 
     Arrays and nested objects are named by type and size.
     """
 
     def text(self: Any) -> str:
-        return f"{kind.__name__}({', '.join(f'{key}={value}' for key, value in _rows(self))})"
+        values = (f"{key}={value}" for key, value in _rows(self))
+        return f"{type(self).__name__}({', '.join(values)})"
 
     def table(self: Any) -> str:
         rows = (f"<tr><th>{key}</th><td>{escape(value)}</td></tr>" for key, value in _rows(self))
-        return f"<table><caption>{kind.__name__}</caption>{''.join(rows)}</table>"
+        return f"<table><caption>{type(self).__name__}</caption>{''.join(rows)}</table>"
 
     changed: Any = kind
     changed.__repr__, changed._repr_html_ = text, table
@@ -126,7 +127,8 @@ def shown_briefly(kind: Shown) -> Shown:
 
 
 def _rows(shown: Any) -> list[tuple[str, str]]:
-    return [(each.name, _brief(getattr(shown, each.name))) for each in fields(shown)]
+    names = getattr(type(shown), "model_fields", None) or [each.name for each in fields(shown)]
+    return [(name, _brief(getattr(shown, name))) for name in names]
 
 
 def _brief(value: object) -> str:

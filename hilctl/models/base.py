@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hilctl.base.errors import ModelError
+from hilctl.base.formatting import shown_briefly
 from hilctl.base.strict import CheckedModel, Field, StrictModel, field_validator, model_validator
 from hilctl.base.types import F64, CommandUnit
 from hilctl.kernels.hysteresis import rest_memory
@@ -167,6 +168,7 @@ class Provenance(StrictModel):
     created: str = ""
 
 
+@shown_briefly
 class HysteresisModel(CheckedModel, ABC):
     """Parameters of a model from command to displacement, and of its inverse.
 
@@ -197,6 +199,9 @@ class HysteresisModel(CheckedModel, ABC):
         if self.operators > MAX_OPERATORS:
             raise ValueError(f"must have at most {MAX_OPERATORS} operators: {self.operators}")
         return self
+
+    def __str__(self) -> str:
+        return repr(self)  # that of pydantic lists all numbers
 
     @abstractmethod
     def forward(self, sample_rate_hz: float) -> Operator:

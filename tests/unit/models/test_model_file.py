@@ -34,6 +34,12 @@ def problems_of(text):
     return str(caught.value).split("\n")
 
 
+def test_a_model_is_shown_in_one_line():
+    text = str(terfenol_rdpi())
+    assert text.startswith("RdpiModel(input_unit='A', ")
+    assert f"weights=<tuple of {terfenol_rdpi().operators}>" in text
+
+
 @pytest.mark.parametrize("model", MODELS, ids=lambda model: model.kind)
 def test_round_trip_gives_the_same_model(model, tmp_path):
     text = dump_model(model)
