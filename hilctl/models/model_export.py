@@ -2,7 +2,7 @@
 
 import re
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -107,6 +107,14 @@ def _steps(operator: Operator) -> Iterator[Operator | float]:
         yield operator.output_offset
 
 
+def _lines(texts: Iterable[str]) -> str:
+    return "\n".join(texts)
+
+
+def _prefixed(prefix: str, texts: Iterable[str]) -> str:
+    return _lines(f"{prefix}{text}".rstrip() for text in texts)
+
+
 class _CFile:
     """A C file with the function ``name``, and ``name_reset`` for its memory."""
 
@@ -178,25 +186,45 @@ class _CFile:
             f"    {name}_reset(memory);    at rest",
             f"    {name}(memory, {self.source}, {self.target}, n);    n samples, for each block",
         ]
-        structures = [
-            f"typedef struct {{ {members} }} {kind};"
+        structures = "".join(
+            f"typedef struct {{ {members} }} {kind};\n"
             for kind, members in self.translator.structures.items()
-        ]
-        return "\n".join([
-            "/*", *(f" * {line}".rstrip() for line in head), " */", "",
-            "#include <math.h>", "",
-            f"enum {{ {name}_memory = {size}, {name}_preview = {operator.preview} }};", "",
-            "typedef struct { double *at; int n0, n1, n2; } array;", *structures, "",
-            *self.constants, "",
-            *(f"{each}\n" for each in self.translator.functions.values()),
-            f"void {name}_reset(double *memory)", "{",
-            f"    static const double rest[] = {{\n{self._numbers(operator.state())}\n}};",
-            "    int k;", f"    for (k = 0; k < {size}; k++) memory[k] = rest[k];", "}", "",
-            f"void {name}(double *memory, {signals}, int n)", "{",
-            f"    const array signal = {{{self.target}, n, 1, 1}};", "    int k;",
-            f"    for (k = 0; k < n; k++) {self.target}[k] = {self.source}[k];",
-            *(f"    {line}" for line in self.lines), "}", "",
-        ])  # fmt: skip
+        )
+        return f"""\
+/*
+{_prefixed(" * ", head)}
+ */
+
+#include <math.h>
+
+enum {{ {name}_memory = {size}, {name}_preview = {operator.preview} }};
+
+typedef struct {{ double *at; int n0, n1, n2; }} array;
+{structures}
+{_lines(self.constants)}
+
+{self._functions()}
+
+void {name}_reset(double *memory)
+{{
+    static const double rest[] = {{
+{self._numbers(operator.state())}
+}};
+    int k;
+    for (k = 0; k < {size}; k++) memory[k] = rest[k];
+}}
+
+void {name}(double *memory, {signals}, int n)
+{{
+    const array signal = {{{self.target}, n, 1, 1}};
+    int k;
+    for (k = 0; k < n; k++) {self.target}[k] = {self.source}[k];
+{_prefixed("    ", self.lines)}
+}}
+"""
+
+    def _functions(self) -> str:
+        return "\n\n".join(self.translator.functions.values())
 
 
 class _MatlabFile(_CFile):
@@ -233,13 +261,16 @@ class _MatlabFile(_CFile):
             f"    {call});            from rest",
             f"    {call}, memory);    continued",
         ]
-        return "\n".join([
-            f"function {call}, memory)", *(f"% {line}".rstrip() for line in head),
-            "    if nargin < 2",
-            f"        memory = {self._list(operator.state())};",
-            "    end",
-            *self.constants,
-            f"    {self.target} = {self.source};",
-            *(f"    {line}" for line in self.lines), "end", "",
-            *(f"{each}\n" for each in self.translator.functions.values()),
-        ])  # fmt: skip
+        return f"""\
+function {call}, memory)
+{_prefixed("% ", head)}
+    if nargin < 2
+        memory = {self._list(operator.state())};
+    end
+{_lines(self.constants)}
+    {self.target} = {self.source};
+{_prefixed("    ", self.lines)}
+end
+
+{self._functions()}
+"""

@@ -135,9 +135,12 @@ def test_matlab_function_is_equal_in_two_blocks(tmp_path):
             ]
     (tmp_path / "script.m").write_text("\n".join(script), encoding="utf-8")
     run = subprocess.run(
-        ["octave-cli", "--no-init-file", "script.m"], cwd=tmp_path, capture_output=True, text=True,
+        ["octave-cli", "--no-init-file", "script.m"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
         timeout=280,
-    )  # fmt: skip
+    )
     assert run.returncode == 0, run.stderr
     rows = [np.array(line.split(), dtype=float) for line in run.stdout.splitlines()]
     for case, (out, memory) in zip(cases, zip(rows[::2], rows[1::2], strict=True), strict=True):
