@@ -18,7 +18,8 @@ from pydantic_core import PydanticKnownError
 
 from hilctl.base.errors import ConfigError, ConfigProblem, InputError
 from hilctl.base.files import TextFiles
-from hilctl.base.yaml import Document, broken_rules, did_you_mean, loc_of
+from hilctl.base.formatting import did_you_mean
+from hilctl.base.yaml import Document, broken_rules, loc_of
 from hilctl_drivers.profile_base import BaseProfile
 
 FOLDER = Path(__file__).parent / "profiles"

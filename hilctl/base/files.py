@@ -1,6 +1,5 @@
 """Read text files once, write files atomically, and describe OS errors with a fix."""
 
-import difflib
 import errno
 import os
 import secrets
@@ -11,6 +10,7 @@ from types import TracebackType
 from typing import BinaryIO, Self
 
 from hilctl.base.errors import InputError
+from hilctl.base.formatting import did_you_mean
 
 
 class TextFiles:
@@ -285,5 +285,5 @@ def no_such_file(path: Path) -> str:
         names = [] if path.exists() else [each.name for each in path.parent.iterdir()]
     except OSError:
         names = []
-    close = difflib.get_close_matches(path.name, names, n=1, cutoff=0.75)
-    return f"{path}: no such file" + (f" (did you mean '{close[0]}'?)" if close else "")
+    hint = did_you_mean(path.name, names, listed=True)  # a folder may have many
+    return f"{path}: no such file" + (f" ({hint})" if hint else "")

@@ -1,8 +1,9 @@
 """Format numbers with units and printable texts for people, and JSON for programs."""
 
+import difflib
 import json
 import math
-from collections.abc import Mapping, Sized
+from collections.abc import Iterable, Mapping, Sized
 from dataclasses import fields
 from html import escape
 from pathlib import PurePath
@@ -84,6 +85,27 @@ def short_name(text: str) -> str:
     """Return a printable text of at most :data:`MOST_SHOWN` characters."""
     name = printable(text[: MOST_SHOWN + 1])
     return name if len(name) <= MOST_SHOWN else name[: MOST_SHOWN - 3] + "..."
+
+
+_ALIKE = 0.8  # ratio of the common letters of two names, the rest being typing errors
+_MOST_OFFERED = 3
+
+
+def did_you_mean(word: str, known: Iterable[str], *, listed: bool = False) -> str:
+    """Return a hint with the plausible names, or with all of them unless they are ``listed``."""
+    names = sorted(known)
+    close = difflib.get_close_matches(word, names, n=1, cutoff=_ALIKE)
+    offered = close or [each for each in names if _is_plausible(word, each)]
+    if 0 < len(offered) <= _MOST_OFFERED:
+        return f"did you mean {' or '.join(map(repr, offered))}?"
+    return "" if listed or not names else f"known: {', '.join(names)}"
+
+
+def _is_plausible(word: str, name: str) -> bool:
+    """Return whether a name has the same letters, or one begins or consists of parts of both."""
+    short, long = sorted((word.lower(), name.lower()), key=len)
+    inside = f"_{short}_" in f"_{long}_" or long.startswith(short)
+    return (inside and len(short) > 2) or sorted(short) == sorted(long)
 
 
 def finite_json(value: Any, indent: int | None = None) -> str:

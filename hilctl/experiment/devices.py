@@ -19,7 +19,8 @@ from typing import Any, NamedTuple, cast
 from hilctl.base.device import Device, complete
 from hilctl.base.errors import ConfigError, ConfigProblem, InputError
 from hilctl.base.files import TextFiles
-from hilctl.base.yaml import Document, did_you_mean, load_document
+from hilctl.base.formatting import did_you_mean
+from hilctl.base.yaml import Document, load_document
 
 BUILTIN: dict[str, str] = {
     "simulated_terfenol": "hilctl_drivers.simulated.devices:SimulatedTerfenol",

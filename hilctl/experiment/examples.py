@@ -7,7 +7,8 @@ from typing import Any
 
 from hilctl.base.errors import InputError
 from hilctl.base.files import make_folder, read_text, write_text
-from hilctl.base.yaml import did_you_mean, load_document
+from hilctl.base.formatting import did_you_mean
+from hilctl.base.yaml import load_document
 from hilctl.experiment.devices import shipped_profiles
 
 _PACKAGE = Path(__file__).parents[1]

@@ -15,8 +15,9 @@ from typing import Any
 from hilctl.base.device import DeviceInfo
 from hilctl.base.errors import ConfigError, ConfigProblem, InputError
 from hilctl.base.files import TextFiles
+from hilctl.base.formatting import did_you_mean
 from hilctl.base.types import CommandUnit
-from hilctl.base.yaml import Document, commented, did_you_mean, dump
+from hilctl.base.yaml import Document, commented, dump
 from hilctl.experiment.devices import (
     describe,
     is_path,

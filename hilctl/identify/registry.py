@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from hilctl.base.errors import InputError
-from hilctl.base.yaml import did_you_mean
+from hilctl.base.formatting import did_you_mean
 from hilctl.identify.field.duhem_search import fit_generalised_duhem
 from hilctl.identify.field.field_search import fit_field
 from hilctl.identify.fit_api import FitJob, FoundModel

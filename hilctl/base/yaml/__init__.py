@@ -4,10 +4,10 @@ io.py      documents with the line of every value; settings; plain data as YAML
 errors.py  validation errors in words, and tolerant readings of unambiguous values
 """
 
-from hilctl.base.yaml.errors import Loc, broken_rules, did_you_mean, dotted, loc_of
+from hilctl.base.yaml.errors import Loc, broken_rules, dotted, loc_of
 from hilctl.base.yaml.io import Document, commented, dump, load_document
 
 __all__ = [
-    "Document", "Loc", "broken_rules", "commented", "did_you_mean", "dotted", "dump",
+    "Document", "Loc", "broken_rules", "commented", "dotted", "dump",
     "load_document", "loc_of",
 ]  # fmt: skip

@@ -5,7 +5,6 @@ of a few words and there is only one reading: ``1,5`` is 1.5, but ``1,500`` is a
 rejected.
 """
 
-import difflib
 import re
 import types
 import typing
@@ -17,6 +16,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from hilctl.base.errors import ConfigError, ConfigProblem
+from hilctl.base.formatting import did_you_mean
 
 Loc: TypeAlias = tuple[str | int, ...]
 """Location of a value: keys and list indices."""
@@ -83,15 +83,6 @@ def dotted(loc: Loc) -> str:
 def loc_of(key: str) -> Loc:
     """Return a dotted key as a location; numbers are list indices."""
     return tuple(int(part) if part.isdecimal() else part for part in key.split("."))
-
-
-def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """Return a hint with the closest known name, or with all of them."""
-    names = sorted(known)
-    close = difflib.get_close_matches(word, names, n=1)
-    if close:
-        return f"did you mean '{close[0]}'?"
-    return f"known: {', '.join(names)}" if names else ""
 
 
 def broken_rules(
@@ -205,10 +196,9 @@ def _hint(detail: ErrorDetails, known: Iterable[str]) -> str:
     value, kind = detail["input"], detail["type"]
     if kind == "extra_forbidden":
         return did_you_mean(str(detail["loc"][-1]), known)
-    if kind in _WORDS:  # all are listed: suggest only a close one
+    if kind in _WORDS:  # the rule lists all of them
         given, words = detail.get("ctx", {}).get("tag", value), _QUOTED.findall(_expected(detail))
-        close = difflib.get_close_matches(str(given), words, n=1, cutoff=0.75)
-        return f"did you mean '{close[0]}'?" if close and len(words) > 1 else ""
+        return did_you_mean(str(given), words, listed=True) if len(words) > 1 else ""
     if kind in _NUMBER_TYPES and isinstance(value, str):
         return _number_hint(value)
     if kind in _NUMBER_TYPES and isinstance(value, float) and value.is_integer():

@@ -96,3 +96,29 @@ def test_results_are_shown_in_one_line_and_as_a_table():
     expected = "Result(name='a<b', error_um=1.23457, values=<ndarray [3, 2]>, parts=<tuple of 2>)"
     assert repr(shown) == expected
     assert "<th>name</th><td>&#x27;a&lt;b&#x27;</td>" in shown._repr_html_()
+
+
+KEYS = ("amplifier", "host", "parity", "sample_rate_hz", "serial_port", "tcp_port", "timeout_s")
+
+
+@pytest.mark.parametrize(
+    ("word", "offered"),
+    [
+        ("hosst", ["host"]),
+        ("hsot", ["host"]),
+        ("Host", ["host"]),
+        ("timeout", ["timeout_s"]),
+        ("amp", ["amplifier"]),
+        ("rate_hz", ["sample_rate_hz"]),
+        ("port", ["serial_port", "tcp_port"]),
+        ("host_name", ["host"]),
+        ("hyst", []),
+        ("party_line", []),
+        ("s", []),
+    ],
+)
+def test_only_plausible_names_are_offered_otherwise_all(word, offered):
+    hint = formatting.did_you_mean(word, KEYS)
+    assert [key for key in KEYS if key in hint] == (offered or list(KEYS))
+    assert bool(formatting.did_you_mean(word, KEYS, listed=True)) == bool(offered)
+    assert formatting.did_you_mean(word, []) == ""
