@@ -47,7 +47,7 @@ def _range_problems(loaded: LoadedExperiment) -> Iterator[ConfigProblem]:
         )
     else:
         if low < info.command_min or high > info.command_max:
-            yield loaded.problem("limits", rule, f"{low:g} to {high:g}")
+            yield loaded.problem("limits", rule, f"{low:g} to {high:g}", _narrower(config, info))
         if at_start is not None and not info.command_min <= at_start <= info.command_max:
             yield loaded.problem("safe.at_start", rule, f"{at_start:g}")
     low_um, high_um = config.limits.stroke_um
@@ -58,6 +58,19 @@ def _range_problems(loaded: LoadedExperiment) -> Iterator[ConfigProblem]:
     if model is not None and model.input_unit != unit:
         rule = f"must give commands in {unit}, the unit of {info.name}"
         yield loaded.problem("compensator.model", rule, model.input_unit)
+
+
+def _narrower(config: Experiment, info: DeviceInfo) -> str:
+    """Return the largest limits within the range of a device; empty if there are none."""
+    low, high = config.limits.command_range
+    low, high = max(low, info.command_min), min(high, info.command_max)
+    if not low < high:
+        return ""
+    if config.limits.peak_current_a is None:
+        return f"set limits.{config.limits.range_key} to [{low!r}, {high!r}]"
+    if low < 0.0 < high:
+        return f"set limits.peak_current_a to {min(-low, high)!r}"
+    return f"set limits.drive_a to [{low!r}, {high!r}] instead of limits.peak_current_a"
 
 
 def _pace_problems(loaded: LoadedExperiment) -> Iterator[ConfigProblem]:

@@ -9,6 +9,7 @@ import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from decimal import ROUND_CEILING, Context
 
 import numpy as np
 
@@ -205,8 +206,8 @@ def _start_problems(
     rests_um = float(still[-1])
     rule = f"must begin where the actuator rests at {safe:g} {unit}, {rests_um:.4g} µm by the model"
     hint = (
-        f"its first command would step to {first:.4g} {unit}: set waveform.offset, and "
-        "leave out the soft start, which begins at 0 µm"
+        f"its first command would step to {first:.4g} {unit}: set waveform.rest to "
+        f"{rests_um:.4g} and waveform.soft_start_s, or begin there"
     )
     value = f"{float(begun.input_um[:1][0]):.4g} µm"
     return [loaded.problem("waveform", rule, value, hint)]
@@ -227,9 +228,17 @@ def reference_problems(
         if excess > 0.0:
             rule = f"reference must stay within {name}, {lowest:g} to {highest:g} µm"
             value = f"{low:.6g} to {high:.6g} µm"
-            hint = f"{excess:.3g} µm too far: change the waveform's amplitude or offset"
+            hint = f"{excess:.3g} µm too far: {_fitting(low, high, lowest, highest)}"
             found.append(loaded.problem("waveform", rule, value, hint))
     return found
+
+
+def _fitting(low: float, high: float, lowest: float, highest: float) -> str:
+    """Return the changes with which a waveform from ``low`` to ``high`` keeps to a range."""
+    fits, centred = high - low <= highest - lowest, lowest <= 0.5 * low + 0.5 * high <= highest
+    if fits:
+        return f"change the waveform's {'amplitude or offset' if centred else 'offset'}"
+    return f"lower the waveform's amplitude{'' if centred else ', and change its offset'}"
 
 
 def command_problems(loaded: LoadedExperiment, forecast: Forecast) -> list[ConfigProblem]:
@@ -245,16 +254,40 @@ def command_problems(loaded: LoadedExperiment, forecast: Forecast) -> list[Confi
     excess = max(low - forecast.command_min, forecast.command_max - high)
     if excess > 0.0:
         key = f"limits.{limits.range_key}"
-        hint = f"{excess:.3g} {unit} too much: lower the waveform's amplitude, or raise the limit"
+        fitting = _fitting(forecast.command_min, forecast.command_max, low, high)
+        hint = f"{excess:.3g} {unit} too much: {fitting}, or {_wider(loaded, forecast)}"
         rule = f"the run must stay within {low:g} to {high:g} {unit}"
         found.append(loaded.problem(key, rule, span, hint))
     if forecast.slew_per_s > limits.slew_per_s:
         key = "limits.slew_v_per_s" if unit == "V" else "limits.slew_a_per_s"
         times = forecast.slew_per_s / limits.slew_per_s
-        hint = f"{times:.3g} times the limit: lower the frequency, soften the start, or raise it"
+        hint = (
+            f"{times:.3g} times the limit: lower frequency or amplitude, soften jumps "
+            f"(soft_start_s, soft_end_s, rise_s), or raise {key} to {_up(forecast.slew_per_s):g}"
+        )
         rule = f"the run must change no faster than {limits.slew_per_s:g} {unit}/s"
         found.append(loaded.problem(key, rule, f"{forecast.slew_per_s:.6g}", hint))
     return [*found, *_budget_problems(loaded, forecast)]
+
+
+def _wider(loaded: LoadedExperiment, forecast: Forecast) -> str:
+    """Return the limit that a run needs, or that its device has no such range."""
+    limits, info = loaded.config.limits, loaded.device.info
+    low, high = limits.command_range
+    low, high = min(low, -_up(-forecast.command_min)), max(high, _up(forecast.command_max))
+    span = f"[{low!r}, {high!r}]"
+    if limits.peak_current_a is not None:
+        high = max(high, -low)
+        low, span = -high, f"{high:g}"
+    if info.command_min <= low and high <= info.command_max:
+        return f"raise limits.{limits.range_key} to {span} if the actuator allows it"
+    span = f"{info.command_min:g} to {info.command_max:g} {info.command_unit}"
+    return f"use a device with a larger range than {info.name}, {span}"
+
+
+def _up(value: float) -> float:
+    """Return a number rounded up to four digits."""
+    return float(Context(prec=4, rounding=ROUND_CEILING).create_decimal_from_float(value))
 
 
 def _budget_problems(loaded: LoadedExperiment, forecast: Forecast) -> Iterator[ConfigProblem]:

@@ -1,5 +1,6 @@
 """Preflight: what is computed and rejected before anything moves."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -206,6 +207,52 @@ class TestCommand:
         keys = ["limits.peak_current_a", "limits.slew_a_per_s"]
         assert [problem.key for problem in found] == keys
         assert found[0].value == "-1e+308 to 1e+308 A"
+
+
+VOLTS = (
+    CURRENT.replace("unit: A", "unit: V")
+    .replace("peak_current_a: 7.0", "drive_v: [0.0, 6.0]")
+    .replace("slew_a_per_s", "slew_v_per_s")
+)
+ADVISED = re.compile(r"(?:set|raise) (\S+) to (\[.*?\]|[-\d.e+]+)")
+
+
+@pytest.mark.parametrize(
+    ("text", "settings", "given", "advised", "others"),
+    [
+        (CURRENT, ["limits.peak_current_a=6.1234567"], {}, "raise limits.peak_current_a to 6.5",
+         [["waveform.amplitude=5.6"], ["waveform.offset=0.1"]]),
+        (CURRENT, ["limits.peak_current_a=6.0", "waveform.amplitude=7.9"],
+         {}, "fake, -8 to 8 A", [["waveform.amplitude=5.5"]]),
+        (CURRENT, ["waveform.offset=9.0", "limits.slew_a_per_s=1e6"], {}, "fake, -8 to 8 A",
+         [["waveform.offset=1.0"]]),
+        (CURRENT, ["waveform.offset=9.0", "waveform.amplitude=8.0", "limits.slew_a_per_s=1e6"],
+         {}, "fake, -8 to 8 A", [["waveform.offset=1.0", "waveform.amplitude=6.0"]]),
+        (CURRENT, ["limits.peak_current_a=9.0"], {}, "set limits.peak_current_a to 8.0", []),
+        (CURRENT, ["waveform.offset=3.5", "waveform.amplitude=3.0", "limits.slew_a_per_s=1e6"],
+         {"command_min": 0.0, "command_max": 20.0}, "limits.drive_a to [0.0, 7.0]", []),
+        (VOLTS, [], {"command_unit": "V"}, "raise limits.drive_v to [-5.5, 6.5]",
+         [["waveform.offset=0.0", "limits.drive_v=[-6.0, 6.0]"]]),
+        (CURRENT, ["limits.slew_a_per_s=123.4567"], {}, "raise limits.slew_a_per_s to 5000",
+         [["waveform.soft_start_s=0.5", "waveform.frequency_hz=2.0"]]),
+        (DISPLACEMENT, ["limits.stroke_um=[-5.0, 60.0]"], {}, "amplitude or offset",
+         [["waveform.amplitude=4.5"], ["waveform.offset=6.0"]]),
+        (DISPLACEMENT, ["limits.stroke_um=[-9.0, 9.0]"], {}, "lower the waveform's amplitude",
+         [["waveform.amplitude=8.5"]]),
+        (DISPLACEMENT, ["limits.slew_a_per_s=400.0"], {"offset_um": 20.0}, "set waveform.rest to",
+         []),
+    ],
+)  # fmt: skip
+def test_what_a_message_advises_passes_the_check(text, settings, given, advised, others):
+    offset_um = given.pop("offset_um", 0.0)
+    model = terfenol_rdpi().model_copy(update={"output_offset_um": offset_um})
+    given = given | ({"model": model} if text is DISPLACEMENT else {})
+    (found,) = refusals(text, *settings, **given)
+    assert advised in found.hint
+    cures = [[f"{key}={value}"] for key, value in ADVISED.findall(found.hint)] + others
+    for cure in cures:
+        instead = ["limits.peak_current_a=null"] if "limits.drive_a" in cure[0] else []
+        checked(text, *settings, *cure, *instead, **given)
 
 
 class TestBudget:
