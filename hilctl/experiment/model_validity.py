@@ -11,11 +11,13 @@ from hilctl.models.base import IdentifiedRange
 from hilctl.waveforms.build import Reference
 from hilctl.waveforms.shapes import LONG, telling_samples
 
-WINDOW_S = 0.2
+WINDOW_S = 0.2  # shortest window
+PERIODS = 8.0  # of the slowest motion in a window
 FEWEST_SAMPLES = 256  # of a window
-BATCH = 64  # windows at a time, to bound the memory
+BATCH = 1_000_000  # samples of the windows that are transformed together, to bound the memory
+LINE = 2.0  # frequency steps by which a window broadens a sine
 ALL, MOST = 0.999, 0.5  # parts of a signal's power
-STILL = 0.02  # of the largest motion: quieter windows are ignored
+QUIET = 0.02  # of the largest motion: quieter windows are ignored
 MARGIN = 1.1  # of the highest frequency
 FAR = 2.0  # the same, above which a run is rejected
 SMALL = 0.5  # of the smallest motion
@@ -28,7 +30,7 @@ class Spectrum:
     """Frequencies of a signal."""
 
     main_hz: float  # half of the power lies below it; maximum over all windows
-    highest_hz: float  # 99.9 % of the power lies below it; maximum over all windows
+    highest_hz: float  # 99.9 % of the power lies below it, of a sine its frequency; likewise
     resolution_hz: float
 
 
@@ -43,14 +45,18 @@ class RangeFindings:
 def spectrum(
     values: F64,  # float64[n]
     sample_rate_hz: float,
+    slowest_hz: float,  # frequency that is to be resolved
     least_move: float = 0.0,  # peak-to-peak value below which a window is ignored
     told: tuple[slice, ...] | None = None,  # representative parts; None for the whole signal
 ) -> Spectrum:
     """Return the frequencies of a signal, window after window."""
-    size = min(max(round(WINDOW_S * sample_rate_hz), FEWEST_SAMPLES), values.size)
+    parts = told or (slice(0, values.size),)
+    longest = max(part.stop - part.start for part in parts)
+    window = max(WINDOW_S, PERIODS / slowest_hz) * sample_rate_hz
+    size = int(min(max(window, FEWEST_SAMPLES), longest))
     step_hz = sample_rate_hz / size
     main = highest = 0
-    for windows in _windows(values, size, told or (slice(0, values.size),)):
+    for windows in _windows(values, size, parts):
         batch = windows[np.ptp(windows, axis=1) > least_move]
         if not len(batch):
             continue
@@ -58,15 +64,15 @@ def spectrum(
         power = np.cumsum(np.abs(np.fft.rfft(tapered, axis=1)) ** 2, axis=1)
         main = max(main, int((power < MOST * power[:, -1:]).sum(axis=1).max()))
         highest = max(highest, int((power < ALL * power[:, -1:]).sum(axis=1).max()))
-    return Spectrum(main * step_hz, highest * step_hz, step_hz)
+    return Spectrum(main * step_hz, max(main, highest - LINE) * step_hz, step_hz)
 
 
 def _windows(values: F64, size: int, parts: tuple[slice, ...]) -> Iterator[F64]:
     """Yield batches of windows that overlap by half: float64[k, size]."""
-    hop = max(size // 2, 1)
+    hop, rows = max(size // 2, 1), max(BATCH // size, 1)
     for part in parts:
-        for start in range(part.start, part.stop - size + 1, hop * BATCH):
-            piece = values[start : min(start + hop * (BATCH - 1) + size, part.stop)]
+        for start in range(part.start, part.stop - size + 1, hop * rows):
+            piece = values[start : min(start + hop * (rows - 1) + size, part.stop)]
             yield np.lib.stride_tricks.sliding_window_view(piece, size)[::hop]
 
 
@@ -78,20 +84,28 @@ def _lines(batch: F64) -> F64:
     return lines
 
 
-def range_findings(known: IdentifiedRange, reference: Reference) -> RangeFindings:
+UNKNOWN = (
+    "compensator.model has no provenance.identified_range, so its error on this reference is "
+    "unknown: identify it again, or add the range that it was identified on"
+)
+
+
+def range_findings(known: IdentifiedRange | None, reference: Reference) -> RangeFindings:
     """Compare a reference in um with the motions a model was identified on."""
+    if known is None:
+        return RangeFindings(warnings=(UNKNOWN,))
     rate_hz, told = reference.sample_rate_hz, reference.telling
-    found = spectrum(reference.values, rate_hz, STILL * known.peak_to_peak_um[1], told)
     low_hz, high_hz = known.frequency_hz
-    beyond = 2.0 * found.resolution_hz  # broadening by the window
-    if found.main_hz > FAR * high_hz + beyond:
+    still_um = QUIET * known.peak_to_peak_um[1]
+    found = spectrum(reference.values, rate_hz, high_hz, still_um, told)
+    if found.main_hz > FAR * high_hz + found.resolution_hz:
         text = (
             f"the reference moves at about {found.main_hz:.3g} Hz, and the model was identified "
             f"on {_span(low_hz, high_hz)} Hz"
         )
         return RangeFindings(refused=(text,))
     warnings = list(_motion_warnings(known, reference))
-    if found.highest_hz > MARGIN * high_hz + beyond:
+    if found.highest_hz > MARGIN * high_hz + found.resolution_hz:
         warnings.append(
             f"the reference has frequencies up to about {found.highest_hz:.3g} Hz; the model was "
             f"identified on {_span(low_hz, high_hz)} Hz"

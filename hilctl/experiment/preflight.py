@@ -106,9 +106,9 @@ def check(
     except InputError as error:
         raise ConfigError([*problems, loaded.problem("waveform", str(error))]) from None
     _warn_of_long_work(reference)
-    known = loaded.model.provenance.identified_range if loaded.model else None
-    in_um = reference.unit == "um"
-    findings = range_findings(known, reference) if known and in_um else RangeFindings()
+    findings = RangeFindings()
+    if loaded.model is not None and reference.unit == "um":
+        findings = range_findings(loaded.model.provenance.identified_range, reference)
     problems += reference_problems(loaded, reference.unit, *reference.span)
     hint = "identify the model on such motions, or keep the waveform within those it was fitted on"
     problems += [loaded.problem("waveform", text, hint=hint) for text in findings.refused]

@@ -16,7 +16,7 @@ from scipy.optimize import nnls
 
 import hilctl
 from hilctl.base.types import F64, I64
-from hilctl.experiment.model_validity import ALL, spectrum
+from hilctl.experiment.model_validity import ALL, QUIET, spectrum
 from hilctl.identify.data.records import (
     FEWEST_POINTS,
     History,
@@ -242,7 +242,11 @@ def frequencies_hz(record: Record) -> tuple[float, float]:
         return record.frequency_hz, record.frequency_hz * harmonics
     first = int(np.searchsorted(power, LEAST * power[-1]))
     lowest = float(rfftfreq(command.size, 1.0 / record.sample_rate_hz)[max(first, 1)])
-    return lowest, max(lowest, spectrum(command, record.sample_rate_hz).highest_hz)
+    quiet = QUIET * float(np.ptp(command))
+    rate_hz = record.sample_rate_hz
+    main_hz = spectrum(command, rate_hz, lowest, quiet).main_hz
+    # The end of a sweep is resolved by windows that are not longer than its fast motions need.
+    return lowest, max(lowest, spectrum(command, rate_hz, max(lowest, main_hz), quiet).highest_hz)
 
 
 VERSIONS = {"hilctl": hilctl.__version__, "numpy": np.__version__, "scipy": scipy.__version__}

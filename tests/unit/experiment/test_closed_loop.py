@@ -23,6 +23,7 @@ from hilctl.experiment.closed_loop import (
     worst_inputs,
 )
 from hilctl.experiment.load import resolve
+from hilctl.experiment.model_validity import UNKNOWN
 from hilctl.experiment.preflight import check
 from hilctl.loop.adaptation import DisplacementOperator
 from hilctl.loop.compensator import Compensator
@@ -225,11 +226,11 @@ def test_bounds_follow_from_what_else_acts(load):
 
 
 def test_what_adaptation_can_not_do_is_said(load):
-    assert check(load("adaptation={noise_um: 0.03}")).warnings == ()
-    (text,) = check(load("adaptation={noise_um: 0.03, time_constant_s: 0.09}")).warnings
+    assert check(load("adaptation={noise_um: 0.03}")).warnings == (UNKNOWN,)
+    (_, text) = check(load("adaptation={noise_um: 0.03, time_constant_s: 0.09}")).warnings
     assert "0.09 s" in text
     nothing = "adaptation={noise_um: 0.03, gain: 0.0, weight: 0.0}"
-    (text,) = check(load(nothing, INTEGRAL)).warnings
+    (_, text) = check(load(nothing, INTEGRAL)).warnings
     assert text.startswith("adaptation has no effect")
 
 

@@ -58,8 +58,26 @@ def test_what_hardly_moves_has_no_frequency():
     rest = np.concatenate((sine(20.0), sine(900.0, 0.5), np.zeros(5000)))
     assert not findings(rest).refused
     assert findings(rest).warnings == ()
-    assert spectrum(np.zeros(1000), RATE_HZ).highest_hz == 0.0
+    assert spectrum(np.zeros(1000), RATE_HZ, 10.0).highest_hz == 0.0
 
 
 def test_a_reference_shorter_than_a_window_is_one():
-    assert spectrum(sine(100.0, 1.0, 0.03), RATE_HZ).main_hz == pytest.approx(100.0, abs=40.0)
+    found = spectrum(sine(100.0, 1.0, 0.03), RATE_HZ, 10.0)
+    assert found.main_hz == pytest.approx(100.0, abs=40.0)
+
+
+@pytest.mark.parametrize("frequency_hz", [0.3, 1.0, 7.77, 37.0, 800.0])
+def test_the_highest_frequency_of_a_sine_is_its_own(frequency_hz):
+    found = spectrum(sine(frequency_hz, seconds=30.0), RATE_HZ, frequency_hz)
+    assert found.highest_hz == pytest.approx(frequency_hz, abs=0.6 * found.resolution_hz)
+    assert found.resolution_hz <= max(frequency_hz / 8.0, 5.0) * 1.01
+
+
+def test_a_slow_model_bounds_the_reference_as_well():
+    slow = KNOWN.model_copy(update={"frequency_hz": (1.0, 1.0)})
+    segment = Segment("s", 0, 100_000, 0, 100_000, 0.0)
+    for frequency_hz, warned, refused in ((1.0, 0, 0), (1.6, 1, 0), (2.5, 0, 1)):
+        values_um = sine(frequency_hz, seconds=10.0)
+        reference = Reference(values_um, "um", RATE_HZ, (segment,), (-40.0, 40.0))
+        found = range_findings(slow, reference)
+        assert (len(found.warnings), len(found.refused)) == (warned, refused)

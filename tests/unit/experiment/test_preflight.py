@@ -18,6 +18,7 @@ from hilctl.experiment.correction import Correction, LearnedCycle, signature
 from hilctl.experiment.device_state import InitialState
 from hilctl.experiment.file import CompensatorConfig
 from hilctl.experiment.load import resolve
+from hilctl.experiment.model_validity import UNKNOWN
 from hilctl.experiment.preflight import check, command_problems
 from hilctl.models.base import HysteresisModel, IdentifiedRange, Operator, Provenance
 from hilctl.models.model_file import model_sha256
@@ -395,6 +396,7 @@ def test_a_reference_beyond_what_the_model_was_identified_on_is_warned_or_refuse
     assert "repeats at 10 Hz" in check(loaded(DISPLACEMENT, model=within(30.0))).warnings[0]
     (problem,) = refused(loaded(DISPLACEMENT, "waveform.frequency_hz=60", model=within(10.0)))
     assert (problem.key, "60 Hz" in problem.rule) == ("waveform", True)
+    assert check(loaded(DISPLACEMENT, model=terfenol_rdpi())).warnings == (UNKNOWN,)
 
 
 def test_a_reference_that_begins_beside_the_rest_position_is_moved_not_hurried():
