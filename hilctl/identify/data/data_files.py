@@ -13,11 +13,14 @@ from hilctl.base.table import Column, Table
 from hilctl.base.table_file import open_table
 from hilctl.base.types import F64, CommandUnit
 from hilctl.identify.data.cycles import find_cycles, loops_from_pieces
+from hilctl.identify.data.data_faults import correlation
 from hilctl.identify.data.records import History, Record
 from hilctl.identify.settings import IdentifySettings, TableSettings
 from hilctl.recording.reader import RecordingStream
 from hilctl.recording.recording import Recording
 
+SLOWEST_HZ, SMALLEST_UM = 10.0, 0.5  # sample rate and stroke, below which units are in doubt
+FOLLOWS = 0.5  # correlation with the command of a displacement that is more than noise
 UNEVEN = 0.5  # maximum deviation of a time step from the median, due to rounding in text
 
 
@@ -59,16 +62,35 @@ def read_table(path: Path, settings: TableSettings) -> TableRecord:
         parts.insert(0, f"time {_called(table, time, 's')}")
     found = table.read(wanted, settings.first_row, settings.last_row)
     rate_hz = settings.rate_hz or found.sample_rate_hz(2, UNEVEN, per_s)
-    history = History(
-        path.name,
-        found.values[0] * command_scale,
-        found.values[1] * scale,
-        rate_hz,
-        settings.ignore,
-    )
+    signals = found.values[0] * command_scale, found.values[1] * scale
+    history = History(path.name, *signals, rate_hz, settings.ignore)
+    if per_s == 1.0 and settings.rate_hz is None:
+        _check_rate(path, rate_hz)
+    if scale == 1.0 and settings.displacement_scale is None:
+        _check_stroke(path, history)
     size = f"{found.lines.size} rows at {rate_hz:.6g} Hz"
     understood = f"{path.name}: {', '.join(parts)}; {size}"
     return TableRecord(history, cast("CommandUnit | None", unit or None), understood)
+
+
+def _check_rate(path: Path, rate_hz: float) -> None:
+    """Raise DataError if a time column is probably in ms."""
+    if rate_hz < SLOWEST_HZ:
+        raise DataError(
+            f"{path}: {rate_hz:.4g} samples per second are few: instead of --time-column, set "
+            f"--rate-hz {1e3 * rate_hz:.6g} if the time is in ms, or --rate-hz {rate_hz:.6g} if it "
+            "is in s"
+        )
+
+
+def _check_stroke(path: Path, history: History) -> None:
+    """Raise DataError if a displacement is probably in mm."""
+    move_um = float(np.ptp(history.displacement_um))
+    if move_um < SMALLEST_UM and abs(correlation(history.command, history)) > FOLLOWS:
+        raise DataError(
+            f"{path}: the displacement moves by {move_um:.3g} µm only: set --displacement-scale "
+            "1000 if it is in mm, or --displacement-scale 1 if it is in um"
+        )
 
 
 def _column(table: Table, column: Column, option: str) -> int:

@@ -201,7 +201,9 @@ class Equations:
         normal[np.diag_indices_from(normal)] += 1e-12 * float(normal.diagonal().max())
         corner = cholesky(normal)
         downhill = left.T @ right + rows.T @ (self._wanted - rows @ self._lows)
-        more, _ = nnls(corner, solve_triangular(corner, downhill, trans=1))
+        more, _ = nnls(
+            corner, solve_triangular(corner, downhill, trans=1), maxiter=100 * downhill.size
+        )
         found = self._lows + more
         return found, mean - float(means @ found)
 

@@ -59,6 +59,7 @@ POINTS = 90  # samples kept of the fastest cycle
 SMOOTHED = 0.09  # window, in radians of the fastest cycle
 OFF = 5e-4  # deviation of straight lines from the displacement, of its peak-to-peak
 COMMAND_OFF = 1e-4  # the same for commands, at whose turns the operators turn
+SLOWEST_HZ = 0.35  # least top_hz: the longest lag, 1 s, belongs to it
 LONGEST = 0.3  # longest step, in cycles of the fastest
 
 
@@ -129,7 +130,8 @@ class Prepared:
         self._points, self._command_off = points, command_off
         self.reach = max(0.5 * float(np.ptp(record.command)) for record in records)
         self.stroke_um = max(float(np.ptp(record.displacement_um)) for record in records)
-        self.top_hz = max(_speed(record) for record in records) / (2.0 * math.pi * self.reach)
+        fastest = max(_speed(record) for record in records)
+        self.top_hz = max(fastest / (2.0 * math.pi * self.reach), SLOWEST_HZ)
         self.runs: Sequence[Run] = parallel_map(self._run, records)
 
     def _run(self, record: History) -> Run:

@@ -15,12 +15,12 @@ from hilctl.base.errors import DataError, InputError
 from hilctl.base.files import check_writable, write_text
 from hilctl.base.formatting import shown_briefly
 from hilctl.base.samples import Flag
+from hilctl.identify.data.data_faults import data_reasons
 from hilctl.identify.data.data_files import history_from_pieces
 from hilctl.identify.data.records import History
 from hilctl.identify.evaluation import judgement_of
 from hilctl.identify.fit_api import FitData, OnProgress, ignore_progress
 from hilctl.identify.fit_model import VERSIONS, error_table, identified_range
-from hilctl.identify.model_quality import data_reasons
 from hilctl.identify.model_selection import HeldOut, folds_of
 from hilctl.identify.refine.residual_fit import ResidualFit
 from hilctl.models.base import HysteresisModel, IdentifiedRange, Provenance

@@ -125,6 +125,27 @@ def test_a_history_of_one_amplitude_or_frequency_tells_nothing_of_others(
     t = np.arange(4000) / 2000.0
     noise = 0.0005 * np.random.default_rng(3).standard_normal(t.size)
     history = History("h", command(t) + noise, command(t), 2000.0)
-    unknown = model_quality._unknown([history], FitSettings(kind="field"), object())
-    assert ["one amplitude" in text for text in unknown] == [True] * one_amplitude
+    assert len(model_quality._one_amplitude([history])) == one_amplitude
     assert len(model_quality._one_frequency([history])) == one_frequency
+
+
+def test_one_frequency_or_amplitude_is_good_for_a_ppi_at_most():
+    time_s = np.arange(4000) / 1000.0
+    for command in (np.sin(10.0 * time_s), np.sin(10.0 * time_s) * (3.0 - 0.5 * time_s)):
+        displacement_um = TRUTH.forward(1000.0).process(5.0 * command)
+        history = History("sine", 5.0 * command, displacement_um, 1000.0)
+        assert judged([history]).verdict.grade == "good"
+        for kind in ("rdpi", "integrated"):
+            settings = FitSettings(kind=kind, plays=4, starts=1, weight_by="equal")
+            verdict = identify_records(FitRequest([history], settings, "A")).verdict
+            assert verdict.grade != "good"
+            assert any("at other frequencies" in note for note in verdict.notes)
+
+
+def test_a_drift_is_named_with_its_rate():
+    time_s = np.arange(4000) / 500.0
+    command = 5.0 * np.sin(6.0 * time_s) * np.cos(time_s)
+    displacement_um = TRUTH.forward(500.0).process(command) + 6.0 * time_s
+    assert "drifts by about 6" in str(
+        judged([History("h", command, displacement_um, 500.0)]).verdict
+    )

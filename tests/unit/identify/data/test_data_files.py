@@ -210,3 +210,30 @@ def test_unreadable_and_empty_tables(tmp_path):
         table(write(tmp_path, ["v,y"]), 1, 2, rate_hz=1.0)
     with pytest.raises(DataError, match="40 rows"):
         table(write(tmp_path, rows(",")), 2, 3, rate_hz=1.0, first_row=51)
+
+
+@pytest.mark.parametrize(
+    ("head", "time", "um", "cures"),
+    [
+        ("t,drive,gap", 2.0, 30.0, [{"rate_hz": 500.0}, {"rate_hz": 0.5}]),
+        ("t_s,drive,gap", 2.0, 30.0, [{"rate_hz": 500.0}]),
+        ("t_ms,drive,gap_um", 200.0, 30.0, []),
+        ("t,drive,gap", 0.002, 0.03, [{"displacement_scale": 1000.0}, {"displacement_scale": 1.0}]),
+        ("t,drive,gap_um", 0.002, 0.03, [{"displacement_scale": 1000.0}]),
+        ("t,drive,gap_nm", 0.002, 30.0, []),
+    ],
+)
+def test_units_in_doubt_are_refused_until_an_option_confirms_them(tmp_path, head, time, um, cures):
+    rows = [f"{time * k!r},{k % 50},{um * (k % 50) / 49!r}\n" for k in range(200)]
+    (tmp_path / "t.csv").write_text(f"{head}\n{''.join(rows)}")
+    columns = {"command_column": "drive", "displacement_column": head.split(",")[2], "unit": "V"}
+    columns["time_column"] = head.split(",")[0]
+    if cures:
+        with pytest.raises(DataError) as caught:
+            read_table(tmp_path / "t.csv", TableSettings(**columns))
+    for cure in cures or [{}]:
+        ((key, value),) = cure.items() or [("time_column", columns["time_column"])]
+        if cures:
+            assert f"--{key.replace('_', '-')} {value:g}" in str(caught.value)
+        given = {**columns, **cure, **({"time_column": None} if key == "rate_hz" else {})}
+        assert read_table(tmp_path / "t.csv", TableSettings(**given)).history.command.size == 200
