@@ -296,11 +296,16 @@ def _budget_problems(loaded: LoadedExperiment, forecast: Forecast) -> Iterator[C
     if used_s is None or highest_a is None or rms_a is None:
         return
     rule = f"the coil must stay within {rms_a:g} A rms over {limits.thermal_time_constant_s:g} s"
-    by = "condition" if used_s < forecast.before_s else "waveform"
-    hint = (
-        f"{highest_a - rms_a:.3g} A too much, and the budget is used up after {used_s:.4g} s: "
-        f"lower the {by}'s amplitude, or shorten the run"
-    )
+    left_s = used_s - forecast.before_s
+    if abs(loaded.config.safe.value) > rms_a:
+        cure = "lower safe.value"
+    elif left_s <= 0.0:
+        cure = "lower the condition's amplitude or cycles"
+    else:
+        shorter = f"end it within {-_up(-left_s):g} s"
+        cure = f"lower the waveform's amplitude or offset, or {shorter}"
+    used = f"the budget is used up after {used_s:.4g} s"
+    hint = f"{highest_a - rms_a:.3g} A too much, and {used}: {cure}"
     begins_a = forecast.begins_rms_a or 0.0
     pause_s = CoolingCoil(loaded.config, begins_a**2, 0.0).pause_s(forecast.heat, 0.0)
     if pause_s > 0.0 and forecast.heat.hottest_a2 > loaded.config.safe.value**2:

@@ -215,6 +215,7 @@ VOLTS = (
     .replace("peak_current_a: 7.0", "drive_v: [0.0, 6.0]")
     .replace("slew_a_per_s", "slew_v_per_s")
 )
+HEAT = ["limits.rms_current_a=3.5", "limits.thermal_time_constant_s=0.6"]
 ADVISED = re.compile(r"(?:set|raise) (\S+) to (\[.*?\]|[-\d.e+]+)")
 
 
@@ -236,6 +237,12 @@ ADVISED = re.compile(r"(?:set|raise) (\S+) to (\[.*?\]|[-\d.e+]+)")
          [["waveform.offset=0.0", "limits.drive_v=[-6.0, 6.0]"]]),
         (CURRENT, ["limits.slew_a_per_s=123.4567"], {}, "raise limits.slew_a_per_s to 5000",
          [["waveform.soft_start_s=0.5", "waveform.frequency_hz=2.0"]]),
+        (CURRENT, HEAT, {}, "end it within 0.63",
+         [["waveform.duration_s=0.6333"], ["waveform.amplitude=4.0"]]),
+        (CURRENT, [*HEAT, "waveform.amplitude=1.0", "condition={decay: 1.0, cycles: 50}"], {},
+         "condition's amplitude", [["condition.amplitude_a=3.0"], ["condition.cycles=3"]]),
+        (CURRENT, [*HEAT, "limits.slew_a_per_s=1e6", "safe.value=3.6"], {}, "lower safe.value",
+         [["safe.value=0.0", "waveform.amplitude=4.0"]]),
         (DISPLACEMENT, ["limits.stroke_um=[-5.0, 60.0]"], {}, "amplitude or offset",
          [["waveform.amplitude=4.5"], ["waveform.offset=6.0"]]),
         (DISPLACEMENT, ["limits.stroke_um=[-9.0, 9.0]"], {}, "lower the waveform's amplitude",
