@@ -107,12 +107,12 @@ def _still(record: Record, settings: FitSettings) -> str:
     """Return in which part of a history the displacement does not move and the command does."""
     if not isinstance(record, History):
         return ""
-    turns = turning_points(record.command)
+    turns, y = turning_points(record.command), record.displacement_um
     command = np.abs(np.diff(record.command[turns]))
-    moves_um = np.abs(np.diff(record.displacement_um[turns]))
     large = np.flatnonzero(command > LARGE * command.max(initial=0.0))
     if not large.size:
         return ""
+    moves_um = np.maximum.reduceat(y, turns) - np.minimum.reduceat(y, turns)
     gains = moves_um[large] / command[large]
     dead = np.flatnonzero(gains < DEAD * np.median(gains))
     if dead.size < FEWEST_DEAD or np.any(np.diff(dead) > 1):
