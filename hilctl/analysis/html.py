@@ -41,12 +41,12 @@ h2 { font-size: 1.1rem; margin: 1.8rem 0 .5rem; border-bottom: 1px solid var(--l
 .headline { font-size: 1.1rem; margin: .8rem 0; }
 .note, .bad { border-left: 4px solid #e69f00; padding: .5rem .8rem; background: var(--note); }
 .bad { border-color: #d55e00; background: var(--bad); }
-.side { display: grid; gap: 0 2.5rem; align-items: start;
-  grid-template-columns: repeat(auto-fit, minmax(min(100%, 27rem), 1fr)); }
-.figures { columns: 20.1rem; column-gap: 1.5rem; }
+.side { columns: 27rem; column-gap: 2.5rem; }
+.side h2 { break-after: avoid; }
+.side h2:first-child { margin-top: 0; }
+.figures { columns: 20.1rem; column-gap: 1.5rem; margin-top: 1rem; }
 figure { margin: 0 0 1.2rem; break-inside: avoid; }
 figure svg { display: block; width: 100%; height: auto; max-width: 30rem; }
-.alone svg { max-width: none; }
 figcaption { color: var(--quiet); font-size: .85rem; max-width: 30rem; }
 figcaption::before { counter-increment: figure; content: "Figure " counter(figure) ". ";
   font-weight: 600; }
@@ -54,13 +54,15 @@ table { border-collapse: collapse; margin: .3rem 0; }
 th, td { text-align: left; vertical-align: top; padding: .2rem .9rem .2rem 0;
   border-bottom: 1px solid var(--line); }
 th { font-weight: 600; white-space: nowrap; }
-td { font-variant-numeric: tabular-nums; overflow-wrap: anywhere; }
-.numbers td, .numbers th { overflow-wrap: normal; white-space: nowrap; }
+td { font-variant-numeric: tabular-nums; }
+section td { overflow-wrap: anywhere; }
+.numbers td { white-space: nowrap; }
 .numbers td:not(:first-child), .numbers th:not(:first-child) { text-align: right; }
 pre { background: var(--pale); padding: .8rem; overflow-x: auto; font-size: 13px; }
 summary { cursor: pointer; }
 dt { font-weight: 600; } dd { margin: 0 0 .4rem 1rem; }
-.wide { overflow-x: auto; }
+.wide { overflow: auto; max-height: 85vh; }
+.wide th { position: sticky; top: 0; background: var(--paper); white-space: normal; }
 @media print { body { max-width: none; padding: 0; font-size: 10pt; }
   .figures { columns: 2; column-gap: 5mm; } details { display: none; } }
 """
@@ -110,19 +112,13 @@ def grid(headings: Iterable[str], cells: Iterable[Iterable[str]], css: str = "")
 
 
 def figures(sheets: Iterable[FigureSpec]) -> str:
-    """Return figures with captions, side by side if there is room."""
+    """Return figures with captions, side by side if there is room; nothing without any."""
     blocks = "\n".join(
         f"<figure>{svg(drawn(sheet), text(sheet.caption))}"
         f"<figcaption>{text(sheet.caption)}</figcaption></figure>"
         for sheet in sheets
     )
-    return f'<div class="figures">{blocks}</div>'
-
-
-def wide_figure(alternative: str, figure: Figure) -> str:
-    """Return a figure of its own size, limited by the page; the alternative text is HTML."""
-    inner = f'style="max-width: {figure.get_figwidth():g}in">{svg(figure, alternative)}'
-    return f'<figure class="alone" {inner}</figure>\n'
+    return f'<div class="figures">{blocks}</div>' if blocks else ""
 
 
 def svg(figure: Figure, alternative: str) -> str:

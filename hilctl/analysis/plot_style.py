@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from hilctl.base.types import F64, I64
 from hilctl.recording.recording import Recording
@@ -18,8 +19,14 @@ COMMAND = "#D55E00"
 ERROR = "#009E73"
 MARK = "#CC79A7"
 QUIET = "#666666"
+PALE = "#ababab"
 WITHOUT, WITH = COMMAND, DISPLACEMENT
 """Colours of motions without and with a compensator."""
+NAMED = (
+    WITH, WITHOUT, ERROR, MARK, "#E69F00", "#56B4E9", "#882255", "#44AA99", "#999933", "#332288",
+    REFERENCE, QUIET,
+)  # fmt: skip
+"""Colours of names without an order."""
 
 MAX_POINTS = 4000
 """Most points of one line."""
@@ -116,11 +123,14 @@ def draw_line(
     axes.plot(*min_max(t, values), color=colour, linestyle=style, linewidth=width, label=name)
 
 
-def legend(axes: Axes) -> None:
-    """Put a legend above the axes, at the right."""
-    handles, _ = axes.get_legend_handles_labels()
-    corner = (1.0, 1.0)
-    axes.legend(loc="lower right", bbox_to_anchor=corner, borderaxespad=0.2, ncols=len(handles))
+def plain_numbers(axes: Axes) -> None:
+    """Write the ticks of logarithmic axes as plain numbers; 1, 2 and 5 in a narrow range."""
+    for axis in (axes.xaxis, axes.yaxis):
+        if axis.get_scale() == "log":
+            low, high = axis.get_view_interval()
+            axis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 100.0 * low else (1,)))
+            axis.set_major_formatter("{x:g}")
+            axis.set_minor_formatter(NullFormatter())
 
 
 def of_range(loop: F64) -> F64:

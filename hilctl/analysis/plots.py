@@ -8,7 +8,6 @@ from functools import partial
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.ticker import NullFormatter
 
 from hilctl.analysis import tick_lateness
 from hilctl.analysis.figure_layout import FigureSpec, Panel
@@ -21,6 +20,7 @@ from hilctl.analysis.plot_style import (
     REFERENCE,
     draw_line,
     draw_over_time,
+    plain_numbers,
 )
 from hilctl.analysis.quantiles import Quantiles
 from hilctl.analysis.steady_state import SteadyPart, steady_part, steady_samples
@@ -249,7 +249,7 @@ def _draw_spectrum(axes: Axes, found: ErrorSpectrum) -> None:
     if highest > 0.0:
         axes.set_ylim(max(1e3 * float(y.min()), highest * 10.0**-_DECADES), 2.0 * highest)
     axes.set(xlabel="frequency, Hz", ylabel="amplitude, nm", xlim=(x[0], x[-1]))
-    _plain_numbers(axes)
+    plain_numbers(axes)
 
 
 def _draw_harmonics(axes: Axes, found: ErrorSpectrum) -> None:
@@ -284,13 +284,7 @@ def _draw_lateness(axes: Axes, recording: Recording) -> None:
     if period_ns is not None and period_ns * 0.5e-3 < bins[-1]:
         axes.axvline(period_ns * 0.5e-3, color=MARK, linewidth=1.4, label="half a tick period")
     axes.set(xscale="log", yscale="log", xlabel="time, µs (below 1 µs counts as 1)", ylabel="ticks")
-    _plain_numbers(axes)
-
-
-def _plain_numbers(axes: Axes) -> None:
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_formatter(lambda value, _: f"{value:g}")
-        axis.set_minor_formatter(NullFormatter())
+    plain_numbers(axes)
 
 
 def _microseconds(times_ns: I64) -> F64:

@@ -208,7 +208,8 @@ def compare(
         experiment: Experiment with device, limits and waveform of the tests; default: from the
             first recording.
         settings: Overrides of that experiment.
-        frequencies_hz: Frequencies of the tests; default: 10, 100 and 200 Hz for sines.
+        frequencies_hz: Frequencies of the tests; default: the lowest, a middle and the highest one
+            of the loops, for sines.
         points: Points per loop; default: 300.
         html: Page with table and plot to write, if any.
         save: Folder for the identified model files, if any.

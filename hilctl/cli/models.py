@@ -113,7 +113,10 @@ TryIn = Annotated[
 ]
 Frequencies = Annotated[
     str | None,
-    typer.Option(help="Frequencies of the tests, Hz, separated by commas; default: 10,100,200."),
+    typer.Option(
+        help="Frequencies of the tests, Hz, separated by commas; default: the lowest, a middle and"
+        " the highest recorded one."
+    ),
 ]
 
 

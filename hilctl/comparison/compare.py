@@ -29,7 +29,6 @@ from hilctl.models.model_file import dump_model, load_model
 from hilctl.recording.reader import read
 from hilctl.recording.recording import Recording
 
-FREQUENCIES_HZ = (10.0, 100.0, 200.0)
 POINTS = 300
 _FILES = (".yaml", ".yml")
 
@@ -64,8 +63,8 @@ class ComparisonRequest:
         experiment: Experiment with device, limits and waveform of the trials; None for device and
             limits of the first recording and a sine over nearly the complete stroke.
         settings: ``key=value`` texts over the experiment.
-        frequencies_hz: Frequencies of the trials; None for 10, 100 and 200 Hz with a sine or a
-            triangle, and for the unchanged waveform otherwise.
+        frequencies_hz: Frequencies of the trials; None for the lowest, the middle and the highest
+            of the loops with a sine or a triangle, and for the unchanged waveform otherwise.
     """
 
     recordings: Sequence[Path]
@@ -228,13 +227,19 @@ def _device(request: ComparisonRequest, recording: Recording, data: FitData) -> 
         loaded = load_experiment(request.experiment, request.settings)
         waveform = loaded.config.waveform
         if frequencies is None and waveform.kind in ("sine", "triangle"):
-            frequencies = FREQUENCIES_HZ
+            frequencies = _frequencies_hz(data.loops)
         return TrialDevice(loaded, waveforms_of(waveform, frequencies))
     recorded = _recorded(recording, request.settings)
     if recorded is None:
         return None
-    waveforms = waveforms_of(full_stroke(data.loops), frequencies or FREQUENCIES_HZ)
+    waveforms = waveforms_of(full_stroke(data.loops), frequencies or _frequencies_hz(data.loops))
     return TrialDevice(recorded, waveforms)
+
+
+def _frequencies_hz(loops: Sequence[SteadyLoop]) -> list[float]:
+    """Return the lowest, the middle and the highest frequency of loops, without duplicates."""
+    known = sorted({float(f"{loop.frequency_hz:.4g}") for loop in loops})
+    return sorted({known[0], known[len(known) // 2], known[-1]})
 
 
 def _recorded(recording: Recording, settings: Sequence[str]) -> LoadedExperiment | None:

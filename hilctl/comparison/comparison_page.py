@@ -1,24 +1,18 @@
-"""The comparison as a self-contained HTML page with a table and a figure."""
+"""The comparison as a self-contained HTML page with tables and figures."""
 
-import html
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from functools import partial
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure, SubFigure
 
-from hilctl.analysis.html import document, grid, wide_figure
-from hilctl.analysis.plot_style import DISPLACEMENT, QUIET, REFERENCE, STYLE
-from hilctl.base.types import F64
-from hilctl.comparison.compare import ComparedModel, Comparison, headings, notes, table_rows
+from hilctl.analysis import html
+from hilctl.analysis.figure_layout import FigureSpec, Panel
+from hilctl.analysis.plot_style import NAMED, plain_numbers
+from hilctl.comparison.compare import Comparison, headings, notes, table_rows
 from hilctl.identify.data.records import SteadyLoop
+from hilctl.identify.model_page import record_sheet
 
-_COLUMNS = 6
-_COLOURS = (
-    "#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#882255", "#44AA99",
-    "#999933",
-)  # fmt: skip
 _STYLES = ("-", "--", ":")
 
 
@@ -26,32 +20,36 @@ def comparison_page(comparison: Comparison) -> str:
     """Return the page as HTML."""
     body = [
         "<h1>Comparison of models</h1>",
-        f'<p class="file">{html.escape(", ".join(comparison.sources))}</p>',
-        grid(headings(comparison), table_rows(comparison), "numbers"),
-        *(f"<p>{html.escape(note)}</p>" for note in notes(comparison)),
-        grid(("model", "description"), [(row.name, row.title) for row in comparison.rows]),
-        wide_figure("Errors against frequency, and loops", comparison_figure(comparison)),
+        html.paragraph(", ".join(comparison.sources), "file"),
+        html.grid(headings(comparison), table_rows(comparison), "numbers"),
+        *map(html.paragraph, notes(comparison)),
+        html.grid(("model", "description"), [(row.name, row.title) for row in comparison.rows]),
+        html.figures(comparison_sheets(comparison)),
     ]
-    return document("Comparison of models", body)
+    return html.document("Comparison of models", body)
 
 
-@mpl.rc_context(STYLE)
-def comparison_figure(comparison: Comparison) -> Figure:
-    """Plot model and compensated errors over frequency, and measured and modelled loops."""
-    shown = len(comparison.rows)
-    lines = -(-shown // _COLUMNS)
-    figure = Figure(figsize=(11.0, 4.2 + 2.3 * lines))
-    upper, lower = figure.subfigures(2, 1, squeeze=False, height_ratios=[4.2, 2.3 * lines])[:, 0]
-    _draw_errors(upper, comparison)
-    number = _fastest(comparison.loops)
-    panels = lower.subplots(lines, _COLUMNS, squeeze=False, sharex=True, sharey=True)
-    for axes, row in zip(panels.flat, comparison.rows, strict=False):
-        _draw_loop(axes, comparison.loops[number], row, number)
-        axes.tick_params(labelbottom=True)
-    for axes in panels.flat[shown:]:
-        axes.set_axis_off()
-    lower.suptitle(f"{comparison.loops[number].label}, measured (grey) and modelled", fontsize=10)
-    return figure
+def comparison_sheets(comparison: Comparison) -> Iterator[FigureSpec]:
+    """Yield errors of all models over frequency, and the fastest loop with each model."""
+    loops, rows = comparison.loops, comparison.rows
+    hz = [loop.frequency_hz for loop in loops]
+    modelled = [(row.name, hz, [error.peak_percent for error in row.error.errors]) for row in rows]
+    panels = [Panel(partial(_draw_errors, lines=modelled), "model", 0.7)]
+    if comparison.device:
+        tried = [
+            (
+                row.name,
+                [t.frequency_hz for t in row.trials],
+                [t.peak_error_percent for t in row.trials],
+            )
+            for row in rows
+        ]
+        panels.append(Panel(partial(_draw_errors, lines=tried), "compensated", 0.7))
+    yield FigureSpec("errors", "Largest error against frequency.", tuple(panels))
+    number = _fastest(loops)
+    for k, row in enumerate(rows):
+        modelled_um, unit = row.error.modelled_um[number], row.model.input_unit
+        yield record_sheet(loops[number], modelled_um, unit, row.name, NAMED[k % len(NAMED)])
 
 
 def _fastest(loops: Sequence[SteadyLoop]) -> int:
@@ -62,57 +60,17 @@ def _fastest(loops: Sequence[SteadyLoop]) -> int:
     )
 
 
-def _draw_errors(figure: SubFigure, comparison: Comparison) -> None:
-    panels = figure.subplots(1, 2, sharey=True)
-    model, compensated = panels
-    for i, row in enumerate(comparison.rows):
-        look = {
-            "color": _COLOURS[(i - 1) % len(_COLOURS)] if i else REFERENCE,
-            "linestyle": _STYLES[(i - 1) // len(_COLOURS) % len(_STYLES)] if i else "-",
-            "marker": "o",
-            "markersize": 3.0,
-        }
-        model.plot(*_largest(_model_points(comparison.loops, row)), label=row.name, **look)
-        if row.trials:
-            compensated.plot(*_largest(_trial_points(row)), **look)
-    for axes in panels:
-        axes.set(yscale="log", xlabel="frequency, Hz")
-        axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
-    model.set(title="model", ylabel="peak error, % of peak-to-peak")
-    compensated.set_title("compensated" if comparison.device else "compensated: no trials")
-    figure.legend(loc="outside right upper")
-
-
-def _model_points(loops: Sequence[SteadyLoop], row: ComparedModel) -> list[tuple[float, float]]:
-    hz = [loop.frequency_hz for loop in loops]
-    return list(zip(hz, (error.peak_percent for error in row.error.errors), strict=True))
-
-
-def _trial_points(row: ComparedModel) -> list[tuple[float, float]]:
-    return [
-        (trial.frequency_hz, trial.peak_error_percent)
-        for trial in row.trials
-        if trial.peak_error_percent is not None
-    ]
-
-
-def _largest(points: list[tuple[float, float]]) -> tuple[F64, F64]:
-    """Return unique frequencies with their largest errors: two float64[n]."""
-    worst: dict[float, float] = {}
-    for exact_hz, error in points:
-        frequency_hz = round(exact_hz, 3)
-        worst[frequency_hz] = max(error, worst.get(frequency_hz, 0.0))
-    frequencies = sorted(worst)
-    return np.array(frequencies), np.array([worst[f] for f in frequencies])
-
-
-def _draw_loop(axes: Axes, loop: SteadyLoop, row: ComparedModel, number: int) -> None:
-    modelled_um = row.error.modelled_um[number]
-    axes.plot(_closed(loop.command), _closed(loop.displacement_um), color=QUIET, linewidth=2.0,
-              alpha=0.5)  # fmt: skip
-    axes.plot(_closed(loop.command), _closed(modelled_um), color=DISPLACEMENT, linewidth=0.9)
-    axes.set_title(f"{row.name}: {row.error.errors[number].peak_percent:.1f} %", fontsize=8)
-
-
-def _closed(values: F64) -> F64:
-    return np.append(values, values[0])
+def _draw_errors(
+    axes: Axes, lines: Sequence[tuple[str, Sequence[float], Sequence[float | None]]]
+) -> None:
+    for k, (name, frequencies_hz, percents) in enumerate(lines):
+        worst: dict[float, float] = {}
+        for hz, percent in zip(frequencies_hz, percents, strict=True):
+            if percent is not None:
+                worst[round(hz, 3)] = max(percent, worst.get(round(hz, 3), 0.0))
+        points = sorted(worst.items())
+        axes.plot([hz for hz, _ in points], [percent for _, percent in points], marker="o",
+                  color=NAMED[k % len(NAMED)], linestyle=_STYLES[k // len(NAMED) % len(_STYLES)],
+                  label=name)  # fmt: skip
+    axes.set(xlabel="frequency, Hz", ylabel="peak error, % of peak-to-peak", yscale="log")
+    plain_numbers(axes)

@@ -1,15 +1,16 @@
 """HTML pages of an identified or a refined model, with plots of model and data."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.figure import Figure
+from matplotlib.axes import Axes
 
 from hilctl.analysis import html
-from hilctl.analysis.plot_style import DISPLACEMENT, ERROR, REFERENCE, STYLE
-from hilctl.base.types import F64
-from hilctl.identify.data.records import Record, SteadyLoop
+from hilctl.analysis.figure_layout import FigureSpec, Panel
+from hilctl.analysis.plot_style import DISPLACEMENT, ERROR, PALE, min_max
+from hilctl.base.formatting import short_name
+from hilctl.base.types import F64, I64
+from hilctl.identify.data.records import History, Record, turning_points
 from hilctl.identify.evaluation import Evaluation
 from hilctl.identify.pipeline import Identification
 from hilctl.identify.refine.refinement import Refinement
@@ -23,10 +24,9 @@ from hilctl.identify.summary import (
 )
 from hilctl.models.model_file import dump_model
 
-COLUMNS = 3
 MOST_RECORDS = 36
 MOST_RUNS = 12
-MOST_DRAWN = 20_000  # samples of a history per plot
+_CYCLES, _CYCLE_POINTS = 16, 300  # drawn of a history of loops
 
 
 def identification_page(found: Identification) -> str:
@@ -39,56 +39,79 @@ def identification_page(found: Identification) -> str:
     if (held_out := found.held_out) is not None:
         body += ["<h2>Errors on data not fitted</h2>"]
         body += [html.grid(HEADINGS, error_rows(held_out.judgement.errors), "numbers")]
-        body += _drawn("Model and data not fitted", held_out.judgement, held_out.records, unit)
+        body += ["<h2>Model and data not fitted</h2>"]
+        body += drawn_records(held_out.judgement, held_out.records, unit)
     body += [
         "<h2>Errors on data fitted</h2>",
         html.grid(HEADINGS, error_rows(fit.errors), "numbers"),
+        "<h2>Model and data</h2>",
+        *drawn_records(fit, found.data, unit),
+        "<h2>Parameters</h2>",
+        html.grid(("name", "value"), parameter_texts(fit), "numbers"),
     ]
-    body += _drawn("Model and data", fit, found.data, unit)
-    body += ["<h2>Parameters</h2>", html.grid(("name", "value"), parameter_texts(fit), "numbers")]
     return html.document(html.text(title), [*body, html.details("Model", dump_model(fit.model))])
 
 
-def _drawn(heading: str, judged: Evaluation, data: Sequence[Record], unit: str) -> list[str]:
-    shown = data[:MOST_RECORDS]
-    left_out = [f"<p>The first {len(shown)} of {len(data)}.</p>"] if len(shown) < len(data) else []
-    figure = loops_figure(judged.modelled_um, shown, unit)
-    return [f"<h2>{heading}</h2>", *left_out, html.wide_figure(heading, figure)]
+def drawn_records(
+    judged: Evaluation, data: Sequence[Record], unit: str, most: int = MOST_RECORDS
+) -> Iterator[str]:
+    """Yield figures of the first records, measured and modelled, and a note if some are omitted."""
+    if len(data) > most:
+        yield html.paragraph(f"The first {most} of {len(data)}.")
+    pairs = zip(data[:most], judged.modelled_um, strict=False)
+    yield html.figures(record_sheet(record, modelled, unit) for record, modelled in pairs)
 
 
-@mpl.rc_context(STYLE)
-def loops_figure(modelled_um: Sequence[F64], data: Sequence[Record], unit: str) -> Figure:
-    """Draw displacement against command, measured and modelled, and the error below each."""
-    columns = min(COLUMNS, len(data))
-    rows = -(-len(data) // columns)
-    figure = Figure(figsize=(3.6 * columns, 3.8 * rows))
-    axes = figure.subplots(2 * rows, columns, squeeze=False, height_ratios=[3.0, 1.0] * rows)
-    for each in axes.flat[:]:
-        each.set_visible(False)
-    for i, (record, modelled) in enumerate(zip(data, modelled_um, strict=False)):
-        row, column = divmod(i, columns)
-        upper, lower = axes[2 * row, column], axes[2 * row + 1, column]
-        command, measured = (
-            signal[-modelled.size :] for signal in (record.command, record.displacement_um)
-        )
-        steady = isinstance(record, SteadyLoop)
-        step = 1 + command.size // MOST_DRAWN
-        x = (command if steady else np.arange(command.size))[::step]
-        upper.plot(x, measured[::step], color=REFERENCE, label="measured", linewidth=1.6)
-        upper.plot(x, modelled[::step], color=DISPLACEMENT, label="model", linewidth=0.9)
-        lower.plot(x, (modelled - measured)[::step], color=ERROR)
-        upper.set(title=record.label, ylabel="µm")
-        lower.set(xlabel=f"command, {unit}" if steady else "sample", ylabel="error, µm")
-        upper.set_visible(True)
-        lower.set_visible(True)
-    axes[0, 0].legend(loc="upper left")
-    return figure
+def record_sheet(
+    record: Record, modelled_um: F64, unit: str, name: str = "model", colour: str = DISPLACEMENT
+) -> FigureSpec:
+    """Return displacement and error of a model: of loops against command, otherwise over time."""
+    part = slice(record.command.size - modelled_um.size, None)
+    command, measured_um = record.command[part], record.displacement_um[part]
+    time_s = record.time_s[part] if isinstance(record, History) else None
+    cycles = np.append(np.arange(command.size), 0)  # closed
+    if time_s is not None and "-loops" in record.label:  # a step of characterise
+        time_s, cycles = None, _some_cycles(command)
+
+    def line(axes: Axes, values: F64, colour: str, label: str = "_error", width: float = 0.9
+             ) -> None:  # fmt: skip
+        if time_s is None:
+            shown = np.append(command, np.nan)[cycles], np.append(values, np.nan)[cycles]
+        else:
+            shown = min_max(time_s, values)
+        axes.plot(*shown, color=colour, linewidth=width, label=label)
+        axes.set_xlabel(f"command, {unit}" if time_s is None else "time, s")
+
+    def displacements(axes: Axes) -> None:
+        line(axes, measured_um, PALE, "measured", 2.2)
+        line(axes, modelled_um, colour, name)
+        axes.set_ylabel("displacement, µm")
+
+    def errors(axes: Axes) -> None:
+        line(axes, modelled_um - measured_um, ERROR)
+        axes.set_ylabel("error, µm")
+
+    panels = (
+        Panel(displacements, height=0.75 if time_s is None else 0.5),
+        Panel(errors, height=0.35),
+    )
+    caption = f"{short_name(record.label)}: measured, and by the {name}."
+    return FigureSpec("record", caption, panels, stacked=True)
+
+
+def _some_cycles(command: F64) -> I64:
+    """Return samples of cycles evenly spread over a history, with -1 after each cycle."""
+    turns = np.concatenate(([0], turning_points(command), [command.size - 1]))
+    wanted = np.linspace(0, command.size, _CYCLES)
+    first = np.unique(np.searchsorted(turns, wanted).clip(0, max(0, turns.size - 3)))
+    ends = [(turns[k], turns[min(k + 2, turns.size - 1)]) for k in first]
+    cycles = [np.linspace(*each, _CYCLE_POINTS).astype(np.int64) for each in ends]
+    return np.concatenate([np.append(each, -1) for each in cycles])
 
 
 def refinement_page(found: Refinement) -> str:
     """Return the page as HTML."""
-    after = found.choice.after
-    shown = after.records[:MOST_RUNS]
+    after, unit = found.choice.after, found.model.input_unit
     title = html.text(f"Refined: {', '.join(found.model.provenance.source)}")
     body = [
         f"<h1>{title}</h1>",
@@ -98,7 +121,6 @@ def refinement_page(found: Refinement) -> str:
         html.grid(REFINEMENT_HEADINGS, refinement_rows(found), "numbers"),
     ]
     for heading, held in (("Before", found.choice.before), ("After", after)):
-        modelled = held.judgement.modelled_um[:MOST_RUNS]
-        figure = loops_figure(modelled, shown, found.model.input_unit)
-        body += [f"<h2>{heading}</h2>", html.wide_figure(heading, figure)]
+        body += [f"<h2>{heading}</h2>"]
+        body += drawn_records(held.judgement, after.records, unit, MOST_RUNS)
     return html.document(title, [*body, html.details("Model", dump_model(found.model))])

@@ -1,30 +1,29 @@
 """Page and figures of a characterisation, as one self-contained HTML file."""
 
 from collections.abc import Iterator, Sequence
+from functools import partial
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from hilctl.analysis import html
+from hilctl.analysis.figure_layout import FigureSpec, Panel
 from hilctl.analysis.plot_style import (
-    COMMAND,
     DISPLACEMENT,
     ERROR,
     MARK,
-    QUIET,
+    NAMED,
     REFERENCE,
-    STYLE,
     draw_line,
-    legend,
     min_max,
+    plain_numbers,
 )
 from hilctl.base.formatting import quantity, significant
 from hilctl.base.types import F64
-from hilctl.identify.model_page import loops_figure
+from hilctl.identify.model_page import drawn_records
 from hilctl.identify.summary import HEADINGS, error_rows, summary
 from hilctl.models.model_file import dump_model
 from hilctl.models.staged import StagedModel
@@ -33,110 +32,110 @@ from hilctl.studies.characterise.response import SmallSignal
 from hilctl.studies.characterise.results import Characterisation, Measured, ValidationReference
 from hilctl.studies.characterise.waveforms import CREEP_S
 
-_WIDTH = 10.0
 _CLOSE = 0.02  # of the duration, to either side
-_COLOURS = (DISPLACEMENT, COMMAND, ERROR, MARK, "#E69F00", "#56B4E9", REFERENCE, QUIET)
+_SQUARE = 0.85
 
 
-@mpl.rc_context(STYLE)
-def response_figure(small: SmallSignal, band_hz: tuple[float, float], unit: str) -> Figure:
-    """Plot magnitude and phase of the small-signal response, measured and fitted."""
-    figure = Figure(figsize=(_WIDTH, 4.6))
-    upper, lower = figure.subplots(2, 1, sharex=True)
-    measured, fitted = small.response, small.fitted
-    dots: dict[str, Any] = {"fmt": ".", "color": DISPLACEMENT, "markersize": 3}
-    upper.errorbar(small.frequency_hz, np.abs(measured), small.noise, **dots, label="measured")
-    upper.loglog(small.frequency_hz, np.abs(fitted), color=REFERENCE, label="fitted")
-    upper.set(ylabel=f"µm/{unit}", title="Small-signal response")
-    for signal, style, colour in ((measured, ".", DISPLACEMENT), (fitted, "-", REFERENCE)):
-        degrees = np.degrees(np.unwrap(np.angle(signal)))
-        lower.semilogx(small.frequency_hz, degrees, style, color=colour, markersize=3)
-    lower.set(xlabel="Hz", ylabel="phase, degrees")
-    for axes in (upper, lower):
-        axes.axvspan(*band_hz, color="#eeeeee", zorder=0)
+def response_sheet(small: SmallSignal, band_hz: tuple[float, float], unit: str) -> FigureSpec:
+    """Return magnitude and phase of the small-signal response, measured and fitted."""
+
+    def frame(axes: Axes) -> None:
+        axes.axvspan(*band_hz, color="#eeeeee", zorder=0, label="band of the loops")
         if small.natural_hz is not None:
-            axes.axvline(small.natural_hz, color=MARK, linewidth=0.8, linestyle="--")
-        axes.xaxis.set_major_formatter("{x:g}")
-    upper.yaxis.set_major_formatter("{x:g}")
-    upper.set_xlim(0.8 * small.frequency_hz[0], 1.2 * small.frequency_hz[-1])
-    legend(upper)
-    return figure
+            axes.axvline(small.natural_hz, color=MARK, linestyle="--", label="resonance")
+        axes.set(xscale="log", xlabel="frequency, Hz")
+        axes.set_xlim(0.8 * small.frequency_hz[0], 1.2 * small.frequency_hz[-1])
+        plain_numbers(axes)
+
+    def magnitude(axes: Axes) -> None:
+        dots: dict[str, Any] = {"fmt": ".", "color": DISPLACEMENT, "markersize": 3}
+        axes.errorbar(
+            small.frequency_hz, np.abs(small.response), small.noise, **dots, label="measured"
+        )
+        axes.plot(small.frequency_hz, np.abs(small.fitted), color=REFERENCE, label="fitted")
+        axes.set(yscale="log", ylabel=f"magnitude, µm/{unit}")
+        frame(axes)
+
+    def phase(axes: Axes) -> None:
+        for signal, style, colour in (
+            (small.response, ".", DISPLACEMENT),
+            (small.fitted, "-", REFERENCE),
+        ):
+            degrees = np.degrees(np.unwrap(np.angle(signal)))
+            axes.plot(small.frequency_hz, degrees, style, color=colour, markersize=3)
+        axes.set_ylabel("phase, °")
+        frame(axes)
+
+    panels = Panel(magnitude), Panel(phase, height=0.45)
+    return FigureSpec("response", "Small-signal response.", panels, stacked=True)
 
 
-@mpl.rc_context(STYLE)
-def measured_loops_figure(groups: Sequence[tuple[str, Sequence[LoopFigures]]], unit: str) -> Figure:
-    """Plot loops, one panel per group."""
-    drawn = [(title, loops) for title, loops in groups if loops]
-    columns = min(2, len(drawn))
-    rows = -(-len(drawn) // columns)
-    figure = Figure(figsize=(_WIDTH, 4.2 * rows))
-    panels = figure.subplots(rows, columns, squeeze=False)
-    for axes in panels.flat[len(drawn) :]:
-        axes.set_visible(False)
-    for axes, (title, loops) in zip(panels.flat, drawn, strict=False):
-        _loops(axes, loops, unit)
-        axes.set(title=title, xlabel=f"command, {unit}", ylabel="displacement, µm")
-    return figure
+def loops_sheet(caption: str, loops: Sequence[LoopFigures], unit: str) -> FigureSpec:
+    """Return displacement against command of several loops."""
+
+    def draw(axes: Axes) -> None:
+        for loop, colour in zip(loops, cycle(NAMED), strict=False):
+            around = (np.append(each, each[0]) for each in (loop.command, loop.displacement_um))
+            at = f"{loop.bias:+.2g} " if abs(loop.bias) > 0.05 * loop.amplitude else ""
+            label = f"{at}{loop.amplitude:.3g} {unit}, {loop.frequency_hz:g} Hz"
+            axes.plot(*around, color=colour, linewidth=0.9, label=label)
+        axes.set(xlabel=f"command, {unit}", ylabel="displacement, µm")
+
+    return FigureSpec("loops", caption, (Panel(draw, height=_SQUARE),))
 
 
-def _loops(axes: Axes, loops: Sequence[LoopFigures], unit: str) -> None:
-    for loop, colour in zip(loops, _COLOURS * len(loops), strict=False):
-        around = (np.append(each, each[0]) for each in (loop.command, loop.displacement_um))
-        at = f"{loop.bias:+.2g} " if abs(loop.bias) > 0.05 * loop.amplitude else ""
-        label = f"{at}{loop.amplitude:.3g} {unit}, {loop.frequency_hz:g} Hz"
-        axes.plot(*around, color=colour, linewidth=0.9, label=label)
-    axes.legend(fontsize=6.5, loc="upper left", ncols=1 if len(loops) <= len(_COLOURS) else 2)
-
-
-@mpl.rc_context(STYLE)
-def reversal_figure(found: ReversalCurves, unit: str) -> Figure:
-    """Plot the reversal curves, and their difference to the outer curve."""
-    figure = Figure(figsize=(_WIDTH, 4.2))
-    left, right = figure.subplots(1, 2)
+def reversal_sheet(found: ReversalCurves, unit: str) -> FigureSpec:
+    """Return the reversal curves, and their difference to the outer curve."""
     outer = found.curves[0]
-    for number, curve in enumerate(found.curves):
-        shade = str(0.75 * number / len(found.curves))
-        command, displacement_um = min_max(curve[0], curve[1])
-        left.plot(command, displacement_um, color=shade, linewidth=0.8)
-        apart = curve[1] - np.interp(curve[0], outer[0], outer[1])
-        right.plot(*min_max(curve[0], apart), color=shade, linewidth=0.8)
-    left.set(title="Reversal curves", xlabel=f"command, {unit}", ylabel="displacement, µm")
-    right.set(title="Difference to the outer curve", xlabel=f"command, {unit}", ylabel="µm")
-    return figure
+
+    def draw(axes: Axes, *, apart: bool) -> None:
+        for number, (command, displacement_um) in enumerate(found.curves):
+            off = np.interp(command, *outer) if apart else 0.0
+            shade = str(0.75 * number / len(found.curves))
+            axes.plot(*min_max(command, displacement_um - off), color=shade, linewidth=0.8)
+        axes.set(
+            xlabel=f"command, {unit}", ylabel="difference, µm" if apart else "displacement, µm"
+        )
+
+    panels = (
+        Panel(partial(draw, apart=False), "curves", 0.7),
+        Panel(partial(draw, apart=True), "difference to the outer curve", 0.5),
+    )
+    return FigureSpec("reversal", "First-order reversal curves.", panels, stacked=True)
 
 
-@mpl.rc_context(STYLE)
-def held_out_figure(found: ValidationReference, *, close: bool) -> Figure:
-    """Plot displacements and error over time; a close figure shows the largest error only."""
-    figure = Figure(figsize=(_WIDTH, 4.6))
-    upper, lower = figure.subplots(2, 1, height_ratios=[2.0, 1.0])
+def held_out_sheet(found: ValidationReference, *, close: bool) -> FigureSpec:
+    """Return displacements and error over time; a close figure is about the largest error only."""
     time_s, measured_um, modelled_um = _with_gaps(found)
     error_um = modelled_um - measured_um
-    shown = np.full(time_s.size, fill_value=True)
+    shown = slice(None)
     if close:
-        worst_s = time_s[np.nanargmax(np.abs(error_um))]
-        shown = np.abs(time_s - worst_s) < _CLOSE * (time_s[-1] - time_s[0])
-    draw_line(upper, time_s[shown], measured_um[shown], DISPLACEMENT)
-    draw_line(upper, time_s[shown], modelled_um[shown], REFERENCE, dashed=True)
+        worst, half = int(np.nanargmax(np.abs(error_um))), int(_CLOSE * time_s.size)
+        shown = slice(max(0, worst - half), worst + half + 1)
+
+    def displacements(axes: Axes) -> None:
+        draw_line(axes, time_s[shown], measured_um[shown], DISPLACEMENT, "measured")
+        draw_line(axes, time_s[shown], modelled_um[shown], REFERENCE, "modelled", dashed=True)
+        axes.set(xlabel="time, s", ylabel="displacement, µm")
+
+    def error(axes: Axes) -> None:
+        axes.plot(*min_max(time_s[shown], error_um[shown]), color=ERROR, linewidth=0.8)
+        axes.set(xlabel="time, s", ylabel="error, µm")
+
     about = ", about the largest error" if close else ""
-    upper.set(ylabel="µm", title=f"{found.label}: measured, and modelled (dashed){about}")
-    draw_line(lower, time_s, error_um, ERROR)
-    lower.set(xlabel="s", ylabel="error, µm")
-    return figure
+    panels = Panel(displacements), Panel(error, height=0.35)
+    return FigureSpec("validation", f"Validation: {found.label}{about}.", panels, stacked=True)
 
 
 def _with_gaps(found: ValidationReference) -> tuple[F64, F64, F64]:
-    """Return time and displacements with a NaN in each gap, so that lines are interrupted."""
-    steps = np.diff(found.time_s)
-    gaps = np.flatnonzero(steps > 1.5 * steps.min()) + 1
-    time_s = np.insert(found.time_s, gaps, found.time_s[gaps - 1])
-    measured_um, modelled_um = (
-        np.insert(each, gaps, np.nan) for each in (found.measured_um, found.modelled_um)
-    )
-    return time_s, measured_um, modelled_um
+    """Return time and displacements with NaN in each gap, so that lines are interrupted."""
+    step_s = float(np.diff(found.time_s).min())
+    at = np.round((found.time_s - found.time_s[0]) / step_s).astype(np.int64)
+    filled = np.full((2, at[-1] + 1), np.nan)
+    filled[:, at] = found.measured_um, found.modelled_um
+    return found.time_s[0] + step_s * np.arange(filled.shape[1]), filled[0], filled[1]
 
 
-_FITTED_SHOWN = 12
 HELD_OUT_HEADINGS = ("validation", "peak %", "rms %", "mean %", "noise floor %")
 
 
@@ -212,10 +211,10 @@ def characterisation_page(found: Characterisation) -> str:
         *_held_out(found),
         "<h2>Measured</h2>",
         html.grid(("quantity", "value"), figure_rows(found)),
-        *_drawn(found),
+        html.figures(_sheets(found)),
         *_model(found),
         "<h2>Steps</h2>",
-        html.grid(("step", "purpose", "s", "result", "recording"), rows),
+        html.grid(("step", "purpose", "time, s", "result", "recording"), rows),
     ]
     return html.document(html.text(title), body)
 
@@ -230,33 +229,32 @@ def _held_out(found: Characterisation) -> list[str]:
         html.paragraph(f"Verdict: {found.verdict}. {noise}"),
         *map(html.paragraph, found.verdict.notes if found.verdict else ()),
         html.grid(HELD_OUT_HEADINGS, held_out_rows(found), "numbers"),
-        *(
-            html.wide_figure(html.text(each.label), held_out_figure(each, close=i == 0))
-            for i, each in enumerate(found.held_out)
+        html.figures(
+            [
+                held_out_sheet(first, close=True),
+                *(held_out_sheet(each, close=False) for each in found.held_out),
+            ]
         ),
     ]
 
 
-def _drawn(found: Characterisation) -> Iterator[str]:
+def _sheets(found: Characterisation) -> Iterator[FigureSpec]:
+    """Yield the figures of the measurements."""
     measured, unit = found.measured, found.unit
     if measured.small is not None:
-        yield "<h2>Small-signal response</h2>"
-        yield "<p>Grey: the band of the loops. Dashed: the resonance.</p>"
-        yield html.wide_figure("response", response_figure(measured.small, found.band_hz, unit))
+        yield response_sheet(measured.small, found.band_hz, unit)
     # Smaller loops would be hidden.
     large = 0.9 * max((each.amplitude for each in measured.fast), default=0.0)
-    groups = [
-        ("Growing amplitude", measured.growing),
-        ("Lowest frequency", measured.slow),
-        ("Several frequencies", [each for each in measured.fast if each.amplitude > large]),
-        ("Small loops over the whole range", measured.biased),
-    ]
-    if any(loops for _, loops in groups):
-        yield "<h2>Loops</h2>"
-        yield html.wide_figure("loops", measured_loops_figure(groups, unit))
+    for caption, loops in (
+        ("Loops of growing amplitude.", measured.growing),
+        ("Loops at the lowest frequency.", measured.slow),
+        ("Loops at several frequencies.", [e for e in measured.fast if e.amplitude > large]),
+        ("Small loops over the whole range.", measured.biased),
+    ):
+        if loops:
+            yield loops_sheet(caption, loops, unit)
     if measured.reversal is not None:
-        yield "<h2>First-order reversal curves</h2>"
-        yield html.wide_figure("reversal curves", reversal_figure(measured.reversal, unit))
+        yield reversal_sheet(measured.reversal, unit)
 
 
 def _model(found: Characterisation) -> Iterator[str]:
@@ -268,6 +266,5 @@ def _model(found: Characterisation) -> Iterator[str]:
     yield html.paragraph(fit.model.provenance.method)
     yield from map(html.paragraph, summary(known))
     yield html.grid(HEADINGS, error_rows(fit.errors), "numbers")
-    figure = loops_figure(fit.modelled_um, known.data[:_FITTED_SHOWN], fit.model.input_unit)
-    yield html.wide_figure("model and data", figure)
+    yield from drawn_records(fit, known.data, fit.model.input_unit)
     yield html.details("Model file", dump_model(fit.model))

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from hilctl.analysis.figure_layout import ColumnWidth, FigureSpec, Panel, drawn, write_figure
-from hilctl.analysis.plot_style import COMMAND, DISPLACEMENT, ERROR, MARK, QUIET
+from hilctl.analysis.plot_style import COMMAND, DISPLACEMENT, ERROR, MARK, QUIET, plain_numbers
 from hilctl.base.errors import InputError
 from hilctl.base.files import already_there, make_folder
 from hilctl.base.formatting import unit_text
@@ -124,7 +124,7 @@ def draw_trends(axes: Axes, series: RunSeries, found: Sequence[Trend], *, fitted
         note(axes, f"r² = {' to '.join(texts)}")
     if logarithmic:
         axes.set_xscale("log")
-        axes.xaxis.set_major_formatter("{x:g}")
+        plain_numbers(axes)
     name = "\n".join(wrap(axis_name(series, figure), _LONGEST_NAME))
     axes.set(xlabel=along.axis, ylabel=name)
     everything = np.concatenate([trend.y for trend in found])

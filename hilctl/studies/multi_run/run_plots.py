@@ -12,13 +12,14 @@ from matplotlib.axes import Axes
 from hilctl.analysis.figure_layout import FigureSpec, Panel
 from hilctl.analysis.plot_style import (
     DISPLACEMENT,
-    ERROR,
     MARK,
+    NAMED,
+    PALE,
     QUIET,
     REFERENCE,
-    WITH,
     WITHOUT,
     of_range,
+    plain_numbers,
 )  # fmt: skip
 from hilctl.base.formatting import quantity, significant
 from hilctl.base.types import C128, F64
@@ -37,7 +38,6 @@ Measured: TypeAlias = tuple[SeriesRun, RunDigest]
 
 _SIGNS = ("o", "s", "^", "D", "v", "P", "X", "<", ">")
 _LINES = ("-", "--", "-.", ":")
-_NAMED = (WITH, WITHOUT, ERROR, MARK, "#E69F00", "#56B4E9", REFERENCE, QUIET)
 _MOST_CURVES = 7  # most distinguishable curves
 
 
@@ -66,8 +66,8 @@ def looks(dimension: VariedParameter | None, values: Sequence[Hashable]) -> Mapp
 def _of_names(names: Sequence[Hashable]) -> list[str]:
     """Return one colour per name; one colour is reserved for runs without a compensator."""
     if WITHOUT_COMPENSATOR not in names:
-        return [_NAMED[k % len(_NAMED)] for k in range(len(names))]
-    others = cycle(colour for colour in _NAMED if colour != WITHOUT)
+        return [NAMED[k % len(NAMED)] for k in range(len(names))]
+    others = cycle(colour for colour in NAMED if colour != WITHOUT)
     return [WITHOUT if name == WITHOUT_COMPENSATOR else next(others) for name in names]
 
 
@@ -169,7 +169,7 @@ def model_sheet(series: RunSeries) -> FigureSpec | None:
 
 def _draw_model(axes: Axes, digest: RunDigest) -> None:
     command, measured, modelled = digest.modelled
-    axes.plot(command, measured, color=QUIET, linewidth=2.2, alpha=0.6, label="measured")
+    axes.plot(command, measured, color=PALE, linewidth=2.2, label="measured")
     axes.plot(command, modelled, color=DISPLACEMENT, linewidth=0.9, label="model")
     axes.set(xlabel=f"command, {digest.command_unit}", ylabel=_DISPLACEMENT_AXIS)
     note(axes, f"error {quantity(digest.model_error_percent, '%')}")
@@ -326,8 +326,7 @@ def _draw_response(
     axes.set(
         xscale="log", xlabel="frequency, Hz", yscale="log" if part == "magnitude" else "linear"
     )
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_formatter("{x:g}")
+    plain_numbers(axes)
 
 
 def _part(response: C128, part: str) -> F64:

@@ -59,6 +59,13 @@ def test_a_compensated_recording_gives_device_and_limits():
     assert judged.rows[0].trials[0].frequency_hz == pytest.approx(200.0)
 
 
+def test_inverses_are_tried_at_the_frequencies_of_the_data():
+    path = GOLDEN.with_name("piezo_compensated.mcap")
+    judged = compared(path)
+    recorded = {round(loop.frequency_hz, 3) for loop in judged.loops}
+    assert {round(trial.frequency_hz, 3) for trial in judged.rows[0].trials} <= recorded
+
+
 def test_progress_rises_to_the_end():
     told = []
     compared(progress=lambda *each: told.append(each), frequencies_hz=[100.0])

@@ -4,25 +4,27 @@ from pathlib import Path
 
 import pytest
 
+from hilctl.analysis.figure_layout import drawn
 from hilctl.base.errors import InputError
 from hilctl.cli.models import compare as command
-from hilctl.comparison.comparison_page import comparison_figure, comparison_page
+from hilctl.comparison.comparison_page import comparison_page, comparison_sheets
 
 
 @pytest.mark.slow
 def test_the_page_holds_table_and_figure(comparison):
     page = comparison_page(comparison)
-    assert page.count("<svg") == 1
+    assert page.count("<svg") == 4
     assert "http://" not in page
     assert "https://" not in page
     for row in comparison.rows:
         assert row.name in page
 
 
-def test_the_figure_draws_each_model_once(comparison):
-    upper, lower = comparison_figure(comparison).subfigs
-    assert [len(axes.lines) for axes in upper.axes] == [3, 3]
-    assert sum(bool(axes.lines) for axes in lower.axes) == 3
+def test_each_model_has_one_colour_in_all_figures(comparison):
+    errors, *loops = (drawn(sheet) for sheet in comparison_sheets(comparison))
+    colours = [[line.get_color() for line in axes.lines] for axes in errors.axes]
+    assert colours[0] == colours[1] == [figure.axes[0].lines[1].get_color() for figure in loops]
+    assert len(set(colours[0])) == len(comparison.rows)
 
 
 def test_an_existing_page_is_kept(tmp_path):

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from hilctl.identify import model_page as module
+from hilctl.analysis.figure_layout import drawn
 from hilctl.identify.data.records import History
 from hilctl.identify.evaluation import judge
 from hilctl.identify.fit_api import FitRequest
 from hilctl.identify.fit_model import fit_model
-from hilctl.identify.model_page import identification_page, loops_figure
+from hilctl.identify.model_page import drawn_records, identification_page, record_sheet
 from hilctl.identify.model_quality import verdict_of
 from hilctl.identify.model_selection import HeldOut
 from hilctl.identify.pipeline import Identification
@@ -35,7 +35,7 @@ def page_of(data_of):
 @pytest.mark.slow
 def test_the_page_fetches_nothing_and_shows_names_as_they_are(page_of):
     page = page_of()
-    assert page.count("<svg") == 1
+    assert page.count("<svg") == page.count("<figcaption") > 0
     assert "http://" not in page
     assert "&lt;a &amp; b&gt;.csv" in page
     assert "<a & b>" not in page
@@ -44,21 +44,32 @@ def test_the_page_fetches_nothing_and_shows_names_as_they_are(page_of):
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_data_not_fitted_have_errors_and_a_figure_of_their_own(page_of, data_of, monkeypatch):
-    monkeypatch.setattr(module, "MOST_RECORDS", 2)
+def test_data_not_fitted_have_errors_and_figures_of_their_own(page_of, data_of):
     loops = data_of(TRUTH).loops
     page = page_of((loops[0],) * 3)
-    assert page.count("<svg") == 2
-    assert "The first 2 of 3." in page
+    assert page.count("<svg") == len(loops) + 3
+    shown = "".join(drawn_records(judge(TRUTH, (loops[0],) * 3), (loops[0],) * 3, "A", most=2))
+    assert shown.count("<svg") == 2
+    assert "first 2 of 3" in shown
 
 
-def test_loops_are_drawn_over_the_command_and_histories_over_samples(data_of):
+SWING = np.sin(np.linspace(0.0, 20.0 * np.pi, 2000))
+
+
+@pytest.mark.parametrize(
+    ("label", "axis"), [("h", "time, s"), ("12-slow-loops.mcap", "command, A")]
+)
+def test_histories_are_drawn_over_time_except_loops(label, axis):
+    history = History(label, SWING, SWING, 1000.0, ignore=10)
+    upper, lower = drawn(record_sheet(history, SWING[10:] + 0.5, "A")).axes
+    assert lower.get_xlabel() == axis
+    assert upper.get_ylabel() == "displacement, µm"
+    error_um = lower.lines[0].get_ydata()
+    np.testing.assert_allclose(error_um[np.isfinite(error_um)], 0.5)
+
+
+def test_loops_are_drawn_over_the_command(data_of):
     loop = data_of(TRUTH).loops[0]
-    history = History("h", np.arange(50.0), np.arange(50.0), 1000.0, ignore=10)
-    modelled = [loop.displacement_um + 1.0, np.zeros(40)]
-    figure = loops_figure(modelled, [loop, history], "A")
-    shown = [axes for axes in figure.axes if axes.get_visible()]
-    assert [axes.get_xlabel() for axes in shown if axes.get_xlabel()] == ["command, A", "sample"]
-    errors = [axes.lines[0].get_ydata() for axes in shown if axes.get_ylabel() == "error, µm"]
-    np.testing.assert_allclose(errors[0], 1.0)
-    np.testing.assert_allclose(errors[1], -np.arange(10.0, 50.0))
+    upper, _ = drawn(record_sheet(loop, loop.displacement_um, "A")).axes
+    around = np.append(loop.command, loop.command[0])
+    np.testing.assert_array_equal(upper.lines[0].get_xdata(), around)
