@@ -41,9 +41,9 @@ h2 { font-size: 1.1rem; margin: 1.8rem 0 .5rem; border-bottom: 1px solid var(--l
 .headline { font-size: 1.1rem; margin: .8rem 0; }
 .note, .bad { border-left: 4px solid #e69f00; padding: .5rem .8rem; background: var(--note); }
 .bad { border-color: #d55e00; background: var(--bad); }
-.side { columns: 27rem; column-gap: 2.5rem; }
-.side h2 { break-after: avoid; }
-.side h2:first-child { margin-top: 0; }
+.side { columns: 27rem; column-gap: 2.5rem; margin-top: 1.8rem; }
+.side section { break-inside: avoid; margin-bottom: 1.8rem; }
+.side h2 { margin-top: 0; }
 .figures { columns: 20.1rem; column-gap: 1.5rem; margin-top: 1rem; }
 figure { margin: 0 0 1.2rem; break-inside: avoid; }
 figure svg { display: block; width: 100%; height: auto; max-width: 30rem; }
@@ -63,8 +63,11 @@ summary { cursor: pointer; }
 dt { font-weight: 600; } dd { margin: 0 0 .4rem 1rem; }
 .wide { overflow: auto; max-height: 85vh; }
 .wide th { position: sticky; top: 0; background: var(--paper); white-space: normal; }
-@media print { body { max-width: none; padding: 0; font-size: 10pt; }
-  .figures { columns: 2; column-gap: 5mm; } details { display: none; } }
+@page { margin: 12mm; }
+@media print { body { max-width: none; padding: 0; font-size: 9pt; }
+  .figures, .side { columns: 2; column-gap: 5mm; } .figures svg { max-width: 78mm; }
+  h2 { break-after: avoid; } tr { break-inside: avoid; }
+  .wide { max-height: none; overflow: visible; } details { display: none; } }
 """
 
 _HEAD = """<!DOCTYPE html>

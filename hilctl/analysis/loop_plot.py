@@ -25,19 +25,24 @@ def hysteresis_loop(recording: Recording, focus: int = 0) -> FigureSpec | None:
 
     The second panel shows the deviation from the ideal line of a compensated run, otherwise from a
     linear fit. Loops without a period are drawn as measured. The peak hysteresis of segment
-    ``focus`` is marked. None if no segment has steady samples.
+    ``focus`` is marked. None if no segment of a loop has steady samples.
     """
     parts = [steady_part(recording, segment) for segment in recording.segments]
-    everything = np.concatenate([np.empty((2, 0)), *map(_loop, parts)], axis=1)
+    loops = [
+        _loop(part) if segment.is_loop else np.empty((2, 0))
+        for segment, part in zip(recording.segments, parts, strict=True)
+    ]
+    everything = np.concatenate([np.empty((2, 0)), *loops], axis=1)
     if everything.size == 0:
         return None
     line = np.array([1.0, 0.0]) if recording.compensated else _closest_line(everything)
     averaged = any(part.cycle is not None for part in parts)
     title = "average steady cycle" if averaged else "as measured, not averaged"
-    draw = partial(_draw, recording=recording, parts=parts, focus=focus, line=line)
+    widest = parts[focus] if focus < len(parts) and loops[focus].size else None
+    draw = partial(_draw, recording=recording, loops=loops, focus=focus, widest=widest, line=line)
     panels = (
-        Panel(partial(draw, taken_off=np.zeros(2)), title, _SQUARE),
-        Panel(partial(draw, taken_off=line), "off the straight line"),
+        Panel(partial(draw, taken_off=np.zeros(2)), title, 0.75),
+        Panel(partial(draw, taken_off=line), "off the straight line", 0.5),
     )
     caption = f"Displacement against {_input_name(recording)}, and what is off a straight line."
     return FigureSpec("hysteresis", caption, panels)
@@ -65,12 +70,12 @@ def _closest_line(everything: F64) -> F64:
 def _draw(
     axes: Axes,
     recording: Recording,
-    parts: Sequence[SteadyPart],
+    loops: Sequence[F64],
     focus: int,
+    widest: SteadyPart | None,
     line: F64,
     taken_off: F64,
 ) -> None:
-    loops = [_loop(part) for part in parts]
     reached = [k for k, loop in enumerate(loops) if loop[0].size]
     for k, colour in zip(reached, _colours(len(reached)), strict=True):
         named = len(reached) <= _MOST_LABELS or k in (reached[0], reached[-1], focus)
@@ -81,8 +86,8 @@ def _draw(
     ends = np.array([everything[0].min(), everything[0].max()])
     straight = np.polyval(line - taken_off, ends)
     axes.plot(ends, straight, color=REFERENCE, linestyle=":", linewidth=0.8)
-    if focus < len(parts):
-        _mark_gap(axes, parts[focus], taken_off)
+    if widest is not None:
+        _mark_gap(axes, widest, taken_off)
     unit = "µm" if recording.compensated else recording.command_unit
     left = " less line" if taken_off.any() else ""
     axes.set(xlabel=f"{_input_name(recording)}, {unit}", ylabel=f"displacement{left}, µm")
@@ -140,7 +145,8 @@ def before_and_after(before: Recording, after: Recording) -> FigureSpec | None:
 
 def _worst_loop(recording: Recording) -> F64 | None:
     """Return the closed loop with the largest peak hysteresis; None without any."""
-    parts = [steady_part(recording, segment) for segment in recording.segments]
+    segments = [segment for segment in recording.segments if segment.is_loop]
+    parts = [steady_part(recording, segment) for segment in segments]
     loops = [_loop(part) for part in parts if part.cycle is not None]
     return max(
         loops, key=lambda loop: cycle_metrics.peak_hysteresis_percent(*loop) or 0.0, default=None

@@ -20,10 +20,17 @@ from hilctl.analysis.plot_style import (
     REFERENCE,
     draw_line,
     draw_over_time,
+    draw_response,
     plain_numbers,
 )
 from hilctl.analysis.quantiles import Quantiles
-from hilctl.analysis.steady_state import SteadyPart, steady_part, steady_samples
+from hilctl.analysis.steady_state import (
+    SteadyPart,
+    loop_signals,
+    steady_part,
+    steady_samples,
+    trusted,
+)
 from hilctl.base.formatting import quantity, short_name
 from hilctl.base.samples import Samples
 from hilctl.base.segments import Segment
@@ -41,6 +48,8 @@ _DECADES = 5.0  # of amplitude that a spectrum shows
 _LOW = 0.5
 _LARGEST_UM = 1e100  # larger readings have no spectrum
 _WIDEST_GAP = 0.02  # share of samples that may be missing
+_STRONG = 0.2  # of the largest line of an input: weaker ones have no response
+_SETTLED = 0.05  # of a step
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,20 +71,29 @@ class ErrorSpectrum:
 def error_spectrum(recording: Recording, segment: Segment, index: I64, error_um: F64
                    ) -> ErrorSpectrum | None:  # fmt: skip
     """Return the spectrum of an error at sample indices; None with too few finite values."""
-    finite = np.isfinite(error_um)
-    if np.count_nonzero(finite) < 2 * MOST_HARMONICS:
+    found = _even(index, error_um)
+    if found is None:
         return None
-    index, error_um = index[finite][-_MOST_SAMPLES:], error_um[finite][-_MOST_SAMPLES:]
-    span = int(index[-1] - index[0]) + 1
-    if span - index.size > _WIDEST_GAP * span or np.abs(error_um).max() > _LARGEST_UM:
-        return None
-    even = np.interp(np.arange(index[0], index[-1] + 1), index, error_um)
+    index, error_um, even = found
+    span = even.size
     window = np.hanning(span + 1)[:-1]
     wave = np.fft.rfft((even - even.mean()) * window)
     size = np.asarray(np.abs(wave), dtype=np.float64) * (2.0 / float(window.sum()))
     frequency_hz: F64 = np.arange(float(size.size)) * (recording.sample_rate_hz / span)
     harmonics_um = _harmonics(index - segment.start, error_um, segment.period)
     return ErrorSpectrum(frequency_hz[1:], size[1:], harmonics_um)
+
+
+def _even(index: I64, values: F64) -> tuple[I64, F64, F64] | None:
+    """Return the last finite values with their indices, and without gaps; None with too few."""
+    finite = np.isfinite(values)
+    if np.count_nonzero(finite) < 2 * MOST_HARMONICS:
+        return None
+    index, values = index[finite][-_MOST_SAMPLES:], values[finite][-_MOST_SAMPLES:]
+    span = int(index[-1] - index[0]) + 1
+    if span - index.size > _WIDEST_GAP * span or np.abs(values).max() > _LARGEST_UM:
+        return None
+    return index, values, np.interp(np.arange(index[0], index[-1] + 1), index, values)
 
 
 def _harmonics(index: I64, error_um: F64, period: float) -> F64:
@@ -133,23 +151,57 @@ def steady_cycles(recording: Recording, focus: int = 0) -> FigureSpec | None:
     zoom = _zoom(recording, focus)
     if zoom is None:
         return None
-    t = zoom.index / recording.sample_rate_hz
+    label = short_name(recording.segments[focus].label)
+    return _detail("steady_cycles", f"End of the steady part: {label}.", recording, zoom)
+
+
+def _detail(
+    name: str, caption: str, recording: Recording, samples: Samples, origin: int = 0
+) -> FigureSpec:
+    """Return displacement, reference and command of some samples, over the time since one."""
+    t = (samples.index - origin) / recording.sample_rate_hz
+    since = "time after the step, s" if origin else "time, s"
 
     def moved(axes: Axes) -> None:
-        draw_line(axes, t, zoom.displacement_um, DISPLACEMENT, "displacement")
-        draw_line(axes, t, zoom.reference_um, REFERENCE, "reference", dashed=True)
-        axes.set(xlabel="time, s", ylabel="displacement, µm")
+        draw_line(axes, t, samples.displacement_um, DISPLACEMENT, "displacement")
+        draw_line(axes, t, samples.reference_um, REFERENCE, "reference", dashed=True)
+        axes.set(xlabel=since, ylabel="displacement, µm")
 
     def commanded(axes: Axes) -> None:
-        draw_line(axes, t, zoom.command, COMMAND, "command")
-        axes.set(xlabel="time, s", ylabel=f"command, {recording.command_unit}")
+        draw_line(axes, t, samples.command, COMMAND, "command")
+        axes.set(xlabel=since, ylabel=f"command, {recording.command_unit}")
         axes.ticklabel_format(axis="x", useOffset=False)
         axes.locator_params(axis="x", nbins=5)
 
-    label = short_name(recording.segments[focus].label)
-    caption = f"End of the steady part: {label}."
-    panels = (Panel(moved), Panel(commanded, height=_LOW))
-    return FigureSpec("steady_cycles", caption, panels, stacked=True)
+    panels = Panel(moved), Panel(commanded, height=_LOW)
+    return FigureSpec(name, caption, panels, stacked=True)
+
+
+def step_response(recording: Recording, focus: int = 0) -> FigureSpec | None:
+    """Return the response to the largest step of a segment, until it settles, or None."""
+    if focus >= len(recording.segments) or recording.segments[focus].kind != "step":
+        return None
+    segment = recording.segments[focus]
+    samples = trusted(recording.samples.part(segment.start, segment.stop))
+    wanted, moved_um = loop_signals(samples, compensated=recording.compensated)
+    moves = np.flatnonzero(np.diff(wanted))
+    if not moves.size or not np.isfinite(moved_um).all():
+        return None
+    starts = moves[np.diff(moves, prepend=-2) > 1]
+    stops = moves[np.diff(moves, append=wanted.size) > 1] + 1
+    largest = int(np.argmax(np.abs(wanted[stops] - wanted[starts])))
+    start, stop = int(starts[largest]), int(np.append(starts, wanted.size)[largest + 1])
+    after_um = moved_um[start:stop]
+    end_um = float(after_um[-max(1, after_um.size // 10) :].mean())
+    off = np.abs(after_um - end_um) > _SETTLED * abs(end_um - after_um[0])
+    settled = int(np.append(np.flatnonzero(off), 0).max()) + 1
+    rate_hz = recording.sample_rate_hz
+    caption = (
+        f"Largest step: within {100.0 * _SETTLED:g} % of its end after "
+        f"{quantity(settled / rate_hz, 's')}."
+    )
+    shown = samples.rows(slice(max(0, start - settled // 4), min(stop, start + 4 * settled)))
+    return _detail("step_response", caption, recording, shown, int(samples.index[start]))
 
 
 def _zoom(recording: Recording, focus: int) -> Samples | None:
@@ -186,13 +238,14 @@ def error(recording: Recording, focus: int = 0) -> FigureSpec | None:
         axes.set(xlabel="time, s", ylabel="error, µm")
         _mark_judged(axes, recording)
 
-    panels = [Panel(over_time, "whole run")]
+    panels, more = [Panel(over_time, "whole run", 0.5)], ""
     if focus < len(recording.segments):
         segment = recording.segments[focus]
         part = steady_part(recording, segment)
         if part.cycle is not None:
-            panels.append(Panel(partial(_draw_phase, part=part, segment=segment), "over one cycle"))
-    caption = "Error: displacement less reference, over the run and over one cycle."
+            draw = partial(_draw_phase, part=part, segment=segment)
+            panels, more = [*panels, Panel(draw, "over one cycle", 0.5)], " and over one cycle"
+    caption = f"Error: displacement less reference, over the run{more}."
     return FigureSpec("error", caption, tuple(panels))
 
 
@@ -257,6 +310,36 @@ def _draw_harmonics(axes: Axes, found: ErrorSpectrum) -> None:
     axes.bar(order, 1e3 * found.harmonics_um, color=ERROR, width=0.7)
     axes.set(xlabel="harmonic of the waveform's frequency", ylabel="amplitude, nm")
     axes.set_xticks([1, *range(5, int(order[-1]) + 1, 5)])
+
+
+def response(recording: Recording, focus: int = 0) -> FigureSpec | None:
+    """Return displacement over input of a multisine or a random segment; None for others."""
+    if focus >= len(recording.segments):
+        return None
+    segment = recording.segments[focus]
+    samples = steady_samples(recording, segment)[0]
+    signals = loop_signals(samples, compensated=recording.compensated)
+    finite = np.isfinite(signals).all(axis=0)
+    found = [_even(samples.index[finite], each) for each in signals[:, finite]]
+    if segment.kind not in {"multisine", "random"} or found[0] is None or found[1] is None:
+        return None
+    size = found[0][2].size
+    if segment.period > 0.0:  # whole periods need no window
+        size = round(size // segment.period * segment.period)
+    window = np.ones(size) if segment.period > 0.0 else np.hanning(size)
+    sent, moved = (
+        np.fft.rfft((each[2][-size:] - each[2][-size:].mean()) * window) for each in found if each
+    )
+    lines = np.flatnonzero(np.abs(sent) > _STRONG * np.abs(sent).max())
+    hz = lines.astype(np.float64) * (recording.sample_rate_hz / size)
+    answer = moved[lines] / sent[lines]
+    unit = "µm" if recording.compensated else recording.command_unit
+    line = {"color": DISPLACEMENT, "linestyle": "", "marker": "."}
+    draw = partial(draw_response, frequency_hz=hz, response=answer, unit=unit, line=line)
+    panels = Panel(partial(draw, part="magnitude")), Panel(partial(draw, part="phase"), height=_LOW)
+    over = "reference" if recording.compensated else "command"
+    caption = f"Response: displacement over {over}, at the frequencies of the {segment.kind}."
+    return FigureSpec("response", caption, panels, stacked=True)
 
 
 def lateness(recording: Recording) -> FigureSpec | None:

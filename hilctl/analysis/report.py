@@ -225,9 +225,9 @@ def _identity(recording: Recording) -> dict[str, Any]:
 
 
 def worst_segment(segments: Sequence[SegmentReport]) -> int:
-    """Return the number of the segment with the largest peak hysteresis; 0 if none has any."""
-    heights = [segment.peak_hysteresis_percent or 0.0 for segment in segments]
-    return heights.index(max(heights)) if heights else 0
+    """Return the number of the segment with the largest peak hysteresis, otherwise peak error."""
+    figures = [(s.peak_hysteresis_percent or 0.0, s.peak_error_percent or 0.0) for s in segments]
+    return figures.index(max(figures)) if figures else 0
 
 
 def _worst(segments: Sequence[SegmentReport]) -> dict[str, Any]:

@@ -52,22 +52,21 @@ def usage_text(usage: ProcessUsage) -> str:
 
 
 def quality_rows(report: RunReport) -> list[tuple[str, str]]:
-    """Return name and value of the metrics."""
-    floor, noise_um = number(report.noise_floor_percent, "%"), report.sensor_noise_um
-    raw = f"{number(report.peak_error_raw_percent, '%')} peak, "
-    raw += f"{number(report.rms_error_raw_percent, '%')} rms"
+    """Return name and value of the metrics that the run has."""
+    floor = f" (noise floor {number(report.noise_floor_percent, '%')})"
     rows = [
-        ("peak hysteresis", f"{number(report.peak_hysteresis_percent, '%')} (noise floor {floor})"),
-        ("loop area", number(report.loop_area, report.loop_area_unit)),
-        ("peak-to-peak", number(report.peak_to_peak_um, "um")),
-        ("peak error", number(report.peak_error_percent, "%")),
-        ("rms error", number(report.rms_error_percent, "%")),
-        ("error, not averaged", raw),
-        ("sensor noise", MISSING if noise_um is None else f"{number(noise_um, 'um')} rms"),
-        ("steady cycles", f"{report.steady_cycles:,}"),
-        ("steady samples", f"{report.steady_samples:,}"),
+        ("peak hysteresis", report.peak_hysteresis_percent, "%", floor),
+        ("loop area", report.loop_area, report.loop_area_unit, ""),
+        ("peak-to-peak", report.peak_to_peak_um, "um", ""),
+        ("peak error", report.peak_error_percent, "%", ""),
+        ("rms error", report.rms_error_percent, "%", ""),
+        ("peak error, not averaged", report.peak_error_raw_percent, "%", ""),
+        ("rms error, not averaged", report.rms_error_raw_percent, "%", ""),
+        ("sensor noise", report.sensor_noise_um, "um", " rms"),
     ]
-    return rows if report.compensated else [row for row in rows if "error" not in row[0]]
+    known = [(name, number(v, unit) + more) for name, v, unit, more in rows if v is not None]
+    counts = ("steady cycles", report.steady_cycles), ("steady samples", report.steady_samples)
+    return [*known, *((name, f"{count:,}") for name, count in counts if count)]
 
 
 def segment_table(report: RunReport) -> tuple[list[str], list[list[str]]]:
@@ -102,6 +101,6 @@ def _count(value: int | None) -> str:
 
 
 def _percentiles(figures: dict[str, float]) -> str:
-    if not figures:
+    if not any(figures.values()):  # of a run that did not keep real time
         return MISSING
     return ", ".join(f"{name} {quantity(value, 'us')}" for name, value in figures.items())

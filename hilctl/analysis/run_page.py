@@ -14,7 +14,7 @@ from hilctl.analysis.report import worst_segment
 from hilctl.analysis.run_metrics import RunReport
 from hilctl.base.errors import ConfigError
 from hilctl.base.events import Event
-from hilctl.base.formatting import printable, quantity, significant
+from hilctl.base.formatting import MISSING, printable, quantity, significant
 from hilctl.models.base import HysteresisModel
 from hilctl.models.model_file import parse_model
 from hilctl.recording.metadata_keys import OVERRIDES_FACT
@@ -27,7 +27,6 @@ _FAULT = "fault"
 _WAVEFORM = "waveform."
 _NOT_SHOWN = {"waveform.kind", "waveform.unit"}
 _USUAL = {"0.0", "None", ""}
-_TERMS = ("average cycle", "peak hysteresis", "noise floor", "loop area", "lateness")
 
 
 def write_html(
@@ -47,24 +46,37 @@ def write_html(
 def page(recording: Recording, report: RunReport, before: Recording | None = None) -> str:
     """Return the page of a run as HTML."""
     title = html.text(report.name or "run")
-    error_terms = ("peak and rms error", "harmonics of the error") if report.compensated else ()
+    terms = ["average cycle"] if report.steady_cycles else []
+    if report.peak_hysteresis_percent is not None:
+        terms += ["peak hysteresis", "noise floor", "loop area"]
+    if report.peak_error_percent is not None:
+        terms += ["peak and rms error", "harmonics of the error"]
+    samples = [
+        (name, value)
+        for name, value in report_table.run_rows(report)
+        if name not in {"labels", "device"}
+        and value != MISSING
+        # The end of an incomplete run is above.
+        and (report.complete or name != "ended")
+    ]
+    terms += [name for name, _ in samples if name == "lateness"]
     body = [
         f"<h1>{title}</h1>",
         html.paragraph(report.path, "file"),
-        *_fault(recording, report),
+        *_end(recording, report),
         html.paragraph(headline(report), "headline"),
         html.paragraph(f"The device is {report_table.SIMULATED}.", "note")
         if report.simulated
         else "",
         *_figures(recording, report, before),
         '<div class="side">',
-        html.rows("Figures", report_table.quality_rows(report)),
+        html.rows("Results", results) if (results := report_table.quality_rows(report)) else "",
+        html.rows("Samples and timing", samples),
         html.rows("Run", provenance_rows(recording)),
-        html.rows("Samples and timing", report_table.run_rows(report)),
         "</div>",
         *_segments(report),
         *_events(recording.events),
-        html.definitions("What the figures mean", definitions_of(*_TERMS, *error_terms)),
+        html.definitions("Definitions", definitions_of(*terms)) if terms else "",
         html.details("Experiment", recording.experiment_yaml) if recording.experiment_yaml else "",
         html.details("Model", recording.model_yaml) if recording.model_yaml else "",
     ]
@@ -83,61 +95,64 @@ def headline(report: RunReport) -> str:
         parts.append(f"peak error {quantity(report.peak_error_percent, '%')}, rms {rms}")
     if report.peak_to_peak_um is not None:
         parts.append(f"peak-to-peak {quantity(report.peak_to_peak_um, 'um')}")
-    ended = report.reason or "its end is not known"
-    timing = f"; {report.deadline_misses}" if report.deadline_misses else ""
-    found = "; ".join(parts) or "no figure: nothing steady was recorded"
-    return f"{found[0].upper()}{found[1:]}. Ended: {ended}{timing}."
+    if report.deadline_misses:
+        parts.append(report.deadline_misses)
+    found = "; ".join(parts) or "no steady samples were recorded"
+    return f"{found[0].upper()}{found[1:]}."
 
 
-def _fault(recording: Recording, report: RunReport) -> Iterator[str]:
-    """Yield the reason if a run did not complete."""
-    errors = [event for event in recording.events if event.level == "error"]
-    if recording.end.get("code") == _FAULT:
-        yield html.paragraph(f"Ended by a fault: {report.reason}.", "bad")
-        for event in errors[-_MOST_FAULTS:]:
-            at_s = event.sample / recording.sample_rate_hz
-            yield html.paragraph(f"{quantity(at_s, 's', 4)}: {event.code}: {event.text}", "bad")
+def _end(recording: Recording, report: RunReport) -> Iterator[str]:
+    """Yield how a run ended, and its errors if it is not complete."""
+    if _is_fault(recording):
+        same = (
+            e.sample for e in recording.events if e.level == "error" and e.text == report.reason
+        )
+        at_s = next(same, report.samples) / recording.sample_rate_hz
+        text = f"Ended by a fault at {quantity(at_s, 's', 4)}: {report.reason}."
+        yield html.paragraph(text, "bad")
     elif not report.complete:
         yield html.paragraph(f"The run is not complete: {report.reason}.", "bad")
+    errors = {
+        event.text: f"{quantity(event.sample / recording.sample_rate_hz, 's', 4)}: {event.text}"
+        for event in recording.events
+        if event.level == "error" and event.text != report.reason
+    }
+    for text in list(errors.values())[-_MOST_FAULTS:]:
+        yield html.paragraph(text, "bad")
     if recording.end.get("output_safe") == "false":
         yield html.paragraph("The output was NOT confirmed to be safe at the end.", "bad")
 
 
 def _figures(recording: Recording, report: RunReport, before: Recording | None) -> Iterator[str]:
     if not _drawable(recording):
-        yield html.paragraph("No figure is drawn: readings are near the end of all numbers.")
+        yield html.paragraph("No figure is drawn: readings are near the largest number.")
         return
-    drawn = _sheets(recording, report, before)
-    sheets = [sheet for sheet, _ in drawn if sheet is not None]
-    if sheets:
-        yield html.figures(sheets)
-    for sheet, otherwise in drawn:
-        if sheet is None and otherwise:
-            yield html.paragraph(otherwise)
+    sheets = run_sheets(recording, report)
+    if before and (both := loop_plot.before_and_after(before, recording)):
+        sheets.insert(0, both)
+    yield html.figures(sheets)
 
 
 def run_sheets(recording: Recording, report: RunReport) -> list[FigureSpec]:
     """Return the applicable figures of a run."""
     if not _drawable(recording):
         return []
-    return [sheet for sheet, _ in _sheets(recording, report, None) if sheet is not None]
-
-
-def _sheets(
-    recording: Recording, report: RunReport, before: Recording | None
-) -> list[tuple[FigureSpec | None, str]]:
-    """Return each figure, or the text in its place."""
     focus = worst_segment(report.segments)
-    no_error = "No error is drawn: no sample has a reference displacement."
-    return [
-        (loop_plot.before_and_after(before, recording) if before else None, ""),
-        (loop_plot.hysteresis_loop(recording, focus), "No steady samples were recorded."),
-        (plots.steady_cycles(recording, focus), ""),
-        (plots.error(recording, focus), no_error),
-        (plots.spectrum(recording, focus), ""),
-        (plots.time_history(recording), "No samples were recorded."),
-        (plots.lateness(recording), "No ticks were recorded, or the run did not keep real time."),
-    ]
+    found = (
+        None if _is_fault(recording) else loop_plot.hysteresis_loop(recording, focus),
+        plots.step_response(recording, focus),
+        plots.response(recording, focus),
+        plots.steady_cycles(recording, focus),
+        plots.error(recording, focus),
+        plots.spectrum(recording, focus),
+        plots.time_history(recording),
+        plots.lateness(recording),
+    )
+    return [sheet for sheet in found if sheet is not None]
+
+
+def _is_fault(recording: Recording) -> bool:
+    return recording.end.get("code") == _FAULT
 
 
 def _drawable(recording: Recording) -> bool:
@@ -150,7 +165,7 @@ def _drawable(recording: Recording) -> bool:
 def _segments(report: RunReport) -> list[str]:
     if len(report.segments) < 2:
         return []
-    note = html.paragraph("The figures above are the worst of these.")
+    note = html.paragraph("The results above are the worst of these.")
     headings, rows = report_table.segment_table(report)
     return ["<h2>By segment</h2>", note, html.grid(headings, rows, "numbers")]
 

@@ -83,9 +83,10 @@ class SegmentReportBuilder:
             loop_input, output = cycle.signals
             stroke_um = cycle_metrics.peak_to_peak(output)
             errors = cycle_metrics.peak_and_rms_percent(output - loop_input, stroke_um)
-            hysteresis = cycle_metrics.peak_hysteresis_percent(loop_input, output)
-            area = cycle_metrics.loop_area(loop_input, output)
-            if noise_um is not None:
+            if self._segment.is_loop:
+                hysteresis = cycle_metrics.peak_hysteresis_percent(loop_input, output)
+                area = cycle_metrics.loop_area(loop_input, output)
+            if hysteresis is not None and noise_um is not None:
                 floor = cycle_metrics.noise_floor_percent(noise_um, cycle.counts, stroke_um)
         elif cycle is None and self._averaged.count:
             stroke_um = self._highest_um - self._lowest_um

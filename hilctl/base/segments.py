@@ -6,6 +6,8 @@ from typing import Any, Self
 SHORTEST_PERIOD = 1.0
 """Shortest period of a waveform in samples."""
 
+_NO_LOOP = ("multisine", "random", "step", "hold")
+
 
 @dataclass(frozen=True, slots=True)
 class Segment:
@@ -48,6 +50,16 @@ class Segment:
         cycles = max(available - 1, min(available, 1))
         start = self.steady_stop - round(cycles * self.period)
         return max(start, self.steady_start), self.steady_stop, cycles
+
+    @property
+    def kind(self) -> str:
+        """Kind of the waveform, the first word of its label."""
+        return self.label.partition(" ")[0]
+
+    @property
+    def is_loop(self) -> bool:
+        """Whether displacement against its input is a hysteresis loop."""
+        return self.kind not in _NO_LOOP
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the fields as plain values, for a recording's metadata."""

@@ -189,7 +189,7 @@ class _Group:
 
     def __init__(self, start: int, stop: int, segment: Segment) -> None:
         self.start, self.stop = start, stop
-        self._origin, period = segment.start, segment.period
+        self._origin, period, self._is_loop = segment.start, segment.period, segment.is_loop
         self._folding = CycleAverager(period, 2) if period > 0.0 else None
         self._peak_um = self._squares_um2 = 0.0
         self._low_um, self._high_um = math.inf, -math.inf
@@ -239,11 +239,10 @@ class _Group:
             return {}
         loop_input, output = cycle.signals
         stroke_um = peak_to_peak(output)
-        found: FigureValues = {
-            "peak_hysteresis_percent": peak_hysteresis_percent(loop_input, output),
-            "peak_to_peak_um": stroke_um,
-        }
-        if noise_um is not None:
+        found: FigureValues = {"peak_to_peak_um": stroke_um}
+        if self._is_loop:
+            found["peak_hysteresis_percent"] = peak_hysteresis_percent(loop_input, output)
+        if self._is_loop and noise_um is not None:
             found["noise_floor_percent"] = noise_floor_percent(noise_um, cycle.counts, stroke_um)
         if self._errors:
             error_um = output - loop_input

@@ -323,8 +323,9 @@ class _SegmentFigures:
                 loop_input, output = cycle.signals
                 error_um = output - loop_input
                 found = self._quality(peak_to_peak(output), peak(error_um), rms(error_um))
-                found["peak_hysteresis_percent"] = peak_hysteresis_percent(loop_input, output)
-                found["loop_area"] = loop_area(loop_input, output)
+                if self._segment.is_loop:
+                    found["peak_hysteresis_percent"] = peak_hysteresis_percent(loop_input, output)
+                    found["loop_area"] = loop_area(loop_input, output)
         elif self._samples:
             rms_um = math.sqrt(self._squares_um2 / self._samples)
             found = self._quality(self._highest_um - self._lowest_um, self._peak_um, rms_um)

@@ -4,7 +4,6 @@ from collections.abc import Iterator, Sequence
 from functools import partial
 from itertools import cycle
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -18,8 +17,8 @@ from hilctl.analysis.plot_style import (
     NAMED,
     REFERENCE,
     draw_line,
+    draw_response,
     min_max,
-    plain_numbers,
 )
 from hilctl.base.formatting import quantity, significant
 from hilctl.base.types import F64
@@ -39,34 +38,22 @@ _SQUARE = 0.85
 def response_sheet(small: SmallSignal, band_hz: tuple[float, float], unit: str) -> FigureSpec:
     """Return magnitude and phase of the small-signal response, measured and fitted."""
 
-    def frame(axes: Axes) -> None:
+    def draw(axes: Axes, part: str) -> None:
         axes.axvspan(*band_hz, color="#eeeeee", zorder=0, label="band of the loops")
         if small.natural_hz is not None:
             axes.axvline(small.natural_hz, color=MARK, linestyle="--", label="resonance")
-        axes.set(xscale="log", xlabel="frequency, Hz")
-        axes.set_xlim(0.8 * small.frequency_hz[0], 1.2 * small.frequency_hz[-1])
-        plain_numbers(axes)
+        hz = small.frequency_hz
+        if part == "magnitude":
+            axes.errorbar(hz, np.abs(small.response), small.noise, fmt="none", ecolor=DISPLACEMENT)
+        measured = {"color": DISPLACEMENT, "linestyle": "", "marker": ".", "label": "measured"}
+        draw_response(axes, part, hz, small.response, unit, measured)
+        draw_response(axes, part, hz, small.fitted, unit, {"color": REFERENCE, "label": "fitted"})
+        axes.set_xlim(0.8 * hz[0], 1.2 * hz[-1])
 
-    def magnitude(axes: Axes) -> None:
-        dots: dict[str, Any] = {"fmt": ".", "color": DISPLACEMENT, "markersize": 3}
-        axes.errorbar(
-            small.frequency_hz, np.abs(small.response), small.noise, **dots, label="measured"
-        )
-        axes.plot(small.frequency_hz, np.abs(small.fitted), color=REFERENCE, label="fitted")
-        axes.set(yscale="log", ylabel=f"magnitude, µm/{unit}")
-        frame(axes)
-
-    def phase(axes: Axes) -> None:
-        for signal, style, colour in (
-            (small.response, ".", DISPLACEMENT),
-            (small.fitted, "-", REFERENCE),
-        ):
-            degrees = np.degrees(np.unwrap(np.angle(signal)))
-            axes.plot(small.frequency_hz, degrees, style, color=colour, markersize=3)
-        axes.set_ylabel("phase, °")
-        frame(axes)
-
-    panels = Panel(magnitude), Panel(phase, height=0.45)
+    panels = (
+        Panel(partial(draw, part="magnitude")),
+        Panel(partial(draw, part="phase"), height=0.45),
+    )
     return FigureSpec("response", "Small-signal response.", panels, stacked=True)
 
 

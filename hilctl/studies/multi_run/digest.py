@@ -180,15 +180,14 @@ def _figures(
     worst: Segment | None,
     structure: SmallSignal | Ringing | None,
 ) -> RunFigures:
-    loops = not isinstance(structure, SmallSignal)  # a multisine has no loop
     measured = [event.values.get("offset_um") for event in recording.events if event.code == OFFSET]
     return RunFigures(
-        peak_hysteresis_percent=report.peak_hysteresis_percent if loops else None,
+        peak_hysteresis_percent=report.peak_hysteresis_percent,
         peak_error_percent=report.peak_error_percent,
         rms_error_percent=report.rms_error_percent,
-        loop_area=report.loop_area if loops else None,
+        loop_area=report.loop_area,
         peak_to_peak_um=report.peak_to_peak_um,
-        **(_cycle_figures(recording, worst, minor=loops) if worst else {}),
+        **(_cycle_figures(recording, worst) if worst else {}),
         offset_um=measured[0] if measured else None,
         natural_hz=structure.natural_hz if structure else None,
         damping_ratio=structure.damping_ratio if structure else None,
@@ -202,7 +201,7 @@ def _rms_a(heat: str | None) -> float | None:
     return None if heat is None else float(np.sqrt(float(heat)))
 
 
-def _cycle_figures(recording: Recording, segment: Segment, *, minor: bool) -> dict[str, float]:
+def _cycle_figures(recording: Recording, segment: Segment) -> dict[str, float]:
     part = steady_part(recording, segment)
     if part.cycle is None or not part.loop.size:
         return {}
@@ -212,7 +211,7 @@ def _cycle_figures(recording: Recording, segment: Segment, *, minor: bool) -> di
         "high_um": float(output.max()),
         "mean_um": float(output.mean()),
     }
-    return found | _minor(loop_input, output) if minor else found
+    return found | _minor(loop_input, output) if segment.is_loop else found
 
 
 def _minor(loop_input: F64, output: F64) -> dict[str, float]:
@@ -350,8 +349,7 @@ def digest_of(recording: Recording, model: HysteresisModel | None = None) -> Run
         command_unit=recording.command_unit,
         waveform=worst.label if worst else "",
         figures=_figures(recording, report, worst, structure),
-        # Displacement against input of a multisine is no loop.
-        **(_loop(recording, worst, model) if worst and not isinstance(waveform, Multisine) else {}),
+        **(_loop(recording, worst, model) if worst and worst.is_loop else {}),
         step=_shown_step(recording, waveform, structure),
         response=structure if isinstance(structure, SmallSignal) else None,
     )

@@ -18,11 +18,10 @@ from hilctl.analysis.plot_style import (
     QUIET,
     REFERENCE,
     WITHOUT,
+    draw_response,
     of_range,
-    plain_numbers,
 )  # fmt: skip
 from hilctl.base.formatting import quantity, significant
-from hilctl.base.types import C128, F64
 from hilctl.studies.multi_run.collect import RunSeries, SeriesRun
 from hilctl.studies.multi_run.digest import RunDigest
 from hilctl.studies.multi_run.minor_loops import minor_parts
@@ -221,7 +220,7 @@ def _draw_pair(axes: Axes, before: RunDigest, after: Sequence[tuple[str, RunDige
     axes.plot([0, 100], [0, 100], color=REFERENCE, linestyle=":", linewidth=0.8)
     for name, digest in lines:
         axes.plot(*of_range(digest.loop), **line_of(look[name]), linewidth=0.9, label=name)
-    axes.set(xlabel="input, % of its range", ylabel="displacement, %")
+    axes.set(xlabel="input, % of its range", ylabel="displacement, % of its range")
 
 
 def error_sheet(series: RunSeries) -> FigureSpec | None:
@@ -317,19 +316,8 @@ def _draw_response(
     for (run, digest), value in zip(runs, values, strict=True):
         if (found := digest.response) is None:
             continue
-        measured, fitted = (_part(each, part) for each in (found.response, found.fitted))
-        colour = look[value]["color"]
-        axes.plot(found.frequency_hz, measured, ".", color=colour, markersize=2.0, alpha=0.7)
-        axes.plot(found.frequency_hz, fitted, color=colour, linewidth=0.9, label=text(run))
-        unit = digest.command_unit
-        axes.set_ylabel(f"magnitude, µm/{unit}" if part == "magnitude" else "phase, degrees")
-    axes.set(
-        xscale="log", xlabel="frequency, Hz", yscale="log" if part == "magnitude" else "linear"
-    )
-    plain_numbers(axes)
-
-
-def _part(response: C128, part: str) -> F64:
-    size: F64 = np.abs(response)
-    degrees: F64 = np.degrees(np.unwrap(np.angle(response)))
-    return size if part == "magnitude" else degrees
+        colour, unit = look[value]["color"], digest.command_unit
+        dots = {"color": colour, "marker": ".", "linestyle": "", "markersize": 2.0, "alpha": 0.7}
+        draw_response(axes, part, found.frequency_hz, found.response, unit, dots)
+        line = {"color": colour, "linewidth": 0.9, "label": text(run)}
+        draw_response(axes, part, found.frequency_hz, found.fitted, unit, line)

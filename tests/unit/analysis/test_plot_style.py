@@ -54,6 +54,6 @@ def test_band_follows_the_index_across_gaps() -> None:
 
 def test_band_is_for_many_narrow_cycles() -> None:
     assert plot_style.shown_as_band(100_000, 200.0, 100_000)
-    assert not plot_style.shown_as_band(100_000, 1000.0, 100_000)
+    assert not plot_style.shown_as_band(100_000, 2000.0, 100_000)
     assert not plot_style.shown_as_band(700, 200.0, 100_000)
     assert not plot_style.shown_as_band(100_000, 0.0, 100_000)

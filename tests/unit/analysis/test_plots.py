@@ -71,6 +71,35 @@ class TestTimeHistory:
         assert stop == pytest.approx(3999 / 50_000)
 
 
+def test_the_largest_step_is_shown_until_it_settles(make_recording) -> None:
+    wanted = np.repeat([0.0, 10.0, -20.0, 0.0], 2000)
+    after = np.arange(2000) / 100.0
+    moved = np.concatenate([wanted[:4000], 10.0 - 30.0 * (1.0 - np.exp(-after)), wanted[6000:]])
+    part = Segment("step", 0, 8000, 0, 8000)
+    recording = make_recording(moved, command=wanted, segments=[part])
+    sheet = plots.step_response(recording)
+    upper, _ = drawn(sheet).axes
+    time_s, moved_um = lines(upper)["displacement"].get_data()
+    np.testing.assert_allclose(np.interp(100 / 50_000, time_s, moved_um), -20.0 + 30.0 / np.e, 0.02)
+    assert "6.02 ms" in sheet.caption  # three time constants and a sample
+    assert plots.response(recording) is None
+
+
+@pytest.mark.parametrize(("label", "period"), [("multisine", PERIOD), ("random", 0.0)])
+def test_the_response_is_displacement_over_input(make_recording, label, period) -> None:
+    turns = np.arange(8000) / PERIOD
+    wave = np.sin(2.0 * np.pi * 3.0 * turns) + np.sin(2.0 * np.pi * 7.0 * turns + 1.0)
+    part = Segment(label, 0, 8000, 0, 8000, period)
+    recording = make_recording(-2.5 * wave, command=wave, segments=[part])
+    magnitude, phase = drawn(plots.response(recording)).axes
+    hz, size = magnitude.lines[0].get_data()
+    assert {150.0, 350.0} <= set(np.round(hz, 6))
+    np.testing.assert_allclose(size, 2.5, rtol=1e-6)
+    np.testing.assert_allclose(np.abs(phase.lines[0].get_ydata()), 180.0)
+    assert magnitude.get_ylabel() == "magnitude, µm/A"
+    assert plots.step_response(recording) is None
+
+
 class TestHysteresisLoop:
     @pytest.mark.parametrize("compensated", [True, False])
     def test_peak_hysteresis_is_marked_at_its_height(self, run, compensated: bool) -> None:

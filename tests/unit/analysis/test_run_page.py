@@ -9,7 +9,14 @@ import numpy as np
 import pytest
 
 from hilctl.analysis.report import summarize
-from hilctl.analysis.run_page import headline, model_error, page, provenance_rows, write_html
+from hilctl.analysis.run_page import (
+    headline,
+    model_error,
+    page,
+    provenance_rows,
+    run_sheets,
+    write_html,
+)
 from hilctl.base.events import Event
 from hilctl.base.segments import Segment
 from hilctl.models.model_file import load_model
@@ -74,7 +81,7 @@ def shown(recording: Recording) -> str:
 @pytest.mark.slow
 def test_fetches_nothing(shown: str) -> None:
     seen = Page(shown)
-    assert seen.tags.count("svg") == 6
+    assert seen.tags.count("svg") == seen.tags.count("figcaption") == 6
     assert all(reference.startswith("#") for reference in seen.references)
     assert not {"script", "link", "iframe", "object", "embed", "base"} & set(seen.tags)
     for address in ("http:", "https:", "@import", "xlink"):
@@ -125,18 +132,45 @@ def test_is_small(make_recording) -> None:
 def test_cut_short_recording_has_a_page(recording: Recording) -> None:
     empty = replace(recording, samples=recording.samples.part(0, 0), end={}, events=())
     text = Page(page(empty, summarize(empty))).text
-    for said in ("not complete", "No samples were recorded", "No steady samples"):
+    for said in ("not complete", "No steady samples"):
         assert said in text
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_a_fault_stands_above_all_figures(recording: Recording) -> None:
+def test_a_fault_stands_above_all_figures_and_once(recording: Recording) -> None:
     ended = {"code": "fault", "reason": "device gone", "output_safe": "false"}
-    events = (Event(100, "error", "lost", "no answer"),)
-    text = page(replace(recording, end=ended, events=events), summarize(recording))
-    assert text.index("Ended by") < text.index("Peak hysteresis")
-    assert "NOT confirmed" in text
-    assert "2.000 ms: lost: no answer" in text
+    events = (Event(100, "error", "lost", "device gone"), Event(120, "error", "more", "no answer"))
+    failed = replace(recording, end=ended, events=events)
+    text = page(failed, summarize(failed))
+    above = text[: text.index("<h2")]
+    assert above.count("device gone") == 1
+    assert "at 2.000 ms" in above
+    assert "2.400 ms: no answer" in above
+    assert "NOT confirmed" in above
+    assert "hysteresis" not in {sheet.name for sheet in run_sheets(failed, summarize(failed))}
+
+
+@pytest.mark.parametrize(
+    ("label", "period", "shown"),
+    [
+        ("sine 40 um 50 Hz", 1000.0, {"hysteresis", "steady_cycles"}),
+        ("multisine 40 um 50-60 Hz", 1000.0, {"response", "steady_cycles"}),
+        ("random 40 um 5-60 Hz seed 1", 0.0, {"response"}),
+        ("step", 0.0, {"step_response"}),
+        ("path 40 um/s", 0.0, {"hysteresis"}),
+    ],
+)
+def test_a_run_has_the_figures_of_its_waveform(recording, label, period, shown) -> None:
+    part = Segment(label, 0, 4000, 0, 4000, period)
+    single = replace(recording, segments=(part,))
+    report = summarize(single)
+    names = {sheet.name for sheet in run_sheets(single, report)}
+    assert names == shown | {"error", "error_spectrum", "history", "lateness"}
+    known = "hysteresis" in shown and period > 0.0
+    assert (report.peak_hysteresis_percent is not None) == known
+    assert (report.loop_area is not None) == known
+    assert report.peak_error_percent is not None
+    assert ("Peak hysteresis" in headline(report)) == known
 
 
 @pytest.mark.slow

@@ -55,3 +55,11 @@ def test_mapping_goes_through_json() -> None:
     original = Segment("complex harmonic 4 um 20 Hz", 7, 12345, 100, 12000, 50e3 / 3.0)
     text = json.dumps(original.to_mapping())
     assert Segment.from_mapping(json.loads(text)) == original
+
+
+@pytest.mark.parametrize(
+    ("label", "loop"),
+    [("sine 6 A 10 Hz", True), ("file step.csv", True), ("step", False), ("hold 2 A", False)],
+)
+def test_steps_and_sums_of_many_sines_are_no_loops(label, loop):
+    assert Segment(label, 0, 100, 0, 100, 10.0).is_loop == loop

@@ -60,8 +60,7 @@ def test_a_compensated_recording_gives_device_and_limits():
 
 
 def test_inverses_are_tried_at_the_frequencies_of_the_data():
-    path = GOLDEN.with_name("piezo_compensated.mcap")
-    judged = compared(path)
+    judged = compared()
     recorded = {round(loop.frequency_hz, 3) for loop in judged.loops}
     assert {round(trial.frequency_hz, 3) for trial in judged.rows[0].trials} <= recorded
 

@@ -150,12 +150,10 @@ def test_a_model_is_held_against_what_was_measured(make_recording):
 
 
 def test_many_sines_at_once_are_no_loop(make_recording):
-    text = (
-        "waveform: {kind: multisine, unit: A, amplitude: 1.0, first_hz: 10.0, last_hz: 1000.0, "
-        "step_hz: 10.0, duration_s: 0.4}\n"
-    )
-    recording = make_recording(WAVE, command=WAVE, segments=[SEGMENT], experiment_yaml=text)
-    assert digest.digest_of(recording).loop.size == 0
+    sines = replace(SEGMENT, label="multisine 1 A 10-1000 Hz")
+    found = digest.digest_of(make_recording(WAVE, command=WAVE, segments=[sines]))
+    assert found.loop.size == 0
+    assert found.figures.peak_hysteresis_percent is None
 
 
 def test_a_damaged_experiment_takes_only_its_settings_away(make_recording):
