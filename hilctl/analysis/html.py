@@ -57,17 +57,18 @@ th { font-weight: 600; white-space: nowrap; }
 td { font-variant-numeric: tabular-nums; }
 section td { overflow-wrap: anywhere; }
 .numbers td { white-space: nowrap; }
+.numbers td, .numbers th { padding-right: .6rem; }
 .numbers td:not(:first-child), .numbers th:not(:first-child) { text-align: right; }
 pre { background: var(--pale); padding: .8rem; overflow-x: auto; font-size: 13px; }
 summary { cursor: pointer; }
 dt { font-weight: 600; } dd { margin: 0 0 .4rem 1rem; }
-.wide { overflow: auto; max-height: 85vh; }
-.wide th { position: sticky; top: 0; background: var(--paper); white-space: normal; }
+.wide { overflow-x: auto; }
+.wide th { white-space: normal; }
 @page { margin: 12mm; }
 @media print { body { max-width: none; padding: 0; font-size: 9pt; }
   .figures, .side { columns: 2; column-gap: 5mm; } .figures svg { max-width: 78mm; }
   h2 { break-after: avoid; } tr { break-inside: avoid; }
-  .wide { max-height: none; overflow: visible; } details { display: none; } }
+  .wide { overflow: visible; } details { display: none; } }
 """
 
 _HEAD = """<!DOCTYPE html>

@@ -169,7 +169,7 @@ def sensitivity_sheet(series: RunSeries) -> FigureSpec | None:
         runs, figures = series.done, (HYSTERESIS, PEAK_ERROR, RMS_ERROR)
     found = [(figure, _changes(figure, numbers, runs)) for figure in figures]
     panels = tuple(
-        Panel(partial(_draw_bars, bars=bars), figure.text, 0.12 + 0.09 * len(bars))
+        Panel(partial(_draw_bars, bars=bars), figure.text, 0.12 + 0.11 * len(bars))
         for figure, bars in found
         if len(bars) > 1
     )
@@ -195,7 +195,8 @@ def _changes(
         if len(by) > 1 and whole > 0.0:
             means = [float(np.mean(members)) for members in by.values()]
             low, high = each.text(each.values[0]), each.text(each.values[-1])
-            found.append((f"{each.name}\n{low} to {high}", 100.0 * float(np.ptp(means)) / whole))
+            name = "\n".join((each.name, *wrap(f"{low} to {high}", _LONGEST_NAME)))
+            found.append((name, 100.0 * float(np.ptp(means)) / whole))
     return sorted(found, key=lambda bar: bar[1])[-_MOST_BARS:]
 
 
@@ -206,7 +207,7 @@ def _draw_bars(axes: Axes, bars: Sequence[tuple[str, float]]) -> None:
     for number, (_, size) in enumerate(bars):
         axes.annotate(f"{size:.3g} %", (size, number), xytext=(3, 0), textcoords="offset points",
                       va="center", fontsize=7)  # fmt: skip
-    axes.set(xlabel="change over the range, %")
+    axes.set(xlabel="change, %")
     axes.margins(x=0.18)
     axes.grid(axis="y", visible=False)
 

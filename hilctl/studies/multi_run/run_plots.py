@@ -83,17 +83,19 @@ _DISPLACEMENT_AXIS = "displacement, µm"
 def loop_sheets(series: RunSeries) -> Iterator[FigureSpec]:
     """Yield the loops against each numeric parameter, one panel per value of the others."""
     for along in series.dimensions:
-        groups = _groups(series, along)
-        if along.numeric and groups:
-            panels = [
+        groups = _groups(series, along) if along.numeric else []
+        name = f"loops_by_{along.name.replace(' ', '_')}"
+        # One figure per input, because its panels share their axes.
+        for axis in dict.fromkeys(_input_axis(runs[0][1]) for _, runs in groups):
+            found = [each for each in groups if _input_axis(each[1][0][1]) == axis]
+            panels = tuple(
                 Panel(partial(_draw_loops, along=along, runs=runs), title, _SQUARE)
-                for title, runs in spread(groups, _MOST_PANELS)
-            ]
-            more = f", {len(panels)} of {len(groups)} shown" if len(panels) < len(groups) else ""
+                for title, runs in spread(found, _MOST_PANELS)
+            )
+            more = f", {len(panels)} of {len(found)} shown" if len(panels) < len(found) else ""
             caption = f"Average steady loops by {along.name}{more}."
-            name = f"loops_by_{along.name.replace(' ', '_')}"
-            inputs = {_input_axis(digest) for _, runs in groups for _, digest in runs}
-            yield FigureSpec(name, caption, tuple(panels), alike=len(inputs) == 1)
+            yield FigureSpec(name, caption, panels, alike=True)
+            name = f"{name}_against_reference"
 
 
 def _groups(series: RunSeries, along: VariedParameter) -> list[tuple[str, list[Measured]]]:
@@ -235,7 +237,11 @@ def error_sheet(series: RunSeries) -> FigureSpec | None:
         if compensated:
             groups.append((title, compensated))
     groups = groups or [("", runs)]
-    text = (lambda run: along.text(run.values[along.key])) if along else series.text
+
+    def text(run: SeriesRun) -> str:
+        value = run.values.get(along.key) if along else None
+        return series.text(run) if along is None or value is None else along.text(value)
+
     panels = tuple(
         Panel(partial(_draw_error, text=text, runs=members), title)
         for title, members in spread(groups, _MOST_PANELS)

@@ -82,7 +82,8 @@ def test_they_are_found_from_what_varied(crossed, compensated):
         (crossed, "hysteresis_against_frequency hysteresis_against_amplitude loops_by_frequency "
                   "loops_by_amplitude sensitivity"),
         (compensated, "before_and_after hysteresis_against_frequency "
-                      "compensation_against_frequency loops_by_frequency error_history"),
+                      "compensation_against_frequency loops_by_frequency "
+                          "loops_by_frequency_against_reference error_history"),
     ):  # fmt: skip
         assert [sheet.name for sheet in plots.sheets_of(series)] == names.split()
 
