@@ -54,14 +54,14 @@ def usage_text(usage: ProcessUsage) -> str:
 def quality_rows(report: RunReport) -> list[tuple[str, str]]:
     """Return name and value of the metrics that the run has."""
     floor = f" (noise floor {number(report.noise_floor_percent, '%')})"
+    raw = f" peak, {number(report.rms_error_raw_percent, '%')} rms"
     rows = [
         ("peak hysteresis", report.peak_hysteresis_percent, "%", floor),
         ("loop area", report.loop_area, report.loop_area_unit, ""),
         ("peak-to-peak", report.peak_to_peak_um, "um", ""),
         ("peak error", report.peak_error_percent, "%", ""),
         ("rms error", report.rms_error_percent, "%", ""),
-        ("peak error, not averaged", report.peak_error_raw_percent, "%", ""),
-        ("rms error, not averaged", report.rms_error_raw_percent, "%", ""),
+        ("error, not averaged", report.peak_error_raw_percent, "%", raw),
         ("sensor noise", report.sensor_noise_um, "um", " rms"),
     ]
     known = [(name, number(v, unit) + more) for name, v, unit, more in rows if v is not None]

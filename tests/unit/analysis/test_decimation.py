@@ -109,7 +109,7 @@ def test_its_page_has_the_figures_of_the_whole(small, recording, undrawn):
     assert pieces.walks == 1
     whole = summarize(recording)
     assert summary.peak_hysteresis_percent == pytest.approx(whole.peak_hysteresis_percent, rel=1e-9)
-    assert "Figures" in page(shown, summary)
+    assert "Results" in page(shown, summary)
 
 
 def test_many_ticks_are_told_by_some_of_them(small, monkeypatch, recording):
