@@ -82,6 +82,8 @@ class BinaryLineSettings(SerialLineSettings):
 Text: TypeAlias = Annotated[str, StringConstraints(min_length=1)]
 Name: TypeAlias = Annotated[str, StringConstraints(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
 
+_USUAL_STEP = 1e-3
+
 
 class Range(StrictModel):
     """Range of a channel at its terminals.
@@ -107,6 +109,11 @@ class Range(StrictModel):
     def limits(self) -> tuple[float, float]:
         """Lowest and highest value, in ``unit``."""
         return self.min, self.max
+
+    @property
+    def step(self) -> float:
+        """Smallest step in ``unit``; a thousandth of the range if the profile does not say."""
+        return self.resolution or _USUAL_STEP * (self.max - self.min)
 
 
 class Watchdog(StrictModel):

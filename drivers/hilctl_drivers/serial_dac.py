@@ -230,8 +230,7 @@ class SerialDac(DacDevice):
     def _check_read_back(self, wanted: float, found: float) -> None:
         """Reject a read-back that differs from the written value by more than two steps."""
         output = self._setup.output
-        step = output.resolution or 1e-3 * (output.max - output.min)
-        check_read_back(output, wanted, found, 2.0 * step)
+        check_read_back(output, wanted, found, 2.0 * output.step)
 
     def _release(self) -> None:
         self._link.close()

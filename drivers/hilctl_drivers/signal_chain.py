@@ -220,6 +220,8 @@ class SignalChain:
         self._offset_um = sensor.offset_um
         self.command_range = sorted(map(self.command, output.limits))
         """Lowest and highest command of the output's range."""
+        self.command_step = abs(self._gain) * output.step
+        """Smallest step of a command."""
         self.displacement_range = sorted(map(self.displacement_um, sensor_input.limits))
         """Lowest and highest displacement of the input's range, um."""
 
@@ -258,6 +260,7 @@ class SignalChain:
             command_unit=self.command_unit,
             command_min=self.command_range[0],
             command_max=self.command_range[1],
+            command_step=self.command_step,
             sensor_min_um=self.displacement_range[0],
             sensor_max_um=self.displacement_range[1],
             max_rate_hz=rates.highest_hz,

@@ -27,6 +27,7 @@ class DeviceInfo:
         command_unit: Unit of the commands it takes.
         command_min: Lowest command it accepts, in ``command_unit``.
         command_max: Highest command it accepts, in ``command_unit``.
+        command_step: Smallest step of its output, in ``command_unit``; 0 if unknown.
         sensor_min_um: Lowest displacement its sensor can report.
         sensor_max_um: Highest displacement its sensor can report.
         max_rate_hz: Highest sample rate it can keep.
@@ -63,6 +64,7 @@ class DeviceInfo:
     sensor_max_um: float
     max_rate_hz: float
     rate_note: str = ""
+    command_step: float = 0.0
     buffered: bool = False
     fifo_depth: int = 0
     latency_blocks: int = 0

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from hilctl.recording.recording import Recording
 
 _STILL_S = 1.0
+_AT_REST_S = 0.1  # after which the stages of any actuator are at rest
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,6 +100,12 @@ def begin(
         run_id=before.run_id if before else "",
         stands_um=before.stands_um if before else None,
     )
+
+
+def rests_at(model: HysteresisModel, sample_rate_hz: float, command: float) -> float:
+    """Return the displacement at rest at a command that was never exceeded, in um."""
+    samples = max(round(_AT_REST_S * sample_rate_hz), 1)
+    return float(model.forward(sample_rate_hz).process(np.full(samples, command))[-1])
 
 
 def initial_state_after(

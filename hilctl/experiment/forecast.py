@@ -49,6 +49,9 @@ class Forecast:
     command_min: float
     command_max: float
     slew_per_s: float  # fastest change of the command
+    lowest_at_s: float  # time of the lowest command, from the start of the conditioning
+    highest_at_s: float
+    fastest_at_s: float
     heat: RunHeat  # effect on the heat of the coil, whatever the heat before
     begins_rms_a: float | None  # running rms after the last run; None without a thermal budget
     heating_rms_a: float | None  # highest running rms of the coil current; None without a budget
@@ -101,6 +104,7 @@ def forecast_of(
     )
     low, high = reference.span
     command, heat = figures.command, figures.command.heat
+    lowest_at_s, highest_at_s, fastest_at_s = command.places_s
     return Forecast(
         samples=values.size,
         duration_s=values.size / config.sample_rate_hz,
@@ -112,6 +116,9 @@ def forecast_of(
         command_min=command.low,
         command_max=command.high,
         slew_per_s=command.slew_per_s,
+        lowest_at_s=lowest_at_s,
+        highest_at_s=highest_at_s,
+        fastest_at_s=fastest_at_s,
         heat=figures.heat,
         begins_rms_a=None if heat.rms_a is None else math.sqrt(heat_a2),
         heating_rms_a=heat.rms_a,
@@ -217,16 +224,35 @@ class CommandFigures:
         self.heat = CoilHeat(config.limits, config.sample_rate_hz, heat_a2)
         self._rate_hz = config.sample_rate_hz
         self._step = 0.0
+        self._samples = 0
+        self._places = [0, 0, 0]  # samples of the lowest, highest and fastest command
 
     def add(self, command: F64) -> None:
         """Add the next commands: float64[n], n > 0."""
         with np.errstate(over="ignore", invalid="ignore"):  # such commands are rejected later
             steps = np.abs(np.diff(command, prepend=self.last))
-        self.low = float(np.minimum(self.low, command.min()))  # keeps a NaN, unlike min()
-        self.high = float(np.maximum(self.high, command.max()))
-        self._step = float(np.maximum(self._step, steps.max()))
+        places = int(command.argmin()), int(command.argmax()), int(steps.argmax())
+        before = self.low, self.high, self._step
+        self.low = float(np.minimum(self.low, command[places[0]]))  # keeps a NaN, unlike min()
+        self.high = float(np.maximum(self.high, command[places[1]]))
+        self._step = float(np.maximum(self._step, steps[places[2]]))
+        for i, now in enumerate((self.low, self.high, self._step)):
+            if now != before[i]:
+                self._places[i] = self._samples + places[i]
         self.last = float(command[-1])
         self.heat.add(command)
+        self._samples += command.size
+
+    def skip(self, heat_a2: float, samples: int, times: int) -> None:
+        """Add the last ``samples`` ``times`` more times; the heat before them was ``heat_a2``."""
+        self.heat.repeat(heat_a2, samples, times)
+        self._samples += samples * times
+
+    @property
+    def places_s(self) -> tuple[float, float, float]:
+        """Times of the lowest, the highest and the fastest command, in s."""
+        low, high, fast = (place / self._rate_hz for place in self._places)
+        return low, high, fast
 
     @property
     def slew_per_s(self) -> float:
@@ -264,7 +290,7 @@ class _RunFigures:
     def skip(self, samples: int, times: int) -> None:
         """Add the cycle since the mark, of ``samples`` samples, ``times`` more times."""
         before_a2, alone_a2 = self._marked
-        self.command.heat.repeat(before_a2, samples, times)
+        self.command.skip(before_a2, samples, times)
         self.heat = self.heat.repeated(alone_a2, samples, times, self._limits, self._rate_hz)
 
 

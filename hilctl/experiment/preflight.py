@@ -35,6 +35,7 @@ from hilctl.experiment.device_state import (
     initial_state_after,
     left_by,
     left_by_last_run,
+    rests_at,
 )
 from hilctl.experiment.forecast import Forecast, forecast_of
 from hilctl.experiment.load import LoadedExperiment
@@ -46,7 +47,9 @@ from hilctl.waveforms.build import Reference, build
 _log = logging.getLogger(__name__)
 
 _MANY = 50_000_000  # samples, which take some seconds
-STILL_S = 0.1  # time after which the stages of any actuator are at rest
+_ROUNDING = 1e-9  # of the range of commands
+_MORE_SLOPE = 1.5  # of a loop at its ends, than on average
+_SOFT_SHARE = 0.25  # of the slew limit, for a soft start
 
 
 @shown_briefly
@@ -97,12 +100,15 @@ def check(
     Raises:
         ConfigError: The run is rejected; all reasons are listed, each with its amount.
     """
-    config = loaded.config
+    config, model = loaded.config, loaded.model
     problems = [*device_problems(loaded), *condition_problems(loaded)]
     conditioning = conditioning_of(loaded)
     conditioned = np.empty(0) if conditioning is None else conditioning.command
+    rest = config.safe.value
+    if model is not None:
+        rest = rests_at(model, config.sample_rate_hz, rest)
     try:
-        reference = build(config.waveform, config.sample_rate_hz, loaded.folder)
+        reference = build(config.waveform, config.sample_rate_hz, loaded.folder, rest)
     except InputError as error:
         raise ConfigError([*problems, loaded.problem("waveform", str(error))]) from None
     _warn_of_long_work(reference)
@@ -122,15 +128,17 @@ def check(
     problems += feedback_problems(loaded, begun.preview)
     problems += adaptation_problems(loaded, begun.preview)
     warnings = findings.warnings + adaptation_warnings(config, reference.segments)
-    problems += _start_problems(loaded, begun, forecast) or command_problems(loaded, forecast)
+    problems += _start_problems(loaded, begun, forecast, rest) or command_problems(
+        loaded, forecast, reference
+    )
     if problems:
         raise ConfigError(problems)
     operator = adapted_operator(config, reference)
     for input_um in worst_inputs(config, operator, begun.input_um):
         worst = forecast_of(loaded, reference, begun, conditioned, input_um=input_um)
-        if found := command_problems(loaded, worst):
+        if found := command_problems(loaded, worst, reference):
             raise ConfigError([at_worst(each) for each in found])
-    warnings += pace_warnings(config, loaded.device.info)
+    warnings += (*pace_warnings(config, loaded.device.info), *_clamped(loaded, forecast))
     return CheckedExperiment(loaded, reference, forecast, begun, warnings, heat_a2, operator)
 
 
@@ -161,7 +169,9 @@ def _start(
             problems.append(loaded.problem("compensator.correction", str(error), hint=hint))
     before, begins = _state_before(loaded, conditioned, now_s, problems)
     if before is not None:
-        values = before.lead_in(values, config.lead_in_samples)
+        # With a soft start of this length, it becomes one from where the actuator stands.
+        soft = reference.segments[0].steady_start
+        values = before.lead_in(values, max(config.lead_in_samples, soft))
     begun = begin(loaded.model, config.sample_rate_hz, values, before, begins)
     return begun if measures_offset(config) else replace(begun, stands_um=None)
 
@@ -191,24 +201,27 @@ def _state_before(
 
 
 def _start_problems(
-    loaded: LoadedExperiment, begun: CompensatorStart, forecast: Forecast
+    loaded: LoadedExperiment, begun: CompensatorStart, forecast: Forecast, rests_um: float
 ) -> list[ConfigProblem]:
     """Return that the reference begins too far from the actuator's rest position."""
     # A higher slew limit would be the wrong remedy: it would pass the step on to the coil.
     model, config, rate_hz = loaded.model, loaded.config, loaded.config.sample_rate_hz
-    if model is None or not config.limits.slew_per_s < forecast.slew_per_s < math.inf:
+    slew_per_s = config.limits.slew_per_s
+    if model is None or not slew_per_s < forecast.slew_per_s < math.inf:
         return []
     first, safe, unit = forecast.first_command, config.safe.value, config.limits.unit
-    step = abs(first - safe) * rate_hz
-    if not config.limits.slew_per_s < step or not forecast.slew_per_s <= step * (1.0 + 1e-9):
+    step = abs(first - safe)
+    if not slew_per_s < step * rate_hz or not forecast.slew_per_s <= step * rate_hz * (1.0 + 1e-9):
         return []
-    still = model.forward(rate_hz).process(np.full(max(round(STILL_S * rate_hz), 1), safe))
-    rests_um = float(still[-1])
+    key, part = "waveform", config.waveform
+    if part.kind == "sequence":
+        key, part = "waveform.parts.0", part.parts[0]
+    soft_s = max(config.safe.ramp_s, 0.5 * math.pi * step / (_SOFT_SHARE * slew_per_s))
+    cure = f"set {key}.soft_start_s to {soft_s:.3g}"
+    if part.soft_start_s:
+        cure = f"remove {key}.rest: {rests_um:.4g} is its default"
     rule = f"must begin where the actuator rests at {safe:g} {unit}, {rests_um:.4g} µm by the model"
-    hint = (
-        f"its first command would step to {first:.4g} {unit}: set waveform.rest to "
-        f"{rests_um:.4g} and waveform.soft_start_s, or begin there"
-    )
+    hint = f"its first command would step to {first:.4g} {unit}: {cure}"
     value = f"{float(begun.input_um[:1][0]):.4g} µm"
     return [loaded.problem("waveform", rule, value, hint)]
 
@@ -241,8 +254,13 @@ def _fitting(low: float, high: float, lowest: float, highest: float) -> str:
     return f"lower the waveform's amplitude{'' if centred else ', and change its offset'}"
 
 
-def command_problems(loaded: LoadedExperiment, forecast: Forecast) -> list[ConfigProblem]:
-    """Return the limits that the commands of a forecast exceed, and by how much."""
+def command_problems(
+    loaded: LoadedExperiment, forecast: Forecast, reference: Reference | None = None
+) -> list[ConfigProblem]:
+    """Return the limits that the commands of a forecast exceed, by how much, and when.
+
+    An excess below a step of the output is none: the limiter takes it away.
+    """
     limits = loaded.config.limits
     low, high = limits.command_range
     unit = limits.unit
@@ -251,18 +269,23 @@ def command_problems(loaded: LoadedExperiment, forecast: Forecast) -> list[Confi
         rule = "every command must be a finite number"
         return [loaded.problem("compensator.model", rule, span)]
     found = []
-    excess = max(low - forecast.command_min, forecast.command_max - high)
-    if excess > 0.0:
+    if (excess := _excess(loaded, forecast)) > loaded.device.info.command_step:
         key = f"limits.{limits.range_key}"
+        below = low - forecast.command_min == excess
+        at_s = forecast.lowest_at_s if below else forecast.highest_at_s
+        place, cure = _place(loaded, reference, forecast, at_s)
         fitting = _fitting(forecast.command_min, forecast.command_max, low, high)
-        hint = f"{excess:.3g} {unit} too much: {fitting}, or {_wider(loaded, forecast)}"
+        cure = cure or _smaller(loaded, forecast, excess) or fitting
+        cure += f", or {_wider(loaded, forecast)}"
         rule = f"the run must stay within {low:g} to {high:g} {unit}"
+        hint = f"{excess:.3g} {unit} too much{place}: {cure}"
         found.append(loaded.problem(key, rule, span, hint))
     if forecast.slew_per_s > limits.slew_per_s:
         key = "limits.slew_v_per_s" if unit == "V" else "limits.slew_a_per_s"
         times = forecast.slew_per_s / limits.slew_per_s
+        place, _ = _place(loaded, reference, forecast, forecast.fastest_at_s)
         hint = (
-            f"{times:.3g} times the limit: lower frequency or amplitude, soften jumps "
+            f"{times:.3g} times the limit{place}: lower frequency or amplitude, soften jumps "
             f"(soft_start_s, soft_end_s, rise_s), or raise {key} to {_up(forecast.slew_per_s):g}"
         )
         rule = f"the run must change no faster than {limits.slew_per_s:g} {unit}/s"
@@ -288,6 +311,56 @@ def _wider(loaded: LoadedExperiment, forecast: Forecast) -> str:
 def _up(value: float) -> float:
     """Return a number rounded up to four digits."""
     return float(Context(prec=4, rounding=ROUND_CEILING).create_decimal_from_float(value))
+
+
+def _excess(loaded: LoadedExperiment, forecast: Forecast) -> float:
+    """Return by how much commands exceed their range; 0 for rounding errors."""
+    low, high = loaded.config.limits.command_range
+    excess = max(low - forecast.command_min, forecast.command_max - high)
+    return excess if excess > _ROUNDING * (high - low) else 0.0
+
+
+def _clamped(loaded: LoadedExperiment, forecast: Forecast) -> Iterator[str]:
+    limits, step = loaded.config.limits, loaded.device.info.command_step
+    if excess := _excess(loaded, forecast):
+        yield (
+            f"limits.{limits.range_key}: commands exceed it by {excess:.2g} {limits.unit}, less "
+            f"than a step of the output, {step:.2g} {limits.unit}: the limiter clamps them"
+        )
+
+
+def _smaller(loaded: LoadedExperiment, forecast: Forecast, excess: float) -> str:
+    """Return the amplitude with which commands keep to their limits; empty if there is none."""
+    amplitude = getattr(loaded.config.waveform, "amplitude", 0.0)
+    if commanded := forecast.command_max - forecast.command_min:
+        slope = (forecast.reference_max - forecast.reference_min) / commanded
+        amplitude -= _MORE_SLOPE * slope * excess
+    return f"set waveform.amplitude to {amplitude:.3g}" if amplitude > 0.0 else ""
+
+
+def _place(
+    loaded: LoadedExperiment, reference: Reference | None, forecast: Forecast, at_s: float
+) -> tuple[str, str]:
+    """Return the time and part of a run in words, and its key that cures an excess, if any."""
+    if reference is None:
+        return "", ""
+    sample = round((at_s - forecast.before_s) * reference.sample_rate_hz)
+    if sample < 0:
+        return f" at {at_s:.4g} s in the conditioning", ""
+    number = next(i for i, each in enumerate(reference.segments) if sample < each.stop)
+    segment, waveform = reference.segments[number], loaded.config.waveform
+    key, then = "waveform", ""
+    if waveform.kind == "sequence":
+        parts = len(waveform.parts)
+        key = f"waveform.parts.{number % parts}"
+        if number + 1 < len(reference.segments):
+            then = f" and waveform.parts.{(number + 1) % parts}.soft_start_s"
+    if sample < segment.steady_start:
+        return f" at {at_s:.4g} s in the soft start of {key}", ""
+    if sample < segment.steady_stop:
+        return f" at {at_s:.4g} s in {key}", ""
+    cure = f"set {key}.soft_end_s{then} to 0" + ("" if then else ", because the safe ramp follows")
+    return f" at {at_s:.4g} s in the soft end of {key}", cure
 
 
 def _budget_problems(loaded: LoadedExperiment, forecast: Forecast) -> Iterator[ConfigProblem]:

@@ -57,8 +57,10 @@ class _Part:
     repeats: bool
 
 
-def build(waveform: spec.AnyWaveform, sample_rate_hz: float, folder: Path) -> Reference:
-    """Compute every sample of a waveform.
+def build(
+    waveform: spec.AnyWaveform, sample_rate_hz: float, folder: Path, rest: float = 0.0
+) -> Reference:
+    """Compute every sample of a waveform; ``rest`` is the default of its key of that name.
 
     Raises:
         InputError: A file is not usable, the waveform is too long, a soft start does not fit, a
@@ -67,7 +69,7 @@ def build(waveform: spec.AnyWaveform, sample_rate_hz: float, folder: Path) -> Re
     if waveform.unit is None:
         raise InputError("unit is required: um, A or V")
     with np.errstate(over="ignore", invalid="ignore"):  # non-finite values are rejected below
-        parts, repeat = _parts(waveform, waveform.unit, sample_rate_hz, folder)
+        parts, repeat = _parts(waveform, waveform.unit, sample_rate_hz, folder, rest)
         values = parts[0].values
         if len(parts) * repeat > 1:
             values = np.concatenate([part.values for part in parts] * repeat)
@@ -100,22 +102,26 @@ def _repeats(parts: list[_Part], repeat: int) -> tuple[RepeatedPart, ...]:
 
 
 def _parts(
-    waveform: spec.AnyWaveform, unit: str, sample_rate_hz: float, folder: Path
+    waveform: spec.AnyWaveform, unit: str, sample_rate_hz: float, folder: Path, rest: float
 ) -> tuple[list[_Part], int]:
     """Return the parts of a waveform and the number of repeats."""
     if waveform.kind != "sequence":
-        return [_part(waveform, waveform.kind, unit, sample_rate_hz, folder)], 1
+        return [_part(waveform, waveform.kind, unit, sample_rate_hz, folder, rest)], 1
     built = []
     samples = 0
     for i, each in enumerate(waveform.parts):
-        part = _part(each, f"parts.{i} ({each.kind})", unit, sample_rate_hz, folder)
+        part = _part(each, f"parts.{i} ({each.kind})", unit, sample_rate_hz, folder, rest)
         samples += part.values.size
         shapes.check_length(samples * waveform.repeat)
         built.append(part)
     return built, waveform.repeat
 
 
-def _part(w: spec.SinglePart, name: str, unit: str, sample_rate_hz: float, folder: Path) -> _Part:
+def _part(
+    w: spec.SinglePart, name: str, unit: str, sample_rate_hz: float, folder: Path, rest: float
+) -> _Part:
+    if w.rest is None:
+        w = w.model_copy(update={"rest": rest})
     if w.kind == "file":
         values, period = read_samples(w, sample_rate_hz, folder)
         label = f"file {Path(w.path).name}"
@@ -131,7 +137,7 @@ def _part(w: spec.SinglePart, name: str, unit: str, sample_rate_hz: float, folde
     soft_start, soft_end = _soft_samples(w, name, n, sample_rate_hz)
     period = period if math.isfinite(period) else 0.0
     segment = Segment(label, 0, n, soft_start, n - soft_end, period)
-    _soften(values, w.rest, soft_start, soft_end)
+    _soften(values, w.rest_value, soft_start, soft_end)
     # The period of a file is not verified.
     return _Part(values, segment, period > 0.0 and w.kind != "file")
 

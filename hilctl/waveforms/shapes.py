@@ -187,7 +187,7 @@ def _chirp(w: spec.Chirp, t: F64) -> F64:
 
 def _step(w: spec.Step, t: F64) -> F64:
     """Return levels, each reached linearly in ``rise_s``: float64[n]."""
-    levels = np.array((0.0, *w.levels))
+    levels = _levels(w)
     index = np.minimum((t / w.dwell_s + 1e-12).astype(np.int64), len(w.levels) - 1)
     since = t - index * w.dwell_s
     part = np.ones_like(t) if w.rise_s == 0.0 else np.clip(since / w.rise_s, 0.0, 1.0)
@@ -239,9 +239,9 @@ def _random(w: spec.RandomSines, size: int) -> F64:
     return w.amplitude / float(np.max(np.abs(total))) * total
 
 
-def _levels(w: spec.LevelPath) -> F64:
+def _levels(w: spec.LevelPath | spec.Step) -> F64:
     """Return the levels including the initial one: float64[m + 1]."""
-    return np.array((w.rest - w.offset, *w.levels))
+    return np.array((w.rest_value - w.offset, *w.levels))
 
 
 def _arrivals_s(w: spec.LevelPath) -> F64:

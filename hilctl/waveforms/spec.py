@@ -48,8 +48,10 @@ class _Shape(StrictModel):
 
     unit: WaveformUnit | None = Field(default=None, description=UNIT)
     offset: float = Field(default=0.0, description="constant added to the waveform, in unit")
-    rest: float = Field(
-        default=0.0, description="value before a soft start and after a soft end, in unit"
+    rest: float | None = Field(
+        default=None,
+        description="value before a soft start and after a soft end, in unit; default: the model's"
+        " displacement at safe.value, or safe.value without a compensator",
     )
     soft_start_s: NotNegative = Field(
         default=0.0,
@@ -59,6 +61,11 @@ class _Shape(StrictModel):
     soft_end_s: NotNegative = Field(
         default=0.0, description="duration of the fade to rest, s; part of the waveform's duration"
     )
+
+    @property
+    def rest_value(self) -> float:
+        """Value at rest; 0 if it is not set."""
+        return self.rest or 0.0
 
 
 class Sine(_Shape):
@@ -121,7 +128,7 @@ class Chirp(_Shape):
 
 
 class Step(_Shape):
-    """Consecutive constant levels, each reached in ``rise_s``."""
+    """Consecutive constant levels, each reached in ``rise_s``, beginning at ``rest``."""
 
     kind: Literal["step"]
     levels: Annotated[tuple[float, ...], NotEmpty, AtLeastOne] = Field(

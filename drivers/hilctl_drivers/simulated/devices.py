@@ -354,6 +354,7 @@ class SimulatedTerfenol(SimulatedDevice):
             command_unit="A",
             command_min=command_min,
             command_max=command_max,
+            command_step=self._parameters.dac_range_a / self._parameters.dac_codes,
         )
 
     def plant(self, sample_rate_hz: float) -> Plant:
@@ -384,6 +385,7 @@ class SimulatedPiezo(SimulatedDevice):
             command_unit="V",
             command_min=low_v,
             command_max=high_v,
+            command_step=(high_v - low_v) / self._parameters.dac_codes,
         )
 
     def plant(self, sample_rate_hz: float) -> Plant:

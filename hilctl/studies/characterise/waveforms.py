@@ -205,7 +205,6 @@ def rests(limits: CharacterisationLimits, amplitude: float) -> Keys:
         "rise_s": rise_s,
         "offset": limits.centre,
         "rest": limits.rest,
-        "soft_start_s": rise_s,
     }
     return _conditioned(limits, amplitude, steps)
 

@@ -15,7 +15,7 @@ from hilctl.base.yaml import Document
 from hilctl.experiment import preflight as module
 from hilctl.experiment.coil_heat import RunHeat
 from hilctl.experiment.correction import Correction, LearnedCycle, signature
-from hilctl.experiment.device_state import InitialState
+from hilctl.experiment.device_state import InitialState, left_by
 from hilctl.experiment.file import CompensatorConfig
 from hilctl.experiment.load import resolve
 from hilctl.experiment.model_validity import UNKNOWN
@@ -63,8 +63,8 @@ class BrokenModel(HysteresisModel):
         return 1
 
     def forward(self, sample_rate_hz):
-        """Refuse: only the inverse is run."""
-        raise AssertionError("forward")
+        """Return an operator that is always at rest."""
+        return Operator(lambda x, memory, out: out.fill(0.0), (), self.operators)
 
     def inverse(self, sample_rate_hz):
         def run(x, memory, out):
@@ -79,7 +79,8 @@ class BrokenModel(HysteresisModel):
 
 def loaded(text, *settings, model=None, **info):
     """Read an experiment and put a fake device and a model in."""
-    without_model = text.replace("{model: model.yaml}", "none").replace("unit: um", "unit: A")
+    unit = info.get("command_unit", "A")
+    without_model = text.replace("{model: model.yaml}", "none").replace("um\n", f"{unit}\n")
     made = resolve(Document("x.yaml", text if model is None else without_model), Path(), settings)
     device = DescribedDevice(replace(DESCRIBED, **info))
     if model is None:
@@ -406,15 +407,99 @@ def test_a_reference_beyond_what_the_model_was_identified_on_is_warned_or_refuse
     assert check(loaded(DISPLACEMENT, model=terfenol_rdpi())).warnings == (UNKNOWN,)
 
 
-def test_a_reference_that_begins_beside_the_rest_position_is_moved_not_hurried():
-    """At 0 A the actuator rests at 24.5 um: from 0 um the first command would be a step."""
-    moved = terfenol_rdpi().model_copy(update={"output_offset_um": 24.5})
-    (problem,) = refused(loaded(DISPLACEMENT, "waveform.offset=0", model=moved))
-    assert (problem.key, problem.value) == ("waveform", "0 µm")
+MOVED = terfenol_rdpi().model_copy(update={"output_offset_um": 24.5})
+"""At 0 A the actuator rests at 24.5 um."""
+
+
+@pytest.mark.parametrize(
+    ("setting", "cure"),
+    [
+        ("waveform.soft_start_s=0", r"set (waveform\.soft_start_s) to ([.\d]+)"),
+        ("waveform.rest=0", r"remove (waveform\.rest): ([.\d]+)"),
+    ],
+)
+def test_a_reference_begins_where_the_actuator_rests(setting, cure):
+    """From 0 um the first command would be a step."""
+    found = checked(DISPLACEMENT, model=MOVED)
+    assert found.reference.values[0] == 24.5
+    (problem,) = refusals(DISPLACEMENT, setting, model=MOVED)
+    assert problem.key == "waveform"
     assert "24.5 µm" in problem.rule
     assert "slew" not in str(problem)
-    there = ("waveform.offset=24.5", "waveform.soft_start_s=0")
-    assert check(loaded(DISPLACEMENT, *there, model=moved))
+    key, value = re.search(cure, problem.hint).groups()
+    assert checked(DISPLACEMENT, setting, f"{key}={value}", model=MOVED)
+
+
+PIEZO = """\
+name: piezo
+device: {kind: simulated_piezo}
+sample_rate_hz: 1000
+waveform:
+  kind: sine
+  unit: um
+  amplitude: 12.0
+  offset: 17.0
+  frequency_hz: 1.0
+  duration_s: 3.0
+  soft_start_s: 1.0
+compensator: {model: model.yaml}
+limits: {drive_v: [0.0, 100.0], slew_v_per_s: 2000.0, stroke_um: [-1.0, 38.0]}
+"""
+VOLTS = {"command_unit": "V", "command_min": 0.0, "command_max": 100.0, "command_step": 1.5e-3}
+STAGE = piezo_ppi().model_copy(update={"output_offset_um": 0.006})
+
+
+def test_a_unipolar_drive_begins_at_rest_and_never_below():
+    found = checked(PIEZO, model=STAGE, **VOLTS)
+    assert (found.forecast.command_min, found.warnings) == (0.0, ())
+
+
+HOLDS = """waveform={kind: sequence, unit: V, parts: [
+  {kind: hold, level: 10.0, duration_s: 2.0, soft_start_s: 0.5, soft_end_s: 0.5},
+  {kind: hold, level: 10.0, duration_s: 1.0, soft_start_s: 0.5}]}"""
+
+
+@pytest.mark.parametrize(
+    ("setting", "at_s", "part", "keys"),
+    [
+        ("waveform.soft_end_s=1.0", 3.0, "soft end", ["waveform.soft_end_s"]),
+        (HOLDS, 2.0, "soft end", ["waveform.parts.0.soft_end_s", "waveform.parts.1.soft_start_s"]),
+        ("waveform.offset=13.0", 1.75, "in waveform", ["waveform.amplitude"]),
+        ("waveform.offset=36.0", 1.25, "in waveform", ["waveform.amplitude"]),
+    ],
+)
+def test_an_exceeded_limit_is_named_with_time_part_and_a_cure(setting, at_s, part, keys):
+    """A stage that was driven is above its rest position at 0 V."""
+    given = (setting, "limits.stroke_um=[-9, 60]")
+    wide = {**VOLTS, "sensor_max_um": 60.0}
+    (found,) = refusals(PIEZO, *given, model=STAGE, **wide)
+    assert found.key == "limits.drive_v"
+    assert float(re.search(r"at ([.\d]+) s", found.hint).group(1)) == pytest.approx(at_s, abs=0.01)
+    assert part in found.hint
+    assert re.findall(r"waveform\.[\w.]+_s\b|waveform\.amplitude", found.hint) == keys
+    value = re.search(r" to ([.\d]*\d)", found.hint).group(1)
+    assert checked(PIEZO, *given, *(f"{key}={value}" for key in keys), model=STAGE, **wide)
+
+
+def test_an_excess_below_a_step_of_the_output_is_clamped_and_said():
+    given = ("waveform.rest=0.0058",)
+    found = checked(PIEZO, *given, model=STAGE, **VOLTS)
+    assert -1.5e-3 < found.forecast.command_min < 0.0
+    assert "limits.drive_v" in found.warnings[0]
+    (problem,) = refusals(PIEZO, *given, model=STAGE, **VOLTS | {"command_step": 0.0})
+    assert problem.key == "limits.drive_v"
+
+
+def test_a_soft_start_begins_where_the_last_run_left_the_actuator(monkeypatch):
+    """A unipolar drive cannot bring it back to rest."""
+    left = left_by([100.0 * np.sin(np.linspace(0.0, np.pi, 1000))], STAGE, 1000.0)
+    monkeypatch.setattr(module, "left_by_last_run", lambda *_: (left, "as left"))
+    made = compensated(loaded(PIEZO, model=STAGE, **VOLTS), initial_state="last")
+    found = check(made)
+    assert left.stands_um > 1.0
+    assert found.begun.input_um[0] == pytest.approx(left.stands_um)
+    assert found.forecast.command_min > -1e-9
+    assert found.reference.values[0] == pytest.approx(0.006)
 
 
 class Offset(HysteresisModel):
@@ -438,12 +523,22 @@ class Offset(HysteresisModel):
         return Operator(run, (), self.operators)
 
 
-FAST = ("limits.slew_a_per_s=400.0", "waveform.frequency_hz=20.0", "waveform.amplitude=3.5")
+FAST = (
+    "waveform.rest=0",
+    "limits.slew_a_per_s=400.0",
+    "waveform.frequency_hz=20.0",
+    "waveform.amplitude=3.5",
+)
 
 
 @pytest.mark.parametrize(("rate_hz", "rests_um"), [(10_000.0, 999), (40.0, 3), (2.0, 0)])
 def test_where_it_rests_is_said_once_all_stages_do(rate_hz, rests_um):
-    slow = (f"sample_rate_hz={rate_hz}", "limits.slew_a_per_s=1.0", "waveform.frequency_hz=0.01")
+    slow = (
+        "waveform.rest=0",
+        f"sample_rate_hz={rate_hz}",
+        "limits.slew_a_per_s=1.0",
+        "waveform.frequency_hz=0.01",
+    )
     (found,) = refusals(DISPLACEMENT, *slow, "waveform.amplitude=1.0", model=Offset())
     assert (found.key, found.value) == ("waveform", "0 µm")
     assert f" {rests_um} µm" in found.rule

@@ -80,6 +80,11 @@ class TestStep:
         second = [4.0, 3.5, 3.0, 2.5] + [2.0] * 6
         np.testing.assert_allclose(values, first + second, rtol=0.0, atol=1e-12)
 
+    def test_first_rise_begins_at_rest(self, made: Made) -> None:
+        keys = {"offset": 10.0, "rest": 9.0, "dwell_s": 1.0, "rise_s": 0.4}
+        values = made(10.0, kind="step", levels=(3.0,), **keys).values
+        np.testing.assert_allclose(values[:5], [9.0, 10.0, 11.0, 12.0, 13.0], atol=1e-12)
+
     def test_rise_as_long_as_the_dwell(self, made: Made) -> None:
         values = made(100.0, kind="step", levels=(1.0, 2.0, 3.0), dwell_s=0.5, rise_s=0.5).values
         np.testing.assert_allclose(values, np.arange(150) / 50.0, rtol=0.0, atol=1e-12)
