@@ -1,5 +1,6 @@
 """The command ``hilctl characterise``."""
 
+import shlex
 import signal
 import sys
 from pathlib import Path
@@ -71,6 +72,9 @@ def characterise(
         raise RunError(f"{error}; {_RESUMES}") from None
     if result is not None:
         _finish(result, output, chosen, as_json=as_json)
+        if result.first_run and not as_json:
+            keys = [word for each in result.first_run for word in ("--set", each)]
+            print(f"run it: {shlex.join(['hilctl', 'run', str(experiment), *keys])}")
 
 
 def _finish(result: Characterisation, output: Path, folder: Path, *, as_json: bool) -> None:

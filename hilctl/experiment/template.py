@@ -175,7 +175,7 @@ def _first_values(info: DeviceInfo, limits: object) -> tuple[dict[str, Any], dic
         remarks["block"] = "samples exchanged in one tick; the device has a FIFO"
     data["waveform"] = _sine(info.command_unit, low, high, frequency_hz)
     remarks["waveform.amplitude"] = f"{info.command_unit}: half of the limits below"
-    remarks["waveform.soft_start_s"] = "the first cycle grows, the last one fades"
+    remarks["waveform.soft_start_s"] = "the first cycle grows; at the end the safe ramp follows"
     data["compensator"] = "none"
     remarks["compensator"] = "or {model: model.yaml}, once there is one"
     # Of loops over the whole range, with a margin; the starter sine and the ramp are slower.
@@ -215,7 +215,6 @@ def _sine(unit: CommandUnit, low: float, high: float, frequency_hz: float) -> di
         "frequency_hz": frequency_hz,
         "duration_s": 4.0 * cycle_s,
         "soft_start_s": cycle_s,
-        "soft_end_s": cycle_s,
     }
 
 

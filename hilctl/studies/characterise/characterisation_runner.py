@@ -1,17 +1,20 @@
 """Characterisation runner: one run per step, each planned from the steps before it."""
 
+import json
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
-from hilctl.base.errors import DataError, InputError, RunError
+from hilctl.base.errors import ConfigError, DataError, InputError, RunError
 from hilctl.base.files import check_writable, make_folder, write_text
 from hilctl.base.types import F64, CommandUnit
 from hilctl.experiment.coil_heat import CoolingCoil, RunHeat
 from hilctl.experiment.device_state import heat_before
 from hilctl.experiment.load import load_experiment
 from hilctl.loop.interlocks import InterlockRequirement, InterlockSettings
+from hilctl.models.base import HysteresisModel
 from hilctl.models.model_file import dump_model
 from hilctl.recording.reader import read
 from hilctl.recording.recording import Recording
@@ -27,7 +30,7 @@ from hilctl.studies.characterise.results import (
     validated,
 )
 from hilctl.studies.characterise.steps import STEPS, CharacterisationStep
-from hilctl.studies.characterise.waveforms import Keys, at_rest, within
+from hilctl.studies.characterise.waveforms import FIRST_PARTS, Keys, at_rest, first_run, within
 from hilctl.studies.step_runner import (
     StepRunner,
     StudyHost,
@@ -113,6 +116,7 @@ class CharacterisationRunner:
         host: CharacterisationHost | None = None,
     ) -> None:
         self._experiment = experiment
+        self._given = settings
         self._settings = [*settings, *without_reference(experiment, settings)]
         self._folder = folder
         self._host = host or CharacterisationHost()
@@ -267,9 +271,22 @@ class CharacterisationRunner:
             remedy = "check the loops on the page, or run 'hilctl identify' on the recordings"
             raise RigProblemError("no_model", f"no model identified: {error}", remedy) from None
         result = replace(self._so_far(result), held_out=apart, identification=found)
-        if result.is_model:
-            write_text(output, dump_model(found.fit.model), overwrite=overwrite)
-        return result
+        if not result.is_model:
+            return result
+        write_text(output, dump_model(found.fit.model), overwrite=overwrite)
+        return replace(result, first_run=self._first_run(output, found.fit.model))
+
+    def _first_run(self, output: Path, model: HysteresisModel) -> tuple[str, ...]:
+        """Return the settings of a run through the model; empty if its check fails."""
+        named = [*self._given, f"compensator.model={json.dumps(str(output))}"]
+        waveform = document_with(self._experiment, self._given).data.get("waveform")
+        own = isinstance(waveform, dict) and waveform.get("unit") == "um"
+        for part in FIRST_PARTS:
+            keys = [] if own else [setting("waveform", first_run(self.limits, model, part))]
+            with suppress(ConfigError):
+                checked_experiment(self._experiment, [*named, *keys])
+                return (*named, *keys)
+        return ()
 
     def _path(self, number: int, step: CharacterisationStep) -> Path:
         return self._folder / f"{number:02d}-{step.name}.mcap"

@@ -86,6 +86,7 @@ class Characterisation:
         identification: The model; None if none was identified.
         problem: Problem of the rig with its remedy; empty if all steps were completed.
         problem_code: Code of the problem.
+        first_run: Settings of the experiment for a first run through the model.
     """
 
     experiment: str
@@ -98,6 +99,7 @@ class Characterisation:
     identification: Identification | None = None
     problem: str = ""
     problem_code: str = ""
+    first_run: tuple[str, ...] = ()
 
     @property
     def verdict(self) -> Verdict | None:
@@ -128,6 +130,7 @@ class Characterisation:
             "verdict": None if self.verdict is None else self.verdict.to_mapping(),
             "problem": self.problem or None,
             "problem_code": self.problem_code or None,
+            "first_run": list(self.first_run),
             "experiment": self.experiment,
             "device": self.device,
             "unit": self.unit,

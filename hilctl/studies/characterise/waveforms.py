@@ -9,6 +9,7 @@ from pydantic import TypeAdapter
 
 from hilctl.base.types import F64
 from hilctl.experiment.template import round_hz
+from hilctl.models.base import HysteresisModel
 from hilctl.studies.characterise.limits import CharacterisationLimits
 from hilctl.waveforms.build import Reference, build
 from hilctl.waveforms.spec import AnyWaveform
@@ -18,6 +19,8 @@ Keys: TypeAlias = dict[str, Any]
 REST_S = 2.0
 CREEP_S = 4.0
 RANDOM_S = 3.0
+FIRST_PARTS = (0.3, 0.1, 0.03)
+"""Amplitudes of a first run through a model, of its range; the first that passes the check."""
 HELD_OUT_SEED = 7
 TRAINING_SEED = 100
 
@@ -235,6 +238,22 @@ def small_motions(limits: CharacterisationLimits, amplitude: float) -> Keys:
         for seed, (at, size) in enumerate(_SMALL, TRAINING_SEED + 1)
     )
     return _conditioned(limits, amplitude, *parts)
+
+
+def first_run(limits: CharacterisationLimits, model: HysteresisModel, part: float) -> Keys:
+    """Return a sine in um about the middle of a model's range, with a part of it as amplitude."""
+    low_um, high_um = model.output_range_um or limits.stroke_um
+    soft_s = max(2.0 / limits.middle_hz, limits.soft_s(limits.reach, limits.centre))
+    soft_s = _rounded(soft_s)
+    return {
+        "kind": "sine",
+        "unit": "um",
+        "amplitude": _rounded(part * (high_um - low_um)),
+        "offset": _rounded(0.5 * (low_um + high_um)),
+        "frequency_hz": limits.middle_hz,
+        "duration_s": _rounded(soft_s + 8.0 / limits.middle_hz),
+        "soft_start_s": soft_s,
+    }
 
 
 def _rounded(amplitude: float) -> float:

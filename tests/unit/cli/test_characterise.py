@@ -52,9 +52,17 @@ def command(ends, hilctl, tmp_path):
 
 
 def test_plan_and_result_are_printed(ends, command, tmp_path):
+    ends["found"] = replace(ends["found"], first_run=("waveform.rest=1",))
     code, shown, _ = command("--fast")
     assert code == 0
-    for value in ("-4 to 4 A", "-50 to 50 µm", "0.5 to 80 Hz", "2 s", "30.0 nm rms"):
+    for value in (
+        "-4 to 4 A",
+        "-50 to 50 µm",
+        "0.5 to 80 Hz",
+        "2 s",
+        "30.0 nm rms",
+        "--set waveform.rest=1",
+    ):
         assert value in shown
     assert (tmp_path / "model.html").is_file()
     assert ends["folder"] == tmp_path / "model-runs"
