@@ -6,6 +6,7 @@ import pytest
 
 from hilctl import api
 from hilctl.analysis.report import summarize
+from hilctl.recording.reader import read
 
 ONE_SIGN = (
     "limits={drive_a: [0.0, 2.0], slew_a_per_s: 400.0, stroke_um: [-90.0, 90.0]}",
@@ -49,7 +50,7 @@ def test_a_rig_is_compensated_by_default(tmp_path, device, settings, within_perc
     assert api.check(rig, found.first_run).warnings == ()
     run = api.run(rig, tmp_path / "run.mcap", settings=found.first_run, fast=True)
     assert run.code == "completed"
-    before = summarize(api.read(run.path)).peak_error_percent
+    before = summarize(read(run.path)).peak_error_percent
     assert before < 2.0
     learned = api.learn(rig, tmp_path / "learned.yaml", settings=found.first_run, fast=True)
     assert Path(tmp_path / "learned.yaml").is_file()
