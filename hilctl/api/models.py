@@ -47,7 +47,7 @@ def identify(
         on_progress: Called with the fraction done (0 to 1) and the current step.
 
     Returns:
-        The model, its errors (validation first) and its verdict: good, usable, or not a model.
+        The model, its errors (validation first) and verdict: good, usable, poor, or not a model.
 
     Raises:
         InputError: A file or a setting is invalid; nothing is written.

@@ -1,4 +1,4 @@
-"""Grade of a model: good, usable within an error, or not a model, with reasons."""
+"""Grade of a model: good, usable within an error, poor, or not a model, with reasons."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -13,9 +13,10 @@ from hilctl.identify.fit_model import FittedModel
 from hilctl.identify.model_selection import HeldOut
 from hilctl.identify.settings import FitSettings
 
-Grade: TypeAlias = Literal["good", "usable", "not a model"]
+Grade: TypeAlias = Literal["good", "usable", "poor", "not a model"]
 
 GOOD_PERCENT = 2.0
+USABLE_PERCENT = 5.0
 MOST_PERCENT = 25.0  # of a record's own peak-to-peak, the typical error of a straight line
 FOLLOWED = 0.5  # part of the variance of the displacement that a model must explain
 EVEN = 0.5  # correlation with the command's distance from its middle
@@ -42,12 +43,19 @@ class Verdict:
         percent = f"{self.within_percent:.2f} % of a record's own peak-to-peak"
         if not self.held_out:
             return f"fit error {percent} (no validation data, so the error elsewhere is unknown)"
-        within = "good: within" if self.grade == "good" else "usable within"
+        within = {"good": "good: within", "usable": "usable within"}.get(self.grade, "poor: within")
         return f"{within} {percent}, on held-out data"
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the fields as plain values."""
         return asdict(self) | {"text": str(self)}
+
+
+def grade_of(within_percent: float, *, known: bool = True) -> Grade:
+    """Return the grade of an error; ``known`` is whether it holds for other motions too."""
+    if within_percent > USABLE_PERCENT:
+        return "poor"
+    return "good" if known and within_percent <= GOOD_PERCENT else "usable"
 
 
 def verdict_of(
@@ -72,10 +80,9 @@ def verdict_of(
             "no data were held out: use four loops or more at several amplitudes and frequencies, "
             "or other files with --validate"
         )
-    good = known and held_out is not None and within <= GOOD_PERCENT
     if within > GOOD_PERCENT and (cause := _cause(fit, records, settings)):
         notes.insert(0, cause)
-    grade: Grade = "good" if good else "usable"
+    grade = grade_of(within, known=known and held_out is not None)
     return Verdict(grade, within, held_out is not None, notes=(*notes, *suggestions))
 
 

@@ -11,7 +11,7 @@ from hilctl.base.formatting import shown_briefly
 from hilctl.base.types import F64
 from hilctl.identify.data.records import History
 from hilctl.identify.fit_api import FitRequest
-from hilctl.identify.model_quality import GOOD_PERCENT, MOST_PERCENT, Grade, Verdict
+from hilctl.identify.model_quality import MOST_PERCENT, Verdict, grade_of
 from hilctl.identify.parallel import parallel_map, workers
 from hilctl.identify.pipeline import Identification, identify_records, settings_from
 from hilctl.models.base import HysteresisModel
@@ -114,8 +114,7 @@ class Characterisation:
         if peak > MOST_PERCENT:
             reason = f"its error reaches {peak:.0f} % of the peak-to-peak of a {first.label}"
             return Verdict("not a model", peak, held_out=True, reasons=(reason,))
-        grade: Grade = "good" if peak <= GOOD_PERCENT else "usable"
-        return Verdict(grade, peak, held_out=True, notes=known.notes)
+        return Verdict(grade_of(peak), peak, held_out=True, notes=known.notes)
 
     @property
     def is_model(self) -> bool:

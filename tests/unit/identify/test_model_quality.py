@@ -43,9 +43,9 @@ def test_a_model_that_holds_on_what_it_did_not_see_is_good(grid):
 def test_an_error_on_what_was_not_fitted_decides(grid):
     others = changed(grid[:1], lambda y: y + 0.1 * np.ptp(y))
     verdict = judged(grid, others).verdict
-    assert verdict.grade == "usable"
+    assert verdict.grade == "poor"
     assert verdict.within_percent == pytest.approx(10.0, abs=0.5)
-    assert str(verdict).startswith(f"usable within {verdict.within_percent:.2f} %")
+    assert str(verdict).startswith(f"poor: within {verdict.within_percent:.2f} %")
     far = judged(grid, changed(grid[:1], lambda y: y + 0.3 * np.ptp(y))).verdict
     assert far.grade == "not a model"
     assert "'sine 2 A 10 Hz'" in str(far)

@@ -55,6 +55,7 @@ def identification(grade="usable"):
 @pytest.mark.parametrize(("peak", "grade", "text"), [
     (1.5, "good", "good: within 1.50 %"),
     (5.0, "usable", "usable within 5.00 %"),
+    (5.1, "poor", "poor: within 5.10 %"),
     (30.0, "not a model", "not a model: "),
 ])  # fmt: skip
 def test_the_verdict_is_that_of_the_random_reference(peak, grade, text):
