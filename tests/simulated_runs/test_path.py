@@ -8,16 +8,11 @@ from hilctl import api
 from hilctl.analysis.report import summarize
 from hilctl.recording.reader import read
 
-ONE_SIGN = (
-    "limits={drive_a: [0.0, 2.0], slew_a_per_s: 400.0, stroke_um: [-90.0, 90.0]}",
-    "waveform.offset=1.0",
-    "waveform.amplitude=0.5",
-)
 QUICK = ("sample_rate_hz=1000", "block=10")
 
 RIGS = {
     "current, both signs": ("simulated_terfenol", (), 1.2),
-    "current, one sign": ("simulated_terfenol", ONE_SIGN, 1.2),
+    "current, one sign": ("simulated_terfenol", ("limits.drive_a=[0.0, 6.0]",), 1.2),
     "voltage, one sign": ("simulated_piezo", (), 0.24),
 }
 """Device, settings of ``init``, and 1.5 times the validation error with limits set by hand."""
