@@ -24,6 +24,7 @@ def asked(has, offset_a=0.0, **wanted):
         }
     )
     chain = SignalChain(VOLTS, VOLTS, options.amplifier, options.sensor)
+    assert chain.command_step == 2.0 * VOLTS.step
     check_watchdog("Acme", options, VOLTS, chain, has)
 
 
