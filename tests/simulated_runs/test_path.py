@@ -1,12 +1,11 @@
 """The path of a new user: init, check, characterise, run and learn, with nothing edited."""
 
-from pathlib import Path
-
 import pytest
 
 from hilctl import api
 from hilctl.analysis.report import summarize
 from hilctl.recording.reader import read
+from tests.simulated_runs.test_wires import BOARD, Wire, emulated
 
 QUICK = ("sample_rate_hz=1000", "block=10")
 
@@ -19,34 +18,45 @@ RIGS = {
 PHYSICS = {"domains": 1.2, "diffusion": 1.2, "jiles_atherton": 1.2}
 
 
-@pytest.mark.parametrize(
-    ("device", "settings", "within_percent"),
-    [
-        *(pytest.param(*rig, id=name) for name, rig in RIGS.items()),
-        *(
-            pytest.param(
-                "simulated_terfenol",
-                (f"device.physics={name}",),
-                percent,
-                id=name,
-                marks=pytest.mark.long,
-            )
-            for name, percent in PHYSICS.items()
-        ),
-    ],
-)
-def test_a_rig_is_compensated_by_default(tmp_path, device, settings, within_percent):
-    rig, model = tmp_path / "rig.yaml", tmp_path / "model.yaml"
-    api.init(device, rig, settings=[*settings, *QUICK])
+EMULATED = {
+    "current, both signs": ("cobs_board_fifo", ()),
+    "current, one sign": ("cobs_board_fifo", ("limits.drive_a=[0.0, 6.0]",)),
+}
+"""Profile and settings of ``init``. Boards with a FIFO keep their rate on any machine."""
+
+
+def follow(folder, device, settings, within_percent, *, fast=True):
+    rig, model, learned = (folder / f"{name}.yaml" for name in ("rig", "model", "learned"))
+    api.init(device, rig, settings=settings)
     assert api.check(rig).warnings == ()
-    found = api.characterise(rig, model, fast=True)
+    found = api.characterise(rig, model, fast=fast)
     assert (found.problem, found.verdict.grade) == ("", "good")
     assert found.held_out[0].peak_percent < within_percent
     assert api.check(rig, found.first_run).warnings == ()
-    run = api.run(rig, tmp_path / "run.mcap", settings=found.first_run, fast=True)
+    run = api.run(rig, folder / "run.mcap", settings=found.first_run, fast=fast)
     assert run.code == "completed"
     before = summarize(read(run.path)).peak_error_percent
     assert before < 2.0
-    learned = api.learn(rig, tmp_path / "learned.yaml", settings=found.first_run, fast=True)
-    assert Path(tmp_path / "learned.yaml").is_file()
-    assert learned.check[0].error_percent < before
+    result = api.learn(rig, learned, settings=found.first_run, fast=fast)
+    assert learned.is_file()
+    assert result.check[0].error_percent < before
+
+
+@pytest.mark.parametrize(("device", "settings", "percent"), RIGS.values(), ids=RIGS)
+def test_a_simulated_rig_is_compensated_by_default(tmp_path, device, settings, percent):
+    follow(tmp_path, device, (*settings, *QUICK), percent)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("physics", "percent"), PHYSICS.items())
+def test_so_is_one_of_other_physics(tmp_path, physics, percent):
+    settings = (f"device.physics={physics}", *QUICK)
+    follow(tmp_path, "simulated_terfenol", settings, percent)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("profile", "settings"), EMULATED.values(), ids=EMULATED)
+def test_so_is_an_emulated_one(tmp_path, profile, settings):
+    with emulated(Wire(profile, BOARD, 10_000.0), tmp_path) as device:
+        at = (f"device.serial_port={device['serial_port']}", "device.timeout_s=2.0")
+        follow(tmp_path, profile, (*settings, *at), 1.2, fast=False)
