@@ -385,7 +385,7 @@ class SimulatedPiezo(SimulatedDevice):
             command_unit="V",
             command_min=low_v,
             command_max=high_v,
-            command_step=(high_v - low_v) / self._parameters.dac_codes,
+            command_step=high_v / self._parameters.dac_codes,
         )
 
     def plant(self, sample_rate_hz: float) -> Plant:
