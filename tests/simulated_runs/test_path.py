@@ -9,6 +9,7 @@ from hilctl_drivers.simulated.devices import PiezoStage
 from tests.simulated_runs.test_wires import BOARD, Wire, emulated
 
 STAGE = f"device.stage={PiezoStage.fitted(-100.0, 100.0, 38.0).model_dump_json()}"
+SLOW = ("sample_rate_hz=2000", "block=100")  # the FIFO of the board lasts 0.4 s
 QUICK = ("sample_rate_hz=1000", "block=10")
 
 RIGS = {
@@ -58,8 +59,9 @@ def test_so_is_one_of_other_physics(tmp_path, physics, percent):
 
 
 @pytest.mark.long
+@pytest.mark.timeout(1200)
 @pytest.mark.parametrize(("profile", "settings"), EMULATED.values(), ids=EMULATED)
 def test_so_is_an_emulated_one(tmp_path, profile, settings):
     with emulated(Wire(profile, BOARD, 10_000.0), tmp_path) as device:
-        at = (f"device.serial_port={device['serial_port']}", "device.timeout_s=2.0")
+        at = (f"device.serial_port={device['serial_port']}", "device.timeout_s=2.0", *SLOW)
         follow(tmp_path, profile, (*settings, *at), 1.2, fast=False)
