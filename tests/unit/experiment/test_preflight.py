@@ -248,8 +248,8 @@ ADVISED = re.compile(r"(?:set|raise) (\S+) to (\[.*?\]|[-\d.e+]+)")
          [["waveform.amplitude=4.5"], ["waveform.offset=6.0"]]),
         (DISPLACEMENT, ["limits.stroke_um=[-9.0, 9.0]"], {}, "lower the waveform's amplitude",
          [["waveform.amplitude=8.5"]]),
-        (DISPLACEMENT, ["limits.slew_a_per_s=400.0"], {"offset_um": 20.0}, "set waveform.rest to",
-         []),
+        (DISPLACEMENT, ["limits.slew_a_per_s=1000.0", "waveform.soft_start_s=0"],
+         {"offset_um": 20.0}, "set waveform.soft_start_s to", []),
     ],
 )  # fmt: skip
 def test_what_a_message_advises_passes_the_check(text, settings, given, advised, others):
@@ -451,7 +451,8 @@ STAGE = piezo_ppi().model_copy(update={"output_offset_um": 0.006})
 
 def test_a_unipolar_drive_begins_at_rest_and_never_below():
     found = checked(PIEZO, model=STAGE, **VOLTS)
-    assert (found.forecast.command_min, found.warnings) == (0.0, ())
+    assert found.forecast.command_min == 0.0
+    assert not any("limits" in each for each in found.warnings)
 
 
 HOLDS = """waveform={kind: sequence, unit: V, parts: [
@@ -485,7 +486,7 @@ def test_an_excess_below_a_step_of_the_output_is_clamped_and_said():
     given = ("waveform.rest=0.0058",)
     found = checked(PIEZO, *given, model=STAGE, **VOLTS)
     assert -1.5e-3 < found.forecast.command_min < 0.0
-    assert "limits.drive_v" in found.warnings[0]
+    assert any("limits.drive_v" in each for each in found.warnings)
     (problem,) = refusals(PIEZO, *given, model=STAGE, **VOLTS | {"command_step": 0.0})
     assert problem.key == "limits.drive_v"
 
