@@ -6,10 +6,8 @@ from hilctl import api
 from hilctl.analysis.report import summarize
 from hilctl.recording.reader import read
 from hilctl_drivers.simulated.devices import PiezoStage
-from tests.simulated_runs.test_wires import BOARD, Wire, emulated
 
 STAGE = f"device.stage={PiezoStage.fitted(-100.0, 100.0, 38.0).model_dump_json()}"
-SLOW = ("sample_rate_hz=2000", "block=100")  # the FIFO of the board lasts 0.4 s
 QUICK = ("sample_rate_hz=1000", "block=10")
 
 RIGS = {
@@ -22,26 +20,19 @@ RIGS = {
 PHYSICS = {"domains": 1.2, "diffusion": 1.2, "jiles_atherton": 1.2}
 
 
-EMULATED = {
-    "current, both signs": ("cobs_board_fifo", ()),
-    "current, one sign": ("cobs_board_fifo", ("limits.drive_a=[0.0, 6.0]",)),
-}
-"""Profile and settings of ``init``. Boards with a FIFO keep their rate on any machine."""
-
-
-def follow(folder, device, settings, within_percent, *, fast=True):
+def follow(folder, device, settings, within_percent):
     rig, model, learned = (folder / f"{name}.yaml" for name in ("rig", "model", "learned"))
     api.init(device, rig, settings=settings)
     assert api.check(rig).warnings == ()
-    found = api.characterise(rig, model, fast=fast)
+    found = api.characterise(rig, model, fast=True)
     assert (found.problem, found.verdict.grade) == ("", "good")
     assert found.held_out[0].peak_percent < within_percent
     assert api.check(rig, found.first_run).warnings == ()
-    run = api.run(rig, folder / "run.mcap", settings=found.first_run, fast=fast)
+    run = api.run(rig, folder / "run.mcap", settings=found.first_run, fast=True)
     assert run.code == "completed"
     before = summarize(read(run.path)).peak_error_percent
     assert before < 2.0
-    result = api.learn(rig, learned, settings=found.first_run, fast=fast)
+    result = api.learn(rig, learned, settings=found.first_run, fast=True)
     assert learned.is_file()
     assert result.check[0].error_percent < before
 
@@ -56,12 +47,3 @@ def test_a_simulated_rig_is_compensated_by_default(tmp_path, device, settings, p
 def test_so_is_one_of_other_physics(tmp_path, physics, percent):
     settings = (f"device.physics={physics}", *QUICK)
     follow(tmp_path, "simulated_terfenol", settings, percent)
-
-
-@pytest.mark.long
-@pytest.mark.timeout(1200)
-@pytest.mark.parametrize(("profile", "settings"), EMULATED.values(), ids=EMULATED)
-def test_so_is_an_emulated_one(tmp_path, profile, settings):
-    with emulated(Wire(profile, BOARD, 10_000.0), tmp_path) as device:
-        at = (f"device.serial_port={device['serial_port']}", "device.timeout_s=2.0", *SLOW)
-        follow(tmp_path, profile, (*settings, *at), 1.2, fast=False)
