@@ -323,7 +323,7 @@ def _print_learned(learned: IlcResult, output: Path, folder: Path) -> None:
     checks = {row.label: row for row in learned.check}
     last = {row.label: row for row in learned.rows}
     headings = (
-        "waveform", "start %", "best %", "verified %", "noise floor %", "delay", "resonance",
+        "waveform", "start %", "best %", "verified %", "floor %", "delay samples", "resonance Hz",
     )  # fmt: skip
     cycles = [
         (each, last[each.label], checks.get(each.label)) for each in learned.correction.cycles
@@ -335,11 +335,11 @@ def _print_learned(learned: IlcResult, output: Path, folder: Path) -> None:
             f"{cycle.error_percent:.4f}",
             f"{check.error_percent:.4f}" if check else "-",
             f"{row.floor_percent:.4f}",
-            f"{row.delay_samples:.2f} samples",
-            f"{row.natural_hz:.0f} Hz" if row.natural_hz else "-",
+            f"{row.delay_samples:.2f}",
+            f"{row.natural_hz:.0f}" if row.natural_hz else "-",
         )
         for cycle, row, check in cycles
     ]
-    print_rich(table(f"learned: {learned.reason}", headings, rows))
+    print_rich(table(f"learned: {learned.reason}", headings, rows, wrap=True))
     print(f"correction: {output}; runs: {folder}")
     print(f"  --set {shlex.quote(correction_setting(output))}")

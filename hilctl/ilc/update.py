@@ -113,7 +113,10 @@ def fit(changes: Sequence[Change], first: tuple[float, complex], sample_rate_hz:
         for delay in delays
         for slow in (0.05, 0.7, 2.0)
     ]
-    return _response_at(min(tries, key=lambda each: float(each.cost)).x, highest, sample_rate_hz)
+    best = min(tries, key=lambda each: float(each.cost)).x
+    if best[2] < (highest / sample_rate_hz) ** 2:  # above the sample rate: there is none
+        best[2] = 0.0
+    return _response_at(best, highest, sample_rate_hz)
 
 
 def _response_at(x: F64, highest_hz: float, sample_rate_hz: float) -> Response:

@@ -177,6 +177,7 @@ def test_nothing_but_the_first_answer_gives_delay_and_gain_near_what_is_usual():
     found = fit([], (STEP_HZ, 1.0 + 0.0j), RATE_HZ)
     assert found.gain == pytest.approx(1.0, abs=0.02)
     assert abs(found.delay_s * RATE_HZ) < 2.0
+    assert found.natural_hz is None or found.natural_hz < RATE_HZ
 
 
 def test_a_late_first_answer_is_seen():
