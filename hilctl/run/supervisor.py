@@ -190,8 +190,9 @@ class RunMonitor:
             reason = hung if result.hung else said.reason if said else self._child.death()
             if self._safety.by == "guardian" and result.confirmed:
                 reason += "; the guardian set the output to its safe value"
-            if not result.confirmed:
-                reason += f"; {describe(result.output, result.error)}"
+            output = describe(result.output, result.error)
+            if not result.confirmed and not reason.endswith(output):
+                reason += f"; {output}"
             last = said or LoopOutcome("fault", "", 0, "unknown", 0)
             self.outcome = replace(last, code="fault", reason=reason, output=result.output)
         if self.outcome is not None:
