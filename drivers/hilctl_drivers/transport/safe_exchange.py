@@ -1,4 +1,4 @@
-"""The safe value on a serial line: tested at open, written in one attempt, read back.
+"""The safe value on a stream: tested at open, written in one attempt, read back.
 
 An attempt usually follows a failure: late answers may be on the line, it may never become silent,
 and the device may be booting. So the value is sent first and confirmed afterwards. Only the
@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 from hilctl.base.errors import DeviceError, UnconfirmedError
 from hilctl_drivers.profile_base import Range
-from hilctl_drivers.transport.serial_port import SerialLink
+from hilctl_drivers.transport.stream_link import StreamLink
 
 _QUIET_S = 0.05
 """Silence that is taken as the end of late answers in the first attempt: adapters hold bytes back
@@ -28,7 +28,7 @@ class SafeExchange:
         self._quiet_s = _QUIET_S
 
     def attempt(
-        self, link: SerialLink, send: Callable[[], None], confirm: Callable[[], None]
+        self, link: StreamLink, send: Callable[[], None], confirm: Callable[[], None]
     ) -> None:
         """Send the value and have it confirmed, once.
 

@@ -1,29 +1,22 @@
 """Serial port as a link."""
 
-import array
 import contextlib
 import errno
-import math
 import os
 import select
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
-from os import read, write
 from typing import Literal
 
 import serial
+from serial.rs485 import RS485Settings
 
 from hilctl.base.errors import DeviceError
 from hilctl.base.files import PORT_REMEDIES, reason
-from hilctl_drivers.transport.links import LostError, Missing, NoAnswerError, cut, why
+from hilctl_drivers.transport.links import LostError
 from hilctl_drivers.transport.resource_names import admit_others, refuse_to_others
-
-_FIRST = 256
-"""Most replies are shorter; see :mod:`hilctl_drivers.transport.tcp`."""
-_CHUNK = 4096
-_QUIET_S = 0.02
+from hilctl_drivers.transport.stream_link import StreamLink
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +29,8 @@ class SerialSettings:
         flow: Flow control. With xonxoff, bytes 0x11 and 0x13 are signals and never data.
         dtr: Level to hold DTR at; None to raise it, as opening a port does.
         rts: Level to hold RTS at, likewise.
+        rs485: Level of RTS while sending, which the kernel then switches.
+        echo: Whether each request comes back before its reply.
     """
 
     baud: int = 9600
@@ -47,6 +42,8 @@ class SerialSettings:
     flow: Literal["none", "xonxoff"] = "none"
     dtr: bool | None = None
     rts: bool | None = None
+    rs485: Literal["high", "low"] | None = None
+    echo: bool = False
 
 
 def _open_port(path: str, settings: SerialSettings, timeout_s: float) -> serial.Serial:
@@ -70,6 +67,9 @@ def _open_port(path: str, settings: SerialSettings, timeout_s: float) -> serial.
         port.dtr = settings.dtr
     if settings.rts is not None:
         port.rts = settings.rts
+    if settings.rs485 is not None:
+        high = settings.rs485 == "high"
+        port.rs485_mode = RS485Settings(rts_level_for_tx=high, rts_level_for_rx=not high)
     port.port = path
     port.open()
     if settings.boot_s > 0.0:
@@ -97,17 +97,10 @@ def _keep_levels(fd: int) -> None:
         raise OSError(*error.args) from None
 
 
-def _counts_waiting(fd: int, waiting: "array.array[int]") -> Callable[[], object]:
-    """Return a function that stores the number of received bytes in ``waiting[0]``."""
-    # Only here: settings can be read and checked on computers that have neither.
-    from fcntl import ioctl
-    from termios import FIONREAD
-
-    return partial(ioctl, fd, FIONREAD, waiting)
-
-
-class SerialLink:
+class SerialLink(StreamLink):
     """A serial port with exclusive access."""
+
+    LOST = "port lost, unplugged?"
 
     def __init__(
         self,
@@ -117,183 +110,51 @@ class SerialLink:
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
+        super().__init__(settings.gap_s, timeout_s, clock, sleep, echo=settings.echo)
         self._path = port
         self._settings = settings
-        self._gap_s = settings.gap_s
-        self.timeout_s = timeout_s
-        """Longest time of one exchange, s."""
-        self._timeout_ms = math.ceil(timeout_s * 1e3)
-        self._clock = clock
-        self._sleep = sleep
         self._port: serial.Serial | None = None
-        self._fd = -1
-        self._poll = select.poll()
-        self._waiting = array.array("i", [0])
-        self._count_waiting: Callable[[], object] = lambda: None
-        self._stale = True
         self._exclusive = False
-        self._quiet_at = 0.0
-
-    @property
-    def is_open(self) -> bool:
-        """Whether the port is open, as far as is known."""
-        return self._port is not None
-
-    @property
-    def is_in_step(self) -> bool:
-        """Whether it is open, and no bytes of an older exchange can still come."""
-        return self._port is not None and not self._stale
 
     def open(self, *, boot: bool = True) -> None:
-        """Open and lock the port, see :meth:`~hilctl_drivers.transport.links.Link.open`.
-
-        Received bytes are discarded.
-
-        Args:
-            boot: Whether to wait for a device that opening may have reset. Otherwise a port that
-                this object closed in step is in step.
-        """
+        """Open and lock the port, see :meth:`StreamLink.open`."""
         self.close()
         try:
             port = _open_port(self._path, self._settings, self.timeout_s)
         except (OSError, ValueError) as error:
             text = reason(error, PORT_REMEDIES) if isinstance(error, OSError) else str(error)
+            if self._settings.rs485 is not None and isinstance(error, ValueError):
+                text += " (omit rs485 if the adapter switches its direction itself)"
             raise LostError(f"can't be opened: {text}") from None
         # Otherwise an FTDI adapter holds bytes back for up to 16 ms; ptys and USB CDC refuse it.
         with contextlib.suppress(OSError, ValueError, NotImplementedError):
             port.set_low_latency_mode(True)
-        self._port, self._fd = port, port.fileno()
-        self._count_waiting = _counts_waiting(self._fd, self._waiting)
-        self._poll = select.poll()
-        self._poll.register(self._fd, select.POLLIN)
+        self._port = port
+        self._use(port.fileno())
         if boot:
             self._exclusive = refuse_to_others(self._fd, self._path)
             self._stale = True
             self._sleep(self._settings.boot_s)
         self._quiet_at = self._clock()
 
-    def transact(
-        self, request: bytes | bytearray, missing: Missing, usual: int = 0
-    ) -> bytes | bytearray:
-        """Exchange, see :meth:`~hilctl_drivers.transport.links.Link.transact`.
-
-        After a failure the next request waits until the line is quiet and discards what came:
-        serial protocols do not number their replies, so a late one would pass for the next.
-        """
-        if self._port is None:
-            raise LostError("not open")
-        reply: bytes | bytearray
+    def _send(self, data: bytes | bytearray) -> None:
+        assert self._port is not None
         try:
-            if self._stale:
-                self.drain()
-            self._count_waiting()
-            if self._waiting[0] or self._gap_s:
-                self._await_gap()
-            deadline = self._clock() + self.timeout_s
-            # Past pyserial, which takes three times as long; its flush() hangs on ptys and USB CDC.
-            try:
-                sent = write(self._fd, request)
-            except BlockingIOError:
-                sent = 0
-            if sent != len(request):
-                self._port.write(request[sent:])
-                usual = 0  # that took a part of the time-out
-            if usual and self._poll.poll(self._timeout_ms):
-                reply = read(self._fd, _FIRST)
-                if len(reply) != usual:
-                    reply = self._complete(bytearray(reply), missing, deadline)
-            else:
-                reply = self._complete(bytearray(), missing, deadline)
-        except (OSError, DeviceError) as error:
-            raise self._failed(error) from None
-        if self._gap_s:
-            self._quiet_at = self._clock() + self._gap_s
-        return reply
+            self._port.write(data)
+        except serial.SerialTimeoutException:
+            raise self._timed_out() from None
 
-    def send_now(self, request: bytes | bytearray) -> None:
-        """Send ``request`` whatever is on the line, and await no answer.
+    def _discard_unsent(self) -> None:
+        assert self._port is not None
+        self._port.reset_output_buffer()
 
-        The next exchange discards what comes meanwhile.
-        """
-        if self._port is None:
-            raise LostError("not open")
-        self._stale = True
-        try:
-            self._port.write(request)
-        except serial.SerialTimeoutException as error:
-            # What waits there would be executed before the next try, or hold it up for good.
-            self._port.reset_output_buffer()
-            raise self._failed(error) from None
-        except OSError as error:
-            raise self._failed(error) from None
-
-    def doubt(self) -> None:
-        """Assume that bytes of an older exchange can still come, until the line was silent."""
-        self._stale = True
-
-    def _failed(self, error: OSError | DeviceError) -> DeviceError:
-        """Return the error to raise, and protect the next request from late bytes."""
-        self._stale = True
-        if isinstance(error, OSError) and not isinstance(error, serial.SerialTimeoutException):
-            self.close()
-            return LostError(f"port lost, unplugged? {why(error)}")
-        if isinstance(error, DeviceError):
-            return error
-        return NoAnswerError(f"could not send within {self.timeout_s:g} s")
-
-    def _await_gap(self) -> None:
-        if self._waiting[0]:
-            raise DeviceError(f"{self._waiting[0]} bytes that answer no request")
-        early_s = self._quiet_at - self._clock()
-        if early_s > 0.0:
-            self._sleep(early_s)
-
-    def _complete(self, reply: bytearray, missing: Missing, deadline: float) -> bytearray:
-        while wanted := missing(reply):
-            left_s = deadline - self._clock()
-            if left_s <= 0.0 or not self._poll.poll(math.ceil(left_s * 1e3)):
-                raise NoAnswerError(cut(len(reply), wanted, self.timeout_s))
-            reply += self._read()
-        return reply
-
-    def _read(self) -> bytes:
-        data = read(self._fd, _CHUNK)
-        if data:
-            return data
+    def _nothing_read(self) -> None:
         if dict(self._poll.poll(0)).get(self._fd, 0) & ~select.POLLIN:
             raise OSError(errno.EIO, os.strerror(errno.EIO))
         raise DeviceError(
             "bytes came and were gone before they could be read: another program reads this port "
             "(lsof names it; ModemManager, brltty and terminal programs do)"
         )
-
-    def await_silence(self, quiet_s: float, answer_s: float = 0.0) -> None:
-        """Discard received bytes until the line was silent for ``quiet_s``.
-
-        Before, wait up to ``answer_s`` for the first byte of an answer.
-        """
-        if self._port is None:
-            raise LostError("not open")
-        try:
-            self._poll.poll(math.ceil(1e3 * answer_s))
-            self.drain(quiet_s)
-        except (OSError, DeviceError) as error:
-            raise self._failed(error) from None
-
-    def drain(self, quiet_s: float = _QUIET_S) -> None:
-        """Discard received bytes until the line was silent for ``quiet_s``, or its own gap.
-
-        Raises:
-            OSError: The port broke.
-            DeviceError: The line did not get silent in time.
-        """
-        quiet_ms = math.ceil(1e3 * max(quiet_s, self._gap_s))
-        deadline = self._clock() + max(self.timeout_s, 10.0 * _QUIET_S)
-        while self._poll.poll(quiet_ms):
-            self._read()
-            if self._clock() > deadline:
-                raise DeviceError("the line does not get quiet: another device keeps sending")
-        self._stale = False
 
     def close(self) -> None:
         """Close and unlock the port."""

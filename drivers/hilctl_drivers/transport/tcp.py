@@ -1,4 +1,4 @@
-"""TCP connection as a link."""
+"""TCP connections as links."""
 
 import math
 import select
@@ -10,6 +10,7 @@ from collections.abc import Callable
 from hilctl.base.errors import DeviceError
 from hilctl.base.files import CONNECT_REMEDIES
 from hilctl_drivers.transport.links import LostError, Missing, NoAnswerError, cut, why
+from hilctl_drivers.transport.stream_link import StreamLink
 
 _FIRST = 256
 """Most replies are shorter; buffers up to 512 bytes come from Python's own pool, which is faster
@@ -17,8 +18,34 @@ than the system's."""
 _CHUNK = 4096
 
 
+def _connected(address: tuple[str, int], timeout_s: float) -> socket.socket:
+    """Return a connection without Nagle's delay, or raise LostError."""
+    try:
+        made = socket.create_connection(address, timeout_s)
+    except TimeoutError:
+        raise LostError(f"no connection within {timeout_s:g} s") from None
+    except OSError as error:
+        raise LostError(f"can't connect: {why(error, CONNECT_REMEDIES)}") from None
+    try:
+        made.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        # What is not acknowledged by then is given up, also where this process dies: else the
+        # kernel sends an old command again when the cable is back.
+        unacknowledged_ms = math.ceil(timeout_s * 1e3)
+        made.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, unacknowledged_ms)
+    except OSError as error:  # reset since
+        made.close()
+        raise LostError(f"can't connect: {why(error)}") from None
+    return made
+
+
+def _reset(connection: socket.socket) -> None:
+    """Close a connection; what the peer has not been given yet must not reach it later."""
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    connection.close()
+
+
 class TcpLink:
-    """A TCP connection without Nagle's delay.
+    """A TCP connection for replies with a number, as those of Modbus TCP.
 
     ``timeout_s`` is the longest time to connect, and of one exchange.
     """
@@ -36,32 +63,19 @@ class TcpLink:
     def open(self) -> None:
         """Connect, see :meth:`~hilctl_drivers.transport.links.Link.open`."""
         self.close()
+        made = _connected(self._address, self._timeout_s)
         try:
-            made = socket.create_connection(self._address, self._timeout_s)
-        except TimeoutError:
-            raise LostError(f"no connection within {self._timeout_s:g} s") from None
-        except OSError as error:
-            raise LostError(f"can't connect: {why(error, CONNECT_REMEDIES)}") from None
-        try:
-            self._set_up(made)
+            self.peer_host = made.getpeername()[0]
         except OSError as error:  # reset since
             made.close()
             raise LostError(f"can't connect: {why(error)}") from None
-        self._socket = made
-
-    def _set_up(self, made: socket.socket) -> None:
-        made.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         made.settimeout(None)
         # The kernel's own time-outs spare the poll() before each call that Python's would cost.
         seconds, fraction = divmod(self._timeout_s, 1.0)
         limit = struct.pack("ll", int(seconds), max(1, int(fraction * 1e6)))
         made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, limit)
         made.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, limit)
-        # What is not acknowledged by then is given up, also where this process dies: else the
-        # kernel sends an old command again when the cable is back.
-        unacknowledged_ms = math.ceil(self._timeout_s * 1e3)
-        made.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, unacknowledged_ms)
-        self.peer_host = made.getpeername()[0]
+        self._socket = made
 
     def transact(
         self, request: bytes | bytearray, missing: Missing, usual: int = 0
@@ -115,11 +129,70 @@ class TcpLink:
 
     def _reset(self) -> None:
         if self._socket is not None:
-            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
-        self.close()
+            _reset(self._socket)
+            self._socket = None
 
     def close(self) -> None:
         """Close the connection."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
+
+
+class TcpStream(StreamLink):
+    """A TCP connection for text, or to a serial line behind a serial server.
+
+    A late reply may still come on the next connection: the server has it from its line.
+    """
+
+    LOST = "connection lost:"
+
+    def __init__(
+        self,
+        host: str,
+        port: int,
+        timeout_s: float,
+        gap_s: float = 0.0,
+        *,
+        echo: bool = False,
+    ) -> None:
+        super().__init__(gap_s, timeout_s, echo=echo)
+        self._port = port
+        self._socket: socket.socket | None = None
+        self.peer_host = host
+        """Numeric address of the peer after connecting; before that, ``host``."""
+
+    def open(self, *, boot: bool = True) -> None:
+        """Connect, see :meth:`StreamLink.open`."""
+        self.close()
+        self._socket = made = _connected((self.peer_host, self._port), self.timeout_s)
+        self._use(made.fileno())  # with its time-out set, Python keeps it non-blocking
+        try:
+            self.peer_host = made.getpeername()[0]
+        except OSError as error:  # reset since
+            raise self._failed(error) from None
+        if boot:
+            self._stale = True
+
+    def _send(self, data: bytes | bytearray) -> None:
+        assert self._socket is not None
+        try:
+            self._socket.sendall(data)
+        except TimeoutError as error:
+            if error.errno is None:  # otherwise the kernel has given the connection up
+                raise self._timed_out() from None
+            raise
+
+    def _nothing_read(self) -> None:
+        self.close()
+        raise LostError("connection closed by the device")
+
+    def close(self) -> None:
+        """Close the connection; break it if it has failed, so no older request arrives later."""
+        made, self._socket, self._fd = self._socket, None, -1
+        if made is None:
+            return
+        if self._stale:
+            _reset(made)
+        else:
+            made.close()

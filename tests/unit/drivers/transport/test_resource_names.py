@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 from hilctl.base.errors import DeviceError
-from hilctl_drivers.transport import resource_names
-from hilctl_drivers.transport import serial_port as serial_link
+from hilctl_drivers.transport import resource_names, stream_link
 from hilctl_drivers.transport.links import LostError
 from hilctl_drivers.transport.resource_names import held_address, held_port
 from hilctl_drivers.transport.serial_port import SerialLink, SerialSettings
@@ -84,7 +83,7 @@ def test_a_link_is_exclusive_while_it_is_open(port, monkeypatch):
 def test_bytes_that_another_program_took_are_no_lost_port(line, monkeypatch):
     master, path = line
     link = serial(path, QUICK_S)
-    monkeypatch.setattr(serial_link, "read", lambda fd, size: b"")
+    monkeypatch.setattr(stream_link, "read", lambda fd, size: b"")
 
     def missing(got):
         os.write(master, b"x")

@@ -9,7 +9,7 @@ import pytest
 
 from hilctl.base.errors import InputError
 from hilctl_drivers.profile import load_profile, with_link
-from hilctl_drivers.transport import serial_port as serial_link
+from hilctl_drivers.transport import stream_link
 from hilctl_drivers.transport.links import NoAnswerError
 from hilctl_drivers.transport.serial_port import SerialLink, SerialSettings
 from tests.unit.drivers.transport.conftest import QUICK_S, answering, serial
@@ -90,7 +90,7 @@ def test_time_spent_on_sending_is_not_there_for_the_answer(line, monkeypatch):
         def poll(self, _ms):
             raise AssertionError("waited after the deadline")
 
-    monkeypatch.setattr(serial_link, "write", lambda _fd, _data: 0)
+    monkeypatch.setattr(stream_link, "write", lambda _fd, _data: 0)
     monkeypatch.setattr(link._port, "write", lambda _data: now.__setitem__(0, 2.0))
     monkeypatch.setattr(link, "_poll", Never())
     with pytest.raises(NoAnswerError, match="within 1 s"):

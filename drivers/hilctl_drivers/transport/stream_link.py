@@ -1,0 +1,257 @@
+"""Link over bytes without framing: the base of serial ports and TCP streams.
+
+Protocols on such a link do not number their replies, so a late reply would pass for the next one.
+"""
+
+import array
+import math
+import select
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from functools import partial
+from os import read, write
+
+from hilctl.base.errors import DeviceError
+from hilctl_drivers.transport.links import (
+    CorruptError,
+    LostError,
+    Missing,
+    NoAnswerError,
+    cut,
+    why,
+)
+
+_FIRST = 256
+"""Most replies are shorter; see :mod:`hilctl_drivers.transport.tcp`."""
+_CHUNK = 4096
+_QUIET_S = 0.02
+
+
+def _counts_waiting(fd: int, waiting: "array.array[int]") -> Callable[[], object]:
+    """Return a function that stores the number of received bytes in ``waiting[0]``."""
+    # Only here: settings can be read and checked on computers that have neither.
+    from fcntl import ioctl
+    from termios import FIONREAD
+
+    return partial(ioctl, fd, FIONREAD, waiting)
+
+
+def _behind(request: bytes | bytearray, missing: Missing) -> Missing:
+    """Return ``missing`` for replies behind an echo of the request."""
+    size = len(request)
+
+    def counted(got: bytearray) -> int:
+        if not request.startswith(got[:size]):
+            raise CorruptError(
+                "the reply does not begin with the request: omit echo if the adapter does not echo"
+            )
+        return max(0, size - len(got)) + missing(got[size:])
+
+    return counted
+
+
+class StreamLink(ABC):
+    """A descriptor with one exchange at a time; subclasses open and close it.
+
+    ``gap_s`` is the silence to keep between a reply and the next request. With ``echo`` each
+    request comes back before its reply.
+    """
+
+    LOST = ""
+    """Text on a broken connection."""
+
+    def __init__(
+        self,
+        gap_s: float,
+        timeout_s: float,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+        *,
+        echo: bool = False,
+    ) -> None:
+        self._gap_s = gap_s
+        self._echo = echo
+        self.timeout_s = timeout_s
+        """Longest time of one exchange, s."""
+        self._timeout_ms = math.ceil(timeout_s * 1e3)
+        self._clock = clock
+        self._sleep = sleep
+        self._fd = -1
+        self._poll = select.poll()
+        self._waiting = array.array("i", [0])
+        self._count_waiting: Callable[[], object] = lambda: None
+        self._stale = True
+        self._quiet_at = 0.0
+
+    @property
+    def is_open(self) -> bool:
+        """Whether it is open, as far as is known."""
+        return self._fd >= 0
+
+    @property
+    def is_in_step(self) -> bool:
+        """Whether it is open, and no bytes of an older exchange can still come."""
+        return self.is_open and not self._stale
+
+    @abstractmethod
+    def open(self, *, boot: bool = True) -> None:
+        """Connect, see :meth:`~hilctl_drivers.transport.links.Link.open`.
+
+        Received bytes are discarded.
+
+        Args:
+            boot: Whether to wait for a device that opening may have reset. Otherwise a link that
+                this object closed in step is in step.
+        """
+
+    def _use(self, fd: int) -> None:
+        """Take an open descriptor, which must not block."""
+        self._fd = fd
+        self._count_waiting = _counts_waiting(fd, self._waiting)
+        self._poll = select.poll()
+        self._poll.register(fd, select.POLLIN)
+
+    def transact(
+        self, request: bytes | bytearray, missing: Missing, usual: int = 0
+    ) -> bytes | bytearray:
+        """Exchange, see :meth:`~hilctl_drivers.transport.links.Link.transact`.
+
+        After a failure the next request waits until the line is quiet and discards what came.
+        """
+        if self._fd < 0:
+            raise LostError("not open")
+        if self._echo:
+            missing, usual = _behind(request, missing), 0
+        reply: bytes | bytearray
+        try:
+            if self._stale:
+                self.drain()
+            self._count_waiting()
+            if self._waiting[0] or self._gap_s:
+                self._await_gap()
+            deadline = self._clock() + self.timeout_s
+            if self._write(request):
+                usual = 0  # that took a part of the time-out
+            if usual and self._poll.poll(self._timeout_ms):
+                reply = read(self._fd, _FIRST)
+                if len(reply) != usual:
+                    reply = self._complete(bytearray(reply), missing, deadline)
+            else:
+                reply = self._complete(bytearray(), missing, deadline)
+        except (OSError, DeviceError) as error:
+            raise self._failed(error) from None
+        if self._gap_s:
+            self._quiet_at = self._clock() + self._gap_s
+        return reply[len(request) :] if self._echo else reply
+
+    def _write(self, request: bytes | bytearray) -> bool:
+        """Send a request; return whether it had to wait for room."""
+        # Past pyserial, which takes three times as long; its flush() hangs on ptys and USB CDC.
+        try:
+            sent = write(self._fd, request)
+        except BlockingIOError:
+            sent = 0
+        if sent == len(request):
+            return False
+        self._send(request[sent:])
+        return True
+
+    def send_now(self, request: bytes | bytearray) -> None:
+        """Send ``request`` whatever is on the line, and await no answer.
+
+        The next exchange discards what comes meanwhile.
+        """
+        if self._fd < 0:
+            raise LostError("not open")
+        self._stale = True
+        try:
+            self._send(request)
+        except NoAnswerError:
+            # What waits there would be executed before the next try, or hold it up for good.
+            self._discard_unsent()
+            raise
+        except OSError as error:
+            raise self._failed(error) from None
+
+    def doubt(self) -> None:
+        """Assume that bytes of an older exchange can still come, until the line was silent."""
+        self._stale = True
+
+    @abstractmethod
+    def _send(self, data: bytes | bytearray) -> None:
+        """Send all, or raise NoAnswerError if that takes longer than the timeout."""
+
+    def _discard_unsent(self) -> None:  # noqa: B027  an unread TCP stream is closed soon
+        """Discard bytes that wait to be sent."""
+
+    def _timed_out(self) -> NoAnswerError:
+        return NoAnswerError(f"could not send within {self.timeout_s:g} s")
+
+    def _failed(self, error: OSError | DeviceError) -> DeviceError:
+        """Return the error to raise, and protect the next request from late bytes."""
+        self._stale = True
+        if isinstance(error, DeviceError):
+            return error
+        self.close()
+        return LostError(f"{self.LOST} {why(error)}")
+
+    def _await_gap(self) -> None:
+        if self._waiting[0]:
+            raise DeviceError(
+                f"{self._waiting[0]} bytes that answer no request: another device sends, or the "
+                "adapter echoes (then set echo: true)"
+            )
+        early_s = self._quiet_at - self._clock()
+        if early_s > 0.0:
+            self._sleep(early_s)
+
+    def _complete(self, reply: bytearray, missing: Missing, deadline: float) -> bytearray:
+        while wanted := missing(reply):
+            left_s = deadline - self._clock()
+            if left_s <= 0.0 or not self._poll.poll(math.ceil(left_s * 1e3)):
+                raise NoAnswerError(cut(len(reply), wanted, self.timeout_s))
+            reply += self._read()
+        return reply
+
+    def _read(self) -> bytes:
+        data = read(self._fd, _CHUNK)
+        if not data:
+            self._nothing_read()
+        return data
+
+    @abstractmethod
+    def _nothing_read(self) -> None:
+        """Raise the error for a descriptor that was readable and had no bytes."""
+
+    def await_silence(self, quiet_s: float, answer_s: float = 0.0) -> None:
+        """Discard received bytes until the line was silent for ``quiet_s``.
+
+        Before, wait up to ``answer_s`` for the first byte of an answer.
+        """
+        if self._fd < 0:
+            raise LostError("not open")
+        try:
+            self._poll.poll(math.ceil(1e3 * answer_s))
+            self.drain(quiet_s)
+        except (OSError, DeviceError) as error:
+            raise self._failed(error) from None
+
+    def drain(self, quiet_s: float = _QUIET_S) -> None:
+        """Discard received bytes until the line was silent for ``quiet_s``, or its own gap.
+
+        Raises:
+            OSError: The connection broke.
+            DeviceError: The line did not get silent in time.
+        """
+        quiet_ms = math.ceil(1e3 * max(quiet_s, self._gap_s))
+        deadline = self._clock() + max(self.timeout_s, 10.0 * _QUIET_S)
+        while self._poll.poll(quiet_ms):
+            self._read()
+            if self._clock() > deadline:
+                raise DeviceError("the line does not get quiet: another device keeps sending")
+        self._stale = False
+
+    @abstractmethod
+    def close(self) -> None:
+        """Close it; closing twice is fine."""
