@@ -5,6 +5,7 @@
 
 device.py, serial_dac.py    bases of devices
 signal_chain.py             options of every DAC: address, amplifier, sensor, reader, watchdog
+endpoint.py, dac_setup.py   addresses and links; output and reader of the sensor as one device
 profile.py, profile_base.py profiles of commercial devices; the files are in profiles/
 template.py                 device section of a new experiment
 contract.py                 the device contract as tests, for any package

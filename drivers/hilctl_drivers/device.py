@@ -8,6 +8,7 @@ exchanges and disconnects.
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
@@ -39,6 +40,8 @@ class DacDevice(ABC):
         self._output_name = output
         self._low, self._high = info.command_min, info.command_max
         self._block = 0  # samples in each exchange; 0 while it is not open
+        self.transactions = 0
+        """Requests of one exchange, known once it is open; 0 if it sends none."""
 
     @property
     def info(self) -> DeviceInfo:
@@ -64,6 +67,9 @@ class DacDevice(ABC):
         except DeviceError as error:
             raise self._failed("open", error, self._release) from None
         self._block = block
+        if self.transactions:
+            details = {**self._info.details, "transactions": str(self.transactions)}
+            self._info = replace(self._info, details=details)
 
     def arm(self) -> None:
         """Arm the watchdog, see :meth:`hilctl.base.device.WatchdogDevice.arm`."""

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Annotated, ClassVar, Literal, Self, TypeAlias
 
 from pydantic import Field, StringConstraints, model_validator
@@ -12,12 +13,49 @@ from hilctl_drivers.transport.serial_port import SerialSettings
 
 
 class LinkSettings(StrictModel):
-    """Settings of every link; ``kind`` selects the protocol."""
+    """Settings of every link; ``kind`` selects the protocol. These are those of TCP."""
+
+    COMMON: ClassVar[tuple[str, ...]] = ()
+    """Keys that must be the same for all devices on a line."""
 
     kind: str
 
+    @property
+    def char_s(self) -> float:
+        """Time of one character, s."""
+        return 0.0
 
-class SerialLineSettings(LinkSettings):
+    @property
+    def silence_s(self) -> float:
+        """Silence to keep between a reply and the next request, s."""
+        return 0.0
+
+    @property
+    def medium(self) -> str:
+        """The line in words, like ``at 115200 8N1``."""
+        return "over TCP"
+
+
+class StreamSettings(LinkSettings):
+    """Settings of a link whose replies have no number."""
+
+    echo: bool = Field(
+        default=False, description="whether each request comes back before its reply"
+    )
+    gap_s: float | None = Field(default=None, ge=0.0, description="silence before each request, s")
+
+    @property
+    def silence_s(self) -> float:
+        """Silence to keep between a reply and the next request, s."""
+        return self.gap_s or 0.0
+
+    @property
+    def settings(self) -> SerialSettings:
+        """Settings of the link."""
+        return SerialSettings(gap_s=self.silence_s, echo=self.echo)
+
+
+class SerialLineSettings(StreamSettings):
     """Settings of every serial line."""
 
     baud: int = Field(
@@ -43,6 +81,9 @@ class SerialLineSettings(LinkSettings):
     rts: bool | None = Field(
         default=None, description="level of RTS; if omitted, raised when the port is opened"
     )
+    rs485: Literal["high", "low"] | None = Field(
+        default=None, description="level of RTS while sending, switched by the kernel (TIOCSRS485)"
+    )
 
     @property
     def char_s(self) -> float:
@@ -51,22 +92,16 @@ class SerialLineSettings(LinkSettings):
         return bits / self.baud
 
     @property
-    def format(self) -> str:
-        """Baud and character format, like ``115200 8N1``."""
-        return f"{self.baud} {self.bytesize}{self.parity}{self.stopbits}"
-
-    @property
-    def silence_s(self) -> float:
-        """Silence to keep between a reply and the next request, s."""
-        return 0.0
+    def medium(self) -> str:
+        """Baud and character format."""
+        return f"at {self.baud} {self.bytesize}{self.parity}{self.stopbits}"
 
     @property
     def settings(self) -> SerialSettings:
         """Settings of the port."""
-        same = self.model_dump(
-            include={"baud", "bytesize", "parity", "stopbits", "flow", "dtr", "rts"}
-        )
-        return SerialSettings(gap_s=self.silence_s, boot_s=self.boot_wait_s, **same)
+        same = {"baud", "bytesize", "parity", "stopbits", "flow", "dtr", "rts", "rs485"}
+        values = self.model_dump(include=same)
+        return replace(super().settings, boot_s=self.boot_wait_s, **values)
 
 
 class BinaryLineSettings(SerialLineSettings):
@@ -91,7 +126,9 @@ class Range(StrictModel):
     ``min`` and ``max`` are the limits of the output or input, not those of its register.
     """
 
-    unit: Literal["V", "A", "mA"] = Field(description="unit of the value, min and max")
+    unit: Literal["V", "A", "mA", "um"] = Field(
+        description="unit of the value, min and max; um for a sensor with a digital interface"
+    )
     min: float = Field(description="lowest value of the output or input, in unit")
     max: float = Field(description="highest value of the output or input, in unit")
     resolution: float | None = Field(default=None, gt=0.0, description="smallest step, in unit")
@@ -167,9 +204,11 @@ class BaseProfile(StrictModel):
 
     Attributes:
         DEVICE: Device kind of an experiment that uses such a profile.
+        READER: The :class:`~hilctl_drivers.dac_setup.SensorReader` of its inputs.
     """
 
     DEVICE: ClassVar[str]
+    READER: ClassVar[str]
 
     vendor: Text = Field(description="manufacturer")
     model: Text = Field(description="model, as ordered")
@@ -207,12 +246,27 @@ class BaseProfile(StrictModel):
             raise ValueError("must have outputs or inputs, or both")
         if self.watchdog != "none" and not self.outputs:
             raise ValueError("watchdog must be none if there are no outputs")
+        if any(each.unit == "um" for each in self.outputs.values()):
+            raise ValueError("unit um is for inputs")
         return self
 
     @property
     def driver(self) -> str:
         """The :class:`~hilctl_drivers.serial_dac.SerialDac` for it; empty for other devices."""
         return ""
+
+    @property
+    def framings(self) -> tuple[Literal["tcp", "rtu"], ...]:
+        """Frames of Modbus that it may use on TCP, the usual first; empty for other protocols.
+
+        On a serial line it uses the last.
+        """
+        return ()
+
+    @property
+    def usual_unit(self) -> int | None:
+        """Address as shipped; None if it has none."""
+        return None
 
     @property
     def title(self) -> str:

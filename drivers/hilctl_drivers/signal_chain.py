@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from typing import Annotated, Any, Literal, Self, TypeAlias, TypeVar
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from hilctl.base.device import DeviceInfo, DeviceOptions
 from hilctl.base.errors import InputError
@@ -23,6 +23,7 @@ PROFILE = "name of a shipped profile, or path of your own relative to the experi
 
 _Channel = TypeVar("_Channel", bound=Range)
 _Value = TypeVar("_Value", float, F64)
+_SENSITIVITIES = {"um_per_v": "V", "um_per_ma": "mA", "um_per_um": "um"}
 _GAINS = ("gain_a_per_v", "gain_a_per_ma", "gain_v_per_v", "gain_v_per_ma")
 
 
@@ -75,24 +76,30 @@ class Sensor(StrictModel):
 
     um_per_v: float | None = Field(default=None, description="displacement per volt, um/V")
     um_per_ma: float | None = Field(default=None, description="displacement per mA, um/mA")
+    um_per_um: float | None = Field(
+        default=None, description="displacement per um of a reading in um; -1 reverses it"
+    )
     offset_um: float = Field(default=0.0, description="displacement at input 0, um")
 
     @model_validator(mode="after")
     def _one_sensitivity(self) -> Self:
-        given = [each for each in (self.um_per_v, self.um_per_ma) if each is not None]
-        if len(given) != 1 or given[0] == 0.0:
-            raise ValueError("must have one of um_per_v and um_per_ma, and not 0")
+        if len(self._given) != 1 or self.um_per_unit == 0.0:
+            raise ValueError(f"must have one of {', '.join(_SENSITIVITIES)}, and not 0")
         return self
+
+    @property
+    def _given(self) -> list[str]:
+        return [name for name in _SENSITIVITIES if getattr(self, name) is not None]
 
     @property
     def input_unit(self) -> str:
         """Unit of the input that it is wired to."""
-        return "mA" if self.um_per_v is None else "V"
+        return _SENSITIVITIES[self._given[0]]
 
     @property
     def um_per_unit(self) -> float:
         """Displacement for one unit of the input, um."""
-        return self.um_per_v or self.um_per_ma or 0.0
+        return float(getattr(self, self._given[0]))
 
 
 class Calibration(StrictModel):
@@ -115,24 +122,86 @@ class WatchdogOptions(StrictModel):
     )
 
 
-class ReaderOptions(StrictModel):
-    """The device with the input, if it is another one."""
+def _without_port(host: str) -> str:
+    name, colon, port = host.rpartition(":")
+    if not host.strip():
+        raise ValueError("must be a name or an address, got an empty text")
+    if colon and ":" not in name and port.isdecimal():
+        raise ValueError(f"must have no port: set host to {name} and tcp_port to {port}")
+    return host
+
+
+HostName: TypeAlias = Annotated[str, AfterValidator(_without_port)]
+
+LINE = ("baud", "parity", "stopbits", "echo", "gap_s")
+"""Settings of a serial line, at a port of this machine or behind a gateway or serial server."""
+PORT = ("boot_wait_s", "dtr", "rts", "rs485")
+"""Settings of a serial port of this machine."""
+
+
+class AddressOptions(DeviceOptions):
+    """Profile and address of a device."""
 
     profile: ProfileName = Field(description=PROFILE)
+    host: HostName | None = Field(
+        default=None,
+        description="host name or address of the device, of a gateway to Modbus RTU, or of a"
+        " serial server",
+    )
+    tcp_port: int | None = Field(
+        default=None, ge=1, le=65535, description="TCP port; default: the profile's; 502 for Modbus"
+    )
+    framing: Literal["tcp", "rtu"] | None = Field(
+        default=None,
+        description="frames of Modbus at host: tcp, or rtu for a serial server that passes bytes"
+        " on; default: the profile's, tcp for Modbus RTU",
+    )
     serial_port: str | None = Field(
-        default=None, description="device file; omitted if on the same line"
+        default=None, description="device file, preferably under /dev/serial/by-id"
     )
     unit_id: int | None = Field(
         default=None, ge=0, le=255, description="address on a shared line; default: the profile's"
     )
-    baud: int | None = Field(
-        default=None, ge=300, description="baud of its own line; default: the profile's"
+    baud: int | None = Field(default=None, ge=300, description="default: the profile's")
+    parity: Literal["N", "E", "O"] | None = Field(
+        default=None, description="default: the profile's"
+    )
+    stopbits: Literal[1, 2] | None = Field(default=None, description="default: the profile's")
+    echo: bool | None = Field(
+        default=None,
+        description="whether the adapter receives what it sends; default: the profile's, or false",
+    )
+    gap_s: float | None = Field(
+        default=None, ge=0.0, description="silence before each request, s; default: the profile's"
+    )
+    boot_wait_s: float | None = Field(
+        default=None, ge=0.0, le=30.0, description="wait after opening the port, s; default: the"
+        " profile's",
+    )  # fmt: skip
+    dtr: bool | None = Field(default=None, description="level of DTR; default: the profile's")
+    rts: bool | None = Field(default=None, description="level of RTS; default: the profile's")
+    rs485: Literal["high", "low"] | None = Field(
+        default=None,
+        description="level of RTS while sending, switched by the kernel (TIOCSRS485); omitted if"
+        " the adapter switches its direction itself",
     )
 
     @model_validator(mode="after")
-    def _own_line(self) -> Self:
-        if self.serial_port is None and self.baud is not None:
-            raise ValueError("baud goes with serial_port")
+    def _settings_go_with_their_place(self) -> Self:
+        if self.host is not None and self.serial_port is not None:
+            raise ValueError("must have one of host and serial_port, not both")
+        places = {
+            "host": (self.host, ("tcp_port", "framing")),
+            "serial_port": (self.serial_port, PORT),
+            "serial_port or host": (self.serial_port or self.host, LINE),
+        }
+        wrong = [
+            f"{', '.join(given)} must go with {name}"
+            for name, (place, keys) in places.items()
+            if place is None and (given := [key for key in keys if getattr(self, key) is not None])
+        ]
+        if wrong:
+            raise ValueError("; ".join(wrong))
         return self
 
 
@@ -147,25 +216,15 @@ FifoBlocks: TypeAlias = Annotated[
 ]
 
 
-class DacOptions(DeviceOptions):
+class DacOptions(AddressOptions):
     """Options of every DAC with a profile."""
 
-    profile: ProfileName = Field(description=PROFILE)
-    serial_port: str | None = Field(
-        default=None, description="device file, preferably under /dev/serial/by-id"
-    )
-    baud: int | None = Field(default=None, ge=300, description="default: the profile's")
-    parity: Literal["N", "E", "O"] | None = Field(
-        default=None, description="default: the profile's"
-    )
-    stopbits: Literal[1, 2] | None = Field(default=None, description="default: the profile's")
-    unit_id: int | None = Field(
-        default=None, ge=0, le=255, description="address on a shared line; default: the profile's"
-    )
     output: str = Field(description="output that drives the actuator")
     input: str = Field(description="input of the displacement sensor")
-    reader: ReaderOptions | None = Field(
-        default=None, description="device with the input, if it is another one"
+    reader: AddressOptions | None = Field(
+        default=None,
+        description="device with the input, if it is another one; without host and serial_port it"
+        " is on the line or connection of the output",
     )
     timeout_s: float = Field(
         default=0.1, gt=0.0, le=60.0, description="longest wait for a reply, s"
@@ -178,6 +237,12 @@ class DacOptions(DeviceOptions):
     watchdog: WatchdogOptions | Literal["none"] = Field(
         description="the device's own; none if the device may hold its last output"
     )
+
+    @model_validator(mode="after")
+    def _has_a_place(self) -> Self:
+        if self.host is None is self.serial_port:
+            raise ValueError("must have either host or serial_port")
+        return self
 
     @property
     def watchdog_timeout_s(self) -> float | None:

@@ -11,11 +11,10 @@ from typing import Any, TypeVar
 from hilctl.base.errors import InputError
 from hilctl.base.types import CommandUnit
 from hilctl_drivers.profile import load_profile
-from hilctl_drivers.profile_base import BaseProfile, Range, Watchdog
+from hilctl_drivers.profile_base import BaseProfile, Range, SerialLineSettings, Watchdog
 
 _HERE = "127.0.0.1"
 _PORT = "/dev/serial/by-id/set-me"
-_SUFFIX = {"V": "v", "mA": "ma"}
 _UM_PER_UNIT = 10.0
 _SILENCE_S = 2.0
 
@@ -131,14 +130,15 @@ def _ask(made: StartingSection, key: str, question: str, remark: str) -> None:
 def _place(made: StartingSection, prefix: str, profile: BaseProfile) -> dict[str, Any]:
     """Add the place of a device, or return it for a reader, whose keys begin with ``prefix``."""
     where = {} if prefix else made.values
-    if profile.link.kind == "tcp":
+    if not isinstance(profile.link, SerialLineSettings):
         where["host"] = _HERE
         # Two devices cannot have one place: at addresses of their own both have the usual port.
-        where["tcp_port"] = getattr(profile.link, "port", 502) + bool(prefix)
+        port = getattr(profile.link, "port", 0)
+        where["tcp_port"] = port + (port == made.values.get("tcp_port"))
         remark = "name or address; this machine is hilctl emulate's"
         _ask(made, f"{prefix}host", f"name or address of the {profile.title}", remark)
     else:
-        where["serial_port"] = _PORT
+        where["serial_port"] = _PORT + ("-sensor" if prefix else "")
         remark = "hilctl devices lists the ports of this machine"
         _ask(made, f"{prefix}serial_port", f"serial port of the {profile.title}", remark)
     return where
@@ -159,7 +159,7 @@ def _reader(
 def _amplifier(made: StartingSection, output: Range, unit: CommandUnit) -> None:
     if output.unit == "A":
         return
-    key = f"gain_{unit.lower()}_per_{_SUFFIX[output.unit]}"
+    key = f"gain_{unit.lower()}_per_{output.unit.lower()}"
     middle = 0.5 * (output.min + output.max) if unit == "A" else 0.0
     made.values["amplifier"] = {key: 1.0, f"offset_{unit.lower()}": 0.0 - middle}
     of = {"A": "coil current", "V": "drive voltage"}[unit]
@@ -171,9 +171,12 @@ def _amplifier(made: StartingSection, output: Range, unit: CommandUnit) -> None:
 def _sensor(made: StartingSection, sensor_input: Range) -> None:
     if sensor_input.unit == "A":
         raise InputError(f"{made.values['input']} is in A: no displacement sensor gives that")
-    key = f"um_per_{_SUFFIX[sensor_input.unit]}"
+    key = f"um_per_{sensor_input.unit.lower()}"
     middle = 0.5 * (sensor_input.min + sensor_input.max)
-    made.values["sensor"] = {key: _UM_PER_UNIT, "offset_um": 0.0 - _UM_PER_UNIT * middle}
+    values = {key: 1.0, "offset_um": 0.0}  # of a reading in um
+    if sensor_input.unit != "um":
+        values = {key: _UM_PER_UNIT, "offset_um": 0.0 - _UM_PER_UNIT * middle}
+    made.values["sensor"] = values
     per_unit = f"displacement of one {sensor_input.unit} of the "
     at_zero = f"displacement at 0 {sensor_input.unit}, um"
     _ask(made, f"sensor.{key}", f"{per_unit}sensor, um", f"{per_unit}input, um")

@@ -52,7 +52,8 @@ class DeviceInfo:
         safe_note: Limitation of the safe value in words: its message takes longer than 0.2 s, or
             the device cannot confirm it; may be empty.
         confirms: Whether an answer of the device is evidence of the command that it answers.
-        details: Facts for the recording (serial numbers, physical parameters).
+        details: Facts for the recording (serial numbers, physical parameters). Opening may add some
+            (``transactions``: requests per tick).
     """
 
     name: str

@@ -131,6 +131,7 @@ def run_job(job: Job, ring: SampleRing) -> LoopOutcome:
     steps = prepare(config.realtime)
     if config.realtime.require:
         require(steps)
+    known = device.info.details
     device.open(config.sample_rate_hz, config.block)
     try:
         output = starting_output(device, config.safe.at_start)
@@ -140,7 +141,10 @@ def run_job(job: Job, ring: SampleRing) -> LoopOutcome:
             PageField.REAL_TIME, int(any(s.name == "fifo" and s.outcome == "done" for s in steps))
         )
         page.put(PageField.WAVEFORM_AT, waveform_at)
-        page.write_text(PageSlot.SET_UP, json.dumps([step_facts(steps), refusals(steps)]))
+        details = device.info.details.items()
+        learned = {f"device.{key}": value for key, value in details if key not in known}
+        facts = step_facts(steps) | learned
+        page.write_text(PageSlot.SET_UP, json.dumps([facts, refusals(steps)]))
         # After the text, which the phase announces.
         page.publish(PageField.PHASE, Phase.READY)
         start_ns = _await_go(page, host)

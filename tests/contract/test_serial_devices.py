@@ -1,4 +1,4 @@
-"""The device contract of ``serial_dac`` for every shipped serial profile, emulated on a pty.
+"""The device contract of ``serial_dac`` for every shipped profile of it, emulated.
 
 The checks are those of ``test_devices.py``. If a device has no input, a second device reads the
 sensor, on its own or on the same line.
@@ -24,6 +24,8 @@ SERIAL = (
     "adam_4024_ascii agilent_34970a own", "adam_4024_ascii only_reads same", "agilent_34970a",
     "cobs_board", "cobs_board_fifo", "icp_m7024_dcon agilent_34970a own",
     "kepco_bop agilent_34970a own", "tdk_lambda_gen agilent_34970a own",
+    "kepco_bop labjack_t7 own", "icp_m7024_dcon adam_4117 own", "cobs_board labjack_t7 own",
+    "kepco_bop cobs_board own",
 )  # fmt: skip
 """What serial_dac is tried with: what drives, what reads, and whether they share a line."""
 PIEZO = ("cobs_board V", "icp_m7024_dcon agilent_34970a own V")
@@ -45,6 +47,7 @@ turnaround_s: 0.001
 max_rate_hz: 100.0
 watchdog: none
 """
+KINDS = {"ascii", "frames"}
 SETTLED_S = 2e-3
 TIMEOUT_S = 2.0
 """A busy machine answers within it; a device without numbered answers is silent for as long."""
@@ -57,7 +60,7 @@ MUST_BE_AT_REST = {"kepco_bop", "tdk_lambda_gen"}
 def serial_profiles():
     """Return the shipped profiles of serial devices, by name."""
     kinds = {name: load_profile(name).link.kind for name in shipped_profiles()}
-    return [name for name, kind in kinds.items() if kind in {"ascii", "frames"}]
+    return [name for name, kind in kinds.items() if kind in KINDS]
 
 
 class DrivenSerial(contract.DrivenDevice):
@@ -102,6 +105,10 @@ def wired(case, tmp_path, stack):
     path = tmp_path / f"{name}.yaml"
     text = shipped_profiles()[name].read_text()
     path.write_text(text.replace("boot_wait_s: 2.0", "boot_wait_s: 0.0"))
+    if reader in shipped_profiles():
+        text = shipped_profiles()[reader].read_text()
+        reader = str(tmp_path / f"{reader}.yaml")
+        Path(reader).write_text(text.replace("boot_wait_s: 2.0", "boot_wait_s: 0.0"))
     if reader == "only_reads":
         reader = str(tmp_path / "only_reads.yaml")
         Path(reader).write_text(ONLY_READS)
@@ -123,7 +130,7 @@ def wired(case, tmp_path, stack):
 
     block = BLOCK if device.info.latency_blocks else 1
     made = DrivenSerial(device, block, rate_hz, lambda: rig.command, pass_time, name="serial_dac")
-    made.silent = silent and line == "own"
+    made.silent = silent and (line == "own" or profile.exchange == "none")
     made.must_be_at_rest = name in MUST_BE_AT_REST
     made.reads_back = name != "adam_4024_ascii"  # returns its last command, not its output
     return made
@@ -172,5 +179,5 @@ def test_opening_does_not_move_the_output(driven, case):
 def test_no_serial_profile_is_left_out():
     drives = {case.split()[0] for case in SERIAL}
     reads = {word for case in SERIAL for word in case.split()[1:2]}
-    assert drives | (reads - {"only_reads"}) == set(serial_profiles())
-    assert {"ascii", "frames"} == {load_profile(name).link.kind for name in drives}
+    assert drives | (reads & set(serial_profiles())) == set(serial_profiles())
+    assert {load_profile(name).link.kind for name in drives} == KINDS

@@ -1,4 +1,4 @@
-"""``serial_dac`` for devices with a text protocol; another such device may read the sensor."""
+"""``serial_dac`` for devices with a text protocol."""
 
 import re
 from string import Formatter
@@ -15,8 +15,8 @@ from hilctl_drivers.ascii.ascii_session import (
     query_time,
 )
 from hilctl_drivers.profile_base import Range
-from hilctl_drivers.serial_dac import SerialDac, SerialSetup
-from hilctl_drivers.transport.links import WatchdogTrippedError, naming
+from hilctl_drivers.serial_dac import SerialDac
+from hilctl_drivers.transport.links import WatchdogTrippedError
 from hilctl_drivers.transport.safe_exchange import try_out
 from hilctl_drivers.transport.wire_time import RateLimit, WireTime, check_feeds
 
@@ -30,68 +30,57 @@ class AsciiDac(SerialDac):
     """A :class:`~hilctl_drivers.serial_dac.SerialDac` with lines of text."""
 
     def _prepare(self) -> None:
-        setup = self._setup
-        assert isinstance(setup.profile, AsciiProfile)
-        assert isinstance(setup.output, AsciiOutput)
-        options, reader = setup.options, setup.options.reader
-        self._profile = setup.profile
-        self._reader_profile = _reader_profile(setup, setup.profile)
-        assert isinstance(setup.input, AsciiInput)
-        self._target, self._input = setup.output, setup.input
-        self._measure = _measuring_input(setup.profile, options.measure, setup.output)
+        setup, options = self._setup, self._options
+        profile, output = setup.writer.profile, setup.output
+        assert isinstance(profile, AsciiProfile)
+        assert isinstance(output, AsciiOutput)
+        self._profile, self._target = profile, output
+        self._measure = _measuring_input(profile, options.measure, output)
         self.measures = self._measure is not None
-        self._writer = self._reader = AsciiSession(self._profile, self._link, options.unit_id)
-        self._reader_link = setup.reader_link(self._link)
-        self._reader_name = ""
-        if reader is not None:
-            self._reader = AsciiSession(self._reader_profile, self._reader_link, reader.unit_id)
-            where = reader.serial_port or f"unit {self._reader.address}"
-            self._reader_name = f"reader {self._reader_profile.title} at {where}"
+        self._writer = AsciiSession(profile, self._link, setup.writer.unit)
+        self._sensor = self._reader = setup.reader_on(self._link)
         self._feed_every = self._ticks = 0
         # Half duplex: what was asked last is answered before the safe value can go out.
-        write = exchange_time(self._profile, options.output, None)
-        self.longest_message_s = self._sample_time().answered_s + write.answered_s
+        write = exchange_time(profile, options.output, None)
+        busy = self._own_time()
+        if setup.shares_link:
+            busy = setup.after_reading(busy)
+        self.longest_message_s = busy.answered_s + write.answered_s
         self.unconfirmed = self._unconfirmed()
-        self.arm_s = arm_s(self._profile, options.output)
+        self.arm_s = arm_s(profile, options.output)
 
     def _rates(self, block: int) -> RateLimit:
         del block
-        slowest = min((self._profile, self._reader_profile), key=lambda each: each.max_rate_hz)
-        whose = f"the profile of {slowest.title}"
-        return RateLimit.of(self._sample_time(), slowest.max_rate_hz, whose)
+        return self._setup.rates(self._setup.after_reading(self._own_time()))
 
-    def _sample_time(self) -> WireTime:
-        """Return the time of a sample on the wire."""
-        options, profile, reader = self._setup.options, self._profile, self._reader_profile
-        reads_itself = not self._setup.reads_elsewhere
-        wire = exchange_time(profile, options.output, options.input if reads_itself else None)
-        if not reads_itself:
-            wire = wire.then(query_time(reader, self._input, f"to {reader.title}"))
+    def _own_time(self) -> WireTime:
+        """Return the time of a sample without another device that reads the sensor."""
+        options, profile = self._options, self._profile
+        own = None if self._setup.reads_elsewhere else options.input
+        wire = exchange_time(profile, options.output, own)
         if self._measure is not None:
-            wire = wire.then(query_time(profile, self._measure, f"to measure {options.measure}"))
-        if options.watchdog != "none":
-            wire = wire.then(feed_time(profile))
-        return wire
+            purpose = f"to measure {options.measure}"
+            wire = wire.then(query_time(profile, self._measure).named(purpose))
+        return wire if options.watchdog == "none" else wire.then(feed_time(profile))
 
     def _open(self, sample_rate_hz: float, block: int) -> None:
         del block
-        feed_every = check_feeds(self._setup.options.watchdog_timeout_s, sample_rate_hz)
+        feed_every = check_feeds(self._options.watchdog_timeout_s, sample_rate_hz)
         watchdog = self._profile.watchdog
         self._connect()
         # A device that has tripped refuses the steps that follow.
         self._clear_trip()
         self._writer.run(self._profile.init)
-        if self._setup.reads_elsewhere:
-            with naming(self._reader_name):
-                self._reader.run(self._reader_profile.init)
+        self._sensor.begin()
         self._try_out_safe_value()
         strict = watchdog != "none" and watchdog.kick == "strict"
         self._feed_every = feed_every if strict else 0
         self._writer.check_errors()  # after all steps: those without a reply leave theirs there
         self._ticks = 0
+        self.transactions = (1 if self._is_combined else 2) + self.measures
 
     def _arm(self) -> None:
-        if self._setup.options.watchdog != "none":
+        if self._options.watchdog != "none":
             # The safe value before the timeout: once it counts, it must know where to go.
             self._run("safe")
             self._run("arm")
@@ -105,15 +94,15 @@ class AsciiDac(SerialDac):
         combined = self._profile.exchange
         if combined != "none" and self._is_combined:
             text = self._writer.text(combined.write, value=value)
-            found = parse_number(self._writer.ask(text, combined.pattern)[1])
+            number = parse_number(self._writer.ask(text, combined.pattern)[1])
+            found = self._profile.inputs[combined.input].value(number)
         else:
             # First the reading, which must not show yet what the command does.
-            found = self._read()
+            found = self._sensor.read()
             self._write(value)
-        displacement_um[0] = self._chain.displacement_um(_value(self._input, found))
+        displacement_um[0] = self._chain.displacement_um(found)
         if self._measure is not None:
-            value = _value(self._measure, self._writer.number(self._measure))
-            measured[0] = self._chain.command(value)
+            measured[0] = self._chain.command(self._writer.value(self._measure))
         self._feed()
 
     def _output(self) -> float | None:
@@ -131,26 +120,23 @@ class AsciiDac(SerialDac):
 
     def _look(self) -> tuple[float, float | None]:
         self._connect()
-        displacement_um = self._chain.displacement_um(_value(self._input, self._read()))
+        displacement_um = self._chain.displacement_um(self._sensor.read())
         return displacement_um, self._as_command(self._measured_output())
 
     def _as_command(self, value: float | None) -> float | None:
         return None if value is None else self._chain.command(value)
 
     def _close(self) -> None:
-        if self._setup.options.watchdog != "none":
+        if self._options.watchdog != "none":
             # First: nothing feeds it any more, and it would trip while the close steps run.
             self._run("disarm")
         self._writer.run(self._profile.close)
         self._writer.check_errors()
-
-    def _release(self) -> None:
-        super()._release()
-        self._reader_link.close()
+        self._sensor.end()
 
     @property
     def _is_combined(self) -> bool:
-        combined, options = self._profile.exchange, self._setup.options
+        combined, options = self._profile.exchange, self._options
         if combined == "none" or self._setup.reads_elsewhere:
             return False
         return (combined.output, combined.input) == (options.output, options.input)
@@ -159,15 +145,7 @@ class AsciiDac(SerialDac):
         """Open the links and check the devices."""
         self._link.open()
         self._writer.check_selftest()
-        if self._setup.reads_elsewhere:
-            with naming(self._reader_name):
-                if self._reader_link is not self._link:
-                    self._reader_link.open()
-                self._reader.check_selftest()
-
-    def _read(self) -> float:
-        with naming(self._reader_name):
-            return self._reader.number(self._input)
+        self._sensor.open()
 
     def _write(self, value: float) -> bool:
         """Write the output; return whether the answer shows that a device has received it."""
@@ -186,7 +164,7 @@ class AsciiDac(SerialDac):
         unit = self._target.unit
         for source in self._profile.inputs.values():
             if source.measures == "output" and source.unit == unit:
-                return _value(source, self._writer.number(source))
+                return self._writer.value(source)
         readback = self._target.readback
         if readback != "none" and readback.of == "command" and self._writer.tripped():
             return None
@@ -245,7 +223,7 @@ class AsciiDac(SerialDac):
         watchdog = self._profile.watchdog
         if watchdog == "none" or not self._writer.tripped():
             return
-        safe = self._chain.output(self._setup.options.safe_command)
+        safe = self._chain.output(self._options.safe_command)
         # Before if it is accepted, and after in any case: a device that goes back to its last
         # command when the trip ends must not output that, or not for longer than one line takes.
         if not watchdog.refuses_while_tripped:
@@ -255,7 +233,7 @@ class AsciiDac(SerialDac):
 
     def _run(self, name: str) -> None:
         """Run the watchdog's steps of that name."""
-        watchdog, options = self._profile.watchdog, self._setup.options
+        watchdog, options = self._profile.watchdog, self._options
         assert watchdog != "none"
         steps = getattr(watchdog, name)
         if name == "safe":
@@ -273,24 +251,6 @@ class AsciiDac(SerialDac):
 
 def _without_numbers(text: str) -> str:
     return re.sub(r"[-+.\d]+", "#", text)
-
-
-def _value(source: AsciiInput, number: float) -> float:
-    return number * source.scale + source.offset
-
-
-def _reader_profile(setup: SerialSetup, profile: AsciiProfile) -> AsciiProfile:
-    """Return the reader's profile; raise InputError if it cannot share the other's line."""
-    reader, options = setup.reader, setup.options.reader
-    if not isinstance(reader, AsciiProfile):
-        raise InputError("reader is for devices that speak lines of text, both of them")
-    if options is None or options.serial_port is not None:
-        return reader
-    kept = ("terminator", "reply_terminator", "checksum", "bytesize", "echo")
-    if any(getattr(profile.link, name) != getattr(reader.link, name) for name in kept):
-        rule = f"{reader.title} can't share the line of {profile.title}: {', '.join(kept)} differ"
-        raise InputError(f"{rule}; give reader.serial_port")
-    return reader
 
 
 def _measuring_input(profile: AsciiProfile, name: str | None, output: Range) -> AsciiInput | None:

@@ -7,6 +7,7 @@ pattern is for, proves that it matches, and tells how long a reply is.
 """
 
 import re
+from dataclasses import replace
 from string import Formatter
 from typing import Annotated, ClassVar, Literal, Self, TypeAlias
 
@@ -18,9 +19,11 @@ from hilctl_drivers.profile_base import (
     Name,
     Range,
     SerialLineSettings,
+    StreamSettings,
     WaitStep,
     Watchdog,
 )
+from hilctl_drivers.transport.serial_port import SerialSettings
 
 _SAMPLES = {"value": 0.0, "safe": 0.0, "address": 1, "timeout": 1}
 
@@ -54,16 +57,18 @@ def fields_of(template: str) -> set[str]:
     return {field for _, field, _, _ in Formatter().parse(template) if field}
 
 
-class AsciiLink(SerialLineSettings):
-    """Lines of text: SCPI, DCON and the like."""
+class TextLines(StreamSettings):
+    """Lines of text: SCPI, GCS, DCON and the like."""
 
-    kind: Literal["ascii"]
+    COMMON: ClassVar[tuple[str, ...]] = (
+        "terminator", "reply_terminator", "checksum", "bytesize", "echo",
+    )  # fmt: skip
+
     terminator: Literal["\r", "\n", "\r\n"] = Field(description="end of a sent line")
     reply_terminator: Literal["\r", "\n", "\r\n"] = Field(description="end of a reply")
     checksum: Literal["none", "dcon", "gen"] = Field(
         default="none", description="dcon: two hex digits; gen: $ and two hex digits"
     )
-    echo: bool = Field(default=False, description="whether the device repeats what is sent")
     min_gap_s: float = Field(default=0.0, ge=0.0, description="silence between commands, s")
     max_line_chars: int | None = Field(
         default=None, ge=1, description="longest line that it accepts"
@@ -72,7 +77,25 @@ class AsciiLink(SerialLineSettings):
     @property
     def silence_s(self) -> float:
         """Silence between commands, s."""
-        return self.min_gap_s
+        return self.min_gap_s if self.gap_s is None else self.gap_s
+
+    @property
+    def settings(self) -> SerialSettings:
+        """Settings of the link; the session takes the lines that come back, for its terminators."""
+        return replace(super().settings, echo=False)
+
+
+class AsciiLink(TextLines, SerialLineSettings):
+    """Lines of text on a serial line."""
+
+    kind: Literal["ascii"]
+
+
+class AsciiTcpLink(TextLines):
+    """Lines of text on a TCP connection."""
+
+    kind: Literal["ascii_tcp"]
+    port: int = Field(ge=1, le=65535, description="TCP port; SCPI uses 5025")
 
 
 class Reply(StrictModel):
@@ -154,6 +177,10 @@ class AsciiInput(Range, Query):
     measures: Literal["terminal", "output"] = Field(
         default="terminal", description="terminal: what is wired to it; output: its own output"
     )
+
+    def value(self, number: float) -> float:
+        """Return the value of a number in a reply, in ``unit``."""
+        return number * self.scale + self.offset
 
 
 class AsciiExchange(NumberReply):
@@ -272,7 +299,7 @@ class AsciiProfile(BaseProfile):
     """A device with a text protocol.
 
     Attributes:
-        link: Serial line.
+        link: Serial line or TCP connection.
         outputs: Outputs by name.
         inputs: Inputs by name.
         exchange: One line that writes and reads; none if there is none.
@@ -282,8 +309,9 @@ class AsciiProfile(BaseProfile):
     """
 
     DEVICE: ClassVar[str] = "serial_dac"
+    READER: ClassVar[str] = "hilctl_drivers.ascii.ascii_session:TextReader"
 
-    link: AsciiLink
+    link: Annotated[AsciiLink | AsciiTcpLink, Field(discriminator="kind")]
     address: int | Literal["none"] = Field(description="device address as shipped, for {address}")
     outputs: dict[Name, AsciiOutput]
     inputs: dict[Name, AsciiInput]
@@ -325,6 +353,11 @@ class AsciiProfile(BaseProfile):
     def unit(self) -> int:
         """The address as shipped; 0 if it has none."""
         return 0 if self.address == "none" else self.address
+
+    @property
+    def usual_unit(self) -> int | None:
+        """See :attr:`~hilctl_drivers.profile_base.BaseProfile.usual_unit`."""
+        return None if self.address == "none" else self.address
 
     @property
     def driver(self) -> str:

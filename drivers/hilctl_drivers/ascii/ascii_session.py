@@ -23,6 +23,7 @@ from hilctl_drivers.ascii.ascii_profile import (
     Reply,
     SendStep,
 )
+from hilctl_drivers.dac_setup import DacSetup, SensorReader
 from hilctl_drivers.profile_base import WaitStep
 from hilctl_drivers.transport.crc import Bytes, dcon_checksum, gen_checksum
 from hilctl_drivers.transport.framing import DelimitedSplitter
@@ -191,14 +192,18 @@ class AsciiSession:
         found = self.ask(text, pattern)
         if found.string == text:
             raise MismatchError(
-                f"{text}: came back unchanged: the line echoes what is sent; set link.echo in the "
-                "profile if the device answers after that"
+                f"{text}: came back unchanged: the line echoes what is sent; set echo: true "
+                "beside the address if the device answers after that"
             )
         return found
 
     def number(self, query: Query) -> float:
         """Ask for a number."""
         return parse_number(self.query(self.text(query.ask), query.pattern)[1])
+
+    def value(self, source: AsciiInput) -> float:
+        """Ask for the value of an input, in its unit."""
+        return source.value(self.number(source))
 
     def run(self, steps: Sequence[AsciiStep], **values: float) -> None:
         """Execute steps with ``timeout`` and ``safe``; raise DeviceError if one fails."""
@@ -306,9 +311,39 @@ def exchange_time(profile: AsciiProfile, output: str, sensor: str | None) -> Wir
     return _lines_time(profile, lines, settle_s)
 
 
-def query_time(profile: AsciiProfile, query: AsciiInput, purpose: str) -> WireTime:
-    """Return the time of a question besides the exchange, named by its purpose."""
-    return _lines_time(profile, [_question(profile, query)], query.settle_s).named(purpose)
+def query_time(profile: AsciiProfile, query: AsciiInput) -> WireTime:
+    """Return the time of a question besides the exchange."""
+    return _lines_time(profile, [_question(profile, query)], query.settle_s)
+
+
+class TextReader(SensorReader):
+    """A :class:`~hilctl_drivers.dac_setup.SensorReader` for lines of text."""
+
+    def __init__(self, setup: DacSetup, link: Link) -> None:
+        """See :class:`~hilctl_drivers.dac_setup.SensorReader`."""
+        super().__init__(setup, link)
+        profile, source = setup.reader.profile, setup.input
+        assert isinstance(profile, AsciiProfile)
+        assert isinstance(source, AsciiInput)
+        self._profile, self._source = profile, source
+        self._session = AsciiSession(profile, self._link, setup.reader.unit)
+
+    @staticmethod
+    def time(profile: AsciiProfile, source: AsciiInput) -> WireTime:
+        """See :meth:`~hilctl_drivers.dac_setup.SensorReader.time`."""
+        return query_time(profile, source).named(f"to {profile.title}")
+
+    def _identify(self) -> None:
+        self._session.check_selftest()
+
+    def _set_up(self) -> None:
+        self._session.run(self._profile.init)
+
+    def _read(self) -> float:
+        return self._session.value(self._source)
+
+    def _finish(self) -> None:
+        self._session.run(self._profile.close)
 
 
 def feed_time(profile: AsciiProfile) -> WireTime | None:
@@ -346,11 +381,11 @@ def _lines_time(profile: AsciiProfile, lines: Sequence[_Line], settle_s: float =
     replies = [reply for _, reply in lines if reply is not None]
     received = sum(len(reply) + check + len(link.reply_terminator) for reply in replies)
     return WireTime(
-        f"{len(lines)} {'line' if len(lines) == 1 else 'lines'} at {link.format}",
+        f"{len(lines)} {'line' if len(lines) == 1 else 'lines'} {link.medium}",
         sent * link.char_s,
         received * link.char_s,
-        len(lines),
-        len(lines) * link.min_gap_s,
+        len(lines) if link.silence_s else 0,
+        len(lines) * link.silence_s,
         len(replies) * profile.turnaround_s,
         settle_s=settle_s,
     )

@@ -12,14 +12,15 @@ import numpy as np
 
 from hilctl.base.errors import DeviceError, InputError
 from hilctl.base.types import F64
-from hilctl_drivers.board import frames as board
 from hilctl_drivers.board.board_profile import FrameProfile
 from hilctl_drivers.board.board_session import BoardFacts, BoardSession, Readings
-from hilctl_drivers.board.frames import exchange_sizes, watchdog_sizes
+from hilctl_drivers.board.frames import exchange_sizes, state_sizes, watchdog_sizes
+from hilctl_drivers.dac_setup import DacSetup, SensorReader
 from hilctl_drivers.device import check_fifo, check_next
+from hilctl_drivers.profile_base import Range
 from hilctl_drivers.serial_dac import SerialDac
 from hilctl_drivers.transport.framing import binary_framing
-from hilctl_drivers.transport.links import WatchdogTrippedError
+from hilctl_drivers.transport.links import Link, WatchdogTrippedError
 from hilctl_drivers.transport.safe_exchange import try_out
 from hilctl_drivers.transport.wire_time import RateLimit, WireTime, check_feeds
 
@@ -53,7 +54,7 @@ def _value_bytes(profile: FrameProfile) -> int:
 def _wire_time(profile: FrameProfile, sizes: tuple[int, int]) -> WireTime:
     """Return the time of a message and its reply, with the line as text."""
     link = profile.link
-    byte_s, gaps, gaps_s, line = link.char_s, 0, 0.0, f"at {link.format}"
+    byte_s, gaps, gaps_s, line = link.char_s, 0, 0.0, link.medium
     if link.usb:
         full_speed = link.usb_frame_s >= 1e-3
         byte_s, gaps, gaps_s = 8.0 / _USB_BITS_PER_S[full_speed], 1, link.usb_frame_s
@@ -63,42 +64,63 @@ def _wire_time(profile: FrameProfile, sizes: tuple[int, int]) -> WireTime:
     return WireTime(line, request_s, reply_s, gaps, gaps_s, profile.turnaround_s)
 
 
+class BoardReader(SensorReader):
+    """A :class:`~hilctl_drivers.dac_setup.SensorReader` for boards, by STATE."""
+
+    def __init__(self, setup: DacSetup, link: Link) -> None:
+        """See :class:`~hilctl_drivers.dac_setup.SensorReader`."""
+        super().__init__(setup, link)
+        profile = setup.reader.profile
+        assert isinstance(profile, FrameProfile)
+        self._session = BoardSession(profile, self._link)
+
+    @staticmethod
+    def time(profile: FrameProfile, source: Range) -> WireTime:
+        """See :meth:`~hilctl_drivers.dac_setup.SensorReader.time`."""
+        values = (*profile.outputs.values(), *profile.inputs.values())
+        wire = _wire_time(profile, state_sizes(sum(each.format.size for each in values)))
+        return replace(wire, what=f"STATE {wire.what}", settle_s=source.settle_s)
+
+    def _identify(self) -> None:
+        self._session.facts()
+
+    def _read(self) -> float:
+        return self._session.known_state().reading
+
+
 class BoardDac(SerialDac):
     """A :class:`~hilctl_drivers.serial_dac.SerialDac` with binary frames."""
 
     def _prepare(self) -> None:
-        setup, profile = self._setup, self._setup.profile
+        setup, profile = self._setup, self._setup.writer.profile
         assert isinstance(profile, FrameProfile)
-        for name in ("reader", "measure", "unit_id"):
-            if getattr(setup.options, name) is not None:
-                raise InputError(f"{name} is for devices that speak lines of text")
+        if self._options.measure is not None:
+            raise InputError("measure is for devices that speak lines of text")
         self._profile = profile
         self._session = BoardSession(profile, self._link)
-        self._safe = setup.chain.output(setup.options.safe_command)
+        if setup.reads_elsewhere:
+            self._reader = setup.reader_on(self._link)
+        self._safe = setup.chain.output(self._options.safe_command)
         self.arm_s = _wire_time(profile, watchdog_sizes(_value_bytes(profile))).answered_s
 
     def _rates(self, block: int) -> RateLimit:
-        most_hz, whose = self._profile.max_rate_hz, f"the profile of {self._profile.title}"
-        settling_s = settle_s(self._profile)
-        if settling_s * most_hz > 1.0:
-            most_hz = 1.0 / settling_s
-            whose = f"settling {1e3 * settling_s:.2f} ms: {whose}"
         streaming = self._profile.streaming
         lowest_hz = 0.0 if streaming == "none" else streaming.rate_min_hz
-        return RateLimit.of(exchange_time(self._profile, block), most_hz, whose, lowest_hz)
+        wire = self._setup.after_reading(exchange_time(self._profile, block))
+        return self._setup.rates(wire, lowest_hz, settle_s(self._profile))
 
     def _output(self) -> float | None:
         state = self._session.state()
         return None if state is None else self._chain.command(state.output)
 
     def _look(self) -> tuple[float, float | None]:
-        facts = self._connect()
-        state = self._session.state()
-        if state is None:
-            raise DeviceError(
-                f"{facts.name} speaks version 1 of the protocol: no message only reads"
-            )
-        return self._chain.displacement_um(state.reading), self._chain.command(state.output)
+        self._connect()
+        state = self._session.known_state()
+        reading = state.reading
+        if self._reader is not None:
+            self._reader.open()
+            reading = self._reader.read()
+        return self._chain.displacement_um(reading), self._chain.command(state.output)
 
     def _send(self, value: float) -> None:
         self._link.send_now(self._session.safe_frame(value))
@@ -107,7 +129,7 @@ class BoardDac(SerialDac):
         try:
             self._session.put_out(value)
         except WatchdogTrippedError:
-            self._set_watchdog(self._setup.options.watchdog_timeout_s)
+            self._set_watchdog(self._options.watchdog_timeout_s)
             self._session.put_out(value)
         state = self._session.state()
         if state is not None:
@@ -115,15 +137,10 @@ class BoardDac(SerialDac):
 
     def _connect(self, extra_s: float = 0.0) -> BoardFacts:
         """Connect and check that it is a board that this profile describes."""
-        self._link = self._setup.link(extra_s)
+        self._link = self._setup.writer.stream(extra_s)
         self._session = BoardSession(self._profile, self._link)
         self._link.open()
         facts = self._session.facts()
-        if facts.version not in board.VERSIONS:
-            known = " or ".join(str(each) for each in board.VERSIONS)
-            raise DeviceError(
-                f"{facts.name} speaks version {facts.version} of the protocol, not {known}"
-            )
         low, high = self._setup.output.limits
         slack = 1e-6 * (high - low)
         if low < facts.low - slack or high > facts.high + slack:
@@ -134,8 +151,8 @@ class BoardDac(SerialDac):
         return facts
 
     def _arm(self) -> None:
-        if self._setup.options.watchdog != "none":
-            self._set_watchdog(self._setup.options.watchdog_timeout_s)
+        if self._options.watchdog != "none":
+            self._set_watchdog(self._options.watchdog_timeout_s)
 
     def _try_out_safe_value(self) -> None:
         """Set the output to what it holds by SAFE, or to the safe value after a trip."""
@@ -159,21 +176,29 @@ class BoardSingle(BoardDac):
 
     def _open(self, sample_rate_hz: float, block: int) -> None:
         del block
-        check_feeds(self._setup.options.watchdog_timeout_s, sample_rate_hz)
+        check_feeds(self._options.watchdog_timeout_s, sample_rate_hz)
         self._connect()
+        if self._reader is not None:
+            self._reader.open()
+            self._reader.begin()
         self._try_out_safe_value()
+        self.transactions = 1 if self._reader is None else 2
 
     def _exchange(
         self, first_sample: int, command: F64, displacement_um: F64, measured: F64
     ) -> None:
         del first_sample, measured
+        # First the reading, which must not show yet what the command does.
+        read = None if self._reader is None else self._reader.read()
         found = self._session.exchange(self._chain.output(command))
         if found.values.size != 1:
             raise DeviceError(f"{found.values.size} readings came for one sample")
-        self._chain.fill_um(found.values, displacement_um)
+        self._chain.fill_um(found.values if read is None else np.array([read]), displacement_um)
 
     def _close(self) -> None:
         self._set_watchdog(None)
+        if self._reader is not None:
+            self._reader.end()
 
 
 class BoardStream(BoardDac):
@@ -181,10 +206,12 @@ class BoardStream(BoardDac):
 
     def _prepare(self) -> None:
         super()._prepare()
+        if self._reader is not None:
+            raise InputError("reader must be omitted: a board with a FIFO samples its own input")
         streaming = self._profile.streaming
         assert streaming != "none"
         self.block_max, self.fifo_depth = streaming.block_max, streaming.fifo_depth
-        self._latency_blocks = self._setup.options.fifo_blocks
+        self._latency_blocks = self._options.fifo_blocks
         self._samples = 0
         self._next_sample = 0
         self.fifo_level_min = 0
@@ -192,7 +219,7 @@ class BoardStream(BoardDac):
 
     def _open(self, sample_rate_hz: float, block: int) -> None:
         check_fifo(block, self._latency_blocks, self.fifo_depth)
-        check_feeds(self._setup.options.watchdog_timeout_s, sample_rate_hz / block)
+        check_feeds(self._options.watchdog_timeout_s, sample_rate_hz / block)
         facts = self._connect(extra_s=block / sample_rate_hz)
         self._check_board(facts, sample_rate_hz, block)
         self._try_out_safe_value()  # before the clock, which SAFE stops
@@ -201,6 +228,7 @@ class BoardStream(BoardDac):
         self._samples = block
         self._next_sample = 0
         self.fifo_level_min = prefill
+        self.transactions = 1
 
     def _exchange(
         self, first_sample: int, command: F64, displacement_um: F64, measured: F64

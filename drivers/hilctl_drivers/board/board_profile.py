@@ -81,6 +81,7 @@ class FrameProfile(BaseProfile):
     """
 
     DEVICE: ClassVar[str] = "serial_dac"
+    READER: ClassVar[str] = "hilctl_drivers.board.board_dac:BoardReader"
 
     link: FramesLink
     protocol: Literal["hilctl-1", "hilctl-2"] = Field(

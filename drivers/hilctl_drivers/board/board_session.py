@@ -15,6 +15,7 @@ from hilctl_drivers.board.board_profile import FrameChannel, FrameProfile
 from hilctl_drivers.transport.framing import CobsFraming, Framing, binary_framing
 from hilctl_drivers.transport.links import (
     BadRequestError,
+    CorruptError,
     IncompleteError,
     Link,
     MismatchError,
@@ -132,7 +133,8 @@ class BoardSession:
         self._seq = 0
         self.link = link
         self.outputs = BoardValues(next(iter(profile.outputs.values())))
-        self.inputs = BoardValues(next(iter(profile.inputs.values())))
+        # A board without an input sends a reading too, as its output is.
+        self.inputs = BoardValues(next(iter((profile.inputs or profile.outputs).values())))
 
     def ask(
         self, kind: int, body: bytes = b"", reply: Struct = _NO_FIELDS
@@ -145,6 +147,11 @@ class BoardSession:
             RefusedError: The board refused it; ``code`` is the status.
         """
         payload = self._framing.decode(self.link.transact(self._frame(kind, body), self._missing))
+        if payload.startswith(board.HEAD.pack(kind, self._seq)):
+            raise CorruptError(
+                "the request came back before the reply: the adapter echoes, or receives what it "
+                "sends; set echo: true beside the address"
+            )
         if len(payload) < board.REPLY_HEAD.size:
             raise MismatchError(f"reply of {len(payload)} bytes: {payload.hex(' ')}")
         found_kind, found_seq, status = board.REPLY_HEAD.unpack_from(payload)
@@ -166,10 +173,16 @@ class BoardSession:
         return self._framing.encode(board.HEAD.pack(kind, self._seq) + body)
 
     def facts(self) -> BoardFacts:
-        """Query the properties of the board."""
+        """Query the properties of the board; raise DeviceError for another protocol."""
         fields, name = self.ask(board.INFO, reply=board.INFO_REPLY)
         # Escaped: it goes to terminals, and a board may send anything.
-        return BoardFacts(ascii(name.decode("latin-1"))[1:-1] or "the board", *fields)
+        found = BoardFacts(ascii(name.decode("latin-1"))[1:-1] or "the board", *fields)
+        if found.version not in board.VERSIONS:
+            known = " or ".join(str(each) for each in board.VERSIONS)
+            raise DeviceError(
+                f"{found.name} speaks version {found.version} of the protocol, not {known}"
+            )
+        return found
 
     def state(self) -> BoardState | None:
         """Query output and input; None if the board does not know this message."""
@@ -185,6 +198,13 @@ class BoardSession:
         output, reading = self.outputs.decode(rest[:size]), self.inputs.decode(rest[size:])
         tripped = bool(flags & board.StateFlag.TRIPPED)
         return BoardState(tripped, float(output[0]), float(reading[0]))
+
+    def known_state(self) -> BoardState:
+        """Query output and input; raise DeviceError if the board does not know this message."""
+        state = self.state()
+        if state is None:
+            raise DeviceError("the board speaks version 1 of the protocol: no message only reads")
+        return state
 
     def exchange(self, value: F64) -> Readings:
         """Output float64[1] and return one reading."""

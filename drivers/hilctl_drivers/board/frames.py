@@ -102,6 +102,11 @@ def exchange_sizes(samples: int, value_bytes: int, *, stream: bool) -> tuple[int
     return HEAD.size + body, REPLY_HEAD.size + body + FIFO_TAIL.size
 
 
+def state_sizes(values_bytes: int) -> tuple[int, int]:
+    """Return payload bytes of a STATE request and of its reply with both values."""
+    return HEAD.size, REPLY_HEAD.size + STATE_REPLY.size + values_bytes
+
+
 def watchdog_sizes(value_bytes: int) -> tuple[int, int]:
     """Return payload bytes of a WATCHDOG request and of its reply."""
     return HEAD.size + WATCHDOG_FIELDS.size + value_bytes, REPLY_HEAD.size + WATCHDOG_FIELDS.size

@@ -27,11 +27,11 @@ class EmulatedBoard(EmulatedDevice):
 
     profile: FrameProfile
 
-    def __init__(self, profile: FrameProfile, bench: Bench) -> None:
+    def __init__(self, profile: FrameProfile, bench: Bench, output: str | None) -> None:
         self._name, self._range = next(iter(profile.outputs.items()))
-        super().__init__(profile, bench, self._name)
+        super().__init__(profile, bench, output)
         self._outputs = BoardValues(self._range)
-        self._inputs = BoardValues(next(iter(profile.inputs.values())))
+        self._inputs = BoardValues(next(iter((profile.inputs or profile.outputs).values())))
         streaming = profile.streaming
         self._streaming = streaming if isinstance(streaming, FrameStreaming) else None
         self.fifo = SampleFifo(self._rig.actuator, repeats=False, on_played=self._played)
@@ -55,7 +55,8 @@ class EmulatedBoard(EmulatedDevice):
         low, high = self._range.limits
         # The power-up value is 0 at the terminal, not at the actuator.
         self.fifo.command = self.wiring.command(min(max(0.0, low), high))
-        self._rig.put_out(self.fifo.command, 0)
+        if output is not None:
+            self._rig.put_out(self.fifo.command, 0)
 
     def _trip(self, due_ns: int) -> None:
         self.fifo.advance(due_ns)

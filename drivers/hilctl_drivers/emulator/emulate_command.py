@@ -19,15 +19,13 @@ from hilctl.base.types import CommandUnit
 from hilctl.base.yaml import Document, load_document
 from hilctl_drivers.emulator.factory import Emulator, build
 from hilctl_drivers.emulator.modbus_device import EmulatedModbus
-from hilctl_drivers.emulator.modbus_wire import LinkKind
-from hilctl_drivers.emulator.options import EmulatorOptions, ReaderLine, parse_fault
+from hilctl_drivers.emulator.options import EmulatorOptions, LinkKind, ReaderLine, parse_fault
 from hilctl_drivers.emulator.rig import ACTUATORS
 from hilctl_drivers.labjack.modbus_stream import ModbusStreamOptions
-from hilctl_drivers.modbus.config import ModbusReaderOptions
 from hilctl_drivers.modbus.modbus_profile import ModbusProfile
 from hilctl_drivers.profile import NamedProfile, load_profile, shipped_profiles
 from hilctl_drivers.serial_dac import SerialOptions
-from hilctl_drivers.signal_chain import DacOptions, ReaderOptions
+from hilctl_drivers.signal_chain import AddressOptions, DacOptions
 from hilctl_drivers.simulated.devices import SimulatedOptions
 
 _UNPRIVILEGED = 1024
@@ -80,14 +78,15 @@ def wired_experiment(
     unit = "A" if options.amplifier is None else options.amplifier.command_unit
     made = EmulatorOptions(
         profile=_found(options.profile, path.parent),
-        link=None if not hasattr(options, "host") else "rtu" if options.host is None else "tcp",
+        link=_link(options),
+        reader_link=None if reader is None else _link(reader),
         host=host or EmulatorOptions.host,
         port=port or _port(options),
         output=options.output,
         sensor=options.input,
         reader=_found(reader.profile, path.parent) if reader else None,
         reader_line=_line(reader),
-        reader_unit_id=reader.unit_id if isinstance(reader, ModbusReaderOptions) else None,
+        reader_unit_id=reader.unit_id if reader else None,
         reader_port=_port(reader),
         actuator=_actuator(unit, actuator),
         wiring=(options.amplifier, options.sensor),
@@ -108,13 +107,13 @@ def _found(named: NamedProfile, folder: Path) -> str:
     return str(folder / path) if path.suffix or len(path.parts) > 1 else named.name
 
 
-def _port(options: DacOptions | ReaderOptions | None) -> int:
+def _port(options: DacOptions | AddressOptions | None) -> int:
     """Return the TCP port of options if users may listen there; otherwise 0, for a free one."""
     given = getattr(options, "tcp_port", None) or 0
     return given if getattr(options, "host", None) in _HERE and given >= _UNPRIVILEGED else 0
 
 
-def _line(reader: ReaderOptions | None) -> Any:
+def _line(reader: AddressOptions | None) -> Any:
     if reader is None:
         return None
     apart = reader.serial_port is not None or getattr(reader, "host", None) is not None
@@ -134,6 +133,17 @@ def _actuator(unit: CommandUnit, settings: Sequence[str]) -> SimulatedOptions:
     if of_device:
         raise ConfigError(of_device)
     return document.validate(ACTUATORS[unit][0])
+
+
+def _link(options: AddressOptions) -> LinkKind | None:
+    """Return how to serve a device at an address; None at that of the other one."""
+    if options.serial_port is not None:
+        return "rtu"
+    if options.host is None:
+        return None
+    profile = options.profile.profile
+    framing = options.framing or next(iter(profile.framings), "tcp")
+    return "tcp" if framing == "tcp" else "rtu_tcp"
 
 
 def _differing(
@@ -156,7 +166,9 @@ def emulate(
             autocompletion=lambda: list(shipped_profiles()),
         ),
     ],
-    link: Annotated[str | None, typer.Option(help="tcp or rtu; default: from the profile.")] = None,
+    link: Annotated[
+        str | None, typer.Option(help="tcp, rtu or rtu_tcp; default: from the profile.")
+    ] = None,
     host: Annotated[str, typer.Option(help="Address to listen on.")] = EmulatorOptions.host,
     port: Annotated[
         int, typer.Option(min=0, max=65535, help="TCP port; 0 for any free port.")
@@ -176,7 +188,7 @@ def emulate(
     reader_line: Annotated[
         str | None,
         typer.Option(
-            help="Line of the reader: same or own; default: same for Modbus RTU, otherwise own."
+            help="Line of the reader: same or own; default: same for two Modbus RTU, otherwise own."
         ),
     ] = None,
     reader_unit_id: Annotated[int | None, typer.Option(help="Unit id of the reader.")] = None,

@@ -1,13 +1,13 @@
 """Factory of emulators: a device that drives the rig, and optionally another that reads it.
 
 Two Modbus devices share a line, or a gateway, by unit id, and two text devices a line by address;
-or each has a port of its own.
+or each has a port of its own, with any protocol.
 """
 
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Generic, NamedTuple, TypeAlias, TypeVar
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 from hilctl.base.errors import InputError
 from hilctl_drivers.ascii.ascii_profile import AsciiProfile
@@ -15,17 +15,16 @@ from hilctl_drivers.board.board_profile import FrameProfile
 from hilctl_drivers.emulator.board_device import EmulatedBoard
 from hilctl_drivers.emulator.modbus_device import EmulatedModbus
 from hilctl_drivers.emulator.modbus_wire import ModbusWire
-from hilctl_drivers.emulator.options import EmulatorOptions
+from hilctl_drivers.emulator.options import EmulatorOptions, LinkKind, ReaderLine
 from hilctl_drivers.emulator.rig import ACTUATORS, Bench, Rig, SimulatedWiring, WriteLog
 from hilctl_drivers.emulator.server import EmulatorServer
 from hilctl_drivers.emulator.text_device import EmulatedText
 from hilctl_drivers.emulator.wire import EmulatedLine, EmulatedWire, SerialProfile
 from hilctl_drivers.modbus.modbus_profile import ModbusProfile
 from hilctl_drivers.profile import load_profile
-from hilctl_drivers.profile_base import BaseProfile, Range
+from hilctl_drivers.profile_base import BaseProfile, Range, SerialLineSettings
 from hilctl_drivers.simulated.devices import PiezoOptions, PiezoStage, SimulatedDevice
 
-ProfileT = TypeVar("ProfileT", bound=BaseProfile)
 AnyDevice: TypeAlias = EmulatedModbus | EmulatedText | EmulatedBoard
 _DRIVE_V, _RANGE_UM = 100.0, 50.0  # of a piezo stage if no wiring is given
 
@@ -56,7 +55,7 @@ class Emulator:
 
 def build(options: EmulatorOptions, clock_ns: Callable[[], int] = time.monotonic_ns) -> Emulator:
     """Return an emulator with open ports and one clock; raise InputError for wrong options."""
-    plan = _plan(options)
+    plan = _Plan(options)
     now_ns = clock_ns()
     log = WriteLog(options.log, time.time_ns() - now_ns)
     server = EmulatorServer(options.faults, clock_ns)
@@ -88,34 +87,13 @@ def _opened(server: EmulatorServer, port: _Port, host: str) -> str:
     return server.listen_tcp(port.wire, host, port.tcp_port)
 
 
-def _plan(options: EmulatorOptions) -> "_ModbusPlan | _SerialPlan":
-    """Check the options against the profiles; nothing is opened or written."""
-    profile = load_profile(options.profile)
-    reader = profile if options.reader is None else load_profile(options.reader)
-    if isinstance(profile, ModbusProfile):
-        if not isinstance(reader, ModbusProfile):
-            raise InputError(f"{options.reader}: only Modbus profiles read for {profile.title}")
-        return _ModbusPlan(options, profile, reader)
-    given = (options.link, options.reader_unit_id, options.reader_port, options.command)
-    if given != (None, None, 0, None):
-        rule = "link, initial command and the reader's unit and port are for Modbus profiles"
-        raise InputError(f"{rule}, {options.profile} has a line of its own")
-    if isinstance(profile, FrameProfile):
-        if reader is not profile:
-            raise InputError(f"{profile.title} reads its own sensor: it takes no reader")
-        return _SerialPlan(options, profile, profile)
-    if not (isinstance(profile, AsciiProfile) and isinstance(reader, AsciiProfile)):
-        raise InputError(f"{options.reader}: only text profiles read for {profile.title}")
-    return _SerialPlan(options, profile, reader)
+class _Plan:
+    """The profiles, channels and links of options, and the wiring between them."""
 
-
-class _Plan(Generic[ProfileT]):
-    """The profiles and channels of options, and the wiring between them."""
-
-    reader_unit_id: int | None = None
-
-    def __init__(self, options: EmulatorOptions, profile: ProfileT, reader: ProfileT) -> None:
-        self._options, self._profile, self._reader = options, profile, reader
+    def __init__(self, options: EmulatorOptions) -> None:
+        self._options = options
+        self._profile = profile = load_profile(options.profile)
+        self._reader = reader = profile if options.reader is None else load_profile(options.reader)
         sensors = [
             name
             for name, each in reader.inputs.items()
@@ -127,12 +105,84 @@ class _Plan(Generic[ProfileT]):
         self.actuator, self.wiring = _rig(
             options, profile.outputs[self._output], reader.inputs[self._sensor]
         )
-        self._apart = reader is not profile
+        self._links = (
+            _Served.of(profile, options.link),
+            _Served.of(reader, options.reader_link or options.link),
+        )
+        self._apart = reader is not profile and not self._may_share(options.reader_line)
         """Whether the reader is on a wire of its own."""
-
-    def _refuse_resets(self) -> None:
-        if any(fault.kind == "reset" for fault in self._options.faults):
+        self.reader_unit_id = self._unit_of_reader()
+        if any(fault.kind == "reset" for fault in options.faults) and not all(
+            link.tcp for link in self._links
+        ):
             raise InputError("fault reset is for tcp: a serial line has no connection to break")
+
+    def _may_share(self, wanted: ReaderLine | None) -> bool:
+        """Return whether the reader is on the line of the device; raise InputError if it can't."""
+        profile, reader = self._profile, self._reader
+        alike = type(profile) is type(reader) and not isinstance(reader, FrameProfile)
+        if wanted == "same" and not alike:
+            raise InputError(f"{reader.title} can't share the line of {profile.title}: use own")
+        shares = wanted or ("same" if reader.link.kind == "rtu" else "own")
+        return alike and shares == "same" and self._links[0] == self._links[1]
+
+    def _unit_of_reader(self) -> int | None:
+        """Return the reader's unit id on Modbus; on the same line it must not be the other's."""
+        profile, reader, wanted = self._profile, self._reader, self._options.reader_unit_id
+        if not isinstance(reader, ModbusProfile):
+            if wanted is not None:
+                raise InputError(f"reader_unit_id is for Modbus, not for {reader.title}")
+            return None
+        if self._apart or not isinstance(profile, ModbusProfile) or reader is profile:
+            return reader.unit_id if wanted is None else wanted
+        if wanted == profile.unit_id:
+            raise InputError(f"reader_unit_id must not be {wanted}, that of {profile.title}")
+        return reader.unit_id + (reader.unit_id == profile.unit_id) if wanted is None else wanted
+
+    def devices(self, bench: Bench) -> tuple[AnyDevice, AnyDevice, list[_Port]]:
+        """Return the devices that drive and show the rig, and where they are served."""
+        reads_itself = self._reader is self._profile
+        device = reader = self._device(
+            self._profile, bench, self._output, self._sensor if reads_itself else None
+        )
+        if not reads_itself:
+            reader = self._device(self._reader, bench, None, self._sensor)
+        if reads_itself or self._apart:
+            ports = [self._port(0, {self._profile.usual_unit: device})]
+            if self._apart:
+                ports.append(self._port(1, {self.reader_unit_id: reader}))
+            return device, reader, ports
+        unit = self.reader_unit_id if self.reader_unit_id is not None else self._reader.usual_unit
+        return device, reader, [self._port(0, {unit: reader, self._profile.usual_unit: device})]
+
+    def _device(
+        self, profile: BaseProfile, bench: Bench, output: str | None, sensor: str | None
+    ) -> AnyDevice:
+        options = self._options
+        if isinstance(profile, ModbusProfile):
+            return EmulatedModbus(
+                profile, bench, output, sensor, options.command if output else None
+            )
+        if options.command is not None and output is not None:
+            raise InputError(f"initial command is for Modbus profiles, not for {profile.title}")
+        if isinstance(profile, FrameProfile):
+            return EmulatedBoard(profile, bench, output)
+        assert isinstance(profile, AsciiProfile)
+        return EmulatedText(profile, bench, output, sensor)
+
+    def _port(self, which: int, devices: dict[int | None, AnyDevice]) -> _Port:
+        options, link = self._options, self._links[which]
+        profile = (self._profile, self._reader)[which]
+        wire: EmulatedWire
+        if isinstance(profile, ModbusProfile):
+            units: Any = devices
+            wire = ModbusWire(link.framing, units, options.lacking, options.mute)
+        else:
+            assert isinstance(profile, SerialProfile)
+            members: Any = list(devices.values())[::-1]
+            wire = EmulatedLine(profile, members)
+        port = (options.port, options.reader_port)[which] if link.tcp else None
+        return _Port(wire, port, faulty=which == 0 or isinstance(profile, ModbusProfile))
 
     def channels(self) -> dict[str, Any]:
         """Return the part of a device section with profile, channels and wiring."""
@@ -150,12 +200,37 @@ class _Plan(Generic[ProfileT]):
 
     def places(self, addresses: list[str]) -> dict[str, Any]:
         """Return the part of a device section with the addresses of the devices."""
-        made = _place(addresses[0])
+        made = self._place(0, addresses[0])
         if self._reader is not self._profile:
             unit = {} if self.reader_unit_id is None else {"unit_id": self.reader_unit_id}
-            place = _place(addresses[1]) if self._apart else {}
+            place = self._place(1, addresses[1]) if self._apart else {}
             made["reader"] = {"profile": self._options.reader, **unit, **place}
         return made
+
+    def _place(self, which: int, address: str) -> dict[str, Any]:
+        if not self._links[which].tcp:
+            return {"serial_port": address}
+        host, _, port = address.rpartition(":")
+        usual = next(iter((self._profile, self._reader)[which].framings), "rtu")
+        framing = self._links[which].framing
+        framed = {} if framing == usual else {"framing": framing}
+        return {"host": host, "tcp_port": int(port), **framed}
+
+
+class _Served(NamedTuple):
+    """How a device is served: on a TCP port or a pty, and the frames of Modbus."""
+
+    tcp: bool
+    framing: Literal["tcp", "rtu"]
+
+    @classmethod
+    def of(cls, profile: BaseProfile, wanted: LinkKind | None) -> "_Served":
+        """Return what an option wants of a device, or what its profile says."""
+        if isinstance(profile, ModbusProfile):
+            kind = wanted or profile.link.kind
+            return cls(kind != "rtu", "tcp" if kind == "tcp" else "rtu")
+        on_line = isinstance(profile.link, SerialLineSettings)
+        return cls(wanted == "tcp" or not on_line, "rtu")
 
 
 def _rig(
@@ -181,78 +256,6 @@ def _rig(
             f"{wiring.command_unit}: use --unit {wiring.command_unit}"
         )
     return device, wiring
-
-
-def _place(address: str) -> dict[str, Any]:
-    host, _, port = address.rpartition(":")
-    return {"host": host, "tcp_port": int(port)} if host else {"serial_port": address}
-
-
-class _ModbusPlan(_Plan[ModbusProfile]):
-    def __init__(
-        self, options: EmulatorOptions, profile: ModbusProfile, reader: ModbusProfile
-    ) -> None:
-        super().__init__(options, profile, reader)
-        self._links = (options.link or profile.link.kind, options.link or reader.link.kind)
-        line = options.reader_line or ("own" if reader.link.kind == "tcp" else "same")
-        self._apart &= line == "own" or self._links[0] != self._links[1]
-        self.reader_unit_id = self._unit_of_reader()
-        if "rtu" in self._links:
-            self._refuse_resets()
-
-    def _unit_of_reader(self) -> int:
-        """Return the reader's unit id; on the same line it must not be the other's."""
-        profile, reader, wanted = self._profile, self._reader, self._options.reader_unit_id
-        if self._apart or reader is profile:
-            return reader.unit_id if wanted is None else wanted
-        if wanted == profile.unit_id:
-            raise InputError(f"reader_unit_id must not be {wanted}, that of {profile.title}")
-        return reader.unit_id + (reader.unit_id == profile.unit_id) if wanted is None else wanted
-
-    def devices(self, bench: Bench) -> tuple[AnyDevice, AnyDevice, list[_Port]]:
-        """Return the devices that drive and show the rig, and where they are served."""
-        options, output, sensor = self._options, self._output, self._sensor
-        reads_itself = self._reader is self._profile
-        device = reader = EmulatedModbus(
-            self._profile, bench, output, sensor if reads_itself else None, options.command
-        )  # fmt: skip
-        if not reads_itself:
-            reader = EmulatedModbus(self._reader, bench, None, sensor)
-        assert self.reader_unit_id is not None
-        own, other = {self._profile.unit_id: device}, {self.reader_unit_id: reader}
-        served = [(own, 0), (other, 1)] if self._apart else [(other | own, 0)]
-        return device, reader, [self._port(which, devices) for devices, which in served]
-
-    def _port(self, which: int, devices: dict[int, EmulatedModbus]) -> _Port:
-        options, link = self._options, self._links[which]
-        wire = ModbusWire(link, devices, options.lacking, options.mute)
-        return _Port(wire, (options.port, options.reader_port)[which] if link == "tcp" else None)
-
-
-class _SerialPlan(_Plan[SerialProfile]):
-    def __init__(
-        self, options: EmulatorOptions, profile: SerialProfile, reader: SerialProfile
-    ) -> None:
-        super().__init__(options, profile, reader)
-        self._refuse_resets()
-        self._apart &= options.reader_line != "same"
-
-    def devices(self, bench: Bench) -> tuple[AnyDevice, AnyDevice, list[_Port]]:
-        """Return the devices that drive and show the rig, and where they are served."""
-        profile, reader = self._profile, self._reader
-        if isinstance(profile, FrameProfile):
-            board = EmulatedBoard(profile, bench)
-            return board, board, [_Port(EmulatedLine(profile, [board]))]
-        assert isinstance(reader, AsciiProfile)
-        if reader is profile:
-            text = EmulatedText(profile, bench, self._output, self._sensor)
-            return text, text, [_Port(EmulatedLine(profile, [text]))]
-        drives = EmulatedText(profile, bench, self._output, None)
-        reads = EmulatedText(reader, bench, None, self._sensor)
-        if not self._apart:
-            return drives, reads, [_Port(EmulatedLine(profile, [drives, reads]))]
-        ports = [_Port(EmulatedLine(profile, [drives]))]
-        return drives, reads, [*ports, _Port(EmulatedLine(reader, [reads]), faulty=False)]
 
 
 def _chosen(what: str, name: str | None, names: list[str], profile: BaseProfile) -> str:

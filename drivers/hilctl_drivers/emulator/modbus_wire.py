@@ -7,7 +7,7 @@ faults into replies.
 
 import struct
 from collections.abc import Coroutine, Iterator, Mapping, Sequence
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal
 
 from pymodbus.constants import ExcCodes
 from pymodbus.exceptions import ModbusException
@@ -17,8 +17,6 @@ from pymodbus.pdu import DecodePDU, ExceptionResponse, ModbusPDU
 from hilctl_drivers.emulator.modbus_device import EmulatedModbus
 from hilctl_drivers.emulator.registers import RejectedRequest
 from hilctl_drivers.emulator.wire import EmulatedReply
-
-LinkKind: TypeAlias = Literal["tcp", "rtu"]
 
 _CORRUPT_AT = 3  # the protocol id (TCP), data (RTU)
 
@@ -120,7 +118,7 @@ class ModbusWire:
 
     def __init__(
         self,
-        kind: LinkKind,
+        kind: Literal["tcp", "rtu"],
         devices: Mapping[int, EmulatedModbus],
         lacking: frozenset[int] = frozenset(),
         mute: frozenset[int] = frozenset(),

@@ -7,9 +7,11 @@ from pathlib import Path
 from typing import Literal, TypeAlias, cast, get_args
 
 from hilctl.base.errors import InputError
-from hilctl_drivers.emulator.modbus_wire import LinkKind
 from hilctl_drivers.signal_chain import Amplifier, Sensor
 from hilctl_drivers.simulated.devices import SimulatedOptions, TerfenolOptions
+
+LinkKind: TypeAlias = Literal["tcp", "rtu", "rtu_tcp"]
+"""A TCP port, a pty, or a TCP port with frames of Modbus RTU."""
 
 FaultKind: TypeAlias = Literal[
     "silence", "delay", "late", "exception", "corrupt", "cut", "duplicate", "wrong_id", "reset",
@@ -88,10 +90,11 @@ ReaderLine: TypeAlias = Literal["same", "own"]
 
 @dataclass(frozen=True)
 class EmulatorOptions:
-    """What to emulate; link, initial command, functions, and reader unit and port: Modbus only."""
+    """What to emulate; initial command, functions, and unit of the reader: Modbus only."""
 
     profile: str  # name of a shipped profile, or path of one
-    link: LinkKind | None = None  # tcp, or rtu on a pty; the profile's own if None
+    link: LinkKind | None = None  # of both devices; the profiles' own if None
+    reader_link: LinkKind | None = None  # of the reader, if it differs
     host: str = "127.0.0.1"  # address to listen on
     port: int = 0  # TCP port to listen on; 0 for a free one
     log: Path | None = None  # file for a log of every write, one JSON object per line
@@ -112,7 +115,8 @@ class EmulatorOptions:
     command: float | None = None  # initial command, as if it was the power-up value
 
     def __post_init__(self) -> None:
-        for name, words in (("link", LinkKind), ("reader_line", ReaderLine)):
+        kinds = {"link": LinkKind, "reader_link": LinkKind, "reader_line": ReaderLine}
+        for name, words in kinds.items():
             given, known = getattr(self, name), get_args(words)
             if given is not None and given not in known:
                 raise InputError(f"{name} must be one of {', '.join(known)}, got {given!r}")

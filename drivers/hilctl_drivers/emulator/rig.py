@@ -33,8 +33,6 @@ ACTUATORS: dict[CommandUnit, tuple[type[SimulatedOptions], Callable[[Any], Simul
     "V": (PiezoOptions, SimulatedPiezo),
 }
 """Options and class of the actuator behind an emulated device, by the unit of its drive."""
-SUFFIX = {"V": "v", "mA": "ma"}
-"""Units of a channel in the keys of amplifier and sensor."""
 
 
 class Rig:
@@ -103,10 +101,10 @@ class SimulatedWiring(SignalChain):
         if output.unit != "A":
             unit = info.command_unit.lower()
             gain, offset = _spread(output, info.command_min, info.command_max)
-            keys = {f"gain_{unit}_per_{SUFFIX[output.unit]}": gain, f"offset_{unit}": offset}
+            keys = {f"gain_{unit}_per_{output.unit.lower()}": gain, f"offset_{unit}": offset}
             amplifier = Amplifier.model_validate(keys)
         gain, offset = _spread(sensor_input, info.sensor_min_um, info.sensor_max_um)
-        keys = {f"um_per_{SUFFIX[sensor_input.unit]}": gain, "offset_um": offset}
+        keys = {f"um_per_{sensor_input.unit.lower()}": gain, "offset_um": offset}
         return cls(output, sensor_input, amplifier, Sensor.model_validate(keys))
 
 

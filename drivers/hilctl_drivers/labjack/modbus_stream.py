@@ -9,7 +9,7 @@ which is the longest stall of this machine. The first sample is output once that
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -28,13 +28,13 @@ from hilctl_drivers.labjack.stream import (
     f32,
     u32,
 )
-from hilctl_drivers.modbus.config import ModbusEndpoint, ModbusOptions, ModbusSetup
+from hilctl_drivers.modbus.config import ModbusSetup, session_at
 from hilctl_drivers.modbus.modbus_dac import ModbusDevice
 from hilctl_drivers.modbus.modbus_profile import LabJackStreaming, ModbusProfile
 from hilctl_drivers.modbus.modbus_session import ModbusSession
 from hilctl_drivers.modbus.pdu import FeedbackFrame, ReadFrame, WriteFrame
 from hilctl_drivers.modbus.watchdog import Connect, ModbusSafeWrite
-from hilctl_drivers.signal_chain import FifoBlocks
+from hilctl_drivers.signal_chain import DacOptions, FifoBlocks
 from hilctl_drivers.transport.links import RefusedError
 from hilctl_drivers.transport.wire_time import RateLimit, WireTime
 
@@ -204,17 +204,19 @@ def _shortage(level: int) -> str:
     return f"only {level} values were left, too few to be sure that each was output in time"
 
 
-def stream_time(profile: ModbusProfile, block: int) -> WireTime:
-    """Return the time of a block: messages with its values, and one that waits for the clock.
+def stream_messages(block: int) -> int:
+    """Return the messages of a block: those with its values, and one that waits for the clock."""
+    return math.ceil(block / VALUES_MAX) + 1
 
-    Readings come back in the same messages, so that fetching the last of them is one more.
-    """
-    messages = math.ceil(block / VALUES_MAX) + 1
+
+def stream_time(profile: ModbusProfile, block: int) -> WireTime:
+    """Return the time of a block; readings come back in the messages that bring values."""
+    messages = stream_messages(block)
     what = f"{block} samples in {messages} messages over TCP"
     return WireTime(what, 0.0, 0.0, 0, 0.0, messages * profile.turnaround_s, block)
 
 
-class ModbusStreamOptions(ModbusOptions):
+class ModbusStreamOptions(DacOptions):
     """Options of ``modbus_stream``."""
 
     fifo_blocks: FifoBlocks = 8
@@ -242,7 +244,7 @@ class StreamSetup:
     def of(cls, options: ModbusStreamOptions) -> "StreamSetup":
         """Resolve options, or raise InputError if they do not fit, or the device cannot stream."""
         base = ModbusSetup.of(options)
-        profile = base.writer.profile
+        profile = base.profile
         streaming = profile.streaming
         if streaming == "none":
             raise InputError(f"{profile.title} can't stream: take kind: modbus_dac, and block: 1")
@@ -270,24 +272,16 @@ class StreamSetup:
         whose += " an output: its profile"
         if settle_s * most_hz > 1.0:
             most_hz, whose = 1.0 / settle_s, f"settling {settle_s * 1e3:.2f} ms: its profile"
-        wire = stream_time(self.base.writer.profile, block)
+        wire = stream_time(self.base.profile, block)
         return RateLimit.of(wire, most_hz, whose, self.streaming.rate_min_hz)
 
     def info(self) -> DeviceInfo:
         """Return the description of the device."""
-        found = self.base.info()
-        rates = self.rates(self.block_max)
         depth = self.streaming.fifo_depth
-        details = {
-            **found.details,
-            "fifo_depth": f"{depth} samples",
-            "fifo_level": f"{self.fifo_blocks} blocks",
-        }
-        return replace(
-            found,
-            name="modbus_stream",
-            max_rate_hz=rates.highest_hz,
-            rate_note=rates.note,
+        details = {"fifo_depth": f"{depth} samples", "fifo_level": f"{self.fifo_blocks} blocks"}
+        return self.base.described(
+            "modbus_stream",
+            self.rates(self.block_max),
             buffered=True,
             fifo_depth=depth,
             latency_blocks=self.fifo_blocks,
@@ -299,8 +293,8 @@ class StreamSafeWrite(ModbusSafeWrite):
     """Stops the stream and writes the output in one message; queued values are dropped."""
 
     def _put(self, session: ModbusSession, data: bytes) -> None:
-        feedback = ModbusFeedback(session.link, self._setup.writer.unit)
-        write = WriteFrame(self._setup.writer.profile.wire_address(self._setup.output), data)
+        feedback = ModbusFeedback(session.link, session.unit)
+        write = WriteFrame(self._setup.profile.wire_address(self._setup.output), data)
         # The stream first: it would write over the safe value with its next scan.
         try:
             feedback.call([WriteFrame(ENABLE, u32(0)), write])
@@ -309,8 +303,8 @@ class StreamSafeWrite(ModbusSafeWrite):
 
     def _held(self, session: ModbusSession) -> float:
         output = self._setup.output
-        feedback = ModbusFeedback(session.link, self._setup.writer.unit)
-        target = ReadFrame(self._setup.writer.profile.wire_address(output), output.words)
+        feedback = ModbusFeedback(session.link, session.unit)
+        target = ReadFrame(self._setup.profile.wire_address(output), output.words)
         running, held = feedback.call([ReadFrame(ENABLE, 2), target])
         if running != u32(0):
             raise DeviceError("the stream was stopped, but still runs")
@@ -325,7 +319,7 @@ class ModbusStream(ModbusDevice):
     def __init__(
         self,
         options: ModbusStreamOptions,
-        connect: Connect = ModbusEndpoint.session,
+        connect: Connect = session_at,
         sleep: Callable[[float], None] = time.sleep,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -363,25 +357,26 @@ class ModbusStream(ModbusDevice):
         """
         setup = self._streaming
         self._guard.plan(sample_rate_hz / block)
-        pair = self._connected()
-        stream = self._stream_on(pair.writer)
+        writer, _ = self._connected()
+        stream = self._stream_on(writer)
         stream.stop()  # also one of another program: a running stream accepts no settings
-        pair.run("init")
-        pair.writer.run(setup.streaming.setup)
+        writer.run(writer.profile.init)
+        writer.run(setup.streaming.setup)
         self._calibration = stream.calibration(setup.source // 2)
         stream.prepare(sample_rate_hz, setup.target, setup.source)
         check_fifo(block, setup.fifo_blocks, stream.capacity)
-        self._safe_write.try_out(pair.writer)
+        self._safe_write.try_out(writer)
         self._stream = stream
         self._next_sample = 0
+        self.transactions = stream_messages(block)
 
     def _stream_on(self, session: ModbusSession) -> StreamSession:
-        writer = self._setup.writer
+        setup = self._setup
         return StreamSession(
-            ModbusFeedback(session.link, writer.unit),
+            ModbusFeedback(session.link, session.unit),
             self._streaming.streaming,
-            writer.timeout_s,
-            writer.profile.turnaround_s,
+            setup.options.timeout_s,
+            setup.profile.turnaround_s,
             self._sleep,
             self._clock,
         )
@@ -399,8 +394,8 @@ class ModbusStream(ModbusDevice):
         stream.feed(self._chain.output(command))
         self._next_sample += command.size
         readings = self._readings(stream, command.size)
-        if self._guard.feed_every and self._pair is not None:
-            self._guard.feed(self._pair.writer)
+        if self._guard.feed_every and self._writer is not None:
+            self._guard.feed(self._writer)
         if readings is not None:
             self._chain.fill_um(readings, displacement_um)
 

@@ -8,5 +8,5 @@ modbus_session.py     session, exchange times, prepared requests
 pdu.py                messages
 """
 
-LINK_KINDS = dict.fromkeys(("tcp", "rtu"), f"{__name__}.modbus_profile:ModbusProfile")
+LINK_KINDS = dict.fromkeys(("tcp", "rtu", "rtu_tcp"), f"{__name__}.modbus_profile:ModbusProfile")
 """Class of profiles per ``link.kind``."""

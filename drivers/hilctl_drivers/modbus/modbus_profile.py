@@ -22,6 +22,7 @@ from hilctl_drivers.profile_base import (
     BinaryLineSettings,
     LinkSettings,
     Name,
+    StreamSettings,
     Watchdog,
 )
 
@@ -74,15 +75,28 @@ FAST_GAP_S = 1.75e-3
 """Silence between RTU frames above 19200 baud (Modbus over serial line 1.02, section 2.5.1.1)."""
 
 
+MODBUS_PORT = 502
+"""TCP port that is registered for Modbus."""
+
+
 class ModbusTcpLink(LinkSettings):
     """Modbus TCP."""
 
     kind: Literal["tcp"]
-    port: int = Field(default=502, ge=1, le=65535, description="TCP port")
+    port: int = Field(default=MODBUS_PORT, ge=1, le=65535, description="TCP port")
+
+
+class ModbusRtuTcpLink(StreamSettings):
+    """Frames of Modbus RTU on a TCP connection."""
+
+    kind: Literal["rtu_tcp"]
+    port: int = Field(default=MODBUS_PORT, ge=1, le=65535, description="TCP port")
 
 
 class ModbusRtuLink(BinaryLineSettings):
     """Modbus RTU."""
+
+    port: ClassVar[int] = MODBUS_PORT  # of a gateway or a serial server
 
     kind: Literal["rtu"]
     bytesize: Literal[8] = Field(default=8, description="data bits per character")
@@ -201,10 +215,11 @@ class ModbusProfile(BaseProfile):
     """A Modbus device."""
 
     DEVICE: ClassVar[str] = "modbus_dac"
+    READER: ClassVar[str] = "hilctl_drivers.modbus.config:ModbusReader"
 
-    link: Annotated[ModbusTcpLink | ModbusRtuLink, Field(discriminator="kind")] = Field(
-        description="connection to the device"
-    )
+    link: Annotated[
+        ModbusTcpLink | ModbusRtuTcpLink | ModbusRtuLink, Field(discriminator="kind")
+    ] = Field(description="connection to the device")
     unit_id: int = Field(default=1, ge=0, le=255, description="unit id as shipped")
     address_base: AddressBase = Field(description="address_base of registers without their own")
     exchange: Literal[23, 76, "none"] = Field(
@@ -271,6 +286,18 @@ class ModbusProfile(BaseProfile):
             if unknown:
                 raise ValueError(f"watchdog.safe.{min(unknown)} must be one of the outputs")
         return self
+
+    @property
+    def usual_unit(self) -> int:
+        """See :attr:`~hilctl_drivers.profile_base.BaseProfile.usual_unit`."""
+        return self.unit_id
+
+    @property
+    def framings(self) -> tuple[Literal["tcp", "rtu"], ...]:
+        """See :attr:`~hilctl_drivers.profile_base.BaseProfile.framings`."""
+        if self.link.kind == "rtu":  # behind a gateway, or a serial server that passes bytes on
+            return "tcp", "rtu"
+        return ("tcp",) if self.link.kind == "tcp" else ("rtu",)
 
     def registers(self) -> Iterator[tuple[str, Register]]:
         """Yield every register with its dotted key."""

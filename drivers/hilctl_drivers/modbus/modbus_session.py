@@ -16,7 +16,6 @@ from hilctl_drivers.modbus.modbus_profile import (
     ModbusInput,
     ModbusOutput,
     ModbusProfile,
-    ModbusRtuLink,
 )
 from hilctl_drivers.modbus.pdu import (
     FEEDBACK,
@@ -182,7 +181,7 @@ class RtuTransaction(Transaction):
         if adu[: len(self._last)] == self._last and not self._echo:
             raise CorruptError(
                 "the request came back before the reply: the adapter echoes, or receives what it "
-                "sends; switch its local echo off"
+                "sends; set echo: true beside the address"
             )
         missing = self.missing(adu)
         if missing:
@@ -244,15 +243,15 @@ class ModbusSession:
     ) -> None:
         self.profile = profile
         self.link = link
-        self._framing = framing or profile.link.kind
-        self._unit = unit
+        self._framing = framing or ("tcp" if profile.link.kind == "tcp" else "rtu")
+        self.unit = unit
         self._sleep = sleep
 
     def prepare(self, pdu: bytes) -> Transaction:
         """Return a request that can be sent many times."""
         if self._framing == "tcp":
-            return TcpTransaction(self._unit, pdu)
-        return RtuTransaction(self._unit, pdu)
+            return TcpTransaction(self.unit, pdu)
+        return RtuTransaction(self.unit, pdu)
 
     def call(self, transaction: Transaction, data: bytes = b"") -> bytes:
         """Send a prepared request with register bytes to write; return those that were read."""
@@ -380,13 +379,11 @@ def _requests_time(
     what = "+".join(f"FC{pdu[0]:02d}" for pdu in requests)
     turnaround_s = len(requests) * profile.turnaround_s
     link = profile.link
-    if not isinstance(link, ModbusRtuLink):
-        return WireTime(f"{what} over TCP", 0.0, 0.0, 0, 0.0, turnaround_s, settle_s=settle_s)
     sent = sum(len(rtu_adu(1, pdu)) for pdu in requests)
     received = sum(reply_size(pdu) + 3 for pdu in requests)  # unit and CRC
-    gaps = 2 * len(requests)
+    gaps = 2 * len(requests) if link.silence_s else 0
     return WireTime(
-        f"{what} at {link.format}",
+        f"{what} {link.medium}",
         sent * link.char_s,
         received * link.char_s,
         gaps,

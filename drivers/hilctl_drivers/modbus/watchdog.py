@@ -5,13 +5,14 @@ from contextlib import suppress
 from typing import TypeAlias
 
 from hilctl.base.errors import DeviceError, UnconfirmedError
-from hilctl_drivers.modbus.config import ModbusEndpoint, ModbusSetup
+from hilctl_drivers.endpoint import Endpoint
+from hilctl_drivers.modbus.config import ModbusSetup
 from hilctl_drivers.modbus.modbus_profile import ModbusWatchdog
 from hilctl_drivers.modbus.modbus_session import ModbusSession, write_request
 from hilctl_drivers.modbus.register_map import ModbusStep, RegisterStep
 from hilctl_drivers.transport.links import RefusedError
 from hilctl_drivers.transport.safe_exchange import SafeExchange, check_read_back, try_out
-from hilctl_drivers.transport.serial_port import SerialLink
+from hilctl_drivers.transport.stream_link import StreamLink
 from hilctl_drivers.transport.wire_time import check_feeds
 
 
@@ -21,7 +22,7 @@ class ModbusWatchdogDriver:
     def __init__(self, setup: ModbusSetup) -> None:
         self._setup = setup
         self._wanted = setup.options.watchdog
-        self._has = setup.writer.profile.watchdog
+        self._has = setup.profile.watchdog
         self._ticks = 0
         self.feed_every = 0
         """Ticks from one feeding to the next; 0 if exchanges feed it."""
@@ -128,7 +129,7 @@ class ModbusWatchdogDriver:
         return has.bound(steps, self._setup.output, self._wanted.timeout_s, safe)
 
 
-Connect: TypeAlias = Callable[[ModbusEndpoint], ModbusSession]
+Connect: TypeAlias = Callable[[Endpoint], ModbusSession]
 """Makes a session on a new link."""
 
 
@@ -142,15 +143,13 @@ class ModbusSafeWrite:
         self._exchange = SafeExchange()
         self._session: ModbusSession | None = None
 
-    def attempt(
-        self, peer: ModbusEndpoint, value: float, opened: ModbusSession | None = None
-    ) -> None:
+    def attempt(self, peer: Endpoint, value: float, opened: ModbusSession | None = None) -> None:
         """Write the output and have the device confirm it; the link is closed afterwards.
 
         Args:
             peer: The device; best with a numeric address, which needs no name server.
             value: In the output's unit.
-            opened: A session on an open serial line; None to open a connection.
+            opened: A session on an open line without framing; None to open a connection.
         """
         if opened is None and self._session is not None:
             opened = self._session  # which knows whether answers are outstanding on the line
@@ -158,7 +157,7 @@ class ModbusSafeWrite:
         link = session.link
         try:
             # No self-test, no init steps, no reader: none of them may cost the safe value.
-            if isinstance(link, SerialLink):
+            if isinstance(link, StreamLink):
                 self._session = session
                 self._exchange.attempt(
                     link,

@@ -33,7 +33,7 @@ _READS = 3
 class PageSlot(IntEnum):
     """Texts of loop and guardian for the supervisor."""
 
-    SET_UP = 0  # real-time set-up of the loop: JSON of all steps, and of refused required steps
+    SET_UP = 0  # set-up of the loop: JSON of all steps and of facts on the device, refused steps
     OUTCOME = 1  # outcome of the run: JSON of :class:`hilctl.loop.safe_output.LoopOutcome`
     ERROR = 2  # why the loop failed
     GUARDIAN = 3  # result of the guardian: JSON of :class:`SafeActionResult`, or why it failed

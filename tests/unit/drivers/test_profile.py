@@ -88,6 +88,8 @@ WATCHDOG = {
     "arm": [{"kind": "write", "address": 9, "type": "uint16", "value": "timeout"}],
 }  # fmt: skip
 
+KINDS = "link.kind: must be one of ascii, ascii_tcp, frames, rtu, rtu_tcp, tcp"
+
 BROKEN: list[tuple[str, dict[str, Any], str]] = [
     ("modbus", {"vendor": None}, "vendor: is required"),
     ("modbus", {"vendor": ""}, "vendor: string should have at least 1 character, got ''"),
@@ -101,8 +103,8 @@ BROKEN: list[tuple[str, dict[str, Any], str]] = [
     ("modbus", {"outputs": {}, "exchange": 76}, "exchange must be none if there are no outputs"),
     ("modbus", {"inputs": {}, "exchange": 23}, "exchange must be none if there are no outputs"),
     ("modbus", {"outputs": {}, "watchdog": WATCHDOG}, "watchdog must be none if there are no"),
-    ("modbus", {"link.kind": "udp"}, "link.kind: must be one of ascii, frames, rtu, tcp, got"),
-    ("modbus", {"link": None}, "link.kind: must be one of ascii, frames, rtu, tcp, got nothing"),
+    ("modbus", {"link.kind": "udp"}, f"{KINDS}, got"),
+    ("modbus", {"link": None}, f"{KINDS}, got nothing"),
     ("modbus", {"link.parity": "X"}, "link.parity: must be one of 'N', 'E' or 'O', got 'X'"),
     ("modbus", {"link.baud": 9600.5}, "link.baud: must be a whole number, got 9600.5"),
     ("modbus", {"link.gap_s": -1.0}, "link.gap_s: must be >= 0.0, got -1.0"),

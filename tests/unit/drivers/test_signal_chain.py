@@ -16,6 +16,7 @@ def asked(has, offset_a=0.0, **wanted):
     options = DacOptions.model_validate(
         {
             "profile": "generic_float32",
+            "host": "h",
             "output": "B",
             "input": "I",
             "amplifier": {"gain_a_per_v": 2.0, "offset_a": offset_a},

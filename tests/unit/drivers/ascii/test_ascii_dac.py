@@ -1,4 +1,4 @@
-"""Text devices behind ``serial_dac``: whose line a reader may share, and what measures the output.
+"""Text devices behind ``serial_dac``: what measures the output, and what a watchdog costs.
 
 Exchanges over a line are in ``tests/unit/drivers/test_serial_dac.py``.
 """
@@ -22,21 +22,6 @@ OPTIONS = {
 
 def device(**options):
     return AsciiDac(SerialOptions.model_validate({**OPTIONS, **options}))
-
-
-def test_a_reader_that_speaks_otherwise_needs_a_line_of_its_own(tmp_path):
-    text = Path(DCON).read_text().replace("checksum: dcon", "checksum: none")
-    (tmp_path / "plain.yaml").write_text(text)
-    reader = {"profile": str(tmp_path / "plain.yaml"), "unit_id": 3}
-    with pytest.raises(InputError, match=r"share the line.*reader\.serial_port"):
-        device(reader=reader)
-    assert device(reader={**reader, "serial_port": "/dev/y"}).block_max == 1
-
-
-def test_a_board_is_no_reader_of_text():
-    reader = {"profile": "cobs_board", "serial_port": "/dev/y"}
-    with pytest.raises(InputError, match="reader is for"):
-        device(reader=reader, input="ADC")
 
 
 def test_what_measures_the_output_is_an_input_that_says_so():

@@ -12,6 +12,7 @@ from hilctl_drivers.profile import load_profile
 from hilctl_drivers.transport.framing import binary_framing
 from hilctl_drivers.transport.links import (
     BadRequestError,
+    CorruptError,
     MismatchError,
     RefusedError,
     WatchdogTrippedError,
@@ -53,6 +54,13 @@ def answer(status=0, body=b"", kind=None, seq=None):
         return bytes([first, asked[1] if seq is None else seq, status]) + body
 
     return make
+
+
+def test_an_echo_is_named(board):
+    board.link.make = lambda payload: payload
+    for ask in (board.facts, board.state):
+        with pytest.raises(CorruptError, match="echo: true"):
+            ask()
 
 
 def test_an_exchange_byte_by_byte(board):

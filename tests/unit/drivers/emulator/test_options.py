@@ -13,7 +13,7 @@ from hilctl_drivers.emulator.options import (
 
 
 @pytest.mark.parametrize(("options", "words"), [
-    ({"link": "pigeon"}, "link must be one of tcp, rtu, got 'pigeon'"),
+    ({"link": "pigeon"}, "link must be one of tcp, rtu, rtu_tcp, got 'pigeon'"),
     ({"reader_line": "other"}, "reader_line must be one of same, own, got 'other'"),
 ])  # fmt: skip
 def test_words_that_mean_nothing_are_refused(options, words):

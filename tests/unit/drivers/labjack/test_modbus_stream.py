@@ -18,6 +18,7 @@ from hilctl_drivers.labjack.modbus_stream import (
     stream_time,
 )
 from hilctl_drivers.labjack.stream import VALUES_MAX
+from hilctl_drivers.modbus.config import session_at
 from hilctl_drivers.modbus.pdu import WriteFrame
 from hilctl_drivers.profile import load_profile
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
@@ -46,7 +47,7 @@ class DrivenStream:
         self._log = log
         self.device = ModbusStream(
             chosen,
-            connect=lambda peer: peer.session(emulated.link),
+            connect=lambda peer: session_at(peer, emulated.link),
             sleep=emulated.time.sleep,
             clock=emulated.time,
         )
@@ -383,7 +384,7 @@ def test_safe_is_a_stopped_stream_and_an_output_that_holds(
     answer = SimpleNamespace(call=lambda frames: [stream.u32(running), encoded])
     monkeypatch.setattr("hilctl_drivers.labjack.modbus_stream.ModbusFeedback", lambda *_: answer)
     with nullcontext() if holds else pytest.raises(DeviceError):
-        safe_write._write(SimpleNamespace(link=None), 1.0)
+        safe_write._write(SimpleNamespace(link=None, unit=1), 1.0)
 
 
 @pytest.mark.parametrize(("changes", "text"), [

@@ -103,7 +103,7 @@ class TestPlaces:
         ours = {"serial_port": str(tmp_path / "port")}
         theirs = {**READS, "serial_port": str(tmp_path / "by-id")}
         assert made(**ours, reader=theirs).info.holds == (f"serial:{tmp_path / 'port'}",)
-        with pytest.raises(InputError, match="both be unit"):
+        with pytest.raises(InputError, match="both are unit"):
             made(**ours, reader={**theirs, "unit_id": 1})
 
     def test_what_it_is_is_kept(self):

@@ -29,13 +29,13 @@ def made(**changes):
 
 class TestOptions:
     @pytest.mark.parametrize(("changes", "words"), [
-        ({"serial_port": "/dev/x"}, "either host or serial_port"),
+        ({"serial_port": "/dev/x"}, "one of host and serial_port"),
         ({"host": None}, "either host or serial_port"),
-        ({"host": None, "serial_port": "/dev/x", "tcp_port": 502}, "tcp_port goes with host"),
+        ({"host": None, "serial_port": "/dev/x", "tcp_port": 502}, "must go with host"),
         ({"reader": {"unit_id": 2}}, "Field required"),
         ({"reader": {**READER, "host": "r", "serial_port": "/dev/r"}}, "one of host and"),
-        ({"reader": {**READER, "tcp_port": 502}}, "tcp_port goes with host"),
-        ({"reader": {**READER, "baud": 9600}}, "baud goes with serial_port"),
+        ({"reader": {**READER, "tcp_port": 502}}, "must go with host"),
+        ({"reader": {**READER, "baud": 9600}}, "must go with serial_port"),
         ({"profile": "nothing"}, "no profile 'nothing' is shipped"),
         ({"reader": {"profile": "nothing"}}, "no profile 'nothing' is shipped"),
         ({"profile": 7}, "valid string"),
@@ -59,15 +59,15 @@ class TestOptions:
         ({"amplifier": {"gain_a_per_ma": 1.0}}, "amplifier takes mA"),
         ({"sensor": {"um_per_ma": 1.0}}, "sensor gives mA"),
         ({"profile": "kepco_bop"}, "kepco_bop"),
-        ({"host": None, "serial_port": "/dev/x"}, "is for Modbus tcp: give host"),
+        ({"host": None, "serial_port": "/dev/x"}, "is for TCP: give host"),
         ({"watchdog": {"timeout_s": 1.0}, "output": "TDAC0"}, "does nothing for TDAC0"),
         ({"timeout_s": 1e-4}, "timeout_s must be > 0.001"),
         ({"baud": 9600, "parity": "E"}, "baud, parity must be omitted"),
         ({**READS, "input": "AI9"}, "input must be one that Advantech ADAM-6217 has"),
-        ({"reader": {"profile": "adam_6217"}, "input": "AI0"}, "both be unit 1 at h:502"),
-        ({**READS, "reader": {"profile": "kepco_bop"}}, "kepco_bop"),
+        ({"reader": {"profile": "adam_6217"}, "input": "AI0"}, "both are unit 1"),
+        ({**READS, "reader": {"profile": "kepco_bop"}}, "another protocol"),
         ({**READS, "output": "AI0", "profile": "adam_6217"}, "output must be one that"),
-        ({**READS, "reader": {**READER, "serial_port": "/dev/r"}}, "tcp: give reader.host"),
+        ({**READS, "reader": {**READER, "serial_port": "/dev/r"}}, "TCP: give reader.host"),
     ])  # fmt: skip
     def test_options_that_do_not_go_with_the_profile(self, changes, words):
         with pytest.raises(InputError, match=words):

@@ -169,6 +169,20 @@ class TestReader:
         other.open(5.0, 1)
         other.close()
 
+    def test_the_safe_value_does_not_wait_for_the_reader(self, serve):
+        served = serve("adam_6224", "agilent_34970a")
+        device = served.running(5.0)
+        exchange(device, 1.0)
+        reader, released = device._reader, []
+        served.emulator.wires[1].devices = []
+        reader._link.timeout_s = 0.2
+        reader.release = lambda: released.append(served.events()[-1]["current_a"])
+        with pytest.raises(DeviceError, match="reader agilent_34970a"):
+            exchange(device, 1.0)
+        assert released == []
+        device.make_safe(-1.0)
+        assert released == [pytest.approx(-1.0, abs=1e-3)]
+
     def test_no_reader_there_moves_nothing(self, serve):
         served = serve("adam_6224", "adam_6217")
         said = r"reader adam_6217, unit 1 at 127\.0\.0\.1:1: can't connect: .* \(to open\)"

@@ -4,7 +4,7 @@ import pytest
 
 from hilctl.base.errors import DeviceError
 from hilctl_drivers.emulator.options import EmulatorOptions
-from hilctl_drivers.modbus.config import ModbusOptions
+from hilctl_drivers.modbus.config import ModbusOptions, session_at
 from hilctl_drivers.modbus.modbus_dac import ModbusDac
 from tests.fakes import emulated, made_safe
 from tests.unit.drivers.modbus.conftest import MESSAGE_S, RATE_HZ, exchange
@@ -256,7 +256,7 @@ def test_no_name_is_looked_up_for_it():
 
         def connect(peer):
             hosts.append(peer.host)
-            return peer.session()
+            return session_at(peer)
 
         options = ModbusOptions.model_validate(
             {**served.options, "host": "localhost", "timeout_s": 20.0}

@@ -1,0 +1,208 @@
+"""A DAC's options resolved against the profiles, and the session that reads its sensor.
+
+The sensor is read by the device with the output or by another one, the reader, of any protocol. The
+reader has a link of its own, or shares the line or connection of the output.
+"""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
+from pkgutil import resolve_name
+from typing import Any, Self, cast
+
+from hilctl.base.device import DeviceInfo
+from hilctl.base.errors import InputError
+from hilctl_drivers.endpoint import Endpoint, reader_of
+from hilctl_drivers.profile_base import Range
+from hilctl_drivers.signal_chain import DacOptions, SignalChain, channel, check_watchdog
+from hilctl_drivers.transport.links import Link, naming
+from hilctl_drivers.transport.wire_time import RateLimit, WireTime
+
+
+@dataclass(frozen=True, slots=True)
+class DacSetup:
+    """An experiment's options, resolved against the profiles.
+
+    Attributes:
+        options: The options.
+        writer: The device that has the output.
+        reader: The device that has the input; the same object if it is the same device.
+        output: The output in use.
+        input: The input in use.
+        chain: Amplifier and sensor.
+    """
+
+    options: DacOptions
+    writer: Endpoint
+    reader: Endpoint
+    output: Range
+    input: Range
+    chain: SignalChain
+
+    @classmethod
+    def of(cls, options: DacOptions) -> Self:
+        """Resolve options, or raise InputError if they do not fit their profiles."""
+        writer = Endpoint.of(options, options.timeout_s)
+        reader = reader_of(options, writer)
+        there, here = reader.profile, writer.profile
+        output = channel("output", options.output, here.outputs, here.title)
+        sensor_input = channel("input", options.input, there.inputs, there.title)
+        chain = SignalChain(output, sensor_input, options.amplifier, options.sensor)
+        check_watchdog(here.title, options, output, chain, here.watchdog)
+        setup = cls(options, writer, reader, output, sensor_input, chain)
+        if setup.reads_elsewhere:
+            setup.check_timeout(setup.read_time)
+        return setup
+
+    @property
+    def reads_elsewhere(self) -> bool:
+        """Whether another device has the input."""
+        return self.reader is not self.writer
+
+    @property
+    def shares_link(self) -> bool:
+        """Whether both devices are on one line or connection."""
+        return not set(self.reader.holds).isdisjoint(self.writer.holds)
+
+    @property
+    def reader_name(self) -> str:
+        """Name of the reader in messages; empty if it is the device with the output."""
+        return f"reader {self.reader.name}{self._reader_place}" if self.reads_elsewhere else ""
+
+    @property
+    def _reader_place(self) -> str:
+        unit = "" if self.reader.unit is None else f", unit {self.reader.unit}"
+        return f"{unit} at {self.reader.place}"
+
+    @property
+    def read_time(self) -> WireTime:
+        """Time of reading the input alone."""
+        return self._reader_class.time(self.reader.profile, self.input)
+
+    def reader_on(self, link: Link) -> "SensorReader":
+        """Return the session that reads the sensor; it uses the output's link if it shares it."""
+        return self._reader_class(self, link)
+
+    @property
+    def _reader_class(self) -> "type[SensorReader]":
+        return cast("type[SensorReader]", resolve_name(self.reader.profile.READER))
+
+    def check_timeout(self, wire: WireTime) -> None:
+        """Raise InputError if an answer cannot come within the timeout."""
+        timeout_s = self.options.timeout_s
+        if timeout_s <= wire.answered_s:
+            raise InputError(f"timeout_s must be > {wire.answered_s:g}, got {timeout_s:g} ({wire})")
+
+    def after_reading(self, wire: WireTime) -> WireTime:
+        """Return the time of a sample that ``wire`` writes, and that the reader reads before."""
+        if not self.reads_elsewhere:
+            return wire
+        read = self.read_time
+        both = read.then(wire)
+        if self.shares_link:
+            return both
+        # Of two links, one is silent before its next request while the other is at work.
+        silent_s = (
+            min(self.reader.profile.link.silence_s, wire.total_s),
+            min(self.writer.profile.link.silence_s, read.total_s),
+        )
+        gaps = both.gaps - sum(each > 0.0 for each in silent_s)
+        return replace(both, gaps=gaps, gaps_s=both.gaps_s - sum(silent_s))
+
+    def rates(self, wire: WireTime, lowest_hz: float = 0.0, settle_s: float = 0.0) -> RateLimit:
+        """Return the sample rates that a sample's time and the devices allow.
+
+        ``settle_s`` is the settling time of a device that is not part of ``wire``.
+        """
+        slowest = min((self.writer, self.reader), key=lambda each: each.profile.max_rate_hz)
+        most_hz, whose = slowest.profile.max_rate_hz, f"profile {slowest.name}"
+        if settle_s * most_hz > 1.0:
+            most_hz, whose = 1.0 / settle_s, f"settling {1e3 * settle_s:.2f} ms: {whose}"
+        return RateLimit.of(wire, most_hz, whose, lowest_hz)
+
+    def info(self, kind: str, rates: RateLimit, **more: Any) -> DeviceInfo:
+        """Return the description of a device of this kind; ``more`` depends on the protocol."""
+        options, writer, reader = self.options, self.writer, self.reader
+        description = f"{writer.profile.title} at {writer.place}: {options.output}"
+        details = writer.profile.provenance()
+        details |= {"link": writer.profile.link.model_dump_json(), **options.details()}
+        details |= more.pop("details", {})
+        if self.reads_elsewhere:
+            description += f"; {reader.profile.title}{self._reader_place}"
+            details |= reader.profile.provenance("reader_")
+            details["reader_link"] = reader.profile.link.model_dump_json()
+        description += f"{':' if self.reads_elsewhere else ','} {options.input}"
+        return self.chain.info(
+            kind,
+            options,
+            rates,
+            description=description,
+            holds=tuple(dict.fromkeys(writer.holds + reader.holds)),
+            details=details,
+            **more,
+        )
+
+
+class SensorReader(ABC):
+    """Session with the device that has the input; each protocol has one.
+
+    If it is another device than the output's, its errors name it, and it is identified, set up and
+    finished here. It has a link of its own, or shares that of the output.
+    """
+
+    def __init__(self, setup: DacSetup, link: Link) -> None:
+        """Take the output's link; nothing is sent before :meth:`open`."""
+        self._name = setup.reader_name
+        self._own = None
+        if setup.reads_elsewhere and not setup.shares_link:
+            self._own = setup.reader.link()
+        self._link: Link = self._own or link
+
+    @staticmethod
+    @abstractmethod
+    def time(profile: Any, source: Any) -> WireTime:
+        """Return the time of reading an input."""
+
+    def open(self) -> None:
+        """Connect and identify the device."""
+        with naming(self._name):
+            if self._own is not None:
+                self._own.open()
+            if self._name:
+                self._identify()
+
+    def begin(self) -> None:
+        """Run the init steps, and read once: a wrong input must show before the output moves."""
+        with naming(self._name):
+            if self._name:
+                self._set_up()
+            self._read()
+
+    def read(self) -> float:
+        """Return the value of the input in its unit."""
+        with naming(self._name):
+            return self._read()
+
+    def end(self) -> None:
+        """Run the close steps."""
+        if self._name:
+            with naming(self._name):
+                self._finish()
+
+    def release(self) -> None:
+        """Close its own link."""
+        if self._own is not None:
+            self._own.close()
+
+    @abstractmethod
+    def _identify(self) -> None:
+        """Raise DeviceError if it is another device."""
+
+    def _set_up(self) -> None:  # noqa: B027  a board has no steps
+        """Run the init steps."""
+
+    @abstractmethod
+    def _read(self) -> float:
+        """Return the value of the input in its unit."""
+
+    def _finish(self) -> None:  # noqa: B027  a board has no steps
+        """Run the close steps."""
