@@ -198,6 +198,20 @@ def test_a_reader_that_fails_is_named(rig):
         exchange_until_it_fails(bench, 0.0)
 
 
+def test_a_lost_sensor_is_not_waited_for(rig):
+    """The safe value uses the link of the output only."""
+    bench = rig("kepco_bop", reader="labjack_t7", own_line=True, timeout_s=SILENCE_S)
+    bench.open()
+    bench.exchange(2.0)
+    asked, wire = [], bench.emulator.wires[1]
+    wire.answer = lambda request, now_ns: asked.append(request)
+    with pytest.raises(DeviceError, match=r"reader labjack_t7, unit 1 at .*: no answer"):
+        bench.exchange(2.0)
+    bench.device.make_safe(-1.0)
+    assert bench.current_a() == -1.0
+    assert len(asked) == 1
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("fault", ["silence", "corrupt", "duplicate", "wrong_id"])

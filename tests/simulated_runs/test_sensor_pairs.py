@@ -1,0 +1,100 @@
+"""Output and sensor on devices of different protocols, over every kind of link, sample by sample.
+
+The emulator's time stands still during an exchange, so each reading is known.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilctl.experiment.devices import device_class
+from hilctl_drivers.emulator.options import EmulatorOptions
+from hilctl_drivers.profile import load_profile, shipped_profiles
+from tests.fakes import ManualClock, emulated, logged
+
+SAMPLES = 2000
+PATIENT_S = 10.0
+RTU = {"adam_4024", "adam_4117", "icp_m7017", "icp_m7024"}
+LSB_UM = 0.03  # of the coarsest input, 14 bits over 250 um
+GCS = """\
+vendor: nobody
+model: a piezo controller with GCS over TCP
+source: [this test]
+verified: "yes"
+link: {kind: ascii_tcp, port: 50000, terminator: "\\n", reply_terminator: "\\n"}
+address: none
+outputs:
+  axis1:
+    {write: "SVA 1 {value:.6f}", reply: none, unit: V, min: -10.0, max: 10.0,
+      readback: {ask: "SVA? 1", pattern: "1=(-?[0-9.]+)", example: "1=10.000000"}}
+inputs:
+  position1:
+    {ask: "POS? 1", pattern: "1=(-?[0-9.]+)", example: "1=12.3456", unit: um, min: -125,
+      max: 125}
+exchange: none
+error_query: {ask: "ERR?", pattern: "0", example: "0"}
+turnaround_s: 0.0
+max_rate_hz: 1000.0
+watchdog: none
+"""
+PAIRS = {
+    "text with LabJack": ("kepco_bop", {"reader": "labjack_t7"}),
+    "Modbus TCP with text": ("adam_6224", {"reader": "agilent_34970a"}),
+    "GCS over TCP": ("gcs", {}),
+    "RTU over TCP": ("adam_4024", {"reader": "adam_4117", "link": "rtu_tcp"}),
+    "text over TCP with RTU over TCP": (
+        "kepco_bop", {"reader": "icp_m7017", "link": "tcp", "reader_link": "rtu_tcp"},
+    ),
+    "board with text over TCP": ("cobs_board", {"reader": "gcs"}),
+    "Modbus RTU with a board": ("icp_m7024", {"reader": "cobs_board"}),
+}  # fmt: skip
+
+
+@pytest.fixture
+def profile(tmp_path):
+    """Return a function that returns the path of a profile, of which no board has to boot."""
+
+    def of(name):
+        text = GCS if name == "gcs" else shipped_profiles()[name].read_text()
+        path = tmp_path / f"{name}.yaml"
+        path.write_text(text.replace("boot_wait_s: 2.0", "boot_wait_s: 0.0"))
+        return str(path)
+
+    return of
+
+
+@pytest.mark.parametrize("name", PAIRS)
+def test_all_commands_and_readings_are_those_of_the_devices(profile, tmp_path, name):
+    output, options = PAIRS[name]
+    if "reader" in options:
+        options = {**options, "reader": profile(options["reader"])}
+    log, clock = tmp_path / "log.jsonl", ManualClock()
+    path = profile(output)
+    with emulated(EmulatorOptions(path, log=log, noise=False, **options), clock) as emulator:
+        keys = {**emulator.options, "timeout_s": PATIENT_S}
+        for section in (keys, keys.get("reader")):
+            placed = section and {"host", "serial_port"} & section.keys()
+            if placed and Path(section["profile"]).stem in RTU:
+                section["gap_s"] = 0.0  # the silence of Modbus RTU takes most of the time
+        chosen = device_class(load_profile(path).DEVICE)
+        device = chosen(chosen.Options.model_validate(keys))
+        device.open(min(10.0, device.info.max_rate_hz), 1)
+        device.arm()
+        before = len(logged(log))
+        sent = np.round(np.random.default_rng(1).uniform(-5.0, 5.0, SAMPLES), 3)
+        displacement_um, shown_um, measured = np.zeros((3, SAMPLES))
+        for k in range(SAMPLES):
+            part = slice(k, k + 1)
+            device.exchange(k, sent[part], displacement_um[part], measured[part])
+            device.output()  # a command without a reply has been executed then
+            shown_um[k] = emulator.device._rig.displacement_um
+            clock.pass_s(0.001)
+        assert device.info.details["transactions"] == "2"
+        device.close()
+        device.make_safe(0.0)
+    written = [each["current_a"] for each in logged(log)[before:] if "current_a" in each]
+    assert np.abs(np.array(written[:SAMPLES]) - sent).max() < 5e-3  # a 12-bit output
+    assert written[-1] == pytest.approx(0.0, abs=5e-3)
+    assert np.abs(displacement_um - shown_um).max() < LSB_UM
+    assert np.ptp(shown_um) > 10.0
