@@ -49,13 +49,15 @@ def modbus_tk(link: str, device: str) -> None:
 
 
 async def serve_pymodbus(link: str, device: str) -> None:
+    from pymodbus.framer import FramerType
     from pymodbus.server import ModbusSerialServer, ModbusTcpServer
     from pymodbus.simulator import DataType, SimData, SimDevice
 
     data = SimData(0, count=REGISTERS, datatype=DataType.REGISTERS)
     served = SimDevice(1, simdata=[data])
-    if link == "tcp":
-        server = ModbusTcpServer(served, address=(HOST, 0))
+    if link != "rtu":
+        framer = FramerType.SOCKET if link == "tcp" else FramerType.RTU
+        server = ModbusTcpServer(served, framer=framer, address=(HOST, 0))
         await server.serve_forever(background=True)
         say(server.transport.sockets[0].getsockname()[1])
     else:

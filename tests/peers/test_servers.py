@@ -83,6 +83,7 @@ SERVERS = {
         Server("modbus-tk", "rtu", reads_first=True),
         Server("pymodbus", "tcp"),
         Server("pymodbus", "rtu"),
+        Server("pymodbus", "rtu_tcp"),
         Server("modbus-serial", "tcp", writes_and_reads=False),
         Server(  # does not answer function 23 and later requests
             "jsmodbus",
@@ -106,7 +107,9 @@ class Served:
         self.process = process
         self._where = where
         self._profile = folder / "profile.yaml"
-        link = "{kind: tcp}" if server.link == "tcp" else f"{{kind: rtu, baud: {BAUD}}}"
+        link = f"{{kind: {server.link}}}"
+        if server.link == "rtu":
+            link = f"{{kind: rtu, baud: {BAUD}}}"
         self._profile.write_text(PROFILE.format(link=link), encoding="utf-8")
 
     def device(self, output: str = "FLOAT", sensor: str = "FLOAT", **more) -> ModbusDac:
@@ -128,9 +131,12 @@ class Served:
     def client(self):
         """Yield pymodbus's client; over a serial cable the driver must be closed."""
         from pymodbus.client import ModbusSerialClient, ModbusTcpClient
+        from pymodbus.framer import FramerType
 
-        if self.server.link == "tcp":
-            made = ModbusTcpClient(self._where["host"], port=self._where["tcp_port"])
+        if self.server.link != "rtu":
+            framer = FramerType.SOCKET if self.server.link == "tcp" else FramerType.RTU
+            where = self._where
+            made = ModbusTcpClient(where["host"], port=where["tcp_port"], framer=framer)
         else:
             made = ModbusSerialClient(self._where["serial_port"], baudrate=BAUD)
         assert made.connect()
@@ -195,7 +201,7 @@ def start(programs, tmp_path_factory) -> Callable:
                 command, words = [node, str(HERE / "servers.cjs"), server.name], []
             process = stack.enter_context(running([*command, *words], fds))
             said = read_line(process)
-            if server.link == "tcp":
+            if server.link != "rtu":
                 where = {"host": "127.0.0.1", "tcp_port": int(said)}
             yield Served(server, process, where, folder)
 
