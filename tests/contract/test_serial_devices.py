@@ -28,7 +28,7 @@ SERIAL = (
     "kepco_bop cobs_board own",
 )  # fmt: skip
 """What serial_dac is tried with: what drives, what reads, and whether they share a line."""
-PIEZO = ("cobs_board V", "icp_m7024_dcon agilent_34970a own V")
+PIEZO = ("pi_e727 V", "cobs_board V", "icp_m7024_dcon agilent_34970a own V")
 """Serial devices that drive a piezo too."""
 ONLY_READS = """\
 vendor: nobody
@@ -47,7 +47,7 @@ turnaround_s: 0.001
 max_rate_hz: 100.0
 watchdog: none
 """
-KINDS = {"ascii", "frames"}
+KINDS = {"ascii", "ascii_tcp", "frames"}
 SETTLED_S = 2e-3
 TIMEOUT_S = 2.0
 """A busy machine answers within it; a device without numbered answers is silent for as long."""
@@ -71,6 +71,7 @@ class DrivenSerial(contract.DrivenDevice):
     """
 
     silent = False
+    reach = (-10.0, 10.0)  # of the rig's amplifier
 
     def exchange(self, command):
         """Exchange any number of samples, a block at a time."""
@@ -82,7 +83,7 @@ class DrivenSerial(contract.DrivenDevice):
         for block in sent:
             answers.append(super().exchange(block))
             if self.silent:
-                self._await(float(np.clip(block[-1], -10.0, 10.0)), 1e-4)  # the rig's amplifier
+                self._await(float(np.clip(block[-1], *self.reach)), 1e-4)
         assert np.array_equal(sent, before)
         displacement_um, measured = np.concatenate(answers, axis=1)
         return displacement_um[late:][: command.size], measured[: command.size]
@@ -131,6 +132,8 @@ def wired(case, tmp_path, stack):
     block = BLOCK if device.info.latency_blocks else 1
     made = DrivenSerial(device, block, rate_hz, lambda: rig.command, pass_time, name="serial_dac")
     made.silent = silent and (line == "own" or profile.exchange == "none")
+    if case.endswith(" V"):
+        made.reach = (device.info.command_min, device.info.command_max)
     made.must_be_at_rest = name in MUST_BE_AT_REST
     made.reads_back = name != "adam_4024_ascii"  # returns its last command, not its output
     return made
@@ -177,7 +180,7 @@ def test_opening_does_not_move_the_output(driven, case):
 
 
 def test_no_serial_profile_is_left_out():
-    drives = {case.split()[0] for case in SERIAL}
+    drives = {case.split()[0] for case in (*SERIAL, *PIEZO)}
     reads = {word for case in SERIAL for word in case.split()[1:2]}
     assert drives | (reads & set(serial_profiles())) == set(serial_profiles())
     assert {load_profile(name).link.kind for name in drives} == KINDS

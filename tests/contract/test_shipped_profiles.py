@@ -16,7 +16,7 @@ NAMES = (
     "adam_4024", "adam_4024_ascii", "adam_4117", "adam_6024", "adam_6217", "adam_6224",
     "agilent_34970a", "beckhoff_bk9000", "cobs_board", "cobs_board_fifo", "generic_float32",
     "icp_et7000", "icp_m7017", "icp_m7024", "icp_m7024_dcon", "kepco_bop", "labjack_t4",
-    "labjack_t7", "labjack_t8", "tdk_lambda_gen", "wago_750", "waveshare_ai_8ch",
+    "labjack_t7", "labjack_t8", "pi_e727", "tdk_lambda_gen", "wago_750", "waveshare_ai_8ch",
     "waveshare_ai_8ch_b", "waveshare_ao_8ch", "waveshare_ao_8ch_b",
 )  # fmt: skip
 
@@ -258,6 +258,7 @@ def test_flash_is_not_rewritten(modbus, name):
     ("kepco_bop", "current", -2.5, "CURR -2.500000"),
     ("kepco_bop", "current", 1e-7, "CURR 0.000000"),
     ("tdk_lambda_gen", "current", 7.07, "PC 7.070"),
+    ("pi_e727", "axis1", 12.5, "SVA 1 12.5000"),
 ])  # fmt: skip
 def test_text_output(profiles, name, output, value, line):
     """The output line agrees with the manual and has no exponent."""

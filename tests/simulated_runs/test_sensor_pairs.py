@@ -11,9 +11,11 @@ import pytest
 from hilctl.experiment.devices import device_class
 from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.profile import load_profile, shipped_profiles
+from hilctl_drivers.simulated.devices import TerfenolOptions
 from tests.fakes import ManualClock, emulated, logged
 
 SAMPLES = 2000
+STILL = TerfenolOptions(noise=False)
 PATIENT_S = 10.0
 RTU = {"adam_4024", "adam_4117", "icp_m7017", "icp_m7024"}
 LSB_UM = 0.03  # of the coarsest input, 14 bits over 250 um
@@ -71,7 +73,7 @@ def test_all_commands_and_readings_are_those_of_the_devices(profile, tmp_path, n
         options = {**options, "reader": profile(options["reader"])}
     log, clock = tmp_path / "log.jsonl", ManualClock()
     path = profile(output)
-    with emulated(EmulatorOptions(path, log=log, noise=False, **options), clock) as emulator:
+    with emulated(EmulatorOptions(path, log=log, actuator=STILL, **options), clock) as emulator:
         keys = {**emulator.options, "timeout_s": PATIENT_S}
         for section in (keys, keys.get("reader")):
             placed = section and {"host", "serial_port"} & section.keys()
