@@ -68,13 +68,14 @@ def serial_bench(tmp_path):
         benches = []
 
         def of(profile, /, *, faults=(), rate_hz=20.0, block=1, noise=True, reader=None,
-               own_line=False, **options):  # fmt: skip
+               own_line=False, link=None, **options):  # fmt: skip
             log, clock = tmp_path / f"log{len(benches)}.jsonl", ShiftedClock()
             wanted = EmulatorOptions(
                 profile,
                 log=log,
                 actuator=TerfenolOptions(noise=noise),
                 faults=tuple(map(parse_fault, faults)),
+                link=link,
                 reader=reader,
                 reader_line="own" if own_line else "same",
             )

@@ -16,6 +16,8 @@ from tests.unit.drivers.conftest import TIMEOUT_S
 
 DCON = (Path(__file__).parents[2] / "data" / "dcon_module.yaml").read_text()
 KINDS = ["dcon", "scpi", "cobs", "length"]
+WIRES = [*KINDS, "dcon tcp"]
+"""On ptys, and one of them on TCP."""
 PATIENT_S = 20.0
 SILENCE_S = 0.5
 """A timeout that a test waits for."""
@@ -37,7 +39,9 @@ def rig(profiles, serial_bench):
     """Return a function that wires a device of a kind to its emulator."""
 
     def of(kind, timeout_s=PATIENT_S, **options):
-        return serial_bench(profiles.get(kind, kind), timeout_s=timeout_s, **options)
+        name, *link = kind.split()
+        more = {"link": link[0]} if link else {}
+        return serial_bench(profiles.get(name, name), timeout_s=timeout_s, **more, **options)
 
     return of
 
@@ -50,7 +54,7 @@ def await_current(bench, current_a):
         os.sched_yield()
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", WIRES)
 def test_a_command_arrives_and_a_reading_comes_back(rig, kind):
     bench = rig(kind)
     bench.open()
@@ -80,7 +84,7 @@ def exchange_until_it_fails(bench, command=2.0):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", WIRES)
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_bad_answer_is_an_error_and_the_output_can_still_be_made_safe(rig, kind, fault):
     late = f":{1.5 * TIMEOUT_S}" if fault == "delay" else ""
@@ -91,6 +95,15 @@ def test_a_bad_answer_is_an_error_and_the_output_can_still_be_made_safe(rig, kin
     assert str(caught.value).startswith("serial_dac ")
     with pytest.raises(DeviceError, match="not open"):
         bench.exchange(2.0)
+    bench.device.make_safe(-1.0)
+    assert bench.current_a() == pytest.approx(-1.0, abs=2e-3)
+
+
+def test_a_broken_connection_is_an_error_and_the_output_can_still_be_made_safe(rig):
+    bench = rig("dcon tcp", faults=["reset@30"])
+    bench.open()
+    with pytest.raises(DeviceError, match=r"connection lost|closed by the device"):
+        exchange_until_it_fails(bench)
     bench.device.make_safe(-1.0)
     assert bench.current_a() == pytest.approx(-1.0, abs=2e-3)
 
@@ -213,10 +226,10 @@ def test_a_lost_sensor_is_not_waited_for(rig):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", WIRES)
 @pytest.mark.parametrize("fault", ["silence", "corrupt", "duplicate", "wrong_id"])
 def test_a_bad_answer_to_the_safe_value_confirms_nothing(rig, kind, fault):
-    message = {"dcon": 15, "scpi": 15, "cobs": 10, "length": 10}[kind]
+    message = {"dcon": 16, "scpi": 16, "cobs": 10, "length": 10}[kind.split()[0]]
     bench = rig(kind, faults=[f"{fault}@{message}"], timeout_s=TIMEOUT_S)
     bench.open()
     for _ in range(5):
@@ -226,7 +239,7 @@ def test_a_bad_answer_to_the_safe_value_confirms_nothing(rig, kind, fault):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", WIRES)
 def test_a_device_that_was_deaf_is_made_safe_when_it_comes_back(rig, kind):
     bench = rig(kind, faults=[f"silence@{n}" for n in range(20, 25)], timeout_s=0.3)
     bench.open()
@@ -236,7 +249,7 @@ def test_a_device_that_was_deaf_is_made_safe_when_it_comes_back(rig, kind):
     assert bench.current_a() == pytest.approx(-1.0, abs=2e-3)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", WIRES)
 def test_safe_is_said_only_of_what_was_read_back(rig, kind):
     bench = rig(kind)
     bench.open()
