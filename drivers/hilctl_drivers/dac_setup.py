@@ -164,18 +164,18 @@ class SensorReader(ABC):
 
     def open(self) -> None:
         """Connect and identify the device."""
-        with naming(self._name):
-            if self._own is not None:
-                self._own.open()
-            if self._name:
+        if self._name:
+            with naming(self._name):
+                if self._own is not None:
+                    self._own.open()
                 self._identify()
 
     def begin(self) -> None:
         """Run the init steps, and read once: a wrong input must show before the output moves."""
-        with naming(self._name):
-            if self._name:
+        if self._name:
+            with naming(self._name):
                 self._set_up()
-            self._read()
+                self._read()
 
     def read(self) -> float:
         """Return the value of the input in its unit."""

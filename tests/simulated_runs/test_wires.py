@@ -67,6 +67,8 @@ WIRES = {
         "cobs_board_fifo", {**BOARD, "fifo_blocks": 15}, 10_000.0, block=100, per_cycle=500
     ),
 }
+TRANSACTIONS = {"SCPI": "2", "SCPI, measured": "3", "DCON": "2"}
+"""Requests per tick, where they are not one."""
 LIKE_OTHERS = {"Modbus RTU", "SCPI, measured"}
 """Wires whose parts the others have, each in a run that takes its time."""
 
@@ -170,6 +172,7 @@ def test_compensated_run_is_complete(tmp_path, name):
     assert (measured.size > 0 and abs(measured - recording.samples.command).max() < 1e-3) == (
         name == "SCPI, measured"
     )
+    assert recording.run["device.transactions"] == TRANSACTIONS.get(name, "1")
     assert replay(recording).identical
 
 

@@ -137,6 +137,8 @@ class ModbusDac(ModbusDevice):
         writer, reader = self._connected()
         writer.run(writer.profile.init)
         reader.begin()
+        if not self._setup.reads_elsewhere:
+            reader.read()  # a missing address must show before the output moves
         swap, self.one_transaction = self._find_swap(writer, reader)
         self._safe_write.try_out(writer)
         rates = self._setup.sample_rates(self.one_transaction)

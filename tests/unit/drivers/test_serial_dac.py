@@ -229,7 +229,7 @@ def test_a_lost_sensor_is_not_waited_for(rig):
 @pytest.mark.parametrize("kind", WIRES)
 @pytest.mark.parametrize("fault", ["silence", "corrupt", "duplicate", "wrong_id"])
 def test_a_bad_answer_to_the_safe_value_confirms_nothing(rig, kind, fault):
-    message = {"dcon": 16, "scpi": 16, "cobs": 10, "length": 10}[kind.split()[0]]
+    message = {"dcon": 15, "scpi": 15, "cobs": 10, "length": 10}[kind.split()[0]]
     bench = rig(kind, faults=[f"{fault}@{message}"], timeout_s=TIMEOUT_S)
     bench.open()
     for _ in range(5):
