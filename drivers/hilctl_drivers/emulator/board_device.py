@@ -27,9 +27,12 @@ class EmulatedBoard(EmulatedDevice):
 
     profile: FrameProfile
 
-    def __init__(self, profile: FrameProfile, bench: Bench, output: str | None) -> None:
+    def __init__(
+        self, profile: FrameProfile, bench: Bench, output: str | None, sensor: str | None
+    ) -> None:
         self._name, self._range = next(iter(profile.outputs.items()))
         super().__init__(profile, bench, output)
+        self._sensor = sensor
         self._outputs = BoardValues(self._range)
         self._inputs = BoardValues(next(iter((profile.inputs or profile.outputs).values())))
         streaming = profile.streaming
@@ -112,7 +115,7 @@ class EmulatedBoard(EmulatedDevice):
             raise _Refuse(Status.BAD_MESSAGE)
         (value,) = self._values(data)
         self._refuse_if_tripped()
-        reading = self.wiring.at_terminal(np.array([self._rig.displacement_um]))
+        reading = self._at_terminal(np.array([self._rig.displacement_um]))
         self._put_out(float(value), "write", self._now_ns)
         return count + self._inputs.encode(reading) + board.FIFO_TAIL.pack(0, 0)
 
@@ -152,7 +155,7 @@ class EmulatedBoard(EmulatedDevice):
         self._returned += count
         fields = board.STREAM_FIELDS.pack(first & 0xFFFFFFFF, readings.size)
         tail = board.FIFO_TAIL.pack(min(fifo.level, 0xFFFF), min(fifo.underruns, 0xFFFF))
-        return head + _GOOD + fields + self._inputs.encode(self.wiring.at_terminal(readings)) + tail
+        return head + _GOOD + fields + self._inputs.encode(self._at_terminal(readings)) + tail
 
     def _watchdog(self, body: bytes) -> bytes:
         size = board.WATCHDOG_FIELDS.size
@@ -192,7 +195,7 @@ class EmulatedBoard(EmulatedDevice):
             raise _Refuse(Status.BAD_MESSAGE)
         output = self._outputs.encode(np.array([self.wiring.output(self.fifo.command)]))
         read_um = self._played_um if self.fifo.started else self._rig.displacement_um
-        reading = self._inputs.encode(self.wiring.at_terminal(np.array([read_um])))
+        reading = self._inputs.encode(self._at_terminal(np.array([read_um])))
         return board.STATE_REPLY.pack(board.StateFlag.TRIPPED * self.tripped) + output + reading
 
     def _clock(self, body: bytes) -> bytes:
@@ -216,3 +219,9 @@ class EmulatedBoard(EmulatedDevice):
         self._readings = np.concatenate([self._readings, displacement_um])
         self._played_um = float(displacement_um[-1])
         self._log_played(first, command, now_ns)
+
+    def _at_terminal(self, displacement_um: F64) -> F64:
+        """Return float64[n], readings of the input; 0 if another device reads the sensor."""
+        if self._sensor is None:
+            return np.zeros_like(displacement_um)
+        return self.wiring.at_terminal(displacement_um)

@@ -166,7 +166,7 @@ class _Plan:
         if options.command is not None and output is not None:
             raise InputError(f"initial command is for Modbus profiles, not for {profile.title}")
         if isinstance(profile, FrameProfile):
-            return EmulatedBoard(profile, bench, output)
+            return EmulatedBoard(profile, bench, output, sensor)
         assert isinstance(profile, AsciiProfile)
         return EmulatedText(profile, bench, output, sensor)
 
