@@ -35,7 +35,9 @@ LOAD_PROFILE = "hilctl_drivers.profile:load_profile"
 _PROTOCOLS = {
     "tcp": "Modbus TCP",
     "rtu": "Modbus RTU",
+    "rtu_tcp": "Modbus RTU over TCP",
     "ascii": "lines of text",
+    "ascii_tcp": "lines of text over TCP",
     "frames": "binary frames",
 }
 """Names of protocols by ``link.kind`` of a profile."""

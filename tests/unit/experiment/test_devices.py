@@ -16,6 +16,7 @@ from hilctl.base.yaml import Document
 from hilctl.experiment import devices as registry
 from hilctl.experiment.devices import describe, inventory, made_device
 from hilctl.experiment.file import schema_text
+from hilctl_drivers.profile import link_kinds
 
 
 def made(text, folder):
@@ -251,3 +252,7 @@ class TestSchema:
         assert path.read_text(encoding="utf-8") == schema_text(), (
             "configs/schema.json is out of date: run `hilctl schema --output configs/schema.json`"
         )
+
+
+def test_every_link_has_a_name():
+    assert set(registry._PROTOCOLS) == set(link_kinds())
