@@ -267,6 +267,7 @@ class RigInterlocks:
     safe: float = 0.0
     frozen_travel: float = math.inf
     heat_a2: float = 0.0
+    sensor_invalid_s: float | None = None
     frozen_s: float | None = None
     frozen_um: float | None = None
     measured_deviation_a: float | None = None

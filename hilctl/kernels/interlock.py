@@ -27,12 +27,14 @@ class InterlockFlag(IntFlag):
 
 (
     STROKE_LOW, STROKE_HIGH, RAIL_LOW, RAIL_HIGH, FROZEN_UM, FROZEN_TRAVEL, FROZEN_SAMPLES,
-    DEVIATION, DEVIATION_SAMPLES, WARMING, BUDGET, TRACKING_UM, TRACKING_SAMPLES,
-) = range(13)  # fmt: skip
-SETTINGS = 13
+    DEVIATION, DEVIATION_SAMPLES, WARMING, BUDGET, TRACKING_UM, TRACKING_SAMPLES, MISSING_SAMPLES,
+) = range(14)  # fmt: skip
+SETTINGS = 14
 
-COMMAND, READING, LOWEST, HIGHEST, FROZEN_RUN, DEVIATION_RUN, HEAT, TRACKING_RUN = range(8)
-MEMORY = 8
+(
+    COMMAND, READING, LOWEST, HIGHEST, FROZEN_RUN, DEVIATION_RUN, HEAT, TRACKING_RUN, MISSING_RUN,
+) = range(9)  # fmt: skip
+MEMORY = 9
 
 _INVALID = int(Flag.SENSOR_INVALID)
 _FROZEN = int(InterlockFlag.SENSOR_FROZEN)
@@ -124,28 +126,38 @@ def interlock_block(
 ) -> int:
     """Check a block of samples against all interlocks.
 
+    A missing reading (NaN) is flagged, and trips if too many follow one another. It neither ends
+    nor continues the time of the other conditions on readings.
+
     Args:
-        settings: float64[13], see the names above.
-        memory: float64[8], updated in place; any cut into blocks gives the same bits.
+        settings: float64[14], see the names above.
+        memory: float64[9], updated in place; any cut into blocks gives the same bits.
         command: float64[n], in A or V.
         reference: float64[n], in um; NaN without one.
         displacement_um: float64[n].
         measured: float64[n], the measured command, in A or V; NaN without one.
-        flags: uint32[n]; the bit of each tripped interlock is added.
+        flags: uint32[n]; the bits of invalid readings and of each tripped interlock are added.
 
     Returns:
         Index of the first trip, or -1.
     """
     first = -1
     for k in range(command.size):
-        bits = _invalid(displacement_um[k], settings)
-        bits |= _frozen(displacement_um[k], command[k], settings, memory)
-        bits |= _deviating(measured[k], command[k], settings, memory)
-        bits |= _too_hot(command[k], measured[k], settings, memory)
-        bits |= _off_track(reference[k], displacement_um[k], settings, memory)
+        trips = _deviating(measured[k], command[k], settings, memory)
+        trips |= _too_hot(command[k], measured[k], settings, memory)
+        if displacement_um[k] == displacement_um[k]:
+            memory[MISSING_RUN] = 0.0
+            trips |= _invalid(displacement_um[k], settings)
+            trips |= _frozen(displacement_um[k], command[k], settings, memory)
+            trips |= _off_track(reference[k], displacement_um[k], settings, memory)
+        else:
+            memory[MISSING_RUN] += 1.0
+            flags[k] |= _INVALID
+            if memory[MISSING_RUN] > settings[MISSING_SAMPLES]:
+                trips |= _INVALID
         memory[COMMAND] = command[k]
-        flags[k] |= bits
-        if first < 0 < bits:
+        flags[k] |= trips
+        if first < 0 < trips:
             first = k
     return first
 

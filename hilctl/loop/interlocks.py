@@ -24,6 +24,7 @@ TripCode: TypeAlias = Literal[
 ]
 
 _FIRST_SAMPLE = int(BlockHeader.FIRST_SAMPLE)
+_TRIPPED = sum(InterlockFlag)
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +60,8 @@ _NotNegative: TypeAlias = Annotated[float, Field(ge=0.0)]
 class InterlockSettings(StrictModel):
     """Settings of the interlocks: keys of an experiment's ``limits``; None disables an interlock.
 
-    A condition with a time trips after it has been true for longer without interruption.
+    A condition with a time trips after it has been true for longer without interruption. A missing
+    reading does not interrupt a condition on readings.
     """
 
     rms_current_a: Annotated[
@@ -77,6 +79,11 @@ class InterlockSettings(StrictModel):
     )
     tracking_s: Annotated[_NotNegative | None, InterlockRequirement(key="tracking_error_um")] = (
         Field(default=None, description="time for which the error may be larger, s; default: 0")
+    )
+    sensor_invalid_s: _Positive | None = Field(
+        default=None,
+        description="time for which the device may mark its readings as invalid, s; default: 0, the"
+        " first such reading ends the run",
     )
     frozen_s: _Positive | None = Field(
         default=None,
@@ -208,7 +215,8 @@ class Interlocks:
         rest = memory[kernels.COMMAND] ** 2
         cooling = (1.0 - self._numbers[kernels.WARMING]) ** samples
         memory[kernels.HEAT] = rest + (memory[kernels.HEAT] - rest) * cooling
-        for run in (kernels.FROZEN_RUN, kernels.DEVIATION_RUN, kernels.TRACKING_RUN):
+        runs = kernels.FROZEN_RUN, kernels.DEVIATION_RUN, kernels.TRACKING_RUN, kernels.MISSING_RUN
+        for run in runs:
             if memory[run]:
                 memory[run] += samples
 
@@ -221,7 +229,9 @@ class Interlocks:
         """
         reference, displacement = seen
         settings = self.settings
-        if bits & Flag.SENSOR_INVALID:
+        # A missing reading that is permitted for a time is not the reason of another trip.
+        permitted = settings.sensor_invalid_s and math.isnan(displacement) and bits & _TRIPPED
+        if bits & Flag.SENSOR_INVALID and not permitted:
             return self._invalid(sample, displacement)
         if bits & InterlockFlag.SENSOR_FROZEN:
             return self._frozen(sample, displacement)
@@ -238,6 +248,9 @@ class Interlocks:
 
     def _invalid(self, sample: int, displacement_um: float) -> Trip:
         reading = f"displacement {displacement_um:.4g} µm at sample {sample}"
+        if math.isnan(displacement_um):
+            text = f"{reading} is no valid reading{_since(self.settings.sensor_invalid_s)}"
+            return Trip(sample, "stroke", text)
         low, high = self.context.sensor_um
         if math.isfinite(displacement_um) and not low < displacement_um < high:
             text = f"{reading} is at an end of the sensor's range, {low:g} to {high:g} µm"
@@ -304,4 +317,5 @@ def _numbers(context: InterlockContext, given: InterlockSettings, rate_hz: float
     numbers[kernels.BUDGET] = _or_inf(given.rms_current_a) ** 2
     numbers[kernels.TRACKING_UM] = _or_inf(given.tracking_error_um)
     numbers[kernels.TRACKING_SAMPLES] = samples(given.tracking_s or 0.0)
+    numbers[kernels.MISSING_SAMPLES] = samples(given.sensor_invalid_s or 0.0)
     return numbers

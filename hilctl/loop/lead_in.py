@@ -85,6 +85,9 @@ class LeadIn:
         low, high = self._rest[0] - first_sample, self._rest[1] - first_sample
         if low < displacement_um.size and high > 0:
             resting = displacement_um[max(low, 0) : high]
+            resting = resting[~np.isnan(resting)]  # readings that the device marks as invalid
+            if not resting.size:
+                return
             self._sum_um += float(resting.sum())
             if not self._count:
                 self._about_um = resting.item(0)

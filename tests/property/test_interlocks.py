@@ -24,6 +24,7 @@ def limits(draw):
         stroke_um=(-5.0, 3.5),
         sensor_um=draw(st.sampled_from([(-math.inf, math.inf), (-8.0, 8.0), (-2.0, 3.0)])),
         safe=draw(COMMANDS),
+        sensor_invalid_s=draw(st.sampled_from([0.01, 0.03, None])),
         frozen_s=draw(st.sampled_from([0.01, 0.03, None])),
         frozen_um=draw(st.sampled_from([0.0, 0.3])),
         frozen_travel=draw(st.sampled_from([0.3, 2.0])),
@@ -60,32 +61,51 @@ class Rules:
     def __init__(self, settings):
         self.settings = settings
         self.history = []
+        self.readings = []  # the rows that have one
+        self.missing = 0
         self.heat = settings.safe**2
 
-    def flags(self, command, reference, displacement, measured):
-        self.history.append((command, reference, displacement, measured))
+    def judge(self, *row):
+        """Return the flags of a sample, and those that end the run."""
+        self.history.append(row)
+        if not math.isnan(row[2]):
+            self.readings.append(row)
+            self.missing = 0
+            found = self.of_sent(*row) | self.of_reading(row[2])
+            return found, found
+        self.missing += 1
+        found = self.of_sent(*row)
+        tolerated = self.missing <= round((self.settings.sensor_invalid_s or 0.0) * RATE_HZ)
+        return found | Flag.SENSOR_INVALID, found | (not tolerated) * Flag.SENSOR_INVALID
+
+    def of_reading(self, displacement):
         settings, found = self.settings, 0
         (low, high), (left, right) = settings.stroke_um, settings.sensor_um
         if not (low <= displacement <= high and left < displacement < right):
             found |= Flag.SENSOR_INVALID
         if self.frozen():
             found |= InterlockFlag.SENSOR_FROZEN
+        tracks = settings.tracking_error_um is not None
+        if tracks and self.lasts(self.readings, self.off_track, settings.tracking_s):
+            found |= InterlockFlag.TRACKING_ERROR
+        return found
+
+    def of_sent(self, command, _reference, _displacement, measured):
+        settings, found = self.settings, 0
         deviates = settings.measured_deviation_a is not None
-        if deviates and self.lasts(self.deviates, settings.deviation_s):
+        if deviates and self.lasts(self.history, self.deviates, settings.deviation_s):
             found |= InterlockFlag.DEVIATION
         load = max(command**2, measured**2 if math.isfinite(measured) else 0.0)
         share = 1.0 - math.exp(-1.0 / (settings.thermal_time_constant_s * RATE_HZ))
         self.heat += (load - self.heat) * share
         if settings.rms_current_a and self.heat > settings.rms_current_a**2:
             found |= InterlockFlag.THERMAL
-        if settings.tracking_error_um and self.lasts(self.off_track, settings.tracking_s):
-            found |= InterlockFlag.TRACKING_ERROR
         return found
 
-    def lasts(self, condition, time_s):
-        """Whether a condition has held in this sample and for the time before it."""
+    def lasts(self, rows, condition, time_s):
+        """Whether a condition has held in the last of the rows and for the time before it."""
         n = round(time_s * RATE_HZ) + 1
-        last = range(len(self.history) - n, len(self.history))
+        last = range(len(rows) - n, len(rows))
         return last.start >= 0 and all(condition(k) for k in last)
 
     def deviates(self, k):
@@ -95,7 +115,7 @@ class Rules:
         return not min(before, command) - away <= measured <= max(before, command) + away
 
     def off_track(self, k):
-        _, reference, displacement, _ = self.history[k]
+        _, reference, displacement, _ = self.readings[k]
         return abs(reference - displacement) > self.settings.tracking_error_um
 
     def frozen(self):
@@ -104,10 +124,10 @@ class Rules:
         if settings.frozen_s is None:
             return False
         start = 0
-        for k, (_, _, reading, _) in enumerate(self.history):
-            if not abs(reading - self.history[start][2]) <= settings.frozen_um:
+        for k, (_, _, reading, _) in enumerate(self.readings):
+            if not abs(reading - self.readings[start][2]) <= settings.frozen_um:
                 start = k
-        commands = [row[0] for row in self.history[start:]]
+        commands = [row[0] for row in self.readings[start:]]
         for k in range(len(commands)):
             if max(commands[: k + 1]) - min(commands[: k + 1]) > settings.frozen_travel:
                 return len(commands) - 1 - k >= round(settings.frozen_s * RATE_HZ)
@@ -118,12 +138,12 @@ class Rules:
 def test_follows_the_stated_rules(settings, rows):
     trip, flags = judged(settings, rows)
     rules = Rules(settings)
-    expected = [int(rules.flags(*row)) for row in rows]
-    assert flags.tolist() == expected
-    flagged = np.flatnonzero(flags)
-    assert (trip is None) == (flagged.size == 0)
+    expected, trips = zip(*[map(int, rules.judge(*row)) for row in rows], strict=True)
+    assert flags.tolist() == list(expected)
+    tripped = np.flatnonzero(trips)
+    assert (trip is None) == (tripped.size == 0)
     if trip is not None:
-        assert trip.sample == flagged[0]
+        assert trip.sample == tripped[0]
         assert f"at sample {trip.sample}" in trip.reason
 
 

@@ -10,7 +10,7 @@ from hilctl.kernels import interlock as kernels
 from hilctl.kernels.interlock import InterlockFlag, heat_block, interlock_block
 
 N = 400
-SETTINGS = np.array([-8.0, 8.0, -9.0, 9.0, 0.0, 0.5, 3.0, 0.2, 2.0, 0.01, 1.5, 4.0, 2.0])
+SETTINGS = np.array([-8.0, 8.0, -9.0, 9.0, 0.0, 0.5, 3.0, 0.2, 2.0, 0.01, 1.5, 4.0, 2.0, 1.0])
 ALL = Flag.SENSOR_INVALID | sum(InterlockFlag)
 
 
@@ -21,6 +21,7 @@ def columns():
     displacement = 3.0 * np.roll(command, 2) + 0.1 * generator.standard_normal(N)
     displacement[100:140] = displacement[100]
     displacement[[200, 201, 202]] = np.nan, -8.5, 9.0
+    displacement[210:213] = np.nan
     reference = 3.0 * command
     reference[250:300] += 5.0
     reference[280:] = np.nan

@@ -62,7 +62,7 @@ class TestStroke:
 
     @pytest.mark.parametrize(
         ("value", "shown"),
-        [(-60.001, "-60"), (50.001, "50"), (77.7, "77.7"), (np.nan, "nan"), (np.inf, "inf")],
+        [(-60.001, "-60"), (50.001, "50"), (77.7, "77.7"), (np.inf, "inf")],
     )
     def test_outside(self, value, shown):
         trip, bench = trips(STROKE, 4, first=100, displacement=[1.0, value, 2.0, value])
@@ -74,6 +74,40 @@ class TestStroke:
         limits = RigInterlocks(stroke_um=(-1.0, 2.0))
         assert trips(limits, 1, displacement=np.inf)[0].code == "stroke"
         assert trips(limits, 1, displacement=-np.inf)[0].code == "stroke"
+
+
+class TestMissing:
+    LIMITS = replace(STROKE, sensor_invalid_s=0.003, measured_deviation_a=0.1)
+
+    def test_ends_a_run_by_default(self):
+        trip, bench = trips(STROKE, 4, first=100, displacement=[1.0, np.nan, 2.0, np.nan])
+        assert (trip.sample, trip.code) == (101, "stroke")
+        assert bench.flagged(Flag.SENSOR_INVALID) == [1, 3]
+
+    @pytest.mark.parametrize(("missing", "sample"), [(3, None), (4, 14)])
+    def test_trips_after_its_time(self, missing, sample):
+        readings = np.ones(30)
+        readings[[1, *range(11, 11 + missing)]] = np.nan
+        trip, bench = trips(
+            replace(self.LIMITS, measured_deviation_a=None), 30, displacement=readings
+        )
+        assert (trip and (trip.sample, trip.code)) == (sample and (sample, "stroke"))
+        assert bench.flagged(Flag.SENSOR_INVALID) == [1, *range(11, 11 + missing)]
+
+    def test_a_permitted_one_does_not_hide_another_reason(self):
+        columns = {"measured": [0.0, 5.0], "displacement": [0.0, np.nan]}
+        assert trips(self.LIMITS, 2, **columns)[0].code == "deviation"
+
+    def test_skipped_samples_count(self):
+        bench = Fed(self.LIMITS)
+        assert bench.feed(1, measured=0.0, displacement=np.nan) is None
+        assert bench.feed(1, first=9, measured=0.0, displacement=np.nan).code == "stroke"
+
+    def test_neither_ends_nor_continues_other_times(self):
+        limits = replace(self.LIMITS, tracking_error_um=1.0, tracking_s=0.002)
+        readings = [5.0, np.nan, 5.0, np.nan, 5.0]
+        trip, _ = trips(limits, 5, displacement=readings, reference=0.0, measured=0.0)
+        assert (trip.sample, trip.code) == (4, "tracking_error")
 
 
 class TestSensorRange:
