@@ -125,6 +125,7 @@ class DacSetup:
         description = f"{writer.profile.title} at {writer.place}: {options.output}"
         details = writer.profile.provenance()
         details |= {"link": writer.profile.link.model_dump_json(), **options.details()}
+        details["input_unit"] = self.input.unit
         details |= more.pop("details", {})
         if self.reads_elsewhere:
             description += f"; {reader.profile.title}{self._reader_place}"

@@ -9,6 +9,7 @@ from pydantic import Field, StringConstraints, model_validator
 
 from hilctl.base.errors import InputError
 from hilctl.base.strict import StrictModel
+from hilctl.base.table import known_unit
 from hilctl_drivers.transport.serial_port import SerialSettings
 
 
@@ -126,8 +127,8 @@ class Range(StrictModel):
     ``min`` and ``max`` are the limits of the output or input, not those of its register.
     """
 
-    unit: Literal["V", "A", "mA", "um"] = Field(
-        description="unit of the value, min and max; um for a sensor with a digital interface"
+    unit: Literal["V", "A", "mA", "um", "mm", "nm"] = Field(
+        description="unit of the value, min and max; um, mm or nm for an input that is a position"
     )
     min: float = Field(description="lowest value of the output or input, in unit")
     max: float = Field(description="highest value of the output or input, in unit")
@@ -151,6 +152,11 @@ class Range(StrictModel):
     def step(self) -> float:
         """Smallest step in ``unit``; a thousandth of the range if the profile does not say."""
         return self.resolution or _USUAL_STEP * (self.max - self.min)
+
+    def per_unit(self, base_unit: str) -> float | None:
+        """Return one ``unit`` in a base unit (um, A, V); None if it is another quantity."""
+        base, factor = known_unit(self.unit) or ("", 1.0)
+        return factor if base == base_unit else None
 
 
 class Watchdog(StrictModel):
@@ -246,8 +252,8 @@ class BaseProfile(StrictModel):
             raise ValueError("must have outputs or inputs, or both")
         if self.watchdog != "none" and not self.outputs:
             raise ValueError("watchdog must be none if there are no outputs")
-        if any(each.unit == "um" for each in self.outputs.values()):
-            raise ValueError("unit um is for inputs")
+        if any(each.per_unit("um") for each in self.outputs.values()):
+            raise ValueError("units um, mm and nm are for inputs")
         return self
 
     @property

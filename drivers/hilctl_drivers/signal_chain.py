@@ -23,7 +23,9 @@ PROFILE = "name of a shipped profile, or path of your own relative to the experi
 
 _Channel = TypeVar("_Channel", bound=Range)
 _Value = TypeVar("_Value", float, F64)
-_SENSITIVITIES = {"um_per_v": "V", "um_per_ma": "mA", "um_per_um": "um"}
+_SENSITIVITIES = {
+    "um_per_v": "V", "um_per_ma": "mA", "um_per_um": "um", "um_per_mm": "mm", "um_per_nm": "nm",
+}  # fmt: skip
 _GAINS = ("gain_a_per_v", "gain_a_per_ma", "gain_v_per_v", "gain_v_per_ma")
 
 
@@ -72,34 +74,49 @@ class Amplifier(StrictModel):
 
 
 class Sensor(StrictModel):
-    """The displacement sensor at the input; set one sensitivity."""
+    """The displacement sensor at the input; set one sensitivity, unless the input is a position."""
 
     um_per_v: float | None = Field(default=None, description="displacement per volt, um/V")
     um_per_ma: float | None = Field(default=None, description="displacement per mA, um/mA")
     um_per_um: float | None = Field(
-        default=None, description="displacement per um of a reading in um; -1 reverses it"
+        default=None, description="displacement per um of a position; default: 1; -1 reverses it"
+    )
+    um_per_mm: float | None = Field(
+        default=None,
+        description="displacement per mm of a position; default: 1000; -1000 reverses it",
+    )
+    um_per_nm: float | None = Field(
+        default=None,
+        description="displacement per nm of a position; default: 0.001; -0.001 reverses it",
     )
     offset_um: float = Field(default=0.0, description="displacement at input 0, um")
 
     @model_validator(mode="after")
     def _one_sensitivity(self) -> Self:
-        if len(self._given) != 1 or self.um_per_unit == 0.0:
+        if len(self._given) > 1 or 0.0 in self._given.values():
             raise ValueError(f"must have one of {', '.join(_SENSITIVITIES)}, and not 0")
         return self
 
     @property
-    def _given(self) -> list[str]:
-        return [name for name in _SENSITIVITIES if getattr(self, name) is not None]
+    def _given(self) -> dict[str, float]:
+        """The sensitivity by unit of the input; empty if it is not set."""
+        found = {unit: getattr(self, name) for name, unit in _SENSITIVITIES.items()}
+        return {unit: value for unit, value in found.items() if value is not None}
 
-    @property
-    def input_unit(self) -> str:
-        """Unit of the input that it is wired to."""
-        return _SENSITIVITIES[self._given[0]]
-
-    @property
-    def um_per_unit(self) -> float:
-        """Displacement for one unit of the input, um."""
-        return float(getattr(self, self._given[0]))
+    def um_per_unit(self, source: Range) -> float:
+        """Return the displacement for one unit of an input, um; raise InputError without one."""
+        default = source.per_unit("um")
+        if not self._given and default is not None:
+            return default
+        if source.unit not in self._given:
+            known = {unit: name for name, unit in _SENSITIVITIES.items()}
+            if source.unit not in known:
+                raise InputError(f"no sensor gives {source.unit}, the unit of the input")
+            got = ", ".join(known[unit] for unit in self._given) or "nothing"
+            raise InputError(
+                f"sensor must have {known[source.unit]}: the input is in {source.unit}, got {got}"
+            )
+        return self._given[source.unit]
 
 
 class Calibration(StrictModel):
@@ -232,7 +249,9 @@ class DacOptions(AddressOptions):
     amplifier: Amplifier | None = Field(
         default=None, description="omitted only if the output is in A and drives the coil"
     )
-    sensor: Sensor = Field(description="displacement sensor")
+    sensor: Sensor = Field(
+        default=Sensor(), description="displacement sensor; may be omitted for a position"
+    )
     calibration: Calibration | None = Field(default=None, description="last calibration")
     watchdog: WatchdogOptions | Literal["none"] = Field(
         description="the device's own; none if the device may hold its last output"
@@ -274,14 +293,10 @@ class SignalChain:
             raise InputError(
                 f"amplifier takes {amplifier.output_unit}, but the output is in {output.unit}"
             )
-        if sensor.input_unit != sensor_input.unit:
-            raise InputError(
-                f"sensor gives {sensor.input_unit}, but the input is in {sensor_input.unit}"
-            )
         self.command_unit: CommandUnit = "A" if amplifier is None else amplifier.command_unit
         self._gain = 1.0 if amplifier is None else amplifier.gain
         self._offset = 0.0 if amplifier is None else amplifier.offset
-        self._um_per_unit = sensor.um_per_unit
+        self._um_per_unit = sensor.um_per_unit(sensor_input)
         self._offset_um = sensor.offset_um
         self.command_range = sorted(map(self.command, output.limits))
         """Lowest and highest command of the output's range."""

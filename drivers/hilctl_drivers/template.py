@@ -173,8 +173,8 @@ def _sensor(made: StartingSection, sensor_input: Range) -> None:
         raise InputError(f"{made.values['input']} is in A: no displacement sensor gives that")
     key = f"um_per_{sensor_input.unit.lower()}"
     middle = 0.5 * (sensor_input.min + sensor_input.max)
-    values = {key: 1.0, "offset_um": 0.0}  # of a reading in um
-    if sensor_input.unit != "um":
+    values = {key: sensor_input.per_unit("um"), "offset_um": 0.0}
+    if values[key] is None:
         values = {key: _UM_PER_UNIT, "offset_um": 0.0 - _UM_PER_UNIT * middle}
     made.values["sensor"] = values
     per_unit = f"displacement of one {sensor_input.unit} of the "

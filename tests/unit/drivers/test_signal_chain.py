@@ -6,7 +6,14 @@ from hilctl.base.errors import InputError
 from hilctl_drivers.ascii.ascii_profile import AsciiWatchdog
 from hilctl_drivers.profile import load_profile
 from hilctl_drivers.profile_base import Range
-from hilctl_drivers.signal_chain import DacOptions, SignalChain, channel, check_watchdog
+from hilctl_drivers.signal_chain import (
+    Amplifier,
+    DacOptions,
+    Sensor,
+    SignalChain,
+    channel,
+    check_watchdog,
+)
 
 VOLTS = Range(unit="V", min=-10.0, max=10.0)
 
@@ -56,6 +63,29 @@ def test_watchdog_that_does_not_do_what_is_asked_is_refused(has, wanted, words):
 def test_watchdog_that_does_is_taken(has):
     """A safe value, one for this output among others, or 0 where that is asked for."""
     asked(has)
+
+
+@pytest.mark.parametrize(("unit", "sensor", "span"), [
+    ("V", {"um_per_v": 2.0, "offset_um": 1.0}, [-1.0, 9.0]),
+    ("um", {}, [-1.0, 4.0]),
+    ("mm", {"offset_um": 5.0}, [-995.0, 4005.0]),
+    ("nm", {}, [-1e-3, 4e-3]),
+    ("mm", {"um_per_mm": -1000.0}, [-4000.0, 1000.0]),
+])  # fmt: skip
+def test_position_needs_no_sensitivity(unit, sensor, span):
+    source = Range(unit=unit, min=-1.0, max=4.0)
+    amplifier = Amplifier(gain_a_per_v=1.0)
+    chain = SignalChain(VOLTS, source, amplifier, Sensor.model_validate(sensor))
+    assert chain.displacement_range == pytest.approx(span)
+
+
+@pytest.mark.parametrize(("unit", "sensor"), [
+    ("V", {}), ("mA", {"um_per_v": 1.0}), ("mm", {"um_per_um": 1.0}), ("A", {}),
+])  # fmt: skip
+def test_sensitivity_must_fit_the_input(unit, sensor):
+    source = Range(unit=unit, min=-1.0, max=4.0)
+    with pytest.raises(InputError, match=f"in {unit}|gives {unit}"):
+        SignalChain(VOLTS, source, Amplifier(gain_a_per_v=1.0), Sensor.model_validate(sensor))
 
 
 def test_channels_are_found_by_name():

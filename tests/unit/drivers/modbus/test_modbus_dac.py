@@ -42,7 +42,7 @@ class TestOptions:
         ({"amplifier": {"offset_a": 1.0}}, "must have one of gain_a_per_v"),
         ({"amplifier": {"gain_a_per_v": 1.0, "gain_v_per_v": 1.0}}, "must have one of"),
         ({"amplifier": {"gain_v_per_v": 1.0, "offset_a": 1.0}}, "offset must be in the unit"),
-        ({"sensor": {"offset_um": 1.0}}, "must have one of um_per_v"),
+        ({"sensor": {"um_per_v": 1.0, "um_per_mm": 1.0}}, "must have one of um_per_v"),
     ])  # fmt: skip
     def test_options_that_contradict_themselves(self, changes, words):
         with pytest.raises(ValidationError, match=words):
@@ -57,7 +57,8 @@ class TestOptions:
         ({"input": "AIN9"}, "input must be one that LabJack T7 has"),
         ({"amplifier": None}, "amplifier is required"),
         ({"amplifier": {"gain_a_per_ma": 1.0}}, "amplifier takes mA"),
-        ({"sensor": {"um_per_ma": 1.0}}, "sensor gives mA"),
+        ({"sensor": {"um_per_ma": 1.0}}, "sensor must have um_per_v: .* got um_per_ma"),
+        ({"sensor": {"offset_um": 1.0}}, "sensor must have um_per_v: .* got nothing"),
         ({"profile": "kepco_bop"}, "kepco_bop"),
         ({"host": None, "serial_port": "/dev/x"}, "is for TCP: give host"),
         ({"watchdog": {"timeout_s": 1.0}, "output": "TDAC0"}, "does nothing for TDAC0"),
