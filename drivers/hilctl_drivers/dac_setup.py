@@ -13,7 +13,13 @@ from hilctl.base.device import DeviceInfo
 from hilctl.base.errors import InputError
 from hilctl_drivers.endpoint import Endpoint, reader_of
 from hilctl_drivers.profile_base import Range
-from hilctl_drivers.signal_chain import DacOptions, SignalChain, channel, check_watchdog
+from hilctl_drivers.signal_chain import (
+    DacOptions,
+    SignalChain,
+    channel,
+    check_watchdog,
+    measuring_input,
+)
 from hilctl_drivers.transport.links import Link, naming
 from hilctl_drivers.transport.wire_time import RateLimit, WireTime
 
@@ -29,6 +35,7 @@ class DacSetup:
         output: The output in use.
         input: The input in use.
         chain: Amplifier and sensor.
+        measure: The input that measures the output; None if it is not measured.
     """
 
     options: DacOptions
@@ -37,6 +44,7 @@ class DacSetup:
     output: Range
     input: Range
     chain: SignalChain
+    measure: Any
 
     @classmethod
     def of(cls, options: DacOptions) -> Self:
@@ -47,8 +55,11 @@ class DacSetup:
         output = channel("output", options.output, here.outputs, here.title)
         sensor_input = channel("input", options.input, there.inputs, there.title)
         chain = SignalChain(output, sensor_input, options.amplifier, options.sensor)
+        measure = measuring_input(getattr(options, "measure", None), here.inputs, here.title)
+        if measure is not None:
+            chain.measured(measure)
         check_watchdog(here.title, options, output, chain, here.watchdog)
-        setup = cls(options, writer, reader, output, sensor_input, chain)
+        setup = cls(options, writer, reader, output, sensor_input, chain, measure)
         if setup.reads_elsewhere:
             setup.check_timeout(setup.read_time)
         return setup

@@ -10,13 +10,11 @@ from abc import abstractmethod
 from pkgutil import resolve_name
 from typing import ClassVar
 
-from pydantic import Field
-
 from hilctl.base.device import DeviceInfo, DeviceOptions
 from hilctl.base.errors import InputError
 from hilctl_drivers.dac_setup import DacSetup, SensorReader
 from hilctl_drivers.device import DacDevice
-from hilctl_drivers.signal_chain import DacOptions, FifoBlocks
+from hilctl_drivers.signal_chain import DacOptions, FifoBlocks, Measure
 from hilctl_drivers.transport.safe_exchange import SafeExchange, check_read_back
 
 _PROMPT_S = 0.2
@@ -26,11 +24,7 @@ _PROMPT_S = 0.2
 class SerialOptions(DacOptions):
     """Options of ``serial_dac``."""
 
-    measure: str | None = Field(
-        default=None,
-        description="input that measures the output itself, recorded beside the command; it costs"
-        " one more question a sample",
-    )
+    measure: Measure = None
     fifo_blocks: FifoBlocks = 8
 
 

@@ -233,6 +233,15 @@ FifoBlocks: TypeAlias = Annotated[
 ]
 
 
+Measure: TypeAlias = Annotated[
+    str | None,
+    Field(
+        description="input that measures the output itself, recorded beside the command; it costs"
+        " one more request a sample"
+    ),
+]
+
+
 class DacOptions(AddressOptions):
     """Options of every DAC with a profile."""
 
@@ -294,6 +303,7 @@ class SignalChain:
                 f"amplifier takes {amplifier.output_unit}, but the output is in {output.unit}"
             )
         self.command_unit: CommandUnit = "A" if amplifier is None else amplifier.command_unit
+        self._output_unit = output.unit
         self._gain = 1.0 if amplifier is None else amplifier.gain
         self._offset = 0.0 if amplifier is None else amplifier.offset
         self._um_per_unit = sensor.um_per_unit(sensor_input)
@@ -321,6 +331,20 @@ class SignalChain:
     def displacement_um(self, value: float) -> float:
         """Return the displacement of an input value, um."""
         return value * self._um_per_unit + self._offset_um
+
+    def measured(self, source: Range) -> tuple[float, float]:
+        """Return gain and offset of the command as measured by an input, in its unit.
+
+        Raises:
+            InputError: The input is neither in the unit of the output nor in that of the command.
+        """
+        if source.unit == self._output_unit:
+            return self._gain, self._offset
+        gain = source.per_unit(self.command_unit)
+        if gain is None:
+            units = " or ".join(dict.fromkeys((self._output_unit, self.command_unit)))
+            raise InputError(f"measure must be in {units}, got one in {source.unit}")
+        return gain, 0.0
 
     def fill_um(self, values: F64, displacement_um: F64) -> None:
         """Fill in the displacements of a block of input values, um."""
@@ -371,6 +395,22 @@ def channel(what: str, name: str, channels: Mapping[str, _Channel], title: str) 
             "the sensor as reader"
         )
     return found
+
+
+def measuring_input(
+    name: str | None, inputs: Mapping[str, _Channel], title: str
+) -> _Channel | None:
+    """Return the input of that name, which must measure the output itself; None without a name."""
+    if name is None:
+        return None
+    measuring = {
+        key: each for key, each in inputs.items() if getattr(each, "measures", "") == "output"
+    }
+    if name not in measuring:
+        known = ", ".join(measuring) or "none"
+        rule = f"measure must be an input of {title} that measures its own output"
+        raise InputError(f"{rule}, got {name!r} (it has {known})")
+    return measuring[name]
 
 
 def check_watchdog(

@@ -1,9 +1,10 @@
 """``serial_dac`` for devices with a text protocol."""
 
 import re
+from functools import partial
 from string import Formatter
 
-from hilctl.base.errors import InputError, UnconfirmedError
+from hilctl.base.errors import UnconfirmedError
 from hilctl.base.types import F64
 from hilctl_drivers.ascii.ascii_profile import AsciiInput, AsciiOutput, AsciiProfile
 from hilctl_drivers.ascii.ascii_session import (
@@ -11,10 +12,9 @@ from hilctl_drivers.ascii.ascii_session import (
     arm_s,
     exchange_time,
     feed_time,
-    parse_number,
     query_time,
+    reading,
 )
-from hilctl_drivers.profile_base import Range
 from hilctl_drivers.serial_dac import SerialDac
 from hilctl_drivers.transport.links import WatchdogTrippedError
 from hilctl_drivers.transport.safe_exchange import try_out
@@ -35,7 +35,7 @@ class AsciiDac(SerialDac):
         assert isinstance(profile, AsciiProfile)
         assert isinstance(output, AsciiOutput)
         self._profile, self._target = profile, output
-        self._measure = _measuring_input(profile, options.measure, output)
+        self._measure: AsciiInput | None = setup.measure
         self.measures = self._measure is not None
         self._writer = AsciiSession(profile, self._link, setup.writer.unit)
         self._sensor = self._reader = setup.reader_on(self._link)
@@ -94,7 +94,7 @@ class AsciiDac(SerialDac):
         combined = self._profile.exchange
         if combined != "none" and self._is_combined:
             text = self._writer.text(combined.write, value=value)
-            number = parse_number(self._writer.ask(text, combined.pattern)[1])
+            number = reading(combined, partial(self._writer.ask, text))
             found = self._profile.inputs[combined.input].value(number)
         else:
             # First the reading, which must not show yet what the command does.
@@ -102,7 +102,8 @@ class AsciiDac(SerialDac):
             self._write(value)
         displacement_um[0] = self._chain.displacement_um(found)
         if self._measure is not None:
-            measured[0] = self._chain.command(self._writer.value(self._measure))
+            gain, offset = self._chain.measured(self._measure)
+            measured[0] = self._writer.value(self._measure) * gain + offset
         self._feed()
 
     def _output(self) -> float | None:
@@ -251,18 +252,3 @@ class AsciiDac(SerialDac):
 
 def _without_numbers(text: str) -> str:
     return re.sub(r"[-+.\d]+", "#", text)
-
-
-def _measuring_input(profile: AsciiProfile, name: str | None, output: Range) -> AsciiInput | None:
-    """Return the input of that name, which must measure the output itself; None without a name."""
-    if name is None:
-        return None
-    measuring = {key: each for key, each in profile.inputs.items() if each.measures == "output"}
-    if name not in measuring:
-        known = ", ".join(measuring) or "none"
-        rule = f"measure must be an input of {profile.title} that measures its own output"
-        raise InputError(f"{rule}, got {name!r} (it has {known})")
-    if measuring[name].unit != output.unit:
-        rule = f"measure must be in {output.unit}, as the output is"
-        raise InputError(f"{rule}: {name} is in {measuring[name].unit}")
-    return measuring[name]

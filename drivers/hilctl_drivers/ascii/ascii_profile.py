@@ -130,6 +130,15 @@ class NumberReply(Reply):
         return self
 
 
+class MeasuredReply(NumberReply):
+    """A reply with a reading."""
+
+    invalid: Reply | Literal["none"] = Field(
+        default="none",
+        description="reply instead of a reading, such as an over-range; recorded as missing",
+    )
+
+
 class Query(NumberReply):
     """A query with a number as its reply."""
 
@@ -164,7 +173,7 @@ class AsciiOutput(Range):
         return self
 
 
-class AsciiInput(Range, Query):
+class AsciiInput(Range, Query, MeasuredReply):
     """An input that is read with a line of text; value = number * scale + offset.
 
     Attributes:
@@ -183,7 +192,7 @@ class AsciiInput(Range, Query):
         return number * self.scale + self.offset
 
 
-class AsciiExchange(NumberReply):
+class AsciiExchange(MeasuredReply):
     """One line that sets an output and reads an input.
 
     Attributes:
@@ -339,14 +348,16 @@ class AsciiProfile(BaseProfile):
 
     @model_validator(mode="after")
     def _errors_are_no_answers(self) -> Self:
-        for name, output in self.outputs.items():
-            if output.reply == "none":
-                continue
+        answers = {
+            f"good reply of outputs.{name}": each.reply for name, each in self.outputs.items()
+        }
+        answers |= {f"invalid of inputs.{name}": each.invalid for name, each in self.inputs.items()}
+        if self.exchange != "none":
+            answers["invalid of exchange"] = self.exchange.invalid
+        for name, answer in answers.items():
             for error in self.errors:
-                if error.match(output.reply.example):
-                    raise ValueError(
-                        f"errors: {error.pattern!r} matches the good reply of outputs.{name}"
-                    )
+                if answer != "none" and error.match(answer.example):
+                    raise ValueError(f"errors: {error.pattern!r} matches the {name}")
         return self
 
     @property

@@ -4,10 +4,12 @@ DCON (ICP DAS, Advantech ADAM): ICP DAS "DCON protocol command set". GEN (TDK-La
 Manual" 7.5. SCPI: SCPI-1999 volume 1, 7.2.1 for numbers; number forms as in IEEE 488.2, 8.7.
 """
 
+import math
 import re
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal, TypeAlias
 
 from hilctl.base.errors import DeviceError
@@ -18,6 +20,7 @@ from hilctl_drivers.ascii.ascii_profile import (
     AsciiWatchdog,
     AskStep,
     Check,
+    MeasuredReply,
     NumberStep,
     Query,
     Reply,
@@ -116,8 +119,20 @@ def parse_number(text: str) -> float:
         raise CorruptError(f"must be one number, got {text!r}")
     value = float(body)
     if abs(value) >= _SCPI_INFINITY:
-        raise CorruptError(f"stands for no measurement: {text!r}")
+        rule = "if it is a reading, set invalid of its input in the profile"
+        raise CorruptError(f"stands for no measurement: {text!r}; {rule}")
     return value
+
+
+def reading(form: MeasuredReply, ask: Callable[..., re.Match[str]]) -> float:
+    """Return the number in a reply of that form, NaN if it marks the reading as invalid.
+
+    ``ask`` takes patterns and returns the match of the reply.
+    """
+    if form.invalid == "none":
+        return parse_number(ask(form.pattern)[1])
+    found = ask(form.invalid.pattern, form.pattern)
+    return math.nan if form.invalid.match(found.string) else parse_number(found[1])
 
 
 class AsciiSession:
@@ -161,8 +176,8 @@ class AsciiSession:
         else:
             self.link.transact(request, lambda got: 0)
 
-    def ask(self, text: str, pattern: str) -> re.Match[str]:
-        """Send a line and return its reply, matched whole.
+    def ask(self, text: str, *patterns: str) -> re.Match[str]:
+        """Send a line and return its reply, matched whole by the first pattern that does.
 
         Raises:
             WatchdogTrippedError: The command was ignored because of a trip.
@@ -179,17 +194,18 @@ class AsciiSession:
             data = self._check_echo(text, data)
         reply = self._replies.decode(data)
         self._check_trouble(text, reply)
-        found = re.fullmatch(pattern, reply, re.ASCII)
+        matches = (re.fullmatch(pattern, reply, re.ASCII) for pattern in patterns)
+        found = next(filter(None, matches), None)
         if found is None:
             raise MismatchError(f"{text}: not an answer to this: {reply!r}")
         return found
 
-    def query(self, text: str, pattern: str) -> re.Match[str]:
+    def query(self, text: str, *patterns: str) -> re.Match[str]:
         """Ask a question, see :meth:`ask`; a reply that repeats it is a MismatchError.
 
         The line then echoes, and perhaps nothing is connected.
         """
-        found = self.ask(text, pattern)
+        found = self.ask(text, *patterns)
         if found.string == text:
             raise MismatchError(
                 f"{text}: came back unchanged: the line echoes what is sent; set echo: true "
@@ -202,8 +218,8 @@ class AsciiSession:
         return parse_number(self.query(self.text(query.ask), query.pattern)[1])
 
     def value(self, source: AsciiInput) -> float:
-        """Ask for the value of an input, in its unit."""
-        return source.value(self.number(source))
+        """Ask for the value of an input, in its unit; NaN if the reading is invalid."""
+        return source.value(reading(source, partial(self.query, self.text(source.ask))))
 
     def run(self, steps: Sequence[AsciiStep], **values: float) -> None:
         """Execute steps with ``timeout`` and ``safe``; raise DeviceError if one fails."""

@@ -94,8 +94,6 @@ class BoardDac(SerialDac):
     def _prepare(self) -> None:
         setup, profile = self._setup, self._setup.writer.profile
         assert isinstance(profile, FrameProfile)
-        if self._options.measure is not None:
-            raise InputError("measure is for devices that speak lines of text")
         self._profile = profile
         self._session = BoardSession(profile, self._link)
         if setup.reads_elsewhere:

@@ -105,6 +105,12 @@ class _Plan:
         self.actuator, self.wiring = _rig(
             options, profile.outputs[self._output], reader.inputs[self._sensor]
         )
+        source = reader.inputs[self._sensor]
+        markers = [getattr(source, key, "none") for key in ("validity", "invalid")]
+        if markers == ["none", "none"] and any(each.kind == "invalid" for each in options.faults):
+            raise InputError(
+                f"fault invalid: {self._sensor} of {reader.title} has no validity or invalid"
+            )
         self._links = (
             _Served.of(profile, options.link),
             _Served.of(reader, options.reader_link or options.link),

@@ -171,7 +171,11 @@ class EmulatedModbus(EmulatedDevice):
         except RejectedRequest:
             for (words, _), old in zip(targets, before, strict=True):
                 words.words[:] = old
-            raise
+            register = self.profile.error_register
+            if register == "none":
+                raise
+            self._steps[id(register)].set_bits(register.mask, register.mask)
+            return
         tripped = self.tripped
         for words, _ in targets:
             self._act(words)
@@ -251,6 +255,16 @@ class EmulatedModbus(EmulatedDevice):
         if self._sensor is not None:
             value = float(self.wiring.at_terminal(self._rig.displacement_um))
             self._inputs[self._sensor].value = value
+            validity = self.profile.inputs[self._sensor].validity
+            if validity != "none":
+                bits = validity.valid ^ (validity.mask * self._is_invalid)
+                self._steps[id(validity)].set_bits(validity.mask, bits)
+        for name, source in self.profile.inputs.items():
+            if source.measures == "output" and self._output is not None:
+                same = source.unit == self.profile.outputs[self._output].unit
+                value = self._outputs[self._output].value
+                value = value if same else self.wiring.command(value)
+                self._inputs[name].value = min(max(value, source.min), source.max)
         watchdog = self.profile.watchdog
         if watchdog != "none" and watchdog.tripped != "none":
             self._steps[id(watchdog.tripped)].words[-1] = watchdog.tripped.mask * self.tripped

@@ -179,6 +179,11 @@ class ModbusWire:
         """Return the exception reply of a device that fails."""
         return self._answered(ExceptionResponse(request[3], ExcCodes.DEVICE_FAILURE), request)
 
+    def mark_invalid(self, until_ns: int) -> None:
+        """Mark the readings of all devices as invalid until a time."""
+        for device in self._devices.values():
+            device.invalid_until_ns = until_ns
+
     def encode(self, data: bytes) -> bytes:
         """Return a reply, which has its envelope already."""
         return data

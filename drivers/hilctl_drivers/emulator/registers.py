@@ -43,6 +43,12 @@ class Words:
         data = self._format.encode(value)
         return list(struct.unpack(f">{len(data) // 2}H", data))
 
+    def set_bits(self, mask: int, bits: int) -> None:
+        """Replace the bits of a mask."""
+        raw = int.from_bytes(struct.pack(f">{len(self.words)}H", *self.words), "big")
+        data = (raw & ~mask | bits).to_bytes(2 * len(self.words), "big")
+        self.words[:] = struct.unpack(f">{len(self.words)}H", data)
+
     @property
     def value(self) -> float:
         """The value that the words stand for."""
@@ -153,6 +159,10 @@ class RegisterMap:
         self._place_steps((*profile.init, *profile.close))
         if profile.selftest != "none":
             self._place(profile.selftest, read=True, write=False).value = profile.selftest.expect
+        status = [profile.error_register, *(each.validity for each in profile.inputs.values())]
+        for register in status:
+            if register != "none":
+                self.steps[id(register)] = self._place(register, read=True, write=True)
         if profile.watchdog == "none":
             return
         for steps in profile.watchdog.steps().values():

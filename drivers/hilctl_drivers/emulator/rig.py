@@ -192,6 +192,12 @@ class EmulatedDevice(ABC):
         self._logged = COLUMNS["command"].field(bench.wiring.command_unit).name
         self._timer = WatchdogTimer()
         self._now_ns = 0
+        self.invalid_until_ns = 0
+        """Time until which the sensor's readings are marked as invalid."""
+
+    @property
+    def _is_invalid(self) -> bool:
+        return self._now_ns < self.invalid_until_ns
 
     @property
     def tripped(self) -> bool:

@@ -249,6 +249,9 @@ class EmulatorServer:
         fault = None
         if connection.faulty:
             fault = self._plan.next((now_ns - self._start_ns) * 1e-9)
+        if fault is not None and fault.kind == "invalid":
+            for wire in self._wires:
+                wire.mark_invalid(now_ns + round(fault.delay_s * 1e9))
         if fault is not None and fault.kind in {"silence", "unplug", "reset", "exception", "late"}:
             self._keep_back(fault, connection, request)
         else:

@@ -8,6 +8,7 @@ from hilctl_drivers.ascii.ascii_profile import (
     AsciiProfile,
     AsciiStep,
     AskStep,
+    MeasuredReply,
     NumberStep,
     Reply,
     SendStep,
@@ -144,8 +145,7 @@ class EmulatedText(EmulatedDevice):
         if fields is None:
             return None
         source = self.profile.inputs[combined.input]
-        reading = self._reading(combined.input, source)
-        reply = in_style(combined.example, combined.pattern, reading)
+        reply = self._said(combined.input, source, combined)
         return self._set(combined.output, fields["value"], reply)
 
     def _set(self, name: str, value: float, reply: str) -> str:
@@ -166,8 +166,14 @@ class EmulatedText(EmulatedDevice):
     def _inputs(self, text: str) -> str | None:
         for name, source in self.profile.inputs.items():
             if self._matches(source.ask, text):
-                return in_style(source.example, source.pattern, self._reading(name, source))
+                return self._said(name, source, source)
         return None
+
+    def _said(self, name: str, source: AsciiInput, form: MeasuredReply) -> str:
+        """Return the reply of that form with a reading, or the one that marks it as invalid."""
+        if form.invalid != "none" and name == self._sensor and self._is_invalid:
+            return form.invalid.example
+        return in_style(form.example, form.pattern, self._reading(name, source))
 
     def _reading(self, name: str, source: AsciiInput) -> float:
         if source.measures == "output":

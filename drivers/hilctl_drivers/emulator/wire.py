@@ -43,6 +43,10 @@ class EmulatedWire(Protocol):
         """Return an answer that refuses the request."""
         ...
 
+    def mark_invalid(self, until_ns: int) -> None:
+        """Mark the readings of all devices as invalid until a time."""
+        ...
+
     def encode(self, data: bytes) -> bytes:
         """Return a reply in the form sent on the line."""
         ...
@@ -54,6 +58,8 @@ class EmulatedWire(Protocol):
 
 class SerialDevice(Protocol):
     """An emulated device on a line; it sees messages without their framing."""
+
+    invalid_until_ns: int
 
     def tick(self, now_ns: int) -> None:
         """Advance the time."""
@@ -113,6 +119,11 @@ class EmulatedLine:
     def refusal(self, request: bytes) -> EmulatedReply | None:
         """Return an answer of the first device that says no."""
         return self.devices[0].refusal(request)
+
+    def mark_invalid(self, until_ns: int) -> None:
+        """Mark the readings of all devices as invalid until a time."""
+        for device in self.devices:
+            device.invalid_until_ns = until_ns
 
     def encode(self, data: bytes) -> bytes:
         """Return a reply in the form sent on the line."""

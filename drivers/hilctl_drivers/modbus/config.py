@@ -13,16 +13,18 @@ from hilctl_drivers.modbus.modbus_session import (
     arm_s,
     exchange_time,
     feed_time,
-    read_request,
+    read_requests,
     read_time,
 )
-from hilctl_drivers.signal_chain import DacOptions
+from hilctl_drivers.signal_chain import DacOptions, Measure
 from hilctl_drivers.transport.links import Link
 from hilctl_drivers.transport.wire_time import RateLimit, WireTime
 
 
 class ModbusOptions(DacOptions):
     """Options of ``modbus_dac``."""
+
+    measure: Measure = None
 
 
 def session_at(endpoint: Endpoint, link: Link | None = None) -> ModbusSession:
@@ -84,9 +86,21 @@ class ModbusSetup(DacSetup):
     def wire(self, one_transaction: bool) -> WireTime:
         """Return the time of a sample on the wire."""
         own = None if self.reads_elsewhere else self.options.input
-        return self.after_reading(
-            exchange_time(self.profile, self.options.output, own, one_transaction=one_transaction)
+        wire = exchange_time(
+            self.profile, self.options.output, own, one_transaction=one_transaction
         )
+        if self.measure is not None:
+            wire = wire.then(read_time(self.profile, self.measure).named("to measure the output"))
+        return self.after_reading(wire)
+
+    def transactions(self, one_transaction: bool) -> int:
+        """Return the number of requests of a sample."""
+        count = 1 if one_transaction else 2
+        if isinstance(self.input, ModbusInput):
+            count += len(read_requests(cast(ModbusProfile, self.reader.profile), self.input)) - 1
+        if self.measure is not None:
+            count += len(read_requests(self.profile, self.measure))
+        return count + (self.profile.error_register != "none")
 
     def sample_rates(self, one_transaction: bool) -> RateLimit:
         """Return the sample rates that wire and devices allow."""
@@ -101,6 +115,7 @@ class ModbusSetup(DacSetup):
         return self.info(
             kind,
             rates,
+            measures_command=self.measure is not None,
             arm_s=0.0 if options.watchdog == "none" else arm_s(self.profile, options.output),
             confirms=not self.unconfirmed,
             safe_note=self.unconfirmed,
@@ -116,8 +131,7 @@ class ModbusReader(SensorReader):
         super().__init__(setup, link)
         source = cast(ModbusInput, setup.input)
         self._session = session_at(setup.reader, self._link)
-        self._request = self._session.prepare(read_request(self._session.profile, source))
-        self._decode = source.format.decode
+        self._read_input = self._session.input_reader(source)
 
     @staticmethod
     def time(profile: ModbusProfile, source: ModbusInput) -> WireTime:
@@ -131,7 +145,7 @@ class ModbusReader(SensorReader):
         self._session.run(self._session.profile.init)
 
     def _read(self) -> float:
-        return self._decode(self._session.call(self._request))
+        return self._read_input()
 
     def _finish(self) -> None:
         self._session.run(self._session.profile.close)

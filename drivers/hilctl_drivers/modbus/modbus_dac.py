@@ -124,6 +124,9 @@ class ModbusDac(ModbusDevice):
         self._factors = setup.chain.factors
         self._encode = setup.output.format.encode
         self._swap: Swap = _not_open
+        self._measure: Callable[[], float] | None = None
+        if setup.measure is not None:
+            self._measured_by = setup.chain.measured(setup.measure)
         self.one_transaction = False
         """Whether a tick is one transaction; known after opening."""
 
@@ -144,8 +147,10 @@ class ModbusDac(ModbusDevice):
         rates = self._setup.sample_rates(self.one_transaction)
         how = "one transaction" if self.one_transaction else "a read and a write"
         replace(rates, note=f"{how} a sample; {rates.note}").check(sample_rate_hz)
-        self.transactions = 1 if self.one_transaction else 2
-        self._swap = swap
+        self._swap = self._checked(swap, writer)
+        if self._setup.measure is not None:
+            self._measure = writer.input_reader(self._setup.measure)
+        self.transactions = self._setup.transactions(self.one_transaction)
 
     def _exchange(
         self, first_sample: int, command: F64, displacement_um: F64, measured: F64
@@ -153,6 +158,9 @@ class ModbusDac(ModbusDevice):
         gain, offset, um_per_unit, offset_um = self._factors
         request = self._encode((command.item() - offset) / gain)
         displacement_um[0] = self._swap(request) * um_per_unit + offset_um
+        if self._measure is not None:
+            gain, offset = self._measured_by
+            measured[0] = self._measure() * gain + offset
         if self._guard.feed_every and self._writer is not None:
             self._guard.feed(self._writer)
 
@@ -206,6 +214,20 @@ class ModbusDac(ModbusDevice):
 
         return pair, False
 
+    def _checked(self, swap: Swap, writer: ModbusSession) -> Swap:
+        """Return ``swap`` with a look at the error register, if there is one, after the write."""
+        check = writer.error_check()
+        if check is None:
+            return swap
+        check()  # a refused init step, or an error of before
+
+        def checked(data: bytes) -> float:
+            found = swap(data)
+            check()
+            return found
+
+        return checked
+
     def _combined(self, writer: ModbusSession) -> Swap | None:
         setup = self._setup
         if setup.reads_elsewhere or not isinstance(setup.input, ModbusInput):
@@ -213,7 +235,7 @@ class ModbusDac(ModbusDevice):
         pdu = combined_request(writer.profile, setup.output, setup.input)
         if pdu is None:
             return None
-        transaction, decode = writer.prepare(pdu), setup.input.format.decode
+        transaction, decode = writer.prepare(pdu), writer.decoder(setup.input)
         transact, usual = writer.link.transact, transaction.reply_size
         request, missing, reply = transaction.request, transaction.missing, transaction.reply
         return lambda data: decode(reply(transact(request(data), missing, usual)))

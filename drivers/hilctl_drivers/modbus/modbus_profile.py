@@ -14,7 +14,8 @@ from hilctl_drivers.modbus.register_map import (
     ModbusStep,
     Register,
     RegisterStep,
-    TripFlag,
+    StatusRegister,
+    Validity,
     wire_address,
 )
 from hilctl_drivers.profile_base import (
@@ -154,6 +155,11 @@ class ModbusInput(Channel):
         default="terminal",
         description="measured quantity: the signal at the terminal, or the device's own output",
     )
+    validity: Validity | Literal["none"] = Field(
+        default="none",
+        description="register that shows whether the reading is valid; an invalid reading is"
+        " recorded as missing. It is read together with the input if it is beside it",
+    )
 
     @model_validator(mode="after")
     def _readable(self) -> Self:
@@ -181,7 +187,7 @@ class ModbusWatchdog(Watchdog):
     safe: dict[Name, tuple[ModbusStep, ...]] = Field(
         default={}, description="steps that set the safe value, per output"
     )
-    tripped: TripFlag | Literal["none"] = Field(
+    tripped: StatusRegister | Literal["none"] = Field(
         default="none", description="register that shows a trip"
     )
 
@@ -233,6 +239,11 @@ class ModbusProfile(BaseProfile):
     selftest: ModbusSelftest | Literal["none"] = Field(
         default="none", description="register that identifies the device"
     )
+    error_register: StatusRegister | Literal["none"] = Field(
+        default="none",
+        description="register that is not 0 if the device has refused a value; read after each"
+        " write of a run, which ends with an error",
+    )
     streaming: LabJackStreaming | Literal["none"] = Field(
         default="none", description="streaming that the device supports"
     )
@@ -241,6 +252,9 @@ class ModbusProfile(BaseProfile):
     def _channels(self) -> Self:
         if self.exchange != "none" and not (self.outputs and self.inputs):
             raise ValueError("exchange must be none if there are no outputs or no inputs")
+        checked = [self.error_register, *(each.validity for each in self.inputs.values())]
+        if self.streaming != "none" and any(each != "none" for each in checked):
+            raise ValueError("streaming must be none with validity or error_register")
         for key in ("outputs", "inputs") if self.streaming != "none" else ():
             unknown = [
                 name for name in getattr(self.streaming, key) if name not in getattr(self, key)
@@ -302,6 +316,22 @@ class ModbusProfile(BaseProfile):
     def registers(self) -> Iterator[tuple[str, Register]]:
         """Yield every register with its dotted key."""
         return _registers(self)
+
+    def span(self, register: Register) -> tuple[int, int]:
+        """Return wire address and number of the registers that are read for one.
+
+        A validity register beside an input is read with it.
+        """
+        at = self.wire_address(register)
+        validity = register.validity if isinstance(register, ModbusInput) else "none"
+        if validity == "none" or validity.read_function != register.read_function:
+            return at, register.words
+        there = self.wire_address(validity)
+        if at + register.words == there:
+            return at, register.words + validity.words
+        if there + validity.words == at:
+            return there, register.words + validity.words
+        return at, register.words
 
     def wire_address(self, register: Register) -> int:
         """Return the address that goes into the frame, 0 to 65535."""

@@ -5,6 +5,7 @@ its good reply. A tick adds transaction id, data and CRC, and compares. Only a r
 parsed by :mod:`hilctl_drivers.modbus.pdu`, which raises the error.
 """
 
+import math
 import struct
 import time
 from abc import ABC, abstractmethod
@@ -46,11 +47,17 @@ from hilctl_drivers.modbus.register_map import (
     ModbusStep,
     Register,
     RegisterStep,
-    TripFlag,
+    StatusRegister,
 )
 from hilctl_drivers.profile_base import WaitStep
 from hilctl_drivers.transport.crc import MODBUS_WORDS, Bytes, crc16_modbus
-from hilctl_drivers.transport.links import BadRequestError, CorruptError, IncompleteError, Link
+from hilctl_drivers.transport.links import (
+    BadRequestError,
+    CorruptError,
+    IncompleteError,
+    Link,
+    RefusedError,
+)
 from hilctl_drivers.transport.wire_time import WireTime
 
 _RTU_SHORTEST = 5
@@ -197,8 +204,8 @@ class RtuTransaction(Transaction):
 
 
 def read_request(profile: ModbusProfile, register: Register) -> bytes:
-    """Return the PDU that reads a register."""
-    return read_pdu(register.read_function, profile.wire_address(register), register.words)
+    """Return the PDU that reads a register, and the validity of an input beside it."""
+    return read_pdu(register.read_function, *profile.span(register))
 
 
 def write_request(profile: ModbusProfile, register: Register, data: bytes = b"") -> bytes:
@@ -217,12 +224,12 @@ def combined_request(
     profile: ModbusProfile, output: ModbusOutput, sensor: ModbusInput
 ) -> bytes | None:
     """Return the PDU that writes an output and reads an input; None if the device has none."""
-    source, target = profile.wire_address(sensor), profile.wire_address(output)
+    source, target = profile.span(sensor), profile.wire_address(output)
     data = bytes(2 * output.words)
     if profile.exchange == 23:
-        return write_read_pdu(source, sensor.words, target, data)
+        return write_read_pdu(*source, target, data)
     if profile.exchange == 76:
-        return feedback_pdu(ReadFrame(source, sensor.words), WriteFrame(target, data))
+        return feedback_pdu(ReadFrame(*source), WriteFrame(target, data))
     return None
 
 
@@ -317,9 +324,51 @@ class ModbusSession:
                 "profile's"
             )
 
-    def is_set(self, flag: TripFlag) -> bool:
+    def is_set(self, flag: StatusRegister) -> bool:
         """Return whether a bit of the flag's mask is set."""
-        return bool(int.from_bytes(self.read_bytes(flag), "big") & flag.mask)
+        return flag.bits(self.read_bytes(flag)) != 0
+
+    def decoder(self, source: ModbusInput) -> Callable[[bytes], float]:
+        """Return the conversion of the bytes that :func:`read_request` reads for an input.
+
+        The value is NaN if the validity register, which may be read separately, shows that.
+        """
+        decode, validity = source.format.decode, source.validity
+        if validity == "none":
+            return decode
+        bits, valid = validity.bits, validity.valid
+        start, words = self.profile.span(source)
+        if words == source.words:
+            request = self.prepare(read_request(self.profile, validity))
+            # Afterwards: a reading that has become invalid in between is not used.
+            return lambda data: decode(data) if bits(self.call(request)) == valid else math.nan
+
+        def part(register: Register) -> slice:
+            first = 2 * (self.profile.wire_address(register) - start)
+            return slice(first, first + 2 * register.words)
+
+        own, other = part(source), part(validity)
+        return lambda data: decode(data[own]) if bits(data[other]) == valid else math.nan
+
+    def input_reader(self, source: ModbusInput) -> Callable[[], float]:
+        """Return a function that reads an input, NaN if it is invalid."""
+        request, decode = self.prepare(read_request(self.profile, source)), self.decoder(source)
+        return lambda: decode(self.call(request))
+
+    def error_check(self) -> Callable[[], None] | None:
+        """Return a function that raises RefusedError if the error register is not 0, if any."""
+        register = self.profile.error_register
+        if register == "none":
+            return None
+        request = self.prepare(read_request(self.profile, register))
+        place = f"{register.area} {register.address}"
+
+        def check() -> None:
+            found = register.bits(self.call(request))
+            if found:
+                raise RefusedError(f"the error register, {place}, holds {found:#x}", found)
+
+        return check
 
 
 def _encoded(register: Register, value: float | str) -> bytes:
@@ -342,17 +391,28 @@ def exchange_time(
     """Return the time to write an output and read an input, by name; None to write only."""
     written = profile.outputs[output]
     write = write_request(profile, written)
+    after = []
+    if profile.error_register != "none":
+        after = [read_request(profile, profile.error_register)]
     if sensor is None:
-        return _requests_time(profile, [write], written.settle_s)
+        return _requests_time(profile, [write, *after], written.settle_s)
     read = profile.inputs[sensor]
-    combined = combined_request(profile, written, read) if one_transaction else None
-    requests = [combined] if combined else [read_request(profile, read), write]
-    return _requests_time(profile, requests, written.settle_s + read.settle_s)
+    reads, combined = read_requests(profile, read), combined_request(profile, written, read)
+    both = [combined, *reads[1:]] if combined and one_transaction else [*reads, write]
+    return _requests_time(profile, [*both, *after], written.settle_s + read.settle_s)
 
 
 def read_time(profile: ModbusProfile, sensor: ModbusInput) -> WireTime:
     """Return the time to read an input."""
-    return _requests_time(profile, [read_request(profile, sensor)], sensor.settle_s)
+    return _requests_time(profile, read_requests(profile, sensor), sensor.settle_s)
+
+
+def read_requests(profile: ModbusProfile, sensor: ModbusInput) -> list[bytes]:
+    """Return the requests that read an input, and its validity if that is elsewhere."""
+    requests, validity = [read_request(profile, sensor)], sensor.validity
+    if validity != "none" and profile.span(sensor)[1] == sensor.words:
+        requests.append(read_request(profile, validity))
+    return requests
 
 
 def feed_time(profile: ModbusProfile) -> WireTime | None:

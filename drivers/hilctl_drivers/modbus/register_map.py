@@ -292,15 +292,31 @@ ModbusStep: TypeAlias = Annotated[
 ]
 
 
-class TripFlag(Register):
-    """A register that shows a trip if any bit of ``mask`` is set."""
+class StatusRegister(Register):
+    """A register of which the bits in ``mask`` count."""
 
-    mask: int = Field(ge=1, le=0xFFFFFFFF, description="bits of the raw value that show a trip")
+    mask: int = Field(ge=1, le=0xFFFFFFFF, description="bits of the raw value that count")
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
         if self.type.startswith("float") or self.mask > self.representable[1]:
             raise ValueError(f"mask must fit into {self.type}, got {self.mask:#x}")
+        return self
+
+    def bits(self, data: Bytes) -> int:
+        """Return the bits that count in the register's bytes."""
+        return int.from_bytes(data, "big") & self.mask
+
+
+class Validity(StatusRegister):
+    """A register that shows whether a reading is valid."""
+
+    valid: int = Field(default=0, ge=0, description="bits in mask if the reading is valid")
+
+    @model_validator(mode="after")
+    def _in_mask(self) -> Self:
+        if self.valid & ~self.mask:
+            raise ValueError(f"valid must have bits of mask only, got {self.valid:#x}")
         return self
 
 

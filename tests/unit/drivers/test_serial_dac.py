@@ -381,3 +381,20 @@ def test_a_board_reads_itself():
     info = SerialDac(SerialOptions.model_validate(BOARD)).info
     assert info.holds == held_port("/dev/x")
     assert "reader_vendor" not in info.details
+
+
+def test_a_marked_reading_is_missing(rig, tmp_path):
+    text = DCON.replace('>+05.123",', '>+05.123", invalid: {pattern: ">OVL", example: ">OVL"},')
+    path = tmp_path / "marked.yaml"
+    path.write_text(text)
+    bench = rig(str(path), faults=["invalid:1@30"])
+    bench.open()
+    readings = [float(bench.exchange(0.0)[0]) for _ in range(40)]
+    bench.pass_s(2.0)
+    assert np.isnan(readings).any()
+    assert np.isfinite([readings[0], float(bench.exchange(0.0)[0])]).all()
+
+
+def test_fault_that_the_input_cannot_show_is_refused(rig):
+    with pytest.raises(InputError, match="fault invalid: AI0 of"):
+        rig("dcon", faults=["invalid@30"])

@@ -1,10 +1,12 @@
 """Asking a device in lines of text: templates out, patterns back, trouble by its own name."""
 
+import math
 from pathlib import Path
 
 import pytest
 
 from hilctl.base.errors import DeviceError
+from hilctl_drivers.ascii.ascii_profile import Reply
 from hilctl_drivers.ascii.ascii_session import (
     AsciiSession,
     LineFormat,
@@ -258,3 +260,19 @@ def test_stream_of_lines_finds_an_end_cut_in_two_by_noise():
 
 def test_stream_of_lines_passes_on_empty_lines():
     assert PLAIN_LINE.splitter().feed(b"\rOK\r\r") == ["", "OK", ""]
+
+
+@pytest.mark.parametrize(("reply", "value"), [
+    (b">+05.123\r", 5.123), (b">+99.999\r", math.nan), (b">OVL\r", math.nan),
+])  # fmt: skip
+def test_reply_that_marks_a_reading_as_invalid(reply, value):
+    invalid = Reply(pattern=r">(\+99\.999|OVL)", example=">OVL")
+    source = PLAIN.inputs["AI0"].model_copy(update={"invalid": invalid})
+    assert session(reply).value(source) == pytest.approx(value, nan_ok=True)
+
+
+def test_a_refusal_is_no_invalid_reading():
+    invalid = Reply(pattern=">OVL", example=">OVL")
+    source = PLAIN.inputs["AI0"].model_copy(update={"invalid": invalid})
+    with pytest.raises(links.RefusedError):
+        session(b"?02\r").value(source)

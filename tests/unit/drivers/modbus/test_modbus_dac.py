@@ -1,5 +1,8 @@
 """modbus_dac on loopback: what it checks before it opens, how it exchanges, and its watchdog."""
 
+import math
+
+import numpy as np
 import pytest
 from pydantic import ValidationError
 
@@ -7,7 +10,7 @@ from hilctl.base.errors import DeviceError, InputError
 from hilctl_drivers.emulator.options import parse_fault
 from hilctl_drivers.modbus.config import ModbusOptions
 from hilctl_drivers.modbus.modbus_dac import ModbusDac
-from tests.fakes import T7_OPTIONS
+from tests.fakes import T7_OPTIONS, made_safe
 from tests.unit.drivers.modbus.conftest import exchange
 
 T7 = {**T7_OPTIONS, "host": "h"}
@@ -330,3 +333,84 @@ def test_output_that_can_not_be_read_is_not_known(driven, variant):
     made.open()
     made.exchange(3.0)
     assert made.device.output() is None
+
+
+END = "max: 10.0}\nwatchdog"
+FOREVER_NS = 2**62
+
+
+@pytest.mark.parametrize(("validity", "requests"), [
+    ("{address: 4, type: uint16, mask: 0x3, valid: 0x1}", ["17000200030000000102"]),
+    ("{address: 1, type: uint16, mask: 0x8}", ["17000100030000000102"]),
+    ("{address: 9, type: uint16, mask: 0x3, valid: 0x1}", ["17000200020000000102", "0300090001"]),
+    ("{area: discrete, address: 5, type: bit, mask: 1}", ["17000200020000000102", "0200050001"]),
+])  # fmt: skip
+def test_invalid_reading_is_missing(driven, variant, validity, requests):
+    """A register beside the input is read with it."""
+    output = (
+        "OUT: {address: 0, type: float32, order: ABCD",
+        "OUT: {address: 0, type: int16, scale: 0.001",
+    )
+    made = driven(variant(output, (END, f"max: 10.0, validity: {validity}}}\nwatchdog")))
+    made.open()
+    assert abs(made.exchange(0.0)) < 1.0
+    made.emulated.device.invalid_until_ns = FOREVER_NS
+    made.link.requests.clear()
+    assert math.isnan(made.exchange(1.0))
+    sent = [each[7:].hex() for each in made.link.requests]
+    assert [each[: len(start)] for each, start in zip(sent, requests, strict=True)] == requests
+    made.emulated.device.invalid_until_ns = 0
+    assert math.isfinite(made.exchange(1.0))
+
+
+class TestErrorRegister:
+    REGISTER = "error_register: {address: 6, type: uint16, mask: 0xFF}\nwatchdog: none"
+    ERROR = "error register, holding 6, holds 0x5"
+
+    @pytest.fixture
+    def rig(self, driven, variant):
+        return driven(variant(("watchdog: none", self.REGISTER)))
+
+    def test_refused_value_ends_exchanges(self, rig):
+        rig.open()
+        rig.exchange(1.0)
+        rig.emulated.device.write("holding", 6, [0xFF05])
+        with pytest.raises(DeviceError, match=self.ERROR):
+            rig.exchange(2.0)
+        made_safe(rig.device, 0.0)
+        assert rig.current_a == pytest.approx(0.0)
+
+    def test_error_of_before_refuses_to_open(self, rig):
+        rig.emulated.device.write("holding", 6, [5])
+        with pytest.raises(DeviceError, match=self.ERROR):
+            rig.open()
+        assert rig.current_a == pytest.approx(0.0)
+
+    def test_emulator_reports_a_value_out_of_range_there(self, rig):
+        device = rig.emulated.device
+        device.write("holding", 0, [0x4130, 0])  # 11 V
+        assert device.read(["holding"], 6, 1) == [0xFF]
+        assert device.read(["holding"], 0, 2) == [0, 0]
+
+
+class TestMeasure:
+    INPUT = "\n  MON: {address: 8, type: float32, unit: %s, min: -9.0, max: 9.0, measures: output}"
+
+    @pytest.mark.parametrize("unit", ["V", "A"])
+    def test_measured_command(self, driven, variant, unit):
+        made = driven(variant((END, f"max: 10.0}}{self.INPUT % unit}\nwatchdog")), measure="MON")
+        made.open()
+        assert made.device.info.measures_command
+        measured = np.full(1, np.nan)
+        made.device.exchange(0, np.array([3.0]), np.empty(1), measured)
+        assert measured == pytest.approx([3.0])
+        assert not made.another(measure=None).info.measures_command
+
+    @pytest.mark.parametrize(("unit", "name", "words"), [
+        ("um", "MON", "measure must be in V or A"),
+        ("V", "IN", "measures its own output, got 'IN'"),
+    ])  # fmt: skip
+    def test_input_that_does_not_measure_it_is_refused(self, variant, unit, name, words):
+        path = variant((END, f"max: 10.0}}{self.INPUT % unit}\nwatchdog"))
+        with pytest.raises(InputError, match=words):
+            made(profile=path, output="OUT", input="IN", measure=name)
