@@ -142,7 +142,8 @@ class DacSetup:
             description += f"; {reader.profile.title}{self._reader_place}"
             details |= reader.profile.provenance("reader_")
             details["reader_link"] = reader.profile.link.model_dump_json()
-        description += f"{':' if self.reads_elsewhere else ','} {options.input}"
+        position = f" in {self.input.unit}" if self.input.per_unit("um") else ""
+        description += f"{':' if self.reads_elsewhere else ','} {options.input}{position}"
         return self.chain.info(
             kind,
             options,

@@ -171,15 +171,15 @@ def _amplifier(made: StartingSection, output: Range, unit: CommandUnit) -> None:
 def _sensor(made: StartingSection, sensor_input: Range) -> None:
     if sensor_input.unit == "A":
         raise InputError(f"{made.values['input']} is in A: no displacement sensor gives that")
-    key = f"um_per_{sensor_input.unit.lower()}"
-    middle = 0.5 * (sensor_input.min + sensor_input.max)
-    values = {key: sensor_input.per_unit("um"), "offset_um": 0.0}
-    if values[key] is None:
-        values = {key: _UM_PER_UNIT, "offset_um": 0.0 - _UM_PER_UNIT * middle}
-    made.values["sensor"] = values
-    per_unit = f"displacement of one {sensor_input.unit} of the "
     at_zero = f"displacement at 0 {sensor_input.unit}, um"
-    _ask(made, f"sensor.{key}", f"{per_unit}sensor, um", f"{per_unit}input, um")
+    if sensor_input.per_unit("um"):
+        made.values["sensor"] = {"offset_um": 0.0}
+    else:
+        key = f"um_per_{sensor_input.unit.lower()}"
+        middle = 0.5 * (sensor_input.min + sensor_input.max)
+        made.values["sensor"] = {key: _UM_PER_UNIT, "offset_um": 0.0 - _UM_PER_UNIT * middle}
+        per_unit = f"displacement of one {sensor_input.unit} of the "
+        _ask(made, f"sensor.{key}", f"{per_unit}sensor, um", f"{per_unit}input, um")
     _ask(made, "sensor.offset_um", at_zero, at_zero)
 
 

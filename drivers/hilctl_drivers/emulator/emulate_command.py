@@ -21,9 +21,8 @@ from hilctl_drivers.emulator.factory import Emulator, build
 from hilctl_drivers.emulator.modbus_device import EmulatedModbus
 from hilctl_drivers.emulator.options import EmulatorOptions, LinkKind, ReaderLine, parse_fault
 from hilctl_drivers.emulator.rig import ACTUATORS
-from hilctl_drivers.labjack.modbus_stream import ModbusStreamOptions
 from hilctl_drivers.modbus.modbus_profile import ModbusProfile
-from hilctl_drivers.profile import NamedProfile, load_profile, shipped_profiles
+from hilctl_drivers.profile import NamedProfile, shipped_profiles
 from hilctl_drivers.serial_dac import SerialOptions
 from hilctl_drivers.signal_chain import AddressOptions, DacOptions
 from hilctl_drivers.simulated.devices import SimulatedOptions
@@ -73,7 +72,7 @@ def wired_experiment(
     if not isinstance(section, dict) or not isinstance(name, str):
         rule = "must name a profile: what has none is not behind a wire, and needs no emulator"
         raise ConfigError([ConfigProblem(document.where(("device",)), "device.profile", rule)])
-    options = _validated(document, load_profile(name, files, path.parent), path.parent, files)
+    options = _validated(document, path.parent, files)
     reader = options.reader
     unit = "A" if options.amplifier is None else options.amplifier.command_unit
     made = EmulatorOptions(
@@ -94,11 +93,10 @@ def wired_experiment(
     return WiredExperiment(path, section, made)
 
 
-def _validated(document: Document, profile: object, folder: Path, files: TextFiles) -> DacOptions:
-    kind = ModbusStreamOptions if isinstance(profile, ModbusProfile) else SerialOptions
+def _validated(document: Document, folder: Path, files: TextFiles) -> DacOptions:
+    """Return the options of a device of any protocol: those of serial_dac include all."""
     context = {"folder": folder, "files": files}
-    made: DacOptions = document.validate(kind, at=("device",), without=("kind",), context=context)
-    return made
+    return document.validate(SerialOptions, at=("device",), without=("kind",), context=context)
 
 
 def _found(named: NamedProfile, folder: Path) -> str:
