@@ -170,7 +170,7 @@ class Device(Protocol):
             first_sample: Index of the block's first sample since the start of the run. A jump
                 means that samples in between were skipped; the output held its last value.
             command: float64[block], in ``info.command_unit``; not modified.
-            displacement_um: float64[block], filled by the call.
+            displacement_um: float64[block], filled by the call; NaN is an invalid reading.
             measured: float64[block], the command as measured by the device, filled by the call
                 if ``info.measures_command``; unchanged otherwise.
 

@@ -345,7 +345,7 @@ def test_nobody_there_is_said(rig):
     ({"profile": "labjack_t7"}, "one for kind: modbus_dac"),
     ({"profile": "kepco_bop", "output": "current", "input": "current"}, "as reader"),
     ({"measure": "AI0"}, "measure must be an input of nobody .* measures its own output"),
-    ({"profile": "cobs_board", "output": "DAC", "input": "ADC", "measure": "ADC"}, "lines of"),
+    ({"profile": "cobs_board", "output": "DAC", "input": "ADC", "measure": "ADC"}, "measures its"),
     ({"watchdog": {"timeout_s": 100.0}}, "timeout_s must be 0.1 to 25.5"),
     ({"watchdog": {"timeout_s": 1.0, "safe_command": 11.0}}, "safe_command must be -10 to 10"),
     ({"sensor": {"um_per_ma": 1.0}}, "the input is in V"),

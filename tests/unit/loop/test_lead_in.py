@@ -29,6 +29,14 @@ def test_nothing_before():
     assert input_um.tolist() == [1.0, 1.0, 1.0]
 
 
+def test_invalid_readings_at_rest_are_left_out():
+    beginning = LeadIn(short_conditioning(), 0)
+    for first, readings in [(30, [np.nan, np.nan]), (32, [1.0, 3.0]), (34, [np.nan, 2.0])]:
+        beginning.take(first, np.array(readings))
+    assert beginning.resting_um == pytest.approx(2.0)
+    assert math.isfinite(beginning.noise_um)
+
+
 def test_parts_follow_one_another():
     beginning, wanted = LeadIn(short_conditioning(), 10), np.empty(5)
     assert (beginning.condition_at, beginning.waveform_at) == (10, 50)
