@@ -15,6 +15,7 @@ from hilctl.comparison import compare as library
 from hilctl.comparison.compare import Comparison
 from hilctl.experiment.load import inputs_of
 from hilctl.identify.pipeline import Identification, identify_files, settings_from
+from hilctl.identify.refine.acceptance import TOLERANCE_PERCENT
 from hilctl.identify.refine.refinement import Refinement, refine_files
 from hilctl.models.base import HysteresisModel, IdentifiedRange, Operator
 from hilctl.models.model_export import check_rate, export_text
@@ -161,6 +162,7 @@ def refine(
     output: PathLike | None = None,
     *,
     validate: Paths = (),
+    tolerance_percent: float = TOLERANCE_PERCENT,
     overwrite: bool = False,
     on_progress: Callable[[float, str], None] = lambda done, text: None,
 ) -> Refinement:
@@ -171,6 +173,7 @@ def refine(
         runs: Recordings of compensated, learned or plain runs.
         output: Model file to write, if any.
         validate: Recordings to validate the model with; default: each run in turn.
+        tolerance_percent: Increase of a run's rms error to accept, in percent of its peak-to-peak.
         overwrite: Replace an existing model file.
         on_progress: Called with the fraction done (0 to 1) and the current step.
 
@@ -182,6 +185,7 @@ def refine(
         paths_of(runs),
         path_or_none(output),
         paths_of(validate),
+        tolerance_percent=tolerance_percent,
         overwrite=overwrite,
         progress=on_progress,
     )

@@ -18,16 +18,20 @@ from hilctl.cli.output import print_result
 from hilctl.comparison.compare import Comparison, headings, notes, table_rows
 from hilctl.identify.model_selection import OrderScore
 from hilctl.identify.pipeline import Identification
+from hilctl.identify.refine.acceptance import TOLERANCE_PERCENT
 from hilctl.identify.refine.refinement import Refinement
 from hilctl.identify.registry import CATALOGUE
 from hilctl.identify.settings import setting_rows
 from hilctl.identify.summary import (
+    CLASS_HEADINGS,
     HEADINGS,
     REFINEMENT_HEADINGS,
+    class_rows,
     error_rows,
     parameter_texts,
     refinement_rows,
     summary,
+    worse_lines,
 )
 from hilctl.run.control.client import finish_dead_runs
 
@@ -222,6 +226,10 @@ def refine(
     ],
     output: Annotated[Path | None, typer.Option(help="Model file to write.")] = None,
     validate: ValidateRuns = None,
+    tolerance_percent: Annotated[
+        float,
+        typer.Option(help="Increase of a run's rms error to accept, percent of its peak-to-peak."),
+    ] = TOLERANCE_PERCENT,
     html: Annotated[
         Path | None, typer.Option(help="HTML page that compares both models, to write.")
     ] = None,
@@ -234,7 +242,13 @@ def refine(
     finish_dead_runs()
     with progress_bar("refine", quiet=as_json) as progress:
         result = api.refine(
-            model, runs, output, validate=validate or [], overwrite=overwrite, on_progress=progress
+            model,
+            runs,
+            output,
+            validate=validate or [],
+            tolerance_percent=tolerance_percent,
+            overwrite=overwrite,
+            on_progress=progress,
         )
     if html is not None:
         from hilctl.analysis.html import write_page  # it imports matplotlib
@@ -251,8 +265,11 @@ def refine(
 def print_refinement(result: Refinement, output: Path | None) -> None:
     """Print the validation errors of the old and the new model."""
     print(result)
+    for line in worse_lines(result):
+        print(line)
     title = f"validation: {result.choice.after.how}"
     print_rich(table(title, REFINEMENT_HEADINGS, refinement_rows(result)))
+    print_rich(table("by stroke", CLASS_HEADINGS, class_rows(result)))
     if result.choice.own:
         print("offset, creep and drift of single runs were not learned")
     if output is not None:

@@ -15,12 +15,15 @@ from hilctl.identify.evaluation import Evaluation
 from hilctl.identify.pipeline import Identification
 from hilctl.identify.refine.refinement import Refinement
 from hilctl.identify.summary import (
+    CLASS_HEADINGS,
     HEADINGS,
     REFINEMENT_HEADINGS,
+    class_rows,
     error_rows,
     parameter_texts,
     refinement_rows,
     summary,
+    worse_lines,
 )
 from hilctl.models.model_file import dump_model
 
@@ -115,10 +118,10 @@ def refinement_page(found: Refinement) -> str:
     title = html.text(f"Refined: {', '.join(found.model.provenance.source)}")
     body = [
         f"<h1>{title}</h1>",
-        html.paragraph(str(found)),
-        html.paragraph(after.how),
+        *map(html.paragraph, (str(found), *worse_lines(found), after.how)),
         "<h2>Errors on runs not fitted</h2>",
         html.grid(REFINEMENT_HEADINGS, refinement_rows(found), "numbers"),
+        html.grid(CLASS_HEADINGS, class_rows(found), "numbers"),
     ]
     for heading, held in (("Before", found.choice.before), ("After", after)):
         body += [f"<h2>{heading}</h2>"]

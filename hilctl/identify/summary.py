@@ -8,6 +8,7 @@ from hilctl.identify.pipeline import Identification
 from hilctl.identify.refine.refinement import Refinement
 
 REFINEMENT_HEADINGS = ("run", "p-p µm", "peak % before", "after", "rms % before", "after")
+CLASS_HEADINGS = ("class", "largest p-p µm", "rms % before", "after")
 HEADINGS = ("loop", "p-p µm", "peak %", "rms %", "area %")
 
 
@@ -83,3 +84,16 @@ def refinement_rows(found: Refinement) -> list[tuple[str, ...]]:
         figures += [was.rms_percent, now.rms_percent]
         rows.append((was.label, *(f"{figure:.3g}" for figure in figures)))
     return rows
+
+
+def class_rows(found: Refinement) -> list[tuple[str, ...]]:
+    """Return one row per class of held-out runs under :data:`CLASS_HEADINGS`."""
+    return [
+        (each.label, *(f"{n:.3g}" for n in (each.peak_to_peak_um, each.before, each.after)))
+        for each in found.choice.classes
+    ]
+
+
+def worse_lines(found: Refinement) -> list[str]:
+    """Return one line per held-out run whose error increases with the accepted model."""
+    return [f"worse: {run}" for run in found.worse] if found.better else []

@@ -4,7 +4,7 @@ Held-out runs select the regularisation towards the old model.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,13 @@ from hilctl.identify.evaluation import judgement_of
 from hilctl.identify.fit_api import FitData, OnProgress, ignore_progress
 from hilctl.identify.fit_model import VERSIONS, error_table, identified_range
 from hilctl.identify.model_selection import HeldOut, folds_of
+from hilctl.identify.refine.acceptance import (
+    TOLERANCE_PERCENT,
+    AcceptanceRule,
+    ErrorChange,
+    error_changes,
+    worst_class,
+)
 from hilctl.identify.refine.residual_fit import ResidualFit
 from hilctl.models.base import HysteresisModel, IdentifiedRange, Provenance
 from hilctl.models.model_file import dump_model, load_model
@@ -33,11 +40,9 @@ STRENGTHS = (0.003, 0.01, 0.02, 0.03, 0.05, 0.1, 0.3, 1.0)
 ANCHORS = (100.0, 10.0, 3.0)
 """Weights of the old model on motions of its whole range, of the least weight."""
 AS_GOOD = 1.02  # of the least error on held-out runs
-WORTH = 0.9  # maximum error, of the old one: a smaller gain is not worth the risk
 STRETCHES = 10  # parts of a run that are evaluated separately
 MOST = 1.12  # maximum error of a part, of the old one
 FOREGONE = 0.5  # part of the possible gain that even errors may cost
-LOSS = 0.5  # maximum loss on one run, of the mean gain
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,13 +62,22 @@ class SelectedRegularisation:
     own: bool
     before: HeldOut
     after: HeldOut
+    rule: AcceptanceRule
 
     @property
-    def worse(self) -> tuple[str, ...]:
-        """Labels of held-out runs that lose more than a part of the mean gain."""
-        most = 1.0 + LOSS * max(1.0 - self.ratio, 0.0)
-        pairs = zip(self.after.judgement.errors, self.before.judgement.errors, strict=True)
-        return tuple(now.label for now, was in pairs if now.rms_percent > most * was.rms_percent)
+    def runs(self) -> tuple[ErrorChange, ...]:
+        """Errors of held-out runs before and after."""
+        return error_changes(self.before.judgement.errors, self.after.judgement.errors)
+
+    @property
+    def classes(self) -> list[ErrorChange]:
+        """Errors of classes of held-out runs before and after."""
+        return self.rule.classes(self.runs)
+
+    @property
+    def reasons(self) -> list[str]:
+        """Why the old model is kept; empty if the refined one is better."""
+        return self.rule.reasons(self.runs)
 
     @property
     def even(self) -> bool:
@@ -87,15 +101,15 @@ class SelectedRegularisation:
     def ratio(self) -> float:
         """Error after over error before: root mean square of the relative errors of the runs."""
         after, before = (
-            np.mean([error.rms_percent**2 for error in held.judgement.errors])
-            for held in (self.after, self.before)
+            np.mean([error**2 for error in errors])
+            for errors in zip(*((run.after, run.before) for run in self.runs), strict=True)
         )
         return float(np.sqrt(after / before))
 
     @property
     def better(self) -> bool:
-        """Whether it is better than the old model, and worse on no run."""
-        return self.ratio <= WORTH and not self.worse
+        """Whether it is better than the old model."""
+        return not self.reasons
 
     def as_good(self, other: "SelectedRegularisation") -> bool:
         """Return whether it is about as good as another one."""
@@ -133,8 +147,10 @@ class Regularisation:
         model: HysteresisModel,
         parts: Sequence[History],
         splits: Sequence[RegularisationSplit],
+        rule: AcceptanceRule,
     ) -> None:
         self._parts, self._splits, self._unit = parts, splits, model.input_unit
+        self._rule = rule
         # All fitted parts; also the end of a single run that is cut in two.
         fitted = {i for split in splits for i in split.fitted}
         cut = parts[-1].label == parts[0].label
@@ -161,11 +177,13 @@ class Regularisation:
         even = [way for way in left if way[0].even and way[0].better]
         even = [way for way in even if 1.0 - way[0].ratio >= least_gain]
         best = min(even, key=lambda way: way[0].ratio, default=best)
-        # Beyond the motions of the runs the old model is kept, if that costs almost nothing.
-        if not best[0].better:
-            return best
-        held = [self._tried(best[0].strength, anchor, own=own)[:2] for anchor in ANCHORS]
+        # Beyond the motions of the runs the old model is kept, if that costs almost nothing. That
+        # can also keep single runs from getting worse.
+        strengths = [best[0].strength] if best[0].better else STRENGTHS
+        held = [self._tried(s, a, own=own)[:2] for s in strengths for a in ANCHORS]
         least = min([best, *held], key=lambda way: (not way[0].better, way[0].ratio))
+        if not best[0].better:
+            return least
         good = (way for way in held if way[0].as_good(best[0]) and way[0].as_good(least[0]))
         return next(good, best)
 
@@ -176,7 +194,7 @@ class Regularisation:
         models = {s: self._refined(s.fitted, strength, anchor, own=own) for s in self._splits}
         after = self._held_out(models)
         bare = self._held_out(models, own=True) if own else after
-        choice = SelectedRegularisation(strength, anchor, own, self._before[own], bare)
+        choice = SelectedRegularisation(strength, anchor, own, self._before[own], bare, self._rule)
         whole = self._refined(self._whole, strength, anchor, own=own)
         return choice, whole, after.judgement.rms_percent
 
@@ -264,15 +282,22 @@ class Refinement:
 
     @property
     def better(self) -> bool:
-        """Whether it is better than the old model on held-out runs, and worse on none."""
+        """Whether it is better than the old model on held-out runs."""
         return not self.reasons
 
+    @property
+    def worse(self) -> list[ErrorChange]:
+        """Held-out runs whose error increases."""
+        return [run for run in self.choice.runs if run.increase > 0.0]
+
     def __str__(self) -> str:
-        was, now = self.choice.before.judgement, self.choice.after.judgement
-        what = f"peak error {now.own_peak_percent:.2f} % (before {was.own_peak_percent:.2f} %)"
-        if self.better:
-            return f"better: {self.choice.ratio:.2f} times the old error on held-out runs; {what}"
-        return f"no better than the old model: {'; '.join(self.reasons)}"
+        if not self.better:
+            return f"no better than the old model: {'; '.join(self.reasons)}"
+        return (
+            f"better: {self.choice.ratio:.2f} times the old error on held-out runs; worst class: "
+            f"{worst_class(self.choice.classes)}; "
+            f"{len(self.worse)} of {len(self.choice.runs)} runs worse"
+        )
 
     def to_mapping(self) -> dict[str, Any]:
         """Return all figures as plain mappings, lists and numbers, for JSON."""
@@ -284,6 +309,8 @@ class Refinement:
             "strength": self.choice.strength,
             "anchor": self.choice.anchor,
             "own_drift": self.choice.own,
+            "classes": [asdict(each) for each in self.choice.classes],
+            "worse": [asdict(each) for each in self.worse],
             "before": self.choice.before.to_mapping(),
             "after": self.choice.after.to_mapping(),
         }
@@ -295,6 +322,7 @@ def refine_files(
     output: Path | None,  # model file to write
     validate: Sequence[Path] = (),  # if there are none, those of ``paths`` in turn
     *,
+    tolerance_percent: float = TOLERANCE_PERCENT,
     overwrite: bool = False,
     progress: OnProgress = ignore_progress,
 ) -> Refinement:
@@ -308,7 +336,8 @@ def refine_files(
     old = load_model(model)
     progress(0.0, "reading")
     both = load_runs([*paths, *validate], old)
-    found = refine_runs(old, both[: len(paths)], both[len(paths) :], model.name, progress)
+    runs, others = both[: len(paths)], both[len(paths) :]
+    found = refine_runs(old, runs, others, model.name, progress, tolerance_percent)
     if output is not None and found.better:
         write_text(output, dump_model(found.model), overwrite=overwrite)
     return found
@@ -320,26 +349,23 @@ def refine_runs(
     validate: Sequence[History] = (),
     source: str = "",
     progress: OnProgress = ignore_progress,
+    tolerance_percent: float = TOLERANCE_PERCENT,
 ) -> Refinement:
     """Refine a model from runs, and evaluate it on held-out runs."""
     if reasons := tuple(data_reasons([*runs, *validate])):
         raise InputError("\n".join(reasons))
     parts, splits = parts_of(runs, validate)
-    choice, refined = Regularisation(old, parts, splits).best(progress)
+    rule = AcceptanceRule(_range_um(old, parts), tolerance_percent)
+    choice, refined = Regularisation(old, parts, splits, rule).best(progress)
     progress(1.0, "done")
     named = refined.model_copy(update={"provenance": _provenance(old, runs, choice, source)})
-    return Refinement(named, choice, tuple(_reasons(choice)))
+    return Refinement(named, choice, tuple(choice.reasons))
 
 
-def _reasons(choice: SelectedRegularisation) -> list[str]:
-    if choice.better:
-        return []
-    if choice.ratio <= WORTH:
-        return [f"held-out run '{label}' would become worse" for label in choice.worse]
-    return [
-        f"held-out runs would have {choice.ratio:.2f} times the old error: the rest is noise or "
-        "drift, or beyond this kind of model"
-    ]
+def _range_um(model: HysteresisModel, runs: Sequence[History]) -> float:
+    if model.output_range_um is not None:
+        return float(np.ptp(model.output_range_um))
+    return max(float(np.ptp(run.displacement_um[run.ignore :])) for run in runs)
 
 
 def _provenance(
