@@ -121,6 +121,7 @@ def refinement_page(found: Refinement) -> str:
         *map(html.paragraph, (str(found), *worse_lines(found), after.how)),
         "<h2>Errors on runs not fitted</h2>",
         html.grid(REFINEMENT_HEADINGS, refinement_rows(found), "numbers"),
+        "<h2>Errors by stroke</h2>",
         html.grid(CLASS_HEADINGS, class_rows(found), "numbers"),
     ]
     for heading, held in (("Before", found.choice.before), ("After", after)):

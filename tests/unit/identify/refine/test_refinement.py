@@ -14,7 +14,13 @@ from hilctl.identify.model_page import refinement_page
 from hilctl.identify.model_selection import HeldOut
 from hilctl.identify.refine import refinement
 from hilctl.identify.refine.acceptance import AcceptanceRule
-from hilctl.identify.summary import REFINEMENT_HEADINGS, refinement_rows
+from hilctl.identify.summary import (
+    CLASS_HEADINGS,
+    REFINEMENT_HEADINGS,
+    class_rows,
+    refinement_rows,
+    worse_lines,
+)
 from hilctl.models.model_file import dump_model, load_model
 from hilctl.models.refined import RefinedModel
 from hilctl.recording.reader import read
@@ -151,6 +157,15 @@ def test_nothing_is_written_where_it_is_no_better(tmp_path, monkeypatch, old):
     assert not output.exists()
 
 
+def test_runs_that_get_worse_are_named():
+    before, after = held_out((0.03, 0.01)), held_out((0.01, 0.011))
+    choice = refinement.SelectedRegularisation(0.1, 1.0, False, before, after, RULE)
+    found = refinement.Refinement(actuator(), choice, ())
+    assert [run.label for run in found.worse] == ["run 1"]
+    assert [each["label"] for each in found.to_mapping()["worse"]] == ["run 1"]
+    assert "run 1" in worse_lines(found)[0]
+
+
 def test_a_file_that_exists_is_refused_before_anything_is_read(tmp_path):
     output = tmp_path / "better.yaml"
     output.write_text("mine")
@@ -199,6 +214,7 @@ def test_page_has_verdict_table_figures_and_model(old, runs):
     rows = refinement_rows(found)
     assert [row[0] for row in rows] == ["run 0", "run 1", "run 2"]
     assert all(len(row) == len(REFINEMENT_HEADINGS) for row in rows)
+    assert all(len(row) == len(CLASS_HEADINGS) for row in class_rows(found))
     page = refinement_page(found)
     assert "a&lt;b&gt;.yaml" in page
     assert "<b>" not in page.replace("<body>", "")
