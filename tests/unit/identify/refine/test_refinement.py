@@ -218,7 +218,7 @@ def test_page_has_verdict_table_figures_and_model(old, runs):
     page = refinement_page(found)
     assert "a&lt;b&gt;.yaml" in page
     assert "<b>" not in page.replace("<body>", "")
-    assert page.count("<svg") == 2
+    assert page.count("<svg") == 2 * len(rows)
     assert "kind: refined" in page
 
 
