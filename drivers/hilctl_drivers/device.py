@@ -6,10 +6,11 @@ unknown, so the connection is closed and the device must be opened again. A subc
 exchanges and disconnects.
 """
 
+import json
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -249,6 +250,14 @@ class DacDevice(ABC):
         unit = self._info.command_unit
         rule = f"{name} must be in [{self._low:g}, {self._high:g}] {unit}"
         return self._error(self._action, f"{rule}, got {command[index]} {unit}, nothing was sent")
+
+
+def details_of(values: Mapping[str, Any]) -> dict[str, str]:
+    """Return values for :attr:`hilctl.base.device.DeviceInfo.details`: texts, others as JSON."""
+    return {
+        name: value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+        for name, value in values.items()
+    }
 
 
 def check_fifo(block: int, fifo_blocks: int, depth: int) -> None:

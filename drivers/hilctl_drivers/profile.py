@@ -32,10 +32,11 @@ class BrokenProfileError(ConfigError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class NamedProfile:
-    """A profile, and its name in the experiment: that of a shipped one, or a path."""
+    """A profile, its text, and its name in the experiment: that of a shipped one, or a path."""
 
     name: str
     profile: BaseProfile
+    text: str
 
 
 def _named(value: object, info: ValidationInfo) -> NamedProfile:
@@ -50,9 +51,7 @@ def _named(value: object, info: ValidationInfo) -> NamedProfile:
         raise PydanticKnownError("string_type")
     context = info.context or {}
     try:
-        return NamedProfile(
-            value, load_profile(value, context.get("files"), context.get("folder", Path()))
-        )
+        return _load(value, context.get("files"), context.get("folder", Path()))
     except ConfigError as error:
         raise BrokenProfileError(error.problems) from None
     except InputError as error:
@@ -102,6 +101,10 @@ def load_profile(
         InputError: There is no such profile, or the file cannot be read.
         ConfigError: It breaks rules; all are listed.
     """
+    return _load(name_or_path, files, folder).profile
+
+
+def _load(name_or_path: str, files: TextFiles | None, folder: Path | None) -> NamedProfile:
     shipped = shipped_profiles()
     if name_or_path in shipped:
         path = shipped[name_or_path]
@@ -113,7 +116,8 @@ def load_profile(
             f"no profile '{name_or_path}' is shipped ({hint}): take another one, or give the path "
             "of a .yaml file"
         )
-    return parse_profile((files or TextFiles()).read(path), str(path))
+    text = (files or TextFiles()).read(path)
+    return NamedProfile(name_or_path, parse_profile(text, str(path)), text)
 
 
 def parse_profile(text: str, where: str) -> BaseProfile:

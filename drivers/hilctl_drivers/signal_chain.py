@@ -15,6 +15,7 @@ from hilctl.base.device import DeviceInfo, DeviceOptions
 from hilctl.base.errors import InputError
 from hilctl.base.strict import StrictModel
 from hilctl.base.types import F64, CommandUnit
+from hilctl_drivers.device import details_of
 from hilctl_drivers.profile import ProfileName
 from hilctl_drivers.profile_base import Range, Watchdog
 from hilctl_drivers.transport.wire_time import RateLimit
@@ -283,8 +284,15 @@ class DacOptions(AddressOptions):
         return 0.0 if self.watchdog == "none" else self.watchdog.safe_command
 
     def details(self) -> dict[str, str]:
-        """Return the options as text, to keep with a recording."""
-        return {name: str(value) for name, value in self.model_dump(exclude_none=True).items()}
+        """Return the options for a recording: texts, other values as JSON."""
+        return details_of(self.model_dump(mode="json", exclude_none=True))
+
+    def files(self) -> dict[str, str]:
+        """Return the texts of the profiles for a recording."""
+        named = {"profile.yaml": self.profile}
+        if self.reader is not None:
+            named["reader_profile.yaml"] = self.reader.profile
+        return {name: each.text for name, each in named.items()}
 
 
 class SignalChain:
@@ -369,6 +377,7 @@ class SignalChain:
             sensor_max_um=self.displacement_range[1],
             max_rate_hz=rates.highest_hz,
             rate_note=rates.note,
+            files=options.files(),
             **more,
         )
 

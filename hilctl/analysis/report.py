@@ -215,6 +215,7 @@ def _identity(recording: Recording) -> dict[str, Any]:
         "name": recording.run.get("name", ""),
         "labels": recording.labels,
         "device": recording.run.get("device", ""),
+        "device_description": recording.run.get("device_description", ""),
         "simulated": recording.run.get("simulated") == "true",
         "reason": recording.end.get("reason", "") if recording.end else cut_short,
         "sample_rate_hz": recording.sample_rate_hz,

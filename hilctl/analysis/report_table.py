@@ -22,6 +22,7 @@ def run_rows(report: RunReport) -> list[tuple[str, str]]:
     return [
         *([("labels", printable(labels))] if labels else []),
         ("device", f"{printable(report.device) or MISSING}{simulated}"),
+        ("device is", printable(report.device_description) or MISSING),
         ("ended", f"{reason}{'' if report.complete else ' (NOT complete)'}"),
         ("samples", f"{report.samples:,} of the waveform, {report.ramp_samples:,} of ramps"),
         ("missing samples", f"{report.dropped:,}"),

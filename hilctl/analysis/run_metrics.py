@@ -108,6 +108,7 @@ class RunReport(RunMetrics):
     name: str
     labels: Mapping[str, LabelValue]
     device: str
+    device_description: str
     simulated: bool
     reason: str
     complete: bool

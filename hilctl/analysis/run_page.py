@@ -54,7 +54,7 @@ def page(recording: Recording, report: RunReport, before: Recording | None = Non
     samples = [
         (name, value)
         for name, value in report_table.run_rows(report)
-        if name not in {"labels", "device"}
+        if name not in {"labels", "device", "device is"}
         and value != MISSING
         # The end of an incomplete run is above.
         and (report.complete or name != "ended")
@@ -79,6 +79,7 @@ def page(recording: Recording, report: RunReport, before: Recording | None = Non
         html.definitions("Definitions", definitions_of(*terms)) if terms else "",
         html.details("Experiment", recording.experiment_yaml) if recording.experiment_yaml else "",
         html.details("Model", recording.model_yaml) if recording.model_yaml else "",
+        *(html.details(name, text) for name, text in sorted(recording.device_files.items())),
     ]
     return html.document(title, filter(None, body))
 

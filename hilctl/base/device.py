@@ -54,6 +54,7 @@ class DeviceInfo:
         confirms: Whether an answer of the device is evidence of the command that it answers.
         details: Facts for the recording (serial numbers, physical parameters). Opening may add some
             (``transactions``: requests per tick).
+        files: YAML texts for the recording by file name, such as ``profile.yaml``.
     """
 
     name: str
@@ -79,6 +80,7 @@ class DeviceInfo:
     safe_note: str = ""
     confirms: bool = True
     details: Mapping[str, str] = field(default_factory=dict)
+    files: Mapping[str, str] = field(default_factory=dict)
 
 
 REQUIRED = ("info", "open", "exchange", "make_safe", "close")

@@ -26,6 +26,9 @@ OVERRIDES_FACT = "overrides"
 RECORDINGS = "recordings"
 """Default folder of recordings, relative to the working directory."""
 
+DEVICE_FILES = "device/"
+"""Start of the names of attachments with files of the device, such as its profile."""
+
 CHECKSUM_FACT = "crc32"
 """Fact of every metadata record: CRC-32 of its name and other facts, in hexadecimal digits."""
 

@@ -16,7 +16,7 @@ from hilctl.base.files import no_such_file, reason
 from hilctl.base.samples import COLUMNS, LAST_SAMPLE, Samples
 from hilctl.base.types import F64, I64, U32, CommandUnit
 from hilctl.recording.codec import BlockArrays
-from hilctl.recording.metadata_keys import unsealed
+from hilctl.recording.metadata_keys import DEVICE_FILES, unsealed
 from hilctl.recording.recording import TICK_COLUMNS, Recording, ReplayStart, Ticks
 from hilctl.recording.recording_files import is_being_recorded
 from hilctl.recording.recovery_scan import RecoveryScan
@@ -95,7 +95,7 @@ class RecordingBuilder:
                 self._run, _ = unsealed(record.name, record.metadata)  # the scan notes damage
             case Metadata(name="hilctl.end"):
                 self._end, _ = unsealed(record.name, record.metadata)
-            case Attachment() if record.name in _TEXTS:
+            case Attachment() if record.name in _TEXTS or record.name.startswith(DEVICE_FILES):
                 self._refuse_late(record.name)
                 try:
                     self._texts[record.name] = record.data.decode()
@@ -200,6 +200,11 @@ class RecordingBuilder:
             "experiment_yaml": self._texts.get("experiment.yaml", ""),
             "model_yaml": self._texts.get("model.yaml", ""),
             "correction_yaml": self._texts.get("correction.yaml", ""),
+            "device_files": {
+                name.removeprefix(DEVICE_FILES): text
+                for name, text in self._texts.items()
+                if name.startswith(DEVICE_FILES)
+            },
             "labels": labels_of(run),
         }
 

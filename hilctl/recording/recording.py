@@ -61,6 +61,7 @@ class Recording:
         model_yaml: The compensator's model, or empty.
         starts: Possible starts of a replay.
         correction_yaml: The learned correction that was added to the reference, or empty.
+        device_files: YAML texts by name: ``profile.yaml`` and ``reader_profile.yaml``.
     """
 
     path: Path
@@ -79,3 +80,4 @@ class Recording:
     starts: tuple[ReplayStart, ...] = ()
     correction_yaml: str = ""
     labels: Mapping[str, LabelValue] = field(default_factory=dict)
+    device_files: Mapping[str, str] = field(default_factory=dict)

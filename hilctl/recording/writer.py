@@ -9,7 +9,7 @@ import json
 import os
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from io import FileIO
 from pathlib import Path
 from typing import IO, cast
@@ -22,7 +22,7 @@ from hilctl.base.files import begins_as_recording
 from hilctl.base.samples import BlockBatch
 from hilctl.base.segments import Segment
 from hilctl.recording.encoder import MessageMaker, RecordingLayout, Topics
-from hilctl.recording.metadata_keys import sealed
+from hilctl.recording.metadata_keys import DEVICE_FILES, sealed
 from hilctl.recording.recording_files import lock
 
 _CHUNK_BYTES = 5 << 20
@@ -44,6 +44,7 @@ class RunFacts:
     model_yaml: str
     layout: RecordingLayout
     correction_yaml: str = ""
+    device_files: Mapping[str, str] = field(default_factory=dict)
 
 
 class RecordingWriter:
@@ -65,6 +66,7 @@ class RecordingWriter:
         texts = {"experiment.yaml": run.experiment_yaml}
         texts |= {"model.yaml": run.model_yaml} if run.model_yaml else {}
         texts |= {"correction.yaml": run.correction_yaml} if run.correction_yaml else {}
+        texts |= {f"{DEVICE_FILES}{name}": text for name, text in run.device_files.items()}
         for name, text in texts.items():
             times = start_unix_ns, start_unix_ns
             self._writer.add_attachment(*times, name, "application/yaml", text.encode())

@@ -96,7 +96,11 @@ def run_facts(
         if isinstance(value, str | int | float)
     }
     facts |= machine_facts(config.realtime, Path(config.recording.folder))
-    return facts | {f"device.{key}": value for key, value in info.details.items()}
+    facts |= {f"device.{key}": value for key, value in info.details.items()}
+    return facts | {
+        f"device.{name.removesuffix('.yaml')}_sha256": sha256_of(text)
+        for name, text in info.files.items()
+    }
 
 
 def experiment_sha256(loaded: "LoadedExperiment") -> str:

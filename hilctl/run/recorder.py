@@ -231,6 +231,7 @@ class Recorder:
             experiment_yaml=loaded.yaml_text,
             model_yaml=model_yaml,
             correction_yaml=correction_yaml,
+            device_files=info.files,
             layout=RecordingLayout(
                 sample_rate_hz=config.sample_rate_hz,
                 command_unit=info.command_unit,

@@ -15,7 +15,7 @@ from hilctl.base.device import DeviceInfo, DeviceOptions
 from hilctl.base.errors import DeviceError
 from hilctl.base.strict import Field, StrictModel, model_validator
 from hilctl.base.types import F64
-from hilctl_drivers.device import DacDevice
+from hilctl_drivers.device import DacDevice, details_of
 from hilctl_drivers.simulated.actuator_base import Plant, RodParameters
 from hilctl_drivers.simulated.diffusion import DiffusionParameters
 from hilctl_drivers.simulated.domains import DomainsParameters
@@ -80,7 +80,7 @@ class SimulatedDevice(DacDevice):
     ) -> None:
         """Describe the device; a recording keeps parameters and options as its details."""
         plain = asdict(parameters)
-        details = plain | plain.pop("rods", {}) | options.model_dump()
+        details = plain | plain.pop("rods", {}) | options.model_dump(mode="json")
         described = DeviceInfo(
             sensor_min_um=-parameters.sensor_range_um,
             sensor_max_um=parameters.sensor_range_um,
@@ -89,7 +89,7 @@ class SimulatedDevice(DacDevice):
             fifo_depth=FIFO_DEPTH,
             measures_command=True,
             simulated=True,
-            details={name: str(value) for name, value in details.items()},
+            details=details_of(details),
             **info,
         )
         super().__init__(described, described.name, "exchange a block", "the output")

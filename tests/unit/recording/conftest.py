@@ -49,6 +49,7 @@ def write(
         segments=(SEGMENT,),
         experiment_yaml="name: x\n",
         model_yaml="model: y\n",
+        device_files={"profile.yaml": "vendor: z\n"},
         layout=RecordingLayout(
             sample_rate_hz=RATE_HZ,
             command_unit=unit,

@@ -34,6 +34,7 @@ def test_everything_comes_back(recorded, make):
     assert back.events == (make.ended,)
     assert back.segments == (make.segment,)
     assert (back.experiment_yaml, back.model_yaml) == ("name: x\n", "model: y\n")
+    assert back.device_files == {"profile.yaml": "vendor: z\n"}
     assert back.end["recorded_samples"] == "1850"
     assert back.end["missing_samples"] == "200"
     assert back.compensated

@@ -1,5 +1,6 @@
 """What a recording says of its run."""
 
+import hashlib
 import json
 from dataclasses import replace
 from itertools import pairwise
@@ -73,6 +74,15 @@ def test_labels_are_recorded_and_change_no_identity():
 
 
 CONFIGS = Path(__file__).parents[3] / "configs"
+
+
+def test_profiles_have_hashes():
+    checked = checked_experiment(CONFIGS / "modbus_adam_6224.yaml", [])
+    facts = run_facts(checked, "2000-01-01T00:00:00", "")
+    files = checked.loaded.device.info.files
+    for name in ("profile", "reader_profile"):
+        text = files[f"{name}.yaml"]
+        assert facts[f"device.{name}_sha256"] == hashlib.sha256(text.encode()).hexdigest()
 
 
 def test_a_description_says_what_the_experiment_says(tmp_path):

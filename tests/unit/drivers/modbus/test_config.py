@@ -7,6 +7,7 @@ import pytest
 from hilctl.base.errors import InputError
 from hilctl_drivers.modbus.config import ModbusOptions
 from hilctl_drivers.modbus.modbus_dac import ModbusDac
+from hilctl_drivers.profile import shipped_profiles
 from tests.unit.drivers.modbus.conftest import exchange
 
 PAIR = {
@@ -115,3 +116,8 @@ class TestPlaces:
         assert info.details["model"] == "M-7024 (Modbus RTU)"
         assert info.details["reader_model"] == "M-7017 (Modbus RTU)"
         assert "m7000_address_mapping" in info.details["reader_source"]
+        shipped = shipped_profiles()
+        assert info.files == {
+            "profile.yaml": shipped["icp_m7024"].read_text(),
+            "reader_profile.yaml": shipped["icp_m7017"].read_text(),
+        }

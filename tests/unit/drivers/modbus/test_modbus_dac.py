@@ -1,5 +1,6 @@
 """modbus_dac on loopback: what it checks before it opens, how it exchanges, and its watchdog."""
 
+import json
 import math
 
 import numpy as np
@@ -104,9 +105,12 @@ class TestOptions:
         assert (info.watchdog_command, info.watchdog_reason) == (1.5, "holds a load")
         assert made().info.watchdog_command is None
 
-    def test_calibration_is_kept(self):
+    def test_wiring_is_kept_as_json(self):
         calibration = {"date": "2026-01-01", "by": "N. N.", "reference": "sheet 4"}
-        assert "sheet 4" in made(calibration=calibration).info.details["calibration"]
+        details = made(calibration=calibration).info.details
+        assert json.loads(details["calibration"]) == calibration
+        assert json.loads(details["amplifier"]).keys() == {"gain_a_per_v", "offset_a", "offset_v"}
+        assert json.loads(details["sensor"]).keys() == {"um_per_v", "offset_um"}
 
 
 SILENCE_S = 0.5
