@@ -12,9 +12,8 @@ refine      better models from recordings of their use
 """
 
 PUBLIC = (
-    "data.cycles", "data.records", "evaluation", "fit_api", "fit_model", "model_page",
-    "model_quality", "model_selection", "parallel", "pipeline", "refine.acceptance",
-    "refine.refinement", "registry",
-    "settings", "summary",
+    "data.cycles", "data.data_files", "data.records", "evaluation", "fit_api", "fit_model",
+    "model_page", "model_quality", "model_selection", "parallel", "pipeline",
+    "refine.acceptance", "refine.refinement", "registry", "settings", "summary",
 )  # fmt: skip
 """Modules that other rooms import; the others are private."""

@@ -209,8 +209,8 @@ def identified_range(data: FitData) -> IdentifiedRange:
     """Return the range of motions, frequencies and speeds of the records."""
     moves = [float(np.ptp(data.target_um[place])) for place in data.places]
     speeds = [
-        move * float(speed.max()) / float(np.ptp(record.command))
-        for move, speed, record in zip(moves, data.speeds, data.records, strict=True)
+        move * float(np.abs(record.rate()).max()) / float(np.ptp(record.command))
+        for move, record in zip(moves, data.records, strict=True)
     ]
     lowest, highest = zip(*map(frequencies_hz, data.records), strict=True)
     return IdentifiedRange(

@@ -126,12 +126,16 @@ def _halved(record: Record) -> tuple[Record, Record | None]:
     """Return the fitted and the held-out part of a record; no part of a loop is held out."""
     if isinstance(record, SteadyLoop):
         return record, None
-    label, rate_hz = record.label, record.sample_rate_hz
-    command, displacement_um = record.command, record.displacement_um
+    command, displacement_um, held = record.command, record.displacement_um, record.held
     cut = record.ignore + round(HEAD * (command.size - record.ignore))
     try:
-        head = History(label, command[:cut], displacement_um[:cut], rate_hz, record.ignore)
-        tail = History(label, command, displacement_um, rate_hz, cut)
+        head = replace(
+            record,
+            command=command[:cut],
+            displacement_um=displacement_um[:cut],
+            held=held[held < cut],
+        )
+        tail = replace(record, ignore=cut)
     except DataError:
         return record, None
     moves = np.ptp(displacement_um[cut:]) > MOVES * np.ptp(displacement_um)
@@ -145,9 +149,9 @@ def _within(record: Record, others: Sequence[Record]) -> bool:
 
 def _extremes(record: Record) -> F64:
     """Return command, frequency and speed, both ways, that held-out records may not exceed."""
-    command, rate, _ = record.run()
+    command = record.command
     frequency_hz = record.frequency_hz if isinstance(record, SteadyLoop) else 0.0
-    speed = float(np.abs(rate).max())
+    speed = float(np.abs(record.rate()).max())
     return np.array([command.max(), -command.min(), frequency_hz, -frequency_hz, speed])
 
 

@@ -1,5 +1,6 @@
 """Records of an identification, read from recordings and text tables."""
 
+import logging
 from collections.abc import Iterable, Sequence
 from itertools import chain
 from pathlib import Path
@@ -11,13 +12,15 @@ from hilctl.base.errors import DataError, InputError
 from hilctl.base.samples import Flag
 from hilctl.base.table import Column, Table
 from hilctl.base.table_file import open_table
-from hilctl.base.types import F64, CommandUnit
+from hilctl.base.types import F64, I64, CommandUnit
 from hilctl.identify.data.cycles import find_cycles, loops_from_pieces
 from hilctl.identify.data.data_faults import correlation
 from hilctl.identify.data.records import History, Record
 from hilctl.identify.settings import IdentifySettings, TableSettings
 from hilctl.recording.reader import RecordingStream
 from hilctl.recording.recording import Recording
+
+_log = logging.getLogger(__name__)
 
 SLOWEST_HZ, SMALLEST_UM = 10.0, 0.5  # sample rate and stroke, below which units are in doubt
 FOLLOWS = 0.5  # correlation with the command of a displacement that is more than noise
@@ -172,33 +175,75 @@ def load_records(
     return LoadedRecords(records, next(iter(units), None), understood)
 
 
+_MOST_MISSING = 0.01  # share of samples
+
+
+def without_gaps(recording: Recording, start: int, stop: int) -> tuple[F64, F64]:
+    """Return every command and displacement in [start, stop), with gaps filled.
+
+    The command is held, as the device holds its output in skipped ticks. The displacement in um is
+    interpolated: it approaches that of the held command, which the next sample still shows.
+
+    Raises:
+        DataError: More than 1 % of the samples are missing or have no displacement.
+    """
+    samples = recording.samples.part(start, stop)
+    signals = samples.index, samples.command, samples.displacement_um
+    return _filled(recording.path, *signals, np.arange(start, stop))
+
+
+def _filled(
+    path: Path, index: I64, command: F64, displacement_um: F64, wanted: I64
+) -> tuple[F64, F64]:
+    good = np.isfinite(displacement_um)
+    missing = wanted.size - np.count_nonzero(good)
+    if missing > _MOST_MISSING * wanted.size:
+        rule = f"{missing} of {wanted.size} samples are missing or have no displacement"
+        raise DataError(f"{path}: {rule}: check late ticks and the sensor")
+    if missing:
+        text = "the command is held and the displacement interpolated"
+        _log.warning("%s: %d of %d samples are missing: %s", path, missing, wanted.size, text)
+    last = np.maximum(np.searchsorted(index, wanted, side="right") - 1, 0)
+    filled_um = np.interp(wanted, index[good], displacement_um[good])
+    return np.ascontiguousarray(command[last]), filled_um
+
+
 def history_from_pieces(pieces: Iterable[Recording]) -> History:
     """Return the whole waveform of a run from rest, without the ramp at its end.
 
+    Skipped samples are filled, see :func:`without_gaps`.
+
     Raises:
-        DataError: Samples are missing or have no displacement, the run is too long, or it begins
-            with a ramp from another output, so that its initial state is unknown.
+        DataError: Too many samples are missing, the command of a missing one is unknown, the run is
+            too long, or it begins with a ramp from another output, so that its initial state is
+            unknown.
     """
+    indices: list[I64] = []
     command: list[F64] = []
     displacement_um: list[F64] = []
-    conditioned = size = begins_at = 0
-    ramped = broken = False
+    conditioned = begins_at = next_sample = 0
+    ramped = lost = False
     for piece in pieces:
         samples = piece.samples
         condition = (samples.flags & Flag.CONDITION.value) != 0
         if condition.any() and not conditioned:  # conditioning erases what came before
             samples = samples.rows(slice(int(np.argmax(condition)), None))
-            command, displacement_um, size, begins_at = [], [], 0, int(samples.index[0])
-            ramped = broken = False
-        conditioned += int(np.count_nonzero(condition))  # sets the state; not evaluated
+            indices, command, displacement_um = [], [], []
+            begins_at = next_sample = int(samples.index[0])
+            ramped = lost = False
+        if condition.any():  # sets the state; not evaluated
+            conditioned = int(piece.samples.index[condition][-1]) + 1 - begins_at
         rows = (samples.flags & Flag.RAMP.value) == 0
         ramped |= bool(rows.size) and samples.index[0] == 0 and not rows[0]
         index = samples.index[rows]
-        broken |= not np.array_equal(index, begins_at + size + np.arange(index.size))
+        gaps = np.diff(index, prepend=next_sample - 1) > 1
+        # In other gaps samples were output but not recorded.
+        lost |= bool(np.any(gaps & ((samples.flags[rows] & Flag.AFTER_SKIPPED.value) == 0)))
+        next_sample = int(index[-1]) + 1 if index.size else next_sample
+        indices.append(index)
         command.append(samples.command[rows])
         displacement_um.append(samples.displacement_um[rows])
-        size += index.size
-        if size > MOST_WHOLE:
+        if next_sample - begins_at > MOST_WHOLE:
             raise DataError(
                 f"{piece.path}: has more than {MOST_WHOLE:,} samples, too many to be fitted as a "
                 "whole. Omit --whole to use its steady cycles, or record a shorter run"
@@ -208,14 +253,15 @@ def history_from_pieces(pieces: Iterable[Recording]) -> History:
             f"{piece.path}: begins with a ramp, so the actuator was not at rest. Omit --whole to "
             "use its steady cycles"
         )
-    broken |= not all(np.isfinite(each).all() for each in displacement_um)
-    if broken or not size:
+    if lost or next_sample == begins_at:
         raise DataError(
-            f"{piece.path}: samples are missing, so it can't be fitted as a whole. "
-            "Omit --whole to use its steady cycles"
+            f"{piece.path}: samples are missing whose command is unknown, so it can't be fitted as "
+            "a whole. Omit --whole to use its steady cycles"
         )
-    label, rate_hz = piece.path.name, piece.sample_rate_hz
-    return History(label, _joined(command), _joined(displacement_um), rate_hz, conditioned)
+    signals = np.concatenate(indices), _joined(command), _joined(displacement_um)
+    filled = _filled(piece.path, *signals, np.arange(begins_at, next_sample))
+    held = np.setdiff1d(np.arange(next_sample - begins_at), signals[0] - begins_at)
+    return History(piece.path.name, *filled, piece.sample_rate_hz, conditioned, held)
 
 
 def _joined(parts: list[F64]) -> F64:

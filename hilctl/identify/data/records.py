@@ -1,7 +1,7 @@
 """Records that models are fitted to: steady loops and time histories."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -69,6 +69,8 @@ class History:
     displacement_um: F64  # float64[n]
     sample_rate_hz: float
     ignore: int = 0  # samples at the start that are not evaluated
+    held: I64 = field(default_factory=lambda: np.empty(0, np.int64))
+    """Samples of skipped ticks, in which the command was held."""
 
     def __post_init__(self) -> None:
         check_signals(self.label, self.command, self.displacement_um)
@@ -100,6 +102,12 @@ class History:
         """Return samples to simulate, their backward difference, and the number not evaluated."""
         rate = np.diff(self.command, prepend=self.command[0]) * self.sample_rate_hz
         return np.ascontiguousarray(self.command), rate, self.ignore
+
+    def rate(self) -> F64:
+        """Return the rate of the motion, float64[n]; skipped ticks do not make it faster."""
+        kept = np.setdiff1d(np.arange(self.command.size), self.held)
+        moved = np.interp(np.arange(self.command.size), kept, self.command[kept])
+        return np.diff(moved, prepend=moved[0]) * self.sample_rate_hz
 
 
 Record: TypeAlias = SteadyLoop | History
@@ -143,6 +151,10 @@ class ThinHistory(History):
     def time_s(self) -> F64:
         """Time of each sample since the first of the whole: float64[n]."""
         return np.asarray(self.index / self.sample_rate_hz, dtype=np.float64)
+
+    def rate(self) -> F64:
+        """Return the rate of the motion, see :meth:`History.rate`."""
+        return self.rates
 
     def run(self) -> tuple[F64, F64, int]:
         """Return what a model is run on, see :meth:`History.run`."""

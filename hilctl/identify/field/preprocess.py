@@ -168,5 +168,4 @@ def histories_of(records: Sequence[Record], what: str) -> list[History]:
 
 def _speed(record: History) -> float:
     """Return the largest rate of a command; a quantile, because a measured one has noise."""
-    _, rate, _ = record.run()
-    return float(np.quantile(np.abs(rate), 0.999))
+    return float(np.quantile(np.abs(record.rate()), 0.999))

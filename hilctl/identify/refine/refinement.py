@@ -263,7 +263,10 @@ def _history(recording: Recording, known: Mapping[str, Recording]) -> History:
     ahead = np.zeros(command.size - history.command.size)  # not evaluated
     displacement_um = np.concatenate((ahead, history.displacement_um))
     ignore = ahead.size + history.ignore
-    return replace(history, command=command, displacement_um=displacement_um, ignore=ignore)
+    held = history.held + ahead.size
+    return replace(
+        history, command=command, displacement_um=displacement_um, ignore=ignore, held=held
+    )
 
 
 @shown_briefly

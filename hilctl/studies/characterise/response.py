@@ -11,6 +11,7 @@ from scipy.optimize import OptimizeResult, least_squares
 from hilctl.analysis.steady_state import steady_samples
 from hilctl.base.errors import DataError, RunError
 from hilctl.base.types import C128, F64, I64
+from hilctl.identify.data.data_files import without_gaps
 from hilctl.ilc.cycle import coefficients
 from hilctl.recording.recording import Recording
 
@@ -40,7 +41,6 @@ _EVEN = 2.0
 _FEWEST_CYCLES = 4
 _MEAN_S = 0.1
 _LONG = 10  # times that: shortest hold for creep
-_MOST_MISSING = 0.01  # share of samples
 _FEWEST_LINES = 8
 _USABLE = 0.3  # largest relative noise of a line that is fitted
 _HYSTERESIS = 0.03  # of a line, that no linear response explains
@@ -163,26 +163,6 @@ def _each_cycle(since: I64, period: float, values: F64, cycles: int) -> np.ndarr
         slope = np.polynomial.polynomial.polyfit(np.arange(len(rows)), means, 1)[1]
         values = values - slope * since / period
     return np.array([coefficients(since[r], period, values[r], 2) for r in rows])
-
-
-def without_gaps(recording: Recording, start: int, stop: int) -> tuple[F64, F64]:
-    """Return every command and displacement in [start, stop), with gaps filled.
-
-    The command is held, and the displacement in um interpolated: float64[stop - start] each.
-
-    Raises:
-        DataError: More than 1 % of the samples are missing or have no displacement.
-    """
-    samples = recording.samples.part(start, stop)
-    wanted = np.arange(start, stop)
-    good = np.isfinite(samples.displacement_um)
-    missing = wanted.size - np.count_nonzero(good)
-    if missing > _MOST_MISSING * wanted.size:
-        rule = f"{missing} of {wanted.size} samples are missing or have no displacement"
-        raise DataError(f"{recording.path}: {rule}: check late ticks and the sensor")
-    last = np.maximum(np.searchsorted(samples.index, wanted, side="right") - 1, 0)
-    displacement_um = np.interp(wanted, samples.index[good], samples.displacement_um[good])
-    return np.ascontiguousarray(samples.command[last]), displacement_um
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,6 +9,7 @@ import numpy as np
 
 from hilctl.base.formatting import shown_briefly
 from hilctl.base.types import F64
+from hilctl.identify.data.data_files import without_gaps
 from hilctl.identify.data.records import History
 from hilctl.identify.fit_api import FitRequest
 from hilctl.identify.model_quality import MOST_PERCENT, Verdict, grade_of
@@ -23,7 +24,6 @@ from hilctl.studies.characterise.response import (
     RestNoise,
     SmallSignal,
     StepResponseCheck,
-    without_gaps,
 )
 
 
@@ -191,8 +191,10 @@ def identified(recordings: Mapping[str, Path]) -> Identification:
 
 def _history(recording: Recording) -> History:
     """Return a recording up to the end of its last waveform, with gaps filled."""
-    signals = without_gaps(recording, 0, recording.segments[-1].steady_stop)
-    return History(recording.path.name, *signals, recording.sample_rate_hz)
+    stop = recording.segments[-1].steady_stop
+    signals = without_gaps(recording, 0, stop)
+    held = np.setdiff1d(np.arange(stop), recording.samples.index)
+    return History(recording.path.name, *signals, recording.sample_rate_hz, held=held)
 
 
 def validated(

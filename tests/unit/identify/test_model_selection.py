@@ -72,6 +72,14 @@ def test_a_history_that_grows_has_no_part_that_says_anything_of_the_rest():
     assert folds_of([history(np.linspace(0.5, 1.0, 1000))]) == []
 
 
+def test_a_step_after_skipped_ticks_is_no_faster_motion():
+    record = history(np.ones(1000))
+    skipped = np.array([879, 880])  # the command crosses 0
+    record.command[skipped] = record.command[878]
+    assert folds_of([record]) == []
+    assert len(folds_of([replace(record, held=skipped)])) == 1
+
+
 def test_a_history_that_rests_at_its_end_is_fitted_as_a_whole():
     """Errors in percent of the little that a rest moves by would say nothing."""
     envelope = np.where(np.arange(1000) < 650, 1.0, 0.02)

@@ -11,10 +11,19 @@ import pytest
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.samples import Flag
 from hilctl.identify.data import data_files
-from hilctl.identify.data.data_files import history_from_pieces, load_records, read_table
+from hilctl.identify.data.data_files import (
+    history_from_pieces,
+    load_records,
+    read_table,
+    without_gaps,
+)
 from hilctl.identify.data.records import History, SteadyLoop
+from hilctl.identify.evaluation import judge
+from hilctl.identify.fit_api import FitRequest
+from hilctl.identify.fit_model import fit_model
 from hilctl.identify.pipeline import settings_from
 from hilctl.identify.settings import TableSettings
+from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 
 GOLDEN = Path(__file__).parents[4] / "recordings" / "golden"
 CURRENT, VOLTAGE = GOLDEN / "terfenol_uncompensated.mcap", GOLDEN / "piezo_compensated.mcap"
@@ -61,17 +70,75 @@ def test_a_conditioned_history_begins_with_its_cycle(recording_of, ramp):
     assert history.ignore == 60 - ramp
 
 
-@pytest.mark.parametrize("what", ["begins late", "has a gap", "has no reading"])
-def test_a_history_with_missing_samples_is_refused(recording_of, what):
-    index, displacement_um = np.arange(100), np.zeros(100)
-    if what == "begins late":
-        index += 1
-    elif what == "has a gap":
-        index[50:] += 1
-    else:
-        displacement_um[50] = np.nan
-    with pytest.raises(DataError, match="samples are missing"):
-        history_from_pieces([recording_of(np.zeros(100), displacement_um, [], index=index)])
+@pytest.mark.parametrize("what", ["begins late", "lost samples"])
+def test_a_history_without_known_commands_is_refused(recording_of, what):
+    index = np.arange(200)
+    index[0 if what == "begins late" else 50 :] += 1
+    with pytest.raises(DataError, match="command is unknown"):
+        history_from_pieces([recording_of(np.zeros(200), np.zeros(200), [], index=index)])
+
+
+def skipping(recording_of, skipped):
+    """Return a ramp of 1000 samples with skipped ticks."""
+    index = np.delete(np.arange(1000), skipped)
+    recording = recording_of(1.0 * index, 2.0 * index, [], index=index)
+    recording.samples.flags[1:][np.diff(index) > 1] |= Flag.AFTER_SKIPPED.value
+    return recording
+
+
+@pytest.mark.parametrize("edges", [[], [500], [300, 501, 700]])
+def test_skipped_samples_hold_the_command(recording_of, edges):
+    recording = skipping(recording_of, [500, 501])
+    history = history_from_pieces(pieces_of(recording, edges))
+    assert history.command.size == 1000
+    np.testing.assert_array_equal(history.command[498:504], [498, 499, 499, 499, 502, 503])
+    np.testing.assert_allclose(history.displacement_um, 2.0 * np.arange(1000))
+    np.testing.assert_allclose(history.rate()[1:], history.sample_rate_hz)  # no faster motion
+    command, displacement_um = without_gaps(recording, 100, 900)
+    np.testing.assert_array_equal(command, history.command[100:900])
+    np.testing.assert_array_equal(displacement_um, history.displacement_um[100:900])
+
+
+@pytest.mark.slow
+def test_skipped_samples_cost_little_accuracy(make_recording):
+    rate_hz, rng = 1000.0, np.random.default_rng(1)
+    time = np.arange(8000) / rate_hz
+    wave = sum(np.sin(2.0 * np.pi * (f * time + rng.uniform())) for f in (0.7, 1.7, 3.1, 7.0, 13.0))
+    wanted = 6.0 * np.minimum(2.0 * time, 1.0) * wave / np.abs(wave).max()
+    skipped = np.unique(np.add.outer(rng.integers(100, 7990, 12), np.arange(3)))
+
+    def run(index):
+        held = wanted[index[np.searchsorted(index, np.arange(8000), side="right") - 1]]
+        displacement_um, current_a = np.empty_like(held), np.empty_like(held)
+        TerfenolActuator(TerfenolParameters(), rate_hz, seed=3).step(
+            held, displacement_um, current_a
+        )
+        recording = make_recording(
+            displacement_um[index], command=held[index], index=index, sample_rate_hz=rate_hz
+        )
+        recording.samples.flags[1:][np.diff(index) > 1] |= Flag.AFTER_SKIPPED.value
+        return history_from_pieces([recording])
+
+    complete, gappy = run(np.arange(8000)), run(np.delete(np.arange(8000), skipped))
+    settings = settings_from("field", ["drags=0", "plays=8", "cells=12", "knots=16"])
+    errors = [
+        judge(fit_model(FitRequest([history], settings)).model, [complete]).rms_percent
+        for history in (complete, gappy)
+    ]
+    assert errors[1] <= 1.2 * errors[0]
+
+
+def test_readings_that_are_no_numbers_are_missing_too(recording_of):
+    recording = skipping(recording_of, [])
+    recording.samples.displacement_um[300] = np.nan
+    np.testing.assert_allclose(without_gaps(recording, 0, 1000)[1], 2.0 * np.arange(1000))
+
+
+def test_too_many_missing_samples_are_refused(recording_of):
+    recording = skipping(recording_of, np.arange(500, 511))
+    for read in (history_from_pieces, lambda pieces: without_gaps(*pieces, 0, 1000)):
+        with pytest.raises(DataError, match="11 of 1000"):
+            read([recording])
 
 
 def pieces_of(recording, edges):
