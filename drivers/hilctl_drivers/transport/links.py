@@ -15,6 +15,7 @@ DeviceError
         `-- WatchdogTrippedError   its host watchdog has put the output at its safe value
 """
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from types import MappingProxyType
@@ -80,6 +81,14 @@ def why(error: OSError, remedies: Mapping[int, str] = MappingProxyType({})) -> s
     """Return the text of an OS error, for use in a sentence, with the remedy for its ``errno``."""
     text = reason(error, remedies)
     return text[:1].lower() + text[1:]
+
+
+def wait_ms(deadline: float, now: float) -> int:
+    """Return the longest wait for the rest of a reply, in ms: 0 after the deadline.
+
+    A link then still reads once what has arrived, because the host may have stalled meanwhile.
+    """
+    return max(0, math.ceil((deadline - now) * 1e3))
 
 
 def cut(got: int, wanted: int, timeout_s: float) -> str:

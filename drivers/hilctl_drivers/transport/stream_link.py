@@ -19,6 +19,7 @@ from hilctl_drivers.transport.links import (
     Missing,
     NoAnswerError,
     cut,
+    wait_ms,
     why,
 )
 
@@ -207,10 +208,11 @@ class StreamLink(ABC):
             self._sleep(early_s)
 
     def _complete(self, reply: bytearray, missing: Missing, deadline: float) -> bytearray:
+        late = False
         while wanted := missing(reply):
-            left_s = deadline - self._clock()
-            if left_s <= 0.0 or not self._poll.poll(math.ceil(left_s * 1e3)):
+            if late or not self._poll.poll(wait_ms(deadline, self._clock())):
                 raise NoAnswerError(cut(len(reply), wanted, self.timeout_s))
+            late = self._clock() > deadline
             reply += self._read()
         return reply
 

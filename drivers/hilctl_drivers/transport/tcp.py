@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 from hilctl.base.errors import DeviceError
 from hilctl.base.files import CONNECT_REMEDIES
-from hilctl_drivers.transport.links import LostError, Missing, NoAnswerError, cut, why
+from hilctl_drivers.transport.links import LostError, Missing, NoAnswerError, cut, wait_ms, why
 from hilctl_drivers.transport.stream_link import StreamLink
 
 _FIRST = 256
@@ -112,20 +112,17 @@ class TcpLink:
     ) -> bytearray:
         if not reply:
             raise LostError("connection closed by the device")
-        while wanted := missing(reply):
-            reply += self._more(connection, len(reply), wanted, deadline)
-        return reply
-
-    def _more(self, connection: socket.socket, got: int, wanted: int, deadline: float) -> bytes:
-        left_s = deadline - self._clock()
-        poll = select.poll()
+        poll, late = select.poll(), False
         poll.register(connection, select.POLLIN)
-        if left_s <= 0.0 or not poll.poll(math.ceil(left_s * 1e3)):
-            raise NoAnswerError(cut(got, wanted, self._timeout_s))
-        data = connection.recv(_CHUNK)
-        if not data:
-            raise LostError(f"connection closed by the device, {wanted} bytes before the end")
-        return data
+        while wanted := missing(reply):
+            if late or not poll.poll(wait_ms(deadline, self._clock())):
+                raise NoAnswerError(cut(len(reply), wanted, self._timeout_s))
+            late = self._clock() > deadline
+            data = connection.recv(_CHUNK)
+            if not data:
+                raise LostError(f"connection closed by the device, {wanted} bytes before the end")
+            reply += data
+        return reply
 
     def _reset(self) -> None:
         if self._socket is not None:

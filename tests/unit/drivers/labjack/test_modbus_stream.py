@@ -516,6 +516,14 @@ def test_a_late_device_is_waited_for_and_a_standing_one_is_not(scene):
     assert sum(standing.slept_s) == pytest.approx(0.12)
 
 
+def test_a_stall_of_the_host_is_not_the_clock_of_the_device(scene):
+    made = scene((2, 8, 90), (8, 0, 90))
+    made.session.start()
+    call = made.device.call
+    made.device.call = lambda frames: (made.slept_s.append(10.0), call(frames))[1]
+    assert made.session.take(10).size == 10
+
+
 def test_the_margin_is_rounded_up(scene):
     assert scene(turnaround_s=0.0011).session.margin == 4
 

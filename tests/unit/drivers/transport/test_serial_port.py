@@ -12,7 +12,7 @@ from hilctl_drivers.profile import load_profile, with_link
 from hilctl_drivers.transport import stream_link
 from hilctl_drivers.transport.links import NoAnswerError
 from hilctl_drivers.transport.serial_port import SerialLink, SerialSettings
-from tests.unit.drivers.transport.conftest import QUICK_S, answering, serial
+from tests.unit.drivers.transport.conftest import QUICK_S, REPLY, answering, missing, serial
 
 XOFF, XON = b"\x13", b"\x11"
 
@@ -87,14 +87,38 @@ def test_time_spent_on_sending_is_not_there_for_the_answer(line, monkeypatch):
     link.drain()
 
     class Never:
-        def poll(self, _ms):
-            raise AssertionError("waited after the deadline")
+        def poll(self, ms):
+            assert ms == 0, "waited after the deadline"
+            return []
 
     monkeypatch.setattr(stream_link, "write", lambda _fd, _data: 0)
     monkeypatch.setattr(link._port, "write", lambda _data: now.__setitem__(0, 2.0))
     monkeypatch.setattr(link, "_poll", Never())
     with pytest.raises(NoAnswerError, match="within 1 s"):
         link.transact(b"ask", lambda got: 10 - len(got), 10)
+    link.close()
+
+
+@pytest.mark.parametrize("came", [REPLY, REPLY[:4]])
+def test_a_reply_that_came_while_the_host_stalled_is_read(line, came):
+    master, name = line
+    now, stalled = [0.0], []
+    link = SerialLink(name, SerialSettings(), QUICK_S, clock=lambda: now[0])
+    link.open()
+    link.drain()
+
+    def late(got):
+        if not stalled:
+            stalled.append(True)
+            os.write(master, came)
+            now[0] += 10.0
+        return missing(got)
+
+    if came == REPLY:
+        assert link.transact(b"ask", late) == REPLY
+    else:
+        with pytest.raises(NoAnswerError, match="only 4 bytes"):
+            link.transact(b"ask", late)
     link.close()
 
 

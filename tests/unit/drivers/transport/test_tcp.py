@@ -25,6 +25,30 @@ def test_tcp_reply_in_pieces_is_put_together(serve):
     link.close()
 
 
+def test_a_reply_that_came_while_the_host_stalled_is_read(serve):
+    now, go, came = [0.0], threading.Event(), threading.Event()
+
+    def act(connection):
+        connection.recv(100)
+        connection.sendall(REPLY[:4])
+        go.wait(PATIENT_S)
+        connection.sendall(REPLY[4:])
+        came.set()
+
+    link = TcpLink("127.0.0.1", serve(act), PATIENT_S, clock=lambda: now[0])
+    link.open()
+
+    def late(got):
+        if got and not go.is_set():
+            go.set()
+            came.wait(PATIENT_S)
+            now[0] += 10.0
+        return missing(got)
+
+    assert link.transact(b"ask", late) == REPLY
+    link.close()
+
+
 @pytest.mark.parametrize(
     ("sent", "words"), [(b"", "no answer within 0.05 s"), (b"0123", "only 4 bytes, 6 short")]
 )
