@@ -181,7 +181,7 @@ DEFINITIONS = {
         "Amplitudes of the error's steady part at multiples of the waveform's frequency."
     ),
     "r²": "Share of the variance explained by a linear fit.",
-    "lateness": "Time from a tick's deadline to its wake-up; 99 % of the ticks are within p99.",
+    "lateness": "Time from a tick's deadline to its exchange; 99 % of the ticks are within p99.",
 }
 
 

@@ -83,7 +83,7 @@ class Headroom:
             self._warm(np.fmax(np.abs(command), np.abs(measured)))
 
     def gauges(self, late_s: float) -> list[Gauge]:
-        """Return the gauges; ``late_s`` is the largest wake-up lateness of the newest ticks."""
+        """Return the gauges; ``late_s`` is the largest lateness of the newest ticks."""
         limits = self._limits
         held = [[gauge for _, gauge in each] for each in self._held.values()]
         found = [max(each, key=lambda gauge: gauge.used) for each in held if each]

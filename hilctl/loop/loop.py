@@ -320,12 +320,14 @@ class Loop:
             # Before the exchange: the block survives if the loop is killed in it.
             self._host.sending(sent)
             self._ended_at = self._next_sample
-        first_sample = sent.head[_FIRST_SAMPLE]
+        head = sent.head
         before_ns = self._clock.now_ns()
+        # The wake-up alone would not show a delay by the work of this tick.
+        head[_LATE_NS] = max(head[_LATE_NS], before_ns - self._pacer.deadline_ns)
         self._device.exchange(
-            first_sample, sent.command, answered.displacement_um, answered.measured
+            head[_FIRST_SAMPLE], sent.command, answered.displacement_um, answered.measured
         )
-        sent.head[_EXCHANGE_NS] = self._clock.now_ns() - before_ns
+        head[_EXCHANGE_NS] = self._clock.now_ns() - before_ns
         if not early:
             in_flight.popleft()
             self._process_answer(answered, self._interlocks.judge(answered))

@@ -18,7 +18,8 @@ class Ticks:
     Attributes:
         first_sample: int64[m], index of the tick's first sample.
         deadline_ns: int64[m], when the tick was due, since the start of the run.
-        late_ns: int64[m], lateness of the wake-up; after a skip, from the first missed tick.
+        late_ns: int64[m], lateness of the exchange (of the wake-up in older recordings); after a
+            skip, from the first missed tick.
         exchange_ns: int64[m], duration of the exchange with the device.
     """
 

@@ -84,6 +84,22 @@ def test_waveform_then_ramp(block):
     assert outcome.ended_at == len(commands)
 
 
+def test_work_before_the_exchange_is_lateness():
+    clock = FakeClock()
+
+    def stop():
+        if rig.host.heartbeats and rig.host.heartbeats[-1] == 30:
+            clock.now += 700_000
+            return "asked"
+        return ""
+
+    rig = Rig(sine(), clock=clock, stop=stop)
+    rig.run()
+    late_ns = {head[BlockHeader.FIRST_SAMPLE]: head[BlockHeader.LATE_NS] for head in rig.host.heads}
+    assert late_ns[30] == 700_000
+    assert set(late_ns.values()) == {0, 700_000}
+
+
 def test_blocks_make_no_difference():
     commands = []
     for block in (1, 8, 40):
