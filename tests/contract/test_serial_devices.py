@@ -25,10 +25,10 @@ SERIAL = (
     "cobs_board", "cobs_board_fifo", "icp_m7024_dcon agilent_34970a own",
     "kepco_bop agilent_34970a own", "tdk_lambda_gen agilent_34970a own",
     "kepco_bop labjack_t7 own", "icp_m7024_dcon adam_4117 own", "cobs_board labjack_t7 own",
-    "kepco_bop cobs_board own",
+    "kepco_bop cobs_board own", "magna_power_sl keyence_cl3000 own",
 )  # fmt: skip
 """What serial_dac is tried with: what drives, what reads, and whether they share a line."""
-PIEZO = ("pi_e727 V", "cobs_board V", "icp_m7024_dcon agilent_34970a own V")
+PIEZO = ("pi_e709 V", "pi_e727 V", "cobs_board V", "icp_m7024_dcon agilent_34970a own V")
 """Serial devices that drive a piezo too."""
 ONLY_READS = """\
 vendor: nobody
@@ -54,7 +54,7 @@ TIMEOUT_S = 2.0
 STREAM_RATE_HZ = 640.0
 BLOCK = 10
 FIFO_BLOCKS = 32  # 500 ms, the longest stall of a busy machine
-MUST_BE_AT_REST = {"kepco_bop", "tdk_lambda_gen"}
+MUST_BE_AT_REST = {"kepco_bop", "magna_power_sl", "tdk_lambda_gen"}
 
 
 def serial_profiles():

@@ -15,9 +15,10 @@ from hilctl_drivers.profile import FOLDER, link_kinds, load_profile, profile_cla
 NAMES = (
     "adam_4024", "adam_4024_ascii", "adam_4117", "adam_6024", "adam_6217", "adam_6224",
     "agilent_34970a", "beckhoff_bk9000", "cobs_board", "cobs_board_fifo", "generic_float32",
-    "icp_et7000", "icp_m7017", "icp_m7024", "icp_m7024_dcon", "kepco_bop", "labjack_t4",
-    "labjack_t7", "labjack_t8", "pi_e727", "tdk_lambda_gen", "wago_750", "waveshare_ai_8ch",
-    "waveshare_ai_8ch_b", "waveshare_ao_8ch", "waveshare_ao_8ch_b",
+    "icp_et7000", "icp_m7017", "icp_m7024", "icp_m7024_dcon", "kepco_bop", "keyence_cl3000",
+    "labjack_t4", "labjack_t7", "labjack_t8", "magna_power_sl", "moxa_iologik_e1240", "pi_e709",
+    "pi_e727", "tdk_lambda_gen", "wago_750", "waveshare_ai_8ch", "waveshare_ai_8ch_b",
+    "waveshare_ao_8ch", "waveshare_ao_8ch_b",
 )  # fmt: skip
 
 OUTPUTS = [
@@ -56,6 +57,8 @@ INPUTS = [
     ("adam_6217", "AI0", 0, 3, "ffff", 10.0),
     ("adam_6217", "AI7", 7, 3, "0000", -10.0),
     ("icp_m7017", "AI0", 0, 4, "7fff", 10.0),
+    ("moxa_iologik_e1240", "AI0", 0, 4, "ffff", 10.0),
+    ("moxa_iologik_e1240", "AI7", 7, 4, "0000", 0.0),
     ("icp_m7017", "AI7", 7, 4, "8001", -10.0),
     ("waveshare_ai_8ch", "AI0", 0, 4, "4e20", 20.0),
     ("waveshare_ai_8ch", "AI7", 7, 4, "0fa0", 4.0),
@@ -83,6 +86,7 @@ SPECIAL = [
     ("adam_4117", "selftest", "holding", 210),
     ("adam_6217", "init.7", "holding", 207),
     ("icp_m7017", "init.0", "coil", 268),
+    ("moxa_iologik_e1240", "init.7", "holding", 31),
     ("waveshare_ai_8ch", "init.0", "holding", 0x1000),
     ("waveshare_ai_8ch_b", "init.7", "holding", 0x1007),
     ("wago_750", "outputs.AO1.readback", "holding", 0x0201),
@@ -259,6 +263,7 @@ def test_flash_is_not_rewritten(modbus, name):
     ("kepco_bop", "current", 1e-7, "CURR 0.000000"),
     ("tdk_lambda_gen", "current", 7.07, "PC 7.070"),
     ("pi_e727", "axis1", 12.5, "SVA 1 12.5000"),
+    ("magna_power_sl", "current", 2.5, "CURR 2.5000"),
 ])  # fmt: skip
 def test_text_output(profiles, name, output, value, line):
     """The output line agrees with the manual and has no exponent."""
@@ -276,9 +281,21 @@ def test_dcon_watchdog(profiles):
     assert line == "~013164"
 
 
-def test_kepco_exchange(profiles):
-    line = profiles["kepco_bop"].exchange.write.format(value=1.0)
-    assert line == "CURR 1.000000;:MEAS:CURR?"
+@pytest.mark.parametrize(("name", "text"), [
+    ("kepco_bop", "CURR 1.000000;:MEAS:CURR?"), ("pi_e709", "SVA 1 1.0000\nPOS? 1"),
+])  # fmt: skip
+def test_text_exchange(profiles, name, text):
+    assert profiles[name].exchange.write.format(value=1.0) == text
+
+
+@pytest.mark.parametrize(("reply", "um"), [
+    ("MS,-0000.1234,0,LO", -123.4), ("MS,-999999,1,--", None), ("MS,-999999.0,1,GO", None),
+])  # fmt: skip
+def test_keyence_reading(profiles, reply, um):
+    """A reading without a measurement does not match."""
+    sensor = profiles["keyence_cl3000"].inputs["OUT1"]
+    found = sensor.match(reply)
+    assert (found and sensor.value(float(found[1]))) == (um and pytest.approx(um))
 
 
 def test_gap(profiles):

@@ -155,7 +155,7 @@ class AsciiDac(SerialDac):
             self._writer.send(text)
             return False
         # A line that echoes gives an answer that equals what was sent.
-        return self._writer.ask(text, reply.pattern).string != text
+        return self._writer.ask(text, reply).string != text
 
     def _command(self, value: float) -> str:
         return self._writer.text(self._target.write, value=value)

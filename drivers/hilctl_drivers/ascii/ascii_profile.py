@@ -1,9 +1,12 @@
-"""Profiles of devices with a text protocol: templates of requests and patterns of replies.
+r"""Profiles of devices with a text protocol: templates of requests and patterns of replies.
 
 A template is a Python format string with the fields ``{value}``, ``{address}``, ``{timeout}`` and
 ``{safe}``, such as ``#{address:02X}0{value:+07.3f}``. A pattern is a regular expression that must
 match a whole reply. Each pattern has an example, as in the vendor's manual: it shows what the
 pattern is for, proves that it matches, and tells how long a reply is.
+
+A line feed in a template separates lines that are sent in one write, such as
+``SVA 1 {value:.4f}\nPOS? 1``. A line feed in an example separates the lines of one reply.
 """
 
 import re
@@ -33,8 +36,9 @@ def _check_template(text: str) -> str:
         if field is not None and (field not in _SAMPLES or conversion or "{" in (form or "")):
             known = ", ".join(f"{{{name}}}" for name in _SAMPLES)
             raise ValueError(f"fields must be of {known}")
-    if not text.format(**_SAMPLES).isprintable() or not text.isascii():
-        raise ValueError("must be printable ASCII")
+    lines = text.format(**_SAMPLES).split("\n")
+    if not all(line and line.isprintable() for line in lines) or not text.isascii():
+        raise ValueError(r"must be printable ASCII, with \n between lines")
     return text
 
 
@@ -109,6 +113,11 @@ class Reply(StrictModel):
         if self.match(self.example) is None:
             raise ValueError(f"pattern {self.pattern!r} must match the example {self.example!r}")
         return self
+
+    @property
+    def lines(self) -> int:
+        """Number of lines of a reply."""
+        return self.example.count("\n") + 1
 
     def match(self, text: str) -> re.Match[str] | None:
         """Return the match of a whole reply."""
@@ -193,12 +202,12 @@ class AsciiInput(Range, Query, MeasuredReply):
 
 
 class AsciiExchange(MeasuredReply):
-    """One line that sets an output and reads an input.
+    """One write that sets an output and reads an input.
 
     Attributes:
         output: Name of the output.
         input: Name of the input.
-        write: Line that is sent, with {value} in the unit of the output.
+        write: Line or lines that are sent, with {value} in the unit of the output.
     """
 
     output: Name
@@ -311,7 +320,7 @@ class AsciiProfile(BaseProfile):
         link: Serial line or TCP connection.
         outputs: Outputs by name.
         inputs: Inputs by name.
-        exchange: One line that writes and reads; none if there is none.
+        exchange: Lines that write and read in one go; none if there are none.
         init: Steps after the device is identified.
         close: Steps before the port is closed.
         watchdog: Host watchdog; none if it has none.
@@ -344,6 +353,11 @@ class AsciiProfile(BaseProfile):
             raise ValueError("exchange.output and exchange.input must be an output and an input")
         if "value" not in fields_of(self.exchange.write):
             raise ValueError("exchange.write must have the field {value}")
+        if "\n" in self.exchange.write and self.link.min_gap_s:
+            raise ValueError(
+                "exchange.write must be one line if min_gap_s separates commands, got "
+                f"{self.exchange.write!r}"
+            )
         return self
 
     @model_validator(mode="after")

@@ -7,7 +7,7 @@ Manual" 7.5. SCPI: SCPI-1999 volume 1, 7.2.1 for numbers; number forms as in IEE
 import math
 import re
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Literal, TypeAlias
@@ -127,11 +127,11 @@ def parse_number(text: str) -> float:
 def reading(form: MeasuredReply, ask: Callable[..., re.Match[str]]) -> float:
     """Return the number in a reply of that form, NaN if it marks the reading as invalid.
 
-    ``ask`` takes patterns and returns the match of the reply.
+    ``ask`` takes forms and returns the match of the reply.
     """
     if form.invalid == "none":
-        return parse_number(ask(form.pattern)[1])
-    found = ask(form.invalid.pattern, form.pattern)
+        return parse_number(ask(form)[1])
+    found = ask(form.invalid, form)
     return math.nan if form.invalid.match(found.string) else parse_number(found[1])
 
 
@@ -165,19 +165,21 @@ class AsciiSession:
         return template.format(address=self.address, **values)
 
     def line(self, text: str) -> bytes:
-        """Return a line in the form sent on the wire."""
-        return self._lines.encode(text)
+        """Return a text of one or more lines in the form sent on the wire."""
+        return b"".join(map(self._lines.encode, text.split("\n")))
 
     def send(self, text: str) -> None:
-        """Send a line that is not answered."""
-        request = self._lines.encode(text)
+        """Send a text that is not answered."""
+        request = self.line(text)
         if self._echoes:
-            self._check_echo(text, self.link.transact(request, self._missing(1)))
+            self._check_echo(text, self.link.transact(request, self._missing(_lines(text))))
         else:
             self.link.transact(request, lambda got: 0)
 
-    def ask(self, text: str, *patterns: str) -> re.Match[str]:
-        """Send a line and return its reply, matched whole by the first pattern that does.
+    def ask(self, text: str, *forms: Reply) -> re.Match[str]:
+        """Send a text and return its reply, matched whole by the first form that does.
+
+        All forms have as many lines.
 
         Raises:
             WatchdogTrippedError: The command was ignored because of a trip.
@@ -185,37 +187,15 @@ class AsciiSession:
             MismatchError: It is no answer to this.
             DeviceError: No answer, or a damaged one.
         """
-        request = self._lines.encode(text)
-        try:
-            data: bytes | bytearray = self.link.transact(request, self._missing(1 + self._echoes))
-        except NoAnswerError as error:
-            raise NoAnswerError(f"{text}: {error}") from None
-        if self._echoes:
-            data = self._check_echo(text, data)
-        reply = self._replies.decode(data)
-        self._check_trouble(text, reply)
-        matches = (re.fullmatch(pattern, reply, re.ASCII) for pattern in patterns)
-        found = next(filter(None, matches), None)
-        if found is None:
-            raise MismatchError(f"{text}: not an answer to this: {reply!r}")
-        return found
+        return _matched(text, forms, self._transact(text, forms[0].lines))
 
-    def query(self, text: str, *patterns: str) -> re.Match[str]:
-        """Ask a question, see :meth:`ask`; a reply that repeats it is a MismatchError.
-
-        The line then echoes, and perhaps nothing is connected.
-        """
-        found = self.ask(text, *patterns)
-        if found.string == text:
-            raise MismatchError(
-                f"{text}: came back unchanged: the line echoes what is sent; set echo: true "
-                "beside the address if the device answers after that"
-            )
-        return found
+    def query(self, text: str, *forms: Reply) -> re.Match[str]:
+        """Ask a question, see :meth:`ask`; a reply that repeats it is a MismatchError."""
+        return _matched(text, forms, self._question(text, forms[0].lines))
 
     def number(self, query: Query) -> float:
         """Ask for a number."""
-        return parse_number(self.query(self.text(query.ask), query.pattern)[1])
+        return parse_number(self.query(self.text(query.ask), query)[1])
 
     def value(self, source: AsciiInput) -> float:
         """Ask for the value of an input, in its unit; NaN if the reading is invalid."""
@@ -256,7 +236,36 @@ class AsciiSession:
     def _ask(self, check: Check) -> tuple[str, str]:
         """Return a question and whatever is answered."""
         text = self.text(check.ask)
-        return text, self.query(text, ".*")[0]
+        return text, self._question(text, check.lines)
+
+    def _question(self, text: str, lines: int) -> str:
+        """Return the reply to a question; one that repeats it is a MismatchError.
+
+        The line then echoes, and perhaps nothing is connected.
+        """
+        reply = self._transact(text, lines)
+        if reply == text:
+            raise MismatchError(
+                f"{text}: came back unchanged: the line echoes what is sent; set echo: true "
+                "beside the address if the device answers after that"
+            )
+        return reply
+
+    def _transact(self, text: str, lines: int) -> str:
+        """Send a text and return its reply, which has that many lines and is no error."""
+        expected = lines + (_lines(text) if self._echoes else 0)
+        try:
+            data: bytes | bytearray = self.link.transact(self.line(text), self._missing(expected))
+        except NoAnswerError as error:
+            raise NoAnswerError(f"{text}: {error}") from None
+        if self._echoes:
+            data = self._check_echo(text, data)
+        end = self._replies.terminator
+        *others, last = data.split(end, lines - 1)
+        replies = [self._replies.decode(line) for line in (*(each + end for each in others), last)]
+        for reply in replies:
+            self._check_trouble(text, reply)
+        return "\n".join(replies)
 
     def _step(self, step: AsciiStep, values: dict[str, float]) -> None:
         if isinstance(step, WaitStep):
@@ -266,9 +275,9 @@ class AsciiSession:
             if step.reply == "none":
                 self.send(text)
             else:
-                self.ask(text, step.reply.pattern)
+                self.ask(text, step.reply)
         elif isinstance(step, AskStep):
-            self.ask(self.text(step.ask, **values), step.pattern)
+            self.ask(self.text(step.ask, **values), step)
         else:
             wanted, found = (
                 values["safe"] if step.value == "safe" else step.value,
@@ -293,21 +302,35 @@ class AsciiSession:
         end = self._replies.terminator
 
         def missing(got: bytearray) -> int:
-            if len(got) > 2 * self._replies.size_max:
+            if len(got) > (lines + 1) * self._replies.size_max:
                 raise CorruptError(f"no end of line within {len(got)} bytes")
             return max(0, lines - got.count(end))
 
         return missing
 
     def _check_echo(self, text: str, data: bytes | bytearray) -> bytes | bytearray:
-        echo, end, rest = data.partition(self._replies.terminator)
-        if bytes(echo + end).rstrip(b"\r\n") != self._lines.encode(text).rstrip(b"\r\n"):
-            raise CorruptError(f"{text}: came back as {bytes(echo)!r}")
+        end = self._replies.terminator
+        *echo, rest = data.split(end, _lines(text))
+        if [bytes(line).strip(b"\r\n") for line in echo] != [
+            line.rstrip(b"\r\n") for line in map(self._lines.encode, text.split("\n"))
+        ]:
+            raise CorruptError(f"{text}: came back as {bytes(end.join(echo))!r}")
         return rest
 
 
+def _lines(text: str) -> int:
+    return text.count("\n") + 1
+
+
+def _matched(text: str, forms: Sequence[Reply], reply: str) -> re.Match[str]:
+    found = next(filter(None, (form.match(reply) for form in forms)), None)
+    if found is None:
+        raise MismatchError(f"{text}: not an answer to this: {reply!r}")
+    return found
+
+
 _Line: TypeAlias = tuple[str, str | None]
-"""A sent line, and an example of its reply; None if it is not answered."""
+"""Text that is sent in one write, and an example of its reply; None if it is not answered."""
 
 
 def exchange_time(profile: AsciiProfile, output: str, sensor: str | None) -> WireTime:
@@ -393,11 +416,16 @@ def _lines_time(profile: AsciiProfile, lines: Sequence[_Line], settle_s: float =
     """Return the time of lines with their replies, one after the other."""
     link = profile.link
     check = _CHECKSUM_CHARS[link.checksum]
-    sent = sum(len(line) + check + len(link.terminator) for line, _ in lines)
+
+    def chars(texts: Iterable[str], end: str) -> int:
+        return sum(len(line) + check + len(end) for text in texts for line in text.split("\n"))
+
+    sent = chars((text for text, _ in lines), link.terminator)
     replies = [reply for _, reply in lines if reply is not None]
-    received = sum(len(reply) + check + len(link.reply_terminator) for reply in replies)
+    received = chars(replies, link.reply_terminator)
+    count = sum(_lines(text) for text, _ in lines)
     return WireTime(
-        f"{len(lines)} {'line' if len(lines) == 1 else 'lines'} {link.medium}",
+        f"{count} {'line' if count == 1 else 'lines'} {link.medium}",
         sent * link.char_s,
         received * link.char_s,
         len(lines) if link.silence_s else 0,

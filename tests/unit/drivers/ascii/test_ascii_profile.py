@@ -16,7 +16,7 @@ def test_fields_of_a_template():
     assert fields_of("*IDN?") == set()
 
 
-@pytest.mark.parametrize("text", ["SET {value!r}", "SET {value} µV", ""])
+@pytest.mark.parametrize("text", ["SET {value!r}", "SET {value} µV", "", "SVA 1\n", "\tPOS?"])
 def test_templates_that_can_not_be_sent_are_refused(text):
     with pytest.raises(ValidationError, match="text"):
         SendStep(kind="send", text=text)
@@ -26,6 +26,13 @@ def test_templates_that_can_not_be_sent_are_refused(text):
 def test_a_number_is_the_one_group_of_its_pattern(pattern, example):
     with pytest.raises(ValidationError, match=r"group"):
         NumberReply(pattern=pattern, example=example)
+
+
+def test_lines_of_one_write_have_no_gap():
+    plain = load_profile("pi_e709").model_dump()
+    plain["link"]["min_gap_s"] = 0.005
+    with pytest.raises(ValidationError, match="min_gap_s"):
+        AsciiProfile.model_validate(plain)
 
 
 def test_a_trip_that_nobody_can_ask_about_is_not_cleared():

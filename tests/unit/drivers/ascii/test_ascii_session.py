@@ -18,6 +18,7 @@ from hilctl_drivers.profile import load_profile, with_link
 from hilctl_drivers.transport import links
 
 DCON = load_profile(str(Path(__file__).parents[3] / "data" / "dcon_module.yaml"))
+GOOD = Reply(pattern=">", example=">")
 PLAIN = DCON.model_copy(update={"link": DCON.link.model_copy(update={"checksum": "none"})})
 
 
@@ -59,17 +60,17 @@ def test_a_value_is_put_in_and_a_number_comes_out():
 ])  # fmt: skip
 def test_trouble_is_told_with_what_was_asked(reply, error, said):
     with pytest.raises(error, match=said):
-        session(reply).ask("#020", ">")
+        session(reply).ask("#020", GOOD)
 
 
 def test_another_address_answers_for_nobody():
     with pytest.raises(links.MismatchError, match="address 03"):
-        session(b"!037024\r").ask("$02M", "![0-9A-F]{2}.*")
+        session(b"!037024\r").ask("$02M", PLAIN.selftest)
 
 
 def test_a_line_is_waited_for_to_its_end_but_not_for_ever():
     asked = session(b">\r")
-    asked.ask("#020", ">")
+    asked.ask("#020", GOOD)
     missing = asked.link.missing
     assert (missing(bytearray(b">")), missing(bytearray(b">\r"))) == (1, 0)
     with pytest.raises(links.CorruptError, match="no end of"):
@@ -104,9 +105,38 @@ def test_the_wrong_device_is_told_by_its_answer():
 def test_an_echo_must_be_what_was_sent():
     link = PLAIN.link.model_copy(update={"echo": True})
     profile = PLAIN.model_copy(update={"link": link})
-    session(b"#020\r>\r", profile=profile).ask("#020", ">")
+    session(b"#020\r>\r", profile=profile).ask("#020", GOOD)
     with pytest.raises(links.CorruptError, match="b'#030'"):
-        session(b"#030\r>\r", profile=profile).ask("#020", ">")
+        session(b"#030\r>\r", profile=profile).ask("#020", GOOD)
+
+
+LINES = Reply(pattern=r"1=([0-9.]+) \n2=[0-9.]+", example="1=0.5 \n2=0.25")
+
+
+def test_several_lines_are_one_write():
+    asked = session(b"1=1.5 \r2=3\r")
+    assert asked.ask("SVA 1 5\nPOS? 1 2", LINES)[1] == "1.5"
+    assert asked.link.sent == [b"SVA 1 5\rPOS? 1 2\r"]
+    assert asked.link.missing(bytearray(b"1=1.5 \r")) == 1
+
+
+@pytest.mark.parametrize(("reply", "error"), [
+    (b"1=1.5 \r?\r", links.RefusedError),
+    (b"1=1.5 \r3=3\r", links.MismatchError),
+    (b"1=1.5 \r2=3\r4", links.CorruptError),
+])  # fmt: skip
+def test_each_line_of_a_reply_is_checked(reply, error):
+    with pytest.raises(error):
+        session(reply).ask("SVA 1 5\nPOS? 1 2", LINES)
+
+
+def test_an_echo_may_have_several_lines():
+    link = PLAIN.link.model_copy(update={"echo": True})
+    profile = PLAIN.model_copy(update={"link": link})
+    asked = session(b"SVA 1 5\rPOS? 1\r>\r", b"a\rb\r", profile=profile)
+    assert asked.ask("SVA 1 5\nPOS? 1", GOOD)[0] == ">"
+    asked.send("a\nb")
+    assert asked.link.missing(bytearray(b"a\r")) == 1
 
 
 def wire_s(time):
@@ -122,6 +152,13 @@ class TestText:
         assert wire_s(exchange_time(with_link(profile, checksum="dcon"), "AO0", None)) == (
             pytest.approx(18 * 10 / 9600)
         )
+
+    def test_lines_of_one_write(self):
+        """SVA 1 100.0000, POS? 1 and 1=12.3456 with their line feeds; one turnaround."""
+        profile = load_profile("pi_e709")
+        time = exchange_time(profile, "axis1", "position1")
+        assert wire_s(time) == pytest.approx((15 + 7 + 10) * 10 / 115200)
+        assert time.turnaround_s == profile.turnaround_s
 
     def test_gap(self):
         """TDK-Lambda's 5 ms come once a line."""
