@@ -108,6 +108,8 @@ class SerialLineSettings(StreamSettings):
 class BinaryLineSettings(SerialLineSettings):
     """A serial line that carries all byte values."""
 
+    bytesize: Literal[8] = Field(default=8, description="data bits per character")
+
     @model_validator(mode="after")
     def _all_bytes_pass(self) -> Self:
         if self.flow != "none":

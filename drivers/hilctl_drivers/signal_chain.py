@@ -5,7 +5,10 @@ and sensor, and name the reader if another device reads the sensor.
 command = gain * output + offset, displacement = sensitivity * input + offset.
 """
 
+import re
 from collections.abc import Mapping
+from contextlib import suppress
+from ipaddress import ip_address
 from typing import Annotated, Any, Literal, Self, TypeAlias, TypeVar
 
 import numpy as np
@@ -140,16 +143,30 @@ class WatchdogOptions(StrictModel):
     )
 
 
-def _without_port(host: str) -> str:
-    name, colon, port = host.rpartition(":")
-    if not host.strip():
-        raise ValueError("must be a name or an address, got an empty text")
-    if colon and ":" not in name and port.isdecimal():
+_NAME = re.compile(r"(?=.{1,253}\Z)\w([\w-]{0,61}\w)?(\.\w([\w-]{0,61}\w)?)*\.?")
+_NAME_AND_PORT = re.compile(r"\[?(.*?)\]?:(\d+)")
+
+
+def _host(host: str) -> str:
+    if _NAME.fullmatch(host):
+        return host
+    with suppress(ValueError):
+        ip_address(host)
+        return host
+    given = _NAME_AND_PORT.fullmatch(host)
+    if given:
+        name, port = given.groups()
         raise ValueError(f"must have no port: set host to {name} and tcp_port to {port}")
-    return host
+    raise ValueError(f"must be a host name or an IP address, got {host!r}")
 
 
-HostName: TypeAlias = Annotated[str, AfterValidator(_without_port)]
+def _device_file(path: str) -> str:
+    if not path.strip() or not path.isprintable():
+        raise ValueError(f"must be a device file (hilctl devices lists them), got {path!r}")
+    return path
+
+
+HostName: TypeAlias = Annotated[str, AfterValidator(_host)]
 
 LINE = ("baud", "parity", "stopbits", "echo", "gap_s")
 """Settings of a serial line, at a port of this machine or behind a gateway or serial server."""
@@ -174,7 +191,7 @@ class AddressOptions(DeviceOptions):
         description="frames of Modbus at host: tcp, or rtu for a serial server that passes bytes"
         " on; default: the profile's, tcp for Modbus RTU",
     )
-    serial_port: str | None = Field(
+    serial_port: Annotated[str, AfterValidator(_device_file)] | None = Field(
         default=None, description="device file, preferably under /dev/serial/by-id"
     )
     unit_id: int | None = Field(

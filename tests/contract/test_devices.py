@@ -37,7 +37,7 @@ MODBUS = (
     "adam_6224 adam_6217 own", "icp_m7024 icp_m7017 same", "waveshare_ao_8ch waveshare_ai_8ch same",
     "waveshare_ao_8ch_b waveshare_ai_8ch_b same", "adam_4024 adam_6217 own",
     "adam_6224 agilent_34970a own", "icp_m7024 labjack_t7 own",
-    "adam_6224 moxa_iologik_e1240 own",
+    "adam_6224 moxa_iologik_e1240 own", "adam_6224 acromag_962en own",
 )  # fmt: skip
 """What modbus_dac is tried with; every shipped Modbus profile is among them."""
 PIEZO = ("generic_float32 V", "labjack_t8 V")

@@ -13,12 +13,12 @@ from hilctl_drivers.modbus.register_map import EnsureStep, RegisterStep
 from hilctl_drivers.profile import FOLDER, link_kinds, load_profile, profile_class, shipped_profiles
 
 NAMES = (
-    "adam_4024", "adam_4024_ascii", "adam_4117", "adam_6024", "adam_6217", "adam_6224",
-    "agilent_34970a", "beckhoff_bk9000", "cobs_board", "cobs_board_fifo", "generic_float32",
-    "icp_et7000", "icp_m7017", "icp_m7024", "icp_m7024_dcon", "kepco_bop", "keyence_cl3000",
-    "labjack_t4", "labjack_t7", "labjack_t8", "magna_power_sl", "moxa_iologik_e1240", "pi_e709",
-    "pi_e727", "tdk_lambda_gen", "wago_750", "waveshare_ai_8ch", "waveshare_ai_8ch_b",
-    "waveshare_ao_8ch", "waveshare_ao_8ch_b",
+    "acromag_962en", "adam_4024", "adam_4024_ascii", "adam_4117", "adam_6024", "adam_6217",
+    "adam_6224", "agilent_34970a", "beckhoff_bk9000", "cobs_board", "cobs_board_fifo",
+    "generic_float32", "icp_et7000", "icp_m7017", "icp_m7024", "icp_m7024_dcon", "kepco_bop",
+    "keyence_cl3000", "labjack_t4", "labjack_t7", "labjack_t8", "magna_power_sl",
+    "moxa_iologik_e1240", "pi_e709", "pi_e727", "tdk_lambda_gen", "wago_750", "waveshare_ai_8ch",
+    "waveshare_ai_8ch_b", "waveshare_ao_8ch", "waveshare_ao_8ch_b",
 )  # fmt: skip
 
 OUTPUTS = [
@@ -57,6 +57,8 @@ INPUTS = [
     ("adam_6217", "AI0", 0, 3, "ffff", 10.0),
     ("adam_6217", "AI7", 7, 3, "0000", -10.0),
     ("icp_m7017", "AI0", 0, 4, "7fff", 10.0),
+    ("acromag_962en", "CH0", 9, 4, "4e20", 10.0),
+    ("acromag_962en", "CH5", 14, 4, "b1e0", -10.0),
     ("moxa_iologik_e1240", "AI0", 0, 4, "ffff", 10.0),
     ("moxa_iologik_e1240", "AI7", 7, 4, "0000", 0.0),
     ("icp_m7017", "AI7", 7, 4, "8001", -10.0),
@@ -86,6 +88,7 @@ SPECIAL = [
     ("adam_4117", "selftest", "holding", 210),
     ("adam_6217", "init.7", "holding", 207),
     ("icp_m7017", "init.0", "coil", 268),
+    ("acromag_962en", "init.1", "holding", 1),
     ("moxa_iologik_e1240", "init.7", "holding", 31),
     ("waveshare_ai_8ch", "init.0", "holding", 0x1000),
     ("waveshare_ai_8ch_b", "init.7", "holding", 0x1007),

@@ -10,6 +10,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import ClassVar, TypeAlias
 
+import numpy as np
+
 from hilctl.base.device import DeviceInfo, DeviceOptions
 from hilctl.base.errors import DeviceError
 from hilctl.base.types import F64
@@ -82,8 +84,14 @@ class ModbusDevice(DacDevice):
     def _look(self) -> tuple[float, float | None]:
         setup = self._setup
         writer, reader = self._sessions()
-        displacement_um = setup.chain.displacement_um(reader.read())
-        held = writer.held(setup.output)
+        reading, held = reader.read(), writer.held(setup.output)
+        for name, value in ((setup.options.input, reading), (setup.options.output, held)):
+            if value and abs(value) < np.finfo(np.float32).tiny:
+                raise DeviceError(
+                    f"{name} must be 0 or a normal number, got {value:.3g}: compare its order "
+                    "(ABCD, CDAB, ...) and type in the profile with the device's manual"
+                )
+        displacement_um = setup.chain.displacement_um(reading)
         watchdog = writer.profile.watchdog
         flag = "none" if watchdog == "none" else watchdog.tripped
         if held is None or (flag != "none" and writer.is_set(flag)):

@@ -100,7 +100,6 @@ class ModbusRtuLink(BinaryLineSettings):
     port: ClassVar[int] = MODBUS_PORT  # of a gateway or a serial server
 
     kind: Literal["rtu"]
-    bytesize: Literal[8] = Field(default=8, description="data bits per character")
     gap_s: float | None = Field(
         default=None,
         ge=0.0,

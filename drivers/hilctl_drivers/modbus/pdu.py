@@ -185,7 +185,8 @@ def reply_data(request_pdu: bytes, reply_pdu: bytes) -> bytes:
     if len(reply_pdu) == 2 and reply_pdu[0] == function | 0x80:
         code = reply_pdu[1]
         name = EXCEPTIONS.get(code, "unknown")
-        raise RefusedError(f"function {function} refused with exception {code} ({name})", code)
+        said = f"function {function} refused with exception {code} ({name})"
+        raise RefusedError(said + _place(request_pdu), code)
     if not reply_pdu or reply_pdu[0] != function:
         got = reply_pdu[0] if reply_pdu else "nothing"
         raise MismatchError(f"asked with function {function}, answered with {got}")
@@ -195,6 +196,16 @@ def reply_data(request_pdu: bytes, reply_pdu: bytes) -> bytes:
         got_head = reply_pdu[: len(head)].hex(" ")
         raise MismatchError(f"reply must begin with {head.hex(' ')}, got {got_head}")
     return bytes(reply_pdu[len(head) :])
+
+
+def _place(request_pdu: bytes) -> str:
+    """Return the addresses of a request, as in a message; empty for function 76."""
+    if request_pdu[0] == FEEDBACK:
+        return ""
+    at = f" at address {int.from_bytes(request_pdu[1:3], 'big')}"
+    if request_pdu[0] == WRITE_READ:
+        at += f" (read) and {int.from_bytes(request_pdu[5:7], 'big')} (write)"
+    return at
 
 
 def tcp_adu(transaction: int, unit: int, pdu: bytes) -> bytes:

@@ -1,12 +1,14 @@
 """Watchdogs that can't do what is asked of them, and channels that can't be wired so."""
 
 import pytest
+from pydantic import ValidationError
 
 from hilctl.base.errors import InputError
 from hilctl_drivers.ascii.ascii_profile import AsciiWatchdog
 from hilctl_drivers.profile import load_profile
 from hilctl_drivers.profile_base import Range
 from hilctl_drivers.signal_chain import (
+    AddressOptions,
     Amplifier,
     DacOptions,
     Sensor,
@@ -86,6 +88,29 @@ def test_sensitivity_must_fit_the_input(unit, sensor):
     source = Range(unit=unit, min=-1.0, max=4.0)
     with pytest.raises(InputError, match=f"in {unit}|gives {unit}"):
         SignalChain(VOLTS, source, Amplifier(gain_a_per_v=1.0), Sensor.model_validate(sensor))
+
+
+@pytest.mark.parametrize(("host", "words"), [
+    ("h:502", "set host to h and tcp_port to 502"), ("[::1]:502", "set host to ::1 and tcp_port"),
+    *((each, "host name or an IP address") for each in
+      ("", " ", "..", "a..b", ".", "a\0b", "a b", "-a", "a-", "http://h", "300::x", "h" * 64)),
+])  # fmt: skip
+def test_malformed_hosts_are_refused(host, words):
+    with pytest.raises(ValidationError, match=words):
+        AddressOptions.model_validate({"profile": "icp_et7000", "host": host})
+
+
+@pytest.mark.parametrize(
+    "host", ["h", "plc_3.lab", "Rig-1.lab.", "10.0.0.7", "::1", "fe80::1%eth0", "müller.local"]
+)
+def test_hosts_are_names_or_addresses(host):
+    assert AddressOptions.model_validate({"profile": "icp_et7000", "host": host}).host == host
+
+
+@pytest.mark.parametrize("path", ["", " ", "/dev/tty\0"])
+def test_malformed_device_files_are_refused(path):
+    with pytest.raises(ValidationError, match="device file"):
+        AddressOptions.model_validate({"profile": "cobs_board", "serial_port": path})
 
 
 def test_channels_are_found_by_name():

@@ -375,6 +375,17 @@ def test_input_and_output_are_read(serve, profile, reader):
     assert served.events() == before
 
 
+def test_a_denormal_read_back_is_named(serve, variant):
+    """3 V with its words swapped is 2.3e-41, which the offset of an amplifier would hide."""
+    right = "address: 0, type: float32, order: ABCD"
+    swapped = variant((right, right.replace("ABCD", "CDAB")))
+    served = serve("generic_float32")
+    served.device().make_safe(3.0)
+    given = served.device(profile=swapped, amplifier={"gain_a_per_v": 1.0, "offset_a": 0.5})
+    with pytest.raises(DeviceError, match=r"OUT must be .*order"):
+        given.look()
+
+
 def test_a_command_from_before_a_trip_is_not_taken_for_the_output(serve):
     served = serve("wago_750")
     device = served.running(watchdog={"timeout_s": 0.5})

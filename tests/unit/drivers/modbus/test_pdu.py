@@ -145,9 +145,19 @@ def test_exceptions_are_refusals_with_their_code(code, name):
     theirs = ExceptionResponse(23, code)
     theirs.dev_id, theirs.transaction_id = 1, 5
     adu = FramerSocket(DecodePDU(False)).buildFrame(theirs)
-    with pytest.raises(RefusedError, match=f"function 23 .*exception {code} .*{name}") as caught:
+    with pytest.raises(
+        RefusedError, match=f"function 23 .*exception {code} .*{name}.* 0 .* 2048"
+    ) as caught:
         reply_data(write_read_pdu(0, 2, 0x800, FOUR), tcp_pdu(adu, 5, 1))
     assert caught.value.code == code
+
+
+@pytest.mark.parametrize(("request_pdu", "place"), [
+    (read_pdu(3, 200, 1), "address 200"), (write_single_pdu(3, H("0102")), "address 3"),
+])  # fmt: skip
+def test_exception_names_the_address(request_pdu, place):
+    with pytest.raises(RefusedError, match=rf"{place}$"):
+        reply_data(request_pdu, bytes((request_pdu[0] | 0x80, 2)))
 
 
 @pytest.mark.parametrize(("build", "arguments"), [
