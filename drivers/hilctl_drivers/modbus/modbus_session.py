@@ -21,6 +21,7 @@ from hilctl_drivers.modbus.modbus_profile import (
 from hilctl_drivers.modbus.pdu import (
     FEEDBACK,
     TCP_HEAD,
+    WRITE_COIL,
     WRITE_READ,
     WRITE_REGISTER,
     WRITE_REGISTERS,
@@ -72,6 +73,8 @@ class Transaction(ABC):
 
     def __init__(self, adu: bytes, pdu: bytes, start: int) -> None:
         """Take the first request, its PDU, and where in the request the PDU begins."""
+        self.pdu = pdu
+        """The first request; later ones differ in the data only."""
         first = _DATA_AT.get(pdu[0], len(pdu))
         head, read_size = reply_layout(pdu)
         self._last = adu
@@ -263,7 +266,21 @@ class ModbusSession:
     def call(self, transaction: Transaction, data: bytes = b"") -> bytes:
         """Send a prepared request with register bytes to write; return those that were read."""
         request, usual = transaction.request(data), transaction.reply_size
-        return transaction.reply(self.link.transact(request, transaction.missing, usual))
+        try:
+            return transaction.reply(self.link.transact(request, transaction.missing, usual))
+        except RefusedError as error:
+            raise RefusedError(f"{error}{self._keys(transaction.pdu)}", error.code) from None
+
+    def _keys(self, pdu: bytes) -> str:
+        """Return the keys of registers at the address of a request; none for functions 23, 76."""
+        address = int.from_bytes(pdu[1:3], "big")
+        keys = [
+            key
+            for key, register in self.profile.registers()
+            if pdu[0] in {register.read_function, WRITE_COIL, WRITE_REGISTER, WRITE_REGISTERS}
+            and self.profile.wire_address(register) == address
+        ]
+        return f" ({', '.join(keys)} in the profile)" if keys else ""
 
     def read_bytes(self, register: Register) -> bytes:
         """Return the content of a register as bytes; a bit as one byte, 0 or 1."""

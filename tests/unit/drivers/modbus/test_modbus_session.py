@@ -375,6 +375,13 @@ def test_input_and_output_are_read(serve, profile, reader):
     assert served.events() == before
 
 
+def test_an_exception_names_the_key(serve, variant):
+    served = serve("generic_float32")
+    given = served.device(profile=variant(("address: 2, type", "address: 60000, type")))
+    with pytest.raises(DeviceError, match=r"exception 2 .* 60000 \(inputs\.IN "):
+        given.look()
+
+
 def test_a_denormal_read_back_is_named(serve, variant):
     """3 V with its words swapped is 2.3e-41, which the offset of an amplifier would hide."""
     right = "address: 0, type: float32, order: ABCD"
