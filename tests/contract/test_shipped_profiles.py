@@ -291,14 +291,15 @@ def test_text_exchange(profiles, name, text):
     assert profiles[name].exchange.write.format(value=1.0) == text
 
 
-@pytest.mark.parametrize(("reply", "um"), [
-    ("MS,-0000.1234,0,LO", -123.4), ("MS,-999999,1,--", None), ("MS,-999999.0,1,GO", None),
+@pytest.mark.parametrize(("reply", "number", "invalid"), [
+    ("MS,-0000.1234,0,LO", "-0000.1234", False), ("MS,-999999,1,--", None, True),
+    ("MS,-999999.0,1,GO", None, True),
 ])  # fmt: skip
-def test_keyence_reading(profiles, reply, um):
-    """A reading without a measurement does not match."""
+def test_keyence_reading(profiles, reply, number, invalid):
     sensor = profiles["keyence_cl3000"].inputs["OUT1"]
     found = sensor.match(reply)
-    assert (found and sensor.value(float(found[1]))) == (um and pytest.approx(um))
+    assert (found and found[1]) == number
+    assert (sensor.invalid.match(reply) is not None) is invalid
 
 
 def test_gap(profiles):
