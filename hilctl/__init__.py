@@ -1,28 +1,27 @@
 """hilctl: a real-time hardware-in-the-loop compensator for smart-material actuators.
 
-The rooms, top to bottom; each sees those below it:
+The packages, top to bottom; each imports those below it only:
 
-cli          commands, messages and tables; the only room that prints
-api          all of it from a program of one's own; what is kept
-desk         who looks on: the live page of a run, and its server
-campaign     many runs of one experiment, kept and resumed
-series       many runs side by side: what varied, figures and page of all of them
-characterise from a wired device to its model: a campaign of runs
-learning     corrections from run to run
+cli          commands, messages and tables; the only package that prints
+api          the same functions for a program of one's own
+live         the live page of a run, and its server
+studies      many runs of one experiment: campaigns, their figures and page, characterisation
 comparison   models of the literature on the same loops
-identify     measured data in, model parameters out
+identify     parameters of models from measured data
 analysis     figures, plots, pages, replay and export of a recording
-run          three processes round one loop: recording, requests, recovery
+ilc          iterative learning: corrections from run to run
+run          the processes of a run: loop, supervisor, guardian; recording, requests, recovery
 experiment   the file, what it refers to, and whether it may start; moves nothing
 machine      what this computer can do
 loop         everything that a tick executes
 waveforms    reference samples from a few keys
-recording    MCAP in, out, recovered
+recording    MCAP files: written, read, recovered
 models       parameters, forward and inverse operators
+signals      spectra, cycles and metrics of sampled signals
 kernels      compiled arithmetic on plain arrays
-base         what all share: arrays, errors, the device contract, samples, strict YAML
+base         arrays, errors, the device contract, samples, strict YAML
 
-Devices stand in ``hilctl_drivers``, which sees ``base`` and ``kernels`` only.
+Devices are in ``hilctl_drivers``, which imports ``base`` and ``kernels`` only.
 """
 
 import os
