@@ -93,4 +93,4 @@ def test_a_saved_model_runs_like_any_other(models, folder, name):
 def test_the_page_is_written(models, folder):
     text = (folder / "models.html").read_text()
     assert all(name in text for name in models)
-    assert text.count("<svg") == 1
+    assert "<svg" in text

