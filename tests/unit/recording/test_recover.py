@@ -96,7 +96,8 @@ def check(path, sound, cut):
         attachments = [record.name for record in reader.iter_attachments()]
     assert summary.statistics.message_count == len(back)
     assert summary.statistics.metadata_count == 2
-    assert attachments == ["experiment.yaml", "model.yaml"][: len(attachments)]
+    named = ["experiment.yaml", "model.yaml", "device/profile.yaml"]
+    assert attachments == named[: len(attachments)]
     assert back[-1][0] == "/events"
     assert back[:-1] == sound.messages[: len(back) - 1]
     assert len(back) - 1 >= sound.before(cut)
