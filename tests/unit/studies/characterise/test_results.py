@@ -99,8 +99,9 @@ RATE_HZ = 1000.0
 def run(make_recording):
     """A conditioning cycle, then a reference that is evaluated between 600 and 1900."""
 
-    def make(off_um=0.0, reach=1.0):
+    def make(off_um=0.0, reach=1.0, rest=0.0):
         command = reach * np.sin(np.arange(2000) ** 1.5 / 900.0)
+        command[0] = rest
         moved = MODEL.forward(RATE_HZ).process(command) + off_um
         segments = [Segment("decaying", 0, 500, 0, 500), Segment("random", 500, 2000, 600, 1900)]
         return make_recording(moved, command=command, segments=segments, sample_rate_hz=RATE_HZ)
@@ -156,3 +157,9 @@ def test_the_kind_is_chosen_on_whole_histories_of_what_may_be_fitted(run, monkey
     assert (settings.auto, settings.whole, unit) == (True, True, "A")
     assert all(isinstance(record, History) for record in records)
     assert all(record.command.size == 1900 for record in records)
+    # The first cycle ends what happened before it; a drive of one sign ends nothing.
+    ends = [np.argmin(run().samples.command[:500]), np.argmax(run().samples.command[:500])]
+    assert all(record.ignore == max(ends) for record in records)
+    monkeypatch.setattr(results, "read", lambda path: run(rest=-1.0))
+    results.identified(paths)
+    assert all(record.ignore == 0 for record in asked[-1].records)
