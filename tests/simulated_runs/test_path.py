@@ -12,12 +12,16 @@ QUICK = ("sample_rate_hz=1000", "block=10")
 
 RIGS = {
     "current, both signs": ("simulated_terfenol", (), 1.2),
-    "current, one sign": ("simulated_terfenol", ("limits.drive_a=[0.0, 6.0]",), 1.2),
     "voltage, one sign": ("simulated_piezo", (), 0.24),
-    "voltage, both signs": ("simulated_piezo", (STAGE,), 0.24),
 }
 """Device, settings of ``init``, and 1.5 times the validation error with limits set by hand."""
-PHYSICS = {"domains": 1.2, "diffusion": 1.2, "jiles_atherton": 1.2}
+MORE_RIGS = {
+    "current, one sign": ("simulated_terfenol", ("limits.drive_a=[0.0, 6.0]",), 1.2),
+    "voltage, both signs": ("simulated_piezo", (STAGE,), 0.24),
+    "domains": ("simulated_terfenol", ("device.physics=domains",), 1.2),
+    "diffusion": ("simulated_terfenol", ("device.physics=diffusion",), 1.2),
+    "jiles_atherton": ("simulated_terfenol", ("device.physics=jiles_atherton",), 1.2),
+}
 
 
 def follow(folder, device, settings, within_percent):
@@ -43,7 +47,6 @@ def test_a_simulated_rig_is_compensated_by_default(tmp_path, device, settings, p
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("physics", "percent"), PHYSICS.items())
-def test_so_is_one_of_other_physics(tmp_path, physics, percent):
-    settings = (f"device.physics={physics}", *QUICK)
-    follow(tmp_path, "simulated_terfenol", settings, percent)
+@pytest.mark.parametrize(("device", "settings", "percent"), MORE_RIGS.values(), ids=MORE_RIGS)
+def test_so_are_the_others(tmp_path, device, settings, percent):
+    follow(tmp_path, device, (*settings, *QUICK), percent)
