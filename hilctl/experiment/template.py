@@ -203,10 +203,15 @@ def _range_of(limits: object, info: DeviceInfo) -> tuple[float, float]:
     return low, high
 
 
+def _about_zero(low: float, high: float) -> bool:
+    """Return whether a range has room on both sides of 0; a piezo's may begin a little below."""
+    return 2.0 * min(high, -low) >= max(high, -low)
+
+
 def _sine(unit: CommandUnit, low: float, high: float, frequency_hz: float) -> dict[str, Any]:
     """Return a sine of half the range between limits, around 0 if possible."""
     cycle_s = 1.0 / frequency_hz
-    offset = 0.0 if low < 0.0 < high else 0.5 * (low + high)
+    offset = 0.0 if _about_zero(low, high) else 0.5 * (low + high)
     return {
         "kind": "sine",
         "unit": unit,
@@ -224,7 +229,7 @@ def _limits(
     unit, ends = info.command_unit, f"{info.command_min:g} to {info.command_max:g}"
     range_key, slew_key = f"drive_{unit.lower()}", f"slew_{unit.lower()}_per_s"
     value: Any = [low, high]
-    if unit == "A" and low < 0.0 < high:
+    if unit == "A" and _about_zero(low, high):
         range_key, value = "peak_current_a", min(high, -low)
     stroke = [_rounded(0.9 * each, 3) for each in (info.sensor_min_um, info.sensor_max_um)]
     return {range_key: value, slew_key: slew, "stroke_um": stroke}, {

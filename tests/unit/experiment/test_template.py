@@ -94,3 +94,13 @@ def test_a_current_of_one_sign_has_a_range(tmp_path, name, settings, reader, hig
     checked, _, _ = written(tmp_path, name, settings, reader=reader)
     limits = checked.loaded.config.limits
     assert limits.drive_a == limits.command_range == (0.0, high)
+
+
+def test_a_range_that_begins_a_little_below_zero_is_moved_about_its_middle(tmp_path):
+    settings = ["device.amplifier.gain_v_per_v=10"]
+    checked, _, _ = written(tmp_path, "labjack_t8", settings, unit="V")
+    low, high = checked.loaded.config.limits.command_range
+    assert -1.0 < low < 0.0
+    waveform = checked.loaded.config.waveform
+    assert waveform.offset == pytest.approx(0.5 * (low + high))
+    assert waveform.amplitude > 0.2 * (high - low)
