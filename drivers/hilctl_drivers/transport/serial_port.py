@@ -15,7 +15,11 @@ from serial.rs485 import RS485Settings
 from hilctl.base.errors import DeviceError
 from hilctl.base.files import PORT_REMEDIES, reason
 from hilctl_drivers.transport.links import LostError
-from hilctl_drivers.transport.resource_names import admit_others, refuse_to_others
+from hilctl_drivers.transport.resource_names import (
+    admit_others,
+    port_identity,
+    refuse_to_others,
+)
 from hilctl_drivers.transport.stream_link import StreamLink
 
 
@@ -98,7 +102,7 @@ def _keep_levels(fd: int) -> None:
 
 
 class SerialLink(StreamLink):
-    """A serial port with exclusive access."""
+    """A serial port with exclusive access, for the device that was there first."""
 
     LOST = "port lost, unplugged?"
 
@@ -115,10 +119,19 @@ class SerialLink(StreamLink):
         self._settings = settings
         self._port: serial.Serial | None = None
         self._exclusive = False
+        # Before the first opening: the guardian opens the port only after a run has failed.
+        self._identity = port_identity(port)
 
     def open(self, *, boot: bool = True) -> None:
         """Open and lock the port, see :meth:`StreamLink.open`."""
         self.close()
+        found = port_identity(self._path)
+        self._identity = self._identity or found
+        if found not in {"", self._identity}:
+            raise LostError(
+                f"another device is at this port now ({found} instead of {self._identity}): name "
+                "the port by its link in /dev/serial/by-id, which stays with the device"
+            )
         try:
             port = _open_port(self._path, self._settings, self.timeout_s)
         except (OSError, ValueError) as error:

@@ -8,6 +8,7 @@ import threading
 from pathlib import Path
 
 import pytest
+from serial.tools.list_ports_common import ListPortInfo
 
 from hilctl.base.errors import DeviceError
 from hilctl_drivers.transport import resource_names, stream_link
@@ -173,3 +174,36 @@ def test_a_port_is_known_by_its_number_too(line):
     number = f"tty:{os.major(rdev)}:{os.minor(rdev)}"
     assert held_port(path) == (f"serial:{path}", number)
     assert number in held_port(f"/proc/self/root{path}")
+
+
+def test_a_port_whose_path_leads_to_another_device_is_not_opened(line):
+    """A guardian that retries would send its value to whatever was plugged in since."""
+    _, path = line
+    link = SerialLink(path, SerialSettings(), QUICK_S)
+    link.open()
+    link.open()
+    link.close()
+    Path(path).chmod(0o600)  # changes the time that tells a new pty from an old one
+    with pytest.raises(LostError, match="another device"):
+        link.open()
+
+
+@pytest.mark.parametrize(
+    ("now", "same"),
+    [
+        ({"serial_number": "A1", "location": "1-9"}, True),  # in another socket
+        ({"serial_number": "B2", "location": "1-4"}, False),
+        ({"serial_number": None, "location": "1-4"}, False),
+        ({"serial_number": "A1", "location": "1-4", "pid": 2}, False),
+    ],
+)
+def test_a_usb_adapter_is_known_by_its_number(monkeypatch, now, same):
+    def identity(given):
+        port = ListPortInfo(os.devnull)
+        values = {"vid": 0x0403, "pid": 1, **given}
+        for name, value in values.items():
+            setattr(port, name, value)
+        monkeypatch.setattr(resource_names, "comports", lambda: [port])
+        return resource_names.port_identity(os.devnull)
+
+    assert (identity({"serial_number": "A1", "location": "1-4"}) == identity(now)) is same
