@@ -280,6 +280,12 @@ def print_forecast(checked: CheckedExperiment) -> None:
     }
     if forecast.begins:
         rows["initial state"] = forecast.begins
+    interlocks = config.interlocks
+    if interlocks.tracking_error_um is not None:
+        most = f"at most {interlocks.tracking_error_um:g} µm"
+        rows["tracking error"] = (
+            f"{most}, longer than {interlocks.tracking_s or 0.0:g} s ends the run"
+        )
     if info.safe_note:
         rows["safe value"] = info.safe_note
     if forecast.heating_rms_a is not None:

@@ -16,9 +16,13 @@ from hilctl.experiment.sections import (
     RecordingConfig,
     Timing,
 )
+from hilctl.loop.interlocks import InterlockSettings
 from hilctl.loop.limiter import CommandLimits
 from hilctl.machine.rt_setup import Realtime
 from hilctl.waveforms.spec import AnyWaveform
+
+_TRACKING_SHARE = 0.25  # of limits.stroke_um
+_TRACKING_S = 1e-3  # less than half a period at 250 Hz, and two samples on a slow wire
 
 
 def _none_or_mapping(value: Any) -> Any:
@@ -119,6 +123,19 @@ class Experiment(StrictModel):
     def lead_in_samples(self) -> int:
         """Length of the lead-in from the initial displacement to the reference, in samples."""
         return max(1, round(self.safe.ramp_s * self.sample_rate_hz))
+
+    @property
+    def interlocks(self) -> InterlockSettings:
+        """Settings of the interlocks; a compensated run has one on its tracking error by default.
+
+        ``limits.tracking_error_um: null`` disables it.
+        """
+        limits = self.limits
+        if self.compensator is None or "tracking_error_um" in limits.model_fields_set:
+            return limits
+        low_um, high_um = limits.stroke_um
+        most_um = _TRACKING_SHARE * (high_um - low_um)
+        return limits.model_copy(update={"tracking_error_um": most_um, "tracking_s": _TRACKING_S})
 
     def command_limits(self) -> CommandLimits:
         """Return the settings of the limiter, in the device's unit."""

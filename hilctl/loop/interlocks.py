@@ -75,7 +75,9 @@ class InterlockSettings(StrictModel):
         _Positive | None, InterlockRequirement("A", "rms_current_a")
     ] = Field(default=None, description="thermal time constant of the coil, s")
     tracking_error_um: Annotated[_Positive | None, InterlockRequirement(reference_um=True)] = Field(
-        default=None, description="largest |reference - displacement| of a compensated run, um"
+        default=None,
+        description="largest |reference - displacement| of a compensated run, um; default: a"
+        " quarter of limits.stroke_um for 1 ms; null disables it",
     )
     tracking_s: Annotated[_NotNegative | None, InterlockRequirement(key="tracking_error_um")] = (
         Field(default=None, description="time for which the error may be larger, s; default: 0")

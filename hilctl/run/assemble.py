@@ -78,7 +78,7 @@ def assemble(
         compensator=compensator,
         limits=config.command_limits(),
         interlocks=replace(interlock_context(config, info), heat_a2=heat_a2),
-        interlock_settings=config.limits,
+        interlock_settings=config.interlocks,
         late_policy=policy,
         start_policy="spaced" if host_paced else policy,
         # By time, not by ticks: otherwise the ramp would take long on a slow device.

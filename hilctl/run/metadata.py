@@ -226,7 +226,7 @@ def _limits(checked: "CheckedExperiment") -> LimitBounds:
         rms_current_a=limits.rms_current_a,
         thermal_time_constant_s=limits.thermal_time_constant_s,
         heat_a2=checked.heat_a2,
-        tracking_error_um=limits.tracking_error_um,
+        tracking_error_um=config.interlocks.tracking_error_um,
         measured_deviation=limits.measured_deviation,
         late_s=config.timing.max_late_s,
     )

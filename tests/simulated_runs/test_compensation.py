@@ -61,3 +61,22 @@ def test_minor_loops_are_compensated(tmp_path, name, peak_percent):
     report = summarize(read(path))
     assert report.peak_error_percent is not None
     assert report.peak_error_percent <= peak_percent
+
+
+@pytest.mark.parametrize("frequency_hz", [1, 20, 250])
+def test_a_reversed_actuator_ends_the_run(tmp_path, frequency_hz):
+    """A reversed bias has the effect of swapped coil wires: the displacement falls."""
+    settings = [
+        "device.magnet=false",
+        "device.bias_a=-3.2",
+        "limits.peak_current_a=6.8",
+        "waveform.amplitude=36",
+        f"waveform.frequency_hz={frequency_hz}",
+    ]
+    path = tmp_path / "run.mcap"
+    result = start_run(
+        CONFIGS / "terfenol_sine_6a.yaml", settings, path, False, lambda progress: None
+    )
+    assert (result.code, result.output_state) == ("fault", "confirmed")
+    assert [event.code for event in read(path).events if event.code == "tracking_error"]
+    assert result.samples < 15_000

@@ -116,6 +116,29 @@ class TestConsistency:
         assert "simulated_terfenol" in found.rule
         check(loaded(CURRENT, "limits.measured_deviation_a=1.0"))
 
+    @pytest.mark.parametrize(
+        ("compensator", "settings", "error_um", "time_s"),
+        [
+            ("{model: models/terfenol_omega.yaml}", [], 33.75, 1e-3),
+            ("{model: models/terfenol_omega.yaml}", ["tracking_error_um=null"], None, None),
+            ("{model: models/terfenol_omega.yaml}", ["tracking_error_um=5"], 5.0, None),
+            ("none", [], None, None),
+        ],
+    )
+    def test_a_compensated_run_has_a_limit_of_its_tracking_error(
+        self, compensator, settings, error_um, time_s
+    ):
+        text = CURRENT.replace("none", compensator)
+        if compensator != "none":
+            text = text.replace("unit: A", "unit: um")
+        made = resolve(
+            Document("x.yaml", text),
+            Path(__file__).parents[3] / "configs",
+            [f"limits.{setting}" for setting in settings],
+        )
+        interlocks = made.config.interlocks
+        assert (interlocks.tracking_error_um, interlocks.tracking_s) == (error_um, time_s)
+
     def test_all_of_them_together_are_fine(self):
         text = CURRENT.replace("unit: A", "unit: um")
         settings = (
