@@ -1,4 +1,4 @@
-"""The references that ``physics.py`` judges an inverse on, each with its goals."""
+"""The references on which ``physics.py`` evaluates an inverse, each with its class and goal."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,90 +11,82 @@ from hilctl.waveforms import spec
 from hilctl.waveforms.shapes import sampled
 
 RATE_HZ = 50_000.0
-UNJUDGED = 250  # samples at the end, where the reference that an inverse looks ahead to stops
-_PARTS = (1.0, 0.5, 0.25, 0.1)
-_FREQUENCIES_HZ = (1.0, 50.0, 100.0, 250.0)
-_GOAL, _SMALL_GOAL = 0.5, 1.0
-_RANDOM_GOALS = 1.5, 0.5
+GOALS = {
+    "sine 100 %": 0.5,
+    "sine 50 %": 1.0,
+    "sine 25 %": 1.0,
+    "sine 10 %": 2.0,
+    "complex": 1.0,
+    "triangle": 1.0,
+    "multisine": 1.5,
+    "chirp": 1.5,
+    "random": 1.5,
+}
+"""Largest peak error of each class of references, percent of a reference's own peak-to-peak."""
+_UNJUDGED = 250  # samples at the end, where the reference that an inverse looks ahead to stops
+_FREQUENCIES_HZ = (1.0, 20.0, 100.0, 250.0)
 _SWELL_S = 0.05
 _CORNER_S = 0.5e-3
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A reference and what is asked of it.
+    """A reference.
 
     Attributes:
-        goal: Largest peak error, percent of its peak-to-peak.
-        rms_goal: The same for the rms error; None where only the peak counts.
+        group: Its class, a key of ``GOALS``.
         reference_um: float64[n], from 0.
-        judged: bool[n], where it counts.
+        judged: bool[n], the evaluated samples.
     """
 
+    group: str
     name: str
-    goal: float
-    rms_goal: float | None
     reference_um: F64
     judged: npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
 class Stroke:
-    """Where references may go, in um."""
+    """Range of references, in um."""
 
     low_um: float
     high_um: float
 
-    @property
-    def half_um(self) -> float:
-        return 0.5 * (self.high_um - self.low_um)
-
-    @property
-    def middle_um(self) -> float:
-        return 0.5 * (self.low_um + self.high_um)
-
     def row(
-        self,
-        name: str,
-        goals: tuple[float, float | None],
-        wave: F64,
-        begin_s: float = _SWELL_S,
-        *,
-        place: float = 0.0,
+        self, group: str, detail: str, wave: F64, begin_s: float = _SWELL_S, *, place: float = 0.0
     ) -> Row:
-        """Return a row for a wave of -1 to 1, swollen from rest, and in place of -1 to 1."""
+        """Return a row for a wave of -1 to 1 about ``place`` of -1 to 1, with a soft start."""
+        half_um = 0.5 * (self.high_um - self.low_um)
+        middle_um = 0.5 * (self.low_um + self.high_um) + place * half_um
         time_s = np.arange(wave.size) / RATE_HZ
         swelling = 0.5 - 0.5 * np.cos(np.pi * np.clip(time_s / begin_s, 0.0, 1.0))
-        middle_um = self.middle_um + place * self.half_um
         judged = np.zeros(wave.size, dtype=np.bool_)
-        judged[round(begin_s * RATE_HZ) : -UNJUDGED] = True
-        return Row(name, *goals, swelling * (middle_um + self.half_um * wave), judged)
+        judged[round(begin_s * RATE_HZ) : -_UNJUDGED] = True
+        return Row(group, f"{group}, {detail}", swelling * (middle_um + half_um * wave), judged)
 
 
 def references(low_um: float, high_um: float) -> Iterator[Row]:
-    """Give all rows within a stroke."""
+    """Yield all rows within a stroke."""
     stroke = Stroke(low_um, high_um)
-    for part in _PARTS:
-        goal = _GOAL if part == 1.0 else _SMALL_GOAL
-        places = {"": 0.0} if part == 1.0 else {"": 0.0, " low": part - 1.0, " high": 1.0 - part}
-        for name, place in places.items():
+    for part in (1.0, 0.5, 0.25, 0.1):
+        places = {"": 0.0, " low": part - 1.0, " high": 1.0 - part} if part < 1.0 else {"": 0.0}
+        for label, place in places.items():
             for frequency_hz in _FREQUENCIES_HZ:
                 begin_s = max(0.04, 1.0 / frequency_hz)
-                label = f"{100 * part:.0f} %{name}, {frequency_hz:g} Hz"
                 wave = part * _sine(frequency_hz, begin_s)
-                yield stroke.row(label, (goal, None), wave, begin_s, place=place)
+                group, detail = f"sine {100 * part:.0f} %", f"{frequency_hz:g} Hz{label}"
+                yield stroke.row(group, detail, wave, begin_s, place=place)
     for low_hz in (50.0, 100.0):
-        label = f"complex {low_hz:g}/{2 * low_hz:g} Hz"
-        yield stroke.row(label, (_SMALL_GOAL, None), _complex(low_hz))
+        yield stroke.row("complex", f"{low_hz:g} and {2 * low_hz:g} Hz", _complex(low_hz))
     yield _triangle(stroke)
     for part, seed in ((1.0, 5), (0.5, 6)):
         percent = f"{100 * part:.0f} %"
-        yield stroke.row(f"random {percent}", _RANDOM_GOALS, part * random(seed))
-        yield stroke.row(f"multisine {percent}", _RANDOM_GOALS, part * _multisine())
-        yield stroke.row(f"chirp {percent}", _RANDOM_GOALS, part * _chirp())
+        yield stroke.row("random", percent, part * _random(seed))
+        yield stroke.row("multisine", percent, part * _multisine())
+        yield stroke.row("chirp", percent, part * _chirp())
 
 
-def random(seed: int) -> F64:
+def _random(seed: int) -> F64:
     """Return a band-limited random wave, 5 to 200 Hz, of -1 to 1."""
     rng = np.random.default_rng(seed)
     time_s = np.arange(round(0.8 * RATE_HZ)) / RATE_HZ
@@ -107,7 +99,7 @@ def random(seed: int) -> F64:
 
 
 def _sine(frequency_hz: float, begin_s: float) -> F64:
-    samples = round((begin_s + max(0.04, 2.0 / frequency_hz)) * RATE_HZ) + UNJUDGED
+    samples = round((begin_s + max(0.04, 2.0 / frequency_hz)) * RATE_HZ) + _UNJUDGED
     return np.asarray(np.sin(2.0 * np.pi * frequency_hz * np.arange(samples) / RATE_HZ))
 
 
@@ -123,9 +115,9 @@ def _complex(low_hz: float) -> F64:
 
 
 def _triangle(stroke: Stroke) -> Row:
-    """Return 100 Hz, judged away from its corners, which no structure with a mass follows."""
+    """Return 100 Hz, evaluated away from its corners, which no structure with a mass follows."""
     shape = spec.Triangle(kind="triangle", amplitude=1.0, frequency_hz=100.0, duration_s=0.13)
-    row = stroke.row("triangle 100 Hz", (_SMALL_GOAL, None), sampled(shape, RATE_HZ))
+    row = stroke.row("triangle", "100 Hz", sampled(shape, RATE_HZ))
     turns = np.mod(100.0 * np.arange(row.judged.size) / RATE_HZ - 0.25, 0.5)
     row.judged[np.minimum(turns, 0.5 - turns) < 100.0 * _CORNER_S] = False
     return row
