@@ -33,7 +33,13 @@ from hilctl_drivers.simulated.devices import PHYSICS, SimulatedDevice
 from tests.benchmark.references import GOALS, RATE_HZ, Row, references
 
 CONFIGS = Path(__file__).parents[2] / "configs"
-RIGS = {physics: ("terfenol_sine_6a.yaml", f"device.physics={physics}") for physics in PHYSICS}
+RIGS = {physics: ("terfenol_sine_6a.yaml", f"device.physics={physics}") for physics in PHYSICS} | {
+    "thermal_switching": (
+        "piezo_sine.yaml",
+        "device.physics=thermal_switching",
+        "limits.slew_v_per_s=200000",
+    )
+}
 """Experiment file and settings of each rig."""
 MARGIN = 0.06  # of the range that a model was identified on, at either end
 SLACK = 1.25  # of the promised error

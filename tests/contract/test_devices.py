@@ -27,7 +27,7 @@ TIMEOUT_S = 5.0
 ELSEWHERE = {"serial_dac": "test_serial_devices.py", "modbus_stream": "test_modbus_stream.py"}
 """Devices that are tested with this contract in another file."""
 SIMULATED = sorted(set(BUILTIN) - {"modbus_dac", *ELSEWHERE})
-PHYSICS = ("domains", "diffusion", "jiles_atherton")
+PHYSICS = ("domains", "diffusion", "jiles_atherton", "growing_lag")
 """What simulated_terfenol is tried with beside its default."""
 MODBUS = (
     "adam_6024", "beckhoff_bk9000", "generic_float32", "icp_et7000", "labjack_t4", "labjack_t7",

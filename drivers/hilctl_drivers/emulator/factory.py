@@ -245,7 +245,7 @@ def _rig(
     """Return the actuator and its wiring to an output and an input; each may follow the other."""
     actuator, given = options.actuator, options.wiring
     wiring = None if given is None else SimulatedWiring(output, sensor_input, *given)
-    if isinstance(actuator, PiezoOptions) and actuator.stage is None:
+    if isinstance(actuator, PiezoOptions) and (actuator.physics, actuator.stage) == ("plays", None):
         if wiring is None:  # 0 V of an output drives with 0 V
             share = min(0.0, output.min) / max(abs(output.min), abs(output.max))
             stage = PiezoStage.fitted(share * _DRIVE_V, _DRIVE_V, _RANGE_UM)

@@ -19,8 +19,8 @@ from hilctl_drivers.device import DacDevice, details_of
 from hilctl_drivers.simulated.actuator_base import Plant, RodParameters
 from hilctl_drivers.simulated.diffusion import DiffusionParameters
 from hilctl_drivers.simulated.domains import DomainsParameters
-from hilctl_drivers.simulated.jiles_atherton import JilesAthertonParameters
-from hilctl_drivers.simulated.piezo import PiezoActuator, PiezoParameters
+from hilctl_drivers.simulated.jiles_atherton import GrowingLagParameters, JilesAthertonParameters
+from hilctl_drivers.simulated.piezo import PiezoParameters
 from hilctl_drivers.simulated.pinned_cells import PinnedCellsParameters
 from hilctl_drivers.simulated.terfenol import (
     CreepEffect,
@@ -30,6 +30,7 @@ from hilctl_drivers.simulated.terfenol import (
     Thermal,
     VoltageLimit,
 )
+from hilctl_drivers.simulated.thermal_switching import SwitchingParameters
 
 FIFO_DEPTH = 4096
 MAX_RATE_HZ = 200e3
@@ -75,7 +76,7 @@ class SimulatedDevice(DacDevice):
     def __init__(
         self,
         options: SimulatedOptions,
-        parameters: TerfenolParameters | PiezoParameters,
+        parameters: TerfenolParameters | PiezoParameters | SwitchingParameters,
         **info: Any,
     ) -> None:
         """Describe the device; a recording keeps parameters and options as its details."""
@@ -174,12 +175,15 @@ class SimulatedDevice(DacDevice):
             np.minimum(spoilt, self._info.sensor_max_um, out=spoilt)
 
 
-Physics: TypeAlias = Literal["pinned_cells", "domains", "diffusion", "jiles_atherton"]
+Physics: TypeAlias = Literal[
+    "pinned_cells", "domains", "diffusion", "jiles_atherton", "growing_lag"
+]
 PHYSICS: dict[Physics, type[RodParameters]] = {
     "pinned_cells": PinnedCellsParameters,
     "domains": DomainsParameters,
     "diffusion": DiffusionParameters,
     "jiles_atherton": JilesAthertonParameters,
+    "growing_lag": GrowingLagParameters,
 }
 Factor: TypeAlias = Annotated[float, Field(ge=0.5, le=2.0)]
 
@@ -218,7 +222,8 @@ class TerfenolOptions(SimulatedOptions):
         description="what goes on in the rods; pinned_cells: cells with dry friction behind one lag"
         " of the field; domains: domains of eight orientations, averaged over their energies;"
         " diffusion: the field diffuses into conducting rods, shell by shell;"
-        " jiles_atherton: Jiles and Atherton's equations with eddy and excess loss",
+        " jiles_atherton: Jiles and Atherton's equations with eddy and excess loss;"
+        " growing_lag: the same with an eddy-current loss that grows with itself",
     )
     load_kg: float = Field(default=0.0, ge=0.0, le=100.0, description="mass on the actuator, kg")
     magnet: bool = Field(
@@ -329,12 +334,23 @@ class PiezoStage(DeviceOptions):
 class PiezoOptions(SimulatedOptions):
     """Options of ``simulated_piezo``."""
 
+    physics: Literal["plays", "thermal_switching"] = Field(
+        default="plays",
+        description="plays: the published stage, or that of stage; thermal_switching: domains that"
+        " switch over barriers by thermal activation, in a stack with two modes",
+    )
     stage: PiezoStage | None = Field(
         default=None, description="a stage of your own instead of the published P-753.31C"
     )
     sensor_noise_um: float = Field(
         default=1e-3, ge=0.0, le=1.0, description="rms noise of each reading, um"
     )
+
+    @model_validator(mode="after")
+    def _stage_of_plays(self) -> Self:
+        if self.stage is not None and self.physics != "plays":
+            raise ValueError(f"stage is for physics: plays (got {self.physics}): remove it")
+        return self
 
 
 class SimulatedTerfenol(SimulatedDevice):
@@ -366,7 +382,7 @@ class SimulatedTerfenol(SimulatedDevice):
 
 
 class SimulatedPiezo(SimulatedDevice):
-    """The piezo stage of :mod:`hilctl_drivers.simulated.piezo`; commands in V of drive."""
+    """A piezo stage of :mod:`hilctl_drivers.simulated`; commands in V of drive."""
 
     Options: ClassVar[type[DeviceOptions]] = PiezoOptions
 
@@ -374,7 +390,11 @@ class SimulatedPiezo(SimulatedDevice):
         self._seed = options.seed
         noise_um = options.sensor_noise_um if options.noise else 0.0
         stage = options.stage.model_dump() if options.stage else {}
-        self._parameters = PiezoParameters(sensor_noise_um=noise_um, **stage)
+        self._parameters: PiezoParameters | SwitchingParameters
+        if options.physics == "plays":
+            self._parameters = PiezoParameters(sensor_noise_um=noise_um, **stage)
+        else:
+            self._parameters = SwitchingParameters(sensor_noise_um=noise_um)
         low_v, high_v = self._parameters.drive_min_v, self._parameters.drive_max_v
         drive = f"{low_v:g}..{high_v:g} V drive"
         super().__init__(
@@ -390,4 +410,4 @@ class SimulatedPiezo(SimulatedDevice):
 
     def plant(self, sample_rate_hz: float) -> Plant:
         """Return the stage at rest."""
-        return PiezoActuator(self._parameters, sample_rate_hz, self._seed)
+        return self._parameters.plant(sample_rate_hz, self._seed)

@@ -22,6 +22,9 @@ of the equations above is the applied one less what eddy currents and walls in m
     H = H_applied - e dM/dt - x sign(dM/dt) |dM/dt|^(1/2),
     e = mu_0 R^2 / (8 rho),  x = (0.1356 V_0 mu_0 pi R^2 / rho)^(1/2)
 
+Here e grows with the field z = H_applied - H that is taken, as e (1 + g |z|); the published law has
+g = 0. Without walls that is z = e dM/dt / (1 - g e |dM/dt|).
+
 Fields and magnetisation are in A/m, displacements in um, times in s.
 """
 
@@ -63,6 +66,7 @@ class JilesAthertonParameters(RodParameters):
     stress_pa: float = -22e6  # sigma_0, negative in compression
     resistivity_ohm_m: float = 0.6e-6  # rho
     wall_field_a_per_m: float = 100.0  # V_0, which scales the loss of walls in motion
+    lag_growth_m_per_a: float = 0.0  # g, relative growth of the eddy-current loss
 
     @property
     def effective_coupling(self) -> float:
@@ -71,12 +75,12 @@ class JilesAthertonParameters(RodParameters):
         return self.coupling + stress / (VACUUM_PERMEABILITY * self.saturation_a_per_m**2)
 
     @property
-    def losses(self) -> tuple[float, float]:
-        """Coefficients e in s and x in (A s / m)^(1/2) of the loss fields."""
+    def losses(self) -> tuple[float, float, float]:
+        """Coefficients e in s, x in (A s / m)^(1/2) and g in m/A of the loss fields."""
         eddy = VACUUM_PERMEABILITY * ROD_RADIUS_M**2 / (8.0 * self.resistivity_ohm_m)
         section = math.pi * ROD_RADIUS_M**2
         wall = 0.1356 * self.wall_field_a_per_m * VACUUM_PERMEABILITY * section
-        return eddy, math.sqrt(wall / self.resistivity_ohm_m)
+        return eddy, math.sqrt(wall / self.resistivity_ohm_m), self.lag_growth_m_per_a
 
     def rods(self, coil: Coil) -> Rods:
         """Return such rods in a coil."""
@@ -92,6 +96,16 @@ class JilesAthertonParameters(RodParameters):
             # The same shear at another strain: the stroke alone is to change.
             stress_pa=self.stress_pa / strain,
         )
+
+
+@dataclass(frozen=True, slots=True)
+class GrowingLagParameters(JilesAthertonParameters):
+    """Constants of rods in which the eddy-current loss grows with the field that it takes."""
+
+    pinning_a_per_m: float = 3000.0
+    resistivity_ohm_m: float = 0.4e-6
+    wall_field_a_per_m: float = 0.0
+    lag_growth_m_per_a: float = 1.1e-4
 
 
 @kernel("UniTuple(float64, 2)(float64)")
@@ -127,17 +141,19 @@ def susceptibility(field: float, magnetisation: float, sign: float, material: Ma
     return (irreversible + share) / (1.0 - coupling * share)
 
 
-@kernel("float64(float64, float64, float64, UniTuple(float64, 2))")
-def _advance(behind: float, chi: float, step: float, losses: tuple[float, float]) -> float:
+@kernel("float64(float64, float64, float64, float64, UniTuple(float64, 3))")
+def _advance(
+    behind: float, lag: float, chi: float, step: float, losses: tuple[float, float, float]
+) -> float:
     """Return the change of H in a step, in s: implicit midpoint of the loss equation.
 
-    With q^2 = |dH|: (e chi / step + 1/2) q^2 + x (chi / step)^(1/2) q = |H_applied - H|.
-    ``behind`` is the applied field at the middle of the step less H at its start, ``losses`` e
-    and x.
+    With q^2 = |dH|: (e (1 + g |lag|) chi / step + 1/2) q^2 + x (chi / step)^(1/2) q = |behind|.
+    ``behind`` is the applied field at the middle of the step less H at its start, ``lag`` an
+    estimate of the same less H at the middle, ``losses`` e, x and g.
     """
-    eddy, wall = losses
+    eddy, wall, growth = losses
     rate = chi / step
-    square = eddy * rate + 0.5
+    square = eddy * (1.0 + growth * abs(lag)) * rate + 0.5
     half = 0.5 * wall * math.sqrt(rate)
     root = abs(behind) / (half + math.sqrt(half * half + square * abs(behind)))
     return math.copysign(root * root, behind)
@@ -145,7 +161,7 @@ def _advance(behind: float, chi: float, step: float, losses: tuple[float, float]
 
 @kernel(
     "void(float64[::1], float64[::1], float64[::1], UniTuple(float64, 3), UniTuple(float64, 5),"
-    " UniTuple(float64, 2), float64)"
+    " UniTuple(float64, 3), float64)"
 )
 def _follow(
     halves_a: F64,
@@ -153,7 +169,7 @@ def _follow(
     state: F64,
     coil: tuple[float, float, float],
     material: Material,
-    losses: tuple[float, float],
+    losses: tuple[float, float, float],
     strain_um: float,
 ) -> None:
     """Do ``Rods.follow``.
@@ -170,9 +186,9 @@ def _follow(
         if behind != 0.0:
             sign = math.copysign(1.0, behind)
             chi = susceptibility(field, magnetisation, sign, material)
-            half = 0.5 * _advance(behind, chi, step, losses)
+            half = 0.5 * _advance(behind, behind, chi, step, losses)
             chi = susceptibility(field + half, magnetisation + chi * half, sign, material)
-            change = _advance(behind, chi, step, losses)
+            change = _advance(behind, behind - half, chi, step, losses)
             field += change
             magnetisation += chi * change
         share = magnetisation / material[0]

@@ -16,10 +16,10 @@ import numpy as np
 from hilctl.base.device import DeviceOptions
 from hilctl.base.strict import Field
 from hilctl.base.types import F64
-from hilctl.kernels.dynamics import exponential
 from hilctl.kernels.jit import ensure_compiled, kernel
 from hilctl_drivers.simulated.actuator_base import CHUNK, Coil, Plant, RodParameters
 from hilctl_drivers.simulated.pinned_cells import PinnedCellsParameters
+from hilctl_drivers.simulated.structure import Mode, motion, respond
 
 Amplification: TypeAlias = tuple[float, float, float, float, float, float]
 
@@ -103,42 +103,6 @@ def warm(
             current = halves_a[2 * k + 1] + bias
             warmth += reached * (rise * current * current - warmth)
     state[0] = warmth
-
-
-@kernel(
-    "void(float64[::1], float64[::1], float64[::1], float64[::1], float64[:, ::1], float64,"
-    " UniTuple(float64, 2), int64)"
-)
-def respond(
-    free_um: F64,  # float64[n substeps], displacement of the rods at the end of each step
-    noise_um: F64,  # float64[n], of each reading
-    displacement_um: F64,  # float64[n], filled with the sensor's readings
-    mechanics: F64,  # float64[m], updated
-    motion: F64,  # float64[m - 2, m], exact step for a free displacement that changes linearly
-    rest_um: float,  # free displacement at rest
-    sensor: tuple[float, float],  # one ADC code and the range, in um
-    substeps: int,  # in a sample period
-) -> None:
-    """Read the sensor, then let structure and sensor follow the rods; for every sample."""
-    # mechanics: position and velocity of each mode, sensor output, free displacement from rest
-    # before and after the last step.
-    adc_code, sensor_range = sensor
-    size = mechanics.size
-    moved = np.empty(size - 2)
-    for j in range(noise_um.size):
-        reading = np.rint((mechanics[size - 3] + noise_um[j]) / adc_code) * adc_code
-        displacement_um[j] = min(sensor_range, max(-sensor_range, reading))
-        for k in range(j * substeps, (j + 1) * substeps):
-            mechanics[size - 2] = mechanics[size - 1]
-            mechanics[size - 1] = free_um[k] - rest_um
-            for row in range(size - 2):
-                value = 0.0
-                for i in range(size):
-                    value += motion[row, i] * mechanics[i]
-                moved[row] = value
-            # Not as a slice: numba then compiles a message for sizes that differ, which takes 2 s.
-            for row in range(size - 2):
-                mechanics[row] = moved[row]
 
 
 TimeConstant: TypeAlias = Annotated[float, Field(ge=1e-3, le=1e5)]
@@ -237,30 +201,15 @@ class TerfenolParameters:
     amplifier: VoltageLimit | None = None  # limit of the amplifier's voltage
 
 
-def _motion(parameters: TerfenolParameters, load_kg: float, step_s: float) -> F64:
-    """Return float64[m - 2, m], the exact step of structure and sensor for ``respond``."""
-    # Velocities are in um per radian of their natural frequency: then it is well scaled.
+def _modes(parameters: TerfenolParameters, load_kg: float) -> list[Mode]:
     omega = math.sqrt(parameters.stiffness_n_per_m / (parameters.moving_mass_kg + load_kg))
-    modes = [(omega, parameters.damping_ratio, 1.0)]
     second = parameters.second_mode
-    if second is not None:
-        modes[0] = (omega, parameters.damping_ratio, 1.0 - second.share)
-        modes.append((2.0 * math.pi * second.frequency_hz, second.damping_ratio, second.share))
-    sensor = 2.0 * math.pi * parameters.sensor_bandwidth_hz
-    # States: position and velocity of each mode, sensor output, free displacement, its change over
-    # the step.
-    size = 2 * len(modes) + 3
-    rates = np.zeros((size, size))
-    for k, (natural, damping_ratio, share) in enumerate(modes):
-        rates[2 * k, 2 * k + 1] = natural
-        rates[2 * k + 1, 2 * k : 2 * k + 2] = -natural, -2.0 * damping_ratio * natural
-        rates[2 * k + 1, -2] = natural * share
-        rates[-3, 2 * k] = sensor
-    rates[-3, -3] = -sensor
-    rates[-2, -1] = 1.0 / step_s
-    motion: F64 = np.ascontiguousarray(exponential(rates * step_s)[:-2])
-    motion[:, -2] -= motion[:, -1]
-    return motion
+    if second is None:
+        return [(omega, parameters.damping_ratio, 1.0)]
+    return [
+        (omega, parameters.damping_ratio, 1.0 - second.share),
+        (2.0 * math.pi * second.frequency_hz, second.damping_ratio, second.share),
+    ]
 
 
 def _amplifier(parameters: TerfenolParameters, step_s: float) -> Amplification:
@@ -336,7 +285,8 @@ class TerfenolActuator(Plant):
                 thermal.ambient_k,
                 bias_a,
             )
-        self._motion = _motion(parameters, load_kg, step_s)
+        modes = _modes(parameters, load_kg)
+        self._motion = motion(modes, parameters.sensor_bandwidth_hz, step_s)
         self._mechanics = np.zeros(self._motion.shape[1])
         self._current = np.zeros(1)
         self._halves = np.empty(2 * chunk * self._substeps + 1)

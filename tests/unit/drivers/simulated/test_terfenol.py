@@ -390,11 +390,3 @@ def test_rods_warm_with_the_square_of_the_current():
     assert growth[0] == pytest.approx(3.0 * -4.0)
     assert growth[-1] == pytest.approx(3.0 * (-4.0 + 0.5 * 3.0**2))
     assert state[0] == pytest.approx(4.5)
-
-
-def test_a_reading_shows_what_was_before_its_step_and_ends_at_the_range():
-    """A structure that follows at once: the reading is the displacement one sample before."""
-    motion = np.array([[0.0, 0, 0, 0, 1.0], [0.0] * 5, [0.0, 0, 0, 0, 1.0]])
-    free, shown = np.array([3.0, 5.04, 99.0, 0.0]), np.empty(4)
-    terfenol.respond(free, np.zeros(4), shown, np.zeros(5), motion, 1.0, (0.1, 50.0), 1)
-    assert shown == pytest.approx([0.0, 2.0, 4.0, 50.0])
